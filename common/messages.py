@@ -1,0 +1,309 @@
+"""What travels between services: frozen, typed, checked on the way in and on the way out.
+
+A message is a frozen pydantic model. Arrays are declared with dtype and shape,
+`Annotated[np.ndarray, Array("float32", "N")]`; a letter binds a dimension across the fields of one
+message. Arrays are made read-only: every consumer in a process sees the same memory.
+
+Versions: a class carries `version = "major.minor"`. Within a major, fields are only ever added, and
+each added field has a default, so that old recordings open for ever (tests/common/golden holds one
+file of every released version).
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, ClassVar, Literal
+
+import numpy as np
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+from pydantic_core import core_schema
+
+from common.geometry import is_rigid
+
+MAX_ARRAY_BYTES = 256 * 1024 * 1024
+
+
+class Array:
+    """Annotation for a numpy field: dtype, shape, and whether NaN and inf are refused.
+
+    Shape entries are ints (exact) or letters (any size, equal within one message).
+    """
+
+    def __init__(self, dtype: str, *shape: int | str, finite: bool = False) -> None:
+        self.dtype = np.dtype(dtype)
+        self.shape = shape
+        self.finite = finite
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> core_schema.CoreSchema:
+        return core_schema.no_info_plain_validator_function(self.check)
+
+    def check(self, value: Any) -> np.ndarray:
+        """The array as a read-only, C-contiguous view (a copy only if it was strided).
+
+        Raises:
+            ValueError: not an array, or another dtype, rank, fixed size, or non-finite where forbidden.
+        """
+        if not isinstance(value, np.ndarray):
+            raise ValueError(f"expected a numpy array, got {type(value).__name__}")
+        if value.dtype != self.dtype:
+            raise ValueError(f"expected dtype {self.dtype}, got {value.dtype}")
+        if value.ndim != len(self.shape):
+            raise ValueError(f"expected shape {list(self.shape)}, got {list(value.shape)}")
+        for wanted, size in zip(self.shape, value.shape):
+            if isinstance(wanted, int) and wanted != size:
+                raise ValueError(f"expected shape {list(self.shape)}, got {list(value.shape)}")
+        if value.nbytes > MAX_ARRAY_BYTES:
+            raise ValueError(f"{value.nbytes} bytes exceed the limit of {MAX_ARRAY_BYTES}")
+        if self.finite and not np.all(np.isfinite(value)):
+            raise ValueError("contains NaN or infinity")
+        view = np.ascontiguousarray(value).view()
+        view.flags.writeable = False
+        return view
+
+
+def _check_rigid(T: np.ndarray) -> np.ndarray:
+    for matrix in T.reshape(-1, 4, 4):
+        if not is_rigid(matrix):
+            raise ValueError(f"is not a rigid transform: {matrix.tolist()}")
+    return T
+
+
+Transform = Annotated[np.ndarray, Array("float64", 4, 4, finite=True), AfterValidator(_check_rigid)]
+Transforms = Annotated[np.ndarray, Array("float64", "N", 4, 4, finite=True), AfterValidator(_check_rigid)]
+StampNs = Annotated[int, Field(ge=0, lt=2**63)]
+Count = Annotated[int, Field(ge=0, lt=2**63)]
+Name = Annotated[str, Field(max_length=256)]
+Text = Annotated[str, Field(max_length=65536)]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+
+
+class Part(BaseModel):
+    """A frozen piece of a message (or of a configuration)."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, arbitrary_types_allowed=True)
+
+    @model_validator(mode="after")
+    def _dimensions_agree(self) -> Part:
+        sizes: dict[str, tuple[int, str]] = {}
+        for name, field in type(self).model_fields.items():
+            array = next((m for m in field.metadata if isinstance(m, Array)), None)
+            if array is None:
+                continue
+            for letter, size in zip(array.shape, getattr(self, name).shape):
+                if isinstance(letter, str):
+                    known, first = sizes.setdefault(letter, (size, name))
+                    if known != size:
+                        raise ValueError(f"{name} has {letter}={size}, but {first} has {letter}={known}")
+        return self
+
+
+class Message(Part):
+    """Base of everything on the bus. `stamp_ns` is the time of measurement, int64 nanoseconds."""
+
+    version: ClassVar[str] = "1.0"
+    stamp_ns: StampNs
+
+    @classmethod
+    def schema_name(cls) -> str:
+        return cls.__name__
+
+
+# --- sensors -----------------------------------------------------------------------------------
+
+
+class CameraModel(Part):
+    """A pinhole camera with the distortion of OpenCV; K belongs to this image size.
+
+    `distortion_model` follows ROS: plumb_bob (k1 k2 p1 p2 k3), rational_polynomial (8),
+    equidistant (4, fisheye), none.
+    """
+
+    width_px: Annotated[int, Field(gt=0, le=16384)]
+    height_px: Annotated[int, Field(gt=0, le=16384)]
+    fx_px: Positive
+    fy_px: Positive
+    cx_px: Finite
+    cy_px: Finite
+    distortion_model: Literal["none", "plumb_bob", "rational_polynomial", "equidistant"] = "none"
+    distortion: Annotated[tuple[Finite, ...], Field(max_length=14)] = ()
+    T_body_camera: Transform
+
+    @model_validator(mode="after")
+    def _k_fits_the_image(self) -> CameraModel:
+        for axis, centre, size in (("cx", self.cx_px, self.width_px), ("cy", self.cy_px, self.height_px)):
+            if not 0.0 < centre < size:
+                raise ValueError(
+                    f"{axis} = {centre:g} px lies outside the {self.width_px}x{self.height_px} image: "
+                    "K belongs to another image size"
+                )
+        counts = {"none": (0,), "plumb_bob": (0, 4, 5), "rational_polynomial": (8,), "equidistant": (4,)}
+        if len(self.distortion) not in counts[self.distortion_model]:
+            raise ValueError(
+                f"distortion model {self.distortion_model} takes {counts[self.distortion_model]} "
+                f"coefficients, got {len(self.distortion)}"
+            )
+        return self
+
+    @property
+    def K(self) -> np.ndarray:
+        """float64 [3, 3]."""
+        return np.array([[self.fx_px, 0.0, self.cx_px], [0.0, self.fy_px, self.cy_px], [0.0, 0.0, 1.0]])
+
+
+class LidarModel(Part):
+    """Where the planar lidar sits."""
+
+    T_body_lidar: Transform
+
+
+class Rig(Message):
+    """Calibration in use: what was found, and in `assumed`, one sentence for each value that was not."""
+
+    camera: CameraModel | None = None
+    lidar: LidarModel | None = None
+    assumed: Annotated[tuple[Text, ...], Field(max_length=64)] = ()
+    source: Text = ""
+
+
+class Image(Message):
+    """One camera picture, in the bytes the sensor gave: compressed ones are never decoded on the way."""
+
+    width_px: Annotated[int, Field(gt=0, le=16384)]
+    height_px: Annotated[int, Field(gt=0, le=16384)]
+    encoding: Literal["jpeg", "png", "rgb8", "bgr8", "rgba8", "bgra8", "mono8", "yuv422_yuy2"]
+    step_bytes: Count = 0  # bytes of a row of a raw encoding; 0 for compressed
+    data: Annotated[np.ndarray, Array("uint8", "B")]
+
+
+class Scan(Message):
+    """One revolution of a planar lidar, as measured; `stamp_ns` is the time of the first beam.
+
+    Beam i points at angle_min_rad + i * angle_increment_rad in the lidar frame and was taken
+    i * time_increment_s after the stamp. No return is +inf; rubbish (NaN, negative) passes unchanged,
+    consumers decide.
+    """
+
+    angle_min_rad: Finite
+    angle_increment_rad: Annotated[float, Field(allow_inf_nan=False)]
+    time_increment_s: NonNegative
+    scan_time_s: NonNegative
+    range_min_m: NonNegative
+    range_max_m: Positive
+    ranges_m: Annotated[np.ndarray, Array("float32", "N")]
+    intensities: Annotated[np.ndarray, Array("float32", "M")] = Field(
+        default_factory=lambda: np.zeros(0, np.float32)
+    )
+
+    @model_validator(mode="after")
+    def _intensities_are_none_or_one_a_beam(self) -> Scan:
+        if len(self.intensities) not in (0, len(self.ranges_m)):
+            raise ValueError(f"{len(self.intensities)} intensities for {len(self.ranges_m)} beams")
+        return self
+
+
+class WheelOdometry(Message):
+    """Pose by wheel counting in its own drifting frame, and the body's velocity."""
+
+    T_odom_body: Transform
+    velocity_m_s: Annotated[np.ndarray, Array("float64", 3, finite=True)]
+    angular_velocity_rad_s: Annotated[np.ndarray, Array("float64", 3, finite=True)]
+
+
+class ExternalPose(Message):
+    """`T_map_body` from somebody else's localization (motion capture, another SLAM, recorded truth)."""
+
+    T_map_body: Transform
+
+
+# --- localization ------------------------------------------------------------------------------
+
+
+class Odometry(Message):
+    """Smooth pose `T_odom_body` at the stamp, with the covariance of (x, y, yaw)."""
+
+    T_odom_body: Transform
+    covariance: Annotated[np.ndarray, Array("float64", 3, 3)]
+    status: Literal["ok", "lost", "relocalizing", "rejected"] = "ok"
+    detail: Text = ""
+
+
+class Correction(Message):
+    """`T_map_odom`: takes the smooth pose to the map; may jump when a loop closes."""
+
+    T_map_odom: Transform
+    optimisation: Count = 0
+
+
+class Anchors(Message):
+    """`T_map_anchor` of all anchors (lidar submaps) after an optimisation."""
+
+    anchor_ids: Annotated[np.ndarray, Array("int64", "N")]
+    T_map_anchor: Transforms
+    optimisation: Count = 0
+
+
+class Grid(Message):
+    """Occupancy grid: cell [row, column] covers origin + (column, row) * resolution, y up.
+
+    Values as nav2: -1 unknown, 0 free .. 100 occupied. `changed` is the region touched since the grid
+    before: row0, column0, row1, column1 (half open).
+    """
+
+    resolution_m: Positive
+    origin_m: Annotated[np.ndarray, Array("float64", 2, finite=True)]
+    occupancy: Annotated[np.ndarray, Array("int8", "H", "W")]
+    changed: tuple[Count, Count, Count, Count] = (0, 0, 0, 0)
+
+
+# --- the system itself -------------------------------------------------------------------------
+
+
+class Tick(Message):
+    """A timer's beat: time passes as a message, so that a replay repeats it."""
+
+    count: Count
+
+
+class InputHealth(Part):
+    """One subscription of one node, since it started."""
+
+    topic: Name
+    received: Count  # handed to the node
+    dropped: Count  # overtaken in the ring or overflowed: by design, but counted
+    lost: Count  # gaps in the sequence of an `every` stream: a fault
+    undecodable: Count
+    stale: Count  # from an epoch that has been taken over
+    age_ms: NonNegative  # publish to handler, of the newest, on clocks of one host; 0 if unknown
+
+
+class OutputHealth(Part):
+    """One publication of one node."""
+
+    topic: Name
+    sent: Count
+    bytes: Count
+
+
+class Health(Message):
+    """Once a second from every node."""
+
+    node: Name
+    instance: Name
+    epoch: Count
+    state: Literal["configure", "standby", "active", "drain", "drained", "closed"]
+    inputs: Annotated[tuple[InputHealth, ...], Field(max_length=64)] = ()
+    outputs: Annotated[tuple[OutputHealth, ...], Field(max_length=64)] = ()
+    step_p50_ms: NonNegative = 0.0
+    step_p95_ms: NonNegative = 0.0
+    rss_mb: NonNegative = 0.0
+    cpu_percent: NonNegative = 0.0
+    detail: Text = ""
+
+
+MESSAGES: dict[str, type[Message]] = {
+    cls.schema_name(): cls
+    for cls in (
+        Rig, Image, Scan, WheelOdometry, ExternalPose, Odometry, Correction, Anchors, Grid, Tick, Health,
+    )
+}  # fmt: skip

@@ -1,0 +1,71 @@
+"""THE dataflow: every topic, its message, who may produce it, its rate and how it is delivered.
+
+Change this table first. Deliveries are the default of a subscription, which may choose otherwise:
+
+latest   a ring of one: the newest wins, the writer never waits, what is overtaken is counted
+every    in order; `cache` messages are kept by the publisher, so that a subscriber recovers what a
+         broken link lost; what is lost for good is counted
+latched  the last value reaches late joiners
+
+`uplink` marks what crosses from the robot to an edge server. A topic has exactly one producer in a
+running system; where several services are named, a deployment starts one of them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from common import messages as m
+
+Delivery = Literal["latest", "every", "latched"]
+
+
+@dataclass(frozen=True)
+class Topic:
+    """One row of the table."""
+
+    name: str
+    message: type[m.Message]
+    producers: tuple[str, ...]
+    rate_hz: float  # nominal; 0 = on events
+    delivery: Delivery
+    cache: int = 0  # messages the publisher keeps for recovery: rate x longest outage to survive
+    uplink: bool = False
+
+    @property
+    def handler(self) -> str:
+        """Name of the node method that takes this topic: camera/image -> on_camera_image."""
+        return "on_" + self.name.replace("/", "_")
+
+
+_ROWS = (
+    # name                    message          producers                 Hz  delivery  cache  uplink
+    Topic("rig",                     m.Rig,           ("camera", "replay"),      0, "latched", 1, True),
+    Topic("wheel/odometry",          m.WheelOdometry, ("wheels", "replay"),     50, "every", 2000),
+    Topic("lidar/scan",              m.Scan,          ("lidar", "replay"),      10, "every", 400),
+    Topic("camera/image",            m.Image,         ("camera", "replay"),     10, "latest"),
+    Topic("external/pose",           m.ExternalPose,  ("ros2", "replay"),       10, "every", 400),
+    Topic("localization/odometry",   m.Odometry,      ("localization",),        10, "every", 400, True),
+    Topic("localization/correction", m.Correction,    ("localization",),         0, "latched", 1, True),
+    Topic("localization/anchors",    m.Anchors,       ("localization",),         0, "latched", 1, True),
+    Topic("localization/grid",       m.Grid,          ("localization",),         0, "latched", 1, True),
+    Topic("tick",                    m.Tick,          ("timer",),                1, "every"),
+)  # fmt: skip
+
+TOPICS: dict[str, Topic] = {row.name: row for row in _ROWS}
+ROW_NUMBER: dict[str, int] = {row.name: i for i, row in enumerate(_ROWS)}
+
+# Not part of the dataflow: each node reports its own health under health/<node>.
+HEALTH = "health"
+
+
+def topic(name: str) -> Topic:
+    """The row called `name`.
+
+    Raises:
+        KeyError: no such topic; the text lists those there are.
+    """
+    if name not in TOPICS:
+        raise KeyError(f"no topic called {name!r}; there are {', '.join(TOPICS)}")
+    return TOPICS[name]
