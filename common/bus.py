@@ -1,0 +1,362 @@
+"""Zenoh, as BeamSplat uses it: sessions, keys, publications, subscriptions.
+
+Everything a robot says lives under `beamsplat/<robot>/`:
+
+    <topic>                       messages; header in the attachment, schema in the encoding
+    health/<node>                 once a second
+    end/<topic>                   the producer has nothing more to say (latched)
+    alive/<node>/<instance>       liveliness token of an active node
+    query/<node>/<name>           queryables
+
+All sessions are clients of a router on this host: two peers that know only a router do not reach each
+other, and access control acts between client and router. Channels with threads of our own take the
+place of Python callbacks, which keep a process from ending.
+"""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from collections.abc import Callable, Iterator
+
+import msgpack
+import zenoh
+import zenoh.ext
+
+from common.codec import MEDIA_TYPE, decode, encode, schema_of
+from common.errors import UserError
+from common.header import DecodeError, Header, local_clock_id
+from common.mailbox import Letter
+from common.messages import Health, Message
+from common.node import Input
+from common.topics import HEALTH, Topic, topic
+
+ROOT = "beamsplat"
+FIFO_MESSAGES = 256  # buffered by Zenoh ahead of our thread for an `every` input without a cache
+SHM_POOL_BYTES = 64 * 1024 * 1024
+_ENCODING = zenoh.Encoding(MEDIA_TYPE)
+
+
+def key(robot: str, *parts: str) -> str:
+    """`beamsplat/<robot>/<parts...>`."""
+    return "/".join((ROOT, robot, *parts))
+
+
+def _base_config(mode: str) -> zenoh.Config:
+    config = zenoh.Config()
+    config.insert_json5("mode", json.dumps(mode))
+    config.insert_json5("scouting/multicast/enabled", "false")
+    config.insert_json5("scouting/gossip/enabled", "false")
+    config.insert_json5("transport/link/tx/lease", "2000")  # a hung peer is noticed in 2 s
+    config.insert_json5(
+        "connect/retry", "{period_init_ms: 100, period_max_ms: 1000, period_increase_factor: 2}"
+    )
+    config.insert_json5("transport/shared_memory/transport_optimization/pool_size", str(SHM_POOL_BYTES))
+    return config
+
+
+def open_router(listen: tuple[str, ...], connect: tuple[str, ...] = ()) -> zenoh.Session:
+    """A router in this process.
+
+    Raises:
+        UserError: an endpoint cannot be listened on (in use, or malformed).
+    """
+    zenoh.init_log_from_env_or("error")
+    config = _base_config("router")
+    config.insert_json5("listen/endpoints", json.dumps(list(listen)))
+    config.insert_json5("connect/endpoints", json.dumps(list(connect)))
+    config.insert_json5("adminspace/enabled", "true")
+    config.insert_json5("adminspace/permissions", "{read: true, write: false}")
+    try:
+        return zenoh.open(config)
+    except zenoh.ZError as error:
+        raise UserError(
+            f"router cannot listen on {', '.join(listen)} ({_short(error)}): is another router running? "
+            "Stop it, or choose another port with --set router.listen='[\"tcp/127.0.0.1:7448\"]'"
+        ) from error
+
+
+def open_session(endpoints: tuple[str, ...], wait_s: float = 15.0) -> zenoh.Session:
+    """A client session of the router at one of `endpoints`, waiting `wait_s` for it to appear.
+
+    Raises:
+        UserError: no router answered.
+    """
+    zenoh.init_log_from_env_or("error")
+    config = _base_config("client")
+    config.insert_json5("connect/endpoints", json.dumps(list(endpoints)))
+    config.insert_json5("connect/timeout_ms", "1000")
+    config.insert_json5("connect/exit_on_failure", "true")
+    deadline = time.monotonic() + wait_s
+    while True:
+        try:
+            return zenoh.open(config)
+        except zenoh.ZError as error:
+            if time.monotonic() > deadline:
+                raise UserError(
+                    f"no router answers at {', '.join(endpoints)} ({_short(error)}). Start the system "
+                    "with `beamsplat run FILE`, or a router alone with `beamsplat run FILE router`"
+                ) from error
+            time.sleep(0.1)
+
+
+def _short(error: zenoh.ZError) -> str:
+    return str(error).split(" at ")[0][:120]
+
+
+class Publication:
+    """One topic as one producer writes it; `put` may be called from several threads."""
+
+    def __init__(self, bus: Bus, row: Topic, key_expr: str) -> None:
+        self._bus = bus
+        self._lock = threading.Lock()
+        self.row = row
+        self.sent = 0
+        self.bytes = 0
+        encoding = _ENCODING.with_schema(schema_of(row.message))
+        if row.cache:
+            self._publisher = zenoh.ext.declare_advanced_publisher(
+                bus.session,
+                key_expr,
+                encoding=encoding,
+                congestion_control=zenoh.CongestionControl.DROP,
+                cache=zenoh.ext.CacheConfig(row.cache),
+                sample_miss_detection=zenoh.ext.MissDetectionConfig(sporadic_heartbeat=0.5),
+                publisher_detection=True,
+            )
+        else:
+            self._publisher = bus.session.declare_publisher(
+                key_expr, encoding=encoding, congestion_control=zenoh.CongestionControl.DROP
+            )
+
+    def put(self, message: Message) -> Header:
+        """Sends one message; never waits for a subscriber."""
+        payload = encode(message)
+        with self._lock:
+            header = Header(
+                stamp_ns=message.stamp_ns,
+                publish_ns=time.monotonic_ns(),
+                clock_id=self._bus.clock_id,
+                sequence=self.sent,
+                epoch=self._bus.epoch,
+                producer=self._bus.node,
+                instance=self._bus.instance,
+            )
+            self._publisher.put(payload, attachment=header.pack())
+            self.sent += 1
+            self.bytes += len(payload)
+        return header
+
+
+class Subscription:
+    """One input: a thread that takes samples from Zenoh's channel and decodes them."""
+
+    def __init__(
+        self,
+        bus: Bus,
+        row: Topic,
+        delivery: str,
+        key_expr: str,
+        on_letter: Callable[[Letter], None],
+        on_undecodable: Callable[[str, str], None],
+    ) -> None:
+        self.row = row
+        self._on_letter = on_letter
+        self._on_undecodable = on_undecodable
+        if delivery == "every":
+            channel = zenoh.handlers.FifoChannel(max(row.cache, FIFO_MESSAGES))
+        else:
+            channel = zenoh.handlers.RingChannel(1)
+        if row.cache and delivery != "latest":
+            latched = delivery == "latched"
+            self._subscriber = zenoh.ext.declare_advanced_subscriber(
+                bus.session,
+                key_expr,
+                channel,
+                recovery=zenoh.ext.RecoveryConfig(heartbeat=True),
+                history=zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=1)
+                if latched
+                else None,
+            )
+        else:
+            self._subscriber = bus.session.declare_subscriber(key_expr, channel)
+        self._thread = threading.Thread(target=self._receive, name=f"sub-{row.name}", daemon=True)
+        self._thread.start()
+
+    def _receive(self) -> None:
+        while True:
+            try:
+                sample = self._subscriber.recv()
+            except zenoh.ZError:  # the session was closed
+                return
+            try:
+                letter = open_sample(sample, self.row)
+            except DecodeError as error:
+                self._on_undecodable(self.row.name, str(error))
+            else:
+                self._on_letter(letter)
+
+
+def open_sample(sample: zenoh.Sample, row: Topic) -> Letter:
+    """The letter in a sample of topic `row`.
+
+    Raises:
+        DecodeError: no header, another message's schema, or a payload that does not decode.
+    """
+    if sample.attachment is None:
+        raise DecodeError("sample without a header")
+    header = Header.unpack(sample.attachment.to_bytes())
+    schema = str(sample.encoding).partition(";")[2]
+    message = decode(schema, sample.payload.to_bytes())
+    if type(message) is not row.message:
+        raise DecodeError(f"{schema} on {row.name}, which carries {row.message.schema_name()}")
+    return Letter(row.name, header, message)
+
+
+class Bus:
+    """One node's place on the network. Keep it open with `with`."""
+
+    def __init__(self, session: zenoh.Session, robot: str, node: str, instance: str, epoch: int) -> None:
+        self.session = session
+        self.robot = robot
+        self.node = node
+        self.instance = instance
+        self.epoch = epoch
+        self.clock_id = local_clock_id()
+        self._declared: list[object] = []  # dropped handles would be undeclared at once
+        self._health = Publication(
+            self, Topic(HEALTH, Health, (node,), 1, "latest"), key(robot, HEALTH, node)
+        )
+
+    def __enter__(self) -> Bus:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.session.close()
+
+    def publish(self, topic_name: str) -> Publication:
+        """Declares a publication of a topic."""
+        return Publication(self, topic(topic_name), key(self.robot, topic_name))
+
+    def subscribe(
+        self,
+        entry: Input,
+        on_letter: Callable[[Letter], None],
+        on_undecodable: Callable[[str, str], None],
+        on_end: Callable[[str, str, int, int], None],
+    ) -> None:
+        """Declares a subscription; the callbacks run in threads of the bus.
+
+        `on_end(topic, instance, epoch, sent)` tells that a producer has ended after `sent` messages.
+        """
+        delivery = entry.effective_delivery
+        self._declared.append(
+            Subscription(self, entry.row, delivery, key(self.robot, entry.topic), on_letter, on_undecodable)
+        )
+        subscriber = zenoh.ext.declare_advanced_subscriber(
+            self.session,
+            key(self.robot, "end", entry.topic),
+            zenoh.handlers.FifoChannel(16),
+            history=zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=1),
+            recovery=zenoh.ext.RecoveryConfig(heartbeat=True),
+        )
+        self._declared.append(subscriber)
+
+        def receive() -> None:
+            while True:
+                try:
+                    sample = subscriber.recv()
+                except zenoh.ZError:
+                    return
+                try:
+                    header = Header.unpack(sample.attachment.to_bytes() if sample.attachment else b"")
+                    sent = msgpack.unpackb(sample.payload.to_bytes())
+                except (DecodeError, ValueError, msgpack.UnpackException) as error:
+                    on_undecodable(entry.topic, f"end marker: {error}")
+                    continue
+                if isinstance(sent, int):
+                    on_end(entry.topic, header.instance, header.epoch, sent)
+
+        threading.Thread(target=receive, name=f"end-{entry.topic}", daemon=True).start()
+
+    def end(self, publication: Publication) -> None:
+        """Tells the subscribers of a publication that nothing more will come."""
+        publisher = zenoh.ext.declare_advanced_publisher(
+            self.session,
+            key(self.robot, "end", publication.row.name),
+            cache=zenoh.ext.CacheConfig(1),
+            sample_miss_detection=zenoh.ext.MissDetectionConfig(sporadic_heartbeat=0.5),
+            publisher_detection=True,
+        )
+        header = Header(
+            0, time.monotonic_ns(), self.clock_id, publication.sent, self.epoch, self.node, self.instance
+        )
+        publisher.put(msgpack.packb(publication.sent), attachment=header.pack())
+        self._declared.append(publisher)
+
+    def answer(self, name: str, on_query: Callable[[str, zenoh.Query], None]) -> None:
+        """Declares the queryable query/<node>/<name>; `on_query(name, query)` runs in a bus thread."""
+        queryable = self.session.declare_queryable(
+            key(self.robot, "query", self.node, name), zenoh.handlers.FifoChannel(16)
+        )
+        self._declared.append(queryable)
+
+        def receive() -> None:
+            while True:
+                try:
+                    query = queryable.recv()
+                except zenoh.ZError:
+                    return
+                on_query(name, query)
+
+        threading.Thread(target=receive, name=f"query-{name}", daemon=True).start()
+
+    def report(self, health: Health) -> None:
+        """Publishes this node's health."""
+        self._health.put(health)
+
+    def declare_alive(self) -> None:
+        """Shows this node as active, until the session ends."""
+        token = self.session.liveliness().declare_token(key(self.robot, "alive", self.node, self.instance))
+        self._declared.append(token)
+
+    def alive_nodes(self) -> set[str]:
+        """Names of the nodes of this robot that are active now."""
+        replies = self.session.liveliness().get(key(self.robot, "alive", "*", "*"), timeout=2.0)
+        return {str(r.ok.key_expr).split("/")[3] for r in replies if r.ok is not None}
+
+
+def ask(
+    session: zenoh.Session, robot: str, node: str, name: str, parameters: dict[str, str], timeout_s: float
+) -> Iterator[Message]:
+    """The replies to a query, as they come.
+
+    Raises:
+        UserError: nobody answers to this query, the node refused it, or it took too long.
+    """
+    selector = zenoh.Selector(key(robot, "query", node, name), zenoh.Parameters(parameters))
+    answered = False
+    for reply in session.get(
+        selector,
+        timeout=timeout_s,
+        target=zenoh.QueryTarget.ALL,
+        consolidation=zenoh.ConsolidationMode.NONE,
+    ):
+        if reply.ok is None:
+            raise UserError(f"{node} refused {name}: {reply.err.payload.to_string()}")
+        answered = True
+        yield decode(str(reply.ok.encoding).partition(";")[2], reply.ok.payload.to_bytes())
+    if not answered:
+        raise UserError(f"nobody answers {name} of node {node!r}: is it running? (`beamsplat top` shows it)")
+
+
+def reply(query: zenoh.Query, messages: Iterator[Message]) -> None:
+    """Answers a query with messages; a UserError on the way becomes an error reply."""
+    with query:
+        try:
+            for message in messages:
+                encoding = _ENCODING.with_schema(schema_of(message))
+                query.reply(query.key_expr, encode(message), encoding=encoding)
+        except UserError as error:
+            query.reply_err(str(error).encode())

@@ -1,0 +1,299 @@
+"""One node as one process on Zenoh.
+
+Threads: the main thread runs the node; one per subscription fills the mailbox; one works off
+background jobs; one reports health every second. The node itself never sees any of them.
+"""
+
+from __future__ import annotations
+
+import logging
+import secrets
+import signal
+import threading
+import time
+from collections import deque
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+import zenoh
+
+from common.bus import Bus, Publication, open_session, reply
+from common.jobs import JobQueue
+from common.mailbox import Letter, Mailbox
+from common.messages import Health, OutputHealth
+from common.node import Job, Node, Output, Sourced
+from common.persist import Bookmark, claim_epoch
+
+log = logging.getLogger(__name__)
+
+_POLL_S = 0.2  # how soon a signal is noticed while nothing arrives
+_END_PATIENCE_S = 2.0  # an end marker waits this long for messages still on their way
+_LOG_PERIOD_S = 5.0
+
+
+@dataclass(frozen=True)
+class LiveSettings:
+    """How a process takes part; everything about the node itself is in the node's own config."""
+
+    robot: str
+    endpoints: tuple[str, ...]
+    run_dir: Path
+    rate: float = 1.0  # pacing of recorded sources: times real time, 0 = as fast as possible
+    wait_for: frozenset[str] = frozenset()  # a source starts when these nodes are active
+    wait_s: float = 60.0
+    resume: bool = False  # a restarted source goes on where its predecessor died
+    exit_when_drained: bool = False
+
+
+class Live:
+    """Runs one node until its inputs end or a signal comes."""
+
+    def __init__(self, node: Node, settings: LiveSettings) -> None:
+        self.node = node
+        self.settings = settings
+        self.instance = secrets.token_hex(8)
+        self.mailbox = Mailbox(type(node))
+        self._changed = threading.Condition()
+        self._stopping = False
+        self._state = "configure"
+        self._detail = ""
+        self._queries: deque[tuple[str, zenoh.Query]] = deque()
+        self._ends: list[tuple[str, str, int, int, float]] = []
+        self._steps_ms: deque[float] = deque(maxlen=512)
+        self._publications: dict[str, Publication] = {}
+        self._complaints: dict[str, tuple[float, int]] = {}
+        self._bookmark = Bookmark(settings.run_dir, node.name)
+
+    def run(self) -> None:
+        """Life of the process: configure, standby, active, drain, drained, closed."""
+        epoch = claim_epoch(self.settings.run_dir, self.node.name)
+        session = open_session(self.settings.endpoints)
+        with (
+            Bus(session, self.settings.robot, self.node.name, self.instance, epoch) as bus,
+            ThreadPoolExecutor(1, "job") as workers,
+        ):
+            threading.Thread(target=self._report, args=(bus,), name="health", daemon=True).start()
+            self._jobs = JobQueue(workers.submit)
+            try:
+                self.node.configure()
+                self._state = "standby"
+                self._join(bus)
+                self._work(bus)
+                self._send_health(bus)
+            finally:
+                self._state = "closed"
+                self.node.close()
+
+    def stop(self, *_: object) -> None:
+        """Asks the node to end; safe in a signal handler."""
+        self._stopping = True
+
+    def install_signal_handlers(self) -> None:
+        """SIGINT and SIGTERM end the node cleanly."""
+        signal.signal(signal.SIGINT, self.stop)
+        signal.signal(signal.SIGTERM, self.stop)
+
+    def _join(self, bus: Bus) -> None:
+        for name in self.node.outputs:
+            self._publications[name] = bus.publish(name)
+        for entry in self.node.inputs:
+            bus.subscribe(entry, self._on_letter, self._on_undecodable, self._on_end)
+        for name in self.node.queries():
+            bus.answer(name, self._on_query)
+        bus.declare_alive()
+
+    def _work(self, bus: Bus) -> None:
+        if self.node.is_source():
+            self._wait_for_consumers(bus)
+            self._state = "active"
+            self._run_source()
+        else:
+            self._state = "active"
+            self._run_steps()
+        finished = not self._stopping
+        self._state = "drain"
+        for name, result in self._jobs.rest():
+            self._emit(self.node.handle_job(name, result))
+        self._emit(self.node.handle_drain())
+        self._state = "drained"
+        if finished:  # stopped by a signal it leaves the stream open: a successor goes on
+            self._bookmark.clear()
+            for publication in self._publications.values():
+                bus.end(publication)
+            while not self._stopping and not self.settings.exit_when_drained:
+                self._answer_queries()
+                with self._changed:
+                    self._changed.wait(_POLL_S)
+
+    # --- the node's own thread ---
+
+    def _run_steps(self) -> None:
+        while not self._stopping:
+            self._answer_queries()
+            letter = self._next()
+            self._emit_all(self._jobs.finished())
+            if letter is None:
+                if self.mailbox.ended:
+                    return
+                continue
+            started = time.perf_counter()
+            self._emit_all(self._jobs.before_message())
+            self._emit(self.node.handle(letter.topic, letter.message))
+            self._steps_ms.append((time.perf_counter() - started) * 1e3)
+
+    def _next(self) -> Letter | None:
+        """The next letter, or None after a short wait."""
+        with self._changed:
+            self._apply_ends()
+            letter = self.mailbox.pop()
+            if letter is None and not self.mailbox.ended:
+                self._changed.wait(_POLL_S)
+                self._apply_ends()
+                letter = self.mailbox.pop()
+            if letter is not None:
+                age_ns = letter.header.age_ns(time.monotonic_ns(), self._clock_id)
+                self.mailbox.counts[letter.topic].age_ms = 0.0 if age_ns is None else age_ns / 1e6
+        return letter
+
+    def _apply_ends(self) -> None:
+        """Lets an input end once all that its producer sent has come, or is given up."""
+        waiting = []
+        for topic, instance, epoch, sent, deadline in self._ends:
+            if self.mailbox.next_sequence(topic, instance) >= sent or time.monotonic() > deadline:
+                self.mailbox.end(topic, instance, epoch)
+            else:
+                waiting.append((topic, instance, epoch, sent, deadline))
+        self._ends = waiting
+
+    def _emit_all(self, results: Iterator[tuple[str, Any]]) -> None:
+        for name, result in results:
+            self._emit(self.node.handle_job(name, result))
+
+    def _emit(self, outputs: Iterator[Output]) -> None:
+        for output in outputs:
+            if isinstance(output, Job):
+                future = self._jobs.start(output)
+                future.add_done_callback(lambda _: self._wake())
+            else:
+                self._publications[output[0]].put(output[1])
+
+    def _run_source(self) -> None:
+        pace = _Pace(self.settings.rate)
+        resume_ns = self._bookmark.read() if self.settings.resume else None
+        for item in self.node.source():
+            if self._stopping:
+                return
+            latched = item.topic in self._publications and self._publications[item.topic].row.cache == 1
+            if resume_ns is not None and item.at_ns is not None and item.at_ns <= resume_ns and not latched:
+                continue
+            while not self._stopping and (wait_s := pace.wait_s(item)) > 0.0:
+                time.sleep(min(wait_s, _POLL_S))
+            started = time.perf_counter()
+            self.node.check_output(item.topic, item.message)
+            self._publications[item.topic].put(item.message)
+            self._steps_ms.append((time.perf_counter() - started) * 1e3)
+            if item.at_ns is not None:
+                self._bookmark.write(item.at_ns)
+
+    def _wait_for_consumers(self, bus: Bus) -> None:
+        deadline = time.monotonic() + self.settings.wait_s
+        missing = self.settings.wait_for
+        while missing and not self._stopping:
+            missing = self.settings.wait_for - bus.alive_nodes()
+            if time.monotonic() > deadline:
+                log.warning("starting without %s: not active after %g s", ", ".join(sorted(missing)),
+                            self.settings.wait_s)  # fmt: skip
+                return
+            self._detail = f"waiting for {', '.join(sorted(missing))}" if missing else ""
+            if missing:
+                time.sleep(0.1)
+
+    def _answer_queries(self) -> None:
+        while self._queries:
+            name, query = self._queries.popleft()
+            parameters = {k: v for k, v in query.parameters.items()} if query.parameters else {}
+            reply(query, getattr(self.node, f"on_query_{name}")(parameters))
+
+    # --- called from threads of the bus ---
+
+    def _on_letter(self, letter: Letter) -> None:
+        with self._changed:
+            if self.mailbox.put(letter):
+                self._changed.notify()
+
+    def _on_undecodable(self, topic: str, reason: str) -> None:
+        with self._changed:
+            self.mailbox.counts[topic].undecodable += 1
+            last, count = self._complaints.get(topic, (-_LOG_PERIOD_S, 0))
+            now = time.monotonic()
+            if now - last < _LOG_PERIOD_S:
+                self._complaints[topic] = (last, count + 1)
+                return
+            self._complaints[topic] = (now, 0)
+        log.warning("dropped a message on %s (%d more since the last report): %s", topic, count, reason)
+
+    def _on_end(self, topic: str, instance: str, epoch: int, sent: int) -> None:
+        with self._changed:
+            self._ends.append((topic, instance, epoch, sent, time.monotonic() + _END_PATIENCE_S))
+            self._changed.notify()
+
+    def _on_query(self, name: str, query: zenoh.Query) -> None:
+        self._queries.append((name, query))
+        self._wake()
+
+    def _wake(self) -> None:
+        with self._changed:
+            self._changed.notify()
+
+    # --- health ---
+
+    def _report(self, bus: Bus) -> None:
+        self._clock_id = bus.clock_id
+        self._process = psutil.Process()
+        self._process.cpu_percent()
+        while self._state != "closed":
+            try:
+                self._send_health(bus)
+            except zenoh.ZError:  # the session is closing
+                return
+            time.sleep(1.0)
+
+    def _send_health(self, bus: Bus) -> None:
+        with self._changed:
+            inputs = self.mailbox.health()
+        steps = np.array(self._steps_ms or [0.0])
+        outputs = tuple(
+            OutputHealth(topic=name, sent=p.sent, bytes=p.bytes) for name, p in self._publications.items()
+        )
+        bus.report(
+            Health(
+                stamp_ns=time.time_ns(), node=self.node.name, instance=self.instance, epoch=bus.epoch,
+                state=self._state, inputs=inputs, outputs=outputs,
+                step_p50_ms=float(np.percentile(steps, 50)), step_p95_ms=float(np.percentile(steps, 95)),
+                rss_mb=self._process.memory_info().rss / 1e6, cpu_percent=self._process.cpu_percent(),
+                detail=self._detail,
+            )
+        )  # fmt: skip
+
+
+class _Pace:
+    """Maps a recording's clock to this machine's."""
+
+    def __init__(self, rate: float) -> None:
+        self._rate = rate
+        self._first: tuple[int, float] | None = None
+
+    def wait_s(self, item: Sourced) -> float:
+        """Seconds until an item is due; not positive when it is."""
+        if item.at_ns is None or self._rate == 0.0:
+            return 0.0
+        now = time.monotonic()
+        if self._first is None:
+            self._first = (item.at_ns, now)
+        first_ns, started = self._first
+        return started + (item.at_ns - first_ns) / 1e9 / self._rate - now

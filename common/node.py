@@ -1,0 +1,161 @@
+"""A node: messages in, messages out. It knows neither the bus nor the time of day.
+
+A subclass names its topics and has one handler per input, a generator of what it sends:
+
+    class Localization(Node):
+        name = "localization"
+        inputs = ("lidar/scan", "wheel/odometry")
+        outputs = ("localization/odometry",)
+
+        def on_lidar_scan(self, scan: Scan) -> Outputs:
+            yield "localization/odometry", Odometry(...)
+
+What is misspelt or missing fails when the class is defined. The same node runs under
+`common.live` (a process on Zenoh) and `common.lockstep` (all nodes in one reproducible thread).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple
+
+from common.config import NodeConfig
+from common.messages import Message
+from common.topics import ROW_NUMBER, Delivery, Topic, topic
+
+
+@dataclass(frozen=True)
+class Input:
+    """A subscription: a topic, and a delivery other than its row's default."""
+
+    topic: str
+    delivery: Delivery | None = None
+
+    @property
+    def row(self) -> Topic:
+        return topic(self.topic)
+
+    @property
+    def effective_delivery(self) -> Delivery:
+        return self.delivery or self.row.delivery
+
+
+@dataclass(frozen=True)
+class Job:
+    """Long work, yielded by a handler; its result comes back as `on_job_<name>(result)`.
+
+    `run` must hold no reference to state that the node changes meanwhile. With `after = n` the result
+    is taken in just before the n-th next message, and waited for: reproducible in both runners.
+    With None it is taken in when it is there.
+    """
+
+    name: str
+    run: Callable[[], Any]
+    after: int | None = None
+
+
+class Sourced(NamedTuple):
+    """What `source()` yields: `at_ns` is the arrival time on a recording's clock, by which runners
+    pace and order; None means now (a real device)."""
+
+    at_ns: int | None
+    topic: str
+    message: Message
+
+
+Output = tuple[str, Message] | Job
+Outputs = Iterator[Output]
+
+
+class UndeclaredTopic(RuntimeError):
+    """A node wrote a topic, or started a job, that it does not declare."""
+
+
+class Node:
+    """Base of all nodes. Life: configure() -> messages -> drain() -> close()."""
+
+    name: ClassVar[str] = ""
+    Config: ClassVar[type[NodeConfig]] = NodeConfig
+    inputs: ClassVar[tuple[str | Input, ...]] = ()
+    outputs: ClassVar[tuple[str, ...]] = ()
+
+    def __init__(self, config: NodeConfig) -> None:
+        self.config = config
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        if not cls.name:  # an abstract base between Node and the real ones
+            return
+        cls.inputs = tuple(Input(i) if isinstance(i, str) else i for i in cls.inputs)
+        for entry in cls.inputs:
+            if not callable(getattr(cls, entry.row.handler, None)):
+                raise TypeError(f"{cls.__name__} takes {entry.topic} but has no {entry.row.handler}")
+        for name in cls.outputs:
+            if cls.name not in topic(name).producers:
+                raise TypeError(
+                    f"{cls.__name__} ({cls.name}) writes {name}, whose producers are {topic(name).producers}"
+                )
+
+    # --- life cycle: override what is needed ---
+
+    def configure(self) -> None:
+        """Loads and warms what the first message must not wait for."""
+
+    def drain(self) -> Iterable[Output]:
+        """Last outputs, when all inputs have ended."""
+        return ()
+
+    def close(self) -> None:
+        """Releases files and devices. Called once, also after an error."""
+
+    def source(self) -> Iterator[Sourced]:
+        """Sensors override this; a node with a source has no inputs."""
+        return iter(())
+
+    # --- used by the runners ---
+
+    @classmethod
+    def is_source(cls) -> bool:
+        """Whether this node makes messages of its own."""
+        return cls.source is not Node.source
+
+    @classmethod
+    def queries(cls) -> tuple[str, ...]:
+        """Names of the queries it answers: its `on_query_<name>(parameters)` generators."""
+        prefix = "on_query_"
+        return tuple(sorted(n.removeprefix(prefix) for n in dir(cls) if n.startswith(prefix)))
+
+    def handle(self, topic_name: str, message: Message) -> Iterator[Output]:
+        """What the handler of `topic_name` sends, each checked to be declared."""
+        yield from self._declared(getattr(self, topic(topic_name).handler)(message))
+
+    def handle_job(self, name: str, result: Any) -> Iterator[Output]:
+        """What `on_job_<name>` sends."""
+        yield from self._declared(getattr(self, f"on_job_{name}")(result))
+
+    def handle_drain(self) -> Iterator[Output]:
+        """What `drain` sends."""
+        yield from self._declared(self.drain())
+
+    def _declared(self, outputs: Iterable[Output] | None) -> Iterator[Output]:
+        for output in outputs or ():
+            if isinstance(output, Job):
+                if not callable(getattr(self, f"on_job_{output.name}", None)):
+                    raise UndeclaredTopic(f"{self.name} starts job {output.name!r} but has no on_job_ for it")
+            else:
+                self.check_output(*output)
+            yield output
+
+    def check_output(self, topic_name: str, message: Message) -> None:
+        """Raises UndeclaredTopic unless this node may send this message there."""
+        if topic_name not in self.outputs:
+            raise UndeclaredTopic(f"{self.name} wrote {topic_name}, which is not among its outputs")
+        if type(message) is not topic(topic_name).message:
+            raise UndeclaredTopic(f"{self.name} wrote a {type(message).__name__} to {topic_name}")
+
+
+def merged_topics(node: type[Node]) -> tuple[str, ...]:
+    """The inputs that are merged by stamp before the node sees them: its `every` ones, in row order."""
+    names = [i.topic for i in node.inputs if i.effective_delivery == "every"]
+    return tuple(sorted(names, key=ROW_NUMBER.__getitem__))

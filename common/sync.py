@@ -1,0 +1,82 @@
+"""Merging streams by stamp, so that a node sees the same order live and replayed.
+
+A message is released once every other stream has shown that nothing older will come: its newest
+stamp is not before the message's, or it has ended. A stream that falls behind the newest stamp by
+more than `patience_ns` stops being waited for until it speaks again. All of this depends on the
+data alone, never on the time of day.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Any
+
+PATIENCE_NS = 500_000_000
+_END_NS = 2**63 - 1
+
+
+class StampMerger:
+    """In-order streams in, one stream ordered by (stamp, stream number) out."""
+
+    def __init__(self, streams: tuple[str, ...], patience_ns: int = PATIENCE_NS) -> None:
+        self._queues: dict[str, deque[tuple[int, Any]]] = {name: deque() for name in streams}
+        self._newest_ns: dict[str, int] = {}
+        self._given_up: set[str] = set()
+        self._order = {name: i for i, name in enumerate(streams)}
+        self._patience_ns = patience_ns
+        self._first_ns: int | None = None
+        self._front_ns = 0  # newest stamp of any stream
+        self._released_ns = 0
+        self.late = 0  # released behind a younger one, because their stream had been given up
+
+    def __len__(self) -> int:
+        return sum(len(queue) for queue in self._queues.values())
+
+    def queued(self, stream: str) -> int:
+        """Items of `stream` not yet released."""
+        return len(self._queues[stream])
+
+    def put(self, stream: str, stamp_ns: int, item: Any) -> None:
+        """Takes one item; stamps may jump back within a stream, order of arrival is then kept."""
+        if self._first_ns is None:
+            self._first_ns = stamp_ns
+        self._queues[stream].append((stamp_ns, item))
+        self._newest_ns[stream] = stamp_ns
+        self._given_up.discard(stream)
+        self._front_ns = max(self._front_ns, stamp_ns)
+        for name in self._queues:
+            if self._front_ns - self._newest_ns.get(name, self._first_ns) > self._patience_ns:
+                self._given_up.add(name)
+
+    def drop_oldest(self, stream: str) -> None:
+        """Forgets the oldest item of `stream`: the caller's bound was hit, and the caller counts."""
+        self._queues[stream].popleft()
+
+    def end(self, stream: str) -> None:
+        """Nothing more will come from `stream`."""
+        self._newest_ns[stream] = _END_NS
+        self._given_up.discard(stream)
+
+    def reopen(self, stream: str) -> None:
+        """A successor speaks where `stream` had ended."""
+        if self._newest_ns.get(stream) == _END_NS:
+            del self._newest_ns[stream]
+
+    def pop(self) -> tuple[str, Any] | None:
+        """The next (stream, item), or None while it is not certain which that is."""
+        heads = [(queue[0][0], self._order[name], name) for name, queue in self._queues.items() if queue]
+        if not heads:
+            return None
+        stamp_ns, _, stream = min(heads)
+        for name, queue in self._queues.items():
+            silent = not queue and name not in self._given_up
+            if silent and self._newest_ns.get(name, -1) < stamp_ns:
+                return None
+        self.late += stamp_ns < self._released_ns
+        self._released_ns = max(self._released_ns, stamp_ns)
+        return stream, self._queues[stream].popleft()[1]
+
+    @property
+    def ended(self) -> bool:
+        """All streams have ended and are empty."""
+        return not len(self) and all(self._newest_ns.get(name) == _END_NS for name in self._queues)
