@@ -1,0 +1,200 @@
+"""The front end: one scan in, one smooth pose out. Never waits for loop closure."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from services.localization.lidar2d import se2
+from services.localization.lidar2d.matching import Match, refine, search
+from services.localization.lidar2d.odometry import OdometryBuffer, Predictor
+from services.localization.lidar2d.scan import PreparedScan, prepare_scan
+from services.localization.lidar2d.settings import LidarSlamSettings
+from services.localization.lidar2d.surfel_map import SurfelMap
+
+NS = 1e-9
+
+
+@dataclass(frozen=True)
+class RawScan:
+    """One revolution or sweep as the sensor gives it; the stamp is that of the first beam."""
+
+    stamp_ns: int
+    ranges_m: np.ndarray  # float32 [N], +inf or >= range_max_m: no return
+    angle_min_rad: float
+    angle_increment_rad: float
+    time_increment_s: float
+    range_min_m: float
+    range_max_m: float
+
+
+@dataclass
+class LocalMap:
+    """A submap that is still being filled."""
+
+    T_odom_map: np.ndarray  # float64 [3]
+    surfels: SurfelMap
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """Motion since the last scan and how far it may be off."""
+
+    motion: np.ndarray  # float64 [3] T_last_now
+    sigma_m: float
+    sigma_rad: float
+    source: str
+
+
+class FrontEnd:
+    """Prediction, deskew, matching; the caller decides what enters which map."""
+
+    def __init__(self, settings: LidarSlamSettings, T_body_lidar: np.ndarray, upside_down: bool = False) -> None:
+        self.settings = settings
+        self.T_body_lidar = T_body_lidar
+        self._flip = -1.0 if upside_down else 1.0
+        self.odometry = OdometryBuffer()
+        self._wheels = Predictor(0.01, 0.05, 0.004, 0.05)
+        self._inertia = Predictor(0.02, 0.10, 0.02, 0.20)
+        self._still = Predictor(0.05, 0.0, 0.05, 0.0)
+        self.stamps: list[int] = []  # recent matched stamps and poses, newest last
+        self.poses: list[np.ndarray] = []
+
+    # ---- motion -----------------------------------------------------------------------------------
+
+    def velocity(self) -> np.ndarray:
+        """Body twist (m/s, m/s, rad/s) over the last fifth of a second or the last step."""
+        if len(self.poses) < 2:
+            return np.zeros(3)
+        i = len(self.stamps) - 2
+        while i > 0 and self.stamps[-1] - self.stamps[i] < 0.15 / NS:
+            i -= 1
+        dt = (self.stamps[-1] - self.stamps[i]) * NS
+        if not 0.02 < dt < 1.5:
+            return np.zeros(3)
+        return twist(se2.between(self.poses[i], self.poses[-1]), dt)
+
+    def predict(self, stamp_ns: int) -> tuple[Prediction, list[tuple[Predictor, np.ndarray]]]:
+        """The better of wheels and inertia, judged by how they did lately."""
+        dt = (stamp_ns - self.stamps[-1]) * NS
+        steady = exp_twist(self.velocity(), min(dt, self.settings.extrapolate_s))
+        # Stamps of real logs come in bursts and out of order; then "as before" is worse than "not at all".
+        options = [(self._inertia, steady, "inertia"), (self._still, np.zeros(3), "still")]
+        wheels = self.odometry.increment(self.stamps[-1], stamp_ns)
+        if wheels is not None and self._possible(wheels, dt):
+            options.append((self._wheels, wheels, "wheels"))
+        rated = []
+        for predictor, motion, name in options:
+            sigma_m, sigma_rad = predictor.sigmas(motion, dt)
+            rated.append((sigma_m / 0.05 + sigma_rad / 0.03, Prediction(motion, sigma_m, sigma_rad, name)))
+        best = min(rated, key=lambda item: item[0])[1]
+        return best, [(predictor, motion) for predictor, motion, _ in options]
+
+    def _possible(self, motion: np.ndarray, dt_s: float) -> bool:
+        s = self.settings
+        margin = dt_s + 0.2  # stamps of real robots jitter
+        return math.hypot(motion[0], motion[1]) < s.max_speed_m_s * margin and abs(motion[2]) < (
+            s.max_yaw_rate_rad_s * margin
+        )
+
+    def scan_velocity(self, raw: RawScan, motion: np.ndarray | None) -> np.ndarray:
+        """Body twist while the beams were taken: the wheels if they know, else the matched motion."""
+        duration = raw.time_increment_s * len(raw.ranges_m)
+        if duration <= 0.0:
+            return np.zeros(3)
+        end = raw.stamp_ns + round(duration / NS)
+        wheels = self.odometry.increment(raw.stamp_ns, end)
+        trusted = self._wheels.scale2_m < 10.0 and self._wheels.scale2_rad < 10.0
+        if wheels is not None and trusted and self._possible(wheels, duration):
+            return twist(wheels, duration)
+        if motion is not None and self.stamps:
+            dt = (raw.stamp_ns - self.stamps[-1]) * NS
+            if 0.02 < dt < 0.5:
+                return twist(motion, dt)
+        return self.velocity()
+
+    def prepare(self, raw: RawScan, velocity: np.ndarray) -> PreparedScan:
+        s = self.settings
+        return prepare_scan(
+            raw.ranges_m, self._flip * raw.angle_min_rad, self._flip * raw.angle_increment_rad, raw.time_increment_s,
+            raw.range_min_m, min(raw.range_max_m, s.use_range_m), self.T_body_lidar, velocity, s.spread_m,
+            s.match_points,
+        )  # fmt: skip
+
+    # ---- matching ---------------------------------------------------------------------------------
+
+    def match(
+        self, raw: RawScan, scan: PreparedScan, prediction: Prediction, local: LocalMap
+    ) -> tuple[PreparedScan, Match, bool]:
+        """Pose of the scan in the local map; the flag says whether the match can be trusted."""
+        s = self.settings
+        T_map_last = se2.between(local.T_odom_map, self.poses[-1])
+        T_guess = se2.compose(T_map_last, prediction.motion)
+        information = np.diag([prediction.sigma_m**-2, prediction.sigma_m**-2, prediction.sigma_rad**-2])
+        tables, seen = local.surfels.tables(), local.surfels.misses
+        points = scan.points_body[scan.match_index]
+        match = refine(points, scan.origin_body, T_guess, tables, s, T_guess, information, seen)
+        window_m = min(max(3.0 * prediction.sigma_m, s.search_min_m), s.search_max_m)
+        window_rad = min(max(3.0 * prediction.sigma_rad, s.search_min_rad), s.search_max_rad)
+        if window_m > s.search_min_m or window_rad > s.search_min_rad:
+            match = self._search(scan, match, T_guess, T_guess, information, local, window_m, window_rad)
+        if match.share < s.good_share:  # a prediction this wrong may be worse than none
+            wide_m, wide_rad = max(window_m, 0.4), max(window_rad, math.radians(20.0))
+            match = self._search(scan, match, T_guess, T_map_last, information, local, wide_m, wide_rad)
+        if match.share < s.lost_share:
+            match = self._search(scan, match, T_guess, T_map_last, information, local, s.search_max_m, s.search_max_rad)
+        if raw.time_increment_s > 0.0:
+            motion = se2.between(T_map_last, match.T_map_body)
+            scan = self.prepare(raw, self.scan_velocity(raw, motion))
+            points = scan.points_body[scan.match_index]
+            match = refine(points, scan.origin_body, match.T_map_body, tables, s, T_guess, information, seen,
+                           anneal=(1.0,))  # fmt: skip
+        return scan, match, match.share >= s.lost_share
+
+    def _search(
+        self, scan: PreparedScan, best: Match, T_prior: np.ndarray, T_centre: np.ndarray, information: np.ndarray,
+        local: LocalMap, window_m: float, window_rad: float,
+    ) -> Match:  # fmt: skip
+        """The best of the given match and of those found in a window."""
+        tables, seen, s = local.surfels.tables(), local.surfels.misses, self.settings
+        points = scan.points_body[scan.match_index]
+        for _, T_start in search(points, T_centre, tables, window_m, window_rad, prior_weight=0.02):
+            other = refine(points, scan.origin_body, T_start, tables, s, T_prior, information, seen)
+            if other.share * other.known > best.share * best.known + 0.02:
+                best = other
+        return best
+
+    def accept(self, stamp_ns: int, T_odom_body: np.ndarray, options: list[tuple[Predictor, np.ndarray]]) -> None:
+        """Take in the pose of the newest scan; predictors and the delay learn from it."""
+        if self.poses:
+            dt = (stamp_ns - self.stamps[-1]) * NS
+            moved = se2.between(self.poses[-1], T_odom_body)
+            for predictor, motion in options:
+                predictor.learn(motion, dt, moved)
+            self.odometry.observe_turn(self.stamps[-1], stamp_ns, float(moved[2]))
+        self.stamps.append(stamp_ns)
+        self.poses.append(T_odom_body)
+        if len(self.stamps) > 512:
+            del self.stamps[:256], self.poses[:256]
+
+
+def twist(motion: np.ndarray, dt_s: float) -> np.ndarray:
+    """Constant body twist that moves by `motion` in `dt_s` (logarithm of SE(2))."""
+    half = 0.5 * motion[2]
+    ratio = 1.0 - half * half / 3.0 if abs(half) < 1e-3 else half / math.tan(half)
+    vx = ratio * motion[0] + half * motion[1]
+    vy = -half * motion[0] + ratio * motion[1]
+    return np.array([vx, vy, motion[2]]) / dt_s
+
+
+def exp_twist(velocity: np.ndarray, dt_s: float) -> np.ndarray:
+    """Motion after `dt_s` at a constant body twist (exponential of SE(2))."""
+    yaw = velocity[2] * dt_s
+    half = 0.5 * yaw
+    sinc = 1.0 - half * half / 6.0 if abs(half) < 1e-3 else math.sin(half) / half
+    c, s = math.cos(half) * sinc, math.sin(half) * sinc
+    return np.array([
+        (c * velocity[0] - s * velocity[1]) * dt_s, (s * velocity[0] + c * velocity[1]) * dt_s, se2.wrap(yaw)
+    ])  # fmt: skip

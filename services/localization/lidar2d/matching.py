@@ -1,0 +1,275 @@
+"""Scan to map: correlative search over the likelihood field, then Gauss-Newton on surface elements."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from services.localization.lidar2d import se2
+from services.localization.lidar2d.settings import LidarSlamSettings
+from services.localization.lidar2d.surfel_map import MatchTables
+
+ANNEAL = (3.0, 2.0, 1.4)  # the outlier scale starts wide and ends at 1
+
+
+@dataclass(frozen=True)
+class Match:
+    """Where a scan lies in a map."""
+
+    T_map_body: np.ndarray  # float64 [3]
+    information: np.ndarray  # float64 [3, 3], of the scan alone, axes of the map, yaw about the body
+    share: float  # returns on known surfaces / returns in known space
+    known: float  # returns in known space / all returns
+    residual_m: float  # robust RMS distance to the surfaces
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def accumulate(
+    points: np.ndarray,  # float64 [K, 2] body frame
+    origin: np.ndarray,  # float64 [2] lidar in the body frame
+    T: np.ndarray,  # float64 [3] T_map_body
+    nearest: np.ndarray, means: np.ndarray, omegas: np.ndarray, views: np.ndarray,
+    row0: int, col0: int, cell_m: float,
+    scale2: float,  # squared outlier scale, in units of the surface's standard deviation
+    H: np.ndarray,  # out float64 [3, 3]
+    g: np.ndarray,  # out float64 [3]
+) -> tuple[float, float, float]:
+    """Normal equations of sum rho(d' Omega d), d = T p - mean, Geman-McClure weights.
+
+    Returns (sum of weights, number of associated returns, weighted sum of d' Omega d).
+    A surface seen from its other side does not count: walls are thin.
+    """
+    c, s = math.cos(T[2]), math.sin(T[2])
+    ox, oy = T[0] + c * origin[0] - s * origin[1], T[1] + s * origin[0] + c * origin[1]
+    H[:] = 0.0
+    g[:] = 0.0
+    weights = found = cost = 0.0
+    inv = 1.0 / cell_m
+    rows, cols = nearest.shape
+    for i in range(points.shape[0]):
+        px, py = points[i, 0], points[i, 1]
+        rx, ry = c * px - s * py, s * px + c * py
+        x, y = T[0] + rx, T[1] + ry
+        r, q = int(math.floor(y * inv)) - row0, int(math.floor(x * inv)) - col0
+        if r < 0 or q < 0 or r >= rows or q >= cols:
+            continue
+        k = nearest[r, q]
+        if k < 0:
+            continue
+        if (ox - x) * views[k, 0] + (oy - y) * views[k, 1] < 0.0:
+            continue
+        found += 1.0
+        dx, dy = x - means[k, 0], y - means[k, 1]
+        a, b, d = omegas[k, 0], omegas[k, 1], omegas[k, 2]
+        ux, uy = a * dx + b * dy, b * dx + d * dy
+        e2 = dx * ux + dy * uy
+        root = scale2 / (scale2 + e2)
+        w = root * root
+        weights += w
+        cost += w * e2
+        # Jacobian of T p: [I, (-ry, rx)]
+        jx, jy = a * -ry + b * rx, b * -ry + d * rx
+        H[0, 0] += w * a
+        H[0, 1] += w * b
+        H[1, 1] += w * d
+        H[0, 2] += w * jx
+        H[1, 2] += w * jy
+        H[2, 2] += w * (-ry * jx + rx * jy)
+        g[0] += w * ux
+        g[1] += w * uy
+        g[2] += w * (-ry * ux + rx * uy)
+    H[1, 0], H[2, 0], H[2, 1] = H[0, 1], H[0, 2], H[1, 2]
+    return weights, found, cost
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def solve3(A: np.ndarray, b: np.ndarray, x: np.ndarray) -> bool:
+    """x = A^-1 b for symmetric positive definite A [3, 3] by Cholesky; False if it is not."""
+    l00 = A[0, 0]
+    if not l00 > 0.0:
+        return False
+    l00 = math.sqrt(l00)
+    l10, l20 = A[1, 0] / l00, A[2, 0] / l00
+    l11 = A[1, 1] - l10 * l10
+    if not l11 > 1e-12 * A[1, 1]:
+        return False
+    l11 = math.sqrt(l11)
+    l21 = (A[2, 1] - l20 * l10) / l11
+    l22 = A[2, 2] - l20 * l20 - l21 * l21
+    if not l22 > 1e-12 * A[2, 2]:
+        return False
+    l22 = math.sqrt(l22)
+    y0 = b[0] / l00
+    y1 = (b[1] - l10 * y0) / l11
+    y2 = (b[2] - l20 * y0 - l21 * y1) / l22
+    x[2] = y2 / l22
+    x[1] = (y1 - l21 * x[2]) / l11
+    x[0] = (y0 - l10 * x[1] - l20 * x[2]) / l00
+    return True
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def gauss_newton(
+    points: np.ndarray, origin: np.ndarray, T_start: np.ndarray,
+    nearest: np.ndarray, means: np.ndarray, omegas: np.ndarray, views: np.ndarray,
+    row0: int, col0: int, cell_m: float,
+    prior_T: np.ndarray,  # float64 [3]
+    prior_information: np.ndarray,  # float64 [3, 3], zeros = no prior
+    outlier: float,  # units of the surface's standard deviation
+    per_fact: float,  # so many returns count as one independent measurement
+    anneal: np.ndarray,  # float64 [A]
+    iterations: int,
+    T: np.ndarray,  # out float64 [3]
+    H: np.ndarray,  # out float64 [3, 3] information of the scan alone
+) -> tuple[float, float, float]:
+    """Iteratively reweighted Gauss-Newton with a robust prior; the step is damped where the scan says nothing."""
+    g, A, b, step, e = np.empty(3), np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(3)
+    T[:] = T_start
+    weights = found = cost = 0.0
+    for it in range(iterations):
+        scale = outlier * (anneal[it] if it < anneal.shape[0] else 1.0)
+        weights, found, cost = accumulate(
+            points, origin, T, nearest, means, omegas, views, row0, col0, cell_m, scale * scale, H, g
+        )
+        e[0], e[1], e[2] = T[0] - prior_T[0], T[1] - prior_T[1], se2.wrap(T[2] - prior_T[2])
+        m2 = 0.0
+        for i in range(3):
+            for j in range(3):
+                m2 += e[i] * prior_information[i, j] * e[j]
+        w = 1.0 / (1.0 + m2 / 9.0)  # Cauchy: a prediction three sigma off has half its say
+        for i in range(3):
+            b[i] = -g[i] / per_fact
+            for j in range(3):
+                A[i, j] = H[i, j] / per_fact + w * prior_information[i, j]
+                b[i] -= w * prior_information[i, j] * e[j]
+        # Damping of (1 m)^-2 and (0.3 rad)^-2: only felt in directions without any information.
+        A[0, 0] += 1.0
+        A[1, 1] += 1.0
+        A[2, 2] += 10.0
+        if not solve3(A, b, step):
+            break
+        T[0] += step[0]
+        T[1] += step[1]
+        T[2] = se2.wrap(T[2] + step[2])
+        if it >= anneal.shape[0] and step[0] ** 2 + step[1] ** 2 < 1e-8 and abs(step[2]) < 2e-5:
+            break
+    weights, found, cost = accumulate(
+        points, origin, T, nearest, means, omegas, views, row0, col0, cell_m, outlier * outlier, H, g
+    )
+    H /= per_fact
+    return weights, found, cost
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def known_returns(
+    points: np.ndarray, T: np.ndarray, nearest: np.ndarray, seen: np.ndarray, row0: int, col0: int, cell_m: float
+) -> int:
+    """Returns that fall where the map knows anything: a surface in reach or a cell a beam crossed."""
+    c, s = math.cos(T[2]), math.sin(T[2])
+    n = 0
+    for i in range(points.shape[0]):
+        x, y = T[0] + c * points[i, 0] - s * points[i, 1], T[1] + s * points[i, 0] + c * points[i, 1]
+        r, q = int(math.floor(y / cell_m)) - row0, int(math.floor(x / cell_m)) - col0
+        if 0 <= r < nearest.shape[0] and 0 <= q < nearest.shape[1] and (nearest[r, q] >= 0 or seen[r, q] > 0):
+            n += 1
+    return n
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def correlate(
+    points: np.ndarray,  # float64 [K, 2] body frame
+    T: np.ndarray,  # float64 [3] centre of the window
+    field: np.ndarray,  # uint8 [H, W]
+    row0: int, col0: int, cell_m: float,
+    steps_xy: int, stride: int,  # window of +-steps_xy * stride cells
+    steps_yaw: int, step_yaw_rad: float,
+    scores: np.ndarray,  # out float32 [2 steps_yaw + 1, 2 steps_xy + 1, 2 steps_xy + 1], mean likelihood
+) -> None:
+    """Real-time correlative scan matching (Olson 2009): the score of every pose in a window."""
+    n = points.shape[0]
+    rows, cols = np.empty(n, dtype=np.int32), np.empty(n, dtype=np.int32)
+    for a in range(2 * steps_yaw + 1):
+        yaw = T[2] + (a - steps_yaw) * step_yaw_rad
+        c, s = math.cos(yaw), math.sin(yaw)
+        for i in range(n):
+            rows[i] = int(math.floor((T[1] + s * points[i, 0] + c * points[i, 1]) / cell_m)) - row0
+            cols[i] = int(math.floor((T[0] + c * points[i, 0] - s * points[i, 1]) / cell_m)) - col0
+        for iy in range(2 * steps_xy + 1):
+            dr = (iy - steps_xy) * stride
+            for ix in range(2 * steps_xy + 1):
+                dc = (ix - steps_xy) * stride
+                total = 0
+                for i in range(n):
+                    r, q = rows[i] + dr, cols[i] + dc
+                    if r >= 0 and q >= 0 and r < field.shape[0] and q < field.shape[1]:
+                        total += field[r, q]
+                scores[a, iy, ix] = total / (255.0 * n)
+
+
+def refine(
+    points: np.ndarray,  # float64 [K, 2]
+    origin: np.ndarray,  # float64 [2]
+    T_start: np.ndarray,
+    tables: MatchTables,
+    settings: LidarSlamSettings,
+    prior_T: np.ndarray | None = None,
+    prior_information: np.ndarray | None = None,
+    seen: np.ndarray | None = None,
+    iterations: int = 15,
+    anneal: tuple[float, ...] = ANNEAL,
+) -> Match:
+    """Gauss-Newton from one start."""
+    T, H = np.empty(3), np.empty((3, 3))
+    sigma_m = math.hypot(settings.range_sigma_m, settings.map_sigma_m)
+    if prior_T is None or prior_information is None:
+        prior_T, prior_information = T_start, np.zeros((3, 3))
+    weights, found, cost = gauss_newton(
+        points, origin, T_start, tables.nearest, tables.means, tables.omegas, tables.views, tables.row0, tables.col0,
+        tables.cell_m, prior_T, prior_information, settings.outlier_m / sigma_m, settings.beams_per_fact,
+        np.array(anneal), iterations, T, H,
+    )  # fmt: skip
+    n = max(len(points), 1)
+    known = found if seen is None else known_returns(
+        points, T, tables.nearest, seen, tables.row0, tables.col0, tables.cell_m
+    )  # fmt: skip
+    residual = sigma_m * math.sqrt(cost / weights) if weights > 0 else math.inf
+    return Match(T, H, weights / max(known, 1), known / n, residual)
+
+
+def search(
+    points: np.ndarray,
+    T_centre: np.ndarray,
+    tables: MatchTables,
+    window_m: float,
+    window_rad: float,
+    prior_weight: float = 0.0,
+    candidates: int = 3,
+    step_yaw_rad: float = math.radians(1.5),
+) -> list[tuple[float, np.ndarray]]:
+    """The best distinct poses (score, T_map_body) of a window; the score falls with the squared distance
+    from the centre by `prior_weight` at its border."""
+    stride = 2
+    steps_xy = max(1, math.ceil(window_m / (stride * tables.cell_m)))
+    steps_yaw = max(1, math.ceil(window_rad / step_yaw_rad))
+    subset = points[:: max(1, len(points) // 100)]
+    scores = np.empty((2 * steps_yaw + 1, 2 * steps_xy + 1, 2 * steps_xy + 1), dtype=np.float32)
+    correlate(subset, T_centre, tables.field, tables.row0, tables.col0, tables.cell_m, steps_xy, stride, steps_yaw,
+              step_yaw_rad, scores)  # fmt: skip
+    grid_xy = np.linspace(-1.0, 1.0, 2 * steps_xy + 1) ** 2
+    grid_yaw = np.linspace(-1.0, 1.0, 2 * steps_yaw + 1) ** 2
+    ranked = scores - prior_weight * (grid_yaw[:, None, None] + grid_xy[:, None] + grid_xy)
+    best = []
+    for _ in range(candidates):
+        a, iy, ix = np.unravel_index(int(np.argmax(ranked)), ranked.shape)
+        T = T_centre + np.array([
+            (ix - steps_xy) * stride * tables.cell_m, (iy - steps_xy) * stride * tables.cell_m,
+            (a - steps_yaw) * step_yaw_rad,
+        ])  # fmt: skip
+        best.append((float(scores[a, iy, ix]), T))
+        ranked[max(a - 2, 0) : a + 3, max(iy - 1, 0) : iy + 2, max(ix - 1, 0) : ix + 2] = -np.inf
+        if not np.isfinite(ranked).any():
+            break
+    return best

@@ -1,0 +1,167 @@
+"""Wheel odometry that is trusted as far as the scans confirm it: delay, gaps, noise, lies."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from services.localization.lidar2d import se2
+
+NS = 1e-9
+DELAYS_S = np.arange(-30, 31) * 0.01  # candidates for the delay of the odometry clock
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def interpolate(
+    stamps_ns: np.ndarray,  # int64 [N], increasing
+    poses: np.ndarray,  # float64 [N, 3]
+    at_ns: int,
+    ahead_ns: int,  # how far beyond the newest pose its last velocity may be followed
+    gap_ns: int,  # an interval longer than this is no information
+    out: np.ndarray,  # out float64 [3]
+) -> bool:
+    """Pose at a stamp; False if the buffer cannot tell."""
+    n = stamps_ns.shape[0]
+    if n < 2 or at_ns < stamps_ns[0] or at_ns > stamps_ns[n - 1] + ahead_ns:
+        return False
+    i = min(max(np.searchsorted(stamps_ns, at_ns), 1), n - 1)
+    span = stamps_ns[i] - stamps_ns[i - 1]
+    if span > gap_ns or span <= 0:
+        return False
+    f = (at_ns - stamps_ns[i - 1]) / span
+    for j in range(2):
+        out[j] = poses[i - 1, j] + f * (poses[i, j] - poses[i - 1, j])
+    out[2] = se2.wrap(poses[i - 1, 2] + f * se2.wrap(poses[i, 2] - poses[i - 1, 2]))
+    return True
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def delay_costs(
+    stamps_ns: np.ndarray, poses: np.ndarray, t0_ns: int, t1_ns: int, yaw_rad: float,
+    delays_ns: np.ndarray, gap_ns: int, costs: np.ndarray,
+) -> bool:  # fmt: skip
+    """Squared difference between the turn of the odometry, read `delay` later, and the matched turn."""
+    a, b = np.empty(3), np.empty(3)
+    for k in range(delays_ns.shape[0]):
+        d = delays_ns[k]
+        if not interpolate(stamps_ns, poses, t0_ns + d, 0, gap_ns, a):
+            return False
+        if not interpolate(stamps_ns, poses, t1_ns + d, 0, gap_ns, b):
+            return False
+        e = se2.wrap(b[2] - a[2] - yaw_rad)
+        costs[k] = e * e
+    return True
+
+
+class OdometryBuffer:
+    """The last minute of wheel poses, and the delay that fits the scans best."""
+
+    def __init__(self, capacity: int = 4096, gap_s: float = 0.6) -> None:
+        self._stamps = np.zeros(2 * capacity, dtype=np.int64)
+        self._poses = np.zeros((2 * capacity, 3))
+        self._capacity, self._count = capacity, 0
+        self._gap_ns = round(gap_s / NS)
+        self.delay_ns = 0
+        self.refused = 0
+        self._delays_ns = np.round(DELAYS_S / NS).astype(np.int64)
+        self._cost = np.zeros(len(DELAYS_S))
+        self._weight = 0.0
+        self._turns: list[tuple[int, int, float]] = []  # matched turns waiting for odometry after them
+
+    @property
+    def stamps_ns(self) -> np.ndarray:
+        return self._stamps[: self._count]
+
+    @property
+    def poses(self) -> np.ndarray:
+        return self._poses[: self._count]
+
+    def add(self, stamp_ns: int, x_m: float, y_m: float, yaw_rad: float) -> bool:
+        """False (and counted) for poses that are not finite or not newer than the last one."""
+        values = (x_m, y_m, yaw_rad)
+        if not all(math.isfinite(v) for v in values) or (self._count and stamp_ns <= self.stamps_ns[-1]):
+            # A clock that was set back by more than the buffer's reach starts afresh.
+            if self._count and stamp_ns < self.stamps_ns[0] and all(math.isfinite(v) for v in values):
+                self._count = 0
+            else:
+                self.refused += 1
+                return False
+        if self._count == 2 * self._capacity:
+            self._stamps[: self._capacity] = self._stamps[self._capacity :]
+            self._poses[: self._capacity] = self._poses[self._capacity :]
+            self._count = self._capacity
+        self._stamps[self._count] = stamp_ns
+        self._poses[self._count] = values
+        self._count += 1
+        return True
+
+    def increment(self, t0_ns: int, t1_ns: int, ahead_s: float = 0.25) -> np.ndarray | None:
+        """Motion of the body between two scan stamps, read at the estimated delay; None if unknown."""
+        a, b = np.empty(3), np.empty(3)
+        ahead = round(ahead_s / NS)
+        for stamp, out in ((t0_ns, a), (t1_ns, b)):
+            if not interpolate(self.stamps_ns, self.poses, stamp + self.delay_ns, ahead, self._gap_ns, out):
+                return None
+        return se2.between(a, b)
+
+    def observe_turn(self, t0_ns: int, t1_ns: int, yaw_rad: float) -> None:
+        """Learn the delay from a matched turn: the candidate whose turns differ least, robustly averaged."""
+        if abs(yaw_rad) > 0.01 and t1_ns - t0_ns < self._gap_ns:
+            self._turns.append((t0_ns, t1_ns, yaw_rad))
+        horizon = int(self._delays_ns[-1])
+        while self._turns and self._count and self.stamps_ns[-1] >= self._turns[0][1] + horizon:
+            t0, t1, yaw = self._turns.pop(0)
+            costs = np.empty(len(self._delays_ns))
+            recent = max(0, self._count - 1024)
+            if not delay_costs(self.stamps_ns[recent:], self.poses[recent:], t0, t1, yaw, self._delays_ns,
+                               self._gap_ns, costs):  # fmt: skip
+                continue
+            self._learn(costs / (costs + 0.02**2))
+        if len(self._turns) > 256:
+            del self._turns[:128]
+
+    def _learn(self, costs: np.ndarray) -> None:
+        self._cost = 0.998 * self._cost + costs
+        self._weight = 0.998 * self._weight + 1.0
+        if self._weight < 20.0:
+            return
+        best = int(np.argmin(self._cost))
+        now = int(np.argmin(np.abs(self._delays_ns - self.delay_ns)))
+        # Change only for a gain that is clear beyond the noise of the sum.
+        if self._cost[best] < self._cost[now] - 0.02 * self._weight**0.5 - 0.02 * self._cost[now]:
+            self.delay_ns = int(self._delays_ns[best])
+
+
+class Predictor:
+    """How wrong a source of motion has been lately; its prediction is weighted by that."""
+
+    def __init__(self, base_m: float, per_m: float, base_rad: float, per_rad: float) -> None:
+        self._base = (base_m, per_m, base_rad, per_rad)
+        self.scale2_m = self.scale2_rad = 1.0
+
+    def sigmas(self, motion: np.ndarray, dt_s: float) -> tuple[float, float]:
+        """Standard deviations (m, rad) of a predicted motion float64 [3]."""
+        base_m, base_rad = self._unit(motion, dt_s)
+        return base_m * math.sqrt(self.scale2_m), base_rad * math.sqrt(self.scale2_rad)
+
+    def _unit(self, motion: np.ndarray, dt_s: float) -> tuple[float, float]:
+        distance, turn = math.hypot(motion[0], motion[1]), abs(motion[2])
+        gap = max(1.0, dt_s / 0.3)  # nothing predicts well over a gap
+        base_m, per_m, base_rad, per_rad = self._base
+        return gap * (base_m + per_m * distance), gap * (base_rad + per_rad * turn + 0.1 * per_rad * distance)
+
+    def learn(self, motion: np.ndarray, dt_s: float, truth: np.ndarray) -> None:
+        """Compare with the matched motion; the scale follows quickly upwards and slowly down."""
+        error = se2.between(motion, truth)
+        unit_m, unit_rad = self._unit(motion, dt_s)
+        ratio_m = min((error[0] ** 2 + error[1] ** 2) / (2.0 * unit_m**2), 400.0)
+        ratio_rad = min(error[2] ** 2 / unit_rad**2, 400.0)
+        self.scale2_m = _follow(self.scale2_m, ratio_m)
+        self.scale2_rad = _follow(self.scale2_rad, ratio_rad)
+
+
+def _follow(value: float, sample: float) -> float:
+    gain = 0.25 if sample > value else 0.03
+    return min(max(value + gain * (sample - value), 0.05), 400.0)

@@ -1,0 +1,170 @@
+"""From raw ranges to deskewed points with tangents: everything that needs only one scan."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+
+@dataclass(frozen=True)
+class PreparedScan:
+    """Valid returns of one scan, moved to the scan's stamp and expressed in the body frame."""
+
+    points_body: np.ndarray  # float64 [M, 2], metres, deskewed
+    tangents: np.ndarray  # float64 [M, 2], unit direction of the surface, (0, 0) where unknown
+    spacing_m: np.ndarray  # float64 [M], distance between neighbouring returns on the surface
+    beams: np.ndarray  # int32 [M], index into the raw ranges
+    match_index: np.ndarray  # int32 [K], evenly spread subset used for matching
+    origin_body: np.ndarray  # float64 [2], the lidar in the body frame
+
+    def __len__(self) -> int:
+        return len(self.points_body)
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _valid_points(
+    ranges_m: np.ndarray,  # float32 [N]
+    angle_min_rad: float,
+    angle_increment_rad: float,  # negative for a lidar mounted upside down
+    time_increment_s: float,
+    range_min_m: float,
+    range_max_m: float,  # readings at or beyond it are no returns
+    T_body_lidar: np.ndarray,  # float64 [3]
+    velocity_body: np.ndarray,  # float64 [3], vx, vy (m/s), yaw rate (rad/s) during the scan
+    points: np.ndarray,  # out float64 [N, 2]
+    beams: np.ndarray,  # out int32 [N]
+) -> int:
+    count = 0
+    cl, sl = math.cos(T_body_lidar[2]), math.sin(T_body_lidar[2])
+    for i in range(ranges_m.shape[0]):
+        r = float(ranges_m[i])
+        if not (r >= range_min_m and r < range_max_m and r > 0.0):
+            continue
+        a = angle_min_rad + i * angle_increment_rad
+        lx, ly = r * math.cos(a), r * math.sin(a)
+        bx = T_body_lidar[0] + cl * lx - sl * ly
+        by = T_body_lidar[1] + sl * lx + cl * ly
+        # Constant body twist: the exact motion after t seconds (the half-angle form of exp).
+        t = i * time_increment_s
+        yaw = velocity_body[2] * t
+        half = 0.5 * yaw
+        sinc = 1.0 - half * half / 6.0 if abs(half) < 1e-3 else math.sin(half) / half
+        ch, sh = math.cos(half) * sinc, math.sin(half) * sinc
+        mx = (ch * velocity_body[0] - sh * velocity_body[1]) * t
+        my = (sh * velocity_body[0] + ch * velocity_body[1]) * t
+        c, s = math.cos(yaw), math.sin(yaw)
+        points[count, 0] = mx + c * bx - s * by
+        points[count, 1] = my + s * bx + c * by
+        beams[count] = i
+        count += 1
+    return count
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _tangents(
+    points: np.ndarray,  # float64 [M, 2] in beam order
+    beams: np.ndarray,  # int32 [M]
+    origin: np.ndarray,  # float64 [2]
+    increment_rad: float,
+    window_m: float,
+    tangents: np.ndarray,  # out float64 [M, 2]
+    spacing: np.ndarray,  # out float64 [M]
+) -> None:
+    """Surface direction by PCA over the connected neighbours within `window_m` (at least two a side)."""
+    m = points.shape[0]
+    for i in range(m):
+        px, py = points[i, 0], points[i, 1]
+        r = math.hypot(px - origin[0], py - origin[1])
+        step = max(r * increment_rad, 1e-4)
+        gap = 5.0 * step + 0.03  # a surface seen at up to ~78 degrees from its normal stays connected
+        n, sx, sy, sxx, sxy, syy = 1.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        near, found = 0.0, 0
+        for side in (-1, 1):
+            qx, qy, last = px, py, beams[i]
+            j, taken = i + side, 0
+            while 0 <= j < m and taken < 12:
+                d = math.hypot(points[j, 0] - qx, points[j, 1] - qy)
+                if abs(beams[j] - last) > 2 or d > gap * abs(beams[j] - last):
+                    break
+                dx, dy = points[j, 0] - px, points[j, 1] - py
+                if taken >= 2 and dx * dx + dy * dy > window_m * window_m:
+                    break
+                if taken == 0:
+                    near += d
+                    found += 1
+                n += 1.0
+                sx += dx
+                sy += dy
+                sxx += dx * dx
+                sxy += dx * dy
+                syy += dy * dy
+                qx, qy, last = points[j, 0], points[j, 1], beams[j]
+                j += side
+                taken += 1
+        spacing[i] = max(near / found, step) if found > 0 else step
+        tangents[i, 0] = 0.0
+        tangents[i, 1] = 0.0
+        if n >= 3.0:
+            cxx = sxx / n - (sx / n) ** 2
+            cxy = sxy / n - (sx / n) * (sy / n)
+            cyy = syy / n - (sy / n) ** 2
+            mean = 0.5 * (cxx + cyy)
+            root = math.sqrt(max(0.25 * (cxx - cyy) ** 2 + cxy * cxy, 0.0))
+            if mean - root < 0.15 * (mean + root):
+                angle = 0.5 * math.atan2(2.0 * cxy, cxx - cyy)
+                tangents[i, 0] = math.cos(angle)
+                tangents[i, 1] = math.sin(angle)
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _spread(points: np.ndarray, step_m: float, limit: int, keep: np.ndarray) -> int:
+    """Indices of returns at least `step_m` from the last kept one (voxel filter along the beam order);
+    the step grows until at most `limit` are left (the adaptive part)."""
+    step = step_m
+    while True:
+        count = 0
+        lx, ly = 1e18, 1e18
+        for i in range(points.shape[0]):
+            dx, dy = points[i, 0] - lx, points[i, 1] - ly
+            if dx * dx + dy * dy >= step * step:
+                if count == limit:
+                    count = limit + 1
+                    break
+                keep[count] = i
+                count += 1
+                lx, ly = points[i, 0], points[i, 1]
+        if count <= limit:
+            return count
+        step *= 1.25
+
+
+def prepare_scan(
+    ranges_m: np.ndarray,  # float32 [N]
+    angle_min_rad: float,
+    angle_increment_rad: float,
+    time_increment_s: float,
+    range_min_m: float,
+    range_max_m: float,
+    T_body_lidar: np.ndarray,  # float64 [3]
+    velocity_body: np.ndarray,  # float64 [3]
+    spread_m: float,
+    match_limit: int,
+    tangent_window_m: float = 0.10,
+) -> PreparedScan:
+    """Drop what is no return, deskew by per-beam time to the stamp of the first beam, find tangents."""
+    n = len(ranges_m)
+    points = np.empty((n, 2))
+    beams = np.empty(n, dtype=np.int32)
+    count = _valid_points(
+        np.ascontiguousarray(ranges_m, dtype=np.float32), angle_min_rad, angle_increment_rad, time_increment_s,
+        range_min_m, range_max_m, T_body_lidar, velocity_body, points, beams,
+    )  # fmt: skip
+    points, beams = points[:count].copy(), beams[:count].copy()
+    tangents, spacing = np.empty((count, 2)), np.empty(count)
+    _tangents(points, beams, T_body_lidar[:2].copy(), abs(angle_increment_rad), tangent_window_m, tangents, spacing)
+    keep = np.empty(match_limit + 1, dtype=np.int32)
+    kept = _spread(points, spread_m, match_limit, keep)
+    return PreparedScan(points, tangents, spacing, beams, keep[:kept].copy(), T_body_lidar[:2].copy())

@@ -1,0 +1,45 @@
+"""Every setting of the lidar SLAM in one frozen object; one configuration serves all lidars and logs.
+
+What differs between sensors (angles, range limits, rate, beam count) comes with each scan.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class LidarSlamSettings:
+    """Physical assumptions and budgets; lengths in metres, angles in radians, times in seconds."""
+
+    # Scan
+    use_range_m: float = 30.0  # farther returns are too sparse to describe a surface
+    spread_m: float = 0.03  # returns closer together than this say the same thing to the matcher
+    match_points: int = 360  # at most so many returns are matched
+    min_points: int = 20  # a scan with fewer returns is rejected
+
+    # Local map
+    cell_m: float = 0.05
+    reach_cells: int = 6  # a return finds its surface within this many cells
+    range_sigma_m: float = 0.015  # noise of one return along the surface normal
+    map_sigma_m: float = 0.02  # what repeated averaging does not remove (beam footprint, sensor bias)
+    submap_keynodes: int = 40  # each submap holds twice as many; neighbours share half
+    keynode_distance_m: float = 0.15
+    keynode_angle_rad: float = math.radians(8.0)
+    keynode_time_s: float = 4.0
+
+    # Matching
+    outlier_m: float = 0.08  # a return this far from its surface has lost three quarters of its weight
+    beams_per_fact: float = 6.0  # neighbouring returns share their error: so many count as one
+    search_min_m: float = 0.10
+    search_max_m: float = 0.80
+    search_min_rad: float = math.radians(4.0)
+    search_max_rad: float = math.radians(35.0)
+    good_share: float = 0.55  # share of returns on known surfaces below which a match is checked again
+    lost_share: float = 0.35
+
+    # Motion
+    max_speed_m_s: float = 3.0
+    max_yaw_rate_rad_s: float = 6.0
+    extrapolate_s: float = 0.5  # pose_at() follows the last velocity no longer than this

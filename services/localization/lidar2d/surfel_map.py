@@ -1,0 +1,133 @@
+"""The local map scans are matched to: surface elements, free space and a likelihood field on one grid."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from services.localization.lidar2d.settings import LidarSlamSettings
+from services.localization.lidar2d.surfel_kernels import add_returns, cast_rays, refresh, splat
+
+BLOCK = 64  # grids grow in blocks of so many cells
+MARGIN = 8
+
+
+@dataclass(frozen=True)
+class MatchTables:
+    """What a matcher reads; arrays are shared with the map that made them."""
+
+    nearest: np.ndarray  # int32 [H, W] index of the nearest surface element, -1 = none in reach
+    field: np.ndarray  # uint8 [H, W] likelihood of a return, for searches
+    means: np.ndarray  # float64 [S, 2]
+    omegas: np.ndarray  # float64 [S, 3]
+    views: np.ndarray  # float64 [S, 2]
+    row0: int
+    col0: int
+    cell_m: float
+
+
+class SurfelMap:
+    """A growing grid in its own frame; row is y, column is x, cell (0, 0) starts at the frame's origin."""
+
+    def __init__(self, settings: LidarSlamSettings) -> None:
+        self.settings = settings
+        self.cell_m = settings.cell_m
+        self.row0 = self.col0 = -BLOCK
+        shape = (2 * BLOCK, 2 * BLOCK)
+        self.cell_id = np.full(shape, -1, dtype=np.int32)
+        self.nearest = np.full(shape, -1, dtype=np.int32)
+        self.touched = np.full(shape, -1, dtype=np.int32)
+        self.field = np.zeros(shape, dtype=np.uint8)
+        self.hits = np.zeros(shape, dtype=np.uint8)
+        self.misses = np.zeros(shape, dtype=np.uint8)
+        self.count = 0
+        self.scans = 0
+        self._reserve_surfels(1024)
+
+    def _reserve_surfels(self, capacity: int) -> None:
+        for name, width, dtype in (("moments", 6, np.float64), ("views", 2, np.float64), ("cells", 2, np.int32),
+                                   ("means", 2, np.float64), ("omegas", 3, np.float64)):  # fmt: skip
+            grown = np.zeros((capacity, width), dtype=dtype)
+            if self.count:
+                grown[: self.count] = getattr(self, name)[: self.count]
+            setattr(self, name, grown)
+
+    def _cover(self, points: np.ndarray) -> None:
+        low = np.floor(points.min(axis=0) / self.cell_m).astype(np.int64) - MARGIN
+        high = np.floor(points.max(axis=0) / self.cell_m).astype(np.int64) + MARGIN + 1
+        rows, cols = self.cell_id.shape
+        grow = (
+            max(0, self.row0 - low[1]), max(0, high[1] - self.row0 - rows),
+            max(0, self.col0 - low[0]), max(0, high[0] - self.col0 - cols),
+        )  # fmt: skip
+        top, bottom, left, right = (int(-(-g // BLOCK) * BLOCK) for g in grow)
+        if top or bottom or left or right:
+            pad = ((top, bottom), (left, right))
+            for name, fill in (("cell_id", -1), ("nearest", -1), ("touched", -1), ("field", 0), ("hits", 0),
+                               ("misses", 0)):  # fmt: skip
+                setattr(self, name, np.pad(getattr(self, name), pad, constant_values=fill))
+            self.row0 -= top
+            self.col0 -= left
+
+    def insert(
+        self,
+        points: np.ndarray,  # float64 [M, 2] in this map's frame
+        tangents: np.ndarray,  # float64 [M, 2]
+        spacing_m: np.ndarray,  # float64 [M]
+        origin: np.ndarray,  # float64 [2] where the lidar was
+        surface: np.ndarray,  # bool [M] returns that become surface
+        free: np.ndarray,  # bool [M] returns whose beam clears the cells before it
+    ) -> None:
+        """Add one scan."""
+        if len(points) == 0:
+            return
+        s = self.settings
+        self._cover(np.vstack([points, origin]))
+        if self.count + len(points) > len(self.moments):
+            self._reserve_surfels(max(2 * len(self.moments), self.count + len(points)))
+        changed = np.empty(len(points), dtype=np.int32)
+        self.count, n = add_returns(
+            points, tangents, spacing_m, surface, origin, self.scans, self.cell_id, self.hits, self.misses,
+            self.touched, self.moments, self.views, self.cells, self.count, self.row0, self.col0, self.cell_m, changed,
+        )  # fmt: skip
+        cast_rays(points, free, origin, self.scans, self.hits, self.misses, self.touched, self.row0, self.col0,
+                  self.cell_m)  # fmt: skip
+        refresh(changed[:n], self.cell_id, self.nearest, self.field, self.moments, self.cells, self.means,
+                self.omegas, self.row0, self.col0, self.cell_m, s.reach_cells, s.range_sigma_m,
+                s.map_sigma_m)  # fmt: skip
+        self.scans += 1
+
+    def tables(self) -> MatchTables:
+        """The live tables of this map (not a copy)."""
+        return MatchTables(self.nearest, self.field, self.means, self.omegas, self.views, self.row0, self.col0,
+                           self.cell_m)  # fmt: skip
+
+
+def tables_of(
+    means: np.ndarray,  # float [S, 2]
+    omegas: np.ndarray,  # float [S, 3]
+    views: np.ndarray,  # float [S, 2]
+    cell_m: float,
+    reach_cells: int,
+) -> MatchTables:
+    """Match tables of a finished map from its surface elements alone."""
+    means, omegas = means.astype(np.float64), omegas.astype(np.float64)
+    cells = np.floor(means[:, ::-1] / cell_m).astype(np.int64)
+    margin = reach_cells + 2
+    row0, col0 = (int(v) for v in cells.min(axis=0) - margin)
+    rows, cols = (int(v) for v in cells.max(axis=0) + margin + 1 - np.array([row0, col0]))
+    nearest = np.full((rows, cols), -1, dtype=np.int32)
+    field = np.zeros((rows, cols), dtype=np.uint8)
+    _splat_all(nearest, field, means, omegas, cells, row0, col0, cell_m, reach_cells)
+    return MatchTables(nearest, field, means, omegas, views.astype(np.float64), row0, col0, cell_m)
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _splat_all(
+    nearest: np.ndarray, field: np.ndarray, means: np.ndarray, omegas: np.ndarray, cells: np.ndarray,
+    row0: int, col0: int, cell_m: float, reach: int,
+) -> None:  # fmt: skip
+    for i in range(len(means)):
+        splat(nearest, field, means, omegas, i, cells[i, 0] - row0, cells[i, 1] - col0, row0, col0, cell_m, reach)
