@@ -51,7 +51,7 @@ def test_rubbish_raises_user_errors_only(text):
     try:
         parse_tum(text, "rubbish")
     except UserError as error:
-        assert "rubbish" in str(error)
+        assert "rubbish" in str(error)  # noqa: PT017
 
 
 def test_stamps_of_today_keep_their_nanoseconds():

@@ -1,0 +1,135 @@
+"""ROS messages (1 and 2 alike) as ours, field by field.
+
+`fields_of(cls, ros_message)` gives the fields that the ROS message carries, without checking them: the
+reader of our own recordings adds those ROS has no room for. `message_of` is for foreign bags: checked,
+and complete.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from common import messages as m
+from common.recording.picture import picture_head
+from common.recording.ros_types import stamp_ns_of, transform_of
+
+# ROS types that carry each of our messages, best first.
+ROS_TYPES: dict[type[m.Message], tuple[str, ...]] = {
+    m.Image: ("sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/Image"),
+    m.Scan: ("sensor_msgs/msg/LaserScan",),
+    m.WheelOdometry: ("nav_msgs/msg/Odometry",),
+    m.ExternalPose: ("geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped"),
+}
+
+# OpenCV's names for what ROS also calls by its colours.
+_ENCODINGS = {"8UC3": "bgr8", "8UC1": "mono8", "8UC4": "bgra8", "yuyv": "yuv422_yuy2"}
+
+
+def message_of(cls: type[m.Message], ros_message: Any) -> m.Message:
+    """Our message of class `cls`.
+
+    Raises:
+        ValueError: what the ROS message holds is not acceptable; says which field and why.
+    """
+    return cls.model_validate(fields_of(cls, ros_message))
+
+
+def fields_of(cls: type[m.Message], ros_message: Any) -> dict[str, Any]:
+    """Fields of `cls` as found in a ROS message."""
+    return _CONVERTERS[cls](ros_message)
+
+
+def _image(ros_image: Any) -> dict[str, Any]:
+    fields: dict[str, Any] = {
+        "stamp_ns": stamp_ns_of(ros_image.header.stamp),
+        "data": np.asarray(ros_image.data).view(np.uint8),
+    }
+    if hasattr(ros_image, "format"):
+        head = picture_head(fields["data"].data)
+        if head is not None:
+            fields |= head._asdict()
+        else:
+            fields["encoding"] = ros_image.format
+    else:
+        fields |= {
+            "width_px": ros_image.width,
+            "height_px": ros_image.height,
+            "encoding": _ENCODINGS.get(ros_image.encoding, ros_image.encoding),
+            "step_bytes": ros_image.step,
+        }
+    return fields
+
+
+def _scan(laser: Any) -> dict[str, Any]:
+    return {
+        "stamp_ns": stamp_ns_of(laser.header.stamp),
+        "angle_min_rad": float(laser.angle_min),
+        "angle_increment_rad": float(laser.angle_increment),
+        "time_increment_s": float(laser.time_increment),
+        "scan_time_s": float(laser.scan_time),
+        "range_min_m": float(laser.range_min),
+        "range_max_m": float(laser.range_max),
+        "ranges_m": np.asarray(laser.ranges, dtype=np.float32),
+        "intensities": np.asarray(laser.intensities, dtype=np.float32),
+    }
+
+
+def _wheel_odometry(odometry: Any) -> dict[str, Any]:
+    twist = odometry.twist.twist
+    return _odometry_pose(odometry) | {
+        "velocity_m_s": _vector(twist.linear),
+        "angular_velocity_rad_s": _vector(twist.angular),
+    }
+
+
+def _odometry(odometry: Any) -> dict[str, Any]:
+    planar = np.ix_([0, 1, 5], [0, 1, 5])
+    covariance = np.asarray(odometry.pose.covariance, dtype=np.float64).reshape(6, 6)[planar]
+    return _odometry_pose(odometry) | {"covariance": covariance}
+
+
+def _odometry_pose(odometry: Any) -> dict[str, Any]:
+    pose = odometry.pose.pose
+    return {
+        "stamp_ns": stamp_ns_of(odometry.header.stamp),
+        "T_odom_body": transform_of(pose.position, pose.orientation),
+    }
+
+
+def _external_pose(stamped: Any) -> dict[str, Any]:
+    pose = stamped.pose.pose if hasattr(stamped.pose, "pose") else stamped.pose
+    T_map_body = transform_of(pose.position, pose.orientation)
+    return {"stamp_ns": stamp_ns_of(stamped.header.stamp), "T_map_body": T_map_body}
+
+
+def _correction(tf_message: Any) -> dict[str, Any]:
+    stamped = tf_message.transforms[0]
+    T = transform_of(stamped.transform.translation, stamped.transform.rotation)
+    return {"stamp_ns": stamp_ns_of(stamped.header.stamp), "T_map_odom": T}
+
+
+def _grid(grid: Any) -> dict[str, Any]:
+    origin = grid.info.origin.position
+    return {
+        "stamp_ns": stamp_ns_of(grid.header.stamp),
+        "resolution_m": float(grid.info.resolution),
+        "origin_m": np.array([origin.x, origin.y]),
+        "occupancy": np.asarray(grid.data, dtype=np.int8).reshape(grid.info.height, grid.info.width),
+    }
+
+
+def _vector(vector: Any) -> np.ndarray:
+    return np.array([vector.x, vector.y, vector.z])
+
+
+_CONVERTERS = {
+    m.Image: _image,
+    m.Scan: _scan,
+    m.WheelOdometry: _wheel_odometry,
+    m.Odometry: _odometry,
+    m.ExternalPose: _external_pose,
+    m.Correction: _correction,
+    m.Grid: _grid,
+}

@@ -1,0 +1,304 @@
+"""Reads MCAP files: indexed and seekable where they are whole, chunk by chunk where they were cut off.
+
+The `mcap` package gives up on a file without a footer. A robot whose battery died leaves exactly such
+files, so this reader indexes what is there and says what is not.
+"""
+
+from __future__ import annotations
+
+import heapq
+import struct
+import zlib
+from collections import Counter
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass, field
+from io import BytesIO
+from pathlib import Path
+from typing import BinaryIO
+
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import Channel, Chunk, ChunkIndex, Footer, Header, Message, Schema, Statistics
+from mcap.stream_reader import get_chunk_data_stream
+
+from common.errors import UserError
+
+MAGIC = b"\x89MCAP0\r\n"
+_FOOTER_BYTES = 9 + 20 + len(MAGIC)
+_PREFIX = struct.Struct("<BQ")
+_CHUNK_HEAD = struct.Struct("<QQQI")
+_MESSAGE_HEAD = struct.Struct("<HIQQ")
+_REGION_BYTES = 4 * 1024 * 1024
+# What damaged bytes provoke in the record parsers and the decompressors.
+_DAMAGE = (McapError, ValueError, struct.error, RuntimeError, EOFError, OverflowError, MemoryError)
+
+try:
+    from zstandard import ZstdError
+
+    _DAMAGE = (*_DAMAGE, ZstdError)
+except ImportError:  # files without zstd still open
+    pass
+
+
+@dataclass
+class _Block:
+    """A chunk, or a run of top-level messages in a file written without chunks."""
+
+    offset: int
+    length: int
+    start_ns: int
+    end_ns: int
+    channel_ids: set[int] | None  # None: not known without reading it
+    chunked: bool = True
+
+
+@dataclass
+class McapFile:
+    """An open MCAP file. `truncated` says in one sentence what is missing, or is empty.
+
+    Raises:
+        UserError: not an MCAP file, or nothing in it can be read.
+    """
+
+    path: Path
+    profile: str = ""
+    library: str = ""
+    truncated: str = ""
+    damaged_chunks: int = 0
+    schemas: dict[int, Schema] = field(default_factory=dict)
+    channels: dict[int, Channel] = field(default_factory=dict)
+    counts: Counter[int] = field(default_factory=Counter)
+    start_ns: int = 0
+    end_ns: int = 0
+
+    def __post_init__(self) -> None:
+        self.path = Path(self.path)
+        self._blocks: list[_Block] = []
+        self._size = self.path.stat().st_size
+        self._file: BinaryIO = self.path.open("rb")
+        try:
+            self._open()
+        except _DAMAGE as error:
+            self._file.close()
+            raise UserError(
+                f"{self.path}: damaged MCAP file: {str(error) or type(error).__name__}"
+            ) from error
+        except UserError:
+            self._file.close()
+            raise
+
+    def close(self) -> None:
+        self._file.close()
+
+    def __enter__(self) -> McapFile:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def messages(
+        self, channel_ids: Collection[int] | None = None, start_ns: int = 0, stop_ns: int | None = None
+    ) -> Iterator[tuple[Channel, Message]]:
+        """Messages with start_ns <= log_time < stop_ns by log time; equal times in file order.
+
+        Chunks that hold none of the channels are not read. A chunk that does not decode is counted in
+        `damaged_chunks` and passed over.
+        """
+        wanted = None if channel_ids is None else set(channel_ids)
+        stop_ns = 2**64 if stop_ns is None else stop_ns
+        heap: list[tuple[int, int, int, Message]] = []
+        for number, block in enumerate(self._blocks):
+            while heap and heap[0][0] < block.start_ns:
+                message = heapq.heappop(heap)[3]
+                yield self.channels[message.channel_id], message
+            if block.end_ns < start_ns or block.start_ns >= stop_ns:
+                continue
+            if wanted is not None and block.channel_ids is not None and wanted.isdisjoint(block.channel_ids):
+                continue
+            for position, message in enumerate(self._read_block(block)):
+                if (
+                    wanted is None or message.channel_id in wanted
+                ) and start_ns <= message.log_time < stop_ns:
+                    heapq.heappush(heap, (message.log_time, number, position, message))
+        while heap:
+            message = heapq.heappop(heap)[3]
+            yield self.channels[message.channel_id], message
+
+    def _open(self) -> None:
+        if self._file.read(len(MAGIC)) != MAGIC:
+            raise UserError(f"{self.path}: not an MCAP file (wrong first bytes)")
+        if not self._read_summary():
+            self._scan()
+        self._blocks.sort(key=lambda block: (block.start_ns, block.offset))
+        self.start_ns = min((block.start_ns for block in self._blocks), default=0)
+        self.end_ns = max((block.end_ns for block in self._blocks), default=0)
+
+    def _read_summary(self) -> bool:
+        """Index from the end of the file; False if there is none to trust."""
+        self._file.seek(len(MAGIC))
+        self._take_header(self._file.read(min(self._size, 4096)))
+        if self._size < len(MAGIC) + _FOOTER_BYTES:
+            return False
+        self._file.seek(self._size - _FOOTER_BYTES)
+        tail = self._file.read(_FOOTER_BYTES)
+        if tail[0] != Opcode.FOOTER or tail[-len(MAGIC) :] != MAGIC:
+            return False
+        footer = Footer.read(_stream(tail[9:-8]))
+        if not len(MAGIC) <= footer.summary_start < self._size - _FOOTER_BYTES:
+            return False
+        self._file.seek(footer.summary_start)
+        summary = self._file.read(self._size - _FOOTER_BYTES - footer.summary_start)
+        # The checksum covers the summary and the footer up to itself.
+        if footer.summary_crc and zlib.crc32(tail[:25], zlib.crc32(summary)) != footer.summary_crc:
+            return False
+        counted = False
+        for opcode, body in _records(summary):
+            if opcode == Opcode.CHUNK_INDEX:
+                index = ChunkIndex.read(_stream(body))
+                # Without message indexes the chunk's channels are not known; empty would mean none.
+                ids = set(index.message_index_offsets) or None
+                self._blocks.append(
+                    _Block(
+                        index.chunk_start_offset, index.chunk_length,
+                        index.message_start_time, index.message_end_time, ids,
+                    )
+                )  # fmt: skip
+            elif opcode == Opcode.STATISTICS:
+                self.counts.update(Statistics.read(_stream(body)).channel_message_counts)
+                counted = True
+            else:
+                self._take_definition(opcode, body)
+        complete = counted and bool(self.channels) and (bool(self._blocks) or not self.counts.total())
+        if not complete:
+            self._blocks.clear()
+            self.counts.clear()
+        return complete
+
+    def _take_header(self, data: bytes) -> None:
+        for opcode, body in _records(data):
+            if opcode == Opcode.HEADER:
+                header = Header.read(_stream(body))
+                self.profile, self.library = header.profile, header.library
+            return
+
+    def _take_definition(self, opcode: int, body: bytes) -> None:
+        if opcode == Opcode.SCHEMA:
+            schema = Schema.read(_stream(body))
+            self.schemas[schema.id] = schema
+        elif opcode == Opcode.CHANNEL:
+            channel = Channel.read(_stream(body))
+            self.channels[channel.id] = channel
+
+    def _scan(self) -> None:
+        """Index by walking the records; notes in `truncated` where the file breaks off."""
+        position = len(MAGIC)
+        while True:
+            self._file.seek(position)
+            prefix = self._file.read(_PREFIX.size)
+            if len(prefix) < _PREFIX.size:
+                break
+            opcode, length = _PREFIX.unpack(prefix)
+            end = position + _PREFIX.size + length
+            if end > self._size or not 0 < opcode <= Opcode.DATA_END:
+                break
+            if opcode in (Opcode.DATA_END, Opcode.FOOTER):
+                self._file.seek(self._size - len(MAGIC))
+                if self._file.read() != MAGIC:
+                    self.truncated = "its last bytes (the index) are missing, though all messages are there"
+                return
+            self._scan_record(opcode, position, length)
+            position = end
+        self.truncated = self._loss(position)
+
+    def _scan_record(self, opcode: int, position: int, length: int) -> None:
+        whole = _PREFIX.size + length
+        if opcode == Opcode.CHUNK:
+            start_ns, end_ns = _CHUNK_HEAD.unpack(self._file.read(_CHUNK_HEAD.size))[:2]
+            block = _Block(position, whole, start_ns, end_ns, None)
+            block.channel_ids = set()
+            for message in self._read_block(block):
+                block.channel_ids.add(message.channel_id)
+                self.counts[message.channel_id] += 1
+            self._blocks.append(block)
+        elif opcode == Opcode.MESSAGE:
+            channel_id, _, log_time, _ = _MESSAGE_HEAD.unpack(self._file.read(_MESSAGE_HEAD.size))
+            self.counts[channel_id] += 1
+            last = self._blocks[-1] if self._blocks else None
+            if (
+                last
+                and not last.chunked
+                and last.length < _REGION_BYTES
+                and last.offset + last.length == position
+            ):
+                last.length += whole
+                last.start_ns, last.end_ns = min(last.start_ns, log_time), max(last.end_ns, log_time)
+                last.channel_ids.add(channel_id)
+            else:
+                self._blocks.append(_Block(position, whole, log_time, log_time, {channel_id}, chunked=False))
+        elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+            self._take_definition(opcode, self._file.read(length))
+
+    def _loss(self, position: int) -> str:
+        lost = self._size - position
+        text = f"breaks off after byte {position} of {self._size}: "
+        if lost == 0:
+            return text + "the end of the file with its index is missing, all whole chunks are there"
+        self._file.seek(position)
+        head = self._file.read(_PREFIX.size + _CHUNK_HEAD.size)
+        if len(head) == _PREFIX.size + _CHUNK_HEAD.size and head[0] == Opcode.CHUNK:
+            start_ns, end_ns, size, _ = _CHUNK_HEAD.unpack(head[_PREFIX.size :])
+            if start_ns <= end_ns < 2**63 and size < 2**40:
+                return text + (
+                    f"the last chunk ({(end_ns - start_ns) / 1e9:.2f} s, {size} bytes of messages) is lost, "
+                    "and whatever came after it"
+                )
+        return text + f"{lost} bytes are lost, and whatever came after them"
+
+    def _read_block(self, block: _Block) -> list[Message]:
+        """Messages of a block in file order; [] and counted if its bytes do not decode."""
+        try:
+            if block.offset + block.length > self._size:
+                raise McapError("chunk beyond the end of the file")
+            self._file.seek(block.offset)
+            data = self._file.read(block.length)
+            if block.chunked:
+                chunk = Chunk.read(_stream(data[_PREFIX.size :]))
+                stream, size = get_chunk_data_stream(chunk)
+                data = stream.read(size) if size else b""
+                if chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
+                    raise McapError("checksum")
+            return self._parse(data)
+        except _DAMAGE:
+            self.damaged_chunks += 1
+            return []
+
+    def _parse(self, data: bytes) -> list[Message]:
+        messages = []
+        for opcode, body in _records(data):
+            if opcode == Opcode.MESSAGE:
+                channel_id, sequence, log_time, publish_time = _MESSAGE_HEAD.unpack_from(body)
+                if channel_id not in self.channels:
+                    raise McapError("message of a channel that is not declared")
+                payload = bytes(body[_MESSAGE_HEAD.size :])
+                messages.append(Message(channel_id, log_time, payload, publish_time, sequence))
+            elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+                self._take_definition(opcode, body)
+        return messages
+
+
+def _stream(data: bytes | memoryview) -> ReadDataStream:
+    return ReadDataStream(BytesIO(data))
+
+
+def _records(data: bytes) -> Iterator[tuple[int, memoryview]]:
+    """(opcode, body) of each record in `data`; a last one that is cut short ends it."""
+    view = memoryview(data)
+    position = 0
+    while position + _PREFIX.size <= len(view):
+        opcode, length = _PREFIX.unpack_from(view, position)
+        position += _PREFIX.size
+        if position + length > len(view):
+            return
+        yield opcode, view[position : position + length]
+        position += length

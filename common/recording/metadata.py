@@ -1,0 +1,70 @@
+"""metadata.yaml: what makes a folder with an MCAP file a ROS 2 bag (format 5: Humble and later)."""
+
+from __future__ import annotations
+
+from io import StringIO
+
+from ruamel.yaml import YAML
+
+_QOS = """- history: 1
+  depth: {depth}
+  reliability: 1
+  durability: {durability}
+  deadline:
+    sec: 0
+    nsec: 0
+  lifespan:
+    sec: 0
+    nsec: 0
+  liveliness: 1
+  liveliness_lease_duration:
+    sec: 0
+    nsec: 0
+  avoid_ros_namespace_conventions: false
+"""
+
+
+def metadata_yaml(file_name: str, topics: dict[str, tuple[str, int]], first_ns: int, last_ns: int) -> str:
+    """Text for one MCAP file; `topics` gives ROS type and message count. Only ROS topics are listed:
+    `ros2 bag play` makes a publisher for each of them."""
+    span = {
+        "starting_time": {"nanoseconds_since_epoch": first_ns},
+        "duration": {"nanoseconds": last_ns - first_ns},
+    }
+    count = sum(number for _, number in topics.values())
+    table = {
+        "rosbag2_bagfile_information": {
+            "version": 5,
+            "storage_identifier": "mcap",
+            **span,
+            "message_count": count,
+            "topics_with_message_count": [
+                {"topic_metadata": _topic(name, type_name), "message_count": number}
+                for name, (type_name, number) in sorted(topics.items())
+            ],
+            "compression_format": "",
+            "compression_mode": "",
+            "relative_file_paths": [file_name],
+            "files": [{"path": file_name, **span, "message_count": count}],
+        }
+    }
+    text = StringIO()
+    yaml = YAML(typ="safe")
+    yaml.default_flow_style = False
+    yaml.dump(table, text)
+    return text.getvalue()
+
+
+def qos_profiles(topic: str) -> str:
+    """Offered QoS of a ROS topic; channel metadata and metadata.yaml must agree on it."""
+    latched = topic == "/tf_static"  # transient local: late joiners get the last one
+    return _QOS.format(depth=1 if latched else 10, durability=1 if latched else 2)
+
+
+def _topic(name: str, type_name: str) -> dict[str, str]:
+    return {
+        "name": name,
+        "type": type_name,
+        "serialization_format": "cdr",
+        "offered_qos_profiles": qos_profiles(name),
+    }

@@ -1,0 +1,133 @@
+"""ROS 2 types as our recordings use them: definitions, frame names, stamps."""
+
+from __future__ import annotations
+
+import struct
+from functools import cache
+from typing import Any
+
+import numpy as np
+from rosbags.serde import SerdeError
+from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys.store import Typestore
+
+from common.geometry import make_transform, matrix_from_quat_xyzw, quat_xyzw_from_matrix
+
+# The names of REP 103 and REP 105, so that RViz, nav2 and Foxglove find what they expect.
+FRAME_MAP = "map"
+FRAME_ODOM = "odom"
+FRAME_BODY = "base_link"
+FRAME_LIDAR = "laser"
+FRAME_CAMERA = "camera_optical_frame"
+
+_SEC_LIMIT = 2**31  # builtin_interfaces/Time counts seconds in an int32
+
+
+@cache
+def typestore() -> Typestore:
+    """The message definitions of ROS 2 Jazzy; those we use are the same in Humble."""
+    return get_typestore(Stores.ROS2_JAZZY)
+
+
+@cache
+def definition(type_name: str) -> bytes:
+    """Full text definition with all dependencies: the `ros2msg` schema of MCAP."""
+    return typestore().generate_msgdef(type_name, ros_version=2)[0].encode()
+
+
+def new(type_name: str, **fields: Any) -> Any:
+    """An instance of a ROS type: new("std_msgs/msg/Header", stamp=..., frame_id=...)."""
+    return typestore().types[type_name](**fields)
+
+
+def serialize(message: Any) -> bytes:
+    """CDR, little endian."""
+    return bytes(typestore().serialize_cdr(message, message.__msgtype__))
+
+
+def time_of(stamp_ns: int) -> Any:
+    """builtin_interfaces/Time; beyond 2038 the seconds are clipped (the writer notices)."""
+    sec, nanosec = divmod(stamp_ns, 10**9)
+    return new("builtin_interfaces/msg/Time", sec=min(sec, _SEC_LIMIT - 1), nanosec=nanosec)
+
+
+def header(stamp_ns: int, frame_id: str) -> Any:
+    """std_msgs/Header."""
+    return new("std_msgs/msg/Header", stamp=time_of(stamp_ns), frame_id=frame_id)
+
+
+def stamp_ns_of(time: Any) -> int:
+    """int64 ns of a ROS 1 or ROS 2 time."""
+    return int(time.sec) * 10**9 + int(time.nanosec)
+
+
+def vector(values: np.ndarray) -> Any:
+    """geometry_msgs/Vector3 of [3]."""
+    x, y, z = (float(v) for v in values)
+    return new("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
+
+
+def quaternion(R: np.ndarray) -> Any:
+    """geometry_msgs/Quaternion of a rotation [3, 3]."""
+    x, y, z, w = (float(v) for v in quat_xyzw_from_matrix(R))
+    return new("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
+
+
+def pose(T: np.ndarray) -> Any:
+    """geometry_msgs/Pose of a transform [4, 4]."""
+    x, y, z = (float(v) for v in T[:3, 3])
+    position = new("geometry_msgs/msg/Point", x=x, y=y, z=z)
+    return new("geometry_msgs/msg/Pose", position=position, orientation=quaternion(T[:3, :3]))
+
+
+def tf(stamp_ns: int, parent: str, child: str, T_parent_child: np.ndarray) -> Any:
+    """geometry_msgs/TransformStamped."""
+    transform = new(
+        "geometry_msgs/msg/Transform",
+        translation=vector(T_parent_child[:3, 3]),
+        rotation=quaternion(T_parent_child[:3, :3]),
+    )
+    return new(
+        "geometry_msgs/msg/TransformStamped",
+        header=header(stamp_ns, parent), child_frame_id=child, transform=transform,
+    )  # fmt: skip
+
+
+def tf_message(transforms: list[Any]) -> Any:
+    """tf2_msgs/TFMessage."""
+    return new("tf2_msgs/msg/TFMessage", transforms=transforms)
+
+
+def transform_of(position: Any, orientation: Any) -> np.ndarray:
+    """[4, 4] of a ROS position (or translation) and orientation.
+
+    Raises:
+        ValueError: the quaternion has no direction.
+    """
+    quat_xyzw = np.array([orientation.x, orientation.y, orientation.z, orientation.w])
+    return make_transform(matrix_from_quat_xyzw(quat_xyzw), np.array([position.x, position.y, position.z]))
+
+
+# What rosbags' generated deserialisers raise on rubbish, besides its own error.
+_RUBBISH = (
+    SerdeError,
+    ValueError,
+    struct.error,
+    IndexError,
+    AssertionError,
+    OverflowError,
+    MemoryError,
+    TypeError,
+)
+
+
+def deserialize(data: bytes, type_name: str) -> Any:
+    """ROS message of CDR bytes.
+
+    Raises:
+        ValueError: not that message.
+    """
+    try:
+        return typestore().deserialize_cdr(data, type_name)
+    except _RUBBISH as error:
+        raise ValueError(f"not a {type_name}: {error}") from error
