@@ -18,24 +18,22 @@ from __future__ import annotations
 import json
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import msgpack
 import zenoh
 import zenoh.ext
 
-from common.codec import MEDIA_TYPE, decode, encode, schema_of
 from common.errors import UserError
 from common.header import DecodeError, Header, local_clock_id
 from common.mailbox import Letter
-from common.messages import Health, Message
+from common.messages import Health
 from common.node import Input
+from common.streams import Publication, Subscription
 from common.topics import HEALTH, Topic, topic
 
 ROOT = "beamsplat"
-FIFO_MESSAGES = 256  # buffered by Zenoh ahead of our thread for an `every` input without a cache
 SHM_POOL_BYTES = 64 * 1024 * 1024
-_ENCODING = zenoh.Encoding(MEDIA_TYPE)
 
 
 def key(robot: str, *parts: str) -> str:
@@ -103,115 +101,6 @@ def open_session(endpoints: tuple[str, ...], wait_s: float = 15.0) -> zenoh.Sess
 
 def _short(error: zenoh.ZError) -> str:
     return str(error).split(" at ")[0][:120]
-
-
-class Publication:
-    """One topic as one producer writes it; `put` may be called from several threads."""
-
-    def __init__(self, bus: Bus, row: Topic, key_expr: str) -> None:
-        self._bus = bus
-        self._lock = threading.Lock()
-        self.row = row
-        self.sent = 0
-        self.bytes = 0
-        encoding = _ENCODING.with_schema(schema_of(row.message))
-        if row.cache:
-            self._publisher = zenoh.ext.declare_advanced_publisher(
-                bus.session,
-                key_expr,
-                encoding=encoding,
-                congestion_control=zenoh.CongestionControl.DROP,
-                cache=zenoh.ext.CacheConfig(row.cache),
-                sample_miss_detection=zenoh.ext.MissDetectionConfig(sporadic_heartbeat=0.5),
-                publisher_detection=True,
-            )
-        else:
-            self._publisher = bus.session.declare_publisher(
-                key_expr, encoding=encoding, congestion_control=zenoh.CongestionControl.DROP
-            )
-
-    def put(self, message: Message) -> Header:
-        """Sends one message; never waits for a subscriber."""
-        payload = encode(message)
-        with self._lock:
-            header = Header(
-                stamp_ns=message.stamp_ns,
-                publish_ns=time.monotonic_ns(),
-                clock_id=self._bus.clock_id,
-                sequence=self.sent,
-                epoch=self._bus.epoch,
-                producer=self._bus.node,
-                instance=self._bus.instance,
-            )
-            self._publisher.put(payload, attachment=header.pack())
-            self.sent += 1
-            self.bytes += len(payload)
-        return header
-
-
-class Subscription:
-    """One input: a thread that takes samples from Zenoh's channel and decodes them."""
-
-    def __init__(
-        self,
-        bus: Bus,
-        row: Topic,
-        delivery: str,
-        key_expr: str,
-        on_letter: Callable[[Letter], None],
-        on_undecodable: Callable[[str, str], None],
-    ) -> None:
-        self.row = row
-        self._on_letter = on_letter
-        self._on_undecodable = on_undecodable
-        if delivery == "every":
-            channel = zenoh.handlers.FifoChannel(max(row.cache, FIFO_MESSAGES))
-        else:
-            channel = zenoh.handlers.RingChannel(1)
-        if row.cache and delivery != "latest":
-            latched = delivery == "latched"
-            self._subscriber = zenoh.ext.declare_advanced_subscriber(
-                bus.session,
-                key_expr,
-                channel,
-                recovery=zenoh.ext.RecoveryConfig(heartbeat=True),
-                history=zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=1)
-                if latched
-                else None,
-            )
-        else:
-            self._subscriber = bus.session.declare_subscriber(key_expr, channel)
-        self._thread = threading.Thread(target=self._receive, name=f"sub-{row.name}", daemon=True)
-        self._thread.start()
-
-    def _receive(self) -> None:
-        while True:
-            try:
-                sample = self._subscriber.recv()
-            except zenoh.ZError:  # the session was closed
-                return
-            try:
-                letter = open_sample(sample, self.row)
-            except DecodeError as error:
-                self._on_undecodable(self.row.name, str(error))
-            else:
-                self._on_letter(letter)
-
-
-def open_sample(sample: zenoh.Sample, row: Topic) -> Letter:
-    """The letter in a sample of topic `row`.
-
-    Raises:
-        DecodeError: no header, another message's schema, or a payload that does not decode.
-    """
-    if sample.attachment is None:
-        raise DecodeError("sample without a header")
-    header = Header.unpack(sample.attachment.to_bytes())
-    schema = str(sample.encoding).partition(";")[2]
-    message = decode(schema, sample.payload.to_bytes())
-    if type(message) is not row.message:
-        raise DecodeError(f"{schema} on {row.name}, which carries {row.message.schema_name()}")
-    return Letter(row.name, header, message)
 
 
 class Bus:
@@ -325,38 +214,3 @@ class Bus:
         """Names of the nodes of this robot that are active now."""
         replies = self.session.liveliness().get(key(self.robot, "alive", "*", "*"), timeout=2.0)
         return {str(r.ok.key_expr).split("/")[3] for r in replies if r.ok is not None}
-
-
-def ask(
-    session: zenoh.Session, robot: str, node: str, name: str, parameters: dict[str, str], timeout_s: float
-) -> Iterator[Message]:
-    """The replies to a query, as they come.
-
-    Raises:
-        UserError: nobody answers to this query, the node refused it, or it took too long.
-    """
-    selector = zenoh.Selector(key(robot, "query", node, name), zenoh.Parameters(parameters))
-    answered = False
-    for reply in session.get(
-        selector,
-        timeout=timeout_s,
-        target=zenoh.QueryTarget.ALL,
-        consolidation=zenoh.ConsolidationMode.NONE,
-    ):
-        if reply.ok is None:
-            raise UserError(f"{node} refused {name}: {reply.err.payload.to_string()}")
-        answered = True
-        yield decode(str(reply.ok.encoding).partition(";")[2], reply.ok.payload.to_bytes())
-    if not answered:
-        raise UserError(f"nobody answers {name} of node {node!r}: is it running? (`beamsplat top` shows it)")
-
-
-def reply(query: zenoh.Query, messages: Iterator[Message]) -> None:
-    """Answers a query with messages; a UserError on the way becomes an error reply."""
-    with query:
-        try:
-            for message in messages:
-                encoding = _ENCODING.with_schema(schema_of(message))
-                query.reply(query.key_expr, encode(message), encoding=encoding)
-        except UserError as error:
-            query.reply_err(str(error).encode())

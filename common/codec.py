@@ -23,22 +23,9 @@ from common.messages import MESSAGES, Message
 MEDIA_TYPE = "application/x-beamsplat"
 _ALIGN = 64
 _ARRAY = 1
-_DTYPES = frozenset(
-    [
-        "float32",
-        "float64",
-        "float16",
-        "int8",
-        "int16",
-        "int32",
-        "int64",
-        "uint8",
-        "uint16",
-        "uint32",
-        "uint64",
-        "bool",
-    ]
-)
+_DTYPES = frozenset(f"{kind}{bits}" for kind in ("int", "uint") for bits in (8, 16, 32, 64)) | {
+    "bool", "float16", "float32", "float64",
+}  # fmt: skip
 _LENGTH = struct.Struct("<I")
 
 

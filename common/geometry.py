@@ -68,7 +68,8 @@ def is_rigid(T: np.ndarray, tolerance: float = 1e-6) -> bool:
         return False
     R = T[:3, :3]
     return bool(
-        np.allclose(R @ R.T, np.eye(3), atol=tolerance)
+        np.all(np.abs(R) < 2.0)  # keeps the product below from overflowing on rubbish
+        and np.allclose(R @ R.T, np.eye(3), atol=tolerance)
         and np.linalg.det(R) > 0.0
         and np.array_equal(T[3], [0.0, 0.0, 0.0, 1.0])
     )
@@ -117,11 +118,7 @@ def _left_jacobian(phi: np.ndarray) -> np.ndarray:
     W = skew(phi)
     if angle < 1e-5:
         return np.eye(3) + 0.5 * W + W @ W / 6.0
-    return (
-        np.eye(3)
-        + (1.0 - np.cos(angle)) / angle**2 * W
-        + (angle - np.sin(angle)) / angle**3 * (W @ W)
-    )
+    return np.eye(3) + (1.0 - np.cos(angle)) / angle**2 * W + (angle - np.sin(angle)) / angle**3 * (W @ W)
 
 
 def quat_wxyz_from_matrix(R: np.ndarray) -> np.ndarray:

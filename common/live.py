@@ -22,12 +22,15 @@ import numpy as np
 import psutil
 import zenoh
 
-from common.bus import Bus, Publication, open_session, reply
+from common.bus import Bus, open_session
+from common.header import local_clock_id
 from common.jobs import JobQueue
-from common.mailbox import Letter, Mailbox
+from common.mailbox import NOBODY, Letter, Mailbox
 from common.messages import Health, OutputHealth
 from common.node import Job, Node, Output, Sourced
 from common.persist import Bookmark, claim_epoch
+from common.queries import reply
+from common.streams import Publication
 
 log = logging.getLogger(__name__)
 
@@ -46,6 +49,7 @@ class LiveSettings:
     rate: float = 1.0  # pacing of recorded sources: times real time, 0 = as fast as possible
     wait_for: frozenset[str] = frozenset()  # a source starts when these nodes are active
     wait_s: float = 60.0
+    unfed: frozenset[str] = frozenset()  # inputs that nobody in this deployment produces: not waited for
     resume: bool = False  # a restarted source goes on where its predecessor died
     exit_when_drained: bool = False
 
@@ -68,6 +72,9 @@ class Live:
         self._publications: dict[str, Publication] = {}
         self._complaints: dict[str, tuple[float, int]] = {}
         self._bookmark = Bookmark(settings.run_dir, node.name)
+        self._clock_id = local_clock_id()
+        self._process = psutil.Process()
+        self._process.cpu_percent()  # the first call only starts the measurement
 
     def run(self) -> None:
         """Life of the process: configure, standby, active, drain, drained, closed."""
@@ -102,6 +109,8 @@ class Live:
         for name in self.node.outputs:
             self._publications[name] = bus.publish(name)
         for entry in self.node.inputs:
+            if entry.topic in self.settings.unfed:
+                self.mailbox.end(entry.topic, NOBODY, 0)
             bus.subscribe(entry, self._on_letter, self._on_undecodable, self._on_end)
         for name in self.node.queries():
             bus.answer(name, self._on_query)
@@ -216,7 +225,7 @@ class Live:
     def _answer_queries(self) -> None:
         while self._queries:
             name, query = self._queries.popleft()
-            parameters = {k: v for k, v in query.parameters.items()} if query.parameters else {}
+            parameters = dict(query.parameters.items()) if query.parameters else {}
             reply(query, getattr(self.node, f"on_query_{name}")(parameters))
 
     # --- called from threads of the bus ---
@@ -253,9 +262,6 @@ class Live:
     # --- health ---
 
     def _report(self, bus: Bus) -> None:
-        self._clock_id = bus.clock_id
-        self._process = psutil.Process()
-        self._process.cpu_percent()
         while self._state != "closed":
             try:
                 self._send_health(bus)

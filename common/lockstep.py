@@ -15,7 +15,7 @@ from typing import Any
 
 from common.header import Header
 from common.jobs import Deferred, JobQueue
-from common.mailbox import Letter, Mailbox
+from common.mailbox import NOBODY, Letter, Mailbox
 from common.messages import Message
 from common.node import Job, Node, Output
 from common.topics import ROW_NUMBER, TOPICS
@@ -57,7 +57,7 @@ class Lockstep:
             produced = {name for seat in self._seats for name in seat.node.outputs}
             for name in TOPICS:
                 if name not in produced:
-                    self._end_topic(name, "nobody", 0)
+                    self._end_topic(name, NOBODY, 0)
             for seat in self._seats:
                 if seat.source is not None:
                     self._pull(seat, 0)

@@ -14,6 +14,7 @@ from common.node import Input, Node, merged_topics
 from common.sync import StampMerger
 from common.topics import ROW_NUMBER
 
+NOBODY = "nobody"  # ends an input that no node produces
 MAX_QUEUED = 20_000  # of an `every` input: beyond it the oldest goes, and is counted
 
 
@@ -97,7 +98,7 @@ class Mailbox:
     def end(self, topic: str, instance: str, epoch: int) -> None:
         """The producer `instance` says that nothing more will come on `topic`."""
         count = self.counts[topic]
-        if epoch < count.epoch:
+        if epoch < count.epoch:  # of a producer that has been taken over
             return
         count.ended_by = instance
         if self._deliveries[topic] == "every":
@@ -124,8 +125,9 @@ class Mailbox:
 
     @property
     def ended(self) -> bool:
-        """Every input has ended and everything has been handed out."""
-        return not len(self) and all(count.ended_by is not None for count in self.counts.values())
+        """Every input has ended, at least one by its producer's word, and everything was handed out."""
+        enders = [count.ended_by for count in self.counts.values()]
+        return not len(self) and all(enders) and any(e != NOBODY for e in enders)
 
     def health(self) -> tuple[InputHealth, ...]:
         """The counters as they go into a Health message."""

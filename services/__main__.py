@@ -1,0 +1,44 @@
+"""The command `beamsplat`."""
+
+from __future__ import annotations
+
+import sys
+
+import typer
+from rich.console import Console
+
+from common.errors import UserError
+from services import doctor, system_cli
+from services.replay import cli as replay_cli
+from services.simulator import cli as simulator_cli
+
+app = typer.Typer(
+    name="beamsplat",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    help="A live, metric, photorealistic 3D Gaussian map from one camera and one 2D lidar.",
+)
+_SYSTEM = "Run a system"
+_DATA = "Recordings and calibration"
+for command in (
+    system_cli.run, system_cli.check, system_cli.serve, system_cli.offline, system_cli.record,
+    system_cli.top, system_cli.topics, system_cli.graph,
+):  # fmt: skip
+    app.command(rich_help_panel=_SYSTEM)(command)
+app.command(rich_help_panel=_DATA)(simulator_cli.simulate)
+app.command(rich_help_panel=_DATA)(replay_cli.info)
+app.command(rich_help_panel=_DATA)(replay_cli.rig)
+app.command(rich_help_panel=_SYSTEM)(doctor.doctor)
+
+
+def main() -> None:
+    """Entry point: bad input is one sentence and exit code 2, not a traceback."""
+    try:
+        app()
+    except UserError as error:
+        Console(stderr=True).print(f"[red]error:[/] {error}", soft_wrap=True, highlight=False)
+        sys.exit(2)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,77 @@
+"""From a deployment file to nodes: what would run, and whether it fits together."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from common.config import Deployment
+from common.errors import UserError
+from common.node import Node
+from common.registry import Service, make_node
+from common.topics import TOPICS
+from services.nodes import NODES
+
+
+@dataclass(frozen=True)
+class Fault:
+    """Something wrong in a deployment. Fatal ones keep it from running."""
+
+    text: str
+    fatal: bool = True
+
+
+def build_node(deployment: Deployment, name: str, table: dict[str, Service] = NODES) -> Node:
+    """The node called `name` as this deployment configures it.
+
+    Raises:
+        UserError: not in the deployment, or not in the process list, or wrong options.
+    """
+    if name not in deployment.nodes:
+        raise UserError(
+            f"the deployment has no node {name!r}; it has {', '.join(deployment.nodes) or 'none'}"
+        )
+    if name not in table:
+        raise UserError(f"nodes.{name}: no such service; there are {', '.join(table)}")
+    return make_node(table[name], deployment.nodes[name], "deployment")
+
+
+def node_classes(deployment: Deployment, table: dict[str, Service] = NODES) -> dict[str, type[Node]]:
+    """The class of each node of a deployment, by name."""
+    return {name: type(build_node(deployment, name, table)) for name in deployment.nodes}
+
+
+def faults(deployment: Deployment, table: dict[str, Service] = NODES) -> list[Fault]:
+    """What is wrong with a deployment; empty if it would run."""
+    found: list[Fault] = []
+    classes: dict[str, type[Node]] = {}
+    for name in deployment.nodes:
+        try:
+            classes[name] = type(build_node(deployment, name, table))
+        except UserError as error:
+            found.append(Fault(str(error)))
+    producers: dict[str, list[str]] = {topic: [] for topic in TOPICS}
+    for name, node_class in classes.items():
+        for topic in node_class.outputs:
+            producers[topic].append(name)
+    for topic, names in producers.items():
+        if len(names) > 1:
+            found.append(Fault(f"{topic} would be written by {' and '.join(names)}: keep one of them"))
+    for name, node_class in classes.items():
+        missing = [i.topic for i in node_class.inputs if not producers[i.topic]]
+        if missing and len(missing) == len(node_class.inputs):
+            found.append(Fault(f"nothing in this deployment feeds {name}: {', '.join(missing)}", fatal=False))
+    return found
+
+
+def consumers_of(deployment: Deployment, source: str, table: dict[str, Service] = NODES) -> frozenset[str]:
+    """The nodes that must be active before `source` starts, so that they miss nothing: all that have
+    inputs, since what they take may come from it through others."""
+    classes = node_classes(deployment, table)
+    return frozenset(name for name, node in classes.items() if node.inputs and name != source)
+
+
+def unfed_inputs(deployment: Deployment, name: str, table: dict[str, Service] = NODES) -> frozenset[str]:
+    """The inputs of a node that no node of the deployment produces."""
+    classes = node_classes(deployment, table)
+    fed = {topic for node in classes.values() for topic in node.outputs}
+    return frozenset(entry.topic for entry in classes[name].inputs if entry.topic not in fed)

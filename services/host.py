@@ -1,0 +1,109 @@
+"""What runs inside a service's process: one node on the bus, or the router."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import sys
+import threading
+from multiprocessing import connection, parent_process
+from pathlib import Path
+
+from common.bus import open_router
+from common.config import Deployment
+from common.errors import UserError
+from common.live import Live, LiveSettings
+from common.registry import Service
+from services.deployment import build_node, consumers_of, unfed_inputs
+from services.nodes import NODES
+
+log = logging.getLogger("beamsplat")
+
+# Two cores are shared by all services: nobody starts a thread per core. Read by OpenMP, BLAS and
+# numba when they are first imported, hence set before the fork server starts.
+ONE_THREAD = dict.fromkeys(
+    ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1"
+)
+
+
+def serve(
+    deployment: Deployment,
+    name: str,
+    *,
+    resume: bool = False,
+    exit_when_drained: bool = False,
+    table: dict[str, Service] = NODES,
+) -> None:
+    """Runs one node until its inputs end or SIGINT or SIGTERM comes.
+
+    Raises:
+        UserError: wrong options, bad input data, or no router.
+    """
+    node = build_node(deployment, name, table)
+    _limit_threads(node.config.threads)
+    settings = LiveSettings(
+        robot=deployment.robot,
+        endpoints=deployment.router.listen,
+        run_dir=deployment.run_dir,
+        rate=deployment.rate,
+        wait_for=consumers_of(deployment, name, table) if node.is_source() else frozenset(),
+        unfed=unfed_inputs(deployment, name, table),
+        resume=resume,
+        exit_when_drained=exit_when_drained,
+    )
+    live = Live(node, settings)
+    live.install_signal_handlers()
+    live.run()
+
+
+def route(deployment: Deployment) -> None:
+    """Runs this host's router until SIGINT or SIGTERM comes."""
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    with open_router(deployment.router.listen, deployment.router.connect):
+        while not stop.wait(0.5):
+            pass
+
+
+def child(deployment: Deployment, name: str, log_file: Path, resume: bool, table: dict[str, Service]) -> None:
+    """Entry of a supervised process: its output goes to a log file, its end shows in the exit code."""
+    # Ctrl-C in a terminal reaches the whole group; the supervisor decides who stops when.
+    os.setpgrp()
+    with log_file.open("ab", buffering=0) as file:
+        os.dup2(file.fileno(), 1)
+        os.dup2(file.fileno(), 2)
+    threading.Thread(target=_die_with_parent, name="parent", daemon=True).start()
+    start_logging()
+    try:
+        if name == "router":
+            route(deployment)
+        else:
+            serve(deployment, name, resume=resume, table=table)
+    except UserError as error:
+        log.error("%s", error)
+        sys.exit(2)
+
+
+def start_logging(level: int = logging.INFO) -> None:
+    """Log lines with time, level and origin on standard error."""
+    logging.basicConfig(
+        level=level, format="%(asctime)s %(levelname)-7s %(name)s: %(message)s", stream=sys.stderr, force=True
+    )
+
+
+def _die_with_parent() -> None:
+    """A killed supervisor must not leave a robot's services running unwatched."""
+    parent = parent_process()
+    if parent is not None:
+        connection.wait([parent.sentinel])
+        os.kill(os.getpid(), signal.SIGTERM)
+
+
+def _limit_threads(threads: int) -> None:
+    """Fixed thread counts in what is already imported here."""
+    if "cv2" in sys.modules:
+        sys.modules["cv2"].setNumThreads(threads)
+    if "torch" in sys.modules:
+        sys.modules["torch"].set_num_threads(threads)

@@ -1,0 +1,30 @@
+"""THE process list: every service, by the name it has in a deployment file."""
+
+from __future__ import annotations
+
+from common.registry import Service
+
+_ROWS = (
+    Service(
+        "replay",
+        "plays a bag, a recording or a folder as if the robot were driving",
+        {"default": "services.replay.node:ReplayNode"},
+    ),
+    Service(
+        "localization",
+        "where the robot is",
+        {"external": "services.localization.external.node:ExternalLocalization"},
+    ),
+    Service(
+        "recorder",
+        "writes what goes over the bus to an MCAP file",
+        {"default": "services.recorder.node:RecorderNode"},
+    ),
+    Service(
+        "monitor",
+        "shows the running system in rerun",
+        {"rerun": "services.monitor.node:MonitorNode"},
+    ),
+)
+
+NODES: dict[str, Service] = {row.name: row for row in _ROWS}

@@ -1,0 +1,86 @@
+"""A whole deployment in lockstep, recorded and hashed."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+from common.codec import encode, schema_of
+from common.config import Deployment
+from common.lockstep import Lockstep
+from common.mailbox import Letter
+from common.persist import write_atomically
+from common.recording import RecordingWriter
+from common.registry import Service
+from services.deployment import build_node
+from services.nodes import NODES
+
+# Watching and recording happen around a lockstep run, not inside it.
+OUTSIDE = ("monitor", "recorder")
+
+
+class MessageHash:
+    """SHA-256 over (topic, schema, sequence, payload) of messages, in order; all, and by topic."""
+
+    def __init__(self) -> None:
+        self._all = hashlib.sha256()
+        self.counts: dict[str, int] = {}
+
+    def add(self, letter: Letter, payload: bytes) -> None:
+        """Takes one message."""
+        head = f"{letter.topic} {schema_of(letter.message)} {letter.header.sequence} {len(payload)}\n"
+        self._all.update(head.encode())
+        self._all.update(payload)
+        self.counts[letter.topic] = self.counts.get(letter.topic, 0) + 1
+
+    def hexdigest(self) -> str:
+        """64 hex digits."""
+        return self._all.hexdigest()
+
+
+def run_offline(
+    deployment: Deployment, out: Path, console: Console, table: dict[str, Service] = NODES
+) -> dict[str, Any]:
+    """Runs all nodes of a deployment but the watching ones; writes `messages` (a recording) and
+    summary.json into `out`, and returns the summary.
+
+    Raises:
+        UserError: options or data that do not fit.
+    """
+    nodes = [build_node(deployment, name, table) for name in deployment.nodes if name not in OUTSIDE]
+    digest = MessageHash()
+    started = time.perf_counter()
+    out.mkdir(parents=True, exist_ok=True)
+    progress = Progress(
+        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
+        console=console, transient=True,
+    )  # fmt: skip
+    with RecordingWriter(out / "messages", overwrite=True) as writer, progress:
+        total = next((n.expected_messages() for n in nodes if hasattr(n, "expected_messages")), None)
+        task = progress.add_task("lockstep", total=total)
+
+        def on_message(letter: Letter) -> None:
+            digest.add(letter, encode(letter.message))
+            writer.write(letter.topic, letter.message, letter.header.publish_ns, letter.header)
+            if letter.header.producer == "replay":
+                progress.advance(task)
+
+        mailboxes = Lockstep(nodes, on_message).run()
+    summary = {
+        "sha256": digest.hexdigest(),
+        "messages": sum(digest.counts.values()),
+        "topics": digest.counts,
+        "dropped": {
+            node: {name: count.dropped for name, count in mailbox.counts.items() if count.dropped}
+            for node, mailbox in mailboxes.items()
+        },
+        "wall_s": time.perf_counter() - started,
+    }
+    write_atomically(out / "summary.json", json.dumps(summary, indent=1).encode())
+    return summary

@@ -1,0 +1,174 @@
+"""Starts the router and the nodes of a deployment, restarts what dies, and ends them in order."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import multiprocessing
+import os
+import signal
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from multiprocessing.process import BaseProcess
+from pathlib import Path
+
+from common.bus import open_session
+from common.config import Deployment
+from common.errors import UserError
+from common.registry import Service
+from services.deployment import node_classes
+from services.host import ONE_THREAD, child
+from services.nodes import NODES
+
+log = logging.getLogger("beamsplat")
+
+ROUTER = "router"
+BACK_OFF_S = (0.1, 0.5, 1.0, 2.0, 5.0)
+HEALTHY_S = 30.0  # alive for so long, a process earns a fresh back-off
+STOP_S = 5.0  # from SIGTERM to SIGKILL
+PRELOADED = ("numpy", "cv2", "scipy.spatial", "pydantic", "zenoh", "common.live", "common.lockstep")
+
+
+@dataclass
+class Child:
+    """One supervised process."""
+
+    name: str
+    process: BaseProcess
+    started: float
+    restarts: int = 0
+    attempts: int = 0  # within the current back-off
+    due: float | None = None  # dead, to be started again then
+    gave_up: bool = False  # ended with a user error: restarting would not help
+    exit_code: int | None = None
+
+
+class Supervisor:
+    """The processes of one deployment. `poll()` a few times a second; use with `with`."""
+
+    def __init__(
+        self,
+        deployment: Deployment,
+        names: tuple[str, ...] | None = None,
+        *,
+        table: dict[str, Service] = NODES,
+        on_event: Callable[[str], None] | None = None,
+    ) -> None:
+        self.deployment = deployment
+        self.log_dir = deployment.run_dir / "logs"
+        self.children: dict[str, Child] = {}
+        self._table = table
+        self._names = names if names is not None else (ROUTER, *deployment.nodes)
+        self._on_event = on_event or (lambda text: log.info("%s", text))
+        os.environ.update({k: os.environ.get(k, v) for k, v in ONE_THREAD.items()})
+        self._context = multiprocessing.get_context("forkserver")
+        self._context.set_forkserver_preload(list(PRELOADED))
+
+    def __enter__(self) -> Supervisor:
+        self.log_dir.mkdir(parents=True, exist_ok=True)
+        try:
+            self._start_all()
+        except BaseException:
+            self.stop()
+            raise
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.stop()
+
+    def _start_all(self) -> None:
+        """The router, then who listens, then who speaks."""
+        if ROUTER in self._names:
+            self._start(ROUTER)
+            self._wait_for_router()
+        classes = node_classes(self.deployment, self._table)
+        nodes = [name for name in self._names if name != ROUTER]
+        for name in sorted(nodes, key=lambda n: classes[n].is_source()):
+            self._start(name)
+
+    def _wait_for_router(self) -> None:
+        router = self.children[ROUTER]
+        deadline = time.monotonic() + 20.0
+        while time.monotonic() < deadline:
+            with contextlib.suppress(UserError):
+                open_session(self.deployment.router.listen, wait_s=0.0).close()
+                return
+            if not router.process.is_alive():
+                raise UserError(f"the router did not start: {_last_line(self.log_file(ROUTER))}")
+        raise UserError(f"no router at {', '.join(self.deployment.router.listen)} after 20 s")
+
+    def log_file(self, name: str) -> Path:
+        """Where a process writes what it has to say."""
+        return self.log_dir / f"{name}.log"
+
+    def _start(self, name: str, resume: bool = False) -> None:
+        process = self._context.Process(
+            target=child,
+            args=(self.deployment, name, self.log_file(name), resume, self._table),
+            name=name,
+            daemon=False,
+        )
+        process.start()
+        known = self.children.get(name)
+        if known is None:
+            self.children[name] = Child(name, process, time.monotonic())
+        else:
+            known.process, known.started, known.due = process, time.monotonic(), None
+
+    def poll(self) -> None:
+        """Notices what has died and starts what is due."""
+        now = time.monotonic()
+        for entry in self.children.values():
+            if entry.due is not None:
+                if now >= entry.due:
+                    entry.restarts += 1
+                    self._start(entry.name, resume=True)
+            elif not entry.process.is_alive() and entry.exit_code is None and not entry.gave_up:
+                self._bury(entry, now)
+
+    def _bury(self, entry: Child, now: float) -> None:
+        code = entry.process.exitcode or 0
+        if code == 0:
+            entry.exit_code = 0
+            return
+        if code == 2:
+            entry.gave_up, entry.exit_code = True, 2
+            self._on_event(f"{entry.name} cannot run: {_last_line(self.log_file(entry.name))}")
+            return
+        if now - entry.started > HEALTHY_S:
+            entry.attempts = 0
+        delay = BACK_OFF_S[min(entry.attempts, len(BACK_OFF_S) - 1)]
+        entry.attempts += 1
+        entry.due = now + delay
+        how = f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
+        self._on_event(
+            f"{entry.name} died ({how}: {_last_line(self.log_file(entry.name))}); starts again in {delay:g} s"
+        )
+
+    def stop(self) -> None:
+        """SIGTERM to the nodes, sources first; then the router; SIGKILL to who does not listen."""
+        nodes = [c for c in self.children.values() if c.name != ROUTER]
+        _end(list(reversed(nodes)))
+        _end([c for c in self.children.values() if c.name == ROUTER])
+
+
+def _end(children: list[Child]) -> None:
+    for entry in children:
+        if entry.process.is_alive():
+            entry.process.terminate()
+    deadline = time.monotonic() + STOP_S
+    for entry in children:
+        entry.process.join(max(deadline - time.monotonic(), 0.0))
+        if entry.process.is_alive():
+            log.warning("%s does not stop: killed", entry.name)
+            entry.process.kill()
+            entry.process.join()
+
+
+def _last_line(path: Path) -> str:
+    try:
+        lines = path.read_text(errors="replace").strip().splitlines()
+    except OSError:
+        return f"no log at {path}"
+    return lines[-1].split(": ", 1)[-1] if lines else f"nothing in {path}"

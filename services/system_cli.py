@@ -1,0 +1,233 @@
+"""Commands that run a system: check, run, serve, offline, record, top, topics, graph."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import sys
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.live import Live as Screen
+
+from common.config import Deployment, load_deployment
+from common.errors import UserError
+
+FileArgument = Annotated[Path, typer.Argument(help="Deployment file (TOML), for example deploy/demo.toml")]
+SetOption = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="NODE.OPTION=VALUE", help="Override an option of the file; repeatable"),
+]
+console = Console(stderr=True)
+
+
+def _load(file: Path, overrides: list[str] | None) -> Deployment:
+    return load_deployment(file, tuple(overrides or ()))
+
+
+def check(file: FileArgument, set_: SetOption = None) -> None:
+    """Says whether a deployment would run, and what is wrong if not.
+
+    Example: beamsplat check deploy/demo.toml
+    """
+    from services.deployment import faults
+
+    deployment = _load(file, set_)
+    found = faults(deployment)
+    for fault in found:
+        console.print(f"[{'red' if fault.fatal else 'yellow'}]{fault.text}[/]", soft_wrap=True)
+    if any(fault.fatal for fault in found):
+        raise typer.Exit(2)
+    print(f"{file}: {len(deployment.nodes)} nodes, fits together")
+
+
+def _checked(deployment: Deployment) -> Deployment:
+    from services.deployment import faults
+
+    fatal = [fault.text for fault in faults(deployment) if fault.fatal]
+    if fatal:
+        raise UserError("; ".join(fatal))
+    return deployment
+
+
+def run(
+    file: FileArgument,
+    nodes: Annotated[list[str] | None, typer.Argument(help="Only these (and `router`); default: all")] = None,
+    set_: SetOption = None,
+    rate: Annotated[float | None, typer.Option(help="Replay at N times real time; 0 = flat out")] = None,
+) -> None:
+    """Runs a deployment: a router and one supervised process per node.
+
+    Ends when recorded data ends, or with Ctrl-C. Logs lie under the robot's state folder.
+
+    Examples:
+
+        beamsplat run deploy/demo.toml --set replay.data=drive/bag
+
+        beamsplat run deploy/robot.toml router localization
+    """
+    deployment = _load(file, set_)
+    if rate is not None:
+        deployment = deployment.model_copy(update={"rate": rate})
+    run_deployment(_checked(deployment), tuple(nodes) if nodes else None)
+
+
+def run_deployment(deployment: Deployment, names: tuple[str, ...] | None = None) -> None:
+    """Runs processes until all have drained, one cannot run, or Ctrl-C.
+
+    Raises:
+        UserError: a node cannot run with what it was given.
+    """
+    from common.bus import open_session
+    from services.board import HealthBoard
+    from services.supervisor import Supervisor
+
+    events: list[str] = []
+    show = sys.stderr.isatty()
+
+    def on_event(text: str) -> None:
+        events.append(text)
+        console.print(f"[yellow]{text}[/]", soft_wrap=True)
+
+    with Supervisor(deployment, names, on_event=on_event) as supervisor:
+        console.print(f"robot {deployment.robot}: logs in {supervisor.log_dir}", soft_wrap=True)
+        with open_session(deployment.router.listen) as session:
+            board = HealthBoard(session, deployment.robot)
+            screen = Screen(console=console, refresh_per_second=2) if show else contextlib.nullcontext()
+            with screen, contextlib.suppress(KeyboardInterrupt):
+                while True:
+                    time.sleep(0.2)
+                    supervisor.poll()
+                    if show:
+                        screen.update(board.nodes_table())
+                    nodes = [c for c in supervisor.children.values() if c.name != "router"]
+                    failed = [c for c in nodes if c.gave_up]
+                    if failed:
+                        raise UserError(events[-1])
+                    states = board.states()
+                    if nodes and all(c.exit_code == 0 or states.get(c.name) == "drained" for c in nodes):
+                        break
+            if not show:
+                console.print(board.nodes_table())
+
+
+def serve(
+    file: FileArgument,
+    node: Annotated[str, typer.Argument(help="Name of the node, or `router`")],
+    set_: SetOption = None,
+) -> None:
+    """Runs one node in this process, without supervision (for debuggers, systemd, containers).
+
+    Example: beamsplat serve deploy/robot.toml localization
+    """
+    from services.host import route, start_logging
+    from services.host import serve as serve_node
+
+    deployment = _load(file, set_)
+    start_logging()
+    if node == "router":
+        route(deployment)
+    else:
+        serve_node(deployment, node, exit_when_drained=True)
+
+
+def offline(
+    file: FileArgument,
+    out: Annotated[Path, typer.Option(help="Folder for messages.mcap and summary.json")],
+    data: Annotated[Path | None, typer.Option(help="Bag, recording or folder for the replay node")] = None,
+    set_: SetOption = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the summary as one JSON object")] = False,
+) -> None:
+    """Runs a deployment in lockstep: one thread, no bus, as fast as possible, reproducible.
+
+    The same input gives the same bytes: summary.json holds a SHA-256 over all messages.
+
+    Example: beamsplat offline deploy/demo.toml --data drive/bag --out out/
+    """
+    from services.offline import run_offline
+
+    deployment = _load(file, set_)
+    if data is not None:
+        replay = {**deployment.nodes.get("replay", {}), "data": str(data)}
+        deployment = deployment.model_copy(update={"nodes": {**deployment.nodes, "replay": replay}})
+    summary = run_offline(_checked(deployment), out, console)
+    if as_json:
+        print(json.dumps(summary))
+    else:
+        console.print(f"{summary['messages']} messages in {summary['wall_s']:.1f} s, SHA-256 "
+                      f"{summary['sha256'][:16]}..., in {out}", soft_wrap=True)  # fmt: skip
+
+
+def record(
+    file: FileArgument,
+    out: Annotated[Path, typer.Option(help="Folder of the recording to write")],
+    set_: SetOption = None,
+) -> None:
+    """Records the topics of a running deployment to MCAP, until Ctrl-C or the end of the data.
+
+    Example: beamsplat record deploy/robot.toml --out drive1
+    """
+    from services.host import serve as serve_node
+    from services.host import start_logging
+
+    deployment = _load(file, set_)
+    options = {**deployment.nodes.get("recorder", {}), "out": str(out)}
+    deployment = deployment.model_copy(update={"nodes": {**deployment.nodes, "recorder": options}})
+    start_logging()
+    serve_node(deployment, "recorder", exit_when_drained=True)
+    print(f"recorded to {out}")
+
+
+def _watch(file: Path, overrides: list[str] | None, table: str, seconds: float | None) -> None:
+    from common.bus import open_session
+    from services.board import HealthBoard
+
+    deployment = _load(file, overrides)
+    with open_session(deployment.router.listen, wait_s=2.0) as session:
+        board = HealthBoard(session, deployment.robot)
+        draw = getattr(board, table)
+        deadline = time.monotonic() + (seconds if seconds is not None else 1e12)
+        with (
+            Screen(console=Console(), refresh_per_second=2) as screen,
+            contextlib.suppress(KeyboardInterrupt),
+        ):
+            while time.monotonic() < deadline:
+                time.sleep(0.25)
+                screen.update(draw())
+
+
+SecondsOption = Annotated[float | None, typer.Option(help="Stop after this long; default: Ctrl-C")]
+
+
+def top(file: FileArgument, seconds: SecondsOption = None, set_: SetOption = None) -> None:
+    """Live table of the nodes: state, rates, step time, age, drops, memory, CPU.
+
+    Example: beamsplat top deploy/robot.toml
+    """
+    _watch(file, set_, "nodes_table", seconds)
+
+
+def topics(file: FileArgument, seconds: SecondsOption = None, set_: SetOption = None) -> None:
+    """Live table of the topics: who sends how often, who takes it and how late.
+
+    Example: beamsplat topics deploy/robot.toml
+    """
+    _watch(file, set_, "topics_table", seconds)
+
+
+def graph(
+    file: FileArgument,
+    mermaid: Annotated[bool, typer.Option(help="As a Mermaid flowchart")] = False,
+) -> None:
+    """The dataflow of a deployment.
+
+    Example: beamsplat graph deploy/demo.toml --mermaid
+    """
+    from services.deployment import node_classes
+    from services.graph import as_mermaid, as_text
+
+    classes = node_classes(_load(file, None))
+    print(as_mermaid(classes) if mermaid else as_text(classes))

@@ -1,0 +1,174 @@
+"""Small real nodes for the tests of the runners; they use rows of the real topic table."""
+
+import hashlib
+import time
+from collections.abc import Iterator
+
+import numpy as np
+
+from common.config import NodeConfig
+from common.geometry import se2_to_se3
+from common.messages import Correction, ExternalPose, Grid, Image, Odometry, Scan, WheelOdometry
+from common.node import Input, Job, Node, Outputs, Sourced
+from common.registry import Service
+
+
+class DriveConfig(NodeConfig):
+    seconds: float = 3.0
+    scans: bool = True
+    images: bool = True
+    image_bytes: int = 2000
+    seed: int = 0
+
+
+class Drive(Node):
+    """Scans at 10 Hz, wheel odometry at 50 Hz, pictures at 30 Hz; each arrives late by its own jitter."""
+
+    name = "replay"
+    Config = DriveConfig
+    outputs = ("lidar/scan", "wheel/odometry", "camera/image")
+
+    def source(self) -> Iterator[Sourced]:
+        rng = np.random.default_rng(self.config.seed)
+        items = []
+        for i in range(int(self.config.seconds * 50)):
+            stamp_ns = 1_000_000_000 + i * 20_000_000
+            pose = se2_to_se3(np.array([0.01 * i, 0.0, 0.0]))
+            items.append(
+                Sourced(
+                    stamp_ns + int(rng.uniform(1e6, 9e6)),
+                    "wheel/odometry",
+                    WheelOdometry(stamp_ns=stamp_ns, T_odom_body=pose, velocity_m_s=np.zeros(3),
+                                  angular_velocity_rad_s=np.zeros(3)),
+                )
+            )  # fmt: skip
+        for i in range(int(self.config.seconds * 10) if self.config.scans else 0):
+            stamp_ns = 1_003_000_000 + i * 100_000_000
+            items.append(
+                Sourced(
+                    stamp_ns + 100_000_000 + int(rng.uniform(1e6, 9e6)),
+                    "lidar/scan",
+                    Scan(stamp_ns=stamp_ns, angle_min_rad=-3.14, angle_increment_rad=0.01, time_increment_s=0.0,
+                         scan_time_s=0.1, range_min_m=0.1, range_max_m=12.0,
+                         ranges_m=rng.uniform(0, 12, 360).astype(np.float32)),
+                )
+            )  # fmt: skip
+        for i in range(int(self.config.seconds * 30) if self.config.images else 0):
+            stamp_ns = 1_005_000_000 + i * 33_333_333
+            data = rng.integers(0, 255, self.config.image_bytes).astype(np.uint8)
+            items.append(
+                Sourced(
+                    stamp_ns + 20_000_000,
+                    "camera/image",
+                    Image(stamp_ns=stamp_ns, width_px=640, height_px=480, encoding="jpeg", data=data),
+                )
+            )
+        yield from sorted(items, key=lambda item: item.at_ns)
+
+
+class Chain(Node):
+    """Sends, per scan, a digest of everything seen so far: any other order gives other messages."""
+
+    name = "localization"
+    inputs = ("lidar/scan", "wheel/odometry")
+    outputs = ("localization/odometry", "localization/correction")
+
+    def configure(self) -> None:
+        self._digest = hashlib.sha256()
+        self._jobs = 0
+
+    def on_wheel_odometry(self, message: WheelOdometry) -> Outputs:
+        self._digest.update(message.T_odom_body.tobytes())
+        return iter(())
+
+    def on_lidar_scan(self, message: Scan) -> Outputs:
+        self._digest.update(message.ranges_m.tobytes())
+        detail = self._digest.hexdigest()
+        yield (
+            "localization/odometry",
+            Odometry(stamp_ns=message.stamp_ns, T_odom_body=np.eye(4), covariance=np.eye(3), detail=detail),
+        )
+        if int(detail[:2], 16) < 64:
+            yield Job("sum", lambda: float(message.ranges_m.sum()), after=7)
+
+    def on_job_sum(self, result: float) -> Outputs:
+        self._jobs += 1
+        self._digest.update(str(result).encode())
+        T = se2_to_se3(np.array([result, 0.0, 0.0]))
+        yield (
+            "localization/correction",
+            Correction(stamp_ns=self._jobs, T_map_odom=T, optimisation=self._jobs),
+        )
+
+    def on_query_count(self, parameters: dict[str, str]) -> Iterator[Correction]:
+        yield Correction(stamp_ns=0, T_map_odom=np.eye(4), optimisation=int(parameters.get("add", 0)))
+
+
+class SlowConfig(NodeConfig):
+    sleep_s: float = 0.0
+
+
+class Slow(Node):
+    """Takes the newest picture and needs its time for it; takes every scan as well."""
+
+    name = "localization"
+    Config = SlowConfig
+    inputs = ("camera/image", "lidar/scan")
+    outputs = ("localization/grid",)
+
+    def on_camera_image(self, message: Image) -> Outputs:
+        time.sleep(self.config.sleep_s)
+        yield (
+            "localization/grid",
+            Grid(stamp_ns=message.stamp_ns, resolution_m=0.1, origin_m=np.zeros(2),
+                 occupancy=message.data[:4].astype(np.int8).reshape(2, 2)),
+        )  # fmt: skip
+
+    def on_lidar_scan(self, message: Scan) -> Outputs:
+        return iter(())
+
+
+class Sink(Node):
+    """Takes every result in and keeps it for the test to look at."""
+
+    name = "recorder"
+    inputs = (
+        "localization/odometry",
+        Input("localization/correction", delivery="every"),
+        Input("localization/grid", delivery="every"),
+    )
+
+    def __init__(self, config: NodeConfig) -> None:
+        super().__init__(config)
+        self.seen: list[tuple[str, object]] = []
+
+    def on_localization_odometry(self, message: Odometry) -> Outputs:
+        self.seen.append(("localization/odometry", message))
+        return iter(())
+
+    def on_localization_correction(self, message: Correction) -> Outputs:
+        self.seen.append(("localization/correction", message))
+        return iter(())
+
+    def on_localization_grid(self, message: Grid) -> Outputs:
+        self.seen.append(("localization/grid", message))
+        return iter(())
+
+
+class Poser(Node):
+    """A source that says what it says at once, as a device would."""
+
+    name = "ros2"
+    outputs = ("external/pose",)
+
+    def source(self) -> Iterator[Sourced]:
+        for i in range(5):
+            yield Sourced(None, "external/pose", ExternalPose(stamp_ns=i, T_map_body=np.eye(4)))
+
+
+_HERE = "tests.common.nodes:"
+TABLE = {
+    "replay": Service("replay", "", {"drive": _HERE + "Drive"}),
+    "localization": Service("localization", "", {"chain": _HERE + "Chain", "slow": _HERE + "Slow"}),
+    "recorder": Service("recorder", "", {"sink": _HERE + "Sink"}),
+}

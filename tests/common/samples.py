@@ -1,0 +1,89 @@
+"""One filled-in message of every type, and the strategies that make random ones."""
+
+import numpy as np
+
+from common.frames import camera_mount, lidar_mount
+from common.geometry import se2_to_se3
+from common.messages import (
+    Anchors,
+    CameraModel,
+    Correction,
+    ExternalPose,
+    Grid,
+    Health,
+    Image,
+    InputHealth,
+    LidarModel,
+    Message,
+    Odometry,
+    OutputHealth,
+    Rig,
+    Scan,
+    Tick,
+    WheelOdometry,
+)  # fmt: skip
+
+
+def sample_messages() -> list[Message]:
+    """Every message type once, no field left at its default."""
+    rng = np.random.default_rng(7)
+    T = se2_to_se3(np.array([[1.0, -2.0, 0.3], [0.5, 4.0, -3.0]]))
+    camera = CameraModel(
+        width_px=640, height_px=480, fx_px=530.0, fy_px=531.0, cx_px=319.5, cy_px=239.5,
+        distortion_model="plumb_bob", distortion=(0.1, -0.2, 0.001, 0.002, 0.03),
+        T_body_camera=camera_mount(0.1, 0.0, 0.45, pitch_down_rad=0.035),
+    )  # fmt: skip
+    return [
+        Rig(
+            stamp_ns=11, camera=camera, lidar=LidarModel(T_body_lidar=lidar_mount(0.0, 0.0, 0.18)),
+            assumed=("camera height: assumed 0.45 m",), source="rig.toml",
+        ),
+        Image(
+            stamp_ns=12, width_px=4, height_px=2, encoding="rgb8", step_bytes=12,
+            data=rng.integers(0, 255, 24).astype(np.uint8),
+        ),
+        Scan(
+            stamp_ns=13, angle_min_rad=-3.1, angle_increment_rad=0.01, time_increment_s=1e-4, scan_time_s=0.1,
+            range_min_m=0.12, range_max_m=12.0,
+            ranges_m=np.array([1.0, np.inf, np.nan, -1.0], np.float32), intensities=np.ones(4, np.float32),
+        ),
+        WheelOdometry(
+            stamp_ns=14, T_odom_body=T[0], velocity_m_s=np.array([0.3, 0.0, 0.0]),
+            angular_velocity_rad_s=np.array([0.0, 0.0, 0.1]),
+        ),
+        ExternalPose(stamp_ns=15, T_map_body=T[1]),
+        Odometry(
+            stamp_ns=16, T_odom_body=T[0], covariance=np.diag([1e-4, 1e-4, 1e-6]), status="lost",
+            detail="no returns",
+        ),
+        Correction(stamp_ns=17, T_map_odom=T[1], optimisation=3),
+        Anchors(stamp_ns=18, anchor_ids=np.array([0, 7]), T_map_anchor=T, optimisation=3),
+        Grid(
+            stamp_ns=19, resolution_m=0.05, origin_m=np.array([-1.0, 2.0]),
+            occupancy=np.array([[-1, 0, 100]], np.int8), changed=(0, 1, 1, 3),
+        ),
+        Tick(stamp_ns=20, count=5),
+        Health(
+            stamp_ns=21, node="depth", instance="00ff", epoch=2, state="active",
+            inputs=(InputHealth(topic="rig", received=1, dropped=2, lost=3, undecodable=4, stale=5, age_ms=6.0),),
+            outputs=(OutputHealth(topic="rig", sent=1, bytes=2),),
+            step_p50_ms=1.0, step_p95_ms=2.0, rss_mb=3.0, cpu_percent=4.0, detail="warm",
+        ),
+    ]  # fmt: skip
+
+
+def assert_equal(a: object, b: object) -> None:
+    """Deep equality with NaN equal to NaN, arrays by value, shape and dtype."""
+    assert type(a) is type(b)
+    if isinstance(a, np.ndarray):
+        assert a.dtype == b.dtype
+        np.testing.assert_array_equal(a, b)
+    elif hasattr(a, "model_fields_set"):
+        for name in type(a).model_fields:
+            assert_equal(getattr(a, name), getattr(b, name))
+    elif isinstance(a, tuple):
+        assert len(a) == len(b)
+        for x, y in zip(a, b):
+            assert_equal(x, y)
+    else:
+        assert a == b

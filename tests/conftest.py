@@ -1,0 +1,24 @@
+"""Fixtures that all tests share."""
+
+import socket
+from pathlib import Path
+
+import pytest
+
+SHARED = Path(__file__).resolve().parents[2] / "shared"
+
+
+@pytest.fixture(scope="session")
+def shared_dir() -> Path:
+    """Recordings with truth and network weights, which the repository does not contain."""
+    if not (SHARED / "data").is_dir():
+        pytest.skip("needs the shared recordings, which are not part of the repository")
+    return SHARED
+
+
+@pytest.fixture
+def free_endpoint() -> str:
+    """A loopback endpoint nobody listens on."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
