@@ -1,0 +1,241 @@
+"""Triangle meshes with materials, and the builder every piece of furniture is made with.
+
+A surface is finely tessellated because light is baked per vertex: the builder's `edge_m` is the
+resolution of shadows, not of shape.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+BAKE_OFFSET_M = 0.004  # light is gathered this far in front of the surface
+BAKE_INSET_M = 0.012  # and this far from the rim of a flat piece: a rim lies in its neighbour
+
+
+@dataclass(frozen=True)
+class Material:
+    """What a triangle looks like: a texture by name, multiplied by a linear RGB tint."""
+
+    texture: str = "plain"
+    tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    emission: float = 0.0  # radiance = emission * albedo, besides reflected light
+    glass: bool = False  # a lidar beam may pass; the camera sees what the pane shows
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """Geometry in metres; V vertices, F triangles; front faces are counter-clockwise."""
+
+    vertices_m: np.ndarray  # float32 [V, 3]
+    normals: np.ndarray  # float32 [V, 3]
+    bake_points_m: np.ndarray  # float32 [V, 3], where light is gathered for each vertex
+    uvs: np.ndarray  # float32 [V, 2], in texture repeats, v up
+    triangles: np.ndarray  # int32 [F, 3]
+    material: np.ndarray  # int32 [F], into materials
+    surface: np.ndarray  # int32 [F], same number = same smooth surface
+    materials: tuple[Material, ...]
+
+    def posed(self, vertices_m: np.ndarray, normals: np.ndarray) -> Mesh:
+        """The same mesh with moved vertices."""
+        return replace(
+            self,
+            vertices_m=vertices_m.astype(np.float32),
+            normals=normals.astype(np.float32),
+            bake_points_m=vertices_m.astype(np.float32),
+        )
+
+
+def merge(meshes: Iterable[Mesh]) -> Mesh:
+    """One mesh of several; materials and surfaces are renumbered."""
+    parts = list(meshes)
+    vertices = np.cumsum([0, *(len(p.vertices_m) for p in parts)])
+    materials = np.cumsum([0, *(len(p.materials) for p in parts)])
+    surfaces = np.cumsum([0, *(int(p.surface.max(initial=-1)) + 1 for p in parts)])
+    return Mesh(
+        vertices_m=np.concatenate([p.vertices_m for p in parts]),
+        normals=np.concatenate([p.normals for p in parts]),
+        bake_points_m=np.concatenate([p.bake_points_m for p in parts]),
+        uvs=np.concatenate([p.uvs for p in parts]),
+        triangles=np.concatenate([p.triangles + np.int32(o) for p, o in zip(parts, vertices)]),
+        material=np.concatenate([p.material + np.int32(o) for p, o in zip(parts, materials)]),
+        surface=np.concatenate([p.surface + np.int32(o) for p, o in zip(parts, surfaces)]),
+        materials=tuple(m for p in parts for m in p.materials),
+    )
+
+
+@dataclass(frozen=True)
+class Light:
+    """A shining patch: a parallelogram (a window), or a ball where `right` and `up` are zero."""
+
+    centre_m: tuple[float, float, float]
+    right_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # half extent
+    up_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    radius_m: float = 0.0
+    intensity: tuple[float, float, float] = (1.0, 1.0, 1.0)  # irradiance at 1 m, facing it
+
+
+@dataclass
+class _Store:
+    """What all views of one builder share."""
+
+    lights: list[Light] = field(default_factory=list)
+    pieces: list[tuple[np.ndarray, ...]] = field(default_factory=list)
+    materials: dict[Material, int] = field(default_factory=dict)
+    vertices: int = 0
+    surfaces: int = 0
+
+
+class MeshBuilder:
+    """Collects pieces given in a local frame (x right, y away, z up); `placed` gives a moved frame."""
+
+    def __init__(self, texture_size_m: dict[str, tuple[float, float]], edge_m: float = 0.11) -> None:
+        self.texture_size_m = texture_size_m
+        self.edge_m = edge_m
+        self._store = _Store()
+        self._R = np.eye(3)
+        self._t = np.zeros(3)
+
+    def placed(
+        self, x_m: float, y_m: float, z_m: float = 0.0, yaw_rad: float = 0.0, edge_m: float | None = None
+    ) -> MeshBuilder:
+        """A builder in a frame at (x, y, z), turned left by yaw, filling the same mesh."""
+        child = MeshBuilder.__new__(MeshBuilder)
+        child.texture_size_m, child._store = self.texture_size_m, self._store
+        child.edge_m = self.edge_m if edge_m is None else edge_m
+        cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
+        child._R = self._R @ np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+        child._t = self._t + self._R @ np.array([x_m, y_m, z_m])
+        return child
+
+    def tilted(self, axis: str, angle_rad: float) -> MeshBuilder:
+        """A builder turned about this frame's x, y or z axis."""
+        child = self.placed(0.0, 0.0)
+        cos, sin = np.cos(angle_rad), np.sin(angle_rad)
+        i, j = {"x": (1, 2), "y": (2, 0), "z": (0, 1)}[axis]
+        R = np.eye(3)
+        R[i, i] = R[j, j] = cos
+        R[i, j], R[j, i] = -sin, sin
+        child._R = self._R @ R
+        return child
+
+    def add(
+        self,
+        vertices: np.ndarray,  # [V, 3] local metres
+        normals: np.ndarray,  # [V, 3] local, unit
+        uvs: np.ndarray,  # [V, 2] texture repeats
+        triangles: np.ndarray,  # [F, 3]
+        material: Material,
+        bake_points: np.ndarray | None = None,
+    ) -> None:
+        """One smooth surface."""
+        store = self._store
+        number = store.materials.setdefault(material, len(store.materials))
+        bake = vertices if bake_points is None else bake_points
+        bake = bake + BAKE_OFFSET_M * normals
+        store.pieces.append(
+            (
+                vertices @ self._R.T + self._t,
+                normals @ self._R.T,
+                bake @ self._R.T + self._t,
+                uvs,
+                triangles + store.vertices,
+                np.full(len(triangles), number),
+                np.full(len(triangles), store.surfaces),
+            )
+        )
+        store.vertices += len(vertices)
+        store.surfaces += 1
+
+    def quad(
+        self,
+        origin: np.ndarray,
+        right: np.ndarray,
+        up: np.ndarray,
+        material: Material,
+        *,
+        fit: bool = False,
+        offset: tuple[float, float] | None = None,
+        turn: bool = False,
+        edge_m: float | None = None,
+    ) -> None:
+        """A parallelogram seen from its front with `origin` lower left.
+
+        `fit` stretches the texture over it once; otherwise it repeats in its own size in metres, from
+        `offset` (in repeats; None: somewhere else for each piece). `turn` lays the texture's u axis along `up`.
+        """
+        origin, right, up = (np.asarray(v, dtype=np.float64) for v in (origin, right, up))
+        width, height = float(np.linalg.norm(right)), float(np.linalg.norm(up))
+        if width < 1e-6 or height < 1e-6:
+            return
+        edge = edge_m or self.edge_m
+        columns, rows = int(np.ceil(width / edge)) + 1, int(np.ceil(height / edge)) + 1
+        s, t = np.meshgrid(np.linspace(0.0, 1.0, columns), np.linspace(0.0, 1.0, rows))
+        s, t = s.ravel()[:, None], t.ravel()[:, None]
+        inset_s, inset_t = min(BAKE_INSET_M / width, 0.3), min(BAKE_INSET_M / height, 0.3)
+        bake = origin + np.clip(s, inset_s, 1 - inset_s) * right + np.clip(t, inset_t, 1 - inset_t) * up
+        normal = np.cross(right, up)
+        normal /= np.linalg.norm(normal)
+        uv = np.hstack([s, t])
+        if not fit:
+            size = self.texture_size_m[material.texture]
+            metres = np.hstack([t * height, s * width]) if turn else np.hstack([s * width, t * height])
+            k = self._store.surfaces
+            shift = (k * 0.6180339 % 1.0, k * 0.7548776 % 1.0) if offset is None else offset
+            uv = metres / np.array(size) + np.array(shift)
+        self.add(
+            origin + s * right + t * up,
+            np.broadcast_to(normal, (len(s), 3)),
+            uv,
+            grid_triangles(rows, columns),
+            material,
+            bake,
+        )
+
+    def lamp(self, at: tuple[float, float, float], radius_m: float, power: float, tint: np.ndarray) -> None:
+        """A ball of light; its fixture's geometry must lie inside the radius."""
+        centre = tuple((self._R @ np.asarray(at, dtype=np.float64) + self._t).tolist())
+        intensity = tuple((power * np.asarray(tint, dtype=np.float64)).tolist())
+        self._store.lights.append(Light(centre, radius_m=radius_m, intensity=intensity))
+
+    def window(self, origin: np.ndarray, right: np.ndarray, up: np.ndarray, radiance: np.ndarray) -> None:
+        """A pane that lets daylight in; arguments as for `quad`."""
+        origin, right, up = (np.asarray(v, dtype=np.float64) for v in (origin, right, up))
+        centre = self._R @ (origin + right / 2 + up / 2) + self._t
+        area = float(np.linalg.norm(np.cross(right, up)))
+        self._store.lights.append(
+            Light(
+                tuple(centre.tolist()),
+                tuple((self._R @ right / 2).tolist()),
+                tuple((self._R @ up / 2).tolist()),
+                intensity=tuple((area * np.asarray(radiance)).tolist()),
+            )
+        )
+
+    @property
+    def lights(self) -> tuple[Light, ...]:
+        return tuple(self._store.lights)
+
+    def build(self) -> Mesh:
+        """Everything collected so far."""
+        columns = [np.concatenate(column) for column in zip(*self._store.pieces)]
+        vertices, normals, bake, uvs, triangles, material, surface = columns
+        return Mesh(
+            vertices.astype(np.float32),
+            normals.astype(np.float32),
+            bake.astype(np.float32),
+            uvs.astype(np.float32),
+            triangles.astype(np.int32),
+            material.astype(np.int32),
+            surface.astype(np.int32),
+            tuple(self._store.materials),
+        )
+
+
+def grid_triangles(rows: int, columns: int) -> np.ndarray:
+    """[2 (rows-1) (columns-1), 3] over a row-major grid whose rows go up and columns right."""
+    index = np.arange(rows * columns).reshape(rows, columns)
+    a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]
+    return np.stack([a, b, c, a, c, d], axis=-1).reshape(-1, 3)
