@@ -1,8 +1,7 @@
 """ROS messages (1 and 2 alike) as ours, field by field.
 
 `fields_of(cls, ros_message)` gives the fields that the ROS message carries, without checking them: the
-reader of our own recordings adds those ROS has no room for. `message_of` is for foreign bags: checked,
-and complete.
+reader of our own recordings adds those ROS has no room for; a foreign bag must do with what is there.
 """
 
 from __future__ import annotations
@@ -15,25 +14,8 @@ from common import messages as m
 from common.recording.picture import picture_head
 from common.recording.ros_types import stamp_ns_of, transform_of
 
-# ROS types that carry each of our messages, best first.
-ROS_TYPES: dict[type[m.Message], tuple[str, ...]] = {
-    m.Image: ("sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/Image"),
-    m.Scan: ("sensor_msgs/msg/LaserScan",),
-    m.WheelOdometry: ("nav_msgs/msg/Odometry",),
-    m.ExternalPose: ("geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped"),
-}
-
 # OpenCV's names for what ROS also calls by its colours.
 _ENCODINGS = {"8UC3": "bgr8", "8UC1": "mono8", "8UC4": "bgra8", "yuyv": "yuv422_yuy2"}
-
-
-def message_of(cls: type[m.Message], ros_message: Any) -> m.Message:
-    """Our message of class `cls`.
-
-    Raises:
-        ValueError: what the ROS message holds is not acceptable; says which field and why.
-    """
-    return cls.model_validate(fields_of(cls, ros_message))
 
 
 def fields_of(cls: type[m.Message], ros_message: Any) -> dict[str, Any]:

@@ -69,7 +69,7 @@ class RecordingWriter:
     crash can cost.
 
     Raises:
-        UserError: the path exists already, or cannot be made.
+        UserError: the path exists already (unless `overwrite`), or cannot be made.
     """
 
     def __init__(
@@ -80,6 +80,7 @@ class RecordingWriter:
         chunk_s: float = 1.0,
         compression: CompressionType = CompressionType.ZSTD,
         sync: bool = False,
+        overwrite: bool = False,
     ) -> None:
         self.path = Path(path)
         self.counts: Counter[str] = Counter()  # messages written, by our topic
@@ -97,7 +98,7 @@ class RecordingWriter:
         self._times_ns: list[int] = []  # first and last log time
         self._failure = ""
         self._closed = False
-        self.file_path = self._make_path()
+        self.file_path = self._make_path(overwrite)
         self._file = _File(self.file_path)
         # Chunks end in `flush` only, between two messages: a message and its fields stay together.
         self._writer = Writer(self._file, chunk_size=2**62, compression=compression)
@@ -165,19 +166,20 @@ class RecordingWriter:
     ) -> None:
         self.close()
 
-    def _make_path(self) -> Path:
-        if self.path.exists():
-            raise UserError(
-                f"{self.path}: exists already; recordings are never overwritten, choose another name"
-            )
+    def _make_path(self, overwrite: bool) -> Path:
+        single = self.path.suffix == ".mcap"
+        file = self.path if single else self.path / f"{self.path.name}_0.mcap"
+        if self.path.exists() and not overwrite:
+            raise UserError(f"{self.path}: exists already and is not overwritten; choose another name")
         try:
-            if self.path.suffix == ".mcap":
-                self.path.parent.mkdir(parents=True, exist_ok=True)
-                return self.path
-            self.path.mkdir(parents=True)
+            file.parent.mkdir(parents=True, exist_ok=True)
+            if overwrite:  # takes away what a recording of this name consists of, nothing else
+                file.unlink(missing_ok=True)
+                if not single:
+                    (self.path / "metadata.yaml").unlink(missing_ok=True)
         except OSError as error:
             raise UserError(f"{self.path}: cannot be made: {error.strerror}") from error
-        return self.path / f"{self.path.name}_0.mcap"
+        return file
 
     def _write_records(
         self, topic: str, message: Message, log_time_ns: int, header: Header | None, sequence: int

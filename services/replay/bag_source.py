@@ -1,0 +1,258 @@
+"""A foreign ROS bag as a source of our messages."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from common.errors import UserError
+from common.recording.ros_types import transform_of
+from common.recording.sensors import SENSORS, build, ros_fields
+from common.rig import RigFile, load_rig
+from services.replay import calibration as cal
+from services.replay.bags import Bag, BagTopic, RawMessage, deserialize, knows
+from services.replay.choose import choose_camera_info, choose_topics
+from services.replay.options import SourceOptions
+from services.replay.static_frames import StaticFrames, clean
+
+TF_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
+_PICTURES = ("rgb8", "bgr8", "rgba8", "bgra8", "mono8", "yuv422_yuy2", "jpeg", "png")
+_PEEK = 5  # messages looked at before a topic counts as broken
+
+
+class BagSource:
+    """Messages of the chosen topics by receive time, and the calibration found or given.
+
+    Raises:
+        UserError: required topics or calibration missing, or contradictory.
+    """
+
+    def __init__(self, bag: Bag, options: SourceOptions) -> None:
+        self.bag = bag
+        self.options = options
+        self.where = str(bag.path)
+        self.skipped: Counter[str] = Counter()  # messages that do not decode or are refused, by topic
+        self.unstamped: Counter[str] = Counter()  # stamp zero: the receive time stands in
+        self.first_fault: dict[str, str] = {}
+        self.chosen = choose_topics(bag.topics, options, self.where, self._is_picture)
+        self._first = {word: self._peek(topic) for word, topic in self.chosen.items()}
+        self.frames = StaticFrames()
+        self.calibration = cal.Calibration()
+        self._calibrated = False
+        self._T_child_body = np.eye(4)
+
+    @property
+    def start_ns(self) -> int:
+        return self.bag.start_ns
+
+    @property
+    def end_ns(self) -> int:
+        return self.bag.end_ns
+
+    @property
+    def problems(self) -> list[str]:
+        """Plain sentences about what was passed over or stood in for."""
+        found = list(self.bag.problems)
+        for name, count in sorted(self.skipped.items()):
+            found.append(f"{name}: {count} messages passed over, the first because: {self.first_fault[name]}")
+        found += [
+            f"{name}: {count} messages have no stamp; the receive time stands in"
+            for name, count in sorted(self.unstamped.items())
+        ]
+        return found
+
+    def expected(self) -> int:
+        """How many messages the chosen topics hold."""
+        return sum(topic.count for topic in self.chosen.values())
+
+    def rig(self) -> Any:
+        """The calibration as the message `Rig`; see `rig_file`."""
+        rig = self.rig_file()
+        return rig.message(self.start_ns, rig.source)
+
+    def rig_file(self) -> RigFile:
+        """The calibration: the rig file given by option, else what the bag tells.
+
+        Raises:
+            UserError: incomplete, or not of this picture size; one sentence says all that is missing.
+        """
+        self.calibrate()
+        picture = self._picture_px()
+        if self.options.rig is not None:
+            rig = load_rig(self.options.rig)
+            self._check_rig(rig, picture)
+            return rig.model_copy(update={"source": rig.source or str(self.options.rig)})
+        if self.calibration.missing:
+            missing = "; ".join(self.calibration.missing)
+            raise UserError(
+                f"{self.where}: calibration is missing: {missing}; give a rig file (`beamsplat rig` writes "
+                'a first one) with rig = "rig.toml"'
+            )
+        return self.calibration.rig(self.where)
+
+    def calibrate(self) -> cal.Calibration:
+        """What the bag tells about intrinsics and mounts; fills `frames` on the way."""
+        if self._calibrated:
+            return self.calibration
+        self._calibrated = True
+        sensor_frames = {
+            sensor: clean(self._first[word].header.frame_id)
+            for sensor, word in (("camera", "image"), ("lidar", "scan"))
+            if word in self._first
+        }
+        odometry = self._first.get("odometry")
+        child = clean(odometry.child_frame_id) if odometry is not None else ""
+        self._read_frames(static=True)
+        if (
+            any(self.frames.find(child or f, f) is None for f in sensor_frames.values())
+            or not self.frames.names
+        ):
+            self._read_frames(static=False)
+        if "image" in self.chosen and self.options.rig is None:
+            self._find_intrinsics()
+        cal.find_mounts(
+            self.calibration,
+            self.frames,
+            sensor_frames,
+            child,
+            self.options.body_frame,
+            self.options.assume_mounts,
+        )
+        if child and self.calibration.body_frame:
+            T = self.frames.find(child, self.calibration.body_frame)
+            self._T_child_body = np.eye(4) if T is None else T
+        return self.calibration
+
+    def messages(self, start_ns: int = 0, stop_ns: int | None = None) -> Iterator[tuple[int, str, Any]]:
+        """(receive time, our topic, message) with start_ns <= receive time < stop_ns, in that order."""
+        words = {topic.name: word for word, topic in self.chosen.items()}
+        for raw in self.bag.messages(list(words), start_ns, stop_ns):
+            sensor = SENSORS[words[raw.topic]]
+            try:
+                fields = ros_fields(sensor.topic, deserialize(raw))
+                if fields["stamp_ns"] == 0:
+                    fields["stamp_ns"] = raw.at_ns
+                    self.unstamped[raw.topic] += 1
+                if sensor.word == "odometry":
+                    self._to_body(fields)
+                message = build(sensor.topic, fields)
+            except ValueError as error:
+                self.skipped[raw.topic] += 1
+                self.first_fault.setdefault(raw.topic, _first_line(error))
+                continue
+            yield raw.at_ns, sensor.topic, message
+
+    def close(self) -> None:
+        self.bag.close()
+
+    def _peek(self, topic: BagTopic) -> Any:
+        """First message of a topic that decodes."""
+        for count, raw in enumerate(self.bag.messages([topic.name])):
+            try:
+                return deserialize(raw)
+            except ValueError as error:
+                if count >= _PEEK:
+                    raise UserError(
+                        f"{self.where}: {topic.name} holds no {topic.type_name}: {error}"
+                    ) from error
+        raise UserError(f"{self.where}: {topic.name} holds no message that decodes")
+
+    def _is_picture(self, topic: BagTopic) -> bool:
+        """Raw image topics also carry depth maps and masks; their encoding tells."""
+        try:
+            fields = ros_fields("camera/image", self._peek(topic))
+        except UserError:
+            return True  # let whoever reads it say what is wrong
+        if topic.type_name == "sensor_msgs/msg/CompressedImage":
+            return "width_px" in fields
+        return fields["encoding"] in _PICTURES
+
+    def _picture_px(self) -> tuple[int, int] | None:
+        if "image" not in self._first:
+            return None
+        fields = ros_fields("camera/image", self._first["image"])
+        if "width_px" not in fields:
+            name = self.chosen["image"].name
+            raise UserError(f"{self.where}: {name} starts with a picture that is neither JPEG nor PNG")
+        return fields["width_px"], fields["height_px"]
+
+    def _find_intrinsics(self) -> None:
+        image = self.chosen["image"]
+        info = choose_camera_info(self.bag.topics, image, self.options.camera_info_topic, self.where)
+        if info is None:
+            self.calibration.missing.append(
+                f"there are pictures on {image.name} but no sensor_msgs/CameraInfo with the camera's K"
+            )
+            return
+        self.calibration.camera = cal.intrinsics(self._peek(info), self._picture_px(), image.name, self.where)
+        if self.calibration.camera is None:
+            self.calibration.missing.append(f"K on {info.name} is all zero: this camera was never calibrated")
+        else:
+            K = self.calibration.camera
+            self.calibration.found.append(
+                f"K from {info.name}: fx {K['fx_px']:.1f}, fy {K['fy_px']:.1f}, cx {K['cx_px']:.1f}, "
+                f"cy {K['cy_px']:.1f} px for {K['width_px']}x{K['height_px']}, "
+                f"distortion {K['distortion_model']}"
+            )
+
+    def _read_frames(self, *, static: bool) -> None:
+        """Fixed transforms of /tf_static, or those of /tf that never change."""
+        names = [
+            topic.name
+            for topic in self.bag.topics
+            if topic.type_name in TF_TYPES and topic.name.endswith("tf_static") == static
+        ]
+        if not names:
+            return
+        for raw in self.bag.messages(names):
+            for parent, child, T in _transforms(raw):
+                self.frames.add(parent, child, T, replace=static)
+
+    def _check_rig(self, rig: RigFile, picture: tuple[int, int] | None) -> None:
+        for word, sensor in (("image", "camera"), ("scan", "lidar")):
+            if word in self.chosen and getattr(rig, sensor) is None:
+                raise UserError(
+                    f"{self.options.rig}: has no [{sensor}], but {self.where} has {self.chosen[word].name}; "
+                    f'add it, or set without = ["{word}"]'
+                )
+        if rig.camera and picture and (rig.camera.width_px, rig.camera.height_px) != picture:
+            raise UserError(
+                f"{self.options.rig}: K is for {rig.camera.width_px}x{rig.camera.height_px} px but the "
+                f"pictures of {self.where} are {picture[0]}x{picture[1]} px; calibrate at this size"
+            )
+
+    def _to_body(self, fields: dict[str, Any]) -> None:
+        """Odometry of another point of the robot (a base_link above the floor) moved to the body."""
+        T = self._T_child_body
+        if np.array_equal(T, np.eye(4)):
+            return
+        R_body_child, lever_m = T[:3, :3].T, T[:3, 3]
+        turning = fields["angular_velocity_rad_s"]
+        fields["T_odom_body"] = fields["T_odom_body"] @ T
+        fields["velocity_m_s"] = R_body_child @ (fields["velocity_m_s"] + np.cross(turning, lever_m))
+        fields["angular_velocity_rad_s"] = R_body_child @ turning
+
+
+def _transforms(raw: RawMessage) -> Iterator[tuple[str, str, np.ndarray]]:
+    """(parent, child, T_parent_child) of a TFMessage; broken ones are passed over."""
+    if not knows(raw.type_name, raw.encoding):
+        return
+    try:
+        message = deserialize(raw)
+        for stamped in message.transforms:
+            T = transform_of(stamped.transform.translation, stamped.transform.rotation)
+            if np.all(np.isfinite(T)):
+                yield stamped.header.frame_id, stamped.child_frame_id, T
+    except ValueError:
+        return
+
+
+def _first_line(error: Exception) -> str:
+    """Field and reason of a refused message, in a few words."""
+    if hasattr(error, "errors"):
+        fault = error.errors(include_url=False, include_input=False)[0]
+        return f"{'.'.join(str(part) for part in fault['loc'])}: {fault['msg']}"
+    return str(error).split("\n")[0][:200]

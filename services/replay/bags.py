@@ -1,0 +1,286 @@
+"""Any ROS bag as one thing: topics with types and counts, raw messages in order of arrival.
+
+ROS 1 (.bag, or a folder of splits), ROS 2 sqlite (.db3), MCAP (.mcap), and ROS 2 folders with or
+without metadata.yaml. What goes wrong is said in one sentence that names the file.
+"""
+
+from __future__ import annotations
+
+import heapq
+import sqlite3
+import struct
+from collections.abc import Collection, Iterator
+from contextlib import ExitStack, suppress
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import apsw
+from rosbags.rosbag1 import Reader as Reader1
+from rosbags.rosbag1 import ReaderError as ReaderError1
+from rosbags.rosbag2 import Reader as Reader2
+from rosbags.rosbag2 import ReaderError as ReaderError2
+from rosbags.serde import SerdeError
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
+
+from common.errors import UserError
+from common.recording.mcap_file import McapFile
+
+# What the readers raise on damaged files, beyond their own errors.
+_DAMAGE = (
+    ReaderError1, ReaderError2, apsw.Error, sqlite3.Error, OSError, AssertionError, KeyError, IndexError,
+    ValueError, struct.error, EOFError, RuntimeError, TypeError, MemoryError, OverflowError,
+)  # fmt: skip
+_RUBBISH = (
+    SerdeError, ValueError, struct.error, IndexError, AssertionError, OverflowError, MemoryError, TypeError,
+)  # fmt: skip
+_COPY_AGAIN = "copy it again from where it was recorded"
+
+
+class BagTopic(NamedTuple):
+    """One topic of a bag; `type_name` in the form pkg/msg/Type for ROS 1 too."""
+
+    name: str
+    type_name: str
+    count: int
+    encoding: str  # "cdr", "ros1", or something nobody here decodes
+
+
+class RawMessage(NamedTuple):
+    """One message as stored; `at_ns` is its receive time."""
+
+    at_ns: int
+    topic: str
+    type_name: str
+    data: bytes
+    encoding: str
+
+
+@cache
+def _store(encoding: str) -> Typestore:
+    if encoding != "ros1":
+        return get_typestore(Stores.ROS2_JAZZY)
+    store = get_typestore(Stores.ROS1_NOETIC)  # comes without tf
+    for name in ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage"):
+        if name not in store.types:
+            store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", name))
+    return store
+
+
+def knows(type_name: str, encoding: str) -> bool:
+    """Whether messages of this type can be deserialised."""
+    return encoding in ("cdr", "ros1") and type_name in _store(encoding).types
+
+
+def deserialize(message: RawMessage) -> Any:
+    """The ROS message as an object with the fields of its definition.
+
+    Raises:
+        ValueError: the bytes are not that message.
+    """
+    store = _store(message.encoding)
+    read = store.deserialize_ros1 if message.encoding == "ros1" else store.deserialize_cdr
+    try:
+        return read(message.data, message.type_name)
+    except _RUBBISH as error:
+        raise ValueError(f"not a {message.type_name}: {error}") from error
+
+
+class Bag:
+    """An open bag. `problems` holds sentences about what is missing.
+
+    Raises:
+        UserError: no such file, not a bag, truncated (unless `allow_truncated`), or without messages.
+    """
+
+    def __init__(self, path: Path, *, allow_truncated: bool = False) -> None:
+        self.path = Path(path)
+        self.problems: list[str] = []
+        self._stack = ExitStack()
+        self._parts: list[_Part] = []
+        try:
+            for file in _files(self.path):
+                self._parts.append(self._open(file, allow_truncated))
+            if not any(topic.count for part in self._parts for topic in part.topics):
+                raise UserError(f"{self.path}: the bag holds no messages; record again")
+        except UserError:
+            self.close()
+            raise
+
+    @property
+    def topics(self) -> list[BagTopic]:
+        """Topics by name, counts summed over the files of the bag."""
+        found: dict[tuple[str, str, str], int] = {}
+        for part in self._parts:
+            for topic in part.topics:
+                key = (topic.name, topic.type_name, topic.encoding)
+                found[key] = found.get(key, 0) + topic.count
+        return [BagTopic(name, kind, count, code) for (name, kind, code), count in sorted(found.items())]
+
+    @property
+    def start_ns(self) -> int:
+        return min(part.span_ns[0] for part in self._parts if part.span_ns)
+
+    @property
+    def end_ns(self) -> int:
+        """Receive time of the last message."""
+        return max(part.span_ns[1] for part in self._parts if part.span_ns)
+
+    def messages(
+        self, topics: Collection[str] | None = None, start_ns: int = 0, stop_ns: int | None = None
+    ) -> Iterator[RawMessage]:
+        """Raw messages with start_ns <= at_ns < stop_ns by receive time.
+
+        Raises:
+            UserError: the file turns out to be damaged here.
+        """
+        stop_ns = 2**63 - 1 if stop_ns is None else stop_ns
+        streams = [part.messages(topics, start_ns, stop_ns) for part in self._parts]
+        last_ns = start_ns
+        try:
+            for message in heapq.merge(*streams, key=lambda raw: raw.at_ns):
+                last_ns = message.at_ns
+                yield message
+        except _DAMAGE as error:
+            if isinstance(error, UserError):
+                raise
+            after_s = (last_ns - self.start_ns) / 1e9
+            raise UserError(
+                f"{self.path}: damaged {after_s:.1f} s after its start ({_reason(error)}); {_COPY_AGAIN}"
+            ) from error
+
+    def close(self) -> None:
+        self._stack.close()
+
+    def __enter__(self) -> Bag:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _open(self, file: Path, allow_truncated: bool) -> _Part:
+        if file.suffix == ".mcap":
+            part = _McapPart(self._stack.enter_context(McapFile(file)))
+            if part.file.truncated:
+                sentence = f"{file}: truncated: {part.file.truncated}"
+                if not allow_truncated:
+                    raise UserError(f"{sentence}; {_COPY_AGAIN}, or set allow_truncated to use what is there")
+                self.problems.append(sentence)
+            return part
+        try:
+            reader = Reader1(file) if file.suffix == ".bag" else Reader2(file)
+            reader.open()
+        except _DAMAGE as error:
+            raise UserError(_explain(file, error)) from error
+        self._stack.callback(_close, reader)
+        return _RosbagsPart(reader)
+
+
+class _Part:
+    """One storage of a bag."""
+
+    topics: list[BagTopic]
+    span_ns: tuple[int, int] | None
+
+    def messages(self, topics: Collection[str] | None, start_ns: int, stop_ns: int) -> Iterator[RawMessage]:
+        raise NotImplementedError
+
+
+class _McapPart(_Part):
+    def __init__(self, file: McapFile) -> None:
+        self.file = file
+        self.span_ns = (file.start_ns, file.end_ns) if file.counts.total() else None
+        self.topics = [
+            BagTopic(channel.topic, self._type_of(channel), file.counts[i], channel.message_encoding)
+            for i, channel in file.channels.items()
+        ]
+
+    def _type_of(self, channel: Any) -> str:
+        schema = self.file.schemas.get(channel.schema_id)
+        if schema is None:
+            return channel.metadata.get("beamsplat.schema", "unknown")
+        package, _, name = schema.name.partition("/")
+        return schema.name if "/msg/" in schema.name or not name else f"{package}/msg/{name}"
+
+    def messages(self, topics: Collection[str] | None, start_ns: int, stop_ns: int) -> Iterator[RawMessage]:
+        ids = [i for i, channel in self.file.channels.items() if topics is None or channel.topic in topics]
+        types = {i: self._type_of(self.file.channels[i]) for i in ids}
+        for channel, message in self.file.messages(ids, start_ns, stop_ns):
+            yield RawMessage(
+                message.log_time, channel.topic, types[channel.id], message.data, channel.message_encoding
+            )
+
+
+class _RosbagsPart(_Part):
+    def __init__(self, reader: Reader1 | Reader2) -> None:
+        self._reader = reader
+        ros1 = isinstance(reader, Reader1)
+        self._encodings = {
+            id(c): "ros1" if ros1 else getattr(c.ext, "serialization_format", "cdr")
+            for c in reader.connections
+        }
+        self.topics = [
+            BagTopic(c.topic, c.msgtype, c.msgcount, self._encodings[id(c)]) for c in reader.connections
+        ]
+        # rosbags' end_time is one past the last message.
+        self.span_ns = (reader.start_time, reader.end_time - 1) if reader.message_count else None
+
+    def messages(self, topics: Collection[str] | None, start_ns: int, stop_ns: int) -> Iterator[RawMessage]:
+        chosen = [c for c in self._reader.connections if topics is None or c.topic in topics]
+        if not chosen:
+            return
+        for connection, at_ns, data in self._reader.messages(chosen, start_ns, stop_ns):
+            encoding = self._encodings.get(id(connection), "cdr")
+            yield RawMessage(at_ns, connection.topic, connection.msgtype, bytes(data), encoding)
+
+
+def looks_like_bag(path: Path) -> bool:
+    """Whether `path` is, by its name or the files in it, a bag of some kind."""
+    if path.is_dir():
+        names = {file.suffix for file in path.iterdir()}
+        return bool(names & {".mcap", ".db3", ".bag", ".zstd"}) or (path / "metadata.yaml").exists()
+    return path.suffix in (".bag", ".mcap", ".db3")
+
+
+def _files(path: Path) -> list[Path]:
+    """The storages to open, by what lies at `path`; a folder that rosbags must open is its own storage."""
+    if not path.exists():
+        raise UserError(f"{path}: no such file or folder; check the path")
+    if path.is_file():
+        if path.suffix not in (".bag", ".mcap", ".db3"):
+            raise UserError(f"{path}: not a bag; expected .bag, .mcap, .db3, or a folder with one of them")
+        return [path]
+    mcaps = sorted(path.glob("*.mcap"))
+    if mcaps:
+        return mcaps
+    if (path / "metadata.yaml").exists():
+        return [path]
+    files = sorted(path.glob("*.db3")) or sorted(path.glob("*.bag"))
+    if not files:
+        raise UserError(f"{path}: not a bag: no metadata.yaml and no .mcap, .db3 or .bag file in this folder")
+    return files
+
+
+def _explain(file: Path, error: Exception) -> str:
+    """One sentence for what a reader said when a bag did not open."""
+    if file.is_file() and file.stat().st_size == 0:
+        return f"{file}: the file is empty; {_COPY_AGAIN}"
+    reason = _reason(error)
+    if "magic" in reason or "file is not a database" in reason or "missing tables" in reason:
+        return f"{file}: not a bag, whatever its name says ({reason})"
+    if "not indexed" in reason:
+        return f"{file}: the recording was not closed; repair it with `rosbag reindex {file.name}`"
+    if isinstance(error, (ReaderError1, apsw.Error, AssertionError, struct.error, IndexError, ValueError)):
+        return f"{file}: truncated or damaged ({reason}); {_COPY_AGAIN}"
+    return f"{file}: cannot be read ({reason}); {_COPY_AGAIN}"
+
+
+def _reason(error: Exception) -> str:
+    text = " ".join(str(argument) for argument in error.args).strip().split("\n")[0]
+    return text.rstrip(".")[:200] or type(error).__name__
+
+
+def _close(reader: Reader1 | Reader2) -> None:
+    with suppress(*_DAMAGE):  # closing a damaged file may complain again
+        reader.close()

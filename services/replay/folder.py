@@ -1,0 +1,220 @@
+"""A plain folder as a source: pictures, scans and poses named or stamped in nanoseconds.
+
+    images/<stamp_ns>.jpg | .png
+    lasers/<stamp_ns>.pcd      or   scans.csv
+    odometry.txt               TUM, T_odom_body
+    poses.txt                  TUM, T_map_body
+    rig.toml                   calibration (common/rig.py)
+    folder.toml                optional: range_min_m, range_max_m, scan_time_s of the PCD scans
+
+docs/recordings.md describes them. There are no receive times: what was measured at t arrives at t.
+"""
+
+from __future__ import annotations
+
+import heapq
+import tomllib
+from collections import Counter
+from collections.abc import Iterator
+from operator import itemgetter
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import Field
+
+from common.config import Config, parse
+from common.errors import UserError
+from common.geometry import so3_log
+from common.recording.picture import picture_head
+from common.recording.sensors import SENSORS, build
+from common.rig import load_rig
+from common.trajectory import Trajectory, read_tum
+from services.replay.folder_scans import CsvScans, scan_from_points, xy_from_pcd
+from services.replay.options import SourceOptions
+
+_PICTURES = (".jpg", ".jpeg", ".png")
+Stamped = tuple[int, str, Any]
+
+
+class FolderFile(Config):
+    """folder.toml: what PCD files do not say about the lidar."""
+
+    range_min_m: Annotated[float, Field(ge=0.0, allow_inf_nan=False)] = 0.02
+    range_max_m: Annotated[float, Field(gt=0.0, allow_inf_nan=False)] = 30.0
+    scan_time_s: Annotated[float, Field(ge=0.0, allow_inf_nan=False)] = 0.0
+
+
+def looks_like_folder(path: Path) -> bool:
+    """Whether `path` holds any of the files of this layout."""
+    names = ("images", "lasers", "scans.csv", "odometry.txt", "poses.txt")
+    return path.is_dir() and any((path / name).exists() for name in names)
+
+
+class FolderSource:
+    """Messages of a plain folder by stamp.
+
+    Raises:
+        UserError: a file that does not fit the layout, or something required is missing.
+    """
+
+    def __init__(self, path: Path, options: SourceOptions) -> None:
+        self.path = Path(path)
+        self.where = str(path)
+        self.options = options
+        self.skipped: Counter[str] = Counter()
+        self.first_fault: dict[str, str] = {}
+        self._settings = self._read_settings()
+        self._streams = {
+            word: stream for word, stream in self._find_streams().items() if word not in options.without
+        }
+        for word in sorted(options.require - options.without):
+            if not self._streams.get(word):
+                there = ", ".join(word for word, stream in self._streams.items() if stream) or "nothing"
+                raise UserError(
+                    f"{path}: has no {word}; it holds {there}. Use another recording, or set "
+                    f'without = ["{word}"] if the deployment does not need one'
+                )
+        stamps = [stamp for stream in self._streams.values() for stamp, _ in stream]
+        if not stamps:
+            raise UserError(f"{path}: the folder holds no pictures, scans or poses")
+        self.start_ns, self.end_ns = min(stamps), max(stamps)
+
+    @property
+    def problems(self) -> list[str]:
+        return [
+            f"{self.where}: {word}: {count} passed over, the first because: {self.first_fault[word]}"
+            for word, count in sorted(self.skipped.items())
+        ]
+
+    def counts(self) -> dict[str, int]:
+        """Files or rows by word ("image", "scan", ...)."""
+        return {word: len(stream) for word, stream in self._streams.items() if stream}
+
+    def expected(self) -> int:
+        return sum(self.counts().values())
+
+    def rig(self) -> Any:
+        """The calibration as the message `Rig`, from the option or from rig.toml in the folder.
+
+        Raises:
+            UserError: neither is there, or K is of another picture size.
+        """
+        file = self.options.rig or self.path / "rig.toml"
+        if self.options.rig is None and not file.exists():
+            raise UserError(
+                f"{self.where}: calibration is missing: no rig.toml in the folder; put one there or give "
+                'one with rig = "rig.toml" (`beamsplat rig` writes a first one)'
+            )
+        rig = load_rig(file)
+        images = self._streams.get("image")
+        if images and rig.camera is None:
+            raise UserError(f'{file}: has no [camera] for the pictures; add it, or set without = ["image"]')
+        if images:
+            head = picture_head(images[0][1].read_bytes())
+            size = (rig.camera.width_px, rig.camera.height_px)
+            if head is not None and head[1:] != size:
+                raise UserError(
+                    f"{file}: K is for {size[0]}x{size[1]} px but {images[0][1]} is {head[1]}x{head[2]} px; "
+                    "calibrate at this size"
+                )
+        return rig.message(self.start_ns, rig.source or str(file))
+
+    def messages(self, start_ns: int = 0, stop_ns: int | None = None) -> Iterator[Stamped]:
+        """(stamp, our topic, message) with start_ns <= stamp < stop_ns, by stamp."""
+        stop_ns = 2**63 if stop_ns is None else stop_ns
+        makers = {
+            "image": self._image, "scan": self._scan, "odometry": self._odometry, "pose": self._pose,
+        }  # fmt: skip
+        streams = [
+            self._stream(word, [entry for entry in stream if start_ns <= entry[0] < stop_ns], makers[word])
+            for word, stream in self._streams.items()
+        ]
+        yield from heapq.merge(*streams, key=itemgetter(0))
+
+    def close(self) -> None:
+        pass
+
+    def _stream(self, word: str, entries: list[tuple[int, Any]], make: Any) -> Iterator[Stamped]:
+        topic = SENSORS[word].topic
+        for stamp_ns, entry in entries:
+            try:
+                message = build(topic, {"stamp_ns": stamp_ns, **make(entry)})
+            except (ValueError, OSError) as error:
+                self.skipped[word] += 1
+                self.first_fault.setdefault(word, str(error).split("\n")[0][:200])
+                continue
+            yield stamp_ns, topic, message
+
+    def _find_streams(self) -> dict[str, list[tuple[int, Any]]]:
+        pcds = _stamped_files(self.path / "lasers", (".pcd",))
+        csv = self.path / "scans.csv"
+        if pcds and csv.exists():
+            raise UserError(f"{self.path}: has both lasers/ and scans.csv; keep one of them")
+        self._csv = CsvScans(csv) if csv.exists() else None
+        streams: dict[str, list[tuple[int, Any]]] = {
+            "image": _stamped_files(self.path / "images", _PICTURES),
+            "scan": self._csv.rows if self._csv else pcds,
+        }
+        for word, name in (("odometry", "odometry.txt"), ("pose", "poses.txt")):
+            if (self.path / name).exists():
+                poses = read_tum(self.path / name)
+                made = _with_velocity(poses) if word == "odometry" else poses.T_a_b
+                streams[word] = list(zip(poses.stamps_ns.tolist(), made))
+        return streams
+
+    def _read_settings(self) -> FolderFile:
+        file = self.path / "folder.toml"
+        if not file.exists():
+            return FolderFile()
+        try:
+            return parse(FolderFile, tomllib.loads(file.read_text()), str(file))
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+            raise UserError(f"{file}: not a TOML file: {error}") from error
+
+    def _image(self, file: Path) -> dict[str, Any]:
+        data = np.fromfile(file, np.uint8)
+        head = picture_head(data.data)
+        if head is None:
+            raise ValueError(f"{file.name} is neither JPEG nor PNG")
+        return {**head._asdict(), "data": data}
+
+    def _scan(self, entry: Any) -> dict[str, Any]:
+        if self._csv is not None:
+            return self._csv.fields(entry)
+        settings = self._settings
+        points = xy_from_pcd(entry.read_bytes(), entry.name)
+        return scan_from_points(points, settings.range_min_m, settings.range_max_m, settings.scan_time_s)
+
+    @staticmethod
+    def _odometry(entry: tuple[np.ndarray, np.ndarray, np.ndarray]) -> dict[str, Any]:
+        return dict(zip(("T_odom_body", "velocity_m_s", "angular_velocity_rad_s"), entry))
+
+    @staticmethod
+    def _pose(T_map_body: np.ndarray) -> dict[str, Any]:
+        return {"T_map_body": T_map_body}
+
+
+def _stamped_files(folder: Path, endings: tuple[str, ...]) -> list[tuple[int, Path]]:
+    """(stamp, file) by stamp; a name that is not a stamp is an error, not a guess."""
+    found = []
+    for file in folder.glob("*") if folder.is_dir() else ():
+        if file.suffix.lower() not in endings or file.name.startswith("."):
+            continue
+        if not (file.stem.isascii() and file.stem.isdecimal()) or int(file.stem) >= 2**63:
+            raise UserError(
+                f"{file}: the name must be the stamp in nanoseconds, like 1700000000000000000{file.suffix}"
+            )
+        found.append((int(file.stem), file))
+    return sorted(found)
+
+
+def _with_velocity(poses: Trajectory) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Pose, velocity and turn rate in the body, by the difference to the pose before (zero at the first)."""
+    made = [(T, np.zeros(3), np.zeros(3)) for T in poses.T_a_b[:1]]
+    for i in range(1, len(poses)):
+        T_0, T_1 = poses.T_a_b[i - 1], poses.T_a_b[i]
+        dt_s = (poses.stamps_ns[i] - poses.stamps_ns[i - 1]) / 1e9
+        velocity = T_1[:3, :3].T @ (T_1[:3, 3] - T_0[:3, 3]) / dt_s
+        made.append((T_1, velocity, so3_log(T_0[:3, :3].T @ T_1[:3, :3]) / dt_s))
+    return made

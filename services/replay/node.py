@@ -1,0 +1,73 @@
+"""Plays recorded data as if the robot were driving."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+
+from common.node import Node, Sourced
+from services.replay.config import ReplayConfig
+from services.replay.options import SourceOptions
+from services.replay.source import Source, open_source, play
+
+log = logging.getLogger("beamsplat.replay")
+
+
+class ReplayNode(Node):
+    """Sensor topics of a bag, a recording or a folder, paced by the runner."""
+
+    name = "replay"
+    Config = ReplayConfig
+    outputs = ("rig", "wheel/odometry", "lidar/scan", "camera/image", "external/pose", "tick")
+
+    def __init__(self, config: ReplayConfig) -> None:
+        super().__init__(config)
+        self._source: Source | None = None
+
+    def configure(self) -> None:
+        """Opens the data, so that what is wrong with it is said before anything runs."""
+        if self._source is not None:
+            return
+        source = open_source(self.config.data, source_options(self.config))
+        try:
+            source.rig()
+        except ValueError:
+            source.close()
+            raise
+        self._source = source
+
+    def expected_messages(self) -> int | None:
+        """How many messages the sensors have; None if there is no end, or only a part is played."""
+        config = self.config
+        if config.loop or config.start_s or config.duration_s is not None:
+            return None
+        self.configure()
+        return self._source.expected()
+
+    def source(self) -> Iterator[Sourced]:
+        """The calibration, then everything by arrival."""
+        self.configure()
+        config = self.config
+        played = play(self._source, start_s=config.start_s, duration_s=config.duration_s, loop=config.loop)
+        for at_ns, topic, message in played:
+            yield Sourced(at_ns, topic, message)
+        for problem in self._source.problems:
+            log.warning("%s", problem)
+
+    def close(self) -> None:
+        if self._source is not None:
+            self._source.close()
+            self._source = None
+
+
+def source_options(config: ReplayConfig) -> SourceOptions:
+    """The options of the libraries, from those of the node."""
+    names = (
+        "image_topic", "scan_topic", "odometry_topic", "pose_topic", "camera_info_topic", "body_frame", "rig",
+        "assume_mounts", "allow_truncated",
+    )  # fmt: skip
+    return SourceOptions(
+        **{name: getattr(config, name) for name in names},
+        without=frozenset(config.without),
+        require=frozenset(config.require),
+    )

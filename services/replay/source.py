@@ -1,0 +1,114 @@
+"""Opens whatever a user calls data, and plays it: seek, loop, ticks, in order of arrival."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Protocol
+
+from common.errors import UserError
+from common.recording import is_recording
+from common.recording.sensors import build
+from services.replay.bag_source import BagSource
+from services.replay.bags import Bag, looks_like_bag
+from services.replay.folder import FolderSource, looks_like_folder
+from services.replay.options import SourceOptions
+from services.replay.recording_source import RecordingSource
+
+TICK_NS = 10**9
+# Between the last message of one round and the first of the next.
+_LOOP_PAUSE_NS = 100_000_000
+
+
+class Source(Protocol):
+    """Something to play: a bag, a recording, a folder."""
+
+    start_ns: int
+    end_ns: int
+    problems: list[str]
+
+    def expected(self) -> int:
+        """How many sensor messages it holds."""
+
+    def rig(self) -> Any:
+        """The calibration, as the message `Rig`."""
+
+    def messages(self, start_ns: int = 0, stop_ns: int | None = None) -> Iterator[tuple[int, str, Any]]:
+        """(arrival, topic, message) by arrival."""
+
+    def close(self) -> None:
+        """Releases files."""
+
+
+def data_path(path: Path) -> Path:
+    """Where the data lie: `path` itself, or its bag/ where truth lies beside a bag (as in house_a)."""
+    path = Path(path)
+    if path.is_dir() and not looks_like_bag(path) and looks_like_bag(path / "bag"):
+        return path / "bag"
+    return path
+
+
+def open_source(path: Path, options: SourceOptions) -> Source:
+    """The source at `path`, whatever its kind.
+
+    Raises:
+        UserError: nothing there that can be played, or options that do not fit; one sentence.
+    """
+    path = data_path(path)
+    if not path.exists():
+        raise UserError(f"{path}: no such file or folder; check the path")
+    if is_recording(path):
+        return RecordingSource(path, options)
+    if looks_like_bag(path) or path.is_file():
+        bag = Bag(path, allow_truncated=options.allow_truncated)
+        try:
+            return BagSource(bag, options)
+        except UserError:
+            bag.close()
+            raise
+    if looks_like_folder(path):
+        return FolderSource(path, options)
+    raise UserError(
+        f"{path}: no data found: expected a bag (.bag, .mcap, .db3 or a ROS 2 bag folder), a recording, or a "
+        "folder with images/, lasers/ or scans.csv"
+    )
+
+
+def play(
+    source: Source, *, start_s: float = 0.0, duration_s: float | None = None, loop: bool = False
+) -> Iterator[tuple[int, str, Any]]:
+    """(arrival, topic, message) with the calibration first and a tick each second of arrival time.
+
+    `start_s` counts from the first message. With `loop` it starts over for ever, stamps and arrivals
+    moved on by the length of a round, so that time never runs backwards.
+
+    Raises:
+        UserError: nothing lies between start and end.
+    """
+    begin_ns = source.start_ns + round(start_s * 1e9)
+    stop_ns = source.end_ns + 1
+    if duration_s is not None:
+        stop_ns = min(stop_ns, begin_ns + round(duration_s * 1e9))
+    if begin_ns >= stop_ns:
+        length_s = (source.end_ns - source.start_ns) / 1e9
+        raise UserError(
+            f"start_s = {start_s:g} lies beyond the end of the data, which are {length_s:.1f} s long"
+        )
+    rig = source.rig()
+    yield begin_ns, "rig", rig.model_copy(update={"stamp_ns": max(begin_ns, 0)})
+    offset_ns, count = 0, 0
+    next_tick_ns = begin_ns
+    while True:
+        played = False
+        for at_ns, topic, message in source.messages(begin_ns, stop_ns):
+            played = True
+            at_ns += offset_ns
+            while next_tick_ns <= at_ns:
+                yield next_tick_ns, "tick", build("tick", {"stamp_ns": next_tick_ns, "count": count})
+                next_tick_ns, count = next_tick_ns + TICK_NS, count + 1
+            if offset_ns:
+                message = message.model_copy(update={"stamp_ns": message.stamp_ns + offset_ns})
+            yield at_ns, topic, message
+        if not loop or not played:
+            return
+        offset_ns += stop_ns - begin_ns + _LOOP_PAUSE_NS
