@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 import struct
+from functools import lru_cache
 from typing import Any
 
 import msgpack
@@ -81,6 +82,7 @@ def decode(schema: str, payload: bytes) -> Message:
         raise DecodeError(f"{schema}: {_first_line(error)}") from error
 
 
+@lru_cache(maxsize=256)
 def _class_of(schema: str) -> tuple[type[Message], int]:
     name, _, version = schema.partition("/")
     if name not in MESSAGES:

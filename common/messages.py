@@ -83,18 +83,30 @@ class Part(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, arbitrary_types_allowed=True)
 
+    _lettered: ClassVar[tuple[tuple[str, int, str], ...]] = ()  # (field, axis, letter) of letters used twice
+
+    @classmethod
+    def __pydantic_init_subclass__(cls, **kwargs: Any) -> None:
+        """Looks up once which dimensions must agree: this is checked for every message."""
+        found = [
+            (name, axis, letter)
+            for name, field in cls.model_fields.items()
+            for array in field.metadata
+            if isinstance(array, Array)
+            for axis, letter in enumerate(array.shape)
+            if isinstance(letter, str)
+        ]
+        letters = [letter for _, _, letter in found]
+        cls._lettered = tuple(entry for entry in found if letters.count(entry[2]) > 1)
+
     @model_validator(mode="after")
     def _dimensions_agree(self) -> Part:
         sizes: dict[str, tuple[int, str]] = {}
-        for name, field in type(self).model_fields.items():
-            array = next((m for m in field.metadata if isinstance(m, Array)), None)
-            if array is None:
-                continue
-            for letter, size in zip(array.shape, getattr(self, name).shape):
-                if isinstance(letter, str):
-                    known, first = sizes.setdefault(letter, (size, name))
-                    if known != size:
-                        raise ValueError(f"{name} has {letter}={size}, but {first} has {letter}={known}")
+        for name, axis, letter in self._lettered:
+            size = getattr(self, name).shape[axis]
+            known, first = sizes.setdefault(letter, (size, name))
+            if known != size:
+                raise ValueError(f"{name} has {letter}={size}, but {first} has {letter}={known}")
         return self
 
 

@@ -1,0 +1,52 @@
+# beamsplat: `make demo` sets up and shows it at work, `make test` sets up and runs the tests.
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+OUT ?= out/demo
+STAMP := $(VENV)/.installed
+
+.PHONY: setup demo test quick soak bench lint clean
+
+setup: $(STAMP)
+
+# On Linux x86-64 the plain torch wheel brings gigabytes of CUDA. Without an NVIDIA GPU the CPU build is
+# taken instead: from the configured index if that has it, else from PyTorch's own.
+TORCH := torch==2.13.0
+TORCH_CPU_INDEX ?= https://download.pytorch.org/whl/cpu
+
+$(STAMP): pyproject.toml constraints.txt
+	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "BeamSplat needs Python 3.11 or newer")'
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/pip install -q --upgrade pip
+	@if command -v nvidia-smi >/dev/null || [ "$$(uname -sm)" != "Linux x86_64" ]; then \
+		$(BIN)/pip install -q $(TORCH); \
+	else \
+		$(BIN)/pip install -q $(TORCH)+cpu 2>/dev/null \
+			|| $(BIN)/pip install -q --index-url $(TORCH_CPU_INDEX) $(TORCH); \
+	fi
+	$(BIN)/pip install -q -c constraints.txt -e '.[all]'
+	$(BIN)/beamsplat warm
+	touch $@
+
+demo: setup
+	$(BIN)/beamsplat demo --out $(OUT)
+
+test: setup
+	$(BIN)/python -m pytest -m "not soak"
+
+quick: setup
+	$(BIN)/python -m pytest -m "not soak and not slow"
+
+soak: setup
+	$(BIN)/python -m pytest -m soak
+
+bench: setup
+	$(BIN)/beamsplat bench bus
+
+lint: setup
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+clean:
+	rm -rf $(VENV) out .numba_cache
