@@ -50,7 +50,7 @@ _ROWS = (
     Topic("localization/correction", m.Correction,    ("localization",),         0, "latched", 1, True),
     Topic("localization/anchors",    m.Anchors,       ("localization",),         0, "latched", 1, True),
     Topic("localization/grid",       m.Grid,          ("localization",),         0, "latched", 1, True),
-    Topic("tick",                    m.Tick,          ("timer", "replay"),      1, "every"),
+    Topic("tick",                    m.Tick,          ("replay",),               1, "every", 60),
 )  # fmt: skip
 
 TOPICS: dict[str, Topic] = {row.name: row for row in _ROWS}

@@ -8,7 +8,8 @@ import typer
 from rich.console import Console
 
 from common.errors import UserError
-from services import doctor, system_cli
+from services import demo, doctor, system_cli, warm
+from services.bench import cli as bench_cli
 from services.replay import cli as replay_cli
 from services.simulator import cli as simulator_cli
 
@@ -21,14 +22,16 @@ app = typer.Typer(
 _SYSTEM = "Run a system"
 _DATA = "Recordings and calibration"
 for command in (
-    system_cli.run, system_cli.check, system_cli.serve, system_cli.offline, system_cli.record,
+    demo.demo, system_cli.run, system_cli.check, system_cli.serve, system_cli.offline, system_cli.record,
     system_cli.top, system_cli.topics, system_cli.graph,
 ):  # fmt: skip
     app.command(rich_help_panel=_SYSTEM)(command)
 app.command(rich_help_panel=_DATA)(simulator_cli.simulate)
 app.command(rich_help_panel=_DATA)(replay_cli.info)
 app.command(rich_help_panel=_DATA)(replay_cli.rig)
-app.command(rich_help_panel=_SYSTEM)(doctor.doctor)
+for command in (doctor.doctor, warm.warm):
+    app.command(rich_help_panel="This machine")(command)
+app.add_typer(bench_cli.app, name="bench", rich_help_panel="This machine")
 
 
 def main() -> None:

@@ -72,15 +72,16 @@ def run(
     deployment = _load(file, set_)
     if rate is not None:
         deployment = deployment.model_copy(update={"rate": rate})
-    run_deployment(_checked(deployment), tuple(nodes) if nodes else None)
+    run_checked(deployment, tuple(nodes) if nodes else None)
 
 
-def run_deployment(deployment: Deployment, names: tuple[str, ...] | None = None) -> None:
+def run_checked(deployment: Deployment, names: tuple[str, ...] | None = None) -> None:
     """Runs processes until all have drained, one cannot run, or Ctrl-C.
 
     Raises:
-        UserError: a node cannot run with what it was given.
+        UserError: the deployment does not fit together, or a node cannot run with what it was given.
     """
+    _checked(deployment)
     from common.bus import open_session
     from services.board import HealthBoard
     from services.supervisor import Supervisor

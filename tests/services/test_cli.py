@@ -1,0 +1,72 @@
+"""The command as a user meets it: exit codes, one clear sentence, help with examples."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def beamsplat(*arguments, **kwargs):
+    return subprocess.run(
+        [sys.executable, "-m", "services", *map(str, arguments)],
+        capture_output=True, text=True, timeout=120, cwd=ROOT, **kwargs,
+    )  # fmt: skip
+
+
+def test_help_names_every_command_and_each_has_an_example():
+    from services.__main__ import app
+
+    shown = beamsplat("--help").stdout
+    for command in app.registered_commands:
+        name = command.name or command.callback.__name__
+        assert name in shown
+        assert "Example" in command.callback.__doc__, f"{name} has no example"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        (("check", "no.toml"), "no.toml: no such deployment file"),
+        (("check", "deploy/demo.toml", "--set", "replay.speed=2"), "unknown option 'speed'"),
+        (("offline", "deploy/demo.toml", "--data", "no/bag", "--out", "{tmp}"), "no/bag"),
+        (("info", "no/bag"), "no/bag"),
+        (("rig", "no/bag", "--out", "{tmp}/rig.toml"), "no/bag"),
+    ],
+)
+def test_bad_input_is_one_sentence_and_exit_code_2(tmp_path, arguments, complaint):
+    done = beamsplat(*(a.replace("{tmp}", str(tmp_path)) for a in arguments))
+    assert done.returncode == 2, done.stderr
+    assert complaint in done.stderr + done.stdout
+    assert "Traceback" not in done.stderr
+
+
+def test_run_without_a_router_port_says_what_to_do(tmp_path, free_endpoint):
+    from common.bus import open_router
+
+    with open_router((free_endpoint,)):
+        done = beamsplat(
+            "run", "deploy/poses.toml", "router", "--set", f'router.listen=["{free_endpoint}"]',
+            "--set", f"state_dir={tmp_path}", "--set", "replay.data=x", "--set", "recorder.out=x",
+        )  # fmt: skip
+    assert done.returncode == 2
+    assert "router" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_doctor_names_a_taken_port(tmp_path, free_endpoint):
+    import socket
+
+    deployment = tmp_path / "d.toml"
+    deployment.write_text(f'state_dir = "{tmp_path}"\n[router]\nlisten = ["{free_endpoint}"]\n')
+    host, port = free_endpoint.removeprefix("tcp/").split(":")
+    with socket.socket() as squatter:
+        squatter.bind((host, int(port)))
+        squatter.listen()
+        taken = beamsplat("doctor", deployment, "--brief", env={"PATH": "/usr/bin", "COLUMNS": "300", "HOME": str(tmp_path)})
+    assert taken.returncode == 1
+    assert "cannot be listened on" in taken.stdout
+    free = beamsplat("doctor", deployment, env={"PATH": "/usr/bin", "COLUMNS": "300", "HOME": str(tmp_path)})
+    assert f"{free_endpoint} is free" in free.stdout
