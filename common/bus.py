@@ -29,7 +29,7 @@ from common.header import DecodeError, Header, local_clock_id
 from common.mailbox import Letter
 from common.messages import Health
 from common.node import Input
-from common.streams import Publication, Subscription
+from common.streams import Publication, Subscription, open_sample
 from common.topics import HEALTH, Topic, topic
 
 ROOT = "beamsplat"
@@ -200,6 +200,28 @@ class Bus:
                 on_query(name, query)
 
         threading.Thread(target=receive, name=f"query-{name}", daemon=True).start()
+
+    def watch_health(self, on_health: Callable[[Health], None]) -> None:
+        """Brings the health of every node of this robot; `on_health` runs in a thread of the bus."""
+        subscriber = self.session.declare_subscriber(
+            key(self.robot, HEALTH, "*"), zenoh.handlers.FifoChannel(256)
+        )
+        self._declared.append(subscriber)
+        row = Topic(HEALTH, Health, (), 1, "latest")
+
+        def receive() -> None:
+            while True:
+                try:
+                    sample = subscriber.recv()
+                except zenoh.ZError:
+                    return
+                try:
+                    health = open_sample(sample, row).message
+                except DecodeError:  # another version's health cannot be shown; its node still runs
+                    continue
+                on_health(health)
+
+        threading.Thread(target=receive, name="watch-health", daemon=True).start()
 
     def report(self, health: Health) -> None:
         """Publishes this node's health."""

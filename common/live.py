@@ -37,6 +37,7 @@ log = logging.getLogger(__name__)
 _POLL_S = 0.2  # how soon a signal is noticed while nothing arrives
 _END_PATIENCE_S = 2.0  # an end marker waits this long for messages still on their way
 _LOG_PERIOD_S = 5.0
+_DETAIL_CHARS = 2000
 
 
 @dataclass(frozen=True)
@@ -67,6 +68,7 @@ class Live:
         self._state = "configure"
         self._detail = ""
         self._queries: deque[tuple[str, zenoh.Query]] = deque()
+        self._healths: deque[Health] = deque(maxlen=256)
         self._ends: list[tuple[str, str, int, int, float]] = []
         self._steps_ms: deque[float] = deque(maxlen=512)
         self._publications: dict[str, Publication] = {}
@@ -114,6 +116,8 @@ class Live:
             bus.subscribe(entry, self._on_letter, self._on_undecodable, self._on_end)
         for name in self.node.queries():
             bus.answer(name, self._on_query)
+        if self.node.watches_health():
+            bus.watch_health(self._on_health)
         bus.declare_alive()
 
     def _work(self, bus: Bus) -> None:
@@ -135,7 +139,7 @@ class Live:
             for publication in self._publications.values():
                 bus.end(publication)
             while not self._stopping and not self.settings.exit_when_drained:
-                self._answer_queries()
+                self._attend()
                 with self._changed:
                     self._changed.wait(_POLL_S)
 
@@ -143,7 +147,7 @@ class Live:
 
     def _run_steps(self) -> None:
         while not self._stopping:
-            self._answer_queries()
+            self._attend()
             letter = self._next()
             self._emit_all(self._jobs.finished())
             if letter is None:
@@ -151,7 +155,7 @@ class Live:
                     return
                 continue
             started = time.perf_counter()
-            self._emit_all(self._jobs.before_message())
+            self._emit_all(self._jobs.before_message(letter.topic))
             self._emit(self.node.handle(letter.topic, letter.message))
             self._steps_ms.append((time.perf_counter() - started) * 1e3)
 
@@ -222,7 +226,10 @@ class Live:
             if missing:
                 time.sleep(0.1)
 
-    def _answer_queries(self) -> None:
+    def _attend(self) -> None:
+        """What comes besides messages."""
+        while self._healths:
+            self.node.on_health(self._healths.popleft())
         while self._queries:
             name, query = self._queries.popleft()
             parameters = dict(query.parameters.items()) if query.parameters else {}
@@ -255,6 +262,10 @@ class Live:
         self._queries.append((name, query))
         self._wake()
 
+    def _on_health(self, health: Health) -> None:
+        self._healths.append(health)
+        self._wake()
+
     def _wake(self) -> None:
         with self._changed:
             self._changed.notify()
@@ -282,7 +293,7 @@ class Live:
                 state=self._state, inputs=inputs, outputs=outputs,
                 step_p50_ms=float(np.percentile(steps, 50)), step_p95_ms=float(np.percentile(steps, 95)),
                 rss_mb=self._process.memory_info().rss / 1e6, cpu_percent=self._process.cpu_percent(),
-                detail=self._detail,
+                detail=self._detail or self.node.detail[:_DETAIL_CHARS],
             )
         )  # fmt: skip
 

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
 from common.config import NodeConfig
-from common.messages import Message
+from common.messages import Health, Message
 from common.topics import ROW_NUMBER, Delivery, Topic, topic
 
 
@@ -46,13 +46,14 @@ class Job:
     """Long work, yielded by a handler; its result comes back as `on_job_<name>(result)`.
 
     `run` must hold no reference to state that the node changes meanwhile. With `after = n` the result
-    is taken in just before the n-th next message, and waited for: reproducible in both runners.
-    With None it is taken in when it is there.
+    is taken in just before the n-th next message (on topic `of`, where given), and waited for:
+    reproducible in both runners. With None it is taken in when it is there.
     """
 
     name: str
     run: Callable[[], Any]
     after: int | None = None
+    of: str | None = None
 
 
 class Sourced(NamedTuple):
@@ -82,6 +83,7 @@ class Node:
 
     def __init__(self, config: NodeConfig) -> None:
         self.config = config
+        self.detail = ""  # one line that the node wants shown beside its health
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
@@ -113,12 +115,20 @@ class Node:
         """Sensors override this; a node with a source has no inputs."""
         return iter(())
 
+    def on_health(self, health: Health) -> None:
+        """Those that watch override this: the health of every node, live only."""
+
     # --- used by the runners ---
 
     @classmethod
     def is_source(cls) -> bool:
         """Whether this node makes messages of its own."""
         return cls.source is not Node.source
+
+    @classmethod
+    def watches_health(cls) -> bool:
+        """Whether the health of all nodes is brought to this one."""
+        return cls.on_health is not Node.on_health
 
     @classmethod
     def queries(cls) -> tuple[str, ...]:
