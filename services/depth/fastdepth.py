@@ -1,0 +1,74 @@
+"""FastDepth (Wofk et al., ICRA 2019), trained on NYU-v2: small, metric on paper, off by tens of per cent.
+
+The network knows one view: 224x224 pixels of a crop with normalised focals fx/w = 0.889, fy/h = 1.187.
+Every camera is cropped to that view; RGB in [0, 1], no mean subtracted.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from common.camera import Pinhole
+from services.depth.onnx_model import OnnxModel, to_hw
+from services.depth.source import Estimate, View, judge
+from services.depth.store import find_model
+
+_FX_PER_WIDTH = 0.889
+_FY_PER_HEIGHT = 1.187
+_SIDE = 224
+_MULTIPLE = 32
+_Z_RANGE_M = (0.3, 10.0)
+
+
+class FastDepth:
+    """FastDepth on one ONNX session.
+
+    Raises:
+        UserError: the model is missing, or another graph.
+    """
+
+    def __init__(self, model: str | Path = "fastdepth_nyu_fp32", threads: int = 1) -> None:
+        self._onnx = OnnxModel(find_model(model), threads=threads)
+        self._onnx.check_inputs(1)
+        port = self._onnx.image_input()
+        self._side = self._onnx.side_lengths(port, _SIDE, _SIDE, _MULTIPLE)
+        (first, *_) = self._onnx.warm_up((1, 3, *self._side))
+        to_hw(first, str(self._onnx.path))
+
+    def estimate(self, view: View) -> Estimate:
+        """Depth in metres inside the network's view, NaN outside it."""
+        u0, v0, u1, v1, factor = network_view(view.camera)
+        h, w = self._side
+        patch = cv2.resize(view.image_rgb[v0:v1, u0:u1], (w, h), interpolation=cv2.INTER_AREA)
+        tensor = (patch.astype(np.float32) / 255.0).transpose(2, 0, 1)[None]
+        raw = to_hw(self._onnx.run(tensor)[0], str(self._onnx.path))
+        status = judge(raw)
+        z = raw * factor
+        with np.errstate(invalid="ignore"):
+            z[~((z >= _Z_RANGE_M[0]) & (z <= _Z_RANGE_M[1]))] = np.nan
+        values = np.full(view.camera.shape, np.nan, dtype=np.float32)
+        values[v0:v1, u0:u1] = resize_with_holes(z, u1 - u0, v1 - v0)
+        return Estimate(values, "metric", status)
+
+
+def network_view(camera: Pinhole) -> tuple[int, int, int, int, float]:
+    """Crop (u0, v0, u1, v1), half open, that shows the camera as NYU's, and the factor on its depth.
+
+    A camera with a narrower view than NYU's fills the network's picture with less of the world, so that
+    all looks nearer by the ratio of the focals in network pixels (first-order pinhole argument).
+    """
+    wanted_w, wanted_h = camera.fx_px / _FX_PER_WIDTH, camera.fy_px / _FY_PER_HEIGHT
+    u0 = max(round(camera.cx_px + 0.5 - wanted_w / 2), 0)
+    u1 = min(round(camera.cx_px + 0.5 + wanted_w / 2), camera.width_px)
+    v0 = max(round(camera.cy_px + 0.5 - wanted_h / 2), 0)
+    v1 = min(round(camera.cy_px + 0.5 + wanted_h / 2), camera.height_px)
+    factor = camera.fx_px / (u1 - u0) / _FX_PER_WIDTH
+    return u0, v0, u1, v1, factor if u1 - u0 < wanted_w - 1.0 else 1.0
+
+
+def resize_with_holes(values: np.ndarray, width: int, height: int) -> np.ndarray:
+    """Bilinear resize of float32 [h, w]; an output pixel that touches NaN is NaN."""
+    return cv2.resize(values, (width, height), interpolation=cv2.INTER_LINEAR)

@@ -1,0 +1,15 @@
+"""`none`: no dense guess; beams alone carry the depth (the MonoGS configuration)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from services.depth.source import Estimate, View
+
+
+class NoDepth:
+    """The null object among depth sources."""
+
+    def estimate(self, view: View) -> Estimate:
+        """All unknown, and that is right."""
+        return Estimate(np.full(view.camera.shape, np.nan, dtype=np.float32), "none")

@@ -1,0 +1,70 @@
+"""`recorded`: depth maps by stamp from a folder, for networks that cannot run here."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from common.errors import UserError
+from services.depth.source import Estimate, Kind, View, judge
+
+
+class Recorded:
+    """Files `<stamp_ns>.png` (uint16 millimetres, 0 = unknown) or `<stamp_ns>.npy` (float, as `kind` says).
+
+    Raises:
+        UserError: no such folder, or no such file in it.
+    """
+
+    def __init__(self, folder: str | Path = "", kind: Kind = "metric", tolerance_ns: int = 1_000_000) -> None:
+        self._folder = Path(folder)
+        if not folder or not self._folder.is_dir():
+            raise UserError(f"recorded depth: folder = {str(folder)!r} is no folder with depth maps")
+        files = [p for p in self._folder.iterdir() if p.suffix in (".png", ".npy") and p.stem.isdigit()]
+        if not files:
+            raise UserError(f"{self._folder}: holds no <stamp_ns>.png or <stamp_ns>.npy")
+        files.sort(key=lambda p: int(p.stem))
+        self._stamps = np.array([int(p.stem) for p in files], dtype=np.int64)
+        self._files = files
+        self._kind = kind
+        self._tolerance_ns = tolerance_ns
+
+    def estimate(self, view: View) -> Estimate:
+        """The map nearest in time, resized to the picture."""
+        i = int(np.argmin(np.abs(self._stamps - view.stamp_ns)))
+        empty = np.full(view.camera.shape, np.nan, dtype=np.float32)
+        if abs(int(self._stamps[i]) - view.stamp_ns) > self._tolerance_ns:
+            return Estimate(empty, self._kind, f"no recorded depth at {view.stamp_ns} ns")
+        values = read_depth(self._files[i])
+        if values.shape != view.camera.shape:
+            h, w = view.camera.shape
+            if abs(values.shape[1] / values.shape[0] - w / h) > 0.02:
+                return Estimate(
+                    empty, self._kind,
+                    f"{self._files[i]}: {values.shape[1]}x{values.shape[0]} does not show the {w}x{h} picture",
+                )  # fmt: skip
+            values = cv2.resize(values, (w, h), interpolation=cv2.INTER_NEAREST)
+        return Estimate(values, self._kind, judge(values, least_share=0.01))
+
+
+def read_depth(path: Path) -> np.ndarray:
+    """float32 [H, W] metres of a 16 bit PNG in millimetres (0 = NaN), or a .npy as it is.
+
+    Raises:
+        UserError: unreadable, or of another kind.
+    """
+    if path.suffix == ".npy":
+        try:
+            values = np.load(path, allow_pickle=False)
+        except (OSError, ValueError) as error:
+            raise UserError(f"{path}: not a numpy array: {error}") from error
+    else:
+        raw = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        if raw is None or raw.dtype != np.uint16:
+            raise UserError(f"{path}: expected a 16 bit PNG in millimetres")
+        values = np.where(raw > 0, raw, np.nan) * 1e-3
+    if values.ndim != 2:
+        raise UserError(f"{path}: has shape {list(values.shape)}; expected H x W")
+    return values.astype(np.float32)

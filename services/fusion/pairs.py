@@ -1,0 +1,86 @@
+"""Pairs of a beam's optical z and the dense guess at its pixel, and the clustering that drops the wrong ones."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """Beams that fell on pixels with an answer."""
+
+    uv_px: np.ndarray  # float64 [N, 2]
+    z_m: np.ndarray  # float64 [N]: optical z of the beam, not its range (l_j of the paper)
+    guess: np.ndarray  # float64 [N]: the dense guess there (d_j of the paper)
+
+    def __len__(self) -> int:
+        return len(self.z_m)
+
+    def take(self, keep: np.ndarray) -> Pairs:
+        return Pairs(self.uv_px[keep], self.z_m[keep], self.guess[keep])
+
+
+def make_pairs(
+    guess: np.ndarray,  # float32 [H, W], NaN = unknown
+    uv_px: np.ndarray,  # float64 [N, 2], inside the image
+    z_m: np.ndarray,  # float64 [N]
+    max_jump: float = 0.10,
+) -> Pairs:
+    """Pairs at the beams' pixels; a pixel whose neighbours differ by more than `max_jump` is left out."""
+    h, w = guess.shape
+    u = np.clip(np.rint(uv_px[:, 0]).astype(int), 0, w - 1)
+    v = np.clip(np.rint(uv_px[:, 1]).astype(int), 0, h - 1)
+    here = guess[v, u].astype(np.float64)
+    low, high = here.copy(), here.copy()
+    for dv, du in ((0, 2), (0, -2), (2, 0), (-2, 0)):
+        near = guess[np.clip(v + dv, 0, h - 1), np.clip(u + du, 0, w - 1)]
+        low, high = np.fmin(low, near), np.fmax(high, near)
+    with np.errstate(invalid="ignore"):
+        good = np.isfinite(here) & (here > 0.0) & (z_m > 0.0) & (high - low <= max_jump * here)
+    return Pairs(uv_px[good], z_m[good], here[good])
+
+
+def largest_cluster(values: np.ndarray, radius: float, least: int = 4) -> np.ndarray:
+    """bool [N]: members of the largest density cluster of numbers [N] (DBSCAN in one dimension).
+
+    A core value has `least` values (itself included) within `radius`; cores closer than `radius` are one
+    cluster, values within `radius` of a core belong to it. Sorting makes it O(N log N). With no core at
+    all nobody is a member.
+    """
+    count = len(values)
+    member = np.zeros(count, dtype=bool)
+    if count == 0:
+        return member
+    order = np.argsort(values, kind="stable")
+    x = values[order]
+    neighbours = np.searchsorted(x, x + radius, "right") - np.searchsorted(x, x - radius, "left")
+    cores = np.flatnonzero(neighbours >= least)
+    if len(cores) == 0:
+        return member
+    splits = np.flatnonzero(np.diff(x[cores]) > radius) + 1
+    best: tuple[int, int, int] = (0, 0, 0)
+    for group in np.split(cores, splits):
+        first = int(np.searchsorted(x, x[group[0]] - radius, "left"))
+        stop = int(np.searchsorted(x, x[group[-1]] + radius, "right"))
+        if stop - first > best[0]:
+            best = (stop - first, first, stop)
+    member[order[best[1] : best[2]]] = True
+    return member
+
+
+def effective_count(residuals: np.ndarray) -> float:
+    """How many independent values neighbouring residuals [N] are worth (first-order autocorrelation).
+
+    Beams next to each other see the same surface, and the network errs on it as one.
+    """
+    count = len(residuals)
+    if count < 4:
+        return float(count)
+    r = residuals - residuals.mean()
+    power = float(r @ r)
+    if power <= 0.0:
+        return float(count)
+    rho = min(max(float(r[:-1] @ r[1:]) / power, 0.0), 0.99)
+    return max(count * (1.0 - rho) / (1.0 + rho), 1.0)

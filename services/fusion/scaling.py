@@ -1,0 +1,130 @@
+"""One correction for a whole picture: the paper's ratio, and scale with shift in inverse depth."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+
+from services.fusion.pairs import effective_count, largest_cluster, make_pairs
+from services.fusion.result import Fused, refusal
+
+Kind = Literal["metric", "relative", "disparity", "none"]
+
+MIN_PAIRS = 12
+MIN_INLIER_SHARE = 0.3
+_RADIUS = (
+    0.2  # of log ratios: along one row a small network errs by tens of per cent; beyond lies what it missed
+)
+_MAX_DEPTH_M = 30.0
+
+
+def as_depth(values: np.ndarray, kind: Kind) -> np.ndarray:
+    """The guess as something proportional to depth; a disparity's unknown shift is taken as zero."""
+    if kind != "disparity":
+        return values
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(values > 1e-6, 1.0 / values, np.nan).astype(np.float32)
+
+
+def ratio(values: np.ndarray, kind: Kind, uv_px: np.ndarray, z_m: np.ndarray) -> Fused:
+    """The paper: D_scaled = alpha D with alpha = sum(l_j) / sum(d_j) over the largest cluster of ratios.
+
+    Args:
+        values: float32 [H, W], the dense guess.
+        kind: what its numbers mean.
+        uv_px: float64 [N, 2], the beams' pixels.
+        z_m: float64 [N], the beams' optical z (l_j).
+    """
+    guess = as_depth(values, kind)
+    pairs = make_pairs(guess, uv_px, z_m)
+    if len(pairs) < MIN_PAIRS:
+        return refusal(values.shape, _too_few(len(uv_px), len(pairs)))
+    inlier = largest_cluster(np.log(pairs.z_m / pairs.guess), _RADIUS)
+    used = pairs.take(inlier)
+    if len(used) < MIN_PAIRS or inlier.mean() < MIN_INLIER_SHARE:
+        return refusal(values.shape, f"beams and guess agree on no scale ({len(used)} of {len(pairs)} pairs)")
+    alpha = float(used.z_m.sum() / used.guess.sum())
+    residual = used.z_m - alpha * used.guess
+    n_eff = effective_count(residual)
+    # Standard error of a ratio estimator (Cochran, Sampling Techniques, 2.41), with n_eff for n.
+    error = float(np.sqrt(np.mean(residual**2) / max(n_eff - 1.0, 1.0)) / used.guess.mean())
+    depth = (alpha * guess).astype(np.float32)
+    spread = np.std(np.log(pairs.z_m / (alpha * pairs.guess)))
+    sigma = depth * np.float32(np.hypot(spread, error / alpha))
+    return Fused(
+        depth, sigma, scale=alpha, scale_sigma=error, inlier_share=float(inlier.mean()),
+        residual_m=float(np.median(np.abs(residual))), pairs=len(pairs),
+    )  # fmt: skip
+
+
+def affine(values: np.ndarray, kind: Kind, uv_px: np.ndarray, z_m: np.ndarray) -> Fused:
+    """1/z = a q + b with q the guess in inverse depth: what affine-invariant disparity needs.
+
+    Robust: median of slopes (Theil-Sen over fixed partners), then reweighted least squares (Tukey). With
+    too little spread in q the shift cannot be told and stays zero. Arguments as in `ratio`.
+    """
+    pairs = make_pairs(as_depth(values, kind), uv_px, z_m)
+    if len(pairs) < MIN_PAIRS:
+        return refusal(values.shape, _too_few(len(uv_px), len(pairs)))
+    q, y = 1.0 / pairs.guess, 1.0 / pairs.z_m
+    a, b, weight = _robust_line(q, y)
+    if not a > 0.0:
+        return refusal(
+            values.shape, "nearer in the guess is farther for the beams: wrong network or wrong beams"
+        )
+    inlier = weight > 0.0
+    if inlier.mean() < MIN_INLIER_SHARE:
+        return refusal(
+            values.shape, f"beams and guess agree on no line ({inlier.sum()} of {len(pairs)} pairs)"
+        )
+    with np.errstate(divide="ignore", invalid="ignore"):
+        q_all = values if kind == "disparity" else 1.0 / values
+        inverse = np.maximum(a * q_all + b, 1.0 / _MAX_DEPTH_M)
+        depth = np.where(np.isfinite(q_all), 1.0 / inverse, np.nan).astype(np.float32)
+    residual = y - (a * q + b)
+    spread = 1.4826 * float(np.median(np.abs(residual)))
+    n_eff = effective_count(residual[inlier])
+    error = spread / np.sqrt(max(n_eff - 2.0, 1.0)) / max(float(np.std(q[inlier])), 1e-9)
+    fitted = 1.0 / np.maximum(a * q + b, 1.0 / _MAX_DEPTH_M)
+    sigma = (depth**2 * np.float32(max(spread, 1e-4))).astype(np.float32)
+    return Fused(
+        depth, sigma, scale=1.0 / a, scale_sigma=error / a**2, inlier_share=float(inlier.mean()),
+        residual_m=float(np.median(np.abs(fitted - pairs.z_m)[inlier])), pairs=len(pairs),
+    )  # fmt: skip
+
+
+def _robust_line(q: np.ndarray, y: np.ndarray) -> tuple[float, float, np.ndarray]:
+    """(a, b, weights [N]) of y = a q + b."""
+    order = np.argsort(q, kind="stable")
+    half = len(q) // 2
+    low, high = order[:half], order[-half:]
+    run = q[high] - q[low]
+    wide = run > 0.02 * np.median(q)
+    if wide.sum() >= MIN_PAIRS // 2 and np.std(q) > 0.03 * np.mean(q):
+        a = float(np.median((y[high] - y[low])[wide] / run[wide]))
+        b = float(np.median(y - a * q))
+        free = True
+    else:
+        a, b, free = float(np.median(y / q)), 0.0, False
+    weight = np.ones(len(q))
+    for _ in range(10):
+        residual = y - a * q - b
+        scale = 4.685 * max(1.4826 * float(np.median(np.abs(residual))), 1e-4)
+        weight = np.where(np.abs(residual) < scale, (1.0 - (residual / scale) ** 2) ** 2, 0.0)
+        if free:
+            mean_q, mean_y = np.average(q, weights=weight), np.average(y, weights=weight)
+            spread = float(weight @ (q - mean_q) ** 2)
+            if spread <= 0.0:
+                break
+            a = float(weight @ ((q - mean_q) * (y - mean_y))) / spread
+            b = float(mean_y - a * mean_q)
+        else:
+            a = float(weight @ (q * y) / (weight @ q**2))
+    return a, b, weight
+
+
+def _too_few(beams: int, pairs: int) -> str:
+    if beams == 0:
+        return "no beams in view"
+    return f"only {pairs} of {beams} beams in view fall on pixels with a depth guess; {MIN_PAIRS} are needed"
