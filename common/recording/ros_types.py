@@ -11,7 +11,7 @@ from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
-from common.geometry import make_transform, matrix_from_quat_xyzw, quat_xyzw_from_matrix
+from common.geometry import make_transform, matrix_from_quat_wxyz, quat_xyzw_from_matrix
 
 # The names of REP 103 and REP 105, so that RViz, nav2 and Foxglove find what they expect.
 FRAME_MAP = "map"
@@ -104,8 +104,8 @@ def transform_of(position: Any, orientation: Any) -> np.ndarray:
     Raises:
         ValueError: the quaternion has no direction.
     """
-    quat_xyzw = np.array([orientation.x, orientation.y, orientation.z, orientation.w])
-    return make_transform(matrix_from_quat_xyzw(quat_xyzw), np.array([position.x, position.y, position.z]))
+    quat_wxyz = np.array([orientation.w, orientation.x, orientation.y, orientation.z])
+    return make_transform(matrix_from_quat_wxyz(quat_wxyz), np.array([position.x, position.y, position.z]))
 
 
 # What rosbags' generated deserialisers raise on rubbish, besides its own error.

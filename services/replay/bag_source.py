@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -13,8 +14,9 @@ from common.recording.ros_types import transform_of
 from common.recording.sensors import SENSORS, build, ros_fields
 from common.rig import RigFile, load_rig
 from services.replay import calibration as cal
-from services.replay.bags import Bag, BagTopic, RawMessage, deserialize, knows
+from services.replay.bags import Bag, BagTopic
 from services.replay.choose import choose_camera_info, choose_topics
+from services.replay.decode import RawMessage, deserialize
 from services.replay.options import SourceOptions
 from services.replay.static_frames import StaticFrames, clean
 
@@ -80,7 +82,7 @@ class BagSource:
             UserError: incomplete, or not of this picture size; one sentence says all that is missing.
         """
         self.calibrate()
-        picture = self._picture_px()
+        picture = self.picture_px()
         if self.options.rig is not None:
             rig = load_rig(self.options.rig)
             self._check_rig(rig, picture)
@@ -111,8 +113,6 @@ class BagSource:
             or not self.frames.names
         ):
             self._read_frames(static=False)
-        if "image" in self.chosen and self.options.rig is None:
-            self._find_intrinsics()
         cal.find_mounts(
             self.calibration,
             self.frames,
@@ -124,6 +124,8 @@ class BagSource:
         if child and self.calibration.body_frame:
             T = self.frames.find(child, self.calibration.body_frame)
             self._T_child_body = np.eye(4) if T is None else T
+        if "image" in self.chosen and self.options.rig is None:
+            self._find_intrinsics()
         return self.calibration
 
     def messages(self, start_ns: int = 0, stop_ns: int | None = None) -> Iterator[tuple[int, str, Any]]:
@@ -144,6 +146,17 @@ class BagSource:
                 self.first_fault.setdefault(raw.topic, _first_line(error))
                 continue
             yield raw.at_ns, sensor.topic, message
+
+    def sample(self, word: str, count: int) -> list[dict[str, Any]]:
+        """Fields of up to `count` messages of a sensor, spread evenly over the bag, unchecked."""
+        topic = self.chosen.get(word)
+        found = []
+        step = max(1, topic.count // count) if topic else 1
+        for i, raw in enumerate(self.bag.messages([topic.name]) if topic else ()):
+            if i % step == 0 and len(found) < count:
+                with suppress(ValueError):  # counted when played
+                    found.append(ros_fields(SENSORS[word].topic, deserialize(raw)))
+        return found
 
     def close(self) -> None:
         self.bag.close()
@@ -170,7 +183,8 @@ class BagSource:
             return "width_px" in fields
         return fields["encoding"] in _PICTURES
 
-    def _picture_px(self) -> tuple[int, int] | None:
+    def picture_px(self) -> tuple[int, int] | None:
+        """Width and height of the pictures; None if there are none."""
         if "image" not in self._first:
             return None
         fields = ros_fields("camera/image", self._first["image"])
@@ -187,7 +201,7 @@ class BagSource:
                 f"there are pictures on {image.name} but no sensor_msgs/CameraInfo with the camera's K"
             )
             return
-        self.calibration.camera = cal.intrinsics(self._peek(info), self._picture_px(), image.name, self.where)
+        self.calibration.camera = cal.intrinsics(self._peek(info), self.picture_px(), image.name, self.where)
         if self.calibration.camera is None:
             self.calibration.missing.append(f"K on {info.name} is all zero: this camera was never calibrated")
         else:
@@ -238,8 +252,6 @@ class BagSource:
 
 def _transforms(raw: RawMessage) -> Iterator[tuple[str, str, np.ndarray]]:
     """(parent, child, T_parent_child) of a TFMessage; broken ones are passed over."""
-    if not knows(raw.type_name, raw.encoding):
-        return
     try:
         message = deserialize(raw)
         for stamped in message.transforms:

@@ -11,7 +11,6 @@ import sqlite3
 import struct
 from collections.abc import Collection, Iterator
 from contextlib import ExitStack, suppress
-from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,20 +19,15 @@ from rosbags.rosbag1 import Reader as Reader1
 from rosbags.rosbag1 import ReaderError as ReaderError1
 from rosbags.rosbag2 import Reader as Reader2
 from rosbags.rosbag2 import ReaderError as ReaderError2
-from rosbags.serde import SerdeError
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-from rosbags.typesys.store import Typestore
 
 from common.errors import UserError
 from common.recording.mcap_file import McapFile
+from services.replay.decode import RawMessage
 
 # What the readers raise on damaged files, beyond their own errors.
 _DAMAGE = (
     ReaderError1, ReaderError2, apsw.Error, sqlite3.Error, OSError, AssertionError, KeyError, IndexError,
     ValueError, struct.error, EOFError, RuntimeError, TypeError, MemoryError, OverflowError,
-)  # fmt: skip
-_RUBBISH = (
-    SerdeError, ValueError, struct.error, IndexError, AssertionError, OverflowError, MemoryError, TypeError,
 )  # fmt: skip
 _COPY_AGAIN = "copy it again from where it was recorded"
 
@@ -45,46 +39,6 @@ class BagTopic(NamedTuple):
     type_name: str
     count: int
     encoding: str  # "cdr", "ros1", or something nobody here decodes
-
-
-class RawMessage(NamedTuple):
-    """One message as stored; `at_ns` is its receive time."""
-
-    at_ns: int
-    topic: str
-    type_name: str
-    data: bytes
-    encoding: str
-
-
-@cache
-def _store(encoding: str) -> Typestore:
-    if encoding != "ros1":
-        return get_typestore(Stores.ROS2_JAZZY)
-    store = get_typestore(Stores.ROS1_NOETIC)  # comes without tf
-    for name in ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage"):
-        if name not in store.types:
-            store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", name))
-    return store
-
-
-def knows(type_name: str, encoding: str) -> bool:
-    """Whether messages of this type can be deserialised."""
-    return encoding in ("cdr", "ros1") and type_name in _store(encoding).types
-
-
-def deserialize(message: RawMessage) -> Any:
-    """The ROS message as an object with the fields of its definition.
-
-    Raises:
-        ValueError: the bytes are not that message.
-    """
-    store = _store(message.encoding)
-    read = store.deserialize_ros1 if message.encoding == "ros1" else store.deserialize_cdr
-    try:
-        return read(message.data, message.type_name)
-    except _RUBBISH as error:
-        raise ValueError(f"not a {message.type_name}: {error}") from error
 
 
 class Bag:

@@ -132,8 +132,19 @@ class FolderSource:
         ]
         yield from heapq.merge(*streams, key=itemgetter(0))
 
+    def stamps(self) -> dict[str, list[int]]:
+        """Stamps by word."""
+        return {word: [stamp for stamp, _ in stream] for word, stream in self._streams.items() if stream}
+
+    def sample(self, word: str, count: int) -> list[dict[str, Any]]:
+        """Fields of up to `count` messages of a sensor, spread evenly."""
+        topic = SENSORS[word].topic
+        step = max(1, len(self._streams.get(word, ())) // count)
+        found = (message for _, name, message in self.messages() if name == topic)
+        return [vars(message) for i, message in enumerate(found) if i % step == 0][:count]
+
     def close(self) -> None:
-        pass
+        """Nothing stays open."""
 
     def _stream(self, word: str, entries: list[tuple[int, Any]], make: Any) -> Iterator[Stamped]:
         topic = SENSORS[word].topic

@@ -84,5 +84,12 @@ class RecordingSource:
         for recorded in self._reader.messages(topics, start_ns, stop_ns):
             yield recorded.log_time_ns, recorded.topic, recorded.message
 
+    def sample(self, word: str, count: int) -> list[dict[str, Any]]:
+        """Fields of up to `count` messages of a sensor, spread evenly over the recording."""
+        topic = SENSORS[word].topic
+        step = max(1, self._reader.counts[topic] // count)
+        recorded = self._reader.messages([topic]) if word in self.words else ()
+        return [vars(r.message) for i, r in enumerate(recorded) if i % step == 0][:count]
+
     def close(self) -> None:
         self._reader.close()

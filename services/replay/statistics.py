@@ -1,0 +1,137 @@
+"""Facts about streams of data: rates, gaps, lags, what a lidar's scans are like. Arrays in, facts out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+_GAP_PERIODS = 3.0
+
+
+@dataclass(frozen=True)
+class StreamFacts:
+    """One topic. Times in its own stamps where it has them, else in receive times; None: not known."""
+
+    name: str
+    type: str
+    count: int
+    rate_hz: float | None  # mean
+    largest_gap_s: float | None
+    gaps: int  # pauses longer than three periods
+    backwards: int  # stamps earlier than the one before
+    lag_median_ms: float | None  # receive time minus stamp
+    lag_max_ms: float | None
+    lag_min_ms: float | None
+
+
+@dataclass(frozen=True)
+class LidarFacts:
+    """What the scans of a lidar have in common, from a sample of them."""
+
+    beams_min: int
+    beams_max: int
+    field_of_view_deg: float
+    range_min_m: float
+    range_max_m: float
+    scan_time_s: float
+    time_increment_s: float
+    no_return_share: float  # +inf
+    invalid_share: float  # NaN, negative, or below range_min_m
+    beyond_share: float  # finite, but beyond range_max_m
+    most_common_far_m: float | None  # a far reading that many beams share exactly: a mark, not a distance
+    most_common_far_share: float
+
+
+def stream_facts(name: str, type_name: str, at_ns: np.ndarray, stamp_ns: np.ndarray | None) -> StreamFacts:
+    """Facts of a topic from receive times and stamps, int64 [N] each, in order of arrival."""
+    times = at_ns if stamp_ns is None else stamp_ns
+    steps = np.diff(times)
+    forward = np.diff(np.sort(times))
+    # Bursts make the median small, gaps make the mean large: a period must be both to be missed thrice.
+    period = float(max(np.median(forward), forward.mean())) if len(forward) else 0.0
+    span = float(forward.sum())
+    lag_ms = None if stamp_ns is None or not len(stamp_ns) else (at_ns - stamp_ns) / 1e6
+    return StreamFacts(
+        name=name,
+        type=type_name,
+        count=len(times),
+        rate_hz=len(forward) * 1e9 / span if span > 0.0 else None,
+        largest_gap_s=float(forward.max()) / 1e9 if len(forward) else None,
+        gaps=int((forward > _GAP_PERIODS * period).sum()) if period > 0.0 else 0,
+        backwards=int((steps < 0).sum()),
+        lag_median_ms=None if lag_ms is None else float(np.median(lag_ms)),
+        lag_max_ms=None if lag_ms is None else float(lag_ms.max()),
+        lag_min_ms=None if lag_ms is None else float(lag_ms.min()),
+    )
+
+
+def lidar_facts(scans: list[dict[str, Any]]) -> LidarFacts:
+    """Facts of a lidar from the fields of some of its scans (at least one)."""
+    first = scans[0]
+    beams = [len(scan["ranges_m"]) for scan in scans]
+    ranges = np.concatenate([scan["ranges_m"] for scan in scans]).astype(np.float64)
+    total = max(len(ranges), 1)
+    low, high = first["range_min_m"], first["range_max_m"]
+    finite = np.isfinite(ranges)
+    invalid = np.isnan(ranges) | (ranges < low)
+    far, far_share = None, 0.0
+    # Many drivers write their maximum, or a number beyond it, for "nothing seen".
+    candidates = ranges[finite & (ranges >= 0.5 * ranges[finite].max())] if finite.any() else ranges[:0]
+    if len(candidates):
+        values, counts = np.unique(candidates, return_counts=True)
+        share = float(counts.max()) / total
+        if share > 0.005 and counts.max() > 20:
+            far, far_share = float(values[counts.argmax()]), share
+    return LidarFacts(
+        beams_min=min(beams),
+        beams_max=max(beams),
+        field_of_view_deg=float(np.degrees(abs(first["angle_increment_rad"]) * max(max(beams) - 1, 0))),
+        range_min_m=low,
+        range_max_m=high,
+        scan_time_s=first["scan_time_s"],
+        time_increment_s=first["time_increment_s"],
+        no_return_share=float(np.isposinf(ranges).sum()) / total,
+        invalid_share=float(invalid.sum()) / total,
+        beyond_share=float((finite & (ranges > high)).sum()) / total,
+        most_common_far_m=far,
+        most_common_far_share=far_share,
+    )
+
+
+def stream_problems(facts: StreamFacts) -> list[str]:
+    """Plain sentences about what may trouble a consumer of this stream."""
+    found = []
+    if facts.gaps:
+        found.append(
+            f"{facts.name}: {facts.gaps} gaps of more than three periods, "
+            f"the longest {facts.largest_gap_s:.2f} s"
+        )
+    if facts.backwards:
+        found.append(f"{facts.name}: {facts.backwards} stamps are earlier than the one before")
+    if facts.lag_median_ms is not None and facts.lag_min_ms < -1.0:
+        found.append(
+            f"{facts.name}: stamps lie up to {-facts.lag_min_ms:.0f} ms after their receipt: "
+            "sensor and recorder have different clocks"
+        )
+    if facts.lag_median_ms is not None and facts.lag_median_ms > 1000.0:
+        found.append(f"{facts.name}: arrives {facts.lag_median_ms / 1e3:.1f} s after its stamps")
+    return found
+
+
+def lidar_problems(facts: LidarFacts, *, sparse: bool = False) -> list[str]:
+    """Plain sentences about the scans; in `sparse` ones beams that were not measured are normal."""
+    found = []
+    if facts.beams_min != facts.beams_max:
+        found.append(f"the scans have between {facts.beams_min} and {facts.beams_max} beams")
+    if facts.invalid_share > 0.2 and not sparse:
+        found.append(f"{facts.invalid_share:.0%} of the beams are NaN, negative or below range_min")
+    if facts.most_common_far_m is not None:
+        found.append(
+            f"{facts.most_common_far_share:.1%} of the beams read exactly {facts.most_common_far_m:.2f} m: "
+            "that stands for no return, drop them"
+        )
+    if facts.time_increment_s == 0.0:
+        found.append("the scans do not say when each beam was taken (time_increment is 0): no deskewing")
+    return found
