@@ -1,0 +1,42 @@
+"""How the viewer is laid out: the map large, the camera beside it, health below."""
+
+from __future__ import annotations
+
+import rerun.blueprint as rrb
+
+from services.monitor.panel import PLOTS
+from services.monitor.scene import CAMERA, SCAN, WORLD
+from services.monitor.screen import TIMELINE
+
+
+def layout() -> rrb.Blueprint:
+    """The blueprint."""
+    world = rrb.Spatial3DView(origin=WORLD, name="Map")
+    # The beams lie in the picture by projection: a wrong calibration shows at once.
+    camera = rrb.Spatial2DView(origin=CAMERA, contents=["$origin/**", f"/{SCAN}"], name="Camera")
+    plots = [
+        rrb.TimeSeriesView(
+            origin=f"plots/{quantity}", name=name, plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop)
+        )
+        for quantity, name in PLOTS.items()
+    ]
+    health = rrb.Tabs(
+        rrb.TextDocumentView(origin="health/table", name="Nodes"),
+        rrb.StateTimelineView(origin="health/state", name="States"),
+        *plots[3:],
+    )
+    return rrb.Blueprint(
+        rrb.Vertical(
+            rrb.Horizontal(
+                world,
+                rrb.Vertical(camera, rrb.TextLogView(origin="log", name="Log"), row_shares=[3, 2]),
+                column_shares=[3, 2],
+            ),
+            rrb.Horizontal(health, *plots[:3], column_shares=[3, 2, 2, 2]),
+            row_shares=[5, 2],
+        ),
+        rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="following"),
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+        auto_views=False,
+    )

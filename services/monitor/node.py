@@ -1,0 +1,190 @@
+"""Shows the running system in rerun. It only listens: nobody ever waits for it."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field
+
+from common.config import NodeConfig
+from common.errors import UserError
+from common.messages import Health, Odometry, Rig
+from common.node import Input, Node, Output
+from services.monitor.layout import layout
+from services.monitor.panel import NodeReport, Panel
+from services.monitor.scene import Look, Scene
+from services.monitor.screen import Screen
+from services.monitor.tracks import RateLimit
+from services.monitor.web import allowed_origins, free_port, serve_page
+
+log = logging.getLogger(__name__)
+
+Hz = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
+Port = Annotated[int, Field(ge=0, le=65535)]
+Megabytes = Annotated[int, Field(gt=0)]
+
+
+class MonitorConfig(NodeConfig):
+    """`view`: a page for any browser ("serve"), a window here ("spawn"), or neither. With `save` a file
+    besides. Rates are the most that is drawn, by measurement time; 0 draws none of a kind."""
+
+    view: Literal["none", "spawn", "serve"] = "serve"
+    save: Path | None = None
+    bind: str = "127.0.0.1"  # "0.0.0.0" shows it, unencrypted, to everybody who reaches this machine
+    grpc_port: Port = 9876  # 0 = any free one
+    web_port: Port = 9090
+    viewer_memory_mb: Megabytes = 512  # history kept for viewers that connect late
+    save_limit_mb: Megabytes = 8000  # then the file is finished
+    keep_free_mb: Megabytes = 500  # of the disk
+    image_hz: Hz = 10.0
+    scan_hz: Hz = 10.0
+    pose_hz: Hz = 20.0
+    path_hz: Hz = 1.0
+    grid_hz: Hz = 0.5
+    anchors_hz: Hz = 1.0
+    path_points: Annotated[int, Field(ge=16)] = 2000
+    path_step_m: Annotated[float, Field(gt=0.0)] = 0.05
+    body_size_m: tuple[float, float, float] = (0.4, 0.3, 0.25)  # length, width, height of the robot
+
+
+def _draw_rig(scene: Scene, panel: Panel, rig: Rig) -> None:
+    if rig.camera is not None:
+        size_px = (rig.camera.width_px, rig.camera.height_px)
+        scene.camera(rig.camera.K, size_px, rig.camera.T_body_camera)
+    if rig.lidar is not None:
+        scene.lidar(rig.lidar.T_body_lidar)
+    for sentence in rig.assumed:
+        panel.say(f"rig: {sentence}", scene.newest_ns, "WARN")
+
+
+def _draw_odometry(scene: Scene, panel: Panel, m: Odometry) -> None:
+    scene.pose("localization", m.stamp_ns, m.T_odom_body)
+    panel.status("localization", m.status, m.detail, m.stamp_ns)
+
+
+Draw = Callable[[Scene, Panel, Any], None]
+
+# What is shown, and how: one row a topic. Its delivery never holds a publisher up.
+DRAW: dict[Input, Draw] = {
+    Input("rig", "latched"): _draw_rig,
+    Input("camera/image", "latest"): lambda scene, _, m: scene.picture(
+        m.stamp_ns, m.data, m.encoding, (m.width_px, m.height_px), m.step_bytes
+    ),
+    Input("lidar/scan", "latest"): lambda scene, _, m: scene.scan(
+        m.stamp_ns, m.ranges_m, m.angle_min_rad, m.angle_increment_rad, m.time_increment_s,
+        (m.range_min_m, m.range_max_m),
+    ),
+    Input("wheel/odometry", "latest"): lambda scene, _, m: scene.pose("wheel", m.stamp_ns, m.T_odom_body),
+    Input("external/pose", "latest"): lambda scene, _, m: scene.pose("external", m.stamp_ns, m.T_map_body),
+    Input("localization/odometry", "latest"): _draw_odometry,
+    Input("localization/correction", "latched"): lambda scene, _, m: scene.correction(
+        m.stamp_ns, m.T_map_odom
+    ),
+    Input("localization/anchors", "latched"): lambda scene, _, m: scene.anchors(
+        m.stamp_ns, m.anchor_ids, m.T_map_anchor
+    ),
+    Input("localization/grid", "latched"): lambda scene, _, m: scene.grid(
+        m.stamp_ns, m.occupancy, m.resolution_m, m.origin_m
+    ),
+}  # fmt: skip
+
+
+def _handler(draw: Draw) -> Callable[[MonitorNode, Any], tuple[Output, ...]]:
+    def handle(self: MonitorNode, message: Any) -> tuple[Output, ...]:
+        draw(self.scene, self.panel, message)
+        self.detail = self.screen.status
+        return ()
+
+    return handle
+
+
+_Handlers = type("_Handlers", (), {entry.row.handler: _handler(draw) for entry, draw in DRAW.items()})
+
+
+class MonitorNode(_Handlers, Node):
+    """Draws what comes by `DRAW`, and the health of all nodes."""
+
+    name = "monitor"
+    Config = MonitorConfig
+    inputs = tuple(DRAW)
+    config: MonitorConfig
+
+    def configure(self) -> None:
+        c = self.config
+        if c.view == "none" and c.save is None:
+            raise UserError('monitor: view = "none" and no save: choose a view, or a file to save')
+        self.screen = Screen()
+        try:
+            self._open()
+        except (RuntimeError, OSError) as error:
+            self.screen.close()
+            raise UserError(f"monitor: {error}") from error
+        kinds = ("image", "scan", "pose", "path", "grid", "anchors")
+        limits = RateLimit({"health": 1.0, **{kind: getattr(c, f"{kind}_hz") for kind in kinds}})
+        self.panel = Panel(self.screen, limits)
+        self.scene = Scene(self.screen, limits, Look(c.path_points, c.path_step_m, c.body_size_m))
+        self.detail = self.screen.status
+        log.info("%s", self.detail)
+
+    def _open(self) -> None:
+        """Opens the file and the view.
+
+        Raises:
+            RuntimeError, OSError: it cannot be; the text says what to do.
+        """
+        c, screen = self.config, self.screen
+        if c.save is not None:
+            screen.save(c.save, layout(), limit_mb=c.save_limit_mb, keep_free_mb=c.keep_free_mb)
+        if c.view == "none":
+            return
+        grpc_port, web_port = _port(c.bind, "grpc_port", c.grpc_port), 0
+        origins: list[str] = []
+        if c.view == "serve":
+            web_port = _port("0.0.0.0", "web_port", c.web_port)
+            origins = allowed_origins(c.bind, web_port)
+        address = screen.serve(
+            layout(), bind=c.bind, port=grpc_port, origins=origins, memory_mb=c.viewer_memory_mb
+        )
+        if c.view == "serve":
+            screen.notes.append(f"open {serve_page(c.bind, web_port, grpc_port)}")
+        else:
+            screen.spawn(address, c.viewer_memory_mb)
+            screen.notes.append(f"viewer at {address}")
+
+    def on_health(self, health: Health) -> None:
+        """A row of the table, and a point of each curve."""
+        inputs = health.inputs
+        report = NodeReport(
+            node=health.node, instance=health.instance, wall_ns=health.stamp_ns, state=health.state,
+            detail=health.detail, step_p50_ms=health.step_p50_ms, step_p95_ms=health.step_p95_ms,
+            age_ms=max((i.age_ms for i in inputs), default=0.0),
+            received=sum(i.received for i in inputs), sent=sum(o.sent for o in health.outputs),
+            dropped=sum(i.dropped for i in inputs), lost=sum(i.lost for i in inputs),
+            broken=sum(i.undecodable + i.stale for i in inputs),
+            rss_mb=health.rss_mb, cpu_percent=health.cpu_percent,
+        )  # fmt: skip
+        self.panel.report(report, self.scene.newest_ns)
+        self.detail = self.screen.status
+
+    def drain(self) -> tuple[Output, ...]:
+        self.scene.finish()
+        self.screen.flush()
+        return ()
+
+    def close(self) -> None:
+        screen = getattr(self, "screen", None)
+        if screen is not None:
+            screen.close()
+
+
+def _port(bind: str, option: str, port: int) -> int:
+    try:
+        return free_port(bind, port)
+    except OSError as error:
+        raise OSError(
+            f"cannot listen at {bind}:{port} ({error.strerror}): another viewer may be running. "
+            f"Choose another with --set monitor.{option}=PORT (0 = any free one)"
+        ) from error

@@ -1,0 +1,135 @@
+"""The health of the nodes as plots, states, a table and a log.
+
+plots/<quantity>/<node>    one curve a node
+health/state/<node>        configure, active, drained ... as coloured lanes
+health/table               the newest of all nodes
+log                        what changed: states, faults, words of the nodes
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import rerun as rr
+
+from services.monitor.screen import Screen
+from services.monitor.tracks import RateLimit
+
+# quantity -> how its plot is called
+PLOTS = {
+    "step_p95_ms": "Step time, p95 [ms]",
+    "age_ms": "Age of inputs [ms]",
+    "dropped_hz": "Dropped and lost [1/s]",
+    "rss_mb": "Memory [MB]",
+    "cpu_percent": "CPU [%]",
+}
+_STATES = {
+    "configure": 0x9E9E9EFF, "standby": 0xFFC107FF, "active": 0x4CAF50FF,
+    "drain": 0x00BCD4FF, "drained": 0x2196F3FF, "closed": 0x607D8BFF,
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class NodeReport:
+    """What one node says of itself once a second. Counts are since it started."""
+
+    node: str
+    instance: str
+    wall_ns: int  # its clock, for rates
+    state: str
+    detail: str
+    step_p50_ms: float
+    step_p95_ms: float
+    age_ms: float
+    received: int
+    sent: int
+    dropped: int
+    lost: int
+    broken: int
+    rss_mb: float
+    cpu_percent: float
+
+
+class Panel:
+    """All nodes' reports, newest and one before."""
+
+    def __init__(self, screen: Screen, limits: RateLimit) -> None:
+        self._screen = screen
+        self._limits = limits
+        self._reports: dict[str, NodeReport] = {}
+        self._statuses: dict[str, str] = {}
+
+    def report(self, new: NodeReport, stamp_ns: int | None) -> None:
+        """Takes a report in; `stamp_ns` is the newest measurement's, None before the first."""
+        old = self._reports.get(new.node)
+        if old is None:
+            self._introduce(new.node)
+        if old is not None and old.instance != new.instance:
+            self.say(f"{new.node} was started again", stamp_ns, "WARN")
+            old = None
+        self._reports[new.node] = new
+        curves = {
+            "step_p95_ms": new.step_p95_ms,
+            "age_ms": new.age_ms,
+            "dropped_hz": 0.0 if old is None else _rate_hz(old, new),
+            "rss_mb": new.rss_mb,
+            "cpu_percent": new.cpu_percent,
+        }
+        for quantity, value in curves.items():
+            self._screen.log(f"plots/{quantity}/{new.node}", rr.Scalars(value), stamp_ns=stamp_ns)
+        if old is None or old.state != new.state:
+            self._screen.log(f"health/state/{new.node}", rr.StateChange(state=new.state), stamp_ns=stamp_ns)
+            self.say(f"{new.node} is {new.state}", stamp_ns)
+        if new.detail and (old is None or old.detail != new.detail):
+            self.say(f"{new.node}: {new.detail}", stamp_ns)
+        for count, text in (("lost", "lost"), ("broken", "could not read")):
+            more = getattr(new, count) - (0 if old is None else getattr(old, count))
+            if more > 0:
+                self.say(f"{new.node} {text} {more} messages", stamp_ns, "WARN")
+        if self._limits.due("health", new.wall_ns):
+            self._screen.log(
+                "health/table",
+                rr.TextDocument(self._table(), media_type=rr.MediaType.MARKDOWN),
+                stamp_ns=stamp_ns,
+            )
+
+    def status(self, path: str, status: str, detail: str, stamp_ns: int) -> None:
+        """What a node says of its results; drawn when it changes."""
+        if self._statuses.get(path) == status:
+            return
+        self._statuses[path] = status
+        self._screen.log(f"health/state/{path}", rr.StateChange(state=status), stamp_ns=stamp_ns)
+        level = "INFO" if status == "ok" else "WARN"
+        self.say(f"{path}: {status}{f' ({detail})' if detail and status != 'ok' else ''}", stamp_ns, level)
+
+    def say(self, text: str, stamp_ns: int | None, level: str = "INFO") -> None:
+        """One line in the log."""
+        self._screen.log("log", rr.TextLog(text, level=level), stamp_ns=stamp_ns)
+
+    def _introduce(self, node: str) -> None:
+        for quantity in PLOTS:
+            self._screen.log(f"plots/{quantity}/{node}", rr.SeriesLines(names=node), static=True)
+        self._screen.log(
+            f"health/state/{node}",
+            rr.StateConfiguration(values=list(_STATES), labels=list(_STATES), colors=list(_STATES.values())),
+            static=True,
+        )
+
+    def _table(self) -> str:
+        lines = [
+            "| node | state | step p50 ms | p95 | age ms | in | out | dropped | lost | bad | MB | CPU % | |",
+            "|---|---|--:|--:|--:|--:|--:|--:|--:|--:|--:|--:|---|",
+        ]
+        for name, r in sorted(self._reports.items()):
+            lines.append(
+                f"| **{name}** | {r.state} | {r.step_p50_ms:.2f} | {r.step_p95_ms:.2f} | {r.age_ms:.1f} | "
+                f"{r.received} | {r.sent} | {r.dropped} | {r.lost} | {r.broken} | {r.rss_mb:.0f} | "
+                f"{r.cpu_percent:.0f} | {r.detail.replace('|', '/')} |"
+            )
+        return "\n".join(lines)
+
+
+def _rate_hz(old: NodeReport, new: NodeReport) -> float:
+    """Messages that did not reach the node, per second between two reports."""
+    seconds = max((new.wall_ns - old.wall_ns) / 1e9, 1e-3)
+    return (new.dropped + new.lost - old.dropped - old.lost) / seconds

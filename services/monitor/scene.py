@@ -1,0 +1,290 @@
+"""The robot and its map, drawn in rerun. Entities:
+
+map                        the world, z up
+map/grid                   occupancy
+map/anchors                lidar submaps
+map/scan                   the last sweep, where it was measured
+map/path/<source>          where each source of poses says the robot has been
+map/odom                   moves when a loop closes (T_map_odom)
+map/odom/body              the robot
+map/odom/body/camera       pinhole, with the picture in camera/image
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import rerun as rr
+
+from common.geometry import inverse, quat_xyzw_from_matrix, transform_points
+from services.monitor.screen import Screen
+from services.monitor.tracks import Path, Poses, RateLimit, scan_points, sweep_to_world
+
+WORLD = "map"
+BODY = f"{WORLD}/odom/body"
+CAMERA = f"{BODY}/camera"
+SCAN = f"{WORLD}/scan"
+
+# Who is believed about the robot's pose, best first.
+SOURCES = ("localization", "external", "wheel")
+_COLOURS = {"localization": (80, 200, 255), "external": (120, 230, 120), "wheel": (150, 150, 150)}
+_ROBOT = (255, 160, 40)
+_SCAN = (255, 70, 90)
+_ANCHOR = (200, 140, 255)
+_FRUSTUM_M = 0.5
+_LOOPED_NS = 5_000_000_000  # stamps that fall back further are of another lap
+_RAW = {
+    "rgb8": (rr.ColorModel.RGB, 3),
+    "bgr8": (rr.ColorModel.BGR, 3),
+    "rgba8": (rr.ColorModel.RGBA, 4),
+    "bgra8": (rr.ColorModel.BGRA, 4),
+    "mono8": (rr.ColorModel.L, 1),
+}
+
+
+@dataclass(frozen=True)
+class Look:
+    """How things are drawn."""
+
+    path_points: int = 2000
+    path_step_m: float = 0.05
+    body_size_m: tuple[float, float, float] = (0.4, 0.3, 0.25)
+
+
+@dataclass
+class _Sweep:
+    """A scan that waits for the pose at its end."""
+
+    stamp_ns: int
+    end_ns: int
+    points_body: np.ndarray
+    share: np.ndarray
+
+
+class Scene:
+    """What is known of the robot and its map, and how it looks."""
+
+    def __init__(self, screen: Screen, limits: RateLimit, look: Look) -> None:
+        self._screen = screen
+        self._limits = limits
+        self._poses = {name: Poses() for name in SOURCES}
+        self._paths = {name: Path(look.path_points, look.path_step_m) for name in SOURCES}
+        self._T_map_odom = np.eye(4)
+        self._T_map_wheel: np.ndarray | None = None
+        self._T_body_lidar = np.eye(4)
+        self._sweep: _Sweep | None = None
+        self.newest_ns: int | None = None  # of all measurements
+        screen.log(WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        half = np.array(look.body_size_m) / 2.0
+        screen.log(
+            f"{BODY}/shape",
+            rr.Boxes3D(half_sizes=half, centers=[0.0, 0.0, half[2]], colors=_ROBOT),
+            static=True,
+        )
+        heading = rr.Arrows3D(origins=[half[0], 0.0, half[2]], vectors=[0.25, 0.0, 0.0], colors=_ROBOT)
+        screen.log(f"{BODY}/heading", heading, static=True)
+
+    # --- calibration ---
+
+    def camera(
+        self,
+        K: np.ndarray,  # float64 [3, 3]
+        size_px: tuple[int, int],  # width, height
+        T_body_camera: np.ndarray,
+    ) -> None:
+        """The camera's place on the robot, and its frustum (without lens distortion)."""
+        self._screen.log(
+            CAMERA,
+            _transform(T_body_camera),
+            rr.Pinhole(
+                image_from_camera=K, width=size_px[0], height=size_px[1],
+                camera_xyz=rr.ViewCoordinates.RDF, image_plane_distance=_FRUSTUM_M,
+            ),
+            static=True,
+        )  # fmt: skip
+
+    def lidar(self, T_body_lidar: np.ndarray) -> None:
+        """The lidar's place on the robot."""
+        self._T_body_lidar = T_body_lidar
+
+    # --- measurements ---
+
+    def picture(
+        self,
+        stamp_ns: int,
+        data: np.ndarray,  # uint8 [B]
+        encoding: str,  # jpeg, png, yuv422_yuy2, or one of `_RAW`
+        size_px: tuple[int, int],  # width, height
+        step_bytes: int,  # of a raw row; 0 = no padding
+    ) -> None:
+        """A camera picture as it came: compressed ones stay so."""
+        self._saw(stamp_ns)
+        if not self._limits.due("image", stamp_ns):
+            return
+        width, height = size_px
+        if encoding in ("jpeg", "png"):
+            drawing = rr.EncodedImage(contents=data.tobytes(), media_type=f"image/{encoding}")
+        elif encoding == "yuv422_yuy2":
+            rows = _rows(data, height, width * 2, step_bytes)
+            drawing = rr.Image(
+                bytes=rows.tobytes(), width=width, height=height, pixel_format=rr.PixelFormat.YUY2
+            )
+        else:
+            model, channels = _RAW[encoding]
+            rows = _rows(data, height, width * channels, step_bytes)
+            drawing = rr.Image(
+                bytes=rows.tobytes(), width=width, height=height, color_model=model,
+                datatype=rr.ChannelDatatype.U8,
+            )  # fmt: skip
+        self._screen.log(f"{CAMERA}/image", drawing, stamp_ns=stamp_ns)
+
+    def scan(
+        self,
+        stamp_ns: int,
+        ranges_m: np.ndarray,  # float32 [N]
+        angle_min_rad: float,
+        angle_increment_rad: float,
+        time_increment_s: float,
+        range_limits_m: tuple[float, float],
+    ) -> None:
+        """A sweep of the lidar: drawn in the map as soon as it is known where the robot was."""
+        self._saw(stamp_ns)
+        if not self._limits.due("scan", stamp_ns):
+            return
+        self._draw_sweep()  # what still waits gets no better pose any more
+        points, beams = scan_points(ranges_m, angle_min_rad, angle_increment_rad, range_limits_m)
+        self._sweep = _Sweep(
+            stamp_ns=stamp_ns,
+            end_ns=stamp_ns + round(time_increment_s * len(ranges_m) * 1e9),
+            points_body=transform_points(self._T_body_lidar, points),
+            share=beams / max(len(ranges_m), 1),
+        )
+        if not any(self._poses.values()):
+            self._draw_sweep()
+
+    def pose(self, source: str, stamp_ns: int, T_source_body: np.ndarray) -> None:
+        """The robot's pose by one of `SOURCES`: localization in odom, external in map, wheel in its own
+        drifting frame, which is laid on the map where the robot was first known to be."""
+        self._saw(stamp_ns)
+        self._poses[source].add(stamp_ns, T_source_body)
+        leader = self._leader()
+        self._paths[source].add((self._T_map_source(source) @ T_source_body)[:3, 3])
+        if self._limits.due("path", stamp_ns, source):
+            strip = rr.LineStrips3D(
+                [self._paths[source].points_m], colors=_COLOURS[source], radii=rr.Radius.ui_points(1.5)
+            )
+            self._screen.log(f"{WORLD}/path/{source}", strip, stamp_ns=stamp_ns)
+        if source != leader:
+            return
+        if self._limits.due("pose", stamp_ns):
+            T_odom_body = inverse(self._T_map_odom) @ self._T_map_source(source) @ T_source_body
+            self._screen.log(BODY, _transform(T_odom_body), stamp_ns=stamp_ns)
+        if self._sweep is not None and stamp_ns >= self._sweep.end_ns:
+            self._draw_sweep()
+
+    def correction(self, stamp_ns: int, T_map_odom: np.ndarray) -> None:
+        """Where the smooth frame lies in the map."""
+        self._T_map_odom = T_map_odom
+        self._screen.log(f"{WORLD}/odom", _transform(T_map_odom), stamp_ns=self._not_before(stamp_ns))
+
+    # --- the map ---
+
+    def anchors(self, stamp_ns: int, anchor_ids: np.ndarray, T_map_anchor: np.ndarray) -> None:
+        """Submaps: `anchor_ids` int64 [N], `T_map_anchor` [N, 4, 4]."""
+        if not self._limits.due("anchors", stamp_ns):
+            return
+        arrows = rr.Arrows3D(
+            origins=T_map_anchor[:, :3, 3], vectors=0.3 * T_map_anchor[:, :3, 0],
+            labels=[str(i) for i in anchor_ids], show_labels=False, colors=_ANCHOR,
+        )  # fmt: skip
+        self._screen.log(f"{WORLD}/anchors", arrows, stamp_ns=stamp_ns)
+
+    def grid(
+        self,
+        stamp_ns: int,
+        occupancy: np.ndarray,  # int8 [H, W], row 0 at the smallest y; -1 unknown, 0 free .. 100 occupied
+        resolution_m: float,
+        origin_m: np.ndarray,  # [2], corner of cell (0, 0)
+    ) -> None:
+        """The occupancy grid, lying on the floor."""
+        if not occupancy.size or not self._limits.due("grid", stamp_ns):
+            return
+        height, width = occupancy.shape
+        drawing = rr.GridMap(
+            data=np.ascontiguousarray(occupancy).tobytes(),
+            format=rr.components.ImageFormat(
+                width=width, height=height, color_model="L", channel_datatype="U8"
+            ),
+            cell_size=resolution_m,
+            translation=[origin_m[0], origin_m[1], -0.01],  # just below what stands on the floor
+            colormap=rr.components.Colormap.RvizMap,
+        )
+        self._screen.log(f"{WORLD}/grid", drawing, stamp_ns=stamp_ns)
+
+    def finish(self) -> None:
+        """Nothing more will come: draws what still waits."""
+        self._draw_sweep()
+
+    # --- where and when things are ---
+
+    def _saw(self, stamp_ns: int) -> None:
+        """Keeps the time of the newest measurement; a recording that loops takes it back."""
+        if self.newest_ns is None or not self.newest_ns - _LOOPED_NS < stamp_ns <= self.newest_ns:
+            self.newest_ns = stamp_ns
+
+    def _leader(self) -> str | None:
+        return next((name for name in SOURCES if self._poses[name]), None)
+
+    def _T_map_source(self, source: str) -> np.ndarray:
+        if source == "localization":
+            return self._T_map_odom
+        if source == "external":
+            return np.eye(4)
+        if self._T_map_wheel is None:
+            better = next((n for n in SOURCES[:2] if self._poses[n]), None)
+            if better is None:
+                return np.eye(4)
+            T_map_body = self._T_map_source(better) @ self._poses[better].newest[1]
+            self._T_map_wheel = T_map_body @ inverse(self._poses["wheel"].newest[1])
+            self._paths["wheel"].clear()
+        return self._T_map_wheel
+
+    def _draw_sweep(self) -> None:
+        sweep, self._sweep = self._sweep, None
+        if sweep is None:
+            return
+        leader = self._leader()
+        T_world_body = [None, None]
+        if leader is not None:
+            T_world_body = [self._poses[leader].at(t) for t in (sweep.stamp_ns, sweep.end_ns)]
+        if T_world_body[0] is None or T_world_body[1] is None:
+            if leader is not None:
+                return  # no pose of that time: nowhere to draw it
+            T_world_body = [np.eye(4), np.eye(4)]
+        T_map = np.eye(4) if leader is None else self._T_map_source(leader)
+        points_map = sweep_to_world(sweep.points_body, sweep.share, *(T_map @ T for T in T_world_body))
+        points = rr.Points3D(points_map.astype(np.float32), colors=_SCAN, radii=rr.Radius.ui_points(2.0))
+        self._screen.log(SCAN, points, stamp_ns=sweep.stamp_ns)
+
+    def _not_before(self, stamp_ns: int) -> int:
+        """Optimisations carry the stamp of what they were computed from; they hold from now on."""
+        return stamp_ns if self.newest_ns is None else max(stamp_ns, self.newest_ns)
+
+
+def _transform(T: np.ndarray) -> rr.Transform3D:
+    return rr.Transform3D(
+        translation=T[:3, 3], quaternion=rr.Quaternion(xyzw=quat_xyzw_from_matrix(T[:3, :3]))
+    )
+
+
+def _rows(data: np.ndarray, height: int, row_bytes: int, step_bytes: int) -> np.ndarray:
+    """uint8 [height, row_bytes] without the padding of a raw picture.
+
+    Raises:
+        ValueError: fewer bytes than the picture needs.
+    """
+    step = step_bytes or row_bytes
+    if step < row_bytes or data.size < step * (height - 1) + row_bytes:
+        raise ValueError(f"{data.size} bytes are too few for {height} rows of {row_bytes} (step {step})")
+    return np.lib.stride_tricks.as_strided(data, (height, row_bytes), (step, 1))

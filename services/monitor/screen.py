@@ -1,0 +1,278 @@
+"""Where drawings go: a viewer, a file, or both, each behind a thread of its own.
+
+rerun can feed several sinks from one stream (`set_sinks`), but then the slowest sink sets the pace: a
+browser that stops reading blocks `log()` for more than 20 s, and the file with it. So each sink has its
+own stream of the same recording, and a queue that never makes the caller wait: when it is full, what is
+drawn replaces what still waits to be drawn at the same place.
+"""
+
+from __future__ import annotations
+
+import logging
+import shutil
+import subprocess
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+
+log = logging.getLogger(__name__)
+
+APPLICATION = "beamsplat"
+TIMELINE = "time"
+_QUEUE = 512  # about ten seconds of drawings at the default rates
+_CHECK_S = 1.0
+_FLUSH_S = 3.0
+
+
+@dataclass
+class _Drawing:
+    path: str
+    parts: tuple[Any, ...]
+    stamp_ns: int | None
+    static: bool
+
+
+class Channel:
+    """One sink of a recording, fed by a thread."""
+
+    def __init__(
+        self,
+        name: str,
+        stream: rr.RecordingStream,
+        sink: Any,
+        blueprint: rrb.Blueprint,
+        watch: Callable[[], str] = lambda: "",
+    ) -> None:
+        """`watch` is asked about once a second whether the sink must be given up: a reason, or "".
+
+        Raises:
+            RuntimeError: the sink cannot be opened.
+        """
+        self.name = name
+        self.fault = ""  # why nothing is drawn here any more
+        self.skipped = 0  # drawings overtaken by newer ones
+        self._stream = stream
+        self._watch = watch
+        self._queue: deque[_Drawing | threading.Event] = deque()
+        self._newest: dict[str, _Drawing] = {}
+        self._changed = threading.Condition()
+        self._closing = False
+        stream.set_sinks(sink, default_blueprint=blueprint)
+        self._thread = threading.Thread(target=self._run, name=f"monitor-{name}", daemon=True)
+        self._thread.start()
+
+    def put(self, drawing: _Drawing) -> None:
+        """Takes one drawing; never waits."""
+        if self.fault:
+            return
+        with self._changed:
+            waiting = self._newest.get(drawing.path)
+            if len(self._queue) >= _QUEUE and waiting is not None:
+                waiting.parts, waiting.stamp_ns = drawing.parts, drawing.stamp_ns
+                self.skipped += 1
+                return
+            drawing = _Drawing(drawing.path, drawing.parts, drawing.stamp_ns, drawing.static)
+            self._queue.append(drawing)
+            self._newest[drawing.path] = drawing
+            self._changed.notify()
+
+    def flush(self, timeout_s: float) -> bool:
+        """Waits until all that was put is with the sink; False if it took longer."""
+        done = threading.Event()
+        with self._changed:
+            self._queue.append(done)
+            self._changed.notify()
+        return bool(self.fault) or done.wait(timeout_s)
+
+    def close(self, timeout_s: float) -> None:
+        """Draws what is waiting, closes the sink; gives up after a while."""
+        with self._changed:
+            self._closing = True
+            self._changed.notify()
+        self._thread.join(timeout_s)
+        if self._thread.is_alive():
+            log.warning("%s did not finish within %g s: the last drawings are missing", self.name, timeout_s)
+
+    def _run(self) -> None:
+        next_check = time.monotonic() + _CHECK_S
+        while not self.fault and (item := self._take()) != "closing":
+            try:
+                if isinstance(item, threading.Event):
+                    self._stream.flush(timeout_sec=_FLUSH_S)
+                    item.set()
+                elif item is not None:
+                    self._draw(item)
+                if time.monotonic() >= next_check:
+                    self._check()
+                    next_check = time.monotonic() + _CHECK_S
+            except RuntimeError as error:  # what rerun raises when a sink has died
+                self._give_up(str(error))
+        try:
+            if not self.fault:
+                self._stream.flush(timeout_sec=_FLUSH_S)
+            self._stream.disconnect()
+        except RuntimeError as error:
+            self._give_up(str(error))
+
+    def _take(self) -> _Drawing | threading.Event | str | None:
+        with self._changed:
+            if not self._queue and not self._closing:
+                self._changed.wait(_CHECK_S)
+            if not self._queue:
+                return "closing" if self._closing else None
+            item = self._queue.popleft()
+            if isinstance(item, _Drawing) and self._newest.get(item.path) is item:
+                del self._newest[item.path]
+            return item
+
+    def _draw(self, drawing: _Drawing) -> None:
+        self._stream.reset_time()
+        if drawing.stamp_ns is not None:
+            self._stream.set_time(TIMELINE, timestamp=np.datetime64(drawing.stamp_ns, "ns"))
+        self._stream.log(drawing.path, *drawing.parts, static=drawing.static)
+
+    def _check(self) -> None:
+        try:
+            self._stream.flush(timeout_sec=0.2)
+        except RuntimeError as error:
+            if "timed out" not in str(error):  # slow is not dead
+                raise
+        reason = self._watch()
+        if reason:
+            self._give_up(reason)
+
+    def _give_up(self, reason: str) -> None:
+        if not self.fault:
+            self.fault = f"{self.name}: {reason}"
+            log.warning("the monitor goes on without %s", self.fault)
+        with self._changed:
+            self._queue.clear()
+            self._newest.clear()
+
+
+class Screen:
+    """The channels in use. Drawing on it never waits and never raises."""
+
+    def __init__(self) -> None:
+        self.channels: list[Channel] = []
+        self.notes: list[str] = []  # where to look
+        self._recording_id = np.random.default_rng().bytes(16).hex()
+        self._viewer: subprocess.Popen[bytes] | None = None
+
+    def log(self, path: str, *parts: Any, stamp_ns: int | None = None, static: bool = False) -> None:
+        """Draws rerun archetypes at an entity; without a stamp on the clock of this machine only."""
+        for channel in self.channels:
+            channel.put(_Drawing(path, parts, stamp_ns, static))
+
+    def save(self, path: Path, blueprint: rrb.Blueprint, *, limit_mb: int, keep_free_mb: int) -> Path:
+        """Starts a file beside what may be there already (drive.rrd, drive-2.rrd, ...); returns its name.
+
+        The file ends, whole, at `limit_mb`, or when less than `keep_free_mb` are left on the disk.
+
+        Raises:
+            RuntimeError: the file cannot be written.
+        """
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise RuntimeError(f"cannot make the folder of {path}: {error}") from error
+        path = _unused(path)
+        # Few, large chunks: their directory stays in memory until the file is closed.
+        stream = self._stream(flush_tick_s=2.0)
+        watch = _disk_watch(path, limit_mb, keep_free_mb)
+        self.channels.append(Channel(str(path), stream, rr.FileSink(path), blueprint, watch))
+        self.notes.append(f"writing {path}")
+        return path
+
+    def serve(
+        self, blueprint: rrb.Blueprint, *, bind: str, port: int, origins: list[str], memory_mb: int
+    ) -> str:
+        """Starts the server that viewers connect to, which keeps `memory_mb` of history for those who
+        come late; returns its address.
+
+        Raises:
+            RuntimeError: the port is taken.
+        """
+        sink = rr.GrpcServerSink(
+            bind, port, server_memory_limit=f"{memory_mb}MB", cors_allow_origin=origins or None
+        )
+        channel = Channel(f"viewer at port {port}", self._stream(0.1), sink, blueprint, self._watch_viewer)
+        self.channels.append(channel)
+        return f"rerun+http://127.0.0.1:{port}/proxy"
+
+    def spawn(self, address: str, memory_mb: int) -> None:
+        """Opens a viewer window on the server at `address`. It stays when the monitor ends."""
+        self._viewer = subprocess.Popen(
+            [sys.executable, "-m", "rerun_cli", "--connect", address, "--memory-limit", f"{memory_mb}MB"],
+            stdin=subprocess.DEVNULL,
+            start_new_session=True,
+        )
+
+    def _watch_viewer(self) -> str:
+        """The server outlives a window: a new one can be opened on it."""
+        if self._viewer is not None and self._viewer.poll() is not None:
+            code = self._viewer.returncode
+            self._viewer = None
+            why = "" if code == 0 else f' with code {code} (no display? use view = "serve")'
+            self.notes.append(f"the viewer window has ended{why}")
+            log.warning("%s", self.notes[-1])
+        return ""
+
+    def _stream(self, flush_tick_s: float) -> rr.RecordingStream:
+        config = rr.ChunkBatcherConfig(flush_tick=flush_tick_s)
+        return rr.RecordingStream(APPLICATION, recording_id=self._recording_id, batcher_config=config)
+
+    @property
+    def status(self) -> str:
+        """One line: where to look, and what has failed."""
+        parts = [*self.notes]
+        for channel in self.channels:
+            if channel.fault:
+                parts.append(f"stopped: {channel.fault}")
+            elif channel.skipped:
+                parts.append(f"{channel.name} is slow: {channel.skipped} drawings overtaken")
+        return "; ".join(parts)
+
+    def flush(self, timeout_s: float = _FLUSH_S) -> None:
+        """Waits a little until everything drawn has arrived."""
+        for channel in self.channels:
+            channel.flush(timeout_s)
+
+    def close(self, timeout_s: float = _FLUSH_S) -> None:
+        """Finishes files and closes servers."""
+        for channel in self.channels:
+            channel.close(timeout_s)
+
+
+def _unused(path: Path) -> Path:
+    """`path`, or the first of path-2, path-3 ... that does not exist: a restart must not overwrite."""
+    candidate, number = path, 1
+    while candidate.exists():
+        number += 1
+        candidate = path.with_stem(f"{path.stem}-{number}")
+    return candidate
+
+
+def _disk_watch(path: Path, limit_mb: int, keep_free_mb: int) -> Callable[[], str]:
+    def watch() -> str:
+        try:
+            size_mb = path.stat().st_size / 1e6
+            free_mb = shutil.disk_usage(path.parent).free / 1e6
+        except OSError as error:
+            return f"the file is gone ({error})"
+        if size_mb > limit_mb:
+            return f"complete at {size_mb:.0f} MB (save_limit_mb = {limit_mb})"
+        if free_mb < keep_free_mb:
+            return f"complete: {free_mb:.0f} MB left on the disk (keep_free_mb = {keep_free_mb})"
+        return ""
+
+    return watch
