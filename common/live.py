@@ -156,6 +156,7 @@ class Live:
                 continue
             started = time.perf_counter()
             self._emit_all(self._jobs.before_message(letter.topic))
+            self.node.on_header(letter.header)
             self._emit(self.node.handle(letter.topic, letter.message))
             self._steps_ms.append((time.perf_counter() - started) * 1e3)
 

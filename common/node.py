@@ -21,6 +21,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
 from common.config import NodeConfig
+from common.header import Header
 from common.messages import Health, Message
 from common.topics import ROW_NUMBER, Delivery, Topic, topic
 
@@ -117,6 +118,9 @@ class Node:
 
     def on_health(self, health: Health) -> None:
         """Those that watch override this: the health of every node, live only."""
+
+    def on_header(self, header: Header) -> None:
+        """Sees what rode beside the message that is handled next; the recorder keeps it."""
 
     # --- used by the runners ---
 
