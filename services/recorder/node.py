@@ -1,0 +1,105 @@
+"""Writes what goes over the bus to MCAP."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Iterable
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+from mcap.writer import CompressionType
+
+from common.errors import UserError
+from common.header import Header, local_clock_id
+from common.messages import Health, Message
+from common.node import Input, Node, Output
+from common.recording import RecordingError, RecordingWriter
+from common.topics import HEALTH, TOPICS
+from services.recorder.arrival import ArrivalClock
+from services.recorder.config import RecorderConfig
+
+log = logging.getLogger("beamsplat.recorder")
+
+
+def _keeper(topic: str) -> Callable[[Any, Message], Iterable[Output]]:
+    def keep(self: RecorderNode, message: Message) -> Iterable[Output]:
+        self.keep(topic, message)
+        return ()
+
+    return keep
+
+
+# A handler for each row of the topic table, so that a new topic is recorded the day it appears.
+_Handlers = type("_Handlers", (), {row.handler: _keeper(row.name) for row in TOPICS.values()})
+
+
+class RecorderNode(_Handlers, Node):
+    """All topics, every message of them, and the health of all nodes."""
+
+    name = "recorder"
+    Config = RecorderConfig
+    inputs = tuple(Input(row.name, None if row.delivery == "latched" else "every") for row in TOPICS.values())
+
+    def __init__(self, config: RecorderConfig) -> None:
+        super().__init__(config)
+        for name in (*config.topics, *config.without):
+            if name not in TOPICS:
+                raise UserError(f"recorder: no topic called {name!r}; there are {', '.join(TOPICS)}")
+        self._chosen = set(config.topics or TOPICS) - set(config.without)
+        self._clock = ArrivalClock(config.clock, time.time_ns, time.monotonic_ns)
+        self._clock_id = local_clock_id()
+        self._header: Header | None = None
+        self.writer: RecordingWriter | None = None
+
+    def configure(self) -> None:
+        """Makes the recording, so that a wrong path is said before anything runs."""
+        self.writer = RecordingWriter(
+            _free(self.config.out),
+            compression=CompressionType[self.config.compression.upper()],
+            chunk_s=self.config.chunk_s,
+            sync=self.config.sync,
+        )
+        log.info("recording to %s", self.writer.path)
+
+    def on_header(self, header: Header) -> None:
+        self._header = header
+
+    def on_health(self, health: Health) -> None:
+        if self.config.health:
+            self._write(f"{HEALTH}/{health.node}", health, None)
+
+    def keep(self, topic: str, message: Message) -> None:
+        """Writes one message with the header that came with it."""
+        header, self._header = self._header, None
+        if topic in self._chosen:
+            self._write(topic, message, header)
+
+    def close(self) -> None:
+        if self.writer is None:
+            return
+        try:
+            self.writer.close()
+        except RecordingError as error:
+            log.error("%s", error)
+        lost = self.writer.lost.total()
+        log.info("%d messages in %s, %d lost", self.writer.counts.total(), self.writer.path, lost)
+
+    def _write(self, topic: str, message: Message, header: Header | None) -> None:
+        own_clock = header is not None and header.clock_id == self._clock_id
+        arrival_ns = self._clock.arrival_ns(message.stamp_ns, header.publish_ns if own_clock else None)
+        failed_before = self.writer.lost.total() > 0
+        try:
+            self.writer.write(topic, message, arrival_ns, header)
+        except RecordingError as error:
+            if not failed_before:  # once is enough; the count is in `lost` and in the last log line
+                log.error("%s", error)
+
+
+def _free(path: Path) -> Path:
+    """`path`, or with a number behind it the first that is free."""
+    if not path.exists():
+        return path
+    names = (path.with_name(f"{path.stem}_{number}{path.suffix}") for number in count(2))
+    return next(name for name in names if not name.exists())
