@@ -1,0 +1,140 @@
+"""Sinks that stall, fill up, vanish or cannot be opened: the node goes on and says so."""
+
+import subprocess
+import sys
+import textwrap
+import threading
+import time
+
+import pytest
+import rerun as rr
+
+from services.monitor.layout import layout
+from services.monitor.screen import _QUEUE, Channel, Screen, _Drawing
+
+
+class StuckStream:
+    """A recording stream whose sink stops reading until the test lets it go on."""
+
+    def __init__(self):
+        self.gate = threading.Event()
+        self.logged = []
+
+    def set_sinks(self, *sinks, default_blueprint):
+        pass
+
+    def reset_time(self):
+        pass
+
+    def set_time(self, *args, **kwargs):
+        pass
+
+    def flush(self, timeout_sec):
+        if not self.gate.is_set():
+            raise RuntimeError("Flush timed out - not all log messages were sent")
+
+    def disconnect(self):
+        pass
+
+    def log(self, path, *parts, static):
+        self.gate.wait()
+        self.logged.append((path, *parts))
+
+
+def test_a_stalled_viewer_holds_nobody_up_and_then_gets_the_newest():
+    stream = StuckStream()
+    channel = Channel("viewer", stream, None, None)
+    channel.put(_Drawing("rig", ("rig",), None, True))
+    for i in range(10 * _QUEUE):
+        channel.put(_Drawing(f"entity{i % 3}", (i,), i, False))
+    assert not channel.flush(0.05)
+    assert len(channel._queue) <= _QUEUE + 4
+    assert channel.skipped >= 8 * _QUEUE
+    stream.gate.set()
+    assert channel.flush(10.0)
+    channel.close(10.0)
+    assert not channel.fault
+    assert ("rig", "rig") in stream.logged
+    newest = {path: value for path, value in stream.logged}
+    assert {newest[f"entity{i}"] for i in range(3)} == {10 * _QUEUE - i for i in (1, 2, 3)}
+
+
+def test_closing_does_not_wait_for_ever():
+    stream = StuckStream()
+    channel = Channel("viewer", stream, None, None)
+    channel.put(_Drawing("a", (1,), None, False))
+    channel.close(0.1)  # returns
+    stream.gate.set()
+
+
+def _draw_until_fault(screen, path="a"):
+    deadline = time.monotonic() + 20.0
+    while not screen.channels[0].fault and time.monotonic() < deadline:
+        screen.log(path, rr.TextDocument("x" * 100_000), stamp_ns=1)
+        time.sleep(0.02)
+    return screen.status
+
+
+def test_a_file_ends_whole_at_its_limit(tmp_path, read_rrd):
+    screen = Screen()
+    path = screen.save(tmp_path / "sub" / "drive.rrd", layout(), limit_mb=0, keep_free_mb=0)
+    assert "complete at" in _draw_until_fault(screen)
+    screen.log("b", rr.TextDocument("more"))
+    screen.close()
+    assert read_rrd(path).entities == {"a"}
+
+
+def test_a_disk_that_runs_full_ends_the_file(tmp_path, read_rrd):
+    screen = Screen()
+    path = screen.save(tmp_path / "drive.rrd", layout(), limit_mb=100, keep_free_mb=10**9)
+    assert "left on the disk" in _draw_until_fault(screen)
+    screen.close()
+    assert read_rrd(path).entities == {"a"}
+
+
+def test_a_file_that_vanishes_is_noticed(tmp_path):
+    screen = Screen()
+    path = screen.save(tmp_path / "drive.rrd", layout(), limit_mb=100, keep_free_mb=0)
+    path.unlink()
+    assert "the file is gone" in _draw_until_fault(screen)
+    screen.close()
+
+
+def test_a_disk_that_refuses_is_noticed(tmp_path):
+    """The kernel refuses to write beyond a size, as a full disk would."""
+    script = """
+        import resource, sys, time
+        from pathlib import Path
+        import rerun as rr
+        from services.monitor.layout import layout
+        from services.monitor.screen import Screen
+        resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, 300_000))
+        screen = Screen()
+        screen.save(Path(sys.argv[1]), layout(), limit_mb=100, keep_free_mb=0)
+        deadline = time.monotonic() + 30
+        while not screen.channels[0].fault and time.monotonic() < deadline:
+            screen.log("a", rr.TextDocument(str(time.monotonic()) * 5000), stamp_ns=1)
+            time.sleep(0.01)
+        screen.close()
+        print(screen.status)
+    """
+    done = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(script), str(tmp_path / "drive.rrd")],
+        capture_output=True, text=True, timeout=60, check=True,
+    )  # fmt: skip
+    assert "stopped:" in done.stdout, done
+    assert "drive.rrd: " in done.stdout
+
+
+def test_a_file_is_never_overwritten(tmp_path):
+    (tmp_path / "drive.rrd").write_bytes(b"precious")
+    screen = Screen()
+    assert screen.save(tmp_path / "drive.rrd", layout(), limit_mb=1, keep_free_mb=0).name == "drive-2.rrd"
+    screen.close()
+    assert (tmp_path / "drive.rrd").read_bytes() == b"precious"
+
+
+def test_a_folder_that_cannot_be_made_is_named(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(RuntimeError, match="cannot make the folder"):
+        Screen().save(tmp_path / "file" / "drive.rrd", layout(), limit_mb=1, keep_free_mb=0)
