@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from services.simulator.cast import Caster
-from services.simulator.shade import Surfaces, find_edges, shade
+from services.simulator.shade import Surfaces, find_edges, shade, turn_rays
 
 SUBPIXELS = ((-0.125, -0.375), (0.375, -0.125), (0.125, 0.375), (-0.375, 0.125))
 NO_BALLS = np.zeros((0, 4))
@@ -55,13 +55,14 @@ class Renderer:
     def __init__(self, caster: Caster, scene: Surfaces) -> None:
         self.caster = caster
         self.scene = scene
+        self._surface = np.append(scene.surface, np.int32(-1))  # [-1]: nothing
 
     def picture(self, T_world_camera: np.ndarray, table: RayTable, actors: Actors | None = None) -> Picture:
         """The view from T_world_camera [4, 4]."""
         height, width = table.rays.shape[:2]
-        R = T_world_camera[:3, :3].astype(np.float32).T
+        R = np.ascontiguousarray(T_world_camera[:3, :3], dtype=np.float32)
         origin = T_world_camera[:3, 3].astype(np.float64)
-        rays, rays_x, rays_y = (a.reshape(-1, 3) @ R for a in (table.rays, table.rays_x, table.rays_y))
+        rays, rays_x, rays_y = (_turned(a, R) for a in (table.rays, table.rays_x, table.rays_y))
         colour = np.zeros((len(rays), 3), np.float32)
         depth = np.full(len(rays), FAR_M)
         triangle, moving, surface = self._trace(origin, rays, rays_x, rays_y, 1.0, actors, colour, depth)
@@ -96,7 +97,7 @@ class Renderer:
         balls = NO_BALLS if actors is None else actors.balls
         triangle = self.caster.first_from(origin, rays)
         shade(self.scene, triangle, origin, rays, rays_x, rays_y, scale, balls, colour, depth)
-        surface = np.where(triangle >= 0, self.scene.surface[triangle], -1)
+        surface = self._surface[triangle]
         moving = np.zeros(len(rays), np.bool_)
         if actors is None:
             return triangle, moving, surface
@@ -111,6 +112,12 @@ class Renderer:
         colour[at], depth[at] = part, after
         surface[at] = np.where(after < before, -2 - actors.surfaces.surface[hit], surface[at])
         return triangle, moving, surface
+
+
+def _turned(table: np.ndarray, R: np.ndarray) -> np.ndarray:
+    out = np.empty((table.shape[0] * table.shape[1], 3), np.float32)
+    turn_rays(table.reshape(-1, 3), R, out)
+    return out
 
 
 def _near(origin: np.ndarray, rays: np.ndarray, bounds: np.ndarray) -> np.ndarray:
