@@ -36,3 +36,9 @@ class ArrivalClock:
             return self._wall_ns() - waited_ns
         self._newest_ns = max(self._newest_ns, stamp_ns)
         return self._newest_ns
+
+    def now_ns(self) -> int | None:
+        """Now, for what has no stamp of the data's clock; None before the first message of the data."""
+        if self._wall:
+            return self._wall_ns()
+        return self._newest_ns or None

@@ -67,14 +67,18 @@ class RecorderNode(_Handlers, Node):
         self._header = header
 
     def on_health(self, health: Health) -> None:
-        if self.config.health:
-            self._write(f"{HEALTH}/{health.node}", health, None)
+        arrival_ns = self._clock.now_ns()
+        if self.config.health and arrival_ns is not None:
+            self._write(f"{HEALTH}/{health.node}", health, arrival_ns, None)
+        self.detail = f"{self.writer.counts.total()} messages, {self.writer.lost.total()} lost"
 
     def keep(self, topic: str, message: Message) -> None:
         """Writes one message with the header that came with it."""
         header, self._header = self._header, None
         if topic in self._chosen:
-            self._write(topic, message, header)
+            own_clock = header is not None and header.clock_id == self._clock_id
+            arrival_ns = self._clock.arrival_ns(message.stamp_ns, header.publish_ns if own_clock else None)
+            self._write(topic, message, arrival_ns, header)
 
     def close(self) -> None:
         if self.writer is None:
@@ -86,9 +90,7 @@ class RecorderNode(_Handlers, Node):
         lost = self.writer.lost.total()
         log.info("%d messages in %s, %d lost", self.writer.counts.total(), self.writer.path, lost)
 
-    def _write(self, topic: str, message: Message, header: Header | None) -> None:
-        own_clock = header is not None and header.clock_id == self._clock_id
-        arrival_ns = self._clock.arrival_ns(message.stamp_ns, header.publish_ns if own_clock else None)
+    def _write(self, topic: str, message: Message, arrival_ns: int, header: Header | None) -> None:
         failed_before = self.writer.lost.total() > 0
         try:
             self.writer.write(topic, message, arrival_ns, header)

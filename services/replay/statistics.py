@@ -78,7 +78,7 @@ def lidar_facts(scans: list[dict[str, Any]]) -> LidarFacts:
     invalid = np.isnan(ranges) | (ranges < low)
     far, far_share = None, 0.0
     # Many drivers write their maximum, or a number beyond it, for "nothing seen".
-    candidates = ranges[finite & (ranges >= 0.5 * ranges[finite].max())] if finite.any() else ranges[:0]
+    candidates = ranges[finite & (ranges >= 0.98 * high)]
     if len(candidates):
         values, counts = np.unique(candidates, return_counts=True)
         share = float(counts.max()) / total
