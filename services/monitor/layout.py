@@ -5,13 +5,17 @@ from __future__ import annotations
 import rerun.blueprint as rrb
 
 from services.monitor.panel import PLOTS
-from services.monitor.scene import CAMERA, SCAN, WORLD
+from services.monitor.scene import BODY, CAMERA, SCAN, WORLD
 from services.monitor.screen import TIMELINE
 
 
 def layout() -> rrb.Blueprint:
     """The blueprint."""
-    world = rrb.Spatial3DView(origin=WORLD, name="Map")
+    eye = rrb.EyeControls3D(
+        kind=rrb.Eye3DKind.Orbital, position=(-5.0, -5.0, 7.0), look_target=(0.0, 0.0, 0.0),
+        eye_up=(0.0, 0.0, 1.0), tracking_entity=f"/{BODY}",
+    )  # fmt: skip
+    world = rrb.Spatial3DView(origin=WORLD, name="Map", eye_controls=eye)
     # The beams lie in the picture by projection: a wrong calibration shows at once.
     camera = rrb.Spatial2DView(origin=CAMERA, contents=["$origin/**", f"/{SCAN}"], name="Camera")
     plots = [

@@ -94,7 +94,10 @@ DRAW: dict[Input, Draw] = {
 
 def _handler(draw: Draw) -> Callable[[MonitorNode, Any], tuple[Output, ...]]:
     def handle(self: MonitorNode, message: Any) -> tuple[Output, ...]:
-        draw(self.scene, self.panel, message)
+        try:
+            draw(self.scene, self.panel, message)
+        except ValueError as error:  # a message that is valid, but cannot be drawn
+            self.panel.say(str(error), message.stamp_ns, "WARN")
         self.detail = self.screen.status
         return ()
 

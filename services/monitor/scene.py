@@ -12,6 +12,7 @@ map/odom/body/camera       pinhole, with the picture in camera/image
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,14 +26,17 @@ WORLD = "map"
 BODY = f"{WORLD}/odom/body"
 CAMERA = f"{BODY}/camera"
 SCAN = f"{WORLD}/scan"
+_SMOOTH = f"{WORLD}/odom/path"
 
 # Who is believed about the robot's pose, best first.
 SOURCES = ("localization", "external", "wheel")
 _COLOURS = {"localization": (80, 200, 255), "external": (120, 230, 120), "wheel": (150, 150, 150)}
+_SMOOTH_COLOUR = (40, 90, 130)
 _ROBOT = (255, 160, 40)
 _SCAN = (255, 70, 90)
 _ANCHOR = (200, 140, 255)
 _FRUSTUM_M = 0.5
+_WAITING_SWEEPS = 3
 _LOOPED_NS = 5_000_000_000  # stamps that fall back further are of another lap
 _RAW = {
     "rgb8": (rr.ColorModel.RGB, 3),
@@ -69,11 +73,12 @@ class Scene:
         self._screen = screen
         self._limits = limits
         self._poses = {name: Poses() for name in SOURCES}
-        self._paths = {name: Path(look.path_points, look.path_step_m) for name in SOURCES}
+        paths = (*(f"{WORLD}/path/{name}" for name in SOURCES), _SMOOTH)
+        self._paths = {entity: Path(look.path_points, look.path_step_m) for entity in paths}
         self._T_map_odom = np.eye(4)
         self._T_map_wheel: np.ndarray | None = None
         self._T_body_lidar = np.eye(4)
-        self._sweep: _Sweep | None = None
+        self._sweeps: deque[_Sweep] = deque()
         self.newest_ns: int | None = None  # of all measurements
         screen.log(WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         half = np.array(look.body_size_m) / 2.0
@@ -152,16 +157,18 @@ class Scene:
         self._saw(stamp_ns)
         if not self._limits.due("scan", stamp_ns):
             return
-        self._draw_sweep()  # what still waits gets no better pose any more
         points, beams = scan_points(ranges_m, angle_min_rad, angle_increment_rad, range_limits_m)
-        self._sweep = _Sweep(
-            stamp_ns=stamp_ns,
-            end_ns=stamp_ns + round(time_increment_s * len(ranges_m) * 1e9),
-            points_body=transform_points(self._T_body_lidar, points),
-            share=beams / max(len(ranges_m), 1),
+        self._sweeps.append(
+            _Sweep(
+                stamp_ns=stamp_ns,
+                end_ns=stamp_ns + round(time_increment_s * len(ranges_m) * 1e9),
+                points_body=transform_points(self._T_body_lidar, points),
+                share=beams / max(len(ranges_m), 1),
+            )
         )
-        if not any(self._poses.values()):
-            self._draw_sweep()
+        # The pose at a sweep's end is found from the next one; whoever needs longer gets the last known.
+        if len(self._sweeps) > _WAITING_SWEEPS or self._leader() is None:
+            self._draw_sweep(self._sweeps.popleft())
 
     def pose(self, source: str, stamp_ns: int, T_source_body: np.ndarray) -> None:
         """The robot's pose by one of `SOURCES`: localization in odom, external in map, wheel in its own
@@ -169,19 +176,24 @@ class Scene:
         self._saw(stamp_ns)
         self._poses[source].add(stamp_ns, T_source_body)
         leader = self._leader()
-        self._paths[source].add((self._T_map_source(source) @ T_source_body)[:3, 3])
-        if self._limits.due("path", stamp_ns, source):
-            strip = rr.LineStrips3D(
-                [self._paths[source].points_m], colors=_COLOURS[source], radii=rr.Radius.ui_points(1.5)
-            )
-            self._screen.log(f"{WORLD}/path/{source}", strip, stamp_ns=stamp_ns)
+        T_map_body = self._T_map_source(source) @ T_source_body
+        self._extend(f"{WORLD}/path/{source}", stamp_ns, T_map_body[:3, 3], _COLOURS[source])
+        if source == "localization":
+            self._extend(_SMOOTH, stamp_ns, T_source_body[:3, 3], _SMOOTH_COLOUR)
         if source != leader:
             return
-        if self._limits.due("pose", stamp_ns):
-            T_odom_body = inverse(self._T_map_odom) @ self._T_map_source(source) @ T_source_body
+        if self._limits.due("pose", stamp_ns, source):
+            T_odom_body = inverse(self._T_map_odom) @ T_map_body
             self._screen.log(BODY, _transform(T_odom_body), stamp_ns=stamp_ns)
-        if self._sweep is not None and stamp_ns >= self._sweep.end_ns:
-            self._draw_sweep()
+        while self._sweeps and stamp_ns >= self._sweeps[0].end_ns:
+            self._draw_sweep(self._sweeps.popleft())
+
+    def _extend(self, entity: str, stamp_ns: int, point_m: np.ndarray, colour: tuple[int, int, int]) -> None:
+        path = self._paths[entity]
+        path.add(point_m)
+        if self._limits.due("path", stamp_ns, entity):
+            strip = rr.LineStrips3D([path.points_m], colors=colour, radii=rr.Radius.ui_points(1.5))
+            self._screen.log(entity, strip, stamp_ns=stamp_ns)
 
     def correction(self, stamp_ns: int, T_map_odom: np.ndarray) -> None:
         """Where the smooth frame lies in the map."""
@@ -207,24 +219,31 @@ class Scene:
         resolution_m: float,
         origin_m: np.ndarray,  # [2], corner of cell (0, 0)
     ) -> None:
-        """The occupancy grid, lying on the floor."""
-        if not occupancy.size or not self._limits.due("grid", stamp_ns):
+        """The occupancy grid, lying on the floor, as far as anything is known."""
+        if not self._limits.due("grid", stamp_ns):
             return
-        height, width = occupancy.shape
+        known = occupancy >= 0
+        rows, columns = np.flatnonzero(known.any(axis=1)), np.flatnonzero(known.any(axis=0))
+        if not len(rows):
+            return
+        part = occupancy[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+        height, width = part.shape
+        corner_m = origin_m + resolution_m * np.array([columns[0], rows[0]])
         drawing = rr.GridMap(
-            data=np.ascontiguousarray(occupancy).tobytes(),
+            data=np.ascontiguousarray(part[::-1]).tobytes(),  # a picture's first row is its top
             format=rr.components.ImageFormat(
                 width=width, height=height, color_model="L", channel_datatype="U8"
             ),
             cell_size=resolution_m,
-            translation=[origin_m[0], origin_m[1], -0.01],  # just below what stands on the floor
+            translation=[corner_m[0], corner_m[1], -0.01],  # just below what stands on the floor
             colormap=rr.components.Colormap.RvizMap,
         )
         self._screen.log(f"{WORLD}/grid", drawing, stamp_ns=stamp_ns)
 
     def finish(self) -> None:
         """Nothing more will come: draws what still waits."""
-        self._draw_sweep()
+        while self._sweeps:
+            self._draw_sweep(self._sweeps.popleft())
 
     # --- where and when things are ---
 
@@ -247,23 +266,18 @@ class Scene:
                 return np.eye(4)
             T_map_body = self._T_map_source(better) @ self._poses[better].newest[1]
             self._T_map_wheel = T_map_body @ inverse(self._poses["wheel"].newest[1])
-            self._paths["wheel"].clear()
+            self._paths[f"{WORLD}/path/wheel"].clear()
         return self._T_map_wheel
 
-    def _draw_sweep(self) -> None:
-        sweep, self._sweep = self._sweep, None
-        if sweep is None:
-            return
+    def _draw_sweep(self, sweep: _Sweep) -> None:
         leader = self._leader()
-        T_world_body = [None, None]
+        ends = [np.eye(4), np.eye(4)]
         if leader is not None:
-            T_world_body = [self._poses[leader].at(t) for t in (sweep.stamp_ns, sweep.end_ns)]
-        if T_world_body[0] is None or T_world_body[1] is None:
-            if leader is not None:
+            ends = [self._poses[leader].at(t) for t in (sweep.stamp_ns, sweep.end_ns)]
+            if ends[0] is None or ends[1] is None:
                 return  # no pose of that time: nowhere to draw it
-            T_world_body = [np.eye(4), np.eye(4)]
-        T_map = np.eye(4) if leader is None else self._T_map_source(leader)
-        points_map = sweep_to_world(sweep.points_body, sweep.share, *(T_map @ T for T in T_world_body))
+            ends = [self._T_map_source(leader) @ T for T in ends]
+        points_map = sweep_to_world(sweep.points_body, sweep.share, *ends)
         points = rr.Points3D(points_map.astype(np.float32), colors=_SCAN, radii=rr.Radius.ui_points(2.0))
         self._screen.log(SCAN, points, stamp_ns=sweep.stamp_ns)
 

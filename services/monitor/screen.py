@@ -212,18 +212,20 @@ class Screen:
     def spawn(self, address: str, memory_mb: int) -> None:
         """Opens a viewer window on the server at `address`. It stays when the monitor ends."""
         self._viewer = subprocess.Popen(
-            [sys.executable, "-m", "rerun_cli", "--connect", address, "--memory-limit", f"{memory_mb}MB"],
+            [sys.executable, "-m", "rerun_cli", "--connect", address, "--bind", "127.0.0.1",
+             "--memory-limit", f"{memory_mb}MB"],
             stdin=subprocess.DEVNULL,
             start_new_session=True,
-        )
+        )  # fmt: skip
 
     def _watch_viewer(self) -> str:
         """The server outlives a window: a new one can be opened on it."""
         if self._viewer is not None and self._viewer.poll() is not None:
-            code = self._viewer.returncode
             self._viewer = None
-            why = "" if code == 0 else f' with code {code} (no display? use view = "serve")'
-            self.notes.append(f"the viewer window has ended{why}")
+            self.notes.append(
+                "the viewer window has ended; the data are still served (without a display use "
+                'view = "serve")'
+            )
             log.warning("%s", self.notes[-1])
         return ""
 

@@ -55,7 +55,7 @@ def test_a_stalled_viewer_holds_nobody_up_and_then_gets_the_newest():
     channel.close(10.0)
     assert not channel.fault
     assert ("rig", "rig") in stream.logged
-    newest = {path: value for path, value in stream.logged}
+    newest = dict(stream.logged)
     assert {newest[f"entity{i}"] for i in range(3)} == {10 * _QUEUE - i for i in (1, 2, 3)}
 
 

@@ -1,0 +1,123 @@
+"""The monitor as a process among others: it shows, it saves, and nobody waits for it."""
+
+import itertools
+import os
+import re
+import signal
+import time
+import urllib.request
+
+import pytest
+
+from common.bus import open_session
+from common.config import Deployment, RouterConfig
+from common.errors import UserError
+from services.board import HealthBoard
+from services.monitor.node import MonitorConfig, MonitorNode
+from services.nodes import NODES
+from services.supervisor import Supervisor
+from tests.common.nodes import TABLE
+
+
+def _poll(supervisor, until, timeout_s):
+    deadline = time.monotonic() + timeout_s
+    while time.monotonic() < deadline:
+        supervisor.poll()
+        if until():
+            return
+        time.sleep(0.05)
+    raise AssertionError(f"not within {timeout_s} s")
+
+
+def _sent(board, node, topic):
+    return next(o.sent for o in board.records[node].health.outputs if o.topic == topic)
+
+
+def _received(board, node, topic):
+    return next(i for i in board.records[node].health.inputs if i.topic == topic)
+
+
+@pytest.fixture
+def system(tmp_path, free_endpoint):
+    nodes = {
+        "replay": {"kind": "drive", "seconds": 60.0, "image_bytes": 100_000},
+        "localization": {"kind": "chain"},
+        "monitor": {"grpc_port": 0, "web_port": 0, "save": str(tmp_path / "drive.rrd")},
+    }
+    deployment = Deployment(
+        robot="test", router=RouterConfig(listen=(free_endpoint,)), state_dir=tmp_path, nodes=nodes
+    )
+    table = {**TABLE, "monitor": NODES["monitor"]}
+    with Supervisor(deployment, table=table) as supervisor, open_session((free_endpoint,)) as session:
+        board = HealthBoard(session, "test")
+        _poll(supervisor, lambda: _flows(board), 60)
+        yield supervisor, board, tmp_path / "drive.rrd"
+
+
+def _flows(board):
+    try:
+        return _received(board, "monitor", "localization/odometry").received > 5
+    except (KeyError, StopIteration):
+        return False
+
+
+def test_a_stopped_monitor_slows_nobody_and_what_it_saved_opens(system, read_rrd):
+    supervisor, board, path = system
+    page = re.search(r"http://127\.0\.0\.1:\d+/\?url=\S+", board.records["monitor"].health.detail)
+    with urllib.request.urlopen(page.group().split("?")[0], timeout=10) as reply:
+        assert reply.status == 200
+        assert b"<html" in reply.read().lower()
+    monitor = supervisor.children["monitor"].process.pid
+    scans, pictures = (_sent(board, "replay", t) for t in ("lidar/scan", "camera/image"))
+    os.kill(monitor, signal.SIGSTOP)
+    try:
+        # 5 s of data at its own speed, while 3 MB of pictures a second pile up for somebody who sleeps.
+        _poll(supervisor, lambda: _sent(board, "replay", "lidar/scan") >= scans + 50, 15)
+        assert _sent(board, "replay", "camera/image") >= pictures + 130
+        slam = _received(board, "localization", "lidar/scan")
+        assert (slam.lost, slam.dropped) == (0, 0)
+    finally:
+        os.kill(monitor, signal.SIGCONT)
+    before = _received(board, "monitor", "localization/odometry").received
+    _poll(supervisor, lambda: _received(board, "monitor", "localization/odometry").received > before + 10, 30)
+    assert supervisor.children["monitor"].process.pid == monitor
+    supervisor.stop()
+    saved = read_rrd(path)
+    assert {
+        "map/odom/body",
+        "map/odom/body/camera/image",
+        "map/scan",
+        "log",
+        "health/table",
+    } <= saved.entities
+    assert {f"plots/step_p95_ms/{n}" for n in ("replay", "localization", "monitor")} <= saved.entities
+    stamps = saved.stamps("map/odom/body/camera/image")
+    assert len(stamps) > 15
+    assert all(b - a >= 90_000_000 for a, b in itertools.pairwise(stamps)), "10 Hz of 30"
+
+
+def test_a_taken_port_is_said_in_one_sentence(free_endpoint):
+    import socket
+
+    port = int(free_endpoint.rpartition(":")[2])
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", port))
+        taken.listen()
+        monitor = MonitorNode(MonitorConfig(view="serve", grpc_port=port, web_port=0))
+        with pytest.raises(UserError, match=f"127.0.0.1:{port} .*--set monitor.grpc_port=PORT"):
+            monitor.configure()
+
+
+def test_a_window_that_cannot_open_is_said_and_the_node_goes_on(monkeypatch, tmp_path, read_rrd):
+    """Without a display the viewer ends at once; the file is written all the same."""
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    monitor = MonitorNode(MonitorConfig(view="spawn", grpc_port=0, save=tmp_path / "a.rrd"))
+    monitor.configure()
+    deadline = time.monotonic() + 30.0
+    while "window has ended" not in monitor.screen.status and time.monotonic() < deadline:
+        time.sleep(0.1)
+    assert "the data are still served" in monitor.screen.status
+    monitor.panel.say("still here", None)
+    monitor.close()
+    assert "log" in read_rrd(tmp_path / "a.rrd").entities
