@@ -50,10 +50,10 @@ class JobQueue:
         self._pending.append(_Pending(job, future, job.after))
         return future
 
-    def before_message(self) -> Iterator[tuple[str, Any]]:
-        """(name, result) of the jobs due before the next message; waits for those that must be in."""
+    def before_message(self, topic: str) -> Iterator[tuple[str, Any]]:
+        """(name, result) of the jobs due before this message; waits for those that must be in."""
         for pending in self._pending:
-            if pending.remaining is not None:
+            if pending.remaining is not None and pending.job.of in (None, topic):
                 pending.remaining -= 1
         due = [p for p in self._pending if p.remaining is not None and p.remaining <= 0]
         yield from self._take(due)

@@ -102,9 +102,10 @@ class Lockstep:
     def _step(self, seat: _Seat, now_ns: int) -> None:
         """Lets a node handle what it can at this time."""
         while now_ns >= seat.busy_until_ns and (letter := seat.mailbox.pop()) is not None:
-            for name, result in seat.jobs.before_message():
+            for name, result in seat.jobs.before_message(letter.topic):
                 self._emit(seat, seat.node.handle_job(name, result), now_ns)
             seat.busy_until_ns = now_ns + _ns(seat.node.config.step_cost_s)
+            seat.node.on_header(letter.header)
             self._emit(seat, seat.node.handle(letter.topic, letter.message), seat.busy_until_ns)
             if seat.busy_until_ns > now_ns:
                 self._at(seat.busy_until_ns, _LAST_ROW, lambda t: self._step(seat, t))

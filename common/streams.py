@@ -87,7 +87,7 @@ class Subscription:
         else:
             channel = zenoh.handlers.RingChannel(1)
         if row.cache and delivery != "latest":
-            latched = delivery == "latched"
+            latched = row.delivery == "latched"
             self._subscriber = zenoh.ext.declare_advanced_subscriber(
                 bus.session,
                 key_expr,

@@ -54,11 +54,11 @@ def demo(
 
 def _simulated(out: Path, seconds: float) -> Path:
     """The bag of a drive simulated into `out`, made anew only if its length differs."""
-    from services.simulator.cli import simulate_drive
+    from services.simulator.cli import simulate
 
     folder = out / f"simulated-{seconds:g}s"
-    if not (folder / "bag" / "metadata.yaml").exists():
-        simulate_drive(folder, seconds=seconds)
+    if not folder.exists():  # the simulator leaves a whole folder or none
+        simulate(folder, seconds=seconds)
     return folder / "bag"
 
 

@@ -47,13 +47,13 @@ class MessageHash:
 def run_offline(
     deployment: Deployment, out: Path, console: Console, table: dict[str, Service] = NODES
 ) -> dict[str, Any]:
-    """Runs all nodes of a deployment but the watching ones; writes `messages` (a recording) and
+    """Runs all nodes of a deployment (leave the watching ones out of it); writes `messages` (a recording) and
     summary.json into `out`, and returns the summary.
 
     Raises:
         UserError: options or data that do not fit.
     """
-    nodes = [build_node(deployment, name, table) for name in deployment.nodes if name not in OUTSIDE]
+    nodes = [build_node(deployment, name, table) for name in deployment.nodes]
     digest = MessageHash()
     started = time.perf_counter()
     out.mkdir(parents=True, exist_ok=True)

@@ -148,12 +148,13 @@ def offline(
 
     Example: beamsplat offline deploy/demo.toml --data drive/bag --out out/
     """
-    from services.offline import run_offline
+    from services.offline import OUTSIDE, run_offline
 
     deployment = _load(file, set_)
+    nodes = {name: table for name, table in deployment.nodes.items() if name not in OUTSIDE}
     if data is not None:
-        replay = {**deployment.nodes.get("replay", {}), "data": str(data)}
-        deployment = deployment.model_copy(update={"nodes": {**deployment.nodes, "replay": replay}})
+        nodes["replay"] = {**nodes.get("replay", {}), "data": str(data)}
+    deployment = deployment.model_copy(update={"nodes": nodes})
     summary = run_offline(_checked(deployment), out, console)
     if as_json:
         print(json.dumps(summary))

@@ -89,7 +89,7 @@ class Chain(Node):
             Odometry(stamp_ns=message.stamp_ns, T_odom_body=np.eye(4), covariance=np.eye(3), detail=detail),
         )
         if int(detail[:2], 16) < 64:
-            yield Job("sum", lambda: float(message.ranges_m.sum()), after=7)
+            yield Job("sum", lambda: float(message.ranges_m.sum()), after=2, of="lidar/scan")
 
     def on_job_sum(self, result: float) -> Outputs:
         self._jobs += 1
