@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
@@ -12,10 +12,11 @@ from rich.markup import escape
 from rich.table import Table
 
 from common.errors import UserError
-from common.rig import write_rig
-from services.replay.inspection import Report, inspect
-from services.replay.options import SourceOptions
-from services.replay.rig_draft import draft_from_data, draft_from_device, is_device
+
+if TYPE_CHECKING:
+    from services.replay.inspection import Report
+
+# Readers of bags and OpenCV are imported where they are used: every other command starts without them.
 
 
 def info(
@@ -30,6 +31,9 @@ def info(
 
     Exit code 2, and the reason in one sentence, if it cannot be played as it is.
     """
+    from services.replay.inspection import inspect
+    from services.replay.options import SourceOptions
+
     report = inspect(path, SourceOptions(rig=rig, allow_truncated=allow_truncated))
     if as_json:
         print(json.dumps(report.as_dict()))
@@ -54,6 +58,9 @@ def rig(
     overwrite: Annotated[bool, typer.Option(help="Replace an existing file.")] = False,
 ) -> None:
     """A first calibration file: what was found, what was assumed, what must be measured with a tape."""
+    from common.rig import write_rig
+    from services.replay.rig_draft import draft_from_data, draft_from_device, is_device
+
     if out.exists() and not overwrite:
         raise UserError(f"{out}: exists already; choose another name with --out, or say --overwrite")
     text, notes = draft_from_device(source, fov_deg) if is_device(source) else draft_from_data(Path(source))

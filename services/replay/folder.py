@@ -13,17 +13,17 @@ docs/recordings.md describes them. There are no receive times: what was measured
 from __future__ import annotations
 
 import heapq
+import math
 import tomllib
 from collections import Counter
 from collections.abc import Iterator
+from dataclasses import dataclass, fields
 from operator import itemgetter
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-from pydantic import Field
 
-from common.config import Config, parse
 from common.errors import UserError
 from common.geometry import so3_log
 from common.recording.picture import picture_head
@@ -37,12 +37,13 @@ _PICTURES = (".jpg", ".jpeg", ".png")
 Stamped = tuple[int, str, Any]
 
 
-class FolderFile(Config):
+@dataclass(frozen=True)
+class Lidar:
     """folder.toml: what PCD files do not say about the lidar."""
 
-    range_min_m: Annotated[float, Field(ge=0.0, allow_inf_nan=False)] = 0.02
-    range_max_m: Annotated[float, Field(gt=0.0, allow_inf_nan=False)] = 30.0
-    scan_time_s: Annotated[float, Field(ge=0.0, allow_inf_nan=False)] = 0.0
+    range_min_m: float = 0.02
+    range_max_m: float = 30.0
+    scan_time_s: float = 0.0
 
 
 def looks_like_folder(path: Path) -> bool:
@@ -174,14 +175,21 @@ class FolderSource:
                 streams[word] = list(zip(poses.stamps_ns.tolist(), made))
         return streams
 
-    def _read_settings(self) -> FolderFile:
+    def _read_settings(self) -> Lidar:
         file = self.path / "folder.toml"
         if not file.exists():
-            return FolderFile()
+            return Lidar()
         try:
-            return parse(FolderFile, tomllib.loads(file.read_text()), str(file))
+            table = tomllib.loads(file.read_text())
         except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
             raise UserError(f"{file}: not a TOML file: {error}") from error
+        known = [field.name for field in fields(Lidar)]
+        for name, value in table.items():
+            if name not in known:
+                raise UserError(f"{file}: unknown option {name!r} (there are: {', '.join(known)})")
+            if type(value) not in (int, float) or not 0.0 <= value < math.inf:
+                raise UserError(f"{file}: {name} = {value!r} is not a number of at least 0")
+        return Lidar(**table)
 
     def _image(self, file: Path) -> dict[str, Any]:
         data = np.fromfile(file, np.uint8)

@@ -93,7 +93,8 @@ def _inspect_bag(path: Path, options: SourceOptions, *, own: bool) -> Report:
                 report.problems += stream_problems(facts)
         if report.lidar is not None:
             report.problems += lidar_problems(report.lidar)
-        report.problems = list(dict.fromkeys([*bag.problems, *report.problems]))
+        before = [] if source is not None else bag.problems  # a source repeats them
+        report.problems = list(dict.fromkeys([*before, *report.problems]))
         return report
 
 

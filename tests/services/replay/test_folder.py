@@ -81,6 +81,20 @@ def test_faults_are_named(folder):
     assert "K is for 80x48 px but" in refusal(folder, rig=other)
 
 
+def test_folder_toml(folder):
+    (folder / "folder.toml").write_text("range_max_m = 12\nscan_time_s = 0.1\n")
+    scan = of(play(folder)[0], "lidar/scan")[0].message
+    assert (scan.range_max_m, scan.time_increment_s) == (12.0, pytest.approx(0.1 / 180))
+    for text, words in [
+        ("range_max = 3", "unknown option 'range_max'"),
+        ("range_max_m = 'far'", "'far' is not a number"),
+        ("range_max_m = nan", "is not a number"),
+        ("[", "not a TOML file"),
+    ]:
+        (folder / "folder.toml").write_text(text)
+        assert words in refusal(folder)
+
+
 def test_a_scan_is_needed_unless_said_otherwise(folder):
     for file in (folder / "lasers").iterdir():
         file.unlink()
