@@ -255,6 +255,12 @@ class Anchors(Message):
     optimisation: Count = 0
 
 
+class MovingBeams(Message):
+    """Which beams of the scan with this stamp ended in space known to be free: people, carts, doors."""
+
+    moving: Annotated[np.ndarray, Array("bool", "N")]
+
+
 class Grid(Message):
     """Occupancy grid: cell [row, column] covers origin + (column, row) * resolution, y up.
 
@@ -316,6 +322,7 @@ class Health(Message):
 MESSAGES: dict[str, type[Message]] = {
     cls.schema_name(): cls
     for cls in (
-        Rig, Image, Scan, WheelOdometry, ExternalPose, Odometry, Correction, Anchors, Grid, Tick, Health,
+        Rig, Image, Scan, WheelOdometry, ExternalPose, Odometry, Correction, Anchors, MovingBeams, Grid, Tick,
+        Health,
     )
 }  # fmt: skip

@@ -49,6 +49,7 @@ _ROWS = (
     Topic("localization/odometry",   m.Odometry,      ("localization",),        10, "every", 400, True),
     Topic("localization/correction", m.Correction,    ("localization",),         0, "latched", 1, True),
     Topic("localization/anchors",    m.Anchors,       ("localization",),         0, "latched", 1, True),
+    Topic("localization/movers",     m.MovingBeams,   ("localization",),        10, "every", 400),
     Topic("localization/grid",       m.Grid,          ("localization",),         0, "latched", 1, True),
     Topic("tick",                    m.Tick,          ("replay",),               1, "every", 60),
 )  # fmt: skip

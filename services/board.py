@@ -8,7 +8,10 @@ from collections import deque
 from dataclasses import dataclass, field
 
 import zenoh
+from rich import box
+from rich.console import Group, RenderableType
 from rich.table import Table
+from rich.text import Text
 
 from common.bus import key
 from common.header import DecodeError
@@ -70,24 +73,25 @@ class HealthBoard:
                 for name, r in self.records.items()
             }
 
-    def nodes_table(self) -> Table:
-        """One row a node: state, rate, step time, age, losses, memory, CPU."""
-        table = Table(expand=False, pad_edge=False)
-        table.add_column("node")
-        table.add_column("state")
-        for heading in ("in Hz", "out Hz", "step p50 ms", "p95", "age ms", "dropped", "lost", "broken",
-                        "MB", "CPU %"):  # fmt: skip
-            table.add_column(heading, justify="right")
-        table.add_column("")
+    def nodes_table(self) -> RenderableType:
+        """One row a node: state, rates, step time, age, losses, memory, CPU; below, what they say."""
+        table = Table(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False)
+        for heading in ("node", "state"):
+            table.add_column(heading, no_wrap=True)
+        for heading in ("in Hz", "out Hz", "step ms", "p95", "age ms", "drop", "lost", "bad", "MB", "CPU%"):
+            table.add_column(heading, justify="right", no_wrap=True)
         now = time.monotonic()
+        said = []
         with self._lock:
             for name, record in sorted(self.records.items()):
                 table.add_row(*_node_row(name, record, now))
-        return table
+                if record.health.detail:
+                    said.append(Text(f"{name}: {record.health.detail}", style="dim"))
+        return Group(table, *said)
 
     def topics_table(self) -> Table:
         """One row a topic that flows: producer, rate, bytes, and who takes it."""
-        table = Table(expand=False, pad_edge=False)
+        table = Table(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False)
         for heading in ("topic", "from"):
             table.add_column(heading)
         for heading in ("Hz", "nominal", "KB/s", "sent"):
@@ -111,15 +115,14 @@ def _node_row(name: str, record: NodeRecord, now: float) -> tuple[str, ...]:
         f"[{colour}]{state}[/]",
         f"{_rate(record, lambda h: sum(i.received for i in h.inputs)):.1f}" if health.inputs else "",
         f"{_rate(record, lambda h: sum(o.sent for o in h.outputs)):.1f}" if health.outputs else "",
-        f"{health.step_p50_ms:.2f}",
-        f"{health.step_p95_ms:.2f}",
+        f"{health.step_p50_ms:.1f}",
+        f"{health.step_p95_ms:.1f}",
         f"{max((i.age_ms for i in health.inputs), default=0.0):.1f}" if health.inputs else "",
         _count(sum(i.dropped for i in health.inputs), "yellow"),
         _count(sum(i.lost for i in health.inputs), "red"),
         _count(sum(i.undecodable + i.stale for i in health.inputs), "red"),
         f"{health.rss_mb:.0f}",
         f"{health.cpu_percent:.0f}",
-        health.detail,
     )
 
 

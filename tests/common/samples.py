@@ -15,6 +15,7 @@ from common.messages import (
     InputHealth,
     LidarModel,
     Message,
+    MovingBeams,
     Odometry,
     OutputHealth,
     Rig,
@@ -58,6 +59,7 @@ def sample_messages() -> list[Message]:
         ),
         Correction(stamp_ns=17, T_map_odom=T[1], optimisation=3),
         Anchors(stamp_ns=18, anchor_ids=np.array([0, 7]), T_map_anchor=T, optimisation=3),
+        MovingBeams(stamp_ns=22, moving=np.array([True, False, True])),
         Grid(
             stamp_ns=19, resolution_m=0.05, origin_m=np.array([-1.0, 2.0]),
             occupancy=np.array([[-1, 0, 100]], np.int8), changed=(0, 1, 1, 3),

@@ -69,3 +69,9 @@ def test_topic_rows_are_consistent():
         assert row.delivery != "every" or row.cache == 0 or row.cache >= 30 * row.rate_hz, (
             f"{name}: the cache does not survive an outage of 30 s"
         )
+
+
+def test_only_who_asks_for_it_is_told_the_health_of_others():
+    assert not Chain.watches_health()
+    watcher = type("Watcher", (Node,), {"name": "monitor", "on_health": lambda self, health: None})
+    assert watcher.watches_health()
