@@ -13,7 +13,8 @@ from common.config import NodeConfig
 class RecorderConfig(NodeConfig):
     """What to write, and where."""
 
-    out: Path  # folder to make; if it is there, NAME_2, NAME_3, ... so that a restart loses nothing
+    # Folder to make; if it is there, NAME_2, NAME_3, ... so that a restart loses nothing.
+    out: Path = Path("recording")
     topics: tuple[str, ...] = ()  # only these; none named: all
     without: tuple[str, ...] = ()
     health: bool = True

@@ -7,6 +7,7 @@ without metadata.yaml. What goes wrong is said in one sentence that names the fi
 from __future__ import annotations
 
 import heapq
+import re
 import sqlite3
 import struct
 from collections.abc import Collection, Iterator
@@ -205,15 +206,24 @@ def _files(path: Path) -> list[Path]:
         if path.suffix not in (".bag", ".mcap", ".db3"):
             raise UserError(f"{path}: not a bag; expected .bag, .mcap, .db3, or a folder with one of them")
         return [path]
+    metadata = path / "metadata.yaml"
     mcaps = sorted(path.glob("*.mcap"))
-    if mcaps:
+    if mcaps and not (metadata.exists() and _compressed_by_message(metadata)):
         return mcaps
-    if (path / "metadata.yaml").exists():
+    if metadata.exists():
         return [path]
     files = sorted(path.glob("*.db3")) or sorted(path.glob("*.bag"))
     if not files:
         raise UserError(f"{path}: not a bag: no metadata.yaml and no .mcap, .db3 or .bag file in this folder")
     return files
+
+
+def _compressed_by_message(metadata: Path) -> bool:
+    """Whether each message is compressed by itself: rosbags undoes that, our MCAP reader does not."""
+    return (
+        re.search(r"compression_mode:\s*['\"]?message", metadata.read_text(errors="replace"), re.I)
+        is not None
+    )
 
 
 def _explain(file: Path, error: Exception) -> str:

@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 from rosbags.rosbag1 import Writer as Writer1
-from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -43,6 +43,7 @@ class Drive:
     extra_scan: str = ""  # a second lidar's topic
     stamped: bool = True
     corrupt_scans: int = 0
+    compression: CompressionMode | None = None  # ROS 2 only
 
 
 class _Bag:
@@ -130,6 +131,8 @@ def write_bag(folder: Path, kind: str, drive: Drive) -> Path:
     """Writes one bag; its path (a file for ROS 1, a folder for ROS 2)."""
     path = folder / ("drive.bag" if kind == "ros1" else "drive")
     bag = _Bag(path, kind)
+    if drive.compression is not None:
+        bag.writer.set_compression(drive.compression, CompressionFormat.ZSTD)
     with bag.writer:
         if drive.tf == "static":
             bag.write("/tf_static", bag.tf(START_NS, edges_of(drive)), START_NS)

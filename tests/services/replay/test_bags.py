@@ -8,11 +8,16 @@ import cv2
 import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
+from rosbags.rosbag2 import CompressionMode
 
 from common.errors import UserError
 from common.frames import R_body_camera_level, camera_mount
 from common.geometry import make_transform
+from common.recording.sensors import SENSORS, build, ros_fields
+from services.replay.bag_source import TF_TYPES, _transforms
+from services.replay.bags import Bag
 from services.replay.config import ReplayConfig
+from services.replay.decode import deserialize, header_stamp_ns
 from services.replay.node import ReplayNode
 from tests.services.replay.make_bags import (
     KINDS,
@@ -279,6 +284,15 @@ def test_ros2_files_open_without_their_metadata(tmp_path, kind):
     assert len(play(file)[0]) > 60
 
 
+@pytest.mark.parametrize("kind", ["sqlite", "mcap"])
+@pytest.mark.parametrize("mode", [CompressionMode.FILE, CompressionMode.MESSAGE])
+def test_compressed_bags(tmp_path, kind, mode):
+    sourced, problems = play(write_bag(tmp_path, kind, Drive(compression=mode)))
+    assert problems == []
+    assert len(of(sourced, "lidar/scan")) == 20
+    assert sourced[0].message.camera.fx_px == 50.0
+
+
 def test_what_is_no_bag_is_refused(tmp_path):
     for name, content, words in [
         ("a.bag", b"hello", "not a bag"),
@@ -336,3 +350,30 @@ def test_the_shared_recordings_play(shared_dir, name):
         assert rig.camera.fx_px == 530.0
     if name == "freiburg/fr079.bag":
         assert rig.lidar.T_body_lidar[0, 3] == pytest.approx(0.04)
+
+
+@pytest.mark.filterwarnings("ignore:overflow")
+@pytest.mark.parametrize("kind", ["ros1", "mcap"])
+def test_mutated_messages_raise_value_errors_only(tmp_path, kind):
+    """Every sensor and transform message, 400 times with wrong bytes or cut short."""
+    rng = np.random.default_rng(11)
+    path = write_bag(tmp_path, kind, Drive(seconds=0.1, pose=True))
+    topics = {ros_type: sensor.topic for sensor in SENSORS.values() for ros_type in sensor.ros_types}
+    with Bag(path) as bag:
+        originals = list(bag.messages())
+    assert len(originals) == 6
+    for raw in originals:
+        for _ in range(400):
+            data = bytearray(raw.data)
+            for position in rng.integers(0, len(data), rng.integers(1, 6)):
+                data[position] = rng.integers(0, 256)
+            data = bytes(data[: rng.integers(0, len(data) + 1)] if rng.random() < 0.3 else data)
+            try:
+                message = deserialize(raw._replace(data=data))
+                if raw.type_name in topics:
+                    build(topics[raw.type_name], ros_fields(topics[raw.type_name], message))
+            except ValueError:
+                pass
+            header_stamp_ns(raw._replace(data=data))
+            if raw.type_name in TF_TYPES:
+                list(_transforms(raw._replace(data=data)))
