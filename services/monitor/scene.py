@@ -32,6 +32,7 @@ _SMOOTH = f"{WORLD}/odom/path"
 SOURCES = ("localization", "external", "wheel")
 _COLOURS = {"localization": (80, 200, 255), "external": (120, 230, 120), "wheel": (150, 150, 150)}
 _SMOOTH_COLOUR = (40, 90, 130)
+_LIFT_M = {"localization": 0.03, "external": 0.02, "wheel": 0.01}  # the better one is seen where they meet
 _ROBOT = (255, 160, 40)
 _SCAN = (255, 70, 90)
 _ANCHOR = (200, 140, 255)
@@ -177,7 +178,8 @@ class Scene:
         self._poses[source].add(stamp_ns, T_source_body)
         leader = self._leader()
         T_map_body = self._T_map_source(source) @ T_source_body
-        self._extend(f"{WORLD}/path/{source}", stamp_ns, T_map_body[:3, 3], _COLOURS[source])
+        lift_m = np.array([0.0, 0.0, _LIFT_M[source]])
+        self._extend(f"{WORLD}/path/{source}", stamp_ns, T_map_body[:3, 3] + lift_m, _COLOURS[source])
         if source == "localization":
             self._extend(_SMOOTH, stamp_ns, T_source_body[:3, 3], _SMOOTH_COLOUR)
         if source != leader:

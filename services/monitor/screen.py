@@ -28,7 +28,7 @@ log = logging.getLogger(__name__)
 
 APPLICATION = "beamsplat"
 TIMELINE = "time"
-_QUEUE = 512  # about ten seconds of drawings at the default rates
+_QUEUE = 256  # about five seconds of drawings at the default rates
 _CHECK_S = 1.0
 _FLUSH_S = 3.0
 
@@ -93,11 +93,15 @@ class Channel:
             self._changed.notify()
         return bool(self.fault) or done.wait(timeout_s)
 
-    def close(self, timeout_s: float) -> None:
-        """Draws what is waiting, closes the sink; gives up after a while."""
+    def begin_close(self) -> None:
+        """What waits is still drawn, then the sink is closed."""
         with self._changed:
             self._closing = True
             self._changed.notify()
+
+    def close(self, timeout_s: float) -> None:
+        """Waits for that; gives up after a while."""
+        self.begin_close()
         self._thread.join(timeout_s)
         if self._thread.is_alive():
             log.warning("%s did not finish within %g s: the last drawings are missing", self.name, timeout_s)
@@ -250,9 +254,12 @@ class Screen:
             channel.flush(timeout_s)
 
     def close(self, timeout_s: float = _FLUSH_S) -> None:
-        """Finishes files and closes servers."""
+        """Finishes files and closes servers, all within `timeout_s`."""
+        deadline = time.monotonic() + timeout_s
         for channel in self.channels:
-            channel.close(timeout_s)
+            channel.begin_close()
+        for channel in self.channels:
+            channel.close(max(deadline - time.monotonic(), 0.0))
 
 
 def _unused(path: Path) -> Path:

@@ -103,7 +103,7 @@ def test_a_file_that_vanishes_is_noticed(tmp_path):
 def test_a_disk_that_refuses_is_noticed(tmp_path):
     """The kernel refuses to write beyond a size, as a full disk would."""
     script = """
-        import resource, sys, time
+        import os, resource, sys, time
         from pathlib import Path
         import rerun as rr
         from services.monitor.layout import layout
@@ -113,7 +113,7 @@ def test_a_disk_that_refuses_is_noticed(tmp_path):
         screen.save(Path(sys.argv[1]), layout(), limit_mb=100, keep_free_mb=0)
         deadline = time.monotonic() + 30
         while not screen.channels[0].fault and time.monotonic() < deadline:
-            screen.log("a", rr.TextDocument(str(time.monotonic()) * 5000), stamp_ns=1)
+            screen.log("a", rr.TextDocument(os.urandom(50_000).hex()), stamp_ns=1)
             time.sleep(0.01)
         screen.close()
         print(screen.status)
