@@ -56,9 +56,9 @@ class FrontEnd:
         self.T_body_lidar = T_body_lidar
         self._flip = -1.0 if upside_down else 1.0
         self.odometry = OdometryBuffer()
-        self._wheels = Predictor(0.01, 0.05, 0.004, 0.05)
-        self._inertia = Predictor(0.02, 0.10, 0.02, 0.20)
-        self._still = Predictor(0.05, 0.0, 0.05, 0.0)
+        self._wheels = Predictor(0.01, 0.05, 0.02, 0.004, 0.05, 0.03)
+        self._inertia = Predictor(0.02, 0.10, 0.3, 0.02, 0.20, 0.4)
+        self._still = Predictor(0.05, 0.0, 0.3, 0.05, 0.0, 0.4)
         self.stamps: list[int] = []  # recent matched stamps and poses, newest last
         self.poses: list[np.ndarray] = []
 
@@ -134,10 +134,11 @@ class FrontEnd:
         T_guess = se2.compose(T_map_last, prediction.motion)
         information = np.diag([prediction.sigma_m**-2, prediction.sigma_m**-2, prediction.sigma_rad**-2])
         tables, seen = local.surfels.tables(), local.surfels.misses
-        points = scan.points_body[scan.match_index]
+        points = scan.features()
         match = refine(points, scan.origin_body, T_guess, tables, s, T_guess, information, seen)
-        window_m = min(max(3.0 * prediction.sigma_m, s.search_min_m), s.search_max_m)
-        window_rad = min(max(3.0 * prediction.sigma_rad, s.search_min_rad), s.search_max_rad)
+        blind = (raw.stamp_ns - self.stamps[-1]) * NS > 1.0
+        window_m = min(max(3.0 * prediction.sigma_m, s.search_min_m), 2.0 if blind else s.search_max_m)
+        window_rad = min(max(3.0 * prediction.sigma_rad, s.search_min_rad), math.pi if blind else s.search_max_rad)
         if window_m > s.search_min_m or window_rad > s.search_min_rad:
             match = self._search(scan, match, T_guess, T_guess, information, local, window_m, window_rad)
         if match.share < s.good_share:  # a prediction this wrong may be worse than none
@@ -148,7 +149,7 @@ class FrontEnd:
         if raw.time_increment_s > 0.0:
             motion = se2.between(T_map_last, match.T_map_body)
             scan = self.prepare(raw, self.scan_velocity(raw, motion))
-            points = scan.points_body[scan.match_index]
+            points = scan.features()
             match = refine(points, scan.origin_body, match.T_map_body, tables, s, T_guess, information, seen,
                            anneal=(1.0,))  # fmt: skip
         return scan, match, match.share >= s.lost_share
@@ -159,7 +160,7 @@ class FrontEnd:
     ) -> Match:  # fmt: skip
         """The best of the given match and of those found in a window."""
         tables, seen, s = local.surfels.tables(), local.surfels.misses, self.settings
-        points = scan.points_body[scan.match_index]
+        points = scan.features()
         for _, T_start in search(points, T_centre, tables, window_m, window_rad, prior_weight=0.02):
             other = refine(points, scan.origin_body, T_start, tables, s, T_prior, information, seen)
             if other.share * other.known > best.share * best.known + 0.02:
@@ -169,10 +170,9 @@ class FrontEnd:
     def accept(self, stamp_ns: int, T_odom_body: np.ndarray, options: list[tuple[Predictor, np.ndarray]]) -> None:
         """Take in the pose of the newest scan; predictors and the delay learn from it."""
         if self.poses:
-            dt = (stamp_ns - self.stamps[-1]) * NS
             moved = se2.between(self.poses[-1], T_odom_body)
             for predictor, motion in options:
-                predictor.learn(motion, dt, moved)
+                predictor.learn(motion, moved)
             self.odometry.observe_turn(self.stamps[-1], stamp_ns, float(moved[2]))
         self.stamps.append(stamp_ns)
         self.poses.append(T_odom_body)

@@ -12,6 +12,7 @@ from services.localization.lidar2d import se2
 from services.localization.lidar2d.settings import LidarSlamSettings
 from services.localization.lidar2d.surfel_map import MatchTables
 
+ALONG2 = 0.3**2  # m^2, along its tangent a return may belong to any part of the surface near it
 ANNEAL = (3.0, 2.0, 1.4)  # the outlier scale starts wide and ends at 1
 
 
@@ -28,7 +29,7 @@ class Match:
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def accumulate(
-    points: np.ndarray,  # float64 [K, 2] body frame
+    points: np.ndarray,  # float64 [K, 5] body frame: x, y, tangent x, tangent y, half spacing
     origin: np.ndarray,  # float64 [2] lidar in the body frame
     T: np.ndarray,  # float64 [3] T_map_body
     nearest: np.ndarray, means: np.ndarray, omegas: np.ndarray, views: np.ndarray,
@@ -38,6 +39,10 @@ def accumulate(
     g: np.ndarray,  # out float64 [3]
 ) -> tuple[float, float, float]:
     """Normal equations of sum rho(d' Omega d), d = T p - mean, Geman-McClure weights.
+
+    A return is known across its own surface only: along its tangent (or, where that is unknown, within its
+    spacing) it may be anywhere, S = s^2 t t' or s^2 I, and Omega' = (Omega^-1 + S)^-1. Without this a
+    corridor would hold on to a robot that drives along it.
 
     Returns (sum of weights, number of associated returns, weighted sum of d' Omega d).
     A surface seen from its other side does not count: walls are thin.
@@ -64,6 +69,16 @@ def accumulate(
         found += 1.0
         dx, dy = x - means[k, 0], y - means[k, 1]
         a, b, d = omegas[k, 0], omegas[k, 1], omegas[k, 2]
+        if points[i, 2] != 0.0 or points[i, 3] != 0.0:
+            tx, ty = c * points[i, 2] - s * points[i, 3], s * points[i, 2] + c * points[i, 3]
+            vx, vy = a * tx + b * ty, b * tx + d * ty
+            f = ALONG2 / (1.0 + ALONG2 * (tx * vx + ty * vy))
+            a, b, d = a - f * vx * vx, b - f * vx * vy, d - f * vy * vy
+        else:
+            s2 = points[i, 4] * points[i, 4]
+            det = a * d - b * b
+            f = 1.0 / (1.0 + s2 * (a + d) + s2 * s2 * det)
+            a, b, d = f * (a + s2 * det), f * b, f * (d + s2 * det)
         ux, uy = a * dx + b * dy, b * dx + d * dy
         e2 = dx * ux + dy * uy
         root = scale2 / (scale2 + e2)
@@ -210,7 +225,7 @@ def correlate(
 
 
 def refine(
-    points: np.ndarray,  # float64 [K, 2]
+    points: np.ndarray,  # float64 [K, 5], PreparedScan.features()
     origin: np.ndarray,  # float64 [2]
     T_start: np.ndarray,
     tables: MatchTables,
@@ -235,7 +250,7 @@ def refine(
     known = found if seen is None else known_returns(
         points, T, tables.nearest, seen, tables.row0, tables.col0, tables.cell_m
     )  # fmt: skip
-    residual = sigma_m * math.sqrt(cost / weights) if weights > 0 else math.inf
+    residual = sigma_m * math.sqrt(max(cost, 0.0) / weights) if weights > 0 else math.inf
     return Match(T, H, weights / max(known, 1), known / n, residual)
 
 

@@ -58,11 +58,12 @@ def delay_costs(
 class OdometryBuffer:
     """The last minute of wheel poses, and the delay that fits the scans best."""
 
-    def __init__(self, capacity: int = 4096, gap_s: float = 0.6) -> None:
+    def __init__(self, capacity: int = 4096, gap_s: float = 0.6, bridge_s: float = 10.0) -> None:
         self._stamps = np.zeros(2 * capacity, dtype=np.int64)
         self._poses = np.zeros((2 * capacity, 3))
         self._capacity, self._count = capacity, 0
-        self._gap_ns = round(gap_s / NS)
+        self._gap_ns = round(gap_s / NS)  # no learning over longer gaps
+        self._bridge_ns = round(bridge_s / NS)  # wheels keep counting while messages are missing
         self.delay_ns = 0
         self.refused = 0
         self._delays_ns = np.round(DELAYS_S / NS).astype(np.int64)
@@ -102,7 +103,7 @@ class OdometryBuffer:
         a, b = np.empty(3), np.empty(3)
         ahead = round(ahead_s / NS)
         for stamp, out in ((t0_ns, a), (t1_ns, b)):
-            if not interpolate(self.stamps_ns, self.poses, stamp + self.delay_ns, ahead, self._gap_ns, out):
+            if not interpolate(self.stamps_ns, self.poses, stamp + self.delay_ns, ahead, self._bridge_ns, out):
                 return None
         return se2.between(a, b)
 
@@ -137,25 +138,29 @@ class OdometryBuffer:
 class Predictor:
     """How wrong a source of motion has been lately; its prediction is weighted by that."""
 
-    def __init__(self, base_m: float, per_m: float, base_rad: float, per_rad: float) -> None:
+    def __init__(
+        self, base_m: float, per_m: float, per_s: float, base_rad: float, per_rad: float, rad_per_s: float
+    ) -> None:
         self._base = (base_m, per_m, base_rad, per_rad)
+        self._blind = (per_s, rad_per_s)  # growth over a gap in the scans, not scaled by what was learnt
         self.scale2_m = self.scale2_rad = 1.0
 
     def sigmas(self, motion: np.ndarray, dt_s: float) -> tuple[float, float]:
         """Standard deviations (m, rad) of a predicted motion float64 [3]."""
-        base_m, base_rad = self._unit(motion, dt_s)
-        return base_m * math.sqrt(self.scale2_m), base_rad * math.sqrt(self.scale2_rad)
+        base_m, base_rad = self._unit(motion)
+        gap_s = max(0.0, dt_s - 0.5)
+        sigma_m = base_m * math.sqrt(self.scale2_m) + self._blind[0] * gap_s
+        return sigma_m, base_rad * math.sqrt(self.scale2_rad) + self._blind[1] * gap_s
 
-    def _unit(self, motion: np.ndarray, dt_s: float) -> tuple[float, float]:
+    def _unit(self, motion: np.ndarray) -> tuple[float, float]:
         distance, turn = math.hypot(motion[0], motion[1]), abs(motion[2])
-        gap = max(1.0, dt_s / 0.3)  # nothing predicts well over a gap
         base_m, per_m, base_rad, per_rad = self._base
-        return gap * (base_m + per_m * distance), gap * (base_rad + per_rad * turn + 0.1 * per_rad * distance)
+        return base_m + per_m * distance, base_rad + per_rad * turn + 0.1 * per_rad * distance
 
-    def learn(self, motion: np.ndarray, dt_s: float, truth: np.ndarray) -> None:
+    def learn(self, motion: np.ndarray, truth: np.ndarray) -> None:
         """Compare with the matched motion; the scale follows quickly upwards and slowly down."""
         error = se2.between(motion, truth)
-        unit_m, unit_rad = self._unit(motion, dt_s)
+        unit_m, unit_rad = self._unit(motion)
         ratio_m = min((error[0] ** 2 + error[1] ** 2) / (2.0 * unit_m**2), 400.0)
         ratio_rad = min(error[2] ** 2 / unit_rad**2, 400.0)
         self.scale2_m = _follow(self.scale2_m, ratio_m)

@@ -20,6 +20,12 @@ class PreparedScan:
     match_index: np.ndarray  # int32 [K], evenly spread subset used for matching
     origin_body: np.ndarray  # float64 [2], the lidar in the body frame
 
+    def features(self) -> np.ndarray:
+        """What the matcher takes, float64 [K, 5]: x, y, tangent x, tangent y, half spacing (m)."""
+        i = self.match_index
+        half = np.minimum(0.5 * self.spacing_m[i], 0.10)
+        return np.column_stack([self.points_body[i], self.tangents[i], half])
+
     def __len__(self) -> int:
         return len(self.points_body)
 

@@ -43,3 +43,20 @@ class LidarSlamSettings:
     max_speed_m_s: float = 3.0
     max_yaw_rate_rad_s: float = 6.0
     extrapolate_s: float = 0.5  # pose_at() follows the last velocity no longer than this
+
+    # Pose graph
+    edge_sigma_m: float = 0.01  # what a match cannot know about itself
+    edge_sigma_rad: float = math.radians(0.15)
+    inner_facts: float = 10.0  # so many poses inside their own submap count as one: they share the drift
+    job_keynodes: int = 20  # background work is handed out every so many keynodes
+    apply_after_scans: int = 20  # and its result is taken in exactly so many scans later
+    loop_submaps: int = 3  # each keynode is tied to at most so many submaps of other passes
+    loop_near_m: float = 3.0  # a submap is "here" if one of its keynodes is this close
+    narrow_m: float = 0.8  # loop windows up to this are searched for every keynode
+    narrow_rad: float = math.radians(12.0)
+    wide_searches: int = 4  # larger windows: so many submaps per job
+    wide_limit_m: float = 40.0
+    chunk_keynodes: int = 17  # keynodes merged for a wide search
+    wide_score: float = 0.30
+    loop_share: float = 0.60
+    loop_known: float = 0.40

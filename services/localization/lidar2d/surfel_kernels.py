@@ -157,17 +157,19 @@ def add_returns(
             for j in range(6):
                 m[j] *= f
             views[k] *= f
-        # A return stands for a short piece of the surface: its own spacing, along the tangent.
+        # A return stands for a short piece of the surface: its own spacing, along the tangent; where the
+        # tangent is unknown it may lie anywhere within it.
         s = min(0.5 * spacing_m[i], 0.10)
         s2 = s * s
         tx, ty = tangents[i, 0], tangents[i, 1]
+        blob = s2 if tx == 0.0 and ty == 0.0 else 0.0
         w = max(0.1, min(1.0, spacing_m[i] / cell_m))
         m[0] += w
         m[1] += w * x
         m[2] += w * y
-        m[3] += w * (x * x + s2 * tx * tx)
+        m[3] += w * (x * x + s2 * tx * tx + blob)
         m[4] += w * (x * y + s2 * tx * ty)
-        m[5] += w * (y * y + s2 * ty * ty)
+        m[5] += w * (y * y + s2 * ty * ty + blob)
         vx, vy = origin[0] - x, origin[1] - y
         norm = max(math.hypot(vx, vy), 1e-6)
         views[k, 0] += w * vx / norm

@@ -105,23 +105,47 @@ class SurfelMap:
                            self.cell_m)  # fmt: skip
 
 
-def tables_of(
-    means: np.ndarray,  # float [S, 2]
-    omegas: np.ndarray,  # float [S, 3]
-    views: np.ndarray,  # float [S, 2]
-    cell_m: float,
-    reach_cells: int,
-) -> MatchTables:
-    """Match tables of a finished map from its surface elements alone."""
-    means, omegas = means.astype(np.float64), omegas.astype(np.float64)
-    cells = np.floor(means[:, ::-1] / cell_m).astype(np.int64)
-    margin = reach_cells + 2
-    row0, col0 = (int(v) for v in cells.min(axis=0) - margin)
-    rows, cols = (int(v) for v in cells.max(axis=0) + margin + 1 - np.array([row0, col0]))
-    nearest = np.full((rows, cols), -1, dtype=np.int32)
-    field = np.zeros((rows, cols), dtype=np.uint8)
-    _splat_all(nearest, field, means, omegas, cells, row0, col0, cell_m, reach_cells)
-    return MatchTables(nearest, field, means, omegas, views.astype(np.float64), row0, col0, cell_m)
+@dataclass(frozen=True)
+class FrozenMap:
+    """A finished local map in little memory: what is needed to match to it, to search it and to draw it."""
+
+    means: np.ndarray  # float32 [S, 2]
+    omegas: np.ndarray  # float32 [S, 3]
+    views: np.ndarray  # float32 [S, 2]
+    hits: np.ndarray  # uint8 [H, W]
+    misses: np.ndarray  # uint8 [H, W]
+    row0: int
+    col0: int
+    cell_m: float
+
+    def tables(self, reach_cells: int) -> MatchTables:
+        """Match tables, computed from the surface elements."""
+        means, omegas = self.means.astype(np.float64), self.omegas.astype(np.float64)
+        nearest = np.full(self.hits.shape, -1, dtype=np.int32)
+        field = np.zeros(self.hits.shape, dtype=np.uint8)
+        cells = np.floor(means[:, ::-1] / self.cell_m).astype(np.int64)
+        _splat_all(nearest, field, means, omegas, cells, self.row0, self.col0, self.cell_m, reach_cells)
+        return MatchTables(nearest, field, means, omegas, self.views.astype(np.float64), self.row0, self.col0,
+                           self.cell_m)  # fmt: skip
+
+
+def freeze(surfels: SurfelMap, min_hit_share: float = 0.2) -> FrozenMap:
+    """Keep the surface elements that later beams did not contradict, crop the grids to what was seen."""
+    n = surfels.count
+    rows, cols = surfels.cells[:n, 0] - surfels.row0, surfels.cells[:n, 1] - surfels.col0
+    hits = surfels.hits[rows, cols].astype(np.float64)
+    alive = hits >= min_hit_share * (hits + surfels.misses[rows, cols])
+    seen = (surfels.hits > 0) | (surfels.misses > 0)
+    used_rows, used_cols = np.flatnonzero(seen.any(axis=1)), np.flatnonzero(seen.any(axis=0))
+    if len(used_rows) == 0:
+        raise ValueError("a map without a single return cannot be frozen")
+    r0, r1 = max(used_rows[0] - MARGIN, 0), used_rows[-1] + MARGIN + 1
+    c0, c1 = max(used_cols[0] - MARGIN, 0), used_cols[-1] + MARGIN + 1
+    return FrozenMap(
+        surfels.means[:n][alive].astype(np.float32), surfels.omegas[:n][alive].astype(np.float32),
+        surfels.views[:n][alive].astype(np.float32), surfels.hits[r0:r1, c0:c1].copy(),
+        surfels.misses[r0:r1, c0:c1].copy(), int(surfels.row0 + r0), int(surfels.col0 + c0), surfels.cell_m,
+    )  # fmt: skip
 
 
 @njit(nogil=True, cache=True, error_model="numpy")

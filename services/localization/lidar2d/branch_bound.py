@@ -1,0 +1,173 @@
+"""Branch and bound over poses (Hess et al. 2016, section V-B): the best match in a large window, exactly."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+LEVELS = 6  # the coarsest level looks at 2^5 search cells at once
+
+
+@dataclass(frozen=True)
+class Pyramid:
+    """Level h holds the maximum of the field over 2^h x 2^h search cells starting at each cell."""
+
+    levels: np.ndarray  # uint8 [LEVELS, H, W], padded by 2^(LEVELS - 1) on all sides
+    row0: int  # search cell of the first row of the padded arrays
+    col0: int
+    cell_m: float
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _fill(field: np.ndarray, shift_r: int, shift_c: int, levels: np.ndarray) -> None:
+    for r in range(field.shape[0]):
+        for c in range(field.shape[1]):
+            rr, cc = (r + shift_r) >> 1, (c + shift_c) >> 1
+            if field[r, c] > levels[0, rr, cc]:
+                levels[0, rr, cc] = field[r, c]
+    rows, cols = levels.shape[1], levels.shape[2]
+    for h in range(1, levels.shape[0]):
+        d = 1 << (h - 1)
+        for r in range(rows):
+            r2 = min(r + d, rows - 1)
+            for c in range(cols):
+                c2 = min(c + d, cols - 1)
+                levels[h, r, c] = max(
+                    max(levels[h - 1, r, c], levels[h - 1, r2, c]), max(levels[h - 1, r, c2], levels[h - 1, r2, c2])
+                )
+
+
+def build_pyramid(field: np.ndarray, row0: int, col0: int, cell_m: float) -> Pyramid:
+    """Pyramid of a likelihood field uint8 [H, W] whose first cell is (row0, col0); search cells are twice
+    as large."""
+    pad = 1 << (LEVELS - 1)
+    r0, c0 = row0 >> 1, col0 >> 1
+    rows = ((row0 + field.shape[0]) >> 1) - r0 + 1
+    cols = ((col0 + field.shape[1]) >> 1) - c0 + 1
+    levels = np.zeros((LEVELS, rows + 2 * pad, cols + 2 * pad), dtype=np.uint8)
+    _fill(field, row0 - 2 * r0 + 2 * pad, col0 - 2 * c0 + 2 * pad, levels)
+    return Pyramid(levels, r0 - pad, c0 - pad, 2.0 * cell_m)
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _score(level: np.ndarray, rows: np.ndarray, cols: np.ndarray, dr: int, dc: int) -> float:
+    total = 0
+    for i in range(rows.shape[0]):
+        r, c = rows[i] + dr, cols[i] + dc
+        if r >= 0 and c >= 0 and r < level.shape[0] and c < level.shape[1]:
+            total += level[r, c]
+    return total / (255.0 * rows.shape[0])
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _search(
+    levels: np.ndarray,  # uint8 [L, H, W]
+    rows: np.ndarray,  # int32 [A, K] cells of the returns at each yaw, window centre
+    cols: np.ndarray,
+    steps: int,  # window of +-steps cells
+    min_score: float,
+    keep: float,  # leaves better than keep * best are reported
+    found: np.ndarray,  # out float64 [M, 4] score, yaw index, dr, dc
+) -> tuple[int, int]:
+    """Depth first, best child first. Returns (number of leaves reported, nodes visited)."""
+    top = levels.shape[0] - 1
+    width = 1 << top
+    n_angles = rows.shape[0]
+    side = (2 * steps) // width + 1
+    n = n_angles * side * side
+    order_score = np.empty(n)
+    for a in range(n_angles):
+        for iy in range(side):
+            for ix in range(side):
+                order_score[(a * side + iy) * side + ix] = _score(
+                    levels[top], rows[a], cols[a], -steps + iy * width, -steps + ix * width
+                )
+    order = np.argsort(-order_score)
+    best, count, visited = min_score, 0, n
+    stack = np.empty((8 * (top + 1) + 8, 5))
+    for k in range(n):
+        root = order[k]
+        if order_score[root] < max(min_score, keep * best):
+            break
+        a = root // (side * side)
+        stack[0, 0], stack[0, 1], stack[0, 2] = order_score[root], top, a
+        stack[0, 3], stack[0, 4] = -steps + (root // side) % side * width, -steps + root % side * width
+        depth = 1
+        while depth > 0:
+            depth -= 1
+            score, hh, ai = stack[depth, 0], int(stack[depth, 1]), int(stack[depth, 2])
+            r0, c0 = int(stack[depth, 3]), int(stack[depth, 4])
+            if score < max(min_score, keep * best):
+                continue
+            if hh == 0:
+                if score > best:
+                    best = score
+                row = count % found.shape[0]
+                found[row, 0], found[row, 1], found[row, 2], found[row, 3] = score, ai, r0, c0
+                count += 1
+                continue
+            half = 1 << (hh - 1)
+            base = depth
+            for q in range(4):
+                r1, c1 = r0 + (q >> 1) * half, c0 + (q & 1) * half
+                if r1 > steps or c1 > steps:
+                    continue
+                child = _score(levels[hh - 1], rows[ai], cols[ai], r1, c1)
+                visited += 1
+                if child < max(min_score, keep * best):
+                    continue
+                j = depth  # insertion keeps the best child on top of the stack
+                while j > base and stack[j - 1, 0] > child:
+                    stack[j] = stack[j - 1]
+                    j -= 1
+                stack[j, 0], stack[j, 1], stack[j, 2], stack[j, 3], stack[j, 4] = child, hh - 1, ai, r1, c1
+                depth += 1
+    return count, visited
+
+
+def branch_and_bound(
+    points: np.ndarray,  # float64 [K, >= 2] body frame
+    T_centre: np.ndarray,  # float64 [3] centre of the window, in the pyramid's frame
+    pyramid: Pyramid,
+    window_m: float,
+    window_rad: float,
+    min_score: float,
+    keep: float = 0.97,
+    max_found: int = 512,
+    min_step_rad: float = math.radians(0.8),
+) -> list[tuple[float, np.ndarray]]:
+    """Distinct poses (score, T_map_body), best first; empty if none reaches `min_score`."""
+    if len(points) == 0:
+        return []
+    reach = np.percentile(np.hypot(points[:, 0], points[:, 1]), 80)
+    step_rad = min(max(pyramid.cell_m / max(reach, 1e-6), min_step_rad), math.radians(3.0))
+    half = math.ceil(window_rad / step_rad)
+    if window_rad >= math.pi - 1e-6:
+        half = math.ceil(math.pi / step_rad)
+        step_rad = math.pi / half
+    yaws = T_centre[2] + step_rad * np.arange(-half, half + 1)
+    if window_rad >= math.pi - 1e-6:
+        yaws = yaws[:-1]
+    c, s = np.cos(yaws)[:, None], np.sin(yaws)[:, None]
+    x = T_centre[0] + c * points[:, 0] - s * points[:, 1]
+    y = T_centre[1] + s * points[:, 0] + c * points[:, 1]
+    rows = np.floor(y / pyramid.cell_m).astype(np.int32) - pyramid.row0
+    cols = np.floor(x / pyramid.cell_m).astype(np.int32) - pyramid.col0
+    found = np.empty((max_found, 4))
+    steps = max(1, math.ceil(window_m / pyramid.cell_m))
+    count, _ = _search(pyramid.levels, rows, cols, steps, min_score, keep, found)
+    found = found[: min(count, max_found)]
+    best = []
+    for score, a, dr, dc in found[np.argsort(-found[:, 0], kind="stable")]:
+        T = np.array([T_centre[0] + dc * pyramid.cell_m, T_centre[1] + dr * pyramid.cell_m, yaws[int(a)]])
+        near = any(
+            math.hypot(T[0] - o[0], T[1] - o[1]) < 4 * pyramid.cell_m
+            and abs(math.remainder(T[2] - o[2], 2 * math.pi)) < max(4 * step_rad, 0.1)
+            for _, o in best
+        )
+        if not near and score >= keep * (best[0][0] if best else 0.0):
+            best.append((float(score), T))
+    return best

@@ -1,0 +1,140 @@
+"""Loop closure: which submaps a keynode may lie in, how uncertain that is, and where exactly it lies."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from scipy.sparse.csgraph import dijkstra
+
+from services.localization.lidar2d.branch_bound import branch_and_bound
+from services.localization.lidar2d.matching import Match, refine, search
+from services.localization.lidar2d.nodes import Constraint, Keynode, TableCache, edge_information, merged_features
+from services.localization.lidar2d.pose_graph import Edges
+from services.localization.lidar2d.settings import LidarSlamSettings
+from services.localization.lidar2d.surfel_map import FrozenMap
+
+CHUNK_SHARE = 0.75  # a merged chunk must agree better than a single scan: it is what tells places apart
+AMBIGUOUS = 0.85  # a second place that scores this close to the best makes the answer worthless
+
+
+@dataclass(frozen=True)
+class Place:
+    """A submap a keynode may lie in."""
+
+    submap: int
+    frozen: FrozenMap
+    T_submap_node: np.ndarray  # float64 [3] guess
+    window_m: float
+    window_rad: float
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _link_variances(
+    submap: np.ndarray, first: np.ndarray, var_m: np.ndarray, var_rad: np.ndarray, links: np.ndarray
+) -> None:
+    """Smallest variance of a path from submap to submap over one shared node, float64 [3, S, S] (m2, rad2, hops)."""
+    for n in range(first.shape[0] - 1):
+        for i in range(first[n], first[n + 1]):
+            for j in range(first[n], i):
+                a, b = submap[i], submap[j]
+                m, r = var_m[i] + var_m[j], var_rad[i] + var_rad[j]
+                if m < links[0, a, b]:
+                    links[0, a, b] = links[0, b, a] = m
+                if r < links[1, a, b]:
+                    links[1, a, b] = links[1, b, a] = r
+                links[2, a, b] = links[2, b, a] = 1.0
+
+
+class DriftModel:
+    """How far the relative pose of two submaps may be off: the shortest path of uncertainties between them."""
+
+    def __init__(self, edges: Edges, n_submaps: int, n_nodes: int, submap_length_m: float, inner_facts: float) -> None:
+        covariance = np.linalg.inv(edges.information) / inner_facts
+        # The errors of matches in a row are not independent (a lidar's angles are off by a constant factor):
+        # drift seen on real logs is a few centimetres and half a degree per submap.
+        var_m = 0.5 * (covariance[:, 0, 0] + covariance[:, 1, 1]) + 0.02**2
+        var_rad = covariance[:, 2, 2] + math.radians(0.3) ** 2
+        self._links = np.full((3, n_submaps, n_submaps), np.inf)
+        first = np.searchsorted(edges.node, np.arange(n_nodes + 1)).astype(np.int64)
+        _link_variances(edges.submap, first, var_m, var_rad, self._links)
+        self._length_m = submap_length_m
+
+    def windows(self, source: int) -> tuple[np.ndarray, np.ndarray]:
+        """Search windows (m, rad) of each submap, float64 [S] each, three sigma seen from one submap."""
+        var_m, var_rad, hops = (
+            dijkstra(np.where(np.isfinite(links), links, 0.0), directed=False, indices=source)
+            for links in self._links
+        )
+        lever_m = np.minimum(hops * self._length_m / 3.0, 30.0)
+        window_m = 0.15 + 3.0 * np.sqrt(var_m + var_rad * lever_m**2)
+        return window_m, math.radians(1.5) + 3.0 * np.sqrt(var_rad)
+
+
+def close_narrow(node: Keynode, place: Place, cache: TableCache, settings: LidarSlamSettings) -> Constraint | None:
+    """One scan against one submap, the guess is good to some decimetres."""
+    tables = cache.tables(place.submap, place.frozen)
+    features = node.scan.features.astype(np.float64)
+    if len(features) < settings.min_points:
+        return None
+    best = refine(features, node.scan.origin, place.T_submap_node, tables, settings, seen=place.frozen.misses)
+    if place.window_m > 0.2 or place.window_rad > math.radians(4.0) or best.share < 0.8:
+        for _, T_start in search(features, place.T_submap_node, tables, place.window_m, place.window_rad, 0.02):
+            other = refine(features, node.scan.origin, T_start, tables, settings, seen=place.frozen.misses)
+            if other.share * other.known > best.share * best.known + 0.02:
+                best = other
+    return _accepted(node, place, best, settings)
+
+
+def close_wide(
+    node: Keynode, neighbours: list[Keynode], place: Place, cache: TableCache, settings: LidarSlamSettings
+) -> Constraint | None:
+    """A chunk of scans against one submap by branch and bound, then the scan of its centre alone."""
+    features = merged_features(neighbours, node)
+    if len(features) < settings.min_points:
+        return None
+    window_m, window_rad = min(place.window_m, settings.wide_limit_m), min(place.window_rad, math.pi)
+    found = branch_and_bound(
+        features[:: max(1, len(features) // 200)], place.T_submap_node, cache.pyramid(place.submap, place.frozen),
+        window_m, window_rad, settings.wide_score, keep=0.9,
+    )  # fmt: skip
+    if not found:
+        return None
+    tables = cache.tables(place.submap, place.frozen)
+    matches = [
+        refine(features, node.scan.origin, T, tables, settings, seen=place.frozen.misses) for _, T in found[:8]
+    ]
+    matches.sort(key=lambda m: -evidence(m))
+    best = matches[0]
+    if best.share < CHUNK_SHARE or best.known < settings.loop_known:
+        return None
+    for other in matches[1:]:
+        apart = np.hypot(*(other.T_map_body[:2] - best.T_map_body[:2])) > 0.5 or (
+            abs(math.remainder(other.T_map_body[2] - best.T_map_body[2], 2 * math.pi)) > 0.2
+        )
+        if apart and evidence(other) > AMBIGUOUS * evidence(best):
+            return None
+    single = refine(node.scan.features.astype(np.float64), node.scan.origin, best.T_map_body, tables, settings,
+                    seen=place.frozen.misses)  # fmt: skip
+    return _accepted(node, place, single, settings)
+
+
+def evidence(match: Match) -> float:
+    """How much speaks for a match: returns on surfaces for it, returns in known free space against it,
+    returns in unknown space neither."""
+    return match.known * (match.share - 0.5)
+
+
+def _accepted(node: Keynode, place: Place, match: Match, settings: LidarSlamSettings) -> Constraint | None:
+    """A constraint if enough of what the scan sees is known there and agrees."""
+    if match.share < settings.loop_share or match.known < settings.loop_known:
+        return None
+    guess = place.T_submap_node
+    moved = np.hypot(*(match.T_map_body[:2] - guess[:2]))
+    turned = abs(math.remainder(match.T_map_body[2] - guess[2], 2 * math.pi))
+    if moved > 1.5 * place.window_m + 0.1 or turned > 1.5 * place.window_rad + 0.05:
+        return None
+    information = edge_information(match.information, settings.edge_sigma_m, settings.edge_sigma_rad)
+    return Constraint(place.submap, node.id, match.T_map_body, information, True)

@@ -1,0 +1,137 @@
+"""What the back end remembers: keynodes with their scans, submaps, and the edges between them."""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from services.localization.lidar2d import se2
+from services.localization.lidar2d.branch_bound import Pyramid, build_pyramid
+from services.localization.lidar2d.pose_graph import Edges
+from services.localization.lidar2d.scan import PreparedScan
+from services.localization.lidar2d.surfel_map import FrozenMap, MatchTables
+
+
+@dataclass(frozen=True)
+class KeyScan:
+    """The returns of one keynode, body frame, small types."""
+
+    points: np.ndarray  # float32 [M, 2]
+    tangents: np.ndarray  # float32 [M, 2]
+    spacing_m: np.ndarray  # float32 [M]
+    moving: np.ndarray  # bool [M]
+    features: np.ndarray  # float32 [K, 5], see PreparedScan.features
+    origin: np.ndarray  # float64 [2]
+
+    @staticmethod
+    def of(scan: PreparedScan, moving: np.ndarray) -> KeyScan:
+        static = ~moving[scan.match_index]
+        return KeyScan(
+            scan.points_body.astype(np.float32), scan.tangents.astype(np.float32), scan.spacing_m.astype(np.float32),
+            moving, scan.features()[static].astype(np.float32), scan.origin_body,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Keynode:
+    """A scan that entered the map."""
+
+    id: int
+    stamp_ns: int
+    T_odom_body: np.ndarray  # float64 [3]
+    scan: KeyScan
+
+
+@dataclass
+class Submap:
+    """A local map with a pose of its own; the anchor that everything built on it hangs on."""
+
+    id: int
+    T_odom_submap: np.ndarray  # float64 [3], where it was started
+    T_map_submap: np.ndarray  # float64 [3], optimised
+    members: list[int] = field(default_factory=list)  # keynode ids
+    frozen: FrozenMap | None = None
+
+
+@dataclass(frozen=True)
+class Constraint:
+    """A measured pose of a keynode in a submap."""
+
+    submap: int  # submap id
+    node: int  # keynode id
+    T_submap_node: np.ndarray  # float64 [3]
+    information: np.ndarray  # float64 [3, 3]
+    loop: bool
+
+
+class TableCache:
+    """Match tables and pyramids of finished submaps, the most recently used ones."""
+
+    def __init__(self, reach_cells: int, capacity: int = 24) -> None:
+        self._reach, self._capacity = reach_cells, capacity
+        self._tables: OrderedDict[tuple[int, int], MatchTables] = OrderedDict()
+        self._pyramids: OrderedDict[tuple[int, int], Pyramid] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def tables(self, submap: int, frozen: FrozenMap) -> MatchTables:
+        """Tables of a submap's frozen map (recomputed if the map was replaced)."""
+        return self._get(self._tables, (submap, id(frozen)), lambda: frozen.tables(self._reach))
+
+    def pyramid(self, submap: int, frozen: FrozenMap) -> Pyramid:
+        """Search pyramid of a submap's frozen map."""
+        key = (submap, id(frozen))
+        return self._get(self._pyramids, key, lambda: _pyramid_of(self.tables(submap, frozen)))
+
+    def _get(self, store: OrderedDict, key: tuple[int, int], make: object) -> object:
+        with self._lock:
+            if key in store:
+                store.move_to_end(key)
+                return store[key]
+        value = make()
+        with self._lock:
+            store[key] = value
+            while len(store) > self._capacity:
+                store.popitem(last=False)
+        return value
+
+
+def _pyramid_of(tables: MatchTables) -> Pyramid:
+    return build_pyramid(tables.field, tables.row0, tables.col0, tables.cell_m)
+
+
+def edges_of(constraints: list[Constraint], submap_row: dict[int, int], node_row: dict[int, int]) -> Edges:
+    """Edge arrays in the order the solver wants."""
+    node = np.array([node_row[c.node] for c in constraints], dtype=np.int32)
+    order = np.argsort(node, kind="stable")
+    chosen = [constraints[i] for i in order]
+    return Edges(
+        np.array([submap_row[c.submap] for c in chosen], dtype=np.int32), node[order],
+        np.array([c.T_submap_node for c in chosen]).reshape(-1, 3),
+        np.array([c.information for c in chosen]).reshape(-1, 3, 3), np.array([c.loop for c in chosen], dtype=bool),
+    )  # fmt: skip
+
+
+def edge_information(match_information: np.ndarray, sigma_m: float, sigma_rad: float) -> np.ndarray:
+    """Information of an edge: that of the match, limited by what a match cannot know about itself."""
+    # (3 m)^-2 and (0.5 rad)^-2 keep the inverse finite where the scan says nothing.
+    covariance = np.linalg.inv(match_information + np.diag([0.1, 0.1, 4.0]))
+    return np.linalg.inv(covariance + np.diag([sigma_m**2, sigma_m**2, sigma_rad**2]))
+
+
+def merged_features(nodes: list[Keynode], centre: Keynode, limit: int = 360) -> np.ndarray:
+    """Features float64 [K, 5] of several keynodes in the body frame of one of them."""
+    parts = []
+    for node in nodes:
+        T_centre_node = se2.between(centre.T_odom_body, node.T_odom_body)
+        f = node.scan.features.astype(np.float64)
+        turn = np.array([0.0, 0.0, T_centre_node[2]])
+        parts.append(np.column_stack([se2.transform(T_centre_node, f[:, :2]), se2.transform(turn, f[:, 2:4]), f[:, 4]]))
+    merged = np.concatenate(parts)
+    # One return per 10 cm cell: near walls would outvote far ones.
+    cells = np.floor(merged[:, :2] / 0.1).astype(np.int64)
+    _, index = np.unique(cells[:, 0] * 1_000_003 + cells[:, 1], return_index=True)
+    merged = merged[np.sort(index)]
+    return merged[:: max(1, -(-len(merged) // limit))]

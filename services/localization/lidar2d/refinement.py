@@ -1,0 +1,67 @@
+"""Draw submaps anew from optimised poses and measure every edge again: what makes relations accurate."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from services.localization.lidar2d import se2
+from services.localization.lidar2d.matching import refine
+from services.localization.lidar2d.nodes import Constraint, Keynode, edge_information
+from services.localization.lidar2d.settings import LidarSlamSettings
+from services.localization.lidar2d.surfel_map import FrozenMap, SurfelMap, freeze
+
+
+def draw_submap(settings: LidarSlamSettings, nodes: list[Keynode], T_submap_node: list[np.ndarray]) -> FrozenMap:
+    """A frozen map of keynodes at given poses."""
+    surfels = SurfelMap(settings)
+    for node, T in zip(nodes, T_submap_node):
+        scan = node.scan
+        still = ~scan.moving
+        surfels.insert(
+            se2.transform(T, scan.points.astype(np.float64)),
+            se2.transform(np.array([0.0, 0.0, T[2]]), scan.tangents.astype(np.float64)),
+            scan.spacing_m.astype(np.float64), se2.transform(T, scan.origin[None])[0], still, still,
+        )  # fmt: skip
+    return freeze(surfels)
+
+
+def refine_submaps(
+    settings: LidarSlamSettings,
+    nodes: dict[int, Keynode],
+    members: dict[int, list[int]],
+    frozen: dict[int, FrozenMap],
+    constraints: list[Constraint],
+    T_map_submap: dict[int, np.ndarray],
+    T_map_node: dict[int, np.ndarray],
+) -> tuple[dict[int, FrozenMap], list[Constraint]]:
+    """New maps of the finished submaps and all constraints measured in them."""
+    drawn: dict[int, FrozenMap] = {}
+    by_submap: dict[int, list[int]] = {}
+    for k, c in enumerate(constraints):
+        by_submap.setdefault(c.submap, []).append(k)
+    measured = list(constraints)
+    for submap in sorted(frozen):
+        poses = [se2.between(T_map_submap[submap], T_map_node[n]) for n in members[submap]]
+        drawn[submap] = draw_submap(settings, [nodes[n] for n in members[submap]], poses)
+        tables = drawn[submap].tables(settings.reach_cells)
+        for k in by_submap.get(submap, []):
+            measured[k] = _measure(settings, nodes[constraints[k].node], constraints[k], drawn[submap], tables,
+                                   T_map_submap[submap], T_map_node[constraints[k].node])  # fmt: skip
+    return drawn, measured
+
+
+def _measure(
+    settings: LidarSlamSettings, node: Keynode, constraint: Constraint, frozen: FrozenMap, tables: object,
+    T_map_submap: np.ndarray, T_map_node: np.ndarray,
+) -> Constraint:  # fmt: skip
+    """The same constraint from a fresh match that starts at the optimised pose."""
+    features = node.scan.features.astype(np.float64)
+    guess = se2.between(T_map_submap, T_map_node)
+    match = refine(features, node.scan.origin, guess, tables, settings, seen=frozen.misses, anneal=(1.5,))
+    moved = np.hypot(*(match.T_map_body[:2] - guess[:2]))
+    if match.share < settings.loop_share or match.known < settings.loop_known or moved > 0.3:
+        return constraint
+    information = edge_information(match.information, settings.edge_sigma_m, settings.edge_sigma_rad)
+    if not constraint.loop:
+        information /= settings.inner_facts
+    return Constraint(constraint.submap, constraint.node, match.T_map_body, information, constraint.loop)
