@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.interpolate import CubicSpline
+from scipy.interpolate import CubicHermiteSpline, CubicSpline
 
 from common.geometry import se2_to_se3
 
@@ -53,8 +53,9 @@ class Drive:
         speed = _accelerate(speed, along, limits.acceleration_m_s2)
         time = np.concatenate([[0.0], np.cumsum(2 * np.diff(along) / (speed[1:] + speed[:-1]))])
         self.length_m = float(along[-1])
-        self._time, self._s = time, s
-        self._speed = speed
+        # Between samples the acceleration is constant: position is a parabola, which Hermite's cubic meets.
+        self._motion = CubicHermiteSpline(time, s, speed / metric)
+        self._drive_s = float(time[-1])
         # Whole seconds: every sensor's period divides a lap, so that laps can share their pictures.
         self.lap_s = float(np.ceil(time[-1] + 0.5))
 
@@ -72,16 +73,16 @@ class Drive:
     def speed_at(self, time_s: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:
         """Forward speed m/s and turn rate rad/s at times in seconds."""
         time = np.asarray(time_s, dtype=np.float64)
-        s, h = self._position(time), 1e-4
-        before, after = self.pose_at(time - h), self.pose_at(time + h)
-        moved = np.linalg.norm(after[..., :2] - before[..., :2], axis=-1) / (2 * h)
+        s = self._position(time)
         first, second = self._curve(s, 1), self._curve(s, 2)
         metric = np.linalg.norm(first, axis=-1)
+        lap_time = np.mod(time, self.lap_s)
+        moved = np.where(lap_time < self._drive_s, self._motion(lap_time, 1) * metric, 0.0)
         bend = (first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0]) / metric**3
         return moved, moved * bend
 
     def _position(self, time: np.ndarray) -> np.ndarray:
-        return np.interp(np.mod(time, self.lap_s), self._time, self._s) % self._s_end
+        return self._motion(np.minimum(np.mod(time, self.lap_s), self._drive_s)) % self._s_end
 
 
 def _accelerate(speed: np.ndarray, along: np.ndarray, limit: float) -> np.ndarray:

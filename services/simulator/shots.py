@@ -21,7 +21,7 @@ from services.simulator.shade import surfaces
 from services.simulator.world import World, load_world
 
 METERING_VIEWS = 12
-METERED = 0.52  # exposed value of the 70th percentile of the drive's light
+METERED = 0.40  # exposed value of the 70th percentile of the drive's light
 
 
 @dataclass(frozen=True)

@@ -5,8 +5,11 @@ Pictures are float32 [H, W, 3] in sRGB, 0..1, row 0 on top. Every function takes
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import cv2
 import numpy as np
+from scipy import fft
 
 Rgb = tuple[float, float, float]
 
@@ -19,13 +22,26 @@ def rgb(hex_colour: str) -> np.ndarray:
 def fractal(
     rng: np.random.Generator, height: int, width: int, beta: float = 1.6, stretch: tuple[float, float] = (1.0, 1.0)
 ) -> np.ndarray:
-    """Periodic 1/f^beta noise [H, W], zero mean, unit deviation; `stretch` (x, y) lengthens its grain."""
+    """Periodic 1/f^beta noise [H, W], zero mean, unit deviation; `stretch` (x, y) lengthens its grain.
+
+    One field for each set of arguments, shifted and mirrored by the generator: a transform for each
+    texture would take longer than all the rest of a home.
+    """
+    noise = _noise(height, width, beta, stretch)
+    rolled = np.roll(noise, tuple(rng.integers(0, (height, width)).tolist()), axis=(0, 1))
+    return rolled[:, :: int(rng.choice([-1, 1]))] * np.float32(rng.choice([-1.0, 1.0]))
+
+
+@lru_cache(maxsize=64)
+def _noise(height: int, width: int, beta: float, stretch: tuple[float, float]) -> np.ndarray:
     fy = np.fft.fftfreq(height)[:, None] * height * stretch[1]
     fx = np.fft.rfftfreq(width)[None, :] * width * stretch[0]
     radius = np.hypot(fx, fy)
     radius[0, 0] = np.inf
-    spectrum = np.fft.rfft2(rng.standard_normal((height, width))) * radius**-beta
-    noise = np.fft.irfft2(spectrum, s=(height, width))
+    seed = [height, width, round(1000 * beta), round(1000 * stretch[0]), round(1000 * stretch[1])]
+    white = np.random.default_rng(seed).standard_normal((height, width), dtype=np.float32)
+    spectrum = fft.rfft2(white) * (radius**-beta).astype(np.float32)
+    noise = fft.irfft2(spectrum, s=(height, width))
     return (noise / noise.std()).astype(np.float32)
 
 

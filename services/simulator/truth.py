@@ -85,9 +85,16 @@ def surface_points(
     area = np.linalg.norm(scene.normal, axis=1) / 2
     unit = scene.normal / np.maximum(2 * area[:, None], 1e-30)
     e1, e2 = _edges(scene)
+    # Triangles are small: one with no corner and no middle in sight has nothing in sight worth a point.
+    probes = np.stack([scene.corner + 0.02 * (e1 + e2), scene.corner + 0.96 * e1, scene.corner + 0.96 * e2,
+                       scene.corner + (e1 + e2) / 3])  # fmt: skip
+    in_sight = np.any([seen.count(p, unit) > 0 for p in probes], axis=0)
+    weight = np.where(in_sight, area, 0.0)
+    if weight.sum() <= 0.0:
+        return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
     found, colours, total = [], [], 0
     for _ in range(12):
-        triangle = rng.choice(len(area), size=2 * wanted, p=area / area.sum())
+        triangle = rng.choice(len(area), size=wanted, p=weight / weight.sum())
         a, b = rng.random((2, len(triangle)))
         fold = a + b > 1
         a, b = np.where(fold, 1 - a, a), np.where(fold, 1 - b, b)
@@ -103,11 +110,12 @@ def surface_points(
 
 
 def _edges(scene: Surfaces) -> tuple[np.ndarray, np.ndarray]:
-    """The edge vectors [F, 3] whose barycentrics `scene.dual` measures."""
+    """The edge vectors [F, 3] whose barycentrics `scene.dual` measures.
+
+    dual_1 = e2 x n / n^2 and dual_2 = n x e1 / n^2 give n x dual_1 = e2 and dual_2 x n = e1.
+    """
     dual = scene.dual.astype(np.float64)
-    squared = np.einsum("ij,ij->i", scene.normal, scene.normal)[:, None]
-    # dual_1 = e2 x n / n^2 and dual_2 = n x e1 / n^2, so n x dual_1 = e2 and dual_2 x n = e1.
-    return np.cross(dual[:, 1], scene.normal) * np.sign(squared), np.cross(scene.normal, dual[:, 0])
+    return np.cross(dual[:, 1], scene.normal), np.cross(scene.normal, dual[:, 0])
 
 
 def _colours(scene: Surfaces, triangle: np.ndarray, a: np.ndarray, b: np.ndarray, gain: float) -> np.ndarray:

@@ -111,12 +111,12 @@ def _window(b: MeshBuilder, hole: Opening, finish: Finish, rng: np.random.Genera
     for z in rows if not glazed else (hole.z0, hole.z1 - bar):
         box(b, (middle, t - 0.04, z), (width, 0.05, bar), finish.trim, skip=("back",))
     if not glazed:
-        box(b, (middle, -0.03, hole.z0 - 0.03), (width + 0.16, 0.20, 0.03), finish.trim)
-    rod(b, (hole.s0 - 0.3, -0.09, hole.z1 + 0.16), (hole.s1 + 0.3, -0.09, hole.z1 + 0.16), 0.012, STEEL)
+        box(b, (middle, 0.0, hole.z0 - 0.03), (width + 0.10, 0.16, 0.03), finish.trim)
+    rod(b, (hole.s0 - 0.3, -0.14, hole.z1 + 0.16), (hole.s1 + 0.3, -0.14, hole.z1 + 0.16), 0.012, STEEL)
     low = 0.03 if glazed or rng.random() < 0.5 else hole.z0 - 0.15
     for left in (hole.s0 - 0.28, hole.s1 - 0.06):
         cloth = 0.34
         folds = float(rng.uniform(4.0, 6.0))
-        curtain(b, (left, -0.09, low), cloth, hole.z1 + 0.15 - low, Material("curtain"), folds=folds)
-        back = b.placed(left + cloth, -0.086, 0.0, np.pi)
+        curtain(b, (left, -0.14, low), cloth, hole.z1 + 0.15 - low, Material("curtain"), folds=folds)
+        back = b.placed(left + cloth, -0.136, 0.0, np.pi)
         curtain(back, (0, 0, low), cloth, hole.z1 + 0.15 - low, Material("curtain"), folds=folds)
