@@ -233,7 +233,7 @@ class Live:
             self.node.on_health(self._healths.popleft())
         while self._queries:
             name, query = self._queries.popleft()
-            parameters = dict(query.parameters.items()) if query.parameters else {}
+            parameters = dict(query.parameters)
             reply(query, getattr(self.node, f"on_query_{name}")(parameters))
 
     # --- called from threads of the bus ---
