@@ -21,7 +21,7 @@ SetOption = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="NODE.OPTION=VALUE", help="Override an option of the file; repeatable"),
 ]
-console = Console(stderr=True)
+console = Console(stderr=True, width=None if sys.stderr.isatty() else 120)
 
 
 def _load(file: Path, overrides: list[str] | None) -> Deployment:
