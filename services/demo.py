@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import Annotated
 
@@ -39,10 +40,11 @@ def demo(
 
     out.mkdir(parents=True, exist_ok=True)
     source = data if data is not None else _simulated(out, seconds)
+    shutil.rmtree(out / "recording", ignore_errors=True)
+    (out / "demo.rrd").unlink(missing_ok=True)
     overrides = (
         f"replay.data={json.dumps(str(source))}",
         f"recorder.out={json.dumps(str(out / 'recording'))}",
-        "recorder.overwrite=true",
         f"monitor.save={json.dumps(str(out / 'demo.rrd'))}",
         f"monitor.view={json.dumps(view)}",
         f"rate={rate}",

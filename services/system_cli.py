@@ -175,6 +175,8 @@ def record(
     from services.host import serve as serve_node
     from services.host import start_logging
 
+    if out.exists():
+        raise UserError(f"{out} exists: a recording is never overwritten, choose another --out")
     deployment = _load(file, set_)
     options = {**deployment.nodes.get("recorder", {}), "out": str(out)}
     deployment = deployment.model_copy(update={"nodes": {**deployment.nodes, "recorder": options}})
