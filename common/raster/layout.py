@@ -1,0 +1,43 @@
+"""What the arrays of the rasterizer hold, and the constants all backends agree on.
+
+Parameters are stored by component, float32 [PARAMS, capacity], so that vectors of lanes run over Gaussians.
+Semantics are those of 3DGS (Kerbl et al. 2023) with gsplat's constants: the screen covariance gets 0.3 px^2,
+alpha is at most 0.999, alpha below 1/255 is skipped, and a pixel stops before transmittance falls to 1e-4.
+"""
+
+from __future__ import annotations
+
+import math
+
+from common.raster.simd import LANES
+
+MEAN, SCALE, QUAT, OPACITY, COLOUR = 0, 3, 6, 10, 11  # first row of each parameter
+PARAMS = 14  # mean_map_m 3, log scale (ln m) 3, quat_wxyz 4, opacity logit 1, colour rgb 3
+GROUPS = {
+    "mean": (0, 3),
+    "log_scale": (3, 6),
+    "quat_wxyz": (6, 10),
+    "opacity_logit": (10, 11),
+    "colour": (11, 14),
+}
+
+# Rows of the gradient beside those of the parameters.
+SCREEN_GRADIENT, WEIGHT = 14, 15  # |dL/d(centre in px)|, and the sum of blending weights over all pixels
+GRADIENTS = 16
+
+CHANNELS = 5  # planes of a rendered image: red, green, blue, accumulated depth (m), alpha
+
+BLUR_PX2 = 0.3
+ALPHA_MAX = 0.999
+ALPHA_MIN = 1.0 / 255.0
+STOP = 1e-4
+NEAR_M = 0.05
+LOG2_ALPHA_MIN = math.log2(ALPHA_MIN)
+LOG2_ALPHA_MAX = math.log2(ALPHA_MAX)
+
+TILE_W, TILE_H = 8, 32
+TILE_PIXELS = TILE_W * TILE_H
+ROWS = LANES // TILE_W  # image rows in one vector
+RECORD = 16  # floats of a projected splat: x y A B C log2(opacity) r g b z, and what binning needs
+SLOT = 16  # a cache line: sums of one (splat, tile) pair: v vx vy vxx | vxy vyy wr wg | wb wz w | -
+CHUNKS = 16  # parts of the depth order that are projected and binned on their own, whatever the threads

@@ -1,0 +1,205 @@
+"""Gaussians on the screen: projection of `LANES` at a time, and the tiles that each one touches.
+
+EWA splatting (Zwicker et al. 2001) as in 3DGS: V = J R_camera_map R_q diag(s), screen covariance V V^T + blur.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from common.raster.compiled import inner, kernel
+from common.raster.lanes import LOG2_E, exp_lanes, log2_lanes, sigmoid_lanes
+from common.raster.layout import BLUR_PX2, CHUNKS, COLOUR, OPACITY, QUAT, RECORD, ROWS, SCALE, TILE_H, TILE_W
+from common.raster.simd import LANES, aligned_floats, atomic_next, fma, gather, larger, root, smaller, store
+from common.raster.visible import sort_by_depth
+
+_LN_255 = float(np.log(255.0))
+_FIELDS = 15  # fields of a record that `_write_records` fills
+
+
+@inner
+def camera_point(params, stride, index, at, c):  # noqa: ANN001, ANN201
+    """Centres of Gaussians index[at...] in the camera frame: three vectors."""
+    x, y, z = (
+        gather(params, 0, index, at),
+        gather(params, stride, index, at),
+        gather(params, 2 * stride, index, at),
+    )
+    xc = fma(x, c[0], fma(y, c[1], fma(z, c[2], c[9])))
+    yc = fma(x, c[3], fma(y, c[4], fma(z, c[5], c[10])))
+    zc = fma(x, c[6], fma(y, c[7], fma(z, c[8], c[11])))
+    return xc, yc, zc
+
+
+@inner
+def rotation(params, stride, index, at):  # noqa: ANN001, ANN201
+    """Unit quaternion (w x y z) of Gaussians index[at...], 1/length of the raw one, and the nine of R, by rows."""
+    w, x = gather(params, QUAT * stride, index, at), gather(params, (QUAT + 1) * stride, index, at)
+    y, z = gather(params, (QUAT + 2) * stride, index, at), gather(params, (QUAT + 3) * stride, index, at)
+    n = 1.0 / root(larger(w * w + x * x + y * y + z * z, 1e-24))
+    w, x, y, z = w * n, x * n, y * n, z * n
+    q = (w, x, y, z, n)
+    R = (
+        1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y),
+        2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x),
+        2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y),
+    )  # fmt: skip
+    return q, R
+
+
+@inner
+def axes(params, stride, index, at, c, R):  # noqa: ANN001, ANN201
+    """M = R_camera_map R_q diag(s), nine vectors by rows, and the three scales (metres)."""
+    s0 = exp_lanes(gather(params, SCALE * stride, index, at))
+    s1 = exp_lanes(gather(params, (SCALE + 1) * stride, index, at))
+    s2 = exp_lanes(gather(params, (SCALE + 2) * stride, index, at))
+    M = (
+        (R[0] * c[0] + R[3] * c[1] + R[6] * c[2]) * s0,
+        (R[1] * c[0] + R[4] * c[1] + R[7] * c[2]) * s1,
+        (R[2] * c[0] + R[5] * c[1] + R[8] * c[2]) * s2,
+        (R[0] * c[3] + R[3] * c[4] + R[6] * c[5]) * s0,
+        (R[1] * c[3] + R[4] * c[4] + R[7] * c[5]) * s1,
+        (R[2] * c[3] + R[5] * c[4] + R[8] * c[5]) * s2,
+        (R[0] * c[6] + R[3] * c[7] + R[6] * c[8]) * s0,
+        (R[1] * c[6] + R[4] * c[7] + R[7] * c[8]) * s1,
+        (R[2] * c[6] + R[5] * c[7] + R[8] * c[8]) * s2,
+    )
+    return M, (s0, s1, s2)
+
+
+@inner
+def screen_covariance(M, xc, yc, zc, c):  # noqa: ANN001, ANN201
+    """V = J M (rows V0, V1), the covariance (a, b, d) in px^2 with blur, and what J was made of."""
+    inverse = 1.0 / zc
+    ux = smaller(larger(xc * inverse, c[16]), c[17])
+    uy = smaller(larger(yc * inverse, c[18]), c[19])
+    j00, j02 = inverse * c[12], -(ux * inverse) * c[12]
+    j11, j12 = inverse * c[13], -(uy * inverse) * c[13]
+    V0 = (fma(j00, M[0], j02 * M[6]), fma(j00, M[1], j02 * M[7]), fma(j00, M[2], j02 * M[8]))
+    V1 = (fma(j11, M[3], j12 * M[6]), fma(j11, M[4], j12 * M[7]), fma(j11, M[5], j12 * M[8]))
+    a = V0[0] * V0[0] + V0[1] * V0[1] + V0[2] * V0[2] + BLUR_PX2
+    b = V0[0] * V1[0] + V0[1] * V1[1] + V0[2] * V1[2]
+    d = V1[0] * V1[0] + V1[1] * V1[1] + V1[2] * V1[2] + BLUR_PX2
+    return V0, V1, (a, b, d), (inverse, ux, uy, j00, j02, j11, j12)
+
+
+@kernel
+def _write_records(params, stride, index, first, c, records, lanes):  # noqa: ANN001, ANN202
+    """Projects Gaussians index[first ... first + LANES) into records[first * RECORD ...]."""
+    xc, yc, zc = camera_point(params, stride, index, first, c)
+    _, R = rotation(params, stride, index, first)
+    M, _ = axes(params, stride, index, first, c, R)
+    _, _, cov, _ = screen_covariance(M, xc, yc, zc, c)
+    inverse = 1.0 / zc
+    k = 1.0 / larger(cov[0] * cov[2] - cov[1] * cov[1], 1e-12)
+    log_opacity = log2_lanes(larger(sigmoid_lanes(gather(params, OPACITY * stride, index, first)), 1e-30))
+    reach = 2.0 * fma(log_opacity, 1.0 / LOG2_E, _LN_255)  # d^T cov^-1 d of the ellipse where alpha is 1/255
+    store(lanes, 0, fma(xc * inverse, c[12], c[14]))
+    store(lanes, LANES, fma(yc * inverse, c[13], c[15]))
+    store(lanes, 2 * LANES, cov[2] * k * (-0.5 * LOG2_E))
+    store(lanes, 3 * LANES, cov[1] * k * LOG2_E)
+    store(lanes, 4 * LANES, cov[0] * k * (-0.5 * LOG2_E))
+    store(lanes, 5 * LANES, log_opacity)
+    store(lanes, 6 * LANES, gather(params, COLOUR * stride, index, first))
+    store(lanes, 7 * LANES, gather(params, (COLOUR + 1) * stride, index, first))
+    store(lanes, 8 * LANES, gather(params, (COLOUR + 2) * stride, index, first))
+    store(lanes, 9 * LANES, zc)
+    store(lanes, 10 * LANES, reach)
+    store(lanes, 11 * LANES, root(larger(reach * cov[0], 0.0)))  # half width of the ellipse
+    store(lanes, 12 * LANES, root(larger(reach * cov[2], 0.0)))  # half height
+    store(lanes, 13 * LANES, root(larger(reach / cov[2], 0.0)) * cov[1])  # x of its top point
+    store(lanes, 14 * LANES, cov[1] * cov[1] - cov[0] * cov[2])
+    for lane in range(LANES):
+        at = (first + lane) * RECORD
+        for field in range(_FIELDS):
+            records[at + field] = lanes[field * LANES + lane]
+
+
+@inner
+def _edge(x, record, records, sign):  # noqa: ANN001, ANN202
+    """y of the ellipse's upper (sign 1) or lower (-1) arc at x, relative to the centre.
+
+    From (A, B, C) of the record: a = A x^2, ...; solves C y^2 + B x y + A x^2 = -reach log2(e) / 2.
+    """
+    A, B, C = records[record + 2], records[record + 3], records[record + 4]
+    level = records[record + 10] * np.float32(-0.5 * LOG2_E)
+    inside = max(B * B * x * x - np.float32(4.0) * C * (A * x * x - level), np.float32(0.0))
+    return (-B * x - sign * np.sqrt(inside)) / (np.float32(2.0) * C)
+
+
+@kernel
+def _emit(splat, records, width, height, tiles_x, tiles, rows, at, limit):  # noqa: ANN001, ANN202
+    """Writes the (tile, first and last vector of rows) of one splat behind `at`; gives the new end.
+
+    The coverage is exact per column of tiles: the ellipse's largest and smallest y over its eight pixels.
+    Beyond `limit` pairs are counted only.
+    """
+    record = splat * RECORD
+    if not records[record + 10] > 0.0:  # fainter than 1/255 at its centre, or not a number
+        return at
+    x, y = records[record], records[record + 1]
+    half_w, half_h, x_top = records[record + 11], records[record + 12], records[record + 13]
+    if not (
+        x + half_w >= 0.0 and x - half_w <= width - 1.0 and y + half_h >= 0.0 and y - half_h <= height - 1.0
+    ):
+        return at
+    slack = np.float32(1e-3)
+    first = int(max(x - half_w, np.float32(0.0))) // TILE_W
+    last = int(min(x + half_w, np.float32(width - 1.0))) // TILE_W
+    for column in range(first, last + 1):
+        left = max(np.float32(column * TILE_W) - x, -half_w)
+        right = min(np.float32(column * TILE_W + TILE_W - 1) - x, half_w)
+        if left > right + slack:
+            continue
+        top_x, bottom_x = min(max(x_top, left), right), min(max(-x_top, left), right)
+        high = half_h if top_x == x_top else _edge(top_x, record, records, np.float32(1.0))
+        low = -half_h if bottom_x == -x_top else _edge(bottom_x, record, records, np.float32(-1.0))
+        y0 = int(np.ceil(max(y + low - slack, np.float32(0.0))))
+        y1 = int(np.floor(min(y + high + slack, np.float32(height - 1.0))))
+        if y0 > y1:
+            continue
+        for row in range(y0 // TILE_H, y1 // TILE_H + 1):
+            if at < limit:
+                tile = row * tiles_x + column
+                begin, end = max(y0 - row * TILE_H, 0) // ROWS, min(y1 - row * TILE_H, TILE_H - 1) // ROWS
+                tiles[at], rows[at] = tile, begin | (end << 8)
+            at += 1
+    return at
+
+
+@kernel
+def project_and_emit(  # noqa: ANN201
+    counter, params, stride, index, visible, camera, width, height, tiles_x,  # noqa: ANN001
+    records, first_pair, pair_count, tiles, rows, emitted,  # noqa: ANN001
+    depth, order, keys, keys_other, order_other,  # noqa: ANN001
+):  # fmt: skip
+    """Projects the visible Gaussians and lists their pairs with tiles, in parts; one thread sorts by depth.
+
+    `tiles` and `rows` are int32 [CHUNKS * capacity]; `emitted` [CHUNKS] tells how many pairs a part wanted to
+    write: more than the capacity means that the caller must make room and call again. The pairs of splat i
+    are first_pair[i] ... + pair_count[i]. The other arguments are those of `sort_by_depth`.
+    """
+    lanes = aligned_floats(RECORD * LANES)
+    size, capacity = chunk_size(visible), len(rows) // CHUNKS
+    while True:
+        chunk = atomic_next(counter, 0) - 1
+        if chunk >= CHUNKS:
+            return
+        if chunk < 0:
+            sort_by_depth(depth, visible, order, keys, keys_other, order_other)
+            continue
+        at, limit = chunk * capacity, (chunk + 1) * capacity
+        start, stop = chunk * size, min(visible, (chunk + 1) * size)
+        for group in range(start, stop, LANES):
+            _write_records(params, stride, index, group, camera, records, lanes)
+            for splat in range(group, min(group + LANES, stop)):
+                end = _emit(splat, records, width, height, tiles_x, tiles, rows, at, limit)
+                first_pair[splat], pair_count[splat] = at, end - at
+                at = end
+        emitted[chunk] = at - chunk * capacity
+
+
+@inner
+def chunk_size(visible):  # noqa: ANN001, ANN201
+    """Splats in one part: a multiple of LANES, so that parts do not write into each other's records."""
+    return ((visible + CHUNKS - 1) // CHUNKS + LANES - 1) // LANES * LANES

@@ -1,0 +1,224 @@
+"""The CPU rasterizer on arrays: `render` a picture, then `backward` from the gradient of a loss.
+
+    pictures = Rasterizer(threads=2)
+    render = pictures.render(params, count, camera, T_camera_map)     # params float32 [14, capacity]
+    gradients = pictures.backward(render, dL_dimage)                  # dL_dimage float32 [5, H, W]
+    pictures.release(render)
+
+Memory comes from a pool and belongs to a render until it is released: several may be alive at once.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from common.raster.bins import count as count_pairs
+from common.raster.bins import place, scatter
+from common.raster.camera import RasterCamera
+from common.raster.chain import chain
+from common.raster.layout import CHANNELS, CHUNKS, GRADIENTS, PARAMS, RECORD, SLOT, TILE_H, TILE_W
+from common.raster.project import project_and_emit
+from common.raster.simd import LANES
+from common.raster.threads import Team
+from common.raster.tiles import backward_tiles, forward_tiles
+from common.raster.visible import BLOCK, compact, cull
+
+
+class Workspace:
+    """Arrays of one render by name; grown when needed, never shrunk. Fresh pages cost more than the work."""
+
+    def __init__(self) -> None:
+        self._arrays: dict[str, np.ndarray] = {}
+
+    def take(self, name: str, shape: tuple[int, ...], dtype: type = np.float32) -> np.ndarray:
+        """A C-contiguous array of this shape, with whatever it held before."""
+        size = int(np.prod(shape))
+        held = self._arrays.get(name)
+        if held is None or held.size < size or held.dtype != dtype:
+            held = _aligned(size + size // 4, dtype)
+            self._arrays[name] = held
+        return held[:size].reshape(shape)
+
+
+def _aligned(size: int, dtype: type) -> np.ndarray:
+    """Uninitialised [size] on a cache line's boundary."""
+    item = np.dtype(dtype).itemsize
+    raw = np.empty(size * item + 64, np.uint8)
+    skip = -raw.ctypes.data % 64
+    return raw[skip : skip + size * item].view(dtype)
+
+
+@dataclass(frozen=True)
+class Tables:
+    """What binning made of a scene: memory of one workspace."""
+
+    index: np.ndarray  # int32 [>= V]: Gaussian of each visible splat, ascending
+    records: np.ndarray  # float32 [V * RECORD]: splats on the screen
+    first_pair: np.ndarray  # int32 [V]
+    pair_count: np.ndarray  # int32 [V]
+    places: np.ndarray  # int32: row in `lists` of each pair
+    lists: np.ndarray  # int32 [pairs, 2]: (splat, rows) tile by tile, nearest first
+    tile_start: np.ndarray  # int64 [tiles + 1]
+
+
+@dataclass
+class Render:
+    """A picture and all that its gradient needs. Valid until released."""
+
+    image: np.ndarray  # float32 [5, H, W]: red, green, blue, accumulated depth (m), alpha
+    index: np.ndarray  # int32 [V]: Gaussians that may be seen, ascending
+    params: np.ndarray
+    camera: np.ndarray
+    background: np.ndarray
+    workspace: Workspace
+    tables: Tables
+
+    @property
+    def pairs(self) -> int:
+        """(splat, tile) pairs blended."""
+        return len(self.tables.lists) - 1
+
+    def expected_depth(self) -> np.ndarray:
+        """float32 [H, W] metres: accumulated depth over alpha, NaN where alpha is below 1e-3."""
+        alpha = self.image[4]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.where(alpha > 1e-3, self.image[3] / alpha, np.float32(np.nan))
+
+
+@dataclass
+class Gradients:
+    """dL/d(parameters) of the visible Gaussians. `by_splat` is memory of the render: copy what must outlive it."""
+
+    by_splat: np.ndarray  # float32 [GRADIENTS, >= V]: rows as in layout, one column a visible Gaussian
+    index: np.ndarray  # int32 [V]: which Gaussian a column belongs to, ascending
+    pose: np.ndarray  # float64 [6]: (rho, phi), left perturbation of T_camera_map
+
+    def dense(self, count: int) -> np.ndarray:
+        """float32 [GRADIENTS, count], zero where nothing was seen."""
+        out = np.zeros((GRADIENTS, count), np.float32)
+        out[:, self.index] = self.by_splat[:, : len(self.index)]
+        return out
+
+
+class Rasterizer:
+    """Kernels, threads and the pool of workspaces."""
+
+    def __init__(self, threads: int = 1) -> None:
+        self.team = Team(threads)
+        self._pool: list[Workspace] = []
+        self._capacity = 4096  # pairs of one part of the depth order; grows with the scenes seen
+
+    def render(
+        self,
+        params: np.ndarray,  # float32 [14, capacity], C-contiguous, capacity a multiple of 16
+        count: int,  # Gaussians in use, <= capacity
+        camera: RasterCamera,
+        T_camera_map: np.ndarray,
+        background: np.ndarray | None = None,  # float32 [3], default black
+    ) -> Render:
+        """Renders the first `count` Gaussians.
+
+        Raises:
+            ValueError: the arrays are not as stated.
+        """
+        stride = _check_params(params, count)
+        packed = camera.packed(T_camera_map)
+        background = np.zeros(3, np.float32) if background is None else np.asarray(background, np.float32)
+        if background.shape != (3,):
+            raise ValueError(f"background must be 3 colours, got shape {list(background.shape)}")
+        work = self._pool.pop() if self._pool else Workspace()
+        flat = params.reshape(-1)
+        seen = self._visible(work, flat, stride, count, packed)
+        tables = self._bin(work, flat, stride, seen, packed, camera)
+        image = work.take("image", (CHANNELS, camera.height_px, camera.width_px))
+        tiles_x = -(-camera.width_px // TILE_W)
+        self.team.run(
+            forward_tiles, tiles_x, background, tables.lists, tables.tile_start, tables.records, image
+        )
+        return Render(image, seen[0][: seen[2]], params, packed, background, work, tables)
+
+    def backward(self, render: Render, gradient: np.ndarray) -> Gradients:
+        """Gradients of a loss, given dL/d(image) float32 [5, H, W]. May be called again for another loss."""
+        if gradient.shape != render.image.shape or gradient.dtype != np.float32:
+            raise ValueError(
+                f"the gradient must be float32 {list(render.image.shape)}, got {gradient.dtype} {list(gradient.shape)}"
+            )
+        work, tables, visible = render.workspace, render.tables, len(render.index)
+        slots = work.take("slots", (max(render.pairs, 1) * SLOT,))
+        tiles_x = -(-render.image.shape[2] // TILE_W)
+        self.team.run(
+            backward_tiles, tiles_x, render.background, tables.lists, tables.tile_start, tables.records,
+            render.image, gradient, slots,
+        )  # fmt: skip
+        out = work.take("gradients", (GRADIENTS, -(-max(visible, 1) // LANES) * LANES))
+        pose_sums = np.zeros((CHUNKS, 6))
+        self.team.run(
+            chain, render.params.reshape(-1), render.params.shape[1], tables.index, visible, render.camera, slots,
+            tables.places, tables.first_pair, tables.pair_count, out, pose_sums,
+        )  # fmt: skip
+        return Gradients(out, render.index, pose_sums.sum(axis=0))
+
+    def release(self, render: Render) -> None:
+        """Gives the render's memory back; its arrays may change from now on."""
+        self._pool.append(render.workspace)
+
+    def close(self) -> None:
+        """Ends the threads."""
+        self.team.close()
+
+    def _visible(
+        self, work: Workspace, flat: np.ndarray, stride: int, count: int, packed: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, int]:
+        room = count + 2 * LANES
+        index, depth = work.take("index", (room,), np.int32), work.take("depth", (room,))
+        kept = work.take("kept", (-(-count // BLOCK),), np.int64)
+        self.team.run(cull, flat, stride, count, packed, index, depth, kept)
+        return index, depth, int(compact(index, depth, kept))
+
+    def _bin(
+        self, work: Workspace, flat: np.ndarray, stride: int, seen: tuple[np.ndarray, np.ndarray, int],
+        packed: np.ndarray, camera: RasterCamera,
+    ) -> Tables:  # fmt: skip
+        index, depth, visible = seen
+        width, height = camera.width_px, camera.height_px
+        tiles_x, tiles_y = -(-width // TILE_W), -(-height // TILE_H)
+        records = work.take("records", ((visible + LANES) * RECORD,))
+        first_pair = work.take("first_pair", (visible,), np.int32)
+        pair_count = work.take("pair_count", (visible,), np.int32)
+        order, order_other = (work.take(name, (visible,), np.int32) for name in ("order", "order_other"))
+        keys, keys_other = (work.take(name, (visible,), np.uint32) for name in ("keys", "keys_other"))
+        emitted = np.zeros(CHUNKS, np.int64)
+        while True:
+            tiles = work.take("tiles", (CHUNKS * self._capacity + 64,), np.int32)
+            rows = work.take("rows", (CHUNKS * self._capacity,), np.int32)
+            self.team.run(
+                project_and_emit, flat, stride, index, visible, packed, width, height, tiles_x,
+                records, first_pair, pair_count, tiles, rows, emitted, depth, order, keys, keys_other, order_other,
+            )  # fmt: skip
+            most = int(emitted.max())
+            if most <= self._capacity:
+                break
+            self._capacity = most + most // 2
+        per_tile = work.take("per_tile", (CHUNKS, tiles_x * tiles_y), np.int32)
+        tile_start = work.take("tile_start", (tiles_x * tiles_y + 1,), np.int64)
+        self.team.run(count_pairs, visible, order, first_pair, pair_count, tiles, per_tile)
+        lists = work.take("lists", (int(place(per_tile, tile_start)) + 1, 2), np.int32)
+        self.team.run(scatter, visible, order, first_pair, pair_count, tiles, rows, per_tile, lists)
+        return Tables(index, records, first_pair, pair_count, tiles, lists, tile_start)
+
+
+def _check_params(params: np.ndarray, count: int) -> int:
+    if (
+        params.dtype != np.float32
+        or params.ndim != 2
+        or params.shape[0] != PARAMS
+        or not params.flags.c_contiguous
+    ):
+        raise ValueError(
+            f"parameters must be contiguous float32 [{PARAMS}, capacity], got {params.dtype} {params.shape}"
+        )
+    if params.shape[1] % 16 or not 0 <= count <= params.shape[1]:
+        raise ValueError(f"capacity {params.shape[1]} must be a multiple of 16 and hold {count} Gaussians")
+    return params.shape[1]

@@ -1,0 +1,228 @@
+"""Blending of a tile's splats, front to back, and its gradient.
+
+A tile's pixels lie flat in scratch memory, `ROWS` image rows to a vector. A pixel that is done has its
+transmittance T stored negative. The gradient runs front to back as well: with q = <dL/dout, splat> and
+Q = what the splats behind add to <dL/dout, out>, dL/dalpha = T q - Q / (1 - alpha); T and Q are all the state.
+With v = alpha dL/dalpha every gradient of a splat on screen is a moment of v over dx, dy (ten sums).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from common.raster.compiled import inner, kernel
+from common.raster.lanes import exp2_lanes
+from common.raster.layout import (
+    ALPHA_MAX,
+    LOG2_ALPHA_MAX,
+    LOG2_ALPHA_MIN,
+    RECORD,
+    ROWS,
+    SLOT,
+    STOP,
+    TILE_H,
+    TILE_PIXELS,
+    TILE_W,
+)  # fmt: skip
+from common.raster.simd import (
+    LANES,
+    aligned_floats,
+    any_lane,
+    atomic_next,
+    floor,
+    fma,
+    iota,
+    larger,
+    load,
+    magnitude,
+    prefetch,
+    reciprocal,
+    repeat,
+    smaller,
+    store,
+    store_sums4,
+    where,
+)  # fmt: skip
+
+_AHEAD = 8  # splats whose records are fetched in advance: they lie anywhere in the depth order
+_CHECK = 8  # splats between two looks whether all pixels of the tile are done
+# Scratch memory: per vector of pixels one line for each quantity, side by side (planes far apart would alias
+# at 4096 bytes). Forward: T, R, G, B, D; backward: T, Q and the gradient's five channels.
+T, R, G, B, D = (i * LANES for i in range(5))
+Q, GR, GG, GB, GD, GA = (i * LANES for i in range(1, 7))
+_FORWARD, _BACKWARD = 5 * LANES, 7 * LANES
+_VECTORS = TILE_PIXELS // LANES
+
+
+@inner
+def _alive(scratch, step):  # noqa: ANN001, ANN202
+    best = load(scratch, T)
+    for vector in range(1, _VECTORS):
+        best = larger(best, load(scratch, T + vector * step))
+    return any_lane(best > 0.0)
+
+
+@inner
+def _place(x, y, step):  # noqa: ANN001, ANN202
+    """Where the pixel (x, y) of a tile begins in the scratch memory."""
+    return y // ROWS * step + y % ROWS * TILE_W + x
+
+
+@inner
+def _open_pixels(scratch, step, left, top, width, height):  # noqa: ANN001, ANN202
+    """All zero, but T = 1 inside the image and -1 outside."""
+    scratch[:] = 0.0
+    for row in range(TILE_H):
+        for column in range(TILE_W):
+            inside = left + column < width and top + row < height
+            scratch[T + _place(column, row, step)] = 1.0 if inside else -1.0
+
+
+@kernel
+def _forward_tile(lists, first, last, records, left, top, scratch):  # noqa: ANN001, ANN202
+    row_of_lane = floor(iota() * np.float32(1.0 / TILE_W))
+    column = iota() - row_of_lane * np.float32(TILE_W) + np.float32(left)
+    row_of_lane = row_of_lane + np.float32(top)
+    for i in range(first, last):
+        if (i - first) % _CHECK == 0 and not _alive(scratch, _FORWARD):
+            return
+        prefetch(records, lists[min(i + _AHEAD, last - 1), 0] * RECORD)
+        record = lists[i, 0] * RECORD
+        begin, end = lists[i, 1] & 255, lists[i, 1] >> 8
+        dx = column - records[record]
+        constant = fma(dx * dx, records[record + 2], records[record + 5])
+        linear = dx * records[record + 3]
+        C = repeat(records[record + 4])
+        red, green, blue = (
+            repeat(records[record + 6]),
+            repeat(records[record + 7]),
+            repeat(records[record + 8]),
+        )
+        z = repeat(records[record + 9])
+        dy = row_of_lane + (np.float32(begin * ROWS) - records[record + 1])
+        for at in range(begin * _FORWARD, (end + 1) * _FORWARD, _FORWARD):
+            power = fma(dy, fma(dy, C, linear), constant)
+            dy = dy + np.float32(ROWS)
+            alpha = where(power >= LOG2_ALPHA_MIN, smaller(exp2_lanes(power), ALPHA_MAX), 0.0)
+            before = load(scratch, T + at)
+            weight = before * alpha
+            after = before - weight
+            goes_on = after > STOP
+            weight = where(goes_on, weight, 0.0)
+            store(scratch, T + at, where(goes_on, after, -magnitude(before)))
+            store(scratch, R + at, fma(weight, red, load(scratch, R + at)))
+            store(scratch, G + at, fma(weight, green, load(scratch, G + at)))
+            store(scratch, B + at, fma(weight, blue, load(scratch, B + at)))
+            store(scratch, D + at, fma(weight, z, load(scratch, D + at)))
+
+
+@kernel
+def forward_tiles(counter, tiles_x, background, lists, tile_start, records, image):  # noqa: ANN001, ANN201
+    """Renders tiles as they are handed out into `image` float32 [5, H, W]."""
+    height, width = image.shape[1], image.shape[2]
+    scratch = aligned_floats(_VECTORS * _FORWARD)
+    while True:
+        tile = atomic_next(counter, 0)
+        if tile >= len(tile_start) - 1:
+            return
+        left, top = tile % tiles_x * TILE_W, tile // tiles_x * TILE_H
+        _open_pixels(scratch, _FORWARD, left, top, width, height)
+        _forward_tile(lists, tile_start[tile], tile_start[tile + 1], records, left, top, scratch)
+        for y in range(top, min(top + TILE_H, height)):
+            for x in range(left, min(left + TILE_W, width)):
+                at = _place(x - left, y - top, _FORWARD)
+                through = abs(scratch[T + at])
+                image[0, y, x] = scratch[R + at] + through * background[0]
+                image[1, y, x] = scratch[G + at] + through * background[1]
+                image[2, y, x] = scratch[B + at] + through * background[2]
+                image[3, y, x] = scratch[D + at]
+                image[4, y, x] = np.float32(1.0) - through
+
+
+@kernel
+def _backward_tile(lists, first, last, records, left, top, scratch, slots):  # noqa: ANN001, ANN202
+    row_of_lane = floor(iota() * np.float32(1.0 / TILE_W))
+    column = iota() - row_of_lane * np.float32(TILE_W) + np.float32(left)
+    row_of_lane = row_of_lane + np.float32(top)
+    nothing = repeat(np.float32(0.0))
+    for i in range(first, last):
+        if (i - first) % _CHECK == 0 and not _alive(scratch, _BACKWARD):
+            slots[i * SLOT : last * SLOT] = 0.0  # hidden; the memory holds an older picture's sums
+            return
+        prefetch(records, lists[min(i + _AHEAD, last - 1), 0] * RECORD)
+        record = lists[i, 0] * RECORD
+        begin, end = lists[i, 1] & 255, lists[i, 1] >> 8
+        dx = column - records[record]
+        constant = fma(dx * dx, records[record + 2], records[record + 5])
+        linear = dx * records[record + 3]
+        C = repeat(records[record + 4])
+        red, green, blue = (
+            repeat(records[record + 6]),
+            repeat(records[record + 7]),
+            repeat(records[record + 8]),
+        )
+        z = repeat(records[record + 9])
+        dy = row_of_lane + (np.float32(begin * ROWS) - records[record + 1])
+        v_0, v_y, v_yy = nothing, nothing, nothing
+        w_red, w_green, w_blue, w_z, w_all = nothing, nothing, nothing, nothing, nothing
+        for at in range(begin * _BACKWARD, (end + 1) * _BACKWARD, _BACKWARD):
+            power = fma(dy, fma(dy, C, linear), constant)
+            alpha = where(power >= LOG2_ALPHA_MIN, smaller(exp2_lanes(power), ALPHA_MAX), 0.0)
+            before = load(scratch, T + at)
+            weight = before * alpha
+            after = before - weight
+            goes_on = after > STOP
+            weight = where(goes_on, weight, 0.0)
+            g_red, g_green, g_blue = load(scratch, GR + at), load(scratch, GG + at), load(scratch, GB + at)
+            g_z = load(scratch, GD + at)
+            q = fma(g_red, red, fma(g_green, green, fma(g_blue, blue, fma(g_z, z, load(scratch, GA + at)))))
+            gain = weight * q
+            behind = load(scratch, Q + at) - gain
+            store(scratch, T + at, where(goes_on, after, -magnitude(before)))
+            store(scratch, Q + at, behind)
+            v = where(
+                goes_on & (power < LOG2_ALPHA_MAX), gain - behind * (alpha * reciprocal(1.0 - alpha)), 0.0
+            )
+            v_0 = v_0 + v
+            vy = v * dy
+            v_y = v_y + vy
+            v_yy = fma(vy, dy, v_yy)
+            w_red, w_green, w_blue = (
+                fma(weight, g_red, w_red),
+                fma(weight, g_green, w_green),
+                fma(weight, g_blue, w_blue),
+            )
+            w_z, w_all = fma(weight, g_z, w_z), w_all + weight
+            dy = dy + np.float32(ROWS)
+        slot, v_x = i * SLOT, v_0 * dx
+        store_sums4(slots, slot, v_0, v_x, v_y, v_x * dx)
+        store_sums4(slots, slot + 4, v_y * dx, v_yy, w_red, w_green)
+        store_sums4(slots, slot + 8, w_blue, w_z, w_all, nothing)
+
+
+@kernel
+def backward_tiles(counter, tiles_x, background, lists, tile_start, records, image, gradient, slots):  # noqa: ANN001, ANN201
+    """Sums dL/d(splat) of each (splat, tile) pair into its slot, given dL/d(image) float32 [5, H, W]."""
+    height, width = image.shape[1], image.shape[2]
+    scratch = aligned_floats(_VECTORS * _BACKWARD)
+    while True:
+        tile = atomic_next(counter, 0)
+        if tile >= len(tile_start) - 1:
+            return
+        left, top = tile % tiles_x * TILE_W, tile // tiles_x * TILE_H
+        _open_pixels(scratch, _BACKWARD, left, top, width, height)
+        for y in range(top, min(top + TILE_H, height)):
+            for x in range(left, min(left + TILE_W, width)):
+                at = _place(x - left, y - top, _BACKWARD)
+                g0, g1, g2, g3 = gradient[0, y, x], gradient[1, y, x], gradient[2, y, x], gradient[3, y, x]
+                # out = sum w c + (1 - A) background: the background's share belongs to alpha.
+                g4 = gradient[4, y, x] - (g0 * background[0] + g1 * background[1] + g2 * background[2])
+                alpha = image[4, y, x]
+                through = np.float32(1.0) - alpha
+                scratch[GR + at], scratch[GG + at], scratch[GB + at] = g0, g1, g2
+                scratch[GD + at], scratch[GA + at] = g3, g4
+                scratch[Q + at] = (
+                    (image[0, y, x] - through * background[0]) * g0 + (image[1, y, x] - through * background[1]) * g1
+                    + (image[2, y, x] - through * background[2]) * g2 + image[3, y, x] * g3 + alpha * g4
+                )  # fmt: skip
+        _backward_tile(lists, tile_start[tile], tile_start[tile + 1], records, left, top, scratch, slots)

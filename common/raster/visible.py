@@ -1,0 +1,119 @@
+"""Which Gaussians can touch the image, and which is nearer: culling, and one radix sort by depth."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from common.raster.compiled import kernel
+from common.raster.lanes import exp_lanes
+from common.raster.layout import BLUR_PX2, SCALE
+from common.raster.simd import LANES, aligned_floats, any_lane, atomic_next, larger, load, store, where
+
+BLOCK = 4096  # Gaussians culled in one piece
+
+
+@kernel
+def cull(counter, params, stride, count, camera, index, depth, kept):  # noqa: ANN001, ANN201
+    """Writes index and depth z of the Gaussians of each block that may be seen; blocks are handed out.
+
+    The bound is conservative: 3.4 times the largest scale, projected where the view is steepest. `params`
+    is [14 * stride], `index` and `depth` hold a block at its own place, `kept` [blocks] counts.
+    """
+    r = camera
+    steep = max(max(-camera[16], camera[17]), max(-camera[18], camera[19]))
+    focal = max(camera[12], camera[13]) * np.float32(np.sqrt(1.0 + steep * steep))
+    pad = np.float32(1.0 + 3.4 * np.sqrt(BLUR_PX2))
+    lanes = aligned_floats(2 * LANES)
+    blocks = (count + BLOCK - 1) // BLOCK
+    while True:
+        block = atomic_next(counter, 0)
+        if block >= blocks:
+            return
+        first, last = block * BLOCK, min(count, (block + 1) * BLOCK)
+        n = first
+        for i in range(first, last, LANES):
+            x, y, z = load(params, i), load(params, stride + i), load(params, 2 * stride + i)
+            zc = x * r[6] + y * r[7] + z * r[8] + r[11]
+            ahead = zc > camera[22]
+            if not any_lane(ahead):
+                continue
+            xc = x * r[0] + y * r[1] + z * r[2] + r[9]
+            yc = x * r[3] + y * r[4] + z * r[5] + r[10]
+            s = larger(load(params, SCALE * stride + i), load(params, (SCALE + 1) * stride + i))
+            s = exp_lanes(larger(s, load(params, (SCALE + 2) * stride + i)))
+            inverse = 1.0 / zc
+            reach = s * inverse * (focal * np.float32(3.4)) + pad
+            u, v = xc * inverse * camera[12] + camera[14], yc * inverse * camera[13] + camera[15]
+            seen = ahead & (u + reach > 0.0) & (u - reach < camera[20])
+            seen = seen & (v + reach > 0.0) & (v - reach < camera[21])
+            if not any_lane(seen):
+                continue
+            store(lanes, 0, zc)
+            store(lanes, LANES, where(seen, 1.0, 0.0))
+            for k in range(min(LANES, last - i)):
+                index[n] = i + k
+                depth[n] = lanes[k]
+                n += lanes[LANES + k] > 0.0
+        kept[block] = n - first
+
+
+@kernel
+def compact(index, depth, kept):  # noqa: ANN001, ANN201
+    """Closes the gaps between blocks in place; gives the number of visible Gaussians.
+
+    `index` is filled behind the end with the last one, so that whole vectors may be read.
+    """
+    n = 0
+    for block in range(len(kept)):
+        first = block * BLOCK
+        for i in range(first, first + kept[block]):
+            index[n], depth[n] = index[i], depth[i]
+            n += 1
+    if n > 0:
+        index[n : n + LANES] = index[n - 1]
+    return n
+
+
+@kernel
+def sort_by_depth(depth, n, order, keys, keys_other, order_other):  # noqa: ANN001, ANN201
+    """order[rank] = which of depth[0 : n] is the rank-th nearest; equal depths keep their order.
+
+    Least significant digit radix sort on the bits of positive floats, 11 bits a pass and only as many passes
+    as the spread needs.
+    """
+    bits = depth.view(np.uint32)
+    low, high = np.uint32(0xFFFFFFFF), np.uint32(0)
+    for i in range(n):
+        keys[i], order[i] = bits[i], i
+        low, high = min(low, bits[i]), max(high, bits[i])
+    if n == 0:
+        return
+    histogram = np.empty(2048, np.int64)
+    spread, shift, flipped = high - low, 0, False
+    while shift < 32 and (spread >> np.uint32(shift)) > 0:
+        if flipped:
+            _pass(keys_other, order_other, keys, order, histogram, n, low, shift)
+        else:
+            _pass(keys, order, keys_other, order_other, histogram, n, low, shift)
+        flipped = not flipped
+        shift += 11
+    if flipped:
+        order[:n] = order_other[:n]
+
+
+@kernel
+def _pass(keys, order, keys_out, order_out, histogram, n, low, shift):  # noqa: ANN001, ANN202
+    s = np.uint32(shift)
+    histogram[:] = 0
+    for i in range(n):
+        histogram[((keys[i] - low) >> s) & np.uint32(2047)] += 1
+    total = 0
+    for digit in range(2048):
+        here = histogram[digit]
+        histogram[digit] = total
+        total += here
+    for i in range(n):
+        digit = ((keys[i] - low) >> s) & np.uint32(2047)
+        at = histogram[digit]
+        keys_out[at], order_out[at] = keys[i], order[i]
+        histogram[digit] = at + 1

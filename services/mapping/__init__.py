@@ -1,0 +1,1 @@
+"""The mapper: Gaussians from keyframes with depth, optimised by differentiable rendering."""

@@ -1,0 +1,78 @@
+"""`cpu`: the Numba rasterizer as a torch function. Float32; each graph holds its own workspace."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+
+from common.raster.camera import RasterCamera
+from common.raster.layout import GROUPS, PARAMS
+from common.raster.rasterizer import Rasterizer, Render
+from services.mapping.renderers.protocol import Gaussians, Picture
+
+
+class Cpu:
+    """See module. `threads` are shared by all pictures of this renderer."""
+
+    def __init__(self, threads: int = 1) -> None:
+        self._rasterizer = Rasterizer(threads)
+
+    def render(
+        self,
+        gaussians: Gaussians,
+        camera: RasterCamera,
+        T_camera_map: np.ndarray,
+        background: torch.Tensor | None = None,
+        pose_tangent: torch.Tensor | None = None,
+    ) -> Picture:
+        """The picture; differentiable once."""
+        tangent = torch.zeros(6) if pose_tangent is None else pose_tangent
+        black = torch.zeros(3) if background is None else background
+        image = _Rasterize.apply(self._rasterizer, camera, T_camera_map, black, tangent, *gaussians.tensors())
+        return Picture(image[:3].permute(1, 2, 0), image[3], image[4])
+
+
+def pack(gaussians: tuple[torch.Tensor, ...]) -> tuple[np.ndarray, int]:
+    """Parameters as the kernels want them: float32 [14, capacity], and the count."""
+    count = len(gaussians[0])
+    params = np.zeros((PARAMS, -(-max(count, 1) // 16) * 16), np.float32)
+    for tensor, (first, last) in zip(gaussians, GROUPS.values()):
+        params[first:last, :count] = tensor.detach().reshape(count, last - first).numpy().T
+    return params, count
+
+
+class _Lease:
+    """Gives a render's memory back when the graph that needs it is gone, whether or not it ran backward."""
+
+    def __init__(self, rasterizer: Rasterizer, render: Render) -> None:
+        self.rasterizer, self.render = rasterizer, render
+
+    def __del__(self) -> None:
+        self.rasterizer.release(self.render)
+
+
+class _Rasterize(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, rasterizer: Rasterizer, camera: RasterCamera, T_camera_map: np.ndarray,
+                background: torch.Tensor, tangent: torch.Tensor, *gaussians: torch.Tensor) -> torch.Tensor:  # fmt: skip
+        params, count = pack(gaussians)
+        render = rasterizer.render(params, count, camera, T_camera_map, background.detach().numpy())
+        ctx.lease, ctx.count, ctx.dtypes = _Lease(rasterizer, render), count, [g.dtype for g in gaussians]
+        ctx.tangent_dtype = tangent.dtype
+        return torch.from_numpy(render.image.copy())
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, d_image: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+        rasterizer, render = ctx.lease.rasterizer, ctx.lease.render
+        gradients = rasterizer.backward(render, np.ascontiguousarray(d_image.numpy()))
+        dense = torch.from_numpy(gradients.dense(ctx.count))
+        # Light that no splat stopped shows the background: its gradient needs no kernel.
+        through = 1.0 - torch.from_numpy(render.image[4])
+        d_background = (d_image[:3] * through).sum(dim=(1, 2))
+        out = [dense[first:last].T.to(dtype) for dtype, (first, last) in zip(ctx.dtypes, GROUPS.values())]
+        out[3] = out[3].reshape(-1)
+        pose = torch.from_numpy(gradients.pose).to(ctx.tangent_dtype)
+        return None, None, None, d_background, pose, *out

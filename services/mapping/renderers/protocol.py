@@ -1,0 +1,83 @@
+"""What every renderer takes and gives, on torch tensors with autograd.
+
+Gaussians are five tensors of one dtype: mean_map_m [N, 3], log_scale [N, 3] (ln metres), quat_wxyz [N, 4] (any
+length but zero), opacity_logit [N], colour [N, 3]. The pose enters as `T_camera_map` and, for its gradient, as a
+tangent xi [6] = (rho, phi): the camera stands at se3_exp(xi) @ T_camera_map (left perturbation). `xi` must be
+zero: renderers may linearise there.
+"""
+
+from __future__ import annotations
+
+import importlib
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import torch
+
+from common.errors import UserError
+from common.raster.camera import RasterCamera
+
+
+@dataclass(frozen=True)
+class Gaussians:
+    """Parameters as tensors; `requires_grad` as the caller wants."""
+
+    mean_map_m: torch.Tensor  # [N, 3]
+    log_scale: torch.Tensor  # [N, 3]
+    quat_wxyz: torch.Tensor  # [N, 4]
+    opacity_logit: torch.Tensor  # [N]
+    colour: torch.Tensor  # [N, 3]
+
+    def tensors(self) -> tuple[torch.Tensor, ...]:
+        """In the order of the rows of the rasterizer's parameter array."""
+        return self.mean_map_m, self.log_scale, self.quat_wxyz, self.opacity_logit, self.colour
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A rendered image."""
+
+    colour: torch.Tensor  # [H, W, 3]
+    depth_m: torch.Tensor  # [H, W]: accumulated, sum of weight times optical z
+    alpha: torch.Tensor  # [H, W]
+
+    def expected_depth_m(self) -> torch.Tensor:
+        """Accumulated depth over alpha; NaN where alpha is below 1e-3."""
+        known = self.alpha > 1e-3
+        return torch.where(known, self.depth_m / torch.where(known, self.alpha, 1.0), torch.nan)
+
+
+class Renderer(Protocol):
+    """A differentiable rasterizer."""
+
+    def render(
+        self,
+        gaussians: Gaussians,
+        camera: RasterCamera,
+        T_camera_map: np.ndarray,  # float64 [4, 4]
+        background: torch.Tensor | None = None,  # [3], default black
+        pose_tangent: torch.Tensor
+        | None = None,  # [6], zero, with requires_grad where its gradient is wanted
+    ) -> Picture:
+        """The picture from there."""
+        ...
+
+
+RENDERERS: dict[str, str] = {
+    "reference": "services.mapping.renderers.reference:Reference",
+    "cpu": "services.mapping.renderers.cpu:Cpu",
+    "gsplat": "services.mapping.renderers.gsplat:Gsplat",
+}
+
+
+def make_renderer(name: str) -> Renderer:
+    """The renderer called `name`; its module is imported only now.
+
+    Raises:
+        UserError: no such renderer, or this machine cannot run it.
+    """
+    if name not in RENDERERS:
+        raise UserError(f"there is no renderer {name!r}; there are {', '.join(RENDERERS)}")
+    module, _, cls = RENDERERS[name].partition(":")
+    return getattr(importlib.import_module(module), cls)()
