@@ -11,12 +11,42 @@ import numpy as np
 from services.simulator.textures import finish, fractal, rgb
 
 WORDS = (
-    "ATLAS OCEAN NIGHT GARDEN LIGHT NORTH RIVER STONE PAPER SIGNAL WINTER HARBOUR ORBIT FOREST MAPS ISLAND "
-    "COOKING POEMS ALGEBRA HISTORY OPTICS ROBOTS VOYAGE SILENCE COLOUR BIRDS DESIGN LETTERS MUSIC TREES"
-).split()
+    "ATLAS",
+    "OCEAN",
+    "NIGHT",
+    "GARDEN",
+    "LIGHT",
+    "NORTH",
+    "RIVER",
+    "STONE",
+    "PAPER",
+    "SIGNAL",
+    "WINTER",
+    "HARBOUR",
+    "ORBIT",
+    "FOREST",
+    "MAPS",
+    "ISLAND",
+    "COOKING",
+    "POEMS",
+    "ALGEBRA",
+    "HISTORY",
+    "OPTICS",
+    "ROBOTS",
+    "VOYAGE",
+    "SILENCE",
+    "COLOUR",
+    "BIRDS",
+    "DESIGN",
+    "LETTERS",
+    "MUSIC",
+    "TREES",
+)
 
 
-def text_mask(height: int, width: int, at: tuple[int, int], text: str, scale: float, thick: int) -> np.ndarray:
+def text_mask(
+    height: int, width: int, at: tuple[int, int], text: str, scale: float, thick: int
+) -> np.ndarray:
     """float32 [H, W, 1], 1 where a word is printed (OpenCV writes on bytes only)."""
     mask = np.zeros((height, width), np.uint8)
     cv2.putText(mask, text, at, cv2.FONT_HERSHEY_DUPLEX, scale, 255, thick, cv2.LINE_AA)
@@ -110,13 +140,21 @@ def portrait(rng: np.random.Generator, height: int, width: int) -> np.ndarray:
     cx, unit = width // 2, min(width, height)
     skin = rgb("d9a884") * rng.uniform(0.5, 1.1)
     coat, hair = rng.uniform(0.05, 0.6, 3), rng.uniform(0.03, 0.35) * np.array([1.0, 0.75, 0.5])
-    cv2.ellipse(out, (cx, height), (int(unit * 0.42), int(unit * 0.34)), 0, 0, 360, coat.tolist(), -1, cv2.LINE_AA)
-    cv2.rectangle(out, (cx - unit // 14, height // 2), (cx + unit // 14, int(height * 0.78)), (skin * 0.8).tolist(), -1)
+    cv2.ellipse(
+        out, (cx, height), (int(unit * 0.42), int(unit * 0.34)), 0, 0, 360, coat.tolist(), -1, cv2.LINE_AA
+    )
+    cv2.rectangle(
+        out, (cx - unit // 14, height // 2), (cx + unit // 14, int(height * 0.78)), (skin * 0.8).tolist(), -1
+    )
     head = (cx, int(height * 0.43))
-    cv2.ellipse(out, (cx, int(height * 0.39)), (unit // 5, unit // 4), 0, 0, 360, hair.tolist(), -1, cv2.LINE_AA)
+    cv2.ellipse(
+        out, (cx, int(height * 0.39)), (unit // 5, unit // 4), 0, 0, 360, hair.tolist(), -1, cv2.LINE_AA
+    )
     cv2.ellipse(out, head, (unit // 7, unit // 5), 0, 0, 360, skin.tolist(), -1, cv2.LINE_AA)
     for side in (-1, 1):
-        cv2.circle(out, (cx + side * unit // 17, int(height * 0.41)), max(2, unit // 60), (0.1, 0.08, 0.08), -1)
+        cv2.circle(
+            out, (cx + side * unit // 17, int(height * 0.41)), max(2, unit // 60), (0.1, 0.08, 0.08), -1
+        )
     mouth = (cx, int(height * 0.51))
     cv2.ellipse(out, mouth, (unit // 22, unit // 70), 0, 0, 360, (0.6, 0.25, 0.22), -1, cv2.LINE_AA)
     return finish(out * (1 + 0.06 * fractal(rng, height, width, 0.8))[..., None])
@@ -130,7 +168,9 @@ def lettering(rng: np.random.Generator, height: int, width: int) -> np.ndarray:
     for k in range(6):
         radius = int(width * 0.36 * (1 - k / 6))
         colour = accent if k % 2 == 0 else paper
-        cv2.circle(out, (width // 2, int(height * 0.36)), radius, np.asarray(colour).tolist(), -1, cv2.LINE_AA)
+        cv2.circle(
+            out, (width // 2, int(height * 0.36)), radius, np.asarray(colour).tolist(), -1, cv2.LINE_AA
+        )
     for k, word in enumerate(rng.choice(WORDS, 2, replace=False)):
         scale = width * 0.8 / max(1, cv2.getTextSize(str(word), cv2.FONT_HERSHEY_DUPLEX, 1.0, 2)[0][0])
         at = (int(width * 0.1), int(height * (0.78 + 0.14 * k)))
@@ -142,11 +182,14 @@ def lettering(rng: np.random.Generator, height: int, width: int) -> np.ndarray:
 PAINTINGS = (landscape, mondrian, abstract, skyline, portrait, lettering)
 
 
-def book_spines(rng: np.random.Generator, height: int = 256, width: int = 1024, count: int = 32) -> np.ndarray:
+def book_spines(
+    rng: np.random.Generator, height: int = 256, width: int = 1024, count: int = 32
+) -> np.ndarray:
     """`count` spines of equal width side by side: cell k is u in [k, k + 1] / count."""
     out = np.empty((height, width, 3), np.float32)
     cell = width // count
-    cloths = [rgb(c) for c in "7b2d26 1f3a5f 2f4b3c e0d6c2 3b3b3d b5762b 8c8f91 5a2a4a d8d2c4 20504f c7a24b".split()]
+    dyes = "7b2d26,1f3a5f,2f4b3c,e0d6c2,3b3b3d,b5762b,8c8f91,5a2a4a,d8d2c4,20504f,c7a24b"
+    cloths = [rgb(c) for c in dyes.split(",")]
     for k in range(count):
         colour = cloths[int(rng.integers(len(cloths)))] * rng.uniform(0.75, 1.1)
         spine = np.broadcast_to(np.clip(colour, 0, 1), (height, cell, 3)).astype(np.float32).copy()
@@ -154,7 +197,9 @@ def book_spines(rng: np.random.Generator, height: int = 256, width: int = 1024, 
         for at in (0.06, 0.12, 0.86):
             if rng.random() < 0.7:
                 spine[int(at * height) : int(at * height) + int(rng.integers(2, 9))] = ink
-        strip = text_mask(cell, int(height * 0.66), (4, int(cell * 0.72)), str(rng.choice(WORDS)), cell / 30.0, 2)
+        strip = text_mask(
+            cell, int(height * 0.66), (4, int(cell * 0.72)), str(rng.choice(WORDS)), cell / 30.0, 2
+        )
         mask = cv2.rotate(strip[..., 0], cv2.ROTATE_90_CLOCKWISE)[..., None]
         top = int(height * 0.17)
         area = spine[top : top + mask.shape[0]]
@@ -240,6 +285,9 @@ def clock_face(size_px: int = 256) -> np.ndarray:
         q = [int(centre[i] + 0.36 * size_px * f) for i, f in ((0, np.sin(a)), (1, -np.cos(a)))]
         cv2.line(out, tuple(p), tuple(q), (0.1, 0.1, 0.1), 5, cv2.LINE_AA)
     for angle, length, width in ((-1.0, 0.24, 8), (1.05, 0.36, 5)):
-        tip = (int(centre[0] + np.sin(angle) * length * size_px), int(centre[1] - np.cos(angle) * length * size_px))
+        tip = (
+            int(centre[0] + np.sin(angle) * length * size_px),
+            int(centre[1] - np.cos(angle) * length * size_px),
+        )
         cv2.line(out, centre, tip, (0.08, 0.08, 0.1), width, cv2.LINE_AA)
     return out

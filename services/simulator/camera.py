@@ -35,10 +35,11 @@ def undistort(points: np.ndarray, distortion: tuple[float, ...], iterations: int
         ValueError: the lens folds over inside the picture: no ray belongs to some pixel.
     """
     ideal, step = points.copy(), 1e-6
+    right, down = np.array([step, 0.0]), np.array([0.0, step])
     for _ in range(iterations):
         error = distort(ideal, distortion) - points
-        fx = (distort(ideal + [step, 0.0], distortion) - distort(ideal - [step, 0.0], distortion)) / (2 * step)
-        fy = (distort(ideal + [0.0, step], distortion) - distort(ideal - [0.0, step], distortion)) / (2 * step)
+        fx = (distort(ideal + right, distortion) - distort(ideal - right, distortion)) / (2 * step)
+        fy = (distort(ideal + down, distortion) - distort(ideal - down, distortion)) / (2 * step)
         det = fx[:, 0] * fy[:, 1] - fy[:, 0] * fx[:, 1]
         if np.any(det < 0.05):
             break
@@ -49,12 +50,15 @@ def undistort(points: np.ndarray, distortion: tuple[float, ...], iterations: int
             return ideal
     if np.abs(distort(ideal, distortion) - points).max() > 1e-9:
         raise ValueError(
-            f"distortion {distortion} folds over inside the picture: take smaller coefficients or a longer lens"
+            f"distortion {distortion} folds over inside the picture: "
+            "take smaller coefficients or a longer lens"
         )
     return ideal
 
 
-def pixel_rays(width: int, height: int, K: np.ndarray, distortion: tuple[float, ...] = (0.0,) * 5) -> np.ndarray:
+def pixel_rays(
+    width: int, height: int, K: np.ndarray, distortion: tuple[float, ...] = (0.0,) * 5
+) -> np.ndarray:
     """float64 [H, W, 3], camera frame, z = 1: where each pixel looks. Pixel centres are integers."""
     u, v = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
     points = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1]], axis=-1).reshape(-1, 2)
@@ -76,9 +80,15 @@ TONE = _tone_table()
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _develop(
-    radiance: np.ndarray, gain: float, falloff: np.ndarray, noise: np.ndarray, tone: np.ndarray, shot: float,
-    read: float, out: np.ndarray,
-) -> None:  # fmt: skip
+    radiance: np.ndarray,
+    gain: float,
+    falloff: np.ndarray,
+    noise: np.ndarray,
+    tone: np.ndarray,
+    shot: float,
+    read: float,
+    out: np.ndarray,
+) -> None:
     height, width = radiance.shape[:2]
     top = len(tone) - 1
     for y in range(height):

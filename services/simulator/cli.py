@@ -12,17 +12,14 @@ from typing import Annotated
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-
-EPILOG = """
-Examples:
-
-  beamsplat simulate --out rec --seconds 30
-  beamsplat simulate --out rec --seconds 60 --movers 2 --seed 7
-  beamsplat simulate --out small --size 320x240 --rate-hz 5
-  beamsplat simulate --out soak --lidar-only --laps 40
-  beamsplat simulate --out faulty --clock-offset-ms 40 --extrinsic-yaw-deg 2 --distortion=-0.12,0.03,0,0,0
-"""
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 
 console = Console(stderr=True)
 
@@ -49,23 +46,37 @@ def _size(text: str) -> tuple[int, int]:
 
 def simulate(
     out: Annotated[Path, typer.Option(help="Folder to write; refused if it exists.")],
-    seconds: Annotated[float | None, typer.Option(min=1.0, help="Length; default: one lap, about 80 s.")] = None,
-    laps: Annotated[int | None, typer.Option(min=1, help="Whole laps; each picture is rendered once.")] = None,
+    seconds: Annotated[
+        float | None, typer.Option(min=1.0, help="Length; default: one lap, about 80 s.")
+    ] = None,
+    laps: Annotated[
+        int | None, typer.Option(min=1, help="Whole laps; each picture is rendered once.")
+    ] = None,
     movers: Annotated[int, typer.Option(min=0, max=6, help="People walking about.")] = 0,
     carts: Annotated[int, typer.Option(min=0, max=3, help="Trolleys rolling about.")] = 0,
     seed: Annotated[int, typer.Option(min=0, help="Another home, drive and noise for each seed.")] = 0,
     size: Annotated[str, typer.Option(help="Picture size.")] = "640x480",
     rate_hz: Annotated[float, typer.Option(min=0.5, max=60.0, help="Camera rate.")] = 10.0,
-    scene: Annotated[Path | None, typer.Option(exists=True, dir_okay=False, help="glTF/GLB instead of the home.")] = None,
+    scene: Annotated[
+        Path | None, typer.Option(exists=True, dir_okay=False, help="glTF/GLB instead of the home.")
+    ] = None,
     glass: Annotated[bool, typer.Option("--glass", help="Glazed doors let some beams through.")] = False,
-    lidar_only: Annotated[bool, typer.Option("--lidar-only", help="No camera: quick, for long drives.")] = False,
+    lidar_only: Annotated[
+        bool, typer.Option("--lidar-only", help="No camera: quick, for long drives.")
+    ] = False,
     clock_offset_ms: Annotated[float, typer.Option(help="Fault: added to the camera's stamps.")] = 0.0,
-    extrinsic_yaw_deg: Annotated[float, typer.Option(help="Fault: the tf's camera is turned left of the true one.")] = 0.0,
-    extrinsic_pitch_deg: Annotated[float, typer.Option(help="Fault: the tf's camera looks lower than the true one.")] = 0.0,
+    extrinsic_yaw_deg: Annotated[
+        float, typer.Option(help="Fault: the tf's camera is turned left of the true one.")
+    ] = 0.0,
+    extrinsic_pitch_deg: Annotated[
+        float, typer.Option(help="Fault: the tf's camera looks lower than the true one.")
+    ] = 0.0,
     extrinsic_roll_deg: Annotated[float, typer.Option(help="Fault: the tf's camera is rolled.")] = 0.0,
     extrinsic_xyz_m: Annotated[str, typer.Option(help="Fault: the tf's camera is moved by x,y,z.")] = "0,0,0",
     distortion: Annotated[str, typer.Option(help="Lens: k1,k2,p1,p2,k3 (plumb_bob).")] = "0,0,0,0,0",
-    exposure_changes: Annotated[bool, typer.Option("--exposure-changes", help="Fault: brightness wanders.")] = False,
+    exposure_changes: Annotated[
+        bool, typer.Option("--exposure-changes", help="Fault: brightness wanders.")
+    ] = False,
     jobs: Annotated[int, typer.Option(min=1, help="Rendering processes.")] = os.cpu_count() or 1,
     force: Annotated[bool, typer.Option("--force", help="Replace an existing folder.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")] = False,
@@ -75,6 +86,18 @@ def simulate(
     The folder holds bag/ (ROS 2, MCAP) without any truth in it, and beside it groundtruth.txt, camera.json,
     depth_gt/, moving_masks/, beams.npz, extra_views/ and gt_surface.ply. Worlds and pictures are kept in
     $BEAMSPLAT_CACHE (default ~/.cache/beamsplat) and reused.
+
+    Examples:
+
+    beamsplat simulate --out rec --seconds 30
+
+    beamsplat simulate --out rec --seconds 60 --movers 2 --seed 7
+
+    beamsplat simulate --out small --size 320x240 --rate-hz 5
+
+    beamsplat simulate --out soak --lidar-only --laps 40
+
+    beamsplat simulate --out faulty --clock-offset-ms 40 --extrinsic-yaw-deg 2 --distortion=-0.12,0.03,0,0,0
     """
     from services.simulator import recording
     from services.simulator.settings import CameraSettings, Faults, LidarSettings, Simulation
@@ -83,16 +106,24 @@ def simulate(
     lens = _numbers(distortion, 5, "--distortion")
     shift = _numbers(extrinsic_xyz_m, 3, "--extrinsic-xyz-m")
     settings = Simulation(
-        seed=seed, seconds=seconds, laps=laps, people=movers, carts=carts,
-        scene=None if scene is None else str(scene), lidar_only=lidar_only,
+        seed=seed,
+        seconds=seconds,
+        laps=laps,
+        people=movers,
+        carts=carts,
+        scene=None if scene is None else str(scene),
+        lidar_only=lidar_only,
         camera=CameraSettings(width_px=width, height_px=height, rate_hz=rate_hz, distortion=lens),
         lidar=LidarSettings(glass=glass),
         faults=Faults(
-            clock_offset_ms=clock_offset_ms, extrinsic_xyz_m=shift, extrinsic_yaw_deg=extrinsic_yaw_deg,
-            extrinsic_pitch_deg=extrinsic_pitch_deg, extrinsic_roll_deg=extrinsic_roll_deg,
+            clock_offset_ms=clock_offset_ms,
+            extrinsic_xyz_m=shift,
+            extrinsic_yaw_deg=extrinsic_yaw_deg,
+            extrinsic_pitch_deg=extrinsic_pitch_deg,
+            extrinsic_roll_deg=extrinsic_roll_deg,
             exposure_changes=exposure_changes,
         ),
-    )  # fmt: skip
+    )
     began = time.monotonic()
     try:
         with _Bar() as bar:
@@ -121,9 +152,13 @@ class _Bar:
 
     def __init__(self) -> None:
         self._progress = Progress(
-            TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
-            TimeRemainingColumn(), console=console,
-        )  # fmt: skip
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+            TimeRemainingColumn(),
+            console=console,
+        )
         self._stage = ""
         self._task = None
 

@@ -31,9 +31,16 @@ class Step:
 
 
 def simulate_lidar(
-    mesh: Mesh, caster: Caster, drive: Drive, lidar: LidarSettings, wheels: WheelSettings, *, seed: int,
-    duration_s: float, cast: Cast | None = None,
-) -> Iterator[Step]:  # fmt: skip
+    mesh: Mesh,
+    caster: Caster,
+    drive: Drive,
+    lidar: LidarSettings,
+    wheels: WheelSettings,
+    *,
+    seed: int,
+    duration_s: float,
+    cast: Cast | None = None,
+) -> Iterator[Step]:
     """Every revolution that is complete within `duration_s`.
 
     What the beams of a lap meet is cast once; noise, dropouts and odometry are fresh on every lap.
@@ -41,7 +48,7 @@ def simulate_lidar(
     device = Lidar(mesh, caster, lidar)
     counter = Wheels(wheels, np.random.default_rng([seed, 0x57]))
     noise = np.random.default_rng([seed, 0x4C49])
-    movers_at = cast.caster_at if cast is not None and cast.walks else None
+    movers = cast if cast is not None and cast.walks else None
     laps: dict[int, Revolution] = {}
     per_lap = round(drive.lap_s * lidar.rate_hz)
     period_ns = round(1e9 / lidar.rate_hz)
@@ -51,7 +58,7 @@ def simulate_lidar(
     while first_ns + (k + 1) * period_ns <= end_ns:
         stamp = first_ns + k * period_ns
         if k % per_lap not in laps:
-            laps[k % per_lap] = device.revolution((stamp / 1e9) % drive.lap_s, drive.pose_at, movers_at)
+            laps[k % per_lap] = device.revolution((stamp / 1e9) % drive.lap_s, drive.pose_at, movers)
         revolution = laps[k % per_lap]
         ranges, through = device.measure(revolution, noise)
         last_tick = (stamp + period_ns) // tick_ns

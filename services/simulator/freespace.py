@@ -50,7 +50,8 @@ class FreeSpace:
             points += 0.45 * (0.5 * (np.roll(points, 1, axis=0) + np.roll(points, -1, axis=0)) - points)
             at = (points - self.origin_m) / RESOLUTION_M - 0.5
             push = np.stack(
-                [ndimage.map_coordinates(g, [at[:, 1], at[:, 0]], order=1, mode="nearest") for g in gradient], axis=1
+                [ndimage.map_coordinates(g, [at[:, 1], at[:, 0]], order=1, mode="nearest") for g in gradient],
+                axis=1,
             )
             lack = np.clip(wanted_m - self.clearance(points), 0.0, wanted_m)
             points += 0.12 * lack[:, None] * push

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from services.simulator.mesh import Material, MeshBuilder
-from services.simulator.shapes import box, cushion, cylinder, lathe, rod
+from services.simulator.shapes import box, cushion, lathe, rod
 
 Draw = Callable[[MeshBuilder, np.random.Generator], None]
 
@@ -83,7 +83,14 @@ def armchair() -> Piece:
             for y in (-0.27, 0.27):
                 rod(b, (x, y, 0.0), (x * 0.85, y * 0.85, 0.2), 0.02, WALNUT)
         cushion(b, (0, 0, 0.17), (0.74, 0.74, 0.26), cloth, power=0.3, squash=0.4)
-        cushion(b.placed(0, 0.27, 0.3).tilted("x", -0.2), (0, 0, 0), (0.7, 0.2, 0.58), cloth, power=0.4, squash=0.45)
+        cushion(
+            b.placed(0, 0.27, 0.3).tilted("x", -0.2),
+            (0, 0, 0),
+            (0.7, 0.2, 0.58),
+            cloth,
+            power=0.4,
+            squash=0.45,
+        )
         for side in (-1, 1):
             cushion(b, (side * 0.33, 0.0, 0.25), (0.14, 0.68, 0.34), cloth, power=0.3, squash=0.45)
 
@@ -99,11 +106,22 @@ def coffee_table() -> Piece:
         box(b, (0, 0, 0.14), (0.95, 0.5, 0.02), top)
         legs(b, 1.0, 0.54, 0.38, top)
         stack(b.placed(-0.25, 0.05, 0.415, 0.3), rng, 3)
-        lathe(b, (0.22, 0.0, 0.415), [(0.05, 0.0), (0.12, 0.05), (0.14, 0.08), (0.13, 0.08)], Material("ceramic"))
+        lathe(
+            b,
+            (0.22, 0.0, 0.415),
+            [(0.05, 0.0), (0.12, 0.05), (0.14, 0.08), (0.13, 0.08)],
+            Material("ceramic"),
+        )
         for k in range(3):
-            cushion(b, (0.22 + 0.05 * np.cos(k * 2.1), 0.05 * np.sin(k * 2.1), 0.44), (0.08, 0.08, 0.08),
-                    Material("plain", tint=((0.7, 0.1, 0.05), (0.75, 0.5, 0.05), (0.3, 0.5, 0.06))[k]),
-                    power=1.0, squash=1.0, detail=8)  # fmt: skip
+            cushion(
+                b,
+                (0.22 + 0.05 * np.cos(k * 2.1), 0.05 * np.sin(k * 2.1), 0.44),
+                (0.08, 0.08, 0.08),
+                Material("plain", tint=((0.7, 0.1, 0.05), (0.75, 0.5, 0.05), (0.3, 0.5, 0.06))[k]),
+                power=1.0,
+                squash=1.0,
+                detail=8,
+            )
 
     return Piece("coffee_table", 1.05, 0.60, 0.45, draw)
 
@@ -119,7 +137,9 @@ def stack(b: MeshBuilder, rng: np.random.Generator, count: int) -> None:
         z += thick
 
 
-def book(b: MeshBuilder, k: int, width: float, depth: float, height: float, colour: tuple[float, ...]) -> None:
+def book(
+    b: MeshBuilder, k: int, width: float, depth: float, height: float, colour: tuple[float, ...]
+) -> None:
     """A box whose front shows spine number k of the texture."""
     cover = Material("plain", tint=(colour[0], colour[1], colour[2]))
     box(b, (0, 0, 0), (width, depth, height), cover, skip=("front",))
@@ -130,16 +150,22 @@ def spine(
     b: MeshBuilder, k: int, origin: tuple[float, ...], right: tuple[float, ...], up: tuple[float, ...]
 ) -> None:
     """Cell k of the 64 spines on one quad."""
-    vertices = np.array([origin, np.add(origin, right), np.add(np.add(origin, right), up), np.add(origin, up)])
+    vertices = np.array(
+        [origin, np.add(origin, right), np.add(np.add(origin, right), up), np.add(origin, up)]
+    )
     normal = np.cross(right, up) / np.linalg.norm(np.cross(right, up))
     u0, u1 = (k % 64 + 0.02) / 64, (k % 64 + 0.98) / 64
     # Standing books are taller than wide; a lying one shows its spine turned.
     upright = np.linalg.norm(up) > np.linalg.norm(right)
     uvs = [(u0, 0), (u1, 0), (u1, 1), (u0, 1)] if upright else [(u0, 1), (u0, 0), (u1, 0), (u1, 1)]
     b.add(
-        vertices, np.broadcast_to(normal, (4, 3)), np.array(uvs, dtype=float),
-        np.array([[0, 1, 2], [0, 2, 3]]), Material("books"), vertices + 0.01 * normal,
-    )  # fmt: skip
+        vertices,
+        np.broadcast_to(normal, (4, 3)),
+        np.array(uvs, dtype=float),
+        np.array([[0, 1, 2], [0, 2, 3]]),
+        Material("books"),
+        vertices + 0.01 * normal,
+    )
 
 
 def bookshelf(width: float, height: float) -> Piece:
@@ -217,7 +243,14 @@ def sideboard(width: float, *, television: bool = False) -> Piece:
 
 
 def fronts(
-    b: MeshBuilder, width: float, height: float, y: float, z: float, columns: int, rows: int, material: Material
+    b: MeshBuilder,
+    width: float,
+    height: float,
+    y: float,
+    z: float,
+    columns: int,
+    rows: int,
+    material: Material,
 ) -> None:
     """Doors or drawers as raised panels with handles on the plane y = const."""
     gap, w, h = 0.006, width / columns, height / rows
@@ -233,7 +266,9 @@ def fronts(
             rod(b, (x - 0.05, y - 0.035, handle_z), (x + 0.05, y - 0.035, handle_z), 0.006, STEEL, sides=6)
 
 
-def frame(b: MeshBuilder, rng: np.random.Generator, width: float, height: float, number: int | None = None) -> None:
+def frame(
+    b: MeshBuilder, rng: np.random.Generator, width: float, height: float, number: int | None = None
+) -> None:
     """A framed picture standing in the local xz plane, back at y = 0."""
     from services.simulator.palette import PAINTINGS
 
@@ -248,51 +283,3 @@ def frame(b: MeshBuilder, rng: np.random.Generator, width: float, height: float,
     b.quad((-w / 2, -0.008, bar), (w, 0, 0), (0, 0, h), Material("plain", tint=(0.86, 0.84, 0.8)))
     at = (-w / 2 + mat, -0.0095, bar + mat)
     b.quad(at, (w - 2 * mat, 0, 0), (0, 0, h - 2 * mat), Material(f"painting_{k}"), fit=True)
-
-
-def floor_lamp() -> Piece:
-    """A shade on a pole; it shines."""
-
-    def draw(b: MeshBuilder, rng: np.random.Generator) -> None:
-        cylinder(b, (0, 0, 0), 0.15, 0.025, BLACK, sides=20)
-        rod(b, (0, 0, 0.02), (0, 0, 1.45), 0.012, STEEL)
-        lathe(b, (0, 0, 1.35), [(0.22, 0.0), (0.16, 0.3)], SHADE, sides=24)
-        b.lamp((0, 0, 1.5), 0.30, 0.9, WARM)
-
-    return Piece("floor_lamp", 0.42, 0.42, 1.65, draw)
-
-
-def plant(height: float) -> Piece:
-    """Leaves on stems in a pot."""
-
-    def draw(b: MeshBuilder, rng: np.random.Generator) -> None:
-        pot = Material("terracotta") if rng.random() < 0.5 else Material("ceramic")
-        r = 0.16
-        lathe(b, (0, 0, 0), [(0.0, 0.0), (r * 0.75, 0.0), (r, 0.30), (r * 1.06, 0.31), (r * 0.95, 0.30)], pot)
-        lathe(b, (0, 0, 0.27), [(r * 0.95, 0.0), (0.0, 0.01)], Material("soil"))
-        for k in range(16):
-            yaw = k * 2.39996 + float(rng.normal(0, 0.2))
-            lean, rise = float(rng.uniform(0.15, 0.34)), float(rng.uniform(0.45, 1.0)) * (height - 0.45)
-            tip = np.array([lean * np.cos(yaw), lean * np.sin(yaw), 0.28 + rise])
-            base = (0.04 * np.cos(yaw), 0.04 * np.sin(yaw), 0.27)
-            rod(b, base, tuple(tip), 0.006, Material("leaf", tint=(0.7, 0.7, 0.5)), sides=5)
-            leaf(b, tip, yaw, float(rng.uniform(0.2, 0.34)), float(rng.uniform(-0.3, 0.5)))
-
-    return Piece("plant", 0.55, 0.55, height, draw)
-
-
-def leaf(b: MeshBuilder, tip: np.ndarray, yaw: float, length: float, pitch: float) -> None:
-    """A pointed, drooping blade of both sides starting at `tip`."""
-    s = np.linspace(0.0, 1.0, 7)
-    half = 0.30 * length * np.sin(np.pi * np.clip(s, 0.03, 1.0) ** 0.8)
-    along = length * s
-    drop = length * (np.sin(pitch) * s - 0.45 * s**2)
-    forward, side = np.array([np.cos(yaw), np.sin(yaw), 0]), np.array([-np.sin(yaw), np.cos(yaw), 0])
-    centre = tip + along[:, None] * forward + drop[:, None] * np.array([0, 0, 1.0])
-    vertices = np.concatenate([centre - half[:, None] * side, centre + half[:, None] * side])
-    uvs = np.concatenate([np.stack([s, np.zeros(7)], 1), np.stack([s, np.ones(7)], 1)])
-    up = np.broadcast_to([0.0, 0.0, 1.0], (14, 3))
-    i = np.arange(6)
-    tri = np.concatenate([np.stack([i, i + 1, i + 8], 1), np.stack([i, i + 8, i + 7], 1)])
-    b.add(vertices, up, uvs, tri, Material("leaf"))
-    b.add(vertices, -up, uvs, tri[:, ::-1], Material("leaf", tint=(0.8, 0.9, 0.7)))

@@ -7,7 +7,6 @@ import numpy as np
 from services.simulator.furniture import (
     BLACK,
     BULB,
-    FRONT,
     LACQUER,
     OAK,
     SHADE,
@@ -53,10 +52,17 @@ def dining_set(width: float) -> Piece:
                 yaw = float(rng.normal(0, 0.12)) + (0.0 if side > 0 else np.pi)
                 chair(b.placed(x, side * gap, 0, yaw), rng, seat)
         vase(b.placed(0.05, 0, 0.755), rng, 0.26)
-        for k in range(3):
+        for _ in range(3):
             at = (float(rng.uniform(-0.4, 0.4) * width), float(rng.uniform(-0.25, 0.25)), 0.755)
-            lathe(b, at, [(0.0, 0.0), (0.06, 0.0), (0.11, 0.015), (0.105, 0.02), (0.0, 0.008)], Material("ceramic"))
-            lathe(b, (at[0] + 0.15, at[1], at[2]), [(0.03, 0), (0.04, 0.09), (0.036, 0.09)], Material("ceramic"))
+            lathe(
+                b,
+                at,
+                [(0.0, 0.0), (0.06, 0.0), (0.11, 0.015), (0.105, 0.02), (0.0, 0.008)],
+                Material("ceramic"),
+            )
+            lathe(
+                b, (at[0] + 0.15, at[1], at[2]), [(0.03, 0), (0.04, 0.09), (0.036, 0.09)], Material("ceramic")
+            )
 
     return Piece("dining_set", width + 0.1, 1.75, 0.95, draw)
 
@@ -69,15 +75,42 @@ def bed(width: float) -> Piece:
         box(b, (0, length / 2 - 0.03, 0.0), (width + 0.06, 0.06, 1.05), timber)
         box(b, (0, -0.02, 0.10), (width, length - 0.08, 0.20), timber)
         legs(b, width, length - 0.1, 0.10, timber, 0.07)
-        cushion(b, (0, -0.02, 0.28), (width - 0.04, length - 0.1, 0.26), Material("sheet"), power=0.12, squash=0.25,
-                detail=30)  # fmt: skip
-        cushion(b, (0, -0.30, 0.26), (width + 0.05, length - 0.66, 0.32), Material("quilt"), power=0.12,
-                squash=0.22, detail=30)  # fmt: skip
+        cushion(
+            b,
+            (0, -0.02, 0.28),
+            (width - 0.04, length - 0.1, 0.26),
+            Material("sheet"),
+            power=0.12,
+            squash=0.25,
+            detail=30,
+        )
+        cushion(
+            b,
+            (0, -0.30, 0.26),
+            (width + 0.05, length - 0.66, 0.32),
+            Material("quilt"),
+            power=0.12,
+            squash=0.22,
+            detail=30,
+        )
         for side in (-1, 1) if width > 1.2 else (0,):
             pillow = b.placed(side * width * 0.24, length / 2 - 0.33, 0.52, float(rng.normal(0, 0.08)))
-            cushion(pillow.tilted("x", 0.25), (0, 0, 0), (0.62, 0.42, 0.17), Material("sheet"), power=0.4, squash=0.6)
-        cushion(b.placed(0.1, length / 2 - 0.55, 0.55).tilted("x", -0.6), (0, 0, 0), (0.4, 0.12, 0.38),
-                Material("cushion_a"), power=0.4, squash=0.6)  # fmt: skip
+            cushion(
+                pillow.tilted("x", 0.25),
+                (0, 0, 0),
+                (0.62, 0.42, 0.17),
+                Material("sheet"),
+                power=0.4,
+                squash=0.6,
+            )
+        cushion(
+            b.placed(0.1, length / 2 - 0.55, 0.55).tilted("x", -0.6),
+            (0, 0, 0),
+            (0.4, 0.12, 0.38),
+            Material("cushion_a"),
+            power=0.4,
+            squash=0.6,
+        )
 
     return Piece("bed", width + 0.06, 2.08, 1.05, draw)
 
@@ -98,7 +131,12 @@ def nightstand() -> Piece:
 
 def table_lamp(b: MeshBuilder) -> None:
     """A small shining shade on a turned foot."""
-    lathe(b, (0, 0, 0), [(0.07, 0), (0.07, 0.015), (0.02, 0.05), (0.05, 0.13), (0.012, 0.22)], Material("ceramic"))
+    lathe(
+        b,
+        (0, 0, 0),
+        [(0.07, 0), (0.07, 0.015), (0.02, 0.05), (0.05, 0.13), (0.012, 0.22)],
+        Material("ceramic"),
+    )
     lathe(b, (0, 0, 0.2), [(0.13, 0.0), (0.09, 0.2)], SHADE, sides=20)
     b.lamp((0, 0, 0.3), 0.18, 0.35, WARM)
 
@@ -162,90 +200,17 @@ def swivel_chair(b: MeshBuilder) -> None:
         cushion(b, (end[0], end[1], 0.0), (0.06, 0.06, 0.06), BLACK, power=1, squash=1, detail=6)
     rod(b, (0, 0, 0.1), (0, 0, 0.44), 0.025, STEEL)
     cushion(b, (0, 0, 0.43), (0.5, 0.5, 0.09), leather, power=0.4, squash=0.5)
-    cushion(b.placed(0, 0.24, 0.52).tilted("x", -0.12), (0, 0, 0), (0.46, 0.09, 0.55), leather, power=0.4, squash=0.5)
+    cushion(
+        b.placed(0, 0.24, 0.52).tilted("x", -0.12),
+        (0, 0, 0),
+        (0.46, 0.09, 0.55),
+        leather,
+        power=0.4,
+        squash=0.5,
+    )
     for x in (-0.28, 0.28):
         rod(b, (x, 0.1, 0.48), (x, 0.08, 0.66), 0.014, BLACK)
         box(b, (x, 0.0, 0.66), (0.06, 0.26, 0.03), BLACK)
-
-
-def kitchen_run(width: float) -> Piece:
-    """Base cabinets with worktop, sink, hob and oven; hanging cupboards, hood, tiles between."""
-
-    def draw(b: MeshBuilder, rng: np.random.Generator) -> None:
-        top = Material("granite") if rng.random() < 0.5 else OAK
-        depth, units = 0.58, max(3, round(width / 0.6))
-        w = width / units
-        box(b, (0, 0.03, 0.0), (width, depth - 0.08, 0.10), BLACK, skip=("bottom", "top"))
-        box(b, (0, 0, 0.10), (width, depth, 0.76), FRONT, skip=("bottom", "top"))
-        oven = int(rng.integers(1, units - 1))
-        for k in range(units):
-            at = b.placed(-width / 2 + (k + 0.5) * w, 0)
-            if k == oven:
-                _oven(at, w, depth)
-            else:
-                fronts(at, w, 0.74, -depth / 2, 0.11, 1, int(rng.choice([1, 1, 3])), FRONT)
-        box(b, (0, -0.01, 0.86), (width + 0.02, depth + 0.04, 0.04), top)
-        b.quad((-width / 2, depth / 2 - 0.002, 0.9), (width, 0, 0), (0, 0, 0.55), Material("splash"))
-        hob = b.placed(-width / 2 + (oven + 0.5) * w, 0, 0.90)
-        box(hob, (0, 0, 0), (w - 0.04, 0.48, 0.008), BLACK)
-        lathe(hob, (-0.13, 0.08, 0.008), [(0.1, 0), (0.11, 0.13), (0.104, 0.13), (0.09, 0.02)], STEEL)
-        box(b.placed(-width / 2 + (oven + 0.5) * w, 0), (0, 0.08, 1.55), (w, 0.42, 0.06), STEEL)
-        box(b.placed(-width / 2 + (oven + 0.5) * w, 0), (0, 0.16, 1.6), (0.24, 0.24, 0.9), STEEL)
-        sink = (oven + 2) % units
-        basin = b.placed(-width / 2 + (sink + 0.5) * w, 0, 0.901)
-        box(basin, (0, -0.02, 0), (w - 0.08, 0.4, 0.004), STEEL)
-        rod(basin, (0, 0.2, 0), (0, 0.2, 0.28), 0.014, STEEL)
-        rod(basin, (0, 0.2, 0.28), (0, 0.02, 0.25), 0.012, STEEL)
-        for k in range(units):
-            if k not in (oven, sink):
-                cupboard = b.placed(-width / 2 + (k + 0.5) * w, 0.12, 1.45)
-                box(cupboard, (0, 0, 0), (w, 0.33, 0.65), FRONT)
-                fronts(cupboard, w, 0.65, -0.165, 0.0, 1, 1, FRONT)
-            if k not in (oven, sink) and rng.random() < 0.8:
-                _clutter(b.placed(-width / 2 + (k + 0.5) * w, 0.1, 0.9), rng)
-
-    return Piece("kitchen_run", width, 0.64, 2.1, draw)
-
-
-def _oven(b: MeshBuilder, width: float, depth: float) -> None:
-    box(b, (0, -depth / 2 - 0.008, 0.11), (width - 0.01, 0.02, 0.74), STEEL, skip=("back",))
-    box(b, (0, -depth / 2 - 0.02, 0.22), (width - 0.12, 0.006, 0.36), BLACK, skip=("back",))
-    rod(b, (-width * 0.36, -depth / 2 - 0.045, 0.63), (width * 0.36, -depth / 2 - 0.045, 0.63), 0.009, STEEL)
-    for k in range(4):
-        x = (k - 1.5) * width * 0.2
-        rod(b, (x, -depth / 2 - 0.018, 0.75), (x, -depth / 2 - 0.045, 0.75), 0.02, BLACK, sides=12)
-
-
-def _clutter(b: MeshBuilder, rng: np.random.Generator) -> None:
-    kind = rng.integers(4)
-    if kind == 0:
-        box(b, (0, 0.0, 0), (0.26, 0.18, 0.2), Material("steel", tint=(0.9, 0.3, 0.25)))
-    elif kind == 1:
-        for k in range(3):
-            tint = tuple(rng.uniform(0.2, 0.9, 3).tolist())
-            cylinder(b, (-0.14 + 0.13 * k, 0.02, 0), 0.05, 0.12 + 0.03 * k, Material("ceramic", tint=tint))
-    elif kind == 2:
-        box(b.tilted("x", -0.12), (0, 0.14, 0), (0.28, 0.02, 0.36), OAK)
-        vase(b.placed(0.1, -0.02), rng, 0.22)
-    else:
-        b.placed(0, 0)
-        lathe(b, (0, 0, 0), [(0.06, 0), (0.09, 0.08), (0.07, 0.18), (0.03, 0.2)], STEEL)
-
-
-def fridge() -> Piece:
-    """Two doors, handles, notes on the front."""
-
-    def draw(b: MeshBuilder, rng: np.random.Generator) -> None:
-        box(b, (0, 0.02, 0.04), (0.66, 0.62, 1.82), STEEL, turn=True)
-        for z, h in ((0.06, 0.62), (0.70, 1.14)):
-            box(b, (0, -0.30, z), (0.65, 0.03, h), STEEL, turn=True, skip=("back",))
-            rod(b, (-0.26, -0.34, z + h * 0.25), (-0.26, -0.34, z + h * 0.75), 0.012, BLACK)
-        for k in range(4):
-            x, z = float(rng.uniform(-0.12, 0.2)), float(rng.uniform(0.9, 1.5))
-            note = Material(f"painting_{int(rng.integers(14))}")
-            b.quad((x, -0.317 - 0.001 * k, z), (0.13, 0, 0.01), (-0.01, 0, 0.16), note, fit=True)
-
-    return Piece("fridge", 0.68, 0.68, 1.88, draw)
 
 
 def bench(width: float) -> Piece:
@@ -257,7 +222,12 @@ def bench(width: float) -> Piece:
         legs(b, width - 0.04, 0.34, 0.42, timber, 0.05)
         cushion(b, (-width * 0.2, 0, 0.45), (0.45, 0.34, 0.08), Material("cushion_b"), power=0.3, squash=0.5)
         tint = (0.75, 0.6, 0.4)
-        lathe(b, (width * 0.2, 0, 0), [(0.0, 0.0), (0.14, 0), (0.16, 0.24), (0.15, 0.24)], Material("lampshade", tint))
+        lathe(
+            b,
+            (width * 0.2, 0, 0),
+            [(0.0, 0.0), (0.14, 0), (0.16, 0.24), (0.15, 0.24)],
+            Material("lampshade", tint),
+        )
 
     return Piece("bench", width, 0.40, 0.55, draw)
 
@@ -270,7 +240,13 @@ def stool() -> Piece:
         cylinder(b, (0, 0, 0.42), 0.17, 0.035, timber)
         for k in range(3):
             a = k * 2 * np.pi / 3
-            rod(b, (0.17 * np.cos(a), 0.17 * np.sin(a), 0), (0.1 * np.cos(a), 0.1 * np.sin(a), 0.43), 0.016, timber)
+            rod(
+                b,
+                (0.17 * np.cos(a), 0.17 * np.sin(a), 0),
+                (0.1 * np.cos(a), 0.1 * np.sin(a), 0.43),
+                0.016,
+                timber,
+            )
 
     return Piece("stool", 0.40, 0.40, 0.46, draw)
 
@@ -286,7 +262,11 @@ def toy_box() -> Piece:
         box(b, (0, 0, 0.01), (0.58, 0.36, 0.012), OAK)
         for _ in range(9):
             tint = tuple(rng.choice([0.05, 0.5, 0.8], 3).tolist())
-            at = (float(rng.uniform(-0.22, 0.22)), float(rng.uniform(-0.12, 0.12)), float(rng.uniform(0.12, 0.26)))
+            at = (
+                float(rng.uniform(-0.22, 0.22)),
+                float(rng.uniform(-0.12, 0.12)),
+                float(rng.uniform(0.12, 0.26)),
+            )
             size = float(rng.uniform(0.09, 0.16))
             power = 1.0 if rng.random() < 0.5 else 0.15
             material = Material("plain", tint=tint)
@@ -318,6 +298,12 @@ def fireplace() -> Piece:
         box(b, (0, 0.06, 1.12), (1.2, 0.3, 1.3), stones)
         for k in range(5):
             y = float(rng.uniform(-0.08, 0.08))
-            rod(b, (-0.2, y, 0.09 + 0.05 * (k % 3)), (0.2, y * -1, 0.1 + 0.05 * (k % 3)), 0.035, Material("walnut"))
+            rod(
+                b,
+                (-0.2, y, 0.09 + 0.05 * (k % 3)),
+                (0.2, y * -1, 0.1 + 0.05 * (k % 3)),
+                0.035,
+                Material("walnut"),
+            )
 
     return Piece("fireplace", 1.66, 0.52, 2.42, draw)

@@ -40,14 +40,18 @@ def load_glb(path: Path) -> tuple[Mesh, Pictures]:
     mesh = merge(parts)
     if len(mesh.triangles) > MAX_TRIANGLES:
         raise ValueError(
-            f"{path} has {len(mesh.triangles)} triangles after refinement to {EDGE_M} m (limit {MAX_TRIANGLES}): "
+            f"{path} has {len(mesh.triangles)} triangles at {EDGE_M} m (limit {MAX_TRIANGLES}): "
             "is it in metres?"
         )
     return mesh, pictures
 
 
 def _part(
-    geometry: trimesh.Trimesh, T_world_part: np.ndarray, texture: str, tint: tuple[float, float, float], number: int
+    geometry: trimesh.Trimesh,
+    T_world_part: np.ndarray,
+    texture: str,
+    tint: tuple[float, float, float],
+    number: int,
 ) -> Mesh:
     vertices = trimesh.transformations.transform_points(geometry.vertices, T_world_part)
     uv = getattr(geometry.visual, "uv", None)
@@ -57,7 +61,9 @@ def _part(
     extent = float(np.ptp(vertices, axis=0).max())
     if extent > EDGE_M:
         if len(faces) * (extent / EDGE_M) ** 2 > 50 * MAX_TRIANGLES:
-            raise ValueError(f"a mesh of {extent:.0f} m is too large to refine to {EDGE_M} m: is the file in metres?")
+            raise ValueError(
+                f"a mesh of {extent:.0f} m is too large to refine to {EDGE_M} m: is the file in metres?"
+            )
         joined, faces = _refine(joined, faces)
     corners = joined[:, :3][faces]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -101,7 +107,10 @@ def _refine(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.nda
         corners = np.take_along_axis(corners, pick[..., None], axis=1)
         middle = 0.5 * (corners[:, 0] + corners[:, 1])
         halves = np.concatenate(
-            [np.stack([corners[:, 0], middle, corners[:, 2]], 1), np.stack([middle, corners[:, 1], corners[:, 2]], 1)]
+            [
+                np.stack([corners[:, 0], middle, corners[:, 2]], 1),
+                np.stack([middle, corners[:, 1], corners[:, 2]], 1),
+            ]
         )
         vertices, faces = halves.reshape(-1, vertices.shape[1]), np.arange(3 * len(halves)).reshape(-1, 3)
     return np.concatenate(done_v), np.concatenate(done_f)
@@ -128,5 +137,3 @@ def _material(
         return "plain", tint
     pictures[name] = (np.clip(picture, 0.0, 1.0), (1.0, 1.0))
     return name, tint
-
-

@@ -72,7 +72,9 @@ def floor_plan(rng: np.random.Generator) -> tuple[list[Room], np.ndarray]:
             point = np.array([line, along] if axis == "x" else [along, line])
             s = _along(room, side, point)
             room.openings[side].append(Opening(s - half, s + half, 0.0, 2.08, "door"))
-    for room, outer in zip(rooms, (("south", "west"), ("south", "east"), ("north", "east"), ("north", "west"))):
+    for room, outer in zip(
+        rooms, (("south", "west"), ("south", "east"), ("north", "east"), ("north", "west"))
+    ):
         _windows(rng, room, outer)
     shifted = np.array([-width / 2, -depth / 2])
     route = _route(rng, rooms, doors) + shifted
@@ -84,7 +86,9 @@ def floor_plan(rng: np.random.Generator) -> tuple[list[Room], np.ndarray]:
 
 def _along(room: Room, side: str, point: np.ndarray) -> float:
     x, y = room.corner(side)
-    return float({"south": x - point[0], "north": point[0] - x, "east": y - point[1], "west": point[1] - y}[side])
+    return float(
+        {"south": x - point[0], "north": point[0] - x, "east": y - point[1], "west": point[1] - y}[side]
+    )
 
 
 def _windows(rng: np.random.Generator, room: Room, outer: tuple[str, str]) -> None:
@@ -102,8 +106,12 @@ def _windows(rng: np.random.Generator, room: Room, outer: tuple[str, str]) -> No
 
 def _route(rng: np.random.Generator, rooms: list[Room], doors: list[tuple[str, float, float]]) -> np.ndarray:
     """Straight through each doorway, and in each room out towards its outer corner, then back."""
-    corners = [(rooms[0].x0, rooms[0].y0), (rooms[1].x1, rooms[1].y0), (rooms[2].x1, rooms[2].y1),
-               (rooms[3].x0, rooms[3].y1)]  # fmt: skip
+    corners = [
+        (rooms[0].x0, rooms[0].y0),
+        (rooms[1].x1, rooms[1].y0),
+        (rooms[2].x1, rooms[2].y1),
+        (rooms[3].x0, rooms[3].y1),
+    ]
     points: list[np.ndarray] = []
     for k in range(4):
         room = rooms[k]
@@ -130,7 +138,12 @@ def _door_point(door: tuple[str, float, float], room: Room, distance: float) -> 
 def _finishes(rng: np.random.Generator, rooms: list[Room]) -> dict[str, Finish]:
     floors = dict(zip(("living", "study", "bedroom"), rng.permutation(["floor_a", "floor_c", "floor_d"])))
     floors["kitchen"] = str(rng.choice(["floor_b", "checker"]))
-    walls = dict(zip(("living", "kitchen", "bedroom", "study"), rng.permutation(["wall_a", "wall_b", "wall_c", "wall_d"])))
+    walls = dict(
+        zip(
+            ("living", "kitchen", "bedroom", "study"),
+            rng.permutation(["wall_a", "wall_b", "wall_c", "wall_d"]),
+        )
+    )
     accents = {"living": "brick", "bedroom": "damask", "study": str(rng.choice(["wall_c", "stonebrick"]))}
     out = {}
     for k, room in enumerate(rooms):

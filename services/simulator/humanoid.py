@@ -89,7 +89,10 @@ def person(rng: np.random.Generator, sizes: dict[str, tuple[float, float]]) -> B
     shirt = Material(f"shirt_{int(rng.integers(4))}")
     trousers = Material(str(rng.choice(["denim", "chino"])))
     tone = float(rng.uniform(0.45, 1.05))
-    skin, hair = Material("skin", tint=(tone, tone, tone)), Material("hair", tint=(1, 1, float(rng.uniform(0.7, 1.2))))
+    skin, hair = (
+        Material("skin", tint=(tone, tone, tone)),
+        Material("hair", tint=(1, 1, float(rng.uniform(0.7, 1.2)))),
+    )
 
     def part(draw: object, parent: int, joint: tuple[float, float, float]) -> Part:
         b = MeshBuilder(sizes, edge_m=0.12)
@@ -99,8 +102,17 @@ def person(rng: np.random.Generator, sizes: dict[str, tuple[float, float]]) -> B
         return Part(scaled, parent, (joint[0] * scale, joint[1] * scale, joint[2] * scale))
 
     def torso(b: MeshBuilder) -> None:
-        profile = [(0.0, -0.10), (0.14, -0.08), (0.165, 0.02), (0.15, 0.14), (0.175, 0.32), (0.185, 0.44),
-                   (0.15, 0.53), (0.07, 0.58), (0.055, 0.62)]  # fmt: skip
+        profile = [
+            (0.0, -0.10),
+            (0.14, -0.08),
+            (0.165, 0.02),
+            (0.15, 0.14),
+            (0.175, 0.32),
+            (0.185, 0.44),
+            (0.15, 0.53),
+            (0.07, 0.58),
+            (0.055, 0.62),
+        ]
         _oval(b, profile[:4], 0.75, trousers)
         _oval(b, profile[2:-1], 0.68, shirt)
         _oval(b, profile[-2:], 0.95, skin)
@@ -112,10 +124,17 @@ def person(rng: np.random.Generator, sizes: dict[str, tuple[float, float]]) -> B
         cushion(b, (0.105, 0, 0.10), (0.03, 0.03, 0.05), skin, power=1, squash=1, detail=6)
 
     def thigh(b: MeshBuilder) -> None:
-        lathe(b, (0, 0, -0.46), [(0.062, 0.0), (0.072, 0.15), (0.09, 0.36), (0.092, 0.44), (0.05, 0.5)], trousers)
+        lathe(
+            b,
+            (0, 0, -0.46),
+            [(0.062, 0.0), (0.072, 0.15), (0.09, 0.36), (0.092, 0.44), (0.05, 0.5)],
+            trousers,
+        )
 
     def shin(b: MeshBuilder) -> None:
-        lathe(b, (0, 0, -0.40), [(0.056, 0.0), (0.06, 0.1), (0.07, 0.26), (0.066, 0.38), (0.03, 0.43)], trousers)
+        lathe(
+            b, (0, 0, -0.40), [(0.056, 0.0), (0.06, 0.1), (0.07, 0.26), (0.066, 0.38), (0.03, 0.43)], trousers
+        )
 
     def foot(b: MeshBuilder) -> None:
         cushion(b, (0.055, 0, -0.075), (0.27, 0.10, 0.10), Material("shoe"), power=0.5, squash=0.6, detail=12)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
@@ -15,7 +16,16 @@ SLICES = 10  # of a revolution, in each of which movers stand still
 GRAZING = 0.08  # cosine below which a beam often does not come back
 
 PoseAt = Callable[[np.ndarray], np.ndarray]  # seconds [N] -> SE(2) poses [N, 3]
-MoversAt = Callable[[float], Caster | None]
+
+
+class Movers(Protocol):
+    """What moves while the lidar turns."""
+
+    def circles(self, time_s: float) -> np.ndarray:
+        """float64 [A, 3]: x, y and a radius that each mover stays within."""
+
+    def caster_of(self, index: int, time_s: float) -> Caster:
+        """One mover as it stands at a time."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +52,7 @@ class Lidar:
         s = settings
         self._angle = s.angle_min_rad + s.angle_increment_rad * np.arange(s.beams)
 
-    def revolution(self, time_s: float, pose_at: PoseAt, movers_at: MoversAt | None = None) -> Revolution:
+    def revolution(self, time_s: float, pose_at: PoseAt, movers: Movers | None = None) -> Revolution:
         """The revolution that starts at a time."""
         s = self.settings
         times = time_s + s.time_increment_s * np.arange(s.beams)
@@ -67,17 +77,34 @@ class Lidar:
             second = self._open.first(origins[at], rays[at])
             behind[at] = self._open.distance(origins[at], rays[at], second)
         moving = np.zeros(s.beams, np.bool_)
-        if movers_at is not None:
+        if movers is not None:
             for part in np.array_split(np.arange(s.beams), SLICES):
-                caster = movers_at(float(times[part].mean()))
-                if caster is None:
-                    continue
-                body = caster.first(origins[part], rays[part])
-                nearer = caster.distance(origins[part], rays[part], body)
-                won = nearer < distance[part]
-                distance[part[won]], moving[part[won]] = nearer[won], True
-                behind[part[won]] = np.nan
+                self._meet(movers, float(times[part].mean()), part, origins, rays, distance, moving)
+            behind[moving] = np.nan
         return Revolution(distance, moving, behind, cosine.astype(np.float32))
+
+    @staticmethod
+    def _meet(
+        movers: Movers,
+        time_s: float,
+        part: np.ndarray,
+        origins: np.ndarray,
+        rays: np.ndarray,
+        distance: np.ndarray,
+        moving: np.ndarray,
+    ) -> None:
+        """Shortens the beams `part` that meet a mover at a time; only those that pass near one are cast."""
+        for index, (x, y, radius) in enumerate(movers.circles(time_s)):
+            to = np.array([x, y]) - origins[part, :2]
+            along = np.einsum("ij,ij->i", to, rays[part, :2])
+            aside = np.abs(to[:, 0] * rays[part, 1] - to[:, 1] * rays[part, 0])
+            at = part[(aside < radius) & (along > -radius) & (along - radius < distance[part])]
+            if len(at) == 0:
+                continue
+            caster = movers.caster_of(index, time_s)
+            nearer = caster.distance(origins[at], rays[at], caster.first(origins[at], rays[at]))
+            won = at[nearer < distance[at]]
+            distance[won], moving[won] = nearer[nearer < distance[at]], True
 
     def measure(self, revolution: Revolution, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         """Ranges float32 [B] as the device reports them (+inf no return), and bool [B]: went through glass.

@@ -21,7 +21,9 @@ AMBIENT = 0.03  # what reaches a corner no ray of ours does; also outside
 BLOCK = 1 << 16
 
 
-def bake(mesh: Mesh, atlas: Atlas, lights: tuple[Light, ...], caster: Caster, *, rays: int = GATHER_RAYS) -> np.ndarray:
+def bake(
+    mesh: Mesh, atlas: Atlas, lights: tuple[Light, ...], caster: Caster, *, rays: int = GATHER_RAYS
+) -> np.ndarray:
     """Irradiance / pi of every vertex, linear RGB float32 [V, 3]: radiance of a white surface there."""
     direct = np.zeros((len(mesh.vertices_m), 3), np.float32)
     for number, light in enumerate(lights):
@@ -48,7 +50,9 @@ def _direct(mesh: Mesh, light: Light, caster: Caster, number: int) -> np.ndarray
     probes = (0, 3, 6)
     everyone = np.arange(len(chosen))
     for k in probes:
-        total += _arriving(points[chosen], normals[chosen], light, samples[:, k], sample_normals[:, k], caster)
+        total += _arriving(
+            points[chosen], normals[chosen], light, samples[:, k], sample_normals[:, k], caster
+        )
     some = everyone[total > 0]
     at = chosen[some]
     for k in set(range(LIGHT_SAMPLES)) - set(probes):
@@ -60,9 +64,13 @@ def _direct(mesh: Mesh, light: Light, caster: Caster, number: int) -> np.ndarray
 
 
 def _arriving(
-    points: np.ndarray, normals: np.ndarray, light: Light, samples: np.ndarray, sample_normals: np.ndarray,
+    points: np.ndarray,
+    normals: np.ndarray,
+    light: Light,
+    samples: np.ndarray,
+    sample_normals: np.ndarray,
     caster: Caster,
-) -> np.ndarray:  # fmt: skip
+) -> np.ndarray:
     """Relative irradiance float32 [N] from one sample of the light for each point; 0 in its shadow."""
     to = samples - points
     squared = np.maximum(np.einsum("ij,ij->i", to, to), 1e-3)
@@ -76,7 +84,9 @@ def _arriving(
     return part
 
 
-def _light_points(light: Light, rng: np.random.Generator, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _light_points(
+    light: Light, rng: np.random.Generator, points: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Stratified points [N, LIGHT_SAMPLES, 3] on the light for receivers [N, 3], and where they shine to."""
     count = len(points)
     centre = np.array(light.centre_m, np.float32)
@@ -84,7 +94,9 @@ def _light_points(light: Light, rng: np.random.Generator, points: np.ndarray) ->
         # Even over the disc a point sees of the ball, lifted onto the ball: all samples weigh the same.
         toward = points - centre
         toward /= np.linalg.norm(toward, axis=1, keepdims=True) + np.float32(1e-9)
-        helper = np.where(np.abs(toward[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]]).astype(np.float32)
+        helper = np.where(np.abs(toward[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]]).astype(
+            np.float32
+        )
         side = np.cross(toward, helper)
         side /= np.linalg.norm(side, axis=1, keepdims=True)
         other = np.cross(toward, side)
@@ -93,9 +105,10 @@ def _light_points(light: Light, rng: np.random.Generator, points: np.ndarray) ->
         angle = 2.39996 * np.arange(LIGHT_SAMPLES) + 2 * np.pi * rng.random((count, 1), dtype=np.float32)
         r = np.sqrt(squared)
         unit = (
-            (r * np.cos(angle))[..., None] * side[:, None] + (r * np.sin(angle))[..., None] * other[:, None]
+            (r * np.cos(angle))[..., None] * side[:, None]
+            + (r * np.sin(angle))[..., None] * other[:, None]
             + np.sqrt(1 - squared)[..., None] * toward[:, None]
-        )  # fmt: skip
+        )
         normals = np.broadcast_to(toward[:, None], unit.shape)
         return (centre + light.radius_m * unit).astype(np.float32), normals.astype(np.float32)
     columns = LIGHT_SAMPLES // 2

@@ -164,7 +164,8 @@ class MeshBuilder:
         """A parallelogram seen from its front with `origin` lower left.
 
         `fit` stretches the texture over it once; otherwise it repeats in its own size in metres, from
-        `offset` (in repeats; None: somewhere else for each piece). `turn` lays the texture's u axis along `up`.
+        `offset` (in repeats; None: somewhere else for each piece). `turn` lays the
+        texture's u axis along `up`.
         """
         origin, right, up = (np.asarray(v, dtype=np.float64) for v in (origin, right, up))
         width, height = float(np.linalg.norm(right)), float(np.linalg.norm(up))

@@ -17,6 +17,7 @@ from services.simulator.shade import Surfaces, surfaces
 
 TURN_M = 0.22  # radius of the turns at both ends
 KEEP_OFF_M = 0.85  # from the robot's centre
+REACH_M = 0.75  # of a body's limbs from its place
 PROBE_RAYS = 192
 
 
@@ -48,22 +49,32 @@ class Walk:
         turn_a = a + TURN_M * (left - np.sin(bend) * ahead + np.cos(bend) * left)
         back = b + 2 * TURN_M * left - (s - length - half) * ahead
         place = np.where(
-            s < length, a + s * ahead,
+            s < length,
+            a + s * ahead,
             np.where(s < length + half, turn_b, np.where(s < 2 * length + half, back, turn_a)),
-        )  # fmt: skip
+        )
         base = np.arctan2(ahead[1], ahead[0])
         s = s[..., 0]
         turned = np.where(
-            s < length, 0.0,
-            np.where(s < length + half, bend[..., 0], np.where(s < 2 * length + half, np.pi, np.pi + bend[..., 0])),
-        )  # fmt: skip
+            s < length,
+            0.0,
+            np.where(
+                s < length + half, bend[..., 0], np.where(s < 2 * length + half, np.pi, np.pi + bend[..., 0])
+            ),
+        )
         return place, base + turned, walked
 
 
 def choose_walks(
-    space: FreeSpace, drive: Drive, caster: Caster, count: int, duration_s: float, rng: np.random.Generator,
-    *, tries: int = 500,
-) -> list[Walk]:  # fmt: skip
+    space: FreeSpace,
+    drive: Drive,
+    caster: Caster,
+    count: int,
+    duration_s: float,
+    rng: np.random.Generator,
+    *,
+    tries: int = 500,
+) -> list[Walk]:
     """The walks most often in the robot's view among random ones that keep off it and off each other.
 
     Raises:
@@ -94,9 +105,7 @@ def choose_walks(
     return chosen
 
 
-def _random_walk(
-    space: FreeSpace, places: np.ndarray, lap_s: float, rng: np.random.Generator
-) -> Walk | None:
+def _random_walk(space: FreeSpace, places: np.ndarray, lap_s: float, rng: np.random.Generator) -> Walk | None:
     if len(places) == 0:
         return None
     a = places[int(rng.integers(len(places)))]
@@ -142,14 +151,24 @@ class Cast:
             meshes.append(body.posed(float(place[0]), float(place[1]), float(yaw), float(walked)))
         return merge(meshes)
 
-    def caster_at(self, time_s: float) -> Caster:
-        return Caster.of(self.mesh_at(time_s))
+    def circles(self, time_s: float) -> np.ndarray:
+        """float64 [A, 3]: place and reach of each body."""
+        places = [walk.at(np.array(time_s))[0] for walk in self.walks]
+        return np.array([[*place, REACH_M] for place in places])
+
+    def caster_of(self, index: int, time_s: float) -> Caster:
+        """One body at a time."""
+        place, yaw, walked = self.walks[index].at(np.array(time_s))
+        mesh = self.bodies[index].posed(float(place[0]), float(place[1]), float(yaw), float(walked))
+        return Caster.of(mesh)
 
 
 class Stage:
     """Lights the cast by what the static scene around each body sends out."""
 
-    def __init__(self, cast: Cast, caster: Caster, scene: Surfaces, atlas: Atlas, lights: tuple[Light, ...]) -> None:
+    def __init__(
+        self, cast: Cast, caster: Caster, scene: Surfaces, atlas: Atlas, lights: tuple[Light, ...]
+    ) -> None:
         self._cast, self._caster, self._atlas = cast, caster, atlas
         mean = atlas.mean[scene.texture] * scene.tint
         self._leaving = mean * (scene.light.mean(axis=1) + scene.emission[:, None])

@@ -43,11 +43,12 @@ def _surfaces(rng: np.random.Generator) -> Pictures:
         "leaf": (art.foliage(rng), (1.0, 1.0)),
         "marble": (tx.stone(rng, rgb("e9e7e3"), rgb("8c8d92")), (1.3, 1.3)),
         "granite": (
-            tx.terrazzo(rng, rgb("55565a"), [rgb("2b2c2f"), rgb("8d8e90"), rgb("b3a9a0")]), (0.7, 0.7),
+            tx.terrazzo(rng, rgb("55565a"), [rgb("2b2c2f"), rgb("8d8e90"), rgb("b3a9a0")]),
+            (0.7, 0.7),
         ),
         "stonebrick": (tx.brick(rng, rgb("a3988a"), rgb("c9c3b6")), (1.2, 1.2)),
         "lampshade": (tx.weave(rng, rgb("f3e6c8"), strength=0.08), (0.12, 0.12)),
-    }  # fmt: skip
+    }
 
 
 def _floors_and_walls(rng: np.random.Generator) -> Pictures:
@@ -61,7 +62,7 @@ def _floors_and_walls(rng: np.random.Generator) -> Pictures:
         (tx.herringbone(rng, dark), (2.4, 2.4)),
         (tx.planks(rng, _pick(rng, "d8c7ab bfa27c a98f73"), boards=18, contrast=0.8), (2.4, 2.4)),
     ]
-    paint = "e9e4d8 dfe5e6 e3dccb d5dcd2 e8dfe0 cfd9df".split()
+    paint = ["e9e4d8", "dfe5e6", "e3dccb", "d5dcd2", "e8dfe0", "cfd9df"]
     tones = [rgb(c) for c in rng.choice(paint, 4, replace=False)]
     accent = _pick(rng, "7f98a3 97a58b b58d74 8d86a0")
     walls = [
@@ -79,16 +80,25 @@ def _floors_and_walls(rng: np.random.Generator) -> Pictures:
         "panelling": (tx.planks(rng, _pick(rng, "c08a4a d3a566 e2d9c8"), boards=16, gap=0.7), (1.9, 1.9)),
         "splash": (
             tx.tiles(
-                rng, [_pick(rng, "e6ebe9 9fb8b6 d9c7a8") * f for f in (1.0, 0.95, 1.05)], rgb("c9c9c4"),
-                count=4, rows=8, grout_px=3, pattern="brick", mottle=0.05,
-            ), (0.8, 0.8),
+                rng,
+                [_pick(rng, "e6ebe9 9fb8b6 d9c7a8") * f for f in (1.0, 0.95, 1.05)],
+                rgb("c9c9c4"),
+                count=4,
+                rows=8,
+                grout_px=3,
+                pattern="brick",
+                mottle=0.05,
+            ),
+            (0.8, 0.8),
         ),
         "checker": (
-            tx.tiles(rng, [rgb("dcd9d2"), _pick(rng, "4a4f55 6b4f43 41565a")], grout, count=4, pattern="checker"),
+            tx.tiles(
+                rng, [rgb("dcd9d2"), _pick(rng, "4a4f55 6b4f43 41565a")], grout, count=4, pattern="checker"
+            ),
             (1.2, 1.2),
         ),
         "paving": (tx.tiles(rng, [rgb("9d978c"), rgb("a8a296")], rgb("77736a"), count=3), (1.5, 1.5)),
-    }  # fmt: skip
+    }
 
 
 def _cloths(rng: np.random.Generator) -> Pictures:

@@ -72,9 +72,11 @@ class Placer:
         self.rng = rng
         self.clearance_m = clearance_m
         near = (
-            (route_m[:, 0] > room.x0 - 1.0) & (route_m[:, 0] < room.x1 + 1.0)
-            & (route_m[:, 1] > room.y0 - 1.0) & (route_m[:, 1] < room.y1 + 1.0)
-        )  # fmt: skip
+            (route_m[:, 0] > room.x0 - 1.0)
+            & (route_m[:, 0] < room.x1 + 1.0)
+            & (route_m[:, 1] > room.y0 - 1.0)
+            & (route_m[:, 1] < room.y1 + 1.0)
+        )
         self.route_m = route_m[near]
 
     def at_wall(self, piece: Piece, *, tries: int = 60, sides: tuple[str, ...] = SIDES) -> Spot | None:

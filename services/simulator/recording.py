@@ -86,9 +86,15 @@ def simulate(settings: Simulation, out: Path, *, jobs: int, replace: bool, progr
         log = _Log()
         cast = build_cast(world, tuple(walks), settings.people, settings.seed)
         steps = simulate_lidar(
-            world.mesh, caster, drive, settings.lidar, settings.wheels, seed=settings.seed,
-            duration_s=duration, cast=cast,
-        )  # fmt: skip
+            world.mesh,
+            caster,
+            drive,
+            settings.lidar,
+            settings.wheels,
+            seed=settings.seed,
+            duration_s=duration,
+            cast=cast,
+        )
         scans = round(duration * settings.lidar.rate_hz)
         streams.append(_lidar_records(settings, steps, log, lambda i: progress("scanning", i, scans)))
         messages = w.write_bag(folder / "bag", streams, topics)
@@ -206,9 +212,14 @@ def _write_picture_truth(folder: Path, settings: Simulation, times_s: list[float
 
 
 def _write_views(
-    folder: Path, settings: Simulation, shoot: Shoot, space: FreeSpace, times_s: list[float], paths: list[Path],
+    folder: Path,
+    settings: Simulation,
+    shoot: Shoot,
+    space: FreeSpace,
+    times_s: list[float],
+    paths: list[Path],
     progress: Progress,
-) -> int:  # fmt: skip
+) -> int:
     """Off-path views and the seen surface; returns the number of views."""
     if not times_s:
         return 0
@@ -223,9 +234,15 @@ def _write_views(
     )
     rng = np.random.default_rng([settings.seed, 0x56])
     count = write_extra_views(
-        folder / "extra_views", studio, space, seen, np.array(times_s), settings.extra_views, rng,
+        folder / "extra_views",
+        studio,
+        space,
+        seen,
+        np.array(times_s),
+        settings.extra_views,
+        rng,
         lambda i, n: progress("views off the path", i, n),
-    )  # fmt: skip
+    )
     progress("sampling the seen surface", 0, 0)
     scene = studio.renderer.scene
     points, colours = surface_points(scene, seen, settings.surface_points, studio.gain, rng)

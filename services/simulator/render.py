@@ -1,4 +1,4 @@
-"""One picture of a lit scene: primary rays, shading, and four more rays where an edge runs through a pixel."""
+"""One picture of a lit scene: primary rays, shading, and four more rays where an edge crosses a pixel."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from services.simulator.cast import Caster
-from services.simulator.shade import Surfaces, find_edges, shade, turn_rays
+from services.simulator.shade import Surfaces, find_edges, mark_cones, shade, turn_rays
 
 SUBPIXELS = ((-0.125, -0.375), (0.375, -0.125), (0.125, 0.375), (-0.375, 0.125))
 NO_BALLS = np.zeros((0, 4))
@@ -80,7 +80,12 @@ class Renderer:
         )
 
     def _supersampled(
-        self, origin: np.ndarray, rays: np.ndarray, rays_x: np.ndarray, rays_y: np.ndarray, actors: Actors | None
+        self,
+        origin: np.ndarray,
+        rays: np.ndarray,
+        rays_x: np.ndarray,
+        rays_y: np.ndarray,
+        actors: Actors | None,
     ) -> np.ndarray:
         jittered = np.concatenate([rays + x * rays_x + y * rays_y for x, y in SUBPIXELS])
         dx, dy = np.tile(rays_x, (len(SUBPIXELS), 1)), np.tile(rays_y, (len(SUBPIXELS), 1))
@@ -91,9 +96,16 @@ class Renderer:
         return np.minimum(colour, 1.5).reshape(len(SUBPIXELS), -1, 3).mean(axis=0)
 
     def _trace(
-        self, origin: np.ndarray, rays: np.ndarray, rays_x: np.ndarray, rays_y: np.ndarray, scale: float,
-        actors: Actors | None, colour: np.ndarray, depth: np.ndarray,
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
+        self,
+        origin: np.ndarray,
+        rays: np.ndarray,
+        rays_x: np.ndarray,
+        rays_y: np.ndarray,
+        scale: float,
+        actors: Actors | None,
+        colour: np.ndarray,
+        depth: np.ndarray,
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         balls = NO_BALLS if actors is None else actors.balls
         triangle = self.caster.first_from(origin, rays)
         shade(self.scene, triangle, origin, rays, rays_x, rays_y, scale, balls, colour, depth)
@@ -122,13 +134,11 @@ def _turned(table: np.ndarray, R: np.ndarray) -> np.ndarray:
 
 def _near(origin: np.ndarray, rays: np.ndarray, bounds: np.ndarray) -> np.ndarray:
     """Indices of rays that may meet one of the balls."""
-    length = np.linalg.norm(rays, axis=1)
+    to = bounds[:, :3] - origin
+    distance = np.linalg.norm(to, axis=1)
+    if np.any(distance <= bounds[:, 3]):
+        return np.arange(len(rays))
+    cos_limit = np.sqrt(1.0 - (bounds[:, 3] / distance) ** 2)
     near = np.zeros(len(rays), np.bool_)
-    for ball in bounds:
-        to = ball[:3] - origin
-        distance = np.linalg.norm(to)
-        if distance <= ball[3]:
-            return np.arange(len(rays))
-        cos_limit = np.sqrt(1.0 - (ball[3] / distance) ** 2)
-        near |= rays @ (to / distance).astype(np.float32) > cos_limit * length
+    mark_cones(rays, to / distance[:, None], cos_limit, near)
     return np.flatnonzero(near)

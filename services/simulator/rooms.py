@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from services.simulator import furniture as f
+from services.simulator import furniture_kitchen as fk
 from services.simulator import furniture_rooms as fr
+from services.simulator import furniture_small as fs
 from services.simulator.furniture import Piece
 from services.simulator.mesh import Material, MeshBuilder
 from services.simulator.place import SIDES, YAW, Placer, Room, Spot
@@ -19,7 +21,11 @@ def furnish(
     """Fills one room; pieces that find no place stay out."""
     placer = Placer(room, route_m, clearance_m, rng)
     {"living": _living, "kitchen": _kitchen, "bedroom": _bedroom, "study": _study}[room.name](b, placer, rng)
-    for piece in (f.plant(float(rng.uniform(0.9, 1.5))), f.plant(float(rng.uniform(0.8, 1.2))), f.floor_lamp()):
+    for piece in (
+        fs.plant(float(rng.uniform(0.9, 1.5))),
+        fs.plant(float(rng.uniform(0.8, 1.2))),
+        fs.floor_lamp(),
+    ):
         _wall_piece(b, placer, piece, rng)
     centre = ((room.x0 + room.x1) / 2, (room.y0 + room.y1) / 2)
     fr.ceiling_lamp(b.placed(*centre, CEILING_M), 0.35)
@@ -45,7 +51,9 @@ def rug(b: MeshBuilder, name: str, x: float, y: float, yaw: float, width: float,
     """A carpet 8 mm thick, its rim bound."""
     at = b.placed(x, y, 0.0, yaw, edge_m=0.07)
     h = 0.008
-    at.quad((-width / 2, -depth / 2, h), (width, 0, 0), (0, depth, 0), Material(name), fit=name.startswith("rug"))
+    at.quad(
+        (-width / 2, -depth / 2, h), (width, 0, 0), (0, depth, 0), Material(name), fit=name.startswith("rug")
+    )
     rim = Material("cushion_b")
     box(at, (0, 0, 0.0), (width, depth, h), rim, skip=("top", "bottom"))
 
@@ -69,9 +77,9 @@ def _living(b: MeshBuilder, placer: Placer, rng: np.random.Generator) -> None:
 
 def _kitchen(b: MeshBuilder, placer: Placer, rng: np.random.Generator) -> None:
     for width in (3.6, 3.0, 2.4, 1.8):
-        if _wall_piece(b, placer, fr.kitchen_run(width), rng) is not None:
+        if _wall_piece(b, placer, fk.kitchen_run(width), rng) is not None:
             break
-    for piece in (fr.fridge(), fr.kitchen_run(1.8)):
+    for piece in (fk.fridge(), fk.kitchen_run(1.8)):
         _wall_piece(b, placer, piece, rng)
     for width in (1.9, 1.5, 1.3):
         if _inside_piece(b, placer, fr.dining_set(width), rng) is not None:

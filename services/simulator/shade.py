@@ -120,7 +120,9 @@ def sample(
     r, g, b = np.float32(0.0), np.float32(0.0), np.float32(0.0)
     for k in range(probes):
         f = (k + 0.5) / probes - 0.5
-        red, green, blue = _bilinear(s, texture, low, u + f * step_u, v + f * step_v, weight * (1.0 - fraction))
+        red, green, blue = _bilinear(
+            s, texture, low, u + f * step_u, v + f * step_v, weight * (1.0 - fraction)
+        )
         r, g, b = r + red, g + green, b + blue
         if fraction > 0.0:
             red, green, blue = _bilinear(s, texture, high, u + f * step_u, v + f * step_v, weight * fraction)
@@ -130,7 +132,7 @@ def sample(
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def turn_rays(table: np.ndarray, R: np.ndarray, out: np.ndarray) -> None:
-    """out [N, 3] = table [N, 3] turned by R [3, 3]; BLAS starts threads for this, which costs more than it."""
+    """out [N, 3] = table [N, 3] turned by R [3, 3]; BLAS would start threads for this."""
     for i in range(len(table)):
         x, y, z = table[i, 0], table[i, 1], table[i, 2]
         for c in range(3):
@@ -218,6 +220,18 @@ def _ball_shadow(balls: np.ndarray, x: float, y: float, z: float, nx: float, ny:
         if cos > 0.0:
             left *= 1.0 - 0.8 * cos * balls[k, 3] ** 2 / squared
     return left
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def mark_cones(rays: np.ndarray, axis: np.ndarray, cosine: np.ndarray, inside: np.ndarray) -> None:
+    """bool [N] out: rays [N, 3] within one of the cones about unit axes [A, 3]."""
+    for i in range(len(rays)):
+        x, y, z = rays[i, 0], rays[i, 1], rays[i, 2]
+        squared = x * x + y * y + z * z
+        for k in range(len(axis)):
+            along = axis[k, 0] * x + axis[k, 1] * y + axis[k, 2] * z
+            if along > 0.0 and along * along > cosine[k] * cosine[k] * squared:
+                inside[i] = True
 
 
 @njit(nogil=True, cache=True, error_model="numpy")

@@ -65,7 +65,8 @@ def lathe(
         outward /= np.linalg.norm(outward, axis=1, keepdims=True) + 1e-12
         radius, height = band[:, 0][:, None], band[:, 1][:, None]
         vertices = np.stack(
-            [radius * ring[:, 0], radius * ring[:, 1], np.broadcast_to(height, (len(band), sides + 1))], axis=-1
+            [radius * ring[:, 0], radius * ring[:, 1], np.broadcast_to(height, (len(band), sides + 1))],
+            axis=-1,
         )
         normals = np.stack(
             [
@@ -204,9 +205,15 @@ def cushion(
 
 
 def curtain(
-    b: MeshBuilder, left: tuple[float, float, float], width_m: float, height_m: float, material: Material,
-    *, wave_m: float = 0.03, folds: float = 7.0,
-) -> None:  # fmt: skip
+    b: MeshBuilder,
+    left: tuple[float, float, float],
+    width_m: float,
+    height_m: float,
+    material: Material,
+    *,
+    wave_m: float = 0.03,
+    folds: float = 7.0,
+) -> None:
     """Hanging cloth in the local xz plane, waving in y, lower left corner at `left`, facing -y."""
     columns, rows = int(folds * 8) + 1, max(2, int(height_m / 0.15))
     s, t = np.meshgrid(np.linspace(0.0, 1.0, columns), np.linspace(0.0, 1.0, rows))
@@ -219,6 +226,9 @@ def curtain(
     size = b.texture_size_m[material.texture]
     uvs = np.stack([s * width_m * 1.5 / size[0], t * height_m / size[1]], axis=-1)
     b.add(
-        vertices.reshape(-1, 3), normals.reshape(-1, 3), uvs.reshape(-1, 2),
-        grid_triangles(rows, columns), material,
-    )  # fmt: skip
+        vertices.reshape(-1, 3),
+        normals.reshape(-1, 3),
+        uvs.reshape(-1, 2),
+        grid_triangles(rows, columns),
+        material,
+    )

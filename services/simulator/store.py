@@ -14,9 +14,19 @@ from pathlib import Path
 from typing import Any
 
 # A change in any other module of this folder may change what is drawn ...
-NOT_DRAWING = frozenset({
-    "cli.py", "writer.py", "wheels.py", "recording.py", "drive_log.py", "lidar.py", "truth.py", "store.py", "__init__.py",
-})  # fmt: skip
+NOT_DRAWING = frozenset(
+    {
+        "cli.py",
+        "writer.py",
+        "wheels.py",
+        "recording.py",
+        "drive_log.py",
+        "lidar.py",
+        "truth.py",
+        "store.py",
+        "__init__.py",
+    }
+)
 # ... and in any but these, too, the world that it is drawn from.
 NOT_BUILDING = NOT_DRAWING | {"shots.py", "movers.py", "render.py", "shade.py", "camera.py", "settings.py"}
 

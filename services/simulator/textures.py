@@ -6,6 +6,7 @@ Pictures are float32 [H, W, 3] in sRGB, 0..1, row 0 on top. Every function takes
 from __future__ import annotations
 
 from functools import lru_cache
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -20,7 +21,11 @@ def rgb(hex_colour: str) -> np.ndarray:
 
 
 def fractal(
-    rng: np.random.Generator, height: int, width: int, beta: float = 1.6, stretch: tuple[float, float] = (1.0, 1.0)
+    rng: np.random.Generator,
+    height: int,
+    width: int,
+    beta: float = 1.6,
+    stretch: tuple[float, float] = (1.0, 1.0),
 ) -> np.ndarray:
     """Periodic 1/f^beta noise [H, W], zero mean, unit deviation; `stretch` (x, y) lengthens its grain.
 
@@ -51,9 +56,14 @@ def finish(picture: np.ndarray) -> np.ndarray:
 
 
 def planks(
-    rng: np.random.Generator, base: np.ndarray, *, size_px: int = 1024, boards: int = 14, contrast: float = 1.0,
+    rng: np.random.Generator,
+    base: np.ndarray,
+    *,
+    size_px: int = 1024,
+    boards: int = 14,
+    contrast: float = 1.0,
     gap: float = 0.5,
-) -> np.ndarray:  # fmt: skip
+) -> np.ndarray:
     """A floor of boards along x: each board its own tone and cut of the grain, with knots and joints."""
     grain = fractal(rng, size_px, size_px, 1.1, (14.0, 1.0))
     fine = fractal(rng, size_px, size_px, 0.6, (24.0, 1.0))
@@ -61,7 +71,7 @@ def planks(
     out = np.empty((size_px, size_px, 3), np.float32)
     edges = np.linspace(0, size_px, boards + 1).astype(int)
     warm = np.array([1.06, 1.0, 0.9], np.float32)
-    for top, bottom in zip(edges[:-1], edges[1:]):
+    for top, bottom in pairwise(edges):
         start = int(rng.integers(size_px))
         joints = np.sort((start + np.array([0.0, rng.uniform(0.4, 0.6)]) * size_px).astype(int) % size_px)
         spans = [(joints[0], joints[1]), (joints[1], joints[0] + size_px)]
@@ -96,7 +106,9 @@ def _knot(rng: np.random.Generator, board: np.ndarray, base: np.ndarray) -> np.n
     return board * (1.0 - np.clip(dark, -0.1, 0.8)[..., None] * (1.3 - base * 0.5))
 
 
-def herringbone(rng: np.random.Generator, base: np.ndarray, size_px: int = 1024, blocks: int = 8) -> np.ndarray:
+def herringbone(
+    rng: np.random.Generator, base: np.ndarray, size_px: int = 1024, blocks: int = 8
+) -> np.ndarray:
     """Parquet: pairs of staves in alternating directions (basket weave, which tiles on a square)."""
     cell = size_px // blocks
     staves = 4
@@ -114,9 +126,17 @@ def herringbone(rng: np.random.Generator, base: np.ndarray, size_px: int = 1024,
 
 
 def tiles(
-    rng: np.random.Generator, colours: list[np.ndarray], grout: np.ndarray, *, size_px: int = 512, count: int = 4,
-    grout_px: int = 4, pattern: str = "grid", mottle: float = 0.03, rows: int | None = None,
-) -> np.ndarray:  # fmt: skip
+    rng: np.random.Generator,
+    colours: list[np.ndarray],
+    grout: np.ndarray,
+    *,
+    size_px: int = 512,
+    count: int = 4,
+    grout_px: int = 4,
+    pattern: str = "grid",
+    mottle: float = 0.03,
+    rows: int | None = None,
+) -> np.ndarray:
     """Glazed tiles: `grid`, `checker` or `brick` (half offset); `rows` x `count` of them."""
     rows = count if rows is None else rows
     clouds = fractal(rng, size_px, size_px, 1.4)
@@ -169,7 +189,9 @@ def plaster(rng: np.random.Generator, base: np.ndarray, size_px: int = 512, dept
     return finish(base * (1.0 + depth * (0.028 * slope + 0.022 * clouds))[..., None])
 
 
-def stripes(rng: np.random.Generator, first: np.ndarray, second: np.ndarray, size_px: int = 512) -> np.ndarray:
+def stripes(
+    rng: np.random.Generator, first: np.ndarray, second: np.ndarray, size_px: int = 512
+) -> np.ndarray:
     """Wallpaper in stripes of four widths with a woven ground."""
     x = np.arange(size_px)
     widths = rng.integers(14, 46, size=6)
@@ -199,7 +221,11 @@ def damask(rng: np.random.Generator, ground: np.ndarray, motif: np.ndarray, size
 
 
 def weave(
-    rng: np.random.Generator, base: np.ndarray, size_px: int = 256, strength: float = 0.16, melange: float = 0.05
+    rng: np.random.Generator,
+    base: np.ndarray,
+    size_px: int = 256,
+    strength: float = 0.16,
+    melange: float = 0.05,
 ) -> np.ndarray:
     """Plain woven cloth: over-and-under threads, uneven yarn."""
     y, x = np.mgrid[:size_px, :size_px].astype(np.float32)
@@ -227,7 +253,9 @@ def shag(rng: np.random.Generator, base: np.ndarray, size_px: int = 512) -> np.n
     return finish(base * (1.0 + pile)[..., None])
 
 
-def veneer(rng: np.random.Generator, base: np.ndarray, size_px: int = 512, contrast: float = 1.0) -> np.ndarray:
+def veneer(
+    rng: np.random.Generator, base: np.ndarray, size_px: int = 512, contrast: float = 1.0
+) -> np.ndarray:
     """Furniture wood, grain along u: cathedral rings, pores, slow change of tone."""
     wave = fractal(rng, size_px, size_px, 2.3, (4.0, 1.0))
     rings = np.sin(9.0 * wave) * 0.5 + np.sin(23.0 * wave) * 0.2
@@ -247,7 +275,9 @@ def stone(rng: np.random.Generator, base: np.ndarray, vein: np.ndarray, size_px:
     return finish((base * (1 - mix) + vein * mix) * clouds)
 
 
-def terrazzo(rng: np.random.Generator, base: np.ndarray, chips: list[np.ndarray], size_px: int = 512) -> np.ndarray:
+def terrazzo(
+    rng: np.random.Generator, base: np.ndarray, chips: list[np.ndarray], size_px: int = 512
+) -> np.ndarray:
     """Stone chips in cement, also good as granite."""
     out = np.broadcast_to(base, (size_px, size_px, 3)).astype(np.float32).copy()
     for _ in range(2200):
@@ -257,7 +287,9 @@ def terrazzo(rng: np.random.Generator, base: np.ndarray, chips: list[np.ndarray]
         for dx in (-size_px, 0, size_px):  # a chip on the rim comes back on the other side
             at = (int(centre[0]) + dx, int(centre[1]))
             if -8 < at[0] < size_px + 8:
-                cv2.ellipse(out, at, axes, float(rng.uniform(0, 180)), 0, 360, colour.tolist(), -1, cv2.LINE_AA)
+                cv2.ellipse(
+                    out, at, axes, float(rng.uniform(0, 180)), 0, 360, colour.tolist(), -1, cv2.LINE_AA
+                )
     return finish(out * (1.0 + 0.02 * fractal(rng, size_px, size_px, 0.5)[..., None]))
 
 
@@ -279,4 +311,6 @@ def dots(rng: np.random.Generator, ground: np.ndarray, spot: np.ndarray, size_px
     column = (x // pitch) % 2
     d = np.hypot(x % pitch - pitch / 2, (y + column * pitch / 2) % pitch - pitch / 2)
     mask = np.clip((pitch * 0.26 - d) / 1.5, 0, 1)[..., None]
-    return finish((ground * (1 - mask) + spot * mask) * (1 + 0.03 * fractal(rng, size_px, size_px, 0.6)[..., None]))
+    return finish(
+        (ground * (1 - mask) + spot * mask) * (1 + 0.03 * fractal(rng, size_px, size_px, 0.6)[..., None])
+    )

@@ -86,8 +86,14 @@ def surface_points(
     unit = scene.normal / np.maximum(2 * area[:, None], 1e-30)
     e1, e2 = _edges(scene)
     # Triangles are small: one with no corner and no middle in sight has nothing in sight worth a point.
-    probes = np.stack([scene.corner + 0.02 * (e1 + e2), scene.corner + 0.96 * e1, scene.corner + 0.96 * e2,
-                       scene.corner + (e1 + e2) / 3])  # fmt: skip
+    probes = np.stack(
+        [
+            scene.corner + 0.02 * (e1 + e2),
+            scene.corner + 0.96 * e1,
+            scene.corner + 0.96 * e2,
+            scene.corner + (e1 + e2) / 3,
+        ]
+    )
     in_sight = np.any([seen.count(p, unit) > 0 for p in probes], axis=0)
     weight = np.where(in_sight, area, 0.0)
     if weight.sum() <= 0.0:
@@ -139,9 +145,15 @@ def _point_radiance(s: Surfaces, triangle: np.ndarray, a: np.ndarray, b: np.ndar
 
 
 def write_extra_views(
-    folder: Path, studio: Studio, space: FreeSpace, seen: Seen, times_s: np.ndarray, count: int,
-    rng: np.random.Generator, progress: Callable[[int, int], None],
-) -> int:  # fmt: skip
+    folder: Path,
+    studio: Studio,
+    space: FreeSpace,
+    seen: Seen,
+    times_s: np.ndarray,
+    count: int,
+    rng: np.random.Generator,
+    progress: Callable[[int, int], None],
+) -> int:
     """Pinhole views off the path of what the drive has seen, without movers, with depth; returns how many."""
     folder.mkdir()
     camera = studio.shoot.camera
@@ -179,10 +191,17 @@ def write_extra_views(
         progress(len(views), count)
     K = camera.K
     intrinsics = {
-        "width": camera.width_px, "height": camera.height_px, "fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2],
-        "cy": K[1, 2], "distortion": [0, 0, 0, 0, 0],
-    }  # fmt: skip
-    (folder / "poses.json").write_text(json.dumps({"intrinsics": intrinsics, "views": views}, indent=1) + "\n")
+        "width": camera.width_px,
+        "height": camera.height_px,
+        "fx": K[0, 0],
+        "fy": K[1, 1],
+        "cx": K[0, 2],
+        "cy": K[1, 2],
+        "distortion": [0, 0, 0, 0, 0],
+    }
+    (folder / "poses.json").write_text(
+        json.dumps({"intrinsics": intrinsics, "views": views}, indent=1) + "\n"
+    )
     return len(views)
 
 

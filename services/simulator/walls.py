@@ -33,7 +33,9 @@ class Finish:
 def draw_shell(b: MeshBuilder, room: Room, finish: Finish, rng: np.random.Generator) -> None:
     """Everything that does not move out with the tenants."""
     width, depth = room.x1 - room.x0, room.y1 - room.y0
-    b.quad((room.x0, room.y0, 0.0), (width, 0, 0), (0, depth, 0), finish.floor, offset=(0.3, 0.1), edge_m=0.07)
+    b.quad(
+        (room.x0, room.y0, 0.0), (width, 0, 0), (0, depth, 0), finish.floor, offset=(0.3, 0.1), edge_m=0.07
+    )
     b.quad((room.x0, room.y1, CEILING_M), (width, 0, 0), (0, -depth, 0), finish.ceiling, edge_m=0.16)
     for side in SIDES:
         frame = b.placed(*room.corner(side), 0.0, YAW[side])
@@ -54,9 +56,15 @@ def draw_shell(b: MeshBuilder, room: Room, finish: Finish, rng: np.random.Genera
 
 
 def _wall(
-    b: MeshBuilder, length: float, openings: list[Opening], upper: Material, lower: Material, finish: Finish,
-    *, dado: bool,
-) -> None:  # fmt: skip
+    b: MeshBuilder,
+    length: float,
+    openings: list[Opening],
+    upper: Material,
+    lower: Material,
+    finish: Finish,
+    *,
+    dado: bool,
+) -> None:
     split = 0.92 if dado and finish.dado is not None else 0.0
     cuts = [0.0]
     for hole in sorted(openings, key=lambda o: o.s0):

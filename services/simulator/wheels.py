@@ -41,7 +41,10 @@ class Wheels:
         # Slip grows with what the wheels do: a standing robot's odometry stands.
         grain = self._rng.standard_normal((2, len(pose)))
         forward = forward * self.scale + self._noise * np.sqrt(np.abs(forward) * 0.01) * grain[0]
-        turn = turn * self.turn + self._noise * np.sqrt(np.abs(turn) * 0.02 + np.abs(forward) * 0.0005) * grain[1]
+        turn = (
+            turn * self.turn
+            + self._noise * np.sqrt(np.abs(turn) * 0.02 + np.abs(forward) * 0.0005) * grain[1]
+        )
         yaw = self._pose[2] + np.cumsum(turn)
         along = yaw - turn / 2
         x = self._pose[0] + np.cumsum(forward * np.cos(along))

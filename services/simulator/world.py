@@ -1,4 +1,4 @@
-"""A scene ready to be driven through: lit geometry, textures, a route; built once, then found in the cache."""
+"""A scene ready to be driven through: lit geometry, textures, a route; built once, then cached."""
 
 from __future__ import annotations
 
@@ -95,9 +95,7 @@ def _lamps(route_m: np.ndarray) -> tuple[Light, ...]:
     for point in route_m:
         if all(np.linalg.norm(point - other) > 2.5 for other in chosen):
             chosen.append(point)
-    return tuple(
-        Light((float(x), float(y), 2.2), radius_m=0.2, intensity=(3.0, 2.9, 2.7)) for x, y in chosen
-    )
+    return tuple(Light((float(x), float(y), 2.2), radius_m=0.2, intensity=(3.0, 2.9, 2.7)) for x, y in chosen)
 
 
 def _save(world: World, out: object) -> None:
@@ -110,7 +108,11 @@ def _save(world: World, out: object) -> None:
     arrays = {f"mesh_{k}": getattr(mesh, k) for k in _MESH}
     arrays |= {f"atlas_{k}": getattr(atlas, k) for k in _ATLAS}
     np.savez(
-        out, head=np.frombuffer(json.dumps(head).encode(), np.uint8), light=world.light, route_m=world.route_m, **arrays
+        out,
+        head=np.frombuffer(json.dumps(head).encode(), np.uint8),
+        light=world.light,
+        route_m=world.route_m,
+        **arrays,
     )
 
 
@@ -124,7 +126,8 @@ def load_world(path: Path) -> World:
         head = json.loads(data["head"].tobytes())
         materials = tuple(Material(**{**m, "tint": tuple(m["tint"])}) for m in head["materials"])
         lights = tuple(
-            Light(**{k: tuple(v) if isinstance(v, list) else v for k, v in light.items()}) for light in head["lights"]
+            Light(**{k: tuple(v) if isinstance(v, list) else v for k, v in light.items()})
+            for light in head["lights"]
         )
         mesh = Mesh(**{k: data[f"mesh_{k}"] for k in _MESH}, materials=materials)
         atlas = Atlas(tuple(head["names"]), **{k: data[f"atlas_{k}"] for k in _ATLAS})

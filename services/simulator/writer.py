@@ -203,7 +203,7 @@ def write_camera_json(path: Path, camera: CameraSettings, lidar: LidarSettings, 
         "rate_hz": camera.rate_hz,
         "pixel_convention": "pixel centres at integer coordinates: u = fx*X/Z+cx",
         "depth_unit": "uint16 millimetres along optical z, 0 = no surface",
-        "depth_grid": "depth_gt and moving_masks share the pixels of the (distorted) images; extra_views are pinhole",
+        "depth_grid": "depth_gt and moving_masks have the images' distorted pixels; extra_views are pinhole",
         "frames": {
             "base": f"{BASE} (on the floor between the wheels, x forward, z up)",
             "camera": f"{CAMERA} (x right, y down, z forward)",

@@ -38,8 +38,16 @@ def room(sizes):
 def room_atlas(textures):
     from services.simulator.humanoid import clothes
 
-    return build_atlas({**textures, **clothes(np.random.default_rng(0)), "oak": textures["noise"],
-                        "steel": textures["plain"], "black": textures["plain"], "cushion_b": textures["noise"]})  # fmt: skip
+    return build_atlas(
+        {
+            **textures,
+            **clothes(np.random.default_rng(0)),
+            "oak": textures["noise"],
+            "steel": textures["plain"],
+            "black": textures["plain"],
+            "cushion_b": textures["noise"],
+        }
+    )
 
 
 @pytest.fixture(scope="session")

@@ -2,19 +2,21 @@
 
 import numpy as np
 import pytest
+from tests_simulator_room import draw_room
 
 from common.geometry import inverse, se2_to_se3, wrap_angle
-from services.simulator.mesh import Material, MeshBuilder
 from services.simulator.cast import Caster
 from services.simulator.freespace import FreeSpace
+from services.simulator.mesh import Material, MeshBuilder
 from services.simulator.movers import KEEP_OFF_M, TURN_M, Walk, choose_walks
 from services.simulator.path import Drive, Limits, resample_closed
 from services.simulator.settings import WheelSettings
 from services.simulator.shapes import box
 from services.simulator.wheels import Wheels
-from tests_simulator_room import draw_room
 
-SQUARE = resample_closed(np.array([[0.0, 0.0], [5.0, 0.0], [5.5, 1.5], [5.0, 3.5], [0.0, 3.5], [-0.5, 2.0]]), 0.5)
+SQUARE = resample_closed(
+    np.array([[0.0, 0.0], [5.0, 0.0], [5.5, 1.5], [5.0, 3.5], [0.0, 3.5], [-0.5, 2.0]]), 0.5
+)
 LIMITS = Limits()
 
 

@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
+from tests_simulator_room import draw_room, room_distance
 
 from services.simulator.cast import Caster
 from services.simulator.lidar import Lidar
 from services.simulator.mesh import Material, MeshBuilder, merge
 from services.simulator.settings import LidarSettings
-from tests_simulator_room import draw_room, room_distance
 
 QUIET = LidarSettings(noise_m=0.0, dropout=0.0)
 
@@ -63,7 +63,10 @@ def test_glass_lets_some_beams_through_and_says_which(sizes):
         scans, through = zip(*(lidar.measure(revolution, rng) for _ in range(40)))
         assert np.mean(np.stack(through)[:, ahead]) == pytest.approx(share, abs=0.05)
         assert not np.stack(through)[:, ~ahead & (np.abs(revolution.range_m) < 2.5)].any()
-        x = np.stack(scans)[:, ahead] * np.cos(settings.angle_min_rad + settings.angle_increment_rad * np.arange(720))[ahead]
+        x = (
+            np.stack(scans)[:, ahead]
+            * np.cos(settings.angle_min_rad + settings.angle_increment_rad * np.arange(720))[ahead]
+        )
         np.testing.assert_allclose(np.where(np.stack(through)[:, ahead], x, 5.0), 5.0, atol=1e-3)
         np.testing.assert_allclose(np.where(np.stack(through)[:, ahead], 3.0, x), 3.0, atol=1e-3)
 
@@ -73,13 +76,18 @@ def test_beams_on_a_mover_are_marked_and_follow_it_within_the_revolution(room, s
     lidar = Lidar(room, Caster.of(room), settings)
     still = lambda times: np.zeros((len(times), 3))  # noqa: E731
 
-    def wall_ahead(time_s):
-        b = MeshBuilder(sizes)
-        x = 2.0 - time_s  # comes nearer at 1 m/s
-        b.quad((x, 0.5, 0), (0, -1.0, 0), (0, 0, 1.0), Material("plain"))
-        return Caster.of(b.build())
+    class Wall:
+        """Comes nearer at 1 m/s."""
 
-    revolution = lidar.revolution(0.0, still, wall_ahead)
+        def circles(self, time_s):
+            return np.array([[2.0 - time_s, 0.0, 0.6]])
+
+        def caster_of(self, index, time_s):
+            b = MeshBuilder(sizes)
+            b.quad((2.0 - time_s, 0.5, 0), (0, -1.0, 0), (0, 0, 1.0), Material("plain"))
+            return Caster.of(b.build())
+
+    revolution = lidar.revolution(0.0, still, Wall())
     angle = settings.angle_min_rad + settings.angle_increment_rad * np.arange(720)
     np.testing.assert_array_equal(revolution.moving, np.abs(angle) < np.arctan2(0.5, 1.95) - 1e-3)
     # Beams straight ahead are the middle of the revolution: 50 ms after its start, within half a slice.

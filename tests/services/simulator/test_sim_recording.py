@@ -25,9 +25,14 @@ def run(out, settings, **options):
 
 def base(scene_file, **changes):
     settings = {
-        "seed": 3, "seconds": 4.0, "people": 1, "scene": str(scene_file), "camera": CAMERA,
-        "extra_views": 3, "surface_points": 3000,
-    }  # fmt: skip
+        "seed": 3,
+        "seconds": 4.0,
+        "people": 1,
+        "scene": str(scene_file),
+        "camera": CAMERA,
+        "extra_views": 3,
+        "surface_points": 3000,
+    }
     return Simulation(**{**settings, **changes})
 
 
@@ -92,7 +97,9 @@ def test_depth_pictures_lie_on_the_surface_the_scans_see(recorded):
     out, _ = recorded
     bag = read(out)
     camera = json.loads((out / "camera.json").read_text())
-    T_camera_lidar = np.linalg.inv(camera["T_base_camera"]["matrix"]) @ np.array(camera["T_base_lidar"]["matrix"])
+    T_camera_lidar = np.linalg.inv(camera["T_base_camera"]["matrix"]) @ np.array(
+        camera["T_base_lidar"]["matrix"]
+    )
     stamp = min(int(p.stem) for p in (out / "depth_gt").iterdir())
     depth = cv2.imread(str(out / "depth_gt" / f"{stamp}.png"), cv2.IMREAD_UNCHANGED) / 1000.0
     scan = min((m for _, m in bag["/scan"]), key=lambda m: abs(stamp_of(m) - stamp))
@@ -172,7 +179,9 @@ def test_planted_faults_are_in_the_bag_and_named_beside_it(recorded, scene_file,
         np.testing.assert_array_equal(g.data, b.data)
 
     def mount(bag):
-        link = next(t for t in bag["/tf_static"][0][1].transforms if t.child_frame_id == "camera_optical_frame")
+        link = next(
+            t for t in bag["/tf_static"][0][1].transforms if t.child_frame_id == "camera_optical_frame"
+        )
         q, t = link.transform.rotation, link.transform.translation
         return make_transform(matrix_from_quat_xyzw([q.x, q.y, q.z, q.w]), [t.x, t.y, t.z])
 
@@ -187,7 +196,10 @@ def test_planted_faults_are_in_the_bag_and_named_beside_it(recorded, scene_file,
 
 def test_laps_reuse_pictures_but_not_noise(scene_file, own_cache, tmp_path):
     tiny = CameraSettings(width_px=48, height_px=36, rate_hz=1.0)
-    summary = run(tmp_path / "laps", base(scene_file, seconds=None, laps=2, people=0, camera=tiny, extra_views=0, surface_points=100))
+    summary = run(
+        tmp_path / "laps",
+        base(scene_file, seconds=None, laps=2, people=0, camera=tiny, extra_views=0, surface_points=100),
+    )
     bag = read(tmp_path / "laps")
     images = [(stamp_of(m), m.data.tobytes()) for _, m in bag["/camera/image_raw/compressed"]]
     half = len(images) // 2

@@ -2,18 +2,18 @@
 
 import numpy as np
 import pytest
+from tests_simulator_room import HALF_X, draw_room, room_distance
 
 from common.frames import camera_mount
 from common.geometry import se2_to_se3
 from services.simulator.camera import pixel_rays
 from services.simulator.cast import Caster
+from services.simulator.humanoid import person
 from services.simulator.light import bake
 from services.simulator.mesh import Material, MeshBuilder
 from services.simulator.movers import Cast, Stage, Walk
 from services.simulator.render import Renderer, ray_table
 from services.simulator.shade import sample, surfaces
-from services.simulator.humanoid import person
-from tests_simulator_room import HALF_X, draw_room, room_distance
 
 K = np.array([[130.0, 0.0, 79.5], [0.0, 130.0, 59.5], [0.0, 0.0, 1.0]])
 RAYS = pixel_rays(160, 120, K)
@@ -46,7 +46,8 @@ def test_a_lamp_gives_the_irradiance_of_the_inverse_square_law(sizes, room_atlas
     x, y = floor.vertices_m[:, 0], floor.vertices_m[:, 1]
     squared = x**2 + y**2 + 4.0
     expected = 3.0 * (2.0 / np.sqrt(squared)) / squared / np.pi
-    ambient = light[:, 0] - expected
+    inner = (np.abs(x) < 0.8) & (np.abs(y) < 0.8)  # the rim is smoothed from one side only
+    ambient = (light[:, 0] - expected)[inner]
     assert np.ptp(ambient) < 0.03 * expected.max()  # the rest is the constant ambient term
 
 
@@ -113,7 +114,7 @@ def test_pixels_on_an_edge_are_a_mixture(sizes, room_atlas):
     b.quad((HALF_X - 0.01, 0.013, 0), (0, -1.5, 0), (0, 0, 2.5), Material("plain"))
     mesh = b.build()
     scene = surfaces(mesh, room_atlas, np.ones((len(mesh.vertices_m), 3), np.float32))
-    picture = Renderer(Caster.of(mesh), scene).picture(pose(0.0, 0.0, 0.0) , TABLE)
+    picture = Renderer(Caster.of(mesh), scene).picture(pose(0.0, 0.0, 0.0), TABLE)
     row = picture.radiance[40, :, 0]
     levels = np.unique(np.round(row / row.max(), 3))
     assert np.any((levels > 0.2) & (levels < 0.9))

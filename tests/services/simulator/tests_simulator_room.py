@@ -7,7 +7,10 @@ from services.simulator.mesh import Material
 HALF_X, HALF_Y, HEIGHT = 3.0, 2.0, 2.5
 
 
-def draw_room(b, wall=Material("noise"), east=None):
+WALL = Material("noise")
+
+
+def draw_room(b, wall=WALL, east=None):
     """Inner faces of a 6 x 4 x 2.5 m room about the origin."""
     x, y, z = 2 * HALF_X, 2 * HALF_Y, HEIGHT
     b.quad((-HALF_X, -HALF_Y, 0), (x, 0, 0), (0, y, 0), wall)
