@@ -80,6 +80,11 @@ class Supervisor:
     def _start_all(self) -> None:
         """The router, then who listens, then who speaks."""
         if ROUTER in self._names:
+            if self._router_answers():
+                raise UserError(
+                    f"a router already runs at {', '.join(self.deployment.router.listen)}: stop it, name the "
+                    "nodes to run beside it (beamsplat run FILE NODE...), or choose another router.listen"
+                )
             self._start(ROUTER)
             self._wait_for_router()
         classes = node_classes(self.deployment, self._table)
@@ -87,12 +92,17 @@ class Supervisor:
         for name in sorted(nodes, key=lambda n: classes[n].is_source()):
             self._start(name)
 
+    def _router_answers(self) -> bool:
+        with contextlib.suppress(UserError):
+            open_session(self.deployment.router.listen, wait_s=0.0).close()
+            return True
+        return False
+
     def _wait_for_router(self) -> None:
         router = self.children[ROUTER]
         deadline = time.monotonic() + 20.0
         while time.monotonic() < deadline:
-            with contextlib.suppress(UserError):
-                open_session(self.deployment.router.listen, wait_s=0.0).close()
+            if self._router_answers():
                 return
             if not router.process.is_alive():
                 raise UserError(f"the router did not start: {_last_line(self.log_file(ROUTER))}")

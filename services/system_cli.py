@@ -105,8 +105,7 @@ def run_checked(deployment: Deployment, names: tuple[str, ...] | None = None) ->
                     if show:
                         screen.update(board.nodes_table())
                     nodes = [c for c in supervisor.children.values() if c.name != "router"]
-                    failed = [c for c in nodes if c.gave_up]
-                    if failed:
+                    if any(c.gave_up for c in supervisor.children.values()):
                         raise UserError(events[-1])
                     states = board.states()
                     if nodes and all(c.exit_code == 0 or states.get(c.name) == "drained" for c in nodes):

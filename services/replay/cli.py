@@ -30,6 +30,8 @@ def info(
     """What is in a bag or recording: topics, rates, gaps, sensors, calibration, problems.
 
     Exit code 2, and the reason in one sentence, if it cannot be played as it is.
+
+    Example: beamsplat info drive/bag
     """
     from services.replay.inspection import inspect
     from services.replay.options import SourceOptions
@@ -57,7 +59,14 @@ def rig(
     ] = 65.0,
     overwrite: Annotated[bool, typer.Option(help="Replace an existing file.")] = False,
 ) -> None:
-    """A first calibration file: what was found, what was assumed, what must be measured with a tape."""
+    """A first calibration file: what was found, what was assumed, what must be measured with a tape.
+
+    Examples:
+
+        beamsplat rig drive/bag --out rig.toml
+
+        beamsplat rig /dev/video0 --fov-deg 78
+    """
     from common.rig import write_rig
     from services.replay.rig_draft import draft_from_data, draft_from_device, is_device
 
