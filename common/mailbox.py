@@ -16,6 +16,8 @@ from common.topics import ROW_NUMBER
 
 NOBODY = "nobody"  # ends an input that no node produces
 MAX_QUEUED = 20_000  # of an `every` input: beyond it the oldest goes, and is counted
+MAX_QUEUED_BYTES = 256 * 1024 * 1024  # likewise: pictures for a recorder whose disk has stalled
+_MAX_COUNT = 2**63 - 1  # what a Health message can say
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,6 +27,7 @@ class Letter:
     topic: str
     header: Header
     message: Message
+    size_bytes: int = 0  # of the payload; 0 where there was none
 
 
 @dataclass
@@ -40,6 +43,7 @@ class InputCount:
     epoch: int = -1
     expected: dict[str, int] = field(default_factory=dict)  # instance -> next sequence
     ended_by: str | None = None
+    queued_bytes: int = 0
 
 
 class Mailbox:
@@ -63,14 +67,21 @@ class Mailbox:
         if letter.topic in self._slots:
             count.dropped += 1
         if every:
-            if self._merger.queued(letter.topic) >= MAX_QUEUED:
-                self._merger.drop_oldest(letter.topic)
-                count.dropped += 1
-            self._merger.reopen(letter.topic)
+            self._make_room(letter, count)
             self._merger.put(letter.topic, letter.message.stamp_ns, letter)
+            if count.ended_by is not None:  # a straggler: its producer has ended all the same
+                self._merger.end(letter.topic)
         else:
             self._slots[letter.topic] = letter
         return True
+
+    def _make_room(self, letter: Letter, count: InputCount) -> None:
+        while queued := self._merger.queued(letter.topic):
+            if queued < MAX_QUEUED and count.queued_bytes + letter.size_bytes <= MAX_QUEUED_BYTES:
+                break
+            count.queued_bytes -= self._merger.drop_oldest(letter.topic).size_bytes
+            count.dropped += 1
+        count.queued_bytes += letter.size_bytes
 
     def _admit(self, count: InputCount, header: Header, every: bool) -> bool:
         """Epoch and sequence bookkeeping; False for a stale or repeated message."""
@@ -92,7 +103,8 @@ class Mailbox:
             else:
                 count.dropped += gap
         count.expected[header.instance] = header.sequence + 1
-        count.ended_by = None
+        if header.instance != count.ended_by:
+            count.ended_by = None
         return True
 
     def end(self, topic: str, instance: str, epoch: int) -> None:
@@ -109,15 +121,15 @@ class Mailbox:
         return self.counts[topic].expected.get(instance, 0)
 
     def pop(self) -> Letter | None:
-        """The letter to handle next: the oldest of what is certain, by (stamp, row)."""
-        slot = min(
-            self._slots.values(), key=lambda s: (s.message.stamp_ns, ROW_NUMBER[s.topic]), default=None
-        )
+        """The letter to handle next: what is certain of the `every` inputs, then the oldest of the rest."""
         merged = self._merger.pop()
         if merged is not None:
             letter = merged[1]
-        elif slot is not None:
-            letter = self._slots.pop(slot.topic)
+            self.counts[letter.topic].queued_bytes -= letter.size_bytes
+        elif self._slots:
+            slots = self._slots.values()
+            oldest = min(slots, key=lambda s: (s.message.stamp_ns, ROW_NUMBER[s.topic]))
+            letter = self._slots.pop(oldest.topic)
         else:
             return None
         self.counts[letter.topic].received += 1
@@ -133,8 +145,9 @@ class Mailbox:
         """The counters as they go into a Health message."""
         return tuple(
             InputHealth(
-                topic=name, received=c.received, dropped=c.dropped, lost=c.lost,
-                undecodable=c.undecodable, stale=c.stale, age_ms=max(c.age_ms, 0.0),
+                topic=name, received=c.received, dropped=min(c.dropped, _MAX_COUNT),
+                lost=min(c.lost, _MAX_COUNT), undecodable=c.undecodable, stale=c.stale,
+                age_ms=max(c.age_ms, 0.0),
             )
             for name, c in self.counts.items()
         )  # fmt: skip

@@ -126,7 +126,8 @@ def open_sample(sample: zenoh.Sample, row: Topic) -> Letter:
         raise DecodeError("sample without a header")
     header = Header.unpack(sample.attachment.to_bytes())
     schema = str(sample.encoding).partition(";")[2]
-    message = decode(schema, sample.payload.to_bytes())
+    payload = sample.payload.to_bytes()
+    message = decode(schema, payload)
     if type(message) is not row.message:
         raise DecodeError(f"{schema} on {row.name}, which carries {row.message.schema_name()}")
-    return Letter(row.name, header, message)
+    return Letter(row.name, header, message, len(payload))

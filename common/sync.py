@@ -48,19 +48,14 @@ class StampMerger:
             if self._front_ns - self._newest_ns.get(name, self._first_ns) > self._patience_ns:
                 self._given_up.add(name)
 
-    def drop_oldest(self, stream: str) -> None:
-        """Forgets the oldest item of `stream`: the caller's bound was hit, and the caller counts."""
-        self._queues[stream].popleft()
+    def drop_oldest(self, stream: str) -> Any:
+        """Takes the oldest item out of `stream`: the caller's bound was hit, and the caller counts."""
+        return self._queues[stream].popleft()[1]
 
     def end(self, stream: str) -> None:
-        """Nothing more will come from `stream`."""
+        """Nothing more will come from `stream`, unless a successor speaks."""
         self._newest_ns[stream] = _END_NS
         self._given_up.discard(stream)
-
-    def reopen(self, stream: str) -> None:
-        """A successor speaks where `stream` had ended."""
-        if self._newest_ns.get(stream) == _END_NS:
-            del self._newest_ns[stream]
 
     def pop(self) -> tuple[str, Any] | None:
         """The next (stream, item), or None while it is not certain which that is."""
