@@ -62,7 +62,7 @@ class Live:
         self.node = node
         self.settings = settings
         self.instance = secrets.token_hex(8)
-        self.mailbox = Mailbox(type(node))
+        self.mailbox = Mailbox(type(node), time.monotonic_ns)
         self._changed = threading.Condition()
         self._stopping = False
         self._state = "configure"

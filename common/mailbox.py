@@ -6,6 +6,7 @@ it. Whatever is overtaken, lost, stale or undecodable is counted here, per input
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from common.header import Header
@@ -49,9 +50,10 @@ class InputCount:
 class Mailbox:
     """The inputs of one node."""
 
-    def __init__(self, node: type[Node]) -> None:
+    def __init__(self, node: type[Node], clock_ns: Callable[[], int] | None = None) -> None:
+        """`clock_ns` is given live: see `StampMerger`."""
         self._deliveries = {i.topic: i.effective_delivery for i in _inputs(node)}
-        self._merger = StampMerger(merged_topics(node))
+        self._merger = StampMerger(merged_topics(node), clock_ns=clock_ns)
         self._slots: dict[str, Letter] = {}
         self.counts = {name: InputCount() for name in self._deliveries}
 
