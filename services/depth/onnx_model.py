@@ -93,7 +93,7 @@ class OnnxModel:
             channels_last = len(port.shape) == 4 and port.shape[3] == 3
             hint = " (channels last: export it with N x 3 x H x W)" if channels_last else ""
             raise UserError(
-                f"{self.path}: input {port.name!r} has shape {_show(port.shape)}; expected N x 3 x H x W{hint}"
+                f"{self.path}: input {port.name!r} has shape {_show(port.shape)}; not N x 3 x H x W{hint}"
             )
         return port
 

@@ -43,7 +43,7 @@ class Recorded:
             if abs(values.shape[1] / values.shape[0] - w / h) > 0.02:
                 return Estimate(
                     empty, self._kind,
-                    f"{self._files[i]}: {values.shape[1]}x{values.shape[0]} does not show the {w}x{h} picture",
+                    f"{self._files[i]}: {values.shape[1]}x{values.shape[0]} does not fit the {w}x{h} picture",
                 )  # fmt: skip
             values = cv2.resize(values, (w, h), interpolation=cv2.INTER_NEAREST)
         return Estimate(values, self._kind, judge(values, least_share=0.01))

@@ -35,7 +35,7 @@ class View:
 
 @dataclass(frozen=True)
 class Estimate:
-    """A dense guess. metric: metres; relative: metres up to a factor; disparity: a / z + b, nearer = larger."""
+    """A dense guess. metric: metres; relative: up to a factor; disparity: a / z + b, nearer = larger."""
 
     values: np.ndarray  # float32 [H, W] of the picture's size; NaN = no answer
     kind: Kind

@@ -1,4 +1,4 @@
-"""Where model files are: BEAMSPLAT_MODELS, else the user's data folder. Names come from deploy/models.toml."""
+"""Where model files are: BEAMSPLAT_MODELS, else the user's data folder; deploy/models.toml names them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pairs of a beam's optical z and the dense guess at its pixel, and the clustering that drops the wrong ones."""
+"""Pairs of a beam's optical z and the dense guess at its pixel, and the clustering of their ratios."""
 
 from __future__ import annotations
 

@@ -1,0 +1,292 @@
+"""`field`: metric depth everywhere, from surfaces that beams and floor predict, past pictures, and a network.
+
+Neither a network nor extruded beams can be trusted alone. Every candidate only makes its depth cheaper in
+a cost volume; past pictures, seen from poses that the lidar knows to a centimetre, decide per pixel.
+
+`refine` is the step of a keyframe (plane sweep, semi-global matching); `predict` is the step of every
+other picture: it carries the keyframes' depth over.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from common.beams import Beams, project_beams
+from common.camera import Pinhole
+from common.geometry import inverse
+from services.fusion import volume_kernels as kernels
+from services.fusion.guess import metric_guess
+from services.fusion.lidar_map import LidarMap
+from services.fusion.memory import Memory, Remembered
+from services.fusion.relative_pose import corners, refine_between
+from services.fusion.surfaces import CeilingFinder, SurfaceFinder, Surfaces
+
+
+@dataclass(frozen=True)
+class FieldConfig:
+    """Weights are in units of the matching cost, whose worst value is `cost_scale`."""
+
+    width_px: int = 160  # working size; the height follows
+    labels: int = 88
+    z_near_m: float = 0.4
+    z_far_m: float = 14.0
+    baselines_m: tuple[float, ...] = (0.1, 0.2, 0.4, 0.8)
+    max_turn_rad: float = 0.6
+    cost_scale: float = 12.0
+    p1: float = 0.7
+    p2: float = 12.0
+    edge_grey: float = 8.0
+    temperature: float = 2.0
+    wall_near: float = 4.0  # at the height of the lidar
+    wall_far: float = 0.5  # far above and below
+    wall_reach_m: float = 0.15
+    floor: float = 3.0
+    behind: float = 1.0
+    ceiling: float = 2.0
+    ceiling_evidence: float = 500.0
+    memory: float = 1.5
+    memory_keyframes: int = 6
+    memory_spread: float = 0.15
+    guess: float = 0.8
+    guess_spread: float = 0.12
+    near_m: float = 0.7  # unsupported depth below this is unlikely
+    near: float = 1.0
+    rotation_sigma_rad: float = 0.007
+    translation_sigma_m: float = 0.015
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One undistorted picture with its pose, beams and the guess of a depth source."""
+
+    stamp_ns: int
+    image_rgb: np.ndarray  # uint8 [H, W, 3]
+    T_map_body: np.ndarray
+    beams: Beams
+    guess: np.ndarray | None = None  # float32 [H, W]
+    guess_kind: str = "none"
+
+
+@dataclass(frozen=True)
+class Small:
+    """A picture at the working size."""
+
+    T_map_camera: np.ndarray
+    grey: np.ndarray  # float32 [h, w]
+    features: np.ndarray  # float32 [h, w, 3]
+    middle: np.ndarray  # uint8 [2h, 2w]: corners are tracked here
+
+
+@dataclass(frozen=True)
+class Solved:
+    """Depth at the working size."""
+
+    depth_m: np.ndarray  # float32 [h, w]
+    spread: np.ndarray  # float32 [h, w]: standard deviation of log depth, as the method believes
+    snapped: np.ndarray  # bool [h, w]: depth taken from a surface that beams or floor predict
+    views: int  # pictures swept over
+
+
+def features(grey: np.ndarray, side: int = 9, floor_grey: float = 3.0) -> np.ndarray:
+    """float32 [h, w, 3]: grey and its gradient, by the contrast around: blind to exposure and gain."""
+    mean = cv2.boxFilter(grey, -1, (side, side))
+    contrast = (
+        np.sqrt(np.maximum(cv2.boxFilter(grey * grey, -1, (side, side)) - mean * mean, 0.0)) + floor_grey
+    )
+    dx = cv2.Sobel(grey, cv2.CV_32F, 1, 0, ksize=3, scale=0.125)
+    dy = cv2.Sobel(grey, cv2.CV_32F, 0, 1, ksize=3, scale=0.125)
+    return np.stack([(grey - mean) / contrast, dx / contrast, dy / contrast], axis=-1)
+
+
+class Field:
+    """State of a drive: past pictures, the lidar's map, keyframe depth, ceilings."""
+
+    def __init__(
+        self, camera: Pinhole, T_body_camera: np.ndarray, *, floor_known: bool, planar: bool,
+        config: FieldConfig | None = None,
+    ) -> None:  # fmt: skip
+        if camera.is_distorted:
+            raise ValueError("fusion works on undistorted pictures: pass Pinhole.undistorted()")
+        self.config = config or FieldConfig()
+        self.camera = camera
+        self.T_body_camera = T_body_camera
+        width = self.config.width_px
+        height = round(camera.height_px * width / camera.width_px)
+        self.small_camera = camera.resized(width, height)
+        self._middle_camera = camera.resized(2 * width, 2 * height)
+        c = self.small_camera
+        self._K = np.array([c.fx_px, c.fy_px, c.cx_px, c.cy_px], dtype=np.float32)
+        self._finder = SurfaceFinder(c, T_body_camera, floor_known=floor_known)
+        self._floor_known = floor_known
+        self._ceilings = CeilingFinder()
+        self._lidar_map = LidarMap() if planar else None
+        self._memory = Memory(self._K, c.shape, self.config.memory_keyframes)
+        self._past: deque[Small] = deque(maxlen=240)
+        self._log_z = np.linspace(
+            np.log(self.config.z_near_m), np.log(self.config.z_far_m), self.config.labels
+        )
+        limit = np.where(np.isfinite(self._finder.floor), self._finder.floor * 1.08, np.inf)
+        self._z_last = np.maximum(limit, 1.1 * self.config.z_near_m).astype(np.float32)
+
+    def add_scan(self, points_map_m: np.ndarray) -> None:
+        """Returns [N, 3] of a scan in the map frame, for walls behind walls."""
+        if self._lidar_map is not None:
+            self._lidar_map.add(points_map_m)
+
+    def shrink(self, frame: Frame) -> Small:
+        """The picture at the working size."""
+        grey = cv2.cvtColor(frame.image_rgb, cv2.COLOR_RGB2GRAY)
+        h, w = self.small_camera.shape
+        middle = cv2.resize(grey, (2 * w, 2 * h), interpolation=cv2.INTER_AREA)
+        small = cv2.resize(middle, (w, h), interpolation=cv2.INTER_AREA).astype(np.float32)
+        return Small(frame.T_map_body @ self.T_body_camera, small, features(small), middle)
+
+    def keep(self, small: Small) -> None:
+        """Remembers a picture for later sweeps if the camera has moved since the last one."""
+        if self._past:
+            T = inverse(self._past[-1].T_map_camera) @ small.T_map_camera
+            if np.linalg.norm(T[:3, 3]) < 0.03 and np.trace(T[:3, :3]) > 1.0 + 2.0 * np.cos(0.05):
+                return
+        self._past.append(small)
+
+    def surfaces(self, frame: Frame) -> Surfaces:
+        heights = self._ceilings.heights(self.config.ceiling_evidence) if self._floor_known else ()
+        return self._finder.find(frame.beams, self._lidar_map, frame.T_map_body, heights)
+
+    def recall(self, small: Small) -> Remembered:
+        return self._memory.recall(small.T_map_camera)
+
+    def refine(self, frame: Frame, small: Small) -> Solved:
+        """Depth of a keyframe: sweep over past pictures, candidates as priors, semi-global matching."""
+        cost, views = self._sweep(frame, small)
+        if self._floor_known and views:
+            surfaces = self._finder.find(frame.beams, None, frame.T_map_body, ())
+            self._find_ceilings(cost, surfaces.wall)
+        surfaces = self.surfaces(frame)
+        self._add_priors(cost, frame, surfaces, self.recall(small) if len(self._memory) else None)
+        solved = self._solve(cost, small, surfaces, views)
+        sure = solved.spread < self.config.memory_spread
+        self._memory.add(small.T_map_camera, np.where(sure, solved.depth_m, np.nan))
+        return solved
+
+    def choose_views(self, T_map_camera: np.ndarray) -> list[Small]:
+        """Past pictures whose baselines come nearest to the wished ones, facing the same way."""
+        if not self._past:
+            return []
+        past = list(self._past)
+        T = np.array([p.T_map_camera for p in past])
+        distance = np.linalg.norm(T[:, :3, 3] - T_map_camera[:3, 3], axis=1)
+        turn_cos = (np.einsum("nij,ij->n", T[:, :3, :3], T_map_camera[:3, :3]) - 1.0) / 2.0
+        free = (turn_cos > np.cos(self.config.max_turn_rad)) & (distance > 0.04)
+        age = np.arange(len(past))[::-1] * 1e-4
+        chosen = []
+        for wished in self.config.baselines_m:
+            score = np.where(free, np.abs(distance - wished) + age, np.inf)
+            k = int(np.argmin(score))
+            if score[k] < 0.5 * wished:
+                chosen.append(past[k])
+                free[k] = False
+        return chosen
+
+    def _sweep(self, frame: Frame, small: Small) -> tuple[np.ndarray, int]:
+        """(costs float32 [h, w, D], number of views)."""
+        h, w = self.small_camera.shape
+        views = self.choose_views(small.T_map_camera)
+        if not views:
+            return np.full((h, w, self.config.labels), 0.5 * self.config.cost_scale, np.float32), 0
+        uv = corners(small.middle)
+        depth_guess = (
+            float(np.median(np.linalg.norm(frame.beams.points_body_m, axis=1))) if len(frame.beams) else 2.5
+        )
+        T = [
+            refine_between(
+                inverse(view.T_map_camera) @ small.T_map_camera, small.middle, view.middle, uv,
+                self._middle_camera, depth_guess, self.config.rotation_sigma_rad,
+                self.config.translation_sigma_m,
+            )
+            for view in views
+        ]  # fmt: skip
+        raw = np.empty((h, w, self.config.labels), np.float32)
+        kernels.cost_volume(
+            small.features, np.stack([view.features for view in views]),
+            np.array([t[:3, :3] for t in T], np.float32), np.array([t[:3, 3] for t in T], np.float32),
+            self._K, np.exp(self._log_z).astype(np.float32), self._z_last, 1.0, raw,
+        )  # fmt: skip
+        cost = np.empty_like(raw)
+        kernels.box3(raw, self.config.cost_scale, cost)
+        return cost, len(views)
+
+    def _find_ceilings(self, cost: np.ndarray, wall: np.ndarray) -> None:
+        gain = np.zeros(len(self._ceilings.heights_m))
+        step = self._log_z[1] - self._log_z[0]
+        kernels.plane_gain(
+            cost, self._finder.rise, wall, self._finder.camera_z_m, self._log_z[0], step,
+            self._ceilings.heights_m, gain,
+        )  # fmt: skip
+        self._ceilings.add(gain)
+
+    def _add_priors(
+        self, cost: np.ndarray, frame: Frame, surfaces: Surfaces, remembered: Remembered | None
+    ) -> None:
+        c = self.config
+        on_floor = surfaces.on_floor
+        near = np.exp(-np.nan_to_num(surfaces.wall_off_m) / c.wall_reach_m)
+        self._dig(cost, np.where(on_floor, np.nan, surfaces.wall), c.wall_far + c.wall_near * near)
+        self._dig(cost, np.where(on_floor, surfaces.floor, np.nan), c.floor)
+        for layer in surfaces.behind:
+            self._dig(cost, layer, c.behind)
+        for ceiling in surfaces.ceilings:
+            self._dig(cost, ceiling, c.ceiling)
+        if remembered is not None:
+            self._dig(cost, remembered.depth_m, c.memory * np.minimum(remembered.votes, 3) / 3.0)
+        guess = self.guess_of(frame)
+        if guess is not None:
+            trust = float(np.exp(-((guess.spread / c.guess_spread) ** 2)))
+            h, w = self.small_camera.shape
+            small = cv2.resize(guess.depth_m, (w, h), interpolation=cv2.INTER_NEAREST)
+            self._dig(cost, small, c.guess * trust, width=4.0)
+        unlikely = c.near * np.maximum(np.log(c.near_m) - self._log_z, 0.0)
+        cost += unlikely.astype(np.float32)
+
+    def guess_of(self, frame: Frame):  # noqa: ANN201
+        """The network's guess in metres, or None."""
+        if frame.guess is None or frame.guess_kind == "none":
+            return None
+        uv, z, _ = project_beams(frame.beams, self.camera, self.T_body_camera)
+        return metric_guess(frame.guess, frame.guess_kind, uv, z)
+
+    def _dig(self, cost: np.ndarray, z: np.ndarray, weight: np.ndarray | float, width: float = 1.0) -> None:
+        step = self._log_z[1] - self._log_z[0]
+        weights = np.broadcast_to(np.asarray(weight, np.float32), z.shape)
+        z32 = np.asarray(z, dtype=np.float32)
+        kernels.add_prior(cost, z32, np.ascontiguousarray(weights), self._log_z[0], step, width)
+
+    def _solve(self, cost: np.ndarray, small: Small, surfaces: Surfaces, views: int) -> Solved:
+        c = self.config
+        total = np.zeros_like(cost)
+        for dv, du in ((0, 1), (0, -1), (1, 0), (-1, 0)):
+            kernels.aggregate(cost, small.grey, dv, du, c.p1, c.p2, c.edge_grey, total)
+        depth = np.empty(cost.shape[:2], np.float32)
+        spread = np.empty_like(depth)
+        kernels.winners(total, self._log_z, c.temperature, depth, spread)
+        snapped = snap(depth, surfaces, 1.2 * (self._log_z[1] - self._log_z[0]))
+        return Solved(depth, spread, snapped, views)
+
+
+def snap(depth: np.ndarray, surfaces: Surfaces, tolerance: float) -> np.ndarray:
+    """Moves depth [h, w], in place, onto the nearest surface within `tolerance` (log); bool [h, w] where."""
+    wall = np.where(surfaces.on_floor, np.nan, surfaces.wall)
+    best = np.full(depth.shape, tolerance)
+    result = depth.copy()
+    for surface in (wall, surfaces.floor, *surfaces.behind, *surfaces.ceilings):
+        with np.errstate(invalid="ignore"):
+            error = np.abs(np.log(surface / depth))
+            nearer = error < best
+        result[nearer] = surface[nearer]
+        best = np.where(nearer, error, best)
+    depth[:] = result
+    return best < tolerance

@@ -1,0 +1,54 @@
+"""The network's guess as a candidate: brought to metres along the scan line, and how far to trust it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from services.fusion.pairs import make_pairs
+from services.fusion.scaling import Kind, affine, as_depth
+
+_BAND = 0.10  # of the picture's width: how far a beam's ratio reaches sideways
+
+
+@dataclass(frozen=True)
+class MetricGuess:
+    """A network's depth after correction by columns."""
+
+    depth_m: np.ndarray  # float32 [H, W]
+    spread: float  # median |log ratio| at beams that were left out of the correction of their columns
+    pairs: int
+
+
+def metric_guess(values: np.ndarray, kind: Kind, uv_px: np.ndarray, z_m: np.ndarray) -> MetricGuess | None:
+    """The guess times a factor that varies smoothly over the columns; None if too few beams meet it.
+
+    The spread is measured at each beam with a correction made without its neighbours: what the guess
+    would be worth away from the scan line, seen from what it is worth along it.
+    """
+    if kind == "disparity":
+        fitted = affine(values, kind, uv_px, z_m)
+        guess = fitted.depth_m if fitted.ok else as_depth(values, kind)
+    else:
+        guess = values
+    pairs = make_pairs(guess, uv_px, z_m)
+    if len(pairs) < 12:
+        return None
+    log_ratio = np.log(pairs.z_m / pairs.guess)
+    u = pairs.uv_px[:, 0]
+    band = _BAND * values.shape[1]
+    columns = np.arange(values.shape[1], dtype=np.float64)
+    factor = _smooth(columns, u, log_ratio, band, exclude=0.0)
+    left_out = _smooth(u, u, log_ratio, band, exclude=0.5 * band)
+    spread = float(np.median(np.abs(log_ratio - left_out)))
+    return MetricGuess((guess * np.exp(factor)[None]).astype(np.float32), spread, len(pairs))
+
+
+def _smooth(at: np.ndarray, u: np.ndarray, values: np.ndarray, band: float, exclude: float) -> np.ndarray:
+    """Gaussian kernel means [M], samples nearer than `exclude` left out, drawn to the median of all."""
+    distance = np.abs(at[:, None] - u[None])
+    weight = np.exp(-0.5 * (distance / band) ** 2) * (distance >= exclude)
+    centre = float(np.median(values))
+    clipped = np.clip(values, centre - 0.7, centre + 0.7)
+    return (weight @ clipped + 0.5 * centre) / (weight.sum(axis=1) + 0.5)

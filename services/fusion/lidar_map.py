@@ -1,0 +1,109 @@
+"""Beam returns of the drive so far in the floor plane: what stands behind what the lidar sees now.
+
+A column of the picture may look over a low cupboard at a wall that the lidar saw from elsewhere. Only for
+robots that stay on a floor: a tilting lidar paints other heights.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+jit = njit(nogil=True, cache=True, error_model="numpy")
+
+
+class LidarMap:
+    """Grid of return counts and their mean positions; grows with the drive."""
+
+    def __init__(self, cell_m: float = 0.04) -> None:
+        self.cell_m = cell_m
+        self._origin = np.zeros(2, dtype=np.int64)  # cell numbers of [0, 0]
+        self._cells = np.zeros((0, 0, 3), dtype=np.float32)  # count, sum x, sum y relative to the cell
+
+    def add(self, points_map_m: np.ndarray) -> None:
+        """Takes in the returns [N, 2 or 3] of a scan."""
+        if len(points_map_m) == 0:
+            return
+        xy = points_map_m[:, :2]
+        cells = np.floor(xy / self.cell_m).astype(np.int64)
+        self._cover(cells.min(axis=0), cells.max(axis=0))
+        inner = xy - (cells + 0.5) * self.cell_m
+        column, row = (cells - self._origin).T
+        for k, value in enumerate((np.ones(len(xy)), inner[:, 0], inner[:, 1])):
+            np.add.at(self._cells[..., k], (row, column), value.astype(np.float32))
+
+    def _cover(self, low: np.ndarray, high: np.ndarray) -> None:
+        rows, columns = self._cells.shape[:2]
+        if rows and np.all(low >= self._origin) and np.all(high < self._origin + np.array([columns, rows])):
+            return
+        margin = 128
+        if rows:
+            low = np.minimum(low - margin, self._origin)
+            high = np.maximum(high + margin, self._origin + np.array([columns - 1, rows - 1]))
+        else:
+            low, high = low - margin, high + margin
+        width, height = high - low + 1
+        grown = np.zeros((int(height), int(width), 3), dtype=np.float32)
+        if rows:
+            dx, dy = self._origin - low
+            grown[dy : dy + rows, dx : dx + columns] = self._cells
+        self._cells, self._origin = grown, low
+
+    def layers(
+        self,
+        position_map_m: np.ndarray,  # float64 [2]
+        azimuth_map_rad: np.ndarray,  # float64 [M]
+        count: int = 4,
+        max_range_m: float = 14.0,
+        min_hits: int = 2,
+    ) -> np.ndarray:
+        """Ranges float64 [count, M] of the surfaces along each ray, nearest first, NaN = no more."""
+        out = np.full((count, len(azimuth_map_rad)), np.nan)
+        if self._cells.size:
+            march(
+                self._cells, self._origin.astype(np.float64) * self.cell_m, self.cell_m,
+                np.asarray(position_map_m, dtype=np.float64), np.asarray(azimuth_map_rad, dtype=np.float64),
+                max_range_m, min_hits, out,
+            )  # fmt: skip
+        return out
+
+
+@jit
+def march(
+    cells: np.ndarray,  # float32 [rows, columns, 3]
+    origin_m: np.ndarray,  # float64 [2]
+    cell_m: float,
+    start_m: np.ndarray,  # float64 [2]
+    azimuth_rad: np.ndarray,  # float64 [M]
+    max_range_m: float,
+    min_hits: int,
+    out: np.ndarray,  # float64 [L, M]
+) -> None:
+    """Walks each ray in half cells; a run of hit cells is one surface at its mean range along the ray."""
+    rows, columns = cells.shape[0], cells.shape[1]
+    for k in range(azimuth_rad.shape[0]):
+        ca, sa = np.cos(azimuth_rad[k]), np.sin(azimuth_rad[k])
+        layer, gap, total, weight = 0, 0, 0.0, 0.0
+        last_i, last_j = -1, -1
+        r = 0.15
+        while r < max_range_m and layer < out.shape[0]:
+            j = int(np.floor((start_m[0] + r * ca - origin_m[0]) / cell_m))
+            i = int(np.floor((start_m[1] + r * sa - origin_m[1]) / cell_m))
+            hit = 0 <= i < rows and 0 <= j < columns and cells[i, j, 0] >= min_hits
+            if hit:
+                gap = 0
+                if i != last_i or j != last_j:
+                    n = cells[i, j, 0]
+                    x = origin_m[0] + (j + 0.5) * cell_m + cells[i, j, 1] / n - start_m[0]
+                    y = origin_m[1] + (i + 0.5) * cell_m + cells[i, j, 2] / n - start_m[1]
+                    total += n * (x * ca + y * sa)
+                    weight += n
+                    last_i, last_j = i, j
+            elif weight > 0.0:
+                gap += 1
+                if gap > 2:
+                    out[layer, k] = total / weight
+                    layer, gap, total, weight = layer + 1, 0, 0.0, 0.0
+            r += 0.5 * cell_m
+        if weight > 0.0 and layer < out.shape[0]:
+            out[layer, k] = total / weight

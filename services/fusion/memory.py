@@ -1,0 +1,103 @@
+"""Depth of past keyframes, carried into the present view."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from common.geometry import inverse
+
+jit = njit(nogil=True, cache=True, error_model="numpy")
+
+
+@dataclass(frozen=True)
+class Remembered:
+    """What past keyframes say about the pixels of a view."""
+
+    depth_m: np.ndarray  # float32 [h, w], NaN = never seen
+    votes: np.ndarray  # int64 [h, w]: keyframes that agree on it
+
+
+class Memory:
+    """A ring of keyframe depth maps of one camera at the working size."""
+
+    def __init__(self, K: np.ndarray, shape: tuple[int, int], most: int) -> None:
+        self._K = np.asarray(K, dtype=np.float32)  # [4] fx, fy, cx, cy
+        self._shape = shape
+        self._ring: deque[tuple[np.ndarray, np.ndarray]] = deque(maxlen=most)
+
+    def __len__(self) -> int:
+        return len(self._ring)
+
+    def add(self, T_map_camera: np.ndarray, depth_m: np.ndarray) -> None:
+        """Keeps a depth map float32 [h, w]; NaN pixels are not carried."""
+        self._ring.append((T_map_camera, np.ascontiguousarray(depth_m, dtype=np.float32)))
+
+    def recall(self, T_map_camera: np.ndarray, agreement: float = 0.06) -> Remembered:
+        """Median of the carried depths of each pixel, and how many lie within `agreement` (log) of it."""
+        carried = np.full((len(self._ring), *self._shape), np.nan, dtype=np.float32)
+        T_camera_map = inverse(T_map_camera)
+        for k, (T_map_then, depth) in enumerate(self._ring):
+            T = (T_camera_map @ T_map_then).astype(np.float32)
+            carry(depth, T[:3, :3].copy(), T[:3, 3].copy(), self._K, carried[k])
+        depth = np.full(self._shape, np.nan, dtype=np.float32)
+        votes = np.zeros(self._shape, dtype=np.int64)
+        vote(carried, agreement, depth, votes)
+        return Remembered(depth, votes)
+
+
+@jit
+def carry(z: np.ndarray, R: np.ndarray, t: np.ndarray, K: np.ndarray, out: np.ndarray) -> None:
+    """Splats depth float32 [h, w] of one view into another (`R, t`: first to second); nearest wins.
+
+    A pixel covers as many pixels as it grows by coming nearer, and a third of a pixel more to close seams.
+    """
+    h, w = z.shape
+    fx, fy, cx, cy = K[0], K[1], K[2], K[3]
+    for v in range(h):
+        for u in range(w):
+            d = z[v, u]
+            if not d > 0.0:
+                continue
+            x, y = (u - cx) / fx * d, (v - cy) / fy * d
+            Z = R[2, 0] * x + R[2, 1] * y + R[2, 2] * d + t[2]
+            if Z < 0.1:
+                continue
+            a = fx * (R[0, 0] * x + R[0, 1] * y + R[0, 2] * d + t[0]) / Z + cx
+            b = fy * (R[1, 0] * x + R[1, 1] * y + R[1, 2] * d + t[1]) / Z + cy
+            reach = 0.5 * d / Z + 0.3
+            if not (-reach <= a <= w - 1 + reach and -reach <= b <= h - 1 + reach):
+                continue
+            for i in range(max(int(np.ceil(b - reach)), 0), min(int(np.floor(b + reach)), h - 1) + 1):
+                for j in range(max(int(np.ceil(a - reach)), 0), min(int(np.floor(a + reach)), w - 1) + 1):
+                    if not out[i, j] <= Z:  # also where it is NaN
+                        out[i, j] = Z
+
+
+@jit
+def vote(carried: np.ndarray, agreement: float, depth: np.ndarray, votes: np.ndarray) -> None:
+    """Median over the first axis of float32 [n, h, w] (NaN left out), and the count within `agreement`."""
+    n, h, w = carried.shape
+    values = np.empty(n, np.float64)
+    for v in range(h):
+        for u in range(w):
+            count = 0
+            for k in range(n):
+                z = carried[k, v, u]
+                if z > 0.0:
+                    i = count
+                    while i > 0 and values[i - 1] > z:
+                        values[i] = values[i - 1]
+                        i -= 1
+                    values[i] = z
+                    count += 1
+            if count == 0:
+                continue
+            middle = values[(count - 1) // 2]
+            depth[v, u] = middle
+            for k in range(count):
+                if abs(np.log(values[k] / middle)) <= agreement:
+                    votes[v, u] += 1

@@ -1,0 +1,113 @@
+"""Surfaces a picture may show, as the lidar and the floor predict them: candidates, not answers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from common.beams import Beams, hidden_beams, plan_polar, plane_depth, wall_depth
+from common.camera import Pinhole
+from common.geometry import yaw_of
+from services.fusion.lidar_map import LidarMap
+
+
+@dataclass(frozen=True)
+class Surfaces:
+    """Optical z [h, w] of each candidate surface, NaN where it is not met."""
+
+    wall: np.ndarray  # the nearest beam of the column, extruded upright
+    wall_off_m: np.ndarray  # how far above or below the lidar plane the pixel meets that wall
+    floor: np.ndarray
+    behind: tuple[np.ndarray, ...]  # walls farther back, from the drive so far
+    ceilings: tuple[np.ndarray, ...]
+
+    @property
+    def nearest(self) -> np.ndarray:
+        """What one sees if nothing but these surfaces exists (`stixel`, and ceilings)."""
+        near = np.fmin(self.wall, self.floor)
+        for ceiling in self.ceilings:
+            near = np.fmin(near, ceiling)
+        return near
+
+    @property
+    def on_floor(self) -> np.ndarray:
+        """bool [h, w]: the floor comes before the wall."""
+        with np.errstate(invalid="ignore"):
+            return np.isfinite(self.floor) & ~(self.wall < self.floor)
+
+
+class SurfaceFinder:
+    """Rays of the working size in the body frame, and the surfaces they meet."""
+
+    def __init__(self, camera: Pinhole, T_body_camera: np.ndarray, *, floor_known: bool) -> None:
+        self._T_body_camera = T_body_camera
+        self._floor_known = floor_known
+        self.rays_body = camera.ray_grid() @ T_body_camera[:3, :3].T
+        self._azimuth = np.arctan2(self.rays_body[..., 1], self.rays_body[..., 0])
+        self._across = np.maximum(np.hypot(self.rays_body[..., 0], self.rays_body[..., 1]), 1e-9)
+        self.rise = np.ascontiguousarray(self.rays_body[..., 2])
+        self.camera_z_m = float(T_body_camera[2, 3])
+        empty = np.full(self.rise.shape, np.nan)
+        self.floor = plane_depth(self.rays_body, self.camera_z_m) if floor_known else empty
+        low, high = float(self._azimuth.min()), float(self._azimuth.max())
+        self._fan = np.linspace(low, high, 2 * camera.width_px)
+        place = (self._azimuth - low) / max(high - low, 1e-9) * (len(self._fan) - 1)
+        self._fan_index = np.clip(np.rint(place).astype(np.int64), 0, len(self._fan) - 1)
+
+    def find(
+        self,
+        beams: Beams,
+        lidar_map: LidarMap | None,
+        T_map_body: np.ndarray,
+        ceiling_heights_m: tuple[float, ...],
+    ) -> Surfaces:
+        """Candidate surfaces of one view; `ceiling_heights_m` are above the floor."""
+        points = beams.points_body_m
+        points = points[~hidden_beams(points, self._T_body_camera)]
+        azimuth, reach = plan_polar(points, self._T_body_camera)
+        wall = wall_depth(self.rays_body, azimuth, reach)
+        lidar_z_m = float(np.median(points[:, 2])) if len(points) else 0.0
+        off = np.abs(self.camera_z_m + wall * self.rise - lidar_z_m)
+        behind: list[np.ndarray] = []
+        if lidar_map is not None:
+            position = (T_map_body @ self._T_body_camera)[:2, 3]
+            ranges = lidar_map.layers(position, self._fan + float(yaw_of(T_map_body)))
+            for layer in ranges[:, self._fan_index] / self._across:
+                with np.errstate(invalid="ignore"):
+                    farther = (layer > 1.08 * wall) & ~(self.floor < layer)
+                behind.append(np.where(farther, layer, np.nan))
+        ceilings = []
+        for height in ceiling_heights_m:
+            plane = plane_depth(self.rays_body, self.camera_z_m, height)
+            with np.errstate(invalid="ignore"):
+                ceilings.append(np.where((self.rise > 0.02) & (plane < wall), plane, np.nan))
+        return Surfaces(wall, off, self.floor, tuple(behind), tuple(ceilings))
+
+
+class CeilingFinder:
+    """Heights of horizontal planes overhead: where they explain pictures better than the walls behind.
+
+    Evidence fades by a tenth a keyframe, so that the next room may have another ceiling.
+    """
+
+    def __init__(self, low_m: float = 1.6, high_m: float = 4.5, step_m: float = 0.05) -> None:
+        self.heights_m = np.arange(low_m, high_m, step_m)
+        self._evidence = np.zeros(len(self.heights_m))
+        self._apart = round(0.2 / step_m)
+
+    def add(self, gain: np.ndarray) -> None:
+        """Evidence [n] of one keyframe."""
+        self._evidence = 0.9 * self._evidence + gain
+
+    def heights(self, least: float, most: int = 2) -> tuple[float, ...]:
+        """Heights of up to `most` peaks of the evidence above `least`, strongest first, 0.25 m apart."""
+        left = self._evidence.copy()
+        found: list[float] = []
+        while len(found) < most:
+            k = int(np.argmax(left))
+            if left[k] <= least:
+                break
+            found.append(float(self.heights_m[k]))
+            left[max(k - self._apart, 0) : k + self._apart + 1] = 0.0
+        return tuple(found)
