@@ -1,203 +1,18 @@
-"""The back end: submaps and keynodes, loop closure and optimisation as background jobs on snapshots."""
+"""The back end owns the map: keynodes, submaps, edges; it hands out snapshots and takes in results."""
 
 from __future__ import annotations
-
-import math
-from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 
 from services.localization.lidar2d import se2
-from services.localization.lidar2d.loops import DriftModel, Place, close_narrow, close_wide
-from services.localization.lidar2d.nodes import Constraint, Keynode, Submap, TableCache, edges_of
-from services.localization.lidar2d.pose_graph import Edges, optimise
-from services.localization.lidar2d.refinement import refine_submaps
+from services.localization.lidar2d.jobs import JobResult, Snapshot
+from services.localization.lidar2d.lifelong import redundant_submaps
+from services.localization.lidar2d.nodes import Constraint, Keynode, Submap, TableCache
 from services.localization.lidar2d.settings import LidarSlamSettings
-from services.localization.lidar2d.surfel_map import FrozenMap
-
-REJECT_CHI2 = 100.0  # a loop this far off after optimisation is forgotten
-
-
-@dataclass(frozen=True)
-class JobResult:
-    """What a background job found; `LidarSlam.apply` takes it in."""
-
-    number: int
-    constraints: list[Constraint] | None  # None: as they were; else the whole new list up to the snapshot
-    known_constraints: int  # how many the snapshot had
-    T_map_submap: dict[int, np.ndarray]
-    T_map_node: dict[int, np.ndarray]
-    frozen: dict[int, FrozenMap]  # submaps that were drawn anew
-    still_pending: list[int]
-    tried: list[int]  # submaps that were searched widely
-    loops_found: int
-
-
-@dataclass(frozen=True)
-class BackgroundJob:
-    """Pure work on a snapshot: call `run` in any thread, hand the result to `LidarSlam.apply`."""
-
-    number: int
-    apply_at_scan: int  # before the scan of this number is added
-    run: Callable[[], JobResult]
-
-
-@dataclass(frozen=True)
-class Snapshot:
-    """Everything a job reads; nothing in it changes later."""
-
-    number: int
-    settings: LidarSlamSettings
-    nodes: dict[int, Keynode]
-    frozen: dict[int, FrozenMap]
-    submap_ids: list[int]
-    node_ids: list[int]
-    members: dict[int, list[int]]
-    T_map_submap: np.ndarray  # float64 [S, 3]
-    T_map_node: np.ndarray  # float64 [N, 3]
-    constraints: list[Constraint]
-    pending: list[int]
-    tries: dict[int, int]
-    cache: TableCache
-
-
-def run_job(snapshot: Snapshot, refine_rounds: int = 0) -> JobResult:
-    """Close loops, optimise; with `refine_rounds` also draw the submaps anew and measure every edge again."""
-    submap_row = {s: i for i, s in enumerate(snapshot.submap_ids)}
-    node_row = {n: i for i, n in enumerate(snapshot.node_ids)}
-    constraints, tried, frozen = list(snapshot.constraints), [], dict(snapshot.frozen)
-    edges = edges_of(constraints, submap_row, node_row)
-    found, tried, still = _close_loops(snapshot, edges, submap_row, node_row)
-    constraints += found
-    T_s, T_n = snapshot.T_map_submap, snapshot.T_map_node
-    solution = optimise(T_s, T_n, edges_of(constraints, submap_row, node_row))
-    drawn: dict[int, FrozenMap] = {}
-    for _ in range(refine_rounds):
-        drawn, constraints = refine_submaps(
-            snapshot.settings, snapshot.nodes, snapshot.members, frozen, constraints,
-            dict(zip(snapshot.submap_ids, solution.T_map_submap)), dict(zip(snapshot.node_ids, solution.T_map_node)),
-        )  # fmt: skip
-        frozen.update(drawn)
-        edges = edges_of(constraints, submap_row, node_row)
-        solution = optimise(solution.T_map_submap, solution.T_map_node, edges)
-    constraints = _without_outliers(constraints, solution.chi2, node_row)
-    return JobResult(
-        snapshot.number, constraints, len(snapshot.constraints),
-        dict(zip(snapshot.submap_ids, solution.T_map_submap)), dict(zip(snapshot.node_ids, solution.T_map_node)),
-        drawn, still, tried, len(found),
-    )  # fmt: skip
-
-
-def _without_outliers(
-    constraints: list[Constraint], chi2: np.ndarray, node_row: dict[int, int]
-) -> list[Constraint]:
-    order = np.argsort([node_row[c.node] for c in constraints], kind="stable")
-    keep = np.ones(len(constraints), dtype=bool)
-    keep[order] = chi2 < REJECT_CHI2
-    return [c for c, k in zip(constraints, keep) if k or not c.loop]
-
-
-def _close_loops(
-    snapshot: Snapshot, edges: Edges, submap_row: dict[int, int], node_row: dict[int, int]
-) -> tuple[list[Constraint], list[int], list[int]]:
-    """New loop constraints, the submaps searched widely, and the nodes whose turn has not come."""
-    s = snapshot.settings
-    if not snapshot.frozen or not snapshot.pending:
-        return [], [], list(snapshot.pending)
-    length_m = s.submap_keynodes * s.keynode_distance_m
-    drift = DriftModel(edges, len(snapshot.submap_ids), len(snapshot.node_ids), length_m, s.inner_facts)
-    windows: dict[int, tuple[np.ndarray, np.ndarray]] = {}
-    found, still = [], []
-    turn = snapshot.pending[-3 * s.job_keynodes :]
-    still = snapshot.pending[: -3 * s.job_keynodes]
-    for node_id in turn:
-        own = sorted({c for c in _submaps_of(edges, node_row[node_id])})
-        if own[0] not in windows:
-            windows[own[0]] = drift.windows(own[0])
-        places, unsure = _places(snapshot, edges, submap_row, node_row[node_id], own, windows[own[0]])
-        for place in places:
-            constraint = close_narrow(snapshot.nodes[node_id], place, snapshot.cache, s)
-            if constraint is not None:
-                found.append(constraint)
-        if unsure and not places:
-            still.append(node_id)
-    wide, tried = _close_wide(snapshot, edges, submap_row, node_row, turn[len(turn) // 2], windows, drift)
-    return found + wide, tried, sorted(still)[-2000:]
-
-
-def _submaps_of(edges: Edges, row: int) -> np.ndarray:
-    lo, hi = np.searchsorted(edges.node, [row, row + 1])
-    return edges.submap[lo:hi][~edges.robust[lo:hi]]
-
-
-def _nearest_member(snapshot: Snapshot, edges: Edges, row: int) -> np.ndarray:
-    """Distance (m) from a node to the nearest member of each submap, float64 [S]."""
-    away = np.hypot(*(snapshot.T_map_node[:, :2] - snapshot.T_map_node[row, :2]).T)
-    distance = np.full(len(snapshot.submap_ids), np.inf)
-    inner = ~edges.robust
-    np.minimum.at(distance, edges.submap[inner], away[edges.node[inner]])
-    return distance
-
-
-def _places(
-    snapshot: Snapshot, edges: Edges, submap_row: dict[int, int], row: int, own: list[int],
-    windows: tuple[np.ndarray, np.ndarray],
-) -> tuple[list[Place], bool]:  # fmt: skip
-    """Submaps of other passes right here, nearest first; the flag: some are too uncertain for a narrow search."""
-    s = snapshot.settings
-    distance = _nearest_member(snapshot, edges, row)
-    distance[[k for o in own for k in (o - 1, o, o + 1) if 0 <= k < len(distance)]] = np.inf
-    places, taken, unsure = [], [], False
-    for k in np.argsort(distance, kind="stable"):
-        if distance[k] > s.loop_near_m or len(places) == s.loop_submaps:
-            break
-        submap_id = snapshot.submap_ids[k]
-        if submap_id not in snapshot.frozen or any(abs(int(k) - t) <= 1 for t in taken):
-            continue
-        if windows[0][k] > s.narrow_m or windows[1][k] > s.narrow_rad:
-            unsure = True
-            continue
-        taken.append(int(k))
-        T = se2.between(snapshot.T_map_submap[k], snapshot.T_map_node[row])
-        places.append(Place(submap_id, snapshot.frozen[submap_id], T, float(windows[0][k]), float(windows[1][k])))
-    return places, unsure
-
-
-def _close_wide(
-    snapshot: Snapshot, edges: Edges, submap_row: dict[int, int], node_row: dict[int, int], centre: int,
-    windows: dict[int, tuple[np.ndarray, np.ndarray]], drift: DriftModel,
-) -> tuple[list[Constraint], list[int]]:  # fmt: skip
-    s = snapshot.settings
-    row = node_row[centre]
-    own = sorted({c for c in _submaps_of(edges, row)})
-    window_m, window_rad = windows.setdefault(own[0], drift.windows(own[0]))
-    distance = _nearest_member(snapshot, edges, row)
-    distance[own] = np.inf
-    half = s.chunk_keynodes // 2
-    chunk = [snapshot.nodes[n] for n in snapshot.node_ids[max(0, row - half) : row + half + 1]]
-    candidates = []
-    for k in np.flatnonzero(np.isfinite(distance)):
-        submap_id = snapshot.submap_ids[k]
-        narrow = window_m[k] <= s.narrow_m and window_rad[k] <= s.narrow_rad
-        if submap_id in snapshot.frozen and not narrow and distance[k] < s.loop_near_m + window_m[k]:
-            candidates.append((snapshot.tries.get(submap_id, 0), float(distance[k]), int(k)))
-    found, tried = [], []
-    for _, _, k in sorted(candidates)[: s.wide_searches]:
-        submap_id = snapshot.submap_ids[k]
-        T = se2.between(snapshot.T_map_submap[k], snapshot.T_map_node[row])
-        window = min(float(window_m[k]), s.wide_limit_m) if math.isfinite(window_m[k]) else s.wide_limit_m
-        turn = min(float(window_rad[k]), math.pi) if math.isfinite(window_rad[k]) else math.pi
-        place = Place(submap_id, snapshot.frozen[submap_id], T, window, turn)
-        constraint = close_wide(snapshot.nodes[centre], chunk, place, snapshot.cache, s)
-        tried.append(submap_id)
-        if constraint is not None:
-            found.append(constraint)
-    return found, tried
 
 
 class BackEnd:
-    """Owns the map; hands out snapshots, takes in results."""
+    """State of the map between jobs."""
 
     def __init__(self, settings: LidarSlamSettings) -> None:
         self.settings = settings
@@ -211,6 +26,10 @@ class BackEnd:
         self.cache = TableCache(settings.reach_cells)
         self.loop_closures = 0
         self.optimisations = 0
+        self.unlinked_from: int | None = None
+        self.fixed: frozenset[int] = frozenset()
+        # Keynodes that were taken out: the one they hang on now, and where (x, y, yaw).
+        self.retired: dict[int, tuple[int, float, float, float]] = {}
         self._jobs = 0
         self._next_node = self._next_submap = 0
 
@@ -219,6 +38,16 @@ class BackEnd:
         self._next_submap += 1
         self.submaps[submap.id] = submap
         return submap
+
+    def resume_numbering(self) -> None:
+        """Continue the ids of a loaded map."""
+        self._next_node = 1 + max([*self.nodes, *self.retired], default=-1)
+        self._next_submap = 1 + max(self.submaps, default=-1)
+
+    def start_segment(self) -> None:
+        """What comes next hangs on nothing until its place in the map is found."""
+        if self.nodes and self.unlinked_from is None:
+            self.unlinked_from = self._next_node
 
     def add_keynode(self, node: Keynode, edges: list[Constraint]) -> None:
         """A new keynode and its poses in the submaps it was put into."""
@@ -243,7 +72,7 @@ class BackEnd:
             list(self.nodes), {i: list(s.members) for i, s in self.submaps.items()},
             np.array([s.T_map_submap for s in self.submaps.values()]).reshape(-1, 3),
             np.array(list(self.T_map_node.values())).reshape(-1, 3), list(self.constraints), list(self.pending),
-            dict(self.tries), self.cache,
+            dict(self.tries), self.cache, self.optimisations, self.unlinked_from, self.fixed,
         )  # fmt: skip
 
     def apply(self, result: JobResult) -> None:
@@ -266,5 +95,53 @@ class BackEnd:
         self.pending = result.still_pending + newer
         for i in result.tried:
             self.tries[i] = self.tries.get(i, 0) + 1
+        if result.linked and self.unlinked_from is not None and last >= self.unlinked_from:
+            self.unlinked_from = None
         self.loop_closures += result.loops_found
         self.optimisations += 1
+
+    def trim(self, active: set[int]) -> list[int]:
+        """Take out submaps nobody needs; returns their ids."""
+        s = self.settings
+        if self.unlinked_from is not None:
+            return []
+        if self.fixed:  # localization only: of the own submaps keep the last few
+            own = [i for i in self.submaps if i not in self.fixed and i not in active]
+            gone = own[: max(0, len(own) - 2)]
+        else:
+            gone = redundant_submaps(self.submaps, self.T_map_node, active, s.copies_of_a_place)
+        for submap_id in gone:
+            self._remove(submap_id)
+        return gone
+
+    def _remove(self, submap_id: int) -> None:
+        members = set(self.submaps.pop(submap_id).members)
+        self.tries.pop(submap_id, None)
+        self.constraints = [c for c in self.constraints if c.submap != submap_id]
+        inner = {m for s in self.submaps.values() for m in s.members if m in members}
+        orphans = sorted(members - inner)
+        if not orphans:
+            return
+        gone = set(orphans)
+        self.constraints = [c for c in self.constraints if c.node not in gone]
+        left = np.array([n for n in self.nodes if n not in gone], dtype=np.int64)
+        poses = np.array([self.T_map_node[int(n)] for n in left])
+        for n in orphans:
+            anchor = int(left[np.argmin(np.hypot(*(poses[:, :2] - self.T_map_node[n][:2]).T))])
+            self.retired[n] = (anchor, *se2.between(self.T_map_node[anchor], self.T_map_node[n]).tolist())
+        for n in orphans:
+            del self.nodes[n], self.T_map_node[n]
+        self.pending = [n for n in self.pending if n not in gone]
+
+    def all_node_poses(self) -> dict[int, np.ndarray]:
+        """T_map_node of every keynode there ever was."""
+        poses = dict(self.T_map_node)
+        for n in self.retired:
+            chain, k = [], n
+            while k not in poses:
+                chain.append(k)
+                k = self.retired[k][0]
+            for k in reversed(chain):
+                anchor, *relative = self.retired[k]
+                poses[k] = se2.compose(poses[anchor], np.array(relative))
+        return poses

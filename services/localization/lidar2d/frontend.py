@@ -62,6 +62,11 @@ class FrontEnd:
         self.stamps: list[int] = []  # recent matched stamps and poses, newest last
         self.poses: list[np.ndarray] = []
 
+    def restart_clock(self, stamp_ns: int) -> None:
+        """Go on from the last pose under a clock that was set."""
+        if self.poses:
+            self.stamps, self.poses = [stamp_ns - round(0.1 / NS)], [self.poses[-1]]
+
     # ---- motion -----------------------------------------------------------------------------------
 
     def velocity(self) -> np.ndarray:
@@ -133,9 +138,9 @@ class FrontEnd:
         T_map_last = se2.between(local.T_odom_map, self.poses[-1])
         T_guess = se2.compose(T_map_last, prediction.motion)
         information = np.diag([prediction.sigma_m**-2, prediction.sigma_m**-2, prediction.sigma_rad**-2])
-        tables, seen = local.surfels.tables(), local.surfels.misses
+        tables = local.surfels.tables()
         points = scan.features()
-        match = refine(points, scan.origin_body, T_guess, tables, s, T_guess, information, seen)
+        match = refine(points, scan.origin_body, T_guess, tables, s, T_guess, information)
         blind = (raw.stamp_ns - self.stamps[-1]) * NS > 1.0
         window_m = min(max(3.0 * prediction.sigma_m, s.search_min_m), 2.0 if blind else s.search_max_m)
         window_rad = min(max(3.0 * prediction.sigma_rad, s.search_min_rad), math.pi if blind else s.search_max_rad)
@@ -150,7 +155,7 @@ class FrontEnd:
             motion = se2.between(T_map_last, match.T_map_body)
             scan = self.prepare(raw, self.scan_velocity(raw, motion))
             points = scan.features()
-            match = refine(points, scan.origin_body, match.T_map_body, tables, s, T_guess, information, seen,
+            match = refine(points, scan.origin_body, match.T_map_body, tables, s, T_guess, information,
                            anneal=(1.0,))  # fmt: skip
         return scan, match, match.share >= s.lost_share
 
@@ -159,10 +164,10 @@ class FrontEnd:
         local: LocalMap, window_m: float, window_rad: float,
     ) -> Match:  # fmt: skip
         """The best of the given match and of those found in a window."""
-        tables, seen, s = local.surfels.tables(), local.surfels.misses, self.settings
+        tables, s = local.surfels.tables(), self.settings
         points = scan.features()
         for _, T_start in search(points, T_centre, tables, window_m, window_rad, prior_weight=0.02):
-            other = refine(points, scan.origin_body, T_start, tables, s, T_prior, information, seen)
+            other = refine(points, scan.origin_body, T_start, tables, s, T_prior, information)
             if other.share * other.known > best.share * best.known + 0.02:
                 best = other
         return best

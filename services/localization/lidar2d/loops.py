@@ -9,6 +9,7 @@ import numpy as np
 from numba import njit
 from scipy.sparse.csgraph import dijkstra
 
+from services.localization.lidar2d import se2
 from services.localization.lidar2d.branch_bound import branch_and_bound
 from services.localization.lidar2d.matching import Match, refine, search
 from services.localization.lidar2d.nodes import Constraint, Keynode, TableCache, edge_information, merged_features
@@ -16,8 +17,10 @@ from services.localization.lidar2d.pose_graph import Edges
 from services.localization.lidar2d.settings import LidarSlamSettings
 from services.localization.lidar2d.surfel_map import FrozenMap
 
-CHUNK_SHARE = 0.75  # a merged chunk must agree better than a single scan: it is what tells places apart
-AMBIGUOUS = 0.85  # a second place that scores this close to the best makes the answer worthless
+CHUNK_SHARE = 0.80  # a merged chunk must agree better than a single scan: it is what tells places apart
+AMBIGUOUS = 0.06  # a second place whose share is this close to the best makes the answer worthless
+CHECK_STEPS = (-60, -48, -36, -24, -12, 12, 24)  # keynodes around a wide loop that must agree with it
+CHECK_SHARE = 0.75
 
 
 @dataclass(frozen=True)
@@ -51,16 +54,19 @@ def _link_variances(
 class DriftModel:
     """How far the relative pose of two submaps may be off: the shortest path of uncertainties between them."""
 
-    def __init__(self, edges: Edges, n_submaps: int, n_nodes: int, submap_length_m: float, inner_facts: float) -> None:
-        covariance = np.linalg.inv(edges.information) / inner_facts
-        # The errors of matches in a row are not independent (a lidar's angles are off by a constant factor):
-        # drift seen on real logs is a few centimetres and half a degree per submap.
-        var_m = 0.5 * (covariance[:, 0, 0] + covariance[:, 1, 1]) + 0.02**2
-        var_rad = covariance[:, 2, 2] + math.radians(0.3) ** 2
+    def __init__(self, edges: Edges, n_submaps: int, n_nodes: int, settings: LidarSlamSettings) -> None:
+        s = settings
+        covariance = np.linalg.inv(edges.information)
+        # The edges into younger submaps carry the drift of a whole link each, see link_information().
+        per_edge = s.submap_keynodes
+        var_m = 0.5 * (covariance[:, 0, 0] + covariance[:, 1, 1]) - per_edge * s.link_sigma_m**2
+        var_rad = covariance[:, 2, 2] - per_edge * s.link_sigma_rad**2
+        var_m = np.maximum(var_m, 0.0) + s.link_sigma_m**2
+        var_rad = np.maximum(var_rad, 0.0) + s.link_sigma_rad**2
         self._links = np.full((3, n_submaps, n_submaps), np.inf)
         first = np.searchsorted(edges.node, np.arange(n_nodes + 1)).astype(np.int64)
         _link_variances(edges.submap, first, var_m, var_rad, self._links)
-        self._length_m = submap_length_m
+        self._length_m = s.submap_keynodes * s.keynode_distance_m
 
     def windows(self, source: int) -> tuple[np.ndarray, np.ndarray]:
         """Search windows (m, rad) of each submap, float64 [S] each, three sigma seen from one submap."""
@@ -79,10 +85,10 @@ def close_narrow(node: Keynode, place: Place, cache: TableCache, settings: Lidar
     features = node.scan.features.astype(np.float64)
     if len(features) < settings.min_points:
         return None
-    best = refine(features, node.scan.origin, place.T_submap_node, tables, settings, seen=place.frozen.misses)
+    best = refine(features, node.scan.origin, place.T_submap_node, tables, settings)
     if place.window_m > 0.2 or place.window_rad > math.radians(4.0) or best.share < 0.8:
         for _, T_start in search(features, place.T_submap_node, tables, place.window_m, place.window_rad, 0.02):
-            other = refine(features, node.scan.origin, T_start, tables, settings, seen=place.frozen.misses)
+            other = refine(features, node.scan.origin, T_start, tables, settings)
             if other.share * other.known > best.share * best.known + 0.02:
                 best = other
     return _accepted(node, place, best, settings)
@@ -97,28 +103,71 @@ def close_wide(
         return None
     window_m, window_rad = min(place.window_m, settings.wide_limit_m), min(place.window_rad, math.pi)
     found = branch_and_bound(
-        features[:: max(1, len(features) // 200)], place.T_submap_node, cache.pyramid(place.submap, place.frozen),
-        window_m, window_rad, settings.wide_score, keep=0.9,
+        features[:: max(1, len(features) // 150)], place.T_submap_node, cache.pyramid(place.submap, place.frozen),
+        window_m, window_rad, settings.wide_score, keep=0.75,
     )  # fmt: skip
     if not found:
         return None
     tables = cache.tables(place.submap, place.frozen)
-    matches = [
-        refine(features, node.scan.origin, T, tables, settings, seen=place.frozen.misses) for _, T in found[:8]
-    ]
-    matches.sort(key=lambda m: -evidence(m))
-    best = matches[0]
-    if best.share < CHUNK_SHARE or best.known < settings.loop_known:
+    matches = [refine(features, node.scan.origin, T, tables, settings) for _, T in found[:12]]
+    matches = [m for m in matches if m.known >= settings.loop_known]
+    matches.sort(key=lambda m: -m.share)
+    if not matches or matches[0].share < CHUNK_SHARE:
         return None
+    # A place only half known is as good an answer as one fully known: the share alone decides, and if it
+    # cannot (corridors), there is no answer.
+    best = matches[0]
     for other in matches[1:]:
-        apart = np.hypot(*(other.T_map_body[:2] - best.T_map_body[:2])) > 0.5 or (
-            abs(math.remainder(other.T_map_body[2] - best.T_map_body[2], 2 * math.pi)) > 0.2
+        apart = np.hypot(*(other.T_map_body[:2] - best.T_map_body[:2])) > 0.3 or (
+            abs(math.remainder(other.T_map_body[2] - best.T_map_body[2], 2 * math.pi)) > 0.1
         )
-        if apart and evidence(other) > AMBIGUOUS * evidence(best):
+        if apart and other.share > best.share - AMBIGUOUS:
             return None
-    single = refine(node.scan.features.astype(np.float64), node.scan.origin, best.T_map_body, tables, settings,
-                    seen=place.frozen.misses)  # fmt: skip
+    single = refine(node.scan.features.astype(np.float64), node.scan.origin, best.T_map_body, tables, settings)  # fmt: skip
     return _accepted(node, place, single, settings)
+
+
+def confirmed(
+    link: Constraint,
+    node_ids: list[int],
+    nodes: dict[int, Keynode],
+    members: dict[int, list[int]],
+    frozen: dict[int, FrozenMap],
+    T_map_submap: dict[int, np.ndarray],
+    T_map_node: dict[int, np.ndarray],
+    cache: TableCache,
+    settings: LidarSlamSettings,
+) -> bool:
+    """Whether keynodes metres before and after a wide loop see what its place says they should see.
+
+    The neighbourhood of the node is laid rigidly over the neighbourhood of the submap; each check matches one
+    scan against the submap of the other pass it then lies in.
+    """
+    T_shift = se2.compose(se2.compose(T_map_submap[link.submap], link.T_submap_node),
+                          se2.inverse(T_map_node[link.node]))  # fmt: skip
+    position = {n: k for k, n in enumerate(node_ids)}
+    near = [s for s in frozen if abs(s - link.submap) <= 6]
+    places = [(T_map_node[m][:2], s) for s in near for m in members[s] if m in T_map_node]
+    where = np.array([p for p, _ in places])
+    shares = []
+    for step in CHECK_STEPS:
+        k = position[link.node] + step
+        if not 0 <= k < len(node_ids):
+            continue
+        node = nodes[node_ids[k]]
+        T_map_guess = se2.compose(T_shift, T_map_node[node.id])
+        away = np.hypot(*(where - T_map_guess[:2]).T)
+        if away.min() > settings.loop_near_m:
+            continue
+        submap = places[int(np.argmin(away))][1]
+        if node.id in members[submap]:
+            continue
+        match = refine(node.scan.features.astype(np.float64), node.scan.origin,
+                       se2.between(T_map_submap[submap], T_map_guess), cache.tables(submap, frozen[submap]),
+                       settings)  # fmt: skip
+        if match.known >= settings.loop_known:
+            shares.append(match.share)
+    return len(shares) >= 2 and float(np.mean(shares)) >= CHECK_SHARE and min(shares) >= 0.5
 
 
 def evidence(match: Match) -> float:

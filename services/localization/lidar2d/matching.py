@@ -232,7 +232,6 @@ def refine(
     settings: LidarSlamSettings,
     prior_T: np.ndarray | None = None,
     prior_information: np.ndarray | None = None,
-    seen: np.ndarray | None = None,
     iterations: int = 15,
     anneal: tuple[float, ...] = ANNEAL,
 ) -> Match:
@@ -241,15 +240,13 @@ def refine(
     sigma_m = math.hypot(settings.range_sigma_m, settings.map_sigma_m)
     if prior_T is None or prior_information is None:
         prior_T, prior_information = T_start, np.zeros((3, 3))
-    weights, found, cost = gauss_newton(
+    weights, _, cost = gauss_newton(
         points, origin, T_start, tables.nearest, tables.means, tables.omegas, tables.views, tables.row0, tables.col0,
         tables.cell_m, prior_T, prior_information, settings.outlier_m / sigma_m, settings.beams_per_fact,
         np.array(anneal), iterations, T, H,
     )  # fmt: skip
     n = max(len(points), 1)
-    known = found if seen is None else known_returns(
-        points, T, tables.nearest, seen, tables.row0, tables.col0, tables.cell_m
-    )  # fmt: skip
+    known = known_returns(points, T, tables.nearest, tables.seen, tables.row0, tables.col0, tables.cell_m)
     residual = sigma_m * math.sqrt(max(cost, 0.0) / weights) if weights > 0 else math.inf
     return Match(T, H, weights / max(known, 1), known / n, residual)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -12,6 +13,7 @@ from services.localization.lidar2d import se2
 from services.localization.lidar2d.branch_bound import Pyramid, build_pyramid
 from services.localization.lidar2d.pose_graph import Edges
 from services.localization.lidar2d.scan import PreparedScan
+from services.localization.lidar2d.settings import LidarSlamSettings
 from services.localization.lidar2d.surfel_map import FrozenMap, MatchTables
 
 
@@ -70,10 +72,11 @@ class Constraint:
 class TableCache:
     """Match tables and pyramids of finished submaps, the most recently used ones."""
 
-    def __init__(self, reach_cells: int, capacity: int = 24) -> None:
+    def __init__(self, reach_cells: int, capacity: int = 12) -> None:
         self._reach, self._capacity = reach_cells, capacity
         self._tables: OrderedDict[tuple[int, int], MatchTables] = OrderedDict()
         self._pyramids: OrderedDict[tuple[int, int], Pyramid] = OrderedDict()
+        self._world: tuple[object, object] | None = None
         self._lock = threading.Lock()
 
     def tables(self, submap: int, frozen: FrozenMap) -> MatchTables:
@@ -84,6 +87,16 @@ class TableCache:
         """Search pyramid of a submap's frozen map."""
         key = (submap, id(frozen))
         return self._get(self._pyramids, key, lambda: _pyramid_of(self.tables(submap, frozen)))
+
+    def world(self, key: object, make: Callable[[], object]) -> object:
+        """The map of everything; only the latest is kept."""
+        with self._lock:
+            if self._world is not None and self._world[0] == key:
+                return self._world[1]
+        value = make()
+        with self._lock:
+            self._world = (key, value)
+        return value
 
     def _get(self, store: OrderedDict, key: tuple[int, int], make: object) -> object:
         with self._lock:
@@ -119,6 +132,18 @@ def edge_information(match_information: np.ndarray, sigma_m: float, sigma_rad: f
     # (3 m)^-2 and (0.5 rad)^-2 keep the inverse finite where the scan says nothing.
     covariance = np.linalg.inv(match_information + np.diag([0.1, 0.1, 4.0]))
     return np.linalg.inv(covariance + np.diag([sigma_m**2, sigma_m**2, sigma_rad**2]))
+
+
+def link_information(match_information: np.ndarray, settings: LidarSlamSettings) -> np.ndarray:
+    """Information of a keynode's edge into the younger submap, which it was not matched to.
+
+    All those edges together tie two neighbouring submaps, by no more than the drift from one to the next; if
+    they were as stiff as matches, a loop would have to bend steel and be taken for an outlier.
+    """
+    s = settings
+    inner = np.linalg.inv(edge_information(match_information, s.edge_sigma_m, s.edge_sigma_rad))
+    drift = s.submap_keynodes * np.diag([s.link_sigma_m**2, s.link_sigma_m**2, s.link_sigma_rad**2])
+    return np.linalg.inv(inner + drift)
 
 
 def merged_features(nodes: list[Keynode], centre: Keynode, limit: int = 360) -> np.ndarray:

@@ -9,6 +9,7 @@ scale shrinks during the iterations (graduated non-convexity, Yang et al. 2020).
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -78,6 +79,42 @@ def _invert(A: np.ndarray, out: np.ndarray) -> None:
     out[0, 2] = (A[0, 1] * A[1, 2] - A[0, 2] * A[1, 1]) * d
     out[1, 2] = (A[0, 2] * A[1, 0] - A[0, 0] * A[1, 2]) * d
     out[2, 2] = (A[0, 0] * A[1, 1] - A[0, 1] * A[1, 0]) * d
+
+
+@njit(nogil=True, cache=True, error_model="numpy", fastmath=True)
+def cholesky_solve(A: np.ndarray, x: np.ndarray) -> bool:
+    """x <- A^-1 x for symmetric positive definite A [n, n] (destroyed); False if it is not.
+
+    By rows inside the envelope: submaps in time order give a narrow one. Own code, because BLAS starts
+    threads that spin for systems this small.
+    """
+    n = A.shape[0]
+    start = np.empty(n, dtype=np.int64)
+    for i in range(n):
+        k = 0
+        while k < i and A[i, k] == 0.0:
+            k += 1
+        start[i] = k
+        for j in range(k, i):
+            t = A[i, j]
+            for q in range(max(k, start[j]), j):
+                t -= A[i, q] * A[j, q]
+            A[i, j] = t / A[j, j]
+        t = A[i, i]
+        for q in range(k, i):
+            t -= A[i, q] * A[i, q]
+        if not t > 0.0:
+            return False
+        A[i, i] = math.sqrt(t)
+        t = x[i]
+        for q in range(k, i):
+            t -= A[i, q] * x[q]
+        x[i] = t / A[i, i]
+    for i in range(n - 1, -1, -1):
+        x[i] /= A[i, i]
+        for q in range(start[i], i):
+            x[q] -= A[i, q] * x[i]
+    return True
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
@@ -193,7 +230,7 @@ def optimise(
     T_map_submap: np.ndarray,  # float64 [S, 3] start
     T_map_node: np.ndarray,  # float64 [N, 3] start
     edges: Edges,
-    fixed: int = 0,  # this submap does not move
+    fixed: Sequence[int] = (0,),  # rows of the submaps that do not move
     final_scale2: float = 9.0,
     iterations: int = 16,
 ) -> GraphSolution:
@@ -226,16 +263,20 @@ def optimise(
     return GraphSolution(T_s, T_n, chi2, done)
 
 
-def _solve(blocks: np.ndarray, row: np.ndarray, col: np.ndarray, rhs: np.ndarray, fixed: int) -> np.ndarray:
+def _solve(blocks: np.ndarray, row: np.ndarray, col: np.ndarray, rhs: np.ndarray, fixed: Sequence[int]) -> np.ndarray:
     n = len(rhs)
     diagonal = 1e-6 * np.ones(3 * n)
-    diagonal[3 * fixed : 3 * fixed + 3] = 1e12
+    for row_fixed in fixed:
+        diagonal[3 * row_fixed : 3 * row_fixed + 3] = 1e12
     if n <= DENSE_SUBMAPS:
         A = np.zeros((n, 3, n, 3))
         A[row, :, col, :] = blocks
         A = A.reshape(3 * n, 3 * n)
         A[np.arange(3 * n), np.arange(3 * n)] += diagonal
-        return np.linalg.solve(A, rhs.ravel()).reshape(n, 3)
+        x = rhs.ravel().copy()
+        if not cholesky_solve(A, x):
+            raise FloatingPointError("the pose graph's normal equations are not positive definite")
+        return x.reshape(n, 3)
     rows = np.repeat(3 * row[:, None] + np.arange(3), 3, axis=1).ravel()
     cols = np.tile(3 * col[:, None] + np.arange(3), (1, 3)).ravel()
     A = scipy.sparse.coo_matrix((blocks.ravel(), (rows, cols)), shape=(3 * n, 3 * n)).tocsc()

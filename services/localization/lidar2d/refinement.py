@@ -57,7 +57,7 @@ def _measure(
     """The same constraint from a fresh match that starts at the optimised pose."""
     features = node.scan.features.astype(np.float64)
     guess = se2.between(T_map_submap, T_map_node)
-    match = refine(features, node.scan.origin, guess, tables, settings, seen=frozen.misses, anneal=(1.5,))
+    match = refine(features, node.scan.origin, guess, tables, settings, anneal=(1.5,))
     moved = np.hypot(*(match.T_map_body[:2] - guess[:2]))
     if match.share < settings.loop_share or match.known < settings.loop_known or moved > 0.3:
         return constraint

@@ -47,7 +47,10 @@ class LidarSlamSettings:
     # Pose graph
     edge_sigma_m: float = 0.01  # what a match cannot know about itself
     edge_sigma_rad: float = math.radians(0.15)
-    inner_facts: float = 10.0  # so many poses inside their own submap count as one: they share the drift
+    # Drift from one submap to the next as seen on real logs: matches in a row share their errors.
+    link_sigma_m: float = 0.03
+    link_sigma_rad: float = math.radians(0.5)
+    inner_facts: float = 4.0  # after refinement: so many poses in their own submap count as one
     job_keynodes: int = 20  # background work is handed out every so many keynodes
     apply_after_scans: int = 20  # and its result is taken in exactly so many scans later
     loop_submaps: int = 3  # each keynode is tied to at most so many submaps of other passes
@@ -60,3 +63,10 @@ class LidarSlamSettings:
     wide_score: float = 0.30
     loop_share: float = 0.60
     loop_known: float = 0.40
+
+    # Long operation
+    copies_of_a_place: int = 6  # a submap that adds nothing to so many others of its place is taken out
+    trim_every_jobs: int = 5
+    lost_scans: int = 5  # so many scans without a match: start afresh and look for the place in the map
+    link_every_scans: int = 10
+    link_confidence: float = 0.5

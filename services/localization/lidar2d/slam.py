@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from services.localization.lidar2d import se2
-from services.localization.lidar2d.backend import BackEnd, BackgroundJob, JobResult, run_job
-from services.localization.lidar2d.frontend import FrontEnd, LocalMap, RawScan
-from services.localization.lidar2d.movers import contradicts_free_space, grow_along_beams
-from services.localization.lidar2d.nodes import Constraint, Keynode, KeyScan, Submap, edge_information
+from services.localization.lidar2d.backend import BackEnd
+from services.localization.lidar2d.frontend import FrontEnd, RawScan, exp_twist
+from services.localization.lidar2d.jobs import BackgroundJob, JobResult, run_job
+from services.localization.lidar2d.mapping import LocalMapper
+from services.localization.lidar2d.matching import Match
+from services.localization.lidar2d.nodes import edge_information
+from services.localization.lidar2d.occupancy import CountGrid, OccupancyGrid, render
+from services.localization.lidar2d.record import TrajectoryRecord
+from services.localization.lidar2d.relocalization import GlobalMap, Relocalization, build_global_map, relocalize_in
 from services.localization.lidar2d.scan import PreparedScan
 from services.localization.lidar2d.settings import LidarSlamSettings
-from services.localization.lidar2d.surfel_map import SurfelMap, freeze
+from services.localization.lidar2d.state import load_state, save_state
+from services.localization.lidar2d.validate import StampGuard, reason_to_reject
 
 NS = 1e-9
 
@@ -32,30 +38,34 @@ class ScanResult:
     points_body: np.ndarray  # float64 [M, 2] deskewed returns
     beams: np.ndarray  # int32 [M] beam of each return
     keynode: bool
-    share: float  # share of returns on known surfaces
-    job: BackgroundJob | None  # work to run; its result is due before scan `job.apply_at_scan`
+    share: float  # share of returns in known space that lie on known surfaces
+    job: BackgroundJob | None  # work to run; its result is due before scan number `job.apply_at_scan`
 
 
-@dataclass
-class _Active:
-    submap: Submap
-    local: LocalMap
+@dataclass(frozen=True)
+class PoseAt:
+    """Pose at any stamp; both factors as of now."""
+
+    T_map_odom: np.ndarray  # float64 [3]
+    T_odom_body: np.ndarray  # float64 [3]
+    extrapolated_s: float  # 0 between scans
 
 
 class LidarSlam:
-    """One robot, one lidar. `add_scan` never waits for background work; see `offline.JobRunner`."""
+    """One robot, one lidar. `add_scan` never waits for background work; `offline.JobRunner` runs the jobs."""
 
     def __init__(self, settings: LidarSlamSettings, T_body_lidar: np.ndarray) -> None:
-        matrix = np.asarray(T_body_lidar)
+        matrix = np.asarray(T_body_lidar, dtype=np.float64)
         self.settings = settings
         self.front = FrontEnd(settings, se2.from_matrix(matrix), matrix.shape == (4, 4) and matrix[2, 2] < 0)
         self.back = BackEnd(settings)
+        self.mapper = LocalMapper(settings, self.back)
+        self.record = TrajectoryRecord()
         self.scans = 0
-        self._active: list[_Active] = []
-        self._last_key: Keynode | None = None
-        self._since_job = 0
+        self._stamps = StampGuard()
+        self._lost_run = 0
+        self._next_link_scan = 0
         self._due: BackgroundJob | None = None
-        self._record: list[tuple[int, int, np.ndarray, np.ndarray]] = []
 
     def add_odometry(self, stamp_ns: int, x_m: float, y_m: float, yaw_rad: float) -> None:
         """A pose of the wheels in their own frame; refused ones are counted in `front.odometry.refused`."""
@@ -65,105 +75,92 @@ class LidarSlam:
         self, stamp_ns: int, ranges_m: np.ndarray, angle_min_rad: float, angle_increment_rad: float,
         time_increment_s: float, range_min_m: float, range_max_m: float,
     ) -> ScanResult:  # fmt: skip
-        """Match one scan; keynodes enter the map."""
+        """Match one scan; keynodes enter the map. Raises RuntimeError if a job's result is overdue."""
         if self._due is not None and self.scans >= self._due.apply_at_scan:
-            raise RuntimeError(f"result of job {self._due.number} is due before scan {self.scans}: call apply() first")
+            raise RuntimeError(f"the result of job {self._due.number} is due: call apply() before scan {self.scans}")
         raw = RawScan(stamp_ns, ranges_m, angle_min_rad, angle_increment_rad, time_increment_s, range_min_m, range_max_m)
         self.scans += 1
-        if not self._active:
+        reason = reason_to_reject(raw)
+        restarted = False
+        if not reason:
+            reason, restarted = self._stamps.check(stamp_ns)
+        if reason:
+            return self._rejected(raw, reason)
+        if restarted:
+            self.front.restart_clock(stamp_ns)
+        if not self.front.poses:
             return self._first(raw)
+        # 1. predict, 2. deskew, 3. match
         prediction, options = self.front.predict(stamp_ns)
         scan = self.front.prepare(raw, self.front.scan_velocity(raw, prediction.motion))
-        local = self._active[0].local
-        scan, match, good = self.front.match(raw, scan, prediction, local)
+        if len(scan) < self.settings.min_points:
+            return self._rejected(raw, f"{len(scan)} returns, {self.settings.min_points} are needed")
+        scan, match, good = self.front.match(raw, scan, prediction, self.mapper.matched)
+        # 4. take the pose, or hold on to what the wheels say
         if good:
-            T_odom_body = se2.compose(local.T_odom_map, match.T_map_body)
+            T_odom_body = se2.compose(self.mapper.matched.T_odom_map, match.T_map_body)
         else:
             last = self.front.poses[-1]
             T_odom_body = se2.compose(last, prediction.motion) if prediction.source == "wheels" else last
-            options = []
-        self.front.accept(stamp_ns, T_odom_body, options)
-        moving = self._moving(scan, match.T_map_body if good else None)
-        information = match.information
-        return self._finish_scan(raw, scan, T_odom_body, "ok" if good else "lost", moving, information, match.share)
+        self.front.accept(stamp_ns, T_odom_body, options if good else [])
+        self._lost_run = 0 if good else self._lost_run + 1
+        if self._lost_run >= self.settings.lost_scans:
+            self._start_segment(raw.stamp_ns, scan, T_odom_body)
+            good = True
+        # 5. movers, 6. map, 7. background work
+        return self._map(raw, scan, T_odom_body, match, good)
 
     def _first(self, raw: RawScan) -> ScanResult:
-        scan = self.front.prepare(raw, self.front.scan_velocity(raw, None))
+        scan = self.front.prepare(raw, np.zeros(3))
+        if len(scan) < self.settings.min_points:
+            return self._rejected(raw, f"{len(scan)} returns, {self.settings.min_points} are needed")
         self.front.accept(raw.stamp_ns, np.zeros(3), [])
-        information = np.diag([1e6, 1e6, 1e8])
-        return self._finish_scan(raw, scan, np.zeros(3), "ok", np.zeros(len(scan), dtype=bool), information, 1.0)
+        return self._map(raw, scan, np.zeros(3), Match(np.zeros(3), np.diag([1e6, 1e6, 1e8]), 1.0, 1.0, 0.0), True)
 
-    def _moving(self, scan: PreparedScan, T_map_body: np.ndarray | None) -> np.ndarray:
-        moving = np.zeros(len(scan), dtype=bool)
-        if T_map_body is None or len(scan) == 0:
-            return moving
-        surfels = self._active[0].local.surfels
-        seeds = np.empty(len(scan), dtype=bool)
-        contradicts_free_space(scan.points_body, T_map_body, surfels.nearest, surfels.means, surfels.hits,
-                               surfels.misses, surfels.row0, surfels.col0, surfels.cell_m, seeds)  # fmt: skip
-        grow_along_beams(seeds, scan.points_body, scan.beams, 0.15, moving)
-        return moving
+    def _start_segment(self, stamp_ns: int, scan: PreparedScan, T_odom_body: np.ndarray) -> None:
+        self._lost_run = 0
+        self.mapper.close()
+        self.back.start_segment()
+        self._next_link_scan = self.scans
 
-    def _finish_scan(
-        self, raw: RawScan, scan: PreparedScan, T_odom_body: np.ndarray, status: str, moving: np.ndarray,
-        information: np.ndarray, share: float,
-    ) -> ScanResult:  # fmt: skip
-        key = status == "ok" and self._is_key(raw.stamp_ns, T_odom_body)
-        if key:
-            self._insert(raw.stamp_ns, scan, T_odom_body, moving, information)
+    def _map(
+        self, raw: RawScan, scan: PreparedScan, T_odom_body: np.ndarray, match: Match, good: bool
+    ) -> ScanResult:
+        moving = self.mapper.moving(scan, T_odom_body) if good else np.zeros(len(scan), dtype=bool)
+        key = good and self.mapper.insert(raw.stamp_ns, scan, T_odom_body, moving, match.information)
         job = self._job()
         per_beam = np.zeros(len(raw.ranges_m), dtype=bool)
         per_beam[scan.beams[moving]] = True
         T_map_odom = self.back.T_map_odom.copy()
-        T_key_body = se2.between(self._last_key.T_odom_body, T_odom_body)
-        self._record.append((raw.stamp_ns, self._last_key.id, T_key_body, se2.compose(T_map_odom, T_odom_body)))
-        covariance = np.linalg.inv(edge_information(information, 0.003, 0.001))
+        last = self.mapper.last_key
+        self.record.add(raw.stamp_ns, last.id, se2.between(last.T_odom_body, T_odom_body),
+                        se2.compose(T_map_odom, T_odom_body))  # fmt: skip
+        covariance = np.linalg.inv(edge_information(match.information, 0.003, 0.001))
+        status = "lost" if not good else "ok" if self.back.unlinked_from is None else "relocalizing"
         return ScanResult(raw.stamp_ns, status, T_odom_body, T_map_odom, covariance, per_beam, scan.points_body,
-                          scan.beams, key, share, job)  # fmt: skip
+                          scan.beams, key, match.share, job)  # fmt: skip
 
-    def _is_key(self, stamp_ns: int, T_odom_body: np.ndarray) -> bool:
-        if self._last_key is None:
-            return True
-        s = self.settings
-        moved = se2.between(self._last_key.T_odom_body, T_odom_body)
-        return (
-            math.hypot(moved[0], moved[1]) > s.keynode_distance_m
-            or abs(moved[2]) > s.keynode_angle_rad
-            or (stamp_ns - self._last_key.stamp_ns) * NS > s.keynode_time_s
-        )
+    def _rejected(self, raw: RawScan, reason: str) -> ScanResult:
+        T_odom_body = self.front.poses[-1].copy() if self.front.poses else np.zeros(3)
+        count = len(raw.ranges_m) if isinstance(raw.ranges_m, np.ndarray) and raw.ranges_m.ndim == 1 else 0
+        return ScanResult(
+            raw.stamp_ns, f"rejected: {reason}", T_odom_body, self.back.T_map_odom.copy(), np.diag([1.0, 1.0, 0.1]),
+            np.zeros(count, dtype=bool), np.zeros((0, 2)), np.zeros(0, dtype=np.int32), False, 0.0, self._job(),
+        )  # fmt: skip
 
-    def _insert(
-        self, stamp_ns: int, scan: PreparedScan, T_odom_body: np.ndarray, moving: np.ndarray, information: np.ndarray
-    ) -> None:
-        s = self.settings
-        if not self._active or self._active[-1].local.surfels.scans >= s.submap_keynodes:
-            if len(self._active) == 2:
-                done = self._active.pop(0)
-                done.submap.frozen = freeze(done.local.surfels)
-            self._active.append(_Active(self.back.start_submap(T_odom_body), LocalMap(T_odom_body, SurfelMap(s))))
-        node = Keynode(self.back.next_node_id, stamp_ns, T_odom_body, KeyScan.of(scan, moving))
-        edges = []
-        for active in self._active:
-            T = se2.between(active.local.T_odom_map, T_odom_body)
-            turn = np.array([0.0, 0.0, T[2]])
-            active.local.surfels.insert(
-                se2.transform(T, scan.points_body), se2.transform(turn, scan.tangents), scan.spacing_m,
-                se2.transform(T, scan.origin_body[None])[0], ~moving, ~moving,
-            )  # fmt: skip
-            info = edge_information(information, s.edge_sigma_m, s.edge_sigma_rad) / s.inner_facts
-            edges.append(Constraint(active.submap.id, node.id, T, info, False))
-        self.back.add_keynode(node, edges)
-        self._last_key = node
-        self._since_job += 1
+    # ---- background work --------------------------------------------------------------------------
 
     def _job(self) -> BackgroundJob | None:
-        if self._since_job < self.settings.job_keynodes or self._due is not None:
+        s = self.settings
+        searching = self.back.unlinked_from is not None and self.scans >= self._next_link_scan
+        if self._due is not None or not self.back.nodes:
             return None
-        self._since_job = 0
+        if not searching and self.mapper.keynodes_since_job < s.job_keynodes:
+            return None
+        self.mapper.keynodes_since_job = 0
+        self._next_link_scan = self.scans + s.link_every_scans
         snapshot = self.back.snapshot()
-        self._due = BackgroundJob(
-            snapshot.number, self.scans + self.settings.apply_after_scans, lambda: run_job(snapshot)
-        )
+        self._due = BackgroundJob(snapshot.number, self.scans + s.apply_after_scans, lambda: run_job(snapshot))
         return self._due
 
     @property
@@ -176,25 +173,97 @@ class LidarSlam:
         self.back.apply(result)
         if self._due is not None and self._due.number == result.number:
             self._due = None
+        if result.number % self.settings.trim_every_jobs == 0 or self.back.fixed:
+            self.back.trim(self.mapper.active_ids)
 
     def finish(self, refine_rounds: int = 2) -> None:
-        """Final loop closure, refinement and optimisation, inline."""
+        """Final loop closure, refinement and optimisation, inline; mapping may go on afterwards."""
         if self._due is not None:
             self.apply(self._due.run())
-        for active in self._active:
-            if active.submap.frozen is None:
-                active.submap.frozen = freeze(active.local.surfels)
+        self.mapper.close()
+        if not self.back.nodes:
+            return
         before = -1
-        while self.back.pending and len(self.back.pending) != before:
+        while self.back.pending and len(self.back.pending) != before and self.back.unlinked_from is None:
             before = len(self.back.pending)
             self.back.apply(run_job(self.back.snapshot()))
-        self.back.apply(run_job(self.back.snapshot(), refine_rounds))
+        self.back.apply(run_job(self.back.snapshot(), 0 if self.back.fixed else refine_rounds))
+
+    # ---- answers ----------------------------------------------------------------------------------
+
+    def pose_at(self, stamp_ns: int) -> PoseAt | None:
+        """Interpolated between scans; beyond the newest by its velocity for `extrapolate_s` at most, else None."""
+        stamps, poses = self.front.stamps, self.front.poses
+        if not stamps or stamp_ns < stamps[0]:
+            return None
+        ahead_s = (stamp_ns - stamps[-1]) * NS
+        if ahead_s > self.settings.extrapolate_s:
+            return None
+        if ahead_s >= 0.0:
+            T = se2.compose(poses[-1], exp_twist(self.front.velocity(), ahead_s))
+            return PoseAt(self.back.T_map_odom.copy(), T, ahead_s)
+        i = int(np.searchsorted(np.array(stamps), stamp_ns, side="right"))
+        f = (stamp_ns - stamps[i - 1]) / (stamps[i] - stamps[i - 1])
+        T = se2.compose(poses[i - 1], f * se2.between(poses[i - 1], poses[i]))
+        return PoseAt(self.back.T_map_odom.copy(), T, 0.0)
 
     def trajectory(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Stamps int64 [N], T_map_body [N, 3] as now known, and as published online [N, 3], of every scan."""
-        stamps = np.array([r[0] for r in self._record], dtype=np.int64)
-        if len(stamps) == 0:
-            return stamps, np.zeros((0, 3)), np.zeros((0, 3))
-        base = np.array([self.back.T_map_node[r[1]] for r in self._record])
-        relative = np.array([r[2] for r in self._record])
-        return stamps, se2.compose_many(base, relative), np.array([r[3] for r in self._record])
+        return self.record.stamps_ns, self.record.optimised(self.back.all_node_poses()), self.record.online
+
+    def anchors(self) -> dict[int, np.ndarray]:
+        """T_map_anchor float64 [3] by id: the submaps."""
+        return {i: s.T_map_submap.copy() for i, s in self.back.submaps.items()}
+
+    def grid(self, resolution_m: float = 0.05) -> OccupancyGrid:
+        """Occupancy of everything seen so far."""
+        grids = []
+        for submap in self.back.submaps.values():
+            if submap.frozen is not None:
+                f = submap.frozen
+                hits, misses = f.counts()
+                grids.append(CountGrid(hits, misses, f.row0, f.col0, f.cell_m, submap.T_map_submap))
+        return render(grids + self.mapper.count_grids(), resolution_m)
+
+    def relocalize(
+        self, ranges_m: np.ndarray, angle_min_rad: float, angle_increment_rad: float, range_min_m: float,
+        range_max_m: float,
+    ) -> Relocalization:  # fmt: skip
+        """Where one scan was taken, without any guess. Raises ValueError for an empty map or a bad scan."""
+        raw = RawScan(0, ranges_m, angle_min_rad, angle_increment_rad, 0.0, range_min_m, range_max_m)
+        reason = reason_to_reject(raw)
+        if reason:
+            raise ValueError(reason)
+        scan = self.front.prepare(raw, np.zeros(3))
+        return relocalize_in(self.world(), scan.features(), scan.origin_body, self.settings)
+
+    def world(self) -> GlobalMap:
+        """The map relocalization searches; drawn once per state of the map (about a second)."""
+        back = self.back
+        known = [n for n in back.nodes if back.unlinked_from is None or n < back.unlinked_from]
+        return back.cache.world(
+            (back.optimisations, len(known)),
+            lambda: build_global_map(self.settings, [back.nodes[n] for n in known],
+                                     [back.T_map_node[n] for n in known]),  # fmt: skip
+        )
+
+    def save(self, folder: Path) -> None:
+        """Write the state; mapping may go on."""
+        self.mapper.with_frozen(lambda: save_state(Path(folder), self.back, self.record.arrays()))
+
+    @staticmethod
+    def load(
+        folder: Path, settings: LidarSlamSettings, T_body_lidar: np.ndarray, localize_only: bool = False
+    ) -> LidarSlam:
+        """A saved map to go on with; the first scans find their place in it ("relocalizing").
+
+        With `localize_only` the saved map stays as it is. Raises MapStateError.
+        """
+        slam = LidarSlam(settings, T_body_lidar)
+        slam.back, extra = load_state(folder, settings)
+        slam.mapper = LocalMapper(settings, slam.back)
+        slam.record = TrajectoryRecord() if localize_only else TrajectoryRecord.of(extra)
+        slam.back.start_segment()
+        if localize_only:
+            slam.back.fixed = frozenset(slam.back.submaps)
+        return slam

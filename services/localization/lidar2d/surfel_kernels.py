@@ -8,6 +8,7 @@ import numpy as np
 from numba import njit
 
 MAX_WEIGHT = 60.0  # moments forget beyond this many returns: slow change is followed, memory of drift fades
+RESPLAT_M = 0.006  # a surface element that moved less than this is where its neighbourhood thinks it is
 FIELD_SIGMA_M = 0.06  # width of the likelihood field used by searches
 
 
@@ -124,6 +125,7 @@ def add_returns(
     moments: np.ndarray,
     views: np.ndarray,  # float64 [S, 2] sum of directions towards the lidar
     cells: np.ndarray,  # int32 [S, 2] row, col (absolute)
+    told: np.ndarray,  # float64 [S, 2], see refresh()
     count: int,
     row0: int,
     col0: int,
@@ -146,6 +148,7 @@ def add_returns(
             cells[k, 0], cells[k, 1] = ar, ac
             moments[k] = 0.0
             views[k] = 0.0
+            told[k] = 1e9
         if touched[r, c] != scan_number:
             touched[r, c] = scan_number
             _bump(hits, misses, r, c)
@@ -236,6 +239,7 @@ def refresh(
     cells: np.ndarray,
     means: np.ndarray,
     omegas: np.ndarray,
+    told: np.ndarray,  # in out float64 [S, 2] the mean that the cells around know
     row0: int,
     col0: int,
     cell_m: float,
@@ -253,4 +257,8 @@ def refresh(
                     merged_surfel(cell_id, moments, r, c, range_sigma_m, map_sigma_m, means[k], omegas[k])
     for i in range(changed.shape[0]):
         k = changed[i]
+        moved = abs(means[k, 0] - told[k, 0]) + abs(means[k, 1] - told[k, 1])
+        if moved < RESPLAT_M:
+            continue
+        told[k] = means[k]
         splat(nearest, field, means, omegas, k, cells[k, 0] - row0, cells[k, 1] - col0, row0, col0, cell_m, reach)

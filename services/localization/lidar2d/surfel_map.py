@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,6 +24,7 @@ class MatchTables:
     means: np.ndarray  # float64 [S, 2]
     omegas: np.ndarray  # float64 [S, 3]
     views: np.ndarray  # float64 [S, 2]
+    seen: np.ndarray  # uint8 [H, W] beams that crossed a cell
     row0: int
     col0: int
     cell_m: float
@@ -48,7 +50,7 @@ class SurfelMap:
 
     def _reserve_surfels(self, capacity: int) -> None:
         for name, width, dtype in (("moments", 6, np.float64), ("views", 2, np.float64), ("cells", 2, np.int32),
-                                   ("means", 2, np.float64), ("omegas", 3, np.float64)):  # fmt: skip
+                                   ("means", 2, np.float64), ("omegas", 3, np.float64), ("told", 2, np.float64)):  # fmt: skip
             grown = np.zeros((capacity, width), dtype=dtype)
             if self.count:
                 grown[: self.count] = getattr(self, name)[: self.count]
@@ -90,19 +92,19 @@ class SurfelMap:
         changed = np.empty(len(points), dtype=np.int32)
         self.count, n = add_returns(
             points, tangents, spacing_m, surface, origin, self.scans, self.cell_id, self.hits, self.misses,
-            self.touched, self.moments, self.views, self.cells, self.count, self.row0, self.col0, self.cell_m, changed,
+            self.touched, self.moments, self.views, self.cells, self.told, self.count, self.row0, self.col0, self.cell_m, changed,
         )  # fmt: skip
         cast_rays(points, free, origin, self.scans, self.hits, self.misses, self.touched, self.row0, self.col0,
                   self.cell_m)  # fmt: skip
         refresh(changed[:n], self.cell_id, self.nearest, self.field, self.moments, self.cells, self.means,
-                self.omegas, self.row0, self.col0, self.cell_m, s.reach_cells, s.range_sigma_m,
+                self.omegas, self.told, self.row0, self.col0, self.cell_m, s.reach_cells, s.range_sigma_m,
                 s.map_sigma_m)  # fmt: skip
         self.scans += 1
 
     def tables(self) -> MatchTables:
         """The live tables of this map (not a copy)."""
-        return MatchTables(self.nearest, self.field, self.means, self.omegas, self.views, self.row0, self.col0,
-                           self.cell_m)  # fmt: skip
+        return MatchTables(self.nearest, self.field, self.means, self.omegas, self.views, self.misses, self.row0,
+                           self.col0, self.cell_m)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -112,21 +114,26 @@ class FrozenMap:
     means: np.ndarray  # float32 [S, 2]
     omegas: np.ndarray  # float32 [S, 3]
     views: np.ndarray  # float32 [S, 2]
-    hits: np.ndarray  # uint8 [H, W]
-    misses: np.ndarray  # uint8 [H, W]
+    packed: bytes  # hits and misses, uint8 [2, H, W], deflated: most of a grid is empty
+    shape: tuple[int, int]
     row0: int
     col0: int
     cell_m: float
 
+    def counts(self) -> tuple[np.ndarray, np.ndarray]:
+        """Hits and misses, uint8 [H, W] each."""
+        hits, misses = np.frombuffer(zlib.decompress(self.packed), dtype=np.uint8).reshape(2, *self.shape)
+        return hits, misses
+
     def tables(self, reach_cells: int) -> MatchTables:
         """Match tables, computed from the surface elements."""
         means, omegas = self.means.astype(np.float64), self.omegas.astype(np.float64)
-        nearest = np.full(self.hits.shape, -1, dtype=np.int32)
-        field = np.zeros(self.hits.shape, dtype=np.uint8)
+        nearest = np.full(self.shape, -1, dtype=np.int32)
+        field = np.zeros(self.shape, dtype=np.uint8)
         cells = np.floor(means[:, ::-1] / self.cell_m).astype(np.int64)
         _splat_all(nearest, field, means, omegas, cells, self.row0, self.col0, self.cell_m, reach_cells)
-        return MatchTables(nearest, field, means, omegas, self.views.astype(np.float64), self.row0, self.col0,
-                           self.cell_m)  # fmt: skip
+        return MatchTables(nearest, field, means, omegas, self.views.astype(np.float64), self.counts()[1],
+                           self.row0, self.col0, self.cell_m)  # fmt: skip
 
 
 def freeze(surfels: SurfelMap, min_hit_share: float = 0.2) -> FrozenMap:
@@ -143,8 +150,9 @@ def freeze(surfels: SurfelMap, min_hit_share: float = 0.2) -> FrozenMap:
     c0, c1 = max(used_cols[0] - MARGIN, 0), used_cols[-1] + MARGIN + 1
     return FrozenMap(
         surfels.means[:n][alive].astype(np.float32), surfels.omegas[:n][alive].astype(np.float32),
-        surfels.views[:n][alive].astype(np.float32), surfels.hits[r0:r1, c0:c1].copy(),
-        surfels.misses[r0:r1, c0:c1].copy(), int(surfels.row0 + r0), int(surfels.col0 + c0), surfels.cell_m,
+        surfels.views[:n][alive].astype(np.float32),
+        zlib.compress(np.stack([surfels.hits[r0:r1, c0:c1], surfels.misses[r0:r1, c0:c1]]).tobytes(), 1),
+        surfels.hits[r0:r1, c0:c1].shape, int(surfels.row0 + r0), int(surfels.col0 + c0), surfels.cell_m,
     )  # fmt: skip
 
 

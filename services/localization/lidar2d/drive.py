@@ -1,0 +1,105 @@
+"""Maps a whole recorded drive as fast as the machine allows, and counts what it costs."""
+
+from __future__ import annotations
+
+import json
+import resource
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from common.errors import UserError
+from common.geometry import se2_to_se3
+from common.sync import StampMerger
+from common.trajectory import Trajectory, write_tum
+from services.localization.lidar2d import se2
+from services.localization.lidar2d.occupancy import save_nav2
+from services.localization.lidar2d.offline import JobRunner
+from services.localization.lidar2d.settings import LidarSlamSettings
+from services.localization.lidar2d.slam import LidarSlam
+
+STREAMS = ("odometry", "scan")
+
+
+@dataclass(frozen=True)
+class Drive:
+    """Measurements in order of arrival: ("scan", stamp_ns, ranges_m, angle_min_rad, angle_increment_rad,
+    time_increment_s, range_min_m, range_max_m) and ("odometry", stamp_ns, x_m, y_m, yaw_rad)."""
+
+    T_body_lidar: np.ndarray  # float64 [4, 4]
+    measurements: Iterable[tuple]
+    advance: Callable[[], None]  # called once a measurement, for a progress bar
+
+
+def map_drive(drive: Drive, out: Path, resolution_m: float = 0.05) -> dict[str, Any]:
+    """Runs the SLAM over a drive and writes poses, map, state and figures into `out`.
+
+    Background jobs run in a second thread and are taken in at the scans where they are due, exactly as in
+    the live node.
+
+    Raises:
+        UserError: there was no usable scan.
+    """
+    slam = LidarSlam(LidarSlamSettings(), drive.T_body_lidar)
+    wall, cpu = time.perf_counter(), time.process_time()
+    steps_ms: list[float] = []
+    statuses: dict[str, int] = {}
+    with JobRunner(slam, threaded=True) as jobs:
+        for kind, *values in _merged(drive):
+            if kind == "odometry":
+                slam.add_odometry(*values)
+                continue
+            jobs.before_scan()
+            started = time.perf_counter()
+            result = slam.add_scan(*values)
+            steps_ms.append((time.perf_counter() - started) * 1e3)
+            jobs.after_scan(result)
+            status = result.status.partition(":")[0]
+            statuses[status] = statuses.get(status, 0) + 1
+        jobs.finish()
+    cpu_s, wall_s = time.process_time() - cpu, time.perf_counter() - wall
+    if slam.record.count == 0:
+        raise UserError(f"no scan could be used: {statuses or 'there was none'}")
+    _write(slam, out, resolution_m)
+    figures = {
+        "scans": len(steps_ms),
+        "wall_s": wall_s,
+        "cpu_s": cpu_s,
+        "cpu_ms_per_scan": cpu_s / len(steps_ms) * 1e3,
+        "step_p50_ms": float(np.percentile(steps_ms, 50)),
+        "step_p95_ms": float(np.percentile(steps_ms, 95)),
+        "peak_rss_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0,
+        "loop_closures": slam.back.loop_closures,
+        "odometry_refused": slam.front.odometry.refused,
+        **{f"scans_{status}": count for status, count in statuses.items()},
+        "T_body_lidar": se2.from_matrix(drive.T_body_lidar).tolist(),
+    }
+    (out / "figures.json").write_text(json.dumps(figures, indent=1))
+    return figures
+
+
+def _merged(drive: Drive) -> Iterable[tuple]:
+    """Measurements by stamp, with the merger that the live runner uses."""
+    merger = StampMerger(STREAMS)
+    for measurement in drive.measurements:
+        drive.advance()
+        merger.put(measurement[0], measurement[1], measurement)
+        while (item := merger.pop()) is not None:
+            yield item[1]
+    for stream in STREAMS:
+        merger.end(stream)
+    while (item := merger.pop()) is not None:
+        yield item[1]
+
+
+def _write(slam: LidarSlam, out: Path, resolution_m: float) -> None:
+    out.mkdir(parents=True, exist_ok=True)
+    slam.save(out / "state")
+    stamps_ns, T_map_body, published = slam.trajectory()
+    for name, poses in (("trajectory.tum", T_map_body), ("online.tum", published)):
+        write_tum(out / name, Trajectory(stamps_ns, se2_to_se3(poses)), "T_map_body")
+    save_nav2(slam.grid(resolution_m), out)

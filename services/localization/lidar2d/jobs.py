@@ -1,0 +1,213 @@
+"""Background work as pure functions of a snapshot: loop closure, linking, refinement, optimisation."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from services.localization.lidar2d import se2
+from services.localization.lidar2d.loops import DriftModel, Place, close_narrow, close_wide, confirmed
+from services.localization.lidar2d.nodes import Constraint, Keynode, TableCache, edges_of
+from services.localization.lidar2d.pose_graph import Edges, optimise
+from services.localization.lidar2d.refinement import refine_submaps
+from services.localization.lidar2d.segments import link_segment
+from services.localization.lidar2d.settings import LidarSlamSettings
+from services.localization.lidar2d.surfel_map import FrozenMap
+
+REJECT_CHI2 = 100.0  # a loop this far off after optimisation is forgotten
+
+
+@dataclass(frozen=True)
+class JobResult:
+    """What a background job found; `LidarSlam.apply` takes it in."""
+
+    number: int
+    constraints: list[Constraint] | None  # None: as they were; else the whole new list up to the snapshot
+    known_constraints: int  # how many the snapshot had
+    T_map_submap: dict[int, np.ndarray]
+    T_map_node: dict[int, np.ndarray]
+    frozen: dict[int, FrozenMap]  # submaps that were drawn anew
+    still_pending: list[int]
+    tried: list[int]  # submaps that were searched widely
+    loops_found: int
+    linked: bool  # the newest segment now hangs on the map
+
+
+@dataclass(frozen=True)
+class BackgroundJob:
+    """Pure work on a snapshot: call `run` in any thread, hand the result to `LidarSlam.apply`."""
+
+    number: int
+    apply_at_scan: int  # before the scan of this number is added
+    run: Callable[[], JobResult]
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """Everything a job reads; nothing in it changes later."""
+
+    number: int
+    settings: LidarSlamSettings
+    nodes: dict[int, Keynode]
+    frozen: dict[int, FrozenMap]
+    submap_ids: list[int]
+    node_ids: list[int]
+    members: dict[int, list[int]]
+    T_map_submap: np.ndarray  # float64 [S, 3]
+    T_map_node: np.ndarray  # float64 [N, 3]
+    constraints: list[Constraint]
+    pending: list[int]
+    tries: dict[int, int]
+    cache: TableCache
+    version: int  # of the map's poses
+    unlinked_from: int | None  # first keynode of a segment whose place in the map is unknown
+    fixed: frozenset[int]  # submaps that must not move
+
+
+def run_job(snapshot: Snapshot, refine_rounds: int = 0) -> JobResult:
+    """Close loops, optimise; with `refine_rounds` also draw the submaps anew and measure every edge again."""
+    submap_row = {s: i for i, s in enumerate(snapshot.submap_ids)}
+    node_row = {n: i for i, n in enumerate(snapshot.node_ids)}
+    constraints, tried, frozen = list(snapshot.constraints), [], dict(snapshot.frozen)
+    edges = edges_of(constraints, submap_row, node_row)
+    T_s, T_n, link = snapshot.T_map_submap, snapshot.T_map_node, None
+    if snapshot.unlinked_from is None:
+        found, tried, still = _close_loops(snapshot, edges, submap_row, node_row)
+    else:
+        link, T_s, T_n = link_segment(snapshot)
+        found, tried, still = [] if link is None else [link], [], list(snapshot.pending)
+    constraints += found
+    fixed = [submap_row[i] for i in sorted(snapshot.fixed) if i in submap_row] or [0]
+    solution = optimise(T_s, T_n, edges_of(constraints, submap_row, node_row), fixed)
+    drawn: dict[int, FrozenMap] = {}
+    for _ in range(refine_rounds):
+        drawn, constraints = refine_submaps(
+            snapshot.settings, snapshot.nodes, snapshot.members, frozen, constraints,
+            dict(zip(snapshot.submap_ids, solution.T_map_submap)), dict(zip(snapshot.node_ids, solution.T_map_node)),
+        )  # fmt: skip
+        frozen.update(drawn)
+        edges = edges_of(constraints, submap_row, node_row)
+        solution = optimise(solution.T_map_submap, solution.T_map_node, edges, fixed)
+    constraints = _without_outliers(constraints, solution.chi2, node_row)
+    return JobResult(
+        snapshot.number, constraints, len(snapshot.constraints),
+        dict(zip(snapshot.submap_ids, solution.T_map_submap)), dict(zip(snapshot.node_ids, solution.T_map_node)),
+        drawn, still, tried, len(found), snapshot.unlinked_from is None or link is not None,
+    )  # fmt: skip
+
+
+def _without_outliers(
+    constraints: list[Constraint], chi2: np.ndarray, node_row: dict[int, int]
+) -> list[Constraint]:
+    order = np.argsort([node_row[c.node] for c in constraints], kind="stable")
+    keep = np.ones(len(constraints), dtype=bool)
+    keep[order] = chi2 < REJECT_CHI2
+    return [c for c, k in zip(constraints, keep) if k or not c.loop]
+
+
+def _close_loops(
+    snapshot: Snapshot, edges: Edges, submap_row: dict[int, int], node_row: dict[int, int]
+) -> tuple[list[Constraint], list[int], list[int]]:
+    """New loop constraints, the submaps searched widely, and the nodes whose turn has not come."""
+    s = snapshot.settings
+    if not snapshot.frozen or not snapshot.pending:
+        return [], [], list(snapshot.pending)
+    drift = DriftModel(edges, len(snapshot.submap_ids), len(snapshot.node_ids), s)
+    windows: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+    turn = snapshot.pending[-3 * s.job_keynodes :]
+    still = snapshot.pending[: -3 * s.job_keynodes]
+    tasks = []
+    for node_id in turn:
+        own = sorted(set(_submaps_of(edges, node_row[node_id]).tolist()))
+        if own[0] not in windows:
+            windows[own[0]] = drift.windows(own[0])
+        places, unsure = _places(snapshot, edges, node_row[node_id], own, windows[own[0]])
+        tasks += [(place.submap, node_id, place) for place in places]
+        if unsure and not places:
+            still.append(node_id)
+    # One submap after the other: their tables are large.
+    closed = [
+        close_narrow(snapshot.nodes[node_id], place, snapshot.cache, s)
+        for _, node_id, place in sorted(tasks, key=lambda task: task[:2])
+    ]
+    found = [c for c in closed if c is not None]
+    fresh = turn[-s.job_keynodes :]
+    wide, tried = _close_wide(snapshot, edges, node_row, fresh[len(fresh) // 2], windows, drift)
+    return found + wide, tried, sorted(still)[-2000:]
+
+
+def _submaps_of(edges: Edges, row: int) -> np.ndarray:
+    lo, hi = np.searchsorted(edges.node, [row, row + 1])
+    return edges.submap[lo:hi][~edges.robust[lo:hi]]
+
+
+def _nearest_member(snapshot: Snapshot, edges: Edges, row: int) -> np.ndarray:
+    """Distance (m) from a node to the nearest member of each submap, float64 [S]."""
+    away = np.hypot(*(snapshot.T_map_node[:, :2] - snapshot.T_map_node[row, :2]).T)
+    distance = np.full(len(snapshot.submap_ids), np.inf)
+    inner = ~edges.robust
+    np.minimum.at(distance, edges.submap[inner], away[edges.node[inner]])
+    return distance
+
+
+def _places(
+    snapshot: Snapshot, edges: Edges, row: int, own: list[int],
+    windows: tuple[np.ndarray, np.ndarray],
+) -> tuple[list[Place], bool]:  # fmt: skip
+    """Submaps of other passes right here, nearest first; the flag: some are too uncertain for a narrow search."""
+    s = snapshot.settings
+    distance = _nearest_member(snapshot, edges, row)
+    distance[[k for o in own for k in (o - 1, o, o + 1) if 0 <= k < len(distance)]] = np.inf
+    places, taken, unsure = [], [], False
+    for k in np.argsort(distance, kind="stable"):
+        if distance[k] > s.loop_near_m or len(places) == s.loop_submaps:
+            break
+        submap_id = snapshot.submap_ids[k]
+        if submap_id not in snapshot.frozen or any(abs(int(k) - t) <= 1 for t in taken):
+            continue
+        if windows[0][k] > s.narrow_m or windows[1][k] > s.narrow_rad:
+            unsure = True
+            continue
+        taken.append(int(k))
+        T = se2.between(snapshot.T_map_submap[k], snapshot.T_map_node[row])
+        places.append(Place(submap_id, snapshot.frozen[submap_id], T, float(windows[0][k]), float(windows[1][k])))
+    return places, unsure
+
+
+def _close_wide(
+    snapshot: Snapshot, edges: Edges, node_row: dict[int, int], centre: int,
+    windows: dict[int, tuple[np.ndarray, np.ndarray]], drift: DriftModel,
+) -> tuple[list[Constraint], list[int]]:  # fmt: skip
+    s = snapshot.settings
+    row = node_row[centre]
+    own = sorted(set(_submaps_of(edges, row).tolist()))
+    window_m, window_rad = windows.setdefault(own[0], drift.windows(own[0]))
+    distance = _nearest_member(snapshot, edges, row)
+    distance[own] = np.inf
+    half = s.chunk_keynodes // 2
+    chunk = [snapshot.nodes[n] for n in snapshot.node_ids[max(0, row - half) : row + half + 1]]
+    candidates = []
+    for k in np.flatnonzero(np.isfinite(distance)):
+        submap_id = snapshot.submap_ids[k]
+        narrow = window_m[k] <= s.narrow_m and window_rad[k] <= s.narrow_rad
+        if submap_id in snapshot.frozen and not narrow and distance[k] < s.loop_near_m + window_m[k]:
+            candidates.append((snapshot.tries.get(submap_id, 0), float(distance[k]), int(k)))
+    found, tried = [], []
+    for _, _, k in sorted(candidates)[: s.wide_searches]:
+        submap_id = snapshot.submap_ids[k]
+        T = se2.between(snapshot.T_map_submap[k], snapshot.T_map_node[row])
+        window = min(float(window_m[k]), s.wide_limit_m) if math.isfinite(window_m[k]) else s.wide_limit_m
+        turn = min(float(window_rad[k]), math.pi) if math.isfinite(window_rad[k]) else math.pi
+        place = Place(submap_id, snapshot.frozen[submap_id], T, window, turn)
+        constraint = close_wide(snapshot.nodes[centre], chunk, place, snapshot.cache, s)
+        tried.append(submap_id)
+        if constraint is not None and confirmed(
+            constraint, snapshot.node_ids, snapshot.nodes, snapshot.members, snapshot.frozen,
+            dict(zip(snapshot.submap_ids, snapshot.T_map_submap)), dict(zip(snapshot.node_ids, snapshot.T_map_node)),
+            snapshot.cache, s,
+        ):  # fmt: skip
+            found.append(constraint)
+    return found, tried

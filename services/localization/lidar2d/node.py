@@ -1,0 +1,170 @@
+"""Lidar SLAM as a node: scans and wheels in; smooth pose, correction, anchors, movers and grid out."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+from pydantic import Field
+
+from common.config import NodeConfig
+from common.geometry import se2_to_se3, se3_to_se2
+from common.messages import Anchors, Correction, Grid, MovingBeams, Odometry, Rig, Scan, WheelOdometry
+from common.node import Input, Job, Node, Outputs
+from services.localization.lidar2d.occupancy import OccupancyGrid
+from services.localization.lidar2d.settings import LidarSlamSettings
+from services.localization.lidar2d.slam import LidarSlam, ScanResult
+
+log = logging.getLogger("beamsplat.localization")
+
+
+class LidarLocalizationConfig(NodeConfig):
+    """The SLAM itself needs no tuning: what differs between lidars comes with the scans."""
+
+    grid_every_scans: Annotated[int, Field(ge=1)] = 50
+    grid_resolution_m: Annotated[float, Field(gt=0.0, le=1.0)] = 0.05
+    save: Path | None = None  # folder for map, trajectory and state, written at the end of the data
+
+
+class LidarLocalization(Node):
+    """The robot's pose from its lidar, with wheel odometry if there is any."""
+
+    name = "localization"
+    Config = LidarLocalizationConfig
+    # The calibration is merged by stamp with the scans: whether it is there must not depend on luck.
+    inputs = (Input("rig", "every"), "lidar/scan", "wheel/odometry")
+    outputs = (
+        "localization/odometry", "localization/correction", "localization/anchors", "localization/movers",
+        "localization/grid",
+    )  # fmt: skip
+
+    def configure(self) -> None:
+        self._slam: LidarSlam | None = None
+        self._said: np.ndarray | None = None  # T_map_odom as last published
+        self._optimisations = 0
+        self._stamp_ns = 0
+        self._drawn: OccupancyGrid | None = None
+
+    def on_rig(self, rig: Rig) -> Outputs:
+        """Where the lidar sits. A second calibration would bend the map: it is refused, and said."""
+        if rig.lidar is None:
+            log.error("the calibration has no lidar: scans cannot be used")
+        elif self._slam is None:
+            self._slam = LidarSlam(LidarSlamSettings(), rig.lidar.T_body_lidar)
+        else:
+            log.warning("a new calibration is ignored: restart the node to use it")
+        return iter(())
+
+    def on_wheel_odometry(self, odometry: WheelOdometry) -> Outputs:
+        if self._slam is not None:
+            self._slam.add_odometry(odometry.stamp_ns, *se3_to_se2(odometry.T_odom_body).tolist())
+        return iter(())
+
+    def on_lidar_scan(self, scan: Scan) -> Outputs:
+        """One pose a scan; background work and a new grid now and then."""
+        if self._slam is None:
+            yield "localization/odometry", _unusable(scan.stamp_ns, "no calibration yet")
+            return
+        result = self._slam.add_scan(
+            scan.stamp_ns, scan.ranges_m, scan.angle_min_rad, scan.angle_increment_rad,
+            scan.time_increment_s, scan.range_min_m, scan.range_max_m,
+        )  # fmt: skip
+        self._stamp_ns = scan.stamp_ns
+        yield "localization/odometry", _odometry(result)
+        yield "localization/movers", MovingBeams(stamp_ns=scan.stamp_ns, moving=result.moving)
+        yield from self._correction(scan.stamp_ns, result.T_map_odom)
+        if result.job is not None:
+            # Its result is due before the scan with number `apply_at_scan`; the next one is `scans`.
+            after = result.job.apply_at_scan - self._slam.scans + 1
+            yield Job("optimise", result.job.run, after=after, of="lidar/scan")
+        if self._slam.scans % self.config.grid_every_scans == 0:
+            yield from self._draw_grid()
+
+    def on_job_optimise(self, result: object) -> Outputs:
+        """A background optimisation is taken in: the map moves, the smooth pose does not."""
+        self._slam.apply(result)
+        self._optimisations += 1
+        yield from self._map_moved()
+
+    def drain(self) -> Outputs:
+        """Last loop closures and optimisation, the final grid, and the files asked for."""
+        if self._slam is None or self._slam.scans == 0:
+            return
+        self._slam.finish()
+        self._optimisations += 1
+        yield from self._map_moved()
+        yield from self._draw_grid()
+        if self.config.save is not None:
+            self._slam.save(self.config.save)
+            log.info("map and state saved to %s", self.config.save)
+
+    def _map_moved(self) -> Outputs:
+        yield from self._correction(self._stamp_ns, self._slam.back.T_map_odom)
+        anchors = self._slam.anchors()
+        T_map_anchor = se2_to_se3(np.array(list(anchors.values())).reshape(-1, 3))
+        yield (
+            "localization/anchors",
+            Anchors(
+                stamp_ns=self._stamp_ns, anchor_ids=np.array(list(anchors), dtype=np.int64),
+                T_map_anchor=T_map_anchor, optimisation=self._optimisations,
+            ),
+        )  # fmt: skip
+
+    def _correction(self, stamp_ns: int, T_map_odom: np.ndarray) -> Outputs:
+        """Says `T_map_odom` when it has changed: it is latched."""
+        if self._said is None or not np.array_equal(self._said, T_map_odom):
+            self._said = T_map_odom.copy()
+            yield (
+                "localization/correction",
+                Correction(
+                    stamp_ns=stamp_ns, T_map_odom=se2_to_se3(T_map_odom), optimisation=self._optimisations
+                ),
+            )
+
+    def _draw_grid(self) -> Outputs:
+        """The occupancy grid as it is now, and the region in which it differs from the one before."""
+        grid = self._slam.grid(self.config.grid_resolution_m)
+        changed = _changed(self._drawn, grid)
+        self._drawn = grid
+        yield (
+            "localization/grid",
+            Grid(
+                stamp_ns=self._stamp_ns, resolution_m=grid.resolution_m,
+                origin_m=np.array([grid.origin_x_m, grid.origin_y_m]), occupancy=grid.values, changed=changed,
+            ),
+        )  # fmt: skip
+
+
+def _changed(before: OccupancyGrid | None, grid: OccupancyGrid) -> tuple[int, int, int, int]:
+    """Bounding box (row0, column0, row1, column1) of the cells that differ; all, if the grid has moved."""
+    rows, columns = grid.values.shape
+    same_place = before is not None and before.values.shape == grid.values.shape and (
+        before.origin_x_m == grid.origin_x_m and before.origin_y_m == grid.origin_y_m
+    )  # fmt: skip
+    if not same_place:
+        return 0, 0, rows, columns
+    differs = np.argwhere(before.values != grid.values)
+    if not len(differs):
+        return 0, 0, 0, 0
+    (row0, column0), (row1, column1) = differs.min(axis=0).tolist(), differs.max(axis=0).tolist()
+    return row0, column0, row1 + 1, column1 + 1
+
+
+def _odometry(result: ScanResult) -> Odometry:
+    status, _, detail = result.status.partition(": ")
+    return Odometry(
+        stamp_ns=result.stamp_ns, T_odom_body=se2_to_se3(result.T_odom_body), covariance=result.covariance,
+        status=status, detail=detail,
+    )  # fmt: skip
+
+
+def _unusable(stamp_ns: int, why: str) -> Odometry:
+    return Odometry(
+        stamp_ns=stamp_ns,
+        T_odom_body=np.eye(4),
+        covariance=np.full((3, 3), np.nan),
+        status="rejected",
+        detail=why,
+    )

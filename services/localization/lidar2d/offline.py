@@ -1,0 +1,59 @@
+"""Running the background jobs: at once in the same thread, or in one of their own; the results are the same."""
+
+from __future__ import annotations
+
+from concurrent.futures import Future, ThreadPoolExecutor
+from types import TracebackType
+
+from services.localization.lidar2d.jobs import BackgroundJob, JobResult
+from services.localization.lidar2d.slam import LidarSlam, ScanResult
+
+
+class JobRunner:
+    """Call `before_scan()` before and `after_scan()` after each `slam.add_scan()`.
+
+    A job's result is taken in at the scan its job names, never earlier, so that a thread and no thread give
+    the same map; a thread that is not done by then is waited for (and counted in `waits`).
+    """
+
+    def __init__(self, slam: LidarSlam, threaded: bool = False) -> None:
+        self.slam = slam
+        self.waits = 0
+        self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="lidar-slam") if threaded else None
+        self._future: Future[JobResult] | None = None
+        self._job: BackgroundJob | None = None
+
+    def before_scan(self) -> None:
+        """Take in what is due before the next scan."""
+        if self._job is None or self.slam.scans < self._job.apply_at_scan:
+            return
+        if self._future is not None:
+            self.waits += not self._future.done()
+            result = self._future.result()
+        else:
+            result = self._job.run()
+        self._job, self._future = None, None
+        self.slam.apply(result)
+
+    def after_scan(self, result: ScanResult) -> None:
+        """Start the job a scan handed out."""
+        if result.job is not None:
+            self._job = result.job
+            self._future = self._pool.submit(result.job.run) if self._pool is not None else None
+
+    def finish(self) -> None:
+        """Take in what is still running, then the final optimisation."""
+        if self._job is not None:
+            result = self._future.result() if self._future is not None else self._job.run()
+            self._job, self._future = None, None
+            self.slam.apply(result)
+        self.slam.finish()
+
+    def __enter__(self) -> JobRunner:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._pool is not None:
+            self._pool.shutdown(wait=True, cancel_futures=True)

@@ -1,0 +1,75 @@
+"""Segments: after a restart, a kidnapping or a loss, what is mapped hangs on nothing until its place is found."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from services.localization.lidar2d import se2
+from services.localization.lidar2d.loops import Place, close_narrow
+from services.localization.lidar2d.nodes import Constraint, merged_features
+from services.localization.lidar2d.relocalization import GlobalMap, build_global_map, relocalize_in
+
+if TYPE_CHECKING:
+    from services.localization.lidar2d.jobs import Snapshot
+
+REACH_M = 4.0  # the submap a new segment is tied to has a keynode within this distance
+
+
+def link_segment(snapshot: Snapshot) -> tuple[Constraint | None, np.ndarray, np.ndarray]:
+    """An edge from the newest keynode to the map and the poses with the segment moved there.
+
+    Returns (None, poses as they were) while the place is not certain.
+    """
+    T_s, T_n = snapshot.T_map_submap.copy(), snapshot.T_map_node.copy()
+    first = snapshot.unlinked_from
+    row = {n: i for i, n in enumerate(snapshot.node_ids)}
+    segment = [n for n in snapshot.node_ids if n >= first]
+    known = [n for n in snapshot.node_ids if n < first]
+    if not segment or not known:
+        return None, T_s, T_n
+    newest = snapshot.nodes[segment[-1]]
+    chunk = [snapshot.nodes[n] for n in segment[-snapshot.settings.chunk_keynodes :]]
+    world: GlobalMap = snapshot.cache.world(
+        (snapshot.version, len(known)),
+        lambda: build_global_map(snapshot.settings, [snapshot.nodes[n] for n in known], [T_n[row[n]] for n in known]),
+    )
+    answer = relocalize_in(world, merged_features(chunk, newest), newest.scan.origin, snapshot.settings)
+    if answer.confidence < snapshot.settings.link_confidence:
+        return None, T_s, T_n
+    link = _tie(snapshot, newest.id, answer.T_map_body, known, row, T_s, T_n)
+    if link is None:
+        return None, T_s, T_n
+    submap_row = {s: i for i, s in enumerate(snapshot.submap_ids)}
+    T_map_newest = se2.compose(T_s[submap_row[link.submap]], link.T_submap_node)
+    T_shift = se2.compose(T_map_newest, se2.inverse(T_n[row[newest.id]]))
+    for n in segment:
+        T_n[row[n]] = se2.compose(T_shift, T_n[row[n]])
+    for s, members in snapshot.members.items():
+        if members and members[0] >= first:
+            T_s[submap_row[s]] = se2.compose(T_shift, T_s[submap_row[s]])
+    return link, T_s, T_n
+
+
+def _tie(
+    snapshot: Snapshot, node_id: int, T_map_body: np.ndarray, known: list[int], row: dict[int, int],
+    T_s: np.ndarray, T_n: np.ndarray,
+) -> Constraint | None:  # fmt: skip
+    """The edge to the nearest finished submap that confirms the place."""
+    positions = np.array([T_n[row[n], :2] for n in known])
+    away = dict(zip(known, np.hypot(*(positions - T_map_body[:2]).T)))
+    near = sorted(
+        (min(away[m] for m in snapshot.members[s] if m in away), k, s)
+        for k, s in enumerate(snapshot.submap_ids)
+        if s in snapshot.frozen and any(m in away for m in snapshot.members[s])
+    )
+    for distance, k, s in near[:4]:
+        if distance > REACH_M:
+            break
+        place = Place(s, snapshot.frozen[s], se2.between(T_s[k], T_map_body), 0.3, math.radians(5.0))
+        link = close_narrow(snapshot.nodes[node_id], place, snapshot.cache, snapshot.settings)
+        if link is not None:
+            return link
+    return None
