@@ -100,6 +100,8 @@ def parse(cls: type[Config], table: dict[str, Any], where: str) -> Any:
             if fault["type"] == "extra_forbidden":
                 known = ", ".join(sorted(cls.model_fields))
                 faults.append(f"unknown option {field!r} (there are: {known})")
+            elif fault["type"] == "missing":
+                faults.append(f"option {field!r} is required")
             else:
                 faults.append(f"{field} = {fault['input']!r}: {fault['msg']}")
         raise UserError(f"{where}: " + "; ".join(faults)) from error

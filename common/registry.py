@@ -37,12 +37,21 @@ class Service:
         return getattr(module, class_name)
 
 
+def class_of(service: Service, options: dict[str, object]) -> type[Node]:
+    """The node class that a node's table in a deployment asks for; its other options are not looked at.
+
+    Raises:
+        UserError: unknown kind.
+    """
+    return service.load(str(options.get("kind", "default")))
+
+
 def make_node(service: Service, options: dict[str, object], where: str) -> Node:
     """A configured-to-be node from its table in a deployment.
 
     Raises:
         UserError: unknown kind or option, or a value that does not fit.
     """
-    node_class = service.load(str(options.get("kind", "default")))
+    node_class = class_of(service, options)
     config: NodeConfig = parse(node_class.Config, options, f"{where}: node {service.name!r}")
     return node_class(config)

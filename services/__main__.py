@@ -11,6 +11,7 @@ from rich.markup import escape
 from common.errors import UserError
 from services import demo, doctor, system_cli, warm
 from services.bench import cli as bench_cli
+from services.localization import cli as localization_cli
 from services.replay import cli as replay_cli
 from services.simulator import cli as simulator_cli
 
@@ -32,6 +33,10 @@ app.command(rich_help_panel=_DATA)(replay_cli.info)
 app.command(rich_help_panel=_DATA)(replay_cli.rig)
 for command in (doctor.doctor, warm.warm):
     app.command(rich_help_panel="This machine")(command)
+app.command(rich_help_panel="Maps and figures")(localization_cli.slam)
+evaluate = typer.Typer(no_args_is_help=True, help="Errors against truth.")
+evaluate.command("slam")(localization_cli.eval_slam)
+app.add_typer(evaluate, name="eval", rich_help_panel="Maps and figures")
 app.add_typer(bench_cli.app, name="bench", rich_help_panel="This machine")
 
 

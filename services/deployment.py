@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from common.config import Deployment
 from common.errors import UserError
 from common.node import Node
-from common.registry import Service, make_node
+from common.registry import Service, class_of, make_node
 from common.topics import TOPICS
 from services.nodes import NODES
 
@@ -26,18 +26,24 @@ def build_node(deployment: Deployment, name: str, table: dict[str, Service] = NO
     Raises:
         UserError: not in the deployment, or not in the process list, or wrong options.
     """
+    return make_node(_service(deployment, name, table), deployment.nodes[name], "deployment")
+
+
+def _service(deployment: Deployment, name: str, table: dict[str, Service]) -> Service:
     if name not in deployment.nodes:
-        raise UserError(
-            f"the deployment has no node {name!r}; it has {', '.join(deployment.nodes) or 'none'}"
-        )
+        known = ", ".join(deployment.nodes) or "none"
+        raise UserError(f"the deployment has no node {name!r}; it has {known}")
     if name not in table:
         raise UserError(f"nodes.{name}: no such service; there are {', '.join(table)}")
-    return make_node(table[name], deployment.nodes[name], "deployment")
+    return table[name]
 
 
 def node_classes(deployment: Deployment, table: dict[str, Service] = NODES) -> dict[str, type[Node]]:
-    """The class of each node of a deployment, by name."""
-    return {name: type(build_node(deployment, name, table)) for name in deployment.nodes}
+    """The class of each node of a deployment, by name; options other than `kind` are not looked at."""
+    return {
+        name: class_of(_service(deployment, name, table), options)
+        for name, options in deployment.nodes.items()
+    }
 
 
 def faults(deployment: Deployment, table: dict[str, Service] = NODES) -> list[Fault]:

@@ -13,7 +13,10 @@ _ROWS = (
     Service(
         "localization",
         "where the robot is",
-        {"external": "services.localization.external.node:ExternalLocalization"},
+        {
+            "lidar": "services.localization.lidar2d.node:LidarLocalization",
+            "external": "services.localization.external.node:ExternalLocalization",
+        },
     ),
     Service(
         "recorder",
