@@ -27,7 +27,8 @@ from common.header import local_clock_id
 from common.jobs import JobQueue
 from common.mailbox import NOBODY, Letter, Mailbox
 from common.messages import Health, OutputHealth
-from common.node import Job, Node, Output, Sourced
+from common.node import Job, Node, Output
+from common.pacing import Playback
 from common.persist import Bookmark, claim_epoch
 from common.queries import reply
 from common.streams import Publication
@@ -81,6 +82,8 @@ class Live:
     def run(self) -> None:
         """Life of the process: configure, standby, active, drain, drained, closed."""
         epoch = claim_epoch(self.settings.run_dir, self.node.name)
+        if not self.settings.resume:  # an earlier run's: a crash before the first message must not lead there
+            self._bookmark.clear()
         session = open_session(self.settings.endpoints)
         with (
             Bus(session, self.settings.robot, self.node.name, self.instance, epoch) as bus,
@@ -108,8 +111,8 @@ class Live:
         signal.signal(signal.SIGTERM, self.stop)
 
     def _join(self, bus: Bus) -> None:
-        for name in self.node.outputs:
-            self._publications[name] = bus.publish(name)
+        # Assigned as a whole: the health thread goes through it meanwhile.
+        self._publications = {name: bus.publish(name) for name in self.node.outputs}
         for entry in self.node.inputs:
             if entry.topic in self.settings.unfed:
                 self.mailbox.end(entry.topic, NOBODY, 0)
@@ -135,7 +138,7 @@ class Live:
         self._emit(self.node.handle_drain())
         self._state = "drained"
         if finished:  # stopped by a signal it leaves the stream open: a successor goes on
-            self._bookmark.clear()
+            self._bookmark.finish()
             for publication in self._publications.values():
                 bus.end(publication)
             while not self._stopping and not self.settings.exit_when_drained:
@@ -197,35 +200,36 @@ class Live:
                 self._publications[output[0]].put(output[1])
 
     def _run_source(self) -> None:
-        pace = _Pace(self.settings.rate)
-        resume_ns = self._bookmark.read() if self.settings.resume else None
+        playback = Playback(self.settings.rate, self._bookmark, self.settings.resume)
         for item in self.node.source():
+            while not self._stopping and (wait_s := playback.wait_s(item)) > 0.0:
+                self._attend()
+                time.sleep(min(wait_s, _POLL_S))
             if self._stopping:
                 return
-            latched = item.topic in self._publications and self._publications[item.topic].row.cache == 1
-            if resume_ns is not None and item.at_ns is not None and item.at_ns <= resume_ns and not latched:
-                continue
-            while not self._stopping and (wait_s := pace.wait_s(item)) > 0.0:
-                time.sleep(min(wait_s, _POLL_S))
+            self._attend()
             started = time.perf_counter()
             self.node.check_output(item.topic, item.message)
-            self._publications[item.topic].put(item.message)
+            publication = self._publications[item.topic]
+            if playback.is_past(item) and publication.row.delivery != "latched":
+                continue
+            publication.put(item.message)
             self._steps_ms.append((time.perf_counter() - started) * 1e3)
-            if item.at_ns is not None:
-                self._bookmark.write(item.at_ns)
+            playback.sent(item)
 
     def _wait_for_consumers(self, bus: Bus) -> None:
         deadline = time.monotonic() + self.settings.wait_s
         missing = self.settings.wait_for
         while missing and not self._stopping:
             missing = self.settings.wait_for - bus.alive_nodes()
-            if time.monotonic() > deadline:
+            if missing and time.monotonic() > deadline:
                 log.warning("starting without %s: not active after %g s", ", ".join(sorted(missing)),
                             self.settings.wait_s)  # fmt: skip
-                return
-            self._detail = f"waiting for {', '.join(sorted(missing))}" if missing else ""
+                break
             if missing:
+                self._detail = f"waiting for {', '.join(sorted(missing))}"
                 time.sleep(0.1)
+        self._detail = ""
 
     def _attend(self) -> None:
         """What comes besides messages."""
@@ -297,21 +301,3 @@ class Live:
                 detail=self._detail or self.node.detail[:_DETAIL_CHARS],
             )
         )  # fmt: skip
-
-
-class _Pace:
-    """Maps a recording's clock to this machine's."""
-
-    def __init__(self, rate: float) -> None:
-        self._rate = rate
-        self._first: tuple[int, float] | None = None
-
-    def wait_s(self, item: Sourced) -> float:
-        """Seconds until an item is due; not positive when it is."""
-        if item.at_ns is None or self._rate == 0.0:
-            return 0.0
-        now = time.monotonic()
-        if self._first is None:
-            self._first = (item.at_ns, now)
-        first_ns, started = self._first
-        return started + (item.at_ns - first_ns) / 1e9 / self._rate - now

@@ -6,6 +6,8 @@ import os
 import time
 from pathlib import Path
 
+_FINISHED_NS = 2**63 - 1  # behind everything
+
 
 def write_atomically(path: Path, data: bytes) -> None:
     """Replaces a file so that a reader, or a crash, sees the old or the new one, never a half."""
@@ -56,6 +58,10 @@ class Bookmark:
             temporary.write_text(str(at_ns))
             temporary.replace(self._path)
 
+    def finish(self) -> None:
+        """The end was reached: a restarted replay has nothing left to send."""
+        write_atomically(self._path, str(_FINISHED_NS).encode())
+
     def clear(self) -> None:
-        """Forgets the position: the end was reached."""
+        """Forgets the position."""
         self._path.unlink(missing_ok=True)
