@@ -75,11 +75,13 @@ def open_router(listen: tuple[str, ...], connect: tuple[str, ...] = ()) -> zenoh
         ) from error
 
 
-def open_session(endpoints: tuple[str, ...], wait_s: float = 15.0) -> zenoh.Session:
+def open_session(
+    endpoints: tuple[str, ...], wait_s: float = 15.0, gave_up: Callable[[], bool] = lambda: False
+) -> zenoh.Session:
     """A client session of the router at one of `endpoints`, waiting `wait_s` for it to appear.
 
     Raises:
-        UserError: no router answered.
+        UserError: no router answered, until then or until the caller `gave_up`.
     """
     zenoh.init_log_from_env_or("error")
     config = _base_config("client")
@@ -91,7 +93,7 @@ def open_session(endpoints: tuple[str, ...], wait_s: float = 15.0) -> zenoh.Sess
         try:
             return zenoh.open(config)
         except zenoh.ZError as error:
-            if time.monotonic() > deadline:
+            if gave_up() or time.monotonic() > deadline:
                 raise UserError(
                     f"no router answers at {', '.join(endpoints)} ({_short(error)}). Start the system "
                     "with `beamsplat run FILE`, or a router alone with `beamsplat run FILE router`"

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import concurrent.futures
+import queue
+import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -28,6 +31,46 @@ class Deferred:
 
     def done(self) -> bool:
         return False
+
+
+class Abandoned(Exception):
+    """A job that was waited for takes too long for a process that is to end."""
+
+
+class _WorkerFuture(concurrent.futures.Future):
+    def __init__(self, gave_up: Callable[[], bool]) -> None:
+        super().__init__()
+        self._gave_up = gave_up
+
+    def result(self, timeout: float | None = None) -> Any:
+        """Raises Abandoned once the process is to end and has waited long enough."""
+        while not concurrent.futures.wait([self], 0.2).done:
+            if self._gave_up():
+                raise Abandoned
+        return super().result(timeout)
+
+
+class Worker:
+    """One thread that runs jobs in turn. Unlike a pool's it does not keep the process from ending."""
+
+    def __init__(self, gave_up: Callable[[], bool]) -> None:
+        self._gave_up = gave_up
+        self._waiting: queue.SimpleQueue[tuple[_WorkerFuture, Callable[[], Any]]] = queue.SimpleQueue()
+        threading.Thread(target=self._work, name="job", daemon=True).start()
+
+    def submit(self, run: Callable[[], Any]) -> Future:
+        """Runs it when those before it are done."""
+        future = _WorkerFuture(self._gave_up)
+        self._waiting.put((future, run))
+        return future
+
+    def _work(self) -> None:
+        while True:
+            future, run = self._waiting.get()
+            try:
+                future.set_result(run())
+            except BaseException as error:  # raised where the result is asked for
+                future.set_exception(error)
 
 
 @dataclass

@@ -7,13 +7,13 @@ background jobs; one reports health every second. The node itself never sees any
 from __future__ import annotations
 
 import logging
+import math
 import secrets
 import signal
 import threading
 import time
 from collections import deque
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,8 +23,9 @@ import psutil
 import zenoh
 
 from common.bus import Bus, open_session
+from common.errors import UserError
 from common.header import local_clock_id
-from common.jobs import JobQueue
+from common.jobs import Abandoned, JobQueue, Worker
 from common.mailbox import NOBODY, Letter, Mailbox
 from common.messages import Health, OutputHealth
 from common.node import Job, Node, Output
@@ -36,6 +37,7 @@ from common.streams import Publication
 log = logging.getLogger(__name__)
 
 _POLL_S = 0.2  # how soon a signal is noticed while nothing arrives
+_STOP_PATIENCE_S = 2.0  # after a signal, background jobs have so long to finish
 _END_PATIENCE_S = 2.0  # an end marker waits this long for messages still on their way
 _LOG_PERIOD_S = 5.0
 _DETAIL_CHARS = 2000
@@ -66,6 +68,7 @@ class Live:
         self.mailbox = Mailbox(type(node), time.monotonic_ns)
         self._changed = threading.Condition()
         self._stopping = False
+        self._stop_by = math.inf
         self._state = "configure"
         self._detail = ""
         self._queries: deque[tuple[str, zenoh.Query]] = deque()
@@ -84,19 +87,23 @@ class Live:
         epoch = claim_epoch(self.settings.run_dir, self.node.name)
         if not self.settings.resume:  # an earlier run's: a crash before the first message must not lead there
             self._bookmark.clear()
-        session = open_session(self.settings.endpoints)
-        with (
-            Bus(session, self.settings.robot, self.node.name, self.instance, epoch) as bus,
-            ThreadPoolExecutor(1, "job") as workers,
-        ):
+        try:
+            session = open_session(self.settings.endpoints, gave_up=lambda: self._stopping)
+        except UserError:
+            if self._stopping:
+                return
+            raise
+        with Bus(session, self.settings.robot, self.node.name, self.instance, epoch) as bus:
             threading.Thread(target=self._report, args=(bus,), name="health", daemon=True).start()
-            self._jobs = JobQueue(workers.submit)
+            self._jobs = JobQueue(Worker(self._gave_up).submit)
             try:
                 self.node.configure()
                 self._state = "standby"
                 self._join(bus)
                 self._work(bus)
                 self._send_health(bus)
+            except Abandoned:
+                log.warning("stopped in the middle of a background job: its result is lost")
             finally:
                 self._state = "closed"
                 self.node.close()
@@ -104,6 +111,10 @@ class Live:
     def stop(self, *_: object) -> None:
         """Asks the node to end; safe in a signal handler."""
         self._stopping = True
+        self._stop_by = min(self._stop_by, time.monotonic() + _STOP_PATIENCE_S)
+
+    def _gave_up(self) -> bool:
+        return time.monotonic() > self._stop_by
 
     def install_signal_handlers(self) -> None:
         """SIGINT and SIGTERM end the node cleanly."""
