@@ -258,10 +258,10 @@ def fronts(
         for j in range(rows):
             x = -width / 2 + (i + 0.5) * w
             at = (x, y - 0.008, z + j * h + gap / 2)
-            box(b, at, (w - gap, 0.018, h - gap), material, skip=("back",))
+            box(b, at, (w - gap, 0.018, h - gap), material, skip=("back",), turn=h > w)
             inner = (x, y - 0.019, z + j * h + 0.05)
             if w > 0.25 and h > 0.25:
-                box(b, inner, (w - 0.1, 0.006, h - 0.1), material, skip=("back",))
+                box(b, inner, (w - 0.1, 0.006, h - 0.1), material, skip=("back",), turn=h > w)
             handle_z = z + j * h + h * (0.5 if h < 0.3 else 0.85)
             rod(b, (x - 0.05, y - 0.035, handle_z), (x + 0.05, y - 0.035, handle_z), 0.006, STEEL, sides=6)
 

@@ -112,9 +112,10 @@ def sample(
     low = int(level)
     high = min(low + 1, top)
     fraction = level - low
-    if fraction < 0.12:
+    # Between levels only where it shows: many probes already blur the step, and near a level there is none.
+    if fraction < 0.12 or (probes > 2 and fraction < 0.5):
         fraction = 0.0
-    elif fraction > 0.88:
+    elif fraction > 0.88 or probes > 2:
         low, fraction = high, 0.0
     weight = 1.0 / probes
     r, g, b = np.float32(0.0), np.float32(0.0), np.float32(0.0)

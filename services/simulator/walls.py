@@ -121,7 +121,8 @@ def _window(b: MeshBuilder, hole: Opening, finish: Finish, rng: np.random.Genera
     if not glazed:
         box(b, (middle, 0.0, hole.z0 - 0.03), (width + 0.10, 0.16, 0.03), finish.trim)
     rod(b, (hole.s0 - 0.3, -0.14, hole.z1 + 0.16), (hole.s1 + 0.3, -0.14, hole.z1 + 0.16), 0.012, STEEL)
-    low = 0.03 if glazed or rng.random() < 0.5 else hole.z0 - 0.15
+    # Furniture stands under windows: only a glazed door has curtains down to the floor.
+    low = 0.03 if glazed else hole.z0 - 0.15
     for left in (hole.s0 - 0.28, hole.s1 - 0.06):
         cloth = 0.34
         folds = float(rng.uniform(4.0, 6.0))

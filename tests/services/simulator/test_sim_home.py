@@ -30,8 +30,8 @@ def test_every_plan_has_four_rooms_in_a_ring_and_a_route_through_their_doors(see
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, 5])
-def test_a_home_can_be_driven_through_and_is_the_same_every_time(seed):
+def test_a_home_can_be_driven_through_and_is_the_same_every_time():
+    seed = 5
     home = build_home(seed)
     mesh = home.mesh
     again = build_home(seed).mesh
