@@ -70,7 +70,8 @@ class RecorderNode(_Handlers, Node):
         arrival_ns = self._clock.now_ns()
         if self.config.health and arrival_ns is not None:
             self._write(f"{HEALTH}/{health.node}", health, arrival_ns, None)
-        self.detail = f"{self.writer.counts.total()} messages, {self.writer.lost.total()} lost"
+        lost = self.writer.lost.total()
+        self.detail = f"writing {self.writer.path}" + (f", {lost} messages LOST" if lost else "")
 
     def keep(self, topic: str, message: Message) -> None:
         """Writes one message with the header that came with it."""

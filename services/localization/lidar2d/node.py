@@ -90,8 +90,8 @@ class LidarLocalization(Node):
 
     def drain(self) -> Outputs:
         """Last loop closures and optimisation, the final grid, and the files asked for."""
-        if self._slam is None or self._slam.scans == 0:
-            return
+        if self._slam is None or not self._slam.anchors():
+            return  # nothing usable came: there is no map
         self._slam.finish()
         self._optimisations += 1
         yield from self._map_moved()

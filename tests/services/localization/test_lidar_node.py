@@ -1,0 +1,143 @@
+"""The lidar localization as a node, on a real recording with truth: accurate, reproducible, unhurried."""
+
+import hashlib
+
+import numpy as np
+import pytest
+
+from common.codec import encode
+from common.config import Deployment, RouterConfig
+from common.geometry import inverse, yaw_of
+from common.lockstep import Lockstep
+from common.messages import Rig, Scan
+from common.node import Node
+from common.recording import RecordingReader
+from common.trajectory import read_tum
+from services.deployment import build_node
+from services.localization.lidar2d.node import LidarLocalization
+from services.nodes import NODES
+from services.supervisor import Supervisor
+from tests.common.samples import sample_messages
+
+
+def _house(shared_dir, **replay):
+    nodes = {
+        "replay": {"data": str(shared_dir / "data/house_a/bag"), "without": ("image",), **replay},
+        "localization": {"kind": "lidar"},
+    }
+    return Deployment(nodes=nodes)
+
+
+def _lockstep(deployment):
+    letters, digest = [], hashlib.sha256()
+
+    def on_message(letter):
+        if letter.header.producer == "localization":
+            letters.append(letter)
+            digest.update(encode(letter.message))
+
+    Lockstep([build_node(deployment, name) for name in deployment.nodes], on_message).run()
+    return letters, digest.hexdigest()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("without", [("image",), ("image", "odometry")], ids=["wheels", "scans alone"])
+def test_published_poses_of_the_house_are_true(shared_dir, without):
+    """Online: T_map_odom as last published, times T_odom_body, aligned by the first pose only."""
+    letters, _ = _lockstep(_house(shared_dir, without=without))
+    truth = read_tum(shared_dir / "data/house_a/groundtruth.txt")
+    T_map_odom, stamps, online = np.eye(4), [], []
+    for letter in letters:
+        if letter.topic == "localization/correction":
+            T_map_odom = letter.message.T_map_odom
+        elif letter.topic == "localization/odometry":
+            assert letter.message.status == "ok"
+            stamps.append(letter.message.stamp_ns)
+            online.append(T_map_odom @ letter.message.T_odom_body)
+    answered, T_world_body = truth.resampled(stamps)
+    online = np.array(online)[answered]
+    T_world_map = T_world_body[0] @ inverse(online[0])
+    errors = inverse(T_world_body) @ (T_world_map @ online)
+    assert len(online) > 870
+    assert np.sqrt(np.mean(np.sum(errors[:, :2, 3] ** 2, axis=1))) <= 0.015
+    assert np.sqrt(np.mean(yaw_of(errors) ** 2)) <= 0.003
+
+
+@pytest.mark.slow
+def test_the_same_drive_gives_the_same_bytes(shared_dir):
+    deployment = _house(shared_dir, duration_s=25.0)
+    letters, first = _lockstep(deployment)
+    assert {letter.topic for letter in letters} == set(LidarLocalization.outputs)
+    assert _lockstep(deployment)[1] == first
+
+
+@pytest.mark.slow
+def test_live_through_zenoh_gives_the_same_messages(shared_dir, tmp_path, free_endpoint):
+    """Background optimisation included: its results are taken in at fixed scans."""
+    offline = _house(shared_dir, duration_s=12.0)
+    letters, _ = _lockstep(offline)
+    live = Deployment(
+        robot="t",
+        router=RouterConfig(listen=(free_endpoint,)),
+        rate=3.0,
+        state_dir=tmp_path / "state",
+        nodes={**offline.nodes, "recorder": {"out": str(tmp_path / "rec")}},
+    )
+    with Supervisor(live) as supervisor:
+        _until_recorded(supervisor, tmp_path / "rec")
+    with RecordingReader(tmp_path / "rec") as reader:
+        recorded = [r for r in reader.messages() if r.topic.startswith("localization/")]
+    for topic in ("localization/odometry", "localization/movers"):
+        expected = [encode(x.message) for x in letters if x.topic == topic]
+        assert [encode(r.message) for r in recorded if r.topic == topic] == expected, topic
+
+
+def _until_recorded(supervisor, folder):
+    import time
+
+    from common.bus import open_session
+    from services.board import HealthBoard
+
+    with open_session(supervisor.deployment.router.listen) as session:
+        board = HealthBoard(session, "t")
+        deadline = time.monotonic() + 90
+        while board.states().get("recorder") != "drained":
+            supervisor.poll()
+            assert time.monotonic() < deadline, board.states()
+            time.sleep(0.1)
+    assert folder.exists()
+
+
+def _feed(node: Node, topic, message):
+    return [output for output in node.handle(topic, message) if isinstance(output, tuple)]
+
+
+def test_scans_before_the_calibration_are_refused_and_said():
+    node = LidarLocalization(LidarLocalization.Config())
+    node.configure()
+    scan = next(m for m in sample_messages() if type(m) is Scan)
+    ((topic, odometry),) = _feed(node, "lidar/scan", scan)
+    assert topic == "localization/odometry"
+    assert (odometry.status, odometry.detail) == ("rejected", "no calibration yet")
+    assert np.isnan(odometry.covariance).all()
+
+
+def test_rubbish_scans_give_a_status_and_no_map():
+    node = LidarLocalization(LidarLocalization.Config())
+    node.configure()
+    assert _feed(node, "rig", next(m for m in sample_messages() if type(m) is Rig)) == []
+    for i, value in enumerate((np.nan, np.inf, -1.0, 0.0)):
+        scan = Scan(
+            stamp_ns=1_000_000_000 + i * 100_000_000, angle_min_rad=-3.0, angle_increment_rad=0.01,
+            time_increment_s=0.0, scan_time_s=0.1, range_min_m=0.1, range_max_m=12.0,
+            ranges_m=np.full(600, value, np.float32),
+        )  # fmt: skip
+        outputs = dict(_feed(node, "lidar/scan", scan))
+        assert outputs["localization/odometry"].status == "rejected"
+        assert outputs["localization/odometry"].detail
+        assert not outputs["localization/movers"].moving.any()
+    assert list(node.drain()) == []
+
+
+def test_the_process_list_knows_it():
+    assert NODES["localization"].load("lidar") is LidarLocalization
