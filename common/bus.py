@@ -54,16 +54,25 @@ def _base_config(mode: str) -> zenoh.Config:
     return config
 
 
+def _set_endpoints(config: zenoh.Config, side: str, endpoints: tuple[str, ...]) -> None:
+    try:
+        config.insert_json5(f"{side}/endpoints", json.dumps(list(endpoints)))
+    except zenoh.ZError as error:
+        raise UserError(
+            f'router: {", ".join(endpoints)} are no endpoints; they look like "tcp/127.0.0.1:7447"'
+        ) from error
+
+
 def open_router(listen: tuple[str, ...], connect: tuple[str, ...] = ()) -> zenoh.Session:
     """A router in this process.
 
     Raises:
-        UserError: an endpoint cannot be listened on (in use, or malformed).
+        UserError: an endpoint cannot be listened on (in use), or is malformed.
     """
     zenoh.init_log_from_env_or("error")
     config = _base_config("router")
-    config.insert_json5("listen/endpoints", json.dumps(list(listen)))
-    config.insert_json5("connect/endpoints", json.dumps(list(connect)))
+    _set_endpoints(config, "listen", listen)
+    _set_endpoints(config, "connect", connect)
     config.insert_json5("adminspace/enabled", "true")
     config.insert_json5("adminspace/permissions", "{read: true, write: false}")
     try:
@@ -81,11 +90,11 @@ def open_session(
     """A client session of the router at one of `endpoints`, waiting `wait_s` for it to appear.
 
     Raises:
-        UserError: no router answered, until then or until the caller `gave_up`.
+        UserError: a malformed endpoint; no router answered, until then or until the caller `gave_up`.
     """
     zenoh.init_log_from_env_or("error")
     config = _base_config("client")
-    config.insert_json5("connect/endpoints", json.dumps(list(endpoints)))
+    _set_endpoints(config, "connect", endpoints)
     config.insert_json5("connect/timeout_ms", "1000")
     config.insert_json5("connect/exit_on_failure", "true")
     deadline = time.monotonic() + wait_s

@@ -32,12 +32,15 @@ class Config(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
+Seconds = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
+
+
 class NodeConfig(Config):
     """Options that every node has."""
 
     kind: str = "default"  # which implementation, by name (services/nodes.py lists them)
-    step_cost_s: Annotated[float, Field(ge=0.0)] = 0.0  # lockstep: modelled time of one step
-    job_cost_s: Annotated[float, Field(ge=0.0)] = 0.0  # lockstep: modelled time of a background job
+    step_cost_s: Seconds = 0.0  # lockstep: modelled time of one step
+    job_cost_s: Seconds = 0.0  # lockstep: modelled time of a background job
     threads: Annotated[int, Field(ge=1)] = 1  # for cv2, torch and ONNX in this process
 
 
@@ -78,7 +81,7 @@ def load_deployment(path: Path, overrides: tuple[str, ...] = ()) -> Deployment:
         table = tomllib.loads(path.read_text())
     except FileNotFoundError as error:
         raise UserError(f"{path}: no such deployment file") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, IsADirectoryError) as error:
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, OSError) as error:
         raise UserError(f"{path}: not a TOML file: {error}") from error
     for override in overrides:
         _apply(table, override)
@@ -98,13 +101,24 @@ def parse(cls: type[Config], table: dict[str, Any], where: str) -> Any:
         for fault in error.errors(include_url=False):
             field = ".".join(str(part) for part in fault["loc"])
             if fault["type"] == "extra_forbidden":
-                known = ", ".join(sorted(cls.model_fields))
+                known = ", ".join(sorted(_at(cls, fault["loc"][:-1]).model_fields))
                 faults.append(f"unknown option {field!r} (there are: {known})")
             elif fault["type"] == "missing":
                 faults.append(f"option {field!r} is required")
             else:
                 faults.append(f"{field} = {fault['input']!r}: {fault['msg']}")
         raise UserError(f"{where}: " + "; ".join(faults)) from error
+
+
+def _at(cls: type[BaseModel], place: tuple[str | int, ...]) -> type[BaseModel]:
+    """The model of the table at `place` within `cls`, as far down as models go."""
+    for part in place:
+        field = cls.model_fields.get(str(part))
+        inner = field.annotation if field is not None else None
+        if not (isinstance(inner, type) and issubclass(inner, BaseModel)):
+            break
+        cls = inner
+    return cls
 
 
 def _apply(table: dict[str, Any], override: str) -> None:

@@ -6,7 +6,22 @@ import os
 import time
 from pathlib import Path
 
+from common.errors import UserError
+
 _FINISHED_NS = 2**63 - 1  # behind everything
+
+
+def make_folder(path: Path) -> Path:
+    """`path`, which is a folder now.
+
+    Raises:
+        UserError: it cannot be made, or is a file.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"{path}: cannot make this folder ({error.strerror}): choose another") from error
+    return path
 
 
 def write_atomically(path: Path, data: bytes) -> None:
@@ -29,7 +44,7 @@ def _read_int(path: Path) -> int | None:
 
 def claim_epoch(run_dir: Path, node: str) -> int:
     """The next epoch of a node: one above the highest ever claimed, also after a crash."""
-    path = run_dir / "epochs" / node
+    path = make_folder(run_dir / "epochs") / node
     epoch = (_read_int(path) or 0) + 1
     write_atomically(path, str(epoch).encode())
     return epoch

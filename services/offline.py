@@ -15,7 +15,7 @@ from common.codec import encode, schema_of
 from common.config import Deployment
 from common.lockstep import Lockstep
 from common.mailbox import Letter
-from common.persist import write_atomically
+from common.persist import make_folder, write_atomically
 from common.recording import RecordingWriter
 from common.registry import Service
 from services.deployment import build_node
@@ -56,7 +56,7 @@ def run_offline(
     nodes = [build_node(deployment, name, table) for name in deployment.nodes]
     digest = MessageHash()
     started = time.perf_counter()
-    out.mkdir(parents=True, exist_ok=True)
+    make_folder(out)
     progress = Progress(
         TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
         console=console, transient=True,

@@ -16,6 +16,7 @@ from pathlib import Path
 from common.bus import open_session
 from common.config import Deployment
 from common.errors import UserError
+from common.persist import make_folder
 from common.registry import Service
 from services.deployment import node_classes
 from services.host import ONE_THREAD, child
@@ -66,7 +67,7 @@ class Supervisor:
         self._context.set_forkserver_preload(list(PRELOADED))
 
     def __enter__(self) -> Supervisor:
-        self.log_dir.mkdir(parents=True, exist_ok=True)
+        make_folder(self.log_dir)
         try:
             self._start_all()
         except BaseException:

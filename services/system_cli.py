@@ -28,6 +28,11 @@ def _load(file: Path, overrides: list[str] | None) -> Deployment:
     return load_deployment(file, tuple(overrides or ()))
 
 
+def _say(text: str, style: str | None = None) -> None:
+    """Prints text as it is: what stands in brackets is no markup."""
+    console.print(text, style=style, markup=False, highlight=False, soft_wrap=True)
+
+
 def check(file: FileArgument, set_: SetOption = None) -> None:
     """Says whether a deployment would run, and what is wrong if not.
 
@@ -38,7 +43,7 @@ def check(file: FileArgument, set_: SetOption = None) -> None:
     deployment = _load(file, set_)
     found = faults(deployment)
     for fault in found:
-        console.print(f"[{'red' if fault.fatal else 'yellow'}]{fault.text}[/]", soft_wrap=True)
+        _say(fault.text, "red" if fault.fatal else "yellow")
     if any(fault.fatal for fault in found):
         raise typer.Exit(2)
     print(f"{file}: {len(deployment.nodes)} nodes, fits together")
@@ -91,10 +96,10 @@ def run_checked(deployment: Deployment, names: tuple[str, ...] | None = None) ->
 
     def on_event(text: str) -> None:
         events.append(text)
-        console.print(f"[yellow]{text}[/]", soft_wrap=True)
+        _say(text, "yellow")
 
     with Supervisor(deployment, names, on_event=on_event) as supervisor:
-        console.print(f"robot {deployment.robot}: logs in {supervisor.log_dir}", soft_wrap=True)
+        _say(f"robot {deployment.robot}: logs in {supervisor.log_dir}")
         with open_session(deployment.router.listen) as session:
             board = HealthBoard(session, deployment.robot)
             screen = Screen(console=console, refresh_per_second=2) if show else contextlib.nullcontext()

@@ -8,6 +8,8 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 
+POSES = ("--set", "replay.data=x", "--set", "recorder.out=x")
+
 
 def beamsplat(*arguments, **kwargs):
     return subprocess.run(
@@ -35,6 +37,14 @@ def test_help_names_every_command_and_each_has_an_example():
     [
         (("check", "no.toml"), "no.toml: no such deployment file"),
         (("check", "deploy/demo.toml", "--set", "replay.speed=2"), "unknown option 'speed'"),
+        (
+            ("check", "deploy/demo.toml", "--set", "router.port=1"),
+            "unknown option 'router.port' (there are: connect,",
+        ),
+        (("check", "deploy/demo.toml", "--set", "replay.[/x]=1"), "unknown option '[/x]'"),
+        (("serve", "deploy/demo.toml", "router", "--set", 'router.listen=["no"]'), "no are no endpoints"),
+        (("run", "deploy/poses.toml", *POSES, "--set", "state_dir=/dev/null/x"), "cannot make this folder"),
+        (("offline", "deploy/poses.toml", *POSES, "--out", "/dev/null/x"), "cannot make this folder"),
         (("offline", "deploy/demo.toml", "--data", "no/bag", "--out", "{tmp}"), "no/bag"),
         (("info", "no/bag"), "no/bag"),
         (("rig", "no/bag", "--out", "{tmp}/rig.toml"), "no/bag"),
@@ -69,7 +79,9 @@ def test_doctor_names_a_taken_port(tmp_path, free_endpoint):
     with socket.socket() as squatter:
         squatter.bind((host, int(port)))
         squatter.listen()
-        taken = beamsplat("doctor", deployment, "--brief", env={"PATH": "/usr/bin", "COLUMNS": "300", "HOME": str(tmp_path)})
+        taken = beamsplat(
+            "doctor", deployment, "--brief", env={"PATH": "/usr/bin", "COLUMNS": "300", "HOME": str(tmp_path)}
+        )
     assert taken.returncode == 1
     assert "cannot be listened on" in taken.stdout
     free = beamsplat("doctor", deployment, env={"PATH": "/usr/bin", "COLUMNS": "300", "HOME": str(tmp_path)})
