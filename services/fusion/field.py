@@ -19,11 +19,13 @@ from common.beams import Beams, project_beams
 from common.camera import Pinhole
 from common.geometry import inverse
 from services.fusion import volume_kernels as kernels
-from services.fusion.guess import metric_guess
+from services.fusion.guess import MetricGuess, metric_guess
 from services.fusion.lidar_map import LidarMap
 from services.fusion.memory import Memory, Remembered
 from services.fusion.relative_pose import corners, refine_between
 from services.fusion.surfaces import CeilingFinder, SurfaceFinder, Surfaces
+
+_TILTED_WALL_M = 0.05  # a lidar in the hand: walls are not upright in its frame
 
 
 @dataclass(frozen=True)
@@ -42,7 +44,7 @@ class FieldConfig:
     edge_grey: float = 8.0
     temperature: float = 2.0
     wall_near: float = 4.0  # at the height of the lidar
-    wall_far: float = 0.5  # far above and below
+    wall_far: float = 0.25  # far above and below, on a body that stays level
     wall_reach_m: float = 0.15
     floor: float = 3.0
     behind: float = 1.0
@@ -123,6 +125,7 @@ class Field:
         self._finder = SurfaceFinder(c, T_body_camera, floor_known=floor_known)
         self._floor_known = floor_known
         self._ceilings = CeilingFinder()
+        self._planar = planar
         self._lidar_map = LidarMap() if planar else None
         self._memory = Memory(self._K, c.shape, self.config.memory_keyframes)
         self._past: deque[Small] = deque(maxlen=240)
@@ -145,13 +148,21 @@ class Field:
         small = cv2.resize(middle, (w, h), interpolation=cv2.INTER_AREA).astype(np.float32)
         return Small(frame.T_map_body @ self.T_body_camera, small, features(small), middle)
 
+    def keep_if_moved(self, frame: Frame) -> None:
+        """Remembers a picture for later sweeps, unless the camera stands where the last one was taken."""
+        if self._is_new(frame.T_map_body @ self.T_body_camera):
+            self._past.append(self.shrink(frame))
+
     def keep(self, small: Small) -> None:
-        """Remembers a picture for later sweeps if the camera has moved since the last one."""
-        if self._past:
-            T = inverse(self._past[-1].T_map_camera) @ small.T_map_camera
-            if np.linalg.norm(T[:3, 3]) < 0.03 and np.trace(T[:3, :3]) > 1.0 + 2.0 * np.cos(0.05):
-                return
-        self._past.append(small)
+        """`keep_if_moved` of a picture that is small already."""
+        if self._is_new(small.T_map_camera):
+            self._past.append(small)
+
+    def _is_new(self, T_map_camera: np.ndarray) -> bool:
+        if not self._past:
+            return True
+        T = inverse(self._past[-1].T_map_camera) @ T_map_camera
+        return bool(np.linalg.norm(T[:3, 3]) >= 0.03 or np.trace(T[:3, :3]) <= 1.0 + 2.0 * np.cos(0.05))
 
     def surfaces(self, frame: Frame) -> Surfaces:
         heights = self._ceilings.heights(self.config.ceiling_evidence) if self._floor_known else ()
@@ -235,7 +246,11 @@ class Field:
         c = self.config
         on_floor = surfaces.on_floor
         near = np.exp(-np.nan_to_num(surfaces.wall_off_m) / c.wall_reach_m)
-        self._dig(cost, np.where(on_floor, np.nan, surfaces.wall), c.wall_far + c.wall_near * near)
+        self._dig(
+            cost,
+            np.where(on_floor, np.nan, surfaces.wall),
+            (c.wall_far if self._planar else 0.0) + c.wall_near * near,
+        )
         self._dig(cost, np.where(on_floor, surfaces.floor, np.nan), c.floor)
         for layer in surfaces.behind:
             self._dig(cost, layer, c.behind)
@@ -252,7 +267,7 @@ class Field:
         unlikely = c.near * np.maximum(np.log(c.near_m) - self._log_z, 0.0)
         cost += unlikely.astype(np.float32)
 
-    def guess_of(self, frame: Frame):  # noqa: ANN201
+    def guess_of(self, frame: Frame) -> MetricGuess | None:
         """The network's guess in metres, or None."""
         if frame.guess is None or frame.guess_kind == "none":
             return None
@@ -273,13 +288,17 @@ class Field:
         depth = np.empty(cost.shape[:2], np.float32)
         spread = np.empty_like(depth)
         kernels.winners(total, self._log_z, c.temperature, depth, spread)
-        snapped = snap(depth, surfaces, 1.2 * (self._log_z[1] - self._log_z[0]))
+        reach_m = np.inf if self._planar else _TILTED_WALL_M
+        snapped = snap(depth, surfaces, 1.2 * (self._log_z[1] - self._log_z[0]), reach_m)
         return Solved(depth, spread, snapped, views)
 
 
-def snap(depth: np.ndarray, surfaces: Surfaces, tolerance: float) -> np.ndarray:
-    """Moves depth [h, w], in place, onto the nearest surface within `tolerance` (log); bool [h, w] where."""
-    wall = np.where(surfaces.on_floor, np.nan, surfaces.wall)
+def snap(depth: np.ndarray, surfaces: Surfaces, tolerance: float, wall_reach_m: float) -> np.ndarray:
+    """Moves depth [h, w], in place, onto the nearest surface within `tolerance` (log); bool [h, w] where.
+
+    Walls count up to `wall_reach_m` from the lidar plane.
+    """
+    wall = np.where(surfaces.on_floor | ~(surfaces.wall_off_m < wall_reach_m), np.nan, surfaces.wall)
     best = np.full(depth.shape, tolerance)
     result = depth.copy()
     for surface in (wall, surfaces.floor, *surfaces.behind, *surfaces.ceilings):

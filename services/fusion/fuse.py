@@ -1,0 +1,153 @@
+"""The stage as the robot runs it: picture, pose, beams, guess in; metric depth with sigma, status out."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+
+from common.beams import NO_BEAMS, project_beams
+from common.camera import Pinhole
+from services.fusion import finish
+from services.fusion.field import Field, FieldConfig, Frame, Solved
+from services.fusion.health import PictureHealth, beams_status
+from services.fusion.memory import Remembered
+from services.fusion.pairs import largest_cluster
+from services.fusion.result import Fused, refusal
+from services.fusion.scaling import ratio
+from services.fusion.surfaces import Surfaces
+
+# Standard deviations of log depth, measured on both recordings by what a pixel's depth rests on.
+_BEAM, _FLOOR, _SURFACE, _MATCHED = 0.006, 0.006, 0.012, 0.05
+_PER_SPREAD = 2.3  # error per unit of the matcher's own spread
+_CARRIED = (0.10, 0.06, 0.045)  # depth remembered from one, two, three and more keyframes
+_UPRIGHT, _TILTING = 0.15, 0.35  # extruded walls that nothing confirms: body on a floor, body in the hand
+_BEAM_HEIGHT_M = 0.06
+_SAME_SURFACE = 0.08
+_CONTRADICTION = 0.25  # log: a beam that far from remembered depth contradicts it
+_LEAST_KNOWN = 20
+_LEAST_INLIERS = 0.3
+
+
+class Fusion:
+    """Depth of every picture by `field`; keyframes are swept, others get the keyframes' depth."""
+
+    def __init__(
+        self, camera: Pinhole, T_body_camera: np.ndarray, *, floor_known: bool, planar: bool,
+        config: FieldConfig | None = None,
+    ) -> None:  # fmt: skip
+        """`floor_known`: the height of `T_body_camera` holds; `planar`: the body stays level on a floor."""
+        self.field = Field(camera, T_body_camera, floor_known=floor_known, planar=planar, config=config)
+        self._planar = planar
+        self._health = PictureHealth()
+
+    def add_scan(self, points_map_m: np.ndarray) -> None:
+        """Returns [N, 3] of every scan, in the map frame."""
+        self.field.add_scan(points_map_m)
+
+    def fuse(self, frame: Frame, *, keyframe: bool) -> Fused:
+        """Depth of one picture. A keyframe costs several times more, and later pictures live on it."""
+        shape = self.field.camera.shape
+        status = self._health.judge(frame.image_rgb, frame.T_map_body)
+        if status != "ok":
+            return refusal(shape, status)
+        uv, z, _ = project_beams(frame.beams, self.field.camera, self.field.T_body_camera)
+        small = self.field.shrink(frame)
+        surfaces = self.field.surfaces(frame)
+        remembered = self.field.recall(small)
+        status = beams_status(len(uv), self._contradicted(remembered.depth_m, uv, z))
+        if status != "ok":
+            return refusal(shape, status)
+        if keyframe:
+            solved = self.field.refine(frame, small)
+            surfaces = self.field.surfaces(frame)
+            sigma_log = self._sigma_swept(solved, surfaces)
+        else:
+            solved = self._carried(frame, remembered, surfaces)
+            sigma_log = solved.spread
+        self.field.keep(small)
+        return self._finish(frame, solved, sigma_log, uv, z)
+
+    def look(self, image_rgb: np.ndarray, T_map_body: np.ndarray) -> None:
+        """Takes a picture in for later sweeps, without making depth of it."""
+        frame = Frame(0, image_rgb, T_map_body, NO_BEAMS)
+        if self._health.judge(image_rgb, T_map_body) == "ok":
+            self.field.keep_if_moved(frame)
+
+    def _carried(self, frame: Frame, remembered: Remembered, surfaces: Surfaces) -> Solved:
+        """Keyframe depth where there is any, else the surfaces, else the guess; `spread` is sigma of log."""
+        depth = surfaces.nearest.astype(np.float32)
+        upright = _UPRIGHT if self._planar else _TILTING
+        spread = np.full(depth.shape, upright, dtype=np.float32)
+        spread[surfaces.on_floor] = _FLOOR * 3.0
+        h, w = depth.shape
+        guess = self.field.guess_of(frame)
+        if guess is not None:
+            guessed = cv2.resize(guess.depth_m, (w, h), interpolation=cv2.INTER_NEAREST)
+            error = 2.0 * guess.spread + 0.02
+            take = np.isfinite(guessed) & (~np.isfinite(depth) | (spread > error))
+            depth[take], spread[take] = guessed[take], error
+        known = remembered.votes > 0
+        depth[known] = remembered.depth_m[known]
+        spread[known] = np.array(_CARRIED, np.float32)[np.minimum(remembered.votes[known], 3) - 1]
+        with np.errstate(invalid="ignore"):
+            at_beam = (surfaces.wall_off_m < _BEAM_HEIGHT_M) & ~surfaces.on_floor
+            exact = np.abs(np.log(surfaces.floor / depth)) < 0.03
+        depth[at_beam], spread[at_beam] = surfaces.wall[at_beam], 2.0 * _BEAM
+        depth[exact], spread[exact] = surfaces.floor[exact], _FLOOR
+        return Solved(depth, spread, at_beam | exact, 0)
+
+    def _contradicted(self, remembered: np.ndarray, uv: np.ndarray, z: np.ndarray) -> float | None:
+        """Share of beams far from what keyframes remember there; None while they remember little."""
+        if len(z) == 0:
+            return None
+        h, w = remembered.shape
+        v = np.clip(((uv[:, 1] + 0.5) * h / self.field.camera.height_px).astype(int), 0, h - 1)
+        u = np.clip(((uv[:, 0] + 0.5) * w / self.field.camera.width_px).astype(int), 0, w - 1)
+        then = remembered[v, u]
+        known = np.isfinite(then)
+        if known.sum() < _LEAST_KNOWN:
+            return None
+        return float(np.mean(np.abs(np.log(z[known] / then[known])) > _CONTRADICTION))
+
+    def _sigma_swept(self, solved: Solved, surfaces: Surfaces) -> np.ndarray:
+        """Standard deviation of log depth [h, w]: by what the depth rests on, and the matcher's own doubt."""
+        with np.errstate(invalid="ignore"):
+            floor = solved.snapped & (np.abs(np.log(surfaces.floor / solved.depth_m)) < 0.01)
+            beam = solved.snapped & (surfaces.wall_off_m < _BEAM_HEIGHT_M)
+        base = np.where(solved.snapped, _SURFACE, _MATCHED)
+        base = np.where(floor, _FLOOR, np.where(beam, _BEAM + 0.01 / solved.depth_m, base))
+        doubt = np.where(floor | beam, 0.0, _PER_SPREAD * solved.spread)
+        return np.hypot(base, doubt).astype(np.float32)
+
+    def _finish(
+        self, frame: Frame, solved: Solved, sigma_log: np.ndarray, uv: np.ndarray, z: np.ndarray
+    ) -> Fused:
+        """Full size, and the figures that go with every result."""
+        h, w = self.field.small_camera.shape
+        depth = np.empty(self.field.camera.shape, np.float32)
+        sigma = np.empty_like(depth)
+        colour = cv2.resize(frame.image_rgb, (w, h), interpolation=cv2.INTER_AREA)
+        finish.enlarge(solved.depth_m, sigma_log, colour, frame.image_rgb, _SAME_SURFACE, depth, sigma)
+        H, W = depth.shape
+        v = np.clip(np.rint(uv[:, 1]).astype(int), 0, H - 1)
+        u = np.clip(np.rint(uv[:, 0]).astype(int), 0, W - 1)
+        here = depth[v, u].astype(np.float64)
+        good = np.isfinite(here)
+        log_ratio = np.log(z[good] / here[good])
+        inlier = largest_cluster(log_ratio, 0.02)
+        result = Fused(
+            depth, sigma, inlier_share=float(inlier.mean()) if len(inlier) else 0.0, pairs=int(good.sum()),
+            residual_m=float(np.median(np.abs(z[good] - here[good]))) if good.any() else float("nan"),
+        )  # fmt: skip
+        if result.inlier_share < _LEAST_INLIERS:
+            return result.refused(
+                f"only {result.inlier_share:.0%} of the beams fit the depth found: wrong pose or calibration"
+            )
+        scaled = None
+        if frame.guess is not None and frame.guess_kind != "none":
+            scaled = ratio(frame.guess, frame.guess_kind, uv, z)
+        if scaled is None or not scaled.ok:
+            return replace(result, scale=1.0, scale_sigma=float(np.std(log_ratio) / np.sqrt(max(len(z), 1))))
+        return replace(result, scale=scaled.scale, scale_sigma=scaled.scale_sigma)
