@@ -7,6 +7,7 @@ import os
 import signal
 import sys
 import threading
+import time
 from multiprocessing import connection, parent_process
 from pathlib import Path
 
@@ -19,6 +20,8 @@ from services.deployment import build_node, consumers_of, unfed_inputs
 from services.nodes import NODES
 
 log = logging.getLogger("beamsplat")
+
+STOP_S = 5.0  # from SIGTERM to SIGKILL
 
 # Two cores are shared by all services: nobody starts a thread per core. Read by OpenMP, BLAS and
 # numba when they are first imported, hence set before the fork server starts.
@@ -94,11 +97,13 @@ def start_logging(level: int = logging.INFO) -> None:
 
 
 def _die_with_parent() -> None:
-    """A killed supervisor must not leave a robot's services running unwatched."""
+    """A killed supervisor must not leave a robot's services running unwatched, busy or not."""
     parent = parent_process()
     if parent is not None:
         connection.wait([parent.sentinel])
         os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(STOP_S)
+        os.kill(os.getpid(), signal.SIGKILL)
 
 
 def _limit_threads(threads: int) -> None:

@@ -19,7 +19,7 @@ from common.errors import UserError
 from common.persist import make_folder
 from common.registry import Service
 from services.deployment import node_classes
-from services.host import ONE_THREAD, child
+from services.host import ONE_THREAD, STOP_S, child
 from services.nodes import NODES
 
 log = logging.getLogger("beamsplat")
@@ -27,7 +27,6 @@ log = logging.getLogger("beamsplat")
 ROUTER = "router"
 BACK_OFF_S = (0.1, 0.5, 1.0, 2.0, 5.0)
 HEALTHY_S = 30.0  # alive for so long, a process earns a fresh back-off
-STOP_S = 5.0  # from SIGTERM to SIGKILL
 PRELOADED = ("numpy", "cv2", "scipy.spatial", "pydantic", "zenoh", "common.live", "common.lockstep")
 
 
@@ -140,7 +139,7 @@ class Supervisor:
 
     def _bury(self, entry: Child, now: float) -> None:
         code = entry.process.exitcode or 0
-        if code == 0:
+        if code == 0 and entry.name != ROUTER:  # nobody goes on without a router, however it was ended
             entry.exit_code = 0
             return
         if code == 2:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import signal
 import sys
 import time
 from pathlib import Path
@@ -62,7 +63,9 @@ def run(
     file: FileArgument,
     nodes: Annotated[list[str] | None, typer.Argument(help="Only these (and `router`); default: all")] = None,
     set_: SetOption = None,
-    rate: Annotated[float | None, typer.Option(help="Replay at N times real time; 0 = flat out")] = None,
+    rate: Annotated[
+        float | None, typer.Option(min=0.0, help="Replay at N times real time; 0 = flat out")
+    ] = None,
 ) -> None:
     """Runs a deployment: a router and one supervised process per node.
 
@@ -87,10 +90,16 @@ def run_checked(deployment: Deployment, names: tuple[str, ...] | None = None) ->
         UserError: the deployment does not fit together, or a node cannot run with what it was given.
     """
     _checked(deployment)
+    for name in names or ():
+        if name != "router" and name not in deployment.nodes:
+            there = ", ".join(("router", *deployment.nodes))
+            raise UserError(f"the deployment has no node {name!r}; there are {there}")
     from common.bus import open_session
     from services.board import HealthBoard
     from services.supervisor import Supervisor
 
+    for number in (signal.SIGTERM, signal.SIGHUP):  # ends the children in order, as Ctrl-C does
+        signal.signal(number, signal.default_int_handler)
     events: list[str] = []
     show = sys.stderr.isatty()
 
@@ -110,8 +119,11 @@ def run_checked(deployment: Deployment, names: tuple[str, ...] | None = None) ->
                     if show:
                         screen.update(board.nodes_table())
                     nodes = [c for c in supervisor.children.values() if c.name != "router"]
-                    if any(c.gave_up for c in supervisor.children.values()):
-                        raise UserError(events[-1])
+                    for entry in supervisor.children.values():
+                        if entry.gave_up:
+                            raise UserError(
+                                next(e for e in events if e.startswith(f"{entry.name} cannot run"))
+                            )
                     states = board.states()
                     if nodes and all(c.exit_code == 0 or states.get(c.name) == "drained" for c in nodes):
                         break

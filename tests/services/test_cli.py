@@ -44,6 +44,7 @@ def test_help_names_every_command_and_each_has_an_example():
         (("check", "deploy/demo.toml", "--set", "replay.[/x]=1"), "unknown option '[/x]'"),
         (("serve", "deploy/demo.toml", "router", "--set", 'router.listen=["no"]'), "no are no endpoints"),
         (("run", "deploy/poses.toml", *POSES, "--set", "state_dir=/dev/null/x"), "cannot make this folder"),
+        (("run", "deploy/poses.toml", *POSES, "router", "nope"), "has no node 'nope'"),
         (("offline", "deploy/poses.toml", *POSES, "--out", "/dev/null/x"), "cannot make this folder"),
         (("offline", "deploy/demo.toml", "--data", "no/bag", "--out", "{tmp}"), "no/bag"),
         (("info", "no/bag"), "no/bag"),

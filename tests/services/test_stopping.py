@@ -1,5 +1,6 @@
 """SIGTERM ends a process soon, in whatever state it is."""
 
+import os
 import signal
 import subprocess
 import sys
@@ -8,10 +9,14 @@ import time
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 
 from common.bus import Bus, open_router, open_session
+from common.config import Deployment, RouterConfig
 from common.messages import ExternalPose
+from services.board import HealthBoard
+from services.supervisor import Supervisor
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -117,3 +122,60 @@ def test_in_the_middle_of_a_long_background_job(serve, free_endpoint, after):
                 time.sleep(0.2)
             assert process.stdout.readline() == "working\n"
             assert _ends(process).split() == ["closed", "clean"]
+
+
+_RUN = """
+    import sys
+    from pathlib import Path
+    from common.config import Deployment, RouterConfig
+    from services import nodes, system_cli
+    from tests.common.nodes import TABLE
+
+    nodes.NODES.clear()
+    nodes.NODES.update(TABLE)
+    slow = {"kind": "slow", "sleep_s": float(sys.argv[3])}
+    system_cli.run_checked(Deployment(
+        robot="test", router=RouterConfig(listen=(sys.argv[1],)), state_dir=Path(sys.argv[2]),
+        nodes={"replay": {"kind": "drive", "seconds": 60.0}, "localization": slow},
+    ))
+"""
+
+
+@pytest.mark.parametrize(("number", "sleep_s"), [(signal.SIGTERM, 0.0), (signal.SIGKILL, 300.0)])
+def test_a_whole_system_whose_supervisor_is_ended(tmp_path, free_endpoint, number, sleep_s):
+    """SIGTERM ends all in order. Even a supervisor killed outright leaves nothing, busy or not."""
+    command = [sys.executable, "-c", textwrap.dedent(_RUN), free_endpoint, tmp_path, str(sleep_s)]
+    process = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
+    try:
+        with open_session((free_endpoint,), wait_s=30.0) as session:
+            board = HealthBoard(session, "test")
+            _until(lambda: any(i.received for r in board.records.values() for i in r.health.inputs), 30)
+        family = [psutil.Process(process.pid), *psutil.Process(process.pid).children(recursive=True)]
+    finally:
+        process.send_signal(number)
+    assert process.wait(15) == (0 if number == signal.SIGTERM else -number)
+    _, left = psutil.wait_procs(family, timeout=15)
+    for orphan in left:
+        orphan.kill()
+    assert left == []
+
+
+def test_a_router_that_was_asked_to_end_comes_back(tmp_path, free_endpoint):
+    deployment = Deployment(robot="test", router=RouterConfig(listen=(free_endpoint,)), state_dir=tmp_path)
+    with Supervisor(deployment, on_event=lambda text: None) as supervisor:
+        first = supervisor.children["router"].process
+        os.kill(first.pid, signal.SIGTERM)
+        first.join(10)
+
+        def back():
+            supervisor.poll()
+            return supervisor.children["router"].process.pid != first.pid
+
+        _until(back, 10)
+
+
+def _until(done, seconds):
+    deadline = time.monotonic() + seconds
+    while not done():
+        assert time.monotonic() < deadline, f"not within {seconds} s"
+        time.sleep(0.05)
