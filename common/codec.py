@@ -72,9 +72,8 @@ def decode(schema: str, payload: bytes) -> Message:
     cls, minor = _class_of(schema)
     try:
         fields = _unpack(payload)
-        if minor > _version(cls)[1]:
-            fields = {name: value for name, value in fields.items() if name in cls.model_fields}
-        return cls.model_validate(fields)
+        newer = minor > _version(cls)[1]
+        return cls.model_validate(fields, extra="ignore" if newer else None)
     except DecodeError:
         raise
     # msgpack and pydantic raise ValueErrors; hostile bytes also provoke the other three in them.

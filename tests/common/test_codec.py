@@ -12,7 +12,7 @@ from hypothesis.extra import numpy as hnp
 
 from common.codec import decode, encode, schema_of
 from common.header import DecodeError, Header
-from common.messages import MESSAGES, Correction, Image, Scan
+from common.messages import MESSAGES, Correction, Image, Rig, Scan
 from tests.common.samples import assert_equal, sample_messages
 
 SAMPLES = sample_messages()
@@ -79,6 +79,21 @@ def test_a_newer_minor_version_decodes_without_the_fields_we_do_not_know():
         decode("Correction/1.0", newer)
     with pytest.raises(DecodeError, match=r"version 2\.0.*speaks 1\.0"):
         decode("Correction/2.0", newer)
+
+
+def test_a_newer_minor_version_may_have_grown_inside_a_part():
+    rig = next(m for m in SAMPLES if isinstance(m, Rig) and m.lidar is not None)
+    payload = encode(rig)
+    length = int.from_bytes(payload[:4], "little")
+    head = msgpack.unpackb(payload[4 : 4 + length], ext_hook=msgpack.ExtType, strict_map_key=False)
+    head["lidar"]["future"] = 7
+    longer = msgpack.packb(head)
+    start, old_start = -(-(4 + len(longer)) // 64) * 64, -(-(4 + length) // 64) * 64
+    newer = len(longer).to_bytes(4, "little") + longer
+    newer += bytes(start - len(newer)) + payload[old_start:]
+    assert_equal(decode("Rig/1.9", newer), rig)
+    with pytest.raises(DecodeError, match=r"lidar\.future"):
+        decode("Rig/1.0", newer)
 
 
 def _mutations(payload: bytes, rng: random.Random) -> bytes:
