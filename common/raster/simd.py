@@ -199,6 +199,34 @@ def gather(
 
 
 @intrinsic
+def scatter_some(
+    typingctx: Any, array: types.Array, base: types.Integer, index: types.Array, at: types.Integer, value: _F32Type,
+    count: types.Integer,
+) -> Any:  # fmt: skip
+    """array[base + index[at + lane]] = value for the first `count` lanes; `index` is contiguous int32."""
+
+    def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
+        lanes = _aligned_load(builder, _address(context, builder, sig.args[2], args[2], args[3]), _IVEC)
+        start = _address(context, builder, sig.args[0], args[0], args[1])
+        pointers = builder.gep(start, [lanes], inbounds=False, source_etype=_FLOAT)
+        kind = ir.VectorType(start.type, LANES)
+        pointers.type = kind
+        number = builder.insert_element(
+            ir.Constant(_IVEC, ir.Undefined), builder.trunc(args[5], _INT), ir.Constant(_INT, 0)
+        )
+        number = _shuffle(builder, number, number, [0] * LANES)
+        used = builder.icmp_signed("<", ir.Constant(_IVEC, list(range(LANES))), number)
+        scattered = cgutils.get_or_insert_function(
+            builder.module, ir.FunctionType(ir.VoidType(), [_VEC, kind, _INT, _MASK]),
+            f"llvm.masked.scatter.v{LANES}f32.v{LANES}p0",
+        )  # fmt: skip
+        builder.call(scattered, [args[4], pointers, ir.Constant(_INT, 4), used])
+        return context.get_dummy_value()
+
+    return types.void(array, types.int64, index, types.int64, F32, types.int64), emit
+
+
+@intrinsic
 def prefetch(typingctx: Any, array: types.Array, at: types.Integer) -> Any:
     """Asks for the cache line of array[at] ahead of time."""
 

@@ -14,7 +14,6 @@ from common.raster.compiled import inner, kernel
 from common.raster.lanes import exp2_lanes
 from common.raster.layout import (
     ALPHA_MAX,
-    LOG2_ALPHA_MAX,
     LOG2_ALPHA_MIN,
     RECORD,
     ROWS,
@@ -79,7 +78,7 @@ def _open_pixels(scratch, step, left, top, width, height):  # noqa: ANN001, ANN2
 
 
 @kernel
-def _forward_tile(lists, first, last, records, left, top, scratch):  # noqa: ANN001, ANN202
+def _forward_tile(lists, first, last, records, left, top, scratch, alphas):  # noqa: ANN001, ANN202
     row_of_lane = floor(iota() * np.float32(1.0 / TILE_W))
     column = iota() - row_of_lane * np.float32(TILE_W) + np.float32(left)
     row_of_lane = row_of_lane + np.float32(top)
@@ -100,10 +99,12 @@ def _forward_tile(lists, first, last, records, left, top, scratch):  # noqa: ANN
         )
         z = repeat(records[record + 9])
         dy = row_of_lane + (np.float32(begin * ROWS) - records[record + 1])
-        for at in range(begin * _FORWARD, (end + 1) * _FORWARD, _FORWARD):
+        for at in range(begin * LANES, (end + 1) * LANES, LANES):
             power = fma(dy, fma(dy, C, linear), constant)
             dy = dy + np.float32(ROWS)
-            alpha = where(power >= LOG2_ALPHA_MIN, smaller(exp2_lanes(power), ALPHA_MAX), 0.0)
+            store(alphas, at, where(power >= LOG2_ALPHA_MIN, smaller(exp2_lanes(power), ALPHA_MAX), 0.0))
+        for vector in range(begin, end + 1):
+            at, alpha = vector * _FORWARD, load(alphas, vector * LANES)
             before = load(scratch, T + at)
             weight = before * alpha
             after = before - weight
@@ -120,14 +121,14 @@ def _forward_tile(lists, first, last, records, left, top, scratch):  # noqa: ANN
 def forward_tiles(counter, tiles_x, background, lists, tile_start, records, image):  # noqa: ANN001, ANN201
     """Renders tiles as they are handed out into `image` float32 [5, H, W]."""
     height, width = image.shape[1], image.shape[2]
-    scratch = aligned_floats(_VECTORS * _FORWARD)
+    scratch, alphas = aligned_floats(_VECTORS * _FORWARD), aligned_floats(TILE_PIXELS)
     while True:
         tile = atomic_next(counter, 0)
         if tile >= len(tile_start) - 1:
             return
         left, top = tile % tiles_x * TILE_W, tile // tiles_x * TILE_H
         _open_pixels(scratch, _FORWARD, left, top, width, height)
-        _forward_tile(lists, tile_start[tile], tile_start[tile + 1], records, left, top, scratch)
+        _forward_tile(lists, tile_start[tile], tile_start[tile + 1], records, left, top, scratch, alphas)
         for y in range(top, min(top + TILE_H, height)):
             for x in range(left, min(left + TILE_W, width)):
                 at = _place(x - left, y - top, _FORWARD)
@@ -140,7 +141,7 @@ def forward_tiles(counter, tiles_x, background, lists, tile_start, records, imag
 
 
 @kernel
-def _backward_tile(lists, first, last, records, left, top, scratch, slots):  # noqa: ANN001, ANN202
+def _backward_tile(lists, first, last, records, left, top, scratch, alphas, slots):  # noqa: ANN001, ANN202
     row_of_lane = floor(iota() * np.float32(1.0 / TILE_W))
     column = iota() - row_of_lane * np.float32(TILE_W) + np.float32(left)
     row_of_lane = row_of_lane + np.float32(top)
@@ -163,11 +164,15 @@ def _backward_tile(lists, first, last, records, left, top, scratch, slots):  # n
         )
         z = repeat(records[record + 9])
         dy = row_of_lane + (np.float32(begin * ROWS) - records[record + 1])
+        dy_first = dy
         v_0, v_y, v_yy = nothing, nothing, nothing
         w_red, w_green, w_blue, w_z, w_all = nothing, nothing, nothing, nothing, nothing
-        for at in range(begin * _BACKWARD, (end + 1) * _BACKWARD, _BACKWARD):
-            power = fma(dy, fma(dy, C, linear), constant)
-            alpha = where(power >= LOG2_ALPHA_MIN, smaller(exp2_lanes(power), ALPHA_MAX), 0.0)
+        for at in range(begin * LANES, (end + 1) * LANES, LANES):
+            power = fma(dy_first, fma(dy_first, C, linear), constant)
+            dy_first = dy_first + np.float32(ROWS)
+            store(alphas, at, where(power >= LOG2_ALPHA_MIN, smaller(exp2_lanes(power), ALPHA_MAX), 0.0))
+        for vector in range(begin, end + 1):
+            at, alpha = vector * _BACKWARD, load(alphas, vector * LANES)
             before = load(scratch, T + at)
             weight = before * alpha
             after = before - weight
@@ -180,9 +185,7 @@ def _backward_tile(lists, first, last, records, left, top, scratch, slots):  # n
             behind = load(scratch, Q + at) - gain
             store(scratch, T + at, where(goes_on, after, -magnitude(before)))
             store(scratch, Q + at, behind)
-            v = where(
-                goes_on & (power < LOG2_ALPHA_MAX), gain - behind * (alpha * reciprocal(1.0 - alpha)), 0.0
-            )
+            v = where(goes_on & (alpha < ALPHA_MAX), gain - behind * (alpha * reciprocal(1.0 - alpha)), 0.0)
             v_0 = v_0 + v
             vy = v * dy
             v_y = v_y + vy
@@ -204,7 +207,7 @@ def _backward_tile(lists, first, last, records, left, top, scratch, slots):  # n
 def backward_tiles(counter, tiles_x, background, lists, tile_start, records, image, gradient, slots):  # noqa: ANN001, ANN201
     """Sums dL/d(splat) of each (splat, tile) pair into its slot, given dL/d(image) float32 [5, H, W]."""
     height, width = image.shape[1], image.shape[2]
-    scratch = aligned_floats(_VECTORS * _BACKWARD)
+    scratch, alphas = aligned_floats(_VECTORS * _BACKWARD), aligned_floats(TILE_PIXELS)
     while True:
         tile = atomic_next(counter, 0)
         if tile >= len(tile_start) - 1:
@@ -225,4 +228,6 @@ def backward_tiles(counter, tiles_x, background, lists, tile_start, records, ima
                     (image[0, y, x] - through * background[0]) * g0 + (image[1, y, x] - through * background[1]) * g1
                     + (image[2, y, x] - through * background[2]) * g2 + image[3, y, x] * g3 + alpha * g4
                 )  # fmt: skip
-        _backward_tile(lists, tile_start[tile], tile_start[tile + 1], records, left, top, scratch, slots)
+        _backward_tile(
+            lists, tile_start[tile], tile_start[tile + 1], records, left, top, scratch, alphas, slots
+        )

@@ -1,0 +1,148 @@
+"""`bench map`: how good a map the mapper makes of a recording in real time with true poses, and refined."""
+
+from __future__ import annotations
+
+import resource
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from common.beams import project_beams
+from common.camera import Pinhole
+from common.raster.camera import RasterCamera
+from common.raster.warm import warm
+from services.mapping.dataset import Recording, load, read_depth_png
+from services.mapping.export import read_ply_points
+from services.mapping.keyframe import Keyframe
+from services.mapping.mapper import HALF, Mapper
+from services.mapping.priors import find_prior
+from services.mapping.scores import ViewScore, f_score, fused_surface, render_rgb_depth, score_view
+from services.mapping.settings import MapperSettings
+
+HELD_OUT_EVERY, HELD_OUT_AT = 8, 2  # pictures i with i % 8 == 2 are scored and never shown
+Say = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class MapBench:
+    """What to run."""
+
+    prior: str = "stixel"
+    distance_m: float = 0.3
+    angle_rad: float = 0.26
+    settings: MapperSettings = field(default_factory=MapperSettings)
+    refine_half: int = 0
+    refine_full: int = 500
+    threads: int = 1
+    seed: int = 0
+
+
+@dataclass
+class _Clock:
+    """Wall and CPU seconds of the mapper alone: without decoding, scoring and compiling."""
+
+    wall_s: float = 0.0
+    cpu_s: float = 0.0
+
+    def run(self, work: Callable[[], Any]) -> Any:
+        wall, cpu = time.perf_counter(), time.process_time()
+        result = work()
+        self.wall_s += time.perf_counter() - wall
+        self.cpu_s += time.process_time() - cpu
+        return result
+
+
+def raster_camera(camera: Pinhole) -> RasterCamera:
+    """The rasterizer's camera of a pinhole."""
+    return RasterCamera(
+        camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px, camera.width_px, camera.height_px
+    )
+
+
+def bench_map(path: Path, bench: MapBench, say: Say = lambda text: None) -> dict[str, Any]:
+    """Runs the mapper over a recording and gives the figures of the design's section 12."""
+    warm()
+    recording = load(path)
+    prior = find_prior(bench.prior)
+    mapper = Mapper(bench.settings, seed=bench.seed, threads=bench.threads)
+    clock, keyframes, refused, last = _Clock(), 0, 0, None
+    for index, shot in enumerate(recording.shots):
+        if index % HELD_OUT_EVERY == HELD_OUT_AT or not _moved(last, shot.T_map_camera, bench):
+            continue
+        guess = clock.run(lambda i=index: prior(recording, i))
+        if guess is None:
+            continue
+        last = shot.T_map_camera
+        frame = make_keyframe(recording, index, guess)
+        outcome = clock.run(lambda f=frame: mapper.add(f, np.eye(4)))
+        clock.run(mapper.optimise)
+        keyframes, refused = keyframes + outcome.ok, refused + (not outcome.ok)
+        if keyframes % 10 == 0:
+            say(f"{keyframes} keyframes, {mapper.store.count} Gaussians, {clock.cpu_s:.0f} CPU s")
+    online_clock = replace(clock)
+    online = score_map(recording, mapper, say)
+    online_steps = mapper.steps
+    clock.run(lambda: (mapper.refine(bench.refine_half, HALF), mapper.refine(bench.refine_full)))
+    refined = score_map(recording, mapper, say)
+    return {
+        "data": str(path), "prior": bench.prior, "threads": bench.threads, "seed": bench.seed,
+        "keyframes": keyframes, "refused": refused, "data_s": recording.seconds,
+        "wall_s": online_clock.wall_s, "cpu_s": online_clock.cpu_s, "steps": online_steps,
+        "refine_wall_s": clock.wall_s - online_clock.wall_s, "refine_cpu_s": clock.cpu_s - online_clock.cpu_s,
+        "refine_steps": mapper.steps - online_steps, "online": online, "refined": refined,
+        "peak_rss_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0,
+    }  # fmt: skip
+
+
+def _moved(last: np.ndarray | None, T_map_camera: np.ndarray, bench: MapBench) -> bool:
+    if last is None:
+        return True
+    cos = (np.trace(last[:3, :3].T @ T_map_camera[:3, :3]) - 1.0) / 2.0
+    far = np.linalg.norm(last[:3, 3] - T_map_camera[:3, 3]) >= bench.distance_m
+    return bool(far or np.arccos(np.clip(cos, -1.0, 1.0)) >= bench.angle_rad)
+
+
+def make_keyframe(recording: Recording, index: int, guess: tuple[np.ndarray, np.ndarray]) -> Keyframe:
+    """A keyframe bound to one anchor at the map's origin, with the beams of the moment."""
+    shot = recording.shots[index]
+    uv, z, _ = project_beams(shot.beams, recording.camera, recording.T_body_camera)
+    return Keyframe(
+        id=index, rgb=recording.image(index), camera=raster_camera(recording.camera), T_anchor_camera=shot.T_map_camera,
+        depth_m=guess[0], sigma_m=guess[1], beams_uvz=np.column_stack([uv, z]) if len(z) else np.zeros((0, 3)),
+    )  # fmt: skip
+
+
+def score_map(recording: Recording, mapper: Mapper, say: Say) -> dict[str, float]:
+    """Figures at the views that the mapper has not seen."""
+    say("scoring")
+    camera = raster_camera(recording.camera)
+    off, held = [], []
+    for view in recording.extra_views:
+        true_rgb = cv2.cvtColor(cv2.imread(str(view.image_file)), cv2.COLOR_BGR2RGB)
+        rgb, depth, _ = render_rgb_depth(mapper.rasterizer, mapper.store, camera, view.T_map_camera)
+        off.append(score_view(rgb, depth, true_rgb, read_depth_png(view.depth_file)))
+    for index in range(HELD_OUT_AT, len(recording.shots), HELD_OUT_EVERY):
+        rgb, depth, _ = render_rgb_depth(
+            mapper.rasterizer, mapper.store, camera, recording.shots[index].T_map_camera
+        )
+        held.append(score_view(rgb, depth, recording.image(index), None))
+    figures = {
+        "psnr_offpath_db": _mean(off, "psnr_db"), "ssim_offpath": _mean(off, "ssim"),
+        "depth_l1_offpath_m": _mean(off, "depth_l1_m"), "psnr_heldout_db": _mean(held, "psnr_db"),
+        "ssim_heldout": _mean(held, "ssim"), "gaussians": mapper.store.count,
+    }  # fmt: skip
+    surface = recording.path / "gt_surface.ply"
+    if surface.is_file():
+        half = camera.resized(camera.width_px // 2, camera.height_px // 2)
+        views = [(half, mapper.T_map_camera(held)) for held in mapper.keyframes.values()]
+        figures |= f_score(fused_surface(mapper.rasterizer, mapper.store, views), read_ply_points(surface))
+    return figures
+
+
+def _mean(scores: list[ViewScore], name: str) -> float:
+    return float(np.mean([getattr(score, name) for score in scores])) if scores else float("nan")

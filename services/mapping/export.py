@@ -1,0 +1,57 @@
+"""The map as files others read: 3DGS `.ply` (INRIA layout)."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+
+from common.errors import UserError
+from common.raster.layout import COLOUR, MEAN, OPACITY, QUAT, SCALE
+
+SH_C0 = 0.28209479177387814  # the constant spherical harmonic
+_PLY_TYPES = {"float": "<f4", "float32": "<f4", "double": "<f8", "uchar": "u1", "uint8": "u1", "char": "i1",
+              "short": "<i2", "ushort": "<u2", "int": "<i4", "uint": "<u4"}  # fmt: skip
+FIELDS = ("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity",
+          "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3")  # fmt: skip
+
+
+def write_gaussian_ply(path: Path, params: np.ndarray) -> None:
+    """Writes Gaussians float32 [14, N] as INRIA's 3DGS does (SH degree 0); a reader never sees half a file."""
+    count = params.shape[1]
+    rows = np.zeros((count, len(FIELDS)), "<f4")
+    rows[:, 0:3] = params[MEAN : MEAN + 3].T
+    rows[:, 6:9] = (params[COLOUR : COLOUR + 3].T - 0.5) / SH_C0
+    rows[:, 9] = params[OPACITY]
+    rows[:, 10:13] = params[SCALE : SCALE + 3].T
+    quat = params[QUAT : QUAT + 4]
+    rows[:, 13:17] = (quat / np.maximum(np.linalg.norm(quat, axis=0), 1e-12)).T
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
+    header += [f"property float {name}" for name in FIELDS] + ["end_header", ""]
+    path = Path(path)
+    partial = path.with_name(path.name + ".partial")
+    partial.write_bytes("\n".join(header).encode() + rows.tobytes())
+    os.replace(partial, path)
+
+
+def read_ply_points(path: Path) -> np.ndarray:
+    """float64 [N, 3] of the vertices of a binary little-endian PLY.
+
+    Raises:
+        UserError: not such a file.
+    """
+    blob = Path(path).read_bytes()
+    end = blob.find(b"end_header\n")
+    lines = blob[:end].decode("ascii", "replace").split("\n")
+    if end < 0 or "format binary_little_endian 1.0" not in lines:
+        raise UserError(f"{path}: expected a binary little-endian PLY")
+    fields, count = [], 0
+    for line in lines:
+        words = line.split()
+        if words[:2] == ["element", "vertex"]:
+            count = int(words[2])
+        elif words[:1] == ["property"] and len(words) == 3:
+            fields.append((words[2], _PLY_TYPES[words[1]]))
+    rows = np.frombuffer(blob, np.dtype(fields), count, end + len(b"end_header\n"))
+    return np.stack([rows[name] for name in "xyz"], axis=1).astype(np.float64)

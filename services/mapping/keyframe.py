@@ -1,0 +1,115 @@
+"""A keyframe as the mapper takes it and as it keeps it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+
+from common.geometry import is_rigid
+from common.raster.camera import RasterCamera
+
+MAX_DEPTH_M = 60.0
+
+
+@dataclass(frozen=True)
+class Keyframe:
+    """One undistorted picture with depth and its place beside an anchor.
+
+    Several may arrive in any order; `anchor` is the lidar submap that `T_anchor_camera` refers to.
+    """
+
+    id: int
+    rgb: np.ndarray  # uint8 [H, W, 3]
+    camera: RasterCamera
+    T_anchor_camera: np.ndarray
+    depth_m: np.ndarray  # float32 [H, W] optical z, NaN unknown
+    sigma_m: np.ndarray  # float32 [H, W] standard deviation
+    anchor: int = 0
+    beams_uvz: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))  # px, px, metres: lidar returns
+    mask: np.ndarray | None = None  # bool [H, W], False = do not use (movers)
+
+    def fault(self) -> str | None:
+        """Why this cannot be mapped, in one sentence; None if it can."""
+        shape = (self.camera.height_px, self.camera.width_px)
+        if self.rgb.shape != (*shape, 3) or self.rgb.dtype != np.uint8:
+            return f"picture must be uint8 [{shape[0]}, {shape[1]}, 3], got {self.rgb.dtype} {list(self.rgb.shape)}"
+        if self.depth_m.shape != shape or self.sigma_m.shape != shape:
+            return f"depth and sigma must be {list(shape)}, got {list(self.depth_m.shape)} and {list(self.sigma_m.shape)}"
+        if not is_rigid(self.T_anchor_camera):
+            return "T_anchor_camera is not a rigid transform"
+        if self.mask is not None and (self.mask.shape != shape or not self.mask.any()):
+            return "the mask leaves no pixel to use"
+        if not np.any(np.isfinite(self.depth_m)):
+            return "no pixel has a depth"
+        return None
+
+
+@dataclass
+class Level:
+    """A keyframe's targets at one size, in few bytes."""
+
+    camera: RasterCamera
+    rgb: np.ndarray  # uint8 [3, H, W]
+    depth_mm: np.ndarray  # uint16 [H, W], 0 unknown
+    depth_weight: np.ndarray  # uint8 [H, W], 255 = 1
+    beam_pixels: np.ndarray  # int32 [N], flat
+    beam_z_m: np.ndarray  # float32 [N]
+
+
+@dataclass
+class Held:
+    """A keyframe in the map. `levels[0]` is the full size, `levels[1]` half."""
+
+    id: int
+    anchor: int
+    T_anchor_camera: np.ndarray  # as given (SLAM)
+    levels: list[Level]
+    delta: np.ndarray = field(default_factory=lambda: np.eye(4))  # the mapper's own correction, on the right
+    pose_first: np.ndarray = field(default_factory=lambda: np.zeros(6))  # Adam's moments of the pose
+    pose_second: np.ndarray = field(default_factory=lambda: np.zeros(6))
+    pose_steps: int = 0
+    exposure: np.ndarray = field(default_factory=lambda: np.zeros(6, np.float32))  # log gains, offsets
+    exposure_first: np.ndarray = field(default_factory=lambda: np.zeros(6))
+    exposure_second: np.ndarray = field(default_factory=lambda: np.zeros(6))
+
+    def T_anchor_refined(self) -> np.ndarray:
+        """T_anchor_camera (SLAM) @ delta (mapper)."""
+        return self.T_anchor_camera @ self.delta
+
+
+def hold(frame: Keyframe, sigma_unit_m: float) -> Held:
+    """The compact form of a keyframe that has no fault."""
+    with np.errstate(invalid="ignore"):
+        known = np.isfinite(frame.depth_m) & (frame.depth_m > 0.05) & (frame.depth_m < MAX_DEPTH_M)
+        if frame.mask is not None:
+            known &= frame.mask
+        weight = np.where(known, 1.0 / (1.0 + (frame.sigma_m / sigma_unit_m) ** 2), 0.0)
+    depth_mm = np.where(known, frame.depth_m * 1e3, 0.0).astype(np.uint16)
+    weight_8 = np.clip(np.nan_to_num(weight) * 255.0 + 0.5, 0.0, 255.0).astype(np.uint8)
+    levels, camera, rgb = [], frame.camera, frame.rgb
+    for halvings in range(2):
+        step = 1 << halvings
+        w, h = frame.camera.width_px // step, frame.camera.height_px // step
+        if halvings:
+            camera, rgb = (
+                frame.camera.resized(w, h),
+                cv2.resize(frame.rgb, (w, h), interpolation=cv2.INTER_AREA),
+            )
+        pixels, z = _beams_at(frame.beams_uvz, frame.camera, camera)
+        levels.append(Level(
+            camera, np.ascontiguousarray(rgb.transpose(2, 0, 1)), np.ascontiguousarray(depth_mm[: h * step : step, : w * step : step]),
+            np.ascontiguousarray(weight_8[: h * step : step, : w * step : step]), pixels, z,
+        ))  # fmt: skip
+    return Held(frame.id, frame.anchor, np.array(frame.T_anchor_camera, dtype=np.float64), levels)
+
+
+def _beams_at(uvz: np.ndarray, full: RasterCamera, camera: RasterCamera) -> tuple[np.ndarray, np.ndarray]:
+    """Flat pixel numbers int32 and z float32 of the beams in a resized picture."""
+    if len(uvz) == 0:
+        return np.zeros(0, np.int32), np.zeros(0, np.float32)
+    u = np.round((uvz[:, 0] + 0.5) * camera.width_px / full.width_px - 0.5).astype(int)
+    v = np.round((uvz[:, 1] + 0.5) * camera.height_px / full.height_px - 0.5).astype(int)
+    inside = (u >= 0) & (v >= 0) & (u < camera.width_px) & (v < camera.height_px)
+    return (v * camera.width_px + u)[inside].astype(np.int32), uvz[inside, 2].astype(np.float32)

@@ -1,0 +1,230 @@
+"""The mapper: keyframes with depth in, Gaussians out. Knows no clock, no messages and no torch.
+
+Per keyframe: refuse what cannot be used, insert where the map does not explain the picture, carve what floats
+before trusted surfaces, then a fixed number of steps on a window of new and randomly drawn old keyframes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from common.geometry import inverse, is_rigid, se3_exp, se3_log
+from common.raster.layout import OPACITY
+from common.raster.rasterizer import Gradients, Rasterizer, Render
+from services.mapping.insertion import candidates, make_gaussians, unexplained
+from services.mapping.kernels import adam, add_lidar, contradicted, photometric_and_depth, rate_rows
+from services.mapping.keyframe import Held, Keyframe, Level, hold
+from services.mapping.settings import MapperSettings
+from services.mapping.ssim import SsimLoss
+from services.mapping.store import GaussianStore
+
+FULL, HALF = 0, 1
+_REACH_M = 1e4  # no robot is further from its anchor
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of a keyframe. `status` is "ok" or one sentence: then the map is as it was."""
+
+    status: str
+    inserted: int = 0
+    removed: int = 0
+
+    @property
+    def ok(self) -> bool:
+        return self.status == "ok"
+
+
+class Mapper:
+    """See module. The same keyframes and seed give the same map, bit for bit."""
+
+    def __init__(self, settings: MapperSettings | None = None, *, seed: int = 0, threads: int = 1) -> None:
+        self.settings = settings or MapperSettings()
+        self.store = GaussianStore()
+        self.rasterizer = Rasterizer(threads)
+        self.keyframes: dict[int, Held] = {}
+        self.T_map_anchor: dict[int, np.ndarray] = {}
+        self.steps = 0
+        self._random = np.random.default_rng(seed)
+        self._newest: list[int] = []
+        self._ssim = SsimLoss()
+        self._buffers: dict[tuple[int, int], tuple[np.ndarray, np.ndarray]] = {}
+        r = self.settings.rates
+        self._rates = rate_rows(r.mean_m, r.log_scale, r.quat, r.opacity_logit, r.colour)
+
+    # --- keyframes and anchors ---------------------------------------------------------------------
+
+    def add(self, frame: Keyframe, T_map_anchor: np.ndarray | None = None) -> Outcome:
+        """Takes a keyframe in: insertion, carving, pruning. `optimise` is separate.
+
+        `T_map_anchor` places the frame's anchor if it is new. A keyframe known by its id is left as it is.
+        """
+        if frame.id in self.keyframes:
+            return Outcome("ok")
+        fault = frame.fault() or self._fault_of_place(frame, T_map_anchor)
+        if fault is not None:
+            return Outcome(fault)
+        if frame.anchor not in self.T_map_anchor:
+            self.T_map_anchor[frame.anchor] = np.array(T_map_anchor, dtype=np.float64)
+        held = hold(frame, self.settings.sigma_unit_m)
+        removed = self._carve(held) + self._prune()
+        inserted = self._insert(held, held.levels[FULL])
+        self.keyframes[frame.id] = held
+        self._newest = [*self._newest, frame.id][-self.settings.recent :]
+        return Outcome("ok", inserted, removed)
+
+    def _fault_of_place(self, frame: Keyframe, T_map_anchor: np.ndarray | None) -> str | None:
+        if np.abs(frame.T_anchor_camera[:3, 3]).max() > _REACH_M:
+            return f"the pose lies more than {_REACH_M:g} m from its anchor"
+        if frame.anchor in self.T_map_anchor:
+            return None
+        if T_map_anchor is None or not is_rigid(T_map_anchor):
+            return f"anchor {frame.anchor} has no place in the map"
+        return None
+
+    def T_map_camera(self, held: Held) -> np.ndarray:
+        """T_map_anchor (SLAM) @ T_anchor_camera (SLAM) @ delta (mapper)."""
+        return self.T_map_anchor[held.anchor] @ held.T_anchor_refined()
+
+    def move_anchors(self, T_map_anchor: dict[int, np.ndarray]) -> int:
+        """Takes new places of anchors: their Gaussians move along, exactly. Gives how many anchors moved.
+
+        Raises:
+            ValueError: a place is no rigid transform; then nothing has moved.
+        """
+        for anchor, T in T_map_anchor.items():
+            if not is_rigid(T):
+                raise ValueError(
+                    f"anchor {anchor}: its new place is not a rigid transform: {np.asarray(T).tolist()}"
+                )
+        moved = 0
+        for anchor, T in T_map_anchor.items():
+            old = self.T_map_anchor.get(anchor)
+            if old is not None and not np.allclose(old, T, atol=1e-9):
+                self.store.move(anchor, T @ inverse(old))
+                moved += 1
+            self.T_map_anchor[anchor] = np.array(T, dtype=np.float64)
+        return moved
+
+    # --- growing and shrinking ---------------------------------------------------------------------
+
+    def _insert(self, held: Held, level: Level) -> int:
+        room = self.settings.max_gaussians - self.store.count
+        if room <= 0:
+            return 0
+        T_map_camera = self.T_map_camera(held)
+        render = self._render(level, T_map_camera)
+        missing = unexplained(render.image, level, self.settings)
+        self.rasterizer.release(render)
+        u, v, spacing = candidates(missing, level, self.settings)
+        if len(u) > room:
+            u, v, spacing = u[:room], v[:room], spacing[:room]
+        if len(u):
+            self.store.append(make_gaussians(u, v, spacing, level, T_map_camera, self.settings), held.anchor)
+        return len(u)
+
+    def _carve(self, held: Held) -> int:
+        level, s = held.levels[FULL], self.settings
+        packed = level.camera.packed(inverse(self.T_map_camera(held)))
+        contradicted(self.store.params, self.store.count, packed, level.depth_mm, level.depth_weight,
+                     np.uint8(200), s.carve_margin, self.store.strikes)  # fmt: skip
+        return self.store.keep(self.store.strikes[: self.store.count] < s.carve_strikes)
+
+    def _prune(self) -> int:
+        least = np.log(self.settings.prune_opacity / (1.0 - self.settings.prune_opacity))
+        return self.store.keep(self.store.params[OPACITY, : self.store.count] > least)
+
+    # --- optimising --------------------------------------------------------------------------------
+
+    def optimise(self, half: int | None = None, full: int | None = None) -> float:
+        """The fixed work per keyframe: `half` steps at half size, then `full` at full size. Gives the mean loss."""
+        half = self.settings.half_iterations if half is None else half
+        full = self.settings.full_iterations if full is None else full
+        if not self.keyframes or self.store.count == 0:
+            return 0.0
+        losses = [self.step(self._draw(), HALF) for _ in range(half)]
+        losses += [self.step(self._draw(), FULL) for _ in range(full)]
+        return float(np.mean(losses)) if losses else 0.0
+
+    def refine(self, iterations: int, size: int = FULL) -> float:
+        """Steps on all keyframes in random order, every one as often as the others. Gives the mean loss."""
+        ids, losses = [], []
+        for _ in range(iterations):
+            if not ids:
+                ids = list(self._random.permutation(sorted(self.keyframes)))
+            losses.append(self.step(self.keyframes[int(ids.pop())], size))
+        return float(np.mean(losses)) if losses else 0.0
+
+    def _draw(self) -> Held:
+        """Half of the time one of the newest keyframes, else any."""
+        pool = self._newest if self._random.random() < 0.5 else list(self.keyframes)
+        return self.keyframes[pool[int(self._random.integers(len(pool)))]]
+
+    def step(self, held: Held, size: int) -> float:
+        """One render, loss, backward and Adam on one keyframe. Gives the loss."""
+        level = held.levels[size]
+        T_map_camera = self.T_map_camera(held)
+        render = self._render(level, T_map_camera)
+        loss, gradient, sums = self._loss(render, level, held)
+        gradients = self.rasterizer.backward(render, gradient)
+        s = self.settings
+        pixels = level.camera.width_px * level.camera.height_px
+        self.rasterizer.team.run(
+            adam, gradients.by_splat, gradients.index, self.store.params, self.store.first, self.store.second,
+            self.store.steps, self._rates, np.float32(s.isotropy_weight / pixels), np.float32(np.log(s.isotropy_ratio)),
+        )  # fmt: skip
+        if s.refine_pose:
+            self._refine_pose(held, gradients, inverse(T_map_camera))
+        if s.refine_exposure:
+            self._refine_exposure(held, sums)
+        self.rasterizer.release(render)
+        self.steps += 1
+        return loss
+
+    def _render(self, level: Level, T_map_camera: np.ndarray) -> Render:
+        return self.rasterizer.render(
+            self.store.params, self.store.count, level.camera, inverse(T_map_camera)
+        )
+
+    def _loss(self, render: Render, level: Level, held: Held) -> tuple[float, np.ndarray, np.ndarray]:
+        s, (h, w) = self.settings, level.depth_mm.shape
+        if (h, w) not in self._buffers:
+            self._buffers[h, w] = np.empty((5, h, w), np.float32), np.empty((h, 8))
+        gradient, sums = self._buffers[h, w]
+        with_ssim = s.ssim_weight > 0.0 and self.steps % s.ssim_every == 0
+        colour_scale = np.float32((1.0 - s.ssim_weight * with_ssim) / (3 * h * w))
+        self.rasterizer.team.run(
+            photometric_and_depth, render.image, level.rgb, level.depth_mm, level.depth_weight, held.exposure,
+            colour_scale, np.float32(s.depth_weight / (h * w)), gradient, sums,
+        )  # fmt: skip
+        loss = float(sums[:, 0].sum() * colour_scale + sums[:, 1].sum())
+        if len(level.beam_pixels):
+            scale = np.float32(s.lidar_weight / len(level.beam_pixels))
+            loss += add_lidar(render.image, level.beam_pixels, level.beam_z_m, scale, gradient)
+        if with_ssim:
+            loss += self._ssim.add(render.image, level.rgb, s.ssim_weight, gradient, self.rasterizer.team)
+        return loss, gradient, sums
+
+    def _refine_pose(self, held: Held, gradients: Gradients, T_camera_map: np.ndarray) -> None:
+        """Adam on the camera's own tangent: T_map_camera <- T_map_camera @ exp(-step)."""
+        # T_camera_map <- exp(xi) T_camera_map moves T_map_camera on the right by exp(-xi).
+        rates = np.repeat([self.settings.rates.pose_m, self.settings.rates.pose_rad], 3)
+        held.pose_steps += 1
+        move = _adam_step(gradients.pose, held.pose_first, held.pose_second, held.pose_steps) * rates
+        tangent = se3_log(held.delta @ se3_exp(move))
+        limits = np.repeat([self.settings.max_pose_m, self.settings.max_pose_rad], 3)
+        held.delta = se3_exp(np.clip(tangent, -limits, limits))
+
+    def _refine_exposure(self, held: Held, sums: np.ndarray) -> None:
+        gradient = sums[:, 2:8].sum(axis=0) + 1e-3 * held.exposure  # a weak pull to "as it was taken"
+        move = _adam_step(gradient, held.exposure_first, held.exposure_second, max(held.pose_steps, 1))
+        held.exposure = (held.exposure - self.settings.rates.exposure * move).astype(np.float32)
+
+
+def _adam_step(gradient: np.ndarray, first: np.ndarray, second: np.ndarray, t: int) -> np.ndarray:
+    """Adam's normalised step; updates the moments in place."""
+    first += 0.1 * (gradient - first)
+    second += 0.01 * (gradient**2 - second)
+    return first / (1 - 0.9**t) / (np.sqrt(second / (1 - 0.99**t)) + 1e-12)

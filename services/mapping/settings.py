@@ -1,0 +1,58 @@
+"""What can be chosen about the mapper. All work is fixed per keyframe: nothing depends on the time of day."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True)
+class LearningRates:
+    """Adam's step per parameter, in the parameter's own unit."""
+
+    mean_m: float = 4e-4
+    log_scale: float = 6e-3
+    quat: float = 2e-3
+    opacity_logit: float = 3e-2
+    colour: float = 5e-3
+    pose_rad: float = 2e-4
+    pose_m: float = 2e-4
+    exposure: float = 1e-3
+
+
+@dataclass(frozen=True)
+class MapperSettings:
+    """See module. Lengths in metres, sizes in pixels of the full picture."""
+
+    # Work per keyframe; sizes are halved once for `half` iterations.
+    half_iterations: int = 24
+    full_iterations: int = 8
+    recent: int = 4  # keyframes of the window that are newest; each second draw is one of them
+    # Insertion
+    stride_px: int = 4
+    fine_stride_px: int = 2  # where the picture has texture
+    texture: float = 0.06  # mean absolute colour step over `stride_px` that counts as texture
+    alpha_low: float = 0.7  # less than this is not explained
+    colour_off: float = 0.20  # mean absolute colour error that is not explained
+    depth_off: float = 0.10  # relative depth error that is not explained
+    opacity: float = 0.6
+    size: float = 0.65  # standard deviation over spacing
+    flatness: float = 0.2
+    max_gaussians: int = 400_000
+    # Losses
+    ssim_weight: float = 0.2
+    ssim_every: int = 1
+    depth_weight: float = 0.1
+    lidar_weight: float = 1e-3
+    isotropy_weight: float = 0.05
+    isotropy_ratio: float = 4.0
+    sigma_unit_m: float = 0.05  # a depth of this sigma has weight 1/2
+    # Upkeep
+    prune_opacity: float = 0.03
+    carve_sigma: float = 3.0
+    carve_margin: float = 0.08  # relative, beyond which a Gaussian floats before a trusted surface
+    carve_strikes: int = 2
+    refine_pose: bool = False
+    refine_exposure: bool = False
+    max_pose_m: float = 0.10
+    max_pose_rad: float = 0.05
+    rates: LearningRates = field(default_factory=LearningRates)

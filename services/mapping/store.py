@@ -1,0 +1,74 @@
+"""The Gaussians and what the optimiser knows of them, in arrays that grow; bound to anchors."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from common.geometry import quat_wxyz_from_matrix
+from common.raster.layout import MEAN, PARAMS, QUAT, SCALE
+
+
+class GaussianStore:
+    """Columns 0 ... count of every array are Gaussians. Rows of `params` are those of common.raster.layout."""
+
+    def __init__(self, capacity: int = 4096) -> None:
+        self.count = 0
+        self._allocate(-(-capacity // 16) * 16)
+
+    def _allocate(self, capacity: int) -> None:
+        self.params = np.zeros((PARAMS, capacity), np.float32)
+        self.first = np.zeros((PARAMS, capacity), np.float32)  # Adam's moments
+        self.second = np.zeros((PARAMS, capacity), np.float32)
+        self.steps = np.zeros(capacity, np.float32)
+        self.anchor = np.zeros(capacity, np.int32)
+        self.strikes = np.zeros(capacity, np.int32)  # times seen floating before a trusted surface
+
+    def _arrays(self) -> list[str]:
+        return ["params", "first", "second", "steps", "anchor", "strikes"]
+
+    @property
+    def capacity(self) -> int:
+        return self.params.shape[1]
+
+    def append(self, params: np.ndarray, anchor: int) -> None:
+        """Adds Gaussians float32 [14, M] bound to an anchor."""
+        new = params.shape[1]
+        if self.count + new > self.capacity:
+            self._grow(max(self.count + new, 2 * self.capacity))
+        at = slice(self.count, self.count + new)
+        self.params[:, at] = params
+        for name in ("first", "second", "steps", "strikes"):
+            getattr(self, name)[..., at] = 0
+        self.anchor[at] = anchor
+        self.count += new
+
+    def _grow(self, capacity: int) -> None:
+        old = {name: getattr(self, name) for name in self._arrays()}
+        self._allocate(-(-capacity // 16) * 16)
+        for name, array in old.items():
+            getattr(self, name)[..., : array.shape[-1]] = array
+
+    def keep(self, mask: np.ndarray) -> int:
+        """Drops the Gaussians whose flag in bool [count] is not set; the others stay in order. Gives how many."""
+        chosen = np.flatnonzero(mask)
+        dropped = self.count - len(chosen)
+        if dropped:
+            for name in self._arrays():
+                array = getattr(self, name)
+                array[..., : len(chosen)] = array[..., chosen]
+            self.count = len(chosen)
+        return dropped
+
+    def move(self, anchor: int, T_new_old: np.ndarray) -> None:
+        """Moves the Gaussians of an anchor rigidly: means, rotations, and the momentum of the means."""
+        chosen = np.flatnonzero(self.anchor[: self.count] == anchor)
+        if len(chosen) == 0:
+            return
+        R = T_new_old[:3, :3]
+        mean = self.params[MEAN:SCALE, chosen].astype(np.float64)
+        self.params[MEAN:SCALE, chosen] = R @ mean + T_new_old[:3, 3:4]
+        self.first[MEAN:SCALE, chosen] = R @ self.first[MEAN:SCALE, chosen]
+        w, x, y, z = quat_wxyz_from_matrix(R)
+        left = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
+        self.params[QUAT : QUAT + 4, chosen] = left @ self.params[QUAT : QUAT + 4, chosen]
+        self.first[QUAT : QUAT + 4, chosen] = left @ self.first[QUAT : QUAT + 4, chosen]
