@@ -53,7 +53,8 @@ class FieldConfig:
     memory: float = 1.5
     memory_keyframes: int = 6
     memory_spread: float = 0.15
-    guess: float = 0.8
+    outvote: int = 3  # keyframes
+    guess: float = 1.6
     guess_spread: float = 0.12
     near_m: float = 0.7  # unsupported depth below this is unlikely
     near: float = 1.0
@@ -182,7 +183,22 @@ class Field:
         solved = self._solve(cost, small, surfaces, views)
         sure = solved.spread < self.config.memory_spread
         self._memory.add(small.T_map_camera, np.where(sure, solved.depth_m, np.nan))
-        return solved
+        return self._outvote(solved, self.recall(small), surfaces)
+
+    def _outvote(self, solved: Solved, remembered: Remembered, surfaces: Surfaces) -> Solved:
+        """Where three keyframes agree on another depth than this sweep alone, theirs counts."""
+        others = (remembered.votes >= self.config.outvote) & ~solved.snapped
+        if self._planar:
+            others |= (
+                (remembered.votes >= self.config.outvote)
+                & ~surfaces.on_floor
+                & (np.abs(np.log(remembered.depth_m / solved.depth_m)) > 0.06)
+                & (surfaces.wall_off_m > 0.1)
+            )
+        depth, spread = solved.depth_m.copy(), solved.spread.copy()
+        depth[others] = remembered.depth_m[others]
+        spread[others] = np.minimum(spread[others], 0.02)
+        return Solved(depth, spread, solved.snapped & ~others, solved.views)
 
     def choose_views(self, T_map_camera: np.ndarray) -> list[Small]:
         """Past pictures whose baselines come nearest to the wished ones, facing the same way."""

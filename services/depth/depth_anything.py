@@ -1,0 +1,106 @@
+"""Depth Anything V1 and V2: affine-invariant disparity, and the metric variants of V2.
+
+Preprocessing as in the reference (util/transform.py, dpt.py): RGB / 255, the short side brought to the
+input size with the aspect kept, both sides multiples of 14, bicubic, ImageNet mean and deviation. Exports
+name their ports differently, so the first input and the first output count.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from common.errors import UserError
+from services.depth.onnx_model import OnnxModel, to_hw
+from services.depth.source import Estimate, View, judge
+from services.depth.store import find_model
+
+PATCH = 14
+_MEAN = np.array([0.485, 0.456, 0.406], dtype=np.float32)
+_DEVIATION = np.array([0.229, 0.224, 0.225], dtype=np.float32)
+
+
+class DepthAnything:
+    """Disparity d >= 0, nearer = larger; 1/z = a d + b is fitted by fusion.
+
+    Raises:
+        UserError: the model is missing or of another kind, or `input_px` is below one patch.
+    """
+
+    kind = "disparity"
+
+    def __init__(
+        self, model: str | Path = "depth_anything_v2_small", input_px: int = 252, threads: int = 1
+    ) -> None:
+        if input_px < PATCH:
+            raise UserError(f"depth_anything: input_px = {input_px} is below one patch of {PATCH} px")
+        self._onnx = OnnxModel(find_model(model), threads=threads)
+        self._onnx.check_inputs(1)
+        self._port = self._onnx.image_input()
+        self._input_px = input_px
+        if self._port.shape[2] and self._port.shape[3]:
+            self._onnx.side_lengths(self._port, PATCH, PATCH, PATCH)
+        self._warm: tuple[int, int] | None = None
+
+    def estimate(self, view: View) -> Estimate:
+        """The network's answer at the picture's size (bilinear, corners aligned as in the reference)."""
+        h, w = view.camera.shape
+        wish = lower_bound(h, w, self._input_px)
+        side = self._onnx.side_lengths(self._port, *wish, PATCH)
+        if self._warm != side:
+            self._onnx.warm_up((1, 3, *side))
+            self._warm = side
+        raw = to_hw(self._onnx.run(normalised(view.image_rgb, side))[0], str(self._onnx.path))
+        status = judge(raw)
+        return Estimate(self._values(align_corners(raw, h, w)), self.kind, status)
+
+    def _values(self, raw: np.ndarray) -> np.ndarray:
+        return raw
+
+
+class DepthAnythingMetric(DepthAnything):
+    """The metric variants (Hypersim indoors, VKITTI outdoors): metres; still to be scaled by fusion.
+
+    The network does not know the focal length, and errs by 10 to 20 % of scale.
+    """
+
+    kind = "metric"
+
+    def __init__(
+        self, model: str | Path = "depth_anything_v2_metric_hypersim_small", input_px: int = 252,
+        max_depth_m: float = 20.0, threads: int = 1,
+    ) -> None:  # fmt: skip
+        super().__init__(model, input_px, threads)
+        self._max_depth_m = max_depth_m
+
+    def _values(self, raw: np.ndarray) -> np.ndarray:
+        with np.errstate(invalid="ignore"):
+            return np.where((raw > 0.0) & (raw < 0.999 * self._max_depth_m), raw, np.nan).astype(np.float32)
+
+
+def lower_bound(height: int, width: int, input_px: int) -> tuple[int, int]:
+    """Network size (height, width): short side at least `input_px`, multiples of 14, aspect kept."""
+    scale = max(input_px / height, input_px / width)
+
+    def rounded(side: float) -> int:
+        nearest = int(np.round(side / PATCH)) * PATCH
+        return nearest if nearest >= input_px else int(np.ceil(side / PATCH)) * PATCH
+
+    return rounded(scale * height), rounded(scale * width)
+
+
+def normalised(image_rgb: np.ndarray, side: tuple[int, int]) -> np.ndarray:
+    """float32 [1, 3, h, w] of uint8 [H, W, 3]: bicubic, ImageNet mean and deviation."""
+    small = cv2.resize(image_rgb.astype(np.float32) / 255.0, side[::-1], interpolation=cv2.INTER_CUBIC)
+    return np.ascontiguousarray(((small - _MEAN) / _DEVIATION).transpose(2, 0, 1)[None], dtype=np.float32)
+
+
+def align_corners(values: np.ndarray, height: int, width: int) -> np.ndarray:
+    """Bilinear resize of float32 [h, w] whose corner pixels map onto corner pixels."""
+    h, w = values.shape
+    x = np.linspace(0.0, w - 1.0, width, dtype=np.float32)
+    y = np.linspace(0.0, h - 1.0, height, dtype=np.float32)
+    map_x, map_y = np.meshgrid(x, y)
+    return cv2.remap(values, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
