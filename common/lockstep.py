@@ -51,9 +51,9 @@ class Lockstep:
 
     def run(self) -> dict[str, Mailbox]:
         """Runs until all sources are exhausted and all nodes drained; mailboxes (counters) by node."""
-        for seat in self._seats:
-            seat.node.configure()
         try:
+            for seat in self._seats:
+                seat.node.configure()
             produced = {name for seat in self._seats for name in seat.node.outputs}
             for name in TOPICS:
                 if name not in produced:

@@ -48,11 +48,12 @@ def ask(
 
 
 def reply(query: zenoh.Query, messages: Iterator[Message]) -> None:
-    """Answers a query with messages; a UserError on the way becomes an error reply."""
+    """Answers a query with messages; bad input (a ValueError) becomes an error reply: who asks must not
+    be able to end a node."""
     with query:
         try:
             for message in messages:
                 encoding = ENCODING.with_schema(schema_of(message))
                 query.reply(query.key_expr, encode(message), encoding=encoding)
-        except UserError as error:
+        except ValueError as error:
             query.reply_err(str(error).encode())

@@ -2,6 +2,8 @@
 
 import hashlib
 
+import pytest
+
 from common.codec import encode
 from common.lockstep import Lockstep
 from tests.common.nodes import Chain, Drive, DriveConfig, Sink, Slow, SlowConfig
@@ -62,6 +64,22 @@ def test_messages_reach_a_node_in_order_of_their_stamps():
     _run(Drive(DriveConfig()), Watcher(Watcher.Config()))
     assert len(order) == 150 + 30
     assert order == sorted(order)
+
+
+def test_all_nodes_are_closed_when_one_cannot_be_configured():
+    closed = []
+
+    class Closing(Sink):
+        def close(self):
+            closed.append("sink")
+
+    class Broken(Chain):
+        def configure(self):
+            raise ValueError("no weights")
+
+    with pytest.raises(ValueError, match="no weights"):
+        _run(Closing(Closing.Config()), Broken(Broken.Config()))
+    assert closed == ["sink"]
 
 
 def test_a_topic_nobody_produces_is_not_waited_for():

@@ -10,6 +10,7 @@ import pytest
 from common.bus import Bus, open_session
 from common.codec import encode
 from common.config import Deployment, RouterConfig
+from common.errors import UserError
 from common.live import Live, LiveSettings
 from common.lockstep import Lockstep
 from common.queries import ask
@@ -78,13 +79,14 @@ def _poll(supervisor, until, timeout):
     raise AssertionError(f"not within {timeout} s")
 
 
-def test_live_equals_lockstep_message_for_message(deployment):
+@pytest.mark.parametrize("rate", [4.0, 0.0])
+def test_live_equals_lockstep_message_for_message(deployment, rate):
     """The order in which packets arrive over the bus must not show in what a node says."""
     drive = {"seconds": 6.0, "image_bytes": 20_000}
     sink = Sink(Sink.Config())
     Lockstep([Drive(DriveConfig(**drive)), Chain(Chain.Config()), sink]).run()
     nodes = {"replay": {"kind": "drive", **drive}, "localization": {"kind": "chain"}, "recorder": {}}
-    live = deployment(nodes, rate=4.0)
+    live = deployment(nodes, rate=rate)
     with Supervisor(live, ("router", "localization"), table=TABLE), SinkThread(live) as thread:
         with Supervisor(live, ("replay",), table=TABLE):
             thread.join(30)
@@ -215,7 +217,10 @@ def test_queries_are_answered_by_the_node(deployment):
         _poll(supervisor, lambda: board.states().get("localization") == "active", 30)
         replies = list(ask(session, "test", "localization", "count", {"add": "41"}, 5.0))
         assert [r.optimisation for r in replies] == [41]
-        with pytest.raises(ValueError, match="nobody answers"):
+        with pytest.raises(UserError, match="refused count: invalid literal"):
+            list(ask(session, "test", "localization", "count", {"add": "much"}, 5.0))
+        assert [r.optimisation for r in ask(session, "test", "localization", "count", {}, 5.0)] == [0]  # it lives
+        with pytest.raises(UserError, match="nobody answers"):
             list(ask(session, "test", "depth", "count", {}, 5.0))
 
 
