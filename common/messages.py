@@ -179,6 +179,48 @@ class Grid(Message):
     changed: tuple[Count, Count, Count, Count] = (0, 0, 0, 0)
 
 
+# --- depth and fusion --------------------------------------------------------------------------
+
+
+class DepthEstimate(Message):
+    """What a depth source says of the picture with this stamp, undistorted; what it means, `kind` says.
+
+    metric: metres of optical z; relative: up to a factor; disparity: a / z + b; none: no values (0 x 0).
+    With a status other than "ok" the values must not be used.
+    """
+
+    source: Name
+    kind: Literal["metric", "relative", "disparity", "none"]
+    values: Annotated[np.ndarray, Array("float32", "H", "W")]  # NaN = no answer
+    status: Text = "ok"
+
+
+class FusedDepth(Message):
+    """Metric depth of the picture with this stamp, undistorted, with its error bar and how it came about.
+
+    With a status other than "ok" there is no depth (0 x 0): a bad frame is refused, not used.
+    """
+
+    depth_m: Annotated[np.ndarray, Array("float32", "H", "W")]  # optical z, NaN = unknown
+    sigma_m: Annotated[np.ndarray, Array("float32", "H", "W")]  # standard deviation
+    status: Text = "ok"
+    keyframe: bool = False
+    scale: float = float("nan")  # metres per unit of the estimate (the paper's alpha)
+    scale_sigma: float = float("nan")
+    inlier_share: NonNegative = 0.0
+    residual_m: float = float("nan")
+    pairs: Count = 0
+    beams_age_ns: Annotated[int, Field(ge=-(2**63), lt=2**63)] = 0  # picture minus the beams used
+    T_odom_body: Transform = Field(default_factory=lambda: np.eye(4))
+
+
+class Cloud(Message):
+    """Coloured points of a picture in the odom frame."""
+
+    points_odom_m: Annotated[np.ndarray, Array("float32", "N", 3, finite=True)]
+    colours: Annotated[np.ndarray, Array("uint8", "N", 3)]
+
+
 # --- the system itself -------------------------------------------------------------------------
 
 
@@ -227,7 +269,7 @@ class Health(Message):
 MESSAGES: dict[str, type[Message]] = {
     cls.schema_name(): cls
     for cls in (
-        Rig, Image, Scan, WheelOdometry, ExternalPose, Odometry, Correction, Anchors, MovingBeams, Grid, Tick,
-        Health,
+        Rig, Image, Scan, WheelOdometry, ExternalPose, Odometry, Correction, Anchors, MovingBeams, Grid,
+        DepthEstimate, FusedDepth, Cloud, Tick, Health,
     )
 }  # fmt: skip

@@ -51,6 +51,9 @@ _ROWS = (
     Topic("localization/anchors",    m.Anchors,       ("localization",),         0, "latched", 1, True),
     Topic("localization/movers",     m.MovingBeams,   ("localization",),        10, "every", 400),
     Topic("localization/grid",       m.Grid,          ("localization",),         0, "latched", 1, True),
+    Topic("depth/estimate",          m.DepthEstimate, ("depth",),                5, "latest"),
+    Topic("fusion/depth",            m.FusedDepth,    ("fusion",),               5, "latest"),
+    Topic("fusion/cloud",            m.Cloud,         ("fusion",),               1, "latest"),
     Topic("tick",                    m.Tick,          ("replay",),               1, "every", 60),
 )  # fmt: skip
 

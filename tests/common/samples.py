@@ -7,8 +7,11 @@ from common.geometry import se2_to_se3
 from common.messages import (
     Anchors,
     CameraModel,
+    Cloud,
     Correction,
+    DepthEstimate,
     ExternalPose,
+    FusedDepth,
     Grid,
     Health,
     Image,
@@ -63,6 +66,18 @@ def sample_messages() -> list[Message]:
         Grid(
             stamp_ns=19, resolution_m=0.05, origin_m=np.array([-1.0, 2.0]),
             occupancy=np.array([[-1, 0, 100]], np.int8), changed=(0, 1, 1, 3),
+        ),
+        DepthEstimate(
+            stamp_ns=23, source="fastdepth", kind="relative", status="the network returned nothing above zero",
+            values=np.array([[1.0, np.nan]], np.float32),
+        ),
+        FusedDepth(
+            stamp_ns=24, depth_m=np.array([[1.0, np.nan]], np.float32), sigma_m=np.array([[0.1, np.nan]], np.float32),
+            status="no beams in view", keyframe=True, scale=1.2, scale_sigma=0.01, inlier_share=0.9, residual_m=0.02,
+            pairs=120, beams_age_ns=-5, T_odom_body=T[1],
+        ),
+        Cloud(
+            stamp_ns=25, points_odom_m=np.ones((2, 3), np.float32), colours=np.full((2, 3), 9, np.uint8),
         ),
         Tick(stamp_ns=20, count=5),
         Health(
