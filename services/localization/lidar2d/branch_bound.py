@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
+NEAR_CELLS = 3  # leaves this close are the same place
 LEVELS = 6  # the coarsest level looks at 2^5 search cells at once
 
 
@@ -63,6 +64,37 @@ def _score(level: np.ndarray, rows: np.ndarray, cols: np.ndarray, dr: int, dc: i
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
+def _row_for(found: np.ndarray, count: int, score: float, yaw: int, dr: int, dc: int, near_yaw: int) -> int:
+    """Where a leaf goes: the row of a weaker neighbour, a new row, or -1 if a neighbour is better. Without
+    this the hundred poses around the best would crowd out all other places."""
+    for i in range(count):
+        if (
+            abs(found[i, 2] - dr) <= NEAR_CELLS
+            and abs(found[i, 3] - dc) <= NEAR_CELLS
+            and abs(found[i, 1] - yaw) <= near_yaw
+        ):
+            return i if score > found[i, 0] else -1
+    return count
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _make_room(found: np.ndarray, best: float, keep: float) -> tuple[float, int]:
+    """Be pickier until at least a quarter of the table is free; the best never goes."""
+    count = found.shape[0]
+    while 4 * count > 3 * found.shape[0]:
+        keep += 0.2 * (1.0 - keep)
+        kept = 0
+        for i in range(count):
+            if found[i, 0] >= keep * best:
+                found[kept] = found[i]
+                kept += 1
+        if keep > 0.9999:
+            kept = min(kept, found.shape[0] // 2)  # half a table of equals: any of them will do
+        count = kept
+    return keep, count
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
 def _search(
     levels: np.ndarray,  # uint8 [L, H, W]
     rows: np.ndarray,  # int32 [A, K] cells of the returns at each yaw, window centre
@@ -70,6 +102,7 @@ def _search(
     steps: int,  # window of +-steps cells
     min_score: float,
     keep: float,  # leaves better than keep * best are reported
+    near_yaw: int,  # leaves within so many yaw steps are the same place
     found: np.ndarray,  # out float64 [M, 4] score, yaw index, dr, dc
 ) -> tuple[int, int]:
     """Depth first, best child first. Returns (number of leaves reported, nodes visited)."""
@@ -105,9 +138,13 @@ def _search(
             if hh == 0:
                 if score > best:
                     best = score
-                row = count % found.shape[0]
-                found[row, 0], found[row, 1], found[row, 2], found[row, 3] = score, ai, r0, c0
-                count += 1
+                row = _row_for(found, count, score, ai, r0, c0, near_yaw)
+                if row == found.shape[0]:
+                    keep, count = _make_room(found, best, keep)
+                    row = count
+                if row >= 0:
+                    found[row, 0], found[row, 1], found[row, 2], found[row, 3] = score, ai, r0, c0
+                    count = max(count, row + 1)
                 continue
             half = 1 << (hh - 1)
             base = depth
@@ -158,8 +195,8 @@ def branch_and_bound(
     cols = np.floor(x / pyramid.cell_m).astype(np.int32) - pyramid.col0
     found = np.empty((max_found, 4))
     steps = max(1, math.ceil(window_m / pyramid.cell_m))
-    count, _ = _search(pyramid.levels, rows, cols, steps, min_score, keep, found)
-    found = found[: min(count, max_found)]
+    count, _ = _search(pyramid.levels, rows, cols, steps, min_score, keep, max(1, round(0.1 / step_rad)), found)
+    found = found[:count]
     best = []
     for score, a, dr, dc in found[np.argsort(-found[:, 0], kind="stable")]:
         T = np.array([T_centre[0] + dc * pyramid.cell_m, T_centre[1] + dr * pyramid.cell_m, yaws[int(a)]])

@@ -46,6 +46,7 @@ class Prediction:
     sigma_m: float
     sigma_rad: float
     source: str
+    blind: bool  # over a gap without wheels: anything may have happened
 
 
 class FrontEnd:
@@ -93,7 +94,8 @@ class FrontEnd:
         rated = []
         for predictor, motion, name in options:
             sigma_m, sigma_rad = predictor.sigmas(motion, dt)
-            rated.append((sigma_m / 0.05 + sigma_rad / 0.03, Prediction(motion, sigma_m, sigma_rad, name)))
+            rated.append((sigma_m / 0.05 + sigma_rad / 0.03, Prediction(motion, sigma_m, sigma_rad, name,
+                                                                        dt > 1.0 and wheels is None)))
         best = min(rated, key=lambda item: item[0])[1]
         return best, [(predictor, motion) for predictor, motion, _ in options]
 
@@ -157,7 +159,16 @@ class FrontEnd:
             points = scan.features()
             match = refine(points, scan.origin_body, match.T_map_body, tables, s, T_guess, information,
                            anneal=(1.0,))  # fmt: skip
-        return scan, match, match.share >= s.lost_share
+        return scan, match, self._trusted(prediction, T_guess, match)
+
+    def _trusted(self, prediction: Prediction, T_guess: np.ndarray, match: Match) -> bool:
+        """Enough agrees; more has to agree where the prediction says something else or nothing."""
+        s = self.settings
+        off = se2.between(T_guess, match.T_map_body)
+        far = math.hypot(off[0], off[1]) > 0.2 + 3.0 * prediction.sigma_m or abs(off[2]) > (
+            0.15 + 3.0 * prediction.sigma_rad
+        )
+        return match.share >= (s.sure_share if far or prediction.blind else s.lost_share)
 
     def _search(
         self, scan: PreparedScan, best: Match, T_prior: np.ndarray, T_centre: np.ndarray, information: np.ndarray,

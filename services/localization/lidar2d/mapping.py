@@ -104,15 +104,20 @@ class LocalMapper:
             active.submap.frozen = freeze(active.local.surfels)
         self._active = []
 
-    def with_frozen(self, work: Callable[[], None]) -> None:
-        """Do something while the active submaps look finished (saving)."""
+    def freeze_active(self) -> None:
+        """Let the active submaps take part in loop closure as they are; they go on being filled."""
         for active in self._active:
             active.submap.frozen = freeze(active.local.surfels)
+
+    def with_frozen(self, work: Callable[[], None]) -> None:
+        """Do something while the active submaps look finished (saving)."""
+        before = [active.submap.frozen for active in self._active]
+        self.freeze_active()
         try:
             work()
         finally:
-            for active in self._active:
-                active.submap.frozen = None
+            for active, frozen in zip(self._active, before):
+                active.submap.frozen = frozen
 
     def count_grids(self) -> list[CountGrid]:
         """Hits and misses of the active submaps."""

@@ -13,6 +13,7 @@ from services.localization.lidar2d.settings import LidarSlamSettings
 from services.localization.lidar2d.surfel_map import MatchTables
 
 ALONG2 = 0.3**2  # m^2, along its tangent a return may belong to any part of the surface near it
+OTHER_SIDE = -0.3  # cosine times how much of one mind the views of a surface are
 ANNEAL = (3.0, 2.0, 1.4)  # the outlier scale starts wide and ends at 1
 
 
@@ -64,7 +65,8 @@ def accumulate(
         k = nearest[r, q]
         if k < 0:
             continue
-        if (ox - x) * views[k, 0] + (oy - y) * views[k, 1] < 0.0:
+        vx, vy = ox - x, oy - y
+        if vx * views[k, 0] + vy * views[k, 1] < OTHER_SIDE * math.sqrt(vx * vx + vy * vy):
             continue
         found += 1.0
         dx, dy = x - means[k, 0], y - means[k, 1]

@@ -74,19 +74,19 @@ class TableCache:
 
     def __init__(self, reach_cells: int, capacity: int = 12) -> None:
         self._reach, self._capacity = reach_cells, capacity
-        self._tables: OrderedDict[tuple[int, int], MatchTables] = OrderedDict()
-        self._pyramids: OrderedDict[tuple[int, int], Pyramid] = OrderedDict()
+        # Each entry keeps the map it was made from: a submap that was drawn anew has another one.
+        self._tables: OrderedDict[int, tuple[FrozenMap, MatchTables]] = OrderedDict()
+        self._pyramids: OrderedDict[int, tuple[FrozenMap, Pyramid]] = OrderedDict()
         self._world: tuple[object, object] | None = None
         self._lock = threading.Lock()
 
     def tables(self, submap: int, frozen: FrozenMap) -> MatchTables:
         """Tables of a submap's frozen map (recomputed if the map was replaced)."""
-        return self._get(self._tables, (submap, id(frozen)), lambda: frozen.tables(self._reach))
+        return self._get(self._tables, submap, frozen, lambda: frozen.tables(self._reach))
 
     def pyramid(self, submap: int, frozen: FrozenMap) -> Pyramid:
         """Search pyramid of a submap's frozen map."""
-        key = (submap, id(frozen))
-        return self._get(self._pyramids, key, lambda: _pyramid_of(self.tables(submap, frozen)))
+        return self._get(self._pyramids, submap, frozen, lambda: _pyramid_of(self.tables(submap, frozen)))
 
     def world(self, key: object, make: Callable[[], object]) -> object:
         """The map of everything; only the latest is kept."""
@@ -98,14 +98,15 @@ class TableCache:
             self._world = (key, value)
         return value
 
-    def _get(self, store: OrderedDict, key: tuple[int, int], make: object) -> object:
+    def _get(self, store: OrderedDict, submap: int, frozen: FrozenMap, make: Callable[[], object]) -> object:
         with self._lock:
-            if key in store:
-                store.move_to_end(key)
-                return store[key]
+            if submap in store and store[submap][0] is frozen:
+                store.move_to_end(submap)
+                return store[submap][1]
         value = make()
         with self._lock:
-            store[key] = value
+            store[submap] = (frozen, value)
+            store.move_to_end(submap)
             while len(store) > self._capacity:
                 store.popitem(last=False)
         return value

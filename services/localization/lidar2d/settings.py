@@ -36,8 +36,9 @@ class LidarSlamSettings:
     search_max_m: float = 0.80
     search_min_rad: float = math.radians(4.0)
     search_max_rad: float = math.radians(35.0)
-    good_share: float = 0.55  # share of returns on known surfaces below which a match is checked again
-    lost_share: float = 0.35
+    good_share: float = 0.70  # share of returns on known surfaces below which a match is checked again
+    lost_share: float = 0.50
+    sure_share: float = 0.80  # a match far from its prediction must be at least this good
 
     # Motion
     max_speed_m_s: float = 3.0

@@ -104,14 +104,14 @@ class LidarSlam:
             T_odom_body = se2.compose(last, prediction.motion) if prediction.source == "wheels" else last
         self.front.accept(stamp_ns, T_odom_body, options if good else [])
         self._lost_run = 0 if good else self._lost_run + 1
-        if self._lost_run >= self.settings.lost_scans:
+        if self._lost_run >= self.settings.lost_scans or (self._lost_run and prediction.blind):
             self._start_segment(raw.stamp_ns, scan, T_odom_body)
             good = True
         # 5. movers, 6. map, 7. background work
         return self._map(raw, scan, T_odom_body, match, good)
 
     def _first(self, raw: RawScan) -> ScanResult:
-        scan = self.front.prepare(raw, np.zeros(3))
+        scan = self.front.prepare(raw, self.front.scan_velocity(raw, None))
         if len(scan) < self.settings.min_points:
             return self._rejected(raw, f"{len(scan)} returns, {self.settings.min_points} are needed")
         self.front.accept(raw.stamp_ns, np.zeros(3), [])
@@ -180,9 +180,9 @@ class LidarSlam:
         """Final loop closure, refinement and optimisation, inline; mapping may go on afterwards."""
         if self._due is not None:
             self.apply(self._due.run())
-        self.mapper.close()
         if not self.back.nodes:
             return
+        self.mapper.freeze_active()
         before = -1
         while self.back.pending and len(self.back.pending) != before and self.back.unlinked_from is None:
             before = len(self.back.pending)

@@ -123,7 +123,7 @@ def add_returns(
     misses: np.ndarray,  # uint8 [H, W]
     touched: np.ndarray,  # int32 [H, W] last scan that counted here
     moments: np.ndarray,
-    views: np.ndarray,  # float64 [S, 2] sum of directions towards the lidar
+    views: np.ndarray,  # float64 [S, 2] mean of the unit directions towards the lidar
     cells: np.ndarray,  # int32 [S, 2] row, col (absolute)
     told: np.ndarray,  # float64 [S, 2], see refresh()
     count: int,
@@ -159,7 +159,6 @@ def add_returns(
             f = MAX_WEIGHT / m[0]
             for j in range(6):
                 m[j] *= f
-            views[k] *= f
         # A return stands for a short piece of the surface: its own spacing, along the tangent; where the
         # tangent is unknown it may lie anywhere within it.
         s = min(0.5 * spacing_m[i], 0.10)
@@ -175,8 +174,8 @@ def add_returns(
         m[5] += w * (y * y + s2 * ty * ty + blob)
         vx, vy = origin[0] - x, origin[1] - y
         norm = max(math.hypot(vx, vy), 1e-6)
-        views[k, 0] += w * vx / norm
-        views[k, 1] += w * vy / norm
+        views[k, 0] += w / m[0] * (vx / norm - views[k, 0])
+        views[k, 1] += w / m[0] * (vy / norm - views[k, 1])
     return count, n_changed
 
 

@@ -1,0 +1,107 @@
+import cv2
+import numpy as np
+
+from services.localization.lidar2d import se2
+from services.localization.lidar2d.movers import contradicts_free_space, grow_along_beams
+from services.localization.lidar2d.occupancy import CountGrid, OccupancyGrid, changed_regions, render, save_nav2
+from services.localization.lidar2d.surfel_kernels import cast_rays
+
+
+def counts(shape=(20, 30)):
+    hits, misses = np.zeros(shape, np.uint8), np.zeros(shape, np.uint8)
+    hits[5, 3:25] = 10
+    misses[6:15, 3:25] = 10
+    return hits, misses
+
+
+def test_walls_and_floor_land_where_they_are():
+    hits, misses = counts()
+    T = np.array([2.0, 1.0, np.pi / 2])
+    grid = render([CountGrid(hits, misses, 0, 0, 0.05, T)], 0.05)
+    wall = se2.transform(T, np.array([[0.5, 5.5 * 0.05]]))[0]
+    floor = se2.transform(T, np.array([[0.5, 10.5 * 0.05]]))[0]
+
+    def at(p):
+        return grid.values[int((p[1] - grid.origin_y_m) / 0.05), int((p[0] - grid.origin_x_m) / 0.05)]
+
+    assert at(wall) > 90
+    assert 0 <= at(floor) < 10
+    assert grid.values[0, 0] == -1
+    assert (grid.values >= 0).sum() == ((hits > 0) | (misses > 0)).sum()  # turning leaves no holes
+
+
+def test_rendering_against_a_slow_twin(rng):
+    hits = rng.integers(0, 3, (12, 9)).astype(np.uint8)
+    misses = rng.integers(0, 3, (12, 9)).astype(np.uint8)
+    T = np.array([0.3, -0.2, 0.7])
+    grid = render([CountGrid(hits, misses, -4, -3, 0.1, T)], 0.05)
+    for r in range(0, grid.values.shape[0], 3):
+        for c in range(0, grid.values.shape[1], 3):
+            p = np.array([[grid.origin_x_m + (c + 0.5) * 0.05, grid.origin_y_m + (r + 0.5) * 0.05]])
+            q = np.floor(se2.transform(se2.inverse(T), p)[0] / 0.1).astype(int)
+            i, j = q[1] + 4, q[0] + 3
+            inside = 0 <= i < 12 and 0 <= j < 9 and (hits[i, j] or misses[i, j])
+            expected = 1 / (1 + np.exp(-(1.5 * hits[i, j] - 0.5 * misses[i, j]))) if inside else None
+            assert grid.values[r, c] == (-1 if expected is None else round(100 * expected))
+
+
+def test_changed_regions_cover_every_difference(rng):
+    old = OccupancyGrid(np.zeros((128, 192), np.int8), 0.0, 0.0, 0.05)
+    values = old.values.copy()
+    values[70, 130] = 100
+    assert changed_regions(old, OccupancyGrid(values, 0.0, 0.0, 0.05)) == [(64, 128, 64, 64)]
+    assert changed_regions(old, old) == []
+    grown = np.full((192, 192), -1, np.int8)
+    grown[64:] = old.values  # the map grew downwards by one tile, where nothing is known yet
+    assert changed_regions(old, OccupancyGrid(grown, 0.0, -3.2, 0.05)) == []
+    assert len(changed_regions(None, old)) == 6
+
+
+def test_nav2_files(tmp_path):
+    values = np.full((64, 64), -1, np.int8)
+    values[10, 20], values[11, 20] = 100, 0
+    save_nav2(OccupancyGrid(values, -1.0, 2.0, 0.05), tmp_path)
+    image = cv2.imread(str(tmp_path / "map.pgm"), cv2.IMREAD_UNCHANGED)
+    assert image.shape == (64, 64)
+    assert image[63 - 10, 20] == 0  # pgm rows run from the top
+    assert image[63 - 11, 20] == 254
+    assert image[0, 0] == 205
+    text = (tmp_path / "map.yaml").read_text()
+    assert "image: map.pgm" in text
+    assert "origin: [-1.000000, 2.000000, 0.0]" in text
+    assert (tmp_path / "map.png").stat().st_size > 0
+
+
+def test_rays_clear_what_they_cross_and_stop_before_the_wall():
+    hits, misses = np.zeros((40, 40), np.uint8), np.zeros((40, 40), np.uint8)
+    touched = np.full((40, 40), -1, np.int32)
+    origin, end = np.array([0.12, 0.13]), np.array([[1.51, 0.92]])
+    cast_rays(end, np.array([True]), origin, 0, hits, misses, touched, 0, 0, 0.05)
+    length = np.hypot(*(end[0] - origin)) - 1.5 * 0.05
+    along = origin + (end[0] - origin) / np.hypot(*(end[0] - origin)) * np.linspace(0, length, 20000)[:, None]
+    crossed = {tuple(c) for c in np.floor(along[:, ::-1] / 0.05).astype(int)}
+    assert {tuple(c) for c in np.argwhere(misses)} == crossed
+    assert misses.max() == 1
+
+
+def test_movers_stand_in_free_space():
+    hits, misses = np.zeros((40, 40), np.uint8), np.full((40, 40), 20, np.uint8)
+    nearest = np.full((40, 40), -1, np.int32)
+    hits[:, 30] = 20
+    nearest[:, 25:36] = 0
+    misses[20:, :] = 0  # unknown half
+    means = np.array([[30.5 * 0.05, 0.5]])
+    points = np.array([[0.5, 0.5], [30.5 * 0.05, 0.5], [0.5, 1.5], [1.4, 0.52]])
+    out = np.empty(4, dtype=bool)
+    contradicts_free_space(points, np.zeros(3), nearest, means, hits, misses, 0, 0, 0.05, out)
+    assert out.tolist() == [True, False, False, False]  # free, wall, unknown, next to the wall
+
+
+def test_movers_grow_to_their_edge_only():
+    points = np.column_stack([np.arange(10) * 0.05, np.ones(10)])
+    points[6:] += [2.0, 0.0]  # another object behind a gap
+    moving = np.zeros(10, dtype=bool)
+    moving[2:5] = True
+    out = np.empty(10, dtype=bool)
+    grow_along_beams(moving, points, np.arange(10, dtype=np.int32), 0.15, out)
+    assert out.tolist() == [True, True, True, True, True, True, False, False, False, False]
