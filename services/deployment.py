@@ -69,15 +69,19 @@ def faults(deployment: Deployment, table: dict[str, Service] = NODES) -> list[Fa
     return found
 
 
-def consumers_of(deployment: Deployment, source: str, table: dict[str, Service] = NODES) -> frozenset[str]:
-    """The nodes that must be active before `source` starts, so that they miss nothing: all that have
-    inputs, since what they take may come from it through others."""
-    classes = node_classes(deployment, table)
-    return frozenset(name for name, node in classes.items() if node.inputs and name != source)
+@dataclass(frozen=True)
+class Surroundings:
+    """What a node must know of the others of its deployment."""
+
+    wait_for: frozenset[str]  # a source starts when these are active, so that they miss nothing
+    unfed: frozenset[str]  # inputs that nobody here produces: they are not waited for
 
 
-def unfed_inputs(deployment: Deployment, name: str, table: dict[str, Service] = NODES) -> frozenset[str]:
-    """The inputs of a node that no node of the deployment produces."""
-    classes = node_classes(deployment, table)
+def surroundings(classes: dict[str, type[Node]], name: str) -> Surroundings:
+    """The surroundings of a node among the classes of its deployment."""
     fed = {topic for node in classes.values() for topic in node.outputs}
-    return frozenset(entry.topic for entry in classes[name].inputs if entry.topic not in fed)
+    listeners = frozenset(other for other, node in classes.items() if node.inputs and other != name)
+    return Surroundings(
+        wait_for=listeners if classes[name].is_source() else frozenset(),
+        unfed=frozenset(entry.topic for entry in classes[name].inputs if entry.topic not in fed),
+    )

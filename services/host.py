@@ -16,7 +16,7 @@ from common.config import Deployment
 from common.errors import UserError
 from common.live import Live, LiveSettings
 from common.registry import Service
-from services.deployment import build_node, consumers_of, unfed_inputs
+from services.deployment import Surroundings, build_node, node_classes, surroundings
 from services.nodes import NODES
 
 log = logging.getLogger("beamsplat")
@@ -36,22 +36,27 @@ def serve(
     *,
     resume: bool = False,
     exit_when_drained: bool = False,
+    around: Surroundings | None = None,
     table: dict[str, Service] = NODES,
 ) -> None:
     """Runs one node until its inputs end or SIGINT or SIGTERM comes.
+
+    A supervisor says what is `around` it; without one, the classes of all nodes are imported to see.
 
     Raises:
         UserError: wrong options, bad input data, or no router.
     """
     node = build_node(deployment, name, table)
     _limit_threads(node.config.threads)
+    if around is None:
+        around = surroundings(node_classes(deployment, table), name)
     settings = LiveSettings(
         robot=deployment.robot,
         endpoints=deployment.router.listen,
         run_dir=deployment.run_dir,
         rate=deployment.rate,
-        wait_for=consumers_of(deployment, name, table) if node.is_source() else frozenset(),
-        unfed=unfed_inputs(deployment, name, table),
+        wait_for=around.wait_for,
+        unfed=around.unfed,
         resume=resume,
         exit_when_drained=exit_when_drained,
     )
@@ -70,7 +75,14 @@ def route(deployment: Deployment) -> None:
             pass
 
 
-def child(deployment: Deployment, name: str, log_file: Path, resume: bool, table: dict[str, Service]) -> None:
+def child(
+    deployment: Deployment,
+    name: str,
+    log_file: Path,
+    resume: bool,
+    around: Surroundings | None,
+    table: dict[str, Service],
+) -> None:
     """Entry of a supervised process: its output goes to a log file, its end shows in the exit code."""
     # Ctrl-C in a terminal reaches the whole group; the supervisor decides who stops when.
     os.setpgrp()
@@ -83,7 +95,7 @@ def child(deployment: Deployment, name: str, log_file: Path, resume: bool, table
         if name == "router":
             route(deployment)
         else:
-            serve(deployment, name, resume=resume, table=table)
+            serve(deployment, name, resume=resume, around=around, table=table)
     except UserError as error:
         log.error("%s", error)
         sys.exit(2)

@@ -18,7 +18,7 @@ from common.config import Deployment
 from common.errors import UserError
 from common.persist import make_folder
 from common.registry import Service
-from services.deployment import node_classes
+from services.deployment import Surroundings, node_classes, surroundings
 from services.host import ONE_THREAD, STOP_S, child
 from services.nodes import NODES
 
@@ -58,6 +58,7 @@ class Supervisor:
         self.deployment = deployment
         self.log_dir = deployment.run_dir / "logs"
         self.children: dict[str, Child] = {}
+        self._around: dict[str, Surroundings] = {}
         self._table = table
         self._names = names if names is not None else (ROUTER, *deployment.nodes)
         self._on_event = on_event or (lambda text: log.info("%s", text))
@@ -89,6 +90,7 @@ class Supervisor:
             self._wait_for_router()
         classes = node_classes(self.deployment, self._table)
         nodes = [name for name in self._names if name != ROUTER]
+        self._around = {name: surroundings(classes, name) for name in nodes}
         for name in sorted(nodes, key=lambda n: classes[n].is_source()):
             self._start(name)
 
@@ -115,7 +117,7 @@ class Supervisor:
     def _start(self, name: str, resume: bool = False) -> None:
         process = self._context.Process(
             target=child,
-            args=(self.deployment, name, self.log_file(name), resume, self._table),
+            args=(self.deployment, name, self.log_file(name), resume, self._around.get(name), self._table),
             name=name,
             daemon=False,
         )

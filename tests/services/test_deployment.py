@@ -6,7 +6,7 @@ import pytest
 
 from common.config import Deployment, load_deployment
 from common.errors import UserError
-from services.deployment import build_node, consumers_of, faults, node_classes, unfed_inputs
+from services.deployment import build_node, faults, node_classes, surroundings
 from services.graph import as_mermaid, as_text, edges
 from services.nodes import NODES
 from tests.common.nodes import TABLE
@@ -41,8 +41,10 @@ def test_faults_are_found():
 def test_a_source_waits_for_all_who_listen():
     nodes = {"replay": {}, "localization": {"kind": "chain"}, "recorder": {}}
     deployment = Deployment(nodes=nodes)
-    assert consumers_of(deployment, "replay", TABLE) == {"localization", "recorder"}
-    assert unfed_inputs(deployment, "recorder", TABLE) == {"localization/grid"}
+    classes = node_classes(deployment, TABLE)
+    assert surroundings(classes, "replay").wait_for == {"localization", "recorder"}
+    assert surroundings(classes, "recorder").unfed == {"localization/grid"}
+    assert surroundings(classes, "localization").wait_for == set()
 
 
 def test_the_graph_shows_every_connection():

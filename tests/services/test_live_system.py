@@ -15,7 +15,7 @@ from common.live import Live, LiveSettings
 from common.lockstep import Lockstep
 from common.queries import ask
 from services.board import HealthBoard
-from services.deployment import unfed_inputs
+from services.deployment import node_classes, surroundings
 from services.supervisor import Supervisor
 from tests.common.nodes import TABLE, Chain, Drive, DriveConfig, Sink
 
@@ -38,16 +38,14 @@ class SinkThread:
     """A Sink on the bus, in a thread of the test."""
 
     def __init__(self, deployment):
+        nodes = {**deployment.nodes, "recorder": {"kind": "sink"}}
+        classes = node_classes(deployment.model_copy(update={"nodes": nodes}), TABLE)
         settings = LiveSettings(
             robot=deployment.robot,
             endpoints=deployment.router.listen,
             run_dir=deployment.run_dir,
             exit_when_drained=True,
-            unfed=unfed_inputs(
-                deployment.model_copy(update={"nodes": {**deployment.nodes, "recorder": {}}}),
-                "recorder",
-                TABLE,
-            ),
+            unfed=surroundings(classes, "recorder").unfed,
         )
         self.node = Sink(Sink.Config())
         self.live = Live(self.node, settings)
