@@ -19,6 +19,16 @@ _ROWS = (
         },
     ),
     Service(
+        "depth",
+        "a dense guess for each picture",
+        {"default": "services.depth.node:DepthNode"},
+    ),
+    Service(
+        "fusion",
+        "metric depth with an error bar, from beams, floor, past pictures and the guess",
+        {"default": "services.fusion.node:FusionNode"},
+    ),
+    Service(
         "recorder",
         "writes what goes over the bus to an MCAP file",
         {"default": "services.recorder.node:RecorderNode"},

@@ -66,6 +66,9 @@ SOURCES: dict[str, str] = {
     "none": "services.depth.nothing:NoDepth",
 }
 
+# These look at the beams of a picture's time; the others need not wait for them.
+NEED_BEAMS = frozenset({"stixel"})
+
 
 def make_source(name: str, options: Mapping[str, Any] | None = None) -> DepthSource:
     """The source called `name`.

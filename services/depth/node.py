@@ -1,0 +1,129 @@
+"""The depth service: a dense guess for the newest picture, by the source that the deployment names."""
+
+from __future__ import annotations
+
+import logging
+from collections import deque
+from typing import Any
+
+import numpy as np
+from pydantic import Field
+
+from common.camera import Pinhole, Undistorter
+from common.config import NodeConfig
+from common.errors import UserError
+from common.history import History, TimedScan
+from common.messages import DepthEstimate, Image, Odometry, Rig, Scan
+from common.node import Input, Node, Outputs
+from common.picture import decode_rgb
+from services.depth.source import NEED_BEAMS, DepthSource, View, make_source
+
+log = logging.getLogger("beamsplat.depth")
+
+_PICTURES = 8  # that may wait for their pose
+
+
+class DepthConfig(NodeConfig):
+    """`source` is a name of services/depth/source.py; `options` are that source's own, checked by it."""
+
+    source: str = "stixel"
+    options: dict[str, Any] = Field(default_factory=dict)
+    floor_known: bool = True  # the camera's height in the calibration can be relied on
+
+
+class DepthNode(Node):
+    """Pictures in, estimates out; sources that look at beams wait for the pose of the picture's time."""
+
+    name = "depth"
+    Config = DepthConfig
+    inputs = (Input("rig", "every"), "camera/image", "lidar/scan", "localization/odometry")
+    outputs = ("depth/estimate",)
+
+    def configure(self) -> None:
+        self._source: DepthSource = make_source(self.config.source, self.config.options)
+        self._needs_beams = self.config.source in NEED_BEAMS
+        self._undistort: Undistorter | None = None
+        self._history: History | None = None
+        self._waiting: deque[Image] = deque(maxlen=_PICTURES)
+        self.overtaken = 0
+
+    def on_rig(self, rig: Rig) -> Outputs:
+        """Camera and lidar of this robot; without a camera there is nothing to do here."""
+        if rig.camera is None:
+            log.error("the calibration has no camera: no depth")
+        else:
+            camera = rig.camera
+            self._undistort = Undistorter(
+                Pinhole(
+                    camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px, camera.width_px, camera.height_px,
+                    camera.distortion_model, camera.distortion,
+                )
+            )  # fmt: skip
+            self._T_body_camera = camera.T_body_camera
+            T_body_lidar = rig.lidar.T_body_lidar if rig.lidar is not None else np.eye(4)
+            self._history = History(T_body_lidar)
+        return iter(())
+
+    def on_lidar_scan(self, scan: Scan) -> Outputs:
+        if self._history is not None:
+            self._history.add_scan(timed_scan(scan))
+        return iter(())
+
+    def on_localization_odometry(self, odometry: Odometry) -> Outputs:
+        """A pose; a picture may have waited for it."""
+        if self._history is not None and odometry.status == "ok":
+            self._history.add_pose(odometry.stamp_ns, odometry.T_odom_body)
+            yield from self._estimate_waiting()
+
+    def on_camera_image(self, image: Image) -> Outputs:
+        """A picture; it may have to wait for its pose, which comes a scan later."""
+        if self._undistort is not None:
+            self._waiting.append(image)
+            yield from self._estimate_waiting()
+
+    def _estimate_waiting(self) -> Outputs:
+        """The newest picture that is ready; older ones are overtaken, and counted."""
+        image = None
+        while self._waiting:
+            if self._needs_beams and self._waiting[0].stamp_ns > self._history.newest_pose_ns:
+                break
+            self.overtaken += image is not None
+            image = self._waiting.popleft()
+        if image is None:
+            return
+        try:
+            rgb = self._undistort(
+                decode_rgb(image.data, image.encoding, image.width_px, image.height_px, image.step_bytes)
+            )
+        except (UserError, ValueError) as error:
+            yield self._refusal(image.stamp_ns, str(error))
+            return
+        beams, _ = self._history.beams(image.stamp_ns)
+        view = View(
+            image.stamp_ns, rgb, self._undistort.pinhole, self._T_body_camera, beams, self.config.floor_known
+        )
+        estimate = self._source.estimate(view)
+        if not estimate.ok or estimate.kind == "none":
+            yield self._refusal(image.stamp_ns, estimate.status, estimate.kind)
+            return
+        yield (
+            "depth/estimate",
+            DepthEstimate(
+                stamp_ns=image.stamp_ns, source=self.config.source, kind=estimate.kind, values=estimate.values
+            ),
+        )
+
+    def _refusal(self, stamp_ns: int, status: str, kind: str = "none") -> tuple[str, DepthEstimate]:
+        empty = np.zeros((0, 0), np.float32)
+        message = DepthEstimate(
+            stamp_ns=stamp_ns, source=self.config.source, kind=kind, values=empty, status=status
+        )
+        return "depth/estimate", message
+
+
+def timed_scan(scan: Scan) -> TimedScan:
+    """The library's scan of a message."""
+    return TimedScan(
+        scan.stamp_ns, scan.angle_min_rad, scan.angle_increment_rad, scan.time_increment_s,
+        scan.range_min_m, scan.range_max_m, scan.ranges_m,
+    )  # fmt: skip

@@ -1,0 +1,212 @@
+"""The fusion service: beams, floor, past pictures and a guess become metric depth with an error bar."""
+
+from __future__ import annotations
+
+import logging
+from collections import deque
+from dataclasses import replace
+
+import numpy as np
+
+from common.camera import Pinhole, Undistorter
+from common.config import NodeConfig
+from common.errors import UserError
+from common.geometry import inverse, transform_points
+from common.history import History, TimedScan
+from common.messages import (
+    Cloud,
+    DepthEstimate,
+    FusedDepth,
+    Image,
+    MovingBeams,
+    Odometry,
+    Rig,
+    Scan,
+)  # fmt: skip
+from common.node import Input, Node, Outputs
+from common.picture import decode_rgb
+from services.fusion.field import Frame
+from services.fusion.fuse import Fusion
+from services.fusion.result import Fused
+
+log = logging.getLogger("beamsplat.fusion")
+
+_PICTURES = 8  # kept until their estimate comes
+
+
+class FusionConfig(NodeConfig):
+    """What is true of this robot, and how often a picture is a keyframe (swept against past ones)."""
+
+    floor_known: bool = True  # the camera's height in the calibration can be relied on
+    planar: bool = True  # the body stays level on a floor
+    keyframe_m: float = 0.3
+    keyframe_rad: float = 0.26
+    cloud_every_px: int = 4  # a point of the cloud per so many pixels in each direction
+
+
+class FusionNode(Node):
+    """Waits for picture, estimate and pose of one moment; works in the odom frame, which never jumps."""
+
+    name = "fusion"
+    Config = FusionConfig
+    inputs = (
+        Input("rig", "every"), "camera/image", "depth/estimate", "lidar/scan", "localization/odometry",
+        "localization/movers",
+    )  # fmt: skip
+    outputs = ("fusion/depth", "fusion/cloud")
+
+    def configure(self) -> None:
+        self._fusion: Fusion | None = None
+        self._pictures: deque[Image] = deque(maxlen=_PICTURES)
+        self._estimates: deque[DepthEstimate] = deque(maxlen=_PICTURES)
+        self._unmarked: deque[TimedScan] = deque()  # scans whose movers are not known yet
+        self._marked: deque[TimedScan] = deque()  # scans whose last beam has no pose yet
+        self._T_odom_keyframe: np.ndarray | None = None
+        self.overtaken = 0
+
+    def on_rig(self, rig: Rig) -> Outputs:
+        """Camera and lidar of this robot; both are needed."""
+        if rig.camera is None or rig.lidar is None:
+            log.error("the calibration lacks the camera or the lidar: nothing can be fused")
+            return iter(())
+        camera = rig.camera
+        self._undistort = Undistorter(
+            Pinhole(
+                camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px, camera.width_px, camera.height_px,
+                camera.distortion_model, camera.distortion,
+            )
+        )  # fmt: skip
+        self._T_body_camera = camera.T_body_camera
+        self._history = History(rig.lidar.T_body_lidar)
+        self._fusion = Fusion(
+            self._undistort.pinhole, camera.T_body_camera, floor_known=self.config.floor_known,
+            planar=self.config.planar,
+        )  # fmt: skip
+        return iter(())
+
+    def on_lidar_scan(self, scan: Scan) -> Outputs:
+        if self._fusion is not None:
+            self._unmarked.append(
+                TimedScan(
+                    scan.stamp_ns, scan.angle_min_rad, scan.angle_increment_rad, scan.time_increment_s,
+                    scan.range_min_m, scan.range_max_m, scan.ranges_m,
+                )
+            )  # fmt: skip
+            while len(self._unmarked) > _PICTURES:  # localization says nothing of movers: take them all
+                self._marked.append(self._unmarked.popleft())
+        return iter(())
+
+    def on_localization_movers(self, movers: MovingBeams) -> Outputs:
+        """Which beams of a scan to leave out: what moves must not become part of the walls."""
+        while self._unmarked and self._unmarked[0].stamp_ns <= movers.stamp_ns:
+            scan = self._unmarked.popleft()
+            moving = movers.moving if scan.stamp_ns == movers.stamp_ns else None
+            self._marked.append(replace(scan, moving=moving))
+        return iter(())
+
+    def on_localization_odometry(self, odometry: Odometry) -> Outputs:
+        """A pose: scans that end before it can be placed, and a picture may have waited for it."""
+        if self._fusion is None or odometry.status != "ok":
+            return
+        self._history.add_pose(odometry.stamp_ns, odometry.T_odom_body)
+        while self._marked and self._marked[0].last_ns <= odometry.stamp_ns:
+            scan = self._marked.popleft()
+            self._history.add_scan(scan)
+            self._fusion.add_scan(self._history.scan_points_a(scan))
+        yield from self._fuse_if_ready()
+
+    def on_camera_image(self, image: Image) -> Outputs:
+        self._pictures.append(image)
+        yield from self._fuse_if_ready()
+
+    def on_depth_estimate(self, estimate: DepthEstimate) -> Outputs:
+        """An estimate; it may have to wait for the pose of its picture."""
+        self._estimates.append(estimate)
+        yield from self._fuse_if_ready()
+
+    def _fuse_if_ready(self) -> Outputs:
+        """The newest picture that has its estimate and its pose; older ones are overtaken, and counted."""
+        ready = None
+        while self._fusion is not None and self._estimates:
+            if self._estimates[0].stamp_ns > self._history.newest_pose_ns:
+                break
+            self.overtaken += ready is not None
+            ready = self._estimates.popleft()
+        if ready is None:
+            return
+        image = next((p for p in self._pictures if p.stamp_ns == ready.stamp_ns), None)
+        if image is None:  # its picture never came here: overtaken on the way
+            self.overtaken += 1
+            return
+        yield from self._fuse(image, ready)
+
+    def _fuse(self, image: Image, estimate: DepthEstimate) -> Outputs:
+        """One picture: keyframes are swept and give a cloud, the others live on the keyframes' depth."""
+        T_odom_body = self._history.pose(image.stamp_ns)
+        try:
+            rgb = self._undistort(
+                decode_rgb(image.data, image.encoding, image.width_px, image.height_px, image.step_bytes)
+            )
+        except (UserError, ValueError) as error:
+            yield "fusion/depth", _refused(image.stamp_ns, str(error))
+            return
+        if T_odom_body is None:
+            yield "fusion/depth", _refused(image.stamp_ns, "no pose at the time of the picture")
+            return
+        beams, age_ns = self._history.beams(image.stamp_ns)
+        usable = estimate.status == "ok" and estimate.kind != "none"
+        frame = Frame(
+            image.stamp_ns, rgb, T_odom_body, beams, estimate.values if usable else None,
+            estimate.kind if usable else "none",
+        )  # fmt: skip
+        keyframe = self._moved(T_odom_body)
+        fused = self._fusion.fuse(frame, keyframe=keyframe)
+        if not fused.ok:
+            yield "fusion/depth", _refused(image.stamp_ns, fused.status)
+            return
+        if keyframe:
+            self._T_odom_keyframe = T_odom_body
+        yield "fusion/depth", _message(image.stamp_ns, fused, keyframe, age_ns, T_odom_body)
+        if keyframe:
+            yield "fusion/cloud", self._cloud(image.stamp_ns, fused, rgb, T_odom_body)
+
+    def _moved(self, T_odom_body: np.ndarray) -> bool:
+        if self._T_odom_keyframe is None:
+            return True
+        T = inverse(self._T_odom_keyframe) @ T_odom_body
+        turn = np.arccos(np.clip((np.trace(T[:3, :3]) - 1.0) / 2.0, -1.0, 1.0))
+        return bool(np.linalg.norm(T[:3, 3]) > self.config.keyframe_m or turn > self.config.keyframe_rad)
+
+    def _cloud(self, stamp_ns: int, fused: Fused, rgb: np.ndarray, T_odom_body: np.ndarray) -> Cloud:
+        every = self.config.cloud_every_px
+        depth = fused.depth_m[::every, ::every]
+        known = np.isfinite(depth)
+        points = (self._undistort.pinhole.ray_grid()[::every, ::every] * depth[..., None])[known]
+        return Cloud(
+            stamp_ns=stamp_ns,
+            points_odom_m=transform_points(T_odom_body @ self._T_body_camera, points).astype(np.float32),
+            colours=rgb[::every, ::every][known],
+        )
+
+
+def _message(
+    stamp_ns: int, fused: Fused, keyframe: bool, age_ns: int, T_odom_body: np.ndarray
+) -> FusedDepth:
+    return FusedDepth(
+        stamp_ns=stamp_ns,
+        depth_m=fused.depth_m,
+        sigma_m=fused.sigma_m,
+        keyframe=keyframe,
+        scale=float(fused.scale),
+        scale_sigma=float(fused.scale_sigma),
+        inlier_share=float(fused.inlier_share),
+        residual_m=float(fused.residual_m),
+        pairs=fused.pairs,
+        beams_age_ns=age_ns,
+        T_odom_body=T_odom_body,
+    )
+
+
+def _refused(stamp_ns: int, status: str) -> FusedDepth:
+    empty = np.zeros((0, 0), np.float32)
+    return FusedDepth(stamp_ns=stamp_ns, depth_m=empty, sigma_m=empty, status=status)
