@@ -83,8 +83,8 @@ def pull(
     if row.sha256 and digest != row.sha256:
         partial.unlink()
         raise UserError(
-            f"{name}: the file from {row.url} has sha256 {digest}, the table says {row.sha256}; it was removed. "
-            "Try again, or check the table"
+            f"{name}: the file from {row.url} has sha256 {digest}, the table says {row.sha256}; "
+            "it was removed. Try again, or check the table"
         )
     question = f"{name}: sha256 of what arrived is {digest}; the table holds none to compare with. Keep it?"
     if not row.sha256 and not agree(question):

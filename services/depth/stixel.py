@@ -2,10 +2,27 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
-from common.beams import hidden_beams, plan_polar, plane_depth, wall_depth
+from common.beams import hidden_beams, plan_polar, plane_depth, wall_ranges
+from common.camera import Pinhole
 from services.depth.source import Estimate, View
+
+_FINE = 2  # azimuths a pixel column
+
+
+@dataclass(frozen=True)
+class _Rays:
+    """What stays the same from picture to picture of one mounted camera."""
+
+    camera: Pinhole
+    T_body_camera: np.ndarray
+    azimuth_rad: np.ndarray  # float64 [M]: the fan over the picture's width
+    place: np.ndarray  # int32 [H, W]: each pixel's azimuth in the fan
+    per_range: np.ndarray  # float32 [H, W]: optical z per metre of horizontal range
+    floor: np.ndarray  # float32 [H, W]: optical z of the floor, inf = not met
 
 
 class Stixel:
@@ -13,23 +30,38 @@ class Stixel:
 
     def __init__(self, max_depth_m: float = 30.0) -> None:
         self._max_depth_m = max_depth_m
+        self._rays: _Rays | None = None
 
     def estimate(self, view: View) -> Estimate:
         """Metric depth; NaN in columns that no beam serves (floor excepted)."""
-        values = stixel_depth(view, view.camera.ray_grid())
+        rays = self._rays
+        if (
+            rays is None
+            or rays.camera != view.camera
+            or not np.array_equal(rays.T_body_camera, view.T_body_camera)
+        ):
+            rays = self._rays = _prepare(view.camera, view.T_body_camera)
+        points = view.beams.points_body_m
+        points = points[~hidden_beams(points, view.T_body_camera)]
+        azimuth, reach = plan_polar(points, view.T_body_camera)
+        ranges = wall_ranges(rays.azimuth_rad, azimuth, reach).astype(np.float32)
+        values = ranges[rays.place] * rays.per_range
+        if view.floor_known:
+            values = np.fmin(values, rays.floor)
         with np.errstate(invalid="ignore"):
             values[values > self._max_depth_m] = np.nan
         status = "ok" if np.isfinite(values).any() else "no beams in view and no floor known"
-        return Estimate(values.astype(np.float32), "metric", status)
+        return Estimate(values, "metric", status)
 
 
-def stixel_depth(view: View, rays_camera: np.ndarray) -> np.ndarray:
-    """Optical z float64 [H, W] for rays [H, W, 3] of z = 1."""
-    rays_body = rays_camera @ view.T_body_camera[:3, :3].T
-    points = view.beams.points_body_m
-    points = points[~hidden_beams(points, view.T_body_camera)]
-    azimuth, reach = plan_polar(points, view.T_body_camera)
-    wall = wall_depth(rays_body, azimuth, reach)
-    if not view.floor_known:
-        return wall
-    return np.fmin(wall, plane_depth(rays_body, float(view.T_body_camera[2, 3])))
+def _prepare(camera: Pinhole, T_body_camera: np.ndarray) -> _Rays:
+    rays_body = camera.ray_grid() @ T_body_camera[:3, :3].T
+    azimuth = np.arctan2(rays_body[..., 1], rays_body[..., 0])
+    fan = np.linspace(float(azimuth.min()), float(azimuth.max()), _FINE * camera.width_px)
+    place = np.rint((azimuth - fan[0]) / max(fan[-1] - fan[0], 1e-9) * (len(fan) - 1))
+    across = np.maximum(np.hypot(rays_body[..., 0], rays_body[..., 1]), 1e-9)
+    floor = plane_depth(rays_body, float(T_body_camera[2, 3]))
+    return _Rays(
+        camera, T_body_camera.copy(), fan, place.astype(np.int32), (1.0 / across).astype(np.float32),
+        np.where(np.isfinite(floor), floor, np.inf).astype(np.float32),
+    )  # fmt: skip

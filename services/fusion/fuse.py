@@ -22,9 +22,10 @@ from services.fusion.surfaces import Surfaces
 _BEAM, _FLOOR, _SURFACE, _MATCHED = 0.006, 0.006, 0.012, 0.05
 _PER_SPREAD = 2.3  # error per unit of the matcher's own spread
 _CARRIED = (0.10, 0.06, 0.045)  # depth remembered from one, two, three and more keyframes
-_UPRIGHT, _TILTING = 0.15, 0.35  # extruded walls that nothing confirms: body on a floor, body in the hand
+_UPRIGHT, _TILTING = 0.15, 0.24  # extruded walls that nothing confirms: body on a floor, body in the hand
 _BEAM_HEIGHT_M = 0.06
 _SAME_SURFACE = 0.08
+_TELL_UP_TO = 0.25  # sigma of log depth beyond which a pixel has no answer
 _CONTRADICTION = 0.25  # log: a beam that far from remembered depth contradicts it
 _LEAST_KNOWN = 20
 _LEAST_INLIERS = 0.3
@@ -63,6 +64,7 @@ class Fusion:
             solved = self.field.refine(frame, small)
             surfaces = self.field.surfaces(frame)
             sigma_log = self._sigma_swept(solved, surfaces)
+            self._pin_to_beams(solved, sigma_log, surfaces)
         else:
             solved = self._carried(frame, remembered, surfaces)
             sigma_log = solved.spread
@@ -121,6 +123,12 @@ class Fusion:
         doubt = np.where(floor | beam, 0.0, _PER_SPREAD * solved.spread)
         return np.hypot(base, doubt).astype(np.float32)
 
+    def _pin_to_beams(self, solved: Solved, sigma_log: np.ndarray, surfaces: Surfaces) -> None:
+        """On the scan line itself the beams are right, whatever matches; changes both arrays."""
+        pinned = (surfaces.wall_off_m < 0.5 * _BEAM_HEIGHT_M) & ~surfaces.on_floor
+        solved.depth_m[pinned] = surfaces.wall[pinned]
+        sigma_log[pinned] = _BEAM + 0.01 / solved.depth_m[pinned]
+
     def _finish(
         self, frame: Frame, solved: Solved, sigma_log: np.ndarray, uv: np.ndarray, z: np.ndarray
     ) -> Fused:
@@ -128,8 +136,9 @@ class Fusion:
         h, w = self.field.small_camera.shape
         depth = np.empty(self.field.camera.shape, np.float32)
         sigma = np.empty_like(depth)
+        known = np.where(sigma_log <= _TELL_UP_TO, solved.depth_m, np.nan)
         colour = cv2.resize(frame.image_rgb, (w, h), interpolation=cv2.INTER_AREA)
-        finish.enlarge(solved.depth_m, sigma_log, colour, frame.image_rgb, _SAME_SURFACE, depth, sigma)
+        finish.enlarge(known, sigma_log, colour, frame.image_rgb, _SAME_SURFACE, depth, sigma)
         H, W = depth.shape
         v = np.clip(np.rint(uv[:, 1]).astype(int), 0, H - 1)
         u = np.clip(np.rint(uv[:, 0]).astype(int), 0, W - 1)

@@ -189,9 +189,7 @@ class FusionNode(Node):
         )
 
 
-def _message(
-    stamp_ns: int, fused: Fused, keyframe: bool, age_ns: int, T_odom_body: np.ndarray
-) -> FusedDepth:
+def _message(stamp_ns: int, fused: Fused, keyframe: bool, age_ns: int, T_odom_body: np.ndarray) -> FusedDepth:
     return FusedDepth(
         stamp_ns=stamp_ns,
         depth_m=fused.depth_m,

@@ -20,7 +20,7 @@ MIN_TRACKS = 12
 def corners(grey: np.ndarray, most: int = 150) -> np.ndarray:
     """Corners float32 [N, 2] (u, v) of an uint8 [H, W] picture, best first."""
     found = cv2.goodFeaturesToTrack(grey, most, 0.01, 8)
-    return np.zeros((0, 2), np.float32) if found is None else found[:, 0]
+    return np.zeros((0, 2), np.float32) if found is None else found.reshape(-1, 2)
 
 
 def track(

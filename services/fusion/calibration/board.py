@@ -1,0 +1,167 @@
+"""Camera and planar lidar from still pairs with a chessboard: yaw and the two offsets in the lidar's plane.
+
+The board is a plane in the camera; beams on it are points of that plane. A lidar that is mounted level
+with the camera tells its yaw and its offsets to the side and along the view; its height and its small
+tilts move points within the board and stay unknown.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from common.camera import Pinhole
+from common.frames import R_body_camera_level
+from common.geometry import inverse, make_transform, so3_exp, transform_points
+
+_GAP_M = 0.05  # beams of one board are no further apart than this
+_SIGMA_M = 0.008
+_MARGIN = 3.0  # board squares around the corners that are still board, where its size is not given
+
+
+@dataclass(frozen=True)
+class BoardPair:
+    """A chessboard plane in the camera and the scan of the same moment."""
+
+    normal_camera: np.ndarray  # float64 [3], unit
+    offset_m: float  # normal . point = offset
+    centre_camera: np.ndarray  # float64 [3]
+    half_width_m: float  # of the board along the scan line, about
+    points_lidar: np.ndarray  # float64 [N, 3]
+
+
+@dataclass(frozen=True)
+class BoardCalibration:
+    """`T_camera_lidar`, the standard errors of (yaw rad, x m, z m), and how beams fit the boards."""
+
+    T_camera_lidar: np.ndarray
+    yaw_rad: float  # of the lidar against the camera's forward direction, to the left
+    x_m: float  # of the lidar in the camera, to the right
+    z_m: float  # of the lidar in the camera, forward
+    sigma: np.ndarray  # float64 [3]
+    rms_m: float
+    beams: int
+    on_board: tuple[np.ndarray, ...]  # indices of the beams on each board
+
+
+def chessboard_plane(
+    grey: np.ndarray, camera: Pinhole, corners: tuple[int, int], square_m: float
+) -> tuple[np.ndarray, float, np.ndarray, float] | None:
+    """(normal, offset, centre, rms px) of a chessboard with inner `corners`; None if it is not found."""
+    found, uv = cv2.findChessboardCornersSB(grey, corners, flags=cv2.CALIB_CB_ACCURACY)
+    if not found:
+        return None
+    uv = uv.reshape(-1, 2).astype(np.float64)  # OpenCV 4 and 5 shape it differently
+    grid = np.zeros((corners[0] * corners[1], 3))
+    grid[:, :2] = np.mgrid[: corners[0], : corners[1]].T.reshape(-1, 2) * square_m
+    rays = camera.rays(uv)
+    ok, rotation, translation = cv2.solvePnP(grid, np.ascontiguousarray(rays[:, :2]), np.eye(3), None)
+    if not ok:
+        return None
+    R = cv2.Rodrigues(rotation)[0]
+    in_camera = grid @ R.T + translation[:, 0]
+    back, _ = camera.project(in_camera)
+    rms = float(np.sqrt(np.mean(np.sum((back - uv) ** 2, axis=1))))
+    normal = R[:, 2]
+    return normal, float(normal @ translation[:, 0]), in_camera.mean(axis=0), rms
+
+
+def level_mount(yaw_rad: float, x_m: float, y_m: float, z_m: float) -> np.ndarray:
+    """`T_camera_lidar` of a lidar level with the camera, turned by yaw to the left."""
+    R_lidar_level = so3_exp([0.0, 0.0, yaw_rad])
+    return make_transform(R_body_camera_level.T @ R_lidar_level, np.array([x_m, y_m, z_m]))
+
+
+def solve_board(
+    pairs: list[BoardPair], start: tuple[float, float, float], y_m: float = 0.0, rounds: int = 14
+) -> BoardCalibration:
+    """Yaw, x and z of the lidar from point-to-plane distances; beams on boards are found anew each round.
+
+    Args:
+        pairs: two boards at least, turned against each other.
+        start: (yaw rad, x m, z m), right to a few degrees and centimetres.
+        y_m: height of the lidar below the camera, which nothing here can tell.
+
+    Raises:
+        ValueError: no beams on boards from this start, or boards that leave a direction open.
+    """
+    x = np.array(start, dtype=np.float64)
+    on_board: list[np.ndarray] = []
+    for number in range(rounds):
+        reach = max(0.20 * 0.7**number, 0.015)
+        on_board = [_beams_on(pair, level_mount(x[0], x[1], y_m, x[2]), reach) for pair in pairs]
+        if sum(len(i) for i in on_board) < 20:
+            raise ValueError("too few beams fall on the boards; check the start values and the board's place")
+        for _ in range(5):
+            r, J = _linear(pairs, on_board, x, y_m)
+            weight = 1.0 / (1.0 + (r / (3.0 * _SIGMA_M)) ** 2)
+            H = J.T @ (J * weight[:, None])
+            if np.linalg.cond(H) > 1e7:
+                raise ValueError("all boards face the same way: turn the board between pictures")
+            x -= np.linalg.solve(H, J.T @ (weight * r))
+    r, J = _linear(pairs, on_board, x, y_m)
+    variance = float(r @ r) / max(len(r) - 3, 1)
+    # Beams of one board share its plane's error: as good as one tenth of them.
+    sigma = np.sqrt(np.diag(np.linalg.inv(J.T @ J)) * variance * 10.0)
+    T = level_mount(x[0], x[1], y_m, x[2])
+    return BoardCalibration(
+        T,
+        float(x[0]),
+        float(x[1]),
+        float(x[2]),
+        sigma,
+        float(np.sqrt(np.mean(r**2))),
+        len(r),
+        tuple(on_board),
+    )
+
+
+def _linear(
+    pairs: list[BoardPair], on_board: list[np.ndarray], x: np.ndarray, y_m: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Point-to-plane distances [M] and their derivatives [M, 3]."""
+
+    def distances(x: np.ndarray) -> np.ndarray:
+        T = level_mount(x[0], x[1], y_m, x[2])
+        return np.concatenate([
+            transform_points(T, pair.points_lidar[i]) @ pair.normal_camera - pair.offset_m
+            for pair, i in zip(pairs, on_board)
+        ])  # fmt: skip
+
+    r = distances(x)
+    J = np.stack([(distances(x + step) - r) / 1e-6 for step in np.eye(3) * 1e-6], axis=1)
+    return r, J
+
+
+def _beams_on(pair: BoardPair, T_camera_lidar: np.ndarray, reach_m: float) -> np.ndarray:
+    """Indices of the longest run of neighbouring beams near the board's plane and place."""
+    points = transform_points(T_camera_lidar, pair.points_lidar)
+    near = np.abs(points @ pair.normal_camera - pair.offset_m) < reach_m
+    near &= np.abs(points[:, 0] - pair.centre_camera[0]) < pair.half_width_m + 0.5 * reach_m
+    near &= np.abs(points[:, 2] - pair.centre_camera[2]) < pair.half_width_m + reach_m
+    index = np.flatnonzero(near)
+    if len(index) == 0:
+        return index
+    angle = np.arctan2(pair.points_lidar[index, 1], pair.points_lidar[index, 0])
+    index = index[np.argsort(angle)]
+    gaps = np.linalg.norm(np.diff(pair.points_lidar[index], axis=0), axis=1) > _GAP_M
+    runs = np.split(index, np.flatnonzero(gaps) + 1)
+    return max(runs, key=len)
+
+
+def board_edges_px(
+    pair: BoardPair, beams: np.ndarray, T_camera_lidar: np.ndarray, camera: Pinhole
+) -> np.ndarray:
+    """Pixels float64 [2, 2] of the first and last beam on the board."""
+    ends = pair.points_lidar[beams[[0, -1]]]
+    uv, _ = camera.project(transform_points(T_camera_lidar, ends))
+    return uv
+
+
+def start_of(T_camera_lidar: np.ndarray) -> tuple[float, float, float, float]:
+    """(yaw rad, x m, y m, z m) of a mount, for `solve_board`."""
+    forward = inverse(make_transform(R_body_camera_level, np.zeros(3)))[:3, :3].T @ T_camera_lidar[:3, :3]
+    yaw = float(np.arctan2(forward[1, 0], forward[0, 0]))
+    return yaw, float(T_camera_lidar[0, 3]), float(T_camera_lidar[1, 3]), float(T_camera_lidar[2, 3])
