@@ -91,6 +91,7 @@ class DepthNode(Node):
             image = self._waiting.popleft()
         if image is None:
             return
+        self.detail = f"{self.overtaken} pictures overtaken" if self.overtaken else ""
         try:
             rgb = self._undistort(
                 decode_rgb(image.data, image.encoding, image.width_px, image.height_px, image.step_bytes)

@@ -50,7 +50,7 @@ class FusionNode(Node):
     name = "fusion"
     Config = FusionConfig
     inputs = (
-        Input("rig", "every"), "camera/image", "depth/estimate", "lidar/scan", "localization/odometry",
+        Input("rig", "every"), Input("camera/image", "every"), "depth/estimate", "lidar/scan", "localization/odometry",
         "localization/movers",
     )  # fmt: skip
     outputs = ("fusion/depth", "fusion/cloud")
@@ -134,8 +134,9 @@ class FusionNode(Node):
             ready = self._estimates.popleft()
         if ready is None:
             return
+        self.detail = f"{self.overtaken} estimates overtaken" if self.overtaken else ""
         image = next((p for p in self._pictures if p.stamp_ns == ready.stamp_ns), None)
-        if image is None:  # its picture never came here: overtaken on the way
+        if image is None:  # its picture was lost on the way, or is older than those kept
             self.overtaken += 1
             return
         yield from self._fuse(image, ready)

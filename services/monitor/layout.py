@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import rerun.blueprint as rrb
 
+from services.monitor.depth_view import DEPTH
 from services.monitor.panel import PLOTS
 from services.monitor.scene import BODY, CAMERA, SCAN, WORLD
 from services.monitor.screen import TIMELINE
@@ -33,7 +34,14 @@ def layout() -> rrb.Blueprint:
         rrb.Vertical(
             rrb.Horizontal(
                 world,
-                rrb.Vertical(camera, rrb.TextLogView(origin="log", name="Log"), row_shares=[3, 2]),
+                rrb.Vertical(
+                    camera,
+                    rrb.Tabs(
+                        rrb.Spatial2DView(origin=DEPTH, name="Depth"),
+                        rrb.TextLogView(origin="log", name="Log"),
+                    ),
+                    row_shares=[3, 2],
+                ),
                 column_shares=[3, 2],
             ),
             rrb.Horizontal(health, *plots[:3], column_shares=[3, 2, 2, 2]),

@@ -11,8 +11,9 @@ from pydantic import Field
 
 from common.config import NodeConfig
 from common.errors import UserError
-from common.messages import Health, Odometry, Rig
+from common.messages import FusedDepth, Health, Odometry, Rig
 from common.node import Input, Node, Output
+from services.monitor.depth_view import DepthView
 from services.monitor.layout import layout
 from services.monitor.panel import NodeReport, Panel
 from services.monitor.scene import Look, Scene
@@ -45,6 +46,8 @@ class MonitorConfig(NodeConfig):
     path_hz: Hz = 1.0
     grid_hz: Hz = 0.5
     anchors_hz: Hz = 1.0
+    depth_hz: Hz = 2.0
+    clouds: Annotated[int, Field(ge=1)] = 40  # keyframes whose points are shown
     path_points: Annotated[int, Field(ge=16)] = 2000
     path_step_m: Annotated[float, Field(gt=0.0)] = 0.05
     body_size_m: tuple[float, float, float] = (0.4, 0.3, 0.25)  # length, width, height of the robot
@@ -65,10 +68,15 @@ def _draw_odometry(scene: Scene, panel: Panel, m: Odometry) -> None:
     panel.status("localization", m.status, m.detail, m.stamp_ns)
 
 
-Draw = Callable[[Scene, Panel, Any], None]
+def _draw_depth(view: DepthView, panel: Panel, m: FusedDepth) -> None:
+    view.depth(m.stamp_ns, m.depth_m)
+    panel.status("fusion", "ok" if m.status == "ok" else "refused", m.status.removeprefix("ok"), m.stamp_ns)
 
-# What is shown, and how: one row a topic. Its delivery never holds a publisher up.
-DRAW: dict[Input, Draw] = {
+
+Draw = Callable[[Any, Panel, Any], None]
+
+# What is shown in the scene, and how: one row a topic. Its delivery never holds a publisher up.
+SCENE: dict[Input, Draw] = {
     Input("rig", "latched"): _draw_rig,
     Input("camera/image", "latest"): lambda scene, _, m: scene.picture(
         m.stamp_ns, m.data, m.encoding, (m.width_px, m.height_px), m.step_bytes
@@ -90,12 +98,16 @@ DRAW: dict[Input, Draw] = {
         m.stamp_ns, m.occupancy, m.resolution_m, m.origin_m
     ),
 }  # fmt: skip
+DEPTH: dict[Input, Draw] = {
+    Input("fusion/depth", "latest"): _draw_depth,
+    Input("fusion/cloud", "latest"): lambda view, _, m: view.cloud(m.stamp_ns, m.points_odom_m, m.colours),
+}
 
 
-def _handler(draw: Draw) -> Callable[[MonitorNode, Any], tuple[Output, ...]]:
+def _handler(view: str, draw: Draw) -> Callable[[MonitorNode, Any], tuple[Output, ...]]:
     def handle(self: MonitorNode, message: Any) -> tuple[Output, ...]:
         try:
-            draw(self.scene, self.panel, message)
+            draw(getattr(self, view), self.panel, message)
         except ValueError as error:  # a message that is valid, but cannot be drawn
             self.panel.say(str(error), message.stamp_ns, "WARN")
         self.detail = self.screen.status
@@ -104,15 +116,23 @@ def _handler(draw: Draw) -> Callable[[MonitorNode, Any], tuple[Output, ...]]:
     return handle
 
 
-_Handlers = type("_Handlers", (), {entry.row.handler: _handler(draw) for entry, draw in DRAW.items()})
+_Handlers = type(
+    "_Handlers",
+    (),
+    {
+        entry.row.handler: _handler(view, draw)
+        for view, rows in (("scene", SCENE), ("depth_view", DEPTH))
+        for entry, draw in rows.items()
+    },
+)
 
 
 class MonitorNode(_Handlers, Node):
-    """Draws what comes by `DRAW`, and the health of all nodes."""
+    """Draws what comes by `SCENE` and `DEPTH`, and the health of all nodes."""
 
     name = "monitor"
     Config = MonitorConfig
-    inputs = tuple(DRAW)
+    inputs = (*SCENE, *DEPTH)
     config: MonitorConfig
 
     def configure(self) -> None:
@@ -125,10 +145,11 @@ class MonitorNode(_Handlers, Node):
         except (RuntimeError, OSError) as error:
             self.screen.close()
             raise UserError(f"monitor: {error}") from error
-        kinds = ("image", "scan", "pose", "path", "grid", "anchors")
+        kinds = ("image", "scan", "pose", "path", "grid", "anchors", "depth")
         limits = RateLimit({"health": 1.0, **{kind: getattr(c, f"{kind}_hz") for kind in kinds}})
         self.panel = Panel(self.screen, limits)
         self.scene = Scene(self.screen, limits, Look(c.path_points, c.path_step_m, c.body_size_m))
+        self.depth_view = DepthView(self.screen, limits, c.clouds)
         self.detail = self.screen.status
         log.info("%s", self.detail)
 

@@ -25,7 +25,7 @@ from common.messages import (
 )  # fmt: skip
 from common.node import Node, Sourced
 from common.topics import TOPICS
-from services.monitor.node import DRAW, MonitorConfig, MonitorNode
+from services.monitor.node import DEPTH, SCENE, MonitorConfig, MonitorNode
 
 NS = 1_000_000_000
 T0 = 1_700_000_000 * NS
@@ -308,6 +308,6 @@ def test_a_monitor_that_would_show_nothing_is_refused():
 
 
 def test_every_row_is_a_topic_and_none_holds_a_publisher_up():
-    for entry in DRAW:
+    for entry in (*SCENE, *DEPTH):
         assert entry.topic in TOPICS
         assert entry.effective_delivery in ("latest", "latched"), entry.topic

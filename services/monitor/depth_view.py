@@ -1,0 +1,43 @@
+"""Fused depth and coloured points, drawn in rerun.
+
+depth                                the last fused depth, as a picture of its own
+map/odom/cloud/<number>              points of a keyframe, in the odom frame: a loop closure moves them all
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import rerun as rr
+
+from services.monitor.screen import Screen
+from services.monitor.tracks import RateLimit
+
+DEPTH = "depth"
+CLOUD = "map/odom/cloud"
+_SHRINK = 2  # a quarter of the pixels is enough to look at
+_RANGE_M = (0.3, 8.0)  # of the colour scale
+
+
+class DepthView:
+    """The newest depth picture, and the points of the newest `clouds` keyframes."""
+
+    def __init__(self, screen: Screen, limits: RateLimit, clouds: int) -> None:
+        self._screen = screen
+        self._limits = limits
+        self._clouds = clouds
+        self._drawn = 0
+
+    def depth(self, stamp_ns: int, depth_m: np.ndarray) -> None:
+        """float32 [H, W] optical z, NaN = unknown (drawn as nothing)."""
+        if depth_m.size and self._limits.due("depth", stamp_ns):
+            small = np.nan_to_num(depth_m[::_SHRINK, ::_SHRINK], nan=0.0)
+            drawing = rr.DepthImage(
+                np.ascontiguousarray(small), meter=1.0, depth_range=_RANGE_M, colormap="turbo"
+            )
+            self._screen.log(DEPTH, drawing, stamp_ns=stamp_ns)
+
+    def cloud(self, stamp_ns: int, points_odom_m: np.ndarray, colours: np.ndarray) -> None:
+        """Points float32 [N, 3] with colours uint8 [N, 3]; the oldest keyframe's give way."""
+        entity = f"{CLOUD}/{self._drawn % self._clouds}"
+        self._drawn += 1
+        self._screen.log(entity, rr.Points3D(points_odom_m, colors=colours, radii=0.01), stamp_ns=stamp_ns)
