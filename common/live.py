@@ -38,7 +38,7 @@ log = logging.getLogger(__name__)
 
 _POLL_S = 0.2  # how soon a signal is noticed while nothing arrives
 _STOP_PATIENCE_S = 2.0  # after a signal, background jobs have so long to finish
-_END_PATIENCE_S = 2.0  # an end marker waits this long for messages still on their way
+_END_PATIENCE_S = 5.0  # an end marker waits this long for messages still on their way
 _LOG_PERIOD_S = 5.0
 _DETAIL_CHARS = 2000
 
@@ -193,7 +193,7 @@ class Live:
         waiting = []
         for topic, instance, epoch, sent, deadline in self._ends:
             if self.mailbox.next_sequence(topic, instance) >= sent or time.monotonic() > deadline:
-                self.mailbox.end(topic, instance, epoch)
+                self.mailbox.end(topic, instance, epoch, sent)
             else:
                 waiting.append((topic, instance, epoch, sent, deadline))
         self._ends = waiting

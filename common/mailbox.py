@@ -109,13 +109,15 @@ class Mailbox:
             count.ended_by = None
         return True
 
-    def end(self, topic: str, instance: str, epoch: int) -> None:
-        """The producer `instance` says that nothing more will come on `topic`."""
+    def end(self, topic: str, instance: str, epoch: int, sent: int = 0) -> None:
+        """The producer `instance` says that nothing more will come on `topic`, after `sent` messages; what
+        of them has not come by now counts as lost."""
         count = self.counts[topic]
         if epoch < count.epoch:  # of a producer that has been taken over
             return
         count.ended_by = instance
         if self._deliveries[topic] == "every":
+            count.lost += max(sent - self.next_sequence(topic, instance), 0)
             self._merger.end(topic)
 
     def next_sequence(self, topic: str, instance: str) -> int:

@@ -41,7 +41,6 @@ class Child:
     attempts: int = 0  # within the current back-off
     due: float | None = None  # dead, to be started again then
     gave_up: bool = False  # ended with a user error: restarting would not help
-    exit_code: int | None = None
 
 
 class Supervisor:
@@ -136,16 +135,13 @@ class Supervisor:
                 if now >= entry.due:
                     entry.restarts += 1
                     self._start(entry.name, resume=True)
-            elif not entry.process.is_alive() and entry.exit_code is None and not entry.gave_up:
+            elif not entry.process.is_alive() and not entry.gave_up:
                 self._bury(entry, now)
 
     def _bury(self, entry: Child, now: float) -> None:
         code = entry.process.exitcode or 0
-        if code == 0 and entry.name != ROUTER:  # nobody goes on without a router, however it was ended
-            entry.exit_code = 0
-            return
         if code == 2:
-            entry.gave_up, entry.exit_code = True, 2
+            entry.gave_up = True
             self._on_event(f"{entry.name} cannot run: {_last_line(self.log_file(entry.name))}")
             return
         if now - entry.started > HEALTHY_S:
@@ -153,6 +149,7 @@ class Supervisor:
         delay = BACK_OFF_S[min(entry.attempts, len(BACK_OFF_S) - 1)]
         entry.attempts += 1
         entry.due = now + delay
+        # A drained node stays until it is told to go, so exit code 0 means that somebody else told it.
         how = f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
         self._on_event(
             f"{entry.name} died ({how}: {_last_line(self.log_file(entry.name))}); starts again in {delay:g} s"

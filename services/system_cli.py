@@ -125,7 +125,7 @@ def run_checked(deployment: Deployment, names: tuple[str, ...] | None = None) ->
                                 next(e for e in events if e.startswith(f"{entry.name} cannot run"))
                             )
                     states = board.states()
-                    if nodes and all(c.exit_code == 0 or states.get(c.name) == "drained" for c in nodes):
+                    if nodes and all(states.get(c.name) == "drained" for c in nodes):
                         break
             if not show:
                 console.print(board.nodes_table())

@@ -67,3 +67,9 @@ def test_what_waits_is_bounded_in_bytes(monkeypatch):
     mailbox.put(_scan(100, size_bytes=50_000))  # one that is larger than the bound still passes
     assert mailbox.pop().header.sequence == 100
     assert mailbox.counts["lidar/scan"].dropped == 90
+
+
+def test_what_never_came_before_the_end_counts_as_lost():
+    mailbox = Mailbox(Chain)
+    mailbox.end("lidar/scan", "ab" * 8, 1, sent=3)
+    assert mailbox.counts["lidar/scan"].lost == 3
