@@ -67,13 +67,23 @@ class BackEnd:
         """What a job may read while the map goes on growing."""
         self._jobs += 1
         return Snapshot(
-            self._jobs, self.settings, dict(self.nodes),
-            {i: s.frozen for i, s in self.submaps.items() if s.frozen is not None}, list(self.submaps),
-            list(self.nodes), {i: list(s.members) for i, s in self.submaps.items()},
+            self._jobs,
+            self.settings,
+            dict(self.nodes),
+            {i: s.frozen for i, s in self.submaps.items() if s.frozen is not None},
+            list(self.submaps),
+            list(self.nodes),
+            {i: list(s.members) for i, s in self.submaps.items()},
             np.array([s.T_map_submap for s in self.submaps.values()]).reshape(-1, 3),
-            np.array(list(self.T_map_node.values())).reshape(-1, 3), list(self.constraints), list(self.pending),
-            dict(self.tries), self.cache, self.optimisations, self.unlinked_from, self.fixed,
-        )  # fmt: skip
+            np.array(list(self.T_map_node.values())).reshape(-1, 3),
+            list(self.constraints),
+            list(self.pending),
+            dict(self.tries),
+            self.cache,
+            self.optimisations,
+            self.unlinked_from,
+            self.fixed,
+        )
 
     def apply(self, result: JobResult) -> None:
         """Take in a job's result; what was added since the snapshot moves with the last optimised node."""
@@ -85,10 +95,14 @@ class BackEnd:
         self.T_map_odom = se2.compose(result.T_map_node[last], se2.inverse(self.nodes[last].T_odom_body))
         for i, submap in self.submaps.items():
             moved = result.T_map_submap.get(i)
-            submap.T_map_submap = moved if moved is not None else se2.compose(self.T_map_odom, submap.T_odom_submap)
+            submap.T_map_submap = (
+                moved if moved is not None else se2.compose(self.T_map_odom, submap.T_odom_submap)
+            )
         for i, node in self.nodes.items():
             moved = result.T_map_node.get(i)
-            self.T_map_node[i] = moved if moved is not None else se2.compose(self.T_map_odom, node.T_odom_body)
+            self.T_map_node[i] = (
+                moved if moved is not None else se2.compose(self.T_map_odom, node.T_odom_body)
+            )
         for i, frozen in result.frozen.items():
             self.submaps[i].frozen = frozen
         newer = [n for n in self.pending if n > last]

@@ -37,7 +37,8 @@ def _fill(field: np.ndarray, shift_r: int, shift_c: int, levels: np.ndarray) -> 
             for c in range(cols):
                 c2 = min(c + d, cols - 1)
                 levels[h, r, c] = max(
-                    max(levels[h - 1, r, c], levels[h - 1, r2, c]), max(levels[h - 1, r, c2], levels[h - 1, r2, c2])
+                    max(levels[h - 1, r, c], levels[h - 1, r2, c]),
+                    max(levels[h - 1, r, c2], levels[h - 1, r2, c2]),
                 )
 
 
@@ -195,7 +196,9 @@ def branch_and_bound(
     cols = np.floor(x / pyramid.cell_m).astype(np.int32) - pyramid.col0
     found = np.empty((max_found, 4))
     steps = max(1, math.ceil(window_m / pyramid.cell_m))
-    count, _ = _search(pyramid.levels, rows, cols, steps, min_score, keep, max(1, round(0.1 / step_rad)), found)
+    count, _ = _search(
+        pyramid.levels, rows, cols, steps, min_score, keep, max(1, round(0.1 / step_rad)), found
+    )
     found = found[:count]
     best = []
     for score, a, dr, dc in found[np.argsort(-found[:, 0], kind="stable")]:

@@ -8,13 +8,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from services.localization.lidar2d import se2
-from services.localization.lidar2d.matching import Match, refine, search
+from services.localization.lidar2d.correlative import search
+from services.localization.lidar2d.matching import Match, refine
+from services.localization.lidar2d.observability import weak_direction, without_slip
 from services.localization.lidar2d.odometry import OdometryBuffer, Predictor
 from services.localization.lidar2d.scan import PreparedScan, prepare_scan
 from services.localization.lidar2d.settings import LidarSlamSettings
 from services.localization.lidar2d.surfel_map import SurfelMap
 
 NS = 1e-9
+LEARN_SIGMA_M = 0.02  # directions known less well than this teach nothing about the wheels
 
 
 @dataclass(frozen=True)
@@ -52,7 +55,9 @@ class Prediction:
 class FrontEnd:
     """Prediction, deskew, matching; the caller decides what enters which map."""
 
-    def __init__(self, settings: LidarSlamSettings, T_body_lidar: np.ndarray, upside_down: bool = False) -> None:
+    def __init__(
+        self, settings: LidarSlamSettings, T_body_lidar: np.ndarray, upside_down: bool = False
+    ) -> None:
         self.settings = settings
         self.T_body_lidar = T_body_lidar
         self._flip = -1.0 if upside_down else 1.0
@@ -94,8 +99,12 @@ class FrontEnd:
         rated = []
         for predictor, motion, name in options:
             sigma_m, sigma_rad = predictor.sigmas(motion, dt)
-            rated.append((sigma_m / 0.05 + sigma_rad / 0.03, Prediction(motion, sigma_m, sigma_rad, name,
-                                                                        dt > 1.0 and wheels is None)))
+            rated.append(
+                (
+                    sigma_m / 0.05 + sigma_rad / 0.03,
+                    Prediction(motion, sigma_m, sigma_rad, name, dt > 1.0 and wheels is None),
+                )
+            )
         best = min(rated, key=lambda item: item[0])[1]
         return best, [(predictor, motion) for predictor, motion, _ in options]
 
@@ -125,10 +134,17 @@ class FrontEnd:
     def prepare(self, raw: RawScan, velocity: np.ndarray) -> PreparedScan:
         s = self.settings
         return prepare_scan(
-            raw.ranges_m, self._flip * raw.angle_min_rad, self._flip * raw.angle_increment_rad, raw.time_increment_s,
-            raw.range_min_m, min(raw.range_max_m, s.use_range_m), self.T_body_lidar, velocity, s.spread_m,
+            raw.ranges_m,
+            self._flip * raw.angle_min_rad,
+            self._flip * raw.angle_increment_rad,
+            raw.time_increment_s,
+            raw.range_min_m,
+            min(raw.range_max_m, s.use_range_m),
+            self.T_body_lidar,
+            velocity,
+            s.spread_m,
             s.match_points,
-        )  # fmt: skip
+        )
 
     # ---- matching ---------------------------------------------------------------------------------
 
@@ -145,21 +161,28 @@ class FrontEnd:
         match = refine(points, scan.origin_body, T_guess, tables, s, T_guess, information)
         blind = (raw.stamp_ns - self.stamps[-1]) * NS > 1.0
         window_m = min(max(3.0 * prediction.sigma_m, s.search_min_m), 2.0 if blind else s.search_max_m)
-        window_rad = min(max(3.0 * prediction.sigma_rad, s.search_min_rad), math.pi if blind else s.search_max_rad)
+        window_rad = min(
+            max(3.0 * prediction.sigma_rad, s.search_min_rad), math.pi if blind else s.search_max_rad
+        )
         if window_m > s.search_min_m or window_rad > s.search_min_rad:
             match = self._search(scan, match, T_guess, T_guess, information, local, window_m, window_rad)
         if match.share < s.good_share:  # a prediction this wrong may be worse than none
             wide_m, wide_rad = max(window_m, 0.4), max(window_rad, math.radians(20.0))
             match = self._search(scan, match, T_guess, T_map_last, information, local, wide_m, wide_rad)
         if match.share < s.lost_share:
-            match = self._search(scan, match, T_guess, T_map_last, information, local, s.search_max_m, s.search_max_rad)
+            match = self._search(
+                scan, match, T_guess, T_map_last, information, local, s.search_max_m, s.search_max_rad
+            )
+        points = scan.features()
         if raw.time_increment_s > 0.0:
             motion = se2.between(T_map_last, match.T_map_body)
             scan = self.prepare(raw, self.scan_velocity(raw, motion))
             points = scan.features()
-            match = refine(points, scan.origin_body, match.T_map_body, tables, s, T_guess, information,
-                           anneal=(1.0,))  # fmt: skip
-        return scan, match, self._trusted(prediction, T_guess, match)
+            match = refine(
+                points, scan.origin_body, match.T_map_body, tables, s, T_guess, information, anneal=(1.0,)
+            )
+        trusted = self._trusted(prediction, T_guess, match)
+        return scan, without_slip(points, scan.origin_body, match, tables, s), trusted
 
     def _trusted(self, prediction: Prediction, T_guess: np.ndarray, match: Match) -> bool:
         """Enough agrees; more has to agree where the prediction says something else or nothing."""
@@ -171,9 +194,16 @@ class FrontEnd:
         return match.share >= (s.sure_share if far or prediction.blind else s.lost_share)
 
     def _search(
-        self, scan: PreparedScan, best: Match, T_prior: np.ndarray, T_centre: np.ndarray, information: np.ndarray,
-        local: LocalMap, window_m: float, window_rad: float,
-    ) -> Match:  # fmt: skip
+        self,
+        scan: PreparedScan,
+        best: Match,
+        T_prior: np.ndarray,
+        T_centre: np.ndarray,
+        information: np.ndarray,
+        local: LocalMap,
+        window_m: float,
+        window_rad: float,
+    ) -> Match:
         """The best of the given match and of those found in a window."""
         tables, s = local.surfels.tables(), self.settings
         points = scan.features()
@@ -183,12 +213,27 @@ class FrontEnd:
                 best = other
         return best
 
-    def accept(self, stamp_ns: int, T_odom_body: np.ndarray, options: list[tuple[Predictor, np.ndarray]]) -> None:
-        """Take in the pose of the newest scan; predictors and the delay learn from it."""
+    def accept(
+        self,
+        stamp_ns: int,
+        T_odom_body: np.ndarray,
+        options: list[tuple[Predictor, np.ndarray]],
+        information: np.ndarray | None = None,  # of the match, axes of the map it was matched to
+        T_odom_map: np.ndarray | None = None,
+    ) -> None:
+        """Take in the pose of the newest scan; predictors and the delay learn from it, but only in directions
+        the match knows: a corridor must not teach that the wheels are wrong."""
         if self.poses:
             moved = se2.between(self.poses[-1], T_odom_body)
+            blind = None
+            if information is not None and T_odom_map is not None:
+                v = weak_direction(information)
+                if 1.0 / max(float(v @ information[:2, :2] @ v), 1e-9) > LEARN_SIGMA_M**2:
+                    turn = T_odom_map[2] - self.poses[-1][2]
+                    c, s = math.cos(turn), math.sin(turn)
+                    blind = np.array([c * v[0] - s * v[1], s * v[0] + c * v[1]])
             for predictor, motion in options:
-                predictor.learn(motion, moved)
+                predictor.learn(motion, moved, blind)
             self.odometry.observe_turn(self.stamps[-1], stamp_ns, float(moved[2]))
         self.stamps.append(stamp_ns)
         self.poses.append(T_odom_body)
@@ -211,6 +256,10 @@ def exp_twist(velocity: np.ndarray, dt_s: float) -> np.ndarray:
     half = 0.5 * yaw
     sinc = 1.0 - half * half / 6.0 if abs(half) < 1e-3 else math.sin(half) / half
     c, s = math.cos(half) * sinc, math.sin(half) * sinc
-    return np.array([
-        (c * velocity[0] - s * velocity[1]) * dt_s, (s * velocity[0] + c * velocity[1]) * dt_s, se2.wrap(yaw)
-    ])  # fmt: skip
+    return np.array(
+        [
+            (c * velocity[0] - s * velocity[1]) * dt_s,
+            (s * velocity[0] + c * velocity[1]) * dt_s,
+            se2.wrap(yaw),
+        ]
+    )

@@ -85,18 +85,30 @@ def run_job(snapshot: Snapshot, refine_rounds: int = 0) -> JobResult:
     drawn: dict[int, FrozenMap] = {}
     for _ in range(refine_rounds):
         drawn, constraints = refine_submaps(
-            snapshot.settings, snapshot.nodes, snapshot.members, frozen, constraints,
-            dict(zip(snapshot.submap_ids, solution.T_map_submap)), dict(zip(snapshot.node_ids, solution.T_map_node)),
-        )  # fmt: skip
+            snapshot.settings,
+            snapshot.nodes,
+            snapshot.members,
+            frozen,
+            constraints,
+            dict(zip(snapshot.submap_ids, solution.T_map_submap)),
+            dict(zip(snapshot.node_ids, solution.T_map_node)),
+        )
         frozen.update(drawn)
         edges = edges_of(constraints, submap_row, node_row)
         solution = optimise(solution.T_map_submap, solution.T_map_node, edges, fixed)
     constraints = _without_outliers(constraints, solution.chi2, node_row)
     return JobResult(
-        snapshot.number, constraints, len(snapshot.constraints),
-        dict(zip(snapshot.submap_ids, solution.T_map_submap)), dict(zip(snapshot.node_ids, solution.T_map_node)),
-        drawn, still, tried, len(found), snapshot.unlinked_from is None or link is not None,
-    )  # fmt: skip
+        snapshot.number,
+        constraints,
+        len(snapshot.constraints),
+        dict(zip(snapshot.submap_ids, solution.T_map_submap)),
+        dict(zip(snapshot.node_ids, solution.T_map_node)),
+        drawn,
+        still,
+        tried,
+        len(found),
+        snapshot.unlinked_from is None or link is not None,
+    )
 
 
 def _without_outliers(
@@ -154,10 +166,13 @@ def _nearest_member(snapshot: Snapshot, edges: Edges, row: int) -> np.ndarray:
 
 
 def _places(
-    snapshot: Snapshot, edges: Edges, row: int, own: list[int],
+    snapshot: Snapshot,
+    edges: Edges,
+    row: int,
+    own: list[int],
     windows: tuple[np.ndarray, np.ndarray],
-) -> tuple[list[Place], bool]:  # fmt: skip
-    """Submaps of other passes right here, nearest first; the flag: some are too uncertain for a narrow search."""
+) -> tuple[list[Place], bool]:
+    """Submaps of other passes right here, nearest first; the flag: some are too uncertain for that."""
     s = snapshot.settings
     distance = _nearest_member(snapshot, edges, row)
     distance[[k for o in own for k in (o - 1, o, o + 1) if 0 <= k < len(distance)]] = np.inf
@@ -173,14 +188,20 @@ def _places(
             continue
         taken.append(int(k))
         T = se2.between(snapshot.T_map_submap[k], snapshot.T_map_node[row])
-        places.append(Place(submap_id, snapshot.frozen[submap_id], T, float(windows[0][k]), float(windows[1][k])))
+        places.append(
+            Place(submap_id, snapshot.frozen[submap_id], T, float(windows[0][k]), float(windows[1][k]))
+        )
     return places, unsure
 
 
 def _close_wide(
-    snapshot: Snapshot, edges: Edges, node_row: dict[int, int], centre: int,
-    windows: dict[int, tuple[np.ndarray, np.ndarray]], drift: DriftModel,
-) -> tuple[list[Constraint], list[int]]:  # fmt: skip
+    snapshot: Snapshot,
+    edges: Edges,
+    node_row: dict[int, int],
+    centre: int,
+    windows: dict[int, tuple[np.ndarray, np.ndarray]],
+    drift: DriftModel,
+) -> tuple[list[Constraint], list[int]]:
     s = snapshot.settings
     row = node_row[centre]
     own = sorted(set(_submaps_of(edges, row).tolist()))
@@ -205,9 +226,15 @@ def _close_wide(
         constraint = close_wide(snapshot.nodes[centre], chunk, place, snapshot.cache, s)
         tried.append(submap_id)
         if constraint is not None and confirmed(
-            constraint, snapshot.node_ids, snapshot.nodes, snapshot.members, snapshot.frozen,
-            dict(zip(snapshot.submap_ids, snapshot.T_map_submap)), dict(zip(snapshot.node_ids, snapshot.T_map_node)),
-            snapshot.cache, s,
-        ):  # fmt: skip
+            constraint,
+            snapshot.node_ids,
+            snapshot.nodes,
+            snapshot.members,
+            snapshot.frozen,
+            dict(zip(snapshot.submap_ids, snapshot.T_map_submap)),
+            dict(zip(snapshot.node_ids, snapshot.T_map_node)),
+            snapshot.cache,
+            s,
+        ):
             found.append(constraint)
     return found, tried

@@ -11,8 +11,16 @@ from scipy.sparse.csgraph import dijkstra
 
 from services.localization.lidar2d import se2
 from services.localization.lidar2d.branch_bound import branch_and_bound
-from services.localization.lidar2d.matching import Match, refine, search
-from services.localization.lidar2d.nodes import Constraint, Keynode, TableCache, edge_information, merged_features
+from services.localization.lidar2d.correlative import search
+from services.localization.lidar2d.matching import Match, refine
+from services.localization.lidar2d.nodes import (
+    Constraint,
+    Keynode,
+    TableCache,
+    edge_information,
+    merged_features,
+)
+from services.localization.lidar2d.observability import without_slip
 from services.localization.lidar2d.pose_graph import Edges
 from services.localization.lidar2d.settings import LidarSlamSettings
 from services.localization.lidar2d.surfel_map import FrozenMap
@@ -38,7 +46,7 @@ class Place:
 def _link_variances(
     submap: np.ndarray, first: np.ndarray, var_m: np.ndarray, var_rad: np.ndarray, links: np.ndarray
 ) -> None:
-    """Smallest variance of a path from submap to submap over one shared node, float64 [3, S, S] (m2, rad2, hops)."""
+    """Smallest variance from submap to submap over a shared node, float64 [3, S, S] (m2, rad2, hops)."""
     for n in range(first.shape[0] - 1):
         for i in range(first[n], first[n + 1]):
             for j in range(first[n], i):
@@ -52,7 +60,7 @@ def _link_variances(
 
 
 class DriftModel:
-    """How far the relative pose of two submaps may be off: the shortest path of uncertainties between them."""
+    """How far two submaps may be off: the shortest path of uncertainties between them."""
 
     def __init__(self, edges: Edges, n_submaps: int, n_nodes: int, settings: LidarSlamSettings) -> None:
         s = settings
@@ -79,7 +87,9 @@ class DriftModel:
         return window_m, math.radians(1.5) + 3.0 * np.sqrt(var_rad)
 
 
-def close_narrow(node: Keynode, place: Place, cache: TableCache, settings: LidarSlamSettings) -> Constraint | None:
+def close_narrow(
+    node: Keynode, place: Place, cache: TableCache, settings: LidarSlamSettings
+) -> Constraint | None:
     """One scan against one submap, the guess is good to some decimetres."""
     tables = cache.tables(place.submap, place.frozen)
     features = node.scan.features.astype(np.float64)
@@ -87,11 +97,13 @@ def close_narrow(node: Keynode, place: Place, cache: TableCache, settings: Lidar
         return None
     best = refine(features, node.scan.origin, place.T_submap_node, tables, settings)
     if place.window_m > 0.2 or place.window_rad > math.radians(4.0) or best.share < 0.8:
-        for _, T_start in search(features, place.T_submap_node, tables, place.window_m, place.window_rad, 0.02):
+        for _, T_start in search(
+            features, place.T_submap_node, tables, place.window_m, place.window_rad, 0.02
+        ):
             other = refine(features, node.scan.origin, T_start, tables, settings)
             if other.share * other.known > best.share * best.known + 0.02:
                 best = other
-    return _accepted(node, place, best, settings)
+    return _accepted(node, place, without_slip(features, node.scan.origin, best, tables, settings), settings)
 
 
 def close_wide(
@@ -103,9 +115,14 @@ def close_wide(
         return None
     window_m, window_rad = min(place.window_m, settings.wide_limit_m), min(place.window_rad, math.pi)
     found = branch_and_bound(
-        features[:: max(1, len(features) // 150)], place.T_submap_node, cache.pyramid(place.submap, place.frozen),
-        window_m, window_rad, settings.wide_score, keep=0.75,
-    )  # fmt: skip
+        features[:: max(1, len(features) // 150)],
+        place.T_submap_node,
+        cache.pyramid(place.submap, place.frozen),
+        window_m,
+        window_rad,
+        settings.wide_score,
+        keep=0.75,
+    )
     if not found:
         return None
     tables = cache.tables(place.submap, place.frozen)
@@ -123,8 +140,9 @@ def close_wide(
         )
         if apart and other.share > best.share - AMBIGUOUS:
             return None
-    single = refine(node.scan.features.astype(np.float64), node.scan.origin, best.T_map_body, tables, settings)  # fmt: skip
-    return _accepted(node, place, single, settings)
+    own = node.scan.features.astype(np.float64)
+    single = refine(own, node.scan.origin, best.T_map_body, tables, settings)
+    return _accepted(node, place, without_slip(own, node.scan.origin, single, tables, settings), settings)
 
 
 def confirmed(
@@ -143,8 +161,9 @@ def confirmed(
     The neighbourhood of the node is laid rigidly over the neighbourhood of the submap; each check matches one
     scan against the submap of the other pass it then lies in.
     """
-    T_shift = se2.compose(se2.compose(T_map_submap[link.submap], link.T_submap_node),
-                          se2.inverse(T_map_node[link.node]))  # fmt: skip
+    T_shift = se2.compose(
+        se2.compose(T_map_submap[link.submap], link.T_submap_node), se2.inverse(T_map_node[link.node])
+    )
     position = {n: k for k, n in enumerate(node_ids)}
     near = [s for s in frozen if abs(s - link.submap) <= 6]
     places = [(T_map_node[m][:2], s) for s in near for m in members[s] if m in T_map_node]
@@ -162,9 +181,13 @@ def confirmed(
         submap = places[int(np.argmin(away))][1]
         if node.id in members[submap]:
             continue
-        match = refine(node.scan.features.astype(np.float64), node.scan.origin,
-                       se2.between(T_map_submap[submap], T_map_guess), cache.tables(submap, frozen[submap]),
-                       settings)  # fmt: skip
+        match = refine(
+            node.scan.features.astype(np.float64),
+            node.scan.origin,
+            se2.between(T_map_submap[submap], T_map_guess),
+            cache.tables(submap, frozen[submap]),
+            settings,
+        )
         if match.known >= settings.loop_known:
             shares.append(match.share)
     return len(shares) >= 2 and float(np.mean(shares)) >= CHECK_SHARE and min(shares) >= 0.5

@@ -12,7 +12,14 @@ from services.localization.lidar2d import se2
 from services.localization.lidar2d.backend import BackEnd
 from services.localization.lidar2d.frontend import LocalMap
 from services.localization.lidar2d.movers import contradicts_free_space, grow_along_beams
-from services.localization.lidar2d.nodes import Constraint, Keynode, KeyScan, Submap, edge_information, link_information
+from services.localization.lidar2d.nodes import (
+    Constraint,
+    Keynode,
+    KeyScan,
+    Submap,
+    edge_information,
+    link_information,
+)
 from services.localization.lidar2d.occupancy import CountGrid
 from services.localization.lidar2d.scan import PreparedScan
 from services.localization.lidar2d.settings import LidarSlamSettings
@@ -55,14 +62,27 @@ class LocalMapper:
         local = self._active[0].local
         surfels, seeds = local.surfels, np.empty(len(scan), dtype=bool)
         contradicts_free_space(
-            scan.points_body, se2.between(local.T_odom_map, T_odom_body), surfels.nearest, surfels.means, surfels.hits,
-            surfels.misses, surfels.row0, surfels.col0, surfels.cell_m, seeds,
-        )  # fmt: skip
+            scan.points_body,
+            se2.between(local.T_odom_map, T_odom_body),
+            surfels.nearest,
+            surfels.means,
+            surfels.hits,
+            surfels.misses,
+            surfels.row0,
+            surfels.col0,
+            surfels.cell_m,
+            seeds,
+        )
         grow_along_beams(seeds, scan.points_body, scan.beams, 0.15, moving)
         return moving
 
     def insert(
-        self, stamp_ns: int, scan: PreparedScan, T_odom_body: np.ndarray, moving: np.ndarray, information: np.ndarray
+        self,
+        stamp_ns: int,
+        scan: PreparedScan,
+        T_odom_body: np.ndarray,
+        moving: np.ndarray,
+        information: np.ndarray,
     ) -> bool:
         """Put the scan into the active submaps if it adds anything (motion filter)."""
         if self._active and not self._is_key(stamp_ns, T_odom_body):
@@ -72,16 +92,23 @@ class LocalMapper:
             if len(self._active) == 2:
                 done = self._active.pop(0)
                 done.submap.frozen = freeze(done.local.surfels)
-            self._active.append(_Active(self.back.start_submap(T_odom_body), LocalMap(T_odom_body, SurfelMap(s))))
+            self._active.append(
+                _Active(self.back.start_submap(T_odom_body), LocalMap(T_odom_body, SurfelMap(s)))
+            )
         node = Keynode(self.back.next_node_id, stamp_ns, T_odom_body, KeyScan.of(scan, moving))
         matched = edge_information(information, s.edge_sigma_m, s.edge_sigma_rad)
         edges = []
         for active in self._active:
+            active.submap.frozen = None  # what was frozen for a last optimisation goes on growing
             T = se2.between(active.local.T_odom_map, T_odom_body)
             active.local.surfels.insert(
-                se2.transform(T, scan.points_body), se2.transform(np.array([0.0, 0.0, T[2]]), scan.tangents),
-                scan.spacing_m, se2.transform(T, scan.origin_body[None])[0], ~moving, ~moving,
-            )  # fmt: skip
+                se2.transform(T, scan.points_body),
+                se2.transform(np.array([0.0, 0.0, T[2]]), scan.tangents),
+                scan.spacing_m,
+                se2.transform(T, scan.origin_body[None])[0],
+                ~moving,
+                ~moving,
+            )
             info = matched if active is self._active[0] else link_information(information, s)
             edges.append(Constraint(active.submap.id, node.id, T, info, False))
         self.back.add_keynode(node, edges)
@@ -111,18 +138,26 @@ class LocalMapper:
 
     def with_frozen(self, work: Callable[[], None]) -> None:
         """Do something while the active submaps look finished (saving)."""
-        before = [active.submap.frozen for active in self._active]
-        self.freeze_active()
+        growing = [active for active in self._active if active.submap.frozen is None]
+        for active in growing:
+            active.submap.frozen = freeze(active.local.surfels)
         try:
             work()
         finally:
-            for active, frozen in zip(self._active, before):
-                active.submap.frozen = frozen
+            for active in growing:
+                active.submap.frozen = None
 
     def count_grids(self) -> list[CountGrid]:
-        """Hits and misses of the active submaps."""
+        """Hits and misses of the submaps that are not frozen."""
         return [
-            CountGrid(a.local.surfels.hits, a.local.surfels.misses, a.local.surfels.row0, a.local.surfels.col0,
-                      a.local.surfels.cell_m, a.submap.T_map_submap)
+            CountGrid(
+                a.local.surfels.hits,
+                a.local.surfels.misses,
+                a.local.surfels.row0,
+                a.local.surfels.col0,
+                a.local.surfels.cell_m,
+                a.submap.T_map_submap,
+            )
             for a in self._active
-        ]  # fmt: skip
+            if a.submap.frozen is None
+        ]

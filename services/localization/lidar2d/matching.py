@@ -1,4 +1,4 @@
-"""Scan to map: correlative search over the likelihood field, then Gauss-Newton on surface elements."""
+"""Scan to map: robust Gauss-Newton on surface elements, from wherever a search or a prediction starts it."""
 
 from __future__ import annotations
 
@@ -33,8 +33,13 @@ def accumulate(
     points: np.ndarray,  # float64 [K, 5] body frame: x, y, tangent x, tangent y, half spacing
     origin: np.ndarray,  # float64 [2] lidar in the body frame
     T: np.ndarray,  # float64 [3] T_map_body
-    nearest: np.ndarray, means: np.ndarray, omegas: np.ndarray, views: np.ndarray,
-    row0: int, col0: int, cell_m: float,
+    nearest: np.ndarray,
+    means: np.ndarray,
+    omegas: np.ndarray,
+    views: np.ndarray,
+    row0: int,
+    col0: int,
+    cell_m: float,
     scale2: float,  # squared outlier scale, in units of the surface's standard deviation
     H: np.ndarray,  # out float64 [3, 3]
     g: np.ndarray,  # out float64 [3]
@@ -59,7 +64,7 @@ def accumulate(
         px, py = points[i, 0], points[i, 1]
         rx, ry = c * px - s * py, s * px + c * py
         x, y = T[0] + rx, T[1] + ry
-        r, q = int(math.floor(y * inv)) - row0, int(math.floor(x * inv)) - col0
+        r, q = math.floor(y * inv) - row0, math.floor(x * inv) - col0
         if r < 0 or q < 0 or r >= rows or q >= cols:
             continue
         k = nearest[r, q]
@@ -130,9 +135,16 @@ def solve3(A: np.ndarray, b: np.ndarray, x: np.ndarray) -> bool:
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def gauss_newton(
-    points: np.ndarray, origin: np.ndarray, T_start: np.ndarray,
-    nearest: np.ndarray, means: np.ndarray, omegas: np.ndarray, views: np.ndarray,
-    row0: int, col0: int, cell_m: float,
+    points: np.ndarray,
+    origin: np.ndarray,
+    T_start: np.ndarray,
+    nearest: np.ndarray,
+    means: np.ndarray,
+    omegas: np.ndarray,
+    views: np.ndarray,
+    row0: int,
+    col0: int,
+    cell_m: float,
     prior_T: np.ndarray,  # float64 [3]
     prior_information: np.ndarray,  # float64 [3, 3], zeros = no prior
     outlier: float,  # units of the surface's standard deviation
@@ -142,7 +154,7 @@ def gauss_newton(
     T: np.ndarray,  # out float64 [3]
     H: np.ndarray,  # out float64 [3, 3] information of the scan alone
 ) -> tuple[float, float, float]:
-    """Iteratively reweighted Gauss-Newton with a robust prior; the step is damped where the scan says nothing."""
+    """Iteratively reweighted Gauss-Newton with a robust prior; damped where the scan says nothing."""
     g, A, b, step, e = np.empty(3), np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(3)
     T[:] = T_start
     weights = found = cost = 0.0
@@ -182,48 +194,23 @@ def gauss_newton(
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def known_returns(
-    points: np.ndarray, T: np.ndarray, nearest: np.ndarray, seen: np.ndarray, row0: int, col0: int, cell_m: float
+    points: np.ndarray,
+    T: np.ndarray,
+    nearest: np.ndarray,
+    seen: np.ndarray,
+    row0: int,
+    col0: int,
+    cell_m: float,
 ) -> int:
     """Returns that fall where the map knows anything: a surface in reach or a cell a beam crossed."""
     c, s = math.cos(T[2]), math.sin(T[2])
     n = 0
     for i in range(points.shape[0]):
         x, y = T[0] + c * points[i, 0] - s * points[i, 1], T[1] + s * points[i, 0] + c * points[i, 1]
-        r, q = int(math.floor(y / cell_m)) - row0, int(math.floor(x / cell_m)) - col0
+        r, q = math.floor(y / cell_m) - row0, math.floor(x / cell_m) - col0
         if 0 <= r < nearest.shape[0] and 0 <= q < nearest.shape[1] and (nearest[r, q] >= 0 or seen[r, q] > 0):
             n += 1
     return n
-
-
-@njit(nogil=True, cache=True, error_model="numpy")
-def correlate(
-    points: np.ndarray,  # float64 [K, 2] body frame
-    T: np.ndarray,  # float64 [3] centre of the window
-    field: np.ndarray,  # uint8 [H, W]
-    row0: int, col0: int, cell_m: float,
-    steps_xy: int, stride: int,  # window of +-steps_xy * stride cells
-    steps_yaw: int, step_yaw_rad: float,
-    scores: np.ndarray,  # out float32 [2 steps_yaw + 1, 2 steps_xy + 1, 2 steps_xy + 1], mean likelihood
-) -> None:
-    """Real-time correlative scan matching (Olson 2009): the score of every pose in a window."""
-    n = points.shape[0]
-    rows, cols = np.empty(n, dtype=np.int32), np.empty(n, dtype=np.int32)
-    for a in range(2 * steps_yaw + 1):
-        yaw = T[2] + (a - steps_yaw) * step_yaw_rad
-        c, s = math.cos(yaw), math.sin(yaw)
-        for i in range(n):
-            rows[i] = int(math.floor((T[1] + s * points[i, 0] + c * points[i, 1]) / cell_m)) - row0
-            cols[i] = int(math.floor((T[0] + c * points[i, 0] - s * points[i, 1]) / cell_m)) - col0
-        for iy in range(2 * steps_xy + 1):
-            dr = (iy - steps_xy) * stride
-            for ix in range(2 * steps_xy + 1):
-                dc = (ix - steps_xy) * stride
-                total = 0
-                for i in range(n):
-                    r, q = rows[i] + dr, cols[i] + dc
-                    if r >= 0 and q >= 0 and r < field.shape[0] and q < field.shape[1]:
-                        total += field[r, q]
-                scores[a, iy, ix] = total / (255.0 * n)
 
 
 def refine(
@@ -243,47 +230,26 @@ def refine(
     if prior_T is None or prior_information is None:
         prior_T, prior_information = T_start, np.zeros((3, 3))
     weights, _, cost = gauss_newton(
-        points, origin, T_start, tables.nearest, tables.means, tables.omegas, tables.views, tables.row0, tables.col0,
-        tables.cell_m, prior_T, prior_information, settings.outlier_m / sigma_m, settings.beams_per_fact,
-        np.array(anneal), iterations, T, H,
-    )  # fmt: skip
+        points,
+        origin,
+        T_start,
+        tables.nearest,
+        tables.means,
+        tables.omegas,
+        tables.views,
+        tables.row0,
+        tables.col0,
+        tables.cell_m,
+        prior_T,
+        prior_information,
+        settings.outlier_m / sigma_m,
+        settings.beams_per_fact,
+        np.array(anneal),
+        iterations,
+        T,
+        H,
+    )
     n = max(len(points), 1)
     known = known_returns(points, T, tables.nearest, tables.seen, tables.row0, tables.col0, tables.cell_m)
     residual = sigma_m * math.sqrt(max(cost, 0.0) / weights) if weights > 0 else math.inf
     return Match(T, H, weights / max(known, 1), known / n, residual)
-
-
-def search(
-    points: np.ndarray,
-    T_centre: np.ndarray,
-    tables: MatchTables,
-    window_m: float,
-    window_rad: float,
-    prior_weight: float = 0.0,
-    candidates: int = 3,
-    step_yaw_rad: float = math.radians(1.5),
-) -> list[tuple[float, np.ndarray]]:
-    """The best distinct poses (score, T_map_body) of a window; the score falls with the squared distance
-    from the centre by `prior_weight` at its border."""
-    stride = 2
-    steps_xy = max(1, math.ceil(window_m / (stride * tables.cell_m)))
-    steps_yaw = max(1, math.ceil(window_rad / step_yaw_rad))
-    subset = points[:: max(1, len(points) // 100)]
-    scores = np.empty((2 * steps_yaw + 1, 2 * steps_xy + 1, 2 * steps_xy + 1), dtype=np.float32)
-    correlate(subset, T_centre, tables.field, tables.row0, tables.col0, tables.cell_m, steps_xy, stride, steps_yaw,
-              step_yaw_rad, scores)  # fmt: skip
-    grid_xy = np.linspace(-1.0, 1.0, 2 * steps_xy + 1) ** 2
-    grid_yaw = np.linspace(-1.0, 1.0, 2 * steps_yaw + 1) ** 2
-    ranked = scores - prior_weight * (grid_yaw[:, None, None] + grid_xy[:, None] + grid_xy)
-    best = []
-    for _ in range(candidates):
-        a, iy, ix = np.unravel_index(int(np.argmax(ranked)), ranked.shape)
-        T = T_centre + np.array([
-            (ix - steps_xy) * stride * tables.cell_m, (iy - steps_xy) * stride * tables.cell_m,
-            (a - steps_yaw) * step_yaw_rad,
-        ])  # fmt: skip
-        best.append((float(scores[a, iy, ix]), T))
-        ranked[max(a - 2, 0) : a + 3, max(iy - 1, 0) : iy + 2, max(ix - 1, 0) : ix + 2] = -np.inf
-        if not np.isfinite(ranked).any():
-            break
-    return best

@@ -45,7 +45,9 @@ def read_relations(path: Path) -> tuple[np.ndarray, np.ndarray]:
         if not fields or fields[0].startswith("#"):
             continue
         if len(fields) != 8:
-            raise ValueError(f"{path}:{number}: {len(fields)} columns, expected 8: t1 t2 x y z roll pitch yaw")
+            raise ValueError(
+                f"{path}:{number}: {len(fields)} columns, expected 8: t1 t2 x y z roll pitch yaw"
+            )
         try:
             stamps.append([stamp_ns_of(fields[0]), stamp_ns_of(fields[1])])
             relative.append([float(fields[2]), float(fields[3]), float(fields[7])])
@@ -82,18 +84,24 @@ def relation_errors(
     translation = np.hypot(difference[:, 0], difference[:, 1])
     rotation = np.degrees(np.abs(difference[:, 2]))
     return RelationErrors(
-        int(ok.sum()), int((~ok).sum()),
-        float(translation.mean()), float(translation.std()), float(rotation.mean()), float(rotation.std()),
-    )  # fmt: skip
+        int(ok.sum()),
+        int((~ok).sum()),
+        float(translation.mean()),
+        float(translation.std()),
+        float(rotation.mean()),
+        float(rotation.std()),
+    )
 
 
 def trajectory_errors(
     T_map_body: np.ndarray,  # float64 [N, 3], estimated
     T_world_body: np.ndarray,  # float64 [N, 3], truth at the same stamps
 ) -> TrajectoryErrors:
-    """ATE aligned by the first pose only, ATE after the best rigid alignment, yaw RMSE (first pose aligned)."""
+    """ATE aligned by the first pose only, ATE after the best rigid alignment, yaw RMSE."""
     if T_map_body.shape != T_world_body.shape or len(T_map_body) == 0:
-        raise ValueError(f"estimate {T_map_body.shape} and truth {T_world_body.shape} must be equal [N > 0, 3]")
+        raise ValueError(
+            f"estimate {T_map_body.shape} and truth {T_world_body.shape} must be equal [N > 0, 3]"
+        )
     T_world_map = se2.compose(T_world_body[0], se2.inverse(T_map_body[0]))
     aligned = se2.compose_many(T_world_map, T_map_body)
     first = np.hypot(*(aligned[:, :2] - T_world_body[:, :2]).T)
@@ -120,11 +128,17 @@ def interpolate_poses(
     base = int(stamps_ns[0])
     t, q = (stamps_ns - base) * 1e-9, (at_ns - base) * 1e-9
     yaw = np.unwrap(poses[:, 2])
-    columns = [np.interp(q, t, poses[:, 0]), np.interp(q, t, poses[:, 1]), se2.wrap_many(np.interp(q, t, yaw))]
+    columns = [
+        np.interp(q, t, poses[:, 0]),
+        np.interp(q, t, poses[:, 1]),
+        se2.wrap_many(np.interp(q, t, yaw)),
+    ]
     return np.stack(columns, axis=1)
 
 
-def nearest_stamps(stamps_ns: np.ndarray, wanted_ns: np.ndarray, tolerance_ns: int) -> tuple[np.ndarray, np.ndarray]:
+def nearest_stamps(
+    stamps_ns: np.ndarray, wanted_ns: np.ndarray, tolerance_ns: int
+) -> tuple[np.ndarray, np.ndarray]:
     """Index of the nearest stamp for each wanted one and whether it lies within the tolerance."""
     if len(stamps_ns) == 0:
         return np.zeros(len(wanted_ns), dtype=np.int64), np.zeros(len(wanted_ns), dtype=bool)

@@ -15,18 +15,22 @@ CLEARANCE_M = 0.12  # a return this close to a known surface belongs to it
 def contradicts_free_space(
     points: np.ndarray,  # float64 [M, 2] body frame
     T: np.ndarray,  # float64 [3] T_map_body
-    nearest: np.ndarray, means: np.ndarray,
-    hits: np.ndarray, misses: np.ndarray,  # uint8 [H, W]
-    row0: int, col0: int, cell_m: float,
+    nearest: np.ndarray,
+    means: np.ndarray,
+    hits: np.ndarray,
+    misses: np.ndarray,  # uint8 [H, W]
+    row0: int,
+    col0: int,
+    cell_m: float,
     out: np.ndarray,  # out bool [M]
-) -> None:  # fmt: skip
+) -> None:
     """A return is on something that was not there: its cell and all around it were seen free often, hit
     hardly ever, and no surface is near."""
     c, s = math.cos(T[2]), math.sin(T[2])
     for i in range(points.shape[0]):
         out[i] = False
         x, y = T[0] + c * points[i, 0] - s * points[i, 1], T[1] + s * points[i, 0] + c * points[i, 1]
-        r, q = int(math.floor(y / cell_m)) - row0, int(math.floor(x / cell_m)) - col0
+        r, q = math.floor(y / cell_m) - row0, math.floor(x / cell_m) - col0
         if r < 1 or q < 1 or r >= hits.shape[0] - 1 or q >= hits.shape[1] - 1:
             continue
         k = nearest[r, q]
@@ -59,8 +63,10 @@ def grow_along_beams(
         for step in range(m):
             i = step if direction == 1 else m - 1 - step
             j = i - direction
-            joined = 0 <= j < m and abs(beams[i] - beams[j]) <= 2 and (
-                math.hypot(points[i, 0] - points[j, 0], points[i, 1] - points[j, 1]) < gap_m
+            joined = (
+                0 <= j < m
+                and abs(beams[i] - beams[j]) <= 2
+                and (math.hypot(points[i, 0] - points[j, 0], points[i, 1] - points[j, 1]) < gap_m)
             )
             if not joined:
                 run, grown = 0, 0

@@ -32,9 +32,13 @@ class KeyScan:
     def of(scan: PreparedScan, moving: np.ndarray) -> KeyScan:
         static = ~moving[scan.match_index]
         return KeyScan(
-            scan.points_body.astype(np.float32), scan.tangents.astype(np.float32), scan.spacing_m.astype(np.float32),
-            moving, scan.features()[static].astype(np.float32), scan.origin_body,
-        )  # fmt: skip
+            scan.points_body.astype(np.float32),
+            scan.tangents.astype(np.float32),
+            scan.spacing_m.astype(np.float32),
+            moving,
+            scan.features()[static].astype(np.float32),
+            scan.origin_body,
+        )
 
 
 @dataclass(frozen=True)
@@ -122,10 +126,12 @@ def edges_of(constraints: list[Constraint], submap_row: dict[int, int], node_row
     order = np.argsort(node, kind="stable")
     chosen = [constraints[i] for i in order]
     return Edges(
-        np.array([submap_row[c.submap] for c in chosen], dtype=np.int32), node[order],
+        np.array([submap_row[c.submap] for c in chosen], dtype=np.int32),
+        node[order],
         np.array([c.T_submap_node for c in chosen]).reshape(-1, 3),
-        np.array([c.information for c in chosen]).reshape(-1, 3, 3), np.array([c.loop for c in chosen], dtype=bool),
-    )  # fmt: skip
+        np.array([c.information for c in chosen]).reshape(-1, 3, 3),
+        np.array([c.loop for c in chosen], dtype=bool),
+    )
 
 
 def edge_information(match_information: np.ndarray, sigma_m: float, sigma_rad: float) -> np.ndarray:
@@ -154,7 +160,9 @@ def merged_features(nodes: list[Keynode], centre: Keynode, limit: int = 360) -> 
         T_centre_node = se2.between(centre.T_odom_body, node.T_odom_body)
         f = node.scan.features.astype(np.float64)
         turn = np.array([0.0, 0.0, T_centre_node[2]])
-        parts.append(np.column_stack([se2.transform(T_centre_node, f[:, :2]), se2.transform(turn, f[:, 2:4]), f[:, 4]]))
+        parts.append(
+            np.column_stack([se2.transform(T_centre_node, f[:, :2]), se2.transform(turn, f[:, 2:4]), f[:, 4]])
+        )
     merged = np.concatenate(parts)
     # One return per 10 cm cell: near walls would outvote far ones.
     cells = np.floor(merged[:, :2] / 0.1).astype(np.int64)

@@ -29,21 +29,30 @@ class OccupancyGrid:
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def add_counts(
-    hits: np.ndarray, misses: np.ndarray,  # uint8 [h, w] of a submap
-    row0: int, col0: int, cell_m: float,
+    hits: np.ndarray,
+    misses: np.ndarray,  # uint8 [h, w] of a submap
+    row0: int,
+    col0: int,
+    cell_m: float,
     T_submap_map: np.ndarray,  # float64 [3]
-    origin_x: float, origin_y: float, resolution: float,
-    low_row: int, high_row: int, low_col: int, high_col: int,
-    sum_hits: np.ndarray, sum_misses: np.ndarray,  # in out float32 [H, W]
-) -> None:  # fmt: skip
+    origin_x: float,
+    origin_y: float,
+    resolution: float,
+    low_row: int,
+    high_row: int,
+    low_col: int,
+    high_col: int,
+    sum_hits: np.ndarray,
+    sum_misses: np.ndarray,  # in out float32 [H, W]
+) -> None:
     """Each map cell asks the submap's cell at its centre (so that turning leaves no holes)."""
     c, s = math.cos(T_submap_map[2]), math.sin(T_submap_map[2])
     for r in range(low_row, high_row):
         y = origin_y + (r + 0.5) * resolution
         for q in range(low_col, high_col):
             x = origin_x + (q + 0.5) * resolution
-            i = int(math.floor((T_submap_map[1] + s * x + c * y) / cell_m)) - row0
-            j = int(math.floor((T_submap_map[0] + c * x - s * y) / cell_m)) - col0
+            i = math.floor((T_submap_map[1] + s * x + c * y) / cell_m) - row0
+            j = math.floor((T_submap_map[0] + c * x - s * y) / cell_m) - col0
             if 0 <= i < hits.shape[0] and 0 <= j < hits.shape[1]:
                 sum_hits[r, q] += hits[i, j]
                 sum_misses[r, q] += misses[i, j]
@@ -62,9 +71,12 @@ class CountGrid:
 
     def corners(self) -> np.ndarray:
         """Corners of what was seen in the map frame, float64 [4, 2]."""
-        rows, cols = self.hits.shape
-        x = np.array([0, cols, cols, 0]) + self.col0
-        y = np.array([0, 0, rows, rows]) + self.row0
+        seen = (self.hits > 0) | (self.misses > 0)
+        rows, cols = np.flatnonzero(seen.any(axis=1)), np.flatnonzero(seen.any(axis=0))
+        if len(rows) == 0:
+            return se2.transform(self.T_map_submap, np.zeros((4, 2)))
+        x = np.array([cols[0], cols[-1] + 1, cols[-1] + 1, cols[0]]) + self.col0
+        y = np.array([rows[0], rows[0], rows[-1] + 1, rows[-1] + 1]) + self.row0
         return se2.transform(self.T_map_submap, np.column_stack([x, y]) * self.cell_m)
 
 
@@ -81,9 +93,23 @@ def render(grids: list[CountGrid], resolution_m: float) -> OccupancyGrid:
     for grid, box in zip(grids, boxes):
         first = np.floor((box.min(axis=0) - low) / resolution_m).astype(int)
         last = np.ceil((box.max(axis=0) - low) / resolution_m).astype(int)
-        add_counts(grid.hits, grid.misses, grid.row0, grid.col0, grid.cell_m, se2.inverse(grid.T_map_submap),
-                   low[0], low[1], resolution_m, max(first[1], 0), min(last[1], rows), max(first[0], 0),
-                   min(last[0], cols), hits, misses)  # fmt: skip
+        add_counts(
+            grid.hits,
+            grid.misses,
+            grid.row0,
+            grid.col0,
+            grid.cell_m,
+            se2.inverse(grid.T_map_submap),
+            low[0],
+            low[1],
+            resolution_m,
+            max(first[1], 0),
+            min(last[1], rows),
+            max(first[0], 0),
+            min(last[0], cols),
+            hits,
+            misses,
+        )
     log_odds = np.clip(HIT_LOG_ODDS * hits + MISS_LOG_ODDS * misses, -6.0, 6.0)
     percent = np.round(100.0 / (1.0 + np.exp(-log_odds))).astype(np.int8)
     values = np.where((hits > 0) | (misses > 0), percent, np.int8(UNKNOWN)).astype(np.int8)

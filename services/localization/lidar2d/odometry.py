@@ -39,9 +39,15 @@ def interpolate(
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def delay_costs(
-    stamps_ns: np.ndarray, poses: np.ndarray, t0_ns: int, t1_ns: int, yaw_rad: float,
-    delays_ns: np.ndarray, gap_ns: int, costs: np.ndarray,
-) -> bool:  # fmt: skip
+    stamps_ns: np.ndarray,
+    poses: np.ndarray,
+    t0_ns: int,
+    t1_ns: int,
+    yaw_rad: float,
+    delays_ns: np.ndarray,
+    gap_ns: int,
+    costs: np.ndarray,
+) -> bool:
     """Squared difference between the turn of the odometry, read `delay` later, and the matched turn."""
     a, b = np.empty(3), np.empty(3)
     for k in range(delays_ns.shape[0]):
@@ -103,7 +109,9 @@ class OdometryBuffer:
         a, b = np.empty(3), np.empty(3)
         ahead = round(ahead_s / NS)
         for stamp, out in ((t0_ns, a), (t1_ns, b)):
-            if not interpolate(self.stamps_ns, self.poses, stamp + self.delay_ns, ahead, self._bridge_ns, out):
+            if not interpolate(
+                self.stamps_ns, self.poses, stamp + self.delay_ns, ahead, self._bridge_ns, out
+            ):
                 return None
         return se2.between(a, b)
 
@@ -116,8 +124,16 @@ class OdometryBuffer:
             t0, t1, yaw = self._turns.pop(0)
             costs = np.empty(len(self._delays_ns))
             recent = max(0, self._count - 1024)
-            if not delay_costs(self.stamps_ns[recent:], self.poses[recent:], t0, t1, yaw, self._delays_ns,
-                               self._gap_ns, costs):  # fmt: skip
+            if not delay_costs(
+                self.stamps_ns[recent:],
+                self.poses[recent:],
+                t0,
+                t1,
+                yaw,
+                self._delays_ns,
+                self._gap_ns,
+                costs,
+            ):
                 continue
             self._learn(costs / (costs + 0.02**2))
         if len(self._turns) > 256:
@@ -157,9 +173,12 @@ class Predictor:
         base_m, per_m, base_rad, per_rad = self._base
         return base_m + per_m * distance, base_rad + per_rad * turn + 0.1 * per_rad * distance
 
-    def learn(self, motion: np.ndarray, truth: np.ndarray) -> None:
+    def learn(self, motion: np.ndarray, truth: np.ndarray, blind: np.ndarray | None = None) -> None:
         """Compare with the matched motion; the scale follows quickly upwards and slowly down."""
         error = se2.between(motion, truth)
+        if blind is not None:  # unit vector in the last body frame along which the match knows nothing
+            along = (truth[0] - motion[0]) * blind[0] + (truth[1] - motion[1]) * blind[1]
+            error[:2] = truth[:2] - motion[:2] - along * blind
         unit_m, unit_rad = self._unit(motion)
         ratio_m = min((error[0] ** 2 + error[1] ** 2) / (2.0 * unit_m**2), 400.0)
         ratio_rad = min(error[2] ** 2 / unit_rad**2, 400.0)

@@ -1,4 +1,4 @@
-"""Running the background jobs: at once in the same thread, or in one of their own; the results are the same."""
+"""Running the background jobs: at once or in a thread of their own; the results are the same."""
 
 from __future__ import annotations
 

@@ -49,7 +49,11 @@ class TrajectoryRecord:
 
     def arrays(self) -> dict[str, np.ndarray]:
         """For saving."""
-        return {"extra_stamps": self.stamps_ns, "extra_nodes": self.nodes, "extra_poses": self._poses[: self.count]}
+        return {
+            "extra_stamps": self.stamps_ns,
+            "extra_nodes": self.nodes,
+            "extra_poses": self._poses[: self.count],
+        }
 
     @staticmethod
     def of(arrays: dict[str, np.ndarray]) -> TrajectoryRecord:

@@ -7,11 +7,14 @@ import numpy as np
 from services.localization.lidar2d import se2
 from services.localization.lidar2d.matching import refine
 from services.localization.lidar2d.nodes import Constraint, Keynode, edge_information
+from services.localization.lidar2d.observability import without_slip
 from services.localization.lidar2d.settings import LidarSlamSettings
-from services.localization.lidar2d.surfel_map import FrozenMap, SurfelMap, freeze
+from services.localization.lidar2d.surfel_map import FrozenMap, MatchTables, SurfelMap, freeze
 
 
-def draw_submap(settings: LidarSlamSettings, nodes: list[Keynode], T_submap_node: list[np.ndarray]) -> FrozenMap:
+def draw_submap(
+    settings: LidarSlamSettings, nodes: list[Keynode], T_submap_node: list[np.ndarray]
+) -> FrozenMap:
     """A frozen map of keynodes at given poses."""
     surfels = SurfelMap(settings)
     for node, T in zip(nodes, T_submap_node):
@@ -20,8 +23,11 @@ def draw_submap(settings: LidarSlamSettings, nodes: list[Keynode], T_submap_node
         surfels.insert(
             se2.transform(T, scan.points.astype(np.float64)),
             se2.transform(np.array([0.0, 0.0, T[2]]), scan.tangents.astype(np.float64)),
-            scan.spacing_m.astype(np.float64), se2.transform(T, scan.origin[None])[0], still, still,
-        )  # fmt: skip
+            scan.spacing_m.astype(np.float64),
+            se2.transform(T, scan.origin[None])[0],
+            still,
+            still,
+        )
     return freeze(surfels)
 
 
@@ -45,15 +51,27 @@ def refine_submaps(
         drawn[submap] = draw_submap(settings, [nodes[n] for n in members[submap]], poses)
         tables = drawn[submap].tables(settings.reach_cells)
         for k in by_submap.get(submap, []):
-            measured[k] = _measure(settings, nodes[constraints[k].node], constraints[k], drawn[submap], tables,
-                                   T_map_submap[submap], T_map_node[constraints[k].node])  # fmt: skip
+            measured[k] = _measure(
+                settings,
+                nodes[constraints[k].node],
+                constraints[k],
+                drawn[submap],
+                tables,
+                T_map_submap[submap],
+                T_map_node[constraints[k].node],
+            )
     return drawn, measured
 
 
 def _measure(
-    settings: LidarSlamSettings, node: Keynode, constraint: Constraint, frozen: FrozenMap, tables: object,
-    T_map_submap: np.ndarray, T_map_node: np.ndarray,
-) -> Constraint:  # fmt: skip
+    settings: LidarSlamSettings,
+    node: Keynode,
+    constraint: Constraint,
+    frozen: FrozenMap,
+    tables: MatchTables,
+    T_map_submap: np.ndarray,
+    T_map_node: np.ndarray,
+) -> Constraint:
     """The same constraint from a fresh match that starts at the optimised pose."""
     features = node.scan.features.astype(np.float64)
     guess = se2.between(T_map_submap, T_map_node)
@@ -61,6 +79,7 @@ def _measure(
     moved = np.hypot(*(match.T_map_body[:2] - guess[:2]))
     if match.share < settings.loop_share or match.known < settings.loop_known or moved > 0.3:
         return constraint
+    match = without_slip(features, node.scan.origin, match, tables, settings)
     information = edge_information(match.information, settings.edge_sigma_m, settings.edge_sigma_rad)
     if not constraint.loop:
         information /= settings.inner_facts

@@ -54,8 +54,11 @@ def build_global_map(
         surfels.insert(
             se2.transform(T, node.scan.points.astype(np.float64)),
             se2.transform(np.array([0.0, 0.0, T[2]]), node.scan.tangents.astype(np.float64)),
-            node.scan.spacing_m.astype(np.float64), se2.transform(T, node.scan.origin[None])[0], still, still,
-        )  # fmt: skip
+            node.scan.spacing_m.astype(np.float64),
+            se2.transform(T, node.scan.origin[None])[0],
+            still,
+            still,
+        )
     tables = freeze(surfels).tables(settings.reach_cells)
     positions = np.array([T[:2] for T in T_map_node])
     low, high = positions.min(axis=0), positions.max(axis=0)
@@ -78,10 +81,13 @@ def relocalize_in(
     subset = features[:: max(1, len(features) // SEARCH_RETURNS)]
     found = branch_and_bound(subset, centre, world.pyramid, world.half_extent_m, math.pi, 0.4, keep=0.85)
     rough = [
-        refine(features, origin, T, world.tables, settings, iterations=REFINE_FIRST) for _, T in found[:CANDIDATES]
+        refine(features, origin, T, world.tables, settings, iterations=REFINE_FIRST)
+        for _, T in found[:CANDIDATES]
     ]
     rough.sort(key=lambda m: -evidence(m))
-    matches = [refine(features, origin, m.T_map_body, world.tables, settings, anneal=(1.5,)) for m in rough[:6]]
+    matches = [
+        refine(features, origin, m.T_map_body, world.tables, settings, anneal=(1.5,)) for m in rough[:6]
+    ]
     matches.sort(key=lambda m: -evidence(m))
     if not matches or evidence(matches[0]) <= 0.0:
         return _nowhere(world)

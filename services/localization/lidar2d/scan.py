@@ -165,12 +165,22 @@ def prepare_scan(
     points = np.empty((n, 2))
     beams = np.empty(n, dtype=np.int32)
     count = _valid_points(
-        np.ascontiguousarray(ranges_m, dtype=np.float32), angle_min_rad, angle_increment_rad, time_increment_s,
-        range_min_m, range_max_m, T_body_lidar, velocity_body, points, beams,
-    )  # fmt: skip
+        np.ascontiguousarray(ranges_m, dtype=np.float32),
+        angle_min_rad,
+        angle_increment_rad,
+        time_increment_s,
+        range_min_m,
+        range_max_m,
+        T_body_lidar,
+        velocity_body,
+        points,
+        beams,
+    )
     points, beams = points[:count].copy(), beams[:count].copy()
     tangents, spacing = np.empty((count, 2)), np.empty(count)
-    _tangents(points, beams, T_body_lidar[:2].copy(), abs(angle_increment_rad), tangent_window_m, tangents, spacing)
+    _tangents(
+        points, beams, T_body_lidar[:2].copy(), abs(angle_increment_rad), tangent_window_m, tangents, spacing
+    )
     keep = np.empty(match_limit + 1, dtype=np.int32)
     kept = _spread(points, spread_m, match_limit, keep)
     return PreparedScan(points, tangents, spacing, beams, keep[:kept].copy(), T_body_lidar[:2].copy())

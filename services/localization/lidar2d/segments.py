@@ -1,4 +1,4 @@
-"""Segments: after a restart, a kidnapping or a loss, what is mapped hangs on nothing until its place is found."""
+"""Segments: after a restart, a kidnapping or a loss the new map hangs on nothing until its place is found."""
 
 from __future__ import annotations
 
@@ -34,7 +34,9 @@ def link_segment(snapshot: Snapshot) -> tuple[Constraint | None, np.ndarray, np.
     chunk = [snapshot.nodes[n] for n in segment[-snapshot.settings.chunk_keynodes :]]
     world: GlobalMap = snapshot.cache.world(
         (snapshot.version, len(known)),
-        lambda: build_global_map(snapshot.settings, [snapshot.nodes[n] for n in known], [T_n[row[n]] for n in known]),
+        lambda: build_global_map(
+            snapshot.settings, [snapshot.nodes[n] for n in known], [T_n[row[n]] for n in known]
+        ),
     )
     answer = relocalize_in(world, merged_features(chunk, newest), newest.scan.origin, snapshot.settings)
     if answer.confidence < snapshot.settings.link_confidence:
@@ -54,9 +56,14 @@ def link_segment(snapshot: Snapshot) -> tuple[Constraint | None, np.ndarray, np.
 
 
 def _tie(
-    snapshot: Snapshot, node_id: int, T_map_body: np.ndarray, known: list[int], row: dict[int, int],
-    T_s: np.ndarray, T_n: np.ndarray,
-) -> Constraint | None:  # fmt: skip
+    snapshot: Snapshot,
+    node_id: int,
+    T_map_body: np.ndarray,
+    known: list[int],
+    row: dict[int, int],
+    T_s: np.ndarray,
+    T_n: np.ndarray,
+) -> Constraint | None:
     """The edge to the nearest finished submap that confirms the place."""
     positions = np.array([T_n[row[n], :2] for n in known])
     away = dict(zip(known, np.hypot(*(positions - T_map_body[:2]).T)))

@@ -16,7 +16,12 @@ from services.localization.lidar2d.matching import Match
 from services.localization.lidar2d.nodes import edge_information
 from services.localization.lidar2d.occupancy import CountGrid, OccupancyGrid, render
 from services.localization.lidar2d.record import TrajectoryRecord
-from services.localization.lidar2d.relocalization import GlobalMap, Relocalization, build_global_map, relocalize_in
+from services.localization.lidar2d.relocalization import (
+    GlobalMap,
+    Relocalization,
+    build_global_map,
+    relocalize_in,
+)
 from services.localization.lidar2d.scan import PreparedScan
 from services.localization.lidar2d.settings import LidarSlamSettings
 from services.localization.lidar2d.state import load_state, save_state
@@ -72,13 +77,23 @@ class LidarSlam:
         self.front.odometry.add(stamp_ns, x_m, y_m, yaw_rad)
 
     def add_scan(
-        self, stamp_ns: int, ranges_m: np.ndarray, angle_min_rad: float, angle_increment_rad: float,
-        time_increment_s: float, range_min_m: float, range_max_m: float,
-    ) -> ScanResult:  # fmt: skip
+        self,
+        stamp_ns: int,
+        ranges_m: np.ndarray,
+        angle_min_rad: float,
+        angle_increment_rad: float,
+        time_increment_s: float,
+        range_min_m: float,
+        range_max_m: float,
+    ) -> ScanResult:
         """Match one scan; keynodes enter the map. Raises RuntimeError if a job's result is overdue."""
         if self._due is not None and self.scans >= self._due.apply_at_scan:
-            raise RuntimeError(f"the result of job {self._due.number} is due: call apply() before scan {self.scans}")
-        raw = RawScan(stamp_ns, ranges_m, angle_min_rad, angle_increment_rad, time_increment_s, range_min_m, range_max_m)
+            raise RuntimeError(
+                f"the result of job {self._due.number} is due: call apply() before scan {self.scans}"
+            )
+        raw = RawScan(
+            stamp_ns, ranges_m, angle_min_rad, angle_increment_rad, time_increment_s, range_min_m, range_max_m
+        )
         self.scans += 1
         reason = reason_to_reject(raw)
         restarted = False
@@ -102,7 +117,9 @@ class LidarSlam:
         else:
             last = self.front.poses[-1]
             T_odom_body = se2.compose(last, prediction.motion) if prediction.source == "wheels" else last
-        self.front.accept(stamp_ns, T_odom_body, options if good else [])
+        self.front.accept(
+            stamp_ns, T_odom_body, options if good else [], match.information, self.mapper.matched.T_odom_map
+        )
         self._lost_run = 0 if good else self._lost_run + 1
         if self._lost_run >= self.settings.lost_scans or (self._lost_run and prediction.blind):
             self._start_segment(raw.stamp_ns, scan, T_odom_body)
@@ -115,7 +132,9 @@ class LidarSlam:
         if len(scan) < self.settings.min_points:
             return self._rejected(raw, f"{len(scan)} returns, {self.settings.min_points} are needed")
         self.front.accept(raw.stamp_ns, np.zeros(3), [])
-        return self._map(raw, scan, np.zeros(3), Match(np.zeros(3), np.diag([1e6, 1e6, 1e8]), 1.0, 1.0, 0.0), True)
+        return self._map(
+            raw, scan, np.zeros(3), Match(np.zeros(3), np.diag([1e6, 1e6, 1e8]), 1.0, 1.0, 0.0), True
+        )
 
     def _start_segment(self, stamp_ns: int, scan: PreparedScan, T_odom_body: np.ndarray) -> None:
         self._lost_run = 0
@@ -133,20 +152,44 @@ class LidarSlam:
         per_beam[scan.beams[moving]] = True
         T_map_odom = self.back.T_map_odom.copy()
         last = self.mapper.last_key
-        self.record.add(raw.stamp_ns, last.id, se2.between(last.T_odom_body, T_odom_body),
-                        se2.compose(T_map_odom, T_odom_body))  # fmt: skip
+        self.record.add(
+            raw.stamp_ns,
+            last.id,
+            se2.between(last.T_odom_body, T_odom_body),
+            se2.compose(T_map_odom, T_odom_body),
+        )
         covariance = np.linalg.inv(edge_information(match.information, 0.003, 0.001))
         status = "lost" if not good else "ok" if self.back.unlinked_from is None else "relocalizing"
-        return ScanResult(raw.stamp_ns, status, T_odom_body, T_map_odom, covariance, per_beam, scan.points_body,
-                          scan.beams, key, match.share, job)  # fmt: skip
+        return ScanResult(
+            raw.stamp_ns,
+            status,
+            T_odom_body,
+            T_map_odom,
+            covariance,
+            per_beam,
+            scan.points_body,
+            scan.beams,
+            key,
+            match.share,
+            job,
+        )
 
     def _rejected(self, raw: RawScan, reason: str) -> ScanResult:
         T_odom_body = self.front.poses[-1].copy() if self.front.poses else np.zeros(3)
         count = len(raw.ranges_m) if isinstance(raw.ranges_m, np.ndarray) and raw.ranges_m.ndim == 1 else 0
         return ScanResult(
-            raw.stamp_ns, f"rejected: {reason}", T_odom_body, self.back.T_map_odom.copy(), np.diag([1.0, 1.0, 0.1]),
-            np.zeros(count, dtype=bool), np.zeros((0, 2)), np.zeros(0, dtype=np.int32), False, 0.0, self._job(),
-        )  # fmt: skip
+            raw.stamp_ns,
+            f"rejected: {reason}",
+            T_odom_body,
+            self.back.T_map_odom.copy(),
+            np.diag([1.0, 1.0, 0.1]),
+            np.zeros(count, dtype=bool),
+            np.zeros((0, 2)),
+            np.zeros(0, dtype=np.int32),
+            False,
+            0.0,
+            self._job(),
+        )
 
     # ---- background work --------------------------------------------------------------------------
 
@@ -160,7 +203,9 @@ class LidarSlam:
         self.mapper.keynodes_since_job = 0
         self._next_link_scan = self.scans + s.link_every_scans
         snapshot = self.back.snapshot()
-        self._due = BackgroundJob(snapshot.number, self.scans + s.apply_after_scans, lambda: run_job(snapshot))
+        self._due = BackgroundJob(
+            snapshot.number, self.scans + s.apply_after_scans, lambda: run_job(snapshot)
+        )
         return self._due
 
     @property
@@ -192,7 +237,7 @@ class LidarSlam:
     # ---- answers ----------------------------------------------------------------------------------
 
     def pose_at(self, stamp_ns: int) -> PoseAt | None:
-        """Interpolated between scans; beyond the newest by its velocity for `extrapolate_s` at most, else None."""
+        """Between scans interpolated; up to `extrapolate_s` beyond the newest by its velocity; else None."""
         stamps, poses = self.front.stamps, self.front.poses
         if not stamps or stamp_ns < stamps[0]:
             return None
@@ -226,9 +271,13 @@ class LidarSlam:
         return render(grids + self.mapper.count_grids(), resolution_m)
 
     def relocalize(
-        self, ranges_m: np.ndarray, angle_min_rad: float, angle_increment_rad: float, range_min_m: float,
+        self,
+        ranges_m: np.ndarray,
+        angle_min_rad: float,
+        angle_increment_rad: float,
+        range_min_m: float,
         range_max_m: float,
-    ) -> Relocalization:  # fmt: skip
+    ) -> Relocalization:
         """Where one scan was taken, without any guess. Raises ValueError for an empty map or a bad scan."""
         raw = RawScan(0, ranges_m, angle_min_rad, angle_increment_rad, 0.0, range_min_m, range_max_m)
         reason = reason_to_reject(raw)
@@ -243,8 +292,9 @@ class LidarSlam:
         known = [n for n in back.nodes if back.unlinked_from is None or n < back.unlinked_from]
         return back.cache.world(
             (back.optimisations, len(known)),
-            lambda: build_global_map(self.settings, [back.nodes[n] for n in known],
-                                     [back.T_map_node[n] for n in known]),  # fmt: skip
+            lambda: build_global_map(
+                self.settings, [back.nodes[n] for n in known], [back.T_map_node[n] for n in known]
+            ),
         )
 
     def save(self, folder: Path) -> None:

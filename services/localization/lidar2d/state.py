@@ -38,11 +38,16 @@ def save_state(folder: Path, back: BackEnd, extra: dict[str, np.ndarray]) -> Non
         os.fsync(file.fileno())
     os.replace(folder / f"{name}.tmp", folder / name)
     manifest = {
-        "format": FORMAT, "version": VERSION, "arrays": name, "bytes": (folder / name).stat().st_size,
-        "crc32": zlib.crc32((folder / name).read_bytes()), "keynodes": len(back.nodes),
-        "submaps": len(back.submaps), "constraints": len(back.constraints),
+        "format": FORMAT,
+        "version": VERSION,
+        "arrays": name,
+        "bytes": (folder / name).stat().st_size,
+        "crc32": zlib.crc32((folder / name).read_bytes()),
+        "keynodes": len(back.nodes),
+        "submaps": len(back.submaps),
+        "constraints": len(back.constraints),
         "settings": dataclasses.asdict(back.settings),
-    }  # fmt: skip
+    }
     with open(folder / f"{MANIFEST}.tmp", "w") as file:
         json.dump(manifest, file, indent=1)
         file.flush()
@@ -61,13 +66,19 @@ def load_state(folder: Path, settings: LidarSlamSettings) -> tuple[BackEnd, dict
     try:
         raw = arrays_path.read_bytes()
     except OSError as error:
-        raise MapStateError(f"{arrays_path}: named by {path} but cannot be read ({error}); restore it") from error
+        raise MapStateError(
+            f"{arrays_path}: named by {path} but cannot be read ({error}); restore it"
+        ) from error
     if len(raw) != manifest["bytes"] or zlib.crc32(raw) != manifest["crc32"]:
-        raise MapStateError(f"{arrays_path}: truncated or altered ({len(raw)} bytes, {manifest['bytes']} expected); "
-                            "restore the folder from a copy")  # fmt: skip
+        raise MapStateError(
+            f"{arrays_path}: truncated or altered ({len(raw)} bytes, {manifest['bytes']} expected); "
+            "restore the folder from a copy"
+        )
     cell_m = manifest["settings"].get("cell_m")
     if cell_m != settings.cell_m:
-        raise MapStateError(f"{path}: settings.cell_m is {cell_m}, the running SLAM has {settings.cell_m}; use that")
+        raise MapStateError(
+            f"{path}: settings.cell_m is {cell_m}, the running SLAM has {settings.cell_m}; use that"
+        )
     try:
         with np.load(arrays_path, allow_pickle=False) as stored:
             arrays = {key: stored[key] for key in stored.files}
@@ -81,14 +92,18 @@ def _manifest(path: Path) -> dict:
     try:
         manifest = json.loads(path.read_text())
     except OSError as error:
-        raise MapStateError(f"{path}: no saved map here ({error}); give the folder that was saved to") from error
+        raise MapStateError(
+            f"{path}: no saved map here ({error}); give the folder that was saved to"
+        ) from error
     except json.JSONDecodeError as error:
         raise MapStateError(f"{path}: not valid JSON ({error}); restore the folder from a copy") from error
     if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
         raise MapStateError(f"{path}: field 'format' is not {FORMAT!r}; this is not a lidar map")
     if manifest.get("version") != VERSION:
-        raise MapStateError(f"{path}: version {manifest.get('version')!r}, this program reads {VERSION}; "
-                            "map again or use the program that wrote it")  # fmt: skip
+        raise MapStateError(
+            f"{path}: version {manifest.get('version')!r}, this program reads {VERSION}; "
+            "map again or use the program that wrote it"
+        )
     missing = [key for key in ("arrays", "bytes", "crc32", "settings") if key not in manifest]
     if missing:
         raise MapStateError(f"{path}: field {missing[0]!r} is missing; restore the folder from a copy")
@@ -106,11 +121,12 @@ def _pack_nodes(back: BackEnd) -> dict[str, np.ndarray]:
         "node_origin": np.array([s.origin for s in scans]).reshape(-1, 2),
         "node_points": np.array([len(s.points) for s in scans], dtype=np.int64),
         "node_features": np.array([len(s.features) for s in scans], dtype=np.int64),
-        "points": _concat([s.points for s in scans], 2), "tangents": _concat([s.tangents for s in scans], 2),
+        "points": _concat([s.points for s in scans], 2),
+        "tangents": _concat([s.tangents for s in scans], 2),
         "spacing": np.concatenate([s.spacing_m for s in scans]) if scans else np.zeros(0, np.float32),
         "moving": np.concatenate([s.moving for s in scans]) if scans else np.zeros(0, bool),
         "features": _concat([s.features for s in scans], 5),
-    }  # fmt: skip
+    }
 
 
 def _concat(parts: list[np.ndarray], width: int) -> np.ndarray:
@@ -128,11 +144,12 @@ def _pack_submaps(back: BackEnd) -> dict[str, np.ndarray]:
         "members": np.array([m for s in submaps for m in s.members], dtype=np.int64),
         "submap_grid": np.array([[f.row0, f.col0, *f.shape] for f in frozen], dtype=np.int64).reshape(-1, 4),
         "submap_surfels": np.array([len(f.means) for f in frozen], dtype=np.int64),
-        "means": _concat([f.means for f in frozen], 2), "omegas": _concat([f.omegas for f in frozen], 3),
+        "means": _concat([f.means for f in frozen], 2),
+        "omegas": _concat([f.omegas for f in frozen], 3),
         "views": _concat([f.views for f in frozen], 2),
         "submap_packed": np.array([len(f.packed) for f in frozen], dtype=np.int64),
         "packed": np.frombuffer(b"".join(f.packed for f in frozen), dtype=np.uint8),
-    }  # fmt: skip
+    }
 
 
 def _pack_edges(constraints: list[Constraint]) -> dict[str, np.ndarray]:
@@ -150,22 +167,37 @@ def _unpack(a: dict[str, np.ndarray], settings: LidarSlamSettings) -> BackEnd:
     p, f = np.r_[0, np.cumsum(a["node_points"])], np.r_[0, np.cumsum(a["node_features"])]
     for k, node_id in enumerate(a["node_id"].tolist()):
         here = slice(p[k], p[k + 1])
-        scan = KeyScan(a["points"][here], a["tangents"][here], a["spacing"][here], a["moving"][here],
-                       a["features"][f[k] : f[k + 1]], a["node_origin"][k])  # fmt: skip
+        scan = KeyScan(
+            a["points"][here],
+            a["tangents"][here],
+            a["spacing"][here],
+            a["moving"][here],
+            a["features"][f[k] : f[k + 1]],
+            a["node_origin"][k],
+        )
         back.nodes[node_id] = Keynode(node_id, int(a["node_stamp_ns"][k]), a["node_odom"][k], scan)
         back.T_map_node[node_id] = a["node_map"][k]
     m, s, b = (np.r_[0, np.cumsum(a[key])] for key in ("submap_members", "submap_surfels", "submap_packed"))
     for k, submap_id in enumerate(a["submap_id"].tolist()):
         row0, col0, rows, cols = a["submap_grid"][k].tolist()
-        frozen = FrozenMap(a["means"][s[k] : s[k + 1]], a["omegas"][s[k] : s[k + 1]], a["views"][s[k] : s[k + 1]],
-                           a["packed"][b[k] : b[k + 1]].tobytes(), (rows, cols), row0, col0,
-                           settings.cell_m)  # fmt: skip
-        back.submaps[submap_id] = Submap(submap_id, a["submap_odom"][k], a["submap_map"][k],
-                                         a["members"][m[k] : m[k + 1]].tolist(), frozen)  # fmt: skip
+        frozen = FrozenMap(
+            a["means"][s[k] : s[k + 1]],
+            a["omegas"][s[k] : s[k + 1]],
+            a["views"][s[k] : s[k + 1]],
+            a["packed"][b[k] : b[k + 1]].tobytes(),
+            (rows, cols),
+            row0,
+            col0,
+            settings.cell_m,
+        )
+        back.submaps[submap_id] = Submap(
+            submap_id, a["submap_odom"][k], a["submap_map"][k], a["members"][m[k] : m[k + 1]].tolist(), frozen
+        )
     back.constraints = [
         Constraint(int(i), int(j), z, w, bool(loop))
-        for i, j, z, w, loop in zip(a["edge_submap"], a["edge_node"], a["edge_pose"], a["edge_information"],
-                                    a["edge_loop"])  # fmt: skip
+        for i, j, z, w, loop in zip(
+            a["edge_submap"], a["edge_node"], a["edge_pose"], a["edge_information"], a["edge_loop"]
+        )
         if int(i) in back.submaps and int(j) in back.nodes
     ]
     back.resume_numbering()

@@ -94,7 +94,9 @@ def splat(
             else:
                 nearest[r, c] = index
             # Distance across the surface counts fully, along it a quarter.
-            across = (omegas[index, 0] * cx * cx + 2.0 * omegas[index, 1] * cx * cy + omegas[index, 2] * cy * cy) / trace
+            across = (
+                omegas[index, 0] * cx * cx + 2.0 * omegas[index, 1] * cx * cy + omegas[index, 2] * cy * cy
+            ) / trace
             d2f = across + 0.25 * max(d2 - across, 0.0)
             if d2f < 9.0 * FIELD_SIGMA_M * FIELD_SIGMA_M:
                 v = 255.0 * math.exp(-0.5 * d2f / (FIELD_SIGMA_M * FIELD_SIGMA_M))
@@ -138,7 +140,7 @@ def add_returns(
         if not use[i]:
             continue
         x, y = points[i, 0], points[i, 1]
-        ar, ac = int(math.floor(y / cell_m)), int(math.floor(x / cell_m))
+        ar, ac = math.floor(y / cell_m), math.floor(x / cell_m)
         r, c = ar - row0, ac - col0
         k = cell_id[r, c]
         if k < 0:
@@ -203,8 +205,8 @@ def cast_rays(
             continue
         norm = math.hypot(dx, dy)
         ux, uy = dx / norm, dy / norm
-        r = int(math.floor(origin[1] / cell_m))
-        c = int(math.floor(origin[0] / cell_m))
+        r = math.floor(origin[1] / cell_m)
+        c = math.floor(origin[0] / cell_m)
         step_c = 1 if ux > 0 else -1
         step_r = 1 if uy > 0 else -1
         tdx = cell_m / max(abs(ux), 1e-12)
@@ -260,4 +262,16 @@ def refresh(
         if moved < RESPLAT_M:
             continue
         told[k] = means[k]
-        splat(nearest, field, means, omegas, k, cells[k, 0] - row0, cells[k, 1] - col0, row0, col0, cell_m, reach)
+        splat(
+            nearest,
+            field,
+            means,
+            omegas,
+            k,
+            cells[k, 0] - row0,
+            cells[k, 1] - col0,
+            row0,
+            col0,
+            cell_m,
+            reach,
+        )

@@ -49,8 +49,14 @@ class SurfelMap:
         self._reserve_surfels(1024)
 
     def _reserve_surfels(self, capacity: int) -> None:
-        for name, width, dtype in (("moments", 6, np.float64), ("views", 2, np.float64), ("cells", 2, np.int32),
-                                   ("means", 2, np.float64), ("omegas", 3, np.float64), ("told", 2, np.float64)):  # fmt: skip
+        for name, width, dtype in (
+            ("moments", 6, np.float64),
+            ("views", 2, np.float64),
+            ("cells", 2, np.int32),
+            ("means", 2, np.float64),
+            ("omegas", 3, np.float64),
+            ("told", 2, np.float64),
+        ):
             grown = np.zeros((capacity, width), dtype=dtype)
             if self.count:
                 grown[: self.count] = getattr(self, name)[: self.count]
@@ -61,14 +67,22 @@ class SurfelMap:
         high = np.floor(points.max(axis=0) / self.cell_m).astype(np.int64) + MARGIN + 1
         rows, cols = self.cell_id.shape
         grow = (
-            max(0, self.row0 - low[1]), max(0, high[1] - self.row0 - rows),
-            max(0, self.col0 - low[0]), max(0, high[0] - self.col0 - cols),
-        )  # fmt: skip
+            max(0, self.row0 - low[1]),
+            max(0, high[1] - self.row0 - rows),
+            max(0, self.col0 - low[0]),
+            max(0, high[0] - self.col0 - cols),
+        )
         top, bottom, left, right = (int(-(-g // BLOCK) * BLOCK) for g in grow)
         if top or bottom or left or right:
             pad = ((top, bottom), (left, right))
-            for name, fill in (("cell_id", -1), ("nearest", -1), ("touched", -1), ("field", 0), ("hits", 0),
-                               ("misses", 0)):  # fmt: skip
+            for name, fill in (
+                ("cell_id", -1),
+                ("nearest", -1),
+                ("touched", -1),
+                ("field", 0),
+                ("hits", 0),
+                ("misses", 0),
+            ):
                 setattr(self, name, np.pad(getattr(self, name), pad, constant_values=fill))
             self.row0 -= top
             self.col0 -= left
@@ -91,20 +105,70 @@ class SurfelMap:
             self._reserve_surfels(max(2 * len(self.moments), self.count + len(points)))
         changed = np.empty(len(points), dtype=np.int32)
         self.count, n = add_returns(
-            points, tangents, spacing_m, surface, origin, self.scans, self.cell_id, self.hits, self.misses,
-            self.touched, self.moments, self.views, self.cells, self.told, self.count, self.row0, self.col0, self.cell_m, changed,
-        )  # fmt: skip
-        cast_rays(points, free, origin, self.scans, self.hits, self.misses, self.touched, self.row0, self.col0,
-                  self.cell_m)  # fmt: skip
-        refresh(changed[:n], self.cell_id, self.nearest, self.field, self.moments, self.cells, self.means,
-                self.omegas, self.told, self.row0, self.col0, self.cell_m, s.reach_cells, s.range_sigma_m,
-                s.map_sigma_m)  # fmt: skip
+            points,
+            tangents,
+            spacing_m,
+            surface,
+            origin,
+            self.scans,
+            self.cell_id,
+            self.hits,
+            self.misses,
+            self.touched,
+            self.moments,
+            self.views,
+            self.cells,
+            self.told,
+            self.count,
+            self.row0,
+            self.col0,
+            self.cell_m,
+            changed,
+        )
+        cast_rays(
+            points,
+            free,
+            origin,
+            self.scans,
+            self.hits,
+            self.misses,
+            self.touched,
+            self.row0,
+            self.col0,
+            self.cell_m,
+        )
+        refresh(
+            changed[:n],
+            self.cell_id,
+            self.nearest,
+            self.field,
+            self.moments,
+            self.cells,
+            self.means,
+            self.omegas,
+            self.told,
+            self.row0,
+            self.col0,
+            self.cell_m,
+            s.reach_cells,
+            s.range_sigma_m,
+            s.map_sigma_m,
+        )
         self.scans += 1
 
     def tables(self) -> MatchTables:
         """The live tables of this map (not a copy)."""
-        return MatchTables(self.nearest, self.field, self.means, self.omegas, self.views, self.misses, self.row0,
-                           self.col0, self.cell_m)  # fmt: skip
+        return MatchTables(
+            self.nearest,
+            self.field,
+            self.means,
+            self.omegas,
+            self.views,
+            self.misses,
+            self.row0,
+            self.col0,
+            self.cell_m,
+        )
 
 
 @dataclass(frozen=True)
@@ -132,8 +196,17 @@ class FrozenMap:
         field = np.zeros(self.shape, dtype=np.uint8)
         cells = np.floor(means[:, ::-1] / self.cell_m).astype(np.int64)
         _splat_all(nearest, field, means, omegas, cells, self.row0, self.col0, self.cell_m, reach_cells)
-        return MatchTables(nearest, field, means, omegas, self.views.astype(np.float64), self.counts()[1],
-                           self.row0, self.col0, self.cell_m)  # fmt: skip
+        return MatchTables(
+            nearest,
+            field,
+            means,
+            omegas,
+            self.views.astype(np.float64),
+            self.counts()[1],
+            self.row0,
+            self.col0,
+            self.cell_m,
+        )
 
 
 def freeze(surfels: SurfelMap, min_hit_share: float = 0.2) -> FrozenMap:
@@ -149,17 +222,40 @@ def freeze(surfels: SurfelMap, min_hit_share: float = 0.2) -> FrozenMap:
     r0, r1 = max(used_rows[0] - MARGIN, 0), used_rows[-1] + MARGIN + 1
     c0, c1 = max(used_cols[0] - MARGIN, 0), used_cols[-1] + MARGIN + 1
     return FrozenMap(
-        surfels.means[:n][alive].astype(np.float32), surfels.omegas[:n][alive].astype(np.float32),
+        surfels.means[:n][alive].astype(np.float32),
+        surfels.omegas[:n][alive].astype(np.float32),
         surfels.views[:n][alive].astype(np.float32),
         zlib.compress(np.stack([surfels.hits[r0:r1, c0:c1], surfels.misses[r0:r1, c0:c1]]).tobytes(), 1),
-        surfels.hits[r0:r1, c0:c1].shape, int(surfels.row0 + r0), int(surfels.col0 + c0), surfels.cell_m,
-    )  # fmt: skip
+        surfels.hits[r0:r1, c0:c1].shape,
+        int(surfels.row0 + r0),
+        int(surfels.col0 + c0),
+        surfels.cell_m,
+    )
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _splat_all(
-    nearest: np.ndarray, field: np.ndarray, means: np.ndarray, omegas: np.ndarray, cells: np.ndarray,
-    row0: int, col0: int, cell_m: float, reach: int,
-) -> None:  # fmt: skip
+    nearest: np.ndarray,
+    field: np.ndarray,
+    means: np.ndarray,
+    omegas: np.ndarray,
+    cells: np.ndarray,
+    row0: int,
+    col0: int,
+    cell_m: float,
+    reach: int,
+) -> None:
     for i in range(len(means)):
-        splat(nearest, field, means, omegas, i, cells[i, 0] - row0, cells[i, 1] - col0, row0, col0, cell_m, reach)
+        splat(
+            nearest,
+            field,
+            means,
+            omegas,
+            i,
+            cells[i, 0] - row0,
+            cells[i, 1] - col0,
+            row0,
+            col0,
+            cell_m,
+            reach,
+        )

@@ -50,7 +50,9 @@ def test_relations_in_another_frame_and_without_stamps():
 
 def test_read_relations(tmp_path):
     path = tmp_path / "x.relations"
-    path.write_text("# t1 t2 x y z roll pitch yaw\n976052905.167303 976052911.885496 -0.05 -0.1 0 0 0 -1.5\n\n")
+    path.write_text(
+        "# t1 t2 x y z roll pitch yaw\n976052905.167303 976052911.885496 -0.05 -0.1 0 0 0 -1.5\n\n"
+    )
     stamps, relations = read_relations(path)
     assert stamps.tolist() == [[976052905167303000, 976052911885496000]]
     assert relations.tolist() == [[-0.05, -0.1, -1.5]]

@@ -3,7 +3,13 @@ import numpy as np
 
 from services.localization.lidar2d import se2
 from services.localization.lidar2d.movers import contradicts_free_space, grow_along_beams
-from services.localization.lidar2d.occupancy import CountGrid, OccupancyGrid, changed_regions, render, save_nav2
+from services.localization.lidar2d.occupancy import (
+    CountGrid,
+    OccupancyGrid,
+    changed_regions,
+    render,
+    save_nav2,
+)
 from services.localization.lidar2d.surfel_kernels import cast_rays
 
 
@@ -91,7 +97,7 @@ def test_movers_stand_in_free_space():
     nearest[:, 25:36] = 0
     misses[20:, :] = 0  # unknown half
     means = np.array([[30.5 * 0.05, 0.5]])
-    points = np.array([[0.5, 0.5], [30.5 * 0.05, 0.5], [0.5, 1.5], [1.4, 0.52]])
+    points = np.array([[0.5, 0.5], [30.5 * 0.05, 0.5], [0.5, 1.5], [1.43, 0.52]])
     out = np.empty(4, dtype=bool)
     contradicts_free_space(points, np.zeros(3), nearest, means, hits, misses, 0, 0, 0.05, out)
     assert out.tolist() == [True, False, False, False]  # free, wall, unknown, next to the wall

@@ -11,7 +11,9 @@ NS = 1_000_000_000
 
 def turning(times):
     """A robot that sways while it drives."""
-    return np.column_stack([0.3 * times, 0.1 * np.sin(times), 0.8 * np.sin(1.3 * times) + 0.3 * np.sin(3.1 * times)])
+    return np.column_stack(
+        [0.3 * times, 0.1 * np.sin(times), 0.8 * np.sin(1.3 * times) + 0.3 * np.sin(3.1 * times)]
+    )
 
 
 def test_interpolation_against_a_slow_twin(rng):
@@ -46,7 +48,9 @@ def test_increments_across_gaps_and_beyond_the_end():
     for k in range(10):
         buffer.add(k * NS // 10, 0.1 * k, 0.0, 0.0)
     assert np.allclose(buffer.increment(NS // 4, NS * 3 // 4), [0.5, 0, 0])
-    assert np.allclose(buffer.increment(NS // 2, NS), [0.5, 0, 0])  # the last velocity, a tenth of a second on
+    assert np.allclose(
+        buffer.increment(NS // 2, NS), [0.5, 0, 0]
+    )  # the last velocity, a tenth of a second on
     assert buffer.increment(NS // 2, 2 * NS) is None
     buffer.add(4 * NS, 2.0, 0.0, 0.0)  # the wheels kept counting during three silent seconds
     assert np.allclose(buffer.increment(NS // 2, 4 * NS), [1.5, 0, 0])
@@ -61,10 +65,13 @@ def test_bad_odometry_is_refused_and_counted():
 
 
 def test_a_lying_predictor_loses_its_say():
-    honest, liar = Predictor(0.01, 0.05, 0.02, 0.004, 0.05, 0.03), Predictor(0.01, 0.05, 0.02, 0.004, 0.05, 0.03)
+    honest, liar = (
+        Predictor(0.01, 0.05, 0.02, 0.004, 0.05, 0.03),
+        Predictor(0.01, 0.05, 0.02, 0.004, 0.05, 0.03),
+    )
     truth = np.array([0.1, 0.0, 0.02])
     for _ in range(30):
-        honest.learn(truth + [0.002, 0, 0.001], truth)
+        honest.learn(truth + np.array([0.002, 0, 0.001]), truth)
         liar.learn(-truth, truth)
     assert liar.sigmas(truth, 0.1)[0] > 0.1  # it says so itself: decimetres
     assert honest.sigmas(truth, 0.1)[0] < 0.01

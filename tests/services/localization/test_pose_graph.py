@@ -2,8 +2,9 @@ import numpy as np
 import scipy.optimize
 
 from services.localization.lidar2d import pose_graph, se2
+from services.localization.lidar2d.graph_kernels import cholesky_solve
 from services.localization.lidar2d.nodes import edge_information
-from services.localization.lidar2d.pose_graph import Edges, cholesky_solve, optimise
+from services.localization.lidar2d.pose_graph import Edges, optimise
 
 
 def problem(rng, n_submaps=6, n_nodes=40, noise=0.01):
@@ -21,27 +22,43 @@ def problem(rng, n_submaps=6, n_nodes=40, noise=0.01):
             z.append(se2.between(submaps[k], T) + noise * rng.standard_normal(3))
             A = rng.normal(size=(3, 3))
             info.append(np.diag([1e4, 1e4, 4e4]) + 1e3 * A @ A.T)
-    edges = Edges(np.array(submap, np.int32), np.array(node, np.int32), np.array(z), np.array(info),
-                  np.zeros(len(z), dtype=bool))  # fmt: skip
+    edges = Edges(
+        np.array(submap, np.int32),
+        np.array(node, np.int32),
+        np.array(z),
+        np.array(info),
+        np.zeros(len(z), dtype=bool),
+    )
     return submaps, np.array(nodes), edges
 
 
 def test_solution_against_scipy(rng):
     submaps, nodes, edges = problem(rng)
-    start_s, start_n = submaps + 0.05 * rng.standard_normal(submaps.shape), nodes + 0.05 * rng.standard_normal(nodes.shape)
+    start_s, start_n = (
+        submaps + 0.05 * rng.standard_normal(submaps.shape),
+        nodes + 0.05 * rng.standard_normal(nodes.shape),
+    )
     start_s[0] = submaps[0]
     solution = optimise(start_s, start_n, edges, iterations=25)
     roots = np.linalg.cholesky(edges.information)
 
     def residuals(x):
-        s, n = np.vstack([submaps[:1], x[: 3 * (len(submaps) - 1)].reshape(-1, 3)]), x[3 * (len(submaps) - 1) :].reshape(-1, 3)
+        s, n = (
+            np.vstack([submaps[:1], x[: 3 * (len(submaps) - 1)].reshape(-1, 3)]),
+            x[3 * (len(submaps) - 1) :].reshape(-1, 3),
+        )
         e = se2.between_many(s[edges.submap], n[edges.node]) - edges.T_submap_node
         e[:, 2] = se2.wrap_many(e[:, 2])
         return np.einsum("nji,nj->ni", roots, e).ravel()
 
-    best = scipy.optimize.least_squares(residuals, np.concatenate([start_s[1:].ravel(), start_n.ravel()]), xtol=1e-12)
+    best = scipy.optimize.least_squares(
+        residuals, np.concatenate([start_s[1:].ravel(), start_n.ravel()]), xtol=1e-12
+    )
     assert np.allclose(solution.T_map_submap[1:].ravel(), best.x[: 3 * (len(submaps) - 1)], atol=2e-4)
-    assert np.abs(se2.between_many(solution.T_map_node, best.x[3 * (len(submaps) - 1) :].reshape(-1, 3))).max() < 2e-4
+    assert (
+        np.abs(se2.between_many(solution.T_map_node, best.x[3 * (len(submaps) - 1) :].reshape(-1, 3))).max()
+        < 2e-4
+    )
 
 
 def test_sparse_and_dense_agree(rng, monkeypatch):
@@ -60,14 +77,23 @@ def test_a_wrong_loop_is_overruled_and_a_true_one_bends_the_chain(rng):
     robust[edges.submap == 0] = edges.node[edges.submap == 0] >= 37
     z = edges.T_submap_node.copy()
     liar = np.flatnonzero(robust)[0]
-    extra = Edges(np.append(edges.submap, 0).astype(np.int32), np.append(edges.node, edges.node[liar]).astype(np.int32),
-                  np.vstack([z, z[liar] + [2.0, 0, 0]]), np.concatenate([edges.information, edges.information[liar][None]]),
-                  np.append(robust, True))  # fmt: skip
+    extra = Edges(
+        np.append(edges.submap, 0).astype(np.int32),
+        np.append(edges.node, edges.node[liar]).astype(np.int32),
+        np.vstack([z, z[liar] + [2.0, 0, 0]]),
+        np.concatenate([edges.information, edges.information[liar][None]]),
+        np.append(robust, True),
+    )
     order = np.argsort(extra.node, kind="stable")
-    extra = Edges(*(getattr(extra, f)[order] for f in ("submap", "node", "T_submap_node", "information", "robust")))
+    extra = Edges(
+        *(getattr(extra, f)[order] for f in ("submap", "node", "T_submap_node", "information", "robust"))
+    )
     solution = optimise(submaps, nodes, extra)
     assert np.abs(se2.between_many(solution.T_map_node, nodes)[:, :2]).max() < 0.01
-    wrong = np.flatnonzero(np.abs(extra.T_submap_node[:, 0] - se2.between_many(submaps[extra.submap], nodes[extra.node])[:, 0]) > 1)
+    wrong = np.flatnonzero(
+        np.abs(extra.T_submap_node[:, 0] - se2.between_many(submaps[extra.submap], nodes[extra.node])[:, 0])
+        > 1
+    )
     assert solution.chi2[wrong].min() > 1000
 
 

@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 
 from services.localization.lidar2d import se2
 from services.localization.lidar2d.branch_bound import LEVELS, branch_and_bound, build_pyramid
-from services.localization.lidar2d.matching import ALONG2, accumulate, correlate, refine, search, solve3
+from services.localization.lidar2d.correlative import correlate, search
+from services.localization.lidar2d.matching import ALONG2, accumulate, refine, solve3
 from services.localization.lidar2d.scan import prepare_scan
 from services.localization.lidar2d.settings import LidarSlamSettings
 from services.localization.lidar2d.surfel_kernels import merged_surfel
@@ -37,15 +38,32 @@ def mapped(views):
         scan = prepared(pose)
         use = np.ones(len(scan), dtype=bool)
         turn = np.array([0, 0, pose[2]])
-        surfels.insert(se2.transform(pose, scan.points_body), se2.transform(turn, scan.tangents), scan.spacing_m,
-                       pose[:2].copy(), use, use)  # fmt: skip
+        surfels.insert(
+            se2.transform(pose, scan.points_body),
+            se2.transform(turn, scan.tangents),
+            scan.spacing_m,
+            pose[:2].copy(),
+            use,
+            use,
+        )
     return surfels
 
 
 @pytest.fixture(scope="module")
 def room():
-    return mapped([np.array([x, y, yaw]) for x, y, yaw in
-                   [(2, 2, 0), (2.3, 2, 0.3), (2.6, 2.1, 0.6), (3, 2.4, 0.8), (3.3, 2.8, 1.0), (2, 3, 3.0)]])  # fmt: skip
+    return mapped(
+        [
+            np.array([x, y, yaw])
+            for x, y, yaw in [
+                (2, 2, 0),
+                (2.3, 2, 0.3),
+                (2.6, 2.1, 0.6),
+                (3, 2.4, 0.8),
+                (3.3, 2.8, 1.0),
+                (2, 3, 3.0),
+            ]
+        ]
+    )
 
 
 @given(poses, poses, poses)
@@ -120,9 +138,9 @@ def test_surfel_of_merged_cells_against_numpy(rng):
     low, high = np.linalg.eigvalsh(C)
     axis = np.linalg.eigh(C)[1]
     along = np.clip((low / high - 0.1) / 0.3, 0, 1) / (high + 0.000625)
-    O = axis @ np.diag([1 / (low + 0.000625), along]) @ axis.T  # noqa: E741
+    W = axis @ np.diag([1 / (low + 0.000625), along]) @ axis.T
     assert np.allclose(mean, expected)
-    assert np.allclose(omega, [O[0, 0], O[0, 1], O[1, 1]])
+    assert np.allclose(omega, [W[0, 0], W[0, 1], W[1, 1]])
 
 
 def test_normal_equations_against_numpy(room, rng):
@@ -130,8 +148,21 @@ def test_normal_equations_against_numpy(room, rng):
     scan = prepared(np.array([2.5, 2.1, 0.5]))
     features = scan.features()
     H, g = np.empty((3, 3)), np.empty(3)
-    weights, _, cost = accumulate(features, scan.origin_body, T, tables.nearest, tables.means, tables.omegas, tables.views,
-                                  tables.row0, tables.col0, tables.cell_m, scale2, H, g)  # fmt: skip
+    weights, _, cost = accumulate(
+        features,
+        scan.origin_body,
+        T,
+        tables.nearest,
+        tables.means,
+        tables.omegas,
+        tables.views,
+        tables.row0,
+        tables.col0,
+        tables.cell_m,
+        scale2,
+        H,
+        g,
+    )
     H2, g2, w2, c2 = np.zeros((3, 3)), np.zeros(3), 0.0, 0.0
     R = np.array([[math.cos(T[2]), -math.sin(T[2])], [math.sin(T[2]), math.cos(T[2])]])
     for x, y, tx, ty, half in features:
@@ -141,13 +172,13 @@ def test_normal_equations_against_numpy(room, rng):
         if k < 0 or (T[:2] - p) @ tables.views[k] < -0.3 * np.hypot(*(T[:2] - p)):
             continue
         a, b, c = tables.omegas[k]
-        O, t = np.array([[a, b], [b, c]]), R @ [tx, ty]
+        W, t = np.array([[a, b], [b, c]]), R @ [tx, ty]
         S = ALONG2 * np.outer(t, t) if (tx, ty) != (0, 0) else half**2 * np.eye(2)
-        O = np.linalg.inv(np.eye(2) + O @ S) @ O
+        W = np.linalg.inv(np.eye(2) + W @ S) @ W
         d = p - tables.means[k]
         J = np.column_stack([np.eye(2), R @ [-y, x]])
-        w = (scale2 / (scale2 + d @ O @ d)) ** 2
-        H2, g2, w2, c2 = H2 + w * J.T @ O @ J, g2 + w * J.T @ O @ d, w2 + w, c2 + w * d @ O @ d
+        w = (scale2 / (scale2 + d @ W @ d)) ** 2
+        H2, g2, w2, c2 = H2 + w * J.T @ W @ J, g2 + w * J.T @ W @ d, w2 + w, c2 + w * d @ W @ d
     assert np.allclose(H, H2, rtol=1e-9)
     assert np.allclose(g, g2, rtol=1e-9, atol=1e-6)
     assert (weights, cost) == pytest.approx((w2, c2))
@@ -167,7 +198,9 @@ def test_solve3(rng):
 def test_refinement_finds_the_pose_within_millimetres(room, dx, dy, dyaw):
     truth = np.array([2.5, 2.2, 0.5])
     scan = prepared(truth)
-    match = refine(scan.features(), scan.origin_body, truth + [dx, dy, dyaw], room.tables(), SETTINGS)
+    match = refine(
+        scan.features(), scan.origin_body, truth + np.array([dx, dy, dyaw]), room.tables(), SETTINGS
+    )
     assert np.hypot(*(match.T_map_body[:2] - truth[:2])) < 0.01
     assert abs(match.T_map_body[2] - truth[2]) < 0.004
     assert match.share > 0.9
@@ -177,14 +210,16 @@ def test_search_against_brute_force_and_from_far(room):
     truth = np.array([2.5, 2.2, 0.5])
     scan, tables = prepared(truth), room.tables()
     features = scan.features()[::5]
-    centre = truth + [0.1, -0.1, 0.05]
+    centre = truth + np.array([0.1, -0.1, 0.05])
     scores = np.empty((3, 5, 5), dtype=np.float32)
     correlate(features, centre, tables.field, tables.row0, tables.col0, tables.cell_m, 2, 2, 1, 0.05, scores)
     for a, iy, ix in [(0, 0, 0), (1, 2, 3), (2, 4, 1)]:
         p = se2.transform(np.array([centre[0], centre[1], centre[2] + (a - 1) * 0.05]), features[:, :2])
         cells = np.floor(p / 0.05).astype(int) - [tables.col0, tables.row0] + [(ix - 2) * 2, (iy - 2) * 2]
-        assert scores[a, iy, ix] == pytest.approx(tables.field[cells[:, 1], cells[:, 0]].mean() / 255.0, rel=1e-5)
-    best = search(scan.features(), truth + [0.5, -0.4, 0.3], tables, 0.8, 0.5)
+        assert scores[a, iy, ix] == pytest.approx(
+            tables.field[cells[:, 1], cells[:, 0]].mean() / 255.0, rel=1e-5
+        )
+    best = search(scan.features(), truth + np.array([0.5, -0.4, 0.3]), tables, 0.8, 0.5)
     assert min(np.hypot(*(T[:2] - truth[:2])) for _, T in best) < 0.12
 
 
@@ -194,9 +229,13 @@ def test_a_corridor_gives_no_information_along_it():
     for x in np.linspace(0, 2, 15):
         pose = np.array([x, 1.0, 0.0])
         a, inc, _, low, high = lidar.arguments()
-        scan = prepare_scan(lidar.scan(still(pose), 0.0, walls), a, inc, 0.0, low, high, np.zeros(3), np.zeros(3), 0.03, 360)
+        scan = prepare_scan(
+            lidar.scan(still(pose), 0.0, walls), a, inc, 0.0, low, high, np.zeros(3), np.zeros(3), 0.03, 360
+        )
         use = np.ones(len(scan), dtype=bool)
-        surfels.insert(se2.transform(pose, scan.points_body), scan.tangents, scan.spacing_m, pose[:2], use, use)
+        surfels.insert(
+            se2.transform(pose, scan.points_body), scan.tangents, scan.spacing_m, pose[:2], use, use
+        )
     match = refine(scan.features(), scan.origin_body, np.array([2.0, 1.02, 0.01]), surfels.tables(), SETTINGS)
     sigma = np.sqrt(np.diag(np.linalg.inv(match.information + np.diag([1e-3, 1e-3, 1e-3]))))
     assert sigma[1] < 0.01
@@ -216,7 +255,10 @@ def test_branch_and_bound_is_exact(room):
     found = branch_and_bound(features, centre, pyramid, 1.5, 0.4, 0.2, min_step_rad=math.radians(2))
     assert np.hypot(*(found[0][1][:2] - truth[:2])) < 0.15
     best = 0.0
-    step = min(max(pyramid.cell_m / np.percentile(np.hypot(*features[:, :2].T), 80), math.radians(2)), math.radians(3))
+    step = min(
+        max(pyramid.cell_m / np.percentile(np.hypot(*features[:, :2].T), 80), math.radians(2)),
+        math.radians(3),
+    )
     half = math.ceil(0.4 / step)
     for yaw in centre[2] + step * np.arange(-half, half + 1):
         p = se2.transform(np.array([centre[0], centre[1], yaw]), features[:, :2])

@@ -5,13 +5,28 @@ import numpy as np
 from services.localization.lidar2d import se2
 
 # Two rooms, a door between them, a box, a pillar and a slanted wall; metres.
-WALLS = np.array([
-    [0, 0, 9, 0], [9, 0, 9, 6], [9, 6, 0, 6], [0, 6, 0, 0],
-    [4.5, 0, 4.5, 2.2], [4.5, 3.4, 4.5, 6],
-    [1, 4.2, 2.2, 4.2], [2.2, 4.2, 2.2, 5.1], [2.2, 5.1, 1, 5.1], [1, 5.1, 1, 4.2],
-    [7.2, 1.5, 7.5, 1.5], [7.5, 1.5, 7.5, 1.8], [7.5, 1.8, 7.2, 1.8], [7.2, 1.8, 7.2, 1.5],
-    [8, 6, 9, 4.5], [0, 1.2, 0.6, 0.6], [3.0, 0, 3.0, 0.7],
-], dtype=float)  # fmt: skip
+WALLS = np.array(
+    [
+        [0, 0, 9, 0],
+        [9, 0, 9, 6],
+        [9, 6, 0, 6],
+        [0, 6, 0, 0],
+        [4.5, 0, 4.5, 2.2],
+        [4.5, 3.4, 4.5, 6],
+        [1, 4.2, 2.2, 4.2],
+        [2.2, 4.2, 2.2, 5.1],
+        [2.2, 5.1, 1, 5.1],
+        [1, 5.1, 1, 4.2],
+        [7.2, 1.5, 7.5, 1.5],
+        [7.5, 1.5, 7.5, 1.8],
+        [7.5, 1.8, 7.2, 1.8],
+        [7.2, 1.8, 7.2, 1.5],
+        [8, 6, 9, 4.5],
+        [0, 1.2, 0.6, 0.6],
+        [3.0, 0, 3.0, 0.7],
+    ],
+    dtype=float,
+)
 
 
 def cast(origins: np.ndarray, angles: np.ndarray, walls: np.ndarray) -> np.ndarray:
@@ -36,7 +51,9 @@ def box(x: float, y: float, size: float) -> np.ndarray:
 class Lidar:
     """A full turn (or less) of beams, each at its own time."""
 
-    def __init__(self, beams=360, fov=2 * np.pi, rate_hz=10.0, sigma_m=0.01, seed=0, sweep=True, range_max=12.0):
+    def __init__(
+        self, beams=360, fov=2 * np.pi, rate_hz=10.0, sigma_m=0.01, seed=0, sweep=True, range_max=12.0
+    ):
         self.beams, self.increment, self.angle_min = beams, fov / beams, -fov / 2
         self.dt = 1.0 / rate_hz / beams if sweep else 0.0
         self.sigma_m, self.range_max, self.rng = sigma_m, range_max, np.random.default_rng(seed)
@@ -53,8 +70,25 @@ class Lidar:
         return self.angle_min, self.increment, self.dt, 0.1, self.range_max
 
 
-LOOP = np.array([[1.2, 1.8], [3.6, 1.6], [4.5, 2.8], [6.0, 3.0], [8.0, 2.6], [8.2, 4.0], [6.5, 5.0], [5.2, 3.6],
-                 [4.5, 2.8], [3.4, 3.2], [3.2, 5.2], [2.8, 3.6], [1.2, 3.2], [0.9, 2.3], [1.2, 1.8]])  # fmt: skip
+LOOP = np.array(
+    [
+        [1.2, 1.8],
+        [3.6, 1.6],
+        [4.5, 2.8],
+        [6.0, 3.0],
+        [8.0, 2.6],
+        [8.2, 4.0],
+        [6.5, 5.0],
+        [5.2, 3.6],
+        [4.5, 2.8],
+        [3.4, 3.2],
+        [3.2, 5.2],
+        [2.8, 3.6],
+        [1.2, 3.2],
+        [0.9, 2.3],
+        [1.2, 1.8],
+    ]
+)
 
 
 class Drive:

@@ -1,0 +1,108 @@
+"""What a match really knows: a corridor looks the same a little further on."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+from numba import njit
+
+from services.localization.lidar2d import se2
+from services.localization.lidar2d.matching import Match, accumulate
+from services.localization.lidar2d.settings import LidarSlamSettings
+from services.localization.lidar2d.surfel_map import MatchTables
+
+SHIFTS_M = np.array([-0.45, -0.3, -0.15, 0.15, 0.3, 0.45])
+TELLING = 0.10  # share of the returns that must disagree with a shift for its direction to be trusted
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def agreement_when_shifted(
+    points: np.ndarray,
+    origin: np.ndarray,
+    T: np.ndarray,
+    direction: np.ndarray,
+    shifts_m: np.ndarray,
+    nearest: np.ndarray,
+    means: np.ndarray,
+    omegas: np.ndarray,
+    views: np.ndarray,
+    row0: int,
+    col0: int,
+    cell_m: float,
+    scale2: float,
+    out: np.ndarray,
+) -> float:
+    """Sum of weights at the match (returned) and at each shift along a direction (out float64 [K])."""
+    H, g, moved = np.empty((3, 3)), np.empty(3), np.empty(3)
+    here, _, _ = accumulate(
+        points, origin, T, nearest, means, omegas, views, row0, col0, cell_m, scale2, H, g
+    )
+    for k in range(shifts_m.shape[0]):
+        moved[0] = T[0] + shifts_m[k] * direction[0]
+        moved[1] = T[1] + shifts_m[k] * direction[1]
+        moved[2] = T[2]
+        out[k], _, _ = accumulate(
+            points, origin, moved, nearest, means, omegas, views, row0, col0, cell_m, scale2, H, g
+        )
+    return here
+
+
+def weak_direction(information: np.ndarray) -> np.ndarray:
+    """Unit vector of the translation a match knows least about (yaw marginalised)."""
+    yaw = max(information[2, 2], 1e-9)
+    A = information[:2, :2] - np.outer(information[:2, 2], information[2, :2]) / yaw
+    angle = 0.5 * math.atan2(2.0 * A[0, 1], A[0, 0] - A[1, 1])  # of the strong axis
+    return np.array([-math.sin(angle), math.cos(angle)])
+
+
+def without_slip(
+    points: np.ndarray,  # float64 [K, 5]
+    origin: np.ndarray,
+    match: Match,
+    tables: MatchTables,
+    settings: LidarSlamSettings,
+) -> Match:
+    """The match with its information along the weak direction reduced to what shifting it tells."""
+    if len(points) == 0:
+        return match
+    direction = weak_direction(match.information)
+    sigma_m = math.hypot(settings.range_sigma_m, settings.map_sigma_m)
+    shifted = np.empty(len(SHIFTS_M))
+    here = agreement_when_shifted(
+        points,
+        origin,
+        match.T_map_body,
+        direction,
+        SHIFTS_M,
+        tables.nearest,
+        tables.means,
+        tables.omegas,
+        tables.views,
+        tables.row0,
+        tables.col0,
+        tables.cell_m,
+        (settings.outlier_m / sigma_m) ** 2,
+        shifted,
+    )
+    known = max(match.known * len(points), 1.0)
+    trust = min(max((here - float(shifted.max())) / (TELLING * known), 0.0), 1.0)
+    if trust >= 1.0:
+        return match
+    v = np.array([direction[0], direction[1], 0.0])
+    along = match.information @ v
+    reduced = match.information - (1.0 - trust**2) * np.outer(along, along) / max(float(v @ along), 1e-9)
+    return dataclasses.replace(match, information=reduced)
+
+
+def with_prior(match: Match, prior_T: np.ndarray, prior_information: np.ndarray) -> Match:
+    """Where a match of reduced information is pulled by the prediction."""
+    e = np.array(
+        [*(prior_T - match.T_map_body)[:2], math.remainder(prior_T[2] - match.T_map_body[2], 2 * math.pi)]
+    )
+    P = prior_information / (1.0 + float(e @ prior_information @ e) / 9.0)
+    step = np.linalg.solve(match.information + P + np.diag([1e-3, 1e-3, 1e-1]), P @ e)
+    T = match.T_map_body + step
+    T[2] = se2.wrap(T[2])
+    return dataclasses.replace(match, T_map_body=T)
