@@ -11,7 +11,10 @@ from rich.markup import escape
 from common.errors import UserError
 from services import demo, doctor, system_cli, warm
 from services.bench import cli as bench_cli
+from services.depth import calibrate_cli, models_cli
+from services.depth import cli as depth_cli
 from services.localization import cli as localization_cli
+from services.mapping import cli as mapping_cli
 from services.replay import cli as replay_cli
 from services.simulator import cli as simulator_cli
 
@@ -23,21 +26,31 @@ app = typer.Typer(
 )
 _SYSTEM = "Run a system"
 _DATA = "Recordings and calibration"
+_RESULTS = "Maps and figures"
+_MACHINE = "This machine"
 for command in (
     demo.demo, system_cli.run, system_cli.check, system_cli.serve, system_cli.offline, system_cli.record,
     system_cli.top, system_cli.topics, system_cli.graph,
 ):  # fmt: skip
     app.command(rich_help_panel=_SYSTEM)(command)
-app.command(rich_help_panel=_DATA)(simulator_cli.simulate)
-app.command(rich_help_panel=_DATA)(replay_cli.info)
-app.command(rich_help_panel=_DATA)(replay_cli.rig)
-for command in (doctor.doctor, warm.warm):
-    app.command(rich_help_panel="This machine")(command)
-app.command(rich_help_panel="Maps and figures")(localization_cli.slam)
+for command in (simulator_cli.simulate, replay_cli.info, replay_cli.rig):
+    app.command(rich_help_panel=_DATA)(command)
+app.add_typer(calibrate_cli.app, name="calibrate", rich_help_panel=_DATA)
+for command in (localization_cli.slam, depth_cli.depth):
+    app.command(rich_help_panel=_RESULTS)(command)
+
 evaluate = typer.Typer(no_args_is_help=True, help="Errors against truth.")
 evaluate.command("slam")(localization_cli.eval_slam)
-app.add_typer(evaluate, name="eval", rich_help_panel="Maps and figures")
-app.add_typer(bench_cli.app, name="bench", rich_help_panel="This machine")
+evaluate.command("depth")(depth_cli.eval_depth)
+app.add_typer(evaluate, name="eval", rich_help_panel=_RESULTS)
+
+for command in (doctor.doctor, warm.warm):
+    app.command(rich_help_panel=_MACHINE)(command)
+app.add_typer(models_cli.app, name="models", rich_help_panel=_MACHINE)
+bench_cli.app.command("depth")(depth_cli.bench_depth)
+bench_cli.app.command("raster")(mapping_cli.bench_raster)
+bench_cli.app.command("map")(mapping_cli.bench_map)
+app.add_typer(bench_cli.app, name="bench", rich_help_panel=_MACHINE)
 
 
 def main() -> None:
