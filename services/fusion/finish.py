@@ -60,7 +60,4 @@ def enlarge(
                 sigma_out[V, U] = np.nan
             else:
                 depth_out[V, U] = depth[best_i, best_j]
-                # Which side of the edge a pixel lies on is a guess: a share of the jump joins the error.
-                s = sigma_log[best_i, best_j]
-                jump = 0.15 * np.log(high / low)
-                sigma_out[V, U] = depth[best_i, best_j] * np.sqrt(s * s + jump * jump)
+                sigma_out[V, U] = depth[best_i, best_j] * sigma_log[best_i, best_j]

@@ -19,13 +19,15 @@ from services.fusion.scaling import ratio
 from services.fusion.surfaces import Surfaces
 
 # Standard deviations of log depth, measured on both recordings by what a pixel's depth rests on.
-_BEAM, _FLOOR, _SURFACE, _MATCHED = 0.006, 0.006, 0.012, 0.05
+_BEAM, _FLOOR, _SURFACE, _MATCHED = 0.003, 0.004, 0.010, 0.05
 _PER_SPREAD = 2.3  # error per unit of the matcher's own spread
 _CARRIED = (0.10, 0.06, 0.045)  # depth remembered from one, two, three and more keyframes
-_UPRIGHT, _TILTING = 0.15, 0.24  # extruded walls that nothing confirms: body on a floor, body in the hand
+_UPRIGHT, _TILTING = 0.125, 0.13  # extruded walls that nothing confirms: body on a floor, body in the hand
 _BEAM_HEIGHT_M = 0.06
 _SAME_SURFACE = 0.08
-_TELL_UP_TO = 0.25  # sigma of log depth beyond which a pixel has no answer
+_EDGE = 0.3  # of the jump next to a pixel: which side it lies on is a guess
+_EDGE_REACH = (3, 5)  # rows, columns of the working size
+_TELL_UP_TO = 0.13  # sigma of log depth beyond which a pixel has no answer
 _CONTRADICTION = 0.25  # log: a beam that far from remembered depth contradicts it
 _LEAST_KNOWN = 20
 _LEAST_INLIERS = 0.3
@@ -129,6 +131,13 @@ class Fusion:
         solved.depth_m[pinned] = surfaces.wall[pinned]
         sigma_log[pinned] = _BEAM + 0.01 / solved.depth_m[pinned]
 
+    def _doubt_edges(self, depth: np.ndarray, sigma_log: np.ndarray) -> np.ndarray:
+        """Sigma of log depth with a share of the jumps nearby; thin gaps between beams end anywhere."""
+        log_z = np.log(depth)
+        window = np.ones(_EDGE_REACH, np.uint8)
+        jump = cv2.dilate(log_z, window) - cv2.erode(log_z, window)
+        return np.hypot(sigma_log, np.where(jump > _SAME_SURFACE, _EDGE * jump, 0.0)).astype(np.float32)
+
     def _finish(
         self, frame: Frame, solved: Solved, sigma_log: np.ndarray, uv: np.ndarray, z: np.ndarray
     ) -> Fused:
@@ -137,6 +146,7 @@ class Fusion:
         depth = np.empty(self.field.camera.shape, np.float32)
         sigma = np.empty_like(depth)
         known = np.where(sigma_log <= _TELL_UP_TO, solved.depth_m, np.nan)
+        sigma_log = self._doubt_edges(solved.depth_m, sigma_log)
         colour = cv2.resize(frame.image_rgb, (w, h), interpolation=cv2.INTER_AREA)
         finish.enlarge(known, sigma_log, colour, frame.image_rgb, _SAME_SURFACE, depth, sigma)
         H, W = depth.shape

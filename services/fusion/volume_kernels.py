@@ -95,7 +95,7 @@ def _finish(best: np.ndarray, count: np.ndarray, last: int, cut: float, out: np.
             total += best[d, 0]
             lowest = min(lowest, best[d, 0])
     if seen * 10 < last * 4:
-        for d in range(D):
+        for d in range(last):
             out[d] = np.float32(0.5) * cut
     else:
         neutral = np.float32(0.5) * (lowest + total / np.float32(seen))

@@ -1,0 +1,100 @@
+"""Sources without weights: stixel, none, recorded; and the metrics of the evaluation."""
+
+import cv2
+import numpy as np
+import pytest
+
+from common.errors import UserError
+from common.geometry import se2_to_se3
+from services.depth.metrics import MethodErrors, blocks, confirmed, every_third
+from services.depth.source import View, judge, make_source
+from tests.services.fusion.room import CAMERA, T_BODY_CAMERA, render, scan
+
+POSE = se2_to_se3(np.array([0.3, 0.2, 0.1]))
+
+
+def _view(**changes):
+    picture, _ = render(POSE)
+    return View(
+        **{
+            "stamp_ns": 5,
+            "image_rgb": picture,
+            "camera": CAMERA,
+            "T_body_camera": T_BODY_CAMERA,
+            "beams": scan(POSE),
+            "floor_known": True,
+        }
+        | changes
+    )
+
+
+def test_stixel_is_exact_on_floor_and_on_what_the_lidar_sees():
+    _, truth = render(POSE)
+    values = make_source("stixel").estimate(_view()).values
+    error = np.abs(values - truth) / truth
+    assert np.median(error[120:]) < 0.005
+    assert np.mean(error[130:] < 0.01) > 0.9
+    assert np.mean(error[:60] < 0.01) < 0.6  # no ceiling, and the wall behind the cupboard is unseen
+
+
+def test_without_a_known_floor_only_the_beams_speak():
+    values = make_source("stixel").estimate(_view(floor_known=False)).values
+    assert np.nanmin(values[200]) > 1.2
+
+
+def test_none_answers_nothing_and_recorded_answers_what_is_in_the_folder(tmp_path):
+    assert np.isnan(make_source("none").estimate(_view()).values).all()
+    _, truth = render(POSE)
+    cv2.imwrite(str(tmp_path / "5.png"), np.rint(truth * 1000).astype(np.uint16))
+    np.save(tmp_path / "9000000000.npy", truth[::2, ::2])
+    source = make_source("recorded", {"folder": tmp_path})
+    assert np.abs(source.estimate(_view()).values - truth).max() < 0.001
+    assert "no recorded depth" in source.estimate(_view(stamp_ns=4_000_000_000)).status
+    assert source.estimate(_view(stamp_ns=9_000_000_000)).values.shape == CAMERA.shape
+    with pytest.raises(UserError, match="no folder"):
+        make_source("recorded", {"folder": tmp_path / "absent"})
+
+
+def test_judge_says_what_is_wrong_with_a_map():
+    rng = np.random.default_rng(0)
+    assert judge(rng.uniform(1, 3, (20, 20))) == "ok"
+    assert "same value" in judge(np.full((20, 20), 2.0))
+    assert "above zero" in judge(-rng.uniform(1, 3, (20, 20)))
+    assert "only 0%" in judge(np.full((20, 20), np.nan))
+
+
+def test_held_out_patterns_are_thirds_of_the_circle():
+    assert every_third(720).sum() == 240
+    hidden = blocks(720, np.radians(0.5))
+    assert hidden.sum() == 240
+    assert np.all(hidden[:15])
+    assert not hidden[15:45].any()
+
+
+def test_metrics_are_what_they_are_called():
+    truth = np.full((10, 10), 2.0, np.float32)
+    truth[0] = np.nan
+    depth = truth * 1.1
+    depth[1] = np.nan
+    errors = MethodErrors()
+    errors.add_dense(depth, np.full_like(depth, 0.15), truth)
+    errors.add_held(
+        "third", depth, np.full_like(depth, 0.1), np.array([[3.0, 4.0], [3.0, 1.0]]), np.array([2.0, 2.0])
+    )
+    summary = errors.summary({"third": 0.25})
+    assert summary["rmse_m"] == pytest.approx(0.2, rel=1e-5)
+    assert summary["absrel"] == pytest.approx(0.1, rel=1e-5)
+    assert summary["delta1"] == 1.0
+    assert summary["coverage"] == pytest.approx(80 / 90)
+    assert summary["dense_within_1sigma"] == 0.0
+    assert summary["dense_within_3sigma"] == 1.0
+    assert summary["heldout_beams"] == 1
+    assert summary["heldout_median_m"] == pytest.approx(0.2, rel=1e-5)
+    assert summary["within_3sigma"] == 1.0
+    assert summary["heldout_excluded"] == 0.25
+
+
+def test_beams_that_the_truth_does_not_confirm_are_told():
+    truth = np.full((10, 10), 2.0, np.float32)
+    uv = np.array([[1.0, 1.0]] * 4)
+    assert confirmed(truth, uv, np.array([2.0, 2.089, 2.091, 1.0])).tolist() == [True, True, False, False]

@@ -1,0 +1,117 @@
+"""The models store: table, digest, resume, licence."""
+
+import functools
+import threading
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+
+import pytest
+
+from common.errors import UserError
+from services.depth.models import ModelRow, pull, read_table, row_of
+from services.depth.source import SOURCES
+from services.depth.store import find_model, sha256_of
+
+DATA = bytes(range(256)) * 4000
+
+
+class _Ranges(SimpleHTTPRequestHandler):
+    """Serves a file, in parts where asked."""
+
+    asked: list[str] = []
+
+    def do_GET(self):
+        range_ = self.headers.get("Range")
+        self.asked.append(range_ or "")
+        start = int(range_.removeprefix("bytes=").split("-")[0]) if range_ else 0
+        if start >= len(DATA):
+            self.send_error(416)
+            return
+        self.send_response(206 if range_ else 200)
+        self.send_header("Content-Length", str(len(DATA) - start))
+        self.end_headers()
+        self.wfile.write(DATA[start:])
+
+    def log_message(self, *_):
+        pass
+
+
+@pytest.fixture
+def server():
+    _Ranges.asked = []
+    with ThreadingHTTPServer(("127.0.0.1", 0), _Ranges) as running:
+        threading.Thread(target=running.serve_forever, daemon=True).start()
+        yield f"http://127.0.0.1:{running.server_port}/net.onnx"
+        running.shutdown()
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.setenv("BEAMSPLAT_MODELS", str(tmp_path))
+    return tmp_path
+
+
+def _digest(tmp_path):
+    (tmp_path / "whole").write_bytes(DATA)
+    return sha256_of(tmp_path / "whole")
+
+
+def _row(**changes):
+    return ModelRow(
+        **{"source": "fastdepth", "licence": "MIT", "commercial": True, "url": "", "sha256": ""} | changes
+    )
+
+
+def test_the_table_fits_and_names_sources_that_exist():
+    table = read_table()
+    assert {row.source for row in table.values()} <= set(SOURCES)
+    assert all(row.url or row.how for row in table.values())
+    assert not table["unidepth_v2_vits"].commercial
+    with pytest.raises(UserError, match="there is no model"):
+        row_of("nothing", table)
+
+
+def test_a_broken_download_goes_on_where_it_stopped(server, folder):
+    (folder / "net.onnx.partial").write_bytes(DATA[:100_000])
+    seen = []
+    row = _row(url=server, sha256=_digest(folder))
+    path = pull("net", row, agree=lambda _: False, progress=lambda done, total: seen.append((done, total)))
+    assert path.read_bytes() == DATA
+    assert _Ranges.asked == ["bytes=100000-"]
+    assert seen[-1] == (len(DATA), len(DATA))
+    assert find_model("net") == path
+    assert not list(folder.glob("*.partial"))
+    pull("net", row, agree=lambda _: False)
+    assert len(_Ranges.asked) == 1  # it is here already
+
+
+def test_a_download_that_was_complete_is_not_fetched_again(server, folder):
+    (folder / "net.onnx.partial").write_bytes(DATA)
+    assert pull("net", _row(url=server, sha256=_digest(folder)), agree=lambda _: False).read_bytes() == DATA
+
+
+def test_a_file_of_another_digest_is_removed(server, folder):
+    with pytest.raises(UserError, match="the table says"):
+        pull("net", _row(url=server, sha256="0" * 64), agree=lambda _: True)
+    assert not list(folder.iterdir())
+
+
+def test_what_nobody_has_verified_and_what_is_not_commercial_is_asked_for(server, folder):
+    asked = []
+
+    def agree(question, answers=functools.partial(next, iter([True, False]))):
+        asked.append(question)
+        return answers()
+
+    with pytest.raises(UserError, match="not kept"):
+        pull("net", _row(url=server, commercial=False, licence="CC-BY-NC-4.0"), agree)
+    assert "CC-BY-NC-4.0" in asked[0]
+    assert _digest(folder) in asked[1]
+    with pytest.raises(UserError, match="licence"):
+        pull("net", _row(url=server, commercial=False), lambda _: False)
+
+
+def test_no_address_and_no_connection_are_said(folder):
+    with pytest.raises(UserError, match="export it"):
+        pull("net", _row(how="export it yourself."), lambda _: True)
+    with pytest.raises(UserError, match="cannot be fetched"):
+        pull("net", _row(url="http://127.0.0.1:9/net.onnx"), lambda _: True)
