@@ -9,6 +9,7 @@ from common.raster.lanes import sigmoid_lanes
 from common.raster.layout import (
     CHUNKS,
     COLOUR,
+    GRADIENTS,
     OPACITY,
     QUAT,
     SCALE,
@@ -20,6 +21,7 @@ from common.raster.project import axes, camera_point, chunk_size, rotation, scre
 from common.raster.simd import (
     LANES,
     aligned_floats,
+    any_lane,
     atomic_next,
     gather,
     load,
@@ -178,6 +180,10 @@ def chain(  # noqa: ANN201
         stop = min(visible, (chunk + 1) * size)
         for first in range(chunk * size, stop, LANES):
             _gather_sums(slots, places, first_pair, pair_count, first, stop, sums)
+            if not any_lane(gather(sums, 10, lane_at, 0) > 0.0):  # hidden behind others: no gradient at all
+                for row in range(GRADIENTS):
+                    store(flat, row * wide + first, repeat(np.float32(0.0)))
+                continue
             _chain_group(params, stride, index, first, camera, sums, lane_at, flat, wide, pose)
             for k in range(6):
                 pose_sums[chunk, k] += pose[k]

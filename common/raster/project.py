@@ -14,7 +14,7 @@ from common.raster.simd import LANES, aligned_floats, atomic_next, fma, gather, 
 from common.raster.visible import sort_by_depth
 
 _LN_255 = float(np.log(255.0))
-_FIELDS = 15  # fields of a record that `_write_records` fills
+_SHIFT_W, _SHIFT_H = TILE_W.bit_length() - 1, TILE_H.bit_length() - 1
 
 
 @inner
@@ -108,62 +108,72 @@ def _write_records(params, stride, index, first, c, records, lanes):  # noqa: AN
     store(lanes, 11 * LANES, root(larger(reach * cov[0], 0.0)))  # half width of the ellipse
     store(lanes, 12 * LANES, root(larger(reach * cov[2], 0.0)))  # half height
     store(lanes, 13 * LANES, root(larger(reach / cov[2], 0.0)) * cov[1])  # x of its top point
-    store(lanes, 14 * LANES, cov[1] * cov[1] - cov[0] * cov[2])
+    # B^2 - 4 A C, and 4 C level with level = -log2(e) reach / 2: what the ellipse's arcs need.
+    store(lanes, 14 * LANES, -(k * (LOG2_E * LOG2_E)))
+    store(lanes, 15 * LANES, cov[0] * k * reach * (LOG2_E * LOG2_E))
     for lane in range(LANES):
         at = (first + lane) * RECORD
-        for field in range(_FIELDS):
+        for field in range(RECORD):
             records[at + field] = lanes[field * LANES + lane]
 
 
-@inner
-def _edge(x, record, records, sign):  # noqa: ANN001, ANN202
-    """y of the ellipse's upper (sign 1) or lower (-1) arc at x, relative to the centre.
-
-    From (A, B, C) of the record: a = A x^2, ...; solves C y^2 + B x y + A x^2 = -reach log2(e) / 2.
-    """
-    A, B, C = records[record + 2], records[record + 3], records[record + 4]
-    level = records[record + 10] * np.float32(-0.5 * LOG2_E)
-    inside = max(B * B * x * x - np.float32(4.0) * C * (A * x * x - level), np.float32(0.0))
-    return (-B * x - sign * np.sqrt(inside)) / (np.float32(2.0) * C)
-
-
 @kernel
-def _emit(splat, records, width, height, tiles_x, tiles, rows, at, limit):  # noqa: ANN001, ANN202
-    """Writes the (tile, first and last vector of rows) of one splat behind `at`; gives the new end.
+def _emit(  # noqa: ANN202
+    begin, stop, records, width, height, tiles_x, first_pair, pair_count, tiles, rows, at, limit,  # noqa: ANN001
+):  # fmt: skip
+    """Writes the (tile, first and last vector of rows) of splats begin ... stop behind `at`; gives the new end.
 
-    The coverage is exact per column of tiles: the ellipse's largest and smallest y over its eight pixels.
-    Beyond `limit` pairs are counted only.
+    The coverage is exact per column of tiles: the ellipse's largest and smallest y over its eight pixels,
+    y = (-B x -+ sqrt(B^2 x^2 - 4 C (A x^2 - level))) / 2 C. Beyond `limit` pairs are counted only.
+    A loop over splats, not a function of one: each call counts references to its arrays, atomically.
     """
-    record = splat * RECORD
-    if not records[record + 10] > 0.0:  # fainter than 1/255 at its centre, or not a number
-        return at
-    x, y = records[record], records[record + 1]
-    half_w, half_h, x_top = records[record + 11], records[record + 12], records[record + 13]
-    if not (
-        x + half_w >= 0.0 and x - half_w <= width - 1.0 and y + half_h >= 0.0 and y - half_h <= height - 1.0
-    ):
-        return at
+    zero, right_edge, bottom = np.float32(0.0), np.float32(width - 1), np.float32(height - 1)
     slack = np.float32(1e-3)
-    first = int(max(x - half_w, np.float32(0.0))) // TILE_W
-    last = int(min(x + half_w, np.float32(width - 1.0))) // TILE_W
-    for column in range(first, last + 1):
-        left = max(np.float32(column * TILE_W) - x, -half_w)
-        right = min(np.float32(column * TILE_W + TILE_W - 1) - x, half_w)
-        if left > right + slack:
+    for splat in range(begin, stop):
+        first_pair[splat] = at
+        record = splat * RECORD
+        if not records[record + 10] > 0.0:  # fainter than 1/255 at its centre, or not a number
+            pair_count[splat] = 0
             continue
-        top_x, bottom_x = min(max(x_top, left), right), min(max(-x_top, left), right)
-        high = half_h if top_x == x_top else _edge(top_x, record, records, np.float32(1.0))
-        low = -half_h if bottom_x == -x_top else _edge(bottom_x, record, records, np.float32(-1.0))
-        y0 = int(np.ceil(max(y + low - slack, np.float32(0.0))))
-        y1 = int(np.floor(min(y + high + slack, np.float32(height - 1.0))))
-        if y0 > y1:
+        x, y, half_w, half_h = (
+            records[record],
+            records[record + 1],
+            records[record + 11],
+            records[record + 12],
+        )
+        if not (
+            x + half_w >= zero and x - half_w <= right_edge and y + half_h >= zero and y - half_h <= bottom
+        ):
+            pair_count[splat] = 0
             continue
-        for row in range(y0 // TILE_H, y1 // TILE_H + 1):
-            if at < limit:
-                tile = row * tiles_x + column
-                begin, end = max(y0 - row * TILE_H, 0) // ROWS, min(y1 - row * TILE_H, TILE_H - 1) // ROWS
-                tiles[at], rows[at] = tile, begin | (end << 8)
-            at += 1
+        first, last = int(max(x - half_w, zero)) >> _SHIFT_W, int(min(x + half_w, right_edge)) >> _SHIFT_W
+        B, x_top = records[record + 3], records[record + 13]
+        curved, level = records[record + 14], records[record + 15]
+        half_over_c = np.float32(0.5) / records[record + 4]
+        for column in range(first, last + 1):
+            low, high = -half_h, half_h
+            if first != last:
+                left = max(np.float32(column << _SHIFT_W) - x, -half_w)
+                right = min(np.float32((column << _SHIFT_W) + TILE_W - 1) - x, half_w)
+                if left > right + slack:
+                    continue
+                if x_top < left or x_top > right:
+                    e = min(max(x_top, left), right)
+                    high = (-B * e - np.sqrt(max(curved * e * e + level, zero))) * half_over_c
+                if -x_top < left or -x_top > right:
+                    e = min(max(-x_top, left), right)
+                    low = (-B * e + np.sqrt(max(curved * e * e + level, zero))) * half_over_c
+            y0 = int(np.ceil(max(y + low - slack, zero)))
+            y1 = int(np.floor(min(y + high + slack, bottom)))
+            if y0 > y1:
+                continue
+            for row in range(y0 >> _SHIFT_H, (y1 >> _SHIFT_H) + 1):
+                if at < limit:
+                    top = row << _SHIFT_H
+                    tiles[at] = row * tiles_x + column
+                    rows[at] = (max(y0 - top, 0) // ROWS) | ((min(y1 - top, TILE_H - 1) // ROWS) << 8)
+                at += 1
+        pair_count[splat] = at - first_pair[splat]
     return at
 
 
@@ -192,10 +202,10 @@ def project_and_emit(  # noqa: ANN201
         start, stop = chunk * size, min(visible, (chunk + 1) * size)
         for group in range(start, stop, LANES):
             _write_records(params, stride, index, group, camera, records, lanes)
-            for splat in range(group, min(group + LANES, stop)):
-                end = _emit(splat, records, width, height, tiles_x, tiles, rows, at, limit)
-                first_pair[splat], pair_count[splat] = at, end - at
-                at = end
+            at = _emit(
+                group, min(group + LANES, stop), records, width, height, tiles_x, first_pair, pair_count, tiles, rows,
+                at, limit,
+            )  # fmt: skip
         emitted[chunk] = at - chunk * capacity
 
 

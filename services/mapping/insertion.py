@@ -19,11 +19,13 @@ def unexplained(
     """bool [H, W]: seen through, of another colour, or at another depth than a trusted measurement."""
     alpha = image[4]
     rgb = level.rgb.astype(np.float32) * np.float32(1 / 255)
-    colour_off = np.abs(image[:3] - rgb).mean(axis=0) > settings.colour_off
+    # Over a few pixels: thin edges that lie half a pixel off are for the optimiser, not for new Gaussians.
+    colour_off = cv2.blur(np.abs(image[:3] - rgb).mean(axis=0), (5, 5)) > settings.colour_off
     depth = level.depth_mm.astype(np.float32) * np.float32(1e-3)
     expected = image[3] / np.maximum(alpha, 1e-3)
     trusted = level.depth_weight >= 128
-    depth_off = trusted & (np.abs(expected - depth) > settings.depth_off * depth)
+    depth_off = (trusted & (np.abs(expected - depth) > settings.depth_off * depth)).astype(np.uint8)
+    depth_off = cv2.erode(depth_off, np.ones((5, 5), np.uint8)) > 0
     return (alpha < settings.alpha_low) | colour_off | depth_off
 
 

@@ -8,7 +8,18 @@ from common.raster.compiled import kernel
 from common.raster.lanes import exp2_lanes
 from common.raster.layout import COLOUR, GRADIENTS, MEAN, OPACITY, PARAMS, QUAT, SCALE, WEIGHT
 from common.raster.simd import (
-    LANES, atomic_next, fma, gather, larger, load, repeat, root, scatter_some, smaller, where,
+    LANES,
+    any_lane,
+    atomic_next,
+    fma,
+    gather,
+    larger,
+    load,
+    repeat,
+    root,
+    scatter_some,
+    smaller,
+    where,
 )  # fmt: skip
 
 BETA_1, BETA_2, EPSILON = 0.9, 0.999, 1e-15
@@ -106,6 +117,8 @@ def adam(  # noqa: ANN201
         if begin >= visible:
             return
         for at in range(begin, min(visible, begin + block), LANES):
+            if not any_lane(load(g_flat, WEIGHT * wide + at) > 0.0):  # hidden: nothing to learn
+                continue
             used = min(LANES, visible - at)
             t = gather(steps, 0, index, at) + 1.0
             scatter_some(steps, 0, index, at, t, used)

@@ -69,7 +69,7 @@ class Mapper:
         if frame.anchor not in self.T_map_anchor:
             self.T_map_anchor[frame.anchor] = np.array(T_map_anchor, dtype=np.float64)
         held = hold(frame, self.settings.sigma_unit_m)
-        removed = self._carve(held) + self._prune()
+        removed = self._clean(held)
         inserted = self._insert(held, held.levels[FULL])
         self.keyframes[frame.id] = held
         self._newest = [*self._newest, frame.id][-self.settings.recent :]
@@ -125,16 +125,18 @@ class Mapper:
             self.store.append(make_gaussians(u, v, spacing, level, T_map_camera, self.settings), held.anchor)
         return len(u)
 
-    def _carve(self, held: Held) -> int:
-        level, s = held.levels[FULL], self.settings
+    def _clean(self, held: Held) -> int:
+        """Drops what has faded, and what floats before surfaces that are known well; gives how many."""
+        level, s, store = held.levels[HALF], self.settings, self.store
         packed = level.camera.packed(inverse(self.T_map_camera(held)))
-        contradicted(self.store.params, self.store.count, packed, level.depth_mm, level.depth_weight,
-                     np.uint8(200), s.carve_margin, self.store.strikes)  # fmt: skip
-        return self.store.keep(self.store.strikes[: self.store.count] < s.carve_strikes)
-
-    def _prune(self) -> int:
-        least = np.log(self.settings.prune_opacity / (1.0 - self.settings.prune_opacity))
-        return self.store.keep(self.store.params[OPACITY, : self.store.count] > least)
+        contradicted(store.params, store.count, packed, level.depth_mm, level.depth_weight, np.uint8(200),
+                     s.carve_margin, store.strikes)  # fmt: skip
+        faint = np.log(s.prune_opacity / (1.0 - s.prune_opacity))
+        keep = (store.strikes[: store.count] < s.carve_strikes) & (
+            store.params[OPACITY, : store.count] > faint
+        )
+        # Closing gaps moves all arrays: worth it only for many.
+        return store.keep(keep) if np.count_nonzero(~keep) > store.count // 200 else 0
 
     # --- optimising --------------------------------------------------------------------------------
 

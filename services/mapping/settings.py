@@ -24,15 +24,15 @@ class MapperSettings:
     """See module. Lengths in metres, sizes in pixels of the full picture."""
 
     # Work per keyframe; sizes are halved once for `half` iterations.
-    half_iterations: int = 24
-    full_iterations: int = 8
+    half_iterations: int = 20
+    full_iterations: int = 6
     recent: int = 4  # keyframes of the window that are newest; each second draw is one of them
     # Insertion
     stride_px: int = 4
     fine_stride_px: int = 2  # where the picture has texture
-    texture: float = 0.06  # mean absolute colour step over `stride_px` that counts as texture
+    texture: float = 0.15  # mean absolute colour step over `stride_px` that counts as texture
     alpha_low: float = 0.7  # less than this is not explained
-    colour_off: float = 0.20  # mean absolute colour error that is not explained
+    colour_off: float = 0.15  # mean absolute colour error that is not explained
     depth_off: float = 0.10  # relative depth error that is not explained
     opacity: float = 0.6
     size: float = 0.65  # standard deviation over spacing
@@ -40,7 +40,7 @@ class MapperSettings:
     max_gaussians: int = 400_000
     # Losses
     ssim_weight: float = 0.2
-    ssim_every: int = 1
+    ssim_every: int = 3
     depth_weight: float = 0.1
     lidar_weight: float = 1e-3
     isotropy_weight: float = 0.05

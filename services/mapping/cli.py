@@ -1,0 +1,81 @@
+"""`beamsplat bench raster` and `bench map`: the rasterizer's speed, and what the mapper makes of a recording."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+console = Console(stderr=True)
+JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object")]
+
+
+def bench_raster(
+    gaussians: Annotated[int, typer.Option(min=1000, help="Gaussians in the synthetic room")] = 50_000,
+    repeats: Annotated[int, typer.Option(min=3, help="Timed runs; the median counts")] = 15,
+    as_json: JsonOption = False,
+) -> None:
+    """Forward + L1 + backward of the rasterizers, one and two threads, beside plain torch.
+
+    Example: beamsplat bench raster --json
+    """
+    from services.mapping.bench_raster import bench_raster as run
+
+    result = run(gaussians, repeats, console.print)
+    if as_json:
+        print(json.dumps(result))
+        return
+    table = Table(
+        "backend", "size", "Gaussians", "threads", "forward ms", "total ms", "CPU ms", "best total ms"
+    )
+    for case in result["cases"]:
+        numbers = [f"{case[key]:.1f}" for key in ("forward_ms", "total_ms", "cpu_ms", "best_total_ms")]
+        size = f"{case['width']}x{case['height']}"
+        table.add_row(case["backend"], size, str(case["gaussians"]), str(case["threads"]), *numbers)
+    Console().print(table)
+
+
+def bench_map(
+    data: Annotated[Path, typer.Argument(help="Folder with bag/, groundtruth.txt and the held-out truth")],
+    prior: Annotated[
+        str, typer.Option(help="Depth of the keyframes: stixel (beams and floor) or truth")
+    ] = "stixel",
+    refine_s: Annotated[
+        float, typer.Option(min=0.0, help="Refinement after the drive, in seconds of one core")
+    ] = 60.0,
+    threads: Annotated[int, typer.Option(min=1, help="Threads of the rasterizer")] = 2,
+    seed: Annotated[int, typer.Option(help="Seed of the mapper")] = 0,
+    out: Annotated[
+        Path | None, typer.Option(help="Write pictures and the map (.ply) into this folder")
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """A map from true poses: PSNR, SSIM and depth at views that it never saw, online and refined.
+
+    Example: beamsplat bench map ../shared/data/house_a --prior truth --json
+    """
+    from services.mapping.bench_map import MapBench, run_bench
+
+    result = run_bench(
+        data, MapBench(prior=prior, threads=threads, seed=seed, refine_s=refine_s), console.print, out
+    )
+    if as_json:
+        print(json.dumps(result))
+        return
+    _print_scores(result)
+
+
+def _print_scores(result: dict[str, Any]) -> None:
+    table = Table("figure", "online", "refined")
+    for key in result["online"]:
+        table.add_row(key, f"{result['online'][key]:.3f}", f"{result['refined'][key]:.3f}")
+    screen = Console()
+    screen.print(table)
+    for key in ("keyframes", "refused", "data_s", "wall_s", "cpu_s", "steps", "refine_steps", "peak_rss_mb"):
+        screen.print(
+            f"{key}: {result[key]:.1f}" if isinstance(result[key], float) else f"{key}: {result[key]}"
+        )
