@@ -10,14 +10,13 @@ import numpy as np
 from services.localization.lidar2d import se2
 from services.localization.lidar2d.correlative import search
 from services.localization.lidar2d.matching import Match, refine
-from services.localization.lidar2d.observability import weak_direction, without_slip
+from services.localization.lidar2d.observability import without_slip
 from services.localization.lidar2d.odometry import OdometryBuffer, Predictor
 from services.localization.lidar2d.scan import PreparedScan, prepare_scan
 from services.localization.lidar2d.settings import LidarSlamSettings
 from services.localization.lidar2d.surfel_map import SurfelMap
 
 NS = 1e-9
-LEARN_SIGMA_M = 0.02  # directions known less well than this teach nothing about the wheels
 
 
 @dataclass(frozen=True)
@@ -214,26 +213,13 @@ class FrontEnd:
         return best
 
     def accept(
-        self,
-        stamp_ns: int,
-        T_odom_body: np.ndarray,
-        options: list[tuple[Predictor, np.ndarray]],
-        information: np.ndarray | None = None,  # of the match, axes of the map it was matched to
-        T_odom_map: np.ndarray | None = None,
+        self, stamp_ns: int, T_odom_body: np.ndarray, options: list[tuple[Predictor, np.ndarray]]
     ) -> None:
-        """Take in the pose of the newest scan; predictors and the delay learn from it, but only in directions
-        the match knows: a corridor must not teach that the wheels are wrong."""
+        """Take in the pose of the newest scan; predictors and the delay learn from it."""
         if self.poses:
             moved = se2.between(self.poses[-1], T_odom_body)
-            blind = None
-            if information is not None and T_odom_map is not None:
-                v = weak_direction(information)
-                if 1.0 / max(float(v @ information[:2, :2] @ v), 1e-9) > LEARN_SIGMA_M**2:
-                    turn = T_odom_map[2] - self.poses[-1][2]
-                    c, s = math.cos(turn), math.sin(turn)
-                    blind = np.array([c * v[0] - s * v[1], s * v[0] + c * v[1]])
             for predictor, motion in options:
-                predictor.learn(motion, moved, blind)
+                predictor.learn(motion, moved)
             self.odometry.observe_turn(self.stamps[-1], stamp_ns, float(moved[2]))
         self.stamps.append(stamp_ns)
         self.poses.append(T_odom_body)

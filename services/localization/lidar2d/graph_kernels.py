@@ -106,8 +106,7 @@ def reduce_nodes(
     blocks[:] = 0.0
     rhs[:] = 0.0
     e, Js, Jn, Om = np.empty(3), np.empty((3, 3)), np.zeros((3, 3)), np.empty((3, 3))
-    OJs, OJn, Hss, Hnn, t1, t2 = (
-        np.empty((3, 3)),
+    OJs, OJn, Hss, Hnn, t1 = (
         np.empty((3, 3)),
         np.empty((3, 3)),
         np.empty((3, 3)),

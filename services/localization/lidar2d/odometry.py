@@ -173,12 +173,9 @@ class Predictor:
         base_m, per_m, base_rad, per_rad = self._base
         return base_m + per_m * distance, base_rad + per_rad * turn + 0.1 * per_rad * distance
 
-    def learn(self, motion: np.ndarray, truth: np.ndarray, blind: np.ndarray | None = None) -> None:
+    def learn(self, motion: np.ndarray, truth: np.ndarray) -> None:
         """Compare with the matched motion; the scale follows quickly upwards and slowly down."""
         error = se2.between(motion, truth)
-        if blind is not None:  # unit vector in the last body frame along which the match knows nothing
-            along = (truth[0] - motion[0]) * blind[0] + (truth[1] - motion[1]) * blind[1]
-            error[:2] = truth[:2] - motion[:2] - along * blind
         unit_m, unit_rad = self._unit(motion)
         ratio_m = min((error[0] ** 2 + error[1] ** 2) / (2.0 * unit_m**2), 400.0)
         ratio_rad = min(error[2] ** 2 / unit_rad**2, 400.0)

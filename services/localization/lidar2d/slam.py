@@ -117,9 +117,7 @@ class LidarSlam:
         else:
             last = self.front.poses[-1]
             T_odom_body = se2.compose(last, prediction.motion) if prediction.source == "wheels" else last
-        self.front.accept(
-            stamp_ns, T_odom_body, options if good else [], match.information, self.mapper.matched.T_odom_map
-        )
+        self.front.accept(stamp_ns, T_odom_body, options if good else [])
         self._lost_run = 0 if good else self._lost_run + 1
         if self._lost_run >= self.settings.lost_scans or (self._lost_run and prediction.blind):
             self._start_segment(raw.stamp_ns, scan, T_odom_body)
