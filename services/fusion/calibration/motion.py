@@ -88,11 +88,12 @@ def solve_motion(
     before = problem.residuals(start)
     if mask[0]:
         clocks = np.arange(-_SEARCH_S, _SEARCH_S + 1e-9, 0.02)
-        rest = mask & (np.arange(len(mask)) != 0)
+        # Yaw is the mount error that most looks like a wrong clock: it follows along.
+        rest = mask & (np.array(PARAMETERS) == "yaw_rad")
         costs = []
         for clock in clocks:
             x = np.concatenate([[clock], start[1:]])
-            costs.append(problem.cost(problem.descend(x, rest, 2)))
+            costs.append(problem.cost(problem.descend(x, rest, 1)))
         start[0] = clocks[int(np.argmin(costs))]
     best = problem.descend(start, mask, 12)
     groups = np.array_split(np.arange(len(pairs)), _BLOCKS)
