@@ -41,14 +41,14 @@ class FieldConfig:
     cost_scale: float = 12.0
     p1: float = 0.7
     p2: float = 12.0
-    edge_grey: float = 8.0
+    edge_grey: float = 12.0
     temperature: float = 2.0
     wall_near: float = 4.0  # at the height of the lidar
     wall_far: float = 0.25  # far above and below, on a body that stays level
     wall_reach_m: float = 0.15
     floor: float = 3.0
     behind: float = 1.0
-    ceiling: float = 2.0
+    ceiling: float = 3.5
     ceiling_evidence: float = 500.0
     memory: float = 1.5
     memory_keyframes: int = 6
@@ -177,7 +177,7 @@ class Field:
         cost, views = self._sweep(frame, small)
         if self._floor_known and views:
             surfaces = self._finder.find(frame.beams, None, frame.T_map_body, ())
-            self._find_ceilings(cost, surfaces.wall)
+            self._find_ceilings(cost, surfaces.backdrop)
         surfaces = self.surfaces(frame)
         self._add_priors(cost, frame, surfaces, self.recall(small) if len(self._memory) else None)
         solved = self._solve(cost, small, surfaces, views)
@@ -265,8 +265,10 @@ class Field:
         self._dig(
             cost,
             np.where(on_floor, np.nan, surfaces.wall),
-            (c.wall_far if self._planar else 0.0) + c.wall_near * near,
+            c.wall_near * near,
         )
+        if self._planar:
+            self._dig(cost, np.where(on_floor, np.nan, surfaces.backdrop), c.wall_far)
         self._dig(cost, np.where(on_floor, surfaces.floor, np.nan), c.floor)
         for layer in surfaces.behind:
             self._dig(cost, layer, c.behind)
@@ -317,7 +319,8 @@ def snap(depth: np.ndarray, surfaces: Surfaces, tolerance: float, wall_reach_m: 
     wall = np.where(surfaces.on_floor | ~(surfaces.wall_off_m < wall_reach_m), np.nan, surfaces.wall)
     best = np.full(depth.shape, tolerance)
     result = depth.copy()
-    for surface in (wall, surfaces.floor, *surfaces.behind, *surfaces.ceilings):
+    backdrop = np.where(surfaces.on_floor, np.nan, surfaces.backdrop) if np.isinf(wall_reach_m) else wall
+    for surface in (wall, backdrop, surfaces.floor, *surfaces.behind, *surfaces.ceilings):
         with np.errstate(invalid="ignore"):
             error = np.abs(np.log(surface / depth))
             nearer = error < best

@@ -27,7 +27,7 @@ _BEAM_HEIGHT_M = 0.06
 _SAME_SURFACE = 0.08
 _EDGE = 0.3  # of the jump next to a pixel: which side it lies on is a guess
 _EDGE_REACH = (3, 5)  # rows, columns of the working size
-_TELL_UP_TO = 0.13  # sigma of log depth beyond which a pixel has no answer
+_TELL_UP_TO = 0.14  # sigma of log depth beyond which a pixel has no answer
 _CONTRADICTION = 0.25  # log: a beam that far from remembered depth contradicts it
 _LEAST_KNOWN = 20
 _LEAST_INLIERS = 0.3
@@ -145,8 +145,8 @@ class Fusion:
         h, w = self.field.small_camera.shape
         depth = np.empty(self.field.camera.shape, np.float32)
         sigma = np.empty_like(depth)
-        known = np.where(sigma_log <= _TELL_UP_TO, solved.depth_m, np.nan)
         sigma_log = self._doubt_edges(solved.depth_m, sigma_log)
+        known = np.where(sigma_log <= _TELL_UP_TO, solved.depth_m, np.nan).astype(np.float32)
         colour = cv2.resize(frame.image_rgb, (w, h), interpolation=cv2.INTER_AREA)
         finish.enlarge(known, sigma_log, colour, frame.image_rgb, _SAME_SURFACE, depth, sigma)
         H, W = depth.shape

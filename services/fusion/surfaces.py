@@ -11,12 +11,15 @@ from common.camera import Pinhole
 from common.geometry import yaw_of
 from services.fusion.lidar_map import LidarMap
 
+_POST_HEIGHT_M = 0.35  # how far from the lidar plane legs and posts are taken to reach
+
 
 @dataclass(frozen=True)
 class Surfaces:
     """Optical z [h, w] of each candidate surface, NaN where it is not met."""
 
     wall: np.ndarray  # the nearest beam of the column, extruded upright
+    backdrop: np.ndarray  # the same without what is narrow (legs, posts): what stands behind it
     wall_off_m: np.ndarray  # how far above or below the lidar plane the pixel meets that wall
     floor: np.ndarray
     behind: tuple[np.ndarray, ...]  # walls farther back, from the drive so far
@@ -25,7 +28,9 @@ class Surfaces:
     @property
     def nearest(self) -> np.ndarray:
         """What one sees if nothing but these surfaces exists (`stixel`, and ceilings)."""
-        near = np.fmin(self.wall, self.floor)
+        with np.errstate(invalid="ignore"):
+            high = self.wall_off_m > _POST_HEIGHT_M
+        near = np.fmin(np.where(high, self.backdrop, self.wall), self.floor)
         for ceiling in self.ceilings:
             near = np.fmin(near, ceiling)
         return near
@@ -69,6 +74,7 @@ class SurfaceFinder:
         wall = wall_depth(self.rays_body, azimuth, reach)
         lidar_z_m = float(np.median(points[:, 2])) if len(points) else 0.0
         off = np.abs(self.camera_z_m + wall * self.rise - lidar_z_m)
+        backdrop = wall_depth(self.rays_body, azimuth, without_posts(azimuth, reach))
         behind: list[np.ndarray] = []
         if lidar_map is not None:
             position = (T_map_body @ self._T_body_camera)[:2, 3]
@@ -81,8 +87,37 @@ class SurfaceFinder:
         for height in ceiling_heights_m:
             plane = plane_depth(self.rays_body, self.camera_z_m, height)
             with np.errstate(invalid="ignore"):
-                ceilings.append(np.where((self.rise > 0.02) & (plane < wall), plane, np.nan))
-        return Surfaces(wall, off, self.floor, tuple(behind), tuple(ceilings))
+                ceilings.append(np.where((self.rise > 0.02) & (plane < backdrop), plane, np.nan))
+        return Surfaces(wall, backdrop, off, self.floor, tuple(behind), tuple(ceilings))
+
+
+def without_posts(
+    azimuth_rad: np.ndarray, reach_m: np.ndarray, width_m: float = 0.3, jump: float = 1.15
+) -> np.ndarray:
+    """Ranges [N] with narrow things replaced by what stands beside them.
+
+    A run of beams no wider than `width_m` whose neighbours on both sides are farther by `jump` is a leg,
+    a post, the end of a rail: it seldom reaches the ceiling.
+    """
+    order = np.argsort(azimuth_rad, kind="stable")
+    a, r = azimuth_rad[order], reach_m[order].copy()
+    for _ in range(2):  # a post before a post
+        cut = np.flatnonzero(np.maximum(r[1:], r[:-1]) > jump * np.minimum(r[1:], r[:-1])) + 1
+        starts, stops = np.concatenate([[0], cut]), np.concatenate([cut, [len(r)]])
+        out = r.copy()
+        for first, stop in zip(starts, stops):
+            if first == 0 or stop == len(r):
+                continue
+            middle = float(np.median(r[first:stop]))
+            left, right = r[first - 1], r[stop]
+            narrow = (a[stop - 1] - a[first]) * middle < width_m
+            if narrow and min(left, right) > jump * middle:
+                share = np.linspace(0.0, 1.0, stop - first + 2)[1:-1]
+                out[first:stop] = 1.0 / ((1.0 - share) / left + share / right)
+        r = out
+    result = np.empty_like(r)
+    result[order] = r
+    return result
 
 
 class CeilingFinder:
