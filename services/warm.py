@@ -8,7 +8,11 @@ import time
 from rich.console import Console
 
 # Each function runs its library's kernels once, on tiny inputs of the types that are used.
-WARMERS = ("services.localization.lidar2d.warm:warm",)
+WARMERS = (
+    "services.localization.lidar2d.warm:warm",
+    "services.fusion.warm:warm",
+    "common.raster.warm:warm",
+)
 
 
 def warm() -> None:
