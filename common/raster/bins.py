@@ -5,7 +5,7 @@ from __future__ import annotations
 from common.raster.compiled import kernel
 from common.raster.layout import CHUNKS
 from common.raster.project import chunk_size
-from common.raster.simd import atomic_next
+from common.raster.simd_memory import atomic_next
 
 
 @kernel
@@ -25,7 +25,7 @@ def count(counter, visible, order, first_pair, pair_count, tiles, per_tile):  # 
 
 @kernel
 def place(per_tile, tile_start):  # noqa: ANN001, ANN201
-    """Turns counts into the place where each part begins to write; `tile_start` [tiles + 1]. Gives their sum."""
+    """Turns counts into places where the parts begin to write; fills `tile_start`; gives the sum."""
     total = 0
     for tile in range(per_tile.shape[1]):
         tile_start[tile] = total
@@ -41,7 +41,7 @@ def place(per_tile, tile_start):  # noqa: ANN001, ANN201
 def scatter(  # noqa: ANN201
     counter, visible, order, first_pair, pair_count, tiles, rows, per_tile, lists,  # noqa: ANN001
 ):  # fmt: skip
-    """Fills lists [pairs, 2] of (splat, rows), tile after tile; tiles[pair] becomes the pair's place there."""
+    """Fills lists [pairs, 2] of (splat, rows), tile after tile; tiles[pair] becomes the pair's place."""
     size = chunk_size(visible)
     while True:
         chunk = atomic_next(counter, 0)

@@ -44,11 +44,13 @@ class RasterCamera:
         )  # fmt: skip
 
     def slope_limits(self) -> tuple[float, float, float, float]:
-        """x/z and y/z (low, high, low, high) beyond which the Jacobian is held: 30 % of a half view outside."""
+        """x/z and y/z (low, high, low, high) beyond which the Jacobian is held: 15 % of a view outside."""
         margin_x, margin_y = 0.15 * self.width_px / self.fx_px, 0.15 * self.height_px / self.fy_px
         return (
-            -(self.cx_px + 0.5) / self.fx_px - margin_x, (self.width_px - 0.5 - self.cx_px) / self.fx_px + margin_x,
-            -(self.cy_px + 0.5) / self.fy_px - margin_y, (self.height_px - 0.5 - self.cy_px) / self.fy_px + margin_y,
+            -(self.cx_px + 0.5) / self.fx_px - margin_x,
+            (self.width_px - 0.5 - self.cx_px) / self.fx_px + margin_x,
+            -(self.cy_px + 0.5) / self.fy_px - margin_y,
+            (self.height_px - 0.5 - self.cy_px) / self.fy_px + margin_y,
         )  # fmt: skip
 
     def packed(self, T_camera_map: np.ndarray) -> np.ndarray:
@@ -60,9 +62,8 @@ class RasterCamera:
         T = np.asarray(T_camera_map, dtype=np.float64)
         if T.shape != (4, 4) or not np.all(np.isfinite(T)):
             raise ValueError(f"T_camera_map must be a finite [4, 4], got {T.tolist()}")
-        size = (self.width_px, self.height_px, NEAR_M, 0.0, 0.0)[:5]
         values = (*T[:3, :3].ravel(), *T[:3, 3], self.fx_px, self.fy_px, self.cx_px, self.cy_px,
-                  *self.slope_limits(), *size[:4])  # fmt: skip
+                  *self.slope_limits(), self.width_px, self.height_px, NEAR_M, 0.0)  # fmt: skip
         return np.array(values, dtype=np.float32)
 
 

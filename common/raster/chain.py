@@ -18,20 +18,8 @@ from common.raster.layout import (
     WEIGHT,
 )  # fmt: skip
 from common.raster.project import axes, camera_point, chunk_size, rotation, screen_covariance
-from common.raster.simd import (
-    LANES,
-    aligned_floats,
-    any_lane,
-    atomic_next,
-    gather,
-    load,
-    prefetch,
-    repeat,
-    root,
-    store,
-    store_sums4,
-    where,
-)
+from common.raster.simd import LANES, any_lane, repeat, root, where
+from common.raster.simd_memory import aligned_floats, atomic_next, gather, load, prefetch, store, store_sums4
 
 _AHEAD = 24  # pairs whose slots are fetched in advance
 
@@ -107,10 +95,14 @@ def _write_shape(out, at, wide, c, q, M, dM, s):  # noqa: ANN001, ANN202
     store(out, (SCALE + 1) * wide + at, M[1] * dM[1] + M[4] * dM[4] + M[7] * dM[7])
     store(out, (SCALE + 2) * wide + at, M[2] * dM[2] + M[5] * dM[5] + M[8] * dM[8])
     N = (  # dL/dR_q = R_camera_map^T dL/dM diag(s)
-        (dM[0] * c[0] + dM[3] * c[3] + dM[6] * c[6]) * s[0], (dM[1] * c[0] + dM[4] * c[3] + dM[7] * c[6]) * s[1],
-        (dM[2] * c[0] + dM[5] * c[3] + dM[8] * c[6]) * s[2], (dM[0] * c[1] + dM[3] * c[4] + dM[6] * c[7]) * s[0],
-        (dM[1] * c[1] + dM[4] * c[4] + dM[7] * c[7]) * s[1], (dM[2] * c[1] + dM[5] * c[4] + dM[8] * c[7]) * s[2],
-        (dM[0] * c[2] + dM[3] * c[5] + dM[6] * c[8]) * s[0], (dM[1] * c[2] + dM[4] * c[5] + dM[7] * c[8]) * s[1],
+        (dM[0] * c[0] + dM[3] * c[3] + dM[6] * c[6]) * s[0],
+        (dM[1] * c[0] + dM[4] * c[3] + dM[7] * c[6]) * s[1],
+        (dM[2] * c[0] + dM[5] * c[3] + dM[8] * c[6]) * s[2],
+        (dM[0] * c[1] + dM[3] * c[4] + dM[6] * c[7]) * s[0],
+        (dM[1] * c[1] + dM[4] * c[4] + dM[7] * c[7]) * s[1],
+        (dM[2] * c[1] + dM[5] * c[4] + dM[8] * c[7]) * s[2],
+        (dM[0] * c[2] + dM[3] * c[5] + dM[6] * c[8]) * s[0],
+        (dM[1] * c[2] + dM[4] * c[5] + dM[7] * c[8]) * s[1],
         (dM[2] * c[2] + dM[5] * c[5] + dM[8] * c[8]) * s[2],
     )  # fmt: skip
     g = _quat_gradient(q, N)
@@ -122,7 +114,7 @@ def _write_shape(out, at, wide, c, q, M, dM, s):  # noqa: ANN001, ANN202
 
 @kernel
 def _chain_group(params, stride, index, first, c, sums, lane_at, out, wide, pose):  # noqa: ANN001, ANN202
-    """Gradients of splats first ... first + LANES into out[row * wide + first], their pose sums into pose[8]."""
+    """Gradients of a group of splats into out[row * wide + first], their pose sums into pose[8]."""
     xc, yc, zc = camera_point(params, stride, index, first, c)
     q, Rq = rotation(params, stride, index, first)
     M, s = axes(params, stride, index, first, c, Rq)

@@ -1,6 +1,6 @@
 """Gaussians on the screen: projection of `LANES` at a time, and the tiles that each one touches.
 
-EWA splatting (Zwicker et al. 2001) as in 3DGS: V = J R_camera_map R_q diag(s), screen covariance V V^T + blur.
+EWA splatting (Zwicker et al. 2001) as in 3DGS: V = J R_camera_map R_q diag(s), covariance V V^T + blur.
 """
 
 from __future__ import annotations
@@ -10,7 +10,8 @@ import numpy as np
 from common.raster.compiled import inner, kernel
 from common.raster.lanes import LOG2_E, exp_lanes, log2_lanes, sigmoid_lanes
 from common.raster.layout import BLUR_PX2, CHUNKS, COLOUR, OPACITY, QUAT, RECORD, ROWS, SCALE, TILE_H, TILE_W
-from common.raster.simd import LANES, aligned_floats, atomic_next, fma, gather, larger, root, smaller, store
+from common.raster.simd import LANES, fma, larger, root, smaller
+from common.raster.simd_memory import aligned_floats, atomic_next, gather, store
 from common.raster.visible import sort_by_depth
 
 _LN_255 = float(np.log(255.0))
@@ -33,7 +34,7 @@ def camera_point(params, stride, index, at, c):  # noqa: ANN001, ANN201
 
 @inner
 def rotation(params, stride, index, at):  # noqa: ANN001, ANN201
-    """Unit quaternion (w x y z) of Gaussians index[at...], 1/length of the raw one, and the nine of R, by rows."""
+    """Unit quaternion (w x y z) of Gaussians index[at...], 1/length of the raw one, and R by rows."""
     w, x = gather(params, QUAT * stride, index, at), gather(params, (QUAT + 1) * stride, index, at)
     y, z = gather(params, (QUAT + 2) * stride, index, at), gather(params, (QUAT + 3) * stride, index, at)
     n = 1.0 / root(larger(w * w + x * x + y * y + z * z, 1e-24))
@@ -121,7 +122,7 @@ def _write_records(params, stride, index, first, c, records, lanes):  # noqa: AN
 def _emit(  # noqa: ANN202
     begin, stop, records, width, height, tiles_x, first_pair, pair_count, tiles, rows, at, limit,  # noqa: ANN001
 ):  # fmt: skip
-    """Writes the (tile, first and last vector of rows) of splats begin ... stop behind `at`; gives the new end.
+    """Writes (tile, first and last vector of rows) of splats begin ... stop behind `at`; gives the new end.
 
     The coverage is exact per column of tiles: the ellipse's largest and smallest y over its eight pixels,
     y = (-B x -+ sqrt(B^2 x^2 - 4 C (A x^2 - level))) / 2 C. Beyond `limit` pairs are counted only.
@@ -203,8 +204,8 @@ def project_and_emit(  # noqa: ANN201
         for group in range(start, stop, LANES):
             _write_records(params, stride, index, group, camera, records, lanes)
             at = _emit(
-                group, min(group + LANES, stop), records, width, height, tiles_x, first_pair, pair_count, tiles, rows,
-                at, limit,
+                group, min(group + LANES, stop), records, width, height, tiles_x, first_pair, pair_count,
+                tiles, rows, at, limit,
             )  # fmt: skip
         emitted[chunk] = at - chunk * capacity
 

@@ -89,7 +89,7 @@ class Render:
 
 @dataclass
 class Gradients:
-    """dL/d(parameters) of the visible Gaussians. `by_splat` is memory of the render: copy what must outlive it."""
+    """dL/d(parameters) of visible Gaussians. `by_splat` is the render's memory: copy what must outlive it."""
 
     by_splat: np.ndarray  # float32 [GRADIENTS, >= V]: rows as in layout, one column a visible Gaussian
     index: np.ndarray  # int32 [V]: which Gaussian a column belongs to, ascending
@@ -143,7 +143,8 @@ class Rasterizer:
         """Gradients of a loss, given dL/d(image) float32 [5, H, W]. May be called again for another loss."""
         if gradient.shape != render.image.shape or gradient.dtype != np.float32:
             raise ValueError(
-                f"the gradient must be float32 {list(render.image.shape)}, got {gradient.dtype} {list(gradient.shape)}"
+                f"the gradient must be float32 {list(render.image.shape)}, "
+                f"got {gradient.dtype} {list(gradient.shape)}"
             )
         work, tables, visible = render.workspace, render.tables, len(render.index)
         slots = work.take("slots", (max(render.pairs, 1) * SLOT,))
@@ -155,8 +156,8 @@ class Rasterizer:
         out = work.take("gradients", (GRADIENTS, -(-max(visible, 1) // LANES) * LANES))
         pose_sums = np.zeros((CHUNKS, 6))
         self.team.run(
-            chain, render.params.reshape(-1), render.params.shape[1], tables.index, visible, render.camera, slots,
-            tables.places, tables.first_pair, tables.pair_count, out, pose_sums,
+            chain, render.params.reshape(-1), render.params.shape[1], tables.index, visible, render.camera,
+            slots, tables.places, tables.first_pair, tables.pair_count, out, pose_sums,
         )  # fmt: skip
         return Gradients(out, render.index, pose_sums.sum(axis=0))
 
@@ -195,7 +196,8 @@ class Rasterizer:
             rows = work.take("rows", (CHUNKS * self._capacity,), np.int32)
             self.team.run(
                 project_and_emit, flat, stride, index, visible, packed, width, height, tiles_x,
-                records, first_pair, pair_count, tiles, rows, emitted, depth, order, keys, keys_other, order_other,
+                records, first_pair, pair_count, tiles, rows, emitted,
+                depth, order, keys, keys_other, order_other,
             )  # fmt: skip
             most = int(emitted.max())
             if most <= self._capacity:

@@ -13,20 +13,19 @@ from collections.abc import Callable
 from typing import Any
 
 import llvmlite.binding as llvm
-import numpy as np
 from llvmlite import ir
-from numba import njit, types
+from numba import types
 from numba.core import cgutils
 from numba.core.typing.templates import ConcreteTemplate, infer_global, signature
 from numba.extending import intrinsic, lower_builtin, models, register_model
 
 LANES = 16 if llvm.get_host_cpu_features().get("avx512f", False) else 8
-_FLOAT, _INT, _BIT = ir.FloatType(), ir.IntType(32), ir.IntType(1)
-_VEC, _IVEC, _MASK = (ir.VectorType(kind, LANES) for kind in (_FLOAT, _INT, _BIT))
+FLOAT, INT, _BIT = ir.FloatType(), ir.IntType(32), ir.IntType(1)
+VEC, IVEC, MASK = (ir.VectorType(kind, LANES) for kind in (FLOAT, INT, _BIT))
 _FUSE = ("contract",)
 
 
-class _F32Type(types.Type):
+class F32Type(types.Type):
     def __init__(self) -> None:
         super().__init__(name=f"f32x{LANES}")
 
@@ -36,55 +35,47 @@ class _MaskType(types.Type):
         super().__init__(name=f"mask{LANES}")
 
 
-F32, Mask = _F32Type(), _MaskType()
+F32, Mask = F32Type(), _MaskType()
 
 
-@register_model(_F32Type)
+@register_model(F32Type)
 class _F32Model(models.PrimitiveModel):
     def __init__(self, dmm: Any, fe_type: types.Type) -> None:
-        super().__init__(dmm, fe_type, _VEC)
+        super().__init__(dmm, fe_type, VEC)
 
 
 @register_model(_MaskType)
 class _MaskModel(models.PrimitiveModel):
     def __init__(self, dmm: Any, fe_type: types.Type) -> None:
-        super().__init__(dmm, fe_type, _MASK)
+        super().__init__(dmm, fe_type, MASK)
 
 
-def _constant(value: float) -> ir.Constant:
-    return ir.Constant(_VEC, [value] * LANES)
+def constant(value: float) -> ir.Constant:
+    return ir.Constant(VEC, [value] * LANES)
 
 
 def _icon(value: int) -> ir.Constant:
-    return ir.Constant(_IVEC, [value] * LANES)
+    return ir.Constant(IVEC, [value] * LANES)
 
 
-def _shuffle(builder: ir.IRBuilder, a: ir.Value, b: ir.Value, lanes: list[int]) -> ir.Value:
-    return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(_INT, len(lanes)), lanes))
+def shuffle(builder: ir.IRBuilder, a: ir.Value, b: ir.Value, lanes: list[int]) -> ir.Value:
+    return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(INT, len(lanes)), lanes))
 
 
 def _repeat(builder: ir.IRBuilder, scalar: ir.Value) -> ir.Value:
-    one = builder.insert_element(ir.Constant(_VEC, ir.Undefined), scalar, ir.Constant(_INT, 0))
-    return _shuffle(builder, one, one, [0] * LANES)
+    one = builder.insert_element(ir.Constant(VEC, ir.Undefined), scalar, ir.Constant(INT, 0))
+    return shuffle(builder, one, one, [0] * LANES)
 
 
 def _as_vector(builder: ir.IRBuilder, value: ir.Value) -> ir.Value:
-    return value if value.type == _VEC else _repeat(builder, value)
+    return value if value.type == VEC else _repeat(builder, value)
 
 
 def _call(builder: ir.IRBuilder, name: str, *args: ir.Value) -> ir.Value:
-    kind = ir.FunctionType(_VEC, [a.type for a in args])
+    kind = ir.FunctionType(VEC, [a.type for a in args])
     return builder.call(
         cgutils.get_or_insert_function(builder.module, kind, f"llvm.{name}.v{LANES}f32"), list(args)
     )
-
-
-@njit(nogil=True, error_model="numpy")
-def aligned_floats(count: int) -> np.ndarray:
-    """Uninitialised float32 [count] on a 64 byte boundary: vectors that straddle cache lines cost double."""
-    raw = np.empty(count + 16, np.float32)
-    skip = (64 - raw.ctypes.data % 64) % 64 // 4
-    return raw[skip : skip + count]
 
 
 # --- operators -------------------------------------------------------------------------------------
@@ -121,7 +112,7 @@ _define(operator.ge, Mask, _compare(">="))
 
 @infer_global(operator.neg)
 class _Negate(ConcreteTemplate):
-    cases = [signature(F32, F32)]
+    cases = (signature(F32, F32),)
 
 
 @lower_builtin(operator.neg, F32)
@@ -131,124 +122,12 @@ def _negate(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Valu
 
 @infer_global(operator.and_)
 class _And(ConcreteTemplate):
-    cases = [signature(Mask, Mask, Mask)]
+    cases = (signature(Mask, Mask, Mask),)
 
 
 @lower_builtin(operator.and_, Mask, Mask)
 def _and(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
     return builder.and_(*args)
-
-
-# --- memory ----------------------------------------------------------------------------------------
-
-
-def _address(
-    context: Any, builder: ir.IRBuilder, kind: types.Array, array: ir.Value, at: ir.Value
-) -> ir.Value:
-    data = context.make_array(kind)(context, builder, value=array).data
-    return builder.gep(data, [at], inbounds=True)
-
-
-def _aligned_load(builder: ir.IRBuilder, pointer: ir.Value, kind: ir.Type) -> ir.Value:
-    value = builder.load(builder.bitcast(pointer, kind.as_pointer()), typ=kind)
-    value.align = 4
-    return value
-
-
-@intrinsic
-def load(typingctx: Any, array: types.Array, at: types.Integer) -> Any:
-    """Lanes array[at], array[at + 1], ... of a contiguous float32 array; no bounds are checked."""
-
-    def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
-        return _aligned_load(builder, _address(context, builder, sig.args[0], args[0], args[1]), _VEC)
-
-    return F32(array, types.int64), emit
-
-
-@intrinsic
-def store(typingctx: Any, array: types.Array, at: types.Integer, value: _F32Type) -> Any:
-    """Writes the lanes to array[at], array[at + 1], ...; no bounds are checked."""
-
-    def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
-        pointer = _address(context, builder, sig.args[0], args[0], args[1])
-        builder.store(args[2], builder.bitcast(pointer, _VEC.as_pointer()), align=4)
-        return context.get_dummy_value()
-
-    return types.void(array, types.int64, F32), emit
-
-
-@intrinsic
-def gather(
-    typingctx: Any, array: types.Array, base: types.Integer, index: types.Array, at: types.Integer
-) -> Any:
-    """Lanes array[base + index[at]], array[base + index[at + 1]], ...; `index` is contiguous int32."""
-
-    def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
-        lanes = _aligned_load(builder, _address(context, builder, sig.args[2], args[2], args[3]), _IVEC)
-        start = _address(context, builder, sig.args[0], args[0], args[1])
-        pointers = builder.gep(start, [lanes], inbounds=False, source_etype=_FLOAT)
-        kind = ir.VectorType(start.type, LANES)
-        pointers.type = kind
-        gathered = cgutils.get_or_insert_function(
-            builder.module, ir.FunctionType(_VEC, [kind, _INT, _MASK, _VEC]), f"llvm.masked.gather.v{LANES}f32.v{LANES}p0"
-        )  # fmt: skip
-        every = ir.Constant(_MASK, [1] * LANES)
-        return builder.call(gathered, [pointers, ir.Constant(_INT, 4), every, _constant(0.0)])
-
-    return F32(array, types.int64, index, types.int64), emit
-
-
-@intrinsic
-def scatter_some(
-    typingctx: Any, array: types.Array, base: types.Integer, index: types.Array, at: types.Integer, value: _F32Type,
-    count: types.Integer,
-) -> Any:  # fmt: skip
-    """array[base + index[at + lane]] = value for the first `count` lanes; `index` is contiguous int32."""
-
-    def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
-        lanes = _aligned_load(builder, _address(context, builder, sig.args[2], args[2], args[3]), _IVEC)
-        start = _address(context, builder, sig.args[0], args[0], args[1])
-        pointers = builder.gep(start, [lanes], inbounds=False, source_etype=_FLOAT)
-        kind = ir.VectorType(start.type, LANES)
-        pointers.type = kind
-        number = builder.insert_element(
-            ir.Constant(_IVEC, ir.Undefined), builder.trunc(args[5], _INT), ir.Constant(_INT, 0)
-        )
-        number = _shuffle(builder, number, number, [0] * LANES)
-        used = builder.icmp_signed("<", ir.Constant(_IVEC, list(range(LANES))), number)
-        scattered = cgutils.get_or_insert_function(
-            builder.module, ir.FunctionType(ir.VoidType(), [_VEC, kind, _INT, _MASK]),
-            f"llvm.masked.scatter.v{LANES}f32.v{LANES}p0",
-        )  # fmt: skip
-        builder.call(scattered, [args[4], pointers, ir.Constant(_INT, 4), used])
-        return context.get_dummy_value()
-
-    return types.void(array, types.int64, index, types.int64, F32, types.int64), emit
-
-
-@intrinsic
-def prefetch(typingctx: Any, array: types.Array, at: types.Integer) -> Any:
-    """Asks for the cache line of array[at] ahead of time."""
-
-    def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
-        pointer = _address(context, builder, sig.args[0], args[0], args[1])
-        kind = ir.FunctionType(ir.VoidType(), [pointer.type, _INT, _INT, _INT])
-        function = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
-        builder.call(function, [pointer, *(ir.Constant(_INT, value) for value in (0, 3, 1))])
-        return context.get_dummy_value()
-
-    return types.void(array, types.int64), emit
-
-
-@intrinsic
-def atomic_next(typingctx: Any, counter: types.Array, at: types.Integer) -> Any:
-    """counter[at] += 1 for all threads at once; gives the value before. int64 array."""
-
-    def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
-        pointer = _address(context, builder, sig.args[0], args[0], args[1])
-        return builder.atomic_rmw("add", pointer, ir.Constant(ir.IntType(64), 1), "monotonic")
-
-    return types.int64(counter, types.int64), emit
 
 
 # --- lane functions --------------------------------------------------------------------------------
@@ -263,7 +142,7 @@ def repeat(typingctx: Any, value: types.Float) -> Any:
 @intrinsic
 def iota(typingctx: Any) -> Any:
     """0, 1, 2, ..."""
-    lanes = ir.Constant(_VEC, [float(i) for i in range(LANES)])
+    lanes = ir.Constant(VEC, [float(i) for i in range(LANES)])
     return F32(), lambda context, builder, sig, args: lanes
 
 
@@ -292,27 +171,27 @@ def _lane_function(emit: Callable[..., ir.Value], arity: int, result: types.Type
 
 
 def _mantissa(builder: ir.IRBuilder, v: ir.Value) -> ir.Value:
-    bits = builder.and_(builder.bitcast(v, _IVEC), _icon(0x007FFFFF))
-    return builder.bitcast(builder.or_(bits, _icon(0x3F800000)), _VEC)
+    bits = builder.and_(builder.bitcast(v, IVEC), _icon(0x007FFFFF))
+    return builder.bitcast(builder.or_(bits, _icon(0x3F800000)), VEC)
 
 
 def _exponent(builder: ir.IRBuilder, v: ir.Value) -> ir.Value:
-    bits = builder.lshr(builder.bitcast(v, _IVEC), _icon(23))
-    return builder.sitofp(builder.sub(bits, _icon(127)), _VEC)
+    bits = builder.lshr(builder.bitcast(v, IVEC), _icon(23))
+    return builder.sitofp(builder.sub(bits, _icon(127)), VEC)
 
 
 def _exp2_scale(builder: ir.IRBuilder, value: ir.Value, shifted: ir.Value) -> ir.Value:
-    exponent_bits = builder.shl(builder.bitcast(shifted, _IVEC), _icon(23))
-    return builder.bitcast(builder.add(builder.bitcast(value, _IVEC), exponent_bits), _VEC)
+    exponent_bits = builder.shl(builder.bitcast(shifted, IVEC), _icon(23))
+    return builder.bitcast(builder.add(builder.bitcast(value, IVEC), exponent_bits), VEC)
 
 
 def _reciprocal(builder: ir.IRBuilder, v: ir.Value) -> ir.Value:
     if LANES != 16:
-        return builder.fdiv(_constant(1.0), v)
-    kind = ir.FunctionType(_VEC, [_VEC, _VEC, ir.IntType(16)])
+        return builder.fdiv(constant(1.0), v)
+    kind = ir.FunctionType(VEC, [VEC, VEC, ir.IntType(16)])
     estimate = cgutils.get_or_insert_function(builder.module, kind, "llvm.x86.avx512.rcp14.ps.512")
-    r = builder.call(estimate, [v, _constant(0.0), ir.Constant(ir.IntType(16), 0xFFFF)])
-    two_minus = _call(builder, "fmuladd", builder.fneg(v), r, _constant(2.0))  # one step of Newton
+    r = builder.call(estimate, [v, constant(0.0), ir.Constant(ir.IntType(16), 0xFFFF)])
+    two_minus = _call(builder, "fmuladd", builder.fneg(v), r, constant(2.0))  # one step of Newton
     return builder.fmul(r, two_minus)
 
 
@@ -337,29 +216,3 @@ def any_lane(typingctx: Any, mask: _MaskType) -> Any:
         return builder.icmp_unsigned("!=", bits, ir.Constant(ir.IntType(LANES), 0))
 
     return types.boolean(Mask), emit
-
-
-@intrinsic
-def store_sums4(typingctx: Any, array: types.Array, at: types.Integer, a: Any, b: Any, c: Any, d: Any) -> Any:
-    """array[at : at + 4] = the sums over all lanes of a, b, c and d: four horizontal sums by one tree."""
-
-    def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
-        quads = range(0, LANES, 4)
-        low = [q + i for q in quads for i in (0, LANES, 1, LANES + 1)]
-        high = [q + i for q in quads for i in (2, LANES + 2, 3, LANES + 3)]
-        fold = lambda x, y, one, two: builder.fadd(  # noqa: E731
-            _shuffle(builder, x, y, one), _shuffle(builder, x, y, two)
-        )
-        ab, cd = fold(args[2], args[3], low, high), fold(args[4], args[5], low, high)
-        first = [q + i for q in quads for i in (0, 1, LANES, LANES + 1)]
-        second = [q + i for q in quads for i in (2, 3, LANES + 2, LANES + 3)]
-        sums, width = fold(ab, cd, first, second), LANES
-        while width > 4:
-            width //= 2
-            sums = fold(sums, sums, list(range(width)), list(range(width, 2 * width)))
-        kind = ir.VectorType(_FLOAT, 4)
-        pointer = _address(context, builder, sig.args[0], args[0], args[1])
-        builder.store(sums, builder.bitcast(pointer, kind.as_pointer()), align=4)
-        return context.get_dummy_value()
-
-    return types.void(array, types.int64, F32, F32, F32, F32), emit

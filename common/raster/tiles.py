@@ -2,7 +2,7 @@
 
 A tile's pixels lie flat in scratch memory, `ROWS` image rows to a vector. A pixel that is done has its
 transmittance T stored negative. The gradient runs front to back as well: with q = <dL/dout, splat> and
-Q = what the splats behind add to <dL/dout, out>, dL/dalpha = T q - Q / (1 - alpha); T and Q are all the state.
+Q = what the splats behind add to <dL/dout, out>, dL/dalpha = T q - Q / (1 - alpha): no other state.
 With v = alpha dL/dalpha every gradient of a splat on screen is a moment of v over dx, dy (ten sums).
 """
 
@@ -25,23 +25,18 @@ from common.raster.layout import (
 )  # fmt: skip
 from common.raster.simd import (
     LANES,
-    aligned_floats,
     any_lane,
-    atomic_next,
     floor,
     fma,
     iota,
     larger,
-    load,
     magnitude,
-    prefetch,
     reciprocal,
     repeat,
     smaller,
-    store,
-    store_sums4,
     where,
-)  # fmt: skip
+)
+from common.raster.simd_memory import aligned_floats, atomic_next, load, prefetch, store, store_sums4
 
 _AHEAD = 8  # splats whose records are fetched in advance: they lie anywhere in the depth order
 _CHECK = 8  # splats between two looks whether all pixels of the tile are done
@@ -225,8 +220,11 @@ def backward_tiles(counter, tiles_x, background, lists, tile_start, records, ima
                 scratch[GR + at], scratch[GG + at], scratch[GB + at] = g0, g1, g2
                 scratch[GD + at], scratch[GA + at] = g3, g4
                 scratch[Q + at] = (
-                    (image[0, y, x] - through * background[0]) * g0 + (image[1, y, x] - through * background[1]) * g1
-                    + (image[2, y, x] - through * background[2]) * g2 + image[3, y, x] * g3 + alpha * g4
+                    (image[0, y, x] - through * background[0]) * g0
+                    + (image[1, y, x] - through * background[1]) * g1
+                    + (image[2, y, x] - through * background[2]) * g2
+                    + image[3, y, x] * g3
+                    + alpha * g4
                 )  # fmt: skip
         _backward_tile(
             lists, tile_start[tile], tile_start[tile + 1], records, left, top, scratch, alphas, slots

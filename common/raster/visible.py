@@ -7,7 +7,8 @@ import numpy as np
 from common.raster.compiled import kernel
 from common.raster.lanes import exp_lanes
 from common.raster.layout import BLUR_PX2, SCALE
-from common.raster.simd import LANES, aligned_floats, any_lane, atomic_next, larger, load, store, where
+from common.raster.simd import LANES, any_lane, larger, where
+from common.raster.simd_memory import aligned_floats, atomic_next, load, store
 
 BLOCK = 4096  # Gaussians culled in one piece
 

@@ -15,7 +15,6 @@ import numpy as np
 from common.beams import project_beams
 from common.camera import Pinhole
 from common.raster.camera import RasterCamera
-from common.raster.warm import warm
 from services.mapping.dataset import Recording, load, read_depth_png
 from services.mapping.export import read_ply_points, write_gaussian_ply
 from services.mapping.keyframe import Keyframe
@@ -23,6 +22,7 @@ from services.mapping.mapper import Mapper
 from services.mapping.priors import find_prior
 from services.mapping.scores import ViewScore, f_score, fused_surface, render_rgb_depth, score_view
 from services.mapping.settings import MapperSettings
+from services.mapping.warm import warm
 
 HELD_OUT_EVERY, HELD_OUT_AT = 8, 2  # pictures i with i % 8 == 2 are scored and never shown
 Say = Callable[[str], None]
@@ -155,8 +155,9 @@ def make_keyframe(recording: Recording, index: int, guess: tuple[np.ndarray, np.
     shot = recording.shots[index]
     uv, z, _ = project_beams(shot.beams, recording.camera, recording.T_body_camera)
     return Keyframe(
-        id=index, rgb=recording.image(index), camera=raster_camera(recording.camera), T_anchor_camera=shot.T_map_camera,
-        depth_m=guess[0], sigma_m=guess[1], beams_uvz=np.column_stack([uv, z]) if len(z) else np.zeros((0, 3)),
+        id=index, rgb=recording.image(index), camera=raster_camera(recording.camera),
+        T_anchor_camera=shot.T_map_camera, depth_m=guess[0], sigma_m=guess[1],
+        beams_uvz=np.column_stack([uv, z]) if len(z) else np.zeros((0, 3)),
     )  # fmt: skip
 
 

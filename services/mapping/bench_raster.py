@@ -1,4 +1,4 @@
-"""`bench raster`: forward + L1 + backward of each backend on a synthetic room, beside the plain torch reference."""
+"""`bench raster`: forward + L1 + backward of each backend on a synthetic room, beside plain torch."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ Say = Callable[[str], None]
 def synthetic_room(gaussians: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     """(params float32 [14, capacity], T_camera_map): a furnished room of 6 x 5 x 2.5 m seen from a corner.
 
-    Discs of 1-4 cm on walls, floor, ceiling and the sides of boxes, in random order of nothing: neighbours in
-    memory are neighbours on one surface, as a mapper makes them.
+    Discs of 1-4 cm on walls, floor, ceiling and the sides of boxes. Neighbours in memory are neighbours on
+    a surface, as a mapper makes them.
     """
     rng = np.random.default_rng(seed)
     faces = _faces(rng)

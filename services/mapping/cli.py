@@ -1,4 +1,4 @@
-"""`beamsplat bench raster` and `bench map`: the rasterizer's speed, and what the mapper makes of a recording."""
+"""`beamsplat bench raster` and `bench map`: the rasterizer's speed, what the mapper makes of a recording."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ FIELDS = ("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacit
 
 
 def write_gaussian_ply(path: Path, params: np.ndarray) -> None:
-    """Writes Gaussians float32 [14, N] as INRIA's 3DGS does (SH degree 0); a reader never sees half a file."""
+    """Writes Gaussians float32 [14, N] as INRIA's 3DGS does (SH degree 0), all at once or not at all."""
     count = params.shape[1]
     rows = np.zeros((count, len(FIELDS)), "<f4")
     rows[:, 0:3] = params[MEAN : MEAN + 3].T

@@ -90,7 +90,7 @@ def make_gaussians(
 def _normals(
     depth: np.ndarray, u: np.ndarray, v: np.ndarray, camera: RasterCamera, rays: np.ndarray
 ) -> np.ndarray:
-    """Unit normals [N, 3] towards the camera, from central differences; the view direction across depth jumps."""
+    """Unit normals [N, 3] towards the camera, by central differences; the view direction at depth jumps."""
     h, w = depth.shape
     reach = 2
     z = depth[v, u]
@@ -130,7 +130,7 @@ def _frames(normals: np.ndarray, rays: np.ndarray) -> np.ndarray:
 
 
 def _quats(R: np.ndarray) -> np.ndarray:
-    """Quaternions (w, x, y, z) float64 [N, 4] of rotations [N, 3, 3] (Shepperd, the largest component first)."""
+    """Quaternions (w, x, y, z) [N, 4] of rotations [N, 3, 3] (Shepperd: from the largest component)."""
     m = R
     trace = m[:, 0, 0] + m[:, 1, 1] + m[:, 2, 2]
     squares = np.stack(

@@ -7,20 +7,8 @@ import numpy as np
 from common.raster.compiled import kernel
 from common.raster.lanes import exp2_lanes
 from common.raster.layout import COLOUR, GRADIENTS, MEAN, OPACITY, PARAMS, QUAT, SCALE, WEIGHT
-from common.raster.simd import (
-    LANES,
-    any_lane,
-    atomic_next,
-    fma,
-    gather,
-    larger,
-    load,
-    repeat,
-    root,
-    scatter_some,
-    smaller,
-    where,
-)  # fmt: skip
+from common.raster.simd import LANES, any_lane, fma, larger, repeat, root, smaller, where
+from common.raster.simd_memory import atomic_next, gather, load, scatter_some
 
 BETA_1, BETA_2, EPSILON = 0.9, 0.999, 1e-15
 _LOG2_BETA_1, _LOG2_BETA_2 = float(np.log2(BETA_1)), float(np.log2(BETA_2))

@@ -34,9 +34,11 @@ class Keyframe:
         """Why this cannot be mapped, in one sentence; None if it can."""
         shape = (self.camera.height_px, self.camera.width_px)
         if self.rgb.shape != (*shape, 3) or self.rgb.dtype != np.uint8:
-            return f"picture must be uint8 [{shape[0]}, {shape[1]}, 3], got {self.rgb.dtype} {list(self.rgb.shape)}"
+            got = f"{self.rgb.dtype} {list(self.rgb.shape)}"
+            return f"picture must be uint8 [{shape[0]}, {shape[1]}, 3], got {got}"
         if self.depth_m.shape != shape or self.sigma_m.shape != shape:
-            return f"depth and sigma must be {list(shape)}, got {list(self.depth_m.shape)} and {list(self.sigma_m.shape)}"
+            got = f"{list(self.depth_m.shape)} and {list(self.sigma_m.shape)}"
+            return f"depth and sigma must be {list(shape)}, got {got}"
         if not is_rigid(self.T_anchor_camera):
             return "T_anchor_camera is not a rigid transform"
         if self.mask is not None and (self.mask.shape != shape or not self.mask.any()):
@@ -98,10 +100,10 @@ def hold(frame: Keyframe, sigma_unit_m: float) -> Held:
                 cv2.resize(frame.rgb, (w, h), interpolation=cv2.INTER_AREA),
             )
         pixels, z = _beams_at(frame.beams_uvz, frame.camera, camera)
-        levels.append(Level(
-            camera, np.ascontiguousarray(rgb.transpose(2, 0, 1)), np.ascontiguousarray(depth_mm[: h * step : step, : w * step : step]),
-            np.ascontiguousarray(weight_8[: h * step : step, : w * step : step]), pixels, z,
-        ))  # fmt: skip
+        sampled = np.s_[: h * step : step, : w * step : step]
+        planes, d, wt = rgb.transpose(2, 0, 1), depth_mm[sampled], weight_8[sampled]
+        arrays = (np.ascontiguousarray(array) for array in (planes, d, wt))
+        levels.append(Level(camera, *arrays, pixels, z))
     return Held(frame.id, frame.anchor, np.array(frame.T_anchor_camera, dtype=np.float64), levels)
 
 

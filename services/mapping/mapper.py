@@ -141,7 +141,7 @@ class Mapper:
     # --- optimising --------------------------------------------------------------------------------
 
     def optimise(self, half: int | None = None, full: int | None = None) -> float:
-        """The fixed work per keyframe: `half` steps at half size, then `full` at full size. Gives the mean loss."""
+        """The fixed work per keyframe: steps at half size, then at full size. Gives the mean loss."""
         half = self.settings.half_iterations if half is None else half
         full = self.settings.full_iterations if full is None else full
         if not self.keyframes or self.store.count == 0:
@@ -175,7 +175,8 @@ class Mapper:
         pixels = level.camera.width_px * level.camera.height_px
         self.rasterizer.team.run(
             adam, gradients.by_splat, gradients.index, self.store.params, self.store.first, self.store.second,
-            self.store.steps, self._rates, np.float32(s.isotropy_weight / pixels), np.float32(np.log(s.isotropy_ratio)),
+            self.store.steps, self._rates, np.float32(s.isotropy_weight / pixels),
+            np.float32(np.log(s.isotropy_ratio)),
         )  # fmt: skip
         if s.refine_pose:
             self._refine_pose(held, gradients, inverse(T_map_camera))

@@ -24,12 +24,12 @@ class MapperSettings:
     """See module. Lengths in metres, sizes in pixels of the full picture."""
 
     # Work per keyframe; sizes are halved once for `half` iterations.
-    half_iterations: int = 20
-    full_iterations: int = 6
+    half_iterations: int = 18
+    full_iterations: int = 5
     recent: int = 4  # keyframes of the window that are newest; each second draw is one of them
     # Insertion
-    stride_px: int = 4
-    fine_stride_px: int = 2  # where the picture has texture
+    stride_px: int = 5
+    fine_stride_px: int = 3  # where the picture has texture
     texture: float = 0.15  # mean absolute colour step over `stride_px` that counts as texture
     alpha_low: float = 0.7  # less than this is not explained
     colour_off: float = 0.15  # mean absolute colour error that is not explained
@@ -37,7 +37,7 @@ class MapperSettings:
     opacity: float = 0.6
     size: float = 0.65  # standard deviation over spacing
     flatness: float = 0.2
-    max_gaussians: int = 400_000
+    max_gaussians: int = 300_000
     # Losses
     ssim_weight: float = 0.2
     ssim_every: int = 3

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from common.raster.compiled import inner, kernel
-from common.raster.simd import atomic_next
+from common.raster.simd_memory import atomic_next
 from common.raster.threads import Team
 
 C1, C2 = 0.01**2, 0.03**2

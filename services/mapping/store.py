@@ -2,17 +2,29 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from common.geometry import quat_wxyz_from_matrix
 from common.raster.layout import MEAN, PARAMS, QUAT, SCALE
 
 
+@dataclass(frozen=True)
+class Chunk:
+    """The Gaussians of one anchor. `version` changes whenever one of them does."""
+
+    anchor: int
+    version: int
+    params: np.ndarray  # float32 [14, N], in the map frame
+
+
 class GaussianStore:
-    """Columns 0 ... count of every array are Gaussians. Rows of `params` are those of common.raster.layout."""
+    """Columns 0 ... count of every array are Gaussians; rows of `params` as in common.raster.layout."""
 
     def __init__(self, capacity: int = 4096) -> None:
         self.count = 0
+        self._events: dict[int, int] = {}  # per anchor: insertions, removals and moves so far
         self._allocate(-(-capacity // 16) * 16)
 
     def _allocate(self, capacity: int) -> None:
@@ -40,6 +52,7 @@ class GaussianStore:
         for name in ("first", "second", "steps", "strikes"):
             getattr(self, name)[..., at] = 0
         self.anchor[at] = anchor
+        self._events[anchor] = self._events.get(anchor, 0) + 1
         self.count += new
 
     def _grow(self, capacity: int) -> None:
@@ -49,10 +62,12 @@ class GaussianStore:
             getattr(self, name)[..., : array.shape[-1]] = array
 
     def keep(self, mask: np.ndarray) -> int:
-        """Drops the Gaussians whose flag in bool [count] is not set; the others stay in order. Gives how many."""
+        """Drops Gaussians whose flag in bool [count] is unset, the rest keep their order; gives how many."""
         chosen = np.flatnonzero(mask)
         dropped = self.count - len(chosen)
         if dropped:
+            for anchor in np.unique(self.anchor[: self.count][~np.asarray(mask)]):
+                self._events[int(anchor)] = self._events.get(int(anchor), 0) + 1
             for name in self._arrays():
                 array = getattr(self, name)
                 array[..., : len(chosen)] = array[..., chosen]
@@ -64,6 +79,7 @@ class GaussianStore:
         chosen = np.flatnonzero(self.anchor[: self.count] == anchor)
         if len(chosen) == 0:
             return
+        self._events[anchor] = self._events.get(anchor, 0) + 1
         R = T_new_old[:3, :3]
         mean = self.params[MEAN:SCALE, chosen].astype(np.float64)
         self.params[MEAN:SCALE, chosen] = R @ mean + T_new_old[:3, 3:4]
@@ -72,3 +88,21 @@ class GaussianStore:
         left = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
         self.params[QUAT : QUAT + 4, chosen] = left @ self.params[QUAT : QUAT + 4, chosen]
         self.first[QUAT : QUAT + 4, chosen] = left @ self.first[QUAT : QUAT + 4, chosen]
+
+    def versions(self) -> dict[int, int]:
+        """Version of every anchor's chunk: grows with each step of the optimiser and each event."""
+        steps = np.zeros(0)
+        if self.count:
+            steps = np.bincount(self.anchor[: self.count], weights=self.steps[: self.count])
+        seen = {int(a): int(steps[a]) if a < len(steps) else 0 for a in self._events}
+        # An event outweighs the steps that removed Gaussians took with them.
+        return {a: (self._events[a] << 40) + seen[a] for a in sorted(seen)}
+
+    def chunks(self, known: dict[int, int] | None = None) -> list[Chunk]:
+        """Chunks whose version differs from that in `known` (all without it), copied."""
+        known = known or {}
+        return [
+            Chunk(a, version, self.params[:, : self.count][:, self.anchor[: self.count] == a])
+            for a, version in self.versions().items()
+            if known.get(a) != version
+        ]

@@ -55,8 +55,15 @@ class _Lease:
 
 class _Rasterize(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, rasterizer: Rasterizer, camera: RasterCamera, T_camera_map: np.ndarray,
-                background: torch.Tensor, tangent: torch.Tensor, *gaussians: torch.Tensor) -> torch.Tensor:  # fmt: skip
+    def forward(
+        ctx: Any,
+        rasterizer: Rasterizer,
+        camera: RasterCamera,
+        T_camera_map: np.ndarray,
+        background: torch.Tensor,
+        tangent: torch.Tensor,
+        *gaussians: torch.Tensor,
+    ) -> torch.Tensor:
         params, count = pack(gaussians)
         render = rasterizer.render(params, count, camera, T_camera_map, background.detach().numpy())
         ctx.lease, ctx.count, ctx.dtypes = _Lease(rasterizer, render), count, [g.dtype for g in gaussians]

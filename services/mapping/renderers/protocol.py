@@ -1,9 +1,9 @@
 """What every renderer takes and gives, on torch tensors with autograd.
 
-Gaussians are five tensors of one dtype: mean_map_m [N, 3], log_scale [N, 3] (ln metres), quat_wxyz [N, 4] (any
-length but zero), opacity_logit [N], colour [N, 3]. The pose enters as `T_camera_map` and, for its gradient, as a
-tangent xi [6] = (rho, phi): the camera stands at se3_exp(xi) @ T_camera_map (left perturbation). `xi` must be
-zero: renderers may linearise there.
+Gaussians are five tensors of one dtype: mean_map_m [N, 3], log_scale [N, 3] (ln metres), quat_wxyz
+[N, 4] (any length but zero), opacity_logit [N], colour [N, 3]. The pose enters as `T_camera_map` and, for its
+gradient, as a tangent xi [6] = (rho, phi): the camera stands at se3_exp(xi) @ T_camera_map.
+`xi` must be zero: renderers may linearise there.
 """
 
 from __future__ import annotations

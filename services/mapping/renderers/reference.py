@@ -1,6 +1,6 @@
-"""`reference`: the rasterizer in plain torch, for any dtype. Slow; the truth that the others are tested against.
+"""`reference`: the rasterizer in plain torch, for any dtype. Slow; the others' truth in tests.
 
-Dense over pixels within blocks of 16 x 16, gradients by autograd. Constants are those of common.raster.layout.
+Dense over pixels within blocks of 16 x 16, gradients by autograd. Constants are in common.raster.layout.
 """
 
 from __future__ import annotations
@@ -35,7 +35,8 @@ class Reference:
             R, t = turn @ R, turn @ t + pose_tangent[:3]
         centre, cov, z, keep = _project(gaussians, camera, R, t)
         order = torch.argsort(z, stable=True)
-        splats = (centre[order], torch.linalg.inv(cov[order]), torch.sigmoid(gaussians.opacity_logit[keep][order]),
+        opacity = torch.sigmoid(gaussians.opacity_logit[keep][order])
+        splats = (centre[order], torch.linalg.inv(cov[order]), opacity,
                   torch.cat([gaussians.colour[keep], z[:, None]], dim=1)[order])  # fmt: skip
         reach = 3.34 * torch.linalg.eigvalsh(cov.detach()[order])[:, 1].sqrt() + 1.0
         rows = []
@@ -53,7 +54,8 @@ def _so3_exp(phi: torch.Tensor) -> torch.Tensor:
     """exp of a rotation vector at zero, to second order: enough for gradients there."""
     zero = torch.zeros_like(phi[0])
     W = torch.stack([
-        torch.stack([zero, -phi[2], phi[1]]), torch.stack([phi[2], zero, -phi[0]]), torch.stack([-phi[1], phi[0], zero]),
+        torch.stack([zero, -phi[2], phi[1]]), torch.stack([phi[2], zero, -phi[0]]),
+        torch.stack([-phi[1], phi[0], zero]),
     ])  # fmt: skip
     return torch.eye(3, dtype=phi.dtype) + W + 0.5 * W @ W
 

@@ -10,7 +10,8 @@ from common.raster.camera import RasterCamera
 from common.raster.lanes import exp2_lanes, exp_lanes, log2_lanes, sigmoid_lanes
 from common.raster.layout import GRADIENTS, WEIGHT
 from common.raster.rasterizer import Rasterizer
-from common.raster.simd import LANES, gather, iota, load, scatter_some, store, store_sums4
+from common.raster.simd import LANES, iota
+from common.raster.simd_memory import gather, load, scatter_some, store, store_sums4
 from common.raster.visible import sort_by_depth
 from common.raster.warm import warm
 from tests.common.raster.scenes import random_camera, random_gaussians, random_pose

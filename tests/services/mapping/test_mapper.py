@@ -15,6 +15,7 @@ from services.mapping.keyframe import Keyframe
 from services.mapping.mapper import FULL, HALF, Mapper
 from services.mapping.scores import f_score, fused_surface, render_rgb_depth, score_view
 from services.mapping.settings import MapperSettings
+from services.mapping.warm import warm
 
 CAMERA = RasterCamera(110.0, 110.0, 79.5, 59.5, 160, 120)
 SETTINGS = MapperSettings(half_iterations=10, full_iterations=5, stride_px=3)
@@ -215,3 +216,23 @@ def test_ply_is_what_inria_writes(tmp_path, mapped):
     assert np.array_equal(column["opacity"], params[10])
     assert np.allclose(np.linalg.norm(rows[:, 13:17], axis=1), 1.0, atol=1e-5)
     assert np.array_equal(read_ply_points(tmp_path / "map.ply"), params[:3].T.astype(float))
+
+
+def test_chunks_say_what_has_changed(room, mapped):
+    mapper = copy_of(mapped)
+    mapper.store._events = {0: 1}
+    known = mapper.store.versions()
+    assert mapper.store.chunks(known) == []
+    assert mapper.store.chunks()[0].params.shape == (14, mapper.store.count)
+    mapper.add(keyframe(room, 6, anchor=5), make_transform(so3_exp([0, 0, 0.3]), np.array([0.4, 0.0, 0.0])))
+    assert [chunk.anchor for chunk in mapper.store.chunks(known)] in ([5], [0, 5])
+    known = mapper.store.versions()
+    mapper.step(mapper.keyframes[2], HALF)
+    assert 0 in [chunk.anchor for chunk in mapper.store.chunks(known)]
+    known = mapper.store.versions()
+    mapper.move_anchors({5: np.eye(4)})
+    assert [chunk.anchor for chunk in mapper.store.chunks(known)] == [5]
+
+
+def test_warm_compiles_what_is_used():
+    warm()

@@ -1,0 +1,157 @@
+"""Vectors of lanes and memory: load, store, gather, scatter, prefetch, atomic counters, sums over lanes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from llvmlite import ir
+from numba import njit, types
+from numba.core import cgutils
+from numba.extending import intrinsic
+
+from common.raster.simd import F32, FLOAT, INT, IVEC, LANES, MASK, VEC, F32Type, constant, shuffle
+
+
+@njit(nogil=True, error_model="numpy")
+def aligned_floats(count: int) -> np.ndarray:
+    """Uninitialised float32 [count] on a 64 byte boundary: vectors that straddle cache lines cost double."""
+    raw = np.empty(count + 16, np.float32)
+    skip = (64 - raw.ctypes.data % 64) % 64 // 4
+    return raw[skip : skip + count]
+
+
+def _address(
+    context: Any, builder: ir.IRBuilder, kind: types.Array, array: ir.Value, at: ir.Value
+) -> ir.Value:
+    data = context.make_array(kind)(context, builder, value=array).data
+    return builder.gep(data, [at], inbounds=True)
+
+
+def _aligned_load(builder: ir.IRBuilder, pointer: ir.Value, kind: ir.Type) -> ir.Value:
+    value = builder.load(builder.bitcast(pointer, kind.as_pointer()), typ=kind)
+    value.align = 4
+    return value
+
+
+@intrinsic
+def load(typingctx: Any, array: types.Array, at: types.Integer) -> Any:
+    """Lanes array[at], array[at + 1], ... of a contiguous float32 array; no bounds are checked."""
+
+    def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
+        return _aligned_load(builder, _address(context, builder, sig.args[0], args[0], args[1]), VEC)
+
+    return F32(array, types.int64), emit
+
+
+@intrinsic
+def store(typingctx: Any, array: types.Array, at: types.Integer, value: F32Type) -> Any:
+    """Writes the lanes to array[at], array[at + 1], ...; no bounds are checked."""
+
+    def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
+        pointer = _address(context, builder, sig.args[0], args[0], args[1])
+        builder.store(args[2], builder.bitcast(pointer, VEC.as_pointer()), align=4)
+        return context.get_dummy_value()
+
+    return types.void(array, types.int64, F32), emit
+
+
+@intrinsic
+def gather(
+    typingctx: Any, array: types.Array, base: types.Integer, index: types.Array, at: types.Integer
+) -> Any:
+    """Lanes array[base + index[at]], array[base + index[at + 1]], ...; `index` is contiguous int32."""
+
+    def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
+        lanes = _aligned_load(builder, _address(context, builder, sig.args[2], args[2], args[3]), IVEC)
+        start = _address(context, builder, sig.args[0], args[0], args[1])
+        pointers = builder.gep(start, [lanes], inbounds=False, source_etype=FLOAT)
+        kind = ir.VectorType(start.type, LANES)
+        pointers.type = kind
+        gathered = cgutils.get_or_insert_function(
+            builder.module, ir.FunctionType(VEC, [kind, INT, MASK, VEC]),
+            f"llvm.masked.gather.v{LANES}f32.v{LANES}p0",
+        )  # fmt: skip
+        every = ir.Constant(MASK, [1] * LANES)
+        return builder.call(gathered, [pointers, ir.Constant(INT, 4), every, constant(0.0)])
+
+    return F32(array, types.int64, index, types.int64), emit
+
+
+@intrinsic
+def scatter_some(
+    typingctx: Any, array: types.Array, base: types.Integer, index: types.Array, at: types.Integer,
+    value: F32Type, count: types.Integer,
+) -> Any:  # fmt: skip
+    """array[base + index[at + lane]] = value for the first `count` lanes; `index` is contiguous int32."""
+
+    def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
+        lanes = _aligned_load(builder, _address(context, builder, sig.args[2], args[2], args[3]), IVEC)
+        start = _address(context, builder, sig.args[0], args[0], args[1])
+        pointers = builder.gep(start, [lanes], inbounds=False, source_etype=FLOAT)
+        kind = ir.VectorType(start.type, LANES)
+        pointers.type = kind
+        number = builder.insert_element(
+            ir.Constant(IVEC, ir.Undefined), builder.trunc(args[5], INT), ir.Constant(INT, 0)
+        )
+        number = shuffle(builder, number, number, [0] * LANES)
+        used = builder.icmp_signed("<", ir.Constant(IVEC, list(range(LANES))), number)
+        scattered = cgutils.get_or_insert_function(
+            builder.module, ir.FunctionType(ir.VoidType(), [VEC, kind, INT, MASK]),
+            f"llvm.masked.scatter.v{LANES}f32.v{LANES}p0",
+        )  # fmt: skip
+        builder.call(scattered, [args[4], pointers, ir.Constant(INT, 4), used])
+        return context.get_dummy_value()
+
+    return types.void(array, types.int64, index, types.int64, F32, types.int64), emit
+
+
+@intrinsic
+def prefetch(typingctx: Any, array: types.Array, at: types.Integer) -> Any:
+    """Asks for the cache line of array[at] ahead of time."""
+
+    def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
+        pointer = _address(context, builder, sig.args[0], args[0], args[1])
+        kind = ir.FunctionType(ir.VoidType(), [pointer.type, INT, INT, INT])
+        function = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
+        builder.call(function, [pointer, *(ir.Constant(INT, value) for value in (0, 3, 1))])
+        return context.get_dummy_value()
+
+    return types.void(array, types.int64), emit
+
+
+@intrinsic
+def atomic_next(typingctx: Any, counter: types.Array, at: types.Integer) -> Any:
+    """counter[at] += 1 for all threads at once; gives the value before. int64 array."""
+
+    def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
+        pointer = _address(context, builder, sig.args[0], args[0], args[1])
+        return builder.atomic_rmw("add", pointer, ir.Constant(ir.IntType(64), 1), "monotonic")
+
+    return types.int64(counter, types.int64), emit
+
+
+@intrinsic
+def store_sums4(typingctx: Any, array: types.Array, at: types.Integer, a: Any, b: Any, c: Any, d: Any) -> Any:
+    """array[at : at + 4] = the sums over all lanes of a, b, c and d: four horizontal sums by one tree."""
+
+    def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
+        quads = range(0, LANES, 4)
+        low = [q + i for q in quads for i in (0, LANES, 1, LANES + 1)]
+        high = [q + i for q in quads for i in (2, LANES + 2, 3, LANES + 3)]
+        fold = lambda x, y, one, two: builder.fadd(  # noqa: E731
+            shuffle(builder, x, y, one), shuffle(builder, x, y, two)
+        )
+        ab, cd = fold(args[2], args[3], low, high), fold(args[4], args[5], low, high)
+        first = [q + i for q in quads for i in (0, 1, LANES, LANES + 1)]
+        second = [q + i for q in quads for i in (2, 3, LANES + 2, LANES + 3)]
+        sums, width = fold(ab, cd, first, second), LANES
+        while width > 4:
+            width //= 2
+            sums = fold(sums, sums, list(range(width)), list(range(width, 2 * width)))
+        kind = ir.VectorType(FLOAT, 4)
+        pointer = _address(context, builder, sig.args[0], args[0], args[1])
+        builder.store(sums, builder.bitcast(pointer, kind.as_pointer()), align=4)
+        return context.get_dummy_value()
+
+    return types.void(array, types.int64, F32, F32, F32, F32), emit

@@ -1,0 +1,29 @@
+"""Compiles the mapper's kernels, and those of the rasterizer, into their caches."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from common.raster.camera import RasterCamera
+from common.raster.warm import warm as warm_rasterizer
+from services.mapping.keyframe import Keyframe
+from services.mapping.mapper import FULL, HALF, Mapper
+from services.mapping.settings import MapperSettings
+
+
+def warm() -> None:
+    """Maps two tiny keyframes, with everything switched on, with the types used in production."""
+    warm_rasterizer()
+    settings = MapperSettings(ssim_every=1, refine_pose=True, refine_exposure=True, carve_strikes=1)
+    mapper = Mapper(settings)
+    wall = Keyframe(
+        id=0, rgb=np.full((48, 64, 3), 128, np.uint8), camera=RasterCamera(50.0, 50.0, 31.5, 23.5, 64, 48),
+        T_anchor_camera=np.eye(4), depth_m=np.full((48, 64), 2.0, np.float32),
+        sigma_m=np.full((48, 64), 0.01, np.float32), beams_uvz=np.array([[30.0, 20.0, 2.0]]),
+    )  # fmt: skip
+    for frame in (wall, replace(wall, id=1)):
+        mapper.add(frame, np.eye(4))
+        mapper.step(mapper.keyframes[0], FULL)
+        mapper.step(mapper.keyframes[0], HALF)
