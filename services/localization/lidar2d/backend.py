@@ -27,6 +27,7 @@ class BackEnd:
         self.loop_closures = 0
         self.optimisations = 0
         self.unlinked_from: int | None = None
+        self._candidate: tuple[int, np.ndarray] | None = None
         self.fixed: frozenset[int] = frozenset()
         # Keynodes that were taken out: the one they hang on now, and where (x, y, yaw).
         self.retired: dict[int, tuple[int, float, float, float]] = {}
@@ -48,6 +49,7 @@ class BackEnd:
         """What comes next hangs on nothing until its place in the map is found."""
         if self.nodes and self.unlinked_from is None:
             self.unlinked_from = self._next_node
+            self._candidate = None
 
     def add_keynode(self, node: Keynode, edges: list[Constraint]) -> None:
         """A new keynode and its poses in the submaps it was put into."""
@@ -83,6 +85,7 @@ class BackEnd:
             self.optimisations,
             self.unlinked_from,
             self.fixed,
+            self._candidate,
         )
 
     def apply(self, result: JobResult) -> None:
@@ -111,6 +114,7 @@ class BackEnd:
             self.tries[i] = self.tries.get(i, 0) + 1
         if result.linked and self.unlinked_from is not None and last >= self.unlinked_from:
             self.unlinked_from = None
+        self._candidate = result.candidate
         self.loop_closures += result.loops_found
         self.optimisations += 1
 

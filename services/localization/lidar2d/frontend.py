@@ -190,7 +190,9 @@ class FrontEnd:
         far = math.hypot(off[0], off[1]) > 0.2 + 3.0 * prediction.sigma_m or abs(off[2]) > (
             0.15 + 3.0 * prediction.sigma_rad
         )
-        return match.share >= (s.sure_share if far or prediction.blind else s.lost_share)
+        if prediction.blind:
+            return match.share >= s.good_share
+        return match.share >= (s.sure_share if far else s.lost_share)
 
     def _search(
         self,

@@ -34,6 +34,7 @@ class JobResult:
     tried: list[int]  # submaps that were searched widely
     loops_found: int
     linked: bool  # the newest segment now hangs on the map
+    candidate: tuple[int, np.ndarray] | None  # keynode and T_map_node of an answer that waits for another
 
 
 @dataclass(frozen=True)
@@ -65,6 +66,7 @@ class Snapshot:
     version: int  # of the map's poses
     unlinked_from: int | None  # first keynode of a segment whose place in the map is unknown
     fixed: frozenset[int]  # submaps that must not move
+    candidate: tuple[int, np.ndarray] | None  # an earlier answer to where the segment is
 
 
 def run_job(snapshot: Snapshot, refine_rounds: int = 0) -> JobResult:
@@ -73,11 +75,11 @@ def run_job(snapshot: Snapshot, refine_rounds: int = 0) -> JobResult:
     node_row = {n: i for i, n in enumerate(snapshot.node_ids)}
     constraints, tried, frozen = list(snapshot.constraints), [], dict(snapshot.frozen)
     edges = edges_of(constraints, submap_row, node_row)
-    T_s, T_n, link = snapshot.T_map_submap, snapshot.T_map_node, None
+    T_s, T_n, link, candidate = snapshot.T_map_submap, snapshot.T_map_node, None, None
     if snapshot.unlinked_from is None:
         found, tried, still = _close_loops(snapshot, edges, submap_row, node_row)
     else:
-        link, T_s, T_n = link_segment(snapshot)
+        link, T_s, T_n, candidate = link_segment(snapshot)
         found, tried, still = [] if link is None else [link], [], list(snapshot.pending)
     constraints += found
     fixed = [submap_row[i] for i in sorted(snapshot.fixed) if i in submap_row] or [0]
@@ -108,6 +110,7 @@ def run_job(snapshot: Snapshot, refine_rounds: int = 0) -> JobResult:
         tried,
         len(found),
         snapshot.unlinked_from is None or link is not None,
+        candidate,
     )
 
 

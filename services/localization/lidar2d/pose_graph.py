@@ -19,6 +19,7 @@ import scipy.sparse.linalg
 from services.localization.lidar2d.graph_kernels import cholesky_solve, edge_pairs, reduce_nodes, substitute
 
 DENSE_SUBMAPS = 250  # beyond this the reduced system is solved as a sparse one
+INNER_SCALE2 = 50.0  # poses in their own submap may be wrong too: a scan slips along a corridor
 SHRINK = 5.0  # the squared scale of the loop edges falls by this factor per iteration until the final one
 
 
@@ -76,7 +77,7 @@ def optimise(
             T_s,
             T_n,
             min(scale2, 1e12),
-            1e4,
+            max(min(scale2, 1e12), INNER_SCALE2),
             blocks,
             rhs,
             W,
@@ -102,7 +103,7 @@ def optimise(
         T_s,
         T_n,
         final_scale2,
-        1e4,
+        INNER_SCALE2,
         blocks,
         rhs,
         W,

@@ -71,3 +71,5 @@ class LidarSlamSettings:
     lost_scans: int = 5  # so many scans without a match: start afresh and look for the place in the map
     link_every_scans: int = 10
     link_confidence: float = 0.5
+    link_alone_rival: float = 0.7  # one answer is enough if nowhere else comes near it; else two must agree
+    link_apart_m: float = 1.0  # from places at least this far apart

@@ -33,7 +33,7 @@ def problem(rng, n_submaps=6, n_nodes=40, noise=0.01):
 
 
 def test_solution_against_scipy(rng):
-    submaps, nodes, edges = problem(rng)
+    submaps, nodes, edges = problem(rng, noise=0.001)
     start_s, start_n = (
         submaps + 0.05 * rng.standard_normal(submaps.shape),
         nodes + 0.05 * rng.standard_normal(nodes.shape),
