@@ -19,17 +19,12 @@ import tomllib
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
+from pydantic import Field, StringConstraints
 
 from common.errors import UserError
+from common.strict import Config, parse
 
 Token = Annotated[str, StringConstraints(pattern=r"^[a-z0-9][a-z0-9_-]{0,63}$")]
-
-
-class Config(BaseModel):
-    """Base of every configuration: frozen, and an unknown key is an error."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
 
 Seconds = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
@@ -58,7 +53,7 @@ class Deployment(Config):
     router: RouterConfig = RouterConfig()
     rate: Annotated[float, Field(ge=0.0)] = 1.0  # replayed data: times real time; 0 = as fast as possible
     state_dir: Path | None = None
-    nodes: dict[Token, dict[str, Any]] = {}
+    nodes: dict[Token, dict[str, Any]] = Field(default_factory=dict)
 
     @property
     def run_dir(self) -> Path:
@@ -86,39 +81,6 @@ def load_deployment(path: Path, overrides: tuple[str, ...] = ()) -> Deployment:
     for override in overrides:
         _apply(table, override)
     return parse(Deployment, table, str(path))
-
-
-def parse(cls: type[Config], table: dict[str, Any], where: str) -> Any:
-    """`cls` from a raw table.
-
-    Raises:
-        UserError: one sentence per fault, naming `where`, field, value and what was expected.
-    """
-    try:
-        return cls.model_validate(table)
-    except ValidationError as error:
-        faults = []
-        for fault in error.errors(include_url=False):
-            field = ".".join(str(part) for part in fault["loc"])
-            if fault["type"] == "extra_forbidden":
-                known = ", ".join(sorted(_at(cls, fault["loc"][:-1]).model_fields))
-                faults.append(f"unknown option {field!r} (there are: {known})")
-            elif fault["type"] == "missing":
-                faults.append(f"option {field!r} is required")
-            else:
-                faults.append(f"{field} = {fault['input']!r}: {fault['msg']}")
-        raise UserError(f"{where}: " + "; ".join(faults)) from error
-
-
-def _at(cls: type[BaseModel], place: tuple[str | int, ...]) -> type[BaseModel]:
-    """The model of the table at `place` within `cls`, as far down as models go."""
-    for part in place:
-        field = cls.model_fields.get(str(part))
-        inner = field.annotation if field is not None else None
-        if not (isinstance(inner, type) and issubclass(inner, BaseModel)):
-            break
-        cls = inner
-    return cls
 
 
 def _apply(table: dict[str, Any], override: str) -> None:

@@ -5,9 +5,10 @@ from __future__ import annotations
 import importlib
 from dataclasses import dataclass
 
-from common.config import NodeConfig, parse
+from common.config import NodeConfig
 from common.errors import UserError
 from common.node import Node
+from common.strict import parse
 
 
 @dataclass(frozen=True)

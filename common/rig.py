@@ -33,7 +33,6 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from common.config import Config, parse
 from common.errors import UserError
 from common.frames import R_body_camera_level
 from common.geometry import (
@@ -44,6 +43,7 @@ from common.geometry import (
     so3_exp,
 )
 from common.messages import CameraModel, LidarModel, Rig
+from common.strict import Config, parse
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Metres = Annotated[float, Field(allow_inf_nan=False, ge=-100.0, le=100.0)]

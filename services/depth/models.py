@@ -12,8 +12,8 @@ from typing import Annotated
 
 from pydantic import Field
 
-from common.config import Config, parse
 from common.errors import UserError
+from common.strict import Config, parse
 from services.depth.store import find_model, models_dirs, sha256_of
 
 TABLE = Path(__file__).resolve().parents[2] / "deploy" / "models.toml"

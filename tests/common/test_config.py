@@ -6,8 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from common.config import NodeConfig, load_deployment, parse
+from common.config import NodeConfig, load_deployment
 from common.errors import UserError
+from common.strict import parse
 
 
 def _file(tmp_path, text):
