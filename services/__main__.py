@@ -11,8 +11,9 @@ from rich.markup import escape
 from common.errors import UserError
 from services import demo, doctor, system_cli, warm
 from services.bench import cli as bench_cli
-from services.depth import calibrate_cli, models_cli
-from services.depth import cli as depth_cli
+from services.depth import models_cli
+from services.evaluation import calibrate_cli
+from services.evaluation import cli as depth_cli
 from services.localization import cli as localization_cli
 from services.mapping import cli as mapping_cli
 from services.replay import cli as replay_cli

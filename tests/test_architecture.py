@@ -13,7 +13,7 @@ MAX_LINES = 320
 SHELLS = {"node.py", "config.py", "cli.py", "__main__.py"}
 SHELL_ONLY = ("zenoh", "common.bus", "common.streams", "common.queries", "common.live", "common.lockstep",
               "common.topics", "common.messages", "common.node", "common.config", "common.registry")  # fmt: skip
-NOT_A_SERVICE = {"bench"}  # measures the whole house
+NOT_A_SERVICE = {"bench", "evaluation"}  # they measure the whole house
 
 
 def _imports(path: Path) -> set[str]:

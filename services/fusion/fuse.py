@@ -10,7 +10,8 @@ import numpy as np
 from common.beams import NO_BEAMS, project_beams
 from common.camera import Pinhole
 from services.fusion import finish
-from services.fusion.field import Field, FieldConfig, Frame, Solved
+from services.fusion.field import Field
+from services.fusion.frame import FieldConfig, Frame, Solved
 from services.fusion.health import PictureHealth, beams_status
 from services.fusion.memory import Remembered
 from services.fusion.pairs import largest_cluster

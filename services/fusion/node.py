@@ -25,7 +25,7 @@ from common.messages import (
 )  # fmt: skip
 from common.node import Input, Node, Outputs
 from common.picture import decode_rgb
-from services.fusion.field import Frame
+from services.fusion.frame import Frame
 from services.fusion.fuse import Fusion
 from services.fusion.result import Fused
 

@@ -8,7 +8,7 @@ from common.beams import Beams
 from common.camera import Pinhole
 from common.frames import camera_mount
 from common.geometry import se2_to_se3
-from services.fusion.field import Frame
+from services.fusion.frame import Frame
 from services.fusion.fuse import Fusion
 
 

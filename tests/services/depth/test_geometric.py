@@ -6,8 +6,8 @@ import pytest
 
 from common.errors import UserError
 from common.geometry import se2_to_se3
-from services.depth.metrics import MethodErrors, blocks, confirmed, every_third
 from services.depth.source import View, judge, make_source
+from services.evaluation.metrics import MethodErrors, blocks, confirmed, every_third
 from tests.services.fusion.room import CAMERA, T_BODY_CAMERA, render, scan
 
 POSE = se2_to_se3(np.array([0.3, 0.2, 0.1]))

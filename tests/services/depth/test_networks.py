@@ -164,8 +164,8 @@ def test_the_network_at_hand_answers_at_its_known_error(shared_dir, monkeypatch)
     """FastDepth on real pictures of a kitchen: AbsRel 0.24 as probed elsewhere on these weights."""
     import cv2
 
-    from services.depth.evaluate import read_truth
     from services.depth.recorded import read_depth
+    from services.evaluation.evaluate import read_truth
     from services.replay.options import SourceOptions
     from services.replay.source import open_source
 

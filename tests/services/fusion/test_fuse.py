@@ -5,7 +5,7 @@ import pytest
 
 from common.beams import NO_BEAMS
 from common.geometry import se2_to_se3
-from services.fusion.field import Frame
+from services.fusion.frame import Frame
 from services.fusion.fuse import Fusion
 from services.fusion.relative_pose import epipolar_px, refine
 from tests.services.fusion.room import CAMERA, T_BODY_CAMERA, in_map, render, scan

@@ -12,7 +12,7 @@ from common.camera import Pinhole
 from common.frames import camera_mount
 from common.geometry import make_transform
 from services.depth.source import View, make_source
-from services.fusion.field import Frame
+from services.fusion.frame import Frame
 from services.fusion.fuse import Fusion
 
 _WALL_M = 4.0

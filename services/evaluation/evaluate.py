@@ -12,11 +12,11 @@ import numpy as np
 from common.beams import project_beams
 from common.errors import UserError
 from common.geometry import inverse
-from services.depth.drive import Drive
-from services.depth.metrics import MethodErrors, blocks, confirmed, every_third
 from services.depth.recorded import read_depth
 from services.depth.source import DepthSource, Estimate, View
-from services.fusion.field import FieldConfig, Frame
+from services.evaluation.drive import Drive
+from services.evaluation.metrics import MethodErrors, blocks, confirmed, every_third
+from services.fusion.frame import FieldConfig, Frame
 from services.fusion.fuse import Fusion
 from services.fusion.result import Fused, refusal
 from services.fusion.scaling import affine, ratio

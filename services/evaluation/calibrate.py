@@ -11,7 +11,7 @@ import numpy as np
 
 from common.errors import UserError
 from common.rig import load_rig
-from services.depth.drive import Drive, pinhole_of
+from services.evaluation.drive import Drive, pinhole_of
 from services.fusion.calibration.board import BoardPair, chessboard_plane, solve_board
 from services.fusion.calibration.motion import PARAMETERS, MotionCalibration, TrackedPair, solve_motion
 from services.fusion.relative_pose import corners, track

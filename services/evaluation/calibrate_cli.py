@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from common.errors import UserError
-from services.depth.cli import JsonOption, PosesOption, RigOption
+from services.evaluation.cli import JsonOption, PosesOption, RigOption
 
 app = typer.Typer(no_args_is_help=True, help="Camera, lidar and their clocks against each other.")
 
@@ -36,8 +36,8 @@ def extrinsics(
 
         beamsplat calibrate extrinsics pairs --target board --rig rig.toml
     """
-    from services.depth.calibrate import calibrate_board, calibrate_motion, motion_report
-    from services.depth.drive import open_drive
+    from services.evaluation.calibrate import calibrate_board, calibrate_motion, motion_report
+    from services.evaluation.drive import open_drive
     from services.fusion.calibration.motion import PARAMETERS
 
     if target == "board":
@@ -66,8 +66,8 @@ def clock(
 
     Example: beamsplat calibrate time drive --poses out/trajectory.tum
     """
-    from services.depth.calibrate import calibrate_motion, motion_report, with_clock
-    from services.depth.drive import open_drive
+    from services.evaluation.calibrate import calibrate_motion, motion_report, with_clock
+    from services.evaluation.drive import open_drive
 
     drive = open_drive(data, poses, rig)
     if shift_ms:

@@ -12,9 +12,9 @@ from common.beams import project_beams
 from common.camera import Pinhole, Undistorter
 from common.errors import UserError
 from common.rig import load_rig
-from services.depth.drive import Drive, pinhole_of
-from services.depth.evaluate import Outcome, read_truth, walk
 from services.depth.source import DepthSource, View
+from services.evaluation.drive import Drive, pinhole_of
+from services.evaluation.evaluate import Outcome, read_truth, walk
 
 _Z_RANGE_M = (0.4, 10.0)
 _SIGMA_RANGE_M = (0.005, 2.0)

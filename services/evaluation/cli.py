@@ -14,7 +14,7 @@ from rich.table import Table
 from common.errors import UserError
 
 if TYPE_CHECKING:
-    from services.depth.drive import Drive
+    from services.evaluation.drive import Drive
 
 # OpenCV, Numba and onnxruntime are imported where they are used: every other command starts without them.
 
@@ -54,9 +54,12 @@ def eval_depth(
 
         beamsplat eval depth drive --truth drive/depth_gt --source stixel --json
     """
-    from services.depth.evaluate import evaluate, read_truth
-    from services.depth.source import make_source
+    import cv2
 
+    from services.depth.source import make_source
+    from services.evaluation.evaluate import evaluate, read_truth
+
+    cv2.setNumThreads(1)  # CPU times are those of one core
     drive = _open(bag, poses, rig)
     with _progress() as bar:
         task = bar.add_task("", total=None)
@@ -92,8 +95,8 @@ def depth(
 
         beamsplat depth photo.jpg --out pictures --rig rig.toml
     """
-    from services.depth.pictures import draw_drive, draw_image
     from services.depth.source import make_source
+    from services.evaluation.pictures import draw_drive, draw_image
 
     chosen = make_source(source, options_of(set_))
     out.mkdir(parents=True, exist_ok=True)
@@ -118,7 +121,7 @@ def bench_depth(
 
     Example: beamsplat bench depth --source stixel
     """
-    from services.depth.bench import bench
+    from services.evaluation.bench import bench
 
     figures = bench(source, frames)
     if as_json:
@@ -149,7 +152,7 @@ def options_of(pairs: list[str] | None) -> dict[str, Any]:
 
 
 def _open(bag: Path, poses: Path | None, rig: Path | None) -> Drive:
-    from services.depth.drive import open_drive
+    from services.evaluation.drive import open_drive
 
     return open_drive(bag, poses, rig)
 

@@ -1,0 +1,1 @@
+"""Commands that look at depth, measure it and calibrate: they play recordings through several services."""

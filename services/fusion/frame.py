@@ -1,0 +1,87 @@
+"""What `field` works on: a picture with its pose, its small version, what was solved, and the weights."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from common.beams import Beams
+
+
+@dataclass(frozen=True)
+class FieldConfig:
+    """Weights are in units of the matching cost, whose worst value is `cost_scale`."""
+
+    width_px: int = 160  # working size; the height follows
+    labels: int = 88
+    z_near_m: float = 0.4
+    z_far_m: float = 14.0
+    baselines_m: tuple[float, ...] = (0.1, 0.2, 0.4, 0.8)
+    max_turn_rad: float = 0.6
+    cost_scale: float = 12.0
+    p1: float = 0.7
+    p2: float = 12.0
+    edge_grey: float = 12.0
+    temperature: float = 2.0
+    wall_near: float = 4.0  # at the height of the lidar
+    wall_far: float = 0.25  # far above and below, on a body that stays level
+    wall_reach_m: float = 0.15
+    floor: float = 3.0
+    behind: float = 1.0
+    ceiling: float = 3.5
+    ceiling_evidence: float = 500.0
+    memory: float = 1.5
+    memory_keyframes: int = 6
+    memory_spread: float = 0.15
+    outvote: int = 3  # keyframes
+    guess: float = 1.6
+    guess_spread: float = 0.12
+    near_m: float = 0.7  # unsupported depth below this is unlikely
+    near: float = 1.0
+    rotation_sigma_rad: float = 0.007
+    translation_sigma_m: float = 0.015
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One undistorted picture with its pose, beams and the guess of a depth source."""
+
+    stamp_ns: int
+    image_rgb: np.ndarray  # uint8 [H, W, 3]
+    T_map_body: np.ndarray
+    beams: Beams
+    guess: np.ndarray | None = None  # float32 [H, W]
+    guess_kind: str = "none"
+
+
+@dataclass(frozen=True)
+class Small:
+    """A picture at the working size."""
+
+    T_map_camera: np.ndarray
+    grey: np.ndarray  # float32 [h, w]
+    features: np.ndarray  # float32 [h, w, 3]
+    middle: np.ndarray  # uint8 [2h, 2w]: corners are tracked here
+
+
+@dataclass(frozen=True)
+class Solved:
+    """Depth at the working size."""
+
+    depth_m: np.ndarray  # float32 [h, w]
+    spread: np.ndarray  # float32 [h, w]: standard deviation of log depth, as the method believes
+    snapped: np.ndarray  # bool [h, w]: depth taken from a surface that beams or floor predict
+    views: int  # pictures swept over
+
+
+def features(grey: np.ndarray, side: int = 9, floor_grey: float = 3.0) -> np.ndarray:
+    """float32 [h, w, 3]: grey and its gradient, by the contrast around: blind to exposure and gain."""
+    mean = cv2.boxFilter(grey, -1, (side, side))
+    contrast = (
+        np.sqrt(np.maximum(cv2.boxFilter(grey * grey, -1, (side, side)) - mean * mean, 0.0)) + floor_grey
+    )
+    dx = cv2.Sobel(grey, cv2.CV_32F, 1, 0, ksize=3, scale=0.125)
+    dy = cv2.Sobel(grey, cv2.CV_32F, 0, 1, ksize=3, scale=0.125)
+    return np.stack([(grey - mean) / contrast, dx / contrast, dy / contrast], axis=-1)
