@@ -1,4 +1,4 @@
-"""`bench raster`: forward + L1 + backward of each backend on a synthetic room, beside plain torch."""
+"""`bench raster`: forward + L1 (colour and depth) + backward on a synthetic room, beside plain torch."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ import numpy as np
 from common.raster.camera import RasterCamera
 from common.raster.layout import COLOUR, MEAN, OPACITY, PARAMS, QUAT, SCALE
 from common.raster.rasterizer import Rasterizer
-from common.raster.warm import warm
+from services.mapping.kernels import photometric_and_depth
+from services.mapping.warm import warm
 
 SIZES = ((320, 240), (640, 480))
 Say = Callable[[str], None]
@@ -101,7 +102,11 @@ def _target(shape: tuple[int, ...]) -> np.ndarray:
 def _cpu_cases(
     params: np.ndarray, count: int, camera: RasterCamera, T_camera_map: np.ndarray, repeats: int
 ) -> list[dict[str, Any]]:
-    target = _target((5, camera.height_px, camera.width_px))
+    shape = (camera.height_px, camera.width_px)
+    target = (_target((5, *shape)) * 255.0).astype(np.uint8)
+    depth_mm = target[3].astype(np.uint16) * np.uint16(20)
+    gradient, sums = np.empty((5, *shape), np.float32), np.empty((shape[0], 8))
+    scale = np.float32(1.0 / gradient.size)
     teams = {threads: Rasterizer(threads) for threads in (1, 2)}
     times: dict[int, list[tuple[float, float, float]]] = {threads: [] for threads in teams}
     pairs = 0
@@ -110,8 +115,10 @@ def _cpu_cases(
             cpu, start = time.process_time(), time.perf_counter()
             render = rasterizer.render(params, count, camera, T_camera_map)
             middle = time.perf_counter()
-            gradient = np.sign(render.image - target)
-            gradient *= np.float32(1.0 / gradient.size)
+            rasterizer.team.run(
+                photometric_and_depth, render.image, target[:3], depth_mm, target[4], np.zeros(6, np.float32),
+                scale, scale, gradient, sums,
+            )  # fmt: skip
             rasterizer.backward(render, gradient)
             end, pairs = time.perf_counter(), render.pairs
             rasterizer.release(render)
