@@ -1,0 +1,100 @@
+"""Beams and pixels on things that move: beams that end where past scans saw free space."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from common.beams import Beams, plan_polar
+from common.camera import Pinhole
+
+jit = njit(nogil=True, cache=True, error_model="numpy")
+
+
+class FreeSpace:
+    """Grid over the floor: how often beams passed through each cell, and how often they ended there."""
+
+    def __init__(self, cell_m: float = 0.1, side_m: float = 60.0) -> None:
+        cells = round(side_m / cell_m)
+        self.cell_m = cell_m
+        self._low_m = -0.5 * side_m
+        self._passed = np.zeros((cells, cells), dtype=np.uint16)
+        self._ended = np.zeros((cells, cells), dtype=np.uint16)
+
+    def add(self, position_map_m: np.ndarray, points_map_m: np.ndarray) -> None:
+        """Takes in a scan from `position_map_m` [2 or 3] with returns [N, 2 or 3], both in the map."""
+        start = np.asarray(position_map_m, dtype=np.float64)[:2].copy()
+        ends = np.ascontiguousarray(points_map_m[:, :2], dtype=np.float64)
+        pass_through(start, ends, self._low_m, self.cell_m, self._passed, self._ended)
+
+    def contradicted(self, points_map_m: np.ndarray, least: int = 6, ratio: float = 0.1) -> np.ndarray:
+        """bool [N]: returns in cells that beams passed `least` times and hardly ever ended at."""
+        index = np.floor((points_map_m[:, :2] - self._low_m) / self.cell_m).astype(np.int64)
+        size = len(self._passed)
+        inside = np.all((index >= 1) & (index < size - 1), axis=1)
+        column, row = np.clip(index, 1, size - 2).T
+        ended = np.zeros(len(index), dtype=np.int64)
+        for dv in (-1, 0, 1):
+            for du in (-1, 0, 1):
+                ended = np.maximum(ended, self._ended[row + dv, column + du])
+        passed = self._passed[row, column].astype(np.int64)
+        return inside & (passed >= least) & (ended <= ratio * passed)
+
+
+def mover_mask(
+    beams: Beams, moving: np.ndarray, depth_m: np.ndarray, camera: Pinhole, T_body_camera: np.ndarray,
+    height_m: float = 2.0, tolerance: float = 0.1,
+) -> np.ndarray:  # fmt: skip
+    """bool [H, W]: pixels of columns that a moving beam serves, at that beam's depth and below `height_m`.
+
+    `moving` bool [N] marks beams (`FreeSpace.contradicted`); `depth_m` float32 [H, W] is the fused depth.
+    """
+    mask = np.zeros(depth_m.shape, dtype=bool)
+    if not moving.any():
+        return mask
+    rays = camera.ray_grid() @ T_body_camera[:3, :3].T
+    azimuth, reach = plan_polar(beams.points_body_m[moving], T_body_camera)
+    pixel_azimuth = np.arctan2(rays[..., 1], rays[..., 0])
+    across = np.hypot(rays[..., 0], rays[..., 1])
+    order = np.argsort(azimuth)
+    azimuth, reach = azimuth[order], reach[order]
+    after = np.clip(np.searchsorted(azimuth, pixel_azimuth), 0, len(azimuth) - 1)
+    before = np.maximum(after - 1, 0)
+    nearer = np.abs(azimuth[before] - pixel_azimuth) < np.abs(azimuth[after] - pixel_azimuth)
+    nearest = np.where(nearer, before, after)
+    served = np.abs(azimuth[nearest] - pixel_azimuth) < 0.01
+    z = reach[nearest] / np.maximum(across, 1e-9)
+    low = T_body_camera[2, 3] + rays[..., 2] * z < height_m
+    with np.errstate(invalid="ignore"):
+        at_depth = np.abs(depth_m / z - 1.0) < tolerance
+    return served & low & at_depth
+
+
+@jit
+def pass_through(
+    start_m: np.ndarray,  # float64 [2]
+    ends_m: np.ndarray,  # float64 [N, 2]
+    low_m: float,
+    cell_m: float,
+    passed: np.ndarray,  # uint16 [rows, columns]
+    ended: np.ndarray,  # uint16 [rows, columns]
+) -> None:
+    """Counts the cells that each beam crosses, its last two left out, and the cell where it ends."""
+    rows, columns = passed.shape
+    for k in range(ends_m.shape[0]):
+        dx, dy = ends_m[k, 0] - start_m[0], ends_m[k, 1] - start_m[1]
+        length = np.hypot(dx, dy)
+        steps = int(length / (0.5 * cell_m)) - 4
+        last_i, last_j = -1, -1
+        for step in range(max(steps, 0)):
+            f = step * 0.5 * cell_m / length
+            j = int(np.floor((start_m[0] + f * dx - low_m) / cell_m))
+            i = int(np.floor((start_m[1] + f * dy - low_m) / cell_m))
+            if (i != last_i or j != last_j) and 0 <= i < rows and 0 <= j < columns:
+                if passed[i, j] < 65535:
+                    passed[i, j] += 1
+                last_i, last_j = i, j
+        j = int(np.floor((ends_m[k, 0] - low_m) / cell_m))
+        i = int(np.floor((ends_m[k, 1] - low_m) / cell_m))
+        if 0 <= i < rows and 0 <= j < columns and ended[i, j] < 65535:
+            ended[i, j] += 1
