@@ -84,6 +84,8 @@ def pass_through(
     for k in range(ends_m.shape[0]):
         dx, dy = ends_m[k, 0] - start_m[0], ends_m[k, 1] - start_m[1]
         length = np.hypot(dx, dy)
+        if not 0.0 < length < cell_m * (rows + columns):  # also rubbish: a walk must end
+            continue
         steps = int(length / (0.5 * cell_m)) - 4
         last_i, last_j = -1, -1
         for step in range(max(steps, 0)):
