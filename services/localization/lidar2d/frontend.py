@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from dataclasses import dataclass
 
@@ -9,8 +10,9 @@ import numpy as np
 
 from services.localization.lidar2d import se2
 from services.localization.lidar2d.correlative import search
+from services.localization.lidar2d.dead_reckoning import SIGMA_M, DeadReckoning
 from services.localization.lidar2d.matching import Match, refine
-from services.localization.lidar2d.observability import without_slip
+from services.localization.lidar2d.observability import Observed, without_slip
 from services.localization.lidar2d.odometry import OdometryBuffer, Predictor
 from services.localization.lidar2d.scan import PreparedScan, prepare_scan
 from services.localization.lidar2d.settings import LidarSlamSettings
@@ -61,6 +63,7 @@ class FrontEnd:
         self.T_body_lidar = T_body_lidar
         self._flip = -1.0 if upside_down else 1.0
         self.odometry = OdometryBuffer()
+        self.reckoning = DeadReckoning(self.odometry)
         self._wheels = Predictor(0.01, 0.05, 0.02, 0.004, 0.05, 0.03)
         self._inertia = Predictor(0.02, 0.10, 0.3, 0.02, 0.20, 0.4)
         self._still = Predictor(0.05, 0.0, 0.3, 0.05, 0.0, 0.4)
@@ -71,6 +74,7 @@ class FrontEnd:
         """Go on from the last pose under a clock that was set."""
         if self.poses:
             self.stamps, self.poses = [stamp_ns - round(0.1 / NS)], [self.poses[-1]]
+            self.reckoning.restart(stamp_ns, self.poses[-1])
 
     # ---- motion -----------------------------------------------------------------------------------
 
@@ -95,6 +99,13 @@ class FrontEnd:
         wheels = self.odometry.increment(self.stamps[-1], stamp_ns)
         if wheels is not None and self._possible(wheels, dt):
             options.append((self._wheels, wheels, "wheels"))
+        counted = self.reckoning.predict(stamp_ns)
+        if counted is not None:
+            motion = se2.between(self.poses[-1], counted)
+            if self._possible(motion, dt):
+                sigma_rad = self._wheels.sigmas(motion, dt)[1]
+                known = Prediction(motion, SIGMA_M, sigma_rad, "wheels", False)
+                return known, [(predictor, motion) for predictor, motion, _ in options]
         rated = []
         for predictor, motion, name in options:
             sigma_m, sigma_rad = predictor.sigmas(motion, dt)
@@ -181,7 +192,29 @@ class FrontEnd:
                 points, scan.origin_body, match.T_map_body, tables, s, T_guess, information, anneal=(1.0,)
             )
         trusted = self._trusted(prediction, T_guess, match)
-        return scan, without_slip(points, scan.origin_body, match, tables, s), trusted
+        if not trusted:
+            return scan, match, False
+        return (
+            scan,
+            self._count_on_wheels(
+                raw.stamp_ns, local, without_slip(points, scan.origin_body, match, tables, s)
+            ),
+            True,
+        )
+
+    def _count_on_wheels(self, stamp_ns: int, local: LocalMap, seen: Observed) -> Match:
+        """Where the scan slides freely, let the wheels say how far it is."""
+        T_odom_map = local.T_odom_map
+        turn = np.array([0.0, 0.0, T_odom_map[2]])
+        direction_odom = se2.transform(turn, seen.direction[None])[0]
+        T_odom_body = se2.compose(T_odom_map, seen.match.T_map_body)
+        corrected, counted = self.reckoning.correct(stamp_ns, T_odom_body, seen.trust, direction_odom)
+        if not counted:
+            return seen.match
+        v = np.array([*seen.direction, 0.0])
+        information = seen.match.information + (1.0 - seen.trust**2) * np.outer(v, v) / SIGMA_M**2
+        T_map_body = se2.between(T_odom_map, corrected)
+        return dataclasses.replace(seen.match, T_map_body=T_map_body, information=information)
 
     def _trusted(self, prediction: Prediction, T_guess: np.ndarray, match: Match) -> bool:
         """Enough agrees; more has to agree where the prediction says something else or nothing."""

@@ -103,7 +103,9 @@ def close_narrow(
             other = refine(features, node.scan.origin, T_start, tables, settings)
             if other.share * other.known > best.share * best.known + 0.02:
                 best = other
-    return _accepted(node, place, without_slip(features, node.scan.origin, best, tables, settings), settings)
+    return _accepted(
+        node, place, without_slip(features, node.scan.origin, best, tables, settings).match, settings
+    )
 
 
 def close_wide(
@@ -142,7 +144,9 @@ def close_wide(
             return None
     own = node.scan.features.astype(np.float64)
     single = refine(own, node.scan.origin, best.T_map_body, tables, settings)
-    return _accepted(node, place, without_slip(own, node.scan.origin, single, tables, settings), settings)
+    return _accepted(
+        node, place, without_slip(own, node.scan.origin, single, tables, settings).match, settings
+    )
 
 
 def confirmed(

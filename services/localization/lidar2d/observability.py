@@ -8,7 +8,6 @@ import math
 import numpy as np
 from numba import njit
 
-from services.localization.lidar2d import se2
 from services.localization.lidar2d.matching import Match, accumulate
 from services.localization.lidar2d.settings import LidarSlamSettings
 from services.localization.lidar2d.surfel_map import MatchTables
@@ -57,17 +56,26 @@ def weak_direction(information: np.ndarray) -> np.ndarray:
     return np.array([-math.sin(angle), math.cos(angle)])
 
 
+@dataclasses.dataclass(frozen=True)
+class Observed:
+    """A match and how far it can be trusted along its weak direction."""
+
+    match: Match  # with the information that is left
+    trust: float  # 0 (slides freely) .. 1
+    direction: np.ndarray  # float64 [2] unit vector, axes of the map
+
+
 def without_slip(
     points: np.ndarray,  # float64 [K, 5]
     origin: np.ndarray,
     match: Match,
     tables: MatchTables,
     settings: LidarSlamSettings,
-) -> Match:
-    """The match with its information along the weak direction reduced to what shifting it tells."""
-    if len(points) == 0:
-        return match
+) -> Observed:
+    """Reduce the information along the weak direction to what shifting the scan tells."""
     direction = weak_direction(match.information)
+    if len(points) == 0:
+        return Observed(match, 0.0, direction)
     sigma_m = math.hypot(settings.range_sigma_m, settings.map_sigma_m)
     shifted = np.empty(len(SHIFTS_M))
     here = agreement_when_shifted(
@@ -89,20 +97,8 @@ def without_slip(
     known = max(match.known * len(points), 1.0)
     trust = min(max((here - float(shifted.max())) / (TELLING * known), 0.0), 1.0)
     if trust >= 1.0:
-        return match
+        return Observed(match, 1.0, direction)
     v = np.array([direction[0], direction[1], 0.0])
     along = match.information @ v
     reduced = match.information - (1.0 - trust**2) * np.outer(along, along) / max(float(v @ along), 1e-9)
-    return dataclasses.replace(match, information=reduced)
-
-
-def with_prior(match: Match, prior_T: np.ndarray, prior_information: np.ndarray) -> Match:
-    """Where a match of reduced information is pulled by the prediction."""
-    e = np.array(
-        [*(prior_T - match.T_map_body)[:2], math.remainder(prior_T[2] - match.T_map_body[2], 2 * math.pi)]
-    )
-    P = prior_information / (1.0 + float(e @ prior_information @ e) / 9.0)
-    step = np.linalg.solve(match.information + P + np.diag([1e-3, 1e-3, 1e-1]), P @ e)
-    T = match.T_map_body + step
-    T[2] = se2.wrap(T[2])
-    return dataclasses.replace(match, T_map_body=T)
+    return Observed(dataclasses.replace(match, information=reduced), trust, direction)

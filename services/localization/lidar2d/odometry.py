@@ -10,6 +10,7 @@ from numba import njit
 from services.localization.lidar2d import se2
 
 NS = 1e-9
+BASELINE_NS = 80_000_000
 DELAYS_S = np.arange(-30, 31) * 0.01  # candidates for the delay of the odometry clock
 
 
@@ -27,13 +28,17 @@ def interpolate(
     if n < 2 or at_ns < stamps_ns[0] or at_ns > stamps_ns[n - 1] + ahead_ns:
         return False
     i = min(max(np.searchsorted(stamps_ns, at_ns), 1), n - 1)
-    span = stamps_ns[i] - stamps_ns[i - 1]
+    k = i - 1
+    if at_ns > stamps_ns[n - 1]:  # a velocity needs a baseline: messages come in bursts
+        while k > 0 and stamps_ns[n - 1] - stamps_ns[k] < BASELINE_NS:
+            k -= 1
+    span = stamps_ns[i] - stamps_ns[k]
     if span > gap_ns or span <= 0:
         return False
-    f = (at_ns - stamps_ns[i - 1]) / span
+    f = (at_ns - stamps_ns[k]) / span
     for j in range(2):
-        out[j] = poses[i - 1, j] + f * (poses[i, j] - poses[i - 1, j])
-    out[2] = se2.wrap(poses[i - 1, 2] + f * se2.wrap(poses[i, 2] - poses[i - 1, 2]))
+        out[j] = poses[k, j] + f * (poses[i, j] - poses[k, j])
+    out[2] = se2.wrap(poses[k, 2] + f * se2.wrap(poses[i, 2] - poses[k, 2]))
     return True
 
 

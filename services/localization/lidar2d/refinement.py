@@ -79,7 +79,7 @@ def _measure(
     moved = np.hypot(*(match.T_map_body[:2] - guess[:2]))
     if match.share < settings.loop_share or match.known < settings.loop_known or moved > 0.3:
         return constraint
-    match = without_slip(features, node.scan.origin, match, tables, settings)
+    match = without_slip(features, node.scan.origin, match, tables, settings).match
     information = edge_information(match.information, settings.edge_sigma_m, settings.edge_sigma_rad)
     if not constraint.loop:
         information /= settings.inner_facts
