@@ -12,6 +12,7 @@ WARMERS = (
     "services.localization.lidar2d.warm:warm",
     "services.fusion.warm:warm",
     "common.raster.warm:warm",
+    "services.mapping.warm:warm",
 )
 
 

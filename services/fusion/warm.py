@@ -10,6 +10,7 @@ from common.frames import camera_mount
 from common.geometry import se2_to_se3
 from services.fusion.frame import Frame
 from services.fusion.fuse import Fusion
+from services.fusion.movers import FreeSpace
 
 
 def warm() -> None:
@@ -27,3 +28,4 @@ def warm() -> None:
         guess = np.full((480, 640), 3.0, np.float32) + rng.uniform(0.0, 0.1, (480, 640)).astype(np.float32)
         frame = Frame(i, np.roll(picture, i, axis=1), T_map_body, beams, guess, "relative")
         fusion.fuse(frame, keyframe=i % 2 == 0)
+    FreeSpace().add(np.zeros(2), points)
