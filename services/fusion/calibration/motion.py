@@ -16,7 +16,7 @@ import numpy as np
 from common.geometry import inverse, skew, so3_exp
 
 PARAMETERS = ("clock_s", "roll_rad", "pitch_rad", "yaw_rad", "x_m", "y_m")
-_PRIOR = np.array([0.3, 0.1, 0.1, 0.1, 0.1, 0.1])  # standard deviations: keeps what nothing tells in place
+_PRIOR = np.array([0.3, 0.1, 0.1, 0.1, 0.03, 0.03])  # standard deviations: keeps what nothing tells in place
 _STEP = np.array([1e-3, 1e-5, 1e-5, 1e-5, 1e-4, 1e-4])
 _SEARCH_S = 0.32
 _LEAST_BASELINE_M = 0.005
@@ -103,6 +103,9 @@ def solve_motion(
         estimates.append(_Problem(kept, pose_at, T_body_camera, focal_px).descend(best.copy(), mask, 4))
     spread = np.array(estimates) - np.mean(estimates, axis=0)
     sigma = np.sqrt((_BLOCKS - 1) / _BLOCKS * np.sum(spread**2, axis=0))
+    # What the prior holds does not scatter, and is not known for that: its own width counts instead.
+    held = problem.held_by_prior(best, mask)
+    sigma = np.hypot(sigma, held * _PRIOR)
     after = problem.residuals(best)
     return MotionCalibration(
         best, np.where(mask, sigma, np.inf), float(np.median(np.abs(after))),
@@ -136,6 +139,29 @@ class _Problem:
         """Robust cost (Cauchy, scale 1 px)."""
         return float(np.sum(np.log1p(self.residuals(x) ** 2)))
 
+    def held_by_prior(self, x: np.ndarray, mask: np.ndarray) -> np.ndarray:
+        """Share [6] in [0, 1] of each value that comes from the prior and not from the pictures."""
+        columns = np.flatnonzero(mask)
+        share = np.ones(len(x))
+        if len(columns):
+            H, _, prior = self._normal(x, columns)
+            share[columns] = np.clip(np.diag(np.linalg.solve(H, np.diag(prior))), 0.0, 1.0)
+        return share
+
+    def _normal(self, x: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(H [k, k], gradient [k], weights [k] of the prior) of the robust least squares at x."""
+        r = self.residuals(x)
+        J = np.empty((len(r), len(columns)))
+        for k, column in enumerate(columns):
+            step = np.zeros(len(x))
+            step[column] = _STEP[column]
+            J[:, k] = (self.residuals(x + step) - self.residuals(x - step)) / (2.0 * _STEP[column])
+        scale = max(0.5, 1.4826 * float(np.median(np.abs(r))))
+        weight = 1.0 / (1.0 + (r / scale) ** 2) ** 2
+        # The corners of a pair share the error of its two poses: together they weigh as one.
+        prior = scale**2 * len(r) / len(self._pairs) / _PRIOR[columns] ** 2
+        return J.T @ (J * weight[:, None]) + np.diag(prior), J.T @ (weight * r) + prior * x[columns], prior
+
     def descend(self, x: np.ndarray, mask: np.ndarray, iterations: int) -> np.ndarray:
         """Gauss-Newton over the parameters of `mask`."""
         x = x.copy()
@@ -143,16 +169,8 @@ class _Problem:
         if len(columns) == 0:
             return x
         for _ in range(iterations):
-            r = self.residuals(x)
-            J = np.empty((len(r), len(columns)))
-            for k, column in enumerate(columns):
-                step = np.zeros(len(x))
-                step[column] = _STEP[column]
-                J[:, k] = (self.residuals(x + step) - self.residuals(x - step)) / (2.0 * _STEP[column])
-            scale = max(0.5, 1.4826 * float(np.median(np.abs(r))))
-            weight = 1.0 / (1.0 + (r / scale) ** 2) ** 2
-            H = J.T @ (J * weight[:, None]) + np.diag(scale**2 / _PRIOR[columns] ** 2)
-            delta = np.linalg.solve(H, J.T @ (weight * r) + scale**2 * x[columns] / _PRIOR[columns] ** 2)
+            H, gradient, _ = self._normal(x, columns)
+            delta = np.linalg.solve(H, gradient)
             x[columns] -= delta
             if np.all(np.abs(delta) < 0.1 * _STEP[columns]):
                 break
