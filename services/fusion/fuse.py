@@ -20,7 +20,8 @@ from services.fusion.scaling import ratio
 from services.fusion.surfaces import Surfaces
 
 # Standard deviations of log depth, measured on both recordings by what a pixel's depth rests on.
-_BEAM, _FLOOR, _SURFACE, _MATCHED = 0.003, 0.004, 0.010, 0.05
+_BEAM, _FLOOR, _SURFACE, _MATCHED = 0.002, 0.004, 0.010, 0.05
+_BETWEEN_BEAMS_M = 0.007  # the mean of two beams of 1 cm each
 _PER_SPREAD = 2.3  # error per unit of the matcher's own spread
 _CARRIED = (0.10, 0.06, 0.045)  # depth remembered from one, two, three and more keyframes
 _UPRIGHT, _TILTING = 0.125, 0.13  # extruded walls that nothing confirms: body on a floor, body in the hand
@@ -122,7 +123,7 @@ class Fusion:
             floor = solved.snapped & (np.abs(np.log(surfaces.floor / solved.depth_m)) < 0.01)
             beam = solved.snapped & (surfaces.wall_off_m < _BEAM_HEIGHT_M)
         base = np.where(solved.snapped, _SURFACE, _MATCHED)
-        base = np.where(floor, _FLOOR, np.where(beam, _BEAM + 0.01 / solved.depth_m, base))
+        base = np.where(floor, _FLOOR, np.where(beam, _BEAM + _BETWEEN_BEAMS_M / solved.depth_m, base))
         doubt = np.where(floor | beam, 0.0, _PER_SPREAD * solved.spread)
         return np.hypot(base, doubt).astype(np.float32)
 
@@ -130,7 +131,7 @@ class Fusion:
         """On the scan line itself the beams are right, whatever matches; changes both arrays."""
         pinned = (surfaces.wall_off_m < 0.5 * _BEAM_HEIGHT_M) & ~surfaces.on_floor
         solved.depth_m[pinned] = surfaces.wall[pinned]
-        sigma_log[pinned] = _BEAM + 0.01 / solved.depth_m[pinned]
+        sigma_log[pinned] = _BEAM + _BETWEEN_BEAMS_M / solved.depth_m[pinned]
 
     def _doubt_edges(self, depth: np.ndarray, sigma_log: np.ndarray) -> np.ndarray:
         """Sigma of log depth with a share of the jumps nearby; thin gaps between beams end anywhere."""
