@@ -135,7 +135,9 @@ class Fusion:
 
     def _doubt_edges(self, depth: np.ndarray, sigma_log: np.ndarray) -> np.ndarray:
         """Sigma of log depth with a share of the jumps nearby; thin gaps between beams end anywhere."""
-        log_z = np.log(depth)
+        known = np.isfinite(depth)
+        middle = float(np.median(depth[known])) if known.any() else 1.0
+        log_z = np.log(np.where(known, depth, middle)).astype(np.float32)
         window = np.ones(_EDGE_REACH, np.uint8)
         jump = cv2.dilate(log_z, window) - cv2.erode(log_z, window)
         return np.hypot(sigma_log, np.where(jump > _SAME_SURFACE, _EDGE * jump, 0.0)).astype(np.float32)
