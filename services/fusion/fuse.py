@@ -100,7 +100,8 @@ class Fusion:
         with np.errstate(invalid="ignore"):
             at_beam = (surfaces.wall_off_m < _BEAM_HEIGHT_M) & ~surfaces.on_floor
             exact = np.abs(np.log(surfaces.floor / depth)) < 0.03
-        depth[at_beam], spread[at_beam] = surfaces.wall[at_beam], 2.0 * _BEAM
+        depth[at_beam] = surfaces.wall[at_beam]
+        spread[at_beam] = _BEAM + _BETWEEN_BEAMS_M / depth[at_beam]
         depth[exact], spread[exact] = surfaces.floor[exact], _FLOOR
         return Solved(depth, spread, at_beam | exact, 0)
 
