@@ -11,11 +11,10 @@ import numpy as np
 from services.localization.lidar2d import se2
 from services.localization.lidar2d.loops import DriftModel, Place, close_narrow, close_wide, confirmed
 from services.localization.lidar2d.nodes import Constraint, Keynode, TableCache, edges_of
-from services.localization.lidar2d.pose_graph import Edges, GraphSolution, optimise
+from services.localization.lidar2d.pose_graph import Edges, optimise
 from services.localization.lidar2d.refinement import refine_submaps
 from services.localization.lidar2d.segments import link_segment
 from services.localization.lidar2d.settings import LidarSlamSettings
-from services.localization.lidar2d.slips import slipped_nodes, weakened
 from services.localization.lidar2d.surfel_map import FrozenMap
 
 REJECT_CHI2 = 1e5  # a loop this far off after optimisation is forgotten; less, and it may be right later
@@ -85,7 +84,6 @@ def run_job(snapshot: Snapshot, refine_rounds: int = 0) -> JobResult:
     constraints += found
     fixed = [submap_row[i] for i in sorted(snapshot.fixed) if i in submap_row] or [0]
     solution = optimise(T_s, T_n, edges_of(constraints, submap_row, node_row), fixed)
-    constraints, solution = _heal_slips(snapshot, constraints, solution, fixed)
     drawn: dict[int, FrozenMap] = {}
     for _ in range(refine_rounds):
         drawn, constraints = refine_submaps(
@@ -114,26 +112,6 @@ def run_job(snapshot: Snapshot, refine_rounds: int = 0) -> JobResult:
         snapshot.unlinked_from is None or link is not None,
         candidate,
     )
-
-
-def _heal_slips(
-    snapshot: Snapshot, constraints: list[Constraint], solution: GraphSolution, fixed: list[int]
-) -> tuple[list[Constraint], GraphSolution]:
-    """Optimise again without what slipped keynodes claimed about their own submaps."""
-    submap_row = {s: i for i, s in enumerate(snapshot.submap_ids)}
-    node_row = {n: i for i, n in enumerate(snapshot.node_ids)}
-    order = np.argsort([node_row[c.node] for c in constraints], kind="stable")
-    chi2 = np.empty(len(constraints))
-    chi2[order] = solution.chi2
-    slipped = slipped_nodes(constraints, chi2, dict(zip(snapshot.submap_ids, solution.T_map_submap)))
-    if not slipped:
-        return constraints, solution
-    constraints = weakened(constraints, slipped)
-    T_n = solution.T_map_node.copy()
-    for node, T in slipped.items():
-        T_n[node_row[node]] = T
-    edges = edges_of(constraints, submap_row, node_row)
-    return constraints, optimise(solution.T_map_submap, T_n, edges, fixed)
 
 
 def _without_outliers(

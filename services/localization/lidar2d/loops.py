@@ -20,7 +20,7 @@ from services.localization.lidar2d.nodes import (
     edge_information,
     merged_features,
 )
-from services.localization.lidar2d.observability import without_slip
+from services.localization.lidar2d.observability import held_along, without_slip
 from services.localization.lidar2d.pose_graph import Edges
 from services.localization.lidar2d.settings import LidarSlamSettings
 from services.localization.lidar2d.surfel_map import FrozenMap
@@ -103,9 +103,8 @@ def close_narrow(
             other = refine(features, node.scan.origin, T_start, tables, settings)
             if other.share * other.known > best.share * best.known + 0.02:
                 best = other
-    return _accepted(
-        node, place, without_slip(features, node.scan.origin, best, tables, settings).match, settings
-    )
+    seen = without_slip(features, node.scan.origin, best, tables, settings)
+    return _accepted(node, place, held_along(seen, place.T_submap_node), settings)
 
 
 def close_wide(

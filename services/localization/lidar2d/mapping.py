@@ -11,6 +11,7 @@ import numpy as np
 from services.localization.lidar2d import se2
 from services.localization.lidar2d.backend import BackEnd
 from services.localization.lidar2d.frontend import LocalMap
+from services.localization.lidar2d.matching import Match
 from services.localization.lidar2d.movers import contradicts_free_space, grow_along_beams
 from services.localization.lidar2d.nodes import (
     Constraint,
@@ -77,12 +78,7 @@ class LocalMapper:
         return moving
 
     def insert(
-        self,
-        stamp_ns: int,
-        scan: PreparedScan,
-        T_odom_body: np.ndarray,
-        moving: np.ndarray,
-        information: np.ndarray,
+        self, stamp_ns: int, scan: PreparedScan, T_odom_body: np.ndarray, moving: np.ndarray, match: Match
     ) -> bool:
         """Put the scan into the active submaps if it adds anything (motion filter)."""
         if self._active and not self._is_key(stamp_ns, T_odom_body):
@@ -96,7 +92,9 @@ class LocalMapper:
                 _Active(self.back.start_submap(T_odom_body), LocalMap(T_odom_body, SurfelMap(s)))
             )
         node = Keynode(self.back.next_node_id, stamp_ns, T_odom_body, KeyScan.of(scan, moving))
-        matched = edge_information(information, s.edge_sigma_m, s.edge_sigma_rad)
+        # Scans in a row slip together if they slip: in their own submap they stay together.
+        rigid = match.information if match.rigid is None else match.rigid
+        matched = edge_information(rigid, s.edge_sigma_m, s.edge_sigma_rad)
         edges = []
         for active in self._active:
             active.submap.frozen = None  # what was frozen for a last optimisation goes on growing
@@ -109,7 +107,7 @@ class LocalMapper:
                 ~moving,
                 ~moving,
             )
-            info = matched if active is self._active[0] else link_information(information, s)
+            info = matched if active is self._active[0] else link_information(match.information, s)
             edges.append(Constraint(active.submap.id, node.id, T, info, False))
         self.back.add_keynode(node, edges)
         self.last_key = node

@@ -26,6 +26,7 @@ class Match:
     share: float  # returns on known surfaces / returns in known space
     known: float  # returns in known space / all returns
     residual_m: float  # robust RMS distance to the surfaces
+    rigid: np.ndarray | None = None  # the information before anything was taken from it, see observability
 
 
 @njit(nogil=True, cache=True, error_model="numpy")

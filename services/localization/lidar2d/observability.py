@@ -101,4 +101,17 @@ def without_slip(
     v = np.array([direction[0], direction[1], 0.0])
     along = match.information @ v
     reduced = match.information - (1.0 - trust**2) * np.outer(along, along) / max(float(v @ along), 1e-9)
-    return Observed(dataclasses.replace(match, information=reduced), trust, direction)
+    return Observed(
+        dataclasses.replace(match, information=reduced, rigid=match.information), trust, direction
+    )
+
+
+def held_along(observed: Observed, T_guess: np.ndarray) -> Match:
+    """The match, except that it stays at the guess along a direction it knows nothing about."""
+    match, v = observed.match, observed.direction
+    if observed.trust >= 1.0:
+        return match
+    back = (1.0 - observed.trust**2) * float((T_guess - match.T_map_body)[:2] @ v)
+    T = match.T_map_body.copy()
+    T[:2] += back * v
+    return dataclasses.replace(match, T_map_body=T)

@@ -19,7 +19,7 @@ import scipy.sparse.linalg
 from services.localization.lidar2d.graph_kernels import cholesky_solve, edge_pairs, reduce_nodes, substitute
 
 DENSE_SUBMAPS = 250  # beyond this the reduced system is solved as a sparse one
-INNER_SCALE2 = 1e4  # poses in their own submap are hardly doubted here; see slips.py for those that slipped
+INNER_SCALE2 = 1e4  # poses in their own submap are hardly doubted
 SHRINK = 5.0  # the squared scale of the loop edges falls by this factor per iteration until the final one
 
 

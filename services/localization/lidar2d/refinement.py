@@ -7,7 +7,7 @@ import numpy as np
 from services.localization.lidar2d import se2
 from services.localization.lidar2d.matching import refine
 from services.localization.lidar2d.nodes import Constraint, Keynode, edge_information
-from services.localization.lidar2d.observability import without_slip
+from services.localization.lidar2d.observability import held_along, without_slip
 from services.localization.lidar2d.settings import LidarSlamSettings
 from services.localization.lidar2d.surfel_map import FrozenMap, MatchTables, SurfelMap, freeze
 
@@ -79,8 +79,9 @@ def _measure(
     moved = np.hypot(*(match.T_map_body[:2] - guess[:2]))
     if match.share < settings.loop_share or match.known < settings.loop_known or moved > 0.3:
         return constraint
-    match = without_slip(features, node.scan.origin, match, tables, settings).match
-    information = edge_information(match.information, settings.edge_sigma_m, settings.edge_sigma_rad)
+    match = held_along(without_slip(features, node.scan.origin, match, tables, settings), guess)
+    known = match.information if constraint.loop or match.rigid is None else match.rigid
+    information = edge_information(known, settings.edge_sigma_m, settings.edge_sigma_rad)
     if not constraint.loop:
         information /= settings.inner_facts
     return Constraint(constraint.submap, constraint.node, match.T_map_body, information, constraint.loop)

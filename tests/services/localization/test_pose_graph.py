@@ -119,31 +119,3 @@ def test_edge_information_knows_its_limits():
     blind = np.linalg.inv(edge_information(np.zeros((3, 3)), 0.01, 0.002))
     assert np.all(np.isfinite(blind))
     assert np.sqrt(blind[0, 0]) > 1.0
-
-
-def test_slipped_keynodes_are_those_that_others_agree_on():
-    from services.localization.lidar2d.nodes import Constraint
-    from services.localization.lidar2d.slips import slipped_nodes, weakened
-
-    info = np.eye(3)
-    T_map_submap = {0: np.zeros(3), 1: np.array([1.0, 0, 0]), 2: np.array([0, 1.0, 0])}
-
-    def loop(submap, node, T_map_node):
-        z = se2.between(T_map_submap[submap], np.array(T_map_node))
-        return Constraint(submap, node, z, info, True)
-
-    constraints = [
-        Constraint(0, 7, np.zeros(3), info, False),
-        loop(1, 7, [0.8, 0, 0]),
-        loop(2, 7, [0.82, 0.02, 0.01]),
-        loop(1, 8, [0.8, 0, 0]),  # alone
-        loop(1, 9, [0.8, 0, 0]),  # these two contradict each other
-        loop(2, 9, [-0.8, 0, 0]),
-    ]
-    chi2 = np.array([1.0, 900, 900, 900, 900, 900])
-    slipped = slipped_nodes(constraints, chi2, T_map_submap)
-    assert list(slipped) == [7]
-    assert np.allclose(slipped[7], [0.81, 0.01, 0.005], atol=1e-3)
-    after = weakened(constraints, slipped)
-    assert after[0].information[0, 0] < 0.01
-    assert after[1].information[0, 0] == 1.0
