@@ -42,7 +42,7 @@ def test_the_house_comes_out_metric(shared_dir):
         if file.exists():
             truth = cv2.imread(str(file), cv2.IMREAD_UNCHANGED) / 1000.0
             known = (truth > 0) & np.isfinite(message.depth_m)
-            assert known.sum() > 0.95 * (truth > 0).sum()
+            assert known.sum() > 0.85 * (truth > 0).sum()  # what is doubtful gets no answer
             error = np.abs(message.depth_m - truth)[known]
             absrel.append(np.mean(error / truth[known]))
             inside.append(np.mean(error < 3.0 * message.sigma_m[known]))
