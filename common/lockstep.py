@@ -100,8 +100,9 @@ class Lockstep:
             self._step(consumer, time_ns)
 
     def _step(self, seat: _Seat, now_ns: int) -> None:
-        """Lets a node handle what it can at this time."""
-        while now_ns >= seat.busy_until_ns and (letter := seat.mailbox.pop()) is not None:
+        """Lets a node handle what it can at this time. One that has ended hears no more: what is still fed
+        back to it concerns what it has said already."""
+        while not seat.ended and now_ns >= seat.busy_until_ns and (letter := seat.mailbox.pop()) is not None:
             for name, result in seat.jobs.before_message(letter.topic):
                 self._emit(seat, seat.node.handle_job(name, result), now_ns)
             seat.busy_until_ns = now_ns + _ns(seat.node.config.step_cost_s)

@@ -1,4 +1,5 @@
-"""Where a node's inputs wait: a slot per `latest` input, merged queues for the `every` ones.
+"""Where a node's inputs wait: a slot per `latest` input, merged queues for the `every` ones; an `every`
+input that is fed back waits in a queue of its own.
 
 One mailbox belongs to one node and is not thread-safe by itself; the live runner holds a lock around
 it. Whatever is overtaken, lost, stale or undecodable is counted here, per input.
@@ -6,6 +7,7 @@ it. Whatever is overtaken, lost, stale or undecodable is counted here, per input
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -55,10 +57,12 @@ class Mailbox:
         self._deliveries = {i.topic: i.effective_delivery for i in _inputs(node)}
         self._merger = StampMerger(merged_topics(node), clock_ns=clock_ns)
         self._slots: dict[str, Letter] = {}
+        self._fed_back = frozenset(i.topic for i in _inputs(node) if i.feedback)
+        self._answers: deque[Letter] = deque()  # of `every` inputs that are fed back
         self.counts = {name: InputCount() for name in self._deliveries}
 
     def __len__(self) -> int:
-        return len(self._merger) + len(self._slots)
+        return len(self._merger) + len(self._slots) + len(self._answers)
 
     def put(self, letter: Letter) -> bool:
         """Takes a letter, unless its epoch has been taken over; True if it was taken."""
@@ -68,7 +72,11 @@ class Mailbox:
             return False
         if letter.topic in self._slots:
             count.dropped += 1
-        if every:
+        if every and letter.topic in self._fed_back:
+            if len(self._answers) >= MAX_QUEUED:
+                self.counts[self._answers.popleft().topic].dropped += 1
+            self._answers.append(letter)
+        elif every:
             self._make_room(letter, count)
             self._merger.put(letter.topic, letter.message.stamp_ns, letter)
             if count.ended_by is not None:  # a straggler: its producer has ended all the same
@@ -118,14 +126,19 @@ class Mailbox:
         count.ended_by = instance
         if self._deliveries[topic] == "every":
             count.lost += max(sent - self.next_sequence(topic, instance), 0)
-            self._merger.end(topic)
+            if topic not in self._fed_back:
+                self._merger.end(topic)
 
     def next_sequence(self, topic: str, instance: str) -> int:
         """The sequence number that `topic` should bring next from `instance`; 0 before the first."""
         return self.counts[topic].expected.get(instance, 0)
 
     def pop(self) -> Letter | None:
-        """The letter to handle next: what is certain of the `every` inputs, then the oldest of the rest."""
+        """The letter to handle next: answers, what is certain of the `every` inputs, the oldest of the rest."""
+        if self._answers:
+            letter = self._answers.popleft()
+            self.counts[letter.topic].received += 1
+            return letter
         merged = self._merger.pop()
         if merged is not None:
             letter = merged[1]
@@ -141,8 +154,9 @@ class Mailbox:
 
     @property
     def ended(self) -> bool:
-        """Every input has ended, at least one by its producer's word, and everything was handed out."""
-        enders = [count.ended_by for count in self.counts.values()]
+        """Every input has ended, at least one by its producer's word, and everything was handed out. Inputs
+        that are fed back are not asked: they end after this node."""
+        enders = [count.ended_by for name, count in self.counts.items() if name not in self._fed_back]
         return not len(self) and all(enders) and any(e != NOBODY for e in enders)
 
     def health(self) -> tuple[InputHealth, ...]:

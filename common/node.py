@@ -28,10 +28,15 @@ from common.topics import ROW_NUMBER, Delivery, Topic, topic
 
 @dataclass(frozen=True)
 class Input:
-    """A subscription: a topic, and a delivery other than its row's default."""
+    """A subscription: a topic, and a delivery other than its row's default.
+
+    `feedback` marks what depends on this node's own output (an acknowledgement): it is taken as it comes,
+    not merged by stamp, and the node ends without waiting for its end: both would wait for themselves.
+    """
 
     topic: str
     delivery: Delivery | None = None
+    feedback: bool = False
 
     @property
     def row(self) -> Topic:
@@ -171,5 +176,5 @@ class Node:
 
 def merged_topics(node: type[Node]) -> tuple[str, ...]:
     """The inputs that are merged by stamp before the node sees them: its `every` ones, in row order."""
-    names = [i.topic for i in node.inputs if i.effective_delivery == "every"]
+    names = [i.topic for i in node.inputs if i.effective_delivery == "every" and not i.feedback]
     return tuple(sorted(names, key=ROW_NUMBER.__getitem__))

@@ -54,6 +54,12 @@ _ROWS = (
     Topic("depth/estimate",          m.DepthEstimate, ("depth",),                5, "latest"),
     Topic("fusion/depth",            m.FusedDepth,    ("fusion",),               5, "latest"),
     Topic("fusion/cloud",            m.Cloud,         ("fusion",),               1, "latest"),
+    Topic("keyframes/frame",         m.Keyframe,      ("keyframes",),            2, "every", 60, True),
+    Topic("keyframes/ack",           m.KeyframeAck,   ("mapping",),              2, "every", 60),
+    Topic("mapping/chunk",           m.MapChunk,      ("mapping",),              2, "every", 60),
+    Topic("mapping/poses",           m.MapPoses,      ("mapping",),              0, "latched", 1),
+    Topic("mapping/preview",         m.MapPreview,    ("mapping",),              2, "latest"),
+    Topic("mapping/status",          m.MapStatus,     ("mapping",),              2, "latched", 1),
     Topic("tick",                    m.Tick,          ("replay",),               1, "every", 60),
 )  # fmt: skip
 

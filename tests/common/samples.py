@@ -16,7 +16,13 @@ from common.messages import (
     Health,
     Image,
     InputHealth,
+    Keyframe,
+    KeyframeAck,
     LidarModel,
+    MapChunk,
+    MapPoses,
+    MapPreview,
+    MapStatus,
     Message,
     MovingBeams,
     Odometry,
@@ -78,6 +84,24 @@ def sample_messages() -> list[Message]:
         ),
         Cloud(
             stamp_ns=25, points_odom_m=np.ones((2, 3), np.float32), colours=np.full((2, 3), 9, np.uint8),
+        ),
+        Keyframe(
+            stamp_ns=26, id=26, encoding="jpeg", picture=np.arange(5, dtype=np.uint8), camera=camera, anchor_id=7,
+            T_anchor_body=T[0], T_map_anchor=T[1], optimisation=3, depth_png=np.arange(3, dtype=np.uint8),
+            sigma_png=np.arange(4, dtype=np.uint8), mask_png=np.arange(2, dtype=np.uint8),
+            beams=np.array([[320.0, 240.0, 2.0, 0.01]], np.float32), why="moved",
+        ),
+        KeyframeAck(stamp_ns=26, id=26, status="no pixel has a depth"),
+        MapChunk(
+            stamp_ns=27, anchor_id=7, revision=4, T_map_anchor=T[1], count=2, packed=np.arange(9, dtype=np.uint8),
+        ),
+        MapPoses(
+            stamp_ns=28, keyframe_ids=np.array([26, 30]), stamps_ns=np.array([26, 30]), T_map_body=T,
+        ),
+        MapPreview(stamp_ns=26, keyframe_id=26, render=np.arange(6, dtype=np.uint8), T_map_camera=T[0]),
+        MapStatus(
+            stamp_ns=26, status="the mask leaves no pixel to use", keyframes=3, refused=1, gaussians=9000, steps=40,
+            loss=0.1, foretold_share=0.5, foretold_psnr_db=19.0, psnr_db=27.0, depth_error_m=0.02,
         ),
         Tick(stamp_ns=20, count=5),
         Health(

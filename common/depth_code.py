@@ -1,0 +1,70 @@
+"""Depth, its error bar and masks as PNGs: how a keyframe carries them."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+_SIGMA_M = 1e-3  # of code 1
+_PER_OCTAVE = 16  # codes for each doubling of sigma: 2.2 % at most are lost
+_FAST = (cv2.IMWRITE_PNG_COMPRESSION, 1)
+
+
+def depth_to_png(depth_m: np.ndarray) -> np.ndarray:
+    """uint8 [B]: PNG of uint16 millimetres of float32 [H, W]; NaN and what does not fit become 0, unknown."""
+    with np.errstate(invalid="ignore"):
+        fits = (depth_m > 0.0) & (depth_m < 65.0)
+    mm = np.where(fits, np.nan_to_num(depth_m) * 1e3 + 0.5, 0.0).astype(np.uint16)
+    return cv2.imencode(".png", mm, _FAST)[1].ravel()
+
+
+def depth_from_png(png: np.ndarray) -> np.ndarray:
+    """float32 [H, W] metres, NaN = unknown.
+
+    Raises:
+        ValueError: no PNG of 16 bits and one channel.
+    """
+    mm = _decode(png, np.uint16, "depth")
+    return np.where(mm > 0, mm * np.float32(1e-3), np.float32(np.nan)).astype(np.float32)
+
+
+def sigma_to_png(sigma_m: np.ndarray) -> np.ndarray:
+    """uint8 [B]: PNG of logarithmic codes of float32 [H, W], from 1 mm to 62 m; NaN becomes 0."""
+    with np.errstate(invalid="ignore"):
+        known = sigma_m > 0.0
+    octaves = np.log2(np.where(known, sigma_m, _SIGMA_M) / _SIGMA_M)
+    code = np.where(known, np.clip(np.round(octaves * _PER_OCTAVE) + 1.0, 1.0, 255.0), 0.0)
+    return cv2.imencode(".png", code.astype(np.uint8), _FAST)[1].ravel()
+
+
+def sigma_from_png(png: np.ndarray) -> np.ndarray:
+    """float32 [H, W] metres, NaN = unknown.
+
+    Raises:
+        ValueError: no PNG of 8 bits and one channel.
+    """
+    code = _decode(png, np.uint8, "sigma")
+    sigma = _SIGMA_M * np.exp2((code.astype(np.float32) - 1.0) / _PER_OCTAVE)
+    return np.where(code > 0, sigma, np.float32(np.nan)).astype(np.float32)
+
+
+def mask_to_png(mask: np.ndarray) -> np.ndarray:
+    """uint8 [B]: PNG of bool [H, W]."""
+    return cv2.imencode(".png", mask.astype(np.uint8) * 255, _FAST)[1].ravel()
+
+
+def mask_from_png(png: np.ndarray) -> np.ndarray:
+    """bool [H, W].
+
+    Raises:
+        ValueError: no PNG of 8 bits and one channel.
+    """
+    return _decode(png, np.uint8, "mask") > 127
+
+
+def _decode(png: np.ndarray, dtype: type, what: str) -> np.ndarray:
+    image = cv2.imdecode(png, cv2.IMREAD_UNCHANGED) if len(png) else None
+    if image is None or image.dtype != dtype or image.ndim != 2:
+        found = "nothing" if image is None else f"{image.dtype} {list(image.shape)}"
+        raise ValueError(f"{what}: expected a PNG of {np.dtype(dtype).name} [H, W], found {found}")
+    return image
