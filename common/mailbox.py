@@ -134,7 +134,7 @@ class Mailbox:
         return self.counts[topic].expected.get(instance, 0)
 
     def pop(self) -> Letter | None:
-        """The letter to handle next: answers, what is certain of the `every` inputs, the oldest of the rest."""
+        """The letter to handle next: answers, what is certain of `every` inputs, the oldest of the rest."""
         if self._answers:
             letter = self._answers.popleft()
             self.counts[letter.topic].received += 1

@@ -12,6 +12,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
+from common.map_messages import Keyframe, KeyframeAck, MapChunk, MapPoses, MapPreview, MapStatus
 from common.schema import (
     Array,
     Count,
@@ -25,53 +26,9 @@ from common.schema import (
     Transform,
     Transforms,
 )  # fmt: skip
+from common.sensor_models import CameraModel, LidarModel
 
 # --- sensors -----------------------------------------------------------------------------------
-
-
-class CameraModel(Part):
-    """A pinhole camera with the distortion of OpenCV; K belongs to this image size.
-
-    `distortion_model` follows ROS: plumb_bob (k1 k2 p1 p2 k3), rational_polynomial (8),
-    equidistant (4, fisheye), none.
-    """
-
-    width_px: Annotated[int, Field(gt=0, le=16384)]
-    height_px: Annotated[int, Field(gt=0, le=16384)]
-    fx_px: Positive
-    fy_px: Positive
-    cx_px: Finite
-    cy_px: Finite
-    distortion_model: Literal["none", "plumb_bob", "rational_polynomial", "equidistant"] = "none"
-    distortion: Annotated[tuple[Finite, ...], Field(max_length=14)] = ()
-    T_body_camera: Transform
-
-    @model_validator(mode="after")
-    def _k_fits_the_image(self) -> CameraModel:
-        for axis, centre, size in (("cx", self.cx_px, self.width_px), ("cy", self.cy_px, self.height_px)):
-            if not 0.0 < centre < size:
-                raise ValueError(
-                    f"{axis} = {centre:g} px lies outside the {self.width_px}x{self.height_px} image: "
-                    "K belongs to another image size"
-                )
-        counts = {"none": (0,), "plumb_bob": (0, 4, 5), "rational_polynomial": (8,), "equidistant": (4,)}
-        if len(self.distortion) not in counts[self.distortion_model]:
-            raise ValueError(
-                f"distortion model {self.distortion_model} takes {counts[self.distortion_model]} "
-                f"coefficients, got {len(self.distortion)}"
-            )
-        return self
-
-    @property
-    def K(self) -> np.ndarray:
-        """float64 [3, 3]."""
-        return np.array([[self.fx_px, 0.0, self.cx_px], [0.0, self.fy_px, self.cy_px], [0.0, 0.0, 1.0]])
-
-
-class LidarModel(Part):
-    """Where the planar lidar sits."""
-
-    T_body_lidar: Transform
 
 
 class Rig(Message):
@@ -219,89 +176,6 @@ class Cloud(Message):
 
     points_odom_m: Annotated[np.ndarray, Array("float32", "N", 3, finite=True)]
     colours: Annotated[np.ndarray, Array("uint8", "N", 3)]
-
-
-# --- keyframes and the map ---------------------------------------------------------------------
-
-
-class Keyframe(Message):
-    """A picture that is to become part of the map, with all that the map needs of it: nothing else of this
-    moment has to survive an outage. The same `id` always means the same content.
-
-    T_map_body = T_map_anchor @ T_anchor_body; both of this `optimisation`. A later one moves the anchor only.
-    Depth and mask belong to the undistorted picture (a pinhole with the camera's K). Depths are PNGs of
-    uint16 millimetres, 0 = unknown (common.depth_code); the mask is a PNG, 0 = on something that moves.
-    """
-
-    id: Count
-    encoding: Literal["jpeg", "png"]
-    picture: Annotated[np.ndarray, Array("uint8", "P")]
-    camera: CameraModel
-    anchor_id: Annotated[int, Field(ge=-1, lt=2**63)]  # a lidar submap; -1 = the odom frame's origin
-    T_anchor_body: Transform
-    T_map_anchor: Transform
-    optimisation: Count = 0
-    depth_png: Annotated[np.ndarray, Array("uint8", "D")]  # optical z
-    sigma_png: Annotated[np.ndarray, Array("uint8", "S")]  # standard deviation
-    mask_png: Annotated[np.ndarray, Array("uint8", "M")] = Field(
-        default_factory=lambda: np.zeros(0, np.uint8)
-    )
-    # Returns of the moment, brought to the picture's time: u, v (px, undistorted), z, sigma (m).
-    beams: Annotated[np.ndarray, Array("float32", "N", 4, finite=True)] = Field(
-        default_factory=lambda: np.zeros((0, 4), np.float32)
-    )
-    why: Text = ""  # it was chosen
-
-
-class KeyframeAck(Message):
-    """The mapper has dealt with a keyframe: it need not be sent again. `status` is "ok" or why it was refused."""
-
-    id: Count
-    status: Text = "ok"
-
-
-class MapChunk(Message):
-    """The Gaussians bound to one anchor, in the anchor's frame, packed by common.splats. A newer `revision`
-    replaces all of the older one; none left (`count` 0) takes the chunk away."""
-
-    anchor_id: Annotated[int, Field(ge=-1, lt=2**63)]
-    revision: Count
-    T_map_anchor: Transform
-    count: Count
-    packed: Annotated[np.ndarray, Array("uint8", "B")]
-
-
-class MapPoses(Message):
-    """Where the map's keyframes are, refined: T_map_body = T_map_anchor @ T_anchor_body @ (what the mapper
-    found, brought to the body)."""
-
-    keyframe_ids: Annotated[np.ndarray, Array("int64", "N")]
-    stamps_ns: Annotated[np.ndarray, Array("int64", "N")]
-    T_map_body: Transforms
-
-
-class MapPreview(Message):
-    """The map as seen from its newest keyframe, as a JPEG of the picture's own shape."""
-
-    keyframe_id: Count
-    render: Annotated[np.ndarray, Array("uint8", "B")]
-    T_map_camera: Transform
-
-
-class MapStatus(Message):
-    """How the map is doing after a keyframe. Errors are of the newest keyframe's own view: of what the map
-    foretold before it took the picture in, where it knew anything there, and after."""
-
-    status: Text = "ok"  # or why the newest keyframe was refused
-    keyframes: Count = 0
-    refused: Count = 0
-    gaussians: Count = 0
-    steps: Count = 0
-    loss: NonNegative = 0.0
-    foretold_share: NonNegative = 0.0  # of the pixels, that the map covered before
-    foretold_psnr_db: float = float("nan")
-    psnr_db: float = float("nan")
-    depth_error_m: float = float("nan")  # median |rendered - fused|
 
 
 # --- the system itself -------------------------------------------------------------------------

@@ -39,8 +39,8 @@ def pack(params: np.ndarray) -> np.ndarray:
     opacity = _to_byte(1.0 / (1.0 + np.exp(-np.clip(params[OPACITY], -_LOGIT, _LOGIT))))
     colour = _to_byte(params[COLOUR:])
     # Bytes of one kind side by side, high ones apart from low ones: they repeat, and compress.
-    planes = [(grid >> 8).astype(np.uint8), (grid & 255).astype(np.uint8), scale, turned.view(np.uint8), opacity[None],
-              colour]  # fmt: skip
+    high_byte, low_byte = (grid >> 8).astype(np.uint8), (grid & 255).astype(np.uint8)
+    planes = [high_byte, low_byte, scale, turned.view(np.uint8), opacity[None], colour]
     body = zlib.compress(np.concatenate(planes).tobytes(), 1)
     return np.frombuffer(_HEAD.pack(_MAGIC, count, *low, *high) + body, np.uint8)
 

@@ -19,7 +19,7 @@ from services.mapping.dataset import Recording, load, read_depth_png
 from services.mapping.export import read_ply_points, write_gaussian_ply
 from services.mapping.keyframe import Keyframe
 from services.mapping.mapper import Mapper
-from services.mapping.priors import find_prior
+from services.mapping.priors import Prior, find_prior
 from services.mapping.scores import ViewScore, f_score, fused_surface, render_rgb_depth, score_view
 from services.mapping.settings import MapperSettings
 from services.mapping.warm import warm
@@ -67,18 +67,23 @@ def raster_camera(camera: Pinhole) -> RasterCamera:
 
 
 def run_bench(
-    path: Path, bench: MapBench, say: Say = lambda text: None, out: Path | None = None
+    path: Path,
+    bench: MapBench,
+    say: Say = lambda text: None,
+    out: Path | None = None,
+    prior: Prior | None = None,
 ) -> dict[str, Any]:
     """Runs the mapper over a recording and gives the figures of the design's section 12.
 
     `wall_s` and `cpu_s` are the mapper's and the prior's: pictures are decoded, views scored and kernels
     compiled outside. With `out`, pictures of held-out views beside the truth and the map are written there.
+    `prior` is used in place of the one that `bench.prior` names.
     """
     warm()
     recording = load(path)
     mapper = Mapper(bench.settings, seed=bench.seed, threads=bench.threads)
     clock = _Clock()
-    keyframes, refused = _drive(recording, mapper, bench, clock, say)
+    keyframes, refused = _drive(recording, mapper, bench, prior or find_prior(bench.prior), clock, say)
     online_clock, online_steps = replace(clock), mapper.steps
     online = score_map(recording, mapper, say)
     _refine(mapper, bench, clock)
@@ -96,9 +101,10 @@ def run_bench(
     }  # fmt: skip
 
 
-def _drive(recording: Recording, mapper: Mapper, bench: MapBench, clock: _Clock, say: Say) -> tuple[int, int]:
+def _drive(
+    recording: Recording, mapper: Mapper, bench: MapBench, prior: Prior, clock: _Clock, say: Say
+) -> tuple[int, int]:
     """Every keyframe with its fixed work, as they come; gives how many were used and refused."""
-    prior = find_prior(bench.prior)
     used, refused, last = 0, 0, None
     for index, shot in enumerate(recording.shots):
         if index % HELD_OUT_EVERY == HELD_OUT_AT or not _moved(last, shot.T_map_camera, bench):

@@ -84,7 +84,12 @@ def test_an_answer_after_the_end_harms_nothing():
 
 def test_live_a_loop_of_two_nodes_ends(tmp_path, free_endpoint):
     nodes = [Asks(Asks.Config()), Answers(Answers.Config())]
-    settings = dict(robot="test", endpoints=(free_endpoint,), run_dir=tmp_path, exit_when_drained=True)
+    settings = {
+        "robot": "test",
+        "endpoints": (free_endpoint,),
+        "run_dir": tmp_path,
+        "exit_when_drained": True,
+    }
     with open_router((free_endpoint,)):
         lives = [Live(node, LiveSettings(**settings)) for node in nodes]
         everyone = frozenset({"keyframes", "mapping"})

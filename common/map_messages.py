@@ -1,0 +1,91 @@
+"""Messages between keyframes, mapper and viewers; `common.messages` has all of them."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field
+
+from common.schema import Array, Count, Message, NonNegative, Text, Transform, Transforms
+from common.sensor_models import CameraModel
+
+
+class Keyframe(Message):
+    """A picture that is to become part of the map, with all that the map needs of it: nothing else of this
+    moment has to survive an outage. The same `id` always means the same content.
+
+    T_map_body = T_map_anchor @ T_anchor_body; both of this `optimisation`. A later one moves the anchor only.
+    Depth and mask belong to the undistorted picture (a pinhole with the camera's K). Depths are PNGs of
+    uint16 millimetres, 0 = unknown (common.depth_code); the mask is a PNG, 0 = on something that moves.
+    """
+
+    id: Count
+    encoding: Literal["jpeg", "png"]
+    picture: Annotated[np.ndarray, Array("uint8", "P")]
+    camera: CameraModel
+    anchor_id: Annotated[int, Field(ge=-1, lt=2**63)]  # a lidar submap; -1 = the odom frame's origin
+    T_anchor_body: Transform
+    T_map_anchor: Transform
+    optimisation: Count = 0
+    depth_png: Annotated[np.ndarray, Array("uint8", "D")]  # optical z
+    sigma_png: Annotated[np.ndarray, Array("uint8", "S")]  # standard deviation
+    mask_png: Annotated[np.ndarray, Array("uint8", "M")] = Field(
+        default_factory=lambda: np.zeros(0, np.uint8)
+    )
+    # Returns of the moment, brought to the picture's time: u, v (px, undistorted), z, sigma (m).
+    beams: Annotated[np.ndarray, Array("float32", "N", 4, finite=True)] = Field(
+        default_factory=lambda: np.zeros((0, 4), np.float32)
+    )
+    why: Text = ""  # it was chosen
+
+
+class KeyframeAck(Message):
+    """The mapper has dealt with a keyframe, which need not be sent again: "ok", or why it was refused."""
+
+    id: Count
+    status: Text = "ok"
+
+
+class MapChunk(Message):
+    """The Gaussians bound to one anchor, in the anchor's frame, packed by common.splats. A newer `revision`
+    replaces all of the older one; none left (`count` 0) takes the chunk away."""
+
+    anchor_id: Annotated[int, Field(ge=-1, lt=2**63)]
+    revision: Count
+    T_map_anchor: Transform
+    count: Count
+    packed: Annotated[np.ndarray, Array("uint8", "B")]
+
+
+class MapPoses(Message):
+    """Where the map's keyframes are, refined: T_map_body = T_map_anchor @ T_anchor_body @ (what the mapper
+    found, brought to the body)."""
+
+    keyframe_ids: Annotated[np.ndarray, Array("int64", "N")]
+    stamps_ns: Annotated[np.ndarray, Array("int64", "N")]
+    T_map_body: Transforms
+
+
+class MapPreview(Message):
+    """The map as seen from its newest keyframe, as a JPEG of the picture's own shape."""
+
+    keyframe_id: Count
+    render: Annotated[np.ndarray, Array("uint8", "B")]
+    T_map_camera: Transform
+
+
+class MapStatus(Message):
+    """How the map is doing after a keyframe. Errors are of the newest keyframe's own view: of what the map
+    foretold before it took the picture in, where it knew anything there, and after."""
+
+    status: Text = "ok"  # or why the newest keyframe was refused
+    keyframes: Count = 0
+    refused: Count = 0
+    gaussians: Count = 0
+    steps: Count = 0
+    loss: NonNegative = 0.0
+    foretold_share: NonNegative = 0.0  # of the pixels, that the map covered before
+    foretold_psnr_db: float = float("nan")
+    psnr_db: float = float("nan")
+    depth_error_m: float = float("nan")  # median |rendered - fused|
