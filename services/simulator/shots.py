@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import multiprocessing
-import os
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -168,22 +166,6 @@ def render_all(
     return paths
 
 
-@contextmanager
-def _single_threaded() -> Iterator[None]:
-    """Children started in here have BLAS without threads: they would fight for the cores we share out."""
-    names = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
-    before = {name: os.environ.get(name) for name in names}
-    os.environ.update(dict.fromkeys(names, "1"))
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
-
-
 def _map(shoot: Shoot, tasks: list[tuple[float, str]], jobs: int) -> Iterator[None]:
     if jobs <= 1 or len(tasks) < 8:
         if tasks:
@@ -192,5 +174,5 @@ def _map(shoot: Shoot, tasks: list[tuple[float, str]], jobs: int) -> Iterator[No
                 yield save_shot(Path(path), *studio.shot(time_s))
         return
     context = multiprocessing.get_context("spawn")
-    with _single_threaded(), context.Pool(min(jobs, len(tasks)), _start_worker, (shoot,)) as pool:
+    with context.Pool(min(jobs, len(tasks)), _start_worker, (shoot,)) as pool:
         yield from pool.imap_unordered(_render, tasks, chunksize=2)

@@ -33,7 +33,8 @@ def _mul(A: np.ndarray, B: np.ndarray, out: np.ndarray, transpose_a: bool) -> No
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _invert(A: np.ndarray, out: np.ndarray) -> None:
+def invert3(A: np.ndarray, out: np.ndarray) -> None:
+    """out <- A^-1 for [3, 3] matrices, by cofactors."""
     c00 = A[1, 1] * A[2, 2] - A[1, 2] * A[2, 1]
     c01 = A[1, 2] * A[2, 0] - A[1, 0] * A[2, 2]
     c02 = A[1, 0] * A[2, 1] - A[1, 1] * A[2, 0]
@@ -45,42 +46,6 @@ def _invert(A: np.ndarray, out: np.ndarray) -> None:
     out[0, 2] = (A[0, 1] * A[1, 2] - A[0, 2] * A[1, 1]) * d
     out[1, 2] = (A[0, 2] * A[1, 0] - A[0, 0] * A[1, 2]) * d
     out[2, 2] = (A[0, 0] * A[1, 1] - A[0, 1] * A[1, 0]) * d
-
-
-@njit(nogil=True, cache=True, error_model="numpy", fastmath=True)
-def cholesky_solve(A: np.ndarray, x: np.ndarray) -> bool:
-    """x <- A^-1 x for symmetric positive definite A [n, n] (destroyed); False if it is not.
-
-    By rows inside the envelope: submaps in time order give a narrow one. Own code, because BLAS starts
-    threads that spin for systems this small.
-    """
-    n = A.shape[0]
-    start = np.empty(n, dtype=np.int64)
-    for i in range(n):
-        k = 0
-        while k < i and A[i, k] == 0.0:
-            k += 1
-        start[i] = k
-        for j in range(k, i):
-            t = A[i, j]
-            for q in range(max(k, start[j]), j):
-                t -= A[i, q] * A[j, q]
-            A[i, j] = t / A[j, j]
-        t = A[i, i]
-        for q in range(k, i):
-            t -= A[i, q] * A[i, q]
-        if not t > 0.0:
-            return False
-        A[i, i] = math.sqrt(t)
-        t = x[i]
-        for q in range(k, i):
-            t -= A[i, q] * x[q]
-        x[i] = t / A[i, i]
-    for i in range(n - 1, -1, -1):
-        x[i] /= A[i, i]
-        for q in range(start[i], i):
-            x[q] -= A[i, q] * x[i]
-    return True
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
@@ -152,7 +117,7 @@ def reduce_nodes(
             continue
         for i in range(3):
             Hnn[i, i] += 1e-6
-        _invert(Hnn, Hnn_inv[n])
+        invert3(Hnn, Hnn_inv[n])
         for k in range(lo, hi):
             _mul(W[k], Hnn_inv[n], t1, False)
             for i in range(3):

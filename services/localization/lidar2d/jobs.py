@@ -17,6 +17,7 @@ from services.localization.lidar2d.segments import link_segment
 from services.localization.lidar2d.settings import LidarSlamSettings
 from services.localization.lidar2d.surfel_map import FrozenMap
 
+ITERATIONS, LAST_ITERATIONS = 10, 16
 REJECT_CHI2 = 1e5  # a loop this far off after optimisation is forgotten; less, and it may be right later
 
 
@@ -83,7 +84,11 @@ def run_job(snapshot: Snapshot, refine_rounds: int = 0) -> JobResult:
         found, tried, still = [] if link is None else [link], [], list(snapshot.pending)
     constraints += found
     fixed = [submap_row[i] for i in sorted(snapshot.fixed) if i in submap_row] or [0]
-    solution = optimise(T_s, T_n, edges_of(constraints, submap_row, node_row), fixed)
+    if found:
+        edges = edges_of(constraints, submap_row, node_row)
+    # While driving the next job goes on where this one ends; the last one has to get there by itself.
+    iterations = LAST_ITERATIONS if refine_rounds else ITERATIONS
+    solution = optimise(T_s, T_n, edges, fixed, iterations=iterations)
     drawn: dict[int, FrozenMap] = {}
     for _ in range(refine_rounds):
         drawn, constraints = refine_submaps(
@@ -97,7 +102,9 @@ def run_job(snapshot: Snapshot, refine_rounds: int = 0) -> JobResult:
         )
         frozen.update(drawn)
         edges = edges_of(constraints, submap_row, node_row)
-        solution = optimise(solution.T_map_submap, solution.T_map_node, edges, fixed)
+        solution = optimise(
+            solution.T_map_submap, solution.T_map_node, edges, fixed, iterations=LAST_ITERATIONS
+        )
     constraints = _without_outliers(constraints, solution.chi2, node_row)
     return JobResult(
         snapshot.number,

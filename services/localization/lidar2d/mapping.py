@@ -88,6 +88,7 @@ class LocalMapper:
             if len(self._active) == 2:
                 done = self._active.pop(0)
                 done.submap.frozen = freeze(done.local.surfels)
+                self._active[0].local.surfels.make_matchable()
             self._active.append(
                 _Active(self.back.start_submap(T_odom_body), LocalMap(T_odom_body, SurfelMap(s)))
             )
@@ -106,6 +107,7 @@ class LocalMapper:
                 se2.transform(T, scan.origin_body[None])[0],
                 ~moving,
                 ~moving,
+                matchable=active is self._active[0],
             )
             info = matched if active is self._active[0] else link_information(match.information, s)
             edges.append(Constraint(active.submap.id, node.id, T, info, False))

@@ -8,9 +8,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
+from numba import njit
 
 from services.localization.lidar2d import se2
 from services.localization.lidar2d.branch_bound import Pyramid, build_pyramid
+from services.localization.lidar2d.graph_kernels import invert3
 from services.localization.lidar2d.pose_graph import Edges
 from services.localization.lidar2d.scan import PreparedScan
 from services.localization.lidar2d.settings import LidarSlamSettings
@@ -134,11 +136,20 @@ def edges_of(constraints: list[Constraint], submap_row: dict[int, int], node_row
     )
 
 
+@njit(nogil=True, cache=True, error_model="numpy")
 def edge_information(match_information: np.ndarray, sigma_m: float, sigma_rad: float) -> np.ndarray:
     """Information of an edge: that of the match, limited by what a match cannot know about itself."""
     # (3 m)^-2 and (0.5 rad)^-2 keep the inverse finite where the scan says nothing.
-    covariance = np.linalg.inv(match_information + np.diag([0.1, 0.1, 4.0]))
-    return np.linalg.inv(covariance + np.diag([sigma_m**2, sigma_m**2, sigma_rad**2]))
+    regular, covariance, information = match_information.copy(), np.empty((3, 3)), np.empty((3, 3))
+    regular[0, 0] += 0.1
+    regular[1, 1] += 0.1
+    regular[2, 2] += 4.0
+    invert3(regular, covariance)
+    covariance[0, 0] += sigma_m**2
+    covariance[1, 1] += sigma_m**2
+    covariance[2, 2] += sigma_rad**2
+    invert3(covariance, information)
+    return information
 
 
 def link_information(match_information: np.ndarray, settings: LidarSlamSettings) -> np.ndarray:

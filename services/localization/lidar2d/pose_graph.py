@@ -13,10 +13,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.linalg
 import scipy.sparse
 import scipy.sparse.linalg
 
-from services.localization.lidar2d.graph_kernels import cholesky_solve, edge_pairs, reduce_nodes, substitute
+from services.localization.lidar2d.graph_kernels import edge_pairs, reduce_nodes, substitute
 
 DENSE_SUBMAPS = 250  # beyond this the reduced system is solved as a sparse one
 INNER_SCALE2 = 1e4  # poses in their own submap are hardly doubted
@@ -126,10 +127,8 @@ def _solve(
         A[row, :, col, :] = blocks
         A = A.reshape(3 * n, 3 * n)
         A[np.arange(3 * n), np.arange(3 * n)] += diagonal
-        x = rhs.ravel().copy()
-        if not cholesky_solve(A, x):
-            raise FloatingPointError("the pose graph's normal equations are not positive definite")
-        return x.reshape(n, 3)
+        factor = scipy.linalg.cho_factor(A, lower=True, overwrite_a=True, check_finite=False)
+        return scipy.linalg.cho_solve(factor, rhs.ravel(), check_finite=False).reshape(n, 3)
     rows = np.repeat(3 * row[:, None] + np.arange(3), 3, axis=1).ravel()
     cols = np.tile(3 * col[:, None] + np.arange(3), (1, 3)).ravel()
     A = scipy.sparse.coo_matrix((blocks.ravel(), (rows, cols)), shape=(3 * n, 3 * n)).tocsc()

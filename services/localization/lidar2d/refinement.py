@@ -27,6 +27,7 @@ def draw_submap(
             se2.transform(T, scan.origin[None])[0],
             still,
             still,
+            matchable=False,
         )
     return freeze(surfels)
 

@@ -65,6 +65,24 @@ def merged_surfel(
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
+def elements(
+    cell_id: np.ndarray,
+    moments: np.ndarray,
+    cells: np.ndarray,  # int32 [S, 2] row, col (absolute)
+    row0: int,
+    col0: int,
+    range_sigma_m: float,
+    map_sigma_m: float,
+    means: np.ndarray,  # out float64 [>= S, 2]
+    omegas: np.ndarray,  # out float64 [>= S, 3]
+) -> None:
+    """The surface element of every cell."""
+    for k in range(cells.shape[0]):
+        row, col = cells[k, 0] - row0, cells[k, 1] - col0
+        merged_surfel(cell_id, moments, row, col, range_sigma_m, map_sigma_m, means[k], omegas[k])
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
 def splat(
     nearest: np.ndarray,  # int32 [H, W]
     field: np.ndarray,  # uint8 [H, W]

@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 
 from services.localization.lidar2d.settings import LidarSlamSettings
-from services.localization.lidar2d.surfel_kernels import add_returns, cast_rays, refresh, splat
+from services.localization.lidar2d.surfel_kernels import add_returns, cast_rays, elements, refresh, splat
 
 BLOCK = 64  # grids grow in blocks of so many cells
 MARGIN = 8
@@ -95,11 +95,11 @@ class SurfelMap:
         origin: np.ndarray,  # float64 [2] where the lidar was
         surface: np.ndarray,  # bool [M] returns that become surface
         free: np.ndarray,  # bool [M] returns whose beam clears the cells before it
+        matchable: bool = True,  # False: put off what only a matcher reads, see make_matchable()
     ) -> None:
         """Add one scan."""
         if len(points) == 0:
             return
-        s = self.settings
         self._cover(np.vstack([points, origin]))
         if self.count + len(points) > len(self.moments):
             self._reserve_surfels(max(2 * len(self.moments), self.count + len(points)))
@@ -137,8 +137,18 @@ class SurfelMap:
             self.col0,
             self.cell_m,
         )
+        if matchable:
+            self._refresh(changed[:n])
+        self.scans += 1
+
+    def make_matchable(self) -> None:
+        """Bring surface elements and tables up to date after scans that were added without."""
+        self._refresh(np.arange(self.count, dtype=np.int32))
+
+    def _refresh(self, changed: np.ndarray) -> None:
+        s = self.settings
         refresh(
-            changed[:n],
+            changed,
             self.cell_id,
             self.nearest,
             self.field,
@@ -154,7 +164,15 @@ class SurfelMap:
             s.range_sigma_m,
             s.map_sigma_m,
         )
-        self.scans += 1
+
+    def surface_elements(self) -> tuple[np.ndarray, np.ndarray]:
+        """Means float64 [S, 2] and information float64 [S, 3] of every cell with a return, now."""
+        s, n = self.settings, self.count
+        elements(
+            self.cell_id, self.moments, self.cells[:n], self.row0, self.col0, s.range_sigma_m, s.map_sigma_m,
+            self.means, self.omegas,
+        )  # fmt: skip
+        return self.means[:n], self.omegas[:n]
 
     def tables(self) -> MatchTables:
         """The live tables of this map (not a copy)."""
@@ -212,6 +230,7 @@ class FrozenMap:
 def freeze(surfels: SurfelMap, min_hit_share: float = 0.2) -> FrozenMap:
     """Keep the surface elements that later beams did not contradict, crop the grids to what was seen."""
     n = surfels.count
+    means, omegas = surfels.surface_elements()
     rows, cols = surfels.cells[:n, 0] - surfels.row0, surfels.cells[:n, 1] - surfels.col0
     hits = surfels.hits[rows, cols].astype(np.float64)
     alive = hits >= min_hit_share * (hits + surfels.misses[rows, cols])
@@ -222,8 +241,8 @@ def freeze(surfels: SurfelMap, min_hit_share: float = 0.2) -> FrozenMap:
     r0, r1 = max(used_rows[0] - MARGIN, 0), used_rows[-1] + MARGIN + 1
     c0, c1 = max(used_cols[0] - MARGIN, 0), used_cols[-1] + MARGIN + 1
     return FrozenMap(
-        surfels.means[:n][alive].astype(np.float32),
-        surfels.omegas[:n][alive].astype(np.float32),
+        means[alive].astype(np.float32),
+        omegas[alive].astype(np.float32),
         surfels.views[:n][alive].astype(np.float32),
         zlib.compress(np.stack([surfels.hits[r0:r1, c0:c1], surfels.misses[r0:r1, c0:c1]]).tobytes(), 1),
         surfels.hits[r0:r1, c0:c1].shape,

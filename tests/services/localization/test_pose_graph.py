@@ -2,7 +2,6 @@ import numpy as np
 import scipy.optimize
 
 from services.localization.lidar2d import pose_graph, se2
-from services.localization.lidar2d.graph_kernels import cholesky_solve
 from services.localization.lidar2d.nodes import edge_information
 from services.localization.lidar2d.pose_graph import Edges, optimise
 
@@ -102,15 +101,6 @@ def test_fixed_submaps_stay(rng):
     solution = optimise(submaps, nodes, edges, fixed=[0, 3])
     assert np.allclose(solution.T_map_submap[[0, 3]], submaps[[0, 3]], atol=1e-6)
     assert not np.allclose(solution.T_map_submap[1], submaps[1], atol=1e-4)
-
-
-def test_cholesky_in_its_envelope(rng):
-    M = np.triu(np.tril(rng.normal(size=(30, 30)), 3), -3)
-    A, b = M @ M.T + np.eye(30), rng.normal(size=30)
-    x = b.copy()
-    assert cholesky_solve(A.copy(), x)
-    assert np.allclose(A @ x, b)
-    assert not cholesky_solve(-A, b.copy())
 
 
 def test_edge_information_knows_its_limits():
