@@ -11,6 +11,15 @@ _ROWS = (
         {"default": "services.replay.node:ReplayNode"},
     ),
     Service(
+        "lidar",
+        "reads a planar lidar",
+        {
+            "rplidar": "services.lidar.node:RplidarNode",
+            "ldrobot": "services.lidar.node:LdrobotNode",
+            "hokuyo": "services.lidar.node:HokuyoNode",
+        },
+    ),
+    Service(
         "localization",
         "where the robot is",
         {
@@ -27,6 +36,16 @@ _ROWS = (
         "fusion",
         "metric depth with an error bar, from beams, floor, past pictures and the guess",
         {"default": "services.fusion.node:FusionNode"},
+    ),
+    Service(
+        "keyframes",
+        "picks the pictures that the map needs",
+        {"default": "services.keyframes.node:KeyframesNode"},
+    ),
+    Service(
+        "mapping",
+        "Gaussians that look like the pictures",
+        {"default": "services.mapping.node:MappingNode"},
     ),
     Service(
         "recorder",

@@ -8,7 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from common.errors import UserError
+from common.persist import make_folder
 from common.raster.layout import COLOUR, MEAN, OPACITY, QUAT, SCALE
+from common.trajectory import Trajectory, write_tum
 
 SH_C0 = 0.28209479177387814  # the constant spherical harmonic
 _PLY_TYPES = {"float": "<f4", "float32": "<f4", "double": "<f8", "uchar": "u1", "uint8": "u1", "char": "i1",
@@ -33,6 +35,22 @@ def write_gaussian_ply(path: Path, params: np.ndarray) -> None:
     partial = path.with_name(path.name + ".partial")
     partial.write_bytes("\n".join(header).encode() + rows.tobytes())
     os.replace(partial, path)
+
+
+def write_map(
+    folder: Path,
+    params: np.ndarray,  # float32 [14, N]
+    stamps_ns: np.ndarray,  # int64 [K], rising
+    T_map_body: np.ndarray,  # float64 [K, 4, 4] of the keyframes
+) -> None:
+    """`map.ply` and `keyframes.tum` in a folder, which is made.
+
+    Raises:
+        UserError: the folder cannot be made or written.
+    """
+    make_folder(folder)
+    write_gaussian_ply(folder / "map.ply", params)
+    write_tum(folder / "keyframes.tum", Trajectory(stamps_ns, T_map_body), "keyframes of the map, refined")
 
 
 def read_ply_points(path: Path) -> np.ndarray:

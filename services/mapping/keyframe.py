@@ -11,6 +11,7 @@ from common.geometry import is_rigid
 from common.raster.camera import RasterCamera
 
 MAX_DEPTH_M = 60.0
+REACH_M = 200.0  # no keyframe is further from its anchor: submaps are a few dozen metres at most
 
 
 @dataclass(frozen=True)
@@ -41,6 +42,9 @@ class Keyframe:
             return f"depth and sigma must be {list(shape)}, got {got}"
         if not is_rigid(self.T_anchor_camera):
             return "T_anchor_camera is not a rigid transform"
+        away_m = float(np.abs(self.T_anchor_camera[:3, 3]).max())
+        if away_m > REACH_M:
+            return f"the pose lies {away_m:.0f} m from its anchor, more than {REACH_M:g} m"
         if self.mask is not None and (self.mask.shape != shape or not self.mask.any()):
             return "the mask leaves no pixel to use"
         if not np.any(np.isfinite(self.depth_m)):
@@ -58,6 +62,7 @@ class Level:
     depth_weight: np.ndarray  # uint8 [H, W], 255 = 1
     beam_pixels: np.ndarray  # int32 [N], flat
     beam_z_m: np.ndarray  # float32 [N]
+    hidden: np.ndarray | None = None  # bool [H, W], True = on something that moves: not looked at
 
 
 @dataclass
@@ -103,7 +108,8 @@ def hold(frame: Keyframe, sigma_unit_m: float) -> Held:
         sampled = np.s_[: h * step : step, : w * step : step]
         planes, d, wt = rgb.transpose(2, 0, 1), depth_mm[sampled], weight_8[sampled]
         arrays = (np.ascontiguousarray(array) for array in (planes, d, wt))
-        levels.append(Level(camera, *arrays, pixels, z))
+        hidden = None if frame.mask is None or frame.mask.all() else ~frame.mask[sampled]
+        levels.append(Level(camera, *arrays, pixels, z, hidden))
     return Held(frame.id, frame.anchor, np.array(frame.T_anchor_camera, dtype=np.float64), levels)
 
 

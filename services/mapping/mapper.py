@@ -6,7 +6,7 @@ before trusted surfaces, then a fixed number of steps on a window of new and ran
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -21,7 +21,6 @@ from services.mapping.ssim import SsimLoss
 from services.mapping.store import GaussianStore
 
 FULL, HALF = 0, 1
-_REACH_M = 1e4  # no robot is further from its anchor
 
 
 @dataclass(frozen=True)
@@ -31,6 +30,8 @@ class Outcome:
     status: str
     inserted: int = 0
     removed: int = 0
+    foretold_share: float = 0.0  # of the pixels, covered by the map as it was
+    foretold_psnr_db: float = float("nan")  # there, between the map as it was and the picture
 
     @property
     def ok(self) -> bool:
@@ -49,6 +50,7 @@ class Mapper:
         self.steps = 0
         self._random = np.random.default_rng(seed)
         self._newest: list[int] = []
+        self._forgotten: set[int] = set()
         self._ssim = SsimLoss()
         self._buffers: dict[tuple[int, int], tuple[np.ndarray, np.ndarray]] = {}
         r = self.settings.rates
@@ -61,7 +63,7 @@ class Mapper:
 
         `T_map_anchor` places the frame's anchor if it is new. A keyframe known by its id is left as it is.
         """
-        if frame.id in self.keyframes:
+        if frame.id in self.keyframes or frame.id in self._forgotten:
             return Outcome("ok")
         fault = frame.fault() or self._fault_of_place(frame, T_map_anchor)
         if fault is not None:
@@ -70,14 +72,22 @@ class Mapper:
             self.T_map_anchor[frame.anchor] = np.array(T_map_anchor, dtype=np.float64)
         held = hold(frame, self.settings.sigma_unit_m)
         removed = self._clean(held)
-        inserted = self._insert(held, held.levels[FULL])
+        outcome = self._insert(held, held.levels[FULL])
+        self._forget()
         self.keyframes[frame.id] = held
         self._newest = [*self._newest, frame.id][-self.settings.recent :]
-        return Outcome("ok", inserted, removed)
+        return replace(outcome, removed=removed)
+
+    def _forget(self) -> None:
+        """Makes room for a keyframe: one drawn from all but the newest goes; its Gaussians stay."""
+        while len(self.keyframes) >= self.settings.max_keyframes:
+            old = [id for id in self.keyframes if id not in self._newest] or list(self.keyframes)
+            gone = old[int(self._random.integers(len(old)))]
+            del self.keyframes[gone]
+            self._newest = [id for id in self._newest if id != gone]
+            self._forgotten.add(gone)
 
     def _fault_of_place(self, frame: Keyframe, T_map_anchor: np.ndarray | None) -> str | None:
-        if np.abs(frame.T_anchor_camera[:3, 3]).max() > _REACH_M:
-            return f"the pose lies more than {_REACH_M:g} m from its anchor"
         if frame.anchor in self.T_map_anchor:
             return None
         if T_map_anchor is None or not is_rigid(T_map_anchor):
@@ -110,20 +120,19 @@ class Mapper:
 
     # --- growing and shrinking ---------------------------------------------------------------------
 
-    def _insert(self, held: Held, level: Level) -> int:
-        room = self.settings.max_gaussians - self.store.count
-        if room <= 0:
-            return 0
+    def _insert(self, held: Held, level: Level) -> Outcome:
+        room = max(self.settings.max_gaussians - self.store.count, 0)
         T_map_camera = self.T_map_camera(held)
         render = self._render(level, T_map_camera)
         missing = unexplained(render.image, level, self.settings)
+        foretold = _foretold(render.image, level)
         self.rasterizer.release(render)
         u, v, spacing = candidates(missing, level, self.settings)
         if len(u) > room:
             u, v, spacing = u[:room], v[:room], spacing[:room]
         if len(u):
             self.store.append(make_gaussians(u, v, spacing, level, T_map_camera, self.settings), held.anchor)
-        return len(u)
+        return Outcome("ok", len(u), 0, *foretold)
 
     def _clean(self, held: Held) -> int:
         """Drops what has faded, and what floats before surfaces that are known well; gives how many."""
@@ -169,6 +178,8 @@ class Mapper:
         level = held.levels[size]
         T_map_camera = self.T_map_camera(held)
         render = self._render(level, T_map_camera)
+        if level.hidden is not None:
+            level = _with_hidden(level, render.image, held.exposure)
         loss, gradient, sums = self._loss(render, level, held)
         gradients = self.rasterizer.backward(render, gradient)
         s = self.settings
@@ -208,6 +219,8 @@ class Mapper:
             loss += add_lidar(render.image, level.beam_pixels, level.beam_z_m, scale, gradient)
         if with_ssim:
             loss += self._ssim.add(render.image, level.rgb, s.ssim_weight, gradient, self.rasterizer.team)
+        if level.hidden is not None:
+            gradient[:, level.hidden] = 0.0
         return loss, gradient, sums
 
     def _refine_pose(self, held: Held, gradients: Gradients, T_camera_map: np.ndarray) -> None:
@@ -224,6 +237,25 @@ class Mapper:
         gradient = sums[:, 2:8].sum(axis=0) + 1e-3 * held.exposure  # a weak pull to "as it was taken"
         move = _adam_step(gradient, held.exposure_first, held.exposure_second, max(held.pose_steps, 1))
         held.exposure = (held.exposure - self.settings.rates.exposure * move).astype(np.float32)
+
+
+def _foretold(image: np.ndarray, level: Level) -> tuple[float, float]:
+    """Share of the pixels that the render float32 [5, H, W] covers, and its PSNR (dB) there."""
+    covered = image[4] > 0.9
+    if level.hidden is not None:
+        covered &= ~level.hidden
+    share = float(covered.mean())
+    if share < 0.01:
+        return share, float("nan")
+    error = np.clip(image[:3, covered], 0.0, 1.0) - level.rgb[:, covered] * np.float32(1 / 255)
+    return share, float(-10.0 * np.log10(max(float(np.mean(error**2)), 1e-12)))
+
+
+def _with_hidden(level: Level, image: np.ndarray, exposure: np.ndarray) -> Level:
+    """The level with hidden pixels as they are rendered: there is nothing to see, for SSIM's windows too."""
+    gain, offset = np.exp(exposure[:3])[:, None, None], exposure[3:, None, None]
+    shown = np.clip((image[:3] * gain + offset) * 255.0 + 0.5, 0.0, 255.0).astype(np.uint8)
+    return replace(level, rgb=np.where(level.hidden, shown, level.rgb))
 
 
 def _adam_step(gradient: np.ndarray, first: np.ndarray, second: np.ndarray, t: int) -> np.ndarray:

@@ -38,6 +38,7 @@ class MapperSettings:
     size: float = 0.65  # standard deviation over spacing
     flatness: float = 0.2
     max_gaussians: int = 300_000
+    max_keyframes: int = 800  # 2.2 MB each at 640x480; beyond it old ones are forgotten, drawn by chance
     # Losses
     ssim_weight: float = 0.2
     ssim_every: int = 3

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from common.geometry import quat_wxyz_from_matrix
-from common.raster.layout import MEAN, PARAMS, QUAT, SCALE
+from common.raster.layout import MEAN, OPACITY, PARAMS, QUAT, SCALE
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class GaussianStore:
         self.first = np.zeros((PARAMS, capacity), np.float32)  # Adam's moments
         self.second = np.zeros((PARAMS, capacity), np.float32)
         self.steps = np.zeros(capacity, np.float32)
-        self.anchor = np.zeros(capacity, np.int32)
+        self.anchor = np.zeros(capacity, np.int64)
         self.strikes = np.zeros(capacity, np.int32)  # times seen floating before a trusted surface
 
     def _arrays(self) -> list[str]:
@@ -80,29 +80,42 @@ class GaussianStore:
         if len(chosen) == 0:
             return
         self._events[anchor] = self._events.get(anchor, 0) + 1
+        self.params[:, chosen] = moved(self.params[:, chosen], T_new_old)
         R = T_new_old[:3, :3]
-        mean = self.params[MEAN:SCALE, chosen].astype(np.float64)
-        self.params[MEAN:SCALE, chosen] = R @ mean + T_new_old[:3, 3:4]
         self.first[MEAN:SCALE, chosen] = R @ self.first[MEAN:SCALE, chosen]
-        w, x, y, z = quat_wxyz_from_matrix(R)
-        left = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
-        self.params[QUAT : QUAT + 4, chosen] = left @ self.params[QUAT : QUAT + 4, chosen]
-        self.first[QUAT : QUAT + 4, chosen] = left @ self.first[QUAT : QUAT + 4, chosen]
+        self.first[QUAT:OPACITY, chosen] = _turning(R) @ self.first[QUAT:OPACITY, chosen]
 
     def versions(self) -> dict[int, int]:
         """Version of every anchor's chunk: grows with each step of the optimiser and each event."""
-        steps = np.zeros(0)
-        if self.count:
-            steps = np.bincount(self.anchor[: self.count], weights=self.steps[: self.count])
-        seen = {int(a): int(steps[a]) if a < len(steps) else 0 for a in self._events}
+        anchors, which = np.unique(self.anchor[: self.count], return_inverse=True)
+        steps = np.bincount(which, weights=self.steps[: self.count], minlength=len(anchors))
+        taken = {int(anchor): int(n) for anchor, n in zip(anchors, steps)}
         # An event outweighs the steps that removed Gaussians took with them.
-        return {a: (self._events[a] << 40) + seen[a] for a in sorted(seen)}
+        return {a: (events << 40) + taken.get(a, 0) for a, events in sorted(self._events.items())}
+
+    def chunk(self, anchor: int) -> np.ndarray:
+        """float32 [14, N]: a copy of an anchor's Gaussians, in the map frame."""
+        return self.params[:, : self.count][:, self.anchor[: self.count] == anchor]
 
     def chunks(self, known: dict[int, int] | None = None) -> list[Chunk]:
         """Chunks whose version differs from that in `known` (all without it), copied."""
         known = known or {}
         return [
-            Chunk(a, version, self.params[:, : self.count][:, self.anchor[: self.count] == a])
+            Chunk(a, version, self.chunk(a))
             for a, version in self.versions().items()
             if known.get(a) != version
         ]
+
+
+def moved(params: np.ndarray, T_a_b: np.ndarray) -> np.ndarray:
+    """Gaussians float32 [14, N] of frame b in frame a."""
+    out = params.copy()
+    out[MEAN:SCALE] = T_a_b[:3, :3] @ params[MEAN:SCALE].astype(np.float64) + T_a_b[:3, 3:4]
+    out[QUAT:OPACITY] = _turning(T_a_b[:3, :3]) @ params[QUAT:OPACITY]
+    return out
+
+
+def _turning(R: np.ndarray) -> np.ndarray:
+    """[4, 4] that turns quaternions (w, x, y, z) by R: multiplication from the left."""
+    w, x, y, z = quat_wxyz_from_matrix(R)
+    return np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])

@@ -1,0 +1,245 @@
+"""The keyframes service: on the robot, picks the pictures the map needs and makes each self-sufficient."""
+
+from __future__ import annotations
+
+import logging
+from collections import deque
+from dataclasses import dataclass, replace
+from typing import Annotated
+
+import cv2
+import numpy as np
+from pydantic import Field
+
+from common.beams import project_beams
+from common.camera import Pinhole, Undistorter
+from common.config import NodeConfig
+from common.depth_code import depth_to_png, mask_to_png, sigma_to_png
+from common.errors import UserError
+from common.geometry import inverse
+from common.history import History, TimedScan
+from common.messages import (
+    Anchors,
+    Correction,
+    FusedDepth,
+    Image,
+    Keyframe,
+    KeyframeAck,
+    MovingBeams,
+    Odometry,
+    Rig,
+    Scan,
+)  # fmt: skip
+from common.node import Input, Node, Outputs
+from common.picture import decode_rgb
+from services.keyframes.bodies import body_mask
+from services.keyframes.outbox import Outbox
+from services.keyframes.selection import KeyframeSelector, SelectionSettings
+
+log = logging.getLogger("beamsplat.keyframes")
+
+ODOM_ORIGIN = -1  # the anchor while localization has named none
+_PICTURES = 64  # kept until their depth comes: 6 s at 10 Hz
+_SCANS = 16
+_BEAMS_NS = 120_000_000  # a pose that much later places every beam of the scan around a picture
+
+
+class KeyframesConfig(NodeConfig):
+    """When a picture becomes a keyframe, and how many may wait for the mapper."""
+
+    distance_m: Annotated[float, Field(gt=0.0)] = 0.25
+    angle_rad: Annotated[float, Field(gt=0.0)] = 0.22
+    least_overlap: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.6
+    patience: Annotated[int, Field(ge=1)] = 2  # candidates looked at when one is blurred
+    swept_only: bool = True  # only pictures for which fusion did its best; False: any with depth
+    queue: Annotated[int, Field(ge=1)] = 256  # unacknowledged keyframes that are kept: about 60 MB
+    retry_s: Annotated[float, Field(gt=0.0)] = 10.0
+    jpeg_quality: Annotated[int, Field(ge=50, le=100)] = 95  # of pictures that come uncompressed
+
+
+@dataclass(frozen=True)
+class _Candidate:
+    image: Image
+    depth: FusedDepth
+
+
+class KeyframesNode(Node):
+    """Picture, fused depth, beams and pose of one moment, bound to the newest anchor."""
+
+    name = "keyframes"
+    Config = KeyframesConfig
+    inputs = (
+        Input("rig", "every"),
+        "lidar/scan",
+        Input("camera/image", "every"),
+        "localization/odometry",
+        Input("localization/correction", "every"),
+        Input("localization/anchors", "every"),
+        "localization/movers",
+        Input("fusion/depth", "every"),
+        Input("keyframes/ack", feedback=True),
+    )
+    outputs = ("keyframes/frame",)
+
+    def configure(self) -> None:
+        self._history: History | None = None
+        self._pictures: deque[Image] = deque(maxlen=_PICTURES)
+        self._depths: deque[FusedDepth] = deque(maxlen=_PICTURES)
+        self._candidates: deque[tuple[int, _Candidate]] = deque(maxlen=8)
+        self._unmarked: deque[TimedScan] = deque()
+        self._T_map_odom = np.eye(4)
+        self._anchor_id, self._T_map_anchor, self._optimisation = ODOM_ORIGIN, np.eye(4), 0
+        self._outbox: Outbox[Keyframe] = Outbox(self.config.queue, round(self.config.retry_s * 1e9))
+        self._seen = self._sent = self._refused = 0
+
+    # --- what is known of the robot ---
+
+    def on_rig(self, rig: Rig) -> Outputs:
+        """The camera is needed; beams only where there is a lidar. A second calibration restarts."""
+        if rig.camera is None:
+            log.error("the calibration has no camera: no keyframes")
+            return iter(())
+        c = rig.camera
+        self._camera = c
+        lens = Pinhole(c.fx_px, c.fy_px, c.cx_px, c.cy_px, c.width_px, c.height_px, c.distortion_model,
+                       c.distortion)  # fmt: skip
+        self._undistort = Undistorter(lens)
+        self._history = History(np.eye(4) if rig.lidar is None else rig.lidar.T_body_lidar)
+        s = self.config
+        fov = 2.0 * np.arctan([0.5 * c.width_px / c.fx_px, 0.5 * c.height_px / c.fy_px])
+        self._selector = KeyframeSelector(
+            (float(fov[0]), float(fov[1])),
+            SelectionSettings(
+                distance_m=s.distance_m, angle_rad=s.angle_rad, least_overlap=s.least_overlap,
+                patience=s.patience,
+            ),
+        )  # fmt: skip
+        return iter(())
+
+    def on_lidar_scan(self, scan: Scan) -> Outputs:
+        self._unmarked.append(
+            TimedScan(
+                scan.stamp_ns, scan.angle_min_rad, scan.angle_increment_rad, scan.time_increment_s,
+                scan.range_min_m, scan.range_max_m, scan.ranges_m,
+            )
+        )  # fmt: skip
+        while len(self._unmarked) > _SCANS:  # localization says nothing of movers
+            self._take_scan(self._unmarked.popleft())
+        return iter(())
+
+    def on_localization_movers(self, movers: MovingBeams) -> Outputs:
+        while self._unmarked and self._unmarked[0].stamp_ns <= movers.stamp_ns:
+            scan = self._unmarked.popleft()
+            mine = scan.stamp_ns == movers.stamp_ns and len(movers.moving) == len(scan.ranges_m)
+            self._take_scan(replace(scan, moving=movers.moving) if mine else scan)
+        return iter(())
+
+    def _take_scan(self, scan: TimedScan) -> None:
+        if self._history is not None:
+            self._history.add_scan(scan)
+
+    def on_localization_correction(self, correction: Correction) -> Outputs:
+        self._T_map_odom = correction.T_map_odom
+        return iter(())
+
+    def on_localization_anchors(self, anchors: Anchors) -> Outputs:
+        """New keyframes hang on the newest submap: between the two there is the least drift."""
+        if len(anchors.anchor_ids):
+            newest = int(np.argmax(anchors.anchor_ids))
+            self._anchor_id = int(anchors.anchor_ids[newest])
+            self._T_map_anchor = anchors.T_map_anchor[newest].copy()
+            self._optimisation = anchors.optimisation
+        return iter(())
+
+    # --- pictures ---
+
+    def on_camera_image(self, image: Image) -> Outputs:
+        """Kept until its depth comes; and time has passed for what was not acknowledged."""
+        self._pictures.append(image)
+        again = self._outbox.due(image.stamp_ns)
+        if again is not None:
+            yield "keyframes/frame", again
+
+    def on_fusion_depth(self, depth: FusedDepth) -> Outputs:
+        if depth.status == "ok" and (depth.keyframe or not self.config.swept_only):
+            self._depths.append(depth)
+        return iter(())
+
+    def on_localization_odometry(self, odometry: Odometry) -> Outputs:
+        """A pose: pictures whose beams can be placed now are looked at."""
+        if self._history is None or odometry.status != "ok":
+            return
+        self._history.add_pose(odometry.stamp_ns, odometry.T_odom_body)
+        while self._depths and self._depths[0].stamp_ns + _BEAMS_NS <= odometry.stamp_ns:
+            yield from self._consider(self._depths.popleft())
+
+    def on_keyframes_ack(self, ack: KeyframeAck) -> Outputs:
+        """The mapper has it, or refused it: either way it need not come again."""
+        if self._outbox.acknowledge(ack.id) and ack.status != "ok":
+            self._refused += 1
+        self._say()
+        return iter(())
+
+    def drain(self) -> Outputs:
+        """Depths whose last pose never came."""
+        while self._history is not None and self._depths:
+            yield from self._consider(self._depths.popleft())
+
+    def _consider(self, depth: FusedDepth) -> Outputs:
+        image = next((p for p in self._pictures if p.stamp_ns == depth.stamp_ns), None)
+        if image is None:
+            return
+        try:
+            rgb = decode_rgb(image.data, image.encoding, image.width_px, image.height_px, image.step_bytes)
+        except UserError as error:
+            log.warning("a picture is passed over: %s", error)
+            return
+        self._seen += 1
+        self._candidates.append((self._seen, _Candidate(image, depth)))
+        grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
+        decision = self._selector.consider(self._seen, grey, depth.T_odom_body @ self._camera.T_body_camera)
+        chosen = next((c for number, c in self._candidates if number == decision.key), None)
+        if chosen is None:
+            return
+        frame = self._keyframe(chosen, decision.reason)
+        self._outbox.put(frame.id, frame, depth.stamp_ns)
+        self._sent += 1
+        self._say()
+        yield "keyframes/frame", frame
+
+    def _keyframe(self, chosen: _Candidate, why: str) -> Keyframe:
+        """Self-sufficient; poses are those of the optimisation that is known now."""
+        image, depth = chosen.image, chosen.depth
+        stamp_ns, T_body_camera = image.stamp_ns, self._camera.T_body_camera
+        encoding, picture = self._compressed(image)
+        beams, _ = self._history.beams(stamp_ns)
+        uv, z, index = project_beams(beams, self._undistort.pinhole, T_body_camera)
+        moving = self._moving(stamp_ns)
+        mask = body_mask(moving, depth.depth_m, self._undistort.pinhole, T_body_camera)
+        return Keyframe(
+            stamp_ns=stamp_ns, id=stamp_ns, encoding=encoding, picture=picture, camera=self._camera,
+            anchor_id=self._anchor_id, T_map_anchor=self._T_map_anchor, optimisation=self._optimisation,
+            T_anchor_body=inverse(self._T_map_anchor) @ self._T_map_odom @ depth.T_odom_body,
+            depth_png=depth_to_png(depth.depth_m), sigma_png=sigma_to_png(depth.sigma_m),
+            mask_png=mask_to_png(~mask) if mask.any() else np.zeros(0, np.uint8),
+            beams=np.column_stack([uv, z, beams.sigma_m[index]]).astype(np.float32).reshape(-1, 4), why=why,
+        )  # fmt: skip
+
+    def _moving(self, stamp_ns: int) -> np.ndarray:
+        """Returns on movers [N, 3] in the body frame at the picture's time."""
+        scan = self._history.scan_near(stamp_ns)
+        if scan is None or scan.moving is None or not scan.moving.any():
+            return np.zeros((0, 3))
+        return self._history.beams_of(replace(scan, moving=~scan.moving), stamp_ns).points_body_m
+
+    def _compressed(self, image: Image) -> tuple[str, np.ndarray]:
+        if image.encoding in ("jpeg", "png"):
+            return image.encoding, image.data
+        rgb = decode_rgb(image.data, image.encoding, image.width_px, image.height_px, image.step_bytes)
+        quality = (cv2.IMWRITE_JPEG_QUALITY, self.config.jpeg_quality)
+        return "jpeg", cv2.imencode(".jpg", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), quality)[1].ravel()
+
+    def _say(self) -> None:
+        self.detail = f"{self._sent} keyframes, {len(self._outbox)} not acknowledged" + (
+            f", {self._refused} refused" if self._refused else ""
+        ) + (f", {self._outbox.given_up} given up" if self._outbox.given_up else "")  # fmt: skip

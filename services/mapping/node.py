@@ -1,0 +1,263 @@
+"""The mapping service: keyframes in; Gaussians, renders and how good they are out."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated
+
+import cv2
+import numpy as np
+from pydantic import Field
+
+from common.camera import Pinhole, Undistorter
+from common.config import NodeConfig
+from common.depth_code import depth_from_png, mask_from_png, sigma_from_png
+from common.errors import UserError
+from common.geometry import inverse
+from common.messages import (
+    Anchors,
+    CameraModel,
+    Keyframe,
+    KeyframeAck,
+    MapChunk,
+    MapPoses,
+    MapPreview,
+    MapStatus,
+    Tick,
+)  # fmt: skip
+from common.node import Input, Node, Outputs
+from common.picture import decode_rgb
+from common.raster.camera import RasterCamera
+from common.splats import pack
+from services.mapping.export import write_map
+from services.mapping.keyframe import Keyframe as MapKeyframe
+from services.mapping.look import look
+from services.mapping.mapper import FULL, HALF, Mapper, Outcome
+from services.mapping.settings import MapperSettings
+from services.mapping.store import moved
+from services.mapping.warm import warm
+
+log = logging.getLogger("beamsplat.mapping")
+
+ODOM_ORIGIN = -1  # the anchor of keyframes from before localization named one
+Steps = Annotated[int, Field(ge=0, le=100_000)]
+
+
+class MappingConfig(NodeConfig):
+    """Work is fixed: so many steps a keyframe, so many a tick. `threads` are the rasterizer's."""
+
+    half_steps: Steps = 18  # per keyframe, at half size
+    full_steps: Steps = 5
+    tick_steps: Steps = 6  # per tick while no keyframe waits, at full size
+    mend_steps: Steps = 30  # after anchors have moved: seams
+    final_steps: Steps = 0  # when the data have ended, on all keyframes
+    max_gaussians: Annotated[int, Field(ge=1000)] = 300_000
+    max_keyframes: Annotated[int, Field(ge=4)] = 800
+    refine_pose: bool = True
+    refine_exposure: bool = True
+    chunk_every: Annotated[int, Field(ge=1)] = 2  # keyframes between two versions of the newest chunk
+    seed: int = 0
+    save: Path | None = None  # folder for map.ply and keyframes.tum, written at the end of the data
+
+
+class MappingNode(Node):
+    """Takes every keyframe, in any order; each is acknowledged when it has been dealt with."""
+
+    name = "mapping"
+    Config = MappingConfig
+    inputs = ("keyframes/frame", Input("localization/anchors", "every"), Input("tick", "latest"))
+    outputs = ("keyframes/ack", "mapping/chunk", "mapping/poses", "mapping/preview", "mapping/status")
+    config: MappingConfig
+
+    def configure(self) -> None:
+        c = self.config
+        warm()
+        settings = MapperSettings(
+            half_iterations=c.half_steps, full_iterations=c.full_steps, max_gaussians=c.max_gaussians,
+            max_keyframes=c.max_keyframes, refine_pose=c.refine_pose, refine_exposure=c.refine_exposure,
+        )  # fmt: skip
+        self._mapper = Mapper(settings, seed=c.seed, threads=c.threads)
+        self._lens: dict[Pinhole, Undistorter] = {}
+        self._taken: dict[int, tuple[int, np.ndarray]] = {}  # keyframe -> stamp_ns, T_camera_body
+        self._sent: dict[int, tuple[int, int]] = {}  # anchor -> version sent, when (counted)
+        self._clock = 0  # messages with chunks so far
+        self._refused = 0
+        self._T_oldest_origin: np.ndarray | None = (
+            None  # the oldest submap's place when the origin was tied to it
+        )
+
+    # --- keyframes ---
+
+    def on_keyframes_frame(self, message: Keyframe) -> Outputs:
+        """Insertion and the fixed steps; then how well the picture is explained, and what has changed."""
+        known = message.id in self._taken
+        outcome = Outcome("ok") if known else self._take(message)
+        yield "keyframes/ack", KeyframeAck(stamp_ns=message.stamp_ns, id=message.id, status=outcome.status)
+        if known:  # sent again while the answer was on its way
+            return
+        if not outcome.ok:
+            self._refused += 1
+            log.warning("keyframe %d is refused: %s", message.id, outcome.status)
+            yield "mapping/status", self._status(message.stamp_ns, outcome, 0.0)
+            return
+        self._taken[message.id] = (message.stamp_ns, inverse(message.camera.T_body_camera))
+        loss = self._mapper.optimise()
+        yield from self._show(message, outcome, loss)
+        if len(self._mapper.keyframes) % self.config.chunk_every == 0:
+            yield from self._chunk(message.anchor_id, message.stamp_ns)
+
+    def _take(self, message: Keyframe) -> Outcome:
+        try:
+            frame = self._open(message)
+        except (UserError, ValueError) as error:
+            return Outcome(str(error))
+        return self._mapper.add(frame, message.T_map_anchor)
+
+    def _open(self, message: Keyframe) -> MapKeyframe:
+        """Decoded and undistorted: everything behind sees a pinhole.
+
+        Raises:
+            UserError, ValueError: picture, depth, sigma or mask do not decode, or are of another size.
+        """
+        undistort = self._undistorter(message.camera)
+        p = undistort.pinhole
+        rgb = decode_rgb(message.picture, message.encoding, p.width_px, p.height_px)
+        mask = mask_from_png(message.mask_png) if len(message.mask_png) else None
+        return MapKeyframe(
+            id=message.id, rgb=undistort(rgb),
+            camera=RasterCamera(p.fx_px, p.fy_px, p.cx_px, p.cy_px, p.width_px, p.height_px),
+            T_anchor_camera=message.T_anchor_body @ message.camera.T_body_camera,
+            depth_m=depth_from_png(message.depth_png), sigma_m=sigma_from_png(message.sigma_png),
+            anchor=message.anchor_id, beams_uvz=message.beams[:, :3].astype(np.float64), mask=mask,
+        )  # fmt: skip
+
+    def _undistorter(self, camera: CameraModel) -> Undistorter:
+        """Its maps are made once a calibration; a few are kept."""
+        lens = Pinhole(
+            camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px, camera.width_px, camera.height_px,
+            camera.distortion_model, camera.distortion,
+        )  # fmt: skip
+        if lens not in self._lens:
+            if len(self._lens) >= 4:
+                self._lens.pop(next(iter(self._lens)))
+            self._lens[lens] = Undistorter(lens)
+        return self._lens[lens]
+
+    # --- anchors and time ---
+
+    def on_localization_anchors(self, anchors: Anchors) -> Outputs:
+        """The pose graph has moved: Gaussians move along at once, some steps mend the seams."""
+        places = {int(a): T for a, T in zip(anchors.anchor_ids, anchors.T_map_anchor)}
+        self._tie_origin(places)
+        if self._mapper.move_anchors(places) and self._mapper.keyframes:
+            self._mapper.refine(self.config.mend_steps, HALF)
+            for anchor in places:
+                yield from self._chunk(anchor, anchors.stamp_ns)
+
+    def _tie_origin(self, places: dict[int, np.ndarray]) -> None:
+        """What hangs on the odom frame's origin goes with the oldest submap, which began there."""
+        origin = self._mapper.T_map_anchor.get(ODOM_ORIGIN)
+        if origin is None or not places:
+            return
+        oldest = places[min(places)]
+        if self._T_oldest_origin is None:
+            self._T_oldest_origin = inverse(oldest) @ origin
+        places[ODOM_ORIGIN] = oldest @ self._T_oldest_origin
+
+    def on_tick(self, tick: Tick) -> Outputs:
+        """Time passes and no keyframe waits: steps on all keyframes, and the chunk sent longest ago."""
+        if not self._mapper.keyframes:
+            return
+        self._mapper.refine(self.config.tick_steps, FULL)
+        versions = self._mapper.store.versions()
+        stale = [a for a, version in versions.items() if self._sent.get(a, (-1, 0))[0] != version]
+        if stale:
+            yield from self._chunk(
+                min(stale, key=lambda a: (self._sent.get(a, (-1, -1))[1], a)), tick.stamp_ns
+            )
+
+    # --- what is said ---
+
+    def _show(self, message: Keyframe, outcome: Outcome, loss: float) -> Outputs:
+        view = look(self._mapper, message.id)
+        bgr = cv2.cvtColor(view.rgb, cv2.COLOR_RGB2BGR)
+        render = cv2.imencode(".jpg", bgr, (cv2.IMWRITE_JPEG_QUALITY, 85))[1].ravel()
+        yield (
+            "mapping/preview",
+            MapPreview(
+                stamp_ns=message.stamp_ns,
+                keyframe_id=message.id,
+                render=render,
+                T_map_camera=view.T_map_camera,
+            ),
+        )
+        yield (
+            "mapping/status",
+            self._status(message.stamp_ns, outcome, loss, view.psnr_db, view.depth_error_m),
+        )
+
+    def _status(
+        self,
+        stamp_ns: int,
+        outcome: Outcome,
+        loss: float,
+        psnr_db: float = float("nan"),
+        depth_error_m: float = float("nan"),
+    ) -> MapStatus:
+        m = self._mapper
+        self.detail = f"{len(m.keyframes)} keyframes, {m.store.count} Gaussians, {psnr_db:.1f} dB" + (
+            f", {self._refused} refused (last: {outcome.status})" if not outcome.ok else ""
+        )
+        return MapStatus(
+            stamp_ns=stamp_ns, status=outcome.status, keyframes=len(m.keyframes), refused=self._refused,
+            gaussians=m.store.count, steps=m.steps, loss=loss, foretold_share=outcome.foretold_share,
+            foretold_psnr_db=outcome.foretold_psnr_db, psnr_db=psnr_db, depth_error_m=depth_error_m,
+        )  # fmt: skip
+
+    def _chunk(self, anchor: int, stamp_ns: int) -> Outputs:
+        """An anchor's Gaussians, unless this version has been sent."""
+        version = self._mapper.store.versions().get(anchor)
+        if version is None or self._sent.get(anchor, (-1, 0))[0] == version:
+            return
+        self._clock += 1
+        self._sent[anchor] = (version, self._clock)
+        yield "mapping/chunk", self._packed(anchor, version, stamp_ns)
+
+    def _packed(self, anchor: int, version: int, stamp_ns: int) -> MapChunk:
+        T_map_anchor = self._mapper.T_map_anchor[anchor]
+        params = moved(self._mapper.store.chunk(anchor), inverse(T_map_anchor))
+        return MapChunk(
+            stamp_ns=stamp_ns, anchor_id=anchor, revision=version, T_map_anchor=T_map_anchor,
+            count=params.shape[1], packed=pack(params),
+        )  # fmt: skip
+
+    def on_query_snapshot(self, parameters: dict[str, str]) -> Iterator[MapChunk]:
+        """The whole map, chunk by chunk, for who comes late."""
+        for anchor, version in self._mapper.store.versions().items():
+            yield self._packed(anchor, version, 0)
+
+    def drain(self) -> Outputs:
+        """Last refinement, all chunks as they are now, the refined poses, and the files asked for."""
+        m = self._mapper
+        if not m.keyframes:
+            return
+        m.refine(self.config.final_steps, FULL)
+        stamps = {id: self._taken[id][0] for id in m.keyframes}
+        last_ns = max(stamps.values())
+        for anchor in m.store.versions():
+            yield from self._chunk(anchor, last_ns)
+        ids = sorted(stamps, key=lambda id: (stamps[id], id))
+        T_map_body = np.array([m.T_map_camera(m.keyframes[id]) @ self._taken[id][1] for id in ids])
+        stamps_ns = np.array([stamps[id] for id in ids], np.int64)
+        yield (
+            "mapping/poses",
+            MapPoses(
+                stamp_ns=last_ns, keyframe_ids=np.array(ids, np.int64), stamps_ns=stamps_ns,
+                T_map_body=T_map_body,
+            ),
+        )  # fmt: skip
+        if self.config.save is not None:
+            write_map(self.config.save, m.store.params[:, : m.store.count], stamps_ns, T_map_body)
+            log.info("map of %d Gaussians saved to %s", m.store.count, self.config.save)

@@ -1,0 +1,180 @@
+"""Keyframes as they go out: poses, anchors, depth, beams; sent again while nobody answers."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from common.depth_code import depth_from_png, mask_from_png, sigma_from_png
+from common.geometry import inverse, transform_points
+from common.lockstep import Lockstep
+from common.messages import (
+    FusedDepth,
+    Image,
+    Keyframe,
+    KeyframeAck,
+    LidarModel,
+    MovingBeams,
+    Odometry,
+    Rig,
+    Scan,
+)
+from common.node import Node
+from common.picture import decode_rgb
+from services.keyframes.node import KeyframesConfig, KeyframesNode
+from tests.services.mapping import room_drive as r
+
+
+def keyframes_of(config=None, drive=None, localizer=None, **others):
+    node, frames = KeyframesNode(config or KeyframesConfig()), []
+    nodes = [
+        r.RoomDrive(drive or r.DriveConfig(pictures=12)),
+        r.Localizer(localizer or r.LocalizerConfig()),
+        r.Fusion(r.Fusion.Config()),
+        node,
+        *others.values(),
+    ]
+    Lockstep(
+        nodes, lambda letter: frames.append(letter.message) if letter.topic == "keyframes/frame" else None
+    ).run()
+    return node, frames
+
+
+class Acknowledges(Node):
+    name = "mapping"
+    inputs = ("keyframes/frame",)
+    outputs = ("keyframes/ack",)
+
+    def on_keyframes_frame(self, frame):
+        yield "keyframes/ack", KeyframeAck(stamp_ns=frame.stamp_ns, id=frame.id)
+
+
+@pytest.fixture(scope="module")
+def frames():
+    return keyframes_of()[1]
+
+
+def number_of(frame):
+    return (frame.stamp_ns - r.T0) // r.STEP
+
+
+def test_keyframes_are_apart_by_motion(frames):
+    numbers = [number_of(f) for f in frames]
+    assert numbers[0] == 0
+    assert all(3 <= b - a <= 4 for a, b in pairwise(numbers))  # 8 cm and 1.7 degrees a picture, 25 cm
+    assert frames[1].why == "moved"
+
+
+def test_anchor_and_relative_pose_give_the_pose_in_the_map(frames):
+    for frame in frames:
+        truth = r.T_map_body(number_of(frame))
+        np.testing.assert_allclose(frame.T_map_anchor @ frame.T_anchor_body, truth, atol=1e-9)
+
+
+def test_keyframes_hang_on_the_newest_submap_known(frames):
+    by_number = {number_of(f): f for f in frames}
+    assert by_number[0].anchor_id == -1  # no submap is named yet: the odom frame's origin
+    assert {f.anchor_id for n, f in by_number.items() if n > 7} == {1}
+    np.testing.assert_allclose(frames[-1].T_map_anchor, r.T_map_body(4), atol=1e-12)
+
+
+def test_picture_and_depth_arrive_as_they_were(frames):
+    for frame in frames[:2]:
+        rgb, depth = r.shot(number_of(frame))
+        got = decode_rgb(frame.picture, frame.encoding, r.WIDTH, r.HEIGHT)
+        assert np.array_equal(got, rgb)
+        back = depth_from_png(frame.depth_png)
+        assert np.array_equal(np.isfinite(back), np.isfinite(depth))
+        assert np.nanmax(np.abs(back - depth)) < 0.001
+        assert np.nanmax(np.abs(sigma_from_png(frame.sigma_png) - 0.01)) < 3e-4
+        assert len(frame.mask_png) == 0
+
+
+def test_raw_pictures_are_compressed():
+    frames = keyframes_of(drive=r.DriveConfig(pictures=5, raw=True))[1]
+    assert frames[0].encoding == "jpeg"
+    rgb = decode_rgb(frames[0].picture, "jpeg", r.WIDTH, r.HEIGHT).astype(float)
+    assert np.abs(rgb - r.shot(0)[0]).mean() < 8.0  # the room is grainy
+
+
+def test_without_an_answer_the_oldest_is_sent_again():
+    node, frames = keyframes_of(KeyframesConfig(retry_s=1.0))
+    ids = [f.id for f in frames]
+    assert ids.count(ids[0]) == 3  # after one second and after two
+    assert len(set(ids)) == 3
+    assert "3 not acknowledged" in node.detail
+
+
+def test_an_answer_ends_it():
+    node, frames = keyframes_of(KeyframesConfig(retry_s=1.0), mapper=Acknowledges(Acknowledges.Config()))
+    ids = [f.id for f in frames]
+    assert len(ids) == len(set(ids)) == 3
+    assert (
+        " 0 not acknowledged" in node.detail or "1 not acknowledged" in node.detail
+    )  # the last one's comes late
+
+
+# --- beams and movers: handlers driven by hand ---
+
+LIDAR_Z = 0.18
+
+
+def scan_of_a_wall(stamp_ns, moving_from, moving_to):
+    """A wall 3 m ahead; beams moving_from..moving_to end 1.5 m ahead, on somebody's ankles."""
+    angles = np.linspace(-np.pi, np.pi, 720, endpoint=False)
+    with np.errstate(divide="ignore"):
+        ranges = np.where(np.abs(angles) < 1.2, 3.0 / np.cos(angles), np.inf).astype(np.float32)
+    ranges[moving_from:moving_to] = 1.5 / np.cos(angles[moving_from:moving_to])
+    return Scan(stamp_ns=stamp_ns, angle_min_rad=-np.pi, angle_increment_rad=2 * np.pi / 720, time_increment_s=0.0,
+                scan_time_s=0.1, range_min_m=0.1, range_max_m=12.0, ranges_m=ranges)  # fmt: skip
+
+
+def drive_by_hand(moving):
+    node = KeyframesNode(KeyframesConfig())
+    node.configure()
+    T_body_lidar = np.eye(4)
+    T_body_lidar[2, 3] = LIDAR_Z
+    stamp_ns = r.T0
+    depth = np.full((r.HEIGHT, r.WIDTH), 2.9, np.float32)
+    out = []
+    for topic, message in (
+        ("rig", Rig(stamp_ns=stamp_ns, camera=r.CAMERA_MODEL, lidar=LidarModel(T_body_lidar=T_body_lidar))),
+        ("lidar/scan", scan_of_a_wall(stamp_ns, 350, 370)),
+        ("camera/image", Image(stamp_ns=stamp_ns, width_px=r.WIDTH, height_px=r.HEIGHT, encoding="png",
+                               data=r.jpeg(r.shot(0)[0]))),
+        ("localization/movers", MovingBeams(stamp_ns=stamp_ns, moving=moving)),
+        ("localization/odometry", Odometry(stamp_ns=stamp_ns, T_odom_body=np.eye(4), covariance=np.eye(3))),
+        ("fusion/depth", FusedDepth(stamp_ns=stamp_ns, depth_m=depth, sigma_m=depth * 0.01, keyframe=True)),
+        ("localization/odometry", Odometry(stamp_ns=stamp_ns + 10**9, T_odom_body=np.eye(4), covariance=np.eye(3))),
+    ):  # fmt: skip
+        out += list(node.handle(topic, message))
+    assert [topic for topic, _ in out] == ["keyframes/frame"]
+    frame = out[0][1]
+    assert isinstance(frame, Keyframe)
+    return frame
+
+
+def test_beams_lie_where_the_camera_sees_them():
+    frame = drive_by_hand(np.zeros(720, bool))
+    points = np.column_stack([
+        (frame.beams[:, 0] - 79.5) / r.FOCAL * frame.beams[:, 2],
+        (frame.beams[:, 1] - 59.5) / r.FOCAL * frame.beams[:, 2],
+        frame.beams[:, 2],
+    ])  # fmt: skip
+    body = transform_points(r.T_BODY_CAMERA, points)
+    assert len(body) > 60
+    np.testing.assert_allclose(body[:, 2], LIDAR_Z, atol=1e-4)
+    assert np.all(np.minimum(np.abs(body[:, 0] - 3.0), np.abs(body[:, 0] - 1.5)) < 1e-4)
+    assert len(frame.mask_png) == 0
+
+
+def test_movers_are_masked_and_their_beams_left_out():
+    moving = np.zeros(720, bool)
+    moving[350:370] = True
+    frame = drive_by_hand(moving)
+    assert np.all(frame.beams[:, 2] > 2.0)
+    mask = mask_from_png(frame.mask_png)
+    assert not mask[60, 79]  # the walker
+    assert mask[:, :20].all()
+    assert 0.02 < (~mask).mean() < 0.5
+    np.testing.assert_allclose(inverse(frame.T_map_anchor) @ frame.T_map_anchor, np.eye(4), atol=1e-12)
