@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import rerun.blueprint as rrb
 
-from services.monitor.depth_view import DEPTH
+from services.monitor.depth_view import CLOUD, DEPTH
+from services.monitor.map_view import PLOTS as MAP_PLOTS
+from services.monitor.map_view import RENDER, SPLATS
 from services.monitor.panel import PLOTS
 from services.monitor.scene import BODY, CAMERA, SCAN, WORLD
 from services.monitor.screen import TIMELINE
@@ -16,19 +18,27 @@ def layout() -> rrb.Blueprint:
         kind=rrb.Eye3DKind.Orbital, position=(-5.0, -5.0, 7.0), look_target=(0.0, 0.0, 0.0),
         eye_up=(0.0, 0.0, 1.0), tracking_entity=f"/{BODY}",
     )  # fmt: skip
-    world = rrb.Spatial3DView(origin=WORLD, name="Map", eye_controls=eye)
+    # Points lie on the Gaussians made of them: one view each.
+    world = rrb.Tabs(
+        rrb.Spatial3DView(
+            origin=WORLD, contents=["$origin/**", f"- /{CLOUD}/**"], name="Map", eye_controls=eye
+        ),
+        rrb.Spatial3DView(
+            origin=WORLD, contents=["$origin/**", f"- /{SPLATS}/**"], name="Points", eye_controls=eye
+        ),
+    )
     # The beams lie in the picture by projection: a wrong calibration shows at once.
     camera = rrb.Spatial2DView(origin=CAMERA, contents=["$origin/**", f"/{SCAN}"], name="Camera")
     plots = [
         rrb.TimeSeriesView(
             origin=f"plots/{quantity}", name=name, plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop)
         )
-        for quantity, name in PLOTS.items()
+        for quantity, name in {**MAP_PLOTS, **PLOTS}.items()
     ]
     health = rrb.Tabs(
         rrb.TextDocumentView(origin="health/table", name="Nodes"),
         rrb.StateTimelineView(origin="health/state", name="States"),
-        *plots[3:],
+        *plots[4:],
     )
     return rrb.Blueprint(
         rrb.Vertical(
@@ -37,6 +47,7 @@ def layout() -> rrb.Blueprint:
                 rrb.Vertical(
                     camera,
                     rrb.Tabs(
+                        rrb.Spatial2DView(origin=RENDER, name="Render"),
                         rrb.Spatial2DView(origin=DEPTH, name="Depth"),
                         rrb.TextLogView(origin="log", name="Log"),
                     ),
@@ -44,7 +55,7 @@ def layout() -> rrb.Blueprint:
                 ),
                 column_shares=[3, 2],
             ),
-            rrb.Horizontal(health, *plots[:3], column_shares=[3, 2, 2, 2]),
+            rrb.Horizontal(health, *plots[:4], column_shares=[3, 2, 2, 2, 2]),
             row_shares=[5, 2],
         ),
         rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="following"),

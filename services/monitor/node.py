@@ -11,10 +11,11 @@ from pydantic import Field
 
 from common.config import NodeConfig
 from common.errors import UserError
-from common.messages import FusedDepth, Health, Odometry, Rig
+from common.messages import FusedDepth, Health, MapStatus, Odometry, Rig
 from common.node import Input, Node, Output
 from services.monitor.depth_view import DepthView
 from services.monitor.layout import layout
+from services.monitor.map_view import MapView
 from services.monitor.panel import NodeReport, Panel
 from services.monitor.scene import Look, Scene
 from services.monitor.screen import Screen
@@ -47,6 +48,7 @@ class MonitorConfig(NodeConfig):
     grid_hz: Hz = 0.5
     anchors_hz: Hz = 1.0
     depth_hz: Hz = 2.0
+    splats_hz: Hz = 0.5  # of each chunk of the map
     clouds: Annotated[int, Field(ge=1)] = 40  # keyframes whose points are shown
     path_points: Annotated[int, Field(ge=16)] = 2000
     path_step_m: Annotated[float, Field(gt=0.0)] = 0.05
@@ -71,6 +73,11 @@ def _draw_odometry(scene: Scene, panel: Panel, m: Odometry) -> None:
 def _draw_depth(view: DepthView, panel: Panel, m: FusedDepth) -> None:
     view.depth(m.stamp_ns, m.depth_m)
     panel.status("fusion", "ok" if m.status == "ok" else "refused", m.status.removeprefix("ok"), m.stamp_ns)
+
+
+def _draw_status(view: MapView, panel: Panel, m: MapStatus) -> None:
+    view.figures(m.stamp_ns, m.foretold_psnr_db, m.psnr_db, m.depth_error_m)
+    panel.status("mapping", "ok" if m.status == "ok" else "refused", m.status.removeprefix("ok"), m.stamp_ns)
 
 
 Draw = Callable[[Any, Panel, Any], None]
@@ -102,6 +109,13 @@ DEPTH: dict[Input, Draw] = {
     Input("fusion/depth", "latest"): _draw_depth,
     Input("fusion/cloud", "latest"): lambda view, _, m: view.cloud(m.stamp_ns, m.points_odom_m, m.colours),
 }
+MAP: dict[Input, Draw] = {
+    Input("mapping/chunk", "every"): lambda view, _, m: view.chunk(
+        m.stamp_ns, m.anchor_id, m.revision, m.T_map_anchor, m.packed
+    ),
+    Input("mapping/preview", "latest"): lambda view, _, m: view.render(m.stamp_ns, m.render),
+    Input("mapping/status", "latest"): _draw_status,
+}
 
 
 def _handler(view: str, draw: Draw) -> Callable[[MonitorNode, Any], tuple[Output, ...]]:
@@ -121,18 +135,18 @@ _Handlers = type(
     (),
     {
         entry.row.handler: _handler(view, draw)
-        for view, rows in (("scene", SCENE), ("depth_view", DEPTH))
+        for view, rows in (("scene", SCENE), ("depth_view", DEPTH), ("map_view", MAP))
         for entry, draw in rows.items()
     },
 )
 
 
 class MonitorNode(_Handlers, Node):
-    """Draws what comes by `SCENE` and `DEPTH`, and the health of all nodes."""
+    """Draws what comes by `SCENE`, `DEPTH` and `MAP`, and the health of all nodes."""
 
     name = "monitor"
     Config = MonitorConfig
-    inputs = (*SCENE, *DEPTH)
+    inputs = (*SCENE, *DEPTH, *MAP)
     config: MonitorConfig
 
     def configure(self) -> None:
@@ -145,11 +159,12 @@ class MonitorNode(_Handlers, Node):
         except (RuntimeError, OSError) as error:
             self.screen.close()
             raise UserError(f"monitor: {error}") from error
-        kinds = ("image", "scan", "pose", "path", "grid", "anchors", "depth")
+        kinds = ("image", "scan", "pose", "path", "grid", "anchors", "depth", "splats")
         limits = RateLimit({"health": 1.0, **{kind: getattr(c, f"{kind}_hz") for kind in kinds}})
         self.panel = Panel(self.screen, limits)
         self.scene = Scene(self.screen, limits, Look(c.path_points, c.path_step_m, c.body_size_m))
         self.depth_view = DepthView(self.screen, limits, c.clouds)
+        self.map_view = MapView(self.screen, limits)
         self.detail = self.screen.status
         log.info("%s", self.detail)
 
@@ -195,6 +210,7 @@ class MonitorNode(_Handlers, Node):
 
     def drain(self) -> tuple[Output, ...]:
         self.scene.finish()
+        self.map_view.finish()
         self.screen.flush()
         return ()
 

@@ -1,0 +1,103 @@
+"""The Gaussian map, drawn in rerun.
+
+map/splats/<anchor>          Gaussians of one submap, in the submap's frame: a loop closure moves the frame
+map_render                   the newest render, from the keyframe whose picture it should be
+plots/psnr_db/<what>         of the newest keyframe: foretold before it was taken in, and after
+plots/depth_error_m/map      median |rendered - fused|
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import rerun as rr
+
+from common.geometry import quat_xyzw_from_matrix
+from common.raster.layout import COLOUR, MEAN, OPACITY, QUAT, SCALE
+from common.splats import unpack
+from services.monitor.screen import Screen
+from services.monitor.tracks import RateLimit
+
+SPLATS = "map/splats"
+RENDER = "map_render"
+PLOTS = {"psnr_db": "Map against picture, PSNR [dB]", "depth_error_m": "Map against depth [m]"}
+
+
+@dataclass
+class _Chunk:
+    stamp_ns: int
+    T_map_anchor: np.ndarray
+    packed: np.ndarray
+
+
+class MapView:
+    """The newest version of every chunk, each drawn at a bounded rate and once more at the end."""
+
+    def __init__(self, screen: Screen, limits: RateLimit) -> None:
+        self._screen = screen
+        self._limits = limits
+        self._revisions: dict[int, int] = {}
+        self._waiting: dict[int, _Chunk] = {}
+        self._introduced: set[str] = set()
+
+    def chunk(
+        self, stamp_ns: int, anchor: int, revision: int, T_map_anchor: np.ndarray, packed: np.ndarray
+    ) -> None:
+        """Packed Gaussians of an anchor, in its frame; older versions than the one known are ignored.
+
+        Raises:
+            ValueError: the bytes are no packed Gaussians.
+        """
+        if revision < self._revisions.get(anchor, -1):
+            return
+        self._revisions[anchor] = revision
+        chunk = _Chunk(stamp_ns, T_map_anchor, packed)
+        if self._limits.due("splats", stamp_ns, str(anchor)):
+            self._waiting.pop(anchor, None)
+            self._draw(anchor, chunk)
+        else:
+            self._waiting[anchor] = chunk
+
+    def _draw(self, anchor: int, chunk: _Chunk) -> None:
+        params = unpack(chunk.packed)
+        entity = f"{SPLATS}/{'odom' if anchor < 0 else anchor}"
+        opacity = 1.0 / (1.0 + np.exp(-params[OPACITY]))
+        rgba = np.concatenate([params[COLOUR:], opacity[None]]).T
+        T = chunk.T_map_anchor
+        self._screen.log(
+            entity,
+            rr.Transform3D(
+                translation=T[:3, 3], quaternion=rr.Quaternion(xyzw=quat_xyzw_from_matrix(T[:3, :3]))
+            ),
+            rr.GaussianSplats3D(
+                np.ascontiguousarray(params[MEAN:SCALE].T),
+                scales=np.ascontiguousarray(np.exp(params[SCALE:QUAT]).T),
+                quaternions=np.ascontiguousarray(np.roll(params[QUAT:OPACITY], -1, axis=0).T),
+                colors=(np.clip(rgba, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8),
+            ),
+            stamp_ns=chunk.stamp_ns,
+        )
+
+    def render(self, stamp_ns: int, jpeg: np.ndarray) -> None:
+        """The map as seen from its newest keyframe: uint8 [B], JPEG."""
+        if self._limits.due("image", stamp_ns, RENDER):
+            drawing = rr.EncodedImage(contents=jpeg.tobytes(), media_type="image/jpeg")
+            self._screen.log(RENDER, drawing, stamp_ns=stamp_ns)
+
+    def figures(self, stamp_ns: int, foretold_psnr_db: float, psnr_db: float, depth_error_m: float) -> None:
+        """One point of each curve; NaN draws none."""
+        values = (foretold_psnr_db, psnr_db, depth_error_m)
+        for name, value in zip(("psnr_db/foretold", "psnr_db/after", "depth_error_m/map"), values):
+            if np.isfinite(value):
+                if name not in self._introduced:
+                    self._introduced.add(name)
+                    label = rr.SeriesLines(names=name.partition("/")[2])
+                    self._screen.log(f"plots/{name}", label, static=True)
+                self._screen.log(f"plots/{name}", rr.Scalars(value), stamp_ns=stamp_ns)
+
+    def finish(self) -> None:
+        """Nothing more will come: what the rate held back is drawn."""
+        for anchor, chunk in self._waiting.items():
+            self._draw(anchor, chunk)
+        self._waiting.clear()
