@@ -1,0 +1,152 @@
+"""Direct alignment of a rendered view and a picture, as compiled loops on arrays.
+
+The rendered view is a set of points with colour: X = z K^-1 (u, v, 1) in the frame of the render. Moved by
+T_now_render they fall on the picture; the residual is the picture there minus the rendered grey.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from common.raster.compiled import kernel
+
+UNKNOWNS = 8  # (rho, phi) of the left perturbation of T_now_render, log gain, offset
+
+
+@kernel
+def choose_points(grey, z_m, alpha, least_gradient, least_alpha, stride, out):  # noqa: ANN001, ANN201
+    """Writes (u, v, z, grey) of the pixels with contrast that the map explains into out [N, 4]; gives N.
+
+    `stride` takes every n-th of them; neighbours must be explained and lie on the same surface.
+    """
+    height, width = grey.shape
+    found, n = 0, 0
+    for v in range(1, height - 1):
+        for u in range(1, width - 1):
+            if alpha[v, u] < least_alpha or not z_m[v, u] > 0.0:
+                continue
+            dx = np.float32(0.5) * (grey[v, u + 1] - grey[v, u - 1])
+            dy = np.float32(0.5) * (grey[v + 1, u] - grey[v - 1, u])
+            if dx * dx + dy * dy < least_gradient * least_gradient:
+                continue
+            near = min(min(alpha[v, u - 1], alpha[v, u + 1]), min(alpha[v - 1, u], alpha[v + 1, u]))
+            if near < least_alpha:
+                continue
+            found += 1
+            if found % stride == 0 and n < len(out):
+                out[n, 0], out[n, 1], out[n, 2], out[n, 3] = u, v, z_m[v, u], grey[v, u]
+                n += 1
+    return n
+
+
+@kernel
+def normal_equations(  # noqa: ANN201
+    points, count, camera, R, t, picture, slope_x, slope_y, gain, offset, delta, H, g, residuals,  # noqa: ANN001
+):  # fmt: skip
+    """Sums J^T w J into H [8, 8] and J^T w r into g [8] with Huber's weights; gives (points used, cost).
+
+    Args:
+        points: float32 [N, 4] as chosen. camera: float64 (fx, fy, cx, cy) of this level. R, t: of T_now_render.
+        picture, slope_x, slope_y: float32 [H, W], grey and its central differences a pixel.
+        gain, offset: r = picture - (gain grey + offset). delta: Huber's threshold.
+        residuals: float32 [N], NaN where a point falls outside.
+    """
+    height, width = picture.shape
+    fx, fy, cx, cy = camera[0], camera[1], camera[2], camera[3]
+    H[:] = 0.0
+    g[:] = 0.0
+    J = np.empty(UNKNOWNS)
+    used, cost = 0, 0.0
+    for i in range(count):
+        residuals[i] = np.nan
+        z0 = float(points[i, 2])
+        x0, y0 = (points[i, 0] - cx) / fx * z0, (points[i, 1] - cy) / fy * z0
+        x = R[0, 0] * x0 + R[0, 1] * y0 + R[0, 2] * z0 + t[0]
+        y = R[1, 0] * x0 + R[1, 1] * y0 + R[1, 2] * z0 + t[1]
+        z = R[2, 0] * x0 + R[2, 1] * y0 + R[2, 2] * z0 + t[2]
+        if z < 0.05:
+            continue
+        iz = 1.0 / z
+        u, v = fx * x * iz + cx, fy * y * iz + cy
+        if not (u >= 0.0 and v >= 0.0 and u < width - 1 and v < height - 1):
+            continue
+        c, r = int(u), int(v)
+        a, b = u - c, v - r
+        w00, w01, w10, w11 = (1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b
+        seen = w00 * picture[r, c] + w01 * picture[r, c + 1] + w10 * picture[r + 1, c] + w11 * picture[r + 1, c + 1]
+        sx = w00 * slope_x[r, c] + w01 * slope_x[r, c + 1] + w10 * slope_x[r + 1, c] + w11 * slope_x[r + 1, c + 1]
+        sy = w00 * slope_y[r, c] + w01 * slope_y[r, c + 1] + w10 * slope_y[r + 1, c] + w11 * slope_y[r + 1, c + 1]
+        grey = float(points[i, 3])
+        error = seen - (gain * grey + offset)
+        residuals[i] = error
+        size = abs(error)
+        w = 1.0 if size <= delta else delta / size
+        cost += 0.5 * error * error if size <= delta else delta * (size - 0.5 * delta)
+        # d(u, v)/dX [I | -X^]: the analytic SE(3) Jacobian (Matsuki et al. 2024, eqs. 5 and 6).
+        px, py = sx * fx * iz, sy * fy * iz
+        pz = -(px * x + py * y) * iz
+        J[0], J[1], J[2] = px, py, pz
+        J[3], J[4], J[5] = y * pz - z * py, z * px - x * pz, x * py - y * px
+        J[6], J[7] = -gain * grey, -1.0
+        for row in range(UNKNOWNS):
+            wj = w * J[row]
+            g[row] += wj * error
+            for column in range(row, UNKNOWNS):
+                H[row, column] += wj * J[column]
+        used += 1
+    for row in range(UNKNOWNS):
+        for column in range(row):
+            H[row, column] = H[column, row]
+    return used, cost
+
+
+@kernel
+def adam_rows(gradients, index, visible, params, first, second, steps, rates):  # noqa: ANN001, ANN201
+    """One step of Adam (Kingma & Ba 2015) on the visible Gaussians, each with its own count of steps.
+
+    Args:
+        gradients: float32 [>= 14, >= V]. index: int32 [>= V]. params, first, second: float32 [14, capacity].
+        steps: float32 [capacity]. rates: float32 [14].
+    """
+    rows = len(rates)
+    for k in range(visible):
+        i = index[k]
+        hidden = True
+        for row in range(rows):
+            hidden = hidden and gradients[row, k] == 0.0
+        if hidden:
+            continue
+        steps[i] += np.float32(1.0)
+        fix_1 = np.float32(1.0) / (np.float32(1.0) - np.float32(0.9) ** steps[i])
+        fix_2 = np.float32(1.0) / (np.float32(1.0) - np.float32(0.999) ** steps[i])
+        for row in range(rows):
+            d = gradients[row, k]
+            m = first[row, i] + np.float32(0.1) * (d - first[row, i])
+            v = second[row, i] + np.float32(0.001) * (d * d - second[row, i])
+            first[row, i], second[row, i] = m, v
+            params[row, i] -= rates[row] * m * fix_1 / (np.sqrt(v * fix_2) + np.float32(1e-12))
+
+
+@kernel
+def map_loss(image, rgb, z_m, weight, colour_scale, depth_scale, gradient):  # noqa: ANN001, ANN201
+    """L1 of colour and of weighted depth of a render, and its gradient float32 [5, H, W]; gives the loss.
+
+    `image` float32 [5, H, W] as rendered, `rgb` float32 [3, H, W], `z_m` float32 [H, W] (0 unknown). The depth
+    term is w |sum w_i z_i - z alpha|: zero where the surface is right, whatever its opacity.
+    """
+    height, width = z_m.shape
+    total = 0.0
+    for v in range(height):
+        for channel in range(3):
+            for u in range(width):
+                error = image[channel, v, u] - rgb[channel, v, u]
+                gradient[channel, v, u] = colour_scale if error > 0.0 else -colour_scale
+                total += abs(error) * colour_scale
+        for u in range(width):
+            w = weight[v, u] * depth_scale if z_m[v, u] > 0.0 else np.float32(0.0)
+            error = image[3, v, u] - z_m[v, u] * image[4, v, u]
+            slope = w if error > 0.0 else -w
+            gradient[3, v, u] = slope
+            gradient[4, v, u] = -slope * z_m[v, u]
+            total += w * abs(error)
+    return total
