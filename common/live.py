@@ -213,6 +213,11 @@ class Live:
     def _run_source(self) -> None:
         playback = Playback(self.settings.rate, self._bookmark, self.settings.resume)
         for item in self.node.source():
+            if item is None:  # a device with nothing to say just now
+                self._attend()
+                if self._stopping:
+                    return
+                continue
             while not self._stopping and (wait_s := playback.wait_s(item)) > 0.0:
                 self._attend()
                 time.sleep(min(wait_s, _POLL_S))

@@ -117,8 +117,9 @@ class Node:
     def close(self) -> None:
         """Releases files and devices. Called once, also after an error."""
 
-    def source(self) -> Iterator[Sourced]:
-        """Sensors override this; a node with a source has no inputs."""
+    def source(self) -> Iterator[Sourced | None]:
+        """Sensors override this; a node with a source has no inputs. A device yields None several times a
+        second while it has nothing to say, so that the runner can look after the rest."""
         return iter(())
 
     def on_health(self, health: Health) -> None:

@@ -1,0 +1,1 @@
+"""Planar lidars: their byte protocols, and revolutions with honest times."""

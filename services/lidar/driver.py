@@ -1,0 +1,108 @@
+"""What all drivers share: samples to stamped turns, with the noise of the link and the device's clock."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable
+
+import numpy as np
+
+from services.lidar.clock import DeviceClock
+from services.lidar.framing import Counters
+from services.lidar.guard import LinkNoise
+from services.lidar.link import Link
+from services.lidar.revolution import RevolutionBuilder
+from services.lidar.samples import Samples, StampedScan
+
+_CHAIN = 31  # spans remembered
+_CHAIN_NEEDED = 8  # before the first check
+_SLACK_DEG = 1.0  # a motor's wobble over a packet
+_SLACK = 0.1  # of the angle turned
+
+
+class Driver:
+    """One kind of lidar. `start` talks to it, `feed` takes what it says from then on."""
+
+    bauds: tuple[int, ...] = (115200,)
+    clockwise = True
+    silence_s = 1.0  # without a byte for so long it counts as gone
+
+    def __init__(self, *, unchecked: bool = False) -> None:
+        """`unchecked`: its packets carry no checksum, so that no single range is believed."""
+        self.counters = Counters()
+        self.noise = LinkNoise(always=unchecked)
+        self.clock = DeviceClock()
+        self.range_min_m = 0.05
+        self.range_max_m = 40.0
+        self.model = ""
+        self.builder = RevolutionBuilder(self.counters, clockwise=self.clockwise)
+
+    def start(self, link: Link) -> None:
+        """Asks who is there and starts the stream.
+
+        Raises:
+            LinkError: nobody answers as this kind of device does.
+        """
+        raise NotImplementedError
+
+    def feed(self, data: bytes, at_ns: int) -> list[StampedScan]:
+        """The turns that `data`, arrived at `at_ns`, completes."""
+        raise NotImplementedError
+
+    def stop(self, link: Link) -> None:
+        """Ends the stream, as far as the device can be told."""
+
+    def restart(self) -> None:
+        """Forgets what was under way, when the link has been opened anew."""
+        self.builder.forget()
+        self.clock.forget()
+
+    def turns(self, samples: Iterable[Samples]) -> list[StampedScan]:
+        """Stamped turns out of samples."""
+        found = []
+        for part in samples:
+            for turn in self.builder.add(part, self.noise.noisy):
+                stamp_ns = self.clock.stamp_ns(turn.time_s)
+                found.append(StampedScan(stamp_ns, turn, self.range_min_m, self.range_max_m))
+        return found
+
+
+class StartChain:
+    """Whether a packet begins where its predecessors say that it must.
+
+    A wrong byte in a packet's angle turns all its ranges to a wrong place; the motor's even turning shows it.
+    """
+
+    def __init__(self) -> None:
+        self._spans: deque[float] = deque(maxlen=_CHAIN)
+        self._anchor_deg: float | None = None
+        self._slots = 0
+        self._refused = False
+
+    @property
+    def typical_deg(self) -> float | None:
+        """Angle from packet to packet; None while too few have come."""
+        return float(np.median(self._spans)) if len(self._spans) >= _CHAIN_NEEDED else None
+
+    def missed(self, slots: int = 1) -> None:
+        """Packets that did not come, or were bad."""
+        self._slots += slots
+
+    def takes(self, start_deg: float) -> bool:
+        """Whether a packet that begins there continues what came before."""
+        slots, typical = self._slots + 1, self.typical_deg
+        anchor, self._anchor_deg, self._slots = self._anchor_deg, start_deg, 0
+        if anchor is None:
+            return True
+        if typical is None:
+            if slots == 1:
+                self._spans.append((start_deg - anchor) % 360.0)
+            return True
+        error = abs((start_deg - anchor - slots * typical + 180.0) % 360.0 - 180.0)
+        fits = error <= _SLACK_DEG + _SLACK * typical * slots
+        if fits and slots == 1:
+            self._spans.append((start_deg - anchor) % 360.0)
+        elif not fits and self._refused:
+            self._spans.clear()  # twice in a row: it is the speed that has changed
+        self._refused = not fits
+        return fits

@@ -1,0 +1,153 @@
+"""Hokuyo lidars that speak SCIP 2.0 or 2.2 (URG, UBG, UHG, UTM, UST, UXM): over USB, RS-232 or TCP."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+
+from services.lidar.clock import Unwrapper
+from services.lidar.driver import Driver
+from services.lidar.framing import Framer
+from services.lidar.link import Link, LinkError, drain
+from services.lidar.samples import Revolution, StampedScan
+from services.lidar.scip import Geometry, ScanReply, parameters
+
+_ANSWER_S = 0.6
+_TRIES = 4
+_TIME_MODULUS_MS = 1 << 24
+_LEAST_SHARE = 0.2  # of a scan's blocks that must be good
+
+
+class HokuyoDriver(Driver):
+    """Distances as they are measured, counter-clockwise; with `intensity` also how strong the echo was."""
+
+    bauds = (115200, 19200, 750000)
+    clockwise = False
+
+    def __init__(self, intensity: bool = False) -> None:
+        super().__init__()
+        self._intensity = intensity
+        self._byte_s = 0.0
+        self._reply: ScanReply | None = None
+        self._rest = b""
+
+    def start(self, link: Link) -> None:
+        self.restart()
+        self._byte_s = link.byte_s
+        link.write(b"QT\n")
+        drain(link)
+        link.write(b"SCIP2.0\n")  # the URG-04LX starts in SCIP 1.1; others answer that they do not know it
+        drain(link)
+        geometry = _geometry(link)
+        self.model = f"Hokuyo {geometry.model.strip()}"
+        self.range_min_m, self.range_max_m = geometry.range_min_m, geometry.range_max_m
+        self._reply = ScanReply(geometry, self._intensity)
+        self._framer = Framer(self._reply.length, self._reply.begins, self._reply.begins, self.counters, 1)
+        self._time = Unwrapper(_TIME_MODULUS_MS, 1e3)
+        self._last_s: float | None = None
+        self._missed = 0
+        self._rest = _begin(link, self._reply.command)
+
+    def feed(self, data: bytes, at_ns: int) -> list[StampedScan]:
+        data, self._rest = self._rest + data, b""
+        found = []
+        for packet in self._framer.feed(data):
+            if packet is None:
+                self._missed += 1
+                self.counters.dropped_scans += 1
+                self.counters.lost_samples += self._reply.geometry.count
+                continue
+            found += self._scan(packet, at_ns)
+        return found
+
+    def stop(self, link: Link) -> None:
+        link.write(b"QT\n")
+
+    def _scan(self, packet: bytes, at_ns: int) -> list[StampedScan]:
+        geometry = self._reply.geometry
+        beam_s = geometry.period_s / geometry.steps_per_turn
+        start_s = self._time_of(packet, at_ns)
+        if start_s is None:
+            self.counters.dropped_scans += 1
+            self.counters.lost_samples += geometry.count
+            return []
+        range_m, intensity, blocks, bad = self._reply.values(packet)
+        for i in range(blocks):
+            self.noise.saw(i >= bad)
+        if bad > (1.0 - _LEAST_SHARE) * blocks:
+            self.counters.dropped_scans += 1
+            self.counters.lost_samples += geometry.count
+            return []
+        delay_ns = round(self._reply.length * self._byte_s * 1e9)
+        if not self.clock.hear(start_s + geometry.count * beam_s, at_ns - delay_ns):
+            self.counters.dropped_scans += 1  # its time is wrong
+            self.counters.lost_samples += geometry.count
+            return []
+        step_rad = 2.0 * np.pi / geometry.steps_per_turn
+        turn = Revolution(
+            time_s=start_s,
+            angle_min_rad=(geometry.first_step - geometry.front_step) * step_rad,
+            angle_increment_rad=step_rad,
+            time_increment_s=beam_s,
+            scan_time_s=geometry.period_s,
+            range_m=range_m.astype(np.float32),
+            intensity=intensity.astype(np.float32) if self._intensity else np.zeros(0, np.float32),
+        )
+        lost = round(geometry.count * bad / blocks)
+        found = self.builder.take(turn, lost, self.noise.noisy)
+        return [
+            StampedScan(self.clock.stamp_ns(turn.time_s), turn, self.range_min_m, self.range_max_m)
+            for turn in found
+        ]
+
+    def _time_of(self, packet: bytes, at_ns: int) -> float | None:
+        """Device time of a reply's first measurement; guessed from the one before where its sum is wrong."""
+        time_ms = self._reply.time_ms(packet)
+        missed, self._missed = self._missed + 1, 0
+        expected = None if self._last_s is None else self._last_s + missed * self._reply.geometry.period_s
+        if time_ms is None:
+            self._last_s = expected
+            return expected
+        self._last_s = self._time(time_ms, at_ns) / 1e3
+        return self._last_s
+
+
+def _geometry(link: Link) -> Geometry:
+    problem = "no Hokuyo answers here"
+    for _ in range(_TRIES):
+        try:
+            return Geometry.of(parameters(_ask(link, b"PP\n")))
+        except ValueError as error:
+            problem = str(error)
+    raise LinkError(problem)
+
+
+def _ask(link: Link, command: bytes) -> bytes:
+    """What comes until an empty line, or nothing more does."""
+    link.write(command)
+    data, deadline = b"", time.monotonic() + _ANSWER_S
+    while time.monotonic() < deadline and b"\n\n" not in data[data.find(command[:2]) + 1 :]:
+        data += link.read(0.05)
+    return data
+
+
+def _begin(link: Link, command: bytes) -> bytes:
+    """Starts the scans; the first bytes of them."""
+    status = b""
+    for _ in range(_TRIES):
+        link.write(command + b"\n")
+        data, deadline = b"", time.monotonic() + _ANSWER_S
+        while time.monotonic() < deadline:
+            data += link.read(0.05)
+            agreed, first = command + b"\n00P\n\n", command + b"\n99b\n"
+            if (at := data.find(agreed)) >= 0:
+                return data[at + len(agreed) :]
+            if (at := data.find(first)) >= 0:
+                return data[at:]
+            at = data.find(command + b"\n")
+            if at >= 0 and len(data) >= at + 18:
+                status = data[at + 16 : at + 18]
+        link.write(b"QT\n")
+        drain(link)
+    raise LinkError(f"the Hokuyo refuses to measure (status {status.decode('ascii', 'replace')!r})")

@@ -1,0 +1,128 @@
+"""LDROBOT LD06, LD19 (and their like): they speak as soon as they have power, 47 bytes a packet.
+
+LDROBOT, "LD06 / LD19 Development Manual", chapter 3 (communication protocol): 0x54, 0x2C (twelve points),
+speed in degrees a second, start angle in 0.01 degrees, twelve times distance in mm and intensity, end
+angle, time in ms (starts over at 30000), CRC-8 with polynomial 0x4D.
+"""
+
+from __future__ import annotations
+
+import struct
+from typing import NamedTuple
+
+import numpy as np
+
+from services.lidar.clock import Unwrapper, spread
+from services.lidar.driver import Driver, StartChain
+from services.lidar.framing import Framer
+from services.lidar.link import Link
+from services.lidar.samples import Samples, StampedScan
+
+PACKET_BYTES = 47
+POINTS = 12
+_HEAD = b"\x54\x2c"
+_LAYOUT = struct.Struct("<2sHH36sHHB")
+_TIME_MODULUS_MS = 30000
+
+
+def _crc_table() -> bytes:
+    table = []
+    for value in range(256):
+        for _ in range(8):
+            value = ((value << 1) ^ 0x4D if value & 0x80 else value << 1) & 0xFF
+        table.append(value)
+    return bytes(table)
+
+
+_CRC = _crc_table()
+
+
+def crc8(data: bytes) -> int:
+    """CRC-8, polynomial 0x4D, starting at 0, most significant bit first."""
+    value = 0
+    for byte in data:
+        value = _CRC[value ^ byte]
+    return value
+
+
+class Packet(NamedTuple):
+    """One packet as it stands."""
+
+    speed_deg_s: float
+    start_deg: float
+    end_deg: float
+    time_ms: int
+    range_m: np.ndarray  # float64 [12], NaN where the distance is 0: no valid measurement
+    intensity: np.ndarray  # float64 [12]
+
+    @property
+    def step_deg(self) -> float:
+        """Angle between two points."""
+        return ((self.end_deg - self.start_deg) % 360.0) / (POINTS - 1)
+
+
+def begins(packet: bytes) -> bool:
+    """Whether it starts as one."""
+    return packet.startswith(_HEAD)
+
+
+def whole(packet: bytes) -> bool:
+    """Whether its checksum is right."""
+    return crc8(packet[:-1]) == packet[-1]
+
+
+def parse(packet: bytes) -> Packet:
+    """The values of one packet of 47 bytes."""
+    _, speed, start, points, end, time_ms, _ = _LAYOUT.unpack(packet)
+    data = np.frombuffer(points, dtype=[("mm", "<u2"), ("intensity", "u1")])
+    range_m = np.where(data["mm"] > 0, data["mm"] / 1000.0, np.nan)
+    return Packet(
+        float(speed), start / 100.0, end / 100.0, time_ms, range_m, data["intensity"].astype(np.float64)
+    )
+
+
+class LdrobotDriver(Driver):
+    """Only listens. Angles grow clockwise seen from above."""
+
+    bauds = (230400,)
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.range_min_m, self.range_max_m = 0.02, 12.0
+        self.model = "LDROBOT LD06/LD19"
+        self._byte_s = 0.0
+        self.restart()
+
+    def start(self, link: Link) -> None:
+        self._byte_s = link.byte_s
+        self.restart()
+
+    def restart(self) -> None:
+        super().restart()
+        self._framer = Framer(PACKET_BYTES, begins, whole, self.counters)
+        self._chain = StartChain()
+        self._time = Unwrapper(_TIME_MODULUS_MS, 1e3)
+
+    def feed(self, data: bytes, at_ns: int) -> list[StampedScan]:
+        parts = []
+        for packet in self._framer.feed(data):
+            self.noise.saw(packet is not None)
+            if packet is None:
+                self._chain.missed()
+                continue
+            values = parse(packet)
+            last_s = self._time(values.time_ms % _TIME_MODULUS_MS, at_ns) / 1e3
+            in_place = self._chain.takes(values.start_deg)
+            possible = 0.0 < values.step_deg < 3.0 and values.speed_deg_s > 0.0
+            delay_ns = round(PACKET_BYTES * self._byte_s * 1e9)
+            if not (in_place and possible and self.clock.hear(last_s, at_ns - delay_ns)):
+                continue  # its samples are missing in the turn and counted there
+            parts.append(
+                Samples(
+                    angle_deg=values.start_deg + values.step_deg * np.arange(POINTS),
+                    range_m=values.range_m,
+                    intensity=values.intensity,
+                    time_s=spread(last_s, values.step_deg / values.speed_deg_s, POINTS),
+                )
+            )
+        return self.turns(parts)

@@ -1,0 +1,97 @@
+"""A lidar as a node: its turns as scans, with stamps that no change of the host's time moves."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from common.clock import StampClock
+from common.messages import Scan
+from common.node import Node, Sourced
+from services.lidar.config import HokuyoConfig, LidarConfig, RplidarConfig
+from services.lidar.driver import Driver
+from services.lidar.hokuyo import HokuyoDriver
+from services.lidar.ldrobot import LdrobotDriver
+from services.lidar.link import Link, open_link
+from services.lidar.reader import Reader
+from services.lidar.rplidar import RplidarDriver
+from services.lidar.samples import StampedScan
+
+
+class _LidarNode(Node):
+    """What the kinds share. A device that is not there yet, or gone, is waited for."""
+
+    Config = LidarConfig
+    config: LidarConfig
+
+    def driver(self) -> Driver:
+        """The driver of this kind."""
+        raise NotImplementedError
+
+    def configure(self) -> None:
+        """Makes ready; opening waits until the stream is asked for, so that an absent device is a status."""
+        bauds = (self.config.baud,) if self.config.baud else ()
+        self._reader = Reader(self.driver, self._open, bauds, StampClock().now_ns)
+
+    def _open(self, baud: int) -> Link:
+        return open_link(self.config.device, baud)
+
+    def source(self) -> Iterator[Sourced | None]:
+        """Scans for ever; None while there is nothing to say."""
+        for scan in self._reader.scans():
+            self.detail = self._reader.status
+            yield None if scan is None else Sourced(None, "lidar/scan", self.message(scan))
+
+    def message(self, scan: StampedScan) -> Scan:
+        """A turn as it goes out. NaN: not measured; no device here tells "nothing there" from "not seen"."""
+        turn, sign = scan.revolution, -1.0 if self.config.upside_down else 1.0
+        return Scan(
+            stamp_ns=scan.stamp_ns,
+            angle_min_rad=sign * turn.angle_min_rad,
+            angle_increment_rad=sign * turn.angle_increment_rad,
+            time_increment_s=turn.time_increment_s,
+            scan_time_s=turn.scan_time_s,
+            range_min_m=self.config.range_min_m or scan.range_min_m,
+            range_max_m=self.config.range_max_m or scan.range_max_m,
+            ranges_m=np.asarray(turn.range_m, np.float32),
+            intensities=np.asarray(turn.intensity, np.float32),
+        )
+
+    def close(self) -> None:
+        if hasattr(self, "_reader"):
+            self._reader.close()
+
+
+class RplidarNode(_LidarNode):
+    """SLAMTEC RPLIDAR A, S and C series."""
+
+    name = "lidar"
+    Config = RplidarConfig
+    config: RplidarConfig
+    outputs = ("lidar/scan",)
+
+    def driver(self) -> Driver:
+        return RplidarDriver(self.config.mode)
+
+
+class LdrobotNode(_LidarNode):
+    """LDROBOT LD06 and LD19."""
+
+    name = "lidar"
+    outputs = ("lidar/scan",)
+
+    def driver(self) -> Driver:
+        return LdrobotDriver()
+
+
+class HokuyoNode(_LidarNode):
+    """Hokuyo over serial or TCP."""
+
+    name = "lidar"
+    Config = HokuyoConfig
+    config: HokuyoConfig
+    outputs = ("lidar/scan",)
+
+    def driver(self) -> Driver:
+        return HokuyoDriver(self.config.intensity)

@@ -1,0 +1,181 @@
+"""Cuts a stream of measurements into turns and puts each on a regular grid of directions."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from services.lidar.framing import Counters
+from services.lidar.guard import confirmed
+from services.lidar.samples import Revolution, Samples
+
+_LEAST_SHARE = 0.2  # of a turn's directions that must have been measured
+_LEAST_SAMPLES = 20
+_STEP_BACK_DEG = 20.0
+
+
+class RevolutionBuilder:
+    """Turns out of samples; the first and any turn with a hole of most of its length are dropped."""
+
+    def __init__(self, counters: Counters, *, clockwise: bool) -> None:
+        self._counters = counters
+        self._clockwise = clockwise
+        self._parts: list[Samples] = []
+        self._whole = False  # the turn at hand began at its beginning
+        self._total_deg: float | None = None  # angle of the newest sample, counted on over all turns
+        self._turn = 0
+        self._last_time = -np.inf
+        self._period_s: float | None = None
+        self._before: Revolution | None = None
+
+    def forget(self) -> None:
+        """The stream was cut: what is at hand is no turn."""
+        if self._parts and self._whole:
+            self._counters.dropped_scans += 1
+        self._parts, self._whole, self._before, self._total_deg = [], False, None, None
+        self._last_time = -np.inf
+
+    def add(self, samples: Samples, noisy: bool = False) -> list[Revolution]:
+        """The turns that these samples end. With `noisy`, ranges that nothing confirms are left out."""
+        if not len(samples):
+            return []
+        if self._period_s is not None and samples.time_s[0] - self._last_time > 0.8 * self._period_s:
+            self.forget()  # nobody knows how many turns went by
+        total, turn = self._count_on(samples.angle_deg)
+        cuts = np.flatnonzero(np.diff(turn, prepend=self._turn)).tolist()
+        turns = []
+        start = 0
+        for cut in [*cuts, len(samples)]:
+            if cut > start:
+                self._parts.append(_piece(samples, slice(start, cut), total - 360.0 * turn[start]))
+            if cut < len(samples):
+                turns += self._finish(float(samples.time_s[cut]), noisy)
+            start = cut
+        self._total_deg, self._turn = float(total[-1]), int(turn[-1])
+        self._last_time = float(samples.time_s[-1])
+        return turns
+
+    def _count_on(self, angle_deg: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Angles counted on over all turns, and the number of the turn of each sample.
+
+        A device that corrects its angles by the range steps back a little at times, never forward by
+        nearly a turn; the turn that has begun goes on then.
+        """
+        if self._total_deg is None:
+            self._total_deg = float(angle_deg[0] % 360.0)
+            self._turn = 0
+        steps = np.mod(np.diff(angle_deg, prepend=self._total_deg), 360.0)
+        steps[steps > 360.0 - _STEP_BACK_DEG] -= 360.0
+        total = self._total_deg + np.cumsum(steps)
+        turn = np.maximum.accumulate(np.maximum(np.floor(total / 360.0).astype(np.int64), self._turn))
+        return total, turn
+
+    def _finish(self, next_time_s: float, noisy: bool) -> list[Revolution]:
+        parts, self._parts = self._parts, []
+        whole, self._whole = self._whole, True
+        if not whole or not parts:
+            return []
+        turn = _on_grid(parts, next_time_s, self._clockwise)
+        if turn is None:
+            self._counters.dropped_scans += 1
+            self._before = None
+            return []
+        full = round(2.0 * np.pi / abs(turn.angle_increment_rad))
+        return self.take(turn, full - sum(len(part) for part in parts), noisy)
+
+    def take(self, turn: Revolution, missing: int, noisy: bool) -> list[Revolution]:
+        """Counts a turn that lacks `missing` measurements, and believes of it what can be believed."""
+        self._period_s = turn.scan_time_s
+        before, self._before = self._before, turn
+        self._counters.lost_samples += max(missing, 0)
+        if noisy:
+            turn = self._believed(turn, before)
+        self._counters.scans += 1
+        return [turn]
+
+    def _believed(self, turn: Revolution, before: Revolution | None) -> Revolution:
+        ranges = turn.range_m.astype(np.float64)
+        agrees = confirmed(ranges, same_directions(turn, before))
+        doubtful = np.isfinite(ranges) & ~agrees
+        self._counters.lost_samples += int(doubtful.sum())
+        ranges[doubtful] = np.nan
+        return Revolution(
+            turn.time_s, turn.angle_min_rad, turn.angle_increment_rad, turn.time_increment_s,
+            turn.scan_time_s, ranges.astype(np.float32), turn.intensity,
+        )  # fmt: skip
+
+
+def same_directions(turn: Revolution, before: Revolution | None) -> np.ndarray:
+    """Ranges float64 [N] of `before` in the directions of `turn`, NaN where it has none."""
+    found = np.full(len(turn.range_m), np.nan)
+    if before is None or not len(before.range_m):
+        return found
+    angle = turn.angle_min_rad + turn.angle_increment_rad * np.arange(len(found))
+    apart = np.mod((angle - before.angle_min_rad) * np.sign(before.angle_increment_rad) + 0.1, 2.0 * np.pi)
+    index = np.round((apart - 0.1) / abs(before.angle_increment_rad)).astype(np.int64)
+    inside = (index >= 0) & (index < len(before.range_m))
+    found[inside] = before.range_m[index[inside]]
+    return found
+
+
+def _on_grid(parts: list[Samples], next_time_s: float, clockwise: bool) -> Revolution | None:
+    """The turn on the grid that fits its directions best; None if there is too little of it.
+
+    A motor turns evenly, so that directions are regular up to parts of a step. Each measurement goes to
+    the nearest direction of the grid (of two, the nearer one stays).
+    """
+    angle = np.concatenate([part.angle_deg for part in parts])
+    if len(angle) < _LEAST_SAMPLES:
+        return None
+    ranges = np.concatenate([part.range_m for part in parts])
+    intensity = np.concatenate([part.intensity for part in parts])
+    time_s = np.concatenate([part.time_s for part in parts])
+    if parts[0].number is not None:
+        place = np.concatenate([part.number for part in parts])
+        place = place - place[0]
+    else:
+        place = _places(angle)
+    step, first = np.polyfit(place, angle, 1) if place[-1] > 0.0 else (0.0, 0.0)
+    if step <= 0.0 or 360.0 / step * _LEAST_SHARE > len(angle):
+        return None
+    exact = (angle - first) / step
+    beam = np.round(exact).astype(np.int64)
+    first += beam.min() * step
+    beam -= beam.min()
+    count = int(beam.max()) + 1
+    order = np.argsort(-np.abs(exact - np.round(exact)), kind="stable")  # the nearest is written last
+    filled, light = np.full(count, np.nan, np.float32), np.zeros(count, np.float32)
+    filled[beam[order]], light[beam[order]] = ranges[order], intensity[order]
+    time_step, time_first = np.polyfit(beam, time_s, 1)
+    off = np.abs(time_s - time_first - time_step * beam)
+    if off.max() > 4.0 * off.mean():  # a wrong time or two
+        kept = off <= 4.0 * off.mean()
+        time_step, time_first = np.polyfit(beam[kept], time_s[kept], 1)
+    sign = -1.0 if clockwise else 1.0
+    angle_min = float(np.angle(np.exp(1j * np.radians(sign * first))))
+    return Revolution(
+        time_s=float(time_first),
+        angle_min_rad=angle_min,
+        angle_increment_rad=float(sign * np.radians(step)),
+        time_increment_s=max(float(time_step), 0.0),
+        scan_time_s=max(next_time_s - float(time_s[0]), 0.0),
+        range_m=filled,
+        intensity=light,
+    )
+
+
+def _places(angle_deg: np.ndarray) -> np.ndarray:
+    """Number of each measurement, float64 [N], by even steps of the angle; gaps are counted on."""
+    steps = np.diff(angle_deg)
+    typical = float(np.median(steps))
+    near = np.abs(steps - typical) < 0.5 * abs(typical)
+    if typical <= 0.0 or not near.any():
+        return np.zeros(len(angle_deg))
+    return np.concatenate([[0.0], np.cumsum(np.round(steps / float(steps[near].mean())))])
+
+
+def _piece(samples: Samples, piece: slice, angle_deg: np.ndarray) -> Samples:
+    """A part of samples, with other angles."""
+    number = None if samples.number is None else samples.number[piece]
+    return Samples(
+        angle_deg[piece], samples.range_m[piece], samples.intensity[piece], samples.time_s[piece], number
+    )

@@ -1,0 +1,146 @@
+"""SLAMTEC RPLIDAR of the A, S and C series: asks who it is, starts its best stream that we can read."""
+
+from __future__ import annotations
+
+import struct
+import time
+
+from services.lidar import rplidar_packets as rp
+from services.lidar.driver import Driver
+from services.lidar.link import Link, LinkError, drain
+from services.lidar.rplidar_stream import RplidarStream
+from services.lidar.samples import StampedScan
+
+_ANSWER_S = 0.4
+_TRIES = 4
+_MOTOR_PWM = 660  # SLAMTEC's default for the A2 and A3
+_PWM_MODELS = (2, 3)
+_SAMPLE_S = {rp.STANDARD: 500e-6, rp.CAPSULED: 250e-6, rp.HQ: 62.5e-6, rp.DENSE: 100e-6}
+# By the upper half of the model number: what it is called and how far its data sheet says it sees (m).
+_MODELS = {
+    1: ("A1", 12.0), 2: ("A2", 16.0), 3: ("A3", 25.0), 4: ("C1", 12.0), 6: ("S1", 40.0), 7: ("S2", 30.0),
+    8: ("S3", 40.0),
+}  # fmt: skip
+
+
+class RplidarDriver(Driver):
+    """`mode`: "auto" takes the typical mode of the device if we can read it, else express, else standard."""
+
+    bauds = (115200, 460800, 256000, 1000000)  # A1 and A2; C1; A3 and S1; S2 and S3
+
+    def __init__(self, mode: str = "auto") -> None:
+        super().__init__(unchecked=mode == "standard")
+        self.mode = mode
+        self._stream: RplidarStream | None = None
+        self._byte_s = 0.0
+        self._rest = b""
+
+    def start(self, link: Link) -> None:
+        self.restart()
+        self._byte_s = link.byte_s
+        link.motor(True)
+        link.write(rp.request(rp.STOP))
+        time.sleep(0.01)  # the protocol asks for 1 ms; what was on its way arrives meanwhile
+        drain(link)
+        info = _ask(link, rp.request(rp.GET_INFO), rp.INFO)
+        model, firmware = info[0], info[2] + info[1] / 100.0
+        name, self.range_max_m = _MODELS.get(model >> 4, (f"model {model:#04x}", 40.0))
+        self.range_min_m = 0.05
+        self.model = f"RPLIDAR {name}, firmware {firmware:.2f}"
+        status, code = struct.unpack_from("<BH", _ask(link, rp.request(rp.GET_HEALTH), rp.HEALTH))
+        if status == 2:
+            link.write(rp.request(rp.RESET))  # the only way out of its protection stop
+            raise LinkError(
+                f"{self.model} reports fault {code:#06x}: it was reset; if this stays, replace it"
+            )
+        if model >> 4 in _PWM_MODELS:
+            link.write(rp.request(rp.SET_MOTOR_PWM, struct.pack("<H", _MOTOR_PWM)))
+        self._begin(link, model)
+
+    def feed(self, data: bytes, at_ns: int) -> list[StampedScan]:
+        data, self._rest = self._rest + data, b""
+        parts = self._stream.feed(data)
+        for part in parts:
+            self.noise.saw(part is not None)
+        if any(part is not None for part in parts):
+            delay_s = rp.PACKET_BYTES[self._stream.kind] * self._byte_s
+            self.clock.hear(self._stream.newest_s, at_ns - round(delay_s * 1e9))
+        return self.turns([part for part in parts if part is not None])
+
+    def stop(self, link: Link) -> None:
+        link.write(rp.request(rp.STOP))
+        link.motor(False)
+
+    def _begin(self, link: Link, model: int) -> None:
+        """Starts the first of the possible streams that the device agrees to."""
+        attempts: list[tuple[bytes, float | None]] = []
+        if self.mode == "auto" and model >> 4 not in (1,):  # the A1 knows no modes
+            attempts += _typical(link)
+        if self.mode in ("auto", "express"):
+            attempts.append((rp.request(rp.EXPRESS_SCAN, bytes(5)), None))
+        if self.mode in ("auto", "standard"):
+            attempts.append((rp.request(rp.SCAN), None))
+        for message, sample_s in attempts:
+            kind, self._rest = _start(link, message)
+            if kind is not None:
+                self._stream = RplidarStream(kind, sample_s or self._rate(link, kind), self.counters)
+                return
+        raise LinkError(f'{self.model} starts no stream in mode {self.mode!r}; try mode = "standard"')
+
+    def _rate(self, link: Link, kind: int) -> float:
+        return _SAMPLE_S[kind]
+
+
+def _typical(link: Link) -> list[tuple[bytes, float | None]]:
+    """The mode SLAMTEC thinks best for this device, if its packets are of a kind that we read."""
+    mode = _configuration(link, rp.CONF_TYPICAL_MODE)
+    if mode is None or len(mode) < 2:
+        return []
+    number = mode[:2]
+    kind = _configuration(link, rp.CONF_ANSWER_TYPE, number)
+    if not kind or kind[0] not in (rp.CAPSULED, rp.DENSE, rp.HQ):
+        return []
+    sample_us = _configuration(link, rp.CONF_US_PER_SAMPLE, number)
+    sample_s = struct.unpack_from("<I", sample_us)[0] / 256e6 if sample_us and len(sample_us) >= 4 else None
+    return [(rp.request(rp.EXPRESS_SCAN, number[:1] + bytes(4)), sample_s)]
+
+
+def _configuration(link: Link, entry: int, payload: bytes = b"") -> bytes | None:
+    """An entry of the device's configuration; None from old firmware, which does not answer."""
+    try:
+        answer = _ask(
+            link, rp.request(rp.GET_LIDAR_CONF, struct.pack("<I", entry) + payload), rp.CONF, tries=2
+        )
+    except LinkError:
+        return None
+    return answer[4:] if answer[:4] == struct.pack("<I", entry) else None
+
+
+def _ask(link: Link, message: bytes, kind: int, tries: int = _TRIES) -> bytes:
+    """The data of a single response."""
+    for _ in range(tries):
+        link.write(message)
+        data, deadline = b"", time.monotonic() + _ANSWER_S
+        while time.monotonic() < deadline:
+            data += link.read(0.05)
+            found = rp.find_descriptor(data, (kind,))
+            if found is not None and found[0].length <= 256:
+                descriptor, start = found
+                if len(data) >= start + descriptor.length:
+                    return data[start : start + descriptor.length]
+    raise LinkError("no RPLIDAR answers at this baud rate")
+
+
+def _start(link: Link, message: bytes) -> tuple[int | None, bytes]:
+    """Kind of the stream that a request has started, and its first bytes; None if none of ours started."""
+    for _ in range(_TRIES):
+        link.write(message)
+        data, deadline = b"", time.monotonic() + _ANSWER_S
+        while time.monotonic() < deadline:
+            data += link.read(0.05)
+            found = rp.find_descriptor(data, tuple(rp.PACKET_BYTES))
+            if found is not None:
+                return found[0].kind, data[found[1] :]
+        link.write(rp.request(rp.STOP))
+        drain(link)
+    return None, b""

@@ -1,0 +1,139 @@
+"""SLAMTEC's bytes: requests, descriptors and the four kinds of measurement packets.
+
+SLAMTEC, "RPLIDAR Interface Protocol and Application Notes" LR001 v2.1; where that leaves a detail open
+(sign of the angle compensation, padding of the HQ checksum) as in SLAMTEC's own SDK, sl_lidar_driver.cpp.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+import zlib
+from functools import reduce
+from operator import xor
+from typing import NamedTuple
+
+import numpy as np
+
+STOP, RESET, SCAN, EXPRESS_SCAN = 0x25, 0x40, 0x20, 0x82
+GET_INFO, GET_HEALTH, GET_SAMPLERATE, GET_LIDAR_CONF, SET_MOTOR_PWM = 0x50, 0x52, 0x59, 0x84, 0xF0
+
+INFO, HEALTH, SAMPLERATE, CONF = 0x04, 0x06, 0x15, 0x20
+STANDARD, CAPSULED, HQ, DENSE = 0x81, 0x82, 0x83, 0x85
+PACKET_BYTES = {STANDARD: 5, CAPSULED: 84, HQ: 781, DENSE: 84}
+SAMPLES = {STANDARD: 1, CAPSULED: 32, HQ: 96, DENSE: 40}
+
+CONF_US_PER_SAMPLE, CONF_ANSWER_TYPE, CONF_TYPICAL_MODE = 0x71, 0x75, 0x7C
+DESCRIPTOR_BYTES = 7
+_HQ_NODE = np.dtype([("angle_q14", "<u2"), ("mm_q2", "<u4"), ("quality", "u1"), ("flag", "u1")])
+
+
+def request(command: int, payload: bytes = b"") -> bytes:
+    """A request packet: 0xA5, command; with a payload its size, itself and the XOR of all before (2.2)."""
+    head = bytes((0xA5, command))
+    if not payload:
+        return head
+    body = head + bytes((len(payload),)) + payload
+    return body + bytes((reduce(xor, body),))
+
+
+class Descriptor(NamedTuple):
+    """What announces a response (2.3)."""
+
+    length: int  # of each data packet
+    multiple: bool
+    kind: int
+
+
+def find_descriptor(data: bytes, kinds: tuple[int, ...]) -> tuple[Descriptor, int] | None:
+    """The first descriptor of one of `kinds` in `data`, and where its data begin; None if there is none."""
+    at = data.find(b"\xa5\x5a")
+    while at >= 0 and at + DESCRIPTOR_BYTES <= len(data):
+        word, kind = struct.unpack_from("<IB", data, at + 2)
+        if kind in kinds:
+            return Descriptor(word & 0x3FFFFFFF, word >> 30 == 1, kind), at + DESCRIPTOR_BYTES
+        at = data.find(b"\xa5\x5a", at + 1)
+    return None
+
+
+class Measured(NamedTuple):
+    """Samples of a packet. Angles of capsules are relative to what the next capsule's start says."""
+
+    start_deg: float
+    first: bool  # the device says that a new stream begins here
+    offset_deg: np.ndarray  # float64 [N]: capsules: taken off the evenly spread angle; HQ: the angle itself
+    range_m: np.ndarray  # float64 [N], NaN = invalid
+    quality: np.ndarray  # float64 [N]
+
+
+def capsule_begins(packet: bytes) -> bool:
+    """Capsules start with the nibbles A and 5; the other halves are the checksum."""
+    return packet[0] >> 4 == 0xA and packet[1] >> 4 == 0x5
+
+
+def capsule_whole(packet: bytes) -> bool:
+    """XOR of everything behind the two sync bytes."""
+    checksum = int(np.bitwise_xor.reduce(np.frombuffer(packet, np.uint8, offset=2)))
+    return checksum == (packet[0] & 0xF) | (packet[1] & 0xF) << 4
+
+
+def parse_capsule(packet: bytes) -> Measured:
+    """32 samples in 16 cabins of two distances (q2 without its fraction) and two angle offsets (q3)."""
+    word = struct.unpack_from("<H", packet, 2)[0]
+    cabins = np.frombuffer(packet, [("d", "<u2", 2), ("angles", "u1")], count=16, offset=4)
+    mm = (cabins["d"] >> 2).ravel().astype(np.float64)
+    low = np.stack([cabins["angles"] & 0xF, cabins["angles"] >> 4], axis=1).astype(np.int64)
+    offset_q3 = low | (cabins["d"].astype(np.int64) & 0x3) << 4
+    return Measured((word & 0x7FFF) / 64.0, bool(word >> 15), offset_q3.ravel() / 8.0, _metres(mm), mm * 0.0)
+
+
+def parse_dense(packet: bytes) -> Measured:
+    """40 distances in mm at even angles."""
+    word = struct.unpack_from("<H", packet, 2)[0]
+    mm = np.frombuffer(packet, "<u2", count=40, offset=4).astype(np.float64)
+    return Measured((word & 0x7FFF) / 64.0, bool(word >> 15), np.zeros(40), _metres(mm), np.zeros(40))
+
+
+def hq_begins(packet: bytes) -> bool:
+    """HQ packets start with the byte A5."""
+    return packet[0] == 0xA5
+
+
+def hq_whole(packet: bytes) -> bool:
+    """CRC-32 (IEEE 802.3) of all before it, filled with zeros to a multiple of four."""
+    body = packet[:-4]
+    return zlib.crc32(body + bytes(-len(body) % 4)) == struct.unpack_from("<I", packet, len(body))[0]
+
+
+def parse_hq(packet: bytes) -> Measured:
+    """96 samples, each with its own angle in units of 90 / 2^14 degrees and distance in mm / 4."""
+    nodes = np.frombuffer(packet, _HQ_NODE, count=96, offset=9)
+    angle = nodes["angle_q14"] * (90.0 / 16384.0)
+    mm = nodes["mm_q2"] / 4.0
+    first = bool(nodes["flag"][0] & 1)
+    return Measured(float(angle[0]), first, angle, _metres(mm), nodes["quality"].astype(np.float64))
+
+
+def node_begins(packet: bytes) -> bool:
+    """Two bits of the first byte must differ and one of the second be set: that is all there is to check."""
+    return (packet[0] ^ packet[0] >> 1) & 1 == 1 and packet[1] & 1 == 1
+
+
+class Node(NamedTuple):
+    """One sample of the standard scan."""
+
+    first: bool  # of a turn
+    angle_deg: float
+    range_m: float  # NaN = invalid
+    quality: float
+
+
+def parse_node(packet: bytes) -> Node:
+    """One sample: quality, angle in degrees / 64, distance in mm / 4 (4.2)."""
+    angle, distance = (packet[1] | packet[2] << 8) >> 1, packet[3] | packet[4] << 8
+    range_m = distance / 4000.0 if distance else math.nan
+    return Node(bool(packet[0] & 1), angle / 64.0, range_m, float(packet[0] >> 2))
+
+
+def _metres(mm: np.ndarray) -> np.ndarray:
+    return np.where(mm > 0.0, mm / 1000.0, np.nan)

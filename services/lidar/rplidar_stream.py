@@ -1,0 +1,126 @@
+"""RPLIDAR's measurement packets to samples with times.
+
+The device gives no time, but measures at a fixed rate: the number of a sample is its clock. Packets that
+were bad keep their place in the count.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from services.lidar import rplidar_packets as rp
+from services.lidar.driver import StartChain
+from services.lidar.framing import Counters, Framer
+from services.lidar.samples import Samples
+
+_NODE_SLACK_DEG = 2.0  # a node that is this far from where it must be is not believed
+_NODES_IN_A_ROW = 16  # with three bits to check, so many must fit before they are
+
+
+class RplidarStream:
+    """One run of measurement packets of one kind. `feed` yields None for a bad packet."""
+
+    def __init__(self, kind: int, sample_s: float, counters: Counters) -> None:
+        self.kind = kind
+        self._sample_s = sample_s
+        self._samples = rp.SAMPLES[kind]
+        checks = {
+            rp.STANDARD: (rp.node_begins, lambda packet: True, _NODES_IN_A_ROW),
+            rp.CAPSULED: (rp.capsule_begins, rp.capsule_whole, 3),
+            rp.DENSE: (rp.capsule_begins, rp.capsule_whole, 3),
+            rp.HQ: (rp.hq_begins, rp.hq_whole, 2),
+        }
+        begins, whole, in_a_row = checks[kind]
+        self._framer = Framer(rp.PACKET_BYTES[kind], begins, whole, counters, in_a_row)
+        self._counters = counters
+        self._skipped = counters.skipped_bytes
+        self._chain = StartChain()
+        self._held: tuple[rp.Measured, int] | None = None  # waits for the next start angle
+        self._taken = 0  # samples so far, lost ones included
+        self._node_deg: float | None = None
+        self._node_step_deg = 0.0
+        self._node_gap = 0
+
+    @property
+    def newest_s(self) -> float:
+        """Device time of the newest sample."""
+        return self._taken * self._sample_s
+
+    def feed(self, data: bytes) -> list[Samples | None]:
+        """Samples that `data` completes; None for each packet that was bad."""
+        found: list[Samples | None] = []
+        nodes: list[tuple[float, float, float, int]] = []
+        for packet in self._framer.feed(data):
+            self._taken += self._samples + self._while_searching()
+            if self.kind == rp.STANDARD:
+                self._node(packet, nodes)
+                if packet is None:
+                    found.append(None)
+            elif self.kind == rp.HQ:
+                found.append(self._hq(packet))
+            else:
+                found += self._capsule(packet)
+        if nodes:
+            angle, range_m, quality, number = np.array(nodes).T
+            found.append(Samples(angle, range_m, quality, number * self._sample_s, number))
+        return found
+
+    def _while_searching(self) -> int:
+        """Samples that went by in bytes that were skipped."""
+        skipped, self._skipped = self._counters.skipped_bytes - self._skipped, self._counters.skipped_bytes
+        packets = round(skipped / rp.PACKET_BYTES[self.kind])
+        self._chain.missed(packets)
+        return packets * self._samples
+
+    def _capsule(self, packet: bytes | None) -> list[Samples | None]:
+        """A capsule's angles are known with the start of the next, or from how fast it turned before."""
+        typical = self._chain.typical_deg
+        if packet is None:
+            self._chain.missed()
+            return [*self._release(typical), None]
+        measured = rp.parse_capsule(packet) if self.kind == rp.CAPSULED else rp.parse_dense(packet)
+        if not (measured.start_deg < 360.0 and self._chain.takes(measured.start_deg)):
+            return self._release(typical)
+        if self._held is not None:
+            found = self._release((measured.start_deg - self._held[0].start_deg) % 360.0)
+        else:
+            found = []
+        self._held = (measured, self._taken)
+        return found
+
+    def _release(self, span_deg: float | None) -> list[Samples | None]:
+        held, self._held = self._held, None
+        if held is None or span_deg is None:
+            return []
+        measured, last = held
+        even = span_deg / self._samples * np.arange(self._samples)
+        angle = measured.start_deg + even - measured.offset_deg
+        return [self._numbered(angle, measured, last)]
+
+    def _hq(self, packet: bytes | None) -> Samples | None:
+        if packet is None:
+            return None
+        measured = rp.parse_hq(packet)
+        return self._numbered(measured.offset_deg, measured, self._taken)
+
+    def _node(self, packet: bytes | None, nodes: list[tuple[float, float, float, int]]) -> None:
+        """A node has no checksum: its angle must be where the motor's turning puts it."""
+        self._node_gap += 1
+        if packet is None:
+            return
+        node = rp.parse_node(packet)
+        if node.angle_deg >= 360.0:
+            return
+        last, gap = self._node_deg, self._node_gap
+        self._node_deg, self._node_gap = node.angle_deg, 0
+        if last is None:
+            return
+        moved = (node.angle_deg - last + 180.0) % 360.0 - 180.0
+        if abs(moved - gap * self._node_step_deg) > _NODE_SLACK_DEG:
+            return
+        self._node_step_deg += 0.02 * (moved / gap - self._node_step_deg)
+        nodes.append((node.angle_deg, node.range_m, node.quality, self._taken))
+
+    def _numbered(self, angle_deg: np.ndarray, measured: rp.Measured, last: int) -> Samples:
+        number = last - np.arange(self._samples - 1, -1, -1, dtype=np.float64)
+        return Samples(angle_deg, measured.range_m, measured.quality, number * self._sample_s, number)
