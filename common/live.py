@@ -154,8 +154,16 @@ class Live:
                 bus.end(publication)
             while not self._stopping and not self.settings.exit_when_drained:
                 self._attend()
+                self._hear_answers()
                 with self._changed:
                     self._changed.wait(_POLL_S)
+
+    def _hear_answers(self) -> None:
+        """What is fed back to a node that has ended is still heard; it has nothing more to say to it."""
+        while (letter := self._next()) is not None:
+            self.node.on_header(letter.header)
+            for _ in self.node.handle(letter.topic, letter.message):
+                pass
 
     # --- the node's own thread ---
 

@@ -100,9 +100,10 @@ class Lockstep:
             self._step(consumer, time_ns)
 
     def _step(self, seat: _Seat, now_ns: int) -> None:
-        """Lets a node handle what it can at this time. One that has ended hears no more: what is still fed
-        back to it concerns what it has said already."""
-        while not seat.ended and now_ns >= seat.busy_until_ns and (letter := seat.mailbox.pop()) is not None:
+        """Lets a node handle what it can at this time."""
+        if seat.ended:
+            self._hear_answers(seat)
+        while now_ns >= seat.busy_until_ns and (letter := seat.mailbox.pop()) is not None:
             for name, result in seat.jobs.before_message(letter.topic):
                 self._emit(seat, seat.node.handle_job(name, result), now_ns)
             seat.busy_until_ns = now_ns + _ns(seat.node.config.step_cost_s)
@@ -112,6 +113,13 @@ class Lockstep:
                 self._at(seat.busy_until_ns, _LAST_ROW, lambda t: self._step(seat, t))
         if seat.mailbox.ended and not seat.ended and now_ns >= seat.busy_until_ns:
             self._end_node(seat, now_ns)
+
+    def _hear_answers(self, seat: _Seat) -> None:
+        """What is fed back to a node that has ended is still heard; it has nothing more to say to it."""
+        while (letter := seat.mailbox.pop()) is not None:
+            seat.node.on_header(letter.header)
+            for _ in seat.node.handle(letter.topic, letter.message):
+                pass
 
     def _emit(self, seat: _Seat, outputs: Iterator[Output], time_ns: int) -> None:
         for output in outputs:

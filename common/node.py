@@ -31,7 +31,8 @@ class Input:
     """A subscription: a topic, and a delivery other than its row's default.
 
     `feedback` marks what depends on this node's own output (an acknowledgement): it is taken as it comes,
-    not merged by stamp, and the node ends without waiting for its end: both would wait for themselves.
+    not merged by stamp, and the node ends without waiting for its end: both would wait for themselves. What
+    comes after the node's own end is still heard, but what the handler yields then goes nowhere.
     """
 
     topic: str

@@ -18,7 +18,7 @@ from common.messages import (
     Rig,
     Tick,
 )  # fmt: skip
-from common.node import Node, Sourced
+from common.node import Input, Node, Sourced
 from common.raster.camera import RasterCamera
 from common.raster.rasterizer import Rasterizer
 from common.registry import Service
@@ -105,7 +105,7 @@ class Localizer(Node):
 
     name = "localization"
     Config = LocalizerConfig
-    inputs = (("camera/image"),)
+    inputs = (Input("camera/image", "every"),)
     outputs = ("localization/odometry", "localization/correction", "localization/anchors")
 
     def on_camera_image(self, image):
@@ -136,8 +136,11 @@ class Fusion(Node):
     """True depth, every picture a keyframe."""
 
     name = "fusion"
-    inputs = ("camera/image",)
+    inputs = (Input("camera/image", "every"),)
     outputs = ("fusion/depth",)
+
+    def configure(self):
+        shot(0)
 
     def on_camera_image(self, image):
         number = (image.stamp_ns - T0) // STEP

@@ -1,0 +1,78 @@
+"""Keyframes and mapper as processes on a real router: the map is made, ends, and survives a killed mapper."""
+
+import os
+import signal
+import time
+
+import pytest
+from plyfile import PlyData
+
+from common.bus import open_session
+from common.config import Deployment, RouterConfig
+from services.board import HealthBoard
+from services.supervisor import Supervisor
+from tests.services.mapping.room_drive import TABLE
+
+
+@pytest.fixture
+def deployment(tmp_path, free_endpoint):
+    def make(pictures, **keyframes):
+        return Deployment(
+            robot="test", router=RouterConfig(listen=(free_endpoint,)), rate=1.0, state_dir=tmp_path / "state",
+            nodes={
+                "replay": {"kind": "room", "pictures": pictures},
+                "localization": {"kind": "known"},
+                "fusion": {"kind": "true"},
+                "keyframes": {"distance_m": 0.15, **keyframes},
+                "mapping": {"save": str(tmp_path / "map"), "half_steps": 4, "full_steps": 3, "tick_steps": 2},
+            },
+        )  # fmt: skip
+
+    return make
+
+
+def poll(supervisor, until, timeout_s):
+    deadline = time.monotonic() + timeout_s
+    while time.monotonic() < deadline:
+        supervisor.poll()
+        if until():
+            return
+        time.sleep(0.05)
+    raise AssertionError(f"not within {timeout_s} s")
+
+
+def detail(board, node):
+    record = board.records.get(node)
+    return "" if record is None else record.health.detail
+
+
+def state(board, node):
+    record = board.records.get(node)
+    return "" if record is None else record.health.state
+
+
+@pytest.mark.slow
+def test_the_live_system_maps_and_ends(deployment, tmp_path):
+    live = deployment(14)
+    with Supervisor(live, table=TABLE) as supervisor, open_session(live.router.listen) as session:
+        board = HealthBoard(session, "test")
+        poll(supervisor, lambda: state(board, "mapping") == "drained", 90)
+        poll(supervisor, lambda: " 0 not acknowledged" in detail(board, "keyframes"), 5)
+        received = {i.topic: i for i in board.records["mapping"].health.inputs}["keyframes/frame"]
+        assert received.received >= 6
+        assert received.lost == received.undecodable == 0
+    assert PlyData.read(tmp_path / "map" / "map.ply")["vertex"].count > 1000
+
+
+@pytest.mark.slow
+def test_a_killed_mapper_gets_again_what_it_had_not_acknowledged(deployment):
+    """The successor starts with an empty map: later keyframes reach it, unanswered ones come again."""
+    live = deployment(60, retry_s=1.0)
+    with Supervisor(live, table=TABLE) as supervisor, open_session(live.router.listen) as session:
+        board = HealthBoard(session, "test")
+        poll(supervisor, lambda: "3 keyframes" in detail(board, "mapping"), 90)
+        first = supervisor.children["mapping"].process.pid
+        os.kill(first, signal.SIGKILL)
+        poll(supervisor, lambda: supervisor.children["mapping"].process.pid != first, 5)
+        poll(supervisor, lambda: state(board, "mapping") == "drained", 120)
+        poll(supervisor, lambda: " 0 not acknowledged" in detail(board, "keyframes"), 10)
