@@ -41,10 +41,10 @@ class Topic:
 
 _ROWS = (
     # name                    message          producers                 Hz  delivery  cache  uplink
-    Topic("rig",                     m.Rig,           ("camera", "replay"),      0, "latched", 1, True),
-    Topic("wheel/odometry",          m.WheelOdometry, ("wheels", "replay"),     50, "every", 2000),
-    Topic("lidar/scan",              m.Scan,          ("lidar", "replay"),      10, "every", 400),
-    Topic("camera/image",            m.Image,         ("camera", "replay"),     10, "latest"),
+    Topic("rig",                     m.Rig,           ("camera", "ros2", "replay"), 0, "latched", 1, True),
+    Topic("wheel/odometry",          m.WheelOdometry, ("wheels", "ros2", "replay"), 50, "every", 2000),
+    Topic("lidar/scan",              m.Scan,          ("lidar", "ros2", "replay"), 10, "every", 400),
+    Topic("camera/image",            m.Image,         ("camera", "ros2", "replay"), 10, "latest"),
     Topic("external/pose",           m.ExternalPose,  ("ros2", "replay"),       10, "every", 400),
     Topic("localization/odometry",   m.Odometry,      ("localization",),        10, "every", 400, True),
     Topic("localization/correction", m.Correction,    ("localization",),         0, "latched", 1, True),

@@ -46,3 +46,18 @@ def _jpeg(data: memoryview) -> Picture | None:
         else:
             position += 2 + struct.unpack_from(">H", data, position + 2)[0]
     return None
+
+
+def is_whole(data: bytes | memoryview) -> bool:
+    """Whether a JPEG or PNG has its beginning and its end, so that nothing was cut off.
+
+    Cameras pad their buffers: zeros may follow the end mark. Wrong bytes between are not looked for.
+    """
+    view = memoryview(data)
+    head = picture_head(view)
+    if head is None:
+        return False
+    tail = bytes(view[-4096:]).rstrip(b"\0")
+    if head.encoding == "png":
+        return bytes(view[-16:]).find(b"IEND") >= 0
+    return tail.endswith(b"\xff\xd9")

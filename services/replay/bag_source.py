@@ -10,15 +10,15 @@ from typing import Any
 import numpy as np
 
 from common.errors import UserError
+from common.recording import calibration as cal
 from common.recording.ros_types import transform_of
 from common.recording.sensors import SENSORS, build, ros_fields
+from common.recording.static_frames import StaticFrames, clean
 from common.rig import RigFile, load_rig
-from services.replay import calibration as cal
 from services.replay.bags import Bag, BagTopic
 from services.replay.choose import choose_camera_info, choose_topics
 from services.replay.decode import RawMessage, deserialize
 from services.replay.options import SourceOptions
-from services.replay.static_frames import StaticFrames, clean
 
 TF_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 _PICTURES = ("rgb8", "bgr8", "rgba8", "bgra8", "mono8", "yuv422_yuy2", "jpeg", "png")
@@ -139,7 +139,7 @@ class BagSource:
                     fields["stamp_ns"] = raw.at_ns
                     self.unstamped[raw.topic] += 1
                 if sensor.word == "odometry":
-                    self._to_body(fields)
+                    cal.to_body(fields, self._T_child_body)
                 message = build(sensor.topic, fields)
             except ValueError as error:
                 self.skipped[raw.topic] += 1
@@ -237,17 +237,6 @@ class BagSource:
                 f"{self.options.rig}: K is for {rig.camera.width_px}x{rig.camera.height_px} px but the "
                 f"pictures of {self.where} are {picture[0]}x{picture[1]} px; calibrate at this size"
             )
-
-    def _to_body(self, fields: dict[str, Any]) -> None:
-        """Odometry of another point of the robot (a base_link above the floor) moved to the body."""
-        T = self._T_child_body
-        if np.array_equal(T, np.eye(4)):
-            return
-        R_body_child, lever_m = T[:3, :3].T, T[:3, 3]
-        turning = fields["angular_velocity_rad_s"]
-        fields["T_odom_body"] = fields["T_odom_body"] @ T
-        fields["velocity_m_s"] = R_body_child @ (fields["velocity_m_s"] + np.cross(turning, lever_m))
-        fields["angular_velocity_rad_s"] = R_body_child @ turning
 
 
 def _transforms(raw: RawMessage) -> Iterator[tuple[str, str, np.ndarray]]:

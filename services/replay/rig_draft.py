@@ -10,9 +10,9 @@ import numpy as np
 
 from common.errors import UserError
 from common.frames import camera_mount
+from common.recording.calibration import ASSUMED_MOUNTS
 from common.rig import CameraFile, LidarFile, Mount, RigFile, format_rig
 from services.replay.bag_source import BagSource
-from services.replay.calibration import ASSUMED_MOUNTS
 from services.replay.options import SourceOptions
 from services.replay.source import data_path, open_source
 

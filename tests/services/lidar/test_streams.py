@@ -101,7 +101,7 @@ def test_hq_at_a_wrong_byte_in_a_thousand():
 
 @pytest.mark.parametrize("kind", ["ld19", "rplidar c1 dense"])
 def test_lost_bytes_cost_a_few_packets(kind):
-    make, device, beams, _, allowed = KINDS[kind]
+    make, device, beams, _, _ = KINDS[kind]
     driver, device = make(), device()
 
     class Dropping:

@@ -19,7 +19,7 @@ from services.replay.config import ReplayConfig
 from services.replay.inspection import inspect
 from services.replay.node import ReplayNode
 from services.replay.options import SourceOptions
-from services.replay.static_frames import StaticFrames
+from common.recording.static_frames import StaticFrames
 from services.replay.statistics import lidar_facts, stream_facts
 from tests.services.replay.make_bags import KINDS, T_BASE_CAMERA, T_BASE_LIDAR, Drive, write_bag
 

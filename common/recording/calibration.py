@@ -15,8 +15,8 @@ from pydantic import ValidationError
 from common.errors import UserError
 from common.frames import R_body_camera_level, camera_mount
 from common.geometry import make_transform
+from common.recording.static_frames import StaticFrames, clean
 from common.rig import CameraFile, LidarFile, Mount, RigFile
-from services.replay.static_frames import StaticFrames, clean
 
 # ROS names for the models we know; anything else is refused by name.
 _MODELS = {
@@ -176,6 +176,18 @@ def _without_mount(
         )
     else:
         calibration.missing.append(f"where the {sensor} sits on the robot is not known ({joined})")
+
+
+def to_body(fields: dict[str, Any], T_child_body: np.ndarray) -> None:
+    """Moves the fields of a wheel odometry of another point of the robot (a base_link above the floor) to
+    the body, in place."""
+    if np.array_equal(T_child_body, np.eye(4)):
+        return
+    R_body_child, lever_m = T_child_body[:3, :3].T, T_child_body[:3, 3]
+    turning = fields["angular_velocity_rad_s"]
+    fields["T_odom_body"] = fields["T_odom_body"] @ T_child_body
+    fields["velocity_m_s"] = R_body_child @ (fields["velocity_m_s"] + np.cross(turning, lever_m))
+    fields["angular_velocity_rad_s"] = R_body_child @ turning
 
 
 # Where such sensors often sit on a small robot; a starting point for a tape measure, no more.
