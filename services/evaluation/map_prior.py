@@ -1,13 +1,19 @@
-"""The fusion's depth as a prior for `bench map`: played over the drive as the robot would, no scored picture seen."""
+"""What other services give the mapper, played over a drive for `bench map`: fused depth, masks of movers.
+
+No picture that is scored is seen.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 
+from common.beams import Beams
 from common.geometry import inverse, transform_points
 from services.depth.source import DepthSource, View, make_source
 from services.fusion.frame import Frame
 from services.fusion.fuse import Fusion
+from services.fusion.movers import FreeSpace
+from services.keyframes.bodies import body_mask
 from services.mapping.bench_map import HELD_OUT_AT, HELD_OUT_EVERY
 from services.mapping.dataset import Recording
 
@@ -43,11 +49,36 @@ class FieldPrior:
 
     def _frame(self, recording: Recording, index: int, T_map_body: np.ndarray) -> Frame:
         shot, rgb = recording.shots[index], recording.image(index)
-        view = View(
-            shot.stamp_ns, rgb, recording.camera, recording.T_body_camera, shot.beams, self._level
-        )
+        view = View(shot.stamp_ns, rgb, recording.camera, recording.T_body_camera, shot.beams, self._level)
         estimate = self._source.estimate(view)
         usable = estimate.ok and estimate.kind != "none"
         return Frame(
             shot.stamp_ns, rgb, T_map_body, shot.beams, estimate.values if usable else None, estimate.kind
+        )
+
+
+class MoverMasks:
+    """Masks of what walks where beams have passed before. Called with rising numbers of pictures."""
+
+    def __init__(self) -> None:
+        self._free, self._next = FreeSpace(), 0
+
+    def __call__(self, recording: Recording, index: int) -> np.ndarray | None:
+        """bool [H, W], False on movers; None where nothing moves."""
+        T_camera_body = inverse(recording.T_body_camera)
+        if index < self._next:
+            self._free, self._next = FreeSpace(), 0
+        for number in range(self._next, index + 1):
+            shot = recording.shots[number]
+            T_map_body = shot.T_map_camera @ T_camera_body
+            points = transform_points(T_map_body, shot.beams.points_body_m)
+            moving = self._free.contradicted(points)
+            still: Beams = shot.beams.take(~moving)
+            self._free.add(T_map_body[:3, 3], transform_points(T_map_body, still.points_body_m))
+        self._next = index + 1
+        if not moving.any():
+            return None
+        unknown = np.full(recording.camera.shape, np.nan, np.float32)
+        return ~body_mask(
+            shot.beams.points_body_m[moving], unknown, recording.camera, recording.T_body_camera
         )

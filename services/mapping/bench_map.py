@@ -14,11 +14,12 @@ import numpy as np
 
 from common.beams import project_beams
 from common.camera import Pinhole
+from common.geometry import make_transform, so3_exp
 from common.raster.camera import RasterCamera
 from services.mapping.dataset import Recording, load, read_depth_png
 from services.mapping.export import read_ply_points, write_gaussian_ply
 from services.mapping.keyframe import Keyframe
-from services.mapping.mapper import Mapper
+from services.mapping.mapper import HALF, Mapper
 from services.mapping.priors import Prior, find_prior
 from services.mapping.scores import ViewScore, f_score, fused_surface, render_rgb_depth, score_view
 from services.mapping.settings import MapperSettings
@@ -42,6 +43,13 @@ class MapBench:
     )
     threads: int = 1
     seed: int = 0
+    jump: bool = False  # the second half of the keyframes is misplaced until the drive has ended
+    settle_steps: int = 0  # at the end of the drive, at half size, before the first scoring
+
+
+JUMP = make_transform(so3_exp([0.0, 0.0, np.radians(10.0)]), np.array([1.0, 0.0, 0.0]))
+# (recording, number of the picture) -> bool [H, W], False on what moves; None where all may be used
+Mask = Callable[[Recording, int], np.ndarray | None]
 
 
 @dataclass
@@ -72,18 +80,25 @@ def run_bench(
     say: Say = lambda text: None,
     out: Path | None = None,
     prior: Prior | None = None,
+    mask: Mask | None = None,
 ) -> dict[str, Any]:
     """Runs the mapper over a recording and gives the figures of the design's section 12.
 
     `wall_s` and `cpu_s` are the mapper's and the prior's: pictures are decoded, views scored and kernels
     compiled outside. With `out`, pictures of held-out views beside the truth and the map are written there.
-    `prior` is used in place of the one that `bench.prior` names.
+    `prior` is used in place of the one that `bench.prior` names; `mask` says what moves.
+
+    With `bench.jump` the pose graph holds the second half of the drive 1 m and 10 degrees off, and finds the
+    truth at its end: compare with a run without the jump, both with the same `settle_steps`.
     """
     warm()
     recording = load(path)
     mapper = Mapper(bench.settings, seed=bench.seed, threads=bench.threads)
     clock = _Clock()
-    keyframes, refused = _drive(recording, mapper, bench, prior or find_prior(bench.prior), clock, say)
+    keyframes, refused = _drive(recording, mapper, bench, prior or find_prior(bench.prior), mask, clock, say)
+    if bench.jump:
+        clock.run(lambda: mapper.move_anchors({1: np.eye(4)}))
+    clock.run(lambda: mapper.refine(bench.settle_steps, HALF))
     online_clock, online_steps = replace(clock), mapper.steps
     online = score_map(recording, mapper, say)
     _refine(mapper, bench, clock)
@@ -102,8 +117,9 @@ def run_bench(
 
 
 def _drive(
-    recording: Recording, mapper: Mapper, bench: MapBench, prior: Prior, clock: _Clock, say: Say
-) -> tuple[int, int]:
+    recording: Recording, mapper: Mapper, bench: MapBench, prior: Prior, mask: Mask | None, clock: _Clock,
+    say: Say,
+) -> tuple[int, int]:  # fmt: skip
     """Every keyframe with its fixed work, as they come; gives how many were used and refused."""
     used, refused, last = 0, 0, None
     for index, shot in enumerate(recording.shots):
@@ -113,12 +129,18 @@ def _drive(
         if guess is None:
             continue
         last = shot.T_map_camera
-        frame = make_keyframe(recording, index, guess)
-        outcome = clock.run(lambda f=frame: mapper.add(f, np.eye(4)))
+        late = 2 * index >= len(recording.shots)
+        frame = replace(
+            make_keyframe(recording, index, guess), anchor=int(late),
+            mask=None if mask is None else clock.run(lambda i=index: mask(recording, i)),
+        )  # fmt: skip
+        place = JUMP if late and bench.jump else np.eye(4)
+        outcome = clock.run(lambda f=frame, T=place: mapper.add(f, T))
         clock.run(mapper.optimise)
         used, refused = used + outcome.ok, refused + (not outcome.ok)
         if used % 10 == 0:
             say(f"{used} keyframes, {mapper.store.count} Gaussians, {clock.cpu_s:.0f} CPU s")
+    clock.run(mapper.finish)
     return used, refused
 
 

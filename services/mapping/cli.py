@@ -42,13 +42,24 @@ def bench_raster(
 def bench_map(
     data: Annotated[Path, typer.Argument(help="Folder with bag/, groundtruth.txt and the held-out truth")],
     prior: Annotated[
-        str, typer.Option(help="Depth of the keyframes: stixel (beams and floor) or truth")
-    ] = "stixel",
+        str,
+        typer.Option(help="Depth of the keyframes: field (the fusion's), stixel (beams and floor) or truth"),
+    ] = "field",
+    source: Annotated[str, typer.Option(help="Depth source that the fusion starts from (field)")] = "stixel",
     refine_s: Annotated[
         float, typer.Option(min=0.0, help="Refinement after the drive, in seconds of one core")
     ] = 60.0,
     threads: Annotated[int, typer.Option(min=1, help="Threads of the rasterizer")] = 2,
     seed: Annotated[int, typer.Option(help="Seed of the mapper")] = 0,
+    jump: Annotated[
+        bool, typer.Option("--jump", help="Misplace half of the keyframes by 1 m and 10 deg until the end")
+    ] = False,
+    settle_steps: Annotated[
+        int, typer.Option(min=0, help="Steps at the end of the drive, before the first scoring")
+    ] = 0,
+    movers: Annotated[
+        bool, typer.Option("--movers", help="Mask people and carts that the beams show")
+    ] = False,
     out: Annotated[
         Path | None, typer.Option(help="Write pictures and the map (.ply) into this folder")
     ] = None,
@@ -56,13 +67,23 @@ def bench_map(
 ) -> None:
     """A map from true poses: PSNR, SSIM and depth at views that it never saw, online and refined.
 
-    Example: beamsplat bench map ../shared/data/house_a --prior truth --json
+    Examples:
+
+        beamsplat bench map ../shared/data/house_a --json
+
+        beamsplat bench map ../shared/data/house_a --prior truth --refine-s 0 --jump --settle-steps 300
     """
+    import cv2
+
+    from services.evaluation.map_prior import FieldPrior, MoverMasks
     from services.mapping.bench_map import MapBench, run_bench
 
-    result = run_bench(
-        data, MapBench(prior=prior, threads=threads, seed=seed, refine_s=refine_s), console.print, out
+    cv2.setNumThreads(1)
+    bench = MapBench(
+        prior=prior, threads=threads, seed=seed, refine_s=refine_s, jump=jump, settle_steps=settle_steps
     )
+    field = FieldPrior(source) if prior == "field" else None
+    result = run_bench(data, bench, console.print, out, field, MoverMasks() if movers else None)
     if as_json:
         print(json.dumps(result))
         return

@@ -86,13 +86,15 @@ class Held:
         return self.T_anchor_camera @ self.delta
 
 
-def hold(frame: Keyframe, sigma_unit_m: float) -> Held:
-    """The compact form of a keyframe that has no fault."""
+def hold(frame: Keyframe, sigma_unit: float) -> Held:
+    """The compact form of a keyframe that has no fault. Weights fall with sigma as a share of the depth:
+    far walls are as good as near ones to whoever stands before them later."""
     with np.errstate(invalid="ignore"):
         known = np.isfinite(frame.depth_m) & (frame.depth_m > 0.05) & (frame.depth_m < MAX_DEPTH_M)
         if frame.mask is not None:
             known &= frame.mask
-        weight = np.where(known, 1.0 / (1.0 + (frame.sigma_m / sigma_unit_m) ** 2), 0.0)
+        share = frame.sigma_m / np.maximum(frame.depth_m, 0.05)
+        weight = np.where(known, 1.0 / (1.0 + (share / sigma_unit) ** 2), 0.0)
     depth_mm = np.where(known, frame.depth_m * 1e3, 0.0).astype(np.uint16)
     weight_8 = np.clip(np.nan_to_num(weight) * 255.0 + 0.5, 0.0, 255.0).astype(np.uint8)
     levels, camera, rgb = [], frame.camera, frame.rgb

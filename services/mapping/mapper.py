@@ -6,6 +6,7 @@ before trusted surfaces, then a fixed number of steps on a window of new and ran
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -51,6 +52,7 @@ class Mapper:
         self._random = np.random.default_rng(seed)
         self._newest: list[int] = []
         self._forgotten: set[int] = set()
+        self._unsure: deque[int] = deque()  # keyframes whose doubtful depth waits
         self._ssim = SsimLoss()
         self._buffers: dict[tuple[int, int], tuple[np.ndarray, np.ndarray]] = {}
         r = self.settings.rates
@@ -70,13 +72,26 @@ class Mapper:
             return Outcome(fault)
         if frame.anchor not in self.T_map_anchor:
             self.T_map_anchor[frame.anchor] = np.array(T_map_anchor, dtype=np.float64)
-        held = hold(frame, self.settings.sigma_unit_m)
+        held = hold(frame, self.settings.sigma_unit)
         removed = self._clean(held)
-        outcome = self._insert(held, held.levels[FULL])
+        outcome = self._insert(held, held.levels[FULL], self.settings.sure_weight)
         self._forget()
         self.keyframes[frame.id] = held
+        self._unsure.append(frame.id)
+        self._take_unsure(self.settings.wait_keyframes)
         self._newest = [*self._newest, frame.id][-self.settings.recent :]
         return replace(outcome, removed=removed)
+
+    def finish(self) -> None:
+        """No more keyframes will come soon: depth that waited for a better one is taken as it is."""
+        self._take_unsure(0)
+
+    def _take_unsure(self, waiting: int) -> None:
+        """Fills what the oldest keyframes still see through, but not where others look through it too."""
+        while len(self._unsure) > waiting:
+            held = self.keyframes.get(self._unsure.popleft())
+            if held is not None:
+                self._insert(held, held.levels[FULL], 0.0)
 
     def _forget(self) -> None:
         """Makes room for a keyframe: one drawn from all but the newest goes; its Gaussians stay."""
@@ -120,26 +135,41 @@ class Mapper:
 
     # --- growing and shrinking ---------------------------------------------------------------------
 
-    def _insert(self, held: Held, level: Level) -> Outcome:
+    def _insert(self, held: Held, level: Level, least_weight: float) -> Outcome:
         room = max(self.settings.max_gaussians - self.store.count, 0)
         T_map_camera = self.T_map_camera(held)
         render = self._render(level, T_map_camera)
         missing = unexplained(render.image, level, self.settings)
         foretold = _foretold(render.image, level)
         self.rasterizer.release(render)
-        u, v, spacing = candidates(missing, level, self.settings)
-        if len(u) > room:
-            u, v, spacing = u[:room], v[:room], spacing[:room]
-        if len(u):
-            self.store.append(make_gaussians(u, v, spacing, level, T_map_camera, self.settings), held.anchor)
-        return Outcome("ok", len(u), 0, *foretold)
+        u, v, spacing = candidates(missing, level, self.settings, least_weight)
+        new = make_gaussians(u, v, spacing, level, T_map_camera, self.settings)
+        if least_weight == 0.0:
+            new = new[:, ~self._in_free_space(new)]
+        new = new[:, :room]
+        if new.shape[1]:
+            self.store.append(new, held.anchor)
+        return Outcome("ok", new.shape[1], 0, *foretold)
+
+    def _in_free_space(self, params: np.ndarray) -> np.ndarray:
+        """bool [N]: Gaussians float32 [14, N] that a recent keyframe sees through to a surface known well."""
+        strikes = np.zeros(params.shape[1], np.int32)
+        for id in self._newest:
+            self._strike(self.keyframes[id], params, params.shape[1], strikes)
+        return strikes > 0
+
+    def _strike(self, held: Held, params: np.ndarray, count: int, strikes: np.ndarray) -> None:
+        level, s = held.levels[HALF], self.settings
+        packed = level.camera.packed(inverse(self.T_map_camera(held)))
+        least = np.uint8(255.0 * s.carve_weight)
+        contradicted(
+            params, count, packed, level.depth_mm, level.depth_weight, least, s.carve_margin, strikes
+        )
 
     def _clean(self, held: Held) -> int:
         """Drops what has faded, and what floats before surfaces that are known well; gives how many."""
-        level, s, store = held.levels[HALF], self.settings, self.store
-        packed = level.camera.packed(inverse(self.T_map_camera(held)))
-        contradicted(store.params, store.count, packed, level.depth_mm, level.depth_weight, np.uint8(200),
-                     s.carve_margin, store.strikes)  # fmt: skip
+        s, store = self.settings, self.store
+        self._strike(held, store.params, store.count, store.strikes)
         faint = np.log(s.prune_opacity / (1.0 - s.prune_opacity))
         keep = (store.strikes[: store.count] < s.carve_strikes) & (
             store.params[OPACITY, : store.count] > faint

@@ -31,6 +31,8 @@ class MapperSettings:
     stride_px: int = 5
     fine_stride_px: int = 3  # where the picture has texture
     texture: float = 0.15  # mean absolute colour step over `stride_px` that counts as texture
+    sure_weight: float = 0.25  # depth of less weight waits: a later keyframe may know better
+    wait_keyframes: int = 8  # for so many; then what is still not explained is taken as it is
     alpha_low: float = 0.7  # less than this is not explained
     colour_off: float = 0.15  # mean absolute colour error that is not explained
     depth_off: float = 0.10  # relative depth error that is not explained
@@ -46,10 +48,11 @@ class MapperSettings:
     lidar_weight: float = 1e-3
     isotropy_weight: float = 0.05
     isotropy_ratio: float = 4.0
-    sigma_unit_m: float = 0.05  # a depth of this sigma has weight 1/2
+    sigma_unit: float = 0.03  # a depth whose sigma is this share of it has weight 1/2
     # Upkeep
     prune_opacity: float = 0.03
     carve_sigma: float = 3.0
+    carve_weight: float = 0.5  # of depth that can carve
     carve_margin: float = 0.08  # relative, beyond which a Gaussian floats before a trusted surface
     carve_strikes: int = 2
     refine_pose: bool = False

@@ -135,6 +135,100 @@ def test_the_map_moves_with_its_anchor(room, mapped):
         mapper.move_anchors({0: np.zeros((4, 4))})
 
 
+def test_a_loop_closure_mends_the_map(room):
+    """Half of the keyframes are a metre and ten degrees off until the pose graph knows better: after some steps
+    the views between them are as good as in a map that never jumped."""
+    jump = make_transform(so3_exp([0.0, 0.0, np.deg2rad(10.0)]), np.array([1.0, 0.0, 0.0]))
+    scores = []
+    for misplaced in (np.eye(4), jump):
+        mapper = Mapper(SETTINGS, seed=1)
+        for number in range(6):
+            late = number >= 3
+            assert mapper.add(keyframe(room, number, anchor=int(late)), misplaced if late else np.eye(4)).ok
+            mapper.optimise()
+        mapper.move_anchors({1: np.eye(4)})
+        for number in (2, 4):
+            assert np.allclose(mapper.T_map_camera(mapper.keyframes[number]), view(room, number))
+        mapper.finish()
+        mapper.refine(60, HALF)
+        scores.append(
+            np.mean([quality(mapper, room, view(room, n)).psnr_db for n in (0.5, 1.5, 2.5, 3.5, 4.5)])
+        )
+    assert scores[0] > 22.0
+    assert scores[1] > scores[0] - 0.5
+
+
+def test_doubtful_depth_waits_for_better(room):
+    """A far wall of doubtful depth is left out at first; when nobody knows better it is taken as it is."""
+    settings = replace(SETTINGS, wait_keyframes=2)
+    mapper = Mapper(settings, seed=1)
+    frame = keyframe(room, 0)
+    doubt = frame.sigma_m.copy()
+    doubt[:, 80:] = 0.5 * frame.depth_m[:, 80:]
+    assert mapper.add(replace(frame, sigma_m=doubt), np.eye(4)).ok
+    first = mapper.store.count
+    shown = render_rgb_depth(mapper.rasterizer, mapper.store, CAMERA, view(room, 0))[2]
+    assert shown[:, 100:].mean() < 0.1 < 0.5 < shown[:, :60].mean()
+    mapper.add(replace(keyframe(room, 0, id=1), mask=np.arange(160)[None] < np.full((120, 1), 80)), np.eye(4))
+    assert mapper.store.count < first + 200
+    mapper.finish()
+    shown = render_rgb_depth(mapper.rasterizer, mapper.store, CAMERA, view(room, 0))[2]
+    assert shown[:, 100:].mean() > 0.5
+
+
+def test_what_others_look_through_is_not_filled_with_doubtful_depth(room):
+    """Doubtful depth half way to a wall that another keyframe sees well: nothing is put into the air."""
+    mapper = Mapper(replace(SETTINGS, wait_keyframes=1), seed=1)
+    good = keyframe(room, 0)
+    doubtful = replace(
+        keyframe(room, 1), depth_m=0.5 * keyframe(room, 1).depth_m, sigma_m=0.4 * keyframe(room, 1).depth_m
+    )
+    assert mapper.add(doubtful, np.eye(4)).inserted == 0
+    assert mapper.add(good, np.eye(4)).ok
+    mapper.finish()
+    points = mapper.store.params[:3, : mapper.store.count]
+    camera = inverse(view(room, 0))
+    z = camera[2, :3] @ points + camera[2, 3]
+    u = np.round((camera[0, :3] @ points + camera[0, 3]) / z * 110.0 + 79.5).astype(int)
+    v = np.round((camera[1, :3] @ points + camera[1, 3]) / z * 110.0 + 59.5).astype(int)
+    inside = (u >= 0) & (u < 160) & (v >= 0) & (v < 120)
+    depth = good.depth_m[v[inside], u[inside]]
+    assert np.nanmean(z[inside] < 0.7 * depth) < 0.15  # half of them, if nobody objected
+
+
+def test_masked_pixels_teach_nothing(room):
+    """A grey sheet hangs before half of the picture; with a mask the map does not learn its colour."""
+    results = []
+    for masked in (False, True):
+        mapper = Mapper(SETTINGS, seed=1)
+        mapper.add(keyframe(room, 0), np.eye(4))
+        mapper.optimise()
+        frame = keyframe(room, 0, id=1)
+        rgb = frame.rgb.copy()
+        rgb[:, 80:] = 128
+        mask = np.ones((120, 160), bool)
+        mask[:, 80:] = not masked
+        mapper.add(replace(frame, rgb=rgb, mask=mask), np.eye(4))
+        for _ in range(20):
+            mapper.step(mapper.keyframes[1], FULL)
+        results.append(quality(mapper, room, view(room, 0)).psnr_db)
+    assert results[1] > results[0] + 3.0
+    assert results[1] > 22.0
+
+
+def test_old_keyframes_are_forgotten_within_the_bound(room):
+    mapper = Mapper(replace(SETTINGS, max_keyframes=4, half_iterations=1, full_iterations=0), seed=1)
+    for number in range(8):
+        assert mapper.add(keyframe(room, number), np.eye(4)).ok
+        mapper.optimise()
+    assert len(mapper.keyframes) == 4
+    assert 7 in mapper.keyframes
+    gone = next(n for n in range(8) if n not in mapper.keyframes)
+    before = mapper.store.count
+    assert mapper.add(keyframe(room, gone), np.eye(4)).inserted == 0  # sent again: it has been dealt with
+    assert mapper.store.count == before
+
+
 def test_pose_refinement_undoes_a_planted_error(room, mapped):
     mapper = copy_of(mapped)
     mapper.settings = replace(
