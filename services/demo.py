@@ -41,12 +41,14 @@ def demo(
     out.mkdir(parents=True, exist_ok=True)
     source = data if data is not None else _simulated(out, seconds)
     shutil.rmtree(out / "recording", ignore_errors=True)
+    shutil.rmtree(out / "map", ignore_errors=True)
     (out / "demo.rrd").unlink(missing_ok=True)
     overrides = (
         f"replay.data={json.dumps(str(source))}",
         f"recorder.out={json.dumps(str(out / 'recording'))}",
         f"monitor.save={json.dumps(str(out / 'demo.rrd'))}",
         f"monitor.view={json.dumps(view)}",
+        f"mapping.save={json.dumps(str(out / 'map'))}",
         f"rate={rate}",
         *(set_ or ()),
     )
@@ -71,6 +73,8 @@ def _report(out: Path, source: Path) -> None:
         (out / "recording", "what went over the bus; opens in Foxglove and with `ros2 bag`"),
         (out / "demo.rrd", "what the monitor saw; open it with `rerun FILE`"),
     ]
+    if (out / "map").exists():  # data without a camera give none
+        rows.append((out / "map" / "map.ply", "the map: opens in viewers of 3D Gaussian splats"))
     for path, what in rows:
         if not path.exists():
             raise UserError(f"{path} was not written: the node's log in the state folder says why")
