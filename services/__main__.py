@@ -15,6 +15,7 @@ from services.depth import models_cli
 from services.evaluation import calibrate_cli
 from services.evaluation import cli as depth_cli
 from services.localization import cli as localization_cli
+from services.localization.eval_relocalize import eval_relocalize
 from services.mapping import cli as mapping_cli
 from services.replay import cli as replay_cli
 from services.simulator import cli as simulator_cli
@@ -42,6 +43,7 @@ for command in (localization_cli.slam, depth_cli.depth):
 
 evaluate = typer.Typer(no_args_is_help=True, help="Errors against truth.")
 evaluate.command("slam")(localization_cli.eval_slam)
+evaluate.command("relocalize")(eval_relocalize)
 evaluate.command("depth")(depth_cli.eval_depth)
 app.add_typer(evaluate, name="eval", rich_help_panel=_RESULTS)
 

@@ -4,6 +4,11 @@ import socket
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
+
+# The first example compiles kernels, and the machine may be busy: no test is about time.
+settings.register_profile("beamsplat", deadline=None)
+settings.load_profile("beamsplat")
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 

@@ -75,7 +75,7 @@ def slam(
     if as_json:
         print(json.dumps(figures))
     else:
-        _print_figures(figures)
+        print_figures(figures)
         console.print(f"trajectory.tum, online.tum, map.pgm, map.yaml, map.png and state/ lie in {out}")
 
 
@@ -114,10 +114,11 @@ def eval_slam(
     if as_json:
         print(json.dumps(figures))
     else:
-        _print_figures(figures)
+        print_figures(figures)
 
 
-def _poses(folder: Path, name: str) -> tuple[Any, Any]:
+def poses_of(folder: Path, name: str) -> tuple[Any, Any]:
+    """Stamps int64 [N] and planar poses float64 [N, 3] of a TUM file."""
     from common.geometry import se3_to_se2
     from common.trajectory import read_tum
 
@@ -133,7 +134,7 @@ def _against_relations(folder: Path, path: Path) -> dict[str, Any]:
 
     from services.localization.lidar2d.metrics import read_relations, relation_errors
 
-    stamps_ns, T_map_body = _poses(folder, "trajectory.tum")
+    stamps_ns, T_map_body = poses_of(folder, "trajectory.tum")
     relation_stamps_ns, relative = read_relations(path)
     T_body_lidar = np.array(json.loads((folder / "figures.json").read_text())["T_body_lidar"])
     return asdict(relation_errors(stamps_ns, T_map_body, relation_stamps_ns, relative, T_body_lidar))
@@ -143,9 +144,9 @@ def _against_truth(folder: Path, path: Path) -> dict[str, Any]:
     from services.localization.lidar2d.metrics import interpolate_poses, trajectory_errors
 
     figures: dict[str, Any] = {}
-    true_stamps_ns, T_world_body = _poses(path.parent, path.name)
+    true_stamps_ns, T_world_body = poses_of(path.parent, path.name)
     for prefix, name in (("", "trajectory.tum"), ("online_", "online.tum")):
-        stamps_ns, T_map_body = _poses(folder, name)
+        stamps_ns, T_map_body = poses_of(folder, name)
         inside = (stamps_ns >= true_stamps_ns[0]) & (stamps_ns <= true_stamps_ns[-1])
         if not inside.any():
             raise UserError(f"{path}: no true pose within the time of {folder / name}")
@@ -160,7 +161,8 @@ def _against_truth(folder: Path, path: Path) -> dict[str, Any]:
     return figures
 
 
-def _print_figures(figures: dict[str, Any]) -> None:
+def print_figures(figures: dict[str, Any]) -> None:
+    """A table of the scalars."""
     table = Table("figure", "value")
     for name, value in figures.items():
         if isinstance(value, (int, float, str)):

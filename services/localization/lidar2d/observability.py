@@ -48,11 +48,14 @@ def agreement_when_shifted(
     return here
 
 
+@njit(nogil=True, cache=True, error_model="numpy")
 def weak_direction(information: np.ndarray) -> np.ndarray:
     """Unit vector of the translation a match knows least about (yaw marginalised)."""
     yaw = max(information[2, 2], 1e-9)
-    A = information[:2, :2] - np.outer(information[:2, 2], information[2, :2]) / yaw
-    angle = 0.5 * math.atan2(2.0 * A[0, 1], A[0, 0] - A[1, 1])  # of the strong axis
+    xx = information[0, 0] - information[0, 2] * information[2, 0] / yaw
+    xy = information[0, 1] - information[0, 2] * information[2, 1] / yaw
+    yy = information[1, 1] - information[1, 2] * information[2, 1] / yaw
+    angle = 0.5 * math.atan2(2.0 * xy, xx - yy)  # of the strong axis
     return np.array([-math.sin(angle), math.cos(angle)])
 
 

@@ -11,25 +11,43 @@ from services.localization.lidar2d.observability import held_along, without_slip
 from services.localization.lidar2d.settings import LidarSlamSettings
 from services.localization.lidar2d.surfel_map import FrozenMap, MatchTables, SurfelMap, freeze
 
+STILL_M, STILL_RAD = 0.02, 0.005  # keynodes that moved less leave the free space of a submap as it was
+
 
 def draw_submap(
-    settings: LidarSlamSettings, nodes: list[Keynode], T_submap_node: list[np.ndarray]
+    settings: LidarSlamSettings,
+    nodes: list[Keynode],
+    T_submap_node: list[np.ndarray],
+    before: FrozenMap | None = None,
 ) -> FrozenMap:
-    """A frozen map of keynodes at given poses."""
+    """A frozen map of keynodes at given poses; the free space is taken over where `before` is given."""
     surfels = SurfelMap(settings)
-    for node, T in zip(nodes, T_submap_node):
+    points = [se2.transform(T, n.scan.points.astype(np.float64)) for n, T in zip(nodes, T_submap_node)]
+    surfels.cover(np.concatenate(points))
+    for node, T, there in zip(nodes, T_submap_node, points):
         scan = node.scan
         still = ~scan.moving
         surfels.insert(
-            se2.transform(T, scan.points.astype(np.float64)),
+            there,
             se2.transform(np.array([0.0, 0.0, T[2]]), scan.tangents.astype(np.float64)),
             scan.spacing_m.astype(np.float64),
             se2.transform(T, scan.origin[None])[0],
             still,
-            still,
+            still if before is None else np.zeros_like(still),
             matchable=False,
         )
-    return freeze(surfels)
+    return freeze(surfels, before)
+
+
+def _has_moved(drawn: dict[int, np.ndarray], members: list[int], T_submap_node: list[np.ndarray]) -> bool:
+    """Whether any keynode left the place it was drawn at."""
+    for node, T in zip(members, T_submap_node):
+        if node not in drawn:
+            return True
+        moved = se2.between(drawn[node], T)
+        if abs(moved[0]) + abs(moved[1]) > STILL_M or abs(moved[2]) > STILL_RAD:
+            return True
+    return False
 
 
 def refine_submaps(
@@ -49,8 +67,11 @@ def refine_submaps(
     measured = list(constraints)
     for submap in sorted(frozen):
         poses = [se2.between(T_map_submap[submap], T_map_node[n]) for n in members[submap]]
-        drawn[submap] = draw_submap(settings, [nodes[n] for n in members[submap]], poses)
-        tables = drawn[submap].tables(settings.reach_cells)
+        own = [constraints[k] for k in by_submap.get(submap, []) if not constraints[k].loop]
+        moved = _has_moved({c.node: c.T_submap_node for c in own}, members[submap], poses)
+        before = None if moved else frozen[submap]
+        drawn[submap] = draw_submap(settings, [nodes[n] for n in members[submap]], poses, before)
+        tables = drawn[submap].tables(settings.reach_cells, for_search=False)
         for k in by_submap.get(submap, []):
             measured[k] = _measure(
                 settings,

@@ -58,6 +58,7 @@ def build_global_map(
             se2.transform(T, node.scan.origin[None])[0],
             still,
             still,
+            matchable=False,
         )
     tables = freeze(surfels).tables(settings.reach_cells)
     positions = np.array([T[:2] for T in T_map_node])

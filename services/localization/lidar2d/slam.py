@@ -219,7 +219,7 @@ class LidarSlam:
         if result.number % self.settings.trim_every_jobs == 0 or self.back.fixed:
             self.back.trim(self.mapper.active_ids)
 
-    def finish(self, refine_rounds: int = 2) -> None:
+    def finish(self, refine_rounds: int = 4) -> None:
         """Final loop closure, refinement and optimisation, inline; mapping may go on afterwards."""
         if self._due is not None:
             self.apply(self._due.run())

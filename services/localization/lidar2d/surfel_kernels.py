@@ -1,4 +1,4 @@
-"""Kernels of the local map: moments per cell, the surface element they describe, and who is nearest."""
+"""Kernels of the local map: moments per cell and the surface element they describe."""
 
 from __future__ import annotations
 
@@ -7,9 +7,10 @@ import math
 import numpy as np
 from numba import njit
 
+from services.localization.lidar2d.table_kernels import splat
+
 MAX_WEIGHT = 60.0  # moments forget beyond this many returns: slow change is followed, memory of drift fades
 RESPLAT_M = 0.006  # a surface element that moved less than this is where its neighbourhood thinks it is
-FIELD_SIGMA_M = 0.06  # width of the likelihood field used by searches
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
@@ -80,46 +81,6 @@ def elements(
     for k in range(cells.shape[0]):
         row, col = cells[k, 0] - row0, cells[k, 1] - col0
         merged_surfel(cell_id, moments, row, col, range_sigma_m, map_sigma_m, means[k], omegas[k])
-
-
-@njit(nogil=True, cache=True, error_model="numpy")
-def splat(
-    nearest: np.ndarray,  # int32 [H, W]
-    field: np.ndarray,  # uint8 [H, W]
-    means: np.ndarray,  # float64 [S, 2]
-    omegas: np.ndarray,  # float64 [S, 3]
-    index: int,
-    row: int,
-    col: int,
-    row0: int,
-    col0: int,
-    cell_m: float,
-    reach: int,
-) -> None:
-    """Tell the cells around a surface element that it may be their nearest, and raise the likelihood."""
-    mx, my = means[index, 0], means[index, 1]
-    trace = omegas[index, 0] + omegas[index, 2]
-    for r in range(max(row - reach, 0), min(row + reach + 1, nearest.shape[0])):
-        cy = (r + row0 + 0.5) * cell_m - my
-        for c in range(max(col - reach, 0), min(col + reach + 1, nearest.shape[1])):
-            cx = (c + col0 + 0.5) * cell_m - mx
-            d2 = cx * cx + cy * cy
-            k = nearest[r, c]
-            if k >= 0 and k != index:
-                ex, ey = cx + mx - means[k, 0], cy + my - means[k, 1]
-                if d2 < ex * ex + ey * ey:
-                    nearest[r, c] = index
-            else:
-                nearest[r, c] = index
-            # Distance across the surface counts fully, along it a quarter.
-            across = (
-                omegas[index, 0] * cx * cx + 2.0 * omegas[index, 1] * cx * cy + omegas[index, 2] * cy * cy
-            ) / trace
-            d2f = across + 0.25 * max(d2 - across, 0.0)
-            if d2f < 9.0 * FIELD_SIGMA_M * FIELD_SIGMA_M:
-                v = 255.0 * math.exp(-0.5 * d2f / (FIELD_SIGMA_M * FIELD_SIGMA_M))
-                if v > field[r, c]:
-                    field[r, c] = np.uint8(v)
 
 
 @njit(nogil=True, cache=True, error_model="numpy")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import zlib
 from dataclasses import dataclass
 
@@ -9,7 +10,8 @@ import numpy as np
 from numba import njit
 
 from services.localization.lidar2d.settings import LidarSlamSettings
-from services.localization.lidar2d.surfel_kernels import add_returns, cast_rays, elements, refresh, splat
+from services.localization.lidar2d.surfel_kernels import add_returns, cast_rays, elements, refresh
+from services.localization.lidar2d.table_kernels import nearest_all, splat_all
 
 BLOCK = 64  # grids grow in blocks of so many cells
 MARGIN = 8
@@ -62,17 +64,9 @@ class SurfelMap:
                 grown[: self.count] = getattr(self, name)[: self.count]
             setattr(self, name, grown)
 
-    def _cover(self, points: np.ndarray) -> None:
-        low = np.floor(points.min(axis=0) / self.cell_m).astype(np.int64) - MARGIN
-        high = np.floor(points.max(axis=0) / self.cell_m).astype(np.int64) + MARGIN + 1
-        rows, cols = self.cell_id.shape
-        grow = (
-            max(0, self.row0 - low[1]),
-            max(0, high[1] - self.row0 - rows),
-            max(0, self.col0 - low[0]),
-            max(0, high[0] - self.col0 - cols),
-        )
-        top, bottom, left, right = (int(-(-g // BLOCK) * BLOCK) for g in grow)
+    def cover(self, points: np.ndarray) -> None:
+        """Grow the grids until the points (float64 [N, 2], N > 0) lie inside, with a margin."""
+        top, bottom, left, right = _growth(points, self.cell_m, self.row0, self.col0, *self.cell_id.shape)
         if top or bottom or left or right:
             pad = ((top, bottom), (left, right))
             for name, fill in (
@@ -100,7 +94,8 @@ class SurfelMap:
         """Add one scan."""
         if len(points) == 0:
             return
-        self._cover(np.vstack([points, origin]))
+        self.cover(points)
+        self.cover(origin[None])
         if self.count + len(points) > len(self.moments):
             self._reserve_surfels(max(2 * len(self.moments), self.count + len(points)))
         changed = np.empty(len(points), dtype=np.int32)
@@ -189,6 +184,28 @@ class SurfelMap:
         )
 
 
+@njit(nogil=True, cache=True, error_model="numpy")
+def _growth(
+    points: np.ndarray, cell_m: float, row0: int, col0: int, rows: int, cols: int
+) -> tuple[int, int, int, int]:
+    """Cells to add at the top, bottom, left and right, in whole blocks."""
+    x_low = x_high = points[0, 0]
+    y_low = y_high = points[0, 1]
+    for i in range(1, points.shape[0]):
+        x, y = points[i, 0], points[i, 1]
+        x_low, x_high, y_low, y_high = min(x_low, x), max(x_high, x), min(y_low, y), max(y_high, y)
+    top = row0 - (math.floor(y_low / cell_m) - MARGIN)
+    bottom = math.floor(y_high / cell_m) + MARGIN + 1 - row0 - rows
+    left = col0 - (math.floor(x_low / cell_m) - MARGIN)
+    right = math.floor(x_high / cell_m) + MARGIN + 1 - col0 - cols
+    return (
+        -(-max(top, 0) // BLOCK) * BLOCK,
+        -(-max(bottom, 0) // BLOCK) * BLOCK,
+        -(-max(left, 0) // BLOCK) * BLOCK,
+        -(-max(right, 0) // BLOCK) * BLOCK,
+    )
+
+
 @dataclass(frozen=True)
 class FrozenMap:
     """A finished local map in little memory: what is needed to match to it, to search it and to draw it."""
@@ -207,13 +224,16 @@ class FrozenMap:
         hits, misses = np.frombuffer(zlib.decompress(self.packed), dtype=np.uint8).reshape(2, *self.shape)
         return hits, misses
 
-    def tables(self, reach_cells: int) -> MatchTables:
-        """Match tables, computed from the surface elements."""
+    def tables(self, reach_cells: int, for_search: bool = True) -> MatchTables:
+        """Match tables, computed from the surface elements; without the likelihood field if none searches."""
         means, omegas = self.means.astype(np.float64), self.omegas.astype(np.float64)
         nearest = np.full(self.shape, -1, dtype=np.int32)
         field = np.zeros(self.shape, dtype=np.uint8)
         cells = np.floor(means[:, ::-1] / self.cell_m).astype(np.int64)
-        _splat_all(nearest, field, means, omegas, cells, self.row0, self.col0, self.cell_m, reach_cells)
+        if for_search:
+            splat_all(nearest, field, means, omegas, cells, self.row0, self.col0, self.cell_m, reach_cells)
+        else:
+            nearest_all(nearest, means, cells, self.row0, self.col0, self.cell_m, reach_cells)
         return MatchTables(
             nearest,
             field,
@@ -227,54 +247,54 @@ class FrozenMap:
         )
 
 
-def freeze(surfels: SurfelMap, min_hit_share: float = 0.2) -> FrozenMap:
-    """Keep the surface elements that later beams did not contradict, crop the grids to what was seen."""
+def freeze(surfels: SurfelMap, counts_of: FrozenMap | None = None, min_hit_share: float = 0.2) -> FrozenMap:
+    """Keep the surface elements that later beams did not contradict, crop the grids to what was seen.
+
+    With `counts_of` the counts of an older drawing of the same scans are kept.
+    """
     n = surfels.count
     means, omegas = surfels.surface_elements()
     rows, cols = surfels.cells[:n, 0] - surfels.row0, surfels.cells[:n, 1] - surfels.col0
     hits = surfels.hits[rows, cols].astype(np.float64)
-    alive = hits >= min_hit_share * (hits + surfels.misses[rows, cols])
-    seen = (surfels.hits > 0) | (surfels.misses > 0)
-    used_rows, used_cols = np.flatnonzero(seen.any(axis=1)), np.flatnonzero(seen.any(axis=0))
-    if len(used_rows) == 0:
-        raise ValueError("a map without a single return cannot be frozen")
-    r0, r1 = max(used_rows[0] - MARGIN, 0), used_rows[-1] + MARGIN + 1
-    c0, c1 = max(used_cols[0] - MARGIN, 0), used_cols[-1] + MARGIN + 1
+    if counts_of is None:
+        grid = _Counts.of(surfels)
+        misses, inside = surfels.misses[rows, cols], np.ones(n, dtype=bool)
+    else:
+        grid = _Counts(counts_of.packed, counts_of.shape, counts_of.row0, counts_of.col0)
+        rows, cols = surfels.cells[:n, 0] - grid.row0, surfels.cells[:n, 1] - grid.col0
+        inside = (rows >= 0) & (cols >= 0) & (rows < grid.shape[0]) & (cols < grid.shape[1])
+        misses = np.zeros(n, dtype=np.uint8)
+        misses[inside] = counts_of.counts()[1][rows[inside], cols[inside]]
+    alive = inside & (hits >= min_hit_share * (hits + misses))
     return FrozenMap(
         means[alive].astype(np.float32),
         omegas[alive].astype(np.float32),
         surfels.views[:n][alive].astype(np.float32),
-        zlib.compress(np.stack([surfels.hits[r0:r1, c0:c1], surfels.misses[r0:r1, c0:c1]]).tobytes(), 1),
-        surfels.hits[r0:r1, c0:c1].shape,
-        int(surfels.row0 + r0),
-        int(surfels.col0 + c0),
+        grid.packed,
+        grid.shape,
+        grid.row0,
+        grid.col0,
         surfels.cell_m,
     )
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
-def _splat_all(
-    nearest: np.ndarray,
-    field: np.ndarray,
-    means: np.ndarray,
-    omegas: np.ndarray,
-    cells: np.ndarray,
-    row0: int,
-    col0: int,
-    cell_m: float,
-    reach: int,
-) -> None:
-    for i in range(len(means)):
-        splat(
-            nearest,
-            field,
-            means,
-            omegas,
-            i,
-            cells[i, 0] - row0,
-            cells[i, 1] - col0,
-            row0,
-            col0,
-            cell_m,
-            reach,
-        )
+@dataclass(frozen=True)
+class _Counts:
+    """Hits and misses as a frozen map keeps them."""
+
+    packed: bytes
+    shape: tuple[int, int]
+    row0: int
+    col0: int
+
+    @staticmethod
+    def of(surfels: SurfelMap) -> _Counts:
+        seen = (surfels.hits > 0) | (surfels.misses > 0)
+        used_rows, used_cols = np.flatnonzero(seen.any(axis=1)), np.flatnonzero(seen.any(axis=0))
+        if len(used_rows) == 0:
+            raise ValueError("a map without a single return cannot be frozen")
+        r0, r1 = max(used_rows[0] - MARGIN, 0), used_rows[-1] + MARGIN + 1
+        c0, c1 = max(used_cols[0] - MARGIN, 0), used_cols[-1] + MARGIN + 1
+        cropped = np.stack([surfels.hits[r0:r1, c0:c1], surfels.misses[r0:r1, c0:c1]])
+        packed = zlib.compress(cropped.tobytes(), 1)
+        return _Counts(packed, cropped.shape[1:], int(surfels.row0 + r0), int(surfels.col0 + c0))

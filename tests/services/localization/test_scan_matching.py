@@ -32,7 +32,7 @@ def prepared(pose, lidar=None, velocity=(0.0, 0.0, 0.0), pose_at=None):
     return prepare_scan(ranges, a, inc, dt, low, high, np.zeros(3), np.array(velocity), 0.03, 360)
 
 
-def mapped(views):
+def mapped(views, matchable=True, rays=True):
     surfels = SurfelMap(SETTINGS)
     for pose in views:
         scan = prepared(pose)
@@ -44,26 +44,23 @@ def mapped(views):
             scan.spacing_m,
             pose[:2].copy(),
             use,
-            use,
+            use & rays,
+            matchable,
         )
     return surfels
 
 
+VIEWS = [
+    np.array(pose)
+    for pose in (
+        (2, 2, 0), (2.3, 2, 0.3), (2.6, 2.1, 0.6), (3, 2.4, 0.8), (3.3, 2.8, 1.0), (2, 3, 3.0)
+    )
+]  # fmt: skip
+
+
 @pytest.fixture(scope="module")
 def room():
-    return mapped(
-        [
-            np.array([x, y, yaw])
-            for x, y, yaw in [
-                (2, 2, 0),
-                (2.3, 2, 0.3),
-                (2.6, 2.1, 0.6),
-                (3, 2.4, 0.8),
-                (3.3, 2.8, 1.0),
-                (2, 3, 3.0),
-            ]
-        ]
-    )
+    return mapped(VIEWS)
 
 
 @given(poses, poses, poses)
@@ -282,3 +279,30 @@ def test_a_map_survives_freezing_and_growing(room):
     hits, misses = frozen.counts()
     assert hits.sum() == room.hits.sum()
     assert misses.sum() == room.misses.sum()
+
+
+def test_tables_with_and_without_the_field_agree(room):
+    frozen = freeze(room)
+    searched, matched = frozen.tables(SETTINGS.reach_cells), frozen.tables(SETTINGS.reach_cells, False)
+    assert np.mean(searched.nearest != matched.nearest) < 1e-3  # equally near, within float32
+    assert not matched.field.any()
+    assert searched.field.any()
+
+
+def test_what_was_put_off_is_made_up_for(room):
+    late = mapped(VIEWS, matchable=False)
+    assert not late.field.any()
+    late.make_matchable()
+    assert np.allclose(late.means[: late.count], room.means[: room.count])
+    # The live map moves its tables only once an element has moved by millimetres.
+    rows, cols = np.nonzero((late.nearest >= 0) & (room.nearest >= 0))
+    centre = (np.column_stack([cols + late.col0, rows + late.row0]) + 0.5) * late.cell_m
+    away = [np.linalg.norm(m.means[m.nearest[rows, cols]] - centre, axis=1) for m in (late, room)]
+    assert np.max(np.abs(away[0] - away[1])) < 0.02  # m
+
+
+def test_a_redrawn_submap_keeps_its_free_space(room):
+    frozen = freeze(room)
+    again = freeze(mapped(VIEWS, matchable=False, rays=False), frozen)
+    assert again.packed == frozen.packed
+    assert np.allclose(again.means, frozen.means)

@@ -12,7 +12,7 @@ K = np.array([[265.0, 0.0, 159.5], [0.0, 265.0, 119.5], [0.0, 0.0, 1.0]])
 small = st.floats(-1.0, 1.0)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(small, small, small, small, small)
 def test_every_pixels_ray_projects_back_onto_the_pixel_with_opencv(k1, k2, p1, p2, k3):
     lens = (-0.2 * abs(k1), 0.05 * k2, 0.003 * p1, 0.003 * p2, 0.01 * k3)
@@ -23,7 +23,7 @@ def test_every_pixels_ray_projects_back_onto_the_pixel_with_opencv(k1, k2, p1, p
     np.testing.assert_allclose(pixels.reshape(30, 40, 2), np.stack([u, v], axis=-1), atol=1e-6)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(st.lists(st.tuples(st.floats(-0.6, 0.6), st.floats(-0.45, 0.45)), min_size=1, max_size=20))
 def test_undistort_inverts_distort(points):
     lens = (-0.28, 0.07, 0.001, -0.002, 0.0)

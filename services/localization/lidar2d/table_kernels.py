@@ -1,0 +1,103 @@
+"""Kernels of what a matcher reads: the nearest surface element of every cell, and the likelihood field."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+FIELD_SIGMA_M = 0.06  # width of the likelihood field used by searches
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def splat(
+    nearest: np.ndarray,  # int32 [H, W]
+    field: np.ndarray,  # uint8 [H, W]
+    means: np.ndarray,  # float64 [S, 2]
+    omegas: np.ndarray,  # float64 [S, 3]
+    index: int,
+    row: int,
+    col: int,
+    row0: int,
+    col0: int,
+    cell_m: float,
+    reach: int,
+) -> None:
+    """Tell the cells around a surface element that it may be their nearest, and raise the likelihood."""
+    mx, my = means[index, 0], means[index, 1]
+    trace = omegas[index, 0] + omegas[index, 2]
+    for r in range(max(row - reach, 0), min(row + reach + 1, nearest.shape[0])):
+        cy = (r + row0 + 0.5) * cell_m - my
+        for c in range(max(col - reach, 0), min(col + reach + 1, nearest.shape[1])):
+            cx = (c + col0 + 0.5) * cell_m - mx
+            d2 = cx * cx + cy * cy
+            k = nearest[r, c]
+            if k >= 0 and k != index:
+                ex, ey = cx + mx - means[k, 0], cy + my - means[k, 1]
+                if d2 < ex * ex + ey * ey:
+                    nearest[r, c] = index
+            else:
+                nearest[r, c] = index
+            # Distance across the surface counts fully, along it a quarter.
+            across = (
+                omegas[index, 0] * cx * cx + 2.0 * omegas[index, 1] * cx * cy + omegas[index, 2] * cy * cy
+            ) / trace
+            d2f = across + 0.25 * max(d2 - across, 0.0)
+            if d2f < 9.0 * FIELD_SIGMA_M * FIELD_SIGMA_M:
+                v = 255.0 * math.exp(-0.5 * d2f / (FIELD_SIGMA_M * FIELD_SIGMA_M))
+                if v > field[r, c]:
+                    field[r, c] = np.uint8(v)
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def splat_all(
+    nearest: np.ndarray,
+    field: np.ndarray,
+    means: np.ndarray,
+    omegas: np.ndarray,
+    cells: np.ndarray,
+    row0: int,
+    col0: int,
+    cell_m: float,
+    reach: int,
+) -> None:
+    """Nearest table and likelihood field of all surface elements, from empty ones."""
+    for i in range(len(means)):
+        splat(
+            nearest,
+            field,
+            means,
+            omegas,
+            i,
+            cells[i, 0] - row0,
+            cells[i, 1] - col0,
+            row0,
+            col0,
+            cell_m,
+            reach,
+        )
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def nearest_all(
+    nearest: np.ndarray,  # out int32 [H, W]
+    means: np.ndarray,  # float64 [S, 2]
+    cells: np.ndarray,  # int64 [S, 2] row, col (absolute)
+    row0: int,
+    col0: int,
+    cell_m: float,
+    reach: int,
+) -> None:
+    """What splat_all writes into `nearest`, without the field."""
+    best = np.full(nearest.shape, np.inf, dtype=np.float32)
+    for i in range(len(means)):
+        row, col = cells[i, 0] - row0, cells[i, 1] - col0
+        for r in range(max(row - reach, 0), min(row + reach + 1, nearest.shape[0])):
+            dy = (r + row0 + 0.5) * cell_m - means[i, 1]
+            for c in range(max(col - reach, 0), min(col + reach + 1, nearest.shape[1])):
+                dx = (c + col0 + 0.5) * cell_m - means[i, 0]
+                d2 = dx * dx + dy * dy
+                if d2 < best[r, c]:
+                    best[r, c] = d2
+                    nearest[r, c] = i
