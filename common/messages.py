@@ -94,12 +94,18 @@ class ExternalPose(Message):
 
 
 class Odometry(Message):
-    """Smooth pose `T_odom_body` at the stamp, with the covariance of (x, y, yaw)."""
+    """Smooth pose `T_odom_body` at the stamp, with the covariance of (x, y, yaw).
+
+    Where `metric` is False its unit of length is nobody's: a camera alone, without anything of known size.
+    """
+
+    version = "1.1"
 
     T_odom_body: Transform
     covariance: Annotated[np.ndarray, Array("float64", 3, 3)]
     status: Literal["ok", "lost", "relocalizing", "rejected"] = "ok"
     detail: Text = ""
+    metric: bool = True  # since 1.1
 
 
 class Correction(Message):

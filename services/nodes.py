@@ -20,10 +20,21 @@ _ROWS = (
         },
     ),
     Service(
+        "ros2",
+        "takes the sensors of a robot that speaks ROS 2, without ROS",
+        {"default": "services.ros2.node:Ros2Node"},
+    ),
+    Service(
+        "ros2_out",
+        "gives pose, transforms, map and cloud back to ROS 2",
+        {"default": "services.ros2.publisher.node:Ros2OutNode"},
+    ),
+    Service(
         "localization",
         "where the robot is",
         {
             "lidar": "services.localization.lidar2d.node:LidarLocalization",
+            "camera": "services.localization.camera.node:CameraLocalization",
             "external": "services.localization.external.node:ExternalLocalization",
         },
     ),

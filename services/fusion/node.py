@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections import deque
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 
@@ -28,6 +29,7 @@ from common.picture import decode_rgb
 from services.fusion.frame import Frame
 from services.fusion.fuse import Fusion
 from services.fusion.result import Fused
+from services.fusion.single import SingleCorrection
 
 log = logging.getLogger("beamsplat.fusion")
 
@@ -37,6 +39,9 @@ _PICTURES = 8  # kept until their estimate comes
 class FusionConfig(NodeConfig):
     """What is true of this robot, and how often a picture is a keyframe (swept against past ones)."""
 
+    # field: all that is known; ratio: the paper's one factor a picture; affine: scale and shift of inverse
+    # depth; given: the estimate as it is (robots without a lidar).
+    method: Literal["field", "ratio", "affine", "given"] = "field"
     floor_known: bool = True  # the camera's height in the calibration can be relied on
     planar: bool = True  # the body stays level on a floor
     keyframe_m: float = 0.3
@@ -60,7 +65,7 @@ class FusionNode(Node):
     outputs = ("fusion/depth", "fusion/cloud")
 
     def configure(self) -> None:
-        self._fusion: Fusion | None = None
+        self._fusion: Fusion | SingleCorrection | None = None
         self._pictures: deque[Image] = deque(maxlen=_PICTURES)
         self._estimates: deque[DepthEstimate] = deque(maxlen=_PICTURES)
         self._unmarked: deque[TimedScan] = deque()  # scans whose movers are not known yet
@@ -69,8 +74,9 @@ class FusionNode(Node):
         self.overtaken = 0
 
     def on_rig(self, rig: Rig) -> Outputs:
-        """Camera and lidar of this robot; both are needed."""
-        if rig.camera is None or rig.lidar is None:
+        """Camera and lidar of this robot; both are needed, unless the estimate is taken as given."""
+        method = self.config.method
+        if rig.camera is None or (rig.lidar is None and method != "given"):
             log.error("the calibration lacks the camera or the lidar: nothing can be fused")
             return iter(())
         camera = rig.camera
@@ -81,7 +87,10 @@ class FusionNode(Node):
             )
         )  # fmt: skip
         self._T_body_camera = camera.T_body_camera
-        self._history = History(rig.lidar.T_body_lidar)
+        self._history = History(np.eye(4) if rig.lidar is None else rig.lidar.T_body_lidar)
+        if method != "field":
+            self._fusion = SingleCorrection(self._undistort.pinhole, camera.T_body_camera, method)
+            return iter(())
         self._fusion = Fusion(
             self._undistort.pinhole, camera.T_body_camera, floor_known=self.config.floor_known,
             planar=self.config.planar,

@@ -1,4 +1,4 @@
-"""Where the camera is: the pose at which the map, rendered, looks like the picture (Matsuki et al. 2024, 4.1).
+"""Where the camera is: the pose at which the map, rendered, looks like the picture (Matsuki et al. 2024).
 
 Coarse to fine. At each size the map is rendered once at the pose so far, and the rendered view, colour and
 depth, is aligned to the picture by Gauss-Newton with the analytic Jacobian on SE(3). Steps with the gradient
@@ -148,7 +148,7 @@ class Aligner:
             T_now_render = se3_exp(self._basis @ move[:free]) @ T_now_render
             found.gain *= float(np.exp(np.clip(move[free], -0.2, 0.2)))
             found.offset += float(np.clip(move[free + 1], -0.1, 0.1))
-            if np.abs(move[:free]).max() < 2e-5:
+            if np.abs(move[:free]).max() < 1e-4:
                 break
         found.T_camera_map = T_now_render @ T_render_map
 

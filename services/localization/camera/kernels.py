@@ -46,7 +46,7 @@ def normal_equations(  # noqa: ANN201
     """Sums J^T w J into H [8, 8] and J^T w r into g [8] with Huber's weights; gives (points used, cost).
 
     Args:
-        points: float32 [N, 4] as chosen. camera: float64 (fx, fy, cx, cy) of this level. R, t: of T_now_render.
+        points: float32 [N, 4] as chosen. camera: float64 (fx, fy, cx, cy) of this level. R, t: T_now_render.
         picture, slope_x, slope_y: float32 [H, W], grey and its central differences a pixel.
         gain, offset: r = picture - (gain grey + offset). delta: Huber's threshold.
         residuals: float32 [N], NaN where a point falls outside.
@@ -73,9 +73,24 @@ def normal_equations(  # noqa: ANN201
         c, r = int(u), int(v)
         a, b = u - c, v - r
         w00, w01, w10, w11 = (1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b
-        seen = w00 * picture[r, c] + w01 * picture[r, c + 1] + w10 * picture[r + 1, c] + w11 * picture[r + 1, c + 1]
-        sx = w00 * slope_x[r, c] + w01 * slope_x[r, c + 1] + w10 * slope_x[r + 1, c] + w11 * slope_x[r + 1, c + 1]
-        sy = w00 * slope_y[r, c] + w01 * slope_y[r, c + 1] + w10 * slope_y[r + 1, c] + w11 * slope_y[r + 1, c + 1]
+        seen = (
+            w00 * picture[r, c]
+            + w01 * picture[r, c + 1]
+            + w10 * picture[r + 1, c]
+            + w11 * picture[r + 1, c + 1]
+        )
+        sx = (
+            w00 * slope_x[r, c]
+            + w01 * slope_x[r, c + 1]
+            + w10 * slope_x[r + 1, c]
+            + w11 * slope_x[r + 1, c + 1]
+        )
+        sy = (
+            w00 * slope_y[r, c]
+            + w01 * slope_y[r, c + 1]
+            + w10 * slope_y[r + 1, c]
+            + w11 * slope_y[r + 1, c + 1]
+        )
         grey = float(points[i, 3])
         error = seen - (gain * grey + offset)
         residuals[i] = error
@@ -131,8 +146,8 @@ def adam_rows(gradients, index, visible, params, first, second, steps, rates):  
 def map_loss(image, rgb, z_m, weight, colour_scale, depth_scale, gradient):  # noqa: ANN001, ANN201
     """L1 of colour and of weighted depth of a render, and its gradient float32 [5, H, W]; gives the loss.
 
-    `image` float32 [5, H, W] as rendered, `rgb` float32 [3, H, W], `z_m` float32 [H, W] (0 unknown). The depth
-    term is w |sum w_i z_i - z alpha|: zero where the surface is right, whatever its opacity.
+    `image` float32 [5, H, W] as rendered, `rgb` float32 [3, H, W], `z_m` float32 [H, W] (0 unknown). The
+    depth term is w |sum w_i z_i - z alpha|: zero where the surface is right, whatever its opacity.
     """
     height, width = z_m.shape
     total = 0.0

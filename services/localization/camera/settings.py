@@ -15,16 +15,17 @@ class CameraTrackerSettings:
     coarse_steps: tuple[int, ...] = (8, 8)  # at a quarter and at half of the finest size
     fine_steps: int = 6
     exact_steps: int = 0  # further steps down the rasterizer's own pose gradient
-    least_gradient: float = 0.02  # grey levels a pixel; flatter pixels say nothing of motion
+    least_gradient: float = 0.012  # grey levels a pixel; flatter pixels say nothing of motion
     least_alpha: float = 0.8  # less than this and the map does not explain the pixel
     most_points: int = 12_000
     # Is the answer to be believed?
     least_points: int = 150
-    least_inliers: float = 0.5  # share of points within `inlier_error`
-    inlier_error: float = 0.12
+    least_inliers: float = 0.6  # share of points within `inlier_error`
+    inlier_error: float = 0.10
     least_contrast: float = 0.02  # standard deviation of the picture's grey: below, it shows nothing
     max_step_m: float = 0.5  # between pictures, beyond the prediction
     max_step_rad: float = 0.5
+    restart_after: int = 15  # pictures without an answer, then the map goes on from the last pose
     # Keyframes
     least_covisibility: float = 0.80  # intersection over union of Gaussians in view with the last keyframe's
     least_explained: float = 0.93  # share of the picture where the map is opaque
@@ -38,17 +39,17 @@ class CameraTrackerSettings:
     float_margin: float = 0.08  # relative, beyond which a Gaussian floats before the surface
     coarse_px: float = 6.0  # standard deviation in a keyframe beyond which a Gaussian is too coarse for it
     least_depth_weight: float = 0.5  # below, a depth is no reason to remove anything that floats
-    size: float = 0.65  # standard deviation over spacing
+    size: float = 0.55  # standard deviation over spacing
     flatness: float = 0.2
-    opacity: float = 0.7
+    opacity: float = 0.95
     prune_opacity: float = 0.05
     max_gaussians: int = 200_000
     window: int = 6  # newest keyframes, of which every second optimisation step takes one
-    steps_per_picture: int = 1
+    steps_per_picture: int = 2
     first_steps: int = 30  # on the first keyframe
     depth_weight: float = 0.2
     mean_rate_m: float = 2e-4
     log_scale_rate: float = 3e-3
     quat_rate: float = 1e-3
     opacity_rate: float = 2e-2
-    colour_rate: float = 4e-3
+    colour_rate: float = 1e-2

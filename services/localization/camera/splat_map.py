@@ -220,9 +220,7 @@ def make_discs(
 def _points(z_m: np.ndarray, u: np.ndarray, v: np.ndarray, camera: RasterCamera) -> np.ndarray:
     """float64 [N, 3] in the camera's frame."""
     z = z_m[v, u].astype(np.float64)
-    return np.stack(
-        [(u - camera.cx_px) / camera.fx_px * z, (v - camera.cy_px) / camera.fy_px * z, z], axis=1
-    )
+    return np.stack([(u - camera.cx_px) / camera.fx_px * z, (v - camera.cy_px) / camera.fy_px * z, z], axis=1)
 
 
 def _normals(z_m: np.ndarray, u: np.ndarray, v: np.ndarray, camera: RasterCamera) -> np.ndarray:
@@ -246,7 +244,7 @@ def _normals(z_m: np.ndarray, u: np.ndarray, v: np.ndarray, camera: RasterCamera
 
 
 def disc_quats(normals: np.ndarray, rays: np.ndarray) -> np.ndarray:
-    """Quaternions (w, x, y, z) [N, 4] of discs: z along unit normals [N, 3], x down the slope as seen by rays.
+    """Quaternions (w, x, y, z) [N, 4] of discs: z along unit normals [N, 3], x down the slope seen by rays.
 
     The shortest turn that takes the z axis to the normal, after a turn about z that takes x to the slope.
     """

@@ -11,7 +11,6 @@ depth: metres if it is metric, else in a unit of nobody's knowing. The same inpu
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -19,33 +18,22 @@ from common.camera import Pinhole
 from common.geometry import inverse, se3_exp, se3_log, yaw_of
 from services.localization.camera.align import Aligner, Alignment
 from services.localization.camera.depth import DepthGuess, fitted_to_map, shrunk
+from services.localization.camera.monocular import (
+    FIRST_BASELINES,
+    ROUNDS,
+    WALL,
+    Look,
+    dense,
+    depth_by_motion,
+)
 from services.localization.camera.relocalize import similar_keyframes, thumbnail
+from services.localization.camera.result import CameraResult, Tracked, covisibility
 from services.localization.camera.settings import CameraTrackerSettings
 from services.localization.camera.splat_map import MapKeyframe, SplatMap
 from services.localization.camera.view import PictureView, make_view, small_camera
 
 _KEPT = 24  # pictures whose depth may still come
 _CORRELATION = 8.0  # pixels whose errors go together: variance of a pose over that of independent ones
-
-
-@dataclass(frozen=True)
-class CameraResult:
-    """What is said about one picture."""
-
-    stamp_ns: int
-    T_map_body: np.ndarray
-    status: str  # "ok", "lost", "relocalizing", "rejected"
-    detail: str
-    covariance: np.ndarray  # float64 [3, 3] of (x, y, yaw), NaN unless ok
-    wants_keyframe: bool = False
-
-
-@dataclass
-class _Tracked:
-    stamp_ns: int
-    view: PictureView
-    alignment: Alignment
-    covariance: np.ndarray
 
 
 class CameraTracker:
@@ -63,13 +51,14 @@ class CameraTracker:
         self.scale_disagreement = float("nan")  # mean log ratio of depths given to the map's
         self._T_body_camera = np.asarray(T_body_camera, dtype=np.float64)
         self._aligner = Aligner(self.camera, self._T_body_camera, self.settings)
-        self._recent: deque[_Tracked] = deque(maxlen=_KEPT)
+        self._recent: deque[Tracked] = deque(maxlen=_KEPT)
         self._poses: deque[tuple[int, np.ndarray]] = deque(maxlen=2)  # T_map_body of good pictures
         self._exposure = (1.0, 0.0)
         self._chain = np.zeros((3, 3))  # covariance that keyframes have handed down
         self._missed = 0
         self._steps = 0
         self._ratios: list[float] = []
+        self._rounds = 0  # of settling the first picture's depth, where nobody gives any
 
     # --- every picture -----------------------------------------------------------------------------
 
@@ -84,16 +73,18 @@ class CameraTracker:
             return self._result(stamp_ns, "rejected", f"the picture is blank (contrast {view.contrast:.3f})")
         if not self.splats.keyframes:
             T_camera_map = inverse(self._T_body_camera)
-            self._recent.append(_Tracked(stamp_ns, view, Alignment(T_camera_map), np.zeros((3, 3))))
+            self._recent.append(Tracked(stamp_ns, view, Alignment(T_camera_map), np.zeros((3, 3))))
             return self._result(stamp_ns, "relocalizing", "no map yet: waits for the first depth")
         # 2. The pose at which the map looks like it
         found, why = self._locate(stamp_ns, view)
         if found is None:
             self._missed += 1
+            if self._missed > self.settings.restart_after:
+                self._go_on_from_last_pose(stamp_ns, view)
             return self._result(stamp_ns, "lost" if self._missed == 1 else "relocalizing", why)
         self._missed = 0
         covariance = self._chain + self._covariance(found)
-        self._recent.append(_Tracked(stamp_ns, view, found, covariance))
+        self._recent.append(Tracked(stamp_ns, view, found, covariance))
         self._poses.append((stamp_ns, self._T_map_body(found)))
         self._exposure = (found.gain, found.offset)
         # 3. A little work on the map, the same for every picture
@@ -122,6 +113,15 @@ class CameraTracker:
             if not why:
                 return found, ""
         return None, why
+
+    def _go_on_from_last_pose(self, stamp_ns: int, view: PictureView) -> None:
+        """The place is not known any more: new surfaces are put where the last pose would have them, so that
+        there is something to track; how far the body went meanwhile stays unknown, and in the covariance."""
+        if not self._poses:
+            return
+        self._chain = self._chain + np.diag([0.25, 0.25, 0.25])
+        alignment = Alignment(inverse(self._poses[-1][1] @ self._T_body_camera))
+        self._recent.append(Tracked(stamp_ns, view, alignment, self._chain))
 
     def _starts(self, stamp_ns: int, view: PictureView) -> list[np.ndarray]:
         """T_map_body to begin at: the prediction, the last pose; when lost, keyframes that look alike."""
@@ -196,7 +196,7 @@ class CameraTracker:
         self._add_keyframe(tracked, z, guess)
         return "ok"
 
-    def _add_keyframe(self, tracked: _Tracked, z: np.ndarray, guess: DepthGuess) -> None:
+    def _add_keyframe(self, tracked: Tracked, z: np.ndarray, guess: DepthGuess) -> None:
         rgb = np.ascontiguousarray(tracked.view.rgb.transpose(2, 0, 1)).astype(np.float32) / np.float32(255)
         # As the map would show it: what the exposure has done since is undone.
         rgb = (rgb - np.float32(tracked.alignment.offset)) / np.float32(tracked.alignment.gain)
@@ -208,19 +208,76 @@ class CameraTracker:
         )  # fmt: skip
         self.splats.add(frame)
         if first:
+            self._first_grey = tracked.view.levels[1].grey
             self._poses.append((tracked.stamp_ns, self._T_map_body(tracked.alignment)))
             self._improve(self.settings.first_steps)
         else:
             self._chain = tracked.covariance
 
-    def _fitted(self, z: np.ndarray, alignment: Alignment, scale_sigma: float) -> np.ndarray:
-        """Depth at the scale of the map."""
+    def add_without_depth(self, stamp_ns: int) -> str:
+        """As `add_depth`, with depth from the pictures' own parallax; the map's unit is then arbitrary."""
+        tracked = next((t for t in self._recent if t.stamp_ns == stamp_ns), None)
+        if tracked is None:
+            return "its picture was not tracked, or is too old"
+        guess = DepthGuess(np.zeros((0, 0), np.float32), 0.15, metric=False)
+        if not self.splats.keyframes:
+            self.metric = False
+            wall = np.full(tracked.view.rgb.shape[:2], WALL, np.float32)
+            self._add_keyframe(tracked, wall, guess)
+            return "ok"
+        if self.metric:
+            return "its unit is not that of the map"
+        if self._rounds < ROUNDS:
+            return self._settle(tracked)
+        if not self._keyframe_is_due(tracked.alignment):
+            return "no keyframe is due"
+        shown = self._shown_depth(tracked.alignment)
+        usual = float(np.median(shown[shown > 0.0])) if (shown > 0.0).any() else WALL
+        before = [self._look(t) for t in self._recent if t.stamp_ns < stamp_ns]
+        z = depth_by_motion(self._look(tracked), before, self._aligner.cameras[1], usual)
+        z = dense(z, shown, shown.shape)
+        self._add_keyframe(tracked, self._fitted(z, tracked.alignment, guess.scale_sigma), guess)
+        return "ok"
+
+    def _settle(self, tracked: Tracked) -> str:
+        """The first keyframe's depth again, from the poses that it gave; then the map anew, and the pose."""
+        first = self.splats.keyframes[0]
+        here = (self._first_grey, first.T_map_camera)
+        T_first_now = inverse(first.T_map_camera) @ inverse(tracked.alignment.T_camera_map)
+        if np.linalg.norm(T_first_now[:3, 3]) < FIRST_BASELINES[self._rounds] * WALL:
+            return "the camera has not moved far enough"
+        self._rounds += 1
+        looks = [self._look(t) for t in self._recent if t.stamp_ns > first.stamp_ns]
+        z = depth_by_motion(here, looks, self._aligner.cameras[1], WALL)
+        if (z > 0.0).mean() < 0.05:
+            return "the pictures do not tell depth yet"
+        z = dense(z, np.zeros_like(z), first.z_m.shape)
+        self.splats.close()
+        self.splats = SplatMap(self.camera, self.settings)
+        first.z_m = (z * (WALL / float(np.median(z)))).astype(np.float32)
+        self.splats.add(first)
+        self._improve(self.settings.first_steps)
+        start = Alignment(tracked.alignment.T_camera_map, gain=self._exposure[0], offset=self._exposure[1])
+        tracked.alignment = self._aligner.align(self.splats, tracked.view, start)
+        self._poses.clear()  # velocities were those of another unit
+        self._poses.append((tracked.stamp_ns, self._T_map_body(tracked.alignment)))
+        return "ok"
+
+    def _look(self, tracked: Tracked) -> Look:
+        return tracked.view.levels[1].grey, inverse(tracked.alignment.T_camera_map)
+
+    def _shown_depth(self, alignment: Alignment) -> np.ndarray:
+        """float32 [H, W] of the map as it was seen, 0 where it does not explain the picture."""
         render = self.splats.render(self.camera, alignment.T_camera_map)
         alpha = render.image[4]
         known = alpha > self.settings.least_alpha
         shown = np.where(known, render.image[3] / np.maximum(alpha, 0.1), 0.0).astype(np.float32)
         self.splats.release(render)
-        z, ratio = fitted_to_map(z, shown, scale_sigma)
+        return shown
+
+    def _fitted(self, z: np.ndarray, alignment: Alignment, scale_sigma: float) -> np.ndarray:
+        """Depth at the scale of the map."""
+        z, ratio = fitted_to_map(z, self._shown_depth(alignment), scale_sigma)
         if np.isfinite(ratio):
             self._ratios = [*self._ratios, ratio][-20:]
             self.scale_disagreement = float(np.mean(self._ratios))
@@ -228,11 +285,13 @@ class CameraTracker:
 
     def _keyframe_is_due(self, found: Alignment) -> bool:
         """Whether the map explains too little here, or other Gaussians are in view than at the last one."""
-        if found.in_view is None:
-            return not self.splats.keyframes
+        if found.in_view is None:  # not aligned: the first picture, or one after the track was lost for long
+            return not self.splats.keyframes or self._missed > self.settings.restart_after
         if found.explained < self.settings.least_explained:
             return True
-        return covisibility(found.in_view, self.splats.keyframes[-1].in_view) < self.settings.least_covisibility
+        return (
+            covisibility(found.in_view, self.splats.keyframes[-1].in_view) < self.settings.least_covisibility
+        )
 
     def _improve(self, steps: int) -> None:
         """Optimisation steps: in turn on one of the newest keyframes, and on one of all."""
@@ -248,10 +307,3 @@ class CameraTracker:
     def close(self) -> None:
         """Ends the rasterizer."""
         self.splats.close()
-
-
-def covisibility(in_view_a: np.ndarray, in_view_b: np.ndarray) -> float:
-    """Intersection over union of two ascending lists of Gaussians."""
-    both = len(np.intersect1d(in_view_a, in_view_b, assume_unique=True))
-    union = len(in_view_a) + len(in_view_b) - both
-    return both / union if union else 0.0

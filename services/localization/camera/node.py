@@ -1,0 +1,131 @@
+"""Camera localization as a node: pictures and depth in; pose, its doubt and its scale out."""
+
+from __future__ import annotations
+
+import logging
+from typing import Annotated, Literal
+
+import cv2
+import numpy as np
+from pydantic import Field
+
+from common.camera import Pinhole, Undistorter
+from common.config import NodeConfig
+from common.errors import UserError
+from common.messages import Correction, DepthEstimate, Image, Odometry, Rig
+from common.node import Input, Node, Outputs
+from common.picture import decode_rgb
+from services.localization.camera.depth import DepthGuess
+from services.localization.camera.settings import CameraTrackerSettings
+from services.localization.camera.tracker import CameraResult, CameraTracker
+from services.localization.camera.warm import warm
+
+log = logging.getLogger("beamsplat.localization")
+
+ARBITRARY = "scale is arbitrary: the depth has no unit, lengths are not metres"
+
+
+class CameraLocalizationConfig(NodeConfig):
+    """What is true of the robot and of its depth.
+
+    `depth = "estimate"` waits for the depth service and takes its word for what its numbers mean; "none" lets
+    the camera work alone. `scale_sigma`: how much the depth's scale varies from picture to picture (log).
+    """
+
+    depth: Literal["estimate", "none"] = "estimate"
+    scale_sigma: Annotated[float, Field(ge=0.0, le=2.0)] = 0.15
+    planar: bool = True  # the body stays level on a floor
+    width_px: Annotated[int, Field(ge=64, le=1280)] = 320
+
+
+class CameraLocalization(Node):
+    """The robot's pose from its camera, by rendering a map of Gaussians and comparing."""
+
+    name = "localization"
+    Config = CameraLocalizationConfig
+    # The depth service may itself look at our poses (beams of a picture's time): its end is not waited for.
+    inputs = (Input("rig", "every"), Input("camera/image", "latest"), Input("depth/estimate", feedback=True))
+    outputs = ("localization/odometry", "localization/correction")
+
+    def configure(self) -> None:
+        cv2.setNumThreads(1)
+        warm()
+        self._tracker: CameraTracker | None = None
+        self._refused = 0
+
+    def on_rig(self, rig: Rig) -> Outputs:
+        """The camera. A second calibration would bend the map: it is refused, and said."""
+        if rig.camera is None:
+            log.error("the calibration has no camera: pictures cannot be used")
+        elif self._tracker is None:
+            c = rig.camera
+            lens = Pinhole(c.fx_px, c.fy_px, c.cx_px, c.cy_px, c.width_px, c.height_px, c.distortion_model,
+                           c.distortion)  # fmt: skip
+            self._undistort = Undistorter(lens)
+            settings = CameraTrackerSettings(planar=self.config.planar, width_px=self.config.width_px)
+            self._tracker = CameraTracker(self._undistort.pinhole, c.T_body_camera, settings)
+            # One frame serves as map and as odom: nothing here ever jumps.
+            yield "localization/correction", Correction(stamp_ns=rig.stamp_ns, T_map_odom=np.eye(4))
+        else:
+            log.warning("a new calibration is ignored: restart the node to use it")
+
+    def on_camera_image(self, image: Image) -> Outputs:
+        """One answer a picture."""
+        if self._tracker is None:
+            yield "localization/odometry", _rejected(image.stamp_ns, "no calibration yet")
+            return
+        try:
+            rgb = self._undistort(
+                decode_rgb(image.data, image.encoding, image.width_px, image.height_px, image.step_bytes)
+            )
+        except (UserError, ValueError) as error:
+            yield "localization/odometry", _rejected(image.stamp_ns, str(error))
+            return
+        result = self._tracker.track(image.stamp_ns, rgb)
+        if self.config.depth == "none" and result.status in ("ok", "relocalizing"):
+            self._tracker.add_without_depth(image.stamp_ns)
+        self._say(result)
+        yield "localization/odometry", self._odometry(result)
+
+    def on_depth_estimate(self, estimate: DepthEstimate) -> Outputs:
+        """Depth of a picture that has been tracked: a keyframe, where one is due."""
+        if self._tracker is None or self.config.depth == "none":
+            return iter(())
+        if estimate.kind == "none" and estimate.status == "ok":
+            self._tracker.add_without_depth(estimate.stamp_ns)
+        elif estimate.status == "ok":
+            z = estimate.values
+            if estimate.kind == "disparity":
+                with np.errstate(divide="ignore", invalid="ignore"):
+                    z = np.where(z > 1e-6, 1.0 / z, np.nan).astype(np.float32)
+            guess = DepthGuess(z, self.config.scale_sigma, estimate.kind == "metric")
+            self._tracker.add_depth(estimate.stamp_ns, guess)
+        return iter(())
+
+    def close(self) -> None:
+        if getattr(self, "_tracker", None) is not None:
+            self._tracker.close()
+
+    def _odometry(self, result: CameraResult) -> Odometry:
+        metric = bool(self._tracker.metric)
+        scale = "" if metric or self._tracker.metric is None else ARBITRARY
+        return Odometry(
+            stamp_ns=result.stamp_ns, T_odom_body=result.T_map_body, covariance=result.covariance,
+            status=result.status, detail="; ".join(t for t in (result.detail, scale) if t), metric=metric,
+        )  # fmt: skip
+
+    def _say(self, result: CameraResult) -> None:
+        t = self._tracker
+        said = [f"{len(t.splats.keyframes)} keyframes, {t.splats.count} Gaussians", result.detail]
+        if t.metric is False:
+            said.append(ARBITRARY)
+        if np.isfinite(t.scale_disagreement) and abs(t.scale_disagreement) > 0.05:
+            said.append(f"new depth is {np.exp(t.scale_disagreement):.2f} times the map's")
+        self.detail = "; ".join(text for text in said if text)
+
+
+def _rejected(stamp_ns: int, why: str) -> Odometry:
+    return Odometry(
+        stamp_ns=stamp_ns, T_odom_body=np.eye(4), covariance=np.full((3, 3), np.nan), status="rejected",
+        detail=why, metric=False,
+    )  # fmt: skip

@@ -1,0 +1,80 @@
+"""Depth of a picture from others taken nearby, by sweeping a plane through space (Collins 1996)."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from common.raster.camera import RasterCamera
+
+_PLANES = 48
+_PATCH = (7, 7)
+_CAP = 0.12  # a grey difference beyond which how wrong it is says nothing
+_CLEAR = 0.8  # the best must be so much better than the best elsewhere
+_LEAST_CONTRAST = 0.012
+
+
+def sweep(
+    grey: np.ndarray,  # float32 [h, w]
+    others: list[tuple[np.ndarray, np.ndarray]],  # (grey float32 [h, w], T_other_here [4, 4])
+    camera: RasterCamera,
+    nearest: float,
+    farthest: float,
+) -> np.ndarray:
+    """float32 [h, w] optical z in the poses' unit, 0 where the pictures do not tell.
+
+    A plane z = d seen here is seen there by the homography K (R + t n^T / d) K^-1, n = (0, 0, 1).
+    """
+    h, w = grey.shape
+    K = np.array(
+        [[camera.fx_px, 0, camera.cx_px], [0, camera.fy_px, camera.cy_px], [0, 0, 1.0]], dtype=np.float64
+    )
+    K_inverse = np.linalg.inv(K)
+    inverse_z = np.linspace(1.0 / farthest, 1.0 / nearest, _PLANES)
+    cost = np.zeros((_PLANES, h, w), np.float32)
+    seen = np.zeros((_PLANES, h, w), np.float32)
+    ones = np.ones((h, w), np.float32)
+    for other, T_other_here in others:
+        for i, q in enumerate(inverse_z):
+            lift = T_other_here[:3, :3] + np.outer(T_other_here[:3, 3], [0.0, 0.0, q])
+            H = K @ lift @ K_inverse
+            flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+            warped = cv2.warpPerspective(other, H, (w, h), flags=flags)
+            valid = cv2.warpPerspective(ones, H, (w, h), flags=flags)
+            cost[i] += np.minimum(np.abs(warped - grey), _CAP) * valid
+            seen[i] += valid
+    cost = np.where(seen > 0.5, cost / np.maximum(seen, 0.5), _CAP).astype(np.float32)
+    for plane in cost:
+        cv2.blur(plane, _PATCH, dst=plane)
+    best = cost.argmin(axis=0)
+    least = np.take_along_axis(cost, best[None], axis=0)[0]
+    away = np.abs(np.arange(_PLANES)[:, None, None] - best[None]) > 3
+    second = np.where(away, cost, _CAP).min(axis=0)
+    contrast = cv2.blur(np.abs(grey - cv2.blur(grey, _PATCH)), _PATCH)
+    good = (least < _CLEAR * second) & (contrast > _LEAST_CONTRAST) & (best > 0) & (best < _PLANES - 1)
+    return np.where(good, 1.0 / _refined(inverse_z, cost, best), 0.0).astype(np.float32)
+
+
+def _refined(inverse_z: np.ndarray, cost: np.ndarray, best: np.ndarray) -> np.ndarray:
+    """Inverse depth at the vertex of the parabola through the best plane and its neighbours."""
+    inner = np.clip(best, 1, len(inverse_z) - 2)
+    a, b, c = (np.take_along_axis(cost, (inner + k)[None], axis=0)[0] for k in (-1, 0, 1))
+    bend = np.maximum(a - 2.0 * b + c, 1e-6)
+    shift = np.clip(0.5 * (a - c) / bend, -0.5, 0.5)
+    return inverse_z[inner] + shift * (inverse_z[1] - inverse_z[0])
+
+
+def filled(z: np.ndarray, sigma_px: float) -> np.ndarray:
+    """float32 [h, w]: unknown (0) pixels get the mean inverse depth of what is known around them."""
+    known = (z > 0.0).astype(np.float32)
+    if not known.any():
+        return z
+    q = np.where(z > 0.0, 1.0 / np.maximum(z, 1e-6), 0.0).astype(np.float32)
+    out, weight = np.zeros_like(q), np.zeros_like(q)
+    for reach in (1.0, 3.0, 9.0):  # near neighbours count most, far ones where there are no others
+        share = np.float32(0.02 ** (np.log(reach) / np.log(3.0)))
+        out += share * cv2.GaussianBlur(q, (0, 0), sigma_px * reach)
+        weight += share * cv2.GaussianBlur(known, (0, 0), sigma_px * reach)
+    mean_q = float(q[known > 0].mean())
+    spread = (out + 1e-6 * mean_q) / (weight + 1e-6)
+    return np.where(z > 0.0, z, 1.0 / np.maximum(spread, 1e-6)).astype(np.float32)
