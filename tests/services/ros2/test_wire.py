@@ -1,0 +1,160 @@
+"""Keys, attachments and tokens byte for byte as rmw_zenoh's documents and Zenoh's serializer have them."""
+
+import numpy as np
+import pytest
+import xxhash
+import zenoh.ext as ze
+from hypothesis import given
+from hypothesis import strategies as st
+from rosbags.typesys import Stores, get_typestore
+
+from common import messages as m
+from common.recording import ros_types as ros
+from common.recording.sensors import SENSORS, build, ros_fields
+from common.recording.to_ros import records_of
+from services.ros2.answers import Transforms, occupancy_grid, point_cloud
+from services.ros2.wire import Address, Attachment, Entity, Qos, data_key
+
+# ros2/rmw_zenoh, docs/design.md, "Graph Cache": the tokens of a listener and of a talker on /chatter.
+HASH = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
+NODE = "@ros2_lv/2/aac3178e146ba6f1fc6e6a4085e77f21/0/0/NN/%/%/listener"
+SUBSCRIPTION = (
+    "@ros2_lv/2/aac3178e146ba6f1fc6e6a4085e77f21/0/10/MS/%/%/listener/%chatter/std_msgs::msg::dds_::String_/"
+    + HASH + "/::,10:,:,:,,"
+)  # fmt: skip
+PUBLISHER = (
+    "@ros2_lv/2/8b20917502ee955ac4476e0266340d5c/0/10/MP/%/%/talker/%chatter/std_msgs::msg::dds_::String_/"
+    + HASH + "/::,7:,:,:,,"
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("token", [NODE, SUBSCRIPTION, PUBLISHER])
+def test_tokens_of_the_design_document(token):
+    entity = Entity.parse(token)
+    assert entity.domain == 2
+    assert entity.token() == token
+    assert entity.gid() == xxhash.xxh3_128(token.encode()).intdigest().to_bytes(16, "little")
+
+
+def test_what_a_talkers_token_says():
+    talker = Entity.parse(PUBLISHER)
+    assert (talker.kind, talker.node_name, talker.topic, talker.type_name) == (
+        "MP", "talker", "/chatter", "std_msgs/msg/String",
+    )  # fmt: skip
+    assert talker.qos == Qos(depth=7)
+    assert ros.typestore().hash_rihs01("std_msgs/msg/String") == talker.type_hash == HASH
+    assert (
+        data_key(2, "/chatter", "std_msgs/msg/String", HASH)
+        == f"2/chatter/std_msgs::msg::dds_::String_/{HASH}"
+    )
+
+
+def test_what_is_no_token_of_ours():
+    service = "@ros2_lv/2/f9/0/10/SS/%/%/add_server/%add/example_interfaces::srv::dds_::AddTwoInts_/RIHS01_e1/::,10:,:,:,,"
+    for text in (service, "@ros2_lv/2/x", "chatter", NODE + "/more", PUBLISHER.replace("::,7", "7")):
+        assert Entity.parse(text) is None
+
+
+@given(st.text(max_size=200))
+def test_any_text_is_taken_without_an_error(text):
+    Entity.parse(text)
+    Address.of(text)
+    Qos.parse(text)
+
+
+@given(st.integers(-(2**63), 2**63 - 1), st.integers(0, 2**63 - 1), st.binary(min_size=16, max_size=16))
+def test_attachments_as_zenohs_own_serializer_writes_them(sequence, source_ns, gid):
+    ours = Attachment(sequence, source_ns, gid)
+    theirs = ze.z_serialize((ze.Int64(sequence), ze.Int64(source_ns), gid)).to_bytes()
+    assert ours.pack() == theirs
+    assert Attachment.unpack(theirs) == ours
+    named = ze.z_serialize(
+        ("sequence_number", ze.Int64(sequence), "source_timestamp", ze.Int64(source_ns), "source_gid", gid)
+    )  # late 2024
+    assert Attachment.unpack(named.to_bytes()) == ours
+
+
+@given(st.binary(max_size=90))
+def test_other_attachments_are_ignored(data):
+    found = Attachment.unpack(data)
+    assert found is None or len(data) in (33, 77)
+
+
+def test_addresses():
+    key = f"7/robot1/front/scan/sensor_msgs::msg::dds_::LaserScan_/{HASH}"
+    assert Address.of(key) == ("7", "/robot1/front/scan", "sensor_msgs/msg/LaserScan", HASH)
+    assert Address.of("beamsplat/robot1/lidar/scan") is None
+
+
+def _independent(message):
+    """Bytes and back by a type store that our code has not touched."""
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    data = ros.serialize(message)
+    again = store.deserialize_cdr(data, message.__msgtype__)
+    assert bytes(store.serialize_cdr(again, message.__msgtype__)) == data
+    return again
+
+
+@pytest.mark.parametrize("word", SENSORS)
+def test_sensor_messages_go_through_byte_for_byte(word):
+    """ROS bytes -> our message -> ROS bytes: the same, but for what our frames are called."""
+    sensor = SENSORS[word]
+    rng = np.random.default_rng(0)
+    T = np.eye(4)
+    T[:3, 3] = 1.0, 2.0, 0.0
+    made = {
+        "image": m.Image(stamp_ns=5, width_px=4, height_px=2, encoding="rgb8", step_bytes=12,
+                         data=rng.integers(0, 255, 24).astype(np.uint8)),
+        "scan": m.Scan(stamp_ns=1_700_000_000_123_456_789, angle_min_rad=-3.0, angle_increment_rad=0.25,
+                       time_increment_s=0.5, scan_time_s=0.125, range_min_m=0.125, range_max_m=12.0,
+                       ranges_m=rng.uniform(0, 12, 25).astype(np.float32),
+                       intensities=rng.uniform(0, 99, 25).astype(np.float32)),
+        "odometry": m.WheelOdometry(stamp_ns=9, T_odom_body=T, velocity_m_s=np.array([0.5, 0.0, 0.0]),
+                                    angular_velocity_rad_s=np.array([0.0, 0.0, 0.25])),
+        "pose": m.ExternalPose(stamp_ns=10**18, T_map_body=T),
+    }[word]  # fmt: skip
+    first = records_of(sensor.topic, made)[0].message
+    data = ros.serialize(first)
+    back = build(sensor.topic, ros_fields(sensor.topic, _independent(first)))
+    assert ros.serialize(records_of(sensor.topic, back)[0].message) == data
+
+
+def test_the_answers_are_what_ros_reads():
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-5, 5, (7, 3)).astype(np.float32)
+    colours = rng.integers(0, 255, (7, 3)).astype(np.uint8)
+    T_map_odom = np.eye(4)
+    T_map_odom[:3, 3] = 1.0, 2.0, 3.0
+    cloud = _independent(point_cloud(3, "map", points, colours, T_map_odom))
+    assert [(f.name, f.offset, f.datatype) for f in cloud.fields] == [
+        ("x", 0, 7),
+        ("y", 4, 7),
+        ("z", 8, 7),
+        ("rgb", 12, 7),
+    ]
+    words = np.asarray(cloud.data).view("<f4").reshape(7, 4)
+    assert words[:, :3] == pytest.approx(points + np.array([1.0, 2.0, 3.0]), abs=1e-6)
+    packed = np.ascontiguousarray(words[:, 3]).view("<u4")
+    assert np.array_equal(np.stack([packed >> 16 & 255, packed >> 8 & 255, packed & 255], axis=1), colours)
+    assert (cloud.width, cloud.height, cloud.row_step) == (7, 1, 112)
+    cells = np.arange(6, dtype=np.int8).reshape(2, 3)
+    grid = _independent(occupancy_grid(3, "map", 0.05, np.array([-1.0, 2.0]), cells))
+    assert (grid.info.width, grid.info.height, np.asarray(grid.data).tolist()) == (3, 2, list(range(6)))
+    assert (grid.info.origin.position.x, grid.info.origin.position.y) == (-1.0, 2.0)
+
+
+def test_transforms_leave_the_robots_own_odometry_to_it():
+    from common.geometry import se2_to_se3
+
+    tree = Transforms("map", "odom", "base_link")
+    tree.T_map_odom = se2_to_se3(np.array([1.0, 0.0, 0.0]))
+    ours = se2_to_se3(np.array([2.0, 1.0, 0.5]))
+    both = tree.tf(10**9, ours).transforms
+    assert [(t.header.frame_id, t.child_frame_id) for t in both] == [("map", "odom"), ("odom", "base_link")]
+    wheels = se2_to_se3(np.array([5.0, 5.0, -0.5]))
+    tree.add_wheels(10**9, wheels)
+    (only,) = _independent(tree.tf(10**9 + 1000, ours)).transforms
+    assert (only.header.frame_id, only.child_frame_id) == ("map", "odom")
+    T_map_odom = ros.transform_of(only.transform.translation, only.transform.rotation)
+    assert T_map_odom @ wheels == pytest.approx(tree.T_map_odom @ ours, abs=1e-12)
+    assert tree.tf(2 * 10**9, ours) is None  # where the wheels were then is not known
