@@ -46,9 +46,10 @@ def bench_map(
         typer.Option(help="Depth of the keyframes: field (the fusion's), stixel (beams and floor) or truth"),
     ] = "field",
     source: Annotated[str, typer.Option(help="Depth source that the fusion starts from (field)")] = "stixel",
-    refine_s: Annotated[
-        float, typer.Option(min=0.0, help="Refinement after the drive, in seconds of one core")
-    ] = 60.0,
+    refine_s: Annotated[float, typer.Option(min=0.0, help="Refinement after the drive, in seconds")] = 60.0,
+    count_cpu: Annotated[
+        bool, typer.Option("--count-cpu", help="Count those in CPU seconds a thread: on a busy machine")
+    ] = False,
     threads: Annotated[int, typer.Option(min=1, help="Threads of the rasterizer")] = 2,
     seed: Annotated[int, typer.Option(help="Seed of the mapper")] = 0,
     jump: Annotated[
@@ -80,8 +81,9 @@ def bench_map(
 
     cv2.setNumThreads(1)
     bench = MapBench(
-        prior=prior, threads=threads, seed=seed, refine_s=refine_s, jump=jump, settle_steps=settle_steps
-    )
+        prior=prior, threads=threads, seed=seed, refine_s=refine_s, count_cpu=count_cpu, jump=jump,
+        settle_steps=settle_steps,
+    )  # fmt: skip
     field = FieldPrior(source) if prior == "field" else None
     result = run_bench(data, bench, console.print, out, field, MoverMasks() if movers else None)
     if as_json:

@@ -105,7 +105,7 @@ def load(path: Path) -> Recording:
         raise UserError(f"{path}: no picture has a true pose")
     undistort = Undistorter(camera) if camera.is_distorted else None
     return Recording(
-        path, camera.undistorted(), T_body_camera, shots, _extra_views(path / "extra_views"), undistort
+        path, camera.undistorted(), T_body_camera, shots, extra_views(path / "extra_views"), undistort
     )
 
 
@@ -193,7 +193,8 @@ class _BeamTrack:
         return self._truth.T_a_b[-1] if T is None else T
 
 
-def _extra_views(folder: Path) -> list[ExtraView]:
+def extra_views(folder: Path) -> list[ExtraView]:
+    """Held-out views of a folder with poses.json; none where there is no such file."""
     file = folder / "poses.json"
     if not file.is_file():
         return []

@@ -30,12 +30,11 @@ def unexplained(
 
 
 def candidates(
-    missing: np.ndarray, level: Level, settings: MapperSettings, least_weight: float = 0.0
+    missing: np.ndarray, level: Level, settings: MapperSettings
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(u, v, spacing in px) of pixels of the level to turn into Gaussians: coarse, and fine on texture.
 
-    A cell of `stride` holds one Gaussian, or four where the colour changes within it. Depth of less than
-    `least_weight` is left out.
+    A cell of `stride` holds one Gaussian, or four where the colour changes within it.
     """
     stride, fine = settings.stride_px, settings.fine_stride_px
     h, w = missing.shape
@@ -53,7 +52,6 @@ def candidates(
             np.minimum(u // stride * stride + stride // 2, w - 1),
         )
         chosen = missing[v, u] & wanted[cell_v, cell_u] & (level.depth_mm[v, u] > 0)
-        chosen &= level.depth_weight[v, u] >= 255.0 * least_weight
         out.append(np.stack([u[chosen], v[chosen], np.full(chosen.sum(), step)]))
     u, v, spacing = np.concatenate(out, axis=1)
     # Neighbours in the picture become neighbours in memory: the kernels read visible Gaussians in order.

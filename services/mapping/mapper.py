@@ -6,7 +6,6 @@ before trusted surfaces, then a fixed number of steps on a window of new and ran
 
 from __future__ import annotations
 
-from collections import deque
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -52,7 +51,6 @@ class Mapper:
         self._random = np.random.default_rng(seed)
         self._newest: list[int] = []
         self._forgotten: set[int] = set()
-        self._unsure: deque[int] = deque()  # keyframes whose doubtful depth waits
         self._ssim = SsimLoss()
         self._buffers: dict[tuple[int, int], tuple[np.ndarray, np.ndarray]] = {}
         r = self.settings.rates
@@ -74,24 +72,11 @@ class Mapper:
             self.T_map_anchor[frame.anchor] = np.array(T_map_anchor, dtype=np.float64)
         held = hold(frame, self.settings.sigma_unit)
         removed = self._clean(held)
-        outcome = self._insert(held, held.levels[FULL], self.settings.sure_weight)
+        outcome = self._insert(held, held.levels[FULL])
         self._forget()
         self.keyframes[frame.id] = held
-        self._unsure.append(frame.id)
-        self._take_unsure(self.settings.wait_keyframes)
         self._newest = [*self._newest, frame.id][-self.settings.recent :]
         return replace(outcome, removed=removed)
-
-    def finish(self) -> None:
-        """No more keyframes will come soon: depth that waited for a better one is taken as it is."""
-        self._take_unsure(0)
-
-    def _take_unsure(self, waiting: int) -> None:
-        """Fills what the oldest keyframes still see through, but not where others look through it too."""
-        while len(self._unsure) > waiting:
-            held = self.keyframes.get(self._unsure.popleft())
-            if held is not None:
-                self._insert(held, held.levels[FULL], 0.0)
 
     def _forget(self) -> None:
         """Makes room for a keyframe: one drawn from all but the newest goes; its Gaussians stay."""
@@ -135,17 +120,17 @@ class Mapper:
 
     # --- growing and shrinking ---------------------------------------------------------------------
 
-    def _insert(self, held: Held, level: Level, least_weight: float) -> Outcome:
+    def _insert(self, held: Held, level: Level) -> Outcome:
         room = max(self.settings.max_gaussians - self.store.count, 0)
         T_map_camera = self.T_map_camera(held)
         render = self._render(level, T_map_camera)
         missing = unexplained(render.image, level, self.settings)
         foretold = _foretold(render.image, level)
         self.rasterizer.release(render)
-        u, v, spacing = candidates(missing, level, self.settings, least_weight)
+        u, v, spacing = candidates(missing, level, self.settings)
         new = make_gaussians(u, v, spacing, level, T_map_camera, self.settings)
-        if least_weight == 0.0:
-            new = new[:, ~self._in_free_space(new)]
+        sure = level.depth_weight[v, u] >= 255.0 * self.settings.sure_weight
+        new = new[:, sure | ~self._in_free_space(new)]
         new = new[:, :room]
         if new.shape[1]:
             self.store.append(new, held.anchor)

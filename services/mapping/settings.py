@@ -31,8 +31,7 @@ class MapperSettings:
     stride_px: int = 5
     fine_stride_px: int = 3  # where the picture has texture
     texture: float = 0.15  # mean absolute colour step over `stride_px` that counts as texture
-    sure_weight: float = 0.25  # depth of less weight waits: a later keyframe may know better
-    wait_keyframes: int = 8  # for so many; then what is still not explained is taken as it is
+    sure_weight: float = 0.25  # depth of less weight is not put where other keyframes see through
     alpha_low: float = 0.7  # less than this is not explained
     colour_off: float = 0.15  # mean absolute colour error that is not explained
     depth_off: float = 0.10  # relative depth error that is not explained
