@@ -11,6 +11,11 @@ _ROWS = (
         {"default": "services.replay.node:ReplayNode"},
     ),
     Service(
+        "camera",
+        "reads a camera, a stream or a video",
+        {"opencv": "services.camera.node:CameraNode", "none": "services.camera.node:NoCamera"},
+    ),
+    Service(
         "lidar",
         "reads a planar lidar",
         {

@@ -14,6 +14,7 @@ WARMERS = (
     "common.raster.warm:warm",
     "services.mapping.warm:warm",
     "services.localization.camera.warm:warm",
+    "services.camera.jpeg:warm",
 )
 
 

@@ -30,5 +30,5 @@ def test_every_kernel_that_python_calls_is_compiled(entry):
     # What other kernels call is compiled with them.
     inner = {name for kernel in kernels.values() for name in kernel.py_func.__code__.co_names}
     outer = {key: kernel for key, kernel in kernels.items() if kernel.py_func.__name__ not in inner}
-    assert len(outer) >= 3
+    assert outer
     assert [key for key, kernel in outer.items() if not kernel.signatures] == []

@@ -31,6 +31,14 @@ def key(domain, topic, ros, type_hash):
     return f"{domain}{topic}/{ros.replace('/msg/', '::msg::dds_::')}_/{type_hash}"
 
 
+_PRINTING = threading.Lock()
+
+
+def say(line):
+    with _PRINTING:
+        print(json.dumps(line), flush=True)
+
+
 class Publisher:
     def __init__(self, session, domain, number, topic, ros):
         latched = topic == "/tf_static"
@@ -73,7 +81,7 @@ def listen(session, domain, topic, ros):
             line = {"topic": topic, "sequence": int(sequence), "gid": gid.hex(), "same_bytes": again,
                     "hash_right": str(sample.key_expr).endswith(STORE.hash_rihs01(ros)),
                     "source_age_s": (time.time_ns() - int(source_ns)) / 1e9} | summary(topic, message)  # fmt: skip
-            print(json.dumps(line), flush=True)
+            say(line)
 
     threading.Thread(target=run, daemon=True).start()
     return subscriber
@@ -132,7 +140,7 @@ def main():
                     message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp, 10**9)
                     data = bytes(STORE.serialize_cdr(message, connection.msgtype))
             publishers[connection.topic].put(data)
-        print(json.dumps({"topic": "end", "sent": {t: p.count for t, p in publishers.items()}}), flush=True)
+        say({"topic": "end", "sent": {t: p.count for t, p in publishers.items()}})
         time.sleep(3.0)
         del kept
 

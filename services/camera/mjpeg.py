@@ -1,0 +1,106 @@
+"""JPEG pictures over HTTP (multipart/x-mixed-replace), passed on byte for byte."""
+
+from __future__ import annotations
+
+import contextlib
+import http.client
+from collections.abc import Callable
+from urllib.parse import urlsplit
+
+from services.camera.frame import CameraError, Frame
+
+_MAX_BYTES = 16 * 1024 * 1024
+_MAX_LINE = 4096
+
+
+def is_multipart(url: str, timeout_s: float) -> bool:
+    """Whether an address answers with a stream of parts.
+
+    Raises:
+        CameraError: it does not answer.
+    """
+    source = HttpSource(url, timeout_s, lambda: 0, look_only=True)
+    source.close()
+    return source.multipart
+
+
+class HttpSource:
+    """Parts of one response, each a JPEG. A part without its length is refused: its end would be a guess."""
+
+    def __init__(
+        self, url: str, timeout_s: float, now_ns: Callable[[], int], *, look_only: bool = False
+    ) -> None:
+        """Connects and asks.
+
+        Raises:
+            CameraError: nobody answers, or not with a stream of parts (unless `look_only`).
+        """
+        parts = urlsplit(url)
+        kind = http.client.HTTPSConnection if parts.scheme == "https" else http.client.HTTPConnection
+        self._now_ns = now_ns
+        self._connection = kind(parts.hostname or "", parts.port, timeout=timeout_s)
+        self.where = f"{parts.scheme}://{parts.hostname}"  # without a password that the address may hold
+        path = (parts.path or "/") + (f"?{parts.query}" if parts.query else "")
+        try:
+            self._connection.request("GET", path, headers=_authorization(parts.username, parts.password))
+            self._response = self._connection.getresponse()
+        except (OSError, http.client.HTTPException) as error:
+            self.close()
+            raise CameraError(f"{self.where} does not answer: {error}") from error
+        self.multipart = (self._response.headers.get_content_maintype()) == "multipart"
+        if look_only:
+            return
+        if self._response.status != 200 or not self.multipart:
+            self.close()
+            raise CameraError(
+                f"{self.where} answers {self._response.status} {self._response.headers.get_content_type()}, "
+                "not with a stream of pictures"
+            )
+
+    def read(self) -> Frame:
+        """The next part, stamped when its first line came.
+
+        Raises:
+            CameraError: the stream ended, or stalled for the timeout.
+        """
+        try:
+            length, stamp_ns = self._head()
+            data = self._response.read(length)
+        except (OSError, http.client.HTTPException, ValueError) as error:
+            raise CameraError(f"{self.where} stopped: {error}") from error
+        if len(data) < length:
+            raise CameraError(f"{self.where} closed the connection")
+        return Frame(stamp_ns, data, None)
+
+    def close(self) -> None:
+        """Ends the connection."""
+        with contextlib.suppress(OSError):
+            self._connection.close()
+
+    def _head(self) -> tuple[int, int]:
+        """Length of the next part and when its head came."""
+        length, stamp_ns, headed = -1, 0, False
+        while True:
+            line = self._response.readline(_MAX_LINE)
+            if not line:
+                raise CameraError(f"{self.where} closed the connection")
+            if not headed and not line.strip():  # what ends the part before
+                continue
+            if not headed:
+                headed, stamp_ns = True, self._now_ns()
+            name, _, value = line.decode("latin-1").partition(":")
+            if name.strip().lower() == "content-length":
+                length = int(value)
+            if not line.strip():
+                if not 0 < length <= _MAX_BYTES:
+                    raise CameraError(f"{self.where} sends parts without their length: read it with OpenCV")
+                return length, stamp_ns
+
+
+def _authorization(user: str | None, password: str | None) -> dict[str, str]:
+    if user is None:
+        return {}
+    import base64
+
+    text = base64.b64encode(f"{user}:{password or ''}".encode()).decode()
+    return {"Authorization": f"Basic {text}"}
