@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -35,3 +36,47 @@ def bus(
     for name, value in result.items():
         table.add_row(name, f"{value:.2f}" if isinstance(value, float) else str(value))
     Console().print(table)
+
+
+@app.command()
+def paper(
+    data: Annotated[Path, typer.Option(help="Folder with bag/ and its truth, or a bag with poses in it")],
+    out: Annotated[Path, typer.Option(help="Folder for report.json and report.html")],
+    seeds: Annotated[int, typer.Option(min=1, help="Runs of each configuration")] = 1,
+    only: Annotated[list[str] | None, typer.Option(help="Only this configuration; repeatable")] = None,
+    recorded: Annotated[
+        Path | None, typer.Option(help="Depth maps by stamp, in the place of weights that are missing")
+    ] = None,
+    groundtruth: Annotated[Path | None, typer.Option(help="TUM file of the true body poses")] = None,
+    seconds: Annotated[float | None, typer.Option(help="Only so much of the recording")] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """The paper's six configurations and the default one, live at the recording's speed: its Tables I-IV.
+
+    A network whose weights are missing is replaced by FastDepth (or by --recorded), and named as what it is.
+
+    Examples:
+
+        beamsplat bench paper --data drive --out out/paper
+
+        beamsplat bench paper --data drive --out out/paper --only default --only monogs-lidar --seeds 3
+    """
+    from services.bench.paper import bench_paper
+
+    report = bench_paper(
+        data, out, names=only, seeds=seeds, recorded=recorded, groundtruth=groundtruth, seconds=seconds,
+        say=lambda text: console.print(text, markup=False, highlight=False, soft_wrap=True),
+    )  # fmt: skip
+    if as_json:
+        print(json.dumps(report))
+        return
+    keys = (
+        "position_rmse_m", "ate_sim3_rmse_m", "fps", "cpu_load_percent", "depth_rmse_scaled_m",
+        "psnr_offpath_db",
+    )  # fmt: skip
+    table = Table("configuration", *keys)
+    for row in report["configurations"]:
+        values = [row.get(key) for key in keys]
+        table.add_row(f"{row['name']} #{row['seed']}", *("-" if v is None else f"{v:.4g}" for v in values))
+    Console().print(table)
+    print(f"{out / 'report.html'}\n{out / 'report.json'}")

@@ -1,0 +1,109 @@
+"""Curves as SVG text: no plotting library, and sharp at any size."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from html import escape
+
+import numpy as np
+
+COLOURS = ("#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#ff7f0e", "#17becf", "#8c564b")
+_WIDTH, _HEIGHT, _EDGE = 560, 340, 46
+
+
+@dataclass(frozen=True)
+class Curve:
+    """A named line through points float64 [N, 2]; NaN breaks it."""
+
+    name: str
+    points: np.ndarray
+    colour: str
+    dashed: bool = False
+
+
+def chart(
+    title: str, x_label: str, y_label: str, curves: list[Curve], *, equal: bool = False,
+    dots: np.ndarray | None = None,  # float32 [N, 5]: x, y, red, green, blue
+) -> str:  # fmt: skip
+    """An SVG element; `equal` gives both axes one scale, as maps need."""
+    parts = [c.points[np.all(np.isfinite(c.points), axis=1)] for c in curves]
+    parts += [dots[:, :2].astype(np.float64)] if dots is not None and len(dots) else []
+    everything = np.concatenate(parts) if parts else np.zeros((0, 2))
+    if not len(everything):
+        return f"<p>{escape(title)}: nothing to show</p>"
+    low, high = np.percentile(everything, 0.5, axis=0), np.percentile(everything, 99.5, axis=0)
+    if not equal:
+        low, high = everything.min(axis=0), everything.max(axis=0)
+        low[1] = min(low[1], 0.0)
+    span = np.maximum(high - low, 1e-6)
+    room = np.array([_WIDTH - 2 * _EDGE, _HEIGHT - 2 * _EDGE])
+    scale = np.full(2, (room / span).min()) if equal else room / span
+
+    def at(points: np.ndarray) -> np.ndarray:
+        xy = (points - low) * scale
+        return np.stack([_EDGE + xy[:, 0], _HEIGHT - _EDGE - xy[:, 1]], axis=1)
+
+    out = [
+        f'<svg viewBox="0 0 {_WIDTH} {_HEIGHT}" width="{_WIDTH}" height="{_HEIGHT}" role="img">',
+        f'<text x="{_WIDTH / 2}" y="16" text-anchor="middle" class="t">{escape(title)}</text>',
+    ]
+    out += _axes(low, low + room / scale, x_label, y_label)
+    out += [_dots(at(dots[:, :2].astype(np.float64)), dots[:, 2:5])] if dots is not None and len(dots) else []
+    for number, curve in enumerate(curves):
+        out += _line(curve, at(curve.points))
+        y = 30 + 14 * number
+        out.append(
+            f'<line x1="{_WIDTH - 150}" y1="{y}" x2="{_WIDTH - 132}" y2="{y}" stroke="{curve.colour}"/>'
+        )
+        out.append(f'<text x="{_WIDTH - 128}" y="{y + 4}">{escape(curve.name)}</text>')
+    return "".join([*out, "</svg>"])
+
+
+def _line(curve: Curve, xy: np.ndarray) -> list[str]:
+    """Polylines between gaps, of at most about a thousand points."""
+    good = np.all(np.isfinite(xy), axis=1)
+    pieces = np.split(np.arange(len(xy)), np.flatnonzero(np.diff(good.astype(int)) != 0) + 1)
+    dash = ' stroke-dasharray="5 3"' if curve.dashed else ""
+    out = []
+    for piece in pieces:
+        if len(piece) < 2 or not good[piece[0]]:
+            continue
+        thin = xy[piece][:: max(len(piece) // 1000, 1)]
+        text = " ".join(f"{x:.1f},{y:.1f}" for x, y in thin)
+        out.append(f'<polyline points="{text}" fill="none" stroke="{curve.colour}"{dash}/>')
+    return out
+
+
+def _dots(xy: np.ndarray, rgb: np.ndarray) -> str:
+    """A cloud as one path a colour class: coarse, but small."""
+    classes = (np.clip(rgb, 0.0, 1.0) * 5.0).round().astype(int)
+    inside = (
+        (xy[:, 0] > _EDGE) & (xy[:, 0] < _WIDTH - _EDGE) & (xy[:, 1] > _EDGE) & (xy[:, 1] < _HEIGHT - _EDGE)
+    )
+    cells, first = np.unique(
+        np.column_stack([classes, (xy * 0.7).astype(int)])[inside], axis=0, return_index=True
+    )
+    where = xy[inside][first]
+    out = []
+    for colour in np.unique(cells[:, :3], axis=0):
+        mine = where[np.all(cells[:, :3] == colour, axis=1)]
+        path = "".join(f"M{x:.0f} {y:.0f}h1" for x, y in mine)
+        r, g, b = (colour * 51).tolist()
+        out.append(f'<path d="{path}" stroke="rgb({r},{g},{b})" stroke-width="1.5"/>')
+    return "".join(out)
+
+
+def _axes(low: np.ndarray, high: np.ndarray, x_label: str, y_label: str) -> list[str]:
+    x0, x1, y0, y1 = _EDGE, _WIDTH - _EDGE, _HEIGHT - _EDGE, _EDGE
+    out = [f'<rect x="{x0}" y="{y1}" width="{x1 - x0}" height="{y0 - y1}" fill="none" stroke="#999"/>']
+    for k in range(5):
+        share = k / 4
+        x, y = x0 + share * (x1 - x0), y0 + share * (y1 - y0)
+        vx, vy = low + share * (high - low)
+        out.append(f'<text x="{x:.0f}" y="{y0 + 14}" text-anchor="middle">{vx:.3g}</text>')
+        out.append(f'<text x="{x0 - 4}" y="{y:.0f}" text-anchor="end">{vy:.3g}</text>')
+    out.append(f'<text x="{(x0 + x1) / 2}" y="{_HEIGHT - 12}" text-anchor="middle">{escape(x_label)}</text>')
+    middle = (y0 + y1) / 2
+    turn = f"rotate(-90 12 {middle})"
+    out.append(f'<text x="12" y="{middle}" text-anchor="middle" transform="{turn}">{escape(y_label)}</text>')
+    return out
