@@ -1,4 +1,4 @@
-"""How good a run's map is at views off the path; the map as it was sent, placed in the world by the first pose."""
+"""How good a run's map is at views off the path: the map as it was sent, placed by the first pose."""
 
 from __future__ import annotations
 

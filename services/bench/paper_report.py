@@ -17,14 +17,16 @@ from services.bench.paper_svg import COLOURS, Curve, chart
 from services.evaluation.pictures import colour, label
 
 _STYLE = """body{font:14px/1.4 sans-serif;max-width:1200px;margin:2em auto;padding:0 1em;color:#222}
-table{border-collapse:collapse;margin:.5em 0 1.5em}td,th{border:1px solid #ccc;padding:3px 8px;text-align:right}
+table{border-collapse:collapse;margin:.5em 0 1.5em}
+td,th{border:1px solid #ccc;padding:3px 8px;text-align:right}
 td:first-child,th:first-child{text-align:left}.p{color:#777}svg text{font-size:10px;fill:#333}
 svg .t{font-size:13px;font-weight:bold}img{max-width:100%;margin:2px}.w{color:#a40}figure{margin:0 0 1.5em}"""
 
 Row = dict[str, Any]
 _TABLES: tuple[tuple[str, tuple[tuple[str, str, str], ...]], ...] = (
     ("Table I. Position RMSE (m), first poses aligned", (
-        ("x", "position_rmse_xyz_m.0", ""), ("y", "position_rmse_xyz_m.1", ""), ("z", "position_rmse_xyz_m.2", ""),
+        ("x", "position_rmse_xyz_m.0", ""), ("y", "position_rmse_xyz_m.1", ""),
+        ("z", "position_rmse_xyz_m.2", ""),
         ("together", "position_rmse_m", "position_rmse_m"), ("ATE", "ate_first_pose_rmse_m", ""),
         ("SE(3)-aligned", "ate_se3_rmse_m", ""), ("Sim(3)-aligned", "ate_sim3_rmse_m", ""),
         ("its scale", "sim3_scale", ""), ("unit is the metre", "metric", ""),
@@ -37,12 +39,14 @@ _TABLES: tuple[tuple[str, tuple[tuple[str, str, str], ...]], ...] = (
         ("FPS through the whole system", "fps", "fps"), ("poses per s", "poses_per_s", ""),
         ("CPU load %", "cpu_load_percent", "cpu_load_percent"), ("CPU s per image", "cpu_s_per_image", ""),
         ("keyframes per s", "keyframes_per_s", ""), ("latency p50 ms", "keyframe_latency_p50_ms", ""),
-        ("p95 ms", "keyframe_latency_p95_ms", ""), ("memory MB", "peak_rss_mb", ""), ("link bytes", "link_bytes", ""),
+        ("p95 ms", "keyframe_latency_p95_ms", ""), ("memory MB", "peak_rss_mb", ""),
+        ("link bytes", "link_bytes", ""),
     )),
     ("Table IV. Depth RMSE (m) at the beams; over all truth pixels", (
         ("scaled", "depth_rmse_scaled_m", "depth_rmse_scaled_m"),
         ("unscaled", "depth_rmse_unscaled_m", "depth_rmse_unscaled_m"),
-        ("dense, scaled", "depth_dense_rmse_scaled_m", ""), ("dense, unscaled", "depth_dense_rmse_unscaled_m", ""),
+        ("dense, scaled", "depth_dense_rmse_scaled_m", ""),
+        ("dense, unscaled", "depth_dense_rmse_unscaled_m", ""),
         ("pictures", "depth_frames", ""),
     )),
     ("What the paper lacks: the map", (
@@ -218,4 +222,5 @@ def _figure(bgr: np.ndarray, caption: str) -> str:
         size = (1000, round(bgr.shape[0] * 1000 / bgr.shape[1]))
         bgr = cv2.resize(bgr, size, interpolation=cv2.INTER_AREA)
     data = base64.b64encode(cv2.imencode(".jpg", bgr, (cv2.IMWRITE_JPEG_QUALITY, 80))[1]).decode()
-    return f"<figure><img src='data:image/jpeg;base64,{data}'><figcaption>{escape(caption)}</figcaption></figure>"
+    image = f"<img src='data:image/jpeg;base64,{data}'>"
+    return f"<figure>{image}<figcaption>{escape(caption)}</figcaption></figure>"

@@ -1,4 +1,4 @@
-"""The paper's figures of one run: errors of poses and depth against truth, speed, load; and those of the map."""
+"""The paper's figures of one run: errors of poses and depth against truth, speed and load."""
 
 from __future__ import annotations
 
