@@ -168,11 +168,18 @@ def _models() -> Iterator[Finding]:
                       "correct the variable, or unset it")  # fmt: skip
 
 
+def _devices(deployment: Deployment) -> Iterator[Finding]:
+    from services.devices import examine_devices, wanted_devices
+
+    for remark in examine_devices(wanted_devices(deployment.nodes)):
+        yield Finding(*remark)
+
+
 def examine(deployment: Deployment) -> list[Finding]:
     """All findings about this machine and this deployment."""
     checks: tuple[Callable[[], Iterator[Finding]], ...] = (
         _python, _packages, _gpu, lambda: _router(deployment), _shared_memory, lambda: _state(deployment),
-        _models,
+        _models, lambda: _devices(deployment),
     )  # fmt: skip
     return [finding for check in checks for finding in check()]
 
@@ -181,7 +188,7 @@ def doctor(
     file: Annotated[Path | None, typer.Argument(help="Deployment whose port and folders to check")] = None,
     brief: Annotated[bool, typer.Option(help="Show only what is not well")] = False,
 ) -> None:
-    """Examines this machine: Python, packages, GPU, Zenoh port, shared memory, disk, models.
+    """Examines this machine: Python, packages, GPU, Zenoh port, shared memory, disk, models, devices.
 
     Exit code 1 if there is a fault. Example: beamsplat doctor deploy/demo.toml
     """

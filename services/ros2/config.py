@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -11,13 +12,21 @@ from common.config import NodeConfig
 
 Word = Literal["image", "scan", "odometry", "pose"]
 Domain = Annotated[int, Field(ge=0, le=232)]
+
+
+def _domain() -> int:
+    """As ROS has it: ROS_DOMAIN_ID, else 0."""
+    text = os.environ.get("ROS_DOMAIN_ID", "")
+    return int(text) if text.isdigit() else 0
+
+
 ROUTER = "tcp/127.0.0.1:7447"  # where rmw_zenohd listens, and our own router
 
 
 class Ros2Config(NodeConfig):
     """What to take from the robot. Everything but the domain is found out."""
 
-    domain: Domain = 0  # ROS_DOMAIN_ID
+    domain: Domain = Field(default_factory=_domain, validate_default=True)
     router: str = ROUTER  # the router that the robot's nodes use
     image_topic: str = ""  # where several topics are of the right type
     scan_topic: str = ""
@@ -34,7 +43,7 @@ class Ros2Config(NodeConfig):
 class Ros2OutConfig(NodeConfig):
     """What to give back. An empty topic name leaves it out."""
 
-    domain: Domain = 0
+    domain: Domain = Field(default_factory=_domain, validate_default=True)
     router: str = ROUTER
     pose_topic: str = "/beamsplat/pose"
     cloud_topic: str = "/beamsplat/cloud"
