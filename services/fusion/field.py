@@ -37,7 +37,7 @@ class Field:
     ) -> None:  # fmt: skip
         if camera.is_distorted:
             raise ValueError("fusion works on undistorted pictures: pass Pinhole.undistorted()")
-        self.config = config or FieldConfig()
+        self.config = config or (FieldConfig() if planar else FieldConfig.in_hand())
         self.camera = camera
         self.T_body_camera = T_body_camera
         width = self.config.width_px
@@ -102,22 +102,20 @@ class Field:
             surfaces = self._finder.find(frame.beams, None, frame.T_map_body, ())
             self._find_ceilings(cost, surfaces.backdrop)
         surfaces = self.surfaces(frame)
+        np.minimum(cost, self.config.cost_cap, out=cost)
         self._add_priors(cost, frame, surfaces, self.recall(small) if len(self._memory) else None)
         solved = self._solve(cost, small, surfaces, views)
         sure = solved.spread < self.config.memory_spread
         self._memory.add(small.T_map_camera, np.where(sure, solved.depth_m, np.nan))
-        return self._outvote(solved, self.recall(small), surfaces)
+        return self._outvote(solved, self.recall(small)) if self.config.outvote else solved
 
-    def _outvote(self, solved: Solved, remembered: Remembered, surfaces: Surfaces) -> Solved:
-        """Where three keyframes agree on another depth than this sweep alone, theirs counts."""
+    def _outvote(self, solved: Solved, remembered: Remembered) -> Solved:
+        """Where several keyframes agree on another depth than this sweep alone, theirs counts.
+
+        Not on a floor: there all keyframes take their depth from the same walls where pictures tell
+        little, and their agreement is no evidence.
+        """
         others = (remembered.votes >= self.config.outvote) & ~solved.snapped
-        if self._planar:
-            others |= (
-                (remembered.votes >= self.config.outvote)
-                & ~surfaces.on_floor
-                & (np.abs(np.log(remembered.depth_m / solved.depth_m)) > 0.06)
-                & (surfaces.wall_off_m > 0.1)
-            )
         depth, spread = solved.depth_m.copy(), solved.spread.copy()
         depth[others] = remembered.depth_m[others]
         spread[others] = np.minimum(spread[others], 0.02)

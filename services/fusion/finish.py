@@ -18,7 +18,7 @@ def enlarge(
     depth_out: np.ndarray,  # float32 [H, W]
     sigma_out: np.ndarray,  # float32 [H, W], metres
 ) -> None:
-    """On one surface 1/z is linear in the pixel (exact on planes); at an edge like colour decides."""
+    """On one surface 1/z is linear in the pixel (exact on planes); at edges and holes like colour decides."""
     h, w = depth.shape
     H, W = depth_out.shape
     for V in range(H):
@@ -48,16 +48,14 @@ def enlarge(
             best, best_i, best_j = np.inf, i0, j0
             for i in range(i0, i0 + 2):
                 for j in range(j0, j0 + 2):
-                    if not depth[i, j] > 0.0:
-                        continue
                     away = 8.0 * (abs(y - i) + abs(x - j))
                     for k in range(3):
                         away += abs(float(full_colour[V, U, k]) - float(colour[i, j, k]))
                     if away < best:
                         best, best_i, best_j = away, i, j
-            if best == np.inf:
-                depth_out[V, U] = np.nan
-                sigma_out[V, U] = np.nan
-            else:
+            if depth[best_i, best_j] > 0.0:
                 depth_out[V, U] = depth[best_i, best_j]
                 sigma_out[V, U] = depth[best_i, best_j] * sigma_log[best_i, best_j]
+            else:
+                depth_out[V, U] = np.nan
+                sigma_out[V, U] = np.nan

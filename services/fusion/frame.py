@@ -12,7 +12,10 @@ from common.beams import Beams
 
 @dataclass(frozen=True)
 class FieldConfig:
-    """Weights are in units of the matching cost, whose worst value is `cost_scale`."""
+    """Weights are in units of the matching cost, whose worst value is `cost_scale`.
+
+    The defaults are for a body on a floor, `in_hand()` for one that tilts: measured on one drive of each.
+    """
 
     width_px: int = 160  # working size; the height follows
     labels: int = 88
@@ -21,27 +24,40 @@ class FieldConfig:
     baselines_m: tuple[float, ...] = (0.1, 0.2, 0.4, 0.8)
     max_turn_rad: float = 0.6
     cost_scale: float = 12.0
+    cost_cap: float = 5.0  # beyond it a label is simply wrong: how wrong must not outvote the neighbours
     p1: float = 0.7
-    p2: float = 12.0
-    edge_grey: float = 12.0
-    temperature: float = 2.0
+    p2: float = 20.0
+    edge_grey: float = 30.0
+    temperature: float = 4.0
     wall_near: float = 4.0  # at the height of the lidar
-    wall_far: float = 0.25  # far above and below, on a body that stays level
+    wall_far: float = 0.15  # far above and below, on a body that stays level
     wall_reach_m: float = 0.15
-    floor: float = 3.0
-    behind: float = 1.0
+    floor: float = 4.0
+    behind: float = 0.5
     ceiling: float = 3.5
     ceiling_evidence: float = 500.0
-    memory: float = 1.5
+    memory: float = 0.5
     memory_keyframes: int = 6
-    memory_spread: float = 0.15
-    outvote: int = 3  # keyframes
+    memory_spread: float = 0.12
+    outvote: int = 0  # keyframes that overrule a sweep; 0 = never
+    per_spread: float = 1.0  # error per unit of the matcher's own spread
+    matched: float = 0.07  # standard deviation of log depth that only pictures tell
+    tell_log: float = 0.3  # sigma of log depth, and sigma about a pixel in metres, beyond which there
+    tell_m: float = 0.95  # is no answer
     guess: float = 1.6
     guess_spread: float = 0.12
     near_m: float = 0.7  # unsupported depth below this is unlikely
     near: float = 1.0
     rotation_sigma_rad: float = 0.007
     translation_sigma_m: float = 0.015
+
+    @staticmethod
+    def in_hand() -> FieldConfig:
+        """No floor and no upright walls to lean on: what several keyframes agree on counts instead."""
+        return FieldConfig(
+            cost_cap=np.inf, p2=12.0, edge_grey=12.0, temperature=2.0, memory=1.5, memory_spread=0.15,
+            outvote=3, per_spread=2.3, matched=0.05, tell_log=0.14, tell_m=np.inf,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -20,16 +20,15 @@ from services.fusion.scaling import ratio
 from services.fusion.surfaces import Surfaces
 
 # Standard deviations of log depth, measured on both recordings by what a pixel's depth rests on.
-_BEAM, _FLOOR, _SURFACE, _MATCHED = 0.002, 0.004, 0.010, 0.05
+_BEAM, _FLOOR, _SURFACE = 0.002, 0.004, 0.010
 _BETWEEN_BEAMS_M = 0.007  # the mean of two beams of 1 cm each
-_PER_SPREAD = 2.3  # error per unit of the matcher's own spread
 _CARRIED = (0.10, 0.06, 0.045)  # depth remembered from one, two, three and more keyframes
 _UPRIGHT, _TILTING = 0.125, 0.13  # extruded walls that nothing confirms: body on a floor, body in the hand
 _BEAM_HEIGHT_M = 0.06
 _SAME_SURFACE = 0.08
-_EDGE = 0.3  # of the jump next to a pixel: which side it lies on is a guess
+_EDGE = 0.4  # of the jump next to a pixel: which side it lies on is a guess
 _EDGE_REACH = (3, 5)  # rows, columns of the working size
-_TELL_UP_TO = 0.14  # sigma of log depth beyond which a pixel has no answer
+_TELL_ABOUT_PX = 3.0  # of the working size: a pixel amid doubtful ones is as doubtful
 _CONTRADICTION = 0.25  # log: a beam that far from remembered depth contradicts it
 _LEAST_KNOWN = 20
 _LEAST_INLIERS = 0.3
@@ -123,9 +122,10 @@ class Fusion:
         with np.errstate(invalid="ignore"):
             floor = solved.snapped & (np.abs(np.log(surfaces.floor / solved.depth_m)) < 0.01)
             beam = solved.snapped & (surfaces.wall_off_m < _BEAM_HEIGHT_M)
-        base = np.where(solved.snapped, _SURFACE, _MATCHED)
+        config = self.field.config
+        base = np.where(solved.snapped, _SURFACE, config.matched)
         base = np.where(floor, _FLOOR, np.where(beam, _BEAM + _BETWEEN_BEAMS_M / solved.depth_m, base))
-        doubt = np.where(floor | beam, 0.0, _PER_SPREAD * solved.spread)
+        doubt = np.where(floor | beam, 0.0, config.per_spread * solved.spread)
         return np.hypot(base, doubt).astype(np.float32)
 
     def _pin_to_beams(self, solved: Solved, sigma_log: np.ndarray, surfaces: Surfaces) -> None:
@@ -143,6 +143,16 @@ class Fusion:
         jump = cv2.dilate(log_z, window) - cv2.erode(log_z, window)
         return np.hypot(sigma_log, np.where(jump > _SAME_SURFACE, _EDGE * jump, 0.0)).astype(np.float32)
 
+    def _sure(self, depth: np.ndarray, sigma_log: np.ndarray) -> np.ndarray:
+        """bool [h, w]: pixels that get an answer."""
+        config = self.field.config
+        sure = sigma_log <= config.tell_log
+        if np.isfinite(config.tell_m):
+            far = 3.0 * config.tell_m
+            doubt = np.where(np.isfinite(depth), np.minimum(sigma_log * depth, far), far).astype(np.float32)
+            sure &= cv2.GaussianBlur(doubt, (0, 0), _TELL_ABOUT_PX) <= config.tell_m
+        return sure
+
     def _finish(
         self, frame: Frame, solved: Solved, sigma_log: np.ndarray, uv: np.ndarray, z: np.ndarray
     ) -> Fused:
@@ -151,7 +161,7 @@ class Fusion:
         depth = np.empty(self.field.camera.shape, np.float32)
         sigma = np.empty_like(depth)
         sigma_log = self._doubt_edges(solved.depth_m, sigma_log)
-        known = np.where(sigma_log <= _TELL_UP_TO, solved.depth_m, np.nan).astype(np.float32)
+        known = np.where(self._sure(solved.depth_m, sigma_log), solved.depth_m, np.nan).astype(np.float32)
         colour = cv2.resize(frame.image_rgb, (w, h), interpolation=cv2.INTER_AREA)
         finish.enlarge(known, sigma_log, colour, frame.image_rgb, _SAME_SURFACE, depth, sigma)
         H, W = depth.shape

@@ -13,13 +13,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from common.geometry import inverse, skew, so3_exp
+from common.geometry import inverse, so3_exp
 
 PARAMETERS = ("clock_s", "roll_rad", "pitch_rad", "yaw_rad", "x_m", "y_m")
 _PRIOR = np.array([0.3, 0.1, 0.1, 0.1, 0.03, 0.03])  # standard deviations: keeps what nothing tells in place
 _STEP = np.array([1e-3, 1e-5, 1e-5, 1e-5, 1e-4, 1e-4])
 _SEARCH_S = 0.32
-_LEAST_BASELINE_M = 0.005
+_TRACK_PX = 0.3
+_INVERSE_DEPTH, _INVERSE_DEPTH_SIGMA = 0.35, 0.3  # 1/m: rooms
 _BLOCKS = 8  # of the drive: the jackknife leaves out one at a time
 # A standard error above this is no measurement.
 OBSERVABLE = np.array([0.025, 0.01, 0.01, 0.01, 0.02, 0.02])
@@ -41,7 +42,7 @@ class MotionCalibration:
 
     values: np.ndarray  # float64 [6]
     sigma: np.ndarray  # float64 [6], inf = not looked for
-    residual_px: float  # median |epipolar distance| after
+    residual_px: float  # median distance after
     residual_before_px: float
     corners: int
 
@@ -87,57 +88,73 @@ def solve_motion(
     problem = _Problem(pairs, pose_at, T_body_camera, focal_px)
     before = problem.residuals(start)
     if mask[0]:
-        clocks = np.arange(-_SEARCH_S, _SEARCH_S + 1e-9, 0.02)
-        # Yaw is the mount error that most looks like a wrong clock: it follows along.
-        rest = mask & (np.array(PARAMETERS) == "yaw_rad")
-        costs = []
-        for clock in clocks:
-            x = np.concatenate([[clock], start[1:]])
-            costs.append(problem.cost(problem.descend(x, rest, 1)))
-        start[0] = clocks[int(np.argmin(costs))]
+        start[0] = _search_clock(_Problem(pairs[::3], pose_at, T_body_camera, focal_px), mask)
     best = problem.descend(start, mask, 12)
-    groups = np.array_split(np.arange(len(pairs)), _BLOCKS)
-    estimates = []
-    for group in groups:
-        kept = [pairs[i] for i in range(len(pairs)) if i not in set(group.tolist())]
-        estimates.append(_Problem(kept, pose_at, T_body_camera, focal_px).descend(best.copy(), mask, 4))
-    spread = np.array(estimates) - np.mean(estimates, axis=0)
-    sigma = np.sqrt((_BLOCKS - 1) / _BLOCKS * np.sum(spread**2, axis=0))
+    sigma = problem.jackknife(best, mask)
     # What the prior holds does not scatter, and is not known for that: its own width counts instead.
     held = problem.held_by_prior(best, mask)
     sigma = np.hypot(sigma, held * _PRIOR)
     after = problem.residuals(best)
     return MotionCalibration(
         best, np.where(mask, sigma, np.inf), float(np.median(np.abs(after))),
-        float(np.median(np.abs(before))), len(after),
+        float(np.median(np.abs(before))), len(after) // 2,
     )  # fmt: skip
 
 
+def _search_clock(problem: _Problem, mask: np.ndarray) -> float:
+    """The clock offset, seconds, of least cost on a grid; yaw follows along, it most looks like a clock."""
+    clocks = np.arange(-_SEARCH_S, _SEARCH_S + 1e-9, 0.02)
+    rest = mask & (np.array(PARAMETERS) == "yaw_rad")
+    start = np.zeros(len(PARAMETERS))
+    costs = []
+    for clock in clocks:
+        start[0] = clock
+        costs.append(problem.cost(problem.descend(start, rest, 1)))
+    return float(clocks[int(np.argmin(costs))])
+
+
 class _Problem:
+    """All pairs as one least-squares problem; corners of all pairs stand behind one another."""
+
     def __init__(
         self, pairs: list[TrackedPair], pose_at: Callable[[int], np.ndarray | None],
         T_body_camera: np.ndarray, focal_px: float,
     ) -> None:  # fmt: skip
         self._pairs, self._pose_at = pairs, pose_at
         self._T_body_camera, self._focal_px = T_body_camera, focal_px
+        self._of = np.repeat(np.arange(len(pairs)), [len(p.rays_a) for p in pairs])
+        self._rays_a = np.concatenate([p.rays_a for p in pairs])
+        self._rays_b = np.concatenate([p.rays_b for p in pairs])
+        self._shift_ns: int | None = None
 
     def residuals(self, x: np.ndarray) -> np.ndarray:
-        """Signed epipolar distances of all corners, pixels; zero where a pose is missing."""
+        """`reprojection` of all corners [2M], pixels; zero where a pose is missing."""
+        self._place(round(x[0] * 1e9))
         mount = corrected(self._T_body_camera, x)
-        shift_ns = round(x[0] * 1e9)
-        out = []
-        for pair in self._pairs:
+        T = inverse(mount) @ self._T_bodies @ mount
+        r = reprojection(T[self._of], self._rays_a, self._rays_b, _TRACK_PX / self._focal_px) * self._focal_px
+        return np.where(np.tile(self._known[self._of], 2), r, 0.0)
+
+    def _place(self, shift_ns: int) -> None:
+        """Motions of the body [P, 4, 4] between the pictures of each pair, at shifted stamps."""
+        if shift_ns == self._shift_ns:
+            return
+        self._shift_ns = shift_ns
+        self._T_bodies = np.tile(np.eye(4), (len(self._pairs), 1, 1))
+        self._known = np.zeros(len(self._pairs), dtype=bool)
+        for k, pair in enumerate(self._pairs):
             T_a, T_b = self._pose_at(pair.stamp_a_ns + shift_ns), self._pose_at(pair.stamp_b_ns + shift_ns)
-            if T_a is None or T_b is None:
-                out.append(np.zeros(len(pair.rays_a)))
-                continue
-            T = inverse(T_b @ mount) @ (T_a @ mount)
-            out.append(symmetric_epipolar(T, pair.rays_a, pair.rays_b) * self._focal_px)
-        return np.concatenate(out)
+            if T_a is not None and T_b is not None:
+                self._T_bodies[k], self._known[k] = inverse(T_b) @ T_a, True
+
+    def change(self, X: np.ndarray) -> None:
+        """Motions as placed last, seen through another mounting of the lidar."""
+        self._T_bodies = X @ self._T_bodies @ np.linalg.inv(X)
 
     def cost(self, x: np.ndarray) -> float:
-        """Robust cost (Cauchy, scale 1 px)."""
-        return float(np.sum(np.log1p(self.residuals(x) ** 2)))
+        """Mean robust cost (Cauchy, scale 1 px) of the corners whose poses are known."""
+        r = self.residuals(x)
+        return float(np.sum(np.log1p(r**2))) / max(2 * int(self._known[self._of].sum()), 1)
 
     def held_by_prior(self, x: np.ndarray, mask: np.ndarray) -> np.ndarray:
         """Share [6] in [0, 1] of each value that comes from the prior and not from the pictures."""
@@ -148,8 +165,27 @@ class _Problem:
             share[columns] = np.clip(np.diag(np.linalg.solve(H, np.diag(prior))), 0.0, 1.0)
         return share
 
-    def _normal(self, x: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(H [k, k], gradient [k], weights [k] of the prior) of the robust least squares at x."""
+    def jackknife(self, x: np.ndarray, mask: np.ndarray) -> np.ndarray:
+        """Standard errors [6]: how far one Gauss-Newton step goes when a block of the drive is left out."""
+        sigma = np.zeros(len(x))
+        columns = np.flatnonzero(mask)
+        if len(columns) == 0:
+            return sigma
+        r, J, weight, prior = self._linear(x, columns)
+        block = np.tile(self._of * _BLOCKS // len(self._pairs), 2)
+        steps = []
+        for number in range(_BLOCKS):
+            w = np.where(block == number, 0.0, weight)
+            H = J.T @ (J * w[:, None]) + np.diag(prior)
+            steps.append(np.linalg.solve(H, J.T @ (w * r) + prior * x[columns]))
+        spread = np.array(steps) - np.mean(steps, axis=0)
+        sigma[columns] = np.sqrt((_BLOCKS - 1) / _BLOCKS * np.sum(spread**2, axis=0))
+        return sigma
+
+    def _linear(
+        self, x: np.ndarray, columns: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """(residuals [2M], their derivatives [2M, k], robust weights [2M], weights [k] of the prior)."""
         r = self.residuals(x)
         J = np.empty((len(r), len(columns)))
         for k, column in enumerate(columns):
@@ -159,7 +195,11 @@ class _Problem:
         scale = max(0.5, 1.4826 * float(np.median(np.abs(r))))
         weight = 1.0 / (1.0 + (r / scale) ** 2) ** 2
         # The corners of a pair share the error of its two poses: together they weigh as one.
-        prior = scale**2 * len(r) / len(self._pairs) / _PRIOR[columns] ** 2
+        return r, J, weight, scale**2 * len(r) / 2 / len(self._pairs) / _PRIOR[columns] ** 2
+
+    def _normal(self, x: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(H [k, k], gradient [k], weights [k] of the prior) of the robust least squares at x."""
+        r, J, weight, prior = self._linear(x, columns)
         return J.T @ (J * weight[:, None]) + np.diag(prior), J.T @ (weight * r) + prior * x[columns], prior
 
     def descend(self, x: np.ndarray, mask: np.ndarray, iterations: int) -> np.ndarray:
@@ -177,13 +217,45 @@ class _Problem:
         return x
 
 
-def symmetric_epipolar(T_b_a: np.ndarray, rays_a: np.ndarray, rays_b: np.ndarray) -> np.ndarray:
-    """Sampson distances [N] in normalised pixels.
+def motion_misfit(
+    pairs: list[TrackedPair],
+    pose_at: Callable[[int], np.ndarray | None],
+    T_body_camera: np.ndarray,
+    focal_px: float,
+    X: np.ndarray | None = None,
+) -> float:
+    """Median distance, pixels, of corners from where the poses put them.
 
-    With hardly any baseline the constraint says nothing; the distance fades out below 5 mm.
+    With `X` [4, 4] motions are taken as X T X^-1: those of a body whose lidar was mounted otherwise.
     """
-    t = T_b_a[:3, 3]
-    E = skew(t) @ T_b_a[:3, :3]
-    line_b, line_a = rays_a @ E.T, rays_b @ E
-    scale = np.sqrt(np.sum(line_b[:, :2] ** 2, axis=1) + np.sum(line_a[:, :2] ** 2, axis=1))
-    return np.sum(line_b * rays_b, axis=1) / np.maximum(scale, _LEAST_BASELINE_M)
+    problem = _Problem(pairs, pose_at, T_body_camera, focal_px)
+    start = np.zeros(len(PARAMETERS))
+    problem.residuals(start)
+    if X is not None:
+        problem.change(X)
+    r = np.abs(problem.residuals(start))
+    return float(np.median(r[r > 0.0])) if np.any(r > 0.0) else float("nan")
+
+
+def reprojection(
+    T_b_a: np.ndarray,  # float64 [N, 4, 4], camera a to camera b, of each corner
+    rays_a: np.ndarray,  # float64 [N, 3]
+    rays_b: np.ndarray,  # float64 [N, 3]
+    sigma: float,  # of a track, normalised pixels
+) -> np.ndarray:
+    """Distances [2N] in normalised pixels of tracked rays from where pose and a likely depth put them.
+
+    The inverse depth of a corner is Gaussian, marginalised: across the epipolar line the distance counts
+    in full; along it the less, the more the unknown depth moves the corner. A camera that turns on the
+    spot, where the epipolar constraint says nothing, thus still tells its rotation.
+    """
+    t = T_b_a[:, :3, 3]
+    p = np.einsum("nij,nj->ni", T_b_a[:, :3, :3], rays_a) + _INVERSE_DEPTH * t
+    z = np.maximum(p[:, 2:], 0.1)
+    predicted = p[:, :2] / z
+    r = rays_b[:, :2] - predicted
+    along = (t[:, :2] - predicted * t[:, 2:]) / z  # d predicted / d inverse depth
+    length = np.sqrt(np.sum(along**2, axis=1)) + 1e-12
+    x, y = along.T / length
+    fade = np.sqrt(1.0 + (_INVERSE_DEPTH_SIGMA * length / sigma) ** 2)
+    return np.concatenate([r[:, 1] * x - r[:, 0] * y, (r[:, 0] * x + r[:, 1] * y) / fade])

@@ -1,0 +1,216 @@
+"""The check at every start: do clock, mount and lidar fit what the camera sees, and what do they say if not?
+
+Over the first metres of a drive corners are tracked between pictures and a few scans are kept. Then, once,
+and beside the running work: are the poses those of a mirrored or turned lidar, is the camera's clock
+right, does the camera look where the calibration says.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from common.camera import Pinhole
+from common.geometry import inverse, so3_exp
+from common.trajectory import Trajectory
+from services.fusion.calibration.motion import MotionCalibration, TrackedPair, motion_misfit, solve_motion
+from services.fusion.calibration.mounting import check_mounting
+from services.fusion.relative_pose import corners, track
+
+_WIDTH_PX = 320
+_EVERY_NS = 250_000_000
+_APART_NS = (500_000_000, 1_200_000_000)
+_LEAST_TURN_RAD, _LEAST_WAY_M = 0.02, 0.05  # between the pictures of a pair
+_LEAST_CORNERS = 12
+_POSE_GAP_NS = 1_000_000_000
+_SCANS = 24
+_FREE = ("clock_s", "roll_rad", "pitch_rad", "yaw_rad")
+_CLOCK_MS, _ANGLE_DEG, _SIGMAS = 20.0, 0.7, 5.0  # what is worth a sentence
+_MISFIT_PX = 1.5
+_CLEARLY = 0.5  # another mounting must fit this much better to be believed
+
+
+@dataclass(frozen=True)
+class CalibrationHealth:
+    """What the check found. `status` is "ok" or one sentence that says what is wrong and what to do."""
+
+    status: str
+    misfit_px: float  # median distance of tracked corners from where the poses put them, 320 px wide
+    clock_ms: float  # to be added to the camera's stamps; NaN = this drive does not tell
+    clock_sigma_ms: float
+    turn_deg: np.ndarray  # float64 [3]: roll, pitch, yaw by which to turn the mount; NaN = not told
+    pairs: int
+
+    @property
+    def line(self) -> str:
+        """For a status display."""
+        if self.status != "ok":
+            return f"calibration: {self.status}"
+        told = np.isfinite(self.clock_ms)
+        clock = f", clock {self.clock_ms:+.0f} +- {self.clock_sigma_ms:.0f} ms" if told else ""
+        return f"calibration ok: {self.misfit_px:.2f} px in {self.pairs} pairs of pictures{clock}"
+
+
+class StartupCheck:
+    """Collects what the check needs; `job` gives it once there is enough, as work for another thread."""
+
+    def __init__(
+        self, camera: Pinhole, T_body_camera: np.ndarray, T_body_lidar: np.ndarray, pairs: int = 60
+    ) -> None:
+        height = round(camera.height_px * _WIDTH_PX / camera.width_px)
+        self._camera = camera.resized(_WIDTH_PX, height)
+        self._T_body_camera, self._T_body_lidar = T_body_camera, T_body_lidar
+        self._wanted = pairs
+        self._pairs: list[TrackedPair] = []
+        self._pictures: deque[tuple[int, np.ndarray, np.ndarray]] = deque()
+        self._stamps: list[int] = []
+        self._poses: list[np.ndarray] = []
+        self._scans: list[tuple[np.ndarray, np.ndarray]] = []
+        self.done = False
+
+    @property
+    def progress(self) -> str:
+        return f"calibration not checked yet: {len(self._pairs)} of {self._wanted} pairs of pictures"
+
+    def add_pose(self, stamp_ns: int, T_map_body: np.ndarray) -> None:
+        """Every pose of the localization. A clock that was set back starts the check anew."""
+        if self._stamps and stamp_ns <= self._stamps[-1]:
+            for kept in (self._pairs, self._pictures, self._stamps, self._poses, self._scans):
+                kept.clear()
+        self._stamps.append(stamp_ns)
+        self._poses.append(T_map_body)
+        if not self._pairs and len(self._stamps) > 600:  # a robot that stands: only the last minute counts
+            del self._stamps[:300], self._poses[:300]
+
+    def add_scan(self, points_lidar_m: np.ndarray, T_map_body: np.ndarray) -> None:
+        """Returns float64 [N, 3] of a scan in the lidar frame; only those a quarter metre apart are kept."""
+        if self.done or len(points_lidar_m) < 50 or len(self._scans) >= _SCANS:
+            return
+        if self._scans and not _apart(self._scans[-1][1], T_map_body, 0.25, 0.3):
+            return
+        self._scans.append((points_lidar_m, T_map_body))
+
+    def add_picture(self, stamp_ns: int, image_rgb: np.ndarray, T_map_body: np.ndarray) -> None:
+        """An undistorted picture uint8 [H, W, 3]; most are passed over."""
+        if self.done or (self._pictures and stamp_ns - self._pictures[-1][0] < _EVERY_NS):
+            return
+        grey = cv2.cvtColor(image_rgb, cv2.COLOR_RGB2GRAY)
+        size = (self._camera.width_px, self._camera.height_px)
+        small = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+        while self._pictures and stamp_ns - self._pictures[0][0] > _APART_NS[1]:
+            self._pictures.popleft()
+        if self._pictures and stamp_ns - self._pictures[0][0] >= _APART_NS[0]:
+            then_ns, then, T_then = self._pictures[0]
+            if _apart(T_then, T_map_body, _LEAST_WAY_M, _LEAST_TURN_RAD):
+                self._add_pair(then_ns, then, stamp_ns, small)
+        self._pictures.append((stamp_ns, small, T_map_body))
+
+    def _add_pair(self, a_ns: int, a: np.ndarray, b_ns: int, b: np.ndarray) -> None:
+        uv = corners(a, 80)
+        moved, good = track(a, b, uv, uv)
+        if good.sum() >= _LEAST_CORNERS:
+            rays = self._camera.rays
+            self._pairs.append(TrackedPair(a_ns, b_ns, rays(uv[good]), rays(moved[good])))
+
+    def job(self) -> Callable[[], CalibrationHealth] | None:
+        """The check itself, once, when enough was seen; holds no reference to what changes afterwards."""
+        if self.done or len(self._pairs) < self._wanted:
+            return None
+        self.done = True
+        pairs, scans = self._pairs, self._scans
+        trajectory = Trajectory(np.array(self._stamps, dtype=np.int64), np.array(self._poses))
+        self._pairs, self._scans = [], []
+        self._stamps, self._poses = [], []
+        self._pictures.clear()
+        T_body_camera, T_body_lidar, focal_px = self._T_body_camera, self._T_body_lidar, self._camera.fx_px
+
+        def pose_at(stamp_ns: int) -> np.ndarray | None:
+            return trajectory.at(stamp_ns, max_gap_ns=_POSE_GAP_NS, max_extrapolation_ns=0)
+
+        return lambda: check(pairs, scans, pose_at, T_body_camera, T_body_lidar, focal_px)
+
+
+def check(
+    pairs: list[TrackedPair],
+    scans: list[tuple[np.ndarray, np.ndarray]],  # (points in the lidar frame, T_map_body)
+    pose_at: Callable[[int], np.ndarray | None],
+    T_body_camera: np.ndarray,
+    T_body_lidar: np.ndarray,
+    focal_px: float,
+) -> CalibrationHealth:
+    """Lidar first, then clock and mount: one fault hides the next."""
+    nothing = np.full(3, np.nan)
+    misfit = motion_misfit(pairs, pose_at, T_body_camera, focal_px)
+    against_poses = check_mounting([p for p, _ in scans], [T for _, T in scans], T_body_lidar)
+    fault = against_poses.status if against_poses.pairs and against_poses.status != "ok" else None
+    fault = fault or _mounting_fault(pairs, pose_at, T_body_camera, T_body_lidar, focal_px, misfit)
+    if fault is not None:
+        return CalibrationHealth(fault, misfit, np.nan, np.nan, nothing, len(pairs))
+    try:
+        found = solve_motion(pairs, pose_at, T_body_camera, focal_px, _FREE)
+    except ValueError as error:
+        return CalibrationHealth(f"cannot be checked: {error}", misfit, np.nan, np.nan, nothing, len(pairs))
+    told = found.observable
+    return CalibrationHealth(
+        health_sentence(found, _CLOCK_MS, _ANGLE_DEG, _SIGMAS), found.residual_px,
+        1e3 * found.values[0] if told[0] else np.nan, 1e3 * found.sigma[0] if told[0] else np.nan,
+        np.where(told[1:4], np.degrees(found.values[1:4]), np.nan), len(pairs),
+    )  # fmt: skip
+
+
+def _mounting_fault(
+    pairs: list[TrackedPair], pose_at: Callable[[int], np.ndarray | None], T_body_camera: np.ndarray,
+    T_body_lidar: np.ndarray, focal_px: float, misfit_px: float,
+) -> str | None:  # fmt: skip
+    """A sentence if pictures fit the poses of a mirrored or turned lidar clearly better than these.
+
+    Poses made from scans of a wrongly mounted lidar fit those scans; only something else tells.
+    """
+    if misfit_px < _MISFIT_PX:
+        return None
+    flip, half_turn = np.diag([1.0, -1.0, 1.0, 1.0]), np.eye(4)
+    half_turn[:3, :3] = so3_exp(np.array([0.0, 0.0, np.pi]))
+    mountings = {
+        "mirrored (upside down, or angles counted the other way)": flip,
+        "turned round by 180 degrees": half_turn,
+        "mirrored and turned round by 180 degrees": half_turn @ flip,
+    }
+    fits = {}
+    for name, change in mountings.items():
+        X = T_body_lidar @ change @ inverse(T_body_lidar)
+        fits[name] = motion_misfit(pairs, pose_at, T_body_camera, focal_px, X)
+    best = min(fits, key=lambda name: fits[name])
+    if fits[best] > _CLEARLY * misfit_px:
+        return None
+    return (
+        f"the lidar is {best}: pictures then fit its poses within {fits[best]:.1f} px, "
+        f"not {misfit_px:.1f} px; correct its mounting in the rig"
+    )
+
+
+def health_sentence(
+    found: MotionCalibration, clock_ms: float = 10.0, angle_deg: float = 0.5, sigmas: float = 4.0
+) -> str:
+    """ "ok", or what is wrong with clock or mount; errors smaller than the given ones are no fault."""
+    off_ms, sigma_ms = 1e3 * found.values[0], 1e3 * found.sigma[0]
+    if found.observable[0] and abs(off_ms) > max(clock_ms, sigmas * sigma_ms):
+        return f"the camera's clock is wrong: add {off_ms:.0f} +- {sigma_ms:.0f} ms to its stamps"
+    turn_deg, turn_sigma = np.degrees(found.values[1:4]), np.degrees(found.sigma[1:4])
+    for name, value, sigma, sure in zip(
+        ("roll", "pitch", "yaw"), turn_deg, turn_sigma, found.observable[1:4]
+    ):
+        if sure and abs(value) > max(angle_deg, sigmas * sigma):
+            return f"the camera's {name} is wrong: turn its mount by {value:.2f} +- {sigma:.2f} degrees"
+    if found.residual_px > _MISFIT_PX:
+        return f"pictures and poses do not fit ({found.residual_px:.1f} px): wrong K, or wrong poses"
+    return "ok"
+
+
+def _apart(T_a: np.ndarray, T_b: np.ndarray, way_m: float, turn_rad: float) -> bool:
+    T = inverse(T_a) @ T_b
+    turn = np.arccos(np.clip((np.trace(T[:3, :3]) - 1.0) / 2.0, -1.0, 1.0))
+    return bool(np.linalg.norm(T[:3, 3]) > way_m or turn > turn_rad)
