@@ -51,6 +51,12 @@ def bench_map(
         bool, typer.Option("--count-cpu", help="Count those in CPU seconds a thread: on a busy machine")
     ] = False,
     threads: Annotated[int, typer.Option(min=1, help="Threads of the rasterizer")] = 2,
+    distance_m: Annotated[float, typer.Option(min=0.01, help="Motion between keyframes")] = 0.25,
+    angle_rad: Annotated[float, typer.Option(min=0.01, help="Turn between keyframes")] = 0.22,
+    refine_pose: Annotated[bool, typer.Option("--refine-pose", help="The mapper refines poses")] = False,
+    refine_exposure: Annotated[
+        bool, typer.Option("--refine-exposure", help="The mapper refines each picture's brightness")
+    ] = False,
     seed: Annotated[int, typer.Option(help="Seed of the mapper")] = 0,
     jump: Annotated[
         bool, typer.Option("--jump", help="Misplace half of the keyframes by 1 m and 10 deg until the end")
@@ -78,11 +84,13 @@ def bench_map(
 
     from services.evaluation.map_prior import FieldPrior, MoverMasks
     from services.mapping.bench_map import MapBench, run_bench
+    from services.mapping.settings import MapperSettings
 
     cv2.setNumThreads(1)
     bench = MapBench(
         prior=prior, threads=threads, seed=seed, refine_s=refine_s, count_cpu=count_cpu, jump=jump,
-        settle_steps=settle_steps,
+        settle_steps=settle_steps, distance_m=distance_m, angle_rad=angle_rad,
+        settings=MapperSettings(refine_pose=refine_pose, refine_exposure=refine_exposure),
     )  # fmt: skip
     field = FieldPrior(source) if prior == "field" else None
     result = run_bench(data, bench, console.print, out, field, MoverMasks() if movers else None)
