@@ -1,0 +1,49 @@
+"""An emulated lidar on a wire, and the SLAM behind it: separate processes, as on a robot."""
+
+import time
+
+import numpy as np
+
+from common.bus import Bus, open_session
+from common.config import Deployment, RouterConfig
+from common.node import Input
+from services.board import HealthBoard
+from services.supervisor import Supervisor
+from tests.services.lidar.devices import Ld19, Plugged
+
+RIG = "[lidar.mount]\nxyz_m = [0.0, 0.0, 0.2]\nrpy_deg = [0.0, 0.0, 0.0]\n"
+
+
+def test_a_lidar_on_a_noisy_wire_is_enough_to_know_where_the_robot_stands(tmp_path, free_endpoint):
+    path = str(tmp_path / "lidar")
+    (tmp_path / "rig.toml").write_text(RIG)
+    nodes = {
+        "camera": {"kind": "none", "rig": str(tmp_path / "rig.toml")},
+        "lidar": {"kind": "ldrobot", "device": path},
+        "localization": {"kind": "lidar"},
+    }
+    deployment = Deployment(
+        robot="test", router=RouterConfig(listen=(free_endpoint,)), state_dir=tmp_path / "state", nodes=nodes
+    )
+    poses = []
+    with (
+        Plugged(Ld19(), path, corruption=0.01),
+        Supervisor(deployment) as supervisor,
+        Bus(open_session((free_endpoint,)), "test", "x", "cd" * 8, 1) as bus,
+    ):
+        board = HealthBoard(bus.session, "test")
+        bus.subscribe(Input("localization/odometry"), lambda x: poses.append(x.message), lambda *a: None,
+                      lambda *a: None)  # fmt: skip
+        deadline = time.monotonic() + 60
+        while len([p for p in poses if p.status == "ok"]) < 30 and time.monotonic() < deadline:
+            supervisor.poll()
+            time.sleep(0.05)
+        detail = board.records["lidar"].health.detail
+        stopped = time.monotonic()
+    assert time.monotonic() - stopped < 6.0, "somebody had to be killed"
+    good = [p for p in poses if p.status == "ok"]
+    assert len(good) >= 30
+    wandered_m = max(float(np.linalg.norm(p.T_odom_body[:3, 3])) for p in good)
+    assert wandered_m < 0.03
+    assert "NOISY LINK" in detail
+    assert "LDROBOT" in detail
