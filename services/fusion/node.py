@@ -8,7 +8,9 @@ from dataclasses import replace
 from typing import Literal
 
 import numpy as np
+from pydantic import Field
 
+from common.beams import scan_points
 from common.camera import Pinhole, Undistorter
 from common.config import NodeConfig
 from common.errors import UserError
@@ -24,8 +26,9 @@ from common.messages import (
     Rig,
     Scan,
 )  # fmt: skip
-from common.node import Input, Node, Outputs
+from common.node import Input, Job, Node, Outputs
 from common.picture import decode_rgb
+from services.fusion.calibration.startup import CalibrationHealth, StartupCheck
 from services.fusion.frame import Frame
 from services.fusion.fuse import Fusion
 from services.fusion.result import Fused
@@ -34,6 +37,7 @@ from services.fusion.single import SingleCorrection
 log = logging.getLogger("beamsplat.fusion")
 
 _PICTURES = 8  # kept until their estimate comes
+_CHECK_AFTER_SCANS = 100  # the calibration check has ten seconds for a second or two of work
 
 
 class FusionConfig(NodeConfig):
@@ -47,6 +51,7 @@ class FusionConfig(NodeConfig):
     keyframe_m: float = 0.3
     keyframe_rad: float = 0.26
     cloud_every_px: int = 4  # a point of the cloud per so many pixels in each direction
+    check_pairs: int = Field(60, ge=0)  # pairs of pictures for the calibration check at the start; 0 = none
 
 
 class FusionNode(Node):
@@ -71,6 +76,7 @@ class FusionNode(Node):
         self._unmarked: deque[TimedScan] = deque()  # scans whose movers are not known yet
         self._marked: deque[TimedScan] = deque()  # scans whose last beam has no pose yet
         self._T_odom_keyframe: np.ndarray | None = None
+        self.calibration: CalibrationHealth | None = None
         self.overtaken = 0
 
     def on_rig(self, rig: Rig) -> Outputs:
@@ -95,6 +101,10 @@ class FusionNode(Node):
             self._undistort.pinhole, camera.T_body_camera, floor_known=self.config.floor_known,
             planar=self.config.planar,
         )  # fmt: skip
+        self._check = StartupCheck(
+            self._undistort.pinhole, camera.T_body_camera, rig.lidar.T_body_lidar, self.config.check_pairs
+        )
+        self._check.done = self.config.check_pairs == 0
         return iter(())
 
     def on_lidar_scan(self, scan: Scan) -> Outputs:
@@ -126,7 +136,42 @@ class FusionNode(Node):
             scan = self._marked.popleft()
             self._history.add_scan(scan)
             self._fusion.add_scan(self._history.scan_points_a(scan))
+            self._keep_for_check(scan)
+        if not self._check.done:
+            self._check.add_pose(odometry.stamp_ns, odometry.T_odom_body)
+            job = self._check.job()
+            if job is not None:
+                yield Job("check_calibration", job, after=_CHECK_AFTER_SCANS, of="lidar/scan")
+            self._say()
         yield from self._fuse_if_ready()
+
+    def _keep_for_check(self, scan: TimedScan) -> None:
+        T_odom_body = self._history.pose(scan.middle_ns)
+        if not self._check.done and T_odom_body is not None:
+            points, _ = scan_points(
+                scan.ranges_m,
+                scan.angle_min_rad,
+                scan.angle_increment_rad,
+                scan.range_min_m,
+                scan.range_max_m,
+            )
+            self._check.add_scan(points, T_odom_body)
+
+    def on_job_check_calibration(self, health: CalibrationHealth) -> Outputs:
+        """What the check at the start found: beside the health from now on, and in the log if it is bad."""
+        self.calibration = health
+        (log.info if health.status == "ok" else log.error)("%s", health.line)
+        self._say()
+        return iter(())
+
+    def _say(self) -> None:
+        """The line beside the health: frames overtaken, and the calibration."""
+        overtaken = f"{self.overtaken} estimates overtaken" if self.overtaken else ""
+        if self.calibration is not None:
+            calibration = self.calibration.line
+        else:
+            calibration = "" if self._check.done else self._check.progress
+        self.detail = "; ".join(text for text in (overtaken, calibration) if text)
 
     def on_camera_image(self, image: Image) -> Outputs:
         self._pictures.append(image)
@@ -147,7 +192,7 @@ class FusionNode(Node):
             ready = self._estimates.popleft()
         if ready is None:
             return
-        self.detail = f"{self.overtaken} estimates overtaken" if self.overtaken else ""
+        self._say()
         image = next((p for p in self._pictures if p.stamp_ns == ready.stamp_ns), None)
         if image is None:  # its picture was lost on the way, or is older than those kept
             self.overtaken += 1
@@ -167,6 +212,7 @@ class FusionNode(Node):
         if T_odom_body is None:
             yield "fusion/depth", _refused(image.stamp_ns, "no pose at the time of the picture")
             return
+        self._check.add_picture(image.stamp_ns, rgb, T_odom_body)
         beams, age_ns = self._history.beams(image.stamp_ns)
         usable = estimate.status == "ok" and estimate.kind != "none"
         frame = Frame(

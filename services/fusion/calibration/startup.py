@@ -31,6 +31,7 @@ _SCANS = 24
 _FREE = ("clock_s", "roll_rad", "pitch_rad", "yaw_rad")
 _CLOCK_MS, _ANGLE_DEG, _SIGMAS = 20.0, 0.7, 5.0  # what is worth a sentence
 _MISFIT_PX = 1.5
+_DOUBT_PX = 0.3  # from here on other mountings are tried
 _CLEARLY = 0.5  # another mounting must fit this much better to be believed
 
 
@@ -170,7 +171,7 @@ def _mounting_fault(
 
     Poses made from scans of a wrongly mounted lidar fit those scans; only something else tells.
     """
-    if misfit_px < _MISFIT_PX:
+    if not misfit_px > _DOUBT_PX:
         return None
     flip, half_turn = np.diag([1.0, -1.0, 1.0, 1.0]), np.eye(4)
     half_turn[:3, :3] = so3_exp(np.array([0.0, 0.0, np.pi]))

@@ -1,0 +1,104 @@
+"""The check at every start: planted faults of clock, mount and lidar are named, and a right robot is left alone."""
+
+import numpy as np
+import pytest
+
+from common.geometry import inverse, se2_to_se3, so3_exp, transform_points
+from services.fusion.calibration.motion import corrected
+from services.fusion.calibration.startup import StartupCheck, check
+from tests.services.fusion.room import CAMERA, LIDAR_Z, T_BODY_CAMERA, render, scan
+from tests.services.fusion.test_calibration import MOUNT, _drive, _pose
+
+T_BODY_LIDAR = np.eye(4)
+FLIP = np.diag([1.0, -1.0, 1.0, 1.0])
+HALF_TURN = np.eye(4)
+HALF_TURN[:3, :3] = so3_exp(np.array([0.0, 0.0, np.pi]))
+
+
+def _check(pairs, pose=_pose, mount=MOUNT, scans=()):
+    return check(pairs, list(scans), pose, mount, T_BODY_LIDAR, 265.0)
+
+
+def test_a_right_robot_is_ok_with_figures():
+    health = _check(_drive(MOUNT))
+    assert health.status == "ok"
+    assert abs(health.clock_ms) < 3.0
+    assert health.misfit_px < 0.5
+    assert "calibration ok" in health.line
+    assert "ms" in health.line
+
+
+@pytest.mark.parametrize("clock_ms", [-80, 60])
+def test_a_wrong_clock_is_named_with_its_amount(clock_ms):
+    health = _check(_drive(MOUNT, clock_ms * 1e-3))
+    assert f"add {clock_ms} +-" in health.status or abs(health.clock_ms - clock_ms) < 5.0
+    assert "clock is wrong" in health.status
+
+
+@pytest.mark.parametrize(("axis", "name"), [(2, "pitch"), (3, "yaw")])
+def test_a_turned_camera_is_named_with_its_axis(axis, name):
+    planted = np.zeros(6)
+    planted[axis] = np.radians(2.0)
+    health = _check(_drive(MOUNT), mount=corrected(MOUNT, planted))
+    assert f"the camera's {name} is wrong" in health.status
+    assert health.turn_deg[axis - 1] == pytest.approx(-2.0, abs=0.3)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"), [(FLIP, "mirrored (upside down"), (HALF_TURN, "turned round by 180 degrees")]
+)
+def test_poses_of_a_wrongly_mounted_lidar_are_told_by_the_camera(change, words):
+    """The scans fit such poses: they were made from them. Pictures do not."""
+    health = _check(_drive(MOUNT), pose=lambda stamp: change @ _pose(stamp) @ inverse(change))
+    assert words in health.status
+    assert "rig" in health.status
+
+
+def test_a_mirrored_lidar_is_told_by_poses_from_elsewhere():
+    times = np.arange(0, 24) * 1_000_000_000
+    scans = []
+    for stamp in times:
+        T = _pose(stamp)
+        points = scan(T, np.random.default_rng(1)).points_body_m - [0.0, 0.0, LIDAR_Z]
+        scans.append((points * [1.0, -1.0, 1.0], T))
+    assert "mirrored" in _check(_drive(MOUNT), scans=scans).status
+    right = [(points * [1.0, -1.0, 1.0], T) for points, T in scans]
+    assert _check(_drive(MOUNT), scans=right).status == "ok"
+
+
+def _run(pairs, clock_ns=0):
+    """A drive in the room, its pictures at 8 Hz; the check's result."""
+    wanted = StartupCheck(CAMERA, T_BODY_CAMERA, T_BODY_LIDAR, pairs)
+    for k in range(200):
+        stamp = k * 125_000_000
+        T = _room_pose(stamp)
+        wanted.add_pose(stamp, T)
+        if k % 2 == 0 and stamp >= 500_000_000:
+            picture, _ = render(_room_pose(stamp + clock_ns))
+            wanted.add_picture(stamp, picture, T)
+        job = wanted.job()
+        if job is not None:
+            assert wanted.job() is None
+            return job()
+    raise AssertionError(wanted.progress)
+
+
+def _room_pose(stamp_ns):
+    s = stamp_ns * 1e-9
+    return se2_to_se3(np.array([0.12 * s, 0.3 * np.sin(0.5 * s), 0.25 * np.sin(1.1 * s)]))
+
+
+def test_pictures_of_a_room_pass_the_check_and_late_ones_do_not():
+    assert _run(16).status == "ok"
+    assert "clock is wrong" in _run(16, clock_ns=120_000_000).status
+
+
+def test_a_clock_that_is_set_back_starts_the_check_anew():
+    started = StartupCheck(CAMERA, T_BODY_CAMERA, T_BODY_LIDAR, 4)
+    points = transform_points(np.eye(4), np.random.default_rng(0).uniform(-3, 3, (80, 3)))
+    for stamp in (10, 20, 30):
+        started.add_pose(stamp, np.eye(4))
+    started.add_scan(points, np.eye(4))
+    started.add_pose(5, np.eye(4))
+    assert started.job() is None
+    assert "0 of 4" in started.progress
