@@ -51,7 +51,9 @@ class Ros2Node(Node):
         self._samples: queue.Queue[zenoh.Sample] = queue.Queue(_QUEUED)
         self._overflowed = 0
         self._kept: list[object] = []  # what is dropped would be undeclared
-        self._keys: set[str] = set()
+        self._subscribed: dict[str, str] = {}  # type by key
+        self._unwanted: set[str] = set()  # keys whose subscribers are to end
+        self._tidied = False
         self._session = open_session((c.router,))
         self._listen()
 
@@ -87,7 +89,18 @@ class Ros2Node(Node):
             self._clock.now_ns(),
             time.monotonic(),
         )
+        if self.robot.rig is not None and not self._tidied:
+            self._tidy()
         return [Sourced(None, topic, message) for topic, message in found]
+
+    def _tidy(self) -> None:
+        """The topics are chosen: transforms and raw pictures of others need not come any more."""
+        self._tidied = True
+        chosen = {topic.strip("/") for topic in self.robot.chosen}
+        for key, type_name in self._subscribed.items():
+            topic = key.split("/", 1)[1].rsplit("/", 2)[0]
+            if type_name == TF or (type_name == IMAGE and topic not in chosen):
+                self._unwanted.add(key)
 
     def _hear_of(self, token: str, kind: zenoh.SampleKind) -> None:
         """A publisher has shown itself. Raw pictures are heavy: only those that exist are asked for."""
@@ -111,7 +124,7 @@ class Ros2Node(Node):
         tokens = self._session.liveliness().declare_subscriber(
             f"{ADMIN}/{domain}/**", zenoh.handlers.FifoChannel(_FIFO), history=True
         )
-        self._pump(tokens)
+        self._pump(tokens, ADMIN)
         # Transforms said once, kept by publishers from before Zenoh's advanced ones.
         for reply in self._session.get(f"{domain}/tf_static/*/*", timeout=1.0):
             if reply.ok is not None:
@@ -123,9 +136,8 @@ class Ros2Node(Node):
         )
 
     def _subscribe(self, key: str, type_name: str) -> None:
-        if key in self._keys:
+        if key in self._subscribed or self._tidied:
             return
-        self._keys.add(key)
         channel = zenoh.handlers.FifoChannel(_FIFO)
         if type_name == TF:  # /tf_static is said once, to be found by who comes later
             subscriber = zenoh.ext.declare_advanced_subscriber(
@@ -135,26 +147,32 @@ class Ros2Node(Node):
             )  # fmt: skip
         else:
             subscriber = self._session.declare_subscriber(key, channel)
-        self._pump(subscriber)
+        self._subscribed[key] = type_name
+        self._pump(subscriber, key)
         topic = key.split("/", 1)[1].rsplit("/", 2)[0]
         if topic != "**":
             entity = Entity(
-                self.config.domain, str(self._session.zid()), 0, len(self._keys), "MS", "beamsplat",
+                self.config.domain, str(self._session.zid()), 0, len(self._subscribed), "MS", "beamsplat",
                 topic="/" + topic, type_name=type_name, type_hash=typestore().hash_rihs01(type_name),
                 qos=Qos(best_effort=True, depth=10),
             )  # fmt: skip
             self._kept.append(self._session.liveliness().declare_token(entity.token()))
 
-    def _pump(self, subscriber: object) -> None:
-        """A thread that empties a channel, so that none ever stalls the transport."""
+    def _pump(self, subscriber: object, key: str) -> None:
+        """A thread that empties a channel, so that none ever stalls the transport; it ends what has become
+        unwanted itself, since nobody else may while it waits."""
         self._kept.append(subscriber)
 
         def run() -> None:
             while True:
                 try:
-                    self._put(subscriber.recv())
+                    sample = subscriber.recv()
                 except zenoh.ZError:
                     return
+                if key in self._unwanted:
+                    subscriber.undeclare()
+                    return
+                self._put(sample)
 
         threading.Thread(target=run, name="ros2-in", daemon=True).start()
 
