@@ -14,8 +14,6 @@ import threading
 import time
 from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,9 +21,11 @@ import psutil
 import zenoh
 
 from common.bus import Bus, open_session
+from common.complaints import Complaints
 from common.errors import UserError
 from common.header import local_clock_id
 from common.jobs import Abandoned, JobQueue, Worker
+from common.live_settings import LiveSettings
 from common.mailbox import NOBODY, Letter, Mailbox
 from common.messages import Health, OutputHealth
 from common.node import Job, Node, Output
@@ -39,23 +39,7 @@ log = logging.getLogger(__name__)
 _POLL_S = 0.2  # how soon a signal is noticed while nothing arrives
 _STOP_PATIENCE_S = 2.0  # after a signal, background jobs have so long to finish
 _END_PATIENCE_S = 5.0  # an end marker waits this long for messages still on their way
-_LOG_PERIOD_S = 5.0
 _DETAIL_CHARS = 2000
-
-
-@dataclass(frozen=True)
-class LiveSettings:
-    """How a process takes part; everything about the node itself is in the node's own config."""
-
-    robot: str
-    endpoints: tuple[str, ...]
-    run_dir: Path
-    rate: float = 1.0  # pacing of recorded sources: times real time, 0 = as fast as possible
-    wait_for: frozenset[str] = frozenset()  # a source starts when these nodes are active
-    wait_s: float = 60.0
-    unfed: frozenset[str] = frozenset()  # inputs that nobody in this deployment produces: not waited for
-    resume: bool = False  # a restarted source goes on where its predecessor died
-    exit_when_drained: bool = False
 
 
 class Live:
@@ -76,7 +60,7 @@ class Live:
         self._ends: list[tuple[str, str, int, int, float]] = []
         self._steps_ms: deque[float] = deque(maxlen=512)
         self._publications: dict[str, Publication] = {}
-        self._complaints: dict[str, tuple[float, int]] = {}
+        self._complaints = Complaints()
         self._bookmark = Bookmark(settings.run_dir, node.name)
         self._clock_id = local_clock_id()
         self._process = psutil.Process()
@@ -274,12 +258,9 @@ class Live:
     def _on_undecodable(self, topic: str, reason: str) -> None:
         with self._changed:
             self.mailbox.counts[topic].undecodable += 1
-            last, count = self._complaints.get(topic, (-_LOG_PERIOD_S, 0))
-            now = time.monotonic()
-            if now - last < _LOG_PERIOD_S:
-                self._complaints[topic] = (last, count + 1)
-                return
-            self._complaints[topic] = (now, 0)
+            count = self._complaints.due(topic)
+        if count is None:
+            return
         log.warning("dropped a message on %s (%d more since the last report): %s", topic, count, reason)
 
     def _on_end(self, topic: str, instance: str, epoch: int, sent: int) -> None:
