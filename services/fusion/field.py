@@ -88,22 +88,28 @@ class Field:
         T = inverse(self._past[-1].T_map_camera) @ T_map_camera
         return bool(np.linalg.norm(T[:3, 3]) >= 0.03 or np.trace(T[:3, :3]) <= 1.0 + 2.0 * np.cos(0.05))
 
-    def surfaces(self, frame: Frame) -> Surfaces:
+    def surfaces(self, frame: Frame, *, behind: bool = True) -> Surfaces:
+        """Candidate surfaces; without `behind` those in front only, which cost less."""
         heights = self._ceilings.heights(self.config.ceiling_evidence) if self._floor_known else ()
-        return self._finder.find(frame.beams, self._lidar_map, frame.T_map_body, heights)
+        lidar_map = self._lidar_map if behind else None
+        return self._finder.find(frame.beams, lidar_map, frame.T_map_body, heights)
 
     def recall(self, small: Small) -> Remembered:
         return self._memory.recall(small.T_map_camera)
 
-    def refine(self, frame: Frame, small: Small) -> Solved:
-        """Depth of a keyframe: sweep over past pictures, candidates as priors, semi-global matching."""
+    def refine(self, frame: Frame, small: Small, remembered: Remembered | None = None) -> Solved:
+        """Depth of a keyframe: sweep over past pictures, candidates as priors, semi-global matching.
+
+        `remembered` is what `recall` gives for it, where that is known already.
+        """
         cost, views = self._sweep(frame, small)
         if self._floor_known and views:
             surfaces = self._finder.find(frame.beams, None, frame.T_map_body, ())
             self._find_ceilings(cost, surfaces.backdrop)
         surfaces = self.surfaces(frame)
         np.minimum(cost, self.config.cost_cap, out=cost)
-        self._add_priors(cost, frame, surfaces, self.recall(small) if len(self._memory) else None)
+        remembered = remembered or self.recall(small)
+        self._add_priors(cost, frame, surfaces, remembered if len(self._memory) else None)
         solved = self._solve(cost, small, surfaces, views)
         sure = solved.spread < self.config.memory_spread
         self._memory.add(small.T_map_camera, np.where(sure, solved.depth_m, np.nan))
@@ -201,8 +207,7 @@ class Field:
         if guess is not None:
             trust = float(np.exp(-((guess.spread / c.guess_spread) ** 2)))
             h, w = self.small_camera.shape
-            small = cv2.resize(guess.depth_m, (w, h), interpolation=cv2.INTER_NEAREST)
-            self._dig(cost, small, c.guess * trust, width=4.0)
+            self._dig(cost, guess.at_size(w, h), c.guess * trust, width=4.0)
         unlikely = c.near * np.maximum(np.log(c.near_m) - self._log_z, 0.0)
         cost += unlikely.astype(np.float32)
 

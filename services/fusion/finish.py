@@ -21,41 +21,68 @@ def enlarge(
     """On one surface 1/z is linear in the pixel (exact on planes); at edges and holes like colour decides."""
     h, w = depth.shape
     H, W = depth_out.shape
+    inverse = np.empty((h, w), np.float32)
+    for i in range(h):
+        for j in range(w):
+            inverse[i, j] = np.float32(1.0) / depth[i, j]
+    place, share = np.empty(W, np.int64), np.empty(W, np.float32)
+    for U in range(W):
+        x = min(max((U + 0.5) * w / W - 0.5, 0.0), w - 1.0)
+        place[U] = min(int(x), w - 2)
+        share[U] = x - place[U]
+    most = np.float32(1.0 + same)
+    flat = np.empty(w - 1, np.bool_)
+    last_i0 = -1
     for V in range(H):
         y = min(max((V + 0.5) * h / H - 0.5, 0.0), h - 1.0)
         i0 = min(int(y), h - 2)
-        b = y - i0
+        b = np.float32(y - i0)
+        if i0 != last_i0:
+            last_i0 = i0
+            for j in range(w - 1):
+                flat[j] = _one_surface(depth, i0, j, most)
         for U in range(W):
-            x = min(max((U + 0.5) * w / W - 0.5, 0.0), w - 1.0)
-            j0 = min(int(x), w - 2)
-            a = x - j0
-            low, high, holes = np.inf, 0.0, False
-            for i in range(i0, i0 + 2):
-                for j in range(j0, j0 + 2):
-                    z = depth[i, j]
-                    if not z > 0.0:
-                        holes = True
-                    else:
-                        low, high = min(low, z), max(high, z)
-            if not holes and high < low * (1.0 + same):
-                inv = (1 - b) * ((1 - a) / depth[i0, j0] + a / depth[i0, j0 + 1])
-                inv += b * ((1 - a) / depth[i0 + 1, j0] + a / depth[i0 + 1, j0 + 1])
-                s = (1 - b) * ((1 - a) * sigma_log[i0, j0] + a * sigma_log[i0, j0 + 1])
-                s += b * ((1 - a) * sigma_log[i0 + 1, j0] + a * sigma_log[i0 + 1, j0 + 1])
-                depth_out[V, U] = 1.0 / inv
-                sigma_out[V, U] = s / inv
+            j0, a = place[U], share[U]
+            if flat[j0]:
+                w11 = a * b
+                w01, w10 = a - w11, b - w11
+                w00 = np.float32(1.0) - a - w10
+                near = w00 * inverse[i0, j0] + w01 * inverse[i0, j0 + 1]
+                near += w10 * inverse[i0 + 1, j0] + w11 * inverse[i0 + 1, j0 + 1]
+                s = w00 * sigma_log[i0, j0] + w01 * sigma_log[i0, j0 + 1]
+                s += w10 * sigma_log[i0 + 1, j0] + w11 * sigma_log[i0 + 1, j0 + 1]
+                z = np.float32(1.0) / near
+                depth_out[V, U] = z
+                sigma_out[V, U] = s * z
                 continue
-            best, best_i, best_j = np.inf, i0, j0
-            for i in range(i0, i0 + 2):
-                for j in range(j0, j0 + 2):
-                    away = 8.0 * (abs(y - i) + abs(x - j))
-                    for k in range(3):
-                        away += abs(float(full_colour[V, U, k]) - float(colour[i, j, k]))
-                    if away < best:
-                        best, best_i, best_j = away, i, j
-            if depth[best_i, best_j] > 0.0:
-                depth_out[V, U] = depth[best_i, best_j]
-                sigma_out[V, U] = depth[best_i, best_j] * sigma_log[best_i, best_j]
-            else:
-                depth_out[V, U] = np.nan
-                sigma_out[V, U] = np.nan
+            i, j = _most_alike(colour, full_colour, V, U, i0, j0, a, b)
+            depth_out[V, U] = depth[i, j]  # NaN stays NaN
+            sigma_out[V, U] = depth[i, j] * sigma_log[i, j]
+
+
+@jit
+def _one_surface(depth: np.ndarray, i0: int, j0: int, most: float) -> bool:
+    """Whether the four pixels from [i0, j0] on are known and within a factor `most` of each other."""
+    low, high = np.inf, 0.0
+    for i in range(i0, i0 + 2):
+        for j in range(j0, j0 + 2):
+            if not depth[i, j] > 0.0:
+                return False
+            low, high = min(low, depth[i, j]), max(high, depth[i, j])
+    return high < low * most
+
+
+@jit
+def _most_alike(
+    colour: np.ndarray, full_colour: np.ndarray, V: int, U: int, i0: int, j0: int, a: float, b: float
+) -> tuple[int, int]:
+    """Which of the four pixels from [i0, j0] on has the colour of [V, U], and lies near."""
+    best, best_i, best_j = np.float32(1e9), i0, j0
+    for i in range(i0, i0 + 2):
+        for j in range(j0, j0 + 2):
+            away = np.float32(8.0) * (abs(b - np.float32(i - i0)) + abs(a - np.float32(j - j0)))
+            for k in range(3):
+                away += abs(np.float32(full_colour[V, U, k]) - np.float32(colour[i, j, k]))
+            if away < best:
+                best, best_i, best_j = away, i, j
+    return best_i, best_j

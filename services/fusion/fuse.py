@@ -16,7 +16,7 @@ from services.fusion.health import PictureHealth, beams_status
 from services.fusion.memory import Remembered
 from services.fusion.pairs import largest_cluster
 from services.fusion.result import Fused, refusal
-from services.fusion.scaling import ratio
+from services.fusion.scaling import Scale, as_depth, scale_of
 from services.fusion.surfaces import Surfaces
 
 # Standard deviations of log depth, measured on both recordings by what a pixel's depth rests on.
@@ -58,18 +58,17 @@ class Fusion:
             return refusal(shape, status)
         uv, z, _ = project_beams(frame.beams, self.field.camera, self.field.T_body_camera)
         small = self.field.shrink(frame)
-        surfaces = self.field.surfaces(frame)
         remembered = self.field.recall(small)
         status = beams_status(len(uv), self._contradicted(remembered.depth_m, uv, z))
         if status != "ok":
             return refusal(shape, status)
         if keyframe:
-            solved = self.field.refine(frame, small)
+            solved = self.field.refine(frame, small, remembered)
             surfaces = self.field.surfaces(frame)
             sigma_log = self._sigma_swept(solved, surfaces)
             self._pin_to_beams(solved, sigma_log, surfaces)
         else:
-            solved = self._carried(frame, remembered, surfaces)
+            solved = self._carried(frame, remembered, self.field.surfaces(frame, behind=False))
             sigma_log = solved.spread
         self.field.keep(small)
         return self._finish(frame, solved, sigma_log, uv, z)
@@ -89,7 +88,7 @@ class Fusion:
         h, w = depth.shape
         guess = self.field.guess_of(frame)
         if guess is not None:
-            guessed = cv2.resize(guess.depth_m, (w, h), interpolation=cv2.INTER_NEAREST)
+            guessed = guess.at_size(w, h)
             error = 2.0 * guess.spread + 0.02
             take = np.isfinite(guessed) & (~np.isfinite(depth) | (spread > error))
             depth[take], spread[take] = guessed[take], error
@@ -179,9 +178,9 @@ class Fusion:
             return result.refused(
                 f"only {result.inlier_share:.0%} of the beams fit the depth found: wrong pose or calibration"
             )
-        scaled = None
+        scale = None
         if frame.guess is not None and frame.guess_kind != "none":
-            scaled = ratio(frame.guess, frame.guess_kind, uv, z)
-        if scaled is None or not scaled.ok:
+            scale = scale_of(as_depth(frame.guess, frame.guess_kind), uv, z)
+        if not isinstance(scale, Scale):
             return replace(result, scale=1.0, scale_sigma=float(np.std(log_ratio) / np.sqrt(max(len(z), 1))))
-        return replace(result, scale=scaled.scale, scale_sigma=scaled.scale_sigma)
+        return replace(result, scale=scale.alpha, scale_sigma=scale.sigma)

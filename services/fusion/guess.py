@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from services.fusion.pairs import make_pairs
 from services.fusion.scaling import Kind, affine, as_depth
 
+_COLUMNS = 64
 _BAND = 0.10  # of the picture's width: how far a beam's ratio reaches sideways
 
 
@@ -16,9 +18,21 @@ _BAND = 0.10  # of the picture's width: how far a beam's ratio reaches sideways
 class MetricGuess:
     """A network's depth after correction by columns."""
 
-    depth_m: np.ndarray  # float32 [H, W]
+    guess: np.ndarray  # float32 [H, W] before it
+    log_factor: np.ndarray  # float64 [W]
     spread: float  # median |log ratio| at beams that were left out of the correction of their columns
     pairs: int
+
+    @property
+    def depth_m(self) -> np.ndarray:
+        """float32 [H, W]."""
+        return self.guess * np.exp(self.log_factor).astype(np.float32)
+
+    def at_size(self, width: int, height: int) -> np.ndarray:
+        """float32 [height, width]: the depth at the nearest pixels."""
+        small = cv2.resize(self.guess, (width, height), interpolation=cv2.INTER_NEAREST)
+        columns = (np.arange(width) * self.guess.shape[1]) // width
+        return small * np.exp(self.log_factor[columns]).astype(np.float32)
 
 
 def metric_guess(values: np.ndarray, kind: Kind, uv_px: np.ndarray, z_m: np.ndarray) -> MetricGuess | None:
@@ -39,10 +53,11 @@ def metric_guess(values: np.ndarray, kind: Kind, uv_px: np.ndarray, z_m: np.ndar
     u = pairs.uv_px[:, 0]
     band = _BAND * values.shape[1]
     columns = np.arange(values.shape[1], dtype=np.float64)
-    factor = _smooth(columns, u, log_ratio, band, exclude=0.0)
+    some = np.linspace(0.0, columns[-1], _COLUMNS)  # the factor is smooth
+    factor = np.interp(columns, some, _smooth(some, u, log_ratio, band, exclude=0.0))
     left_out = _smooth(u, u, log_ratio, band, exclude=0.5 * band)
     spread = float(np.median(np.abs(log_ratio - left_out)))
-    return MetricGuess((guess * np.exp(factor)[None]).astype(np.float32), spread, len(pairs))
+    return MetricGuess(guess, factor, spread, len(pairs))
 
 
 def _smooth(at: np.ndarray, u: np.ndarray, values: np.ndarray, band: float, exclude: float) -> np.ndarray:

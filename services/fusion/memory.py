@@ -57,22 +57,28 @@ def carry(z: np.ndarray, R: np.ndarray, t: np.ndarray, K: np.ndarray, out: np.nd
     """
     h, w = z.shape
     fx, fy, cx, cy = K[0], K[1], K[2], K[3]
+    one, half, seam, least = np.float32(1.0), np.float32(0.5), np.float32(0.3), np.float32(0.1)
+    right, bottom = np.float32(w - 1), np.float32(h - 1)
     for v in range(h):
+        ry = (np.float32(v) - cy) / fy
+        bx, by, bz = R[0, 1] * ry + R[0, 2], R[1, 1] * ry + R[1, 2], R[2, 1] * ry + R[2, 2]
         for u in range(w):
             d = z[v, u]
             if not d > 0.0:
                 continue
-            x, y = (u - cx) / fx * d, (v - cy) / fy * d
-            Z = R[2, 0] * x + R[2, 1] * y + R[2, 2] * d + t[2]
-            if Z < 0.1:
+            rx = (np.float32(u) - cx) / fx
+            Z = (R[2, 0] * rx + bz) * d + t[2]
+            if least > Z:
                 continue
-            a = fx * (R[0, 0] * x + R[0, 1] * y + R[0, 2] * d + t[0]) / Z + cx
-            b = fy * (R[1, 0] * x + R[1, 1] * y + R[1, 2] * d + t[1]) / Z + cy
-            reach = 0.5 * d / Z + 0.3
-            if not (-reach <= a <= w - 1 + reach and -reach <= b <= h - 1 + reach):
+            inverse_z = one / Z
+            a = fx * ((R[0, 0] * rx + bx) * d + t[0]) * inverse_z + cx
+            b = fy * ((R[1, 0] * rx + by) * d + t[1]) * inverse_z + cy
+            reach = half * d * inverse_z + seam
+            if not (-reach <= a <= right + reach and -reach <= b <= bottom + reach):
                 continue
+            first, stop = max(int(np.ceil(a - reach)), 0), min(int(np.floor(a + reach)), w - 1) + 1
             for i in range(max(int(np.ceil(b - reach)), 0), min(int(np.floor(b + reach)), h - 1) + 1):
-                for j in range(max(int(np.ceil(a - reach)), 0), min(int(np.floor(a + reach)), w - 1) + 1):
+                for j in range(first, stop):
                     if not out[i, j] <= Z:  # also where it is NaN
                         out[i, j] = Z
 
@@ -82,6 +88,7 @@ def vote(carried: np.ndarray, agreement: float, depth: np.ndarray, votes: np.nda
     """Median over the first axis of float32 [n, h, w] (NaN left out), and the count within `agreement`."""
     n, h, w = carried.shape
     values = np.empty(n, np.float64)
+    low, high = np.exp(-agreement), np.exp(agreement)
     for v in range(h):
         for u in range(w):
             count = 0
@@ -99,5 +106,5 @@ def vote(carried: np.ndarray, agreement: float, depth: np.ndarray, votes: np.nda
             middle = values[(count - 1) // 2]
             depth[v, u] = middle
             for k in range(count):
-                if abs(np.log(values[k] / middle)) <= agreement:
+                if low * middle <= values[k] <= high * middle:
                     votes[v, u] += 1

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -37,25 +38,45 @@ def ratio(values: np.ndarray, kind: Kind, uv_px: np.ndarray, z_m: np.ndarray) ->
         z_m: float64 [N], the beams' optical z (l_j).
     """
     guess = as_depth(values, kind)
+    found = scale_of(guess, uv_px, z_m)
+    if isinstance(found, str):
+        return refusal(values.shape, found)
+    depth = (found.alpha * guess).astype(np.float32)
+    sigma = depth * np.float32(np.hypot(found.spread, found.sigma / found.alpha))
+    return Fused(
+        depth, sigma, scale=found.alpha, scale_sigma=found.sigma, inlier_share=found.inlier_share,
+        residual_m=found.residual_m, pairs=found.pairs,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Scale:
+    """The paper's alpha with its standard error, and how well the pairs agree on it."""
+
+    alpha: float
+    sigma: float
+    spread: float  # standard deviation of the log ratios of all pairs about alpha
+    inlier_share: float
+    residual_m: float
+    pairs: int
+
+
+def scale_of(guess: np.ndarray, uv_px: np.ndarray, z_m: np.ndarray) -> Scale | str:
+    """alpha of a guess proportional to depth, float32 [H, W]; or one sentence on why there is none."""
     pairs = make_pairs(guess, uv_px, z_m)
     if len(pairs) < MIN_PAIRS:
-        return refusal(values.shape, _too_few(len(uv_px), len(pairs)))
+        return _too_few(len(uv_px), len(pairs))
     inlier = largest_cluster(np.log(pairs.z_m / pairs.guess), _RADIUS)
     used = pairs.take(inlier)
     if len(used) < MIN_PAIRS or inlier.mean() < MIN_INLIER_SHARE:
-        return refusal(values.shape, f"beams and guess agree on no scale ({len(used)} of {len(pairs)} pairs)")
+        return f"beams and guess agree on no scale ({len(used)} of {len(pairs)} pairs)"
     alpha = float(used.z_m.sum() / used.guess.sum())
     residual = used.z_m - alpha * used.guess
     n_eff = effective_count(residual)
     # Standard error of a ratio estimator (Cochran, Sampling Techniques, 2.41), with n_eff for n.
     error = float(np.sqrt(np.mean(residual**2) / max(n_eff - 1.0, 1.0)) / used.guess.mean())
-    depth = (alpha * guess).astype(np.float32)
-    spread = np.std(np.log(pairs.z_m / (alpha * pairs.guess)))
-    sigma = depth * np.float32(np.hypot(spread, error / alpha))
-    return Fused(
-        depth, sigma, scale=alpha, scale_sigma=error, inlier_share=float(inlier.mean()),
-        residual_m=float(np.median(np.abs(residual))), pairs=len(pairs),
-    )  # fmt: skip
+    spread = float(np.std(np.log(pairs.z_m / (alpha * pairs.guess))))
+    return Scale(alpha, error, spread, float(inlier.mean()), float(np.median(np.abs(residual))), len(pairs))
 
 
 def affine(values: np.ndarray, kind: Kind, uv_px: np.ndarray, z_m: np.ndarray) -> Fused:

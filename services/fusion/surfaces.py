@@ -6,11 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from common.beams import Beams, hidden_beams, plan_polar, plane_depth, wall_depth
+from common.beams import Beams, hidden_beams, plan_polar, plane_depth, wall_ranges
 from common.camera import Pinhole
 from common.geometry import yaw_of
 from services.fusion.lidar_map import LidarMap
 
+_LAYER_RAYS_PER_PX, _WALL_RAYS_PER_PX = 2, 8
 _POST_HEIGHT_M = 0.35  # how far from the lidar plane legs and posts are taken to reach
 
 
@@ -55,10 +56,19 @@ class SurfaceFinder:
         self.camera_z_m = float(T_body_camera[2, 3])
         empty = np.full(self.rise.shape, np.nan)
         self.floor = plane_depth(self.rays_body, self.camera_z_m) if floor_known else empty
+        self._fan, self._fan_index = self._fan_of(_LAYER_RAYS_PER_PX * camera.width_px)
+        self._wall_fan, self._wall_index = self._fan_of(_WALL_RAYS_PER_PX * camera.width_px)
+
+    def _fan_of(self, count: int) -> tuple[np.ndarray, np.ndarray]:
+        """(azimuths [count], int64 [h, w]: the one nearest to each pixel's)."""
         low, high = float(self._azimuth.min()), float(self._azimuth.max())
-        self._fan = np.linspace(low, high, 2 * camera.width_px)
-        place = (self._azimuth - low) / max(high - low, 1e-9) * (len(self._fan) - 1)
-        self._fan_index = np.clip(np.rint(place).astype(np.int64), 0, len(self._fan) - 1)
+        place = (self._azimuth - low) / max(high - low, 1e-9) * (count - 1)
+        index = np.clip(np.rint(place).astype(np.int64), 0, count - 1)
+        return np.linspace(low, high, count), index
+
+    def _upright(self, azimuth: np.ndarray, reach: np.ndarray) -> np.ndarray:
+        """Optical z [h, w] of beams extruded upright: on a fan of rays finer than pixels."""
+        return wall_ranges(self._wall_fan, azimuth, reach)[self._wall_index] / self._across
 
     def find(
         self,
@@ -71,10 +81,10 @@ class SurfaceFinder:
         points = beams.points_body_m
         points = points[~hidden_beams(points, self._T_body_camera)]
         azimuth, reach = plan_polar(points, self._T_body_camera)
-        wall = wall_depth(self.rays_body, azimuth, reach)
+        wall = self._upright(azimuth, reach)
         lidar_z_m = float(np.median(points[:, 2])) if len(points) else 0.0
         off = np.abs(self.camera_z_m + wall * self.rise - lidar_z_m)
-        backdrop = wall_depth(self.rays_body, azimuth, without_posts(azimuth, reach))
+        backdrop = self._upright(azimuth, without_posts(azimuth, reach))
         behind: list[np.ndarray] = []
         if lidar_map is not None:
             position = (T_map_body @ self._T_body_camera)[:2, 3]
