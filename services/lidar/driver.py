@@ -16,8 +16,9 @@ from services.lidar.samples import Samples, StampedScan
 
 _CHAIN = 31  # spans remembered
 _CHAIN_NEEDED = 8  # before the first check
-_SLACK_DEG = 1.0  # a motor's wobble over a packet
-_SLACK = 0.1  # of the angle turned
+_SLACK_DEG = 0.3  # rounding, and a motor's wobble over a packet
+_SLACK = 0.02  # of the angle turned
+_CONVINCED = 6  # packets in a row that do not fit: it is the speed that has changed
 
 
 class Driver:
@@ -77,7 +78,7 @@ class StartChain:
         self._spans: deque[float] = deque(maxlen=_CHAIN)
         self._anchor_deg: float | None = None
         self._slots = 0
-        self._refused = False
+        self._refused = 0
 
     @property
     def typical_deg(self) -> float | None:
@@ -102,7 +103,8 @@ class StartChain:
         fits = error <= _SLACK_DEG + _SLACK * typical * slots
         if fits and slots == 1:
             self._spans.append((start_deg - anchor) % 360.0)
-        elif not fits and self._refused:
-            self._spans.clear()  # twice in a row: it is the speed that has changed
-        self._refused = not fits
+        self._refused = 0 if fits else self._refused + 1
+        if self._refused >= _CONVINCED:
+            self._spans.clear()
+            self._refused = 0
         return fits

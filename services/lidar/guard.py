@@ -15,8 +15,8 @@ import numpy as np
 
 _WINDOW = 500  # packets looked back
 _NOISY_SHARE = 0.02  # of them bad: at less, a doubly wrong packet passes about once in hours
-_TOLERANCE_M = 0.03
-_TOLERANCE = 0.01  # of the range
+_TOLERANCE_M = 0.02
+_TOLERANCE = 0.005  # of the range
 
 
 class LinkNoise:
@@ -44,7 +44,7 @@ def confirmed(
     range_m: np.ndarray,  # float64 [N] on a regular grid, NaN = none
     before_m: np.ndarray,  # float64 [N]: the same directions one turn before, NaN = none
 ) -> np.ndarray:
-    """bool [N]: ranges that two neighbours or the turn before agree with, within 3 cm + 1 %.
+    """bool [N]: ranges that two neighbours or the turn before agree with, within 2 cm + 0.5 %.
 
     Along a straight wall 1/r is nearly linear in the angle, so that neighbours predict a range.
     """

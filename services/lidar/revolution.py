@@ -8,8 +8,8 @@ from services.lidar.framing import Counters
 from services.lidar.guard import confirmed
 from services.lidar.samples import Revolution, Samples
 
-_LEAST_SHARE = 0.2  # of a turn's directions that must have been measured
-_LEAST_SAMPLES = 20
+_LEAST_SHARE = 0.1  # of a turn's directions that must have been measured
+_LEAST_SAMPLES = 40
 _STEP_BACK_DEG = 20.0
 
 
@@ -38,7 +38,7 @@ class RevolutionBuilder:
         """The turns that these samples end. With `noisy`, ranges that nothing confirms are left out."""
         if not len(samples):
             return []
-        if self._period_s is not None and samples.time_s[0] - self._last_time > 0.8 * self._period_s:
+        if self._period_s is not None and samples.time_s[0] - self._last_time > 0.9 * self._period_s:
             self.forget()  # nobody knows how many turns went by
         total, turn = self._count_on(samples.angle_deg)
         cuts = np.flatnonzero(np.diff(turn, prepend=self._turn)).tolist()

@@ -15,7 +15,7 @@ _ANSWER_S = 0.4
 _TRIES = 4
 _MOTOR_PWM = 660  # SLAMTEC's default for the A2 and A3
 _PWM_MODELS = (2, 3)
-_SAMPLE_S = {rp.STANDARD: 500e-6, rp.CAPSULED: 250e-6, rp.HQ: 62.5e-6, rp.DENSE: 100e-6}
+_SAMPLE_S = {rp.STANDARD: 500e-6, rp.CAPSULED: 250e-6, rp.HQ: 62.5e-6, rp.ULTRA: 62.5e-6, rp.DENSE: 100e-6}
 # By the upper half of the model number: what it is called and how far its data sheet says it sees (m).
 _MODELS = {
     1: ("A1", 12.0), 2: ("A2", 16.0), 3: ("A3", 25.0), 4: ("C1", 12.0), 6: ("S1", 40.0), 7: ("S2", 30.0),
@@ -98,11 +98,13 @@ def _typical(link: Link) -> list[tuple[bytes, float | None]]:
         return []
     number = mode[:2]
     kind = _configuration(link, rp.CONF_ANSWER_TYPE, number)
-    if not kind or kind[0] not in (rp.CAPSULED, rp.DENSE, rp.HQ):
+    if not kind or kind[0] not in (rp.CAPSULED, rp.DENSE, rp.HQ, rp.ULTRA):
         return []
     sample_us = _configuration(link, rp.CONF_US_PER_SAMPLE, number)
     sample_s = struct.unpack_from("<I", sample_us)[0] / 256e6 if sample_us and len(sample_us) >= 4 else None
-    return [(rp.request(rp.EXPRESS_SCAN, number[:1] + bytes(4)), sample_s)]
+    # As SLAMTEC's SDK asks: mode 1 is what a device does when asked for no mode in particular.
+    working_mode = number[:1] if number[0] > 1 else b"\0"
+    return [(rp.request(rp.EXPRESS_SCAN, working_mode + bytes(4)), sample_s)]
 
 
 def _configuration(link: Link, entry: int, payload: bytes = b"") -> bytes | None:

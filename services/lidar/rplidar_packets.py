@@ -19,9 +19,9 @@ STOP, RESET, SCAN, EXPRESS_SCAN = 0x25, 0x40, 0x20, 0x82
 GET_INFO, GET_HEALTH, GET_SAMPLERATE, GET_LIDAR_CONF, SET_MOTOR_PWM = 0x50, 0x52, 0x59, 0x84, 0xF0
 
 INFO, HEALTH, SAMPLERATE, CONF = 0x04, 0x06, 0x15, 0x20
-STANDARD, CAPSULED, HQ, DENSE = 0x81, 0x82, 0x83, 0x85
-PACKET_BYTES = {STANDARD: 5, CAPSULED: 84, HQ: 781, DENSE: 84}
-SAMPLES = {STANDARD: 1, CAPSULED: 32, HQ: 96, DENSE: 40}
+STANDARD, CAPSULED, HQ, ULTRA, DENSE = 0x81, 0x82, 0x83, 0x84, 0x85
+PACKET_BYTES = {STANDARD: 5, CAPSULED: 84, HQ: 781, ULTRA: 132, DENSE: 84}
+SAMPLES = {STANDARD: 1, CAPSULED: 32, HQ: 96, ULTRA: 96, DENSE: 40}
 
 CONF_US_PER_SAMPLE, CONF_ANSWER_TYPE, CONF_TYPICAL_MODE = 0x71, 0x75, 0x7C
 DESCRIPTOR_BYTES = 7
@@ -77,6 +77,11 @@ def capsule_whole(packet: bytes) -> bool:
     return checksum == (packet[0] & 0xF) | (packet[1] & 0xF) << 4
 
 
+def start_deg(packet: bytes) -> float:
+    """Angle at which a capsule begins."""
+    return (struct.unpack_from("<H", packet, 2)[0] & 0x7FFF) / 64.0
+
+
 def parse_capsule(packet: bytes) -> Measured:
     """32 samples in 16 cabins of two distances (q2 without its fraction) and two angle offsets (q3)."""
     word = struct.unpack_from("<H", packet, 2)[0]
@@ -92,6 +97,53 @@ def parse_dense(packet: bytes) -> Measured:
     word = struct.unpack_from("<H", packet, 2)[0]
     mm = np.frombuffer(packet, "<u2", count=40, offset=4).astype(np.float64)
     return Measured((word & 0x7FFF) / 64.0, bool(word >> 15), np.zeros(40), _metres(mm), np.zeros(40))
+
+
+# Steps of the variable bit scale: where a code's range begins, what distance (mm) that is, shift within it.
+_SCALE_FROM = np.array([0, 512, 1280, 1792, 3328])
+_SCALE_MM = np.array([0, 1 << 9, 1 << 11, 1 << 12, 1 << 14])
+_SCALE_SHIFT = np.array([0, 1, 2, 3, 4])
+
+
+def parse_ultra(packet: bytes, following: bytes | None) -> Measured:
+    """96 samples in 32 cabins: a distance of variable scale, and two told by their difference from it and
+    from the next cabin's, for which the packet that follows is needed (None: the last sample is lost).
+
+    As _ultraCapsuleToNormal of SLAMTEC's SDK, with the angle offset that the device leaves to the host.
+    """
+    word = struct.unpack_from("<H", packet, 2)[0]
+    cabins = np.frombuffer(packet, "<i4", count=32, offset=4).astype(np.int64)
+    after = cabins[-1:] * 0 if following is None else np.frombuffer(following, "<i4", 1, 4).astype(np.int64)
+    code = np.concatenate([cabins, after]) & 0xFFF
+    step = np.searchsorted(_SCALE_FROM, code, side="right") - 1
+    shift = _SCALE_SHIFT[step]
+    mm = _SCALE_MM[step] + (code - _SCALE_FROM[step] << shift)
+    major, base2, shift2 = mm[:-1], mm[1:], shift[1:]
+    borrowed = (major == 0) & (base2 != 0)
+    base1, shift1 = np.where(borrowed, base2, major), np.where(borrowed, shift2, shift[:-1])
+    predict1, predict2 = (cabins << 42) >> 54, cabins >> 22  # signed, ten bits each
+    second = np.where(np.isin(predict1, (-512, 511)), 0, base1 + (predict1 << shift1))
+    third = np.where(np.isin(predict2, (-512, 511)), 0, base2 + (predict2 << shift2))
+    if following is None:
+        third[-1] = 0
+        second[-1] = second[-1] if major[-1] else 0
+    distance = np.stack([major, second, third], axis=1).ravel().astype(np.float64)
+    return Measured(
+        (word & 0x7FFF) / 64.0,
+        bool(word >> 15),
+        _ultra_offset_deg(distance),
+        _metres(distance),
+        distance * 0.0,
+    )
+
+
+def _ultra_offset_deg(mm: np.ndarray) -> np.ndarray:
+    """How far aside a triangulating lidar looks, by distance, in the fixed point numbers of the SDK."""
+    quarter = np.maximum(mm * 4.0, 200.0).astype(np.int64)
+    k = 98361 // quarter
+    radians_q16 = int(8 * np.pi * 65536 / 180) - (k << 6) - k * k * k // 98304
+    radians_q16 = np.where(mm * 4.0 >= 200.0, radians_q16, int(7.5 * np.pi * 65536 / 180))
+    return np.degrees(radians_q16 / 65536.0)
 
 
 def hq_begins(packet: bytes) -> bool:

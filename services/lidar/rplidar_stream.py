@@ -28,6 +28,7 @@ class RplidarStream:
             rp.STANDARD: (rp.node_begins, lambda packet: True, _NODES_IN_A_ROW),
             rp.CAPSULED: (rp.capsule_begins, rp.capsule_whole, 3),
             rp.DENSE: (rp.capsule_begins, rp.capsule_whole, 3),
+            rp.ULTRA: (rp.capsule_begins, rp.capsule_whole, 3),
             rp.HQ: (rp.hq_begins, rp.hq_whole, 2),
         }
         begins, whole, in_a_row = checks[kind]
@@ -35,7 +36,7 @@ class RplidarStream:
         self._counters = counters
         self._skipped = counters.skipped_bytes
         self._chain = StartChain()
-        self._held: tuple[rp.Measured, int] | None = None  # waits for the next start angle
+        self._held: tuple[bytes, int] | None = None  # waits for the next one's start angle
         self._taken = 0  # samples so far, lost ones included
         self._node_deg: float | None = None
         self._node_step_deg = 0.0
@@ -51,7 +52,10 @@ class RplidarStream:
         found: list[Samples | None] = []
         nodes: list[tuple[float, float, float, int]] = []
         for packet in self._framer.feed(data):
-            self._taken += self._samples + self._while_searching()
+            searched = self._while_searching()
+            if searched:
+                found += self._release(self._chain.typical_deg, None)
+            self._taken += self._samples + searched
             if self.kind == rp.STANDARD:
                 self._node(packet, nodes)
                 if packet is None:
@@ -77,25 +81,28 @@ class RplidarStream:
         typical = self._chain.typical_deg
         if packet is None:
             self._chain.missed()
-            return [*self._release(typical), None]
-        measured = rp.parse_capsule(packet) if self.kind == rp.CAPSULED else rp.parse_dense(packet)
-        if not (measured.start_deg < 360.0 and self._chain.takes(measured.start_deg)):
-            return self._release(typical)
-        if self._held is not None:
-            found = self._release((measured.start_deg - self._held[0].start_deg) % 360.0)
-        else:
-            found = []
-        self._held = (measured, self._taken)
+            return [*self._release(typical, None), None]
+        start_deg = rp.start_deg(packet)
+        if not (start_deg < 360.0 and self._chain.takes(start_deg)):
+            return self._release(typical, None)
+        found: list[Samples | None] = []
+        if self._held is not None and typical is not None:  # else nobody knows how many lie between
+            found = self._release((start_deg - rp.start_deg(self._held[0])) % 360.0, packet)
+        self._held = packet, self._taken
         return found
 
-    def _release(self, span_deg: float | None) -> list[Samples | None]:
+    def _release(self, span_deg: float | None, following: bytes | None) -> list[Samples | None]:
+        """Samples of the capsule that waited, which turned by `span_deg`."""
         held, self._held = self._held, None
         if held is None or span_deg is None:
             return []
-        measured, last = held
+        packet, last = held
+        if self.kind == rp.ULTRA:
+            measured = rp.parse_ultra(packet, following)
+        else:
+            measured = rp.parse_capsule(packet) if self.kind == rp.CAPSULED else rp.parse_dense(packet)
         even = span_deg / self._samples * np.arange(self._samples)
-        angle = measured.start_deg + even - measured.offset_deg
-        return [self._numbered(angle, measured, last)]
+        return [self._numbered(measured.start_deg + even - measured.offset_deg, measured, last)]
 
     def _hq(self, packet: bytes | None) -> Samples | None:
         if packet is None:

@@ -71,6 +71,7 @@ class Rplidar:
         self.samples = 0
         self.scanning = None
         self.requests = []
+        self.mode = {0x82: 1, 0x85: 1, 0x83: 2, 0x84: 3}[kind]  # the typical one
 
     def answer(self, data):
         out, at = b"", 0
@@ -96,18 +97,19 @@ class Rplidar:
             return self._single(0x04, bytes((self.model, 29, 1, 7)) + bytes(range(16)))
         if command == 0x52:
             return self._single(0x06, bytes(3))
-        if command == 0x84 and self.kind in (0x83, 0x85):
+        if command == 0x84 and self.kind != 0x82:
             entry = struct.unpack_from("<I", payload)[0]
-            data = {0x7C: struct.pack("<H", 1), 0x75: bytes((self.kind,)),
+            data = {0x7C: struct.pack("<H", self.mode), 0x75: bytes((self.kind,)),
                     0x71: struct.pack("<I", round(256e6 / self.sample_hz))}[entry]  # fmt: skip
             return self._single(0x20, payload[:4] + data)
         if command == 0x20:
             self.scanning = 0x81
         elif command == 0x82:
-            self.scanning = self.kind if payload[:1] == b"\x01" or self.kind == 0x82 else 0x82
+            asked = payload[0] if payload else 0
+            self.scanning = self.kind if asked == (self.mode if self.mode > 1 else 0) else 0x82
         else:
             return b""
-        length = {0x81: 5, 0x82: 84, 0x83: 781, 0x85: 84}[self.scanning]
+        length = {0x81: 5, 0x82: 84, 0x83: 781, 0x84: 132, 0x85: 84}[self.scanning]
         return b"\xa5\x5a" + struct.pack("<I", length | 1 << 30) + bytes((self.scanning,))
 
     def _single(self, kind, data):
@@ -119,7 +121,8 @@ class Rplidar:
         return turned * 360.0
 
     def packet(self):
-        return {0x81: self._nodes, 0x82: self._capsule, 0x83: self._hq, 0x85: self._dense}[self.scanning]()
+        made = {0x81: self._nodes, 0x82: self._capsule, 0x83: self._hq, 0x84: self._ultra, 0x85: self._dense}
+        return made[self.scanning]()
 
     def _mm(self, angle_deg):
         return room_range_m(-np.radians(angle_deg)) * 1000.0
@@ -156,6 +159,41 @@ class Rplidar:
         """A triangulating lidar looks aside, the more the farther it sees: up to 8 degrees, in 1/8."""
         near = 98361.0 / (self._mm(angles) * 4.0) * 64.0 / 65536.0
         return np.clip(np.round((8.0 - np.degrees(near)) * 8.0), 0, 63).astype(int)
+
+    def _ultra(self):
+        """Cabins of three samples; the third counts from the next cabin's, hence one more than is sent."""
+        angles = self._angles(96)
+        ahead = angles[-1] + (np.arange(3) + 1) * 360.0 * self.turn_hz / self.sample_hz
+        angles = np.concatenate([angles, ahead])
+        seen = self._mm(angles - np.degrees(self._aside(angles)))
+        mm = np.round(seen).astype(int).reshape(33, 3)
+        steps = [(3328, 1 << 14, 4), (1792, 1 << 12, 3), (1280, 1 << 11, 2), (512, 1 << 9, 1), (0, 0, 0)]
+        codes, values, shifts = [], [], []
+        for distance in mm[:, 0]:
+            code, value, shift = next(step for step in steps if distance >= step[1])
+            codes.append(code + (distance - value >> shift))
+            values.append(value + (distance - value >> shift << shift))
+            shifts.append(shift)
+        body = b""
+        for i in range(32):
+            one = self._difference(mm[i, 1] - values[i], shifts[i])
+            two = self._difference(mm[i, 2] - values[i + 1], shifts[i + 1])
+            body += struct.pack("<I", codes[i] | one << 12 | two << 22)
+        return self._head(angles[0] % 360.0, body)
+
+    @staticmethod
+    def _difference(mm, shift):
+        scaled = int(mm) >> shift
+        return scaled & 0x3FF if -512 < scaled < 511 else 0x1FF  # what does not fit is invalid
+
+    def _aside(self, angles):
+        """The angle (rad) that a ULTRA host takes off, by the distance at which the beam ends."""
+        aside = np.full(len(angles), np.radians(6.5))
+        for _ in range(6):
+            q2 = self._mm(angles - np.degrees(aside)) * 4.0
+            k = np.floor(98361 / q2)
+            aside = np.radians(8.0) - k * 64 / 65536 - np.floor(k**3 / 98304) / 65536
+        return aside
 
     def _dense(self):
         angles = self._angles(40)

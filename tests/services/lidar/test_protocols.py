@@ -1,5 +1,6 @@
 """Bytes as the vendors' documents print them, to the numbers the same documents give."""
 
+import itertools
 import struct
 
 import numpy as np
@@ -86,6 +87,54 @@ def test_rplidar_capsules_as_slamtecs_own_decoder(cabins, start_q6, span_q6):
     assert np.nan_to_num(measured.range_m) * 4000 == pytest.approx(expected[:, 1], abs=1e-6)
 
 
+def _int32(value):
+    value &= 0xFFFFFFFF
+    return value - (1 << 32) if value >> 31 else value
+
+
+def _sdk_scale(code):
+    for base, level, target in ((3328, 4, 14), (1792, 3, 12), (1280, 2, 11), (512, 1, 9)):
+        if code >= base:
+            return (1 << target) + (code - base << level), level
+    return code, 0
+
+
+def _sdk_ultra(previous, current):
+    """_ultraCapsuleToNormal in its integers: (angle q6 relative to an even one, distance q2) of 96 samples."""
+    found = []
+    words = [*struct.unpack("<32I", previous[4:]), struct.unpack_from("<I", current, 4)[0]]
+    for word, after in itertools.pairwise(words):
+        (major, level1), (major2, level2) = _sdk_scale(word & 0xFFF), _sdk_scale(after & 0xFFF)
+        predict1, predict2 = _int32(word << 10) >> 22, _int32(word) >> 22
+        base1 = major
+        if not major and major2:
+            base1, level1 = major2, level2
+        second = 0 if predict1 in (-512, 511) else (predict1 << level1) + base1
+        third = 0 if predict2 in (-512, 511) else (predict2 << level2) + major2
+        for mm in (major, second, third):
+            q2 = mm << 2
+            offset = int(7.5 * 3.1415926535 * (1 << 16) / 180.0)
+            if q2 >= 200:
+                k2 = int(98361 / q2)
+                offset = int(8 * 3.1415926535 * (1 << 16) / 180) - (k2 << 6) - (k2 * k2 * k2) // 98304
+            found.append((offset * 180 / 3.14159265 / 65536, q2))
+    return np.array(found)
+
+
+@given(st.binary(min_size=128, max_size=128), st.binary(min_size=4, max_size=4))
+def test_rplidar_ultra_capsules_as_slamtecs_own_decoder(cabins, after):
+    first, second = b"\xa0\x50\0\0" + cabins, b"\xa0\x50\0\0" + after + bytes(124)
+    expected = _sdk_ultra(first, second)
+    measured = rp.parse_ultra(first, second)
+    positive = expected[:, 1] > 0
+    assert np.array_equal(np.isfinite(measured.range_m), positive)
+    assert measured.range_m[positive] * 4000 == pytest.approx(expected[positive, 1], abs=1e-6)
+    assert measured.offset_deg[positive] == pytest.approx(expected[positive, 0], abs=1e-3)
+    alone = rp.parse_ultra(first, None)  # the packet behind is lost: all but the last samples are there
+    assert np.array_equal(alone.range_m[:93], measured.range_m[:93], equal_nan=True)
+    assert np.isnan(alone.range_m[95])
+
+
 def test_rplidar_node_layout():
     """LR001 4.2, figure 4-4: quality, inverted and plain start flag; check bit and angle q6; distance q2."""
     node = rp.parse_node(struct.pack("<BHH", 15 << 2 | 1, round(90.5 * 64) << 1 | 1, 4 * 1234))
@@ -111,15 +160,15 @@ def test_scip_request_for_scans():
     assert scip.ScanReply(geometry, intensity=False).command == b"MD0044072501000"
 
 
-@given(st.binary(max_size=2000), st.integers(0, 3))
+@given(st.binary(max_size=2000), st.integers(0, 4))
 def test_rubbish_is_no_packet_and_no_error(data, kind):
     from services.lidar.framing import Counters, Framer
     from services.lidar.rplidar_stream import RplidarStream
 
-    if kind == 3:
+    if kind == 4:
         stream = Framer(ldrobot.PACKET_BYTES, ldrobot.begins, ldrobot.whole, Counters())
     else:
-        stream = RplidarStream((rp.CAPSULED, rp.DENSE, rp.HQ)[kind], 1e-4, Counters())
+        stream = RplidarStream((rp.CAPSULED, rp.DENSE, rp.HQ, rp.ULTRA)[kind], 1e-4, Counters())
     assert not [part for part in stream.feed(data) if part is not None]
     assert scip.parameters(data) is not None
 
