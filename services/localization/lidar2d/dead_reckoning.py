@@ -11,6 +11,7 @@ SEEN = 0.7  # trust along the weak direction above which a scan knows where it i
 GAIN = 0.5  # stamps of wheels and scans jitter: the pose follows the count, it does not copy it
 CHECK_M = 1.0  # the wheels are checked against the scans over stretches of this length
 USABLE = 0.15  # and are used while they are wrong by less than this share of the way
+BLIND_M = 1.0  # after such a way the scans are no longer held to what they were before, see regained()
 SIGMA_M = 0.15  # what the count is worth in an edge of the pose graph
 
 
@@ -24,6 +25,15 @@ class DeadReckoning:
         self._check: tuple[int, np.ndarray] | None = None
         self.error_share = 0.0
         self.lost_sight = False
+        self._blind_m = 0.0
+        self._last: np.ndarray | None = None
+
+    def regained(self) -> bool:
+        """True once, when the scans know again where they are after a long way of counting."""
+        if self.lost_sight or self._blind_m < BLIND_M:
+            return False
+        self._blind_m = 0.0
+        return True
 
     def predict(self, stamp_ns: int) -> np.ndarray | None:
         """T_odom_body by count, while the scans do not know; None if they do or the wheels are no good."""
@@ -42,7 +52,12 @@ class DeadReckoning:
     ) -> tuple[np.ndarray, bool]:
         """The pose with its part along the weak direction drawn to the count; whether that was done."""
         carried = self._carried(stamp_ns)
-        self.lost_sight = trust < SEEN
+        was_lost, self.lost_sight = self.lost_sight, trust < SEEN
+        if was_lost and self._last is not None:
+            self._blind_m += float(np.hypot(*(T_odom_body - self._last)[:2]))
+        elif self.lost_sight:
+            self._blind_m = 0.0
+        self._last = T_odom_body
         self._stamp_ns = stamp_ns
         if not self.lost_sight:
             self._counted = T_odom_body

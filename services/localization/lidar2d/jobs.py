@@ -185,7 +185,7 @@ def _places(
     """Submaps of other passes right here, nearest first; the flag: some are too uncertain for that."""
     s = snapshot.settings
     distance = _nearest_member(snapshot, edges, row)
-    distance[[k for o in own for k in (o - 1, o, o + 1) if 0 <= k < len(distance)]] = np.inf
+    distance[[k for o in own for k in range(o - 2, o + 3) if 0 <= k < len(distance)]] = np.inf
     places, taken, unsure = [], [], False
     for k in np.argsort(distance, kind="stable"):
         if distance[k] > s.loop_near_m or len(places) == s.loop_submaps:

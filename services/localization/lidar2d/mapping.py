@@ -44,6 +44,7 @@ class LocalMapper:
         self.last_key: Keynode | None = None
         self.keynodes_since_job = 0
         self._active: list[_Active] = []
+        self._cut = False
 
     @property
     def matched(self) -> LocalMap:
@@ -78,13 +79,26 @@ class LocalMapper:
         return moving
 
     def insert(
-        self, stamp_ns: int, scan: PreparedScan, T_odom_body: np.ndarray, moving: np.ndarray, match: Match
+        self,
+        stamp_ns: int,
+        scan: PreparedScan,
+        T_odom_body: np.ndarray,
+        moving: np.ndarray,
+        match: Match,
+        cut: bool = False,
     ) -> bool:
-        """Put the scan into the active submaps if it adds anything (motion filter)."""
+        """Put the scan into the active submaps if it adds anything (motion filter).
+
+        A `cut` ends the older submap early: what comes after a blind stretch hangs together, but only loosely
+        on what was before, and within one submap nothing could bend.
+        """
+        self._cut = self._cut or cut
         if self._active and not self._is_key(stamp_ns, T_odom_body):
             return False
         s = self.settings
-        if not self._active or self._active[-1].local.surfels.scans >= s.submap_keynodes:
+        scans = self._active[-1].local.surfels.scans if self._active else 0
+        if not self._active or scans >= s.submap_keynodes or (self._cut and scans >= s.least_keynodes):
+            self._cut = False
             if len(self._active) == 2:
                 done = self._active.pop(0)
                 done.submap.frozen = freeze(done.local.surfels)

@@ -25,6 +25,7 @@ class LidarSlamSettings:
     range_sigma_m: float = 0.015  # noise of one return along the surface normal
     map_sigma_m: float = 0.02  # what repeated averaging does not remove (beam footprint, sensor bias)
     submap_keynodes: int = 40  # each submap holds twice as many; neighbours share half
+    least_keynodes: int = 10  # before a blind stretch may end a submap early
     keynode_distance_m: float = 0.15
     keynode_angle_rad: float = math.radians(8.0)
     keynode_time_s: float = 4.0

@@ -144,7 +144,9 @@ class LidarSlam:
         self, raw: RawScan, scan: PreparedScan, T_odom_body: np.ndarray, match: Match, good: bool
     ) -> ScanResult:
         moving = self.mapper.moving(scan, T_odom_body) if good else np.zeros(len(scan), dtype=bool)
-        key = good and self.mapper.insert(raw.stamp_ns, scan, T_odom_body, moving, match)
+        key = good and self.mapper.insert(
+            raw.stamp_ns, scan, T_odom_body, moving, match, self.front.reckoning.regained()
+        )
         job = self._job()
         per_beam = np.zeros(len(raw.ranges_m), dtype=bool)
         per_beam[scan.beams[moving]] = True
