@@ -26,7 +26,7 @@ from services.localization.camera.splat_map import SplatMap
 from services.localization.camera.view import GREY, GreyLevel, PictureView, halved
 
 _DAMPING = 1e-4  # of the diagonal: keeps what the picture does not tell where it was predicted
-_GAIN_PRIOR, _OFFSET_PRIOR = 400.0, 400.0  # exposure changes little between pictures
+_GAIN_PRIOR, _OFFSET_PRIOR = 5.0, 5.0  # exposure changes little between pictures
 
 
 @dataclass
@@ -36,6 +36,7 @@ class Alignment:
     T_camera_map: np.ndarray
     points: int = 0  # used at the finest level
     inliers: float = 0.0  # share of them within the error that counts as seen
+    correlation: float = 0.0  # of the rendered grey with the picture's at the points
     error: float = 1.0  # median |grey error|
     explained: float = 0.0  # share of the picture where the map is opaque
     gain: float = 1.0
@@ -117,11 +118,7 @@ class Aligner:
     ) -> None:  # fmt: skip
         """Improves `found` at one level; its pose is that of the picture."""
         s, camera = self.settings, self.cameras[level]
-        stride = self._stride(camera)
-        count = choose_points(
-            rendered.grey, rendered.z_m, rendered.alpha, np.float32(s.least_gradient),
-            np.float32(s.least_alpha), stride, self._points,
-        )  # fmt: skip
+        count = self._choose(rendered)
         T_now_render = found.T_camera_map @ inverse(T_render_map)
         K = np.array([camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px])
         H, g = np.zeros((UNKNOWNS, UNKNOWNS)), np.zeros(UNKNOWNS)
@@ -151,6 +148,17 @@ class Aligner:
             if np.abs(move[:free]).max() < 1e-4:
                 break
         found.T_camera_map = T_now_render @ T_render_map
+        found.correlation = self._correlation(count, found)
+
+    def _correlation(self, count: int, found: Alignment) -> float:
+        """A gain near zero would make anything look alike: this does not fall for it."""
+        residuals = self._residuals[:count].astype(np.float64)
+        inside = np.isfinite(residuals)
+        shown = self._points[:count, 3][inside].astype(np.float64)
+        seen = residuals[inside] + found.gain * shown + found.offset
+        if len(shown) < 6 or shown.std() < 1e-6 or seen.std() < 1e-6:
+            return 0.0
+        return float(np.corrcoef(shown, seen)[0, 1])
 
     def _reduced(self, H: np.ndarray, g: np.ndarray, found: Alignment) -> tuple[np.ndarray, np.ndarray]:
         """Normal equations of the free motions and of exposure, with priors and damping."""
@@ -179,9 +187,17 @@ class Aligner:
         move = -np.linalg.solve(H, self._basis.T @ gradient)
         found.T_camera_map = se3_exp(self._basis @ np.clip(move, -0.02, 0.02)) @ found.T_camera_map
 
-    def _stride(self, camera: RasterCamera) -> int:
-        """So that a picture full of contrast still fits the points' memory."""
-        return max(-(-camera.width_px * camera.height_px // (3 * self.settings.most_points)), 1)
+    def _choose(self, rendered: _Rendered) -> int:
+        """Fills the points; of a picture full of contrast every n-th."""
+        s, stride = self.settings, 1
+        while True:
+            count, found = choose_points(
+                rendered.grey, rendered.z_m, rendered.alpha, np.float32(s.least_gradient),
+                np.float32(s.least_alpha), stride, self._points,
+            )  # fmt: skip
+            if found // stride <= len(self._points):
+                return count
+            stride = -(-found // len(self._points))
 
 
 def exact_gradient(
@@ -193,14 +209,16 @@ def exact_gradient(
     L is Huber's loss of the grey error over pixels that the map explains and that have contrast.
     """
     render = splats.render(camera, found.T_camera_map)
-    grey = np.tensordot(GREY, render.image[:3], axes=1)
+    alpha = np.maximum(render.image[4], 0.3)
+    grey = np.tensordot(GREY, render.image[:3], axes=1) / alpha
     error = found.gain * grey + found.offset - target.grey
     dx, dy = target.slope_x, target.slope_y
     use = (render.image[4] > settings.least_alpha) & (dx * dx + dy * dy > settings.least_gradient**2)
     delta = np.float32(max(1.345 * 1.4826 * found.error, 0.008))
     slope = np.where(use, np.clip(error, -delta, delta), 0.0).astype(np.float32)
     gradient = np.zeros_like(render.image)
-    gradient[:3] = np.float32(found.gain) * GREY[:, None, None] * slope
+    gradient[:3] = np.float32(found.gain) * GREY[:, None, None] * slope / alpha
+    gradient[4] = -np.float32(found.gain) * slope * grey / alpha
     pose = splats.rasterizer.backward(render, gradient).pose.copy()
     splats.release(render)
     return pose, int(use.sum())

@@ -26,12 +26,15 @@ class DepthGuess:
 def shrunk(z: np.ndarray, width_px: int, height_px: int) -> np.ndarray:
     """float32 [height_px, width_px], 0 where unknown or at an edge, of depth [H, W] with NaN.
 
-    Sampled, not averaged: the mean of two surfaces is neither.
+    Inverse depth is averaged, which a plane survives; at edges, where the mean of two surfaces is neither,
+    there is none.
     """
     with np.errstate(invalid="ignore"):
         known = np.isfinite(z) & (z > 0.05) & (z < MAX_DEPTH)
-    clean = np.where(known, z, 0.0).astype(np.float32)
-    small = cv2.resize(clean, (width_px, height_px), interpolation=cv2.INTER_NEAREST)
+        inverse_z = np.where(known, 1.0 / z, 0.0).astype(np.float32)
+    mean = cv2.resize(inverse_z, (width_px, height_px), interpolation=cv2.INTER_AREA)
+    whole = cv2.resize(known.astype(np.float32), (width_px, height_px), interpolation=cv2.INTER_AREA) > 0.999
+    small = np.where(whole, 1.0 / np.maximum(mean, 1e-6), 0.0).astype(np.float32)
     far, near = cv2.dilate(small, np.ones((3, 3))), cv2.erode(small, np.ones((3, 3)))
     return np.where((near > 0.0) & (far - near < _EDGE * 2.0 * np.maximum(near, 1e-6)), small, 0.0)
 

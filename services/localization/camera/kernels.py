@@ -15,9 +15,10 @@ UNKNOWNS = 8  # (rho, phi) of the left perturbation of T_now_render, log gain, o
 
 @kernel
 def choose_points(grey, z_m, alpha, least_gradient, least_alpha, stride, out):  # noqa: ANN001, ANN201
-    """Writes (u, v, z, grey) of the pixels with contrast that the map explains into out [N, 4]; gives N.
+    """Writes (u, v, z, grey) of the pixels with contrast that the map explains into out [N, 4].
 
-    `stride` takes every n-th of them; neighbours must be explained and lie on the same surface.
+    `stride` takes every n-th of them; their neighbours must be explained too. Gives (how many were written,
+    how many there are before the stride): where they do not fit, call again with a larger stride.
     """
     height, width = grey.shape
     found, n = 0, 0
@@ -36,7 +37,7 @@ def choose_points(grey, z_m, alpha, least_gradient, least_alpha, stride, out):  
             if found % stride == 0 and n < len(out):
                 out[n, 0], out[n, 1], out[n, 2], out[n, 3] = u, v, z_m[v, u], grey[v, u]
                 n += 1
-    return n
+    return n, found
 
 
 @kernel
@@ -144,24 +145,34 @@ def adam_rows(gradients, index, visible, params, first, second, steps, rates):  
 
 @kernel
 def map_loss(image, rgb, z_m, weight, colour_scale, depth_scale, gradient):  # noqa: ANN001, ANN201
-    """L1 of colour and of weighted depth of a render, and its gradient float32 [5, H, W]; gives the loss.
+    """L1 of colour over alpha and of depth of a render, its gradient float32 [5, H, W]; gives the loss.
 
     `image` float32 [5, H, W] as rendered, `rgb` float32 [3, H, W], `z_m` float32 [H, W] (0 unknown). The
-    depth term is w |sum w_i z_i - z alpha|: zero where the surface is right, whatever its opacity.
+    depth term is w |sum w_i z_i - z alpha|: zero where the surface is right, whatever its opacity. Where
+    there is a surface, alpha is drawn to one: what is seen through gaps is not part of the picture.
     """
     height, width = z_m.shape
     total = 0.0
     for v in range(height):
-        for channel in range(3):
-            for u in range(width):
-                error = image[channel, v, u] - rgb[channel, v, u]
-                gradient[channel, v, u] = colour_scale if error > 0.0 else -colour_scale
-                total += abs(error) * colour_scale
         for u in range(width):
-            w = weight[v, u] * depth_scale if z_m[v, u] > 0.0 else np.float32(0.0)
-            error = image[3, v, u] - z_m[v, u] * image[4, v, u]
-            slope = w if error > 0.0 else -w
-            gradient[3, v, u] = slope
-            gradient[4, v, u] = -slope * z_m[v, u]
-            total += w * abs(error)
+            alpha = max(image[4, v, u], np.float32(0.3))
+            through = image[4, v, u] < np.float32(0.3)
+            d_alpha = np.float32(0.0)
+            for channel in range(3):
+                shown = image[channel, v, u] / alpha
+                error = shown - rgb[channel, v, u]
+                slope = (colour_scale if error > 0.0 else -colour_scale) / alpha
+                gradient[channel, v, u] = slope
+                d_alpha -= np.float32(0.0) if through else slope * shown
+                total += abs(error) * colour_scale
+            if z_m[v, u] > 0.0:
+                w = weight[v, u] * depth_scale
+                error = image[3, v, u] - z_m[v, u] * image[4, v, u]
+                slope = w if error > 0.0 else -w
+                gradient[3, v, u] = slope
+                gradient[4, v, u] = d_alpha - slope * z_m[v, u] - colour_scale
+                total += w * abs(error) + colour_scale * (np.float32(1.0) - image[4, v, u])
+            else:
+                gradient[3, v, u] = np.float32(0.0)
+                gradient[4, v, u] = d_alpha
     return total

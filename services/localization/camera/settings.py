@@ -16,11 +16,12 @@ class CameraTrackerSettings:
     fine_steps: int = 6
     exact_steps: int = 0  # further steps down the rasterizer's own pose gradient
     least_gradient: float = 0.012  # grey levels a pixel; flatter pixels say nothing of motion
-    least_alpha: float = 0.8  # less than this and the map does not explain the pixel
+    least_alpha: float = 0.6  # less than this and the map does not explain the pixel
     most_points: int = 12_000
     # Is the answer to be believed?
     least_points: int = 150
     least_inliers: float = 0.6  # share of points within `inlier_error`
+    least_correlation: float = 0.6
     inlier_error: float = 0.10
     least_contrast: float = 0.02  # standard deviation of the picture's grey: below, it shows nothing
     max_step_m: float = 0.5  # between pictures, beyond the prediction
@@ -39,7 +40,7 @@ class CameraTrackerSettings:
     float_margin: float = 0.08  # relative, beyond which a Gaussian floats before the surface
     coarse_px: float = 6.0  # standard deviation in a keyframe beyond which a Gaussian is too coarse for it
     least_depth_weight: float = 0.5  # below, a depth is no reason to remove anything that floats
-    size: float = 0.55  # standard deviation over spacing
+    size: float = 0.45  # standard deviation over spacing
     flatness: float = 0.2
     opacity: float = 0.95
     prune_opacity: float = 0.05

@@ -153,6 +153,8 @@ class CameraTracker:
         least = s.least_inliers if self._missed == 0 else 0.5 * (1.0 + s.least_inliers)
         if found.inliers < least:
             return f"lost: only {found.inliers:.0%} of the map's points look like the picture"
+        if found.correlation < s.least_correlation:
+            return f"lost: the map and the picture correlate by {found.correlation:.2f} only"
         move = se3_log(inverse(T_start) @ self._T_map_body(found))
         far, turn = float(np.linalg.norm(move[:3])), float(np.linalg.norm(move[3:]))
         if far > s.max_step_m or turn > s.max_step_rad:

@@ -1,0 +1,224 @@
+"""Tracking a drive through a textured box: where it says the body is, in which unit, and when it does not know."""
+
+import numpy as np
+import pytest
+
+from common.geometry import inverse
+from services.localization.camera.depth import DepthGuess, fitted_to_map, shrunk
+from services.localization.camera.relocalize import thumbnail
+from services.localization.camera.result import covisibility
+from services.localization.camera.settings import CameraTrackerSettings
+from services.localization.camera.sweep import filled, sweep
+from services.localization.camera.tracker import CameraTracker
+from services.localization.camera.view import small_camera
+from tests.services.localization.camera.box import CAMERA, T_BODY_CAMERA, body, drive, off, shot
+
+SETTINGS = CameraTrackerSettings(width_px=160, first_steps=10, steps_per_picture=1)
+
+
+def run(path, scale=1.0, settings=SETTINGS, with_depth=True, tracker=None):
+    tracker = tracker or CameraTracker(CAMERA, T_BODY_CAMERA, settings)
+    results = []
+    for i, T in enumerate(path):
+        rgb, z = shot(T)
+        results.append(tracker.track(i, rgb))
+        if with_depth:
+            tracker.add_depth(i, DepthGuess(z * np.float32(scale), 0.01, True))
+        else:
+            tracker.add_without_depth(i)
+    return tracker, results
+
+
+@pytest.fixture(scope="module")
+def arc():
+    path = drive(30)
+    tracker, results = run(path)
+    yield path, tracker, results
+    tracker.close()
+
+
+def test_a_drive_with_metric_depth_is_followed_in_metres(arc):
+    path, tracker, results = arc
+    assert results[0].status == "relocalizing"
+    assert "first depth" in results[0].detail
+    assert all(r.status == "ok" for r in results[1:])
+    errors = [off(T, r.T_map_body) for T, r in zip(path[1:], results[1:])]
+    assert max(e[0] for e in errors) < 0.04  # of 0.87 m, with pictures 160 px wide
+    assert max(e[1] for e in errors) < 0.015
+    assert tracker.metric is True
+
+
+def test_keyframes_come_by_covisibility_not_by_every_picture(arc):
+    _, tracker, results = arc
+    assert 2 <= len(tracker.splats.keyframes) < 15
+    assert not results[1].wants_keyframe
+
+
+def test_the_covariance_grows_along_the_chain_of_keyframes_and_is_no_wild_guess(arc):
+    _, _, results = arc
+    sigmas = [np.sqrt(np.diag(r.covariance)) for r in results[1:]]
+    assert np.all(np.isfinite(sigmas))
+    assert sigmas[-1][2] >= sigmas[0][2]
+    assert 1e-5 < sigmas[-1][:2].max() < 0.05
+    assert np.all(np.isnan(results[0].covariance))
+
+
+def test_the_same_pictures_give_the_same_poses_bit_for_bit(arc):
+    path, _, results = arc
+    other, again = run(path[:12])
+    other.close()
+    for a, b in zip(results, again):
+        assert np.array_equal(a.T_map_body, b.T_map_body)
+
+
+def test_lengths_are_those_of_the_depth():
+    path = drive(12)
+    tracker, results = run(
+        path, scale=2.0, settings=CameraTrackerSettings(width_px=160, planar=False, first_steps=10)
+    )
+    tracker.close()
+    assert np.linalg.norm(results[-1].T_map_body[:3, 3]) == pytest.approx(2 * 0.33, abs=0.04)
+
+
+def test_without_depth_the_shape_is_right_and_the_unit_is_nobodys():
+    path = drive(36, step_m=0.04, turn_rad=0.012)
+    tracker, results = run(path, with_depth=False)
+    tracker.close()
+    assert tracker.metric is False
+    assert results[-1].status == "ok"
+    found = np.array([r.T_map_body[:2, 3] for r in results[20:]])
+    true = np.array([T[:2, 3] for T in path[20:]])
+    a, b = found - found.mean(axis=0), true - true.mean(axis=0)
+    scale = np.sum(np.linalg.norm(b, axis=1)) / np.sum(np.linalg.norm(a, axis=1))
+    turn = np.arctan2(np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]), np.sum(a * b))
+    R = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    assert np.sqrt(np.mean(np.sum((scale * a @ R.T - b) ** 2, axis=1))) < 0.1  # over 0.8 m
+
+
+def test_a_lost_track_is_said_and_found_again():
+    path = drive(10)
+    tracker, _ = run(path)
+    noise = np.random.default_rng(0).integers(0, 255, (120, 160, 3)).astype(np.uint8)
+    lost, still = tracker.track(20, noise), tracker.track(21, noise)
+    assert lost.status == "lost"
+    assert lost.detail
+    assert still.status == "relocalizing"
+    assert np.all(np.isnan(lost.covariance))
+    back = tracker.track(22, shot(path[3])[0])
+    tracker.close()
+    assert back.status == "ok"
+    assert off(path[3], back.T_map_body)[0] < 0.02
+
+
+def test_after_long_the_map_goes_on_from_the_last_pose_and_the_doubt_shows():
+    settings = CameraTrackerSettings(width_px=160, first_steps=5, steps_per_picture=0, restart_after=2)
+    path = drive(4)
+    tracker, before = run(path, settings=settings)
+    far = body(-1.5, 0.8, 2.4)
+    results = []
+    for i in range(30, 38):
+        rgb, z = shot(far)
+        results.append(tracker.track(i, rgb))
+        tracker.add_depth(i, DepthGuess(z, 0.01, True))
+    tracker.close()
+    assert results[0].status == "lost"
+    assert results[-1].status == "ok"
+    assert results[-1].covariance[0, 0] > before[-1].covariance[0, 0] + 0.2
+
+
+@pytest.mark.parametrize(
+    ("picture", "why"),
+    [
+        (np.zeros((60, 80, 3), np.uint8), "K belongs to another picture size"),
+        (np.zeros((120, 160), np.uint8), "K belongs"),
+        (np.full((120, 160, 3), 90, np.uint8), "blank"),
+    ],
+)
+def test_bad_pictures_are_refused_and_leave_the_track_alone(picture, why):
+    path = drive(3)
+    tracker, _ = run(path)
+    refused = tracker.track(50, picture)
+    assert refused.status == "rejected"
+    assert why in refused.detail
+    assert tracker.track(51, shot(path[2])[0]).status == "ok"
+    assert "not after" in tracker.track(51, shot(path[2])[0]).detail
+    tracker.close()
+
+
+def test_depth_that_cannot_be_used_is_refused():
+    path = drive(2)
+    tracker, _ = run(path)
+    rgb, z = shot(body(0.5, 0.0, 0.5))
+    assert "was not tracked" in tracker.add_depth(99, DepthGuess(z, 0.01, True))
+    fresh = CameraTracker(CAMERA, T_BODY_CAMERA, SETTINGS)
+    fresh.track(1, rgb)
+    assert "no pixel" in fresh.add_depth(1, DepthGuess(np.full_like(z, np.nan), 0.01, True))
+    fresh.close()
+    tracker.close()
+
+
+def test_an_unsure_depth_follows_the_map_and_a_sure_one_keeps_its_scale():
+    rendered = np.full((60, 80), 2.0, np.float32)
+    rendered[:, 60:] = 0.0
+    z = np.full((60, 80), 3.0, np.float32)
+    followed, ratio = fitted_to_map(z, rendered, 0.3)
+    kept, _ = fitted_to_map(z, rendered, 0.002)
+    assert ratio == pytest.approx(np.log(1.5), abs=1e-3)
+    assert np.median(followed[:, :50]) == pytest.approx(2.0, rel=0.03)
+    assert np.median(followed[:, 70:]) == pytest.approx(2.0, rel=0.05)  # beyond the map's end it goes on
+    assert np.median(kept) == pytest.approx(3.0, rel=0.01)
+    alone, unknown = fitted_to_map(z, np.zeros_like(z), 0.3)
+    assert np.array_equal(alone, z)
+    assert np.isnan(unknown)
+
+
+def test_shrunk_depth_has_no_mixed_pixels():
+    z = np.full((120, 160), 1.0, np.float32)
+    z[:, 81:], z[:20] = 3.0, np.nan
+    small = shrunk(z, 80, 60)
+    assert set(np.unique(small.round(5))) == {0.0, 1.0, 3.0}
+    assert small[30, 10] == 1.0
+    assert small[30, 70] == pytest.approx(3.0)
+    assert small[5, 40] == 0.0
+
+
+def test_a_plane_sweep_finds_the_rooms_depth():
+    here, there = body(0, 0, 0) @ T_BODY_CAMERA, body(0, 0, 0) @ body(0.0, 0.15, 0.0) @ T_BODY_CAMERA
+    (rgb, z), (other, _) = shot(body(0, 0, 0)), shot(body(0.0, 0.15, 0.0))
+    grey, grey_other = (p.mean(axis=2).astype(np.float32) / 255 for p in (rgb, other))
+    found = sweep(grey, [(grey_other, inverse(there) @ here)], small_camera(CAMERA, 160), 0.5, 8.0)
+    known = found > 0
+    assert known.mean() > 0.15
+    assert np.median(np.abs(found - z)[known] / z[known]) < 0.03
+    assert np.all(filled(found, 4.0) > 0)
+
+
+def test_thumbnails_do_not_see_brightness_and_covisibility_counts():
+    grey = shot(body(0, 0, 0))[0].mean(axis=2).astype(np.float32)
+    assert np.sum(thumbnail(grey) * thumbnail(grey * 0.5 + 3.0)) == pytest.approx(1.0, abs=1e-5)
+    a, b = np.array([1, 2, 3, 4]), np.array([3, 4, 5, 6])
+    assert covisibility(a, b) == pytest.approx(2 / 6)
+    assert covisibility(a, a) == 1.0
+
+
+@pytest.mark.slow
+def test_house_with_recorded_depth(shared_dir):
+    from services.mapping.dataset import load
+
+    recording = load(shared_dir / "data" / "house_a")
+    tracker = CameraTracker(recording.camera, recording.T_body_camera)
+    T_world_map, errors = None, []
+    for i in range(120):
+        s = recording.shots[i]
+        T_world_body = s.T_map_camera @ inverse(recording.T_body_camera)
+        result = tracker.track(s.stamp_ns, recording.image(i))
+        depth = recording.true_depth(i)
+        if depth is not None:
+            tracker.add_depth(s.stamp_ns, DepthGuess(depth, 0.01, True))
+        if T_world_map is None:
+            T_world_map = T_world_body
+        else:
+            assert result.status == "ok"
+            errors.append(off(T_world_body, T_world_map @ result.T_map_body)[0])
+    tracker.close()
+    assert np.sqrt(np.mean(np.square(errors))) < 0.03
