@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 OUT ?= out/demo
 STAMP := $(VENV)/.installed
 
-.PHONY: setup demo test quick soak bench lint clean
+.PHONY: setup demo test quick soak bench bench-slam lint clean
 
 setup: $(STAMP)
 
@@ -43,6 +43,10 @@ soak: setup
 
 bench: setup
 	$(BIN)/beamsplat bench bus
+
+# The deck of figures in the README: DATA holds X.bag beside X.relations, or bag/ beside groundtruth.txt.
+bench-slam: setup
+	$(BIN)/beamsplat bench slam --data $(DATA) --out out/slam --readme README.md --pictures docs/slam_maps.jpg
 
 lint: setup
 	$(BIN)/ruff check .

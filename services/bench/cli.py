@@ -39,6 +39,35 @@ def bus(
 
 
 @app.command()
+def slam(
+    data: Annotated[
+        Path, typer.Option(help="Folder with X.bag beside X.relations, bag/ beside groundtruth.txt")
+    ],
+    out: Annotated[Path, typer.Option(help="Folder for maps, trajectories and the deck of pictures")],
+    no_odometry: Annotated[bool, typer.Option("--no-odometry", help="Use the scans alone")] = False,
+    readme: Annotated[Path | None, typer.Option(help="Put the table between its marks in this file")] = None,
+    pictures: Annotated[Path | None, typer.Option(help="Where the deck of maps goes")] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Accuracy and cost of the lidar SLAM on recordings with truth, beside Cartographer's published figures.
+
+    Examples:
+
+        beamsplat bench slam --data logs --out out/slam
+
+        beamsplat bench slam --data logs --out out/slam --readme README.md --pictures docs/slam_maps.jpg
+    """
+    from services.bench.slam import bench_slam, deck, into_readme, markdown
+
+    rows = bench_slam(data, out, not no_odometry, lambda text: console.print(text, highlight=False))
+    table = markdown(rows)
+    print(json.dumps(rows) if as_json else table)
+    if readme is not None:
+        into_readme(readme, table)
+    deck(out, [row["name"] for row in rows], pictures or out / "maps.jpg")
+
+
+@app.command()
 def paper(
     data: Annotated[Path, typer.Option(help="Folder with bag/ and its truth, or a bag with poses in it")],
     out: Annotated[Path, typer.Option(help="Folder for report.json and report.html")],
