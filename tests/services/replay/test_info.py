@@ -13,13 +13,13 @@ from typer.testing import CliRunner
 from common.errors import UserError
 from common.recording import RecordingWriter
 from common.recording.mcap_file import McapFile
+from common.recording.static_frames import StaticFrames
 from common.rig import load_rig
 from services.replay import cli
 from services.replay.config import ReplayConfig
 from services.replay.inspection import inspect
 from services.replay.node import ReplayNode
 from services.replay.options import SourceOptions
-from common.recording.static_frames import StaticFrames
 from services.replay.statistics import lidar_facts, stream_facts
 from tests.services.replay.make_bags import KINDS, T_BASE_CAMERA, T_BASE_LIDAR, Drive, write_bag
 
