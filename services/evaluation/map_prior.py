@@ -63,8 +63,8 @@ class MoverMasks:
     def __init__(self) -> None:
         self._free, self._next = FreeSpace(), 0
 
-    def __call__(self, recording: Recording, index: int) -> np.ndarray | None:
-        """bool [H, W], False on movers; None where nothing moves."""
+    def __call__(self, recording: Recording, index: int, depth_m: np.ndarray) -> np.ndarray | None:
+        """bool [H, W], False on movers; None where nothing moves. `depth_m` float32 [H, W] of the picture."""
         T_camera_body = inverse(recording.T_body_camera)
         if index < self._next:
             self._free, self._next = FreeSpace(), 0
@@ -78,7 +78,5 @@ class MoverMasks:
         self._next = index + 1
         if not moving.any():
             return None
-        unknown = np.full(recording.camera.shape, np.nan, np.float32)
-        return ~body_mask(
-            shot.beams.points_body_m[moving], unknown, recording.camera, recording.T_body_camera
-        )
+        body = shot.beams.points_body_m[moving]
+        return ~body_mask(body, depth_m, recording.camera, recording.T_body_camera)

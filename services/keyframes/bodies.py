@@ -8,7 +8,8 @@ from common.beams import plan_polar
 from common.camera import Pinhole
 
 HEIGHT_M = 2.1
-_HALF_WIDTH_M = 0.35  # of a body with its arms, around the beams at its ankles
+_HALF_WIDTH_M = 0.30  # of a body with its arms, around the beams at its ankles
+_COMPANY, _COMPANY_M = 3, 0.5  # returns within that distance of each other: one alone is an edge or noise
 _CORE_M = 0.09  # around the ankles: the walker itself, whatever the depth says
 _FLOOR_M = 0.15  # shadows, and a camera that nods
 _DEPTH_M = 0.45  # a stride to the front and to the back
@@ -24,7 +25,7 @@ def body_mask(
 ) -> np.ndarray:
     """bool [H, W]: True where the picture shows a mover, up to 2.1 m above the floor.
 
-    A pixel belongs to a mover if, at the distance of a moving return, it lies within 0.35 m to the side of
+    A pixel belongs to a mover if, at the distance of a moving return, it lies within 0.3 m to the side of
     it and its depth is within a stride of it or unknown, or within 9 cm and no surface is known before it.
     """
     mask = np.zeros(depth_m.shape, dtype=bool)
@@ -35,7 +36,7 @@ def body_mask(
     across = np.hypot(rays[..., 0], rays[..., 1])
     coarse = np.zeros(azimuth.shape, dtype=bool)
     small = depth_m[::step, ::step]
-    for at, reach in zip(*plan_polar(moving_body_m, T_body_camera)):
+    for at, reach in zip(*plan_polar(_in_company(moving_body_m), T_body_camera)):
         half, core = np.arctan2([_HALF_WIDTH_M, _CORE_M], max(float(reach), 0.2))
         apart = np.abs((azimuth - at + np.pi) % (2.0 * np.pi) - np.pi)
         z = reach / np.maximum(across, 1e-9)
@@ -50,6 +51,12 @@ def body_mask(
     grown = np.kron(coarse, np.ones((step, step), dtype=bool))[: mask.shape[0], : mask.shape[1]]
     mask[: grown.shape[0], : grown.shape[1]] = grown
     return _dilated(mask)
+
+
+def _in_company(points_m: np.ndarray) -> np.ndarray:
+    """The points [M, 3] that have others beside them on the floor plane, as two ankles do."""
+    apart = np.linalg.norm(points_m[:, None, :2] - points_m[None, :, :2], axis=2)
+    return points_m[np.count_nonzero(apart < _COMPANY_M, axis=1) >= _COMPANY]
 
 
 def _dilated(mask: np.ndarray) -> np.ndarray:

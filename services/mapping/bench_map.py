@@ -48,8 +48,8 @@ class MapBench:
 
 
 JUMP = make_transform(so3_exp([0.0, 0.0, np.radians(10.0)]), np.array([1.0, 0.0, 0.0]))
-# (recording, number of the picture) -> bool [H, W], False on what moves; None where all may be used
-Mask = Callable[[Recording, int], np.ndarray | None]
+# (recording, number of the picture, its depth_m) -> bool [H, W], False on what moves; None: nothing does
+Mask = Callable[[Recording, int, np.ndarray], np.ndarray | None]
 
 
 @dataclass
@@ -132,7 +132,7 @@ def _drive(
         late = 2 * index >= len(recording.shots)
         frame = replace(
             make_keyframe(recording, index, guess), anchor=int(late),
-            mask=None if mask is None else clock.run(lambda i=index: mask(recording, i)),
+            mask=None if mask is None else clock.run(lambda i=index, d=guess[0]: mask(recording, i, d)),
         )  # fmt: skip
         place = JUMP if late and bench.jump else np.eye(4)
         outcome = clock.run(lambda f=frame, T=place: mapper.add(f, T))
