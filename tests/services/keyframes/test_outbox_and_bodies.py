@@ -79,3 +79,12 @@ def test_what_stands_before_the_walker_is_not_masked():
 
 def test_without_movers_nothing_is_masked():
     assert not body_mask(np.zeros((0, 3)), np.ones((480, 640), np.float32), CAMERA, T_BODY_CAMERA).any()
+
+
+def test_a_return_alone_masks_nothing():
+    """Edges and noise give single returns in free space; two ankles give several side by side."""
+    depth = np.full((480, 640), 6.0, np.float32)
+    alone = np.array([[2.0, -0.8, 0.18], [2.5, 0.9, 0.18], [3.0, 0.0, 0.18]])
+    assert not body_mask(alone, depth, CAMERA, T_BODY_CAMERA).any()
+    together = alone[:1] + np.array([[0.0, 0.0, 0.0], [0.02, 0.05, 0.0], [0.0, 0.2, 0.0]])
+    assert body_mask(together, depth, CAMERA, T_BODY_CAMERA).any()

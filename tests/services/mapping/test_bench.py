@@ -6,6 +6,7 @@ import pytest
 from common.errors import UserError
 from common.raster.camera import RasterCamera
 from common.raster.rasterizer import Rasterizer
+from services.evaluation.map_prior import FieldPrior, MoverMasks
 from services.mapping.bench_map import HELD_OUT_AT, HELD_OUT_EVERY, MapBench, make_keyframe, run_bench
 from services.mapping.bench_raster import bench_raster, synthetic_room
 from services.mapping.dataset import load
@@ -37,6 +38,25 @@ def test_stixel_prior_is_right_where_it_says_so(house):
         guessed.append(np.nanmean(error[sigma > 0.2]))
     assert np.median(trusted) < 0.03
     assert np.mean(guessed) > 3.0 * np.median(trusted)
+
+
+def test_fused_depth_is_a_prior_that_keeps_what_it_promises(house):
+    """Against true depth, from the pictures before: two thirds of the trusted pixels within their sigma."""
+    prior = FieldPrior("stixel")
+    assert prior(house, 8) is not None
+    depth, sigma = prior(house, 16)
+    error, trusted = np.abs(depth - house.true_depth(16)), sigma < 0.03 * depth
+    assert np.isfinite(depth).mean() > 0.7
+    assert np.nanmedian(error[trusted]) < 0.03
+    assert np.nanmean(error[trusted] < 2.0 * sigma[trusted]) > 0.66
+
+
+def test_masks_of_movers_leave_a_still_house_alone(house):
+    masks, hidden = MoverMasks(), []
+    for index in range(0, 60, 10):
+        mask = masks(house, index, house.true_depth(0))
+        hidden.append(0.0 if mask is None else 1.0 - mask.mean())
+    assert np.mean(hidden) < 0.05
 
 
 def test_keyframes_carry_the_beams_of_the_moment(house):
