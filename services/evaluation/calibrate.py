@@ -9,10 +9,13 @@ from typing import Any
 import cv2
 import numpy as np
 
+from common.camera import Undistorter
 from common.errors import UserError
+from common.geometry import transform_points
 from common.rig import load_rig
 from services.evaluation.drive import Drive, pinhole_of
-from services.fusion.calibration.board import BoardPair, chessboard_plane, solve_board
+from services.fusion.calibration.board import BoardPair, chessboard_plane, level_mount, solve_board
+from services.fusion.calibration.edges import edge_errors, picture_edges
 from services.fusion.calibration.motion import PARAMETERS, MotionCalibration, TrackedPair, solve_motion
 from services.fusion.calibration.startup import health_sentence
 from services.fusion.relative_pose import corners, track
@@ -77,7 +80,7 @@ def calibrate_board(
     if loaded.camera is None:
         raise UserError(f"{rig_file}: has no [camera]; the board needs K and distortion")
     camera = pinhole_of(loaded.camera.model())
-    pairs, missing = [], []
+    pairs, pictures, missing = [], [], []
     for image_file, cloud_file in pair_files(folder):
         grey = cv2.imread(str(image_file), cv2.IMREAD_GRAYSCALE)
         if grey is None or grey.shape != camera.shape:
@@ -86,6 +89,7 @@ def calibrate_board(
         if plane is None:
             missing.append(image_file.name)
             continue
+        pictures.append(grey)
         pairs.append(BoardPair(plane[0], plane[1], plane[2], _HALF_BOARD_M, read_pcd(cloud_file)))
     if len(pairs) < 2:
         raise UserError(
@@ -100,7 +104,21 @@ def calibrate_board(
         found = solve_board(pairs, start, y_m)
     except ValueError as error:
         raise UserError(f"{folder}: {error}") from error
+    pinhole = Undistorter(camera).pinhole
+    edges = [
+        picture_edges(
+            grey, camera, pinhole.project(transform_points(found.T_camera_lidar, pair.points_lidar[beams]))[0]
+        )
+        for grey, pair, beams in zip(pictures, pairs, found.on_board)
+    ]  # fmt: skip
+    before = edge_errors(
+        pairs, found.on_board, edges, level_mount(start[0], start[1], y_m, start[2]), pinhole
+    )
+    after = edge_errors(pairs, found.on_board, edges, found.T_camera_lidar, pinhole)
     return {
+        "edges": len(after.errors_px), "edge_error_before_px": before.median_px,
+        "edge_error_px": after.median_px, "edge_spot_px": after.spot_px,
+        "edge_errors_px": after.errors_px.tolist(),
         "pairs": len(pairs), "without_board": missing, "yaw_deg": float(np.degrees(found.yaw_rad)),
         "x_m": found.x_m, "z_m": found.z_m, "yaw_sigma_deg": float(np.degrees(found.sigma[0])),
         "x_sigma_m": float(found.sigma[1]), "z_sigma_m": float(found.sigma[2]), "rms_m": found.rms_m,

@@ -21,7 +21,9 @@ if TYPE_CHECKING:
 BagArgument = Annotated[Path, typer.Argument(help="A bag or recording, or a folder with bag/ in it.")]
 PosesOption = Annotated[
     Path | None,
-    typer.Option(help="TUM file of T_map_body (from `beamsplat slam`); default: poses in the recording."),
+    typer.Option(
+        help="TUM file of T_map_body; default: poses in the recording, else our lidar SLAM's."
+    ),
 ]
 SourceOption = Annotated[str, typer.Option(help="Depth source, by name.")]
 SetOption = Annotated[
@@ -50,7 +52,7 @@ def eval_depth(
 
     Examples:
 
-        beamsplat eval depth drive --truth drive/depth_gt --poses out/trajectory.tum
+        beamsplat eval depth drive --truth drive/depth_gt
 
         beamsplat eval depth drive --truth drive/depth_gt --source stixel --json
     """

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ import numpy as np
 from common.beams import NO_BEAMS, Beams, move_beams, scan_points
 from common.camera import Pinhole, Undistorter
 from common.errors import UserError
-from common.geometry import transform_points
+from common.geometry import se3_to_se2, transform_points
 from common.trajectory import Trajectory, read_tum
 from services.replay.options import SourceOptions
 from services.replay.source import open_source
@@ -141,14 +142,14 @@ def decode_rgb(image: Any, where: str) -> np.ndarray:
 
 def open_drive(path: Path, poses: Path | None = None, rig: Path | None = None) -> Drive:
     """Reads a recording (a bag, or a folder with bag/ in it). Poses: a TUM file of T_map_body, else the
-    recording's own /pose.
+    recording's own /pose, else the lidar SLAM is run on it.
 
     Raises:
         UserError: pictures, scans, calibration or poses are missing; says which.
     """
     source = open_source(path, SourceOptions(rig=rig, require=frozenset({"scan", "image"})))
     try:
-        images, scans, stamps, T = [], [], [], []
+        images, scans, stamps, T, wheels = [], [], [], [], []
         for _, topic, message in source.messages():
             if topic == "camera/image":
                 images.append(message)
@@ -157,6 +158,9 @@ def open_drive(path: Path, poses: Path | None = None, rig: Path | None = None) -
             elif topic == "external/pose":
                 stamps.append(message.stamp_ns)
                 T.append(message.T_map_body)
+            elif topic == "wheel/odometry":
+                x_m, y_m, yaw_rad = se3_to_se2(message.T_odom_body)
+                wheels.append(("odometry", message.stamp_ns, float(x_m), float(y_m), float(yaw_rad)))
         found = source.rig()
     finally:
         source.close()
@@ -170,15 +174,38 @@ def open_drive(path: Path, poses: Path | None = None, rig: Path | None = None) -
         trajectory = Trajectory(np.array(stamps)[order], np.array(T)[order])
         name = "poses in the recording"
     else:
-        raise UserError(
-            f"{path}: holds no poses; run `beamsplat slam` on it and give --poses DIR/trajectory.tum"
-        )
+        trajectory, name = slam_poses(scans, wheels, calibration.lidar.T_body_lidar), "our SLAM"
     images.sort(key=lambda image: image.stamp_ns)
     scans.sort(key=lambda scan: scan.stamp_ns)
     return Drive(
         Path(path), pinhole_of(calibration.camera), calibration.camera.T_body_camera,
         calibration.lidar.T_body_lidar, images, scans, trajectory, name,
     )  # fmt: skip
+
+
+def slam_poses(scans: list[ScanRecord], wheels: list[tuple], T_body_lidar: np.ndarray) -> Trajectory:
+    """`T_map_body` of every scan, by the lidar SLAM after its last optimisation.
+
+    Args:
+        scans: in order of the recording.
+        wheels: ("odometry", stamp_ns, x_m, y_m, yaw_rad), in order too; may be empty.
+        T_body_lidar: float64 [4, 4].
+
+    Raises:
+        UserError: there is no usable scan.
+    """
+    from services.localization.lidar2d.drive import Drive as Measurements
+    from services.localization.lidar2d.drive import map_drive
+
+    measured = [
+        ("scan", s.stamp_ns, s.ranges_m, s.angle_min_rad, s.angle_increment_rad, s.time_increment_s,
+         s.range_min_m, s.range_max_m)
+        for s in scans
+    ]  # fmt: skip
+    merged = sorted([*wheels, *measured], key=lambda measurement: measurement[1])
+    with tempfile.TemporaryDirectory() as folder:
+        map_drive(Measurements(T_body_lidar, merged, lambda: None), Path(folder))
+        return read_tum(Path(folder) / "trajectory.tum")
 
 
 def pinhole_of(camera: Any) -> Pinhole:

@@ -56,7 +56,7 @@ class FieldConfig:
         """No floor and no upright walls to lean on: what several keyframes agree on counts instead."""
         return FieldConfig(
             cost_cap=np.inf, p2=12.0, edge_grey=12.0, temperature=2.0, memory=1.5, memory_spread=0.15,
-            outvote=3, per_spread=2.3, matched=0.05, tell_log=0.14, tell_m=np.inf,
+            outvote=3, per_spread=2.3, matched=0.05, tell_log=0.19, tell_m=np.inf,
         )  # fmt: skip
 
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from common.camera import Pinhole
 from common.frames import R_body_camera_level
-from common.geometry import inverse, make_transform, so3_exp, transform_points
+from common.geometry import make_transform, so3_exp, transform_points
 
 _GAP_M = 0.05  # beams of one board are no further apart than this
 _SIGMA_M = 0.008
@@ -43,7 +43,7 @@ class BoardCalibration:
     sigma: np.ndarray  # float64 [3]
     rms_m: float
     beams: int
-    on_board: tuple[np.ndarray, ...]  # indices of the beams on each board
+    on_board: tuple[np.ndarray, ...]  # indices of the beams on each board, to its edges
 
 
 def chessboard_plane(
@@ -106,6 +106,8 @@ def solve_board(
     # Beams of one board share its plane's error: as good as one tenth of them.
     sigma = np.sqrt(np.diag(np.linalg.inv(J.T @ J)) * variance * 10.0)
     T = level_mount(x[0], x[1], y_m, x[2])
+    # The chessboard need not be in the board's middle: the beams on it go on to where the board ends.
+    whole = [_beams_on(pair, T, 0.015, widen=1.8) for pair in pairs]
     return BoardCalibration(
         T,
         float(x[0]),
@@ -114,7 +116,7 @@ def solve_board(
         sigma,
         float(np.sqrt(np.mean(r**2))),
         len(r),
-        tuple(on_board),
+        tuple(whole),
     )
 
 
@@ -135,12 +137,13 @@ def _linear(
     return r, J
 
 
-def _beams_on(pair: BoardPair, T_camera_lidar: np.ndarray, reach_m: float) -> np.ndarray:
+def _beams_on(pair: BoardPair, T_camera_lidar: np.ndarray, reach_m: float, widen: float = 1.0) -> np.ndarray:
     """Indices of the longest run of neighbouring beams near the board's plane and place."""
     points = transform_points(T_camera_lidar, pair.points_lidar)
+    half_m = widen * pair.half_width_m
     near = np.abs(points @ pair.normal_camera - pair.offset_m) < reach_m
-    near &= np.abs(points[:, 0] - pair.centre_camera[0]) < pair.half_width_m + 0.5 * reach_m
-    near &= np.abs(points[:, 2] - pair.centre_camera[2]) < pair.half_width_m + reach_m
+    near &= np.abs(points[:, 0] - pair.centre_camera[0]) < half_m + 0.5 * reach_m
+    near &= np.abs(points[:, 2] - pair.centre_camera[2]) < half_m + reach_m
     index = np.flatnonzero(near)
     if len(index) == 0:
         return index
@@ -149,19 +152,3 @@ def _beams_on(pair: BoardPair, T_camera_lidar: np.ndarray, reach_m: float) -> np
     gaps = np.linalg.norm(np.diff(pair.points_lidar[index], axis=0), axis=1) > _GAP_M
     runs = np.split(index, np.flatnonzero(gaps) + 1)
     return max(runs, key=len)
-
-
-def board_edges_px(
-    pair: BoardPair, beams: np.ndarray, T_camera_lidar: np.ndarray, camera: Pinhole
-) -> np.ndarray:
-    """Pixels float64 [2, 2] of the first and last beam on the board."""
-    ends = pair.points_lidar[beams[[0, -1]]]
-    uv, _ = camera.project(transform_points(T_camera_lidar, ends))
-    return uv
-
-
-def start_of(T_camera_lidar: np.ndarray) -> tuple[float, float, float, float]:
-    """(yaw rad, x m, y m, z m) of a mount, for `solve_board`."""
-    forward = inverse(make_transform(R_body_camera_level, np.zeros(3)))[:3, :3].T @ T_camera_lidar[:3, :3]
-    yaw = float(np.arctan2(forward[1, 0], forward[0, 0]))
-    return yaw, float(T_camera_lidar[0, 3]), float(T_camera_lidar[1, 3]), float(T_camera_lidar[2, 3])

@@ -1,0 +1,84 @@
+"""Upright edges of a board: where the picture shows them, and where the beams on it end.
+
+Planes alone give the calibration; edges were not used for it, and judge it. A beam whose spot half misses
+the board still comes back from it: boards look wider to a lidar by the same angle at both edges, which the
+median over all edges takes off. What remains is half a beam's spacing at best.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from common.camera import Pinhole, Undistorter
+from common.geometry import transform_points
+from services.fusion.calibration.board import BoardPair
+
+_WINDOW_PX = 25
+_ACROSS_PX = 3
+_LEAST_STEP = 12.0  # grey values between board and background
+
+
+@dataclass(frozen=True)
+class EdgeErrors:
+    """Ends of the beams on boards against the boards' edges."""
+
+    errors_px: np.ndarray  # float64 [edges]: how far the beams reach beyond the edge, less the spot
+    spot_px: float  # how much wider boards look at each edge
+
+    @property
+    def median_px(self) -> float:
+        return float(np.median(np.abs(self.errors_px))) if len(self.errors_px) else float("nan")
+
+
+def picture_edges(grey: np.ndarray, camera: Pinhole, uv_px: np.ndarray) -> np.ndarray:
+    """Columns float64 [2] of the undistorted picture at which the board ends, along its beams; NaN = unseen.
+
+    `uv_px` [N, 2] are the beams on the board as the pinhole projects them, in any order.
+    """
+    flat = Undistorter(camera)(cv2.cvtColor(grey, cv2.COLOR_GRAY2RGB))[..., 0].astype(np.float32)
+    uv = uv_px[np.argsort(uv_px[:, 0])]
+    slope, row = np.polyfit(uv[:, 0], uv[:, 1], 1)
+    out = np.full(2, np.nan)
+    for side, end in enumerate((uv[0, 0], uv[-1, 0])):
+        u = np.arange(round(end) - _WINDOW_PX, round(end) + _WINDOW_PX + 1).astype(np.float32)
+        profile = np.zeros(len(u))
+        for across in range(-_ACROSS_PX, _ACROSS_PX + 1):
+            v = (slope * u + row + across).astype(np.float32)
+            profile += cv2.remap(flat, u[None], v[None], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[0]
+        profile = cv2.GaussianBlur(profile[None] / (2 * _ACROSS_PX + 1), (0, 0), 1.0)[0]
+        inside = (u >= 1) & (u <= camera.width_px - 2)
+        fall = np.gradient(profile) * (1.0 if side == 0 else -1.0)  # the board is the brighter side
+        fall[~inside] = 0.0
+        k = int(np.argmax(fall[1:-1])) + 1
+        step = abs(float(profile[min(k + 4, len(u) - 1)] - profile[max(k - 4, 0)]))
+        bend = fall[k - 1] + fall[k + 1] - 2.0 * fall[k]
+        if step > _LEAST_STEP and bend < 0.0:
+            out[side] = u[k] + 0.5 * (fall[k - 1] - fall[k + 1]) / bend
+    return out
+
+
+def edge_errors(
+    pairs: list[BoardPair], on_board: tuple[np.ndarray, ...], edges_px: list[np.ndarray],
+    T_camera_lidar: np.ndarray, pinhole: Pinhole,
+) -> EdgeErrors:  # fmt: skip
+    """How far the outermost beams on each board end from the edges that its picture shows.
+
+    Args:
+        pairs: boards with their scans.
+        on_board: indices of the beams on each board (`BoardCalibration.on_board`).
+        edges_px: of each pair, from `picture_edges` (float64 [2], NaN = unseen).
+        T_camera_lidar: the mount that is judged.
+        pinhole: the camera without distortion.
+    """
+    outwards = []
+    for pair, beams, edge in zip(pairs, on_board, edges_px):
+        if len(beams):
+            u = pinhole.project(transform_points(T_camera_lidar, pair.points_lidar[beams]))[0][:, 0]
+            outwards += [edge[0] - u.min(), u.max() - edge[1]]
+    errors = np.array(outwards)
+    errors = errors[np.isfinite(errors)]
+    spot = float(np.median(errors)) if len(errors) else float("nan")
+    return EdgeErrors(errors - spot, spot)
