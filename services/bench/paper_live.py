@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import secrets
 import threading
 import time
@@ -46,6 +47,7 @@ class Seen:
     chunks: dict[int, Any] = field(default_factory=dict)  # the newest of each anchor
     previews: list[tuple[int, np.ndarray, bytes]] = field(default_factory=list)  # stamp, T_map_camera, JPEG
     statuses: list[Any] = field(default_factory=list)
+    refusals: dict[str, int] = field(default_factory=dict)  # why there was no pose or depth -> how often
     undecodable: int = 0
 
 
@@ -83,6 +85,13 @@ class Witness:
         self.seen.poses.append((m.stamp_ns, self._T_map_odom @ m.T_odom_body, m.status, m.metric))
         if m.status == "ok":
             self.seen.pose_at_ns[m.stamp_ns] = letter.header.publish_ns
+        else:
+            self._count_refusal(f"pose, {m.status}: {m.detail}")
+
+    def _count_refusal(self, why: str) -> None:
+        """Numbers in the sentence do not make another reason."""
+        reason = re.sub(r"-?\d+(\.\d+)?", "#", why)
+        self.seen.refusals[reason] = self.seen.refusals.get(reason, 0) + 1
 
     def _depth_estimate(self, letter: Letter, m: Any) -> None:
         self.seen.estimates[m.stamp_ns] = m.status
@@ -92,6 +101,8 @@ class Witness:
 
     def _fusion_depth(self, letter: Letter, m: Any) -> None:
         self.seen.fused[m.stamp_ns] = (letter.header.publish_ns, m.status, m.keyframe)
+        if m.status != "ok":
+            self._count_refusal(f"depth: {m.status}")
         if m.stamp_ns in self._keep_at and m.status == "ok":
             self.seen.kept_fused[m.stamp_ns] = m.depth_m[::DEPTH_STEP, ::DEPTH_STEP].astype(np.float16)
 

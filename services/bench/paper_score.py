@@ -115,7 +115,7 @@ def speed(seen: Seen, costs: Costs, cores: int) -> dict[str, Any]:
         "peak_rss_mb": costs.peak_rss_mb, "link_bytes": seen.link_bytes,
         "keyframe_latency_p50_ms": float(np.percentile(latency, 50)) if latency else None,
         "keyframe_latency_p95_ms": float(np.percentile(latency, 95)) if latency else None,
-        "dropped": costs.dropped, "lost": costs.lost, "drained": costs.drained,
+        "refusals": seen.refusals, "dropped": costs.dropped, "lost": costs.lost, "drained": costs.drained,
         "status_lost_share": float(np.mean([status != "ok" for _, _, status, _ in seen.poses]))
         if seen.poses else 1.0,
         "metric": all(metric for _, _, status, metric in seen.poses if status == "ok"),

@@ -71,6 +71,7 @@ class FusionNode(Node):
 
     def configure(self) -> None:
         self._fusion: Fusion | SingleCorrection | None = None
+        self._check: StartupCheck | None = None  # of the calibration; only `field` has one
         self._pictures: deque[Image] = deque(maxlen=_PICTURES)
         self._estimates: deque[DepthEstimate] = deque(maxlen=_PICTURES)
         self._unmarked: deque[TimedScan] = deque()  # scans whose movers are not known yet
@@ -137,7 +138,7 @@ class FusionNode(Node):
             self._history.add_scan(scan)
             self._fusion.add_scan(self._history.scan_points_a(scan))
             self._keep_for_check(scan)
-        if not self._check.done:
+        if self._check is not None and not self._check.done:
             self._check.add_pose(odometry.stamp_ns, odometry.T_odom_body)
             job = self._check.job()
             if job is not None:
@@ -147,7 +148,7 @@ class FusionNode(Node):
 
     def _keep_for_check(self, scan: TimedScan) -> None:
         T_odom_body = self._history.pose(scan.middle_ns)
-        if not self._check.done and T_odom_body is not None:
+        if self._check is not None and not self._check.done and T_odom_body is not None:
             points, _ = scan_points(
                 scan.ranges_m,
                 scan.angle_min_rad,
@@ -170,7 +171,8 @@ class FusionNode(Node):
         if self.calibration is not None:
             calibration = self.calibration.line
         else:
-            calibration = "" if self._check.done else self._check.progress
+            running = self._check is not None and not self._check.done
+            calibration = self._check.progress if running else ""
         self.detail = "; ".join(text for text in (overtaken, calibration) if text)
 
     def on_camera_image(self, image: Image) -> Outputs:
@@ -212,7 +214,8 @@ class FusionNode(Node):
         if T_odom_body is None:
             yield "fusion/depth", _refused(image.stamp_ns, "no pose at the time of the picture")
             return
-        self._check.add_picture(image.stamp_ns, rgb, T_odom_body)
+        if self._check is not None:
+            self._check.add_picture(image.stamp_ns, rgb, T_odom_body)
         beams, age_ns = self._history.beams(image.stamp_ns)
         usable = estimate.status == "ok" and estimate.kind != "none"
         frame = Frame(
