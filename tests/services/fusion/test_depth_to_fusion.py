@@ -129,3 +129,93 @@ def test_a_picture_that_shows_nothing_gives_no_depth(image, reason):
     assert topic == "fusion/depth"
     assert fused.depth_m.size == 0
     assert any(word in fused.status for word in reason.split("|")), fused.status
+
+
+def _node(**config):
+    node = FusionNode(FusionNode.Config(**config))
+    node.configure()
+    return node
+
+
+def _moment(k, image, ranges=2.0, values=None, status="ok"):
+    """Scan, pose, picture and estimate of the k-th tenth of a second, the body 5 cm on each time."""
+    stamp = (10 + k) * S
+    scan = _scan(stamp).model_copy(update={"ranges_m": np.full(300, ranges, np.float32)})
+    T = np.eye(4)
+    T[0, 3] = 0.05 * k
+    odometry = Odometry(stamp_ns=stamp, T_odom_body=T, covariance=np.eye(3))
+    taken = image.model_copy(update={"stamp_ns": stamp - S // 2})
+    kind = "none" if values is None else "metric"
+    values = np.zeros((0, 0), np.float32) if values is None else values
+    estimate = DepthEstimate(stamp_ns=taken.stamp_ns, source="none", kind=kind, values=values, status=status)
+    return scan, odometry, taken, estimate
+
+
+def _drive(node, moments):
+    out = _feed(node, RIG, _scan(8 * S), _odometry(8 * S))
+    for moment in moments:
+        out += _feed(node, *moment)
+    # A last pose, so that the last picture can be placed.
+    out += _feed(node, _odometry(30 * S).model_copy(update={"T_odom_body": moments[-1][1].T_odom_body}))
+    return [message for topic, message in out if topic == "fusion/depth"]
+
+
+def _live_image(k):
+    rgb = np.random.default_rng(100 + k).integers(0, 255, (480, 640, 3)).astype(np.uint8)
+    return _image(0).model_copy(update={"data": rgb.reshape(-1)})
+
+
+def _nothing_false(messages):
+    """Whatever is refused carries no depth; whatever carries depth says ok."""
+    for message in messages:
+        assert (message.status == "ok") == (message.depth_m.size > 0)
+        assert message.depth_m.size == 0 or np.isfinite(message.depth_m).any()
+
+
+def test_no_beams_in_view_is_said_and_gives_no_depth():
+    messages = _drive(_node(), [_moment(k, _live_image(k), ranges=np.inf) for k in range(3)])
+    assert messages
+    assert all("no beams in view" in m.status for m in messages)
+    _nothing_false(messages)
+
+
+def test_a_frozen_camera_is_said_once_the_robot_has_moved():
+    picture = _live_image(0)
+    messages = _drive(_node(), [_moment(k, picture) for k in range(8)])
+    assert "frozen" in messages[-1].status
+    _nothing_false(messages)
+
+
+@pytest.mark.parametrize("values", [np.nan, 0.0])
+def test_a_network_that_answers_rubbish_is_not_asked(values):
+    """Its estimate comes with a reason; geometry alone carries the picture, without its numbers."""
+    rubbish = np.full((480, 640), values, np.float32)
+    node = _node()
+    messages = _drive(
+        node,
+        [_moment(k, _live_image(k), values=rubbish, status="the network returned rubbish") for k in range(3)],
+    )
+    good = _drive(_node(), [_moment(k, _live_image(k)) for k in range(3)])
+    assert len(messages) == len(good) > 0
+    for with_rubbish, without in zip(messages, good):
+        assert with_rubbish.status == without.status
+        assert np.array_equal(with_rubbish.depth_m, without.depth_m, equal_nan=True)
+    _nothing_false(messages)
+
+
+@pytest.mark.parametrize("values", [np.nan, 0.0])
+def test_rubbish_that_calls_itself_ok_does_no_harm_either(values):
+    rubbish = np.full((480, 640), values, np.float32)
+    messages = _drive(_node(), [_moment(k, _live_image(k), values=rubbish) for k in range(3)])
+    good = _drive(_node(), [_moment(k, _live_image(k)) for k in range(3)])
+    for with_rubbish, without in zip(messages, good):
+        assert np.array_equal(with_rubbish.depth_m, without.depth_m, equal_nan=True)
+
+
+def test_the_calibration_check_is_told_beside_the_health():
+    node = _node()
+    _drive(node, [_moment(k, _live_image(k)) for k in range(3)])
+    assert "calibration not checked yet" in node.detail
+    off = _node(check_pairs=0)
+    _drive(off, [_moment(k, _live_image(k)) for k in range(3)])
+    assert "calibration" not in off.detail
