@@ -44,17 +44,37 @@ def confirmed(
     range_m: np.ndarray,  # float64 [N] on a regular grid, NaN = none
     before_m: np.ndarray,  # float64 [N]: the same directions one turn before, NaN = none
 ) -> np.ndarray:
-    """bool [N]: ranges that two neighbours or the turn before agree with, within 2 cm + 0.5 %.
+    """bool [N]: ranges that their neighbours or the turn before agree with, within 2 cm + 0.5 %.
 
-    Along a straight wall 1/r is nearly linear in the angle, so that neighbours predict a range.
+    Along a straight wall 1/r is nearly linear in the angle: the two neighbours predict a range between them,
+    and three in a row on one side, if they lie on a line themselves, the next.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         inverse = 1.0 / range_m
-        padded = np.concatenate([np.full(2, np.nan), inverse, np.full(2, np.nan)])
-        left2, left, right, right2 = padded[:-4], padded[1:-3], padded[3:-1], padded[4:]
-        predictions = (0.5 * (left + right), 2.0 * left - left2, 2.0 * right - right2)
-        agrees = np.abs(range_m - before_m) <= _TOLERANCE_M + _TOLERANCE * range_m
-        for prediction in predictions:
-            wanted = np.where(prediction > 0.0, 1.0 / prediction, np.nan)
-            agrees |= np.abs(range_m - wanted) <= _TOLERANCE_M + _TOLERANCE * range_m
+        between = _agree(range_m, 0.5 * (_moved(inverse, 1) + _moved(inverse, -1)))
+        agrees = between | (np.abs(range_m - before_m) <= _allowed_m(range_m))
+        for side in (1, -1):
+            ahead = 2.0 * _moved(inverse, side) - _moved(inverse, 2 * side)
+            in_line = _moved(between, 2 * side) == 1.0
+            agrees |= _agree(range_m, ahead) & in_line
     return agrees
+
+
+def _allowed_m(range_m: np.ndarray) -> np.ndarray:
+    return _TOLERANCE_M + _TOLERANCE * range_m
+
+
+def _agree(range_m: np.ndarray, inverse: np.ndarray) -> np.ndarray:
+    """Whether ranges are as predicted by their inverse, 1/m."""
+    wanted_m = np.where(inverse > 0.0, 1.0 / inverse, np.nan)
+    return np.abs(range_m - wanted_m) <= _allowed_m(range_m)
+
+
+def _moved(values: np.ndarray, by: int) -> np.ndarray:
+    """float64 [N]: values[i - by] at i; NaN beyond the ends."""
+    found = np.full(len(values), np.nan)
+    if by > 0:
+        found[by:] = values[:-by]
+    else:
+        found[:by] = values[-by:]
+    return found

@@ -99,23 +99,27 @@ class LdrobotDriver(Driver):
 
     def restart(self) -> None:
         super().restart()
-        self._framer = Framer(PACKET_BYTES, begins, whole, self.counters)
+        self._framer = Framer(PACKET_BYTES, begins, whole, self.counters, followed=True)
         self._chain = StartChain()
+        self._pending_at_ns = 0
         self._time = Unwrapper(_TIME_MODULUS_MS, 1e3)
 
     def feed(self, data: bytes, at_ns: int) -> list[StampedScan]:
         parts = []
-        for packet in self._framer.feed(data):
+        waiting, arrived_ns, taken = self._framer.pending, self._pending_at_ns, 0
+        for number, packet in enumerate(self._framer.feed(data)):
+            came_ns = arrived_ns if number < waiting else at_ns
+            taken = number + 1
             self.noise.saw(packet is not None)
             if packet is None:
                 self._chain.missed()
                 continue
             values = parse(packet)
-            last_s = self._time(values.time_ms % _TIME_MODULUS_MS, at_ns) / 1e3
+            last_s = self._time(values.time_ms % _TIME_MODULUS_MS, came_ns) / 1e3
             in_place = self._chain.takes(values.start_deg)
             possible = 0.0 < values.step_deg < 3.0 and values.speed_deg_s > 0.0
             delay_ns = round(PACKET_BYTES * self._byte_s * 1e9)
-            if not (in_place and possible and self.clock.hear(last_s, at_ns - delay_ns)):
+            if not (in_place and possible and self.clock.hear(last_s, came_ns - delay_ns)):
                 continue  # its samples are missing in the turn and counted there
             parts.append(
                 Samples(
@@ -125,4 +129,6 @@ class LdrobotDriver(Driver):
                     time_s=spread(last_s, values.step_deg / values.speed_deg_s, POINTS),
                 )
             )
+        if self._framer.pending > max(waiting - taken, 0):
+            self._pending_at_ns = at_ns
         return self.turns(parts)

@@ -46,6 +46,9 @@ class _LidarNode(Node):
     def message(self, scan: StampedScan) -> Scan:
         """A turn as it goes out. NaN: not measured; no device here tells "nothing there" from "not seen"."""
         turn, sign = scan.revolution, -1.0 if self.config.upside_down else 1.0
+        range_max_m = self.config.range_max_m or scan.range_max_m
+        # Consumers take what lies beyond for free space; a device has no business to say so.
+        ranges_m = np.where(turn.range_m <= range_max_m, turn.range_m, np.float32(np.nan))
         return Scan(
             stamp_ns=scan.stamp_ns,
             angle_min_rad=sign * turn.angle_min_rad,
@@ -53,8 +56,8 @@ class _LidarNode(Node):
             time_increment_s=turn.time_increment_s,
             scan_time_s=turn.scan_time_s,
             range_min_m=self.config.range_min_m or scan.range_min_m,
-            range_max_m=self.config.range_max_m or scan.range_max_m,
-            ranges_m=np.asarray(turn.range_m, np.float32),
+            range_max_m=range_max_m,
+            ranges_m=ranges_m.astype(np.float32),
             intensities=np.asarray(turn.intensity, np.float32),
         )
 

@@ -32,7 +32,8 @@ class RplidarStream:
             rp.HQ: (rp.hq_begins, rp.hq_whole, 2),
         }
         begins, whole, in_a_row = checks[kind]
-        self._framer = Framer(rp.PACKET_BYTES[kind], begins, whole, counters, in_a_row)
+        followed = kind in (rp.CAPSULED, rp.ULTRA, rp.DENSE)  # whose checksum is weak
+        self._framer = Framer(rp.PACKET_BYTES[kind], begins, whole, counters, in_a_row, followed)
         self._counters = counters
         self._skipped = counters.skipped_bytes
         self._chain = StartChain()
@@ -44,8 +45,8 @@ class RplidarStream:
 
     @property
     def newest_s(self) -> float:
-        """Device time of the newest sample."""
-        return self._taken * self._sample_s
+        """Device time of the newest sample that has come, also in a packet that is not yet believed."""
+        return (self._taken + self._framer.pending * self._samples) * self._sample_s
 
     def feed(self, data: bytes) -> list[Samples | None]:
         """Samples that `data` completes; None for each packet that was bad."""

@@ -178,8 +178,8 @@ def test_packets_are_found_behind_any_rubbish_in_any_pieces(garbage, piece, coun
     from services.lidar.framing import Counters, Framer
 
     counters = Counters()
-    framer = Framer(ldrobot.PACKET_BYTES, ldrobot.begins, ldrobot.whole, counters)
-    data = garbage + LD06_EXAMPLE * count
+    framer = Framer(ldrobot.PACKET_BYTES, ldrobot.begins, ldrobot.whole, counters, followed=True)
+    data = garbage + LD06_EXAMPLE * count + LD06_EXAMPLE[:2]
     found = []
     for i in range(0, len(data), piece):
         found += framer.feed(data[i : i + piece])
