@@ -16,7 +16,7 @@ from common.history import History, TimedScan
 from common.messages import DepthEstimate, Image, Odometry, Rig, Scan
 from common.node import Input, Node, Outputs
 from common.picture import decode_rgb
-from services.depth.source import NEED_BEAMS, DepthSource, View, make_source
+from services.depth.source import BLIND, NEED_BEAMS, DepthSource, View, make_source
 
 log = logging.getLogger("beamsplat.depth")
 
@@ -93,9 +93,7 @@ class DepthNode(Node):
             return
         self.detail = f"{self.overtaken} pictures overtaken" if self.overtaken else ""
         try:
-            rgb = self._undistort(
-                decode_rgb(image.data, image.encoding, image.width_px, image.height_px, image.step_bytes)
-            )
+            rgb = self._picture(image)
         except (UserError, ValueError) as error:
             yield self._refusal(image.stamp_ns, str(error))
             return
@@ -112,6 +110,19 @@ class DepthNode(Node):
             DepthEstimate(
                 stamp_ns=image.stamp_ns, source=self.config.source, kind=estimate.kind, values=estimate.values
             ),
+        )
+
+    def _picture(self, image: Image) -> np.ndarray:
+        """uint8 [H, W, 3], undistorted; black for a source that does not look at it.
+
+        Raises:
+            UserError, ValueError: it does not decode, or is of another size than the calibration.
+        """
+        shape = self._undistort.pinhole.shape
+        if self.config.source in BLIND and (image.height_px, image.width_px) == shape:
+            return np.broadcast_to(np.uint8(0), (*shape, 3))
+        return self._undistort(
+            decode_rgb(image.data, image.encoding, image.width_px, image.height_px, image.step_bytes)
         )
 
     def _refusal(self, stamp_ns: int, status: str, kind: str = "none") -> tuple[str, DepthEstimate]:

@@ -69,6 +69,9 @@ SOURCES: dict[str, str] = {
 # These look at the beams of a picture's time; the others need not wait for them.
 NEED_BEAMS = frozenset({"stixel"})
 
+# These never look at the picture itself: nobody needs to decode it for them.
+BLIND = frozenset({"stixel", "recorded", "none"})
+
 
 def make_source(name: str, options: Mapping[str, Any] | None = None) -> DepthSource:
     """The source called `name`.

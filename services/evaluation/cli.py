@@ -21,9 +21,7 @@ if TYPE_CHECKING:
 BagArgument = Annotated[Path, typer.Argument(help="A bag or recording, or a folder with bag/ in it.")]
 PosesOption = Annotated[
     Path | None,
-    typer.Option(
-        help="TUM file of T_map_body; default: poses in the recording, else our lidar SLAM's."
-    ),
+    typer.Option(help="TUM file of T_map_body; default: poses in the recording, else our lidar SLAM's."),
 ]
 SourceOption = Annotated[str, typer.Option(help="Depth source, by name.")]
 SetOption = Annotated[
