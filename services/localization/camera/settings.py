@@ -47,7 +47,7 @@ class CameraTrackerSettings:
     max_gaussians: int = 200_000
     window: int = 6  # newest keyframes, of which every second optimisation step takes one
     steps_per_picture: int = 2
-    first_steps: int = 30  # on the first keyframe
+    first_steps: int = 8  # on the first keyframe: the robot drives on meanwhile
     depth_weight: float = 0.2
     mean_rate_m: float = 2e-4
     log_scale_rate: float = 3e-3

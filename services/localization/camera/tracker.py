@@ -150,7 +150,9 @@ class CameraTracker:
         s = self.settings
         if found.points < s.least_points:
             return f"lost: the picture and the map share {found.points} points; {s.least_points} are needed"
-        least = s.least_inliers if self._missed == 0 else 0.5 * (1.0 + s.least_inliers)
+        # A keyframe found again must be the right one; after a restart there is only the newest to be found.
+        searching = 0 < self._missed <= s.restart_after
+        least = 0.5 * (1.0 + s.least_inliers) if searching else s.least_inliers
         if found.inliers < least:
             return f"lost: only {found.inliers:.0%} of the map's points look like the picture"
         if found.correlation < s.least_correlation:
@@ -229,8 +231,12 @@ class CameraTracker:
             return "ok"
         if self.metric:
             return "its unit is not that of the map"
-        if self._rounds < ROUNDS:
+        if self._rounds < ROUNDS and self._missed <= self.settings.restart_after:
             return self._settle(tracked)
+        if self._rounds < ROUNDS:  # lost before the unit had settled: from the beginning
+            self.splats.close()
+            self.splats, self._rounds = SplatMap(self.camera, self.settings), 0
+            return self.add_without_depth(stamp_ns)
         if not self._keyframe_is_due(tracked.alignment):
             return "no keyframe is due"
         shown = self._shown_depth(tracked.alignment)

@@ -222,3 +222,16 @@ def test_house_with_recorded_depth(shared_dir):
             errors.append(off(T_world_body, T_world_map @ result.T_map_body)[0])
     tracker.close()
     assert np.sqrt(np.mean(np.square(errors))) < 0.03
+
+
+def test_lost_before_the_unit_has_settled_it_begins_anew():
+    settings = CameraTrackerSettings(width_px=160, first_steps=2, steps_per_picture=0, restart_after=1)
+    tracker, _ = run(drive(2), settings=settings, with_depth=False)
+    statuses = []
+    for i in range(30, 36):
+        statuses.append(tracker.track(i, shot(body(-1.5, 0.8, 2.4))[0]).status)
+        tracker.add_without_depth(i)
+    tracker.close()
+    assert statuses[0] == "lost"
+    assert statuses[-1] == "ok"
+    assert len(tracker.splats.keyframes) == 1
