@@ -14,8 +14,8 @@ from services.bench import cli as bench_cli
 from services.depth import models_cli
 from services.evaluation import calibrate_cli
 from services.evaluation import cli as depth_cli
+from services.evaluation.relocalize_cli import eval_relocalize
 from services.localization import cli as localization_cli
-from services.localization.eval_relocalize import eval_relocalize
 from services.mapping import cli as mapping_cli
 from services.replay import cli as replay_cli
 from services.simulator import cli as simulator_cli
