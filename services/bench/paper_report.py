@@ -30,6 +30,7 @@ _TABLES: tuple[tuple[str, tuple[tuple[str, str, str], ...]], ...] = (
         ("together", "position_rmse_m", "position_rmse_m"), ("ATE", "ate_first_pose_rmse_m", ""),
         ("SE(3)-aligned", "ate_se3_rmse_m", ""), ("Sim(3)-aligned", "ate_sim3_rmse_m", ""),
         ("its scale", "sim3_scale", ""), ("unit is the metre", "metric", ""),
+        ("poses", "poses", ""),
     )),
     ("Table II. Orientation RMSE (rad)", (
         ("roll", "orientation_rmse_rpy_rad.0", ""), ("pitch", "orientation_rmse_rpy_rad.1", ""),
