@@ -30,7 +30,10 @@ def test_rubbish_and_missing_returns_are_left_out():
 
 
 @given(
-    st.floats(-0.5, 0.5), st.floats(-0.5, 0.5), st.floats(-0.6, 0.6), st.floats(-3, 3),
+    st.floats(-0.5, 0.5),
+    st.floats(-0.5, 0.5),
+    st.floats(-0.6, 0.6),
+    st.floats(-3, 3),
 )
 def test_beams_of_a_moving_robot_hit_the_same_points_of_the_world(dx, dy, turn, heading):
     T0 = se2_to_se3(np.array([1.0, 2.0, heading]))
@@ -40,9 +43,12 @@ def test_beams_of_a_moving_robot_hit_the_same_points_of_the_world(dx, dy, turn, 
     rng = np.random.default_rng(0)
     world = np.column_stack([rng.uniform(-5, 5, (20, 2)), np.full(20, 0.18)])
     fraction = np.linspace(0, 1, 20)
-    seen = np.array([
-        transform_points(inverse(interpolate(T0, T1, f) @ T_body_lidar), p[None])[0] for f, p in zip(fraction, world)
-    ])
+    seen = np.array(
+        [
+            transform_points(inverse(interpolate(T0, T1, f) @ T_body_lidar), p[None])[0]
+            for f, p in zip(fraction, world)
+        ]
+    )
     moved = move_beams(seen, fraction, T0, T1, T_image, T_body_lidar)
     assert np.allclose(transform_points(T_image, moved), world, atol=1e-9)
 

@@ -8,7 +8,9 @@ from hypothesis import strategies as st
 from common.camera import Pinhole, Undistorter
 
 PLAIN = Pinhole(530.0, 520.0, 319.5, 239.5, 640, 480)
-PLUMB = Pinhole(519.27, 518.89, 331.11, 229.43, 640, 480, "plumb_bob", (0.1142, 0.1934, -0.0027, 0.0037, -1.0954))
+PLUMB = Pinhole(
+    519.27, 518.89, 331.11, 229.43, 640, 480, "plumb_bob", (0.1142, 0.1934, -0.0027, 0.0037, -1.0954)
+)
 FISHEYE = Pinhole(300.0, 300.0, 320.0, 240.0, 640, 480, "equidistant", (0.02, -0.01, 0.003, -0.001))
 
 

@@ -18,7 +18,9 @@ def _file(tmp_path, text):
 
 
 def test_a_deployment_with_overrides(tmp_path):
-    path = _file(tmp_path, 'robot = "r2"\n[nodes.replay]\ndata = "bag"\n[router]\nlisten = ["tcp/127.0.0.1:1"]\n')
+    path = _file(
+        tmp_path, 'robot = "r2"\n[nodes.replay]\ndata = "bag"\n[router]\nlisten = ["tcp/127.0.0.1:1"]\n'
+    )
     deployment = load_deployment(
         path, ("replay.data=other bag", "replay.rate=2.5", "rate=4", 'router.listen=["tcp/[::1]:9"]')
     )

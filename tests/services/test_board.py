@@ -16,7 +16,9 @@ def _text(table):
 
 
 def _health(node, sent, lost=0, state="active", **inputs):
-    takes = InputHealth(topic="lidar/scan", received=sent, dropped=3, lost=lost, undecodable=0, stale=0, age_ms=1.5)
+    takes = InputHealth(
+        topic="lidar/scan", received=sent, dropped=3, lost=lost, undecodable=0, stale=0, age_ms=1.5
+    )
     return Health(
         stamp_ns=1, node=node, instance="ab" * 8, epoch=1, state=state, detail="warm and well",
         inputs=(takes,) if node == "localization" else (),

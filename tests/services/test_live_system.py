@@ -217,7 +217,9 @@ def test_queries_are_answered_by_the_node(deployment):
         assert [r.optimisation for r in replies] == [41]
         with pytest.raises(UserError, match="refused count: invalid literal"):
             list(ask(session, "test", "localization", "count", {"add": "much"}, 5.0))
-        assert [r.optimisation for r in ask(session, "test", "localization", "count", {}, 5.0)] == [0]  # it lives
+        assert [r.optimisation for r in ask(session, "test", "localization", "count", {}, 5.0)] == [
+            0
+        ]  # it lives
         with pytest.raises(UserError, match="nobody answers"):
             list(ask(session, "test", "depth", "count", {}, 5.0))
 
