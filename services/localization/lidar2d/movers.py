@@ -9,6 +9,9 @@ from numba import njit
 
 FREE_SCANS = 5  # so many keynodes must have looked through a cell
 CLEARANCE_M = 0.12  # a return this close to a known surface belongs to it
+SOLID = 4  # a surface is one while it is hit at least once for so many beams that went through
+BODY_M = 1.2  # what is no wider than this moves as a whole,
+BODY_SHARE = 0.25  # if so many of its returns do
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
@@ -35,7 +38,11 @@ def contradicts_free_space(
             continue
         k = nearest[r, q]
         if k >= 0 and math.hypot(x - means[k, 0], y - means[k, 1]) < CLEARANCE_M:
-            continue
+            # What a mover left behind before it was found out has been looked through since.
+            kr, kq = math.floor(means[k, 1] / cell_m) - row0, math.floor(means[k, 0] / cell_m) - col0
+            if 0 <= kr < hits.shape[0] and 0 <= kq < hits.shape[1]:
+                if SOLID * int(hits[kr, kq]) >= int(misses[kr, kq]):
+                    continue
         free = True
         for rr in range(r - 1, r + 2):
             for qq in range(q - 1, q + 2):
@@ -77,3 +84,24 @@ def grow_along_beams(
                 grown += 1
             else:
                 run = 0
+    _whole_bodies(points, beams, gap_m, out)
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _whole_bodies(points: np.ndarray, beams: np.ndarray, gap_m: float, out: np.ndarray) -> None:
+    """Small connected things of which a good part moves do so altogether."""
+    m = out.shape[0]
+    first = 0
+    for i in range(1, m + 1):
+        if i < m and (
+            abs(beams[i] - beams[i - 1]) <= 2
+            and math.hypot(points[i, 0] - points[i - 1, 0], points[i, 1] - points[i - 1, 1]) < gap_m
+        ):
+            continue
+        width = math.hypot(points[i - 1, 0] - points[first, 0], points[i - 1, 1] - points[first, 1])
+        moving = 0
+        for k in range(first, i):
+            moving += out[k]
+        if width < BODY_M and moving >= max(2.0, BODY_SHARE * (i - first)):
+            out[first:i] = True
+        first = i
