@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 OUT ?= out/demo
 STAMP := $(VENV)/.installed
 
-.PHONY: setup demo test quick soak bench bench-slam lint clean
+.PHONY: setup demo test slow soak bench bench-slam lint clean
 
 setup: $(STAMP)
 
@@ -33,10 +33,11 @@ demo: setup
 	$(BIN)/beamsplat demo --out $(OUT)
 
 test: setup
-	$(BIN)/python -m pytest -m "not soak"
+	$(BIN)/python -m pytest -m "not soak and not slow" --durations=12
 
-quick: setup
-	$(BIN)/python -m pytest -m "not soak and not slow"
+# Whole drives and whole systems, minutes in all; most of them need recordings with truth.
+slow: setup
+	$(BIN)/python -m pytest -m slow
 
 soak: setup
 	$(BIN)/python -m pytest -m soak
