@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -26,6 +27,14 @@ class TimedScan:
     range_max_m: float
     ranges_m: np.ndarray  # float32 [N]
     moving: np.ndarray | None = None  # bool [N]
+
+    @classmethod
+    def of(cls, scan: Any) -> TimedScan:
+        """A Scan message's times and ranges."""
+        return cls(
+            scan.stamp_ns, scan.angle_min_rad, scan.angle_increment_rad, scan.time_increment_s,
+            scan.range_min_m, scan.range_max_m, scan.ranges_m,
+        )  # fmt: skip
 
     @property
     def last_ns(self) -> int:

@@ -56,6 +56,16 @@ def store(typingctx: Any, array: types.Array, at: types.Integer, value: F32Type)
     return types.void(array, types.int64, F32), emit
 
 
+def _scattered(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
+    """Pointers to array[base + index[at + lane]], from the arguments (array, base, index, at, ...)."""
+    lanes = _aligned_load(builder, _address(context, builder, sig.args[2], args[2], args[3]), IVEC)
+    start = _address(context, builder, sig.args[0], args[0], args[1])
+    pointers = builder.gep(start, [lanes], inbounds=False, source_etype=FLOAT)
+    kind = ir.VectorType(start.type, LANES)
+    pointers.type = kind
+    return pointers
+
+
 @intrinsic
 def gather(
     typingctx: Any, array: types.Array, base: types.Integer, index: types.Array, at: types.Integer
@@ -63,13 +73,9 @@ def gather(
     """Lanes array[base + index[at]], array[base + index[at + 1]], ...; `index` is contiguous int32."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
-        lanes = _aligned_load(builder, _address(context, builder, sig.args[2], args[2], args[3]), IVEC)
-        start = _address(context, builder, sig.args[0], args[0], args[1])
-        pointers = builder.gep(start, [lanes], inbounds=False, source_etype=FLOAT)
-        kind = ir.VectorType(start.type, LANES)
-        pointers.type = kind
+        pointers = _scattered(context, builder, sig, args)
         gathered = cgutils.get_or_insert_function(
-            builder.module, ir.FunctionType(VEC, [kind, INT, MASK, VEC]),
+            builder.module, ir.FunctionType(VEC, [pointers.type, INT, MASK, VEC]),
             f"llvm.masked.gather.v{LANES}f32.v{LANES}p0",
         )  # fmt: skip
         every = ir.Constant(MASK, [1] * LANES)
@@ -86,18 +92,14 @@ def scatter_some(
     """array[base + index[at + lane]] = value for the first `count` lanes; `index` is contiguous int32."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
-        lanes = _aligned_load(builder, _address(context, builder, sig.args[2], args[2], args[3]), IVEC)
-        start = _address(context, builder, sig.args[0], args[0], args[1])
-        pointers = builder.gep(start, [lanes], inbounds=False, source_etype=FLOAT)
-        kind = ir.VectorType(start.type, LANES)
-        pointers.type = kind
+        pointers = _scattered(context, builder, sig, args)
         number = builder.insert_element(
             ir.Constant(IVEC, ir.Undefined), builder.trunc(args[5], INT), ir.Constant(INT, 0)
         )
         number = shuffle(builder, number, number, [0] * LANES)
         used = builder.icmp_signed("<", ir.Constant(IVEC, list(range(LANES))), number)
         scattered = cgutils.get_or_insert_function(
-            builder.module, ir.FunctionType(ir.VoidType(), [VEC, kind, INT, MASK]),
+            builder.module, ir.FunctionType(ir.VoidType(), [VEC, pointers.type, INT, MASK]),
             f"llvm.masked.scatter.v{LANES}f32.v{LANES}p0",
         )  # fmt: skip
         builder.call(scattered, [args[4], pointers, ir.Constant(INT, 4), used])

@@ -66,7 +66,7 @@ class DepthNode(Node):
 
     def on_lidar_scan(self, scan: Scan) -> Outputs:
         if self._history is not None:
-            self._history.add_scan(timed_scan(scan))
+            self._history.add_scan(TimedScan.of(scan))
         return iter(())
 
     def on_localization_odometry(self, odometry: Odometry) -> Outputs:
@@ -131,11 +131,3 @@ class DepthNode(Node):
             stamp_ns=stamp_ns, source=self.config.source, kind=kind, values=empty, status=status
         )
         return "depth/estimate", message
-
-
-def timed_scan(scan: Scan) -> TimedScan:
-    """The library's scan of a message."""
-    return TimedScan(
-        scan.stamp_ns, scan.angle_min_rad, scan.angle_increment_rad, scan.time_increment_s,
-        scan.range_min_m, scan.range_max_m, scan.ranges_m,
-    )  # fmt: skip

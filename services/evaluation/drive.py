@@ -14,32 +14,12 @@ from common.beams import NO_BEAMS, Beams, move_beams, scan_points
 from common.camera import Pinhole, Undistorter
 from common.errors import UserError
 from common.geometry import se3_to_se2, transform_points
+from common.history import TimedScan
 from common.trajectory import Trajectory, read_tum
 from services.replay.options import SourceOptions
 from services.replay.source import open_source
 
 _REACH_NS = 200_000_000  # poses are continued this far beyond the trajectory
-
-
-@dataclass(frozen=True)
-class ScanRecord:
-    """One scan as recorded."""
-
-    stamp_ns: int
-    angle_min_rad: float
-    angle_increment_rad: float
-    time_increment_s: float
-    range_min_m: float
-    range_max_m: float
-    ranges_m: np.ndarray
-
-    @property
-    def last_ns(self) -> int:
-        return self.stamp_ns + round(self.time_increment_s * 1e9 * max(len(self.ranges_m) - 1, 0))
-
-    @property
-    def middle_ns(self) -> int:
-        return (self.stamp_ns + self.last_ns) // 2
 
 
 @dataclass
@@ -51,7 +31,7 @@ class Drive:
     T_body_camera: np.ndarray
     T_body_lidar: np.ndarray
     images: list[Any]  # messages Image
-    scans: list[ScanRecord]
+    scans: list[TimedScan]
     poses: Trajectory
     poses_name: str
     undistort: Undistorter = field(init=False)
@@ -79,7 +59,7 @@ class Drive:
         """
         return self.undistort(decode_rgb(self.images[number], str(self.path)))
 
-    def scan_near(self, stamp_ns: int) -> ScanRecord | None:
+    def scan_near(self, stamp_ns: int) -> TimedScan | None:
         """The scan whose middle is nearest in time, if within 0.15 s."""
         if len(self.scans) == 0:
             return None
@@ -91,7 +71,7 @@ class Drive:
         scan = self.scan_near(stamp_ns)
         return NO_BEAMS if scan is None else self.beams_of(scan, stamp_ns, without)
 
-    def beams_of(self, scan: ScanRecord, stamp_ns: int, without: np.ndarray | None = None) -> Beams:
+    def beams_of(self, scan: TimedScan, stamp_ns: int, without: np.ndarray | None = None) -> Beams:
         """Beams of one scan moved to a time."""
         points, index = scan_points(
             scan.ranges_m, scan.angle_min_rad, scan.angle_increment_rad, scan.range_min_m, scan.range_max_m
@@ -106,7 +86,7 @@ class Drive:
         moved = move_beams(points, fraction, first, last, then, self.T_body_lidar)
         return Beams(moved, index, np.full(len(index), 0.01))
 
-    def scan_in_map(self, scan: ScanRecord, without: np.ndarray | None = None) -> np.ndarray:
+    def scan_in_map(self, scan: TimedScan, without: np.ndarray | None = None) -> np.ndarray:
         """Returns [N, 3] of a scan in the map frame."""
         T_map_body = self.pose(scan.middle_ns)
         if T_map_body is None:
@@ -154,7 +134,7 @@ def open_drive(path: Path, poses: Path | None = None, rig: Path | None = None) -
             if topic == "camera/image":
                 images.append(message)
             elif topic == "lidar/scan":
-                scans.append(_scan_record(message))
+                scans.append(TimedScan.of(message))
             elif topic == "external/pose":
                 stamps.append(message.stamp_ns)
                 T.append(message.T_map_body)
@@ -183,7 +163,7 @@ def open_drive(path: Path, poses: Path | None = None, rig: Path | None = None) -
     )  # fmt: skip
 
 
-def slam_poses(scans: list[ScanRecord], wheels: list[tuple], T_body_lidar: np.ndarray) -> Trajectory:
+def slam_poses(scans: list[TimedScan], wheels: list[tuple], T_body_lidar: np.ndarray) -> Trajectory:
     """`T_map_body` of every scan, by the lidar SLAM after its last optimisation.
 
     Args:
@@ -213,11 +193,4 @@ def pinhole_of(camera: Any) -> Pinhole:
     return Pinhole(
         camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px, camera.width_px, camera.height_px,
         camera.distortion_model, tuple(camera.distortion),
-    )  # fmt: skip
-
-
-def _scan_record(scan: Any) -> ScanRecord:
-    return ScanRecord(
-        scan.stamp_ns, scan.angle_min_rad, scan.angle_increment_rad, scan.time_increment_s,
-        scan.range_min_m, scan.range_max_m, scan.ranges_m,
     )  # fmt: skip

@@ -110,12 +110,7 @@ class FusionNode(Node):
 
     def on_lidar_scan(self, scan: Scan) -> Outputs:
         if self._fusion is not None:
-            self._unmarked.append(
-                TimedScan(
-                    scan.stamp_ns, scan.angle_min_rad, scan.angle_increment_rad, scan.time_increment_s,
-                    scan.range_min_m, scan.range_max_m, scan.ranges_m,
-                )
-            )  # fmt: skip
+            self._unmarked.append(TimedScan.of(scan))
             while len(self._unmarked) > _PICTURES:  # localization says nothing of movers: take them all
                 self._marked.append(self._unmarked.popleft())
         return iter(())

@@ -117,12 +117,7 @@ class KeyframesNode(Node):
         return iter(())
 
     def on_lidar_scan(self, scan: Scan) -> Outputs:
-        self._unmarked.append(
-            TimedScan(
-                scan.stamp_ns, scan.angle_min_rad, scan.angle_increment_rad, scan.time_increment_s,
-                scan.range_min_m, scan.range_max_m, scan.ranges_m,
-            )
-        )  # fmt: skip
+        self._unmarked.append(TimedScan.of(scan))
         while len(self._unmarked) > _SCANS:  # localization says nothing of movers
             self._take_scan(self._unmarked.popleft())
         return iter(())

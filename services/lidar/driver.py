@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Iterable
 
@@ -21,7 +22,7 @@ _SLACK = 0.02  # of the angle turned
 _CONVINCED = 6  # packets in a row that do not fit: it is the speed that has changed
 
 
-class Driver:
+class Driver(ABC):
     """One kind of lidar. `start` talks to it, `feed` takes what it says from then on."""
 
     bauds: tuple[int, ...] = (115200,)
@@ -38,19 +39,19 @@ class Driver:
         self.model = ""
         self.builder = RevolutionBuilder(self.counters, clockwise=self.clockwise)
 
+    @abstractmethod
     def start(self, link: Link) -> None:
         """Asks who is there and starts the stream.
 
         Raises:
             LinkError: nobody answers as this kind of device does.
         """
-        raise NotImplementedError
 
+    @abstractmethod
     def feed(self, data: bytes, at_ns: int) -> list[StampedScan]:
         """The turns that `data`, arrived at `at_ns`, completes."""
-        raise NotImplementedError
 
-    def stop(self, link: Link) -> None:
+    def stop(self, link: Link) -> None:  # noqa: B027 (most devices need nothing)
         """Ends the stream, as far as the device can be told."""
 
     def restart(self) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterator
 
 import numpy as np
@@ -19,15 +20,15 @@ from services.lidar.rplidar import RplidarDriver
 from services.lidar.samples import StampedScan
 
 
-class _LidarNode(Node):
+class _LidarNode(Node, ABC):
     """What the kinds share. A device that is not there yet, or gone, is waited for."""
 
     Config = LidarConfig
     config: LidarConfig
 
+    @abstractmethod
     def driver(self) -> Driver:
         """The driver of this kind."""
-        raise NotImplementedError
 
     def configure(self) -> None:
         """Makes ready; opening waits until the stream is asked for, so that an absent device is a status."""

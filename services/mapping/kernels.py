@@ -1,17 +1,12 @@
-"""Loss and optimiser of the mapper as compiled loops on arrays."""
+"""Losses of the mapper, and what contradicts a Gaussian, as compiled loops on arrays."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from common.raster.compiled import kernel
-from common.raster.lanes import exp2_lanes
-from common.raster.layout import COLOUR, GRADIENTS, MEAN, OPACITY, PARAMS, QUAT, SCALE, WEIGHT
-from common.raster.simd import LANES, any_lane, fma, larger, repeat, root, smaller, where
-from common.raster.simd_memory import atomic_next, gather, load, scatter_some
-
-BETA_1, BETA_2, EPSILON = 0.9, 0.999, 1e-15
-_LOG2_BETA_1, _LOG2_BETA_2 = float(np.log2(BETA_1)), float(np.log2(BETA_2))
+from common.raster.layout import MEAN, SCALE
+from common.raster.simd_memory import atomic_next
 
 
 @kernel
@@ -80,60 +75,6 @@ def add_lidar(image, pixels, z_m, scale, gradient):  # noqa: ANN001, ANN201
 
 
 @kernel
-def adam(  # noqa: ANN201
-    counter, gradients, index, params, first, second, steps, rates, isotropy, ratio_log,  # noqa: ANN001
-):  # fmt: skip
-    """One step of Adam on the Gaussians that were seen (Kingma & Ba 2015), each with its own count of steps.
-
-    Args:
-        gradients: float32 [GRADIENTS, >= V]. index: int32 [>= V], padded. params, first, second: float32
-            [PARAMS, capacity]. steps: float32 [capacity]. rates: float32 [PARAMS].
-        isotropy: pulls the longest axis towards the second where it is more than e**ratio_log as long, in
-            proportion to the Gaussian's share of the picture: needles show from other views.
-    """
-    visible, stride = len(index), params.shape[1]
-    g_flat, p_flat, m_flat, v_flat = (
-        gradients.reshape(-1),
-        params.reshape(-1),
-        first.reshape(-1),
-        second.reshape(-1),
-    )
-    wide = gradients.shape[1]
-    block = 64 * LANES
-    while True:
-        begin = atomic_next(counter, 0) * block
-        if begin >= visible:
-            return
-        for at in range(begin, min(visible, begin + block), LANES):
-            if not any_lane(load(g_flat, WEIGHT * wide + at) > 0.0):  # hidden: nothing to learn
-                continue
-            used = min(LANES, visible - at)
-            t = gather(steps, 0, index, at) + 1.0
-            scatter_some(steps, 0, index, at, t, used)
-            fix_1 = 1.0 / (1.0 - exp2_lanes(larger(t * _LOG2_BETA_1, -100.0)))
-            fix_2 = 1.0 / (1.0 - exp2_lanes(larger(t * _LOG2_BETA_2, -100.0)))
-            a = gather(p_flat, SCALE * stride, index, at)
-            b = gather(p_flat, (SCALE + 1) * stride, index, at)
-            c = gather(p_flat, (SCALE + 2) * stride, index, at)
-            longest = larger(a, larger(b, c))
-            middle = larger(smaller(a, b), smaller(larger(a, b), c))
-            pull = larger(longest - middle - ratio_log, 0.0) * isotropy * load(g_flat, WEIGHT * wide + at)
-            for row in range(PARAMS):
-                g = load(g_flat, row * wide + at)
-                p = gather(p_flat, row * stride, index, at)
-                if SCALE <= row < QUAT:
-                    g = g + where(p >= longest, pull, 0.0)
-                m = gather(m_flat, row * stride, index, at)
-                v = gather(v_flat, row * stride, index, at)
-                m = fma(g - m, repeat(np.float32(1.0 - BETA_1)), m)
-                v = fma(g * g - v, repeat(np.float32(1.0 - BETA_2)), v)
-                scatter_some(m_flat, row * stride, index, at, m, used)
-                scatter_some(v_flat, row * stride, index, at, v, used)
-                move = m * fix_1 / (root(v * fix_2) + EPSILON)
-                scatter_some(p_flat, row * stride, index, at, p - move * rates[row], used)
-
-
-@kernel
 def contradicted(  # noqa: ANN201
     params, count, camera, depth_mm, depth_weight, least_weight, margin, strikes,  # noqa: ANN001
 ):  # fmt: skip
@@ -159,14 +100,3 @@ def contradicted(  # noqa: ANN201
             strikes[i] += 1
             struck += 1
     return struck
-
-
-def rate_rows(mean: float, log_scale: float, quat: float, opacity: float, colour: float) -> np.ndarray:
-    """float32 [PARAMS] of `adam` from one rate per group."""
-    rows = np.empty(PARAMS, np.float32)
-    rows[MEAN:SCALE], rows[SCALE:QUAT], rows[QUAT:OPACITY] = mean, log_scale, quat
-    rows[OPACITY:COLOUR], rows[COLOUR:] = opacity, colour
-    return rows
-
-
-assert GRADIENTS > PARAMS

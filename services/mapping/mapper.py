@@ -12,9 +12,10 @@ import numpy as np
 
 from common.geometry import inverse, is_rigid, se3_exp, se3_log
 from common.raster.layout import OPACITY
+from common.raster.optimiser import rate_rows
 from common.raster.rasterizer import Gradients, Rasterizer, Render
-from services.mapping.insertion import candidates, make_gaussians, unexplained
-from services.mapping.kernels import adam, add_lidar, contradicted, photometric_and_depth, rate_rows
+from services.mapping.insertion import new_gaussians, unexplained
+from services.mapping.kernels import add_lidar, contradicted, photometric_and_depth
 from services.mapping.keyframe import Held, Keyframe, Level, hold
 from services.mapping.settings import MapperSettings
 from services.mapping.ssim import SsimLoss
@@ -127,13 +128,12 @@ class Mapper:
         missing = unexplained(render.image, level, self.settings)
         foretold = _foretold(render.image, level)
         self.rasterizer.release(render)
-        u, v, spacing = candidates(missing, level, self.settings)
-        new = make_gaussians(u, v, spacing, level, T_map_camera, self.settings)
+        u, v, new = new_gaussians(missing, level, T_map_camera, self.settings)
         sure = level.depth_weight[v, u] >= 255.0 * self.settings.sure_weight
         new = new[:, sure | ~self._in_free_space(new)]
         new = new[:, :room]
         if new.shape[1]:
-            self.store.append(new, held.anchor)
+            self.store.add(new, held.anchor)
         return Outcome("ok", new.shape[1], 0, *foretold)
 
     def _in_free_space(self, params: np.ndarray) -> np.ndarray:
@@ -199,11 +199,9 @@ class Mapper:
         gradients = self.rasterizer.backward(render, gradient)
         s = self.settings
         pixels = level.camera.width_px * level.camera.height_px
-        self.rasterizer.team.run(
-            adam, gradients.by_splat, gradients.index, self.store.params, self.store.first, self.store.second,
-            self.store.steps, self._rates, np.float32(s.isotropy_weight / pixels),
-            np.float32(np.log(s.isotropy_ratio)),
-        )  # fmt: skip
+        self.store.step(
+            self.rasterizer.team, gradients, self._rates, s.isotropy_weight / pixels, np.log(s.isotropy_ratio)
+        )
         if s.refine_pose:
             self._refine_pose(held, gradients, inverse(T_map_camera))
         if s.refine_exposure:

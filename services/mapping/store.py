@@ -1,4 +1,4 @@
-"""The Gaussians and what the optimiser knows of them, in arrays that grow; bound to anchors."""
+"""The Gaussians of the map, bound to anchors and grouped in chunks by them."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from common.geometry import quat_wxyz_from_matrix
-from common.raster.layout import MEAN, OPACITY, PARAMS, QUAT, SCALE
+from common.raster.layout import MEAN, OPACITY, QUAT, SCALE
+from common.raster.optimiser import GaussianArrays
 
 
 @dataclass(frozen=True)
@@ -19,60 +20,31 @@ class Chunk:
     params: np.ndarray  # float32 [14, N], in the map frame
 
 
-class GaussianStore:
-    """Columns 0 ... count of every array are Gaussians; rows of `params` as in common.raster.layout."""
+class GaussianStore(GaussianArrays):
+    """Gaussians that belong to anchors, and how often each was seen where nothing can be."""
 
     def __init__(self, capacity: int = 4096) -> None:
-        self.count = 0
         self._events: dict[int, int] = {}  # per anchor: insertions, removals and moves so far
-        self._allocate(-(-capacity // 16) * 16)
+        super().__init__(capacity)
 
     def _allocate(self, capacity: int) -> None:
-        self.params = np.zeros((PARAMS, capacity), np.float32)
-        self.first = np.zeros((PARAMS, capacity), np.float32)  # Adam's moments
-        self.second = np.zeros((PARAMS, capacity), np.float32)
-        self.steps = np.zeros(capacity, np.float32)
+        super()._allocate(capacity)
         self.anchor = np.zeros(capacity, np.int64)
         self.strikes = np.zeros(capacity, np.int32)  # times seen floating before a trusted surface
 
     def _arrays(self) -> list[str]:
-        return ["params", "first", "second", "steps", "anchor", "strikes"]
+        return [*super()._arrays(), "anchor", "strikes"]
 
-    @property
-    def capacity(self) -> int:
-        return self.params.shape[1]
-
-    def append(self, params: np.ndarray, anchor: int) -> None:
+    def add(self, params: np.ndarray, anchor: int) -> None:
         """Adds Gaussians float32 [14, M] bound to an anchor."""
-        new = params.shape[1]
-        if self.count + new > self.capacity:
-            self._grow(max(self.count + new, 2 * self.capacity))
-        at = slice(self.count, self.count + new)
-        self.params[:, at] = params
-        for name in ("first", "second", "steps", "strikes"):
-            getattr(self, name)[..., at] = 0
-        self.anchor[at] = anchor
+        self.anchor[self.append(params)] = anchor
         self._events[anchor] = self._events.get(anchor, 0) + 1
-        self.count += new
-
-    def _grow(self, capacity: int) -> None:
-        old = {name: getattr(self, name) for name in self._arrays()}
-        self._allocate(-(-capacity // 16) * 16)
-        for name, array in old.items():
-            getattr(self, name)[..., : array.shape[-1]] = array
 
     def keep(self, mask: np.ndarray) -> int:
         """Drops Gaussians whose flag in bool [count] is unset, the rest keep their order; gives how many."""
-        chosen = np.flatnonzero(mask)
-        dropped = self.count - len(chosen)
-        if dropped:
-            for anchor in np.unique(self.anchor[: self.count][~np.asarray(mask)]):
-                self._events[int(anchor)] = self._events.get(int(anchor), 0) + 1
-            for name in self._arrays():
-                array = getattr(self, name)
-                array[..., : len(chosen)] = array[..., chosen]
-            self.count = len(chosen)
-        return dropped
+        for anchor in np.unique(self.anchor[: self.count][~np.asarray(mask)]):
+            self._events[int(anchor)] = self._events.get(int(anchor), 0) + 1
+        return super().keep(mask)
 
     def move(self, anchor: int, T_new_old: np.ndarray) -> None:
         """Moves the Gaussians of an anchor rigidly: means, rotations, and the momentum of the means."""

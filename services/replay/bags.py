@@ -10,6 +10,7 @@ import heapq
 import re
 import sqlite3
 import struct
+from abc import ABC, abstractmethod
 from collections.abc import Collection, Iterator
 from contextlib import ExitStack, suppress
 from pathlib import Path
@@ -132,14 +133,15 @@ class Bag:
         return _RosbagsPart(reader)
 
 
-class _Part:
+class _Part(ABC):
     """One storage of a bag."""
 
     topics: list[BagTopic]
     span_ns: tuple[int, int] | None
 
+    @abstractmethod
     def messages(self, topics: Collection[str] | None, start_ns: int, stop_ns: int) -> Iterator[RawMessage]:
-        raise NotImplementedError
+        """Messages of the topics (None: all) with start_ns <= at_ns < stop_ns by receive time, in order."""
 
 
 class _McapPart(_Part):

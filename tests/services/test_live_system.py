@@ -18,6 +18,7 @@ from services.board import HealthBoard
 from services.deployment import node_classes, surroundings
 from services.supervisor import Supervisor
 from tests.common.nodes import TABLE, Chain, Drive, DriveConfig, Sink
+from tests.common.polling import poll
 
 
 @pytest.fixture
@@ -67,16 +68,6 @@ class SinkThread:
         return [m.stamp_ns for t, m in list(self.node.seen) if t == topic]
 
 
-def _poll(supervisor, until, timeout):
-    deadline = time.monotonic() + timeout
-    while time.monotonic() < deadline:
-        supervisor.poll()
-        if until():
-            return
-        time.sleep(0.02)
-    raise AssertionError(f"not within {timeout} s")
-
-
 @pytest.mark.parametrize("rate", [4.0, 0.0])
 def test_live_equals_lockstep_message_for_message(deployment, rate):
     """The order in which packets arrive over the bus must not show in what a node says."""
@@ -109,15 +100,15 @@ def test_a_killed_node_comes_back_and_its_peers_go_on(deployment):
         SinkThread(live) as thread,
     ):
         board = HealthBoard(session, "test")
-        _poll(supervisor, lambda: len(thread.stamps("localization/odometry")) > 5, 30)
+        poll(supervisor, lambda: len(thread.stamps("localization/odometry")) > 5, 30)
         peers = {n: c.process.pid for n, c in supervisor.children.items() if n != "localization"}
         first = supervisor.children["localization"].process.pid
         epoch = board.records["localization"].health.epoch
         os.kill(first, signal.SIGKILL)
-        _poll(supervisor, lambda: supervisor.children["localization"].process.pid != first, 2)  # spawned
+        poll(supervisor, lambda: supervisor.children["localization"].process.pid != first, 2)  # spawned
         seen = len(thread.stamps("localization/odometry"))
-        _poll(supervisor, lambda: len(thread.stamps("localization/odometry")) > seen + 3, 10)  # ready
-        _poll(supervisor, lambda: board.records["localization"].health.epoch > epoch, 5)
+        poll(supervisor, lambda: len(thread.stamps("localization/odometry")) > seen + 3, 10)  # ready
+        poll(supervisor, lambda: board.records["localization"].health.epoch > epoch, 5)
         assert {n: c.process.pid for n, c in supervisor.children.items() if n != "localization"} == peers
         assert any("localization died (killed by SIGKILL" in e for e in events)
 
@@ -127,9 +118,9 @@ def test_a_killed_replay_goes_on_where_it_was(deployment):
     live = deployment(nodes, rate=2.0)
     with SinkThreadLater(live) as later, Supervisor(live, table=TABLE) as supervisor:
         thread = later.start()
-        _poll(supervisor, lambda: len(thread.stamps("localization/odometry")) > 15, 30)
+        poll(supervisor, lambda: len(thread.stamps("localization/odometry")) > 15, 30)
         os.kill(supervisor.children["replay"].process.pid, signal.SIGKILL)
-        _poll(supervisor, lambda: not thread._thread.is_alive(), 30)
+        poll(supervisor, lambda: not thread._thread.is_alive(), 30)
         stamps = thread.stamps("localization/odometry")
     # The bookmark is at most 0.2 s of wall time old: at twice the speed, four scans may come twice.
     assert len(set(stamps)) >= 78
@@ -160,13 +151,13 @@ def test_a_killed_router_is_replaced_and_everything_flows_again(deployment):
     live = deployment(nodes, rate=1.0)
     with SinkThreadLater(live) as later, Supervisor(live, table=TABLE) as supervisor:
         thread = later.start()
-        _poll(supervisor, lambda: len(thread.stamps("localization/odometry")) > 5, 30)
+        poll(supervisor, lambda: len(thread.stamps("localization/odometry")) > 5, 30)
         nodes_before = {n: c.process.pid for n, c in supervisor.children.items() if n != "router"}
         router = supervisor.children["router"].process.pid
         os.kill(router, signal.SIGKILL)
-        _poll(supervisor, lambda: supervisor.children["router"].process.pid != router, 2)
+        poll(supervisor, lambda: supervisor.children["router"].process.pid != router, 2)
         seen = len(thread.stamps("localization/odometry"))
-        _poll(supervisor, lambda: len(thread.stamps("localization/odometry")) > seen + 3, 5)
+        poll(supervisor, lambda: len(thread.stamps("localization/odometry")) > seen + 3, 5)
         assert nodes_before == {n: c.process.pid for n, c in supervisor.children.items() if n != "router"}
         # What was sent during the outage is recovered from the publishers' caches, in order, none missing.
         time.sleep(1.0)
@@ -182,7 +173,7 @@ def test_a_slow_node_gets_the_newest_picture_and_every_scan(deployment):
     live = deployment(nodes, rate=1.0)
     with Supervisor(live, table=TABLE) as supervisor, open_session(live.router.listen) as session:
         board = HealthBoard(session, "test")
-        _poll(supervisor, lambda: board.states().get("localization") == "drained", 40)
+        poll(supervisor, lambda: board.states().get("localization") == "drained", 40)
         health = {i.topic: i for i in board.records["localization"].health.inputs}
     assert 20 <= health["camera/image"].received <= 40  # 6 s at 5 Hz
     assert health["camera/image"].received + health["camera/image"].dropped >= 175  # of 180
@@ -193,7 +184,7 @@ def test_broken_messages_are_counted_and_harm_nothing(deployment):
     live = deployment({"localization": {"kind": "chain"}})
     with Supervisor(live, table=TABLE) as supervisor, open_session(live.router.listen) as session:
         board = HealthBoard(session, "test")
-        _poll(supervisor, lambda: board.states().get("localization") == "active", 30)
+        poll(supervisor, lambda: board.states().get("localization") == "active", 30)
         for payload, attachment in ((b"rubbish", None), (b"rubbish", b"short"), (b"", b"x" * 80)):
             session.put("beamsplat/test/lidar/scan", payload, attachment=attachment)
         publication = Bus(session, "test", "replay", "ab" * 8, 1).publish("wheel/odometry")
@@ -204,7 +195,7 @@ def test_broken_messages_are_counted_and_harm_nothing(deployment):
             inputs = {i.topic: i for i in board.records["localization"].health.inputs}
             return inputs["lidar/scan"].undecodable == 3 and inputs["wheel/odometry"].undecodable == 1
 
-        _poll(supervisor, counted, 5)
+        poll(supervisor, counted, 5)
         assert supervisor.children["localization"].process.is_alive()
 
 
@@ -212,7 +203,7 @@ def test_queries_are_answered_by_the_node(deployment):
     live = deployment({"localization": {"kind": "chain"}})
     with Supervisor(live, table=TABLE) as supervisor, open_session(live.router.listen) as session:
         board = HealthBoard(session, "test")
-        _poll(supervisor, lambda: board.states().get("localization") == "active", 30)
+        poll(supervisor, lambda: board.states().get("localization") == "active", 30)
         replies = list(ask(session, "test", "localization", "count", {"add": "41"}, 5.0))
         assert [r.optimisation for r in replies] == [41]
         with pytest.raises(UserError, match="refused count: invalid literal"):

@@ -117,33 +117,6 @@ def normal_equations(  # noqa: ANN201
 
 
 @kernel
-def adam_rows(gradients, index, visible, params, first, second, steps, rates):  # noqa: ANN001, ANN201
-    """One step of Adam (Kingma & Ba 2015) on the visible Gaussians, each with its own count of steps.
-
-    Args:
-        gradients: float32 [>= 14, >= V]. index: int32 [>= V]. params, first, second: float32 [14, capacity].
-        steps: float32 [capacity]. rates: float32 [14].
-    """
-    rows = len(rates)
-    for k in range(visible):
-        i = index[k]
-        hidden = True
-        for row in range(rows):
-            hidden = hidden and gradients[row, k] == 0.0
-        if hidden:
-            continue
-        steps[i] += np.float32(1.0)
-        fix_1 = np.float32(1.0) / (np.float32(1.0) - np.float32(0.9) ** steps[i])
-        fix_2 = np.float32(1.0) / (np.float32(1.0) - np.float32(0.999) ** steps[i])
-        for row in range(rows):
-            d = gradients[row, k]
-            m = first[row, i] + np.float32(0.1) * (d - first[row, i])
-            v = second[row, i] + np.float32(0.001) * (d * d - second[row, i])
-            first[row, i], second[row, i] = m, v
-            params[row, i] -= rates[row] * m * fix_1 / (np.sqrt(v * fix_2) + np.float32(1e-12))
-
-
-@kernel
 def map_loss(image, rgb, z_m, weight, colour_scale, depth_scale, gradient):  # noqa: ANN001, ANN201
     """L1 of colour over alpha and of depth of a render, its gradient float32 [5, H, W]; gives the loss.
 

@@ -116,7 +116,7 @@ class CameraLocalization(Node):
 
     def _say(self, result: CameraResult) -> None:
         t = self._tracker
-        said = [f"{len(t.splats.keyframes)} keyframes, {t.splats.count} Gaussians", result.detail]
+        said = [f"{len(t.splats.keyframes)} keyframes, {t.splats.store.count} Gaussians", result.detail]
         if t.metric is False:
             said.append(ARBITRARY)
         if np.isfinite(t.scale_disagreement) and abs(t.scale_disagreement) > 0.05:

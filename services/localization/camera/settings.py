@@ -33,7 +33,7 @@ class CameraTrackerSettings:
     # The map
     stride_px: int = 4
     fine_stride_px: int = 2
-    texture: float = 0.06
+    texture: float = 0.12  # mean absolute colour step (Sobel sums) that gets the fine stride
     alpha_low: float = 0.6
     colour_off: float = 0.12
     depth_off: float = 0.10

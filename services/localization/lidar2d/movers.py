@@ -40,9 +40,9 @@ def contradicts_free_space(
         if k >= 0 and math.hypot(x - means[k, 0], y - means[k, 1]) < CLEARANCE_M:
             # What a mover left behind before it was found out has been looked through since.
             kr, kq = math.floor(means[k, 1] / cell_m) - row0, math.floor(means[k, 0] / cell_m) - col0
-            if 0 <= kr < hits.shape[0] and 0 <= kq < hits.shape[1]:
-                if SOLID * int(hits[kr, kq]) >= int(misses[kr, kq]):
-                    continue
+            known = 0 <= kr < hits.shape[0] and 0 <= kq < hits.shape[1]
+            if known and SOLID * int(hits[kr, kq]) >= int(misses[kr, kq]):
+                continue
         free = True
         for rr in range(r - 1, r + 2):
             for qq in range(q - 1, q + 2):

@@ -1,12 +1,11 @@
-"""The mapper's loops against torch: Adam, the losses, SSIM."""
+"""The mapper's loops against torch: the losses, SSIM."""
 
 import numpy as np
 import pytest
 import torch
 
-from common.raster.layout import GRADIENTS, WEIGHT
 from common.raster.threads import Team
-from services.mapping.kernels import adam, add_lidar, photometric_and_depth, rate_rows
+from services.mapping.kernels import add_lidar, photometric_and_depth
 from services.mapping.ssim import TAPS, SsimLoss, ssim
 
 H, W = 37, 53
@@ -92,41 +91,3 @@ def test_ssim_of_equal_pictures_is_one():
     picture = np.random.default_rng(0).random((H, W, 3))
     assert ssim(picture, picture) == pytest.approx(1.0)
     assert ssim(picture, np.roll(picture, 3, axis=0)) < 0.3
-
-
-def test_adam_is_that_of_torch_for_what_is_seen():
-    rng = np.random.default_rng(2)
-    count, capacity = 100, 112
-    params = rng.normal(size=(14, capacity)).astype(np.float32)
-    params[3:6] = 0.0  # equal axes: no pull towards roundness
-    index = np.sort(rng.choice(count, 61, replace=False)).astype(np.int32)
-    padded = np.concatenate([index, np.full(32, index[-1], np.int32)])
-    first, second, steps = np.zeros_like(params), np.zeros_like(params), np.zeros(capacity, np.float32)
-    theirs = torch.tensor(params[:, index], requires_grad=True)
-    optimiser = torch.optim.Adam([theirs], lr=0.01, eps=1e-15)
-    untouched = params.copy()
-    for _ in range(20):
-        gradients = np.zeros((GRADIENTS, 64), np.float32)
-        gradients[:14, :61] = rng.normal(size=(14, 61))
-        gradients[WEIGHT] = 1.0
-        Team(1).run(adam, gradients, padded[:61], params, first, second, steps,
-                    rate_rows(0.01, 0.01, 0.01, 0.01, 0.01), np.float32(0.0), np.float32(9.0))  # fmt: skip
-        theirs.grad = torch.tensor(gradients[:14, :61])
-        optimiser.step()
-    assert np.allclose(params[:, index], theirs.detach().numpy(), atol=2e-5)
-    others = np.setdiff1d(np.arange(capacity), index)
-    assert np.array_equal(params[:, others], untouched[:, others])
-    assert np.all(steps[index] == 20.0)
-
-
-def test_needles_are_pulled_towards_discs():
-    params = np.zeros((14, 16), np.float32)
-    params[3:6, 0] = np.log([1.0, 0.1, 0.01])
-    moments = np.zeros((2, 14, 16), np.float32)
-    gradients = np.zeros((GRADIENTS, 16), np.float32)
-    gradients[WEIGHT] = 1.0
-    index = np.zeros(16, np.int32)
-    Team(1).run(adam, gradients, index[:1], params, moments[0], moments[1], np.zeros(16, np.float32),
-                rate_rows(0.0, 0.01, 0.0, 0.0, 0.0), np.float32(1.0), np.float32(np.log(4.0)))  # fmt: skip
-    assert params[3, 0] == pytest.approx(-0.01, abs=1e-6)
-    assert np.allclose(params[4:6, 0], np.log([0.1, 0.01]), atol=1e-6)

@@ -255,7 +255,7 @@ def test_what_floats_before_a_trusted_surface_is_carved(room, mapped):
     floater[MEAN : MEAN + 3] = ahead[:3, None] + np.random.default_rng(0).normal(0, 0.02, (3, 16))
     floater[3:6] = np.log(0.01)
     before = mapper.store.count
-    mapper.store.append(floater, 0)
+    mapper.store.add(floater, 0)
     mapper.settings = replace(SETTINGS, carve_strikes=2)
     for _ in range(2):
         mapper._clean(mapper.keyframes[2])

@@ -2,7 +2,6 @@
 
 import os
 import signal
-import time
 
 import pytest
 from plyfile import PlyData
@@ -11,6 +10,7 @@ from common.bus import open_session
 from common.config import Deployment, RouterConfig
 from services.board import HealthBoard
 from services.supervisor import Supervisor
+from tests.common.polling import poll
 from tests.services.mapping.room_drive import TABLE
 
 
@@ -29,16 +29,6 @@ def deployment(tmp_path, free_endpoint):
         )  # fmt: skip
 
     return make
-
-
-def poll(supervisor, until, timeout_s):
-    deadline = time.monotonic() + timeout_s
-    while time.monotonic() < deadline:
-        supervisor.poll()
-        if until():
-            return
-        time.sleep(0.05)
-    raise AssertionError(f"not within {timeout_s} s")
 
 
 def detail(board, node):

@@ -17,16 +17,7 @@ from services.monitor.node import MonitorConfig, MonitorNode
 from services.nodes import NODES
 from services.supervisor import Supervisor
 from tests.common.nodes import TABLE
-
-
-def _poll(supervisor, until, timeout_s):
-    deadline = time.monotonic() + timeout_s
-    while time.monotonic() < deadline:
-        supervisor.poll()
-        if until():
-            return
-        time.sleep(0.05)
-    raise AssertionError(f"not within {timeout_s} s")
+from tests.common.polling import poll
 
 
 def _sent(board, node, topic):
@@ -50,7 +41,7 @@ def system(tmp_path, free_endpoint):
     table = {**TABLE, "monitor": NODES["monitor"]}
     with Supervisor(deployment, table=table) as supervisor, open_session((free_endpoint,)) as session:
         board = HealthBoard(session, "test")
-        _poll(supervisor, lambda: _flows(board), 60)
+        poll(supervisor, lambda: _flows(board), 60)
         yield supervisor, board, tmp_path / "drive.rrd"
 
 
@@ -72,14 +63,14 @@ def test_a_stopped_monitor_slows_nobody_and_what_it_saved_opens(system, read_rrd
     os.kill(monitor, signal.SIGSTOP)
     try:
         # 5 s of data at its own speed, while 3 MB of pictures a second pile up for somebody who sleeps.
-        _poll(supervisor, lambda: _sent(board, "replay", "lidar/scan") >= scans + 50, 15)
+        poll(supervisor, lambda: _sent(board, "replay", "lidar/scan") >= scans + 50, 15)
         assert _sent(board, "replay", "camera/image") >= pictures + 130
         slam = _received(board, "localization", "lidar/scan")
         assert (slam.lost, slam.dropped) == (0, 0)
     finally:
         os.kill(monitor, signal.SIGCONT)
     before = _received(board, "monitor", "localization/odometry").received
-    _poll(supervisor, lambda: _received(board, "monitor", "localization/odometry").received > before + 10, 30)
+    poll(supervisor, lambda: _received(board, "monitor", "localization/odometry").received > before + 10, 30)
     assert supervisor.children["monitor"].process.pid == monitor
     supervisor.stop()
     saved = read_rrd(path)

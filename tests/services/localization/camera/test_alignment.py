@@ -5,11 +5,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from common.geometry import inverse, make_transform, matrix_from_quat_wxyz, se3_exp, so3_exp
+from common.geometry import inverse, make_transform, se3_exp, so3_exp
 from services.localization.camera.align import Aligner, Alignment, exact_gradient, motion_basis
-from services.localization.camera.kernels import adam_rows, choose_points, map_loss, normal_equations
+from services.localization.camera.kernels import choose_points, map_loss, normal_equations
 from services.localization.camera.settings import CameraTrackerSettings
-from services.localization.camera.splat_map import MapKeyframe, SplatMap, disc_quats
+from services.localization.camera.splat_map import MapKeyframe, SplatMap
 from services.localization.camera.view import make_view, small_camera
 from tests.services.localization.camera.box import CAMERA, T_BODY_CAMERA, body, off, shot
 
@@ -191,37 +191,6 @@ def test_the_maps_loss_has_the_gradient_of_finite_differences():
         moved[at] += 1e-3
         slope = (map_loss(moved, rgb, z, weight, *scales, scratch) - loss) / 1e-3
         assert slope == pytest.approx(gradient[at], rel=1e-2, abs=2e-3)
-
-
-def test_adam_is_the_textbooks():
-    random = np.random.default_rng(4)
-    gradients = random.normal(size=(16, 5)).astype(np.float32)
-    gradients[:, 2] = 0.0  # hidden: nothing to learn
-    index = np.array([1, 3, 4, 7, 9], np.int32)
-    params = random.normal(size=(14, 16)).astype(np.float32)
-    first, second, steps = np.zeros_like(params), np.zeros_like(params), np.zeros(16, np.float32)
-    rates, expected = np.full(14, 0.01, np.float32), params.astype(np.float64)
-    m, v = np.zeros((14, 5)), np.zeros((14, 5))
-    for t in (1, 2, 3):
-        adam_rows(gradients, index, 5, params, first, second, steps, rates)
-        m, v = 0.9 * m + 0.1 * gradients[:14], 0.999 * v + 0.001 * gradients[:14].astype(np.float64) ** 2
-        expected[:, index] -= 0.01 * (m / (1 - 0.9**t)) / (np.sqrt(v / (1 - 0.999**t)) + 1e-12)
-    np.testing.assert_allclose(params, expected, atol=1e-4)
-    assert steps[index].tolist() == [3, 3, 0, 3, 3]
-
-
-_UNIT = st.tuples(*[st.floats(-1, 1) for _ in range(3)]).filter(lambda v: np.linalg.norm(v) > 0.1)
-
-
-@settings(max_examples=60, deadline=None)
-@given(_UNIT, _UNIT)
-def test_discs_lie_on_their_surface_and_point_down_the_slope(normal, ray):
-    n, r = (np.array(v) / np.linalg.norm(v) for v in (normal, ray))
-    slope = r - n * (n @ r)
-    R = matrix_from_quat_wxyz(disc_quats(n[None], r[None])[0])
-    assert abs(R[:, 2] @ n) == pytest.approx(1.0, abs=1e-9)
-    if np.linalg.norm(slope) > 1e-3:
-        assert R[:, 0] @ slope / np.linalg.norm(slope) == pytest.approx(1.0, abs=1e-6)
 
 
 @settings(max_examples=40, deadline=None)

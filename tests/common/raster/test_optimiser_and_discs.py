@@ -1,0 +1,119 @@
+"""Adam against torch, arrays that grow, and discs that lie on the surface they were made from."""
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from common.geometry import make_transform, matrix_from_quat_wxyz, so3_exp
+from common.raster.camera import RasterCamera
+from common.raster.discs import choose_pixels, disc_quats, make_discs
+from common.raster.layout import GRADIENTS, MEAN, OPACITY, QUAT, SCALE, WEIGHT
+from common.raster.optimiser import GaussianArrays, adam, rate_rows
+from common.raster.threads import Team
+
+
+def test_adam_is_that_of_torch_for_what_is_seen():
+    rng = np.random.default_rng(2)
+    count, capacity = 100, 112
+    params = rng.normal(size=(14, capacity)).astype(np.float32)
+    params[3:6] = 0.0  # equal axes: no pull towards roundness
+    index = np.sort(rng.choice(count, 61, replace=False)).astype(np.int32)
+    padded = np.concatenate([index, np.full(32, index[-1], np.int32)])
+    first, second, steps = np.zeros_like(params), np.zeros_like(params), np.zeros(capacity, np.float32)
+    theirs = torch.tensor(params[:, index], requires_grad=True)
+    optimiser = torch.optim.Adam([theirs], lr=0.01, eps=1e-15)
+    untouched = params.copy()
+    for _ in range(20):
+        gradients = np.zeros((GRADIENTS, 64), np.float32)
+        gradients[:14, :61] = rng.normal(size=(14, 61))
+        gradients[WEIGHT] = 1.0
+        Team(1).run(adam, gradients, padded[:61], params, first, second, steps,
+                    rate_rows(0.01, 0.01, 0.01, 0.01, 0.01), np.float32(0.0), np.float32(9.0))  # fmt: skip
+        theirs.grad = torch.tensor(gradients[:14, :61])
+        optimiser.step()
+    assert np.allclose(params[:, index], theirs.detach().numpy(), atol=2e-5)
+    others = np.setdiff1d(np.arange(capacity), index)
+    assert np.array_equal(params[:, others], untouched[:, others])
+    assert np.all(steps[index] == 20.0)
+
+
+def test_needles_are_pulled_towards_discs():
+    params = np.zeros((14, 16), np.float32)
+    params[3:6, 0] = np.log([1.0, 0.1, 0.01])
+    moments = np.zeros((2, 14, 16), np.float32)
+    gradients = np.zeros((GRADIENTS, 16), np.float32)
+    gradients[WEIGHT] = 1.0
+    index = np.zeros(16, np.int32)
+    Team(1).run(adam, gradients, index[:1], params, moments[0], moments[1], np.zeros(16, np.float32),
+                rate_rows(0.0, 0.01, 0.0, 0.0, 0.0), np.float32(1.0), np.float32(np.log(4.0)))  # fmt: skip
+    assert params[3, 0] == pytest.approx(-0.01, abs=1e-6)
+    assert np.allclose(params[4:6, 0], np.log([0.1, 0.01]), atol=1e-6)
+
+
+def test_arrays_grow_and_shrink_with_what_the_optimiser_knows():
+    arrays = GaussianArrays(16)
+    first, second = (np.full((14, n), float(n), np.float32) for n in (10, 30))
+    assert arrays.append(first) == slice(0, 10)
+    arrays.first[:, :10] = 7.0
+    assert arrays.append(second) == slice(10, 40)
+    assert arrays.capacity % 16 == 0
+    keep = np.arange(40) % 2 == 0
+    assert arrays.keep(keep) == 20
+    assert arrays.count == 20
+    assert np.array_equal(arrays.params[0, :20], np.repeat([10.0, 30.0], [5, 15]).astype(np.float32))
+    assert np.array_equal(arrays.first[0, :20], np.repeat([7.0, 0.0], [5, 15]).astype(np.float32))
+    arrays.append(first)  # over what was dropped: nothing of it is left
+    assert not arrays.first[:, 20:30].any()
+
+
+CAMERA = RasterCamera(200.0, 200.0, 79.5, 59.5, 160, 120)
+
+
+def test_discs_cover_a_slanted_wall():
+    """z = 2 + x / 2 seen from another place: centres on the plane, flat along its normal, side by side."""
+    rays = (np.arange(160) - CAMERA.cx_px) / CAMERA.fx_px
+    z = np.tile((2.0 / (1.0 - 0.5 * rays)).astype(np.float32), (120, 1))
+    grey = np.full((120, 160), 0.5, np.float32)
+    u, v, spacing = choose_pixels(z > 0, grey, 4, 2, 0.1)
+    assert len(u) == 40 * 30
+    assert np.all(spacing == 4)
+    T = make_transform(so3_exp([0.1, -0.3, 0.2]), np.array([1.0, 2.0, 3.0]))
+    rgb = np.full((3, len(u)), 0.5, np.float32)
+    discs = make_discs(u, v, spacing, z, rgb, CAMERA, T, size=0.5, flatness=0.1, opacity=0.8, least_slant=0.2)
+    inside = (u > 2) & (u < 157) & (v > 2) & (v < 117)
+    normal = T[:3, :3] @ (np.array([0.5, 0.0, -1.0]) / np.sqrt(1.25))
+    centre = T[:3, :3] @ np.array([0.0, 0.0, 2.0]) + T[:3, 3]
+    off_m = normal @ (discs[MEAN:SCALE].astype(np.float64) - centre[:, None])
+    assert np.abs(off_m).max() < 1e-5
+    axes = np.array([matrix_from_quat_wxyz(q)[:, 2] for q in discs[QUAT:OPACITY, inside].T])
+    assert np.abs(axes @ normal).min() > 0.999
+    spread_m = np.exp(discs[SCALE + 1])
+    assert np.allclose(spread_m, 0.5 * 4 * z[v, u] / 200.0, rtol=1e-5)
+    assert np.all(discs[SCALE, inside] > discs[SCALE + 1, inside])  # longer down the slope
+
+
+def test_texture_and_missing_depth_decide_where_discs_begin():
+    grey = np.full((40, 80), 0.5, np.float32)
+    grey[:, 40:] = np.where(np.arange(40) % 4 < 2, 0.9, 0.5)
+    wanted = np.ones((40, 80), bool)
+    wanted[:, :20] = False
+    u, _, spacing = choose_pixels(wanted, grey, 8, 2, 0.1)
+    assert u.min() >= 20
+    assert set(spacing[u < 32]) == {8.0}
+    assert set(spacing[u > 48]) == {2.0}
+
+
+_UNIT = st.tuples(*[st.floats(-1, 1) for _ in range(3)]).filter(lambda v: np.linalg.norm(v) > 0.1)
+
+
+@settings(max_examples=60, deadline=None)
+@given(_UNIT, _UNIT)
+def test_discs_lie_on_their_surface_and_point_down_the_slope(normal, ray):
+    n, r = (np.array(v) / np.linalg.norm(v) for v in (normal, ray))
+    slope = r - n * (n @ r)
+    R = matrix_from_quat_wxyz(disc_quats(n[None], r[None])[0])
+    assert abs(R[:, 2] @ n) == pytest.approx(1.0, abs=1e-9)
+    if np.linalg.norm(slope) > 1e-3:
+        assert R[:, 0] @ slope / np.linalg.norm(slope) == pytest.approx(1.0, abs=1e-6)
