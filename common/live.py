@@ -16,8 +16,6 @@ from collections import deque
 from collections.abc import Iterator
 from typing import Any
 
-import numpy as np
-import psutil
 import zenoh
 
 from common.bus import Bus, open_session
@@ -27,19 +25,20 @@ from common.header import local_clock_id
 from common.jobs import Abandoned, JobQueue, Worker
 from common.live_settings import LiveSettings
 from common.mailbox import NOBODY, Letter, Mailbox
-from common.messages import Health, OutputHealth
+from common.messages import Health
 from common.node import Job, Node, Output
 from common.pacing import Playback
 from common.persist import Bookmark, claim_epoch
 from common.queries import reply
 from common.streams import Publication
+from common.vitals import Vitals
 
 log = logging.getLogger(__name__)
 
 _POLL_S = 0.2  # how soon a signal is noticed while nothing arrives
 _STOP_PATIENCE_S = 2.0  # after a signal, background jobs have so long to finish
 _END_PATIENCE_S = 5.0  # an end marker waits this long for messages still on their way
-_DETAIL_CHARS = 2000
+_SILENCE_S = 1.0
 
 
 class Live:
@@ -47,24 +46,22 @@ class Live:
 
     def __init__(self, node: Node, settings: LiveSettings) -> None:
         self.node = node
-        self.settings = settings
+        self.settings = node.home = settings
         self.instance = secrets.token_hex(8)
         self.mailbox = Mailbox(type(node), time.monotonic_ns)
-        self._changed = threading.Condition()
+        self.changed = threading.Condition()
         self._stopping = False
         self._stop_by = math.inf
-        self._state = "configure"
-        self._detail = ""
+        self.state = "configure"
+        self.detail = ""
         self._queries: deque[tuple[str, zenoh.Query]] = deque()
         self._healths: deque[Health] = deque(maxlen=256)
         self._ends: list[tuple[str, str, int, int, float]] = []
-        self._steps_ms: deque[float] = deque(maxlen=512)
-        self._publications: dict[str, Publication] = {}
+        self.steps_ms: deque[float] = deque(maxlen=512)
+        self.publications: dict[str, Publication] = {}
         self._complaints = Complaints()
         self._bookmark = Bookmark(settings.run_dir, node.name)
         self._clock_id = local_clock_id()
-        self._process = psutil.Process()
-        self._process.cpu_percent()  # the first call only starts the measurement
 
     def run(self) -> None:
         """Life of the process: configure, standby, active, drain, drained, closed."""
@@ -78,18 +75,18 @@ class Live:
                 return
             raise
         with Bus(session, self.settings.robot, self.node.name, self.instance, epoch) as bus:
-            threading.Thread(target=self._report, args=(bus,), name="health", daemon=True).start()
+            vitals = Vitals(self, bus)
             self._jobs = JobQueue(Worker(self._gave_up).submit)
             try:
                 self.node.configure()
-                self._state = "standby"
+                self.state = "standby"
                 self._join(bus)
                 self._work(bus)
-                self._send_health(bus)
+                vitals.send()
             except Abandoned:
                 log.warning("stopped in the middle of a background job: its result is lost")
             finally:
-                self._state = "closed"
+                self.state = "closed"
                 self.node.close()
 
     def stop(self, *_: object) -> None:
@@ -107,7 +104,7 @@ class Live:
 
     def _join(self, bus: Bus) -> None:
         # Assigned as a whole: the health thread goes through it meanwhile.
-        self._publications = {name: bus.publish(name) for name in self.node.outputs}
+        self.publications = {name: bus.publish(name) for name in self.node.outputs}
         for entry in self.node.inputs:
             if entry.topic in self.settings.unfed:
                 self.mailbox.end(entry.topic, NOBODY, 0)
@@ -121,26 +118,26 @@ class Live:
     def _work(self, bus: Bus) -> None:
         if self.node.is_source():
             self._wait_for_consumers(bus)
-            self._state = "active"
+            self.state = "active"
             self._run_source()
         else:
-            self._state = "active"
+            self.state = "active"
             self._run_steps()
         finished = not self._stopping
-        self._state = "drain"
+        self.state = "drain"
         for name, result in self._jobs.rest():
             self._emit(self.node.handle_job(name, result))
         self._emit(self.node.handle_drain())
-        self._state = "drained"
+        self.state = "drained"
         if finished:  # stopped by a signal it leaves the stream open: a successor goes on
             self._bookmark.finish()
-            for publication in self._publications.values():
+            for publication in self.publications.values():
                 bus.end(publication)
             while not self._stopping and not self.settings.exit_when_drained:
                 self._attend()
                 self._hear_answers()
-                with self._changed:
-                    self._changed.wait(_POLL_S)
+                with self.changed:
+                    self.changed.wait(_POLL_S)
 
     def _hear_answers(self) -> None:
         """What is fed back to a node that has ended is still heard; it has nothing more to say to it."""
@@ -152,27 +149,39 @@ class Live:
     # --- the node's own thread ---
 
     def _run_steps(self) -> None:
+        heard = time.monotonic()
         while not self._stopping:
             self._attend()
             letter = self._next()
             self._emit_all(self._jobs.finished())
             if letter is None:
                 if self.mailbox.ended:
-                    return
+                    if not (self.mailbox.answers_may_come and self.node.awaits_answers()):
+                        return
+                    heard = self._tell_of_silence(heard)
                 continue
+            heard = time.monotonic()
             started = time.perf_counter()
             self._emit_all(self._jobs.before_message(letter.topic))
             self.node.on_header(letter.header)
             self._emit(self.node.handle(letter.topic, letter.message))
-            self._steps_ms.append((time.perf_counter() - started) * 1e3)
+            self.steps_ms.append((time.perf_counter() - started) * 1e3)
+
+    def _tell_of_silence(self, heard: float) -> float:
+        silence_s = time.monotonic() - heard
+        if silence_s < _SILENCE_S:
+            time.sleep(0.02)  # `_next` does not wait once the inputs have ended
+            return heard
+        self._emit(self.node.handle_silence(silence_s))
+        return heard + silence_s
 
     def _next(self) -> Letter | None:
         """The next letter, or None after a short wait."""
-        with self._changed:
+        with self.changed:
             self._apply_ends()
             letter = self.mailbox.pop()
             if letter is None and not self.mailbox.ended:
-                self._changed.wait(_POLL_S)
+                self.changed.wait(_POLL_S)
                 self._apply_ends()
                 letter = self.mailbox.pop()
             if letter is not None:
@@ -200,7 +209,7 @@ class Live:
                 future = self._jobs.start(output)
                 future.add_done_callback(lambda _: self._wake())
             else:
-                self._publications[output[0]].put(output[1])
+                self.publications[output[0]].put(output[1])
 
     def _run_source(self) -> None:
         playback = Playback(self.settings.rate, self._bookmark, self.settings.resume)
@@ -218,11 +227,11 @@ class Live:
             self._attend()
             started = time.perf_counter()
             self.node.check_output(item.topic, item.message)
-            publication = self._publications[item.topic]
+            publication = self.publications[item.topic]
             if playback.is_past(item) and publication.row.delivery != "latched":
                 continue
             publication.put(item.message)
-            self._steps_ms.append((time.perf_counter() - started) * 1e3)
+            self.steps_ms.append((time.perf_counter() - started) * 1e3)
             playback.sent(item)
 
     def _wait_for_consumers(self, bus: Bus) -> None:
@@ -235,9 +244,9 @@ class Live:
                             self.settings.wait_s)  # fmt: skip
                 break
             if missing:
-                self._detail = f"waiting for {', '.join(sorted(missing))}"
+                self.detail = f"waiting for {', '.join(sorted(missing))}"
                 time.sleep(0.1)
-        self._detail = ""
+        self.detail = ""
 
     def _attend(self) -> None:
         """What comes besides messages."""
@@ -251,12 +260,12 @@ class Live:
     # --- called from threads of the bus ---
 
     def _on_letter(self, letter: Letter) -> None:
-        with self._changed:
+        with self.changed:
             if self.mailbox.put(letter):
-                self._changed.notify()
+                self.changed.notify()
 
     def _on_undecodable(self, topic: str, reason: str) -> None:
-        with self._changed:
+        with self.changed:
             self.mailbox.counts[topic].undecodable += 1
             count = self._complaints.due(topic)
         if count is None:
@@ -264,9 +273,9 @@ class Live:
         log.warning("dropped a message on %s (%d more since the last report): %s", topic, count, reason)
 
     def _on_end(self, topic: str, instance: str, epoch: int, sent: int) -> None:
-        with self._changed:
+        with self.changed:
             self._ends.append((topic, instance, epoch, sent, time.monotonic() + _END_PATIENCE_S))
-            self._changed.notify()
+            self.changed.notify()
 
     def _on_query(self, name: str, query: zenoh.Query) -> None:
         self._queries.append((name, query))
@@ -277,32 +286,5 @@ class Live:
         self._wake()
 
     def _wake(self) -> None:
-        with self._changed:
-            self._changed.notify()
-
-    # --- health ---
-
-    def _report(self, bus: Bus) -> None:
-        while self._state != "closed":
-            try:
-                self._send_health(bus)
-            except zenoh.ZError:  # the session is closing
-                return
-            time.sleep(1.0)
-
-    def _send_health(self, bus: Bus) -> None:
-        with self._changed:
-            inputs = self.mailbox.health()
-        steps = np.array(self._steps_ms or [0.0])
-        outputs = tuple(
-            OutputHealth(topic=name, sent=p.sent, bytes=p.bytes) for name, p in self._publications.items()
-        )
-        bus.report(
-            Health(
-                stamp_ns=time.time_ns(), node=self.node.name, instance=self.instance, epoch=bus.epoch,
-                state=self._state, inputs=inputs, outputs=outputs,
-                step_p50_ms=float(np.percentile(steps, 50)), step_p95_ms=float(np.percentile(steps, 95)),
-                rss_mb=self._process.memory_info().rss / 1e6, cpu_percent=self._process.cpu_percent(),
-                detail=self._detail or self.node.detail[:_DETAIL_CHARS],
-            )
-        )  # fmt: skip
+        with self.changed:
+            self.changed.notify()

@@ -15,7 +15,7 @@ from common.header import Header
 from common.messages import InputHealth, Message
 from common.node import Input, Node, merged_topics
 from common.sync import StampMerger
-from common.topics import ROW_NUMBER
+from common.topics import ROW_NUMBER, TOPICS
 
 NOBODY = "nobody"  # ends an input that no node produces
 MAX_QUEUED = 20_000  # of an `every` input: beyond it the oldest goes, and is counted
@@ -68,7 +68,7 @@ class Mailbox:
         """Takes a letter, unless its epoch has been taken over; True if it was taken."""
         count = self.counts[letter.topic]
         every = self._deliveries[letter.topic] == "every"
-        if not self._admit(count, letter.header, every):
+        if not self._admit(count, letter.header, every and not TOPICS[letter.topic].repeated):
             return False
         if letter.topic in self._slots:
             count.dropped += 1
@@ -93,7 +93,7 @@ class Mailbox:
             count.dropped += 1
         count.queued_bytes += letter.size_bytes
 
-    def _admit(self, count: InputCount, header: Header, every: bool) -> bool:
+    def _admit(self, count: InputCount, header: Header, loses: bool) -> bool:
         """Epoch and sequence bookkeeping; False for a stale or repeated message."""
         if header.epoch < count.epoch:
             count.stale += 1
@@ -108,7 +108,7 @@ class Mailbox:
             return False
         if expected is not None:
             gap = header.sequence - expected
-            if every:
+            if loses:
                 count.lost += gap
             else:
                 count.dropped += gap
@@ -125,7 +125,11 @@ class Mailbox:
             return
         count.ended_by = instance
         if self._deliveries[topic] == "every":
-            count.lost += max(sent - self.next_sequence(topic, instance), 0)
+            missing = max(sent - self.next_sequence(topic, instance), 0)
+            if TOPICS[topic].repeated:
+                count.dropped += missing
+            else:
+                count.lost += missing
             if topic not in self._fed_back:
                 self._merger.end(topic)
 
@@ -158,6 +162,11 @@ class Mailbox:
         that are fed back are not asked: they end after this node."""
         enders = [count.ended_by for name, count in self.counts.items() if name not in self._fed_back]
         return not len(self) and all(enders) and any(e != NOBODY for e in enders)
+
+    @property
+    def answers_may_come(self) -> bool:
+        """Somebody feeds back to this node, and has not ended."""
+        return any(self.counts[name].ended_by is None for name in self._fed_back)
 
     def health(self) -> tuple[InputHealth, ...]:
         """The counters as they go into a Health message."""

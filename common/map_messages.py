@@ -20,6 +20,8 @@ class Keyframe(Message):
     uint16 millimetres, 0 = unknown (common.depth_code); the mask is a PNG, 0 = on something that moves.
     """
 
+    version = "1.1"
+
     id: Count
     encoding: Literal["jpeg", "png"]
     picture: Annotated[np.ndarray, Array("uint8", "P")]
@@ -38,6 +40,7 @@ class Keyframe(Message):
         default_factory=lambda: np.zeros((0, 4), np.float32)
     )
     why: Text = ""  # it was chosen
+    backlog: Count = 0  # keyframes not acknowledged when this one went out; since 1.1
 
 
 class KeyframeAck(Message):

@@ -22,6 +22,7 @@ from typing import Any, ClassVar, NamedTuple
 
 from common.config import NodeConfig
 from common.header import Header
+from common.live_settings import LiveSettings
 from common.messages import Health, Message
 from common.topics import ROW_NUMBER, Delivery, Topic, topic
 
@@ -90,6 +91,7 @@ class Node:
 
     def __init__(self, config: NodeConfig) -> None:
         self.config = config
+        self.home: LiveSettings | None = None  # live only: robot, router and state folder
         self.detail = ""  # one line that the node wants shown beside its health
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
@@ -129,6 +131,14 @@ class Node:
     def on_header(self, header: Header) -> None:
         """Sees what rode beside the message that is handled next; the recorder keeps it."""
 
+    def awaits_answers(self) -> bool:
+        """Whether this node, whose inputs have ended, should hear more of what is fed back before it ends."""
+        return False
+
+    def on_silence(self, seconds: float) -> Iterable[Output]:
+        """Live only: so long nothing came to a node that awaits answers after the end of its inputs."""
+        return ()
+
     # --- used by the runners ---
 
     @classmethod
@@ -154,6 +164,10 @@ class Node:
     def handle_job(self, name: str, result: Any) -> Iterator[Output]:
         """What `on_job_<name>` sends."""
         yield from self._declared(getattr(self, f"on_job_{name}")(result))
+
+    def handle_silence(self, seconds: float) -> Iterator[Output]:
+        """What `on_silence` sends."""
+        yield from self._declared(self.on_silence(seconds))
 
     def handle_drain(self) -> Iterator[Output]:
         """What `drain` sends."""

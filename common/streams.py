@@ -23,6 +23,53 @@ FIFO_MESSAGES = 256  # buffered by Zenoh ahead of our thread for an `every` inpu
 ENCODING = zenoh.Encoding(MEDIA_TYPE)
 
 
+def declare_writer(
+    session: zenoh.Session,
+    key_expr: str,
+    row: Topic,
+    congestion: zenoh.CongestionControl = zenoh.CongestionControl.DROP,
+    priority: zenoh.Priority = zenoh.Priority.DATA,
+) -> zenoh.Publisher | zenoh.ext.AdvancedPublisher:
+    """A publisher as the row asks: with a cache from which subscribers recover, or without."""
+    encoding = ENCODING.with_schema(schema_of(row.message))
+    if not row.cache:
+        return session.declare_publisher(
+            key_expr, encoding=encoding, congestion_control=congestion, priority=priority
+        )
+    return zenoh.ext.declare_advanced_publisher(
+        session,
+        key_expr,
+        encoding=encoding,
+        congestion_control=congestion,
+        priority=priority,
+        cache=zenoh.ext.CacheConfig(row.cache),
+        sample_miss_detection=zenoh.ext.MissDetectionConfig(sporadic_heartbeat=0.5),
+        publisher_detection=True,
+    )
+
+
+def declare_reader(
+    session: zenoh.Session,
+    key_expr: str,
+    row: Topic,
+    delivery: str,
+    channel: zenoh.handlers.FifoChannel | zenoh.handlers.RingChannel,
+    origin: zenoh.Locality = zenoh.Locality.ANY,
+) -> zenoh.Subscriber | zenoh.ext.AdvancedSubscriber:
+    """A subscriber that recovers what the row's publisher keeps, where the delivery wants that."""
+    if not row.cache or delivery == "latest":
+        return session.declare_subscriber(key_expr, channel, allowed_origin=origin)
+    latched = zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=1)
+    return zenoh.ext.declare_advanced_subscriber(
+        session,
+        key_expr,
+        channel,
+        allowed_origin=origin,
+        recovery=zenoh.ext.RecoveryConfig(heartbeat=True),
+        history=latched if row.delivery == "latched" else None,
+    )
+
+
 class Publication:
     """One topic as one producer writes it; `put` may be called from several threads."""
 
@@ -32,21 +79,7 @@ class Publication:
         self.row = row
         self.sent = 0
         self.bytes = 0
-        encoding = ENCODING.with_schema(schema_of(row.message))
-        if row.cache:
-            self._publisher = zenoh.ext.declare_advanced_publisher(
-                bus.session,
-                key_expr,
-                encoding=encoding,
-                congestion_control=zenoh.CongestionControl.DROP,
-                cache=zenoh.ext.CacheConfig(row.cache),
-                sample_miss_detection=zenoh.ext.MissDetectionConfig(sporadic_heartbeat=0.5),
-                publisher_detection=True,
-            )
-        else:
-            self._publisher = bus.session.declare_publisher(
-                key_expr, encoding=encoding, congestion_control=zenoh.CongestionControl.DROP
-            )
+        self._publisher = declare_writer(bus.session, key_expr, row)
 
     def put(self, message: Message) -> Header:
         """Sends one message; never waits for a subscriber."""
@@ -86,19 +119,7 @@ class Subscription:
             channel = zenoh.handlers.FifoChannel(max(row.cache, FIFO_MESSAGES))
         else:
             channel = zenoh.handlers.RingChannel(1)
-        if row.cache and delivery != "latest":
-            latched = row.delivery == "latched"
-            self._subscriber = zenoh.ext.declare_advanced_subscriber(
-                bus.session,
-                key_expr,
-                channel,
-                recovery=zenoh.ext.RecoveryConfig(heartbeat=True),
-                history=zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=1)
-                if latched
-                else None,
-            )
-        else:
-            self._subscriber = bus.session.declare_subscriber(key_expr, channel)
+        self._subscriber = declare_reader(bus.session, key_expr, row, delivery, channel)
         self._thread = threading.Thread(target=self._receive, name=f"sub-{row.name}", daemon=True)
         self._thread.start()
 

@@ -7,8 +7,9 @@ every    in order; `cache` messages are kept by the publisher, so that a subscri
          broken link lost; what is lost for good is counted
 latched  the last value reaches late joiners
 
-`uplink` marks what crosses from the robot to an edge server. A topic has exactly one producer in a
-running system; where several services are named, a deployment starts one of them.
+`uplink` marks what crosses between a robot and its edge server (common/relay.py): "up" from the robot, "bulk"
+likewise but large, on a link of its own behind the small, "down" to the robot. A topic has exactly one
+producer in a running system; where several services are named, a deployment starts one of them.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from typing import Literal
 from common import messages as m
 
 Delivery = Literal["latest", "every", "latched"]
+Uplink = Literal["", "up", "bulk", "down"]
 
 
 @dataclass(frozen=True)
@@ -31,7 +33,8 @@ class Topic:
     rate_hz: float  # nominal; 0 = on events
     delivery: Delivery
     cache: int = 0  # messages the publisher keeps for recovery: rate x longest outage to survive
-    uplink: bool = False
+    uplink: Uplink = ""
+    repeated: bool = False  # until it is acknowledged: a gap is no loss
 
     @property
     def handler(self) -> str:
@@ -40,22 +43,22 @@ class Topic:
 
 
 _ROWS = (
-    # name                    message          producers                 Hz  delivery  cache  uplink
-    Topic("rig",                     m.Rig,           ("camera", "ros2", "replay"), 0, "latched", 1, True),
+    # name                    message          producers                 Hz  delivery  cache  uplink  repeated
+    Topic("rig",                     m.Rig,           ("camera", "ros2", "replay"), 0, "latched", 1, "up"),
     Topic("wheel/odometry",          m.WheelOdometry, ("wheels", "ros2", "replay"), 50, "every", 2000),
     Topic("lidar/scan",              m.Scan,          ("lidar", "ros2", "replay"), 10, "every", 400),
     Topic("camera/image",            m.Image,         ("camera", "ros2", "replay"), 10, "latest"),
     Topic("external/pose",           m.ExternalPose,  ("ros2", "replay"),       10, "every", 400),
-    Topic("localization/odometry",   m.Odometry,      ("localization",),        10, "every", 400, True),
-    Topic("localization/correction", m.Correction,    ("localization",),         0, "latched", 1, True),
-    Topic("localization/anchors",    m.Anchors,       ("localization",),         0, "latched", 1, True),
+    Topic("localization/odometry",   m.Odometry,      ("localization",),        10, "every", 400, "up"),
+    Topic("localization/correction", m.Correction,    ("localization",),         0, "latched", 1, "up"),
+    Topic("localization/anchors",    m.Anchors,       ("localization",),         0, "latched", 1, "up"),
     Topic("localization/movers",     m.MovingBeams,   ("localization",),        10, "every", 400),
-    Topic("localization/grid",       m.Grid,          ("localization",),         0, "latched", 1, True),
+    Topic("localization/grid",       m.Grid,          ("localization",),         0, "latched", 1, "bulk"),
     Topic("depth/estimate",          m.DepthEstimate, ("depth",),                5, "latest"),
     Topic("fusion/depth",            m.FusedDepth,    ("fusion",),               5, "latest"),
     Topic("fusion/cloud",            m.Cloud,         ("fusion",),               1, "latest"),
-    Topic("keyframes/frame",         m.Keyframe,      ("keyframes",),            2, "every", 60, True),
-    Topic("keyframes/ack",           m.KeyframeAck,   ("mapping",),              2, "every", 60),
+    Topic("keyframes/frame",         m.Keyframe,      ("keyframes",),           2, "every", 60, "bulk", True),
+    Topic("keyframes/ack",           m.KeyframeAck,   ("mapping",),              2, "every", 60, "down"),
     Topic("mapping/chunk",           m.MapChunk,      ("mapping",),              2, "every", 60),
     Topic("mapping/poses",           m.MapPoses,      ("mapping",),              0, "latched", 1),
     Topic("mapping/preview",         m.MapPreview,    ("mapping",),              2, "latest"),

@@ -72,7 +72,7 @@ class Witness:
     def _take(self, letter: Letter) -> None:
         with self._lock:
             getattr(self, "_" + letter.topic.replace("/", "_"))(letter, letter.message)
-            if topic(letter.topic).uplink:
+            if topic(letter.topic).uplink in ("up", "bulk"):
                 self.seen.link_bytes += letter.size_bytes
 
     def _camera_image(self, letter: Letter, m: Any) -> None:

@@ -13,10 +13,12 @@ from pydantic import Field
 
 from common.beams import project_beams
 from common.camera import Pinhole, Undistorter
+from common.codec import decode, encode, schema_of
 from common.config import NodeConfig
 from common.depth_code import depth_to_png, mask_to_png, sigma_to_png
 from common.errors import UserError
 from common.geometry import inverse
+from common.header import DecodeError, Header
 from common.history import History, TimedScan
 from common.messages import (
     Anchors,
@@ -39,6 +41,7 @@ from services.keyframes.selection import KeyframeSelector, SelectionSettings
 log = logging.getLogger("beamsplat.keyframes")
 
 ODOM_ORIGIN = -1  # the anchor while localization has named none
+_SCHEMA = schema_of(Keyframe)
 _PICTURES = 64  # kept until their depth comes: 6 s at 10 Hz
 _SCANS = 16
 _BEAMS_NS = 120_000_000  # a pose that much later places every beam of the scan around a picture
@@ -52,8 +55,10 @@ class KeyframesConfig(NodeConfig):
     least_overlap: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.6
     patience: Annotated[int, Field(ge=1)] = 2  # candidates looked at when one is blurred
     swept_only: bool = True  # only pictures for which fusion did its best; False: any with depth
-    queue: Annotated[int, Field(ge=1)] = 256  # unacknowledged keyframes that are kept: about 60 MB
-    retry_s: Annotated[float, Field(gt=0.0)] = 10.0
+    durable: bool = False  # live: unacknowledged keyframes lie on disk, in the state folder
+    queue_mb: Annotated[float, Field(gt=0.0)] = 64.0  # of them that are kept: about four a megabyte
+    retry_s: Annotated[float, Field(gt=0.0)] = 10.0  # of silence, after which the oldest is tried again
+    window: Annotated[int, Field(ge=1)] = 4  # of those sent again, on their way at once
     jpeg_quality: Annotated[int, Field(ge=50, le=100)] = 95  # of pictures that come uncompressed
 
 
@@ -89,10 +94,20 @@ class KeyframesNode(Node):
         self._unmarked: deque[TimedScan] = deque()
         self._T_map_odom = np.eye(4)
         self._anchor_id, self._T_map_anchor, self._optimisation = ODOM_ORIGIN, np.eye(4), 0
-        self._outbox: Outbox[Keyframe] = Outbox(self.config.queue, round(self.config.retry_s * 1e9))
-        self._seen = self._sent = self._refused = 0
+        c = self.config
+        folder = self.home.run_dir / "keyframes" if c.durable and self.home is not None else None
+        self._outbox = Outbox(round(c.queue_mb * 1e6), round(c.retry_s * 1e9), c.window, folder)
+        self._now_ns = 0  # by the pictures
+        self._seen = self._sent = self._again = self._refused = 0
+        if self._outbox.earlier:
+            log.info("%d keyframes of before wait in %s", self._outbox.earlier, folder)
 
     # --- what is known of the robot ---
+
+    def on_header(self, header: Header) -> None:
+        """Anchors mean something within one run of localization only: a drive is named after it."""
+        if header.producer == "localization" and header.instance != self._outbox.drive:
+            self._outbox.drive = header.instance
 
     def on_rig(self, rig: Rig) -> Outputs:
         """The camera is needed; beams only where there is a lidar. A second calibration restarts."""
@@ -151,9 +166,19 @@ class KeyframesNode(Node):
     def on_camera_image(self, image: Image) -> Outputs:
         """Kept until its depth comes; and time has passed for what was not acknowledged."""
         self._pictures.append(image)
-        again = self._outbox.due(image.stamp_ns)
-        if again is not None:
-            yield "keyframes/frame", again
+        self._now_ns = max(self._now_ns, image.stamp_ns)
+        yield from self._send_again()
+
+    def _send_again(self) -> Outputs:
+        for key, payload in list(self._outbox.due(self._now_ns)):
+            try:
+                frame = decode(_SCHEMA, payload)
+            except DecodeError as error:  # another version of this program left it
+                log.warning("keyframe %d in the queue is of no use: %s", key, error)
+                self._outbox.discard(key)
+                continue
+            self._again += 1
+            yield "keyframes/frame", frame.model_copy(update={"backlog": len(self._outbox)})
 
     def on_fusion_depth(self, depth: FusedDepth) -> Outputs:
         if depth.status == "ok" and (depth.keyframe or not self.config.swept_only):
@@ -170,10 +195,20 @@ class KeyframesNode(Node):
 
     def on_keyframes_ack(self, ack: KeyframeAck) -> Outputs:
         """The mapper has it, or refused it: either way it need not come again."""
-        if self._outbox.acknowledge(ack.id) and ack.status != "ok":
+        if self._outbox.acknowledge(ack.id, self._now_ns) and ack.status != "ok":
             self._refused += 1
+        yield from self._send_again()
         self._say()
-        return iter(())
+
+    def awaits_answers(self) -> bool:
+        """Recorded data may end before the mapper has everything."""
+        return len(self._outbox) > 0
+
+    def on_silence(self, seconds: float) -> Outputs:
+        """No pictures come any more, so time passes this way."""
+        self._now_ns += round(seconds * 1e9)
+        yield from self._send_again()
+        self._say()
 
     def drain(self) -> Outputs:
         """Depths whose last pose never came."""
@@ -197,10 +232,13 @@ class KeyframesNode(Node):
         if chosen is None:
             return
         frame = self._keyframe(chosen, decision.reason)
-        self._outbox.put(frame.id, frame, depth.stamp_ns)
+        T_map_camera = frame.T_map_anchor @ frame.T_anchor_body @ frame.camera.T_body_camera
+        units = (self.config.distance_m, self.config.angle_rad)
+        view = np.concatenate([T_map_camera[:3, 3] / units[0], T_map_camera[:3, 2] / units[1]])
+        self._outbox.put(frame.id, view, encode(frame), self._now_ns)
         self._sent += 1
         self._say()
-        yield "keyframes/frame", frame
+        yield "keyframes/frame", frame.model_copy(update={"backlog": len(self._outbox)})
 
     def _keyframe(self, chosen: _Candidate, why: str) -> Keyframe:
         """Self-sufficient; poses are those of the optimisation that is known now."""
@@ -235,6 +273,10 @@ class KeyframesNode(Node):
         return "jpeg", cv2.imencode(".jpg", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), quality)[1].ravel()
 
     def _say(self) -> None:
-        self.detail = f"{self._sent} keyframes, {len(self._outbox)} not acknowledged" + (
-            f", {self._refused} refused" if self._refused else ""
-        ) + (f", {self._outbox.given_up} given up" if self._outbox.given_up else "")  # fmt: skip
+        o = self._outbox
+        counts = {
+            "sent again": self._again, "refused": self._refused, "thrown away": o.given_up,
+            "not on disk": o.unstored, "broken": o.broken, "of earlier drives": o.earlier,
+        }  # fmt: skip
+        said = "".join(f", {count} {what}" for what, count in counts.items() if count)
+        self.detail = f"{self._sent} keyframes, {len(o)} not acknowledged{said}"

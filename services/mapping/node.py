@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated
@@ -53,6 +54,7 @@ class MappingConfig(NodeConfig):
     tick_steps: Steps = 6  # per tick while no keyframe waits, at full size
     mend_steps: Steps = 30  # after anchors have moved: seams
     final_steps: Steps = 0  # when the data have ended, on all keyframes
+    calm_backlog: Annotated[int, Field(ge=1)] = 16  # more keyframes wait on the robot: fewer steps for each
     max_gaussians: Annotated[int, Field(ge=1000)] = 300_000
     max_keyframes: Annotated[int, Field(ge=4)] = 800
     refine_pose: bool = True
@@ -103,7 +105,9 @@ class MappingNode(Node):
             yield "mapping/status", self._status(message.stamp_ns, outcome, 0.0)
             return
         self._taken[message.id] = (message.stamp_ns, inverse(message.camera.T_body_camera))
-        loss = self._mapper.optimise()
+        share = min(self.config.calm_backlog / max(message.backlog, 1), 1.0)
+        c = self.config
+        loss = self._mapper.optimise(math.ceil(c.half_steps * share), math.ceil(c.full_steps * share))
         yield from self._show(message, outcome, loss)
         if len(self._mapper.keyframes) % self.config.chunk_every == 0:
             yield from self._chunk(message.anchor_id, message.stamp_ns)

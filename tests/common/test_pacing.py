@@ -44,7 +44,7 @@ def play(tmp_path):
         sent = []
         live = Live(Player(Player.Config()), LiveSettings("r", (), tmp_path, rate=rate, resume=resume))
         live._bookmark._PERIOD_S = 0.0
-        live._publications = {name: FakePublication(name, live, sent, last) for name in Player.outputs}
+        live.publications = {name: FakePublication(name, live, sent, last) for name in Player.outputs}
         live._run_source()
         return sent, live
 

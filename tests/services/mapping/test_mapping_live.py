@@ -8,6 +8,8 @@ from plyfile import PlyData
 
 from common.bus import open_session
 from common.config import Deployment, RouterConfig
+from common.streams import open_sample
+from common.topics import topic
 from services.board import HealthBoard
 from services.supervisor import Supervisor
 from tests.common.polling import poll
@@ -66,3 +68,41 @@ def test_a_killed_mapper_gets_again_what_it_had_not_acknowledged(deployment):
         poll(supervisor, lambda: supervisor.children["mapping"].process.pid != first, 5)
         poll(supervisor, lambda: state(board, "mapping") == "drained", 120)
         poll(supervisor, lambda: " 0 not acknowledged" in detail(board, "keyframes"), 10)
+
+
+def heard(session, name):
+    """Ids on a topic, as they come."""
+    ids = []
+    row = topic(name)
+    session.declare_subscriber(f"beamsplat/test/{name}", lambda s: ids.append(open_sample(s, row).message.id))
+    return ids
+
+
+@pytest.mark.slow
+def test_keyframes_outlive_their_own_process_and_reach_a_mapper_that_comes_later(deployment):
+    live = deployment(70, durable=True, retry_s=0.5, window=2)
+    others = tuple(name for name in live.nodes if name != "mapping")
+    with Supervisor(live, ("router",), table=TABLE), open_session(live.router.listen) as session:
+        sent, answered = heard(session, "keyframes/frame"), heard(session, "keyframes/ack")
+        board = HealthBoard(session, "test")
+        with Supervisor(live, ("mapping",), table=TABLE) as edge:
+            robot = Supervisor(live, others, table=TABLE)
+            with robot:
+                poll(robot, lambda: len(answered) >= 2, 90)
+                edge.stop()  # from now on nobody answers
+                poll(robot, lambda: len(set(sent)) >= len(answered) + 4, 60)
+                first = robot.children["keyframes"].process.pid
+                os.kill(first, signal.SIGKILL)
+                poll(robot, lambda: robot.children["keyframes"].process.pid != first, 5)
+                poll(robot, lambda: "sent again" in detail(board, "keyframes"), 60)
+                unanswered = set(sent) - set(answered)
+                assert len(unanswered) >= 4
+                with Supervisor(live, ("mapping",), table=TABLE):
+                    poll(robot, lambda: state(board, "keyframes") == "drained", 120)
+                    poll(robot, lambda: state(board, "mapping") == "drained", 30)
+                    assert not set(sent) - set(answered)
+                    assert "0 not acknowledged" in detail(board, "keyframes")
+                    received = {i.topic: i for i in board.records["mapping"].health.inputs}["keyframes/frame"]
+                    assert received.lost == 0
+                    assert received.received >= len(unanswered)
+    assert not list((live.run_dir / "keyframes").iterdir())

@@ -1,4 +1,4 @@
-"""What is sent again, and which pixels show somebody who walks."""
+"""Which pixels show somebody who walks."""
 
 import numpy as np
 import pytest
@@ -7,39 +7,9 @@ from common.camera import Pinhole
 from common.frames import camera_mount
 from common.geometry import inverse, transform_points
 from services.keyframes.bodies import body_mask
-from services.keyframes.outbox import Outbox
 
-S = 1_000_000_000
 CAMERA = Pinhole(530.0, 530.0, 319.5, 239.5, 640, 480)
 T_BODY_CAMERA = camera_mount(0.1, 0.0, 0.45)
-
-
-def test_only_the_oldest_is_tried_until_somebody_answers():
-    box = Outbox(limit=10, retry_ns=5 * S)
-    for i in range(3):
-        box.put(i, f"frame {i}", i * S)
-    assert box.due(4 * S) is None
-    assert box.due(5 * S) == "frame 0"
-    assert box.due(6 * S) is None  # frame 1 is old too, but nobody has answered
-    assert box.due(10 * S) == "frame 0"
-    assert box.acknowledge(0)
-    assert box.due(10 * S) == "frame 1"  # the mapper is back: the rest follows at once
-    assert box.acknowledge(1)
-    assert box.due(10 * S) == "frame 2"
-    assert box.acknowledge(2)
-    assert box.due(99 * S) is None
-    assert not box.acknowledge(2)
-    assert len(box) == 0
-
-
-def test_the_bound_holds_and_what_it_cost_is_counted():
-    box = Outbox(limit=2, retry_ns=S)
-    for i in range(5):
-        box.put(i, i, 0)
-    assert (len(box), box.given_up) == (2, 3)
-    assert box.due(S) == 3
-    with pytest.raises(ValueError, match="positive"):
-        Outbox(limit=0, retry_ns=S)
 
 
 def walker(distance_m, side_m=0.0):
