@@ -82,6 +82,8 @@ class MapStatus(Message):
     """How the map is doing after a keyframe. Errors are of the newest keyframe's own view: of what the map
     foretold before it took the picture in, where it knew anything there, and after."""
 
+    version = "1.1"
+
     status: Text = "ok"  # or why the newest keyframe was refused
     keyframes: Count = 0
     refused: Count = 0
@@ -92,3 +94,4 @@ class MapStatus(Message):
     foretold_psnr_db: float = float("nan")
     psnr_db: float = float("nan")
     depth_error_m: float = float("nan")  # median |rendered - fused|
+    session: Text = ""  # since 1.1: how far the map is on disk, or "NOT SAVED: " and why; "" = not asked for

@@ -24,15 +24,23 @@ def make_folder(path: Path) -> Path:
     return path
 
 
-def write_atomically(path: Path, data: bytes) -> None:
-    """Replaces a file so that a reader, or a crash, sees the old or the new one, never a half."""
+def write_atomically(path: Path, data: bytes | memoryview) -> None:
+    """Replaces a file so that a reader, or a crash, sees the old or the new one, never a half.
+
+    Raises:
+        OSError: the disk is full or broken; the old file is as it was, and nothing is left beside it.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    with temporary.open("wb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
-    temporary.replace(path)
+    try:
+        with temporary.open("wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    except OSError:
+        temporary.unlink(missing_ok=True)
+        raise
 
 
 def _read_int(path: Path) -> int | None:

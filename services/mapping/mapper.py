@@ -7,6 +7,7 @@ before trusted surfaces, then a fixed number of steps on a window of new and ran
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -118,6 +119,20 @@ class Mapper:
                 moved += 1
             self.T_map_anchor[anchor] = np.array(T, dtype=np.float64)
         return moved
+
+    def progress(self) -> dict[str, Any]:
+        """What going on later needs beside Gaussians, keyframes and anchors; fit for JSON."""
+        return {
+            "steps": self.steps, "newest": list(self._newest), "forgotten": sorted(self._forgotten),
+            "random": self._random.bit_generator.state,
+        }  # fmt: skip
+
+    def resume(self, progress: dict[str, Any]) -> None:
+        """Goes on from `progress`."""
+        self.steps = progress["steps"]
+        self._newest = [id for id in progress["newest"] if id in self.keyframes]
+        self._forgotten = set(progress["forgotten"])
+        self._random.bit_generator.state = progress["random"]
 
     # --- growing and shrinking ---------------------------------------------------------------------
 

@@ -5,15 +5,12 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Iterator
-from pathlib import Path
-from typing import Annotated
 
 import cv2
 import numpy as np
-from pydantic import Field
 
 from common.camera import Pinhole, Undistorter
-from common.config import NodeConfig
+from common.codec import decode, encode, schema_of
 from common.depth_code import depth_from_png, mask_from_png, sigma_from_png
 from common.errors import UserError
 from common.geometry import inverse
@@ -28,14 +25,16 @@ from common.messages import (
     MapStatus,
     Tick,
 )  # fmt: skip
-from common.node import Input, Node, Outputs
+from common.node import Input, Job, Node, Outputs
 from common.picture import decode_rgb
 from common.raster.camera import RasterCamera
 from common.splats import pack
+from services.mapping.config import MappingConfig
 from services.mapping.export import write_map
 from services.mapping.keyframe import Keyframe as MapKeyframe
 from services.mapping.look import look
 from services.mapping.mapper import FULL, HALF, Mapper, Outcome
+from services.mapping.session.keeper import Keeper, Saved
 from services.mapping.settings import MapperSettings
 from services.mapping.store import moved
 from services.mapping.warm import warm
@@ -43,25 +42,6 @@ from services.mapping.warm import warm
 log = logging.getLogger("beamsplat.mapping")
 
 ODOM_ORIGIN = -1  # the anchor of keyframes from before localization named one
-Steps = Annotated[int, Field(ge=0, le=100_000)]
-
-
-class MappingConfig(NodeConfig):
-    """Work is fixed: so many steps a keyframe, so many a tick. `threads` are the rasterizer's."""
-
-    half_steps: Steps = 18  # per keyframe, at half size
-    full_steps: Steps = 5
-    tick_steps: Steps = 6  # per tick while no keyframe waits, at full size
-    mend_steps: Steps = 30  # after anchors have moved: seams
-    final_steps: Steps = 0  # when the data have ended, on all keyframes
-    calm_backlog: Annotated[int, Field(ge=1)] = 16  # more keyframes wait on the robot: fewer steps for each
-    max_gaussians: Annotated[int, Field(ge=1000)] = 300_000
-    max_keyframes: Annotated[int, Field(ge=4)] = 800
-    refine_pose: bool = True
-    refine_exposure: bool = True
-    chunk_every: Annotated[int, Field(ge=1)] = 2  # keyframes between two versions of the newest chunk
-    seed: int = 0
-    save: Path | None = None  # folder for map.ply and keyframes.tum, written at the end of the data
 
 
 class MappingNode(Node):
@@ -89,6 +69,54 @@ class MappingNode(Node):
         self._T_oldest_origin: np.ndarray | None = (
             None  # the oldest submap's place when the origin was tied to it
         )
+        self._keeper: Keeper | None = None
+        if c.session is not None:
+            self._keeper = Keeper(c.session, round(c.session_every_s * 1e9))
+            self._resume(self._keeper)
+
+    def close(self) -> None:
+        if getattr(self, "_keeper", None) is not None:
+            self._keeper.close()
+
+    # --- session ---
+
+    def _resume(self, keeper: Keeper) -> None:
+        """Becomes what was saved; keyframes that came after the checkpoint are taken in again."""
+        m = self._mapper
+        extra, newer = keeper.resume(m, lambda schema, body: self._open(decode(schema, body)))
+        if extra:
+            rows = zip(
+                extra["taken_id"].tolist(), extra["taken_stamp_ns"].tolist(), extra["taken_T_camera_body"]
+            )
+            self._taken = {id: (stamp_ns, T.copy()) for id, stamp_ns, T in rows}
+            self._T_oldest_origin = next(iter(extra["T_oldest_origin"]), None)
+        for id in newer:
+            body = keeper.body(id)
+            if body is not None and self._take(decode(*body)).ok:
+                self._mapper.optimise()
+        if m.keyframes:
+            log.info("goes on with %d keyframes (%d came after the checkpoint), %d Gaussians, step %d",
+                     len(m.keyframes), len(newer), m.store.count, m.steps)  # fmt: skip
+
+    def _extra(self) -> dict[str, np.ndarray]:
+        """What of this node outlives it, beside the mapper."""
+        ids = list(self._taken)
+        origin = [] if self._T_oldest_origin is None else [self._T_oldest_origin]
+        return {
+            "taken_id": np.array(ids, np.int64),
+            "taken_stamp_ns": np.array([self._taken[id][0] for id in ids], np.int64),
+            "taken_T_camera_body": np.array([self._taken[id][1] for id in ids]).reshape(-1, 4, 4),
+            "T_oldest_origin": np.array(origin).reshape(-1, 4, 4),
+        }
+
+    def _checkpoint(self, stamp_ns: int) -> Outputs:
+        """Now and then the map goes to the disk, in the background."""
+        if self._keeper is not None and self._mapper.keyframes and self._keeper.due(stamp_ns):
+            yield Job("checkpoint", self._keeper.checkpoint(self._mapper, self._extra(), stamp_ns))
+
+    def on_job_checkpoint(self, saved: Saved) -> Outputs:
+        self._keeper.done(saved)
+        return iter(())
 
     # --- keyframes ---
 
@@ -96,7 +124,9 @@ class MappingNode(Node):
         """Insertion and the fixed steps; then how well the picture is explained, and what has changed."""
         known = message.id in self._taken
         outcome = Outcome("ok") if known else self._take(message)
-        yield "keyframes/ack", KeyframeAck(stamp_ns=message.stamp_ns, id=message.id, status=outcome.status)
+        if not outcome.ok or self._kept(message, known):
+            status = outcome.status
+            yield "keyframes/ack", KeyframeAck(stamp_ns=message.stamp_ns, id=message.id, status=status)
         if known:  # sent again while the answer was on its way
             return
         if not outcome.ok:
@@ -104,20 +134,30 @@ class MappingNode(Node):
             log.warning("keyframe %d is refused: %s", message.id, outcome.status)
             yield "mapping/status", self._status(message.stamp_ns, outcome, 0.0)
             return
-        self._taken[message.id] = (message.stamp_ns, inverse(message.camera.T_body_camera))
         share = min(self.config.calm_backlog / max(message.backlog, 1), 1.0)
         c = self.config
         loss = self._mapper.optimise(math.ceil(c.half_steps * share), math.ceil(c.full_steps * share))
         yield from self._show(message, outcome, loss)
         if len(self._mapper.keyframes) % self.config.chunk_every == 0:
             yield from self._chunk(message.anchor_id, message.stamp_ns)
+        yield from self._checkpoint(message.stamp_ns)
 
     def _take(self, message: Keyframe) -> Outcome:
         try:
             frame = self._open(message)
         except (UserError, ValueError) as error:
             return Outcome(str(error))
-        return self._mapper.add(frame, message.T_map_anchor)
+        outcome = self._mapper.add(frame, message.T_map_anchor)
+        if outcome.ok:
+            self._taken[message.id] = (message.stamp_ns, inverse(message.camera.T_body_camera))
+        return outcome
+
+    def _kept(self, message: Keyframe, known: bool) -> bool:
+        """Whether an accepted keyframe survives this process, as far as that was asked for."""
+        keeper = self._keeper
+        if keeper is None or (known and not keeper.lacks(message.id)):
+            return True
+        return keeper.keep(message.id, schema_of(message), encode(message))
 
     def _open(self, message: Keyframe) -> MapKeyframe:
         """Decoded and undistorted: everything behind sees a pinhole.
@@ -181,6 +221,7 @@ class MappingNode(Node):
             yield from self._chunk(
                 min(stale, key=lambda a: (self._sent.get(a, (-1, -1))[1], a)), tick.stamp_ns
             )
+        yield from self._checkpoint(tick.stamp_ns)
 
     # --- what is said ---
 
@@ -214,10 +255,13 @@ class MappingNode(Node):
         self.detail = f"{len(m.keyframes)} keyframes, {m.store.count} Gaussians, {psnr_db:.1f} dB" + (
             f", {self._refused} refused (last: {outcome.status})" if not outcome.ok else ""
         )
+        session = "" if self._keeper is None else self._keeper.text()
+        self.detail += f"; {session}" if session else ""
         return MapStatus(
             stamp_ns=stamp_ns, status=outcome.status, keyframes=len(m.keyframes), refused=self._refused,
             gaussians=m.store.count, steps=m.steps, loss=loss, foretold_share=outcome.foretold_share,
             foretold_psnr_db=outcome.foretold_psnr_db, psnr_db=psnr_db, depth_error_m=depth_error_m,
+            session=session,
         )  # fmt: skip
 
     def _chunk(self, anchor: int, stamp_ns: int) -> Outputs:
@@ -248,6 +292,9 @@ class MappingNode(Node):
         if not m.keyframes:
             return
         m.refine(self.config.final_steps, FULL)
+        if self._keeper is not None:
+            last_ns = max(self._taken[id][0] for id in m.keyframes)
+            self._keeper.done(self._keeper.checkpoint(m, self._extra(), last_ns)())
         stamps = {id: self._taken[id][0] for id in m.keyframes}
         last_ns = max(stamps.values())
         for anchor in m.store.versions():

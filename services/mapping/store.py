@@ -10,6 +10,8 @@ from common.geometry import quat_wxyz_from_matrix
 from common.raster.layout import MEAN, OPACITY, QUAT, SCALE
 from common.raster.optimiser import GaussianArrays
 
+_LEAP = 1000  # events of one anchor between two checkpoints: never as many
+
 
 @dataclass(frozen=True)
 class Chunk:
@@ -34,6 +36,24 @@ class GaussianStore(GaussianArrays):
 
     def _arrays(self) -> list[str]:
         return [*super()._arrays(), "anchor", "strikes"]
+
+    def state(self) -> dict[str, np.ndarray]:
+        """Copies of all arrays, cut to the Gaussians there are, and of the events by anchor."""
+        out = {name: getattr(self, name)[..., : self.count].copy() for name in self._arrays()}
+        out["events"] = np.array(list(self._events.items()), np.int64).reshape(-1, 2)
+        return out
+
+    def restore(self, state: dict[str, np.ndarray]) -> None:
+        """Becomes what `state` came from. Versions leap ahead of all that may have been told since.
+
+        Raises:
+            KeyError: an array is missing.
+        """
+        self.count = state["params"].shape[1]
+        self._allocate(-(-max(self.count, 1) // 16) * 16)
+        for name in self._arrays():
+            getattr(self, name)[..., : self.count] = state[name]
+        self._events = {anchor: events + _LEAP for anchor, events in state["events"].tolist()}
 
     def add(self, params: np.ndarray, anchor: int) -> None:
         """Adds Gaussians float32 [14, M] bound to an anchor."""

@@ -11,6 +11,7 @@ from common.config import Deployment, RouterConfig
 from common.streams import open_sample
 from common.topics import topic
 from services.board import HealthBoard
+from services.mapping.session.folder import SessionFolder
 from services.supervisor import Supervisor
 from tests.common.polling import poll
 from tests.services.mapping.room_drive import TABLE
@@ -18,7 +19,7 @@ from tests.services.mapping.room_drive import TABLE
 
 @pytest.fixture
 def deployment(tmp_path, free_endpoint):
-    def make(pictures, **keyframes):
+    def make(pictures, mapping=None, **keyframes):
         return Deployment(
             robot="test", router=RouterConfig(listen=(free_endpoint,)), rate=1.0, state_dir=tmp_path / "state",
             nodes={
@@ -26,7 +27,8 @@ def deployment(tmp_path, free_endpoint):
                 "localization": {"kind": "known"},
                 "fusion": {"kind": "true"},
                 "keyframes": {"distance_m": 0.15, **keyframes},
-                "mapping": {"save": str(tmp_path / "map"), "half_steps": 4, "full_steps": 3, "tick_steps": 2},
+                "mapping": {"save": str(tmp_path / "map"), "half_steps": 4, "full_steps": 3, "tick_steps": 2,
+                            **(mapping or {})},
             },
         )  # fmt: skip
 
@@ -106,3 +108,21 @@ def test_keyframes_outlive_their_own_process_and_reach_a_mapper_that_comes_later
                     assert received.lost == 0
                     assert received.received >= len(unanswered)
     assert not list((live.run_dir / "keyframes").iterdir())
+
+
+@pytest.mark.slow
+def test_a_killed_mapper_with_a_session_loses_no_keyframe(deployment, tmp_path):
+    """kill -9 in the middle of the drive: the successor resumes, and ends with every keyframe that was sent."""
+    live = deployment(60, {"session": str(tmp_path / "session"), "session_every_s": 2.0}, retry_s=1.0)
+    live = live.model_copy(update={"rate": 0.5})  # the successor must be there before the drive ends
+    with Supervisor(live, table=TABLE) as supervisor, open_session(live.router.listen) as session:
+        board = HealthBoard(session, "test")
+        poll(supervisor, lambda: "saved at " in detail(board, "mapping"), 90)
+        first = supervisor.children["mapping"].process.pid
+        os.kill(first, signal.SIGKILL)
+        poll(supervisor, lambda: supervisor.children["mapping"].process.pid != first, 5)
+        poll(supervisor, lambda: state(board, "mapping") == "drained", 120)
+        poll(supervisor, lambda: " 0 not acknowledged" in detail(board, "keyframes"), 10)
+        sent, _, refused = (int(words.split()[0]) for words in detail(board, "keyframes").split(", "))
+    folder = SessionFolder(tmp_path / "session")  # the path leaves the room: there nothing has a depth
+    assert folder.manifest()["keyframes"] == len(folder.body_ids()) == sent - refused > 8

@@ -1,0 +1,32 @@
+"""What can be chosen about the mapping service."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import Field
+
+from common.config import NodeConfig
+
+Steps = Annotated[int, Field(ge=0, le=100_000)]
+
+
+class MappingConfig(NodeConfig):
+    """Work is fixed: so many steps a keyframe, so many a tick. `threads` are the rasterizer's."""
+
+    half_steps: Steps = 18  # per keyframe, at half size
+    full_steps: Steps = 5
+    tick_steps: Steps = 6  # per tick while no keyframe waits, at full size
+    mend_steps: Steps = 30  # after anchors have moved: seams
+    final_steps: Steps = 0  # when the data have ended, on all keyframes
+    calm_backlog: Annotated[int, Field(ge=1)] = 16  # more keyframes wait on the robot: fewer steps for each
+    max_gaussians: Annotated[int, Field(ge=1000)] = 300_000
+    max_keyframes: Annotated[int, Field(ge=4)] = 800
+    refine_pose: bool = True
+    refine_exposure: bool = True
+    chunk_every: Annotated[int, Field(ge=1)] = 2  # keyframes between two versions of the newest chunk
+    seed: int = 0
+    save: Path | None = None  # folder for map.ply and keyframes.tum, written at the end of the data
+    session: Path | None = None  # folder that the map lives in: saved while mapping, resumed at the start
+    session_every_s: Annotated[float, Field(gt=0.0)] = 30.0  # between checkpoints, by the data's clock

@@ -1,0 +1,105 @@
+"""A mapper as arrays and back: bit for bit, so that training goes on as if nothing had happened."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+
+from common.errors import UserError
+from common.raster.camera import RasterCamera
+from services.mapping.keyframe import Held, Keyframe, hold
+from services.mapping.mapper import FULL, Mapper
+from services.mapping.session.folder import Arrays
+
+_CAMERA = ("fx_px", "fy_px", "cx_px", "cy_px", "width_px", "height_px")
+_NOT_STORED = {"levels"}  # made again from the keyframe's body
+_FIELDS = tuple(field.name for field in fields(Held) if field.name not in _NOT_STORED)
+
+
+def arrays_of(mapper: Mapper, extra: Arrays | None = None) -> Arrays:
+    """Copies of all that a mapper is, but for its keyframes' pictures; `extra` rides along.
+
+    Gaussians are `store_*`, keyframes `keyframe_*` (in the mapper's order), anchors `anchor_*`.
+    """
+    held = list(mapper.keyframes.values())
+    out = {f"store_{name}": array for name, array in mapper.store.state().items()}
+    for name in _FIELDS:
+        out[f"keyframe_{name}"] = np.array([getattr(h, name) for h in held])
+    cameras = [[getattr(h.levels[FULL].camera, name) for name in _CAMERA] for h in held]
+    out["keyframe_camera"] = np.array(cameras, np.float64).reshape(-1, len(_CAMERA))
+    out["anchor_id"] = np.array(list(mapper.T_map_anchor), np.int64)
+    out["anchor_T_map"] = np.array(list(mapper.T_map_anchor.values()), np.float64).reshape(-1, 4, 4)
+    out["progress"] = np.frombuffer(json.dumps(mapper.progress()).encode(), np.uint8)
+    return out | {f"extra_{name}": np.array(array) for name, array in (extra or {}).items()}
+
+
+def extras_of(arrays: Arrays) -> Arrays:
+    """What rode along."""
+    return {key.removeprefix("extra_"): a for key, a in arrays.items() if key.startswith("extra_")}
+
+
+def restore(mapper: Mapper, arrays: Arrays, body: Callable[[int], Keyframe]) -> list[str]:
+    """Makes a fresh mapper what the saved one was; `body` opens a keyframe by its id.
+
+    Gives one sentence for each keyframe that could not be opened: the map is whole without it, but does not
+    learn from it any more.
+
+    Raises:
+        UserError: the arrays are not a whole state.
+    """
+    lost = []
+    try:
+        mapper.store.restore(
+            {k.removeprefix("store_"): a for k, a in arrays.items() if k.startswith("store_")}
+        )
+        anchors = zip(arrays["anchor_id"].tolist(), arrays["anchor_T_map"])
+        mapper.T_map_anchor = {anchor: T.copy() for anchor, T in anchors}
+        for row, id in enumerate(arrays["keyframe_id"].tolist()):
+            try:
+                held = hold(body(id), mapper.settings.sigma_unit)
+            except ValueError as error:
+                lost.append(f"keyframe {id}: {error}")
+                continue
+            for name in _FIELDS:
+                if f"keyframe_{name}" in arrays:  # what came later than the file keeps its default
+                    setattr(held, name, _value(arrays[f"keyframe_{name}"][row]))
+            mapper.keyframes[id] = held
+        mapper.resume(progress_of(arrays))
+    except KeyError as error:
+        raise UserError(f"the saved state lacks {error}: restore the session from a copy") from error
+    return lost
+
+
+def progress_of(arrays: Arrays) -> dict[str, Any]:
+    """The mapper's counters (`Mapper.progress`) in a state."""
+    return json.loads(arrays["progress"].tobytes())
+
+
+def _value(stored: np.ndarray) -> Any:
+    return stored.item() if stored.ndim == 0 else stored.copy()
+
+
+@dataclass(frozen=True)
+class View:
+    """A keyframe of a saved map: where it looks from."""
+
+    id: int
+    camera: RasterCamera
+    T_map_camera: np.ndarray
+
+
+def views_of(arrays: Arrays) -> list[View]:
+    """The keyframes of a state, refined, in order of id (which is time)."""
+    T_map_anchor = dict(zip(arrays["anchor_id"].tolist(), arrays["anchor_T_map"]))
+    out = []
+    for row, id in enumerate(arrays["keyframe_id"].tolist()):
+        numbers = dict(zip(_CAMERA, arrays["keyframe_camera"][row].tolist()))
+        camera = RasterCamera(**numbers | {n: int(numbers[n]) for n in ("width_px", "height_px")})
+        T_anchor_camera = arrays["keyframe_T_anchor_camera"][row] @ arrays["keyframe_delta"][row]
+        T_map_camera = T_map_anchor[int(arrays["keyframe_anchor"][row])] @ T_anchor_camera
+        out.append(View(id, camera, T_map_camera))
+    return sorted(out, key=lambda view: view.id)

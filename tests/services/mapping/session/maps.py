@@ -1,0 +1,53 @@
+"""Maps of the synthetic room for the tests of sessions: keyframes as messages, and a mapper that takes them."""
+
+import numpy as np
+
+from common.depth_code import depth_to_png, sigma_to_png
+from common.geometry import inverse
+from common.messages import Keyframe
+from services.mapping.config import MappingConfig
+from services.mapping.node import MappingNode
+from tests.services.mapping import room_drive as r
+
+SECOND = 1_000_000_000
+
+
+def message(number, stamp_ns=None, **change):
+    """A keyframe a second; the second half hangs on anchor 1."""
+    rgb, depth = r.shot(number)
+    anchor = int(number >= 4)
+    T_map_anchor = r.T_map_body(4 * anchor)
+    stamp_ns = r.T0 + number * SECOND if stamp_ns is None else stamp_ns
+    fields = {
+        "stamp_ns": stamp_ns, "id": stamp_ns, "encoding": "png", "picture": r.jpeg(rgb), "camera": r.CAMERA_MODEL,
+        "anchor_id": anchor, "T_anchor_body": inverse(T_map_anchor) @ r.T_map_body(number),
+        "T_map_anchor": T_map_anchor, "depth_png": depth_to_png(depth),
+        "sigma_png": sigma_to_png(np.full_like(depth, 0.01)),
+        "beams": np.array([[80.0, 60.0, depth[60, 80], 0.01]], np.float32),
+    }  # fmt: skip
+    return Keyframe(**{**fields, **change})
+
+
+def make_node(session=None, **options):
+    """A configured mapper that works quickly."""
+    options = {"half_steps": 4, "full_steps": 3, "tick_steps": 2, **options}
+    node = MappingNode(MappingConfig(session=session, **options))
+    node.configure()
+    return node
+
+
+def feed(node, numbers):
+    """Gives it keyframes; background work is done at once. Gives what it sent, by topic."""
+    sent = {}
+    for number in numbers:
+        handle(node, "keyframes/frame", message(number), sent)
+    return sent
+
+
+def handle(node, topic, content, sent):
+    """One message in; outputs are added to `sent`."""
+    for output in node.handle(topic, content):
+        if isinstance(output, tuple):
+            sent.setdefault(output[0], []).append(output[1])
+        else:
+            list(node.handle_job(output.name, output.run()))
