@@ -29,10 +29,12 @@ from common.header import DecodeError, Header, local_clock_id
 from common.mailbox import Letter
 from common.messages import Health
 from common.node import Input
+from common.security import Keys, SecurityConfig, check_endpoint
 from common.streams import Publication, Subscription, open_sample
 from common.topics import HEALTH, Topic, topic
 
 ROOT = "beamsplat"
+LINK_BUFFER_BYTES = 32 * 1024  # 13 ms at 20 Mbit/s
 SHM_POOL_BYTES = 64 * 1024 * 1024
 
 
@@ -108,6 +110,31 @@ def open_session(
                     "with `beamsplat run FILE`, or a router alone with `beamsplat run FILE router`"
                 ) from error
             time.sleep(0.1)
+
+
+def open_link(endpoint: str, wait_s: float, security: SecurityConfig) -> zenoh.Session:
+    """A client session of a router on another host, over a link that may be slow and may break.
+
+    Small send buffers keep what is urgent from standing behind seconds of what is not.
+
+    Raises:
+        UserError: a malformed endpoint, credentials that are missing, or no router answered within `wait_s`.
+    """
+    zenoh.init_log_from_env_or("error")
+    check_endpoint(endpoint, security)
+    config = _base_config("client")
+    config.insert_json5("transport/shared_memory/enabled", "false")
+    _set_endpoints(config, "connect", (endpoint,))
+    if endpoint.startswith(("tls/", "quic/")):
+        Keys.of(security).identify(config)
+    for protocol in ("tcp", "tls"):
+        config.insert_json5(f"transport/link/{protocol}/so_sndbuf", str(LINK_BUFFER_BYTES))
+    config.insert_json5("connect/timeout_ms", str(round(wait_s * 1e3)))
+    config.insert_json5("connect/exit_on_failure", "true")
+    try:
+        return zenoh.open(config)
+    except zenoh.ZError as error:
+        raise UserError(f"nobody answers at {endpoint} ({_short(error)})") from error
 
 
 def _short(error: zenoh.ZError) -> str:

@@ -17,16 +17,19 @@ from __future__ import annotations
 import os
 import tomllib
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, StringConstraints
 
 from common.errors import UserError
+from common.security import SecurityConfig
 from common.strict import Config, parse
 
 Token = Annotated[str, StringConstraints(pattern=r"^[a-z0-9][a-z0-9_-]{0,63}$")]
 
 
+# Which part of a system a deployment is: topics that cross the uplink are fed by the other part.
+Role = Literal["whole", "robot", "edge"]
 Seconds = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 
 
@@ -53,6 +56,8 @@ class Deployment(Config):
     router: RouterConfig = RouterConfig()
     rate: Annotated[float, Field(ge=0.0)] = 1.0  # replayed data: times real time; 0 = as fast as possible
     state_dir: Path | None = None
+    role: Role = "whole"
+    security: SecurityConfig = SecurityConfig()
     nodes: dict[Token, dict[str, Any]] = Field(default_factory=dict)
 
     @property

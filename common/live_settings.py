@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from common.security import SecurityConfig
+
 
 @dataclass(frozen=True)
 class LiveSettings:
@@ -13,6 +15,7 @@ class LiveSettings:
     robot: str
     endpoints: tuple[str, ...]
     run_dir: Path
+    security: SecurityConfig = SecurityConfig()  # of links to other hosts
     rate: float = 1.0  # pacing of recorded sources: times real time, 0 = as fast as possible
     wait_for: frozenset[str] = frozenset()  # a source starts when these nodes are active
     wait_s: float = 60.0

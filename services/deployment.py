@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from common.config import Deployment
+from common.config import Deployment, Role
 from common.errors import UserError
 from common.node import Node
 from common.registry import Service, class_of, make_node
@@ -59,6 +59,8 @@ def faults(deployment: Deployment, table: dict[str, Service] = NODES) -> list[Fa
     for name, node_class in classes.items():
         for topic in node_class.outputs:
             producers[topic].append(name)
+    for topic in _from_afar(deployment.role):
+        producers[topic].append("the uplink")
     for topic, names in producers.items():
         if len(names) > 1:
             found.append(Fault(f"{topic} would be written by {' and '.join(names)}: keep one of them"))
@@ -66,6 +68,8 @@ def faults(deployment: Deployment, table: dict[str, Service] = NODES) -> list[Fa
         missing = [i.topic for i in node_class.inputs if not producers[i.topic]]
         if missing and len(missing) == len(node_class.inputs):
             found.append(Fault(f"nothing in this deployment feeds {name}: {', '.join(missing)}", fatal=False))
+    if deployment.role == "robot" and "uplink" not in deployment.nodes:
+        found.append(Fault('role = "robot" without node uplink: nothing reaches an edge server', fatal=False))
     return found
 
 
@@ -77,11 +81,17 @@ class Surroundings:
     unfed: frozenset[str]  # inputs that nobody here produces: they are not waited for
 
 
-def surroundings(classes: dict[str, type[Node]], name: str) -> Surroundings:
+def surroundings(classes: dict[str, type[Node]], name: str, role: Role = "whole") -> Surroundings:
     """The surroundings of a node among the classes of its deployment."""
-    fed = {topic for node in classes.values() for topic in node.outputs}
+    fed = {topic for node in classes.values() for topic in node.outputs} | _from_afar(role)
     listeners = frozenset(other for other, node in classes.items() if node.inputs and other != name)
     return Surroundings(
-        wait_for=listeners if classes[name].is_source() else frozenset(),
+        wait_for=listeners if classes[name].is_source() and classes[name].outputs else frozenset(),
         unfed=frozenset(entry.topic for entry in classes[name].inputs if entry.topic not in fed),
     )
+
+
+def _from_afar(role: Role) -> set[str]:
+    """Topics that come over the uplink: to the edge what goes up, to a robot what comes down."""
+    ways = {"whole": (), "robot": ("down",), "edge": ("up", "bulk")}[role]
+    return {name for name, row in TOPICS.items() if row.uplink in ways}

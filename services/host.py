@@ -49,11 +49,12 @@ def serve(
     node = build_node(deployment, name, table)
     _limit_threads(node.config.threads)
     if around is None:
-        around = surroundings(node_classes(deployment, table), name)
+        around = surroundings(node_classes(deployment, table), name, deployment.role)
     settings = LiveSettings(
         robot=deployment.robot,
         endpoints=deployment.router.listen,
         run_dir=deployment.run_dir,
+        security=deployment.security,
         rate=deployment.rate,
         wait_for=around.wait_for,
         unfed=around.unfed,

@@ -64,6 +64,11 @@ _ROWS = (
         {"default": "services.mapping.node:MappingNode"},
     ),
     Service(
+        "uplink",
+        "on a robot: carries what the topic table marks to the edge server, and answers back",
+        {"default": "services.uplink.node:UplinkNode"},
+    ),
+    Service(
         "recorder",
         "writes what goes over the bus to an MCAP file",
         {"default": "services.recorder.node:RecorderNode"},

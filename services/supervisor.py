@@ -89,7 +89,7 @@ class Supervisor:
             self._wait_for_router()
         classes = node_classes(self.deployment, self._table)
         nodes = [name for name in self._names if name != ROUTER]
-        self._around = {name: surroundings(classes, name) for name in nodes}
+        self._around = {name: surroundings(classes, name, self.deployment.role) for name in nodes}
         for name in sorted(nodes, key=lambda n: classes[n].is_source()):
             self._start(name)
 

@@ -27,6 +27,7 @@ from services.mapping.bench_raster import synthetic_room
 WIDTH, HEIGHT, FOCAL = 160, 120, 110.0
 CAMERA = RasterCamera(FOCAL, FOCAL, 79.5, 59.5, WIDTH, HEIGHT)
 T0, STEP = 1_000_000_000_000, 250_000_000
+TURN = 24
 T_MAP_ODOM = se2_to_se3(np.array([0.3, -0.2, 0.1]))
 
 
@@ -44,7 +45,8 @@ T_BODY_CAMERA = make_transform(
 
 
 def T_map_body(number):
-    """Sideways steps of 8 cm and turns of 2 degrees."""
+    """Sideways steps of 8 cm and turns of 2 degrees; there and back again, where the room has walls."""
+    number = TURN - abs(TURN - number % (2 * TURN))
     T_map_camera = room()[1] @ make_transform(
         so3_exp([0.0, 0.03 * number, 0.0]), np.array([0.08 * number, 0.0, 0.0])
     )

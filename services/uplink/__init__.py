@@ -1,0 +1,1 @@
+"""What crosses from the robot to its edge server, and back."""

@@ -1,0 +1,110 @@
+"""The uplink: on the robot, carries what the topic table marks to the edge's router, and answers back.
+
+The robot never waits for it: it runs without a link, connects whenever there is one, and what was missed is
+sent again by who sent it first (keyframes) or recovered from a cache here (poses, anchors).
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from typing import Annotated
+
+import zenoh
+from pydantic import Field
+
+from common.bus import open_link, open_session
+from common.config import NodeConfig
+from common.errors import UserError
+from common.node import Node, Sourced
+from common.relay import Relay, Sides
+
+_POLL_S = 0.1
+_ATTEMPT_S = 1.0
+_CLOSE_S = 1.0
+
+
+class UplinkConfig(NodeConfig):
+    """Where the edge's router listens for robots."""
+
+    edge: Annotated[str, Field(pattern=r"^[a-z]+/\S+:\d+$")]  # "tls/edge.local:7448"
+
+
+class UplinkNode(Node):
+    """No inputs and outputs of its own: the samples of others pass as they are."""
+
+    name = "uplink"
+    Config = UplinkConfig
+    config: UplinkConfig
+
+    def configure(self) -> None:
+        self._sessions: list[zenoh.Session] = []
+        self._relay: Relay | None = None
+        self._cut_since: float | None = None
+        self._cuts = 0
+
+    def source(self) -> Iterator[Sourced | None]:
+        """Runs until all that the robot sends has ended; a robot's sensors never do."""
+        if self.home is None:
+            raise UserError("the uplink runs live only: leave it out of lockstep runs")
+        started = time.monotonic()
+        while self._relay is None:
+            try:
+                self._connect()
+            except UserError as error:
+                self.detail = f"no link for {time.monotonic() - started:.0f} s: {error}"
+                yield None
+        while not self._ended():
+            self._say()
+            yield None
+            time.sleep(_POLL_S)
+
+    def close(self) -> None:
+        """A session whose link is cut says good-bye into the void for longer than a robot has to stop."""
+        threads = [threading.Thread(target=s.close, daemon=True) for s in self._sessions]
+        for thread in threads:
+            thread.start()
+        deadline = time.monotonic() + _CLOSE_S
+        for thread in threads:
+            thread.join(max(deadline - time.monotonic(), 0.0))
+
+    def _connect(self) -> None:
+        """All sessions or none.
+
+        Raises:
+            UserError: no router answers on one of the two sides.
+        """
+        opened: list[zenoh.Session] = []
+        try:
+            for _ in ("small", "large"):
+                opened.append(open_link(self.config.edge, _ATTEMPT_S, self.home.security))
+            opened.append(open_session(self.home.endpoints, _ATTEMPT_S))
+        except UserError:
+            for session in opened:
+                session.close()
+            raise
+        self._sessions = opened
+        small, large, robot = opened
+        self._relay = Relay(self.home.robot, Sides(robot=robot, small=small, large=large))
+
+    def _ended(self) -> bool:
+        """All topics on which the robot said something have ended."""
+        spoke = {name for name, carried in self._relay.upward().items() if carried.messages}
+        return bool(spoke) and spoke <= self._relay.ended
+
+    def _say(self) -> None:
+        now = time.monotonic()
+        if all(session.info.routers_zid() for session in self._sessions[:2]):
+            self._cut_since = None
+            state = "connected"
+        else:
+            if self._cut_since is None:
+                self._cut_since, self._cuts = now, self._cuts + 1
+            state = f"no link for {now - self._cut_since:.0f} s"
+        up = self._relay.upward().values()
+        cuts = f", {self._cuts} cuts" if self._cuts else ""
+        self.detail = (
+            f"{state} ({self.config.edge}){cuts}: {sum(c.messages for c in up)} messages, "
+            f"{sum(c.bytes for c in up) / 1e6:.1f} MB"
+        )

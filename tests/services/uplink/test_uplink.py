@@ -1,0 +1,194 @@
+"""A robot and its edge server, each with a router and processes of its own, and a link that breaks."""
+
+import contextlib
+import os
+import signal
+import time
+
+import pytest
+
+from common.bus import open_session
+from common.config import Deployment, RouterConfig
+from common.errors import UserError
+from common.lockstep import Lockstep
+from common.streams import declare_reader, open_sample
+from common.topics import TOPICS, topic
+from services.board import HealthBoard
+from services.deployment import faults, surroundings
+from services.nodes import NODES
+from services.supervisor import Supervisor
+from services.uplink.node import UplinkConfig, UplinkNode
+from tests.conftest import free_port
+from tests.services.mapping.room_drive import TABLE
+from tests.services.uplink.link import Link
+
+TABLE = {**TABLE, "uplink": NODES["uplink"]}
+
+
+class Ears:
+    """What a session hears of a topic, in order."""
+
+    def __init__(self, session, name):
+        row = topic(name)
+        self.messages, self.schemas = [], set()
+
+        def take(sample):
+            self.schemas.add(str(sample.encoding))
+            self.messages.append(open_sample(sample, row).message)
+
+        self._kept = declare_reader(session, f"beamsplat/r1/{name}", row, "every", take)
+
+    def ids(self):
+        return [m.id for m in self.messages]
+
+    def stamps(self):
+        return [m.stamp_ns for m in self.messages]
+
+
+class Pair:
+    """Two supervisors; the link between them goes through a relay that the test can cut."""
+
+    def __init__(
+        self, tmp_path, pictures, rate_bytes_s=None, edge_security=None, robot_security=None, scheme="tcp"
+    ):
+        ports = [free_port() for _ in range(3)]
+        self.link = Link(ports[2], rate_bytes_s)
+        listen = {"robot": (f"tcp/127.0.0.1:{ports[0]}",), "edge": (f"tcp/127.0.0.1:{ports[1]}",)}
+        self.robot = Deployment(
+            robot="r1", role="robot", router=RouterConfig(listen=listen["robot"]), state_dir=tmp_path / "robot",
+            security=robot_security or {},
+            nodes={
+                "replay": {"kind": "room", "pictures": pictures}, "localization": {"kind": "known"},
+                "fusion": {"kind": "true"},
+                "keyframes": {"distance_m": 0.15, "durable": True, "retry_s": 1.0, "window": 2},
+                "uplink": {"edge": f"{scheme}/127.0.0.1:{self.link.port}"},
+            },
+        )  # fmt: skip
+        self.edge = Deployment(
+            robot="r1", role="edge", state_dir=tmp_path / "edge", security=edge_security or {},
+            router=RouterConfig(listen=(*listen["edge"], f"{scheme}/127.0.0.1:{ports[2]}")),
+            nodes={"mapping": {"half_steps": 3, "full_steps": 2, "tick_steps": 1}},
+        )  # fmt: skip
+
+
+@contextlib.contextmanager
+def running(pair):
+    """(supervisor, session, board) of robot and edge; the edge is there first, as it is at home."""
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(pair.link)
+        made = []
+        for deployment in (pair.edge, pair.robot):
+            supervisor = stack.enter_context(Supervisor(deployment, table=TABLE))
+            session = stack.enter_context(open_session(deployment.router.listen))
+            made.append((supervisor, session, HealthBoard(session, "r1")))
+        yield made[1], made[0]
+
+
+def poll(supervisors, until, timeout_s):
+    deadline = time.monotonic() + timeout_s
+    while time.monotonic() < deadline:
+        for supervisor in supervisors:
+            supervisor.poll()
+        if until():
+            return
+        time.sleep(0.05)
+    raise AssertionError(f"not within {timeout_s} s")
+
+
+def detail(board, node):
+    return board.records[node].health.detail if node in board.records else ""
+
+
+@pytest.mark.slow
+def test_a_cut_link_loses_no_keyframe_and_does_not_reach_the_robot(tmp_path):
+    pair = Pair(tmp_path, pictures=80)
+    with running(pair) as ((robot, near, near_board), (edge, far, far_board)):
+        both = (robot, edge)
+        sent, poses = Ears(near, "keyframes/frame"), Ears(near, "localization/odometry")
+        far_poses, anchors = Ears(far, "localization/odometry"), Ears(far, "localization/anchors")
+        mapped, refined = Ears(far, "keyframes/ack"), Ears(far, "mapping/poses")
+        poll(both, lambda: len(mapped.messages) >= 2, 90)
+        pair.link.cut = True
+        poses_before, sent_before = len(poses.messages), len(set(sent.ids()))
+        poll(both, lambda: "no link" in detail(near_board, "uplink"), 10)
+        poll(both, lambda: len(set(sent.ids())) >= sent_before + 8, 30)
+        assert len(poses.messages) >= poses_before + 12  # the robot drives on
+        assert near_board.states()["uplink"] == "active"
+        os.kill(robot.children["keyframes"].process.pid, signal.SIGKILL)  # the queue is on disk
+        poll(both, lambda: robot.children["keyframes"].restarts == 1, 10)
+        pair.link.cut = False
+        poll(both, lambda: "connected" in detail(near_board, "uplink"), 10)
+        poll(both, lambda: near_board.states().get("keyframes") == "drained", 120)
+        poll(both, lambda: far_board.states().get("mapping") == "drained", 60)
+        assert set(sent.ids()) == set(mapped.ids())
+        (last,) = refined.messages
+        good = {m.id for m in mapped.messages if m.status == "ok"}  # of the others the picture shows nothing
+        assert len(good) >= 20
+        assert set(last.keyframe_ids.tolist()) == good
+        stamps = poses.stamps()
+        assert stamps == sorted(set(stamps))
+        assert set(far_poses.stamps()) >= set(stamps[5:])  # recovered from the uplink's cache
+        assert anchors.messages[-1].optimisation == 6
+        health = {i.topic: i for i in far_board.records["mapping"].health.inputs}
+        assert health["keyframes/frame"].lost == health["keyframes/frame"].undecodable == 0
+        poll(both, lambda: near_board.states().get("uplink") == "drained", 10)
+        assert "localization" in far_board.records  # health crosses
+    assert not list((pair.robot.run_dir / "keyframes").iterdir())
+
+
+@pytest.mark.slow
+def test_the_robot_starts_without_an_edge_and_an_edge_that_dies_gets_the_rest(tmp_path):
+    pair = Pair(tmp_path, pictures=60)
+    pair.link.cut = True
+    with (
+        pair.link,
+        Supervisor(pair.robot, table=TABLE) as robot,
+        open_session(pair.robot.router.listen) as near,
+    ):
+        board = HealthBoard(near, "r1")
+        sent, answered = Ears(near, "keyframes/frame"), Ears(near, "keyframes/ack")
+        poll((robot,), lambda: len(set(sent.ids())) >= 4, 60)
+        assert "no link" in detail(board, "uplink")
+        pair.link.cut = False
+        with Supervisor(pair.edge, table=TABLE) as edge:
+            poll((robot, edge), lambda: len(set(answered.ids())) >= 4, 60)
+            for name in ("mapping", "router"):
+                os.kill(edge.children[name].process.pid, signal.SIGKILL)
+            poll((robot, edge), lambda: board.states().get("keyframes") == "drained", 120)
+            assert set(answered.ids()) == set(sent.ids())
+            assert robot.children["localization"].restarts == robot.children["keyframes"].restarts == 0
+
+
+def test_only_what_the_table_marks_crosses(tmp_path):
+    """Raw pictures, scans and depth stay on the robot, whoever asks for them on the edge."""
+    pair = Pair(tmp_path, pictures=12)
+    with running(pair) as ((robot, near, near_board), (edge, far, _)):
+        everything = set()
+        far.declare_subscriber("beamsplat/**", lambda s: everything.add(str(s.key_expr).split("/", 2)[2]))
+        local = Ears(near, "camera/image")
+        poll((robot, edge), lambda: near_board.states().get("uplink") == "drained", 90)
+        assert len(local.messages) >= 10
+    topics = {name for name in everything if name in TOPICS}
+    assert "keyframes/frame" in topics
+    assert {"localization/odometry", "keyframes/ack", "mapping/status"} <= topics
+    assert all(TOPICS[name].uplink or name.startswith("mapping/") for name in topics)
+
+
+def test_a_deployment_is_told_what_comes_from_the_other_side(tmp_path):
+    pair = Pair(tmp_path, pictures=1)
+    assert faults(pair.robot, TABLE) == faults(pair.edge, TABLE) == []
+    classes = {name: TABLE[name].load("default") for name in ("mapping", "keyframes")}
+    assert "keyframes/frame" not in surroundings({"mapping": classes["mapping"]}, "mapping", "edge").unfed
+    assert "keyframes/frame" in surroundings({"mapping": classes["mapping"]}, "mapping", "whole").unfed
+    assert (
+        "keyframes/ack" not in surroundings({"keyframes": classes["keyframes"]}, "keyframes", "robot").unfed
+    )
+    lonely = pair.robot.model_copy(update={"nodes": {"localization": {"kind": "known"}}})
+    assert any("without node uplink" in f.text for f in faults(lonely, TABLE))
+    both = pair.edge.model_copy(update={"nodes": {"localization": {"kind": "known"}}})
+    assert any("written by localization and the uplink" in f.text for f in faults(both, TABLE))
+
+
+def test_the_uplink_needs_a_bus():
+    with pytest.raises(UserError, match="live only"):
+        Lockstep([UplinkNode(UplinkConfig(edge="tcp/127.0.0.1:1"))]).run()
