@@ -17,6 +17,7 @@ from services.evaluation import cli as depth_cli
 from services.evaluation.relocalize_cli import eval_relocalize
 from services.localization import cli as localization_cli
 from services.mapping import cli as mapping_cli
+from services.mapping.session import cli as session_cli
 from services.replay import cli as replay_cli
 from services.simulator import cli as simulator_cli
 
@@ -40,6 +41,8 @@ for command in (simulator_cli.simulate, replay_cli.info, replay_cli.rig):
 app.add_typer(calibrate_cli.app, name="calibrate", rich_help_panel=_DATA)
 for command in (localization_cli.slam, depth_cli.depth):
     app.command(rich_help_panel=_RESULTS)(command)
+
+app.add_typer(session_cli.app, name="session", rich_help_panel=_RESULTS)
 
 evaluate = typer.Typer(no_args_is_help=True, help="Errors against truth.")
 evaluate.command("slam")(localization_cli.eval_slam)
