@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
@@ -13,9 +13,25 @@ from rich.table import Table
 
 from common.config import load_deployment
 from common.errors import UserError
+from common.persist import write_atomically
+
+if TYPE_CHECKING:
+    from services.bench.paper_live import Costs, Seen
+    from services.supervisor import Supervisor
 
 DEPLOYMENT = Path(__file__).resolve().parents[1] / "deploy" / "demo.toml"
 console = Console(stderr=True)
+SHOWN = (
+    ("keyframes", "keyframes", 0, ""), ("gaussians", "Gaussians", 0, ""),
+    ("psnr_keyframes_db", "PSNR at keyframes", 1, " dB"), ("psnr_offpath_db", "off the path", 1, " dB"),
+    ("ate_first_pose_rmse_m", "position error", 3, " m"), ("fps", "pictures through the system", 1, "/s"),
+    ("keyframe_latency_p95_ms", "keyframe latency p95", 0, " ms"),
+    ("cpu_load_percent", "CPU", 0, " %"), ("peak_rss_mb", "memory", 0, " MB"),
+)  # fmt: skip
+POSE_FIGURES = frozenset({
+    "position_rmse_m", "position_rmse_xyz_m", "orientation_rmse_rad", "orientation_rmse_rpy_rad",
+    "ate_first_pose_rmse_m", "ate_se3_rmse_m", "ate_sim3_rmse_m", "sim3_scale",
+})  # fmt: skip
 
 
 def demo(
@@ -36,24 +52,36 @@ def demo(
 
         beamsplat demo --data drive/bag --view spawn
     """
+    from services.bench.paper_live import Observer
     from services.system_cli import run_checked
 
     out.mkdir(parents=True, exist_ok=True)
     source = data if data is not None else _simulated(out, seconds)
-    shutil.rmtree(out / "recording", ignore_errors=True)
-    shutil.rmtree(out / "map", ignore_errors=True)
-    (out / "demo.rrd").unlink(missing_ok=True)
+    for old in ("recording", "map", "session"):
+        shutil.rmtree(out / old, ignore_errors=True)
+    for old in ("demo.rrd", "map.png", "trajectory.tum", "report.html", "report.json"):
+        (out / old).unlink(missing_ok=True)
     overrides = (
         f"replay.data={json.dumps(str(source))}",
         f"recorder.out={json.dumps(str(out / 'recording'))}",
         f"monitor.save={json.dumps(str(out / 'demo.rrd'))}",
         f"monitor.view={json.dumps(view)}",
         f"mapping.save={json.dumps(str(out / 'map'))}",
+        f"mapping.session={json.dumps(str(out / 'session'))}",
         f"rate={rate}",
         *(set_ or ()),
     )
-    run_checked(load_deployment(DEPLOYMENT, overrides))
-    _report(out, source)
+    deployment = load_deployment(DEPLOYMENT, overrides)
+    seen_by: list[Observer] = []
+
+    def beside(supervisor: Supervisor) -> Observer:
+        seen_by.append(Observer(supervisor, deployment, _truth_stamps(source)))
+        return seen_by[0]
+
+    run_checked(deployment, beside=beside)
+    console.print("the drive has ended; writing the report")
+    figures = write_results(out, source, seen_by[0].seen, seen_by[0].costs)
+    _say_where(out, source, figures)
 
 
 def _simulated(out: Path, seconds: float) -> Path:
@@ -66,17 +94,77 @@ def _simulated(out: Path, seconds: float) -> Path:
     return folder / "bag"
 
 
-def _report(out: Path, source: Path) -> None:
-    table = Table("file", "what it is", show_header=False, pad_edge=False)
+def _truth_stamps(source: Path) -> frozenset[int]:
+    from services.bench.paper_map import truth_folder
+    from services.evaluation.evaluate import read_truth
+
+    try:
+        return frozenset(read_truth(truth_folder(source)))
+    except UserError:
+        return frozenset()
+
+
+def write_results(out: Path, source: Path, seen: Seen, costs: Costs) -> dict[str, Any]:
+    """trajectory.tum, and where there were pictures: map.png, report.html, report.json. Gives the figures.
+
+    Errors are against the recording's own truth (groundtruth.txt beside the bag, or poses in it); without
+    one they are left out.
+    """
+    import cv2
+    import numpy as np
+
+    from common.trajectory import Trajectory, write_tum
+
+    poses = [(stamp_ns, T) for stamp_ns, T, status, _ in seen.poses if status == "ok"]
+    if not poses:
+        return {}
+    stamps_ns, T_map_body = np.array([s for s, _ in poses]), np.array([T for _, T in poses])
+    order = np.argsort(stamps_ns, kind="stable")
+    trajectory = Trajectory(stamps_ns[order], T_map_body[order])
+    write_tum(out / "trajectory.tum", trajectory, "T_map_body as it was said live")
+    if not seen.images:
+        return {}
+    from services.bench.paper import one_row_report, open_truth, score
+    from services.bench.paper_report import write_report
+    from services.evaluation.drive import has_poses
+
+    known = has_poses(source)
+    truth = open_truth(source, None if known else out / "trajectory.tum")
+    row = score(seen, costs, truth)
+    if not known:
+        row = {name: value for name, value in row.items() if name not in POSE_FIGURES}
+    if row["pictures"]["above"] is not None:
+        cv2.imwrite(str(out / "map.png"), row["pictures"]["above"])
+    report = one_row_report("demo", "lidar + fused depth", source, truth, row)
+    write_report(out / "report.html", report, truth, paper=False)
+    figures = {name: value for name, value in row.items() if name != "pictures"}
+    write_atomically(out / "report.json", json.dumps(figures, indent=1).encode())
+    return figures
+
+
+def _say_where(out: Path, source: Path, figures: dict[str, Any]) -> None:
+    table = Table(show_header=False, pad_edge=False, box=None)
     rows = [
         (source, "the drive: camera, lidar, wheels"),
-        (out / "recording", "what went over the bus; opens in Foxglove and with `ros2 bag`"),
-        (out / "demo.rrd", "what the monitor saw; open it with `rerun FILE`"),
+        (out / "report.html", "what came of it: open it in a browser"),
+        (out / "map" / "splats.ply", "the map: opens in viewers of 3D Gaussian splats"),
+        (out / "map.png", "the map from above"),
+        (out / "trajectory.tum", "where the robot was"),
+        (out / "session", "the map to go on with, export, render: beamsplat session info, export, render"),
+        (out / "demo.rrd", "what the monitor saw: rerun FILE"),
+        (out / "recording", "what went over the bus: Foxglove, `ros2 bag`, beamsplat info"),
     ]
-    if (out / "map").exists():  # data without a camera give none
-        rows.append((out / "map" / "map.ply", "the map: opens in viewers of 3D Gaussian splats"))
     for path, what in rows:
+        if path.exists():  # data without a camera give no map
+            table.add_row(str(path), what)
+    screen = Console()
+    screen.print(table)
+    for path in (out / "recording", out / "demo.rrd"):
         if not path.exists():
             raise UserError(f"{path} was not written: the node's log in the state folder says why")
-        table.add_row(str(path), what)
-    Console().print(table)
+    said = [
+        f"{text} {figures[name]:.{digits}f}{unit}"
+        for name, text, digits, unit in SHOWN
+        if figures.get(name) is not None
+    ]
+    screen.print(", ".join(said), highlight=False)

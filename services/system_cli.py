@@ -7,8 +7,9 @@ import json
 import signal
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any, Protocol
 
 import typer
 from rich.console import Console
@@ -16,6 +17,10 @@ from rich.live import Live as Screen
 
 from common.config import Deployment, load_deployment
 from common.errors import UserError
+
+if TYPE_CHECKING:
+    from services.board import HealthBoard
+    from services.supervisor import Supervisor
 
 FileArgument = Annotated[Path, typer.Argument(help="Deployment file (TOML), for example deploy/demo.toml")]
 SetOption = Annotated[
@@ -83,8 +88,22 @@ def run(
     run_checked(deployment, tuple(nodes) if nodes else None)
 
 
-def run_checked(deployment: Deployment, names: tuple[str, ...] | None = None) -> None:
-    """Runs processes until all have drained, one cannot run, or Ctrl-C.
+class Beside(Protocol):
+    """Somebody who looks on while a deployment runs."""
+
+    def poll(self) -> None:
+        """Called a few times a second."""
+
+    def finish(self, board: HealthBoard, drained: bool) -> Any:
+        """Called once, before the processes are ended."""
+
+
+def run_checked(
+    deployment: Deployment,
+    names: tuple[str, ...] | None = None,
+    beside: Callable[[Supervisor], Beside] | None = None,
+) -> None:
+    """Runs processes until all have drained, one cannot run, or Ctrl-C; `beside` makes an onlooker.
 
     Raises:
         UserError: the deployment does not fit together, or a node cannot run with what it was given.
@@ -111,11 +130,15 @@ def run_checked(deployment: Deployment, names: tuple[str, ...] | None = None) ->
         _say(f"robot {deployment.robot}: logs in {supervisor.log_dir}")
         with open_session(deployment.router.listen) as session:
             board = HealthBoard(session, deployment.robot)
+            onlooker = beside(supervisor) if beside is not None else None
             screen = Screen(console=console, refresh_per_second=2) if show else contextlib.nullcontext()
+            drained = False
             with screen, contextlib.suppress(KeyboardInterrupt):
-                while True:
+                while not drained:
                     time.sleep(0.2)
                     supervisor.poll()
+                    if onlooker is not None:
+                        onlooker.poll()
                     if show:
                         screen.update(board.nodes_table())
                     nodes = [c for c in supervisor.children.values() if c.name != "router"]
@@ -125,10 +148,11 @@ def run_checked(deployment: Deployment, names: tuple[str, ...] | None = None) ->
                                 next(e for e in events if e.startswith(f"{entry.name} cannot run"))
                             )
                     states = board.states()
-                    if nodes and all(states.get(c.name) == "drained" for c in nodes):
-                        break
+                    drained = bool(nodes) and all(states.get(c.name) == "drained" for c in nodes)
             if not show:
                 console.print(board.nodes_table())
+            if onlooker is not None:
+                onlooker.finish(board, drained)
 
 
 def serve(

@@ -18,7 +18,7 @@ from common.errors import UserError
 from common.geometry import inverse
 from common.persist import make_folder, write_atomically
 from services.bench.paper_live import Costs, Seen, run_live
-from services.bench.paper_map import map_figures, previews, seen_from_above, truth_folder
+from services.bench.paper_map import map_figures, map_from_above, previews, truth_folder
 from services.bench.paper_report import write_report
 from services.bench.paper_score import Truth, compared_poses, depth_errors, pose_errors, speed
 from services.depth.store import find_model
@@ -207,16 +207,25 @@ def score(seen: Seen, costs: Costs, truth: Truth) -> dict[str, Any]:
     if len(T_found):
         first = next(T for _, T, status, _ in seen.poses if status == "ok")
         T_world_map = T_found[0] @ inverse(first)
-    figures, offpath = map_figures(seen, truth, T_world_map)
+    figures, offpath = ({}, []) if T_world_map is None else map_figures(seen, truth, T_world_map)
     ends = [s.psnr_db for s in seen.statuses if np.isfinite(s.psnr_db)]
     row |= figures | {"psnr_keyframes_db": float(np.mean(ends)) if ends else None}
     row["pictures"] = {
         "stamps_ns": stamps, "found": T_found, "true": T_true, "offpath": offpath,
         "previews": previews(seen, 4),
         "estimates": seen.kept_estimates, "fused": seen.kept_fused,
-        "above": seen_from_above(seen, T_world_map) if T_world_map is not None else None,
+        "above": None if T_world_map is None else map_from_above(seen, T_world_map, T_found[:, :2, 3]),
     }  # fmt: skip
     return row
+
+
+def one_row_report(name: str, title: str, data: Path, truth: Truth, row: dict[str, Any]) -> dict[str, Any]:
+    """The report of a single run that is none of the paper's."""
+    whole = {
+        "name": name, "title": title, "seed": 0, "paper": {}, "partner": None, "lidar": True,
+        "depth_source": title, "advice": "", "status": "ok", **row,
+    }  # fmt: skip
+    return _report([whole], data.parent if data.name == "bag" else data, truth)
 
 
 def _report(rows: list[dict[str, Any]], data: Path, truth: Truth) -> dict[str, Any]:

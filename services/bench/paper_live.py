@@ -24,7 +24,7 @@ from services.supervisor import Supervisor
 
 TOPICS = (
     "camera/image", "localization/odometry", "localization/correction", "depth/estimate", "fusion/depth",
-    "keyframes/frame", "keyframes/ack", "mapping/chunk", "mapping/preview", "mapping/status",
+    "keyframes/frame", "keyframes/ack", "mapping/chunk", "mapping/poses", "mapping/preview", "mapping/status",
 )  # fmt: skip
 DEPTH_STEP = 2  # kept depth is sampled so much
 
@@ -45,6 +45,8 @@ class Seen:
     acks: dict[int, tuple[int, str]] = field(default_factory=dict)  # id -> published, status
     link_bytes: int = 0
     chunks: dict[int, Any] = field(default_factory=dict)  # the newest of each anchor
+    online_chunks: dict[int, Any] | None = None  # when the data ended, before any refinement
+    keyframe_poses: np.ndarray | None = None  # float64 [K, 4, 4] T_map_body, refined
     previews: list[tuple[int, np.ndarray, bytes]] = field(default_factory=list)  # stamp, T_map_camera, JPEG
     statuses: list[Any] = field(default_factory=list)
     refusals: dict[str, int] = field(default_factory=dict)  # why there was no pose or depth -> how often
@@ -115,6 +117,11 @@ class Witness:
     def _mapping_chunk(self, letter: Letter, m: Any) -> None:
         self.seen.chunks[m.anchor_id] = m
 
+    def _mapping_poses(self, letter: Letter, m: Any) -> None:
+        if self.seen.online_chunks is None:
+            self.seen.online_chunks = dict(self.seen.chunks)
+        self.seen.keyframe_poses = m.T_map_body.copy()
+
     def _mapping_preview(self, letter: Letter, m: Any) -> None:
         self.seen.previews.append((m.stamp_ns, m.T_map_camera.copy(), m.render.tobytes()))
 
@@ -135,6 +142,50 @@ class Costs:
     lost: dict[str, int] = field(default_factory=dict)
 
 
+class Observer:
+    """A witness on the bus of a supervised system, and its costs while the data play."""
+
+    def __init__(self, supervisor: Supervisor, deployment: Deployment, keep_depth_at: frozenset[int]) -> None:
+        endpoints = deployment.router.listen
+        self._witness, self.costs = Witness(keep_depth_at), Costs()
+        self._bus = Bus(open_session(endpoints), deployment.robot, "witness", secrets.token_hex(8), 1)
+        self._witness.listen(self._bus)
+        self._meter = _Meter(supervisor)
+        self._began = self._started = time.monotonic()
+        self._state = "starting"
+
+    @property
+    def seen(self) -> Seen:
+        """What went over the bus so far."""
+        return self._witness.seen
+
+    def poll(self) -> None:
+        """Looks at the processes; to be called a few times a second."""
+        if self._state == "over":
+            return
+        self._meter.read()
+        if self._state == "starting" and self.seen.images:
+            self._state, self._started = "driving", time.monotonic()
+            self.costs.startup_cpu_s = self._meter.mark()
+        self._count()
+        if self.seen.online_chunks is not None:  # what comes now is refinement of a map that is whole
+            self._state = "over"
+
+    def _count(self) -> None:
+        self.costs.wall_s = time.monotonic() - self._started
+        self.costs.cpu_s, self.costs.peak_rss_mb = self._meter.since_mark(), self._meter.peak_rss_mb
+
+    def finish(self, board: HealthBoard, drained: bool) -> tuple[Seen, Costs]:
+        """Takes what is still on its way and what the nodes counted, and leaves the bus."""
+        self.costs.drained = drained
+        for name, record in board.records.items():
+            self.costs.dropped[name] = sum(i.dropped for i in record.health.inputs)
+            self.costs.lost[name] = sum(i.lost for i in record.health.inputs)
+        time.sleep(0.5)
+        self._bus.session.close()
+        return self.seen, self.costs
+
+
 def run_live(
     deployment: Deployment, keep_depth_at: frozenset[int], longest_s: float, say: Callable[[str], None]
 ) -> tuple[Seen, Costs]:
@@ -143,44 +194,28 @@ def run_live(
     Raises:
         UserError: a node cannot run.
     """
-    witness, costs = Witness(keep_depth_at), Costs()
     events: list[str] = []
-    with Supervisor(deployment, on_event=events.append) as supervisor:
-        endpoints = deployment.router.listen
-        with (
-            open_session(endpoints) as board_session,
-            Bus(open_session(endpoints), deployment.robot, "witness", secrets.token_hex(8), 1) as bus,
-        ):
-            witness.listen(bus)
-            board = HealthBoard(board_session, deployment.robot)
-            names = tuple(deployment.nodes)
-            meter = _Meter(supervisor)
-            began, started = time.monotonic(), None
-            while True:
-                time.sleep(0.2)
-                supervisor.poll()
-                failed = next((c.name for c in supervisor.children.values() if c.gave_up), None)
-                if failed:
-                    raise UserError(next(e for e in events if e.startswith(f"{failed} cannot run")))
-                meter.read()
-                states = board.states()
-                if started is None and witness.seen.images:
-                    started = time.monotonic()
-                    costs.startup_cpu_s = meter.mark()
-                if all(states.get(name) == "drained" for name in names):
-                    break
-                if time.monotonic() - began > longest_s:
-                    costs.drained = False
-                    break
-            costs.wall_s = time.monotonic() - (started or began)
-            costs.cpu_s, costs.peak_rss_mb = meter.since_mark(), meter.peak_rss_mb
-            for name, record in board.records.items():
-                costs.dropped[name] = sum(i.dropped for i in record.health.inputs)
-                costs.lost[name] = sum(i.lost for i in record.health.inputs)
-            time.sleep(0.5)  # what is still on its way to the witness
+    with (
+        Supervisor(deployment, on_event=events.append) as supervisor,
+        open_session(deployment.router.listen) as board_session,
+    ):
+        observer = Observer(supervisor, deployment, keep_depth_at)
+        board = HealthBoard(board_session, deployment.robot)
+        deadline = time.monotonic() + longest_s
+        drained = False
+        while not drained and time.monotonic() < deadline:
+            time.sleep(0.2)
+            supervisor.poll()
+            observer.poll()
+            failed = next((c.name for c in supervisor.children.values() if c.gave_up), None)
+            if failed:
+                raise UserError(next(e for e in events if e.startswith(f"{failed} cannot run")))
+            states = board.states()
+            drained = all(states.get(name) == "drained" for name in deployment.nodes)
+        result = observer.finish(board, drained)
     for event in events:
         say(event)
-    return witness.seen, costs
+    return result
 
 
 class _Meter:

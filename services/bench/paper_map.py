@@ -8,39 +8,60 @@ from typing import Any
 import cv2
 import numpy as np
 
-from common.geometry import inverse
+from common.geometry import inverse, transform_points
 from common.raster.camera import RasterCamera
-from common.raster.layout import PARAMS
 from common.raster.rasterizer import Rasterizer
 from common.splats import unpack
 from services.bench.paper_live import Seen
 from services.bench.paper_score import Truth
+from services.bench.top_view import top_view
 from services.mapping.dataset import ExtraView, extra_views, read_depth_png
-from services.mapping.scores import render_rgb_depth, score_view
+from services.mapping.export import read_ply_points
+from services.mapping.scores import f_score, fused_surface, render_rgb_depth, score_view
 from services.mapping.store import GaussianStore, moved
 
+_AT_VIEWS = {
+    "psnr_offpath_db": "psnr_db", "ssim_offpath": "ssim", "depth_l1_offpath_m": "depth_l1_m",
+}  # fmt: skip
 
-def assembled(seen: Seen) -> GaussianStore:
-    """All chunks of a run in the map frame."""
+
+def assembled(chunks: dict[int, Any]) -> GaussianStore:
+    """Chunks by anchor as one map, in the map frame."""
     store = GaussianStore()
-    for chunk in seen.chunks.values():
+    for chunk in chunks.values():
         if chunk.count:
-            store.append(moved(unpack(chunk.packed), chunk.T_map_anchor).astype(np.float32), chunk.anchor_id)
+            store.add(moved(unpack(chunk.packed), chunk.T_map_anchor).astype(np.float32), chunk.anchor_id)
     return store
 
 
-def map_figures(
-    seen: Seen, truth: Truth, T_world_map: np.ndarray | None
+def map_figures(seen: Seen, truth: Truth, T_world_map: np.ndarray) -> tuple[dict[str, Any], list[np.ndarray]]:
+    """Figures of the map as the drive left it and, prefixed `refined_`, as it ended; pictures of the latter.
+
+    The map is placed by the first pose alone. Pictures are (truth, render) side by side.
+    """
+    figures, pictures = _scored(seen.online_chunks or seen.chunks, seen, truth, T_world_map)
+    if seen.online_chunks is not None and _revisions(seen.online_chunks) != _revisions(seen.chunks):
+        refined, pictures = _scored(seen.chunks, seen, truth, T_world_map)
+        figures |= {f"refined_{name}": value for name, value in refined.items()}
+    return figures, pictures
+
+
+def _revisions(chunks: dict[int, Any]) -> dict[int, int]:
+    return {anchor: chunk.revision for anchor, chunk in chunks.items()}
+
+
+def _scored(
+    chunks: dict[int, Any], seen: Seen, truth: Truth, T_world_map: np.ndarray
 ) -> tuple[dict[str, Any], list[np.ndarray]]:
-    """PSNR, SSIM and depth at the recording's views off the path; and (truth, render) pictures of some."""
-    store = assembled(seen)
+    store = assembled(chunks)
     figures: dict[str, Any] = {"gaussians": store.count}
-    views: list[ExtraView] = extra_views(truth.path / "extra_views")
-    if not store.count or T_world_map is None or not views:
+    if not store.count:
         return figures, []
     p = truth.drive.undistort.pinhole
     camera = RasterCamera(p.fx_px, p.fy_px, p.cx_px, p.cy_px, p.width_px, p.height_px)
-    rasterizer, scores, pictures = Rasterizer(), [], []
+    rasterizer = Rasterizer()
+    views: list[ExtraView] = extra_views(truth.path / "extra_views")
+    scores, pictures = [], []
     for number, view in enumerate(views):
         true_rgb = cv2.cvtColor(cv2.imread(str(view.image_file)), cv2.COLOR_BGR2RGB)
         T_map_camera = inverse(T_world_map) @ view.T_map_camera
@@ -48,24 +69,24 @@ def map_figures(
         scores.append(score_view(rgb, depth, true_rgb, read_depth_png(view.depth_file)))
         if number % max(len(views) // 3, 1) == 0 and len(pictures) < 3:
             pictures.append(np.hstack([true_rgb, (rgb * 255.0 + 0.5).astype(np.uint8)]))
+    for key, name in _AT_VIEWS.items() if scores else ():
+        figures[key] = float(np.mean([getattr(s, name) for s in scores]))
+    surface = truth.path / "gt_surface.ply"
+    if surface.is_file() and seen.keyframe_poses is not None:
+        half = camera.resized(camera.width_px // 2, camera.height_px // 2)
+        poses = [(half, T @ truth.drive.T_body_camera) for T in seen.keyframe_poses]
+        points = transform_points(T_world_map, fused_surface(rasterizer, store, poses))
+        figures |= f_score(points, read_ply_points(surface))
     rasterizer.close()
-    figures |= {
-        "psnr_offpath_db": float(np.mean([s.psnr_db for s in scores])),
-        "ssim_offpath": float(np.mean([s.ssim for s in scores])),
-        "depth_l1_offpath_m": float(np.mean([s.depth_l1_m for s in scores])),
-    }
     return figures, pictures
 
 
-def seen_from_above(seen: Seen, T_world_map: np.ndarray, step: int = 4) -> np.ndarray:
-    """float32 [N, 5] of the Gaussians between floor and ceiling: x, y (m, world), red, green, blue."""
-    store = assembled(seen)
+def map_from_above(seen: Seen, T_world_map: np.ndarray, path_m: np.ndarray) -> np.ndarray | None:
+    """uint8 BGR picture of the map without its ceiling, and of a path [K, >= 2] in the world on it."""
+    store = assembled(seen.chunks)
     if not store.count:
-        return np.zeros((0, 5), np.float32)
-    params = moved(store.params[:PARAMS, : store.count], T_world_map)
-    chosen = (params[2] > 0.1) & (params[2] < 1.8)
-    rows = np.concatenate([params[0:2], params[11:14]])[:, chosen]
-    return rows.T[::step].astype(np.float32)
+        return None
+    return top_view(moved(store.params[:, : store.count], T_world_map).astype(np.float32), path_m)
 
 
 def previews(seen: Seen, most: int) -> list[tuple[int, bytes]]:

@@ -52,19 +52,25 @@ _TABLES: tuple[tuple[str, tuple[tuple[str, str, str], ...]], ...] = (
     )),
     ("What the paper lacks: the map", (
         ("PSNR off the path dB", "psnr_offpath_db", ""), ("SSIM", "ssim_offpath", ""),
-        ("depth L1 m", "depth_l1_offpath_m", ""), ("PSNR at keyframes dB", "psnr_keyframes_db", ""),
+        ("depth L1 m", "depth_l1_offpath_m", ""), ("F-score 5 cm", "fscore_5cm", ""),
+        ("refined: PSNR dB", "refined_psnr_offpath_db", ""), ("SSIM", "refined_ssim_offpath", ""),
+        ("depth L1 m", "refined_depth_l1_offpath_m", ""), ("F-score 5 cm", "refined_fscore_5cm", ""),
+        ("PSNR at keyframes dB", "psnr_keyframes_db", ""),
         ("Gaussians", "gaussians", ""),
     )),
 )  # fmt: skip
 
 
-def write_report(path: Path, report: dict[str, Any], truth: Truth) -> None:
-    """Writes the report; rows without `pictures` (not run) appear in the tables only."""
+def write_report(path: Path, report: dict[str, Any], truth: Truth, *, paper: bool = True) -> None:
+    """Writes the report; rows without `pictures` (not run) appear in the tables only. Not `paper`: of a
+    drive by itself, without the comparisons."""
     rows: list[Row] = report["configurations"]
     drawn = [row for row in rows if "pictures" in row]
-    body = [f"<h1>The paper's configurations on {escape(report['data'])}</h1>", _preface(report)]
+    title = "The paper's configurations on" if paper else "A drive mapped:"
+    body = [f"<h1>{title} {escape(report['data'])}</h1>", _preface(report, paper)]
     body += [_table(title, columns, rows) for title, columns in _TABLES]
-    body += [_pairs(report["pairs"]), "<h2>Maps and trajectories</h2>", *_trajectories(drawn)]
+    body += [_pairs(report["pairs"])] if paper else []
+    body += ["<h2>Maps and trajectories</h2>", *_trajectories(drawn)]
     body += ["<h2>Errors over time</h2>", *_errors(drawn), "<h2>Depth</h2>", *_depth(drawn, truth)]
     body += ["<h2>Render beside camera</h2>", *_renders(drawn, truth)]
     page = (
@@ -73,11 +79,10 @@ def write_report(path: Path, report: dict[str, Any], truth: Truth) -> None:
     write_atomically(path, (page + "</head><body>" + "".join(body) + "</body></html>").encode())
 
 
-def _preface(report: dict[str, Any]) -> str:
-    lines = [
-        f"Live, as processes, at the recording's own speed, on {report['cores']} CPU cores. "
-        "Small grey figures are the paper's (Gazebo house, i9-12 and RTX 4090)."
-    ]
+def _preface(report: dict[str, Any], paper: bool) -> str:
+    lines = [f"Live, as processes, on {report['cores']} CPU cores."]
+    if paper:
+        lines.append("Small grey figures are the paper's (Gazebo house, i9-12 and RTX 4090).")
     for row in report["configurations"]:
         if row["status"] != "ok":
             lines.append(f"<span class=w>{escape(row['name'])} did not run: {escape(row['status'])}</span>")
@@ -140,7 +145,9 @@ def _trajectories(rows: list[Row]) -> list[str]:
             Curve("truth", p["true"][:, :2, 3], "#222", dashed=True),
             Curve(row["name"], p["found"][:, :2, 3], COLOURS[1]),
         ]
-        out.append(chart(_name(row), "x m", "y m", curves, equal=True, dots=p["above"]))
+        out.append(chart(_name(row), "x m", "y m", curves, equal=True))
+        if p["above"] is not None:
+            out.append(_figure(p["above"], f"{_name(row)}: the map from above, without its ceiling"))
     return out
 
 

@@ -21,13 +21,9 @@ class Curve:
     dashed: bool = False
 
 
-def chart(
-    title: str, x_label: str, y_label: str, curves: list[Curve], *, equal: bool = False,
-    dots: np.ndarray | None = None,  # float32 [N, 5]: x, y, red, green, blue
-) -> str:  # fmt: skip
+def chart(title: str, x_label: str, y_label: str, curves: list[Curve], *, equal: bool = False) -> str:
     """An SVG element; `equal` gives both axes one scale, as maps need."""
     parts = [c.points[np.all(np.isfinite(c.points), axis=1)] for c in curves]
-    parts += [dots[:, :2].astype(np.float64)] if dots is not None and len(dots) else []
     everything = np.concatenate(parts) if parts else np.zeros((0, 2))
     if not len(everything):
         return f"<p>{escape(title)}: nothing to show</p>"
@@ -48,7 +44,6 @@ def chart(
         f'<text x="{_WIDTH / 2}" y="16" text-anchor="middle" class="t">{escape(title)}</text>',
     ]
     out += _axes(low, low + room / scale, x_label, y_label)
-    out += [_dots(at(dots[:, :2].astype(np.float64)), dots[:, 2:5])] if dots is not None and len(dots) else []
     for number, curve in enumerate(curves):
         out += _line(curve, at(curve.points))
         y = 30 + 14 * number
@@ -72,25 +67,6 @@ def _line(curve: Curve, xy: np.ndarray) -> list[str]:
         text = " ".join(f"{x:.1f},{y:.1f}" for x, y in thin)
         out.append(f'<polyline points="{text}" fill="none" stroke="{curve.colour}"{dash}/>')
     return out
-
-
-def _dots(xy: np.ndarray, rgb: np.ndarray) -> str:
-    """A cloud as one path a colour class: coarse, but small."""
-    classes = (np.clip(rgb, 0.0, 1.0) * 5.0).round().astype(int)
-    inside = (
-        (xy[:, 0] > _EDGE) & (xy[:, 0] < _WIDTH - _EDGE) & (xy[:, 1] > _EDGE) & (xy[:, 1] < _HEIGHT - _EDGE)
-    )
-    cells, first = np.unique(
-        np.column_stack([classes, (xy * 0.7).astype(int)])[inside], axis=0, return_index=True
-    )
-    where = xy[inside][first]
-    out = []
-    for colour in np.unique(cells[:, :3], axis=0):
-        mine = where[np.all(cells[:, :3] == colour, axis=1)]
-        path = "".join(f"M{x:.0f} {y:.0f}h1" for x, y in mine)
-        r, g, b = (colour * 51).tolist()
-        out.append(f'<path d="{path}" stroke="rgb({r},{g},{b})" stroke-width="1.5"/>')
-    return "".join(out)
 
 
 def _axes(low: np.ndarray, high: np.ndarray, x_label: str, y_label: str) -> list[str]:

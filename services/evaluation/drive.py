@@ -163,6 +163,17 @@ def open_drive(path: Path, poses: Path | None = None, rig: Path | None = None) -
     )  # fmt: skip
 
 
+def has_poses(path: Path) -> bool:
+    """Whether poses are known: groundtruth.txt beside the bag, or a topic in it."""
+    if any((folder / "groundtruth.txt").is_file() for folder in (Path(path), Path(path).parent)):
+        return True
+    source = open_source(path, SourceOptions())
+    try:
+        return any(topic == "external/pose" for _, topic, _ in source.messages())
+    finally:
+        source.close()
+
+
 def slam_poses(scans: list[TimedScan], wheels: list[tuple], T_body_lidar: np.ndarray) -> Trajectory:
     """`T_map_body` of every scan, by the lidar SLAM after its last optimisation.
 

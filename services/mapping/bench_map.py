@@ -105,7 +105,7 @@ def run_bench(
     refined = score_map(recording, mapper, say)
     if out is not None:
         write_pictures(recording, mapper, out)
-        write_gaussian_ply(out / "map.ply", mapper.store.params[:, : mapper.store.count])
+        write_gaussian_ply(out / "splats.ply", mapper.store.params[:, : mapper.store.count])
     return {
         "data": str(path), "prior": bench.prior, "threads": bench.threads, "seed": bench.seed,
         "keyframes": keyframes, "refused": refused, "data_s": recording.seconds,

@@ -27,6 +27,6 @@ class MappingConfig(NodeConfig):
     refine_exposure: bool = True
     chunk_every: Annotated[int, Field(ge=1)] = 2  # keyframes between two versions of the newest chunk
     seed: int = 0
-    save: Path | None = None  # folder for map.ply and keyframes.tum, written at the end of the data
+    save: Path | None = None  # folder for splats.ply and keyframes.tum, written at the end of the data
     session: Path | None = None  # folder that the map lives in: saved while mapping, resumed at the start
     session_every_s: Annotated[float, Field(gt=0.0)] = 30.0  # between checkpoints, by the data's clock

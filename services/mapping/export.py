@@ -43,13 +43,13 @@ def write_map(
     stamps_ns: np.ndarray,  # int64 [K], rising
     T_map_body: np.ndarray,  # float64 [K, 4, 4] of the keyframes
 ) -> None:
-    """`map.ply` and `keyframes.tum` in a folder, which is made.
+    """`splats.ply` and `keyframes.tum` in a folder, which is made.
 
     Raises:
         UserError: the folder cannot be made or written.
     """
     make_folder(folder)
-    write_gaussian_ply(folder / "map.ply", params)
+    write_gaussian_ply(folder / "splats.ply", params)
     write_tum(folder / "keyframes.tum", Trajectory(stamps_ns, T_map_body), "keyframes of the map, refined")
 
 

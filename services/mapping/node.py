@@ -229,19 +229,12 @@ class MappingNode(Node):
         view = look(self._mapper, message.id)
         bgr = cv2.cvtColor(view.rgb, cv2.COLOR_RGB2BGR)
         render = cv2.imencode(".jpg", bgr, (cv2.IMWRITE_JPEG_QUALITY, 85))[1].ravel()
-        yield (
-            "mapping/preview",
-            MapPreview(
-                stamp_ns=message.stamp_ns,
-                keyframe_id=message.id,
-                render=render,
-                T_map_camera=view.T_map_camera,
-            ),
-        )
-        yield (
-            "mapping/status",
-            self._status(message.stamp_ns, outcome, loss, view.psnr_db, view.depth_error_m),
-        )
+        preview = MapPreview(
+            stamp_ns=message.stamp_ns, keyframe_id=message.id, render=render, T_map_camera=view.T_map_camera
+        )  # fmt: skip
+        yield "mapping/preview", preview
+        status = self._status(message.stamp_ns, outcome, loss, view.psnr_db, view.depth_error_m)
+        yield "mapping/status", status
 
     def _status(
         self,
@@ -287,28 +280,38 @@ class MappingNode(Node):
             yield self._packed(anchor, version, 0)
 
     def drain(self) -> Outputs:
-        """Last refinement, all chunks as they are now, the refined poses, and the files asked for."""
-        m = self._mapper
-        if not m.keyframes:
+        """The map as the data left it; then, if asked for, refined; and the files asked for."""
+        if not self._mapper.keyframes:
             return
-        m.refine(self.config.final_steps, FULL)
-        if self._keeper is not None:
-            last_ns = max(self._taken[id][0] for id in m.keyframes)
-            self._keeper.done(self._keeper.checkpoint(m, self._extra(), last_ns)())
-        stamps = {id: self._taken[id][0] for id in m.keyframes}
-        last_ns = max(stamps.values())
+        yield from self._whole()
+        if self.config.final_steps:
+            self._mapper.refine(self.config.final_steps, FULL)
+            yield from self._whole()
+        self._save()
+
+    def _whole(self) -> Outputs:
+        """Chunks that changed since they were sent, and all poses."""
+        m = self._mapper
+        stamps_ns, T_map_body, ids = self._poses()
+        last_ns = int(stamps_ns[-1])
         for anchor in m.store.versions():
             yield from self._chunk(anchor, last_ns)
-        ids = sorted(stamps, key=lambda id: (stamps[id], id))
+        poses = MapPoses(stamp_ns=last_ns, keyframe_ids=ids, stamps_ns=stamps_ns, T_map_body=T_map_body)
+        yield "mapping/poses", poses
+
+    def _poses(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(stamps_ns [K] rising, T_map_body [K, 4, 4] refined, ids [K]) of the keyframes held."""
+        m = self._mapper
+        ids = sorted(m.keyframes, key=lambda id: (self._taken[id][0], id))
         T_map_body = np.array([m.T_map_camera(m.keyframes[id]) @ self._taken[id][1] for id in ids])
-        stamps_ns = np.array([stamps[id] for id in ids], np.int64)
-        yield (
-            "mapping/poses",
-            MapPoses(
-                stamp_ns=last_ns, keyframe_ids=np.array(ids, np.int64), stamps_ns=stamps_ns,
-                T_map_body=T_map_body,
-            ),
-        )  # fmt: skip
+        stamps_ns = np.array([self._taken[id][0] for id in ids], np.int64)
+        return stamps_ns, T_map_body, np.array(ids, np.int64)
+
+    def _save(self) -> None:
+        m = self._mapper
+        stamps_ns, T_map_body, _ = self._poses()
+        if self._keeper is not None:
+            self._keeper.done(self._keeper.checkpoint(m, self._extra(), int(stamps_ns[-1]))())
         if self.config.save is not None:
             write_map(self.config.save, m.store.params[:, : m.store.count], stamps_ns, T_map_body)
             log.info("map of %d Gaussians saved to %s", m.store.count, self.config.save)

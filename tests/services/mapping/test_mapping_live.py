@@ -55,7 +55,7 @@ def test_the_live_system_maps_and_ends(deployment, tmp_path):
         received = {i.topic: i for i in board.records["mapping"].health.inputs}["keyframes/frame"]
         assert received.received >= 6
         assert received.lost == received.undecodable == 0
-    assert PlyData.read(tmp_path / "map" / "map.ply")["vertex"].count > 1000
+    assert PlyData.read(tmp_path / "map" / "splats.ply")["vertex"].count > 1000
 
 
 @pytest.mark.slow

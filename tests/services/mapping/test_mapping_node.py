@@ -95,7 +95,7 @@ def test_the_preview_shows_what_the_camera_saw(drive):
 
 def test_an_independent_reader_finds_the_map_in_the_file(drive):
     node, letters, _, folder = drive
-    vertices = PlyData.read(folder / "map.ply")["vertex"]
+    vertices = PlyData.read(folder / "splats.ply")["vertex"]
     store = node._mapper.store
     assert vertices.count == store.count
     xyz = np.stack([vertices[axis] for axis in "xyz"])
