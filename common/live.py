@@ -14,6 +14,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Iterator
+from functools import partial
 from typing import Any
 
 import zenoh
@@ -29,7 +30,7 @@ from common.messages import Health
 from common.node import Job, Node, Output
 from common.pacing import Playback
 from common.persist import Bookmark, claim_epoch
-from common.queries import reply
+from common.queries import ask, reply
 from common.streams import Publication
 from common.vitals import Vitals
 
@@ -77,6 +78,7 @@ class Live:
         with Bus(session, self.settings.robot, self.node.name, self.instance, epoch) as bus:
             vitals = Vitals(self, bus)
             self._jobs = JobQueue(Worker(self._gave_up).submit)
+            self.node.meet(partial(ask, session, self.settings.robot))
             try:
                 self.node.configure()
                 self.state = "standby"

@@ -229,11 +229,17 @@ class Health(Message):
     detail: Text = ""
 
 
+class Answer(Message):
+    """What was done about a request, in one sentence."""
+
+    text: Text
+
+
 MESSAGES: dict[str, type[Message]] = {
     cls.schema_name(): cls
     for cls in (
         Rig, Image, Scan, WheelOdometry, ExternalPose, Odometry, Correction, Anchors, MovingBeams, Grid,
         DepthEstimate, FusedDepth, Cloud, Keyframe, KeyframeAck, MapChunk, MapPoses, MapPreview, MapStatus,
-        Tick, Health,
+        Tick, Health, Answer,
     )
 }  # fmt: skip

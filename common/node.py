@@ -75,6 +75,7 @@ class Sourced(NamedTuple):
 
 Output = tuple[str, Message] | Job
 Outputs = Iterator[Output]
+Ask = Callable[[str, str, dict[str, str], float], Iterator[Message]]  # node, query, parameters, time-out in s
 
 
 class UndeclaredTopic(RuntimeError):
@@ -127,6 +128,9 @@ class Node:
 
     def on_health(self, health: Health) -> None:
         """Those that watch override this: the health of every node, live only."""
+
+    def meet(self, ask: Ask) -> None:
+        """Those that command others override this: how to ask a node something, live only."""
 
     def on_header(self, header: Header) -> None:
         """Sees what rode beside the message that is handled next; the recorder keeps it."""

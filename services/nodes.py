@@ -78,6 +78,11 @@ _ROWS = (
         "shows the running system in rerun",
         {"rerun": "services.monitor.node:MonitorNode"},
     ),
+    Service(
+        "page",
+        "shows the running system to any browser, and takes commands of who has its token",
+        {"default": "services.monitor.page.node:PageNode"},
+    ),
 )
 
 NODES: dict[str, Service] = {row.name: row for row in _ROWS}

@@ -22,7 +22,7 @@ from services.deployment import build_node
 from services.nodes import NODES
 
 # Watching and recording happen around a lockstep run, not inside it.
-OUTSIDE = ("monitor", "recorder")
+OUTSIDE = ("monitor", "page", "recorder")
 
 
 class MessageHash:

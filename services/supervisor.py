@@ -41,6 +41,7 @@ class Child:
     attempts: int = 0  # within the current back-off
     due: float | None = None  # dead, to be started again then
     gave_up: bool = False  # ended with a user error: restarting would not help
+    kill_at: float | None = None  # told to end, to be started again; killed if it has not ended by then
 
 
 class Supervisor:
@@ -125,7 +126,14 @@ class Supervisor:
         if known is None:
             self.children[name] = Child(name, process, time.monotonic())
         else:
-            known.process, known.started, known.due = process, time.monotonic(), None
+            known.process, known.started, known.due, known.kill_at = process, time.monotonic(), None, None
+
+    def restart(self, name: str) -> None:
+        """Tells a process to end; the next polls see to it that it does, and start it again at once."""
+        entry = self.children[name]
+        if entry.process.is_alive() and entry.kill_at is None:
+            entry.kill_at = time.monotonic() + STOP_S
+            entry.process.terminate()
 
     def poll(self) -> None:
         """Notices what has died and starts what is due."""
@@ -135,7 +143,13 @@ class Supervisor:
                 if now >= entry.due:
                     entry.restarts += 1
                     self._start(entry.name, resume=True)
-            elif not entry.process.is_alive() and not entry.gave_up:
+            elif entry.process.is_alive():
+                if entry.kill_at is not None and now > entry.kill_at:
+                    entry.process.kill()
+            elif entry.kill_at is not None:
+                entry.due = now
+                self._on_event(f"{entry.name} was ended by request; starts again")
+            elif not entry.gave_up:
                 self._bury(entry, now)
 
     def _bury(self, entry: Child, now: float) -> None:

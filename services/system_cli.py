@@ -115,6 +115,7 @@ def run_checked(
             raise UserError(f"the deployment has no node {name!r}; there are {there}")
     from common.bus import open_session
     from services.board import HealthBoard
+    from services.commands import Commands
     from services.supervisor import Supervisor
 
     for number in (signal.SIGTERM, signal.SIGHUP):  # ends the children in order, as Ctrl-C does
@@ -131,6 +132,7 @@ def run_checked(
         with open_session(deployment.router.listen) as session:
             board = HealthBoard(session, deployment.robot)
             onlooker = beside(supervisor) if beside is not None else None
+            commands = Commands(session, deployment.robot, supervisor)
             screen = Screen(console=console, refresh_per_second=2) if show else contextlib.nullcontext()
             drained = False
             with screen, contextlib.suppress(KeyboardInterrupt):
@@ -139,6 +141,7 @@ def run_checked(
                     supervisor.poll()
                     if onlooker is not None:
                         onlooker.poll()
+                    commands.attend()
                     if show:
                         screen.update(board.nodes_table())
                     nodes = [c for c in supervisor.children.values() if c.name != "router"]

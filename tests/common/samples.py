@@ -6,6 +6,7 @@ from common.frames import camera_mount, lidar_mount
 from common.geometry import se2_to_se3
 from common.messages import (
     Anchors,
+    Answer,
     CameraModel,
     Cloud,
     Correction,
@@ -110,6 +111,7 @@ def sample_messages() -> list[Message]:
             outputs=(OutputHealth(topic="rig", sent=1, bytes=2),),
             step_p50_ms=1.0, step_p95_ms=2.0, rss_mb=3.0, cpu_percent=4.0, detail="warm",
         ),
+        Answer(stamp_ns=31, text="depth was told to end, and starts again"),
     ]  # fmt: skip
 
 

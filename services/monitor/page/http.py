@@ -1,0 +1,126 @@
+"""As much HTTP/1.1 as a page needs: short requests in, replies out, everything bounded.
+
+The standard library's server takes a thread a connection; a page that ten phones keep open should not.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import ipaddress
+import socket
+from dataclasses import dataclass
+from http import HTTPStatus
+
+MAX_HEAD_BYTES = 16 * 1024
+MAX_BODY_BYTES = 16 * 1024
+IDLE_S = 60.0  # a connection without a request is closed
+# Nothing from elsewhere, nothing inline, in nobody's frame; no content is guessed.
+SAFETY = (
+    b"Content-Security-Policy: default-src 'self'; frame-ancestors 'none'; base-uri 'none'\r\n"
+    b"X-Content-Type-Options: nosniff\r\nReferrer-Policy: no-referrer\r\n"
+    b"Cross-Origin-Resource-Policy: same-origin\r\n"
+)
+
+
+class Refused(ValueError):
+    """A request that gets an error as its reply."""
+
+    def __init__(self, status: HTTPStatus, text: str) -> None:
+        super().__init__(text)
+        self.status = status
+
+
+@dataclass(frozen=True)
+class Request:
+    """One request; header names are in lower case."""
+
+    method: str
+    path: str  # without what follows "?"
+    headers: dict[str, str]
+    body: bytes
+
+
+async def read_request(reader: asyncio.StreamReader) -> Request | None:
+    """The next request of a connection; None where it has ended or nothing came for too long.
+
+    Raises:
+        Refused: not HTTP as browsers speak it, or too long.
+    """
+    try:
+        async with asyncio.timeout(IDLE_S):
+            head = await reader.readuntil(b"\r\n\r\n")
+            request = _parse(head)
+            size = _body_bytes(request.headers)
+            if size:
+                request = Request(
+                    request.method, request.path, request.headers, await reader.readexactly(size)
+                )
+            return request
+    except asyncio.LimitOverrunError as error:
+        raise Refused(HTTPStatus.REQUEST_HEADER_FIELDS_TOO_LARGE, "head too long") from error
+    except (asyncio.IncompleteReadError, TimeoutError, ConnectionError):
+        return None
+
+
+def _parse(head: bytes) -> Request:
+    first, *lines = head.decode("latin-1").split("\r\n")
+    parts = first.split(" ")
+    if len(parts) != 3 or not parts[2].startswith("HTTP/1."):
+        raise Refused(HTTPStatus.BAD_REQUEST, "no HTTP/1 request")
+    headers = {}
+    for line in lines:
+        name, colon, value = line.partition(":")
+        if colon:
+            headers[name.strip().lower()] = value.strip()
+    return Request(parts[0], parts[1].partition("?")[0], headers, b"")
+
+
+def _body_bytes(headers: dict[str, str]) -> int:
+    if "transfer-encoding" in headers:
+        raise Refused(HTTPStatus.LENGTH_REQUIRED, "a body must tell its length")
+    text = headers.get("content-length", "0")
+    if not (text.isascii() and text.isdigit()):
+        raise Refused(HTTPStatus.BAD_REQUEST, "no such length")
+    if len(text) > 9 or int(text) > MAX_BODY_BYTES:
+        raise Refused(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"more than {MAX_BODY_BYTES} bytes")
+    return int(text)
+
+
+def reply(status: HTTPStatus, content_type: str, body: bytes, extra: bytes = b"") -> bytes:
+    """A whole reply; nothing of it is kept by caches."""
+    return (
+        f"HTTP/1.1 {status.value} {status.phrase}\r\nContent-Type: {content_type}\r\n"
+        f"Content-Length: {len(body)}\r\nCache-Control: no-store\r\n"
+    ).encode() + SAFETY + extra + b"\r\n" + body  # fmt: skip
+
+
+STREAM_HEAD = (
+    b"HTTP/1.1 200 OK\r\nContent-Type: text/event-stream\r\nCache-Control: no-store\r\n"
+    + SAFETY + b"Connection: close\r\n\r\n"
+)  # fmt: skip
+
+
+def is_own_name(host: str, own: frozenset[str]) -> bool:
+    """Whether a Host header names this machine: by address, as localhost, or by one of its `own` names.
+
+    A page from elsewhere can point a name of its own at this machine (DNS rebinding), and would then be
+    allowed to read what is served here; but it cannot choose the name by which it asks.
+    """
+    name = host.strip().lower()
+    if name.startswith("["):
+        name = name[1:].partition("]")[0]
+    elif name.count(":") <= 1:
+        name = name.partition(":")[0]
+    if name in own:
+        return True
+    try:
+        ipaddress.ip_address(name)
+    except ValueError:
+        return False
+    return True
+
+
+def own_names() -> frozenset[str]:
+    """The names by which browsers may ask for this machine, besides its addresses."""
+    host = socket.gethostname().lower()
+    return frozenset({"localhost", host, f"{host}.local", socket.getfqdn().lower()})

@@ -1,0 +1,220 @@
+"use strict";
+const $ = (id) => document.getElementById(id);
+const fixed = (value, digits) => (value === null || value === undefined ? "–" : value.toFixed(digits));
+const map = new MapCanvas($("map"));
+let token = sessionStorage.getItem("token") ?? "";
+let scales = [];
+
+// Everything from the system is put in as text: a node's words are never markup.
+function cell(row, text, className) {
+  const td = row.insertCell();
+  td.textContent = text;
+  if (className) td.className = className;
+  return td;
+}
+
+function stateClass(state) {
+  return { active: "good", drained: "good", silent: "bad" }[state] ?? "warn";
+}
+
+function showNodes(nodes) {
+  const body = document.createElement("tbody");
+  for (const n of nodes) {
+    const row = body.insertRow();
+    row.dataset.node = n.name;
+    cell(row, n.name);
+    const state = n.state === "silent" ? `silent ${n.silent_s} s` : n.state;
+    cell(row, state + (n.starts > 1 ? ` (start ${n.starts})` : ""), stateClass(n.state));
+    for (const key of ["in_hz", "out_hz", "step_ms", "p95_ms", "age_ms"]) cell(row, fixed(n[key], 1));
+    cell(row, n.dropped, n.dropped ? "warn" : "");
+    cell(row, n.lost, n.lost ? "bad" : "");
+    cell(row, n.bad, n.bad ? "bad" : "");
+    cell(row, n.rss_mb);
+    cell(row, n.cpu_percent);
+    if (n.detail) {
+      row.className = "has-detail";
+      cell(body.insertRow(), n.detail, "detail").colSpan = 12;
+    }
+  }
+  $("nodes").tBodies[0].replaceWith(body);
+}
+
+function showLinks(links) {
+  const body = document.createElement("tbody");
+  for (const l of links) {
+    const row = body.insertRow();
+    row.dataset.topic = l.topic;
+    cell(row, l.topic);
+    cell(row, l.from);
+    cell(row, fixed(l.hz, 1), l.nominal_hz && l.hz < 0.5 * l.nominal_hz ? "warn" : "");
+    cell(row, l.nominal_hz || "event");
+    cell(row, fixed(l.kb_s, 1));
+    const to = cell(row, "");
+    for (const t of l.to) {
+      const span = document.createElement("span");
+      span.textContent = `${t.node} (${fixed(t.age_ms, 1)}, ${t.dropped}, ${t.lost})  `;
+      if (t.lost) span.className = "bad";
+      to.append(span);
+    }
+  }
+  $("links").tBodies[0].replaceWith(body);
+}
+
+function showWords(words) {
+  const lines = [];
+  for (const [subject, w] of Object.entries(words)) {
+    let text = w.status + (w.detail ? ` (${w.detail})` : "");
+    if (w.metric === false) text += ", unit of length unknown";
+    if (subject === "mapping") text += `; ${w.keyframes} keyframes, ${w.gaussians} Gaussians, ${fixed(w.psnr_db, 1)} dB, depth off by ${fixed(w.depth_error_m, 3)} m`;
+    if (subject === "fusion") text += `; ${fixed(100 * w.inlier_share, 0)} % of the pairs fit, within ${fixed(w.residual_m, 3)} m`;
+    lines.push([subject, `${text}, ${fixed(w.age_s, 0)} s ago`, w.status === "ok" ? "good" : "bad"]);
+  }
+  $("words").replaceChildren(...lines.flatMap(([subject, text, className]) => {
+    const dt = document.createElement("dt"), dd = document.createElement("dd");
+    dt.textContent = subject; dd.textContent = text; dd.className = className;
+    return [dt, dd];
+  }));
+  const f = words.fusion;
+  if (f) $("scale-text").textContent = f.scale === null ? "none" : `${fixed(f.scale, 3)} ± ${fixed(f.scale_sigma, 3)}`;
+}
+
+function showSummary(status) {
+  const count = (test) => status.nodes.filter(test).length;
+  const parts = [
+    [`${count((n) => n.state !== "silent")} of ${status.nodes.length} nodes there`, count((n) => n.state === "silent") ? "bad" : "good"],
+    [`${status.nodes.reduce((sum, n) => sum + n.lost, 0)} lost`, status.nodes.some((n) => n.lost) ? "bad" : "good"],
+    [`${status.page.viewers} watching`, ""],
+  ];
+  $("summary").replaceChildren(...parts.map(([text, className]) => {
+    const li = document.createElement("li");
+    li.textContent = text; li.className = className;
+    return li;
+  }));
+}
+
+function showLog(log) {
+  $("log").replaceChildren(...log.slice().reverse().map((line) => {
+    const li = document.createElement("li");
+    li.textContent = `${new Date(line.at * 1000).toLocaleTimeString()}  ${line.text}`;
+    return li;
+  }));
+}
+
+function offerNodes(names) {
+  const select = $("node");
+  if ([...select.options].map((o) => o.value).join() === names.join()) return; // an open list stays open
+  const chosen = select.value;
+  select.replaceChildren(...names.map((name) => new Option(name, name, false, name === chosen)));
+}
+
+function showStatus(status) {
+  showNodes(status.nodes);
+  showLinks(status.links);
+  showWords(status.words);
+  showSummary(status);
+  showLog(status.log);
+  for (const [name, p] of Object.entries(status.pictures)) {
+    const small = document.querySelector(`[data-picture="${name}"] small`);
+    if (small) small.textContent = p.fault || (p.age_s > 3 ? `${fixed(p.age_s, 0)} s old` : "");
+    small?.closest("figure").classList.toggle("stale", p.age_s > 10);
+  }
+  $("commands").hidden = !status.page.commands;
+  offerNodes(status.nodes.map((n) => n.name));
+}
+
+// One picture at a time of each kind: a slow connection skips some, and never piles them up.
+const loading = new Map();
+function fetchPicture(p) {
+  if (loading.has(p.name)) { loading.set(p.name, p); return; }
+  loading.set(p.name, null);
+  const done = () => { const next = loading.get(p.name); loading.delete(p.name); if (next) fetchPicture(next); };
+  const url = `picture/${p.name}?${p.number}`;
+  if (p.name === "map") {
+    const image = new Image();
+    image.onload = () => { map.grid = { image, ...p }; map.draw(); done(); };
+    image.onerror = done;
+    image.src = url;
+  } else {
+    const img = document.querySelector(`[data-picture="${p.name}"] img`);
+    img.onload = () => { img.hidden = false; img.dataset.number = p.number; done(); };
+    img.onerror = done;
+    img.src = url;
+  }
+}
+
+function showRobot(robot) {
+  map.robot = robot;
+  $("pose").textContent = robot ? `${fixed(robot.x_m, 2)} m, ${fixed(robot.y_m, 2)} m, ${fixed((robot.yaw_rad * 180) / Math.PI, 0)}° by ${robot.source}` : "";
+  map.draw();
+}
+
+function drawScales() {
+  const c = $("scale"), ratio = window.devicePixelRatio || 1, w = c.clientWidth, h = c.clientHeight;
+  c.width = w * ratio; c.height = h * ratio;
+  const g = c.getContext("2d");
+  g.scale(ratio, ratio);
+  if (!scales.length) return;
+  const low = Math.min(...scales.map(([, v, s]) => v - (s ?? 0))), high = Math.max(...scales.map(([, v, s]) => v + (s ?? 0)));
+  const margin = Math.max(0.1 * (high - low), 0.01 * Math.abs(high), 1e-6);
+  const y = (v) => h - 4 - ((v - low + margin) / (high - low + 2 * margin)) * (h - 8), x = (age) => w - 46 - (age / 120) * (w - 50);
+  const style = getComputedStyle(c);
+  g.fillStyle = style.color;
+  g.font = "11px system-ui, sans-serif";
+  g.fillText(high.toPrecision(4), w - 42, 12);
+  g.fillText(low.toPrecision(4), w - 42, h - 4);
+  g.strokeStyle = g.fillStyle = style.getPropertyValue("--path");
+  for (const [age, value, sigma] of scales) {
+    g.fillRect(x(age) - 1.5, y(value) - 1.5, 3, 3);
+    if (sigma !== null) { g.beginPath(); g.moveTo(x(age), y(value - sigma)); g.lineTo(x(age), y(value + sigma)); g.stroke(); }
+  }
+}
+
+async function command(action, node, parameters = {}) {
+  const reply = await fetch("command", {
+    method: "POST",
+    headers: { Authorization: `Bearer ${token}`, "Content-Type": "application/json" },
+    body: JSON.stringify({ action, node, parameters }),
+  });
+  const answer = await reply.json();
+  $("answer").textContent = answer.text ?? answer.error;
+  $("answer").className = reply.ok ? "good" : "bad";
+  if (reply.status === 401) mayCommand(false);
+  return reply.ok;
+}
+
+function mayCommand(may) {
+  $("orders").hidden = !may;
+  $("login").hidden = may;
+  if (!may) sessionStorage.removeItem("token");
+}
+
+const failed = (error) => { $("answer").textContent = String(error); $("answer").className = "bad"; return false; };
+$("login").addEventListener("submit", async (e) => {
+  e.preventDefault();
+  token = $("token").value;
+  const right = await command("check", "").catch(failed);
+  if (right) { sessionStorage.setItem("token", token); $("token").value = ""; }
+  mayCommand(right);
+});
+$("orders").addEventListener("submit", (e) => {
+  e.preventDefault();
+  const node = $("node").value;
+  if (confirm(`Restart ${node}?`)) command("restart", node).catch(failed);
+});
+$("follow").addEventListener("change", (e) => { map.follow = e.target.checked; map.draw(); });
+window.addEventListener("resize", drawScales);
+if (token) mayCommand(true);
+
+function connection(text, className) {
+  $("connection").textContent = text;
+  $("connection").className = className;
+}
+const events = new EventSource("events");
+const on = (kind, take) => events.addEventListener(kind, (e) => take(JSON.parse(e.data)));
+events.onopen = () => connection("connected", "good");
+events.onerror = () => connection("not connected", "bad"); // the browser tries again by itself
+on("status", showStatus);
+on("scale", (data) => { scales = data; drawScales(); });
+on("path", (data) => { map.path = data; map.draw(); });
+on("robot", showRobot);
+on("picture", fetchPicture);

@@ -1,0 +1,100 @@
+"""A small system with something to see for the page: a camera, a lidar, a robot that drives a circle in a
+room, its map, depth with a scale."""
+
+import time
+
+import cv2
+import numpy as np
+
+from common.geometry import se2_to_se3
+from common.messages import Correction, FusedDepth, Grid, Image, Odometry, Rig, Scan
+from common.node import Node, Sourced
+from common.registry import Service
+from common.sensor_models import LidarModel
+
+NASTY = "<img src=x onerror=\"document.title='taken over'\"> & <b>bold</b>"
+SCALE, SCALE_SIGMA = 1.25, 0.05
+RADIUS_M = 1.0
+WALL_M = 2.0  # the room's walls, from its middle
+
+
+class Sensors(Node):
+    """Pictures at 10 Hz, grey by grey, and scans of a square room, as if it happened now."""
+
+    name = "replay"
+    outputs = ("rig", "camera/image", "lidar/scan")
+
+    def source(self):
+        yield Sourced(None, "rig", Rig(stamp_ns=1, lidar=LidarModel(T_body_lidar=np.eye(4)), source=NASTY))
+        started = time.monotonic()
+        for i in range(100_000):
+            while time.monotonic() < started + 0.1 * i:
+                yield None
+                time.sleep(0.01)
+            stamp_ns = time.time_ns()
+            bgr = np.full((240, 320, 3), 50 + i % 150, np.uint8)
+            jpeg = cv2.imencode(".jpg", bgr)[1].ravel()
+            yield Sourced(
+                None, "camera/image",
+                Image(stamp_ns=stamp_ns, width_px=320, height_px=240, encoding="jpeg", data=jpeg),
+            )  # fmt: skip
+            angle = np.linspace(-np.pi, np.pi, 360, endpoint=False)
+            ranges = WALL_M / np.maximum(np.abs(np.cos(angle)), np.abs(np.sin(angle)))
+            yield Sourced(
+                None, "lidar/scan",
+                Scan(stamp_ns=stamp_ns, angle_min_rad=-np.pi, angle_increment_rad=2 * np.pi / 360,
+                     time_increment_s=0.0, scan_time_s=0.1, range_min_m=0.1, range_max_m=12.0,
+                     ranges_m=ranges.astype(np.float32)),
+            )  # fmt: skip
+
+
+class Guide(Node):
+    """Where the robot is, and the map of the room."""
+
+    name = "localization"
+    inputs = ("lidar/scan",)
+    outputs = ("localization/odometry", "localization/correction", "localization/grid")
+
+    def configure(self):
+        self._count = 0
+        self.detail = NASTY
+
+    def on_lidar_scan(self, scan):
+        if self._count == 0:
+            T_map_odom = se2_to_se3(np.array([0.5, 0.0, 0.0]))
+            yield "localization/correction", Correction(stamp_ns=scan.stamp_ns, T_map_odom=T_map_odom)
+            occupancy = np.zeros((60, 60), np.int8)
+            occupancy[[0, -1], :] = occupancy[:, [0, -1]] = 100
+            grid = Grid(stamp_ns=scan.stamp_ns, resolution_m=0.1, origin_m=np.array([-3.0, -3.0]),
+                        occupancy=occupancy)  # fmt: skip
+            yield "localization/grid", grid
+        turn = 0.05 * self._count
+        self._count += 1
+        at = np.array([RADIUS_M * np.cos(turn), RADIUS_M * np.sin(turn), turn + np.pi / 2])
+        yield (
+            "localization/odometry",
+            Odometry(stamp_ns=scan.stamp_ns, T_odom_body=se2_to_se3(at), covariance=np.eye(3)),
+        )
+
+
+class Deep(Node):
+    """Depth of a floor, with its scale."""
+
+    name = "fusion"
+    inputs = ("camera/image",)
+    outputs = ("fusion/depth",)
+
+    def on_camera_image(self, picture):
+        depth = np.linspace(0.5, 6.0, 60 * 80, dtype=np.float32).reshape(60, 80)
+        depth[:5] = np.nan
+        fused = FusedDepth(stamp_ns=picture.stamp_ns, depth_m=depth, sigma_m=0.1 * depth, scale=SCALE,
+                           scale_sigma=SCALE_SIGMA, inlier_share=0.9, residual_m=0.02)  # fmt: skip
+        yield "fusion/depth", fused
+
+
+_HERE = "tests.services.monitor.parlour:"
+TABLE = {
+    "replay": Service("replay", "", {"default": _HERE + "Sensors"}),
+    "localization": Service("localization", "", {"default": _HERE + "Guide"}),
+    "fusion": Service("fusion", "", {"default": _HERE + "Deep"}),
+}
