@@ -24,12 +24,13 @@ import msgpack
 import zenoh
 import zenoh.ext
 
+from common.access import access_control, read_hosts
 from common.errors import UserError
 from common.header import DecodeError, Header, local_clock_id
 from common.mailbox import Letter
 from common.messages import Health
 from common.node import Input
-from common.security import Keys, SecurityConfig, check_endpoint
+from common.security import OPEN, Keys, SecurityConfig, check_endpoint, is_secure
 from common.streams import Publication, Subscription, open_sample
 from common.topics import HEALTH, Topic, topic
 
@@ -65,16 +66,25 @@ def _set_endpoints(config: zenoh.Config, side: str, endpoints: tuple[str, ...]) 
         ) from error
 
 
-def open_router(listen: tuple[str, ...], connect: tuple[str, ...] = ()) -> zenoh.Session:
-    """A router in this process.
+def open_router(
+    listen: tuple[str, ...], connect: tuple[str, ...] = (), security: SecurityConfig = OPEN
+) -> zenoh.Session:
+    """A router in this process. Where it listens beyond this host, hosts show certificates, and may do what
+    the topic table and hosts.toml say.
 
     Raises:
-        UserError: an endpoint cannot be listened on (in use), or is malformed.
+        UserError: an endpoint cannot be listened on (in use), is malformed, or leaves this host unprotected.
     """
     zenoh.init_log_from_env_or("error")
     config = _base_config("router")
     _set_endpoints(config, "listen", listen)
     _set_endpoints(config, "connect", connect)
+    for endpoint in (*listen, *connect):
+        check_endpoint(endpoint, security)
+    if any(is_secure(endpoint) for endpoint in (*listen, *connect)):
+        keys = Keys.of(security)
+        keys.identify(config)
+        config.insert_json5("access_control", json.dumps(access_control(read_hosts(keys.folder))))
     config.insert_json5("adminspace/enabled", "true")
     config.insert_json5("adminspace/permissions", "{read: true, write: false}")
     try:
@@ -125,7 +135,7 @@ def open_link(endpoint: str, wait_s: float, security: SecurityConfig) -> zenoh.S
     config = _base_config("client")
     config.insert_json5("transport/shared_memory/enabled", "false")
     _set_endpoints(config, "connect", (endpoint,))
-    if endpoint.startswith(("tls/", "quic/")):
+    if is_secure(endpoint):
         Keys.of(security).identify(config)
     for protocol in ("tcp", "tls"):
         config.insert_json5(f"transport/link/{protocol}/so_sndbuf", str(LINK_BUFFER_BYTES))

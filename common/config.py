@@ -22,7 +22,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, StringConstraints
 
 from common.errors import UserError
-from common.security import SecurityConfig
+from common.security import OPEN, SecurityConfig
 from common.strict import Config, parse
 
 Token = Annotated[str, StringConstraints(pattern=r"^[a-z0-9][a-z0-9_-]{0,63}$")]
@@ -57,7 +57,7 @@ class Deployment(Config):
     rate: Annotated[float, Field(ge=0.0)] = 1.0  # replayed data: times real time; 0 = as fast as possible
     state_dir: Path | None = None
     role: Role = "whole"
-    security: SecurityConfig = SecurityConfig()
+    security: SecurityConfig = OPEN
     nodes: dict[Token, dict[str, Any]] = Field(default_factory=dict)
 
     @property

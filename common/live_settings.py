@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from common.security import SecurityConfig
+from common.security import OPEN, SecurityConfig
 
 
 @dataclass(frozen=True)
@@ -15,7 +15,7 @@ class LiveSettings:
     robot: str
     endpoints: tuple[str, ...]
     run_dir: Path
-    security: SecurityConfig = SecurityConfig()  # of links to other hosts
+    security: SecurityConfig = OPEN  # of links to other hosts
     rate: float = 1.0  # pacing of recorded sources: times real time, 0 = as fast as possible
     wait_for: frozenset[str] = frozenset()  # a source starts when these nodes are active
     wait_s: float = 60.0

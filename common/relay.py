@@ -1,7 +1,7 @@
 """What crosses between a robot and its edge server: samples carried from one session to another, untouched.
 
-The column `uplink` of the topic table says what crosses, and how: a subscription on the other side cannot pull
-anything else over a radio. Small messages and large ones go over links of their own, so that a picture
+The column `uplink` of the topic table says what crosses, and how: a subscription on the other side cannot
+pull anything else over a radio. Small messages and large ones go over links of their own, so that a picture
 never stands before a pose. Ends of streams and health cross as well.
 """
 

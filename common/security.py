@@ -29,6 +29,14 @@ class SecurityConfig(Config):
     plain: bool = False
 
 
+OPEN = SecurityConfig()
+
+
+def is_secure(endpoint: str) -> bool:
+    """Whether both sides of such a link show certificates."""
+    return endpoint.startswith(("tls/", "quic/"))
+
+
 def is_loopback(endpoint: str) -> bool:
     """Whether an endpoint ("tcp/127.0.0.1:7447") cannot be reached from another host."""
     protocol, _, address = endpoint.partition("/")
@@ -80,7 +88,7 @@ class Keys:
 
 def check_endpoint(endpoint: str, security: SecurityConfig) -> None:
     """Raises UserError for a link off this host without certificates, unless that is asked for."""
-    if not (is_loopback(endpoint) or security.plain or endpoint.startswith(("tls/", "quic/"))):
+    if not (is_loopback(endpoint) or security.plain or is_secure(endpoint)):
         raise UserError(
             f"{endpoint} leaves this host unprotected: use tls/ and `beamsplat keys`, or allow it with "
             "security.plain = true in a network that you trust"

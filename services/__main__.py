@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from common.errors import UserError
-from services import demo, doctor, system_cli, warm
+from services import demo, doctor, keys_cli, system_cli, warm
 from services.bench import cli as bench_cli
 from services.depth import models_cli
 from services.evaluation import calibrate_cli
@@ -53,6 +53,7 @@ app.add_typer(evaluate, name="eval", rich_help_panel=_RESULTS)
 for command in (doctor.doctor, warm.warm):
     app.command(rich_help_panel=_MACHINE)(command)
 app.add_typer(models_cli.app, name="models", rich_help_panel=_MACHINE)
+app.add_typer(keys_cli.app, name="keys", rich_help_panel=_MACHINE)
 bench_cli.app.command("depth")(depth_cli.bench_depth)
 bench_cli.app.command("raster")(mapping_cli.bench_raster)
 bench_cli.app.command("map")(mapping_cli.bench_map)

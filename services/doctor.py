@@ -100,13 +100,18 @@ def _gpu() -> Iterator[Finding]:
 def _router(deployment: Deployment) -> Iterator[Finding]:
     from common.bus import open_session
     from common.errors import UserError
+    from common.security import is_loopback
 
-    for endpoint in deployment.router.listen:
+    running = False
+    for endpoint in sorted(deployment.router.listen, key=lambda e: not is_loopback(e)):
+        if running:  # whose other doors are open, too
+            continue
         try:
             open_session((endpoint,), wait_s=0.0).close()
         except UserError:
             pass
         else:
+            running = True
             yield Finding("Zenoh router", "ok", f"one is running at {endpoint}")
             continue
         host, _, port = endpoint.rpartition("/")[2].rpartition(":")
@@ -187,12 +192,24 @@ def examine(deployment: Deployment) -> list[Finding]:
 def doctor(
     file: Annotated[Path | None, typer.Argument(help="Deployment whose port and folders to check")] = None,
     brief: Annotated[bool, typer.Option(help="Show only what is not well")] = False,
+    security: Annotated[bool, typer.Option("--security", help="Only links, keys and the policy")] = False,
 ) -> None:
     """Examines this machine: Python, packages, GPU, Zenoh port, shared memory, disk, models, devices.
 
-    Exit code 1 if there is a fault. Example: beamsplat doctor deploy/demo.toml
+    Exit code 1 if there is a fault. With --security it says why a link to another host is refused, which
+    Zenoh passes over in silence.
+
+    Examples: beamsplat doctor deploy/demo.toml
+
+    beamsplat doctor deploy/robot.toml --security
     """
-    findings = examine(load_deployment(file) if file else Deployment())
+    deployment = load_deployment(file) if file else Deployment()
+    if security:
+        from services.doors import examine_security
+
+        findings = [Finding(*remark) for remark in examine_security(deployment)]
+    else:
+        findings = examine(deployment)
     table = Table("", "what", "found", "remedy", pad_edge=False)
     mark = {"ok": "[green]ok[/]", "note": "[yellow]note[/]", "fault": "[red]FAULT[/]"}
     for finding in findings:

@@ -11,11 +11,13 @@ import time
 from multiprocessing import connection, parent_process
 from pathlib import Path
 
+from common.access import read_hosts
 from common.bus import open_router
 from common.config import Deployment
 from common.errors import UserError
 from common.live import Live, LiveSettings
 from common.registry import Service
+from common.security import CERTIFICATE, HOSTS
 from services.deployment import Surroundings, build_node, node_classes, surroundings
 from services.nodes import NODES
 
@@ -67,13 +69,32 @@ def serve(
 
 
 def route(deployment: Deployment) -> None:
-    """Runs this host's router until SIGINT or SIGTERM comes."""
+    """Runs this host's router until SIGINT or SIGTERM comes. A new policy is taken up at once: clients of a
+    router that opens anew are back within a second."""
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
-    with open_router(deployment.router.listen, deployment.router.connect):
-        while not stop.wait(0.5):
-            pass
+    router, security = deployment.router, deployment.security
+    while not stop.is_set():
+        policy = _changed_at(security.keys)
+        with open_router(router.listen, router.connect, security):
+            while not stop.wait(0.5):
+                if _changed_at(security.keys) == policy:
+                    continue
+                try:
+                    read_hosts(security.keys)
+                    break
+                except UserError as error:  # being copied, or edited: the old policy stays
+                    policy = _changed_at(security.keys)
+                    log.error("the new policy is not taken up: %s", error)
+
+
+def _changed_at(keys: Path | None) -> int:
+    """When the policy in a folder of keys, or the certificate, was last written; 0 where there is none."""
+    if keys is None:
+        return 0
+    files = [keys.expanduser() / name for name in (HOSTS, CERTIFICATE)]
+    return max((file.stat().st_mtime_ns for file in files if file.exists()), default=0)
 
 
 def child(

@@ -87,3 +87,30 @@ def test_doctor_names_a_taken_port(tmp_path, free_endpoint):
     assert "cannot be listened on" in taken.stdout
     free = beamsplat("doctor", deployment, env={"PATH": "/usr/bin", "COLUMNS": "300", "HOME": str(tmp_path)})
     assert f"{free_endpoint} is free" in free.stdout
+
+
+def test_keys_are_made_listed_and_taken_away(tmp_path):
+    folder = tmp_path / "authority"
+
+    def keys(*arguments):
+        return beamsplat("keys", *arguments, "--authority", folder)
+
+    assert "keys init" in keys("issue", "r1").stderr  # nothing there yet
+    assert "keys issue edge" in keys("init").stdout
+    assert "--address" in keys("issue", "edge", "--role", "edge").stderr
+    assert keys("issue", "edge", "--role", "edge", "--address", "edge.local").returncode == 0
+    assert str(folder / "hosts" / "r1") in keys("issue", "r1").stdout
+    assert "lower case" in keys("issue", "R1/**").stderr
+    assert (
+        "Input should be 'robot', 'monitor', 'operator' or 'edge'"
+        in keys("issue", "x", "--role", "king").stderr
+    )
+    listed = keys("list").stdout.splitlines()
+    assert [line.split()[:4] for line in listed] == [
+        ["edge", "edge", "robot", "*"],
+        ["r1", "robot", "robot", "r1"],
+    ]
+    assert keys("remove", "r1").returncode == 0
+    assert len(keys("list").stdout.splitlines()) == 1
+    assert "[r1]" not in (folder / "hosts" / "edge" / "hosts.toml").read_text()
+    assert "no host 'r1'" in keys("remove", "r1").stderr

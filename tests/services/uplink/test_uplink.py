@@ -2,17 +2,21 @@
 
 import contextlib
 import os
+import shutil
 import signal
 import time
 
 import pytest
 
+from common.access import Host
 from common.bus import open_session
 from common.config import Deployment, RouterConfig
 from common.errors import UserError
 from common.lockstep import Lockstep
+from common.security import SecurityConfig
 from common.streams import declare_reader, open_sample
 from common.topics import TOPICS, topic
+from services.authority import Authority
 from services.board import HealthBoard
 from services.deployment import faults, surroundings
 from services.nodes import NODES
@@ -157,6 +161,30 @@ def test_the_robot_starts_without_an_edge_and_an_edge_that_dies_gets_the_rest(tm
             poll((robot, edge), lambda: board.states().get("keyframes") == "drained", 120)
             assert set(answered.ids()) == set(sent.ids())
             assert robot.children["localization"].restarts == robot.children["keyframes"].restarts == 0
+
+
+@pytest.mark.slow
+def test_behind_locked_doors_everything_flows_until_the_robot_is_removed(tmp_path):
+    authority = Authority.create(tmp_path / "authority")
+    keys = {"edge": authority.issue("edge", Host(role="edge"), ("127.0.0.1",))}
+    robot = Host(role="robot", robot="r1")
+    keys["robot"] = shutil.copytree(authority.issue("r1", robot), tmp_path / "keys")
+    secured = {f"{side}_security": SecurityConfig(keys=folder) for side, folder in keys.items()}
+    pair = Pair(tmp_path, pictures=120, scheme="tls", **secured)
+    with running(pair) as ((robot_side, _near, _near_board), (edge, far, far_board)):
+        both = (robot_side, edge)
+        mapped, poses = Ears(far, "keyframes/ack"), Ears(far, "localization/odometry")
+        poll(both, lambda: len(mapped.messages) >= 3 and poses.messages, 90)
+        assert "localization" in far_board.records
+        authority.remove("r1")
+        time.sleep(2.0)  # the router takes the new policy up
+        mapped_before, poses_before = len(mapped.messages), len(poses.messages)
+        time.sleep(3.0)
+        assert (len(mapped.messages), len(poses.messages)) == (mapped_before, poses_before)
+        assert far_board.states()["mapping"] == "active"  # this host's own processes are not concerned
+        authority.issue("r1", robot)  # back in the policy: the certificate it has is still good
+        poll(both, lambda: len(mapped.messages) >= mapped_before + 5, 30)
+        assert robot_side.children["uplink"].restarts == edge.children["router"].restarts == 0
 
 
 def test_only_what_the_table_marks_crosses(tmp_path):
