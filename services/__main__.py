@@ -17,6 +17,7 @@ from services.evaluation import cli as depth_cli
 from services.evaluation.relocalize_cli import eval_relocalize
 from services.localization import cli as localization_cli
 from services.mapping import cli as mapping_cli
+from services.mapping.formats import cli as formats_cli
 from services.mapping.session import cli as session_cli
 from services.replay import cli as replay_cli
 from services.simulator import cli as simulator_cli
@@ -39,7 +40,7 @@ for command in (
 for command in (simulator_cli.simulate, replay_cli.info, replay_cli.rig):
     app.command(rich_help_panel=_DATA)(command)
 app.add_typer(calibrate_cli.app, name="calibrate", rich_help_panel=_DATA)
-for command in (localization_cli.slam, depth_cli.depth):
+for command in (localization_cli.slam, depth_cli.depth, formats_cli.export, formats_cli.render):
     app.command(rich_help_panel=_RESULTS)(command)
 
 app.add_typer(session_cli.app, name="session", rich_help_panel=_RESULTS)

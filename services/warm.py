@@ -13,6 +13,7 @@ WARMERS = (
     "services.fusion.warm:warm",
     "common.raster.warm:warm",
     "services.mapping.warm:warm",
+    "services.mapping.formats.mesh:warm",
     "services.localization.camera.warm:warm",
     "services.camera.jpeg:warm",
 )

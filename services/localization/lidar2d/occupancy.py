@@ -151,7 +151,8 @@ def save_nav2(grid: OccupancyGrid, folder: Path, name: str = "map") -> None:
     (folder / f"{name}.yaml").write_text(
         f"image: {name}.pgm\nmode: trinary\nresolution: {grid.resolution_m}\n"
         f"origin: [{grid.origin_x_m:.6f}, {grid.origin_y_m:.6f}, 0.0]\nnegate: 0\n"
-        f"occupied_thresh: {OCCUPIED / 100}\nfree_thresh: {FREE / 100}\n"
+        # Between the three pixel values: 205 is (255 - 205) / 255 = 0.1961, and must not read as free.
+        "occupied_thresh: 0.65\nfree_thresh: 0.196\n"
     )
     known = np.argwhere(flipped >= 0)
     shown = np.where(flipped < 0, 205, 255 - (flipped.astype(np.int16) * 255) // 100).astype(np.uint8)

@@ -75,7 +75,7 @@ def join(
     from services.mapping.session.edit import with_anchors
 
     folder, arrays = _open(session)
-    slam = _slam(robot)
+    slam = load_slam(robot)
     _same_drive(session, robot, arrays, slam)
     folder.lock()
     try:
@@ -120,7 +120,7 @@ def merge(
     if target.exists():
         raise UserError(f"{out}: holds a session already; choose another folder")
     both = all((folder.robot / ROBOT_MANIFEST).is_file() for folder in (folder_a, folder_b))
-    slams = [_slam(folder.robot) for folder in (folder_a, folder_b)] if both else []
+    slams = [load_slam(folder.robot) for folder in (folder_a, folder_b)] if both else []
     T_a_b = _placed(place) if place else _found(first, second, slams)
     known = [*a["anchor_id"].tolist(), *(slams[0].back.submaps if slams else [])]
     offset = max([*known, -1]) + 2  # -1 is the second's odom origin
@@ -216,7 +216,7 @@ def _write(folder: Any, arrays: dict[str, Any]) -> None:
         ) from error
 
 
-def _slam(path: Path) -> Any:
+def load_slam(path: Path) -> Any:
     """The lidar SLAM of a robot half.
 
     Raises:

@@ -10,7 +10,7 @@ from common.errors import UserError
 from common.geometry import inverse
 from common.raster.layout import OPACITY
 from services.mapping.session.folder import Arrays
-from services.mapping.session.state import progress_of
+from services.mapping.session.state import progress_of, store_of
 from services.mapping.store import GaussianStore
 
 _KEYFRAMES, _STORE, _TAKEN = "keyframe_", "store_", "extra_taken_"
@@ -19,7 +19,7 @@ _KEYFRAMES, _STORE, _TAKEN = "keyframe_", "store_", "extra_taken_"
 def with_anchors(arrays: Arrays, T_map_anchor: dict[int, np.ndarray]) -> Arrays:
     """The map with anchors at new places [4, 4]: Gaussians and keyframes move along. Others stay."""
     ids, places = arrays["anchor_id"], arrays["anchor_T_map"].copy()
-    store = _store(arrays)
+    store = store_of(arrays)
     for row, anchor in enumerate(ids.tolist()):
         if anchor in T_map_anchor:
             store.move(anchor, T_map_anchor[anchor] @ inverse(places[row]))
@@ -62,7 +62,7 @@ def merged(a: Arrays, b: Arrays, T_a_b: np.ndarray, offset: int) -> Arrays:
 def pruned(arrays: Arrays, least_opacity: float, keyframes: int | None) -> Arrays:
     """The map without Gaussians fainter than `least_opacity`, and with at most so many keyframes, spread over
     time; what they made stays."""
-    store = _store(arrays)
+    store = store_of(arrays)
     opacity = 1.0 / (1.0 + np.exp(-store.params[OPACITY, : store.count].astype(np.float64)))
     store.keep(opacity >= least_opacity)
     out = arrays | _prefixed(store)
@@ -87,12 +87,6 @@ def summary_of(arrays: Arrays) -> dict[str, int]:
         "steps": progress_of(arrays)["steps"], "anchors": len(arrays["anchor_id"]),
         "stamp_ns": int(stamps_ns.max()) if len(stamps_ns) else 0,
     }  # fmt: skip
-
-
-def _store(arrays: Arrays) -> GaussianStore:
-    store = GaussianStore()
-    store.restore({key.removeprefix(_STORE): a for key, a in arrays.items() if key.startswith(_STORE)})
-    return store
 
 
 def _prefixed(store: GaussianStore) -> Arrays:

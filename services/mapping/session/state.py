@@ -14,6 +14,7 @@ from common.raster.camera import RasterCamera
 from services.mapping.keyframe import Held, Keyframe, hold
 from services.mapping.mapper import FULL, Mapper
 from services.mapping.session.folder import Arrays
+from services.mapping.store import GaussianStore
 
 _CAMERA = ("fx_px", "fy_px", "cx_px", "cy_px", "width_px", "height_px")
 _NOT_STORED = {"levels"}  # made again from the keyframe's body
@@ -53,9 +54,7 @@ def restore(mapper: Mapper, arrays: Arrays, body: Callable[[int], Keyframe]) -> 
     """
     lost = []
     try:
-        mapper.store.restore(
-            {k.removeprefix("store_"): a for k, a in arrays.items() if k.startswith("store_")}
-        )
+        mapper.store = store_of(arrays)
         anchors = zip(arrays["anchor_id"].tolist(), arrays["anchor_T_map"])
         mapper.T_map_anchor = {anchor: T.copy() for anchor, T in anchors}
         for row, id in enumerate(arrays["keyframe_id"].tolist()):
@@ -72,6 +71,17 @@ def restore(mapper: Mapper, arrays: Arrays, body: Callable[[int], Keyframe]) -> 
     except KeyError as error:
         raise UserError(f"the saved state lacks {error}: restore the session from a copy") from error
     return lost
+
+
+def store_of(arrays: Arrays) -> GaussianStore:
+    """The Gaussians of a state.
+
+    Raises:
+        KeyError: an array is missing.
+    """
+    store = GaussianStore()
+    store.restore({k.removeprefix("store_"): a for k, a in arrays.items() if k.startswith("store_")})
+    return store
 
 
 def progress_of(arrays: Arrays) -> dict[str, Any]:

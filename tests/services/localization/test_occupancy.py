@@ -76,6 +76,11 @@ def test_nav2_files(tmp_path):
     assert "image: map.pgm" in text
     assert "origin: [-1.000000, 2.000000, 0.0]" in text
     assert (tmp_path / "map.png").stat().st_size > 0
+    # As map_server reads them (trinary): what is unknown must stay so.
+    limits = dict(line.split(": ") for line in text.splitlines() if "thresh" in line)
+    occupancy = (255.0 - image.astype(float)) / 255.0
+    occupied, free = occupancy > float(limits["occupied_thresh"]), occupancy < float(limits["free_thresh"])
+    np.testing.assert_array_equal(np.where(occupied, 100, np.where(free, 0, -1))[::-1], values)
 
 
 def test_rays_clear_what_they_cross_and_stop_before_the_wall():
