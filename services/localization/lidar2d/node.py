@@ -10,12 +10,14 @@ import numpy as np
 from pydantic import Field
 
 from common.config import NodeConfig
+from common.errors import UserError
 from common.geometry import se2_to_se3, se3_to_se2
 from common.messages import Anchors, Correction, Grid, MovingBeams, Odometry, Rig, Scan, WheelOdometry
 from common.node import Input, Job, Node, Outputs
 from services.localization.lidar2d.occupancy import OccupancyGrid
 from services.localization.lidar2d.settings import LidarSlamSettings
 from services.localization.lidar2d.slam import LidarSlam, ScanResult
+from services.localization.lidar2d.state import MANIFEST, MapStateError, read_manifest
 
 log = logging.getLogger("beamsplat.localization")
 
@@ -26,6 +28,7 @@ class LidarLocalizationConfig(NodeConfig):
     grid_every_scans: Annotated[int, Field(ge=1)] = 50
     grid_resolution_m: Annotated[float, Field(gt=0.0, le=1.0)] = 0.05
     save: Path | None = None  # folder for map, trajectory and state, written at the end of the data
+    resume: Path | None = None  # folder of a saved state: the robot finds its place in it and maps on
 
 
 class LidarLocalization(Node):
@@ -46,16 +49,31 @@ class LidarLocalization(Node):
         self._optimisations = 0
         self._stamp_ns = 0
         self._drawn: OccupancyGrid | None = None
+        if self.config.resume is not None:
+            try:
+                read_manifest(self.config.resume / MANIFEST)
+            except MapStateError as error:
+                raise UserError(f"localization.resume: {error}") from error
 
     def on_rig(self, rig: Rig) -> Outputs:
         """Where the lidar sits. A second calibration would bend the map: it is refused, and said."""
         if rig.lidar is None:
             log.error("the calibration has no lidar: scans cannot be used")
         elif self._slam is None:
-            self._slam = LidarSlam(LidarSlamSettings(), rig.lidar.T_body_lidar)
+            self._slam = self._begin(rig.lidar.T_body_lidar)
         else:
             log.warning("a new calibration is ignored: restart the node to use it")
         return iter(())
+
+    def _begin(self, T_body_lidar: np.ndarray) -> LidarSlam:
+        if self.config.resume is None:
+            return LidarSlam(LidarSlamSettings(), T_body_lidar)
+        try:
+            slam = LidarSlam.load(self.config.resume, LidarSlamSettings(), T_body_lidar)
+        except MapStateError as error:
+            raise UserError(f"localization.resume: {error}") from error
+        log.info("goes on from %s: %d submaps", self.config.resume, len(slam.anchors()))
+        return slam
 
     def on_wheel_odometry(self, odometry: WheelOdometry) -> Outputs:
         if self._slam is not None:

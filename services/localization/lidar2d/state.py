@@ -61,7 +61,7 @@ def save_state(folder: Path, back: BackEnd, extra: dict[str, np.ndarray]) -> Non
 def load_state(folder: Path, settings: LidarSlamSettings) -> tuple[BackEnd, dict[str, np.ndarray]]:
     """The saved back end and the extra arrays. Raises MapStateError naming the file and the reason."""
     path = Path(folder) / MANIFEST
-    manifest = _manifest(path)
+    manifest = read_manifest(path)
     arrays_path = Path(folder) / str(manifest["arrays"])
     try:
         raw = arrays_path.read_bytes()
@@ -88,7 +88,8 @@ def load_state(folder: Path, settings: LidarSlamSettings) -> tuple[BackEnd, dict
     return back, {key: value for key, value in arrays.items() if key.startswith("extra_")}
 
 
-def _manifest(path: Path) -> dict:
+def read_manifest(path: Path) -> dict:
+    """What a saved map says of itself. Raises MapStateError naming the file and the reason."""
     try:
         manifest = json.loads(path.read_text())
     except OSError as error:

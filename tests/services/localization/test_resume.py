@@ -1,0 +1,92 @@
+"""A second drive goes on in the first one's map: from a wrong start, with the same submaps, into one state."""
+
+import json
+
+import numpy as np
+import pytest
+
+from common.errors import UserError
+from common.geometry import inverse, se2_to_se3
+from common.messages import LidarModel, Rig, Scan
+from services.localization.lidar2d.node import LidarLocalization
+from tests.services.localization.world import Drive, Lidar
+
+T0 = 1_000_000_000_000
+PATH = Drive()
+
+
+def drive(node, start_s, end_s, seed, day):
+    """Messages of a drive through the flat, by topic, and the pose (true, published) of each scan that was ok."""
+    lidar, sent, poses, T_map_odom = Lidar(seed=seed), {}, [], np.eye(4)
+    angle_min, increment, dt, least, most = lidar.arguments()
+
+    def take(outputs):
+        nonlocal T_map_odom
+        for output in outputs:
+            if not isinstance(output, tuple):
+                jobs.append([output.after, output])
+                continue
+            sent.setdefault(output[0], []).append(output[1])
+            if output[0] == "localization/correction":
+                T_map_odom = output[1].T_map_odom
+
+    jobs = []
+    take(node.handle("rig", Rig(stamp_ns=T0, lidar=LidarModel(T_body_lidar=np.eye(4)))))
+    for number in range(int((end_s - start_s) * 10)):
+        t = start_s + number * 0.1
+        for job in jobs:
+            job[0] -= 1
+        for _, job in [j for j in jobs if j[0] <= 0]:
+            take(node.handle_job(job.name, job.run()))
+        jobs = [j for j in jobs if j[0] > 0]
+        scan = Scan(stamp_ns=T0 + day * 86_400 * 10**9 + int(t * 1e9), angle_min_rad=angle_min,
+                    angle_increment_rad=increment, time_increment_s=dt, scan_time_s=0.1, range_min_m=least,
+                    range_max_m=most, ranges_m=lidar.scan(PATH, t))  # fmt: skip
+        take(node.handle("lidar/scan", scan))
+        if sent["localization/odometry"][-1].status == "ok":
+            odometry = sent["localization/odometry"][-1]
+            poses.append((se2_to_se3(PATH(np.array([t]))[0]), T_map_odom @ odometry.T_odom_body))
+    for _, job in jobs:
+        take(node.handle_job(job.name, job.run()))
+    take(node.handle_drain())
+    return sent, poses
+
+
+def fitted(world, mapped):
+    """The rigid motion [3] that takes poses [N, 3] of the map to those of the world, in least squares."""
+    a, b = world[:, :2] - world[:, :2].mean(0), mapped[:, :2] - mapped[:, :2].mean(0)
+    yaw = np.arctan2((b[:, 0] * a[:, 1] - b[:, 1] * a[:, 0]).sum(), (a * b).sum())
+    c, s = np.cos(yaw), np.sin(yaw)
+    return np.array([*(world[:, :2].mean(0) - [[c, -s], [s, c]] @ mapped[:, :2].mean(0)), yaw])
+
+
+def make(**options):
+    node = LidarLocalization(LidarLocalization.Config(kind="lidar", **options))
+    node.configure()
+    return node
+
+
+@pytest.mark.slow
+def test_a_drive_goes_on_in_the_map_of_another(tmp_path):
+    node = make(save=tmp_path / "map")
+    first, _ = drive(node, 0.0, 36.0, 1, 0)
+    old = set(first["localization/anchors"][-1].anchor_ids.tolist())
+    _, optimised, _ = node._slam.trajectory()
+    T_world_map = se2_to_se3(fitted(PATH(np.arange(len(optimised)) * 0.1), optimised))
+    second, after = drive(make(resume=tmp_path / "map", save=tmp_path / "map"), 14.0, 42.0, 2, 1)
+    statuses = [o.status for o in second["localization/odometry"]]
+    assert statuses[0] == "relocalizing"
+    assert statuses.index("ok") < 100  # within ten seconds of the drive
+    assert set(statuses[statuses.index("ok") :]) == {"ok"}
+    errors = [inverse(true) @ T_world_map @ shown for true, shown in after]
+    off_m = [np.hypot(*e[:2, 3]) for e in errors]
+    assert np.percentile(off_m, 95) < 0.05
+    anchors = second["localization/anchors"][-1].anchor_ids.tolist()
+    assert old < set(anchors)  # keyframes of the first drive still hang on theirs
+    table = json.loads((tmp_path / "map" / "lidar_map.json").read_text())
+    assert table["submaps"] == len(anchors)
+
+
+def test_a_state_that_cannot_be_read_is_said_before_anything_starts(tmp_path):
+    with pytest.raises(UserError, match=r"localization\.resume: .*no saved map here"):
+        make(resume=tmp_path)
