@@ -7,6 +7,7 @@ Everything a robot says lives under `beamsplat/<robot>/`:
     end/<topic>                   the producer has nothing more to say (latched)
     alive/<node>/<instance>       liveliness token of an active node
     query/<node>/<name>           queryables
+    control/<instance>/<verb>     what the supervisor asks of one process (common/takeover.py)
 
 All sessions are clients of a router on this host: two peers that know only a router do not reach each
 other, and access control acts between client and router. Channels with threads of our own take the
@@ -32,6 +33,7 @@ from common.messages import Health
 from common.node import Input
 from common.security import OPEN, Keys, SecurityConfig, check_endpoint, is_secure
 from common.streams import Publication, Subscription, open_sample
+from common.takeover import CONTROL
 from common.topics import HEALTH, Topic, topic
 
 ROOT = "beamsplat"
@@ -151,6 +153,10 @@ def _short(error: zenoh.ZError) -> str:
     return str(error).split(" at ")[0][:120]
 
 
+def _last(query: zenoh.Query) -> str:
+    return str(query.key_expr).rpartition("/")[2]
+
+
 class Bus:
     """One node's place on the network. Keep it open with `with`."""
 
@@ -234,9 +240,15 @@ class Bus:
 
     def answer(self, name: str, on_query: Callable[[str, zenoh.Query], None]) -> None:
         """Declares the queryable query/<node>/<name>; `on_query(name, query)` runs in a bus thread."""
-        queryable = self.session.declare_queryable(
-            key(self.robot, "query", self.node, name), zenoh.handlers.FifoChannel(16)
-        )
+        self._answer(key(self.robot, "query", self.node, name), lambda query: on_query(name, query))
+
+    def obey(self, on_query: Callable[[str, zenoh.Query], None]) -> None:
+        """Declares control/<instance>/*: what is asked of one process, not of a node."""
+        place = key(self.robot, CONTROL, self.instance, "*")
+        self._answer(place, lambda query: on_query(f"{CONTROL}/{_last(query)}", query))
+
+    def _answer(self, place: str, on_query: Callable[[zenoh.Query], None]) -> None:
+        queryable = self.session.declare_queryable(place, zenoh.handlers.FifoChannel(16))
         self._declared.append(queryable)
 
         def receive() -> None:
@@ -245,9 +257,9 @@ class Bus:
                     query = queryable.recv()
                 except zenoh.ZError:
                     return
-                on_query(name, query)
+                on_query(query)
 
-        threading.Thread(target=receive, name=f"query-{name}", daemon=True).start()
+        threading.Thread(target=receive, name=f"query-{place}", daemon=True).start()
 
     def watch_health(self, on_health: Callable[[Health], None]) -> None:
         """Brings the health of every node of this robot; `on_health` runs in a thread of the bus."""

@@ -88,6 +88,20 @@ def load_deployment(path: Path, overrides: tuple[str, ...] = ()) -> Deployment:
     return parse(Deployment, table, str(path))
 
 
+def with_overrides(deployment: Deployment, overrides: tuple[str, ...]) -> Deployment:
+    """A copy with `node.key=value` overrides applied to its nodes.
+
+    Raises:
+        UserError: an override that does not fit.
+    """
+    table: dict[str, Any] = {"nodes": {name: dict(options) for name, options in deployment.nodes.items()}}
+    for override in overrides:
+        _apply(table, override)
+    if set(table) != {"nodes"}:
+        raise UserError(f"{', '.join(overrides)}: only options of nodes can be changed in a running system")
+    return deployment.model_copy(update={"nodes": table["nodes"]})
+
+
 def _apply(table: dict[str, Any], override: str) -> None:
     """Sets one dotted `key=value` in a raw table; a first key that names no option names a node."""
     key, equals, text = override.partition("=")

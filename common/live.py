@@ -26,12 +26,13 @@ from common.header import local_clock_id
 from common.jobs import Abandoned, JobQueue, Worker
 from common.live_settings import LiveSettings
 from common.mailbox import NOBODY, Letter, Mailbox
-from common.messages import Health
+from common.messages import Answer, Health
 from common.node import Job, Node, Output
-from common.pacing import Playback
+from common.pacing import Playback, wait_for_nodes
 from common.persist import Bookmark, claim_epoch
 from common.queries import ask, reply
 from common.streams import Publication
+from common.takeover import CONTROL, Takeover
 from common.vitals import Vitals
 
 log = logging.getLogger(__name__)
@@ -48,7 +49,8 @@ class Live:
     def __init__(self, node: Node, settings: LiveSettings) -> None:
         self.node = node
         self.settings = node.home = settings
-        self.instance = secrets.token_hex(8)
+        self.instance = settings.instance or secrets.token_hex(8)
+        self.takeover = Takeover(settings.standby)
         self.mailbox = Mailbox(type(node), time.monotonic_ns)
         self.changed = threading.Condition()
         self._stopping = False
@@ -82,6 +84,7 @@ class Live:
             try:
                 self.node.configure()
                 self.state = "standby"
+                self._bus = bus
                 self._join(bus)
                 self._work(bus)
                 vitals.send()
@@ -111,10 +114,16 @@ class Live:
             if entry.topic in self.settings.unfed:
                 self.mailbox.end(entry.topic, NOBODY, 0)
             bus.subscribe(entry, self._on_letter, self._on_undecodable, self._on_end)
-        for name in self.node.queries():
-            bus.answer(name, self._on_query)
         if self.node.watches_health():
             bus.watch_health(self._on_health)
+        bus.obey(self._on_query)
+        if not self.takeover.standby:
+            self._show(bus)
+
+    def _show(self, bus: Bus) -> None:
+        """From now on this instance is the node."""
+        for name in self.node.queries():
+            bus.answer(name, self._on_query)
         bus.declare_alive()
 
     def _work(self, bus: Bus) -> None:
@@ -123,8 +132,11 @@ class Live:
             self.state = "active"
             self._run_source()
         else:
-            self.state = "active"
+            if not self.takeover.standby:
+                self.state = "active"
             self._run_steps()
+        if self.takeover.retired or self.takeover.standby:
+            return
         finished = not self._stopping
         self.state = "drain"
         for name, result in self._jobs.rest():
@@ -154,6 +166,8 @@ class Live:
         heard = time.monotonic()
         while not self._stopping:
             self._attend()
+            if self.takeover.retired:
+                return
             letter = self._next()
             self._emit_all(self._jobs.finished())
             if letter is None:
@@ -210,7 +224,7 @@ class Live:
             if isinstance(output, Job):
                 future = self._jobs.start(output)
                 future.add_done_callback(lambda _: self._wake())
-            else:
+            elif not self.takeover.keeps(*output):
                 self.publications[output[0]].put(output[1])
 
     def _run_source(self) -> None:
@@ -237,17 +251,10 @@ class Live:
             playback.sent(item)
 
     def _wait_for_consumers(self, bus: Bus) -> None:
-        deadline = time.monotonic() + self.settings.wait_s
-        missing = self.settings.wait_for
-        while missing and not self._stopping:
-            missing = self.settings.wait_for - bus.alive_nodes()
-            if missing and time.monotonic() > deadline:
-                log.warning("starting without %s: not active after %g s", ", ".join(sorted(missing)),
-                            self.settings.wait_s)  # fmt: skip
-                break
-            if missing:
-                self.detail = f"waiting for {', '.join(sorted(missing))}"
-                time.sleep(0.1)
+        def say(missing: list[str]) -> None:
+            self.detail = f"waiting for {', '.join(missing)}"
+
+        wait_for_nodes(bus.alive_nodes, self.settings, lambda: self._stopping, say)
         self.detail = ""
 
     def _attend(self) -> None:
@@ -257,7 +264,28 @@ class Live:
         while self._queries:
             name, query = self._queries.popleft()
             parameters = dict(query.parameters)
+            if name.startswith(CONTROL):
+                reply(query, self._control(name.removeprefix(CONTROL + "/"), parameters))
+                continue
             reply(query, getattr(self.node, f"on_query_{name}")(parameters))
+
+    def _control(self, verb: str, parameters: dict[str, str]) -> Iterator[Answer]:
+        """What the supervisor asks of one instance during a swap, between two steps."""
+        text = ""
+        if verb == "ready":
+            text = self.takeover.ready()
+        elif verb == "retire":
+            text = self.takeover.retire()
+        elif verb == "activate" and self.takeover.standby:
+            held = list(self.takeover.activate(parameters.get("after", "{}")))
+            self._bus.epoch = claim_epoch(self.settings.run_dir, self.node.name)
+            self._emit(iter(held))
+            self._show(self._bus)
+            self.state = "active"
+            text = str(len(held))
+        else:
+            raise ValueError(f"nothing called {verb!r} can be asked of {self.node.name} now")
+        yield Answer(stamp_ns=time.time_ns(), text=text)
 
     # --- called from threads of the bus ---
 

@@ -22,3 +22,5 @@ class LiveSettings:
     unfed: frozenset[str] = frozenset()  # inputs that nobody in this deployment produces: not waited for
     resume: bool = False  # a restarted source goes on where its predecessor died
     exit_when_drained: bool = False
+    instance: str = ""  # 16 hex digits that the supervisor knows it by; "" = random
+    standby: bool = False  # says nothing until the supervisor has its predecessor retire

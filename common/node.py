@@ -89,6 +89,8 @@ class Node:
     Config: ClassVar[type[NodeConfig]] = NodeConfig
     inputs: ClassVar[tuple[str | Input, ...]] = ()
     outputs: ClassVar[tuple[str, ...]] = ()
+    # A second one may run beside it and take over: all it knows comes from its inputs of the last seconds.
+    replaceable: ClassVar[bool] = False
 
     def __init__(self, config: NodeConfig) -> None:
         self.config = config

@@ -2,10 +2,35 @@
 
 from __future__ import annotations
 
+import logging
 import time
+from collections.abc import Callable
 
+from common.live_settings import LiveSettings
 from common.node import Sourced
 from common.persist import Bookmark
+
+log = logging.getLogger(__name__)
+
+
+def wait_for_nodes(
+    alive: Callable[[], set[str]],
+    settings: LiveSettings,
+    stopping: Callable[[], bool],
+    say: Callable[[list[str]], None],
+) -> None:
+    """Returns when all that a source waits for are alive, after `wait_s` without them, or to stop."""
+    deadline = time.monotonic() + settings.wait_s
+    missing = settings.wait_for
+    while missing and not stopping():
+        missing = settings.wait_for - alive()
+        if missing and time.monotonic() > deadline:
+            log.warning("starting without %s: not active after %g s", ", ".join(sorted(missing)),
+                        settings.wait_s)  # fmt: skip
+            return
+        if missing:
+            say(sorted(missing))
+            time.sleep(0.1)
 
 
 class Playback:

@@ -12,6 +12,7 @@ from common.codec import decode, encode, schema_of
 from common.errors import UserError
 from common.messages import Message
 from common.streams import ENCODING
+from common.takeover import CONTROL
 
 _APPEAR_S = 2.0  # right after a (re)connection a queryable is not known yet, and nobody answers
 
@@ -24,7 +25,30 @@ def ask(
     Raises:
         UserError: nobody answers to this query, the node refused it, or it took too long.
     """
-    selector = zenoh.Selector(key(robot, "query", node, name), zenoh.Parameters(parameters))
+    yield from _ask(session, key(robot, "query", node, name), (node, name), parameters, timeout_s)
+
+
+def command(
+    session: zenoh.Session, robot: str, instance: str, verb: str, parameters: dict[str, str], timeout_s: float
+) -> str:
+    """What one process answers to its supervisor (common/takeover.py).
+
+    Raises:
+        UserError: it does not answer, or refuses.
+    """
+    place = key(robot, CONTROL, instance, verb)
+    return next(_ask(session, place, (instance, verb), parameters, timeout_s)).text
+
+
+def _ask(
+    session: zenoh.Session,
+    place: str,
+    what: tuple[str, str],  # who is asked for what
+    parameters: dict[str, str],
+    timeout_s: float,
+) -> Iterator[Message]:
+    who, name = what
+    selector = zenoh.Selector(place, zenoh.Parameters(parameters))
     deadline = time.monotonic() + min(timeout_s, _APPEAR_S)
     while True:
         answered = False
@@ -35,14 +59,14 @@ def ask(
             consolidation=zenoh.ConsolidationMode.NONE,
         ):
             if reply.ok is None:
-                raise UserError(f"{node} refused {name}: {reply.err.payload.to_string()}")
+                raise UserError(f"{who} refused {name}: {reply.err.payload.to_string()}")
             answered = True
             yield decode(str(reply.ok.encoding).partition(";")[2], reply.ok.payload.to_bytes())
         if answered:
             return
         if time.monotonic() > deadline:
             raise UserError(
-                f"nobody answers {name} of node {node!r}: is it running? (`beamsplat top` shows it)"
+                f"nobody answers {name} of node {who!r}: is it running? (`beamsplat top` shows it)"
             )
         time.sleep(0.1)
 

@@ -37,8 +37,10 @@ class Vitals:
             time.sleep(1.0)
 
     def send(self) -> None:
-        """One report now."""
+        """One report now; none before a takeover, or after one."""
         live = self._live
+        if live.takeover.standby or live.takeover.retired:  # another one is the node
+            return
         with live.changed:
             inputs = live.mailbox.health()
         steps = np.array(live.steps_ms or [0.0])

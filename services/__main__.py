@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from common.errors import UserError
-from services import demo, doctor, keys_cli, system_cli, warm
+from services import demo, doctor, keys_cli, swap_cli, system_cli, warm
 from services.bench import cli as bench_cli
 from services.depth import models_cli
 from services.evaluation import calibrate_cli
@@ -37,6 +37,8 @@ for command in (
     system_cli.top, system_cli.topics, system_cli.graph,
 ):  # fmt: skip
     app.command(rich_help_panel=_SYSTEM)(command)
+app.command(rich_help_panel=_SYSTEM)(swap_cli.swap)
+app.add_typer(swap_cli.app, name="params", rich_help_panel=_SYSTEM)
 for command in (simulator_cli.simulate, replay_cli.info, replay_cli.rig):
     app.command(rich_help_panel=_DATA)(command)
 app.add_typer(calibrate_cli.app, name="calibrate", rich_help_panel=_DATA)

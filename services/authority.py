@@ -59,9 +59,7 @@ class Authority:
         """
         folder = make_folder(folder.expanduser())
         if (folder / CA_KEY).exists():
-            raise UserError(
-                f"{folder} holds an authority already, which is never replaced: choose another"
-            )
+            raise UserError(f"{folder} holds an authority already, which is never replaced: choose another")
         folder.chmod(0o700)
         _new_key(folder / CA_KEY)
         openssl("req", "-x509", "-new", "-key", str(folder / CA_KEY), "-sha256", "-days", str(days),
@@ -78,9 +76,7 @@ class Authority:
             UserError: an edge without addresses, or OpenSSL refuses.
         """
         if host.role == "edge" and not addresses:
-            raise UserError(
-                f"{name}: robots check the address they connect to; name one with --address"
-            )
+            raise UserError(f"{name}: robots check the address they connect to; name one with --address")
         out = make_folder(self.folder / "hosts" / name)
         out.chmod(0o700)
         with tempfile.TemporaryDirectory(dir=self.folder) as scratch:

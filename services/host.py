@@ -39,6 +39,8 @@ def serve(
     resume: bool = False,
     exit_when_drained: bool = False,
     around: Surroundings | None = None,
+    instance: str = "",
+    standby: bool = False,
     table: dict[str, Service] = NODES,
 ) -> None:
     """Runs one node until its inputs end or SIGINT or SIGTERM comes.
@@ -62,6 +64,8 @@ def serve(
         unfed=around.unfed,
         resume=resume,
         exit_when_drained=exit_when_drained,
+        instance=instance,
+        standby=standby,
     )
     live = Live(node, settings)
     live.install_signal_handlers()
@@ -104,6 +108,8 @@ def child(
     resume: bool,
     around: Surroundings | None,
     table: dict[str, Service],
+    instance: str = "",
+    standby: bool = False,
 ) -> None:
     """Entry of a supervised process: its output goes to a log file, its end shows in the exit code."""
     # Ctrl-C in a terminal reaches the whole group; the supervisor decides who stops when.
@@ -117,7 +123,15 @@ def child(
         if name == "router":
             route(deployment)
         else:
-            serve(deployment, name, resume=resume, around=around, table=table)
+            serve(
+                deployment,
+                name,
+                resume=resume,
+                around=around,
+                instance=instance,
+                standby=standby,
+                table=table,
+            )
     except UserError as error:
         log.error("%s", error)
         sys.exit(2)

@@ -6,6 +6,7 @@ import contextlib
 import logging
 import multiprocessing
 import os
+import secrets
 import signal
 import time
 from collections.abc import Callable
@@ -14,11 +15,11 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 
 from common.bus import open_session
-from common.config import Deployment
+from common.config import Deployment, with_overrides
 from common.errors import UserError
 from common.persist import make_folder
 from common.registry import Service
-from services.deployment import Surroundings, node_classes, surroundings
+from services.deployment import Surroundings, build_node, node_classes, surroundings
 from services.host import ONE_THREAD, STOP_S, child
 from services.nodes import NODES
 
@@ -37,11 +38,22 @@ class Child:
     name: str
     process: BaseProcess
     started: float
+    instance: str = ""
     restarts: int = 0
     attempts: int = 0  # within the current back-off
     due: float | None = None  # dead, to be started again then
     gave_up: bool = False  # ended with a user error: restarting would not help
     kill_at: float | None = None  # told to end, to be started again; killed if it has not ended by then
+
+
+@dataclass
+class Successor:
+    """What is to take a node's place. Without a process the node ends first."""
+
+    name: str
+    deployment: Deployment
+    process: BaseProcess | None = None
+    instance: str = ""
 
 
 class Supervisor:
@@ -59,7 +71,8 @@ class Supervisor:
         self.log_dir = deployment.run_dir / "logs"
         self.children: dict[str, Child] = {}
         self._around: dict[str, Surroundings] = {}
-        self._table = table
+        self._retired: list[BaseProcess] = []  # ends by itself
+        self.table = table
         self._names = names if names is not None else (ROUTER, *deployment.nodes)
         self._on_event = on_event or (lambda text: log.info("%s", text))
         os.environ.update({k: os.environ.get(k, v) for k, v in ONE_THREAD.items()})
@@ -88,7 +101,7 @@ class Supervisor:
                 )
             self._start(ROUTER)
             self._wait_for_router()
-        classes = node_classes(self.deployment, self._table)
+        classes = node_classes(self.deployment, self.table)
         nodes = [name for name in self._names if name != ROUTER]
         self._around = {name: surroundings(classes, name, self.deployment.role) for name in nodes}
         for name in sorted(nodes, key=lambda n: classes[n].is_source()):
@@ -107,7 +120,7 @@ class Supervisor:
             if self._router_answers():
                 return
             if not router.process.is_alive():
-                raise UserError(f"the router did not start: {_last_line(self.log_file(ROUTER))}")
+                raise UserError(f"the router did not start: {last_line(self.log_file(ROUTER))}")
         raise UserError(f"no router at {', '.join(self.deployment.router.listen)} after 20 s")
 
     def log_file(self, name: str) -> Path:
@@ -115,18 +128,64 @@ class Supervisor:
         return self.log_dir / f"{name}.log"
 
     def _start(self, name: str, resume: bool = False) -> None:
+        self._seat(name, *self._spawn(self.deployment, name, resume))
+
+    def _spawn(
+        self, deployment: Deployment, name: str, resume: bool = False, standby: bool = False
+    ) -> tuple[BaseProcess, str]:
+        """A process and the instance it goes by."""
+        instance = secrets.token_hex(8)
+        around = self._around.get(name)
         process = self._context.Process(
             target=child,
-            args=(self.deployment, name, self.log_file(name), resume, self._around.get(name), self._table),
+            args=(deployment, name, self.log_file(name), resume, around, self.table, instance, standby),
             name=name,
             daemon=False,
         )
         process.start()
+        return process, instance
+
+    def _seat(self, name: str, process: BaseProcess, instance: str) -> None:
         known = self.children.get(name)
         if known is None:
-            self.children[name] = Child(name, process, time.monotonic())
+            self.children[name] = Child(name, process, time.monotonic(), instance)
         else:
-            known.process, known.started, known.due, known.kill_at = process, time.monotonic(), None, None
+            known.process, known.started, known.instance = process, time.monotonic(), instance
+            known.due, known.kill_at = None, None
+
+    def successor(self, name: str, overrides: tuple[str, ...], warm: bool) -> Successor:
+        """A second process of a node, with other options, in standby: see `services.swap`.
+
+        Another kind starts from that kind's defaults.
+
+        Raises:
+            UserError: no such node here, options that do not fit, or a node that cannot run twice.
+        """
+        before = self.deployment
+        if any(o.partition("=")[0].strip() == "kind" for o in overrides):  # whose options are others
+            before = before.model_copy(update={"nodes": {**before.nodes, name: {}}})
+        deployment = with_overrides(before, tuple(f"{name}.{o}" for o in overrides))
+        node = build_node(deployment, name, self.table)
+        if warm and not node.replaceable:
+            raise UserError(
+                f"{name} cannot be taken over while it runs, what it knows lives in its process: --cold ends "
+                "it first, and starts it anew with the new options"
+            )
+        if not warm:
+            return Successor(name, deployment)
+        return Successor(name, deployment, *self._spawn(deployment, name, standby=True))
+
+    def replace(self, successor: Successor) -> None:
+        """The successor, which has been activated, is the node now; also when it must be started again."""
+        self.deployment = successor.deployment
+        self._retired.append(self.children[successor.name].process)
+        self._seat(successor.name, successor.process, successor.instance)
+        self._on_event(f"{successor.name} was taken over by its successor")
+
+    def restart_with(self, successor: Successor) -> None:
+        """The node ends and starts with the successor's options."""
+        self.deployment = successor.deployment
+        self.restart(successor.name)
 
     def restart(self, name: str) -> None:
         """Tells a process to end; the next polls see to it that it does, and start it again at once."""
@@ -156,7 +215,7 @@ class Supervisor:
         code = entry.process.exitcode or 0
         if code == 2:
             entry.gave_up = True
-            self._on_event(f"{entry.name} cannot run: {_last_line(self.log_file(entry.name))}")
+            self._on_event(f"{entry.name} cannot run: {last_line(self.log_file(entry.name))}")
             return
         if now - entry.started > HEALTHY_S:
             entry.attempts = 0
@@ -166,13 +225,16 @@ class Supervisor:
         # A drained node stays until it is told to go, so exit code 0 means that somebody else told it.
         how = f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
         self._on_event(
-            f"{entry.name} died ({how}: {_last_line(self.log_file(entry.name))}); starts again in {delay:g} s"
+            f"{entry.name} died ({how}: {last_line(self.log_file(entry.name))}); starts again in {delay:g} s"
         )
 
     def stop(self) -> None:
         """SIGTERM to the nodes, sources first; then the router; SIGKILL to who does not listen."""
         nodes = [c for c in self.children.values() if c.name != ROUTER]
         _end(list(reversed(nodes)))
+        for process in self._retired:
+            process.join(STOP_S)
+            process.kill()
         _end([c for c in self.children.values() if c.name == ROUTER])
 
 
@@ -189,7 +251,8 @@ def _end(children: list[Child]) -> None:
             entry.process.join()
 
 
-def _last_line(path: Path) -> str:
+def last_line(path: Path) -> str:
+    """The end of a log, without time and origin."""
     try:
         lines = path.read_text(errors="replace").strip().splitlines()
     except OSError:

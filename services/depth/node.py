@@ -36,6 +36,7 @@ class DepthNode(Node):
 
     name = "depth"
     Config = DepthConfig
+    replaceable = True
     inputs = (Input("rig", "every"), "camera/image", "lidar/scan", "localization/odometry")
     outputs = ("depth/estimate",)
 

@@ -14,39 +14,19 @@ from common.config import Deployment, RouterConfig
 from common.errors import UserError
 from common.lockstep import Lockstep
 from common.security import SecurityConfig
-from common.streams import declare_reader, open_sample
-from common.topics import TOPICS, topic
+from common.topics import TOPICS
 from services.authority import Authority
 from services.board import HealthBoard
 from services.deployment import faults, surroundings
 from services.nodes import NODES
 from services.supervisor import Supervisor
 from services.uplink.node import UplinkConfig, UplinkNode
+from tests.common.ears import Ears
 from tests.conftest import free_port
 from tests.services.mapping.room_drive import TABLE
 from tests.services.uplink.link import Link
 
 TABLE = {**TABLE, "uplink": NODES["uplink"]}
-
-
-class Ears:
-    """What a session hears of a topic, in order."""
-
-    def __init__(self, session, name):
-        row = topic(name)
-        self.messages, self.schemas = [], set()
-
-        def take(sample):
-            self.schemas.add(str(sample.encoding))
-            self.messages.append(open_sample(sample, row).message)
-
-        self._kept = declare_reader(session, f"beamsplat/r1/{name}", row, "every", take)
-
-    def ids(self):
-        return [m.id for m in self.messages]
-
-    def stamps(self):
-        return [m.stamp_ns for m in self.messages]
 
 
 class Pair:

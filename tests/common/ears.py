@@ -1,0 +1,24 @@
+"""What a session of a test hears of a topic."""
+
+from common.streams import declare_reader, open_sample
+from common.topics import topic
+
+
+class Ears:
+    """What a session hears of a topic, in order."""
+
+    def __init__(self, session, name):
+        row = topic(name)
+        self.messages, self.schemas = [], set()
+
+        def take(sample):
+            self.schemas.add(str(sample.encoding))
+            self.messages.append(open_sample(sample, row).message)
+
+        self._kept = declare_reader(session, f"beamsplat/r1/{name}", row, "every", take)
+
+    def ids(self):
+        return [m.id for m in self.messages]
+
+    def stamps(self):
+        return [m.stamp_ns for m in self.messages]
