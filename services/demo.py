@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
-from rich.table import Table
 
 from common.config import load_deployment
 from common.errors import UserError
@@ -143,7 +142,6 @@ def write_results(out: Path, source: Path, seen: Seen, costs: Costs) -> dict[str
 
 
 def _say_where(out: Path, source: Path, figures: dict[str, Any]) -> None:
-    table = Table(show_header=False, pad_edge=False, box=None)
     rows = [
         (source, "the drive: camera, lidar, wheels"),
         (out / "report.html", "what came of it: open it in a browser"),
@@ -154,11 +152,9 @@ def _say_where(out: Path, source: Path, figures: dict[str, Any]) -> None:
         (out / "demo.rrd", "what the monitor saw: rerun FILE"),
         (out / "recording", "what went over the bus: Foxglove, `ros2 bag`, beamsplat info"),
     ]
-    for path, what in rows:
-        if path.exists():  # data without a camera give no map
-            table.add_row(str(path), what)
-    screen = Console()
-    screen.print(table)
+    there = [(str(path), what) for path, what in rows if path.exists()]  # no camera, no map
+    wide = max(len(path) for path, _ in there)
+    print("\n".join(f"{path:{wide}}  {what}" for path, what in there))
     for path in (out / "recording", out / "demo.rrd"):
         if not path.exists():
             raise UserError(f"{path} was not written: the node's log in the state folder says why")
@@ -167,4 +163,4 @@ def _say_where(out: Path, source: Path, figures: dict[str, Any]) -> None:
         for name, text, digits, unit in SHOWN
         if figures.get(name) is not None
     ]
-    screen.print(", ".join(said), highlight=False)
+    print(", ".join(said))

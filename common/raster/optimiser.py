@@ -75,7 +75,7 @@ class GaussianArrays:
         """One step of Adam on what was seen; `isotropy` and `ratio_log` as in `adam`."""
         team.run(
             adam, gradients.by_splat, gradients.index, self.params, self.first, self.second, self.steps,
-            rates, np.float32(isotropy), np.float32(ratio_log),
+            rates,  np.float32(isotropy), np.float32(ratio_log),
         )  # fmt: skip
 
 

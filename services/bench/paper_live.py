@@ -219,22 +219,26 @@ def run_live(
 
 
 class _Meter:
-    """CPU seconds and memory of the supervisor's children."""
+    """CPU seconds and memory (proportional set size) of the supervisor's children."""
 
     def __init__(self, supervisor: Supervisor) -> None:
         self._supervisor = supervisor
         self._last: dict[tuple[str, int], float] = {}
         self._marked: dict[tuple[str, int], float] = {}
         self.peak_rss_mb = 0.0
+        self._weighed = 0.0
 
     def read(self) -> None:
         """Looks at all children; a process that has gone keeps what it was last seen with."""
-        memory = 0.0
+        memory, now = 0.0, time.monotonic()
+        weigh = now - self._weighed > 1.0  # reading it costs milliseconds a process
+        self._weighed = now if weigh else self._weighed
         for child in self._supervisor.children.values():
             try:
                 process = psutil.Process(child.process.pid)
                 times = process.cpu_times()
-                memory += process.memory_info().rss / 1e6
+                if weigh:  # shared pages count once: the processes come from one fork server
+                    memory += process.memory_full_info().pss / 1e6
             except psutil.Error:
                 continue
             self._last[child.name, child.process.pid] = times.user + times.system

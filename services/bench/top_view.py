@@ -13,6 +13,7 @@ from common.raster.rasterizer import Rasterizer
 _HEIGHT_M = 60.0  # of the eye: so far away that walls do not lean
 _EDGE_M = 0.4
 _MOST_PX = 2000
+_FAINT = -2.0  # logit of the opacity
 _WHITE = np.ones(3, np.float32)
 
 
@@ -24,7 +25,7 @@ def top_view(
     metres_per_px: float = 0.015,
 ) -> np.ndarray | None:
     """uint8 [H, W, 3] BGR, x to the right and y up; None where there is nothing to see."""
-    solid = (params[MEAN + 2] < ceiling_m) & (params[MEAN + 2] > -0.5) & (params[OPACITY] > 0.0)
+    solid = (params[MEAN + 2] < ceiling_m) & (params[MEAN + 2] > -0.5) & (params[OPACITY] > _FAINT)
     if not solid.any():
         return None
     store = GaussianArrays(int(solid.sum()))

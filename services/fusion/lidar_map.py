@@ -49,6 +49,13 @@ class LidarMap:
             grown[dy : dy + rows, dx : dx + columns] = self._cells
         self._cells, self._origin = grown, low
 
+    def points(self, min_hits: int = 3) -> np.ndarray:
+        """float64 [N, 2]: mean return of every cell that was hit so often."""
+        row, column = np.nonzero(self._cells[..., 0] >= min_hits)
+        n = self._cells[row, column, 0].astype(np.float64)
+        inner = self._cells[row, column, 1:].astype(np.float64) / n[:, None]
+        return (np.stack([column, row], axis=1) + self._origin + 0.5) * self.cell_m + inner
+
     def layers(
         self,
         position_map_m: np.ndarray,  # float64 [2]

@@ -10,8 +10,10 @@ from common.beams import Beams, hidden_beams, plan_polar, plane_depth, wall_rang
 from common.camera import Pinhole
 from common.geometry import yaw_of
 from services.fusion.lidar_map import LidarMap
+from services.fusion.wall_lines import find_lines, ranges_to
 
 _LAYER_RAYS_PER_PX, _WALL_RAYS_PER_PX = 2, 8
+_CONTINUED = 3  # continued walls a ray may meet
 _POST_HEIGHT_M = 0.35  # how far from the lidar plane legs and posts are taken to reach
 
 
@@ -70,6 +72,16 @@ class SurfaceFinder:
         """Optical z [h, w] of beams extruded upright: on a fan of rays finer than pixels."""
         return wall_ranges(self._wall_fan, azimuth, reach)[self._wall_index] / self._across
 
+    def _behind(self, ranges: np.ndarray, wall: np.ndarray) -> list[np.ndarray]:
+        """Optical z [h, w] of ranges [L, fan] where they lie behind the wall and before the floor."""
+        layers = []
+        for layer in ranges[:, self._fan_index] / self._across:
+            with np.errstate(invalid="ignore"):
+                farther = (layer > 1.08 * wall) & ~(self.floor < layer)
+            if farther.any():
+                layers.append(np.where(farther, layer, np.nan))
+        return layers
+
     def find(
         self,
         beams: Beams,
@@ -89,10 +101,12 @@ class SurfaceFinder:
         if lidar_map is not None:
             position = (T_map_body @ self._T_body_camera)[:2, 3]
             ranges = lidar_map.layers(position, self._fan + float(yaw_of(T_map_body)))
-            for layer in ranges[:, self._fan_index] / self._across:
-                with np.errstate(invalid="ignore"):
-                    farther = (layer > 1.08 * wall) & ~(self.floor < layer)
-                behind.append(np.where(farther, layer, np.nan))
+            behind += self._behind(ranges, wall)
+            lines = find_lines(lidar_map.points(), lidar_map.cell_m)
+            front = wall_ranges(self._fan, azimuth, reach)
+            beyond = np.maximum(np.nan_to_num(front, nan=np.inf) * 1.08, front + 0.15)
+            met = ranges_to(lines, position, self._fan + float(yaw_of(T_map_body)), beyond, _CONTINUED)
+            behind += self._behind(met, wall)
         ceilings = []
         for height in ceiling_heights_m:
             plane = plane_depth(self.rays_body, self.camera_z_m, height)
@@ -147,12 +161,13 @@ class CeilingFinder:
 
     def heights(self, least: float, most: int = 2) -> tuple[float, ...]:
         """Heights of up to `most` peaks of the evidence above `least`, strongest first, 0.25 m apart."""
-        left = self._evidence.copy()
-        found: list[float] = []
-        while len(found) < most:
-            k = int(np.argmax(left))
-            if left[k] <= least:
-                break
-            found.append(float(self.heights_m[k]))
-            left[max(k - self._apart, 0) : k + self._apart + 1] = 0.0
-        return tuple(found)
+        e = self._evidence
+        peaks = [k for k in range(1, len(e) - 1) if e[k] > least and e[k] > e[k - 1] and e[k] >= e[k + 1]]
+        found: list[int] = []
+        for k in sorted(peaks, key=lambda k: -e[k]):
+            if len(found) < most and all(abs(k - other) > self._apart for other in found):
+                found.append(k)
+        step_m = self.heights_m[1] - self.heights_m[0]
+        bend = [e[k - 1] - 2.0 * e[k] + e[k + 1] for k in found]
+        tops = [0.5 * (e[k - 1] - e[k + 1]) / b if b < 0.0 else 0.0 for k, b in zip(found, bend)]
+        return tuple(float(self.heights_m[k] + step_m * top) for k, top in zip(found, tops))

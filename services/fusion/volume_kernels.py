@@ -248,11 +248,14 @@ def plane_gain(
                 z = (heights_m[k] - camera_z_m) / rise[v, u]
                 if not (0.0 < z < wall[v, u] * 0.93):
                     continue
-                i = int(np.rint((np.log(z) - log_z0) / log_step))
+                place = (np.log(z) - log_z0) / log_step
+                i = int(np.floor(place))
                 j = int(np.rint((np.log(wall[v, u]) - log_z0) / log_step))
-                if i < 1 or i >= D - 1 or j < 1 or j >= D - 1:
+                if i < 0 or i >= D - 1 or j < 1 or j >= D - 1:
                     continue
-                on_plane = min(volume[v, u, i], volume[v, u, i - 1], volume[v, u, i + 1])
+                # The wall gets the best of three labels, the plane exactly its own: else a plane a little
+                # too low gains as much as the right one.
+                on_plane = volume[v, u, i] + (place - i) * (volume[v, u, i + 1] - volume[v, u, i])
                 on_wall = min(volume[v, u, j], volume[v, u, j - 1], volume[v, u, j + 1])
                 total += on_wall - on_plane
         gain[k] = total

@@ -44,6 +44,6 @@ def new_gaussians(
     rgb = level.rgb[:, v, u] * np.float32(1 / 255)
     discs = make_discs(
         u, v, spacing, z_m, rgb, level.camera, T_map_camera,
-        size=s.size, flatness=s.flatness, opacity=s.opacity, least_slant=0.35,
+        size=s.size, flatness=s.flatness, opacity=s.opacity, least_slant=s.least_slant,
     )  # fmt: skip
     return u, v, discs

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 class LearningRates:
     """Adam's step per parameter, in the parameter's own unit."""
 
-    mean_m: float = 4e-4
+    mean_m: float = 2e-3
     log_scale: float = 6e-3
     quat: float = 2e-3
     opacity_logit: float = 3e-2
@@ -38,6 +38,7 @@ class MapperSettings:
     opacity: float = 0.6
     size: float = 0.65  # standard deviation over spacing
     flatness: float = 0.2
+    least_slant: float = 0.12  # cosine to the normal that bounds how long a disc gets down a slope
     max_gaussians: int = 300_000
     max_keyframes: int = 800  # 2.2 MB each at 640x480; beyond it old ones are forgotten, drawn by chance
     # Losses
@@ -46,7 +47,7 @@ class MapperSettings:
     depth_weight: float = 0.1
     lidar_weight: float = 1e-3
     isotropy_weight: float = 0.05
-    isotropy_ratio: float = 4.0
+    isotropy_ratio: float = 12.0
     sigma_unit: float = 0.03  # a depth whose sigma is this share of it has weight 1/2
     # Upkeep
     prune_opacity: float = 0.03

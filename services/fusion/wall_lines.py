@@ -1,0 +1,98 @@
+"""Long straight walls of the lidar's map, continued behind what stands before them.
+
+Cupboards, sofas and worktops hide the foot of a wall from a lidar near the floor for good; the camera sees
+the wall above them. Walls are straight: the same line comes out again elsewhere.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+jit = njit(nogil=True, cache=True, error_model="numpy")
+
+_ANGLES = 180
+_NEAR_M = 0.06  # of a line: its points
+_REACH_M = 5.0  # a line is continued so far beyond its points
+_PIECE_M, _GAP_M = 0.7, 0.15  # of a wall in one piece
+_GRAZING = 0.12  # sine of the least angle at which a ray meets a line
+
+
+@dataclass(frozen=True)
+class WallLine:
+    """normal . p = offset, with points between two places along (-normal_y, normal_x)."""
+
+    normal: np.ndarray  # float64 [2], unit
+    offset_m: float
+    low_m: float
+    high_m: float
+
+
+def find_lines(points_m: np.ndarray, cell_m: float, least_m: float = 1.2, most: int = 24) -> list[WallLine]:
+    """Lines through points float64 [N, 2], one a cell of the map: those with most points first (Hough).
+
+    Args:
+        points_m: where surfaces stand in the floor plane.
+        cell_m: spacing of the points along a wall.
+        least_m: of wall seen, all pieces together.
+        most: lines.
+    """
+    left = points_m
+    lines: list[WallLine] = []
+    least = max(least_m / cell_m, 8.0)
+    while len(lines) < most and len(left) >= least:
+        reach_m = float(np.abs(left).sum(axis=1).max()) + 1.0
+        votes = np.zeros((_ANGLES, int(2 * reach_m / cell_m) + 2), np.int32)
+        vote(left, cell_m, reach_m, votes)
+        angle, row = np.unravel_index(int(np.argmax(votes)), votes.shape)
+        theta = angle * np.pi / _ANGLES
+        normal, offset = np.array([np.cos(theta), np.sin(theta)]), (row + 0.5) * cell_m - reach_m
+        for _ in range(2):
+            near = np.abs(left @ normal - offset) < _NEAR_M
+            if np.count_nonzero(near) < least:
+                break
+            centre = left[near].mean(axis=0)
+            normal = np.linalg.svd(left[near] - centre, full_matrices=False)[2][1]
+            offset = float(normal @ centre)
+        near = np.abs(left @ normal - offset) < _NEAR_M
+        if np.count_nonzero(near) < least:
+            break
+        along = np.sort(left[near] @ np.array([-normal[1], normal[0]]))
+        pieces = np.split(along, np.flatnonzero(np.diff(along) > _GAP_M) + 1)
+        # Clutter is in line with clutter now and then, but not without gaps.
+        if max(piece[-1] - piece[0] for piece in pieces) >= _PIECE_M:
+            lines.append(WallLine(normal, offset, float(along[0]), float(along[-1])))
+        left = left[~near]
+    return lines
+
+
+@jit
+def vote(points: np.ndarray, cell_m: float, reach_m: float, votes: np.ndarray) -> None:
+    """votes[a, b] += 1 for every line at angle a and distance b from the origin through a point [N, 2]."""
+    for a in range(votes.shape[0]):
+        c, s = np.cos(a * np.pi / votes.shape[0]), np.sin(a * np.pi / votes.shape[0])
+        for i in range(points.shape[0]):
+            votes[a, int((points[i, 0] * c + points[i, 1] * s + reach_m) / cell_m)] += 1
+
+
+def ranges_to(
+    lines: list[WallLine],
+    start_m: np.ndarray,  # float64 [2]
+    azimuth_rad: np.ndarray,  # float64 [M]
+    beyond_m: np.ndarray,  # float64 [M]: nearer meetings do not count
+    count: int,
+) -> np.ndarray:
+    """Ranges float64 [count, M] at which rays meet the continued lines, nearest first, NaN = no more."""
+    directions = np.stack([np.cos(azimuth_rad), np.sin(azimuth_rad)])
+    rows = [np.full((count, len(azimuth_rad)), np.nan)]
+    for line in lines:
+        towards = line.normal @ directions
+        with np.errstate(divide="ignore", invalid="ignore"):
+            r = (line.offset_m - line.normal @ start_m) / towards
+            along = np.array([-line.normal[1], line.normal[0]]) @ (start_m[:, None] + r * directions)
+            good = (np.abs(towards) > _GRAZING) & (r > beyond_m)
+        good &= (along > line.low_m - _REACH_M) & (along < line.high_m + _REACH_M)
+        rows.append(np.where(good, r, np.nan)[None])
+    return np.sort(np.concatenate(rows), axis=0)[:count]  # NaN sorts last
