@@ -78,6 +78,9 @@ def paper(
     ] = None,
     groundtruth: Annotated[Path | None, typer.Option(help="TUM file of the true body poses")] = None,
     seconds: Annotated[float | None, typer.Option(help="Only so much of the recording")] = None,
+    refine_steps: Annotated[
+        int, typer.Option(min=0, help="Steps on the default configuration's map after the drive, 0.1 s each")
+    ] = 500,
     as_json: JsonOption = False,
 ) -> None:
     """The paper's six configurations and the default one, live at the recording's speed: its Tables I-IV.
@@ -94,6 +97,7 @@ def paper(
 
     report = bench_paper(
         data, out, names=only, seeds=seeds, recorded=recorded, groundtruth=groundtruth, seconds=seconds,
+        refine_steps=refine_steps,
         say=lambda text: console.print(text, markup=False, highlight=False, soft_wrap=True),
     )  # fmt: skip
     if as_json:

@@ -26,6 +26,7 @@ from services.evaluation.drive import open_drive
 from services.evaluation.evaluate import read_truth
 
 DEPLOY = Path(__file__).resolve().parents[2] / "deploy"
+DEFAULT = "default"
 STAND_IN = "fastdepth_nyu_fp32"
 
 
@@ -64,7 +65,7 @@ CONFIGURATIONS = (
                   _paper(0.0701, 0.4514, 1.593, 1343), "monogs-camera"),
     Configuration("monogs-camera", "MonoGS, no lidar", "paper/monogs-camera.toml", None,
                   _paper(2.4102, 0.4231, 1.418, 1549)),
-    Configuration("default", "default: lidar + fused depth", "demo.toml"),
+    Configuration(DEFAULT, "default: lidar + fused depth", "demo.toml"),
 )  # fmt: skip
 
 
@@ -106,6 +107,11 @@ def prepared(
     return deployment.model_copy(update={"nodes": nodes}), depth, advice
 
 
+def _with(deployment: Deployment, node: str, **options: Any) -> Deployment:
+    nodes = {**deployment.nodes, node: {**deployment.nodes[node], **options}}
+    return deployment.model_copy(update={"nodes": nodes})
+
+
 def _installed(model: str) -> bool:
     try:
         find_model(model)
@@ -139,7 +145,8 @@ def open_truth(data: Path, groundtruth: Path | None = None) -> Truth:
 
 def bench_paper(
     data: Path, out: Path, *, names: list[str] | None = None, seeds: int = 1, recorded: Path | None = None,
-    groundtruth: Path | None = None, seconds: float | None = None, say: Callable[[str], None] = print,
+    groundtruth: Path | None = None, seconds: float | None = None, refine_steps: int = 0,
+    say: Callable[[str], None] = print,
 ) -> dict[str, Any]:  # fmt: skip
     """Runs everything, writes report.json and report.html into `out`, gives the report.
 
@@ -153,7 +160,7 @@ def bench_paper(
     rows: list[dict[str, Any]] = []
     for configuration in configurations:
         for seed in range(seeds):
-            rows.append(_one_run(configuration, bag, out, truth, recorded, seed, seconds, say))
+            rows.append(_one_run(configuration, bag, out, truth, recorded, seed, seconds, refine_steps, say))
             report = _report(rows, data, truth)
             write_atomically(out / "report.json", json.dumps(_figures_only(report), indent=1).encode())
             write_report(out / "report.html", report, truth)
@@ -162,7 +169,7 @@ def bench_paper(
 
 def _one_run(
     configuration: Configuration, bag: Path, out: Path, truth: Truth, recorded: Path | None, seed: int,
-    seconds: float | None, say: Callable[[str], None],
+    seconds: float | None, refine_steps: int, say: Callable[[str], None],
 ) -> dict[str, Any]:  # fmt: skip
     row: dict[str, Any] = {
         "name": configuration.name, "title": configuration.title, "seed": seed, "paper": configuration.paper,
@@ -176,13 +183,16 @@ def _one_run(
         say(f"{configuration.name}: {advice}")
         return row | {"status": advice}
     if seconds is not None:
-        nodes = {**deployment.nodes, "replay": {**deployment.nodes["replay"], "duration_s": seconds}}
-        deployment = deployment.model_copy(update={"nodes": nodes})
+        deployment = _with(deployment, "replay", duration_s=seconds)
+    if configuration.name == DEFAULT:
+        deployment = _with(deployment, "mapping", final_steps=refine_steps)
     say(f"{configuration.name}: running ({depth})")
     duration_s = seconds or (truth.drive.images[-1].stamp_ns - truth.drive.images[0].stamp_ns) * 1e-9
     began = time.monotonic()
     try:
-        seen, costs = run_live(deployment, frozenset(truth.depth_files), 4.0 * duration_s + 120.0, say)
+        seen, costs = run_live(
+            deployment, frozenset(truth.depth_files), 4.0 * duration_s + 120.0 + 0.5 * refine_steps, say
+        )
     except UserError as error:
         say(f"{configuration.name}: {error}")
         return row | {"status": str(error)}
