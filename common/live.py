@@ -272,8 +272,8 @@ class Live:
     def _control(self, verb: str, parameters: dict[str, str]) -> Iterator[Answer]:
         """What the supervisor asks of one instance during a swap, between two steps."""
         text = ""
-        if verb == "ready":
-            text = self.takeover.ready()
+        if verb == "reached":
+            text = self.takeover.reached()
         elif verb == "retire":
             text = self.takeover.retire()
         elif verb == "activate" and self.takeover.standby:

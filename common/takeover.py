@@ -5,7 +5,7 @@ supervisor has the predecessor retire between two messages and tell how far it h
 on from there, with a higher epoch, beginning with what it has kept back and the predecessor has not said. The
 predecessor says nothing any more, and what is still on its way from it, consumers ignore by its epoch.
 
-    control/<instance>/ready      -> how many messages are kept back; answered once the node is configured
+    control/<instance>/reached    -> {topic: newest stamp said or kept back}; answered once configured
     control/<instance>/retire     -> {topic: newest stamp said}; it says nothing more, and ends
     control/<instance>/activate   ?after={topic: stamp}
 """
@@ -29,21 +29,25 @@ class Takeover:
         self.standby = standby
         self.retired = False
         self._held: deque[tuple[str, Message]] = deque(maxlen=_HELD)
-        self._said: dict[str, int] = {}  # newest stamp by topic
+        self._said: dict[str, int] = {}  # newest stamp by topic; at first, the predecessor's
+        self._inherited: dict[str, int] = {}
 
     def keeps(self, topic: str, message: Message) -> bool:
         """Whether a message is kept back for now; else it is noted as said."""
         if self.standby:
             self._held.append((topic, message))
             return True
-        if self.retired:
-            return True
+        if self.retired or message.stamp_ns <= self._inherited.get(topic, -1):
+            return True  # its predecessor has said this, or its successor will
         self._said[topic] = max(self._said.get(topic, 0), message.stamp_ns)
         return False
 
-    def ready(self) -> str:
-        """How many messages are kept back."""
-        return str(len(self._held))
+    def reached(self) -> str:
+        """The newest stamps said or kept back, as JSON."""
+        newest = dict(self._said)
+        for topic, message in self._held:
+            newest[topic] = max(newest.get(topic, 0), message.stamp_ns)
+        return json.dumps(newest)
 
     def retire(self) -> str:
         """Nothing more is said; the newest stamps that were, as JSON."""
@@ -56,9 +60,10 @@ class Takeover:
         Raises:
             ValueError: this is not JSON, or not of numbers.
         """
-        stamps = {str(topic): int(stamp) for topic, stamp in json.loads(after).items()}
+        self._inherited = {str(topic): int(stamp) for topic, stamp in json.loads(after).items()}
+        self._said = dict(self._inherited)
         self.standby = False
         held, self._held = list(self._held), deque()
         for topic, message in held:
-            if message.stamp_ns > stamps.get(topic, -1):
+            if message.stamp_ns > self._inherited.get(topic, -1):
                 yield topic, message

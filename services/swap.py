@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 
 import zenoh
@@ -11,7 +12,8 @@ from common.queries import command
 from services.supervisor import Successor, Supervisor, last_line
 
 READY_S = 120.0  # to load a model, and say something
-_WARM_S = 10.0  # configured, but nothing to say: the node it replaces may have nothing to say either
+_WARM_S = 10.0  # to catch up with its predecessor, which may be the faster
+_BEHIND_NS = 100_000_000
 _STEP_S = 20.0  # of the predecessor, between two messages
 
 
@@ -40,21 +42,25 @@ class Swap:
                 raise UserError(f"{successor.name} goes on as it was: its successor ended: {last_line(log)}")
             if now - self._started > READY_S:
                 raise UserError(f"{successor.name} goes on as it was: no successor after {READY_S:g} s")
-            kept = self._kept()
-            if kept is None:
+            reached = self._reached(successor.instance)
+            if reached is None:
                 return None
             self._configured = self._configured or now
-            if kept == 0 and now - self._configured < _WARM_S:
+            before = self._reached(self._supervisor.children[successor.name].instance)
+            behind = any(
+                stamp - reached.get(topic, 0) > _BEHIND_NS for topic, stamp in (before or {}).items()
+            )
+            if behind and now - self._configured < _WARM_S:
                 return None
             return self._take_over()
         except UserError:
             successor.process.kill()
             raise
 
-    def _kept(self) -> int | None:
-        """How many messages the successor keeps back; None before it answers."""
+    def _reached(self, instance: str) -> dict[str, int] | None:
+        """How far a process is, by topic; None if it does not answer."""
         try:
-            return int(command(self._session, self._robot, self.successor.instance, "ready", {}, 0.5))
+            return json.loads(command(self._session, self._robot, instance, "reached", {}, 0.5))
         except UserError:
             return None
 

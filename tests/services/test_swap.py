@@ -184,7 +184,7 @@ def test_a_successor_goes_on_where_its_predecessor_ended():
     old, new = Takeover(standby=False), Takeover(standby=True)
     said = [s for s in range(5) if not old.keeps("a", grid(s))]
     assert [new.keeps("a", grid(s)) for s in range(2, 8)] == [True] * 6
-    assert new.ready() == "6"
+    assert (old.reached(), new.reached()) == ('{"a": 4}', '{"a": 7}')
     after = old.retire()
     assert old.keeps("a", grid(9))  # what it would still say goes nowhere
     went_on = [m.stamp_ns for _, m in new.activate(after)]
@@ -192,6 +192,16 @@ def test_a_successor_goes_on_where_its_predecessor_ended():
     assert not new.keeps("a", grid(8))
     with pytest.raises(ValueError):
         list(Takeover(standby=True).activate("not JSON"))
+
+
+def test_a_successor_that_lags_does_not_repeat_what_was_said():
+    new = Takeover(standby=True)
+    new.keeps("a", grid(1))
+    assert [m.stamp_ns for _, m in new.activate('{"a": 5}')] == []
+    assert [s for s in range(2, 9) if not new.keeps("a", grid(s))] == [6, 7, 8]
+    assert not new.keeps("b", grid(2))
+    assert Takeover(standby=False).retire() == "{}"
+    assert new.retire() == '{"a": 8, "b": 2}'
 
 
 def test_what_the_predecessor_never_spoke_of_is_said():
