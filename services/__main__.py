@@ -20,6 +20,7 @@ from services.mapping import cli as mapping_cli
 from services.mapping.formats import cli as formats_cli
 from services.mapping.session import cli as session_cli
 from services.replay import cli as replay_cli
+from services.setup import cli as setup_cli
 from services.simulator import cli as simulator_cli
 
 app = typer.Typer(
@@ -53,7 +54,7 @@ evaluate.command("relocalize")(eval_relocalize)
 evaluate.command("depth")(depth_cli.eval_depth)
 app.add_typer(evaluate, name="eval", rich_help_panel=_RESULTS)
 
-for command in (doctor.doctor, warm.warm):
+for command in (setup_cli.setup, doctor.doctor, warm.warm):
     app.command(rich_help_panel=_MACHINE)(command)
 app.add_typer(models_cli.app, name="models", rich_help_panel=_MACHINE)
 app.add_typer(keys_cli.app, name="keys", rich_help_panel=_MACHINE)

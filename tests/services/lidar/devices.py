@@ -38,10 +38,13 @@ class Ld19:
     def answer(self, data):
         return b""
 
+    def range_m(self, angle_rad):
+        return room_range_m(angle_rad)
+
     def packet(self):
         step = self.speed_deg_s / self.point_hz
         angle = (self.points + np.arange(12)) * step % 360.0
-        mm = np.round(room_range_m(-np.radians(angle)) * 1000).astype(np.uint16)
+        mm = np.round(self.range_m(-np.radians(angle)) * 1000).astype(np.uint16)
         self.points += 12
         time_ms = int(self.points / self.point_hz * 1000) % 30000
         body = b"\x54\x2c" + struct.pack("<HH", int(self.speed_deg_s), round(angle[0] * 100) % 36000)

@@ -1,0 +1,1 @@
+"""From what is plugged in to a deployment that runs, step by step in a terminal."""
