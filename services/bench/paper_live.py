@@ -60,6 +60,7 @@ class Witness:
         self.seen = Seen()
         self._keep_at = keep_depth_at
         self._T_map_odom = np.eye(4)
+        self._ended_ns = 0
         self._lock = threading.Lock()
 
     def listen(self, bus: Bus) -> None:
@@ -116,10 +117,12 @@ class Witness:
 
     def _mapping_chunk(self, letter: Letter, m: Any) -> None:
         self.seen.chunks[m.anchor_id] = m
+        if self.seen.online_chunks is not None and letter.header.publish_ns <= self._ended_ns:
+            self.seen.online_chunks[m.anchor_id] = m  # overtaken by the poses that ended the drive
 
     def _mapping_poses(self, letter: Letter, m: Any) -> None:
         if self.seen.online_chunks is None:
-            self.seen.online_chunks = dict(self.seen.chunks)
+            self.seen.online_chunks, self._ended_ns = dict(self.seen.chunks), letter.header.publish_ns
         self.seen.keyframe_poses = m.T_map_body.copy()
 
     def _mapping_preview(self, letter: Letter, m: Any) -> None:

@@ -167,11 +167,10 @@ def _errors(rows: list[Row]) -> list[str]:
                 points = np.column_stack([(stamps - stamps[0]) * 1e-9, values])
                 depth.append(Curve(f"{row['name']} {name[:-2]}", points, tint, dashed))
     with_lidar = [c for c in position if not c.name.endswith("-camera")]
-    return [
-        chart("Position error", "s", "m", position),
-        chart("Position error, with lidar", "s", "m", with_lidar),
-        chart("Depth RMSE at the beams", "s", "m", depth),
-    ]
+    charts = [chart("Position error", "s", "m", position), chart("Depth RMSE at the beams", "s", "m", depth)]
+    if 0 < len(with_lidar) < len(position):  # beside the others they would be flat
+        charts.insert(1, chart("Position error, with lidar", "s", "m", with_lidar))
+    return charts
 
 
 def _depth(rows: list[Row], truth: Truth) -> list[str]:

@@ -26,7 +26,7 @@ class MapperSettings:
     # Work per keyframe; sizes are halved once for `half` iterations.
     half_iterations: int = 18
     full_iterations: int = 5
-    recent: int = 4  # keyframes of the window that are newest; each second draw is one of them
+    recent: int = 8  # keyframes of the window that are newest; each second draw is one of them
     # Insertion
     stride_px: int = 5
     fine_stride_px: int = 3  # where the picture has texture
@@ -44,7 +44,7 @@ class MapperSettings:
     # Losses
     ssim_weight: float = 0.2
     ssim_every: int = 3
-    depth_weight: float = 0.1
+    depth_weight: float = 0.15
     lidar_weight: float = 1e-3
     isotropy_weight: float = 0.05
     isotropy_ratio: float = 12.0

@@ -215,3 +215,37 @@ def test_a_few_seconds_live(shared_dir, tmp_path):
     assert row["position_rmse_m"] < 0.02
     assert (Path(tmp_path) / "report.json").is_file()
     assert (Path(tmp_path) / "report.html").stat().st_size > 20_000
+
+
+def test_the_map_that_the_drive_left_is_told_from_the_refined_one():
+    """Topics have no common order: a chunk said before the drive's end may come after it."""
+    from common.header import Header
+    from common.mailbox import Letter
+    from common.messages import MapChunk, MapPoses
+    from services.bench.paper_live import Witness
+
+    witness = Witness(frozenset())
+
+    def say(topic, message, at_ns):
+        header = Header(
+            stamp_ns=message.stamp_ns, publish_ns=at_ns, clock_id=1, sequence=0, producer="mapping",
+            instance="ab" * 8, epoch=1,
+        )  # fmt: skip
+        witness._take(Letter(topic, header, message, 100))
+
+    def chunk(anchor, revision):
+        return MapChunk(
+            stamp_ns=S, anchor_id=anchor, revision=revision, T_map_anchor=np.eye(4), count=0,
+            packed=np.zeros(0, np.uint8),
+        )  # fmt: skip
+
+    poses = MapPoses(
+        stamp_ns=S, keyframe_ids=np.zeros(1, np.int64), stamps_ns=np.full(1, S), T_map_body=np.eye(4)[None]
+    )
+    say("mapping/chunk", chunk(0, 1), 10)
+    say("mapping/poses", poses, 30)
+    say("mapping/chunk", chunk(0, 2), 20)  # overtaken
+    say("mapping/chunk", chunk(0, 3), 40)  # refined
+    say("mapping/poses", poses, 50)
+    assert witness.seen.online_chunks[0].revision == 2
+    assert witness.seen.chunks[0].revision == 3

@@ -9,7 +9,9 @@ from services.bench.top_view import top_view
 
 def tiles(low, high, z, colour, step=0.05):
     """Gaussians float32 [PARAMS, N] that pave a rectangle (x, y) at a height."""
-    x, y = (a.ravel() for a in np.meshgrid(np.arange(low[0], high[0], step), np.arange(low[1], high[1], step)))
+    x, y = (
+        a.ravel() for a in np.meshgrid(np.arange(low[0], high[0], step), np.arange(low[1], high[1], step))
+    )
     out = np.zeros((PARAMS, len(x)), np.float32)
     out[MEAN : MEAN + 3] = x, y, np.full(len(x), z)
     out[SCALE : SCALE + 3] = np.log([[0.04], [0.04], [0.005]])
