@@ -189,8 +189,8 @@ def make_keyframe(recording: Recording, index: int, guess: tuple[np.ndarray, np.
     )  # fmt: skip
 
 
-def score_map(recording: Recording, mapper: Mapper, say: Say) -> dict[str, float]:
-    """Figures at the views that the mapper has not seen."""
+def score_map(recording: Recording, mapper: Mapper, say: Say) -> dict[str, float | None]:
+    """Figures at the views that the mapper has not seen; None where the recording has no such views."""
     say("scoring")
     camera = raster_camera(recording.camera)
     off, held = [], []
@@ -216,5 +216,5 @@ def score_map(recording: Recording, mapper: Mapper, say: Say) -> dict[str, float
     return figures
 
 
-def _mean(scores: list[ViewScore], name: str) -> float:
-    return float(np.mean([getattr(score, name) for score in scores])) if scores else float("nan")
+def _mean(scores: list[ViewScore], name: str) -> float | None:
+    return float(np.mean([getattr(score, name) for score in scores])) if scores else None

@@ -103,7 +103,8 @@ def bench_map(
 def _print_scores(result: dict[str, Any]) -> None:
     table = Table("figure", "online", "refined")
     for key in result["online"]:
-        table.add_row(key, f"{result['online'][key]:.3f}", f"{result['refined'][key]:.3f}")
+        shown = (result[part][key] for part in ("online", "refined"))
+        table.add_row(key, *("-" if value is None else f"{value:.3f}" for value in shown))
     screen = Console()
     screen.print(table)
     for key in ("keyframes", "refused", "data_s", "wall_s", "cpu_s", "steps", "refine_steps", "peak_rss_mb"):
