@@ -18,11 +18,15 @@ from common.messages import Health
 from common.streams import open_sample
 from common.topics import HEALTH, Topic
 
+ALL = "*"
+
 
 class HealthBoard:
-    """Listens to health/* in a thread of its own until the session is closed."""
+    """Listens to health/* in a thread of its own until the session is closed: of one robot, or with `ALL` of
+    every robot, whose nodes then go by robot/node."""
 
     def __init__(self, session: zenoh.Session, robot: str) -> None:
+        self._all = robot == ALL
         self._book = HealthBook()
         self.records: dict[str, NodeRecord] = self._book.records
         self._lock = threading.Lock()
@@ -42,6 +46,9 @@ class HealthBoard:
                 health = open_sample(sample, self._row).message
             except DecodeError:  # another version's health cannot be shown; its node still runs
                 continue
+            if self._all:
+                whose = str(sample.key_expr).split("/")[1]
+                health = health.model_copy(update={"node": f"{whose}/{health.node}"})
             with self._lock:
                 self._book.take(health)
 

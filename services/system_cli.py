@@ -228,13 +228,15 @@ def record(
     print(f"recorded to {out}")
 
 
-def _watch(file: Path, overrides: list[str] | None, table: str, seconds: float | None) -> None:
+def _watch(
+    file: Path, overrides: list[str] | None, table: str, seconds: float | None, every_robot: bool = False
+) -> None:
     from common.bus import open_session
-    from services.board import HealthBoard
+    from services.board import ALL, HealthBoard
 
     deployment = _load(file, overrides)
     with open_session(deployment.router.listen, wait_s=2.0) as session:
-        board = HealthBoard(session, deployment.robot)
+        board = HealthBoard(session, ALL if every_robot else deployment.robot)
         draw = getattr(board, table)
         deadline = time.monotonic() + (seconds if seconds is not None else 1e12)
         with (
@@ -249,12 +251,23 @@ def _watch(file: Path, overrides: list[str] | None, table: str, seconds: float |
 SecondsOption = Annotated[float | None, typer.Option(help="Stop after this long; default: Ctrl-C")]
 
 
-def top(file: FileArgument, seconds: SecondsOption = None, set_: SetOption = None) -> None:
+def top(
+    file: FileArgument,
+    seconds: SecondsOption = None,
+    set_: SetOption = None,
+    every_robot: Annotated[
+        bool, typer.Option("--all", help="Of every robot that this router hears of")
+    ] = False,
+) -> None:
     """Live table of the nodes: state, rates, step time, age, drops, memory, CPU.
 
-    Example: beamsplat top deploy/robot.toml
+    Examples:
+
+        beamsplat top deploy/robot.toml
+
+        beamsplat top deploy/edge.toml --all
     """
-    _watch(file, set_, "nodes_table", seconds)
+    _watch(file, set_, "nodes_table", seconds, every_robot)
 
 
 def topics(file: FileArgument, seconds: SecondsOption = None, set_: SetOption = None) -> None:

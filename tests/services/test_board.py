@@ -6,7 +6,7 @@ from rich.console import Console
 
 from common.bus import Bus, open_router, open_session
 from common.messages import Health, InputHealth, OutputHealth
-from services.board import HealthBoard
+from services.board import ALL, HealthBoard
 
 
 def _text(table):
@@ -50,3 +50,24 @@ def test_rates_losses_and_silence_are_shown(free_endpoint):
             time.sleep(3.2)
             assert board.states() == {"replay": "silent", "localization": "silent"}
             assert "silent" in _text(board.nodes_table())
+
+
+def test_a_fleet_is_shown_by_robot_and_kept_apart(free_endpoint):
+    with open_router((free_endpoint,)), open_session((free_endpoint,)) as watcher:
+        fleet, one = HealthBoard(watcher, ALL), HealthBoard(watcher, "r2")
+        buses = {
+            name: Bus(open_session((free_endpoint,)), name, "replay", "ab" * 8, 1)
+            for name in ("r1", "r2", "r3")
+        }
+        time.sleep(0.5)
+        for number, bus in enumerate(buses.values()):
+            bus.report(_health("replay", number))
+        deadline = time.monotonic() + 5.0
+        while len(fleet.states()) < 3 and time.monotonic() < deadline:
+            time.sleep(0.05)
+        assert fleet.states() == dict.fromkeys(("r1/replay", "r2/replay", "r3/replay"), "active")
+        assert one.states() == {"replay": "active"}
+        assert [o.sent for o in one.records["replay"].health.outputs] == [1]
+        assert "r3/replay" in _text(fleet.nodes_table())
+        for bus in buses.values():
+            bus.session.close()

@@ -121,8 +121,9 @@ def test_a_cut_link_loses_no_keyframe_and_does_not_reach_the_robot(tmp_path):
 
 
 @pytest.mark.slow
-def test_the_robot_starts_without_an_edge_and_an_edge_that_dies_gets_the_rest(tmp_path):
+def test_the_robot_starts_without_an_edge_and_an_edge_that_is_killed_goes_on_from_its_session(tmp_path):
     pair = Pair(tmp_path, pictures=60)
+    pair.edge.nodes["mapping"] |= {"session": str(tmp_path / "session"), "session_every_s": 1.0}
     pair.link.cut = True
     with (
         pair.link,
@@ -136,10 +137,20 @@ def test_the_robot_starts_without_an_edge_and_an_edge_that_dies_gets_the_rest(tm
         pair.link.cut = False
         with Supervisor(pair.edge, table=TABLE) as edge:
             poll((robot, edge), lambda: len(set(answered.ids())) >= 4, 60)
+            before = set(answered.ids())
             for name in ("mapping", "router"):
                 os.kill(edge.children[name].process.pid, signal.SIGKILL)
-            poll((robot, edge), lambda: board.states().get("keyframes") == "drained", 120)
-            assert set(answered.ids()) == set(sent.ids())
+            poll((robot, edge), lambda: edge.children["mapping"].restarts == 1, 10)
+            poll((robot, edge), lambda: edge.children["router"].restarts == 1, 10)
+            with open_session(pair.edge.router.listen) as far:
+                refined = Ears(far, "mapping/poses")
+                poll((robot, edge), lambda: board.states().get("keyframes") == "drained", 120)
+                assert set(answered.ids()) == set(sent.ids())
+                poll((robot, edge), lambda: refined.messages, 60)
+                mapped = set(refined.messages[-1].keyframe_ids.tolist())
+            good = {m.id for m in answered.messages if m.status == "ok"}
+            assert before & good <= mapped  # what was acknowledged before the kill
+            assert mapped == good
             assert robot.children["localization"].restarts == robot.children["keyframes"].restarts == 0
 
 
