@@ -3,11 +3,13 @@ commands of who has the token; nobody ever waits for it."""
 
 from __future__ import annotations
 
+import json
 import logging
 import ssl
 from functools import partial
 from pathlib import Path
 from typing import Annotated
+from urllib.parse import quote
 
 from pydantic import Field, SecretStr, field_validator
 
@@ -35,7 +37,11 @@ from services.monitor.page.view import View
 log = logging.getLogger(__name__)
 
 _SHORTEST_TOKEN = 12
-_COMMAND_S = 10.0
+# Command -> what the node's supervisor is asked, and for how long. A swap's successor may load a model.
+_COMMANDS = {
+    "restart": ("restart", 10.0), "params": ("params", 10.0),
+    "swap": ("swap", 150.0), "cold swap": ("swap", 150.0),
+}  # fmt: skip
 Hz = Annotated[float, Field(gt=0.0, le=30.0)]
 
 
@@ -116,12 +122,18 @@ class PageNode(Node):
         """
         if action == "check":
             return "the token is right"
-        if action != "restart" or not node.replace("_", "").isalnum():
-            raise ValueError(f"there is no command {action!r} for {node!r}; there is restart")
+        if action not in _COMMANDS or not node.replace("_", "").replace("-", "").isalnum():
+            raise ValueError(f"there is no command {action!r} for {node!r}; there are {', '.join(_COMMANDS)}")
         if self._ask is None:
             raise ValueError("no bus: nobody can be asked")
-        log.info("%s %s, by command of the page", action, node)
-        return " ".join(answer.text for answer in self._ask(node, action, parameters, _COMMAND_S))
+        verb, patience_s = _COMMANDS[action]
+        asked = {}
+        if verb == "swap":
+            changes = [f"{option}={value}" for option, value in parameters.items()]
+            asked = {"set": quote(json.dumps(changes)), **({"cold": "1"} if action == "cold swap" else {})}
+        if verb != "params":
+            log.info("%s %s, by command of the page", action, node)
+        return " ".join(answer.text for answer in self._ask(node, verb, asked, patience_s))
 
     # --- what is shown ---
 

@@ -4,7 +4,8 @@ GET /                     the page; its parts are /page.js, /page.css
 GET /events               server-sent events: status, scale, path, robot, picture (a newer one is there)
 GET /picture/NAME         the newest camera, depth, render or map
 GET /status               what the status event holds, for scripts
-POST /command             {"action": "restart", "node": "depth"}, with "Authorization: Bearer TOKEN"
+POST /command             {"action": "restart", "node": "depth"}, with "Authorization: Bearer TOKEN";
+                          also params (its options); swap and "cold swap" take {"parameters": {OPTION: VALUE}}
 
 Everything is encoded once for all viewers. What a viewer has not taken yet is replaced by what is newer.
 """

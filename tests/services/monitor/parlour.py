@@ -6,6 +6,7 @@ import time
 import cv2
 import numpy as np
 
+from common.config import NodeConfig
 from common.geometry import se2_to_se3
 from common.messages import Correction, FusedDepth, Grid, Image, Odometry, Rig, Scan
 from common.node import Node, Sourced
@@ -77,17 +78,23 @@ class Guide(Node):
         )
 
 
+class DeepConfig(NodeConfig):
+    scale: float = SCALE
+
+
 class Deep(Node):
     """Depth of a floor, with its scale."""
 
     name = "fusion"
+    Config = DeepConfig
+    replaceable = True
     inputs = ("camera/image",)
     outputs = ("fusion/depth",)
 
     def on_camera_image(self, picture):
         depth = np.linspace(0.5, 6.0, 60 * 80, dtype=np.float32).reshape(60, 80)
         depth[:5] = np.nan
-        fused = FusedDepth(stamp_ns=picture.stamp_ns, depth_m=depth, sigma_m=0.1 * depth, scale=SCALE,
+        fused = FusedDepth(stamp_ns=picture.stamp_ns, depth_m=depth, sigma_m=0.1 * depth, scale=self.config.scale,
                            scale_sigma=SCALE_SIGMA, inlier_share=0.9, residual_m=0.02)  # fmt: skip
         yield "fusion/depth", fused
 

@@ -200,6 +200,35 @@ def test_who_has_the_token_commands_and_nobody_else(chromium, start):
     assert "commands refused" in system.board.records["page"].health.detail
 
 
+def test_a_swap_from_the_page_works(chromium, start):
+    system = start(token=TOKEN)
+    with opened(chromium, system.address, DESK) as page:
+        poll(system, lambda: page.inner_text("#scale-text") == "1.250 ± 0.050", 20)
+        page.fill("#token", TOKEN)
+        page.click("#login button")
+        poll(system, lambda: page.is_visible("#orders"), 10)
+        page.on("dialog", lambda dialog: dialog.accept())
+        page.select_option("#node", "fusion")
+        before = system.pids()
+        page.click("#options")
+        poll(system, lambda: page.is_visible("#swap"), 10)
+        assert page.input_value("#option-scale") == "1.25"
+        page.fill("#option-scale", "much")
+        page.click("#swap button")
+        poll(
+            system, lambda: "scale" in page.inner_text("#answer") and "much" in page.inner_text("#answer"), 20
+        )
+        assert system.pids() == before
+        page.click("#options")
+        poll(system, lambda: page.is_visible("#swap"), 10)
+        page.fill("#option-scale", "1.5")
+        page.click("#swap button")
+        poll(system, lambda: page.inner_text("#scale-text") == "1.500 ± 0.050", 60)
+        poll(system, lambda: "was taken over" in page.inner_text("#answer"), 20)
+        after = system.pids()
+        assert {n for n in before if before[n] != after[n]} == {"fusion"}
+
+
 def _command(address, order, token, method="POST"):
     """(status, text) of a command given by a script."""
     headers = {} if token is None else {"Authorization": f"Bearer {token}"}

@@ -176,6 +176,7 @@ async function command(action, node, parameters = {}) {
     body: JSON.stringify({ action, node, parameters }),
   });
   const answer = await reply.json();
+  if (action === "params" && reply.ok) return JSON.parse(answer.text);
   $("answer").textContent = answer.text ?? answer.error;
   $("answer").className = reply.ok ? "good" : "bad";
   if (reply.status === 401) mayCommand(false);
@@ -184,6 +185,7 @@ async function command(action, node, parameters = {}) {
 
 function mayCommand(may) {
   $("orders").hidden = !may;
+  $("swap").hidden = true;
   $("login").hidden = may;
   if (!may) sessionStorage.removeItem("token");
 }
@@ -200,6 +202,33 @@ $("orders").addEventListener("submit", (e) => {
   e.preventDefault();
   const node = $("node").value;
   if (confirm(`Restart ${node}?`)) command("restart", node).catch(failed);
+});
+// The options of a node as fields; what was changed goes to a successor, written as in a deployment (TOML).
+let shown = { node: "", values: {} };
+$("options").addEventListener("click", async () => {
+  const node = $("node").value;
+  const options = await command("params", node).catch(failed);
+  if (!options) return;
+  shown = { node, values: Object.fromEntries(Object.entries(options).map(([k, v]) => [k, v === null ? "" : JSON.stringify(v)])) };
+  $("fields").replaceChildren(...Object.entries(shown.values).flatMap(([name, value]) => {
+    const label = document.createElement("label"), input = document.createElement("input");
+    label.textContent = name;
+    label.htmlFor = input.id = `option-${name}`;
+    input.name = name;
+    input.value = value;
+    return [label, input];
+  }));
+  $("swap").hidden = false;
+});
+$("swap").addEventListener("submit", (e) => {
+  e.preventDefault();
+  const changed = [...$("fields").querySelectorAll("input")].filter((i) => i.value !== shown.values[i.name]).map((i) => [i.name, i.value]);
+  const said = changed.map(([name, value]) => `${name} = ${value}`).join(", ");
+  if (!said) { $("answer").textContent = "nothing was changed"; return; }
+  if (!confirm(`Swap ${shown.node}: ${said}?`)) return;
+  $("answer").textContent = "the successor gets ready ...";
+  command($("cold").checked ? "cold swap" : "swap", shown.node, Object.fromEntries(changed)).catch(failed);
+  $("swap").hidden = true;
 });
 $("follow").addEventListener("change", (e) => { map.follow = e.target.checked; map.draw(); });
 window.addEventListener("resize", drawScales);
