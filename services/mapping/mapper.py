@@ -56,7 +56,9 @@ class Mapper:
         self._ssim = SsimLoss()
         self._buffers: dict[tuple[int, int], tuple[np.ndarray, np.ndarray]] = {}
         r = self.settings.rates
-        self._rates = rate_rows(r.mean_m, r.log_scale, r.quat, r.opacity_logit, r.colour)
+        rest = (r.log_scale, r.quat, r.opacity_logit, r.colour)
+        self._rates = rate_rows(r.mean_m, *rest)
+        self._refining_rates = rate_rows(r.refined_mean_m, *rest)
 
     # --- keyframes and anchors ---------------------------------------------------------------------
 
@@ -195,7 +197,7 @@ class Mapper:
         for _ in range(iterations):
             if not ids:
                 ids = list(self._random.permutation(sorted(self.keyframes)))
-            losses.append(self.step(self.keyframes[int(ids.pop())], size))
+            losses.append(self.step(self.keyframes[int(ids.pop())], size, refining=True))
         return float(np.mean(losses)) if losses else 0.0
 
     def _draw(self) -> Held:
@@ -203,7 +205,7 @@ class Mapper:
         pool = self._newest if self._random.random() < 0.5 else list(self.keyframes)
         return self.keyframes[pool[int(self._random.integers(len(pool)))]]
 
-    def step(self, held: Held, size: int) -> float:
+    def step(self, held: Held, size: int, *, refining: bool = False) -> float:
         """One render, loss, backward and Adam on one keyframe. Gives the loss."""
         level = held.levels[size]
         T_map_camera = self.T_map_camera(held)
@@ -215,8 +217,9 @@ class Mapper:
         s = self.settings
         pixels = level.camera.width_px * level.camera.height_px
         self.store.step(
-            self.rasterizer.team, gradients, self._rates, s.isotropy_weight / pixels, np.log(s.isotropy_ratio)
-        )
+            self.rasterizer.team, gradients, self._refining_rates if refining else self._rates,
+            s.isotropy_weight / pixels, np.log(s.isotropy_ratio),
+        )  # fmt: skip
         if s.refine_pose:
             self._refine_pose(held, gradients, inverse(T_map_camera))
         if s.refine_exposure:

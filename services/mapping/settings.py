@@ -9,7 +9,8 @@ from dataclasses import dataclass, field
 class LearningRates:
     """Adam's step per parameter, in the parameter's own unit."""
 
-    mean_m: float = 2e-3
+    mean_m: float = 2e-3  # of keyframes just taken in: Gaussians have to find their places
+    refined_mean_m: float = 6e-4  # of refinement: places are known, and jitter shows
     log_scale: float = 6e-3
     quat: float = 2e-3
     opacity_logit: float = 3e-2
