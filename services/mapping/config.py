@@ -29,4 +29,5 @@ class MappingConfig(NodeConfig):
     seed: int = 0
     save: Path | None = None  # folder for splats.ply and keyframes.tum, written at the end of the data
     session: Path | None = None  # folder that the map lives in: saved while mapping, resumed at the start
+    memory_mb: Annotated[float, Field(gt=0.0)] | None = None  # for Gaussians and pictures; more rest on disk
     session_every_s: Annotated[float, Field(gt=0.0)] = 30.0  # between checkpoints, by the data's clock

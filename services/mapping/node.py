@@ -31,10 +31,12 @@ from common.raster.camera import RasterCamera
 from common.splats import pack
 from services.mapping.config import MappingConfig
 from services.mapping.export import write_map
+from services.mapping.keyframe import Held
 from services.mapping.keyframe import Keyframe as MapKeyframe
 from services.mapping.look import look
 from services.mapping.mapper import FULL, HALF, Mapper, Outcome
 from services.mapping.session.keeper import Keeper, Saved
+from services.mapping.session.paging import Pager
 from services.mapping.settings import MapperSettings
 from services.mapping.store import moved
 from services.mapping.warm import warm
@@ -52,6 +54,7 @@ class MappingNode(Node):
     inputs = ("keyframes/frame", Input("localization/anchors", "every"), Input("tick", "latest"))
     outputs = ("keyframes/ack", "mapping/chunk", "mapping/poses", "mapping/preview", "mapping/status")
     config: MappingConfig
+    _keeper: Keeper | None = None
 
     def configure(self) -> None:
         c = self.config
@@ -64,18 +67,18 @@ class MappingNode(Node):
         self._lens: dict[Pinhole, Undistorter] = {}
         self._taken: dict[int, tuple[int, np.ndarray]] = {}  # keyframe -> stamp_ns, T_camera_body
         self._sent: dict[int, tuple[int, int]] = {}  # anchor -> version sent, when (counted)
-        self._clock = 0  # messages with chunks so far
-        self._refused = 0
-        self._T_oldest_origin: np.ndarray | None = (
-            None  # the oldest submap's place when the origin was tied to it
-        )
-        self._keeper: Keeper | None = None
+        self._clock = self._refused = 0  # messages with chunks, keyframes refused so far
+        # The oldest submap's place when the origin was tied to it.
+        self._T_oldest_origin: np.ndarray | None = None
+        if c.memory_mb is not None and c.session is None:
+            raise UserError("mapping.memory_mb: pages to the session's disk; give mapping.session too")
         if c.session is not None:
-            self._keeper = Keeper(c.session, round(c.session_every_s * 1e9))
+            pager = None if c.memory_mb is None else Pager(c.memory_mb * 1e6, c.seed)
+            self._keeper = Keeper(c.session, round(c.session_every_s * 1e9), pager)
             self._resume(self._keeper)
 
     def close(self) -> None:
-        if getattr(self, "_keeper", None) is not None:
+        if self._keeper is not None:
             self._keeper.close()
 
     # --- session ---
@@ -85,10 +88,8 @@ class MappingNode(Node):
         m = self._mapper
         extra, newer = keeper.resume(m, lambda schema, body: self._open(decode(schema, body)))
         if extra:
-            rows = zip(
-                extra["taken_id"].tolist(), extra["taken_stamp_ns"].tolist(), extra["taken_T_camera_body"]
-            )
-            self._taken = {id: (stamp_ns, T.copy()) for id, stamp_ns, T in rows}
+            rows = zip(extra["taken_stamp_ns"].tolist(), extra["taken_T_camera_body"])
+            self._taken = dict(zip(extra["taken_id"].tolist(), rows))
             self._T_oldest_origin = next(iter(extra["T_oldest_origin"]), None)
         for id in newer:
             body = keeper.body(id)
@@ -110,8 +111,11 @@ class MappingNode(Node):
         }
 
     def _checkpoint(self, stamp_ns: int) -> Outputs:
-        """Now and then the map goes to the disk, in the background."""
-        if self._keeper is not None and self._mapper.keyframes and self._keeper.due(stamp_ns):
+        """The memory's budget is kept; now and then the map goes to the disk, in the background."""
+        if self._keeper is None or not self._mapper.keyframes:
+            return
+        self._keeper.page(self._mapper)
+        if self._keeper.due(stamp_ns):
             yield Job("checkpoint", self._keeper.checkpoint(self._mapper, self._extra(), stamp_ns))
 
     def on_job_checkpoint(self, saved: Saved) -> Outputs:
@@ -218,9 +222,8 @@ class MappingNode(Node):
         versions = self._mapper.store.versions()
         stale = [a for a, version in versions.items() if self._sent.get(a, (-1, 0))[0] != version]
         if stale:
-            yield from self._chunk(
-                min(stale, key=lambda a: (self._sent.get(a, (-1, -1))[1], a)), tick.stamp_ns
-            )
+            longest = min(stale, key=lambda a: (self._sent.get(a, (-1, -1))[1], a))
+            yield from self._chunk(longest, tick.stamp_ns)
         yield from self._checkpoint(tick.stamp_ns)
 
     # --- what is said ---
@@ -236,22 +239,22 @@ class MappingNode(Node):
         status = self._status(message.stamp_ns, outcome, loss, view.psnr_db, view.depth_error_m)
         yield "mapping/status", status
 
+    def _held(self) -> dict[int, Held]:
+        """All keyframes, those on disk too."""
+        return self._mapper.keyframes | ({} if self._keeper is None else self._keeper.parked)
+
     def _status(
-        self,
-        stamp_ns: int,
-        outcome: Outcome,
-        loss: float,
-        psnr_db: float = float("nan"),
-        depth_error_m: float = float("nan"),
-    ) -> MapStatus:
-        m = self._mapper
-        self.detail = f"{len(m.keyframes)} keyframes, {m.store.count} Gaussians, {psnr_db:.1f} dB" + (
+        self, stamp_ns: int, outcome: Outcome, loss: float, psnr_db: float = math.nan,
+        depth_error_m: float = math.nan,
+    ) -> MapStatus:  # fmt: skip
+        m, held = self._mapper, len(self._held())
+        self.detail = f"{held} keyframes, {m.store.count} Gaussians, {psnr_db:.1f} dB" + (
             f", {self._refused} refused (last: {outcome.status})" if not outcome.ok else ""
         )
         session = "" if self._keeper is None else self._keeper.text()
         self.detail += f"; {session}" if session else ""
         return MapStatus(
-            stamp_ns=stamp_ns, status=outcome.status, keyframes=len(m.keyframes), refused=self._refused,
+            stamp_ns=stamp_ns, status=outcome.status, keyframes=held, refused=self._refused,
             gaussians=m.store.count, steps=m.steps, loss=loss, foretold_share=outcome.foretold_share,
             foretold_psnr_db=outcome.foretold_psnr_db, psnr_db=psnr_db, depth_error_m=depth_error_m,
             session=session,
@@ -301,9 +304,9 @@ class MappingNode(Node):
 
     def _poses(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """(stamps_ns [K] rising, T_map_body [K, 4, 4] refined, ids [K]) of the keyframes held."""
-        m = self._mapper
-        ids = sorted(m.keyframes, key=lambda id: (self._taken[id][0], id))
-        T_map_body = np.array([m.T_map_camera(m.keyframes[id]) @ self._taken[id][1] for id in ids])
+        held = self._held()
+        ids = sorted(held, key=lambda id: (self._taken[id][0], id))
+        T_map_body = np.array([self._mapper.T_map_camera(held[id]) @ self._taken[id][1] for id in ids])
         stamps_ns = np.array([self._taken[id][0] for id in ids], np.int64)
         return stamps_ns, T_map_body, np.array(ids, np.int64)
 

@@ -37,6 +37,10 @@ class GaussianStore(GaussianArrays):
     def _arrays(self) -> list[str]:
         return [*super()._arrays(), "anchor", "strikes"]
 
+    def arrays(self) -> list[np.ndarray]:
+        """All arrays, with the room to grow."""
+        return [getattr(self, name) for name in self._arrays()]
+
     def state(self) -> dict[str, np.ndarray]:
         """Copies of all arrays, cut to the Gaussians there are, and of the events by anchor."""
         out = {name: getattr(self, name)[..., : self.count].copy() for name in self._arrays()}

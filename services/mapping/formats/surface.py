@@ -67,21 +67,33 @@ def points_of(view: DepthView) -> tuple[np.ndarray, np.ndarray]:
 
 def surface_points(views: Iterable[DepthView], cell_m: float) -> tuple[np.ndarray, np.ndarray]:
     """One point float64 [N, 3] and colour uint8 [N, 3] for each cell that holds any: the means."""
-    cells, sums = np.zeros((0, 3), np.int32), np.zeros((0, 7))
+    cells, sums, waiting = np.zeros(0, np.int64), np.zeros((0, 7)), []
     for view in views:
         points, colours = points_of(view)
         rows = np.column_stack([points, colours, np.ones(len(points))])
-        cells, sums = _summed(
-            np.concatenate([cells, np.floor(points / cell_m).astype(np.int32)]), np.concatenate([sums, rows])
-        )
+        waiting.append(_summed(_cell_numbers(points, cell_m), rows))
+        if sum(len(part[0]) for part in waiting) > 1_000_000:
+            cells, sums = _joined([(cells, sums), *waiting])
+            waiting = []
+    cells, sums = _joined([(cells, sums), *waiting])
     means = sums[:, :6] / np.maximum(sums[:, 6:], 1.0)
     return means[:, :3], np.clip(means[:, 3:] * 255.0 + 0.5, 0.0, 255.0).astype(np.uint8)
 
 
+def _cell_numbers(points: np.ndarray, cell_m: float) -> np.ndarray:
+    """int64 [N]: one number a cell, within 2**20 cells of the origin."""
+    x, y, z = (np.floor(points / cell_m).astype(np.int64) + (1 << 20)).T
+    return (x << 42) | (y << 21) | z
+
+
+def _joined(parts: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
+    cells, rows = zip(*parts)
+    return _summed(np.concatenate(cells), np.concatenate(rows))
+
+
 def _summed(cells: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Different cells int32 [M, 3] and the sums of their rows."""
-    unique, which = np.unique(cells, axis=0, return_inverse=True)
-    which = which.reshape(-1)
+    """Different cells int64 [M], rising, and the sums of their rows."""
+    unique, which = np.unique(cells, return_inverse=True)
     sums = np.stack([np.bincount(which, column, len(unique)) for column in rows.T], axis=1)
     return unique, sums
 

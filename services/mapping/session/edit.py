@@ -49,7 +49,9 @@ def merged(a: Arrays, b: Arrays, T_a_b: np.ndarray, offset: int) -> Arrays:
     }  # fmt: skip
     out = dict(a)
     for key in a:
-        if key.startswith(_STORE) and key != "store_events":
+        if key not in b:  # a newer program's: what it stands for has a default
+            out.pop(key)
+        elif key.startswith(_STORE) and key != "store_events":
             out[key] = np.concatenate([a[key], b[key]], axis=-1)
         elif key.startswith((_KEYFRAMES, "anchor_", _TAKEN)) or key == "store_events":
             out[key] = np.concatenate([a[key], b[key]])

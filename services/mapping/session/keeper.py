@@ -8,9 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from common.errors import UserError
-from services.mapping.keyframe import Keyframe
+from services.mapping.keyframe import Held, Keyframe
 from services.mapping.mapper import Mapper
 from services.mapping.session.folder import Arrays, SessionFolder
+from services.mapping.session.paging import Pager
 from services.mapping.session.state import arrays_of, extras_of, progress_of, restore
 
 log = logging.getLogger("beamsplat.mapping")
@@ -30,10 +31,11 @@ class Saved:
 class Keeper:
     """A mapper's session. Times are those of measurements, so that a replay saves at the same moments."""
 
-    def __init__(self, path: Path, period_ns: int) -> None:
+    def __init__(self, path: Path, period_ns: int, pager: Pager | None = None) -> None:
         self.folder = SessionFolder(path)
         self.folder.create()
         self.folder.lock()
+        self._pager = pager
         self._period_ns = period_ns
         self._since_ns: int | None = None  # stamp at the last checkpoint, or the first stamp there was
         self._running = False
@@ -51,16 +53,30 @@ class Keeper:
             UserError: there is a saved state, but it cannot be read.
         """
         arrays = self.folder.read_state()
+        self._opener = opener
         if arrays is None:
             return {}, self.folder.body_ids()
-        lost = restore(mapper, arrays, lambda id: opener(*self.folder.read_body(id)))
+        lost = restore(mapper, arrays, self._body, None if self._pager is None else self._pager.parked)
         for text in lost:
             log.warning("not looked at any more: %s", text)
         progress = progress_of(arrays)
-        self._last = Saved(int(progress["steps"]), len(mapper.keyframes))
+        self._last = Saved(int(progress["steps"]), len(mapper.keyframes) + len(self.parked))
         extra = extras_of(arrays)
         known = set(extra["taken_id"].tolist()) | set(progress["forgotten"])
         return extra, [id for id in self.folder.body_ids() if id not in known]
+
+    def _body(self, id: int) -> Keyframe:
+        return self._opener(*self.folder.read_body(id))
+
+    def page(self, mapper: Mapper) -> None:
+        """Keeps the keyframes' pictures within the budget, if there is one."""
+        if self._pager is not None:
+            self._pager.page(mapper, self._body, lambda id: id not in self._unsaved)
+
+    @property
+    def parked(self) -> dict[int, Held]:
+        """Keyframes whose pictures are on disk only."""
+        return {} if self._pager is None else self._pager.parked
 
     def body(self, id: int) -> tuple[str, bytes] | None:
         """A keyframe on disk; None if it is broken, which is said."""
@@ -101,8 +117,8 @@ class Keeper:
     def checkpoint(self, mapper: Mapper, extra: Arrays, stamp_ns: int) -> Callable[[], Saved]:
         """Work for the background, on copies made now; its result belongs into `done`."""
         self._running, self._since_ns = True, stamp_ns
-        arrays, folder = arrays_of(mapper, extra), self.folder
-        keyframes, steps = len(mapper.keyframes), mapper.steps
+        arrays, folder = arrays_of(mapper, extra, self.parked), self.folder
+        keyframes, steps = len(mapper.keyframes) + len(self.parked), mapper.steps
         summary = {
             "keyframes": keyframes, "gaussians": mapper.store.count, "steps": steps,
             "anchors": len(mapper.T_map_anchor), "stamp_ns": stamp_ns,
@@ -133,7 +149,11 @@ class Keeper:
             return f"NOT SAVED: {last.fault}; the checkpoint before stays valid"
         if self._body_fault:
             return f"NOT SAVED: {self._body_fault}"
-        return "" if last is None else f"saved at {last.keyframes} keyframes, step {last.steps}"
+        paged = f", {len(self.parked)} keyframes on disk only" if self.parked else ""
+        lost = f", {self._pager.lost} lost" if self._pager is not None and self._pager.lost else ""
+        return (
+            ("" if last is None else f"saved at {last.keyframes} keyframes, step {last.steps}") + paged + lost
+        )
 
     def close(self) -> None:
         """Lets others write to the session."""

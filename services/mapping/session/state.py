@@ -11,7 +11,7 @@ import numpy as np
 
 from common.errors import UserError
 from common.raster.camera import RasterCamera
-from services.mapping.keyframe import Held, Keyframe, hold
+from services.mapping.keyframe import Held, Keyframe, Level, hold
 from services.mapping.mapper import FULL, Mapper
 from services.mapping.session.folder import Arrays
 from services.mapping.store import GaussianStore
@@ -21,16 +21,18 @@ _NOT_STORED = {"levels"}  # made again from the keyframe's body
 _FIELDS = tuple(field.name for field in fields(Held) if field.name not in _NOT_STORED)
 
 
-def arrays_of(mapper: Mapper, extra: Arrays | None = None) -> Arrays:
+def arrays_of(mapper: Mapper, extra: Arrays | None = None, parked: dict[int, Held] | None = None) -> Arrays:
     """Copies of all that a mapper is, but for its keyframes' pictures; `extra` rides along.
 
-    Gaussians are `store_*`, keyframes `keyframe_*` (in the mapper's order), anchors `anchor_*`.
+    Gaussians are `store_*`, keyframes `keyframe_*` (in the mapper's order, then the `parked` ones, whose
+    pictures are not in memory), anchors `anchor_*`.
     """
-    held = list(mapper.keyframes.values())
+    held = [*mapper.keyframes.values(), *(parked or {}).values()]
     out = {f"store_{name}": array for name, array in mapper.store.state().items()}
     for name in _FIELDS:
         out[f"keyframe_{name}"] = np.array([getattr(h, name) for h in held])
     cameras = [[getattr(h.levels[FULL].camera, name) for name in _CAMERA] for h in held]
+    out["keyframe_parked"] = np.arange(len(held)) >= len(mapper.keyframes)
     out["keyframe_camera"] = np.array(cameras, np.float64).reshape(-1, len(_CAMERA))
     out["anchor_id"] = np.array(list(mapper.T_map_anchor), np.int64)
     out["anchor_T_map"] = np.array(list(mapper.T_map_anchor.values()), np.float64).reshape(-1, 4, 4)
@@ -43,8 +45,11 @@ def extras_of(arrays: Arrays) -> Arrays:
     return {key.removeprefix("extra_"): a for key, a in arrays.items() if key.startswith("extra_")}
 
 
-def restore(mapper: Mapper, arrays: Arrays, body: Callable[[int], Keyframe]) -> list[str]:
-    """Makes a fresh mapper what the saved one was; `body` opens a keyframe by its id.
+def restore(
+    mapper: Mapper, arrays: Arrays, body: Callable[[int], Keyframe], parked: dict[int, Held] | None = None
+) -> list[str]:
+    """Makes a fresh mapper what the saved one was; `body` opens a keyframe by its id. Those whose pictures
+    were not in memory go to `parked`, without it into the mapper too.
 
     Gives one sentence for each keyframe that could not be opened: the map is whole without it, but does not
     learn from it any more.
@@ -57,20 +62,34 @@ def restore(mapper: Mapper, arrays: Arrays, body: Callable[[int], Keyframe]) -> 
         mapper.store = store_of(arrays)
         anchors = zip(arrays["anchor_id"].tolist(), arrays["anchor_T_map"])
         mapper.T_map_anchor = {anchor: T.copy() for anchor, T in anchors}
+        resting = arrays.get("keyframe_parked", np.zeros(len(arrays["keyframe_id"]), bool))
         for row, id in enumerate(arrays["keyframe_id"].tolist()):
+            held = _held(arrays, row)
+            if parked is not None and resting[row]:
+                parked[id] = held
+                continue
             try:
-                held = hold(body(id), mapper.settings.sigma_unit)
+                held.levels = hold(body(id), mapper.settings.sigma_unit).levels
             except ValueError as error:
                 lost.append(f"keyframe {id}: {error}")
                 continue
-            for name in _FIELDS:
-                if f"keyframe_{name}" in arrays:  # what came later than the file keeps its default
-                    setattr(held, name, _value(arrays[f"keyframe_{name}"][row]))
             mapper.keyframes[id] = held
         mapper.resume(progress_of(arrays))
     except KeyError as error:
         raise UserError(f"the saved state lacks {error}: restore the session from a copy") from error
     return lost
+
+
+def _held(arrays: Arrays, row: int) -> Held:
+    """A keyframe without its pictures; what came later than the file keeps its default."""
+    empty, stored = np.zeros(0, np.uint8), [n for n in _FIELDS if f"keyframe_{n}" in arrays]
+    level = Level(_camera(arrays, row), empty, empty, empty, empty, empty)
+    return Held(levels=[level], **{n: _value(arrays[f"keyframe_{n}"][row]) for n in stored})
+
+
+def _camera(arrays: Arrays, row: int) -> RasterCamera:
+    numbers = dict(zip(_CAMERA, arrays["keyframe_camera"][row].tolist()))
+    return RasterCamera(**numbers | {name: int(numbers[name]) for name in ("width_px", "height_px")})
 
 
 def store_of(arrays: Arrays) -> GaussianStore:
@@ -107,9 +126,7 @@ def views_of(arrays: Arrays) -> list[View]:
     T_map_anchor = dict(zip(arrays["anchor_id"].tolist(), arrays["anchor_T_map"]))
     out = []
     for row, id in enumerate(arrays["keyframe_id"].tolist()):
-        numbers = dict(zip(_CAMERA, arrays["keyframe_camera"][row].tolist()))
-        camera = RasterCamera(**numbers | {n: int(numbers[n]) for n in ("width_px", "height_px")})
         T_anchor_camera = arrays["keyframe_T_anchor_camera"][row] @ arrays["keyframe_delta"][row]
         T_map_camera = T_map_anchor[int(arrays["keyframe_anchor"][row])] @ T_anchor_camera
-        out.append(View(id, camera, T_map_camera))
+        out.append(View(id, _camera(arrays, row), T_map_camera))
     return sorted(out, key=lambda view: view.id)

@@ -18,8 +18,10 @@ from common.geometry import inverse
 from common.lockstep import Lockstep
 from common.messages import Tick
 from services.keyframes.node import KeyframesConfig, KeyframesNode
+from services.mapping.config import MappingConfig
 from services.mapping.keyframe import Held
 from services.mapping.mapper import FULL, HALF, Mapper
+from services.mapping.node import MappingNode
 from services.mapping.session.folder import EDGE_MANIFEST, MANIFEST, SessionFolder
 from services.mapping.session.keeper import Keeper
 from services.mapping.session.state import arrays_of, extras_of, progress_of, restore, views_of
@@ -134,7 +136,8 @@ def test_checkpoints_come_by_the_datas_clock(tmp_path):
 
 def test_lockstep_gives_the_same_map_with_a_session_as_without(tmp_path):
     def run(session):
-        node = make_node(session, session_every_s=1.0)
+        options = {"half_steps": 4, "full_steps": 3, "tick_steps": 2, "session_every_s": 1.0}
+        node = MappingNode(MappingConfig(session=session, **options))
         source = r.RoomDrive(r.DriveConfig(pictures=12))
         Lockstep([source, r.Localizer(r.LocalizerConfig()), r.Fusion(r.Fusion.Config()),
                   KeyframesNode(KeyframesConfig(distance_m=0.15)), node]).run()  # fmt: skip

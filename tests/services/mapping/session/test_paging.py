@@ -1,0 +1,114 @@
+"""A budget for the mapper's memory: keyframes rest on disk and come back, and nothing is lost by it."""
+
+import numpy as np
+import pytest
+
+from common.errors import UserError
+from common.messages import Tick
+from services.mapping.session.folder import SessionFolder
+from services.mapping.session.paging import Pager, bytes_of, resting
+from services.mapping.session.state import views_of
+from tests.services.mapping import room_drive as r
+from tests.services.mapping.session.maps import SECOND, feed, handle, make_node, message
+
+# A keyframe of 160x120 takes 160 kB with both its sizes, the empty arrays of the Gaussians 0.8 MB.
+BUDGET_MB = 3.0
+
+
+def used(node):
+    store = sum(array.nbytes for array in node._mapper.store.arrays())
+    return store + sum(map(bytes_of, node._mapper.keyframes.values()))
+
+
+@pytest.fixture(scope="module")
+def paged(tmp_path_factory):
+    """(folder, node after a drive there and back, status messages)."""
+    folder = tmp_path_factory.mktemp("paged") / "s"
+    node, sent = make_node(folder, memory_mb=BUDGET_MB, session_every_s=4.0, half_steps=1, full_steps=1), {}
+    for lap in range(2):
+        for number in range(12):
+            stamp_ns = r.T0 + (lap * 12 + number) * SECOND
+            handle(node, "keyframes/frame", message(number, stamp_ns), sent)
+            assert used(node) <= BUDGET_MB * 1e6
+            assert len(node._mapper.keyframes) + len(node._keeper.parked) == lap * 12 + number + 1
+    return folder, node, sent
+
+
+def test_the_budget_holds_lap_after_lap_and_top_says_what_rests(paged):
+    _, node, sent = paged
+    assert len(node._keeper.parked) > 5
+    assert "keyframes on disk only" in node.detail
+    statuses = sent["mapping/status"]
+    assert [s.keyframes for s in statuses] == list(range(1, 25))
+    assert statuses[-1].gaussians == node._mapper.store.count
+
+
+def test_resting_keyframes_take_turns(paged):
+    _, node, _ = paged
+    ever = set(node._mapper.keyframes)
+    for count in range(24):
+        handle(node, "tick", Tick(stamp_ns=r.T0 + 24 * SECOND, count=count), {})
+        assert used(node) <= BUDGET_MB * 1e6
+        ever |= set(node._mapper.keyframes)
+    assert len(ever) == 24
+    assert len(node._mapper.keyframes) + len(node._keeper.parked) == 24
+
+
+def test_a_checkpoint_holds_those_on_disk_and_resumes_with_or_without_a_budget(paged, tmp_path):
+    folder, node, _ = paged
+    sent = {}
+    for output in node.drain():
+        sent.setdefault(output[0], []).append(output[1])
+    assert len(sent["mapping/poses"][-1].keyframe_ids) == 24
+    parked = {id: held.delta for id, held in node._keeper.parked.items()}
+    node.close()
+    arrays = SessionFolder(folder).read_state()
+    assert len(views_of(arrays)) == 24
+    again = make_node(folder, memory_mb=BUDGET_MB)
+    assert set(again._keeper.parked) == set(parked)
+    for id, delta in parked.items():
+        np.testing.assert_array_equal(again._keeper.parked[id].delta, delta)
+    assert list(again._mapper.keyframes) == list(node._mapper.keyframes)
+    again.close()
+    free = make_node(folder)
+    assert len(free._mapper.keyframes) == 24
+    free._mapper.refine(5)
+    free.close()
+
+
+def test_the_same_drive_pages_the_same_keyframes(tmp_path):
+    nodes = [make_node(tmp_path / name, memory_mb=2.0, half_steps=1, full_steps=1) for name in "ab"]
+    for node in nodes:
+        feed(node, range(12))
+        node.close()
+    a, b = nodes
+    assert list(a._keeper.parked) == list(b._keeper.parked)
+    assert a._keeper.parked
+    count = a._mapper.store.count
+    np.testing.assert_array_equal(a._mapper.store.params[:, :count], b._mapper.store.params[:, :count])
+
+
+def test_what_cannot_be_read_again_stays_in_memory_or_is_said(tmp_path, caplog):
+    node = make_node(tmp_path / "s", half_steps=0, full_steps=0)
+    feed(node, range(12))
+    mapper, pager = node._mapper, Pager(0.0, 0)
+    pager.page(mapper, lambda id: None, lambda id: False)
+    assert len(mapper.keyframes) == 12
+    pager.page(mapper, lambda id: None, lambda id: True)
+    assert len(mapper.keyframes) == 8
+
+    def broken(id):
+        raise UserError("the disk is gone")
+
+    pager.page(mapper, broken, lambda id: True)
+    assert pager.lost == 1
+    assert "the disk is gone" in caplog.text
+    held = next(iter(mapper.keyframes.values()))
+    assert bytes_of(resting(held)) == 0 < bytes_of(held)
+    assert resting(held).levels[0].camera == held.levels[0].camera
+    node.close()
+
+
+def test_a_budget_needs_a_disk():
+    with pytest.raises(UserError, match=r"mapping\.memory_mb"):
+        make_node(None, memory_mb=100.0)
