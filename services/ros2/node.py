@@ -18,7 +18,7 @@ from common.recording.ros_types import typestore
 from services.ros2.config import Ros2Config
 from services.ros2.robot import Robot, RobotOptions
 from services.ros2.topics import IMAGE, TF, WANTED
-from services.ros2.wire import ADMIN, Address, Entity, Qos, dds_type
+from services.ros2.wire import ADMIN, Address, Attachment, Entity, Qos, dds_type
 
 _POLL_S = 0.1
 _QUEUED = 1000
@@ -54,6 +54,7 @@ class Ros2Node(Node):
         self._subscribed: dict[str, str] = {}  # type by key
         self._unwanted: set[str] = set()  # keys whose subscribers are to end
         self._tidied = False
+        self._own: set[bytes] = set()  # publishers of /tf that are ours
         self._session = open_session((c.router,))
         self._listen()
 
@@ -82,6 +83,8 @@ class Ros2Node(Node):
         address = Address.of(key)
         if address is None or address.type_name not in WANTED:
             return []
+        if address.type_name == TF and self._is_own(sample):
+            return []
         found = self.robot.take(
             address.topic,
             address.type_name,
@@ -93,13 +96,19 @@ class Ros2Node(Node):
             self._tidy()
         return [Sourced(None, topic, message) for topic, message in found]
 
+    def _is_own(self, sample: zenoh.Sample) -> bool:
+        attachment = Attachment.unpack(sample.attachment.to_bytes()) if sample.attachment else None
+        return attachment is not None and attachment.gid in self._own
+
     def _tidy(self) -> None:
         """The topics are chosen: transforms and raw pictures of others need not come any more."""
         self._tidied = True
         chosen = {topic.strip("/") for topic in self.robot.chosen}
         for key, type_name in self._subscribed.items():
             topic = key.split("/", 1)[1].rsplit("/", 2)[0]
-            if type_name == TF or (type_name == IMAGE and topic not in chosen):
+            if (type_name == TF and not self.robot.wants_frames) or (
+                type_name == IMAGE and topic not in chosen
+            ):
                 self._unwanted.add(key)
 
     def _hear_of(self, token: str, kind: zenoh.SampleKind) -> None:
@@ -108,7 +117,10 @@ class Ros2Node(Node):
         if entity is None or entity.kind != "MP" or kind != zenoh.SampleKind.PUT:
             return
         if entity.node_name == "beamsplat":  # our own answers
-            self.robot.ignore(entity.topic)
+            if entity.type_name == TF:  # the robot's own comes under the same name
+                self._own.add(entity.gid())
+            else:
+                self.robot.ignore(entity.topic)
             return
         self.robot.offer(entity.topic, entity.type_name)
         asked = self.config.image_topic.strip("/") in ("", entity.topic.strip("/"))

@@ -6,6 +6,7 @@ Nothing goes out before the calibration is known, and no picture that it does no
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from common.recording.ros_types import deserialize, transform_of
 from common.recording.sensors import SENSORS, build, ros_fields
 from common.recording.static_frames import StaticFrames, clean
 from common.rig import RigFile, load_rig
+from services.ros2.moving import MovingFrames
 from services.ros2.topics import CAMERA_INFO, PICTURES, TF, WANTED, camera_info_of, choose
 
 _PATIENCE_S = 10.0  # for the first message of a topic that somebody publishes
@@ -48,6 +50,8 @@ class Robot:
         self._infos: dict[str, Any] = {}
         self._fixed = StaticFrames()  # from /tf_static
         self._steady = StaticFrames()  # these, and those of /tf that do not change
+        self._moving = MovingFrames()  # of /tf
+        self._wheels: tuple[str, str] | None = None  # (odom, child) where /tf stands for Odometry
         self._since_s: float | None = None
         self._words: dict[str, str] = {}  # word by chosen topic
         self._T_child_body = np.eye(4)
@@ -61,6 +65,11 @@ class Robot:
     def chosen(self) -> dict[str, str]:
         """Word by topic, once they are chosen."""
         return dict(self._words)
+
+    @property
+    def wants_frames(self) -> bool:
+        """Whether /tf is of use: until the calibration is known, and where it holds the wheels' odometry."""
+        return self.rig is None or self._wheels is not None
 
     def offer(self, topic: str, type_name: str) -> None:
         """Somebody says that it publishes there."""
@@ -87,6 +96,8 @@ class Robot:
         except ValueError as error:
             self._refuse(topic, str(error))
             return []
+        if type_name == TF and self.rig is not None:
+            return self._odometry_of(topic, message)
         if type_name == TF:
             self._take_frames(topic, message)
         elif type_name == CAMERA_INFO:
@@ -122,6 +133,8 @@ class Robot:
         if rig is None:
             return False
         self._words = {topic: word for word, topic in chosen.items()}
+        if "odometry" not in chosen and "odometry" not in self._options.without:
+            self._wheels = self._moving.edge()
         self.rig = rig
         self._describe()
         return True
@@ -146,6 +159,8 @@ class Robot:
         child = ""
         if "odometry" in chosen:
             child = clean(self._first[chosen["odometry"]][1].child_frame_id)
+        elif (edge := self._moving.edge()) is not None:
+            child = edge[1]
         tree = self._fixed
         if not tree.names or any(tree.find(child or f, f) is None for f in frames.values()):
             tree = self._steady
@@ -207,16 +222,33 @@ class Robot:
 
     def _take_frames(self, topic: str, message: Any) -> None:
         fixed = topic.endswith("tf_static")
-        if self.rig is not None:
-            return
-        for stamped in message.transforms:
-            try:
-                T = transform_of(stamped.transform.translation, stamped.transform.rotation)
-            except ValueError:
+        for stamped, T in _transforms(message):
+            if not fixed:
+                self._moving.note(stamped.header.frame_id, stamped.child_frame_id)
+            for tree in (self._fixed, self._steady) if fixed else (self._steady,):
+                tree.add(stamped.header.frame_id, stamped.child_frame_id, T, replace=fixed)
+
+    def _odometry_of(self, topic: str, message: Any) -> list[tuple[str, Any]]:
+        """The wheels' odometry in a message of /tf, where nothing better says it."""
+        found = []
+        for stamped, T in _transforms(message):
+            edge = clean(stamped.header.frame_id), clean(stamped.child_frame_id)
+            if edge != self._wheels or topic.endswith("tf_static"):
                 continue
-            if np.all(np.isfinite(T)):
-                for tree in (self._fixed, self._steady) if fixed else (self._steady,):
-                    tree.add(stamped.header.frame_id, stamped.child_frame_id, T, replace=fixed)
+            stamp = stamped.header.stamp
+            fields = self._moving.fields(int(stamp.sec) * 10**9 + int(stamp.nanosec), T)
+            if fields is None:
+                continue
+            cal.to_body(fields, self._T_child_body)
+            try:
+                found.append((SENSORS["odometry"].topic, build(SENSORS["odometry"].topic, fields)))
+            except ValueError as error:
+                self._refuse(topic, _first_line(error))
+                continue
+            self._words[topic] = "odometry"
+            self.passed[topic] += 1
+            self._describe()
+        return found
 
     def _refuse(self, topic: str, reason: str) -> None:
         self.refused[topic] += 1
@@ -232,6 +264,17 @@ class Robot:
     def _stamp_ns(self, message: Any, received_ns: int) -> int:
         stamp = message.header.stamp
         return int(stamp.sec) * 10**9 + int(stamp.nanosec) or received_ns
+
+
+def _transforms(message: Any) -> Iterator[tuple[Any, np.ndarray]]:
+    """The transforms of a TFMessage with their matrices; what is none is left out."""
+    for stamped in message.transforms:
+        try:
+            T = transform_of(stamped.transform.translation, stamped.transform.rotation)
+        except ValueError:
+            continue
+        if np.all(np.isfinite(T)):
+            yield stamped, T
 
 
 def _word_of(type_name: str) -> str:

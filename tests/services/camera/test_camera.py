@@ -188,6 +188,22 @@ def test_a_camera_that_hangs_is_given_up(rig):
             running.wait(lambda: "LOST: no picture for 0.5 s" in node.detail)
 
 
+def test_the_hosts_time_of_day_moves_no_stamp(rig, monkeypatch):
+    wall = {"offset": 0}
+    real = time.time_ns
+    monkeypatch.setattr("time.time_ns", lambda: real() + wall["offset"])
+    with Camera() as camera:
+        node = CameraNode(CameraConfig(source=camera.url, rig=rig))
+        with Running(node) as running:
+            for offset_h in (0, 1, -1):
+                wall["offset"] = offset_h * 3600 * 10**9
+                before = len(_pictures(running))
+                running.wait(lambda enough=before + 4: len(_pictures(running)) >= enough)
+    stamps = np.array([image.stamp_ns for _, image in _pictures(running)])
+    assert np.diff(stamps).min() > 0
+    assert np.diff(stamps).max() < 5e9
+
+
 @pytest.mark.parametrize("codec", ["MJPG", "mp4v"])
 def test_a_video_file_plays_to_its_end(tmp_path, codec):
     path = tmp_path / ("video.avi" if codec == "MJPG" else "video.mp4")

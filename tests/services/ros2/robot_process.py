@@ -1,9 +1,9 @@
 """A robot as rmw_zenoh_cpp would have it, in a process of its own: replays a ROS 2 bag onto the bus.
 
 Written from rmw_zenoh's documents with Zenoh's own serializer and rosbags; it uses nothing of ours.
-Usage: python -m tests.services.ros2.robot_process ENDPOINT DOMAIN BAG RATE SECONDS NOW
+Usage: python -m tests.services.ros2.robot_process ENDPOINT DOMAIN BAG RATE SECONDS NOW TF
 Prints a line of JSON for each message that comes back on /map, /tf, /beamsplat/pose and /beamsplat/cloud.
-NOW = 1 puts the bag's stamps in the present.
+NOW = 1 puts the bag's stamps in the present, TF = 1 replays its /tf, too.
 """
 
 import json
@@ -103,7 +103,7 @@ def summary(topic, message):
 
 
 def main():
-    endpoint, domain, bag, rate, seconds, now = sys.argv[1:]
+    endpoint, domain, bag, rate, seconds, now, tf = sys.argv[1:]
     rate, seconds = float(rate), float(seconds)
     config = zenoh.Config()
     config.insert_json5("mode", '"client"')
@@ -117,7 +117,7 @@ def main():
                 ("/beamsplat/cloud", "sensor_msgs/msg/PointCloud2"),
             )
         ]  # fmt: skip
-        topics = sorted({(c.topic, c.msgtype) for c in reader.connections if c.topic != "/tf"})
+        topics = sorted({(c.topic, c.msgtype) for c in reader.connections if tf == "1" or c.topic != "/tf"})
         publishers = {
             topic: Publisher(session, domain, 10 + i, topic, ros) for i, (topic, ros) in enumerate(topics)
         }

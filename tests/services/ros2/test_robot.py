@@ -25,10 +25,10 @@ ROOT = Path(__file__).resolve().parents[3]
 
 
 class RobotProcess:
-    def __init__(self, endpoint, domain, bag, rate=1.0, seconds=1e9, now=False):
+    def __init__(self, endpoint, domain, bag, rate=1.0, seconds=1e9, now=False, tf=False):
         self.lines = []
         command = [sys.executable, "-m", "tests.services.ros2.robot_process", endpoint, str(domain), str(bag),
-                   str(rate), str(seconds), str(int(now))]  # fmt: skip
+                   str(rate), str(seconds), str(int(now)), str(int(tf))]  # fmt: skip
         self.process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
         threading.Thread(target=self._read, daemon=True).start()
 
@@ -255,3 +255,33 @@ def test_a_recorded_drive_runs_the_whole_system_over_ros2(tmp_path, free_endpoin
     assert len(robot.on("/beamsplat/pose")) > 80
     assert robot.on("/map")
     assert {edge[0] + ">" + edge[1] for line in robot.on("/tf") for edge in line["edges"]} == {"map>odom"}
+
+
+def test_wheels_that_only_tf_tells_of_are_taken_from_there(tmp_path, free_endpoint):
+    """No Odometry topic: odom -> base_link on /tf is the wheels', and our own /tf beside it is not."""
+    bag = write_bag(tmp_path, "mcap", Drive(seconds=8.0, odometry=False, tf="repeated"))
+    node = Ros2Node(Ros2Config(domain=5, router=free_endpoint))
+    out = Ros2OutNode(Ros2OutConfig(domain=5, router=free_endpoint))
+    with open_router((free_endpoint,)), Bus(open_session((free_endpoint,)), "test", "x", "cd" * 8, 1) as bus:
+        got = _collect(bus, "rig", "wheel/odometry")
+        said = bus.publish("localization/odometry")
+        with (
+            Running(free_endpoint, tmp_path / "state", node, out),
+            RobotProcess(free_endpoint, 5, bag, tf=True),
+        ):
+            elsewhere = np.eye(4)
+            elsewhere[0, 3] = 50.0
+            for i in range(10_000):  # what ros2_out says of it on /tf must not come back as the robot's
+                if len(got["wheel/odometry"]) >= 20 or i == 600:
+                    break
+                said.put(Odometry(stamp_ns=START_NS + i * 10**8, T_odom_body=elsewhere, covariance=np.eye(3)))
+                time.sleep(0.05)
+    assert got["rig"][0].lidar.T_body_lidar == pytest.approx(T_BASE_LIDAR, abs=1e-9)
+    wheels = got["wheel/odometry"]
+    assert len(wheels) >= 20, node.robot.status
+    steps = [round((w.stamp_ns - START_NS) / 1e8) for w in wheels]
+    assert steps == list(range(steps[0], steps[0] + len(steps)))
+    for step, wheel in zip(steps, wheels):
+        assert wheel.T_odom_body[:3, 3] == pytest.approx([0.1 * step, 0.0, 0.0], abs=1e-9)
+        assert wheel.velocity_m_s == pytest.approx([1.0, 0.0, 0.0], abs=1e-6)
+    assert "/tf" in node.robot.status
