@@ -60,6 +60,8 @@ class Keeper:
         for text in lost:
             log.warning("not looked at any more: %s", text)
         progress = progress_of(arrays)
+        # After a crash too, none grows older than a period.
+        self._since_ns = self.folder.manifest().get("stamp_ns")
         self._last = Saved(int(progress["steps"]), len(mapper.keyframes) + len(self.parked))
         extra = extras_of(arrays)
         known = set(extra["taken_id"].tolist()) | set(progress["forgotten"])

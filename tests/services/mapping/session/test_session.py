@@ -134,6 +134,18 @@ def test_checkpoints_come_by_the_datas_clock(tmp_path):
     assert len(list((tmp_path / "a" / "edge").glob("state-*.npz"))) == 1
 
 
+def test_after_a_crash_the_next_checkpoint_is_not_later_than_without_it(tmp_path):
+    node = make_node(tmp_path / "s", session_every_s=3.0)
+    feed(node, range(5))  # saved at second 3
+    node.close()  # no drain: as if killed
+    again, stamps = make_node(tmp_path / "s", session_every_s=3.0), []
+    for number in (5, 6, 7):
+        feed(again, [number])
+        stamps.append((SessionFolder(tmp_path / "s").manifest()["stamp_ns"] - r.T0) // SECOND)
+    assert stamps == [3, 6, 6]
+    again.close()
+
+
 def test_lockstep_gives_the_same_map_with_a_session_as_without(tmp_path):
     def run(session):
         options = {"half_steps": 4, "full_steps": 3, "tick_steps": 2, "session_every_s": 1.0}
@@ -211,9 +223,8 @@ def test_twenty_kills_lose_no_acknowledged_keyframe_and_break_no_file(tmp_path):
         for id in known:
             folder.read_body(id)
         if manifest is not None:
-            assert (
-                manifest["stamp_ns"] >= max(known) - 3 * SECOND
-            )  # every 2 s, and one that was being written
+            # Every 2 s; one that is killed while it is written is tried again a keyframe later.
+            assert manifest["stamp_ns"] >= max(known) - 6 * SECOND
             assert len(arrays["keyframe_id"]) == manifest["keyframes"]
         moments.append(len(known))
     assert max(moments) > 5
