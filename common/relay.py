@@ -7,6 +7,7 @@ never stands before a pose. Ends of streams and health cross as well.
 
 from __future__ import annotations
 
+import logging
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -17,6 +18,8 @@ from common.bus import key
 from common.messages import Health
 from common.streams import FIFO_MESSAGES, declare_reader, declare_writer
 from common.topics import HEALTH, TOPICS, Topic
+
+log = logging.getLogger(__name__)
 
 _NEWEST = 8  # of what is sent again anyway: behind a slow link the oldest is passed over
 _HEALTH_ROW = Topic(HEALTH, Health, (), 1, "every")
@@ -44,14 +47,24 @@ class Relay:
 
     def __init__(self, name: str, sides: Sides) -> None:
         self._name = name
-        self._declared: list[object] = []  # dropped handles would be undeclared at once
+        self._over = threading.Event()  # set: a later session carries the large messages
         self.carried: dict[str, Carried] = {}
         self.ended: set[str] = set()
+        self.failed = 0  # cut off in the middle
         for row in TOPICS.values():
             if row.uplink:
                 self._carry_topic(row, sides)
         self._carry_health(sides.robot, sides.small)
         self._carry_health(sides.small, sides.robot)
+
+    def renew_large(self, sides: Sides) -> None:
+        """Goes on with another session for large messages: what was being written when a link broke can stay
+        stuck in the old one for good."""
+        self._over.set()
+        self._over = threading.Event()
+        for row in TOPICS.values():
+            if row.uplink == "bulk":
+                self._carry_topic(row, sides)
 
     def upward(self) -> dict[str, Carried]:
         """What has crossed from the robot, by topic."""
@@ -108,16 +121,23 @@ class Relay:
         reader = declare_reader(
             source, key(self._name, topic_key), row, row.delivery, channel, zenoh.Locality.REMOTE
         )
-        self._declared.append(reader)
+        over = self._over if row.uplink == "bulk" else threading.Event()
         count = self.carried.setdefault(count_as, Carried()) if count_as else Carried()
 
         def work() -> None:
             while True:
                 try:
                     sample = reader.recv()
-                    send(sample)
-                except zenoh.ZError:  # a session was closed
+                except zenoh.ZError:  # the session was closed
                     return
+                if over.is_set():  # with this thread its reader ends
+                    return
+                try:
+                    send(sample)
+                except zenoh.ZError as error:  # the link broke in the middle of it, or the session was closed
+                    self.failed += 1
+                    log.info("%s did not cross: %s", topic_key, error)
+                    continue
                 count.messages += 1
                 count.bytes += len(sample.payload)
 

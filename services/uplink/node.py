@@ -43,6 +43,7 @@ class UplinkNode(Node):
         self._relay: Relay | None = None
         self._cut_since: float | None = None
         self._cuts = 0
+        self._large_broke = False
 
     def source(self) -> Iterator[Sourced | None]:
         """Runs until all that the robot sends has ended; a robot's sensors never do."""
@@ -57,6 +58,7 @@ class UplinkNode(Node):
                 yield None
         while not self._ended():
             self._say()
+            self._mend()
             yield None
             time.sleep(_POLL_S)
 
@@ -88,6 +90,20 @@ class UplinkNode(Node):
         small, large, robot = opened
         self._relay = Relay(self.home.robot, Sides(robot=robot, small=small, large=large))
 
+    def _mend(self) -> None:
+        """After a cut the session for large messages is replaced, once the small one is connected again."""
+        if not self._large_broke or not self._sessions[0].info.routers_zid():
+            return
+        try:
+            large = open_link(self.config.edge, _ATTEMPT_S, self.home.security)
+        except UserError:
+            return
+        small, old, robot = self._sessions
+        self._sessions = [small, large, robot]
+        self._large_broke = False
+        self._relay.renew_large(Sides(robot=robot, small=small, large=large))
+        threading.Thread(target=old.close, daemon=True).start()
+
     def _ended(self) -> bool:
         """All topics on which the robot said something have ended."""
         spoke = {name for name, carried in self._relay.upward().items() if carried.messages}
@@ -101,9 +117,10 @@ class UplinkNode(Node):
         else:
             if self._cut_since is None:
                 self._cut_since, self._cuts = now, self._cuts + 1
+            self._large_broke = True
             state = f"no link for {now - self._cut_since:.0f} s"
         up = self._relay.upward().values()
-        cuts = f", {self._cuts} cuts" if self._cuts else ""
+        cuts = f", {self._cuts} cuts, {self._relay.failed} messages cut off" if self._cuts else ""
         self.detail = (
             f"{state} ({self.config.edge}){cuts}: {sum(c.messages for c in up)} messages, "
             f"{sum(c.bytes for c in up) / 1e6:.1f} MB"
