@@ -33,7 +33,15 @@ def run(source, out, free_endpoint):
 def test_the_demo_leaves_what_it_names(drive, tmp_path, free_endpoint, capsys):
     figures = run(drive / "bag", tmp_path / "out", free_endpoint)
     said = capsys.readouterr().out
-    for name in ("splats.ply", "map.png", "trajectory.tum", "report.html", "session", "demo.rrd", "recording"):
+    for name in (
+        "splats.ply",
+        "map.png",
+        "trajectory.tum",
+        "report.html",
+        "session",
+        "demo.rrd",
+        "recording",
+    ):
         assert name in said
     assert figures["ate_first_pose_rmse_m"] < 0.05
     assert figures["keyframes"] >= 3
