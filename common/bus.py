@@ -71,13 +71,31 @@ def _set_endpoints(config: zenoh.Config, side: str, endpoints: tuple[str, ...]) 
 def open_router(
     listen: tuple[str, ...], connect: tuple[str, ...] = (), security: SecurityConfig = OPEN
 ) -> zenoh.Session:
-    """A router in this process. Where it listens beyond this host, hosts show certificates, and may do what
-    the topic table and hosts.toml say.
+    """A router in this process.
 
     Raises:
         UserError: an endpoint cannot be listened on (in use), is malformed, or leaves this host unprotected.
     """
     zenoh.init_log_from_env_or("error")
+    config = router_config(listen, connect, security)
+    try:
+        return zenoh.open(config)
+    except zenoh.ZError as error:
+        raise UserError(
+            f"router cannot listen on {', '.join(listen)} ({_short(error)}): is another router running? "
+            "Stop it, or choose another port with --set router.listen='[\"tcp/127.0.0.1:7448\"]'"
+        ) from error
+
+
+def router_config(
+    listen: tuple[str, ...], connect: tuple[str, ...] = (), security: SecurityConfig = OPEN
+) -> zenoh.Config:
+    """What a router of ours runs with. Where it listens beyond this host, hosts show certificates, and may do
+    what the topic table and hosts.toml say.
+
+    Raises:
+        UserError: an endpoint is malformed, or leaves this host unprotected.
+    """
     config = _base_config("router")
     _set_endpoints(config, "listen", listen)
     _set_endpoints(config, "connect", connect)
@@ -89,13 +107,7 @@ def open_router(
         config.insert_json5("access_control", json.dumps(access_control(read_hosts(keys.folder))))
     config.insert_json5("adminspace/enabled", "true")
     config.insert_json5("adminspace/permissions", "{read: true, write: false}")
-    try:
-        return zenoh.open(config)
-    except zenoh.ZError as error:
-        raise UserError(
-            f"router cannot listen on {', '.join(listen)} ({_short(error)}): is another router running? "
-            "Stop it, or choose another port with --set router.listen='[\"tcp/127.0.0.1:7448\"]'"
-        ) from error
+    return config
 
 
 def open_session(

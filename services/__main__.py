@@ -35,7 +35,7 @@ _RESULTS = "Maps and figures"
 _MACHINE = "This machine"
 for command in (
     demo.demo, system_cli.run, system_cli.check, system_cli.serve, system_cli.offline, system_cli.record,
-    system_cli.top, system_cli.topics, system_cli.graph,
+    system_cli.top, system_cli.topics, system_cli.graph, system_cli.router_config,
 ):  # fmt: skip
     app.command(rich_help_panel=_SYSTEM)(command)
 app.command(rich_help_panel=_SYSTEM)(swap_cli.swap)

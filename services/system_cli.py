@@ -178,6 +178,19 @@ def serve(
         serve_node(deployment, node, exit_when_drained=True)
 
 
+def router_config(file: FileArgument, set_: SetOption = None) -> None:
+    """Prints the configuration of a deployment's router for `zenohd -c`, to run that in its place.
+
+    The policy is as it is now: after `beamsplat keys issue` or `remove`, print it again.
+
+    Example: beamsplat router-config deploy/edge.toml > router.json5
+    """
+    from common.bus import router_config as config_of
+
+    deployment = _load(file, set_)
+    print(config_of(deployment.router.listen, deployment.router.connect, deployment.security))
+
+
 def offline(
     file: FileArgument,
     out: Annotated[Path, typer.Option(help="Folder for messages.mcap and summary.json")],
