@@ -63,7 +63,7 @@ _ROWS = (
     Topic("mapping/poses",           m.MapPoses,      ("mapping",),              0, "latched", 1),
     Topic("mapping/preview",         m.MapPreview,    ("mapping",),              2, "latest"),
     Topic("mapping/status",          m.MapStatus,     ("mapping",),              2, "every", 60),
-    Topic("tick",                    m.Tick,          ("replay",),               1, "every", 60, "up"),
+    Topic("tick",                    m.Tick,          ("clock", "replay"),      1, "every", 60, "up"),
 )  # fmt: skip
 
 TOPICS: dict[str, Topic] = {row.name: row for row in _ROWS}

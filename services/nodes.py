@@ -35,6 +35,11 @@ _ROWS = (
         {"default": "services.ros2.publisher.node:Ros2OutNode"},
     ),
     Service(
+        "clock",
+        "a tick a second, on robots that replay nothing",
+        {"default": "services.clock.node:ClockNode"},
+    ),
+    Service(
         "localization",
         "where the robot is",
         {
