@@ -57,13 +57,14 @@ def slam(
 
         beamsplat bench slam --data logs --out out/slam --readme README.md --pictures docs/slam_maps.jpg
     """
-    from services.bench.slam import bench_slam, deck, into_readme, markdown
+    from services.bench.readme import into_readme
+    from services.bench.slam import bench_slam, deck, markdown
 
     rows = bench_slam(data, out, not no_odometry, lambda text: console.print(text, highlight=False))
     table = markdown(rows)
     print(json.dumps(rows) if as_json else table)
     if readme is not None:
-        into_readme(readme, table)
+        into_readme(readme, "slam", table)
     deck(out, [row["name"] for row in rows], pictures or out / "maps.jpg")
 
 
@@ -81,6 +82,7 @@ def paper(
     refine_steps: Annotated[
         int, typer.Option(min=0, help="Steps on the default configuration's map after the drive, 0.1 s each")
     ] = 500,
+    readme: Annotated[Path | None, typer.Option(help="Put the table between its marks in this file")] = None,
     as_json: JsonOption = False,
 ) -> None:
     """The paper's six configurations and the default one, live at the recording's speed: its Tables I-IV.
@@ -94,12 +96,15 @@ def paper(
         beamsplat bench paper --data drive --out out/paper --only default --only monogs-lidar --seeds 3
     """
     from services.bench.paper import bench_paper
+    from services.bench.readme import into_readme, paper_table
 
     report = bench_paper(
         data, out, names=only, seeds=seeds, recorded=recorded, groundtruth=groundtruth, seconds=seconds,
         refine_steps=refine_steps,
         say=lambda text: console.print(text, markup=False, highlight=False, soft_wrap=True),
     )  # fmt: skip
+    if readme is not None:
+        into_readme(readme, "paper", paper_table(report["configurations"]))
     if as_json:
         print(json.dumps(report))
         return

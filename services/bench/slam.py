@@ -14,7 +14,6 @@ import numpy as np
 from common.errors import UserError
 from common.trajectory import read_tum
 
-BEGIN, END = "<!-- bench slam -->", "<!-- /bench slam -->"
 # Mean absolute errors of Cartographer over the same relations as published (Hess et al. 2016, table II).
 CARTOGRAPHER = {"aces": (0.0375, 0.373), "intel": (0.0229, 0.453), "fr079": (0.0452, 0.538)}
 COLUMNS = (
@@ -97,15 +96,6 @@ def markdown(rows: list[dict[str, Any]]) -> str:
         cost = [f"{row[key]:.{digits}f}" for key, digits in COSTS]
         lines.append("| " + " | ".join([name, error, turn, theirs, *cost]) + " |")
     return "\n".join(lines)
-
-
-def into_readme(readme: Path, table: str) -> None:
-    """Replace what stands between the two marks. Raises UserError if they are not there."""
-    text = readme.read_text()
-    if BEGIN not in text or END not in text:
-        raise UserError(f"{readme}: no lines {BEGIN} and {END} between which the table could go")
-    head, tail = text.split(BEGIN)[0], text.split(END)[1]
-    readme.write_text(f"{head}{BEGIN}\n{table}\n{END}{tail}")
 
 
 def deck(out: Path, names: list[str], path: Path) -> None:
