@@ -40,6 +40,7 @@ class NodeConfig(Config):
     step_cost_s: Seconds = 0.0  # lockstep: modelled time of one step
     job_cost_s: Seconds = 0.0  # lockstep: modelled time of a background job
     threads: Annotated[int, Field(ge=1)] = 1  # for cv2, torch and ONNX in this process
+    nice: Annotated[int, Field(ge=0, le=19)] = 0  # niceness of this process: who waits when cores are short
 
 
 class RouterConfig(Config):

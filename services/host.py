@@ -52,6 +52,7 @@ def serve(
     """
     node = build_node(deployment, name, table)
     _limit_threads(node.config.threads)
+    os.nice(node.config.nice)
     if around is None:
         around = surroundings(node_classes(deployment, table), name, deployment.role)
     settings = LiveSettings(

@@ -20,7 +20,7 @@ from common.persist import make_folder, write_atomically
 from services.bench.paper_live import Costs, Seen, run_live
 from services.bench.paper_map import map_figures, map_from_above, previews, truth_folder
 from services.bench.paper_report import write_report
-from services.bench.paper_score import Truth, compared_poses, depth_errors, pose_errors, speed
+from services.bench.paper_score import Truth, compared_poses, depth_errors, pose_errors, rigid_offset, speed
 from services.depth.store import find_model
 from services.evaluation.drive import open_drive
 from services.evaluation.evaluate import read_truth
@@ -216,7 +216,7 @@ def score(seen: Seen, costs: Costs, truth: Truth) -> dict[str, Any]:
     T_world_map = None
     if len(T_found):
         first = next(T for _, T, status, _ in seen.poses if status == "ok")
-        T_world_map = T_found[0] @ inverse(first)
+        T_world_map = rigid_offset(T_found, T_true) @ T_found[0] @ inverse(first)
     figures, offpath = ({}, []) if T_world_map is None else map_figures(seen, truth, T_world_map)
     ends = [s.psnr_db for s in seen.statuses if np.isfinite(s.psnr_db)]
     row |= figures | {"psnr_keyframes_db": float(np.mean(ends)) if ends else None}

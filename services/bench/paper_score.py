@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from common.beams import project_beams
-from common.geometry import inverse
+from common.geometry import inverse, make_transform
 from common.rig import rpy_from_rotation
 from services.bench.paper_live import DEPTH_STEP, Costs, Seen
 from services.depth.recorded import read_depth
@@ -42,6 +42,17 @@ def compared_poses(seen: Seen, truth: Truth) -> tuple[np.ndarray, np.ndarray, np
         return np.zeros(0, np.int64), np.zeros((0, 4, 4)), np.zeros((0, 4, 4))
     T_world_map = true[0] @ inverse(found[0])
     return np.array(stamps), T_world_map @ np.array(found), np.array(true)
+
+
+def rigid_offset(T_found: np.ndarray, T_true: np.ndarray) -> np.ndarray:
+    """The rigid transform [4, 4] that best takes poses [N, 4, 4] to the true ones: mean turn, then mean shift.
+
+    For maps: one first pose a few millimetres off must not move the whole map.
+    """
+    U, _, Vt = np.linalg.svd(np.sum(T_true[:, :3, :3] @ np.swapaxes(T_found[:, :3, :3], 1, 2), axis=0))
+    R = U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt
+    shift = T_true[:, :3, 3].mean(axis=0) - R @ T_found[:, :3, 3].mean(axis=0)
+    return make_transform(R, shift)
 
 
 def pose_errors(T_found: np.ndarray, T_true: np.ndarray) -> dict[str, Any]:

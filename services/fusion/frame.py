@@ -18,10 +18,10 @@ class FieldConfig:
     """
 
     width_px: int = 160  # working size; the height follows
-    labels: int = 88
+    labels: int = 64
     z_near_m: float = 0.4
     z_far_m: float = 14.0
-    baselines_m: tuple[float, ...] = (0.1, 0.2, 0.4, 0.8)
+    baselines_m: tuple[float, ...] = (0.2, 0.4, 0.8)
     max_turn_rad: float = 0.6
     cost_scale: float = 12.0
     cost_cap: float = 5.0  # beyond it a label is simply wrong: how wrong must not outvote the neighbours
@@ -55,6 +55,7 @@ class FieldConfig:
     def in_hand() -> FieldConfig:
         """No floor and no upright walls to lean on: what several keyframes agree on counts instead."""
         return FieldConfig(
+            labels=88, baselines_m=(0.1, 0.2, 0.4, 0.8),
             cost_cap=np.inf, p2=12.0, edge_grey=12.0, temperature=2.0, memory=1.5, memory_spread=0.15,
             outvote=3, per_spread=2.3, matched=0.05, tell_log=0.19, tell_m=np.inf,
         )  # fmt: skip

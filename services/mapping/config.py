@@ -15,12 +15,13 @@ Steps = Annotated[int, Field(ge=0, le=100_000)]
 class MappingConfig(NodeConfig):
     """Work is fixed: so many steps a keyframe, so many a tick. `threads` are the rasterizer's."""
 
+    nice: Annotated[int, Field(ge=0, le=19)] = 5  # whoever feeds the map comes before it
     half_steps: Steps = 18  # per keyframe, at half size
     full_steps: Steps = 5
     tick_steps: Steps = 6  # per tick while no keyframe waits, at full size
     mend_steps: Steps = 30  # after anchors have moved: seams
     final_steps: Steps = 0  # when the data have ended, on all keyframes
-    calm_backlog: Annotated[int, Field(ge=1)] = 16  # more keyframes wait on the robot: fewer steps for each
+    calm_backlog: Annotated[int, Field(ge=1)] = 5  # more keyframes wait on the robot: fewer steps for each
     max_gaussians: Annotated[int, Field(ge=1000)] = 300_000
     max_keyframes: Annotated[int, Field(ge=4)] = 800
     refine_pose: bool = True

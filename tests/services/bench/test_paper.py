@@ -14,7 +14,15 @@ from common.trajectory import Trajectory
 from services.bench import paper
 from services.bench.paper_live import Costs, Seen
 from services.bench.paper_report import write_report
-from services.bench.paper_score import Truth, aligned_rmse, compared_poses, depth_errors, pose_errors, speed
+from services.bench.paper_score import (
+    Truth,
+    aligned_rmse,
+    compared_poses,
+    depth_errors,
+    pose_errors,
+    rigid_offset,
+    speed,
+)
 from services.bench.paper_svg import Curve, chart
 from services.deployment import faults
 from services.evaluation.drive import Drive
@@ -54,6 +62,15 @@ def test_errors_are_per_axis_after_aligning_the_first_pose_only(tmp_path):
     assert figures["orientation_rmse_rpy_rad"] == pytest.approx([0.0, 0.0, 0.1 / np.sqrt(3)], abs=1e-9)
     assert figures["poses"] == 3
     assert pose_errors(found[:1], true[:1]) == {"poses": 1}  # its error is zero by alignment
+
+
+def test_a_map_is_placed_by_all_poses():
+    random = np.random.default_rng(1)
+    true = np.array([pose(*random.normal(size=2), random.normal()) for _ in range(40)])
+    T = pose(0.03, -0.02, 0.004)
+    noise = [pose(*random.normal(0, 0.002, 2), random.normal(0, 0.001)) for _ in true]
+    found = np.linalg.inv(T) @ true @ np.array(noise)
+    np.testing.assert_allclose(rigid_offset(found, true), T, atol=0.002)
 
 
 def test_a_similarity_hides_the_scale_and_a_rigid_alignment_does_not():
