@@ -37,7 +37,7 @@ def assembled(chunks: dict[int, Any]) -> GaussianStore:
 def map_figures(seen: Seen, truth: Truth, T_world_map: np.ndarray) -> tuple[dict[str, Any], list[np.ndarray]]:
     """Figures of the map as the drive left it and, prefixed `refined_`, as it ended; pictures of the latter.
 
-    `T_world_map` places the map: the rigid offset of all poses, no scale. Pictures are (truth, render) side by side.
+    `T_world_map` places the map: the rigid offset of all poses, no scale. Pictures are (truth, render).
     """
     figures, pictures = _scored(seen.online_chunks or seen.chunks, seen, truth, T_world_map)
     if seen.online_chunks is not None and _revisions(seen.online_chunks) != _revisions(seen.chunks):

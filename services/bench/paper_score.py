@@ -45,7 +45,7 @@ def compared_poses(seen: Seen, truth: Truth) -> tuple[np.ndarray, np.ndarray, np
 
 
 def rigid_offset(T_found: np.ndarray, T_true: np.ndarray) -> np.ndarray:
-    """The rigid transform [4, 4] that best takes poses [N, 4, 4] to the true ones: mean turn, then mean shift.
+    """The rigid transform [4, 4] that best takes poses [N, 4, 4] to the true ones: mean turn, mean shift.
 
     For maps: one first pose a few millimetres off must not move the whole map.
     """
