@@ -25,7 +25,7 @@ def test_help_names_every_command_and_each_has_an_example():
 
     shown = beamsplat("--help").stdout
     for command in app.registered_commands:
-        name = command.name or command.callback.__name__
+        name = command.name or command.callback.__name__.replace("_", "-")
         assert name in shown
         helped = CliRunner().invoke(app, [name, "--help"])
         assert helped.exit_code == 0

@@ -46,7 +46,7 @@ def test_the_budget_holds_lap_after_lap_and_top_says_what_rests(paged):
 def test_resting_keyframes_take_turns(paged):
     _, node, _ = paged
     ever = set(node._mapper.keyframes)
-    for count in range(24):
+    for count in range(48):
         handle(node, "tick", Tick(stamp_ns=r.T0 + 24 * SECOND, count=count), {})
         assert used(node) <= BUDGET_MB * 1e6
         ever |= set(node._mapper.keyframes)
