@@ -79,8 +79,14 @@ class DepthNode(Node):
     def on_camera_image(self, image: Image) -> Outputs:
         """A picture; it may have to wait for its pose, which comes a scan later."""
         if self._undistort is not None:
+            if len(self._waiting) == _PICTURES:  # poses are late: the oldest makes room, and is counted
+                self._count_overtaken()
             self._waiting.append(image)
             yield from self._estimate_waiting()
+
+    def _count_overtaken(self) -> None:
+        self.overtaken += 1
+        self.detail = f"{self.overtaken} pictures overtaken"
 
     def _estimate_waiting(self) -> Outputs:
         """The newest picture that is ready; older ones are overtaken, and counted."""
@@ -88,11 +94,11 @@ class DepthNode(Node):
         while self._waiting:
             if self._needs_beams and self._waiting[0].stamp_ns > self._history.newest_pose_ns:
                 break
-            self.overtaken += image is not None
+            if image is not None:
+                self._count_overtaken()
             image = self._waiting.popleft()
         if image is None:
             return
-        self.detail = f"{self.overtaken} pictures overtaken" if self.overtaken else ""
         try:
             rgb = self._picture(image)
         except (UserError, ValueError) as error:

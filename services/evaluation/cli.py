@@ -39,7 +39,7 @@ def eval_depth(
     bag: BagArgument,
     truth: Annotated[Path, typer.Option(help="Folder of <stamp_ns>.png, or with depth_gt/ in it.")],
     poses: PosesOption = None,
-    source: SourceOption = "fastdepth",
+    source: SourceOption = "stixel",
     set_: SetOption = None,
     rig: RigOption = None,
     floor: FloorOption = None,
@@ -80,7 +80,7 @@ def depth(
     data: Annotated[Path, typer.Argument(help="A bag, recording or folder; or one picture (.jpg, .png).")],
     out: Annotated[Path, typer.Option(help="Folder for the pictures.")],
     poses: PosesOption = None,
-    source: SourceOption = "fastdepth",
+    source: SourceOption = "stixel",
     set_: SetOption = None,
     rig: RigOption = None,
     floor: FloorOption = None,
@@ -113,7 +113,7 @@ def depth(
 
 
 def bench_depth(
-    source: SourceOption = "fastdepth",
+    source: SourceOption = "stixel",
     frames: Annotated[int, typer.Option(min=5, help="Frames timed.")] = 60,
     as_json: JsonOption = False,
 ) -> None:

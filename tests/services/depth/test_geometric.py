@@ -98,3 +98,22 @@ def test_beams_that_the_truth_does_not_confirm_are_told():
     truth = np.full((10, 10), 2.0, np.float32)
     uv = np.array([[1.0, 1.0]] * 4)
     assert confirmed(truth, uv, np.array([2.0, 2.089, 2.091, 1.0])).tolist() == [True, True, False, False]
+
+
+def test_pictures_that_wait_in_vain_for_their_poses_are_counted():
+    from common.messages import CameraModel, Image, LidarModel, Rig
+    from services.depth.node import DepthNode
+
+    node = DepthNode(DepthNode.Config(source="stixel"))
+    node.configure()
+    camera = CameraModel(
+        width_px=64, height_px=48, fx_px=50.0, fy_px=50.0, cx_px=31.5, cy_px=23.5, T_body_camera=np.eye(4)
+    )
+    rig = Rig(stamp_ns=0, camera=camera, lidar=LidarModel(T_body_lidar=np.eye(4)), source="test")
+    list(node.on_rig(rig))
+    picture = np.zeros(64 * 48 * 3, np.uint8)
+    for k in range(1, 21):  # localization says nothing meanwhile
+        image = Image(stamp_ns=k * 10**8, width_px=64, height_px=48, encoding="rgb8", data=picture)
+        assert list(node.on_camera_image(image)) == []
+    assert node.overtaken == 12  # eight still wait
+    assert "12 pictures overtaken" in node.detail
