@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -66,6 +66,20 @@ def find_lidar(device: str, kinds: tuple[str, ...] = tuple(LIDAR_S)) -> Found | 
         if "cannot be opened" in answer.says or "permission" in answer.says:
             break  # it is the same for all kinds
     return Silent(device, "; ".join(heard))
+
+
+def answers_of(
+    places: Iterable[str], find: Callable[[str], Found | Silent], say: Callable[[str], None]
+) -> list[Found]:
+    """What answers at any of the places; `say` hears of each what it is."""
+    found = []
+    for place in places:
+        say(f"trying {place} ...")
+        answer = find(place)
+        say(f"  {answer.says}")
+        if isinstance(answer, Found):
+            found.append(answer)
+    return found
 
 
 def _first(

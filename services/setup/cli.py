@@ -86,17 +86,15 @@ def _verify(out: Path) -> None:
 # --- what is there ---
 
 
+def _say(text: str) -> None:
+    console.print(text, markup=False)
+
+
 def _find_camera(more: list[str]) -> Found | None:
-    from services.discover import Found, camera_places, find_camera
+    from services.discover import answers_of, camera_places, find_camera
 
     console.rule("Camera", align="left")
-    answers = []
-    for source in (*more, *camera_places()):
-        console.print(f"trying {source} ...")
-        answer = find_camera(source)
-        console.print(f"  {answer.says}", markup=False)
-        if isinstance(answer, Found):
-            answers.append(answer)
+    answers = answers_of((*more, *camera_places()), find_camera, _say)
     chosen = _choose("camera", answers, [str(a.options["source"]) for a in answers])
     if chosen is None:
         console.print("No camera: the robot will be localized by its lidar alone, and no map is painted.")
@@ -106,16 +104,10 @@ def _find_camera(more: list[str]) -> Found | None:
 
 
 def _find_lidar(more: list[str]) -> Found | None:
-    from services.discover import Found, find_lidar, lidar_places
+    from services.discover import answers_of, find_lidar, lidar_places
 
     console.rule("Lidar", align="left")
-    answers = []
-    for place in (*more, *lidar_places()):
-        console.print(f"trying {place} ...")
-        answer = find_lidar(place)
-        console.print(f"  {answer.says}", markup=False)
-        if isinstance(answer, Found):
-            answers.append(answer)
+    answers = answers_of((*more, *lidar_places()), find_lidar, _say)
     chosen = _choose("lidar", answers, [f"{a.options['kind']} at {a.options['device']}" for a in answers])
     if chosen is not None:
         _show_scan(chosen.first)
