@@ -19,7 +19,7 @@ from common.strict import Config
 from common.topics import HEALTH, TOPICS
 
 ROOT = "beamsplat"
-READ_ONLY_QUERIES = ("snapshot", "params")
+READ_ONLY_QUERIES = ("snapshot", "state", "params")
 _DECLARE = ["declare_subscriber", "declare_queryable", "liveliness_token", "liveliness_query",
             "declare_liveliness_subscriber"]  # fmt: skip
 _ANY = ["put", "delete", "query", "reply", *_DECLARE]

@@ -52,13 +52,24 @@ class KeyframeAck(Message):
 
 class MapChunk(Message):
     """The Gaussians bound to one anchor, in the anchor's frame, packed by common.splats. A newer `revision`
-    replaces all of the older one; none left (`count` 0) takes the chunk away."""
+    replaces all of the older one, as does the same one in finer cells; `count` 0 takes it away."""
+
+    version = "1.1"
 
     anchor_id: Annotated[int, Field(ge=-1, lt=2**63)]
     revision: Count
     T_map_anchor: Transform
     count: Count
     packed: Annotated[np.ndarray, Array("uint8", "B")]
+    cell_m: NonNegative = 0.0  # Gaussians within such a cell are merged into one; 0 = none are; since 1.1
+
+
+class MapState(Message):
+    """A piece of a mapper's whole state, as its checkpoint holds it (an .npz), for who asks."""
+
+    first: Count  # byte of the state with which `data` begins
+    total: Count  # bytes of the state
+    data: Annotated[np.ndarray, Array("uint8", "B")]
 
 
 class MapPoses(Message):

@@ -12,7 +12,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from common.map_messages import Keyframe, KeyframeAck, MapChunk, MapPoses, MapPreview, MapStatus
+from common.map_messages import Keyframe, KeyframeAck, MapChunk, MapPoses, MapPreview, MapState, MapStatus
 from common.schema import (
     Array,
     Count,
@@ -239,7 +239,7 @@ MESSAGES: dict[str, type[Message]] = {
     cls.schema_name(): cls
     for cls in (
         Rig, Image, Scan, WheelOdometry, ExternalPose, Odometry, Correction, Anchors, MovingBeams, Grid,
-        DepthEstimate, FusedDepth, Cloud, Keyframe, KeyframeAck, MapChunk, MapPoses, MapPreview, MapStatus,
-        Tick, Health, Answer,
+        DepthEstimate, FusedDepth, Cloud, Keyframe, KeyframeAck, MapChunk, MapPoses, MapPreview, MapState,
+        MapStatus, Tick, Health, Answer,
     )
 }  # fmt: skip

@@ -10,7 +10,7 @@ SOURCES = sorted([*ROOT.glob("common/**/*.py"), *ROOT.glob("services/**/*.py")])
 MAX_LINES = 320
 
 # Files of a service that may know messages, the bus and the command line. All others are libraries.
-SHELLS = {"node.py", "config.py", "cli.py", "__main__.py"}
+SHELLS = {"node.py", "config.py", "messages.py", "cli.py", "__main__.py"}
 SHELL_ONLY = ("zenoh", "common.bus", "common.streams", "common.queries", "common.live", "common.lockstep",
               "common.topics", "common.messages", "common.map_messages", "common.sensor_models", "common.node", "common.config", "common.registry")  # fmt: skip
 NOT_A_SERVICE = {"bench", "evaluation"}  # they measure the whole house

@@ -27,6 +27,7 @@ class MappingConfig(NodeConfig):
     refine_pose: bool = True
     refine_exposure: bool = True
     chunk_every: Annotated[int, Field(ge=1)] = 2  # keyframes between two versions of the newest chunk
+    chunk_error_px: Annotated[float, Field(gt=0.0)] = 1.0  # finer detail, seen from the robot, is not sent
     seed: int = 0
     save: Path | None = None  # folder for splats.ply and keyframes.tum, written at the end of the data
     session: Path | None = None  # folder that the map lives in: saved while mapping, resumed at the start

@@ -5,40 +5,36 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Iterator
+from functools import lru_cache
 
-import cv2
 import numpy as np
 
-from common.camera import Pinhole, Undistorter
+from common.camera import Undistorter
 from common.codec import decode, encode, schema_of
-from common.depth_code import depth_from_png, mask_from_png, sigma_from_png
 from common.errors import UserError
 from common.geometry import inverse
 from common.messages import (
     Anchors,
-    CameraModel,
     Keyframe,
     KeyframeAck,
     MapChunk,
     MapPoses,
-    MapPreview,
+    MapState,
     MapStatus,
     Tick,
 )  # fmt: skip
 from common.node import Input, Job, Node, Outputs
-from common.picture import decode_rgb
-from common.raster.camera import RasterCamera
-from common.splats import pack
+from services.mapping.chunks import ChunkFeed, Eye, parts
 from services.mapping.config import MappingConfig
 from services.mapping.export import write_map
 from services.mapping.keyframe import Held
-from services.mapping.keyframe import Keyframe as MapKeyframe
 from services.mapping.look import look
 from services.mapping.mapper import FULL, HALF, Mapper, Outcome
+from services.mapping.messages import chunk_message, eye_of, open_keyframe, preview_message, state_messages
 from services.mapping.session.keeper import Keeper, Saved
 from services.mapping.session.paging import Pager
+from services.mapping.session.state import arrays_of
 from services.mapping.settings import MapperSettings
-from services.mapping.store import moved
 from services.mapping.warm import warm
 
 log = logging.getLogger("beamsplat.mapping")
@@ -64,10 +60,11 @@ class MappingNode(Node):
             max_keyframes=c.max_keyframes, refine_pose=c.refine_pose, refine_exposure=c.refine_exposure,
         )  # fmt: skip
         self._mapper = Mapper(settings, seed=c.seed, threads=c.threads)
-        self._lens: dict[Pinhole, Undistorter] = {}
+        self._lens = lru_cache(maxsize=4)(Undistorter)  # its maps are made once a calibration
         self._taken: dict[int, tuple[int, np.ndarray]] = {}  # keyframe -> stamp_ns, T_camera_body
-        self._sent: dict[int, tuple[int, int]] = {}  # anchor -> version sent, when (counted)
-        self._clock = self._refused = 0  # messages with chunks, keyframes refused so far
+        self._feed = ChunkFeed()
+        self._eye: Eye | None = None  # where the newest keyframe looks from
+        self._refused = 0  # keyframes, so far
         # The oldest submap's place when the origin was tied to it.
         self._T_oldest_origin: np.ndarray | None = None
         if c.memory_mb is not None and c.session is None:
@@ -86,7 +83,7 @@ class MappingNode(Node):
     def _resume(self, keeper: Keeper) -> None:
         """Becomes what was saved; keyframes that came after the checkpoint are taken in again."""
         m = self._mapper
-        extra, newer = keeper.resume(m, lambda schema, body: self._open(decode(schema, body)))
+        extra, newer = keeper.resume(m, lambda schema, body: open_keyframe(decode(schema, body), self._lens))
         if extra:
             rows = zip(extra["taken_stamp_ns"].tolist(), extra["taken_T_camera_body"])
             self._taken = dict(zip(extra["taken_id"].tolist(), rows))
@@ -148,7 +145,7 @@ class MappingNode(Node):
 
     def _take(self, message: Keyframe) -> Outcome:
         try:
-            frame = self._open(message)
+            frame = open_keyframe(message, self._lens)
         except (UserError, ValueError) as error:
             return Outcome(str(error))
         outcome = self._mapper.add(frame, message.T_map_anchor)
@@ -162,36 +159,6 @@ class MappingNode(Node):
         if keeper is None or (known and not keeper.lacks(message.id)):
             return True
         return keeper.keep(message.id, schema_of(message), encode(message))
-
-    def _open(self, message: Keyframe) -> MapKeyframe:
-        """Decoded and undistorted: everything behind sees a pinhole.
-
-        Raises:
-            UserError, ValueError: picture, depth, sigma or mask do not decode, or are of another size.
-        """
-        undistort = self._undistorter(message.camera)
-        p = undistort.pinhole
-        rgb = decode_rgb(message.picture, message.encoding, p.width_px, p.height_px)
-        mask = mask_from_png(message.mask_png) if len(message.mask_png) else None
-        return MapKeyframe(
-            id=message.id, rgb=undistort(rgb),
-            camera=RasterCamera(p.fx_px, p.fy_px, p.cx_px, p.cy_px, p.width_px, p.height_px),
-            T_anchor_camera=message.T_anchor_body @ message.camera.T_body_camera,
-            depth_m=depth_from_png(message.depth_png), sigma_m=sigma_from_png(message.sigma_png),
-            anchor=message.anchor_id, beams_uvz=message.beams[:, :3].astype(np.float64), mask=mask,
-        )  # fmt: skip
-
-    def _undistorter(self, camera: CameraModel) -> Undistorter:
-        """Its maps are made once a calibration; a few are kept."""
-        lens = Pinhole(
-            camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px, camera.width_px, camera.height_px,
-            camera.distortion_model, camera.distortion,
-        )  # fmt: skip
-        if lens not in self._lens:
-            if len(self._lens) >= 4:
-                self._lens.pop(next(iter(self._lens)))
-            self._lens[lens] = Undistorter(lens)
-        return self._lens[lens]
 
     # --- anchors and time ---
 
@@ -219,10 +186,8 @@ class MappingNode(Node):
         if not self._mapper.keyframes:
             return
         self._mapper.refine(self.config.tick_steps, FULL)
-        versions = self._mapper.store.versions()
-        stale = [a for a, version in versions.items() if self._sent.get(a, (-1, 0))[0] != version]
-        if stale:
-            longest = min(stale, key=lambda a: (self._sent.get(a, (-1, -1))[1], a))
+        longest = self._feed.longest_due(self._mapper, self._eye)
+        if longest is not None:
             yield from self._chunk(longest, tick.stamp_ns)
         yield from self._checkpoint(tick.stamp_ns)
 
@@ -230,18 +195,17 @@ class MappingNode(Node):
 
     def _show(self, message: Keyframe, outcome: Outcome, loss: float) -> Outputs:
         view = look(self._mapper, message.id)
-        bgr = cv2.cvtColor(view.rgb, cv2.COLOR_RGB2BGR)
-        render = cv2.imencode(".jpg", bgr, (cv2.IMWRITE_JPEG_QUALITY, 85))[1].ravel()
-        preview = MapPreview(
-            stamp_ns=message.stamp_ns, keyframe_id=message.id, render=render, T_map_camera=view.T_map_camera
-        )  # fmt: skip
-        yield "mapping/preview", preview
+        self._eye = Eye(view.T_map_camera[:3, 3], message.camera.fx_px, self.config.chunk_error_px)
+        yield "mapping/preview", preview_message(message, view)
         status = self._status(message.stamp_ns, outcome, loss, view.psnr_db, view.depth_error_m)
         yield "mapping/status", status
 
     def _held(self) -> dict[int, Held]:
         """All keyframes, those on disk too."""
-        return self._mapper.keyframes | ({} if self._keeper is None else self._keeper.parked)
+        return self._mapper.keyframes | self._parked()
+
+    def _parked(self) -> dict[int, Held]:
+        return {} if self._keeper is None else self._keeper.parked
 
     def _status(
         self, stamp_ns: int, outcome: Outcome, loss: float, psnr_db: float = math.nan,
@@ -260,27 +224,23 @@ class MappingNode(Node):
             session=session,
         )  # fmt: skip
 
-    def _chunk(self, anchor: int, stamp_ns: int) -> Outputs:
-        """An anchor's Gaussians, unless this version has been sent."""
-        version = self._mapper.store.versions().get(anchor)
-        if version is None or self._sent.get(anchor, (-1, 0))[0] == version:
-            return
-        self._clock += 1
-        self._sent[anchor] = (version, self._clock)
-        yield "mapping/chunk", self._packed(anchor, version, stamp_ns)
-
-    def _packed(self, anchor: int, version: int, stamp_ns: int) -> MapChunk:
-        T_map_anchor = self._mapper.T_map_anchor[anchor]
-        params = moved(self._mapper.store.chunk(anchor), inverse(T_map_anchor))
-        return MapChunk(
-            stamp_ns=stamp_ns, anchor_id=anchor, revision=version, T_map_anchor=T_map_anchor,
-            count=params.shape[1], packed=pack(params),
-        )  # fmt: skip
+    def _chunk(self, anchor: int, stamp_ns: int, whole: bool = False) -> Outputs:
+        """An anchor's Gaussians, unless viewers have all of them that show; `whole`: all detail."""
+        part = self._feed.take(self._mapper, anchor, None if whole else self._eye)
+        if part is not None:
+            yield "mapping/chunk", chunk_message(self._mapper.T_map_anchor[anchor], anchor, part, stamp_ns)
 
     def on_query_snapshot(self, parameters: dict[str, str]) -> Iterator[MapChunk]:
-        """The whole map, chunk by chunk, for who comes late."""
-        for anchor, version in self._mapper.store.versions().items():
-            yield self._packed(anchor, version, 0)
+        """The whole map, chunk by chunk, for who comes late; `from=X,Y,Z` (m, map), `focal_px` and `error_px`
+        leave out the detail that cannot be seen from there."""
+        for anchor, part in parts(self._mapper, eye_of(parameters)).items():
+            yield chunk_message(self._mapper.T_map_anchor[anchor], anchor, part, 0)
+
+    def on_query_state(self, parameters: dict[str, str]) -> Iterator[MapState]:
+        """All that a checkpoint holds, as it is now, in pieces."""
+        if not self._mapper.keyframes:
+            raise UserError("the map is empty so far")
+        yield from state_messages(arrays_of(self._mapper, self._extra(), self._parked()))
 
     def drain(self) -> Outputs:
         """The map as the data left it; then, if asked for, refined; and the files asked for."""
@@ -298,7 +258,7 @@ class MappingNode(Node):
         stamps_ns, T_map_body, ids = self._poses()
         last_ns = int(stamps_ns[-1])
         for anchor in m.store.versions():
-            yield from self._chunk(anchor, last_ns)
+            yield from self._chunk(anchor, last_ns, whole=True)
         poses = MapPoses(stamp_ns=last_ns, keyframe_ids=ids, stamps_ns=stamps_ns, T_map_body=T_map_body)
         yield "mapping/poses", poses
 

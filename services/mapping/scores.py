@@ -38,18 +38,22 @@ def render_rgb_depth(
     return rgb, depth, alpha
 
 
+def psnr_db(a: np.ndarray, b: np.ndarray) -> float:
+    """Of two pictures in [0, 1]; 120 dB where they are the same."""
+    return float(-10.0 * np.log10(max(float(np.mean((a - b) ** 2)), 1e-12)))
+
+
 def score_view(
     rgb: np.ndarray, depth: np.ndarray, true_rgb: np.ndarray, true_depth: np.ndarray | None
 ) -> ViewScore:
     """Rendered against true: rgb float32 in [0, 1], true_rgb uint8, depths in metres, NaN unknown."""
     truth = true_rgb.astype(np.float32) / 255.0
-    error = float(np.mean((rgb - truth) ** 2))
     l1 = float("nan")
     if true_depth is not None:
         known = np.isfinite(true_depth)
         shown = np.where(np.isfinite(depth[known]), depth[known], 0.0)
         l1 = float(np.mean(np.minimum(np.abs(shown - true_depth[known]), true_depth[known])))
-    return ViewScore(-10.0 * np.log10(max(error, 1e-12)), ssim(rgb, truth), l1)
+    return ViewScore(psnr_db(rgb, truth), ssim(rgb, truth), l1)
 
 
 def fused_surface(

@@ -23,6 +23,7 @@ from common.messages import (
     MapChunk,
     MapPoses,
     MapPreview,
+    MapState,
     MapStatus,
     Message,
     MovingBeams,
@@ -96,6 +97,7 @@ def sample_messages() -> list[Message]:
         MapChunk(
             stamp_ns=27, anchor_id=7, revision=4, T_map_anchor=T[1], count=2, packed=np.arange(9, dtype=np.uint8),
         ),
+        MapState(stamp_ns=27, first=4, total=9, data=np.arange(5, dtype=np.uint8)),
         MapPoses(
             stamp_ns=28, keyframe_ids=np.array([26, 30]), stamps_ns=np.array([26, 30]), T_map_body=T,
         ),

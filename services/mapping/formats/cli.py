@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -15,25 +16,38 @@ FORMATS = {
     "ply": "map.ply", "gltf": "map.glb", "spz": "map.spz", "points": "points.ply", "mesh": "mesh.ply",
     "nav2": "nav2",
 }  # fmt: skip
-SessionArgument = Annotated[Path, typer.Argument(help="Folder written by `mapping.session = DIR`")]
+SessionArgument = Annotated[
+    Path,
+    typer.Argument(
+        help="Folder written by `mapping.session = DIR`; or the deployment file (.toml) of a running system, "
+        "whose mapper is asked"
+    ),
+]
 ThreadsOption = Annotated[int, typer.Option(min=1, help="Threads of the rasterizer")]
 _RESOLUTION_M = 0.05
 _LEAST_FACES = 60  # of a piece of mesh: less is a crumb
+_PATIENCE_S = 120.0  # of a mapper that has a keyframe in hand, over a slow link
+_LATCHED_S = 2.0
+_VIEWS = 12  # from which the cost of leaving detail out is measured
 
 
 def export(
     session: SessionArgument,
     to: Annotated[str, typer.Option(help=f"One of {', '.join(FORMATS)}")],
     out: Annotated[
-        Path | None, typer.Option(help="File (nav2: folder); default: named after the format, in the session")
+        Path | None,
+        typer.Option(help="File (nav2: folder); default: named after the format, in the session, or here"),
     ] = None,
+    detail_m: Annotated[
+        float, typer.Option(min=0.0, help="ply, gltf, spz: Gaussians in a cell of that edge become one")
+    ] = 0.0,
     cell_m: Annotated[float, typer.Option(min=0.002, help="points: between points")] = 0.02,
     voxel_m: Annotated[float, typer.Option(min=0.005, help="mesh: finest detail")] = 0.04,
     low_m: Annotated[float, typer.Option(help="nav2: what stands higher than this is in the way")] = 0.10,
     high_m: Annotated[float, typer.Option(help="nav2: what hangs higher than this is not")] = 1.50,
     threads: ThreadsOption = 2,
 ) -> None:
-    """Writes a saved map for other programs; at any time, also while a mapper saves to it.
+    """Writes a map for other programs; at any time, also while it is being made.
 
     ply: 3DGS layout. gltf: .glb with KHR_gaussian_splatting. spz: Niantic's, small. points: coloured points.
     mesh: coloured triangles. nav2: map.yaml (both), lidar.yaml, camera.yaml (what the lidar's plane misses).
@@ -44,27 +58,30 @@ def export(
         beamsplat export map --to spz
 
         beamsplat export map --to mesh --voxel-m 0.03 --out house.ply
+
+        beamsplat export deploy/demo.toml --to spz --detail-m 0.04 --out far.spz
     """
     from services.mapping.session.state import store_of
 
     if to not in FORMATS:
         raise UserError(f"--to {to!r}: there are {', '.join(FORMATS)}")
-    folder, arrays = _open(session)
-    store, path = store_of(arrays), out or session / FORMATS[to]
-    params = store.params[:, : store.count]
-    if to == "gltf" and path.suffix != ".glb":
-        raise UserError(f"--out {path}: glTF is written in its binary form; expected a name ending in .glb")
+    path = out or (Path() if _running(session) else session) / FORMATS[to]
+    ending = Path(FORMATS[to]).suffix
+    if path.suffix != ending:
+        expected = f"a name ending in {ending}" if ending else "a folder, which has no ending"
+        raise UserError(f"--out {path}: expected {expected} for --to {to}")
+    arrays, lidar = _open(session)
+    store = store_of(arrays)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         if to in ("ply", "gltf", "spz"):
-            _writer(to)(path, params)
-            text = f"{store.count} Gaussians"
+            text = _gaussians(path, to, store, arrays, detail_m, threads)
         elif to == "points":
             text = _points(path, store, arrays, cell_m, threads)
         elif to == "mesh":
             text = _mesh(path, store, arrays, voxel_m, threads)
         else:
-            text = _nav2(path, folder, store, arrays, (low_m, high_m), threads)
+            text = _nav2(path, lidar, store, arrays, (low_m, high_m), threads)
     except (OSError, ValueError) as error:
         if isinstance(error, UserError):
             raise
@@ -72,14 +89,86 @@ def export(
     print(f"{path}: {text}")
 
 
-def _open(session: Path) -> tuple[Any, dict[str, Any]]:
+def _running(session: Path) -> bool:
+    return session.suffix == ".toml"
+
+
+def _open(session: Path) -> tuple[dict[str, Any], Callable[[], Any]]:
+    """(arrays of the map's state, what gives the lidar's OccupancyGrid or None), from disk or a mapper."""
+    if _running(session):
+        return _asked(session)
+    from services.mapping.session.cli import ROBOT_MANIFEST, load_slam
     from services.mapping.session.folder import SessionFolder
 
     folder = SessionFolder(session)
     arrays = folder.read_state()
     if arrays is None:
         raise UserError(f"{session}: nothing has been saved in this session yet")
-    return folder, arrays
+    there = (folder.robot / ROBOT_MANIFEST).is_file()
+    return arrays, lambda: load_slam(folder.robot).grid(_RESOLUTION_M) if there else None
+
+
+def _asked(file: Path) -> tuple[dict[str, Any], Callable[[], Any]]:
+    from common.bus import open_session
+    from common.config import load_deployment
+    from common.queries import ask
+    from services.mapping.messages import joined_state
+
+    deployment = load_deployment(file)
+    with open_session(deployment.router.listen, wait_s=2.0) as session:
+        arrays = joined_state(list(ask(session, deployment.robot, "mapping", "state", {}, _PATIENCE_S)))
+        grid = _latched_grid(session, deployment.robot)
+    return arrays, lambda: grid
+
+
+def _latched_grid(session: Any, robot: str) -> Any:
+    """The lidar's OccupancyGrid as localization said it last; None where none comes."""
+    import queue
+
+    from common.bus import key
+    from common.streams import declare_reader, open_sample
+    from common.topics import topic
+    from services.localization.lidar2d.occupancy import OccupancyGrid
+
+    row, said = topic("localization/grid"), queue.SimpleQueue()
+    _kept = declare_reader(session, key(robot, row.name), row, "latched", said.put)
+    try:
+        grid = open_sample(said.get(timeout=_LATCHED_S), row).message
+    except queue.Empty:
+        return None
+    return OccupancyGrid(grid.occupancy, *map(float, grid.origin_m), grid.resolution_m)
+
+
+def _gaussians(path: Path, to: str, store: Any, arrays: dict[str, Any], detail_m: float, threads: int) -> str:
+    from services.mapping.detail import coarser
+
+    whole = store.params[:, : store.count]
+    params = coarser(whole, detail_m)
+    _writer(to)(path, params)
+    text = f"{params.shape[1]} Gaussians"
+    if params is whole:
+        return text
+    psnr_db = _cost_db(store, params, arrays, threads)
+    return f"{text} for {store.count}; {psnr_db:.1f} dB to the whole map, from the drive's own views"
+
+
+def _cost_db(store: Any, params: Any, arrays: dict[str, Any], threads: int) -> float:
+    """Mean PSNR of coarse Gaussians against all of them."""
+    import numpy as np
+
+    from services.mapping.formats.film import pictures
+    from services.mapping.scores import psnr_db
+    from services.mapping.session.state import views_of
+    from services.mapping.store import GaussianStore
+
+    views = views_of(arrays)
+    views = views[:: -(-len(views) // _VIEWS) or 1]
+    if not views:
+        return float("nan")
+    coarse, poses = GaussianStore(), [view.T_map_camera for view in views]
+    coarse.add(params, 0)
+    pairs = zip(*(pictures(s, views[0].camera, poses, threads) for s in (store, coarse)))
+    return float(np.mean([psnr_db(a / 255.0, b / 255.0) for a, b in pairs]))
 
 
 def _writer(to: str) -> Any:
@@ -138,28 +227,32 @@ def _mesh(path: Path, store: Any, arrays: dict[str, Any], voxel_m: float, thread
 
 
 def _nav2(
-    path: Path, folder: Any, store: Any, arrays: dict[str, Any], band_m: tuple[float, float], threads: int
+    path: Path,
+    lidar_grid: Callable[[], Any],
+    store: Any,
+    arrays: dict[str, Any],
+    band_m: tuple[float, float],
+    threads: int,
 ) -> str:
     from services.localization.lidar2d.occupancy import FREE, OCCUPIED, OccupancyGrid, save_nav2
     from services.mapping.formats.nav2 import camera_layer, combined, grid_around
     from services.mapping.formats.surface import surface_points
-    from services.mapping.session.cli import ROBOT_MANIFEST, load_slam
 
     points, _ = surface_points(_views(store, arrays, threads), 0.4 * _RESOLUTION_M)
     if len(points) == 0:
         raise UserError("the map shows no surface from its keyframes")
-    lidar = load_slam(folder.robot).grid(_RESOLUTION_M) if (folder.robot / ROBOT_MANIFEST).is_file() else None
+    lidar = lidar_grid()
     if lidar is None:
         origin, shape = grid_around(points, _RESOLUTION_M)
         camera = camera_layer(points, origin, shape, _RESOLUTION_M, *band_m)
         save_nav2(OccupancyGrid(camera, *origin, _RESOLUTION_M), path, "camera")
         save_nav2(OccupancyGrid(camera, *origin, _RESOLUTION_M), path)
         return "map.yaml, camera.yaml (no lidar layer: `beamsplat session join` puts the robot's half in)"
-    origin = (lidar.origin_x_m, lidar.origin_y_m)
-    camera = camera_layer(points, origin, lidar.values.shape, _RESOLUTION_M, *band_m)
+    origin, cell_m = (lidar.origin_x_m, lidar.origin_y_m), lidar.resolution_m
+    camera = camera_layer(points, origin, lidar.values.shape, cell_m, *band_m)
     both = combined(lidar.values, camera, OCCUPIED, FREE)
     for name, values in (("map", both), ("lidar", lidar.values), ("camera", camera)):
-        save_nav2(OccupancyGrid(values, *origin, _RESOLUTION_M), path, name)
+        save_nav2(OccupancyGrid(values, *origin, cell_m), path, name)
     return "map.yaml, lidar.yaml, camera.yaml"
 
 
@@ -172,7 +265,7 @@ def render(
     width: Annotated[int, typer.Option(min=0, help="Pixels; 0: as the keyframes")] = 0,
     threads: ThreadsOption = 2,
 ) -> None:
-    """Films a saved map: round it, along its own drive, or along a path of yours.
+    """Films a map: round it, along its own drive, or along a path of yours.
 
     Examples:
 
@@ -185,7 +278,7 @@ def render(
     from services.mapping.formats.film import pictures, write_film
     from services.mapping.session.state import store_of, views_of
 
-    _, arrays = _open(session)
+    arrays, _ = _open(session)
     views, store = views_of(arrays), store_of(arrays)
     if not views:
         raise UserError(f"{session}: has no keyframes, so no camera to film with")

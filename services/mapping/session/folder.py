@@ -7,6 +7,7 @@ that it names is on the disk. One process at a time may write to a session; it h
 from __future__ import annotations
 
 import fcntl
+import io
 import json
 import os
 import struct
@@ -170,8 +171,7 @@ class SessionFolder:
                 raise UserError(
                     f"{path}: truncated ({size} bytes, {manifest['bytes']} expected); restore it from a copy"
                 )
-            with np.load(path, allow_pickle=False) as stored:
-                return {key: stored[key] for key in stored.files}
+            return unpacked_arrays(path)
         except (OSError, zipfile.BadZipFile, zlib.error, ValueError) as error:
             if isinstance(error, UserError):
                 raise
@@ -220,6 +220,23 @@ class SessionFolder:
 
     def _body(self, id: int) -> Path:
         return self.bodies / f"{id}.kf"
+
+
+def packed_arrays(arrays: Arrays) -> bytes:
+    """The bytes of a state, as they stand in its file."""
+    buffer = io.BytesIO()
+    np.savez(buffer, **arrays)
+    return buffer.getvalue()
+
+
+def unpacked_arrays(source: Path | bytes) -> Arrays:
+    """The state in a file, or in its bytes.
+
+    Raises:
+        OSError, ValueError, zipfile.BadZipFile, zlib.error: it is not whole.
+    """
+    with np.load(io.BytesIO(source) if isinstance(source, bytes) else source, allow_pickle=False) as stored:
+        return {key: stored[key] for key in stored.files}
 
 
 def write_durably(path: Path, data: bytes | memoryview) -> None:

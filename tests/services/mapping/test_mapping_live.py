@@ -5,11 +5,13 @@ import signal
 
 import pytest
 from plyfile import PlyData
+from typer.testing import CliRunner
 
 from common.bus import open_session
 from common.config import Deployment, RouterConfig
 from common.streams import open_sample
 from common.topics import topic
+from services.__main__ import app
 from services.board import HealthBoard
 from services.mapping.session.folder import SessionFolder
 from services.supervisor import Supervisor
@@ -70,6 +72,32 @@ def test_a_killed_mapper_gets_again_what_it_had_not_acknowledged(deployment):
         poll(supervisor, lambda: supervisor.children["mapping"].process.pid != first, 5)
         poll(supervisor, lambda: state(board, "mapping") == "drained", 120)
         poll(supervisor, lambda: " 0 not acknowledged" in detail(board, "keyframes"), 10)
+
+
+@pytest.mark.slow
+def test_a_running_mapper_gives_its_map_away(deployment, tmp_path):
+    """Without a session on disk: `export` asks, while keyframes go on coming."""
+    live = deployment(60)
+    file = tmp_path / "robot.toml"
+    file.write_text(f'robot = "test"\n[router]\nlisten = {list(live.router.listen)}\n[nodes.mapping]\n')
+
+    def export(to, *words):
+        out = tmp_path / f"now.{to}"
+        words = ("export", str(file), "--to", to, "--out", str(out), *words)
+        result = CliRunner().invoke(app, words, catch_exceptions=False)
+        assert result.exit_code == 0
+        return out, result.stdout
+
+    with Supervisor(live, table=TABLE) as supervisor, open_session(live.router.listen) as session:
+        board = HealthBoard(session, "test")
+        poll(supervisor, lambda: "4 keyframes" in detail(board, "mapping"), 90)
+        whole, _ = export("ply")
+        coarse, said = export("spz", "--detail-m", "0.2")
+        poll(supervisor, lambda: state(board, "mapping") == "drained", 120)
+    made = PlyData.read(whole)["vertex"].count
+    assert 1000 < made < PlyData.read(tmp_path / "map" / "splats.ply")["vertex"].count
+    assert coarse.stat().st_size < 0.5 * whole.stat().st_size
+    assert "dB to the whole map" in said
 
 
 def heard(session, name):

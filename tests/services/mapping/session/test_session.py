@@ -21,6 +21,7 @@ from services.keyframes.node import KeyframesConfig, KeyframesNode
 from services.mapping.config import MappingConfig
 from services.mapping.keyframe import Held
 from services.mapping.mapper import FULL, HALF, Mapper
+from services.mapping.messages import open_keyframe
 from services.mapping.node import MappingNode
 from services.mapping.session.folder import EDGE_MANIFEST, MANIFEST, SessionFolder
 from services.mapping.session.keeper import Keeper
@@ -71,7 +72,7 @@ def test_training_goes_on_as_if_nothing_had_happened(saved, copy):
     ours = Mapper(saved[1]._mapper.settings)  # a second mapper from memory: the saved node stays as it is
     bodies = SessionFolder(copy)
     arrays = arrays_of(saved[1]._mapper)
-    assert restore(ours, arrays, lambda id: loaded._open(message((id - r.T0) // SECOND))) == []
+    assert restore(ours, arrays, lambda id: open_keyframe(message((id - r.T0) // SECOND), loaded._lens)) == []
     losses = [[m.step(m._draw(), HALF), m.refine(3), m.step(m._draw(), FULL)] for m in (ours, loaded._mapper)]
     assert losses[0] == losses[1]
     a, b = arrays_of(ours), arrays_of(loaded._mapper)

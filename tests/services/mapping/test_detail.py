@@ -1,0 +1,134 @@
+"""Level of detail: what merging keeps, what it costs from afar, and when viewers get more of it."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from common.errors import UserError
+from common.geometry import inverse, make_transform
+from common.raster.camera import RasterCamera
+from common.raster.layout import COLOUR, MEAN, OPACITY, QUAT, SCALE
+from common.raster.rasterizer import Rasterizer
+from services.mapping.chunks import ChunkFeed, Eye, parts
+from services.mapping.detail import FINEST_CELL_M, cell_for, coarser
+from services.mapping.mapper import Mapper
+from services.mapping.messages import eye_of, joined_state, state_messages
+from services.mapping.scores import psnr_db
+from services.mapping.settings import MapperSettings
+from services.mapping.store import GaussianStore
+
+
+def wall(count=60_000, seed=0):
+    """Discs of 6 mm on a wall of 4 x 3 m that stands 1 m off the origin; two colours, in stripes of 40 cm."""
+    random = np.random.default_rng(seed)
+    params = np.zeros((14, count), np.float32)
+    params[MEAN:SCALE] = np.stack(
+        [random.uniform(-2, 2, count), random.uniform(-1.5, 1.5, count), np.ones(count)]
+    )
+    params[SCALE:QUAT] = np.log(np.array([0.006, 0.006, 0.001]))[:, None]
+    params[QUAT] = 1.0
+    params[OPACITY] = 3.0
+    striped = np.floor(params[MEAN] / 0.4) % 2 == 0
+    params[COLOUR:] = np.where(striped, np.array([[0.8], [0.3], [0.2]]), np.array([[0.2], [0.4], [0.7]]))
+    return params
+
+
+CAMERA = RasterCamera(280.0, 280.0, 159.5, 119.5, 320, 240)
+
+
+def seen(params, distance_m):
+    rasterizer, store = Rasterizer(1), GaussianStore()
+    store.add(params, 0)
+    back = make_transform(np.eye(3), np.array([0.0, 0.0, 1.0 - distance_m]))
+    image = rasterizer.render(store.params, store.count, CAMERA, inverse(back)).image
+    return np.clip(image[:3], 0.0, 1.0).copy()
+
+
+def test_no_cell_no_change():
+    params = wall(100)
+    assert coarser(params, 0.0) is params
+    assert coarser(params, 0.001) is params  # all are larger than that
+
+
+@given(st.integers(0, 50), st.sampled_from([0.05, 0.1, 0.4]))
+@settings(max_examples=20, deadline=None)
+def test_merged_gaussians_keep_place_colour_and_plane(seed, cell_m):
+    params = wall(3000, seed)
+    merged = coarser(params, cell_m)
+    assert merged.shape[1] < params.shape[1]
+    assert np.all(np.isfinite(merged))
+    cells = {tuple(c) for c in np.floor(params[MEAN:SCALE].T.astype(float) / cell_m).astype(int)}
+    assert merged.shape[1] == len(cells)
+    assert np.abs(merged[MEAN + 2] - 1.0).max() < 1e-4  # on the wall, m
+    np.testing.assert_allclose(np.linalg.norm(merged[QUAT:OPACITY], axis=0), 1.0, atol=1e-5)
+    assert np.exp(merged[SCALE:QUAT]).min(axis=0).max() < 0.002  # as thin
+    low, high = params[COLOUR:].min(axis=1), params[COLOUR:].max(axis=1)
+    assert np.all(merged[COLOUR:] >= low[:, None] - 1e-5)
+    assert np.all(merged[COLOUR:] <= high[:, None] + 1e-5)
+
+
+def test_larger_ones_stay_themselves():
+    params = wall(500)
+    params[SCALE:QUAT, :3] = np.log(0.5)
+    np.testing.assert_array_equal(coarser(params, 0.1)[:, :3], params[:, :3])
+
+
+@pytest.mark.parametrize("distance_m", [12.0, 24.0])
+def test_a_pixels_worth_of_detail_costs_little_where_it_cannot_be_seen(distance_m):
+    params = wall()
+    cell_m = cell_for(distance_m, 280.0, 1.0)
+    merged = coarser(params, cell_m)
+    assert merged.shape[1] < 0.3 * params.shape[1]
+    assert psnr_db(seen(params, distance_m), seen(merged, distance_m)) > 30.0
+
+
+def test_cells_grow_by_twos_with_the_distance():
+    assert cell_for(5.0, 280.0, 1.0) == 0.0  # 18 mm
+    assert cell_for(5.7, 280.0, 1.0) == FINEST_CELL_M
+    assert cell_for(11.3, 280.0, 1.0) == 2 * FINEST_CELL_M
+    assert cell_for(11.3, 280.0, 2.0) == 4 * FINEST_CELL_M
+
+
+def test_a_far_chunk_comes_coarse_and_whole_once_somebody_is_near():
+    mapper, feed = Mapper(MapperSettings(), seed=0, threads=1), ChunkFeed()
+    mapper.T_map_anchor[3] = make_transform(np.eye(3), np.array([2.0, 0.0, 0.0]))
+    mapper.store.add(wall(20_000), 3)
+    far, near = (Eye(np.array([0.0, 0.0, z]), 280.0, 1.0) for z in (-30.0, 0.0))
+    first = feed.take(mapper, 3, far)
+    assert first.cell_m == 0.08
+    assert first.params.shape[1] < 0.2 * 20_000
+    assert first.params[MEAN].mean() == pytest.approx(-2.0, abs=0.1)  # in the anchor's frame
+    assert feed.take(mapper, 3, far) is None  # nothing new
+    assert feed.longest_due(mapper, far) is None
+    assert feed.longest_due(mapper, near) == 3
+    assert feed.take(mapper, 3, near).params.shape[1] == 20_000
+    assert feed.take(mapper, 3, far) is None  # who goes away keeps it
+    assert feed.longest_due(mapper, far) is None
+    mapper.store.move(3, mapper.T_map_anchor[3])
+    assert feed.longest_due(mapper, far) == 3  # but a new version comes as it is seen from there
+    assert feed.take(mapper, 3, far).cell_m == 0.08
+    assert feed.take(mapper, 3, None).cell_m == 0.0
+    assert parts(mapper, far)[3].cell_m == 0.08
+    assert feed.take(mapper, 99, None) is None
+
+
+def test_who_asks_says_from_where():
+    assert eye_of({}) is None
+    eye = eye_of({"from": "1,2,3", "focal_px": "300"})
+    assert eye.at_m.tolist() == [1.0, 2.0, 3.0]
+    assert (eye.focal_px, eye.error_px) == (300.0, 1.0)
+    for wrong in ({"from": "1,2"}, {"from": "1,2,3"}, {"from": "a,b,c", "focal_px": "3"}):
+        with pytest.raises(UserError, match="from=X,Y,Z"):
+            eye_of(wrong)
+
+
+def test_a_state_in_pieces_is_whole_or_refused():
+    arrays = {"a": np.arange(3_000_000), "b": np.eye(3)}
+    pieces = list(state_messages(arrays))
+    assert len(pieces) > 4
+    again = joined_state(pieces[::-1])
+    for name in arrays:
+        np.testing.assert_array_equal(again[name], arrays[name])
+    with pytest.raises(UserError, match="ask again"):
+        joined_state(pieces[1:])
