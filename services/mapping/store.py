@@ -61,7 +61,8 @@ class GaussianStore(GaussianArrays):
 
     def add(self, params: np.ndarray, anchor: int) -> None:
         """Adds Gaussians float32 [14, M] bound to an anchor."""
-        self.anchor[self.append(params)] = anchor
+        added = self.append(params)  # may replace all arrays by larger ones, so their names are read after it
+        self.anchor[added] = anchor
         self._events[anchor] = self._events.get(anchor, 0) + 1
 
     def keep(self, mask: np.ndarray) -> int:

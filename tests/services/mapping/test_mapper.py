@@ -15,6 +15,7 @@ from services.mapping.keyframe import Keyframe
 from services.mapping.mapper import FULL, HALF, Mapper
 from services.mapping.scores import f_score, fused_surface, render_rgb_depth, score_view
 from services.mapping.settings import MapperSettings
+from services.mapping.store import GaussianStore
 from services.mapping.warm import warm
 
 CAMERA = RasterCamera(110.0, 110.0, 79.5, 59.5, 160, 120)
@@ -263,6 +264,15 @@ def test_what_floats_before_a_trusted_surface_is_carved(room, mapped):
     left = mapper.store.strikes[before : mapper.store.count] < 2
     assert mapper.store.count < before or left.mean() < 0.2
     assert mapper.store.count >= before - 200
+
+
+def test_gaussians_hang_on_their_anchor_whatever_room_they_need():
+    """More than fit: all arrays are replaced by larger ones while they are added."""
+    store = GaussianStore(capacity=16)
+    for anchor, count in ((7, 10), (8, 30), (9, 500), (7, 3000)):
+        store.add(np.zeros((14, count), np.float32), anchor)
+    expected = {7: 3010, 8: 30, 9: 500}
+    assert {chunk.anchor: chunk.params.shape[1] for chunk in store.chunks()} == expected
 
 
 def test_surface_of_the_map_is_that_of_the_room(room, mapped):
