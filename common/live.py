@@ -21,12 +21,13 @@ import zenoh
 
 from common.bus import Bus, open_session
 from common.complaints import Complaints
+from common.control import Control
 from common.errors import UserError
 from common.header import local_clock_id
 from common.jobs import Abandoned, JobQueue, Worker
 from common.live_settings import LiveSettings
 from common.mailbox import NOBODY, Letter, Mailbox
-from common.messages import Answer, Health
+from common.messages import Health
 from common.node import Job, Node, Output
 from common.pacing import Playback, wait_for_nodes
 from common.persist import Bookmark, claim_epoch
@@ -84,7 +85,7 @@ class Live:
             try:
                 self.node.configure()
                 self.state = "standby"
-                self._bus = bus
+                self._control = Control(self, bus)
                 self._join(bus)
                 self._work(bus)
                 vitals.send()
@@ -118,9 +119,9 @@ class Live:
             bus.watch_health(self._on_health)
         bus.obey(self._on_query)
         if not self.takeover.standby:
-            self._show(bus)
+            self.show(bus)
 
-    def _show(self, bus: Bus) -> None:
+    def show(self, bus: Bus) -> None:
         """From now on this instance is the node."""
         for name in self.node.queries():
             bus.answer(name, self._on_query)
@@ -139,15 +140,14 @@ class Live:
             return
         finished = not self._stopping
         self.state = "drain"
-        for name, result in self._jobs.rest():
-            self._emit(self.node.handle_job(name, result))
-        self._emit(self.node.handle_drain())
+        self.finish_jobs()
+        self.emit(self.node.handle_drain())
         self.state = "drained"
         if finished:  # stopped by a signal it leaves the stream open: a successor goes on
             self._bookmark.finish()
             for publication in self.publications.values():
                 bus.end(publication)
-            while not self._stopping and not self.settings.exit_when_drained:
+            while not (self._stopping or self.settings.exit_when_drained or self.takeover.retired):
                 self._attend()
                 self._hear_answers()
                 with self.changed:
@@ -168,6 +168,10 @@ class Live:
             self._attend()
             if self.takeover.retired:
                 return
+            if self.takeover.standby and self.node.hands_over:
+                with self.changed:  # letters wait until it knows what its predecessor knew
+                    self.changed.wait(_POLL_S)
+                continue
             letter = self._next()
             self._emit_all(self._jobs.finished())
             if letter is None:
@@ -177,10 +181,12 @@ class Live:
                     heard = self._tell_of_silence(heard)
                 continue
             heard = time.monotonic()
+            if self.takeover.was_handled(letter):
+                continue
             started = time.perf_counter()
             self._emit_all(self._jobs.before_message(letter.topic))
             self.node.on_header(letter.header)
-            self._emit(self.node.handle(letter.topic, letter.message))
+            self.emit(self.node.handle(letter.topic, letter.message))
             self.steps_ms.append((time.perf_counter() - started) * 1e3)
 
     def _tell_of_silence(self, heard: float) -> float:
@@ -188,7 +194,7 @@ class Live:
         if silence_s < _SILENCE_S:
             time.sleep(0.02)  # `_next` does not wait once the inputs have ended
             return heard
-        self._emit(self.node.handle_silence(silence_s))
+        self.emit(self.node.handle_silence(silence_s))
         return heard + silence_s
 
     def _next(self) -> Letter | None:
@@ -215,11 +221,15 @@ class Live:
                 waiting.append((topic, instance, epoch, sent, deadline))
         self._ends = waiting
 
+    def finish_jobs(self) -> None:
+        """Waits for the background jobs and takes in what they bring."""
+        self._emit_all(self._jobs.rest())
+
     def _emit_all(self, results: Iterator[tuple[str, Any]]) -> None:
         for name, result in results:
-            self._emit(self.node.handle_job(name, result))
+            self.emit(self.node.handle_job(name, result))
 
-    def _emit(self, outputs: Iterator[Output]) -> None:
+    def emit(self, outputs: Iterator[Output]) -> None:
         for output in outputs:
             if isinstance(output, Job):
                 future = self._jobs.start(output)
@@ -265,27 +275,9 @@ class Live:
             name, query = self._queries.popleft()
             parameters = dict(query.parameters)
             if name.startswith(CONTROL):
-                reply(query, self._control(name.removeprefix(CONTROL + "/"), parameters))
+                reply(query, self._control.obey(name.removeprefix(CONTROL + "/"), parameters))
                 continue
             reply(query, getattr(self.node, f"on_query_{name}")(parameters))
-
-    def _control(self, verb: str, parameters: dict[str, str]) -> Iterator[Answer]:
-        """What the supervisor asks of one instance during a swap, between two steps."""
-        text = ""
-        if verb == "reached":
-            text = self.takeover.reached()
-        elif verb == "retire":
-            text = self.takeover.retire()
-        elif verb == "activate" and self.takeover.standby:
-            held = list(self.takeover.activate(parameters.get("after", "{}")))
-            self._bus.epoch = claim_epoch(self.settings.run_dir, self.node.name)
-            self._emit(iter(held))
-            self._show(self._bus)
-            self.state = "active"
-            text = str(len(held))
-        else:
-            raise ValueError(f"nothing called {verb!r} can be asked of {self.node.name} now")
-        yield Answer(stamp_ns=time.time_ns(), text=text)
 
     # --- called from threads of the bus ---
 

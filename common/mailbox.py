@@ -23,6 +23,10 @@ MAX_QUEUED_BYTES = 256 * 1024 * 1024  # likewise: pictures for a recorder whose 
 _MAX_COUNT = 2**63 - 1  # what a Health message can say
 
 
+# Topic -> instance of its producer -> (sequence that should come next, those before it that still wait).
+Handled = dict[str, dict[str, tuple[int, list[int]]]]
+
+
 @dataclass(frozen=True, slots=True)
 class Letter:
     """A received message with what rode beside it."""
@@ -136,6 +140,21 @@ class Mailbox:
     def next_sequence(self, topic: str, instance: str) -> int:
         """The sequence number that `topic` should bring next from `instance`; 0 before the first."""
         return self.counts[topic].expected.get(instance, 0)
+
+    def handled(self) -> Handled:
+        """What of the `every` inputs has come and does not wait here any more."""
+        queued = [*self._answers, *self._merger.items()]
+        return {
+            topic: {
+                instance: (
+                    next_one,
+                    [q.header.sequence for q in queued if q.topic == topic and q.header.instance == instance],
+                )
+                for instance, next_one in self.counts[topic].expected.items()
+            }
+            for topic, delivery in self._deliveries.items()
+            if delivery == "every"
+        }
 
     def pop(self) -> Letter | None:
         """The letter to handle next: answers, what is certain of `every` inputs, the oldest of the rest."""

@@ -89,8 +89,10 @@ class Node:
     Config: ClassVar[type[NodeConfig]] = NodeConfig
     inputs: ClassVar[tuple[str | Input, ...]] = ()
     outputs: ClassVar[tuple[str, ...]] = ()
-    # A second one may run beside it and take over: all it knows comes from its inputs of the last seconds.
+    # A second one may run beside it and take over: all it knows comes from its inputs of the last seconds,
+    # or (`hands_over`) is left by the one and taken up by the other, whose inputs wait until then.
     replaceable: ClassVar[bool] = False
+    hands_over: ClassVar[bool] = False
 
     def __init__(self, config: NodeConfig) -> None:
         self.config = config
@@ -136,6 +138,22 @@ class Node:
 
     def on_header(self, header: Header) -> None:
         """Sees what rode beside the message that is handled next; the recorder keeps it."""
+
+    def obstacle(self, before: Node) -> str:
+        """Why this one, not configured yet, cannot take over from `before` while that runs; "" if it can."""
+        return "" if self.replaceable else "what it knows lives in its process"
+
+    def hand_over(self) -> None:
+        """Between two messages: leaves what it knows where its successor finds it, and lets go of it. Raises
+        UserError where that fails: it goes on as it was."""
+
+    def take_over(self) -> None:
+        """Takes up what its predecessor has left. Not called where there was none: see `in_standby`."""
+
+    @property
+    def in_standby(self) -> bool:
+        """Whether `take_over` is still to come; `configure` leaves alone what a predecessor holds."""
+        return self.home is not None and self.home.standby
 
     def awaits_answers(self) -> bool:
         """Whether this node, whose inputs have ended, should hear more of what is fed back before it ends."""

@@ -11,7 +11,7 @@ for, and the order stays that of the stamps.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 PATIENCE_NS = 500_000_000
@@ -43,6 +43,10 @@ class StampMerger:
     def queued(self, stream: str) -> int:
         """Items of `stream` not yet released."""
         return len(self._queues[stream])
+
+    def items(self) -> Iterator[Any]:
+        """What is not yet released, stream by stream."""
+        return (item for queue in self._queues.values() for _, item in queue)
 
     def put(self, stream: str, stamp_ns: int, item: Any) -> None:
         """Takes one item; stamps may jump back within a stream, order of arrival is then kept."""

@@ -54,6 +54,7 @@ class Successor:
     deployment: Deployment
     process: BaseProcess | None = None
     instance: str = ""
+    hands_over: bool = False  # starts with what its predecessor leaves, and says nothing before
 
 
 class Supervisor:
@@ -166,14 +167,14 @@ class Supervisor:
             before = before.model_copy(update={"nodes": {**before.nodes, name: {}}})
         deployment = with_overrides(before, tuple(f"{name}.{o}" for o in overrides))
         node = build_node(deployment, name, self.table)
-        if warm and not node.replaceable:
-            raise UserError(
-                f"{name} cannot be taken over while it runs, what it knows lives in its process: --cold ends "
-                "it first, and starts it anew with the new options"
-            )
         if not warm:
             return Successor(name, deployment)
-        return Successor(name, deployment, *self._spawn(deployment, name, standby=True))
+        if obstacle := node.obstacle(build_node(self.deployment, name, self.table)):
+            raise UserError(
+                f"{name} cannot be taken over while it runs, {obstacle}: --cold ends it first, and starts it "
+                "anew with the new options"
+            )
+        return Successor(name, deployment, *self._spawn(deployment, name, standby=True), node.hands_over)
 
     def replace(self, successor: Successor) -> None:
         """The successor, which has been activated, is the node now; also when it must be started again."""

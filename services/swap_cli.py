@@ -57,7 +57,7 @@ def swap(
 
         beamsplat swap deploy/robot.toml depth --set source=fastdepth
 
-        beamsplat swap deploy/edge.toml mapping --set half_steps=30 --cold
+        beamsplat swap deploy/edge.toml mapping --set half_steps=30
     """
     _swap(file, node, set_ or [], cold)
 

@@ -10,7 +10,7 @@ from functools import lru_cache
 import numpy as np
 
 from common.camera import Undistorter
-from common.codec import decode, encode, schema_of
+from common.codec import encode, schema_of
 from common.errors import UserError
 from common.geometry import inverse
 from common.messages import (
@@ -23,7 +23,7 @@ from common.messages import (
     MapStatus,
     Tick,
 )  # fmt: skip
-from common.node import Input, Job, Node, Outputs
+from common.node import Input, Outputs
 from services.mapping.chunks import ChunkFeed, Eye, parts
 from services.mapping.config import MappingConfig
 from services.mapping.export import write_map
@@ -31,8 +31,7 @@ from services.mapping.keyframe import Held
 from services.mapping.look import look
 from services.mapping.mapper import FULL, HALF, Mapper, Outcome
 from services.mapping.messages import chunk_message, eye_of, open_keyframe, preview_message, state_messages
-from services.mapping.session.keeper import Keeper, Saved
-from services.mapping.session.paging import Pager
+from services.mapping.session.node import SessionNode
 from services.mapping.session.state import arrays_of
 from services.mapping.settings import MapperSettings
 from services.mapping.warm import warm
@@ -42,7 +41,7 @@ log = logging.getLogger("beamsplat.mapping")
 ODOM_ORIGIN = -1  # the anchor of keyframes from before localization named one
 
 
-class MappingNode(Node):
+class MappingNode(SessionNode):
     """Takes every keyframe, in any order; each is acknowledged when it has been dealt with."""
 
     name = "mapping"
@@ -50,7 +49,6 @@ class MappingNode(Node):
     inputs = ("keyframes/frame", Input("localization/anchors", "every"), Input("tick", "latest"))
     outputs = ("keyframes/ack", "mapping/chunk", "mapping/poses", "mapping/preview", "mapping/status")
     config: MappingConfig
-    _keeper: Keeper | None = None
 
     def configure(self) -> None:
         c = self.config
@@ -69,55 +67,8 @@ class MappingNode(Node):
         self._T_oldest_origin: np.ndarray | None = None
         if c.memory_mb is not None and c.session is None:
             raise UserError("mapping.memory_mb: pages to the session's disk; give mapping.session too")
-        if c.session is not None:
-            pager = None if c.memory_mb is None else Pager(c.memory_mb * 1e6, c.seed)
-            self._keeper = Keeper(c.session, round(c.session_every_s * 1e9), pager)
-            self._resume(self._keeper)
-
-    def close(self) -> None:
-        if self._keeper is not None:
-            self._keeper.close()
-
-    # --- session ---
-
-    def _resume(self, keeper: Keeper) -> None:
-        """Becomes what was saved; keyframes that came after the checkpoint are taken in again."""
-        m = self._mapper
-        extra, newer = keeper.resume(m, lambda schema, body: open_keyframe(decode(schema, body), self._lens))
-        if extra:
-            rows = zip(extra["taken_stamp_ns"].tolist(), extra["taken_T_camera_body"])
-            self._taken = dict(zip(extra["taken_id"].tolist(), rows))
-            self._T_oldest_origin = next(iter(extra["T_oldest_origin"]), None)
-        for id in newer:
-            body = keeper.body(id)
-            if body is not None and self._take(decode(*body)).ok:
-                self._mapper.optimise()
-        if m.keyframes:
-            log.info("goes on with %d keyframes (%d came after the checkpoint), %d Gaussians, step %d",
-                     len(m.keyframes), len(newer), m.store.count, m.steps)  # fmt: skip
-
-    def _extra(self) -> dict[str, np.ndarray]:
-        """What of this node outlives it, beside the mapper."""
-        ids = list(self._taken)
-        origin = [] if self._T_oldest_origin is None else [self._T_oldest_origin]
-        return {
-            "taken_id": np.array(ids, np.int64),
-            "taken_stamp_ns": np.array([self._taken[id][0] for id in ids], np.int64),
-            "taken_T_camera_body": np.array([self._taken[id][1] for id in ids]).reshape(-1, 4, 4),
-            "T_oldest_origin": np.array(origin).reshape(-1, 4, 4),
-        }
-
-    def _checkpoint(self, stamp_ns: int) -> Outputs:
-        """The memory's budget is kept; now and then the map goes to the disk, in the background."""
-        if self._keeper is None or not self._mapper.keyframes:
-            return
-        self._keeper.page(self._mapper)
-        if self._keeper.due(stamp_ns):
-            yield Job("checkpoint", self._keeper.checkpoint(self._mapper, self._extra(), stamp_ns))
-
-    def on_job_checkpoint(self, saved: Saved) -> Outputs:
-        self._keeper.done(saved)
-        return iter(())
+        if not self.in_standby:
+            self.take_over()
 
     # --- keyframes ---
 

@@ -14,9 +14,11 @@ import pytest
 from common.bus import open_session
 from common.config import Deployment, RouterConfig
 from common.errors import UserError
+from common.header import Header
+from common.mailbox import NOBODY, Letter, Mailbox
 from common.messages import Grid, Odometry
 from common.node import Node
-from common.queries import ask
+from common.queries import ask, command
 from common.registry import Service
 from common.takeover import Takeover
 from services.board import HealthBoard
@@ -56,14 +58,15 @@ _TABLE = {
 class System:
     """A supervisor with its commands, attended to in a thread, as `beamsplat run` does."""
 
-    def __init__(self, tmp_path, endpoint, nodes, rate=1.0):
+    def __init__(self, tmp_path, endpoint, nodes, rate=1.0, table=_TABLE):
+        self._table = table
         self.deployment = Deployment(
             robot="r1", router=RouterConfig(listen=(endpoint,)), rate=rate, state_dir=tmp_path, nodes=nodes
         )
         self._stop = threading.Event()
 
     def __enter__(self):
-        self.supervisor = Supervisor(self.deployment, table=_TABLE).__enter__()
+        self.supervisor = Supervisor(self.deployment, table=self._table).__enter__()
         self.session = open_session(self.deployment.router.listen)
         self.board = HealthBoard(self.session, "r1")
         self._commands = Commands(self.session, "r1", self.supervisor)
@@ -147,6 +150,9 @@ def test_a_successor_that_cannot_run_changes_nothing(system):
     with pytest.raises(UserError, match="nobody answers"):
         system.ask("depth", "swap")
     assert system.supervisor.children["localization"].instance == before
+    for verb in ("activate", "dance"):  # common/control.py: it stands by no more, and never heard of it
+        with pytest.raises(UserError, match=f"nothing called '{verb}'"):
+            command(system.asker, "r1", before, verb, {"after": "{}"}, 5.0)
     assert json.loads(system.ask("localization", "params"))["sleep_s"] == 0.01
     count = len(ears.messages)
     system.wait(lambda: len(ears.messages) > count + 5)
@@ -197,11 +203,44 @@ def test_a_successor_goes_on_where_its_predecessor_ended():
 def test_a_successor_that_lags_does_not_repeat_what_was_said():
     new = Takeover(standby=True)
     new.keeps("a", grid(1))
-    assert [m.stamp_ns for _, m in new.activate('{"a": 5}')] == []
+    assert [m.stamp_ns for _, m in new.activate('{"said": {"a": 5}}')] == []
     assert [s for s in range(2, 9) if not new.keeps("a", grid(s))] == [6, 7, 8]
     assert not new.keeps("b", grid(2))
-    assert Takeover(standby=False).retire() == "{}"
-    assert new.retire() == '{"a": 8, "b": 2}'
+    assert Takeover(standby=False).retire() == '{"said": {}}'
+    assert new.retire() == '{"said": {"a": 8, "b": 2}}'
+    for wrong in ("[]", '{"said": 3}', '{"said": {"a": "b"}}'):
+        with pytest.raises(ValueError):
+            list(Takeover(standby=True).activate(wrong))
+
+
+def test_what_standby_has_no_room_for_is_counted_unless_the_predecessor_said_it():
+    new = Takeover(standby=True)
+    for stamp in range(20):
+        new.keeps("a", grid(stamp))
+    assert [m.stamp_ns for _, m in new.activate('{"said": {"a": 1}}')] == list(range(4, 20))
+    assert new.lost == 2  # 2 and 3
+
+
+def letter(sequence, instance="a" * 16):
+    header = Header(sequence, 0, 0, sequence, 1, "localization", instance)
+    return Letter("localization/odometry", header, pose(sequence))
+
+
+def pose(stamp_ns):
+    return Odometry(stamp_ns=stamp_ns, T_odom_body=np.eye(4), covariance=np.eye(3))
+
+
+def test_who_hands_over_what_it_knows_tells_what_it_has_handled():
+    mailbox = Mailbox(Sink)
+    for sequence in (0, 1, 2, 5):
+        mailbox.put(letter(sequence))
+    for name in ("localization/correction", "localization/grid"):
+        mailbox.end(name, NOBODY, 0)
+    assert mailbox.pop().header.sequence == 0
+    old, new = Takeover(standby=False), Takeover(standby=True)
+    list(new.activate(old.retire(mailbox.handled())))
+    assert [s for s in range(8) if not new.was_handled(letter(s))] == [1, 2, 5, 6, 7]
+    assert not new.was_handled(letter(0, "b" * 16))
 
 
 def test_what_the_predecessor_never_spoke_of_is_said():

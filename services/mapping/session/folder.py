@@ -10,6 +10,7 @@ import fcntl
 import io
 import json
 import os
+import socket
 import struct
 import uuid
 import zipfile
@@ -92,16 +93,22 @@ class SessionFolder:
         """Keeps other writers out until `unlock` or the process's end, and clears what a killed writer left.
 
         Raises:
-            UserError: another process writes to this session.
+            UserError: another process writes to this session; the text names it and its host.
         """
-        file = (self.edge / "lock").open("w")
+        file = (self.edge / "lock").open("a+")
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
+            file.seek(0)
+            holder = file.readline().strip() or "it does not say which"
             file.close()
             raise UserError(
-                f"{self.path}: another process writes to this session: end it, or use another folder"
+                f"{self.path}: another process writes to this session ({holder}): end it, or use another "
+                "folder"
             ) from error
+        file.truncate(0)
+        file.write(f"process {os.getpid()} on {socket.gethostname()}\n")
+        file.flush()
         self._lock = file
         for folder in (self.edge, self.bodies):
             for leftover in folder.glob(".*"):

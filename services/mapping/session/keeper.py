@@ -144,6 +144,17 @@ class Keeper:
             log.warning("%s: no checkpoint: %s; the one before stays valid", self.folder.path, saved.fault)
         self._last = saved
 
+    def save(self, mapper: Mapper, extra: Arrays) -> None:
+        """A checkpoint now; none must be under way.
+
+        Raises:
+            UserError: the disk does not take it, or keyframes are in memory only.
+        """
+        stamp_ns = self._since_ns or 0
+        self.done(self.checkpoint(mapper, extra, stamp_ns)())
+        if self._unsaved or self._last.fault:
+            raise UserError(f"{self.folder.path}: {self.text()}")
+
     def text(self) -> str:
         """For the status: how far the session is on disk, or what keeps it from being."""
         last = self._last

@@ -263,7 +263,9 @@ def test_a_full_disk_leaves_the_checkpoint_valid_and_says_so(tmp_path):
 
 def test_two_mappers_cannot_write_to_one_session(copy):
     node = make_node(copy)
-    with pytest.raises(UserError, match="another process writes to this session"):
+    with pytest.raises(
+        UserError, match=rf"another process writes to this session \(process {os.getpid()} on .+\)"
+    ):
         Keeper(copy, SECOND)
     node.close()
     Keeper(copy, SECOND).close()

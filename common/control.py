@@ -1,0 +1,66 @@
+"""What a supervisor asks of one process during a swap (common/takeover.py), answered between two steps."""
+
+from __future__ import annotations
+
+import json
+import logging
+import time
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+from common.bus import Bus
+from common.messages import Answer
+from common.persist import claim_epoch
+
+if TYPE_CHECKING:
+    from common.live import Live
+
+log = logging.getLogger(__name__)
+
+
+class Control:
+    """The three requests, by verb."""
+
+    def __init__(self, live: Live, bus: Bus) -> None:
+        self._live, self._bus = live, bus
+
+    def obey(self, verb: str, parameters: dict[str, str]) -> Iterator[Answer]:
+        """Does what is asked.
+
+        Raises:
+            ValueError: no such request, not now, or it fails: what the process is stays as it was.
+        """
+        takeover = self._live.takeover
+        if verb == "reached":
+            text = takeover.reached()
+        elif verb == "retire":
+            text = self._retire()
+        elif verb == "activate" and takeover.standby:
+            text = self._activate(parameters.get("after", "{}"))
+        else:
+            raise ValueError(f"nothing called {verb!r} can be asked of {self._live.node.name} now")
+        yield Answer(stamp_ns=time.time_ns(), text=text)
+
+    def _retire(self) -> str:
+        live = self._live
+        if not live.node.hands_over:
+            return live.takeover.retire()
+        if not live.takeover.retired:
+            live.finish_jobs()
+            live.node.hand_over()
+        with live.changed:
+            return live.takeover.retire(live.mailbox.handled())
+
+    def _activate(self, after: str) -> str:
+        live = self._live
+        if live.node.hands_over:
+            live.node.take_over()
+        held = list(live.takeover.activate(after))
+        self._bus.epoch = claim_epoch(live.settings.run_dir, live.node.name)
+        live.emit(iter(held))
+        live.show(self._bus)
+        live.state = "active"
+        lost = live.takeover.lost
+        if lost:
+            log.warning("%d messages that nobody has said were not kept back in standby: lost", lost)
+        return json.dumps({"kept": len(held), "lost": lost})

@@ -1,0 +1,100 @@
+"""What of the mapping service outlives its process: the map and its keyframes, in a session on disk."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+
+import numpy as np
+
+from common.camera import Pinhole, Undistorter
+from common.codec import decode
+from common.messages import Keyframe
+from common.node import Job, Node, Outputs
+from services.mapping.config import MappingConfig
+from services.mapping.mapper import Mapper, Outcome
+from services.mapping.messages import open_keyframe
+from services.mapping.session.keeper import Keeper, Saved
+from services.mapping.session.paging import Pager
+
+log = logging.getLogger("beamsplat.mapping")
+
+
+class SessionNode(Node):
+    """The mapping node's part that saves, resumes and hands over; without a session it does nothing."""
+
+    replaceable = hands_over = True
+    config: MappingConfig
+    _keeper: Keeper | None = None
+    _mapper: Mapper
+    _lens: Callable[[Pinhole], Undistorter]
+    _taken: dict[int, tuple[int, np.ndarray]]  # keyframe -> stamp_ns, T_camera_body
+    _T_oldest_origin: np.ndarray | None
+
+    def _take(self, message: Keyframe) -> Outcome:
+        raise NotImplementedError
+
+    def close(self) -> None:
+        if self._keeper is not None:
+            self._keeper.close()
+
+    def obstacle(self, before: Node) -> str:
+        """The map goes along in the session, so there must be one, and both must mean the same."""
+        mine, its = self.config.session, before.config.session
+        if its is None:
+            return "its map goes along in mapping.session, and it was started without one"
+        if mine is None or mine.resolve() != its.resolve():
+            return f"its map is in mapping.session = {its}, not in {mine}"
+        return super().obstacle(before)
+
+    def hand_over(self) -> None:
+        """All that is known goes into the session, which another may write to from now on."""
+        if self._mapper.keyframes:
+            self._keeper.save(self._mapper, self._extra())
+        self._keeper.close()
+
+    def take_over(self) -> None:
+        c = self.config
+        if c.session is not None:
+            pager = None if c.memory_mb is None else Pager(c.memory_mb * 1e6, c.seed)
+            self._keeper = Keeper(c.session, round(c.session_every_s * 1e9), pager)
+            self._resume(self._keeper)
+
+    def _resume(self, keeper: Keeper) -> None:
+        """Becomes what was saved; keyframes that came after the checkpoint are taken in again."""
+        m = self._mapper
+        extra, newer = keeper.resume(m, lambda schema, body: open_keyframe(decode(schema, body), self._lens))
+        if extra:
+            rows = zip(extra["taken_stamp_ns"].tolist(), extra["taken_T_camera_body"])
+            self._taken = dict(zip(extra["taken_id"].tolist(), rows))
+            self._T_oldest_origin = next(iter(extra["T_oldest_origin"]), None)
+        for id in newer:
+            body = keeper.body(id)
+            if body is not None and self._take(decode(*body)).ok:
+                self._mapper.optimise()
+        if m.keyframes:
+            log.info("goes on with %d keyframes (%d came after the checkpoint), %d Gaussians, step %d",
+                     len(m.keyframes), len(newer), m.store.count, m.steps)  # fmt: skip
+
+    def _extra(self) -> dict[str, np.ndarray]:
+        """What of this node outlives it, beside the mapper."""
+        ids = list(self._taken)
+        origin = [] if self._T_oldest_origin is None else [self._T_oldest_origin]
+        return {
+            "taken_id": np.array(ids, np.int64),
+            "taken_stamp_ns": np.array([self._taken[id][0] for id in ids], np.int64),
+            "taken_T_camera_body": np.array([self._taken[id][1] for id in ids]).reshape(-1, 4, 4),
+            "T_oldest_origin": np.array(origin).reshape(-1, 4, 4),
+        }
+
+    def _checkpoint(self, stamp_ns: int) -> Outputs:
+        """The memory's budget is kept; now and then the map goes to the disk, in the background."""
+        if self._keeper is None or not self._mapper.keyframes:
+            return
+        self._keeper.page(self._mapper)
+        if self._keeper.due(stamp_ns):
+            yield Job("checkpoint", self._keeper.checkpoint(self._mapper, self._extra(), stamp_ns))
+
+    def on_job_checkpoint(self, saved: Saved) -> Outputs:
+        self._keeper.done(saved)
+        return iter(())
