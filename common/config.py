@@ -21,7 +21,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, StringConstraints
 
-from common.errors import UserError
+from common.errors import UserError, reason
 from common.security import OPEN, SecurityConfig
 from common.strict import Config, parse
 
@@ -83,7 +83,7 @@ def load_deployment(path: Path, overrides: tuple[str, ...] = ()) -> Deployment:
     except FileNotFoundError as error:
         raise UserError(f"{path}: no such deployment file") from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, OSError) as error:
-        raise UserError(f"{path}: not a TOML file: {error}") from error
+        raise UserError(f"{path}: not a TOML file: {reason(error)}") from error
     for override in overrides:
         _apply(table, override)
     return parse(Deployment, table, str(path))

@@ -3,3 +3,8 @@
 
 class UserError(ValueError):
     """Bad input from outside (file, field, value). The text says what is wrong and what to do."""
+
+
+def reason(error: BaseException) -> str:
+    """What an exception says, without the number and the file name that an OSError repeats."""
+    return (error.strerror or str(error)) if isinstance(error, OSError) else str(error)

@@ -118,6 +118,13 @@ class Node:
     def configure(self) -> None:
         """Loads and warms what the first message must not wait for."""
 
+    def examine(self) -> None:
+        """Looks, before anything runs and without keeping it, whether what the options name is there.
+
+        Raises:
+            UserError: it is not, or cannot be used.
+        """
+
     def drain(self) -> Iterable[Output]:
         """Last outputs, when all inputs have ended."""
         return ()

@@ -33,7 +33,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from common.errors import UserError
+from common.errors import UserError, reason
 from common.frames import R_body_camera_level
 from common.geometry import (
     make_transform,
@@ -180,7 +180,7 @@ def load_rig(path: Path) -> RigFile:
         text = Path(path).read_text()
     except (OSError, UnicodeDecodeError) as error:
         raise UserError(
-            f"{path}: cannot be read as a rig file ({error}); `beamsplat rig` writes a first one"
+            f"{path}: cannot be read as a rig file ({reason(error)}); `beamsplat rig` writes a first one"
         ) from error
     return parse_rig(text, str(path))
 
@@ -190,7 +190,7 @@ def parse_rig(text: str, where: str) -> RigFile:
     try:
         table = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
-        raise UserError(f"{where}: not a TOML file: {error}") from error
+        raise UserError(f"{where}: not a TOML file: {reason(error)}") from error
     rig = parse(RigFile, table, where)
     if rig.camera is None and rig.lidar is None:
         raise UserError(f"{where}: has neither [camera] nor [lidar]; give at least one")

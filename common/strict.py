@@ -31,7 +31,7 @@ def parse(cls: type[Config], table: dict[str, Any], where: str) -> Any:
                 known = ", ".join(sorted(_at(cls, fault["loc"][:-1]).model_fields))
                 faults.append(f"unknown option {field!r} (there are: {known})")
             elif fault["type"] == "missing":
-                faults.append(f"option {field!r} is required")
+                faults.append(f"option {field!r} is required: give it in the file, or by --set")
             else:
                 faults.append(f"{field} = {fault['input']!r}: {fault['msg']}")
         raise UserError(f"{where}: " + "; ".join(faults)) from error

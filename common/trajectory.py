@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from common.errors import UserError
+from common.errors import UserError, reason
 from common.geometry import interpolate, make_transform, matrix_from_quat_xyzw, quat_xyzw_from_matrix
 
 _MAX_STAMP_NS = 2**63 - 1
@@ -139,7 +139,7 @@ def read_tum(path: Path) -> Trajectory:
     try:
         text = Path(path).read_text()
     except (OSError, UnicodeDecodeError) as error:
-        raise UserError(f"{path}: cannot be read as a TUM trajectory: {error}") from error
+        raise UserError(f"{path}: cannot be read as a TUM trajectory: {reason(error)}") from error
     return parse_tum(text, str(path))
 
 

@@ -13,7 +13,7 @@ from rich.text import Text
 
 from common.bus import key
 from common.header import DecodeError
-from common.health import Flow, HealthBook, NodeRecord
+from common.health import Flow, HealthBook, NodeRecord, Taker
 from common.messages import Health
 from common.streams import open_sample
 from common.topics import HEALTH, Topic
@@ -59,7 +59,7 @@ class HealthBoard:
 
     def nodes_table(self) -> RenderableType:
         """One row a node: state, rates, step time, age, losses, memory, CPU; below, what they say."""
-        table = Table(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False)
+        table = _narrow_table()
         for heading in ("node", "state"):
             table.add_column(heading, no_wrap=True)
         for heading in ("in Hz", "out Hz", "step ms", "p95", "age ms", "drop", "lost", "bad", "MB", "CPU%"):
@@ -75,16 +75,21 @@ class HealthBoard:
 
     def topics_table(self) -> Table:
         """One row a topic that flows: producer, rate, bytes, and who takes it."""
-        table = Table(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False)
+        table = _narrow_table()
         for heading in ("topic", "from"):
-            table.add_column(heading)
-        for heading in ("Hz", "nominal", "KB/s", "sent"):
-            table.add_column(heading, justify="right")
-        table.add_column("to (age ms, dropped, lost)")
+            table.add_column(heading, no_wrap=True)
+        for heading in ("Hz/nominal", "KB/s", "sent"):
+            table.add_column(heading, justify="right", no_wrap=True)
+        table.add_column("to, age ms", overflow="fold")
         with self._lock:
             for flow in self._book.flows():
                 table.add_row(*_flow_row(flow))
         return table
+
+
+def _narrow_table() -> Table:
+    """Both tables fit into 80 columns."""
+    return Table(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False, padding=0)
 
 
 def _node_row(name: str, record: NodeRecord, now: float) -> tuple[str, ...]:
@@ -109,9 +114,15 @@ def _node_row(name: str, record: NodeRecord, now: float) -> tuple[str, ...]:
 
 def _flow_row(flow: Flow) -> tuple[str, ...]:
     nominal = f"{flow.nominal_hz:g}" if flow.nominal_hz else "event"
-    takers = "  ".join(f"{t.node} ({t.age_ms:.1f}, {t.dropped}, {t.lost})" for t in flow.takers)
-    hz, kb_s = f"{flow.hz:.1f}", f"{flow.bytes_s / 1e3:.1f}"
-    return flow.topic, flow.producer, hz, nominal, kb_s, str(flow.sent), takers
+    takers = "\n".join(map(_taker_text, flow.takers))
+    hz, kb_s = f"{flow.hz:.1f}/{nominal}", f"{flow.bytes_s / 1e3:.1f}"
+    return flow.topic, flow.producer, hz, kb_s, str(flow.sent), takers
+
+
+def _taker_text(taker: Taker) -> str:
+    counts = ((taker.dropped, "yellow", "dropped"), (taker.lost, "red", "lost"))
+    losses = "".join(f", [{colour}]{number} {what}[/]" for number, colour, what in counts if number)
+    return f"{taker.node} {taker.age_ms:.1f}{losses}"
 
 
 def _count(number: int, colour: str) -> str:

@@ -66,10 +66,25 @@ def faults(deployment: Deployment, table: dict[str, Service] = NODES) -> list[Fa
             found.append(Fault(f"{topic} would be written by {' and '.join(names)}: keep one of them"))
     for name, node_class in classes.items():
         missing = [i.topic for i in node_class.inputs if not producers[i.topic]]
-        if missing and len(missing) == len(node_class.inputs):
+        whole = len(classes) == len(deployment.nodes)  # else what does not fit may have fed it
+        if whole and missing and len(missing) == len(node_class.inputs):
             found.append(Fault(f"nothing in this deployment feeds {name}: {', '.join(missing)}", fatal=False))
     if deployment.role == "robot" and "uplink" not in deployment.nodes:
         found.append(Fault('role = "robot" without node uplink: nothing reaches an edge server', fatal=False))
+    return found
+
+
+def unusable(
+    deployment: Deployment, names: tuple[str, ...] | None = None, table: dict[str, Service] = NODES
+) -> list[Fault]:
+    """What options of a deployment without faults name and cannot be used, such as missing data."""
+    found = []
+    for name in names or tuple(deployment.nodes):
+        if name in deployment.nodes:
+            try:
+                build_node(deployment, name, table).examine()
+            except UserError as error:
+                found.append(Fault(f"{name}: {error}"))
     return found
 
 

@@ -210,7 +210,9 @@ def doctor(
         findings = [Finding(*remark) for remark in examine_security(deployment)]
     else:
         findings = examine(deployment)
-    table = Table("", "what", "found", "remedy", pad_edge=False)
+    table = Table(pad_edge=False)
+    for heading in ("", "what", "found", "remedy"):
+        table.add_column(heading, overflow="fold")  # a path that is cut helps nobody
     mark = {"ok": "[green]ok[/]", "note": "[yellow]note[/]", "fault": "[red]FAULT[/]"}
     for finding in findings:
         if not (brief and finding.verdict == "ok"):

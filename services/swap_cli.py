@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated
 from urllib.parse import quote
@@ -18,25 +19,37 @@ NodeArgument = Annotated[str, typer.Argument(help="Name of the node")]
 ColdOption = Annotated[
     bool, typer.Option("--cold", help="End the node first: for those whose knowledge lives in their process")
 ]
+FileSetOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set", metavar="OPTION=VALUE", help="Override of the file that `run` was given, as router.listen"
+    ),
+]
 _PATIENCE_S = 150.0  # loading a model takes its time
 
 
-def _ask(file: Path, node: str, verb: str, parameters: dict[str, str]) -> str:
+def _ask(
+    file: Path, node: str, verb: str, parameters: dict[str, str], overrides: list[str] | None = None
+) -> str:
     from common.bus import open_session
     from common.queries import ask
 
-    deployment = load_deployment(file)
+    deployment = load_deployment(file, tuple(overrides or ()))
+    if node not in (*deployment.nodes, "router"):
+        near = get_close_matches(node, deployment.nodes, 1)
+        meant = f"did you mean {near[0]!r}?" if near else f"it has {', '.join(deployment.nodes)}"
+        raise UserError(f"{file} has no node {node!r}; {meant}")
     with open_session(deployment.router.listen, wait_s=2.0) as session:
         (answer,) = ask(session, deployment.robot, node, verb, parameters, _PATIENCE_S)
     return answer.text
 
 
-def _swap(file: Path, node: str, changes: list[str], cold: bool) -> None:
+def _swap(file: Path, node: str, changes: list[str], cold: bool, overrides: list[str] | None = None) -> None:
     for change in changes:
         if "=" not in change:
             raise UserError(f"{change!r}: expected OPTION=VALUE, for example source=stixel")
     parameters = {"set": quote(json.dumps(changes)), **({"cold": "1"} if cold else {})}
-    print(_ask(file, node, "swap", parameters))
+    print(_ask(file, node, "swap", parameters, overrides))
 
 
 def swap(
@@ -63,12 +76,12 @@ def swap(
 
 
 @app.command()
-def get(file: FileArgument, node: NodeArgument) -> None:
+def get(file: FileArgument, node: NodeArgument, overrides: FileSetOption = None) -> None:
     """The options of a running node, defaults included, as JSON.
 
     Example: beamsplat params get deploy/robot.toml depth
     """
-    print(_ask(file, node, "params", {}))
+    print(_ask(file, node, "params", {}, overrides))
 
 
 @app.command(name="set")
@@ -77,9 +90,10 @@ def set_params(
     node: NodeArgument,
     changes: Annotated[list[str], typer.Argument(metavar="OPTION=VALUE...", help="What to change")],
     cold: ColdOption = False,
+    overrides: FileSetOption = None,
 ) -> None:
     """Changes options of a running node, by a successor that takes over: `beamsplat swap` in other words.
 
     Example: beamsplat params set deploy/robot.toml depth floor_known=false
     """
-    _swap(file, node, changes, cold)
+    _swap(file, node, changes, cold, overrides)

@@ -44,10 +44,12 @@ def check(file: FileArgument, set_: SetOption = None) -> None:
 
     Example: beamsplat check deploy/demo.toml
     """
-    from services.deployment import faults
+    from services.deployment import faults, unusable
 
     deployment = _load(file, set_)
     found = faults(deployment)
+    if not any(fault.fatal for fault in found):
+        found += unusable(deployment)
     for fault in found:
         _say(fault.text, "red" if fault.fatal else "yellow")
     if any(fault.fatal for fault in found):
@@ -55,10 +57,11 @@ def check(file: FileArgument, set_: SetOption = None) -> None:
     print(f"{file}: {len(deployment.nodes)} nodes, fits together")
 
 
-def _checked(deployment: Deployment) -> Deployment:
-    from services.deployment import faults
+def _checked(deployment: Deployment, names: tuple[str, ...] | None = None) -> Deployment:
+    from services.deployment import faults, unusable
 
     fatal = [fault.text for fault in faults(deployment) if fault.fatal]
+    fatal = fatal or [fault.text for fault in unusable(deployment, names)]
     if fatal:
         raise UserError("; ".join(fatal))
     return deployment
@@ -108,11 +111,11 @@ def run_checked(
     Raises:
         UserError: the deployment does not fit together, or a node cannot run with what it was given.
     """
-    _checked(deployment)
     for name in names or ():
         if name != "router" and name not in deployment.nodes:
             there = ", ".join(("router", *deployment.nodes))
             raise UserError(f"the deployment has no node {name!r}; there are {there}")
+    _checked(deployment, names)
     from common.bus import open_session
     from services.board import HealthBoard
     from services.commands import Commands
@@ -125,7 +128,8 @@ def run_checked(
 
     def on_event(text: str) -> None:
         events.append(text)
-        _say(text, "yellow")
+        if " cannot run: " not in text:  # that is the error with which this ends
+            _say(text, "yellow")
 
     with Supervisor(deployment, names, on_event=on_event) as supervisor:
         _say(f"robot {deployment.robot}: logs in {supervisor.log_dir}")

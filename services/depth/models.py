@@ -12,7 +12,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from common.errors import UserError
+from common.errors import UserError, reason
 from common.strict import Config, parse
 from services.depth.store import find_model, models_dirs, sha256_of
 
@@ -41,7 +41,7 @@ def read_table(path: Path = TABLE) -> dict[str, ModelRow]:
     try:
         table = tomllib.loads(path.read_text())
     except (OSError, tomllib.TOMLDecodeError) as error:
-        raise UserError(f"{path}: cannot be read as the table of models: {error}") from error
+        raise UserError(f"{path}: cannot be read as the table of models: {reason(error)}") from error
     return {name: parse(ModelRow, row, f"{path}: [{name}]") for name, row in table.items()}
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from common.errors import UserError
+from common.errors import UserError, reason
 from services.depth.source import Estimate, Kind, View, judge
 
 
@@ -59,7 +59,7 @@ def read_depth(path: Path) -> np.ndarray:
         try:
             values = np.load(path, allow_pickle=False)
         except (OSError, ValueError) as error:
-            raise UserError(f"{path}: not a numpy array: {error}") from error
+            raise UserError(f"{path}: not a numpy array: {reason(error)}") from error
     else:
         raw = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
         if raw is None or raw.dtype != np.uint16:

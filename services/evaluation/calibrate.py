@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from common.camera import Undistorter
-from common.errors import UserError
+from common.errors import UserError, reason
 from common.geometry import transform_points
 from common.rig import load_rig
 from services.evaluation.drive import Drive, pinhole_of
@@ -159,7 +159,7 @@ def read_pcd(path: Path) -> np.ndarray:
             [[float(w) for w in line.split()[:3]] for line in body.splitlines() if line.strip()]
         )
     except (OSError, UnicodeDecodeError, ValueError) as error:
-        raise UserError(f"{path}: not an ASCII PCD file: {error}") from error
+        raise UserError(f"{path}: not an ASCII PCD file: {reason(error)}") from error
     if "FIELDS x y z" not in head or values.ndim != 2 or values.shape[1] != 3:
         raise UserError(f"{path}: not an ASCII PCD file with fields x y z")
     return values[np.all(np.isfinite(values), axis=1)]

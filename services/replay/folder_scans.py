@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from common.errors import UserError
+from common.errors import UserError, reason
 
 _REQUIRED = ("angle_min_rad", "angle_increment_rad", "range_min_m", "range_max_m")
 _OPTIONAL = ("time_increment_s", "scan_time_s")
@@ -29,7 +29,7 @@ class CsvScans:
         try:
             lines = path.read_text().splitlines()
         except (OSError, UnicodeDecodeError) as error:
-            raise UserError(f"{path}: cannot be read: {error}") from error
+            raise UserError(f"{path}: cannot be read: {reason(error)}") from error
         for number, line in enumerate(lines, start=1):
             where = f"{path}, line {number}"
             if line.lstrip().startswith("#"):

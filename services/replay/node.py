@@ -36,6 +36,10 @@ class ReplayNode(Node):
             raise
         self._source = source
 
+    def examine(self) -> None:
+        self.configure()
+        self.close()
+
     def expected_messages(self) -> int | None:
         """How many messages the sensors have; None if there is no end, or only a part is played."""
         config = self.config

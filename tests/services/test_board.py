@@ -9,8 +9,8 @@ from common.messages import Health, InputHealth, OutputHealth
 from services.board import ALL, HealthBoard
 
 
-def _text(table):
-    console = Console(width=160, record=True, quiet=False, file=open("/dev/null", "w"))  # noqa: SIM115
+def _text(table, width=80):
+    console = Console(width=width, record=True, quiet=False, file=open("/dev/null", "w"))  # noqa: SIM115
     console.print(table)
     return console.export_text()
 
@@ -46,7 +46,9 @@ def test_rates_losses_and_silence_are_shown(free_endpoint):
             assert row.split()[-4:-2] == ["2", "0"]  # lost, broken
             assert "localization: warm and well" in nodes
             topics = _text(board.topics_table())
-            assert "localization (1.5, 3, 2)" in topics
+            assert "localization 1.5, 3" in topics
+            assert "2 lost" in topics
+            assert "…" not in nodes + topics  # nothing is cut off in 80 columns
             time.sleep(3.2)
             assert board.states() == {"replay": "silent", "localization": "silent"}
             assert "silent" in _text(board.nodes_table())

@@ -43,9 +43,11 @@ def test_help_names_every_command_and_each_has_an_example():
         ),
         (("check", "deploy/demo.toml", "--set", "replay.[/x]=1"), "unknown option '[/x]'"),
         (("serve", "deploy/demo.toml", "router", "--set", 'router.listen=["no"]'), "no are no endpoints"),
-        (("run", "deploy/poses.toml", *POSES, "--set", "state_dir=/dev/null/x"), "cannot make this folder"),
+        (
+            ("run", "deploy/poses.toml", *POSES, "router", "--set", "state_dir=/dev/null/x"),
+            "cannot make this folder",
+        ),
         (("run", "deploy/poses.toml", *POSES, "router", "nope"), "has no node 'nope'"),
-        (("offline", "deploy/poses.toml", *POSES, "--out", "/dev/null/x"), "cannot make this folder"),
         (("offline", "deploy/demo.toml", "--data", "no/bag", "--out", "{tmp}"), "no/bag"),
         (("info", "no/bag"), "no/bag"),
         (("rig", "no/bag", "--out", "{tmp}/rig.toml"), "no/bag"),
@@ -56,6 +58,21 @@ def test_bad_input_is_one_sentence_and_exit_code_2(tmp_path, arguments, complain
     assert done.returncode == 2, done.stderr
     assert complaint in done.stderr + done.stdout
     assert "Traceback" not in done.stderr
+
+
+def test_missing_data_and_misspelt_nodes_are_named_before_anything_starts(tmp_path):
+    for command in ("check", "run"):
+        done = beamsplat(
+            command, "deploy/demo.toml", "--set", "replay.data=nowhere", "--set", f"state_dir={tmp_path}"
+        )
+        assert done.returncode == 2
+        assert done.stderr.count("nowhere: no such file or folder") == 1
+    assert not list(tmp_path.iterdir())
+    done = beamsplat("swap", "deploy/demo.toml", "detph", "--set", "source=stixel")
+    assert "did you mean 'depth'?" in done.stderr
+    done = beamsplat("session", "info", str(tmp_path / "none"))
+    assert "no such folder" in done.stderr
+    assert "Errno" not in done.stderr
 
 
 def test_run_without_a_router_port_says_what_to_do(tmp_path, free_endpoint):

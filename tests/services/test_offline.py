@@ -8,6 +8,7 @@ from rich.console import Console
 
 from common.codec import encode
 from common.config import Deployment, load_deployment
+from common.errors import UserError
 from common.recording import RecordingReader
 from services.offline import run_offline
 from tests.common.nodes import TABLE
@@ -29,6 +30,12 @@ def test_twice_the_same_bytes_also_when_frames_are_dropped(tmp_path):
     for a, b in zip(*recordings):
         assert hashlib.sha256(a.read_bytes()).digest() == hashlib.sha256(b.read_bytes()).digest(), a.name
     assert _run(tmp_path, "c")["sha256"] != first["sha256"]
+
+
+def test_a_folder_that_cannot_be_made_is_named(tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(UserError, match="cannot make this folder"):
+        _run(tmp_path / "file", "a")
 
 
 def test_the_recording_holds_every_message(tmp_path):

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from common.errors import reason
 from services.localization.lidar2d.backend import BackEnd
 from services.localization.lidar2d.nodes import Constraint, Keynode, KeyScan, Submap
 from services.localization.lidar2d.settings import LidarSlamSettings
@@ -67,7 +68,7 @@ def load_state(folder: Path, settings: LidarSlamSettings) -> tuple[BackEnd, dict
         raw = arrays_path.read_bytes()
     except OSError as error:
         raise MapStateError(
-            f"{arrays_path}: named by {path} but cannot be read ({error}); restore it"
+            f"{arrays_path}: named by {path} but cannot be read ({reason(error)}); restore it"
         ) from error
     if len(raw) != manifest["bytes"] or zlib.crc32(raw) != manifest["crc32"]:
         raise MapStateError(
@@ -94,7 +95,7 @@ def read_manifest(path: Path) -> dict:
         manifest = json.loads(path.read_text())
     except OSError as error:
         raise MapStateError(
-            f"{path}: no saved map here ({error}); give the folder that was saved to"
+            f"{path}: no saved map here ({reason(error)}); give the folder that was saved to"
         ) from error
     except json.JSONDecodeError as error:
         raise MapStateError(f"{path}: not valid JSON ({error}); restore the folder from a copy") from error

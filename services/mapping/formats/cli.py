@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
-from common.errors import UserError
+from common.errors import UserError, reason
 
 console = Console(stderr=True)
 FORMATS = {
@@ -85,7 +85,7 @@ def export(
     except (OSError, ValueError) as error:
         if isinstance(error, UserError):
             raise
-        raise UserError(f"{path}: {error}") from error
+        raise UserError(f"{path}: {reason(error)}") from error
     print(f"{path}: {text}")
 
 

@@ -21,7 +21,7 @@ from typing import Any, TextIO
 
 import numpy as np
 
-from common.errors import UserError
+from common.errors import UserError, reason
 from common.persist import make_folder, write_atomically
 
 FORMAT, VERSION = "beamsplat-session", 1
@@ -79,6 +79,8 @@ class SessionFolder:
         Raises:
             UserError: no session, not readable, or of a version that this program does not know.
         """
+        if not self.path.is_dir():
+            raise UserError(f"{self.path}: no such folder; a session is what `mapping.session = DIR` writes")
         head = read_json(self.path / MANIFEST, "a session is a folder written by `mapping.session = DIR`")
         if head.get("format") != FORMAT:
             raise UserError(f"{self.path / MANIFEST}: field 'format' is not {FORMAT!r}: this is no session")
@@ -182,7 +184,7 @@ class SessionFolder:
         except (OSError, zipfile.BadZipFile, zlib.error, ValueError) as error:
             if isinstance(error, UserError):
                 raise
-            raise UserError(f"{path}: cannot be read ({error}); restore it from a copy") from error
+            raise UserError(f"{path}: cannot be read ({reason(error)}); restore it from a copy") from error
 
     # --- keyframes ---
 
@@ -270,7 +272,7 @@ def read_json(path: Path, advice: str) -> dict[str, Any]:
     try:
         table = json.loads(path.read_text())
     except (OSError, ValueError) as error:
-        raise UserError(f"{path}: cannot be read ({error}); {advice}") from error
+        raise UserError(f"{path}: cannot be read ({reason(error)}); {advice}") from error
     if not isinstance(table, dict):
         raise UserError(f"{path}: not a JSON object; {advice}")
     return table
