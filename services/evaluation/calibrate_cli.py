@@ -80,4 +80,15 @@ def _show(report: dict[str, Any], as_json: bool) -> None:
         print(json.dumps(report))
         return
     for name, value in report.items():
-        print(f"{name}: {value:.4f}" if isinstance(value, float) else f"{name}: {value}")
+        if name.endswith("_sigma") or value is None:  # beside its value; not asked for
+            continue
+        sigma = report.get(f"{name}_sigma")
+        print(f"{name}:{_text(value)}" + (f" ± {sigma:.4f}" if sigma is not None else ""))
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, float):
+        return f" {value:.4f}"
+    if isinstance(value, list) and value and isinstance(value[0], list):  # a matrix
+        return "".join("\n    " + "  ".join(f"{number:9.5f}" for number in row) for row in value)
+    return " " + ("; ".join(map(str, value)) if isinstance(value, list) else str(value))
