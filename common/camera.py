@@ -7,9 +7,13 @@ Undistortion happens once, where an image is opened; everything behind sees `Pin
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
+
+if TYPE_CHECKING:
+    from common.sensor_models import CameraModel
 
 MODELS = ("none", "plumb_bob", "rational_polynomial", "equidistant")
 
@@ -38,6 +42,14 @@ class Pinhole:
             raise ValueError(
                 f"distortion model {self.distortion_model!r} is unknown; there are {', '.join(MODELS)}"
             )
+
+    @classmethod
+    def of(cls, camera: CameraModel) -> Pinhole:
+        """Of the camera in a message."""
+        return cls(
+            camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px, camera.width_px, camera.height_px,
+            camera.distortion_model, tuple(camera.distortion),
+        )  # fmt: skip
 
     @property
     def K(self) -> np.ndarray:

@@ -10,7 +10,6 @@ from common.camera import Pinhole
 from common.frames import R_body_camera_level
 from common.geometry import inverse, make_transform, se3_to_se2
 from common.messages import CameraModel, Scan
-from services.evaluation.drive import pinhole_of
 from services.fusion.calibration.board import BoardPair, chessboard_plane, solve_board
 from services.setup.pattern import Board
 
@@ -50,7 +49,7 @@ class Boards:
 
     def __init__(self, model: CameraModel, board: Board) -> None:
         self._model = model
-        self._camera: Pinhole = pinhole_of(model)
+        self._camera: Pinhole = Pinhole.of(model)
         self._board = board
         # Beams stay level where the camera looks down: planes are told in the camera turned level.
         self._T_body_level = make_transform(R_body_camera_level, model.T_body_camera[:3, 3])

@@ -55,10 +55,7 @@ class DepthNode(Node):
         else:
             camera = rig.camera
             self._undistort = Undistorter(
-                Pinhole(
-                    camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px, camera.width_px, camera.height_px,
-                    camera.distortion_model, camera.distortion,
-                )
+                Pinhole.of(camera)
             )  # fmt: skip
             self._T_body_camera = camera.T_body_camera
             T_body_lidar = rig.lidar.T_body_lidar if rig.lidar is not None else np.eye(4)

@@ -9,11 +9,11 @@ from typing import Any
 import cv2
 import numpy as np
 
-from common.camera import Undistorter
+from common.camera import Pinhole, Undistorter
 from common.errors import UserError, reason
 from common.geometry import transform_points
 from common.rig import load_rig
-from services.evaluation.drive import Drive, pinhole_of
+from services.evaluation.drive import Drive
 from services.fusion.calibration.board import BoardPair, chessboard_plane, level_mount, solve_board
 from services.fusion.calibration.edges import edge_errors, picture_edges
 from services.fusion.calibration.motion import PARAMETERS, MotionCalibration, TrackedPair, solve_motion
@@ -79,7 +79,7 @@ def calibrate_board(
     loaded = load_rig(rig_file)
     if loaded.camera is None:
         raise UserError(f"{rig_file}: has no [camera]; the board needs K and distortion")
-    camera = pinhole_of(loaded.camera.model())
+    camera = Pinhole.of(loaded.camera.model())
     pairs, pictures, missing = [], [], []
     for image_file, cloud_file in pair_files(folder):
         grey = cv2.imread(str(image_file), cv2.IMREAD_GRAYSCALE)

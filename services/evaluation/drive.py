@@ -158,7 +158,7 @@ def open_drive(path: Path, poses: Path | None = None, rig: Path | None = None) -
     images.sort(key=lambda image: image.stamp_ns)
     scans.sort(key=lambda scan: scan.stamp_ns)
     return Drive(
-        Path(path), pinhole_of(calibration.camera), calibration.camera.T_body_camera,
+        Path(path), Pinhole.of(calibration.camera), calibration.camera.T_body_camera,
         calibration.lidar.T_body_lidar, images, scans, trajectory, name,
     )  # fmt: skip
 
@@ -197,11 +197,3 @@ def slam_poses(scans: list[TimedScan], wheels: list[tuple], T_body_lidar: np.nda
     with tempfile.TemporaryDirectory() as folder:
         map_drive(Measurements(T_body_lidar, merged, lambda: None), Path(folder))
         return read_tum(Path(folder) / "trajectory.tum")
-
-
-def pinhole_of(camera: Any) -> Pinhole:
-    """The Pinhole of a CameraModel message."""
-    return Pinhole(
-        camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px, camera.width_px, camera.height_px,
-        camera.distortion_model, tuple(camera.distortion),
-    )  # fmt: skip

@@ -13,7 +13,7 @@ from common.camera import Pinhole, Undistorter
 from common.errors import UserError
 from common.rig import load_rig
 from services.depth.source import DepthSource, View
-from services.evaluation.drive import Drive, pinhole_of
+from services.evaluation.drive import Drive
 from services.evaluation.evaluate import Outcome, read_truth, walk
 
 _Z_RANGE_M = (0.4, 10.0)
@@ -73,7 +73,7 @@ def draw_image(path: Path, source: DepthSource, rig: Path | None, out: Path) -> 
         loaded = load_rig(rig)
         if loaded.camera is None:
             raise UserError(f"{rig}: has no [camera]")
-        camera = pinhole_of(loaded.camera.model())
+        camera = Pinhole.of(loaded.camera.model())
     if camera.shape != (h, w):
         raise UserError(f"{rig}: is for {camera.width_px}x{camera.height_px}, {path} is {w}x{h}")
     undistort = Undistorter(camera)

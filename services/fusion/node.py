@@ -88,10 +88,7 @@ class FusionNode(Node):
             return iter(())
         camera = rig.camera
         self._undistort = Undistorter(
-            Pinhole(
-                camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px, camera.width_px, camera.height_px,
-                camera.distortion_model, camera.distortion,
-            )
+            Pinhole.of(camera)
         )  # fmt: skip
         self._T_body_camera = camera.T_body_camera
         self._history = History(np.eye(4) if rig.lidar is None else rig.lidar.T_body_lidar)

@@ -116,8 +116,7 @@ class KeyframesNode(Node):
             return iter(())
         c = rig.camera
         self._camera = c
-        lens = Pinhole(c.fx_px, c.fy_px, c.cx_px, c.cy_px, c.width_px, c.height_px, c.distortion_model,
-                       c.distortion)  # fmt: skip
+        lens = Pinhole.of(c)
         self._undistort = Undistorter(lens)
         self._history = History(np.eye(4) if rig.lidar is None else rig.lidar.T_body_lidar)
         s = self.config

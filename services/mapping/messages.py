@@ -30,10 +30,7 @@ def open_keyframe(message: Keyframe, lens: Callable[[Pinhole], Undistorter]) -> 
     """
     camera = message.camera
     undistort = lens(
-        Pinhole(
-            camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px, camera.width_px, camera.height_px,
-            camera.distortion_model, camera.distortion,
-        )
+        Pinhole.of(camera)
     )  # fmt: skip
     p = undistort.pinhole
     rgb = decode_rgb(message.picture, message.encoding, p.width_px, p.height_px)

@@ -59,8 +59,7 @@ class CameraLocalization(Node):
             log.error("the calibration has no camera: pictures cannot be used")
         elif self._tracker is None:
             c = rig.camera
-            lens = Pinhole(c.fx_px, c.fy_px, c.cx_px, c.cy_px, c.width_px, c.height_px, c.distortion_model,
-                           c.distortion)  # fmt: skip
+            lens = Pinhole.of(c)
             self._undistort = Undistorter(lens)
             settings = CameraTrackerSettings(planar=self.config.planar, width_px=self.config.width_px)
             self._tracker = CameraTracker(self._undistort.pinhole, c.T_body_camera, settings)
