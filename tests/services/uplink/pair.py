@@ -1,0 +1,173 @@
+"""The real system on two hosts with a radio between them: a recorded drive on one, the map on the other.
+
+All times are of one machine's clock, which both hosts share: `sent_ns` is in a message's header (its producer's
+monotonic clock as it was handed to the bus), `heard_ns` is taken by a subscriber beside the consumers.
+"""
+
+import contextlib
+import json
+import os
+import subprocess
+import sys
+import time
+
+import numpy as np
+
+from common.access import Host
+from common.config import Deployment, RouterConfig
+from common.security import SecurityConfig
+from services.authority import Authority
+from services.mapping.session.folder import SessionFolder
+from tests.services.uplink.radio import FAR_ADDRESS, ROOT
+
+PORT = 7448
+LIGHT = {"half_steps": 4, "full_steps": 1, "tick_steps": 0}  # a slow machine for a GPU's work
+
+
+class Log:
+    """What one side has heard so far."""
+
+    def __init__(self, path):
+        lines = path.read_text().splitlines() if path.exists() else []
+        self.lines = [json.loads(line) for line in lines if line.endswith("}")]
+
+    def of(self, topic):
+        return [line for line in self.lines if line["topic"] == topic]
+
+    def first(self, topic, what):
+        """stamp_ns -> the earliest `what` ("heard_ns", "sent_ns")."""
+        out = {}
+        for line in self.of(topic):
+            out[line["stamp_ns"]] = min(line[what], out.get(line["stamp_ns"], line[what]))
+        return out
+
+
+class HostProcess:
+    """A side (see tests.services.uplink.side) that runs on one of the hosts."""
+
+    def __init__(self, radio, namespace, deployment, folder):
+        folder.mkdir(parents=True)
+        self.deployment, self._log = deployment, folder / "heard.jsonl"
+        (folder / "deployment.json").write_text(deployment.model_dump_json())
+        command = [sys.executable, "-m", "tests.services.uplink.side", folder / "deployment.json", self._log]
+        self._process = subprocess.Popen(
+            radio.on(namespace, *map(str, command)), stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+            cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT)}, stderr=(folder / "stderr.log").open("w"),
+        )  # fmt: skip
+        self._answer()
+
+    def _answer(self):
+        line = self._process.stdout.readline()
+        assert line, f"{self.deployment.role} has died: {self._log.parent}/stderr.log"
+        return json.loads(line)
+
+    def ask(self, text):
+        self._process.stdin.write(text + "\n")
+        self._process.stdin.flush()
+        return self._answer()
+
+    def state(self):
+        return self.ask("state")
+
+    def end(self):
+        if self._process.poll() is None:
+            with contextlib.suppress(OSError, AssertionError):
+                self.ask("end")
+        self._process.stdin.close()
+        self._process.wait(60)
+
+    @property
+    def log(self):
+        return Log(self._log)
+
+
+class BadLinkPair:
+    """`near` drives, `far` maps into `session`; use with `with`."""
+
+    def __init__(self, radio, folder, data, *, duration_s=None, mapping=LIGHT, keyframes=None, loop=False):
+        self._radio, self._folder = radio, folder
+        authority = Authority.create(folder / "authority")
+        edge_keys = authority.issue("edge", Host(role="edge"), (FAR_ADDRESS,))
+        robot_keys = authority.issue("r1", Host(role="robot", robot="r1"))
+        self.session = folder / "session"
+        replay = {"data": str(data), "loop": loop}
+        if duration_s is not None and not loop:
+            replay["duration_s"] = float(duration_s)
+        queue = {"durable": True, "queue_mb": 2000.0, "retry_s": 3.0, **(keyframes or {})}
+        self._robot = Deployment(
+            robot="r1", role="robot", router=RouterConfig(listen=("tcp/127.0.0.1:7447",)),
+            state_dir=folder / "robot", security=SecurityConfig(keys=robot_keys),
+            nodes={
+                "replay": replay, "localization": {"kind": "lidar"}, "depth": {"source": "stixel"}, "fusion": {},
+                "keyframes": queue, "uplink": {"edge": f"tls/{FAR_ADDRESS}:{PORT}"},
+            },
+        )  # fmt: skip
+        self._edge = Deployment(
+            robot="r1", role="edge", state_dir=folder / "edge", security=SecurityConfig(keys=edge_keys),
+            router=RouterConfig(listen=("tcp/127.0.0.1:7449", f"tls/{FAR_ADDRESS}:{PORT}")),
+            nodes={"mapping": {**mapping, "session": str(self.session)}},
+        )  # fmt: skip
+
+    def __enter__(self):
+        with contextlib.ExitStack() as stack:
+            self.far = HostProcess(self._radio, self._radio.far, self._edge, self._folder / "far")
+            stack.callback(self.far.end)
+            self.near = HostProcess(self._radio, self._radio.near, self._robot, self._folder / "near")
+            stack.callback(self.near.end)
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(self, *exception):
+        self._stack.close()
+
+    def wait(self, until, timeout_s):
+        """Until `until(near, far)`, given the states of both."""
+        deadline = time.monotonic() + timeout_s
+        while time.monotonic() < deadline:
+            near, far = self.near.state(), self.far.state()
+            if until(near, far):
+                return near, far
+            time.sleep(0.5)
+        raise AssertionError(f"not within {timeout_s} s: {near['states']} {near['details']} {far['states']} {far['details']}")
+
+    def drained(self, timeout_s):
+        """All that was driven is mapped."""
+        return self.wait(
+            lambda near, far: near["states"].get("keyframes") == "drained"
+            and far["states"].get("mapping") == "drained",
+            timeout_s,
+        )
+
+    @property
+    def queued(self):
+        """Ids of keyframes on the robot's disk."""
+        return {int(p.stem) for p in (self._robot.run_dir / "keyframes").glob("*.keyframe")}
+
+    def durable(self):
+        """id -> when it was on the edge's disk (monotonic ns; from the file's time of writing)."""
+        shift_ns = time.monotonic_ns() - time.time_ns()
+        folder = SessionFolder(self.session)
+        return {i: (folder.bodies / f"{i}.kf").stat().st_mtime_ns + shift_ns for i in folder.body_ids()}
+
+
+def quantiles(values_ns):
+    """(p50, p95, p99, largest) in ms."""
+    if not len(values_ns):
+        return (float("nan"),) * 4
+    return tuple(np.percentile(np.asarray(values_ns) / 1e6, (50, 95, 99, 100)))
+
+
+def onboard(log, since_ns, until_ns):
+    """(share of scans that got a pose, poses/s, latencies in ns) of the robot's localization."""
+    scans = {s: t for s, t in log.first("lidar/scan", "sent_ns").items() if since_ns <= t < until_ns}
+    poses = log.first("localization/odometry", "sent_ns")
+    late = [poses[s] - t for s, t in scans.items() if s in poses]
+    seconds = (max(scans.values()) - min(scans.values())) / 1e9 if len(scans) > 1 else float("nan")
+    return len(late) / max(len(scans), 1), len(late) / seconds, late
+
+
+def transit(near, far, topic, since_ns, until_ns):
+    """Latencies in ns, from sent first on the robot to heard first on the edge; and how many never came."""
+    sent, heard = near.first(topic, "sent_ns"), far.first(topic, "heard_ns")
+    mine = {s: t for s, t in sent.items() if since_ns <= t < until_ns}
+    return [heard[s] - t for s, t in mine.items() if s in heard], sum(s not in heard for s in mine)

@@ -1,0 +1,122 @@
+"""The real system over a bad link: 20 Mbit/s, 20 ms each way, 1 % loss; and cut for a while.
+
+Figures are printed (`pytest -s`), not asserted: they belong to a machine. What is lost is asserted.
+"""
+
+import subprocess
+import sys
+import time
+
+import pytest
+
+from tests.services.uplink.pair import BadLinkPair, onboard, quantiles, transit
+from tests.services.uplink.radio import ROOT, Radio, needs_namespaces
+
+BAD = {"rate_mbit": 20, "delay_ms": 20.0, "loss": 0.01, "seed": 7}
+SETTLED_S = 30.0  # link up, before it is cut
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory):
+    """(laps) -> a simulated drive that ends where it began, 70 s a lap."""
+    needs_namespaces()
+    made = {}
+
+    def make(laps):
+        if laps not in made:
+            out = tmp_path_factory.mktemp("drives") / f"laps{laps}"
+            command = [sys.executable, "-m", "services", "simulate", "--out", out, "--laps", laps]
+            subprocess.run([*map(str, command)], check=True, cwd=ROOT, capture_output=True)
+            made[laps] = out / "bag"
+        return made[laps]
+
+    return make
+
+
+def say(what, values):
+    print(f"  {what:<58} {values}", flush=True)
+
+
+def milliseconds(latencies):
+    return "p50 {:.0f}, p95 {:.0f}, p99 {:.0f}, most {:.0f} ms".format(*quantiles(latencies))
+
+
+def print_onboard(log, phase, since_ns, until_ns):
+    share, rate, late = onboard(log, since_ns, until_ns)
+    say(f"localization onboard, {phase}", f"{100 * share:.1f} % of scans, {rate:.2f} Hz, {milliseconds(late)}")
+
+
+def print_transit(near, far, since_ns, until_ns):
+    for topic in ("localization/odometry", "keyframes/frame"):
+        late, missing = transit(near, far, topic, since_ns, until_ns)
+        say(f"{topic} to the edge", f"{len(late)}: {milliseconds(late)}; {missing} not yet there")
+
+
+def run_with_cut(pair, radio, cut_s):
+    """(when cut, when mended), monotonic ns."""
+    pair.wait(lambda near, far: len(pair.far.log.of("keyframes/frame")) >= 2, 120)
+    begin_ns = time.monotonic_ns()
+    time.sleep(SETTLED_S)
+    if cut_s:
+        print(radio.tell("cut"))
+    cut_ns = time.monotonic_ns()
+    time.sleep(cut_s)
+    print(radio.tell("mend"))
+    return begin_ns, cut_ns, time.monotonic_ns()
+
+
+def print_recovery(pair, cut_ns, mended_ns):
+    outage_s = (mended_ns - cut_ns) / 1e9
+    made = pair.near.log.first("keyframes/frame", "sent_ns")
+    durable = pair.durable()
+    mapped = pair.far.log.first("mapping/status", "sent_ns")
+    during = [i for i, t in made.items() if cut_ns - 1_000_000_000 <= t < mended_ns]
+    for what, when, bound in (("durable", durable, 1 / 3), ("mapped", mapped, 1.0)):
+        last_s = max(((when[i] - mended_ns) / 1e9 for i in during if i in when), default=float("nan"))
+        say(f"{len(during)} keyframes of an outage of {outage_s:.0f} s {what}",
+            f"{last_s:.1f} s after it (bound {bound * outage_s:.0f} s)")  # fmt: skip
+    late, _ = transit(pair.near.log, pair.far.log, "keyframes/frame", mended_ns + 1_500_000_000,
+                      mended_ns + round(outage_s / 3 * 1e9))  # fmt: skip
+    say("live keyframes meanwhile", milliseconds(late))
+
+
+def check_complete(pair):
+    """Every keyframe that the robot made is on the edge's disk and in its map, or was refused and said."""
+    made = set(pair.near.log.first("keyframes/frame", "sent_ns"))
+    acks = {line["stamp_ns"]: line["status"] for line in pair.far.log.of("keyframes/ack")}
+    refused = {i for i, status in acks.items() if status != "ok"}
+    say("keyframes made, refused", f"{len(made)}, {len(refused)}")
+    assert len(made) > 20
+    assert made == set(acks)
+    assert set(pair.far.log.of("mapping/poses")[-1]["ids"]) == made - refused
+    assert not pair.queued
+    return made
+
+
+def print_states(states):
+    for state in states:
+        for node, detail in sorted(state["details"].items()):
+            say(node, detail)
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("cut_s", [0, 60, 600])
+def test_a_bad_link_does_not_reach_the_robot_and_loses_no_keyframe(tmp_path, drive, cut_s):
+    data = drive(2 if cut_s <= 60 else 10)
+    with (
+        Radio(**BAD) as radio,
+        BadLinkPair(radio, tmp_path, data, duration_s=SETTLED_S + cut_s + 40.0) as pair,
+    ):
+        begin_ns, cut_ns, mended_ns = run_with_cut(pair, radio, cut_s)
+        states = pair.drained(120 + 2 * cut_s)
+        near, far = pair.near.log, pair.far.log
+        print()
+        print_onboard(near, "link up", begin_ns, cut_ns)
+        if cut_s:
+            print_onboard(near, "link cut", cut_ns, mended_ns)
+            print_onboard(near, "catching up", mended_ns, mended_ns + round(cut_s / 3 * 1e9))
+        print_transit(near, far, begin_ns, cut_ns - 2_000_000_000)
+        if cut_s:
+            print_recovery(pair, cut_ns, mended_ns)
+        print_states(states)
+    check_complete(pair)
