@@ -37,7 +37,8 @@ from common.takeover import CONTROL
 from common.topics import HEALTH, Topic, topic
 
 ROOT = "beamsplat"
-LINK_BUFFER_BYTES = 32 * 1024  # 13 ms at 20 Mbit/s
+URGENT_BUFFER_BYTES = 32 * 1024  # 13 ms at 20 Mbit/s
+BULK_BUFFER_BYTES = 256 * 1024  # at least rate x round trip, or the rate is not reached: 20 Mbit/s x 100 ms
 SHM_POOL_BYTES = 64 * 1024 * 1024
 
 
@@ -136,10 +137,12 @@ def open_session(
             time.sleep(0.1)
 
 
-def open_link(endpoint: str, wait_s: float, security: SecurityConfig) -> zenoh.Session:
+def open_link(
+    endpoint: str, wait_s: float, security: SecurityConfig, buffer_bytes: int = URGENT_BUFFER_BYTES
+) -> zenoh.Session:
     """A client session of a router on another host, over a link that may be slow and may break.
 
-    Small send buffers keep what is urgent from standing behind seconds of what is not.
+    What is written waits in the kernel's send buffer, `buffer_bytes` of it at most: behind the rest.
 
     Raises:
         UserError: a malformed endpoint, credentials that are missing, or no router answered within `wait_s`.
@@ -152,7 +155,7 @@ def open_link(endpoint: str, wait_s: float, security: SecurityConfig) -> zenoh.S
     if is_secure(endpoint):
         Keys.of(security).identify(config)
     for protocol in ("tcp", "tls"):
-        config.insert_json5(f"transport/link/{protocol}/so_sndbuf", str(LINK_BUFFER_BYTES))
+        config.insert_json5(f"transport/link/{protocol}/so_sndbuf", str(buffer_bytes))
     config.insert_json5("connect/timeout_ms", str(round(wait_s * 1e3)))
     config.insert_json5("connect/exit_on_failure", "true")
     try:

@@ -232,8 +232,7 @@ class Live:
     def emit(self, outputs: Iterator[Output]) -> None:
         for output in outputs:
             if isinstance(output, Job):
-                future = self._jobs.start(output)
-                future.add_done_callback(lambda _: self._wake())
+                self._jobs.start(output).add_done_callback(lambda _: self._wake())
             elif not self.takeover.keeps(*output):
                 self.publications[output[0]].put(output[1])
 
@@ -282,6 +281,8 @@ class Live:
     # --- called from threads of the bus ---
 
     def _on_letter(self, letter: Letter) -> None:
+        if not (self.takeover.standby or self.takeover.retired):
+            self.emit(self.node.handle_arrival(letter.topic, letter.message))
         with self.changed:
             if self.mailbox.put(letter):
                 self.changed.notify()
@@ -290,9 +291,8 @@ class Live:
         with self.changed:
             self.mailbox.counts[topic].undecodable += 1
             count = self._complaints.due(topic)
-        if count is None:
-            return
-        log.warning("dropped a message on %s (%d more since the last report): %s", topic, count, reason)
+        if count is not None:
+            log.warning("dropped a message on %s (%d more since the last report): %s", topic, count, reason)
 
     def _on_end(self, topic: str, instance: str, epoch: int, sent: int) -> None:
         with self.changed:

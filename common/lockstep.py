@@ -96,6 +96,7 @@ class Lockstep:
         letter = Letter(name, header, message)
         self._on_message(letter)
         for consumer in self._consumers[name]:
+            self._emit(consumer, consumer.node.handle_arrival(name, message), time_ns)
             consumer.mailbox.put(letter)
             self._step(consumer, time_ns)
 

@@ -44,7 +44,8 @@ class Keyframe(Message):
 
 
 class KeyframeAck(Message):
-    """The mapper has dealt with a keyframe, which need not be sent again: "ok", or why it was refused."""
+    """The mapper has a keyframe, which need not be sent again: "ok", or why it was refused. One that was "ok"
+    when it came can be refused later, when it is looked at."""
 
     id: Count
     status: Text = "ok"

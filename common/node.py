@@ -143,6 +143,11 @@ class Node:
     def meet(self, ask: Ask) -> None:
         """Those that command others override this: how to ask a node something, live only."""
 
+    def on_arrival(self, topic: str, message: Message) -> Iterable[Output]:
+        """Sees each message as it arrives, before its turn among others: what must not wait while a step
+        takes long. Live it is called from other threads than everything else."""
+        return ()
+
     def on_header(self, header: Header) -> None:
         """Sees what rode beside the message that is handled next; the recorder keeps it."""
 
@@ -191,6 +196,10 @@ class Node:
     def handle(self, topic_name: str, message: Message) -> Iterator[Output]:
         """What the handler of `topic_name` sends, each checked to be declared."""
         yield from self._declared(getattr(self, topic(topic_name).handler)(message))
+
+    def handle_arrival(self, topic_name: str, message: Message) -> Iterator[Output]:
+        """What `on_arrival` sends."""
+        yield from self._declared(self.on_arrival(topic_name, message))
 
     def handle_job(self, name: str, result: Any) -> Iterator[Output]:
         """What `on_job_<name>` sends."""

@@ -98,7 +98,8 @@ class KeyframesNode(Node):
         folder = self.home.run_dir / "keyframes" if c.durable and self.home is not None else None
         self._outbox = Outbox(round(c.queue_mb * 1e6), round(c.retry_s * 1e9), c.window, folder)
         self._now_ns = 0  # by the pictures
-        self._seen = self._sent = self._again = self._refused = 0
+        self._seen = self._sent = self._again = 0
+        self._refused: set[int] = set()
         if self._outbox.earlier:
             log.info("%d keyframes of before wait in %s", self._outbox.earlier, folder)
 
@@ -194,8 +195,9 @@ class KeyframesNode(Node):
 
     def on_keyframes_ack(self, ack: KeyframeAck) -> Outputs:
         """The mapper has it, or refused it: either way it need not come again."""
-        if self._outbox.acknowledge(ack.id, self._now_ns) and ack.status != "ok":
-            self._refused += 1
+        self._outbox.acknowledge(ack.id, self._now_ns)
+        if ack.status != "ok":
+            self._refused.add(ack.id)
         yield from self._send_again()
         self._say()
 
@@ -274,7 +276,7 @@ class KeyframesNode(Node):
     def _say(self) -> None:
         o = self._outbox
         counts = {
-            "sent again": self._again, "refused": self._refused, "thrown away": o.given_up,
+            "sent again": self._again, "refused": len(self._refused), "thrown away": o.given_up,
             "not on disk": o.unstored, "broken": o.broken, "of earlier drives": o.earlier,
         }  # fmt: skip
         said = "".join(f", {count} {what}" for what, count in counts.items() if count)

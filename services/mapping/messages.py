@@ -8,9 +8,10 @@ import cv2
 import numpy as np
 
 from common.camera import Pinhole, Undistorter
+from common.codec import encode, schema_of
 from common.depth_code import depth_from_png, mask_from_png, sigma_from_png
 from common.errors import UserError
-from common.messages import Keyframe, MapChunk, MapPreview, MapState
+from common.messages import Keyframe, KeyframeAck, MapChunk, MapPreview, MapState
 from common.picture import decode_rgb
 from common.raster.camera import RasterCamera
 from common.splats import pack
@@ -20,6 +21,16 @@ from services.mapping.look import Look
 from services.mapping.session.folder import Arrays, packed_arrays, unpacked_arrays
 
 _PIECE_BYTES = 4 << 20
+
+
+def ack(message: Keyframe, status: str) -> tuple[str, KeyframeAck]:
+    """The answer to a keyframe, as a node sends it."""
+    return "keyframes/ack", KeyframeAck(stamp_ns=message.stamp_ns, id=message.id, status=status)
+
+
+def body_of(message: Keyframe) -> tuple[str, bytes]:
+    """A keyframe as a session keeps it: schema and payload."""
+    return schema_of(message), encode(message)
 
 
 def open_keyframe(message: Keyframe, lens: Callable[[Pinhole], Undistorter]) -> MapKeyframe:

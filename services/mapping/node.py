@@ -10,19 +10,9 @@ from functools import lru_cache
 import numpy as np
 
 from common.camera import Undistorter
-from common.codec import encode, schema_of
 from common.errors import UserError
 from common.geometry import inverse
-from common.messages import (
-    Anchors,
-    Keyframe,
-    KeyframeAck,
-    MapChunk,
-    MapPoses,
-    MapState,
-    MapStatus,
-    Tick,
-)  # fmt: skip
+from common.messages import Anchors, Keyframe, MapChunk, MapPoses, MapState, MapStatus, Tick
 from common.node import Input, Outputs
 from services.mapping.chunks import ChunkFeed, Eye, parts
 from services.mapping.config import MappingConfig
@@ -30,7 +20,15 @@ from services.mapping.export import write_map
 from services.mapping.keyframe import Held
 from services.mapping.look import look
 from services.mapping.mapper import FULL, HALF, Mapper, Outcome
-from services.mapping.messages import chunk_message, eye_of, open_keyframe, preview_message, state_messages
+from services.mapping.messages import (
+    ack,
+    body_of,
+    chunk_message,
+    eye_of,
+    open_keyframe,
+    preview_message,
+    state_messages,
+)
 from services.mapping.session.node import SessionNode
 from services.mapping.session.state import arrays_of
 from services.mapping.settings import MapperSettings
@@ -42,7 +40,8 @@ ODOM_ORIGIN = -1  # the anchor of keyframes from before localization named one
 
 
 class MappingNode(SessionNode):
-    """Takes every keyframe, in any order; each is acknowledged when it has been dealt with."""
+    """Takes every keyframe, in any order. With a session each is acknowledged as soon as it is on this disk,
+    without one when it is in the map."""
 
     name = "mapping"
     Config = MappingConfig
@@ -62,7 +61,7 @@ class MappingNode(SessionNode):
         self._taken: dict[int, tuple[int, np.ndarray]] = {}  # keyframe -> stamp_ns, T_camera_body
         self._feed = ChunkFeed()
         self._eye: Eye | None = None  # where the newest keyframe looks from
-        self._refused = 0  # keyframes, so far
+        self._refusals: dict[int, str] = {}  # keyframe -> why
         # The oldest submap's place when the origin was tied to it.
         self._T_oldest_origin: np.ndarray | None = None
         if c.memory_mb is not None and c.session is None:
@@ -74,19 +73,19 @@ class MappingNode(SessionNode):
 
     def on_keyframes_frame(self, message: Keyframe) -> Outputs:
         """Insertion and the fixed steps; then how well the picture is explained, and what has changed."""
+        kept = self._arrivals is not None and self._arrivals.begin(message.id)
         known = message.id in self._taken
         outcome = Outcome("ok") if known else self._take(message)
-        if not outcome.ok or self._kept(message, known):
-            status = outcome.status
-            yield "keyframes/ack", KeyframeAck(stamp_ns=message.stamp_ns, id=message.id, status=status)
+        if not outcome.ok or (not kept and self._kept(message, known)):
+            yield ack(message, outcome.status)
         if known:  # sent again while the answer was on its way
             return
         if not outcome.ok:
-            self._refused += 1
-            log.warning("keyframe %d is refused: %s", message.id, outcome.status)
+            self._refuse(message.id, outcome.status)
             yield "mapping/status", self._status(message.stamp_ns, outcome, 0.0)
             return
-        share = min(self.config.calm_backlog / max(message.backlog, 1), 1.0)
+        waiting = message.backlog + (0 if self._arrivals is None else len(self._arrivals))
+        share = min(self.config.calm_backlog / max(waiting, 1), 1.0)
         c = self.config
         loss = self._mapper.optimise(math.ceil(c.half_steps * share), math.ceil(c.full_steps * share))
         yield from self._show(message, outcome, loss)
@@ -109,7 +108,7 @@ class MappingNode(SessionNode):
         keeper = self._keeper
         if keeper is None or (known and not keeper.lacks(message.id)):
             return True
-        return keeper.keep(message.id, schema_of(message), encode(message))
+        return keeper.keep(message.id, *body_of(message))
 
     # --- anchors and time ---
 
@@ -136,7 +135,10 @@ class MappingNode(SessionNode):
         """Time passes and no keyframe waits: steps on all keyframes, and the chunk sent longest ago."""
         if not self._mapper.keyframes:
             return
-        self._mapper.refine(self.config.tick_steps, FULL)
+        if self._arrivals is not None and self._arrivals.behind:
+            yield from self._overtaken()
+        else:
+            self._mapper.refine(self.config.tick_steps, FULL)
         longest = self._feed.longest_due(self._mapper, self._eye)
         if longest is not None:
             yield from self._chunk(longest, tick.stamp_ns)
@@ -164,12 +166,12 @@ class MappingNode(SessionNode):
     ) -> MapStatus:  # fmt: skip
         m, held = self._mapper, len(self._held())
         self.detail = f"{held} keyframes, {m.store.count} Gaussians, {psnr_db:.1f} dB" + (
-            f", {self._refused} refused (last: {outcome.status})" if not outcome.ok else ""
+            f", {len(self._refusals)} refused (last: {outcome.status})" if not outcome.ok else ""
         )
         session = "" if self._keeper is None else self._keeper.text()
         self.detail += f"; {session}" if session else ""
         return MapStatus(
-            stamp_ns=stamp_ns, status=outcome.status, keyframes=held, refused=self._refused,
+            stamp_ns=stamp_ns, status=outcome.status, keyframes=held, refused=len(self._refusals),
             gaussians=m.store.count, steps=m.steps, loss=loss, foretold_share=outcome.foretold_share,
             foretold_psnr_db=outcome.foretold_psnr_db, psnr_db=psnr_db, depth_error_m=depth_error_m,
             session=session,
@@ -195,6 +197,10 @@ class MappingNode(SessionNode):
 
     def drain(self) -> Outputs:
         """The map as the data left it; then, if asked for, refined; and the files asked for."""
+        if self._arrivals is not None:
+            self._arrivals.rest()
+        while self._arrivals:
+            yield from self._overtaken()
         if not self._mapper.keyframes:
             return
         yield from self._whole()

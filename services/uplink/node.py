@@ -14,7 +14,7 @@ from typing import Annotated
 import zenoh
 from pydantic import Field
 
-from common.bus import open_link, open_session
+from common.bus import BULK_BUFFER_BYTES, URGENT_BUFFER_BYTES, open_link, open_session
 from common.config import NodeConfig
 from common.errors import UserError
 from common.node import Node, Sourced
@@ -79,8 +79,8 @@ class UplinkNode(Node):
         """
         opened: list[zenoh.Session] = []
         try:
-            for _ in ("small", "large"):
-                opened.append(open_link(self.config.edge, _ATTEMPT_S, self.home.security))
+            for buffer_bytes in (URGENT_BUFFER_BYTES, BULK_BUFFER_BYTES):
+                opened.append(self._link(buffer_bytes))
             opened.append(open_session(self.home.endpoints, _ATTEMPT_S))
         except UserError:
             for session in opened:
@@ -90,12 +90,15 @@ class UplinkNode(Node):
         small, large, robot = opened
         self._relay = Relay(self.home.robot, Sides(robot=robot, small=small, large=large))
 
+    def _link(self, buffer_bytes: int) -> zenoh.Session:
+        return open_link(self.config.edge, _ATTEMPT_S, self.home.security, buffer_bytes)
+
     def _mend(self) -> None:
         """After a cut the session for large messages is replaced, once the small one is connected again."""
         if not self._large_broke or not self._sessions[0].info.routers_zid():
             return
         try:
-            large = open_link(self.config.edge, _ATTEMPT_S, self.home.security)
+            large = self._link(BULK_BUFFER_BYTES)
         except UserError:
             return
         small, old, robot = self._sessions

@@ -88,6 +88,10 @@ class Keeper:
             log.warning("left out: %s", error)
             return None
 
+    def drop(self, id: int) -> None:
+        """The mapper refuses a keyframe that is on disk."""
+        self.folder.remove_bodies([id])
+
     # --- keyframes ---
 
     def keep(self, id: int, schema: str, payload: bytes) -> bool:

@@ -9,11 +9,12 @@ import numpy as np
 
 from common.camera import Pinhole, Undistorter
 from common.codec import decode
-from common.messages import Keyframe
+from common.messages import Keyframe, Message
 from common.node import Job, Node, Outputs
 from services.mapping.config import MappingConfig
 from services.mapping.mapper import Mapper, Outcome
-from services.mapping.messages import open_keyframe
+from services.mapping.messages import ack, body_of, open_keyframe
+from services.mapping.session.arrivals import Arrivals
 from services.mapping.session.keeper import Keeper, Saved
 from services.mapping.session.paging import Pager
 
@@ -26,12 +27,17 @@ class SessionNode(Node):
     replaceable = hands_over = True
     config: MappingConfig
     _keeper: Keeper | None = None
+    _arrivals: Arrivals | None = None
     _mapper: Mapper
     _lens: Callable[[Pinhole], Undistorter]
     _taken: dict[int, tuple[int, np.ndarray]]  # keyframe -> stamp_ns, T_camera_body
+    _refusals: dict[int, str]
     _T_oldest_origin: np.ndarray | None
 
     def _take(self, message: Keyframe) -> Outcome:
+        raise NotImplementedError
+
+    def on_keyframes_frame(self, message: Keyframe) -> Outputs:
         raise NotImplementedError
 
     def close(self) -> None:
@@ -59,6 +65,27 @@ class SessionNode(Node):
             pager = None if c.memory_mb is None else Pager(c.memory_mb * 1e6, c.seed)
             self._keeper = Keeper(c.session, round(c.session_every_s * 1e9), pager)
             self._resume(self._keeper)
+            self._arrivals = Arrivals(self._keeper)
+
+    def on_arrival(self, topic: str, message: Message) -> Outputs:
+        """A keyframe is acknowledged before its turn comes, if it is to survive this process and does."""
+        if self._arrivals is None or not isinstance(message, Keyframe):
+            return
+        status = self._refusals.get(message.id)
+        known = message.id in self._taken
+        if status is not None or self._arrivals.take(message.id, known, lambda: body_of(message)):
+            yield ack(message, status or "ok")
+
+    def _refuse(self, id: int, why: str) -> None:
+        self._refusals[id] = why
+        if self._keeper is not None:
+            self._keeper.drop(id)
+        log.warning("keyframe %d is refused: %s", id, why)
+
+    def _overtaken(self) -> Outputs:
+        """One keyframe from the disk that the mailbox had no room for."""
+        if (body := self._arrivals.overtaken()) is not None:
+            yield from self.on_keyframes_frame(decode(*body))
 
     def _resume(self, keeper: Keeper) -> None:
         """Becomes what was saved; keyframes that came after the checkpoint are taken in again."""
@@ -70,8 +97,13 @@ class SessionNode(Node):
             self._T_oldest_origin = next(iter(extra["T_oldest_origin"]), None)
         for id in newer:
             body = keeper.body(id)
-            if body is not None and self._take(decode(*body)).ok:
+            if body is None:
+                continue
+            outcome = self._take(decode(*body))
+            if outcome.ok:
                 self._mapper.optimise()
+            else:
+                self._refuse(id, outcome.status)
         if m.keyframes:
             log.info("goes on with %d keyframes (%d came after the checkpoint), %d Gaussians, step %d",
                      len(m.keyframes), len(newer), m.store.count, m.steps)  # fmt: skip

@@ -128,13 +128,16 @@ class BadLinkPair:
             if until(near, far):
                 return near, far
             time.sleep(0.5)
-        raise AssertionError(f"not within {timeout_s} s: {near['states']} {near['details']} {far['states']} {far['details']}")
+        raise AssertionError(
+            f"not within {timeout_s} s: {near['states']} {near['details']} {far['states']} {far['details']}"
+        )
 
     def drained(self, timeout_s):
         """All that was driven is mapped."""
         return self.wait(
-            lambda near, far: near["states"].get("keyframes") == "drained"
-            and far["states"].get("mapping") == "drained",
+            lambda near, far: (
+                near["states"].get("keyframes") == "drained" and far["states"].get("mapping") == "drained"
+            ),
             timeout_s,
         )
 

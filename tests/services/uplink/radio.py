@@ -64,7 +64,7 @@ class Radio:
     def _set_up(self, name, own, other):
         _ip("-n", name, "link", "set", "lo", "up")
         _ip("-n", name, "address", "add", own, "peer", other, "dev", DEVICE)
-        _ip("-n", name, "link", "set", DEVICE, "up")
+        _ip("-n", name, "link", "set", DEVICE, "addrgenmode", "none", "up")  # no packets of the kernel's own
         # By route: a namespace of its own may not choose among all algorithms by sysctl.
         _ip("-n", name, "route", "replace", other, "dev", DEVICE, "src", own, "congctl", self._congestion)
         if self._rate:

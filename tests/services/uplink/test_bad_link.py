@@ -43,7 +43,9 @@ def milliseconds(latencies):
 
 def print_onboard(log, phase, since_ns, until_ns):
     share, rate, late = onboard(log, since_ns, until_ns)
-    say(f"localization onboard, {phase}", f"{100 * share:.1f} % of scans, {rate:.2f} Hz, {milliseconds(late)}")
+    say(
+        f"localization onboard, {phase}", f"{100 * share:.1f} % of scans, {rate:.2f} Hz, {milliseconds(late)}"
+    )
 
 
 def print_transit(near, far, since_ns, until_ns):

@@ -44,10 +44,12 @@ def feed(node, numbers):
     return sent
 
 
-def handle(node, topic, content, sent):
-    """One message in; outputs are added to `sent`."""
+def handle(node, topic, content, sent=None):
+    """One message in; outputs are added to `sent`, which is given back."""
+    sent = {} if sent is None else sent
     for output in node.handle(topic, content):
         if isinstance(output, tuple):
             sent.setdefault(output[0], []).append(output[1])
         else:
             list(node.handle_job(output.name, output.run()))
+    return sent

@@ -1,0 +1,92 @@
+"""What has arrived at a mapper is on its disk, whatever becomes of the mapper before its turn."""
+
+import numpy as np
+
+from common.depth_code import mask_to_png
+from common.lockstep import Lockstep
+from common.messages import Tick
+from services.keyframes.node import KeyframesConfig, KeyframesNode
+from services.mapping.config import MappingConfig
+from services.mapping.node import MappingNode
+from services.mapping.session.arrivals import Arrivals
+from services.mapping.session.folder import SessionFolder
+from services.mapping.session.keeper import Keeper
+from tests.services.mapping import room_drive as r
+from tests.services.mapping.session.maps import SECOND, handle, make_node, message
+
+
+def arrive(node, keyframe):
+    """The statuses that are answered at once."""
+    return [m.status for _, m in node.handle_arrival("keyframes/frame", keyframe)]
+
+
+def ids(node):
+    return sorted(node._mapper.keyframes)
+
+
+def test_an_arrived_keyframe_is_answered_once_and_survives_a_mapper_that_never_came_to_it(tmp_path):
+    node = make_node(tmp_path / "s")
+    assert arrive(node, message(0)) == arrive(node, message(1)) == ["ok"]
+    assert arrive(node, message(1)) == ["ok"]  # sent again before its turn
+    sent = handle(node, "keyframes/frame", message(0))
+    assert "keyframes/ack" not in sent
+    node.close()  # as a killed process does: the lock ends
+    again = make_node(tmp_path / "s")
+    assert ids(again) == [message(0).id, message(1).id]
+    assert arrive(again, message(1)) == ["ok"]
+    again.close()
+
+
+def test_one_that_is_refused_at_its_turn_is_answered_again_and_leaves_the_disk(tmp_path):
+    node = make_node(tmp_path / "s")
+    everything_moves = mask_to_png(np.zeros((r.HEIGHT, r.WIDTH), bool))
+    empty = message(0).model_copy(update={"mask_png": everything_moves})
+    assert arrive(node, empty) == ["ok"]
+    (answer,) = handle(node, "keyframes/frame", empty)["keyframes/ack"]
+    assert "mask leaves no pixel" in answer.status
+    assert SessionFolder(tmp_path / "s").body_ids() == []
+    assert arrive(node, empty) == [answer.status]
+    node.close()
+
+
+def test_what_the_mailbox_had_no_room_for_is_taken_in_from_the_disk(tmp_path):
+    node = make_node(tmp_path / "s")
+    for number in range(5):
+        arrive(node, message(number))
+    handle(node, "keyframes/frame", message(3))  # 0 to 2 had no turn
+    assert ids(node) == [message(3).id]
+    handle(node, "tick", Tick(stamp_ns=r.T0 + 9 * SECOND, count=1))
+    assert ids(node) == [message(0).id, message(3).id]
+    list(node.drain())
+    assert ids(node) == [message(number).id for number in range(5)]
+    node.close()
+
+
+def test_a_keyframe_that_the_disk_does_not_take_waits_for_its_turn(tmp_path):
+    keeper = Keeper(tmp_path / "s", 10**9)
+    arrivals = Arrivals(keeper)
+    keeper.folder.bodies.rmdir()
+    keeper.folder.bodies.write_text("no folder any more")
+    assert not arrivals.take(1, False, lambda: ("s", b"x"))
+    assert len(arrivals) == 0
+    assert not arrivals.begin(1)
+    assert keeper.text().startswith("NOT SAVED")
+    keeper.close()
+
+
+def test_answers_do_not_wait_for_a_slow_mapper(tmp_path):
+    """Three seconds a keyframe, one every quarter of a second: all are answered before the second is mapped."""
+    heard = []
+    mapper = MappingNode(
+        MappingConfig(session=tmp_path / "s", half_steps=1, full_steps=0, tick_steps=0, step_cost_s=3.0)
+    )
+    Lockstep(
+        [r.RoomDrive(r.DriveConfig(pictures=10)), r.Localizer(r.LocalizerConfig()), r.Fusion(r.Fusion.Config()),
+         KeyframesNode(KeyframesConfig(distance_m=0.15)), mapper],
+        lambda letter: heard.append((letter.topic, letter.message.stamp_ns)),
+    ).run()  # fmt: skip
+    sent = [stamp for topic, stamp in heard if topic == "keyframes/frame"]
+    answered = [i for i, (topic, _) in enumerate(heard) if topic == "keyframes/ack"]
+    mapped = [i for i, (topic, _) in enumerate(heard) if topic == "mapping/status"]
+    assert len(set(sent)) == len(answered) == len(mapped) >= 4
+    assert answered[-1] < mapped[1]
