@@ -34,7 +34,7 @@ from common.node import Input
 from common.security import OPEN, Keys, SecurityConfig, check_endpoint, is_secure
 from common.streams import Publication, Subscription, open_sample
 from common.takeover import CONTROL
-from common.topics import HEALTH, Topic, topic
+from common.topics import HEALTH, LIMIT_KB, Topic, topic
 
 ROOT = "beamsplat"
 URGENT_BUFFER_BYTES = 32 * 1024  # 13 ms at 20 Mbit/s
@@ -105,6 +105,7 @@ def router_config(
     if any(is_secure(endpoint) for endpoint in (*listen, *connect)):
         keys = Keys.of(security)
         keys.identify(config)
+        config.insert_json5("transport/link/rx/max_message_size", str(LIMIT_KB * 1000))
         config.insert_json5("access_control", json.dumps(access_control(read_hosts(keys.folder))))
     config.insert_json5("adminspace/enabled", "true")
     config.insert_json5("adminspace/permissions", "{read: true, write: false}")

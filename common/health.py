@@ -13,6 +13,8 @@ from common.topics import TOPICS
 
 STALE_S = 3.0  # a node silent for so long is not well
 _WINDOW_S = 5.0
+_HISTORY = 50  # within it, however often somebody speaks
+_NODES = 1000  # of all robots: more are made up
 
 
 @dataclass
@@ -22,7 +24,7 @@ class NodeRecord:
     health: Health
     heard: float
     starts: int = 1  # instances seen so far: one more after each restart
-    history: deque[tuple[float, Health]] = field(default_factory=deque)
+    history: deque[tuple[float, Health]] = field(default_factory=lambda: deque(maxlen=_HISTORY))
 
     def silent_s(self, now: float) -> float | None:
         """For how long nothing was heard; None while that is no longer than it may be."""
@@ -89,6 +91,8 @@ class HealthBook:
     def take(self, health: Health, now: float | None = None) -> None:
         """Enters what a node says, heard at `now` (monotonic, s)."""
         now = time.monotonic() if now is None else now
+        if health.node not in self.records and len(self.records) >= _NODES:
+            return
         record = self.records.setdefault(health.node, NodeRecord(health, now))
         if record.health.instance != health.instance:
             record.history.clear()

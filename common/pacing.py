@@ -61,3 +61,21 @@ class Playback:
         """Keeps the place behind a message that was sent."""
         if item.at_ns is not None and not self.is_past(item):
             self._bookmark.write(item.at_ns)
+
+
+class Allowance:
+    """So many a second, and twice as many at once after a pause: a token bucket of one thread."""
+
+    def __init__(self, rate_hz: float, clock_s: Callable[[], float] = time.monotonic) -> None:
+        self._rate_hz, self._clock_s = rate_hz, clock_s
+        self._left, self._at_s = 2.0 * rate_hz, clock_s()
+
+    def take(self) -> bool:
+        """Whether one more is allowed now."""
+        now = self._clock_s()
+        self._left = min(self._left + (now - self._at_s) * self._rate_hz, 2.0 * self._rate_hz)
+        self._at_s = now
+        if self._left < 1.0:
+            return False
+        self._left -= 1.0
+        return True

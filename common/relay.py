@@ -16,11 +16,13 @@ import zenoh
 
 from common.bus import key
 from common.messages import Health
+from common.pacing import Allowance
 from common.streams import FIFO_MESSAGES, declare_reader, declare_writer
 from common.topics import HEALTH, TOPICS, Topic
 
 log = logging.getLogger(__name__)
 
+_HEALTHS_HZ = 100.0  # of all nodes of a side: more is no health, and would cost the other side its CPU
 _NEWEST = 8  # of what is sent again anyway: behind a slow link the oldest is passed over
 _HEALTH_ROW = Topic(HEALTH, Health, (), 1, "every")
 
@@ -51,6 +53,7 @@ class Relay:
         self.carried: dict[str, Carried] = {}
         self.ended: set[str] = set()
         self.failed = 0  # cut off in the middle
+        self.refused = 0  # healths beyond what nodes have to say
         for row in TOPICS.values():
             if row.uplink:
                 self._carry_topic(row, sides)
@@ -96,7 +99,12 @@ class Relay:
         self._carry(source, f"end/{row.name}", end, send_end, None)
 
     def _carry_health(self, source: zenoh.Session, target: zenoh.Session) -> None:
+        allowance = Allowance(_HEALTHS_HZ)
+
         def send(sample: zenoh.Sample) -> None:
+            if not allowance.take():
+                self.refused += 1
+                return
             target.put(
                 sample.key_expr, sample.payload, encoding=sample.encoding, attachment=sample.attachment
             )

@@ -141,12 +141,15 @@ def open_sample(sample: zenoh.Sample, row: Topic) -> Letter:
     """The letter in a sample of topic `row`.
 
     Raises:
-        DecodeError: no header, another message's schema, or a payload that does not decode.
+        DecodeError: no header, too large, another message's schema, or a payload that does not decode.
     """
     if sample.attachment is None:
         raise DecodeError("sample without a header")
     header = Header.unpack(sample.attachment.to_bytes())
     schema = str(sample.encoding).partition(";")[2]
+    if len(sample.payload) > row.limit_kb * 1000:
+        size, most = len(sample.payload) / 1e6, row.limit_kb / 1e3
+        raise DecodeError(f"{size:.1f} MB on {row.name}, where {most:g} MB is the most (common/topics.py)")
     payload = sample.payload.to_bytes()
     message = decode(schema, payload)
     if type(message) is not row.message:

@@ -23,6 +23,13 @@ Delivery = Literal["latest", "every", "latched"]
 Uplink = Literal["", "up", "bulk", "down"]
 
 
+LIMIT_KB = 32_000  # of any message; a router that takes links from other hosts lets nothing larger in
+_LIMITS_KB = {  # of what comes from other hosts
+    "rig": 100, "localization/odometry": 64, "localization/correction": 64, "localization/anchors": 4000,
+    "localization/grid": 16_000, "keyframes/frame": 8000, "keyframes/ack": 16, "tick": 16, "health": 64,
+}  # fmt: skip
+
+
 @dataclass(frozen=True)
 class Topic:
     """One row of the table."""
@@ -40,6 +47,11 @@ class Topic:
     def handler(self) -> str:
         """Name of the node method that takes this topic: camera/image -> on_camera_image."""
         return "on_" + self.name.replace("/", "_")
+
+    @property
+    def limit_kb(self) -> int:
+        """A larger message is none of ours: refused before it is decoded, and counted."""
+        return _LIMITS_KB.get(self.name, LIMIT_KB)
 
 
 _ROWS = (

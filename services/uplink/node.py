@@ -124,6 +124,7 @@ class UplinkNode(Node):
             state = f"no link for {now - self._cut_since:.0f} s"
         up = self._relay.upward().values()
         cuts = f", {self._cuts} cuts, {self._relay.failed} messages cut off" if self._cuts else ""
+        cuts += f", {self._relay.refused} healths too many" if self._relay.refused else ""
         self.detail = (
             f"{state} ({self.config.edge}){cuts}: {sum(c.messages for c in up)} messages, "
             f"{sum(c.bytes for c in up) / 1e6:.1f} MB"

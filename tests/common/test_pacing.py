@@ -7,6 +7,7 @@ from common.errors import UserError
 from common.live import Live, LiveSettings
 from common.messages import ExternalPose, Rig
 from common.node import Node, Sourced
+from common.pacing import Allowance
 from common.topics import TOPICS
 
 SECOND_NS = 1_000_000_000
@@ -79,3 +80,13 @@ def test_a_new_run_forgets_the_place_of_an_earlier_one(play, monkeypatch):
 def test_what_has_ended_is_not_played_again(play):
     play(resume=False)[1]._bookmark.finish()
     assert play(resume=True)[0] == [("rig", SECOND_NS)]
+
+
+def test_an_allowance_lets_a_burst_through_and_then_its_rate():
+    now = [0.0]
+    allowance = Allowance(10.0, lambda: now[0])
+    assert [allowance.take() for _ in range(25)].count(True) == 20
+    now[0] = 1.05
+    assert [allowance.take() for _ in range(25)].count(True) == 10
+    now[0] = 100.0
+    assert [allowance.take() for _ in range(25)].count(True) == 20
