@@ -42,16 +42,23 @@ class GaussianArrays:
         """Adds Gaussians float32 [PARAMS, M], everything else of them zero; gives their columns."""
         new = params.shape[1]
         if self.count + new > self.capacity:
-            old = {name: getattr(self, name) for name in self._arrays()}
-            self._allocate(-(-max(self.count + new, 2 * self.capacity) // 16) * 16)
-            for name, array in old.items():
-                getattr(self, name)[..., : array.shape[-1]] = array
+            self.resize(max(self.count + new, 2 * self.capacity))
         at = slice(self.count, self.count + new)
         for name in self._arrays()[1:]:
             getattr(self, name)[..., at] = 0
         self.params[:, at] = params
         self.count += new
         return at
+
+    def resize(self, capacity: int) -> None:
+        """Room for at least so many, none for more: array by array, so that two of them at most stand beside
+        each other."""
+        capacity = -(-max(capacity, self.count, 16) // 16) * 16
+        for name in self._arrays():
+            old = getattr(self, name)
+            new = np.zeros((*old.shape[:-1], capacity), old.dtype)
+            new[..., : self.count] = old[..., : self.count]
+            setattr(self, name, new)
 
     def keep(self, mask: np.ndarray) -> int:
         """Drops Gaussians whose flag in bool [count] is unset, the rest keep their order; gives how many."""

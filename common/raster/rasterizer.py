@@ -41,6 +41,10 @@ class Workspace:
             self._arrays[name] = held
         return held[:size].reshape(shape)
 
+    @property
+    def held_bytes(self) -> int:
+        return sum(array.nbytes for array in self._arrays.values())
+
 
 def _aligned(size: int, dtype: type) -> np.ndarray:
     """Uninitialised [size] on a cache line's boundary."""
@@ -164,6 +168,11 @@ class Rasterizer:
     def release(self, render: Render) -> None:
         """Gives the render's memory back; its arrays may change from now on."""
         self._pool.append(render.workspace)
+
+    @property
+    def held_bytes(self) -> int:
+        """What the pool holds on to; renders that are not released do not count."""
+        return sum(work.held_bytes for work in self._pool)
 
     def close(self) -> None:
         """Ends the threads."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -49,13 +50,12 @@ class ChunkFeed:
         sent, cell_m, _ = self._sent.get(anchor, _NEVER)
         if version is None:
             return None
-        params = mapper.store.chunk(anchor)
-        due_m = _cell(params, eye)
+        due_m = _cell(mapper, anchor, eye)
         if sent == version and cell_m <= due_m:
             return None
         self._clock += 1
         self._sent[anchor] = (version, due_m, self._clock)
-        return Part(version, due_m, _in_anchor(mapper, anchor, params, due_m))
+        return Part(version, due_m, _in_anchor(mapper, anchor, due_m))
 
     def longest_due(self, mapper: Mapper, eye: Eye | None) -> int | None:
         """Of the chunks that have changed or lack detail, the one sent longest ago."""
@@ -68,26 +68,36 @@ class ChunkFeed:
 
     def _lacks(self, mapper: Mapper, anchor: int, eye: Eye | None) -> bool:
         cell_m = self._sent.get(anchor, _NEVER)[1]
-        return cell_m > 0.0 and cell_m > _cell(mapper.store.chunk(anchor), eye)
+        return cell_m > 0.0 and cell_m > _cell(mapper, anchor, eye)
 
 
 def parts(mapper: Mapper, eye: Eye | None) -> dict[int, Part]:
     """The whole map by anchor, for one who asks."""
     out = {}
     for anchor, version in mapper.store.versions().items():
-        params = mapper.store.chunk(anchor)
-        cell_m = _cell(params, eye)
-        out[anchor] = Part(version, cell_m, _in_anchor(mapper, anchor, params, cell_m))
+        cell_m = _cell(mapper, anchor, eye)
+        out[anchor] = Part(version, cell_m, _in_anchor(mapper, anchor, cell_m))
     return out
 
 
-def _cell(params: np.ndarray, eye: Eye | None) -> float:
+def on_disk(mapper: Mapper, anchor: int) -> Iterator[np.ndarray]:
+    """float32 [14, N] of an anchor's Gaussians that are not in memory, in parts, in the map frame."""
+    if mapper.elsewhere is not None:
+        yield from mapper.elsewhere.read(anchor, mapper.T_map_anchor[anchor])
+
+
+def _cell(mapper: Mapper, anchor: int, eye: Eye | None) -> float:
     """By the nearest Gaussian; without an eye all detail is due."""
-    if eye is None or params.shape[1] == 0:
+    if eye is None:
         return 0.0
-    nearest_m = np.sqrt(np.min(np.sum((params[MEAN : MEAN + 3].T - eye.at_m) ** 2, axis=1)))
-    return cell_for(float(nearest_m), eye.focal_px, eye.error_px)
+    means = mapper.store.chunk(anchor)[MEAN : MEAN + 3].T
+    nearest_m = np.sqrt(np.min(np.sum((means - eye.at_m) ** 2, axis=1), initial=np.inf))
+    if mapper.elsewhere is not None:
+        nearest_m = min(nearest_m, mapper.elsewhere.nearest_m(anchor, mapper.T_map_anchor[anchor], eye.at_m))
+    return cell_for(float(nearest_m), eye.focal_px, eye.error_px) if np.isfinite(nearest_m) else 0.0
 
 
-def _in_anchor(mapper: Mapper, anchor: int, params: np.ndarray, cell_m: float) -> np.ndarray:
+def _in_anchor(mapper: Mapper, anchor: int, cell_m: float) -> np.ndarray:
+    """All of an anchor's Gaussians in its own frame, those on disk too."""
+    params = np.concatenate([mapper.store.chunk(anchor), *on_disk(mapper, anchor)], axis=1)
     return coarser(moved(params, inverse(mapper.T_map_anchor[anchor])), cell_m)

@@ -22,7 +22,7 @@ class MappingConfig(NodeConfig):
     mend_steps: Steps = 30  # after anchors have moved: seams
     final_steps: Steps = 0  # when the data have ended, on all keyframes
     calm_backlog: Annotated[int, Field(ge=1)] = 5  # more keyframes wait on the robot: fewer steps for each
-    max_gaussians: Annotated[int, Field(ge=1000)] = 300_000
+    max_gaussians: Annotated[int, Field(ge=1000)] | None = None  # 300 000; with memory_mb 20 million, on disk
     max_keyframes: Annotated[int, Field(ge=4)] = 800
     refine_pose: bool = True
     refine_exposure: bool = True
@@ -31,5 +31,9 @@ class MappingConfig(NodeConfig):
     seed: int = 0
     save: Path | None = None  # folder for splats.ply and keyframes.tum, written at the end of the data
     session: Path | None = None  # folder that the map lives in: saved while mapping, resumed at the start
-    memory_mb: Annotated[float, Field(gt=0.0)] | None = None  # for Gaussians and pictures; more rest on disk
+    memory_mb: Annotated[float, Field(gt=0.0)] | None = None  # of this process; what is more rests on disk
     session_every_s: Annotated[float, Field(gt=0.0)] = 30.0  # between checkpoints, by the data's clock
+
+    def gaussians(self) -> int:
+        """The most Gaussians that the map may have."""
+        return self.max_gaussians or (300_000 if self.memory_mb is None else 20_000_000)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from common.raster.layout import COLOUR, MEAN, OPACITY, QUAT, SCALE
 from common.trajectory import Trajectory, write_tum
 
 SH_C0 = 0.28209479177387814  # the constant spherical harmonic
+_ROWS = 65_536  # written at a time
 _PLY_TYPES = {"float": "<f4", "float32": "<f4", "double": "<f8", "uchar": "u1", "uint8": "u1", "char": "i1",
               "short": "<i2", "ushort": "<u2", "int": "<i4", "uint": "<u4"}  # fmt: skip
 FIELDS = ("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity",
@@ -21,25 +23,46 @@ FIELDS = ("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacit
 
 def write_gaussian_ply(path: Path, params: np.ndarray) -> None:
     """Writes Gaussians float32 [14, N] as INRIA's 3DGS does (SH degree 0), all at once or not at all."""
-    count = params.shape[1]
-    rows = np.zeros((count, len(FIELDS)), "<f4")
+    write_gaussian_parts(path, params.shape[1], [params])
+
+
+def write_gaussian_parts(path: Path, count: int, parts: Iterable[np.ndarray]) -> None:
+    """The same of `count` Gaussians that come in parts float32 [14, N], one after the other.
+
+    Raises:
+        ValueError: there were more or fewer; then nothing is written.
+    """
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
+    header += [f"property float {name}" for name in FIELDS] + ["end_header", ""]
+    path, came = Path(path), 0
+    partial = path.with_name(path.name + ".partial")
+    with partial.open("wb") as file:
+        file.write("\n".join(header).encode())
+        for params in parts:
+            for first in range(0, params.shape[1], _ROWS):
+                file.write(_rows(params[:, first : first + _ROWS]).tobytes())
+            came += params.shape[1]
+    if came != count:
+        partial.unlink()
+        raise ValueError(f"{path}: {came} Gaussians came, {count} were to come")
+    os.replace(partial, path)
+
+
+def _rows(params: np.ndarray) -> np.ndarray:
+    rows = np.zeros((params.shape[1], len(FIELDS)), "<f4")
     rows[:, 0:3] = params[MEAN : MEAN + 3].T
     rows[:, 6:9] = (params[COLOUR : COLOUR + 3].T - 0.5) / SH_C0
     rows[:, 9] = params[OPACITY]
     rows[:, 10:13] = params[SCALE : SCALE + 3].T
     quat = params[QUAT : QUAT + 4]
     rows[:, 13:17] = (quat / np.maximum(np.linalg.norm(quat, axis=0), 1e-12)).T
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
-    header += [f"property float {name}" for name in FIELDS] + ["end_header", ""]
-    path = Path(path)
-    partial = path.with_name(path.name + ".partial")
-    partial.write_bytes("\n".join(header).encode() + rows.tobytes())
-    os.replace(partial, path)
+    return rows
 
 
 def write_map(
     folder: Path,
-    params: np.ndarray,  # float32 [14, N]
+    count: int,
+    parts: Iterable[np.ndarray],  # float32 [14, N] each, `count` in all
     stamps_ns: np.ndarray,  # int64 [K], rising
     T_map_body: np.ndarray,  # float64 [K, 4, 4] of the keyframes
 ) -> None:
@@ -49,7 +72,7 @@ def write_map(
         UserError: the folder cannot be made or written.
     """
     make_folder(folder)
-    write_gaussian_ply(folder / "splats.ply", params)
+    write_gaussian_parts(folder / "splats.ply", count, parts)
     write_tum(folder / "keyframes.tum", Trajectory(stamps_ns, T_map_body), "keyframes of the map, refined")
 
 

@@ -47,3 +47,15 @@ def new_gaussians(
         size=s.size, flatness=s.flatness, opacity=s.opacity, least_slant=s.least_slant,
     )  # fmt: skip
     return u, v, discs
+
+
+def foretold(image: np.ndarray, level: Level) -> tuple[float, float]:
+    """Share of the pixels that the render float32 [5, H, W] covers, and its PSNR (dB) there."""
+    covered = image[4] > 0.9
+    if level.hidden is not None:
+        covered &= ~level.hidden
+    share = float(covered.mean())
+    if share < 0.01:
+        return share, float("nan")
+    error = np.clip(image[:3, covered], 0.0, 1.0) - level.rgb[:, covered] * np.float32(1 / 255)
+    return share, float(-10.0 * np.log10(max(float(np.mean(error**2)), 1e-12)))

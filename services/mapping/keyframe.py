@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -11,6 +11,7 @@ from common.geometry import is_rigid
 from common.raster.camera import RasterCamera
 
 MAX_DEPTH_M = 60.0
+_UNKNOWN_REACH_M = 20.0  # how far a picture may look where it knows no depth
 REACH_M = 200.0  # no keyframe is further from its anchor: submaps are a few dozen metres at most
 
 
@@ -80,6 +81,7 @@ class Held:
     exposure: np.ndarray = field(default_factory=lambda: np.zeros(6, np.float32))  # log gains, offsets
     exposure_first: np.ndarray = field(default_factory=lambda: np.zeros(6))
     exposure_second: np.ndarray = field(default_factory=lambda: np.zeros(6))
+    reach_m: float = MAX_DEPTH_M  # optical z beyond which it sees nothing: walls end the view
 
     def T_anchor_refined(self) -> np.ndarray:
         """T_anchor_camera (SLAM) @ delta (mapper)."""
@@ -112,7 +114,34 @@ def hold(frame: Keyframe, sigma_unit: float) -> Held:
         arrays = (np.ascontiguousarray(array) for array in (planes, d, wt))
         hidden = None if frame.mask is None or frame.mask.all() else ~frame.mask[sampled]
         levels.append(Level(camera, *arrays, pixels, z, hidden))
-    return Held(frame.id, frame.anchor, np.array(frame.T_anchor_camera, dtype=np.float64), levels)
+    T_anchor_camera = np.array(frame.T_anchor_camera, dtype=np.float64)
+    return Held(frame.id, frame.anchor, T_anchor_camera, levels, reach_m=reach_m(frame))
+
+
+def reach_m(frame: Keyframe) -> float:
+    """Optical z beyond which nothing is seen. Where more than a twentieth of the picture has no depth, it
+    may look through a door or a window."""
+    with np.errstate(invalid="ignore"):
+        known = (frame.depth_m > 0.05) & (frame.depth_m < MAX_DEPTH_M)
+    if not known.any():
+        return MAX_DEPTH_M
+    farthest_m = 1.1 * float(frame.depth_m[known].max()) + 0.5
+    unknown = ~known if frame.mask is None else ~known & frame.mask
+    return farthest_m if unknown.mean() < 0.05 else max(farthest_m, _UNKNOWN_REACH_M)
+
+
+def with_hidden(level: Level, image: np.ndarray, exposure: np.ndarray) -> Level:
+    """The level with hidden pixels as they are rendered: there is nothing to see, for SSIM's windows too."""
+    gain, offset = np.exp(exposure[:3])[:, None, None], exposure[3:, None, None]
+    shown = np.clip((image[:3] * gain + offset) * 255.0 + 0.5, 0.0, 255.0).astype(np.uint8)
+    return replace(level, rgb=np.where(level.hidden, shown, level.rgb))
+
+
+def adam_step(gradient: np.ndarray, first: np.ndarray, second: np.ndarray, t: int) -> np.ndarray:
+    """Adam's normalised step; updates the moments in place."""
+    first += 0.1 * (gradient - first)
+    second += 0.01 * (gradient**2 - second)
+    return first / (1 - 0.9**t) / (np.sqrt(second / (1 - 0.99**t)) + 1e-12)
 
 
 def _beams_at(uvz: np.ndarray, full: RasterCamera, camera: RasterCamera) -> tuple[np.ndarray, np.ndarray]:

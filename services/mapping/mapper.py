@@ -6,6 +6,7 @@ before trusted surfaces, then a fixed number of steps on a window of new and ran
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -15,14 +16,16 @@ from common.geometry import inverse, is_rigid, se3_exp, se3_log
 from common.raster.layout import OPACITY
 from common.raster.optimiser import rate_rows
 from common.raster.rasterizer import Gradients, Rasterizer, Render
-from services.mapping.insertion import new_gaussians, unexplained
+from services.mapping.insertion import foretold, new_gaussians, unexplained
 from services.mapping.kernels import add_lidar, contradicted, photometric_and_depth
-from services.mapping.keyframe import Held, Keyframe, Level, hold
+from services.mapping.keyframe import Held, Keyframe, Level, adam_step, hold, with_hidden
+from services.mapping.places import Places
 from services.mapping.settings import MapperSettings
 from services.mapping.ssim import SsimLoss
-from services.mapping.store import GaussianStore
+from services.mapping.store import Elsewhere, GaussianStore
 
 FULL, HALF = 0, 1
+_REMEMBERED = 4096  # keyframes given up whose ids are still known: robots keep fewer to send them again
 
 
 @dataclass(frozen=True)
@@ -46,13 +49,17 @@ class Mapper:
     def __init__(self, settings: MapperSettings | None = None, *, seed: int = 0, threads: int = 1) -> None:
         self.settings = settings or MapperSettings()
         self.store = GaussianStore()
+        self.elsewhere: Elsewhere | None = None  # where Gaussians are that are not in the store
         self.rasterizer = Rasterizer(threads)
         self.keyframes: dict[int, Held] = {}
+        self.resting: dict[int, Held] = {}  # without their pictures, in order of their turn
         self.T_map_anchor: dict[int, np.ndarray] = {}
         self.steps = 0
         self._random = np.random.default_rng(seed)
         self._newest: list[int] = []
-        self._forgotten: set[int] = set()
+        self.given_up = 0  # keyframes, for the sake of others
+        self._forgotten: dict[int, None] = {}  # the last of them, in order
+        self._places = Places()
         self._ssim = SsimLoss()
         self._buffers: dict[tuple[int, int], tuple[np.ndarray, np.ndarray]] = {}
         r = self.settings.rates
@@ -62,12 +69,18 @@ class Mapper:
 
     # --- keyframes and anchors ---------------------------------------------------------------------
 
-    def add(self, frame: Keyframe, T_map_anchor: np.ndarray | None = None) -> Outcome:
+    def add(
+        self,
+        frame: Keyframe,
+        T_map_anchor: np.ndarray | None = None,
+        bring: Callable[[Held], None] | None = None,
+    ) -> Outcome:
         """Takes a keyframe in: insertion, carving, pruning. `optimise` is separate.
 
         `T_map_anchor` places the frame's anchor if it is new. A keyframe known by its id is left as it is.
+        `bring` is called before anything changes: what the keyframe sees has to be in memory.
         """
-        if frame.id in self.keyframes or frame.id in self._forgotten:
+        if self.knows(frame.id):
             return Outcome("ok")
         fault = frame.fault() or self._fault_of_place(frame, T_map_anchor)
         if fault is not None:
@@ -75,21 +88,61 @@ class Mapper:
         if frame.anchor not in self.T_map_anchor:
             self.T_map_anchor[frame.anchor] = np.array(T_map_anchor, dtype=np.float64)
         held = hold(frame, self.settings.sigma_unit)
+        if bring is not None:
+            bring(held)
         removed = self._clean(held)
         outcome = self._insert(held, held.levels[FULL])
         self._forget()
         self.keyframes[frame.id] = held
+        self._places.put(held.id, self._T_map_given(held))
         self._newest = [*self._newest, frame.id][-self.settings.recent :]
         return replace(outcome, removed=removed)
 
+    def holds(self, id: int) -> bool:
+        """Whether a keyframe is in the map."""
+        return id in self.keyframes or id in self.resting
+
+    def knows(self, id: int) -> bool:
+        """Whether a keyframe is in the map, or was and has been given up."""
+        return self.holds(id) or id in self._forgotten
+
+    def strike_off(self, id: int) -> None:
+        """A keyframe that was resting does not come back."""
+        self.resting.pop(id, None)
+        self._places.remove(id)
+
+    @property
+    def newest(self) -> list[int]:
+        """Ids of the window's newest keyframes, in order of coming."""
+        return list(self._newest)
+
+    @property
+    def workspace_bytes(self) -> int:
+        """What rendering and losses hold on to."""
+        losses = sum(array.nbytes for pair in self._buffers.values() for array in pair)
+        return self.rasterizer.held_bytes + self._ssim.held_bytes + losses
+
     def _forget(self) -> None:
-        """Makes room for a keyframe: one drawn from all but the newest goes; its Gaussians stay."""
-        while len(self.keyframes) >= self.settings.max_keyframes:
-            old = [id for id in self.keyframes if id not in self._newest] or list(self.keyframes)
+        """Makes room for a keyframe: one of the place that has most goes; its Gaussians stay."""
+        while len(self.keyframes) + len(self.resting) >= self.settings.max_keyframes:
+            old = self._places.fullest(set(self._newest)) or sorted(self.keyframes)
             gone = old[int(self._random.integers(len(old)))]
-            del self.keyframes[gone]
+            self.keyframes.pop(gone, None)
+            self.resting.pop(gone, None)
+            self._places.remove(gone)
             self._newest = [id for id in self._newest if id != gone]
-            self._forgotten.add(gone)
+            self.given_up += 1
+            self._forgotten[gone] = None
+            if len(self._forgotten) > _REMEMBERED:
+                del self._forgotten[next(iter(self._forgotten))]
+
+    def _T_map_given(self, held: Held) -> np.ndarray:
+        """Where localization says the camera stood; the map's own corrections left out."""
+        return self.T_map_anchor[held.anchor] @ held.T_anchor_camera
+
+    def _sort_places(self) -> None:
+        for held in (*self.keyframes.values(), *self.resting.values()):
+            self._places.put(held.id, self._T_map_given(held))
 
     def _fault_of_place(self, frame: Keyframe, T_map_anchor: np.ndarray | None) -> str | None:
         if frame.anchor in self.T_map_anchor:
@@ -120,30 +173,34 @@ class Mapper:
                 self.store.move(anchor, T @ inverse(old))
                 moved += 1
             self.T_map_anchor[anchor] = np.array(T, dtype=np.float64)
+        if moved:
+            self._sort_places()
         return moved
 
     def progress(self) -> dict[str, Any]:
         """What going on later needs beside Gaussians, keyframes and anchors; fit for JSON."""
         return {
-            "steps": self.steps, "newest": list(self._newest), "forgotten": sorted(self._forgotten),
-            "random": self._random.bit_generator.state,
+            "steps": self.steps, "newest": list(self._newest), "forgotten": list(self._forgotten),
+            "given_up": self.given_up, "random": self._random.bit_generator.state,
         }  # fmt: skip
 
     def resume(self, progress: dict[str, Any]) -> None:
         """Goes on from `progress`."""
         self.steps = progress["steps"]
         self._newest = [id for id in progress["newest"] if id in self.keyframes]
-        self._forgotten = set(progress["forgotten"])
+        self._forgotten = dict.fromkeys(progress["forgotten"])
+        self.given_up = progress.get("given_up", len(self._forgotten))
+        self._sort_places()
         self._random.bit_generator.state = progress["random"]
 
     # --- growing and shrinking ---------------------------------------------------------------------
 
     def _insert(self, held: Held, level: Level) -> Outcome:
-        room = max(self.settings.max_gaussians - self.store.count, 0)
+        room = max(self.settings.max_gaussians - self.store.count - self.store.away_count, 0)
         T_map_camera = self.T_map_camera(held)
         render = self._render(level, T_map_camera)
         missing = unexplained(render.image, level, self.settings)
-        foretold = _foretold(render.image, level)
+        known = foretold(render.image, level)
         self.rasterizer.release(render)
         u, v, new = new_gaussians(missing, level, T_map_camera, self.settings)
         sure = level.depth_weight[v, u] >= 255.0 * self.settings.sure_weight
@@ -151,7 +208,7 @@ class Mapper:
         new = new[:, :room]
         if new.shape[1]:
             self.store.add(new, held.anchor)
-        return Outcome("ok", new.shape[1], 0, *foretold)
+        return Outcome("ok", new.shape[1], 0, *known)
 
     def _in_free_space(self, params: np.ndarray) -> np.ndarray:
         """bool [N]: Gaussians float32 [14, N] that a recent keyframe sees through to a surface known well."""
@@ -211,7 +268,7 @@ class Mapper:
         T_map_camera = self.T_map_camera(held)
         render = self._render(level, T_map_camera)
         if level.hidden is not None:
-            level = _with_hidden(level, render.image, held.exposure)
+            level = with_hidden(level, render.image, held.exposure)
         loss, gradient, sums = self._loss(render, level, held)
         gradients = self.rasterizer.backward(render, gradient)
         s = self.settings
@@ -259,38 +316,12 @@ class Mapper:
         # T_camera_map <- exp(xi) T_camera_map moves T_map_camera on the right by exp(-xi).
         rates = np.repeat([self.settings.rates.pose_m, self.settings.rates.pose_rad], 3)
         held.pose_steps += 1
-        move = _adam_step(gradients.pose, held.pose_first, held.pose_second, held.pose_steps) * rates
+        move = adam_step(gradients.pose, held.pose_first, held.pose_second, held.pose_steps) * rates
         tangent = se3_log(held.delta @ se3_exp(move))
         limits = np.repeat([self.settings.max_pose_m, self.settings.max_pose_rad], 3)
         held.delta = se3_exp(np.clip(tangent, -limits, limits))
 
     def _refine_exposure(self, held: Held, sums: np.ndarray) -> None:
         gradient = sums[:, 2:8].sum(axis=0) + 1e-3 * held.exposure  # a weak pull to "as it was taken"
-        move = _adam_step(gradient, held.exposure_first, held.exposure_second, max(held.pose_steps, 1))
+        move = adam_step(gradient, held.exposure_first, held.exposure_second, max(held.pose_steps, 1))
         held.exposure = (held.exposure - self.settings.rates.exposure * move).astype(np.float32)
-
-
-def _foretold(image: np.ndarray, level: Level) -> tuple[float, float]:
-    """Share of the pixels that the render float32 [5, H, W] covers, and its PSNR (dB) there."""
-    covered = image[4] > 0.9
-    if level.hidden is not None:
-        covered &= ~level.hidden
-    share = float(covered.mean())
-    if share < 0.01:
-        return share, float("nan")
-    error = np.clip(image[:3, covered], 0.0, 1.0) - level.rgb[:, covered] * np.float32(1 / 255)
-    return share, float(-10.0 * np.log10(max(float(np.mean(error**2)), 1e-12)))
-
-
-def _with_hidden(level: Level, image: np.ndarray, exposure: np.ndarray) -> Level:
-    """The level with hidden pixels as they are rendered: there is nothing to see, for SSIM's windows too."""
-    gain, offset = np.exp(exposure[:3])[:, None, None], exposure[3:, None, None]
-    shown = np.clip((image[:3] * gain + offset) * 255.0 + 0.5, 0.0, 255.0).astype(np.uint8)
-    return replace(level, rgb=np.where(level.hidden, shown, level.rgb))
-
-
-def _adam_step(gradient: np.ndarray, first: np.ndarray, second: np.ndarray, t: int) -> np.ndarray:
-    """Adam's normalised step; updates the moments in place."""
-    first += 0.1 * (gradient - first)
-    second += 0.01 * (gradient**2 - second)
-    return first / (1 - 0.9**t) / (np.sqrt(second / (1 - 0.99**t)) + 1e-12)

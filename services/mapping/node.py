@@ -6,6 +6,7 @@ import logging
 import math
 from collections.abc import Iterator
 from functools import lru_cache
+from itertools import chain
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from common.errors import UserError
 from common.geometry import inverse
 from common.messages import Anchors, Keyframe, MapChunk, MapPoses, MapState, MapStatus, Tick
 from common.node import Input, Outputs
-from services.mapping.chunks import ChunkFeed, Eye, parts
+from services.mapping.chunks import ChunkFeed, Eye, on_disk, parts
 from services.mapping.config import MappingConfig
 from services.mapping.export import write_map
 from services.mapping.keyframe import Held
@@ -30,6 +31,7 @@ from services.mapping.messages import (
     state_messages,
 )
 from services.mapping.session.node import SessionNode
+from services.mapping.session.paging import check_budget
 from services.mapping.session.state import arrays_of
 from services.mapping.settings import MapperSettings
 from services.mapping.warm import warm
@@ -53,7 +55,7 @@ class MappingNode(SessionNode):
         c = self.config
         warm()
         settings = MapperSettings(
-            half_iterations=c.half_steps, full_iterations=c.full_steps, max_gaussians=c.max_gaussians,
+            half_iterations=c.half_steps, full_iterations=c.full_steps, max_gaussians=c.gaussians(),
             max_keyframes=c.max_keyframes, refine_pose=c.refine_pose, refine_exposure=c.refine_exposure,
         )  # fmt: skip
         self._mapper = Mapper(settings, seed=c.seed, threads=c.threads)
@@ -64,8 +66,8 @@ class MappingNode(SessionNode):
         self._refusals: dict[int, str] = {}  # keyframe -> why
         # The oldest submap's place when the origin was tied to it.
         self._T_oldest_origin: np.ndarray | None = None
-        if c.memory_mb is not None and c.session is None:
-            raise UserError("mapping.memory_mb: pages to the session's disk; give mapping.session too")
+        if c.memory_mb is not None:
+            check_budget(c.memory_mb, c.session)
         if not self.in_standby:
             self.take_over()
 
@@ -74,7 +76,7 @@ class MappingNode(SessionNode):
     def on_keyframes_frame(self, message: Keyframe) -> Outputs:
         """Insertion and the fixed steps; then how well the picture is explained, and what has changed."""
         kept = self._arrivals is not None and self._arrivals.begin(message.id)
-        known = message.id in self._taken
+        known = self._mapper.knows(message.id)
         outcome = Outcome("ok") if known else self._take(message)
         if not outcome.ok or (not kept and self._kept(message, known)):
             yield ack(message, outcome.status)
@@ -88,6 +90,7 @@ class MappingNode(SessionNode):
         share = min(self.config.calm_backlog / max(waiting, 1), 1.0)
         c = self.config
         loss = self._mapper.optimise(math.ceil(c.half_steps * share), math.ceil(c.full_steps * share))
+        self._page()
         yield from self._show(message, outcome, loss)
         if len(self._mapper.keyframes) % self.config.chunk_every == 0:
             yield from self._chunk(message.anchor_id, message.stamp_ns)
@@ -98,10 +101,7 @@ class MappingNode(SessionNode):
             frame = open_keyframe(message, self._lens)
         except (UserError, ValueError) as error:
             return Outcome(str(error))
-        outcome = self._mapper.add(frame, message.T_map_anchor)
-        if outcome.ok:
-            self._taken[message.id] = (message.stamp_ns, inverse(message.camera.T_body_camera))
-        return outcome
+        return self._add(frame, message)
 
     def _kept(self, message: Keyframe, known: bool) -> bool:
         """Whether an accepted keyframe survives this process, as far as that was asked for."""
@@ -117,6 +117,8 @@ class MappingNode(SessionNode):
         places = {int(a): T for a, T in zip(anchors.anchor_ids, anchors.T_map_anchor)}
         self._tie_origin(places)
         if self._mapper.move_anchors(places) and self._mapper.keyframes:
+            if self._keeper is not None:
+                self._keeper.moved(self._mapper)
             self._mapper.refine(self.config.mend_steps, HALF)
             for anchor in places:
                 yield from self._chunk(anchor, anchors.stamp_ns)
@@ -139,6 +141,7 @@ class MappingNode(SessionNode):
             yield from self._overtaken()
         else:
             self._mapper.refine(self.config.tick_steps, FULL)
+            self._page()
         longest = self._feed.longest_due(self._mapper, self._eye)
         if longest is not None:
             yield from self._chunk(longest, tick.stamp_ns)
@@ -155,24 +158,22 @@ class MappingNode(SessionNode):
 
     def _held(self) -> dict[int, Held]:
         """All keyframes, those on disk too."""
-        return self._mapper.keyframes | self._parked()
-
-    def _parked(self) -> dict[int, Held]:
-        return {} if self._keeper is None else self._keeper.parked
+        return self._mapper.keyframes | self._mapper.resting
 
     def _status(
         self, stamp_ns: int, outcome: Outcome, loss: float, psnr_db: float = math.nan,
         depth_error_m: float = math.nan,
     ) -> MapStatus:  # fmt: skip
         m, held = self._mapper, len(self._held())
-        self.detail = f"{held} keyframes, {m.store.count} Gaussians, {psnr_db:.1f} dB" + (
+        gaussians = m.store.count + m.store.away_count
+        self.detail = f"{held} keyframes, {gaussians} Gaussians, {psnr_db:.1f} dB" + (
             f", {len(self._refusals)} refused (last: {outcome.status})" if not outcome.ok else ""
         )
-        session = "" if self._keeper is None else self._keeper.text()
+        session = "" if self._keeper is None else self._keeper.text(m)
         self.detail += f"; {session}" if session else ""
         return MapStatus(
             stamp_ns=stamp_ns, status=outcome.status, keyframes=held, refused=len(self._refusals),
-            gaussians=m.store.count, steps=m.steps, loss=loss, foretold_share=outcome.foretold_share,
+            gaussians=gaussians, steps=m.steps, loss=loss, foretold_share=outcome.foretold_share,
             foretold_psnr_db=outcome.foretold_psnr_db, psnr_db=psnr_db, depth_error_m=depth_error_m,
             session=session,
         )  # fmt: skip
@@ -193,7 +194,8 @@ class MappingNode(SessionNode):
         """All that a checkpoint holds, as it is now, in pieces."""
         if not self._mapper.keyframes:
             raise UserError("the map is empty so far")
-        yield from state_messages(arrays_of(self._mapper, self._extra(), self._parked()))
+        arrays = arrays_of(self._mapper, self._extra())
+        yield from state_messages(arrays if self._keeper is None else self._keeper.whole(arrays))
 
     def drain(self) -> Outputs:
         """The map as the data left it; then, if asked for, refined; and the files asked for."""
@@ -233,5 +235,8 @@ class MappingNode(SessionNode):
         if self._keeper is not None:
             self._keeper.done(self._keeper.checkpoint(m, self._extra(), int(stamps_ns[-1]))())
         if self.config.save is not None:
-            write_map(self.config.save, m.store.params[:, : m.store.count], stamps_ns, T_map_body)
-            log.info("map of %d Gaussians saved to %s", m.store.count, self.config.save)
+            away = (part for anchor in list(m.store.away) for part in on_disk(m, anchor))
+            parts_map = chain([m.store.params[:, : m.store.count]], away)
+            count = m.store.count + m.store.away_count
+            write_map(self.config.save, count, parts_map, stamps_ns, T_map_body)
+            log.info("map of %d Gaussians saved to %s", count, self.config.save)

@@ -125,6 +125,10 @@ class SsimLoss:
     def __init__(self) -> None:
         self._memory: dict[tuple[int, int], tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
 
+    @property
+    def held_bytes(self) -> int:
+        return sum(array.nbytes for arrays in self._memory.values() for array in arrays)
+
     def add(
         self, image: np.ndarray, rgb: np.ndarray, weight: float, gradient: np.ndarray, team: Team
     ) -> float:

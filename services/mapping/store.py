@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
@@ -11,6 +13,16 @@ from common.raster.layout import MEAN, OPACITY, QUAT, SCALE
 from common.raster.optimiser import GaussianArrays
 
 _LEAP = 1000  # events of one anchor between two checkpoints: never as many
+
+
+class Elsewhere(Protocol):
+    """Gaussians that are not in memory."""
+
+    def read(self, anchor: int, T_map_anchor: np.ndarray) -> Iterator[np.ndarray]:
+        """float32 [14, N] of an anchor's, in the map frame, in parts."""
+
+    def nearest_m(self, anchor: int, T_map_anchor: np.ndarray, at_m: np.ndarray) -> float:
+        """No Gaussian of an anchor is nearer to a place in the map; infinite where there is none."""
 
 
 @dataclass(frozen=True)
@@ -27,6 +39,7 @@ class GaussianStore(GaussianArrays):
 
     def __init__(self, capacity: int = 4096) -> None:
         self._events: dict[int, int] = {}  # per anchor: insertions, removals and moves so far
+        self.away: dict[int, tuple[int, int]] = {}  # per anchor: (Gaussians, their steps) on disk only
         super().__init__(capacity)
 
     def _allocate(self, capacity: int) -> None:
@@ -37,9 +50,10 @@ class GaussianStore(GaussianArrays):
     def _arrays(self) -> list[str]:
         return [*super()._arrays(), "anchor", "strikes"]
 
-    def arrays(self) -> list[np.ndarray]:
-        """All arrays, with the room to grow."""
-        return [getattr(self, name) for name in self._arrays()]
+    @property
+    def bytes_each(self) -> int:
+        """What one Gaussian takes in all arrays."""
+        return sum(getattr(self, name).nbytes for name in self._arrays()) // self.capacity
 
     def state(self) -> dict[str, np.ndarray]:
         """Copies of all arrays, cut to the Gaussians there are, and of the events by anchor."""
@@ -61,8 +75,8 @@ class GaussianStore(GaussianArrays):
 
     def add(self, params: np.ndarray, anchor: int) -> None:
         """Adds Gaussians float32 [14, M] bound to an anchor."""
-        added = self.append(params)  # may replace all arrays by larger ones, so their names are read after it
-        self.anchor[added] = anchor
+        at = self.append(params)  # may bring new arrays: they are asked for afterwards
+        self.anchor[at] = anchor
         self._events[anchor] = self._events.get(anchor, 0) + 1
 
     def keep(self, mask: np.ndarray) -> int:
@@ -71,22 +85,61 @@ class GaussianStore(GaussianArrays):
             self._events[int(anchor)] = self._events.get(int(anchor), 0) + 1
         return super().keep(mask)
 
+    @property
+    def away_count(self) -> int:
+        """Gaussians that are on disk only."""
+        return sum(count for count, _ in self.away.values())
+
+    def take_out(self, groups: list[np.ndarray]) -> None:
+        """Lets go of Gaussians that are on disk now; each group int [N] is of one anchor. The map is as it
+        was: no version changes."""
+        stay = np.ones(self.count, bool)
+        for group in groups:
+            self.note_away(int(self.anchor[group[0]]), len(group), _sum(self.steps[group]))
+            stay[group] = False
+        super().keep(stay)
+        self.resize(self.count + self.count // 4)
+
+    def put_back(self, arrays: dict[str, np.ndarray], anchor: int) -> None:
+        """Takes in what `columns` gave before they went."""
+        count = arrays["params"].shape[1]
+        at = self.append(arrays["params"])
+        for name in self._arrays()[1:]:
+            getattr(self, name)[..., at] = anchor if name == "anchor" else arrays[name]
+        self.note_away(anchor, -count, -_sum(arrays["steps"]))
+
+    def columns(self, group: np.ndarray) -> dict[str, np.ndarray]:
+        """Copies of all that is known of some Gaussians int [N], but for their anchor."""
+        return {name: getattr(self, name)[..., group] for name in self._arrays() if name != "anchor"}
+
+    def note_away(self, anchor: int, count: int, steps: int) -> None:
+        """So many more Gaussians of an anchor, with so many steps in all, are on disk only."""
+        before = self.away.pop(anchor, (0, 0))
+        if before[0] + count:
+            self.away[anchor] = (before[0] + count, before[1] + steps)
+
+    def lose(self, anchor: int, count: int, steps: int) -> None:
+        """Gaussians on disk cannot be read any more: the anchor's chunk is another one now."""
+        self.note_away(anchor, -count, -steps)
+        self._events[anchor] = self._events.get(anchor, 0) + 1
+
     def move(self, anchor: int, T_new_old: np.ndarray) -> None:
         """Moves the Gaussians of an anchor rigidly: means, rotations, and the momentum of the means."""
         chosen = np.flatnonzero(self.anchor[: self.count] == anchor)
-        if len(chosen) == 0:
+        if len(chosen) == 0 and anchor not in self.away:
             return
         self._events[anchor] = self._events.get(anchor, 0) + 1
-        self.params[:, chosen] = moved(self.params[:, chosen], T_new_old)
-        R = T_new_old[:3, :3]
-        self.first[MEAN:SCALE, chosen] = R @ self.first[MEAN:SCALE, chosen]
-        self.first[QUAT:OPACITY, chosen] = _turning(R) @ self.first[QUAT:OPACITY, chosen]
+        self.params[:, chosen], self.first[:, chosen] = carried(
+            self.params[:, chosen], self.first[:, chosen], T_new_old
+        )
 
     def versions(self) -> dict[int, int]:
         """Version of every anchor's chunk: grows with each step of the optimiser and each event."""
         anchors, which = np.unique(self.anchor[: self.count], return_inverse=True)
         steps = np.bincount(which, weights=self.steps[: self.count], minlength=len(anchors))
         taken = {int(anchor): int(n) for anchor, n in zip(anchors, steps)}
+        for anchor, (_, n) in self.away.items():
+            taken[anchor] = taken.get(anchor, 0) + n
         # An event outweighs the steps that removed Gaussians took with them.
         return {a: (events << 40) + taken.get(a, 0) for a, events in sorted(self._events.items())}
 
@@ -104,12 +157,24 @@ class GaussianStore(GaussianArrays):
         ]
 
 
+def _sum(steps: np.ndarray) -> int:
+    return int(steps.sum(dtype=np.float64))
+
+
 def moved(params: np.ndarray, T_a_b: np.ndarray) -> np.ndarray:
     """Gaussians float32 [14, N] of frame b in frame a."""
     out = params.copy()
     out[MEAN:SCALE] = T_a_b[:3, :3] @ params[MEAN:SCALE].astype(np.float64) + T_a_b[:3, 3:4]
     out[QUAT:OPACITY] = _turning(T_a_b[:3, :3]) @ params[QUAT:OPACITY]
     return out
+
+
+def carried(params: np.ndarray, first: np.ndarray, T_a_b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Gaussians of frame b and their momentum, float32 [14, N] each, in frame a."""
+    R, turned = T_a_b[:3, :3], first.copy()
+    turned[MEAN:SCALE] = R @ first[MEAN:SCALE]
+    turned[QUAT:OPACITY] = _turning(R) @ first[QUAT:OPACITY]
+    return moved(params, T_a_b), turned
 
 
 def _turning(R: np.ndarray) -> np.ndarray:

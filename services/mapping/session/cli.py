@@ -202,7 +202,10 @@ def _open(session: Path) -> tuple[Any, dict[str, Any]]:
 
 
 def _newer(folder: Any, arrays: dict[str, Any]) -> int:
-    return len(set(folder.body_ids()) - set(arrays["extra_taken_id"].tolist()))
+    from services.mapping.session.state import progress_of
+
+    known = {*arrays["extra_taken_id"].tolist(), *progress_of(arrays)["forgotten"]}
+    return len(set(folder.body_ids()) - known)
 
 
 def _write(folder: Any, arrays: dict[str, Any]) -> None:
@@ -210,6 +213,7 @@ def _write(folder: Any, arrays: dict[str, Any]) -> None:
 
     try:
         folder.write_state(arrays, summary_of(arrays))
+        folder.remove_blocks(folder.block_numbers())  # all Gaussians are in the state now
     except OSError as error:
         raise UserError(
             f"{folder.path}: not written ({error.strerror}); the state before is whole"

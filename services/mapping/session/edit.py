@@ -9,7 +9,7 @@ import numpy as np
 from common.errors import UserError
 from common.geometry import inverse
 from common.raster.layout import OPACITY
-from services.mapping.session.folder import Arrays
+from services.mapping.session.blocks import Arrays
 from services.mapping.session.state import progress_of, store_of
 from services.mapping.store import GaussianStore
 
@@ -58,6 +58,7 @@ def merged(a: Arrays, b: Arrays, T_a_b: np.ndarray, offset: int) -> Arrays:
     progress, other = progress_of(a), progress_of(b)
     progress["steps"] += other["steps"]
     progress["forgotten"] = sorted(progress["forgotten"] + other["forgotten"])
+    progress["given_up"] = _given_up(progress) + _given_up(other)
     return out | _progress(progress)
 
 
@@ -75,6 +76,7 @@ def pruned(arrays: Arrays, least_opacity: float, keyframes: int | None) -> Array
         out |= {key: a[kept] for key, a in arrays.items() if key.startswith(_KEYFRAMES)}
         progress = progress_of(arrays)
         gone = set(ids.tolist()) - set(ids[kept].tolist())
+        progress["given_up"] = _given_up(progress) + len(gone)
         progress["forgotten"] = sorted({*progress["forgotten"], *gone})
         progress["newest"] = [id for id in progress["newest"] if id not in gone]
         out |= _progress(progress)
@@ -89,6 +91,10 @@ def summary_of(arrays: Arrays) -> dict[str, int]:
         "steps": progress_of(arrays)["steps"], "anchors": len(arrays["anchor_id"]),
         "stamp_ns": int(stamps_ns.max()) if len(stamps_ns) else 0,
     }  # fmt: skip
+
+
+def _given_up(progress: dict) -> int:
+    return progress.get("given_up", len(progress["forgotten"]))
 
 
 def _prefixed(store: GaussianStore) -> Arrays:

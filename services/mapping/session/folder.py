@@ -15,7 +15,7 @@ import struct
 import uuid
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -23,13 +23,14 @@ import numpy as np
 
 from common.errors import UserError, reason
 from common.persist import make_folder, write_atomically
+from services.mapping.session.blocks import Arrays, block_file, with_blocks
 
 FORMAT, VERSION = "beamsplat-session", 1
+EDGE_VERSION = 2  # 2: Gaussians may lie in blocks beside the state; without any, 1 is written
 MANIFEST, EDGE_MANIFEST = "session.json", "edge.json"
+_TRIES = 5  # to read a state while a mapper replaces it
 _BODY_MAGIC = b"BSKF"
 _BODY_HEAD = struct.Struct("<4sIH")  # magic, CRC-32 of what follows the head, length of the schema
-
-Arrays = dict[str, np.ndarray]
 
 
 class SessionFolder:
@@ -51,6 +52,10 @@ class SessionFolder:
     def bodies(self) -> Path:
         return self.edge / "keyframes"
 
+    @property
+    def blocks(self) -> Path:
+        return self.edge / "gaussians"
+
     def exists(self) -> bool:
         """Whether this folder holds a session."""
         return (self.path / MANIFEST).is_file()
@@ -64,6 +69,7 @@ class SessionFolder:
             UserError: the folder cannot be made, or holds a session that cannot be read.
         """
         make_folder(self.bodies)
+        make_folder(self.blocks)
         if self.exists():
             self.head()
             return
@@ -138,7 +144,8 @@ class SessionFolder:
                 file.flush()
                 os.fsync(file.fileno())
             size = (self.edge / name).stat().st_size
-            manifest = {"version": VERSION, "state": name, "bytes": size, **summary}
+            version = EDGE_VERSION if "block_number" in arrays else VERSION
+            manifest = {"version": version, "state": name, "bytes": size, **summary}
             write_json(self.edge / EDGE_MANIFEST, manifest)
         except OSError:
             (self.edge / name).unlink(missing_ok=True)
@@ -158,21 +165,29 @@ class SessionFolder:
         if not path.is_file():
             return None
         manifest = read_json(path, "restore the folder from a copy")
-        check_version(manifest, path)
+        check_version(manifest, path, EDGE_VERSION)
         for field, kind in (("state", str), ("bytes", int)):
             if not isinstance(manifest.get(field), kind):
                 raise UserError(f"{path}: field {field!r} is missing; restore the folder from a copy")
         return manifest
 
-    def read_state(self) -> Arrays | None:
-        """The arrays that the manifest names; None while nothing has been saved.
+    def read_state(self, whole: bool = True) -> Arrays | None:
+        """The arrays that the manifest names; None while nothing has been saved. Without `whole`, blocks of
+        Gaussians stay in their files.
 
         Raises:
             UserError: they are missing, truncated or altered.
         """
-        manifest = self.manifest()
-        if manifest is None:
-            return None
+        for _ in range(_TRIES):
+            manifest = self.manifest()
+            try:
+                return None if manifest is None else self._read(manifest, whole)
+            except UserError:
+                if self.manifest() == manifest:
+                    raise
+        raise UserError(f"{self.path}: is saved faster than it can be read; try again")
+
+    def _read(self, manifest: dict[str, Any], whole: bool) -> Arrays:
         path = self.edge / Path(manifest["state"]).name
         try:
             size = path.stat().st_size
@@ -180,11 +195,12 @@ class SessionFolder:
                 raise UserError(
                     f"{path}: truncated ({size} bytes, {manifest['bytes']} expected); restore it from a copy"
                 )
-            return unpacked_arrays(path)
+            arrays = unpacked_arrays(path)
         except (OSError, zipfile.BadZipFile, zlib.error, ValueError) as error:
             if isinstance(error, UserError):
                 raise
             raise UserError(f"{path}: cannot be read ({reason(error)}); restore it from a copy") from error
+        return with_blocks(self.blocks, arrays) if whole else arrays
 
     # --- keyframes ---
 
@@ -229,6 +245,17 @@ class SessionFolder:
 
     def _body(self, id: int) -> Path:
         return self.bodies / f"{id}.kf"
+
+    # --- blocks of Gaussians ---
+
+    def block_numbers(self) -> list[int]:
+        """Numbers of the blocks on disk, rising."""
+        return sorted(int(p.stem) for p in self.blocks.glob("*.block") if p.stem.isdecimal())
+
+    def remove_blocks(self, numbers: Iterable[int]) -> None:
+        """Takes blocks off the disk."""
+        for number in numbers:
+            block_file(self.blocks, number).unlink(missing_ok=True)
 
 
 def packed_arrays(arrays: Arrays) -> bytes:
@@ -278,14 +305,14 @@ def read_json(path: Path, advice: str) -> dict[str, Any]:
     return table
 
 
-def check_version(table: dict[str, Any], path: Path) -> None:
+def check_version(table: dict[str, Any], path: Path, newest: int = VERSION) -> None:
     """Refuses what a newer program wrote.
 
     Raises:
         UserError: names the file, its version and the one that this program reads.
     """
     version = table.get("version")
-    if not isinstance(version, int) or not 1 <= version <= VERSION:
+    if not isinstance(version, int) or not 1 <= version <= newest:
         raise UserError(
-            f"{path}: version {version!r}, this program reads 1 to {VERSION}; use the program that wrote it"
+            f"{path}: version {version!r}, this program reads 1 to {newest}; use the program that wrote it"
         )

@@ -9,14 +9,15 @@ import numpy as np
 
 from common.camera import Pinhole, Undistorter
 from common.codec import decode
+from common.geometry import inverse
 from common.messages import Keyframe, Message
 from common.node import Job, Node, Outputs
 from services.mapping.config import MappingConfig
+from services.mapping.keyframe import Keyframe as MapKeyframe
 from services.mapping.mapper import Mapper, Outcome
 from services.mapping.messages import ack, body_of, open_keyframe
 from services.mapping.session.arrivals import Arrivals
 from services.mapping.session.keeper import Keeper, Saved
-from services.mapping.session.paging import Pager
 
 log = logging.getLogger("beamsplat.mapping")
 
@@ -62,8 +63,8 @@ class SessionNode(Node):
     def take_over(self) -> None:
         c = self.config
         if c.session is not None:
-            pager = None if c.memory_mb is None else Pager(c.memory_mb * 1e6, c.seed)
-            self._keeper = Keeper(c.session, round(c.session_every_s * 1e9), pager)
+            budget_bytes = None if c.memory_mb is None else c.memory_mb * 1e6
+            self._keeper = Keeper(c.session, round(c.session_every_s * 1e9), budget_bytes, c.seed)
             self._resume(self._keeper)
             self._arrivals = Arrivals(self._keeper)
 
@@ -72,7 +73,7 @@ class SessionNode(Node):
         if self._arrivals is None or not isinstance(message, Keyframe):
             return
         status = self._refusals.get(message.id)
-        known = message.id in self._taken
+        known = message.id in self._taken or self._mapper.knows(message.id)
         if status is not None or self._arrivals.take(message.id, known, lambda: body_of(message)):
             yield ack(message, status or "ok")
 
@@ -119,12 +120,25 @@ class SessionNode(Node):
             "T_oldest_origin": np.array(origin).reshape(-1, 4, 4),
         }
 
+    def _add(self, frame: MapKeyframe, message: Keyframe) -> Outcome:
+        """Into the map, with what it sees in memory; what is known of keyframes given up for it goes."""
+        keeper, m = self._keeper, self._mapper
+        bring = None if keeper is None else lambda held: keeper.bring(m, held)
+        outcome = m.add(frame, message.T_map_anchor, bring)
+        if outcome.ok:
+            self._taken[message.id] = (message.stamp_ns, inverse(message.camera.T_body_camera))
+            if len(self._taken) > len(m.keyframes) + len(m.resting):
+                self._taken = {id: taken for id, taken in self._taken.items() if m.holds(id)}
+        return outcome
+
+    def _page(self) -> None:
+        """The memory's budget is kept."""
+        if self._keeper is not None:
+            self._keeper.page(self._mapper)
+
     def _checkpoint(self, stamp_ns: int) -> Outputs:
-        """The memory's budget is kept; now and then the map goes to the disk, in the background."""
-        if self._keeper is None or not self._mapper.keyframes:
-            return
-        self._keeper.page(self._mapper)
-        if self._keeper.due(stamp_ns):
+        """Now and then the map goes to the disk, in the background."""
+        if self._keeper is not None and self._mapper.keyframes and self._keeper.due(stamp_ns):
             yield Job("checkpoint", self._keeper.checkpoint(self._mapper, self._extra(), stamp_ns))
 
     def on_job_checkpoint(self, saved: Saved) -> Outputs:

@@ -13,7 +13,7 @@ from common.errors import UserError
 from common.raster.camera import RasterCamera
 from services.mapping.keyframe import Held, Keyframe, Level, hold
 from services.mapping.mapper import FULL, Mapper
-from services.mapping.session.folder import Arrays
+from services.mapping.session.blocks import Arrays
 from services.mapping.store import GaussianStore
 
 _CAMERA = ("fx_px", "fy_px", "cx_px", "cy_px", "width_px", "height_px")
@@ -21,13 +21,13 @@ _NOT_STORED = {"levels"}  # made again from the keyframe's body
 _FIELDS = tuple(field.name for field in fields(Held) if field.name not in _NOT_STORED)
 
 
-def arrays_of(mapper: Mapper, extra: Arrays | None = None, parked: dict[int, Held] | None = None) -> Arrays:
+def arrays_of(mapper: Mapper, extra: Arrays | None = None) -> Arrays:
     """Copies of all that a mapper is, but for its keyframes' pictures; `extra` rides along.
 
-    Gaussians are `store_*`, keyframes `keyframe_*` (in the mapper's order, then the `parked` ones, whose
+    Gaussians are `store_*`, keyframes `keyframe_*` (in the mapper's order, then the resting ones, whose
     pictures are not in memory), anchors `anchor_*`.
     """
-    held = [*mapper.keyframes.values(), *(parked or {}).values()]
+    held = [*mapper.keyframes.values(), *mapper.resting.values()]
     out = {f"store_{name}": array for name, array in mapper.store.state().items()}
     for name in _FIELDS:
         out[f"keyframe_{name}"] = np.array([getattr(h, name) for h in held])
@@ -45,11 +45,9 @@ def extras_of(arrays: Arrays) -> Arrays:
     return {key.removeprefix("extra_"): a for key, a in arrays.items() if key.startswith("extra_")}
 
 
-def restore(
-    mapper: Mapper, arrays: Arrays, body: Callable[[int], Keyframe], parked: dict[int, Held] | None = None
-) -> list[str]:
+def restore(mapper: Mapper, arrays: Arrays, body: Callable[[int], Keyframe], rest: bool = False) -> list[str]:
     """Makes a fresh mapper what the saved one was; `body` opens a keyframe by its id. Those whose pictures
-    were not in memory go to `parked`, without it into the mapper too.
+    were not in memory stay without them if they are to `rest`.
 
     Gives one sentence for each keyframe that could not be opened: the map is whole without it, but does not
     learn from it any more.
@@ -65,8 +63,8 @@ def restore(
         resting = arrays.get("keyframe_parked", np.zeros(len(arrays["keyframe_id"]), bool))
         for row, id in enumerate(arrays["keyframe_id"].tolist()):
             held = _held(arrays, row)
-            if parked is not None and resting[row]:
-                parked[id] = held
+            if rest and resting[row]:
+                mapper.resting[id] = held
                 continue
             try:
                 held.levels = hold(body(id), mapper.settings.sigma_unit).levels

@@ -6,18 +6,23 @@ import pytest
 from common.errors import UserError
 from common.messages import Tick
 from services.mapping.session.folder import SessionFolder
-from services.mapping.session.paging import Pager, bytes_of, resting
+from services.mapping.session.paging import PROCESS_MB, Pager, bytes_of, check_budget, resting
+from services.mapping.session.shelf import Shelf
 from services.mapping.session.state import views_of
 from tests.services.mapping import room_drive as r
 from tests.services.mapping.session.maps import SECOND, feed, handle, make_node, message
 
-# A keyframe of 160x120 takes 160 kB with both its sizes, the empty arrays of the Gaussians 0.8 MB.
-BUDGET_MB = 3.0
+# A keyframe of 160x120 takes 140 kB with both its sizes; rendering holds on to 4 MB.
+BUDGET_MB = PROCESS_MB + 10.0
 
 
 def used(node):
-    store = sum(array.nbytes for array in node._mapper.store.arrays())
-    return store + sum(map(bytes_of, node._mapper.keyframes.values()))
+    """Bytes in the mapper's memory, counted apart from the pager: pictures, Gaussians twice, workspaces."""
+    mapper = node._mapper
+    store = mapper.store
+    gaussians = 2 * sum(getattr(store, n)[..., : store.count].nbytes for n in store._arrays())
+    pictures = sum(map(bytes_of, mapper.keyframes.values()))
+    return PROCESS_MB * 1e6 + gaussians + pictures + mapper.workspace_bytes
 
 
 @pytest.fixture(scope="module")
@@ -30,14 +35,14 @@ def paged(tmp_path_factory):
             stamp_ns = r.T0 + (lap * 12 + number) * SECOND
             handle(node, "keyframes/frame", message(number, stamp_ns), sent)
             assert used(node) <= BUDGET_MB * 1e6
-            assert len(node._mapper.keyframes) + len(node._keeper.parked) == lap * 12 + number + 1
+            assert len(node._mapper.keyframes) + len(node._mapper.resting) == lap * 12 + number + 1
     return folder, node, sent
 
 
 def test_the_budget_holds_lap_after_lap_and_top_says_what_rests(paged):
     _, node, sent = paged
-    assert len(node._keeper.parked) > 5
-    assert "keyframes on disk only" in node.detail
+    assert len(node._mapper.resting) > 5
+    assert f"in memory {len(node._mapper.keyframes)} of 24 keyframes" in node.detail
     statuses = sent["mapping/status"]
     assert [s.keyframes for s in statuses] == list(range(1, 25))
     assert statuses[-1].gaussians == node._mapper.store.count
@@ -51,7 +56,7 @@ def test_resting_keyframes_take_turns(paged):
         assert used(node) <= BUDGET_MB * 1e6
         ever |= set(node._mapper.keyframes)
     assert len(ever) == 24
-    assert len(node._mapper.keyframes) + len(node._keeper.parked) == 24
+    assert len(node._mapper.keyframes) + len(node._mapper.resting) == 24
 
 
 def test_a_checkpoint_holds_those_on_disk_and_resumes_with_or_without_a_budget(paged, tmp_path):
@@ -60,14 +65,14 @@ def test_a_checkpoint_holds_those_on_disk_and_resumes_with_or_without_a_budget(p
     for output in node.drain():
         sent.setdefault(output[0], []).append(output[1])
     assert len(sent["mapping/poses"][-1].keyframe_ids) == 24
-    parked = {id: held.delta for id, held in node._keeper.parked.items()}
+    parked = {id: held.delta for id, held in node._mapper.resting.items()}
     node.close()
     arrays = SessionFolder(folder).read_state()
     assert len(views_of(arrays)) == 24
     again = make_node(folder, memory_mb=BUDGET_MB)
-    assert set(again._keeper.parked) == set(parked)
+    assert set(again._mapper.resting) == set(parked)
     for id, delta in parked.items():
-        np.testing.assert_array_equal(again._keeper.parked[id].delta, delta)
+        np.testing.assert_array_equal(again._mapper.resting[id].delta, delta)
     assert list(again._mapper.keyframes) == list(node._mapper.keyframes)
     again.close()
     free = make_node(folder)
@@ -77,13 +82,15 @@ def test_a_checkpoint_holds_those_on_disk_and_resumes_with_or_without_a_budget(p
 
 
 def test_the_same_drive_pages_the_same_keyframes(tmp_path):
-    nodes = [make_node(tmp_path / name, memory_mb=2.0, half_steps=1, full_steps=1) for name in "ab"]
+    nodes = [
+        make_node(tmp_path / name, memory_mb=BUDGET_MB - 2.5, half_steps=1, full_steps=1) for name in "ab"
+    ]
     for node in nodes:
         feed(node, range(12))
         node.close()
     a, b = nodes
-    assert list(a._keeper.parked) == list(b._keeper.parked)
-    assert a._keeper.parked
+    assert list(a._mapper.resting) == list(b._mapper.resting)
+    assert a._mapper.resting
     count = a._mapper.store.count
     np.testing.assert_array_equal(a._mapper.store.params[:, :count], b._mapper.store.params[:, :count])
 
@@ -91,7 +98,7 @@ def test_the_same_drive_pages_the_same_keyframes(tmp_path):
 def test_what_cannot_be_read_again_stays_in_memory_or_is_said(tmp_path, caplog):
     node = make_node(tmp_path / "s", half_steps=0, full_steps=0)
     feed(node, range(12))
-    mapper, pager = node._mapper, Pager(0.0, 0)
+    mapper, pager = node._mapper, Pager(0.0, 0, Shelf(SessionFolder(tmp_path / "s")))
     pager.page(mapper, lambda id: None, lambda id: False)
     assert len(mapper.keyframes) == 12
     pager.page(mapper, lambda id: None, lambda id: True)
@@ -109,6 +116,9 @@ def test_what_cannot_be_read_again_stays_in_memory_or_is_said(tmp_path, caplog):
     node.close()
 
 
-def test_a_budget_needs_a_disk():
-    with pytest.raises(UserError, match=r"mapping\.memory_mb"):
-        make_node(None, memory_mb=100.0)
+def test_a_budget_needs_a_disk_and_room_for_the_process(tmp_path):
+    with pytest.raises(UserError, match=r"mapping\.memory_mb: .*give mapping\.session too"):
+        make_node(None, memory_mb=1000.0)
+    with pytest.raises(UserError, match=r"memory_mb = 100: the process itself takes"):
+        make_node(tmp_path / "s", memory_mb=100.0)
+    check_budget(PROCESS_MB + 1.0, tmp_path)

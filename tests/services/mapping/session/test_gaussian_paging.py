@@ -1,0 +1,354 @@
+"""Gaussians beyond the budget lie on the disk: what was seen looks the same when it comes back, and nothing is lost."""
+
+import shutil
+
+import numpy as np
+import pytest
+
+from common.errors import UserError
+from common.geometry import inverse, se2_to_se3
+from common.messages import Anchors
+from common.raster.layout import MEAN, SCALE
+from common.splats import unpack
+from services.mapping.chunks import on_disk
+from services.mapping.export import read_ply_points
+from services.mapping.keyframe import MAX_DEPTH_M
+from services.mapping.session.blocks import arrays_of_blocks, block_file, blocks_of, with_blocks
+from services.mapping.session.folder import EDGE_MANIFEST, SessionFolder
+from services.mapping.session.paging import PROCESS_MB
+from services.mapping.session.shelf import CELL_M, groups_of, spheres_of
+from services.mapping.session.sight import sees
+from services.mapping.session.state import store_of
+from services.mapping.store import moved
+from tests.services.mapping.session import gallery
+from tests.services.mapping.session.maps import SECOND, handle, make_node
+
+BUDGET_MB = PROCESS_MB + 6.0
+PLACES = 40
+
+
+def walk(node, numbers, sent=None):
+    for number in numbers:
+        handle(node, "keyframes/frame", gallery.message(number, PLACES), {} if sent is None else sent)
+    return node
+
+
+def make(folder, **options):
+    return make_node(folder, **{"memory_mb": BUDGET_MB, "half_steps": 2, "full_steps": 2, **options})
+
+
+def rows(store):
+    """All that is known of the Gaussians, one row each, in an order of its own."""
+    state = store.state()
+    parts = [state[n].reshape(-1, store.count).astype(np.float64) for n in store._arrays()]
+    table = np.concatenate(parts).T
+    return table[np.lexsort(table.T)]
+
+
+def picture(mapper, place):
+    render = mapper.rasterizer.render(
+        mapper.store.params, mapper.store.count, gallery.CAMERA, inverse(gallery.T_map_camera(place))
+    )
+    image = np.clip(render.image[:3], 0.0, 1.0).copy()
+    mapper.rasterizer.release(render)
+    return image
+
+
+def psnr_db(a, b):
+    return -10.0 * np.log10(max(float(np.mean((a - b) ** 2)), 1e-12))
+
+
+@pytest.fixture(scope="module")
+def once(tmp_path_factory):
+    """A session of a walk past all pictures, saved at its end."""
+    folder = tmp_path_factory.mktemp("gallery") / "s"
+    node = walk(make(folder, session_every_s=10.0), range(PLACES))
+    list(node.drain())
+    node.close()
+    return folder
+
+
+@pytest.fixture
+def walked(once, tmp_path):
+    """(folder, a node that has walked past all pictures)."""
+    shutil.copytree(once, tmp_path / "s")
+    node = make(tmp_path / "s", session_every_s=10.0)
+    yield tmp_path / "s", node
+    node.close()
+
+
+def test_the_budget_holds_and_the_status_says_what_is_where(tmp_path):
+    """Twice along the gallery: never over the budget, and what a keyframe in memory sees is in memory."""
+    node = make(tmp_path / "s")
+    pager, shelf, mapper, sent = node._keeper._pager, node._keeper.shelf, node._mapper, {}
+    for number in range(2 * PLACES):
+        walk(node, [number], sent)
+        assert pager._used(mapper) <= BUDGET_MB * 1e6
+        assert not pager.fault
+        for held in mapper.keyframes.values():
+            assert len(pager._on_shelf(mapper, held)) == 0
+        assert mapper.store.away_count == shelf.count
+        assert len(mapper.keyframes) + len(mapper.resting) == number + 1
+    status = sent["mapping/status"][-1]
+    assert shelf.count > 0.3 * status.gaussians
+    assert status.gaussians == mapper.store.count + shelf.count
+    assert (
+        f"{mapper.store.count} of {status.gaussians} Gaussians; {len(shelf.blocks)} chunks" in status.session
+    )
+    assert "of 206 MB" in node.detail
+    node.close()
+
+
+def test_all_places_are_visited_again_while_time_passes(walked):
+    """Keyframes have their turns, those whose surroundings were on the disk too: each visit brings another place."""
+    _, node = walked
+    ever, pager = set(node._mapper.keyframes), node._keeper._pager
+    before = len(ever)
+    for _ in range(320):
+        node._keeper.page(node._mapper)
+        ever |= set(node._mapper.keyframes)
+        assert pager._used(node._mapper) <= BUDGET_MB * 1e6
+    assert len(ever) > before + 8
+    assert min(ever) < gallery.T0 + 15 * SECOND
+
+
+def test_old_places_look_the_same_after_they_were_on_the_disk(walked):
+    """The first places have left; a view brings them back as they were when they left: 60 dB, in fact the same bits."""
+    _, node = walked
+    mapper, keeper = node._mapper, node._keeper
+    assert mapper.store.count < 0.8 * (mapper.store.count + keeper.shelf.count)
+    before, away = {}, [place for place in range(12) if gallery.T0 + place * SECOND in mapper.resting]
+    away = [
+        place
+        for place in away
+        if len(keeper._pager._on_shelf(mapper, mapper.resting[gallery.T0 + place * SECOND]))
+    ]
+    assert len(away) > 3
+    for place in away[:3]:  # they do not see each other
+        held = mapper.resting[gallery.T0 + place * SECOND]
+        seen = gallery.painting(place).transpose(2, 0, 1) / 255.0
+        gone_db = psnr_db(picture(mapper, place), seen)
+        keeper.bring(mapper, held)
+        before[place] = picture(mapper, place)
+        assert psnr_db(before[place], seen) > gone_db + 8.0
+    whole = rows(mapper.store)
+    groups = groups_of(mapper.store, mapper.T_map_anchor)
+    keeper.shelf.put(mapper.store, groups, mapper.T_map_anchor)
+    assert mapper.store.count < 0.05 * len(whole)
+    keeper._pager._where = None
+    for place, image in before.items():
+        keeper.bring(mapper, mapper.resting[gallery.T0 + place * SECOND])
+        assert psnr_db(image, picture(mapper, place)) >= 60.0
+    keeper.shelf.take(mapper.store, list(keeper.shelf.blocks), mapper.T_map_anchor)
+    stored = {tuple(row) for row in rows(mapper.store)}
+    assert {tuple(row) for row in whole} <= stored
+
+
+def test_anchors_take_what_is_on_the_disk_along(walked):
+    """The first submap moves by half a metre and ten degrees while its Gaussians lie on the disk."""
+    _, node = walked
+    mapper, shelf = node._mapper, node._keeper.shelf
+    assert mapper.store.away[0][0] > 0.8 * sum(mapper.store.anchor[: mapper.store.count] == 0)
+    whole = [mapper.store.chunk(0), *on_disk(mapper, 0)]
+    before = np.concatenate(whole, axis=1)
+    move = se2_to_se3(np.array([0.5, 0.2, np.deg2rad(10.0)]))
+    version = mapper.store.versions()[0]
+    places = np.stack([move @ mapper.T_map_anchor[0]])
+    handle(
+        node,
+        "localization/anchors",
+        Anchors(stamp_ns=gallery.T0, anchor_ids=np.array([0]), T_map_anchor=places),
+        {},
+    )
+    assert mapper.store.versions()[0] > version
+    shelf.take(mapper.store, [n for n, b in shelf.blocks.items() if b.anchor == 0], mapper.T_map_anchor)
+    after, expected = mapper.store.chunk(0), moved(before, move)
+    order, expected_order = np.lexsort(after[11:14]), np.lexsort(expected[11:14])
+    np.testing.assert_allclose(after[MEAN:SCALE, order], expected[MEAN:SCALE, expected_order], atol=1e-5)
+
+
+def test_chunks_and_the_file_at_the_end_hold_what_is_on_the_disk(tmp_path):
+    node, sent = make(tmp_path / "s", save=tmp_path / "out"), {}
+    walk(node, range(PLACES), sent)
+    chunks = {c.anchor_id: c for c in node.on_query_snapshot({})}
+    store = node._mapper.store
+    total = store.count + store.away_count
+    assert sum(c.count for c in chunks.values()) == total > store.count
+    points = moved(unpack(chunks[0].packed), chunks[0].T_map_anchor)[MEAN:SCALE]
+    assert len(points[0]) == sum(store.anchor[: store.count] == 0) + store.away[0][0]
+    assert points[1].min() < 0.5 < 8.5 < points[1].max() < 11.0  # four pictures, three metres apart
+    assert chunks == chunks | {
+        c.anchor_id: c for c in sent["mapping/chunk"] if c.revision == chunks[c.anchor_id].revision
+    }
+    for output in node.drain():
+        sent.setdefault(output[0], []).append(output[1])
+    assert len(read_ply_points(tmp_path / "out" / "splats.ply")) == total
+    node.close()
+
+
+def test_leaving_and_coming_back_changes_no_version(walked):
+    _, node = walked
+    mapper, shelf = node._mapper, node._keeper.shelf
+    versions = mapper.store.versions()
+    shelf.take(mapper.store, list(shelf.blocks), mapper.T_map_anchor)
+    assert mapper.store.versions() == versions
+    shelf.put(mapper.store, groups_of(mapper.store, mapper.T_map_anchor), mapper.T_map_anchor)
+    assert mapper.store.versions() == versions
+
+
+# --- sessions ---
+
+
+def test_a_checkpoint_holds_all_and_resumes_with_or_without_a_budget(walked):
+    folder, node = walked
+    list(node.drain())
+    node.close()
+    session = SessionFolder(folder)
+    assert session.manifest()["version"] == 2
+    assert session.manifest()["gaussians"] == node._mapper.store.count + node._keeper.shelf.count
+    again = make(folder)
+    assert again._mapper.store.count == node._mapper.store.count
+    assert again._mapper.store.away == node._mapper.store.away
+    again.close()
+    shelf, mapper = node._keeper.shelf, node._mapper
+    shelf.take(mapper.store, list(shelf.blocks), mapper.T_map_anchor)
+    expected = rows(mapper.store)
+    np.testing.assert_array_equal(rows(store_of(session.read_state())), expected)
+    free = make(folder, memory_mb=None, session_every_s=1.0)
+    np.testing.assert_array_equal(rows(free._mapper.store), expected)
+    list(free.drain())
+    free.close()
+    assert session.manifest()["version"] == 1
+    assert session.block_numbers() == []
+    np.testing.assert_array_equal(rows(store_of(session.read_state())), expected)
+
+
+def test_a_mapper_that_is_killed_finds_what_its_checkpoint_names(tmp_path):
+    """Blocks come and go after the checkpoint; those that it names are still there."""
+    node = walk(make(tmp_path / "s", session_every_s=25.0), range(PLACES))
+    node.close()  # no drain: as if killed
+    session = SessionFolder(tmp_path / "s")
+    named = {block.number for block in blocks_of(session.read_state(whole=False))}
+    assert named
+    assert named <= set(session.block_numbers())
+    assert store_of(session.read_state()).count == session.manifest()["gaussians"]
+    again = make(tmp_path / "s", session_every_s=2.0)
+    assert len(again._mapper.keyframes) + len(again._mapper.resting) == PLACES
+    walk(again, range(PLACES, PLACES + 6))
+    list(again.drain())
+    assert set(session.block_numbers()) == set(again._keeper.shelf.blocks)
+    again.close()
+
+
+def test_the_same_walk_gives_the_same_bytes(tmp_path):
+    nodes = [walk(make(tmp_path / name), range(PLACES + 10)) for name in "ab"]
+    a, b = (node._mapper for node in nodes)
+    assert a.store.away == b.store.away != {}
+    for name in a.store._arrays():
+        x, y = (getattr(m.store, name)[..., : m.store.count] for m in (a, b))
+        np.testing.assert_array_equal(x, y)
+    files = [sorted((tmp_path / name).rglob("*.block")) for name in "ab"]
+    assert [f.read_bytes() for f in files[0]] == [f.read_bytes() for f in files[1]]
+    for node in nodes:
+        node.close()
+
+
+# --- what goes wrong ---
+
+
+def test_a_budget_that_the_view_itself_breaks_is_said(tmp_path, caplog):
+    node, sent = make(tmp_path / "s", memory_mb=PROCESS_MB + 1.0), {}
+    walk(node, range(12), sent)
+    assert sent["mapping/status"][-1].session.startswith(
+        "BUDGET NOT KEPT: what the newest keyframes see takes "
+    )
+    assert "BUDGET NOT KEPT" in node.detail
+    assert "the memory's budget is not kept" in caplog.text
+    node.close()
+
+
+def test_a_disk_that_takes_no_gaussians_keeps_them_in_memory_and_says_so(tmp_path, monkeypatch):
+    node = walk(make(tmp_path / "s", session_every_s=1e6), range(8))
+    (tmp_path / "s" / "edge" / "gaussians").rmdir()
+    sent = {}
+    walk(node, range(8, PLACES), sent)
+    assert node._mapper.store.away_count == 0
+    assert "Gaussians do not go to the disk: No such file" in sent["mapping/status"][-1].session
+    (tmp_path / "s" / "edge" / "gaussians").mkdir()
+    walk(node, range(PLACES, PLACES + 3), sent)
+    assert node._mapper.store.away_count > 0
+    assert "BUDGET NOT KEPT" not in sent["mapping/status"][-1].session
+    node.close()
+
+
+@pytest.mark.parametrize("harm", ["cut", "gone", "altered", "empty"])
+def test_a_broken_block_costs_only_its_gaussians_and_is_said(walked, harm, caplog):
+    _, node = walked
+    mapper, shelf = node._mapper, node._keeper.shelf
+    block = next(b for b in shelf.blocks.values() if b.anchor == 0)
+    path = block_file(shelf._folder.blocks, block.number)
+    blob = bytearray(path.read_bytes())
+    blob[len(blob) // 2] ^= 0xFF
+    {"cut": lambda: path.write_bytes(path.read_bytes()[:-40]), "gone": path.unlink,
+     "altered": lambda: path.write_bytes(blob), "empty": lambda: path.write_bytes(b"")}[harm]()  # fmt: skip
+    total, version = mapper.store.count + shelf.count, mapper.store.versions()[0]
+    shelf.take(mapper.store, list(shelf.blocks), mapper.T_map_anchor)
+    assert shelf.lost == block.count
+    assert mapper.store.count == total - block.count
+    assert mapper.store.versions()[0] > version
+    assert mapper.store.away == {}
+    assert path.name in caplog.text
+    assert f"{block.count} Gaussians lost" in node._keeper.text(mapper)
+    arrays = {"anchor_id": np.array([0]), "anchor_T_map": np.eye(4)[None], **arrays_of_blocks([block])}
+    with pytest.raises(UserError, match=path.name):
+        with_blocks(shelf._folder.blocks, arrays)
+
+
+def test_a_manifest_of_a_newer_program_is_refused(walked):
+    folder, node = walked
+    list(node.drain())
+    path = folder / "edge" / EDGE_MANIFEST
+    path.write_text(path.read_text().replace('"version": 2', '"version": 3'))
+    with pytest.raises(UserError, match="version 3, this program reads 1 to 2"):
+        SessionFolder(folder).read_state()
+
+
+# --- what is seen ---
+
+
+def test_whatever_a_picture_shows_is_seen_and_what_is_far_from_it_is_not():
+    """Points of a sphere that fall into the picture make the sphere seen; ten radii off its pyramid it is not."""
+    chance = np.random.default_rng(4)
+    T_map_camera = gallery.T_map_camera(3)
+    centres, radii = chance.uniform(-12, 12, (4000, 3)), chance.uniform(0.05, 1.5, 4000)
+    on = chance.normal(size=(4000, 200, 3))
+    points = centres[:, None] + on / np.linalg.norm(on, axis=2, keepdims=True) * radii[:, None, None]
+    c, inward = gallery.CAMERA, inverse(T_map_camera)
+    x, y, z = np.moveaxis(points @ inward[:3, :3].T + inward[:3, 3], 2, 0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        u, v = x / z * c.fx_px + c.cx_px, y / z * c.fy_px + c.cy_px
+    inside = (
+        (z > 0.1) & (z < 6.0) & (u > -0.5) & (v > -0.5) & (u < c.width_px - 0.5) & (v < c.height_px - 0.5)
+    )
+    seen = sees(c, T_map_camera, 6.0, centres, radii)
+    assert seen[inside.any(axis=1)].all()
+    assert 60 < seen.sum() < 400
+    behind = (centres - T_map_camera[:3, 3]) @ T_map_camera[:3, 2] < -radii
+    assert not seen[behind].any()
+    assert sees(c, T_map_camera, MAX_DEPTH_M, centres, radii).sum() > seen.sum()
+
+
+def test_groups_hold_every_gaussian_of_a_cube_and_their_spheres_all_they_colour(walked):
+    _, node = walked
+    store, places = node._mapper.store, node._mapper.T_map_anchor
+    groups = groups_of(store, places)
+    members = np.sort(np.concatenate([g.members for g in groups]))
+    size = np.exp(store.params[SCALE : SCALE + 3, : store.count].max(axis=0))
+    np.testing.assert_array_equal(members, np.flatnonzero(3.4 * size < CELL_M))
+    for group, centre, radius in zip(groups, *spheres_of(groups, places)[1:]):
+        off = (
+            np.linalg.norm(store.params[MEAN:SCALE, group.members].T - centre, axis=1)
+            + 3.4 * size[group.members]
+        )
+        assert off.max() <= radius + 1e-4
+        assert np.ptp(store.params[MEAN:SCALE, group.members], axis=1).max() <= CELL_M + 1e-4
