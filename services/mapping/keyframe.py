@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 import cv2
 import numpy as np
 
-from common.geometry import is_rigid
+from common.geometry import is_rigid, se3_exp, se3_log
 from common.raster.camera import RasterCamera
 
 MAX_DEPTH_M = 60.0
@@ -137,7 +137,27 @@ def with_hidden(level: Level, image: np.ndarray, exposure: np.ndarray) -> Level:
     return replace(level, rgb=np.where(level.hidden, shown, level.rgb))
 
 
-def adam_step(gradient: np.ndarray, first: np.ndarray, second: np.ndarray, t: int) -> np.ndarray:
+def refine_pose(
+    held: Held, gradient: np.ndarray, rates: tuple[float, float], most: tuple[float, float]
+) -> None:
+    """Adam on the camera's own tangent: T_map_camera <- T_map_camera @ exp(-step). `gradient` [6] is that of
+    T_camera_map; `rates` and `most` in m and rad."""
+    # T_camera_map <- exp(xi) T_camera_map moves T_map_camera on the right by exp(-xi).
+    held.pose_steps += 1
+    move = _adam_step(gradient, held.pose_first, held.pose_second, held.pose_steps) * np.repeat(rates, 3)
+    tangent = se3_log(held.delta @ se3_exp(move))
+    limits = np.repeat(most, 3)
+    held.delta = se3_exp(np.clip(tangent, -limits, limits))
+
+
+def refine_exposure(held: Held, sums: np.ndarray, rate: float) -> None:
+    """Adam on gains and offsets; `sums` [rows, 8] as the loss gives them."""
+    gradient = sums[:, 2:8].sum(axis=0) + 1e-3 * held.exposure  # a weak pull to "as it was taken"
+    move = _adam_step(gradient, held.exposure_first, held.exposure_second, max(held.pose_steps, 1))
+    held.exposure = (held.exposure - rate * move).astype(np.float32)
+
+
+def _adam_step(gradient: np.ndarray, first: np.ndarray, second: np.ndarray, t: int) -> np.ndarray:
     """Adam's normalised step; updates the moments in place."""
     first += 0.1 * (gradient - first)
     second += 0.01 * (gradient**2 - second)

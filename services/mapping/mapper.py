@@ -12,13 +12,13 @@ from typing import Any
 
 import numpy as np
 
-from common.geometry import inverse, is_rigid, se3_exp, se3_log
+from common.geometry import inverse, is_rigid
 from common.raster.layout import OPACITY
 from common.raster.optimiser import rate_rows
-from common.raster.rasterizer import Gradients, Rasterizer, Render
+from common.raster.rasterizer import Rasterizer, Render
 from services.mapping.insertion import foretold, new_gaussians, unexplained
 from services.mapping.kernels import add_lidar, contradicted, photometric_and_depth
-from services.mapping.keyframe import Held, Keyframe, Level, adam_step, hold, with_hidden
+from services.mapping.keyframe import Held, Keyframe, Level, hold, refine_exposure, refine_pose, with_hidden
 from services.mapping.places import Places
 from services.mapping.settings import MapperSettings
 from services.mapping.ssim import SsimLoss
@@ -278,9 +278,11 @@ class Mapper:
             s.isotropy_weight / pixels, np.log(s.isotropy_ratio),
         )  # fmt: skip
         if s.refine_pose:
-            self._refine_pose(held, gradients, inverse(T_map_camera))
+            refine_pose(
+                held, gradients.pose, (s.rates.pose_m, s.rates.pose_rad), (s.max_pose_m, s.max_pose_rad)
+            )
         if s.refine_exposure:
-            self._refine_exposure(held, sums)
+            refine_exposure(held, sums, s.rates.exposure)
         self.rasterizer.release(render)
         self.steps += 1
         return loss
@@ -310,18 +312,3 @@ class Mapper:
         if level.hidden is not None:
             gradient[:, level.hidden] = 0.0
         return loss, gradient, sums
-
-    def _refine_pose(self, held: Held, gradients: Gradients, T_camera_map: np.ndarray) -> None:
-        """Adam on the camera's own tangent: T_map_camera <- T_map_camera @ exp(-step)."""
-        # T_camera_map <- exp(xi) T_camera_map moves T_map_camera on the right by exp(-xi).
-        rates = np.repeat([self.settings.rates.pose_m, self.settings.rates.pose_rad], 3)
-        held.pose_steps += 1
-        move = adam_step(gradients.pose, held.pose_first, held.pose_second, held.pose_steps) * rates
-        tangent = se3_log(held.delta @ se3_exp(move))
-        limits = np.repeat([self.settings.max_pose_m, self.settings.max_pose_rad], 3)
-        held.delta = se3_exp(np.clip(tangent, -limits, limits))
-
-    def _refine_exposure(self, held: Held, sums: np.ndarray) -> None:
-        gradient = sums[:, 2:8].sum(axis=0) + 1e-3 * held.exposure  # a weak pull to "as it was taken"
-        move = adam_step(gradient, held.exposure_first, held.exposure_second, max(held.pose_steps, 1))
-        held.exposure = (held.exposure - self.settings.rates.exposure * move).astype(np.float32)

@@ -45,7 +45,7 @@ class Places:
                 del self._ids[place]
 
     def fullest(self, spared: set[int]) -> list[int]:
-        """Ids, rising, of the place with most keyframes, without those in `spared`; the same places and ids
-        give the same answer, whatever order they came in."""
-        most = max(self._ids.items(), key=lambda item: (len(item[1] - spared), item[0]), default=None)
-        return [] if most is None else sorted(most[1] - spared)
+        """Ids, rising, of the place with most keyframes that has any beside those `spared`, without them; the
+        same places and ids give the same answer, whatever order they came in."""
+        able = [(len(ids), place) for place, ids in self._ids.items() if not ids <= spared]
+        return sorted(self._ids[max(able)[1]] - spared) if able else []

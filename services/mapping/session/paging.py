@@ -233,7 +233,8 @@ class Pager:
         lost += f", {self._shelf.lost} Gaussians lost" if self._shelf.lost else ""
         return (
             f"{self._used(mapper) / 1e6:.0f} of {self.budget_bytes / 1e6:.0f} MB: in memory "
-            f"{len(mapper.keyframes)} of {held} keyframes, {mapper.store.count} of {total} Gaussians; {blocks} chunks on disk only{lost}"
+            f"{len(mapper.keyframes)} of {held} keyframes, {mapper.store.count} of {total} Gaussians; "
+            f"{blocks} chunks on disk only{lost}"
         )
 
 

@@ -7,6 +7,7 @@ from common.lockstep import Lockstep
 from common.messages import Tick
 from services.keyframes.node import KeyframesConfig, KeyframesNode
 from services.mapping.config import MappingConfig
+from services.mapping.mapper import Mapper
 from services.mapping.node import MappingNode
 from services.mapping.session.arrivals import Arrivals
 from services.mapping.session.folder import SessionFolder
@@ -70,7 +71,7 @@ def test_a_keyframe_that_the_disk_does_not_take_waits_for_its_turn(tmp_path):
     assert not arrivals.take(1, False, lambda: ("s", b"x"))
     assert len(arrivals) == 0
     assert not arrivals.begin(1)
-    assert keeper.text().startswith("NOT SAVED")
+    assert keeper.text(Mapper()).startswith("NOT SAVED")
     keeper.close()
 
 
