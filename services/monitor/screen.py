@@ -2,8 +2,8 @@
 
 rerun can feed several sinks from one stream (`set_sinks`), but then the slowest sink sets the pace: a
 browser that stops reading blocks `log()` for more than 20 s, and the file with it. So each sink has its
-own stream of the same recording, and a queue that never makes the caller wait: when it is full, what is
-drawn replaces what still waits to be drawn at the same place.
+own stream of the same recording, and a queue that never makes the caller wait: when it is full, by number
+or by bytes, what is drawn replaces what still waits to be drawn at the same place.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +29,7 @@ log = logging.getLogger(__name__)
 APPLICATION = "beamsplat"
 TIMELINE = "time"
 _QUEUE = 256  # about five seconds of drawings at the default rates
+_QUEUE_BYTES = 64_000_000  # a large map is some 13 MB, drawn anew every two seconds
 _CHECK_S = 1.0
 _FLUSH_S = 3.0
 
@@ -39,6 +40,7 @@ class _Drawing:
     parts: tuple[Any, ...]
     stamp_ns: int | None
     static: bool
+    bytes: int = 0
 
 
 class Channel:
@@ -64,6 +66,7 @@ class Channel:
         self._watch = watch
         self._queue: deque[_Drawing | threading.Event] = deque()
         self._newest: dict[str, _Drawing] = {}
+        self._bytes = 0  # of the drawings that wait
         self._changed = threading.Condition()
         self._closing = False
         stream.set_sinks(sink, default_blueprint=blueprint)
@@ -76,12 +79,19 @@ class Channel:
             return
         with self._changed:
             waiting = self._newest.get(drawing.path)
-            if len(self._queue) >= _QUEUE and waiting is not None:
-                waiting.parts, waiting.stamp_ns = drawing.parts, drawing.stamp_ns
+            full = len(self._queue) >= _QUEUE or self._bytes + drawing.bytes > _QUEUE_BYTES
+            if full and waiting is not None:
+                self._bytes += drawing.bytes - waiting.bytes
+                waiting.parts, waiting.stamp_ns, waiting.bytes = (
+                    drawing.parts,
+                    drawing.stamp_ns,
+                    drawing.bytes,
+                )
                 self.skipped += 1
                 return
-            drawing = _Drawing(drawing.path, drawing.parts, drawing.stamp_ns, drawing.static)
+            drawing = replace(drawing)
             self._queue.append(drawing)
+            self._bytes += drawing.bytes
             self._newest[drawing.path] = drawing
             self._changed.notify()
 
@@ -134,8 +144,10 @@ class Channel:
             if not self._queue:
                 return "closing" if self._closing else None
             item = self._queue.popleft()
-            if isinstance(item, _Drawing) and self._newest.get(item.path) is item:
-                del self._newest[item.path]
+            if isinstance(item, _Drawing):
+                self._bytes -= item.bytes
+                if self._newest.get(item.path) is item:
+                    del self._newest[item.path]
             return item
 
     def _draw(self, drawing: _Drawing) -> None:
@@ -161,6 +173,7 @@ class Channel:
         with self._changed:
             self._queue.clear()
             self._newest.clear()
+            self._bytes = 0
 
 
 class Screen:
@@ -174,8 +187,9 @@ class Screen:
 
     def log(self, path: str, *parts: Any, stamp_ns: int | None = None, static: bool = False) -> None:
         """Draws rerun archetypes at an entity; without a stamp on the clock of this machine only."""
+        drawing = _Drawing(path, parts, stamp_ns, static, sum(map(_bytes_of, parts)))
         for channel in self.channels:
-            channel.put(_Drawing(path, parts, stamp_ns, static))
+            channel.put(drawing)
 
     def save(self, path: Path, blueprint: rrb.Blueprint, *, limit_mb: int, keep_free_mb: int) -> Path:
         """Starts a file beside what may be there already (drive.rrd, drive-2.rrd, ...); returns its name.
@@ -260,6 +274,10 @@ class Screen:
             channel.begin_close()
         for channel in self.channels:
             channel.close(max(deadline - time.monotonic(), 0.0))
+
+
+def _bytes_of(archetype: Any) -> int:
+    return sum(batch.as_arrow_array().nbytes for batch in archetype.as_component_batches())
 
 
 def _unused(path: Path) -> Path:

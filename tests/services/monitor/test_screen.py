@@ -10,7 +10,7 @@ import pytest
 import rerun as rr
 
 from services.monitor.layout import layout
-from services.monitor.screen import _QUEUE, Channel, Screen, _Drawing
+from services.monitor.screen import _QUEUE, _QUEUE_BYTES, Channel, Screen, _Drawing
 
 
 class StuckStream:
@@ -57,6 +57,20 @@ def test_a_stalled_viewer_holds_nobody_up_and_then_gets_the_newest():
     assert ("rig", "rig") in stream.logged
     newest = dict(stream.logged)
     assert {newest[f"entity{i}"] for i in range(3)} == {10 * _QUEUE - i for i in (1, 2, 3)}
+
+
+def test_large_drawings_that_wait_are_bounded_by_their_bytes():
+    stream = StuckStream()
+    channel = Channel("viewer", stream, None, None)
+    for i in range(200):
+        channel.put(_Drawing(f"splats{i % 4}", (i,), i, False, bytes=10_000_000))
+    assert len(channel._queue) <= _QUEUE_BYTES // 10_000_000 + 4
+    stream.gate.set()
+    assert channel.flush(10.0)
+    channel.close(10.0)
+    newest = dict(stream.logged)
+    assert {newest[f"splats{i}"] for i in range(4)} == {196, 197, 198, 199}
+    assert channel._bytes == 0
 
 
 def test_closing_does_not_wait_for_ever():
