@@ -3,34 +3,17 @@
 Figures are printed (`pytest -s`), not asserted: they belong to a machine. What is lost is asserted.
 """
 
-import subprocess
-import sys
+import math
 import time
 
 import pytest
 
 from tests.services.uplink.pair import BadLinkPair, onboard, quantiles, transit
-from tests.services.uplink.radio import ROOT, Radio, needs_namespaces
+from tests.services.uplink.radio import Radio
 
 BAD = {"rate_mbit": 20, "delay_ms": 20.0, "loss": 0.01, "seed": 7}
 SETTLED_S = 30.0  # link up, before it is cut
-
-
-@pytest.fixture(scope="module")
-def drive(tmp_path_factory):
-    """(laps) -> a simulated drive that ends where it began, 70 s a lap."""
-    needs_namespaces()
-    made = {}
-
-    def make(laps):
-        if laps not in made:
-            out = tmp_path_factory.mktemp("drives") / f"laps{laps}"
-            command = [sys.executable, "-m", "services", "simulate", "--out", out, "--laps", laps]
-            subprocess.run([*map(str, command)], check=True, cwd=ROOT, capture_output=True)
-            made[laps] = out / "bag"
-        return made[laps]
-
-    return make
+LAP_S = 70.0
 
 
 def say(what, values):
@@ -104,11 +87,9 @@ def print_states(states):
 @pytest.mark.soak
 @pytest.mark.parametrize("cut_s", [0, 60, 600])
 def test_a_bad_link_does_not_reach_the_robot_and_loses_no_keyframe(tmp_path, drive, cut_s):
-    data = drive(2 if cut_s <= 60 else 10)
-    with (
-        Radio(**BAD) as radio,
-        BadLinkPair(radio, tmp_path, data, duration_s=SETTLED_S + cut_s + 40.0) as pair,
-    ):
+    seconds = SETTLED_S + cut_s + 40.0
+    data = drive(math.ceil(seconds / LAP_S))
+    with Radio(**BAD) as radio, BadLinkPair(radio, tmp_path, data, duration_s=seconds) as pair:
         begin_ns, cut_ns, mended_ns = run_with_cut(pair, radio, cut_s)
         states = pair.drained(120 + 2 * cut_s)
         near, far = pair.near.log, pair.far.log

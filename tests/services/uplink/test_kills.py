@@ -1,0 +1,78 @@
+"""Processes of robot and edge that die at random over a bad link: nothing wedges, no keyframe is lost."""
+
+import math
+import os
+import random
+import time
+
+import pytest
+
+from tests.services.uplink.pair import BadLinkPair
+from tests.services.uplink.radio import Radio
+from tests.services.uplink.test_bad_link import BAD, LAP_S, print_states, say
+
+VICTIMS = [
+    *(("near", name) for name in ("router", "uplink", "keyframes", "fusion", "depth", "localization", "replay")),
+    *(("far", name) for name in ("router", "mapping")),
+]  # fmt: skip
+KILLS = int(os.environ.get("BEAMSPLAT_KILLS", "100"))
+MINUTES = float(os.environ.get("BEAMSPLAT_KILL_MINUTES", "10"))
+SEED = int(os.environ.get("BEAMSPLAT_KILL_SEED", "0"))
+
+
+def kill_at_random(pair, kills, minutes, seed):
+    """Seconds and victims, drawn from the seed; as they came about."""
+    chance = random.Random(seed)
+    times_s = sorted(chance.uniform(0.0, 60.0 * minutes) for _ in range(kills))
+    begin, done = time.monotonic(), []
+    for at_s in times_s:
+        time.sleep(max(begin + at_s - time.monotonic(), 0.0))
+        side, name = chance.choice(VICTIMS)
+        killed = getattr(pair, side).ask(f"kill {name}")["killed"]
+        done.append((round(at_s, 1), side, name, killed))
+    return done
+
+
+def all_active(near, far):
+    """Every process runs, and has said so since."""
+    now_ns = time.time_ns()
+    for state in (near, far):
+        if state["down"] or any(now_ns - t > 3_000_000_000 for n, t in state["seen_ns"].items()):
+            return False
+    return set(near["states"].values()) | set(far["states"].values()) <= {"active", "drained"}
+
+
+def losses(pair, data_ids):
+    """Keyframes made that are neither on the edge's disk, nor refused, nor still on the robot's."""
+    acks = pair.far.log.of("keyframes/ack")
+    refused = {line["stamp_ns"] for line in acks if line["status"] != "ok"}
+    return data_ids - set(pair.durable()) - refused - pair.queued
+
+
+@pytest.mark.soak
+def test_any_process_may_be_killed_at_any_time(tmp_path, drive):
+    """A killed localization begins a new map: what waits of the one before stays on the robot, counted."""
+    seconds = 60.0 * MINUTES + 30.0
+    laps = drive(math.ceil(seconds / LAP_S))
+    with Radio(**BAD) as radio, BadLinkPair(radio, tmp_path, laps, duration_s=seconds) as pair:
+        pair.wait(lambda near, far: len(pair.far.log.of("keyframes/frame")) >= 2, 120)
+        done = kill_at_random(pair, KILLS, MINUTES, SEED)
+        states = pair.wait(all_active, 60)
+        print()
+        say("killed", f"{sum(k for *_, k in done)} of {len(done)} in {MINUTES:g} min, seed {SEED}")
+        for side in ("near", "far"):
+            say(f"restarts, {side}", getattr(pair, side).state()["restarts"])
+        print_states(states)
+        before = set(pair.durable())
+        pair.wait(lambda near, far: set(pair.durable()) - before, 60)  # the chain works from end to end
+        states = pair.drained(300)
+        print_states(states)
+        made = set(pair.near.log.first("keyframes/frame", "sent_ns"))
+        earlier = pair.queued
+        say("keyframes made, on the edge, of earlier drives on the robot",
+            f"{len(made)}, {len(pair.durable())}, {len(earlier)}")  # fmt: skip
+        assert not any(state["gave_up"] for state in states)
+        assert len(made) > 20
+        assert losses(pair, made) == set()
+        mapped = set(pair.far.log.of("mapping/poses")[-1]["ids"])
+        assert mapped == set(pair.durable())
