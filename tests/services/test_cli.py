@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from services.doctor import congestion
+
 ROOT = Path(__file__).resolve().parents[2]
 
 POSES = ("--set", "replay.data=x", "--set", "recorder.out=x")
@@ -86,6 +88,14 @@ def test_run_without_a_router_port_says_what_to_do(tmp_path, free_endpoint):
     assert done.returncode == 2
     assert "router" in done.stderr
     assert "Traceback" not in done.stderr
+
+
+def test_doctor_says_what_tcp_makes_of_a_bad_link():
+    assert congestion("bbr").verdict == "ok"
+    found = congestion("cubic")
+    assert found.verdict == "note"
+    assert "cubic" in found.text
+    assert "tcp_congestion_control=bbr" in found.remedy
 
 
 def test_doctor_names_a_taken_port(tmp_path, free_endpoint):

@@ -84,19 +84,17 @@ class HostProcess:
 class BadLinkPair:
     """`near` drives, `far` maps into `session`; use with `with`."""
 
-    def __init__(self, radio, folder, data, *, duration_s=None, mapping=LIGHT, keyframes=None, loop=False):
+    def __init__(self, radio, folder, data, *, duration_s=None, mapping=LIGHT, rate=1.0):
         self._radio, self._folder = radio, folder
         authority = Authority.create(folder / "authority")
         edge_keys = authority.issue("edge", Host(role="edge"), (FAR_ADDRESS,))
         robot_keys = authority.issue("r1", Host(role="robot", robot="r1"))
         self.session = folder / "session"
-        replay = {"data": str(data), "loop": loop}
-        if duration_s is not None and not loop:
-            replay["duration_s"] = float(duration_s)
-        queue = {"durable": True, "queue_mb": 2000.0, "retry_s": 3.0, **(keyframes or {})}
+        replay = {"data": str(data)} | ({} if duration_s is None else {"duration_s": float(duration_s)})
+        queue = {"durable": True, "queue_mb": 2000.0, "retry_s": 3.0}  # as deploy/robot.toml
         self._robot = Deployment(
             robot="r1", role="robot", router=RouterConfig(listen=("tcp/127.0.0.1:7447",)),
-            state_dir=folder / "robot", security=SecurityConfig(keys=robot_keys),
+            rate=rate, state_dir=folder / "robot", security=SecurityConfig(keys=robot_keys),
             nodes={
                 "replay": replay, "localization": {"kind": "lidar"}, "depth": {"source": "stixel"}, "fusion": {},
                 "keyframes": queue, "uplink": {"edge": f"tls/{FAR_ADDRESS}:{PORT}"},

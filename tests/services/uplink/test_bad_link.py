@@ -68,14 +68,12 @@ def print_recovery(pair, cut_ns, mended_ns):
 def check_complete(pair):
     """Every keyframe that the robot made is on the edge's disk and in its map, or was refused and said."""
     made = set(pair.near.log.first("keyframes/frame", "sent_ns"))
-    acks = {line["stamp_ns"]: line["status"] for line in pair.far.log.of("keyframes/ack")}
-    refused = {i for i, status in acks.items() if status != "ok"}
+    refused = {line["stamp_ns"] for line in pair.far.log.of("keyframes/ack") if line["status"] != "ok"}
     say("keyframes made, refused", f"{len(made)}, {len(refused)}")
     assert len(made) > 20
-    assert made == set(acks)
+    assert set(pair.durable()) == made - refused
     assert set(pair.far.log.of("mapping/poses")[-1]["ids"]) == made - refused
     assert not pair.queued
-    return made
 
 
 def print_states(states):
@@ -102,4 +100,22 @@ def test_a_bad_link_does_not_reach_the_robot_and_loses_no_keyframe(tmp_path, dri
         if cut_s:
             print_recovery(pair, cut_ns, mended_ns)
         print_states(states)
+    check_complete(pair)
+
+
+@pytest.mark.soak
+def test_an_edge_that_is_killed_goes_on_from_its_session(tmp_path, drive):
+    with Radio(**BAD) as radio, BadLinkPair(radio, tmp_path, drive(1), duration_s=LAP_S) as pair:
+        begin_ns = time.monotonic_ns()
+        pair.wait(lambda near, far: len(pair.durable()) >= 15, 180)
+        for name in ("mapping", "router"):
+            assert pair.far.ask(f"kill {name}")["killed"]
+        killed_ns = time.monotonic_ns()
+        states = pair.drained(300)
+        end_ns = time.monotonic_ns()
+        print()
+        print_onboard(pair.near.log, "before the edge is killed", begin_ns, killed_ns)
+        print_onboard(pair.near.log, "after it", killed_ns, end_ns)
+        print_states(states)
+        assert set(pair.near.state()["restarts"].values()) == {0}
     check_complete(pair)
