@@ -21,6 +21,7 @@ from services.mapping.session.folder import SessionFolder
 from tests.services.uplink.radio import FAR_ADDRESS, ROOT
 
 PORT = 7448
+RATE = float(os.environ.get("BEAMSPLAT_RATE", "1"))  # of the drive: less on a machine that has no time for it
 LIGHT = {"half_steps": 4, "full_steps": 1, "tick_steps": 0}  # a slow machine for a GPU's work
 
 
@@ -84,7 +85,7 @@ class HostProcess:
 class BadLinkPair:
     """`near` drives, `far` maps into `session`; use with `with`."""
 
-    def __init__(self, radio, folder, data, *, duration_s=None, mapping=LIGHT, rate=1.0):
+    def __init__(self, radio, folder, data, *, duration_s=None, mapping=LIGHT, rate=RATE):
         self._radio, self._folder = radio, folder
         authority = Authority.create(folder / "authority")
         edge_keys = authority.issue("edge", Host(role="edge"), (FAR_ADDRESS,))

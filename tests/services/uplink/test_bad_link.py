@@ -8,7 +8,7 @@ import time
 
 import pytest
 
-from tests.services.uplink.pair import BadLinkPair, onboard, quantiles, transit
+from tests.services.uplink.pair import RATE, BadLinkPair, onboard, quantiles, transit
 from tests.services.uplink.radio import Radio
 
 BAD = {"rate_mbit": 20, "delay_ms": 20.0, "loss": 0.01, "seed": 7}
@@ -85,7 +85,7 @@ def print_states(states):
 @pytest.mark.soak
 @pytest.mark.parametrize("cut_s", [0, 60, 600])
 def test_a_bad_link_does_not_reach_the_robot_and_loses_no_keyframe(tmp_path, drive, cut_s):
-    seconds = SETTLED_S + cut_s + 40.0
+    seconds = RATE * (SETTLED_S + cut_s + 40.0)
     data = drive(math.ceil(seconds / LAP_S))
     with Radio(**BAD) as radio, BadLinkPair(radio, tmp_path, data, duration_s=seconds) as pair:
         begin_ns, cut_ns, mended_ns = run_with_cut(pair, radio, cut_s)

@@ -7,7 +7,7 @@ import time
 
 import pytest
 
-from tests.services.uplink.pair import BadLinkPair
+from tests.services.uplink.pair import RATE, BadLinkPair
 from tests.services.uplink.radio import Radio
 from tests.services.uplink.test_bad_link import BAD, LAP_S, print_states, say
 
@@ -17,7 +17,6 @@ VICTIMS = [
 ]  # fmt: skip
 KILLS = int(os.environ.get("BEAMSPLAT_KILLS", "100"))
 MINUTES = float(os.environ.get("BEAMSPLAT_KILL_MINUTES", "10"))
-RATE = float(os.environ.get("BEAMSPLAT_RATE", "1"))  # of the drive: less on a machine that has no time for it
 SEED = int(os.environ.get("BEAMSPLAT_KILL_SEED", "0"))
 
 
@@ -60,7 +59,7 @@ def test_any_process_may_be_killed_at_any_time(tmp_path, drive):
     """A killed localization begins a new map: what waits of the one before stays on the robot, counted."""
     seconds = RATE * (60.0 * MINUTES + 30.0)
     laps = drive(math.ceil(seconds / LAP_S))
-    with Radio(**BAD) as radio, BadLinkPair(radio, tmp_path, laps, duration_s=seconds, rate=RATE) as pair:
+    with Radio(**BAD) as radio, BadLinkPair(radio, tmp_path, laps, duration_s=seconds) as pair:
         pair.wait(lambda near, far: len(pair.far.log.of("keyframes/frame")) >= 2, 120)
         done = kill_at_random(pair, KILLS, MINUTES, SEED)
         print(*done, sep="\n")
