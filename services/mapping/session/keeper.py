@@ -136,10 +136,14 @@ class Keeper:
         """
         return with_blocks(self.folder.blocks, arrays | self.shelf.arrays())
 
-    def due(self, stamp_ns: int) -> bool:
-        """Whether it is time for a checkpoint. A clock that leaps back counts too."""
+    def count_from(self, stamp_ns: int) -> None:
+        """The first keyframe that no checkpoint holds is from then."""
         if self._since_ns is None:
             self._since_ns = stamp_ns
+
+    def due(self, stamp_ns: int) -> bool:
+        """Whether it is time for a checkpoint. A clock that leaps back counts too."""
+        self.count_from(stamp_ns)
         return not self._running and abs(stamp_ns - self._since_ns) >= self._period_ns
 
     def checkpoint(self, mapper: Mapper, extra: Arrays, stamp_ns: int) -> Callable[[], Saved]:

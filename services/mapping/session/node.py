@@ -100,7 +100,9 @@ class SessionNode(Node):
             body = keeper.body(id)
             if body is None:
                 continue
-            outcome = self._take(decode(*body))
+            message = decode(*body)
+            keeper.count_from(message.stamp_ns)  # killed again and again, it still comes to a checkpoint
+            outcome = self._take(message)
             if outcome.ok:
                 self._mapper.optimise()
             else:

@@ -75,6 +75,17 @@ def test_a_keyframe_that_the_disk_does_not_take_waits_for_its_turn(tmp_path):
     keeper.close()
 
 
+def test_a_mapper_that_is_killed_before_every_checkpoint_still_comes_to_one(tmp_path):
+    folder = SessionFolder(tmp_path / "s")
+    for number in range(4):
+        node = make_node(tmp_path / "s", session_every_s=2.5)
+        assert folder.manifest() is None
+        arrive(node, message(number))
+        handle(node, "keyframes/frame", message(number))
+        node.close()
+    assert folder.manifest()["keyframes"] == 4
+
+
 def test_answers_do_not_wait_for_a_slow_mapper(tmp_path):
     """Three seconds a keyframe, one every quarter of a second: all are answered before the second is mapped."""
     heard = []
