@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from services.mapping.session.paging import PROCESS_MB
-from tests.services.mapping.home_drive import home
+from tests.services.mapping.home_drive import home, psnr_db
 from tests.services.mapping.long_drive import lap_of, samples
 
 PERIOD_S = 0.6  # 100 keyframes a minute
@@ -37,3 +37,27 @@ def test_four_hours_at_a_hundred_keyframes_a_minute(tmp_path):
     assert np.ptp(pss_mb[1:]) < 15.0
     assert ms[1:].max() < 1.3 * ms[1:].min()
     assert np.ptp(disk_mb[1:]) < 0.1 * disk_mb.max()
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("budget_mb", [1000.0, 260.0], ids=["1GB", "tight"])
+def test_ten_laps_under_a_budget(tmp_path, budget_mb):
+    """The process stays within its budget lap after lap, and the rooms of the first lap look as good after the last:
+    where everything fits, and where most keyframes and Gaussians lie on the disk."""
+    seen, a_lap = home(320, 60), 60
+    views = list(range(5, a_lap, 9))
+    options = {"memory_mb": budget_mb, "session_every_s": 30.0, "half_steps": 12, "full_steps": 3}
+    laps = samples(lap_of(seen, 10), tmp_path / "s", options, 10 * a_lap, a_lap, PERIOD_S, views, seen.camera)
+    print(f"\nbefore the first keyframe {next(laps):.0f} MB, budget {budget_mb:.0f} MB")
+    truth = [seen.rgb(view).transpose(2, 0, 1) / 255.0 for view in views]
+    pss_mb, dB = [], []
+    for lap, sample in enumerate(laps, start=1):
+        pss_mb.append(sample.pss_mb)
+        dB.append([psnr_db(image.astype(np.float64), true) for image, true in zip(sample.renders, truth)])
+        print(f"lap {lap}: PSS {sample.pss_mb:.0f} MB (accounted {sample.accounted_mb:.0f}), {sample.ms_a_keyframe:.0f} "
+              f"ms a keyframe, first rooms {np.mean(dB[-1]):.2f} dB (worst {min(dB[-1]):.2f}); {sample.detail}",
+              flush=True)  # fmt: skip
+    assert max(pss_mb) <= budget_mb
+    assert max(pss_mb[5:]) < max(pss_mb[:5]) + 0.1 * budget_mb
+    assert np.mean(dB[-1]) > np.mean(dB[0])
+    assert min(np.array(dB[-1]) - np.array(dB[0])) > -1.0
