@@ -118,9 +118,12 @@ class Correction(Message):
 class Anchors(Message):
     """`T_map_anchor` of all anchors (lidar submaps) after an optimisation."""
 
+    version = "1.1"
+
     anchor_ids: Annotated[np.ndarray, Array("int64", "N")]
     T_map_anchor: Transforms
     optimisation: Count = 0
+    map_uuid: Text = ""  # since 1.1: of the map that they belong to; "" = its maker gives none
 
 
 class MovingBeams(Message):

@@ -116,6 +116,7 @@ class MappingNode(SessionNode):
         """The pose graph has moved: Gaussians move along at once, some steps mend the seams."""
         places = {int(a): T for a, T in zip(anchors.anchor_ids, anchors.T_map_anchor)}
         self._tie_origin(places)
+        self._note_map(anchors.map_uuid)
         if self._mapper.move_anchors(places) and self._mapper.keyframes:
             if self._keeper is not None:
                 self._keeper.moved(self._mapper)

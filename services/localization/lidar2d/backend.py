@@ -16,6 +16,7 @@ class BackEnd:
 
     def __init__(self, settings: LidarSlamSettings) -> None:
         self.settings = settings
+        self.uuid = ""  # of the map, from its first scan on; whatever goes on in it keeps it
         self.nodes: dict[int, Keynode] = {}
         self.submaps: dict[int, Submap] = {}
         self.constraints: list[Constraint] = []

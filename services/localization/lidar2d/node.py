@@ -127,6 +127,7 @@ class LidarLocalization(Node):
             Anchors(
                 stamp_ns=self._stamp_ns, anchor_ids=np.array(list(anchors), dtype=np.int64),
                 T_map_anchor=T_map_anchor, optimisation=self._optimisations,
+                map_uuid=self._slam.back.uuid,
             ),
         )  # fmt: skip
 

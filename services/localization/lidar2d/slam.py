@@ -24,7 +24,7 @@ from services.localization.lidar2d.relocalization import (
 )
 from services.localization.lidar2d.scan import PreparedScan
 from services.localization.lidar2d.settings import LidarSlamSettings
-from services.localization.lidar2d.state import load_state, save_state
+from services.localization.lidar2d.state import load_state, map_uuid, save_state
 from services.localization.lidar2d.validate import StampGuard, reason_to_reject
 
 NS = 1e-9
@@ -130,6 +130,7 @@ class LidarSlam:
         if len(scan) < self.settings.min_points:
             return self._rejected(raw, f"{len(scan)} returns, {self.settings.min_points} are needed")
         self.front.accept(raw.stamp_ns, np.zeros(3), [])
+        self.back.uuid = self.back.uuid or map_uuid(raw.stamp_ns, raw.ranges_m)
         return self._map(
             raw, scan, np.zeros(3), Match(np.zeros(3), np.diag([1e6, 1e6, 1e8]), 1.0, 1.0, 0.0), True
         )

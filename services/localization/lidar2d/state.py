@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
+import uuid
 import zipfile
 import zlib
 from pathlib import Path
@@ -26,6 +27,12 @@ class MapStateError(ValueError):
     """A saved map that cannot be read; the text names the file and what to do."""
 
 
+def map_uuid(stamp_ns: int, ranges_m: np.ndarray) -> str:
+    """The name of a map that begins with this scan: the same scans give the same map, its name included."""
+    first = f"{FORMAT} {stamp_ns} {np.asarray(ranges_m, np.float32).tobytes().hex()}"
+    return str(uuid.uuid5(uuid.NAMESPACE_OID, first))
+
+
 def save_state(folder: Path, back: BackEnd, extra: dict[str, np.ndarray]) -> None:
     """Write the map; the manifest is replaced last, so a crash leaves the previous map whole."""
     folder = Path(folder)
@@ -41,6 +48,7 @@ def save_state(folder: Path, back: BackEnd, extra: dict[str, np.ndarray]) -> Non
     manifest = {
         "format": FORMAT,
         "version": VERSION,
+        "uuid": back.uuid,
         "arrays": name,
         "bytes": (folder / name).stat().st_size,
         "crc32": zlib.crc32((folder / name).read_bytes()),
@@ -84,6 +92,7 @@ def load_state(folder: Path, settings: LidarSlamSettings) -> tuple[BackEnd, dict
         with np.load(arrays_path, allow_pickle=False) as stored:
             arrays = {key: stored[key] for key in stored.files}
         back = _unpack(arrays, settings)
+        back.uuid = str(manifest.get("uuid", ""))  # none in states from before it
     except (KeyError, ValueError, zipfile.BadZipFile) as error:
         raise MapStateError(f"{arrays_path}: not a complete map of version {VERSION} ({error})") from error
     return back, {key: value for key, value in arrays.items() if key.startswith("extra_")}

@@ -33,7 +33,9 @@ def info(session: SessionArgument, as_json: JsonOption = False) -> None:
     if manifest is not None:
         edge = {k: manifest[k] for k in ("keyframes", "gaussians", "anchors", "steps", "stamp_ns", "bytes")}
         edge["keyframes_on_disk"] = len(folder.body_ids())
-        edge["keyframes_newer"] = _newer(folder, folder.read_state())
+        state = folder.read_state()
+        edge["keyframes_newer"] = _newer(folder, state)
+        edge["map_uuid"] = _map_uuid(state)
     robot = _robot_summary(folder.robot) if (folder.robot / ROBOT_MANIFEST).is_file() else None
     table = {"uuid": head["uuid"], "version": head["version"], "edge": edge, "robot": robot}
     if as_json:
@@ -46,18 +48,25 @@ def info(session: SessionArgument, as_json: JsonOption = False) -> None:
         print(
             f"edge half: {edge['keyframes']} keyframes, {edge['gaussians']} Gaussians on {edge['anchors']} "
             f"anchors, {edge['steps']} steps, {edge['bytes'] / 1e6:.1f} MB; {edge['keyframes_on_disk']} "
-            f"keyframes on disk, {edge['keyframes_newer']} of them newer than the checkpoint"
+            f"keyframes on disk, {edge['keyframes_newer']} of them newer than the checkpoint; on the robot's "
+            f"map {edge['map_uuid'] or 'without a UUID'}"
         )
     if robot is None:
         print("robot half: none (`beamsplat session join` puts one in)")
     else:
         print(f"robot half: {robot['submaps']} submaps, {robot['keynodes']} keynodes, "
-              f"{robot['constraints']} constraints")  # fmt: skip
+              f"{robot['constraints']} constraints, map {robot['uuid'] or 'without a UUID'}")  # fmt: skip
 
 
-def _robot_summary(path: Path) -> dict[str, int]:
+def _map_uuid(arrays: dict[str, Any]) -> str:
+    """Of the robot's map that a session hangs on; "" where nobody said."""
+    return str(next(iter(arrays.get("extra_map_uuid", [])), ""))
+
+
+def _robot_summary(path: Path) -> dict[str, Any]:
     table = json.loads((path / ROBOT_MANIFEST).read_text())
-    return {key: int(table[key]) for key in ("submaps", "keynodes", "constraints")}
+    counts = {key: int(table[key]) for key in ("submaps", "keynodes", "constraints")}
+    return counts | {"uuid": str(table.get("uuid", ""))}
 
 
 @app.command()
@@ -241,8 +250,16 @@ def load_slam(path: Path) -> Any:
 
 
 def _same_drive(session: Path, robot: Path, arrays: dict[str, Any], slam: Any) -> None:
-    """Raises UserError where the keyframes were not taken while those scans were."""
+    """Raises UserError where the map does not hang on that SLAM's: by their UUIDs, or where a state is from
+    before it had one, because the keyframes were not taken while those scans were."""
     import numpy as np
+
+    mine, its = _map_uuid(arrays), slam.back.uuid
+    if mine and its and mine != its:
+        raise UserError(
+            f"{robot}: is the robot's half of map {its}, but {session} hangs on map {mine}: it is of another "
+            "drive. Give the state that localization.save wrote in the session's own drive, or use `merge`"
+        )
 
     scans_ns = np.array([node.stamp_ns for node in slam.back.nodes.values()])
     stamps_ns = arrays["extra_taken_stamp_ns"]

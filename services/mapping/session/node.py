@@ -34,6 +34,7 @@ class SessionNode(Node):
     _taken: dict[int, tuple[int, np.ndarray]]  # keyframe -> stamp_ns, T_camera_body
     _refusals: dict[int, str]
     _T_oldest_origin: np.ndarray | None
+    _map_uuid: str = ""  # of the robot's map that this one hangs on
 
     def _take(self, message: Keyframe) -> Outcome:
         raise NotImplementedError
@@ -96,6 +97,7 @@ class SessionNode(Node):
             rows = zip(extra["taken_stamp_ns"].tolist(), extra["taken_T_camera_body"])
             self._taken = dict(zip(extra["taken_id"].tolist(), rows))
             self._T_oldest_origin = next(iter(extra["T_oldest_origin"]), None)
+            self._map_uuid = str(next(iter(extra.get("map_uuid", [])), ""))
         for id in newer:
             body = keeper.body(id)
             if body is None:
@@ -120,6 +122,7 @@ class SessionNode(Node):
             "taken_stamp_ns": np.array([self._taken[id][0] for id in ids], np.int64),
             "taken_T_camera_body": np.array([self._taken[id][1] for id in ids]).reshape(-1, 4, 4),
             "T_oldest_origin": np.array(origin).reshape(-1, 4, 4),
+            "map_uuid": np.array([self._map_uuid]),
         }
 
     def _add(self, frame: MapKeyframe, message: Keyframe) -> Outcome:
@@ -132,6 +135,16 @@ class SessionNode(Node):
             if len(self._taken) > len(m.keyframes) + len(m.resting):
                 self._taken = {id: taken for id, taken in self._taken.items() if m.holds(id)}
         return outcome
+
+    def _note_map(self, uuid: str) -> None:
+        """Remembers whose anchors these are; a robot that starts a map of its own is told of."""
+        if uuid and self._map_uuid and uuid != self._map_uuid:
+            log.warning(
+                "the anchors come from another map (%s) than those so far (%s): the parts will not fit. "
+                "Start localization with localization.resume, or the mapper with a session of its own",
+                uuid, self._map_uuid,
+            )  # fmt: skip
+        self._map_uuid = uuid or self._map_uuid
 
     def _page(self) -> None:
         """The memory's budget is kept."""
