@@ -19,6 +19,8 @@ from common.strict import Config
 from common.topics import HEALTH, TOPICS
 
 ROOT = "beamsplat"
+MASTERS = ("supervisor", "operator")  # users of a host's router who are no node
+ASKS_ANYTHING = ("page",)  # nodes that pass commands on, of who has their token
 READ_ONLY_QUERIES = ("snapshot", "state", "params")
 _DECLARE = ["declare_subscriber", "declare_queryable", "liveliness_token", "liveliness_query",
             "declare_liveliness_subscriber"]  # fmt: skip
@@ -65,6 +67,44 @@ def access_control(hosts: dict[str, Host]) -> dict[str, Any]:
         policies.append({"rules": [rule["id"] for rule in own], "subjects": [name]})
     return {"enabled": True, "default_permission": "deny", "rules": rules, "subjects": subjects,
             "policies": policies}  # fmt: skip
+
+
+def local_access_control(users: tuple[str, ...]) -> dict[str, Any]:
+    """Zenoh's `access_control` for a router whose clients log in: a node writes what it produces by the topic
+    table, and reads all; those of ours that are no node (supervisor, operator) may do anything."""
+    rules, subjects, policies = [], [], []
+    for name in users:
+        own = [_rule(name, ["ingress", "egress"], _ANY, ["**", "**/@adv/**", "@/**", "@adv/**"])]
+        if name not in MASTERS:
+            own = _node_rules(name)
+        rules += own
+        subjects.append({"id": name, "usernames": [name]})
+        policies.append({"rules": [rule["id"] for rule in own], "subjects": [name]})
+    return {"enabled": True, "default_permission": "deny", "rules": rules, "subjects": subjects,
+            "policies": policies}  # fmt: skip
+
+
+def _node_rules(name: str) -> list[dict[str, Any]]:
+    # The uplink speaks for the other side: what comes down, and the health of who is there.
+    relays = name == "uplink"
+    mine = [t for t, row in TOPICS.items() if (row.uplink == "down" if relays else name in row.producers)]
+    data = [f"{ROOT}/*/{prefix}{topic}" for topic in mine for prefix in ("", "end/")]
+    adv = [f"{key}/@adv/**" for key in data]
+    answers = [f"{ROOT}/*/query/{name}/*", f"{ROOT}/*/control/*/*"]
+    everything = [f"{ROOT}/**", f"{ROOT}/**/@adv/**"]
+    asked = ("*",) if name in ASKS_ANYTHING else READ_ONLY_QUERIES
+    queries = [f"{ROOT}/*/query/*/{query}" for query in asked]
+    health = f"{ROOT}/*/{HEALTH}/{'*' if relays else name}"
+    return [
+        _rule(f"{name} writes", ["ingress"], ["put", "delete", "reply"], [*data, *adv, *answers, health]),
+        _rule(f"{name} keeps", ["ingress"], ["declare_queryable", "liveliness_token"],
+              [*adv, *answers, f"{ROOT}/*/alive/{name}/*"]),
+        _rule(f"{name} reads", ["ingress"],
+              ["declare_subscriber", "liveliness_query", "declare_liveliness_subscriber"], everything),
+        _rule(f"{name} asks", ["ingress"], ["query"], [*queries, everything[1]]),
+        _rule(f"{name} hears", ["egress"], ["put", "delete", "reply", *_DECLARE], everything),
+        _rule(f"{name} is asked", ["egress"], ["query"], [*adv, *answers]),
+    ]  # fmt: skip
 
 
 def _rule(id: str, flows: list[str], messages: list[str], keys: list[str]) -> dict[str, Any]:

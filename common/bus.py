@@ -26,6 +26,7 @@ import zenoh
 import zenoh.ext
 
 from common.access import access_control, read_hosts
+from common.credentials import Login, guard
 from common.errors import UserError
 from common.header import DecodeError, Header, local_clock_id
 from common.mailbox import Letter
@@ -107,14 +108,16 @@ def router_config(
         keys.identify(config)
         config.insert_json5("transport/link/rx/max_message_size", str(LIMIT_KB * 1000))
         config.insert_json5("access_control", json.dumps(access_control(read_hosts(keys.folder))))
+    guard(config, security, (*listen, *connect))
     config.insert_json5("adminspace/enabled", "true")
     config.insert_json5("adminspace/permissions", "{read: true, write: false}")
     return config
 
 
 def open_session(
-    endpoints: tuple[str, ...], wait_s: float = 15.0, gave_up: Callable[[], bool] = lambda: False
-) -> zenoh.Session:
+    endpoints: tuple[str, ...], wait_s: float = 15.0, gave_up: Callable[[], bool] = lambda: False,
+    login: Login | None = None,
+) -> zenoh.Session:  # fmt: skip
     """A client session of the router at one of `endpoints`, waiting `wait_s` for it to appear.
 
     Raises:
@@ -123,6 +126,8 @@ def open_session(
     zenoh.init_log_from_env_or("error")
     config = _base_config("client")
     _set_endpoints(config, "connect", endpoints)
+    if login is not None:
+        login.identify(config)
     config.insert_json5("connect/timeout_ms", "1000")
     config.insert_json5("connect/exit_on_failure", "true")
     deadline = time.monotonic() + wait_s

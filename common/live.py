@@ -22,6 +22,7 @@ import zenoh
 from common.bus import Bus, open_session
 from common.complaints import Complaints
 from common.control import Control
+from common.credentials import login_of
 from common.errors import UserError
 from common.header import local_clock_id
 from common.jobs import Abandoned, JobQueue, Worker
@@ -73,7 +74,8 @@ class Live:
         if not self.settings.resume:  # an earlier run's: a crash before the first message must not lead there
             self._bookmark.clear()
         try:
-            session = open_session(self.settings.endpoints, gave_up=lambda: self._stopping)
+            login = login_of(self.settings.security, self.node.name)
+            session = open_session(self.settings.endpoints, gave_up=lambda: self._stopping, login=login)
         except UserError:
             if self._stopping:
                 return

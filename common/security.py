@@ -23,10 +23,12 @@ CA, CERTIFICATE, KEY, HOSTS = "ca.pem", "host.pem", "host.key", "hosts.toml"
 
 
 class SecurityConfig(Config):
-    """`keys` is the host's folder of keys; `plain` allows links off this host without, for laboratories."""
+    """`keys` is the host's folder of keys; `plain` allows links off this host without, for laboratories.
+    `local` is a folder for logins of this host's own processes (common/credentials.py)."""
 
     keys: Path | None = None
     plain: bool = False
+    local: Path | None = None
 
 
 OPEN = SecurityConfig()

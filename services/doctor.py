@@ -99,6 +99,7 @@ def _gpu() -> Iterator[Finding]:
 
 def _router(deployment: Deployment) -> Iterator[Finding]:
     from common.bus import open_session
+    from common.credentials import OPERATOR, login_of
     from common.errors import UserError
     from common.security import is_loopback
 
@@ -107,7 +108,8 @@ def _router(deployment: Deployment) -> Iterator[Finding]:
         if running:  # whose other doors are open, too
             continue
         try:
-            open_session((endpoint,), wait_s=0.0).close()
+            login = login_of(deployment.security, OPERATOR)
+            open_session((endpoint,), wait_s=0.0, login=login).close()
         except UserError:
             pass
         else:

@@ -16,6 +16,7 @@ from pathlib import Path
 
 from common.bus import open_session
 from common.config import Deployment, with_overrides
+from common.credentials import OPERATOR, SUPERVISOR, login_of, make_logins
 from common.errors import UserError
 from common.persist import make_folder
 from common.registry import Service
@@ -95,6 +96,8 @@ class Supervisor:
     def _start_all(self) -> None:
         """The router, then who listens, then who speaks."""
         if ROUTER in self._names:
+            if (folder := self.deployment.security.local) is not None:
+                make_logins(folder, (*self.table, SUPERVISOR, OPERATOR))
             if self._router_answers():
                 raise UserError(
                     f"a router already runs at {', '.join(self.deployment.router.listen)}: stop it, name the "
@@ -110,7 +113,8 @@ class Supervisor:
 
     def _router_answers(self) -> bool:
         with contextlib.suppress(UserError):
-            open_session(self.deployment.router.listen, wait_s=0.0).close()
+            login = login_of(self.deployment.security, SUPERVISOR)
+            open_session(self.deployment.router.listen, wait_s=0.0, login=login).close()
             return True
         return False
 

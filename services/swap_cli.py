@@ -32,6 +32,7 @@ def _ask(
     file: Path, node: str, verb: str, parameters: dict[str, str], overrides: list[str] | None = None
 ) -> str:
     from common.bus import open_session
+    from common.credentials import OPERATOR, login_of
     from common.queries import ask
 
     deployment = load_deployment(file, tuple(overrides or ()))
@@ -39,7 +40,8 @@ def _ask(
         near = get_close_matches(node, deployment.nodes, 1)
         meant = f"did you mean {near[0]!r}?" if near else f"it has {', '.join(deployment.nodes)}"
         raise UserError(f"{file} has no node {node!r}; {meant}")
-    with open_session(deployment.router.listen, wait_s=2.0) as session:
+    login = login_of(deployment.security, OPERATOR)
+    with open_session(deployment.router.listen, 2.0, login=login) as session:
         (answer,) = ask(session, deployment.robot, node, verb, parameters, _PATIENCE_S)
     return answer.text
 

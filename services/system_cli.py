@@ -117,6 +117,7 @@ def run_checked(
             raise UserError(f"the deployment has no node {name!r}; there are {there}")
     _checked(deployment, names)
     from common.bus import open_session
+    from common.credentials import SUPERVISOR, login_of
     from services.board import HealthBoard
     from services.commands import Commands
     from services.supervisor import Supervisor
@@ -133,7 +134,8 @@ def run_checked(
 
     with Supervisor(deployment, names, on_event=on_event) as supervisor:
         _say(f"robot {deployment.robot}: logs in {supervisor.log_dir}")
-        with open_session(deployment.router.listen) as session:
+        login = login_of(deployment.security, SUPERVISOR)
+        with open_session(deployment.router.listen, login=login) as session:
             board = HealthBoard(session, deployment.robot)
             onlooker = beside(supervisor) if beside is not None else None
             commands = Commands(session, deployment.robot, supervisor)
@@ -249,10 +251,12 @@ def _watch(
     file: Path, overrides: list[str] | None, table: str, seconds: float | None, every_robot: bool = False
 ) -> None:
     from common.bus import open_session
+    from common.credentials import OPERATOR, login_of
     from services.board import ALL, HealthBoard
 
     deployment = _load(file, overrides)
-    with open_session(deployment.router.listen, wait_s=2.0) as session:
+    login = login_of(deployment.security, OPERATOR)
+    with open_session(deployment.router.listen, 2.0, login=login) as session:
         board = HealthBoard(session, ALL if every_robot else deployment.robot)
         draw = getattr(board, table)
         deadline = time.monotonic() + (seconds if seconds is not None else 1e12)

@@ -16,6 +16,7 @@ from pydantic import Field
 
 from common.bus import BULK_BUFFER_BYTES, URGENT_BUFFER_BYTES, open_link, open_session
 from common.config import NodeConfig
+from common.credentials import login_of
 from common.errors import UserError
 from common.node import Node, Sourced
 from common.relay import Relay, Sides
@@ -81,7 +82,8 @@ class UplinkNode(Node):
         try:
             for buffer_bytes in (URGENT_BUFFER_BYTES, BULK_BUFFER_BYTES):
                 opened.append(self._link(buffer_bytes))
-            opened.append(open_session(self.home.endpoints, _ATTEMPT_S))
+            login = login_of(self.home.security, self.name)
+            opened.append(open_session(self.home.endpoints, _ATTEMPT_S, login=login))
         except UserError:
             for session in opened:
                 session.close()

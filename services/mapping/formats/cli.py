@@ -111,11 +111,13 @@ def _open(session: Path) -> tuple[dict[str, Any], Callable[[], Any]]:
 def _asked(file: Path) -> tuple[dict[str, Any], Callable[[], Any]]:
     from common.bus import open_session
     from common.config import load_deployment
+    from common.credentials import OPERATOR, login_of
     from common.queries import ask
     from services.mapping.messages import joined_state
 
     deployment = load_deployment(file)
-    with open_session(deployment.router.listen, wait_s=2.0) as session:
+    login = login_of(deployment.security, OPERATOR)
+    with open_session(deployment.router.listen, 2.0, login=login) as session:
         arrays = joined_state(list(ask(session, deployment.robot, "mapping", "state", {}, _PATIENCE_S)))
         grid = _latched_grid(session, deployment.robot)
     return arrays, lambda: grid
