@@ -16,6 +16,7 @@ from rich.console import Console
 from common.config import load_deployment
 from common.errors import UserError
 from common.persist import write_atomically
+from services.memory import MemoryOption, memory_overrides
 
 if TYPE_CHECKING:
     from services.bench.paper_live import Costs, Seen
@@ -46,6 +47,7 @@ def demo(
     set_: Annotated[
         list[str] | None, typer.Option("--set", metavar="NODE.OPTION=VALUE", help="Override an option")
     ] = None,
+    memory: MemoryOption = None,
 ) -> None:
     """Simulates a drive through a furnished home, runs the system on it live, watches and records it.
 
@@ -72,6 +74,7 @@ def demo(
         f"mapping.save={json.dumps(str(out / 'map'))}",
         f"mapping.session={json.dumps(str(out / 'session'))}",
         f"rate={rate}",
+        *memory_overrides(memory),
         *(set_ or ()),
     )
     deployment = load_deployment(DEPLOYMENT, overrides)

@@ -17,6 +17,7 @@ from rich.live import Live as Screen
 
 from common.config import Deployment, load_deployment
 from common.errors import UserError
+from services.memory import MemoryOption, memory_overrides
 
 if TYPE_CHECKING:
     from services.board import HealthBoard
@@ -74,6 +75,7 @@ def run(
     rate: Annotated[
         float | None, typer.Option(min=0.0, help="Replay at N times real time; 0 = flat out")
     ] = None,
+    memory: MemoryOption = None,
 ) -> None:
     """Runs a deployment: a router and one supervised process per node.
 
@@ -83,9 +85,11 @@ def run(
 
         beamsplat run deploy/demo.toml --set replay.data=drive/bag
 
+        beamsplat run deploy/edge.toml --memory 1GB --set mapping.session=map
+
         beamsplat run deploy/robot.toml router localization
     """
-    deployment = _load(file, set_)
+    deployment = _load(file, [*memory_overrides(memory), *(set_ or ())])
     if rate is not None:
         deployment = deployment.model_copy(update={"rate": rate})
     run_checked(deployment, tuple(nodes) if nodes else None)
