@@ -120,9 +120,12 @@ def merge(
 
         beamsplat session merge hall annex --out both --place 12.4,-3.1,90
     """
+    from rich.progress import track
+
     from common.geometry import se2_to_se3
     from services.mapping.session.edit import merged, with_anchors
     from services.mapping.session.folder import SessionFolder
+    from services.mapping.session.merge import once
 
     (folder_a, a), (folder_b, b) = _open(first), _open(second)
     target = SessionFolder(out)
@@ -148,10 +151,17 @@ def merge(
         for folder in (folder_a, folder_b):
             for id in held.intersection(folder.body_ids()):
                 target.write_body(id, *folder.read_body(id))
+        before = arrays["store_params"].shape[1]
+        arrays = once(
+            target, arrays, offset, lambda views: track(views, "looking", console=console, transient=True)
+        )
         _write(target, arrays)
     finally:
         target.unlock()
-    print(f"{out}: {len(held)} keyframes, {arrays['store_params'].shape[1]} Gaussians")
+    left = arrays["store_params"].shape[1]
+    print(
+        f"{out}: {len(held)} keyframes, {left} Gaussians; {before - left} that both maps had are there once"
+    )
 
 
 @app.command()

@@ -62,13 +62,18 @@ def merged(a: Arrays, b: Arrays, T_a_b: np.ndarray, offset: int) -> Arrays:
     return out | _progress(progress)
 
 
+def with_gaussians(arrays: Arrays, stay: np.ndarray) -> Arrays:
+    """The map with those Gaussians only whose flag in bool [N] is set."""
+    store = store_of(arrays)
+    store.keep(stay)
+    return arrays | _prefixed(store)
+
+
 def pruned(arrays: Arrays, least_opacity: float, keyframes: int | None) -> Arrays:
     """The map without Gaussians fainter than `least_opacity`, and with at most so many keyframes, spread over
     time; what they made stays."""
-    store = store_of(arrays)
-    opacity = 1.0 / (1.0 + np.exp(-store.params[OPACITY, : store.count].astype(np.float64)))
-    store.keep(opacity >= least_opacity)
-    out = arrays | _prefixed(store)
+    opacity = 1.0 / (1.0 + np.exp(-arrays["store_params"][OPACITY].astype(np.float64)))
+    out = with_gaussians(arrays, opacity >= least_opacity)
     ids = arrays["keyframe_id"]
     if keyframes is not None and len(ids) > keyframes:
         in_time = np.argsort(ids, kind="stable")

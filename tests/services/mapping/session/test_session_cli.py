@@ -78,10 +78,13 @@ def test_two_drives_become_one_map_that_goes_on(drives, tmp_path):
     out = run("merge", drives / "a", drives / "b", "--out", tmp_path / "c", "--place", f"{x},{y},{yaw}")
     assert "10 keyframes" in out
     a, b, c = (SessionFolder(p).read_state() for p in (drives / "a", drives / "b", tmp_path / "c"))
-    assert c["store_params"].shape[1] == a["store_params"].shape[1] + b["store_params"].shape[1]
+    both = a["store_params"].shape[1] + b["store_params"].shape[1]
+    left = c["store_params"].shape[1]
+    assert 0.5 * both < left < 0.8 * both
+    assert f"{both - left} that both maps had are there once" in out
     alone = psnr(a, 1), psnr(b, 7, inverse(T_A_B))
-    assert psnr(c, 1) > alone[0] - 5.0  # walls that neither has learnt well stand in each other's way
-    assert psnr(c, 7) > alone[1] - 5.0
+    assert psnr(c, 1) > alone[0] - 1.3  # 3.3 dB less with all of both: walls in front of walls
+    assert psnr(c, 7) > alone[1] - 0.8
     assert len(set(c["anchor_id"].tolist())) == len(a["anchor_id"]) + len(b["anchor_id"])
     node = make_node(tmp_path / "c")
     assert len(node._mapper.keyframes) == 10
