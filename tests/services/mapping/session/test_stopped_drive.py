@@ -81,7 +81,7 @@ def test_a_stopped_drive_ends_where_an_uninterrupted_one_does(shared_dir, tmp_pa
     print(f"\nuninterrupted {dB[0]:.2f} dB, ATE {1e3 * ate_whole:.1f} mm, {len(whole[0])} keyframes; stopped and relocalized "
           f"after {found_after} scans {dB[1]:.2f} dB, ATE {1e3 * ate_rest:.1f} mm, {len(rest[0])} keyframes; "
           f"{len(views)} views ({len(psnr_whole)}, {len(psnr_rest)})")  # fmt: skip
-    assert statuses[0] == "relocalizing"
+    assert "relocalizing" in statuses[:found_after]
     assert len(views) >= 10
     assert len(psnr_rest) >= len(psnr_whole) - 1
     assert abs(dB[1] - dB[0]) < 0.3 or dB[1] > dB[0]

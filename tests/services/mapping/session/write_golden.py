@@ -4,7 +4,8 @@ import json
 
 import cv2
 
-from services.mapping.session.folder import VERSION
+from services.mapping.session.folder import EDGE_VERSION, VERSION
+from services.mapping.session.shelf import groups_of
 from tests.services.mapping.session.maps import make_node, message
 from tests.services.mapping.session.test_session import GOLDEN
 
@@ -25,16 +26,28 @@ def small(number):
     return whole.model_copy(update={**fields, "camera": camera, "beams": whole.beams[:0]})
 
 
+def write(version, paged):
+    """Two keyframes; `paged`: all Gaussians that fit into a cube lie on the disk."""
+    folder = GOLDEN / f"session-{version}"
+    if folder.exists():
+        return
+    node = make_node(folder, memory_mb=1000.0 if paged else None)
+    for number in range(2):
+        list(node.handle("keyframes/frame", small(number)))
+    mapper = node._mapper
+    first, count = mapper.store.params[:, 0].tolist(), mapper.store.count
+    if paged:
+        node._keeper.shelf.put(
+            mapper.store, groups_of(mapper.store, mapper.T_map_anchor), mapper.T_map_anchor
+        )
+    list(node.drain())
+    node.close()
+    (folder / "edge" / "lock").unlink()
+    facts = {"keyframes": 2, "gaussians": count, "first_gaussian": first}
+    (GOLDEN / f"session-{version}.json").write_text(json.dumps(facts, indent=1) + "\n")
+    print(folder)
+
+
 if __name__ == "__main__":
-    folder = GOLDEN / f"session-{VERSION}"
-    if not folder.exists():
-        node = make_node(folder)
-        for number in range(2):
-            list(node.handle("keyframes/frame", small(number)))
-        list(node.drain())
-        node.close()
-        (folder / "edge" / "lock").unlink()
-        store = node._mapper.store
-        facts = {"keyframes": 2, "gaussians": store.count, "first_gaussian": store.params[:, 0].tolist()}
-        (GOLDEN / f"session-{VERSION}.json").write_text(json.dumps(facts, indent=1) + "\n")
-        print(folder)
+    write(VERSION, False)
+    write(EDGE_VERSION, True)
