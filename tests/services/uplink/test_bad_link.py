@@ -106,6 +106,7 @@ def test_a_bad_link_does_not_reach_the_robot_and_loses_no_keyframe(tmp_path, dri
 @pytest.mark.soak
 def test_an_edge_that_is_killed_goes_on_from_its_session(tmp_path, drive):
     with Radio(**BAD) as radio, BadLinkPair(radio, tmp_path, drive(1), duration_s=LAP_S) as pair:
+        pair.wait(lambda near, far: len(pair.durable()) >= 5, 180)  # everything has started
         begin_ns = time.monotonic_ns()
         pair.wait(lambda near, far: len(pair.durable()) >= 15, 180)
         for name in ("mapping", "router"):
