@@ -47,16 +47,35 @@ class Control:
             return live.takeover.retire()
         if not live.takeover.retired:
             live.finish_jobs()
-            live.node.hand_over()
+            live.takeover.retired = True  # what arrives from here on is the successor's
+            try:
+                live.node.hand_over()
+            except ValueError:
+                live.takeover.retired = False
+                raise
         with live.changed:
             return live.takeover.retire(live.mailbox.handled())
+
+    def _greet_waiting(self) -> None:
+        """Letters that came in standby arrive now, for the node, and before those that come from now on."""
+        live, greeted = self._live, set()
+        while not live.greets:
+            with live.changed:
+                news = [w for w in live.mailbox.waiting() if id(w) not in greeted]
+                live.greets = not news
+            for letter in news:
+                greeted.add(id(letter))
+                if not live.takeover.was_handled(letter):
+                    live.emit(live.node.handle_arrival(letter.topic, letter.message))
 
     def _activate(self, after: str) -> str:
         live = self._live
         if live.node.hands_over:
             live.node.take_over()
+        live.greets = not live.node.hands_over  # who came first is greeted first
         held = list(live.takeover.activate(after))
         self._bus.epoch = claim_epoch(live.settings.run_dir, live.node.name)
+        self._greet_waiting()
         live.emit(iter(held))
         live.show(self._bus)
         live.state = "active"

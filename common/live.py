@@ -53,6 +53,7 @@ class Live:
         self.settings = node.home = settings
         self.instance = settings.instance or secrets.token_hex(8)
         self.takeover = Takeover(settings.standby)
+        self.greets = True  # letters, when they arrive
         self.mailbox = Mailbox(type(node), time.monotonic_ns)
         self.changed = threading.Condition()
         self._stopping = False
@@ -283,7 +284,7 @@ class Live:
     # --- called from threads of the bus ---
 
     def _on_letter(self, letter: Letter) -> None:
-        if not (self.takeover.standby or self.takeover.retired):
+        if self.greets and not (self.takeover.standby or self.takeover.retired):
             self.emit(self.node.handle_arrival(letter.topic, letter.message))
         with self.changed:
             if self.mailbox.put(letter):

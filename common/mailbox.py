@@ -141,9 +141,13 @@ class Mailbox:
         """The sequence number that `topic` should bring next from `instance`; 0 before the first."""
         return self.counts[topic].expected.get(instance, 0)
 
+    def waiting(self) -> list[Letter]:
+        """What of the `every` inputs waits here, input by input in order of arrival."""
+        return [*self._answers, *self._merger.items()]
+
     def handled(self) -> Handled:
         """What of the `every` inputs has come and does not wait here any more."""
-        queued = [*self._answers, *self._merger.items()]
+        queued = self.waiting()
         return {
             topic: {
                 instance: (

@@ -75,6 +75,9 @@ class MappingNode(SessionNode):
 
     def on_keyframes_frame(self, message: Keyframe) -> Outputs:
         """Insertion and the fixed steps; then how well the picture is explained, and what has changed."""
+        if message.id in self._resumed:
+            self._resumed -= {message.id}
+            return
         kept = self._arrivals is not None and self._arrivals.begin(message.id)
         known = self._mapper.knows(message.id)
         outcome = Outcome("ok") if known else self._take(message)

@@ -34,6 +34,7 @@ class SessionNode(Node):
     _taken: dict[int, tuple[int, np.ndarray]]  # keyframe -> stamp_ns, T_camera_body
     _refusals: dict[int, str]
     _T_oldest_origin: np.ndarray | None
+    _resumed: frozenset[int] | set[int] = frozenset()  # taken from the disk in a predecessor's place
     _map_uuid: str = ""  # of the robot's map that this one hangs on
 
     def _take(self, message: Keyframe) -> Outcome:
@@ -71,7 +72,7 @@ class SessionNode(Node):
 
     def on_arrival(self, topic: str, message: Message) -> Outputs:
         """A keyframe is acknowledged before its turn comes, if it is to survive this process and does."""
-        if self._arrivals is None or not isinstance(message, Keyframe):
+        if self._arrivals is None or not isinstance(message, Keyframe) or message.id in self._resumed:
             return
         status = self._refusals.get(message.id)
         known = message.id in self._taken or self._mapper.knows(message.id)
@@ -98,6 +99,8 @@ class SessionNode(Node):
             self._taken = dict(zip(extra["taken_id"].tolist(), rows))
             self._T_oldest_origin = next(iter(extra["T_oldest_origin"]), None)
             self._map_uuid = str(next(iter(extra.get("map_uuid", [])), ""))
+        if self.in_standby:  # its predecessor has acknowledged these; they wait here as well
+            self._resumed = set(newer)
         for id in newer:
             body = keeper.body(id)
             if body is None:
