@@ -45,7 +45,8 @@ class Sample:
     """How the process does after so many keyframes."""
 
     keyframes: int
-    pss_mb: float
+    pss_mb: float  # its share of what others map too is larger when those have ended
+    private_mb: float  # its own alone: what grows shows here
     accounted_mb: float  # by the pager
     ms_a_keyframe: float  # of CPU, since the sample before
     gaussians: int
@@ -73,8 +74,9 @@ def drive(lap, folder, options, keyframes, sample_every, period_s, views, camera
             gc.collect()
             store, pager = node._mapper.store, node._keeper._pager
             disk = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
+            memory = process.memory_full_info()
             said.send(Sample(
-                number + 1, process.memory_full_info().pss / 1e6, pager._used(node._mapper) / 1e6,
+                number + 1, memory.pss / 1e6, memory.uss / 1e6, pager._used(node._mapper) / 1e6,
                 1e3 * spent / sample_every, store.count + store.away_count, store.away_count, node.detail, renders,
                 disk / 1e6,
             ))  # fmt: skip
