@@ -12,6 +12,7 @@ from common.beams import NO_BEAMS, Beams, move_beams, scan_points
 from common.geometry import interpolate, transform_points
 
 EXTRAPOLATE_NS = 200_000_000  # a pose is continued this far along the last motion, no further
+_GAP_NS = 2_000_000_000
 BEAMS_WITHIN_NS = 150_000_000  # beams farther from a picture than this are not of its moment
 
 
@@ -62,10 +63,13 @@ class History:
         return self._poses[-1][0] if self._poses else -1
 
     def add_pose(self, stamp_ns: int, T_a_body: np.ndarray) -> None:
-        """Takes a pose; one that is not newer than the last restarts the history (the clock was set)."""
+        """Takes a pose. One that is not newer than the last restarts the history (the clock was set); after a
+        gap of seconds older poses are forgotten: a process may have started anew, with another frame."""
         if stamp_ns <= self.newest_pose_ns:
             self._poses.clear()
             self._scans.clear()
+        if stamp_ns - self.newest_pose_ns > _GAP_NS:
+            self._poses.clear()
         self._poses.append((stamp_ns, T_a_body))
         while stamp_ns - self._poses[0][0] > self._keep_ns:
             self._poses.popleft()

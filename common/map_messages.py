@@ -20,7 +20,7 @@ class Keyframe(Message):
     uint16 millimetres, 0 = unknown (common.depth_code); the mask is a PNG, 0 = on something that moves.
     """
 
-    version = "1.1"
+    version = "1.2"
 
     id: Count
     encoding: Literal["jpeg", "png"]
@@ -41,6 +41,7 @@ class Keyframe(Message):
     )
     why: Text = ""  # it was chosen
     backlog: Count = 0  # keyframes not acknowledged when this one went out; since 1.1
+    map_uuid: Text = ""  # of the map that the anchor belongs to (`Anchors`); since 1.2
 
 
 class KeyframeAck(Message):

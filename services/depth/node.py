@@ -54,9 +54,7 @@ class DepthNode(Node):
             log.error("the calibration has no camera: no depth")
         else:
             camera = rig.camera
-            self._undistort = Undistorter(
-                Pinhole.of(camera)
-            )  # fmt: skip
+            self._undistort = Undistorter(Pinhole.of(camera))
             self._T_body_camera = camera.T_body_camera
             T_body_lidar = rig.lidar.T_body_lidar if rig.lidar is not None else np.eye(4)
             self._history = History(T_body_lidar)

@@ -15,6 +15,7 @@ from common.camera import Pinhole, Undistorter
 from common.config import NodeConfig
 from common.errors import UserError
 from common.geometry import inverse, transform_points
+from common.header import Header
 from common.history import History, TimedScan
 from common.messages import (
     Cloud,
@@ -77,8 +78,24 @@ class FusionNode(Node):
         self._unmarked: deque[TimedScan] = deque()  # scans whose movers are not known yet
         self._marked: deque[TimedScan] = deque()  # scans whose last beam has no pose yet
         self._T_odom_keyframe: np.ndarray | None = None
+        self._rig: Rig | None = None
+        self._localizer = ""  # the process that localizes
         self.calibration: CalibrationHealth | None = None
         self.overtaken = 0
+
+    def on_header(self, header: Header) -> None:
+        """Another process localizes: what is known hangs on an odom frame that is gone."""
+        if header.producer != "localization" or header.instance == self._localizer:
+            return
+        if self._localizer and self._rig is not None:
+            log.info("localization has started anew: so does fusion")
+            checked = self._check is not None and self._check.done
+            self._T_odom_keyframe = None
+            self._marked.clear()
+            self.on_rig(self._rig)
+            if self._check is not None and checked:
+                self._check.done = True
+        self._localizer = header.instance
 
     def on_rig(self, rig: Rig) -> Outputs:
         """Camera and lidar of this robot; both are needed, unless the estimate is taken as given."""
@@ -86,10 +103,8 @@ class FusionNode(Node):
         if rig.camera is None or (rig.lidar is None and method != "given"):
             log.error("the calibration lacks the camera or the lidar: nothing can be fused")
             return iter(())
-        camera = rig.camera
-        self._undistort = Undistorter(
-            Pinhole.of(camera)
-        )  # fmt: skip
+        self._rig, camera = rig, rig.camera
+        self._undistort = Undistorter(Pinhole.of(camera))
         self._T_body_camera = camera.T_body_camera
         self._history = History(np.eye(4) if rig.lidar is None else rig.lidar.T_body_lidar)
         if method != "field":

@@ -88,12 +88,14 @@ class KeyframesNode(Node):
 
     def configure(self) -> None:
         self._history: History | None = None
+        self._rig: Rig | None = None
         self._pictures: deque[Image] = deque(maxlen=_PICTURES)
         self._depths: deque[FusedDepth] = deque(maxlen=_PICTURES)
         self._candidates: deque[tuple[int, _Candidate]] = deque(maxlen=8)
         self._unmarked: deque[TimedScan] = deque()
         self._T_map_odom = np.eye(4)
-        self._anchor_id, self._T_map_anchor, self._optimisation = ODOM_ORIGIN, np.eye(4), 0
+        self._localizer, self._map_uuid = "", ""  # the process that localizes, and the map it says it is in
+        self._forget_frame()
         c = self.config
         folder = self.home.run_dir / "keyframes" if c.durable and self.home is not None else None
         self._outbox = Outbox(round(c.queue_mb * 1e6), round(c.retry_s * 1e9), c.window, folder)
@@ -106,9 +108,19 @@ class KeyframesNode(Node):
     # --- what is known of the robot ---
 
     def on_header(self, header: Header) -> None:
-        """Anchors mean something within one run of localization only: a drive is named after it."""
-        if header.producer == "localization" and header.instance != self._outbox.drive:
-            self._outbox.drive = header.instance
+        """Another process localizes: the odom frame is another one, and so may be the map. A drive is named
+        after its map, or where localization names none, after that process."""
+        if header.producer == "localization" and header.instance != self._localizer:
+            if self._localizer:
+                self._forget_frame()
+                if self._rig is not None:
+                    self.on_rig(self._rig)
+            self._localizer = self._outbox.drive = header.instance
+
+    def _forget_frame(self) -> None:
+        self._anchor_id, self._T_map_anchor, self._optimisation = ODOM_ORIGIN, np.eye(4), 0
+        self._depths.clear()
+        self._candidates.clear()
 
     def on_rig(self, rig: Rig) -> Outputs:
         """The camera is needed; beams only where there is a lidar. A second calibration restarts."""
@@ -116,7 +128,7 @@ class KeyframesNode(Node):
             log.error("the calibration has no camera: no keyframes")
             return iter(())
         c = rig.camera
-        self._camera = c
+        self._camera, self._rig = c, rig
         lens = Pinhole.of(c)
         self._undistort = Undistorter(lens)
         self._history = History(np.eye(4) if rig.lidar is None else rig.lidar.T_body_lidar)
@@ -154,6 +166,9 @@ class KeyframesNode(Node):
 
     def on_localization_anchors(self, anchors: Anchors) -> Outputs:
         """New keyframes hang on the newest submap: between the two there is the least drift."""
+        self._map_uuid = anchors.map_uuid
+        if anchors.map_uuid:
+            self._outbox.rename(self._localizer, anchors.map_uuid)
         if len(anchors.anchor_ids):
             newest = int(np.argmax(anchors.anchor_ids))
             self._anchor_id = int(anchors.anchor_ids[newest])
@@ -257,6 +272,7 @@ class KeyframesNode(Node):
             depth_png=depth_to_png(depth.depth_m), sigma_png=sigma_to_png(depth.sigma_m),
             mask_png=mask_to_png(~mask) if mask.any() else np.zeros(0, np.uint8),
             beams=np.column_stack([uv, z, beams.sigma_m[index]]).astype(np.float32).reshape(-1, 4), why=why,
+            map_uuid=self._map_uuid,
         )  # fmt: skip
 
     def _moving(self, stamp_ns: int) -> np.ndarray:

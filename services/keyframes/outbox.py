@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -67,6 +67,13 @@ class Outbox:
     def __len__(self) -> int:
         """How many wait for an answer of the present drive's mapper."""
         return sum(entry.label.drive == self.drive for entry in self._entries.values())
+
+    def rename(self, before: str, drive: str) -> None:
+        """The present drive, which went by `before` so far, has a name that survives a restart."""
+        for entry in self._entries.values():
+            if entry.label.drive == before:
+                entry.label = replace(entry.label, drive=drive)
+        self.drive = drive
 
     @property
     def earlier(self) -> int:

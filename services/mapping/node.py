@@ -100,6 +100,9 @@ class MappingNode(SessionNode):
         yield from self._checkpoint(message.stamp_ns)
 
     def _take(self, message: Keyframe) -> Outcome:
+        foreign = self._foreign(message.map_uuid)
+        if foreign:
+            return Outcome(foreign)
         try:
             frame = open_keyframe(message, self._lens)
         except (UserError, ValueError) as error:
@@ -117,9 +120,12 @@ class MappingNode(SessionNode):
 
     def on_localization_anchors(self, anchors: Anchors) -> Outputs:
         """The pose graph has moved: Gaussians move along at once, some steps mend the seams."""
+        foreign = self._foreign(anchors.map_uuid)
+        if foreign:
+            log.warning("anchors are left out: %s", foreign)
+            return
         places = {int(a): T for a, T in zip(anchors.anchor_ids, anchors.T_map_anchor)}
         self._tie_origin(places)
-        self._note_map(anchors.map_uuid)
         if self._mapper.move_anchors(places) and self._mapper.keyframes:
             if self._keeper is not None:
                 self._keeper.moved(self._mapper)

@@ -17,7 +17,7 @@ from rosbags.highlevel import AnyReader
 from common.codec import decode, schema_of
 from common.errors import UserError
 from common.header import Header
-from common.messages import MESSAGES, Image, Odometry, Scan, Tick
+from common.messages import MESSAGES, Anchors, Image, Odometry, Scan, Tick
 from common.recording import RecordingError, RecordingReader, RecordingWriter, is_recording
 from common.recording.mcap_file import McapFile
 from common.recording.picture import picture_head
@@ -109,11 +109,11 @@ def test_other_tools_open_it(tmp_path):
             for _, channel, message in make_reader(stream).iter_messages()
             if channel.message_encoding == "x-beamsplat"
         }
-    assert set(own) >= {"Anchors/1.0", "Tick/1.0", "Health/1.0", "Rig/1.0"}
-    schema, message = own["Anchors/1.0"]
+    assert set(own) >= {schema_of(Anchors), "Tick/1.0", "Health/1.0", "Rig/1.0"}
+    schema, message = own[schema_of(Anchors)]
     assert schema["properties"]["T_map_anchor"]["description"] == "array float64 ['N', 4, 4]"
-    anchors = next(m for m in messages if schema_of(m) == "Anchors/1.0")
-    assert_same(decode("Anchors/1.0", message.data), anchors)
+    anchors = next(m for m in messages if schema_of(m) == schema_of(Anchors))
+    assert_same(decode(schema_of(Anchors), message.data), anchors)
 
 
 def test_topics_and_times_are_chosen(tmp_path):

@@ -46,6 +46,10 @@ class BackEnd:
         self._next_node = 1 + max([*self.nodes, *self.retired], default=-1)
         self._next_submap = 1 + max(self.submaps, default=-1)
 
+    def skip_submaps(self, count: int) -> None:
+        """Leaves ids free: others may know submaps by them that this map has lost."""
+        self._next_submap += count
+
     def start_segment(self) -> None:
         """What comes next hangs on nothing until its place in the map is found."""
         if self.nodes and self.unlinked_from is None:

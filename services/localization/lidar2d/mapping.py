@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 
@@ -27,6 +28,7 @@ from services.localization.lidar2d.settings import LidarSlamSettings
 from services.localization.lidar2d.surfel_map import SurfelMap, freeze
 
 NS = 1e-9
+Result = TypeVar("Result")
 
 
 @dataclass
@@ -150,13 +152,13 @@ class LocalMapper:
         for active in self._active:
             active.submap.frozen = freeze(active.local.surfels)
 
-    def with_frozen(self, work: Callable[[], None]) -> None:
-        """Do something while the active submaps look finished (saving)."""
+    def with_frozen(self, work: Callable[[], Result]) -> Result:
+        """What `work` gives while the active submaps look finished (saving)."""
         growing = [active for active in self._active if active.submap.frozen is None]
         for active in growing:
             active.submap.frozen = freeze(active.local.surfels)
         try:
-            work()
+            return work()
         finally:
             for active in growing:
                 active.submap.frozen = None

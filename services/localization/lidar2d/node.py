@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import shutil
 from pathlib import Path
 from typing import Annotated
 
@@ -10,16 +11,18 @@ import numpy as np
 from pydantic import Field
 
 from common.config import NodeConfig
-from common.errors import UserError
+from common.errors import UserError, reason
 from common.geometry import se2_to_se3, se3_to_se2
 from common.messages import Anchors, Correction, Grid, MovingBeams, Odometry, Rig, Scan, WheelOdometry
 from common.node import Input, Job, Node, Outputs
 from services.localization.lidar2d.occupancy import OccupancyGrid
 from services.localization.lidar2d.settings import LidarSlamSettings
 from services.localization.lidar2d.slam import LidarSlam, ScanResult
-from services.localization.lidar2d.state import MANIFEST, MapStateError, read_manifest
+from services.localization.lidar2d.state import MANIFEST, MapStateError, read_manifest, write_state
 
 log = logging.getLogger("beamsplat.localization")
+
+_LOST_SUBMAPS = 1000  # more than can have been begun since the state that a restart goes on from
 
 
 class LidarLocalizationConfig(NodeConfig):
@@ -29,10 +32,16 @@ class LidarLocalizationConfig(NodeConfig):
     grid_resolution_m: Annotated[float, Field(gt=0.0, le=1.0)] = 0.05
     save: Path | None = None  # folder for map, trajectory and state, written at the end of the data
     resume: Path | None = None  # folder of a saved state: the robot finds its place in it and maps on
+    keep_every_s: Annotated[float, Field(gt=0.0)] = (
+        10.0  # live: state that a restart after a crash goes on from
+    )
 
 
 class LidarLocalization(Node):
-    """The robot's pose from its lidar, with wheel odometry if there is any."""
+    """The robot's pose from its lidar, with wheel odometry if there is any.
+
+    A process that dies costs the seconds until its successor has found its place in the map that it kept.
+    """
 
     name = "localization"
     Config = LidarLocalizationConfig
@@ -49,6 +58,12 @@ class LidarLocalization(Node):
         self._optimisations = 0
         self._stamp_ns = 0
         self._drawn: OccupancyGrid | None = None
+        self._named = ""  # the map whose name was said
+        self._kept_ns: int | None = None  # when the last state was kept for a restart
+        self._keeping = False
+        self._spare = None if self.home is None else self.home.run_dir / "localization"
+        if self._spare is not None and not self.home.resume:  # of another drive
+            shutil.rmtree(self._spare, ignore_errors=True)
         if self.config.resume is not None:
             try:
                 read_manifest(self.config.resume / MANIFEST)
@@ -60,19 +75,27 @@ class LidarLocalization(Node):
         if rig.lidar is None:
             log.error("the calibration has no lidar: scans cannot be used")
         elif self._slam is None:
+            self._stamp_ns = rig.stamp_ns
             self._slam = self._begin(rig.lidar.T_body_lidar)
+            yield from self._name_map()
         else:
             log.warning("a new calibration is ignored: restart the node to use it")
-        return iter(())
 
     def _begin(self, T_body_lidar: np.ndarray) -> LidarSlam:
-        if self.config.resume is None:
+        crashed = self._spare is not None and (self._spare / MANIFEST).is_file()
+        folder = self._spare if crashed else self.config.resume
+        if folder is None:
             return LidarSlam(LidarSlamSettings(), T_body_lidar)
         try:
-            slam = LidarSlam.load(self.config.resume, LidarSlamSettings(), T_body_lidar)
+            slam = LidarSlam.load(folder, LidarSlamSettings(), T_body_lidar)
         except MapStateError as error:
-            raise UserError(f"localization.resume: {error}") from error
-        log.info("goes on from %s: %d submaps", self.config.resume, len(slam.anchors()))
+            if not crashed:
+                raise UserError(f"localization.resume: {error}") from error
+            log.error("begins a new map: %s", error)
+            return LidarSlam(LidarSlamSettings(), T_body_lidar)
+        if crashed:
+            slam.back.skip_submaps(_LOST_SUBMAPS)
+        log.info("goes on from %s: %d submaps", folder, len(slam.anchors()))
         return slam
 
     def on_wheel_odometry(self, odometry: WheelOdometry) -> Outputs:
@@ -90,6 +113,7 @@ class LidarLocalization(Node):
             scan.time_increment_s, scan.range_min_m, scan.range_max_m,
         )  # fmt: skip
         self._stamp_ns = scan.stamp_ns
+        yield from self._name_map()
         yield "localization/odometry", _odometry(result)
         yield "localization/movers", MovingBeams(stamp_ns=scan.stamp_ns, moving=result.moving)
         yield from self._correction(scan.stamp_ns, result.T_map_odom)
@@ -97,6 +121,7 @@ class LidarLocalization(Node):
             # Its result is due before the scan with number `apply_at_scan`; the next one is `scans`.
             after = result.job.apply_at_scan - self._slam.scans + 1
             yield Job("optimise", result.job.run, after=after, of="lidar/scan")
+        yield from self._keep_state(scan.stamp_ns, result.status == "ok")
         if self._slam.scans % self.config.grid_every_scans == 0:
             yield from self._draw_grid()
 
@@ -105,6 +130,29 @@ class LidarLocalization(Node):
         self._slam.apply(result)
         self._optimisations += 1
         yield from self._map_moved()
+
+    def _keep_state(self, stamp_ns: int, placed: bool) -> Outputs:
+        """Now and then a copy goes to the disk, in the background, for whoever is started after a crash."""
+        if self._spare is None or self._keeping or not placed:
+            return
+        if self._kept_ns is None or abs(stamp_ns - self._kept_ns) >= self.config.keep_every_s * 1e9:
+            self._kept_ns, self._keeping = stamp_ns, True
+            folder, state = self._spare, self._slam.packed()
+
+            def keep() -> str:
+                try:
+                    write_state(folder, state)
+                except OSError as error:
+                    return f"{folder}: {reason(error)}"
+                return ""
+
+            yield Job("keep", keep)
+
+    def on_job_keep(self, fault: str) -> Outputs:
+        """The copy is on the disk, or could not be written."""
+        self._keeping = False
+        self.detail = f"no copy of the map for a restart: {fault}" if fault else ""
+        return iter(())
 
     def drain(self) -> Outputs:
         """Last loop closures and optimisation, the final grid, and the files asked for."""
@@ -120,6 +168,15 @@ class LidarLocalization(Node):
 
     def _map_moved(self) -> Outputs:
         yield from self._correction(self._stamp_ns, self._slam.back.T_map_odom)
+        yield from self._anchors()
+
+    def _name_map(self) -> Outputs:
+        """Which map it is, before the first pose in it: what hangs on anchors of two must not mix."""
+        if self._slam.back.uuid != self._named:
+            yield from self._anchors()
+
+    def _anchors(self) -> Outputs:
+        self._named = self._slam.back.uuid
         anchors = self._slam.anchors()
         T_map_anchor = se2_to_se3(np.array(list(anchors.values())).reshape(-1, 3))
         yield (

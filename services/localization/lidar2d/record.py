@@ -48,11 +48,11 @@ class TrajectoryRecord:
         return se2.compose_many(base[inverse], self._poses[: self.count, :3])
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """For saving."""
+        """Copies for saving."""
         return {
             "extra_stamps": self.stamps_ns,
             "extra_nodes": self.nodes,
-            "extra_poses": self._poses[: self.count],
+            "extra_poses": self._poses[: self.count].copy(),
         }
 
     @staticmethod

@@ -24,7 +24,7 @@ from services.localization.lidar2d.relocalization import (
 )
 from services.localization.lidar2d.scan import PreparedScan
 from services.localization.lidar2d.settings import LidarSlamSettings
-from services.localization.lidar2d.state import load_state, map_uuid, save_state
+from services.localization.lidar2d.state import MapState, load_state, map_uuid, packed_state, write_state
 from services.localization.lidar2d.validate import StampGuard, reason_to_reject
 
 NS = 1e-9
@@ -263,12 +263,8 @@ class LidarSlam:
 
     def grid(self, resolution_m: float = 0.05) -> OccupancyGrid:
         """Occupancy of everything seen so far."""
-        grids = []
-        for submap in self.back.submaps.values():
-            if submap.frozen is not None:
-                f = submap.frozen
-                hits, misses = f.counts()
-                grids.append(CountGrid(hits, misses, f.row0, f.col0, f.cell_m, submap.T_map_submap))
+        frozen = [(s.frozen, s.T_map_submap) for s in self.back.submaps.values() if s.frozen is not None]
+        grids = [CountGrid(*f.counts(), f.row0, f.col0, f.cell_m, T) for f, T in frozen]
         return render(grids + self.mapper.count_grids(), resolution_m)
 
     def relocalize(
@@ -291,16 +287,20 @@ class LidarSlam:
         """The map relocalization searches; drawn once per state of the map (about a second)."""
         back = self.back
         known = [n for n in back.nodes if back.unlinked_from is None or n < back.unlinked_from]
-        return back.cache.world(
-            (back.optimisations, len(known)),
-            lambda: build_global_map(
-                self.settings, [back.nodes[n] for n in known], [back.T_map_node[n] for n in known]
-            ),
-        )
+
+        def build() -> GlobalMap:
+            nodes, T_map_node = [back.nodes[n] for n in known], [back.T_map_node[n] for n in known]
+            return build_global_map(self.settings, nodes, T_map_node)
+
+        return back.cache.world((back.optimisations, len(known)), build)
 
     def save(self, folder: Path) -> None:
         """Write the state; mapping may go on."""
-        self.mapper.with_frozen(lambda: save_state(Path(folder), self.back, self.record.arrays()))
+        write_state(folder, self.packed())
+
+    def packed(self) -> MapState:
+        """Copies of the state as it is now."""
+        return self.mapper.with_frozen(lambda: packed_state(self.back, self.record.arrays()))
 
     @staticmethod
     def load(

@@ -33,29 +33,45 @@ def map_uuid(stamp_ns: int, ranges_m: np.ndarray) -> str:
     return str(uuid.uuid5(uuid.NAMESPACE_OID, first))
 
 
-def save_state(folder: Path, back: BackEnd, extra: dict[str, np.ndarray]) -> None:
+@dataclasses.dataclass(frozen=True)
+class MapState:
+    """Copies of all that a map is: writing them may take its time while mapping goes on."""
+
+    arrays: dict[str, np.ndarray]
+    head: dict[str, object]
+
+
+def packed_state(back: BackEnd, extra: dict[str, np.ndarray]) -> MapState:
+    """The map as it is now."""
+    arrays = {**_pack_nodes(back), **_pack_submaps(back), **_pack_edges(back.constraints), **extra}
+    head = {
+        "uuid": back.uuid,
+        "keynodes": len(back.nodes),
+        "submaps": len(back.submaps),
+        "constraints": len(back.constraints),
+        "settings": dataclasses.asdict(back.settings),
+    }
+    return MapState(arrays, head)
+
+
+def write_state(folder: Path, state: MapState) -> None:
     """Write the map; the manifest is replaced last, so a crash leaves the previous map whole."""
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    arrays = {**_pack_nodes(back), **_pack_submaps(back), **_pack_edges(back.constraints), **extra}
     generation = 1 + max((int(p.stem.rpartition("-")[2]) for p in folder.glob("lidar_map-*.npz")), default=0)
     name = f"lidar_map-{generation}.npz"
     with open(folder / f"{name}.tmp", "wb") as file:
-        np.savez(file, **arrays)
+        np.savez(file, **state.arrays)
         file.flush()
         os.fsync(file.fileno())
     os.replace(folder / f"{name}.tmp", folder / name)
     manifest = {
         "format": FORMAT,
         "version": VERSION,
-        "uuid": back.uuid,
         "arrays": name,
         "bytes": (folder / name).stat().st_size,
         "crc32": zlib.crc32((folder / name).read_bytes()),
-        "keynodes": len(back.nodes),
-        "submaps": len(back.submaps),
-        "constraints": len(back.constraints),
-        "settings": dataclasses.asdict(back.settings),
+        **state.head,
     }
     with open(folder / f"{MANIFEST}.tmp", "w") as file:
         json.dump(manifest, file, indent=1)

@@ -139,15 +139,15 @@ class SessionNode(Node):
                 self._taken = {id: taken for id, taken in self._taken.items() if m.holds(id)}
         return outcome
 
-    def _note_map(self, uuid: str) -> None:
-        """Remembers whose anchors these are; a robot that starts a map of its own is told of."""
+    def _foreign(self, uuid: str) -> str:
+        """Why what hangs on anchors of that map cannot be taken; "" if it can. The first names this one's."""
         if uuid and self._map_uuid and uuid != self._map_uuid:
-            log.warning(
-                "the anchors come from another map (%s) than those so far (%s): the parts will not fit. "
-                "Start localization with localization.resume, or the mapper with a session of its own",
-                uuid, self._map_uuid,
-            )  # fmt: skip
+            return (
+                f"of the robot's map {uuid[:8]}, this one hangs on {self._map_uuid[:8]}: start localization "
+                "with localization.resume, or the mapper with another session"
+            )
         self._map_uuid = uuid or self._map_uuid
+        return ""
 
     def _page(self) -> None:
         """The memory's budget is kept."""

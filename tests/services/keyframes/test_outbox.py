@@ -127,6 +127,18 @@ def test_keyframes_of_an_earlier_drive_stay_but_make_room_first(tmp_path):
     assert sent(box, 9 * S) == [10]  # not what hangs on another map
 
 
+def test_a_drive_may_get_the_name_of_its_map_when_that_is_known():
+    box = Outbox(10_000, S, 4)
+    box.drive = "process 1"
+    put(box, 0)
+    box.rename("process 1", "map")
+    put(box, 1)
+    box.drive = "process 2"
+    assert (len(box), box.earlier) == (0, 2)
+    box.rename("process 2", "map")  # localization was started again, in the same map
+    assert (len(box), box.earlier) == (2, 0)
+
+
 def test_broken_files_are_counted_and_the_rest_goes_on(tmp_path, caplog):
     box = Outbox(10_000, S, 4, tmp_path)
     for key in range(5):

@@ -1,12 +1,14 @@
 """A second drive goes on in the first one's map: from a wrong start, with the same submaps, into one state."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from common.errors import UserError
 from common.geometry import inverse, se2_to_se3
+from common.live_settings import LiveSettings
 from common.messages import LidarModel, Rig, Scan
 from services.localization.lidar2d.node import LidarLocalization
 from tests.services.localization.world import Drive, Lidar
@@ -24,7 +26,7 @@ def drive(node, start_s, end_s, seed, day):
         nonlocal T_map_odom
         for output in outputs:
             if not isinstance(output, tuple):
-                jobs.append([output.after, output])
+                jobs.append([output.after or 0, output])
                 continue
             sent.setdefault(output[0], []).append(output[1])
             if output[0] == "localization/correction":
@@ -60,8 +62,9 @@ def fitted(world, mapped):
     return np.array([*(world[:, :2].mean(0) - [[c, -s], [s, c]] @ mapped[:, :2].mean(0)), yaw])
 
 
-def make(**options):
+def make(home=None, **options):
     node = LidarLocalization(LidarLocalization.Config(kind="lidar", **options))
+    node.home = home
     node.configure()
     return node
 
@@ -85,6 +88,30 @@ def test_a_drive_goes_on_in_the_map_of_another(tmp_path):
     assert old < set(anchors)  # keyframes of the first drive still hang on theirs
     table = json.loads((tmp_path / "map" / "lidar_map.json").read_text())
     assert table["submaps"] == len(anchors)
+
+
+@pytest.mark.slow
+def test_a_process_that_dies_goes_on_in_the_map_that_it_kept(tmp_path):
+    home = LiveSettings("r1", (), tmp_path)
+    node = make(home, keep_every_s=5.0)
+    first, _ = drive(node, 0.0, 36.0, 1, 0)
+    _, optimised, _ = node._slam.trajectory()
+    T_world_map = se2_to_se3(fitted(PATH(np.arange(len(optimised)) * 0.1), optimised))
+    second, after = drive(make(replace(home, resume=True)), 39.0, 52.0, 2, 0)
+    statuses = [o.status for o in second["localization/odometry"]]
+    assert statuses.index("ok") < 100  # within ten seconds of the drive
+    errors = [inverse(true) @ T_world_map @ shown for true, shown in after]
+    assert np.percentile([np.hypot(*e[:2, 3]) for e in errors], 95) < 0.05
+    names = {a.map_uuid for sent in (first, second) for a in sent["localization/anchors"]}
+    assert len(names) == 1
+    assert second["localization/anchors"][0].map_uuid  # before the first pose: who has keyframes knows
+    kept = set(second["localization/anchors"][0].anchor_ids.tolist())
+    begun = set(second["localization/anchors"][-1].anchor_ids.tolist()) - kept
+    lost = set(first["localization/anchors"][-1].anchor_ids.tolist()) - kept
+    assert begun
+    assert not begun & lost  # a submap that was begun after the copy is nobody else's name
+    third, _ = drive(make(home), 0.0, 5.0, 3, 0)  # another run of the system is another drive
+    assert {a.map_uuid for a in third["localization/anchors"]}.isdisjoint(names)
 
 
 def test_a_state_that_cannot_be_read_is_said_before_anything_starts(tmp_path):

@@ -94,16 +94,23 @@ def test_who_goes_on_in_a_map_keeps_its_name(halves, tmp_path):
     assert names[0] == names[1]
 
 
-def test_a_mapper_whose_robot_starts_another_map_says_so(halves, tmp_path, caplog):
-    node = make_node(tmp_path / "s")
-    handle(node, "keyframes/frame", message(0), {})
-    places = np.stack([se2_to_se3(np.zeros(3))])
-    for number, name in enumerate(("first", "first", "second")):
+def test_a_mapper_whose_robot_starts_another_map_keeps_its_own_as_it_is(tmp_path, caplog):
+    """Submaps of both have the same numbers: places and keyframes of the second are left out, and said."""
+    node, sent = make_node(tmp_path / "s"), {}
+    handle(node, "keyframes/frame", message(0, map_uuid="first"), sent)
+    for name, x_m in (("first", 0.5), ("second", 7.0)):
         anchors = Anchors(
-            stamp_ns=r.T0 + number, anchor_ids=np.array([0]), T_map_anchor=places, map_uuid=name
-        )
+            stamp_ns=r.T0, anchor_ids=np.array([0]), T_map_anchor=se2_to_se3(np.array([[x_m, 0.0, 0.0]])),
+            map_uuid=name,
+        )  # fmt: skip
         handle(node, "localization/anchors", anchors, {})
-        assert ("come from another map (second)" in caplog.text) == (name == "second")
+        assert ("anchors are left out: of the robot's map second" in caplog.text) == (name == "second")
+    assert node._mapper.T_map_anchor[0][0, 3] == 0.5
+    handle(node, "keyframes/frame", message(1, map_uuid="second"), sent)
+    handle(node, "keyframes/frame", message(2, map_uuid="first"), sent)
+    said = [ack.status for ack in sent["keyframes/ack"]]
+    assert said[0] == said[2] == "ok"
+    assert "localization.resume" in said[1]
     node.close()
 
 
