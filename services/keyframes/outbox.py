@@ -25,6 +25,7 @@ from services.keyframes.folder import Folder, Label
 log = logging.getLogger("beamsplat.keyframes")
 
 _MEMORY_BYTES = 64_000_000  # of those that the disk would not take
+_NEWEST_EVERY = 4  # sendings again
 
 
 @dataclass
@@ -50,7 +51,7 @@ class Outbox:
         self._limit, self._retry_ns, self._window = limit_bytes, retry_ns, window
         self._folder = Folder(folder) if folder is not None else None
         self._entries: dict[int, _Entry] = {}
-        self._sendings = 0
+        self._sendings = self._caught_up = 0  # in all; of the lost ones
         self._heard_ns: int | None = None  # the last answer, or the last attempt to get one
         self._useless = 0
         self._complaints = Complaints()
@@ -121,8 +122,11 @@ class Outbox:
             return
         on_their_way = sum(entry.again and entry.order is not None for entry in mine)
         lost = sorted((e for e in mine if e.order is None), key=lambda entry: entry.label.key)
-        for entry in lost[: max(self._window - on_their_way, 0)]:
-            yield from self._send(entry)
+        for _ in range(min(self._window - on_their_way, len(lost))):
+            # Now and then the newest: where the robot is now should not wait for all of an outage.
+            self._caught_up += 1
+            newest = self._caught_up % _NEWEST_EVERY == 0
+            yield from self._send(lost.pop(-1 if newest else 0))
 
     def discard(self, key: int) -> None:
         """Its payload is of no use to anybody."""

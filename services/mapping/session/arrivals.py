@@ -19,6 +19,7 @@ class Arrivals:
         self._keeper = keeper
         self._waiting: dict[int, None] = {}  # in order of arrival
         self._overtaken: deque[int] = deque()
+        self._read: int | None = None  # came from the disk, and has its turn now
 
     def take(self, id: int, known: bool, body: Callable[[], tuple[str, bytes]]) -> bool:
         """Whether a keyframe that has just come is on the disk. `known`: the mapper has it already; `body`
@@ -35,7 +36,7 @@ class Arrivals:
         """A keyframe's turn has come; whether it was on the disk already. Those that came before it and had
         no turn never will: more were waiting than a mailbox holds."""
         if id not in self._waiting:
-            return False
+            return id == self._read
         for other in list(self._waiting):
             del self._waiting[other]
             if other == id:
@@ -55,7 +56,8 @@ class Arrivals:
     def overtaken(self) -> tuple[str, bytes] | None:
         """(schema, payload) of the oldest that will have no turn; None if there is none that can be read."""
         while self._overtaken:
-            body = self._keeper.body(self._overtaken.popleft())
+            self._read = self._overtaken.popleft()
+            body = self._keeper.body(self._read)
             if body is not None:
                 return body
         return None

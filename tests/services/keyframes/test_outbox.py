@@ -41,9 +41,9 @@ def test_while_nobody_answers_only_the_oldest_is_tried(folder):
     assert sent(box, 10 * S) == [0]
 
 
-def test_an_answer_brings_the_rest_a_few_at_a_time_oldest_first(folder):
+def test_an_answer_brings_the_rest_a_few_at_a_time_oldest_first_and_now_and_then_the_newest(folder):
     box = Outbox(10_000, 5 * S, 2, folder)
-    for i in range(6):
+    for i in range(7):
         put(box, i)
     assert sent(box, 5 * S) == [0]
     assert box.acknowledge(0, 5 * S)
@@ -51,7 +51,9 @@ def test_an_answer_brings_the_rest_a_few_at_a_time_oldest_first(folder):
     assert sent(box, 5 * S) == []  # two are on their way
     assert box.acknowledge(1, 6 * S)
     assert sent(box, 6 * S) == [3]
-    for key in (2, 3, 4, 5):
+    assert box.acknowledge(2, 6 * S)
+    assert sent(box, 6 * S) == [6]  # every fourth
+    for key in (3, 4, 5, 6):
         assert box.acknowledge(key, 6 * S)
         list(box.due(6 * S))
     assert sent(box, 99 * S) == []

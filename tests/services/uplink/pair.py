@@ -22,7 +22,12 @@ from tests.services.uplink.radio import FAR_ADDRESS, ROOT
 
 PORT = 7448
 RATE = float(os.environ.get("BEAMSPLAT_RATE", "1"))  # of the drive: less on a machine that has no time for it
-LIGHT = {"half_steps": 4, "full_steps": 1, "tick_steps": 0}  # a slow machine for a GPU's work
+LIGHT = {
+    "max_keyframes": 5000,
+    "half_steps": 4,
+    "full_steps": 1,
+    "tick_steps": 0,
+}  # a slow machine for a GPU's work
 
 
 class Log:

@@ -53,7 +53,7 @@ def run_with_cut(pair, radio, cut_s):
 def print_recovery(pair, cut_ns, mended_ns):
     outage_s = (mended_ns - cut_ns) / 1e9
     made = pair.near.log.first("keyframes/frame", "sent_ns")
-    durable = pair.durable()
+    durable = pair.far.log.first("keyframes/ack", "sent_ns")  # said once it is on the disk
     mapped = pair.far.log.first("mapping/status", "sent_ns")
     during = [i for i, t in made.items() if cut_ns - 1_000_000_000 <= t < mended_ns]
     for what, when, bound in (("durable", durable, 1 / 3), ("mapped", mapped, 1.0)):
