@@ -19,7 +19,6 @@ from common.topics import ROW_NUMBER, TOPICS
 
 NOBODY = "nobody"  # ends an input that no node produces
 MAX_QUEUED = 20_000  # of an `every` input: beyond it the oldest goes, and is counted
-MAX_QUEUED_BYTES = 256 * 1024 * 1024  # likewise: pictures for a recorder whose disk has stalled
 _MAX_COUNT = 2**63 - 1  # what a Health message can say
 
 
@@ -63,6 +62,7 @@ class Mailbox:
         self._slots: dict[str, Letter] = {}
         self._fed_back = frozenset(i.topic for i in _inputs(node) if i.feedback)
         self._answers: deque[Letter] = deque()  # of `every` inputs that are fed back
+        self._most_bytes = {i.topic: i.queued_bytes for i in _inputs(node)}
         self.counts = {name: InputCount() for name in self._deliveries}
 
     def __len__(self) -> int:
@@ -90,8 +90,9 @@ class Mailbox:
         return True
 
     def _make_room(self, letter: Letter, count: InputCount) -> None:
+        most_bytes = self._most_bytes[letter.topic]
         while queued := self._merger.queued(letter.topic):
-            if queued < MAX_QUEUED and count.queued_bytes + letter.size_bytes <= MAX_QUEUED_BYTES:
+            if queued < MAX_QUEUED and count.queued_bytes + letter.size_bytes <= most_bytes:
                 break
             count.queued_bytes -= self._merger.drop_oldest(letter.topic).size_bytes
             count.dropped += 1

@@ -34,11 +34,14 @@ class Input:
     `feedback` marks what depends on this node's own output (an acknowledgement): it is taken as it comes,
     not merged by stamp, and the node ends without waiting for its end: both would wait for themselves. What
     comes after the node's own end is still heard, but what the handler yields then goes nowhere.
+
+    `queued_bytes` of an `every` input wait at most; beyond them the oldest goes, and is counted.
     """
 
     topic: str
     delivery: Delivery | None = None
     feedback: bool = False
+    queued_bytes: int = 256 * 1024 * 1024  # pictures for a recorder whose disk has stalled
 
     @property
     def row(self) -> Topic:

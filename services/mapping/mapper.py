@@ -58,6 +58,7 @@ class Mapper:
         self._random = np.random.default_rng(seed)
         self._newest: list[int] = []
         self.given_up = 0  # keyframes, for the sake of others
+        self.most_in_memory: int | None = None  # Gaussians: where a budget leaves no room, none are added
         self._forgotten: dict[int, None] = {}  # the last of them, in order
         self._places = Places()
         self._ssim = SsimLoss()
@@ -196,7 +197,8 @@ class Mapper:
     # --- growing and shrinking ---------------------------------------------------------------------
 
     def _insert(self, held: Held, level: Level) -> Outcome:
-        room = max(self.settings.max_gaussians - self.store.count - self.store.away_count, 0)
+        in_all, here = self.settings.max_gaussians - self.store.away_count, self.most_in_memory
+        room = max(min(in_all, in_all if here is None else here) - self.store.count, 0)
         T_map_camera = self.T_map_camera(held)
         render = self._render(level, T_map_camera)
         missing = unexplained(render.image, level, self.settings)

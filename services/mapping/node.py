@@ -47,7 +47,11 @@ class MappingNode(SessionNode):
 
     name = "mapping"
     Config = MappingConfig
-    inputs = ("keyframes/frame", Input("localization/anchors", "every"), Input("tick", "latest"))
+    # Of keyframes few need to wait here: they wait on this disk too (a session), or on the robot's.
+    inputs = (
+        Input("keyframes/frame", queued_bytes=32_000_000), Input("localization/anchors", "every"),
+        Input("tick", "latest"),
+    )  # fmt: skip
     outputs = ("keyframes/ack", "mapping/chunk", "mapping/poses", "mapping/preview", "mapping/status")
     config: MappingConfig
 

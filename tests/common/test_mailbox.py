@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from common import mailbox as mailbox_module
 from common.header import Header
 from common.mailbox import Letter, Mailbox
 from common.messages import Scan
+from common.node import Input
 from tests.common.nodes import Chain, Slow
 
 FIRST, SECOND = "ab" * 8, "cd" * 8
@@ -56,9 +56,15 @@ def test_an_absurd_sequence_number_can_still_be_reported():
     assert health["lidar/scan"].lost == 2**63 - 1
 
 
-def test_what_waits_is_bounded_in_bytes(monkeypatch):
-    monkeypatch.setattr(mailbox_module, "MAX_QUEUED_BYTES", 10_000)
-    mailbox = Mailbox(Slow)
+class Small(Slow):
+    """Lets little wait."""
+
+    name = "localization"
+    inputs = (Input("lidar/scan", "every", queued_bytes=10_000),)
+
+
+def test_what_waits_is_bounded_in_bytes():
+    mailbox = Mailbox(Small)
     for sequence in range(100):
         mailbox.put(_scan(sequence, size_bytes=1000))
     assert len(mailbox) == 10

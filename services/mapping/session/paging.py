@@ -115,6 +115,7 @@ class Pager:
         self._rest_pictures(mapper, free, on_disk)
         self.used_bytes = self._used(mapper)
         self._judge(mapper)
+        mapper.most_in_memory = int(self._most(mapper, free) / (_COPIES * mapper.store.bytes_each))
 
     def _turn(self, mapper: Mapper, body: Callable[[int], Keyframe]) -> None:
         self._turns += 1
