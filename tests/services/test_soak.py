@@ -36,7 +36,7 @@ def test_laps_on_end_cost_no_more_memory_and_no_more_files(tmp_path, free_endpoi
     simulate(tmp_path / "lap", laps=1, jobs=2)
     deployment = load_deployment(ROOT / "deploy" / "demo.toml", (
         f"replay.data={tmp_path / 'lap' / 'bag'}", "replay.loop=true", f"recorder.out={tmp_path / 'recording'}",
-        f"mapping.session={tmp_path / 'session'}", "mapping.memory_mb=400", f'router.listen=["{free_endpoint}"]',
+        f"mapping.session={tmp_path / 'session'}", "mapping.memory_mb=600", f'router.listen=["{free_endpoint}"]',
         f"state_dir={tmp_path / 'state'}", f"monitor.save={tmp_path / 'seen.rrd'}", "monitor.viewer_memory_mb=64", "monitor.view=serve", "monitor.grpc_port=0", "monitor.web_port=0",
     ))  # fmt: skip
     memory_mb, files, threads = (defaultdict(list) for _ in range(3))

@@ -95,7 +95,7 @@ def test_the_budget_holds_and_the_status_says_what_is_where(tmp_path):
     assert (
         f"{mapper.store.count} of {status.gaussians} Gaussians; {len(shelf.blocks)} chunks" in status.session
     )
-    assert "of 206 MB" in node.detail
+    assert f"of {BUDGET_MB:.0f} MB" in node.detail
     node.close()
 
 
