@@ -47,7 +47,8 @@ class Control:
             return live.takeover.retire()
         if not live.takeover.retired:
             live.finish_jobs()
-            live.takeover.retired = True  # what arrives from here on is the successor's
+            with live.greeting:
+                live.takeover.retired = True  # what arrives from here on is the successor's
             try:
                 live.node.hand_over()
             except ValueError:

@@ -54,6 +54,7 @@ class Live:
         self.instance = settings.instance or secrets.token_hex(8)
         self.takeover = Takeover(settings.standby)
         self.greets = True  # letters, when they arrive
+        self.greeting = threading.Lock()  # held for one: whoever retires ends none in the middle
         self.mailbox = Mailbox(type(node), time.monotonic_ns)
         self.changed = threading.Condition()
         self._stopping = False
@@ -284,8 +285,11 @@ class Live:
     # --- called from threads of the bus ---
 
     def _on_letter(self, letter: Letter) -> None:
-        if self.greets and not (self.takeover.standby or self.takeover.retired):
-            self.emit(self.node.handle_arrival(letter.topic, letter.message))
+        with self.greeting:
+            # What a predecessor has dealt with comes again from the sender's cache, perhaps late.
+            over = self.takeover.standby or self.takeover.retired or self.takeover.was_handled(letter)
+            if self.greets and not over:
+                self.emit(self.node.handle_arrival(letter.topic, letter.message))
         with self.changed:
             if self.mailbox.put(letter):
                 self.changed.notify()
