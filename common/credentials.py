@@ -18,12 +18,12 @@ from pathlib import Path
 
 import zenoh
 
-from common.access import local_access_control
-from common.errors import UserError
+from common.access import MASTERS, local_access_control
+from common.errors import UserError, reason
 from common.persist import make_folder
 from common.security import SecurityConfig, is_loopback
 
-SUPERVISOR, OPERATOR = "supervisor", "operator"
+SUPERVISOR, OPERATOR = MASTERS
 USERS = "users"
 
 
@@ -105,7 +105,9 @@ def _lines(path: Path) -> dict[str, str]:
         mode = path.stat().st_mode & 0o777
         rows = dict(line.split(":", 1) for line in path.read_text().splitlines())
     except (OSError, ValueError) as error:
-        raise UserError(f"{path}: no logins ({error}); remove its folder, and new ones are made") from error
+        raise UserError(
+            f"{path}: no logins ({reason(error)}); remove its folder, and new ones are made"
+        ) from error
     if mode & 0o077:
         raise UserError(f"{path} can be read by others (mode {mode:03o}): chmod 600")
     if not rows:

@@ -1,4 +1,4 @@
-"""Waiting for a supervised system to get somewhere."""
+"""Waiting for a system to get somewhere."""
 
 import time
 
@@ -12,3 +12,12 @@ def poll(supervisor, until, timeout_s):
             return
         time.sleep(0.02)
     raise AssertionError(f"not within {timeout_s} s")
+
+
+def say_until_heard(publication, message, heard, times=3, timeout_s=5.0):
+    """Publishes until `heard` holds so many messages."""
+    deadline = time.monotonic() + timeout_s
+    while len(heard) < times and time.monotonic() < deadline:
+        publication.put(message)
+        time.sleep(0.05)
+    assert len(heard) >= times

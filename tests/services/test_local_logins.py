@@ -21,7 +21,7 @@ from services.board import HealthBoard
 from services.nodes import NODES
 from services.supervisor import Supervisor
 from tests.common.ears import Ears
-from tests.common.polling import poll
+from tests.common.polling import poll, say_until_heard
 from tests.common.samples import sample_messages
 from tests.conftest import free_port
 from tests.services.mapping.room_drive import TABLE
@@ -100,11 +100,7 @@ def test_every_topic_reaches_a_monitor_with_what_was_said_before(guarded, name):
         kept = declare_reader(monitor, f"beamsplat/r1/{name}", row, "every", take)
         if row.delivery == "latched":
             wait(lambda: len(heard) == 1)  # said before anybody listened
-        deadline = time.monotonic() + 5.0
-        while len(heard) < 3 and time.monotonic() < deadline:
-            publication.put(message)
-            time.sleep(0.05)
-        assert len(heard) >= 3
+        say_until_heard(publication, message, heard)
         assert kept
 
 

@@ -31,17 +31,13 @@ class SessionNode(Node):
     _arrivals: Arrivals | None = None
     _mapper: Mapper
     _lens: Callable[[Pinhole], Undistorter]
+    _take: Callable[[Keyframe], Outcome]  # these two are the mapping node's own
+    on_keyframes_frame: Callable[[Keyframe], Outputs]
     _taken: dict[int, tuple[int, np.ndarray]]  # keyframe -> stamp_ns, T_camera_body
     _refusals: dict[int, str]
     _T_oldest_origin: np.ndarray | None
     _resumed: frozenset[int] | set[int] = frozenset()  # taken from the disk in a predecessor's place
     _map_uuid: str = ""  # of the robot's map that this one hangs on
-
-    def _take(self, message: Keyframe) -> Outcome:
-        raise NotImplementedError
-
-    def on_keyframes_frame(self, message: Keyframe) -> Outputs:
-        raise NotImplementedError
 
     def close(self) -> None:
         if self._keeper is not None:

@@ -1,8 +1,10 @@
 """What has arrived at a mapper is on its disk, whatever becomes of the mapper before its turn."""
 
 import numpy as np
+import pytest
 
 from common.depth_code import mask_to_png
+from common.errors import UserError
 from common.lockstep import Lockstep
 from common.messages import Tick
 from services.keyframes.node import KeyframesConfig, KeyframesNode
@@ -84,6 +86,26 @@ def test_a_mapper_that_is_killed_before_every_checkpoint_still_comes_to_one(tmp_
         handle(node, "keyframes/frame", message(number))
         node.close()
     assert folder.manifest()["keyframes"] == 4
+
+
+def test_a_hand_over_that_the_disk_refuses_leaves_the_map_with_its_mapper(tmp_path):
+    """What common/control.py does next: the mapper goes on as it was, and may hand over later."""
+    node, edge = make_node(tmp_path / "s"), tmp_path / "s" / "edge"
+    handle(node, "keyframes/frame", message(0))
+    edge.rename(tmp_path / "away")
+    edge.write_text("no folder any more")
+    with pytest.raises(UserError, match="NOT SAVED"):
+        node.hand_over()
+    edge.unlink()
+    (tmp_path / "away").rename(edge)
+    with pytest.raises(UserError, match="writes to this session"):
+        SessionFolder(tmp_path / "s").lock()
+    handle(node, "keyframes/frame", message(1))
+    assert ids(node) == [message(0).id, message(1).id]
+    node.hand_over()
+    again = make_node(tmp_path / "s")
+    assert ids(again) == [message(0).id, message(1).id]
+    again.close()
 
 
 def test_answers_do_not_wait_for_a_slow_mapper(tmp_path):
