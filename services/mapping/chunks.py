@@ -90,7 +90,8 @@ def _cell(mapper: Mapper, anchor: int, eye: Eye | None) -> float:
     """By the nearest Gaussian; without an eye all detail is due."""
     if eye is None:
         return 0.0
-    means = mapper.store.chunk(anchor)[MEAN : MEAN + 3].T
+    store = mapper.store
+    means = store.params[MEAN : MEAN + 3, : store.count][:, store.anchor[: store.count] == anchor].T
     nearest_m = np.sqrt(np.min(np.sum((means - eye.at_m) ** 2, axis=1), initial=np.inf))
     if mapper.elsewhere is not None:
         nearest_m = min(nearest_m, mapper.elsewhere.nearest_m(anchor, mapper.T_map_anchor[anchor], eye.at_m))

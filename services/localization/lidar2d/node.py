@@ -32,9 +32,7 @@ class LidarLocalizationConfig(NodeConfig):
     grid_resolution_m: Annotated[float, Field(gt=0.0, le=1.0)] = 0.05
     save: Path | None = None  # folder for map, trajectory and state, written at the end of the data
     resume: Path | None = None  # folder of a saved state: the robot finds its place in it and maps on
-    keep_every_s: Annotated[float, Field(gt=0.0)] = (
-        10.0  # live: state that a restart after a crash goes on from
-    )
+    keep_every_s: Annotated[float, Field(gt=0.0)] = 10.0  # live: a copy, for a restart after a crash
 
 
 class LidarLocalization(Node):

@@ -24,7 +24,7 @@ from services.localization.lidar2d.relocalization import (
 )
 from services.localization.lidar2d.scan import PreparedScan
 from services.localization.lidar2d.settings import LidarSlamSettings
-from services.localization.lidar2d.state import MapState, load_state, map_uuid, packed_state, write_state
+from services.localization.lidar2d.state import PackedMap, load_state, map_uuid, packed_state, write_state
 from services.localization.lidar2d.validate import StampGuard, reason_to_reject
 
 NS = 1e-9
@@ -298,7 +298,7 @@ class LidarSlam:
         """Write the state; mapping may go on."""
         write_state(folder, self.packed())
 
-    def packed(self) -> MapState:
+    def packed(self) -> PackedMap:
         """Copies of the state as it is now."""
         return self.mapper.with_frozen(lambda: packed_state(self.back, self.record.arrays()))
 

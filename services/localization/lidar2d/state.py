@@ -34,14 +34,14 @@ def map_uuid(stamp_ns: int, ranges_m: np.ndarray) -> str:
 
 
 @dataclasses.dataclass(frozen=True)
-class MapState:
+class PackedMap:
     """Copies of all that a map is: writing them may take its time while mapping goes on."""
 
     arrays: dict[str, np.ndarray]
     head: dict[str, object]
 
 
-def packed_state(back: BackEnd, extra: dict[str, np.ndarray]) -> MapState:
+def packed_state(back: BackEnd, extra: dict[str, np.ndarray]) -> PackedMap:
     """The map as it is now."""
     arrays = {**_pack_nodes(back), **_pack_submaps(back), **_pack_edges(back.constraints), **extra}
     head = {
@@ -51,10 +51,10 @@ def packed_state(back: BackEnd, extra: dict[str, np.ndarray]) -> MapState:
         "constraints": len(back.constraints),
         "settings": dataclasses.asdict(back.settings),
     }
-    return MapState(arrays, head)
+    return PackedMap(arrays, head)
 
 
-def write_state(folder: Path, state: MapState) -> None:
+def write_state(folder: Path, state: PackedMap) -> None:
     """Write the map; the manifest is replaced last, so a crash leaves the previous map whole."""
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
