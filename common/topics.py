@@ -17,7 +17,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from common import messages as m
+from beamsplat.common import messages as m
 
 Delivery = Literal["latest", "every", "latched"]
 Uplink = Literal["", "up", "bulk", "down"]

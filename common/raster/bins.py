@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from common.raster.compiled import kernel
-from common.raster.layout import CHUNKS
-from common.raster.project import chunk_size
-from common.raster.simd_memory import atomic_next
+from beamsplat.common.compiled import kernel
+from beamsplat.common.raster.layout import CHUNKS
+from beamsplat.common.raster.project import chunk_size
+from beamsplat.common.raster.simd_memory import atomic_next
 
 
 @kernel

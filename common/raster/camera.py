@@ -4,7 +4,7 @@ Kernels take `T_camera_map` (what gsplat calls viewmat); pixel centres have inte
 in this project (gsplat's are at halves: its adapter adds 0.5 to cx and cy).
 
 The pose gradient is that of the left perturbation: with T_camera_map(xi) = se3_exp(xi) @ T_camera_map, it is
-dL/dxi at xi = 0, xi = (rho, phi) in the camera frame, translation first (common.geometry.se3_exp).
+dL/dxi at xi = 0, xi = (rho, phi) in the camera frame, translation first (`geometry.transforms.se3_exp`).
 For a perturbation on the other side, T_camera_map @ se3_exp(xi), multiply it by Ad(T_camera_map)^T:
 see `right_gradient`.
 """
@@ -15,8 +15,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from common.geometry import skew
-from common.raster.layout import NEAR_M
+from beamsplat.common.geometry.transforms import skew
+from beamsplat.common.raster.layout import NEAR_M
 
 
 @dataclass(frozen=True)

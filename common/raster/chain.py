@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from common.raster.compiled import inner, kernel
-from common.raster.lanes import sigmoid_lanes
-from common.raster.layout import (
+from beamsplat.common.compiled import inner, kernel
+from beamsplat.common.raster.lanes import sigmoid_lanes
+from beamsplat.common.raster.layout import (
     CHUNKS,
     COLOUR,
     GRADIENTS,
@@ -17,9 +17,17 @@ from common.raster.layout import (
     SLOT,
     WEIGHT,
 )  # fmt: skip
-from common.raster.project import axes, camera_point, chunk_size, rotation, screen_covariance
-from common.raster.simd import LANES, any_lane, repeat, root, where
-from common.raster.simd_memory import aligned_floats, atomic_next, gather, load, prefetch, store, store_sums4
+from beamsplat.common.raster.project import axes, camera_point, chunk_size, rotation, screen_covariance
+from beamsplat.common.raster.simd import LANES, any_lane, repeat, root, where
+from beamsplat.common.raster.simd_memory import (
+    aligned_floats,
+    atomic_next,
+    gather,
+    load,
+    prefetch,
+    store,
+    store_sums4,
+)
 
 _AHEAD = 24  # pairs whose slots are fetched in advance
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from common.raster.camera import RasterCamera
-from common.raster.layout import COLOUR, MEAN, OPACITY, PARAMS, QUAT, SCALE
+from beamsplat.common.raster.camera import RasterCamera
+from beamsplat.common.raster.layout import COLOUR, MEAN, OPACITY, PARAMS, QUAT, SCALE
 
 _REACH_PX = 2  # of the differences that give a normal
 _SMOOTH = 0.05  # relative step of depth beyond which two pixels are not on one surface

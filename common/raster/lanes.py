@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from common.raster.compiled import inlined
-from common.raster.simd import exp2_scale, exponent, fma, larger, mantissa, smaller, where
+from beamsplat.common.compiled import inlined
+from beamsplat.common.raster.simd import exp2_scale, exponent, fma, larger, mantissa, smaller, where
 
 LOG2_E = 1.4426950408889634
 LN_2 = 0.6931471805599453

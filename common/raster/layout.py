@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 
-from common.raster.simd import LANES
+from beamsplat.common.raster.simd import LANES
 
 MEAN, SCALE, QUAT, OPACITY, COLOUR = 0, 3, 6, 10, 11  # first row of each parameter
 PARAMS = 14  # mean_map_m 3, log scale (ln m) 3, quat_wxyz 4, opacity logit 1, colour rgb 3

@@ -4,20 +4,20 @@ from __future__ import annotations
 
 import numpy as np
 
-from common.raster.compiled import kernel
-from common.raster.lanes import exp2_lanes
-from common.raster.layout import COLOUR, GRADIENTS, MEAN, OPACITY, PARAMS, QUAT, SCALE, WEIGHT
-from common.raster.rasterizer import Gradients
-from common.raster.simd import LANES, any_lane, fma, larger, repeat, root, smaller, where
-from common.raster.simd_memory import atomic_next, gather, load, scatter_some
-from common.raster.threads import Team
+from beamsplat.common.compiled import kernel
+from beamsplat.common.raster.lanes import exp2_lanes
+from beamsplat.common.raster.layout import COLOUR, GRADIENTS, MEAN, OPACITY, PARAMS, QUAT, SCALE, WEIGHT
+from beamsplat.common.raster.rasterizer import Gradients
+from beamsplat.common.raster.simd import LANES, any_lane, fma, larger, repeat, root, smaller, where
+from beamsplat.common.raster.simd_memory import atomic_next, gather, load, scatter_some
+from beamsplat.common.raster.threads import Team
 
 BETA_1, BETA_2, EPSILON = 0.9, 0.999, 1e-15
 _LOG2_BETA_1, _LOG2_BETA_2 = float(np.log2(BETA_1)), float(np.log2(BETA_2))
 
 
 class GaussianArrays:
-    """Columns 0 ... count of every array are Gaussians; rows of `params` as in common.raster.layout."""
+    """Columns 0 ... count of every array are Gaussians; rows of `params` as in `layout`."""
 
     def __init__(self, capacity: int = 4096) -> None:
         self.count = 0

@@ -7,12 +7,23 @@ from __future__ import annotations
 
 import numpy as np
 
-from common.raster.compiled import inner, kernel
-from common.raster.lanes import LOG2_E, exp_lanes, log2_lanes, sigmoid_lanes
-from common.raster.layout import BLUR_PX2, CHUNKS, COLOUR, OPACITY, QUAT, RECORD, ROWS, SCALE, TILE_H, TILE_W
-from common.raster.simd import LANES, fma, larger, root, smaller
-from common.raster.simd_memory import aligned_floats, atomic_next, gather, store
-from common.raster.visible import sort_by_depth
+from beamsplat.common.compiled import inner, kernel
+from beamsplat.common.raster.lanes import LOG2_E, exp_lanes, log2_lanes, sigmoid_lanes
+from beamsplat.common.raster.layout import (
+    BLUR_PX2,
+    CHUNKS,
+    COLOUR,
+    OPACITY,
+    QUAT,
+    RECORD,
+    ROWS,
+    SCALE,
+    TILE_H,
+    TILE_W,
+)
+from beamsplat.common.raster.simd import LANES, fma, larger, root, smaller
+from beamsplat.common.raster.simd_memory import aligned_floats, atomic_next, gather, store
+from beamsplat.common.raster.visible import sort_by_depth
 
 _LN_255 = float(np.log(255.0))
 _SHIFT_W, _SHIFT_H = TILE_W.bit_length() - 1, TILE_H.bit_length() - 1

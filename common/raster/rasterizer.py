@@ -14,16 +14,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from common.raster.bins import count as count_pairs
-from common.raster.bins import place, scatter
-from common.raster.camera import RasterCamera
-from common.raster.chain import chain
-from common.raster.layout import CHANNELS, CHUNKS, GRADIENTS, PARAMS, RECORD, SLOT, TILE_H, TILE_W
-from common.raster.project import project_and_emit
-from common.raster.simd import LANES
-from common.raster.threads import Team
-from common.raster.tiles import backward_tiles, forward_tiles
-from common.raster.visible import BLOCK, compact, cull
+from beamsplat.common.raster.bins import count as count_pairs
+from beamsplat.common.raster.bins import place, scatter
+from beamsplat.common.raster.camera import RasterCamera
+from beamsplat.common.raster.chain import chain
+from beamsplat.common.raster.layout import CHANNELS, CHUNKS, GRADIENTS, PARAMS, RECORD, SLOT, TILE_H, TILE_W
+from beamsplat.common.raster.project import project_and_emit
+from beamsplat.common.raster.simd import LANES
+from beamsplat.common.raster.threads import Team
+from beamsplat.common.raster.tiles import backward_tiles, forward_tiles
+from beamsplat.common.raster.visible import BLOCK, compact, cull
 
 
 class Workspace:

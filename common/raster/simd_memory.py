@@ -10,7 +10,7 @@ from numba import njit, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from common.raster.simd import F32, FLOAT, INT, IVEC, LANES, MASK, VEC, F32Type, constant, shuffle
+from beamsplat.common.raster.simd import F32, FLOAT, INT, IVEC, LANES, MASK, VEC, F32Type, constant, shuffle
 
 
 @njit(nogil=True, error_model="numpy")

@@ -10,9 +10,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from common.raster.compiled import inner, kernel
-from common.raster.lanes import exp2_lanes
-from common.raster.layout import (
+from beamsplat.common.compiled import inner, kernel
+from beamsplat.common.raster.lanes import exp2_lanes
+from beamsplat.common.raster.layout import (
     ALPHA_MAX,
     LOG2_ALPHA_MIN,
     RECORD,
@@ -23,7 +23,7 @@ from common.raster.layout import (
     TILE_PIXELS,
     TILE_W,
 )  # fmt: skip
-from common.raster.simd import (
+from beamsplat.common.raster.simd import (
     LANES,
     any_lane,
     floor,
@@ -36,7 +36,14 @@ from common.raster.simd import (
     smaller,
     where,
 )
-from common.raster.simd_memory import aligned_floats, atomic_next, load, prefetch, store, store_sums4
+from beamsplat.common.raster.simd_memory import (
+    aligned_floats,
+    atomic_next,
+    load,
+    prefetch,
+    store,
+    store_sums4,
+)
 
 _AHEAD = 8  # splats whose records are fetched in advance: they lie anywhere in the depth order
 _CHECK = 8  # splats between two looks whether all pixels of the tile are done

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from common.raster.compiled import kernel
-from common.raster.lanes import exp_lanes
-from common.raster.layout import BLUR_PX2, SCALE
-from common.raster.simd import LANES, any_lane, larger, where
-from common.raster.simd_memory import aligned_floats, atomic_next, load, store
+from beamsplat.common.compiled import kernel
+from beamsplat.common.raster.lanes import exp_lanes
+from beamsplat.common.raster.layout import BLUR_PX2, SCALE
+from beamsplat.common.raster.simd import LANES, any_lane, larger, where
+from beamsplat.common.raster.simd_memory import aligned_floats, atomic_next, load, store
 
 BLOCK = 4096  # Gaussians culled in one piece
 

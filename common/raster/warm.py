@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from common.raster.camera import RasterCamera
-from common.raster.layout import PARAMS
-from common.raster.optimiser import GaussianArrays, rate_rows
-from common.raster.rasterizer import Rasterizer
+from beamsplat.common.raster.camera import RasterCamera
+from beamsplat.common.raster.layout import PARAMS
+from beamsplat.common.raster.optimiser import GaussianArrays, rate_rows
+from beamsplat.common.raster.rasterizer import Rasterizer
 
 
 def warm() -> None:

@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
-from common.errors import UserError
-from common.frames import R_body_camera_level, camera_mount
-from common.geometry import make_transform
-from common.recording.static_frames import StaticFrames, clean
-from common.rig import CameraFile, LidarFile, Mount, RigFile
+from beamsplat.common.errors import UserError
+from beamsplat.common.geometry.frames import R_body_camera_level, camera_mount
+from beamsplat.common.geometry.rig import CameraFile, LidarFile, Mount, RigFile
+from beamsplat.common.geometry.transforms import make_transform
+from beamsplat.common.recording.static_frames import StaticFrames, clean
 
 # ROS names for the models we know; anything else is refused by name.
 _MODELS = {

@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from common import messages as m
-from common.recording.picture import picture_head
-from common.recording.ros_types import stamp_ns_of, transform_of
+from beamsplat.common import messages as m
+from beamsplat.common.recording.picture import picture_head
+from beamsplat.common.recording.ros_types import stamp_ns_of, transform_of
 
 # OpenCV's names for what ROS also calls by its colours.
 _ENCODINGS = {"8UC3": "bgr8", "8UC1": "mono8", "8UC4": "bgra8", "yuyv": "yuv422_yuy2"}

@@ -16,9 +16,9 @@ import numpy as np
 from pydantic import BaseModel
 from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
 
-from common.codec import schema_of
-from common.header import DecodeError, Header
-from common.messages import MESSAGES, Array, Message, Part
+from beamsplat.common.messages import MESSAGES, Array, Message, Part
+from beamsplat.common.messages.codec import schema_of
+from beamsplat.common.messages.header import DecodeError, Header
 
 LIBRARY = "beamsplat 1"
 PROFILE = "ros2"

@@ -22,7 +22,7 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, ChunkIndex, Footer, Header, Message, Schema, Statistics
 from mcap.stream_reader import get_chunk_data_stream
 
-from common.errors import UserError
+from beamsplat.common.errors import UserError
 
 MAGIC = b"\x89MCAP0\r\n"
 _FOOTER_BYTES = 9 + 20 + len(MAGIC)

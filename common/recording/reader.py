@@ -9,14 +9,14 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, NamedTuple
 
-from common.codec import decode
-from common.errors import UserError
-from common.header import DecodeError, Header
-from common.messages import Message
-from common.recording import layout, ros_types
-from common.recording.from_ros import fields_of
-from common.recording.mcap_file import MAGIC, Channel, McapFile
-from common.recording.mcap_file import Message as McapMessage
+from beamsplat.common.errors import UserError
+from beamsplat.common.messages import Message
+from beamsplat.common.messages.codec import decode
+from beamsplat.common.messages.header import DecodeError, Header
+from beamsplat.common.recording import layout, ros_types
+from beamsplat.common.recording.from_ros import fields_of
+from beamsplat.common.recording.mcap_file import MAGIC, Channel, McapFile
+from beamsplat.common.recording.mcap_file import Message as McapMessage
 
 _READ_ROLES = ("message", "fields", "own")
 

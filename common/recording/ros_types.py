@@ -11,7 +11,7 @@ from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
-from common.geometry import make_transform, matrix_from_quat_wxyz, quat_xyzw_from_matrix
+from beamsplat.common.geometry.transforms import make_transform, matrix_from_quat_wxyz, quat_xyzw_from_matrix
 
 # The names of REP 103 and REP 105, so that RViz, nav2 and Foxglove find what they expect.
 FRAME_MAP = "map"

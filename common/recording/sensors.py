@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-from common import messages as m
-from common.recording.from_ros import fields_of
+from beamsplat.common import messages as m
+from beamsplat.common.recording.from_ros import fields_of
 
 
 class Sensor(NamedTuple):

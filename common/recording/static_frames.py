@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from common.geometry import inverse
+from beamsplat.common.geometry.transforms import inverse
 
 # Best first. base_footprint lies on the floor by REP 120, as our body does.
 BODY_NAMES = (

@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from common import messages as m
-from common.recording import ros_types as ros
+from beamsplat.common import messages as m
+from beamsplat.common.recording import ros_types as ros
 
 TF = "/tf"
 TF_STATIC = "/tf_static"

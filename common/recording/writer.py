@@ -11,14 +11,14 @@ from typing import Any
 
 from mcap.writer import CompressionType, Writer
 
-from common.codec import encode, schema_of
-from common.errors import UserError
-from common.header import Header
-from common.messages import Message
-from common.recording import layout, ros_types
-from common.recording.from_ros import fields_of
-from common.recording.metadata import metadata_yaml, qos_profiles
-from common.recording.to_ros import RosRecord, records_of
+from beamsplat.common.errors import UserError
+from beamsplat.common.messages import Message
+from beamsplat.common.messages.codec import encode, schema_of
+from beamsplat.common.messages.header import Header
+from beamsplat.common.recording import layout, ros_types
+from beamsplat.common.recording.from_ros import fields_of
+from beamsplat.common.recording.metadata import metadata_yaml, qos_profiles
+from beamsplat.common.recording.to_ros import RosRecord, records_of
 
 
 class RecordingError(OSError):

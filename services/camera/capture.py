@@ -10,7 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from services.camera.frame import CameraEnded, CameraError, Frame
+from beamsplat.services.camera.frame import CameraEnded, CameraError, Frame
 
 _TIMEOUT_MS = 3000
 _KERNEL_AGE_S = 2.0  # a kernel's time stamp older than that is none

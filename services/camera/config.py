@@ -7,7 +7,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from common.config import NodeConfig, Seconds
+from beamsplat.common.config.deployment import NodeConfig, Seconds
 
 
 class NoCameraConfig(NodeConfig):

@@ -12,9 +12,9 @@ import struct
 from functools import lru_cache
 
 import numpy as np
-from numba import njit
 
-from common.recording.picture import is_whole
+from beamsplat.common.compiled import kernel
+from beamsplat.common.recording.picture import is_whole
 
 _BASELINE = (0xC0, 0xC1)
 _STAND_ALONE = frozenset([0x01, *range(0xD0, 0xD8)])
@@ -132,7 +132,7 @@ def _code_table(counts: bytes, symbols: bytes) -> np.ndarray:
     return table
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _follow(
     data: np.ndarray,  # uint8 [N]
     at: int,

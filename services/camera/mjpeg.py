@@ -7,7 +7,7 @@ import http.client
 from collections.abc import Callable
 from urllib.parse import urlsplit
 
-from services.camera.frame import CameraError, Frame
+from beamsplat.services.camera.frame import CameraError, Frame
 
 _MAX_BYTES = 16 * 1024 * 1024
 _MAX_LINE = 4096

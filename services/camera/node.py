@@ -7,15 +7,15 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from common.clock import StampClock
-from common.errors import UserError
-from common.messages import Image, Rig
-from common.node import Node, Sourced
-from common.rig import RigFile, load_rig
-from services.camera.capture import CaptureSource
-from services.camera.config import CameraConfig, NoCameraConfig
-from services.camera.mjpeg import HttpSource, is_multipart
-from services.camera.reader import Reader, Source
+from beamsplat.common.errors import UserError
+from beamsplat.common.geometry.rig import RigFile, load_rig
+from beamsplat.common.messages import Image, Rig
+from beamsplat.common.runtime.clock import StampClock
+from beamsplat.common.runtime.node import Node, Sourced
+from beamsplat.services.camera.capture import CaptureSource
+from beamsplat.services.camera.config import CameraConfig, NoCameraConfig
+from beamsplat.services.camera.mjpeg import HttpSource, is_multipart
+from beamsplat.services.camera.reader import Reader, Source
 
 _TIMEOUT_S = 3.0
 

@@ -13,9 +13,9 @@ from typing import NamedTuple, Protocol
 
 import cv2
 
-from common.recording.picture import picture_head
-from services.camera.frame import CameraEnded, CameraError, Frame
-from services.camera.jpeg import is_intact
+from beamsplat.common.recording.picture import picture_head
+from beamsplat.services.camera.frame import CameraEnded, CameraError, Frame
+from beamsplat.services.camera.jpeg import is_intact
 
 _POLL_S = 0.1
 _RETRY_S = 0.5

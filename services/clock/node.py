@@ -5,9 +5,9 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 
-from common.clock import StampClock
-from common.messages import Tick
-from common.node import Node, Sourced
+from beamsplat.common.messages import Tick
+from beamsplat.common.runtime.clock import StampClock
+from beamsplat.common.runtime.node import Node, Sourced
 
 TICK_NS = 1_000_000_000
 

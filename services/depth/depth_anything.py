@@ -12,10 +12,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from common.errors import UserError
-from services.depth.onnx_model import OnnxModel, to_hw
-from services.depth.source import Estimate, View, judge
-from services.depth.store import find_model
+from beamsplat.common.errors import UserError
+from beamsplat.services.depth.onnx_model import OnnxModel, to_hw
+from beamsplat.services.depth.source import Estimate, View, judge
+from beamsplat.services.depth.store import find_model
 
 PATCH = 14
 _MEAN = np.array([0.485, 0.456, 0.406], dtype=np.float32)

@@ -11,10 +11,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from common.camera import Pinhole
-from services.depth.onnx_model import OnnxModel, to_hw
-from services.depth.source import Estimate, View, judge
-from services.depth.store import find_model
+from beamsplat.common.geometry.camera import Pinhole
+from beamsplat.services.depth.onnx_model import OnnxModel, to_hw
+from beamsplat.services.depth.source import Estimate, View, judge
+from beamsplat.services.depth.store import find_model
 
 _FX_PER_WIDTH = 0.889
 _FY_PER_HEIGHT = 1.187

@@ -12,11 +12,12 @@ from typing import Annotated
 
 from pydantic import Field
 
-from common.errors import UserError, reason
-from common.strict import Config, parse
-from services.depth.store import find_model, models_dirs, sha256_of
+from beamsplat.common.config.base import Config, parse
+from beamsplat.common.errors import UserError, reason
+from beamsplat.common.files.resources import shipped_file
+from beamsplat.services.depth.store import find_model, models_dirs, sha256_of
 
-TABLE = Path(__file__).resolve().parents[2] / "deploy" / "models.toml"
+TABLE = shipped_file("models.toml")
 _BLOCK = 1 << 18
 _TIMEOUT_S = 30.0
 
@@ -127,7 +128,7 @@ def check(file: Path, table: dict[str, ModelRow]) -> dict[str, object]:
     Raises:
         UserError: no such file, or no graph that runs here.
     """
-    from services.depth.onnx_model import OnnxModel
+    from beamsplat.services.depth.onnx_model import OnnxModel
 
     path = find_model(file)
     model = OnnxModel(path)

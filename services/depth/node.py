@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
-from common.camera import Pinhole, Undistorter
-from common.config import NodeConfig
-from common.errors import UserError
-from common.history import History, TimedScan
-from common.messages import DepthEstimate, Image, Odometry, Rig, Scan
-from common.node import Input, Node, Outputs
-from common.picture import decode_rgb
-from services.depth.source import BLIND, NEED_BEAMS, DepthSource, View, make_source
+from beamsplat.common.config.deployment import NodeConfig
+from beamsplat.common.errors import UserError
+from beamsplat.common.geometry.camera import Pinhole, Undistorter
+from beamsplat.common.geometry.history import History, TimedScan
+from beamsplat.common.messages import DepthEstimate, Image, Odometry, Rig, Scan
+from beamsplat.common.messages.image_codec import decode_rgb
+from beamsplat.common.runtime.node import Input, Node, Outputs
+from beamsplat.services.depth.source import BLIND, NEED_BEAMS, DepthSource, View, make_source
 
 log = logging.getLogger("beamsplat.depth")
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from services.depth.source import Estimate, View
+from beamsplat.services.depth.source import Estimate, View
 
 
 class NoDepth:

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import onnxruntime as ort
 
-from common.errors import UserError
+from beamsplat.common.errors import UserError
 
 # In order of preference; what onnxruntime was built with decides.
 PROVIDERS = (

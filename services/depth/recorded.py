@@ -7,8 +7,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from common.errors import UserError, reason
-from services.depth.source import Estimate, Kind, View, judge
+from beamsplat.common.errors import UserError, reason
+from beamsplat.services.depth.source import Estimate, Kind, View, judge
 
 
 class Recorded:

@@ -14,9 +14,9 @@ from typing import Any, Literal, Protocol
 
 import numpy as np
 
-from common.beams import NO_BEAMS, Beams
-from common.camera import Pinhole
-from common.errors import UserError
+from beamsplat.common.errors import UserError
+from beamsplat.common.geometry.beams import NO_BEAMS, Beams
+from beamsplat.common.geometry.camera import Pinhole
 
 Kind = Literal["metric", "relative", "disparity", "none"]
 
@@ -57,13 +57,13 @@ class DepthSource(Protocol):
 
 # name -> "module:Class"; the class takes its options as keyword arguments and checks them.
 SOURCES: dict[str, str] = {
-    "fastdepth": "services.depth.fastdepth:FastDepth",
-    "unidepth": "services.depth.unidepth:UniDepth",
-    "depth_anything": "services.depth.depth_anything:DepthAnything",
-    "depth_anything_metric": "services.depth.depth_anything:DepthAnythingMetric",
-    "stixel": "services.depth.stixel:Stixel",
-    "recorded": "services.depth.recorded:Recorded",
-    "none": "services.depth.nothing:NoDepth",
+    "fastdepth": "beamsplat.services.depth.fastdepth:FastDepth",
+    "unidepth": "beamsplat.services.depth.unidepth:UniDepth",
+    "depth_anything": "beamsplat.services.depth.depth_anything:DepthAnything",
+    "depth_anything_metric": "beamsplat.services.depth.depth_anything:DepthAnythingMetric",
+    "stixel": "beamsplat.services.depth.stixel:Stixel",
+    "recorded": "beamsplat.services.depth.recorded:Recorded",
+    "none": "beamsplat.services.depth.nothing:NoDepth",
 }
 
 # These look at the beams of a picture's time; the others need not wait for them.

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from common.beams import hidden_beams, plan_polar, plane_depth, wall_ranges
-from common.camera import Pinhole
-from services.depth.source import Estimate, View
+from beamsplat.common.geometry.beams import hidden_beams, plan_polar, plane_depth, wall_ranges
+from beamsplat.common.geometry.camera import Pinhole
+from beamsplat.services.depth.source import Estimate, View
 
 _FINE = 2  # azimuths a pixel column
 

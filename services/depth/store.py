@@ -6,7 +6,7 @@ import hashlib
 import os
 from pathlib import Path
 
-from common.errors import UserError
+from beamsplat.common.errors import UserError
 
 
 def models_dirs() -> list[Path]:

@@ -14,12 +14,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from common.camera import Pinhole
-from common.errors import UserError
-from services.depth.depth_anything import PATCH, normalised
-from services.depth.onnx_model import OnnxModel
-from services.depth.source import Estimate, View, judge
-from services.depth.store import find_model
+from beamsplat.common.errors import UserError
+from beamsplat.common.geometry.camera import Pinhole
+from beamsplat.services.depth.depth_anything import PATCH, normalised
+from beamsplat.services.depth.onnx_model import OnnxModel
+from beamsplat.services.depth.source import Estimate, View, judge
+from beamsplat.services.depth.store import find_model
 
 
 @dataclass(frozen=True)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from common.camera import Pinhole
-from services.fusion.result import Fused
+from beamsplat.common.geometry.camera import Pinhole
+from beamsplat.services.fusion.result import Fused
 
 
 def coloured_cloud(

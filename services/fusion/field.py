@@ -14,16 +14,16 @@ from collections import deque
 import cv2
 import numpy as np
 
-from common.beams import project_beams
-from common.camera import Pinhole
-from common.geometry import inverse
-from services.fusion import volume_kernels as kernels
-from services.fusion.frame import FieldConfig, Frame, Small, Solved, features
-from services.fusion.guess import MetricGuess, metric_guess
-from services.fusion.lidar_map import LidarMap
-from services.fusion.memory import Memory, Remembered
-from services.fusion.relative_pose import corners, refine_between
-from services.fusion.surfaces import CeilingFinder, SurfaceFinder, Surfaces
+from beamsplat.common.geometry.beams import project_beams
+from beamsplat.common.geometry.camera import Pinhole
+from beamsplat.common.geometry.transforms import inverse
+from beamsplat.services.fusion import volume_kernels as kernels
+from beamsplat.services.fusion.frame import FieldConfig, Frame, Small, Solved, features
+from beamsplat.services.fusion.guess import MetricGuess, metric_guess
+from beamsplat.services.fusion.lidar_map import LidarMap
+from beamsplat.services.fusion.memory import Memory, Remembered
+from beamsplat.services.fusion.relative_pose import corners, refine_between
+from beamsplat.services.fusion.surfaces import CeilingFinder, SurfaceFinder, Surfaces
 
 _TILTED_WALL_M = 0.05  # a lidar in the hand: walls are not upright in its frame
 

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
-jit = njit(nogil=True, cache=True, error_model="numpy")
+from beamsplat.common.compiled import kernel
 
 
-@jit
+@kernel
 def enlarge(
     depth: np.ndarray,  # float32 [h, w], NaN = unknown
     sigma_log: np.ndarray,  # float32 [h, w]
@@ -60,7 +59,7 @@ def enlarge(
             sigma_out[V, U] = depth[i, j] * sigma_log[i, j]
 
 
-@jit
+@kernel
 def _one_surface(depth: np.ndarray, i0: int, j0: int, most: float) -> bool:
     """Whether the four pixels from [i0, j0] on are known and within a factor `most` of each other."""
     low, high = np.inf, 0.0
@@ -72,7 +71,7 @@ def _one_surface(depth: np.ndarray, i0: int, j0: int, most: float) -> bool:
     return high < low * most
 
 
-@jit
+@kernel
 def _most_alike(
     colour: np.ndarray, full_colour: np.ndarray, V: int, U: int, i0: int, j0: int, a: float, b: float
 ) -> tuple[int, int]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from common.beams import Beams
+from beamsplat.common.geometry.beams import Beams
 
 
 @dataclass(frozen=True)

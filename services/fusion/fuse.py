@@ -7,17 +7,17 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from common.beams import NO_BEAMS, project_beams
-from common.camera import Pinhole
-from services.fusion import finish
-from services.fusion.field import Field
-from services.fusion.frame import FieldConfig, Frame, Solved
-from services.fusion.health import PictureHealth, beams_status
-from services.fusion.memory import Remembered
-from services.fusion.pairs import largest_cluster
-from services.fusion.result import Fused, refusal
-from services.fusion.scaling import Scale, as_depth, scale_of
-from services.fusion.surfaces import Surfaces
+from beamsplat.common.geometry.beams import NO_BEAMS, project_beams
+from beamsplat.common.geometry.camera import Pinhole
+from beamsplat.services.fusion import finish
+from beamsplat.services.fusion.field import Field
+from beamsplat.services.fusion.frame import FieldConfig, Frame, Solved
+from beamsplat.services.fusion.health import PictureHealth, beams_status
+from beamsplat.services.fusion.memory import Remembered
+from beamsplat.services.fusion.pairs import largest_cluster
+from beamsplat.services.fusion.result import Fused, refusal
+from beamsplat.services.fusion.scaling import Scale, as_depth, scale_of
+from beamsplat.services.fusion.surfaces import Surfaces
 
 # Standard deviations of log depth, measured on both recordings by what a pixel's depth rests on.
 _BEAM, _FLOOR, _SURFACE = 0.002, 0.004, 0.010

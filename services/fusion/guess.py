@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from services.fusion.pairs import make_pairs
-from services.fusion.scaling import Kind, affine, as_depth
+from beamsplat.services.fusion.pairs import make_pairs
+from beamsplat.services.fusion.scaling import Kind, affine, as_depth
 
 _COLUMNS = 64
 _BAND = 0.10  # of the picture's width: how far a beam's ratio reaches sideways

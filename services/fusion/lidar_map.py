@@ -7,9 +7,8 @@ robots that stay on a floor: a tilting lidar paints other heights.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
-jit = njit(nogil=True, cache=True, error_model="numpy")
+from beamsplat.common.compiled import kernel
 
 
 class LidarMap:
@@ -75,7 +74,7 @@ class LidarMap:
         return out
 
 
-@jit
+@kernel
 def march(
     cells: np.ndarray,  # float32 [rows, columns, 3]
     origin_m: np.ndarray,  # float64 [2]

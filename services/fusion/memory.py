@@ -6,11 +6,9 @@ from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
-from common.geometry import inverse
-
-jit = njit(nogil=True, cache=True, error_model="numpy")
+from beamsplat.common.compiled import kernel
+from beamsplat.common.geometry.transforms import inverse
 
 
 @dataclass(frozen=True)
@@ -49,7 +47,7 @@ class Memory:
         return Remembered(depth, votes)
 
 
-@jit
+@kernel
 def carry(z: np.ndarray, R: np.ndarray, t: np.ndarray, K: np.ndarray, out: np.ndarray) -> None:
     """Splats depth float32 [h, w] of one view into another (`R, t`: first to second); nearest wins.
 
@@ -83,7 +81,7 @@ def carry(z: np.ndarray, R: np.ndarray, t: np.ndarray, K: np.ndarray, out: np.nd
                         out[i, j] = Z
 
 
-@jit
+@kernel
 def vote(carried: np.ndarray, agreement: float, depth: np.ndarray, votes: np.ndarray) -> None:
     """Median over the first axis of float32 [n, h, w] (NaN left out), and the count within `agreement`."""
     n, h, w = carried.shape

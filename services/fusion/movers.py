@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
-from common.beams import Beams, plan_polar
-from common.camera import Pinhole
-
-jit = njit(nogil=True, cache=True, error_model="numpy")
+from beamsplat.common.compiled import kernel
+from beamsplat.common.geometry.beams import Beams, plan_polar
+from beamsplat.common.geometry.camera import Pinhole
 
 
 class FreeSpace:
@@ -70,7 +68,7 @@ def mover_mask(
     return served & low & at_depth
 
 
-@jit
+@kernel
 def pass_through(
     start_m: np.ndarray,  # float64 [2]
     ends_m: np.ndarray,  # float64 [N, 2]

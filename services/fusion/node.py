@@ -10,14 +10,13 @@ from typing import Literal
 import numpy as np
 from pydantic import Field
 
-from common.beams import scan_points
-from common.camera import Pinhole, Undistorter
-from common.config import NodeConfig
-from common.errors import UserError
-from common.geometry import inverse, transform_points
-from common.header import Header
-from common.history import History, TimedScan
-from common.messages import (
+from beamsplat.common.config.deployment import NodeConfig
+from beamsplat.common.errors import UserError
+from beamsplat.common.geometry.beams import scan_points
+from beamsplat.common.geometry.camera import Pinhole, Undistorter
+from beamsplat.common.geometry.history import History, TimedScan
+from beamsplat.common.geometry.transforms import inverse, transform_points
+from beamsplat.common.messages import (
     Cloud,
     DepthEstimate,
     FusedDepth,
@@ -27,13 +26,14 @@ from common.messages import (
     Rig,
     Scan,
 )  # fmt: skip
-from common.node import Input, Job, Node, Outputs
-from common.picture import decode_rgb
-from services.fusion.calibration.startup import CalibrationHealth, StartupCheck
-from services.fusion.frame import Frame
-from services.fusion.fuse import Fusion
-from services.fusion.result import Fused
-from services.fusion.single import SingleCorrection
+from beamsplat.common.messages.header import Header
+from beamsplat.common.messages.image_codec import decode_rgb
+from beamsplat.common.runtime.node import Input, Job, Node, Outputs
+from beamsplat.services.fusion.calibration.startup import CalibrationHealth, StartupCheck
+from beamsplat.services.fusion.frame import Frame
+from beamsplat.services.fusion.fuse import Fusion
+from beamsplat.services.fusion.result import Fused
+from beamsplat.services.fusion.single import SingleCorrection
 
 log = logging.getLogger("beamsplat.fusion")
 

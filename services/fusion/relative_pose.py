@@ -10,8 +10,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from common.camera import Pinhole
-from common.geometry import skew, so3_exp
+from beamsplat.common.geometry.camera import Pinhole
+from beamsplat.common.geometry.transforms import skew, so3_exp
 
 _LK = {"winSize": (13, 13), "maxLevel": 3, "flags": cv2.OPTFLOW_USE_INITIAL_FLOW}
 MIN_TRACKS = 12

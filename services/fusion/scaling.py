@@ -7,8 +7,8 @@ from typing import Literal
 
 import numpy as np
 
-from services.fusion.pairs import effective_count, largest_cluster, make_pairs
-from services.fusion.result import Fused, refusal
+from beamsplat.services.fusion.pairs import effective_count, largest_cluster, make_pairs
+from beamsplat.services.fusion.result import Fused, refusal
 
 Kind = Literal["metric", "relative", "disparity", "none"]
 

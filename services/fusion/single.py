@@ -6,12 +6,12 @@ from typing import Literal
 
 import numpy as np
 
-from common.beams import project_beams
-from common.camera import Pinhole
-from services.fusion.frame import Frame
-from services.fusion.health import PictureHealth
-from services.fusion.result import Fused, refusal
-from services.fusion.scaling import affine, as_depth, ratio
+from beamsplat.common.geometry.beams import project_beams
+from beamsplat.common.geometry.camera import Pinhole
+from beamsplat.services.fusion.frame import Frame
+from beamsplat.services.fusion.health import PictureHealth
+from beamsplat.services.fusion.result import Fused, refusal
+from beamsplat.services.fusion.scaling import affine, as_depth, ratio
 
 SingleMethod = Literal["ratio", "affine", "given"]
 _GIVEN_SIGMA = 0.3  # relative: nobody has looked whether the guess is right

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from common.beams import Beams, hidden_beams, plan_polar, plane_depth, wall_ranges
-from common.camera import Pinhole
-from common.geometry import yaw_of
-from services.fusion.lidar_map import LidarMap
-from services.fusion.wall_lines import find_lines, ranges_to
+from beamsplat.common.geometry.beams import Beams, hidden_beams, plan_polar, plane_depth, wall_ranges
+from beamsplat.common.geometry.camera import Pinhole
+from beamsplat.common.geometry.transforms import yaw_of
+from beamsplat.services.fusion.lidar_map import LidarMap
+from beamsplat.services.fusion.wall_lines import find_lines, ranges_to
 
 _LAYER_RAYS_PER_PX, _WALL_RAYS_PER_PX = 2, 8
 _CONTINUED = 3  # continued walls a ray may meet

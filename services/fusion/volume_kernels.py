@@ -7,13 +7,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
-jit = njit(nogil=True, cache=True, error_model="numpy")
+from beamsplat.common.compiled import kernel
+
 _BEST = 4  # costs kept of each label; the mean of the better half of the views counts (occlusion)
 
 
-@jit
+@kernel
 def cost_volume(
     reference: np.ndarray,  # [h, w, 3] features of the picture
     sources: np.ndarray,  # [S, h, w, 3] features of the other pictures
@@ -85,7 +85,7 @@ def cost_volume(
             _finish(best, count, last, cut, out[v, u])
 
 
-@jit
+@kernel
 def _finish(best: np.ndarray, count: np.ndarray, last: int, cut: float, out: np.ndarray) -> None:
     D = out.shape[0]
     lowest, total, seen = cut, np.float32(0.0), 0
@@ -110,7 +110,7 @@ def _finish(best: np.ndarray, count: np.ndarray, last: int, cut: float, out: np.
         out[d] = cut
 
 
-@jit
+@kernel
 def box3(volume: np.ndarray, scale: float, out: np.ndarray) -> None:
     """Each label's costs averaged over 3 x 3 pixels (edges repeated), times `scale`."""
     h, w, D = volume.shape
@@ -127,7 +127,7 @@ def box3(volume: np.ndarray, scale: float, out: np.ndarray) -> None:
                 out[v, u, d] = gain * (row[left, d] + row[u, d] + row[right, d])
 
 
-@jit
+@kernel
 def add_prior(
     volume: np.ndarray,  # [h, w, D], changed in place
     z: np.ndarray,  # [h, w] depth of the surface expected, NaN = none
@@ -150,7 +150,7 @@ def add_prior(
                 volume[v, u, d] -= np.float32(weight[v, u] * np.exp(-0.5 * e * e))
 
 
-@jit
+@kernel
 def aggregate(
     cost: np.ndarray,  # [h, w, D]
     guide: np.ndarray,  # [h, w] grey values
@@ -192,7 +192,7 @@ def aggregate(
             v, u = v + dv, u + du
 
 
-@jit
+@kernel
 def winners(
     total: np.ndarray,  # [h, w, D]
     log_z: np.ndarray,  # [D] float64
@@ -226,7 +226,7 @@ def winners(
             spread[v, u] = np.sqrt(second / mass)
 
 
-@jit
+@kernel
 def plane_gain(
     volume: np.ndarray,  # [h, w, D]
     rise: np.ndarray,  # [h, w]: upward part of the rays (z_camera = 1) in the body frame

@@ -9,9 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
-jit = njit(nogil=True, cache=True, error_model="numpy")
+from beamsplat.common.compiled import kernel
 
 _ANGLES = 180
 _NEAR_M = 0.06  # of a line: its points
@@ -68,7 +67,7 @@ def find_lines(points_m: np.ndarray, cell_m: float, least_m: float = 1.2, most: 
     return lines
 
 
-@jit
+@kernel
 def vote(points: np.ndarray, cell_m: float, reach_m: float, votes: np.ndarray) -> None:
     """votes[a, b] += 1 for every line at angle a and distance b from the origin through a point [N, 2]."""
     for a in range(votes.shape[0]):

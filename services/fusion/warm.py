@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from common.beams import Beams
-from common.camera import Pinhole
-from common.frames import camera_mount
-from common.geometry import se2_to_se3
-from services.fusion.frame import Frame
-from services.fusion.fuse import Fusion
-from services.fusion.movers import FreeSpace
+from beamsplat.common.geometry.beams import Beams
+from beamsplat.common.geometry.camera import Pinhole
+from beamsplat.common.geometry.frames import camera_mount
+from beamsplat.common.geometry.transforms import se2_to_se3
+from beamsplat.services.fusion.frame import Frame
+from beamsplat.services.fusion.fuse import Fusion
+from beamsplat.services.fusion.movers import FreeSpace
 
 
 def warm() -> None:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from common.beams import plan_polar
-from common.camera import Pinhole
+from beamsplat.common.geometry.beams import plan_polar
+from beamsplat.common.geometry.camera import Pinhole
 
 HEIGHT_M = 2.1
 _HALF_WIDTH_M = 0.30  # of a body with its arms, around the beams at its ankles

@@ -18,7 +18,7 @@ import msgpack
 import numpy as np
 import xxhash
 
-from common.persist import make_folder, write_atomically
+from beamsplat.common.files.persist import make_folder, write_atomically
 
 log = logging.getLogger("beamsplat.keyframes")
 
@@ -38,7 +38,7 @@ class Label:
 
     key: int
     drive: str  # whose anchors it hangs on
-    view: tuple[float, ...]  # place and direction, see `services.keyframes.outbox`
+    view: tuple[float, ...]  # place and direction, see `beamsplat.services.keyframes.outbox`
     size: int  # bytes of the payload
 
 

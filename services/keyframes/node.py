@@ -11,16 +11,13 @@ import cv2
 import numpy as np
 from pydantic import Field
 
-from common.beams import project_beams
-from common.camera import Pinhole, Undistorter
-from common.codec import decode, encode, schema_of
-from common.config import NodeConfig
-from common.depth_code import depth_to_png, mask_to_png, sigma_to_png
-from common.errors import UserError
-from common.geometry import inverse
-from common.header import DecodeError, Header
-from common.history import History, TimedScan
-from common.messages import (
+from beamsplat.common.config.deployment import NodeConfig
+from beamsplat.common.errors import UserError
+from beamsplat.common.geometry.beams import project_beams
+from beamsplat.common.geometry.camera import Pinhole, Undistorter
+from beamsplat.common.geometry.history import History, TimedScan
+from beamsplat.common.geometry.transforms import inverse
+from beamsplat.common.messages import (
     Anchors,
     Correction,
     FusedDepth,
@@ -32,11 +29,14 @@ from common.messages import (
     Rig,
     Scan,
 )  # fmt: skip
-from common.node import Input, Node, Outputs
-from common.picture import decode_rgb
-from services.keyframes.bodies import body_mask
-from services.keyframes.outbox import Outbox
-from services.keyframes.selection import KeyframeSelector, SelectionSettings
+from beamsplat.common.messages.codec import decode, encode, schema_of
+from beamsplat.common.messages.depth_png import depth_to_png, mask_to_png, sigma_to_png
+from beamsplat.common.messages.header import DecodeError, Header
+from beamsplat.common.messages.image_codec import decode_rgb
+from beamsplat.common.runtime.node import Input, Node, Outputs
+from beamsplat.services.keyframes.bodies import body_mask
+from beamsplat.services.keyframes.outbox import Outbox
+from beamsplat.services.keyframes.selection import KeyframeSelector, SelectionSettings
 
 log = logging.getLogger("beamsplat.keyframes")
 

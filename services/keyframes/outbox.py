@@ -19,8 +19,8 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
-from common.complaints import Complaints
-from services.keyframes.folder import Folder, Label
+from beamsplat.common.runtime.rate_limited_log import Complaints
+from beamsplat.services.keyframes.folder import Folder, Label
 
 log = logging.getLogger("beamsplat.keyframes")
 

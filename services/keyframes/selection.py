@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from common.geometry import inverse, is_rigid, so3_log
+from beamsplat.common.geometry.transforms import inverse, is_rigid, so3_log
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from common.config import NodeConfig
+from beamsplat.common.config.deployment import NodeConfig
 
 Metres = Annotated[float, Field(gt=0.0, le=1000.0, allow_inf_nan=False)]
 

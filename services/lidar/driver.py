@@ -8,12 +8,12 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from services.lidar.clock import DeviceClock
-from services.lidar.framing import Counters
-from services.lidar.guard import LinkNoise
-from services.lidar.link import Link
-from services.lidar.revolution import RevolutionBuilder
-from services.lidar.samples import Samples, StampedScan
+from beamsplat.services.lidar.clock import DeviceClock
+from beamsplat.services.lidar.framing import Counters
+from beamsplat.services.lidar.guard import LinkNoise
+from beamsplat.services.lidar.link import Link
+from beamsplat.services.lidar.revolution import RevolutionBuilder
+from beamsplat.services.lidar.samples import Samples, StampedScan
 
 _CHAIN = 31  # spans remembered
 _CHAIN_NEEDED = 8  # before the first check

@@ -6,12 +6,12 @@ import time
 
 import numpy as np
 
-from services.lidar.clock import Unwrapper
-from services.lidar.driver import Driver
-from services.lidar.framing import Framer
-from services.lidar.link import Link, LinkError, drain
-from services.lidar.samples import Revolution, StampedScan
-from services.lidar.scip import Geometry, ScanReply, parameters
+from beamsplat.services.lidar.clock import Unwrapper
+from beamsplat.services.lidar.driver import Driver
+from beamsplat.services.lidar.framing import Framer
+from beamsplat.services.lidar.link import Link, LinkError, drain
+from beamsplat.services.lidar.samples import Revolution, StampedScan
+from beamsplat.services.lidar.scip import Geometry, ScanReply, parameters
 
 _ANSWER_S = 0.6
 _TRIES = 4

@@ -12,11 +12,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from services.lidar.clock import Unwrapper, spread
-from services.lidar.driver import Driver, StartChain
-from services.lidar.framing import Framer
-from services.lidar.link import Link
-from services.lidar.samples import Samples, StampedScan
+from beamsplat.services.lidar.clock import Unwrapper, spread
+from beamsplat.services.lidar.driver import Driver, StartChain
+from beamsplat.services.lidar.framing import Framer
+from beamsplat.services.lidar.link import Link
+from beamsplat.services.lidar.samples import Samples, StampedScan
 
 PACKET_BYTES = 47
 POINTS = 12

@@ -10,7 +10,7 @@ from typing import Protocol
 
 import serial
 
-from common.errors import UserError
+from beamsplat.common.errors import UserError
 
 _CHUNK = 4096
 _BITS_PER_BYTE = 10  # start, eight, stop

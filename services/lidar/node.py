@@ -7,17 +7,17 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from common.clock import StampClock
-from common.messages import Scan
-from common.node import Node, Sourced
-from services.lidar.config import HokuyoConfig, LidarConfig, RplidarConfig
-from services.lidar.driver import Driver
-from services.lidar.hokuyo import HokuyoDriver
-from services.lidar.ldrobot import LdrobotDriver
-from services.lidar.link import Link, open_link
-from services.lidar.reader import Reader
-from services.lidar.rplidar import RplidarDriver
-from services.lidar.samples import StampedScan
+from beamsplat.common.messages import Scan
+from beamsplat.common.runtime.clock import StampClock
+from beamsplat.common.runtime.node import Node, Sourced
+from beamsplat.services.lidar.config import HokuyoConfig, LidarConfig, RplidarConfig
+from beamsplat.services.lidar.driver import Driver
+from beamsplat.services.lidar.hokuyo import HokuyoDriver
+from beamsplat.services.lidar.ldrobot import LdrobotDriver
+from beamsplat.services.lidar.link import Link, open_link
+from beamsplat.services.lidar.reader import Reader
+from beamsplat.services.lidar.rplidar import RplidarDriver
+from beamsplat.services.lidar.samples import StampedScan
 
 
 class _LidarNode(Node, ABC):

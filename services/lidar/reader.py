@@ -6,9 +6,9 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 
-from services.lidar.driver import Driver
-from services.lidar.link import Link, LinkError
-from services.lidar.samples import StampedScan
+from beamsplat.services.lidar.driver import Driver
+from beamsplat.services.lidar.link import Link, LinkError
+from beamsplat.services.lidar.samples import StampedScan
 
 _POLL_S = 0.1
 _RETRY_S = 0.25  # a device that is plugged in again is found within this

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from services.lidar.framing import Counters
-from services.lidar.guard import confirmed
-from services.lidar.samples import Revolution, Samples
+from beamsplat.services.lidar.framing import Counters
+from beamsplat.services.lidar.guard import confirmed
+from beamsplat.services.lidar.samples import Revolution, Samples
 
 _LEAST_SHARE = 0.1  # of a turn's directions that must have been measured
 _LEAST_SAMPLES = 40

@@ -5,11 +5,11 @@ from __future__ import annotations
 import struct
 import time
 
-from services.lidar import rplidar_packets as rp
-from services.lidar.driver import Driver
-from services.lidar.link import Link, LinkError, drain
-from services.lidar.rplidar_stream import RplidarStream
-from services.lidar.samples import StampedScan
+from beamsplat.services.lidar import rplidar_packets as rp
+from beamsplat.services.lidar.driver import Driver
+from beamsplat.services.lidar.link import Link, LinkError, drain
+from beamsplat.services.lidar.rplidar_stream import RplidarStream
+from beamsplat.services.lidar.samples import StampedScan
 
 _ANSWER_S = 0.4
 _TRIES = 4

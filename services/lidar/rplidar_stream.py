@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from services.lidar import rplidar_packets as rp
-from services.lidar.driver import StartChain
-from services.lidar.framing import Counters, Framer
-from services.lidar.samples import Samples
+from beamsplat.services.lidar import rplidar_packets as rp
+from beamsplat.services.lidar.driver import StartChain
+from beamsplat.services.lidar.framing import Counters, Framer
+from beamsplat.services.lidar.samples import Samples
 
 _NODE_SLACK_DEG = 2.0  # a node that is this far from where it must be is not believed
 _NODES_IN_A_ROW = 16  # with three bits to check, so many must fit before they are

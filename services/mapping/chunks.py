@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from common.geometry import inverse
-from common.raster.layout import MEAN
-from services.mapping.detail import cell_for, coarser
-from services.mapping.mapper import Mapper
-from services.mapping.store import moved
+from beamsplat.common.geometry.transforms import inverse
+from beamsplat.common.mapfiles.detail import cell_for, coarser
+from beamsplat.common.mapfiles.store import moved
+from beamsplat.common.raster.layout import MEAN
+from beamsplat.services.mapping.mapper import Mapper
 
 _NEVER = (-1, 0.0, -1)
 

@@ -7,7 +7,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from common.config import NodeConfig
+from beamsplat.common.config.deployment import NodeConfig
 
 Steps = Annotated[int, Field(ge=0, le=100_000)]
 

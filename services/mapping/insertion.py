@@ -5,9 +5,9 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from common.raster.discs import choose_pixels, make_discs
-from services.mapping.keyframe import Level
-from services.mapping.settings import MapperSettings
+from beamsplat.common.raster.discs import choose_pixels, make_discs
+from beamsplat.services.mapping.keyframe import Level
+from beamsplat.services.mapping.settings import MapperSettings
 
 
 def unexplained(

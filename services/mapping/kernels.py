@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from common.raster.compiled import kernel
-from common.raster.layout import MEAN, SCALE
-from common.raster.simd_memory import atomic_next
+from beamsplat.common.compiled import kernel
+from beamsplat.common.raster.layout import MEAN, SCALE
+from beamsplat.common.raster.simd_memory import atomic_next
 
 
 @kernel

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field, replace
 import cv2
 import numpy as np
 
-from common.geometry import is_rigid, se3_exp, se3_log
-from common.raster.camera import RasterCamera
+from beamsplat.common.geometry.transforms import is_rigid, se3_exp, se3_log
+from beamsplat.common.raster.camera import RasterCamera
 
 MAX_DEPTH_M = 60.0
 _UNKNOWN_REACH_M = 20.0  # how far a picture may look where it knows no depth

@@ -12,17 +12,25 @@ from typing import Any
 
 import numpy as np
 
-from common.geometry import inverse, is_rigid
-from common.raster.layout import OPACITY
-from common.raster.optimiser import rate_rows
-from common.raster.rasterizer import Rasterizer, Render
-from services.mapping.insertion import foretold, new_gaussians, unexplained
-from services.mapping.kernels import add_lidar, contradicted, photometric_and_depth
-from services.mapping.keyframe import Held, Keyframe, Level, hold, refine_exposure, refine_pose, with_hidden
-from services.mapping.places import Places
-from services.mapping.settings import MapperSettings
-from services.mapping.ssim import SsimLoss
-from services.mapping.store import Elsewhere, GaussianStore
+from beamsplat.common.geometry.transforms import inverse, is_rigid
+from beamsplat.common.mapfiles.store import Elsewhere, GaussianStore
+from beamsplat.common.raster.layout import OPACITY
+from beamsplat.common.raster.optimiser import rate_rows
+from beamsplat.common.raster.rasterizer import Rasterizer, Render
+from beamsplat.common.raster.ssim import SsimLoss
+from beamsplat.services.mapping.insertion import foretold, new_gaussians, unexplained
+from beamsplat.services.mapping.kernels import add_lidar, contradicted, photometric_and_depth
+from beamsplat.services.mapping.keyframe import (
+    Held,
+    Keyframe,
+    Level,
+    hold,
+    refine_exposure,
+    refine_pose,
+    with_hidden,
+)
+from beamsplat.services.mapping.places import Places
+from beamsplat.services.mapping.settings import MapperSettings
 
 FULL, HALF = 0, 1
 _REMEMBERED = 4096  # keyframes given up whose ids are still known: robots keep fewer to send them again

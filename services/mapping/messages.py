@@ -7,18 +7,18 @@ from collections.abc import Callable, Iterator
 import cv2
 import numpy as np
 
-from common.camera import Pinhole, Undistorter
-from common.codec import encode, schema_of
-from common.depth_code import depth_from_png, mask_from_png, sigma_from_png
-from common.errors import UserError
-from common.messages import Keyframe, KeyframeAck, MapChunk, MapPreview, MapState
-from common.picture import decode_rgb
-from common.raster.camera import RasterCamera
-from common.splats import pack
-from services.mapping.chunks import Eye, Part
-from services.mapping.keyframe import Keyframe as MapKeyframe
-from services.mapping.look import Look
-from services.mapping.session.folder import Arrays, packed_arrays, unpacked_arrays
+from beamsplat.common.errors import UserError
+from beamsplat.common.geometry.camera import Pinhole, Undistorter
+from beamsplat.common.mapfiles.session import Arrays, packed_arrays, unpacked_arrays
+from beamsplat.common.messages import Keyframe, KeyframeAck, MapChunk, MapPreview, MapState
+from beamsplat.common.messages.codec import encode, schema_of
+from beamsplat.common.messages.depth_png import depth_from_png, mask_from_png, sigma_from_png
+from beamsplat.common.messages.image_codec import decode_rgb
+from beamsplat.common.messages.splat_codec import pack
+from beamsplat.common.raster.camera import RasterCamera
+from beamsplat.services.mapping.chunks import Eye, Part
+from beamsplat.services.mapping.keyframe import Keyframe as MapKeyframe
+from beamsplat.services.mapping.preview import Look
 
 _PIECE_BYTES = 4 << 20
 

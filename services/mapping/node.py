@@ -10,18 +10,17 @@ from itertools import chain
 
 import numpy as np
 
-from common.camera import Undistorter
-from common.errors import UserError
-from common.geometry import inverse
-from common.messages import Anchors, Keyframe, MapChunk, MapPoses, MapState, MapStatus, Tick
-from common.node import Input, Outputs
-from services.mapping.chunks import ChunkFeed, Eye, on_disk, parts
-from services.mapping.config import MappingConfig
-from services.mapping.export import write_map
-from services.mapping.keyframe import Held
-from services.mapping.look import look
-from services.mapping.mapper import FULL, HALF, Mapper, Outcome
-from services.mapping.messages import (
+from beamsplat.common.errors import UserError
+from beamsplat.common.geometry.camera import Undistorter
+from beamsplat.common.geometry.transforms import inverse
+from beamsplat.common.mapfiles.ply import write_map
+from beamsplat.common.messages import Anchors, Keyframe, MapChunk, MapPoses, MapState, MapStatus, Tick
+from beamsplat.common.runtime.node import Input, Outputs
+from beamsplat.services.mapping.chunks import ChunkFeed, Eye, on_disk, parts
+from beamsplat.services.mapping.config import MappingConfig
+from beamsplat.services.mapping.keyframe import Held
+from beamsplat.services.mapping.mapper import FULL, HALF, Mapper, Outcome
+from beamsplat.services.mapping.messages import (
     ack,
     body_of,
     chunk_message,
@@ -30,11 +29,12 @@ from services.mapping.messages import (
     preview_message,
     state_messages,
 )
-from services.mapping.session.node import SessionNode
-from services.mapping.session.paging import check_budget
-from services.mapping.session.state import arrays_of
-from services.mapping.settings import MapperSettings
-from services.mapping.warm import warm
+from beamsplat.services.mapping.preview import look
+from beamsplat.services.mapping.session.node import SessionNode
+from beamsplat.services.mapping.session.paging import check_budget
+from beamsplat.services.mapping.session.state import arrays_of
+from beamsplat.services.mapping.settings import MapperSettings
+from beamsplat.services.mapping.warm import warm
 
 log = logging.getLogger("beamsplat.mapping")
 

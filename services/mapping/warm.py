@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from common.raster.camera import RasterCamera
-from common.raster.warm import warm as warm_rasterizer
-from services.mapping.keyframe import Keyframe
-from services.mapping.mapper import FULL, HALF, Mapper
-from services.mapping.settings import MapperSettings
+from beamsplat.common.raster.camera import RasterCamera
+from beamsplat.common.raster.warm import warm as warm_rasterizer
+from beamsplat.services.mapping.keyframe import Keyframe
+from beamsplat.services.mapping.mapper import FULL, HALF, Mapper
+from beamsplat.services.mapping.settings import MapperSettings
 
 
 def warm() -> None:

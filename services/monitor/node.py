@@ -9,18 +9,18 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from common.config import NodeConfig
-from common.errors import UserError
-from common.messages import FusedDepth, Health, MapStatus, Odometry, Rig
-from common.node import Input, Node, Output
-from services.monitor.depth_view import DepthView
-from services.monitor.layout import layout
-from services.monitor.map_view import MapView
-from services.monitor.panel import NodeReport, Panel
-from services.monitor.scene import Look, Scene
-from services.monitor.screen import Screen
-from services.monitor.tracks import RateLimit
-from services.monitor.web import allowed_origins, free_port, serve_page
+from beamsplat.common.config.deployment import NodeConfig
+from beamsplat.common.errors import UserError
+from beamsplat.common.messages import FusedDepth, Health, MapStatus, Odometry, Rig
+from beamsplat.common.runtime.node import Input, Node, Output
+from beamsplat.services.monitor.depth_view import DepthView
+from beamsplat.services.monitor.layout import layout
+from beamsplat.services.monitor.map_view import MapView
+from beamsplat.services.monitor.panel import NodeReport, Panel
+from beamsplat.services.monitor.scene import Look, Scene
+from beamsplat.services.monitor.screen import Screen
+from beamsplat.services.monitor.tracks import RateLimit
+from beamsplat.services.monitor.web import allowed_origins, free_port, serve_page
 
 log = logging.getLogger(__name__)
 

@@ -18,9 +18,9 @@ from dataclasses import dataclass
 import numpy as np
 import rerun as rr
 
-from common.geometry import inverse, quat_xyzw_from_matrix, transform_points
-from services.monitor.screen import Screen
-from services.monitor.tracks import Path, Poses, RateLimit, scan_points, sweep_to_world
+from beamsplat.common.geometry.transforms import inverse, quat_xyzw_from_matrix, transform_points
+from beamsplat.services.monitor.screen import Screen
+from beamsplat.services.monitor.tracks import Path, Poses, RateLimit, scan_points, sweep_to_world
 
 WORLD = "map"
 BODY = f"{WORLD}/odom/body"

@@ -6,7 +6,7 @@ from collections import deque
 
 import numpy as np
 
-from common.geometry import interpolate, transform_points
+from beamsplat.common.geometry.transforms import interpolate, transform_points
 
 RECENT_POSES = 200
 REACH_NS = 500_000_000  # a pose stands for times this close beyond the first and the last one

@@ -11,14 +11,14 @@ from typing import Any
 
 from mcap.writer import CompressionType
 
-from common.errors import UserError
-from common.header import Header, local_clock_id
-from common.messages import Health, Message
-from common.node import Input, Node, Output
-from common.recording import RecordingError, RecordingWriter
-from common.topics import HEALTH, TOPICS
-from services.recorder.arrival import ArrivalClock
-from services.recorder.config import RecorderConfig
+from beamsplat.common.errors import UserError
+from beamsplat.common.messages import Health, Message
+from beamsplat.common.messages.header import Header, local_clock_id
+from beamsplat.common.recording import RecordingError, RecordingWriter
+from beamsplat.common.runtime.node import Input, Node, Output
+from beamsplat.common.topics import HEALTH, TOPICS
+from beamsplat.services.recorder.arrival import ArrivalClock
+from beamsplat.services.recorder.config import RecorderConfig
 
 log = logging.getLogger("beamsplat.recorder")
 

@@ -9,16 +9,16 @@ from typing import Any
 
 import numpy as np
 
-from common.errors import UserError
-from common.recording import calibration as cal
-from common.recording.ros_types import transform_of
-from common.recording.sensors import SENSORS, build, ros_fields
-from common.recording.static_frames import StaticFrames, clean
-from common.rig import RigFile, load_rig
-from services.replay.bags import Bag, BagTopic
-from services.replay.choose import choose_camera_info, choose_topics
-from services.replay.decode import RawMessage, deserialize
-from services.replay.options import SourceOptions
+from beamsplat.common.errors import UserError
+from beamsplat.common.geometry.rig import RigFile, load_rig
+from beamsplat.common.recording import calibration as cal
+from beamsplat.common.recording.ros_types import transform_of
+from beamsplat.common.recording.sensors import SENSORS, build, ros_fields
+from beamsplat.common.recording.static_frames import StaticFrames, clean
+from beamsplat.services.replay.bags import Bag, BagTopic
+from beamsplat.services.replay.choose import choose_camera_info, choose_topics
+from beamsplat.services.replay.decode import RawMessage, deserialize
+from beamsplat.services.replay.options import SourceOptions
 
 TF_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 _PICTURES = ("rgb8", "bgr8", "rgba8", "bgra8", "mono8", "yuv422_yuy2", "jpeg", "png")

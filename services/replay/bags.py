@@ -22,9 +22,9 @@ from rosbags.rosbag1 import ReaderError as ReaderError1
 from rosbags.rosbag2 import Reader as Reader2
 from rosbags.rosbag2 import ReaderError as ReaderError2
 
-from common.errors import UserError
-from common.recording.mcap_file import McapFile
-from services.replay.decode import RawMessage
+from beamsplat.common.errors import UserError
+from beamsplat.common.recording.mcap_file import McapFile
+from beamsplat.services.replay.decode import RawMessage
 
 # What the readers raise on damaged files, beyond their own errors.
 _DAMAGE = (

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from common.errors import UserError
-from common.recording.sensors import SENSORS, Sensor
-from services.replay.bags import BagTopic
-from services.replay.options import SourceOptions
+from beamsplat.common.errors import UserError
+from beamsplat.common.recording.sensors import SENSORS, Sensor
+from beamsplat.services.replay.bags import BagTopic
+from beamsplat.services.replay.options import SourceOptions
 
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 # A pose somebody wants is not a pose the robot has; depth is not a picture.

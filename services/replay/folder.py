@@ -24,14 +24,14 @@ from typing import Any
 
 import numpy as np
 
-from common.errors import UserError
-from common.geometry import so3_log
-from common.recording.picture import picture_head
-from common.recording.sensors import SENSORS, build
-from common.rig import load_rig
-from common.trajectory import Trajectory, read_tum
-from services.replay.folder_scans import CsvScans, scan_from_points, xy_from_pcd
-from services.replay.options import SourceOptions
+from beamsplat.common.errors import UserError
+from beamsplat.common.geometry.rig import load_rig
+from beamsplat.common.geometry.trajectory import Trajectory, read_tum
+from beamsplat.common.geometry.transforms import so3_log
+from beamsplat.common.recording.picture import picture_head
+from beamsplat.common.recording.sensors import SENSORS, build
+from beamsplat.services.replay.folder_scans import CsvScans, scan_from_points, xy_from_pcd
+from beamsplat.services.replay.options import SourceOptions
 
 _PICTURES = (".jpg", ".jpeg", ".png")
 Stamped = tuple[int, str, Any]

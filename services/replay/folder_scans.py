@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from common.errors import UserError, reason
+from beamsplat.common.errors import UserError, reason
 
 _REQUIRED = ("angle_min_rad", "angle_increment_rad", "range_min_m", "range_max_m")
 _OPTIONAL = ("time_increment_s", "scan_time_s")

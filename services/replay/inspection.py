@@ -9,17 +9,17 @@ from typing import Any
 
 import numpy as np
 
-from common.errors import UserError
-from common.recording import is_recording
-from common.recording.sensors import SENSORS
-from services.replay.bag_source import BagSource
-from services.replay.bags import Bag, BagTopic, looks_like_bag
-from services.replay.decode import begins_with_header, header_stamp_ns
-from services.replay.folder import FolderSource, looks_like_folder
-from services.replay.options import SourceOptions
-from services.replay.recording_source import RecordingSource
-from services.replay.source import data_path
-from services.replay.statistics import (
+from beamsplat.common.errors import UserError
+from beamsplat.common.recording import is_recording
+from beamsplat.common.recording.sensors import SENSORS
+from beamsplat.services.replay.bag_source import BagSource
+from beamsplat.services.replay.bags import Bag, BagTopic, looks_like_bag
+from beamsplat.services.replay.decode import begins_with_header, header_stamp_ns
+from beamsplat.services.replay.folder import FolderSource, looks_like_folder
+from beamsplat.services.replay.options import SourceOptions
+from beamsplat.services.replay.recording_source import RecordingSource
+from beamsplat.services.replay.source import data_path
+from beamsplat.services.replay.statistics import (
     LidarFacts,
     StreamFacts,
     lidar_facts,

@@ -5,10 +5,10 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator
 
-from common.node import Node, Sourced
-from services.replay.config import ReplayConfig
-from services.replay.options import SourceOptions
-from services.replay.source import Source, open_source, play
+from beamsplat.common.runtime.node import Node, Sourced
+from beamsplat.services.replay.config import ReplayConfig
+from beamsplat.services.replay.options import SourceOptions
+from beamsplat.services.replay.source import Source, open_source, play
 
 log = logging.getLogger("beamsplat.replay")
 

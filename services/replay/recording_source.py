@@ -6,11 +6,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from common.errors import UserError
-from common.recording import RecordingReader
-from common.recording.sensors import SENSORS
-from common.rig import LidarFile, Mount, RigFile, load_rig
-from services.replay.options import SourceOptions
+from beamsplat.common.errors import UserError
+from beamsplat.common.geometry.rig import LidarFile, Mount, RigFile, load_rig
+from beamsplat.common.recording import RecordingReader
+from beamsplat.common.recording.sensors import SENSORS
+from beamsplat.services.replay.options import SourceOptions
 
 
 class RecordingSource:

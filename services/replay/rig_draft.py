@@ -8,13 +8,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from common.errors import UserError
-from common.frames import camera_mount
-from common.recording.calibration import ASSUMED_MOUNTS
-from common.rig import CameraFile, LidarFile, Mount, RigFile, format_rig
-from services.replay.bag_source import BagSource
-from services.replay.options import SourceOptions
-from services.replay.source import data_path, open_source
+from beamsplat.common.errors import UserError
+from beamsplat.common.geometry.frames import camera_mount
+from beamsplat.common.geometry.rig import CameraFile, LidarFile, Mount, RigFile, format_rig
+from beamsplat.common.recording.calibration import ASSUMED_MOUNTS
+from beamsplat.services.replay.bag_source import BagSource
+from beamsplat.services.replay.options import SourceOptions
+from beamsplat.services.replay.source import data_path, open_source
 
 _HEADER = """Calibration of one robot: where camera and lidar sit, and how the camera sees.
 The body frame lies on the floor between the wheels: x forward, y left, z up. Metres and degrees.

@@ -6,14 +6,14 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Protocol
 
-from common.errors import UserError
-from common.recording import is_recording
-from common.recording.sensors import build
-from services.replay.bag_source import BagSource
-from services.replay.bags import Bag, looks_like_bag
-from services.replay.folder import FolderSource, looks_like_folder
-from services.replay.options import SourceOptions
-from services.replay.recording_source import RecordingSource
+from beamsplat.common.errors import UserError
+from beamsplat.common.recording import is_recording
+from beamsplat.common.recording.sensors import build
+from beamsplat.services.replay.bag_source import BagSource
+from beamsplat.services.replay.bags import Bag, looks_like_bag
+from beamsplat.services.replay.folder import FolderSource, looks_like_folder
+from beamsplat.services.replay.options import SourceOptions
+from beamsplat.services.replay.recording_source import RecordingSource
 
 TICK_NS = 10**9
 # Between the last message of one round and the first of the next.

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from common.config import NodeConfig
+from beamsplat.common.config.deployment import NodeConfig
 
 Word = Literal["image", "scan", "odometry", "pose"]
 Domain = Annotated[int, Field(ge=0, le=232)]

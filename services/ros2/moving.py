@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from common.geometry import inverse, se3_log
-from common.recording.static_frames import BODY_NAMES, clean
+from beamsplat.common.geometry.transforms import inverse, se3_log
+from beamsplat.common.recording.static_frames import BODY_NAMES, clean
 
 _ODOM = "odom"
 _LONGEST_NS = 1_000_000_000  # a pause longer than that tells no velocity

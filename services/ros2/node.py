@@ -11,14 +11,14 @@ from collections.abc import Iterator
 import zenoh
 import zenoh.ext
 
-from common.bus import open_session
-from common.clock import StampClock
-from common.node import Node, Sourced
-from common.recording.ros_types import typestore
-from services.ros2.config import Ros2Config
-from services.ros2.robot import Robot, RobotOptions
-from services.ros2.topics import IMAGE, TF, WANTED
-from services.ros2.wire import ADMIN, Address, Attachment, Entity, Qos, dds_type
+from beamsplat.common.recording.ros_types import typestore
+from beamsplat.common.runtime.clock import StampClock
+from beamsplat.common.runtime.node import Node, Sourced
+from beamsplat.common.zenoh.bus import open_session
+from beamsplat.common.zenoh.rmw import ADMIN, Address, Attachment, Entity, Qos, dds_type
+from beamsplat.services.ros2.config import Ros2Config
+from beamsplat.services.ros2.robot import Robot, RobotOptions
+from beamsplat.services.ros2.topics import IMAGE, TF, WANTED
 
 _POLL_S = 0.1
 _QUEUED = 1000

@@ -13,15 +13,15 @@ from typing import Any
 
 import numpy as np
 
-from common.errors import UserError
-from common.recording import calibration as cal
-from common.recording.picture import is_whole
-from common.recording.ros_types import deserialize, transform_of
-from common.recording.sensors import SENSORS, build, ros_fields
-from common.recording.static_frames import StaticFrames, clean
-from common.rig import RigFile, load_rig
-from services.ros2.moving import MovingFrames
-from services.ros2.topics import CAMERA_INFO, PICTURES, TF, WANTED, camera_info_of, choose
+from beamsplat.common.errors import UserError
+from beamsplat.common.geometry.rig import RigFile, load_rig
+from beamsplat.common.recording import calibration as cal
+from beamsplat.common.recording.picture import is_whole
+from beamsplat.common.recording.ros_types import deserialize, transform_of
+from beamsplat.common.recording.sensors import SENSORS, build, ros_fields
+from beamsplat.common.recording.static_frames import StaticFrames, clean
+from beamsplat.services.ros2.moving import MovingFrames
+from beamsplat.services.ros2.topics import CAMERA_INFO, PICTURES, TF, WANTED, camera_info_of, choose
 
 _PATIENCE_S = 10.0  # for the first message of a topic that somebody publishes
 

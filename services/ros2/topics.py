@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from common.errors import UserError
-from common.recording.sensors import SENSORS
+from beamsplat.common.errors import UserError
+from beamsplat.common.recording.sensors import SENSORS
 
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 IMAGE = "sensor_msgs/msg/Image"

@@ -14,12 +14,12 @@ from typing import Annotated
 import zenoh
 from pydantic import Field
 
-from common.bus import BULK_BUFFER_BYTES, URGENT_BUFFER_BYTES, open_link, open_session
-from common.config import NodeConfig
-from common.credentials import login_of
-from common.errors import UserError
-from common.node import Node, Sourced
-from common.relay import Relay, Sides
+from beamsplat.common.config.deployment import NodeConfig
+from beamsplat.common.errors import UserError
+from beamsplat.common.runtime.node import Node, Sourced
+from beamsplat.common.security.logins import login_of
+from beamsplat.common.zenoh.bridge import Relay, Sides
+from beamsplat.common.zenoh.bus import BULK_BUFFER_BYTES, URGENT_BUFFER_BYTES, open_link, open_session
 
 _POLL_S = 0.1
 _ATTEMPT_S = 1.0

@@ -1,7 +1,7 @@
 """What a session of a test hears of a topic."""
 
-from common.streams import declare_reader, open_sample
-from common.topics import topic
+from beamsplat.common.topics import topic
+from beamsplat.common.zenoh.streams import declare_reader, open_sample
 
 
 class Ears:

@@ -6,11 +6,11 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from common.config import NodeConfig
-from common.geometry import se2_to_se3
-from common.messages import Correction, ExternalPose, Grid, Image, Odometry, Scan, WheelOdometry
-from common.node import Input, Job, Node, Outputs, Sourced
-from common.registry import Service
+from beamsplat.common.config.deployment import NodeConfig
+from beamsplat.common.geometry.transforms import se2_to_se3
+from beamsplat.common.messages import Correction, ExternalPose, Grid, Image, Odometry, Scan, WheelOdometry
+from beamsplat.common.runtime.node import Input, Job, Node, Outputs, Sourced
+from beamsplat.common.runtime.registry import Service
 
 
 class DriveConfig(NodeConfig):

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from common.frames import camera_mount, lidar_mount
-from common.geometry import se2_to_se3
-from common.messages import (
+from beamsplat.common.geometry.frames import camera_mount, lidar_mount
+from beamsplat.common.geometry.transforms import se2_to_se3
+from beamsplat.common.messages import (
     Anchors,
     Answer,
     CameraModel,

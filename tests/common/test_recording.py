@@ -14,15 +14,15 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 from rosbags.highlevel import AnyReader
 
-from common.codec import decode, schema_of
-from common.errors import UserError
-from common.header import Header
-from common.messages import MESSAGES, Anchors, Image, Odometry, Scan, Tick
-from common.recording import RecordingError, RecordingReader, RecordingWriter, is_recording
-from common.recording.mcap_file import McapFile
-from common.recording.picture import picture_head
-from common.topics import TOPICS
-from tests.common.random_messages import assert_same, random_message
+from beamsplat.common.errors import UserError
+from beamsplat.common.messages import MESSAGES, Anchors, Image, Odometry, Scan, Tick
+from beamsplat.common.messages.codec import decode, schema_of
+from beamsplat.common.messages.header import Header
+from beamsplat.common.recording import RecordingError, RecordingReader, RecordingWriter, is_recording
+from beamsplat.common.recording.mcap_file import McapFile
+from beamsplat.common.recording.picture import picture_head
+from beamsplat.common.topics import TOPICS
+from tests.common.messages.random_messages import assert_same, random_message
 from tests.common.samples import sample_messages
 
 TOPIC_OF = {row.message: name for name, row in TOPICS.items()}
@@ -285,8 +285,8 @@ def test_a_full_disk_is_said_once_and_what_is_safe_stays_readable(tmp_path, monk
 CRASHING = """
 import sys, time
 from pathlib import Path
-from common.messages import Tick
-from common.recording import RecordingWriter
+from beamsplat.common.messages import Tick
+from beamsplat.common.recording import RecordingWriter
 writer = RecordingWriter(Path(sys.argv[1]), chunk_s=1.0)
 for i in range(95):
     writer.write("tick", Tick(stamp_ns=i, count=i), i * 10**8)

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from common.camera import Pinhole
-from common.frames import R_body_camera_level
-from common.geometry import make_transform, so3_exp, transform_points
+from beamsplat.common.geometry.camera import Pinhole
+from beamsplat.common.geometry.frames import R_body_camera_level
+from beamsplat.common.geometry.transforms import make_transform, so3_exp, transform_points
 
 _GAP_M = 0.05  # beams of one board are no further apart than this
 _SIGMA_M = 0.008

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from common.camera import Pinhole, Undistorter
-from common.geometry import transform_points
-from services.fusion.calibration.board import BoardPair
+from beamsplat.common.geometry.camera import Pinhole, Undistorter
+from beamsplat.common.geometry.transforms import transform_points
+from beamsplat.services.fusion.calibration.board import BoardPair
 
 _WINDOW_PX = 25
 _ACROSS_PX = 3

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from common.geometry import inverse, so3_exp
+from beamsplat.common.geometry.transforms import inverse, so3_exp
 
 PARAMETERS = ("clock_s", "roll_rad", "pitch_rad", "yaw_rad", "x_m", "y_m")
 _PRIOR = np.array([0.3, 0.1, 0.1, 0.1, 0.03, 0.03])  # standard deviations: keeps what nothing tells in place

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from common.geometry import inverse, so3_exp, transform_points, yaw_of
+from beamsplat.common.geometry.transforms import inverse, so3_exp, transform_points, yaw_of
 
 _CLIP_M = 0.5
 _MAX_PAIRS = 40

@@ -14,12 +14,17 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from common.camera import Pinhole
-from common.geometry import inverse, so3_exp
-from common.trajectory import Trajectory
-from services.fusion.calibration.motion import MotionCalibration, TrackedPair, motion_misfit, solve_motion
-from services.fusion.calibration.mounting import check_mounting
-from services.fusion.relative_pose import corners, track
+from beamsplat.common.geometry.camera import Pinhole
+from beamsplat.common.geometry.trajectory import Trajectory
+from beamsplat.common.geometry.transforms import inverse, so3_exp
+from beamsplat.services.fusion.calibration.motion import (
+    MotionCalibration,
+    TrackedPair,
+    motion_misfit,
+    solve_motion,
+)
+from beamsplat.services.fusion.calibration.mounting import check_mounting
+from beamsplat.services.fusion.relative_pose import corners, track
 
 _WIDTH_PX = 320
 _EVERY_NS = 250_000_000

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from common.geometry import (
+from beamsplat.common.geometry.transforms import (
     inverse,
     make_transform,
     matrix_from_quat_wxyz,
@@ -19,11 +19,11 @@ from common.geometry import (
     se3_exp,
     skew,
 )
-from common.raster.camera import RasterCamera
-from services.localization.camera.kernels import UNKNOWNS, choose_points, normal_equations
-from services.localization.camera.settings import CameraTrackerSettings
-from services.localization.camera.splat_map import SplatMap
-from services.localization.camera.view import GREY, GreyLevel, PictureView, halved
+from beamsplat.common.raster.camera import RasterCamera
+from beamsplat.services.localization.camera.kernels import UNKNOWNS, choose_points, normal_equations
+from beamsplat.services.localization.camera.settings import CameraTrackerSettings
+from beamsplat.services.localization.camera.splat_map import SplatMap
+from beamsplat.services.localization.camera.view import GREY, GreyLevel, PictureView, halved
 
 _DAMPING = 1e-4  # of the diagonal: keeps what the picture does not tell where it was predicted
 _GAIN_PRIOR, _OFFSET_PRIOR = 5.0, 5.0  # exposure changes little between pictures

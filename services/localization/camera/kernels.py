@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from common.raster.compiled import kernel
+from beamsplat.common.compiled import kernel
 
 UNKNOWNS = 8  # (rho, phi) of the left perturbation of T_now_render, log gain, offset
 

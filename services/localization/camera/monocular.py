@@ -10,9 +10,9 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from common.geometry import inverse
-from common.raster.camera import RasterCamera
-from services.localization.camera.sweep import filled, sweep
+from beamsplat.common.geometry.transforms import inverse
+from beamsplat.common.raster.camera import RasterCamera
+from beamsplat.services.localization.camera.sweep import filled, sweep
 
 WALL = 2.0  # distance of the first wall: the unit
 ROUNDS = 4

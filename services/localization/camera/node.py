@@ -9,16 +9,16 @@ import cv2
 import numpy as np
 from pydantic import Field
 
-from common.camera import Pinhole, Undistorter
-from common.config import NodeConfig
-from common.errors import UserError
-from common.messages import Correction, DepthEstimate, Image, Odometry, Rig
-from common.node import Input, Node, Outputs
-from common.picture import decode_rgb
-from services.localization.camera.depth import DepthGuess
-from services.localization.camera.settings import CameraTrackerSettings
-from services.localization.camera.tracker import CameraResult, CameraTracker
-from services.localization.camera.warm import warm
+from beamsplat.common.config.deployment import NodeConfig
+from beamsplat.common.errors import UserError
+from beamsplat.common.geometry.camera import Pinhole, Undistorter
+from beamsplat.common.messages import Correction, DepthEstimate, Image, Odometry, Rig
+from beamsplat.common.messages.image_codec import decode_rgb
+from beamsplat.common.runtime.node import Input, Node, Outputs
+from beamsplat.services.localization.camera.depth import DepthGuess
+from beamsplat.services.localization.camera.settings import CameraTrackerSettings
+from beamsplat.services.localization.camera.tracker import CameraResult, CameraTracker
+from beamsplat.services.localization.camera.warm import warm
 
 log = logging.getLogger("beamsplat.localization")
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from services.localization.camera.splat_map import MapKeyframe
+from beamsplat.services.localization.camera.splat_map import MapKeyframe
 
 _SIZE = (20, 15)
 _LEAST_CORRELATION = 0.4

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from services.localization.camera.align import Alignment
-from services.localization.camera.view import PictureView
+from beamsplat.services.localization.camera.align import Alignment
+from beamsplat.services.localization.camera.view import PictureView
 
 
 @dataclass(frozen=True)

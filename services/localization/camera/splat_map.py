@@ -10,14 +10,14 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from common.geometry import inverse
-from common.raster.camera import RasterCamera
-from common.raster.discs import choose_pixels, make_discs
-from common.raster.layout import MEAN, OPACITY, SCALE
-from common.raster.optimiser import GaussianArrays, rate_rows
-from common.raster.rasterizer import Rasterizer, Render
-from services.localization.camera.kernels import map_loss
-from services.localization.camera.settings import CameraTrackerSettings
+from beamsplat.common.geometry.transforms import inverse
+from beamsplat.common.raster.camera import RasterCamera
+from beamsplat.common.raster.discs import choose_pixels, make_discs
+from beamsplat.common.raster.layout import MEAN, OPACITY, SCALE
+from beamsplat.common.raster.optimiser import GaussianArrays, rate_rows
+from beamsplat.common.raster.rasterizer import Rasterizer, Render
+from beamsplat.services.localization.camera.kernels import map_loss
+from beamsplat.services.localization.camera.settings import CameraTrackerSettings
 
 
 @dataclass

@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from common.raster.camera import RasterCamera
+from beamsplat.common.raster.camera import RasterCamera
 
 _PLANES = 48
 _PATCH = (7, 7)

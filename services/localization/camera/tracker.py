@@ -14,11 +14,11 @@ from collections import deque
 
 import numpy as np
 
-from common.camera import Pinhole
-from common.geometry import inverse, se3_exp, se3_log, yaw_of
-from services.localization.camera.align import Aligner, Alignment
-from services.localization.camera.depth import DepthGuess, fitted_to_map, shrunk
-from services.localization.camera.monocular import (
+from beamsplat.common.geometry.camera import Pinhole
+from beamsplat.common.geometry.transforms import inverse, se3_exp, se3_log, yaw_of
+from beamsplat.services.localization.camera.align import Aligner, Alignment
+from beamsplat.services.localization.camera.depth import DepthGuess, fitted_to_map, shrunk
+from beamsplat.services.localization.camera.monocular import (
     FIRST_BASELINES,
     ROUNDS,
     WALL,
@@ -26,11 +26,11 @@ from services.localization.camera.monocular import (
     dense,
     depth_by_motion,
 )
-from services.localization.camera.relocalize import similar_keyframes, thumbnail
-from services.localization.camera.result import CameraResult, Tracked, covisibility
-from services.localization.camera.settings import CameraTrackerSettings
-from services.localization.camera.splat_map import MapKeyframe, SplatMap
-from services.localization.camera.view import PictureView, make_view, small_camera
+from beamsplat.services.localization.camera.relocalize import similar_keyframes, thumbnail
+from beamsplat.services.localization.camera.result import CameraResult, Tracked, covisibility
+from beamsplat.services.localization.camera.settings import CameraTrackerSettings
+from beamsplat.services.localization.camera.splat_map import MapKeyframe, SplatMap
+from beamsplat.services.localization.camera.view import PictureView, make_view, small_camera
 
 _KEPT = 24  # pictures whose depth may still come
 _CORRELATION = 8.0  # pixels whose errors go together: variance of a pose over that of independent ones

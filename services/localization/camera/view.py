@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from common.camera import Pinhole
-from common.raster.camera import RasterCamera
+from beamsplat.common.geometry.camera import Pinhole
+from beamsplat.common.raster.camera import RasterCamera
 
 GREY = np.array([0.299, 0.587, 0.114], np.float32)  # of red, green, blue
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from common.camera import Pinhole
-from services.localization.camera.depth import DepthGuess
-from services.localization.camera.settings import CameraTrackerSettings
-from services.localization.camera.tracker import CameraTracker
+from beamsplat.common.geometry.camera import Pinhole
+from beamsplat.services.localization.camera.depth import DepthGuess
+from beamsplat.services.localization.camera.settings import CameraTrackerSettings
+from beamsplat.services.localization.camera.tracker import CameraTracker
 
 _SIZE = (128, 96)
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from common.messages import Correction, ExternalPose, Odometry
-from common.node import Node, Outputs
+from beamsplat.common.messages import Correction, ExternalPose, Odometry
+from beamsplat.common.runtime.node import Node, Outputs
 
 
 class ExternalLocalization(Node):

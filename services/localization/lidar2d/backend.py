@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from services.localization.lidar2d import se2
-from services.localization.lidar2d.jobs import JobResult, Snapshot
-from services.localization.lidar2d.lifelong import redundant_submaps
-from services.localization.lidar2d.nodes import Constraint, Keynode, Submap, TableCache
-from services.localization.lidar2d.settings import LidarSlamSettings
+from beamsplat.services.localization.lidar2d import se2
+from beamsplat.services.localization.lidar2d.jobs import JobResult, Snapshot
+from beamsplat.services.localization.lidar2d.lifelong import redundant_submaps
+from beamsplat.services.localization.lidar2d.nodes import Constraint, Keynode, Submap, TableCache
+from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
 
 
 class BackEnd:

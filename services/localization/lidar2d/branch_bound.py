@@ -6,7 +6,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
+
+from beamsplat.common.compiled import kernel
 
 NEAR_CELLS = 3  # leaves this close are the same place
 LEVELS = 6  # the coarsest level looks at 2^5 search cells at once
@@ -22,7 +23,7 @@ class Pyramid:
     cell_m: float
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _fill(field: np.ndarray, shift_r: int, shift_c: int, levels: np.ndarray) -> None:
     for r in range(field.shape[0]):
         for c in range(field.shape[1]):
@@ -54,7 +55,7 @@ def build_pyramid(field: np.ndarray, row0: int, col0: int, cell_m: float) -> Pyr
     return Pyramid(levels, r0 - pad, c0 - pad, 2.0 * cell_m)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _score(level: np.ndarray, rows: np.ndarray, cols: np.ndarray, dr: int, dc: int) -> float:
     total = 0
     for i in range(rows.shape[0]):
@@ -64,7 +65,7 @@ def _score(level: np.ndarray, rows: np.ndarray, cols: np.ndarray, dr: int, dc: i
     return total / (255.0 * rows.shape[0])
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _row_for(found: np.ndarray, count: int, score: float, yaw: int, dr: int, dc: int, near_yaw: int) -> int:
     """Where a leaf goes: the row of a weaker neighbour, a new row, or -1 if a neighbour is better. Without
     this the hundred poses around the best would crowd out all other places."""
@@ -78,7 +79,7 @@ def _row_for(found: np.ndarray, count: int, score: float, yaw: int, dr: int, dc:
     return count
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _make_room(found: np.ndarray, best: float, keep: float) -> tuple[float, int]:
     """Be pickier until at least a quarter of the table is free; the best never goes."""
     count = found.shape[0]
@@ -95,7 +96,7 @@ def _make_room(found: np.ndarray, best: float, keep: float) -> tuple[float, int]
     return keep, count
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _search(
     levels: np.ndarray,  # uint8 [L, H, W]
     rows: np.ndarray,  # int32 [A, K] cells of the returns at each yaw, window centre

@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
-from services.localization.lidar2d.surfel_map import MatchTables
+from beamsplat.common.compiled import kernel
+from beamsplat.services.localization.lidar2d.surfel_map import MatchTables
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def correlate(
     points: np.ndarray,  # float64 [K, 2] body frame
     T: np.ndarray,  # float64 [3] centre of the window

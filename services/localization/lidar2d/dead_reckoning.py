@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from services.localization.lidar2d import se2
-from services.localization.lidar2d.odometry import OdometryBuffer
+from beamsplat.services.localization.lidar2d import se2
+from beamsplat.services.localization.lidar2d.odometry import OdometryBuffer
 
 SEEN = 0.7  # trust along the weak direction above which a scan knows where it is
 GAIN = 0.5  # stamps of wheels and scans jitter: the pose follows the count, it does not copy it

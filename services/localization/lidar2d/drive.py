@@ -12,15 +12,15 @@ from typing import Any
 
 import numpy as np
 
-from common.errors import UserError
-from common.geometry import se2_to_se3
-from common.sync import StampMerger
-from common.trajectory import Trajectory, write_tum
-from services.localization.lidar2d import se2
-from services.localization.lidar2d.occupancy import save_nav2
-from services.localization.lidar2d.offline import JobRunner
-from services.localization.lidar2d.settings import LidarSlamSettings
-from services.localization.lidar2d.slam import LidarSlam
+from beamsplat.common.errors import UserError
+from beamsplat.common.geometry.trajectory import Trajectory, write_tum
+from beamsplat.common.geometry.transforms import se2_to_se3
+from beamsplat.common.runtime.stamp_merger import StampMerger
+from beamsplat.services.localization.lidar2d import se2
+from beamsplat.services.localization.lidar2d.occupancy import save_nav2
+from beamsplat.services.localization.lidar2d.offline import JobRunner
+from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
+from beamsplat.services.localization.lidar2d.slam import LidarSlam
 
 STREAMS = ("odometry", "scan")
 

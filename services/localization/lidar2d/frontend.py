@@ -8,15 +8,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from services.localization.lidar2d import se2
-from services.localization.lidar2d.correlative import search
-from services.localization.lidar2d.dead_reckoning import SIGMA_M, DeadReckoning
-from services.localization.lidar2d.matching import Match, refine
-from services.localization.lidar2d.observability import Observed, without_slip
-from services.localization.lidar2d.odometry import OdometryBuffer, Predictor
-from services.localization.lidar2d.scan import PreparedScan, prepare_scan
-from services.localization.lidar2d.settings import LidarSlamSettings
-from services.localization.lidar2d.surfel_map import SurfelMap
+from beamsplat.services.localization.lidar2d import se2
+from beamsplat.services.localization.lidar2d.correlative import search
+from beamsplat.services.localization.lidar2d.dead_reckoning import SIGMA_M, DeadReckoning
+from beamsplat.services.localization.lidar2d.matching import Match, refine
+from beamsplat.services.localization.lidar2d.observability import Observed, without_slip
+from beamsplat.services.localization.lidar2d.odometry import OdometryBuffer, Predictor
+from beamsplat.services.localization.lidar2d.scan import PreparedScan, prepare_scan
+from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
+from beamsplat.services.localization.lidar2d.surfel_map import SurfelMap
 
 NS = 1e-9
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
-from services.localization.lidar2d import se2
+from beamsplat.common.compiled import kernel
+from beamsplat.services.localization.lidar2d import se2
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def linearise(T_s: np.ndarray, T_n: np.ndarray, z: np.ndarray, e: np.ndarray, Js: np.ndarray) -> None:
     """Residual [3] and its Jacobian by the submap [3, 3]; that by the node is the rotation R_s'."""
     c, s = math.cos(T_s[2]), math.sin(T_s[2])
@@ -22,7 +22,7 @@ def linearise(T_s: np.ndarray, T_n: np.ndarray, z: np.ndarray, e: np.ndarray, Js
     Js[2, 0], Js[2, 1], Js[2, 2] = 0.0, 0.0, -1.0
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _mul(A: np.ndarray, B: np.ndarray, out: np.ndarray, transpose_a: bool) -> None:
     for i in range(3):
         for j in range(3):
@@ -32,7 +32,7 @@ def _mul(A: np.ndarray, B: np.ndarray, out: np.ndarray, transpose_a: bool) -> No
             out[i, j] = t
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def invert3(A: np.ndarray, out: np.ndarray) -> None:
     """out <- A^-1 for [3, 3] matrices, by cofactors."""
     c00 = A[1, 1] * A[2, 2] - A[1, 2] * A[2, 1]
@@ -48,7 +48,7 @@ def invert3(A: np.ndarray, out: np.ndarray) -> None:
     out[2, 2] = (A[0, 0] * A[1, 1] - A[0, 1] * A[1, 0]) * d
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def reduce_nodes(
     submap: np.ndarray,
     z: np.ndarray,
@@ -134,7 +134,7 @@ def reduce_nodes(
     return cost
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def substitute(
     submap: np.ndarray,
     first: np.ndarray,
@@ -164,7 +164,7 @@ def substitute(
         T_s[s, 2] = se2.wrap(T_s[s, 2])
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def edge_pairs(submap: np.ndarray, first: np.ndarray, n_submaps: int, keys: np.ndarray) -> None:
     p = 0
     for n in range(first.shape[0] - 1):

@@ -8,14 +8,20 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from services.localization.lidar2d import se2
-from services.localization.lidar2d.loops import DriftModel, Place, close_narrow, close_wide, confirmed
-from services.localization.lidar2d.nodes import Constraint, Keynode, TableCache, edges_of
-from services.localization.lidar2d.pose_graph import Edges, optimise
-from services.localization.lidar2d.refinement import refine_submaps
-from services.localization.lidar2d.segments import link_segment
-from services.localization.lidar2d.settings import LidarSlamSettings
-from services.localization.lidar2d.surfel_map import FrozenMap
+from beamsplat.services.localization.lidar2d import se2
+from beamsplat.services.localization.lidar2d.loops import (
+    DriftModel,
+    Place,
+    close_narrow,
+    close_wide,
+    confirmed,
+)
+from beamsplat.services.localization.lidar2d.nodes import Constraint, Keynode, TableCache, edges_of
+from beamsplat.services.localization.lidar2d.pose_graph import Edges, optimise
+from beamsplat.services.localization.lidar2d.refinement import refine_submaps
+from beamsplat.services.localization.lidar2d.segments import link_segment
+from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
+from beamsplat.services.localization.lidar2d.surfel_map import FrozenMap
 
 ITERATIONS, LAST_ITERATIONS = 10, 16
 REJECT_CHI2 = 1e5  # a loop this far off after optimisation is forgotten; less, and it may be right later

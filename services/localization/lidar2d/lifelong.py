@@ -11,7 +11,7 @@ from collections import defaultdict
 
 import numpy as np
 
-from services.localization.lidar2d.nodes import Submap
+from beamsplat.services.localization.lidar2d.nodes import Submap
 
 CELL_M = 1.5
 HEADINGS = 4

@@ -6,24 +6,24 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from scipy.sparse.csgraph import dijkstra
 
-from services.localization.lidar2d import se2
-from services.localization.lidar2d.branch_bound import branch_and_bound
-from services.localization.lidar2d.correlative import search
-from services.localization.lidar2d.matching import Match, refine
-from services.localization.lidar2d.nodes import (
+from beamsplat.common.compiled import kernel
+from beamsplat.services.localization.lidar2d import se2
+from beamsplat.services.localization.lidar2d.branch_bound import branch_and_bound
+from beamsplat.services.localization.lidar2d.correlative import search
+from beamsplat.services.localization.lidar2d.matching import Match, refine
+from beamsplat.services.localization.lidar2d.nodes import (
     Constraint,
     Keynode,
     TableCache,
     edge_information,
     merged_features,
 )
-from services.localization.lidar2d.observability import held_along, without_slip
-from services.localization.lidar2d.pose_graph import Edges
-from services.localization.lidar2d.settings import LidarSlamSettings
-from services.localization.lidar2d.surfel_map import FrozenMap
+from beamsplat.services.localization.lidar2d.observability import held_along, without_slip
+from beamsplat.services.localization.lidar2d.pose_graph import Edges
+from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
+from beamsplat.services.localization.lidar2d.surfel_map import FrozenMap
 
 CHUNK_SHARE = 0.80  # a merged chunk must agree better than a single scan: it is what tells places apart
 AMBIGUOUS = 0.06  # a second place whose share is this close to the best makes the answer worthless
@@ -42,7 +42,7 @@ class Place:
     window_rad: float
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _link_variances(
     submap: np.ndarray, first: np.ndarray, var_m: np.ndarray, var_rad: np.ndarray, links: np.ndarray
 ) -> None:

@@ -9,12 +9,12 @@ from typing import TypeVar
 
 import numpy as np
 
-from services.localization.lidar2d import se2
-from services.localization.lidar2d.backend import BackEnd
-from services.localization.lidar2d.frontend import LocalMap
-from services.localization.lidar2d.matching import Match
-from services.localization.lidar2d.movers import contradicts_free_space, grow_along_beams
-from services.localization.lidar2d.nodes import (
+from beamsplat.services.localization.lidar2d import se2
+from beamsplat.services.localization.lidar2d.backend import BackEnd
+from beamsplat.services.localization.lidar2d.frontend import LocalMap
+from beamsplat.services.localization.lidar2d.matching import Match
+from beamsplat.services.localization.lidar2d.movers import contradicts_free_space, grow_along_beams
+from beamsplat.services.localization.lidar2d.nodes import (
     Constraint,
     Keynode,
     KeyScan,
@@ -22,10 +22,10 @@ from services.localization.lidar2d.nodes import (
     edge_information,
     link_information,
 )
-from services.localization.lidar2d.occupancy import CountGrid
-from services.localization.lidar2d.scan import PreparedScan
-from services.localization.lidar2d.settings import LidarSlamSettings
-from services.localization.lidar2d.surfel_map import SurfelMap, freeze
+from beamsplat.services.localization.lidar2d.occupancy import CountGrid
+from beamsplat.services.localization.lidar2d.scan import PreparedScan
+from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
+from beamsplat.services.localization.lidar2d.surfel_map import SurfelMap, freeze
 
 NS = 1e-9
 Result = TypeVar("Result")

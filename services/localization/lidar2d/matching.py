@@ -6,11 +6,11 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
-from services.localization.lidar2d import se2
-from services.localization.lidar2d.settings import LidarSlamSettings
-from services.localization.lidar2d.surfel_map import MatchTables
+from beamsplat.common.compiled import kernel
+from beamsplat.services.localization.lidar2d import se2
+from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
+from beamsplat.services.localization.lidar2d.surfel_map import MatchTables
 
 ALONG2 = 0.3**2  # m^2, along its tangent a return may belong to any part of the surface near it
 OTHER_SIDE = -0.3  # cosine times how much of one mind the views of a surface are
@@ -29,7 +29,7 @@ class Match:
     rigid: np.ndarray | None = None  # the information before anything was taken from it, see observability
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def accumulate(
     points: np.ndarray,  # float64 [K, 5] body frame: x, y, tangent x, tangent y, half spacing
     origin: np.ndarray,  # float64 [2] lidar in the body frame
@@ -108,7 +108,7 @@ def accumulate(
     return weights, found, cost
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def solve3(A: np.ndarray, b: np.ndarray, x: np.ndarray) -> bool:
     """x = A^-1 b for symmetric positive definite A [3, 3] by Cholesky; False if it is not."""
     l00 = A[0, 0]
@@ -134,7 +134,7 @@ def solve3(A: np.ndarray, b: np.ndarray, x: np.ndarray) -> bool:
     return True
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def gauss_newton(
     points: np.ndarray,
     origin: np.ndarray,
@@ -193,7 +193,7 @@ def gauss_newton(
     return weights, found, cost
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def known_returns(
     points: np.ndarray,
     T: np.ndarray,

@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from services.localization.lidar2d import se2
-from services.localization.lidar2d.nodes import Submap
-from services.localization.lidar2d.record import TrajectoryRecord
-from services.localization.lidar2d.relocalization import relocalize_in
-from services.localization.lidar2d.slam import LidarSlam
+from beamsplat.services.localization.lidar2d import se2
+from beamsplat.services.localization.lidar2d.nodes import Submap
+from beamsplat.services.localization.lidar2d.record import TrajectoryRecord
+from beamsplat.services.localization.lidar2d.relocalization import relocalize_in
+from beamsplat.services.localization.lidar2d.slam import LidarSlam
 
 ASKED = 24  # scans of the second map that are looked for in the first
 LEAST_AGREEING = 3

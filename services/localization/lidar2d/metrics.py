@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from services.localization.lidar2d import se2
+from beamsplat.services.localization.lidar2d import se2
 
 NS_PER_S = 1_000_000_000
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
+
+from beamsplat.common.compiled import kernel
 
 FREE_SCANS = 5  # so many keynodes must have looked through a cell
 CLEARANCE_M = 0.12  # a return this close to a known surface belongs to it
@@ -14,7 +15,7 @@ BODY_M = 1.2  # what is no wider than this moves as a whole,
 BODY_SHARE = 0.25  # if so many of its returns do
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def contradicts_free_space(
     points: np.ndarray,  # float64 [M, 2] body frame
     T: np.ndarray,  # float64 [3] T_map_body
@@ -51,7 +52,7 @@ def contradicts_free_space(
         out[i] = free
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def grow_along_beams(
     moving: np.ndarray,  # bool [M]
     points: np.ndarray,  # float64 [M, 2] in beam order
@@ -87,7 +88,7 @@ def grow_along_beams(
     _whole_bodies(points, beams, gap_m, out)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _whole_bodies(points: np.ndarray, beams: np.ndarray, gap_m: float, out: np.ndarray) -> None:
     """Small connected things of which a good part moves do so altogether."""
     m = out.shape[0]

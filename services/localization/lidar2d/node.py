@@ -10,15 +10,24 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field
 
-from common.config import NodeConfig
-from common.errors import UserError, reason
-from common.geometry import se2_to_se3, se3_to_se2
-from common.messages import Anchors, Correction, Grid, MovingBeams, Odometry, Rig, Scan, WheelOdometry
-from common.node import Input, Job, Node, Outputs
-from services.localization.lidar2d.occupancy import OccupancyGrid
-from services.localization.lidar2d.settings import LidarSlamSettings
-from services.localization.lidar2d.slam import LidarSlam, ScanResult
-from services.localization.lidar2d.state import MANIFEST, MapStateError, read_manifest, write_state
+from beamsplat.common.config.deployment import NodeConfig
+from beamsplat.common.errors import UserError, reason
+from beamsplat.common.geometry.transforms import se2_to_se3, se3_to_se2
+from beamsplat.common.messages import (
+    Anchors,
+    Correction,
+    Grid,
+    MovingBeams,
+    Odometry,
+    Rig,
+    Scan,
+    WheelOdometry,
+)
+from beamsplat.common.runtime.node import Input, Job, Node, Outputs
+from beamsplat.services.localization.lidar2d.occupancy import OccupancyGrid
+from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
+from beamsplat.services.localization.lidar2d.slam import LidarSlam, ScanResult
+from beamsplat.services.localization.lidar2d.state import MANIFEST, MapStateError, read_manifest, write_state
 
 log = logging.getLogger("beamsplat.localization")
 

@@ -8,15 +8,15 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
-from numba import njit
 
-from services.localization.lidar2d import se2
-from services.localization.lidar2d.branch_bound import Pyramid, build_pyramid
-from services.localization.lidar2d.graph_kernels import invert3
-from services.localization.lidar2d.pose_graph import Edges
-from services.localization.lidar2d.scan import PreparedScan
-from services.localization.lidar2d.settings import LidarSlamSettings
-from services.localization.lidar2d.surfel_map import FrozenMap, MatchTables
+from beamsplat.common.compiled import kernel
+from beamsplat.services.localization.lidar2d import se2
+from beamsplat.services.localization.lidar2d.branch_bound import Pyramid, build_pyramid
+from beamsplat.services.localization.lidar2d.graph_kernels import invert3
+from beamsplat.services.localization.lidar2d.pose_graph import Edges
+from beamsplat.services.localization.lidar2d.scan import PreparedScan
+from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
+from beamsplat.services.localization.lidar2d.surfel_map import FrozenMap, MatchTables
 
 
 @dataclass(frozen=True)
@@ -136,7 +136,7 @@ def edges_of(constraints: list[Constraint], submap_row: dict[int, int], node_row
     )
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def edge_information(match_information: np.ndarray, sigma_m: float, sigma_rad: float) -> np.ndarray:
     """Information of an edge: that of the match, limited by what a match cannot know about itself."""
     # (3 m)^-2 and (0.5 rad)^-2 keep the inverse finite where the scan says nothing.

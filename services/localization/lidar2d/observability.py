@@ -6,17 +6,17 @@ import dataclasses
 import math
 
 import numpy as np
-from numba import njit
 
-from services.localization.lidar2d.matching import Match, accumulate
-from services.localization.lidar2d.settings import LidarSlamSettings
-from services.localization.lidar2d.surfel_map import MatchTables
+from beamsplat.common.compiled import kernel
+from beamsplat.services.localization.lidar2d.matching import Match, accumulate
+from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
+from beamsplat.services.localization.lidar2d.surfel_map import MatchTables
 
 SHIFTS_M = np.array([-0.45, -0.3, -0.15, 0.15, 0.3, 0.45])
 TELLING = 0.10  # share of the returns that must disagree with a shift for its direction to be trusted
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def agreement_when_shifted(
     points: np.ndarray,
     origin: np.ndarray,
@@ -48,7 +48,7 @@ def agreement_when_shifted(
     return here
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def weak_direction(information: np.ndarray) -> np.ndarray:
     """Unit vector of the translation a match knows least about (yaw marginalised)."""
     yaw = max(information[2, 2], 1e-9)

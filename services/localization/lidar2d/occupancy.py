@@ -8,9 +8,9 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numba import njit
 
-from services.localization.lidar2d import se2
+from beamsplat.common.compiled import kernel
+from beamsplat.services.localization.lidar2d import se2
 
 HIT_LOG_ODDS = 1.5  # one return outweighs three beams that pass: walls are often seen at a grazing angle
 MISS_LOG_ODDS = -0.5
@@ -27,7 +27,7 @@ class OccupancyGrid:
     resolution_m: float
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def add_counts(
     hits: np.ndarray,
     misses: np.ndarray,  # uint8 [h, w] of a submap

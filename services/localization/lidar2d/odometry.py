@@ -5,16 +5,16 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
-from services.localization.lidar2d import se2
+from beamsplat.common.compiled import kernel
+from beamsplat.services.localization.lidar2d import se2
 
 NS = 1e-9
 BASELINE_NS = 80_000_000
 DELAYS_S = np.arange(-30, 31) * 0.01  # candidates for the delay of the odometry clock
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def interpolate(
     stamps_ns: np.ndarray,  # int64 [N], increasing
     poses: np.ndarray,  # float64 [N, 3]
@@ -42,7 +42,7 @@ def interpolate(
     return True
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def delay_costs(
     stamps_ns: np.ndarray,
     poses: np.ndarray,

@@ -5,8 +5,8 @@ from __future__ import annotations
 from concurrent.futures import Future, ThreadPoolExecutor
 from types import TracebackType
 
-from services.localization.lidar2d.jobs import BackgroundJob, JobResult
-from services.localization.lidar2d.slam import LidarSlam, ScanResult
+from beamsplat.services.localization.lidar2d.jobs import BackgroundJob, JobResult
+from beamsplat.services.localization.lidar2d.slam import LidarSlam, ScanResult
 
 
 class JobRunner:

@@ -17,7 +17,7 @@ import scipy.linalg
 import scipy.sparse
 import scipy.sparse.linalg
 
-from services.localization.lidar2d.graph_kernels import edge_pairs, reduce_nodes, substitute
+from beamsplat.services.localization.lidar2d.graph_kernels import edge_pairs, reduce_nodes, substitute
 
 DENSE_SUBMAPS = 250  # beyond this the reduced system is solved as a sparse one
 INNER_SCALE2 = 1e4  # poses in their own submap are hardly doubted

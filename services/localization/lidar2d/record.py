@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from services.localization.lidar2d import se2
+from beamsplat.services.localization.lidar2d import se2
 
 
 class TrajectoryRecord:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from services.localization.lidar2d import se2
-from services.localization.lidar2d.matching import refine
-from services.localization.lidar2d.nodes import Constraint, Keynode, edge_information
-from services.localization.lidar2d.observability import held_along, without_slip
-from services.localization.lidar2d.settings import LidarSlamSettings
-from services.localization.lidar2d.surfel_map import FrozenMap, MatchTables, SurfelMap, freeze
+from beamsplat.services.localization.lidar2d import se2
+from beamsplat.services.localization.lidar2d.matching import refine
+from beamsplat.services.localization.lidar2d.nodes import Constraint, Keynode, edge_information
+from beamsplat.services.localization.lidar2d.observability import held_along, without_slip
+from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
+from beamsplat.services.localization.lidar2d.surfel_map import FrozenMap, MatchTables, SurfelMap, freeze
 
 STILL_M, STILL_RAD = 0.02, 0.005  # keynodes that moved less leave the free space of a submap as it was
 

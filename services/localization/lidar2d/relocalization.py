@@ -7,13 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from services.localization.lidar2d import se2
-from services.localization.lidar2d.branch_bound import Pyramid, branch_and_bound, build_pyramid
-from services.localization.lidar2d.loops import evidence
-from services.localization.lidar2d.matching import Match, refine
-from services.localization.lidar2d.nodes import Keynode
-from services.localization.lidar2d.settings import LidarSlamSettings
-from services.localization.lidar2d.surfel_map import MatchTables, SurfelMap, freeze
+from beamsplat.services.localization.lidar2d import se2
+from beamsplat.services.localization.lidar2d.branch_bound import Pyramid, branch_and_bound, build_pyramid
+from beamsplat.services.localization.lidar2d.loops import evidence
+from beamsplat.services.localization.lidar2d.matching import Match, refine
+from beamsplat.services.localization.lidar2d.nodes import Keynode
+from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
+from beamsplat.services.localization.lidar2d.surfel_map import MatchTables, SurfelMap, freeze
 
 SEARCH_RETURNS = 120
 CANDIDATES = 40

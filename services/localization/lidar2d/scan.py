@@ -6,7 +6,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
+
+from beamsplat.common.compiled import kernel
 
 
 @dataclass(frozen=True)
@@ -30,7 +31,7 @@ class PreparedScan:
         return len(self.points_body)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _valid_points(
     ranges_m: np.ndarray,  # float32 [N]
     angle_min_rad: float,
@@ -69,7 +70,7 @@ def _valid_points(
     return count
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _tangents(
     points: np.ndarray,  # float64 [M, 2] in beam order
     beams: np.ndarray,  # int32 [M]
@@ -125,7 +126,7 @@ def _tangents(
                 tangents[i, 1] = math.sin(angle)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _spread(points: np.ndarray, step_m: float, limit: int, keep: np.ndarray) -> int:
     """Indices of returns at least `step_m` from the last kept one (voxel filter along the beam order);
     the step grows until at most `limit` are left (the adaptive part)."""

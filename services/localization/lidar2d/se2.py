@@ -5,18 +5,19 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
+
+from beamsplat.common.compiled import kernel
 
 TWO_PI = 2.0 * math.pi
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def wrap(angle_rad: float) -> float:
     """The same angle in [-pi, pi)."""
     return angle_rad - TWO_PI * math.floor((angle_rad + math.pi) / TWO_PI)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def compose(T_a_b: np.ndarray, T_b_c: np.ndarray) -> np.ndarray:
     """T_a_c = T_a_b @ T_b_c."""
     c, s = math.cos(T_a_b[2]), math.sin(T_a_b[2])
@@ -27,7 +28,7 @@ def compose(T_a_b: np.ndarray, T_b_c: np.ndarray) -> np.ndarray:
     return T_a_c
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def inverse(T_a_b: np.ndarray) -> np.ndarray:
     """T_b_a."""
     c, s = math.cos(T_a_b[2]), math.sin(T_a_b[2])
@@ -38,7 +39,7 @@ def inverse(T_a_b: np.ndarray) -> np.ndarray:
     return T_b_a
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def between(T_a_b: np.ndarray, T_a_c: np.ndarray) -> np.ndarray:
     """T_b_c = inverse(T_a_b) @ T_a_c."""
     return compose(inverse(T_a_b), T_a_c)

@@ -7,25 +7,31 @@ from pathlib import Path
 
 import numpy as np
 
-from services.localization.lidar2d import se2
-from services.localization.lidar2d.backend import BackEnd
-from services.localization.lidar2d.frontend import FrontEnd, RawScan, exp_twist
-from services.localization.lidar2d.jobs import BackgroundJob, JobResult, run_job
-from services.localization.lidar2d.mapping import LocalMapper
-from services.localization.lidar2d.matching import Match
-from services.localization.lidar2d.nodes import edge_information
-from services.localization.lidar2d.occupancy import CountGrid, OccupancyGrid, render
-from services.localization.lidar2d.record import TrajectoryRecord
-from services.localization.lidar2d.relocalization import (
+from beamsplat.services.localization.lidar2d import se2
+from beamsplat.services.localization.lidar2d.backend import BackEnd
+from beamsplat.services.localization.lidar2d.frontend import FrontEnd, RawScan, exp_twist
+from beamsplat.services.localization.lidar2d.jobs import BackgroundJob, JobResult, run_job
+from beamsplat.services.localization.lidar2d.mapping import LocalMapper
+from beamsplat.services.localization.lidar2d.matching import Match
+from beamsplat.services.localization.lidar2d.nodes import edge_information
+from beamsplat.services.localization.lidar2d.occupancy import CountGrid, OccupancyGrid, render
+from beamsplat.services.localization.lidar2d.record import TrajectoryRecord
+from beamsplat.services.localization.lidar2d.relocalization import (
     GlobalMap,
     Relocalization,
     build_global_map,
     relocalize_in,
 )
-from services.localization.lidar2d.scan import PreparedScan
-from services.localization.lidar2d.settings import LidarSlamSettings
-from services.localization.lidar2d.state import PackedMap, load_state, map_uuid, packed_state, write_state
-from services.localization.lidar2d.validate import StampGuard, reason_to_reject
+from beamsplat.services.localization.lidar2d.scan import PreparedScan
+from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
+from beamsplat.services.localization.lidar2d.state import (
+    PackedMap,
+    load_state,
+    map_uuid,
+    packed_state,
+    write_state,
+)
+from beamsplat.services.localization.lidar2d.validate import StampGuard, reason_to_reject
 
 NS = 1e-9
 

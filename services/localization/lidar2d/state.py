@@ -12,11 +12,11 @@ from pathlib import Path
 
 import numpy as np
 
-from common.errors import reason
-from services.localization.lidar2d.backend import BackEnd
-from services.localization.lidar2d.nodes import Constraint, Keynode, KeyScan, Submap
-from services.localization.lidar2d.settings import LidarSlamSettings
-from services.localization.lidar2d.surfel_map import FrozenMap
+from beamsplat.common.errors import reason
+from beamsplat.services.localization.lidar2d.backend import BackEnd
+from beamsplat.services.localization.lidar2d.nodes import Constraint, Keynode, KeyScan, Submap
+from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
+from beamsplat.services.localization.lidar2d.surfel_map import FrozenMap
 
 FORMAT = "beamsplat-lidar-map"
 VERSION = 1

@@ -5,15 +5,15 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
-from services.localization.lidar2d.table_kernels import splat
+from beamsplat.common.compiled import kernel
+from beamsplat.services.localization.lidar2d.table_kernels import splat
 
 MAX_WEIGHT = 60.0  # moments forget beyond this many returns: slow change is followed, memory of drift fades
 RESPLAT_M = 0.006  # a surface element that moved less than this is where its neighbourhood thinks it is
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def merged_surfel(
     cell_id: np.ndarray,  # int32 [H, W]
     moments: np.ndarray,  # float64 [S, 6] weight, x, y, xx, xy, yy sums
@@ -65,7 +65,7 @@ def merged_surfel(
     omega[2] = a * ny * ny + b * nx * nx
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def elements(
     cell_id: np.ndarray,
     moments: np.ndarray,
@@ -83,7 +83,7 @@ def elements(
         merged_surfel(cell_id, moments, row, col, range_sigma_m, map_sigma_m, means[k], omegas[k])
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _bump(counter: np.ndarray, other: np.ndarray, r: int, c: int) -> None:
     if counter[r, c] == 255:  # halve both: the ratio stays, old evidence fades
         counter[r, c] = 128
@@ -91,7 +91,7 @@ def _bump(counter: np.ndarray, other: np.ndarray, r: int, c: int) -> None:
     counter[r, c] += 1
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def add_returns(
     points: np.ndarray,  # float64 [M, 2] in the map's frame
     tangents: np.ndarray,  # float64 [M, 2] in the map's frame
@@ -160,7 +160,7 @@ def add_returns(
     return count, n_changed
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def cast_rays(
     points: np.ndarray,
     use: np.ndarray,
@@ -209,7 +209,7 @@ def cast_rays(
                 r += step_r
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def refresh(
     changed: np.ndarray,  # int32 [C] surfels with new returns
     cell_id: np.ndarray,

@@ -7,11 +7,11 @@ import zlib
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
-from services.localization.lidar2d.settings import LidarSlamSettings
-from services.localization.lidar2d.surfel_kernels import add_returns, cast_rays, elements, refresh
-from services.localization.lidar2d.table_kernels import nearest_all, splat_all
+from beamsplat.common.compiled import kernel
+from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
+from beamsplat.services.localization.lidar2d.surfel_kernels import add_returns, cast_rays, elements, refresh
+from beamsplat.services.localization.lidar2d.table_kernels import nearest_all, splat_all
 
 BLOCK = 64  # grids grow in blocks of so many cells
 MARGIN = 8
@@ -184,7 +184,7 @@ class SurfelMap:
         )
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _growth(
     points: np.ndarray, cell_m: float, row0: int, col0: int, rows: int, cols: int
 ) -> tuple[int, int, int, int]:

@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
+
+from beamsplat.common.compiled import kernel
 
 FIELD_SIGMA_M = 0.06  # width of the likelihood field used by searches
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def splat(
     nearest: np.ndarray,  # int32 [H, W]
     field: np.ndarray,  # uint8 [H, W]
@@ -50,7 +51,7 @@ def splat(
                     field[r, c] = np.uint8(v)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def splat_all(
     nearest: np.ndarray,
     field: np.ndarray,
@@ -79,7 +80,7 @@ def splat_all(
         )
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def nearest_all(
     nearest: np.ndarray,  # out int32 [H, W]
     means: np.ndarray,  # float64 [S, 2]

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from services.localization.lidar2d.frontend import RawScan
+from beamsplat.services.localization.lidar2d.frontend import RawScan
 
 RESTART_SCANS = 5  # so many refused scans in a row whose own stamps rise: the clock was set, follow it
 

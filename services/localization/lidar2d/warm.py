@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from services.localization.lidar2d.offline import JobRunner
-from services.localization.lidar2d.settings import LidarSlamSettings
-from services.localization.lidar2d.slam import LidarSlam
+from beamsplat.services.localization.lidar2d.offline import JobRunner
+from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
+from beamsplat.services.localization.lidar2d.slam import LidarSlam
 
 _BEAMS, _SCANS = 360, 80
 _HALF_M = (3.0, 2.0)  # half sides of the room

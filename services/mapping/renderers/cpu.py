@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from common.raster.camera import RasterCamera
-from common.raster.layout import GROUPS, PARAMS
-from common.raster.rasterizer import Rasterizer, Render
-from services.mapping.renderers.protocol import Gaussians, Picture
+from beamsplat.common.raster.camera import RasterCamera
+from beamsplat.common.raster.layout import GROUPS, PARAMS
+from beamsplat.common.raster.rasterizer import Rasterizer, Render
+from beamsplat.services.mapping.renderers.protocol import Gaussians, Picture
 
 
 class Cpu:

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from common.errors import UserError
-from common.raster.camera import RasterCamera
-from common.raster.layout import BLUR_PX2, NEAR_M
-from services.mapping.renderers.protocol import Gaussians, Picture
+from beamsplat.common.errors import UserError
+from beamsplat.common.raster.camera import RasterCamera
+from beamsplat.common.raster.layout import BLUR_PX2, NEAR_M
+from beamsplat.services.mapping.renderers.protocol import Gaussians, Picture
 
 
 def fault() -> str | None:

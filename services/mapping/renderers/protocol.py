@@ -15,8 +15,8 @@ from typing import Protocol
 import numpy as np
 import torch
 
-from common.errors import UserError
-from common.raster.camera import RasterCamera
+from beamsplat.common.errors import UserError
+from beamsplat.common.raster.camera import RasterCamera
 
 
 @dataclass(frozen=True)
@@ -65,9 +65,9 @@ class Renderer(Protocol):
 
 
 RENDERERS: dict[str, str] = {
-    "reference": "services.mapping.renderers.reference:Reference",
-    "cpu": "services.mapping.renderers.cpu:Cpu",
-    "gsplat": "services.mapping.renderers.gsplat:Gsplat",
+    "reference": "beamsplat.services.mapping.renderers.reference:Reference",
+    "cpu": "beamsplat.services.mapping.renderers.cpu:Cpu",
+    "gsplat": "beamsplat.services.mapping.renderers.gsplat:Gsplat",
 }
 
 

@@ -1,6 +1,6 @@
 """`reference`: the rasterizer in plain torch, for any dtype. Slow; the others' truth in tests.
 
-Dense over pixels within blocks of 16 x 16, gradients by autograd. Constants are in common.raster.layout.
+Dense over pixels within blocks of 16 x 16, gradients by autograd. Constants are in `raster.layout`.
 """
 
 from __future__ import annotations
@@ -8,9 +8,9 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from common.raster.camera import RasterCamera
-from common.raster.layout import ALPHA_MAX, ALPHA_MIN, BLUR_PX2, NEAR_M, STOP
-from services.mapping.renderers.protocol import Gaussians, Picture
+from beamsplat.common.raster.camera import RasterCamera
+from beamsplat.common.raster.layout import ALPHA_MAX, ALPHA_MIN, BLUR_PX2, NEAR_M, STOP
+from beamsplat.services.mapping.renderers.protocol import Gaussians, Picture
 
 _BLOCK = 16
 

@@ -7,17 +7,17 @@ from collections.abc import Callable
 
 import numpy as np
 
-from common.camera import Pinhole, Undistorter
-from common.codec import decode
-from common.geometry import inverse
-from common.messages import Keyframe, Message
-from common.node import Job, Node, Outputs
-from services.mapping.config import MappingConfig
-from services.mapping.keyframe import Keyframe as MapKeyframe
-from services.mapping.mapper import Mapper, Outcome
-from services.mapping.messages import ack, body_of, open_keyframe
-from services.mapping.session.arrivals import Arrivals
-from services.mapping.session.keeper import Keeper, Saved
+from beamsplat.common.geometry.camera import Pinhole, Undistorter
+from beamsplat.common.geometry.transforms import inverse
+from beamsplat.common.messages import Keyframe, Message
+from beamsplat.common.messages.codec import decode
+from beamsplat.common.runtime.node import Job, Node, Outputs
+from beamsplat.services.mapping.config import MappingConfig
+from beamsplat.services.mapping.keyframe import Keyframe as MapKeyframe
+from beamsplat.services.mapping.mapper import Mapper, Outcome
+from beamsplat.services.mapping.messages import ack, body_of, open_keyframe
+from beamsplat.services.mapping.session.checkpointer import Keeper, Saved
+from beamsplat.services.mapping.session.inbox import Arrivals
 
 log = logging.getLogger("beamsplat.mapping")
 

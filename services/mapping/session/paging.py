@@ -17,11 +17,11 @@ from pathlib import Path
 
 import numpy as np
 
-from common.errors import UserError
-from services.mapping.keyframe import Held, Keyframe, Level, hold
-from services.mapping.mapper import FULL, Mapper
-from services.mapping.session.shelf import Group, Shelf, groups_of, spheres_of
-from services.mapping.session.sight import sees
+from beamsplat.common.errors import UserError
+from beamsplat.services.mapping.keyframe import Held, Keyframe, Level, hold
+from beamsplat.services.mapping.mapper import FULL, Mapper
+from beamsplat.services.mapping.session.disk_tier import Group, Shelf, groups_of, spheres_of
+from beamsplat.services.mapping.session.frustum import sees
 
 log = logging.getLogger("beamsplat.mapping")
 

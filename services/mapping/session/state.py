@@ -4,19 +4,17 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
 
-from common.errors import UserError
-from common.raster.camera import RasterCamera
-from services.mapping.keyframe import Held, Keyframe, Level, hold
-from services.mapping.mapper import FULL, Mapper
-from services.mapping.session.blocks import Arrays
-from services.mapping.store import GaussianStore
+from beamsplat.common.errors import UserError
+from beamsplat.common.mapfiles.blocks import Arrays
+from beamsplat.common.mapfiles.state import CAMERA_FIELDS, camera_of, progress_of, store_of
+from beamsplat.services.mapping.keyframe import Held, Keyframe, Level, hold
+from beamsplat.services.mapping.mapper import FULL, Mapper
 
-_CAMERA = ("fx_px", "fy_px", "cx_px", "cy_px", "width_px", "height_px")
 _NOT_STORED = {"levels"}  # made again from the keyframe's body
 _FIELDS = tuple(field.name for field in fields(Held) if field.name not in _NOT_STORED)
 
@@ -31,9 +29,9 @@ def arrays_of(mapper: Mapper, extra: Arrays | None = None) -> Arrays:
     out = {f"store_{name}": array for name, array in mapper.store.state().items()}
     for name in _FIELDS:
         out[f"keyframe_{name}"] = np.array([getattr(h, name) for h in held])
-    cameras = [[getattr(h.levels[FULL].camera, name) for name in _CAMERA] for h in held]
+    cameras = [[getattr(h.levels[FULL].camera, name) for name in CAMERA_FIELDS] for h in held]
     out["keyframe_parked"] = np.arange(len(held)) >= len(mapper.keyframes)
-    out["keyframe_camera"] = np.array(cameras, np.float64).reshape(-1, len(_CAMERA))
+    out["keyframe_camera"] = np.array(cameras, np.float64).reshape(-1, len(CAMERA_FIELDS))
     out["anchor_id"] = np.array(list(mapper.T_map_anchor), np.int64)
     out["anchor_T_map"] = np.array(list(mapper.T_map_anchor.values()), np.float64).reshape(-1, 4, 4)
     out["progress"] = np.frombuffer(json.dumps(mapper.progress()).encode(), np.uint8)
@@ -81,50 +79,9 @@ def restore(mapper: Mapper, arrays: Arrays, body: Callable[[int], Keyframe], res
 def _held(arrays: Arrays, row: int) -> Held:
     """A keyframe without its pictures; what came later than the file keeps its default."""
     empty, stored = np.zeros(0, np.uint8), [n for n in _FIELDS if f"keyframe_{n}" in arrays]
-    level = Level(_camera(arrays, row), empty, empty, empty, empty, empty)
+    level = Level(camera_of(arrays, row), empty, empty, empty, empty, empty)
     return Held(levels=[level], **{n: _value(arrays[f"keyframe_{n}"][row]) for n in stored})
-
-
-def _camera(arrays: Arrays, row: int) -> RasterCamera:
-    numbers = dict(zip(_CAMERA, arrays["keyframe_camera"][row].tolist()))
-    return RasterCamera(**numbers | {name: int(numbers[name]) for name in ("width_px", "height_px")})
-
-
-def store_of(arrays: Arrays) -> GaussianStore:
-    """The Gaussians of a state.
-
-    Raises:
-        KeyError: an array is missing.
-    """
-    store = GaussianStore()
-    store.restore({k.removeprefix("store_"): a for k, a in arrays.items() if k.startswith("store_")})
-    return store
-
-
-def progress_of(arrays: Arrays) -> dict[str, Any]:
-    """The mapper's counters (`Mapper.progress`) in a state."""
-    return json.loads(arrays["progress"].tobytes())
 
 
 def _value(stored: np.ndarray) -> Any:
     return stored.item() if stored.ndim == 0 else stored.copy()
-
-
-@dataclass(frozen=True)
-class View:
-    """A keyframe of a saved map: where it looks from."""
-
-    id: int
-    camera: RasterCamera
-    T_map_camera: np.ndarray
-
-
-def views_of(arrays: Arrays) -> list[View]:
-    """The keyframes of a state, refined, in order of id (which is time)."""
-    T_map_anchor = dict(zip(arrays["anchor_id"].tolist(), arrays["anchor_T_map"]))
-    out = []
-    for row, id in enumerate(arrays["keyframe_id"].tolist()):
-        T_anchor_camera = arrays["keyframe_T_anchor_camera"][row] @ arrays["keyframe_delta"][row]
-        T_map_camera = T_map_anchor[int(arrays["keyframe_anchor"][row])] @ T_anchor_camera
-        out.append(View(id, _camera(arrays, row), T_map_camera))
-    return sorted(out, key=lambda view: view.id)

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from common.geometry import make_transform, so3_exp
-from common.raster.camera import RasterCamera
+from beamsplat.common.geometry.transforms import make_transform, so3_exp
+from beamsplat.common.raster.camera import RasterCamera
 
 GROUPS = ("mean_map_m", "log_scale", "quat_wxyz", "opacity_logit", "colour")
 

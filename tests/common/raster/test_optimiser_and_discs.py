@@ -6,12 +6,12 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from common.geometry import make_transform, matrix_from_quat_wxyz, so3_exp
-from common.raster.camera import RasterCamera
-from common.raster.discs import choose_pixels, disc_quats, make_discs
-from common.raster.layout import GRADIENTS, MEAN, OPACITY, QUAT, SCALE, WEIGHT
-from common.raster.optimiser import GaussianArrays, adam, rate_rows
-from common.raster.threads import Team
+from beamsplat.common.geometry.transforms import make_transform, matrix_from_quat_wxyz, so3_exp
+from beamsplat.common.raster.camera import RasterCamera
+from beamsplat.common.raster.discs import choose_pixels, disc_quats, make_discs
+from beamsplat.common.raster.layout import GRADIENTS, MEAN, OPACITY, QUAT, SCALE, WEIGHT
+from beamsplat.common.raster.optimiser import GaussianArrays, adam, rate_rows
+from beamsplat.common.raster.threads import Team
 
 
 def test_adam_is_that_of_torch_for_what_is_seen():

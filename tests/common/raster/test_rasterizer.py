@@ -6,14 +6,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numba import njit
 
-from common.raster.camera import RasterCamera
-from common.raster.lanes import exp2_lanes, exp_lanes, log2_lanes, sigmoid_lanes
-from common.raster.layout import GRADIENTS, WEIGHT
-from common.raster.rasterizer import Rasterizer
-from common.raster.simd import LANES, iota
-from common.raster.simd_memory import gather, load, scatter_some, store, store_sums4
-from common.raster.visible import sort_by_depth
-from common.raster.warm import warm
+from beamsplat.common.raster.camera import RasterCamera
+from beamsplat.common.raster.lanes import exp2_lanes, exp_lanes, log2_lanes, sigmoid_lanes
+from beamsplat.common.raster.layout import GRADIENTS, WEIGHT
+from beamsplat.common.raster.rasterizer import Rasterizer
+from beamsplat.common.raster.simd import LANES, iota
+from beamsplat.common.raster.simd_memory import gather, load, scatter_some, store, store_sums4
+from beamsplat.common.raster.visible import sort_by_depth
+from beamsplat.common.raster.warm import warm
 from tests.common.raster.scenes import random_camera, random_gaussians, random_pose
 
 

@@ -8,11 +8,11 @@ import cv2
 import numpy as np
 import pytest
 
-from common.errors import UserError
-from common.recording.picture import is_whole
-from services.camera.config import CameraConfig, NoCameraConfig
-from services.camera.jpeg import is_intact
-from services.camera.node import CameraNode, NoCamera
+from beamsplat.common.errors import UserError
+from beamsplat.common.recording.picture import is_whole
+from beamsplat.services.camera.config import CameraConfig, NoCameraConfig
+from beamsplat.services.camera.jpeg import is_intact
+from beamsplat.services.camera.node import CameraNode, NoCamera
 from tests.services.lidar.test_live import Running
 
 RIG = """

@@ -4,10 +4,10 @@ import time
 from itertools import pairwise
 from pathlib import Path
 
-from common.clock import StampClock
-from common.config import NodeConfig, load_deployment
-from services.clock.node import TICK_NS, ClockNode
-from services.deployment import faults
+from beamsplat.common.config.deployment import NodeConfig, load_deployment
+from beamsplat.common.runtime.clock import StampClock
+from beamsplat.services.clock.node import TICK_NS, ClockNode
+from beamsplat.tools.system.assembly import faults
 
 ROOT = Path(__file__).resolve().parents[3]
 

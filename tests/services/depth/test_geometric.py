@@ -4,10 +4,10 @@ import cv2
 import numpy as np
 import pytest
 
-from common.errors import UserError
-from common.geometry import se2_to_se3
-from services.depth.source import View, judge, make_source
-from services.evaluation.metrics import MethodErrors, blocks, confirmed, every_third
+from beamsplat.common.errors import UserError
+from beamsplat.common.geometry.transforms import se2_to_se3
+from beamsplat.services.depth.source import View, judge, make_source
+from beamsplat.tools.evaluation.metrics import MethodErrors, blocks, confirmed, every_third
 from tests.services.fusion.room import CAMERA, T_BODY_CAMERA, render, scan
 
 POSE = se2_to_se3(np.array([0.3, 0.2, 0.1]))
@@ -101,8 +101,8 @@ def test_beams_that_the_truth_does_not_confirm_are_told():
 
 
 def test_pictures_that_wait_in_vain_for_their_poses_are_counted():
-    from common.messages import CameraModel, Image, LidarModel, Rig
-    from services.depth.node import DepthNode
+    from beamsplat.common.messages import CameraModel, Image, LidarModel, Rig
+    from beamsplat.services.depth.node import DepthNode
 
     node = DepthNode(DepthNode.Config(source="stixel"))
     node.configure()

@@ -5,10 +5,10 @@ from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 
 import pytest
 
-from common.errors import UserError
-from services.depth.models import ModelRow, pull, read_table, row_of
-from services.depth.source import SOURCES
-from services.depth.store import find_model, sha256_of
+from beamsplat.common.errors import UserError
+from beamsplat.services.depth.models import ModelRow, pull, read_table, row_of
+from beamsplat.services.depth.source import SOURCES
+from beamsplat.services.depth.store import find_model, sha256_of
 
 DATA = bytes(range(256)) * 4000
 

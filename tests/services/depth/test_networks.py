@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from common.camera import Pinhole
-from common.errors import UserError
-from services.depth.depth_anything import lower_bound
-from services.depth.fastdepth import network_view
-from services.depth.onnx_model import OnnxModel, available_providers, to_hw
-from services.depth.source import View, make_source
-from services.depth.unidepth import fit_into, network_rays
+from beamsplat.common.errors import UserError
+from beamsplat.common.geometry.camera import Pinhole
+from beamsplat.services.depth.depth_anything import lower_bound
+from beamsplat.services.depth.fastdepth import network_view
+from beamsplat.services.depth.onnx_model import OnnxModel, available_providers, to_hw
+from beamsplat.services.depth.source import View, make_source
+from beamsplat.services.depth.unidepth import fit_into, network_rays
 
 pytest.importorskip("onnx", reason="needs the package onnx, which builds the graphs")
 from tests.services.depth import graphs
@@ -164,10 +164,10 @@ def test_the_network_at_hand_answers_at_its_known_error(shared_dir, monkeypatch)
     """FastDepth on real pictures of a kitchen: AbsRel 0.24 as probed elsewhere on these weights."""
     import cv2
 
-    from services.depth.recorded import read_depth
-    from services.evaluation.evaluate import read_truth
-    from services.replay.options import SourceOptions
-    from services.replay.source import open_source
+    from beamsplat.services.depth.recorded import read_depth
+    from beamsplat.services.replay.options import SourceOptions
+    from beamsplat.services.replay.source import open_source
+    from beamsplat.tools.evaluation.evaluate import read_truth
 
     monkeypatch.setenv("BEAMSPLAT_MODELS", str(shared_dir / "models"))
     source = make_source("fastdepth")

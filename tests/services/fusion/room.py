@@ -3,10 +3,10 @@
 import cv2
 import numpy as np
 
-from common.beams import Beams
-from common.camera import Pinhole
-from common.frames import camera_mount
-from common.geometry import inverse, transform_points
+from beamsplat.common.geometry.beams import Beams
+from beamsplat.common.geometry.camera import Pinhole
+from beamsplat.common.geometry.frames import camera_mount
+from beamsplat.common.geometry.transforms import inverse, transform_points
 
 CAMERA = Pinhole(265.0, 265.0, 159.5, 119.5, 320, 240)
 T_BODY_CAMERA = camera_mount(0.1, 0.0, 0.45, pitch_down_rad=0.035)

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from common.camera import Pinhole
-from common.frames import camera_mount, lidar_mount
-from common.geometry import inverse, se2_to_se3, transform_points
-from services.fusion.calibration.board import BoardPair, level_mount, solve_board
-from services.fusion.calibration.motion import TrackedPair, corrected, solve_motion
-from services.fusion.calibration.mounting import check_mounting
+from beamsplat.common.geometry.camera import Pinhole
+from beamsplat.common.geometry.frames import camera_mount, lidar_mount
+from beamsplat.common.geometry.transforms import inverse, se2_to_se3, transform_points
+from beamsplat.services.fusion.calibration.board import BoardPair, level_mount, solve_board
+from beamsplat.services.fusion.calibration.motion import TrackedPair, corrected, solve_motion
+from beamsplat.services.fusion.calibration.mounting import check_mounting
 from tests.services.fusion.room import scan
 
 CAMERA = Pinhole(265.0, 265.0, 159.5, 119.5, 320, 240)

@@ -2,12 +2,12 @@
 
 import numpy as np
 
-from common.beams import Beams
-from common.geometry import se2_to_se3, transform_points
-from services.fusion.cloud import coloured_cloud
-from services.fusion.movers import FreeSpace, mover_mask
-from services.fusion.result import Fused
-from services.fusion.surfaces import without_posts
+from beamsplat.common.geometry.beams import Beams
+from beamsplat.common.geometry.transforms import se2_to_se3, transform_points
+from beamsplat.services.fusion.cloud import coloured_cloud
+from beamsplat.services.fusion.movers import FreeSpace, mover_mask
+from beamsplat.services.fusion.result import Fused
+from beamsplat.services.fusion.surfaces import without_posts
 from tests.services.fusion.room import CAMERA, T_BODY_CAMERA, in_map, render, scan
 
 POSE = se2_to_se3(np.array([0.3, 0.2, 0.1]))

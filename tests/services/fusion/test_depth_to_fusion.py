@@ -4,12 +4,12 @@ import cv2
 import numpy as np
 import pytest
 
-from common.config import Deployment
-from common.lockstep import Lockstep
-from common.messages import DepthEstimate, Image, Odometry, Rig, Scan
-from services.deployment import build_node
-from services.depth.node import DepthNode
-from services.fusion.node import FusionNode
+from beamsplat.common.config.deployment import Deployment
+from beamsplat.common.messages import DepthEstimate, Image, Odometry, Rig, Scan
+from beamsplat.common.runtime.lockstep import Lockstep
+from beamsplat.services.depth.node import DepthNode
+from beamsplat.services.fusion.node import FusionNode
+from beamsplat.tools.system.assembly import build_node
 from tests.common.samples import sample_messages
 
 RIG = next(m for m in sample_messages() if type(m) is Rig)

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from common.beams import NO_BEAMS
-from common.geometry import se2_to_se3
-from services.fusion.frame import Frame
-from services.fusion.fuse import Fusion
-from services.fusion.relative_pose import epipolar_px, refine
+from beamsplat.common.geometry.beams import NO_BEAMS
+from beamsplat.common.geometry.transforms import se2_to_se3
+from beamsplat.services.fusion.frame import Frame
+from beamsplat.services.fusion.fuse import Fusion
+from beamsplat.services.fusion.relative_pose import epipolar_px, refine
 from tests.services.fusion.room import CAMERA, T_BODY_CAMERA, in_map, render, scan
 
 
@@ -130,7 +130,7 @@ def test_a_turned_relative_pose_is_put_right_by_tracked_corners():
     moved = points @ T[:3, :3].T + T[:3, 3]
     rays_b = moved / moved[:, 2:] + np.column_stack([rng.normal(0, 0.2 / 265, (80, 2)), np.zeros(80)])
     rays_b[:8, 0] += 0.1  # wrong tracks
-    from common.geometry import so3_exp, so3_log
+    from beamsplat.common.geometry.transforms import so3_exp, so3_log
 
     wrong = T.copy()
     wrong[:3, :3] = so3_exp(np.array([0.002, 0.006, -0.003])) @ T[:3, :3]

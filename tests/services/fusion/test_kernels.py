@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from common.geometry import make_transform, so3_exp
-from services.fusion import finish
-from services.fusion import volume_kernels as fast
-from services.fusion import volume_reference as slow
-from services.fusion.lidar_map import LidarMap
-from services.fusion.memory import Memory, vote
+from beamsplat.common.geometry.transforms import make_transform, so3_exp
+from beamsplat.services.fusion import finish
+from beamsplat.services.fusion import volume_kernels as fast
+from beamsplat.services.fusion import volume_reference as slow
+from beamsplat.services.fusion.lidar_map import LidarMap
+from beamsplat.services.fusion.memory import Memory, vote
 
 
 @pytest.fixture(scope="module")

@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.fusion.guess import metric_guess
-from services.fusion.pairs import effective_count, largest_cluster, make_pairs
-from services.fusion.scaling import affine, ratio
+from beamsplat.services.fusion.guess import metric_guess
+from beamsplat.services.fusion.pairs import effective_count, largest_cluster, make_pairs
+from beamsplat.services.fusion.scaling import affine, ratio
 
 SHAPE = (48, 64)
 

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from common.geometry import inverse, se2_to_se3, so3_exp, transform_points
-from services.fusion.calibration.motion import corrected
-from services.fusion.calibration.startup import StartupCheck, check
+from beamsplat.common.geometry.transforms import inverse, se2_to_se3, so3_exp, transform_points
+from beamsplat.services.fusion.calibration.motion import corrected
+from beamsplat.services.fusion.calibration.startup import StartupCheck, check
 from tests.services.fusion.room import CAMERA, LIDAR_Z, T_BODY_CAMERA, render, scan
 from tests.services.fusion.test_calibration import MOUNT, _drive, _pose
 

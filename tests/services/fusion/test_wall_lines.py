@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from services.fusion.lidar_map import LidarMap
-from services.fusion.surfaces import CeilingFinder
-from services.fusion.wall_lines import find_lines, ranges_to
+from beamsplat.services.fusion.lidar_map import LidarMap
+from beamsplat.services.fusion.surfaces import CeilingFinder
+from beamsplat.services.fusion.wall_lines import find_lines, ranges_to
 
 CELL_M = 0.04
 

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from common.camera import Pinhole
-from common.frames import camera_mount
-from common.geometry import inverse, transform_points
-from services.keyframes.bodies import body_mask
+from beamsplat.common.geometry.camera import Pinhole
+from beamsplat.common.geometry.frames import camera_mount
+from beamsplat.common.geometry.transforms import inverse, transform_points
+from beamsplat.services.keyframes.bodies import body_mask
 
 CAMERA = Pinhole(530.0, 530.0, 319.5, 239.5, 640, 480)
 T_BODY_CAMERA = camera_mount(0.1, 0.0, 0.45)

@@ -5,10 +5,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from common.depth_code import depth_from_png, mask_from_png, sigma_from_png
-from common.geometry import inverse, transform_points
-from common.lockstep import Lockstep
-from common.messages import (
+from beamsplat.common.geometry.transforms import inverse, transform_points
+from beamsplat.common.messages import (
     FusedDepth,
     Image,
     Keyframe,
@@ -19,9 +17,11 @@ from common.messages import (
     Rig,
     Scan,
 )
-from common.node import Node
-from common.picture import decode_rgb
-from services.keyframes.node import KeyframesConfig, KeyframesNode
+from beamsplat.common.messages.depth_png import depth_from_png, mask_from_png, sigma_from_png
+from beamsplat.common.messages.image_codec import decode_rgb
+from beamsplat.common.runtime.lockstep import Lockstep
+from beamsplat.common.runtime.node import Node
+from beamsplat.services.keyframes.node import KeyframesConfig, KeyframesNode
 from tests.services.mapping import room_drive as r
 
 

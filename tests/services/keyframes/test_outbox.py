@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from common.errors import UserError
-from services.keyframes.folder import BrokenFile, Folder, Label, _read_head
-from services.keyframes.outbox import Outbox, least_useful
+from beamsplat.common.errors import UserError
+from beamsplat.services.keyframes.folder import BrokenFile, Folder, Label, _read_head
+from beamsplat.services.keyframes.outbox import Outbox, least_useful
 
 S = 1_000_000_000
 

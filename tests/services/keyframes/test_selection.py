@@ -4,9 +4,9 @@ import cv2
 import numpy as np
 import pytest
 
-from common.frames import camera_mount
-from common.geometry import make_transform, se2_to_se3, so3_exp
-from services.keyframes.selection import KeyframeSelector, SelectionSettings, overlap, sharpness
+from beamsplat.common.geometry.frames import camera_mount
+from beamsplat.common.geometry.transforms import make_transform, se2_to_se3, so3_exp
+from beamsplat.services.keyframes.selection import KeyframeSelector, SelectionSettings, overlap, sharpness
 
 FOV_RAD = (1.09, 0.85)
 HALF = np.tan(0.5 * np.array(FOV_RAD))

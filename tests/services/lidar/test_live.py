@@ -6,14 +6,14 @@ import time
 import numpy as np
 import pytest
 
-from common.bus import Bus, open_router, open_session
-from common.clock import StampClock
-from common.errors import UserError
-from common.live import Live, LiveSettings
-from common.node import Input
-from services.lidar.config import HokuyoConfig, LidarConfig, RplidarConfig
-from services.lidar.link import LinkError, open_link
-from services.lidar.node import HokuyoNode, LdrobotNode, RplidarNode
+from beamsplat.common.errors import UserError
+from beamsplat.common.runtime.clock import StampClock
+from beamsplat.common.runtime.live import Live, LiveSettings
+from beamsplat.common.runtime.node import Input
+from beamsplat.common.zenoh.bus import Bus, open_router, open_session
+from beamsplat.services.lidar.config import HokuyoConfig, LidarConfig, RplidarConfig
+from beamsplat.services.lidar.link import LinkError, open_link
+from beamsplat.services.lidar.node import HokuyoNode, LdrobotNode, RplidarNode
 from tests.services.lidar.devices import Hokuyo, Ld19, Plugged, Rplidar, room_range_m
 
 

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.lidar import ldrobot, scip
-from services.lidar import rplidar_packets as rp
+from beamsplat.services.lidar import ldrobot, scip
+from beamsplat.services.lidar import rplidar_packets as rp
 
 # LDROBOT, LD06 Development Manual v1.0, 3.3 "Example": the packet and the values printed beside it.
 LD06_EXAMPLE = bytes.fromhex(
@@ -162,8 +162,8 @@ def test_scip_request_for_scans():
 
 @given(st.binary(max_size=2000), st.integers(0, 4))
 def test_rubbish_is_no_packet_and_no_error(data, kind):
-    from services.lidar.framing import Counters, Framer
-    from services.lidar.rplidar_stream import RplidarStream
+    from beamsplat.services.lidar.framing import Counters, Framer
+    from beamsplat.services.lidar.rplidar_stream import RplidarStream
 
     if kind == 4:
         stream = Framer(ldrobot.PACKET_BYTES, ldrobot.begins, ldrobot.whole, Counters())
@@ -175,7 +175,7 @@ def test_rubbish_is_no_packet_and_no_error(data, kind):
 
 @given(st.binary(max_size=200), st.integers(1, 100), st.integers(3, 12))
 def test_packets_are_found_behind_any_rubbish_in_any_pieces(garbage, piece, count):
-    from services.lidar.framing import Counters, Framer
+    from beamsplat.services.lidar.framing import Counters, Framer
 
     counters = Counters()
     framer = Framer(ldrobot.PACKET_BYTES, ldrobot.begins, ldrobot.whole, counters, followed=True)

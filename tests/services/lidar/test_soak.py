@@ -5,8 +5,8 @@ import time
 import numpy as np
 import pytest
 
-from services.lidar.config import HokuyoConfig, LidarConfig, RplidarConfig
-from services.lidar.node import HokuyoNode, LdrobotNode, RplidarNode
+from beamsplat.services.lidar.config import HokuyoConfig, LidarConfig, RplidarConfig
+from beamsplat.services.lidar.node import HokuyoNode, LdrobotNode, RplidarNode
 from tests.services.lidar.devices import Hokuyo, Ld19, Plugged, Rplidar, room_range_m
 from tests.services.lidar.test_live import Running
 

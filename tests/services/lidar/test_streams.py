@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from services.lidar.clock import DeviceClock, Unwrapper
-from services.lidar.guard import LinkNoise, confirmed
-from services.lidar.hokuyo import HokuyoDriver
-from services.lidar.ldrobot import LdrobotDriver
-from services.lidar.rplidar import RplidarDriver
+from beamsplat.services.lidar.clock import DeviceClock, Unwrapper
+from beamsplat.services.lidar.guard import LinkNoise, confirmed
+from beamsplat.services.lidar.hokuyo import HokuyoDriver
+from beamsplat.services.lidar.ldrobot import LdrobotDriver
+from beamsplat.services.lidar.rplidar import RplidarDriver
 from tests.services.lidar.devices import Hokuyo, Ld19, Rplidar
 from tests.services.lidar.links import drive, errors_m
 

@@ -4,11 +4,11 @@ import time
 
 import numpy as np
 
-from common.bus import Bus, open_session
-from common.config import Deployment, RouterConfig
-from common.node import Input
-from services.board import HealthBoard
-from services.supervisor import Supervisor
+from beamsplat.common.config.deployment import Deployment, RouterConfig
+from beamsplat.common.runtime.node import Input
+from beamsplat.common.zenoh.bus import Bus, open_session
+from beamsplat.tools.system.health_table import HealthBoard
+from beamsplat.tools.system.supervisor import Supervisor
 from tests.services.lidar.devices import Ld19, Plugged
 
 RIG = "[lidar.mount]\nxyz_m = [0.0, 0.0, 0.2]\nrpy_deg = [0.0, 0.0, 0.0]\n"

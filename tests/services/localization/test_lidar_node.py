@@ -5,18 +5,18 @@ import hashlib
 import numpy as np
 import pytest
 
-from common.codec import encode
-from common.config import Deployment, RouterConfig
-from common.geometry import inverse, yaw_of
-from common.lockstep import Lockstep
-from common.messages import Rig, Scan
-from common.node import Node
-from common.recording import RecordingReader
-from common.trajectory import read_tum
-from services.deployment import build_node
-from services.localization.lidar2d.node import LidarLocalization
-from services.nodes import NODES
-from services.supervisor import Supervisor
+from beamsplat.common.config.deployment import Deployment, RouterConfig
+from beamsplat.common.geometry.trajectory import read_tum
+from beamsplat.common.geometry.transforms import inverse, yaw_of
+from beamsplat.common.messages import Rig, Scan
+from beamsplat.common.messages.codec import encode
+from beamsplat.common.recording import RecordingReader
+from beamsplat.common.runtime.lockstep import Lockstep
+from beamsplat.common.runtime.node import Node
+from beamsplat.services.localization.lidar2d.node import LidarLocalization
+from beamsplat.services.nodes import NODES
+from beamsplat.tools.system.assembly import build_node
+from beamsplat.tools.system.supervisor import Supervisor
 from tests.common.samples import sample_messages
 
 
@@ -95,8 +95,8 @@ def test_live_through_zenoh_gives_the_same_messages(shared_dir, tmp_path, free_e
 def _until_recorded(supervisor, folder):
     import time
 
-    from common.bus import open_session
-    from services.board import HealthBoard
+    from beamsplat.common.zenoh.bus import open_session
+    from beamsplat.tools.system.health_table import HealthBoard
 
     with open_session(supervisor.deployment.router.listen) as session:
         board = HealthBoard(session, "t")

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from services.localization.lidar2d import se2
-from services.localization.lidar2d.metrics import (
+from beamsplat.services.localization.lidar2d import se2
+from beamsplat.services.localization.lidar2d.metrics import (
     interpolate_poses,
     read_relations,
     relation_errors,

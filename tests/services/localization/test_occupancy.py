@@ -1,16 +1,16 @@
 import cv2
 import numpy as np
 
-from services.localization.lidar2d import se2
-from services.localization.lidar2d.movers import contradicts_free_space, grow_along_beams
-from services.localization.lidar2d.occupancy import (
+from beamsplat.services.localization.lidar2d import se2
+from beamsplat.services.localization.lidar2d.movers import contradicts_free_space, grow_along_beams
+from beamsplat.services.localization.lidar2d.occupancy import (
     CountGrid,
     OccupancyGrid,
     changed_regions,
     render,
     save_nav2,
 )
-from services.localization.lidar2d.surfel_kernels import cast_rays
+from beamsplat.services.localization.lidar2d.surfel_kernels import cast_rays
 
 
 def counts(shape=(20, 30)):

@@ -1,10 +1,10 @@
 import numpy as np
 import pytest
 
-from services.localization.lidar2d import se2
-from services.localization.lidar2d.frontend import exp_twist, twist
-from services.localization.lidar2d.metrics import interpolate_poses
-from services.localization.lidar2d.odometry import OdometryBuffer, Predictor, interpolate
+from beamsplat.services.localization.lidar2d import se2
+from beamsplat.services.localization.lidar2d.frontend import exp_twist, twist
+from beamsplat.services.localization.lidar2d.metrics import interpolate_poses
+from beamsplat.services.localization.lidar2d.odometry import OdometryBuffer, Predictor, interpolate
 
 NS = 1_000_000_000
 

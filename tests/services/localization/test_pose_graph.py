@@ -1,9 +1,9 @@
 import numpy as np
 import scipy.optimize
 
-from services.localization.lidar2d import pose_graph, se2
-from services.localization.lidar2d.nodes import edge_information
-from services.localization.lidar2d.pose_graph import Edges, optimise
+from beamsplat.services.localization.lidar2d import pose_graph, se2
+from beamsplat.services.localization.lidar2d.nodes import edge_information
+from beamsplat.services.localization.lidar2d.pose_graph import Edges, optimise
 
 
 def problem(rng, n_submaps=6, n_nodes=40, noise=0.01):

@@ -6,11 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from common.errors import UserError
-from common.geometry import inverse, se2_to_se3
-from common.live_settings import LiveSettings
-from common.messages import LidarModel, Rig, Scan
-from services.localization.lidar2d.node import LidarLocalization
+from beamsplat.common.errors import UserError
+from beamsplat.common.geometry.transforms import inverse, se2_to_se3
+from beamsplat.common.messages import LidarModel, Rig, Scan
+from beamsplat.common.runtime.live_settings import LiveSettings
+from beamsplat.services.localization.lidar2d.node import LidarLocalization
 from tests.services.localization.world import Drive, Lidar
 
 T0 = 1_000_000_000_000

@@ -7,14 +7,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from services.localization.lidar2d import se2
-from services.localization.lidar2d.branch_bound import LEVELS, branch_and_bound, build_pyramid
-from services.localization.lidar2d.correlative import correlate, search
-from services.localization.lidar2d.matching import ALONG2, accumulate, refine, solve3
-from services.localization.lidar2d.scan import prepare_scan
-from services.localization.lidar2d.settings import LidarSlamSettings
-from services.localization.lidar2d.surfel_kernels import merged_surfel
-from services.localization.lidar2d.surfel_map import SurfelMap, freeze
+from beamsplat.services.localization.lidar2d import se2
+from beamsplat.services.localization.lidar2d.branch_bound import LEVELS, branch_and_bound, build_pyramid
+from beamsplat.services.localization.lidar2d.correlative import correlate, search
+from beamsplat.services.localization.lidar2d.matching import ALONG2, accumulate, refine, solve3
+from beamsplat.services.localization.lidar2d.scan import prepare_scan
+from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
+from beamsplat.services.localization.lidar2d.surfel_kernels import merged_surfel
+from beamsplat.services.localization.lidar2d.surfel_map import SurfelMap, freeze
 from tests.services.localization.world import Lidar
 
 SETTINGS = LidarSlamSettings()

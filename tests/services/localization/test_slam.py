@@ -5,12 +5,12 @@ import json
 import numpy as np
 import pytest
 
-from services.localization.lidar2d import se2
-from services.localization.lidar2d.metrics import trajectory_errors
-from services.localization.lidar2d.offline import JobRunner
-from services.localization.lidar2d.settings import LidarSlamSettings
-from services.localization.lidar2d.slam import LidarSlam
-from services.localization.lidar2d.state import MANIFEST, MapStateError
+from beamsplat.services.localization.lidar2d import se2
+from beamsplat.services.localization.lidar2d.metrics import trajectory_errors
+from beamsplat.services.localization.lidar2d.offline import JobRunner
+from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
+from beamsplat.services.localization.lidar2d.slam import LidarSlam
+from beamsplat.services.localization.lidar2d.state import MANIFEST, MapStateError
 from tests.services.localization.world import WALLS, Drive, Lidar, box, wheels
 
 NS = 1_000_000_000

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from services.localization.lidar2d.offline import JobRunner
-from services.localization.lidar2d.settings import LidarSlamSettings
-from services.localization.lidar2d.slam import LidarSlam
+from beamsplat.services.localization.lidar2d.offline import JobRunner
+from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
+from beamsplat.services.localization.lidar2d.slam import LidarSlam
 from tests.services.localization.world import Drive, Lidar
 
 RATE_HZ = 10.0

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from services.localization.lidar2d import se2
+from beamsplat.services.localization.lidar2d import se2
 
 # Two rooms, a door between them, a box, a pillar and a slanted wall; metres.
 WALLS = np.array(

@@ -9,14 +9,14 @@ import pytest
 pytest.importorskip("trimesh", reason="the simulator needs the [sim] extra")
 pytest.importorskip("embreex", reason="the simulator needs the [sim] extra")
 
-from common.depth_code import depth_to_png, sigma_to_png
-from common.geometry import inverse
-from common.messages import CameraModel, Keyframe
-from common.raster.camera import RasterCamera
-from services.simulator.recording import _shoot
-from services.simulator.settings import CameraSettings, Simulation
-from services.simulator.shots import Studio
-from services.simulator.world import get_world
+from beamsplat.common.geometry.transforms import inverse
+from beamsplat.common.messages import CameraModel, Keyframe
+from beamsplat.common.messages.depth_png import depth_to_png, sigma_to_png
+from beamsplat.common.raster.camera import RasterCamera
+from beamsplat.tools.simulator.recording import _shoot
+from beamsplat.tools.simulator.settings import CameraSettings, Simulation
+from beamsplat.tools.simulator.shots import Studio
+from beamsplat.tools.simulator.world import get_world
 
 T0 = 1_000_000_000_000
 SECOND = 1_000_000_000

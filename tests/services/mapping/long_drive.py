@@ -21,8 +21,8 @@ class Lap:
 
     def message(self, number, period_s):
         """Keyframe `number` of a drive of many laps. Anchors are those of the first lap: the place is known."""
-        from common.geometry import inverse
-        from common.messages import Keyframe
+        from beamsplat.common.geometry.transforms import inverse
+        from beamsplat.common.messages import Keyframe
 
         here = number % len(self.parts)
         jpeg, depth, sigma, T_map_body = self.parts[here]
@@ -87,8 +87,8 @@ def drive(lap, folder, options, keyframes, sample_every, period_s, views, camera
 
 def render(node, message, camera):
     """float32 [3, H, W]: what the mapper shows from a keyframe's place, all that it sees brought back first."""
-    from services.mapping.keyframe import hold
-    from services.mapping.messages import open_keyframe
+    from beamsplat.services.mapping.keyframe import hold
+    from beamsplat.services.mapping.messages import open_keyframe
     from tests.services.mapping.home_drive import rendered
 
     frame = open_keyframe(message, node._lens)

@@ -5,9 +5,9 @@ from functools import lru_cache
 import cv2
 import numpy as np
 
-from common.config import NodeConfig
-from common.geometry import inverse, make_transform, se2_to_se3, so3_exp
-from common.messages import (
+from beamsplat.common.config.deployment import NodeConfig
+from beamsplat.common.geometry.transforms import inverse, make_transform, se2_to_se3, so3_exp
+from beamsplat.common.messages import (
     Anchors,
     CameraModel,
     Correction,
@@ -18,11 +18,11 @@ from common.messages import (
     Rig,
     Tick,
 )  # fmt: skip
-from common.node import Input, Node, Sourced
-from common.raster.camera import RasterCamera
-from common.raster.rasterizer import Rasterizer
-from common.registry import Service
-from services.mapping.bench_raster import synthetic_room
+from beamsplat.common.raster.camera import RasterCamera
+from beamsplat.common.raster.rasterizer import Rasterizer
+from beamsplat.common.runtime.node import Input, Node, Sourced
+from beamsplat.common.runtime.registry import Service
+from beamsplat.tools.bench.raster import synthetic_room
 
 WIDTH, HEIGHT, FOCAL = 160, 120, 110.0
 CAMERA = RasterCamera(FOCAL, FOCAL, 79.5, 59.5, WIDTH, HEIGHT)
@@ -159,6 +159,6 @@ TABLE = {
     "replay": Service("replay", "", {"room": _HERE + "RoomDrive"}),
     "localization": Service("localization", "", {"known": _HERE + "Localizer"}),
     "fusion": Service("fusion", "", {"true": _HERE + "Fusion"}),
-    "keyframes": Service("keyframes", "", {"default": "services.keyframes.node:KeyframesNode"}),
-    "mapping": Service("mapping", "", {"default": "services.mapping.node:MappingNode"}),
+    "keyframes": Service("keyframes", "", {"default": "beamsplat.services.keyframes.node:KeyframesNode"}),
+    "mapping": Service("mapping", "", {"default": "beamsplat.services.mapping.node:MappingNode"}),
 }

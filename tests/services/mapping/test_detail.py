@@ -5,18 +5,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from common.errors import UserError
-from common.geometry import inverse, make_transform
-from common.raster.camera import RasterCamera
-from common.raster.layout import COLOUR, MEAN, OPACITY, QUAT, SCALE
-from common.raster.rasterizer import Rasterizer
-from services.mapping.chunks import ChunkFeed, Eye, parts
-from services.mapping.detail import FINEST_CELL_M, cell_for, coarser
-from services.mapping.mapper import Mapper
-from services.mapping.messages import eye_of, joined_state, state_messages
-from services.mapping.scores import psnr_db
-from services.mapping.settings import MapperSettings
-from services.mapping.store import GaussianStore
+from beamsplat.common.errors import UserError
+from beamsplat.common.geometry.transforms import inverse, make_transform
+from beamsplat.common.mapfiles.detail import FINEST_CELL_M, cell_for, coarser
+from beamsplat.common.mapfiles.scores import psnr_db
+from beamsplat.common.mapfiles.store import GaussianStore
+from beamsplat.common.raster.camera import RasterCamera
+from beamsplat.common.raster.layout import COLOUR, MEAN, OPACITY, QUAT, SCALE
+from beamsplat.common.raster.rasterizer import Rasterizer
+from beamsplat.services.mapping.chunks import ChunkFeed, Eye, parts
+from beamsplat.services.mapping.mapper import Mapper
+from beamsplat.services.mapping.messages import eye_of, joined_state, state_messages
+from beamsplat.services.mapping.settings import MapperSettings
 
 
 def wall(count=60_000, seed=0):

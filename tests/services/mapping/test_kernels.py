@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from common.raster.threads import Team
-from services.mapping.kernels import add_lidar, photometric_and_depth
-from services.mapping.ssim import TAPS, SsimLoss, ssim
+from beamsplat.common.raster.ssim import TAPS, SsimLoss, ssim
+from beamsplat.common.raster.threads import Team
+from beamsplat.services.mapping.kernels import add_lidar, photometric_and_depth
 
 H, W = 37, 53
 

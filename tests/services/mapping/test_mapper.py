@@ -5,18 +5,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from common.geometry import inverse, make_transform, se3_exp, se3_log, so3_exp
-from common.raster.camera import RasterCamera
-from common.raster.layout import MEAN
-from common.raster.rasterizer import Rasterizer
-from services.mapping.bench_raster import synthetic_room
-from services.mapping.export import FIELDS, SH_C0, read_ply_points, write_gaussian_ply
-from services.mapping.keyframe import Keyframe
-from services.mapping.mapper import FULL, HALF, Mapper
-from services.mapping.scores import f_score, fused_surface, render_rgb_depth, score_view
-from services.mapping.settings import MapperSettings
-from services.mapping.store import GaussianStore
-from services.mapping.warm import warm
+from beamsplat.common.geometry.transforms import inverse, make_transform, se3_exp, se3_log, so3_exp
+from beamsplat.common.mapfiles.ply import FIELDS, SH_C0, read_ply_points, write_gaussian_ply
+from beamsplat.common.mapfiles.scores import f_score, fused_surface, render_rgb_depth, score_view
+from beamsplat.common.mapfiles.store import GaussianStore
+from beamsplat.common.raster.camera import RasterCamera
+from beamsplat.common.raster.layout import MEAN
+from beamsplat.common.raster.rasterizer import Rasterizer
+from beamsplat.services.mapping.keyframe import Keyframe
+from beamsplat.services.mapping.mapper import FULL, HALF, Mapper
+from beamsplat.services.mapping.settings import MapperSettings
+from beamsplat.services.mapping.warm import warm
+from beamsplat.tools.bench.raster import synthetic_room
 
 CAMERA = RasterCamera(110.0, 110.0, 79.5, 59.5, 160, 120)
 SETTINGS = MapperSettings(half_iterations=10, full_iterations=5, stride_px=3)

@@ -2,7 +2,7 @@
 
 import itertools
 
-from services.mapping.node import MappingConfig, MappingNode
+from beamsplat.services.mapping.node import MappingConfig, MappingNode
 from tests.services.keyframes.test_keyframes_node import keyframes_of
 
 

@@ -7,14 +7,14 @@ import pytest
 from plyfile import PlyData
 from typer.testing import CliRunner
 
-from common.bus import open_session
-from common.config import Deployment, RouterConfig
-from common.streams import open_sample
-from common.topics import topic
-from services.__main__ import app
-from services.board import HealthBoard
-from services.mapping.session.folder import SessionFolder
-from services.supervisor import Supervisor
+from beamsplat.common.config.deployment import Deployment, RouterConfig
+from beamsplat.common.mapfiles.session import SessionFolder
+from beamsplat.common.topics import topic
+from beamsplat.common.zenoh.bus import open_session
+from beamsplat.common.zenoh.streams import open_sample
+from beamsplat.tools.cli.main import app
+from beamsplat.tools.system.health_table import HealthBoard
+from beamsplat.tools.system.supervisor import Supervisor
 from tests.common.polling import poll
 from tests.services.mapping.room_drive import TABLE
 

@@ -7,17 +7,17 @@ import numpy as np
 import pytest
 from plyfile import PlyData
 
-from common.codec import encode
-from common.depth_code import depth_to_png, mask_to_png, sigma_to_png
-from common.geometry import inverse, make_transform
-from common.lockstep import Lockstep
-from common.messages import Anchors, Keyframe, Tick
-from common.picture import decode_rgb
-from common.splats import unpack
-from common.trajectory import read_tum
-from services.keyframes.node import KeyframesConfig, KeyframesNode
-from services.mapping.node import MappingConfig, MappingNode
-from services.mapping.store import moved
+from beamsplat.common.geometry.trajectory import read_tum
+from beamsplat.common.geometry.transforms import inverse, make_transform
+from beamsplat.common.mapfiles.store import moved
+from beamsplat.common.messages import Anchors, Keyframe, Tick
+from beamsplat.common.messages.codec import encode
+from beamsplat.common.messages.depth_png import depth_to_png, mask_to_png, sigma_to_png
+from beamsplat.common.messages.image_codec import decode_rgb
+from beamsplat.common.messages.splat_codec import unpack
+from beamsplat.common.runtime.lockstep import Lockstep
+from beamsplat.services.keyframes.node import KeyframesConfig, KeyframesNode
+from beamsplat.services.mapping.node import MappingConfig, MappingNode
 from tests.services.mapping import room_drive as r
 
 

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from common.geometry import make_transform, se2_to_se3
-from services.mapping.mapper import Mapper
-from services.mapping.places import Places, place_of
-from services.mapping.settings import MapperSettings
+from beamsplat.common.geometry.transforms import make_transform, se2_to_se3
+from beamsplat.services.mapping.mapper import Mapper
+from beamsplat.services.mapping.places import Places, place_of
+from beamsplat.services.mapping.settings import MapperSettings
 from tests.services.mapping.session import gallery
 from tests.services.mapping.session.maps import SECOND, handle, make_node
 

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import torch
 
-from common.errors import UserError
-from common.geometry import se3_exp
-from common.raster.camera import RasterCamera, right_gradient
-from services.mapping.renderers.protocol import Gaussians, make_renderer
+from beamsplat.common.errors import UserError
+from beamsplat.common.geometry.transforms import se3_exp
+from beamsplat.common.raster.camera import RasterCamera, right_gradient
+from beamsplat.services.mapping.renderers.protocol import Gaussians, make_renderer
 from tests.common.raster.scenes import random_camera, random_gaussians, random_pose
 
 NAMES = ("mean_map_m", "log_scale", "quat_wxyz", "opacity_logit", "colour", "pose", "background")
@@ -48,7 +48,7 @@ def scene(seed, **size):
 
 
 def backends():
-    from services.mapping.renderers.gsplat import fault
+    from beamsplat.services.mapping.renderers.gsplat import fault
 
     why = fault()
     return ["cpu", pytest.param("gsplat", marks=pytest.mark.skipif(why is not None, reason=str(why)))]

@@ -6,12 +6,12 @@ import time
 import cv2
 import numpy as np
 
-from common.config import NodeConfig
-from common.geometry import se2_to_se3
-from common.messages import Correction, FusedDepth, Grid, Image, Odometry, Rig, Scan
-from common.node import Node, Sourced
-from common.registry import Service
-from common.sensor_models import LidarModel
+from beamsplat.common.config.deployment import NodeConfig
+from beamsplat.common.geometry.transforms import se2_to_se3
+from beamsplat.common.messages import Correction, FusedDepth, Grid, Image, Odometry, Rig, Scan
+from beamsplat.common.messages.sensor_models import LidarModel
+from beamsplat.common.runtime.node import Node, Sourced
+from beamsplat.common.runtime.registry import Service
 
 NASTY = "<img src=x onerror=\"document.title='taken over'\"> & <b>bold</b>"
 SCALE, SCALE_SIGMA = 1.25, 0.05

@@ -4,11 +4,10 @@ import cv2
 import numpy as np
 import pytest
 
-from common.errors import UserError
-from common.frames import camera_mount, lidar_mount
-from common.geometry import inverse, matrix_from_quat_xyzw, se2_to_se3
-from common.lockstep import Lockstep
-from common.messages import (
+from beamsplat.common.errors import UserError
+from beamsplat.common.geometry.frames import camera_mount, lidar_mount
+from beamsplat.common.geometry.transforms import inverse, matrix_from_quat_xyzw, se2_to_se3
+from beamsplat.common.messages import (
     Anchors,
     CameraModel,
     Correction,
@@ -23,9 +22,10 @@ from common.messages import (
     Scan,
     WheelOdometry,
 )  # fmt: skip
-from common.node import Node, Sourced
-from common.topics import TOPICS
-from services.monitor.node import DEPTH, SCENE, MonitorConfig, MonitorNode
+from beamsplat.common.runtime.lockstep import Lockstep
+from beamsplat.common.runtime.node import Node, Sourced
+from beamsplat.common.topics import TOPICS
+from beamsplat.services.monitor.node import DEPTH, SCENE, MonitorConfig, MonitorNode
 
 NS = 1_000_000_000
 T0 = 1_700_000_000 * NS

@@ -9,13 +9,13 @@ import urllib.request
 
 import pytest
 
-from common.bus import open_session
-from common.config import Deployment, RouterConfig
-from common.errors import UserError
-from services.board import HealthBoard
-from services.monitor.node import MonitorConfig, MonitorNode
-from services.nodes import NODES
-from services.supervisor import Supervisor
+from beamsplat.common.config.deployment import Deployment, RouterConfig
+from beamsplat.common.errors import UserError
+from beamsplat.common.zenoh.bus import open_session
+from beamsplat.services.monitor.node import MonitorConfig, MonitorNode
+from beamsplat.services.nodes import NODES
+from beamsplat.tools.system.health_table import HealthBoard
+from beamsplat.tools.system.supervisor import Supervisor
 from tests.common.nodes import TABLE
 from tests.common.polling import poll
 

@@ -4,11 +4,11 @@ import cv2
 import numpy as np
 import pytest
 
-from common.geometry import se2_to_se3
-from common.messages import MapChunk, MapPreview, MapStatus
-from common.splats import pack
-from common.topics import TOPICS
-from services.monitor.node import MAP, MonitorConfig, MonitorNode
+from beamsplat.common.geometry.transforms import se2_to_se3
+from beamsplat.common.messages import MapChunk, MapPreview, MapStatus
+from beamsplat.common.messages.splat_codec import pack
+from beamsplat.common.topics import TOPICS
+from beamsplat.services.monitor.node import MAP, MonitorConfig, MonitorNode
 
 S = 1_000_000_000
 T0 = 1_700_000_000 * S

@@ -9,8 +9,8 @@ import time
 import pytest
 import rerun as rr
 
-from services.monitor.layout import layout
-from services.monitor.screen import _QUEUE, _QUEUE_BYTES, Channel, Screen, _Drawing
+from beamsplat.services.monitor.layout import layout
+from beamsplat.services.monitor.screen import _QUEUE, _QUEUE_BYTES, Channel, Screen, _Drawing
 
 
 class StuckStream:
@@ -120,8 +120,8 @@ def test_a_disk_that_refuses_is_noticed(tmp_path):
         import os, resource, sys, time
         from pathlib import Path
         import rerun as rr
-        from services.monitor.layout import layout
-        from services.monitor.screen import Screen
+        from beamsplat.services.monitor.layout import layout
+        from beamsplat.services.monitor.screen import Screen
         resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, 300_000))
         screen = Screen()
         screen.save(Path(sys.argv[1]), layout(), limit_mb=100, keep_free_mb=0)

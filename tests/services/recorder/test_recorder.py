@@ -6,15 +6,15 @@ import os
 import numpy as np
 import pytest
 
-from common.errors import UserError
-from common.header import Header
-from common.messages import Health, Tick
-from common.recording import RecordingReader
-from common.topics import TOPICS
-from services.recorder.arrival import ArrivalClock
-from services.recorder.config import RecorderConfig
-from services.recorder.node import RecorderNode
-from tests.common.random_messages import assert_same, random_message
+from beamsplat.common.errors import UserError
+from beamsplat.common.messages import Health, Tick
+from beamsplat.common.messages.header import Header
+from beamsplat.common.recording import RecordingReader
+from beamsplat.common.topics import TOPICS
+from beamsplat.services.recorder.arrival import ArrivalClock
+from beamsplat.services.recorder.config import RecorderConfig
+from beamsplat.services.recorder.node import RecorderNode
+from tests.common.messages.random_messages import assert_same, random_message
 
 SECOND = 10**9
 

@@ -12,8 +12,8 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from common.frames import camera_mount
-from common.geometry import make_transform, quat_xyzw_from_matrix
+from beamsplat.common.geometry.frames import camera_mount
+from beamsplat.common.geometry.transforms import make_transform, quat_xyzw_from_matrix
 
 KINDS = ("ros1", "sqlite", "mcap")
 START_NS = 1_700_000_000 * 10**9

@@ -10,15 +10,15 @@ import pytest
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import CompressionMode
 
-from common.errors import UserError
-from common.frames import R_body_camera_level, camera_mount
-from common.geometry import make_transform
-from common.recording.sensors import SENSORS, build, ros_fields
-from services.replay.bag_source import TF_TYPES, _transforms
-from services.replay.bags import Bag
-from services.replay.config import ReplayConfig
-from services.replay.decode import deserialize, header_stamp_ns
-from services.replay.node import ReplayNode
+from beamsplat.common.errors import UserError
+from beamsplat.common.geometry.frames import R_body_camera_level, camera_mount
+from beamsplat.common.geometry.transforms import make_transform
+from beamsplat.common.recording.sensors import SENSORS, build, ros_fields
+from beamsplat.services.replay.bag_source import TF_TYPES, _transforms
+from beamsplat.services.replay.bags import Bag
+from beamsplat.services.replay.config import ReplayConfig
+from beamsplat.services.replay.decode import deserialize, header_stamp_ns
+from beamsplat.services.replay.node import ReplayNode
 from tests.services.replay.make_bags import (
     KINDS,
     LAG_NS,

@@ -8,10 +8,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from common.errors import UserError
-from services.replay.config import ReplayConfig
-from services.replay.folder_scans import CsvScans, scan_from_points, xy_from_pcd
-from services.replay.node import ReplayNode
+from beamsplat.common.errors import UserError
+from beamsplat.services.replay.config import ReplayConfig
+from beamsplat.services.replay.folder_scans import CsvScans, scan_from_points, xy_from_pcd
+from beamsplat.services.replay.node import ReplayNode
 from tests.services.replay.test_bags import RIG, of, picture, play, refusal
 
 STAMP_NS = 1_700_000_000 * 10**9

@@ -10,17 +10,17 @@ import pytest
 from typer import Typer
 from typer.testing import CliRunner
 
-from common.errors import UserError
-from common.recording import RecordingWriter
-from common.recording.mcap_file import McapFile
-from common.recording.static_frames import StaticFrames
-from common.rig import load_rig
-from services.replay import cli
-from services.replay.config import ReplayConfig
-from services.replay.inspection import inspect
-from services.replay.node import ReplayNode
-from services.replay.options import SourceOptions
-from services.replay.statistics import lidar_facts, stream_facts
+from beamsplat.common.errors import UserError
+from beamsplat.common.geometry.rig import load_rig
+from beamsplat.common.recording import RecordingWriter
+from beamsplat.common.recording.mcap_file import McapFile
+from beamsplat.common.recording.static_frames import StaticFrames
+from beamsplat.services.replay.config import ReplayConfig
+from beamsplat.services.replay.inspection import inspect
+from beamsplat.services.replay.node import ReplayNode
+from beamsplat.services.replay.options import SourceOptions
+from beamsplat.services.replay.statistics import lidar_facts, stream_facts
+from beamsplat.tools.cli import info as cli
 from tests.services.replay.make_bags import KINDS, T_BASE_CAMERA, T_BASE_LIDAR, Drive, write_bag
 
 

@@ -10,15 +10,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from common.bus import Bus, open_router, open_session
-from common.config import Deployment, RouterConfig
-from common.live import Live, LiveSettings
-from common.messages import Cloud, Correction, Grid, Odometry
-from common.node import Input
-from services.ros2.config import Ros2Config, Ros2OutConfig
-from services.ros2.node import Ros2Node
-from services.ros2.publisher.node import Ros2OutNode
-from services.supervisor import Supervisor
+from beamsplat.common.config.deployment import Deployment, RouterConfig
+from beamsplat.common.messages import Cloud, Correction, Grid, Odometry
+from beamsplat.common.runtime.live import Live, LiveSettings
+from beamsplat.common.runtime.node import Input
+from beamsplat.common.zenoh.bus import Bus, open_router, open_session
+from beamsplat.services.ros2.config import Ros2Config, Ros2OutConfig
+from beamsplat.services.ros2.node import Ros2Node
+from beamsplat.services.ros2_out.node import Ros2OutNode
+from beamsplat.tools.system.supervisor import Supervisor
 from tests.services.replay.make_bags import START_NS, T_BASE_CAMERA, T_BASE_LIDAR, Drive, write_bag
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -142,7 +142,7 @@ def test_pictures_of_another_size_and_broken_ones_are_not_passed_on():
     import cv2
     from rosbags.typesys import Stores, get_typestore
 
-    from services.ros2.robot import Robot, RobotOptions
+    from beamsplat.services.ros2.robot import Robot, RobotOptions
 
     robot = Robot(RobotOptions(assume_mounts=True, settle_s=0.0, without=frozenset({"scan"})))
     store = get_typestore(Stores.ROS2_HUMBLE)

@@ -8,12 +8,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_typestore
 
-from common import messages as m
-from common.recording import ros_types as ros
-from common.recording.sensors import SENSORS, build, ros_fields
-from common.recording.to_ros import records_of
-from services.ros2.answers import Transforms, occupancy_grid, point_cloud
-from services.ros2.wire import Address, Attachment, Entity, Qos, data_key
+from beamsplat.common import messages as m
+from beamsplat.common.recording import ros_types as ros
+from beamsplat.common.recording.sensors import SENSORS, build, ros_fields
+from beamsplat.common.recording.to_ros import records_of
+from beamsplat.common.zenoh.rmw import Address, Attachment, Entity, Qos, data_key
+from beamsplat.services.ros2_out.conversions import Transforms, occupancy_grid, point_cloud
 
 # ros2/rmw_zenoh, docs/design.md, "Graph Cache": the tokens of a listener and of a talker on /chatter.
 HASH = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
@@ -144,7 +144,7 @@ def test_the_answers_are_what_ros_reads():
 
 
 def test_transforms_leave_the_robots_own_odometry_to_it():
-    from common.geometry import se2_to_se3
+    from beamsplat.common.geometry.transforms import se2_to_se3
 
     tree = Transforms("map", "odom", "base_link")
     tree.T_map_odom = se2_to_se3(np.array([1.0, 0.0, 0.0]))

@@ -13,11 +13,11 @@ import time
 
 import numpy as np
 
-from common.access import Host
-from common.config import Deployment, RouterConfig
-from common.security import SecurityConfig
-from services.authority import Authority
-from services.mapping.session.folder import SessionFolder
+from beamsplat.common.config.deployment import Deployment, RouterConfig
+from beamsplat.common.mapfiles.session import SessionFolder
+from beamsplat.common.security.access_control import Host
+from beamsplat.common.security.keys import SecurityConfig
+from beamsplat.tools.keys.pki import Authority
 from tests.services.uplink.radio import FAR_ADDRESS, ROOT
 
 PORT = 7448

@@ -17,13 +17,13 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
-from common.bus import key, open_session
-from common.config import Deployment
-from common.header import DecodeError, Header
-from common.streams import declare_reader, open_sample
-from common.topics import topic
-from services.board import HealthBoard
-from services.supervisor import Supervisor
+from beamsplat.common.config.deployment import Deployment
+from beamsplat.common.messages.header import DecodeError, Header
+from beamsplat.common.topics import topic
+from beamsplat.common.zenoh.bus import key, open_session
+from beamsplat.common.zenoh.streams import declare_reader, open_sample
+from beamsplat.tools.system.health_table import HealthBoard
+from beamsplat.tools.system.supervisor import Supervisor
 
 HEARD = {
     "robot": ("lidar/scan", "localization/odometry", "keyframes/frame", "keyframes/ack"),

@@ -8,19 +8,19 @@ import time
 
 import pytest
 
-from common.access import Host
-from common.bus import open_session
-from common.config import Deployment, RouterConfig
-from common.errors import UserError
-from common.lockstep import Lockstep
-from common.security import SecurityConfig
-from common.topics import TOPICS
-from services.authority import Authority
-from services.board import HealthBoard
-from services.deployment import faults, surroundings
-from services.nodes import NODES
-from services.supervisor import Supervisor
-from services.uplink.node import UplinkConfig, UplinkNode
+from beamsplat.common.config.deployment import Deployment, RouterConfig
+from beamsplat.common.errors import UserError
+from beamsplat.common.runtime.lockstep import Lockstep
+from beamsplat.common.security.access_control import Host
+from beamsplat.common.security.keys import SecurityConfig
+from beamsplat.common.topics import TOPICS
+from beamsplat.common.zenoh.bus import open_session
+from beamsplat.services.nodes import NODES
+from beamsplat.services.uplink.node import UplinkConfig, UplinkNode
+from beamsplat.tools.keys.pki import Authority
+from beamsplat.tools.system.assembly import faults, surroundings
+from beamsplat.tools.system.health_table import HealthBoard
+from beamsplat.tools.system.supervisor import Supervisor
 from tests.common.ears import Ears
 from tests.conftest import free_port
 from tests.services.mapping.room_drive import TABLE

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from common.camera import Pinhole
-from common.frames import camera_mount
-from common.geometry import inverse, make_transform, so3_exp
+from beamsplat.common.geometry.camera import Pinhole
+from beamsplat.common.geometry.frames import camera_mount
+from beamsplat.common.geometry.transforms import inverse, make_transform, so3_exp
 
 CAMERA = Pinhole(140.0, 140.0, 79.5, 59.5, 160, 120)
 T_BODY_CAMERA = camera_mount(0.1, 0.0, 0.45, pitch_down_rad=0.035)

@@ -5,12 +5,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from common.geometry import inverse, make_transform, se3_exp, so3_exp
-from services.localization.camera.align import Aligner, Alignment, exact_gradient, motion_basis
-from services.localization.camera.kernels import choose_points, map_loss, normal_equations
-from services.localization.camera.settings import CameraTrackerSettings
-from services.localization.camera.splat_map import MapKeyframe, SplatMap
-from services.localization.camera.view import make_view, small_camera
+from beamsplat.common.geometry.transforms import inverse, make_transform, se3_exp, so3_exp
+from beamsplat.services.localization.camera.align import Aligner, Alignment, exact_gradient, motion_basis
+from beamsplat.services.localization.camera.kernels import choose_points, map_loss, normal_equations
+from beamsplat.services.localization.camera.settings import CameraTrackerSettings
+from beamsplat.services.localization.camera.splat_map import MapKeyframe, SplatMap
+from beamsplat.services.localization.camera.view import make_view, small_camera
 from tests.services.localization.camera.box import CAMERA, T_BODY_CAMERA, body, off, shot
 
 SETTINGS = CameraTrackerSettings(width_px=160)

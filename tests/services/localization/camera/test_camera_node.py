@@ -4,10 +4,10 @@ import cv2
 import numpy as np
 import pytest
 
-from common.lockstep import Lockstep
-from common.messages import CameraModel, DepthEstimate, Image, Rig
-from common.node import Node, Sourced
-from services.localization.camera.node import CameraLocalization, CameraLocalizationConfig
+from beamsplat.common.messages import CameraModel, DepthEstimate, Image, Rig
+from beamsplat.common.runtime.lockstep import Lockstep
+from beamsplat.common.runtime.node import Node, Sourced
+from beamsplat.services.localization.camera.node import CameraLocalization, CameraLocalizationConfig
 from tests.services.localization.camera.box import T_BODY_CAMERA, drive, off, shot
 
 PATH = drive(8)
@@ -91,6 +91,6 @@ def test_depth_without_a_unit_says_that_the_scale_is_arbitrary(kind, options):
 
 
 def test_the_kind_is_in_the_registry():
-    from services.nodes import NODES
+    from beamsplat.services.nodes import NODES
 
     assert NODES["localization"].load("camera") is CameraLocalization

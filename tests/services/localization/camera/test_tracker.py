@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from common.geometry import inverse
-from services.localization.camera.depth import DepthGuess, fitted_to_map, shrunk
-from services.localization.camera.relocalize import thumbnail
-from services.localization.camera.result import covisibility
-from services.localization.camera.settings import CameraTrackerSettings
-from services.localization.camera.sweep import filled, sweep
-from services.localization.camera.tracker import CameraTracker
-from services.localization.camera.view import small_camera
+from beamsplat.common.geometry.transforms import inverse
+from beamsplat.services.localization.camera.depth import DepthGuess, fitted_to_map, shrunk
+from beamsplat.services.localization.camera.relocalize import thumbnail
+from beamsplat.services.localization.camera.result import covisibility
+from beamsplat.services.localization.camera.settings import CameraTrackerSettings
+from beamsplat.services.localization.camera.sweep import filled, sweep
+from beamsplat.services.localization.camera.tracker import CameraTracker
+from beamsplat.services.localization.camera.view import small_camera
 from tests.services.localization.camera.box import CAMERA, T_BODY_CAMERA, body, drive, off, shot
 
 SETTINGS = CameraTrackerSettings(width_px=160, first_steps=10, steps_per_picture=1)
@@ -203,7 +203,7 @@ def test_thumbnails_do_not_see_brightness_and_covisibility_counts():
 
 @pytest.mark.slow
 def test_house_with_recorded_depth(shared_dir):
-    from services.mapping.dataset import load
+    from beamsplat.tools.evaluation.dataset import load
 
     recording = load(shared_dir / "data" / "house_a")
     tracker = CameraTracker(recording.camera, recording.T_body_camera)

@@ -5,11 +5,11 @@ from functools import lru_cache
 import cv2
 import numpy as np
 
-from common.depth_code import depth_to_png, sigma_to_png
-from common.frames import camera_mount
-from common.geometry import inverse, make_transform
-from common.messages import CameraModel, Keyframe
-from common.raster.camera import RasterCamera
+from beamsplat.common.geometry.frames import camera_mount
+from beamsplat.common.geometry.transforms import inverse, make_transform
+from beamsplat.common.messages import CameraModel, Keyframe
+from beamsplat.common.messages.depth_png import depth_to_png, sigma_to_png
+from beamsplat.common.raster.camera import RasterCamera
 from tests.services.mapping.session.maps import SECOND
 
 T0 = 1_000_000_000_000

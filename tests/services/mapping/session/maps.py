@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from common.depth_code import depth_to_png, sigma_to_png
-from common.geometry import inverse
-from common.messages import Keyframe
-from services.mapping.config import MappingConfig
-from services.mapping.node import MappingNode
+from beamsplat.common.geometry.transforms import inverse
+from beamsplat.common.messages import Keyframe
+from beamsplat.common.messages.depth_png import depth_to_png, sigma_to_png
+from beamsplat.services.mapping.config import MappingConfig
+from beamsplat.services.mapping.node import MappingNode
 from tests.services.mapping import room_drive as r
 
 SECOND = 1_000_000_000

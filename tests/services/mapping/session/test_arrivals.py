@@ -3,17 +3,17 @@
 import numpy as np
 import pytest
 
-from common.depth_code import mask_to_png
-from common.errors import UserError
-from common.lockstep import Lockstep
-from common.messages import Tick
-from services.keyframes.node import KeyframesConfig, KeyframesNode
-from services.mapping.config import MappingConfig
-from services.mapping.mapper import Mapper
-from services.mapping.node import MappingNode
-from services.mapping.session.arrivals import Arrivals
-from services.mapping.session.folder import SessionFolder
-from services.mapping.session.keeper import Keeper
+from beamsplat.common.errors import UserError
+from beamsplat.common.mapfiles.session import SessionFolder
+from beamsplat.common.messages import Tick
+from beamsplat.common.messages.depth_png import mask_to_png
+from beamsplat.common.runtime.lockstep import Lockstep
+from beamsplat.services.keyframes.node import KeyframesConfig, KeyframesNode
+from beamsplat.services.mapping.config import MappingConfig
+from beamsplat.services.mapping.mapper import Mapper
+from beamsplat.services.mapping.node import MappingNode
+from beamsplat.services.mapping.session.checkpointer import Keeper
+from beamsplat.services.mapping.session.inbox import Arrivals
 from tests.services.mapping import room_drive as r
 from tests.services.mapping.session.maps import SECOND, handle, make_node, message
 

@@ -5,21 +5,21 @@ import shutil
 import numpy as np
 import pytest
 
-from common.errors import UserError
-from common.geometry import inverse, se2_to_se3
-from common.messages import Anchors
-from common.raster.layout import MEAN, SCALE
-from common.splats import unpack
-from services.mapping.chunks import on_disk
-from services.mapping.export import read_ply_points
-from services.mapping.keyframe import MAX_DEPTH_M
-from services.mapping.session.blocks import arrays_of_blocks, block_file, blocks_of, with_blocks
-from services.mapping.session.folder import EDGE_MANIFEST, SessionFolder
-from services.mapping.session.paging import PROCESS_MB
-from services.mapping.session.shelf import CELL_M, groups_of, spheres_of
-from services.mapping.session.sight import sees
-from services.mapping.session.state import store_of
-from services.mapping.store import moved
+from beamsplat.common.errors import UserError
+from beamsplat.common.geometry.transforms import inverse, se2_to_se3
+from beamsplat.common.mapfiles.blocks import arrays_of_blocks, block_file, blocks_of, with_blocks
+from beamsplat.common.mapfiles.ply import read_ply_points
+from beamsplat.common.mapfiles.session import EDGE_MANIFEST, SessionFolder
+from beamsplat.common.mapfiles.state import store_of
+from beamsplat.common.mapfiles.store import moved
+from beamsplat.common.messages import Anchors
+from beamsplat.common.messages.splat_codec import unpack
+from beamsplat.common.raster.layout import MEAN, SCALE
+from beamsplat.services.mapping.chunks import on_disk
+from beamsplat.services.mapping.keyframe import MAX_DEPTH_M
+from beamsplat.services.mapping.session.disk_tier import CELL_M, groups_of, spheres_of
+from beamsplat.services.mapping.session.frustum import sees
+from beamsplat.services.mapping.session.paging import PROCESS_MB
 from tests.services.mapping.session import gallery
 from tests.services.mapping.session.maps import SECOND, handle, make_node
 

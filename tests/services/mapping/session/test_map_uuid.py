@@ -5,14 +5,14 @@ import json
 import numpy as np
 import pytest
 
-from common.errors import UserError
-from common.geometry import se2_to_se3
-from common.messages import Anchors, LidarModel, Rig, Scan
-from services.localization.lidar2d.node import LidarLocalization
-from services.localization.lidar2d.settings import LidarSlamSettings
-from services.localization.lidar2d.slam import LidarSlam
-from services.localization.lidar2d.state import MANIFEST, map_uuid
-from services.mapping.session.folder import SessionFolder
+from beamsplat.common.errors import UserError
+from beamsplat.common.geometry.transforms import se2_to_se3
+from beamsplat.common.mapfiles.session import SessionFolder
+from beamsplat.common.messages import Anchors, LidarModel, Rig, Scan
+from beamsplat.services.localization.lidar2d.node import LidarLocalization
+from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
+from beamsplat.services.localization.lidar2d.slam import LidarSlam
+from beamsplat.services.localization.lidar2d.state import MANIFEST, map_uuid
 from tests.services.localization.world import Drive, Lidar
 from tests.services.mapping import room_drive as r
 from tests.services.mapping.session.maps import SECOND, handle, make_node, message

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from common.errors import UserError
-from common.messages import Tick
-from services.mapping.session.folder import SessionFolder
-from services.mapping.session.paging import PROCESS_MB, Pager, bytes_of, check_budget, resting
-from services.mapping.session.shelf import Shelf
-from services.mapping.session.state import views_of
+from beamsplat.common.errors import UserError
+from beamsplat.common.mapfiles.session import SessionFolder
+from beamsplat.common.mapfiles.state import views_of
+from beamsplat.common.messages import Tick
+from beamsplat.services.mapping.session.disk_tier import Shelf
+from beamsplat.services.mapping.session.paging import PROCESS_MB, Pager, bytes_of, check_budget, resting
 from tests.services.mapping import room_drive as r
 from tests.services.mapping.session.maps import SECOND, feed, handle, make_node, message
 

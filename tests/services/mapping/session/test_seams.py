@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from services.mapping.messages import open_keyframe
-from services.mapping.session.edit import with_gaussians
-from services.mapping.session.folder import SessionFolder
-from services.mapping.session.seams import without_doubles
+from beamsplat.common.mapfiles.session import SessionFolder
+from beamsplat.services.mapping.messages import open_keyframe
+from beamsplat.tools.sessions.deduplicate import without_doubles
+from beamsplat.tools.sessions.edit import with_gaussians
 from tests.services.mapping.session import gallery
 from tests.services.mapping.session.maps import handle, make_node
 

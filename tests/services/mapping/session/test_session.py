@@ -13,19 +13,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from common.errors import UserError
-from common.geometry import inverse
-from common.lockstep import Lockstep
-from common.messages import Tick
-from services.keyframes.node import KeyframesConfig, KeyframesNode
-from services.mapping.config import MappingConfig
-from services.mapping.keyframe import Held
-from services.mapping.mapper import FULL, HALF, Mapper
-from services.mapping.messages import open_keyframe
-from services.mapping.node import MappingNode
-from services.mapping.session.folder import EDGE_MANIFEST, MANIFEST, SessionFolder
-from services.mapping.session.keeper import Keeper
-from services.mapping.session.state import arrays_of, extras_of, progress_of, restore, views_of
+from beamsplat.common.errors import UserError
+from beamsplat.common.geometry.transforms import inverse
+from beamsplat.common.mapfiles.session import EDGE_MANIFEST, MANIFEST, SessionFolder
+from beamsplat.common.mapfiles.state import progress_of, views_of
+from beamsplat.common.messages import Tick
+from beamsplat.common.runtime.lockstep import Lockstep
+from beamsplat.services.keyframes.node import KeyframesConfig, KeyframesNode
+from beamsplat.services.mapping.config import MappingConfig
+from beamsplat.services.mapping.keyframe import Held
+from beamsplat.services.mapping.mapper import FULL, HALF, Mapper
+from beamsplat.services.mapping.messages import open_keyframe
+from beamsplat.services.mapping.node import MappingNode
+from beamsplat.services.mapping.session.checkpointer import Keeper
+from beamsplat.services.mapping.session.state import arrays_of, extras_of, restore
 from tests.services.mapping import room_drive as r
 from tests.services.mapping.session.maps import SECOND, feed, handle, make_node, message
 

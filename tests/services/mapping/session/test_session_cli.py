@@ -7,17 +7,17 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from common.errors import UserError
-from common.geometry import inverse, se2_to_se3
-from common.raster.rasterizer import Rasterizer
-from services.__main__ import app
-from services.localization.lidar2d import se2
-from services.localization.lidar2d.merge import find_overlap, merge_into
-from services.localization.lidar2d.settings import LidarSlamSettings
-from services.localization.lidar2d.slam import LidarSlam
-from services.mapping.session.edit import merged, pruned, summary_of, with_anchors
-from services.mapping.session.folder import SessionFolder
-from services.mapping.store import GaussianStore
+from beamsplat.common.errors import UserError
+from beamsplat.common.geometry.transforms import inverse, se2_to_se3
+from beamsplat.common.mapfiles.session import SessionFolder
+from beamsplat.common.mapfiles.store import GaussianStore
+from beamsplat.common.raster.rasterizer import Rasterizer
+from beamsplat.services.localization.lidar2d import se2
+from beamsplat.services.localization.lidar2d.merge import find_overlap, merge_into
+from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
+from beamsplat.services.localization.lidar2d.slam import LidarSlam
+from beamsplat.tools.cli.main import app
+from beamsplat.tools.sessions.edit import merged, pruned, summary_of, with_anchors
 from tests.services.localization.world import WALLS, Drive, Lidar
 from tests.services.mapping import room_drive as r
 from tests.services.mapping.session.maps import SECOND, feed, make_node, message

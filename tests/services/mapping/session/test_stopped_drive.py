@@ -4,18 +4,18 @@ import cv2
 import numpy as np
 import pytest
 
-from common.config import Deployment
-from common.geometry import inverse
-from common.lockstep import Lockstep
-from common.raster.camera import RasterCamera
-from common.raster.rasterizer import Rasterizer
-from common.trajectory import read_tum
-from services.bench.paper_score import pose_errors, rigid_offset
-from services.deployment import build_node
-from services.mapping.dataset import extra_views, read_depth_png
-from services.mapping.scores import render_rgb_depth, score_view
-from services.mapping.session.folder import SessionFolder
-from services.mapping.session.state import store_of
+from beamsplat.common.config.deployment import Deployment
+from beamsplat.common.geometry.trajectory import read_tum
+from beamsplat.common.geometry.transforms import inverse
+from beamsplat.common.mapfiles.scores import render_rgb_depth, score_view
+from beamsplat.common.mapfiles.session import SessionFolder
+from beamsplat.common.mapfiles.state import store_of
+from beamsplat.common.raster.camera import RasterCamera
+from beamsplat.common.raster.rasterizer import Rasterizer
+from beamsplat.common.runtime.lockstep import Lockstep
+from beamsplat.tools.evaluation.dataset import extra_views, read_depth_png
+from beamsplat.tools.report.scores import pose_errors, rigid_offset
+from beamsplat.tools.system.assembly import build_node
 
 SECONDS, STOPPED_AT_S, GOES_ON_AT_S = 60.0, 30.0, 26.0
 CAMERA = RasterCamera(530.0, 530.0, 319.5, 239.5, 640, 480)

@@ -4,8 +4,8 @@ import json
 
 import cv2
 
-from services.mapping.session.folder import EDGE_VERSION, VERSION
-from services.mapping.session.shelf import groups_of
+from beamsplat.common.mapfiles.session import EDGE_VERSION, VERSION
+from beamsplat.services.mapping.session.disk_tier import groups_of
 from tests.services.mapping.session.maps import make_node, message
 from tests.services.mapping.session.test_session import GOLDEN
 

@@ -1,0 +1,1 @@
+"""Configuration: strict tables read from TOML, and the deployment file."""

@@ -1,0 +1,1 @@
+"""Transforms, frames, cameras, calibration (rig), trajectories and lidar beams."""

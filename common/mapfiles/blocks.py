@@ -1,0 +1,151 @@
+"""Blocks of Gaussians as files beside a session's state.
+
+A block's file is written once and never changed: a checkpoint names the blocks that belong to it, and a file
+goes only after a later checkpoint does without it.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import struct
+import zlib
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from beamsplat.common.errors import UserError
+from beamsplat.common.geometry.transforms import inverse
+from beamsplat.common.mapfiles.store import carried
+
+_MAGIC = b"BSGB"
+_HEAD = struct.Struct("<4sII")  # magic, CRC-32 of what follows the head, length of the table of arrays
+
+Arrays = dict[str, np.ndarray]
+
+
+@dataclass(frozen=True)
+class Block:
+    """What is known of a block without reading it."""
+
+    number: int  # names the file
+    anchor: int
+    count: int
+    steps: int  # of the optimiser, summed
+    centre_anchor_m: np.ndarray  # [3], in the anchor's frame
+    radius_m: float  # of a sphere round all that its Gaussians colour
+    T_map_anchor: np.ndarray  # when it was written
+
+
+def block_file(folder: Path, number: int) -> Path:
+    return folder / f"{number}.block"
+
+
+def arrays_of_blocks(blocks: list[Block]) -> Arrays:
+    """What a checkpoint says of blocks; empty without any."""
+    if not blocks:
+        return {}
+    return {f"block_{name}": np.array([getattr(b, name) for b in blocks]) for name in Block.__annotations__}
+
+
+def blocks_of(arrays: Arrays) -> list[Block]:
+    """The blocks that a checkpoint names.
+
+    Raises:
+        KeyError: an array is missing.
+    """
+    if "block_number" not in arrays:
+        return []
+    columns = [arrays[f"block_{name}"] for name in Block.__annotations__]
+    return [
+        Block(int(n), int(a), int(c), int(s), centre, float(r), T)
+        for n, a, c, s, centre, r, T in zip(*columns)
+    ]
+
+
+def write_block(folder: Path, number: int, arrays: Arrays) -> None:
+    """The arrays (4 bytes an element, [.., N] each) as one table with its checksum; `sync` comes later.
+
+    Raises:
+        OSError: the disk is full or broken.
+    """
+    rows = [
+        np.ascontiguousarray(array).view(np.uint32).reshape(-1, array.shape[-1]) for array in arrays.values()
+    ]
+    body = np.concatenate(rows).tobytes()
+    table = {name: [array.dtype.str, array.ndim, len(r)] for (name, array), r in zip(arrays.items(), rows)}
+    table_bytes = json.dumps({"count": rows[0].shape[1], "arrays": table}).encode()
+    head = _HEAD.pack(_MAGIC, zlib.crc32(body, zlib.crc32(table_bytes)), len(table_bytes))
+    with block_file(folder, number).open("xb") as file:
+        file.write(head + table_bytes)
+        file.write(body)
+
+
+def read_block(folder: Path, block: Block, T_map_anchor: np.ndarray) -> Arrays:
+    """A block's arrays, where its anchor is now: bit for bit as they were if it has not moved.
+
+    Raises:
+        UserError: the file is missing or altered.
+    """
+    path = block_file(folder, block.number)
+    try:
+        arrays = _unpacked(path.read_bytes())
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read ({error.strerror}); restore it from a copy") from error
+    except ValueError as error:
+        raise UserError(f"{path}: {error}; restore it from a copy") from error
+    if not np.array_equal(T_map_anchor, block.T_map_anchor):
+        move = T_map_anchor @ inverse(block.T_map_anchor)
+        arrays["params"], arrays["first"] = carried(arrays["params"], arrays["first"], move)
+    return arrays
+
+
+def _unpacked(blob: bytes) -> Arrays:
+    if len(blob) < _HEAD.size:
+        raise ValueError("truncated")
+    magic, checksum, length = _HEAD.unpack_from(blob)
+    if magic != _MAGIC or zlib.crc32(blob[_HEAD.size :]) != checksum:
+        raise ValueError("truncated or altered")
+    head = json.loads(blob[_HEAD.size : _HEAD.size + length])
+    rows = np.frombuffer(blob, np.uint32, offset=_HEAD.size + length).reshape(-1, head["count"])
+    out, at = {}, 0
+    for name, (dtype, dimensions, number) in head["arrays"].items():
+        part = rows[at : at + number].view(dtype)
+        out[name], at = part if dimensions == 2 else part[0], at + number
+    return out
+
+
+def with_blocks(folder: Path, arrays: Arrays) -> Arrays:
+    """A checkpoint as if all its Gaussians had been in memory.
+
+    Raises:
+        UserError: a block cannot be read.
+    """
+    blocks = blocks_of(arrays)
+    if not blocks:
+        return arrays
+    places = dict(zip(arrays["anchor_id"].tolist(), arrays["anchor_T_map"]))
+    read = [read_block(folder, block, places[block.anchor]) for block in blocks]
+    for block, part in zip(blocks, read):
+        part["anchor"] = np.full(block.count, block.anchor, np.int64)
+    out = {key: array for key, array in arrays.items() if not key.startswith("block_")}
+    for name in read[0]:
+        out[f"store_{name}"] = np.concatenate([arrays[f"store_{name}"], *(r[name] for r in read)], axis=-1)
+    return out
+
+
+def sync(folder: Path, numbers: Iterable[int]) -> None:
+    """Brings blocks' files to the disk.
+
+    Raises:
+        OSError: the disk is full or broken.
+    """
+    paths: list[Path] = [block_file(folder, number) for number in numbers]
+    for path in [*paths, *([folder] if paths else [])]:
+        handle = os.open(path, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)

@@ -1,0 +1,88 @@
+"""Gaussians as binary glTF with `KHR_gaussian_splatting` (ratified): viewers without it show coloured points.
+
+Values are activated, as the extension wants them: linear scales (standard deviations, metres), opacity 0..1,
+unit quaternions xyzw, colour as the spherical harmonic of degree 0. A node turns z up into glTF's y up.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from beamsplat.common.files.persist import write_atomically
+from beamsplat.common.mapfiles.ply import SH_C0
+from beamsplat.common.mapfiles.y_up import QUAT_XYZW
+from beamsplat.common.raster.layout import COLOUR, MEAN, OPACITY, QUAT, SCALE
+
+_EXTENSION = "KHR_gaussian_splatting"
+_FLOAT, _SHORT = 5126, 5123
+_WIDTH = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
+
+
+def write_gltf(path: Path, params: np.ndarray) -> None:
+    """Writes Gaussians float32 [14, N] as `.glb`, whole or not at all.
+
+    Raises:
+        ValueError: there are none; glTF knows no empty arrays.
+        OSError: not writable.
+    """
+    if params.shape[1] == 0:
+        raise ValueError("the map has no Gaussians: glTF cannot hold an empty one")
+    colour = params[COLOUR : COLOUR + 3].T
+    opacity = 1.0 / (1.0 + np.exp(-params[OPACITY].astype(np.float64)))
+    w, x, y, z = params[QUAT : QUAT + 4] / np.linalg.norm(params[QUAT : QUAT + 4].astype(np.float64), axis=0)
+    fallback = np.concatenate([_linear(np.clip(colour, 0.0, 1.0)), opacity[:, None]], axis=1)
+    attributes: dict[str, np.ndarray] = {
+        "POSITION": params[MEAN : MEAN + 3].T.astype("<f4"),
+        "COLOR_0": np.round(fallback * 65535.0).astype("<u2"),
+        f"{_EXTENSION}:ROTATION": np.stack([x, y, z, w], axis=1).astype("<f4"),
+        f"{_EXTENSION}:SCALE": np.exp(params[SCALE : SCALE + 3].T).astype("<f4"),
+        f"{_EXTENSION}:OPACITY": opacity[:, None].astype("<f4"),
+        f"{_EXTENSION}:SH_DEGREE_0_COEF_0": ((colour - 0.5) / SH_C0).astype("<f4"),
+    }
+    write_atomically(Path(path), _glb(attributes))
+
+
+def _linear(srgb: np.ndarray) -> np.ndarray:
+    """sRGB in [0, 1] decoded: glTF's own vertex colours are linear."""
+    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+
+
+def _glb(attributes: dict[str, np.ndarray]) -> bytes:
+    views, accessors, pieces, offset = [], [], [], 0
+    for array in attributes.values():
+        blob = np.ascontiguousarray(array).tobytes()
+        views.append({"buffer": 0, "byteOffset": offset, "byteLength": len(blob), "target": 34962})
+        accessor: dict[str, Any] = {
+            "bufferView": len(views) - 1, "count": len(array), "type": _WIDTH[array.shape[1]],
+            "componentType": _SHORT if array.dtype == np.uint16 else _FLOAT,
+        }  # fmt: skip
+        if array.dtype == np.uint16:
+            accessor["normalized"] = True
+        accessors.append(accessor)
+        pieces.append(blob)
+        offset += len(blob)
+    positions = attributes["POSITION"]
+    accessors[0] |= {"min": positions.min(axis=0).tolist(), "max": positions.max(axis=0).tolist()}
+    primitive = {
+        "mode": 0, "attributes": {name: number for number, name in enumerate(attributes)},
+        "extensions": {_EXTENSION: {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}},
+    }  # fmt: skip
+    document = {
+        "asset": {"version": "2.0", "generator": "BeamSplat"}, "extensionsUsed": [_EXTENSION],
+        "scene": 0, "scenes": [{"nodes": [0]}],
+        "nodes": [{"name": "map, metres", "mesh": 0, "rotation": list(QUAT_XYZW)}],
+        "meshes": [{"primitives": [primitive]}], "accessors": accessors, "bufferViews": views,
+        "buffers": [{"byteLength": offset}],
+    }  # fmt: skip
+    head = json.dumps(document, separators=(",", ":")).encode()
+    head += b" " * (-len(head) % 4)
+    body = b"".join(pieces)
+    body += bytes(-len(body) % 4)
+    total = 12 + 8 + len(head) + 8 + len(body)
+    return b"".join((struct.pack("<4sII", b"glTF", 2, total), struct.pack("<I4s", len(head), b"JSON"), head,
+                     struct.pack("<I4s", len(body), b"BIN\0"), body))  # fmt: skip

@@ -1,0 +1,98 @@
+"""The map as files others read: 3DGS `.ply` (INRIA layout)."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+
+from beamsplat.common.errors import UserError
+from beamsplat.common.files.persist import make_folder
+from beamsplat.common.geometry.trajectory import Trajectory, write_tum
+from beamsplat.common.raster.layout import COLOUR, MEAN, OPACITY, QUAT, SCALE
+
+SH_C0 = 0.28209479177387814  # the constant spherical harmonic
+_ROWS = 65_536  # written at a time
+_PLY_TYPES = {"float": "<f4", "float32": "<f4", "double": "<f8", "uchar": "u1", "uint8": "u1", "char": "i1",
+              "short": "<i2", "ushort": "<u2", "int": "<i4", "uint": "<u4"}  # fmt: skip
+FIELDS = ("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity",
+          "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3")  # fmt: skip
+
+
+def write_gaussian_ply(path: Path, params: np.ndarray) -> None:
+    """Writes Gaussians float32 [14, N] as INRIA's 3DGS does (SH degree 0), all at once or not at all."""
+    write_gaussian_parts(path, params.shape[1], [params])
+
+
+def write_gaussian_parts(path: Path, count: int, parts: Iterable[np.ndarray]) -> None:
+    """The same of `count` Gaussians that come in parts float32 [14, N], one after the other.
+
+    Raises:
+        ValueError: there were more or fewer; then nothing is written.
+    """
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
+    header += [f"property float {name}" for name in FIELDS] + ["end_header", ""]
+    path, came = Path(path), 0
+    partial = path.with_name(path.name + ".partial")
+    with partial.open("wb") as file:
+        file.write("\n".join(header).encode())
+        for params in parts:
+            for first in range(0, params.shape[1], _ROWS):
+                file.write(_rows(params[:, first : first + _ROWS]).tobytes())
+            came += params.shape[1]
+    if came != count:
+        partial.unlink()
+        raise ValueError(f"{path}: {came} Gaussians came, {count} were to come")
+    os.replace(partial, path)
+
+
+def _rows(params: np.ndarray) -> np.ndarray:
+    rows = np.zeros((params.shape[1], len(FIELDS)), "<f4")
+    rows[:, 0:3] = params[MEAN : MEAN + 3].T
+    rows[:, 6:9] = (params[COLOUR : COLOUR + 3].T - 0.5) / SH_C0
+    rows[:, 9] = params[OPACITY]
+    rows[:, 10:13] = params[SCALE : SCALE + 3].T
+    quat = params[QUAT : QUAT + 4]
+    rows[:, 13:17] = (quat / np.maximum(np.linalg.norm(quat, axis=0), 1e-12)).T
+    return rows
+
+
+def write_map(
+    folder: Path,
+    count: int,
+    parts: Iterable[np.ndarray],  # float32 [14, N] each, `count` in all
+    stamps_ns: np.ndarray,  # int64 [K], rising
+    T_map_body: np.ndarray,  # float64 [K, 4, 4] of the keyframes
+) -> None:
+    """`splats.ply` and `keyframes.tum` in a folder, which is made.
+
+    Raises:
+        UserError: the folder cannot be made or written.
+    """
+    make_folder(folder)
+    write_gaussian_parts(folder / "splats.ply", count, parts)
+    write_tum(folder / "keyframes.tum", Trajectory(stamps_ns, T_map_body), "keyframes of the map, refined")
+
+
+def read_ply_points(path: Path) -> np.ndarray:
+    """float64 [N, 3] of the vertices of a binary little-endian PLY.
+
+    Raises:
+        UserError: not such a file.
+    """
+    blob = Path(path).read_bytes()
+    end = blob.find(b"end_header\n")
+    lines = blob[:end].decode("ascii", "replace").split("\n")
+    if end < 0 or "format binary_little_endian 1.0" not in lines:
+        raise UserError(f"{path}: expected a binary little-endian PLY")
+    fields, count = [], 0
+    for line in lines:
+        words = line.split()
+        if words[:2] == ["element", "vertex"]:
+            count = int(words[2])
+        elif words[:1] == ["property"] and len(words) == 3:
+            fields.append((words[2], _PLY_TYPES[words[1]]))
+    rows = np.frombuffer(blob, np.dtype(fields), count, end + len(b"end_header\n"))
+    return np.stack([rows[name] for name in "xyz"], axis=1).astype(np.float64)

@@ -1,0 +1,87 @@
+"""How good a map is: PSNR, SSIM and depth at views, and the surface against points of the truth."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from beamsplat.common.geometry.transforms import inverse
+from beamsplat.common.mapfiles.store import GaussianStore
+from beamsplat.common.raster.camera import RasterCamera
+from beamsplat.common.raster.rasterizer import Rasterizer
+from beamsplat.common.raster.ssim import ssim
+
+GRID_M = 0.02  # of the fused surface
+NEAR_ENOUGH_M = 0.05
+
+
+@dataclass(frozen=True)
+class ViewScore:
+    """One view at full size."""
+
+    psnr_db: float
+    ssim: float
+    depth_l1_m: float  # per pixel capped at the true depth; NaN without truth
+
+
+def render_rgb_depth(
+    rasterizer: Rasterizer, store: GaussianStore, camera: RasterCamera, T_map_camera: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(rgb float32 [H, W, 3] in [0, 1], expected depth float32 [H, W] m, alpha float32 [H, W])."""
+    render = rasterizer.render(store.params, store.count, camera, inverse(T_map_camera))
+    rgb = np.clip(render.image[:3].transpose(1, 2, 0), 0.0, 1.0).copy()
+    depth, alpha = render.expected_depth(), render.image[4].copy()
+    rasterizer.release(render)
+    return rgb, depth, alpha
+
+
+def psnr_db(a: np.ndarray, b: np.ndarray) -> float:
+    """Of two pictures in [0, 1]; 120 dB where they are the same."""
+    return float(-10.0 * np.log10(max(float(np.mean((a - b) ** 2)), 1e-12)))
+
+
+def score_view(
+    rgb: np.ndarray, depth: np.ndarray, true_rgb: np.ndarray, true_depth: np.ndarray | None
+) -> ViewScore:
+    """Rendered against true: rgb float32 in [0, 1], true_rgb uint8, depths in metres, NaN unknown."""
+    truth = true_rgb.astype(np.float32) / 255.0
+    l1 = float("nan")
+    if true_depth is not None:
+        known = np.isfinite(true_depth)
+        shown = np.where(np.isfinite(depth[known]), depth[known], 0.0)
+        l1 = float(np.mean(np.minimum(np.abs(shown - true_depth[known]), true_depth[known])))
+    return ViewScore(psnr_db(rgb, truth), ssim(rgb, truth), l1)
+
+
+def fused_surface(
+    rasterizer: Rasterizer, store: GaussianStore, views: Iterable[tuple[RasterCamera, np.ndarray]]
+) -> np.ndarray:
+    """Points float64 [N, 3] of the rendered depth with alpha above one half, one a cell of 2 cm."""
+    parts = []
+    for camera, T_map_camera in views:
+        _, depth, alpha = render_rgb_depth(rasterizer, store, camera, T_map_camera)
+        v, u = np.nonzero((alpha > 0.5) & np.isfinite(depth))
+        z = depth[v, u].astype(np.float64)
+        rays = np.stack(
+            [(u - camera.cx_px) / camera.fx_px * z, (v - camera.cy_px) / camera.fy_px * z, z], axis=1
+        )
+        points = rays @ T_map_camera[:3, :3].T + T_map_camera[:3, 3]
+        parts.append(np.unique(np.floor(points / GRID_M).astype(np.int64), axis=0))
+    if not parts:
+        return np.zeros((0, 3))
+    return (np.unique(np.concatenate(parts), axis=0) + 0.5) * GRID_M
+
+
+def f_score(points: np.ndarray, truth: np.ndarray) -> dict[str, float]:
+    """Accuracy, completion (mean metres) and F-score at 5 cm of points [N, 3] against points [M, 3]."""
+    if len(points) == 0 or len(truth) == 0:
+        return {"fscore_5cm": 0.0, "accuracy_m": float("nan"), "completion_m": float("nan")}
+    to_truth, _ = cKDTree(truth).query(points, distance_upper_bound=1.0)
+    to_map, _ = cKDTree(points).query(truth, distance_upper_bound=1.0)
+    to_truth, to_map = np.minimum(to_truth, 1.0), np.minimum(to_map, 1.0)
+    precision, recall = float(np.mean(to_truth < NEAR_ENOUGH_M)), float(np.mean(to_map < NEAR_ENOUGH_M))
+    score = 2.0 * precision * recall / max(precision + recall, 1e-12)
+    return {"fscore_5cm": score, "accuracy_m": float(to_truth.mean()), "completion_m": float(to_map.mean())}

@@ -1,0 +1,56 @@
+"""Reading a saved state without a mapper: its Gaussians, counters and views."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from beamsplat.common.mapfiles.blocks import Arrays
+from beamsplat.common.mapfiles.store import GaussianStore
+from beamsplat.common.raster.camera import RasterCamera
+
+CAMERA_FIELDS = ("fx_px", "fy_px", "cx_px", "cy_px", "width_px", "height_px")
+
+
+def store_of(arrays: Arrays) -> GaussianStore:
+    """The Gaussians of a state.
+
+    Raises:
+        KeyError: an array is missing.
+    """
+    store = GaussianStore()
+    store.restore({k.removeprefix("store_"): a for k, a in arrays.items() if k.startswith("store_")})
+    return store
+
+
+def progress_of(arrays: Arrays) -> dict[str, Any]:
+    """The mapper's counters (`Mapper.progress`) in a state."""
+    return json.loads(arrays["progress"].tobytes())
+
+
+@dataclass(frozen=True)
+class View:
+    """A keyframe of a saved map: where it looks from."""
+
+    id: int
+    camera: RasterCamera
+    T_map_camera: np.ndarray
+
+
+def views_of(arrays: Arrays) -> list[View]:
+    """The keyframes of a state, refined, in order of id (which is time)."""
+    T_map_anchor = dict(zip(arrays["anchor_id"].tolist(), arrays["anchor_T_map"]))
+    out = []
+    for row, id in enumerate(arrays["keyframe_id"].tolist()):
+        T_anchor_camera = arrays["keyframe_T_anchor_camera"][row] @ arrays["keyframe_delta"][row]
+        T_map_camera = T_map_anchor[int(arrays["keyframe_anchor"][row])] @ T_anchor_camera
+        out.append(View(id, camera_of(arrays, row), T_map_camera))
+    return sorted(out, key=lambda view: view.id)
+
+
+def camera_of(arrays: Arrays, row: int) -> RasterCamera:
+    numbers = dict(zip(CAMERA_FIELDS, arrays["keyframe_camera"][row].tolist()))
+    return RasterCamera(**numbers | {name: int(numbers[name]) for name in ("width_px", "height_px")})

@@ -1,0 +1,145 @@
+"""Messages to bytes and back: a msgpack head, then the arrays raw and 64-byte aligned.
+
+    uint32 head length | head (msgpack map) | padding | array 0 | padding | array 1 ...
+
+In the head an array is msgpack extension type 1 holding [dtype, shape, offset]; offsets count from
+the end of the padded head. Nothing is pickled, and decoding gives read-only views into the payload.
+The schema, "Scan/1.0", travels beside the payload (in Zenoh's encoding).
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from functools import lru_cache
+from typing import Any
+
+import msgpack
+import numpy as np
+from pydantic import BaseModel
+
+from beamsplat.common.messages import MESSAGES, Message
+from beamsplat.common.messages.header import DecodeError
+
+MEDIA_TYPE = "application/x-beamsplat"
+_ALIGN = 64
+_ARRAY = 1
+_DTYPES = frozenset(f"{kind}{bits}" for kind in ("int", "uint") for bits in (8, 16, 32, 64)) | {
+    "bool", "float16", "float32", "float64",
+}  # fmt: skip
+_LENGTH = struct.Struct("<I")
+
+
+def schema_of(message: Message | type[Message]) -> str:
+    """ "Scan/1.0": name and version of a message or its class."""
+    return f"{message.schema_name()}/{message.version}"
+
+
+def encode(message: Message) -> bytes:
+    """The payload of a message (its schema travels beside it: `schema_of`)."""
+    arrays: list[np.ndarray] = []
+    position = 0
+
+    def pack(value: Any) -> Any:
+        nonlocal position
+        if isinstance(value, np.ndarray):
+            description = msgpack.packb([value.dtype.name, list(value.shape), position])
+            arrays.append(value)
+            position += _padded(value.nbytes)
+            return msgpack.ExtType(_ARRAY, description)
+        if isinstance(value, BaseModel):
+            return value.__dict__
+        raise TypeError(f"{type(value).__name__} has no place in a message")
+
+    head = msgpack.packb(message.__dict__, default=pack)
+    start = _padded(_LENGTH.size + len(head))
+    pieces = [_LENGTH.pack(len(head)), head, bytes(start - _LENGTH.size - len(head))]
+    for array in arrays:
+        pieces.append(array.data)
+        pieces.append(bytes(_padded(array.nbytes) - array.nbytes))
+    return b"".join(pieces)
+
+
+def decode(schema: str, payload: bytes) -> Message:
+    """The message in `payload`; arrays are read-only views into it.
+
+    A newer minor version decodes, without the fields this program does not know.
+
+    Raises:
+        DecodeError: unknown schema, another major version, truncated or inconsistent bytes, or values
+            that the message class refuses. No other exception leaves.
+    """
+    cls, minor = _class_of(schema)
+    try:
+        fields = _unpack(payload)
+        newer = minor > _version(cls)[1]
+        return cls.model_validate(fields, extra="ignore" if newer else None)
+    except DecodeError:
+        raise
+    # msgpack and pydantic raise ValueErrors; hostile bytes also provoke the other three in them.
+    except (ValueError, TypeError, OverflowError, RecursionError, msgpack.UnpackException) as error:
+        raise DecodeError(f"{schema}: {_first_line(error)}") from error
+
+
+@lru_cache(maxsize=256)
+def _class_of(schema: str) -> tuple[type[Message], int]:
+    name, _, version = schema.partition("/")
+    if name not in MESSAGES:
+        raise DecodeError(f"unknown message {schema[:80]!r}")
+    major, _, minor = version.partition(".")
+    if not (major.isascii() and major.isdecimal() and minor.isascii() and minor.isdecimal()):
+        raise DecodeError(f"{schema[:80]!r} carries no version")
+    if len(version) > 12 or int(major) != _version(MESSAGES[name])[0]:
+        raise DecodeError(
+            f"{name} is version {version[:12]}, this program speaks {MESSAGES[name].version}: "
+            "update the older of the two sides"
+        )
+    return MESSAGES[name], int(minor)
+
+
+def _version(cls: type[Message]) -> tuple[int, int]:
+    major, minor = cls.version.split(".")
+    return int(major), int(minor)
+
+
+def _unpack(payload: bytes) -> dict[str, Any]:
+    if len(payload) < _LENGTH.size:
+        raise DecodeError(f"payload of {len(payload)} bytes has no head")
+    (head_length,) = _LENGTH.unpack_from(payload)
+    start = _padded(_LENGTH.size + head_length)
+    if _LENGTH.size + head_length > len(payload):
+        raise DecodeError(f"head of {head_length} bytes in a payload of {len(payload)}")
+
+    def view(code: int, description: bytes) -> np.ndarray:
+        if code != _ARRAY:
+            raise DecodeError(f"unknown extension type {code}")
+        dtype, shape, offset = msgpack.unpackb(description)
+        if dtype not in _DTYPES or not isinstance(offset, int) or offset < 0 or len(shape) > 8:
+            raise DecodeError(f"array of {dtype!r} at {offset!r}")
+        if not all(isinstance(size, int) and 0 <= size < 2**40 for size in shape):
+            raise DecodeError(f"array of shape {shape!r}")
+        count = math.prod(shape)
+        end = start + offset + count * np.dtype(dtype).itemsize
+        if count and end > len(payload):
+            raise DecodeError(f"array ends at byte {end} of {len(payload)}")
+        if not count:
+            return np.zeros(shape, dtype)
+        return np.frombuffer(payload, dtype, count, start + offset).reshape(shape)
+
+    head = memoryview(payload)[_LENGTH.size : _LENGTH.size + head_length]
+    fields = msgpack.unpackb(head, ext_hook=view, use_list=False, strict_map_key=True)
+    if not isinstance(fields, dict):
+        raise DecodeError(f"head is a {type(fields).__name__}, not a map")
+    return fields
+
+
+def _padded(size: int) -> int:
+    return -(-size // _ALIGN) * _ALIGN
+
+
+def _first_line(error: Exception) -> str:
+    """Pydantic's field and reason on one line; its own text spans several and quotes the input."""
+    if hasattr(error, "errors"):
+        first = error.errors(include_url=False, include_input=False)[0]
+        return f"{'.'.join(str(part) for part in first['loc'])}: {first['msg']}"
+    return str(error).split("\n")[0][:200] or type(error).__name__

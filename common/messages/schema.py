@@ -1,0 +1,117 @@
+"""What messages are made of: checked arrays, transforms, and the frozen base classes.
+
+A message is a frozen pydantic model. Arrays are declared with dtype and shape,
+`Annotated[np.ndarray, Array("float32", "N")]`; a letter binds a dimension across the fields of one
+message. Arrays are made read-only: every consumer in a process sees the same memory.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, ClassVar
+
+import numpy as np
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+from pydantic_core import core_schema
+
+from beamsplat.common.geometry.transforms import is_rigid
+
+MAX_ARRAY_BYTES = 256 * 1024 * 1024
+
+
+class Array:
+    """Annotation for a numpy field: dtype, shape, and whether NaN and inf are refused.
+
+    Shape entries are ints (exact) or letters (any size, equal within one message).
+    """
+
+    def __init__(self, dtype: str, *shape: int | str, finite: bool = False) -> None:
+        self.dtype = np.dtype(dtype)
+        self.shape = shape
+        self.finite = finite
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> core_schema.CoreSchema:
+        return core_schema.no_info_plain_validator_function(self.check)
+
+    def check(self, value: Any) -> np.ndarray:
+        """The array as a read-only, C-contiguous view (a copy only if it was strided).
+
+        Raises:
+            ValueError: not an array, or another dtype, rank, fixed size, or non-finite where forbidden.
+        """
+        if not isinstance(value, np.ndarray):
+            raise ValueError(f"expected a numpy array, got {type(value).__name__}")
+        if value.dtype != self.dtype:
+            raise ValueError(f"expected dtype {self.dtype}, got {value.dtype}")
+        if value.ndim != len(self.shape):
+            raise ValueError(f"expected shape {list(self.shape)}, got {list(value.shape)}")
+        for wanted, size in zip(self.shape, value.shape):
+            if isinstance(wanted, int) and wanted != size:
+                raise ValueError(f"expected shape {list(self.shape)}, got {list(value.shape)}")
+        if value.nbytes > MAX_ARRAY_BYTES:
+            raise ValueError(f"{value.nbytes} bytes exceed the limit of {MAX_ARRAY_BYTES}")
+        if self.finite and not np.all(np.isfinite(value)):
+            raise ValueError("contains NaN or infinity")
+        view = np.ascontiguousarray(value).view()
+        view.flags.writeable = False
+        return view
+
+
+def _check_rigid(T: np.ndarray) -> np.ndarray:
+    for matrix in T.reshape(-1, 4, 4):
+        if not is_rigid(matrix):
+            raise ValueError(f"is not a rigid transform: {matrix.tolist()}")
+    return T
+
+
+Transform = Annotated[np.ndarray, Array("float64", 4, 4, finite=True), AfterValidator(_check_rigid)]
+Transforms = Annotated[np.ndarray, Array("float64", "N", 4, 4, finite=True), AfterValidator(_check_rigid)]
+StampNs = Annotated[int, Field(ge=0, lt=2**63)]
+Count = Annotated[int, Field(ge=0, lt=2**63)]
+Name = Annotated[str, Field(max_length=256)]
+Text = Annotated[str, Field(max_length=65536)]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+
+
+class Part(BaseModel):
+    """A frozen piece of a message (or of a configuration)."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, arbitrary_types_allowed=True)
+
+    _lettered: ClassVar[tuple[tuple[str, int, str], ...]] = ()  # (field, axis, letter) of letters used twice
+
+    @classmethod
+    def __pydantic_init_subclass__(cls, **kwargs: Any) -> None:
+        """Looks up once which dimensions must agree: this is checked for every message."""
+        found = [
+            (name, axis, letter)
+            for name, field in cls.model_fields.items()
+            for array in field.metadata
+            if isinstance(array, Array)
+            for axis, letter in enumerate(array.shape)
+            if isinstance(letter, str)
+        ]
+        letters = [letter for _, _, letter in found]
+        cls._lettered = tuple(entry for entry in found if letters.count(entry[2]) > 1)
+
+    @model_validator(mode="after")
+    def _dimensions_agree(self) -> Part:
+        sizes: dict[str, tuple[int, str]] = {}
+        for name, axis, letter in self._lettered:
+            size = getattr(self, name).shape[axis]
+            known, first = sizes.setdefault(letter, (size, name))
+            if known != size:
+                raise ValueError(f"{name} has {letter}={size}, but {first} has {letter}={known}")
+        return self
+
+
+class Message(Part):
+    """Base of everything on the bus. `stamp_ns` is the time of measurement, int64 nanoseconds."""
+
+    version: ClassVar[str] = "1.0"
+    stamp_ns: StampNs
+
+    @classmethod
+    def schema_name(cls) -> str:
+        return cls.__name__

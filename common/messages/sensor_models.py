@@ -1,0 +1,55 @@
+"""How a camera and a lidar see, and where they sit: parts of messages."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from beamsplat.common.messages.schema import Finite, Part, Positive, Transform
+
+
+class CameraModel(Part):
+    """A pinhole camera with the distortion of OpenCV; K belongs to this image size.
+
+    `distortion_model` follows ROS: plumb_bob (k1 k2 p1 p2 k3), rational_polynomial (8),
+    equidistant (4, fisheye), none.
+    """
+
+    width_px: Annotated[int, Field(gt=0, le=16384)]
+    height_px: Annotated[int, Field(gt=0, le=16384)]
+    fx_px: Positive
+    fy_px: Positive
+    cx_px: Finite
+    cy_px: Finite
+    distortion_model: Literal["none", "plumb_bob", "rational_polynomial", "equidistant"] = "none"
+    distortion: Annotated[tuple[Finite, ...], Field(max_length=14)] = ()
+    T_body_camera: Transform
+
+    @model_validator(mode="after")
+    def _k_fits_the_image(self) -> CameraModel:
+        for axis, centre, size in (("cx", self.cx_px, self.width_px), ("cy", self.cy_px, self.height_px)):
+            if not 0.0 < centre < size:
+                raise ValueError(
+                    f"{axis} = {centre:g} px lies outside the {self.width_px}x{self.height_px} image: "
+                    "K belongs to another image size"
+                )
+        counts = {"none": (0,), "plumb_bob": (0, 4, 5), "rational_polynomial": (8,), "equidistant": (4,)}
+        if len(self.distortion) not in counts[self.distortion_model]:
+            raise ValueError(
+                f"distortion model {self.distortion_model} takes {counts[self.distortion_model]} "
+                f"coefficients, got {len(self.distortion)}"
+            )
+        return self
+
+    @property
+    def K(self) -> np.ndarray:
+        """float64 [3, 3]."""
+        return np.array([[self.fx_px, 0.0, self.cx_px], [0.0, self.fy_px, self.cy_px], [0.0, 0.0, 1.0]])
+
+
+class LidarModel(Part):
+    """Where the planar lidar sits."""
+
+    T_body_lidar: Transform

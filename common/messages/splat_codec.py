@@ -1,0 +1,82 @@
+"""Gaussians as few bytes: what viewers and remote copies of the map receive.
+
+17 bytes each before compression: means to 1/65535 of the chunk's extent, scales to 2.4 %, directions to
+half a degree, opacity and colour to 1/255. Rows are those of beamsplat.common.raster.layout.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+
+import numpy as np
+
+from beamsplat.common.raster.layout import COLOUR, MEAN, OPACITY, PARAMS, QUAT, SCALE
+
+MAX_GAUSSIANS = 8_000_000
+_HEAD = struct.Struct("<4sI6f")  # magic, count, low and high corner of the means
+_MAGIC = b"SPL1"
+_BYTES = 17
+_LOG_SCALE = (-9.2, 2.9)  # 0.1 mm to 18 m
+_LOGIT = 8.0  # opacity 0.0003 to 0.9997
+
+
+def pack(params: np.ndarray) -> np.ndarray:
+    """uint8 [B] of Gaussians float32 [14, N]."""
+    count = params.shape[1]
+    mean = params[MEAN:SCALE].astype(np.float64)
+    low = mean.min(axis=1) if count else np.zeros(3)
+    high = mean.max(axis=1) if count else np.zeros(3)
+    # What the reader divides by must be what is written here.
+    low, high = low.astype(np.float32), high.astype(np.float32)
+    extent = np.maximum(high.astype(np.float64) - low, 1e-9)
+    grid = np.clip((mean - low[:, None]) / extent[:, None] * 65535.0 + 0.5, 0.0, 65535.0).astype("<u2")
+    s0, s1 = _LOG_SCALE
+    scale = _to_byte((params[SCALE:QUAT] - s0) / (s1 - s0))
+    quat = params[QUAT:OPACITY].astype(np.float64)
+    quat = quat / np.maximum(np.linalg.norm(quat, axis=0), 1e-12)
+    turned = np.clip(np.round(quat * 127.0), -127, 127).astype(np.int8)
+    opacity = _to_byte(1.0 / (1.0 + np.exp(-np.clip(params[OPACITY], -_LOGIT, _LOGIT))))
+    colour = _to_byte(params[COLOUR:])
+    # Bytes of one kind side by side, high ones apart from low ones: they repeat, and compress.
+    high_byte, low_byte = (grid >> 8).astype(np.uint8), (grid & 255).astype(np.uint8)
+    planes = [high_byte, low_byte, scale, turned.view(np.uint8), opacity[None], colour]
+    body = zlib.compress(np.concatenate(planes).tobytes(), 1)
+    return np.frombuffer(_HEAD.pack(_MAGIC, count, *low, *high) + body, np.uint8)
+
+
+def unpack(packed: np.ndarray) -> np.ndarray:
+    """float32 [14, N] of `pack`.
+
+    Raises:
+        ValueError: not such bytes, cut off, or of more than 8 million Gaussians.
+    """
+    blob = packed.tobytes()
+    if len(blob) < _HEAD.size:
+        raise ValueError(f"{len(blob)} bytes are too few for packed Gaussians")
+    magic, count, *corners = _HEAD.unpack_from(blob)
+    if magic != _MAGIC or count > MAX_GAUSSIANS or not np.all(np.isfinite(corners)):
+        raise ValueError(f"no packed Gaussians: they start with {magic!r} and claim {count}")
+    try:
+        body = zlib.decompressobj().decompress(blob[_HEAD.size :], _BYTES * count + 1)
+    except zlib.error as error:
+        raise ValueError(f"packed Gaussians do not decompress: {error}") from error
+    if len(body) != _BYTES * count:
+        raise ValueError(f"packed Gaussians: {len(body)} bytes for {count} of {_BYTES} bytes each")
+    planes = np.frombuffer(body, np.uint8).reshape(_BYTES, count)
+    low, high = np.array(corners[:3])[:, None], np.array(corners[3:])[:, None]
+    grid = planes[0:3].astype(np.float64) * 256.0 + planes[3:6]
+    out = np.empty((PARAMS, count), np.float32)
+    out[MEAN:SCALE] = low + grid / 65535.0 * np.maximum(high - low, 1e-9)
+    s0, s1 = _LOG_SCALE
+    out[SCALE:QUAT] = s0 + planes[6:9].astype(np.float32) / 255.0 * (s1 - s0)
+    quat = planes[9:13].view(np.int8).astype(np.float32)
+    out[QUAT:OPACITY] = quat / np.maximum(np.linalg.norm(quat, axis=0), 1e-6)
+    opacity = np.clip(planes[13].astype(np.float64) / 255.0, 1e-3, 1.0 - 1e-3)
+    out[OPACITY] = np.log(opacity / (1.0 - opacity))
+    out[COLOUR:] = planes[14:17].astype(np.float32) / 255.0
+    return out
+
+
+def _to_byte(share: np.ndarray) -> np.ndarray:
+    return np.clip(share * 255.0 + 0.5, 0.0, 255.0).astype(np.uint8)

@@ -1,0 +1,155 @@
+"""SSIM (Wang et al. 2004): as a loss on luma with its gradient, and as a figure on RGB.
+
+Window: 11 x 11 Gaussian of sigma 1.5, zero outside the picture, as 3DGS uses it.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from beamsplat.common.compiled import inner, kernel
+from beamsplat.common.raster.simd_memory import atomic_next
+from beamsplat.common.raster.threads import Team
+
+C1, C2 = 0.01**2, 0.03**2
+_RADIUS = 5
+_TAPS = np.exp(-0.5 * (np.arange(-_RADIUS, _RADIUS + 1) / 1.5) ** 2)
+TAPS = (_TAPS / _TAPS.sum()).astype(np.float32)
+LUMA = (np.float32(0.299), np.float32(0.587), np.float32(0.114))
+_BAND = 16  # rows that one thread takes at a time
+_PAD = 8
+
+
+@inner
+def _blur_row(source, y, out, taps):  # noqa: ANN001, ANN202
+    """out[pad + x] = source blurred down the columns at row y (zero outside)."""
+    height, width = source.shape
+    for x in range(width):
+        out[_PAD + x] = np.float32(0.0)
+    for k in range(max(0, _RADIUS - y), min(2 * _RADIUS + 1, height + _RADIUS - y)):
+        tap, row = taps[k], source[y + k - _RADIUS]
+        for x in range(width):
+            out[_PAD + x] += tap * row[x]
+
+
+@inner
+def _across(padded, out, taps):  # noqa: ANN001, ANN202
+    """out[x] = blurred along the row; `padded` has zeros at both ends."""
+    for x in range(len(out)):
+        out[x] = np.float32(0.0)
+    for k in range(2 * _RADIUS + 1):
+        tap = taps[k]
+        for x in range(len(out)):
+            out[x] += tap * padded[_PAD - _RADIUS + k + x]
+
+
+@kernel
+def _prepare(counter, image, rgb, planes):  # noqa: ANN001, ANN202
+    """planes: x, y, xx, yy, xy of the luma of the rendered and the true picture."""
+    height = image.shape[1]
+    unit = np.float32(1.0 / 255.0)
+    while True:
+        y = atomic_next(counter, 0)
+        if y >= height:
+            return
+        for x in range(image.shape[2]):
+            a = LUMA[0] * image[0, y, x] + LUMA[1] * image[1, y, x] + LUMA[2] * image[2, y, x]
+            b = unit * (LUMA[0] * rgb[0, y, x] + LUMA[1] * rgb[1, y, x] + LUMA[2] * rgb[2, y, x])
+            planes[0, y, x], planes[1, y, x] = a, b
+            planes[2, y, x], planes[3, y, x], planes[4, y, x] = a * a, b * b, a * b
+
+
+@kernel
+def _partials(counter, planes, taps, partials, sums):  # noqa: ANN001, ANN202
+    """dSSIM/d(mean x, mean xx, mean xy) at every pixel, and the rows' sums of SSIM."""
+    height, width = planes.shape[1], planes.shape[2]
+    padded = np.zeros(width + 2 * _PAD, np.float32)
+    m = np.empty((5, width), np.float32)
+    while True:
+        band = atomic_next(counter, 0) * _BAND
+        if band >= height:
+            return
+        for y in range(band, min(height, band + _BAND)):
+            for p in range(5):
+                _blur_row(planes[p], y, padded, taps)
+                _across(padded, m[p], taps)
+            total = np.float32(0.0)
+            for x in range(width):
+                mx, my = m[0, x], m[1, x]
+                a1, a2 = (
+                    np.float32(2.0) * mx * my + np.float32(C1),
+                    np.float32(2.0) * (m[4, x] - mx * my) + np.float32(C2),
+                )
+                b1 = mx * mx + my * my + np.float32(C1)
+                b2 = m[2, x] - mx * mx + m[3, x] - my * my + np.float32(C2)
+                inverse = np.float32(1.0) / (b1 * b2)
+                s = a1 * a2 * inverse
+                d_xy, d_xx = np.float32(2.0) * a1 * inverse, -s / b2
+                partials[0, y, x] = (
+                    np.float32(2.0) * my * a2 * inverse
+                    - np.float32(2.0) * mx * s / b1
+                    - my * d_xy
+                    - np.float32(2.0) * mx * d_xx
+                )
+                partials[1, y, x], partials[2, y, x] = d_xx, d_xy
+                total += s
+            sums[y] = total
+
+
+@kernel
+def _add(counter, planes, partials, taps, scale, gradient):  # noqa: ANN001, ANN202
+    """gradient[rgb] += scale * dSSIM/d(pixel)."""
+    height, width = planes.shape[1], planes.shape[2]
+    padded = np.zeros(width + 2 * _PAD, np.float32)
+    m = np.empty((3, width), np.float32)
+    while True:
+        band = atomic_next(counter, 0) * _BAND
+        if band >= height:
+            return
+        for y in range(band, min(height, band + _BAND)):
+            for p in range(3):
+                _blur_row(partials[p], y, padded, taps)
+                _across(padded, m[p], taps)
+            for x in range(width):
+                g = m[0, x] + np.float32(2.0) * planes[0, y, x] * m[1, x] + planes[1, y, x] * m[2, x]
+                g *= scale
+                gradient[0, y, x] += LUMA[0] * g
+                gradient[1, y, x] += LUMA[1] * g
+                gradient[2, y, x] += LUMA[2] * g
+
+
+class SsimLoss:
+    """weight * (1 - SSIM of luma) / 2, with memory that is reused."""
+
+    def __init__(self) -> None:
+        self._memory: dict[tuple[int, int], tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
+
+    @property
+    def held_bytes(self) -> int:
+        return sum(array.nbytes for arrays in self._memory.values() for array in arrays)
+
+    def add(
+        self, image: np.ndarray, rgb: np.ndarray, weight: float, gradient: np.ndarray, team: Team
+    ) -> float:
+        """Adds the gradient to `gradient` float32 [5, H, W] and gives the loss."""
+        h, w = image.shape[1:]
+        if (h, w) not in self._memory:
+            self._memory[h, w] = np.empty((5, h, w), np.float32), np.empty((3, h, w), np.float32), np.empty(h)
+        planes, partials, sums = self._memory[h, w]
+        team.run(_prepare, image, rgb, planes)
+        team.run(_partials, planes, TAPS, partials, sums)
+        team.run(_add, planes, partials, TAPS, np.float32(-0.5 * weight / (h * w)), gradient)
+        return 0.5 * weight * (1.0 - float(sums.sum()) / (h * w))
+
+
+def ssim(a: np.ndarray, b: np.ndarray) -> float:
+    """Mean SSIM over pixels and channels of two pictures float32 [H, W, C] in [0, 1]."""
+
+    def blur(x: np.ndarray) -> np.ndarray:
+        taps = TAPS.astype(np.float64)
+        return cv2.sepFilter2D(x.astype(np.float64), cv2.CV_64F, taps, taps, borderType=cv2.BORDER_CONSTANT)
+
+    mx, my = blur(a), blur(b)
+    xx, yy, xy = blur(a * a) - mx * mx, blur(b * b) - my * my, blur(a * b) - mx * my
+    return float(np.mean((2 * mx * my + C1) * (2 * xy + C2) / ((mx**2 + my**2 + C1) * (xx + yy + C2))))

@@ -1,0 +1,1 @@
+"""Zenoh: sessions and routers, publishers and subscribers, queries, the bridge to another host."""

@@ -1,0 +1,157 @@
+"""One topic on the wire: how a producer writes it, how a subscriber receives it."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import zenoh
+import zenoh.ext
+
+from beamsplat.common.messages import Message
+from beamsplat.common.messages.codec import MEDIA_TYPE, decode, encode, schema_of
+from beamsplat.common.messages.header import DecodeError, Header
+from beamsplat.common.runtime.mailbox import Letter
+from beamsplat.common.topics import Topic
+
+if TYPE_CHECKING:
+    from beamsplat.common.zenoh.bus import Bus
+
+FIFO_MESSAGES = 256  # buffered by Zenoh ahead of our thread for an `every` input without a cache
+ENCODING = zenoh.Encoding(MEDIA_TYPE)
+
+
+def declare_writer(
+    session: zenoh.Session,
+    key_expr: str,
+    row: Topic,
+    congestion: zenoh.CongestionControl = zenoh.CongestionControl.DROP,
+    priority: zenoh.Priority = zenoh.Priority.DATA,
+) -> zenoh.Publisher | zenoh.ext.AdvancedPublisher:
+    """A publisher as the row asks: with a cache from which subscribers recover, or without."""
+    encoding = ENCODING.with_schema(schema_of(row.message))
+    if not row.cache:
+        return session.declare_publisher(
+            key_expr, encoding=encoding, congestion_control=congestion, priority=priority
+        )
+    return zenoh.ext.declare_advanced_publisher(
+        session,
+        key_expr,
+        encoding=encoding,
+        congestion_control=congestion,
+        priority=priority,
+        cache=zenoh.ext.CacheConfig(row.cache),
+        sample_miss_detection=zenoh.ext.MissDetectionConfig(sporadic_heartbeat=0.5),
+        publisher_detection=True,
+    )
+
+
+def declare_reader(
+    session: zenoh.Session,
+    key_expr: str,
+    row: Topic,
+    delivery: str,
+    channel: zenoh.handlers.FifoChannel | zenoh.handlers.RingChannel,
+    origin: zenoh.Locality = zenoh.Locality.ANY,
+) -> zenoh.Subscriber | zenoh.ext.AdvancedSubscriber:
+    """A subscriber that recovers what the row's publisher keeps, where the delivery wants that."""
+    if not row.cache or delivery == "latest":
+        return session.declare_subscriber(key_expr, channel, allowed_origin=origin)
+    latched = zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=1)
+    return zenoh.ext.declare_advanced_subscriber(
+        session,
+        key_expr,
+        channel,
+        allowed_origin=origin,
+        recovery=zenoh.ext.RecoveryConfig(heartbeat=True),
+        history=latched if row.delivery == "latched" else None,
+    )
+
+
+class Publication:
+    """One topic as one producer writes it; `put` may be called from several threads."""
+
+    def __init__(self, bus: Bus, row: Topic, key_expr: str) -> None:
+        self._bus = bus
+        self._lock = threading.Lock()
+        self.row = row
+        self.sent = 0
+        self.bytes = 0
+        self._publisher = declare_writer(bus.session, key_expr, row)
+
+    def put(self, message: Message) -> Header:
+        """Sends one message; never waits for a subscriber."""
+        payload = encode(message)
+        with self._lock:
+            header = Header(
+                stamp_ns=message.stamp_ns,
+                publish_ns=time.monotonic_ns(),
+                clock_id=self._bus.clock_id,
+                sequence=self.sent,
+                epoch=self._bus.epoch,
+                producer=self._bus.node,
+                instance=self._bus.instance,
+            )
+            self._publisher.put(payload, attachment=header.pack())
+            self.sent += 1
+            self.bytes += len(payload)
+        return header
+
+
+class Subscription:
+    """One input: a thread that takes samples from Zenoh's channel and decodes them."""
+
+    def __init__(
+        self,
+        bus: Bus,
+        row: Topic,
+        delivery: str,
+        key_expr: str,
+        on_letter: Callable[[Letter], None],
+        on_undecodable: Callable[[str, str], None],
+    ) -> None:
+        self.row = row
+        self._on_letter = on_letter
+        self._on_undecodable = on_undecodable
+        if delivery == "every":
+            channel = zenoh.handlers.FifoChannel(max(row.cache, FIFO_MESSAGES))
+        else:
+            channel = zenoh.handlers.RingChannel(1)
+        self._subscriber = declare_reader(bus.session, key_expr, row, delivery, channel)
+        self._thread = threading.Thread(target=self._receive, name=f"sub-{row.name}", daemon=True)
+        self._thread.start()
+
+    def _receive(self) -> None:
+        while True:
+            try:
+                sample = self._subscriber.recv()
+            except zenoh.ZError:  # the session was closed
+                return
+            try:
+                letter = open_sample(sample, self.row)
+            except DecodeError as error:
+                self._on_undecodable(self.row.name, str(error))
+            else:
+                self._on_letter(letter)
+
+
+def open_sample(sample: zenoh.Sample, row: Topic) -> Letter:
+    """The letter in a sample of topic `row`.
+
+    Raises:
+        DecodeError: no header, too large, another message's schema, or a payload that does not decode.
+    """
+    if sample.attachment is None:
+        raise DecodeError("sample without a header")
+    header = Header.unpack(sample.attachment.to_bytes())
+    schema = str(sample.encoding).partition(";")[2]
+    if len(sample.payload) > row.limit_kb * 1000:
+        size, most = len(sample.payload) / 1e6, row.limit_kb / 1e3
+        raise DecodeError(f"{size:.1f} MB on {row.name}, where {most:g} MB is the most (common/topics.py)")
+    payload = sample.payload.to_bytes()
+    message = decode(schema, payload)
+    if type(message) is not row.message:
+        raise DecodeError(f"{schema} on {row.name}, which carries {row.message.schema_name()}")
+    return Letter(row.name, header, message, len(payload))

@@ -1,0 +1,1 @@
+"""Deployment files and the list of models, installed as package data."""

@@ -1,0 +1,31 @@
+"""What a keyframe can see: spheres against the pyramid of its view, which ends where its depth does."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from beamsplat.common.geometry.transforms import inverse, transform_points
+from beamsplat.common.raster.camera import RasterCamera
+from beamsplat.common.raster.layout import NEAR_M
+
+_PAD_PX = 4.0  # small splats are drawn larger than they are
+
+
+def sees(
+    camera: RasterCamera,
+    T_map_camera: np.ndarray,
+    reach_m: float,  # optical z
+    centres_map_m: np.ndarray,  # float64 [B, 3]
+    radii_m: np.ndarray,  # float64 [B]
+) -> np.ndarray:
+    """bool [B]: the sphere may touch the picture. Errs to the side of yes."""
+    x, y, z = transform_points(inverse(T_map_camera), centres_map_m.reshape(-1, 3)).T
+    seen = (z + radii_m > NEAR_M) & (z - radii_m < reach_m)
+    sides = (
+        (x, camera.cx_px, camera.fx_px), (-x, camera.width_px - 1 - camera.cx_px, camera.fx_px),
+        (y, camera.cy_px, camera.fy_px), (-y, camera.height_px - 1 - camera.cy_px, camera.fy_px),
+    )  # fmt: skip
+    for across, edge_px, focal_px in sides:
+        slope = (edge_px + 0.5 + _PAD_PX) / focal_px
+        seen &= across + z * slope > -radii_m * np.hypot(1.0, slope)
+    return seen

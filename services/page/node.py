@@ -1,0 +1,221 @@
+"""A page for any browser, phones included, that shows the running system. It only listens, but for the
+commands of who has the token; nobody ever waits for it."""
+
+from __future__ import annotations
+
+import json
+import logging
+import ssl
+from functools import partial
+from pathlib import Path
+from typing import Annotated
+from urllib.parse import quote
+
+from pydantic import Field, SecretStr, field_validator
+
+from beamsplat.common.config.deployment import NodeConfig
+from beamsplat.common.errors import UserError
+from beamsplat.common.messages import (
+    Correction,
+    ExternalPose,
+    FusedDepth,
+    Grid,
+    Health,
+    Image,
+    MapPreview,
+    MapStatus,
+    Odometry,
+    Rig,
+    Scan,
+    WheelOdometry,
+)
+from beamsplat.common.runtime.node import Ask, Input, Node, Outputs
+from beamsplat.services.page.pictures import Encoded, camera_picture, depth_picture, map_picture
+from beamsplat.services.page.server import Access, PageServer
+from beamsplat.services.page.view import View
+
+log = logging.getLogger(__name__)
+
+_SHORTEST_TOKEN = 12
+# Command -> what the node's supervisor is asked, and for how long. A swap's successor may load a model.
+_COMMANDS = {
+    "restart": ("restart", 10.0), "params": ("params", 10.0),
+    "swap": ("swap", 150.0), "cold swap": ("swap", 150.0),
+}  # fmt: skip
+Hz = Annotated[float, Field(gt=0.0, le=30.0)]
+
+
+class PageConfig(NodeConfig):
+    """Where the page is, and who may command. `bind = "0.0.0.0"` shows it to everybody who reaches this
+    machine; without a certificate pictures and token go over the network as they are."""
+
+    bind: str = "127.0.0.1"
+    port: Annotated[int, Field(ge=0, le=65535)] = 8420  # 0 = any free one
+    names: tuple[str, ...] = ()  # by which browsers ask for this machine, besides address and host name
+    token: SecretStr = SecretStr("")  # who has it may command; "" = nobody may
+    certificate: Path | None = None  # PEM; then the page is https
+    certificate_key: Path | None = None
+    picture_hz: Hz = 2.0
+    map_hz: Hz = 0.5
+    robot_hz: Hz = 5.0
+    widest_px: Annotated[int, Field(ge=64, le=4096)] = 640  # pictures are narrowed to it
+
+    @field_validator("token")
+    @classmethod
+    def _long_enough(cls, token: SecretStr) -> SecretStr:
+        if 0 < len(token.get_secret_value()) < _SHORTEST_TOKEN:
+            raise ValueError(f"a token needs at least {_SHORTEST_TOKEN} characters, or none")
+        return token
+
+
+class PageNode(Node):
+    """Keeps the newest of everything for the page."""
+
+    name = "page"
+    Config = PageConfig
+    config: PageConfig
+    inputs = (
+        Input("rig", "latched"),
+        Input("wheel/odometry", "latest"),
+        Input("lidar/scan", "latest"),
+        Input("camera/image", "latest"),
+        Input("external/pose", "latest"),
+        Input("localization/odometry", "latest"),
+        Input("localization/correction", "latched"),
+        Input("localization/grid", "latched"),
+        Input("fusion/depth", "latest"),
+        Input("mapping/preview", "latest"),
+        Input("mapping/status", "latest"),
+    )
+    _ask: Ask | None = None
+
+    def meet(self, ask: Ask) -> None:
+        self._ask = ask
+
+    def configure(self) -> None:
+        c = self.config
+        self._view = View(c.picture_hz, c.map_hz)
+        access = Access(c.token.get_secret_value(), frozenset(name.lower() for name in c.names))
+        tls = _tls(c.certificate, c.certificate_key)
+        self._server = PageServer(self._view, self._command, access, c.robot_hz)
+        try:
+            port = self._server.start(c.bind, c.port, tls)
+        except OSError as error:
+            raise UserError(
+                f"page: cannot listen at {c.bind}:{c.port} ({error.strerror}): choose another with "
+                "--set page.port=PORT (0 = any free one)"
+            ) from error
+        host = "127.0.0.1" if c.bind in ("0.0.0.0", "::") else c.bind
+        self._address = f"{'https' if tls else 'http'}://{f'[{host}]' if ':' in host else host}:{port}/"
+        self.detail = f"open {self._address}"
+        log.info("%s", self.detail)
+
+    def close(self) -> None:
+        if hasattr(self, "_server"):
+            self._server.close()
+
+    def _command(self, action: str, node: str, parameters: dict[str, str]) -> str:
+        """Carries out what somebody with the right asks for, in a thread of the server.
+
+        Raises:
+            ValueError: there is no such command or node, or it was refused.
+        """
+        if action == "check":
+            return "the token is right"
+        if action not in _COMMANDS or not node.replace("_", "").replace("-", "").isalnum():
+            raise ValueError(f"there is no command {action!r} for {node!r}; there are {', '.join(_COMMANDS)}")
+        if self._ask is None:
+            raise ValueError("no bus: nobody can be asked")
+        verb, patience_s = _COMMANDS[action]
+        asked = {}
+        if verb == "swap":
+            changes = [f"{option}={value}" for option, value in parameters.items()]
+            asked = {"set": quote(json.dumps(changes)), **({"cold": "1"} if action == "cold swap" else {})}
+        if verb != "params":
+            log.info("%s %s, by command of the page", action, node)
+        return " ".join(answer.text for answer in self._ask(node, verb, asked, patience_s))
+
+    # --- what is shown ---
+
+    def on_health(self, health: Health) -> None:
+        self._view.health(health)
+        if health.node == self.name:
+            self._server.check()
+            viewers, refused = len(self._server.audience), self._server.refused
+            self.detail = f"open {self._address}; {viewers} {'viewer' if viewers == 1 else 'viewers'}" + (
+                f"; {refused} commands refused for a wrong token" if refused else ""
+            )
+
+    def on_rig(self, rig: Rig) -> Outputs:
+        if rig.lidar is not None:
+            self._view.lidar(rig.lidar.T_body_lidar)
+        return iter(())
+
+    def on_wheel_odometry(self, m: WheelOdometry) -> Outputs:
+        self._view.pose("wheel", m.stamp_ns, m.T_odom_body)
+        return iter(())
+
+    def on_lidar_scan(self, m: Scan) -> Outputs:
+        self._view.scan(
+            m.stamp_ns, m.ranges_m, m.angle_min_rad, m.angle_increment_rad, (m.range_min_m, m.range_max_m)
+        )
+        return iter(())
+
+    def on_camera_image(self, m: Image) -> Outputs:
+        size_px = (m.width_px, m.height_px)
+        self._view.pictures["camera"].offer(
+            partial(camera_picture, m.data, m.encoding, size_px, m.step_bytes, self.config.widest_px)
+        )
+        return iter(())
+
+    def on_external_pose(self, m: ExternalPose) -> Outputs:
+        self._view.pose("external", m.stamp_ns, m.T_map_body)
+        return iter(())
+
+    def on_localization_odometry(self, m: Odometry) -> Outputs:
+        self._view.pose("localization", m.stamp_ns, m.T_odom_body)
+        self._view.word("localization", m.status, detail=m.detail, metric=m.metric)
+        return iter(())
+
+    def on_localization_correction(self, m: Correction) -> Outputs:
+        self._view.correction(m.T_map_odom)
+        return iter(())
+
+    def on_localization_grid(self, m: Grid) -> Outputs:
+        self._view.pictures["map"].offer(partial(map_picture, m.occupancy, m.resolution_m, m.origin_m))
+        return iter(())
+
+    def on_fusion_depth(self, m: FusedDepth) -> Outputs:
+        self._view.word(
+            "fusion", "ok" if m.status == "ok" else "refused", detail=m.status.removeprefix("ok"),
+            scale=m.scale, scale_sigma=m.scale_sigma, inlier_share=m.inlier_share, residual_m=m.residual_m,
+        )  # fmt: skip
+        self._view.scale(m.scale, m.scale_sigma)
+        if m.depth_m.size:
+            self._view.pictures["depth"].offer(partial(depth_picture, m.depth_m, self.config.widest_px))
+        return iter(())
+
+    def on_mapping_preview(self, m: MapPreview) -> Outputs:
+        self._view.pictures["render"].offer(lambda: Encoded(m.render.tobytes(), "image/jpeg", {}))
+        return iter(())
+
+    def on_mapping_status(self, m: MapStatus) -> Outputs:
+        self._view.word(
+            "mapping", "ok" if m.status == "ok" else "refused", detail=m.status.removeprefix("ok"),
+            keyframes=m.keyframes, gaussians=m.gaussians, psnr_db=m.psnr_db, depth_error_m=m.depth_error_m,
+        )  # fmt: skip
+        return iter(())
+
+
+def _tls(certificate: Path | None, key: Path | None) -> ssl.SSLContext | None:
+    if certificate is None and key is None:
+        return None
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    try:
+        context.load_cert_chain(str(certificate), None if key is None else str(key))
+    except (OSError, ssl.SSLError) as error:
+        raise UserError(
+            f"page: certificate = {certificate}, certificate_key = {key}: cannot be used ({error}): "
+            "both are PEM files, made for each other"
+        ) from error
+    return context

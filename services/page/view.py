@@ -1,0 +1,205 @@
+"""What the page knows of the running system, as the JSON that goes to browsers.
+
+The node's thread tells; the server's thread asks.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections import deque
+from typing import Any
+
+import numpy as np
+
+from beamsplat.common.geometry.transforms import transform_points, yaw_of
+from beamsplat.common.runtime.health import HealthBook, NodeRecord
+from beamsplat.services.monitor.tracks import Path, Poses, scan_points
+from beamsplat.services.page.pictures import Picture
+
+# Who is believed about the robot's pose, best first.
+SOURCES = ("localization", "external", "wheel")
+PICTURES = ("camera", "depth", "render", "map")
+_PATH_POINTS, _PATH_STEP_M = 400, 0.05
+_SCAN_POINTS = 360
+_SWEEPS = 30  # wait for the pose of their time
+_SCALES = 120  # seconds of the chart
+_LOG_LINES = 60
+
+
+class View:
+    """The newest of everything; every method may be called from any thread."""
+
+    def __init__(self, picture_hz: float, map_hz: float) -> None:
+        self._lock = threading.Lock()
+        self._book = HealthBook()
+        self._silent: set[str] = set()
+        self._log: deque[dict[str, Any]] = deque(maxlen=_LOG_LINES)
+        self._words: dict[str, dict[str, Any]] = {}
+        self._scales: deque[tuple[float, float, float]] = deque(maxlen=_SCALES)
+        self._T_body_lidar = np.eye(4)
+        self._T_map_odom = np.eye(4)
+        self._leader = len(SOURCES)
+        self._poses = Poses()  # of the leader, in the map
+        self._posed = 0.0
+        self._path = Path(_PATH_POINTS, _PATH_STEP_M)
+        self._sweeps: deque[tuple[int, np.ndarray]] = deque(maxlen=_SWEEPS)
+        self.pictures = {name: Picture(map_hz if name == "map" else picture_hz) for name in PICTURES}
+
+    # --- told by the node ---
+
+    def health(self, health: Any) -> None:
+        """What a node says of itself (a `Health`)."""
+        with self._lock:
+            before = self._book.records.get(health.node)
+            instance, state = (before.health.instance, before.health.state) if before else ("", "")
+            self._book.take(health)
+            self._silent.discard(health.node)
+            if before and instance != health.instance:
+                self._say(f"{health.node} was started again")
+            if state != health.state:
+                self._say(f"{health.node} is {health.state}")
+
+    def word(self, subject: str, status: str, **facts: Any) -> None:
+        """What a service says of its newest result; a change is logged."""
+        with self._lock:
+            before = self._words.get(subject, {}).get("status")
+            self._words[subject] = {"status": status, "at": time.monotonic(), **facts}
+            if before != status:
+                self._say(f"{subject}: {status}")
+
+    def scale(self, value: float, sigma: float) -> None:
+        """The depth's scale with its standard error; one a second is kept."""
+        now = time.monotonic()
+        with self._lock:
+            if math.isfinite(value) and (not self._scales or now - self._scales[-1][0] >= 1.0):
+                self._scales.append((now, value, sigma))
+
+    def lidar(self, T_body_lidar: np.ndarray) -> None:
+        """Where the lidar sits: [4, 4]."""
+        self._T_body_lidar = T_body_lidar
+
+    def correction(self, T_map_odom: np.ndarray) -> None:
+        """Where the smooth frame lies in the map: [4, 4]."""
+        self._T_map_odom = T_map_odom
+
+    def pose(self, source: str, stamp_ns: int, T_source_body: np.ndarray) -> None:
+        """The robot's pose [4, 4] by one of `SOURCES`: localization in odom, external in map, wheels in their
+        own frame, which stands for the map where nobody else knows. A worse source's says nothing then."""
+        rank = SOURCES.index(source)
+        with self._lock:
+            if rank > self._leader:
+                return
+            if rank < self._leader:
+                self._leader, self._poses = rank, Poses()
+            T_map_body = self._T_map_odom @ T_source_body if source == "localization" else T_source_body
+            self._poses.add(stamp_ns, T_map_body)
+            self._posed = time.monotonic()
+            self._path.add(T_map_body[:3, 3])
+
+    def scan(
+        self,
+        stamp_ns: int,
+        ranges_m: np.ndarray,  # float32 [N]
+        angle_min_rad: float,
+        angle_increment_rad: float,
+        range_limits_m: tuple[float, float],
+    ) -> None:
+        """A sweep of the lidar: laid on the map where the robot was then, as soon as that is known."""
+        points, _ = scan_points(ranges_m, angle_min_rad, angle_increment_rad, range_limits_m)
+        points = points[:: max(-(-len(points) // _SCAN_POINTS), 1)]
+        with self._lock:
+            self._sweeps.append((stamp_ns, transform_points(self._T_body_lidar, points)))
+
+    def _scan_map_m(self) -> np.ndarray:
+        """The newest sweep [N, 3] whose pose is known."""
+        newest_ns, _ = self._poses.newest
+        for stamp_ns, points_body in reversed(self._sweeps):
+            if stamp_ns <= newest_ns and (T_map_body := self._poses.at(stamp_ns)) is not None:
+                return transform_points(T_map_body, points_body)
+        return np.zeros((0, 3))
+
+    def _say(self, text: str) -> None:
+        self._log.append({"at": time.time(), "text": text})
+
+    # --- asked by the server ---
+
+    def status(self) -> dict[str, Any]:
+        """Nodes, links, what the services say, and what has happened."""
+        now = time.monotonic()
+        with self._lock:
+            for name, record in self._book.records.items():
+                if record.silent_s(now) and name not in self._silent:
+                    self._silent.add(name)
+                    self._say(f"{name} is silent")
+            return {
+                "nodes": [_node(n, r, now) for n, r in sorted(self._book.records.items())],
+                "links": [_link(flow) for flow in self._book.flows()],
+                "words": {
+                    subject: {"age_s": round(now - word["at"], 1), **_plain(word)}
+                    for subject, word in self._words.items()
+                },
+                "pictures": {
+                    name: {"age_s": round(now - picture.came, 1), "fault": picture.fault}
+                    for name, picture in self.pictures.items()
+                    if picture.number
+                },
+                "log": list(self._log),
+            }
+
+    def scales(self) -> list[list[float | None]]:
+        """[[age s, scale, standard error], ...], oldest first."""
+        now = time.monotonic()
+        with self._lock:
+            return [[round(now - at, 1), _number(v, 5), _number(s, 5)] for at, v, s in self._scales]
+
+    def robot(self) -> dict[str, Any] | None:
+        """Pose in the map, and the last sweep as x, y, x, y ... in cm; None before the first."""
+        with self._lock:
+            if not self._poses:
+                return None
+            T = self._poses.newest[1]
+            return {
+                "source": SOURCES[self._leader], "age_s": round(time.monotonic() - self._posed, 1),
+                "x_m": round(float(T[0, 3]), 3), "y_m": round(float(T[1, 3]), 3),
+                "yaw_rad": round(float(yaw_of(T)), 4), "scan_cm": _centimetres(self._scan_map_m()),
+            }  # fmt: skip
+
+    def path(self) -> list[int]:
+        """Where the robot has been: x, y, x, y ... in cm."""
+        with self._lock:
+            return _centimetres(self._path.points_m)
+
+
+def _centimetres(points_m: np.ndarray) -> list[int]:
+    return np.round(points_m[:, :2] * 100.0).astype(int).ravel().tolist()
+
+
+def _node(name: str, record: NodeRecord, now: float) -> dict[str, Any]:
+    health, totals, silent_s = record.health, record.totals(), record.silent_s(now)
+    return {
+        "name": name, "state": "silent" if silent_s else health.state, "starts": record.starts,
+        "silent_s": round(silent_s or 0.0), "detail": health.detail,
+        "in_hz": round(totals.in_hz, 1), "out_hz": round(totals.out_hz, 1), "age_ms": round(totals.age_ms, 1),
+        "step_ms": round(health.step_p50_ms, 1), "p95_ms": round(health.step_p95_ms, 1),
+        "dropped": totals.dropped, "lost": totals.lost, "bad": totals.bad,
+        "rss_mb": round(health.rss_mb), "cpu_percent": round(health.cpu_percent),
+    }  # fmt: skip
+
+
+def _link(flow: Any) -> dict[str, Any]:
+    return {
+        "topic": flow.topic, "from": flow.producer, "hz": round(flow.hz, 1), "nominal_hz": flow.nominal_hz,
+        "kb_s": round(flow.bytes_s / 1e3, 1), "sent": flow.sent,
+        "to": [{**taker._asdict(), "age_ms": round(taker.age_ms, 1)} for taker in flow.takers],
+    }  # fmt: skip
+
+
+def _plain(facts: dict[str, Any]) -> dict[str, Any]:
+    return {k: _number(v, 5) if isinstance(v, float) else v for k, v in facts.items() if k != "at"}
+
+
+def _number(value: float, digits: int) -> float | None:
+    """JSON knows neither NaN nor infinity."""
+    return round(value, digits) if math.isfinite(value) else None

@@ -1,0 +1,101 @@
+"""What ROS 2 gets back, as ROS messages: pose, transforms, map, cloud. Arrays in, ROS messages out."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Any
+
+import numpy as np
+
+from beamsplat.common.geometry.transforms import inverse, transform_points
+from beamsplat.common.recording import ros_types as ros
+
+_KEPT = 500  # wheel poses: several seconds
+_APART_NS = 100_000_000  # a wheel pose further from the scan does not say where the odometry was
+
+POSE, TF, MAP, CLOUD = (
+    "geometry_msgs/msg/PoseStamped",
+    "tf2_msgs/msg/TFMessage",
+    "nav_msgs/msg/OccupancyGrid",
+    "sensor_msgs/msg/PointCloud2",
+)
+
+
+class Transforms:
+    """The tree that ROS expects: map -> odom -> body, where the robot's own odometry owns odom -> body."""
+
+    def __init__(self, map_frame: str, odom_frame: str, body_frame: str) -> None:
+        self._frames = map_frame, odom_frame, body_frame
+        self._wheels: deque[tuple[int, np.ndarray]] = deque(maxlen=_KEPT)
+        self.T_map_odom = np.eye(4)  # our own smooth frame's
+
+    def add_wheels(self, stamp_ns: int, T_odom_body: np.ndarray) -> None:
+        """A pose of the robot's own odometry."""
+        self._wheels.append((stamp_ns, T_odom_body))
+
+    def pose(self, stamp_ns: int, T_odom_body: np.ndarray) -> Any:
+        """PoseStamped of the body in the map, from our smooth pose [4, 4]."""
+        header = ros.header(stamp_ns, self._frames[0])
+        return ros.new(POSE, header=header, pose=ros.pose(self.T_map_odom @ T_odom_body))
+
+    def tf(self, stamp_ns: int, T_odom_body: np.ndarray) -> Any | None:
+        """TFMessage for our smooth pose [4, 4]; None if the robot's odometry has no pose of that time.
+
+        A robot with odometry says odom -> body itself; then map -> odom is what puts the body where we
+        have it, as nav2 expects of a localization (REP 105).
+        """
+        map_frame, odom_frame, body_frame = self._frames
+        if not self._wheels:
+            return ros.tf_message(
+                [
+                    ros.tf(stamp_ns, map_frame, odom_frame, self.T_map_odom),
+                    ros.tf(stamp_ns, odom_frame, body_frame, T_odom_body),
+                ]
+            )
+        wheel_ns, T_wheels_body = min(self._wheels, key=lambda entry: abs(entry[0] - stamp_ns))
+        if abs(wheel_ns - stamp_ns) > _APART_NS:
+            return None
+        T_map_wheels = self.T_map_odom @ T_odom_body @ inverse(T_wheels_body)
+        return ros.tf_message([ros.tf(stamp_ns, map_frame, odom_frame, T_map_wheels)])
+
+
+def occupancy_grid(
+    stamp_ns: int,
+    frame: str,
+    resolution_m: float,
+    origin_m: np.ndarray,  # float64 [2]
+    occupancy: np.ndarray,  # int8 [H, W]
+) -> Any:
+    """nav_msgs/OccupancyGrid."""
+    rows, columns = occupancy.shape
+    T = np.eye(4)
+    T[:2, 3] = origin_m
+    info = ros.new(
+        "nav_msgs/msg/MapMetaData",
+        map_load_time=ros.time_of(stamp_ns), resolution=float(resolution_m), width=columns, height=rows,
+        origin=ros.pose(T),
+    )  # fmt: skip
+    return ros.new(MAP, header=ros.header(stamp_ns, frame), info=info, data=occupancy.ravel())
+
+
+def point_cloud(
+    stamp_ns: int,
+    frame: str,
+    points_m: np.ndarray,  # float32 [N, 3]
+    colours: np.ndarray,  # uint8 [N, 3], RGB
+    T_frame_points: np.ndarray,  # float64 [4, 4]
+) -> Any:
+    """sensor_msgs/PointCloud2 with x, y, z and rgb packed into a float32, as RViz and PCL read it."""
+    packed = np.zeros(len(points_m), [("xyz", "<f4", 3), ("rgb", "<u4")])
+    packed["xyz"] = transform_points(T_frame_points, points_m.astype(np.float64))
+    red, green, blue = colours.astype(np.uint32).T
+    packed["rgb"] = red << 16 | green << 8 | blue
+    fields = [
+        ros.new("sensor_msgs/msg/PointField", name=name, offset=4 * i, datatype=7, count=1)
+        for i, name in enumerate(("x", "y", "z", "rgb"))
+    ]
+    return ros.new(
+        CLOUD,
+        header=ros.header(stamp_ns, frame), height=1, width=len(packed), fields=fields, is_bigendian=False,
+        point_step=16, row_step=16 * len(packed), data=packed.view(np.uint8).reshape(-1), is_dense=True,
+    )  # fmt: skip

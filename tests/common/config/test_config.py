@@ -1,0 +1,71 @@
+"""Deployment files are strict: a wrong one is one sentence naming file, field and value."""
+
+import contextlib
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from beamsplat.common.config.base import parse
+from beamsplat.common.config.deployment import NodeConfig, load_deployment
+from beamsplat.common.errors import UserError
+
+
+def _file(tmp_path, text):
+    path = tmp_path / "robot.toml"
+    path.write_text(text)
+    return path
+
+
+def test_a_deployment_with_overrides(tmp_path):
+    path = _file(
+        tmp_path, 'robot = "r2"\n[nodes.replay]\ndata = "bag"\n[router]\nlisten = ["tcp/127.0.0.1:1"]\n'
+    )
+    deployment = load_deployment(
+        path, ("replay.data=other bag", "replay.rate=2.5", "rate=4", 'router.listen=["tcp/[::1]:9"]')
+    )
+    assert deployment.robot == "r2"
+    assert deployment.rate == 4.0
+    assert deployment.router.listen == ("tcp/[::1]:9",)
+    assert deployment.nodes["replay"] == {"data": "other bag", "rate": 2.5}
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("robot = ", "not a TOML file"),
+        ('robott = "x"', r"unknown option 'robott' \(there are: .*robot"),
+        ('robot = "A B"', "robot = 'A B'"),
+        ("rate = -1", r"rate = -1: .*greater than or equal to 0"),
+        ("[nodes]\nreplay = 3", r"nodes.replay = 3"),
+    ],
+)
+def test_wrong_files_are_refused_with_field_and_value(tmp_path, text, complaint):
+    with pytest.raises(UserError, match=complaint) as caught:
+        load_deployment(_file(tmp_path, text))
+    assert "robot.toml" in str(caught.value)
+
+
+def test_no_file(tmp_path):
+    with pytest.raises(UserError, match=r"none\.toml: no such deployment file"):
+        load_deployment(tmp_path / "none.toml")
+
+
+@pytest.mark.parametrize("override", ["replay.data", "=3", "a..b=1", "robot.x=1"])
+def test_wrong_overrides_are_refused(tmp_path, override):
+    with pytest.raises(UserError, match="--set"):
+        load_deployment(_file(tmp_path, 'robot = "r"'), (override,))
+
+
+@given(st.text(max_size=40))
+def test_any_override_text_is_taken_or_refused_cleanly(tmp_path_factory, text):
+    path = _file(tmp_path_factory.mktemp("c"), "")
+    with contextlib.suppress(UserError):
+        load_deployment(path, (text,))
+
+
+def test_node_options_are_strict():
+    with pytest.raises(UserError, match="node 'x': unknown option 'stepcost'"):
+        parse(NodeConfig, {"stepcost": 1}, "node 'x'")
+    with pytest.raises(UserError, match="threads = 0"):
+        parse(NodeConfig, {"threads": 0}, "node 'x'")

@@ -1,0 +1,223 @@
+"""`beamsplat export` and `beamsplat render` on a session of the synthetic room."""
+
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+import trimesh
+import yaml
+from plyfile import PlyData
+from typer.testing import CliRunner
+
+from beamsplat.common.errors import UserError
+from beamsplat.common.geometry.trajectory import Trajectory, write_tum
+from beamsplat.common.geometry.transforms import inverse, make_transform
+from beamsplat.common.mapfiles.film import along, drive, looking, orbit, write_film
+from beamsplat.common.mapfiles.session import SessionFolder
+from beamsplat.common.mapfiles.state import store_of, views_of
+from beamsplat.common.raster.rasterizer import Rasterizer
+from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
+from beamsplat.services.localization.lidar2d.slam import LidarSlam
+from beamsplat.tools.cli.main import app
+from tests.services.localization.world import Drive, Lidar
+from tests.services.mapping import room_drive as r
+from tests.services.mapping.session.maps import feed, make_node
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("export") / "room"
+    node = make_node(folder, half_steps=12, full_steps=8)
+    feed(node, range(8))
+    list(node.drain())
+    node.close()
+    return folder
+
+
+def run(*words):
+    """The command's output; its UserError is raised here."""
+    result = CliRunner().invoke(app, list(map(str, words)))
+    if result.exception is not None and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    assert result.exit_code == 0, result.output
+    return result.stdout
+
+
+def test_every_format_is_written_where_it_is_asked_for(session, tmp_path):
+    params = SessionFolder(session).read_state()["store_params"]
+    for to, name in (("ply", "a.ply"), ("gltf", "b.glb"), ("spz", "c.spz"), ("points", "d.ply")):
+        assert str(tmp_path / name) in run("export", session, "--to", to, "--out", tmp_path / name)
+    assert PlyData.read(tmp_path / "a.ply")["vertex"].count == params.shape[1]
+    (cloud,) = trimesh.load_scene(tmp_path / "b.glb").dump()
+    np.testing.assert_allclose(cloud.vertices[:, 1], params[2], atol=1e-3)
+    assert (tmp_path / "c.spz").stat().st_size < 0.3 * (tmp_path / "a.ply").stat().st_size
+    points = PlyData.read(tmp_path / "d.ply")["vertex"]
+    assert points.count > 1000
+
+
+def test_points_and_mesh_lie_on_the_room(session, tmp_path):
+    """Against the exact depth of a keyframe's view."""
+    run("export", session, "--to", "points", "--out", tmp_path / "points.ply")
+    run("export", session, "--to", "mesh", "--voxel-m", "0.06", "--out", tmp_path / "mesh.ply")
+    T_camera_map = inverse(r.T_map_body(3) @ r.T_BODY_CAMERA)
+    for name in ("points.ply", "mesh.ply"):
+        read = trimesh.load(tmp_path / name, process=False)
+        p = np.asarray(read.vertices) @ T_camera_map[:3, :3].T + T_camera_map[:3, 3]
+        p = p[p[:, 2] > 0.3]
+        u = np.round(r.FOCAL * p[:, 0] / p[:, 2] + 79.5).astype(int)
+        v = np.round(r.FOCAL * p[:, 1] / p[:, 2] + 59.5).astype(int)
+        inside = (u >= 0) & (v >= 0) & (u < r.WIDTH) & (v < r.HEIGHT)
+        off = p[inside, 2] - r.shot(3)[1][v[inside], u[inside]]
+        assert inside.sum() > 500
+        assert np.nanmedian(np.abs(off)) < 0.15  # of 4 m, after a hundred steps
+    assert len(read.faces) > 1000
+
+
+def test_an_export_while_a_mapper_saves_is_of_a_whole_state(session, tmp_path):
+    shutil.copytree(session, tmp_path / "s")
+    node = make_node(tmp_path / "s", session_every_s=1.0)
+    for number in (8, 9):
+        feed(node, [number])
+        run("export", tmp_path / "s", "--to", "ply", "--out", tmp_path / "now.ply")
+        count = SessionFolder(tmp_path / "s").manifest()["gaussians"]
+        assert PlyData.read(tmp_path / "now.ply")["vertex"].count == count
+    node.close()
+
+
+def served(folder, name):
+    """Occupancy int [rows from below, columns] by map_server's rules for trinary maps, and the YAML."""
+    table = yaml.safe_load((folder / f"{name}.yaml").read_text())
+    assert set(table) == {"image", "mode", "resolution", "origin", "negate", "occupied_thresh", "free_thresh"}
+    assert table["mode"] == "trinary"
+    assert table["negate"] == 0
+    assert len(table["origin"]) == 3
+    pixels = cv2.imread(str(folder / table["image"]), cv2.IMREAD_UNCHANGED)
+    assert pixels.dtype == np.uint8
+    shade = (255.0 - pixels[::-1].astype(float)) / 255.0
+    occupied, free = shade > table["occupied_thresh"], shade < table["free_thresh"]
+    return np.where(occupied, 100, np.where(free, 0, -1)), table
+
+
+def test_nav2_without_a_robots_half_is_what_the_camera_saw(session, tmp_path):
+    assert "no lidar layer" in run("export", session, "--to", "nav2", "--out", tmp_path / "nav2")
+    values, table = served(tmp_path / "nav2", "map")
+    assert table["resolution"] == 0.05
+    assert (values == 100).sum() > 20
+    np.testing.assert_array_equal(values, served(tmp_path / "nav2", "camera")[0])
+
+
+@pytest.mark.slow
+def test_nav2_layers_lie_on_each_other(session, tmp_path):
+    """A lidar map of a flat and, wherever the room's keyframes put it, the camera's layer on the same cells."""
+    shutil.copytree(session, tmp_path / "s")
+    lidar, path, slam = Lidar(), Drive(), LidarSlam(LidarSlamSettings(), np.eye(4))
+    angle_min, increment, dt, least, most = lidar.arguments()
+    for number in range(60):
+        slam.add_scan(number * 10**8, lidar.scan(path, number * 0.1), angle_min, increment, dt, least, most)
+    slam.finish()
+    slam.save(tmp_path / "s" / "robot")
+    run("export", tmp_path / "s", "--to", "nav2")
+    (both, a), (wall, b), (seen, c) = (served(tmp_path / "s" / "nav2", n) for n in ("map", "lidar", "camera"))
+    assert a["origin"] == b["origin"] == c["origin"]
+    assert both.shape == wall.shape == seen.shape
+    assert np.all(both[wall == 100] == 100)
+    assert np.all(both[seen == 100] == 100)
+    assert np.all(both[(wall == 0) & (seen != 100)] == 0)
+    assert (wall == 100).sum() > 100
+    assert (seen == 100).sum() > 20
+
+
+def test_wrong_words_are_answered_with_the_right_ones(session, tmp_path):
+    with pytest.raises(UserError, match="there are ply, gltf, spz"):
+        run("export", session, "--to", "obj")
+    with pytest.raises(UserError, match=r"ending in \.glb"):
+        run("export", session, "--to", "gltf", "--out", tmp_path / "map.gltf")
+    with pytest.raises(UserError, match=r"million voxels of 0\.005 m are too many"):
+        run("export", session, "--to", "mesh", "--voxel-m", "0.005", "--out", tmp_path / "m.ply")
+    with pytest.raises(UserError, match=r"ends in \.mp4 or \.png"):
+        run("render", session, "--path", "drive", "--out", tmp_path / "film.gif")
+    with pytest.raises(UserError, match="cannot be read as a TUM trajectory"):
+        run("render", session, "--path", tmp_path / "nothing", "--out", tmp_path / "film.mp4")
+    with pytest.raises(UserError, match="a session is a folder"):
+        run("export", tmp_path, "--to", "ply")
+
+
+# --- pictures ---
+
+
+def test_a_drive_shows_what_the_keyframes_saw(session, tmp_path):
+    out = tmp_path / "frames" / "drive.png"
+    assert "3 pictures of 160x120" in run(
+        "render", session, "--path", "drive", "--seconds", "1", "--fps", "3", "--out", out
+    )
+    first = cv2.imread(str(out.with_name("drive-0001.png")))[..., ::-1].astype(float)
+    assert np.corrcoef(first.ravel(), r.shot(0)[0].astype(float).ravel())[0, 1] > 0.8
+
+
+def test_a_video_has_its_pictures(session, tmp_path):
+    run("render", session, "--path", "orbit", "--seconds", "0.5", "--fps", "10", "--width", "96",
+        "--out", tmp_path / "orbit.mp4")  # fmt: skip
+    video = cv2.VideoCapture(str(tmp_path / "orbit.mp4"))
+    frames = []
+    while (frame := video.read())[0]:
+        frames.append(frame[1])
+    assert len(frames) == 5
+    assert frames[0].shape == (72, 96, 3)
+    assert np.abs(frames[0].astype(float) - frames[2]).mean() > 1.0
+    assert video.get(cv2.CAP_PROP_FPS) == pytest.approx(10.0)
+
+
+def test_a_path_of_body_poses_is_followed_with_the_robots_camera(session, tmp_path):
+    stamps = np.array([0, 10**9])
+    write_tum(tmp_path / "path.tum", Trajectory(stamps, np.stack([r.T_map_body(2), r.T_map_body(2)])))
+    run(
+        "render",
+        session,
+        "--path",
+        tmp_path / "path.tum",
+        "--seconds",
+        "0.1",
+        "--fps",
+        "10",
+        "--out",
+        tmp_path / "p.png",
+    )
+    arrays = SessionFolder(session).read_state()
+    store = store_of(arrays)
+    T_camera_map = inverse(r.T_map_body(2) @ r.T_BODY_CAMERA)
+    image = Rasterizer().render(store.params, store.count, r.CAMERA, T_camera_map).image[:3]
+    shown = cv2.imread(str(tmp_path / "p.png"))[..., ::-1].transpose(2, 0, 1) / 255.0
+    np.testing.assert_allclose(shown, np.clip(image, 0, 1), atol=2 / 255)
+
+
+def test_cameras_look_where_they_should(session):
+    """Upright: x right, y down, z forward; an orbit looks at the map from outside and above."""
+    T = looking(np.array([0.0, -2.0, 1.0]), np.array([0.0, 0.0, 1.0]))
+    np.testing.assert_allclose(T[:3, :3] @ [0.0, 0.0, 1.0], [0.0, 1.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(T[:3, :3] @ [1.0, 0.0, 0.0], [1.0, 0.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(T[:3, :3] @ [0.0, 1.0, 0.0], [0.0, 0.0, -1.0], atol=1e-12)
+    assert np.isfinite(looking(np.array([0.0, 0.0, 5.0]), np.zeros(3))).all()
+    arrays = SessionFolder(session).read_state()
+    store, views = store_of(arrays), views_of(arrays)
+    poses = orbit(store, 0.4, 6)
+    middle = np.median(store.params[:3, : store.count], axis=1)
+    for T in poses:
+        p = inverse(T)[:3, :3] @ middle + inverse(T)[:3, 3]
+        assert p[2] > 0.0
+        assert abs(p[0] / p[2]) < 0.5
+        assert T[2, 3] > middle[2]
+    path = drive([view.T_map_camera for view in views], 15)
+    np.testing.assert_allclose(path[0], views[0].T_map_camera, atol=1e-9)
+    np.testing.assert_allclose(path[-1], views[-1].T_map_camera, atol=1e-9)
+    assert len(drive([np.eye(4)], 3)) == 3
+    track = Trajectory(
+        np.array([0, 10]), np.stack([np.eye(4), make_transform(np.eye(3), np.array([1.0, 0, 0]))])
+    )
+    assert [T[0, 3] for T in along(track, np.eye(4), 3)] == pytest.approx([0.0, 0.5, 1.0])
+
+
+def test_one_picture_is_one_file(tmp_path):
+    written = write_film(tmp_path / "one.png", [np.zeros((8, 8, 3), np.uint8)], 1.0, 1)
+    assert written == [tmp_path / "one.png"]
+    assert cv2.imread(str(written[0])).shape == (8, 8, 3)

@@ -1,0 +1,181 @@
+"""Messages survive the wire exactly; whatever else comes in is refused, never crashes."""
+
+import random
+from pathlib import Path
+
+import msgpack
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from beamsplat.common.messages import MESSAGES, Correction, Image, Rig, Scan
+from beamsplat.common.messages.codec import decode, encode, schema_of
+from beamsplat.common.messages.header import DecodeError, Header
+from tests.common.samples import assert_equal, sample_messages
+
+SAMPLES = sample_messages()
+GOLDEN = Path(__file__).parent / "golden"
+
+
+def test_samples_cover_every_message():
+    assert {type(m) for m in SAMPLES} == set(MESSAGES.values())
+
+
+@pytest.mark.parametrize("message", SAMPLES, ids=lambda m: m.schema_name())
+def test_round_trip(message):
+    payload = encode(message)
+    decoded = decode(schema_of(message), payload)
+    assert_equal(message, decoded)
+    assert encode(decoded) == payload
+
+
+@pytest.mark.parametrize("message", SAMPLES, ids=lambda m: m.schema_name())
+def test_golden_files_of_released_versions_still_open(message):
+    files = sorted(GOLDEN.glob(f"{message.schema_name()}-*.bin"))
+    assert files, (
+        f"no golden file of {message.schema_name()}: run python -m tests.common.messages.write_golden"
+    )
+    for file in files:
+        version = file.stem.split("-")[1]
+        assert_equal(message, decode(f"{message.schema_name()}/{version}", file.read_bytes()))
+
+
+def test_decoded_arrays_are_read_only_views_of_the_payload():
+    message = Image(
+        stamp_ns=1, width_px=10, height_px=10, encoding="mono8", data=np.arange(100, dtype=np.uint8)
+    )
+    payload = encode(message)
+    data = decode("Image/1.0", payload).data
+    assert not data.flags.writeable
+    assert np.shares_memory(data, np.frombuffer(payload, np.uint8))
+    assert (data.__array_interface__["data"][0] - np.frombuffer(payload, np.uint8).ctypes.data) % 64 == 0
+
+
+@given(
+    ranges=hnp.arrays(np.float32, st.integers(0, 300), elements=st.floats(width=32)),
+    stamp=st.integers(0, 2**63 - 1),
+    angle=st.floats(-10, 10),
+)
+@settings(max_examples=100, deadline=None)
+def test_any_scan_round_trips(ranges, stamp, angle):
+    scan = Scan(
+        stamp_ns=stamp, angle_min_rad=angle, angle_increment_rad=0.01, time_increment_s=0.0, scan_time_s=0.1,
+        range_min_m=0.1, range_max_m=10.0, ranges_m=ranges,
+    )  # fmt: skip
+    assert_equal(scan, decode("Scan/1.0", encode(scan)))
+
+
+def test_a_newer_minor_version_decodes_without_the_fields_we_do_not_know():
+    payload = encode(SAMPLES[6])
+    length = int.from_bytes(payload[:4], "little")
+    head = msgpack.unpackb(payload[4 : 4 + length], ext_hook=msgpack.ExtType, strict_map_key=False)
+    head["future"] = 7
+    longer = msgpack.packb(head)
+    start, old_start = -(-(4 + len(longer)) // 64) * 64, -(-(4 + length) // 64) * 64
+    newer = len(longer).to_bytes(4, "little") + longer
+    newer += bytes(start - len(newer)) + payload[old_start:]
+    assert_equal(decode("Correction/1.9", newer), SAMPLES[6])
+    with pytest.raises(DecodeError, match="future"):
+        decode("Correction/1.0", newer)
+    with pytest.raises(DecodeError, match=r"version 2\.0.*speaks 1\.0"):
+        decode("Correction/2.0", newer)
+
+
+def test_a_newer_minor_version_may_have_grown_inside_a_part():
+    rig = next(m for m in SAMPLES if isinstance(m, Rig) and m.lidar is not None)
+    payload = encode(rig)
+    length = int.from_bytes(payload[:4], "little")
+    head = msgpack.unpackb(payload[4 : 4 + length], ext_hook=msgpack.ExtType, strict_map_key=False)
+    head["lidar"]["future"] = 7
+    longer = msgpack.packb(head)
+    start, old_start = -(-(4 + len(longer)) // 64) * 64, -(-(4 + length) // 64) * 64
+    newer = len(longer).to_bytes(4, "little") + longer
+    newer += bytes(start - len(newer)) + payload[old_start:]
+    assert_equal(decode("Rig/1.9", newer), rig)
+    with pytest.raises(DecodeError, match=r"lidar\.future"):
+        decode("Rig/1.0", newer)
+
+
+def _mutations(payload: bytes, rng: random.Random) -> bytes:
+    data = bytearray(payload)
+    kind = rng.randrange(5)
+    if kind == 0:
+        return bytes(data[: rng.randrange(len(data) + 1)])
+    if kind == 1:
+        return rng.randbytes(rng.randrange(200))
+    if kind == 2:
+        at = rng.randrange(len(data))
+        return bytes(data[:at]) + rng.randbytes(rng.randrange(1, 9)) + bytes(data[at:])
+    for _ in range(rng.randrange(1, 8)):  # flip bytes, mostly in the head, where they hurt
+        at = rng.randrange(min(len(data), 300))
+        data[at] = rng.randrange(256)
+    return bytes(data)
+
+
+def test_100_000_broken_payloads_raise_nothing_but_decode_errors():
+    rng = random.Random(1)
+    payloads = [(schema_of(m), encode(m)) for m in SAMPLES]
+    refused = 0
+    per_type = 100_000 // len(payloads) + 1
+    for schema, payload in payloads:
+        for _ in range(per_type):
+            broken = _mutations(payload, rng)
+            try:
+                message = decode(schema, broken)
+            except DecodeError:
+                refused += 1
+            else:  # some mutations hit nothing but array contents or padding: still a whole message
+                assert type(message) is MESSAGES[schema.partition("/")[0]]
+    assert refused > 0.5 * per_type * len(payloads)
+
+
+@given(st.text(max_size=30), st.binary(max_size=300))
+@settings(max_examples=300, deadline=None)
+def test_random_schemas_and_bytes_raise_nothing_but_decode_errors(schema, payload):
+    with pytest.raises(DecodeError):
+        decode(schema, payload)
+
+
+@given(st.binary(max_size=120))
+@settings(max_examples=300, deadline=None)
+def test_random_headers_raise_nothing_but_decode_errors(data):
+    with pytest.raises(DecodeError):
+        Header.unpack(data)
+
+
+@given(
+    st.builds(
+        Header,
+        stamp_ns=st.integers(0, 2**63 - 1), publish_ns=st.integers(0, 2**63 - 1),
+        clock_id=st.integers(0, 2**64 - 1), sequence=st.integers(0, 2**64 - 1), epoch=st.integers(0, 2**32 - 1),
+        producer=st.text(max_size=40), instance=st.binary(min_size=8, max_size=8).map(bytes.hex),
+    )
+)  # fmt: skip
+@settings(deadline=None)
+def test_header_round_trip(header):
+    assert Header.unpack(header.pack()) == header
+
+
+def test_age_is_known_only_on_the_same_clock():
+    header = Header(0, 1000, 42, 0, 0, "a", "00" * 8)
+    assert header.age_ns(1500, 42) == 500
+    assert header.age_ns(1500, 43) is None
+
+
+@pytest.mark.parametrize(
+    ("change", "complaint"),
+    [
+        ({"T_map_odom": np.eye(3)}, "shape"),
+        ({"T_map_odom": np.eye(4, dtype=np.float32)}, "dtype float64"),
+        ({"T_map_odom": np.diag([1.0, 1.0, -1.0, 1.0])}, "rigid"),
+        ({"T_map_odom": np.full((4, 4), np.nan)}, "NaN"),
+        ({"stamp_ns": -1}, "greater than or equal"),
+        ({"optimisation": 0.5}, "integer"),
+    ],
+)
+def test_wrong_values_are_refused_by_name(change, complaint):
+    fields = {"stamp_ns": 0, "T_map_odom": np.eye(4), "optimisation": 0, **change}
+    with pytest.raises(ValueError, match=complaint):
+        Correction(**fields)

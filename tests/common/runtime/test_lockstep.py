@@ -1,0 +1,87 @@
+"""Lockstep: the same bytes every time, drops included."""
+
+import hashlib
+
+import pytest
+
+from beamsplat.common.messages.codec import encode
+from beamsplat.common.runtime.lockstep import Lockstep
+from tests.common.nodes import Chain, Drive, DriveConfig, Sink, Slow, SlowConfig
+
+
+def _run(*nodes):
+    digest, letters = hashlib.sha256(), []
+
+    def on_message(letter):
+        digest.update(letter.topic.encode() + encode(letter.message))
+        letters.append(letter)
+
+    mailboxes = Lockstep(list(nodes), on_message).run()
+    return digest.hexdigest(), letters, mailboxes
+
+
+def test_the_same_input_gives_the_same_bytes():
+    runs = [_run(Drive(DriveConfig()), Chain(Chain.Config()), Sink(Sink.Config())) for _ in range(2)]
+    assert runs[0][0] == runs[1][0]
+    other = _run(Drive(DriveConfig(seed=1)), Chain(Chain.Config()), Sink(Sink.Config()))
+    assert other[0] != runs[0][0]
+    topics = [letter.topic for letter in runs[0][1]]
+    assert topics.count("localization/odometry") == 30
+    assert topics.count("localization/correction") > 2  # the background jobs came back, all of them
+
+
+def test_modelled_cost_drops_what_is_latest_and_always_the_same():
+    runs = []
+    for _ in range(2):
+        slow, sink = Slow(SlowConfig(step_cost_s=0.2)), Sink(Sink.Config())
+        runs.append(_run(Drive(DriveConfig()), slow, sink))
+    assert runs[0][0] == runs[1][0]
+    count = runs[0][2]["localization"].counts["camera/image"]
+    assert count.received + count.dropped == 90
+    assert count.dropped > 60  # 30 Hz of pictures, at most 5 of them a second, beside the scans
+    assert runs[0][2]["localization"].counts["lidar/scan"].dropped == 0
+
+
+def test_no_cost_drops_nothing():
+    slow = Slow(SlowConfig())
+    _, letters, mailboxes = _run(Drive(DriveConfig()), slow, Sink(Sink.Config()))
+    assert mailboxes["localization"].counts["camera/image"].dropped == 0
+    assert sum(letter.topic == "localization/grid" for letter in letters) == 90
+
+
+def test_messages_reach_a_node_in_order_of_their_stamps():
+    order = []
+
+    class Watcher(Chain):
+        def on_wheel_odometry(self, message):
+            order.append(message.stamp_ns)
+            return super().on_wheel_odometry(message)
+
+        def on_lidar_scan(self, message):
+            order.append(message.stamp_ns)
+            yield from super().on_lidar_scan(message)
+
+    _run(Drive(DriveConfig()), Watcher(Watcher.Config()))
+    assert len(order) == 150 + 30
+    assert order == sorted(order)
+
+
+def test_all_nodes_are_closed_when_one_cannot_be_configured():
+    closed = []
+
+    class Closing(Sink):
+        def close(self):
+            closed.append("sink")
+
+    class Broken(Chain):
+        def configure(self):
+            raise ValueError("no weights")
+
+    with pytest.raises(ValueError, match="no weights"):
+        _run(Closing(Closing.Config()), Broken(Broken.Config()))
+    assert closed == ["sink"]
+
+
+def test_a_topic_nobody_produces_is_not_waited_for():
+    letters = _run(Drive(DriveConfig(scans=False)), Chain(Chain.Config()))[1]
+    assert sum(letter.topic == "wheel/odometry" for letter in letters) == 150

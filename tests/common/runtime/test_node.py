@@ -1,0 +1,77 @@
+"""A node that is misspelt fails when it is defined; one that writes what it must not, when it does."""
+
+import numpy as np
+import pytest
+
+from beamsplat.common.config.deployment import NodeConfig
+from beamsplat.common.messages import Correction, ExternalPose
+from beamsplat.common.runtime.node import Job, Node, UndeclaredTopic, merged_topics
+from beamsplat.common.topics import TOPICS
+from tests.common.nodes import Chain, Slow
+
+
+def test_a_missing_handler_fails_at_definition():
+    with pytest.raises(TypeError, match="on_lidar_scan"):
+        type("Deaf", (Node,), {"name": "localization", "inputs": ("lidar/scan",)})
+
+
+def test_an_unknown_topic_fails_at_definition():
+    with pytest.raises(KeyError, match="no topic called 'lidar/scans'"):
+        type("Typo", (Node,), {"name": "localization", "outputs": ("lidar/scans",)})
+
+
+def test_a_foreign_topic_fails_at_definition():
+    with pytest.raises(TypeError, match="whose producers are"):
+        type("Thief", (Node,), {"name": "localization", "outputs": ("camera/image",)})
+
+
+def _node(handler):
+    def on_external_pose(self, message):
+        yield handler
+
+    cls = type(
+        "Writer",
+        (Node,),
+        {
+            "name": "localization",
+            "inputs": ("external/pose",),
+            "outputs": ("localization/odometry",),
+            "on_external_pose": on_external_pose,
+        },
+    )
+    return cls(NodeConfig())
+
+
+@pytest.mark.parametrize(
+    ("output", "complaint"),
+    [
+        (("localization/correction", Correction(stamp_ns=0, T_map_odom=np.eye(4))), "not among its outputs"),
+        (("localization/odometry", Correction(stamp_ns=0, T_map_odom=np.eye(4))), "wrote a Correction to"),
+        (Job("dig", lambda: None), "no on_job_"),
+    ],
+)
+def test_undeclared_outputs_raise(output, complaint):
+    pose = ExternalPose(stamp_ns=0, T_map_body=np.eye(4))
+    with pytest.raises(UndeclaredTopic, match=complaint):
+        list(_node(output).handle("external/pose", pose))
+
+
+def test_merged_inputs_are_the_ones_that_must_not_be_lost():
+    assert merged_topics(Chain) == ("wheel/odometry", "lidar/scan")
+    assert merged_topics(Slow) == ("lidar/scan",)
+    assert Chain.queries() == ("count",)
+
+
+def test_topic_rows_are_consistent():
+    for name, row in TOPICS.items():
+        assert row.producers
+        assert row.delivery != "latched" or row.cache == 1, name
+        assert row.delivery != "every" or row.cache == 0 or row.cache >= 30 * row.rate_hz, (
+            f"{name}: the cache does not survive an outage of 30 s"
+        )
+
+
+def test_only_who_asks_for_it_is_told_the_health_of_others():
+    assert not Chain.watches_health()
+    watcher = type("Watcher", (Node,), {"name": "monitor", "on_health": lambda self, health: None})
+    assert watcher.watches_health()

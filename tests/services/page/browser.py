@@ -1,0 +1,42 @@
+"""A real headless browser. `python -m tests.services.page.browser ADDRESS OUT.png` makes the page's
+picture in docs/: run a system with a page, and call it when there is something to see."""
+
+import contextlib
+import os
+import shutil
+import sys
+
+import pytest
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+PHONE = {"width": 390, "height": 844}
+DESK = {"width": 1280, "height": 1150}
+
+
+@contextlib.contextmanager
+def browser():
+    """Chromium as this machine has it; skips the test where there is none."""
+    api = pytest.importorskip("playwright.sync_api", reason="needs playwright: pip install -e '.[dev]'")
+    if CHROMIUM is None:
+        pytest.skip("needs a browser: apt-get install chromium")
+    sandbox = ["--no-sandbox"] if os.getuid() == 0 else []  # root cannot have one
+    with api.sync_playwright() as playwright:
+        chromium = playwright.chromium.launch(executable_path=CHROMIUM, args=sandbox)
+        try:
+            yield chromium
+        finally:
+            chromium.close()
+
+
+def main(address, out):
+    """The page as it is a few seconds after it was opened."""
+    with browser() as chromium:
+        page = chromium.new_page(viewport=DESK, device_scale_factor=1)
+        page.goto(address)
+        page.wait_for_selector('[data-picture="render"] img[data-number]', timeout=60_000)
+        page.wait_for_timeout(5_000)
+        page.screenshot(path=out)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

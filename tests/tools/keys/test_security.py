@@ -1,0 +1,326 @@
+"""Locked doors: who may open a link to an edge's router, and what each may then do. Real certificates."""
+
+import contextlib
+import subprocess
+import time
+from pathlib import Path
+
+import pytest
+import zenoh
+
+from beamsplat.common.errors import UserError
+from beamsplat.common.security.access_control import Host, access_control, read_hosts
+from beamsplat.common.security.keys import (
+    CA,
+    CERTIFICATE,
+    HOSTS,
+    KEY,
+    Keys,
+    SecurityConfig,
+    check_endpoint,
+    is_loopback,
+)
+from beamsplat.common.topics import TOPICS, topic
+from beamsplat.common.zenoh.bridge import Relay, Sides
+from beamsplat.common.zenoh.bus import Bus, open_link, open_router, open_session
+from beamsplat.common.zenoh.streams import declare_reader, open_sample
+from beamsplat.tools.keys.pki import Authority, expiry, openssl
+from tests.common.polling import say_until_heard
+from tests.common.samples import sample_messages
+from tests.conftest import free_port
+
+NAMES = {"edge": "edge", "r1": "robot", "r2": "robot", "watcher": "monitor", "chief": "operator"}
+
+
+@pytest.fixture(scope="module")
+def authority(tmp_path_factory):
+    made = Authority.create(tmp_path_factory.mktemp("authority"))
+    for name, role in NAMES.items():
+        host = Host(role=role, robot=name if role == "robot" else "*")
+        made.issue(name, host, ("127.0.0.1", "localhost") if role == "edge" else ())
+    return made
+
+
+@pytest.fixture(scope="module")
+def edge(authority):
+    """(endpoint for this host's processes, endpoint for others) of a router that guards its door."""
+    near, far = f"tcp/127.0.0.1:{free_port()}", f"tls/127.0.0.1:{free_port()}"
+    with open_router((near, far), security=SecurityConfig(keys=authority.folder / "hosts" / "edge")):
+        yield near, far
+
+
+def link(authority, edge, name):
+    return open_link(edge[1], 2.0, SecurityConfig(keys=authority.folder / "hosts" / name))
+
+
+def wait(until, timeout_s=5.0):
+    deadline = time.monotonic() + timeout_s
+    while time.monotonic() < deadline:
+        if until():
+            return
+        time.sleep(0.02)
+    raise AssertionError(f"not within {timeout_s} s")
+
+
+def hear(session, pattern):
+    heard = []
+    kept = session.declare_subscriber(pattern, lambda s: heard.append(str(s.key_expr)))
+    return heard, kept
+
+
+# --- the door ---
+
+
+def test_a_host_with_a_certificate_comes_in(authority, edge):
+    with link(authority, edge, "r1") as session:
+        assert list(session.info.routers_zid())
+
+
+def copy(authority, name, folder):
+    folder.mkdir()
+    for file in (CA, CERTIFICATE, KEY):
+        data = (authority.folder / "hosts" / name / file).read_bytes()
+        (folder / file).write_bytes(data)
+        (folder / file).chmod(0o600)
+    return folder
+
+
+def refused(edge, folder):
+    with pytest.raises(UserError, match="nobody answers"):
+        open_link(edge[1], 2.0, SecurityConfig(keys=folder)).close()
+
+
+def test_without_a_certificate_nobody_comes_in(authority, edge, tmp_path):
+    config = zenoh.Config()
+    config.insert_json5("mode", '"client"')
+    config.insert_json5("connect", f'{{endpoints: ["{edge[1]}"], timeout_ms: 2000, exit_on_failure: true}}')
+    config.insert_json5(
+        "transport/link/tls",
+        f'{{root_ca_certificate: "{authority.folder / CA}", verify_name_on_connect: true}}',
+    )
+    with pytest.raises(zenoh.ZError):
+        zenoh.open(config).close()
+    plain = SecurityConfig(plain=True)
+    with pytest.raises(UserError, match="nobody answers"):
+        open_link(edge[1].replace("tls/", "tcp/"), 1.0, plain).close()
+
+
+def test_a_certificate_of_another_authority_opens_nothing(authority, edge, tmp_path):
+    other = Authority.create(tmp_path / "other")
+    other.issue("r1", Host(role="robot", robot="r1"))
+    folder = copy(other, "r1", tmp_path / "r1")
+    refused(edge, folder)  # neither side knows the other's authority
+    (folder / CA).write_bytes((authority.folder / CA).read_bytes())
+    refused(edge, folder)  # the host would trust the edge; the edge does not trust the host
+
+
+def test_an_expired_certificate_opens_nothing(authority, edge, tmp_path):
+    folder = copy(authority, "r1", tmp_path / "r1")
+    request = tmp_path / "request"
+    openssl("req", "-new", "-key", str(folder / KEY), "-subj", "/O=BeamSplat/CN=r1", "-out", str(request))
+    (tmp_path / "index").write_text("")
+    (tmp_path / "serial").write_text("77\n")
+    (tmp_path / "ca.cnf").write_text(
+        f"[ca]\ndefault_ca=a\n[a]\ndatabase={tmp_path}/index\nserial={tmp_path}/serial\nnew_certs_dir={tmp_path}\n"
+        "default_md=sha256\npolicy=p\nx509_extensions=e\n[p]\nO=supplied\nCN=supplied\n"
+        "[e]\nextendedKeyUsage=serverAuth,clientAuth\nsubjectAltName=DNS:r1\n"
+    )
+    openssl("ca", "-batch", "-config", str(tmp_path / "ca.cnf"), "-cert", str(authority.folder / CA), "-keyfile",
+            str(authority.folder / "ca.key"), "-in", str(request), "-out", str(folder / CERTIFICATE),
+            "-startdate", "20200101000000Z", "-enddate", "20200201000000Z", "-notext")  # fmt: skip
+    assert "2020" in expiry(folder / CERTIFICATE)
+    refused(edge, folder)
+
+
+def test_a_robot_does_not_talk_to_an_edge_of_another_name(authority, tmp_path):
+    authority.issue("elsewhere", Host(role="edge"), ("edge.example",))
+    near, far = f"tcp/127.0.0.1:{free_port()}", f"tls/127.0.0.1:{free_port()}"
+    with open_router((near, far), security=SecurityConfig(keys=authority.folder / "hosts" / "elsewhere")):
+        refused((near, far), authority.folder / "hosts" / "r1")
+    authority.remove("elsewhere")
+
+
+def test_links_off_this_host_are_protected_or_not_opened(tmp_path):
+    for endpoint in ("tcp/0.0.0.0:7447", "tcp/192.168.1.5:7447", "udp/[::]:7447"):
+        with pytest.raises(UserError, match="unprotected"):
+            open_router((endpoint,))
+        check_endpoint(endpoint, SecurityConfig(plain=True))
+    for endpoint in ("tcp/127.0.0.1:7447", "tcp/[::1]:7447", "tcp/localhost:1", "unixsock-stream//run/x"):
+        assert is_loopback(endpoint)
+    with pytest.raises(UserError, match="needs the host's keys"):
+        open_router(("tls/127.0.0.1:7448",))
+    with pytest.raises(UserError, match="is missing"):
+        open_link("tls/127.0.0.1:7448", 1.0, SecurityConfig(keys=tmp_path))
+
+
+def test_a_key_that_others_can_read_is_refused(authority, tmp_path):
+    folder = copy(authority, "r1", tmp_path / "r1")
+    (folder / KEY).chmod(0o644)
+    with pytest.raises(UserError, match="can be read by others"):
+        Keys.of(SecurityConfig(keys=folder))
+
+
+# --- what each may do ---
+
+
+def test_a_robot_writes_what_crosses_under_its_own_name_and_nothing_else(authority, edge):
+    allowed = [f"beamsplat/r1/{name}" for name, row in TOPICS.items() if row.uplink in ("up", "bulk")]
+    allowed += ["beamsplat/r1/health/uplink", "beamsplat/r1/end/keyframes/frame"]
+    forbidden = [
+        "beamsplat/r2/localization/odometry", "beamsplat/r1/keyframes/ack", "beamsplat/r1/camera/image",
+        "beamsplat/r1/mapping/chunk", "beamsplat/other", "anything", "beamsplat/r2/health/uplink",
+    ]  # fmt: skip
+    with open_session((edge[0],)) as local, link(authority, edge, "r1") as robot:
+        heard, kept = hear(local, "**")
+        time.sleep(0.5)
+        for key in forbidden + allowed:
+            robot.put(key, b"x")
+        wait(lambda: set(heard) >= set(allowed))
+        time.sleep(0.3)
+        assert set(heard) == set(allowed)
+        kept.undeclare()
+
+
+def test_a_robot_hears_what_is_meant_for_it_and_no_other(authority, edge):
+    with open_session((edge[0],)) as local, link(authority, edge, "r1") as robot:
+        heard, kept = hear(robot, "beamsplat/r1/keyframes/ack")
+        others = [
+            hear(robot, p) for p in ("beamsplat/r2/keyframes/ack", "beamsplat/r2/**", "beamsplat/r1/camera/*")
+        ]
+        queryable = local.declare_queryable(
+            "beamsplat/r1/query/mapping/set_params", lambda q: q.reply(q.key_expr, b"1")
+        )
+        time.sleep(0.5)
+        for name in ("r1/keyframes/ack", "r2/keyframes/ack", "r1/camera/image", "r1/localization/odometry"):
+            local.put(f"beamsplat/{name}", b"x")
+        wait(lambda: heard)
+        time.sleep(0.3)
+        assert set(heard) == {"beamsplat/r1/keyframes/ack"}
+        assert [h for h, _ in others] == [[], [], []]
+        assert list(robot.get("beamsplat/r1/query/mapping/set_params", timeout=2.0)) == []
+        for thing in (kept, queryable, *(k for _, k in others)):
+            thing.undeclare()
+
+
+@pytest.mark.parametrize(("name", "may_change"), [("watcher", False), ("chief", True)])
+def test_a_monitor_reads_everything_and_changes_nothing(authority, edge, name, may_change):
+    def answer(query):
+        with query:
+            query.reply(query.key_expr, b"1")
+
+    with open_session((edge[0],)) as local, link(authority, edge, name) as monitor:
+        heard, kept = hear(local, "**")
+        seen, watching = hear(monitor, "beamsplat/*/**")
+        answers = [
+            local.declare_queryable(f"beamsplat/r1/query/mapping/{q}", answer)
+            for q in ("snapshot", "set_params")
+        ]
+        token = local.liveliness().declare_token("beamsplat/r1/alive/mapping/x")
+        time.sleep(0.5)
+        monitor.put("beamsplat/r1/keyframes/ack", b"x")
+        local.put("beamsplat/r1/mapping/chunk", b"x")
+        local.put("beamsplat/r2/health/mapping", b"x")
+        wait(lambda: len(seen) >= 2)
+        assert "beamsplat/r1/keyframes/ack" not in heard
+        assert len(list(monitor.get("beamsplat/r1/query/mapping/snapshot", timeout=2.0))) == 1
+        assert len(list(monitor.get("beamsplat/r1/query/mapping/set_params", timeout=2.0))) == may_change
+        assert len(list(monitor.liveliness().get("beamsplat/*/alive/**", timeout=2.0))) == 1
+        for thing in (kept, watching, token, *answers):
+            thing.undeclare()
+
+
+@pytest.mark.parametrize("name", [n for n, row in TOPICS.items() if row.uplink])
+def test_every_topic_crosses_a_guarded_door_with_what_was_said_before(authority, edge, name, free_endpoint):
+    """Latched values and caches too: their `@adv` keys need rules of their own."""
+    row = topic(name)
+    message = next(m for m in sample_messages() if type(m) is row.message)
+    with open_router((free_endpoint,)), contextlib.ExitStack() as stack:
+        near = stack.enter_context(open_session((free_endpoint,)))
+        local = stack.enter_context(open_session((edge[0],)))
+        here, there = (local, near) if row.uplink == "down" else (near, local)
+        publication = Bus(here, "r1", row.producers[0], "ab" * 8, 1).publish(name)
+        publication.put(message)
+        sides = Sides(stack.enter_context(open_session((free_endpoint,))), link(authority, edge, "r1"),
+                      link(authority, edge, "r1"))  # fmt: skip
+        stack.enter_context(sides.small)
+        stack.enter_context(sides.large)
+        relay = Relay("r1", sides)
+        heard = []
+        take = lambda s: heard.append(open_sample(s, row).message)  # noqa: E731
+        kept = [declare_reader(there, f"beamsplat/r1/{name}", row, "every", take)]
+        if row.delivery == "latched":
+            wait(lambda: len(heard) == 1)  # said before anybody listened
+        say_until_heard(publication, message, heard)
+        assert relay.carried[name].messages >= len(heard)
+        assert kept
+
+
+def test_a_robot_without_a_rule_is_let_in_but_can_do_nothing(authority, tmp_path):
+    """Removed from the policy: its certificate is still good, but says nothing any more."""
+    made = Authority.create(tmp_path / "authority")
+    made.issue("edge", Host(role="edge"), ("127.0.0.1",))
+    made.issue("r1", Host(role="robot", robot="r1"))
+    folder = copy(made, "r1", tmp_path / "r1")
+    made.remove("r1")
+    assert set(read_hosts(made.folder / "hosts" / "edge")) == {"edge"}
+    near, far = f"tcp/127.0.0.1:{free_port()}", f"tls/127.0.0.1:{free_port()}"
+    with (
+        open_router((near, far), security=SecurityConfig(keys=made.folder / "hosts" / "edge")),
+        open_session((near,)) as local,
+        open_link(far, 2.0, SecurityConfig(keys=folder)) as robot,
+    ):
+        heard, kept = hear(local, "**")
+        time.sleep(0.3)
+        robot.put("beamsplat/r1/localization/odometry", b"x")
+        local.put("beamsplat/r1/tick", b"x")
+        wait(lambda: heard)
+        time.sleep(0.3)
+        assert heard == ["beamsplat/r1/tick"]
+        kept.undeclare()
+
+
+# --- the authority ---
+
+
+def test_renewed_keys_replace_the_old_and_the_policy_stays(authority, tmp_path):
+    made = Authority.create(tmp_path)
+    folder = made.issue("r1", Host(role="robot", robot="r1"), days=1)
+    before = {name: (folder / name).read_bytes() for name in (KEY, CERTIFICATE)}
+    made.issue("r1", Host(role="robot", robot="r1"), days=30)
+    assert all((folder / name).read_bytes() != data for name, data in before.items())
+    assert (folder / KEY).stat().st_mode & 0o077 == 0
+    assert list(made.hosts()) == ["r1"]
+    assert "OK" in openssl("verify", "-CAfile", str(made.folder / CA), str(folder / CERTIFICATE))
+    with pytest.raises(UserError, match="never replaced"):
+        Authority.create(tmp_path)
+    with pytest.raises(UserError, match="no host 'r2'"):
+        made.remove("r2")
+    with pytest.raises(UserError, match="--address"):
+        made.issue("edge", Host(role="edge"))
+    with pytest.raises(UserError, match="holds no authority"):
+        Authority(tmp_path / "hosts")
+
+
+def test_a_policy_that_makes_no_sense_is_refused(tmp_path):
+    with pytest.raises(UserError, match="is missing"):
+        read_hosts(tmp_path)
+    for text in ('[r1]\nrole = "king"', "[r1", '[r1]\nrole = "robot"\nrobot = "r1/**"', "r1 = 3"):
+        (tmp_path / HOSTS).write_text(text)
+        with pytest.raises(UserError, match="not a table of hosts"):
+            read_hosts(tmp_path)
+
+
+def test_everything_in_the_policy_comes_from_the_topic_table():
+    policy = access_control({"r1": Host(role="robot", robot="r1")})
+    assert policy["default_permission"] == "deny"
+    writes = next(r for r in policy["rules"] if r["id"] == "r1 writes")
+    assert {
+        k for k in writes["key_exprs"] if "@adv" not in k and "/end/" not in k and "/health/" not in k
+    } == {f"beamsplat/r1/{name}" for name, row in TOPICS.items() if row.uplink in ("up", "bulk")}
+
+
+def test_openssl_says_why_it_refuses(tmp_path):
+    with pytest.raises(UserError, match="openssl x509 refuses"):
+        openssl("x509", "-in", str(tmp_path / "nothing"))
+    assert subprocess.run(["openssl", "version"], capture_output=True, check=True).stdout
+    assert Path(tmp_path).exists()

@@ -1,0 +1,57 @@
+"""The command's own part: options, refusals, and what it prints."""
+
+import json
+
+import typer
+from typer.testing import CliRunner
+
+from beamsplat.tools.cli.simulate import simulate
+
+app = typer.Typer()
+app.command()(simulate)
+runner = CliRunner()
+
+
+def test_help_shows_examples():
+    result = runner.invoke(app, ["--help"], env={"COLUMNS": "200"})
+    assert result.exit_code == 0
+    assert "--lidar-only --laps" in result.output
+
+
+def test_bad_values_name_the_option_and_exit_with_2(tmp_path):
+    for option, value in (
+        ("--size", "640"),
+        ("--size", "9x9"),
+        ("--distortion", "1,2"),
+        ("--extrinsic-xyz-m", "a,b,c"),
+    ):
+        result = runner.invoke(app, ["--out", str(tmp_path / "r"), option, value], env={"COLUMNS": "200"})
+        assert result.exit_code == 2
+        assert option in result.output
+    assert not (tmp_path / "r").exists()
+
+
+def test_an_existing_folder_is_refused_with_2(tmp_path):
+    result = runner.invoke(app, ["--out", str(tmp_path)], env={"COLUMNS": "200"})
+    assert result.exit_code == 2
+    assert "--force" in result.output
+
+
+def test_a_recording_is_announced_as_json(scene_file, own_cache, tmp_path):
+    options = [
+        "--out",
+        str(tmp_path / "r"),
+        "--scene",
+        str(scene_file),
+        "--seed",
+        "3",
+        "--seconds",
+        "2",
+        "--lidar-only",
+    ]
+    result = runner.invoke(app, [*options, "--json"])
+    assert result.exit_code == 0, result.output
+    told = json.loads(result.stdout)
+    assert told["scans"] == 19
+    assert told["images"] == 0
+    assert (tmp_path / "r" / "bag" / "metadata.yaml").exists()

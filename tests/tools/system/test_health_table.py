@@ -1,0 +1,75 @@
+"""What `top` and `topics` show is what the nodes report."""
+
+import time
+
+from rich.console import Console
+
+from beamsplat.common.messages import Health, InputHealth, OutputHealth
+from beamsplat.common.zenoh.bus import Bus, open_router, open_session
+from beamsplat.tools.system.health_table import ALL, HealthBoard
+
+
+def _text(table, width=80):
+    console = Console(width=width, record=True, quiet=False, file=open("/dev/null", "w"))  # noqa: SIM115
+    console.print(table)
+    return console.export_text()
+
+
+def _health(node, sent, lost=0, state="active", **inputs):
+    takes = InputHealth(
+        topic="lidar/scan", received=sent, dropped=3, lost=lost, undecodable=0, stale=0, age_ms=1.5
+    )
+    return Health(
+        stamp_ns=1, node=node, instance="ab" * 8, epoch=1, state=state, detail="warm and well",
+        inputs=(takes,) if node == "localization" else (),
+        outputs=(OutputHealth(topic="lidar/scan", sent=sent, bytes=1000 * sent),) if node == "replay" else (),
+        step_p50_ms=1.0, step_p95_ms=2.0, rss_mb=100.0, cpu_percent=5.0,
+    )  # fmt: skip
+
+
+def test_rates_losses_and_silence_are_shown(free_endpoint):
+    with open_router((free_endpoint,)), open_session((free_endpoint,)) as watcher:
+        board = HealthBoard(watcher, "r")
+        sender = Bus(open_session((free_endpoint,)), "r", "replay", "ab" * 8, 1)
+        taker = Bus(open_session((free_endpoint,)), "r", "localization", "cd" * 8, 1)
+        with sender, taker:
+            time.sleep(0.5)
+            for sent in (0, 10):
+                sender.report(_health("replay", sent))
+                taker.report(_health("localization", sent, lost=2))
+                time.sleep(1.0)
+            assert board.states() == {"replay": "active", "localization": "active"}
+            nodes = _text(board.nodes_table())
+            row = next(line for line in nodes.splitlines() if line.strip().startswith("localization"))
+            assert row.split()[1] == "active"
+            assert 8.0 < float(row.split()[2]) < 12.0  # 10 in about a second
+            assert row.split()[-4:-2] == ["2", "0"]  # lost, broken
+            assert "localization: warm and well" in nodes
+            topics = _text(board.topics_table())
+            assert "localization 1.5, 3" in topics
+            assert "2 lost" in topics
+            assert "…" not in nodes + topics  # nothing is cut off in 80 columns
+            time.sleep(3.2)
+            assert board.states() == {"replay": "silent", "localization": "silent"}
+            assert "silent" in _text(board.nodes_table())
+
+
+def test_a_fleet_is_shown_by_robot_and_kept_apart(free_endpoint):
+    with open_router((free_endpoint,)), open_session((free_endpoint,)) as watcher:
+        fleet, one = HealthBoard(watcher, ALL), HealthBoard(watcher, "r2")
+        buses = {
+            name: Bus(open_session((free_endpoint,)), name, "replay", "ab" * 8, 1)
+            for name in ("r1", "r2", "r3")
+        }
+        time.sleep(0.5)
+        for number, bus in enumerate(buses.values()):
+            bus.report(_health("replay", number))
+        deadline = time.monotonic() + 5.0
+        while len(fleet.states()) < 3 and time.monotonic() < deadline:
+            time.sleep(0.05)
+        assert fleet.states() == dict.fromkeys(("r1/replay", "r2/replay", "r3/replay"), "active")
+        assert one.states() == {"replay": "active"}
+        assert [o.sent for o in one.records["replay"].health.outputs] == [1]
+        assert "r3/replay" in _text(fleet.nodes_table())
+        for bus in buses.values():
+            bus.session.close()

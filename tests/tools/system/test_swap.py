@@ -1,0 +1,250 @@
+"""Swapping a node under load, with real processes: no stamp twice, none lost, and failures change nothing."""
+
+import itertools
+import json
+import os
+import signal
+import threading
+import time
+from urllib.parse import quote
+
+import numpy as np
+import pytest
+
+from beamsplat.common.config.deployment import Deployment, RouterConfig
+from beamsplat.common.errors import UserError
+from beamsplat.common.messages import Grid, Odometry
+from beamsplat.common.messages.header import Header
+from beamsplat.common.runtime.handover import Takeover
+from beamsplat.common.runtime.mailbox import NOBODY, Letter, Mailbox
+from beamsplat.common.runtime.node import Node
+from beamsplat.common.runtime.registry import Service
+from beamsplat.common.zenoh.bus import open_session
+from beamsplat.common.zenoh.queries import ask, command
+from beamsplat.tools.system.commands import Commands
+from beamsplat.tools.system.health_table import HealthBoard
+from beamsplat.tools.system.supervisor import Supervisor
+from tests.common.ears import Ears
+from tests.common.nodes import TABLE, Sink, SlowConfig
+
+
+class Swift(Node):
+    """A pose for every scan; keeps nothing for long."""
+
+    name = "localization"
+    Config = SlowConfig
+    inputs = ("lidar/scan",)
+    outputs = ("localization/odometry",)
+    replaceable = True
+
+    def configure(self):
+        if self.config.sleep_s > 1.0:
+            raise UserError("a step of more than a second: no")
+
+    def on_lidar_scan(self, scan):
+        time.sleep(self.config.sleep_s)
+        yield (
+            "localization/odometry",
+            Odometry(stamp_ns=scan.stamp_ns, T_odom_body=np.eye(4), covariance=np.eye(3)),
+        )
+
+
+_TABLE = {
+    **TABLE,
+    "localization": Service("localization", "", {"swift": "tests.tools.system.test_swap:Swift", "chain": "tests.common.nodes:Chain"}),
+}  # fmt: skip
+
+
+class System:
+    """A supervisor with its commands, attended to in a thread, as `beamsplat run` does."""
+
+    def __init__(self, tmp_path, endpoint, nodes, rate=1.0, table=_TABLE):
+        self._table = table
+        self.deployment = Deployment(
+            robot="r1", router=RouterConfig(listen=(endpoint,)), rate=rate, state_dir=tmp_path, nodes=nodes
+        )
+        self._stop = threading.Event()
+
+    def __enter__(self):
+        self.supervisor = Supervisor(self.deployment, table=self._table).__enter__()
+        self.session = open_session(self.deployment.router.listen)
+        self.board = HealthBoard(self.session, "r1")
+        self._commands = Commands(self.session, "r1", self.supervisor)
+        self._thread = threading.Thread(target=self._attend)
+        self._thread.start()
+        self.asker = open_session(self.deployment.router.listen)
+        return self
+
+    def _attend(self):
+        while not self._stop.wait(0.05):
+            self._commands.attend()
+            self.supervisor.poll()
+
+    def __exit__(self, *exception):
+        self._stop.set()
+        self._thread.join()
+        self.asker.close()
+        self.session.close()
+        self.supervisor.__exit__()
+
+    def ask(self, node, verb, **parameters):
+        (answer,) = ask(self.asker, "r1", node, verb, parameters, 60.0)
+        return answer.text
+
+    def swap(self, node, *changes, **more):
+        return self.ask(node, "swap", set=quote(json.dumps(changes)), **more)
+
+    def wait(self, until, timeout_s=30.0):
+        deadline = time.monotonic() + timeout_s
+        while time.monotonic() < deadline:
+            if until():
+                return
+            time.sleep(0.05)
+        raise AssertionError(f"not within {timeout_s} s")
+
+
+NODES = {
+    "replay": {"kind": "drive", "seconds": 300.0, "images": False},
+    "localization": {"kind": "swift", "sleep_s": 0.01},
+}
+
+
+@pytest.fixture
+def system(tmp_path, free_endpoint):
+    with System(tmp_path, free_endpoint, NODES) as made:
+        yield made
+
+
+@pytest.mark.slow
+def test_swaps_under_load_say_nothing_twice_and_lose_nothing(system):
+    ears = Ears(system.session, "localization/odometry")
+    system.wait(lambda: len(ears.messages) > 20)
+    instances = {system.supervisor.children["localization"].instance}
+    for number in range(4):
+        text = system.swap("localization", f"sleep_s={0.005 + 0.001 * number}")
+        assert "was taken over" in text
+        before = len(ears.messages)
+        system.wait(lambda before=before: len(ears.messages) > before + 10)
+        instances.add(system.supervisor.children["localization"].instance)
+    assert len(instances) == 5
+    stamps = ears.stamps()
+    assert stamps == sorted(set(stamps)), "a stamp came twice, or late"
+    assert {b - a for a, b in itertools.pairwise(stamps)} == {100_000_000}, "a scan has no pose"
+    assert json.loads(system.ask("localization", "params"))["sleep_s"] == 0.008
+    system.wait(lambda: system.board.records["localization"].health.epoch >= 5)
+
+
+@pytest.mark.slow
+def test_a_successor_that_cannot_run_changes_nothing(system):
+    ears = Ears(system.session, "localization/odometry")
+    system.wait(lambda: len(ears.messages) > 5)
+    before = system.supervisor.children["localization"].instance
+    with pytest.raises(UserError, match="more than a second"):
+        system.swap("localization", "sleep_s=2.0")
+    with pytest.raises(UserError, match="unknown option 'slep_s'"):
+        system.swap("localization", "slep_s=2.0")
+    with pytest.raises(UserError, match="--cold"):
+        system.swap("replay", "seconds=3.0")
+    with pytest.raises(UserError, match="JSON list"):
+        system.ask("localization", "swap", set=quote('{"a": 1}'))
+    with pytest.raises(UserError, match="nobody answers"):
+        system.ask("depth", "swap")
+    assert system.supervisor.children["localization"].instance == before
+    for verb in ("activate", "dance"):  # common/control.py: it stands by no more, and never heard of it
+        with pytest.raises(UserError, match=f"nothing called '{verb}'"):
+            command(system.asker, "r1", before, verb, {"after": "{}"}, 5.0)
+    assert json.loads(system.ask("localization", "params"))["sleep_s"] == 0.01
+    count = len(ears.messages)
+    system.wait(lambda: len(ears.messages) > count + 5)
+
+
+@pytest.mark.slow
+def test_after_a_swap_a_crash_brings_back_the_new_options_and_a_cold_swap_starts_anew(system):
+    ears = Ears(system.session, "localization/odometry")
+    system.wait(lambda: len(ears.messages) > 5)
+    system.swap("localization", "sleep_s=0.02")
+    os.kill(system.supervisor.children["localization"].process.pid, signal.SIGKILL)
+    system.wait(lambda: system.supervisor.children["localization"].restarts == 1)
+    assert json.loads(system.ask("localization", "params"))["sleep_s"] == 0.02
+    count = len(ears.messages)
+    system.wait(lambda: len(ears.messages) > count + 5)
+    assert "starts again with the new options" in system.swap("localization", "kind=chain", cold="1")
+    system.wait(lambda: system.supervisor.children["localization"].restarts == 2)
+    assert json.loads(system.ask("localization", "params"))["kind"] == "chain"
+
+
+def test_a_restart_by_request_still_works(system):
+    ears = Ears(system.session, "localization/odometry")
+    system.wait(lambda: len(ears.messages) > 5)
+    assert "starts again" in system.ask("localization", "restart")
+    system.wait(lambda: system.supervisor.children["localization"].restarts == 1)
+
+
+def grid(stamp_ns):
+    return Grid(
+        stamp_ns=stamp_ns, resolution_m=1.0, origin_m=np.zeros(2), occupancy=np.zeros((1, 1), np.int8)
+    )
+
+
+def test_a_successor_goes_on_where_its_predecessor_ended():
+    old, new = Takeover(standby=False), Takeover(standby=True)
+    said = [s for s in range(5) if not old.keeps("a", grid(s))]
+    assert [new.keeps("a", grid(s)) for s in range(2, 8)] == [True] * 6
+    assert (old.reached(), new.reached()) == ('{"a": 4}', '{"a": 7}')
+    after = old.retire()
+    assert old.keeps("a", grid(9))  # what it would still say goes nowhere
+    went_on = [m.stamp_ns for _, m in new.activate(after)]
+    assert said + went_on == list(range(8))
+    assert not new.keeps("a", grid(8))
+    with pytest.raises(ValueError):
+        list(Takeover(standby=True).activate("not JSON"))
+
+
+def test_a_successor_that_lags_does_not_repeat_what_was_said():
+    new = Takeover(standby=True)
+    new.keeps("a", grid(1))
+    assert [m.stamp_ns for _, m in new.activate('{"said": {"a": 5}}')] == []
+    assert [s for s in range(2, 9) if not new.keeps("a", grid(s))] == [6, 7, 8]
+    assert not new.keeps("b", grid(2))
+    assert Takeover(standby=False).retire() == '{"said": {}}'
+    assert new.retire() == '{"said": {"a": 8, "b": 2}}'
+    for wrong in ("[]", '{"said": 3}', '{"said": {"a": "b"}}'):
+        with pytest.raises(ValueError):
+            list(Takeover(standby=True).activate(wrong))
+
+
+def test_what_standby_has_no_room_for_is_counted_unless_the_predecessor_said_it():
+    new = Takeover(standby=True)
+    for stamp in range(20):
+        new.keeps("a", grid(stamp))
+    assert [m.stamp_ns for _, m in new.activate('{"said": {"a": 1}}')] == list(range(4, 20))
+    assert new.lost == 2  # 2 and 3
+
+
+def letter(sequence, instance="a" * 16):
+    header = Header(sequence, 0, 0, sequence, 1, "localization", instance)
+    return Letter("localization/odometry", header, pose(sequence))
+
+
+def pose(stamp_ns):
+    return Odometry(stamp_ns=stamp_ns, T_odom_body=np.eye(4), covariance=np.eye(3))
+
+
+def test_who_hands_over_what_it_knows_tells_what_it_has_handled():
+    mailbox = Mailbox(Sink)
+    for sequence in (0, 1, 2, 5):
+        mailbox.put(letter(sequence))
+    for name in ("localization/correction", "localization/grid"):
+        mailbox.end(name, NOBODY, 0)
+    assert mailbox.pop().header.sequence == 0
+    old, new = Takeover(standby=False), Takeover(standby=True)
+    list(new.activate(old.retire(mailbox.handled())))
+    assert [s for s in range(8) if not new.was_handled(letter(s))] == [1, 2, 5, 6, 7]
+    assert not new.was_handled(letter(0, "b" * 16))
+
+
+def test_what_the_predecessor_never_spoke_of_is_said():
+    new = Takeover(standby=True)
+    new.keeps("b", grid(3))
+    assert [m.stamp_ns for _, m in new.activate(Takeover(standby=False).retire())] == [3]
+    assert Sink.replaceable is False

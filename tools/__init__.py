@@ -1,0 +1,1 @@
+"""Everything around the processes: command line, supervision, set-up, evaluation, benchmarks, simulator."""

@@ -1,0 +1,230 @@
+"""How fast messages cross the local router, and what a slow subscriber does to the others.
+
+The publisher is a process of its own, the subscriber is this one. Ours and plain Zenoh puts of the same
+bytes alternate within one run, so that their ratio holds on a busy machine.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import struct
+import tempfile
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from multiprocessing.synchronize import Event
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+import zenoh
+
+from beamsplat.common.config.deployment import Deployment, RouterConfig
+from beamsplat.common.messages import Image, WheelOdometry
+from beamsplat.common.runtime.mailbox import Letter, Mailbox
+from beamsplat.common.runtime.node import Node, Outputs
+from beamsplat.common.zenoh.bus import Bus, open_session
+from beamsplat.tools.system.supervisor import Supervisor
+
+ROBOT = "bench"
+PLAIN_KEY = f"beamsplat/{ROBOT}/plain"
+_WARM_UP = 20  # samples, not counted: connections, shared memory and caches settle
+
+
+class _Taker(Node):
+    """Declares the inputs whose mailbox the slow-subscriber run uses."""
+
+    name = "monitor"
+    inputs = ("camera/image",)
+
+    def on_camera_image(self, message: Image) -> Outputs:
+        return iter(())
+
+
+@dataclass
+class _Ages:
+    """Latencies in ms, filled by a receiving thread."""
+
+    values: list[float] = field(default_factory=list)
+
+    def add_since(self, then_ns: int) -> None:
+        self.values.append((time.monotonic_ns() - then_ns) / 1e6)
+
+    def percentiles(self) -> tuple[float, float]:
+        """(p50, p99) in ms without the warm-up.
+
+        Raises:
+            RuntimeError: too little arrived to say anything.
+        """
+        counted = self.values[_WARM_UP:]
+        if len(counted) < 10:
+            raise RuntimeError(f"only {len(self.values)} messages arrived")
+        return float(np.percentile(counted, 50)), float(np.percentile(counted, 99))
+
+
+def _publish(endpoint: str, go: Event, stop: Event, image_bytes: int, hz: float, plain: bool) -> None:
+    """The publishing process: pictures (and, in turn, plain puts) at `hz`, odometry at 100 Hz."""
+    data = np.random.default_rng(0).integers(0, 255, image_bytes).astype(np.uint8)
+    body = data.tobytes()
+    with Bus(open_session((endpoint,)), ROBOT, "replay", "ab" * 8, 1) as bus:
+        pictures = bus.publish("camera/image")
+        bare = bus.session.declare_publisher(PLAIN_KEY, congestion_control=zenoh.CongestionControl.DROP)
+        beside = threading.Thread(target=_publish_odometry, args=(bus, stop), daemon=True)
+        go.wait()
+        beside.start()
+        turn = 0
+        due = time.monotonic()
+        while not stop.is_set():
+            now_ns = time.monotonic_ns()
+            if plain and turn % 2:
+                bare.put(body, attachment=struct.pack("<q", now_ns))
+            else:
+                picture = Image(stamp_ns=now_ns, width_px=640, height_px=480, encoding="jpeg", data=data)
+                pictures.put(picture)
+            turn += 1
+            due += 1.0 / hz
+            time.sleep(max(0.0, due - time.monotonic()))
+        beside.join()
+
+
+def _publish_odometry(bus: Bus, stop: Event) -> None:
+    odometry = bus.publish("wheel/odometry")
+    due = time.monotonic()
+    while not stop.is_set():
+        odometry.put(
+            WheelOdometry(
+                stamp_ns=time.monotonic_ns(),
+                T_odom_body=np.eye(4),
+                velocity_m_s=np.zeros(3),
+                angular_velocity_rad_s=np.zeros(3),
+            )
+        )
+        due += 0.01
+        time.sleep(max(0.0, due - time.monotonic()))
+
+
+def bench_bus(
+    seconds: float, image_bytes: int, endpoint: str, report: Callable[[str], None]
+) -> dict[str, Any]:
+    """Runs both parts; figures by name, units in the names."""
+    with tempfile.TemporaryDirectory() as folder:
+        deployment = Deployment(
+            robot=ROBOT, router=RouterConfig(listen=(endpoint,)), state_dir=Path(folder), nodes={}
+        )
+        with Supervisor(deployment, ("router",)):
+            report(f"{image_bytes / 1e6:g} MB pictures through the local router, ours and plain in turn")
+            result = _latency(endpoint, seconds, image_bytes)
+            report("a subscriber that needs 200 ms a picture, beside a 100 Hz topic")
+            result |= _slow_subscriber(endpoint, seconds, image_bytes)
+    return result
+
+
+def _with_publisher(
+    endpoint: str, image_bytes: int, plain: bool, hz: float, body: Callable[[Bus], Callable[[], None]]
+) -> None:
+    """Declares subscriptions with `body`, then lets a publisher run while what it returned works."""
+    context = multiprocessing.get_context("spawn")
+    go, stop = context.Event(), context.Event()
+    process = context.Process(target=_publish, args=(endpoint, go, stop, image_bytes, hz, plain))
+    process.start()
+    try:
+        with Bus(open_session((endpoint,)), ROBOT, "monitor", "cd" * 8, 1) as bus:
+            work = body(bus)
+            time.sleep(1.0)  # declarations travel through the router
+            go.set()
+            work()
+            stop.set()
+            process.join(10)
+    finally:
+        stop.set()
+        if process.is_alive():
+            process.kill()
+
+
+def _latency(endpoint: str, seconds: float, image_bytes: int) -> dict[str, float]:
+    ours, plain = _Ages(), _Ages()
+
+    def body(bus: Bus) -> Callable[[], None]:
+        bus.subscribe(_Taker.inputs[0], lambda letter: ours.add_since(letter.message.stamp_ns), _broken, _end)
+        subscriber = bus.session.declare_subscriber(PLAIN_KEY, zenoh.handlers.RingChannel(1))
+
+        def receive() -> None:
+            while True:
+                try:
+                    sample = subscriber.recv()
+                except zenoh.ZError:
+                    return
+                sample.payload.to_bytes()
+                plain.add_since(struct.unpack("<q", sample.attachment.to_bytes())[0])
+
+        threading.Thread(target=receive, daemon=True).start()
+        return lambda: time.sleep(seconds)
+
+    _with_publisher(endpoint, image_bytes, True, 60.0, body)
+    (p50, p99), (plain_p50, plain_p99) = ours.percentiles(), plain.percentiles()
+    return {
+        "image_p50_ms": p50,
+        "image_p99_ms": p99,
+        "plain_p50_ms": plain_p50,
+        "plain_p99_ms": plain_p99,
+        "overhead_p50": p50 / plain_p50,
+        "images": len(ours.values),
+    }
+
+
+def _slow_subscriber(endpoint: str, seconds: float, image_bytes: int) -> dict[str, float]:
+    hz = 30.0
+    beside, ages_frames = _Ages(), []
+    mailbox, lock = Mailbox(_Taker), threading.Lock()
+    memory = []
+
+    def on_image(letter: Letter) -> None:
+        with lock:
+            mailbox.put(letter)
+
+    def body(bus: Bus) -> Callable[[], None]:
+        from beamsplat.common.runtime.node import Input
+
+        bus.subscribe(_Taker.inputs[0], on_image, _broken, _end)
+        bus.subscribe(
+            Input("wheel/odometry"), lambda letter: beside.add_since(letter.message.stamp_ns), _broken, _end
+        )
+        return work
+
+    def work() -> None:
+        deadline = time.monotonic() + seconds
+        process = psutil.Process()
+        while time.monotonic() < deadline:
+            with lock:
+                letter = mailbox.pop()
+            if letter is None:
+                time.sleep(0.001)
+                continue
+            ages_frames.append((time.monotonic_ns() - letter.message.stamp_ns) / 1e9 * hz)
+            time.sleep(0.2)
+            memory.append(process.memory_info().rss / 1e6)
+
+    _with_publisher(endpoint, image_bytes, False, hz, body)
+    p50, p99 = beside.percentiles()
+    count = mailbox.counts["camera/image"]
+    settled = memory[len(memory) // 3 :]
+    return {
+        "slow_age_median_frames": float(np.median(ages_frames)),
+        "slow_age_max_frames": float(np.max(ages_frames[2:])),
+        "slow_received": count.received,
+        "slow_dropped": count.dropped,
+        "slow_memory_growth_mb": float(settled[-1] - settled[0]),
+        "beside_p50_ms": p50,
+        "beside_p99_ms": p99,
+        "beside_messages": len(beside.values),
+    }
+
+
+def _broken(topic: str, reason: str) -> None:
+    raise RuntimeError(f"{topic}: {reason}")
+
+
+def _end(topic: str, instance: str, epoch: int, sent: int) -> None:
+    return

@@ -1,0 +1,82 @@
+"""What other services give the mapper, played over a drive for `bench map`: fused depth, masks of movers.
+
+No picture that is scored is seen.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from beamsplat.common.geometry.beams import Beams
+from beamsplat.common.geometry.transforms import inverse, transform_points
+from beamsplat.services.depth.source import DepthSource, View, make_source
+from beamsplat.services.fusion.frame import Frame
+from beamsplat.services.fusion.fuse import Fusion
+from beamsplat.services.fusion.movers import FreeSpace
+from beamsplat.services.keyframes.bodies import body_mask
+from beamsplat.tools.bench.mapping import HELD_OUT_AT, HELD_OUT_EVERY
+from beamsplat.tools.evaluation.dataset import Recording
+
+
+class FieldPrior:
+    """Called with rising numbers of pictures; what lies between is looked at, as the service does."""
+
+    def __init__(self, source: str = "stixel") -> None:
+        self._source: DepthSource = make_source(source, {})
+        self._fusion: Fusion | None = None
+        self._next = 0
+
+    def __call__(self, recording: Recording, index: int) -> tuple[np.ndarray, np.ndarray] | None:
+        """(depth_m, sigma_m) float32 [H, W] of a picture; None where fusion refuses it."""
+        T_camera_body = inverse(recording.T_body_camera)
+        if self._fusion is None or index < self._next:
+            poses = np.array([shot.T_map_camera @ T_camera_body for shot in recording.shots])
+            upright = bool(np.all(poses[:, 2, 2] > np.cos(np.radians(2.0))))
+            self._level = upright and float(np.ptp(poses[:, 2, 3])) < 0.03
+            self._fusion = Fusion(
+                recording.camera, recording.T_body_camera, floor_known=self._level, planar=self._level
+            )
+            self._next = 0
+        for number in range(self._next, index + 1):
+            shot = recording.shots[number]
+            T_map_body = shot.T_map_camera @ T_camera_body
+            self._fusion.add_scan(transform_points(T_map_body, shot.beams.points_body_m))
+            if number < index and number % HELD_OUT_EVERY != HELD_OUT_AT:
+                self._fusion.look(recording.image(number), T_map_body)
+        self._next = index + 1
+        fused = self._fusion.fuse(self._frame(recording, index, T_map_body), keyframe=True)
+        return (fused.depth_m, fused.sigma_m) if fused.ok else None
+
+    def _frame(self, recording: Recording, index: int, T_map_body: np.ndarray) -> Frame:
+        shot, rgb = recording.shots[index], recording.image(index)
+        view = View(shot.stamp_ns, rgb, recording.camera, recording.T_body_camera, shot.beams, self._level)
+        estimate = self._source.estimate(view)
+        usable = estimate.ok and estimate.kind != "none"
+        return Frame(
+            shot.stamp_ns, rgb, T_map_body, shot.beams, estimate.values if usable else None, estimate.kind
+        )
+
+
+class MoverMasks:
+    """Masks of what walks where beams have passed before. Called with rising numbers of pictures."""
+
+    def __init__(self) -> None:
+        self._free, self._next = FreeSpace(), 0
+
+    def __call__(self, recording: Recording, index: int, depth_m: np.ndarray) -> np.ndarray | None:
+        """bool [H, W], False on movers; None where nothing moves. `depth_m` float32 [H, W] of the picture."""
+        T_camera_body = inverse(recording.T_body_camera)
+        if index < self._next:
+            self._free, self._next = FreeSpace(), 0
+        for number in range(self._next, index + 1):
+            shot = recording.shots[number]
+            T_map_body = shot.T_map_camera @ T_camera_body
+            points = transform_points(T_map_body, shot.beams.points_body_m)
+            moving = self._free.contradicted(points)
+            still: Beams = shot.beams.take(~moving)
+            self._free.add(T_map_body[:3, 3], transform_points(T_map_body, still.points_body_m))
+        self._next = index + 1
+        if not moving.any():
+            return None
+        body = shot.beams.points_body_m[moving]
+        return ~body_mask(body, depth_m, recording.camera, recording.T_body_camera)

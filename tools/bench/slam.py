@@ -1,0 +1,116 @@
+"""The lidar SLAM on recordings with truth: accuracy and cost, each recording in a process of its own."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from beamsplat.common.errors import UserError
+from beamsplat.common.geometry.trajectory import read_tum
+
+# Mean absolute errors of Cartographer over the same relations as published (Hess et al. 2016, table II).
+CARTOGRAPHER = {"aces": (0.0375, 0.373), "intel": (0.0229, 0.453), "fr079": (0.0452, 0.538)}
+COLUMNS = (
+    "recording", "error, m", "error, deg", "Cartographer as published", "CPU ms a scan", "p95 of a step, ms",
+    "memory, MB",
+)  # fmt: skip
+COSTS = (("cpu_ms_per_scan", 1), ("step_p95_ms", 1), ("peak_rss_mb", 0))
+MOST_RISE_M, MOST_TILT_DEG = 0.2, 5.0
+MAP_PX = 480  # side of one picture in the deck
+
+
+def recordings_in(folder: Path) -> list[tuple[str, Path, list[str]]]:
+    """(name, recording, arguments of `eval slam`) of what has a truth: X.bag beside X.relations, and folders
+    with bag/ and groundtruth.txt that have a lidar. Raises UserError where there is none."""
+    found = [
+        (path.stem, path.with_suffix(".bag"), ["--relations", str(path)])
+        for path in sorted(folder.rglob("*.relations"))
+        if path.with_suffix(".bag").exists()
+    ]
+    found += [
+        (path.parent.name, path.parent / "bag", ["--groundtruth", str(path)])
+        for path in sorted(folder.rglob("groundtruth.txt"))
+        if (path.parent / "bag").exists()
+    ]
+    if not found:
+        raise UserError(f"{folder}: neither X.bag with X.relations nor bag/ with groundtruth.txt in it")
+    return found
+
+
+def bench_slam(folder: Path, out: Path, odometry: bool, say: Callable[[str], None]) -> list[dict[str, Any]]:
+    """One row for each recording; those without a lidar are said and left out."""
+    rows = []
+    for name, bag, truth in recordings_in(folder):
+        if truth[0] == "--groundtruth" and (why := _not_planar(Path(truth[1]))):
+            say(f"{name}: left out, {why}")
+            continue
+        say(f"{name} ...")
+        command = ["slam", str(bag), "--out", str(out / name), "--json"]
+        mapped = _beamsplat([*command, *([] if odometry else ["--no-odometry"])])
+        if mapped.returncode:
+            say(f"{name}: left out, {mapped.stderr.strip().splitlines()[-1]}")
+            continue
+        scored = _beamsplat(["eval", "slam", str(out / name), *truth, "--json"])
+        if scored.returncode:
+            raise UserError(f"{name}: {scored.stderr.strip()}")
+        rows.append({"name": name, **json.loads(mapped.stdout), **json.loads(scored.stdout)})
+    return rows
+
+
+def _not_planar(groundtruth: Path) -> str:
+    """Why a drive is none on a floor; a planar SLAM says nothing about a camera carried by hand."""
+    T_world_body = read_tum(groundtruth).T_a_b
+    rise_m = float(np.ptp(T_world_body[:, 2, 3]))
+    tilt_deg = float(np.degrees(np.arccos(np.clip(T_world_body[:, 2, 2].min(), -1.0, 1.0))))
+    if rise_m < MOST_RISE_M and tilt_deg < MOST_TILT_DEG:
+        return ""
+    return f"its body rises by {rise_m:.2f} m and tilts by {tilt_deg:.0f} degrees"
+
+
+def _beamsplat(arguments: list[str]) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "services", *arguments]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
+def markdown(rows: list[dict[str, Any]]) -> str:
+    """The table of the README."""
+    lines = [
+        "| " + " | ".join(COLUMNS) + " |",
+        "|---" * len(COLUMNS) + "|",
+    ]
+    for row in rows:
+        name = row["name"]
+        if "translation_mean_m" in row:
+            error = f"{row['translation_mean_m']:.4f} ± {row['translation_std_m']:.4f}"
+            turn = f"{row['rotation_mean_deg']:.3f}"
+        else:
+            error = f"{row['ate_first_pose_rmse_m']:.4f} (online {row['online_ate_first_pose_rmse_m']:.4f})"
+            turn = f"{np.degrees(row['yaw_rmse_rad']):.3f}"
+        theirs = "{:.4f} m, {:.3f}°".format(*CARTOGRAPHER[name]) if name in CARTOGRAPHER else ""
+        cost = [f"{row[key]:.{digits}f}" for key, digits in COSTS]
+        lines.append("| " + " | ".join([name, error, turn, theirs, *cost]) + " |")
+    return "\n".join(lines)
+
+
+def deck(out: Path, names: list[str], path: Path) -> None:
+    """The maps side by side, each with its name, as one JPEG."""
+    import cv2
+
+    tiles = []
+    for name in names:
+        picture = cv2.imread(str(out / name / "map.png"))
+        scale = (MAP_PX - 30) / max(picture.shape[:2])
+        small = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        tile = np.full((MAP_PX, MAP_PX, 3), 205, dtype=np.uint8)
+        top, left = 30 + (MAP_PX - 30 - small.shape[0]) // 2, (MAP_PX - small.shape[1]) // 2
+        tile[top : top + small.shape[0], left : left + small.shape[1]] = small
+        cv2.putText(tile, name, (12, 22), cv2.FONT_HERSHEY_SIMPLEX, 0.6, (40, 40, 40), 1, cv2.LINE_AA)
+        tiles.append(tile)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    cv2.imwrite(str(path), np.hstack(tiles), [cv2.IMWRITE_JPEG_QUALITY, 82])

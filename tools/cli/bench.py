@@ -1,0 +1,120 @@
+"""`beamsplat bench ...`: the figures of this machine, each beside a baseline of the same run."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+app = typer.Typer(no_args_is_help=True, help="Measure this machine; every figure has a baseline beside it.")
+console = Console(stderr=True)
+JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object")]
+
+
+@app.command()
+def bus(
+    seconds: Annotated[float, typer.Option(help="Length of each part")] = 10.0,
+    megabytes: Annotated[float, typer.Option(help="Size of a picture")] = 1.0,
+    port: Annotated[int, typer.Option(help="Port of the router this starts")] = 17447,
+    as_json: JsonOption = False,
+) -> None:
+    """Latency of pictures through the local router beside plain Zenoh; what a slow subscriber costs.
+
+    Example: beamsplat bench bus --seconds 20 --json
+    """
+    from beamsplat.tools.bench.bus import bench_bus
+
+    result = bench_bus(seconds, int(megabytes * 1e6), f"tcp/127.0.0.1:{port}", console.print)
+    if as_json:
+        print(json.dumps(result))
+        return
+    table = Table("figure", "value")
+    for name, value in result.items():
+        table.add_row(name, f"{value:.2f}" if isinstance(value, float) else str(value))
+    Console().print(table)
+
+
+@app.command()
+def slam(
+    data: Annotated[
+        Path, typer.Option(help="Folder with X.bag beside X.relations, bag/ beside groundtruth.txt")
+    ],
+    out: Annotated[Path, typer.Option(help="Folder for maps, trajectories and the deck of pictures")],
+    no_odometry: Annotated[bool, typer.Option("--no-odometry", help="Use the scans alone")] = False,
+    readme: Annotated[Path | None, typer.Option(help="Put the table between its marks in this file")] = None,
+    pictures: Annotated[Path | None, typer.Option(help="Where the deck of maps goes")] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Accuracy and cost of the lidar SLAM on recordings with truth, beside Cartographer's published figures.
+
+    Examples:
+
+        beamsplat bench slam --data logs --out out/slam
+
+        beamsplat bench slam --data logs --out out/slam --readme README.md --pictures docs/slam_maps.jpg
+    """
+    from beamsplat.tools.bench.readme import into_readme
+    from beamsplat.tools.bench.slam import bench_slam, deck, markdown
+
+    rows = bench_slam(data, out, not no_odometry, lambda text: console.print(text, highlight=False))
+    table = markdown(rows)
+    print(json.dumps(rows) if as_json else table)
+    if readme is not None:
+        into_readme(readme, "slam", table)
+    deck(out, [row["name"] for row in rows], pictures or out / "maps.jpg")
+
+
+@app.command()
+def paper(
+    data: Annotated[Path, typer.Option(help="Folder with bag/ and its truth, or a bag with poses in it")],
+    out: Annotated[Path, typer.Option(help="Folder for report.json and report.html")],
+    seeds: Annotated[int, typer.Option(min=1, help="Runs of each configuration")] = 1,
+    only: Annotated[list[str] | None, typer.Option(help="Only this configuration; repeatable")] = None,
+    recorded: Annotated[
+        Path | None, typer.Option(help="Depth maps by stamp, in the place of weights that are missing")
+    ] = None,
+    groundtruth: Annotated[Path | None, typer.Option(help="TUM file of the true body poses")] = None,
+    seconds: Annotated[float | None, typer.Option(help="Only so much of the recording")] = None,
+    refine_steps: Annotated[
+        int, typer.Option(min=0, help="Steps on the default configuration's map after the drive, 0.1 s each")
+    ] = 500,
+    readme: Annotated[Path | None, typer.Option(help="Put the table between its marks in this file")] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """The paper's six configurations and the default one, live at the recording's speed: its Tables I-IV.
+
+    A network whose weights are missing is replaced by FastDepth (or by --recorded), and named as what it is.
+
+    Examples:
+
+        beamsplat bench paper --data drive --out out/paper
+
+        beamsplat bench paper --data drive --out out/paper --only default --only monogs-lidar --seeds 3
+    """
+    from beamsplat.tools.bench.paper import bench_paper
+    from beamsplat.tools.bench.readme import into_readme, paper_table
+
+    report = bench_paper(
+        data, out, names=only, seeds=seeds, recorded=recorded, groundtruth=groundtruth, seconds=seconds,
+        refine_steps=refine_steps,
+        say=lambda text: console.print(text, markup=False, highlight=False, soft_wrap=True),
+    )  # fmt: skip
+    if readme is not None:
+        into_readme(readme, "paper", paper_table(report["configurations"]))
+    if as_json:
+        print(json.dumps(report))
+        return
+    keys = (
+        "position_rmse_m", "ate_sim3_rmse_m", "fps", "cpu_load_percent", "depth_rmse_scaled_m",
+        "psnr_offpath_db",
+    )  # fmt: skip
+    table = Table("configuration", *keys)
+    for row in report["configurations"]:
+        values = [row.get(key) for key in keys]
+        table.add_row(f"{row['name']} #{row['seed']}", *("-" if v is None else f"{v:.4g}" for v in values))
+    Console().print(table)
+    print(f"{out / 'report.html'}\n{out / 'report.json'}")

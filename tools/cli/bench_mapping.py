@@ -1,0 +1,113 @@
+"""`beamsplat bench raster` and `bench map`: the rasterizer's speed, what the mapper makes of a recording."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+console = Console(stderr=True)
+JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object")]
+
+
+def bench_raster(
+    gaussians: Annotated[int, typer.Option(min=1000, help="Gaussians in the synthetic room")] = 50_000,
+    repeats: Annotated[int, typer.Option(min=3, help="Timed runs; the median counts")] = 15,
+    as_json: JsonOption = False,
+) -> None:
+    """Forward + L1 + backward of the rasterizers, one and two threads, beside plain torch.
+
+    Example: beamsplat bench raster --json
+    """
+    from beamsplat.tools.bench.raster import bench_raster as run
+
+    result = run(gaussians, repeats, console.print)
+    if as_json:
+        print(json.dumps(result))
+        return
+    table = Table(
+        "backend", "size", "Gaussians", "threads", "forward ms", "total ms", "CPU ms", "best total ms"
+    )
+    for case in result["cases"]:
+        numbers = [f"{case[key]:.1f}" for key in ("forward_ms", "total_ms", "cpu_ms", "best_total_ms")]
+        size = f"{case['width']}x{case['height']}"
+        table.add_row(case["backend"], size, str(case["gaussians"]), str(case["threads"]), *numbers)
+    Console().print(table)
+
+
+def bench_map(
+    data: Annotated[Path, typer.Argument(help="Folder with bag/, groundtruth.txt and the held-out truth")],
+    prior: Annotated[
+        str,
+        typer.Option(help="Depth of the keyframes: field (the fusion's), stixel (beams and floor) or truth"),
+    ] = "field",
+    source: Annotated[str, typer.Option(help="Depth source that the fusion starts from (field)")] = "stixel",
+    refine_s: Annotated[float, typer.Option(min=0.0, help="Refinement after the drive, in seconds")] = 60.0,
+    count_cpu: Annotated[
+        bool, typer.Option("--count-cpu", help="Count those in CPU seconds a thread: on a busy machine")
+    ] = False,
+    threads: Annotated[int, typer.Option(min=1, help="Threads of the rasterizer")] = 2,
+    distance_m: Annotated[float, typer.Option(min=0.01, help="Motion between keyframes")] = 0.25,
+    angle_rad: Annotated[float, typer.Option(min=0.01, help="Turn between keyframes")] = 0.22,
+    refine_pose: Annotated[bool, typer.Option("--refine-pose", help="The mapper refines poses")] = False,
+    refine_exposure: Annotated[
+        bool, typer.Option("--refine-exposure", help="The mapper refines each picture's brightness")
+    ] = False,
+    seed: Annotated[int, typer.Option(help="Seed of the mapper")] = 0,
+    jump: Annotated[
+        bool, typer.Option("--jump", help="Misplace half of the keyframes by 1 m and 10 deg until the end")
+    ] = False,
+    settle_steps: Annotated[
+        int, typer.Option(min=0, help="Steps at the end of the drive, before the first scoring")
+    ] = 0,
+    movers: Annotated[
+        bool, typer.Option("--movers", help="Mask people and carts that the beams show")
+    ] = False,
+    out: Annotated[
+        Path | None, typer.Option(help="Write pictures and the map (.ply) into this folder")
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """A map from true poses: PSNR, SSIM and depth at views that it never saw, online and refined.
+
+    Examples:
+
+        beamsplat bench map ../shared/data/house_a --json
+
+        beamsplat bench map ../shared/data/house_a --prior truth --refine-s 0 --jump --settle-steps 300
+    """
+    import cv2
+
+    from beamsplat.services.mapping.settings import MapperSettings
+    from beamsplat.tools.bench.fused_prior import FieldPrior, MoverMasks
+    from beamsplat.tools.bench.mapping import MapBench, run_bench
+
+    cv2.setNumThreads(1)
+    bench = MapBench(
+        prior=prior, threads=threads, seed=seed, refine_s=refine_s, count_cpu=count_cpu, jump=jump,
+        settle_steps=settle_steps, distance_m=distance_m, angle_rad=angle_rad,
+        settings=MapperSettings(refine_pose=refine_pose, refine_exposure=refine_exposure),
+    )  # fmt: skip
+    field = FieldPrior(source) if prior == "field" else None
+    result = run_bench(data, bench, console.print, out, field, MoverMasks() if movers else None)
+    if as_json:
+        print(json.dumps(result))
+        return
+    _print_scores(result)
+
+
+def _print_scores(result: dict[str, Any]) -> None:
+    table = Table("figure", "online", "refined")
+    for key in result["online"]:
+        shown = (result[part][key] for part in ("online", "refined"))
+        table.add_row(key, *("-" if value is None else f"{value:.3f}" for value in shown))
+    screen = Console()
+    screen.print(table)
+    for key in ("keyframes", "refused", "data_s", "wall_s", "cpu_s", "steps", "refine_steps", "peak_rss_mb"):
+        screen.print(
+            f"{key}: {result[key]:.1f}" if isinstance(result[key], float) else f"{key}: {result[key]}"
+        )

@@ -1,0 +1,189 @@
+"""`beamsplat demo`: the whole system on a simulated drive, or on a recording of your own."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import psutil
+import typer
+from rich.console import Console
+
+from beamsplat.common.config.deployment import load_deployment
+from beamsplat.common.errors import UserError
+from beamsplat.common.files.persist import write_atomically
+from beamsplat.common.files.resources import shipped_file
+from beamsplat.tools.cli.memory_option import MemoryOption, memory_overrides
+
+if TYPE_CHECKING:
+    from beamsplat.tools.report.observer import Costs, Seen
+    from beamsplat.tools.system.supervisor import Supervisor
+
+DEPLOYMENT = shipped_file("demo.toml")
+console = Console(stderr=True)
+_CORES_OF_OTHERS = 0.4  # taken by other programs: figures suffer, which is said
+SHOWN = (
+    ("keyframes", "keyframes", 0, ""), ("gaussians", "Gaussians", 0, ""),
+    ("psnr_keyframes_db", "PSNR at keyframes", 1, " dB"), ("psnr_offpath_db", "off the path", 1, " dB"),
+    ("ate_first_pose_rmse_m", "position error", 3, " m"), ("fps", "pictures through the system", 1, "/s"),
+    ("keyframe_latency_p95_ms", "keyframe latency p95", 0, " ms"),
+    ("cpu_load_percent", "CPU", 0, " %"), ("peak_rss_mb", "memory", 0, " MB"),
+)  # fmt: skip
+POSE_FIGURES = frozenset({
+    "position_rmse_m", "position_rmse_xyz_m", "orientation_rmse_rad", "orientation_rmse_rpy_rad",
+    "ate_first_pose_rmse_m", "ate_se3_rmse_m", "ate_sim3_rmse_m", "sim3_scale",
+})  # fmt: skip
+
+
+def demo(
+    out: Annotated[Path, typer.Option(help="Folder for everything the demo makes")] = Path("out/demo"),
+    data: Annotated[Path | None, typer.Option(help="Your own bag, recording or folder")] = None,
+    seconds: Annotated[float, typer.Option(help="Length of the simulated drive")] = 30.0,
+    rate: Annotated[float, typer.Option(help="Times real time")] = 1.0,
+    view: Annotated[str, typer.Option(help="none, spawn (a window) or serve (a web viewer)")] = "none",
+    set_: Annotated[
+        list[str] | None, typer.Option("--set", metavar="NODE.OPTION=VALUE", help="Override an option")
+    ] = None,
+    memory: MemoryOption = None,
+) -> None:
+    """Simulates a drive through a furnished home, runs the system on it live, watches and records it.
+
+    Examples:
+
+        beamsplat demo
+
+        beamsplat demo --data drive/bag --view spawn
+    """
+    from beamsplat.tools.cli.system import run_checked
+    from beamsplat.tools.report.observer import Observer
+
+    out.mkdir(parents=True, exist_ok=True)
+    source = data if data is not None else _simulated(out, seconds)
+    for old in ("recording", "map", "session"):
+        shutil.rmtree(out / old, ignore_errors=True)
+    for old in ("demo.rrd", "map.png", "trajectory.tum", "report.html", "report.json"):
+        (out / old).unlink(missing_ok=True)
+    overrides = (
+        f"replay.data={json.dumps(str(source))}",
+        f"recorder.out={json.dumps(str(out / 'recording'))}",
+        f"monitor.save={json.dumps(str(out / 'demo.rrd'))}",
+        f"monitor.view={json.dumps(view)}",
+        f"mapping.save={json.dumps(str(out / 'map'))}",
+        f"mapping.session={json.dumps(str(out / 'session'))}",
+        f"rate={rate}",
+        *memory_overrides(memory),
+        *(set_ or ()),
+    )
+    deployment = load_deployment(DEPLOYMENT, overrides)
+    seen_by: list[Observer] = []
+
+    def beside(supervisor: Supervisor) -> Observer:
+        seen_by.append(Observer(supervisor, deployment, _truth_stamps(source)))
+        return seen_by[0]
+
+    busy_s, began = _busy_s(), time.monotonic()
+    run_checked(deployment, beside=beside)
+    costs = seen_by[0].costs
+    others_s = _busy_s() - busy_s - costs.startup_cpu_s - sum(costs.cpu_s.values())
+    console.print("the drive has ended; writing the report")
+    figures = write_results(out, source, seen_by[0].seen, costs)
+    _say_where(out, source, figures)
+    cores = others_s / (time.monotonic() - began)
+    if cores > _CORES_OF_OTHERS:
+        console.print(
+            f"Other programs took {cores:.1f} of {os.cpu_count()} CPU cores meanwhile: on an idle machine "
+            "more pictures get through, sooner, and the map is better."
+        )
+
+
+def _busy_s() -> float:
+    """CPU seconds that this machine has spent on anything."""
+    times = psutil.cpu_times()
+    return sum(times) - times.idle - getattr(times, "iowait", 0.0) - getattr(times, "guest", 0.0)
+
+
+def _simulated(out: Path, seconds: float) -> Path:
+    """The bag of a drive simulated into `out`, made anew only if its length differs."""
+    from beamsplat.tools.cli.simulate import simulate
+
+    folder = out / f"simulated-{seconds:g}s"
+    if not folder.exists():  # the simulator leaves a whole folder or none
+        simulate(folder, seconds=seconds)
+    return folder / "bag"
+
+
+def _truth_stamps(source: Path) -> frozenset[int]:
+    from beamsplat.tools.evaluation.evaluate import read_truth
+    from beamsplat.tools.report.map_scores import truth_folder
+
+    try:
+        return frozenset(read_truth(truth_folder(source)))
+    except UserError:
+        return frozenset()
+
+
+def write_results(out: Path, source: Path, seen: Seen, costs: Costs) -> dict[str, Any]:
+    """trajectory.tum, and where there were pictures: map.png, report.html, report.json. Gives the figures.
+
+    Errors are against the recording's own truth (groundtruth.txt beside the bag, or poses in it); without
+    one they are left out.
+    """
+    import cv2
+    import numpy as np
+
+    from beamsplat.common.geometry.trajectory import Trajectory, write_tum
+
+    poses = [(stamp_ns, T) for stamp_ns, T, status, _ in seen.poses if status == "ok"]
+    if not poses:
+        return {}
+    stamps_ns, T_map_body = np.array([s for s, _ in poses]), np.array([T for _, T in poses])
+    order = np.argsort(stamps_ns, kind="stable")
+    trajectory = Trajectory(stamps_ns[order], T_map_body[order])
+    write_tum(out / "trajectory.tum", trajectory, "T_map_body as it was said live")
+    if not seen.images:
+        return {}
+    from beamsplat.tools.bench.paper import one_row_report, open_truth, score
+    from beamsplat.tools.evaluation.drive import has_poses
+    from beamsplat.tools.report.html import write_report
+
+    known = has_poses(source)
+    truth = open_truth(source, None if known else out / "trajectory.tum")
+    row = score(seen, costs, truth)
+    if not known:
+        row = {name: value for name, value in row.items() if name not in POSE_FIGURES}
+    if row["pictures"]["above"] is not None:
+        cv2.imwrite(str(out / "map.png"), row["pictures"]["above"])
+    report = one_row_report("demo", "lidar + fused depth", source, truth, row)
+    write_report(out / "report.html", report, truth, paper=False)
+    figures = {name: value for name, value in row.items() if name != "pictures"}
+    write_atomically(out / "report.json", json.dumps(figures, indent=1).encode())
+    return figures
+
+
+def _say_where(out: Path, source: Path, figures: dict[str, Any]) -> None:
+    rows = [
+        (source, "the drive: camera, lidar, wheels"),
+        (out / "report.html", "what came of it: open it in a browser"),
+        (out / "map" / "splats.ply", "the map: opens in viewers of 3D Gaussian splats"),
+        (out / "map.png", "the map from above"),
+        (out / "trajectory.tum", "where the robot was"),
+        (out / "session", "the map to go on with, export, render: beamsplat session info, export, render"),
+        (out / "demo.rrd", "what the monitor saw: rerun FILE"),
+        (out / "recording", "what went over the bus: Foxglove, `ros2 bag`, beamsplat info"),
+    ]
+    there = [(str(path), what) for path, what in rows if path.exists()]  # no camera, no map
+    wide = max(len(path) for path, _ in there)
+    print("\n".join(f"{path:{wide}}  {what}" for path, what in there))
+    for path in (out / "recording", out / "demo.rrd"):
+        if not path.exists():
+            raise UserError(f"{path} was not written: the node's log in the state folder says why")
+    said = [
+        f"{text} {figures[name]:.{digits}f}{unit}"
+        for name, text, digits, unit in SHOWN
+        if figures.get(name) is not None
+    ]
+    print(", ".join(said))

@@ -1,0 +1,184 @@
+"""Commands `beamsplat depth`, `eval depth`, `bench depth`, and `models list | pull | check`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from beamsplat.common.errors import UserError
+
+if TYPE_CHECKING:
+    from beamsplat.tools.evaluation.drive import Drive
+
+# OpenCV, Numba and onnxruntime are imported where they are used: every other command starts without them.
+
+BagArgument = Annotated[Path, typer.Argument(help="A bag or recording, or a folder with bag/ in it.")]
+PosesOption = Annotated[
+    Path | None,
+    typer.Option(help="TUM file of T_map_body; default: poses in the recording, else our lidar SLAM's."),
+]
+SourceOption = Annotated[str, typer.Option(help="Depth source, by name.")]
+SetOption = Annotated[
+    list[str] | None, typer.Option("--set", metavar="OPTION=VALUE", help="Option of the source; repeatable")
+]
+RigOption = Annotated[Path | None, typer.Option(help="A rig file that wins over the calibration inside.")]
+FloorOption = Annotated[
+    bool | None,
+    typer.Option("--floor/--no-floor", help="The camera's height is known; default: if the poses are level."),
+]
+JsonOption = Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")]
+
+
+def eval_depth(
+    bag: BagArgument,
+    truth: Annotated[Path, typer.Option(help="Folder of <stamp_ns>.png, or with depth_gt/ in it.")],
+    poses: PosesOption = None,
+    source: SourceOption = "stixel",
+    set_: SetOption = None,
+    rig: RigOption = None,
+    floor: FloorOption = None,
+    heldout: Annotated[bool, typer.Option(help="Also play twice more with beams held out.")] = True,
+    as_json: JsonOption = False,
+) -> None:
+    """Errors of depth against dense truth and against held-out beams, for every method.
+
+    Examples:
+
+        beamsplat eval depth drive --truth drive/depth_gt
+
+        beamsplat eval depth drive --truth drive/depth_gt --source stixel --json
+    """
+    import cv2
+
+    from beamsplat.services.depth.source import make_source
+    from beamsplat.tools.evaluation.evaluate import evaluate, read_truth
+
+    cv2.setNumThreads(1)  # CPU times are those of one core
+    drive = _open(bag, poses, rig)
+    with _progress() as bar:
+        task = bar.add_task("", total=None)
+        report = evaluate(
+            drive, make_source(source, options_of(set_)), read_truth(truth), heldout=heldout, floor=floor,
+            progress=lambda run, done, total: bar.update(
+                task, description=run, completed=done, total=total
+            ),
+        )  # fmt: skip
+    report["source"] = source
+    if as_json:
+        print(json.dumps(report))
+    else:
+        _print_report(report)
+
+
+def depth(
+    data: Annotated[Path, typer.Argument(help="A bag, recording or folder; or one picture (.jpg, .png).")],
+    out: Annotated[Path, typer.Option(help="Folder for the pictures.")],
+    poses: PosesOption = None,
+    source: SourceOption = "stixel",
+    set_: SetOption = None,
+    rig: RigOption = None,
+    floor: FloorOption = None,
+    truth: Annotated[Path | None, typer.Option(help="Folder of truth, shown beside.")] = None,
+    every: Annotated[int, typer.Option(min=1, help="Each n-th picture.")] = 8,
+) -> None:
+    """Pictures side by side: image with beams, raw depth, corrected depth, sigma, and truth if there is any.
+
+    Examples:
+
+        beamsplat depth drive --out pictures --poses out/trajectory.tum
+
+        beamsplat depth photo.jpg --out pictures --rig rig.toml
+    """
+    from beamsplat.services.depth.source import make_source
+    from beamsplat.tools.evaluation.pictures import draw_drive, draw_image
+
+    chosen = make_source(source, options_of(set_))
+    out.mkdir(parents=True, exist_ok=True)
+    if data.is_file() and data.suffix.lower() in (".jpg", ".jpeg", ".png"):
+        print(draw_image(data, chosen, rig, out))
+        return
+    drive = _open(data, poses, rig)
+    with _progress() as bar:
+        task = bar.add_task("pictures", total=None)
+        count = 0
+        for count, (_, total) in enumerate(draw_drive(drive, chosen, truth, every, out, floor), start=1):
+            bar.update(task, completed=count, total=total)
+    print(f"{count} pictures in {out}")
+
+
+def bench_depth(
+    source: SourceOption = "stixel",
+    frames: Annotated[int, typer.Option(min=5, help="Frames timed.")] = 60,
+    as_json: JsonOption = False,
+) -> None:
+    """CPU milliseconds per 640x480 picture: the bare source, fusion of a picture, fusion of a keyframe.
+
+    Example: beamsplat bench depth --source stixel
+    """
+    from beamsplat.tools.bench.depth import bench
+
+    figures = bench(source, frames)
+    if as_json:
+        print(json.dumps(figures))
+        return
+    for name, value in figures.items():
+        print(f"{name}: {value:.1f}" if isinstance(value, float) else f"{name}: {value}")
+
+
+def options_of(pairs: list[str] | None) -> dict[str, Any]:
+    """Options `name=value` of a depth source; values are TOML where they parse as such.
+
+    Raises:
+        UserError: not of that form.
+    """
+    import tomllib
+
+    options: dict[str, Any] = {}
+    for pair in pairs or []:
+        name, equals, text = pair.partition("=")
+        if not equals or not name.isidentifier():
+            raise UserError(f"--set {pair!r}: expected OPTION=VALUE, for example model=my.onnx")
+        try:
+            options[name] = tomllib.loads(f"v = {text}")["v"]
+        except tomllib.TOMLDecodeError:
+            options[name] = text
+    return options
+
+
+def _open(bag: Path, poses: Path | None, rig: Path | None) -> Drive:
+    from beamsplat.tools.evaluation.drive import open_drive
+
+    return open_drive(bag, poses, rig)
+
+
+def _progress() -> Progress:
+    return Progress(
+        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
+        console=Console(stderr=True),
+    )  # fmt: skip
+
+
+def _print_report(report: dict[str, Any]) -> None:
+    names = [name for name, entry in report.items() if isinstance(entry, dict) and "rmse_m" in entry]
+    keys = (
+        "rmse_m", "absrel", "delta1", "coverage", "beams_rmse_m", "heldout_median_m", "heldout_p90_m",
+        "heldout_excluded", "heldout_blocks_median_m", "within_1sigma", "within_3sigma",
+        "dense_within_1sigma", "dense_within_3sigma", "sigma_median_m", "frames", "frames_refused",
+    )  # fmt: skip
+    table = Table(title=f"default {report['default']}, source {report['source']}, {report['poses']}")
+    table.add_column("")
+    for name in names:
+        table.add_column(name, justify="right")
+    for key in keys:
+        values = [report[name].get(key) for name in names]
+        table.add_row(
+            key, *("-" if v is None else f"{v:.3f}" if isinstance(v, float) else str(v) for v in values)
+        )
+    Console().print(table)
+    print("CPU ms per picture: " + ", ".join(f"{k} {v:.1f}" for k, v in report["cpu_ms"].items()))

@@ -1,0 +1,313 @@
+"""`beamsplat export` and `beamsplat render`: saved maps as files that others open, and as pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+
+from beamsplat.common.errors import UserError, reason
+
+console = Console(stderr=True)
+FORMATS = {
+    "ply": "map.ply", "gltf": "map.glb", "spz": "map.spz", "points": "points.ply", "mesh": "mesh.ply",
+    "nav2": "nav2",
+}  # fmt: skip
+SessionArgument = Annotated[
+    Path,
+    typer.Argument(
+        help="Folder written by `mapping.session = DIR`; or the deployment file (.toml) of a running system, "
+        "whose mapper is asked"
+    ),
+]
+ThreadsOption = Annotated[int, typer.Option(min=1, help="Threads of the rasterizer")]
+_RESOLUTION_M = 0.05
+_LEAST_FACES = 60  # of a piece of mesh: less is a crumb
+_PATIENCE_S = 120.0  # of a mapper that has a keyframe in hand, over a slow link
+_LATCHED_S = 2.0
+_VIEWS = 12  # from which the cost of leaving detail out is measured
+
+
+def export(
+    session: SessionArgument,
+    to: Annotated[str, typer.Option(help=f"One of {', '.join(FORMATS)}")],
+    out: Annotated[
+        Path | None,
+        typer.Option(help="File (nav2: folder); default: named after the format, in the session, or here"),
+    ] = None,
+    detail_m: Annotated[
+        float, typer.Option(min=0.0, help="ply, gltf, spz: Gaussians in a cell of that edge become one")
+    ] = 0.0,
+    cell_m: Annotated[float, typer.Option(min=0.002, help="points: between points")] = 0.02,
+    voxel_m: Annotated[float, typer.Option(min=0.005, help="mesh: finest detail")] = 0.04,
+    low_m: Annotated[float, typer.Option(help="nav2: what stands higher than this is in the way")] = 0.10,
+    high_m: Annotated[float, typer.Option(help="nav2: what hangs higher than this is not")] = 1.50,
+    threads: ThreadsOption = 2,
+) -> None:
+    """Writes a map for other programs; at any time, also while it is being made.
+
+    ply: 3DGS layout. gltf: .glb with KHR_gaussian_splatting. spz: Niantic's, small. points: coloured points.
+    mesh: coloured triangles. nav2: map.yaml (both), lidar.yaml, camera.yaml (what the lidar's plane misses).
+    ply, points, mesh and nav2 have z up, gltf and spz y up; all are in metres.
+
+    Examples:
+
+        beamsplat export map --to spz
+
+        beamsplat export map --to mesh --voxel-m 0.03 --out house.ply
+
+        beamsplat export deploy/demo.toml --to spz --detail-m 0.04 --out far.spz
+    """
+    from beamsplat.common.mapfiles.state import store_of
+
+    if to not in FORMATS:
+        raise UserError(f"--to {to!r}: there are {', '.join(FORMATS)}")
+    path = out or (Path() if _running(session) else session) / FORMATS[to]
+    ending = Path(FORMATS[to]).suffix
+    if path.suffix != ending:
+        expected = f"a name ending in {ending}" if ending else "a folder, which has no ending"
+        raise UserError(f"--out {path}: expected {expected} for --to {to}")
+    arrays, lidar = _open(session)
+    store = store_of(arrays)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if to in ("ply", "gltf", "spz"):
+            text = _gaussians(path, to, store, arrays, detail_m, threads)
+        elif to == "points":
+            text = _points(path, store, arrays, cell_m, threads)
+        elif to == "mesh":
+            text = _mesh(path, store, arrays, voxel_m, threads)
+        else:
+            text = _nav2(path, lidar, store, arrays, (low_m, high_m), threads)
+    except (OSError, ValueError) as error:
+        if isinstance(error, UserError):
+            raise
+        raise UserError(f"{path}: {reason(error)}") from error
+    print(f"{path}: {text}")
+
+
+def _running(session: Path) -> bool:
+    return session.suffix == ".toml"
+
+
+def _open(session: Path) -> tuple[dict[str, Any], Callable[[], Any]]:
+    """(arrays of the map's state, what gives the lidar's OccupancyGrid or None), from disk or a mapper."""
+    if _running(session):
+        return _asked(session)
+    from beamsplat.common.mapfiles.session import SessionFolder
+    from beamsplat.tools.cli.session import ROBOT_MANIFEST, load_slam
+
+    folder = SessionFolder(session)
+    arrays = folder.read_state()
+    if arrays is None:
+        raise UserError(f"{session}: nothing has been saved in this session yet")
+    there = (folder.robot / ROBOT_MANIFEST).is_file()
+    return arrays, lambda: load_slam(folder.robot).grid(_RESOLUTION_M) if there else None
+
+
+def _asked(file: Path) -> tuple[dict[str, Any], Callable[[], Any]]:
+    from beamsplat.common.config.deployment import load_deployment
+    from beamsplat.common.security.logins import OPERATOR, login_of
+    from beamsplat.common.zenoh.bus import open_session
+    from beamsplat.common.zenoh.queries import ask
+    from beamsplat.services.mapping.messages import joined_state
+
+    deployment = load_deployment(file)
+    login = login_of(deployment.security, OPERATOR)
+    with open_session(deployment.router.listen, 2.0, login=login) as session:
+        arrays = joined_state(list(ask(session, deployment.robot, "mapping", "state", {}, _PATIENCE_S)))
+        grid = _latched_grid(session, deployment.robot)
+    return arrays, lambda: grid
+
+
+def _latched_grid(session: Any, robot: str) -> Any:
+    """The lidar's OccupancyGrid as localization said it last; None where none comes."""
+    import queue
+
+    from beamsplat.common.topics import topic
+    from beamsplat.common.zenoh.bus import key
+    from beamsplat.common.zenoh.streams import declare_reader, open_sample
+    from beamsplat.services.localization.lidar2d.occupancy import OccupancyGrid
+
+    row, said = topic("localization/grid"), queue.SimpleQueue()
+    _kept = declare_reader(session, key(robot, row.name), row, "latched", said.put)
+    try:
+        grid = open_sample(said.get(timeout=_LATCHED_S), row).message
+    except queue.Empty:
+        return None
+    return OccupancyGrid(grid.occupancy, *map(float, grid.origin_m), grid.resolution_m)
+
+
+def _gaussians(path: Path, to: str, store: Any, arrays: dict[str, Any], detail_m: float, threads: int) -> str:
+    from beamsplat.common.mapfiles.detail import coarser
+
+    whole = store.params[:, : store.count]
+    params = coarser(whole, detail_m)
+    _writer(to)(path, params)
+    text = f"{params.shape[1]} Gaussians"
+    if params is whole:
+        return text
+    psnr_db = _cost_db(store, params, arrays, threads)
+    return f"{text} for {store.count}; {psnr_db:.1f} dB to the whole map, from the drive's own views"
+
+
+def _cost_db(store: Any, params: Any, arrays: dict[str, Any], threads: int) -> float:
+    """Mean PSNR of coarse Gaussians against all of them."""
+    import numpy as np
+
+    from beamsplat.common.mapfiles.film import pictures
+    from beamsplat.common.mapfiles.scores import psnr_db
+    from beamsplat.common.mapfiles.state import views_of
+    from beamsplat.common.mapfiles.store import GaussianStore
+
+    views = views_of(arrays)
+    views = views[:: -(-len(views) // _VIEWS) or 1]
+    if not views:
+        return float("nan")
+    coarse, poses = GaussianStore(), [view.T_map_camera for view in views]
+    coarse.add(params, 0)
+    pairs = zip(*(pictures(s, views[0].camera, poses, threads) for s in (store, coarse)))
+    return float(np.mean([psnr_db(a / 255.0, b / 255.0) for a, b in pairs]))
+
+
+def _writer(to: str) -> Any:
+    if to == "ply":
+        from beamsplat.common.mapfiles.ply import write_gaussian_ply as write
+    elif to == "gltf":
+        from beamsplat.common.mapfiles.gltf import write_gltf as write
+    else:
+        from beamsplat.common.mapfiles.spz import write_spz as write
+    return write
+
+
+def _views(store: Any, arrays: dict[str, Any], threads: int) -> Any:
+    """The map's rendered depth from all keyframes, with a bar."""
+    from rich.progress import track
+
+    from beamsplat.common.mapfiles.state import views_of
+    from beamsplat.common.mapfiles.surface import rendered_views
+
+    views = [(view.camera, view.T_map_camera) for view in views_of(arrays)]
+    if not views:
+        raise UserError("the session has no keyframes to look from")
+    rendered = rendered_views(store, views, threads)
+    return track(rendered, "looking", len(views), console=console, transient=True)
+
+
+def _points(path: Path, store: Any, arrays: dict[str, Any], cell_m: float, threads: int) -> str:
+    from beamsplat.common.mapfiles.surface import surface_points, write_ply
+
+    points, colours = surface_points(_views(store, arrays, threads), cell_m)
+    write_ply(path, points, colours)
+    return f"{len(points)} points"
+
+
+def _mesh(path: Path, store: Any, arrays: dict[str, Any], voxel_m: float, threads: int) -> str:
+    import numpy as np
+
+    from beamsplat.common.mapfiles.mesh import DistanceField, surface_nets, without_crumbs
+    from beamsplat.common.mapfiles.surface import points_of, write_ply
+
+    views = list(_views(store, arrays, threads))
+    corners = []
+    for view in views:
+        points = points_of(view)[0]
+        if len(points):
+            corners += [points.min(axis=0), points.max(axis=0)]
+    if not corners:
+        raise UserError("the map shows no surface from its keyframes")
+    # The rare pixel that looks out of a window must not make the field large.
+    low, high = np.percentile(corners, 5.0, axis=0), np.percentile(corners, 95.0, axis=0)
+    field = DistanceField.around(low, high, voxel_m)
+    field.add(views)
+    mesh = without_crumbs(surface_nets(field), _LEAST_FACES)
+    write_ply(path, mesh.vertices_m, mesh.colours, mesh.faces)
+    return f"{len(mesh.faces)} triangles"
+
+
+def _nav2(
+    path: Path,
+    lidar_grid: Callable[[], Any],
+    store: Any,
+    arrays: dict[str, Any],
+    band_m: tuple[float, float],
+    threads: int,
+) -> str:
+    from beamsplat.common.mapfiles.nav2 import camera_layer, combined, grid_around
+    from beamsplat.common.mapfiles.surface import surface_points
+    from beamsplat.services.localization.lidar2d.occupancy import FREE, OCCUPIED, OccupancyGrid, save_nav2
+
+    points, _ = surface_points(_views(store, arrays, threads), 0.4 * _RESOLUTION_M)
+    if len(points) == 0:
+        raise UserError("the map shows no surface from its keyframes")
+    lidar = lidar_grid()
+    if lidar is None:
+        origin, shape = grid_around(points, _RESOLUTION_M)
+        camera = camera_layer(points, origin, shape, _RESOLUTION_M, *band_m)
+        save_nav2(OccupancyGrid(camera, *origin, _RESOLUTION_M), path, "camera")
+        save_nav2(OccupancyGrid(camera, *origin, _RESOLUTION_M), path)
+        return "map.yaml, camera.yaml (no lidar layer: `beamsplat session join` puts the robot's half in)"
+    origin, cell_m = (lidar.origin_x_m, lidar.origin_y_m), lidar.resolution_m
+    camera = camera_layer(points, origin, lidar.values.shape, cell_m, *band_m)
+    both = combined(lidar.values, camera, OCCUPIED, FREE)
+    for name, values in (("map", both), ("lidar", lidar.values), ("camera", camera)):
+        save_nav2(OccupancyGrid(values, *origin, cell_m), path, name)
+    return "map.yaml, lidar.yaml, camera.yaml"
+
+
+def render(
+    session: SessionArgument,
+    path: Annotated[str, typer.Option(help="orbit, drive, or a TUM file of body poses in the map")],
+    out: Annotated[Path, typer.Option(help="NAME.mp4, or NAME.png for pictures")],
+    seconds: Annotated[float, typer.Option(min=0.1, help="How long the video is")] = 10.0,
+    fps: Annotated[float, typer.Option(min=1.0, help="Pictures a second")] = 30.0,
+    width: Annotated[int, typer.Option(min=0, help="Pixels; 0: as the keyframes")] = 0,
+    threads: ThreadsOption = 2,
+) -> None:
+    """Films a map: round it, along its own drive, or along a path of yours.
+
+    Examples:
+
+        beamsplat render map --path drive --out drive.mp4
+
+        beamsplat render map --path orbit --seconds 1 --fps 8 --out round.png
+    """
+    from rich.progress import track
+
+    from beamsplat.common.mapfiles.film import pictures, write_film
+    from beamsplat.common.mapfiles.state import store_of, views_of
+
+    arrays, _ = _open(session)
+    views, store = views_of(arrays), store_of(arrays)
+    if not views:
+        raise UserError(f"{session}: has no keyframes, so no camera to film with")
+    frames = max(round(seconds * fps), 1)
+    camera = views[0].camera
+    if width:
+        camera = camera.resized(width, round(width * camera.height_px / camera.width_px))
+    poses = _poses(path, store, arrays, views, frames)
+    bar = track(
+        pictures(store, camera, poses, threads), "rendering", len(poses), console=console, transient=True
+    )
+    written = write_film(out, bar, fps, len(poses))
+    print(f"{written[0]}: {len(poses)} pictures of {camera.width_px}x{camera.height_px}")
+
+
+def _poses(path: str, store: Any, arrays: dict[str, Any], views: list[Any], frames: int) -> Any:
+    import numpy as np
+
+    from beamsplat.common.geometry.trajectory import read_tum
+    from beamsplat.common.geometry.transforms import inverse
+    from beamsplat.common.mapfiles.film import along, drive, orbit
+
+    if path == "orbit":
+        return orbit(store, float(np.median([view.T_map_camera[2, 3] for view in views])), frames)
+    if path == "drive":
+        return drive([view.T_map_camera for view in views], frames)
+    trajectory = read_tum(Path(path))
+    if len(trajectory) == 0:
+        raise UserError(f"{path}: has no poses")
+    return along(trajectory, inverse(arrays["extra_taken_T_camera_body"][0]), frames)

@@ -1,0 +1,83 @@
+"""Commands `beamsplat models list | pull | check`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TransferSpeedColumn
+from rich.table import Table
+
+app = typer.Typer(no_args_is_help=True, help="Depth networks: what there is, fetching one, checking a file.")
+
+
+@app.command("list")
+def list_models(
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")] = False,
+) -> None:
+    """All known models: licence, whether the file is here, where it comes from.
+
+    Example: beamsplat models list
+    """
+    from beamsplat.services.depth.models import installed, read_table
+
+    rows = read_table()
+    if as_json:
+        print(json.dumps({n: {**r.model_dump(), "file": str(installed(n) or "")} for n, r in rows.items()}))
+        return
+    table = Table()
+    for title in ("name", "source", "licence", "here", "to get it"):
+        table.add_column(title, overflow="fold")
+    for name, row in rows.items():
+        where = installed(name)
+        way = f"beamsplat models pull {name}" if row.url else row.how
+        licence = row.licence if row.commercial else f"{row.licence} (not commercial)"
+        table.add_row(name, row.source, licence, str(where) if where else "-", way)
+    Console().print(table)
+
+
+@app.command("pull")
+def pull_model(
+    name: Annotated[str, typer.Argument(help="A name from `beamsplat models list`.")],
+    yes: Annotated[bool, typer.Option("--yes", help="Accept licence and unverified file unasked.")] = False,
+) -> None:
+    """Fetches a model into the first folder of BEAMSPLAT_MODELS, or the user's data folder.
+
+    An interrupted download goes on where it stopped; the digest is checked before the file is used.
+
+    Example: beamsplat models pull depth_anything_v2_small
+    """
+    from beamsplat.services.depth.models import pull, read_table, row_of
+
+    row = row_of(name, read_table())
+    bar = Progress(
+        TextColumn(name), BarColumn(), DownloadColumn(), TransferSpeedColumn(), console=Console(stderr=True)
+    )
+    task = bar.add_task("", total=None)
+
+    def agree(question: str) -> bool:
+        bar.stop()
+        return yes or typer.confirm(question, err=True)
+
+    def progress(done: int, total: int | None) -> None:
+        bar.start()
+        bar.update(task, completed=done, total=total)
+
+    try:
+        print(pull(name, row, agree, progress))
+    finally:
+        bar.stop()
+
+
+@app.command("check")
+def check_model(file: Annotated[Path, typer.Argument(help="A file, or a name that is installed.")]) -> None:
+    """What a model file is: digest, ports, execution providers.
+
+    Example: beamsplat models check my.onnx
+    """
+    from beamsplat.services.depth.models import check, read_table
+
+    print(json.dumps(check(file, read_table()), indent=2))

@@ -1,0 +1,102 @@
+"""`beamsplat eval relocalize`: how often single scans find their place in a saved map, and how fast."""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from rich.progress import track
+
+from beamsplat.common.errors import UserError
+from beamsplat.tools.cli.slam import JsonOption, console, poses_of, print_figures
+
+NEAR_M, NEAR_DEG = 0.10, 2.0  # an answer this good is right
+SURE = 0.5  # confidence from which an answer is used
+
+
+def eval_relocalize(
+    folder: Annotated[Path, typer.Argument(help="Folder written by `beamsplat slam`")],
+    bag: Annotated[Path, typer.Argument(help="Bag or recording the scans are taken from")],
+    scans: Annotated[int, typer.Option(help="Scans drawn at random")] = 100,
+    seed: Annotated[int, typer.Option(help="Of the draw")] = 0,
+    as_json: JsonOption = False,
+) -> None:
+    """Single scans against a saved map, without any guess; right is within 0.10 m and 2 degrees.
+
+    The truth is the mapped trajectory of the same drive, so this measures finding the place, not the map.
+
+    Examples:
+
+        beamsplat eval relocalize map drive/bag
+
+        beamsplat eval relocalize map drive/bag --scans 500 --seed 3 --json
+    """
+    from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
+    from beamsplat.services.localization.lidar2d.slam import LidarSlam
+
+    stamps_ns, T_map_body = poses_of(folder, "trajectory.tum")
+    chosen = np.sort(np.random.default_rng(seed).choice(len(stamps_ns), min(scans, len(stamps_ns)), False))
+    drawn, T_body_lidar = _scans_at(bag, {int(stamps_ns[i]) for i in chosen})
+    slam = LidarSlam.load(folder / "state", LidarSlamSettings(), T_body_lidar, localize_only=True)
+    started = time.perf_counter()
+    slam.world()
+    load_s = time.perf_counter() - started
+    rows = []
+    for i in track(chosen, "relocalizing", console=console, transient=True):
+        m = drawn.get(int(stamps_ns[i]))
+        if m is None:
+            raise UserError(f"{bag} has no scan at {stamps_ns[i]} ns: is {folder} a map of another drive?")
+        started = time.perf_counter()
+        answer = slam.relocalize(
+            m.ranges_m, m.angle_min_rad, m.angle_increment_rad, m.range_min_m, m.range_max_m
+        )
+        rows.append(
+            (*_error(answer.T_map_body, T_map_body[i]), answer.confidence, time.perf_counter() - started)
+        )
+    figures = _summary(np.array(rows)) | {"world_s": load_s}
+    print(json.dumps(figures)) if as_json else print_figures(figures)
+
+
+def _error(T_map_body: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
+    """Distance in metres and angle in degrees."""
+    away = float(np.hypot(*(T_map_body - truth)[:2]))
+    return away, math.degrees(abs(math.remainder(T_map_body[2] - truth[2], 2.0 * math.pi)))
+
+
+def _summary(rows: np.ndarray) -> dict[str, Any]:
+    """Rows float64 [N, 4]: metres, degrees, confidence, seconds."""
+    right = (rows[:, 0] <= NEAR_M) & (rows[:, 1] <= NEAR_DEG)
+    sure = rows[:, 2] >= SURE
+    return {
+        "scans": len(rows),
+        "right_share": float(right.mean()),
+        "sure_share": float(sure.mean()),
+        "wrong_and_sure": int((~right & sure).sum()),
+        "error_p50_m": float(np.median(rows[:, 0])),
+        "error_p50_deg": float(np.median(rows[:, 1])),
+        "time_p50_s": float(np.median(rows[:, 3])),
+        "time_p95_s": float(np.percentile(rows[:, 3], 95)),
+    }
+
+
+def _scans_at(bag: Path, stamps_ns: set[int]) -> tuple[dict[int, Any], np.ndarray]:
+    """Scan messages by stamp, and the lidar's T_body_lidar."""
+    from beamsplat.services.replay.options import SourceOptions
+    from beamsplat.services.replay.source import open_source
+
+    options = SourceOptions(without=frozenset({"image", "pose", "odometry"}), require=frozenset({"scan"}))
+    source = open_source(bag, options)
+    try:
+        found = {
+            m.stamp_ns: m
+            for _, topic, m in source.messages()
+            if topic == "lidar/scan" and m.stamp_ns in stamps_ns
+        }
+        return found, source.rig().lidar.T_body_lidar
+    finally:
+        source.close()

@@ -1,0 +1,176 @@
+"""`beamsplat simulate`: the command around the simulator."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import time
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+
+console = Console(stderr=True)
+
+
+def _numbers(text: str, count: int, option: str) -> tuple[float, ...]:
+    try:
+        values = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        values = ()
+    if len(values) != count:
+        raise typer.BadParameter(f"expected {count} numbers with commas, got {text!r}", param_hint=option)
+    return values
+
+
+def _size(text: str) -> tuple[int, int]:
+    parts = text.lower().split("x")
+    if len(parts) != 2 or not all(p.isdigit() for p in parts):
+        raise typer.BadParameter(f"expected WIDTHxHEIGHT, got {text!r}", param_hint="--size")
+    width, height = int(parts[0]), int(parts[1])
+    if not (32 <= width <= 4096 and 32 <= height <= 4096):
+        raise typer.BadParameter("sides must be 32 to 4096 pixels", param_hint="--size")
+    return width, height
+
+
+def simulate(
+    out: Annotated[Path, typer.Option(help="Folder to write; refused if it exists.")],
+    seconds: Annotated[
+        float | None, typer.Option(min=1.0, help="Length; default: one lap, about 80 s.")
+    ] = None,
+    laps: Annotated[
+        int | None, typer.Option(min=1, help="Whole laps; each picture is rendered once.")
+    ] = None,
+    movers: Annotated[int, typer.Option(min=0, max=6, help="People walking about.")] = 0,
+    carts: Annotated[int, typer.Option(min=0, max=3, help="Trolleys rolling about.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Another home, drive and noise for each seed.")] = 0,
+    size: Annotated[str, typer.Option(help="Picture size.")] = "640x480",
+    rate_hz: Annotated[float, typer.Option(min=0.5, max=60.0, help="Camera rate.")] = 10.0,
+    scene: Annotated[
+        Path | None, typer.Option(exists=True, dir_okay=False, help="glTF/GLB instead of the home.")
+    ] = None,
+    glass: Annotated[bool, typer.Option("--glass", help="Glazed doors let some beams through.")] = False,
+    lidar_only: Annotated[
+        bool, typer.Option("--lidar-only", help="No camera: quick, for long drives.")
+    ] = False,
+    clock_offset_ms: Annotated[float, typer.Option(help="Fault: added to the camera's stamps.")] = 0.0,
+    extrinsic_yaw_deg: Annotated[
+        float, typer.Option(help="Fault: the tf's camera is turned left of the true one.")
+    ] = 0.0,
+    extrinsic_pitch_deg: Annotated[
+        float, typer.Option(help="Fault: the tf's camera looks lower than the true one.")
+    ] = 0.0,
+    extrinsic_roll_deg: Annotated[float, typer.Option(help="Fault: the tf's camera is rolled.")] = 0.0,
+    extrinsic_xyz_m: Annotated[str, typer.Option(help="Fault: the tf's camera is moved by x,y,z.")] = "0,0,0",
+    distortion: Annotated[str, typer.Option(help="Lens: k1,k2,p1,p2,k3 (plumb_bob).")] = "0,0,0,0,0",
+    exposure_changes: Annotated[
+        bool, typer.Option("--exposure-changes", help="Fault: brightness wanders.")
+    ] = False,
+    jobs: Annotated[int, typer.Option(min=1, help="Rendering processes.")] = os.cpu_count() or 1,
+    force: Annotated[bool, typer.Option("--force", help="Replace an existing folder.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")] = False,
+) -> None:
+    """Drive a simulated robot through a generated home and record it, with exact truth.
+
+    The folder holds bag/ (ROS 2, MCAP) without any truth in it, and beside it groundtruth.txt, camera.json,
+    depth_gt/, moving_masks/, beams.npz, extra_views/ and gt_surface.ply. Worlds and pictures are kept in
+    $BEAMSPLAT_CACHE (default ~/.cache/beamsplat) and reused.
+
+    Examples:
+
+    beamsplat simulate --out rec --seconds 30
+
+    beamsplat simulate --out rec --seconds 60 --movers 2 --seed 7
+
+    beamsplat simulate --out small --size 320x240 --rate-hz 5
+
+    beamsplat simulate --out soak --lidar-only --laps 40
+
+    beamsplat simulate --out faulty --clock-offset-ms 40 --extrinsic-yaw-deg 2 --distortion=-0.12,0.03,0,0,0
+    """
+    from beamsplat.tools.simulator import recording
+    from beamsplat.tools.simulator.settings import CameraSettings, Faults, LidarSettings, Simulation
+
+    width, height = _size(size)
+    lens = _numbers(distortion, 5, "--distortion")
+    shift = _numbers(extrinsic_xyz_m, 3, "--extrinsic-xyz-m")
+    settings = Simulation(
+        seed=seed,
+        seconds=seconds,
+        laps=laps,
+        people=movers,
+        carts=carts,
+        scene=None if scene is None else str(scene),
+        lidar_only=lidar_only,
+        camera=CameraSettings(width_px=width, height_px=height, rate_hz=rate_hz, distortion=lens),
+        lidar=LidarSettings(glass=glass),
+        faults=Faults(
+            clock_offset_ms=clock_offset_ms,
+            extrinsic_xyz_m=shift,
+            extrinsic_yaw_deg=extrinsic_yaw_deg,
+            extrinsic_pitch_deg=extrinsic_pitch_deg,
+            extrinsic_roll_deg=extrinsic_roll_deg,
+            exposure_changes=exposure_changes,
+        ),
+    )
+    began = time.monotonic()
+    try:
+        with _Bar() as bar:
+            summary = recording.simulate(settings, out, jobs=jobs, replace=force, progress=bar.show)
+    except (ValueError, FileExistsError) as error:
+        console.print(f"[red]{error}[/]", highlight=False)
+        raise typer.Exit(2) from error
+    except KeyboardInterrupt as error:
+        console.print("stopped; nothing was written (finished pictures stay in the cache)")
+        raise typer.Exit(130) from error
+    took = time.monotonic() - began
+    if as_json:
+        sys.stdout.write(json.dumps({"out": str(out), "wall_s": round(took, 1), **asdict(summary)}) + "\n")
+        return
+    console.print(
+        f"{summary.seconds:g} s, {summary.metres:.1f} m, {summary.laps:.2f} laps: {summary.images} images, "
+        f"{summary.scans} scans, in {took:.0f} s",
+        highlight=False,
+    )
+    for path in sorted(out.iterdir()):
+        console.print(f"  {path}{'/' if path.is_dir() else ''}", highlight=False)
+
+
+class _Bar:
+    """One progress line on standard error; a stage without a count shows no bar."""
+
+    def __init__(self) -> None:
+        self._progress = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+            TimeRemainingColumn(),
+            console=console,
+        )
+        self._stage = ""
+        self._task = None
+
+    def __enter__(self) -> _Bar:
+        self._progress.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._progress.stop()
+
+    def show(self, stage: str, done: int, total: int) -> None:
+        if stage != self._stage or self._task is None:
+            self._stage = stage
+            self._task = self._progress.add_task(stage, total=total or None)
+        self._progress.update(self._task, completed=done, total=total or None)

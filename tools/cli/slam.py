@@ -1,0 +1,170 @@
+"""`beamsplat slam` and `beamsplat eval slam`: a map from a bag, and how good it is."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+from rich.table import Table
+
+from beamsplat.common.errors import UserError
+
+console = Console(stderr=True)
+JsonOption = Annotated[bool, typer.Option("--json", help="Print the figures as one JSON object")]
+
+
+def slam(
+    bag: Annotated[Path, typer.Argument(help="Bag, recording or folder with a 2D lidar")],
+    out: Annotated[Path, typer.Option(help="Folder for trajectory, map and state")],
+    no_odometry: Annotated[bool, typer.Option("--no-odometry", help="Use the scans alone")] = False,
+    rig: Annotated[Path | None, typer.Option(help="Calibration file, where the bag has none")] = None,
+    scan_topic: Annotated[str, typer.Option(help="Where the bag has several")] = "",
+    odometry_topic: Annotated[str, typer.Option(help="Where the bag has several")] = "",
+    as_json: JsonOption = False,
+) -> None:
+    """Maps a bag with the lidar SLAM, as fast as the machine allows.
+
+    Writes trajectory.tum (after the last optimisation), online.tum (as it would have been published),
+    map.pgm and map.yaml (nav2), map.png, state/ (to continue or localize in), figures.json.
+
+    Examples:
+
+        beamsplat slam drive/bag --out map
+
+        beamsplat slam drive/bag --out map2 --no-odometry --json
+    """
+    from beamsplat.services.localization.lidar2d.drive import Drive, map_drive
+    from beamsplat.services.replay.options import SourceOptions
+    from beamsplat.services.replay.source import open_source
+
+    without = {"image", "pose"} | ({"odometry"} if no_odometry else set())
+    options = SourceOptions(
+        scan_topic=scan_topic, odometry_topic=odometry_topic, rig=rig, without=frozenset(without),
+        require=frozenset({"scan"}),
+    )  # fmt: skip
+    source = open_source(bag, options)
+    try:
+        lidar = source.rig().lidar
+        if lidar is None:
+            raise UserError(
+                f"{bag}: no lidar in its calibration; give one with --rig (`beamsplat rig` drafts it)"
+            )
+        bar = Progress(
+            TextColumn("mapping"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
+            TimeRemainingColumn(), console=console, transient=True,
+        )  # fmt: skip
+        with bar:
+            task = bar.add_task("mapping", total=source.expected())
+            drive = Drive(lidar.T_body_lidar, _measurements(source), lambda: bar.advance(task))
+            figures = map_drive(drive, out)
+        for problem in source.problems:
+            console.print(f"[yellow]{problem}[/]", highlight=False)
+    finally:
+        source.close()
+    if as_json:
+        print(json.dumps(figures))
+    else:
+        print_figures(figures)
+        console.print(f"trajectory.tum, online.tum, map.pgm, map.yaml, map.png and state/ lie in {out}")
+
+
+def _measurements(source: Any) -> Any:
+    """Plain tuples for the library, in order of the bag: ("scan", ...) and ("odometry", ...)."""
+    from beamsplat.common.geometry.transforms import se3_to_se2
+
+    for _, topic, m in source.messages():
+        if topic == "lidar/scan":
+            yield (
+                "scan", m.stamp_ns, m.ranges_m, m.angle_min_rad, m.angle_increment_rad, m.time_increment_s,
+                m.range_min_m, m.range_max_m,
+            )  # fmt: skip
+        elif topic == "wheel/odometry":
+            x_m, y_m, yaw_rad = se3_to_se2(m.T_odom_body)
+            yield "odometry", m.stamp_ns, float(x_m), float(y_m), float(yaw_rad)
+
+
+def eval_slam(
+    folder: Annotated[Path, typer.Argument(help="Folder written by `beamsplat slam`")],
+    relations: Annotated[Path | None, typer.Option(help="Relations file (Kuemmerle et al. 2009)")] = None,
+    groundtruth: Annotated[Path | None, typer.Option(help="TUM file of the true body poses")] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Errors of a mapped trajectory against relations or a true trajectory; no scale is ever fitted.
+
+    Examples:
+
+        beamsplat eval slam map --relations intel.relations
+
+        beamsplat eval slam map --groundtruth groundtruth.txt --json
+    """
+    if (relations is None) == (groundtruth is None):
+        raise UserError("eval slam takes one of --relations FILE and --groundtruth FILE")
+    figures = _against_relations(folder, relations) if relations else _against_truth(folder, groundtruth)
+    if as_json:
+        print(json.dumps(figures))
+    else:
+        print_figures(figures)
+
+
+def poses_of(folder: Path, name: str) -> tuple[Any, Any]:
+    """Stamps int64 [N] and planar poses float64 [N, 3] of a TUM file."""
+    from beamsplat.common.geometry.trajectory import read_tum
+    from beamsplat.common.geometry.transforms import se3_to_se2
+
+    trajectory = read_tum(folder / name)
+    return trajectory.stamps_ns, se3_to_se2(trajectory.T_a_b)
+
+
+def _against_relations(folder: Path, path: Path) -> dict[str, Any]:
+    """Relations speak of the laser: the body poses are taken there first."""
+    from dataclasses import asdict
+
+    import numpy as np
+
+    from beamsplat.services.localization.lidar2d.metrics import read_relations, relation_errors
+
+    stamps_ns, T_map_body = poses_of(folder, "trajectory.tum")
+    relation_stamps_ns, relative = read_relations(path)
+    T_body_lidar = np.array(json.loads((folder / "figures.json").read_text())["T_body_lidar"])
+    return asdict(relation_errors(stamps_ns, T_map_body, relation_stamps_ns, relative, T_body_lidar))
+
+
+def _against_truth(folder: Path, path: Path) -> dict[str, Any]:
+    from beamsplat.services.localization.lidar2d.metrics import interpolate_poses, trajectory_errors
+
+    figures: dict[str, Any] = {}
+    true_stamps_ns, T_world_body = poses_of(path.parent, path.name)
+    for prefix, name in (("", "trajectory.tum"), ("online_", "online.tum")):
+        stamps_ns, T_map_body = poses_of(folder, name)
+        inside = (stamps_ns >= true_stamps_ns[0]) & (stamps_ns <= true_stamps_ns[-1])
+        if not inside.any():
+            raise UserError(f"{path}: no true pose within the time of {folder / name}")
+        truth = interpolate_poses(true_stamps_ns, T_world_body, stamps_ns[inside])
+        errors = trajectory_errors(T_map_body[inside], truth)
+        figures |= {
+            f"{prefix}poses": errors.poses,
+            f"{prefix}ate_first_pose_rmse_m": errors.ate_first_pose_rmse_m,
+            f"{prefix}ate_se3_rmse_m": errors.ate_se3_rmse_m,
+            f"{prefix}yaw_rmse_rad": errors.yaw_rmse_rad,
+        }
+    return figures
+
+
+def print_figures(figures: dict[str, Any]) -> None:
+    """A table of the scalars."""
+    table = Table("figure", "value")
+    for name, value in figures.items():
+        if isinstance(value, (int, float, str)):
+            table.add_row(name, f"{value:.4f}" if isinstance(value, float) else str(value))
+    Console().print(table)

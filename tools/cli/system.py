@@ -1,0 +1,318 @@
+"""Commands that run a system: check, run, serve, offline, record, top, topics, graph."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import signal
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Protocol
+
+import typer
+from rich.console import Console
+from rich.live import Live as Screen
+
+from beamsplat.common.config.deployment import Deployment, load_deployment
+from beamsplat.common.errors import UserError
+from beamsplat.tools.cli.memory_option import MemoryOption, memory_overrides
+
+if TYPE_CHECKING:
+    from beamsplat.tools.system.health_table import HealthBoard
+    from beamsplat.tools.system.supervisor import Supervisor
+
+FileArgument = Annotated[Path, typer.Argument(help="Deployment file (TOML), for example deploy/demo.toml")]
+SetOption = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="NODE.OPTION=VALUE", help="Override an option of the file; repeatable"),
+]
+console = Console(stderr=True, width=None if sys.stderr.isatty() else 120)
+
+
+def _load(file: Path, overrides: list[str] | None) -> Deployment:
+    return load_deployment(file, tuple(overrides or ()))
+
+
+def _say(text: str, style: str | None = None) -> None:
+    """Prints text as it is: what stands in brackets is no markup."""
+    console.print(text, style=style, markup=False, highlight=False, soft_wrap=True)
+
+
+def check(file: FileArgument, set_: SetOption = None) -> None:
+    """Says whether a deployment would run, and what is wrong if not.
+
+    Example: beamsplat check deploy/demo.toml
+    """
+    from beamsplat.tools.system.assembly import faults, unusable
+
+    deployment = _load(file, set_)
+    found = faults(deployment)
+    if not any(fault.fatal for fault in found):
+        found += unusable(deployment)
+    for fault in found:
+        _say(fault.text, "red" if fault.fatal else "yellow")
+    if any(fault.fatal for fault in found):
+        raise typer.Exit(2)
+    print(f"{file}: {len(deployment.nodes)} nodes, fits together")
+
+
+def _checked(deployment: Deployment, names: tuple[str, ...] | None = None) -> Deployment:
+    from beamsplat.tools.system.assembly import faults, unusable
+
+    fatal = [fault.text for fault in faults(deployment) if fault.fatal]
+    fatal = fatal or [fault.text for fault in unusable(deployment, names)]
+    if fatal:
+        raise UserError("; ".join(fatal))
+    return deployment
+
+
+def run(
+    file: FileArgument,
+    nodes: Annotated[list[str] | None, typer.Argument(help="Only these (and `router`); default: all")] = None,
+    set_: SetOption = None,
+    rate: Annotated[
+        float | None, typer.Option(min=0.0, help="Replay at N times real time; 0 = flat out")
+    ] = None,
+    memory: MemoryOption = None,
+) -> None:
+    """Runs a deployment: a router and one supervised process per node.
+
+    Ends when recorded data ends, or with Ctrl-C. Logs lie under the robot's state folder.
+
+    Examples:
+
+        beamsplat run deploy/demo.toml --set replay.data=drive/bag
+
+        beamsplat run deploy/edge.toml --memory 1GB --set mapping.session=map
+
+        beamsplat run deploy/robot.toml router localization
+    """
+    deployment = _load(file, [*memory_overrides(memory), *(set_ or ())])
+    if rate is not None:
+        deployment = deployment.model_copy(update={"rate": rate})
+    run_checked(deployment, tuple(nodes) if nodes else None)
+
+
+class Beside(Protocol):
+    """Somebody who looks on while a deployment runs."""
+
+    def poll(self) -> None:
+        """Called a few times a second."""
+
+    def finish(self, board: HealthBoard, drained: bool) -> Any:
+        """Called once, before the processes are ended."""
+
+
+def run_checked(
+    deployment: Deployment,
+    names: tuple[str, ...] | None = None,
+    beside: Callable[[Supervisor], Beside] | None = None,
+) -> None:
+    """Runs processes until all have drained, one cannot run, or Ctrl-C; `beside` makes an onlooker.
+
+    Raises:
+        UserError: the deployment does not fit together, or a node cannot run with what it was given.
+    """
+    for name in names or ():
+        if name != "router" and name not in deployment.nodes:
+            there = ", ".join(("router", *deployment.nodes))
+            raise UserError(f"the deployment has no node {name!r}; there are {there}")
+    _checked(deployment, names)
+    from beamsplat.common.security.logins import SUPERVISOR, login_of
+    from beamsplat.common.zenoh.bus import open_session
+    from beamsplat.tools.system.commands import Commands
+    from beamsplat.tools.system.health_table import HealthBoard
+    from beamsplat.tools.system.supervisor import Supervisor
+
+    for number in (signal.SIGTERM, signal.SIGHUP):  # ends the children in order, as Ctrl-C does
+        signal.signal(number, signal.default_int_handler)
+    events: list[str] = []
+    show = sys.stderr.isatty()
+
+    def on_event(text: str) -> None:
+        events.append(text)
+        if " cannot run: " not in text:  # that is the error with which this ends
+            _say(text, "yellow")
+
+    with Supervisor(deployment, names, on_event=on_event) as supervisor:
+        _say(f"robot {deployment.robot}: logs in {supervisor.log_dir}")
+        login = login_of(deployment.security, SUPERVISOR)
+        with open_session(deployment.router.listen, login=login) as session:
+            board = HealthBoard(session, deployment.robot)
+            onlooker = beside(supervisor) if beside is not None else None
+            commands = Commands(session, deployment.robot, supervisor)
+            screen = Screen(console=console, refresh_per_second=2) if show else contextlib.nullcontext()
+            drained = False
+            with screen, contextlib.suppress(KeyboardInterrupt):
+                while not drained:
+                    time.sleep(0.2)
+                    supervisor.poll()
+                    if onlooker is not None:
+                        onlooker.poll()
+                    commands.attend()
+                    if show:
+                        screen.update(board.nodes_table())
+                    nodes = [c for c in supervisor.children.values() if c.name != "router"]
+                    for entry in supervisor.children.values():
+                        if entry.gave_up:
+                            raise UserError(
+                                next(e for e in events if e.startswith(f"{entry.name} cannot run"))
+                            )
+                    states = board.states()
+                    drained = bool(nodes) and all(states.get(c.name) == "drained" for c in nodes)
+            if not show:
+                console.print(board.nodes_table())
+            if onlooker is not None:
+                onlooker.finish(board, drained)
+
+
+def serve(
+    file: FileArgument,
+    node: Annotated[str, typer.Argument(help="Name of the node, or `router`")],
+    set_: SetOption = None,
+) -> None:
+    """Runs one node in this process, without supervision (for debuggers, systemd, containers).
+
+    Example: beamsplat serve deploy/robot.toml localization
+    """
+    from beamsplat.tools.system.node_process import route, start_logging
+    from beamsplat.tools.system.node_process import serve as serve_node
+
+    deployment = _load(file, set_)
+    start_logging()
+    if node == "router":
+        route(deployment)
+    else:
+        serve_node(deployment, node, exit_when_drained=True)
+
+
+def router_config(file: FileArgument, set_: SetOption = None) -> None:
+    """Prints the configuration of a deployment's router for `zenohd -c`, to run that in its place.
+
+    The policy is as it is now: after `beamsplat keys issue` or `remove`, print it again.
+
+    Example: beamsplat router-config deploy/edge.toml > router.json5
+    """
+    from beamsplat.common.zenoh.bus import router_config as config_of
+
+    deployment = _load(file, set_)
+    print(config_of(deployment.router.listen, deployment.router.connect, deployment.security))
+
+
+def offline(
+    file: FileArgument,
+    out: Annotated[Path, typer.Option(help="Folder for messages.mcap and summary.json")],
+    data: Annotated[Path | None, typer.Option(help="Bag, recording or folder for the replay node")] = None,
+    set_: SetOption = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the summary as one JSON object")] = False,
+) -> None:
+    """Runs a deployment in lockstep: one thread, no bus, as fast as possible, reproducible.
+
+    The same input gives the same bytes: summary.json holds a SHA-256 over all messages.
+
+    Example: beamsplat offline deploy/demo.toml --data drive/bag --out out/
+    """
+    from beamsplat.tools.system.offline import OUTSIDE, run_offline
+
+    deployment = _load(file, set_)
+    nodes = {name: table for name, table in deployment.nodes.items() if name not in OUTSIDE}
+    if data is not None:
+        nodes["replay"] = {**nodes.get("replay", {}), "data": str(data)}
+    deployment = deployment.model_copy(update={"nodes": nodes})
+    summary = run_offline(_checked(deployment), out, console)
+    if as_json:
+        print(json.dumps(summary))
+    else:
+        console.print(f"{summary['messages']} messages in {summary['wall_s']:.1f} s, SHA-256 "
+                      f"{summary['sha256'][:16]}..., in {out}", soft_wrap=True)  # fmt: skip
+
+
+def record(
+    file: FileArgument,
+    out: Annotated[Path, typer.Option(help="Folder of the recording to write")],
+    set_: SetOption = None,
+) -> None:
+    """Records the topics of a running deployment to MCAP, until Ctrl-C or the end of the data.
+
+    Example: beamsplat record deploy/robot.toml --out drive1
+    """
+    from beamsplat.tools.system.node_process import serve as serve_node
+    from beamsplat.tools.system.node_process import start_logging
+
+    if out.exists():
+        raise UserError(f"{out} exists: a recording is never overwritten, choose another --out")
+    deployment = _load(file, set_)
+    options = {**deployment.nodes.get("recorder", {}), "out": str(out)}
+    deployment = deployment.model_copy(update={"nodes": {**deployment.nodes, "recorder": options}})
+    start_logging()
+    serve_node(deployment, "recorder", exit_when_drained=True)
+    print(f"recorded to {out}")
+
+
+def _watch(
+    file: Path, overrides: list[str] | None, table: str, seconds: float | None, every_robot: bool = False
+) -> None:
+    from beamsplat.common.security.logins import OPERATOR, login_of
+    from beamsplat.common.zenoh.bus import open_session
+    from beamsplat.tools.system.health_table import ALL, HealthBoard
+
+    deployment = _load(file, overrides)
+    login = login_of(deployment.security, OPERATOR)
+    with open_session(deployment.router.listen, 2.0, login=login) as session:
+        board = HealthBoard(session, ALL if every_robot else deployment.robot)
+        draw = getattr(board, table)
+        deadline = time.monotonic() + (seconds if seconds is not None else 1e12)
+        with (
+            Screen(console=Console(), refresh_per_second=2) as screen,
+            contextlib.suppress(KeyboardInterrupt),
+        ):
+            while time.monotonic() < deadline:
+                time.sleep(0.25)
+                screen.update(draw())
+
+
+SecondsOption = Annotated[float | None, typer.Option(help="Stop after this long; default: Ctrl-C")]
+
+
+def top(
+    file: FileArgument,
+    seconds: SecondsOption = None,
+    set_: SetOption = None,
+    every_robot: Annotated[
+        bool, typer.Option("--all", help="Of every robot that this router hears of")
+    ] = False,
+) -> None:
+    """Live table of the nodes: state, rates, step time, age, drops, memory, CPU.
+
+    Examples:
+
+        beamsplat top deploy/robot.toml
+
+        beamsplat top deploy/edge.toml --all
+    """
+    _watch(file, set_, "nodes_table", seconds, every_robot)
+
+
+def topics(file: FileArgument, seconds: SecondsOption = None, set_: SetOption = None) -> None:
+    """Live table of the topics: who sends how often, who takes it and how late.
+
+    Example: beamsplat topics deploy/robot.toml
+    """
+    _watch(file, set_, "topics_table", seconds)
+
+
+def graph(
+    file: FileArgument,
+    mermaid: Annotated[bool, typer.Option(help="As a Mermaid flowchart")] = False,
+) -> None:
+    """The dataflow of a deployment.
+
+    Example: beamsplat graph deploy/demo.toml --mermaid
+    """
+    from beamsplat.tools.system.assembly import node_classes
+    from beamsplat.tools.system.graph import as_mermaid, as_text
+
+    classes = node_classes(_load(file, None))
+    print(as_mermaid(classes) if mermaid else as_text(classes))

@@ -1,0 +1,33 @@
+"""Compiles the numeric kernels once, into the cache beside their sources: no service does it later."""
+
+from __future__ import annotations
+
+import importlib
+import time
+
+from rich.console import Console
+
+# Each function runs its library's kernels once, on tiny inputs of the types that are used.
+WARMERS = (
+    "beamsplat.services.localization.lidar2d.warm:warm",
+    "beamsplat.services.fusion.warm:warm",
+    "beamsplat.common.raster.warm:warm",
+    "beamsplat.services.mapping.warm:warm",
+    "beamsplat.common.mapfiles.mesh:warm",
+    "beamsplat.services.localization.camera.warm:warm",
+    "beamsplat.services.camera.jpeg:warm",
+)
+
+
+def warm() -> None:
+    """Compiles all kernels into their cache, so that no service starts cold (about a minute, once).
+
+    Example: beamsplat warm
+    """
+    console = Console(stderr=True)
+    for entry in WARMERS:
+        module, _, function = entry.partition(":")
+        started = time.perf_counter()
+        with console.status(f"compiling {module}"):
+            getattr(importlib.import_module(module), function)()
+        console.print(f"{module}: ready after {time.perf_counter() - started:.1f} s")

@@ -1,0 +1,207 @@
+"""Depth of a drive against dense truth and against beams that nobody was shown."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from beamsplat.common.errors import UserError
+from beamsplat.common.geometry.beams import project_beams
+from beamsplat.common.geometry.transforms import inverse
+from beamsplat.services.depth.recorded import read_depth
+from beamsplat.services.depth.source import DepthSource, Estimate, View
+from beamsplat.services.fusion.frame import FieldConfig, Frame
+from beamsplat.services.fusion.fuse import Fusion
+from beamsplat.services.fusion.result import Fused, refusal
+from beamsplat.services.fusion.scaling import affine, ratio
+from beamsplat.tools.evaluation.drive import Drive
+from beamsplat.tools.evaluation.metrics import MethodErrors, blocks, confirmed, every_third
+
+DEFAULT = "field"
+KEYFRAME_M, KEYFRAME_RAD = 0.3, np.radians(15.0)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Everything said about one picture."""
+
+    stamp_ns: int
+    image_rgb: np.ndarray
+    estimate: Estimate
+    methods: dict[str, Fused]
+    truth: np.ndarray  # float32 [H, W], NaN = none
+    seconds: dict[str, float]  # CPU time by step
+
+
+def read_truth(folder: Path) -> dict[int, Path]:
+    """Truth files `<stamp_ns>.png` of a folder (or of its depth_gt/) by stamp.
+
+    Raises:
+        UserError: there are none.
+    """
+    folder = Path(folder)
+    if (folder / "depth_gt").is_dir():
+        folder = folder / "depth_gt"
+    files = {int(p.stem): p for p in sorted(folder.glob("*.png")) if p.stem.isdigit()}
+    if not files:
+        raise UserError(f"{folder}: holds no truth: expected <stamp_ns>.png, 16 bit millimetres of optical z")
+    return files
+
+
+def walk(
+    drive: Drive,
+    source: DepthSource,
+    wanted: dict[int, Path | None],
+    hide: Callable[[int], np.ndarray] | None = None,
+    config: FieldConfig | None = None,
+    floor: bool | None = None,
+) -> Iterator[Outcome]:
+    """Plays a drive through depth and fusion in order of time; yields the wanted pictures (stamp -> truth).
+
+    `hide(beams)` gives the beams of a scan that nobody may see. Wanted pictures are treated as keyframes
+    (`field`); `field_carried` is what they would have got from the keyframes before. Nothing that comes
+    after a picture is used for it, the scan that was running when it was taken excepted.
+    """
+    planar = drive.planar
+    known = planar if floor is None else floor
+    fusion = Fusion(
+        drive.undistort.pinhole, drive.T_body_camera, floor_known=known, planar=planar, config=config
+    )
+    next_scan = 0
+    last_keyframe: np.ndarray | None = None
+    for number, image in enumerate(drive.images):
+        stamp = image.stamp_ns
+        T_map_body = drive.pose(stamp)
+        if T_map_body is None:
+            continue
+        while next_scan < len(drive.scans) and drive.scans[next_scan].last_ns <= stamp:
+            scan = drive.scans[next_scan]
+            fusion.add_scan(drive.scan_in_map(scan, None if hide is None else hide(len(scan.ranges_m))))
+            next_scan += 1
+        rgb = drive.picture(number)
+        scan = drive.scan_near(stamp)
+        hidden = None if hide is None or scan is None else hide(len(scan.ranges_m))
+        beams = drive.beams(stamp, hidden)
+        is_keyframe = last_keyframe is None or _moved(last_keyframe, T_map_body)
+        if stamp not in wanted and not is_keyframe:
+            fusion.look(rgb, T_map_body)
+            continue
+        started = time.process_time()
+        view = View(stamp, rgb, drive.undistort.pinhole, drive.T_body_camera, beams, known)
+        estimate = source.estimate(view)
+        seconds = {"source": time.process_time() - started}
+        guess = estimate.values if estimate.ok and estimate.kind != "none" else None
+        frame = Frame(stamp, rgb, T_map_body, beams, guess, estimate.kind)
+        methods: dict[str, Fused] = {}
+        for name in ("field_carried", "field"):
+            if name == "field_carried" and stamp not in wanted:
+                continue
+            started = time.process_time()
+            methods[name] = fusion.fuse(frame, keyframe=name == "field")
+            seconds[name] = time.process_time() - started
+        last_keyframe = T_map_body
+        if stamp not in wanted:
+            continue
+        path = wanted[stamp]
+        truth = np.full(rgb.shape[:2], np.nan, np.float32) if path is None else read_depth(path)
+        uv, z, _ = project_beams(beams, drive.undistort.pinhole, drive.T_body_camera)
+        for name, correct in (("ratio", ratio), ("affine", affine)):
+            started = time.process_time()
+            done = correct(guess, estimate.kind, uv, z) if guess is not None else None
+            methods[name] = done or refusal(rgb.shape[:2], estimate.status)
+            seconds[name] = time.process_time() - started
+        yield Outcome(stamp, rgb, estimate, methods, truth, seconds)
+
+
+def _moved(T_before: np.ndarray, T_now: np.ndarray) -> bool:
+    T = inverse(T_before) @ T_now
+    turn = np.arccos(np.clip((np.trace(T[:3, :3]) - 1.0) / 2.0, -1.0, 1.0))
+    return bool(np.linalg.norm(T[:3, 3]) > KEYFRAME_M or turn > KEYFRAME_RAD)
+
+
+def evaluate(
+    drive: Drive,
+    source: DepthSource,
+    truth: dict[int, Path],
+    *,
+    heldout: bool = True,
+    config: FieldConfig | None = None,
+    floor: bool | None = None,
+    progress: Callable[[str, int, int], None] = lambda run, done, total: None,
+) -> dict[str, object]:
+    """The figures of `beamsplat eval depth`: one object per method, and `default`.
+
+    Raises:
+        UserError: no picture of the drive has a truth and a pose.
+    """
+    stamps = {image.stamp_ns for image in drive.images}
+    wanted: dict[int, Path | None] = {s: p for s, p in truth.items() if s in stamps}
+    if not wanted:
+        raise UserError(f"{drive.path}: no picture has the stamp of a truth file")
+    errors: dict[str, MethodErrors] = {}
+    excluded: dict[str, float] = {}
+    seconds: dict[str, list[float]] = {}
+    for run in ("dense", "third", "blocks") if heldout else ("dense",):
+        hide = _hider(run, drive)
+        seen, dropped = 0, 0
+        for count, outcome in enumerate(walk(drive, source, wanted, hide, config, floor)):
+            progress(run, count + 1, len(wanted))
+            results = dict(outcome.methods)
+            if outcome.estimate.kind == "metric":
+                raw = outcome.estimate.values
+                results = {"raw": Fused(raw, np.full_like(raw, np.nan)), **results}
+            if run == "dense":
+                _add_dense(errors, results, outcome, drive, seconds)
+                continue
+            uv, z = _hidden_beams(drive, outcome.stamp_ns, hide)
+            good = confirmed(outcome.truth, uv, z)
+            seen, dropped = seen + len(z), dropped + int((~good).sum())
+            for name, result in results.items():
+                sigma = None if name == "raw" else result.sigma_m
+                errors[name].add_held(run, result.depth_m, sigma, uv[good], z[good])
+        if run != "dense":
+            excluded[run] = dropped / max(seen, 1)
+    report: dict[str, object] = {name: e.summary(excluded) for name, e in errors.items()}
+    report["default"] = DEFAULT
+    report["cpu_ms"] = {name: 1e3 * float(np.median(values)) for name, values in seconds.items()}
+    report["poses"] = drive.poses_name
+    report["floor_known"] = drive.planar if floor is None else floor
+    return report
+
+
+def _add_dense(
+    errors: dict[str, MethodErrors], results: dict[str, Fused], outcome: Outcome, drive: Drive,
+    seconds: dict[str, list[float]],
+) -> None:  # fmt: skip
+    uv, z, _ = project_beams(drive.beams(outcome.stamp_ns), drive.undistort.pinhole, drive.T_body_camera)
+    for name, result in results.items():
+        e = errors.setdefault(name, MethodErrors())
+        e.add_dense(result.depth_m, None if name == "raw" else result.sigma_m, outcome.truth)
+        e.add_beams(result.depth_m, uv, z)
+    for name, value in outcome.seconds.items():
+        seconds.setdefault(name, []).append(value)
+
+
+def _hider(run: str, drive: Drive) -> Callable[[int], np.ndarray] | None:
+    if run == "dense":
+        return None
+    if run == "third":
+        return every_third
+    increment = drive.scans[0].angle_increment_rad if drive.scans else np.radians(0.5)
+    return lambda count: blocks(count, increment)
+
+
+def _hidden_beams(
+    drive: Drive, stamp_ns: int, hide: Callable[[int], np.ndarray] | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """(uv [N, 2], z [N]) of the beams nobody saw."""
+    scan = drive.scan_near(stamp_ns)
+    if scan is None or hide is None:
+        return np.zeros((0, 2)), np.zeros(0)
+    beams = drive.beams(stamp_ns, ~hide(len(scan.ranges_m)))
+    uv, z, _ = project_beams(beams, drive.undistort.pinhole, drive.T_body_camera)
+    return uv, z

@@ -1,0 +1,152 @@
+"""The authority of a fleet: a folder with its own key, a certificate for each host, and who may do what.
+
+    ca.key      never leaves this folder
+    ca.pem      what all hosts trust
+    hosts.toml  every host that was issued and not removed; each edge has a copy
+    hosts/NAME  to be copied to that host: ca.pem, host.pem, host.key (and hosts.toml for an edge)
+
+OpenSSL's command line makes keys and certificates: it is needed where the authority is, and nowhere else.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import os
+import shutil
+import subprocess
+import tempfile
+from pathlib import Path
+
+from beamsplat.common.errors import UserError
+from beamsplat.common.files.persist import make_folder, write_atomically
+from beamsplat.common.security.access_control import Host, read_hosts
+from beamsplat.common.security.keys import CA, CERTIFICATE, HOSTS, KEY
+
+CA_KEY = "ca.key"
+CA_DAYS = 3650
+
+
+def openssl(*arguments: str) -> str:
+    """Output of an OpenSSL command.
+
+    Raises:
+        UserError: it is not installed, or refuses.
+    """
+    if shutil.which("openssl") is None:
+        raise UserError("the command `openssl` is not installed: apt install openssl")
+    done = subprocess.run(["openssl", *arguments], capture_output=True, text=True, check=False)
+    if done.returncode != 0:
+        lines = [line for line in done.stderr.strip().splitlines() if line] or ["no reason given"]
+        raise UserError(f"openssl {arguments[0]} refuses: {lines[-1]}")
+    return done.stdout
+
+
+class Authority:
+    """A folder made by `Authority.create`."""
+
+    def __init__(self, folder: Path) -> None:
+        """Raises UserError where there is no authority."""
+        self.folder = folder.expanduser()
+        if not (self.folder / CA_KEY).is_file():
+            raise UserError(f"{self.folder} holds no authority: `beamsplat keys init` makes one")
+
+    @staticmethod
+    def create(folder: Path, days: int = CA_DAYS) -> Authority:
+        """A new authority.
+
+        Raises:
+            UserError: there is one already (its certificates would become worthless), or OpenSSL refuses.
+        """
+        folder = make_folder(folder.expanduser())
+        if (folder / CA_KEY).exists():
+            raise UserError(f"{folder} holds an authority already, which is never replaced: choose another")
+        folder.chmod(0o700)
+        _new_key(folder / CA_KEY)
+        openssl("req", "-x509", "-new", "-key", str(folder / CA_KEY), "-sha256", "-days", str(days),
+                "-subj", "/O=BeamSplat/CN=BeamSplat authority", "-out", str(folder / CA),
+                "-addext", "basicConstraints=critical,CA:TRUE,pathlen:0",
+                "-addext", "keyUsage=critical,keyCertSign,cRLSign")  # fmt: skip
+        write_atomically(folder / HOSTS, b"")
+        return Authority(folder)
+
+    def issue(self, name: str, host: Host, addresses: tuple[str, ...] = (), days: int = 90) -> Path:
+        """A new key and certificate for a host, which replace those it had; the folder to copy to it.
+
+        Raises:
+            UserError: an edge without addresses, or OpenSSL refuses.
+        """
+        if host.role == "edge" and not addresses:
+            raise UserError(f"{name}: robots check the address they connect to; name one with --address")
+        out = make_folder(self.folder / "hosts" / name)
+        out.chmod(0o700)
+        with tempfile.TemporaryDirectory(dir=self.folder) as scratch:
+            request, extensions = Path(scratch, "request"), Path(scratch, "extensions")
+            _new_key(Path(scratch, KEY))
+            openssl("req", "-new", "-key", str(Path(scratch, KEY)), "-subj", f"/O=BeamSplat/CN={name}",
+                    "-out", str(request))  # fmt: skip
+            extensions.write_text(_extensions((name, *addresses)))
+            openssl("x509", "-req", "-in", str(request), "-CA", str(self.folder / CA), "-CAkey",
+                    str(self.folder / CA_KEY), "-CAcreateserial", "-sha256", "-days", str(days),
+                    "-extfile", str(extensions), "-out", str(Path(scratch, CERTIFICATE)))  # fmt: skip
+            for file in (KEY, CERTIFICATE):
+                Path(scratch, file).replace(out / file)
+        write_atomically(out / CA, (self.folder / CA).read_bytes())
+        self._write({**self.hosts(), name: host})
+        return out
+
+    def remove(self, name: str) -> None:
+        """Takes a host out of the policy; its certificate opens nothing any more.
+
+        Raises:
+            UserError: no such host.
+        """
+        hosts = self.hosts()
+        if hosts.pop(name, None) is None:
+            raise UserError(
+                f"no host {name!r} in {self.folder / HOSTS}; there are {', '.join(hosts) or 'none'}"
+            )
+        shutil.rmtree(self.folder / "hosts" / name, ignore_errors=True)
+        self._write(hosts)
+
+    def hosts(self) -> dict[str, Host]:
+        """Every host there is."""
+        return read_hosts(self.folder)
+
+    def edges(self) -> list[Path]:
+        """Folders of the edge servers, which hold copies of the policy."""
+        return [self.folder / "hosts" / name for name, host in self.hosts().items() if host.role == "edge"]
+
+    def _write(self, hosts: dict[str, Host]) -> None:
+        text = "# Written by `beamsplat keys`: which certificate may do what.\n" + "".join(
+            f'\n[{name}]\nrole = "{host.role}"\nrobot = "{host.robot}"\n' for name, host in hosts.items()
+        )
+        write_atomically(self.folder / HOSTS, text.encode())
+        for folder in self.edges():
+            write_atomically(folder / HOSTS, text.encode())
+
+
+def expiry(certificate: Path) -> str:
+    """When a certificate ends, as OpenSSL prints it."""
+    return openssl("x509", "-in", str(certificate), "-noout", "-enddate").strip().partition("=")[2]
+
+
+def _new_key(path: Path) -> None:
+    path.touch(mode=0o600)
+    openssl("ecparam", "-name", "prime256v1", "-genkey", "-noout", "-out", str(path))
+    os.chmod(path, 0o600)
+
+
+def _extensions(addresses: tuple[str, ...]) -> str:
+    return (
+        "basicConstraints=critical,CA:FALSE\n"
+        "keyUsage=critical,digitalSignature\n"
+        "extendedKeyUsage=serverAuth,clientAuth\n"
+        "subjectAltName=" + ",".join(_alternative(a) for a in dict.fromkeys(addresses)) + "\n"
+    )
+
+
+def _alternative(address: str) -> str:
+    try:
+        return f"IP:{ipaddress.ip_address(address)}"
+    except ValueError:
+        return f"DNS:{address}"

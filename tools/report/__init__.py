@@ -1,0 +1,1 @@
+"""What a live run cost and produced: an observer on the bus, scores against truth, the HTML report."""

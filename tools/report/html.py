@@ -1,0 +1,233 @@
+"""report.html of `bench paper`: one file with the paper's tables and figures, and ours beside them."""
+
+from __future__ import annotations
+
+import base64
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from beamsplat.common.files.persist import write_atomically
+from beamsplat.common.geometry.beams import project_beams
+from beamsplat.tools.evaluation.pictures import colour, label
+from beamsplat.tools.report.scores import Truth
+from beamsplat.tools.report.svg import COLOURS, Curve, chart
+
+_STYLE = """body{font:14px/1.4 sans-serif;max-width:1200px;margin:2em auto;padding:0 1em;color:#222}
+table{border-collapse:collapse;margin:.5em 0 1.5em}
+td,th{border:1px solid #ccc;padding:3px 8px;text-align:right}
+td:first-child,th:first-child{text-align:left}.p{color:#777}svg text{font-size:10px;fill:#333}
+svg .t{font-size:13px;font-weight:bold}img{max-width:100%;margin:2px}.w{color:#a40}figure{margin:0 0 1.5em}"""
+
+Row = dict[str, Any]
+_TABLES: tuple[tuple[str, tuple[tuple[str, str, str], ...]], ...] = (
+    ("Table I. Position RMSE (m), first poses aligned", (
+        ("x", "position_rmse_xyz_m.0", ""), ("y", "position_rmse_xyz_m.1", ""),
+        ("z", "position_rmse_xyz_m.2", ""),
+        ("together", "position_rmse_m", "position_rmse_m"), ("ATE", "ate_first_pose_rmse_m", ""),
+        ("SE(3)-aligned", "ate_se3_rmse_m", ""), ("Sim(3)-aligned", "ate_sim3_rmse_m", ""),
+        ("its scale", "sim3_scale", ""), ("unit is the metre", "metric", ""),
+        ("poses", "poses", ""),
+    )),
+    ("Table II. Orientation RMSE (rad)", (
+        ("roll", "orientation_rmse_rpy_rad.0", ""), ("pitch", "orientation_rmse_rpy_rad.1", ""),
+        ("yaw", "orientation_rmse_rpy_rad.2", "yaw_rmse_rad"), ("together", "orientation_rmse_rad", ""),
+    )),
+    ("Table III. Speed and load", (
+        ("FPS through the whole system", "fps", "fps"), ("poses per s", "poses_per_s", ""),
+        ("CPU load %", "cpu_load_percent", "cpu_load_percent"), ("CPU s per image", "cpu_s_per_image", ""),
+        ("keyframes per s", "keyframes_per_s", ""), ("latency p50 ms", "keyframe_latency_p50_ms", ""),
+        ("p95 ms", "keyframe_latency_p95_ms", ""), ("memory MB", "peak_rss_mb", ""),
+        ("link bytes", "link_bytes", ""),
+    )),
+    ("Table IV. Depth RMSE (m) at the beams; over all truth pixels", (
+        ("scaled", "depth_rmse_scaled_m", "depth_rmse_scaled_m"),
+        ("unscaled", "depth_rmse_unscaled_m", "depth_rmse_unscaled_m"),
+        ("dense, scaled", "depth_dense_rmse_scaled_m", ""),
+        ("dense, unscaled", "depth_dense_rmse_unscaled_m", ""),
+        ("pictures", "depth_frames", ""),
+    )),
+    ("What the paper lacks: the map", (
+        ("PSNR off the path dB", "psnr_offpath_db", ""), ("SSIM", "ssim_offpath", ""),
+        ("depth L1 m", "depth_l1_offpath_m", ""), ("F-score 5 cm", "fscore_5cm", ""),
+        ("refined: PSNR dB", "refined_psnr_offpath_db", ""), ("SSIM", "refined_ssim_offpath", ""),
+        ("depth L1 m", "refined_depth_l1_offpath_m", ""), ("F-score 5 cm", "refined_fscore_5cm", ""),
+        ("PSNR at keyframes dB", "psnr_keyframes_db", ""),
+        ("Gaussians", "gaussians", ""),
+    )),
+)  # fmt: skip
+
+
+def write_report(path: Path, report: dict[str, Any], truth: Truth, *, paper: bool = True) -> None:
+    """Writes the report; rows without `pictures` (not run) appear in the tables only. Not `paper`: of a
+    drive by itself, without the comparisons."""
+    rows: list[Row] = report["configurations"]
+    drawn = [row for row in rows if "pictures" in row]
+    title = "The paper's configurations on" if paper else "A drive mapped:"
+    body = [f"<h1>{title} {escape(report['data'])}</h1>", _preface(report, paper)]
+    body += [_table(title, columns, rows) for title, columns in _TABLES]
+    body += [_pairs(report["pairs"])] if paper else []
+    body += ["<h2>Maps and trajectories</h2>", *_trajectories(drawn)]
+    body += ["<h2>Errors over time</h2>", *_errors(drawn), "<h2>Depth</h2>", *_depth(drawn, truth)]
+    body += ["<h2>Render beside camera</h2>", *_renders(drawn, truth)]
+    page = (
+        f"<!doctype html><html><head><meta charset='utf-8'><title>bench paper</title><style>{_STYLE}</style>"
+    )
+    write_atomically(path, (page + "</head><body>" + "".join(body) + "</body></html>").encode())
+
+
+def _preface(report: dict[str, Any], paper: bool) -> str:
+    lines = [f"Live, as processes, on {report['cores']} CPU cores."]
+    if paper:
+        lines.append("Small grey figures are the paper's (Gazebo house, i9-12 and RTX 4090).")
+    for row in report["configurations"]:
+        if row["status"] != "ok":
+            lines.append(f"<span class=w>{escape(row['name'])} did not run: {escape(row['status'])}</span>")
+        elif row["advice"]:
+            lines.append(f"{escape(row['name'])}: {escape(row['depth_source'])} ({escape(row['advice'])})")
+    return "<p>" + "<br>".join(lines) + "</p>"
+
+
+def _table(title: str, columns: tuple[tuple[str, str, str], ...], rows: list[Row]) -> str:
+    head = "".join(f"<th>{escape(name)}</th>" for name, _, _ in columns)
+    lines = []
+    for row in rows:
+        cells = "".join(_cell(row, key, paper) for _, key, paper in columns)
+        lines.append(f"<tr><td>{escape(_name(row))}</td>{cells}</tr>")
+    return f"<h2>{escape(title)}</h2><table><tr><th></th>{head}</tr>{''.join(lines)}</table>"
+
+
+def _name(row: Row) -> str:
+    """What really ran: a stand-in never goes under the network's name."""
+    stand_in = " [" + row["depth_source"] + "]" if row["advice"] else ""
+    return f"{row['title']}{stand_in} #{row['seed']}"
+
+
+def _cell(row: Row, key: str, paper_key: str) -> str:
+    name, _, index = key.partition(".")
+    value = row.get(name)
+    if index and value is not None:
+        value = value[int(index)]
+    paper = row["paper"].get(paper_key)
+    beside = f" <span class=p>{paper:g}</span>" if paper is not None else ""
+    return f"<td>{_text(value)}{beside}</td>"
+
+
+def _text(value: Any) -> str:
+    if value is None:
+        return "–"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def _pairs(pairs: list[Row]) -> str:
+    keys = ("cpu_load_ratio", "cpu_s_per_located_image_ratio", "fps_ratio", "position_ratio")
+    head = "".join(f"<th>{key.replace('_', ' ')}</th>" for key in keys)
+    lines = "".join(
+        f"<tr><td>{escape(p['lidar'])} / {escape(p['camera'])}</td>"
+        + "".join(f"<td>{_text(p[key])}</td>" for key in keys)
+        + "</tr>"
+        for p in pairs
+    )
+    note = "<p>The paper: 1024 / 1549 = 0.66 of the CPU load, its saving of 34 %.</p>"
+    return f"<h2>Lidar against camera</h2><table><tr><th></th>{head}</tr>{lines}</table>{note}"
+
+
+def _trajectories(rows: list[Row]) -> list[str]:
+    out = []
+    for row in rows:
+        p = row["pictures"]
+        curves = [
+            Curve("truth", p["true"][:, :2, 3], "#222", dashed=True),
+            Curve(row["name"], p["found"][:, :2, 3], COLOURS[1]),
+        ]
+        out.append(chart(_name(row), "x m", "y m", curves, equal=True))
+        if p["above"] is not None:
+            out.append(_figure(p["above"], f"{_name(row)}: the map from above, without its ceiling"))
+    return out
+
+
+def _errors(rows: list[Row]) -> list[str]:
+    position, depth = [], []
+    for number, row in enumerate(rows):
+        p, tint = row["pictures"], COLOURS[number % len(COLOURS)]
+        if len(p["stamps_ns"]):
+            error = np.linalg.norm(p["found"][:, :3, 3] - p["true"][:, :3, 3], axis=1)
+            seconds = (p["stamps_ns"] - p["stamps_ns"][0]) * 1e-9
+            position.append(Curve(row["name"], np.column_stack([seconds, error]), tint))
+        series = row["depth_series"]
+        stamps = np.array(series["stamps_ns"], dtype=np.int64)
+        for name, dashed in (("scaled_m", False), ("unscaled_m", True)):
+            if len(stamps):
+                values = np.array([np.nan if v is None else v for v in series[name]])
+                points = np.column_stack([(stamps - stamps[0]) * 1e-9, values])
+                depth.append(Curve(f"{row['name']} {name[:-2]}", points, tint, dashed))
+    with_lidar = [c for c in position if not c.name.endswith("-camera")]
+    charts = [chart("Position error", "s", "m", position), chart("Depth RMSE at the beams", "s", "m", depth)]
+    if 0 < len(with_lidar) < len(position):  # beside the others they would be flat
+        charts.insert(1, chart("Position error, with lidar", "s", "m", with_lidar))
+    return charts
+
+
+def _depth(rows: list[Row], truth: Truth) -> list[str]:
+    """Beams on the picture; the guess; what became of it."""
+    out = []
+    for row in rows:
+        fused, guesses = row["pictures"]["fused"], row["pictures"]["estimates"]
+        stamps = sorted(fused)
+        for stamp_ns in stamps[len(stamps) // 3 :: max(len(stamps) // 2, 1)][:2]:
+            rgb = _picture(truth, stamp_ns)
+            if rgb is None:
+                continue
+            h, w = fused[stamp_ns].shape
+            shown = cv2.resize(cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), (w, h), interpolation=cv2.INTER_AREA)
+            uv, z, _ = project_beams(
+                truth.drive.beams(stamp_ns), truth.drive.undistort.pinhole, truth.drive.T_body_camera
+            )
+            tints = colour(z[:, None].astype(np.float32), 0.5, 8.0)[:, 0] if len(z) else []
+            for (u, v), tint in zip(uv * (h / rgb.shape[0]), tints):
+                cv2.circle(shown, (round(u), round(v)), 1, tuple(int(k) for k in tint), -1)
+            guess = guesses.get(stamp_ns)
+            before = np.full((h, w), np.nan, np.float32) if guess is None else guess.astype(np.float32)
+            after = fused[stamp_ns].astype(np.float32)
+            tiles = [label(shown, f"{len(z)} beams"), label(colour(before, 0.5, 8.0), "before"),
+                     label(colour(after, 0.5, 8.0), "after")]  # fmt: skip
+            out.append(_figure(np.hstack(tiles), _name(row)))
+    return out
+
+
+def _renders(rows: list[Row], truth: Truth) -> list[str]:
+    out = []
+    for row in rows:
+        for stamp_ns, jpeg in row["pictures"]["previews"]:
+            render = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
+            rgb = _picture(truth, stamp_ns)
+            if render is None or rgb is None:
+                continue
+            size = (render.shape[1], render.shape[0])
+            camera = cv2.resize(cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), size, interpolation=cv2.INTER_AREA)
+            both = np.hstack([label(camera, "camera"), label(render, "map, a keyframe")])
+            out.append(_figure(both, _name(row)))
+        for pair in row["pictures"]["offpath"]:
+            out.append(
+                _figure(cv2.cvtColor(pair, cv2.COLOR_RGB2BGR), f"{_name(row)}: off the path; truth, map")
+            )
+    return out
+
+
+def _picture(truth: Truth, stamp_ns: int) -> np.ndarray | None:
+    numbers = {image.stamp_ns: i for i, image in enumerate(truth.drive.images)}
+    return truth.drive.picture(numbers[stamp_ns]) if stamp_ns in numbers else None
+
+
+def _figure(bgr: np.ndarray, caption: str) -> str:
+    if bgr.shape[1] > 1000:
+        size = (1000, round(bgr.shape[0] * 1000 / bgr.shape[1]))
+        bgr = cv2.resize(bgr, size, interpolation=cv2.INTER_AREA)
+    data = base64.b64encode(cv2.imencode(".jpg", bgr, (cv2.IMWRITE_JPEG_QUALITY, 80))[1]).decode()
+    image = f"<img src='data:image/jpeg;base64,{data}'>"
+    return f"<figure>{image}<figcaption>{escape(caption)}</figcaption></figure>"

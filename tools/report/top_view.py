@@ -1,0 +1,66 @@
+"""A Gaussian map seen from above, without its ceiling, at a known scale: the picture of a floor plan."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from beamsplat.common.raster.camera import RasterCamera
+from beamsplat.common.raster.layout import MEAN, OPACITY
+from beamsplat.common.raster.optimiser import GaussianArrays
+from beamsplat.common.raster.rasterizer import Rasterizer
+
+_HEIGHT_M = 60.0  # of the eye: so far away that walls do not lean
+_EDGE_M = 0.4
+_MOST_PX = 2000
+_FAINT = -2.0  # logit of the opacity
+_WHITE = np.ones(3, np.float32)
+
+
+def top_view(
+    params: np.ndarray,  # float32 [14, N] in a frame whose z points up
+    path_m: np.ndarray | None = None,  # [K, >= 2] drawn on it
+    *,
+    ceiling_m: float = 1.8,  # what lies higher is left out
+    metres_per_px: float = 0.015,
+) -> np.ndarray | None:
+    """uint8 [H, W, 3] BGR, x to the right and y up; None where there is nothing to see."""
+    solid = (params[MEAN + 2] < ceiling_m) & (params[MEAN + 2] > -0.5) & (params[OPACITY] > _FAINT)
+    if not solid.any():
+        return None
+    store = GaussianArrays(int(solid.sum()))
+    store.append(params[:, solid])
+    low, high = _extent(params[MEAN : MEAN + 2, solid])
+    scale = max(metres_per_px, float((high - low).max()) / _MOST_PX)
+    width, height = (int(np.ceil(v / scale)) for v in high - low)
+    centre = (low + high) / 2
+    T_camera_map = np.eye(4)
+    T_camera_map[:3, :3] = np.diag([1.0, -1.0, -1.0])  # looks down, map's y is up in the picture
+    T_camera_map[:3, 3] = [-centre[0], centre[1], _HEIGHT_M]
+    focal_px = _HEIGHT_M / scale
+    camera = RasterCamera(focal_px, focal_px, (width - 1) / 2, (height - 1) / 2, width, height)
+    rasterizer = Rasterizer()
+    render = rasterizer.render(store.params, store.count, camera, T_camera_map, _WHITE)
+    rgb = np.clip(render.image[:3] * 255.0 + 0.5, 0, 255).astype(np.uint8).transpose(1, 2, 0)
+    bgr = cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)
+    rasterizer.release(render)
+    rasterizer.close()
+    if path_m is not None and len(path_m):
+        x = (path_m[:, 0] - centre[0]) / scale + (width - 1) / 2
+        y = (centre[1] - path_m[:, 1]) / scale + (height - 1) / 2
+        line = np.round(np.stack([x, y], axis=1)).astype(np.int32)
+        cv2.polylines(bgr, [line], False, (40, 40, 220), 2, cv2.LINE_AA)
+    _scale_bar(bgr, scale)
+    return bgr
+
+
+def _extent(xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(low, high) [2] that hold all but the outermost: a few strays must not shrink the rest."""
+    return np.percentile(xy, 0.5, axis=1) - _EDGE_M, np.percentile(xy, 99.5, axis=1) + _EDGE_M
+
+
+def _scale_bar(bgr: np.ndarray, metres_per_px: float) -> None:
+    px = round(1.0 / metres_per_px)
+    y = bgr.shape[0] - 12
+    cv2.line(bgr, (12, y), (12 + px, y), (0, 0, 0), 2)
+    cv2.putText(bgr, "1 m", (16 + px, y + 4), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (0, 0, 0), 1, cv2.LINE_AA)

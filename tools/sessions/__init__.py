@@ -1,0 +1,1 @@
+"""Editing saved maps: merge, prune, move to new anchors."""

@@ -1,0 +1,95 @@
+"""Where two maps made one show the same surface, one of them goes: doubled walls stand in each other's way.
+
+At every keyframe both maps are rendered alone. Where both cover a pixel at the same depth, the one that is
+nearer to the picture wins it; each Gaussian at such pixels gathers wins and losses, and goes with more losses
+than wins.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+
+import cv2
+import numpy as np
+
+from beamsplat.common.geometry.transforms import inverse
+from beamsplat.common.mapfiles.blocks import Arrays
+from beamsplat.common.mapfiles.scores import render_rgb_depth
+from beamsplat.common.mapfiles.state import View, store_of, views_of
+from beamsplat.common.mapfiles.store import GaussianStore
+from beamsplat.common.raster.camera import RasterCamera
+from beamsplat.common.raster.layout import MEAN, SCALE
+from beamsplat.common.raster.rasterizer import Rasterizer
+from beamsplat.services.mapping.keyframe import Keyframe, hold
+from beamsplat.services.mapping.mapper import HALF
+
+_COVERED = 0.5  # alpha from which a map shows a surface
+_SAME_M, _SAME_SHARE = 0.15, 0.10  # two depths within both are one surface
+_BLUR_PX = 11  # neighbours go together: a mosaic of both maps has seams everywhere
+
+
+def without_doubles(
+    arrays: Arrays,  # of two maps, as `merged` gives them
+    second: np.ndarray,  # bool [N]: Gaussians of the second map
+    opened: Callable[[int], Keyframe],  # a keyframe by its id; raises ValueError
+    watched: Callable[[list[View]], Iterable[View]] = iter,
+) -> np.ndarray:
+    """bool [N]: the Gaussians that stay. Keyframes that cannot be opened have no say."""
+    stores = [_part(arrays, ~second), _part(arrays, second)]
+    votes = [np.zeros(store.count, np.int32) for store in stores]
+    exposure = dict(zip(arrays["keyframe_id"].tolist(), arrays["keyframe_exposure"]))
+    rasterizer = Rasterizer()
+    for view in watched(views_of(arrays)):
+        try:
+            level = hold(opened(view.id), 1.0).levels[HALF]
+        except ValueError:
+            continue
+        picture, e = level.rgb.transpose(1, 2, 0) * np.float32(1 / 255), exposure[view.id]
+        seen = [render_rgb_depth(rasterizer, store, level.camera, view.T_map_camera) for store in stores]
+        both = _same_surface(seen)
+        if level.hidden is not None:
+            both &= ~level.hidden
+        shown = [rgb * np.exp(e[:3]) + e[3:] for rgb, _, _ in seen]
+        off = [cv2.blur(np.abs(rgb - picture).mean(axis=2), (_BLUR_PX, _BLUR_PX)) for rgb in shown]
+        for which, store in enumerate(stores):
+            won = np.where(both, np.sign(off[1 - which] - off[which]), 0.0).astype(np.int32)
+            _gather(votes[which], won, store, level.camera, view.T_map_camera, seen[which][1])
+    rasterizer.close()
+    stay = np.ones(len(second), bool)
+    stay[~second], stay[second] = votes[0] >= 0, votes[1] >= 0
+    return stay
+
+
+def _part(arrays: Arrays, chosen: np.ndarray) -> GaussianStore:
+    store = store_of(arrays)
+    store.keep(chosen)
+    return store
+
+
+def _same_surface(seen: list[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> np.ndarray:
+    (_, depth_a, alpha_a), (_, depth_b, alpha_b) = seen
+    with np.errstate(invalid="ignore"):
+        near = np.abs(depth_a - depth_b) < _SAME_M + _SAME_SHARE * np.minimum(depth_a, depth_b)
+    return near & (alpha_a > _COVERED) & (alpha_b > _COVERED)
+
+
+def _gather(
+    votes: np.ndarray,  # int32 [N], added to
+    won: np.ndarray,  # int32 [H, W]: 1, -1, or 0 where there was no contest
+    store: GaussianStore,
+    camera: RasterCamera,
+    T_map_camera: np.ndarray,
+    depth_m: np.ndarray,  # float32 [H, W] of this map alone
+) -> None:
+    """Each Gaussian on the surface that the map shows gets what its own pixel won or lost."""
+    T = inverse(T_map_camera)
+    x, y, z = T[:3, :3] @ store.params[MEAN:SCALE, : store.count] + T[:3, 3:4]
+    ahead = np.maximum(z, 1e-3)
+    u = np.round(x / ahead * camera.fx_px + camera.cx_px)
+    v = np.round(y / ahead * camera.fy_px + camera.cy_px)
+    inside = np.flatnonzero((z > 0.05) & (u >= 0) & (v >= 0) & (u < camera.width_px) & (v < camera.height_px))
+    row, column = v[inside].astype(int), u[inside].astype(int)
+    shown = depth_m[row, column]
+    with np.errstate(invalid="ignore"):
+        on = np.abs(z[inside] - shown) < _SAME_M + _SAME_SHARE * shown
+    votes[inside[on]] += won[row[on], column[on]]

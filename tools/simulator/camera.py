@@ -1,0 +1,121 @@
+"""The camera: where its pixels look (plumb_bob distortion included) and what its sensor makes of light."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from beamsplat.common.compiled import kernel
+from beamsplat.tools.simulator.atlas import linear_to_srgb
+
+WHITE = 4096  # entries of the tone table per unit of exposed light
+SHOT_NOISE = 0.0009  # variance of a fully exposed pixel, of shot noise; about 1100 : 1
+READ_NOISE = 4e-6
+
+
+def distort(points: np.ndarray, distortion: tuple[float, ...]) -> np.ndarray:
+    """Ideal normalised coordinates [N, 2] to distorted ones; plumb_bob (k1 k2 p1 p2 k3), as OpenCV's."""
+    k1, k2, p1, p2, k3 = distortion
+    x, y = points[:, 0], points[:, 1]
+    r2 = x * x + y * y
+    radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    return np.stack(
+        [
+            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+            y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
+        ],
+        axis=-1,
+    )
+
+
+def undistort(points: np.ndarray, distortion: tuple[float, ...], iterations: int = 30) -> np.ndarray:
+    """Inverse of `distort` by Newton's method with a numeric Jacobian.
+
+    Raises:
+        ValueError: the lens folds over inside the picture: no ray belongs to some pixel.
+    """
+    ideal, step = points.copy(), 1e-6
+    right, down = np.array([step, 0.0]), np.array([0.0, step])
+    for _ in range(iterations):
+        error = distort(ideal, distortion) - points
+        fx = (distort(ideal + right, distortion) - distort(ideal - right, distortion)) / (2 * step)
+        fy = (distort(ideal + down, distortion) - distort(ideal - down, distortion)) / (2 * step)
+        det = fx[:, 0] * fy[:, 1] - fy[:, 0] * fx[:, 1]
+        if np.any(det < 0.05):
+            break
+        dx = (fy[:, 1] * error[:, 0] - fy[:, 0] * error[:, 1]) / det
+        dy = (fx[:, 0] * error[:, 1] - fx[:, 1] * error[:, 0]) / det
+        ideal = ideal - np.stack([dx, dy], axis=-1)
+        if np.abs(error).max() < 1e-12:
+            return ideal
+    if np.abs(distort(ideal, distortion) - points).max() > 1e-9:
+        raise ValueError(
+            f"distortion {distortion} folds over inside the picture: "
+            "take smaller coefficients or a longer lens"
+        )
+    return ideal
+
+
+def pixel_rays(
+    width: int, height: int, K: np.ndarray, distortion: tuple[float, ...] = (0.0,) * 5
+) -> np.ndarray:
+    """float64 [H, W, 3], camera frame, z = 1: where each pixel looks. Pixel centres are integers."""
+    u, v = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
+    points = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1]], axis=-1).reshape(-1, 2)
+    if any(distortion):
+        points = undistort(points, distortion)
+    return np.concatenate([points, np.ones((len(points), 1))], axis=1).reshape(height, width, 3)
+
+
+def _tone_table() -> np.ndarray:
+    """sRGB value (0..255, float32) of exposed light 0..4 in steps of 1 / WHITE: soft shoulder above 0.7."""
+    x = np.arange(4 * WHITE + 1) / WHITE
+    knee = 0.7
+    soft = knee + (1 - knee) * (1 - np.exp(-(x - knee) / (1 - knee)))
+    return (255.0 * linear_to_srgb(np.where(x < knee, x, soft))).astype(np.float32)
+
+
+TONE = _tone_table()
+
+
+@kernel
+def _develop(
+    radiance: np.ndarray,
+    gain: float,
+    falloff: np.ndarray,
+    noise: np.ndarray,
+    tone: np.ndarray,
+    shot: float,
+    read: float,
+    out: np.ndarray,
+) -> None:
+    height, width = radiance.shape[:2]
+    top = len(tone) - 1
+    for y in range(height):
+        for x in range(width):
+            for c in range(3):
+                value = radiance[y, x, c] * gain * falloff[y, x]
+                value += noise[y, x, c] * np.sqrt(shot * max(value, 0.0) + read)
+                at = int(min(max(value, 0.0) * WHITE + 0.5, float(top)))
+                out[y, x, 2 - c] = np.uint8(tone[at] + 0.5)
+
+
+class Sensor:
+    """Vignetting, exposure, shot noise, tone curve, JPEG."""
+
+    def __init__(self, table_rays: np.ndarray, *, noise: float, vignetting: float, quality: int) -> None:
+        squared = (table_rays[..., :2] ** 2).sum(axis=-1)
+        self._falloff = (1.0 / (1.0 + vignetting * squared)).astype(np.float32)
+        self._noise, self._quality = noise, quality
+
+    def develop(self, radiance: np.ndarray, gain: float, rng: np.random.Generator) -> np.ndarray:
+        """uint8 BGR [H, W, 3] of linear radiance float32 [H, W, 3]."""
+        out = np.empty(radiance.shape, np.uint8)
+        grain = rng.standard_normal(radiance.shape, dtype=np.float32)
+        shot, read = SHOT_NOISE * self._noise**2, READ_NOISE * self._noise**2
+        _develop(radiance, gain, self._falloff, grain, TONE, shot, read, out)
+        return out
+
+    def jpeg(self, bgr: np.ndarray) -> bytes:
+        """The picture as the camera sends it."""
+        return cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, self._quality])[1].tobytes()

@@ -1,0 +1,97 @@
+"""The drive: a smooth closed curve and the speed a differential-drive robot takes along it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.interpolate import CubicHermiteSpline, CubicSpline
+
+from beamsplat.common.geometry.transforms import se2_to_se3
+
+
+def resample_closed(points_m: np.ndarray, step_m: float) -> np.ndarray:
+    """A closed polyline [N, 2] at even steps (the last point is not the first again)."""
+    closed = np.vstack([points_m, points_m[:1]])
+    s = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1))])
+    count = max(8, int(np.ceil(s[-1] / step_m)))
+    at = np.arange(count) * s[-1] / count
+    return np.stack([np.interp(at, s, closed[:, k]) for k in range(2)], axis=1)
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What the wheels can do."""
+
+    speed_m_s: float = 0.45
+    turn_rad_s: float = 0.7
+    acceleration_m_s2: float = 0.35
+    lateral_m_s2: float = 0.25
+
+
+class Drive:
+    """A closed lap as a function of time: starts and ends at rest at the same place.
+
+    The heading is the curve's tangent: the robot cannot slide sideways.
+    """
+
+    def __init__(self, points_m: np.ndarray, limits: Limits, *, start: float = 0.0) -> None:
+        """From control points [N, 2] of a closed curve; `start` is where on it the lap begins, 0..1."""
+        count = len(points_m)
+        points_m = np.roll(points_m, -int(start * count) % count, axis=0)
+        closed = np.vstack([points_m, points_m[:1]])
+        length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1))])
+        self._curve = CubicSpline(length, closed, bc_type="periodic")
+        self._s_end = float(length[-1])
+        s = np.linspace(0.0, self._s_end, max(400, int(self._s_end / 0.005)))
+        first, second = self._curve(s, 1), self._curve(s, 2)
+        metric = np.linalg.norm(first, axis=1)
+        curvature = np.abs(first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]) / metric**3
+        along = np.concatenate([[0.0], np.cumsum(0.5 * (metric[1:] + metric[:-1]) * np.diff(s))])
+        speed = np.minimum(limits.speed_m_s, limits.turn_rad_s / np.maximum(curvature, 1e-6))
+        speed = np.minimum(speed, np.sqrt(limits.lateral_m_s2 / np.maximum(curvature, 1e-6)))
+        speed = _accelerate(speed, along, limits.acceleration_m_s2)
+        time = np.concatenate([[0.0], np.cumsum(2 * np.diff(along) / (speed[1:] + speed[:-1]))])
+        self.length_m = float(along[-1])
+        # Between samples the acceleration is constant: position is a parabola, which Hermite's cubic meets.
+        self._motion = CubicHermiteSpline(time, s, speed / metric)
+        self._drive_s = float(time[-1])
+        # Whole seconds: every sensor's period divides a lap, so that laps can share their pictures.
+        self.lap_s = float(np.ceil(time[-1] + 0.5))
+
+    def pose_at(self, time_s: np.ndarray | float) -> np.ndarray:
+        """SE(2) poses [..., 3] at times in seconds from the start of the first lap (any number of laps)."""
+        time = np.asarray(time_s, dtype=np.float64)
+        s = self._position(time)
+        xy, tangent = self._curve(s), self._curve(s, 1)
+        return np.concatenate([xy, np.arctan2(tangent[..., 1], tangent[..., 0])[..., None]], axis=-1)
+
+    def transform_at(self, time_s: np.ndarray | float) -> np.ndarray:
+        """`T_world_body` [..., 4, 4]."""
+        return se2_to_se3(self.pose_at(time_s))
+
+    def speed_at(self, time_s: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:
+        """Forward speed m/s and turn rate rad/s at times in seconds."""
+        time = np.asarray(time_s, dtype=np.float64)
+        s = self._position(time)
+        first, second = self._curve(s, 1), self._curve(s, 2)
+        metric = np.linalg.norm(first, axis=-1)
+        lap_time = np.mod(time, self.lap_s)
+        moved = np.where(lap_time < self._drive_s, self._motion(lap_time, 1) * metric, 0.0)
+        bend = (first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0]) / metric**3
+        return moved, moved * bend
+
+    def _position(self, time: np.ndarray) -> np.ndarray:
+        return self._motion(np.minimum(np.mod(time, self.lap_s), self._drive_s)) % self._s_end
+
+
+def _accelerate(speed: np.ndarray, along: np.ndarray, limit: float) -> np.ndarray:
+    """Lowers a speed profile until neither its rise nor its fall exceeds the limit; rest at both ends."""
+    v2 = speed**2
+    v2[0] = v2[-1] = 1e-5
+    step = 2.0 * limit * np.diff(along)
+    for k in range(1, len(v2)):
+        v2[k] = min(v2[k], v2[k - 1] + step[k - 1])
+    for k in range(len(v2) - 2, -1, -1):
+        v2[k] = min(v2[k], v2[k + 1] + step[k])
+    return np.sqrt(v2)

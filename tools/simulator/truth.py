@@ -1,0 +1,243 @@
+"""Truth beside the bag: depth, masks, views off the path, and points of the surface the camera saw."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from beamsplat.common.compiled import kernel
+from beamsplat.common.geometry.transforms import so3_exp
+from beamsplat.tools.simulator.camera import TONE, WHITE, Sensor, pixel_rays
+from beamsplat.tools.simulator.freespace import FreeSpace
+from beamsplat.tools.simulator.render import ray_table
+from beamsplat.tools.simulator.settings import CameraSettings
+from beamsplat.tools.simulator.shade import Surfaces, sample
+from beamsplat.tools.simulator.shots import Studio, depth_mm
+from beamsplat.tools.simulator.writer import transform_json, write_png
+
+OFF_PATH_M = (0.15, 0.60)
+SEEN_SHARE = 0.85
+
+
+@dataclass(frozen=True)
+class Seen:
+    """Depth maps of the drive and where they were taken."""
+
+    T_world_camera: np.ndarray  # float64 [N, 4, 4]
+    depth_mm: np.ndarray  # uint16 [N, H, W], in the pixels of the (distorted) images
+    K: np.ndarray
+    distortion: tuple[float, ...]
+
+    def count(self, points_m: np.ndarray, normals: np.ndarray) -> np.ndarray:
+        """int32 [P]: in how many of the views each point [P, 3] is in sight, from its front."""
+        return _count_views(
+            np.ascontiguousarray(points_m, dtype=np.float64),
+            np.ascontiguousarray(normals, dtype=np.float64),
+            self.T_world_camera,
+            self.depth_mm,
+            self.K,
+            np.array(self.distortion, dtype=np.float64),
+        )
+
+
+@kernel
+def _count_views(
+    points: np.ndarray, normals: np.ndarray, T: np.ndarray, depth: np.ndarray, K: np.ndarray, d: np.ndarray
+) -> np.ndarray:
+    seen = np.zeros(len(points), np.int32)
+    height, width = depth.shape[1:]
+    for i in range(len(points)):
+        for k in range(len(T)):
+            x, y, z = points[i, 0] - T[k, 0, 3], points[i, 1] - T[k, 1, 3], points[i, 2] - T[k, 2, 3]
+            if normals[i, 0] * x + normals[i, 1] * y + normals[i, 2] * z > -1e-4:
+                continue
+            cz = T[k, 0, 2] * x + T[k, 1, 2] * y + T[k, 2, 2] * z
+            if cz < 0.05:
+                continue
+            cx = (T[k, 0, 0] * x + T[k, 1, 0] * y + T[k, 2, 0] * z) / cz
+            cy = (T[k, 0, 1] * x + T[k, 1, 1] * y + T[k, 2, 1] * z) / cz
+            r2 = cx * cx + cy * cy
+            if r2 > 2.0:
+                continue
+            radial = 1.0 + r2 * (d[0] + r2 * (d[1] + r2 * d[4]))
+            u = K[0, 0] * (cx * radial + 2 * d[2] * cx * cy + d[3] * (r2 + 2 * cx * cx)) + K[0, 2]
+            v = K[1, 1] * (cy * radial + d[2] * (r2 + 2 * cy * cy) + 2 * d[3] * cx * cy) + K[1, 2]
+            column, row = int(np.floor(u + 0.5)), int(np.floor(v + 0.5))
+            if 0 <= column < width and 0 <= row < height:
+                there = depth[k, row, column] * 0.001
+                if there > 0.0 and abs(there - cz) < 0.015 + 0.01 * cz:
+                    seen[i] += 1
+    return seen
+
+
+def surface_points(
+    scene: Surfaces, seen: Seen, wanted: int, gain: float, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Up to `wanted` points float32 [N, 3], even over the seen surface, and their uint8 RGB [N, 3].
+
+    Fewer come back only if the camera saw next to nothing.
+    """
+    area = np.linalg.norm(scene.normal, axis=1) / 2
+    unit = scene.normal / np.maximum(2 * area[:, None], 1e-30)
+    e1, e2 = _edges(scene)
+    # Triangles are small: one with no corner and no middle in sight has nothing in sight worth a point.
+    probes = np.stack(
+        [
+            scene.corner + 0.02 * (e1 + e2),
+            scene.corner + 0.96 * e1,
+            scene.corner + 0.96 * e2,
+            scene.corner + (e1 + e2) / 3,
+        ]
+    )
+    in_sight = np.any([seen.count(p, unit) > 0 for p in probes], axis=0)
+    weight = np.where(in_sight, area, 0.0)
+    if weight.sum() <= 0.0:
+        return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
+    found, colours, total = [], [], 0
+    for _ in range(12):
+        triangle = rng.choice(len(area), size=wanted, p=weight / weight.sum())
+        a, b = rng.random((2, len(triangle)))
+        fold = a + b > 1
+        a, b = np.where(fold, 1 - a, a), np.where(fold, 1 - b, b)
+        points = scene.corner[triangle] + a[:, None] * e1[triangle] + b[:, None] * e2[triangle]
+        keep = seen.count(points, unit[triangle]) > 0
+        found.append(points[keep].astype(np.float32))
+        colours.append(_colours(scene, triangle[keep], a[keep], b[keep], gain))
+        total += int(keep.sum())
+        if total >= wanted:
+            break
+    order = rng.permutation(total)[:wanted]
+    return np.concatenate(found)[order], np.concatenate(colours)[order]
+
+
+def _edges(scene: Surfaces) -> tuple[np.ndarray, np.ndarray]:
+    """The edge vectors [F, 3] whose barycentrics `scene.dual` measures.
+
+    dual_1 = e2 x n / n^2 and dual_2 = n x e1 / n^2 give n x dual_1 = e2 and dual_2 x n = e1.
+    """
+    dual = scene.dual.astype(np.float64)
+    return np.cross(dual[:, 1], scene.normal), np.cross(scene.normal, dual[:, 0])
+
+
+def _colours(scene: Surfaces, triangle: np.ndarray, a: np.ndarray, b: np.ndarray, gain: float) -> np.ndarray:
+    radiance = np.empty((len(triangle), 3))
+    _point_radiance(scene, triangle, a, b, radiance)
+    at = np.clip(radiance * gain * WHITE + 0.5, 0, len(TONE) - 1).astype(int)
+    return np.rint(TONE[at]).astype(np.uint8)
+
+
+@kernel
+def _point_radiance(s: Surfaces, triangle: np.ndarray, a: np.ndarray, b: np.ndarray, out: np.ndarray) -> None:
+    texel = np.zeros(3)
+    for i in range(len(triangle)):
+        f = triangle[i]
+        u = s.uv[f, 0, 0] + a[i] * s.uv[f, 1, 0] + b[i] * s.uv[f, 2, 0]
+        v = s.uv[f, 0, 1] + a[i] * s.uv[f, 1, 1] + b[i] * s.uv[f, 2, 1]
+        sample(s, s.texture[f], u, v, 1e-9, 0.0, 0.0, 1e-9, texel)
+        for c in range(3):
+            light = (1 - a[i] - b[i]) * s.light[f, 0, c] + a[i] * s.light[f, 1, c] + b[i] * s.light[f, 2, c]
+            out[i, c] = texel[c] * s.tint[f, c] * (light + s.emission[f])
+
+
+def write_extra_views(
+    folder: Path,
+    studio: Studio,
+    space: FreeSpace,
+    seen: Seen,
+    times_s: np.ndarray,
+    count: int,
+    rng: np.random.Generator,
+    progress: Callable[[int, int], None],
+) -> int:
+    """Pinhole views off the path of what the drive has seen, without movers, with depth; returns how many."""
+    folder.mkdir()
+    camera = studio.shoot.camera
+    table = ray_table(pixel_rays(camera.width_px, camera.height_px, camera.K))
+    sensor = Sensor(table.rays, noise=0.0, vignetting=camera.vignetting, quality=camera.jpeg_quality)
+    small = ray_table(pixel_rays(48, 36, _scaled(camera, 48)))
+    path = studio.drive.pose_at(np.linspace(times_s[0], times_s[-1], 2000))[:, :2]
+    views: list[dict[str, object]] = []
+    for _ in range(count * 40):
+        if len(views) == count:
+            break
+        T, offset = _candidate(studio, space, path, times_s, rng)
+        if T is None:
+            continue
+        share = _seen_share(studio, seen, T, studio.still(T, small), small.rays)
+        if share < SEEN_SHARE:
+            continue
+        picture = studio.still(T, table)
+        name = f"{len(views):03d}"
+        bgr = sensor.develop(picture.radiance, studio.gain, np.random.default_rng(0))
+        (folder / f"{name}.jpg").write_bytes(sensor.jpeg(bgr))
+        write_png(folder / f"{name}_depth.png", depth_mm(picture.depth_z_m))
+        pose = transform_json(T)
+        views.append(
+            {
+                "file": f"{name}.jpg",
+                "depth": f"{name}_depth.png",
+                "T_world_camera": pose["matrix"],
+                "translation_xyz": pose["translation_xyz"],
+                "quaternion_xyzw": pose["quaternion_xyzw"],
+                "distance_to_trajectory_m": offset,
+                "fraction_seen_in_sequence": share,
+            }
+        )
+        progress(len(views), count)
+    K = camera.K
+    intrinsics = {
+        "width": camera.width_px,
+        "height": camera.height_px,
+        "fx": K[0, 0],
+        "fy": K[1, 1],
+        "cx": K[0, 2],
+        "cy": K[1, 2],
+        "distortion": [0, 0, 0, 0, 0],
+    }
+    (folder / "poses.json").write_text(
+        json.dumps({"intrinsics": intrinsics, "views": views}, indent=1) + "\n"
+    )
+    return len(views)
+
+
+def _scaled(camera: CameraSettings, width: int) -> np.ndarray:
+    scale = width / camera.width_px
+    K = camera.K * scale
+    K[0, 2], K[1, 2], K[2, 2] = (width - 1) / 2, (width * camera.height_px / camera.width_px - 1) / 2, 1.0
+    return K
+
+
+def _candidate(
+    studio: Studio, space: FreeSpace, path: np.ndarray, times_s: np.ndarray, rng: np.random.Generator
+) -> tuple[np.ndarray | None, float]:
+    T = studio.pose(float(rng.choice(times_s)))
+    sideways = rng.uniform(*OFF_PATH_M) * rng.choice([-1.0, 1.0])
+    place = T[:3, 3] + T[:3, 0] * sideways + T[:3, 2] * rng.uniform(-0.2, 0.2)
+    offset = float(np.linalg.norm(path - place[:2], axis=1).min())
+    if not OFF_PATH_M[0] <= offset <= OFF_PATH_M[1] or space.clearance(place[None, :2])[0] < 0.18:
+        return None, offset
+    turn = so3_exp([0.0, 0.0, rng.normal(0.0, 0.25)])
+    tilt = so3_exp([rng.normal(0.0, 0.05), 0.0, rng.normal(0.0, 0.02)])
+    out = np.eye(4)
+    out[:3, :3] = turn @ T[:3, :3] @ tilt
+    out[:3, 3] = [place[0], place[1], rng.uniform(0.38, 0.62)]
+    return out, offset
+
+
+def _seen_share(studio: Studio, seen: Seen, T: np.ndarray, picture: object, rays: np.ndarray) -> float:
+    depth, triangle = picture.depth_z_m.ravel(), picture.triangle.ravel()  # type: ignore[attr-defined]
+    valid = triangle >= 0
+    points = (rays.reshape(-1, 3) * depth[:, None])[valid] @ T[:3, :3].T + T[:3, 3]
+    n = studio.renderer.scene.normal[triangle[valid]]
+    flip = np.sign(np.einsum("ij,ij->i", n, T[:3, 3] - points))[:, None]
+    return float(np.sum(seen.count(points, n * flip) > 0) / len(depth))
+
+
+def decode_depth(png: np.ndarray) -> np.ndarray:
+    """uint16 [H, W] of PNG bytes uint8 [B]."""
+    return cv2.imdecode(png, cv2.IMREAD_UNCHANGED)

@@ -1,0 +1,59 @@
+"""Wheel odometry: integrates the true motion as counted with wrong wheel sizes and a wrong track."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from beamsplat.common.geometry.transforms import wrap_angle
+from beamsplat.tools.simulator.settings import WheelSettings
+
+
+@dataclass(frozen=True)
+class Odometry:
+    """M readings; the first is the origin of the odometry's own frame."""
+
+    pose: np.ndarray  # float64 [M, 3] SE(2) `odom` from `body`
+    speed_m_s: np.ndarray  # float64 [M]
+    turn_rad_s: np.ndarray  # float64 [M]
+
+
+class Wheels:
+    """Draws this robot's errors once, then counts on and on: state is carried from call to call."""
+
+    def __init__(self, settings: WheelSettings, rng: np.random.Generator) -> None:
+        self._noise, self._rng = settings.noise, rng
+        self.scale = 1.0 + _signed(rng, settings.scale_error)
+        self.turn = 1.0 + _signed(rng, settings.turn_error)
+        self._pose = np.zeros(3)
+        self._before: np.ndarray | None = None
+
+    def count(self, pose: np.ndarray, period_s: float) -> Odometry:
+        """Readings at true poses [M, 3] that follow the last call's, `period_s` apart."""
+        first = pose[:1] if self._before is None else self._before[None]
+        chain = np.concatenate([first, pose])
+        self._before = pose[-1].copy()
+        move = np.diff(chain[:, :2], axis=0)
+        turn = np.asarray(wrap_angle(np.diff(chain[:, 2])))
+        middle = chain[:-1, 2] + turn / 2
+        forward = move[:, 0] * np.cos(middle) + move[:, 1] * np.sin(middle)
+        # Slip grows with what the wheels do: a standing robot's odometry stands.
+        grain = self._rng.standard_normal((2, len(pose)))
+        forward = forward * self.scale + self._noise * np.sqrt(np.abs(forward) * 0.01) * grain[0]
+        turn = (
+            turn * self.turn
+            + self._noise * np.sqrt(np.abs(turn) * 0.02 + np.abs(forward) * 0.0005) * grain[1]
+        )
+        yaw = self._pose[2] + np.cumsum(turn)
+        along = yaw - turn / 2
+        x = self._pose[0] + np.cumsum(forward * np.cos(along))
+        y = self._pose[1] + np.cumsum(forward * np.sin(along))
+        out = np.stack([x, y, yaw], axis=1)
+        self._pose = out[-1].copy()
+        out[:, 2] = wrap_angle(out[:, 2])
+        return Odometry(out, forward / period_s, turn / period_s)
+
+
+def _signed(rng: np.random.Generator, span: tuple[float, float]) -> float:
+    return float(rng.uniform(*span) * rng.choice([-1.0, 1.0]))

@@ -1,0 +1,249 @@
+"""The recording as a ROS 2 bag (MCAP), and the truth files beside it."""
+
+from __future__ import annotations
+
+import heapq
+import json
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+
+from beamsplat.common.geometry.transforms import quat_xyzw_from_matrix
+from beamsplat.tools.simulator.settings import CameraSettings, Faults, LidarSettings
+
+STORE = get_typestore(Stores.ROS2_HUMBLE)
+TYPES = STORE.types
+TOPICS = {
+    "/tf_static": "tf2_msgs/msg/TFMessage",
+    "/tf": "tf2_msgs/msg/TFMessage",
+    "/odom": "nav_msgs/msg/Odometry",
+    "/camera/image_raw/compressed": "sensor_msgs/msg/CompressedImage",
+    "/camera/camera_info": "sensor_msgs/msg/CameraInfo",
+    "/scan": "sensor_msgs/msg/LaserScan",
+}
+SENSOR_TOPICS = ("/scan", "/camera/image_raw/compressed", "/camera/camera_info")
+BASE, CAMERA, LASER, ODOM = "base_link", "camera_optical_frame", "laser", "odom"
+
+
+@dataclass(frozen=True)
+class Record:
+    """One message: when it was received, its topic and the CDR bytes."""
+
+    received_ns: int
+    topic: str
+    data: bytes
+
+
+def write_bag(path: Path, streams: Iterable[Iterator[Record]], topics: Iterable[str]) -> int:
+    """Merges streams (each in order of receipt) into a new bag folder; returns the number of messages."""
+    count = 0
+    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as bag:
+        connections = {
+            name: bag.add_connection(name, TOPICS[name], typestore=STORE, offered_qos_profiles=[_qos(name)])
+            for name in topics
+        }
+        for record in heapq.merge(*streams, key=lambda r: r.received_ns):
+            bag.write(connections[record.topic], record.received_ns, record.data)
+            count += 1
+    return count
+
+
+def _qos(topic: str) -> Qos:
+    latched = topic == "/tf_static"
+    zero = QosTime(0, 0)
+    return Qos(
+        QosHistory.KEEP_LAST,
+        1 if latched else 10,
+        QosReliability.BEST_EFFORT if topic in SENSOR_TOPICS else QosReliability.RELIABLE,
+        QosDurability.TRANSIENT_LOCAL if latched else QosDurability.VOLATILE,
+        zero,
+        zero,
+        QosLiveliness.AUTOMATIC,
+        zero,
+        False,
+    )
+
+
+def _cdr(message: Any) -> bytes:
+    return bytes(STORE.serialize_cdr(message, message.__msgtype__))
+
+
+def _make(kind: str, *values: Any) -> Any:
+    return TYPES[kind](*values)
+
+
+def _header(stamp_ns: int, frame: str) -> Any:
+    time = _make("builtin_interfaces/msg/Time", int(stamp_ns // 10**9), int(stamp_ns % 10**9))
+    return _make("std_msgs/msg/Header", time, frame)
+
+
+def _vector(xyz: np.ndarray) -> Any:
+    return _make("geometry_msgs/msg/Vector3", *(float(v) for v in xyz))
+
+
+def _quaternion(R: np.ndarray) -> Any:
+    return _make("geometry_msgs/msg/Quaternion", *(float(v) for v in quat_xyzw_from_matrix(R)))
+
+
+def _stamped(stamp_ns: int, parent: str, child: str, T: np.ndarray) -> Any:
+    transform = _make("geometry_msgs/msg/Transform", _vector(T[:3, 3]), _quaternion(T[:3, :3]))
+    return _make("geometry_msgs/msg/TransformStamped", _header(stamp_ns, parent), child, transform)
+
+
+def tf_bytes(stamp_ns: int, links: list[tuple[str, str, np.ndarray]]) -> bytes:
+    """A TFMessage of (parent, child, T_parent_child)."""
+    return _cdr(_make("tf2_msgs/msg/TFMessage", [_stamped(stamp_ns, *link) for link in links]))
+
+
+def odometry_bytes(stamp_ns: int, T_odom_body: np.ndarray, speed_m_s: float, turn_rad_s: float) -> bytes:
+    """nav_msgs/Odometry with the covariances a planar driver gives."""
+    point = _make("geometry_msgs/msg/Point", *(float(v) for v in T_odom_body[:3, 3]))
+    pose = _make("geometry_msgs/msg/Pose", point, _quaternion(T_odom_body[:3, :3]))
+    covariances = [np.diag([v, v, 1e6, 1e6, 1e6, w]).ravel() for v, w in ((1e-2, 2e-2), (1e-3, 2e-3))]
+    twist = _make(
+        "geometry_msgs/msg/Twist", _vector(np.array([speed_m_s, 0, 0])), _vector(np.array([0, 0, turn_rad_s]))
+    )
+    return _cdr(
+        _make(
+            "nav_msgs/msg/Odometry",
+            _header(stamp_ns, ODOM),
+            BASE,
+            _make("geometry_msgs/msg/PoseWithCovariance", pose, covariances[0]),
+            _make("geometry_msgs/msg/TwistWithCovariance", twist, covariances[1]),
+        )
+    )
+
+
+def scan_bytes(stamp_ns: int, ranges_m: np.ndarray, lidar: LidarSettings) -> bytes:
+    """sensor_msgs/LaserScan."""
+    step = lidar.angle_increment_rad
+    return _cdr(
+        _make(
+            "sensor_msgs/msg/LaserScan",
+            _header(stamp_ns, LASER),
+            lidar.angle_min_rad,
+            lidar.angle_min_rad + (lidar.beams - 1) * step,
+            step,
+            lidar.time_increment_s,
+            lidar.scan_time_s,
+            lidar.range_min_m,
+            lidar.range_max_m,
+            ranges_m,
+            np.zeros(0, np.float32),
+        )
+    )
+
+
+def image_bytes(stamp_ns: int, jpeg: np.ndarray) -> bytes:
+    """sensor_msgs/CompressedImage of uint8 [B]."""
+    return _cdr(_make("sensor_msgs/msg/CompressedImage", _header(stamp_ns, CAMERA), "jpeg", jpeg))
+
+
+def camera_info_bytes(stamp_ns: int, camera: CameraSettings) -> bytes:
+    """sensor_msgs/CameraInfo."""
+    K = camera.K
+    P = np.hstack([K, np.zeros((3, 1))])
+    region = _make("sensor_msgs/msg/RegionOfInterest", 0, 0, 0, 0, False)
+    return _cdr(
+        _make(
+            "sensor_msgs/msg/CameraInfo",
+            _header(stamp_ns, CAMERA),
+            camera.height_px,
+            camera.width_px,
+            "plumb_bob",
+            np.array(camera.distortion, dtype=np.float64),
+            K.ravel(),
+            np.eye(3).ravel(),
+            P.ravel(),
+            0,
+            0,
+            region,
+        )
+    )
+
+
+def write_tum(path: Path, stamps_ns: np.ndarray, T_world_body: np.ndarray) -> None:
+    """A TUM trajectory; stamps keep all nine digits."""
+    lines = ["# timestamp_s tx ty tz qx qy qz qw  (T_world_base)"]
+    for stamp, T in zip(stamps_ns.tolist(), T_world_body):
+        numbers = " ".join(f"{v:.9f}" for v in (*T[:3, 3], *quat_xyzw_from_matrix(T[:3, :3])))
+        lines.append(f"{stamp // 10**9}.{stamp % 10**9:09d} {numbers}")
+    path.write_text("\n".join(lines) + "\n")
+
+
+def transform_json(T: np.ndarray) -> dict[str, Any]:
+    """A transform as matrix and as translation + quaternion."""
+    return {
+        "matrix": T.tolist(),
+        "translation_xyz": T[:3, 3].tolist(),
+        "quaternion_xyzw": quat_xyzw_from_matrix(T[:3, :3]).tolist(),
+    }
+
+
+def write_camera_json(path: Path, camera: CameraSettings, lidar: LidarSettings, faults: Faults) -> None:
+    """The true calibration; where the bag's tf lies on purpose, `published_T_base_camera` says how."""
+    K = camera.K
+    text: dict[str, Any] = {
+        "width": camera.width_px,
+        "height": camera.height_px,
+        "model": "pinhole",
+        "fx": K[0, 0],
+        "fy": K[1, 1],
+        "cx": K[0, 2],
+        "cy": K[1, 2],
+        "distortion_model": "plumb_bob",
+        "distortion": list(camera.distortion),
+        "rate_hz": camera.rate_hz,
+        "pixel_convention": "pixel centres at integer coordinates: u = fx*X/Z+cx",
+        "depth_unit": "uint16 millimetres along optical z, 0 = no surface",
+        "depth_grid": "depth_gt and moving_masks have the images' distorted pixels; extra_views are pinhole",
+        "frames": {
+            "base": f"{BASE} (on the floor between the wheels, x forward, z up)",
+            "camera": f"{CAMERA} (x right, y down, z forward)",
+            "lidar": LASER,
+        },
+        "T_base_camera": transform_json(camera.T_body_camera),
+        "T_base_lidar": transform_json(lidar.T_body_lidar),
+        "published_T_base_camera": transform_json(faults.published(camera.T_body_camera)),
+        "camera_clock_offset_ms": faults.clock_offset_ms,
+        "exposure_changes": faults.exposure_changes,
+        "lidar": {
+            "beams": lidar.beams,
+            "angle_min": lidar.angle_min_rad,
+            "angle_increment": lidar.angle_increment_rad,
+            "rate_hz": lidar.rate_hz,
+            "scan_time": lidar.scan_time_s,
+            "time_increment": lidar.time_increment_s,
+            "range_min": lidar.range_min_m,
+            "range_max": lidar.range_max_m,
+            "noise_sigma_m": lidar.noise_m,
+            "dropout": lidar.dropout,
+            "glass": lidar.glass,
+            "stamp": "time of the first beam",
+        },
+    }
+    path.write_text(json.dumps(text, indent=1) + "\n")
+
+
+def write_ply(path: Path, points_m: np.ndarray, colours: np.ndarray) -> None:
+    """Binary PLY of float32 points [N, 3] with uint8 RGB [N, 3]."""
+    head = (
+        f"ply\nformat binary_little_endian 1.0\nelement vertex {len(points_m)}\n"
+        "property float x\nproperty float y\nproperty float z\n"
+        "property uchar red\nproperty uchar green\nproperty uchar blue\nend_header\n"
+    )
+    rows = np.zeros(len(points_m), dtype=[("p", "<f4", 3), ("c", "u1", 3)])
+    rows["p"], rows["c"] = points_m, colours
+    path.write_bytes(head.encode() + rows.tobytes())
+
+
+def write_png(path: Path, picture: np.ndarray) -> None:
+    """uint8 or uint16."""
+    path.write_bytes(cv2.imencode(".png", picture)[1].tobytes())

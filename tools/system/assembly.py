@@ -1,0 +1,112 @@
+"""From a deployment file to nodes: what would run, and whether it fits together."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from beamsplat.common.config.deployment import Deployment, Role
+from beamsplat.common.errors import UserError
+from beamsplat.common.runtime.node import Node
+from beamsplat.common.runtime.registry import Service, class_of, make_node
+from beamsplat.common.topics import TOPICS
+from beamsplat.services.nodes import NODES
+
+
+@dataclass(frozen=True)
+class Fault:
+    """Something wrong in a deployment. Fatal ones keep it from running."""
+
+    text: str
+    fatal: bool = True
+
+
+def build_node(deployment: Deployment, name: str, table: dict[str, Service] = NODES) -> Node:
+    """The node called `name` as this deployment configures it.
+
+    Raises:
+        UserError: not in the deployment, or not in the process list, or wrong options.
+    """
+    return make_node(_service(deployment, name, table), deployment.nodes[name], "deployment")
+
+
+def _service(deployment: Deployment, name: str, table: dict[str, Service]) -> Service:
+    if name not in deployment.nodes:
+        known = ", ".join(deployment.nodes) or "none"
+        raise UserError(f"the deployment has no node {name!r}; it has {known}")
+    if name not in table:
+        raise UserError(f"nodes.{name}: no such service; there are {', '.join(table)}")
+    return table[name]
+
+
+def node_classes(deployment: Deployment, table: dict[str, Service] = NODES) -> dict[str, type[Node]]:
+    """The class of each node of a deployment, by name; options other than `kind` are not looked at."""
+    return {
+        name: class_of(_service(deployment, name, table), options)
+        for name, options in deployment.nodes.items()
+    }
+
+
+def faults(deployment: Deployment, table: dict[str, Service] = NODES) -> list[Fault]:
+    """What is wrong with a deployment; empty if it would run."""
+    found: list[Fault] = []
+    classes: dict[str, type[Node]] = {}
+    for name in deployment.nodes:
+        try:
+            classes[name] = type(build_node(deployment, name, table))
+        except UserError as error:
+            found.append(Fault(str(error)))
+    producers: dict[str, list[str]] = {topic: [] for topic in TOPICS}
+    for name, node_class in classes.items():
+        for topic in node_class.outputs:
+            producers[topic].append(name)
+    for topic in _from_afar(deployment.role):
+        producers[topic].append("the uplink")
+    for topic, names in producers.items():
+        if len(names) > 1:
+            found.append(Fault(f"{topic} would be written by {' and '.join(names)}: keep one of them"))
+    for name, node_class in classes.items():
+        missing = [i.topic for i in node_class.inputs if not producers[i.topic]]
+        whole = len(classes) == len(deployment.nodes)  # else what does not fit may have fed it
+        if whole and missing and len(missing) == len(node_class.inputs):
+            found.append(Fault(f"nothing in this deployment feeds {name}: {', '.join(missing)}", fatal=False))
+    if deployment.role == "robot" and "uplink" not in deployment.nodes:
+        found.append(Fault('role = "robot" without node uplink: nothing reaches an edge server', fatal=False))
+    return found
+
+
+def unusable(
+    deployment: Deployment, names: tuple[str, ...] | None = None, table: dict[str, Service] = NODES
+) -> list[Fault]:
+    """What options of a deployment without faults name and cannot be used, such as missing data."""
+    found = []
+    for name in names or tuple(deployment.nodes):
+        if name in deployment.nodes:
+            try:
+                build_node(deployment, name, table).examine()
+            except UserError as error:
+                found.append(Fault(f"{name}: {error}"))
+    return found
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """What a node must know of the others of its deployment."""
+
+    wait_for: frozenset[str]  # a source starts when these are active, so that they miss nothing
+    unfed: frozenset[str]  # inputs that nobody here produces: they are not waited for
+
+
+def surroundings(classes: dict[str, type[Node]], name: str, role: Role = "whole") -> Surroundings:
+    """The surroundings of a node among the classes of its deployment."""
+    fed = {topic for node in classes.values() for topic in node.outputs} | _from_afar(role)
+    listeners = frozenset(other for other, node in classes.items() if node.inputs and other != name)
+    return Surroundings(
+        wait_for=listeners if classes[name].is_source() and classes[name].outputs else frozenset(),
+        unfed=frozenset(entry.topic for entry in classes[name].inputs if entry.topic not in fed),
+    )
+
+
+def _from_afar(role: Role) -> set[str]:
+    """Topics that come over the uplink: to the edge what goes up, to a robot what comes down."""
+    ways = {"whole": (), "robot": ("down",), "edge": ("up", "bulk")}[role]
+    return {name for name, row in TOPICS.items() if row.uplink in ways}

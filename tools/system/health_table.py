@@ -1,0 +1,129 @@
+"""The health of all nodes of a robot, collected from the bus and drawn as a table."""
+
+from __future__ import annotations
+
+import threading
+import time
+
+import zenoh
+from rich import box
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from beamsplat.common.messages import Health
+from beamsplat.common.messages.header import DecodeError
+from beamsplat.common.runtime.health import Flow, HealthBook, NodeRecord, Taker
+from beamsplat.common.topics import HEALTH, Topic
+from beamsplat.common.zenoh.bus import key
+from beamsplat.common.zenoh.streams import open_sample
+
+ALL = "*"
+
+
+class HealthBoard:
+    """Listens to health/* in a thread of its own until the session is closed: of one robot, or with `ALL` of
+    every robot, whose nodes then go by robot/node."""
+
+    def __init__(self, session: zenoh.Session, robot: str) -> None:
+        self._all = robot == ALL
+        self._book = HealthBook()
+        self.records: dict[str, NodeRecord] = self._book.records
+        self._lock = threading.Lock()
+        self._row = Topic(HEALTH, Health, (), 1, "latest")
+        self._subscriber = session.declare_subscriber(
+            key(robot, HEALTH, "*"), zenoh.handlers.FifoChannel(256)
+        )
+        threading.Thread(target=self._receive, name="health-board", daemon=True).start()
+
+    def _receive(self) -> None:
+        while True:
+            try:
+                sample = self._subscriber.recv()
+            except zenoh.ZError:
+                return
+            try:
+                health = open_sample(sample, self._row).message
+            except DecodeError:  # another version's health cannot be shown; its node still runs
+                continue
+            if self._all:
+                whose = str(sample.key_expr).split("/")[1]
+                health = health.model_copy(update={"node": f"{whose}/{health.node}"})
+            with self._lock:
+                self._book.take(health)
+
+    def states(self) -> dict[str, str]:
+        """Node -> state, "silent" where nothing was heard lately."""
+        with self._lock:
+            return self._book.states()
+
+    def nodes_table(self) -> RenderableType:
+        """One row a node: state, rates, step time, age, losses, memory, CPU; below, what they say."""
+        table = _narrow_table()
+        for heading in ("node", "state"):
+            table.add_column(heading, no_wrap=True)
+        for heading in ("in Hz", "out Hz", "step ms", "p95", "age ms", "drop", "lost", "bad", "MB", "CPU%"):
+            table.add_column(heading, justify="right", no_wrap=True)
+        now = time.monotonic()
+        said = []
+        with self._lock:
+            for name, record in sorted(self.records.items()):
+                table.add_row(*_node_row(name, record, now))
+                if record.health.detail:
+                    said.append(Text(f"{name}: {record.health.detail}", style="dim"))
+        return Group(table, *said)
+
+    def topics_table(self) -> Table:
+        """One row a topic that flows: producer, rate, bytes, and who takes it."""
+        table = _narrow_table()
+        for heading in ("topic", "from"):
+            table.add_column(heading, no_wrap=True)
+        for heading in ("Hz/nominal", "KB/s", "sent"):
+            table.add_column(heading, justify="right", no_wrap=True)
+        table.add_column("to, age ms", overflow="fold")
+        with self._lock:
+            for flow in self._book.flows():
+                table.add_row(*_flow_row(flow))
+        return table
+
+
+def _narrow_table() -> Table:
+    """Both tables fit into 80 columns."""
+    return Table(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False, padding=0)
+
+
+def _node_row(name: str, record: NodeRecord, now: float) -> tuple[str, ...]:
+    health, totals, silent_s = record.health, record.totals(), record.silent_s(now)
+    colour = "red" if silent_s else {"active": "green", "drained": "cyan"}.get(health.state, "yellow")
+    state = f"silent {silent_s:.0f} s" if silent_s else health.state
+    return (
+        name,
+        f"[{colour}]{state}[/]",
+        f"{totals.in_hz:.1f}" if health.inputs else "",
+        f"{totals.out_hz:.1f}" if health.outputs else "",
+        f"{health.step_p50_ms:.1f}",
+        f"{health.step_p95_ms:.1f}",
+        f"{totals.age_ms:.1f}" if health.inputs else "",
+        _count(totals.dropped, "yellow"),
+        _count(totals.lost, "red"),
+        _count(totals.bad, "red"),
+        f"{health.rss_mb:.0f}",
+        f"{health.cpu_percent:.0f}",
+    )
+
+
+def _flow_row(flow: Flow) -> tuple[str, ...]:
+    nominal = f"{flow.nominal_hz:g}" if flow.nominal_hz else "event"
+    takers = "\n".join(map(_taker_text, flow.takers))
+    hz, kb_s = f"{flow.hz:.1f}/{nominal}", f"{flow.bytes_s / 1e3:.1f}"
+    return flow.topic, flow.producer, hz, kb_s, str(flow.sent), takers
+
+
+def _taker_text(taker: Taker) -> str:
+    counts = ((taker.dropped, "yellow", "dropped"), (taker.lost, "red", "lost"))
+    losses = "".join(f", [{colour}]{number} {what}[/]" for number, colour, what in counts if number)
+    return f"{taker.node} {taker.age_ms:.1f}{losses}"
+
+
+def _count(number: int, colour: str) -> str:
+    return f"[{colour}]{number}[/]" if number else "0"

@@ -1,0 +1,163 @@
+"""What runs inside a service's process: one node on the bus, or the router."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import sys
+import threading
+import time
+from multiprocessing import connection, parent_process
+from pathlib import Path
+
+from beamsplat.common.config.deployment import Deployment
+from beamsplat.common.errors import UserError
+from beamsplat.common.runtime.live import Live, LiveSettings
+from beamsplat.common.runtime.registry import Service
+from beamsplat.common.security.access_control import read_hosts
+from beamsplat.common.security.keys import CERTIFICATE, HOSTS
+from beamsplat.common.zenoh.bus import open_router
+from beamsplat.services.nodes import NODES
+from beamsplat.tools.system.assembly import Surroundings, build_node, node_classes, surroundings
+
+log = logging.getLogger("beamsplat")
+
+STOP_S = 5.0  # from SIGTERM to SIGKILL
+
+# Two cores are shared by all services: nobody starts a thread per core. Read by OpenMP, BLAS and
+# numba when they are first imported, hence set before the fork server starts.
+ONE_THREAD = dict.fromkeys(
+    ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1"
+)
+
+
+def serve(
+    deployment: Deployment,
+    name: str,
+    *,
+    resume: bool = False,
+    exit_when_drained: bool = False,
+    around: Surroundings | None = None,
+    instance: str = "",
+    standby: bool = False,
+    table: dict[str, Service] = NODES,
+) -> None:
+    """Runs one node until its inputs end or SIGINT or SIGTERM comes.
+
+    A supervisor says what is `around` it; without one, the classes of all nodes are imported to see.
+
+    Raises:
+        UserError: wrong options, bad input data, or no router.
+    """
+    node = build_node(deployment, name, table)
+    _limit_threads(node.config.threads)
+    os.nice(node.config.nice)
+    if around is None:
+        around = surroundings(node_classes(deployment, table), name, deployment.role)
+    settings = LiveSettings(
+        robot=deployment.robot,
+        endpoints=deployment.router.listen,
+        run_dir=deployment.run_dir,
+        security=deployment.security,
+        rate=deployment.rate,
+        wait_for=around.wait_for,
+        unfed=around.unfed,
+        resume=resume,
+        exit_when_drained=exit_when_drained,
+        instance=instance,
+        standby=standby,
+    )
+    live = Live(node, settings)
+    live.install_signal_handlers()
+    live.run()
+
+
+def route(deployment: Deployment) -> None:
+    """Runs this host's router until SIGINT or SIGTERM comes. A new policy is taken up at once: clients of a
+    router that opens anew are back within a second."""
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    router, security = deployment.router, deployment.security
+    while not stop.is_set():
+        policy = _changed_at(security.keys)
+        with open_router(router.listen, router.connect, security):
+            while not stop.wait(0.5):
+                if _changed_at(security.keys) == policy:
+                    continue
+                try:
+                    read_hosts(security.keys)
+                    break
+                except UserError as error:  # being copied, or edited: the old policy stays
+                    policy = _changed_at(security.keys)
+                    log.error("the new policy is not taken up: %s", error)
+
+
+def _changed_at(keys: Path | None) -> int:
+    """When the policy in a folder of keys, or the certificate, was last written; 0 where there is none."""
+    if keys is None:
+        return 0
+    files = [keys.expanduser() / name for name in (HOSTS, CERTIFICATE)]
+    return max((file.stat().st_mtime_ns for file in files if file.exists()), default=0)
+
+
+def child(
+    deployment: Deployment,
+    name: str,
+    log_file: Path,
+    resume: bool,
+    around: Surroundings | None,
+    table: dict[str, Service],
+    instance: str = "",
+    standby: bool = False,
+) -> None:
+    """Entry of a supervised process: its output goes to a log file, its end shows in the exit code."""
+    # Ctrl-C in a terminal reaches the whole group; the supervisor decides who stops when.
+    os.setpgrp()
+    with log_file.open("ab", buffering=0) as file:
+        os.dup2(file.fileno(), 1)
+        os.dup2(file.fileno(), 2)
+    threading.Thread(target=_die_with_parent, name="parent", daemon=True).start()
+    start_logging()
+    try:
+        if name == "router":
+            route(deployment)
+        else:
+            serve(
+                deployment,
+                name,
+                resume=resume,
+                around=around,
+                instance=instance,
+                standby=standby,
+                table=table,
+            )
+    except UserError as error:
+        log.error("%s", error)
+        sys.exit(2)
+
+
+def start_logging(level: int = logging.INFO) -> None:
+    """Log lines with time, level and origin on standard error."""
+    logging.basicConfig(
+        level=level, format="%(asctime)s %(levelname)-7s %(name)s: %(message)s", stream=sys.stderr, force=True
+    )
+
+
+def _die_with_parent() -> None:
+    """A killed supervisor must not leave a robot's services running unwatched, busy or not."""
+    parent = parent_process()
+    if parent is not None:
+        connection.wait([parent.sentinel])
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(STOP_S)
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
+def _limit_threads(threads: int) -> None:
+    """Fixed thread counts in what is already imported here."""
+    if "cv2" in sys.modules:
+        sys.modules["cv2"].setNumThreads(threads)
+    if "torch" in sys.modules:
+        sys.modules["torch"].set_num_threads(threads)

@@ -1,0 +1,86 @@
+"""A whole deployment in lockstep, recorded and hashed."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+from beamsplat.common.config.deployment import Deployment
+from beamsplat.common.files.persist import make_folder, write_atomically
+from beamsplat.common.messages.codec import encode, schema_of
+from beamsplat.common.recording import RecordingWriter
+from beamsplat.common.runtime.lockstep import Lockstep
+from beamsplat.common.runtime.mailbox import Letter
+from beamsplat.common.runtime.registry import Service
+from beamsplat.services.nodes import NODES
+from beamsplat.tools.system.assembly import build_node
+
+# Watching and recording happen around a lockstep run, not inside it.
+OUTSIDE = ("monitor", "page", "recorder")
+
+
+class MessageHash:
+    """SHA-256 over (topic, schema, sequence, payload) of messages, in order; all, and by topic."""
+
+    def __init__(self) -> None:
+        self._all = hashlib.sha256()
+        self.counts: dict[str, int] = {}
+
+    def add(self, letter: Letter, payload: bytes) -> None:
+        """Takes one message."""
+        head = f"{letter.topic} {schema_of(letter.message)} {letter.header.sequence} {len(payload)}\n"
+        self._all.update(head.encode())
+        self._all.update(payload)
+        self.counts[letter.topic] = self.counts.get(letter.topic, 0) + 1
+
+    def hexdigest(self) -> str:
+        """64 hex digits."""
+        return self._all.hexdigest()
+
+
+def run_offline(
+    deployment: Deployment, out: Path, console: Console, table: dict[str, Service] = NODES
+) -> dict[str, Any]:
+    """Runs all nodes of a deployment (leave the watching ones out of it); writes `messages` (a recording) and
+    summary.json into `out`, and returns the summary.
+
+    Raises:
+        UserError: options or data that do not fit.
+    """
+    nodes = [build_node(deployment, name, table) for name in deployment.nodes]
+    digest = MessageHash()
+    started = time.perf_counter()
+    make_folder(out)
+    progress = Progress(
+        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
+        console=console, transient=True,
+    )  # fmt: skip
+    with RecordingWriter(out / "messages", overwrite=True) as writer, progress:
+        total = next((n.expected_messages() for n in nodes if hasattr(n, "expected_messages")), None)
+        task = progress.add_task("lockstep", total=total)
+
+        def on_message(letter: Letter) -> None:
+            digest.add(letter, encode(letter.message))
+            writer.write(letter.topic, letter.message, letter.header.publish_ns, letter.header)
+            if letter.header.producer == "replay":
+                progress.advance(task)
+
+        mailboxes = Lockstep(nodes, on_message).run()
+    summary = {
+        "sha256": digest.hexdigest(),
+        "messages": sum(digest.counts.values()),
+        "topics": digest.counts,
+        "dropped": {
+            node: {name: count.dropped for name, count in mailbox.counts.items() if count.dropped}
+            for node, mailbox in mailboxes.items()
+        },
+        "wall_s": time.perf_counter() - started,
+    }
+    write_atomically(out / "summary.json", json.dumps(summary, indent=1).encode())
+    return summary

@@ -1,0 +1,273 @@
+"""Starts the router and the nodes of a deployment, restarts what dies, and ends them in order."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import multiprocessing
+import os
+import secrets
+import signal
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from multiprocessing.process import BaseProcess
+from pathlib import Path
+
+from beamsplat.common.config.deployment import Deployment, with_overrides
+from beamsplat.common.errors import UserError
+from beamsplat.common.files.persist import make_folder
+from beamsplat.common.runtime.registry import Service
+from beamsplat.common.security.logins import OPERATOR, SUPERVISOR, login_of, make_logins
+from beamsplat.common.zenoh.bus import open_session
+from beamsplat.services.nodes import NODES
+from beamsplat.tools.system.assembly import Surroundings, build_node, node_classes, surroundings
+from beamsplat.tools.system.node_process import ONE_THREAD, STOP_S, child
+
+log = logging.getLogger("beamsplat")
+
+ROUTER = "router"
+BACK_OFF_S = (0.1, 0.5, 1.0, 2.0, 5.0)
+HEALTHY_S = 30.0  # alive for so long, a process earns a fresh back-off
+PRELOADED = (
+    "numpy",
+    "cv2",
+    "scipy.spatial",
+    "pydantic",
+    "zenoh",
+    "beamsplat.common.runtime.live",
+    "beamsplat.common.runtime.lockstep",
+)
+
+
+@dataclass
+class Child:
+    """One supervised process."""
+
+    name: str
+    process: BaseProcess
+    started: float
+    instance: str = ""
+    restarts: int = 0
+    attempts: int = 0  # within the current back-off
+    due: float | None = None  # dead, to be started again then
+    gave_up: bool = False  # ended with a user error: restarting would not help
+    kill_at: float | None = None  # told to end, to be started again; killed if it has not ended by then
+
+
+@dataclass
+class Successor:
+    """What is to take a node's place. Without a process the node ends first."""
+
+    name: str
+    deployment: Deployment
+    process: BaseProcess | None = None
+    instance: str = ""
+    hands_over: bool = False  # starts with what its predecessor leaves, and says nothing before
+
+
+class Supervisor:
+    """The processes of one deployment. `poll()` a few times a second; use with `with`."""
+
+    def __init__(
+        self,
+        deployment: Deployment,
+        names: tuple[str, ...] | None = None,
+        *,
+        table: dict[str, Service] = NODES,
+        on_event: Callable[[str], None] | None = None,
+    ) -> None:
+        self.deployment = deployment
+        self.log_dir = deployment.run_dir / "logs"
+        self.children: dict[str, Child] = {}
+        self._around: dict[str, Surroundings] = {}
+        self._retired: list[BaseProcess] = []  # ends by itself
+        self.table = table
+        self._names = names if names is not None else (ROUTER, *deployment.nodes)
+        self._on_event = on_event or (lambda text: log.info("%s", text))
+        os.environ.update({k: os.environ.get(k, v) for k, v in ONE_THREAD.items()})
+        self._context = multiprocessing.get_context("forkserver")
+        self._context.set_forkserver_preload(list(PRELOADED))
+
+    def __enter__(self) -> Supervisor:
+        make_folder(self.log_dir)
+        try:
+            self._start_all()
+        except BaseException:
+            self.stop()
+            raise
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.stop()
+
+    def _start_all(self) -> None:
+        """The router, then who listens, then who speaks."""
+        if ROUTER in self._names:
+            if (folder := self.deployment.security.local) is not None:
+                make_logins(folder, (*self.table, SUPERVISOR, OPERATOR))
+            if self._router_answers():
+                raise UserError(
+                    f"a router already runs at {', '.join(self.deployment.router.listen)}: stop it, name the "
+                    "nodes to run beside it (beamsplat run FILE NODE...), or choose another router.listen"
+                )
+            self._start(ROUTER)
+            self._wait_for_router()
+        classes = node_classes(self.deployment, self.table)
+        nodes = [name for name in self._names if name != ROUTER]
+        self._around = {name: surroundings(classes, name, self.deployment.role) for name in nodes}
+        for name in sorted(nodes, key=lambda n: classes[n].is_source()):
+            self._start(name)
+
+    def _router_answers(self) -> bool:
+        with contextlib.suppress(UserError):
+            login = login_of(self.deployment.security, SUPERVISOR)
+            open_session(self.deployment.router.listen, wait_s=0.0, login=login).close()
+            return True
+        return False
+
+    def _wait_for_router(self) -> None:
+        router = self.children[ROUTER]
+        deadline = time.monotonic() + 20.0
+        while time.monotonic() < deadline:
+            if self._router_answers():
+                return
+            if not router.process.is_alive():
+                raise UserError(f"the router did not start: {last_line(self.log_file(ROUTER))}")
+        raise UserError(f"no router at {', '.join(self.deployment.router.listen)} after 20 s")
+
+    def log_file(self, name: str) -> Path:
+        """Where a process writes what it has to say."""
+        return self.log_dir / f"{name}.log"
+
+    def _start(self, name: str, resume: bool = False) -> None:
+        self._seat(name, *self._spawn(self.deployment, name, resume))
+
+    def _spawn(
+        self, deployment: Deployment, name: str, resume: bool = False, standby: bool = False
+    ) -> tuple[BaseProcess, str]:
+        """A process and the instance it goes by."""
+        instance = secrets.token_hex(8)
+        around = self._around.get(name)
+        process = self._context.Process(
+            target=child,
+            args=(deployment, name, self.log_file(name), resume, around, self.table, instance, standby),
+            name=name,
+            daemon=False,
+        )
+        process.start()
+        return process, instance
+
+    def _seat(self, name: str, process: BaseProcess, instance: str) -> None:
+        known = self.children.get(name)
+        if known is None:
+            self.children[name] = Child(name, process, time.monotonic(), instance)
+        else:
+            known.process, known.started, known.instance = process, time.monotonic(), instance
+            known.due, known.kill_at = None, None
+
+    def successor(self, name: str, overrides: tuple[str, ...], warm: bool) -> Successor:
+        """A second process of a node, with other options, in standby: see `beamsplat.tools.system.swap`.
+
+        Another kind starts from that kind's defaults.
+
+        Raises:
+            UserError: no such node here, options that do not fit, or a node that cannot run twice.
+        """
+        before = self.deployment
+        if any(o.partition("=")[0].strip() == "kind" for o in overrides):  # whose options are others
+            before = before.model_copy(update={"nodes": {**before.nodes, name: {}}})
+        deployment = with_overrides(before, tuple(f"{name}.{o}" for o in overrides))
+        node = build_node(deployment, name, self.table)
+        if not warm:
+            return Successor(name, deployment)
+        if obstacle := node.obstacle(build_node(self.deployment, name, self.table)):
+            raise UserError(
+                f"{name} cannot be taken over while it runs, {obstacle}: --cold ends it first, and starts it "
+                "anew with the new options"
+            )
+        return Successor(name, deployment, *self._spawn(deployment, name, standby=True), node.hands_over)
+
+    def replace(self, successor: Successor) -> None:
+        """The successor, which has been activated, is the node now; also when it must be started again."""
+        self.deployment = successor.deployment
+        self._retired.append(self.children[successor.name].process)
+        self._seat(successor.name, successor.process, successor.instance)
+        self._on_event(f"{successor.name} was taken over by its successor")
+
+    def restart_with(self, successor: Successor) -> None:
+        """The node ends and starts with the successor's options."""
+        self.deployment = successor.deployment
+        self.restart(successor.name)
+
+    def restart(self, name: str) -> None:
+        """Tells a process to end; the next polls see to it that it does, and start it again at once."""
+        entry = self.children[name]
+        if entry.process.is_alive() and entry.kill_at is None:
+            entry.kill_at = time.monotonic() + STOP_S
+            entry.process.terminate()
+
+    def poll(self) -> None:
+        """Notices what has died and starts what is due."""
+        now = time.monotonic()
+        for entry in self.children.values():
+            if entry.due is not None:
+                if now >= entry.due:
+                    entry.restarts += 1
+                    self._start(entry.name, resume=True)
+            elif entry.process.is_alive():
+                if entry.kill_at is not None and now > entry.kill_at:
+                    entry.process.kill()
+            elif entry.kill_at is not None:
+                entry.due = now
+                self._on_event(f"{entry.name} was ended by request; starts again")
+            elif not entry.gave_up:
+                self._bury(entry, now)
+
+    def _bury(self, entry: Child, now: float) -> None:
+        code = entry.process.exitcode or 0
+        if code == 2:
+            entry.gave_up = True
+            self._on_event(f"{entry.name} cannot run: {last_line(self.log_file(entry.name))}")
+            return
+        if now - entry.started > HEALTHY_S:
+            entry.attempts = 0
+        delay = BACK_OFF_S[min(entry.attempts, len(BACK_OFF_S) - 1)]
+        entry.attempts += 1
+        entry.due = now + delay
+        # A drained node stays until it is told to go, so exit code 0 means that somebody else told it.
+        how = f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
+        self._on_event(
+            f"{entry.name} died ({how}: {last_line(self.log_file(entry.name))}); starts again in {delay:g} s"
+        )
+
+    def stop(self) -> None:
+        """SIGTERM to the nodes, sources first; then the router; SIGKILL to who does not listen."""
+        nodes = [c for c in self.children.values() if c.name != ROUTER]
+        _end(list(reversed(nodes)))
+        for process in self._retired:
+            process.join(STOP_S)
+            process.kill()
+        _end([c for c in self.children.values() if c.name == ROUTER])
+
+
+def _end(children: list[Child]) -> None:
+    for entry in children:
+        if entry.process.is_alive():
+            entry.process.terminate()
+    deadline = time.monotonic() + STOP_S
+    for entry in children:
+        entry.process.join(max(deadline - time.monotonic(), 0.0))
+        if entry.process.is_alive():
+            log.warning("%s does not stop: killed", entry.name)
+            entry.process.kill()
+            entry.process.join()
+
+
+def last_line(path: Path) -> str:
+    """The end of a log, without time and origin."""
+    try:
+        lines = path.read_text(errors="replace").strip().splitlines()
+    except OSError:
+        return f"no log at {path}"
+    return lines[-1].split(": ", 1)[-1] if lines else f"nothing in {path}"
