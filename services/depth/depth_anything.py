@@ -13,9 +13,9 @@ import cv2
 import numpy as np
 
 from beamsplat.common.errors import UserError
+from beamsplat.services.depth.model_files import find_model
 from beamsplat.services.depth.onnx_model import OnnxModel, to_hw
-from beamsplat.services.depth.source import Estimate, View, judge
-from beamsplat.services.depth.store import find_model
+from beamsplat.services.depth.source import DepthInput, Estimate, check_depth_map
 
 PATCH = 14
 _MEAN = np.array([0.485, 0.456, 0.406], dtype=np.float32)
@@ -41,20 +41,20 @@ class DepthAnything:
         self._port = self._onnx.image_input()
         self._input_px = input_px
         if self._port.shape[2] and self._port.shape[3]:
-            self._onnx.side_lengths(self._port, PATCH, PATCH, PATCH)
+            self._onnx.input_size(self._port, PATCH, PATCH, PATCH)
         self._warm: tuple[int, int] | None = None
 
-    def estimate(self, view: View) -> Estimate:
+    def estimate(self, view: DepthInput) -> Estimate:
         """The network's answer at the picture's size (bilinear, corners aligned as in the reference)."""
         h, w = view.camera.shape
-        wish = lower_bound(h, w, self._input_px)
-        side = self._onnx.side_lengths(self._port, *wish, PATCH)
+        wish = network_input_size(h, w, self._input_px)
+        side = self._onnx.input_size(self._port, *wish, PATCH)
         if self._warm != side:
             self._onnx.warm_up((1, 3, *side))
             self._warm = side
-        raw = to_hw(self._onnx.run(normalised(view.image_rgb, side))[0], str(self._onnx.path))
-        status = judge(raw)
-        return Estimate(self._values(align_corners(raw, h, w)), self.kind, status)
+        raw = to_hw(self._onnx.run(normalize_image(view.image_rgb, side))[0], str(self._onnx.path))
+        status = check_depth_map(raw)
+        return Estimate(self._values(resize_align_corners(raw, h, w)), self.kind, status)
 
     def _values(self, raw: np.ndarray) -> np.ndarray:
         return raw
@@ -80,7 +80,7 @@ class DepthAnythingMetric(DepthAnything):
             return np.where((raw > 0.0) & (raw < 0.999 * self._max_depth_m), raw, np.nan).astype(np.float32)
 
 
-def lower_bound(height: int, width: int, input_px: int) -> tuple[int, int]:
+def network_input_size(height: int, width: int, input_px: int) -> tuple[int, int]:
     """Network size (height, width): short side at least `input_px`, multiples of 14, aspect kept."""
     scale = max(input_px / height, input_px / width)
 
@@ -91,13 +91,13 @@ def lower_bound(height: int, width: int, input_px: int) -> tuple[int, int]:
     return rounded(scale * height), rounded(scale * width)
 
 
-def normalised(image_rgb: np.ndarray, side: tuple[int, int]) -> np.ndarray:
+def normalize_image(image_rgb: np.ndarray, side: tuple[int, int]) -> np.ndarray:
     """float32 [1, 3, h, w] of uint8 [H, W, 3]: bicubic, ImageNet mean and deviation."""
     small = cv2.resize(image_rgb.astype(np.float32) / 255.0, side[::-1], interpolation=cv2.INTER_CUBIC)
     return np.ascontiguousarray(((small - _MEAN) / _DEVIATION).transpose(2, 0, 1)[None], dtype=np.float32)
 
 
-def align_corners(values: np.ndarray, height: int, width: int) -> np.ndarray:
+def resize_align_corners(values: np.ndarray, height: int, width: int) -> np.ndarray:
     """Bilinear resize of float32 [h, w] whose corner pixels map onto corner pixels."""
     h, w = values.shape
     x = np.linspace(0.0, w - 1.0, width, dtype=np.float32)

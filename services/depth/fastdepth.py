@@ -1,6 +1,6 @@
 """FastDepth (Wofk et al., ICRA 2019), trained on NYU-v2: small, metric on paper, off by tens of per cent.
 
-The network knows one view: 224x224 pixels of a crop with normalised focals fx/w = 0.889, fy/h = 1.187.
+The network knows one view: 224x224 pixels of a crop with normalize_image focals fx/w = 0.889, fy/h = 1.187.
 Every camera is cropped to that view; RGB in [0, 1], no mean subtracted.
 """
 
@@ -12,9 +12,9 @@ import cv2
 import numpy as np
 
 from beamsplat.common.geometry.camera import Pinhole
+from beamsplat.services.depth.model_files import find_model
 from beamsplat.services.depth.onnx_model import OnnxModel, to_hw
-from beamsplat.services.depth.source import Estimate, View, judge
-from beamsplat.services.depth.store import find_model
+from beamsplat.services.depth.source import DepthInput, Estimate, check_depth_map
 
 _FX_PER_WIDTH = 0.889
 _FY_PER_HEIGHT = 1.187
@@ -34,27 +34,27 @@ class FastDepth:
         self._onnx = OnnxModel(find_model(model), threads=threads)
         self._onnx.check_inputs(1)
         port = self._onnx.image_input()
-        self._side = self._onnx.side_lengths(port, _SIDE, _SIDE, _MULTIPLE)
+        self._side = self._onnx.input_size(port, _SIDE, _SIDE, _MULTIPLE)
         (first, *_) = self._onnx.warm_up((1, 3, *self._side))
         to_hw(first, str(self._onnx.path))
 
-    def estimate(self, view: View) -> Estimate:
+    def estimate(self, view: DepthInput) -> Estimate:
         """Depth in metres inside the network's view, NaN outside it."""
-        u0, v0, u1, v1, factor = network_view(view.camera)
+        u0, v0, u1, v1, factor = network_crop(view.camera)
         h, w = self._side
         patch = cv2.resize(view.image_rgb[v0:v1, u0:u1], (w, h), interpolation=cv2.INTER_AREA)
         tensor = (patch.astype(np.float32) / 255.0).transpose(2, 0, 1)[None]
         raw = to_hw(self._onnx.run(tensor)[0], str(self._onnx.path))
-        status = judge(raw)
+        status = check_depth_map(raw)
         z = raw * factor
         with np.errstate(invalid="ignore"):
             z[~((z >= _Z_RANGE_M[0]) & (z <= _Z_RANGE_M[1]))] = np.nan
         values = np.full(view.camera.shape, np.nan, dtype=np.float32)
-        values[v0:v1, u0:u1] = resize_with_holes(z, u1 - u0, v1 - v0)
+        values[v0:v1, u0:u1] = resize_keeping_unknown(z, u1 - u0, v1 - v0)
         return Estimate(values, "metric", status)
 
 
-def network_view(camera: Pinhole) -> tuple[int, int, int, int, float]:
+def network_crop(camera: Pinhole) -> tuple[int, int, int, int, float]:
     """Crop (u0, v0, u1, v1), half open, that shows the camera as NYU's, and the factor on its depth.
 
     A camera with a narrower view than NYU's fills the network's picture with less of the world, so that
@@ -69,6 +69,6 @@ def network_view(camera: Pinhole) -> tuple[int, int, int, int, float]:
     return u0, v0, u1, v1, factor if u1 - u0 < wanted_w - 1.0 else 1.0
 
 
-def resize_with_holes(values: np.ndarray, width: int, height: int) -> np.ndarray:
+def resize_keeping_unknown(values: np.ndarray, width: int, height: int) -> np.ndarray:
     """Bilinear resize of float32 [h, w]; an output pixel that touches NaN is NaN."""
     return cv2.resize(values, (width, height), interpolation=cv2.INTER_LINEAR)

@@ -15,14 +15,14 @@ from pydantic import Field
 from beamsplat.common.config.base import Config, parse
 from beamsplat.common.errors import UserError, reason
 from beamsplat.common.files.resources import shipped_file
-from beamsplat.services.depth.store import find_model, models_dirs, sha256_of
+from beamsplat.services.depth.model_files import find_model, models_dirs, sha256_of
 
 TABLE = shipped_file("models.toml")
 _BLOCK = 1 << 18
 _TIMEOUT_S = 30.0
 
 
-class ModelRow(Config):
+class ModelEntry(Config):
     """One model of the table."""
 
     source: str  # the depth source that takes it
@@ -33,7 +33,7 @@ class ModelRow(Config):
     how: str = ""
 
 
-def read_table(path: Path = TABLE) -> dict[str, ModelRow]:
+def read_model_table(path: Path = TABLE) -> dict[str, ModelEntry]:
     """All rows by name.
 
     Raises:
@@ -43,10 +43,10 @@ def read_table(path: Path = TABLE) -> dict[str, ModelRow]:
         table = tomllib.loads(path.read_text())
     except (OSError, tomllib.TOMLDecodeError) as error:
         raise UserError(f"{path}: cannot be read as the table of models: {reason(error)}") from error
-    return {name: parse(ModelRow, row, f"{path}: [{name}]") for name, row in table.items()}
+    return {name: parse(ModelEntry, row, f"{path}: [{name}]") for name, row in table.items()}
 
 
-def row_of(name: str, table: dict[str, ModelRow]) -> ModelRow:
+def find_entry(name: str, table: dict[str, ModelEntry]) -> ModelEntry:
     """The row called `name`.
 
     Raises:
@@ -59,7 +59,7 @@ def row_of(name: str, table: dict[str, ModelRow]) -> ModelRow:
 
 def pull(
     name: str,
-    row: ModelRow,
+    row: ModelEntry,
     agree: Callable[[str], bool],
     progress: Callable[[int, int | None], None] = lambda done, total: None,
 ) -> Path:
@@ -122,7 +122,7 @@ def _download(url: str, partial: Path, progress: Callable[[int, int | None], Non
         )
 
 
-def check(file: Path, table: dict[str, ModelRow]) -> dict[str, object]:
+def describe_model_file(file: Path, table: dict[str, ModelEntry]) -> dict[str, object]:
     """What a model file is: digest, the row it matches, ports, and how long a run takes to answer.
 
     Raises:
@@ -144,7 +144,7 @@ def check(file: Path, table: dict[str, ModelRow]) -> dict[str, object]:
     }
 
 
-def installed(name: str) -> Path | None:
+def installed_path(name: str) -> Path | None:
     """Where a model lies, None if nowhere."""
     try:
         return find_model(name)

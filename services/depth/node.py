@@ -16,7 +16,7 @@ from beamsplat.common.geometry.history import History, TimedScan
 from beamsplat.common.messages import DepthEstimate, Image, Odometry, Rig, Scan
 from beamsplat.common.messages.image_codec import decode_rgb
 from beamsplat.common.runtime.node import Input, Node, Outputs
-from beamsplat.services.depth.source import BLIND, NEED_BEAMS, DepthSource, View, make_source
+from beamsplat.services.depth.source import IGNORES_IMAGE, USES_BEAMS, DepthInput, DepthSource, make_source
 
 log = logging.getLogger("beamsplat.depth")
 
@@ -42,7 +42,7 @@ class DepthNode(Node):
 
     def configure(self) -> None:
         self._source: DepthSource = make_source(self.config.source, self.config.options)
-        self._needs_beams = self.config.source in NEED_BEAMS
+        self._needs_beams = self.config.source in USES_BEAMS
         self._undistort: Undistorter | None = None
         self._history: History | None = None
         self._waiting: deque[Image] = deque(maxlen=_PICTURES)
@@ -95,12 +95,12 @@ class DepthNode(Node):
         if image is None:
             return
         try:
-            rgb = self._picture(image)
+            rgb = self._decode_image(image)
         except (UserError, ValueError) as error:
             yield self._refusal(image.stamp_ns, str(error))
             return
         beams, _ = self._history.beams(image.stamp_ns)
-        view = View(
+        view = DepthInput(
             image.stamp_ns, rgb, self._undistort.pinhole, self._T_body_camera, beams, self.config.floor_known
         )
         estimate = self._source.estimate(view)
@@ -114,14 +114,14 @@ class DepthNode(Node):
             ),
         )
 
-    def _picture(self, image: Image) -> np.ndarray:
+    def _decode_image(self, image: Image) -> np.ndarray:
         """uint8 [H, W, 3], undistorted; black for a source that does not look at it.
 
         Raises:
             UserError, ValueError: it does not decode, or is of another size than the calibration.
         """
         shape = self._undistort.pinhole.shape
-        if self.config.source in BLIND and (image.height_px, image.width_px) == shape:
+        if self.config.source in IGNORES_IMAGE and (image.height_px, image.width_px) == shape:
             return np.broadcast_to(np.uint8(0), (*shape, 3))
         return self._undistort(
             decode_rgb(image.data, image.encoding, image.width_px, image.height_px, image.step_bytes)

@@ -23,7 +23,7 @@ _DTYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16, "tensor(d
 
 
 @dataclass(frozen=True)
-class Port:
+class TensorSpec:
     """One input or output of a graph; None stands for a size that is free."""
 
     name: str
@@ -72,13 +72,13 @@ class OnnxModel:
         self.inputs = [self._port(node) for node in self._session.get_inputs()]
         self.outputs = [self._port(node) for node in self._session.get_outputs()]
 
-    def _port(self, node: ort.NodeArg) -> Port:
+    def _port(self, node: ort.NodeArg) -> TensorSpec:
         if node.type not in _DTYPES:
             raise UserError(f"{self.path}: {node.name} is {node.type}; expected a float tensor")
         shape = tuple(size if isinstance(size, int) and size > 0 else None for size in node.shape)
-        return Port(node.name, shape, np.dtype(_DTYPES[node.type]))
+        return TensorSpec(node.name, shape, np.dtype(_DTYPES[node.type]))
 
-    def image_input(self, number: int = 0, name: str | None = None) -> Port:
+    def image_input(self, number: int = 0, name: str | None = None) -> TensorSpec:
         """The input of an RGB picture, N x 3 x H x W, by name if there is one of that name, else by number.
 
         Raises:
@@ -97,7 +97,7 @@ class OnnxModel:
             )
         return port
 
-    def output(self, name: str) -> Port:
+    def output(self, name: str) -> TensorSpec:
         """The output of that name.
 
         Raises:
@@ -115,7 +115,7 @@ class OnnxModel:
             names = ", ".join(port.name for port in self.inputs)
             raise UserError(f"{self.path}: takes {len(self.inputs)} inputs ({names}); expected {count}")
 
-    def side_lengths(self, port: Port, height: int, width: int, multiple: int) -> tuple[int, int]:
+    def input_size(self, port: TensorSpec, height: int, width: int, multiple: int) -> tuple[int, int]:
         """(height, width) to feed: the graph's own where it fixes them, else the wished ones.
 
         Raises:

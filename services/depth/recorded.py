@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 
 from beamsplat.common.errors import UserError, reason
-from beamsplat.services.depth.source import Estimate, Kind, View, judge
+from beamsplat.services.depth.source import DepthInput, Estimate, Kind, check_depth_map
 
 
-class Recorded:
+class RecordedDepth:
     """Files `<stamp_ns>.png` (uint16 millimetres, 0 = unknown) or `<stamp_ns>.npy` (float, as `kind` says).
 
     Raises:
@@ -31,7 +31,7 @@ class Recorded:
         self._kind = kind
         self._tolerance_ns = tolerance_ns
 
-    def estimate(self, view: View) -> Estimate:
+    def estimate(self, view: DepthInput) -> Estimate:
         """The map nearest in time, resized to the picture."""
         i = int(np.argmin(np.abs(self._stamps - view.stamp_ns)))
         empty = np.full(view.camera.shape, np.nan, dtype=np.float32)
@@ -46,7 +46,7 @@ class Recorded:
                     f"{self._files[i]}: {values.shape[1]}x{values.shape[0]} does not fit the {w}x{h} picture",
                 )  # fmt: skip
             values = cv2.resize(values, (w, h), interpolation=cv2.INTER_NEAREST)
-        return Estimate(values, self._kind, judge(values, least_share=0.01))
+        return Estimate(values, self._kind, check_depth_map(values, min_known_share=0.01))
 
 
 def read_depth(path: Path) -> np.ndarray:

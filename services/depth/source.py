@@ -22,7 +22,7 @@ Kind = Literal["metric", "relative", "disparity", "none"]
 
 
 @dataclass(frozen=True)
-class View:
+class DepthInput:
     """One picture and what is known at its time."""
 
     stamp_ns: int
@@ -50,7 +50,7 @@ class Estimate:
 class DepthSource(Protocol):
     """A way to guess dense depth from one picture."""
 
-    def estimate(self, view: View) -> Estimate:
+    def estimate(self, view: DepthInput) -> Estimate:
         """The guess for one picture. Never raises for bad pictures: `status` says what is wrong."""
         ...
 
@@ -62,15 +62,15 @@ SOURCES: dict[str, str] = {
     "depth_anything": "beamsplat.services.depth.depth_anything:DepthAnything",
     "depth_anything_metric": "beamsplat.services.depth.depth_anything:DepthAnythingMetric",
     "stixel": "beamsplat.services.depth.stixel:Stixel",
-    "recorded": "beamsplat.services.depth.recorded:Recorded",
-    "none": "beamsplat.services.depth.nothing:NoDepth",
+    "recorded": "beamsplat.services.depth.recorded:RecordedDepth",
+    "none": "beamsplat.services.depth.no_depth:NoDepth",
 }
 
 # These look at the beams of a picture's time; the others need not wait for them.
-NEED_BEAMS = frozenset({"stixel"})
+USES_BEAMS = frozenset({"stixel"})
 
 # These never look at the picture itself: nobody needs to decode it for them.
-BLIND = frozenset({"stixel", "recorded", "none"})
+IGNORES_IMAGE = frozenset({"stixel", "recorded", "none"})
 
 
 def make_source(name: str, options: Mapping[str, Any] | None = None) -> DepthSource:
@@ -89,11 +89,11 @@ def make_source(name: str, options: Mapping[str, Any] | None = None) -> DepthSou
         raise UserError(f"depth source {name}: {str(error).replace('__init__() ', '')}") from error
 
 
-def judge(values: np.ndarray, least_share: float = 0.2) -> str:
+def check_depth_map(values: np.ndarray, min_known_share: float = 0.2) -> str:
     """ "ok", or one sentence on why a network's output [H, W] cannot be depth."""
     finite = np.isfinite(values)
     share = float(finite.mean()) if values.size else 0.0
-    if share < least_share:
+    if share < min_known_share:
         return f"the network answered only {share:.0%} of the picture with a number"
     known = values[finite]
     if not np.any(known > 0.0):

@@ -8,13 +8,13 @@ import numpy as np
 
 from beamsplat.common.geometry.beams import hidden_beams, plan_polar, plane_depth, wall_ranges
 from beamsplat.common.geometry.camera import Pinhole
-from beamsplat.services.depth.source import Estimate, View
+from beamsplat.services.depth.source import DepthInput, Estimate
 
 _FINE = 2  # azimuths a pixel column
 
 
 @dataclass(frozen=True)
-class _Rays:
+class _PixelRays:
     """What stays the same from picture to picture of one mounted camera."""
 
     camera: Pinhole
@@ -30,9 +30,9 @@ class Stixel:
 
     def __init__(self, max_depth_m: float = 30.0) -> None:
         self._max_depth_m = max_depth_m
-        self._rays: _Rays | None = None
+        self._rays: _PixelRays | None = None
 
-    def estimate(self, view: View) -> Estimate:
+    def estimate(self, view: DepthInput) -> Estimate:
         """Metric depth; NaN in columns that no beam serves (floor excepted)."""
         rays = self._rays
         if (
@@ -54,14 +54,14 @@ class Stixel:
         return Estimate(values, "metric", status)
 
 
-def _prepare(camera: Pinhole, T_body_camera: np.ndarray) -> _Rays:
+def _prepare(camera: Pinhole, T_body_camera: np.ndarray) -> _PixelRays:
     rays_body = camera.ray_grid() @ T_body_camera[:3, :3].T
     azimuth = np.arctan2(rays_body[..., 1], rays_body[..., 0])
     fan = np.linspace(float(azimuth.min()), float(azimuth.max()), _FINE * camera.width_px)
     place = np.rint((azimuth - fan[0]) / max(fan[-1] - fan[0], 1e-9) * (len(fan) - 1))
     across = np.maximum(np.hypot(rays_body[..., 0], rays_body[..., 1]), 1e-9)
     floor = plane_depth(rays_body, float(T_body_camera[2, 3]))
-    return _Rays(
+    return _PixelRays(
         camera, T_body_camera.copy(), fan, place.astype(np.int32), (1.0 / across).astype(np.float32),
         np.where(np.isfinite(floor), floor, np.inf).astype(np.float32),
     )  # fmt: skip

@@ -1,6 +1,6 @@
 """UniDepth V2, exported by its own export.py: metric points, a confidence and the camera it believes in.
 
-Ports: `rgbs` [B, 3, H, W], ImageNet-normalised, and with the camera `rays` [B, 3, H, W], unit vectors
+Ports: `rgbs` [B, 3, H, W], ImageNet-normalize_image, and with the camera `rays` [B, 3, H, W], unit vectors
 K^-1 [u, v, 1] at network resolution with pixel centres at half integers; out `pts_3d` [B, 3, H, W] in
 metres, `confidence` [B, 1, H, W], `intrinsics` [B, 3, 3]. H and W are fixed multiples of 14. Depth is
 pts_3d's z, not its length.
@@ -16,14 +16,14 @@ import numpy as np
 
 from beamsplat.common.errors import UserError
 from beamsplat.common.geometry.camera import Pinhole
-from beamsplat.services.depth.depth_anything import PATCH, normalised
+from beamsplat.services.depth.depth_anything import PATCH, normalize_image
+from beamsplat.services.depth.model_files import find_model
 from beamsplat.services.depth.onnx_model import OnnxModel
-from beamsplat.services.depth.source import Estimate, View, judge
-from beamsplat.services.depth.store import find_model
+from beamsplat.services.depth.source import DepthInput, Estimate, check_depth_map
 
 
 @dataclass(frozen=True)
-class Fit:
+class LetterboxLayout:
     """How a picture sits in the network's input: scaled by `factor`, then padded."""
 
     factor: float
@@ -58,15 +58,15 @@ class UniDepth:
             self._onnx.check_inputs(1)
         self._has_confidence = any(p.name == "confidence" for p in self._onnx.outputs)
         self._onnx.output("pts_3d")
-        self._side = self._onnx.side_lengths(port, port.shape[2], port.shape[3], PATCH)
+        self._side = self._onnx.input_size(port, port.shape[2], port.shape[3], PATCH)
         shape = (1, 3, *self._side)
         self._onnx.warm_up(*([shape, shape] if self._takes_rays else [shape]))
 
-    def estimate(self, view: View) -> Estimate:
+    def estimate(self, view: DepthInput) -> Estimate:
         """Metric depth at the picture's size, and a confidence that ranks pixels within this picture."""
         h, w = view.camera.shape
-        fit = fit_into(h, w, self._side)
-        inputs = [normalised(letterbox(view.image_rgb, fit, self._side), self._side)]
+        fit = letterbox_layout(h, w, self._side)
+        inputs = [normalize_image(letterbox(view.image_rgb, fit, self._side), self._side)]
         if self._takes_rays:
             inputs.append(network_rays(view.camera, fit, self._side))
         names = ("pts_3d", "confidence") if self._has_confidence else ("pts_3d",)
@@ -76,26 +76,26 @@ class UniDepth:
             raise UserError(
                 f"{self._onnx.path}: pts_3d has shape {list(points.shape)}; expected 1 x 3 x H x W"
             )
-        status = judge(points[0, 2])
-        z = _cut(points[0, 2], fit, h, w)
+        status = check_depth_map(points[0, 2])
+        z = _crop_and_resize(points[0, 2], fit, h, w)
         with np.errstate(invalid="ignore"):
             z = np.where(z > 0.0, z, np.nan).astype(np.float32)
         confidence = None
         if self._has_confidence:
             # The export gives an estimated log error: larger is worse. Only the order is used.
-            error = _cut(results[1].reshape(points.shape[2:]), fit, h, w)
+            error = _crop_and_resize(results[1].reshape(points.shape[2:]), fit, h, w)
             confidence = (1.0 / (1.0 + np.maximum(error, 0.0))).astype(np.float32)
         return Estimate(z, "metric", status, confidence)
 
 
-def fit_into(height: int, width: int, side: tuple[int, int]) -> Fit:
+def letterbox_layout(height: int, width: int, side: tuple[int, int]) -> LetterboxLayout:
     """The largest picture of the given aspect inside the network's size, centred."""
     factor = min(side[0] / height, side[1] / width)
     inner_h, inner_w = min(round(height * factor), side[0]), min(round(width * factor), side[1])
-    return Fit(factor, (side[1] - inner_w) // 2, (side[0] - inner_h) // 2, inner_w, inner_h)
+    return LetterboxLayout(factor, (side[1] - inner_w) // 2, (side[0] - inner_h) // 2, inner_w, inner_h)
 
 
-def letterbox(image_rgb: np.ndarray, fit: Fit, side: tuple[int, int]) -> np.ndarray:
+def letterbox(image_rgb: np.ndarray, fit: LetterboxLayout, side: tuple[int, int]) -> np.ndarray:
     """uint8 [h, w, 3] at network size: the picture scaled, mean grey around it."""
     out = np.full((*side, 3), (124, 116, 104), dtype=np.uint8)
     inner = cv2.resize(image_rgb, (fit.width_px, fit.height_px), interpolation=cv2.INTER_LINEAR)
@@ -103,7 +103,7 @@ def letterbox(image_rgb: np.ndarray, fit: Fit, side: tuple[int, int]) -> np.ndar
     return out
 
 
-def network_rays(camera: Pinhole, fit: Fit, side: tuple[int, int]) -> np.ndarray:
+def network_rays(camera: Pinhole, fit: LetterboxLayout, side: tuple[int, int]) -> np.ndarray:
     """float32 [1, 3, h, w] unit rays at network resolution; pixel centres at half integers there."""
     fx, fy = camera.fx_px * fit.width_px / camera.width_px, camera.fy_px * fit.height_px / camera.height_px
     # Our centres are integers, the network's are half integers: cx moves by half a pixel.
@@ -114,6 +114,6 @@ def network_rays(camera: Pinhole, fit: Fit, side: tuple[int, int]) -> np.ndarray
     return (rays / np.linalg.norm(rays, axis=0))[None].astype(np.float32)
 
 
-def _cut(values: np.ndarray, fit: Fit, height: int, width: int) -> np.ndarray:
+def _crop_and_resize(values: np.ndarray, fit: LetterboxLayout, height: int, width: int) -> np.ndarray:
     inner = values[fit.top_px : fit.top_px + fit.height_px, fit.left_px : fit.left_px + fit.width_px]
     return cv2.resize(np.ascontiguousarray(inner), (width, height), interpolation=cv2.INTER_LINEAR)

@@ -12,7 +12,7 @@ from beamsplat.common.geometry.camera import Pinhole
 from beamsplat.common.geometry.frames import camera_mount
 from beamsplat.common.geometry.transforms import make_transform
 from beamsplat.common.messages.image_codec import decode_rgb
-from beamsplat.services.depth.source import BLIND, View, make_source
+from beamsplat.services.depth.source import IGNORES_IMAGE, DepthInput, make_source
 from beamsplat.services.fusion.frame import Frame
 from beamsplat.services.fusion.fuse import Fusion
 
@@ -41,7 +41,7 @@ def bench(source_name: str, frames: int) -> dict[str, float | int | str]:
         points = np.stack([reach * np.cos(azimuth), reach * np.sin(azimuth), np.full(720, 0.18)], axis=1)
         beams = Beams(points, np.arange(720), np.full(720, 0.01))
         started = time.process_time()
-        estimate = source.estimate(View(number, rgb, camera, T_body_camera, beams, True))
+        estimate = source.estimate(DepthInput(number, rgb, camera, T_body_camera, beams, True))
         times["source_ms"].append(1e3 * (time.process_time() - started))
         frame = Frame(number, rgb, T_map_body, beams, estimate.values, estimate.kind)
         for name, keyframe in (("fusion_ms", False), ("keyframe_ms", True)):
@@ -53,7 +53,7 @@ def bench(source_name: str, frames: int) -> dict[str, float | int | str]:
     # The first runs compile, or load from the cache, what later ones use.
     median = {name: float(np.median(values[1:])) for name, values in times.items()}
     # Both nodes decode the picture for themselves, unless the source does not look at it.
-    decodes = 1 if source_name in BLIND else 2
+    decodes = 1 if source_name in IGNORES_IMAGE else 2
     per_picture = median["source_ms"] + median["fusion_ms"] + decodes * median["decode_ms"]
     return {
         "source": source_name, "width": 640, "height": 480, "threads": 1, "frames": frames,

@@ -9,7 +9,7 @@ import numpy as np
 
 from beamsplat.common.geometry.beams import Beams
 from beamsplat.common.geometry.transforms import inverse, transform_points
-from beamsplat.services.depth.source import DepthSource, View, make_source
+from beamsplat.services.depth.source import DepthInput, DepthSource, make_source
 from beamsplat.services.fusion.frame import Frame
 from beamsplat.services.fusion.fuse import Fusion
 from beamsplat.services.fusion.movers import FreeSpace
@@ -49,7 +49,9 @@ class FieldPrior:
 
     def _frame(self, recording: Recording, index: int, T_map_body: np.ndarray) -> Frame:
         shot, rgb = recording.shots[index], recording.image(index)
-        view = View(shot.stamp_ns, rgb, recording.camera, recording.T_body_camera, shot.beams, self._level)
+        view = DepthInput(
+            shot.stamp_ns, rgb, recording.camera, recording.T_body_camera, shot.beams, self._level
+        )
         estimate = self._source.estimate(view)
         usable = estimate.ok and estimate.kind != "none"
         return Frame(

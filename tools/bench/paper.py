@@ -18,7 +18,7 @@ from beamsplat.common.errors import UserError
 from beamsplat.common.files.persist import make_folder, write_atomically
 from beamsplat.common.files.resources import shipped_file
 from beamsplat.common.geometry.transforms import inverse
-from beamsplat.services.depth.store import find_model
+from beamsplat.services.depth.model_files import find_model
 from beamsplat.tools.evaluation.drive import open_drive
 from beamsplat.tools.evaluation.evaluate import read_truth
 from beamsplat.tools.report.html import write_report

@@ -22,17 +22,19 @@ def list_models(
 
     Example: beamsplat models list
     """
-    from beamsplat.services.depth.models import installed, read_table
+    from beamsplat.services.depth.models import installed_path, read_model_table
 
-    rows = read_table()
+    rows = read_model_table()
     if as_json:
-        print(json.dumps({n: {**r.model_dump(), "file": str(installed(n) or "")} for n, r in rows.items()}))
+        print(
+            json.dumps({n: {**r.model_dump(), "file": str(installed_path(n) or "")} for n, r in rows.items()})
+        )
         return
     table = Table()
     for title in ("name", "source", "licence", "here", "to get it"):
         table.add_column(title, overflow="fold")
     for name, row in rows.items():
-        where = installed(name)
+        where = installed_path(name)
         way = f"beamsplat models pull {name}" if row.url else row.how
         licence = row.licence if row.commercial else f"{row.licence} (not commercial)"
         table.add_row(name, row.source, licence, str(where) if where else "-", way)
@@ -50,9 +52,9 @@ def pull_model(
 
     Example: beamsplat models pull depth_anything_v2_small
     """
-    from beamsplat.services.depth.models import pull, read_table, row_of
+    from beamsplat.services.depth.models import find_entry, pull, read_model_table
 
-    row = row_of(name, read_table())
+    row = find_entry(name, read_model_table())
     bar = Progress(
         TextColumn(name), BarColumn(), DownloadColumn(), TransferSpeedColumn(), console=Console(stderr=True)
     )
@@ -78,6 +80,6 @@ def check_model(file: Annotated[Path, typer.Argument(help="A file, or a name tha
 
     Example: beamsplat models check my.onnx
     """
-    from beamsplat.services.depth.models import check, read_table
+    from beamsplat.services.depth.models import describe_model_file, read_model_table
 
-    print(json.dumps(check(file, read_table()), indent=2))
+    print(json.dumps(describe_model_file(file, read_model_table()), indent=2))

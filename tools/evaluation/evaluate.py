@@ -13,7 +13,7 @@ from beamsplat.common.errors import UserError
 from beamsplat.common.geometry.beams import project_beams
 from beamsplat.common.geometry.transforms import inverse
 from beamsplat.services.depth.recorded import read_depth
-from beamsplat.services.depth.source import DepthSource, Estimate, View
+from beamsplat.services.depth.source import DepthInput, DepthSource, Estimate
 from beamsplat.services.fusion.frame import FieldConfig, Frame
 from beamsplat.services.fusion.fuse import Fusion
 from beamsplat.services.fusion.result import Fused, refusal
@@ -91,7 +91,7 @@ def walk(
             fusion.look(rgb, T_map_body)
             continue
         started = time.process_time()
-        view = View(stamp, rgb, drive.undistort.pinhole, drive.T_body_camera, beams, known)
+        view = DepthInput(stamp, rgb, drive.undistort.pinhole, drive.T_body_camera, beams, known)
         estimate = source.estimate(view)
         seconds = {"source": time.process_time() - started}
         guess = estimate.values if estimate.ok and estimate.kind != "none" else None

@@ -12,7 +12,7 @@ from beamsplat.common.errors import UserError
 from beamsplat.common.geometry.beams import project_beams
 from beamsplat.common.geometry.camera import Pinhole, Undistorter
 from beamsplat.common.geometry.rig import load_rig
-from beamsplat.services.depth.source import DepthSource, View
+from beamsplat.services.depth.source import DepthInput, DepthSource
 from beamsplat.tools.evaluation.drive import Drive
 from beamsplat.tools.evaluation.evaluate import Outcome, read_truth, walk
 
@@ -78,7 +78,7 @@ def draw_image(path: Path, source: DepthSource, rig: Path | None, out: Path) -> 
         raise UserError(f"{rig}: is for {camera.width_px}x{camera.height_px}, {path} is {w}x{h}")
     undistort = Undistorter(camera)
     image = undistort(bgr)
-    view = View(0, cv2.cvtColor(image, cv2.COLOR_BGR2RGB), undistort.pinhole)
+    view = DepthInput(0, cv2.cvtColor(image, cv2.COLOR_BGR2RGB), undistort.pinhole)
     estimate = source.estimate(view)
     near, far = _Z_RANGE_M
     if estimate.kind == "disparity" and np.isfinite(estimate.values).any():

@@ -6,7 +6,7 @@ import pytest
 
 from beamsplat.common.errors import UserError
 from beamsplat.common.geometry.transforms import se2_to_se3
-from beamsplat.services.depth.source import View, judge, make_source
+from beamsplat.services.depth.source import DepthInput, check_depth_map, make_source
 from beamsplat.tools.evaluation.metrics import MethodErrors, blocks, confirmed, every_third
 from tests.services.fusion.room import CAMERA, T_BODY_CAMERA, render, scan
 
@@ -15,7 +15,7 @@ POSE = se2_to_se3(np.array([0.3, 0.2, 0.1]))
 
 def _view(**changes):
     picture, _ = render(POSE)
-    return View(
+    return DepthInput(
         **{
             "stamp_ns": 5,
             "image_rgb": picture,
@@ -57,10 +57,10 @@ def test_none_answers_nothing_and_recorded_answers_what_is_in_the_folder(tmp_pat
 
 def test_judge_says_what_is_wrong_with_a_map():
     rng = np.random.default_rng(0)
-    assert judge(rng.uniform(1, 3, (20, 20))) == "ok"
-    assert "same value" in judge(np.full((20, 20), 2.0))
-    assert "above zero" in judge(-rng.uniform(1, 3, (20, 20)))
-    assert "only 0%" in judge(np.full((20, 20), np.nan))
+    assert check_depth_map(rng.uniform(1, 3, (20, 20))) == "ok"
+    assert "same value" in check_depth_map(np.full((20, 20), 2.0))
+    assert "above zero" in check_depth_map(-rng.uniform(1, 3, (20, 20)))
+    assert "only 0%" in check_depth_map(np.full((20, 20), np.nan))
 
 
 def test_held_out_patterns_are_thirds_of_the_circle():

@@ -6,9 +6,9 @@ from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 import pytest
 
 from beamsplat.common.errors import UserError
-from beamsplat.services.depth.models import ModelRow, pull, read_table, row_of
+from beamsplat.services.depth.model_files import find_model, sha256_of
+from beamsplat.services.depth.models import ModelEntry, find_entry, pull, read_model_table
 from beamsplat.services.depth.source import SOURCES
-from beamsplat.services.depth.store import find_model, sha256_of
 
 DATA = bytes(range(256)) * 4000
 
@@ -55,18 +55,18 @@ def _digest(tmp_path):
 
 
 def _row(**changes):
-    return ModelRow(
+    return ModelEntry(
         **{"source": "fastdepth", "licence": "MIT", "commercial": True, "url": "", "sha256": ""} | changes
     )
 
 
 def test_the_table_fits_and_names_sources_that_exist():
-    table = read_table()
+    table = read_model_table()
     assert {row.source for row in table.values()} <= set(SOURCES)
     assert all(row.url or row.how for row in table.values())
     assert not table["unidepth_v2_vits"].commercial
     with pytest.raises(UserError, match="there is no model"):
-        row_of("nothing", table)
+        find_entry("nothing", table)
 
 
 def test_a_broken_download_goes_on_where_it_stopped(server, folder):

@@ -5,11 +5,11 @@ import pytest
 
 from beamsplat.common.errors import UserError
 from beamsplat.common.geometry.camera import Pinhole
-from beamsplat.services.depth.depth_anything import lower_bound
-from beamsplat.services.depth.fastdepth import network_view
+from beamsplat.services.depth.depth_anything import network_input_size
+from beamsplat.services.depth.fastdepth import network_crop
 from beamsplat.services.depth.onnx_model import OnnxModel, available_providers, to_hw
-from beamsplat.services.depth.source import View, make_source
-from beamsplat.services.depth.unidepth import fit_into, network_rays
+from beamsplat.services.depth.source import DepthInput, make_source
+from beamsplat.services.depth.unidepth import letterbox_layout, network_rays
 
 pytest.importorskip("onnx", reason="needs the package onnx, which builds the graphs")
 from tests.services.depth import graphs
@@ -21,7 +21,7 @@ def _view(camera=CAMERA, image=None):
     if image is None:
         ramp = np.linspace(10, 240, camera.width_px)[None].repeat(camera.height_px, 0)
         image = np.repeat(ramp[..., None], 3, axis=2).astype(np.uint8)
-    return View(1, image, camera)
+    return DepthInput(1, image, camera)
 
 
 def test_fastdepth_gets_rgb_in_0_1_of_its_own_view(tmp_path):
@@ -29,7 +29,7 @@ def test_fastdepth_gets_rgb_in_0_1_of_its_own_view(tmp_path):
     estimate = make_source("fastdepth", {"model": tmp_path / "net.onnx"}).estimate(_view())
     assert estimate.ok
     assert estimate.kind == "metric"
-    u0, v0, u1, v1, factor = network_view(CAMERA)
+    u0, v0, u1, v1, factor = network_crop(CAMERA)
     assert factor == 1.0
     assert abs(u1 - u0 - 530 / 0.889) <= 1.0
     assert abs(v1 - v0 - 530 / 1.187) <= 1.0
@@ -42,7 +42,7 @@ def test_fastdepth_gets_rgb_in_0_1_of_its_own_view(tmp_path):
 
 def test_a_narrow_lens_shows_the_network_less_and_the_depth_is_scaled():
     narrow = Pinhole(900.0, 900.0, 319.5, 239.5, 640, 480)
-    u0, v0, u1, v1, factor = network_view(narrow)
+    u0, v0, u1, v1, factor = network_crop(narrow)
     assert (u0, v0, u1, v1) == (0, 0, 640, 480)
     assert factor == pytest.approx(900.0 / 640.0 / 0.889)
 
@@ -77,7 +77,7 @@ def test_depth_anything_takes_whatever_names_the_export_chose(tmp_path, rank):
     ],
 )
 def test_network_size_follows_the_reference(size, input_px, expected):
-    side = lower_bound(*size, input_px)
+    side = network_input_size(*size, input_px)
     assert side == expected
     assert side[0] % 14 == side[1] % 14 == 0
 
@@ -108,7 +108,7 @@ def test_unidepth_depth_is_z_and_rays_are_those_of_the_camera(tmp_path, shape):
 def test_unidepth_rays_have_centres_at_half_integers():
     camera = Pinhole(500.0, 500.0, 319.5, 239.5, 640, 480)
     side = (240, 320)
-    rays = network_rays(camera, fit_into(480, 640, side), side)[0]
+    rays = network_rays(camera, letterbox_layout(480, 640, side), side)[0]
     assert np.allclose(np.linalg.norm(rays, axis=0), 1.0, atol=1e-6)
     direction = rays / rays[2]
     # The pixel (0, 0) of the network covers ours at (0.5, 0.5): the average of four.
@@ -179,7 +179,7 @@ def test_the_network_at_hand_answers_at_its_known_error(shared_dir, monkeypatch)
         if topic != "camera/image" or message.stamp_ns not in list(files)[::10]:
             continue
         rgb = cv2.cvtColor(cv2.imdecode(message.data, 1), cv2.COLOR_BGR2RGB)
-        z = source.estimate(View(message.stamp_ns, rgb, camera)).values
+        z = source.estimate(DepthInput(message.stamp_ns, rgb, camera)).values
         truth = read_depth(files[message.stamp_ns])
         ok = np.isfinite(truth) & np.isfinite(z)
         errors.append(np.mean(np.abs(z - truth)[ok] / truth[ok]))
