@@ -74,7 +74,7 @@ def _not_planar(groundtruth: Path) -> str:
 
 
 def _beamsplat(arguments: list[str]) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "services", *arguments]
+    command = [sys.executable, "-m", "beamsplat", *arguments]
     return subprocess.run(command, capture_output=True, text=True, check=False)
 
 

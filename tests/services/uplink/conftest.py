@@ -17,7 +17,7 @@ def drive(tmp_path_factory):
     def make(laps):
         if laps not in made:
             out = tmp_path_factory.mktemp("drives") / f"laps{laps}"
-            command = [sys.executable, "-m", "services", "simulate", "--out", out, "--laps", laps]
+            command = [sys.executable, "-m", "beamsplat", "simulate", "--out", out, "--laps", laps]
             subprocess.run([*map(str, command)], check=True, cwd=ROOT, capture_output=True)
             made[laps] = out / "bag"
         return made[laps]

@@ -15,7 +15,7 @@ POSES = ("--set", "replay.data=x", "--set", "recorder.out=x")
 
 def beamsplat(*arguments, **kwargs):
     return subprocess.run(
-        [sys.executable, "-m", "services", *map(str, arguments)],
+        [sys.executable, "-m", "beamsplat", *map(str, arguments)],
         capture_output=True, text=True, timeout=120, cwd=ROOT, **kwargs,
     )  # fmt: skip
 

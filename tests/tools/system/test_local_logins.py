@@ -130,7 +130,7 @@ def test_the_whole_system_runs_under_the_policy_and_top_shows_it(tmp_path, free_
             poll(supervisor, lambda: "0 not ack" in board.records["keyframes"].health.detail, 10)
             assert len(poses.messages) >= 15
             assert list(ask(session, "r1", "mapping", "snapshot", {}, 10.0))
-        top = [sys.executable, "-m", "services", "top", str(file), "--seconds", "3"]
+        top = [sys.executable, "-m", "beamsplat", "top", str(file), "--seconds", "3"]
         shown = subprocess.run(
             top, capture_output=True, text=True, check=True, timeout=60, env=os.environ
         ).stdout
