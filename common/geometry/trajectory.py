@@ -61,11 +61,6 @@ class Trajectory:
         """float64 [N, 3]: origin of b in a."""
         return self.T_a_b[:, :3, 3]
 
-    @property
-    def path_length_m(self) -> float:
-        """Sum of the straight pieces between poses."""
-        return float(np.linalg.norm(np.diff(self.positions_m, axis=0), axis=1).sum())
-
     def at(
         self, stamp_ns: int, *, max_gap_ns: int | None = None, max_extrapolation_ns: int = 0
     ) -> np.ndarray | None:
