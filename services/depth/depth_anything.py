@@ -45,7 +45,7 @@ class DepthAnything:
         self._warm: tuple[int, int] | None = None
 
     def estimate(self, view: DepthInput) -> Estimate:
-        """The network's answer at the picture's size (bilinear, corners aligned as in the reference)."""
+        """The network's answer at the image's size (bilinear, corners aligned as in the reference)."""
         h, w = view.camera.shape
         wish = network_input_size(h, w, self._input_px)
         side = self._onnx.input_size(self._port, *wish, PATCH)

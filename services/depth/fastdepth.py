@@ -57,7 +57,7 @@ class FastDepth:
 def network_crop(camera: Pinhole) -> tuple[int, int, int, int, float]:
     """Crop (u0, v0, u1, v1), half open, that shows the camera as NYU's, and the factor on its depth.
 
-    A camera with a narrower view than NYU's fills the network's picture with less of the world, so that
+    A camera with a narrower view than NYU's fills the network's image with less of the world, so that
     all looks nearer by the ratio of the focals in network pixels (first-order pinhole argument).
     """
     wanted_w, wanted_h = camera.fx_px / _FX_PER_WIDTH, camera.fy_px / _FY_PER_HEIGHT

@@ -16,7 +16,14 @@ from beamsplat.common.geometry.history import History, TimedScan
 from beamsplat.common.messages import DepthEstimate, Image, Odometry, Rig, Scan
 from beamsplat.common.messages.image_codec import decode_rgb
 from beamsplat.common.runtime.node import Input, Node, Outputs
-from beamsplat.services.depth.source import IGNORES_IMAGE, USES_BEAMS, DepthInput, DepthSource, make_source
+from beamsplat.services.depth.source import (
+    IGNORES_IMAGE,
+    DepthInput,
+    DepthSource,
+    check_source,
+    make_source,
+    uses_beams,
+)
 
 log = logging.getLogger("beamsplat.depth")
 
@@ -42,11 +49,15 @@ class DepthNode(Node):
 
     def configure(self) -> None:
         self._source: DepthSource = make_source(self.config.source, self.config.options)
-        self._needs_beams = self.config.source in USES_BEAMS
+        self._needs_beams = uses_beams(self.config.source, self._source)
         self._undistort: Undistorter | None = None
         self._history: History | None = None
         self._waiting: deque[Image] = deque(maxlen=_PICTURES)
         self.overtaken = 0
+
+    def examine(self) -> None:
+        """Check the source's name, options and files."""
+        check_source(self.config.source, self.config.options)
 
     def on_rig(self, rig: Rig) -> Outputs:
         """Camera and lidar of this robot; without a camera there is nothing to do here."""

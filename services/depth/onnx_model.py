@@ -79,7 +79,7 @@ class OnnxModel:
         return TensorSpec(node.name, shape, np.dtype(_DTYPES[node.type]))
 
     def image_input(self, number: int = 0, name: str | None = None) -> TensorSpec:
-        """The input of an RGB picture, N x 3 x H x W, by name if there is one of that name, else by number.
+        """The input of an RGB image, N x 3 x H x W, by name if there is one of that name, else by number.
 
         Raises:
             UserError: there is no such input, or it does not take three channels first.
@@ -87,7 +87,7 @@ class OnnxModel:
         port = next((p for p in self.inputs if p.name == name), None)
         if port is None:
             if number >= len(self.inputs):
-                raise UserError(f"{self.path}: has {len(self.inputs)} inputs; expected one for the picture")
+                raise UserError(f"{self.path}: has {len(self.inputs)} inputs; expected one for the image")
             port = self.inputs[number]
         if len(port.shape) != 4 or port.shape[1] not in (3, None):
             channels_last = len(port.shape) == 4 and port.shape[3] == 3
@@ -148,7 +148,7 @@ class OnnxModel:
         return [np.asarray(result, dtype=np.float32) for result in results]
 
     def warm_up(self, *shapes: tuple[int, ...]) -> list[np.ndarray]:
-        """Two runs on grey, so that the first picture does not pay for allocation; gives the outputs."""
+        """Two runs on grey, so that the first image does not pay for allocation; gives the outputs."""
         arrays = [np.full(shape, 0.5, dtype=np.float32) for shape in shapes]
         self.run(*arrays)
         return self.run(*arrays)

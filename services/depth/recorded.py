@@ -32,7 +32,7 @@ class RecordedDepth:
         self._tolerance_ns = tolerance_ns
 
     def estimate(self, view: DepthInput) -> Estimate:
-        """The map nearest in time, resized to the picture."""
+        """The map nearest in time, resized to the image."""
         i = int(np.argmin(np.abs(self._stamps - view.stamp_ns)))
         empty = np.full(view.camera.shape, np.nan, dtype=np.float32)
         if abs(int(self._stamps[i]) - view.stamp_ns) > self._tolerance_ns:
@@ -43,7 +43,7 @@ class RecordedDepth:
             if abs(values.shape[1] / values.shape[0] - w / h) > 0.02:
                 return Estimate(
                     empty, self._kind,
-                    f"{self._files[i]}: {values.shape[1]}x{values.shape[0]} does not fit the {w}x{h} picture",
+                    f"{self._files[i]}: {values.shape[1]}x{values.shape[0]} does not fit the {w}x{h} image",
                 )  # fmt: skip
             values = cv2.resize(values, (w, h), interpolation=cv2.INTER_NEAREST)
         return Estimate(values, self._kind, check_depth_map(values, min_known_share=0.01))

@@ -1,33 +1,38 @@
 """Depth sources: what they get, what they give, and the table of their names.
 
-A source sees one undistorted picture (and, for geometric sources, the beams of that moment) and gives a
-dense estimate of the picture's size. What its numbers mean is said by `kind`; scaling to metres is
+A source sees one undistorted image (and, for geometric sources, the beams of that moment) and gives a
+dense estimate of the image's size. What its numbers mean is said by `kind`; scaling to metres is
 fusion's business.
 """
 
 from __future__ import annotations
 
 import importlib
+import inspect
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal, Protocol
+from difflib import get_close_matches
+from typing import Any, Literal, Protocol, get_type_hints
 
 import numpy as np
+from pydantic import PydanticSchemaGenerationError, TypeAdapter, ValidationError
 
 from beamsplat.common.errors import UserError
 from beamsplat.common.geometry.beams import NO_BEAMS, Beams
 from beamsplat.common.geometry.camera import Pinhole
+from beamsplat.common.plugins import is_class_path, load_class
+from beamsplat.services.depth.model_files import find_model
 
 Kind = Literal["metric", "relative", "disparity", "none"]
 
 
 @dataclass(frozen=True)
 class DepthInput:
-    """One picture and what is known at its time."""
+    """One image and what is known at its time."""
 
     stamp_ns: int
     image_rgb: np.ndarray  # uint8 [H, W, 3], undistorted
-    camera: Pinhole  # without distortion, of the picture's size
+    camera: Pinhole  # without distortion, of the image's size
     T_body_camera: np.ndarray = field(default_factory=lambda: np.eye(4))
     beams: Beams = NO_BEAMS
     floor_known: bool = False  # T_body_camera's height above the floor can be relied on
@@ -37,10 +42,10 @@ class DepthInput:
 class Estimate:
     """A dense guess. metric: metres; relative: up to a factor; disparity: a / z + b, nearer = larger."""
 
-    values: np.ndarray  # float32 [H, W] of the picture's size; NaN = no answer
+    values: np.ndarray  # float32 [H, W] of the image's size; NaN = no answer
     kind: Kind
     status: str = "ok"  # else one sentence: why the values must not be used
-    confidence: np.ndarray | None = None  # float32 [H, W] in [0, 1], ranking within this picture only
+    confidence: np.ndarray | None = None  # float32 [H, W] in [0, 1], ranking within this image only
 
     @property
     def ok(self) -> bool:
@@ -48,10 +53,10 @@ class Estimate:
 
 
 class DepthSource(Protocol):
-    """A way to guess dense depth from one picture."""
+    """A way to guess dense depth from one image."""
 
     def estimate(self, view: DepthInput) -> Estimate:
-        """The guess for one picture. Never raises for bad pictures: `status` says what is wrong."""
+        """The guess for one image. Never raises for bad images: `status` says what is wrong."""
         ...
 
 
@@ -66,27 +71,93 @@ SOURCES: dict[str, str] = {
     "none": "beamsplat.services.depth.no_depth:NoDepth",
 }
 
-# These look at the beams of a picture's time; the others need not wait for them.
+# These look at the beams of an image's time; the others need not wait for them.
 USES_BEAMS = frozenset({"stixel"})
 
-# These never look at the picture itself: nobody needs to decode it for them.
+# These never look at the image itself: nobody needs to decode it for them.
 IGNORES_IMAGE = frozenset({"stixel", "recorded", "none"})
 
 
+def source_class(name: str) -> type[DepthSource]:
+    """Import and return the class of a depth source.
+
+    Args:
+        name: a key of `SOURCES`, or the path of a class elsewhere, "my_package.my_module:MySource".
+
+    Raises:
+        UserError: no such source, or a class that is not a depth source.
+    """
+    if is_class_path(name):
+        cls = load_class(name, "depth.source")
+        if not callable(getattr(cls, "estimate", None)):
+            raise UserError(f"depth.source = {name!r}: the class has no method estimate(view)")
+        return cls
+    if name not in SOURCES:
+        near = get_close_matches(name, SOURCES, 1)
+        meant = f"did you mean {near[0]!r}? " if near else ""
+        raise UserError(
+            f"there is no depth source {name!r}; {meant}there are {', '.join(SOURCES)}, and 'module:Class' "
+            "of a class of your own"
+        )
+    module_name, _, class_name = SOURCES[name].partition(":")
+    return getattr(importlib.import_module(module_name), class_name)
+
+
 def make_source(name: str, options: Mapping[str, Any] | None = None) -> DepthSource:
-    """The source called `name`.
+    """Create the depth source called `name` (see `source_class`) with its own options.
 
     Raises:
         UserError: no such source, an option it does not take, or a model that is missing or wrong.
     """
-    if name not in SOURCES:
-        raise UserError(f"there is no depth source {name!r}; there are {', '.join(SOURCES)}")
-    module_name, _, class_name = SOURCES[name].partition(":")
-    cls = getattr(importlib.import_module(module_name), class_name)
+    cls = source_class(name)
+    return cls(**_checked_options(name, cls, options or {}))
+
+
+def check_source(name: str, options: Mapping[str, Any]) -> None:
+    """Check the name, the options and the files of a depth source, without loading its network.
+
+    Raises:
+        UserError: as `make_source`; whether a model file holds the right network is not checked.
+    """
+    cls = source_class(name)
+    checked = _checked_options(name, cls, options)
+    if is_class_path(name):  # what its constructor costs is unknown
+        return
+    model = inspect.signature(cls).parameters.get("model")
+    if model is None:
+        cls(**checked)
+    else:
+        find_model(checked.get("model", model.default))
+
+
+def uses_beams(name: str, source: DepthSource) -> bool:
+    """Return whether a source reads `DepthInput.beams`; a class of your own sets `uses_beams = True`."""
+    return name in USES_BEAMS or bool(getattr(source, "uses_beams", False))
+
+
+def _checked_options(name: str, cls: type[DepthSource], options: Mapping[str, Any]) -> dict[str, Any]:
+    """Return options whose names and types fit the constructor's parameters and annotations.
+
+    Raises:
+        UserError: an option that the source does not take, that it lacks, or of another type.
+    """
+    signature = inspect.signature(cls)
     try:
-        return cls(**(options or {}))
+        signature.bind(**options)
     except TypeError as error:
-        raise UserError(f"depth source {name}: {str(error).replace('__init__() ', '')}") from error
+        known = ", ".join(signature.parameters) or "none"
+        raise UserError(f"depth source {name}: {error} (options: {known})") from error
+    hints = get_type_hints(cls.__init__)
+    checked = dict(options)
+    for option in options.keys() & hints.keys():
+        try:
+            checked[option] = TypeAdapter(hints[option]).validate_python(options[option])
+        except ValidationError as error:
+            text = error.errors(include_url=False)[0]["msg"]
+            raise UserError(f"depth source {name}: {option} = {options[option]!r}: {text}") from error
+        except PydanticSchemaGenerationError:  # an annotation of somebody's own class
+            continue
+    return checked
 
 
 def check_depth_map(values: np.ndarray, min_known_share: float = 0.2) -> str:
@@ -94,7 +165,7 @@ def check_depth_map(values: np.ndarray, min_known_share: float = 0.2) -> str:
     finite = np.isfinite(values)
     share = float(finite.mean()) if values.size else 0.0
     if share < min_known_share:
-        return f"the network answered only {share:.0%} of the picture with a number"
+        return f"the network answered only {share:.0%} of the image with a number"
     known = values[finite]
     if not np.any(known > 0.0):
         return "the network returned nothing above zero"

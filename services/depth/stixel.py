@@ -15,11 +15,11 @@ _FINE = 2  # azimuths a pixel column
 
 @dataclass(frozen=True)
 class _PixelRays:
-    """What stays the same from picture to picture of one mounted camera."""
+    """What stays the same from image to image of one mounted camera."""
 
     camera: Pinhole
     T_body_camera: np.ndarray
-    azimuth_rad: np.ndarray  # float64 [M]: the fan over the picture's width
+    azimuth_rad: np.ndarray  # float64 [M]: the fan over the image's width
     place: np.ndarray  # int32 [H, W]: each pixel's azimuth in the fan
     per_range: np.ndarray  # float32 [H, W]: optical z per metre of horizontal range
     floor: np.ndarray  # float32 [H, W]: optical z of the floor, inf = not met

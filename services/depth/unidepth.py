@@ -24,7 +24,7 @@ from beamsplat.services.depth.source import DepthInput, Estimate, check_depth_ma
 
 @dataclass(frozen=True)
 class LetterboxLayout:
-    """How a picture sits in the network's input: scaled by `factor`, then padded."""
+    """How an image sits in the network's input: scaled by `factor`, then padded."""
 
     factor: float
     left_px: int
@@ -63,7 +63,7 @@ class UniDepth:
         self._onnx.warm_up(*([shape, shape] if self._takes_rays else [shape]))
 
     def estimate(self, view: DepthInput) -> Estimate:
-        """Metric depth at the picture's size, and a confidence that ranks pixels within this picture."""
+        """Metric depth at the image's size, and a confidence that ranks pixels within this image."""
         h, w = view.camera.shape
         fit = letterbox_layout(h, w, self._side)
         inputs = [normalize_image(letterbox(view.image_rgb, fit, self._side), self._side)]
@@ -89,14 +89,14 @@ class UniDepth:
 
 
 def letterbox_layout(height: int, width: int, side: tuple[int, int]) -> LetterboxLayout:
-    """The largest picture of the given aspect inside the network's size, centred."""
+    """The largest image of the given aspect inside the network's size, centred."""
     factor = min(side[0] / height, side[1] / width)
     inner_h, inner_w = min(round(height * factor), side[0]), min(round(width * factor), side[1])
     return LetterboxLayout(factor, (side[1] - inner_w) // 2, (side[0] - inner_h) // 2, inner_w, inner_h)
 
 
 def letterbox(image_rgb: np.ndarray, fit: LetterboxLayout, side: tuple[int, int]) -> np.ndarray:
-    """uint8 [h, w, 3] at network size: the picture scaled, mean grey around it."""
+    """uint8 [h, w, 3] at network size: the image scaled, mean grey around it."""
     out = np.full((*side, 3), (124, 116, 104), dtype=np.uint8)
     inner = cv2.resize(image_rgb, (fit.width_px, fit.height_px), interpolation=cv2.INTER_LINEAR)
     out[fit.top_px : fit.top_px + fit.height_px, fit.left_px : fit.left_px + fit.width_px] = inner

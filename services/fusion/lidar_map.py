@@ -1,6 +1,6 @@
-"""Beam returns of the drive so far in the floor plane: what stands behind what the lidar sees now.
+"""Beam returns of the drive so far in the floor plane: what stands occluded_walls what the lidar sees now.
 
-A column of the picture may look over a low cupboard at a wall that the lidar saw from elsewhere. Only for
+A column of the image may look over a low cupboard at a wall that the lidar saw from elsewhere. Only for
 robots that stay on a floor: a tilting lidar paints other heights.
 """
 
@@ -66,7 +66,7 @@ class LidarMap:
         """Ranges float64 [count, M] of the surfaces along each ray, nearest first, NaN = no more."""
         out = np.full((count, len(azimuth_map_rad)), np.nan)
         if self._cells.size:
-            march(
+            cast_rays(
                 self._cells, self._origin.astype(np.float64) * self.cell_m, self.cell_m,
                 np.asarray(position_map_m, dtype=np.float64), np.asarray(azimuth_map_rad, dtype=np.float64),
                 max_range_m, min_hits, out,
@@ -75,7 +75,7 @@ class LidarMap:
 
 
 @kernel
-def march(
+def cast_rays(
     cells: np.ndarray,  # float32 [rows, columns, 3]
     origin_m: np.ndarray,  # float64 [2]
     cell_m: float,

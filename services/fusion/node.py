@@ -29,11 +29,11 @@ from beamsplat.common.messages import (
 from beamsplat.common.messages.header import Header
 from beamsplat.common.messages.image_codec import decode_rgb
 from beamsplat.common.runtime.node import Input, Job, Node, Outputs
-from beamsplat.services.fusion.calibration.startup import CalibrationHealth, StartupCheck
-from beamsplat.services.fusion.frame import Frame
+from beamsplat.services.fusion.calibration.startup_check import CalibrationHealth, StartupCheck
 from beamsplat.services.fusion.fuse import Fusion
-from beamsplat.services.fusion.result import Fused
-from beamsplat.services.fusion.single import SingleCorrection
+from beamsplat.services.fusion.inputs import FusionInput
+from beamsplat.services.fusion.result import FusionResult
+from beamsplat.services.fusion.single_image import SingleImageFusion
 
 log = logging.getLogger("beamsplat.fusion")
 
@@ -71,7 +71,7 @@ class FusionNode(Node):
     outputs = ("fusion/depth", "fusion/cloud")
 
     def configure(self) -> None:
-        self._fusion: Fusion | SingleCorrection | None = None
+        self._fusion: Fusion | SingleImageFusion | None = None
         self._check: StartupCheck | None = None  # of the calibration; only `field` has one
         self._pictures: deque[Image] = deque(maxlen=_PICTURES)
         self._estimates: deque[DepthEstimate] = deque(maxlen=_PICTURES)
@@ -108,7 +108,7 @@ class FusionNode(Node):
         self._T_body_camera = camera.T_body_camera
         self._history = History(np.eye(4) if rig.lidar is None else rig.lidar.T_body_lidar)
         if method != "field":
-            self._fusion = SingleCorrection(self._undistort.pinhole, camera.T_body_camera, method)
+            self._fusion = SingleImageFusion(self._undistort.pinhole, camera.T_body_camera, method)
             return iter(())
         self._fusion = Fusion(
             self._undistort.pinhole, camera.T_body_camera, floor_known=self.config.floor_known,
@@ -222,10 +222,10 @@ class FusionNode(Node):
             yield "fusion/depth", _refused(image.stamp_ns, "no pose at the time of the picture")
             return
         if self._check is not None:
-            self._check.add_picture(image.stamp_ns, rgb, T_odom_body)
+            self._check.add_image(image.stamp_ns, rgb, T_odom_body)
         beams, age_ns = self._history.beams(image.stamp_ns)
         usable = estimate.status == "ok" and estimate.kind != "none"
-        frame = Frame(
+        frame = FusionInput(
             image.stamp_ns, rgb, T_odom_body, beams, estimate.values if usable else None,
             estimate.kind if usable else "none",
         )  # fmt: skip
@@ -247,7 +247,7 @@ class FusionNode(Node):
         turn = np.arccos(np.clip((np.trace(T[:3, :3]) - 1.0) / 2.0, -1.0, 1.0))
         return bool(np.linalg.norm(T[:3, 3]) > self.config.keyframe_m or turn > self.config.keyframe_rad)
 
-    def _cloud(self, stamp_ns: int, fused: Fused, rgb: np.ndarray, T_odom_body: np.ndarray) -> Cloud:
+    def _cloud(self, stamp_ns: int, fused: FusionResult, rgb: np.ndarray, T_odom_body: np.ndarray) -> Cloud:
         every = self.config.cloud_every_px
         depth = fused.depth_m[::every, ::every]
         known = np.isfinite(depth)
@@ -259,7 +259,9 @@ class FusionNode(Node):
         )
 
 
-def _message(stamp_ns: int, fused: Fused, keyframe: bool, age_ns: int, T_odom_body: np.ndarray) -> FusedDepth:
+def _message(
+    stamp_ns: int, fused: FusionResult, keyframe: bool, age_ns: int, T_odom_body: np.ndarray
+) -> FusedDepth:
     return FusedDepth(
         stamp_ns=stamp_ns,
         depth_m=fused.depth_m,

@@ -1,4 +1,4 @@
-"""Pairs of a beam's optical z and the dense guess at its pixel, and the clustering of their ratios."""
+"""Pairs of a beam's optical z and the dense estimate at its pixel, and the clustering of their ratios."""
 
 from __future__ import annotations
 
@@ -13,29 +13,29 @@ class Pairs:
 
     uv_px: np.ndarray  # float64 [N, 2]
     z_m: np.ndarray  # float64 [N]: optical z of the beam, not its range (l_j of the paper)
-    guess: np.ndarray  # float64 [N]: the dense guess there (d_j of the paper)
+    estimate: np.ndarray  # float64 [N]: the dense estimate there (d_j of the paper)
 
     def __len__(self) -> int:
         return len(self.z_m)
 
     def take(self, keep: np.ndarray) -> Pairs:
-        return Pairs(self.uv_px[keep], self.z_m[keep], self.guess[keep])
+        return Pairs(self.uv_px[keep], self.z_m[keep], self.estimate[keep])
 
 
 def make_pairs(
-    guess: np.ndarray,  # float32 [H, W], NaN = unknown
+    estimate: np.ndarray,  # float32 [H, W], NaN = unknown
     uv_px: np.ndarray,  # float64 [N, 2], inside the image
     z_m: np.ndarray,  # float64 [N]
     max_jump: float = 0.10,
 ) -> Pairs:
     """Pairs at the beams' pixels; a pixel whose neighbours differ by more than `max_jump` is left out."""
-    h, w = guess.shape
+    h, w = estimate.shape
     u = np.clip(np.rint(uv_px[:, 0]).astype(int), 0, w - 1)
     v = np.clip(np.rint(uv_px[:, 1]).astype(int), 0, h - 1)
-    here = guess[v, u].astype(np.float64)
+    here = estimate[v, u].astype(np.float64)
     low, high = here.copy(), here.copy()
     for dv, du in ((0, 2), (0, -2), (2, 0), (-2, 0)):
-        near = guess[np.clip(v + dv, 0, h - 1), np.clip(u + du, 0, w - 1)]
+        near = estimate[np.clip(v + dv, 0, h - 1), np.clip(u + du, 0, w - 1)]
         low, high = np.fmin(low, near), np.fmax(high, near)
     with np.errstate(invalid="ignore"):
         good = np.isfinite(here) & (here > 0.0) & (z_m > 0.0) & (high - low <= max_jump * here)

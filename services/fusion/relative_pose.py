@@ -1,4 +1,4 @@
-"""Relative poses of two pictures, refined on tracked corners about a prior from localization.
+"""Relative poses of two images, refined on tracked corners about a prior from localization.
 
 A degree tenth of yaw is a pixel, and a pixel of error is ten per cent of depth at a short baseline. The
 epipolar constraint sees all of the relative rotation and the direction of the translation; its length
@@ -17,13 +17,13 @@ _LK = {"winSize": (13, 13), "maxLevel": 3, "flags": cv2.OPTFLOW_USE_INITIAL_FLOW
 MIN_TRACKS = 12
 
 
-def corners(grey: np.ndarray, most: int = 150) -> np.ndarray:
-    """Corners float32 [N, 2] (u, v) of an uint8 [H, W] picture, best first."""
+def detect_corners(grey: np.ndarray, most: int = 150) -> np.ndarray:
+    """Corners float32 [N, 2] (u, v) of an uint8 [H, W] image, best first."""
     found = cv2.goodFeaturesToTrack(grey, most, 0.01, 8)
     return np.zeros((0, 2), np.float32) if found is None else found.reshape(-1, 2)
 
 
-def track(
+def track_corners(
     grey: np.ndarray, other: np.ndarray, uv: np.ndarray, predicted: np.ndarray, tolerance_px: float = 0.4
 ) -> tuple[np.ndarray, np.ndarray]:
     """(uv in `other` float32 [N, 2], bool [N]): Lucas-Kanade there and back."""
@@ -36,7 +36,7 @@ def track(
     return there[:, 0], same & (found[:, 0] > 0) & (found_back[:, 0] > 0)
 
 
-def refine(
+def refine_relative_pose(
     T_b_a: np.ndarray,  # float64 [4, 4], camera a to camera b, from localization
     rays_a: np.ndarray,  # float64 [N, 3] with z = 1
     rays_b: np.ndarray,  # float64 [N, 3] of the same corners
@@ -81,25 +81,25 @@ def epipolar_px(T_b_a: np.ndarray, rays_a: np.ndarray, rays_b: np.ndarray, focal
     return np.sum(lines * rays_b, axis=1) / np.maximum(np.hypot(lines[:, 0], lines[:, 1]), 1e-12) * focal_px
 
 
-def refine_between(
+def refine_from_images(
     T_b_a: np.ndarray,
     grey_a: np.ndarray,  # uint8 [H, W]
     grey_b: np.ndarray,  # uint8 [H, W]
     uv_a: np.ndarray,  # float32 [N, 2] corners of a
     camera: Pinhole,  # of this size, without distortion
-    depth_guess_m: float,
+    initial_depth_m: float,
     rotation_sigma_rad: float,
     translation_sigma_m: float,
 ) -> np.ndarray:
-    """`refine` on corners tracked from a to b; the prior itself where too few can be tracked."""
+    """`refine_relative_pose` on corners tracked from a to b; the prior itself where too few can be tracked."""
     if len(uv_a) < MIN_TRACKS:
         return T_b_a
     rays_a = camera.rays(uv_a)
-    predicted, _ = camera.project(depth_guess_m * rays_a @ T_b_a[:3, :3].T + T_b_a[:3, 3])
+    predicted, _ = camera.project(initial_depth_m * rays_a @ T_b_a[:3, :3].T + T_b_a[:3, 3])
     predicted = np.where(np.isfinite(predicted), predicted, uv_a)
-    uv_b, good = track(grey_a, grey_b, uv_a, predicted)
+    uv_b, good = track_corners(grey_a, grey_b, uv_a, predicted)
     if good.sum() < MIN_TRACKS:
         return T_b_a
-    return refine(
+    return refine_relative_pose(
         T_b_a, rays_a[good], camera.rays(uv_b[good]), camera.fx_px, rotation_sigma_rad, translation_sigma_m
     )

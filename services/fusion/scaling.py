@@ -1,4 +1,4 @@
-"""One correction for a whole picture: the paper's ratio, and scale with shift in inverse depth."""
+"""One correction for a whole image: the paper's ratio, and scale with shift in inverse depth."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 
 from beamsplat.services.fusion.pairs import effective_count, largest_cluster, make_pairs
-from beamsplat.services.fusion.result import Fused, refusal
+from beamsplat.services.fusion.result import FusionResult, rejected
 
 Kind = Literal["metric", "relative", "disparity", "none"]
 
@@ -21,36 +21,36 @@ _MAX_DEPTH_M = 30.0
 
 
 def as_depth(values: np.ndarray, kind: Kind) -> np.ndarray:
-    """The guess as something proportional to depth; a disparity's unknown shift is taken as zero."""
+    """The estimate as something proportional to depth; a disparity's unknown shift is taken as zero."""
     if kind != "disparity":
         return values
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(values > 1e-6, 1.0 / values, np.nan).astype(np.float32)
 
 
-def ratio(values: np.ndarray, kind: Kind, uv_px: np.ndarray, z_m: np.ndarray) -> Fused:
+def ratio(values: np.ndarray, kind: Kind, uv_px: np.ndarray, z_m: np.ndarray) -> FusionResult:
     """The paper: D_scaled = alpha D with alpha = sum(l_j) / sum(d_j) over the largest cluster of ratios.
 
     Args:
-        values: float32 [H, W], the dense guess.
+        values: float32 [H, W], the dense estimate.
         kind: what its numbers mean.
         uv_px: float64 [N, 2], the beams' pixels.
         z_m: float64 [N], the beams' optical z (l_j).
     """
-    guess = as_depth(values, kind)
-    found = scale_of(guess, uv_px, z_m)
+    estimate = as_depth(values, kind)
+    found = fit_scale(estimate, uv_px, z_m)
     if isinstance(found, str):
-        return refusal(values.shape, found)
-    depth = (found.alpha * guess).astype(np.float32)
+        return rejected(values.shape, found)
+    depth = (found.alpha * estimate).astype(np.float32)
     sigma = depth * np.float32(np.hypot(found.spread, found.sigma / found.alpha))
-    return Fused(
+    return FusionResult(
         depth, sigma, scale=found.alpha, scale_sigma=found.sigma, inlier_share=found.inlier_share,
         residual_m=found.residual_m, pairs=found.pairs,
     )  # fmt: skip
 
 
 @dataclass(frozen=True)
-class Scale:
+class ScaleFit:
     """The paper's alpha with its standard error, and how well the pairs agree on it."""
 
     alpha: float
@@ -61,43 +61,45 @@ class Scale:
     pairs: int
 
 
-def scale_of(guess: np.ndarray, uv_px: np.ndarray, z_m: np.ndarray) -> Scale | str:
-    """alpha of a guess proportional to depth, float32 [H, W]; or one sentence on why there is none."""
-    pairs = make_pairs(guess, uv_px, z_m)
+def fit_scale(estimate: np.ndarray, uv_px: np.ndarray, z_m: np.ndarray) -> ScaleFit | str:
+    """alpha of a estimate proportional to depth, float32 [H, W]; or one sentence on why there is none."""
+    pairs = make_pairs(estimate, uv_px, z_m)
     if len(pairs) < MIN_PAIRS:
         return _too_few(len(uv_px), len(pairs))
-    inlier = largest_cluster(np.log(pairs.z_m / pairs.guess), _RADIUS)
+    inlier = largest_cluster(np.log(pairs.z_m / pairs.estimate), _RADIUS)
     used = pairs.take(inlier)
     if len(used) < MIN_PAIRS or inlier.mean() < MIN_INLIER_SHARE:
-        return f"beams and guess agree on no scale ({len(used)} of {len(pairs)} pairs)"
-    alpha = float(used.z_m.sum() / used.guess.sum())
-    residual = used.z_m - alpha * used.guess
+        return f"beams and estimate agree on no scale ({len(used)} of {len(pairs)} pairs)"
+    alpha = float(used.z_m.sum() / used.estimate.sum())
+    residual = used.z_m - alpha * used.estimate
     n_eff = effective_count(residual)
     # Standard error of a ratio estimator (Cochran, Sampling Techniques, 2.41), with n_eff for n.
-    error = float(np.sqrt(np.mean(residual**2) / max(n_eff - 1.0, 1.0)) / used.guess.mean())
-    spread = float(np.std(np.log(pairs.z_m / (alpha * pairs.guess))))
-    return Scale(alpha, error, spread, float(inlier.mean()), float(np.median(np.abs(residual))), len(pairs))
+    error = float(np.sqrt(np.mean(residual**2) / max(n_eff - 1.0, 1.0)) / used.estimate.mean())
+    spread = float(np.std(np.log(pairs.z_m / (alpha * pairs.estimate))))
+    return ScaleFit(
+        alpha, error, spread, float(inlier.mean()), float(np.median(np.abs(residual))), len(pairs)
+    )
 
 
-def affine(values: np.ndarray, kind: Kind, uv_px: np.ndarray, z_m: np.ndarray) -> Fused:
-    """1/z = a q + b with q the guess in inverse depth: what affine-invariant disparity needs.
+def affine(values: np.ndarray, kind: Kind, uv_px: np.ndarray, z_m: np.ndarray) -> FusionResult:
+    """1/z = a q + b with q the estimate in inverse depth: what affine-invariant disparity needs.
 
     Robust: median of slopes (Theil-Sen over fixed partners), then reweighted least squares (Tukey). With
     too little spread in q the shift cannot be told and stays zero. Arguments as in `ratio`.
     """
     pairs = make_pairs(as_depth(values, kind), uv_px, z_m)
     if len(pairs) < MIN_PAIRS:
-        return refusal(values.shape, _too_few(len(uv_px), len(pairs)))
-    q, y = 1.0 / pairs.guess, 1.0 / pairs.z_m
+        return rejected(values.shape, _too_few(len(uv_px), len(pairs)))
+    q, y = 1.0 / pairs.estimate, 1.0 / pairs.z_m
     a, b, weight = _robust_line(q, y)
     if not a > 0.0:
-        return refusal(
-            values.shape, "nearer in the guess is farther for the beams: wrong network or wrong beams"
+        return rejected(
+            values.shape, "nearer in the estimate is farther for the beams: wrong network or wrong beams"
         )
     inlier = weight > 0.0
     if inlier.mean() < MIN_INLIER_SHARE:
-        return refusal(
-            values.shape, f"beams and guess agree on no line ({inlier.sum()} of {len(pairs)} pairs)"
+        return rejected(
+            values.shape, f"beams and estimate agree on no line ({inlier.sum()} of {len(pairs)} pairs)"
         )
     with np.errstate(divide="ignore", invalid="ignore"):
         q_all = values if kind == "disparity" else 1.0 / values
@@ -109,7 +111,7 @@ def affine(values: np.ndarray, kind: Kind, uv_px: np.ndarray, z_m: np.ndarray) -
     error = spread / np.sqrt(max(n_eff - 2.0, 1.0)) / max(float(np.std(q[inlier])), 1e-9)
     fitted = 1.0 / np.maximum(a * q + b, 1.0 / _MAX_DEPTH_M)
     sigma = (depth**2 * np.float32(max(spread, 1e-4))).astype(np.float32)
-    return Fused(
+    return FusionResult(
         depth, sigma, scale=1.0 / a, scale_sigma=error / a**2, inlier_share=float(inlier.mean()),
         residual_m=float(np.median(np.abs(fitted - pairs.z_m)[inlier])), pairs=len(pairs),
     )  # fmt: skip
@@ -148,4 +150,6 @@ def _robust_line(q: np.ndarray, y: np.ndarray) -> tuple[float, float, np.ndarray
 def _too_few(beams: int, pairs: int) -> str:
     if beams == 0:
         return "no beams in view"
-    return f"only {pairs} of {beams} beams in view fall on pixels with a depth guess; {MIN_PAIRS} are needed"
+    return (
+        f"only {pairs} of {beams} beams in view fall on pixels with a depth estimate; {MIN_PAIRS} are needed"
+    )

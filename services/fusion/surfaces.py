@@ -1,4 +1,4 @@
-"""Surfaces a picture may show, as the lidar and the floor predict them: candidates, not answers."""
+"""CandidateSurfaces an image may show, as the lidar and the floor predict them: candidates, not answers."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from beamsplat.common.geometry.beams import Beams, hidden_beams, plan_polar, pla
 from beamsplat.common.geometry.camera import Pinhole
 from beamsplat.common.geometry.transforms import yaw_of
 from beamsplat.services.fusion.lidar_map import LidarMap
-from beamsplat.services.fusion.wall_lines import find_lines, ranges_to
+from beamsplat.services.fusion.wall_lines import find_lines, ranges_to_lines
 
 _LAYER_RAYS_PER_PX, _WALL_RAYS_PER_PX = 2, 8
 _CONTINUED = 3  # continued walls a ray may meet
@@ -18,22 +18,24 @@ _POST_HEIGHT_M = 0.35  # how far from the lidar plane legs and posts are taken t
 
 
 @dataclass(frozen=True)
-class Surfaces:
+class CandidateSurfaces:
     """Optical z [h, w] of each candidate surface, NaN where it is not met."""
 
     wall: np.ndarray  # the nearest beam of the column, extruded upright
-    backdrop: np.ndarray  # the same without what is narrow (legs, posts): what stands behind it
-    wall_off_m: np.ndarray  # how far above or below the lidar plane the pixel meets that wall
+    background_wall: (
+        np.ndarray
+    )  # the same without what is narrow (legs, posts): what stands occluded_walls it
+    wall_offset_m: np.ndarray  # how far above or below the lidar plane the pixel meets that wall
     floor: np.ndarray
-    behind: tuple[np.ndarray, ...]  # walls farther back, from the drive so far
+    occluded_walls: tuple[np.ndarray, ...]  # walls farther back, from the drive so far
     ceilings: tuple[np.ndarray, ...]
 
     @property
     def nearest(self) -> np.ndarray:
         """What one sees if nothing but these surfaces exists (`stixel`, and ceilings)."""
         with np.errstate(invalid="ignore"):
-            high = self.wall_off_m > _POST_HEIGHT_M
-        near = np.fmin(np.where(high, self.backdrop, self.wall), self.floor)
+            high = self.wall_offset_m > _POST_HEIGHT_M
+        near = np.fmin(np.where(high, self.background_wall, self.wall), self.floor)
         for ceiling in self.ceilings:
             near = np.fmin(near, ceiling)
         return near
@@ -45,7 +47,7 @@ class Surfaces:
             return np.isfinite(self.floor) & ~(self.wall < self.floor)
 
 
-class SurfaceFinder:
+class SurfacePredictor:
     """Rays of the working size in the body frame, and the surfaces they meet."""
 
     def __init__(self, camera: Pinhole, T_body_camera: np.ndarray, *, floor_known: bool) -> None:
@@ -73,7 +75,7 @@ class SurfaceFinder:
         return wall_ranges(self._wall_fan, azimuth, reach)[self._wall_index] / self._across
 
     def _behind(self, ranges: np.ndarray, wall: np.ndarray) -> list[np.ndarray]:
-        """Optical z [h, w] of ranges [L, fan] where they lie behind the wall and before the floor."""
+        """Optical z [h, w] of ranges [L, fan] where they lie occluded_walls the wall and before the floor."""
         layers = []
         for layer in ranges[:, self._fan_index] / self._across:
             with np.errstate(invalid="ignore"):
@@ -88,7 +90,7 @@ class SurfaceFinder:
         lidar_map: LidarMap | None,
         T_map_body: np.ndarray,
         ceiling_heights_m: tuple[float, ...],
-    ) -> Surfaces:
+    ) -> CandidateSurfaces:
         """Candidate surfaces of one view; `ceiling_heights_m` are above the floor."""
         points = beams.points_body_m
         points = points[~hidden_beams(points, self._T_body_camera)]
@@ -96,26 +98,28 @@ class SurfaceFinder:
         wall = self._upright(azimuth, reach)
         lidar_z_m = float(np.median(points[:, 2])) if len(points) else 0.0
         off = np.abs(self.camera_z_m + wall * self.rise - lidar_z_m)
-        backdrop = self._upright(azimuth, without_posts(azimuth, reach))
-        behind: list[np.ndarray] = []
+        background_wall = self._upright(azimuth, remove_narrow_objects(azimuth, reach))
+        occluded_walls: list[np.ndarray] = []
         if lidar_map is not None:
             position = (T_map_body @ self._T_body_camera)[:2, 3]
             ranges = lidar_map.layers(position, self._fan + float(yaw_of(T_map_body)))
-            behind += self._behind(ranges, wall)
+            occluded_walls += self._behind(ranges, wall)
             lines = find_lines(lidar_map.points(), lidar_map.cell_m)
             front = wall_ranges(self._fan, azimuth, reach)
             beyond = np.maximum(np.nan_to_num(front, nan=np.inf) * 1.08, front + 0.15)
-            met = ranges_to(lines, position, self._fan + float(yaw_of(T_map_body)), beyond, _CONTINUED)
-            behind += self._behind(met, wall)
+            met = ranges_to_lines(lines, position, self._fan + float(yaw_of(T_map_body)), beyond, _CONTINUED)
+            occluded_walls += self._behind(met, wall)
         ceilings = []
         for height in ceiling_heights_m:
             plane = plane_depth(self.rays_body, self.camera_z_m, height)
             with np.errstate(invalid="ignore"):
-                ceilings.append(np.where((self.rise > 0.02) & (plane < backdrop), plane, np.nan))
-        return Surfaces(wall, backdrop, off, self.floor, tuple(behind), tuple(ceilings))
+                ceilings.append(np.where((self.rise > 0.02) & (plane < background_wall), plane, np.nan))
+        return CandidateSurfaces(
+            wall, background_wall, off, self.floor, tuple(occluded_walls), tuple(ceilings)
+        )
 
 
-def without_posts(
+def remove_narrow_objects(
     azimuth_rad: np.ndarray, reach_m: np.ndarray, width_m: float = 0.3, jump: float = 1.15
 ) -> np.ndarray:
     """Ranges [N] with narrow things replaced by what stands beside them.
@@ -144,8 +148,8 @@ def without_posts(
     return result
 
 
-class CeilingFinder:
-    """Heights of horizontal planes overhead: where they explain pictures better than the walls behind.
+class CeilingDetector:
+    """Heights of horizontal planes overhead: where they explain images better than the walls occluded_walls.
 
     Evidence fades by a tenth a keyframe, so that the next room may have another ceiling.
     """

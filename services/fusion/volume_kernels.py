@@ -15,10 +15,10 @@ _BEST = 4  # costs kept of each label; the mean of the better half of the views 
 
 @kernel
 def cost_volume(
-    reference: np.ndarray,  # [h, w, 3] features of the picture
-    sources: np.ndarray,  # [S, h, w, 3] features of the other pictures
-    R: np.ndarray,  # [S, 3, 3] rotation, picture to source
-    t: np.ndarray,  # [S, 3] translation, picture to source
+    reference: np.ndarray,  # [h, w, 3] features of the image
+    sources: np.ndarray,  # [S, h, w, 3] features of the other images
+    R: np.ndarray,  # [S, 3, 3] rotation, image to source
+    t: np.ndarray,  # [S, 3] translation, image to source
     K: np.ndarray,  # [4] fx, fy, cx, cy at this size
     z: np.ndarray,  # [D] label depths, increasing
     z_last: np.ndarray,  # [h, w] labels beyond this depth are impossible (below the floor)
@@ -193,7 +193,7 @@ def aggregate(
 
 
 @kernel
-def winners(
+def winner_takes_all(
     total: np.ndarray,  # [h, w, D]
     log_z: np.ndarray,  # [D] float64
     temperature: float,
@@ -230,14 +230,14 @@ def winners(
 def plane_gain(
     volume: np.ndarray,  # [h, w, D]
     rise: np.ndarray,  # [h, w]: upward part of the rays (z_camera = 1) in the body frame
-    wall: np.ndarray,  # [h, w] depth of the vertical surface behind, NaN = none
+    wall: np.ndarray,  # [h, w] depth of the vertical surface occluded_walls, NaN = none
     camera_z_m: float,
     log_z0: float,
     log_step: float,
     heights_m: np.ndarray,  # [n]
     gain: np.ndarray,  # [n] out
 ) -> None:
-    """How much cheaper a horizontal plane at each height explains the picture than the walls behind it."""
+    """How much cheaper a horizontal plane at each height explains the image than the walls occluded_walls it."""
     h, w, D = volume.shape
     for k in range(heights_m.shape[0]):
         total = 0.0

@@ -1,4 +1,4 @@
-"""Long straight walls of the lidar's map, continued behind what stands before them.
+"""Long straight walls of the lidar's map, continued occluded_walls what stands before them.
 
 Cupboards, sofas and worktops hide the foot of a wall from a lidar near the floor for good; the camera sees
 the wall above them. Walls are straight: the same line comes out again elsewhere.
@@ -44,7 +44,7 @@ def find_lines(points_m: np.ndarray, cell_m: float, least_m: float = 1.2, most: 
     while len(lines) < most and len(left) >= least:
         reach_m = float(np.abs(left).sum(axis=1).max()) + 1.0
         votes = np.zeros((_ANGLES, int(2 * reach_m / cell_m) + 2), np.int32)
-        vote(left, cell_m, reach_m, votes)
+        hough_vote(left, cell_m, reach_m, votes)
         angle, row = np.unravel_index(int(np.argmax(votes)), votes.shape)
         theta = angle * np.pi / _ANGLES
         normal, offset = np.array([np.cos(theta), np.sin(theta)]), (row + 0.5) * cell_m - reach_m
@@ -68,7 +68,7 @@ def find_lines(points_m: np.ndarray, cell_m: float, least_m: float = 1.2, most: 
 
 
 @kernel
-def vote(points: np.ndarray, cell_m: float, reach_m: float, votes: np.ndarray) -> None:
+def hough_vote(points: np.ndarray, cell_m: float, reach_m: float, votes: np.ndarray) -> None:
     """votes[a, b] += 1 for every line at angle a and distance b from the origin through a point [N, 2]."""
     for a in range(votes.shape[0]):
         c, s = np.cos(a * np.pi / votes.shape[0]), np.sin(a * np.pi / votes.shape[0])
@@ -76,7 +76,7 @@ def vote(points: np.ndarray, cell_m: float, reach_m: float, votes: np.ndarray) -
             votes[a, int((points[i, 0] * c + points[i, 1] * s + reach_m) / cell_m)] += 1
 
 
-def ranges_to(
+def ranges_to_lines(
     lines: list[WallLine],
     start_m: np.ndarray,  # float64 [2]
     azimuth_rad: np.ndarray,  # float64 [M]

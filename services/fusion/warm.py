@@ -8,24 +8,24 @@ from beamsplat.common.geometry.beams import Beams
 from beamsplat.common.geometry.camera import Pinhole
 from beamsplat.common.geometry.frames import camera_mount
 from beamsplat.common.geometry.transforms import se2_to_se3
-from beamsplat.services.fusion.frame import Frame
+from beamsplat.services.fusion.free_space import FreeSpaceGrid
 from beamsplat.services.fusion.fuse import Fusion
-from beamsplat.services.fusion.movers import FreeSpace
+from beamsplat.services.fusion.inputs import FusionInput
 
 
 def warm() -> None:
-    """A few pictures of noise before a wall, as keyframes and between them."""
+    """A few images of noise before a wall, as keyframes and between them."""
     camera = Pinhole(530.0, 530.0, 319.5, 239.5, 640, 480)
     fusion = Fusion(camera, camera_mount(0.1, 0.0, 0.45), floor_known=True, planar=True)
     rng = np.random.default_rng(0)
-    picture = rng.integers(0, 255, (480, 640, 3)).astype(np.uint8)
+    image = rng.integers(0, 255, (480, 640, 3)).astype(np.uint8)
     y = np.linspace(-2.0, 2.0, 200)
     for i in range(4):
         T_map_body = se2_to_se3(np.array([0.15 * i, 0.0, 0.0]))
         points = np.stack([np.full(200, 3.0 - 0.15 * i), y, np.full(200, 0.18)], axis=1)
         fusion.add_scan(points + T_map_body[:3, 3])
         beams = Beams(points, np.arange(200), np.full(200, 0.01))
-        guess = np.full((480, 640), 3.0, np.float32) + rng.uniform(0.0, 0.1, (480, 640)).astype(np.float32)
-        frame = Frame(i, np.roll(picture, i, axis=1), T_map_body, beams, guess, "relative")
+        estimate = np.full((480, 640), 3.0, np.float32) + rng.uniform(0.0, 0.1, (480, 640)).astype(np.float32)
+        frame = FusionInput(i, np.roll(image, i, axis=1), T_map_body, beams, estimate, "relative")
         fusion.fuse(frame, keyframe=i % 2 == 0)
-    FreeSpace().add(np.zeros(2), points)
+    FreeSpaceGrid().add(np.zeros(2), points)

@@ -13,8 +13,8 @@ from beamsplat.common.geometry.frames import camera_mount
 from beamsplat.common.geometry.transforms import make_transform
 from beamsplat.common.messages.image_codec import decode_rgb
 from beamsplat.services.depth.source import IGNORES_IMAGE, DepthInput, make_source
-from beamsplat.services.fusion.frame import Frame
 from beamsplat.services.fusion.fuse import Fusion
+from beamsplat.services.fusion.inputs import FusionInput
 
 _WALL_M = 4.0
 
@@ -43,7 +43,7 @@ def bench(source_name: str, frames: int) -> dict[str, float | int | str]:
         started = time.process_time()
         estimate = source.estimate(DepthInput(number, rgb, camera, T_body_camera, beams, True))
         times["source_ms"].append(1e3 * (time.process_time() - started))
-        frame = Frame(number, rgb, T_map_body, beams, estimate.values, estimate.kind)
+        frame = FusionInput(number, rgb, T_map_body, beams, estimate.values, estimate.kind)
         for name, keyframe in (("fusion_ms", False), ("keyframe_ms", True)):
             if keyframe and number % 5:
                 continue

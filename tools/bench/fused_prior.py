@@ -10,9 +10,9 @@ import numpy as np
 from beamsplat.common.geometry.beams import Beams
 from beamsplat.common.geometry.transforms import inverse, transform_points
 from beamsplat.services.depth.source import DepthInput, DepthSource, make_source
-from beamsplat.services.fusion.frame import Frame
+from beamsplat.services.fusion.free_space import FreeSpaceGrid
 from beamsplat.services.fusion.fuse import Fusion
-from beamsplat.services.fusion.movers import FreeSpace
+from beamsplat.services.fusion.inputs import FusionInput
 from beamsplat.services.keyframes.bodies import body_mask
 from beamsplat.tools.bench.mapping import HELD_OUT_AT, HELD_OUT_EVERY
 from beamsplat.tools.evaluation.dataset import Recording
@@ -47,14 +47,14 @@ class FieldPrior:
         fused = self._fusion.fuse(self._frame(recording, index, T_map_body), keyframe=True)
         return (fused.depth_m, fused.sigma_m) if fused.ok else None
 
-    def _frame(self, recording: Recording, index: int, T_map_body: np.ndarray) -> Frame:
+    def _frame(self, recording: Recording, index: int, T_map_body: np.ndarray) -> FusionInput:
         shot, rgb = recording.shots[index], recording.image(index)
         view = DepthInput(
             shot.stamp_ns, rgb, recording.camera, recording.T_body_camera, shot.beams, self._level
         )
         estimate = self._source.estimate(view)
         usable = estimate.ok and estimate.kind != "none"
-        return Frame(
+        return FusionInput(
             shot.stamp_ns, rgb, T_map_body, shot.beams, estimate.values if usable else None, estimate.kind
         )
 
@@ -63,18 +63,18 @@ class MoverMasks:
     """Masks of what walks where beams have passed before. Called with rising numbers of pictures."""
 
     def __init__(self) -> None:
-        self._free, self._next = FreeSpace(), 0
+        self._free, self._next = FreeSpaceGrid(), 0
 
     def __call__(self, recording: Recording, index: int, depth_m: np.ndarray) -> np.ndarray | None:
         """bool [H, W], False on movers; None where nothing moves. `depth_m` float32 [H, W] of the picture."""
         T_camera_body = inverse(recording.T_body_camera)
         if index < self._next:
-            self._free, self._next = FreeSpace(), 0
+            self._free, self._next = FreeSpaceGrid(), 0
         for number in range(self._next, index + 1):
             shot = recording.shots[number]
             T_map_body = shot.T_map_camera @ T_camera_body
             points = transform_points(T_map_body, shot.beams.points_body_m)
-            moving = self._free.contradicted(points)
+            moving = self._free.dynamic_returns(points)
             still: Beams = shot.beams.take(~moving)
             self._free.add(T_map_body[:3, 3], transform_points(T_map_body, still.points_body_m))
         self._next = index + 1

@@ -14,15 +14,15 @@ from beamsplat.common.geometry.camera import Pinhole, Undistorter
 from beamsplat.common.geometry.rig import load_rig
 from beamsplat.common.geometry.transforms import transform_points
 from beamsplat.services.fusion.calibration.board import BoardPair, chessboard_plane, level_mount, solve_board
-from beamsplat.services.fusion.calibration.edges import edge_errors, picture_edges
+from beamsplat.services.fusion.calibration.board_edges import edge_errors, image_edges
 from beamsplat.services.fusion.calibration.motion import (
     PARAMETERS,
     MotionCalibration,
     TrackedPair,
     solve_motion,
 )
-from beamsplat.services.fusion.calibration.startup import health_sentence
-from beamsplat.services.fusion.relative_pose import corners, track
+from beamsplat.services.fusion.calibration.startup_check import describe_calibration
+from beamsplat.services.fusion.relative_pose import detect_corners, track_corners
 from beamsplat.tools.evaluation.drive import Drive
 
 _WIDTH_PX = 320
@@ -50,8 +50,8 @@ def tracked_pairs(drive: Drive, clock_offset_ns: int = 0) -> list[TrackedPair]:
                        interpolation=cv2.INTER_AREA)
             for k in (i, j)
         ]  # fmt: skip
-        uv = corners(grey[0], 80)
-        moved, good = track(grey[0], grey[1], uv, uv)
+        uv = detect_corners(grey[0], 80)
+        moved, good = track_corners(grey[0], grey[1], uv, uv)
         if good.any():
             pairs.append(TrackedPair(
                 int(stamps[i]) + clock_offset_ns, int(stamps[j]) + clock_offset_ns,
@@ -111,7 +111,7 @@ def calibrate_board(
         raise UserError(f"{folder}: {error}") from error
     pinhole = Undistorter(camera).pinhole
     edges = [
-        picture_edges(
+        image_edges(
             grey, camera, pinhole.project(transform_points(found.T_camera_lidar, pair.points_lidar[beams]))[0]
         )
         for grey, pair, beams in zip(pictures, pairs, found.on_board)
@@ -185,7 +185,7 @@ def motion_report(drive: Drive, found: MotionCalibration) -> dict[str, Any]:
         if np.isfinite(sigma) and not sure:
             unknown.append(name.rsplit("_", 1)[0])
     report["not_observable"] = [*unknown, "z: a body on a floor never moves along it"]
-    report["status"] = health_sentence(found)
+    report["status"] = describe_calibration(found)
     report["T_body_camera"] = found.mount(drive.T_body_camera).tolist()
     return report
 

@@ -14,9 +14,9 @@ from beamsplat.common.geometry.beams import project_beams
 from beamsplat.common.geometry.transforms import inverse
 from beamsplat.services.depth.recorded import read_depth
 from beamsplat.services.depth.source import DepthInput, DepthSource, Estimate
-from beamsplat.services.fusion.frame import FieldConfig, Frame
 from beamsplat.services.fusion.fuse import Fusion
-from beamsplat.services.fusion.result import Fused, refusal
+from beamsplat.services.fusion.inputs import FusionInput, PlaneSweepConfig
+from beamsplat.services.fusion.result import FusionResult, rejected
 from beamsplat.services.fusion.scaling import affine, ratio
 from beamsplat.tools.evaluation.drive import Drive
 from beamsplat.tools.evaluation.metrics import MethodErrors, blocks, confirmed, every_third
@@ -32,7 +32,7 @@ class Outcome:
     stamp_ns: int
     image_rgb: np.ndarray
     estimate: Estimate
-    methods: dict[str, Fused]
+    methods: dict[str, FusionResult]
     truth: np.ndarray  # float32 [H, W], NaN = none
     seconds: dict[str, float]  # CPU time by step
 
@@ -57,7 +57,7 @@ def walk(
     source: DepthSource,
     wanted: dict[int, Path | None],
     hide: Callable[[int], np.ndarray] | None = None,
-    config: FieldConfig | None = None,
+    config: PlaneSweepConfig | None = None,
     floor: bool | None = None,
 ) -> Iterator[Outcome]:
     """Plays a drive through depth and fusion in order of time; yields the wanted pictures (stamp -> truth).
@@ -95,8 +95,8 @@ def walk(
         estimate = source.estimate(view)
         seconds = {"source": time.process_time() - started}
         guess = estimate.values if estimate.ok and estimate.kind != "none" else None
-        frame = Frame(stamp, rgb, T_map_body, beams, guess, estimate.kind)
-        methods: dict[str, Fused] = {}
+        frame = FusionInput(stamp, rgb, T_map_body, beams, guess, estimate.kind)
+        methods: dict[str, FusionResult] = {}
         for name in ("field_carried", "field"):
             if name == "field_carried" and stamp not in wanted:
                 continue
@@ -112,7 +112,7 @@ def walk(
         for name, correct in (("ratio", ratio), ("affine", affine)):
             started = time.process_time()
             done = correct(guess, estimate.kind, uv, z) if guess is not None else None
-            methods[name] = done or refusal(rgb.shape[:2], estimate.status)
+            methods[name] = done or rejected(rgb.shape[:2], estimate.status)
             seconds[name] = time.process_time() - started
         yield Outcome(stamp, rgb, estimate, methods, truth, seconds)
 
@@ -129,7 +129,7 @@ def evaluate(
     truth: dict[int, Path],
     *,
     heldout: bool = True,
-    config: FieldConfig | None = None,
+    config: PlaneSweepConfig | None = None,
     floor: bool | None = None,
     progress: Callable[[str, int, int], None] = lambda run, done, total: None,
 ) -> dict[str, object]:
@@ -153,7 +153,7 @@ def evaluate(
             results = dict(outcome.methods)
             if outcome.estimate.kind == "metric":
                 raw = outcome.estimate.values
-                results = {"raw": Fused(raw, np.full_like(raw, np.nan)), **results}
+                results = {"raw": FusionResult(raw, np.full_like(raw, np.nan)), **results}
             if run == "dense":
                 _add_dense(errors, results, outcome, drive, seconds)
                 continue
@@ -174,7 +174,7 @@ def evaluate(
 
 
 def _add_dense(
-    errors: dict[str, MethodErrors], results: dict[str, Fused], outcome: Outcome, drive: Drive,
+    errors: dict[str, MethodErrors], results: dict[str, FusionResult], outcome: Outcome, drive: Drive,
     seconds: dict[str, list[float]],
 ) -> None:  # fmt: skip
     uv, z, _ = project_beams(drive.beams(outcome.stamp_ns), drive.undistort.pinhole, drive.T_body_camera)

@@ -99,7 +99,7 @@ def solve_board(
             weight = 1.0 / (1.0 + (r / (3.0 * _SIGMA_M)) ** 2)
             H = J.T @ (J * weight[:, None])
             if np.linalg.cond(H) > 1e7:
-                raise ValueError("all boards face the same way: turn the board between pictures")
+                raise ValueError("all boards face the same way: turn the board between images")
             x -= np.linalg.solve(H, J.T @ (weight * r))
     r, J = _linear(pairs, on_board, x, y_m)
     variance = float(r @ r) / max(len(r) - 3, 1)

@@ -1,6 +1,6 @@
-"""Camera clock and camera mount from motion: corners tracked between pictures against poses from the lidar.
+"""Camera clock and camera mount from motion: corners tracked between images against poses from the lidar.
 
-Two pictures a fraction of a second apart obey the epipolar constraint only if the poses are taken at the
+Two images a fraction of a second apart obey the epipolar constraint only if the poses are taken at the
 right times and the camera looks the right way. Turning tells the clock (where the rate of turn changes)
 and the lever arm, driving tells yaw and pitch, both tell roll. A robot on a floor never moves along its
 own vertical: the camera's height cannot be told from its motion, and is said not to be.
@@ -28,7 +28,7 @@ OBSERVABLE = np.array([0.025, 0.01, 0.01, 0.01, 0.02, 0.02])
 
 @dataclass(frozen=True)
 class TrackedPair:
-    """Corners seen in two pictures; stamps on the camera's clock."""
+    """Corners seen in two images; stamps on the camera's clock."""
 
     stamp_a_ns: int
     stamp_b_ns: int
@@ -53,10 +53,10 @@ class MotionCalibration:
 
     def mount(self, T_body_camera: np.ndarray) -> np.ndarray:
         """`T_body_camera` [4, 4] with the observable corrections in."""
-        return corrected(T_body_camera, np.where(self.observable, self.values, 0.0))
+        return apply_correction(T_body_camera, np.where(self.observable, self.values, 0.0))
 
 
-def corrected(T_body_camera: np.ndarray, values: np.ndarray) -> np.ndarray:
+def apply_correction(T_body_camera: np.ndarray, values: np.ndarray) -> np.ndarray:
     """The mount turned by (roll, pitch, yaw) about the body's axes, and moved by (x, y)."""
     T = T_body_camera.copy()
     T[:3, :3] = so3_exp(values[1:4]) @ T_body_camera[:3, :3]
@@ -73,26 +73,24 @@ def solve_motion(
 ) -> MotionCalibration:
     """Most probable corrections: a search over the clock, then Gauss-Newton on all free parameters.
 
-    Standard errors come from a jackknife over blocks of the drive: corners of one picture err together.
+    Standard errors come from a jackknife over blocks of the drive: corners of one image err together.
 
     Raises:
         ValueError: too few pairs with corners and poses.
     """
     pairs = [p for p in pairs if len(p.rays_a) >= 8]
     if len(pairs) < 2 * _BLOCKS:
-        raise ValueError(
-            f"only {len(pairs)} pairs of pictures with tracked corners; {2 * _BLOCKS} are needed"
-        )
+        raise ValueError(f"only {len(pairs)} pairs of images with tracked corners; {2 * _BLOCKS} are needed")
     mask = np.array([name in free for name in PARAMETERS])
     start = np.zeros(len(PARAMETERS))
     problem = _Problem(pairs, pose_at, T_body_camera, focal_px)
     before = problem.residuals(start)
     if mask[0]:
         start[0] = _search_clock(_Problem(pairs[::3], pose_at, T_body_camera, focal_px), mask)
-    best = problem.descend(start, mask, 12)
+    best = problem.gauss_newton(start, mask, 12)
     sigma = problem.jackknife(best, mask)
     # What the prior holds does not scatter, and is not known for that: its own width counts instead.
-    held = problem.held_by_prior(best, mask)
+    held = problem.prior_share(best, mask)
     sigma = np.hypot(sigma, held * _PRIOR)
     after = problem.residuals(best)
     return MotionCalibration(
@@ -109,12 +107,12 @@ def _search_clock(problem: _Problem, mask: np.ndarray) -> float:
     costs = []
     for clock in clocks:
         start[0] = clock
-        costs.append(problem.cost(problem.descend(start, rest, 1)))
+        costs.append(problem.cost(problem.gauss_newton(start, rest, 1)))
     return float(clocks[int(np.argmin(costs))])
 
 
 class _Problem:
-    """All pairs as one least-squares problem; corners of all pairs stand behind one another."""
+    """All pairs as one least-squares problem; corners of all pairs stand occluded_walls one another."""
 
     def __init__(
         self, pairs: list[TrackedPair], pose_at: Callable[[int], np.ndarray | None],
@@ -130,13 +128,13 @@ class _Problem:
     def residuals(self, x: np.ndarray) -> np.ndarray:
         """`reprojection` of all corners [2M], pixels; zero where a pose is missing."""
         self._place(round(x[0] * 1e9))
-        mount = corrected(self._T_body_camera, x)
+        mount = apply_correction(self._T_body_camera, x)
         T = inverse(mount) @ self._T_bodies @ mount
         r = reprojection(T[self._of], self._rays_a, self._rays_b, _TRACK_PX / self._focal_px) * self._focal_px
         return np.where(np.tile(self._known[self._of], 2), r, 0.0)
 
     def _place(self, shift_ns: int) -> None:
-        """Motions of the body [P, 4, 4] between the pictures of each pair, at shifted stamps."""
+        """Motions of the body [P, 4, 4] between the images of each pair, at shifted stamps."""
         if shift_ns == self._shift_ns:
             return
         self._shift_ns = shift_ns
@@ -156,8 +154,8 @@ class _Problem:
         r = self.residuals(x)
         return float(np.sum(np.log1p(r**2))) / max(2 * int(self._known[self._of].sum()), 1)
 
-    def held_by_prior(self, x: np.ndarray, mask: np.ndarray) -> np.ndarray:
-        """Share [6] in [0, 1] of each value that comes from the prior and not from the pictures."""
+    def prior_share(self, x: np.ndarray, mask: np.ndarray) -> np.ndarray:
+        """Share [6] in [0, 1] of each value that comes from the prior and not from the images."""
         columns = np.flatnonzero(mask)
         share = np.ones(len(x))
         if len(columns):
@@ -202,7 +200,7 @@ class _Problem:
         r, J, weight, prior = self._linear(x, columns)
         return J.T @ (J * weight[:, None]) + np.diag(prior), J.T @ (weight * r) + prior * x[columns], prior
 
-    def descend(self, x: np.ndarray, mask: np.ndarray, iterations: int) -> np.ndarray:
+    def gauss_newton(self, x: np.ndarray, mask: np.ndarray, iterations: int) -> np.ndarray:
         """Gauss-Newton over the parameters of `mask`."""
         x = x.copy()
         columns = np.flatnonzero(mask)

@@ -14,11 +14,11 @@ POSE = se2_to_se3(np.array([0.3, 0.2, 0.1]))
 
 
 def _view(**changes):
-    picture, _ = render(POSE)
+    image, _ = render(POSE)
     return DepthInput(
         **{
             "stamp_ns": 5,
-            "image_rgb": picture,
+            "image_rgb": image,
             "camera": CAMERA,
             "T_body_camera": T_BODY_CAMERA,
             "beams": scan(POSE),
@@ -100,7 +100,7 @@ def test_beams_that_the_truth_does_not_confirm_are_told():
     assert confirmed(truth, uv, np.array([2.0, 2.089, 2.091, 1.0])).tolist() == [True, True, False, False]
 
 
-def test_pictures_that_wait_in_vain_for_their_poses_are_counted():
+def test_images_that_wait_in_vain_for_their_poses_are_counted():
     from beamsplat.common.messages import CameraModel, Image, LidarModel, Rig
     from beamsplat.services.depth.node import DepthNode
 
@@ -111,9 +111,9 @@ def test_pictures_that_wait_in_vain_for_their_poses_are_counted():
     )
     rig = Rig(stamp_ns=0, camera=camera, lidar=LidarModel(T_body_lidar=np.eye(4)), source="test")
     list(node.on_rig(rig))
-    picture = np.zeros(64 * 48 * 3, np.uint8)
+    pixels = np.zeros(64 * 48 * 3, np.uint8)
     for k in range(1, 21):  # localization says nothing meanwhile
-        image = Image(stamp_ns=k * 10**8, width_px=64, height_px=48, encoding="rgb8", data=picture)
+        image = Image(stamp_ns=k * 10**8, width_px=64, height_px=48, encoding="rgb8", data=pixels)
         assert list(node.on_camera_image(image)) == []
     assert node.overtaken == 12  # eight still wait
     assert "12 pictures overtaken" in node.detail

@@ -161,7 +161,7 @@ def test_the_cpu_is_always_the_last_resort():
 
 
 def test_the_network_at_hand_answers_at_its_known_error(shared_dir, monkeypatch):
-    """FastDepth on real pictures of a kitchen: AbsRel 0.24 as probed elsewhere on these weights."""
+    """FastDepth on real images of a kitchen: AbsRel 0.24 as probed elsewhere on these weights."""
     import cv2
 
     from beamsplat.services.depth.recorded import read_depth

@@ -71,8 +71,8 @@ def render(T_map_body, camera=CAMERA):
         grey[mine] = cv2.remap(
             _TEXTURES[number], x.astype(np.float32)[:, None], y.astype(np.float32)[:, None], cv2.INTER_LINEAR
         )[:, 0]
-    picture = np.repeat(grey.reshape(camera.shape)[..., None], 3, axis=2).astype(np.uint8)
-    return picture, z.reshape(camera.shape).astype(np.float32)
+    image = np.repeat(grey.reshape(camera.shape)[..., None], 3, axis=2).astype(np.uint8)
+    return image, z.reshape(camera.shape).astype(np.float32)
 
 
 def scan(T_map_body, rng=None, count=720):

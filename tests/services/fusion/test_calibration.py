@@ -7,7 +7,7 @@ from beamsplat.common.geometry.camera import Pinhole
 from beamsplat.common.geometry.frames import camera_mount, lidar_mount
 from beamsplat.common.geometry.transforms import inverse, se2_to_se3, transform_points
 from beamsplat.services.fusion.calibration.board import BoardPair, level_mount, solve_board
-from beamsplat.services.fusion.calibration.motion import TrackedPair, corrected, solve_motion
+from beamsplat.services.fusion.calibration.motion import TrackedPair, apply_correction, solve_motion
 from beamsplat.services.fusion.calibration.mounting import check_mounting
 from tests.services.fusion.room import scan
 
@@ -53,7 +53,7 @@ def test_a_planted_clock_offset_is_found_within_5_ms(clock_ms):
 @pytest.mark.parametrize("yaw_deg", [-2.0, 2.0])
 def test_a_planted_yaw_error_is_found_within_a_fifth_of_a_degree(yaw_deg):
     planted = np.array([0.0, 0.0, 0.0, np.radians(yaw_deg), 0.0, 0.0])
-    wrong = corrected(MOUNT, planted)
+    wrong = apply_correction(MOUNT, planted)
     found = solve_motion(_drive(MOUNT), _pose, wrong, 265.0)
     assert np.degrees(found.values[3]) == pytest.approx(-yaw_deg, abs=0.2)
     assert found.residual_px < 0.9 * found.residual_before_px
@@ -79,7 +79,7 @@ def test_a_robot_that_drives_straight_tells_no_clock():
 
 
 def test_too_little_data_is_said():
-    with pytest.raises(ValueError, match="pairs of pictures"):
+    with pytest.raises(ValueError, match="pairs of images"):
         solve_motion(_drive(MOUNT, count=5), _pose, MOUNT, 265.0)
 
 

@@ -1,4 +1,4 @@
-"""Depth and fusion as nodes behind the lidar localization: metric depth, or a reason why not."""
+"""Depth and fusion as nodes occluded_walls the lidar localization: metric depth, or a reason why not."""
 
 import cv2
 import numpy as np
@@ -48,7 +48,7 @@ def test_the_house_comes_out_metric(shared_dir):
             inside.append(np.mean(error < 3.0 * message.sigma_m[known]))
     assert len(absrel) >= 6
     assert np.mean(answered) > 0.85
-    assert min(answered) > 0.6  # the first pictures have nothing before them
+    assert min(answered) > 0.6  # the first images have nothing before them
     assert np.mean(absrel) < 0.10
     assert np.mean(inside) > 0.85
     for message in fused.values():
@@ -87,7 +87,7 @@ def _feed(node, *messages):
 S = 100_000_000
 
 
-def test_an_estimate_waits_for_the_pose_of_its_picture():
+def test_an_estimate_waits_for_the_pose_of_its_image():
     node = DepthNode(DepthNode.Config(source="stixel"))
     node.configure()
     assert _feed(node, RIG, _odometry(0), _scan(0), _image(5 * S // 10)) == []
@@ -96,7 +96,7 @@ def test_an_estimate_waits_for_the_pose_of_its_picture():
     assert np.isfinite(estimate.values).mean() > 0.5
 
 
-def test_only_the_newest_ready_picture_is_worked_on_and_the_others_are_counted():
+def test_only_the_newest_ready_image_is_worked_on_and_the_others_are_counted():
     node = DepthNode(DepthNode.Config(source="stixel"))
     node.configure()
     _feed(node, RIG, _odometry(0), _scan(0), _image(2 * S // 10), _image(6 * S // 10), _image(15 * S // 10))
@@ -106,7 +106,7 @@ def test_only_the_newest_ready_picture_is_worked_on_and_the_others_are_counted()
     assert "overtaken" in node.detail
 
 
-def test_a_picture_of_another_size_is_refused_with_both_sizes():
+def test_an_image_of_another_size_is_refused_with_both_sizes():
     node = DepthNode(DepthNode.Config(source="none"))
     node.configure()
     ((_, estimate),) = _feed(node, RIG, _image(S, size=(320, 240)))
@@ -118,7 +118,7 @@ def test_a_picture_of_another_size_is_refused_with_both_sizes():
     ("image", "reason"),
     [(_image(S // 2, 0), "black|dark"), (_image(S // 2, 255), "overexposed|bright|white")],
 )
-def test_a_picture_that_shows_nothing_gives_no_depth(image, reason):
+def test_an_image_that_shows_nothing_gives_no_depth(image, reason):
     node = FusionNode(FusionNode.Config())
     node.configure()
     empty = DepthEstimate(stamp_ns=S // 2, source="none", kind="none", values=np.zeros((0, 0), np.float32))
@@ -140,7 +140,7 @@ def _node(**config):
 
 
 def _moment(k, image, ranges=2.0, values=None, status="ok"):
-    """Scan, pose, picture and estimate of the k-th tenth of a second, the body 5 cm on each time."""
+    """Scan, pose, image and estimate of the k-th tenth of a second, the body 5 cm on each time."""
     stamp = (10 + k) * S
     scan = _scan(stamp).model_copy(update={"ranges_m": np.full(300, ranges, np.float32)})
     T = np.eye(4)
@@ -157,7 +157,7 @@ def _drive(node, moments):
     out = _feed(node, RIG, _scan(8 * S), _odometry(8 * S))
     for moment in moments:
         out += _feed(node, *moment)
-    # A last pose, so that the last picture can be placed.
+    # A last pose, so that the last image can be placed.
     out += _feed(node, _odometry(30 * S).model_copy(update={"T_odom_body": moments[-1][1].T_odom_body}))
     return [message for topic, message in out if topic == "fusion/depth"]
 
@@ -182,15 +182,15 @@ def test_no_beams_in_view_is_said_and_gives_no_depth():
 
 
 def test_a_frozen_camera_is_said_once_the_robot_has_moved():
-    picture = _live_image(0)
-    messages = _drive(_node(), [_moment(k, picture) for k in range(8)])
+    image = _live_image(0)
+    messages = _drive(_node(), [_moment(k, image) for k in range(8)])
     assert "frozen" in messages[-1].status
     _nothing_false(messages)
 
 
 @pytest.mark.parametrize("values", [np.nan, 0.0])
 def test_a_network_that_answers_rubbish_is_not_asked(values):
-    """Its estimate comes with a reason; geometry alone carries the picture, without its numbers."""
+    """Its estimate comes with a reason; geometry alone carries the image, without its numbers."""
     rubbish = np.full((480, 640), values, np.float32)
     node = _node()
     messages = _drive(

@@ -5,9 +5,9 @@ import pytest
 
 from beamsplat.common.geometry.beams import NO_BEAMS
 from beamsplat.common.geometry.transforms import se2_to_se3
-from beamsplat.services.fusion.frame import Frame
 from beamsplat.services.fusion.fuse import Fusion
-from beamsplat.services.fusion.relative_pose import epipolar_px, refine
+from beamsplat.services.fusion.inputs import FusionInput
+from beamsplat.services.fusion.relative_pose import epipolar_px, refine_relative_pose
 from tests.services.fusion.room import CAMERA, T_BODY_CAMERA, in_map, render, scan
 
 
@@ -17,14 +17,16 @@ def _path(k):
 
 def _frame(k, **changes):
     T = _path(k)
-    picture, truth = render(T)
+    image, truth = render(T)
     beams = scan(T, np.random.default_rng(k))
-    return Frame(**{"stamp_ns": k, "image_rgb": picture, "T_map_body": T, "beams": beams} | changes), truth
+    return FusionInput(
+        **{"stamp_ns": k, "image_rgb": image, "T_map_body": T, "beams": beams} | changes
+    ), truth
 
 
 @pytest.fixture(scope="module")
 def drive():
-    """(fusion after 12 pictures, its results with truth)."""
+    """(fusion after 12 images, its results with truth)."""
     fusion = Fusion(CAMERA, T_BODY_CAMERA, floor_known=True, planar=True)
     results = []
     for k in range(14):
@@ -47,7 +49,7 @@ def test_depth_of_a_room_is_right_where_the_lidar_cannot_see(drive):
         assert np.nanmedian(np.abs(result.depth_m - truth)[above]) < 0.1
 
 
-def test_pictures_between_keyframes_carry_the_depth_on(drive):
+def test_images_between_keyframes_carry_the_depth_on(drive):
     _, results = drive
     for result, truth in results[9::2]:
         assert result.ok
@@ -107,7 +109,7 @@ def test_beams_that_pass_through_glass_contradict_what_was_seen(drive):
     frame, _ = _frame(14)
     through = frame.beams
     beyond = type(through)(through.points_body_m * [2.5, 2.5, 1.0], through.index, through.sigma_m)
-    result = fusion.fuse(Frame(14, frame.image_rgb, frame.T_map_body, beyond), keyframe=False)
+    result = fusion.fuse(FusionInput(14, frame.image_rgb, frame.T_map_body, beyond), keyframe=False)
     assert "glass" in result.status
     assert np.isnan(result.depth_m).all()
 
@@ -115,7 +117,7 @@ def test_beams_that_pass_through_glass_contradict_what_was_seen(drive):
 def test_a_guess_is_used_where_nothing_else_is_known():
     body_in_hand = Fusion(CAMERA, T_BODY_CAMERA, floor_known=False, planar=False)
     frame, truth = _frame(0)
-    with_guess = Frame(0, frame.image_rgb, frame.T_map_body, frame.beams, truth / 1.5, "metric")
+    with_guess = FusionInput(0, frame.image_rgb, frame.T_map_body, frame.beams, truth / 1.5, "metric")
     result = body_in_hand.fuse(with_guess, keyframe=False)
     error = np.abs(result.depth_m - truth) / truth
     assert result.scale == pytest.approx(1.5, rel=0.03)
@@ -134,6 +136,6 @@ def test_a_turned_relative_pose_is_put_right_by_tracked_corners():
 
     wrong = T.copy()
     wrong[:3, :3] = so3_exp(np.array([0.002, 0.006, -0.003])) @ T[:3, :3]
-    found = refine(wrong, rays_a, rays_b, 265.0, 0.007, 0.015)
+    found = refine_relative_pose(wrong, rays_a, rays_b, 265.0, 0.007, 0.015)
     assert np.degrees(np.linalg.norm(so3_log(found[:3, :3] @ T[:3, :3].T))) < 0.12
     assert np.median(np.abs(epipolar_px(found, rays_a, rays_b, 265.0))) < 0.3

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from beamsplat.common.geometry.transforms import make_transform, so3_exp
-from beamsplat.services.fusion import finish
+from beamsplat.services.fusion import upsample
 from beamsplat.services.fusion import volume_kernels as fast
 from beamsplat.services.fusion import volume_reference as slow
+from beamsplat.services.fusion.keyframe_depth import KeyframeDepths, median_vote
 from beamsplat.services.fusion.lidar_map import LidarMap
-from beamsplat.services.fusion.memory import Memory, vote
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +53,7 @@ def test_a_prior_makes_the_label_at_its_depth_cheapest():
     z = np.array([[1.0, np.nan, 3.0], [0.01, 100.0, 2.0]], np.float32)
     fast.add_prior(cost, z, np.full((2, 3), 2.0, np.float32), log_z[0], log_z[1] - log_z[0], 1.0)
     depth, spread = np.empty((2, 3), np.float32), np.empty((2, 3), np.float32)
-    fast.winners(cost, log_z, 0.2, depth, spread)
+    fast.winner_takes_all(cost, log_z, 0.2, depth, spread)
     for v, u in ((0, 0), (0, 2), (1, 2)):
         assert depth[v, u] == pytest.approx(z[v, u], rel=0.02)
         assert spread[v, u] < 0.2
@@ -89,12 +89,12 @@ def test_depth_carried_into_another_view_lies_where_the_points_are():
         )
         return (offset - T_map_camera[:3, 3] @ normal) / (rays @ normal)
 
-    memory = Memory(K, (120, 160), 3)
+    memory = KeyframeDepths(K, (120, 160), 3)
     for x in (0.0, 0.1, 0.2):
         T = make_transform(so3_exp(np.array([0.0, 0.05 * x, 0.0])), np.array([x, 0.0, x]))
         memory.add(T, plane_in(T).astype(np.float32))
     now = make_transform(so3_exp(np.array([0.01, 0.03, 0.0])), np.array([0.25, 0.02, 0.3]))
-    remembered = memory.recall(now)
+    remembered = memory.warp_into(now)
     truth = plane_in(now)
     seen = remembered.votes == 3
     assert seen.mean() > 0.8
@@ -104,7 +104,7 @@ def test_depth_carried_into_another_view_lies_where_the_points_are():
 def test_the_median_of_keyframes_outvotes_one_that_errs():
     carried = np.array([2.0, 2.02, np.nan, 5.0], np.float32).reshape(4, 1, 1)
     depth, votes = np.full((1, 1), np.nan, np.float32), np.zeros((1, 1), np.int64)
-    vote(carried, 0.06, depth, votes)
+    median_vote(carried, 0.06, depth, votes)
     assert depth[0, 0] == pytest.approx(2.02)
     assert votes[0, 0] == 2
 
@@ -132,20 +132,20 @@ def test_enlarging_is_exact_on_planes_and_keeps_edges_with_the_colour():
     )
     grey = np.full((480, 640, 3), 90, np.uint8)
     depth, sigma = np.empty((480, 640), np.float32), np.empty((480, 640), np.float32)
-    finish.enlarge(small, np.full_like(small, 0.01), grey[::4, ::4].copy(), grey, 0.08, depth, sigma)
+    upsample.upsample_depth(small, np.full_like(small, 0.01), grey[::4, ::4].copy(), grey, 0.08, depth, sigma)
     inner = (slice(2, -2), slice(2, -2))
     assert np.allclose(depth[inner], plane[inner], rtol=1e-4)
     assert np.allclose(sigma[inner], 0.01 * depth[inner], rtol=1e-3)
     step = np.where(np.arange(160) < 80, 1.0, 3.0)[None].repeat(120, 0).astype(np.float32)
     colours = np.zeros((480, 640, 3), np.uint8)
     colours[:, 321:] = 200
-    finish.enlarge(
+    upsample.upsample_depth(
         step, np.full_like(step, 0.01), np.ascontiguousarray(colours[1::4, 1::4]), colours, 0.08, depth, sigma
     )
     assert np.all(depth[:, 318:321] == 1.0)
     assert np.all(depth[:, 321:323] == 3.0)
     step[:, 100:] = np.nan
-    finish.enlarge(
+    upsample.upsample_depth(
         step, np.full_like(step, 0.01), np.ascontiguousarray(colours[1::4, 1::4]), colours, 0.08, depth, sigma
     )
     assert np.isnan(depth[:, 410:]).all()

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from beamsplat.services.fusion.guess import metric_guess
+from beamsplat.services.fusion.metric_estimate import metric_estimate
 from beamsplat.services.fusion.pairs import effective_count, largest_cluster, make_pairs
 from beamsplat.services.fusion.scaling import affine, ratio
 
@@ -106,9 +106,9 @@ def test_beams_that_err_together_count_as_few():
 def test_the_guess_is_corrected_by_columns_and_its_spread_is_that_of_beams_left_out():
     depth, uv, z = _scene(np.random.default_rng(6))
     bent = (depth * np.linspace(0.6, 1.4, 64)[None]).astype(np.float32)
-    guess = metric_guess(bent, "metric", uv, z)
-    assert np.median(np.abs(guess.depth_m / depth - 1.0)) < 0.05
-    assert guess.spread < 0.1
+    estimate = metric_estimate(bent, "metric", uv, z)
+    assert np.median(np.abs(estimate.depth_m / depth - 1.0)) < 0.05
+    assert estimate.spread < 0.1
     rubbish = np.exp(np.random.default_rng(7).normal(0, 0.5, SHAPE)).astype(np.float32)
-    loose = metric_guess(rubbish, "metric", uv, z)
+    loose = metric_estimate(rubbish, "metric", uv, z)
     assert loose is None or loose.spread > 0.1

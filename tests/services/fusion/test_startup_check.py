@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from beamsplat.common.geometry.transforms import inverse, se2_to_se3, so3_exp, transform_points
-from beamsplat.services.fusion.calibration.motion import corrected
-from beamsplat.services.fusion.calibration.startup import StartupCheck, check
+from beamsplat.services.fusion.calibration.motion import apply_correction
+from beamsplat.services.fusion.calibration.startup_check import StartupCheck, check_calibration
 from tests.services.fusion.room import CAMERA, LIDAR_Z, T_BODY_CAMERA, render, scan
 from tests.services.fusion.test_calibration import MOUNT, _drive, _pose
 
@@ -16,7 +16,7 @@ HALF_TURN[:3, :3] = so3_exp(np.array([0.0, 0.0, np.pi]))
 
 
 def _check(pairs, pose=_pose, mount=MOUNT, scans=()):
-    return check(pairs, list(scans), pose, mount, T_BODY_LIDAR, 265.0)
+    return check_calibration(pairs, list(scans), pose, mount, T_BODY_LIDAR, 265.0)
 
 
 def test_a_right_robot_is_ok_with_figures():
@@ -39,7 +39,7 @@ def test_a_wrong_clock_is_named_with_its_amount(clock_ms):
 def test_a_turned_camera_is_named_with_its_axis(axis, name):
     planted = np.zeros(6)
     planted[axis] = np.radians(2.0)
-    health = _check(_drive(MOUNT), mount=corrected(MOUNT, planted))
+    health = _check(_drive(MOUNT), mount=apply_correction(MOUNT, planted))
     assert f"the camera's {name} is wrong" in health.status
     assert health.turn_deg[axis - 1] == pytest.approx(-2.0, abs=0.3)
 
@@ -48,7 +48,7 @@ def test_a_turned_camera_is_named_with_its_axis(axis, name):
     ("change", "words"), [(FLIP, "mirrored (upside down"), (HALF_TURN, "turned round by 180 degrees")]
 )
 def test_poses_of_a_wrongly_mounted_lidar_are_told_by_the_camera(change, words):
-    """The scans fit such poses: they were made from them. Pictures do not."""
+    """The scans fit such poses: they were made from them. Images do not."""
     health = _check(_drive(MOUNT), pose=lambda stamp: change @ _pose(stamp) @ inverse(change))
     assert words in health.status
     assert "rig" in health.status
@@ -67,15 +67,15 @@ def test_a_mirrored_lidar_is_told_by_poses_from_elsewhere():
 
 
 def _run(pairs, clock_ns=0):
-    """A drive in the room, its pictures at 8 Hz; the check's result."""
+    """A drive in the room, its images at 8 Hz; the check's result."""
     wanted = StartupCheck(CAMERA, T_BODY_CAMERA, T_BODY_LIDAR, pairs)
     for k in range(200):
         stamp = k * 125_000_000
         T = _room_pose(stamp)
         wanted.add_pose(stamp, T)
         if k % 2 == 0 and stamp >= 500_000_000:
-            picture, _ = render(_room_pose(stamp + clock_ns))
-            wanted.add_picture(stamp, picture, T)
+            image, _ = render(_room_pose(stamp + clock_ns))
+            wanted.add_image(stamp, image, T)
         job = wanted.job()
         if job is not None:
             assert wanted.job() is None
@@ -88,7 +88,7 @@ def _room_pose(stamp_ns):
     return se2_to_se3(np.array([0.12 * s, 0.3 * np.sin(0.5 * s), 0.25 * np.sin(1.1 * s)]))
 
 
-def test_pictures_of_a_room_pass_the_check_and_late_ones_do_not():
+def test_images_of_a_room_pass_the_check_and_late_ones_do_not():
     assert _run(16).status == "ok"
     assert "clock is wrong" in _run(16, clock_ns=120_000_000).status
 

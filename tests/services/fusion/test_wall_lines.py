@@ -1,4 +1,4 @@
-"""Walls continued behind furniture: found from pieces in any direction, met where they stand."""
+"""Walls continued occluded_walls furniture: found from pieces in any direction, met where they stand."""
 
 import numpy as np
 import pytest
@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from beamsplat.services.fusion.lidar_map import LidarMap
-from beamsplat.services.fusion.surfaces import CeilingFinder
-from beamsplat.services.fusion.wall_lines import find_lines, ranges_to
+from beamsplat.services.fusion.surfaces import CeilingDetector
+from beamsplat.services.fusion.wall_lines import find_lines, ranges_to_lines
 
 CELL_M = 0.04
 
@@ -36,7 +36,7 @@ def test_a_wall_behind_a_sofa_is_met_where_it_stands():
     lines = find_lines(points, CELL_M)
     azimuth = np.radians([80.0, 90.0, 100.0])
     front = 2.2 / np.sin(azimuth)
-    ranges = ranges_to(lines, np.zeros(2), azimuth, front + 0.15, 2)
+    ranges = ranges_to_lines(lines, np.zeros(2), azimuth, front + 0.15, 2)
     np.testing.assert_allclose(ranges[0], 3.0 / np.sin(azimuth), atol=0.02)
     assert not np.any(ranges < front + 0.15)
 
@@ -58,7 +58,7 @@ def test_the_map_gives_the_points_that_scans_agree_on():
 
 
 def test_ceilings_are_peaks_of_the_evidence_and_not_their_shoulders():
-    finder = CeilingFinder()
+    finder = CeilingDetector()
     gain = np.maximum(4000.0 - 20000.0 * (finder.heights_m - 2.68) ** 2, 0.0)
     finder.add(gain)
     (height,) = finder.heights(500.0)

@@ -203,19 +203,19 @@ def test_the_report_is_one_file_and_names_what_did_not_run(tmp_path):
 
 def test_single_corrections_of_fusion_are_the_papers_ratio_or_the_guess_itself():
     from beamsplat.common.geometry.beams import NO_BEAMS
-    from beamsplat.services.fusion.frame import Frame
-    from beamsplat.services.fusion.single import SingleCorrection
+    from beamsplat.services.fusion.inputs import FusionInput
+    from beamsplat.services.fusion.single_image import SingleImageFusion
 
     camera, mount = Pinhole(100.0, 100.0, 31.5, 23.5, 64, 48), camera_mount(0.0, 0.0, 0.4)
     rgb = np.random.default_rng(0).integers(0, 255, (48, 64, 3)).astype(np.uint8)
     guess = np.full((48, 64), 2.0, np.float32)
-    given = SingleCorrection(camera, mount, "given").fuse(
-        Frame(1, rgb, np.eye(4), NO_BEAMS, guess, "metric"), keyframe=True
+    given = SingleImageFusion(camera, mount, "given").fuse(
+        FusionInput(1, rgb, np.eye(4), NO_BEAMS, guess, "metric"), keyframe=True
     )
     assert given.ok
     assert np.array_equal(given.depth_m, guess)
-    refused = SingleCorrection(camera, mount, "ratio").fuse(
-        Frame(2, rgb, np.eye(4), NO_BEAMS, guess, "metric"), keyframe=True
+    refused = SingleImageFusion(camera, mount, "ratio").fuse(
+        FusionInput(2, rgb, np.eye(4), NO_BEAMS, guess, "metric"), keyframe=True
     )
     assert "no beams" in refused.status
 
@@ -238,7 +238,7 @@ def test_the_map_that_the_drive_left_is_told_from_the_refined_one():
     """Topics have no common order: a chunk said before the drive's end may come after it."""
     from beamsplat.common.messages import MapChunk, MapPoses
     from beamsplat.common.messages.header import Header
-    from beamsplat.common.runtime.mailbox import Letter
+    from beamsplat.common.runtime.mailbox import Envelope
     from beamsplat.tools.report.observer import Witness
 
     witness = Witness(frozenset())
@@ -248,7 +248,7 @@ def test_the_map_that_the_drive_left_is_told_from_the_refined_one():
             stamp_ns=message.stamp_ns, publish_ns=at_ns, clock_id=1, sequence=0, producer="mapping",
             instance="ab" * 8, epoch=1,
         )  # fmt: skip
-        witness._take(Letter(topic, header, message, 100))
+        witness._take(Envelope(topic, header, message, 100))
 
     def chunk(anchor, revision):
         return MapChunk(

@@ -1,4 +1,4 @@
-"""From the working size to the picture's: depth along its edges, and a standard deviation per pixel."""
+"""From the working size to the image's: depth along its edges, and a standard deviation per pixel."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from beamsplat.common.compiled import kernel
 
 
 @kernel
-def enlarge(
+def upsample_depth(
     depth: np.ndarray,  # float32 [h, w], NaN = unknown
     sigma_log: np.ndarray,  # float32 [h, w]
-    colour: np.ndarray,  # uint8 [h, w, 3] of the small picture
+    colour: np.ndarray,  # uint8 [h, w, 3] of the small image
     full_colour: np.ndarray,  # uint8 [H, W, 3]
     same: float,  # log depth: neighbours closer than this are one surface
     depth_out: np.ndarray,  # float32 [H, W]

@@ -1,4 +1,4 @@
-"""The network's guess as a candidate: brought to metres along the scan line, and how far to trust it."""
+"""The network's estimate as a candidate: brought to metres along the scan line, and how far to trust it."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from beamsplat.services.fusion.pairs import make_pairs
 from beamsplat.services.fusion.scaling import Kind, affine, as_depth
 
 _COLUMNS = 64
-_BAND = 0.10  # of the picture's width: how far a beam's ratio reaches sideways
+_BAND = 0.10  # of the image's width: how far a beam's ratio reaches sideways
 
 
 @dataclass(frozen=True)
-class MetricGuess:
+class MetricEstimate:
     """A network's depth after correction by columns."""
 
-    guess: np.ndarray  # float32 [H, W] before it
+    estimate: np.ndarray  # float32 [H, W] before it
     log_factor: np.ndarray  # float64 [W]
     spread: float  # median |log ratio| at beams that were left out of the correction of their columns
     pairs: int
@@ -26,30 +26,32 @@ class MetricGuess:
     @property
     def depth_m(self) -> np.ndarray:
         """float32 [H, W]."""
-        return self.guess * np.exp(self.log_factor).astype(np.float32)
+        return self.estimate * np.exp(self.log_factor).astype(np.float32)
 
     def at_size(self, width: int, height: int) -> np.ndarray:
         """float32 [height, width]: the depth at the nearest pixels."""
-        small = cv2.resize(self.guess, (width, height), interpolation=cv2.INTER_NEAREST)
-        columns = (np.arange(width) * self.guess.shape[1]) // width
+        small = cv2.resize(self.estimate, (width, height), interpolation=cv2.INTER_NEAREST)
+        columns = (np.arange(width) * self.estimate.shape[1]) // width
         return small * np.exp(self.log_factor[columns]).astype(np.float32)
 
 
-def metric_guess(values: np.ndarray, kind: Kind, uv_px: np.ndarray, z_m: np.ndarray) -> MetricGuess | None:
-    """The guess times a factor that varies smoothly over the columns; None if too few beams meet it.
+def metric_estimate(
+    values: np.ndarray, kind: Kind, uv_px: np.ndarray, z_m: np.ndarray
+) -> MetricEstimate | None:
+    """The estimate times a factor that varies smoothly over the columns; None if too few beams meet it.
 
-    The spread is measured at each beam with a correction made without its neighbours: what the guess
+    The spread is measured at each beam with a correction made without its neighbours: what the estimate
     would be worth away from the scan line, seen from what it is worth along it.
     """
     if kind == "disparity":
         fitted = affine(values, kind, uv_px, z_m)
-        guess = fitted.depth_m if fitted.ok else as_depth(values, kind)
+        estimate = fitted.depth_m if fitted.ok else as_depth(values, kind)
     else:
-        guess = values
-    pairs = make_pairs(guess, uv_px, z_m)
+        estimate = values
+    pairs = make_pairs(estimate, uv_px, z_m)
     if len(pairs) < 12:
         return None
-    log_ratio = np.log(pairs.z_m / pairs.guess)
+    log_ratio = np.log(pairs.z_m / pairs.estimate)
     u = pairs.uv_px[:, 0]
     band = _BAND * values.shape[1]
     columns = np.arange(values.shape[1], dtype=np.float64)
@@ -57,7 +59,7 @@ def metric_guess(values: np.ndarray, kind: Kind, uv_px: np.ndarray, z_m: np.ndar
     factor = np.interp(columns, some, _smooth(some, u, log_ratio, band, exclude=0.0))
     left_out = _smooth(u, u, log_ratio, band, exclude=0.5 * band)
     spread = float(np.median(np.abs(log_ratio - left_out)))
-    return MetricGuess(guess, factor, spread, len(pairs))
+    return MetricEstimate(estimate, factor, spread, len(pairs))
 
 
 def _smooth(at: np.ndarray, u: np.ndarray, values: np.ndarray, band: float, exclude: float) -> np.ndarray:

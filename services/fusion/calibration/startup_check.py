@@ -1,6 +1,6 @@
 """The check at every start: do clock, mount and lidar fit what the camera sees, and what do they say if not?
 
-Over the first metres of a drive corners are tracked between pictures and a few scans are kept. Then, once,
+Over the first metres of a drive corners are tracked between images and a few scans are kept. Then, once,
 and beside the running work: are the poses those of a mirrored or turned lidar, is the camera's clock
 right, does the camera look where the calibration says.
 """
@@ -24,12 +24,12 @@ from beamsplat.services.fusion.calibration.motion import (
     solve_motion,
 )
 from beamsplat.services.fusion.calibration.mounting import check_mounting
-from beamsplat.services.fusion.relative_pose import corners, track
+from beamsplat.services.fusion.relative_pose import detect_corners, track_corners
 
 _WIDTH_PX = 320
 _EVERY_NS = 250_000_000
 _APART_NS = (500_000_000, 1_200_000_000)
-_LEAST_TURN_RAD, _LEAST_WAY_M = 0.02, 0.05  # between the pictures of a pair
+_LEAST_TURN_RAD, _LEAST_WAY_M = 0.02, 0.05  # between the images of a pair
 _LEAST_CORNERS = 12
 _POSE_GAP_NS = 1_000_000_000
 _SCANS = 24
@@ -58,7 +58,7 @@ class CalibrationHealth:
             return f"calibration: {self.status}"
         told = np.isfinite(self.clock_ms)
         clock = f", clock {self.clock_ms:+.0f} +- {self.clock_sigma_ms:.0f} ms" if told else ""
-        return f"calibration ok: {self.misfit_px:.2f} px in {self.pairs} pairs of pictures{clock}"
+        return f"calibration ok: {self.misfit_px:.2f} px in {self.pairs} pairs of images{clock}"
 
 
 class StartupCheck:
@@ -72,7 +72,7 @@ class StartupCheck:
         self._T_body_camera, self._T_body_lidar = T_body_camera, T_body_lidar
         self._wanted = pairs
         self._pairs: list[TrackedPair] = []
-        self._pictures: deque[tuple[int, np.ndarray, np.ndarray]] = deque()
+        self._images: deque[tuple[int, np.ndarray, np.ndarray]] = deque()
         self._stamps: list[int] = []
         self._poses: list[np.ndarray] = []
         self._scans: list[tuple[np.ndarray, np.ndarray]] = []
@@ -80,12 +80,12 @@ class StartupCheck:
 
     @property
     def progress(self) -> str:
-        return f"calibration not checked yet: {len(self._pairs)} of {self._wanted} pairs of pictures"
+        return f"calibration not checked yet: {len(self._pairs)} of {self._wanted} pairs of images"
 
     def add_pose(self, stamp_ns: int, T_map_body: np.ndarray) -> None:
         """Every pose of the localization. A clock that was set back starts the check anew."""
         if self._stamps and stamp_ns <= self._stamps[-1]:
-            for kept in (self._pairs, self._pictures, self._stamps, self._poses, self._scans):
+            for kept in (self._pairs, self._images, self._stamps, self._poses, self._scans):
                 kept.clear()
         self._stamps.append(stamp_ns)
         self._poses.append(T_map_body)
@@ -100,24 +100,24 @@ class StartupCheck:
             return
         self._scans.append((points_lidar_m, T_map_body))
 
-    def add_picture(self, stamp_ns: int, image_rgb: np.ndarray, T_map_body: np.ndarray) -> None:
-        """An undistorted picture uint8 [H, W, 3]; most are passed over."""
-        if self.done or (self._pictures and stamp_ns - self._pictures[-1][0] < _EVERY_NS):
+    def add_image(self, stamp_ns: int, image_rgb: np.ndarray, T_map_body: np.ndarray) -> None:
+        """An undistorted image uint8 [H, W, 3]; most are passed over."""
+        if self.done or (self._images and stamp_ns - self._images[-1][0] < _EVERY_NS):
             return
         grey = cv2.cvtColor(image_rgb, cv2.COLOR_RGB2GRAY)
         size = (self._camera.width_px, self._camera.height_px)
         small = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
-        while self._pictures and stamp_ns - self._pictures[0][0] > _APART_NS[1]:
-            self._pictures.popleft()
-        if self._pictures and stamp_ns - self._pictures[0][0] >= _APART_NS[0]:
-            then_ns, then, T_then = self._pictures[0]
+        while self._images and stamp_ns - self._images[0][0] > _APART_NS[1]:
+            self._images.popleft()
+        if self._images and stamp_ns - self._images[0][0] >= _APART_NS[0]:
+            then_ns, then, T_then = self._images[0]
             if _apart(T_then, T_map_body, _LEAST_WAY_M, _LEAST_TURN_RAD):
                 self._add_pair(then_ns, then, stamp_ns, small)
-        self._pictures.append((stamp_ns, small, T_map_body))
+        self._images.append((stamp_ns, small, T_map_body))
 
     def _add_pair(self, a_ns: int, a: np.ndarray, b_ns: int, b: np.ndarray) -> None:
-        uv = corners(a, 80)
-        moved, good = track(a, b, uv, uv)
+        uv = detect_corners(a, 80)
+        moved, good = track_corners(a, b, uv, uv)
         if good.sum() >= _LEAST_CORNERS:
             rays = self._camera.rays
             self._pairs.append(TrackedPair(a_ns, b_ns, rays(uv[good]), rays(moved[good])))
@@ -131,16 +131,16 @@ class StartupCheck:
         trajectory = Trajectory(np.array(self._stamps, dtype=np.int64), np.array(self._poses))
         self._pairs, self._scans = [], []
         self._stamps, self._poses = [], []
-        self._pictures.clear()
+        self._images.clear()
         T_body_camera, T_body_lidar, focal_px = self._T_body_camera, self._T_body_lidar, self._camera.fx_px
 
         def pose_at(stamp_ns: int) -> np.ndarray | None:
             return trajectory.at(stamp_ns, max_gap_ns=_POSE_GAP_NS, max_extrapolation_ns=0)
 
-        return lambda: check(pairs, scans, pose_at, T_body_camera, T_body_lidar, focal_px)
+        return lambda: check_calibration(pairs, scans, pose_at, T_body_camera, T_body_lidar, focal_px)
 
 
-def check(
+def check_calibration(
     pairs: list[TrackedPair],
     scans: list[tuple[np.ndarray, np.ndarray]],  # (points in the lidar frame, T_map_body)
     pose_at: Callable[[int], np.ndarray | None],
@@ -162,7 +162,7 @@ def check(
         return CalibrationHealth(f"cannot be checked: {error}", misfit, np.nan, np.nan, nothing, len(pairs))
     told = found.observable
     return CalibrationHealth(
-        health_sentence(found, _CLOCK_MS, _ANGLE_DEG, _SIGMAS), found.residual_px,
+        describe_calibration(found, _CLOCK_MS, _ANGLE_DEG, _SIGMAS), found.residual_px,
         1e3 * found.values[0] if told[0] else np.nan, 1e3 * found.sigma[0] if told[0] else np.nan,
         np.where(told[1:4], np.degrees(found.values[1:4]), np.nan), len(pairs),
     )  # fmt: skip
@@ -172,7 +172,7 @@ def _mounting_fault(
     pairs: list[TrackedPair], pose_at: Callable[[int], np.ndarray | None], T_body_camera: np.ndarray,
     T_body_lidar: np.ndarray, focal_px: float, misfit_px: float,
 ) -> str | None:  # fmt: skip
-    """A sentence if pictures fit the poses of a mirrored or turned lidar clearly better than these.
+    """A sentence if images fit the poses of a mirrored or turned lidar clearly better than these.
 
     Poses made from scans of a wrongly mounted lidar fit those scans; only something else tells.
     """
@@ -193,12 +193,12 @@ def _mounting_fault(
     if fits[best] > _CLEARLY * misfit_px:
         return None
     return (
-        f"the lidar is {best}: pictures then fit its poses within {fits[best]:.1f} px, "
+        f"the lidar is {best}: images then fit its poses within {fits[best]:.1f} px, "
         f"not {misfit_px:.1f} px; correct its mounting in the rig"
     )
 
 
-def health_sentence(
+def describe_calibration(
     found: MotionCalibration, clock_ms: float = 10.0, angle_deg: float = 0.5, sigmas: float = 4.0
 ) -> str:
     """ "ok", or what is wrong with clock or mount; errors smaller than the given ones are no fault."""
@@ -212,7 +212,7 @@ def health_sentence(
         if sure and abs(value) > max(angle_deg, sigmas * sigma):
             return f"the camera's {name} is wrong: turn its mount by {value:.2f} +- {sigma:.2f} degrees"
     if found.residual_px > _MISFIT_PX:
-        return f"pictures and poses do not fit ({found.residual_px:.1f} px): wrong K, or wrong poses"
+        return f"images and poses do not fit ({found.residual_px:.1f} px): wrong K, or wrong poses"
     return "ok"
 
 

@@ -1,4 +1,4 @@
-"""Upright edges of a board: where the picture shows them, and where the beams on it end.
+"""Upright edges of a board: where the image shows them, and where the beams on it end.
 
 Planes alone give the calibration; edges were not used for it, and judge it. A beam whose spot half misses
 the board still comes back from it: boards look wider to a lidar by the same angle at both edges, which the
@@ -33,8 +33,8 @@ class EdgeErrors:
         return float(np.median(np.abs(self.errors_px))) if len(self.errors_px) else float("nan")
 
 
-def picture_edges(grey: np.ndarray, camera: Pinhole, uv_px: np.ndarray) -> np.ndarray:
-    """Columns float64 [2] of the undistorted picture at which the board ends, along its beams; NaN = unseen.
+def image_edges(grey: np.ndarray, camera: Pinhole, uv_px: np.ndarray) -> np.ndarray:
+    """Columns float64 [2] of the undistorted image at which the board ends, along its beams; NaN = unseen.
 
     `uv_px` [N, 2] are the beams on the board as the pinhole projects them, in any order.
     """
@@ -64,12 +64,12 @@ def edge_errors(
     pairs: list[BoardPair], on_board: tuple[np.ndarray, ...], edges_px: list[np.ndarray],
     T_camera_lidar: np.ndarray, pinhole: Pinhole,
 ) -> EdgeErrors:  # fmt: skip
-    """How far the outermost beams on each board end from the edges that its picture shows.
+    """How far the outermost beams on each board end from the edges that its image shows.
 
     Args:
         pairs: boards with their scans.
         on_board: indices of the beams on each board (`BoardCalibration.on_board`).
-        edges_px: of each pair, from `picture_edges` (float64 [2], NaN = unseen).
+        edges_px: of each pair, from `image_edges` (float64 [2], NaN = unseen).
         T_camera_lidar: the mount that is judged.
         pinhole: the camera without distortion.
     """

@@ -12,14 +12,14 @@ from beamsplat.common.geometry.transforms import inverse
 
 
 @dataclass(frozen=True)
-class Remembered:
+class WarpedDepth:
     """What past keyframes say about the pixels of a view."""
 
     depth_m: np.ndarray  # float32 [h, w], NaN = never seen
     votes: np.ndarray  # int64 [h, w]: keyframes that agree on it
 
 
-class Memory:
+class KeyframeDepths:
     """A ring of keyframe depth maps of one camera at the working size."""
 
     def __init__(self, K: np.ndarray, shape: tuple[int, int], most: int) -> None:
@@ -34,21 +34,21 @@ class Memory:
         """Keeps a depth map float32 [h, w]; NaN pixels are not carried."""
         self._ring.append((T_map_camera, np.ascontiguousarray(depth_m, dtype=np.float32)))
 
-    def recall(self, T_map_camera: np.ndarray, agreement: float = 0.06) -> Remembered:
+    def warp_into(self, T_map_camera: np.ndarray, agreement: float = 0.06) -> WarpedDepth:
         """Median of the carried depths of each pixel, and how many lie within `agreement` (log) of it."""
         carried = np.full((len(self._ring), *self._shape), np.nan, dtype=np.float32)
         T_camera_map = inverse(T_map_camera)
         for k, (T_map_then, depth) in enumerate(self._ring):
             T = (T_camera_map @ T_map_then).astype(np.float32)
-            carry(depth, T[:3, :3].copy(), T[:3, 3].copy(), self._K, carried[k])
+            warp_depth(depth, T[:3, :3].copy(), T[:3, 3].copy(), self._K, carried[k])
         depth = np.full(self._shape, np.nan, dtype=np.float32)
         votes = np.zeros(self._shape, dtype=np.int64)
-        vote(carried, agreement, depth, votes)
-        return Remembered(depth, votes)
+        median_vote(carried, agreement, depth, votes)
+        return WarpedDepth(depth, votes)
 
 
 @kernel
-def carry(z: np.ndarray, R: np.ndarray, t: np.ndarray, K: np.ndarray, out: np.ndarray) -> None:
+def warp_depth(z: np.ndarray, R: np.ndarray, t: np.ndarray, K: np.ndarray, out: np.ndarray) -> None:
     """Splats depth float32 [h, w] of one view into another (`R, t`: first to second); nearest wins.
 
     A pixel covers as many pixels as it grows by coming nearer, and a third of a pixel more to close seams.
@@ -82,7 +82,7 @@ def carry(z: np.ndarray, R: np.ndarray, t: np.ndarray, K: np.ndarray, out: np.nd
 
 
 @kernel
-def vote(carried: np.ndarray, agreement: float, depth: np.ndarray, votes: np.ndarray) -> None:
+def median_vote(carried: np.ndarray, agreement: float, depth: np.ndarray, votes: np.ndarray) -> None:
     """Median over the first axis of float32 [n, h, w] (NaN left out), and the count within `agreement`."""
     n, h, w = carried.shape
     values = np.empty(n, np.float64)

@@ -5,71 +5,40 @@ from __future__ import annotations
 import numpy as np
 
 from beamsplat.common.compiled import kernel
-from beamsplat.common.geometry.beams import Beams, plan_polar
-from beamsplat.common.geometry.camera import Pinhole
 
 
-class FreeSpace:
+class FreeSpaceGrid:
     """Grid over the floor: how often beams passed through each cell, and how often they ended there."""
 
     def __init__(self, cell_m: float = 0.1, side_m: float = 60.0) -> None:
         cells = round(side_m / cell_m)
         self.cell_m = cell_m
         self._low_m = -0.5 * side_m
-        self._passed = np.zeros((cells, cells), dtype=np.uint16)
-        self._ended = np.zeros((cells, cells), dtype=np.uint16)
+        self._pass_count = np.zeros((cells, cells), dtype=np.uint16)
+        self._hit_count = np.zeros((cells, cells), dtype=np.uint16)
 
     def add(self, position_map_m: np.ndarray, points_map_m: np.ndarray) -> None:
         """Takes in a scan from `position_map_m` [2 or 3] with returns [N, 2 or 3], both in the map."""
         start = np.asarray(position_map_m, dtype=np.float64)[:2].copy()
         ends = np.ascontiguousarray(points_map_m[:, :2], dtype=np.float64)
-        pass_through(start, ends, self._low_m, self.cell_m, self._passed, self._ended)
+        count_ray_cells(start, ends, self._low_m, self.cell_m, self._pass_count, self._hit_count)
 
-    def contradicted(self, points_map_m: np.ndarray, least: int = 6, ratio: float = 0.1) -> np.ndarray:
+    def dynamic_returns(self, points_map_m: np.ndarray, least: int = 6, ratio: float = 0.1) -> np.ndarray:
         """bool [N]: returns in cells that beams passed `least` times and hardly ever ended at."""
         index = np.floor((points_map_m[:, :2] - self._low_m) / self.cell_m).astype(np.int64)
-        size = len(self._passed)
+        size = len(self._pass_count)
         inside = np.all((index >= 1) & (index < size - 1), axis=1)
         column, row = np.clip(index, 1, size - 2).T
         ended = np.zeros(len(index), dtype=np.int64)
         for dv in (-1, 0, 1):
             for du in (-1, 0, 1):
-                ended = np.maximum(ended, self._ended[row + dv, column + du])
-        passed = self._passed[row, column].astype(np.int64)
+                ended = np.maximum(ended, self._hit_count[row + dv, column + du])
+        passed = self._pass_count[row, column].astype(np.int64)
         return inside & (passed >= least) & (ended <= ratio * passed)
 
 
-def mover_mask(
-    beams: Beams, moving: np.ndarray, depth_m: np.ndarray, camera: Pinhole, T_body_camera: np.ndarray,
-    height_m: float = 2.0, tolerance: float = 0.1,
-) -> np.ndarray:  # fmt: skip
-    """bool [H, W]: pixels of columns that a moving beam serves, at that beam's depth and below `height_m`.
-
-    `moving` bool [N] marks beams (`FreeSpace.contradicted`); `depth_m` float32 [H, W] is the fused depth.
-    """
-    mask = np.zeros(depth_m.shape, dtype=bool)
-    if not moving.any():
-        return mask
-    rays = camera.ray_grid() @ T_body_camera[:3, :3].T
-    azimuth, reach = plan_polar(beams.points_body_m[moving], T_body_camera)
-    pixel_azimuth = np.arctan2(rays[..., 1], rays[..., 0])
-    across = np.hypot(rays[..., 0], rays[..., 1])
-    order = np.argsort(azimuth)
-    azimuth, reach = azimuth[order], reach[order]
-    after = np.clip(np.searchsorted(azimuth, pixel_azimuth), 0, len(azimuth) - 1)
-    before = np.maximum(after - 1, 0)
-    nearer = np.abs(azimuth[before] - pixel_azimuth) < np.abs(azimuth[after] - pixel_azimuth)
-    nearest = np.where(nearer, before, after)
-    served = np.abs(azimuth[nearest] - pixel_azimuth) < 0.01
-    z = reach[nearest] / np.maximum(across, 1e-9)
-    low = T_body_camera[2, 3] + rays[..., 2] * z < height_m
-    with np.errstate(invalid="ignore"):
-        at_depth = np.abs(depth_m / z - 1.0) < tolerance
-    return served & low & at_depth
-
-
 @kernel
-def pass_through(
+def count_ray_cells(
     start_m: np.ndarray,  # float64 [2]
     ends_m: np.ndarray,  # float64 [N, 2]
     low_m: float,

@@ -1,4 +1,4 @@
-"""Pictures and beams that nothing may be built on: said in one sentence, before any depth is made."""
+"""Images and beams that nothing may be built on: said in one sentence, before any depth is made."""
 
 from __future__ import annotations
 
@@ -8,24 +8,24 @@ import numpy as np
 _SIDE = 64
 
 
-class PictureHealth:
-    """Judges pictures one after the other; remembers the last one to see a camera freeze."""
+class ImageCheck:
+    """Judges images one after the other; remembers the last one to see a camera freeze."""
 
     def __init__(self, still_m: float = 0.10, still_rad: float = 0.05) -> None:
         self._still_m, self._still_rad = still_m, still_rad
         self._last: np.ndarray | None = None
-        self._T_map_body: np.ndarray | None = None  # where the picture last changed
+        self._T_map_body: np.ndarray | None = None  # where the image last changed
 
     def judge(self, image_rgb: np.ndarray, T_map_body: np.ndarray) -> str:
-        """ "ok", or why this picture uint8 [H, W, 3] must not be used.
+        """ "ok", or why this image uint8 [H, W, 3] must not be used.
 
-        A picture that repeats the one before byte for byte is a frozen camera once the robot has moved by
-        `still_m` or turned by `still_rad` since; noise makes two live pictures differ.
+        An image that repeats the one before byte for byte is a frozen camera once the robot has moved by
+        `still_m` or turned by `still_rad` since; noise makes two live images differ.
         """
         grey = cv2.resize(
             cv2.cvtColor(image_rgb, cv2.COLOR_RGB2GRAY), (_SIDE, _SIDE), interpolation=cv2.INTER_AREA
         )
-        level = exposure(grey)
+        level = check_exposure(grey)
         sample = image_rgb[::7, ::7]
         same = self._last is not None and np.array_equal(sample, self._last)
         if not same or self._T_map_body is None:
@@ -37,31 +37,31 @@ class PictureHealth:
         turn_cos = (np.trace(self._T_map_body[:3, :3].T @ T_map_body[:3, :3]) - 1.0) / 2.0
         turned = float(np.arccos(np.clip(turn_cos, -1.0, 1.0)))
         if moved > self._still_m or turned > self._still_rad:
-            return f"the camera is frozen: the same picture after {moved:.2f} m, {np.degrees(turned):.0f} deg"
+            return f"the camera is frozen: the same image after {moved:.2f} m, {np.degrees(turned):.0f} deg"
         return "ok"
 
 
-def exposure(grey: np.ndarray) -> str:
+def check_exposure(grey: np.ndarray) -> str:
     """ "ok", or what is wrong with the brightness of uint8 [h, w]."""
     if float(np.percentile(grey, 95)) < 12.0:
-        return "the picture is black"
+        return "the image is black"
     if float(np.percentile(grey, 15)) > 248.0:
-        return "the picture is overexposed"
+        return "the image is overexposed"
     if float(np.percentile(grey, 98)) - float(np.percentile(grey, 2)) < 4.0:
-        return "the picture shows nothing: one grey everywhere"
+        return "the image shows nothing: one grey everywhere"
     return "ok"
 
 
-def beams_status(in_view: int, disagree_share: float | None, least: int = 8) -> str:
+def check_beams(in_view: int, disagree_share: float | None, least: int = 8) -> str:
     """ "ok", or why the beams in view cannot anchor depth.
 
-    `disagree_share`: of the beams in view, how many contradict the depth that past pictures give there.
+    `disagree_share`: of the beams in view, how many contradict the depth that past images give there.
     """
     if in_view < least:
         return f"no beams in view ({in_view} of at least {least}): nothing gives the scale"
     if disagree_share is not None and disagree_share > 0.6:
         return (
-            f"{disagree_share:.0%} of the beams contradict what past pictures show there: "
+            f"{disagree_share:.0%} of the beams contradict what past images show there: "
             "glass in front, a wrong pose, or a moved calibration"
         )
     return "ok"

@@ -1,4 +1,4 @@
-"""What `field` works on: a picture with its pose, its small version, what was solved, and the weights."""
+"""What `field` works on: an image with its pose, its small version, what was solved, and the weights."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from beamsplat.common.geometry.beams import Beams
 
 
 @dataclass(frozen=True)
-class FieldConfig:
+class PlaneSweepConfig:
     """Weights are in units of the matching cost, whose worst value is `cost_scale`.
 
     The defaults are for a body on a floor, `in_hand()` for one that tilts: measured on one drive of each.
@@ -33,7 +33,7 @@ class FieldConfig:
     wall_far: float = 0.15  # far above and below, on a body that stays level
     wall_reach_m: float = 0.15
     floor: float = 4.0
-    behind: float = 0.5
+    occluded_walls: float = 0.5
     ceiling: float = 3.5
     ceiling_evidence: float = 500.0
     memory: float = 0.5
@@ -41,20 +41,20 @@ class FieldConfig:
     memory_spread: float = 0.12
     outvote: int = 0  # keyframes that overrule a sweep; 0 = never
     per_spread: float = 1.0  # error per unit of the matcher's own spread
-    matched: float = 0.07  # standard deviation of log depth that only pictures tell
+    matched: float = 0.07  # standard deviation of log depth that only images tell
     tell_log: float = 0.3  # sigma of log depth, and sigma about a pixel in metres, beyond which there
     tell_m: float = 0.95  # is no answer
-    guess: float = 1.6
-    guess_spread: float = 0.12
+    estimate: float = 1.6
+    estimate_spread: float = 0.12
     near_m: float = 0.7  # unsupported depth below this is unlikely
     near: float = 1.0
     rotation_sigma_rad: float = 0.007
     translation_sigma_m: float = 0.015
 
     @staticmethod
-    def in_hand() -> FieldConfig:
+    def in_hand() -> PlaneSweepConfig:
         """No floor and no upright walls to lean on: what several keyframes agree on counts instead."""
-        return FieldConfig(
+        return PlaneSweepConfig(
             labels=88, baselines_m=(0.1, 0.2, 0.4, 0.8),
             cost_cap=np.inf, p2=12.0, edge_grey=12.0, temperature=2.0, memory=1.5, memory_spread=0.15,
             outvote=3, per_spread=2.3, matched=0.05, tell_log=0.19, tell_m=np.inf,
@@ -62,20 +62,20 @@ class FieldConfig:
 
 
 @dataclass(frozen=True)
-class Frame:
-    """One undistorted picture with its pose, beams and the guess of a depth source."""
+class FusionInput:
+    """One undistorted image with its pose, beams and the estimate of a depth source."""
 
     stamp_ns: int
     image_rgb: np.ndarray  # uint8 [H, W, 3]
     T_map_body: np.ndarray
     beams: Beams
-    guess: np.ndarray | None = None  # float32 [H, W]
-    guess_kind: str = "none"
+    estimate: np.ndarray | None = None  # float32 [H, W]
+    estimate_kind: str = "none"
 
 
 @dataclass(frozen=True)
-class Small:
-    """A picture at the working size."""
+class WorkingImage:
+    """An image at the working size."""
 
     T_map_camera: np.ndarray
     grey: np.ndarray  # float32 [h, w]
@@ -84,17 +84,17 @@ class Small:
 
 
 @dataclass(frozen=True)
-class Solved:
+class SweepResult:
     """Depth at the working size."""
 
     depth_m: np.ndarray  # float32 [h, w]
     spread: np.ndarray  # float32 [h, w]: standard deviation of log depth, as the method believes
     snapped: np.ndarray  # bool [h, w]: depth taken from a surface that beams or floor predict
-    views: int  # pictures swept over
+    views: int  # images swept over
 
 
 def features(grey: np.ndarray, side: int = 9, floor_grey: float = 3.0) -> np.ndarray:
-    """float32 [h, w, 3]: grey and its gradient, by the contrast around: blind to exposure and gain."""
+    """float32 [h, w, 3]: grey and its gradient, by the contrast around: blind to check_exposure and gain."""
     mean = cv2.boxFilter(grey, -1, (side, side))
     contrast = (
         np.sqrt(np.maximum(cv2.boxFilter(grey * grey, -1, (side, side)) - mean * mean, 0.0)) + floor_grey

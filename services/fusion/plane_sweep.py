@@ -1,10 +1,10 @@
-"""`field`: metric depth everywhere, from surfaces that beams and floor predict, past pictures, and a network.
+"""`field`: metric depth everywhere, from surfaces that beams and floor predict, past images, and a network.
 
 Neither a network nor extruded beams can be trusted alone. Every candidate only makes its depth cheaper in
-a cost volume; past pictures, seen from poses that the lidar knows to a centimetre, decide per pixel.
+a cost volume; past images, seen from poses that the lidar knows to a centimetre, decide per pixel.
 
-`refine` is the step of a keyframe (plane sweep, semi-global matching); `predict` is the step of every
-other picture: it carries the keyframes' depth over.
+`refine_relative_pose` is the step of a keyframe (plane sweep, semi-global matching); `predict` is the step of every
+other image: it carries the keyframes' depth over.
 """
 
 from __future__ import annotations
@@ -18,26 +18,32 @@ from beamsplat.common.geometry.beams import project_beams
 from beamsplat.common.geometry.camera import Pinhole
 from beamsplat.common.geometry.transforms import inverse
 from beamsplat.services.fusion import volume_kernels as kernels
-from beamsplat.services.fusion.frame import FieldConfig, Frame, Small, Solved, features
-from beamsplat.services.fusion.guess import MetricGuess, metric_guess
+from beamsplat.services.fusion.inputs import (
+    FusionInput,
+    PlaneSweepConfig,
+    SweepResult,
+    WorkingImage,
+    features,
+)
+from beamsplat.services.fusion.keyframe_depth import KeyframeDepths, WarpedDepth
 from beamsplat.services.fusion.lidar_map import LidarMap
-from beamsplat.services.fusion.memory import Memory, Remembered
-from beamsplat.services.fusion.relative_pose import corners, refine_between
-from beamsplat.services.fusion.surfaces import CeilingFinder, SurfaceFinder, Surfaces
+from beamsplat.services.fusion.metric_estimate import MetricEstimate, metric_estimate
+from beamsplat.services.fusion.relative_pose import detect_corners, refine_from_images
+from beamsplat.services.fusion.surfaces import CandidateSurfaces, CeilingDetector, SurfacePredictor
 
 _TILTED_WALL_M = 0.05  # a lidar in the hand: walls are not upright in its frame
 
 
-class Field:
-    """State of a drive: past pictures, the lidar's map, keyframe depth, ceilings."""
+class PlaneSweep:
+    """State of a drive: past images, the lidar's map, keyframe depth, ceilings."""
 
     def __init__(
         self, camera: Pinhole, T_body_camera: np.ndarray, *, floor_known: bool, planar: bool,
-        config: FieldConfig | None = None,
+        config: PlaneSweepConfig | None = None,
     ) -> None:  # fmt: skip
         if camera.is_distorted:
-            raise ValueError("fusion works on undistorted pictures: pass Pinhole.undistorted()")
-        self.config = config or (FieldConfig() if planar else FieldConfig.in_hand())
+            raise ValueError("fusion works on undistorted images: pass Pinhole.undistorted()")
+        self.config = config or (PlaneSweepConfig() if planar else PlaneSweepConfig.in_hand())
         self.camera = camera
         self.T_body_camera = T_body_camera
         width = self.config.width_px
@@ -46,13 +52,13 @@ class Field:
         self._middle_camera = camera.resized(2 * width, 2 * height)
         c = self.small_camera
         self._K = np.array([c.fx_px, c.fy_px, c.cx_px, c.cy_px], dtype=np.float32)
-        self._finder = SurfaceFinder(c, T_body_camera, floor_known=floor_known)
+        self._finder = SurfacePredictor(c, T_body_camera, floor_known=floor_known)
         self._floor_known = floor_known
-        self._ceilings = CeilingFinder()
+        self._ceilings = CeilingDetector()
         self._planar = planar
         self._lidar_map = LidarMap() if planar else None
-        self._memory = Memory(self._K, c.shape, self.config.memory_keyframes)
-        self._past: deque[Small] = deque(maxlen=240)
+        self._memory = KeyframeDepths(self._K, c.shape, self.config.memory_keyframes)
+        self._past: deque[WorkingImage] = deque(maxlen=240)
         self._log_z = np.linspace(
             np.log(self.config.z_near_m), np.log(self.config.z_far_m), self.config.labels
         )
@@ -60,25 +66,25 @@ class Field:
         self._z_last = np.maximum(limit, 1.1 * self.config.z_near_m).astype(np.float32)
 
     def add_scan(self, points_map_m: np.ndarray) -> None:
-        """Returns [N, 3] of a scan in the map frame, for walls behind walls."""
+        """Returns [N, 3] of a scan in the map frame, for walls occluded_walls walls."""
         if self._lidar_map is not None:
             self._lidar_map.add(points_map_m)
 
-    def shrink(self, frame: Frame) -> Small:
-        """The picture at the working size."""
+    def downscale(self, frame: FusionInput) -> WorkingImage:
+        """The image at the working size."""
         grey = cv2.cvtColor(frame.image_rgb, cv2.COLOR_RGB2GRAY)
         h, w = self.small_camera.shape
         middle = cv2.resize(grey, (2 * w, 2 * h), interpolation=cv2.INTER_AREA)
         small = cv2.resize(middle, (w, h), interpolation=cv2.INTER_AREA).astype(np.float32)
-        return Small(frame.T_map_body @ self.T_body_camera, small, features(small), middle)
+        return WorkingImage(frame.T_map_body @ self.T_body_camera, small, features(small), middle)
 
-    def keep_if_moved(self, frame: Frame) -> None:
-        """Remembers a picture for later sweeps, unless the camera stands where the last one was taken."""
+    def keep_if_moved(self, frame: FusionInput) -> None:
+        """Remembers an image for later sweeps, unless the camera stands where the last one was taken."""
         if self._is_new(frame.T_map_body @ self.T_body_camera):
-            self._past.append(self.shrink(frame))
+            self._past.append(self.downscale(frame))
 
-    def keep(self, small: Small) -> None:
-        """`keep_if_moved` of a picture that is small already."""
+    def keep(self, small: WorkingImage) -> None:
+        """`keep_if_moved` of an image that is small already."""
         if self._is_new(small.T_map_camera):
             self._past.append(small)
 
@@ -88,47 +94,49 @@ class Field:
         T = inverse(self._past[-1].T_map_camera) @ T_map_camera
         return bool(np.linalg.norm(T[:3, 3]) >= 0.03 or np.trace(T[:3, :3]) <= 1.0 + 2.0 * np.cos(0.05))
 
-    def surfaces(self, frame: Frame, *, behind: bool = True) -> Surfaces:
-        """Candidate surfaces; without `behind` those in front only, which cost less."""
+    def surfaces(self, frame: FusionInput, *, occluded_walls: bool = True) -> CandidateSurfaces:
+        """Candidate surfaces; without `occluded_walls` those in front only, which cost less."""
         heights = self._ceilings.heights(self.config.ceiling_evidence) if self._floor_known else ()
-        lidar_map = self._lidar_map if behind else None
+        lidar_map = self._lidar_map if occluded_walls else None
         return self._finder.find(frame.beams, lidar_map, frame.T_map_body, heights)
 
-    def recall(self, small: Small) -> Remembered:
-        return self._memory.recall(small.T_map_camera)
+    def warp_into(self, small: WorkingImage) -> WarpedDepth:
+        return self._memory.warp_into(small.T_map_camera)
 
-    def refine(self, frame: Frame, small: Small, remembered: Remembered | None = None) -> Solved:
-        """Depth of a keyframe: sweep over past pictures, candidates as priors, semi-global matching.
+    def refine(
+        self, frame: FusionInput, small: WorkingImage, remembered: WarpedDepth | None = None
+    ) -> SweepResult:
+        """Depth of a keyframe: sweep over past images, candidates as priors, semi-global matching.
 
-        `remembered` is what `recall` gives for it, where that is known already.
+        `remembered` is what `warp_into` gives for it, where that is known already.
         """
         cost, views = self._sweep(frame, small)
         if self._floor_known and views:
             surfaces = self._finder.find(frame.beams, None, frame.T_map_body, ())
-            self._find_ceilings(cost, surfaces.backdrop)
+            self._find_ceilings(cost, surfaces.background_wall)
         surfaces = self.surfaces(frame)
         np.minimum(cost, self.config.cost_cap, out=cost)
-        remembered = remembered or self.recall(small)
+        remembered = remembered or self.warp_into(small)
         self._add_priors(cost, frame, surfaces, remembered if len(self._memory) else None)
         solved = self._solve(cost, small, surfaces, views)
         sure = solved.spread < self.config.memory_spread
         self._memory.add(small.T_map_camera, np.where(sure, solved.depth_m, np.nan))
-        return self._outvote(solved, self.recall(small)) if self.config.outvote else solved
+        return self._outvote(solved, self.warp_into(small)) if self.config.outvote else solved
 
-    def _outvote(self, solved: Solved, remembered: Remembered) -> Solved:
+    def _outvote(self, solved: SweepResult, remembered: WarpedDepth) -> SweepResult:
         """Where several keyframes agree on another depth than this sweep alone, theirs counts.
 
-        Not on a floor: there all keyframes take their depth from the same walls where pictures tell
+        Not on a floor: there all keyframes take their depth from the same walls where images tell
         little, and their agreement is no evidence.
         """
         others = (remembered.votes >= self.config.outvote) & ~solved.snapped
         depth, spread = solved.depth_m.copy(), solved.spread.copy()
         depth[others] = remembered.depth_m[others]
         spread[others] = np.minimum(spread[others], 0.02)
-        return Solved(depth, spread, solved.snapped & ~others, solved.views)
+        return SweepResult(depth, spread, solved.snapped & ~others, solved.views)
 
-    def choose_views(self, T_map_camera: np.ndarray) -> list[Small]:
-        """Past pictures whose baselines come nearest to the wished ones, facing the same way."""
+    def choose_views(self, T_map_camera: np.ndarray) -> list[WorkingImage]:
+        """Past images whose baselines come nearest to the wished ones, facing the same way."""
         if not self._past:
             return []
         past = list(self._past)
@@ -146,20 +154,20 @@ class Field:
                 free[k] = False
         return chosen
 
-    def _sweep(self, frame: Frame, small: Small) -> tuple[np.ndarray, int]:
+    def _sweep(self, frame: FusionInput, small: WorkingImage) -> tuple[np.ndarray, int]:
         """(costs float32 [h, w, D], number of views)."""
         h, w = self.small_camera.shape
         views = self.choose_views(small.T_map_camera)
         if not views:
             return np.full((h, w, self.config.labels), 0.5 * self.config.cost_scale, np.float32), 0
-        uv = corners(small.middle)
-        depth_guess = (
+        uv = detect_corners(small.middle)
+        initial_depth_m = (
             float(np.median(np.linalg.norm(frame.beams.points_body_m, axis=1))) if len(frame.beams) else 2.5
         )
         T = [
-            refine_between(
+            refine_from_images(
                 inverse(view.T_map_camera) @ small.T_map_camera, small.middle, view.middle, uv,
-                self._middle_camera, depth_guess, self.config.rotation_sigma_rad,
+                self._middle_camera, initial_depth_m, self.config.rotation_sigma_rad,
                 self.config.translation_sigma_m,
             )
             for view in views
@@ -184,39 +192,43 @@ class Field:
         self._ceilings.add(gain)
 
     def _add_priors(
-        self, cost: np.ndarray, frame: Frame, surfaces: Surfaces, remembered: Remembered | None
+        self,
+        cost: np.ndarray,
+        frame: FusionInput,
+        surfaces: CandidateSurfaces,
+        remembered: WarpedDepth | None,
     ) -> None:
         c = self.config
         on_floor = surfaces.on_floor
-        near = np.exp(-np.nan_to_num(surfaces.wall_off_m) / c.wall_reach_m)
+        near = np.exp(-np.nan_to_num(surfaces.wall_offset_m) / c.wall_reach_m)
         self._dig(
             cost,
             np.where(on_floor, np.nan, surfaces.wall),
             c.wall_near * near,
         )
         if self._planar:
-            self._dig(cost, np.where(on_floor, np.nan, surfaces.backdrop), c.wall_far)
+            self._dig(cost, np.where(on_floor, np.nan, surfaces.background_wall), c.wall_far)
         self._dig(cost, np.where(on_floor, surfaces.floor, np.nan), c.floor)
-        for layer in surfaces.behind:
-            self._dig(cost, layer, c.behind)
+        for layer in surfaces.occluded_walls:
+            self._dig(cost, layer, c.occluded_walls)
         for ceiling in surfaces.ceilings:
             self._dig(cost, ceiling, c.ceiling)
         if remembered is not None:
             self._dig(cost, remembered.depth_m, c.memory * np.minimum(remembered.votes, 3) / 3.0)
-        guess = self.guess_of(frame)
-        if guess is not None:
-            trust = float(np.exp(-((guess.spread / c.guess_spread) ** 2)))
+        estimate = self.metric_estimate_of(frame)
+        if estimate is not None:
+            trust = float(np.exp(-((estimate.spread / c.estimate_spread) ** 2)))
             h, w = self.small_camera.shape
-            self._dig(cost, guess.at_size(w, h), c.guess * trust, width=4.0)
+            self._dig(cost, estimate.at_size(w, h), c.estimate * trust, width=4.0)
         unlikely = c.near * np.maximum(np.log(c.near_m) - self._log_z, 0.0)
         cost += unlikely.astype(np.float32)
 
-    def guess_of(self, frame: Frame) -> MetricGuess | None:
-        """The network's guess in metres, or None."""
-        if frame.guess is None or frame.guess_kind == "none":
+    def metric_estimate_of(self, frame: FusionInput) -> MetricEstimate | None:
+        """The network's estimate in metres, or None."""
+        if frame.estimate is None or frame.estimate_kind == "none":
             return None
         uv, z, _ = project_beams(frame.beams, self.camera, self.T_body_camera)
-        return metric_guess(frame.guess, frame.guess_kind, uv, z)
+        return metric_estimate(frame.estimate, frame.estimate_kind, uv, z)
 
     def _dig(self, cost: np.ndarray, z: np.ndarray, weight: np.ndarray | float, width: float = 1.0) -> None:
         step = self._log_z[1] - self._log_z[0]
@@ -224,29 +236,33 @@ class Field:
         z32 = np.asarray(z, dtype=np.float32)
         kernels.add_prior(cost, z32, np.ascontiguousarray(weights), self._log_z[0], step, width)
 
-    def _solve(self, cost: np.ndarray, small: Small, surfaces: Surfaces, views: int) -> Solved:
+    def _solve(
+        self, cost: np.ndarray, small: WorkingImage, surfaces: CandidateSurfaces, views: int
+    ) -> SweepResult:
         c = self.config
         total = np.zeros_like(cost)
         for dv, du in ((0, 1), (0, -1), (1, 0), (-1, 0)):
             kernels.aggregate(cost, small.grey, dv, du, c.p1, c.p2, c.edge_grey, total)
         depth = np.empty(cost.shape[:2], np.float32)
         spread = np.empty_like(depth)
-        kernels.winners(total, self._log_z, c.temperature, depth, spread)
+        kernels.winner_takes_all(total, self._log_z, c.temperature, depth, spread)
         reach_m = np.inf if self._planar else _TILTED_WALL_M
         snapped = snap(depth, surfaces, 1.2 * (self._log_z[1] - self._log_z[0]), reach_m)
-        return Solved(depth, spread, snapped, views)
+        return SweepResult(depth, spread, snapped, views)
 
 
-def snap(depth: np.ndarray, surfaces: Surfaces, tolerance: float, wall_reach_m: float) -> np.ndarray:
+def snap(depth: np.ndarray, surfaces: CandidateSurfaces, tolerance: float, wall_reach_m: float) -> np.ndarray:
     """Moves depth [h, w], in place, onto the nearest surface within `tolerance` (log); bool [h, w] where.
 
     Walls count up to `wall_reach_m` from the lidar plane.
     """
-    wall = np.where(surfaces.on_floor | ~(surfaces.wall_off_m < wall_reach_m), np.nan, surfaces.wall)
+    wall = np.where(surfaces.on_floor | ~(surfaces.wall_offset_m < wall_reach_m), np.nan, surfaces.wall)
     best = np.full(depth.shape, tolerance)
     result = depth.copy()
-    backdrop = np.where(surfaces.on_floor, np.nan, surfaces.backdrop) if np.isinf(wall_reach_m) else wall
-    for surface in (wall, backdrop, surfaces.floor, *surfaces.behind, *surfaces.ceilings):
+    background_wall = (
+        np.where(surfaces.on_floor, np.nan, surfaces.background_wall) if np.isinf(wall_reach_m) else wall
+    )
+    for surface in (wall, background_wall, surfaces.floor, *surfaces.occluded_walls, *surfaces.ceilings):
         with np.errstate(invalid="ignore"):
             error = np.abs(np.log(surface / depth))
             nearer = error < best

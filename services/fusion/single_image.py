@@ -1,0 +1,43 @@
+"""One correction for the whole image, without memory: the paper's ratio, an affine fit, or none at all."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+
+from beamsplat.common.geometry.beams import project_beams
+from beamsplat.common.geometry.camera import Pinhole
+from beamsplat.services.fusion.input_checks import ImageCheck
+from beamsplat.services.fusion.inputs import FusionInput
+from beamsplat.services.fusion.result import FusionResult, rejected
+from beamsplat.services.fusion.scaling import affine, as_depth, ratio
+
+SingleMethod = Literal["ratio", "affine", "given"]
+_GIVEN_SIGMA = 0.3  # relative: nobody has looked whether the estimate is right
+
+
+class SingleImageFusion:
+    """In the place of `Fusion` where a deployment asks for the paper's way; `given` takes the estimate's word
+    for it, for robots without a lidar."""
+
+    def __init__(self, camera: Pinhole, T_body_camera: np.ndarray, method: SingleMethod) -> None:
+        self._camera, self._T_body_camera, self._method = camera, T_body_camera, method
+        self._health = ImageCheck()
+
+    def add_scan(self, points_map_m: np.ndarray) -> None:
+        """Scans are of no use beyond their moment."""
+
+    def fuse(self, frame: FusionInput, *, keyframe: bool) -> FusionResult:
+        """Depth of one image; keyframes are no different."""
+        status = self._health.judge(frame.image_rgb, frame.T_map_body)
+        if status != "ok":
+            return rejected(self._camera.shape, status)
+        if frame.estimate is None:
+            return rejected(self._camera.shape, "there is no depth estimate to correct")
+        if self._method == "given":
+            depth = as_depth(frame.estimate, frame.estimate_kind).astype(np.float32)
+            return FusionResult(depth, np.float32(_GIVEN_SIGMA) * depth, scale=1.0)
+        uv, z, _ = project_beams(frame.beams, self._camera, self._T_body_camera)
+        correct = ratio if self._method == "ratio" else affine
+        return correct(frame.estimate, frame.estimate_kind, uv, z)
