@@ -56,11 +56,6 @@ class Trajectory:
     def __len__(self) -> int:
         return len(self.stamps_ns)
 
-    @property
-    def positions_m(self) -> np.ndarray:
-        """float64 [N, 3]: origin of b in a."""
-        return self.T_a_b[:, :3, 3]
-
     def at(
         self, stamp_ns: int, *, max_gap_ns: int | None = None, max_extrapolation_ns: int = 0
     ) -> np.ndarray | None:
