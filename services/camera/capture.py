@@ -10,7 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from beamsplat.services.camera.frame import CameraEnded, CameraError, Frame
+from beamsplat.services.camera.frame import CameraEnded, CameraError, CapturedFrame
 
 _TIMEOUT_MS = 3000
 _KERNEL_AGE_S = 2.0  # a kernel's time stamp older than that is none
@@ -53,7 +53,7 @@ class CaptureSource:
         self._fps = self._capture.get(cv2.CAP_PROP_FPS)
         self._due = time.monotonic()
 
-    def read(self) -> Frame:
+    def read(self) -> CapturedFrame:
         """The next picture; a file's at the speed it was taken.
 
         Raises:
@@ -70,8 +70,8 @@ class CaptureSource:
             time.sleep(max(0.0, self._due - time.monotonic()))
             stamp_ns = self._now_ns()
         if data.ndim < 3 or 1 in data.shape[:2]:
-            return Frame(stamp_ns, data.tobytes(), None)
-        return Frame(stamp_ns, None, np.ascontiguousarray(data))
+            return CapturedFrame(stamp_ns, data.tobytes(), None)
+        return CapturedFrame(stamp_ns, None, np.ascontiguousarray(data))
 
     def close(self) -> None:
         """Lets go of the device."""

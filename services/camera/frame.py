@@ -16,7 +16,7 @@ class CameraEnded(CameraError):
 
 
 @dataclass(frozen=True)
-class Frame:
+class CapturedFrame:
     """What a source delivered."""
 
     stamp_ns: int

@@ -25,17 +25,17 @@ def is_intact(data: bytes) -> bool:
     if not data.startswith(b"\xff\xd8") or not is_whole(data):
         return False
     try:
-        scan = _scan_of(data)
+        scan = _parse_segments(data)
     except (struct.error, IndexError, ValueError, KeyError):
         return False
     if scan is None:  # progressive, or without tables of its own: its structure was all there is to check
         return True
     start, tables, which, blocks, restart = scan
     stream = np.frombuffer(data, np.uint8)
-    return bool(_follow(stream, start, tables, which, blocks, restart))
+    return bool(_decode_scan(stream, start, tables, which, blocks, restart))
 
 
-def _scan_of(
+def _parse_segments(
     data: bytes,
 ) -> tuple[int, np.ndarray, np.ndarray, int, int] | None:
     """Where the only scan's codes begin, its code tables [T, 65536], (dc, ac) table of each block of an
@@ -62,9 +62,9 @@ def _scan_of(
         if len(body) != length - 2:
             raise ValueError("a segment is cut off")
         if marker == 0xC4:
-            _take_tables(body, codes)
+            _parse_huffman_tables(body, codes)
         elif marker in _BASELINE:
-            frame = _frame(body)
+            frame = _parse_frame_header(body)
         elif 0xC2 <= marker <= 0xCF and marker not in (0xC8, 0xCC):
             return None
         elif marker == 0xDD:
@@ -74,11 +74,11 @@ def _scan_of(
                 raise ValueError("a scan before its frame")
             if not codes or body[0] != len(frame[2]):
                 return None
-            return (at + 2 + length, *_blocks(body, frame, codes), restart)
+            return (at + 2 + length, *_parse_scan_header(body, frame, codes), restart)
         at += 2 + length
 
 
-def _frame(body: bytes) -> tuple[int, int, dict[int, tuple[int, int]]]:
+def _parse_frame_header(body: bytes) -> tuple[int, int, dict[int, tuple[int, int]]]:
     """Width, height and sampling factors (h, v) by component."""
     height, width, count = struct.unpack_from(">HHB", body, 1)
     factors = {body[6 + 3 * i]: (body[7 + 3 * i] >> 4, body[7 + 3 * i] & 15) for i in range(count)}
@@ -87,7 +87,7 @@ def _frame(body: bytes) -> tuple[int, int, dict[int, tuple[int, int]]]:
     return width, height, factors
 
 
-def _blocks(
+def _parse_scan_header(
     body: bytes, frame: tuple[int, int, dict[int, tuple[int, int]]], codes: dict[int, np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray, int]:
     """Tables, tables of each block of an MCU, and number of MCUs."""
@@ -105,7 +105,7 @@ def _blocks(
     return np.stack([codes[key] for key in order]), np.array(which, np.int64), mcus
 
 
-def _take_tables(body: bytes, codes: dict[int, np.ndarray]) -> None:
+def _parse_huffman_tables(body: bytes, codes: dict[int, np.ndarray]) -> None:
     at = 0
     while at < len(body):
         counts = body[at + 1 : at + 17]
@@ -133,7 +133,7 @@ def _code_table(counts: bytes, symbols: bytes) -> np.ndarray:
 
 
 @kernel
-def _follow(
+def _decode_scan(
     data: np.ndarray,  # uint8 [N]
     at: int,
     tables: np.ndarray,  # uint16 [T, 65536]
@@ -200,4 +200,4 @@ def _follow(
 def warm() -> None:
     """Compiles the kernel."""
     empty = np.zeros((1, 65536), np.uint16)
-    _follow(np.zeros(4, np.uint8), 0, empty, np.zeros((1, 2), np.int64), 1, 0)
+    _decode_scan(np.zeros(4, np.uint8), 0, empty, np.zeros((1, 2), np.int64), 1, 0)

@@ -7,7 +7,7 @@ import http.client
 from collections.abc import Callable
 from urllib.parse import urlsplit
 
-from beamsplat.services.camera.frame import CameraError, Frame
+from beamsplat.services.camera.frame import CameraError, CapturedFrame
 
 _MAX_BYTES = 16 * 1024 * 1024
 _MAX_LINE = 4096
@@ -19,7 +19,7 @@ def is_multipart(url: str, timeout_s: float) -> bool:
     Raises:
         CameraError: it does not answer.
     """
-    source = HttpSource(url, timeout_s, lambda: 0, look_only=True)
+    source = HttpSource(url, timeout_s, lambda: 0, probe_only=True)
     source.close()
     return source.multipart
 
@@ -28,12 +28,12 @@ class HttpSource:
     """Parts of one response, each a JPEG. A part without its length is refused: its end would be a guess."""
 
     def __init__(
-        self, url: str, timeout_s: float, now_ns: Callable[[], int], *, look_only: bool = False
+        self, url: str, timeout_s: float, now_ns: Callable[[], int], *, probe_only: bool = False
     ) -> None:
         """Connects and asks.
 
         Raises:
-            CameraError: nobody answers, or not with a stream of parts (unless `look_only`).
+            CameraError: nobody answers, or not with a stream of parts (unless `probe_only`).
         """
         parts = urlsplit(url)
         kind = http.client.HTTPSConnection if parts.scheme == "https" else http.client.HTTPConnection
@@ -48,7 +48,7 @@ class HttpSource:
             self.close()
             raise CameraError(f"{self.where} does not answer: {error}") from error
         self.multipart = (self._response.headers.get_content_maintype()) == "multipart"
-        if look_only:
+        if probe_only:
             return
         if self._response.status != 200 or not self.multipart:
             self.close()
@@ -57,27 +57,27 @@ class HttpSource:
                 "not with a stream of pictures"
             )
 
-    def read(self) -> Frame:
+    def read(self) -> CapturedFrame:
         """The next part, stamped when its first line came.
 
         Raises:
             CameraError: the stream ended, or stalled for the timeout.
         """
         try:
-            length, stamp_ns = self._head()
+            length, stamp_ns = self._read_part_header()
             data = self._response.read(length)
         except (OSError, http.client.HTTPException, ValueError) as error:
             raise CameraError(f"{self.where} stopped: {error}") from error
         if len(data) < length:
             raise CameraError(f"{self.where} closed the connection")
-        return Frame(stamp_ns, data, None)
+        return CapturedFrame(stamp_ns, data, None)
 
     def close(self) -> None:
         """Ends the connection."""
         with contextlib.suppress(OSError):
             self._connection.close()
 
-    def _head(self) -> tuple[int, int]:
+    def _read_part_header(self) -> tuple[int, int]:
         """Length of the next part and when its head came."""
         length, stamp_ns, headed = -1, 0, False
         while True:

@@ -15,7 +15,7 @@ from beamsplat.common.runtime.node import Node, Sourced
 from beamsplat.services.camera.capture import CaptureSource
 from beamsplat.services.camera.config import CameraConfig, NoCameraConfig
 from beamsplat.services.camera.mjpeg import HttpSource, is_multipart
-from beamsplat.services.camera.reader import Reader, Source
+from beamsplat.services.camera.reader import CameraReader, CameraSource
 
 _TIMEOUT_S = 3.0
 
@@ -35,7 +35,7 @@ class CameraNode(Node):
         if self._rig is not None and self._rig.camera is None:
             raise UserError(f'{c.rig}: has no [camera]; add it, or set kind = "none" for a robot without one')
         self._clock = StampClock()
-        self._reader = Reader(
+        self._reader = CameraReader(
             self._open, size_px=self._size_px(strict=True), rate_hz=c.rate_hz, delay_s=c.delay_s,
             silence_s=c.silence_s, jpeg_quality=c.jpeg_quality,
         )  # fmt: skip
@@ -43,8 +43,8 @@ class CameraNode(Node):
     def source(self) -> Iterator[Sourced | None]:
         """The calibration, then pictures; None while there is nothing to say."""
         if self._rig is not None:
-            yield _calibration(self._rig, self._clock.now_ns(), str(self.config.rig))
-        for picture in self._reader.pictures():
+            yield _rig_message(self._rig, self._clock.now_ns(), str(self.config.rig))
+        for picture in self._reader.images():
             uncalibrated = "" if self._rig is not None else "; NO CALIBRATION, give a rig file with rig = ..."
             self.detail = self._reader.status + uncalibrated
             if picture is None:
@@ -61,7 +61,7 @@ class CameraNode(Node):
         if hasattr(self, "_reader"):
             self._reader.close()
 
-    def _open(self) -> Source:
+    def _open(self) -> CameraSource:
         source = self.config.source
         if source.startswith(("http://", "https://")) and is_multipart(source, _TIMEOUT_S):
             return HttpSource(source, _TIMEOUT_S, self._clock.now_ns)
@@ -89,12 +89,12 @@ class NoCamera(Node):
 
     def source(self) -> Iterator[Sourced | None]:
         """The calibration once; it is latched. A robot without it stays without for ever: this never ends."""
-        yield _calibration(self._rig, self._clock.now_ns(), str(self.config.rig))
+        yield _rig_message(self._rig, self._clock.now_ns(), str(self.config.rig))
         while True:
             time.sleep(0.2)
             yield None
 
 
-def _calibration(rig: RigFile, stamp_ns: int, path: str) -> Sourced:
+def _rig_message(rig: RigFile, stamp_ns: int, path: str) -> Sourced:
     message: Rig = rig.message(stamp_ns, rig.source or path)
     return Sourced(None, "rig", message)

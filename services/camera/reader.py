@@ -1,6 +1,6 @@
-"""Keeps a camera open: reads it in a thread of its own, opens it again when it goes, checks each picture.
+"""Keeps a camera open: reads it in a thread of its own, opens it again when it goes, checks each image.
 
-A picture goes out only if it is whole and of the size that the calibration belongs to.
+A image goes out only if it is whole and of the size that the calibration belongs to.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import NamedTuple, Protocol
 import cv2
 
 from beamsplat.common.recording.picture import picture_head
-from beamsplat.services.camera.frame import CameraEnded, CameraError, Frame
+from beamsplat.services.camera.frame import CameraEnded, CameraError, CapturedFrame
 from beamsplat.services.camera.jpeg import is_intact
 
 _POLL_S = 0.1
@@ -23,20 +23,20 @@ _RATE_S = 4.0
 _SLOW = 0.6  # of the rate asked for
 
 
-class Source(Protocol):
+class CameraSource(Protocol):
     """An open camera."""
 
     where: str
 
-    def read(self) -> Frame:
-        """The next picture; waits for it. Raises CameraError."""
+    def read(self) -> CapturedFrame:
+        """The next image; waits for it. Raises CameraError."""
 
     def close(self) -> None:
         """Lets go of it."""
 
 
-class Picture(NamedTuple):
-    """A picture that may go out."""
+class CheckedImage(NamedTuple):
+    """A image that may go out."""
 
     stamp_ns: int
     width_px: int
@@ -44,14 +44,14 @@ class Picture(NamedTuple):
     jpeg: bytes
 
 
-class Reader:
+class CameraReader:
     """Pictures of one camera, for ever (or to the end of a file); `status` is one line about it."""
 
     def __init__(
         self,
-        open_source: Callable[[], Source],
+        open_source: Callable[[], CameraSource],
         *,
-        size_px: tuple[int, int] | None,  # of the calibration; pictures of another are refused
+        size_px: tuple[int, int] | None,  # of the calibration; images of another are rejected
         rate_hz: float = 0.0,  # what was asked for, to tell when it is not met
         delay_s: float = 0.0,
         silence_s: float = 2.0,
@@ -66,27 +66,27 @@ class Reader:
         self._arrivals: deque[float] = deque()
         self._newest_ns = 0
         self._closed = False
-        self._pump: _Pump | None = None
-        self.refused: Counter[str] = Counter()
+        self._thread: _CaptureThread | None = None
+        self.rejected: Counter[str] = Counter()
         self.sent = 0
-        self.overtaken = 0
+        self.dropped = 0
         self.reconnects = -1
         self.status = "not opened yet"
 
-    def pictures(self) -> Iterator[Picture | None]:
+    def images(self) -> Iterator[CheckedImage | None]:
         """Pictures as they come; None whenever nothing has come for a moment."""
         while not self._closed:
-            pump = self._pump = _Pump(self._open_source)
+            thread = self._thread = _CaptureThread(self._open_source)
             try:
-                yield from self._from(pump)
+                yield from self._read_images(thread)
             except CameraEnded as error:
                 self.status = f"{error}: {self._counts()}"
                 return
             except CameraError as error:
-                state = "LOST" if pump.opened else "NOT THERE"
+                state = "DISCONNECTED" if thread.opened else "NOT CONNECTED"
                 self.status = f"{state}: {error}; {self._counts()}"
             finally:
-                pump.stop()
+                thread.stop()
             until = time.monotonic() + _RETRY_S
             while time.monotonic() < until and not self._closed:
                 yield None
@@ -95,60 +95,60 @@ class Reader:
     def close(self) -> None:
         """Lets go of the camera."""
         self._closed = True
-        if self._pump is not None:
-            self._pump.stop()
+        if self._thread is not None:
+            self._thread.stop()
 
-    def _from(self, pump: _Pump) -> Iterator[Picture | None]:
-        heard = time.monotonic()
+    def _read_images(self, thread: _CaptureThread) -> Iterator[CheckedImage | None]:
+        last_frame_s = time.monotonic()
         counted = False
         while True:
-            frame = pump.take(_POLL_S)
-            self.overtaken += pump.forget_overtaken()
+            frame = thread.take(_POLL_S)
+            self.dropped += thread.take_dropped_count()
             now = time.monotonic()
             if frame is None:
-                patience_s = self._silence_s if pump.opened else max(self._silence_s, 5.0)
-                if now - heard > patience_s:
-                    raise CameraError(f"no picture for {patience_s:g} s")
+                timeout_s = self._silence_s if thread.opened else max(self._silence_s, 5.0)
+                if now - last_frame_s > timeout_s:
+                    raise CameraError(f"no image for {timeout_s:g} s")
                 yield None
                 continue
             if not counted:
                 counted = True
                 self.reconnects += 1
-            heard = now
-            self._count_rate(now)
-            picture = self._checked(frame)
-            self._describe(pump.where)
-            yield picture
+            last_frame_s = now
+            self._record_arrival(now)
+            image = self._check(frame)
+            self._update_status(thread.where)
+            yield image
 
-    def _checked(self, frame: Frame) -> Picture | None:
-        """The picture, if nothing is wrong with it; the fault is counted."""
+    def _check(self, frame: CapturedFrame) -> CheckedImage | None:
+        """The image, if nothing is wrong with it; the fault is counted."""
         jpeg = frame.jpeg
         if jpeg is None:
             good, data = cv2.imencode(".jpg", frame.bgr, [cv2.IMWRITE_JPEG_QUALITY, self._quality])
             if not good:
-                return self._refuse("cannot be written as JPEG")
+                return self._reject("cannot be written as JPEG")
             jpeg = data.tobytes()
         elif not is_intact(jpeg):
-            return self._refuse("broken")
+            return self._reject("broken")
         head = picture_head(jpeg)
         if head is None or head.encoding != "jpeg":
-            return self._refuse("no JPEG")
+            return self._reject("no JPEG")
         if self._size_px is not None and (head.width_px, head.height_px) != self._size_px:
             wanted = f"{self._size_px[0]}x{self._size_px[1]}"
-            return self._refuse(f"{head.width_px}x{head.height_px} px, the calibration is for {wanted}")
+            return self._reject(f"{head.width_px}x{head.height_px} px, the calibration is for {wanted}")
         self._newest_ns = max(frame.stamp_ns - self._delay_ns, self._newest_ns + 1)
         self.sent += 1
-        return Picture(self._newest_ns, head.width_px, head.height_px, jpeg)
+        return CheckedImage(self._newest_ns, head.width_px, head.height_px, jpeg)
 
-    def _refuse(self, reason: str) -> None:
-        self.refused[reason] += 1
+    def _reject(self, reason: str) -> None:
+        self.rejected[reason] += 1
 
-    def _count_rate(self, now: float) -> None:
+    def _record_arrival(self, now: float) -> None:
         self._arrivals.append(now)
         while self._arrivals[0] < now - _RATE_S:
             self._arrivals.popleft()
 
-    def _describe(self, where: str) -> None:
+    def _update_status(self, where: str) -> None:
         count = len(self._arrivals)
         span = self._arrivals[-1] - self._arrivals[0]
         rate = (count - 1) / span if count > 1 and span > 0.0 else 0.0
@@ -157,31 +157,31 @@ class Reader:
         self.status = f"{where}: {text}{rate:.1f} Hz, {self._counts()}"
 
     def _counts(self) -> str:
-        parts = [f"{self.sent} pictures"]
-        parts += [f"{count} refused ({reason})" for reason, count in self.refused.most_common(3)]
-        if self.overtaken:
-            parts.append(f"{self.overtaken} overtaken")
+        parts = [f"{self.sent} images"]
+        parts += [f"{count} rejected ({reason})" for reason, count in self.rejected.most_common(3)]
+        if self.dropped:
+            parts.append(f"{self.dropped} dropped")
         if self.reconnects > 0:
-            parts.append(f"opened again {self.reconnects} times")
+            parts.append(f"reopened {self.reconnects} times")
         return ", ".join(parts)
 
 
-class _Pump:
+class _CaptureThread:
     """Reads a source in a thread, because a camera that has gone may block for long. The newest wins."""
 
-    def __init__(self, open_source: Callable[[], Source]) -> None:
+    def __init__(self, open_source: Callable[[], CameraSource]) -> None:
         self._open_source = open_source
         self._changed = threading.Condition()
-        self._frame: Frame | None = None
+        self._frame: CapturedFrame | None = None
         self._fault: CameraError | None = None
         self._stopped = False
-        self._overtaken = 0
+        self._dropped = 0
         self.opened = False
         self.where = "camera"
         threading.Thread(target=self._run, name="camera", daemon=True).start()
 
-    def take(self, timeout_s: float) -> Frame | None:
-        """The newest picture not yet taken; None if none comes in time.
+    def take(self, timeout_s: float) -> CapturedFrame | None:
+        """The newest image not yet taken; None if none comes in time.
 
         Raises:
             CameraError: what ended the source.
@@ -194,10 +194,10 @@ class _Pump:
                 raise self._fault
             return frame
 
-    def forget_overtaken(self) -> int:
-        """How many pictures a newer one has replaced since last asked."""
+    def take_dropped_count(self) -> int:
+        """How many images a newer one has replaced since last asked."""
         with self._changed:
-            count, self._overtaken = self._overtaken, 0
+            count, self._dropped = self._dropped, 0
             return count
 
     def stop(self) -> None:
@@ -213,7 +213,7 @@ class _Pump:
             while not self._stopped:
                 frame = source.read()
                 with self._changed:
-                    self._overtaken += self._frame is not None
+                    self._dropped += self._frame is not None
                     self._frame = frame
                     self._changed.notify()
         except CameraError as error:

@@ -6,20 +6,20 @@ import time
 
 import numpy as np
 
-from beamsplat.services.lidar.clock import Unwrapper
-from beamsplat.services.lidar.driver import Driver
+from beamsplat.services.lidar.clock import CounterUnwrapper
+from beamsplat.services.lidar.driver import LidarDriver
 from beamsplat.services.lidar.framing import Framer
-from beamsplat.services.lidar.link import Link, LinkError, drain
-from beamsplat.services.lidar.samples import Revolution, StampedScan
-from beamsplat.services.lidar.scip import Geometry, ScanReply, parameters
+from beamsplat.services.lidar.link import DeviceLink, LinkError, drain
+from beamsplat.services.lidar.samples import LidarRevolution, StampedScan
+from beamsplat.services.lidar.scip import ScipGeometry, ScipScanReply, parameters
 
 _ANSWER_S = 0.6
 _TRIES = 4
 _TIME_MODULUS_MS = 1 << 24
-_LEAST_SHARE = 0.2  # of a scan's blocks that must be good
+_MIN_GOOD_RATIO = 0.2  # of a scan's blocks that must be good
 
 
-class HokuyoDriver(Driver):
+class HokuyoDriver(LidarDriver):
     """Distances as they are measured, counter-clockwise; with `intensity` also how strong the echo was."""
 
     bauds = (115200, 19200, 750000)
@@ -28,64 +28,66 @@ class HokuyoDriver(Driver):
     def __init__(self, intensity: bool = False) -> None:
         super().__init__()
         self._intensity = intensity
-        self._byte_s = 0.0
-        self._reply: ScanReply | None = None
-        self._rest = b""
+        self._byte_time_s = 0.0
+        self._reply: ScipScanReply | None = None
+        self._leftover = b""
 
-    def start(self, link: Link) -> None:
-        self.restart()
-        self._byte_s = link.byte_s
+    def start(self, link: DeviceLink) -> None:
+        self.reset()
+        self._byte_time_s = link.byte_time_s
         link.write(b"QT\n")
         drain(link)
         link.write(b"SCIP2.0\n")  # the URG-04LX starts in SCIP 1.1; others answer that they do not know it
         drain(link)
-        geometry = _geometry(link)
+        geometry = _query_geometry(link)
         self.model = f"Hokuyo {geometry.model.strip()}"
         self.range_min_m, self.range_max_m = geometry.range_min_m, geometry.range_max_m
-        self._reply = ScanReply(geometry, self._intensity)
-        self._framer = Framer(self._reply.length, self._reply.begins, self._reply.begins, self.counters, 1)
-        self._time = Unwrapper(_TIME_MODULUS_MS, 1e3)
+        self._reply = ScipScanReply(geometry, self._intensity)
+        self._framer = Framer(
+            self._reply.length, self._reply.has_header, self._reply.has_header, self.counters, 1
+        )
+        self._time = CounterUnwrapper(_TIME_MODULUS_MS, 1e3)
         self._last_s: float | None = None
-        self._missed = 0
-        self._rest = _begin(link, self._reply.command)
+        self._missed_scans = 0
+        self._leftover = _start_scanning(link, self._reply.command)
 
     def feed(self, data: bytes, at_ns: int) -> list[StampedScan]:
-        data, self._rest = self._rest + data, b""
+        data, self._leftover = self._leftover + data, b""
         found = []
         for packet in self._framer.feed(data):
             if packet is None:
-                self._missed += 1
+                self._missed_scans += 1
                 self.counters.dropped_scans += 1
                 self.counters.lost_samples += self._reply.geometry.count
                 continue
             found += self._scan(packet, at_ns)
         return found
 
-    def stop(self, link: Link) -> None:
+    def stop(self, link: DeviceLink) -> None:
         link.write(b"QT\n")
 
     def _scan(self, packet: bytes, at_ns: int) -> list[StampedScan]:
         geometry = self._reply.geometry
         beam_s = geometry.period_s / geometry.steps_per_turn
-        start_s = self._time_of(packet, at_ns)
+        start_s = self._device_time_s(packet, at_ns)
         if start_s is None:
             self.counters.dropped_scans += 1
             self.counters.lost_samples += geometry.count
             return []
         range_m, intensity, blocks, bad = self._reply.values(packet)
         for i in range(blocks):
-            self.noise.saw(i >= bad)
-        if bad > (1.0 - _LEAST_SHARE) * blocks:
+            self.noise.update(i >= bad)
+        if bad > (1.0 - _MIN_GOOD_RATIO) * blocks:
             self.counters.dropped_scans += 1
             self.counters.lost_samples += geometry.count
             return []
-        delay_ns = round(self._reply.length * self._byte_s * 1e9)
-        if not self.clock.hear(start_s + geometry.count * beam_s, at_ns - delay_ns):
+        delay_ns = round(self._reply.length * self._byte_time_s * 1e9)
+        if not self.clock.update(start_s + geometry.count * beam_s, at_ns - delay_ns):
             self.counters.dropped_scans += 1  # its time is wrong
             self.counters.lost_samples += geometry.count
             return []
         step_rad = 2.0 * np.pi / geometry.steps_per_turn
-        turn = Revolution(
+        turn = LidarRevolution(
             time_s=start_s,
             angle_min_rad=(geometry.first_step - geometry.front_step) * step_rad,
             angle_increment_rad=step_rad,
@@ -95,16 +97,16 @@ class HokuyoDriver(Driver):
             intensity=intensity.astype(np.float32) if self._intensity else np.zeros(0, np.float32),
         )
         lost = round(geometry.count * bad / blocks)
-        found = self.builder.take(turn, lost, self.noise.noisy)
+        found = self.builder.accept(turn, lost, self.noise.noisy)
         return [
             StampedScan(self.clock.stamp_ns(turn.time_s), turn, self.range_min_m, self.range_max_m)
             for turn in found
         ]
 
-    def _time_of(self, packet: bytes, at_ns: int) -> float | None:
+    def _device_time_s(self, packet: bytes, at_ns: int) -> float | None:
         """Device time of a reply's first measurement; guessed from the one before where its sum is wrong."""
         time_ms = self._reply.time_ms(packet)
-        missed, self._missed = self._missed + 1, 0
+        missed, self._missed_scans = self._missed_scans + 1, 0
         expected = None if self._last_s is None else self._last_s + missed * self._reply.geometry.period_s
         if time_ms is None:
             self._last_s = expected
@@ -113,17 +115,17 @@ class HokuyoDriver(Driver):
         return self._last_s
 
 
-def _geometry(link: Link) -> Geometry:
+def _query_geometry(link: DeviceLink) -> ScipGeometry:
     problem = "no Hokuyo answers here"
     for _ in range(_TRIES):
         try:
-            return Geometry.of(parameters(_ask(link, b"PP\n")))
+            return ScipGeometry.from_parameters(parameters(_request(link, b"PP\n")))
         except ValueError as error:
             problem = str(error)
     raise LinkError(problem)
 
 
-def _ask(link: Link, command: bytes) -> bytes:
+def _request(link: DeviceLink, command: bytes) -> bytes:
     """What comes until an empty line, or nothing more does."""
     link.write(command)
     data, deadline = b"", time.monotonic() + _ANSWER_S
@@ -132,7 +134,7 @@ def _ask(link: Link, command: bytes) -> bytes:
     return data
 
 
-def _begin(link: Link, command: bytes) -> bytes:
+def _start_scanning(link: DeviceLink, command: bytes) -> bytes:
     """Starts the scans; the first bytes of them."""
     status = b""
     for _ in range(_TRIES):

@@ -12,10 +12,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from beamsplat.services.lidar.clock import Unwrapper, spread
-from beamsplat.services.lidar.driver import Driver, StartChain
+from beamsplat.services.lidar.clock import CounterUnwrapper, sample_times_s
+from beamsplat.services.lidar.driver import LidarDriver, StartAngleGate
 from beamsplat.services.lidar.framing import Framer
-from beamsplat.services.lidar.link import Link
+from beamsplat.services.lidar.link import DeviceLink
 from beamsplat.services.lidar.samples import Samples, StampedScan
 
 PACKET_BYTES = 47
@@ -45,7 +45,7 @@ def crc8(data: bytes) -> int:
     return value
 
 
-class Packet(NamedTuple):
+class LdrobotPacket(NamedTuple):
     """One packet as it stands."""
 
     speed_deg_s: float
@@ -61,27 +61,27 @@ class Packet(NamedTuple):
         return ((self.end_deg - self.start_deg) % 360.0) / (POINTS - 1)
 
 
-def begins(packet: bytes) -> bool:
+def has_header(packet: bytes) -> bool:
     """Whether it starts as one."""
     return packet.startswith(_HEAD)
 
 
-def whole(packet: bytes) -> bool:
+def checksum_ok(packet: bytes) -> bool:
     """Whether its checksum is right."""
     return crc8(packet[:-1]) == packet[-1]
 
 
-def parse(packet: bytes) -> Packet:
+def parse(packet: bytes) -> LdrobotPacket:
     """The values of one packet of 47 bytes."""
     _, speed, start, points, end, time_ms, _ = _LAYOUT.unpack(packet)
     data = np.frombuffer(points, dtype=[("mm", "<u2"), ("intensity", "u1")])
     range_m = np.where(data["mm"] > 0, data["mm"] / 1000.0, np.nan)
-    return Packet(
+    return LdrobotPacket(
         float(speed), start / 100.0, end / 100.0, time_ms, range_m, data["intensity"].astype(np.float64)
     )
 
 
-class LdrobotDriver(Driver):
+class LdrobotDriver(LidarDriver):
     """Only listens. Angles grow clockwise seen from above."""
 
     bauds = (230400,)
@@ -90,19 +90,19 @@ class LdrobotDriver(Driver):
         super().__init__()
         self.range_min_m, self.range_max_m = 0.02, 12.0
         self.model = "LDROBOT LD06/LD19"
-        self._byte_s = 0.0
-        self.restart()
+        self._byte_time_s = 0.0
+        self.reset()
 
-    def start(self, link: Link) -> None:
-        self._byte_s = link.byte_s
-        self.restart()
+    def start(self, link: DeviceLink) -> None:
+        self._byte_time_s = link.byte_time_s
+        self.reset()
 
-    def restart(self) -> None:
-        super().restart()
-        self._framer = Framer(PACKET_BYTES, begins, whole, self.counters, followed=True)
-        self._chain = StartChain()
+    def reset(self) -> None:
+        super().reset()
+        self._framer = Framer(PACKET_BYTES, has_header, checksum_ok, self.counters, check_next_header=True)
+        self._start_gate = StartAngleGate()
         self._pending_at_ns = 0
-        self._time = Unwrapper(_TIME_MODULUS_MS, 1e3)
+        self._time = CounterUnwrapper(_TIME_MODULUS_MS, 1e3)
 
     def feed(self, data: bytes, at_ns: int) -> list[StampedScan]:
         parts = []
@@ -110,25 +110,25 @@ class LdrobotDriver(Driver):
         for number, packet in enumerate(self._framer.feed(data)):
             came_ns = arrived_ns if number < waiting else at_ns
             taken = number + 1
-            self.noise.saw(packet is not None)
+            self.noise.update(packet is not None)
             if packet is None:
-                self._chain.missed()
+                self._start_gate.skip_packets()
                 continue
             values = parse(packet)
             last_s = self._time(values.time_ms % _TIME_MODULUS_MS, came_ns) / 1e3
-            in_place = self._chain.takes(values.start_deg)
+            in_place = self._start_gate.accepts(values.start_deg)
             possible = 0.0 < values.step_deg < 3.0 and values.speed_deg_s > 0.0
-            delay_ns = round(PACKET_BYTES * self._byte_s * 1e9)
-            if not (in_place and possible and self.clock.hear(last_s, came_ns - delay_ns)):
+            delay_ns = round(PACKET_BYTES * self._byte_time_s * 1e9)
+            if not (in_place and possible and self.clock.update(last_s, came_ns - delay_ns)):
                 continue  # its samples are missing in the turn and counted there
             parts.append(
                 Samples(
                     angle_deg=values.start_deg + values.step_deg * np.arange(POINTS),
                     range_m=values.range_m,
                     intensity=values.intensity,
-                    time_s=spread(last_s, values.step_deg / values.speed_deg_s, POINTS),
+                    time_s=sample_times_s(last_s, values.step_deg / values.speed_deg_s, POINTS),
                 )
             )
         if self._framer.pending > max(waiting - taken, 0):
             self._pending_at_ns = at_ns
-        return self.turns(parts)
+        return self.stamp_revolutions(parts)

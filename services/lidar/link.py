@@ -20,10 +20,10 @@ class LinkError(OSError):
     """The device is not there, not ours to open, or does not answer; the text says what to do."""
 
 
-class Link(Protocol):
+class DeviceLink(Protocol):
     """An open connection to a device."""
 
-    byte_s: float  # how long a byte is on its way; 0 where that is not known
+    byte_time_s: float  # how long a byte is on its way; 0 where that is not known
 
     def read(self, timeout_s: float) -> bytes:
         """What has come, waiting up to `timeout_s` for the first byte; b"" if nothing.
@@ -35,7 +35,7 @@ class Link(Protocol):
     def write(self, data: bytes) -> None:
         """Sends all of it. Raises LinkError."""
 
-    def motor(self, on: bool) -> None:
+    def set_motor(self, on: bool) -> None:
         """Switches what the adapter's DTR line holds, where there is one."""
 
     def close(self) -> None:
@@ -59,7 +59,7 @@ class SerialLink:
             if getattr(error, "errno", None) == 13:
                 raise LinkError(_no_permission(path)) from error
             raise LinkError(f"{path} cannot be opened: {_reason(error)}") from error
-        self.byte_s = _BITS_PER_BYTE / baud
+        self.byte_time_s = _BITS_PER_BYTE / baud
 
     def read(self, timeout_s: float) -> bytes:
         try:
@@ -78,7 +78,7 @@ class SerialLink:
         except (OSError, ValueError) as error:
             raise LinkError(f"{self._port.name} takes no commands: {_reason(error)}") from error
 
-    def motor(self, on: bool) -> None:
+    def set_motor(self, on: bool) -> None:
         with contextlib.suppress(OSError):  # a pseudo-terminal has no such line
             self._port.dtr = not on
 
@@ -101,7 +101,7 @@ class TcpLink:
         except OSError as error:
             raise LinkError(f"tcp/{host}:{port} does not answer: {_reason(error)}") from error
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self.byte_s = 0.0
+        self.byte_time_s = 0.0
         self._name = f"tcp/{host}:{port}"
 
     def read(self, timeout_s: float) -> bytes:
@@ -121,14 +121,14 @@ class TcpLink:
         except OSError as error:
             raise LinkError(f"{self._name} takes no commands: {_reason(error)}") from error
 
-    def motor(self, on: bool) -> None:
+    def set_motor(self, on: bool) -> None:
         pass
 
     def close(self) -> None:
         self._socket.close()
 
 
-def open_link(device: str, baud: int) -> Link:
+def open_link(device: str, baud: int) -> DeviceLink:
     """The device at a path ("/dev/ttyUSB0") or an address ("tcp/192.168.0.10:10940").
 
     Raises:
@@ -143,7 +143,7 @@ def open_link(device: str, baud: int) -> Link:
     return TcpLink(host.strip("[]"), int(port))
 
 
-def drain(link: Link, quiet_s: float = 0.05, at_most_s: float = 0.5) -> None:
+def drain(link: DeviceLink, quiet_s: float = 0.05, at_most_s: float = 0.5) -> None:
     """Reads away what a device is still sending, until it has been quiet or that has lasted."""
     deadline = time.monotonic() + at_most_s
     while time.monotonic() < deadline and link.read(quiet_s):

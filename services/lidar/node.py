@@ -11,11 +11,11 @@ from beamsplat.common.messages import Scan
 from beamsplat.common.runtime.clock import StampClock
 from beamsplat.common.runtime.node import Node, Sourced
 from beamsplat.services.lidar.config import HokuyoConfig, LidarConfig, RplidarConfig
-from beamsplat.services.lidar.driver import Driver
+from beamsplat.services.lidar.driver import LidarDriver
 from beamsplat.services.lidar.hokuyo import HokuyoDriver
 from beamsplat.services.lidar.ldrobot import LdrobotDriver
-from beamsplat.services.lidar.link import Link, open_link
-from beamsplat.services.lidar.reader import Reader
+from beamsplat.services.lidar.link import DeviceLink, open_link
+from beamsplat.services.lidar.reader import LidarReader
 from beamsplat.services.lidar.rplidar import RplidarDriver
 from beamsplat.services.lidar.samples import StampedScan
 
@@ -27,15 +27,15 @@ class _LidarNode(Node, ABC):
     config: LidarConfig
 
     @abstractmethod
-    def driver(self) -> Driver:
+    def driver(self) -> LidarDriver:
         """The driver of this kind."""
 
     def configure(self) -> None:
         """Makes ready; opening waits until the stream is asked for, so that an absent device is a status."""
         bauds = (self.config.baud,) if self.config.baud else ()
-        self._reader = Reader(self.driver, self._open, bauds, StampClock().now_ns)
+        self._reader = LidarReader(self.driver, self._open, bauds, StampClock().now_ns)
 
-    def _open(self, baud: int) -> Link:
+    def _open(self, baud: int) -> DeviceLink:
         return open_link(self.config.device, baud)
 
     def source(self) -> Iterator[Sourced | None]:
@@ -75,7 +75,7 @@ class RplidarNode(_LidarNode):
     config: RplidarConfig
     outputs = ("lidar/scan",)
 
-    def driver(self) -> Driver:
+    def driver(self) -> LidarDriver:
         return RplidarDriver(self.config.mode)
 
 
@@ -85,7 +85,7 @@ class LdrobotNode(_LidarNode):
     name = "lidar"
     outputs = ("lidar/scan",)
 
-    def driver(self) -> Driver:
+    def driver(self) -> LidarDriver:
         return LdrobotDriver()
 
 
@@ -97,5 +97,5 @@ class HokuyoNode(_LidarNode):
     config: HokuyoConfig
     outputs = ("lidar/scan",)
 
-    def driver(self) -> Driver:
+    def driver(self) -> LidarDriver:
         return HokuyoDriver(self.config.intensity)

@@ -6,22 +6,22 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 
-from beamsplat.services.lidar.driver import Driver
-from beamsplat.services.lidar.link import Link, LinkError
+from beamsplat.services.lidar.driver import LidarDriver
+from beamsplat.services.lidar.link import DeviceLink, LinkError
 from beamsplat.services.lidar.samples import StampedScan
 
 _POLL_S = 0.1
 _RETRY_S = 0.25  # a device that is plugged in again is found within this
-_NO_SCAN_S = 5.0  # bytes that never make a turn: wrong device, wrong baud rate, or a motor that stands
+_NO_SCAN_S = 5.0  # bytes that never make a turn: wrong device, wrong baud rate, or a motor that does not turn
 
 
-class Reader:
+class LidarReader:
     """Scans of one device, for ever; `status` is one line about it."""
 
     def __init__(
         self,
-        make_driver: Callable[[], Driver],
-        open_at: Callable[[int], Link],  # by baud rate
+        make_driver: Callable[[], LidarDriver],
+        open_at: Callable[[int], DeviceLink],  # by baud rate
         bauds: tuple[int, ...],
         now_ns: Callable[[], int],
     ) -> None:
@@ -30,7 +30,7 @@ class Reader:
         self._bauds = bauds or self.driver.bauds
         self._baud = 0  # index of the one that answered last
         self._now_ns = now_ns
-        self._link: Link | None = None
+        self._link: DeviceLink | None = None
         self.status = "not opened yet"
         self.reconnects = -1
 
@@ -44,15 +44,15 @@ class Reader:
             try:
                 yield from self._read()
             except LinkError as error:
-                self.status = f"LOST: {error}; {self.driver.counters}"
-                self._drop()
+                self.status = f"DISCONNECTED: {error}; {self.driver.counters}"
+                self._close_link()
 
     def close(self) -> None:
         """Stops the device and lets go of it."""
         if self._link is not None:
             with suppress(OSError):
                 self.driver.stop(self._link)
-            self._drop()
+            self._close_link()
 
     def _open(self) -> bool:
         """Tries one baud rate; the next call tries the next."""
@@ -62,7 +62,7 @@ class Reader:
             link = self._open_at(baud)
             self.driver.start(link)
         except LinkError as error:
-            self.status = f"NOT THERE: {error}"
+            self.status = f"NOT CONNECTED: {error}"
             if link is not None:  # somebody is there, but at another rate
                 link.close()
                 self._baud = (self._baud + 1) % len(self._bauds)
@@ -72,31 +72,31 @@ class Reader:
         return True
 
     def _read(self) -> Iterator[StampedScan | None]:
-        heard = scanned = time.monotonic()
+        last_data_s = last_scan_s = time.monotonic()
         while True:
             data = self._link.read(_POLL_S)
             at_ns, now = self._now_ns(), time.monotonic()
             if data:
-                heard = now
+                last_data_s = now
                 found = self.driver.feed(data, at_ns)
                 if found:
-                    scanned = now
-                self._describe()
+                    last_scan_s = now
+                self._update_status()
                 yield from found or (None,)
             else:
                 yield None
-            if now - heard > self.driver.silence_s:
+            if now - last_data_s > self.driver.silence_s:
                 raise LinkError("it has fallen silent")
-            if now - scanned > _NO_SCAN_S:
+            if now - last_scan_s > _NO_SCAN_S:
                 self._baud = (self._baud + 1) % len(self._bauds)
                 raise LinkError(f"{_NO_SCAN_S:g} s without a whole turn: is this the right kind and baud?")
 
-    def _describe(self) -> None:
+    def _update_status(self) -> None:
         noise = ", NOISY LINK" if self.driver.noise.noisy else ""
-        again = f", opened again {self.reconnects} times" if self.reconnects else ""
+        again = f", reopened {self.reconnects} times" if self.reconnects else ""
         self.status = f"{self.driver.model}: {self.driver.counters}{noise}{again}"
 
-    def _drop(self) -> None:
+    def _close_link(self) -> None:
         if self._link is not None:
             self._link.close()
         self._link = None

@@ -4,49 +4,49 @@ from __future__ import annotations
 
 import numpy as np
 
-from beamsplat.services.lidar.framing import Counters
-from beamsplat.services.lidar.guard import confirmed
-from beamsplat.services.lidar.samples import Revolution, Samples
+from beamsplat.services.lidar.framing import StreamCounters
+from beamsplat.services.lidar.range_filter import confirmed_ranges
+from beamsplat.services.lidar.samples import LidarRevolution, Samples
 
-_LEAST_SHARE = 0.1  # of a turn's directions that must have been measured
-_LEAST_SAMPLES = 40
-_STEP_BACK_DEG = 20.0
+_MIN_COVERAGE = 0.1  # of a turn's directions that must have been measured
+_MIN_SAMPLES = 40
+_MAX_STEP_BACK_DEG = 20.0
 
 
 class RevolutionBuilder:
     """Turns out of samples; the first and any turn with a hole of most of its length are dropped."""
 
-    def __init__(self, counters: Counters, *, clockwise: bool) -> None:
+    def __init__(self, counters: StreamCounters, *, clockwise: bool) -> None:
         self._counters = counters
         self._clockwise = clockwise
         self._parts: list[Samples] = []
-        self._whole = False  # the turn at hand began at its beginning
+        self._complete = False  # the turn at hand began at its beginning
         self._total_deg: float | None = None  # angle of the newest sample, counted on over all turns
         self._turn = 0
         self._last_time = -np.inf
         self._period_s: float | None = None
-        self._before: Revolution | None = None
+        self._previous: LidarRevolution | None = None
 
-    def forget(self) -> None:
+    def reset(self) -> None:
         """The stream was cut: what is at hand is no turn."""
-        if self._parts and self._whole:
+        if self._parts and self._complete:
             self._counters.dropped_scans += 1
-        self._parts, self._whole, self._before, self._total_deg = [], False, None, None
+        self._parts, self._complete, self._previous, self._total_deg = [], False, None, None
         self._last_time = -np.inf
 
-    def add(self, samples: Samples, noisy: bool = False) -> list[Revolution]:
+    def add(self, samples: Samples, noisy: bool = False) -> list[LidarRevolution]:
         """The turns that these samples end. With `noisy`, ranges that nothing confirms are left out."""
         if not len(samples):
             return []
         if self._period_s is not None and samples.time_s[0] - self._last_time > 0.9 * self._period_s:
-            self.forget()  # nobody knows how many turns went by
-        total, turn = self._count_on(samples.angle_deg)
+            self.reset()  # nobody knows how many turns went by
+        total, turn = self._unwrap_angles(samples.angle_deg)
         cuts = np.flatnonzero(np.diff(turn, prepend=self._turn)).tolist()
         turns = []
         start = 0
         for cut in [*cuts, len(samples)]:
             if cut > start:
-                self._parts.append(_piece(samples, slice(start, cut), total - 360.0 * turn[start]))
+                self._parts.append(_slice(samples, slice(start, cut), total - 360.0 * turn[start]))
             if cut < len(samples):
                 turns += self._finish(float(samples.time_s[cut]), noisy)
             start = cut
@@ -54,7 +54,7 @@ class RevolutionBuilder:
         self._last_time = float(samples.time_s[-1])
         return turns
 
-    def _count_on(self, angle_deg: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _unwrap_angles(self, angle_deg: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Angles counted on over all turns, and the number of the turn of each sample.
 
         A device that corrects its angles by the range steps back a little at times, never forward by
@@ -64,67 +64,69 @@ class RevolutionBuilder:
             self._total_deg = float(angle_deg[0] % 360.0)
             self._turn = 0
         steps = np.mod(np.diff(angle_deg, prepend=self._total_deg), 360.0)
-        steps[steps > 360.0 - _STEP_BACK_DEG] -= 360.0
+        steps[steps > 360.0 - _MAX_STEP_BACK_DEG] -= 360.0
         total = self._total_deg + np.cumsum(steps)
         turn = np.maximum.accumulate(np.maximum(np.floor(total / 360.0).astype(np.int64), self._turn))
         return total, turn
 
-    def _finish(self, next_time_s: float, noisy: bool) -> list[Revolution]:
+    def _finish(self, next_time_s: float, noisy: bool) -> list[LidarRevolution]:
         parts, self._parts = self._parts, []
-        whole, self._whole = self._whole, True
-        if not whole or not parts:
+        complete, self._complete = self._complete, True
+        if not complete or not parts:
             return []
-        turn = _on_grid(parts, next_time_s, self._clockwise)
+        turn = _resample_to_grid(parts, next_time_s, self._clockwise)
         if turn is None:
             self._counters.dropped_scans += 1
-            self._before = None
+            self._previous = None
             return []
         full = round(2.0 * np.pi / abs(turn.angle_increment_rad))
-        return self.take(turn, full - sum(len(part) for part in parts), noisy)
+        return self.accept(turn, full - sum(len(part) for part in parts), noisy)
 
-    def take(self, turn: Revolution, missing: int, noisy: bool) -> list[Revolution]:
+    def accept(self, turn: LidarRevolution, missing: int, noisy: bool) -> list[LidarRevolution]:
         """Counts a turn that lacks `missing` measurements, and believes of it what can be believed."""
         self._period_s = turn.scan_time_s
-        before, self._before = self._before, turn
+        previous, self._previous = self._previous, turn
         self._counters.lost_samples += max(missing, 0)
         if noisy:
-            turn = self._believed(turn, before)
+            turn = self._remove_unconfirmed(turn, previous)
         self._counters.scans += 1
         return [turn]
 
-    def _believed(self, turn: Revolution, before: Revolution | None) -> Revolution:
+    def _remove_unconfirmed(self, turn: LidarRevolution, previous: LidarRevolution | None) -> LidarRevolution:
         ranges = turn.range_m.astype(np.float64)
-        agrees = confirmed(ranges, same_directions(turn, before))
+        agrees = confirmed_ranges(ranges, ranges_in_directions_of(turn, previous))
         doubtful = np.isfinite(ranges) & ~agrees
         self._counters.lost_samples += int(doubtful.sum())
         ranges[doubtful] = np.nan
-        return Revolution(
+        return LidarRevolution(
             turn.time_s, turn.angle_min_rad, turn.angle_increment_rad, turn.time_increment_s,
             turn.scan_time_s, ranges.astype(np.float32), turn.intensity,
         )  # fmt: skip
 
 
-def same_directions(turn: Revolution, before: Revolution | None) -> np.ndarray:
-    """Ranges float64 [N] of `before` in the directions of `turn`, NaN where it has none."""
+def ranges_in_directions_of(turn: LidarRevolution, previous: LidarRevolution | None) -> np.ndarray:
+    """Ranges float64 [N] of `previous` in the directions of `turn`, NaN where it has none."""
     found = np.full(len(turn.range_m), np.nan)
-    if before is None or not len(before.range_m):
+    if previous is None or not len(previous.range_m):
         return found
     angle = turn.angle_min_rad + turn.angle_increment_rad * np.arange(len(found))
-    apart = np.mod((angle - before.angle_min_rad) * np.sign(before.angle_increment_rad) + 0.1, 2.0 * np.pi)
-    index = np.round((apart - 0.1) / abs(before.angle_increment_rad)).astype(np.int64)
-    inside = (index >= 0) & (index < len(before.range_m))
-    found[inside] = before.range_m[index[inside]]
+    apart = np.mod(
+        (angle - previous.angle_min_rad) * np.sign(previous.angle_increment_rad) + 0.1, 2.0 * np.pi
+    )
+    index = np.round((apart - 0.1) / abs(previous.angle_increment_rad)).astype(np.int64)
+    inside = (index >= 0) & (index < len(previous.range_m))
+    found[inside] = previous.range_m[index[inside]]
     return found
 
 
-def _on_grid(parts: list[Samples], next_time_s: float, clockwise: bool) -> Revolution | None:
+def _resample_to_grid(parts: list[Samples], next_time_s: float, clockwise: bool) -> LidarRevolution | None:
     """The turn on the grid that fits its directions best; None if there is too little of it.
 
     A motor turns evenly, so that directions are regular up to parts of a step. Each measurement goes to
     the nearest direction of the grid (of two, the nearer one stays).
     """
     angle = np.concatenate([part.angle_deg for part in parts])
-    if len(angle) < _LEAST_SAMPLES:
+    if len(angle) < _MIN_SAMPLES:
         return None
     ranges = np.concatenate([part.range_m for part in parts])
     intensity = np.concatenate([part.intensity for part in parts])
@@ -133,9 +135,9 @@ def _on_grid(parts: list[Samples], next_time_s: float, clockwise: bool) -> Revol
         place = np.concatenate([part.number for part in parts])
         place = place - place[0]
     else:
-        place = _places(angle)
+        place = _beam_numbers(angle)
     step, first = np.polyfit(place, angle, 1) if place[-1] > 0.0 else (0.0, 0.0)
-    if step <= 0.0 or 360.0 / step * _LEAST_SHARE > len(angle):
+    if step <= 0.0 or 360.0 / step * _MIN_COVERAGE > len(angle):
         return None
     exact = (angle - first) / step
     beam = np.round(exact).astype(np.int64)
@@ -152,7 +154,7 @@ def _on_grid(parts: list[Samples], next_time_s: float, clockwise: bool) -> Revol
         time_step, time_first = np.polyfit(beam[kept], time_s[kept], 1)
     sign = -1.0 if clockwise else 1.0
     angle_min = float(np.angle(np.exp(1j * np.radians(sign * first))))
-    return Revolution(
+    return LidarRevolution(
         time_s=float(time_first),
         angle_min_rad=angle_min,
         angle_increment_rad=float(sign * np.radians(step)),
@@ -163,7 +165,7 @@ def _on_grid(parts: list[Samples], next_time_s: float, clockwise: bool) -> Revol
     )
 
 
-def _places(angle_deg: np.ndarray) -> np.ndarray:
+def _beam_numbers(angle_deg: np.ndarray) -> np.ndarray:
     """Number of each measurement, float64 [N], by even steps of the angle; gaps are counted on."""
     steps = np.diff(angle_deg)
     typical = float(np.median(steps))
@@ -173,7 +175,7 @@ def _places(angle_deg: np.ndarray) -> np.ndarray:
     return np.concatenate([[0.0], np.cumsum(np.round(steps / float(steps[near].mean())))])
 
 
-def _piece(samples: Samples, piece: slice, angle_deg: np.ndarray) -> Samples:
+def _slice(samples: Samples, piece: slice, angle_deg: np.ndarray) -> Samples:
     """A part of samples, with other angles."""
     number = None if samples.number is None else samples.number[piece]
     return Samples(

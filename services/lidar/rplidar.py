@@ -6,8 +6,8 @@ import struct
 import time
 
 from beamsplat.services.lidar import rplidar_packets as rp
-from beamsplat.services.lidar.driver import Driver
-from beamsplat.services.lidar.link import Link, LinkError, drain
+from beamsplat.services.lidar.driver import LidarDriver
+from beamsplat.services.lidar.link import DeviceLink, LinkError, drain
 from beamsplat.services.lidar.rplidar_stream import RplidarStream
 from beamsplat.services.lidar.samples import StampedScan
 
@@ -23,31 +23,31 @@ _MODELS = {
 }  # fmt: skip
 
 
-class RplidarDriver(Driver):
+class RplidarDriver(LidarDriver):
     """`mode`: "auto" takes the typical mode of the device if we can read it, else express, else standard."""
 
     bauds = (115200, 460800, 256000, 1000000)  # A1 and A2; C1; A3 and S1; S2 and S3
 
     def __init__(self, mode: str = "auto") -> None:
-        super().__init__(unchecked=mode == "standard")
+        super().__init__(no_checksum=mode == "standard")
         self.mode = mode
         self._stream: RplidarStream | None = None
-        self._byte_s = 0.0
-        self._rest = b""
+        self._byte_time_s = 0.0
+        self._leftover = b""
 
-    def start(self, link: Link) -> None:
-        self.restart()
-        self._byte_s = link.byte_s
-        link.motor(True)
+    def start(self, link: DeviceLink) -> None:
+        self.reset()
+        self._byte_time_s = link.byte_time_s
+        link.set_motor(True)
         link.write(rp.request(rp.STOP))
         time.sleep(0.01)  # the protocol asks for 1 ms; what was on its way arrives meanwhile
         drain(link)
-        info = _ask(link, rp.request(rp.GET_INFO), rp.INFO)
+        info = _request(link, rp.request(rp.GET_INFO), rp.INFO)
         model, firmware = info[0], info[2] + info[1] / 100.0
         name, self.range_max_m = _MODELS.get(model >> 4, (f"model {model:#04x}", 40.0))
         self.range_min_m = 0.05
         self.model = f"RPLIDAR {name}, firmware {firmware:.2f}"
-        status, code = struct.unpack_from("<BH", _ask(link, rp.request(rp.GET_HEALTH), rp.HEALTH))
+        status, code = struct.unpack_from("<BH", _request(link, rp.request(rp.GET_HEALTH), rp.HEALTH))
         if status == 2:
             link.write(rp.request(rp.RESET))  # the only way out of its protection stop
             raise LinkError(
@@ -55,62 +55,62 @@ class RplidarDriver(Driver):
             )
         if model >> 4 in _PWM_MODELS:
             link.write(rp.request(rp.SET_MOTOR_PWM, struct.pack("<H", _MOTOR_PWM)))
-        self._begin(link, model)
+        self._start_best_stream(link, model)
 
     def feed(self, data: bytes, at_ns: int) -> list[StampedScan]:
-        data, self._rest = self._rest + data, b""
+        data, self._leftover = self._leftover + data, b""
         parts = self._stream.feed(data)
         for part in parts:
-            self.noise.saw(part is not None)
+            self.noise.update(part is not None)
         if any(part is not None for part in parts):
-            delay_s = rp.PACKET_BYTES[self._stream.kind] * self._byte_s
-            self.clock.hear(self._stream.newest_s, at_ns - round(delay_s * 1e9))
-        return self.turns([part for part in parts if part is not None])
+            delay_s = rp.PACKET_BYTES[self._stream.kind] * self._byte_time_s
+            self.clock.update(self._stream.newest_s, at_ns - round(delay_s * 1e9))
+        return self.stamp_revolutions([part for part in parts if part is not None])
 
-    def stop(self, link: Link) -> None:
+    def stop(self, link: DeviceLink) -> None:
         link.write(rp.request(rp.STOP))
-        link.motor(False)
+        link.set_motor(False)
 
-    def _begin(self, link: Link, model: int) -> None:
+    def _start_best_stream(self, link: DeviceLink, model: int) -> None:
         """Starts the first of the possible streams that the device agrees to."""
         attempts: list[tuple[bytes, float | None]] = []
         if self.mode == "auto" and model >> 4 not in (1,):  # the A1 knows no modes
-            attempts += _typical(link)
+            attempts += _typical_mode(link)
         if self.mode in ("auto", "express"):
             attempts.append((rp.request(rp.EXPRESS_SCAN, bytes(5)), None))
         if self.mode in ("auto", "standard"):
             attempts.append((rp.request(rp.SCAN), None))
         for message, sample_s in attempts:
-            kind, self._rest = _start(link, message)
+            kind, self._leftover = _start_stream(link, message)
             if kind is not None:
                 self._stream = RplidarStream(kind, sample_s or self._rate(link, kind), self.counters)
                 return
         raise LinkError(f'{self.model} starts no stream in mode {self.mode!r}; try mode = "standard"')
 
-    def _rate(self, link: Link, kind: int) -> float:
+    def _rate(self, link: DeviceLink, kind: int) -> float:
         return _SAMPLE_S[kind]
 
 
-def _typical(link: Link) -> list[tuple[bytes, float | None]]:
+def _typical_mode(link: DeviceLink) -> list[tuple[bytes, float | None]]:
     """The mode SLAMTEC thinks best for this device, if its packets are of a kind that we read."""
-    mode = _configuration(link, rp.CONF_TYPICAL_MODE)
+    mode = _read_configuration(link, rp.CONF_TYPICAL_MODE)
     if mode is None or len(mode) < 2:
         return []
     number = mode[:2]
-    kind = _configuration(link, rp.CONF_ANSWER_TYPE, number)
+    kind = _read_configuration(link, rp.CONF_ANSWER_TYPE, number)
     if not kind or kind[0] not in (rp.CAPSULED, rp.DENSE, rp.HQ, rp.ULTRA):
         return []
-    sample_us = _configuration(link, rp.CONF_US_PER_SAMPLE, number)
+    sample_us = _read_configuration(link, rp.CONF_US_PER_SAMPLE, number)
     sample_s = struct.unpack_from("<I", sample_us)[0] / 256e6 if sample_us and len(sample_us) >= 4 else None
     # As SLAMTEC's SDK asks: mode 1 is what a device does when asked for no mode in particular.
     working_mode = number[:1] if number[0] > 1 else b"\0"
     return [(rp.request(rp.EXPRESS_SCAN, working_mode + bytes(4)), sample_s)]
 
 
-def _configuration(link: Link, entry: int, payload: bytes = b"") -> bytes | None:
+def _read_configuration(link: DeviceLink, entry: int, payload: bytes = b"") -> bytes | None:
     """An entry of the device's configuration; None from old firmware, which does not answer."""
     try:
-        answer = _ask(
+        answer = _request(
             link, rp.request(rp.GET_LIDAR_CONF, struct.pack("<I", entry) + payload), rp.CONF, tries=2
         )
     except LinkError:
@@ -118,7 +118,7 @@ def _configuration(link: Link, entry: int, payload: bytes = b"") -> bytes | None
     return answer[4:] if answer[:4] == struct.pack("<I", entry) else None
 
 
-def _ask(link: Link, message: bytes, kind: int, tries: int = _TRIES) -> bytes:
+def _request(link: DeviceLink, message: bytes, kind: int, tries: int = _TRIES) -> bytes:
     """The data of a single response."""
     for _ in range(tries):
         link.write(message)
@@ -133,7 +133,7 @@ def _ask(link: Link, message: bytes, kind: int, tries: int = _TRIES) -> bytes:
     raise LinkError("no RPLIDAR answers at this baud rate")
 
 
-def _start(link: Link, message: bytes) -> tuple[int | None, bytes]:
+def _start_stream(link: DeviceLink, message: bytes) -> tuple[int | None, bytes]:
     """Kind of the stream that a request has started, and its first bytes; None if none of ours started."""
     for _ in range(_TRIES):
         link.write(message)

@@ -37,7 +37,7 @@ def request(command: int, payload: bytes = b"") -> bytes:
     return body + bytes((reduce(xor, body),))
 
 
-class Descriptor(NamedTuple):
+class ResponseDescriptor(NamedTuple):
     """What announces a response (2.3)."""
 
     length: int  # of each data packet
@@ -45,33 +45,35 @@ class Descriptor(NamedTuple):
     kind: int
 
 
-def find_descriptor(data: bytes, kinds: tuple[int, ...]) -> tuple[Descriptor, int] | None:
+def find_descriptor(data: bytes, kinds: tuple[int, ...]) -> tuple[ResponseDescriptor, int] | None:
     """The first descriptor of one of `kinds` in `data`, and where its data begin; None if there is none."""
     at = data.find(b"\xa5\x5a")
     while at >= 0 and at + DESCRIPTOR_BYTES <= len(data):
         word, kind = struct.unpack_from("<IB", data, at + 2)
         if kind in kinds:
-            return Descriptor(word & 0x3FFFFFFF, word >> 30 == 1, kind), at + DESCRIPTOR_BYTES
+            return ResponseDescriptor(word & 0x3FFFFFFF, word >> 30 == 1, kind), at + DESCRIPTOR_BYTES
         at = data.find(b"\xa5\x5a", at + 1)
     return None
 
 
-class Measured(NamedTuple):
+class PacketSamples(NamedTuple):
     """Samples of a packet. Angles of capsules are relative to what the next capsule's start says."""
 
     start_deg: float
     first: bool  # the device says that a new stream begins here
-    offset_deg: np.ndarray  # float64 [N]: capsules: taken off the evenly spread angle; HQ: the angle itself
+    offset_deg: (
+        np.ndarray
+    )  # float64 [N]: capsules: taken off the evenly sample_times_s angle; HQ: the angle itself
     range_m: np.ndarray  # float64 [N], NaN = invalid
     quality: np.ndarray  # float64 [N]
 
 
-def capsule_begins(packet: bytes) -> bool:
+def has_capsule_header(packet: bytes) -> bool:
     """Capsules start with the nibbles A and 5; the other halves are the checksum."""
     return packet[0] >> 4 == 0xA and packet[1] >> 4 == 0x5
 
 
-def capsule_whole(packet: bytes) -> bool:
+def capsule_checksum_ok(packet: bytes) -> bool:
     """XOR of everything behind the two sync bytes."""
     checksum = int(np.bitwise_xor.reduce(np.frombuffer(packet, np.uint8, offset=2)))
     return checksum == (packet[0] & 0xF) | (packet[1] & 0xF) << 4
@@ -82,21 +84,23 @@ def start_deg(packet: bytes) -> float:
     return (struct.unpack_from("<H", packet, 2)[0] & 0x7FFF) / 64.0
 
 
-def parse_capsule(packet: bytes) -> Measured:
+def parse_capsule(packet: bytes) -> PacketSamples:
     """32 samples in 16 cabins of two distances (q2 without its fraction) and two angle offsets (q3)."""
     word = struct.unpack_from("<H", packet, 2)[0]
     cabins = np.frombuffer(packet, [("d", "<u2", 2), ("angles", "u1")], count=16, offset=4)
     mm = (cabins["d"] >> 2).ravel().astype(np.float64)
     low = np.stack([cabins["angles"] & 0xF, cabins["angles"] >> 4], axis=1).astype(np.int64)
     offset_q3 = low | (cabins["d"].astype(np.int64) & 0x3) << 4
-    return Measured((word & 0x7FFF) / 64.0, bool(word >> 15), offset_q3.ravel() / 8.0, _metres(mm), mm * 0.0)
+    return PacketSamples(
+        (word & 0x7FFF) / 64.0, bool(word >> 15), offset_q3.ravel() / 8.0, _metres(mm), mm * 0.0
+    )
 
 
-def parse_dense(packet: bytes) -> Measured:
+def parse_dense(packet: bytes) -> PacketSamples:
     """40 distances in mm at even angles."""
     word = struct.unpack_from("<H", packet, 2)[0]
     mm = np.frombuffer(packet, "<u2", count=40, offset=4).astype(np.float64)
-    return Measured((word & 0x7FFF) / 64.0, bool(word >> 15), np.zeros(40), _metres(mm), np.zeros(40))
+    return PacketSamples((word & 0x7FFF) / 64.0, bool(word >> 15), np.zeros(40), _metres(mm), np.zeros(40))
 
 
 # Steps of the variable bit scale: where a code's range begins, what distance (mm) that is, shift within it.
@@ -105,7 +109,7 @@ _SCALE_MM = np.array([0, 1 << 9, 1 << 11, 1 << 12, 1 << 14])
 _SCALE_SHIFT = np.array([0, 1, 2, 3, 4])
 
 
-def parse_ultra(packet: bytes, following: bytes | None) -> Measured:
+def parse_ultra(packet: bytes, following: bytes | None) -> PacketSamples:
     """96 samples in 32 cabins: a distance of variable scale, and two told by their difference from it and
     from the next cabin's, for which the packet that follows is needed (None: the last sample is lost).
 
@@ -128,7 +132,7 @@ def parse_ultra(packet: bytes, following: bytes | None) -> Measured:
         third[-1] = 0
         second[-1] = second[-1] if major[-1] else 0
     distance = np.stack([major, second, third], axis=1).ravel().astype(np.float64)
-    return Measured(
+    return PacketSamples(
         (word & 0x7FFF) / 64.0,
         bool(word >> 15),
         _ultra_offset_deg(distance),
@@ -146,32 +150,32 @@ def _ultra_offset_deg(mm: np.ndarray) -> np.ndarray:
     return np.degrees(radians_q16 / 65536.0)
 
 
-def hq_begins(packet: bytes) -> bool:
+def has_hq_header(packet: bytes) -> bool:
     """HQ packets start with the byte A5."""
     return packet[0] == 0xA5
 
 
-def hq_whole(packet: bytes) -> bool:
+def hq_checksum_ok(packet: bytes) -> bool:
     """CRC-32 (IEEE 802.3) of all before it, filled with zeros to a multiple of four."""
     body = packet[:-4]
     return zlib.crc32(body + bytes(-len(body) % 4)) == struct.unpack_from("<I", packet, len(body))[0]
 
 
-def parse_hq(packet: bytes) -> Measured:
+def parse_hq(packet: bytes) -> PacketSamples:
     """96 samples, each with its own angle in units of 90 / 2^14 degrees and distance in mm / 4."""
     nodes = np.frombuffer(packet, _HQ_NODE, count=96, offset=9)
     angle = nodes["angle_q14"] * (90.0 / 16384.0)
     mm = nodes["mm_q2"] / 4.0
     first = bool(nodes["flag"][0] & 1)
-    return Measured(float(angle[0]), first, angle, _metres(mm), nodes["quality"].astype(np.float64))
+    return PacketSamples(float(angle[0]), first, angle, _metres(mm), nodes["quality"].astype(np.float64))
 
 
-def node_begins(packet: bytes) -> bool:
+def has_node_header(packet: bytes) -> bool:
     """Two bits of the first byte must differ and one of the second be set: that is all there is to check."""
     return (packet[0] ^ packet[0] >> 1) & 1 == 1 and packet[1] & 1 == 1
 
 
-class Node(NamedTuple):
+class MeasurementNode(NamedTuple):
     """One sample of the standard scan."""
 
     first: bool  # of a turn
@@ -180,11 +184,11 @@ class Node(NamedTuple):
     quality: float
 
 
-def parse_node(packet: bytes) -> Node:
+def parse_node(packet: bytes) -> MeasurementNode:
     """One sample: quality, angle in degrees / 64, distance in mm / 4 (4.2)."""
     angle, distance = (packet[1] | packet[2] << 8) >> 1, packet[3] | packet[4] << 8
     range_m = distance / 4000.0 if distance else math.nan
-    return Node(bool(packet[0] & 1), angle / 64.0, range_m, float(packet[0] >> 2))
+    return MeasurementNode(bool(packet[0] & 1), angle / 64.0, range_m, float(packet[0] >> 2))
 
 
 def _metres(mm: np.ndarray) -> np.ndarray:

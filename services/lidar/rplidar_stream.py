@@ -9,36 +9,38 @@ from __future__ import annotations
 import numpy as np
 
 from beamsplat.services.lidar import rplidar_packets as rp
-from beamsplat.services.lidar.driver import StartChain
-from beamsplat.services.lidar.framing import Counters, Framer
+from beamsplat.services.lidar.driver import StartAngleGate
+from beamsplat.services.lidar.framing import Framer, StreamCounters
 from beamsplat.services.lidar.samples import Samples
 
-_NODE_SLACK_DEG = 2.0  # a node that is this far from where it must be is not believed
-_NODES_IN_A_ROW = 16  # with three bits to check, so many must fit before they are
+_NODE_TOLERANCE_DEG = 2.0  # a node that is this far from where it must be is not believed
+_CONFIRM_NODES = 16  # with three bits to check, so many must fit before they are
 
 
 class RplidarStream:
     """One run of measurement packets of one kind. `feed` yields None for a bad packet."""
 
-    def __init__(self, kind: int, sample_s: float, counters: Counters) -> None:
+    def __init__(self, kind: int, sample_s: float, counters: StreamCounters) -> None:
         self.kind = kind
         self._sample_s = sample_s
         self._samples = rp.SAMPLES[kind]
         checks = {
-            rp.STANDARD: (rp.node_begins, lambda packet: True, _NODES_IN_A_ROW),
-            rp.CAPSULED: (rp.capsule_begins, rp.capsule_whole, 3),
-            rp.DENSE: (rp.capsule_begins, rp.capsule_whole, 3),
-            rp.ULTRA: (rp.capsule_begins, rp.capsule_whole, 3),
-            rp.HQ: (rp.hq_begins, rp.hq_whole, 2),
+            rp.STANDARD: (rp.has_node_header, lambda packet: True, _CONFIRM_NODES),
+            rp.CAPSULED: (rp.has_capsule_header, rp.capsule_checksum_ok, 3),
+            rp.DENSE: (rp.has_capsule_header, rp.capsule_checksum_ok, 3),
+            rp.ULTRA: (rp.has_capsule_header, rp.capsule_checksum_ok, 3),
+            rp.HQ: (rp.has_hq_header, rp.hq_checksum_ok, 2),
         }
-        begins, whole, in_a_row = checks[kind]
-        followed = kind in (rp.CAPSULED, rp.ULTRA, rp.DENSE)  # whose checksum is weak
-        self._framer = Framer(rp.PACKET_BYTES[kind], begins, whole, counters, in_a_row, followed)
+        has_header, checksum_ok, confirm_packets = checks[kind]
+        check_next_header = kind in (rp.CAPSULED, rp.ULTRA, rp.DENSE)  # whose checksum is weak
+        self._framer = Framer(
+            rp.PACKET_BYTES[kind], has_header, checksum_ok, counters, confirm_packets, check_next_header
+        )
         self._counters = counters
         self._skipped = counters.skipped_bytes
-        self._chain = StartChain()
-        self._held: tuple[bytes, int] | None = None  # waits for the next one's start angle
-        self._taken = 0  # samples so far, lost ones included
+        self._start_gate = StartAngleGate()
+        self._pending_capsule: tuple[bytes, int] | None = None  # waits for the next one's start angle
+        self._sample_count = 0  # samples so far, lost ones included
         self._node_deg: float | None = None
         self._node_step_deg = 0.0
         self._node_gap = 0
@@ -46,17 +48,17 @@ class RplidarStream:
     @property
     def newest_s(self) -> float:
         """Device time of the newest sample that has come, also in a packet that is not yet believed."""
-        return (self._taken + self._framer.pending * self._samples) * self._sample_s
+        return (self._sample_count + self._framer.pending * self._samples) * self._sample_s
 
     def feed(self, data: bytes) -> list[Samples | None]:
         """Samples that `data` completes; None for each packet that was bad."""
         found: list[Samples | None] = []
         nodes: list[tuple[float, float, float, int]] = []
         for packet in self._framer.feed(data):
-            searched = self._while_searching()
+            searched = self._count_skipped_samples()
             if searched:
-                found += self._release(self._chain.typical_deg, None)
-            self._taken += self._samples + searched
+                found += self._decode_pending(self._start_gate.median_step_deg, None)
+            self._sample_count += self._samples + searched
             if self.kind == rp.STANDARD:
                 self._node(packet, nodes)
                 if packet is None:
@@ -70,46 +72,48 @@ class RplidarStream:
             found.append(Samples(angle, range_m, quality, number * self._sample_s, number))
         return found
 
-    def _while_searching(self) -> int:
+    def _count_skipped_samples(self) -> int:
         """Samples that went by in bytes that were skipped."""
         skipped, self._skipped = self._counters.skipped_bytes - self._skipped, self._counters.skipped_bytes
         packets = round(skipped / rp.PACKET_BYTES[self.kind])
-        self._chain.missed(packets)
+        self._start_gate.skip_packets(packets)
         return packets * self._samples
 
     def _capsule(self, packet: bytes | None) -> list[Samples | None]:
         """A capsule's angles are known with the start of the next, or from how fast it turned before."""
-        typical = self._chain.typical_deg
+        typical = self._start_gate.median_step_deg
         if packet is None:
-            self._chain.missed()
-            return [*self._release(typical, None), None]
+            self._start_gate.skip_packets()
+            return [*self._decode_pending(typical, None), None]
         start_deg = rp.start_deg(packet)
-        if not (start_deg < 360.0 and self._chain.takes(start_deg)):
-            return self._release(typical, None)
+        if not (start_deg < 360.0 and self._start_gate.accepts(start_deg)):
+            return self._decode_pending(typical, None)
         found: list[Samples | None] = []
-        if self._held is not None and typical is not None:  # else nobody knows how many lie between
-            found = self._release((start_deg - rp.start_deg(self._held[0])) % 360.0, packet)
-        self._held = packet, self._taken
+        if (
+            self._pending_capsule is not None and typical is not None
+        ):  # else nobody knows how many lie between
+            found = self._decode_pending((start_deg - rp.start_deg(self._pending_capsule[0])) % 360.0, packet)
+        self._pending_capsule = packet, self._sample_count
         return found
 
-    def _release(self, span_deg: float | None, following: bytes | None) -> list[Samples | None]:
+    def _decode_pending(self, span_deg: float | None, following: bytes | None) -> list[Samples | None]:
         """Samples of the capsule that waited, which turned by `span_deg`."""
-        held, self._held = self._held, None
-        if held is None or span_deg is None:
+        pending, self._pending_capsule = self._pending_capsule, None
+        if pending is None or span_deg is None:
             return []
-        packet, last = held
+        packet, last = pending
         if self.kind == rp.ULTRA:
             measured = rp.parse_ultra(packet, following)
         else:
             measured = rp.parse_capsule(packet) if self.kind == rp.CAPSULED else rp.parse_dense(packet)
         even = span_deg / self._samples * np.arange(self._samples)
-        return [self._numbered(measured.start_deg + even - measured.offset_deg, measured, last)]
+        return [self._with_sample_numbers(measured.start_deg + even - measured.offset_deg, measured, last)]
 
     def _hq(self, packet: bytes | None) -> Samples | None:
         if packet is None:
             return None
         measured = rp.parse_hq(packet)
-        return self._numbered(measured.offset_deg, measured, self._taken)
+        return self._with_sample_numbers(measured.offset_deg, measured, self._sample_count)
 
     def _node(self, packet: bytes | None, nodes: list[tuple[float, float, float, int]]) -> None:
         """A node has no checksum: its angle must be where the motor's turning puts it."""
@@ -124,11 +128,11 @@ class RplidarStream:
         if last is None:
             return
         moved = (node.angle_deg - last + 180.0) % 360.0 - 180.0
-        if abs(moved - gap * self._node_step_deg) > _NODE_SLACK_DEG:
+        if abs(moved - gap * self._node_step_deg) > _NODE_TOLERANCE_DEG:
             return
         self._node_step_deg += 0.02 * (moved / gap - self._node_step_deg)
-        nodes.append((node.angle_deg, node.range_m, node.quality, self._taken))
+        nodes.append((node.angle_deg, node.range_m, node.quality, self._sample_count))
 
-    def _numbered(self, angle_deg: np.ndarray, measured: rp.Measured, last: int) -> Samples:
+    def _with_sample_numbers(self, angle_deg: np.ndarray, measured: rp.PacketSamples, last: int) -> Samples:
         number = last - np.arange(self._samples - 1, -1, -1, dtype=np.float64)
         return Samples(angle_deg, measured.range_m, measured.quality, number * self._sample_s, number)

@@ -22,7 +22,7 @@ class Samples:
 
 
 @dataclass(frozen=True)
-class Revolution:
+class LidarRevolution:
     """One turn on a regular grid: beam i at angle_min + i * increment, i * time_increment after the first."""
 
     time_s: float  # of the first beam, on the device's clock
@@ -39,6 +39,6 @@ class StampedScan:
     """A revolution with its time on the host's clock and the limits of its device."""
 
     stamp_ns: int
-    revolution: Revolution
+    revolution: LidarRevolution
     range_min_m: float
     range_max_m: float

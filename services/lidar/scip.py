@@ -17,7 +17,7 @@ import numpy as np
 
 BLOCK = 64
 _OFFSET = 0x30
-_LEAST_HEAD_SHARE = 0.7  # of a reply's first bytes must be as expected
+_MIN_HEADER_MATCH = 0.7  # of a reply's first bytes must be as expected
 
 
 def checksum(text: bytes) -> int:
@@ -44,7 +44,7 @@ def parameters(reply: bytes) -> dict[str, str]:
     return found
 
 
-class Geometry(NamedTuple):
+class ScipGeometry(NamedTuple):
     """What PP tells: which steps are measured, how fine, how far."""
 
     model: str
@@ -57,7 +57,7 @@ class Geometry(NamedTuple):
     period_s: float
 
     @staticmethod
-    def of(values: dict[str, str]) -> Geometry:
+    def from_parameters(values: dict[str, str]) -> ScipGeometry:
         """From the lines of PP.
 
         Raises:
@@ -70,7 +70,7 @@ class Geometry(NamedTuple):
         dmin, dmax, ares, amin, amax, afrt, rpm = (int(values[name]) for name in names)
         if not (ares > 0 and 0 <= amin < amax and rpm > 0 and 0 <= dmin < dmax):
             raise ValueError(f"the reply to PP makes no sense: {values}")
-        return Geometry(
+        return ScipGeometry(
             values.get("MODL", "Hokuyo").partition("(")[0], dmin / 1e3, dmax / 1e3, ares, amin, amax, afrt,
             60.0 / rpm,
         )  # fmt: skip
@@ -81,10 +81,10 @@ class Geometry(NamedTuple):
         return self.last_step - self.first_step + 1
 
 
-class ScanReply:
+class ScipScanReply:
     """How the replies to one continuous MD or ME look."""
 
-    def __init__(self, geometry: Geometry, intensity: bool) -> None:
+    def __init__(self, geometry: ScipGeometry, intensity: bool) -> None:
         self.geometry = geometry
         self._per_step = 6 if intensity else 3
         name = b"ME" if intensity else b"MD"
@@ -97,10 +97,10 @@ class ScanReply:
         self._data_at = self._time_at + 6
         self.length = self._data_at + self._characters + 2 * blocks + 1
 
-    def begins(self, reply: bytes) -> bool:
+    def has_header(self, reply: bytes) -> bool:
         """Whether it starts as a reply, up to a few wrong bytes."""
         same = sum(a == b for a, b in zip(self._head, reply))
-        return same >= _LEAST_HEAD_SHARE * len(self._head)
+        return same >= _MIN_HEADER_MATCH * len(self._head)
 
     def time_ms(self, reply: bytes) -> int | None:
         """The device's 24 bit clock; None if its sum is wrong."""

@@ -13,7 +13,7 @@ from beamsplat.common.recording.picture import is_whole
 from beamsplat.services.camera.config import CameraConfig, NoCameraConfig
 from beamsplat.services.camera.jpeg import is_intact
 from beamsplat.services.camera.node import CameraNode, NoCamera
-from tests.services.lidar.test_live import Running
+from tests.services.lidar.test_live import RunningSource
 
 RIG = """
 [camera]
@@ -38,7 +38,7 @@ def jpeg(number, width=64, height=48):
     return cv2.imencode(".jpg", cv2.GaussianBlur(noise, (0, 0), 2.0))[1].tobytes()
 
 
-class Camera:
+class EmulatedCamera:
     """A network camera: MJPEG over HTTP, with faults to switch on."""
 
     def __init__(self):
@@ -104,46 +104,52 @@ def rig(tmp_path):
     return path
 
 
-def _pictures(running):
-    return [(at, m) for at, m in running.said if type(m).__name__ == "Image"]
+def _images(running):
+    return [(at, m) for at, m in running.messages if type(m).__name__ == "Image"]
 
 
 def test_jpegs_go_through_byte_for_byte_behind_the_calibration(rig):
-    with Camera() as camera, Running(CameraNode(CameraConfig(source=camera.url, rig=rig))) as running:
-        running.wait(lambda: len(_pictures(running)) >= 5)
+    with (
+        EmulatedCamera() as camera,
+        RunningSource(CameraNode(CameraConfig(source=camera.url, rig=rig))) as running,
+    ):
+        running.wait(lambda: len(_images(running)) >= 5)
     sent = set(camera.sent)
-    first = running.said[0][1]
+    first = running.messages[0][1]
     assert (type(first).__name__, first.camera.width_px) == ("Rig", 64)
-    for _, image in _pictures(running):
+    for _, image in _images(running):
         assert bytes(image.data) in sent
         assert (image.width_px, image.height_px, image.encoding) == (64, 48, "jpeg")
-    stamps = [image.stamp_ns for _, image in _pictures(running)]
+    stamps = [image.stamp_ns for _, image in _images(running)]
     assert sorted(set(stamps)) == stamps
     assert abs(time.time_ns() - stamps[-1]) < 60e9
     assert "Hz" in running.node.detail
 
 
 def test_another_size_than_the_calibrations_is_refused_and_said(rig):
-    with Camera() as camera, Running(CameraNode(CameraConfig(source=camera.url, rig=rig))) as running:
-        running.wait(lambda: len(_pictures(running)) >= 2)
+    with (
+        EmulatedCamera() as camera,
+        RunningSource(CameraNode(CameraConfig(source=camera.url, rig=rig))) as running,
+    ):
+        running.wait(lambda: len(_images(running)) >= 2)
         camera.size = (32, 24)
-        running.wait(lambda: "refused (32x24 px, the calibration is for 64x48)" in running.node.detail)
+        running.wait(lambda: "rejected (32x24 px, the calibration is for 64x48)" in running.node.detail)
         camera.size = (64, 48)
-        before = len(_pictures(running))
-        running.wait(lambda: len(_pictures(running)) >= before + 2)
-    assert {(m.width_px, m.height_px) for _, m in _pictures(running)} == {(64, 48)}
+        before = len(_images(running))
+        running.wait(lambda: len(_images(running)) >= before + 2)
+    assert {(m.width_px, m.height_px) for _, m in _images(running)} == {(64, 48)}
 
 
 def test_a_slow_camera_is_said_to_be_slow(rig):
     config = CameraConfig(source="", rig=rig, rate_hz=25.0)
-    with Camera() as camera:
+    with EmulatedCamera() as camera:
         camera.rate_hz = 2.0
         node = CameraNode(config.model_copy(update={"source": camera.url}))
-        with Running(node) as running:
-            running.wait(lambda: "SLOW, 25 Hz were asked for" in node.detail)
+        with RunningSource(node) as running:
+            running.wait(lambda: "SLOW, 25 Hz requested" in node.detail)
             camera.rate_hz = 25.0
             running.wait(lambda: "SLOW" not in node.detail and "Hz" in node.detail)
-    assert "opened again" not in node.detail  # 2 Hz is slow, not gone
+    assert "reopened" not in node.detail  # 2 Hz is slow, not gone
 
 
 def test_broken_pictures_are_not_passed_on(rig):
@@ -152,54 +158,54 @@ def test_broken_pictures_are_not_passed_on(rig):
     def cut(data):
         return data[: rng.integers(1, len(data))] if rng.random() < 0.5 else data
 
-    with Camera() as camera:
+    with EmulatedCamera() as camera:
         camera.damage = cut
         node = CameraNode(CameraConfig(source=camera.url, rig=rig))
-        with Running(node) as running:
-            running.wait(lambda: len(_pictures(running)) >= 10 and "refused (broken)" in node.detail)
-    for _, image in _pictures(running):
+        with RunningSource(node) as running:
+            running.wait(lambda: len(_images(running)) >= 10 and "rejected (broken)" in node.detail)
+    for _, image in _images(running):
         assert cv2.imdecode(np.asarray(image.data), cv2.IMREAD_COLOR).shape == (48, 64, 3)
         assert is_whole(bytes(image.data))
         assert is_intact(bytes(image.data))
 
 
 def test_a_camera_that_vanishes_is_opened_again(rig):
-    with Camera() as camera:
+    with EmulatedCamera() as camera:
         node = CameraNode(CameraConfig(source=camera.url, rig=rig))
-        with Running(node) as running:
-            running.wait(lambda: len(_pictures(running)) >= 2)
+        with RunningSource(node) as running:
+            running.wait(lambda: len(_images(running)) >= 2)
             camera.unplug()
-            running.wait(lambda: "LOST" in node.detail or "NOT THERE" in node.detail)
+            running.wait(lambda: "DISCONNECTED" in node.detail or "NOT CONNECTED" in node.detail)
             time.sleep(0.5)
-            before = len(_pictures(running))
+            before = len(_images(running))
             camera.plug()
-            running.wait(lambda: len(_pictures(running)) >= before + 2)
-            running.wait(lambda: "opened again 1 times" in node.detail)
-    stamps = [image.stamp_ns for _, image in _pictures(running)]
+            running.wait(lambda: len(_images(running)) >= before + 2)
+            running.wait(lambda: "reopened 1 times" in node.detail)
+    stamps = [image.stamp_ns for _, image in _images(running)]
     assert sorted(set(stamps)) == stamps
 
 
 def test_a_camera_that_hangs_is_given_up(rig):
-    with Camera() as camera:
+    with EmulatedCamera() as camera:
         node = CameraNode(CameraConfig(source=camera.url, rig=rig, silence_s=0.5))
-        with Running(node) as running:
-            running.wait(lambda: len(_pictures(running)) >= 2)
+        with RunningSource(node) as running:
+            running.wait(lambda: len(_images(running)) >= 2)
             camera.rate_hz = 0.05
-            running.wait(lambda: "LOST: no picture for 0.5 s" in node.detail)
+            running.wait(lambda: "DISCONNECTED: no image for 0.5 s" in node.detail)
 
 
 def test_the_hosts_time_of_day_moves_no_stamp(rig, monkeypatch):
     wall = {"offset": 0}
     real = time.time_ns
     monkeypatch.setattr("time.time_ns", lambda: real() + wall["offset"])
-    with Camera() as camera:
+    with EmulatedCamera() as camera:
         node = CameraNode(CameraConfig(source=camera.url, rig=rig))
-        with Running(node) as running:
+        with RunningSource(node) as running:
             for offset_h in (0, 1, -1):
                 wall["offset"] = offset_h * 3600 * 10**9
-                before = len(_pictures(running))
-                running.wait(lambda enough=before + 4: len(_pictures(running)) >= enough)
-    stamps = np.array([image.stamp_ns for _, image in _pictures(running)])
+                before = len(_images(running))
+                running.wait(lambda enough=before + 4: len(_images(running)) >= enough)
+    stamps = np.array([image.stamp_ns for _, image in _images(running)])
     assert np.diff(stamps).min() > 0
     assert np.diff(stamps).max() < 5e9
 
@@ -216,7 +222,7 @@ def test_a_video_file_plays_to_its_end(tmp_path, codec):
     started = time.monotonic()
     images = [item.message for item in node.source() if item is not None]
     assert time.monotonic() - started > 0.4  # at its own speed
-    assert len(images) + node._reader.overtaken >= 11
+    assert len(images) + node._reader.dropped >= 11
     assert len(images) >= 8
     assert "at its end" in node.detail
     if codec == "MJPG":  # undecoded: each picture's bytes stand in the file as they are
@@ -230,9 +236,9 @@ def test_what_is_not_there_is_said(tmp_path, rig):
         ("http://127.0.0.1:9/video", "does not answer"),
     ):  # fmt: skip
         node = CameraNode(CameraConfig(source=source))
-        with Running(node) as running:
+        with RunningSource(node) as running:
             running.wait(lambda n=node, s=said: s in n.detail)
-            assert "NOT THERE" in node.detail
+            assert "NOT CONNECTED" in node.detail
             assert "NO CALIBRATION" in node.detail
     rig.write_text(RIG[RIG.index("[lidar") :])
     with pytest.raises(UserError, match="has no \\[camera\\]"):

@@ -276,7 +276,7 @@ def corrupt(data, rng, share):
     return array.tobytes()
 
 
-class Plugged:
+class EmulatedPort:
     """A device in real time behind a pseudo-terminal that comes and goes, or behind a TCP port."""
 
     def __init__(self, device, path=None, corruption=0.0, seed=0):

@@ -6,7 +6,7 @@ from tests.services.lidar.devices import corrupt, room_range_m
 
 
 class DirectLink:
-    byte_s = 0.0
+    byte_time_s = 0.0
 
     def __init__(self, device):
         self._device = device
@@ -19,14 +19,14 @@ class DirectLink:
         data, self._waiting = self._waiting, b""
         return data
 
-    def motor(self, on):
+    def set_motor(self, on):
         pass
 
     def close(self):
         pass
 
 
-def drive(driver, device, seconds, corruption=0.0, seed=0, chunk=None):
+def run_device(driver, device, seconds, corruption=0.0, seed=0, chunk=None):
     """Scans of so many seconds of the device; arrivals are late by a few random milliseconds."""
     rng = np.random.default_rng(seed)
     driver.start(DirectLink(device))
@@ -40,7 +40,7 @@ def drive(driver, device, seconds, corruption=0.0, seed=0, chunk=None):
     return scans
 
 
-def errors_m(scans):
+def range_errors_m(scans):
     """Differences of all measured ranges from the room's walls."""
     found = [np.zeros(0)]
     for scan in scans:

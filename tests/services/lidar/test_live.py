@@ -14,21 +14,21 @@ from beamsplat.common.zenoh.bus import Bus, open_router, open_session
 from beamsplat.services.lidar.config import HokuyoConfig, LidarConfig, RplidarConfig
 from beamsplat.services.lidar.link import LinkError, open_link
 from beamsplat.services.lidar.node import HokuyoNode, LdrobotNode, RplidarNode
-from tests.services.lidar.devices import Hokuyo, Ld19, Plugged, Rplidar, room_range_m
+from tests.services.lidar.devices import EmulatedPort, Hokuyo, Ld19, Rplidar, room_range_m
 
 
-class Running:
+class RunningSource:
     """A source in a thread, without a bus; what it says with the time it said it."""
 
     def __init__(self, node):
-        self.node, self.said = node, []
+        self.node, self.messages = node, []
         self._stop = False
         self._thread = threading.Thread(target=self._run, daemon=True)
 
     def _run(self):
         for item in self.node.source():
             if item is not None:
-                self.said.append((time.monotonic(), item.message))
+                self.messages.append((time.monotonic(), item.message))
             if self._stop:
                 return
 
@@ -60,17 +60,17 @@ def _right(scan, allowed=0.06):
 def test_scans_over_a_link_with_wrong_bytes(tmp_path, kind):
     path = None if kind == "hokuyo" else str(tmp_path / "lidar")
     device = {"ldrobot": Ld19, "rplidar": Rplidar, "hokuyo": Hokuyo}[kind]()
-    with Plugged(device, path, corruption=0.01) as plugged:
+    with EmulatedPort(device, path, corruption=0.01) as plugged:
         node = {
             "ldrobot": lambda: LdrobotNode(LidarConfig(device=path)),
             "rplidar": lambda: RplidarNode(RplidarConfig(device=path)),
             "hokuyo": lambda: HokuyoNode(HokuyoConfig(device=f"tcp/127.0.0.1:{plugged.port}")),
         }[kind]()
-        with Running(node) as running:
-            running.wait(lambda: len(running.said) >= 6)
-    for _, scan in running.said:
+        with RunningSource(node) as running:
+            running.wait(lambda: len(running.messages) >= 6)
+    for _, scan in running.messages:
         _right(scan)
-    stamps = [scan.stamp_ns for _, scan in running.said]
+    stamps = [scan.stamp_ns for _, scan in running.messages]
     assert sorted(set(stamps)) == stamps
     assert abs(time.time_ns() - stamps[-1]) < 60e9
     assert "bad" in node.detail
@@ -84,23 +84,23 @@ def test_unplugged_and_plugged_in_again(tmp_path, kind):
         "ldrobot": lambda: LdrobotNode(LidarConfig(device=path)),
         "rplidar": lambda: RplidarNode(RplidarConfig(device=path)),
     }[kind]()
-    with Running(node) as running:
-        running.wait(lambda: "NOT THERE" in node.detail)
+    with RunningSource(node) as running:
+        running.wait(lambda: "NOT CONNECTED" in node.detail)
         assert "No such file" in node.detail
-        with Plugged(device, path) as plugged:
-            running.wait(lambda: len(running.said) >= 3)
+        with EmulatedPort(device, path) as plugged:
+            running.wait(lambda: len(running.messages) >= 3)
             plugged.unplug()
-            running.wait(lambda: "LOST" in node.detail or "NOT THERE" in node.detail)
+            running.wait(lambda: "DISCONNECTED" in node.detail or "NOT CONNECTED" in node.detail)
             time.sleep(0.7)
-            before = len(running.said)
+            before = len(running.messages)
             plugged.plug()
             again = time.monotonic()
-            running.wait(lambda: len(running.said) >= before + 2)
+            running.wait(lambda: len(running.messages) >= before + 2)
             # Whoever plugs it in sees data again within 2 s; twice that on a machine busy with other tests.
-            assert running.said[before][0] - again < 4.0
-    stamps = [scan.stamp_ns for _, scan in running.said]
+            assert running.messages[before][0] - again < 4.0
+    stamps = [scan.stamp_ns for _, scan in running.messages]
     assert sorted(set(stamps)) == stamps
-    for _, scan in running.said:
+    for _, scan in running.messages:
         _right(scan)
 
 
@@ -115,8 +115,8 @@ def test_a_lidar_that_falls_silent_is_opened_again(tmp_path):
     device = Mute()
     path = str(tmp_path / "lidar")
     node = LdrobotNode(LidarConfig(device=path))
-    with Plugged(device, path), Running(node) as running:
-        running.wait(lambda: len(running.said) >= 2)
+    with EmulatedPort(device, path), RunningSource(node) as running:
+        running.wait(lambda: len(running.messages) >= 2)
         device.silent = True
         running.wait(lambda: "silent" in node.detail)
 
@@ -134,10 +134,10 @@ def test_the_baud_rate_is_found(tmp_path):
                 link.write = lambda data: None
             return link
 
-    with Plugged(Rplidar(0x85, 0x41, 5000.0, 10.0), path):
+    with EmulatedPort(Rplidar(0x85, 0x41, 5000.0, 10.0), path):
         node = Picky(RplidarConfig(device=path))
-        with Running(node) as running:
-            running.wait(lambda: len(running.said) >= 2)
+        with RunningSource(node) as running:
+            running.wait(lambda: len(running.messages) >= 2)
     assert tried == [115200, 460800]
     assert "RPLIDAR C1" in node.detail
 
@@ -147,15 +147,15 @@ def test_the_hosts_time_of_day_moves_no_stamp(tmp_path, monkeypatch):
     real = time.time_ns
     monkeypatch.setattr("time.time_ns", lambda: real() + wall["offset"])
     path = str(tmp_path / "lidar")
-    with Plugged(Ld19(), path):
+    with EmulatedPort(Ld19(), path):
         node = LdrobotNode(LidarConfig(device=path))
-        with Running(node) as running:
-            running.wait(lambda: len(running.said) >= 3)
+        with RunningSource(node) as running:
+            running.wait(lambda: len(running.messages) >= 3)
             wall["offset"] = 3600 * 10**9
-            running.wait(lambda: len(running.said) >= 6)
+            running.wait(lambda: len(running.messages) >= 6)
             wall["offset"] = -3600 * 10**9
-            running.wait(lambda: len(running.said) >= 9)
-    stamps = np.array([scan.stamp_ns for _, scan in running.said])
+            running.wait(lambda: len(running.messages) >= 9)
+    stamps = np.array([scan.stamp_ns for _, scan in running.messages])
     assert np.diff(stamps).min() > 0
     assert np.diff(stamps).max() < 2e9
 
@@ -180,7 +180,7 @@ def test_addresses():
 def test_a_lidar_on_the_bus(tmp_path, free_endpoint):
     path = str(tmp_path / "lidar")
     got = []
-    with open_router((free_endpoint,)), Plugged(Ld19(), path):
+    with open_router((free_endpoint,)), EmulatedPort(Ld19(), path):
         node = LdrobotNode(LidarConfig(device=path, upside_down=True))
         live = Live(node, LiveSettings("test", (free_endpoint,), tmp_path))
         thread = threading.Thread(target=live.run, daemon=True)

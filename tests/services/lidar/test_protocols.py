@@ -19,8 +19,8 @@ LD06_EXAMPLE = bytes.fromhex(
 
 def test_ldrobot_example_of_the_manual():
     assert len(LD06_EXAMPLE) == ldrobot.PACKET_BYTES
-    assert ldrobot.begins(LD06_EXAMPLE)
-    assert ldrobot.whole(LD06_EXAMPLE)
+    assert ldrobot.has_header(LD06_EXAMPLE)
+    assert ldrobot.checksum_ok(LD06_EXAMPLE)
     packet = ldrobot.parse(LD06_EXAMPLE)
     assert (packet.speed_deg_s, packet.start_deg, packet.end_deg) == (
         2152.0,
@@ -37,7 +37,7 @@ def test_ldrobot_any_one_wrong_byte_is_noticed(at):
     for flip in (0x01, 0x80, 0xFF):
         wrong = bytearray(LD06_EXAMPLE)
         wrong[at] ^= flip
-        assert not ldrobot.whole(bytes(wrong))
+        assert not ldrobot.checksum_ok(bytes(wrong))
 
 
 def test_rplidar_requests_and_descriptors_of_the_protocol_document():
@@ -139,8 +139,8 @@ def test_rplidar_node_layout():
     """LR001 4.2, figure 4-4: quality, inverted and plain start flag; check bit and angle q6; distance q2."""
     node = rp.parse_node(struct.pack("<BHH", 15 << 2 | 1, round(90.5 * 64) << 1 | 1, 4 * 1234))
     assert (node.first, node.angle_deg, node.range_m, node.quality) == (True, 90.5, 1.234, 15.0)
-    assert not rp.node_begins(struct.pack("<BHH", 15 << 2 | 3, 1, 0))  # both start flags set
-    assert not rp.node_begins(struct.pack("<BHH", 15 << 2 | 1, 2, 0))  # no check bit
+    assert not rp.has_node_header(struct.pack("<BHH", 15 << 2 | 3, 1, 0))  # both start flags set
+    assert not rp.has_node_header(struct.pack("<BHH", 15 << 2 | 1, 2, 0))  # no check bit
 
 
 def test_scip_numbers_and_sums_of_the_specification():
@@ -156,29 +156,31 @@ def test_scip_numbers_and_sums_of_the_specification():
 
 def test_scip_request_for_scans():
     """C-42-03320B 8.1: M D, start and end step (4), cluster (2), interval (1), number of scans (2)."""
-    geometry = scip.Geometry("URG-04LX", 0.02, 5.6, 1024, 44, 725, 384, 0.1)
-    assert scip.ScanReply(geometry, intensity=False).command == b"MD0044072501000"
+    geometry = scip.ScipGeometry("URG-04LX", 0.02, 5.6, 1024, 44, 725, 384, 0.1)
+    assert scip.ScipScanReply(geometry, intensity=False).command == b"MD0044072501000"
 
 
 @given(st.binary(max_size=2000), st.integers(0, 4))
 def test_rubbish_is_no_packet_and_no_error(data, kind):
-    from beamsplat.services.lidar.framing import Counters, Framer
+    from beamsplat.services.lidar.framing import Framer, StreamCounters
     from beamsplat.services.lidar.rplidar_stream import RplidarStream
 
     if kind == 4:
-        stream = Framer(ldrobot.PACKET_BYTES, ldrobot.begins, ldrobot.whole, Counters())
+        stream = Framer(ldrobot.PACKET_BYTES, ldrobot.has_header, ldrobot.checksum_ok, StreamCounters())
     else:
-        stream = RplidarStream((rp.CAPSULED, rp.DENSE, rp.HQ, rp.ULTRA)[kind], 1e-4, Counters())
+        stream = RplidarStream((rp.CAPSULED, rp.DENSE, rp.HQ, rp.ULTRA)[kind], 1e-4, StreamCounters())
     assert not [part for part in stream.feed(data) if part is not None]
     assert scip.parameters(data) is not None
 
 
 @given(st.binary(max_size=200), st.integers(1, 100), st.integers(3, 12))
 def test_packets_are_found_behind_any_rubbish_in_any_pieces(garbage, piece, count):
-    from beamsplat.services.lidar.framing import Counters, Framer
+    from beamsplat.services.lidar.framing import Framer, StreamCounters
 
-    counters = Counters()
-    framer = Framer(ldrobot.PACKET_BYTES, ldrobot.begins, ldrobot.whole, counters, followed=True)
+    counters = StreamCounters()
+    framer = Framer(
+        ldrobot.PACKET_BYTES, ldrobot.has_header, ldrobot.checksum_ok, counters, check_next_header=True
+    )
     data = garbage + LD06_EXAMPLE * count + LD06_EXAMPLE[:2]
     found = []
     for i in range(0, len(data), piece):

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from beamsplat.services.lidar.clock import DeviceClock, Unwrapper
-from beamsplat.services.lidar.guard import LinkNoise, confirmed
+from beamsplat.services.lidar.clock import CounterUnwrapper, DeviceClock
 from beamsplat.services.lidar.hokuyo import HokuyoDriver
 from beamsplat.services.lidar.ldrobot import LdrobotDriver
+from beamsplat.services.lidar.range_filter import LinkNoise, confirmed_ranges
 from beamsplat.services.lidar.rplidar import RplidarDriver
 from tests.services.lidar.devices import Hokuyo, Ld19, Rplidar
-from tests.services.lidar.links import drive, errors_m
+from tests.services.lidar.links import range_errors_m, run_device
 
 # name: driver, device, beams of a turn, turns/s, error allowed (m): half a step of direction on these walls
 KINDS = {
@@ -33,9 +33,9 @@ KINDS = {
 def test_clean_stream(kind):
     make, device, beams, turn_hz, allowed = KINDS[kind]
     driver = make()
-    scans = drive(driver, device(), 3.0)
+    scans = run_device(driver, device(), 3.0)
     assert len(scans) >= 0.95 * 3.0 * turn_hz - 2
-    errors = errors_m(scans)
+    errors = range_errors_m(scans)
     assert errors.max() < allowed
     assert len(errors) / len(scans) == pytest.approx(beams, rel=0.01)
     turn = scans[-1].revolution
@@ -52,7 +52,7 @@ def test_clean_stream(kind):
 def test_stamps_are_when_it_was_measured(kind):
     """Arrivals are late by 3 ms on average; the stamps must not wander with them."""
     make, device, _, turn_hz, _ = KINDS[kind]
-    scans = drive(make(), device(), 6.0, seed=3)
+    scans = run_device(make(), device(), 6.0, seed=3)
     stamps = np.array([s.stamp_ns for s in scans[5:]])
     assert np.diff(front_times(scans[5:])) * 1e3 == pytest.approx(1e3 / turn_hz, abs=1.5)
     assert np.diff(stamps).min() > 0
@@ -75,11 +75,11 @@ def front_times(scans):
 def test_one_byte_in_a_hundred_wrong(kind):
     make, device, beams, turn_hz, _ = KINDS[kind]
     driver = make()
-    scans = drive(driver, device(), 6.0, corruption=0.01, seed=1)
+    scans = run_device(driver, device(), 6.0, corruption=0.01, seed=1)
     # Three of four ultra capsules (132 bytes) have a wrong byte then; of others about half.
     assert len(scans) > (0.25 if "ultra" in kind else 0.8) * 6.0 * turn_hz
     assert driver.noise.noisy
-    errors = errors_m(scans)
+    errors = range_errors_m(scans)
     # What the guard lets pass of a doubly wrong packet agrees with its neighbours to 2 cm + 0.5 %.
     assert errors.max() < (0.10 if "standard" in kind else 0.06)
     assert len(errors) > (0.1 if "ultra" in kind else 0.2) * beams * len(scans)
@@ -96,9 +96,9 @@ def test_hq_at_a_wrong_byte_in_a_thousand():
     """Packets of 781 bytes: at one in a hundred none would be whole."""
     make, device, beams, *_ = KINDS["rplidar s1 hq"]
     driver = make()
-    scans = drive(driver, device(), 6.0, corruption=0.001, seed=1)
-    assert errors_m(scans).max() < 0.01
-    assert len(errors_m(scans)) > 0.2 * beams * len(scans) > 0
+    scans = run_device(driver, device(), 6.0, corruption=0.001, seed=1)
+    assert range_errors_m(scans).max() < 0.01
+    assert len(range_errors_m(scans)) > 0.2 * beams * len(scans) > 0
     assert driver.counters.bad_packets > 100
 
 
@@ -120,15 +120,15 @@ def test_lost_bytes_cost_a_few_packets(kind):
                 del data[self.rng.integers(len(data))]
             return bytes(data)
 
-    scans = drive(driver, Dropping(), 5.0)
-    assert errors_m(scans).max() < 0.06
-    assert len(errors_m(scans)) > 0.6 * beams * len(scans) > 0
+    scans = run_device(driver, Dropping(), 5.0)
+    assert range_errors_m(scans).max() < 0.06
+    assert len(range_errors_m(scans)) > 0.6 * beams * len(scans) > 0
     assert driver.counters.skipped_bytes > 0
 
 
 def test_pieces_do_not_matter():
-    whole = drive(LdrobotDriver(), Ld19(), 1.0)
-    pieces = drive(LdrobotDriver(), Ld19(), 1.0, chunk=7)
+    whole = run_device(LdrobotDriver(), Ld19(), 1.0)
+    pieces = run_device(LdrobotDriver(), Ld19(), 1.0, chunk=7)
     assert len(whole) == len(pieces) > 5
     for a, b in zip(whole, pieces):
         assert np.array_equal(a.revolution.range_m, b.revolution.range_m, equal_nan=True)
@@ -136,7 +136,7 @@ def test_pieces_do_not_matter():
 
 def test_a_device_that_knows_no_modes_is_asked_for_none():
     device = Rplidar()
-    drive(RplidarDriver(), device, 0.5)
+    run_device(RplidarDriver(), device, 0.5)
     assert device.requests == [bytes.fromhex(x) for x in ("A525", "A550", "A552", "A58205000000000022")]
 
 
@@ -147,19 +147,19 @@ def test_device_clock_takes_the_fastest_packets_and_no_wrong_times():
         device_s = i * 0.00267
         arrival_ns = int((50.0 + device_s * (1.0 + 5e-5) + rng.exponential(0.004)) * 1e9)  # 50 ppm apart
         if i % 100 == 50:
-            assert not clock.hear(device_s + 7.0, arrival_ns)  # a wrong byte in its time
+            assert not clock.update(device_s + 7.0, arrival_ns)  # a wrong byte in its time
         else:
-            assert clock.hear(device_s, arrival_ns)
+            assert clock.update(device_s, arrival_ns)
     stamp = clock.stamp_ns(2000 * 0.00267)
     assert stamp / 1e9 == pytest.approx(50.0 + 2000 * 0.00267 * (1.0 + 5e-5), abs=0.001)
     assert clock.stamp_ns(0.0) == stamp + 1  # never backwards
     for i in range(8):  # another device, whose clock says something else
-        clock.hear(1000.0 + i, int((60.0 + i) * 1e9))
+        clock.update(1000.0 + i, int((60.0 + i) * 1e9))
     assert clock.stamp_ns(1008.0) / 1e9 == pytest.approx(68.0, abs=0.001)
 
 
 def test_counters_that_start_over():
-    unwrap = Unwrapper(30000, 1e3)
+    unwrap = CounterUnwrapper(30000, 1e3)
     times = [unwrap(t % 30000, t * 1_000_000) for t in range(29000, 200_000, 500)]
     assert np.diff(times).tolist() == [500] * (len(times) - 1)
     unwrap(12345, 200_000_000_000)  # one wrong value
@@ -169,20 +169,20 @@ def test_counters_that_start_over():
 def test_doubtful_ranges_need_a_witness():
     noise = LinkNoise()
     for i in range(100):
-        noise.saw(i % 20 != 0)
+        noise.update(i % 20 != 0)
     assert noise.noisy
     angle = np.radians(np.arange(-40, 41))
     wall = 2.0 / np.cos(angle)
     nothing = np.full(81, np.nan)
-    assert confirmed(wall, nothing).all()  # at the ends by what lies on one side
+    assert confirmed_ranges(wall, nothing).all()  # at the ends by what lies on one side
     twisted = wall.copy()
     twisted[50], twisted[52] = wall[50] - 0.4, wall[52] + 0.4  # one bit of two bytes, up and down
-    assert not confirmed(twisted, nothing)[[50, 52]].any()
+    assert not confirmed_ranges(twisted, nothing)[[50, 52]].any()
     wrong = wall.copy()
     wrong[[30, 31]] += 0.5  # two neighbours wrong by the same amount
-    assert not confirmed(wrong, nothing)[[30, 31]].any()
-    assert not confirmed(wrong, wall)[[30, 31]].any()
+    assert not confirmed_ranges(wrong, nothing)[[30, 31]].any()
+    assert not confirmed_ranges(wrong, wall)[[30, 31]].any()
     post = wall.copy()
     post[40] = 1.0  # a chair leg that was there a turn ago as well
-    assert not confirmed(post, nothing)[40]
-    assert confirmed(post, post)[40]
+    assert not confirmed_ranges(post, nothing)[40]
+    assert confirmed_ranges(post, post)[40]

@@ -9,7 +9,7 @@ from beamsplat.common.runtime.node import Input
 from beamsplat.common.zenoh.bus import Bus, open_session
 from beamsplat.tools.system.health_table import HealthBoard
 from beamsplat.tools.system.supervisor import Supervisor
-from tests.services.lidar.devices import Ld19, Plugged
+from tests.services.lidar.devices import EmulatedPort, Ld19
 
 RIG = "[lidar.mount]\nxyz_m = [0.0, 0.0, 0.2]\nrpy_deg = [0.0, 0.0, 0.0]\n"
 
@@ -27,7 +27,7 @@ def test_a_lidar_on_a_noisy_wire_is_enough_to_know_where_the_robot_stands(tmp_pa
     )
     poses = []
     with (
-        Plugged(Ld19(), path, corruption=0.01),
+        EmulatedPort(Ld19(), path, corruption=0.01),
         Supervisor(deployment) as supervisor,
         Bus(open_session((free_endpoint,)), "test", "x", "cd" * 8, 1) as bus,
     ):

@@ -2,7 +2,7 @@
 
 A checksum of 8 bits (6 in SCIP) catches one wrong byte, but of packets with two or more it lets one in 256
 (one in 64) through. On a clean link that is once in years; with one byte in a hundred wrong it is once in
-seconds. While packets are seen to fail, a range must therefore be confirmed: by two neighbours on a
+seconds. While packets are seen to fail, a range must therefore be confirmed_ranges: by two neighbours on a
 straight surface, or by the same direction one turn before.
 """
 
@@ -14,9 +14,9 @@ from collections import deque
 import numpy as np
 
 _WINDOW = 500  # packets looked back
-_NOISY_SHARE = 0.02  # of them bad: at less, a doubly wrong packet passes about once in hours
+_NOISY_RATIO = 0.02  # of them bad: at less, a doubly wrong packet passes about once in hours
 _TOLERANCE_M = 0.02
-_TOLERANCE = 0.005  # of the range
+_TOLERANCE_RATIO = 0.005  # of the range
 
 
 class LinkNoise:
@@ -27,7 +27,7 @@ class LinkNoise:
         self._bad = 0
         self._always = always  # for packets without a checksum
 
-    def saw(self, good: bool) -> None:
+    def update(self, good: bool) -> None:
         """One more packet."""
         if len(self._recent) == self._recent.maxlen:
             self._bad -= not self._recent[0]
@@ -37,10 +37,10 @@ class LinkNoise:
     @property
     def noisy(self) -> bool:
         """More than one packet in fifty failed lately (two failures at least)."""
-        return self._always or self._bad >= max(2, math.ceil(_NOISY_SHARE * len(self._recent)))
+        return self._always or self._bad >= max(2, math.ceil(_NOISY_RATIO * len(self._recent)))
 
 
-def confirmed(
+def confirmed_ranges(
     range_m: np.ndarray,  # float64 [N] on a regular grid, NaN = none
     before_m: np.ndarray,  # float64 [N]: the same directions one turn before, NaN = none
 ) -> np.ndarray:
@@ -51,26 +51,26 @@ def confirmed(
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         inverse = 1.0 / range_m
-        between = _agree(range_m, 0.5 * (_moved(inverse, 1) + _moved(inverse, -1)))
-        agrees = between | (np.abs(range_m - before_m) <= _allowed_m(range_m))
+        between = _matches_inverse(range_m, 0.5 * (_shifted(inverse, 1) + _shifted(inverse, -1)))
+        agrees = between | (np.abs(range_m - before_m) <= _tolerance_m(range_m))
         for side in (1, -1):
-            ahead = 2.0 * _moved(inverse, side) - _moved(inverse, 2 * side)
-            in_line = _moved(between, 2 * side) == 1.0
-            agrees |= _agree(range_m, ahead) & in_line
+            ahead = 2.0 * _shifted(inverse, side) - _shifted(inverse, 2 * side)
+            in_line = _shifted(between, 2 * side) == 1.0
+            agrees |= _matches_inverse(range_m, ahead) & in_line
     return agrees
 
 
-def _allowed_m(range_m: np.ndarray) -> np.ndarray:
-    return _TOLERANCE_M + _TOLERANCE * range_m
+def _tolerance_m(range_m: np.ndarray) -> np.ndarray:
+    return _TOLERANCE_M + _TOLERANCE_RATIO * range_m
 
 
-def _agree(range_m: np.ndarray, inverse: np.ndarray) -> np.ndarray:
+def _matches_inverse(range_m: np.ndarray, inverse: np.ndarray) -> np.ndarray:
     """Whether ranges are as predicted by their inverse, 1/m."""
     wanted_m = np.where(inverse > 0.0, 1.0 / inverse, np.nan)
-    return np.abs(range_m - wanted_m) <= _allowed_m(range_m)
+    return np.abs(range_m - wanted_m) <= _tolerance_m(range_m)
 
 
-def _moved(values: np.ndarray, by: int) -> np.ndarray:
+def _shifted(values: np.ndarray, by: int) -> np.ndarray:
     """float64 [N]: values[i - by] at i; NaN beyond the ends."""
     found = np.full(len(values), np.nan)
     if by > 0:
