@@ -1,4 +1,4 @@
-"""What a supervisor asks of one process during a swap (common/takeover.py), answered between two steps."""
+"""The requests that a supervisor sends to one process during a hand-over, answered between two steps."""
 
 from __future__ import annotations
 
@@ -6,81 +6,78 @@ import json
 import logging
 import time
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
 
 from beamsplat.common.files.persist import claim_epoch
 from beamsplat.common.messages import Answer
+from beamsplat.common.runtime.running_node import RunningNode
 from beamsplat.common.zenoh.bus import Bus
-
-if TYPE_CHECKING:
-    from beamsplat.common.runtime.live import Live
 
 log = logging.getLogger(__name__)
 
 
-class Control:
-    """The three requests, by verb."""
+class HandoverControl:
+    """Answers `reached`, `retire` and `activate` (see `runtime.handover`) for one process."""
 
-    def __init__(self, live: Live, bus: Bus) -> None:
-        self._live, self._bus = live, bus
+    def __init__(self, running: RunningNode, bus: Bus) -> None:
+        self._running, self._bus = running, bus
 
-    def obey(self, verb: str, parameters: dict[str, str]) -> Iterator[Answer]:
-        """Does what is asked.
+    def answer(self, verb: str, parameters: dict[str, str]) -> Iterator[Answer]:
+        """Carry out a request and yield its answer.
 
         Raises:
-            ValueError: no such request, not now, or it fails: what the process is stays as it was.
+            ValueError: unknown request, not possible in this state, or it failed; the state is unchanged.
         """
-        takeover = self._live.takeover
+        handover = self._running.handover
         if verb == "reached":
-            text = takeover.reached()
+            text = handover.reached()
         elif verb == "retire":
             text = self._retire()
-        elif verb == "activate" and takeover.standby:
+        elif verb == "activate" and handover.standby:
             text = self._activate(parameters.get("after", "{}"))
         else:
-            raise ValueError(f"nothing called {verb!r} can be asked of {self._live.node.name} now")
+            raise ValueError(f"{self._running.node.name} cannot answer the request {verb!r} now")
         yield Answer(stamp_ns=time.time_ns(), text=text)
 
     def _retire(self) -> str:
-        live = self._live
-        if not live.node.hands_over:
-            return live.takeover.retire()
-        if not live.takeover.retired:
-            live.finish_jobs()
-            with live.greeting:
-                live.takeover.retired = True  # what arrives from here on is the successor's
+        r = self._running
+        if not r.node.hands_over:
+            return r.handover.retire()
+        if not r.handover.retired:
+            r.finish_jobs()
+            with r.arrival_lock:
+                r.handover.retired = True  # messages that arrive from here on belong to the successor
             try:
-                live.node.hand_over()
+                r.node.hand_over()
             except ValueError:
-                live.takeover.retired = False
+                r.handover.retired = False
                 raise
-        with live.changed:
-            return live.takeover.retire(live.mailbox.handled())
+        with r.changed:
+            return r.handover.retire(r.mailbox.handled())
 
-    def _greet_waiting(self) -> None:
-        """Letters that came in standby arrive now, for the node, and before those that come from now on."""
-        live, greeted = self._live, set()
-        while not live.greets:
-            with live.changed:
-                news = [w for w in live.mailbox.waiting() if id(w) not in greeted]
-                live.greets = not news
-            for letter in news:
-                greeted.add(id(letter))
-                if not live.takeover.was_handled(letter):
-                    live.emit(live.node.handle_arrival(letter.topic, letter.message))
+    def _pass_on_arrivals(self) -> None:
+        """Call `on_arrival` for messages received in standby, before those that are received from now on."""
+        r, passed = self._running, set()
+        while not r.accepts_arrivals:
+            with r.changed:
+                new = [w for w in r.mailbox.waiting() if id(w) not in passed]
+                r.accepts_arrivals = not new
+            for envelope in new:
+                passed.add(id(envelope))
+                if not r.handover.was_handled(envelope):
+                    r.emit(r.node.handle_arrival(envelope.topic, envelope.message))
 
     def _activate(self, after: str) -> str:
-        live = self._live
-        if live.node.hands_over:
-            live.node.take_over()
-        live.greets = not live.node.hands_over  # who came first is greeted first
-        held = list(live.takeover.activate(after))
-        self._bus.epoch = claim_epoch(live.settings.run_dir, live.node.name)
-        self._greet_waiting()
-        live.emit(iter(held))
-        live.show(self._bus)
-        live.state = "active"
-        lost = live.takeover.lost
+        r = self._running
+        if r.node.hands_over:
+            r.node.take_over()
+        r.accepts_arrivals = not r.node.hands_over  # those that wait are passed on first
+        held = list(r.handover.activate(after))
+        self._bus.producer.epoch = claim_epoch(r.settings.run_dir, r.node.name)
+        self._pass_on_arrivals()
+        r.emit(iter(held))
+        self._bus.announce(r.node.queries())
+        r.state = "active"
+        lost = r.handover.lost
         if lost:
-            log.warning("%d messages that nobody has said were not kept back in standby: lost", lost)
+            log.warning("%d messages were lost in the hand-over: neither process published them", lost)
         return json.dumps({"kept": len(held), "lost": lost})

@@ -23,14 +23,14 @@ from typing import TYPE_CHECKING
 from beamsplat.common.messages import Message
 
 if TYPE_CHECKING:
-    from beamsplat.common.runtime.mailbox import Handled, Letter
+    from beamsplat.common.runtime.mailbox import Envelope, Handled
 
 CONTROL = "control"
 _HELD = 16  # a message may be a picture
 _COUNTED = 100_000  # stamps of those that were not kept
 
 
-class Takeover:
+class Handover:
     """Where one process stands between standby and retirement."""
 
     def __init__(self, standby: bool) -> None:
@@ -43,7 +43,7 @@ class Takeover:
         self._inherited: dict[str, int] = {}
         self._handled: Handled = {}
 
-    def keeps(self, topic: str, message: Message) -> bool:
+    def holds_back(self, topic: str, message: Message) -> bool:
         """Whether a message is kept back for now; else it is noted as said."""
         if self.standby:
             if len(self._held) == _HELD:
@@ -56,10 +56,10 @@ class Takeover:
         self._said[topic] = max(self._said.get(topic, 0), message.stamp_ns)
         return False
 
-    def was_handled(self, letter: Letter) -> bool:
+    def was_handled(self, envelope: Envelope) -> bool:
         """Whether the predecessor has dealt with what waited here meanwhile."""
-        known = self._handled.get(letter.topic, {}).get(letter.header.instance)
-        sequence = letter.header.sequence
+        known = self._handled.get(envelope.topic, {}).get(envelope.header.instance)
+        sequence = envelope.header.sequence
         return known is not None and sequence < known[0] and sequence not in known[1]
 
     def reached(self) -> str:

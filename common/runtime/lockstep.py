@@ -16,7 +16,7 @@ from typing import Any
 from beamsplat.common.messages import Message
 from beamsplat.common.messages.header import Header
 from beamsplat.common.runtime.jobs import Deferred, JobQueue
-from beamsplat.common.runtime.mailbox import NOBODY, Letter, Mailbox
+from beamsplat.common.runtime.mailbox import NOBODY, Envelope, Mailbox
 from beamsplat.common.runtime.node import Job, Node, Output
 from beamsplat.common.topics import ROW_NUMBER, TOPICS
 
@@ -40,8 +40,8 @@ class _Seat:
 class Lockstep:
     """The loop. `on_message` sees every message that any node sends, in order."""
 
-    def __init__(self, nodes: list[Node], on_message: Callable[[Letter], None] | None = None) -> None:
-        self._on_message = on_message or (lambda letter: None)
+    def __init__(self, nodes: list[Node], on_message: Callable[[Envelope], None] | None = None) -> None:
+        self._on_message = on_message or (lambda envelope: None)
         self._seats = [_seat(node) for node in nodes]
         self._events: list[tuple[int, int, int, Callable[[int], None]]] = []
         self._created = 0
@@ -93,23 +93,23 @@ class Lockstep:
         sequence = seat.sequences.get(name, 0)
         seat.sequences[name] = sequence + 1
         header = Header(message.stamp_ns, time_ns, 0, sequence, 0, seat.node.name, seat.instance)
-        letter = Letter(name, header, message)
-        self._on_message(letter)
+        envelope = Envelope(name, header, message)
+        self._on_message(envelope)
         for consumer in self._consumers[name]:
             self._emit(consumer, consumer.node.handle_arrival(name, message), time_ns)
-            consumer.mailbox.put(letter)
+            consumer.mailbox.put(envelope)
             self._step(consumer, time_ns)
 
     def _step(self, seat: _Seat, now_ns: int) -> None:
         """Lets a node handle what it can at this time."""
         if seat.ended:
             self._hear_answers(seat)
-        while now_ns >= seat.busy_until_ns and (letter := seat.mailbox.pop()) is not None:
-            for name, result in seat.jobs.before_message(letter.topic):
+        while now_ns >= seat.busy_until_ns and (envelope := seat.mailbox.pop()) is not None:
+            for name, result in seat.jobs.before_message(envelope.topic):
                 self._emit(seat, seat.node.handle_job(name, result), now_ns)
             seat.busy_until_ns = now_ns + _ns(seat.node.config.step_cost_s)
-            seat.node.on_header(letter.header)
-            self._emit(seat, seat.node.handle(letter.topic, letter.message), seat.busy_until_ns)
+            seat.node.on_header(envelope.header)
+            self._emit(seat, seat.node.handle(envelope.topic, envelope.message), seat.busy_until_ns)
             if seat.busy_until_ns > now_ns:
                 self._at(seat.busy_until_ns, _LAST_ROW, lambda t: self._step(seat, t))
         if seat.mailbox.ended and not seat.ended and now_ns >= seat.busy_until_ns:
@@ -117,9 +117,9 @@ class Lockstep:
 
     def _hear_answers(self, seat: _Seat) -> None:
         """What is fed back to a node that has ended is still heard; it has nothing more to say to it."""
-        while (letter := seat.mailbox.pop()) is not None:
-            seat.node.on_header(letter.header)
-            for _ in seat.node.handle(letter.topic, letter.message):
+        while (envelope := seat.mailbox.pop()) is not None:
+            seat.node.on_header(envelope.header)
+            for _ in seat.node.handle(envelope.topic, envelope.message):
                 pass
 
     def _emit(self, seat: _Seat, outputs: Iterator[Output], time_ns: int) -> None:

@@ -27,7 +27,7 @@ Handled = dict[str, dict[str, tuple[int, list[int]]]]
 
 
 @dataclass(frozen=True, slots=True)
-class Letter:
+class Envelope:
     """A received message with what rode beside it."""
 
     topic: str
@@ -59,47 +59,47 @@ class Mailbox:
         """`clock_ns` is given live: see `StampMerger`."""
         self._deliveries = {i.topic: i.effective_delivery for i in _inputs(node)}
         self._merger = StampMerger(merged_topics(node), clock_ns=clock_ns)
-        self._slots: dict[str, Letter] = {}
+        self._slots: dict[str, Envelope] = {}
         self._fed_back = frozenset(i.topic for i in _inputs(node) if i.feedback)
-        self._answers: deque[Letter] = deque()  # of `every` inputs that are fed back
+        self._answers: deque[Envelope] = deque()  # of `every` inputs that are fed back
         self._most_bytes = {i.topic: i.queued_bytes for i in _inputs(node)}
         self.counts = {name: InputCount() for name in self._deliveries}
 
     def __len__(self) -> int:
         return len(self._merger) + len(self._slots) + len(self._answers)
 
-    def put(self, letter: Letter) -> bool:
-        """Takes a letter, unless its epoch has been taken over; True if it was taken."""
-        count = self.counts[letter.topic]
-        every = self._deliveries[letter.topic] == "every"
-        if not self._admit(count, letter.header, every and not TOPICS[letter.topic].repeated):
+    def put(self, envelope: Envelope) -> bool:
+        """Takes a envelope, unless its epoch has been taken over; True if it was taken."""
+        count = self.counts[envelope.topic]
+        every = self._deliveries[envelope.topic] == "every"
+        if not self._admit(count, envelope.header, every and not TOPICS[envelope.topic].resent_until_ack):
             return False
-        if letter.topic in self._slots:
+        if envelope.topic in self._slots:
             count.dropped += 1
-        if every and letter.topic in self._fed_back:
+        if every and envelope.topic in self._fed_back:
             if len(self._answers) >= MAX_QUEUED:
                 self.counts[self._answers.popleft().topic].dropped += 1
-            self._answers.append(letter)
+            self._answers.append(envelope)
         elif every:
-            self._make_room(letter, count)
-            self._merger.put(letter.topic, letter.message.stamp_ns, letter)
+            self._make_room(envelope, count)
+            self._merger.put(envelope.topic, envelope.message.stamp_ns, envelope)
             if count.ended_by is not None:  # a straggler: its producer has ended all the same
-                self._merger.end(letter.topic)
+                self._merger.end(envelope.topic)
         else:
-            self._slots[letter.topic] = letter
+            self._slots[envelope.topic] = envelope
         return True
 
-    def _make_room(self, letter: Letter, count: InputCount) -> None:
-        most_bytes = self._most_bytes[letter.topic]
-        while queued := self._merger.queued(letter.topic):
-            if queued < MAX_QUEUED and count.queued_bytes + letter.size_bytes <= most_bytes:
+    def _make_room(self, envelope: Envelope, count: InputCount) -> None:
+        most_bytes = self._most_bytes[envelope.topic]
+        while queued := self._merger.queued(envelope.topic):
+            if queued < MAX_QUEUED and count.queued_bytes + envelope.size_bytes <= most_bytes:
                 break
-            count.queued_bytes -= self._merger.drop_oldest(letter.topic).size_bytes
+            count.queued_bytes -= self._merger.drop_oldest(envelope.topic).size_bytes
             count.dropped += 1
-        count.queued_bytes += letter.size_bytes
+        count.queued_bytes += envelope.size_bytes
 
     def _admit(self, count: InputCount, header: Header, loses: bool) -> bool:
-        """Epoch and sequence bookkeeping; False for a stale or repeated message."""
+        """Epoch and sequence bookkeeping; False for a stale or resent_until_ack message."""
         if header.epoch < count.epoch:
             count.stale += 1
             return False
@@ -131,7 +131,7 @@ class Mailbox:
         count.ended_by = instance
         if self._deliveries[topic] == "every":
             missing = max(sent - self.next_sequence(topic, instance), 0)
-            if TOPICS[topic].repeated:
+            if TOPICS[topic].resent_until_ack:
                 count.dropped += missing
             else:
                 count.lost += missing
@@ -142,7 +142,7 @@ class Mailbox:
         """The sequence number that `topic` should bring next from `instance`; 0 before the first."""
         return self.counts[topic].expected.get(instance, 0)
 
-    def waiting(self) -> list[Letter]:
+    def waiting(self) -> list[Envelope]:
         """What of the `every` inputs waits here, input by input in order of arrival."""
         return [*self._answers, *self._merger.items()]
 
@@ -161,24 +161,24 @@ class Mailbox:
             if delivery == "every"
         }
 
-    def pop(self) -> Letter | None:
-        """The letter to handle next: answers, what is certain of `every` inputs, the oldest of the rest."""
+    def pop(self) -> Envelope | None:
+        """The envelope to handle next: answers, what is certain of `every` inputs, the oldest of the rest."""
         if self._answers:
-            letter = self._answers.popleft()
-            self.counts[letter.topic].received += 1
-            return letter
+            envelope = self._answers.popleft()
+            self.counts[envelope.topic].received += 1
+            return envelope
         merged = self._merger.pop()
         if merged is not None:
-            letter = merged[1]
-            self.counts[letter.topic].queued_bytes -= letter.size_bytes
+            envelope = merged[1]
+            self.counts[envelope.topic].queued_bytes -= envelope.size_bytes
         elif self._slots:
             slots = self._slots.values()
             oldest = min(slots, key=lambda s: (s.message.stamp_ns, ROW_NUMBER[s.topic]))
-            letter = self._slots.pop(oldest.topic)
+            envelope = self._slots.pop(oldest.topic)
         else:
             return None
-        self.counts[letter.topic].received += 1
-        return letter
+        self.counts[envelope.topic].received += 1
+        return envelope
 
     @property
     def ended(self) -> bool:

@@ -1,4 +1,4 @@
-"""Complaints at a bounded rate: what repeats is counted and said once in a while."""
+"""RateLimitedLog at a bounded rate: what repeats is counted and said once in a while."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import time
 _PERIOD_S = 5.0
 
 
-class Complaints:
+class RateLimitedLog:
     """One clock and one count a subject."""
 
     def __init__(self) -> None:

@@ -20,6 +20,7 @@ import json
 import threading
 import time
 from collections.abc import Callable
+from functools import partial
 
 import msgpack
 import zenoh
@@ -29,13 +30,13 @@ from beamsplat.common.errors import UserError
 from beamsplat.common.messages import Health
 from beamsplat.common.messages.header import DecodeError, Header, local_clock_id
 from beamsplat.common.runtime.handover import CONTROL
-from beamsplat.common.runtime.mailbox import Letter
+from beamsplat.common.runtime.mailbox import Envelope
 from beamsplat.common.runtime.node import Input
 from beamsplat.common.security.access_control import access_control, read_hosts
 from beamsplat.common.security.keys import OPEN, Keys, SecurityConfig, check_endpoint, is_secure
 from beamsplat.common.security.logins import Login, guard
 from beamsplat.common.topics import HEALTH, LIMIT_KB, Topic, topic
-from beamsplat.common.zenoh.streams import Publication, Subscription, open_sample
+from beamsplat.common.zenoh.streams import Producer, Publication, Subscription, open_sample
 
 ROOT = "beamsplat"
 URGENT_BUFFER_BYTES = 32 * 1024  # 13 ms at 20 Mbit/s
@@ -184,13 +185,10 @@ class Bus:
     def __init__(self, session: zenoh.Session, robot: str, node: str, instance: str, epoch: int) -> None:
         self.session = session
         self.robot = robot
-        self.node = node
-        self.instance = instance
-        self.epoch = epoch
-        self.clock_id = local_clock_id()
+        self.producer = Producer(node, instance, epoch, local_clock_id())
         self._declared: list[object] = []  # dropped handles would be undeclared at once
         self._health = Publication(
-            self, Topic(HEALTH, Health, (node,), 1, "latest"), key(robot, HEALTH, node)
+            session, self.producer, Topic(HEALTH, Health, (node,), 1, "latest"), key(robot, HEALTH, node)
         )
 
     def __enter__(self) -> Bus:
@@ -201,12 +199,12 @@ class Bus:
 
     def publish(self, topic_name: str) -> Publication:
         """Declares a publication of a topic."""
-        return Publication(self, topic(topic_name), key(self.robot, topic_name))
+        return Publication(self.session, self.producer, topic(topic_name), key(self.robot, topic_name))
 
     def subscribe(
         self,
         entry: Input,
-        on_letter: Callable[[Letter], None],
+        on_envelope: Callable[[Envelope], None],
         on_undecodable: Callable[[str, str], None],
         on_end: Callable[[str, str, int, int], None],
     ) -> None:
@@ -216,7 +214,9 @@ class Bus:
         """
         delivery = entry.effective_delivery
         self._declared.append(
-            Subscription(self, entry.row, delivery, key(self.robot, entry.topic), on_letter, on_undecodable)
+            Subscription(
+                self.session, entry.row, delivery, key(self.robot, entry.topic), on_envelope, on_undecodable
+            )
         )
         subscriber = zenoh.ext.declare_advanced_subscriber(
             self.session,
@@ -253,20 +253,29 @@ class Bus:
             sample_miss_detection=zenoh.ext.MissDetectionConfig(sporadic_heartbeat=0.5),
             publisher_detection=True,
         )
-        header = Header(
-            0, time.monotonic_ns(), self.clock_id, publication.sent, self.epoch, self.node, self.instance
-        )
+        p = self.producer
+        header = Header(0, time.monotonic_ns(), p.clock_id, publication.sent, p.epoch, p.node, p.instance)
         publisher.put(msgpack.packb(publication.sent), attachment=header.pack())
         self._declared.append(publisher)
 
-    def answer(self, name: str, on_query: Callable[[str, zenoh.Query], None]) -> None:
-        """Declares the queryable query/<node>/<name>; `on_query(name, query)` runs in a bus thread."""
-        self._answer(key(self.robot, "query", self.node, name), lambda query: on_query(name, query))
+    def answer_queries(self, on_query: Callable[[str, zenoh.Query], None]) -> None:
+        """Declare control/<instance>/*, requests to this process; `announce` adds those to the node.
 
-    def obey(self, on_query: Callable[[str, zenoh.Query], None]) -> None:
-        """Declares control/<instance>/*: what is asked of one process, not of a node."""
-        place = key(self.robot, CONTROL, self.instance, "*")
+        `on_query(name, query)` runs in a thread of the bus.
+        """
+        self._on_query = on_query
+        place = key(self.robot, CONTROL, self.producer.instance, "*")
         self._answer(place, lambda query: on_query(f"{CONTROL}/{_last(query)}", query))
+
+    def announce(self, queries: tuple[str, ...]) -> None:
+        """Show this process as the active node: declare its queries and its liveliness token."""
+        for name in queries:
+            place = key(self.robot, "query", self.producer.node, name)
+            self._answer(place, partial(self._on_query, name))
+        node, instance = self.producer.node, self.producer.instance
+        self._declared.append(
+            self.session.liveliness().declare_token(key(self.robot, "alive", node, instance))
+        )
 
     def _answer(self, place: str, on_query: Callable[[zenoh.Query], None]) -> None:
         queryable = self.session.declare_queryable(place, zenoh.handlers.FifoChannel(16))
@@ -307,11 +316,6 @@ class Bus:
     def report(self, health: Health) -> None:
         """Publishes this node's health."""
         self._health.put(health)
-
-    def declare_alive(self) -> None:
-        """Shows this node as active, until the session ends."""
-        token = self.session.liveliness().declare_token(key(self.robot, "alive", self.node, self.instance))
-        self._declared.append(token)
 
     def alive_nodes(self) -> set[str]:
         """Names of the nodes of this robot that are active now."""

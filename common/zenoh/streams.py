@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
 
 import zenoh
 import zenoh.ext
@@ -13,11 +13,8 @@ import zenoh.ext
 from beamsplat.common.messages import Message
 from beamsplat.common.messages.codec import MEDIA_TYPE, decode, encode, schema_of
 from beamsplat.common.messages.header import DecodeError, Header
-from beamsplat.common.runtime.mailbox import Letter
+from beamsplat.common.runtime.mailbox import Envelope
 from beamsplat.common.topics import Topic
-
-if TYPE_CHECKING:
-    from beamsplat.common.zenoh.bus import Bus
 
 FIFO_MESSAGES = 256  # buffered by Zenoh ahead of our thread for an `every` input without a cache
 ENCODING = zenoh.Encoding(MEDIA_TYPE)
@@ -70,16 +67,26 @@ def declare_reader(
     )
 
 
-class Publication:
-    """One topic as one producer writes it; `put` may be called from several threads."""
+@dataclass
+class Producer:
+    """Who publishes: the fields that every header of one process has in common."""
 
-    def __init__(self, bus: Bus, row: Topic, key_expr: str) -> None:
-        self._bus = bus
+    node: str
+    instance: str
+    epoch: int  # rises when this process takes over from another
+    clock_id: int
+
+
+class Publication:
+    """A topic as written by one producer; `put` may be called from several threads."""
+
+    def __init__(self, session: zenoh.Session, producer: Producer, row: Topic, key_expr: str) -> None:
+        self._producer = producer
         self._lock = threading.Lock()
         self.row = row
         self.sent = 0
         self.bytes = 0
-        self._publisher = declare_writer(bus.session, key_expr, row)
+        self._publisher = declare_writer(session, key_expr, row)
 
     def put(self, message: Message) -> Header:
         """Sends one message; never waits for a subscriber."""
@@ -88,11 +95,11 @@ class Publication:
             header = Header(
                 stamp_ns=message.stamp_ns,
                 publish_ns=time.monotonic_ns(),
-                clock_id=self._bus.clock_id,
+                clock_id=self._producer.clock_id,
                 sequence=self.sent,
-                epoch=self._bus.epoch,
-                producer=self._bus.node,
-                instance=self._bus.instance,
+                epoch=self._producer.epoch,
+                producer=self._producer.node,
+                instance=self._producer.instance,
             )
             self._publisher.put(payload, attachment=header.pack())
             self.sent += 1
@@ -105,21 +112,21 @@ class Subscription:
 
     def __init__(
         self,
-        bus: Bus,
+        session: zenoh.Session,
         row: Topic,
         delivery: str,
         key_expr: str,
-        on_letter: Callable[[Letter], None],
+        on_envelope: Callable[[Envelope], None],
         on_undecodable: Callable[[str, str], None],
     ) -> None:
         self.row = row
-        self._on_letter = on_letter
+        self._on_envelope = on_envelope
         self._on_undecodable = on_undecodable
         if delivery == "every":
             channel = zenoh.handlers.FifoChannel(max(row.cache, FIFO_MESSAGES))
         else:
             channel = zenoh.handlers.RingChannel(1)
-        self._subscriber = declare_reader(bus.session, key_expr, row, delivery, channel)
+        self._subscriber = declare_reader(session, key_expr, row, delivery, channel)
         self._thread = threading.Thread(target=self._receive, name=f"sub-{row.name}", daemon=True)
         self._thread.start()
 
@@ -130,15 +137,15 @@ class Subscription:
             except zenoh.ZError:  # the session was closed
                 return
             try:
-                letter = open_sample(sample, self.row)
+                envelope = open_sample(sample, self.row)
             except DecodeError as error:
                 self._on_undecodable(self.row.name, str(error))
             else:
-                self._on_letter(letter)
+                self._on_envelope(envelope)
 
 
-def open_sample(sample: zenoh.Sample, row: Topic) -> Letter:
-    """The letter in a sample of topic `row`.
+def open_sample(sample: zenoh.Sample, row: Topic) -> Envelope:
+    """The envelope in a sample of topic `row`.
 
     Raises:
         DecodeError: no header, too large, another message's schema, or a payload that does not decode.
@@ -154,4 +161,4 @@ def open_sample(sample: zenoh.Sample, row: Topic) -> Letter:
     message = decode(schema, payload)
     if type(message) is not row.message:
         raise DecodeError(f"{schema} on {row.name}, which carries {row.message.schema_name()}")
-    return Letter(row.name, header, message, len(payload))
+    return Envelope(row.name, header, message, len(payload))

@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
-from beamsplat.common.runtime.rate_limited_log import Complaints
+from beamsplat.common.runtime.rate_limited_log import RateLimitedLog
 from beamsplat.services.keyframes.folder import Folder, Label
 
 log = logging.getLogger("beamsplat.keyframes")
@@ -54,7 +54,7 @@ class Outbox:
         self._sendings = self._caught_up = 0  # in all; of the lost ones
         self._heard_ns: int | None = None  # the last answer, or the last attempt to get one
         self._useless = 0
-        self._complaints = Complaints()
+        self._complaints = RateLimitedLog()
         self.drive = ""  # the present one
         self.bytes = 0
         self.given_up = 0  # never acknowledged, and gone for lack of room

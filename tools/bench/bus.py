@@ -23,7 +23,7 @@ import zenoh
 
 from beamsplat.common.config.deployment import Deployment, RouterConfig
 from beamsplat.common.messages import Image, WheelOdometry
-from beamsplat.common.runtime.mailbox import Letter, Mailbox
+from beamsplat.common.runtime.mailbox import Envelope, Mailbox
 from beamsplat.common.runtime.node import Node, Outputs
 from beamsplat.common.zenoh.bus import Bus, open_session
 from beamsplat.tools.system.supervisor import Supervisor
@@ -147,7 +147,7 @@ def _latency(endpoint: str, seconds: float, image_bytes: int) -> dict[str, float
     ours, plain = _Ages(), _Ages()
 
     def body(bus: Bus) -> Callable[[], None]:
-        bus.subscribe(_Taker.inputs[0], lambda letter: ours.add_since(letter.message.stamp_ns), _broken, _end)
+        bus.subscribe(_Taker.inputs[0], lambda e: ours.add_since(e.message.stamp_ns), _broken, _end)
         subscriber = bus.session.declare_subscriber(PLAIN_KEY, zenoh.handlers.RingChannel(1))
 
         def receive() -> None:
@@ -180,17 +180,15 @@ def _slow_subscriber(endpoint: str, seconds: float, image_bytes: int) -> dict[st
     mailbox, lock = Mailbox(_Taker), threading.Lock()
     memory = []
 
-    def on_image(letter: Letter) -> None:
+    def on_image(envelope: Envelope) -> None:
         with lock:
-            mailbox.put(letter)
+            mailbox.put(envelope)
 
     def body(bus: Bus) -> Callable[[], None]:
         from beamsplat.common.runtime.node import Input
 
         bus.subscribe(_Taker.inputs[0], on_image, _broken, _end)
-        bus.subscribe(
-            Input("wheel/odometry"), lambda letter: beside.add_since(letter.message.stamp_ns), _broken, _end
-        )
+        bus.subscribe(Input("wheel/odometry"), lambda e: beside.add_since(e.message.stamp_ns), _broken, _end)
         return work
 
     def work() -> None:
@@ -198,11 +196,11 @@ def _slow_subscriber(endpoint: str, seconds: float, image_bytes: int) -> dict[st
         process = psutil.Process()
         while time.monotonic() < deadline:
             with lock:
-                letter = mailbox.pop()
-            if letter is None:
+                envelope = mailbox.pop()
+            if envelope is None:
                 time.sleep(0.001)
                 continue
-            ages_frames.append((time.monotonic_ns() - letter.message.stamp_ns) / 1e9 * hz)
+            ages_frames.append((time.monotonic_ns() - envelope.message.stamp_ns) / 1e9 * hz)
             time.sleep(0.2)
             memory.append(process.memory_info().rss / 1e6)
 

@@ -15,7 +15,7 @@ import psutil
 
 from beamsplat.common.config.deployment import Deployment
 from beamsplat.common.errors import UserError
-from beamsplat.common.runtime.mailbox import Letter
+from beamsplat.common.runtime.mailbox import Envelope
 from beamsplat.common.runtime.node import Input
 from beamsplat.common.topics import topic
 from beamsplat.common.zenoh.bus import Bus, open_session
@@ -72,22 +72,22 @@ class Witness:
     def _broken(self, topic_name: str, why: str) -> None:
         self.seen.undecodable += 1
 
-    def _take(self, letter: Letter) -> None:
+    def _take(self, envelope: Envelope) -> None:
         with self._lock:
-            getattr(self, "_" + letter.topic.replace("/", "_"))(letter, letter.message)
-            if topic(letter.topic).uplink in ("up", "bulk"):
-                self.seen.link_bytes += letter.size_bytes
+            getattr(self, "_" + envelope.topic.replace("/", "_"))(envelope, envelope.message)
+            if topic(envelope.topic).uplink in ("up", "bulk"):
+                self.seen.link_bytes += envelope.size_bytes
 
-    def _camera_image(self, letter: Letter, m: Any) -> None:
-        self.seen.images[m.stamp_ns] = letter.header.publish_ns
+    def _camera_image(self, envelope: Envelope, m: Any) -> None:
+        self.seen.images[m.stamp_ns] = envelope.header.publish_ns
 
-    def _localization_correction(self, letter: Letter, m: Any) -> None:
+    def _localization_correction(self, envelope: Envelope, m: Any) -> None:
         self._T_map_odom = m.T_map_odom.copy()
 
-    def _localization_odometry(self, letter: Letter, m: Any) -> None:
+    def _localization_odometry(self, envelope: Envelope, m: Any) -> None:
         self.seen.poses.append((m.stamp_ns, self._T_map_odom @ m.T_odom_body, m.status, m.metric))
         if m.status == "ok":
-            self.seen.pose_at_ns[m.stamp_ns] = letter.header.publish_ns
+            self.seen.pose_at_ns[m.stamp_ns] = envelope.header.publish_ns
         else:
             self._count_refusal(f"pose, {m.status}: {m.detail}")
 
@@ -96,39 +96,39 @@ class Witness:
         reason = re.sub(r"-?\d+(\.\d+)?", "#", why)
         self.seen.refusals[reason] = self.seen.refusals.get(reason, 0) + 1
 
-    def _depth_estimate(self, letter: Letter, m: Any) -> None:
+    def _depth_estimate(self, envelope: Envelope, m: Any) -> None:
         self.seen.estimates[m.stamp_ns] = m.status
         self.seen.kinds.add(m.kind)
         if m.stamp_ns in self._keep_at and m.status == "ok" and m.values.size:
             self.seen.kept_estimates[m.stamp_ns] = m.values[::DEPTH_STEP, ::DEPTH_STEP].astype(np.float16)
 
-    def _fusion_depth(self, letter: Letter, m: Any) -> None:
-        self.seen.fused[m.stamp_ns] = (letter.header.publish_ns, m.status, m.keyframe)
+    def _fusion_depth(self, envelope: Envelope, m: Any) -> None:
+        self.seen.fused[m.stamp_ns] = (envelope.header.publish_ns, m.status, m.keyframe)
         if m.status != "ok":
             self._count_refusal(f"depth: {m.status}")
         if m.stamp_ns in self._keep_at and m.status == "ok":
             self.seen.kept_fused[m.stamp_ns] = m.depth_m[::DEPTH_STEP, ::DEPTH_STEP].astype(np.float16)
 
-    def _keyframes_frame(self, letter: Letter, m: Any) -> None:
-        self.seen.keyframes.setdefault(m.stamp_ns, letter.header.publish_ns)
+    def _keyframes_frame(self, envelope: Envelope, m: Any) -> None:
+        self.seen.keyframes.setdefault(m.stamp_ns, envelope.header.publish_ns)
 
-    def _keyframes_ack(self, letter: Letter, m: Any) -> None:
-        self.seen.acks.setdefault(m.id, (letter.header.publish_ns, m.status))
+    def _keyframes_ack(self, envelope: Envelope, m: Any) -> None:
+        self.seen.acks.setdefault(m.id, (envelope.header.publish_ns, m.status))
 
-    def _mapping_chunk(self, letter: Letter, m: Any) -> None:
+    def _mapping_chunk(self, envelope: Envelope, m: Any) -> None:
         self.seen.chunks[m.anchor_id] = m
-        if self.seen.online_chunks is not None and letter.header.publish_ns <= self._ended_ns:
+        if self.seen.online_chunks is not None and envelope.header.publish_ns <= self._ended_ns:
             self.seen.online_chunks[m.anchor_id] = m  # overtaken by the poses that ended the drive
 
-    def _mapping_poses(self, letter: Letter, m: Any) -> None:
+    def _mapping_poses(self, envelope: Envelope, m: Any) -> None:
         if self.seen.online_chunks is None:
-            self.seen.online_chunks, self._ended_ns = dict(self.seen.chunks), letter.header.publish_ns
+            self.seen.online_chunks, self._ended_ns = dict(self.seen.chunks), envelope.header.publish_ns
         self.seen.keyframe_poses = m.T_map_body.copy()
 
-    def _mapping_preview(self, letter: Letter, m: Any) -> None:
+    def _mapping_preview(self, envelope: Envelope, m: Any) -> None:
         self.seen.previews.append((m.stamp_ns, m.T_map_camera.copy(), m.render.tobytes()))
 
-    def _mapping_status(self, letter: Letter, m: Any) -> None:
+    def _mapping_status(self, envelope: Envelope, m: Any) -> None:
         self.seen.statuses.append(m)
 
 

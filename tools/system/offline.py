@@ -16,7 +16,7 @@ from beamsplat.common.files.persist import make_folder, write_atomically
 from beamsplat.common.messages.codec import encode, schema_of
 from beamsplat.common.recording import RecordingWriter
 from beamsplat.common.runtime.lockstep import Lockstep
-from beamsplat.common.runtime.mailbox import Letter
+from beamsplat.common.runtime.mailbox import Envelope
 from beamsplat.common.runtime.registry import Service
 from beamsplat.services.nodes import NODES
 from beamsplat.tools.system.assembly import build_node
@@ -32,12 +32,12 @@ class MessageHash:
         self._all = hashlib.sha256()
         self.counts: dict[str, int] = {}
 
-    def add(self, letter: Letter, payload: bytes) -> None:
+    def add(self, envelope: Envelope, payload: bytes) -> None:
         """Takes one message."""
-        head = f"{letter.topic} {schema_of(letter.message)} {letter.header.sequence} {len(payload)}\n"
+        head = f"{envelope.topic} {schema_of(envelope.message)} {envelope.header.sequence} {len(payload)}\n"
         self._all.update(head.encode())
         self._all.update(payload)
-        self.counts[letter.topic] = self.counts.get(letter.topic, 0) + 1
+        self.counts[envelope.topic] = self.counts.get(envelope.topic, 0) + 1
 
     def hexdigest(self) -> str:
         """64 hex digits."""
@@ -65,10 +65,10 @@ def run_offline(
         total = next((n.expected_messages() for n in nodes if hasattr(n, "expected_messages")), None)
         task = progress.add_task("lockstep", total=total)
 
-        def on_message(letter: Letter) -> None:
-            digest.add(letter, encode(letter.message))
-            writer.write(letter.topic, letter.message, letter.header.publish_ns, letter.header)
-            if letter.header.producer == "replay":
+        def on_message(envelope: Envelope) -> None:
+            digest.add(envelope, encode(envelope.message))
+            writer.write(envelope.topic, envelope.message, envelope.header.publish_ns, envelope.header)
+            if envelope.header.producer == "replay":
                 progress.advance(task)
 
         mailboxes = Lockstep(nodes, on_message).run()

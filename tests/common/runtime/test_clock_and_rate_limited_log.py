@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from beamsplat.common.runtime import rate_limited_log as complaints
 from beamsplat.common.runtime.clock import StampClock
-from beamsplat.common.runtime.rate_limited_log import Complaints
+from beamsplat.common.runtime.rate_limited_log import RateLimitedLog
 
 
 class Host:
@@ -54,7 +54,7 @@ def test_a_place_that_was_damaged_gives_a_clock_all_the_same(tmp_path):
 def test_what_repeats_is_counted_and_said_once_in_a_while(monkeypatch):
     now = [100.0]
     monkeypatch.setattr(complaints.time, "monotonic", lambda: now[0])
-    c = Complaints()
+    c = RateLimitedLog()
     assert c.due("loss") == 0
     assert [c.due("loss") for _ in range(7)] == [None] * 7
     assert c.due("other") == 0  # each subject by itself

@@ -10,7 +10,7 @@ from beamsplat.common.messages import CameraModel, Keyframe, KeyframeAck
 from beamsplat.common.messages.header import Header
 from beamsplat.common.runtime.live import Live, LiveSettings
 from beamsplat.common.runtime.lockstep import Lockstep
-from beamsplat.common.runtime.mailbox import NOBODY, Letter, Mailbox
+from beamsplat.common.runtime.mailbox import NOBODY, Envelope, Mailbox
 from beamsplat.common.runtime.node import Input, Node, merged_topics
 from beamsplat.common.zenoh.bus import open_router
 from tests.common.nodes import Drive, DriveConfig
@@ -125,7 +125,7 @@ def test_feedback_is_neither_merged_nor_waited_for(delivery):
     assert mailbox.ended
     for i in range(3):
         ack = KeyframeAck(stamp_ns=100 - i, id=i)  # older each time: still in order of arrival
-        mailbox.put(Letter("keyframes/ack", Header(ack.stamp_ns, 0, 0, i, 0, "mapping", "cd" * 8), ack))
+        mailbox.put(Envelope("keyframes/ack", Header(ack.stamp_ns, 0, 0, i, 0, "mapping", "cd" * 8), ack))
     assert not mailbox.ended
     wanted = [0, 1, 2] if delivery is None else [2]
     assert [mailbox.pop().message.id for _ in wanted] == wanted

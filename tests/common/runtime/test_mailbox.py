@@ -4,7 +4,7 @@ import numpy as np
 
 from beamsplat.common.messages import Scan
 from beamsplat.common.messages.header import Header
-from beamsplat.common.runtime.mailbox import Letter, Mailbox
+from beamsplat.common.runtime.mailbox import Envelope, Mailbox
 from beamsplat.common.runtime.node import Input
 from tests.common.nodes import Chain, Slow
 
@@ -18,7 +18,7 @@ def _scan(sequence, *, instance=FIRST, epoch=1, size_bytes=0):
         range_min_m=0.0, range_max_m=1.0, ranges_m=np.zeros(1, np.float32),
     )  # fmt: skip
     header = Header(stamp_ns, 0, 0, sequence, epoch, "replay", instance)
-    return Letter("lidar/scan", header, scan, size_bytes)
+    return Envelope("lidar/scan", header, scan, size_bytes)
 
 
 def _ended_mailbox():

@@ -45,7 +45,7 @@ def play(tmp_path):
         sent = []
         live = Live(Player(Player.Config()), LiveSettings("r", (), tmp_path, rate=rate, resume=resume))
         live._bookmark._PERIOD_S = 0.0
-        live.publications = {name: FakePublication(name, live, sent, last) for name in Player.outputs}
+        live.running.publications = {name: FakePublication(name, live, sent, last) for name in Player.outputs}
         live._run_source()
         return sent, live
 
@@ -73,7 +73,7 @@ def test_a_new_run_forgets_the_place_of_an_earlier_one(play, monkeypatch):
 
     monkeypatch.setattr("beamsplat.common.runtime.live.open_session", dies)
     with pytest.raises(UserError):  # the new run: killed before its first message
-        Live(live.node, live.settings).run()
+        Live(live.running.node, live.running.settings).run()
     assert ("external/pose", 1) in play(resume=True)[0]
 
 

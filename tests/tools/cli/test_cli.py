@@ -8,7 +8,7 @@ import pytest
 
 from beamsplat.tools.cli.doctor import congestion
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 
 POSES = ("--set", "replay.data=x", "--set", "recorder.out=x")
 

@@ -11,7 +11,7 @@ from beamsplat.tools.system.assembly import build_node, faults, node_classes, su
 from beamsplat.tools.system.graph import as_mermaid, as_text, edges
 from tests.common.nodes import TABLE
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "deploy").glob("*.toml")), ids=lambda p: p.name)

@@ -11,7 +11,7 @@ import zenoh
 from beamsplat.common.zenoh.bus import open_session
 from beamsplat.tools.cli.system import router_config
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 
 
 def test_a_router_from_the_printed_configuration_routes(tmp_path, free_endpoint, capsys):

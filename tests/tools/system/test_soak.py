@@ -18,7 +18,7 @@ from beamsplat.tools.cli.simulate import simulate
 from beamsplat.tools.system.health_table import HealthBoard
 from beamsplat.tools.system.supervisor import Supervisor
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 MINUTES = float(os.environ.get("BEAMSPLAT_SOAK_MINUTES", "20"))
 EVERY_S = 5.0
 

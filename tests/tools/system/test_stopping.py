@@ -18,7 +18,7 @@ from beamsplat.common.zenoh.bus import Bus, open_router, open_session
 from beamsplat.tools.system.health_table import HealthBoard
 from beamsplat.tools.system.supervisor import Supervisor
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 
 _SERVE = """
     import sys, time

@@ -15,8 +15,8 @@ from beamsplat.common.config.deployment import Deployment, RouterConfig
 from beamsplat.common.errors import UserError
 from beamsplat.common.messages import Grid, Odometry
 from beamsplat.common.messages.header import Header
-from beamsplat.common.runtime.handover import Takeover
-from beamsplat.common.runtime.mailbox import NOBODY, Letter, Mailbox
+from beamsplat.common.runtime.handover import Handover
+from beamsplat.common.runtime.mailbox import NOBODY, Envelope, Mailbox
 from beamsplat.common.runtime.node import Node
 from beamsplat.common.runtime.registry import Service
 from beamsplat.common.zenoh.bus import open_session
@@ -187,43 +187,43 @@ def grid(stamp_ns):
 
 
 def test_a_successor_goes_on_where_its_predecessor_ended():
-    old, new = Takeover(standby=False), Takeover(standby=True)
-    said = [s for s in range(5) if not old.keeps("a", grid(s))]
-    assert [new.keeps("a", grid(s)) for s in range(2, 8)] == [True] * 6
+    old, new = Handover(standby=False), Handover(standby=True)
+    said = [s for s in range(5) if not old.holds_back("a", grid(s))]
+    assert [new.holds_back("a", grid(s)) for s in range(2, 8)] == [True] * 6
     assert (old.reached(), new.reached()) == ('{"a": 4}', '{"a": 7}')
     after = old.retire()
-    assert old.keeps("a", grid(9))  # what it would still say goes nowhere
+    assert old.holds_back("a", grid(9))  # what it would still say goes nowhere
     went_on = [m.stamp_ns for _, m in new.activate(after)]
     assert said + went_on == list(range(8))
-    assert not new.keeps("a", grid(8))
+    assert not new.holds_back("a", grid(8))
     with pytest.raises(ValueError):
-        list(Takeover(standby=True).activate("not JSON"))
+        list(Handover(standby=True).activate("not JSON"))
 
 
 def test_a_successor_that_lags_does_not_repeat_what_was_said():
-    new = Takeover(standby=True)
-    new.keeps("a", grid(1))
+    new = Handover(standby=True)
+    new.holds_back("a", grid(1))
     assert [m.stamp_ns for _, m in new.activate('{"said": {"a": 5}}')] == []
-    assert [s for s in range(2, 9) if not new.keeps("a", grid(s))] == [6, 7, 8]
-    assert not new.keeps("b", grid(2))
-    assert Takeover(standby=False).retire() == '{"said": {}}'
+    assert [s for s in range(2, 9) if not new.holds_back("a", grid(s))] == [6, 7, 8]
+    assert not new.holds_back("b", grid(2))
+    assert Handover(standby=False).retire() == '{"said": {}}'
     assert new.retire() == '{"said": {"a": 8, "b": 2}}'
     for wrong in ("[]", '{"said": 3}', '{"said": {"a": "b"}}'):
         with pytest.raises(ValueError):
-            list(Takeover(standby=True).activate(wrong))
+            list(Handover(standby=True).activate(wrong))
 
 
 def test_what_standby_has_no_room_for_is_counted_unless_the_predecessor_said_it():
-    new = Takeover(standby=True)
+    new = Handover(standby=True)
     for stamp in range(20):
-        new.keeps("a", grid(stamp))
+        new.holds_back("a", grid(stamp))
     assert [m.stamp_ns for _, m in new.activate('{"said": {"a": 1}}')] == list(range(4, 20))
     assert new.lost == 2  # 2 and 3
 
 
-def letter(sequence, instance="a" * 16):
+def envelope(sequence, instance="a" * 16):
     header = Header(sequence, 0, 0, sequence, 1, "localization", instance)
-    return Letter("localization/odometry", header, pose(sequence))
+    return Envelope("localization/odometry", header, pose(sequence))
 
 
 def pose(stamp_ns):
@@ -233,18 +233,18 @@ def pose(stamp_ns):
 def test_who_hands_over_what_it_knows_tells_what_it_has_handled():
     mailbox = Mailbox(Sink)
     for sequence in (0, 1, 2, 5):
-        mailbox.put(letter(sequence))
+        mailbox.put(envelope(sequence))
     for name in ("localization/correction", "localization/grid"):
         mailbox.end(name, NOBODY, 0)
     assert mailbox.pop().header.sequence == 0
-    old, new = Takeover(standby=False), Takeover(standby=True)
+    old, new = Handover(standby=False), Handover(standby=True)
     list(new.activate(old.retire(mailbox.handled())))
-    assert [s for s in range(8) if not new.was_handled(letter(s))] == [1, 2, 5, 6, 7]
-    assert not new.was_handled(letter(0, "b" * 16))
+    assert [s for s in range(8) if not new.was_handled(envelope(s))] == [1, 2, 5, 6, 7]
+    assert not new.was_handled(envelope(0, "b" * 16))
 
 
 def test_what_the_predecessor_never_spoke_of_is_said():
-    new = Takeover(standby=True)
-    new.keeps("b", grid(3))
-    assert [m.stamp_ns for _, m in new.activate(Takeover(standby=False).retire())] == [3]
+    new = Handover(standby=True)
+    new.holds_back("b", grid(3))
+    assert [m.stamp_ns for _, m in new.activate(Handover(standby=False).retire())] == [3]
     assert Sink.replaceable is False

@@ -1,0 +1,114 @@
+"""A node in a live process: inputs, outputs, background jobs and hand-over state, shared by its threads."""
+
+from __future__ import annotations
+
+import secrets
+import threading
+import time
+from collections import deque
+from collections.abc import Iterator
+from typing import Any
+
+from beamsplat.common.messages.header import local_clock_id
+from beamsplat.common.runtime.handover import Handover
+from beamsplat.common.runtime.jobs import JobQueue
+from beamsplat.common.runtime.live_settings import LiveSettings
+from beamsplat.common.runtime.mailbox import Envelope, Mailbox
+from beamsplat.common.runtime.node import Job, Node, Output
+from beamsplat.common.zenoh.streams import Publication
+
+POLL_S = 0.2  # how soon a signal is noticed while no message arrives
+_END_PATIENCE_S = 5.0  # an end marker waits this long for messages that are still in transit
+
+
+class RunningNode:
+    """The state that the threads of one live process share.
+
+    The node's own thread calls `next_envelope`, `emit` and the job methods; bus threads call `receive`,
+    `receive_end` and `wake`; the health thread reads counters. `changed` guards the mailbox.
+    """
+
+    def __init__(self, node: Node, settings: LiveSettings) -> None:
+        self.node = node
+        self.settings = node.home = settings
+        self.instance = settings.instance or secrets.token_hex(8)
+        self.handover = Handover(settings.standby)
+        self.accepts_arrivals = True  # whether `on_arrival` is called as soon as a message is received
+        self.arrival_lock = threading.Lock()  # held during `on_arrival`: retiring waits for it
+        self.mailbox = Mailbox(type(node), time.monotonic_ns)
+        self.changed = threading.Condition()
+        self.state = "configure"
+        self.detail = ""
+        self.steps_ms: deque[float] = deque(maxlen=512)
+        self.publications: dict[str, Publication] = {}
+        self.jobs: JobQueue  # set by the runner, before the node is configured
+        self._ends: list[tuple[str, str, int, int, float]] = []
+        self._clock_id = local_clock_id()
+
+    # --- called from threads of the bus ---
+
+    def receive(self, envelope: Envelope) -> None:
+        """Put a message into the mailbox, after the node's `on_arrival` has seen it."""
+        with self.arrival_lock:
+            # A message that the predecessor has handled may be recovered from the sender's cache later.
+            handover = self.handover
+            skip = handover.standby or handover.retired or handover.was_handled(envelope)
+            if self.accepts_arrivals and not skip:
+                self.emit(self.node.handle_arrival(envelope.topic, envelope.message))
+        with self.changed:
+            if self.mailbox.put(envelope):
+                self.changed.notify()
+
+    def receive_end(self, topic: str, instance: str, epoch: int, sent: int) -> None:
+        """Note that a producer has ended after `sent` messages."""
+        with self.changed:
+            self._ends.append((topic, instance, epoch, sent, time.monotonic() + _END_PATIENCE_S))
+            self.changed.notify()
+
+    def wake(self) -> None:
+        """Wake the node's thread from its wait for messages."""
+        with self.changed:
+            self.changed.notify()
+
+    # --- called from the node's thread ---
+
+    def next_envelope(self) -> Envelope | None:
+        """Return the next message, or None after `POLL_S` without one."""
+        with self.changed:
+            self._apply_ends()
+            envelope = self.mailbox.pop()
+            if envelope is None and not self.mailbox.ended:
+                self.changed.wait(POLL_S)
+                self._apply_ends()
+                envelope = self.mailbox.pop()
+            if envelope is not None:
+                age_ns = envelope.header.age_ns(time.monotonic_ns(), self._clock_id)
+                self.mailbox.counts[envelope.topic].age_ms = 0.0 if age_ns is None else age_ns / 1e6
+        return envelope
+
+    def _apply_ends(self) -> None:
+        """End an input once all messages that its producer sent have arrived, or after a time-out."""
+        waiting = []
+        for topic, instance, epoch, sent, deadline in self._ends:
+            if self.mailbox.next_sequence(topic, instance) >= sent or time.monotonic() > deadline:
+                self.mailbox.end(topic, instance, epoch, sent)
+            else:
+                waiting.append((topic, instance, epoch, sent, deadline))
+        self._ends = waiting
+
+    def emit(self, outputs: Iterator[Output]) -> None:
+        """Publish messages and start jobs; in standby, messages are held back."""
+        for output in outputs:
+            if isinstance(output, Job):
+                self.jobs.start(output).add_done_callback(lambda _: self.wake())
+            elif not self.handover.holds_back(*output):
+                self.publications[output[0]].put(output[1])
+
+    def emit_results(self, results: Iterator[tuple[str, Any]]) -> None:
+        """Hand the results of background jobs to the node and emit what it returns."""
+        for name, result in results:
+            self.emit(self.node.handle_job(name, result))
+
+    def finish_jobs(self) -> None:
+        """Wait for all background jobs and process their results."""
+        self.emit_results(self.jobs.rest())
