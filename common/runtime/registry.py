@@ -1,4 +1,4 @@
-"""Implementations chosen by name: "module:Class", imported only when chosen."""
+"""Implementations of a service by name ("module:Class"), imported only when a deployment chooses them."""
 
 from __future__ import annotations
 
@@ -8,12 +8,13 @@ from dataclasses import dataclass
 from beamsplat.common.config.base import parse
 from beamsplat.common.config.deployment import NodeConfig
 from beamsplat.common.errors import UserError
+from beamsplat.common.plugins import is_class_path, load_class
 from beamsplat.common.runtime.node import Node
 
 
 @dataclass(frozen=True)
 class Service:
-    """One row of the process list: a node, and the kinds there are of it."""
+    """One row of the process list: a node and its implementations ("kinds")."""
 
     name: str
     summary: str
@@ -21,14 +22,22 @@ class Service:
     extra: str = ""  # what `pip install beamsplat[extra]` it needs, beyond the robot's
 
     def load(self, kind: str) -> type[Node]:
-        """The node class of a kind.
+        """Import and return the node class of a kind.
+
+        Args:
+            kind: a key of `kinds`, "default", or the path of a class elsewhere, "my_package.my_node:MyNode".
 
         Raises:
-            UserError: no such kind, or its packages are not installed.
+            UserError: no such kind or class, its packages are not installed, or the class is not this node.
         """
         chosen = next(iter(self.kinds)) if kind == "default" else kind
+        if is_class_path(chosen):
+            return self._load_class(chosen)
         if chosen not in self.kinds:
-            raise UserError(f"{self.name} has no kind {kind!r}; there are {', '.join(self.kinds)}")
+            raise UserError(
+                f"nodes.{self.name}: there is no kind {kind!r}; there are {', '.join(self.kinds)}, and "
+                "'module:Class' of a class of your own"
+            )
         module_name, _, class_name = self.kinds[chosen].partition(":")
         try:
             module = importlib.import_module(module_name)
@@ -36,6 +45,17 @@ class Service:
             remedy = f"pip install 'beamsplat[{self.extra}]'" if self.extra else "make setup"
             raise UserError(f"{self.name} ({chosen}) needs the package {error.name}: {remedy}") from error
         return getattr(module, class_name)
+
+    def _load_class(self, path: str) -> type[Node]:
+        option = f"nodes.{self.name}.kind"
+        found = load_class(path, option)
+        if not issubclass(found, Node):
+            raise UserError(f"{option} = {path!r}: this class does not derive from {Node.__module__}.Node")
+        if found.name != self.name:
+            raise UserError(
+                f"{option} = {path!r}: the class declares name = {found.name!r}, expected {self.name!r}"
+            )
+        return found
 
 
 def class_of(service: Service, options: dict[str, object]) -> type[Node]:

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from difflib import get_close_matches
 
 from beamsplat.common.config.deployment import Deployment, Role
 from beamsplat.common.errors import UserError
+from beamsplat.common.plugins import is_class_path
 from beamsplat.common.runtime.node import Node
 from beamsplat.common.runtime.registry import Service, class_of, make_node
+from beamsplat.common.security.access_control import MASTERS
 from beamsplat.common.topics import TOPICS
 from beamsplat.services.nodes import NODES
+
+RESERVED = ("router", *MASTERS)  # users and processes of a running system that are not nodes
 
 
 @dataclass(frozen=True)
@@ -33,9 +38,19 @@ def _service(deployment: Deployment, name: str, table: dict[str, Service]) -> Se
     if name not in deployment.nodes:
         known = ", ".join(deployment.nodes) or "none"
         raise UserError(f"the deployment has no node {name!r}; it has {known}")
-    if name not in table:
-        raise UserError(f"nodes.{name}: no such service; there are {', '.join(table)}")
-    return table[name]
+    if name in table:
+        return table[name]
+    kind = str(deployment.nodes[name].get("kind", ""))
+    if is_class_path(kind):
+        if name in RESERVED:
+            raise UserError(f"nodes.{name}: this name is reserved; choose another for a node of your own")
+        return Service(name, "defined outside this package", {kind: kind})
+    near = get_close_matches(name, table, 1)
+    meant = f"did you mean {near[0]!r}? " if near else ""
+    raise UserError(
+        f"nodes.{name}: no such service; {meant}there are {', '.join(table)}; a node of your own needs "
+        'kind = "module:Class"'
+    )
 
 
 def node_classes(deployment: Deployment, table: dict[str, Service] = NODES) -> dict[str, type[Node]]:

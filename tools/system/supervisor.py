@@ -105,7 +105,7 @@ class Supervisor:
         """The router, then who listens, then who speaks."""
         if ROUTER in self._names:
             if (folder := self.deployment.security.local) is not None:
-                make_logins(folder, (*self.table, SUPERVISOR, OPERATOR))
+                make_logins(folder, (*self.table, *self.deployment.nodes, SUPERVISOR, OPERATOR))
             if self._router_answers():
                 raise UserError(
                     f"a router already runs at {', '.join(self.deployment.router.listen)}: stop it, name the "
