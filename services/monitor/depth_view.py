@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 import rerun as rr
 
+from beamsplat.common.geometry.tracks import RateLimit
 from beamsplat.services.monitor.screen import Screen
-from beamsplat.services.monitor.tracks import RateLimit
 
 DEPTH = "depth"
 CLOUD = "map/odom/cloud"

@@ -13,11 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 import rerun as rr
 
+from beamsplat.common.geometry.tracks import RateLimit
 from beamsplat.common.geometry.transforms import quat_xyzw_from_matrix
 from beamsplat.common.messages.splat_codec import unpack
 from beamsplat.common.raster.layout import COLOUR, MEAN, OPACITY, QUAT, SCALE
 from beamsplat.services.monitor.screen import Screen
-from beamsplat.services.monitor.tracks import RateLimit
 
 SPLATS = "map/splats"
 RENDER = "map_render"

@@ -11,6 +11,7 @@ from pydantic import Field
 
 from beamsplat.common.config.deployment import NodeConfig
 from beamsplat.common.errors import UserError
+from beamsplat.common.geometry.tracks import RateLimit
 from beamsplat.common.messages import FusedDepth, Health, MapStatus, Odometry, Rig
 from beamsplat.common.runtime.node import Input, Node, Output
 from beamsplat.services.monitor.depth_view import DepthView
@@ -19,7 +20,6 @@ from beamsplat.services.monitor.map_view import MapView
 from beamsplat.services.monitor.panel import NodeReport, Panel
 from beamsplat.services.monitor.scene import Look, Scene
 from beamsplat.services.monitor.screen import Screen
-from beamsplat.services.monitor.tracks import RateLimit
 from beamsplat.services.monitor.web import allowed_origins, free_port, serve_page
 
 log = logging.getLogger(__name__)

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import rerun as rr
 
+from beamsplat.common.geometry.tracks import RateLimit
 from beamsplat.services.monitor.screen import Screen
-from beamsplat.services.monitor.tracks import RateLimit
 
 # quantity -> how its plot is called
 PLOTS = {

@@ -18,9 +18,9 @@ from dataclasses import dataclass
 import numpy as np
 import rerun as rr
 
+from beamsplat.common.geometry.tracks import BoundedPath, PoseBuffer, RateLimit, scan_points, sweep_to_world
 from beamsplat.common.geometry.transforms import inverse, quat_xyzw_from_matrix, transform_points
 from beamsplat.services.monitor.screen import Screen
-from beamsplat.services.monitor.tracks import Path, Poses, RateLimit, scan_points, sweep_to_world
 
 WORLD = "map"
 BODY = f"{WORLD}/odom/body"
@@ -73,9 +73,9 @@ class Scene:
     def __init__(self, screen: Screen, limits: RateLimit, look: Look) -> None:
         self._screen = screen
         self._limits = limits
-        self._poses = {name: Poses() for name in SOURCES}
+        self._poses = {name: PoseBuffer() for name in SOURCES}
         paths = (*(f"{WORLD}/path/{name}" for name in SOURCES), _SMOOTH)
-        self._paths = {entity: Path(look.path_points, look.path_step_m) for entity in paths}
+        self._paths = {entity: BoundedPath(look.path_points, look.path_step_m) for entity in paths}
         self._T_map_odom = np.eye(4)
         self._T_map_wheel: np.ndarray | None = None
         self._T_body_lidar = np.eye(4)

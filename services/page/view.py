@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
+from beamsplat.common.geometry.tracks import BoundedPath, PoseBuffer, scan_points
 from beamsplat.common.geometry.transforms import transform_points, yaw_of
 from beamsplat.common.runtime.health import HealthBook, NodeRecord
-from beamsplat.services.monitor.tracks import Path, Poses, scan_points
 from beamsplat.services.page.pictures import Picture
 
 # Who is believed about the robot's pose, best first.
@@ -41,9 +41,9 @@ class View:
         self._T_body_lidar = np.eye(4)
         self._T_map_odom = np.eye(4)
         self._leader = len(SOURCES)
-        self._poses = Poses()  # of the leader, in the map
+        self._poses = PoseBuffer()  # of the leader, in the map
         self._posed = 0.0
-        self._path = Path(_PATH_POINTS, _PATH_STEP_M)
+        self._path = BoundedPath(_PATH_POINTS, _PATH_STEP_M)
         self._sweeps: deque[tuple[int, np.ndarray]] = deque(maxlen=_SWEEPS)
         self.pictures = {name: Picture(map_hz if name == "map" else picture_hz) for name in PICTURES}
 
@@ -92,7 +92,7 @@ class View:
             if rank > self._leader:
                 return
             if rank < self._leader:
-                self._leader, self._poses = rank, Poses()
+                self._leader, self._poses = rank, PoseBuffer()
             T_map_body = self._T_map_odom @ T_source_body if source == "localization" else T_source_body
             self._poses.add(stamp_ns, T_map_body)
             self._posed = time.monotonic()

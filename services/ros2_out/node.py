@@ -13,8 +13,8 @@ from beamsplat.common.recording import ros_types as ros
 from beamsplat.common.runtime.node import Node, Outputs
 from beamsplat.common.zenoh.bus import open_session
 from beamsplat.common.zenoh.rmw import Attachment, Entity, Qos, data_key
-from beamsplat.services.ros2.config import Ros2OutConfig
 from beamsplat.services.ros2_out import conversions as answers
+from beamsplat.services.ros2_out.config import Ros2OutConfig
 
 _VOLATILE = Qos(depth=10)
 _LATCHED = Qos(transient_local=True, depth=1)

@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from beamsplat.services.localization.lidar2d import se2
-from beamsplat.services.localization.lidar2d.jobs import JobResult, Snapshot
+from beamsplat.services.localization.lidar2d.jobs import JobResult
 from beamsplat.services.localization.lidar2d.lifelong import redundant_submaps
 from beamsplat.services.localization.lidar2d.nodes import Constraint, Keynode, Submap, TableCache
 from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
+from beamsplat.services.localization.lidar2d.snapshot import Snapshot
 
 
 class BackEnd:

@@ -16,11 +16,11 @@ from beamsplat.services.localization.lidar2d.loops import (
     close_wide,
     confirmed,
 )
-from beamsplat.services.localization.lidar2d.nodes import Constraint, Keynode, TableCache, edges_of
+from beamsplat.services.localization.lidar2d.nodes import Constraint, edges_of
 from beamsplat.services.localization.lidar2d.pose_graph import Edges, optimise
 from beamsplat.services.localization.lidar2d.refinement import refine_submaps
 from beamsplat.services.localization.lidar2d.segments import link_segment
-from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
+from beamsplat.services.localization.lidar2d.snapshot import Snapshot
 from beamsplat.services.localization.lidar2d.surfel_map import FrozenMap
 
 ITERATIONS, LAST_ITERATIONS = 10, 16
@@ -51,29 +51,6 @@ class BackgroundJob:
     number: int
     apply_at_scan: int  # before the scan of this number is added
     run: Callable[[], JobResult]
-
-
-@dataclass(frozen=True)
-class Snapshot:
-    """Everything a job reads; nothing in it changes later."""
-
-    number: int
-    settings: LidarSlamSettings
-    nodes: dict[int, Keynode]
-    frozen: dict[int, FrozenMap]
-    submap_ids: list[int]
-    node_ids: list[int]
-    members: dict[int, list[int]]
-    T_map_submap: np.ndarray  # float64 [S, 3]
-    T_map_node: np.ndarray  # float64 [N, 3]
-    constraints: list[Constraint]
-    pending: list[int]
-    tries: dict[int, int]
-    cache: TableCache
-    version: int  # of the map's poses
-    unlinked_from: int | None  # first keynode of a segment whose place in the map is unknown
-    fixed: frozenset[int]  # submaps that must not move
-    candidate: tuple[int, np.ndarray] | None  # an earlier answer to where the segment is
 
 
 def run_job(snapshot: Snapshot, refine_rounds: int = 0) -> JobResult:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -11,9 +10,7 @@ from beamsplat.services.localization.lidar2d import se2
 from beamsplat.services.localization.lidar2d.loops import Place, close_narrow
 from beamsplat.services.localization.lidar2d.nodes import Constraint, merged_features
 from beamsplat.services.localization.lidar2d.relocalization import GlobalMap, build_global_map, relocalize_in
-
-if TYPE_CHECKING:
-    from beamsplat.services.localization.lidar2d.jobs import Snapshot
+from beamsplat.services.localization.lidar2d.snapshot import Snapshot
 
 REACH_M = 4.0  # the submap a new segment is tied to has a keynode within this distance
 

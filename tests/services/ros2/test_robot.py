@@ -15,8 +15,9 @@ from beamsplat.common.messages import Cloud, Correction, Grid, Odometry
 from beamsplat.common.runtime.live import Live, LiveSettings
 from beamsplat.common.runtime.node import Input
 from beamsplat.common.zenoh.bus import Bus, open_router, open_session
-from beamsplat.services.ros2.config import Ros2Config, Ros2OutConfig
+from beamsplat.services.ros2.config import Ros2Config
 from beamsplat.services.ros2.node import Ros2Node
+from beamsplat.services.ros2_out.config import Ros2OutConfig
 from beamsplat.services.ros2_out.node import Ros2OutNode
 from beamsplat.tools.system.supervisor import Supervisor
 from tests.services.replay.make_bags import START_NS, T_BASE_CAMERA, T_BASE_LIDAR, Drive, write_bag

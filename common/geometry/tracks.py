@@ -1,4 +1,4 @@
-"""What a picture of a moving robot needs to remember: recent poses, a bounded path, when what was drawn."""
+"""Drawing a moving robot: rate limits, recent poses, a bounded path, a sweep in the world frame."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class RateLimit:
         return True
 
 
-class Poses:
+class PoseBuffer:
     """The last poses `T_world_body` of one source."""
 
     def __init__(self) -> None:
@@ -67,7 +67,7 @@ class Poses:
         return interpolate(T_0, T_1, (stamp_ns - stamp_0) / (stamp_1 - stamp_0))
 
 
-class Path:
+class BoundedPath:
     """Where something has been, in at most `max_points` vertices however long it drives.
 
     Vertices are `step_m` apart; when there are too many, every other one goes and the step doubles.

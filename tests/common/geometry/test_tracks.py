@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from beamsplat.common.geometry.transforms import inverse, se2_to_se3, transform_points
-from beamsplat.services.monitor.tracks import Path, Poses, RateLimit, scan_points, sweep_to_world
+from beamsplat.common.geometry.tracks import BoundedPath, PoseBuffer, RateLimit, scan_points, sweep_to_world
 
 NS = 1_000_000_000
 
@@ -28,7 +28,7 @@ def test_a_stream_at_the_limit_passes_in_spite_of_jitter():
 
 
 def test_poses_between_and_beyond_those_known():
-    poses = Poses()
+    poses = PoseBuffer()
     assert not poses
     assert poses.at(0) is None
     for i in range(300):
@@ -45,7 +45,7 @@ def test_poses_between_and_beyond_those_known():
 
 @given(st.integers(16, 200), st.integers(1, 3000))
 def test_a_path_is_bounded_and_ends_where_the_robot_is(max_points, steps):
-    path = Path(max_points, 0.05)
+    path = BoundedPath(max_points, 0.05)
     for i in range(steps):
         path.add(np.array([0.04 * i, 0.0, 0.0]))
     points = path.points_m

@@ -1,0 +1,34 @@
+"""The immutable copy of the pose graph on which background jobs work."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from beamsplat.services.localization.lidar2d.nodes import Constraint, Keynode, TableCache
+from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
+from beamsplat.services.localization.lidar2d.surfel_map import FrozenMap
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """Everything that a background job reads; nothing in it changes afterwards."""
+
+    number: int
+    settings: LidarSlamSettings
+    nodes: dict[int, Keynode]
+    frozen: dict[int, FrozenMap]
+    submap_ids: list[int]
+    node_ids: list[int]
+    members: dict[int, list[int]]
+    T_map_submap: np.ndarray  # float64 [S, 3]
+    T_map_node: np.ndarray  # float64 [N, 3]
+    constraints: list[Constraint]
+    pending: list[int]
+    tries: dict[int, int]
+    cache: TableCache
+    version: int  # of the map's poses
+    unlinked_from: int | None  # first keynode of a segment whose place in the map is unknown
+    fixed: frozenset[int]  # submaps that must not move
+    candidate: tuple[int, np.ndarray] | None  # an earlier answer to where the segment is

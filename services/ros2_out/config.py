@@ -1,0 +1,20 @@
+"""Options of the node that publishes to ROS 2."""
+
+from __future__ import annotations
+
+from beamsplat.common.config.deployment import NodeConfig
+from beamsplat.common.config.ros import ROUTER, Domain, domain_field
+
+
+class Ros2OutConfig(NodeConfig):
+    """What to give back. An empty topic name leaves it out."""
+
+    domain: Domain = domain_field()
+    router: str = ROUTER
+    pose_topic: str = "/beamsplat/pose"
+    cloud_topic: str = "/beamsplat/cloud"
+    map_topic: str = "/map"
+    tf: bool = True  # map -> odom, and odom -> body where the robot has no odometry of its own
+    map_frame: str = "map"
+    odom_frame: str = "odom"
+    body_frame: str = "base_link"
