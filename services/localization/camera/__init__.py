@@ -1,1 +1,1 @@
-"""Localization by the camera alone: render-and-compare tracking against a map of Gaussians of its own."""
+"""Camera-only localization: render-and-compare tracking against the tracker's own Gaussian map."""

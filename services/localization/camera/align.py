@@ -1,8 +1,8 @@
-"""Where the camera is: the pose at which the map, rendered, looks like the picture (Matsuki et al. 2024).
+"""Camera pose by direct alignment of the rendered map to an image (Matsuki et al. 2024).
 
-Coarse to fine. At each size the map is rendered once at the pose so far, and the rendered view, colour and
-depth, is aligned to the picture by Gauss-Newton with the analytic Jacobian on SE(3). Steps with the gradient
-of the rasterizer itself may follow; the normal equations then serve as preconditioner.
+Coarse to fine. At each pyramid level the map is rendered once at the current pose, and the rendered grey
+values and depth are aligned to the image by Gauss-Newton with the analytic Jacobian on SE(3). Optional steps
+along the rasterizer's own pose gradient may follow; they use the normal equations as preconditioner.
 """
 
 from __future__ import annotations
@@ -20,43 +20,43 @@ from beamsplat.common.geometry.transforms import (
     skew,
 )
 from beamsplat.common.raster.camera import RasterCamera
-from beamsplat.services.localization.camera.kernels import UNKNOWNS, choose_points, normal_equations
+from beamsplat.services.localization.camera.image_pyramid import GREY, GreyLevel, ImagePyramid, downsample_2x
+from beamsplat.services.localization.camera.kernels import UNKNOWN_COUNT, normal_equations, select_points
 from beamsplat.services.localization.camera.settings import CameraTrackerSettings
 from beamsplat.services.localization.camera.splat_map import SplatMap
-from beamsplat.services.localization.camera.view import GREY, GreyLevel, PictureView, halved
 
-_DAMPING = 1e-4  # of the diagonal: keeps what the picture does not tell where it was predicted
-_GAIN_PRIOR, _OFFSET_PRIOR = 5.0, 5.0  # exposure changes little between pictures
+_DAMPING = 1e-4  # relative to the diagonal: unobservable motions stay at their prediction
+_GAIN_PRIOR, _OFFSET_PRIOR = 5.0, 5.0  # information of the prior: exposure changes little between images
 
 
 @dataclass
 class Alignment:
-    """The answer for one picture, and what speaks for it."""
+    """Result of aligning one image, with its quality measures."""
 
-    T_camera_map: np.ndarray
-    points: int = 0  # used at the finest level
-    inliers: float = 0.0  # share of them within the error that counts as seen
-    correlation: float = 0.0  # of the rendered grey with the picture's at the points
-    error: float = 1.0  # median |grey error|
-    explained: float = 0.0  # share of the picture where the map is opaque
-    gain: float = 1.0
+    T_camera_map: np.ndarray  # float64 [4, 4]
+    points: int = 0  # number of points used at the finest level
+    inlier_ratio: float = 0.0  # fraction of these points whose error is below `settings.inlier_error`
+    correlation: float = 0.0  # Pearson correlation of rendered and observed grey at the points
+    error: float = 1.0  # median absolute grey error
+    coverage: float = 0.0  # fraction of the image where the map is opaque
+    gain: float = 1.0  # exposure model: observed = gain * rendered + offset
     offset: float = 0.0
-    hessian: np.ndarray | None = None  # [D, D] of the degrees of freedom, over the variance of the grey
-    in_view: np.ndarray | None = None  # int32: Gaussians that may be seen, ascending
+    hessian: np.ndarray | None = None  # float64 [D, D] of the free motions, divided by the grey variance
+    in_view: np.ndarray | None = None  # int32, ascending: indices of the Gaussians in the frustum
 
 
 @dataclass
 class _Rendered:
-    """The map as seen from a pose."""
+    """The map rendered at one pose."""
 
     grey: np.ndarray  # float32 [H, W]
-    z_m: np.ndarray  # float32 [H, W], 0 where unknown
+    z_m: np.ndarray  # float32 [H, W], 0 = unknown
     alpha: np.ndarray  # float32 [H, W]
-    index: np.ndarray
+    index: np.ndarray  # int32: Gaussians in the frustum
 
 
 class Aligner:
-    """Scratch memory and settings of `align`."""
+    """Aligns images to a splat map; holds the settings, the camera of each level and scratch buffers."""
 
     def __init__(
         self, camera: RasterCamera, T_body_camera: np.ndarray, settings: CameraTrackerSettings
@@ -68,35 +68,37 @@ class Aligner:
             self.cameras.append(last.resized(last.width_px // 2, last.height_px // 2))
         self._T_body_camera = T_body_camera
         self._basis = motion_basis(T_body_camera, settings.planar)  # [6, D]
-        self._points = np.zeros((settings.most_points, 4), np.float32)
-        self._residuals = np.zeros(settings.most_points, np.float32)
+        self._points = np.zeros((settings.max_points, 4), np.float32)
+        self._residuals = np.zeros(settings.max_points, np.float32)
 
-    def align(self, splats: SplatMap, picture: PictureView, start: Alignment) -> Alignment:
-        """Aligns the picture, beginning at `start` (its pose, gain and offset)."""
+    def align(self, splats: SplatMap, pyramid: ImagePyramid, start: Alignment) -> Alignment:
+        """Return the alignment of the image, starting at the pose, gain and offset of `start`."""
         s, found = self.settings, Alignment(start.T_camera_map, gain=start.gain, offset=start.offset)
-        # Coarse: one render at the second level serves all that are smaller.
+        # Coarse levels: one render at half size is downsampled for all smaller levels.
         rendered = self._render(splats, found.T_camera_map, 1)
         views = [rendered]
         for _ in range(1, len(s.coarse_steps)):
             last = views[-1]
-            views.append(_Rendered(*(halved(a) for a in (last.grey, last.z_m, last.alpha)), last.index))
+            views.append(
+                _Rendered(*(downsample_2x(a) for a in (last.grey, last.z_m, last.alpha)), last.index)
+            )
         T_start = found.T_camera_map
         for back, steps in enumerate(s.coarse_steps):
             level = len(s.coarse_steps) - back
-            self._gauss_newton(views[level - 1], picture.levels[level], level, T_start, steps, found)
+            self._gauss_newton(views[level - 1], pyramid.levels[level], level, T_start, steps, found)
         rendered = self._render(splats, found.T_camera_map, 0)
-        found.explained = float((rendered.alpha > s.least_alpha).mean())
+        found.coverage = float((rendered.alpha > s.min_alpha).mean())
         found.in_view = rendered.index
-        self._gauss_newton(rendered, picture.levels[0], 0, found.T_camera_map, s.fine_steps, found)
-        for _ in range(s.exact_steps):
-            self._exact_step(splats, picture.levels[0], found)
-        # Rounding grows from picture to picture where poses are inverted by transposition and extrapolated.
+        self._gauss_newton(rendered, pyramid.levels[0], 0, found.T_camera_map, s.fine_steps, found)
+        for _ in range(s.rasterizer_steps):
+            self._rasterizer_step(splats, pyramid.levels[0], found)
+        # Re-orthonormalise: poses are inverted by transposition and extrapolated, so rounding errors grow.
         R = matrix_from_quat_wxyz(quat_wxyz_from_matrix(found.T_camera_map[:3, :3]))
         found.T_camera_map = make_transform(R, found.T_camera_map[:3, 3])
         return found
 
     def to_body(self, covariance: np.ndarray) -> np.ndarray:
-        """float64 [3, 3] of the body's motion (x, y, yaw) in its own frame, from that of the free motions."""
+        """Return the covariance float64 [3, 3] of (x, y, yaw) in the body frame from that of the motions."""
         R, t = self._T_body_camera[:3, :3], self._T_body_camera[:3, 3]
         adjoint = np.block([[R, skew(t) @ R], [np.zeros((3, 3)), R]])
         to_body = (adjoint @ self._basis)[[0, 1, 5]]
@@ -105,7 +107,7 @@ class Aligner:
     def _render(self, splats: SplatMap, T_camera_map: np.ndarray, level: int) -> _Rendered:
         render = splats.render(self.cameras[level], T_camera_map)
         alpha = render.image[4].copy()
-        # Where little light comes through the gaps, it is the surface's: else gaps would look like texture.
+        # Normalise by alpha, so that small gaps between Gaussians do not look like texture.
         grey = np.tensordot(GREY, render.image[:3], axes=1) / np.maximum(alpha, 0.3)
         z = np.where(alpha > 0.3, render.image[3] / np.maximum(alpha, 0.3), 0.0).astype(np.float32)
         index = render.index.copy()
@@ -116,18 +118,18 @@ class Aligner:
         self, rendered: _Rendered, target: GreyLevel, level: int, T_render_map: np.ndarray, steps: int,
         found: Alignment,
     ) -> None:  # fmt: skip
-        """Improves `found` at one level; its pose is that of the picture."""
+        """Refine `found` in place at one pyramid level."""
         s, camera = self.settings, self.cameras[level]
-        count = self._choose(rendered)
+        count = self._select_points(rendered)
         T_now_render = found.T_camera_map @ inverse(T_render_map)
         K = np.array([camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px])
-        H, g = np.zeros((UNKNOWNS, UNKNOWNS)), np.zeros(UNKNOWNS)
+        H, g = np.zeros((UNKNOWN_COUNT, UNKNOWN_COUNT)), np.zeros(UNKNOWN_COUNT)
         delta = 0.05
         free = self._basis.shape[1]
         for step in range(steps + 1):
             used, _ = normal_equations(
                 self._points, count, K, T_now_render[:3, :3].copy(), T_now_render[:3, 3].copy(), target.grey,
-                target.slope_x, target.slope_y, found.gain, found.offset, delta, H, g, self._residuals,
+                target.gradient_x, target.gradient_y, found.gain, found.offset, delta, H, g, self._residuals,
             )  # fmt: skip
             if used < 6:
                 break
@@ -135,7 +137,7 @@ class Aligner:
             residuals = residuals[np.isfinite(residuals)]
             error = float(np.median(residuals))
             found.points, found.error = used, error
-            found.inliers = float((residuals < s.inlier_error).mean())
+            found.inlier_ratio = float((residuals < s.inlier_error).mean())
             delta = max(1.345 * 1.4826 * error, 0.008)
             A, b = self._reduced(H, g, found)
             found.hessian = A[:free, :free] / max(1.4826 * error, 0.004) ** 2
@@ -151,7 +153,7 @@ class Aligner:
         found.correlation = self._correlation(count, found)
 
     def _correlation(self, count: int, found: Alignment) -> float:
-        """A gain near zero would make anything look alike: this does not fall for it."""
+        """Return the correlation of rendered and observed grey; it detects a gain near zero."""
         residuals = self._residuals[:count].astype(np.float64)
         inside = np.isfinite(residuals)
         shown = self._points[:count, 3][inside].astype(np.float64)
@@ -161,8 +163,8 @@ class Aligner:
         return float(np.corrcoef(shown, seen)[0, 1])
 
     def _reduced(self, H: np.ndarray, g: np.ndarray, found: Alignment) -> tuple[np.ndarray, np.ndarray]:
-        """Normal equations of the free motions and of exposure, with priors and damping."""
-        B = np.zeros((UNKNOWNS, self._basis.shape[1] + 2))
+        """Return the normal equations of the free motions and the exposure, with priors and damping."""
+        B = np.zeros((UNKNOWN_COUNT, self._basis.shape[1] + 2))
         B[:6, :-2] = self._basis
         B[6, -2] = B[7, -1] = 1.0
         A, b = B.T @ H @ B, B.T @ g
@@ -174,46 +176,47 @@ class Aligner:
         A[np.diag_indices_from(A)] += 1e-9
         return A, b
 
-    def _exact_step(self, splats: SplatMap, target: GreyLevel, found: Alignment) -> None:
-        """One step down the rasterizer's pose gradient of the same robust loss."""
+    def _rasterizer_step(self, splats: SplatMap, target: GreyLevel, found: Alignment) -> None:
+        """Move `found` one step along the rasterizer's pose gradient of the same robust loss."""
         s = self.settings
-        gradient, used = exact_gradient(splats, self.cameras[0], target, found, s)
-        if used < s.least_points or found.hessian is None:
+        gradient, used = rasterizer_gradient(splats, self.cameras[0], target, found, s)
+        if used < s.min_points or found.hessian is None:
             return
         variance = max(1.4826 * found.error, 0.004) ** 2
         free = self._basis.shape[1]
-        # The normal equations hold for the chosen points, the gradient for all pixels used.
+        # The normal equations cover the selected points, the gradient all used pixels: rescale.
         H = found.hessian * variance * (used / max(found.points, 1)) + 1e-9 * np.eye(free)
         move = -np.linalg.solve(H, self._basis.T @ gradient)
         found.T_camera_map = se3_exp(self._basis @ np.clip(move, -0.02, 0.02)) @ found.T_camera_map
 
-    def _choose(self, rendered: _Rendered) -> int:
-        """Fills the points; of a picture full of contrast every n-th."""
+    def _select_points(self, rendered: _Rendered) -> int:
+        """Fill `self._points` and return their number; subsample if there are more than the buffer holds."""
         s, stride = self.settings, 1
         while True:
-            count, found = choose_points(
-                rendered.grey, rendered.z_m, rendered.alpha, np.float32(s.least_gradient),
-                np.float32(s.least_alpha), stride, self._points,
+            count, found = select_points(
+                rendered.grey, rendered.z_m, rendered.alpha, np.float32(s.min_gradient),
+                np.float32(s.min_alpha), stride, self._points,
             )  # fmt: skip
             if found // stride <= len(self._points):
                 return count
             stride = -(-found // len(self._points))
 
 
-def exact_gradient(
+def rasterizer_gradient(
     splats: SplatMap, camera: RasterCamera, target: GreyLevel, found: Alignment,
     settings: CameraTrackerSettings,
 ) -> tuple[np.ndarray, int]:  # fmt: skip
-    """dL/dxi [6] of T_camera_map <- se3_exp(xi) T_camera_map through the rasterizer, and the pixels used.
+    """Return dL/dxi [6] of T_camera_map <- se3_exp(xi) T_camera_map, and the number of pixels used.
 
-    L is Huber's loss of the grey error over pixels that the map explains and that have contrast.
+    The gradient passes through the rasterizer. L is the Huber loss of the grey error over pixels that the
+    map covers and that have contrast.
     """
     render = splats.render(camera, found.T_camera_map)
     alpha = np.maximum(render.image[4], 0.3)
     grey = np.tensordot(GREY, render.image[:3], axes=1) / alpha
     error = found.gain * grey + found.offset - target.grey
-    dx, dy = target.slope_x, target.slope_y
-    use = (render.image[4] > settings.least_alpha) & (dx * dx + dy * dy > settings.least_gradient**2)
+    dx, dy = target.gradient_x, target.gradient_y
+    use = (render.image[4] > settings.min_alpha) & (dx * dx + dy * dy > settings.min_gradient**2)
     delta = np.float32(max(1.345 * 1.4826 * found.error, 0.008))
     slope = np.where(use, np.clip(error, -delta, delta), 0.0).astype(np.float32)
     gradient = np.zeros_like(render.image)
@@ -225,10 +228,10 @@ def exact_gradient(
 
 
 def motion_basis(T_body_camera: np.ndarray, planar: bool) -> np.ndarray:
-    """[6, D] motions of the camera that are allowed: all six, or what a body does that stays on its floor.
+    """Return a basis [6, D] of the allowed camera motions: all six, or only planar motions of the body.
 
-    T_camera_map <- exp(xi) T_camera_map moves the map as the camera sees it; a body that drives and turns
-    on the floor gives xi = Ad(T_camera_body) (vx, vy, 0, 0, 0, wz).
+    The update is T_camera_map <- exp(xi) T_camera_map. A body that moves on the floor has
+    xi = Ad(T_camera_body) (vx, vy, 0, 0, 0, wz).
     """
     if not planar:
         return np.eye(6)

@@ -1,4 +1,4 @@
-"""What becomes of a picture's depth before it may enter the map: its size, its edges, its scale."""
+"""Preparation of an image's depth map for the splat map: resampling, removal of edges, scale alignment."""
 
 from __future__ import annotations
 
@@ -7,50 +7,52 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-MAX_DEPTH = 60.0
-_EDGE = 0.06  # relative step between neighbours that is an edge: a pixel there belongs to neither side
-_BLUR_SHARE = 0.12  # of the picture's width: reach of what the map knows into what it does not
-_LEAST_OVERLAP = 0.05  # share of the picture that must be known to both, to compare scales
-_MAP_SCALE_SIGMA = 0.03  # of the log scale at which the map shows what it has seen before
+MAX_DEPTH_M = 60.0
+_EDGE_RELATIVE_STEP = 0.06  # relative depth step of a depth edge; pixels at an edge mix two surfaces
+_BLUR_WIDTH_RATIO = 0.12  # of the image width: sigma of the blur that extends the scale field
+_MIN_OVERLAP = 0.05  # fraction of the image where both depths must be known to compare scales
+_MAP_SCALE_SIGMA = 0.03  # standard deviation of the map's own log scale
 
 
 @dataclass(frozen=True)
-class DepthGuess:
-    """Depth of one picture, as its source gives it."""
+class DepthPrior:
+    """Depth map of one image from a depth source."""
 
-    z: np.ndarray  # float32 [H, W], optical z, NaN unknown; any size of the picture's shape
-    scale_sigma: float  # standard deviation of the log of its scale, from picture to picture
-    metric: bool  # its unit is the metre
+    z: np.ndarray  # float32 [H, W], optical z, NaN = unknown; any size with the image's aspect ratio
+    scale_sigma: float  # standard deviation of the log scale between images
+    metric: bool  # True: metres; False: arbitrary unit
 
 
-def shrunk(z: np.ndarray, width_px: int, height_px: int) -> np.ndarray:
-    """float32 [height_px, width_px], 0 where unknown or at an edge, of depth [H, W] with NaN.
+def resize_depth(z: np.ndarray, width_px: int, height_px: int) -> np.ndarray:
+    """Return depth [H, W] (NaN = unknown) resampled to float32 [height_px, width_px].
 
-    Inverse depth is averaged, which a plane survives; at edges, where the mean of two surfaces is neither,
-    there is none.
+    The result is 0 where the depth is unknown and at depth edges, because the mean of two surfaces is
+    neither of them. Inverse depth is averaged, because it is linear in the image for a plane.
     """
     with np.errstate(invalid="ignore"):
-        known = np.isfinite(z) & (z > 0.05) & (z < MAX_DEPTH)
+        known = np.isfinite(z) & (z > 0.05) & (z < MAX_DEPTH_M)
         inverse_z = np.where(known, 1.0 / z, 0.0).astype(np.float32)
     mean = cv2.resize(inverse_z, (width_px, height_px), interpolation=cv2.INTER_AREA)
     whole = cv2.resize(known.astype(np.float32), (width_px, height_px), interpolation=cv2.INTER_AREA) > 0.999
     small = np.where(whole, 1.0 / np.maximum(mean, 1e-6), 0.0).astype(np.float32)
     far, near = cv2.dilate(small, np.ones((3, 3))), cv2.erode(small, np.ones((3, 3)))
-    return np.where((near > 0.0) & (far - near < _EDGE * 2.0 * np.maximum(near, 1e-6)), small, 0.0)
+    return np.where(
+        (near > 0.0) & (far - near < _EDGE_RELATIVE_STEP * 2.0 * np.maximum(near, 1e-6)), small, 0.0
+    )
 
 
-def fitted_to_map(
+def align_scale_to_map(
     z: np.ndarray,  # float32 [h, w], 0 unknown
-    rendered_z: np.ndarray,  # float32 [h, w] of the map from there, 0 unknown
+    rendered_z: np.ndarray,  # float32 [h, w] of the map rendered at the same pose, 0 unknown
     scale_sigma: float,
 ) -> tuple[np.ndarray, float]:
-    """Depth brought to the scale at which the map continues, and the log ratio found (NaN if none).
+    """Return the depth rescaled towards the map, and the median log ratio found (NaN if too little overlap).
 
-    A source that is sure of its scale keeps it; one that is not follows the map, smoothly varying over the
-    picture: a keyframe must not begin beside the surface where the map ends.
+    The weight of the map grows with `scale_sigma`: a source with an exact scale keeps it. The correction
+    varies smoothly over the image, so that a new keyframe continues the map's surface without a step.
     """
     both = (z > 0.0) & (rendered_z > 0.0)
-    if both.mean() < _LEAST_OVERLAP:
+    if both.mean() < _MIN_OVERLAP:
         return z, float("nan")
     log_ratio = np.zeros(z.shape, np.float32)
     log_ratio[both] = np.log(z[both] / rendered_z[both])
@@ -58,9 +60,9 @@ def fitted_to_map(
     spread = max(1.4826 * float(np.median(np.abs(log_ratio[both] - middle))), 0.02)
     good = both & (np.abs(log_ratio - middle) < 3.0 * spread)
     trust = scale_sigma**2 / (scale_sigma**2 + _MAP_SCALE_SIGMA**2)
-    sigma_px = _BLUR_SHARE * z.shape[1]
+    sigma_px = _BLUR_WIDTH_RATIO * z.shape[1]
     weight = cv2.GaussianBlur(good.astype(np.float32), (0, 0), sigma_px)
     local = cv2.GaussianBlur(np.where(good, log_ratio, middle * 0.0), (0, 0), sigma_px)
-    prior = 0.05  # so much of the whole picture's answer, where little is known nearby
+    prior = 0.05  # weight of the image's median, where little overlap is nearby
     field = (local + prior * middle) / (weight + prior)
     return (z * np.exp(-trust * field)).astype(np.float32), middle

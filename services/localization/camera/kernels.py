@@ -1,7 +1,8 @@
-"""Direct alignment of a rendered view and a picture, as compiled loops on arrays.
+"""Compiled kernels of the direct alignment of a rendered view to an image, and of the map loss.
 
-The rendered view is a set of points with colour: X = z K^-1 (u, v, 1) in the frame of the render. Moved by
-T_now_render they fall on the picture; the residual is the picture there minus the rendered grey.
+The rendered view is a set of points with grey values: X = z K^-1 (u, v, 1) in the camera frame of the render.
+They are transformed by T_now_render and projected into the image; the residual is the image value minus the
+rendered grey.
 """
 
 from __future__ import annotations
@@ -10,28 +11,28 @@ import numpy as np
 
 from beamsplat.common.compiled import kernel
 
-UNKNOWNS = 8  # (rho, phi) of the left perturbation of T_now_render, log gain, offset
+UNKNOWN_COUNT = 8  # (rho, phi) of the left perturbation of T_now_render, log gain, offset
 
 
 @kernel
-def choose_points(grey, z_m, alpha, least_gradient, least_alpha, stride, out):  # noqa: ANN001, ANN201
-    """Writes (u, v, z, grey) of the pixels with contrast that the map explains into out [N, 4].
+def select_points(grey, z_m, alpha, min_gradient, min_alpha, stride, out):  # noqa: ANN001, ANN201
+    """Write (u, v, z, grey) of pixels with contrast and an opaque map (and neighbours) into out [N, 4].
 
-    `stride` takes every n-th of them; their neighbours must be explained too. Gives (how many were written,
-    how many there are before the stride): where they do not fit, call again with a larger stride.
+    Every `stride`-th such pixel is taken. Returns (number written, number before the stride); if they do not
+    fit into `out`, call again with a larger stride.
     """
     height, width = grey.shape
     found, n = 0, 0
     for v in range(1, height - 1):
         for u in range(1, width - 1):
-            if alpha[v, u] < least_alpha or not z_m[v, u] > 0.0:
+            if alpha[v, u] < min_alpha or not z_m[v, u] > 0.0:
                 continue
             dx = np.float32(0.5) * (grey[v, u + 1] - grey[v, u - 1])
             dy = np.float32(0.5) * (grey[v + 1, u] - grey[v - 1, u])
-            if dx * dx + dy * dy < least_gradient * least_gradient:
+            if dx * dx + dy * dy < min_gradient * min_gradient:
                 continue
             near = min(min(alpha[v, u - 1], alpha[v, u + 1]), min(alpha[v - 1, u], alpha[v + 1, u]))
-            if near < least_alpha:
+            if near < min_alpha:
                 continue
             found += 1
             if found % stride == 0 and n < len(out):
@@ -42,21 +43,22 @@ def choose_points(grey, z_m, alpha, least_gradient, least_alpha, stride, out):  
 
 @kernel
 def normal_equations(  # noqa: ANN201
-    points, count, camera, R, t, picture, slope_x, slope_y, gain, offset, delta, H, g, residuals,  # noqa: ANN001
+    points, count, camera, R, t, image, gradient_x, gradient_y, gain, offset, delta, H, g, residuals,  # noqa: ANN001
 ):  # fmt: skip
-    """Sums J^T w J into H [8, 8] and J^T w r into g [8] with Huber's weights; gives (points used, cost).
+    """Sum J^T w J into H [8, 8] and J^T w r into g [8] with Huber weights; return (points used, cost).
 
     Args:
-        points: float32 [N, 4] as chosen. camera: float64 (fx, fy, cx, cy) of this level. R, t: T_now_render.
-        picture, slope_x, slope_y: float32 [H, W], grey and its central differences a pixel.
-        gain, offset: r = picture - (gain grey + offset). delta: Huber's threshold.
-        residuals: float32 [N], NaN where a point falls outside.
+        points: float32 [N, 4] of select_points. camera: float64 (fx, fy, cx, cy) of this level.
+        R, t: rotation and translation of T_now_render.
+        image, gradient_x, gradient_y: float32 [H, W], grey and its central differences per pixel.
+        gain, offset: r = image - (gain grey + offset). delta: Huber threshold.
+        residuals: out float32 [N], NaN where a point falls outside the image.
     """
-    height, width = picture.shape
+    height, width = image.shape
     fx, fy, cx, cy = camera[0], camera[1], camera[2], camera[3]
     H[:] = 0.0
     g[:] = 0.0
-    J = np.empty(UNKNOWNS)
+    J = np.empty(UNKNOWN_COUNT)
     used, cost = 0, 0.0
     for i in range(count):
         residuals[i] = np.nan
@@ -74,23 +76,18 @@ def normal_equations(  # noqa: ANN201
         c, r = int(u), int(v)
         a, b = u - c, v - r
         w00, w01, w10, w11 = (1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b
-        seen = (
-            w00 * picture[r, c]
-            + w01 * picture[r, c + 1]
-            + w10 * picture[r + 1, c]
-            + w11 * picture[r + 1, c + 1]
-        )
+        seen = w00 * image[r, c] + w01 * image[r, c + 1] + w10 * image[r + 1, c] + w11 * image[r + 1, c + 1]
         sx = (
-            w00 * slope_x[r, c]
-            + w01 * slope_x[r, c + 1]
-            + w10 * slope_x[r + 1, c]
-            + w11 * slope_x[r + 1, c + 1]
+            w00 * gradient_x[r, c]
+            + w01 * gradient_x[r, c + 1]
+            + w10 * gradient_x[r + 1, c]
+            + w11 * gradient_x[r + 1, c + 1]
         )
         sy = (
-            w00 * slope_y[r, c]
-            + w01 * slope_y[r, c + 1]
-            + w10 * slope_y[r + 1, c]
-            + w11 * slope_y[r + 1, c + 1]
+            w00 * gradient_y[r, c]
+            + w01 * gradient_y[r, c + 1]
+            + w10 * gradient_y[r + 1, c]
+            + w11 * gradient_y[r + 1, c + 1]
         )
         grey = float(points[i, 3])
         error = seen - (gain * grey + offset)
@@ -104,13 +101,13 @@ def normal_equations(  # noqa: ANN201
         J[0], J[1], J[2] = px, py, pz
         J[3], J[4], J[5] = y * pz - z * py, z * px - x * pz, x * py - y * px
         J[6], J[7] = -gain * grey, -1.0
-        for row in range(UNKNOWNS):
+        for row in range(UNKNOWN_COUNT):
             wj = w * J[row]
             g[row] += wj * error
-            for column in range(row, UNKNOWNS):
+            for column in range(row, UNKNOWN_COUNT):
                 H[row, column] += wj * J[column]
         used += 1
-    for row in range(UNKNOWNS):
+    for row in range(UNKNOWN_COUNT):
         for column in range(row):
             H[row, column] = H[column, row]
     return used, cost
@@ -118,11 +115,12 @@ def normal_equations(  # noqa: ANN201
 
 @kernel
 def map_loss(image, rgb, z_m, weight, colour_scale, depth_scale, gradient):  # noqa: ANN001, ANN201
-    """L1 of colour over alpha and of depth of a render, its gradient float32 [5, H, W]; gives the loss.
+    """Return the L1 loss of a render against a keyframe and write its gradient float32 [5, H, W].
 
-    `image` float32 [5, H, W] as rendered, `rgb` float32 [3, H, W], `z_m` float32 [H, W] (0 unknown). The
-    depth term is w |sum w_i z_i - z alpha|: zero where the surface is right, whatever its opacity. Where
-    there is a surface, alpha is drawn to one: what is seen through gaps is not part of the picture.
+    `image` float32 [5, H, W] is the render (colour, depth, alpha), `rgb` float32 [3, H, W], `z_m` float32
+    [H, W] (0 = unknown). The colour term uses colour / alpha. The depth term is w |sum w_i z_i - z alpha|,
+    which is zero at the right depth for any opacity. Where the depth is known, alpha is pulled towards one,
+    so that gaps in the surface close.
     """
     height, width = z_m.shape
     total = 0.0

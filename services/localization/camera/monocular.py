@@ -1,8 +1,9 @@
-"""Depth where nobody gives any: from the pictures' own parallax, in a unit that is nobody's.
+"""Depth from the parallax of the images themselves, in an arbitrary unit, for use without a depth source.
 
-The first picture is taken for a wall. What the camera then does before it gives first poses, those give the
-first picture's depth by a plane sweep, that gives better poses, and so on: a few rounds settle it. The unit
-is fixed by the wall's distance. Later keyframes get depth from the pictures before them.
+Initialisation: the first image is assumed to show a fronto-parallel plane at depth INITIAL_DEPTH. Tracking
+against it yields poses; a plane sweep with these poses yields depth of the first image; better depth yields
+better poses. INIT_ROUNDS repetitions suffice. INITIAL_DEPTH fixes the unit. Later keyframes get their depth
+from the images before them.
 """
 
 from __future__ import annotations
@@ -12,56 +13,61 @@ import numpy as np
 
 from beamsplat.common.geometry.transforms import inverse
 from beamsplat.common.raster.camera import RasterCamera
-from beamsplat.services.localization.camera.sweep import filled, sweep
+from beamsplat.services.localization.camera.plane_sweep import fill_unknown, sweep
 
-WALL = 2.0  # distance of the first wall: the unit
-ROUNDS = 4
-FIRST_BASELINES = (0.03, 0.06, 0.10, 0.14)  # of the wall's distance, one a round
-_LEAST_BASELINE = 0.025  # of the usual depth
-_MOST_OTHERS = 3
-_FILL_PX = 4.0
-_NEAREST, _FARTHEST = 0.2, 6.0  # times the usual depth
+INITIAL_DEPTH = 2.0  # assumed depth of the first image; defines the unit of the map
+INIT_ROUNDS = 4
+INIT_BASELINES = (0.03, 0.06, 0.10, 0.14)  # baseline of each round, relative to INITIAL_DEPTH
+_MIN_BASELINE_RATIO = 0.025  # relative to the typical depth
+_MAX_OTHER_IMAGES = 3
+_FILL_PX = 4.0  # sigma of the interpolation of unknown depth
+_NEAREST_RATIO, _FARTHEST_RATIO = 0.2, 6.0  # range of the plane sweep, relative to the typical depth
 
-# (grey float32 [h, w] at half the finest size, T_map_camera)
-Look = tuple[np.ndarray, np.ndarray]
+# (grey float32 [h, w] at half of the finest size, T_map_camera)
+PosedImage = tuple[np.ndarray, np.ndarray]
 
 
-def choose_others(
-    here: Look, candidates: list[Look], usual_depth: float
+def select_other_images(
+    here: PosedImage, candidates: list[PosedImage], usual_depth: float
 ) -> list[tuple[np.ndarray, np.ndarray]]:
-    """(grey, T_other_here) of up to three looks with different baselines, the widest first."""
+    """Return (grey, T_other_here) of up to three images with different baselines, the widest first."""
     found = []
     for grey, T_map_camera in candidates:
         T_other_here = inverse(T_map_camera) @ here[1]
         baseline = float(np.linalg.norm(T_other_here[:3, 3]))
-        if baseline > _LEAST_BASELINE * usual_depth and T_other_here[2, 2] > 0.85:
+        if baseline > _MIN_BASELINE_RATIO * usual_depth and T_other_here[2, 2] > 0.85:
             found.append((baseline, grey, T_other_here))
     found.sort(key=lambda entry: -entry[0])
-    picked = [found[i] for i in np.unique(np.linspace(0, len(found) - 1, _MOST_OTHERS).round().astype(int))]
+    picked = [
+        found[i] for i in np.unique(np.linspace(0, len(found) - 1, _MAX_OTHER_IMAGES).round().astype(int))
+    ]
     return [(grey, T) for _, grey, T in picked] if found else []
 
 
-def depth_by_motion(
-    here: Look, candidates: list[Look], camera: RasterCamera, usual_depth: float
+def depth_from_parallax(
+    here: PosedImage, candidates: list[PosedImage], camera: RasterCamera, usual_depth: float
 ) -> np.ndarray:
-    """float32 [h, w], 0 where there is no parallax to tell it by."""
-    others = choose_others(here, candidates, usual_depth) if candidates else []
+    """Return depth float32 [h, w] of the image `here`, 0 where there is no parallax."""
+    others = select_other_images(here, candidates, usual_depth) if candidates else []
     if not others:
         return np.zeros(here[0].shape, np.float32)
-    z = sweep(here[0], others, camera, _NEAREST * usual_depth, _FARTHEST * usual_depth)
-    return _without_loners(z)
+    z = sweep(here[0], others, camera, _NEAREST_RATIO * usual_depth, _FARTHEST_RATIO * usual_depth)
+    return _remove_outliers(z)
 
 
 def dense(z: np.ndarray, shown: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """float32 `shape`: swept depth, where there is none what the map shows, elsewhere what lies around."""
+    """Return depth float32 of size `shape` without gaps.
+
+    Sources in order of preference: swept depth `z`, depth `shown` rendered from the map, interpolation.
+    """
     h, w = z.shape
     known = cv2.resize(shown, (w, h), interpolation=cv2.INTER_NEAREST)
-    both = filled(np.where(z > 0.0, z, known), _FILL_PX)
+    both = fill_unknown(np.where(z > 0.0, z, known), _FILL_PX)
     return cv2.resize(both, (shape[1], shape[0]), interpolation=cv2.INTER_NEAREST)
 
 
-def _without_loners(z: np.ndarray) -> np.ndarray:
-    """Drops pixels whose inverse depth differs from the median around them."""
+def _remove_outliers(z: np.ndarray) -> np.ndarray:
+    """Set pixels to 0 whose inverse depth differs from the mean of their 9 x 9 neighbourhood."""
     q = np.where(z > 0.0, 1.0 / np.maximum(z, 1e-6), 0.0).astype(np.float32)
     weight = cv2.blur((z > 0.0).astype(np.float32), (9, 9))
     mean = cv2.blur(q, (9, 9)) / np.maximum(weight, 1e-6)

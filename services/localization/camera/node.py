@@ -1,4 +1,4 @@
-"""Camera localization as a node: pictures and depth in; pose, its doubt and its scale out."""
+"""Camera localization node: images and depth in; pose with covariance and metric flag out."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from beamsplat.common.geometry.camera import Pinhole, Undistorter
 from beamsplat.common.messages import Correction, DepthEstimate, Image, Odometry, Rig
 from beamsplat.common.messages.image_codec import decode_rgb
 from beamsplat.common.runtime.node import Input, Node, Outputs
-from beamsplat.services.localization.camera.depth import DepthGuess
+from beamsplat.services.localization.camera.depth import DepthPrior
 from beamsplat.services.localization.camera.settings import CameraTrackerSettings
-from beamsplat.services.localization.camera.tracker import CameraResult, CameraTracker
+from beamsplat.services.localization.camera.tracker import CameraTracker, TrackingResult
 from beamsplat.services.localization.camera.warm import warm
 
 log = logging.getLogger("beamsplat.localization")
 
-ARBITRARY = "scale is arbitrary: the depth has no unit, lengths are not metres"
+ARBITRARY_SCALE = "scale is arbitrary: the depth has no unit, lengths are not metres"
 
 
 class CameraLocalizationConfig(NodeConfig):
-    """What is true of the robot and of its depth.
+    """Properties of the robot and of its depth source.
 
-    `depth = "estimate"` waits for the depth service and takes its word for what its numbers mean; "none" lets
-    the camera work alone. `scale_sigma`: how much the depth's scale varies from picture to picture (log).
+    `depth = "estimate"` uses the depth service, in the unit that it states; "none" uses the camera alone.
+    `scale_sigma` is the standard deviation of the log scale of the depth between images.
     """
 
     depth: Literal["estimate", "none"] = "estimate"
@@ -39,11 +39,11 @@ class CameraLocalizationConfig(NodeConfig):
 
 
 class CameraLocalization(Node):
-    """The robot's pose from its camera, by rendering a map of Gaussians and comparing."""
+    """Localization service that tracks the camera against a Gaussian map by rendering and comparison."""
 
     name = "localization"
     Config = CameraLocalizationConfig
-    # The depth service may itself look at our poses (beams of a picture's time): its end is not waited for.
+    # The depth service may itself use the poses of this node: do not wait for its end of stream.
     inputs = (Input("rig", "every"), Input("camera/image", "latest"), Input("depth/estimate", feedback=True))
     outputs = ("localization/odometry", "localization/correction")
 
@@ -51,25 +51,24 @@ class CameraLocalization(Node):
         cv2.setNumThreads(1)
         warm()
         self._tracker: CameraTracker | None = None
-        self._refused = 0
 
     def on_rig(self, rig: Rig) -> Outputs:
-        """The camera. A second calibration would bend the map: it is refused, and said."""
+        """Create the tracker from the first calibration; ignore later ones, which would distort the map."""
         if rig.camera is None:
-            log.error("the calibration has no camera: pictures cannot be used")
+            log.error("the calibration has no camera: images cannot be used")
         elif self._tracker is None:
             c = rig.camera
             lens = Pinhole.of(c)
             self._undistort = Undistorter(lens)
             settings = CameraTrackerSettings(planar=self.config.planar, width_px=self.config.width_px)
             self._tracker = CameraTracker(self._undistort.pinhole, c.T_body_camera, settings)
-            # One frame serves as map and as odom: nothing here ever jumps.
+            # The map and odom frames are identical, because the estimate is never corrected.
             yield "localization/correction", Correction(stamp_ns=rig.stamp_ns, T_map_odom=np.eye(4))
         else:
             log.warning("a new calibration is ignored: restart the node to use it")
 
     def on_camera_image(self, image: Image) -> Outputs:
-        """One answer a picture."""
+        """Publish one pose per image."""
         if self._tracker is None:
             yield "localization/odometry", _rejected(image.stamp_ns, "no calibration yet")
             return
@@ -83,11 +82,11 @@ class CameraLocalization(Node):
         result = self._tracker.track(image.stamp_ns, rgb)
         if self.config.depth == "none" and result.status in ("ok", "relocalizing"):
             self._tracker.add_without_depth(image.stamp_ns)
-        self._say(result)
+        self._set_detail(result)
         yield "localization/odometry", self._odometry(result)
 
     def on_depth_estimate(self, estimate: DepthEstimate) -> Outputs:
-        """Depth of a picture that has been tracked: a keyframe, where one is due."""
+        """Add a keyframe from the depth of a tracked image, where one is due."""
         if self._tracker is None or self.config.depth == "none":
             return iter(())
         if estimate.kind == "none" and estimate.status == "ok":
@@ -97,30 +96,31 @@ class CameraLocalization(Node):
             if estimate.kind == "disparity":
                 with np.errstate(divide="ignore", invalid="ignore"):
                     z = np.where(z > 1e-6, 1.0 / z, np.nan).astype(np.float32)
-            guess = DepthGuess(z, self.config.scale_sigma, estimate.kind == "metric")
-            self._tracker.add_depth(estimate.stamp_ns, guess)
+            prior = DepthPrior(z, self.config.scale_sigma, estimate.kind == "metric")
+            self._tracker.add_depth(estimate.stamp_ns, prior)
         return iter(())
 
     def close(self) -> None:
         if getattr(self, "_tracker", None) is not None:
             self._tracker.close()
 
-    def _odometry(self, result: CameraResult) -> Odometry:
+    def _odometry(self, result: TrackingResult) -> Odometry:
         metric = bool(self._tracker.metric)
-        scale = "" if metric or self._tracker.metric is None else ARBITRARY
+        scale = "" if metric or self._tracker.metric is None else ARBITRARY_SCALE
         return Odometry(
             stamp_ns=result.stamp_ns, T_odom_body=result.T_map_body, covariance=result.covariance,
             status=result.status, detail="; ".join(t for t in (result.detail, scale) if t), metric=metric,
         )  # fmt: skip
 
-    def _say(self, result: CameraResult) -> None:
+    def _set_detail(self, result: TrackingResult) -> None:
+        """Set the text that the health message shows."""
         t = self._tracker
-        said = [f"{len(t.splats.keyframes)} keyframes, {t.splats.store.count} Gaussians", result.detail]
+        parts = [f"{len(t.splats.keyframes)} keyframes, {t.splats.store.count} Gaussians", result.detail]
         if t.metric is False:
-            said.append(ARBITRARY)
+            parts.append(ARBITRARY_SCALE)
         if np.isfinite(t.scale_disagreement) and abs(t.scale_disagreement) > 0.05:
-            said.append(f"new depth is {np.exp(t.scale_disagreement):.2f} times the map's")
-        self.detail = "; ".join(text for text in said if text)
+            parts.append(f"new depth is {np.exp(t.scale_disagreement):.2f} times the map's")
+        self.detail = "; ".join(text for text in parts if text)
 
 
 def _rejected(stamp_ns: int, why: str) -> Odometry:

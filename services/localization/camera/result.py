@@ -1,4 +1,4 @@
-"""What tracking says about a picture, and what it keeps of one."""
+"""Results of camera tracking."""
 
 from __future__ import annotations
 
@@ -7,33 +7,33 @@ from dataclasses import dataclass
 import numpy as np
 
 from beamsplat.services.localization.camera.align import Alignment
-from beamsplat.services.localization.camera.view import PictureView
+from beamsplat.services.localization.camera.image_pyramid import ImagePyramid
 
 
 @dataclass(frozen=True)
-class CameraResult:
-    """What is said about one picture."""
+class TrackingResult:
+    """Pose estimate of one image."""
 
     stamp_ns: int
-    T_map_body: np.ndarray
+    T_map_body: np.ndarray  # float64 [4, 4]
     status: str  # "ok", "lost", "relocalizing", "rejected"
     detail: str
-    covariance: np.ndarray  # float64 [3, 3] of (x, y, yaw), NaN unless ok
+    covariance: np.ndarray  # float64 [3, 3] of (x, y, yaw) in the map frame, NaN unless the status is "ok"
     wants_keyframe: bool = False
 
 
 @dataclass
-class Tracked:
-    """A picture that has a pose; its depth may still come."""
+class TrackedImage:
+    """A tracked image that becomes a keyframe if its depth arrives."""
 
     stamp_ns: int
-    view: PictureView
+    view: ImagePyramid
     alignment: Alignment
-    covariance: np.ndarray
+    covariance: np.ndarray  # float64 [3, 3] of (x, y, yaw) in the map frame
 
 
 def covisibility(in_view_a: np.ndarray, in_view_b: np.ndarray) -> float:
-    """Intersection over union of two ascending lists of Gaussians."""
+    """Return the intersection over union of two ascending index lists of Gaussians."""
     both = len(np.intersect1d(in_view_a, in_view_b, assume_unique=True))
     union = len(in_view_a) + len(in_view_b) - both
     return both / union if union else 0.0

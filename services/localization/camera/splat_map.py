@@ -1,6 +1,6 @@
-"""The tracker's own small map: Gaussians put where keyframes' depth shows surfaces, and optimised a little.
+"""The tracker's own Gaussian map: Gaussians placed on the surfaces of keyframe depth, then optimised.
 
-It is not the map that anybody looks at: it has to look like the pictures from where the camera is.
+It serves tracking only and is separate from the map of the mapping service.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ from beamsplat.services.localization.camera.settings import CameraTrackerSetting
 
 @dataclass
 class MapKeyframe:
-    """A picture that the map is made of, at the tracker's size."""
+    """A keyframe of the tracker's map, at the tracker's resolution."""
 
     stamp_ns: int
-    T_map_camera: np.ndarray
+    T_map_camera: np.ndarray  # float64 [4, 4]
     rgb: np.ndarray  # float32 [3, H, W] in [0, 1]
     z_m: np.ndarray  # float32 [H, W], 0 unknown
     weight: np.ndarray  # float32 [H, W] of the depth
-    in_view: np.ndarray  # int32: Gaussians in view when it was taken in
-    thumbnail: np.ndarray  # float32 [h, w], to find it again
+    in_view: np.ndarray  # int32: Gaussians in the frustum when the keyframe was added
+    thumbnail: np.ndarray  # float32 [h, w], descriptor for relocalization
 
 
 class SplatMap:
-    """Gaussians, and the pictures that they were made of."""
+    """Gaussians and the keyframes that they were made from."""
 
     def __init__(self, camera: RasterCamera, settings: CameraTrackerSettings) -> None:
         self.camera, self.settings = camera, settings
@@ -46,24 +46,24 @@ class SplatMap:
         self._gradient = np.empty((5, camera.height_px, camera.width_px), np.float32)
 
     def render(self, camera: RasterCamera, T_camera_map: np.ndarray) -> Render:
-        """The map from a pose; give it back with `release`."""
+        """Return the map rendered at a pose; pass the result to `release` after use."""
         return self.rasterizer.render(self.store.params, self.store.count, camera, T_camera_map)
 
     def release(self, render: Render) -> None:
-        """Gives a render's memory back."""
+        """Return the buffers of a render to the rasterizer."""
         self.rasterizer.release(render)
 
     # --- growing -----------------------------------------------------------------------------------
 
     def add(self, frame: MapKeyframe) -> int:
-        """Takes a keyframe in: Gaussians where the map does not explain it. Gives how many."""
+        """Add a keyframe and new Gaussians where the map does not match it; return their number."""
         s = self.settings
         render = self.render(self.camera, inverse(frame.T_map_camera))
         missing = _unexplained(render.image, frame, s)
-        stale = self._stale(render.index.copy(), missing, frame)
+        stale = self._contradicted_by(render.index.copy(), missing, frame)
         self.release(render)
         if len(stale):
-            self._drop(stale)
+            self._remove(stale)
             render = self.render(self.camera, inverse(frame.T_map_camera))
             missing = _unexplained(render.image, frame, s)
             self.release(render)
@@ -84,11 +84,11 @@ class SplatMap:
         self.keyframes.append(frame)
         return len(u)
 
-    def _stale(self, index: np.ndarray, missing: np.ndarray, frame: MapKeyframe) -> np.ndarray:
-        """Of the Gaussians in view int32 [V], those that the keyframe speaks against.
+    def _contradicted_by(self, index: np.ndarray, missing: np.ndarray, frame: MapKeyframe) -> np.ndarray:
+        """Return the Gaussians, out of those in view (int32 [V]), that contradict the keyframe.
 
-        They float before the surface that its depth shows; or lie on the surface where the picture looks
-        different, or finer than they are. What replaces them is put there next.
+        They are in front of the surface of its depth, transparent, or on the surface but of another colour
+        or too coarse. `add` replaces them by new ones.
         """
         s, camera = self.settings, self.camera
         h, w = frame.z_m.shape
@@ -100,29 +100,29 @@ class SplatMap:
         inside = (points[2] > 0.05) & (u >= 0) & (v >= 0) & (u < w) & (v < h)
         index, z, u, v = index[inside], z[inside], u[inside], v[inside]
         surface = frame.z_m[v, u]
-        known = (surface > 0.0) & (frame.weight[v, u] > s.least_depth_weight)
+        known = (surface > 0.0) & (frame.weight[v, u] > s.min_depth_weight)
         size = np.exp(self.store.params[SCALE : SCALE + 2, index].max(axis=0))
         floats = known & (z + 2.0 * size < surface * (1.0 - s.float_margin))
-        on_it = (surface > 0.0) & (np.abs(z - surface) < s.depth_off * surface)
+        on_surface = (surface > 0.0) & (np.abs(z - surface) < s.max_depth_error * surface)
         coarse = size * camera.fx_px / z > s.coarse_px
         faint = self.store.params[OPACITY, index] < np.log(s.prune_opacity / (1.0 - s.prune_opacity))
-        return index[floats | faint | (on_it & (missing[v, u] | coarse))]
+        return index[floats | faint | (on_surface & (missing[v, u] | coarse))]
 
-    def _drop(self, index: np.ndarray) -> None:
-        """Removes Gaussians; the others keep their order, and the keyframes' lists their meaning."""
+    def _remove(self, index: np.ndarray) -> None:
+        """Remove Gaussians; the others keep their order. Renumbers `in_view` of the newest keyframe."""
         if not len(index):
             return
         keep = np.ones(self.store.count, bool)
         keep[index] = False
         self.store.keep(keep)
         place = np.cumsum(keep, dtype=np.int32) - 1
-        for frame in self.keyframes[-1:]:  # the others' lists are not asked for any more
+        for frame in self.keyframes[-1:]:  # the lists of older keyframes are not used any more
             frame.in_view = place[frame.in_view[keep[frame.in_view]]]
 
     # --- optimising --------------------------------------------------------------------------------
 
     def step(self, frame: MapKeyframe) -> tuple[float, np.ndarray]:
-        """One step of Adam on what a keyframe sees. Gives the loss, and dL/dxi [6] of its T_camera_map."""
+        """Do one Adam step on one keyframe; return the loss and dL/dxi [6] of its T_camera_map."""
         s, pixels = self.settings, frame.z_m.size
         render = self.render(self.camera, inverse(frame.T_map_camera))
         loss = map_loss(
@@ -136,16 +136,16 @@ class SplatMap:
         return float(loss), pose
 
     def close(self) -> None:
-        """Ends the rasterizer."""
+        """Release the rasterizer's threads and buffers."""
         self.rasterizer.close()
 
 
 def _unexplained(image: np.ndarray, frame: MapKeyframe, s: CameraTrackerSettings) -> np.ndarray:
-    """bool [H, W]: seen through, of another colour, or behind what the depth says."""
+    """Return a mask bool [H, W] of pixels where the map is transparent or differs in colour or depth."""
     alpha = image[4]
-    colour_off = cv2.blur(np.abs(image[:3] - frame.rgb).mean(axis=0), (5, 5)) > s.colour_off
+    colour_differs = cv2.blur(np.abs(image[:3] - frame.rgb).mean(axis=0), (5, 5)) > s.max_colour_error
     expected = image[3] / np.maximum(alpha, 1e-3)
     known = (frame.z_m > 0.0) & (frame.weight > 0.5)
-    depth_off = (known & (np.abs(expected - frame.z_m) > s.depth_off * frame.z_m)).astype(np.uint8)
-    depth_off = cv2.erode(depth_off, np.ones((5, 5), np.uint8)) > 0
-    return (alpha < s.alpha_low) | colour_off | depth_off
+    depth_differs = (known & (np.abs(expected - frame.z_m) > s.max_depth_error * frame.z_m)).astype(np.uint8)
+    depth_differs = cv2.erode(depth_differs, np.ones((5, 5), np.uint8)) > 0
+    return (alpha < s.alpha_low) | colour_differs | depth_differs

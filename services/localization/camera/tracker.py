@@ -1,11 +1,11 @@
 """Camera tracking against a splat map of its own (after Matsuki et al., Gaussian Splatting SLAM, CVPR 2024).
 
     tracker = CameraTracker(pinhole, T_body_camera)
-    result = tracker.track(stamp_ns, rgb)         # every picture: where is the body
-    tracker.add_depth(stamp_ns, DepthGuess(...))  # some pictures: becomes a keyframe if one is wanted
+    result = tracker.track(stamp_ns, rgb)         # every image: pose of the body
+    tracker.add_depth(stamp_ns, DepthPrior(...))  # some images: become keyframes where one is due
 
-The first picture with depth makes the map; the body is then at the map's origin. Lengths are those of the
-depth: metres if it is metric, else in a unit of nobody's knowing. The same input gives the same output.
+The first image with depth initialises the map, with the body at the map's origin. Lengths have the unit of
+the depth: metres if it is metric, else arbitrary. The tracker is deterministic.
 """
 
 from __future__ import annotations
@@ -17,194 +17,200 @@ import numpy as np
 from beamsplat.common.geometry.camera import Pinhole
 from beamsplat.common.geometry.transforms import inverse, se3_exp, se3_log, yaw_of
 from beamsplat.services.localization.camera.align import Aligner, Alignment
-from beamsplat.services.localization.camera.depth import DepthGuess, fitted_to_map, shrunk
+from beamsplat.services.localization.camera.depth import DepthPrior, align_scale_to_map, resize_depth
+from beamsplat.services.localization.camera.image_pyramid import (
+    ImagePyramid,
+    make_image_pyramid,
+    tracking_camera,
+)
 from beamsplat.services.localization.camera.monocular import (
-    FIRST_BASELINES,
-    ROUNDS,
-    WALL,
-    Look,
+    INIT_BASELINES,
+    INIT_ROUNDS,
+    INITIAL_DEPTH,
+    PosedImage,
     dense,
-    depth_by_motion,
+    depth_from_parallax,
 )
 from beamsplat.services.localization.camera.relocalize import similar_keyframes, thumbnail
-from beamsplat.services.localization.camera.result import CameraResult, Tracked, covisibility
+from beamsplat.services.localization.camera.result import TrackedImage, TrackingResult, covisibility
 from beamsplat.services.localization.camera.settings import CameraTrackerSettings
 from beamsplat.services.localization.camera.splat_map import MapKeyframe, SplatMap
-from beamsplat.services.localization.camera.view import PictureView, make_view, small_camera
 
-_KEPT = 24  # pictures whose depth may still come
-_CORRELATION = 8.0  # pixels whose errors go together: variance of a pose over that of independent ones
+_RECENT_IMAGES = 24  # images that are kept until their depth arrives
+_RESIDUAL_CORRELATION = 8.0  # factor on the covariance, because errors of neighbouring pixels are correlated
 
 
 class CameraTracker:
-    """See module."""
+    """Camera pose tracker with its own splat map; see the module's text for the use."""
 
     def __init__(
         self, camera: Pinhole, T_body_camera: np.ndarray, settings: CameraTrackerSettings | None = None
     ) -> None:
-        """`camera` is that of the (undistorted) pictures."""
+        """Create a tracker for undistorted images of `camera`; `T_body_camera` is float64 [4, 4]."""
         self.settings = settings or CameraTrackerSettings()
         self.shape = (camera.height_px, camera.width_px)
-        self.camera = small_camera(camera, self.settings.width_px)
+        self.camera = tracking_camera(camera, self.settings.width_px)
         self.splats = SplatMap(self.camera, self.settings)
-        self.metric: bool | None = None  # unknown before the first depth
-        self.scale_disagreement = float("nan")  # mean log ratio of depths given to the map's
+        self.metric: bool | None = None  # None before the first depth
+        self.scale_disagreement = float("nan")  # mean log ratio of new depth to the map's depth
         self._T_body_camera = np.asarray(T_body_camera, dtype=np.float64)
         self._aligner = Aligner(self.camera, self._T_body_camera, self.settings)
-        self._recent: deque[Tracked] = deque(maxlen=_KEPT)
-        self._poses: deque[tuple[int, np.ndarray]] = deque(maxlen=2)  # T_map_body of good pictures
-        self._exposure = (1.0, 0.0)
-        self._chain = np.zeros((3, 3))  # covariance that keyframes have handed down
-        self._missed = 0
+        self._recent: deque[TrackedImage] = deque(maxlen=_RECENT_IMAGES)
+        self._last_poses: deque[tuple[int, np.ndarray]] = deque(maxlen=2)  # T_map_body of tracked images
+        self._exposure = (1.0, 0.0)  # gain, offset of the last tracked image
+        self._keyframe_covariance = np.zeros((3, 3))  # of the newest keyframe; it accumulates from the first
+        self._failures = 0  # consecutive images without an accepted alignment
         self._steps = 0
-        self._ratios: list[float] = []
-        self._rounds = 0  # of settling the first picture's depth, where nobody gives any
+        self._log_ratios: list[float] = []
+        self._init_rounds = 0  # refinements of the first image's depth, used without a depth source
 
-    # --- every picture -----------------------------------------------------------------------------
+    # --- tracking ----------------------------------------------------------------------------------
 
-    def track(self, stamp_ns: int, rgb: np.ndarray) -> CameraResult:
-        """Where the body was when this picture (uint8 [H, W, 3], undistorted) was taken."""
-        refused = self._fault(stamp_ns, rgb)
-        if refused is not None:
-            return self._result(stamp_ns, "rejected", refused)
-        # 1. The picture at several sizes
-        view = make_view(rgb, self.camera, 1 + len(self.settings.coarse_steps))
-        if view.contrast < self.settings.least_contrast:
-            return self._result(stamp_ns, "rejected", f"the picture is blank (contrast {view.contrast:.3f})")
+    def track(self, stamp_ns: int, rgb: np.ndarray) -> TrackingResult:
+        """Return the pose of the body for an undistorted image uint8 [H, W, 3]."""
+        error = self._input_error(stamp_ns, rgb)
+        if error is not None:
+            return self._result(stamp_ns, "rejected", error)
+        # 1. Image pyramid
+        view = make_image_pyramid(rgb, self.camera, 1 + len(self.settings.coarse_steps))
+        if view.contrast < self.settings.min_contrast:
+            return self._result(stamp_ns, "rejected", f"the image is blank (contrast {view.contrast:.3f})")
         if not self.splats.keyframes:
             T_camera_map = inverse(self._T_body_camera)
-            self._recent.append(Tracked(stamp_ns, view, Alignment(T_camera_map), np.zeros((3, 3))))
-            return self._result(stamp_ns, "relocalizing", "no map yet: waits for the first depth")
-        # 2. The pose at which the map looks like it
+            self._recent.append(TrackedImage(stamp_ns, view, Alignment(T_camera_map), np.zeros((3, 3))))
+            return self._result(stamp_ns, "relocalizing", "no map yet: waiting for the first depth")
+        # 2. Align the rendered map to the image
         found, why = self._locate(stamp_ns, view)
         if found is None:
-            self._missed += 1
-            if self._missed > self.settings.restart_after:
-                self._go_on_from_last_pose(stamp_ns, view)
-            return self._result(stamp_ns, "lost" if self._missed == 1 else "relocalizing", why)
-        self._missed = 0
-        covariance = self._chain + self._covariance(found)
-        self._recent.append(Tracked(stamp_ns, view, found, covariance))
-        self._poses.append((stamp_ns, self._T_map_body(found)))
+            self._failures += 1
+            if self._failures > self.settings.restart_after:
+                self._continue_from_last_pose(stamp_ns, view)
+            return self._result(stamp_ns, "lost" if self._failures == 1 else "relocalizing", why)
+        self._failures = 0
+        covariance = self._keyframe_covariance + self._covariance(found)
+        self._recent.append(TrackedImage(stamp_ns, view, found, covariance))
+        self._last_poses.append((stamp_ns, self._T_map_body(found)))
         self._exposure = (found.gain, found.offset)
-        # 3. A little work on the map, the same for every picture
-        self._improve(self.settings.steps_per_picture)
+        # 3. A fixed number of optimisation steps on the map
+        self._optimise_map(self.settings.steps_per_image)
         wanted = self._keyframe_is_due(found)
-        return CameraResult(stamp_ns, self._poses[-1][1], "ok", why, covariance, wanted)
+        return TrackingResult(stamp_ns, self._last_poses[-1][1], "ok", why, covariance, wanted)
 
-    def _fault(self, stamp_ns: int, rgb: np.ndarray) -> str | None:
+    def _input_error(self, stamp_ns: int, rgb: np.ndarray) -> str | None:
         if rgb.shape[:2] != self.shape or rgb.ndim != 3 or rgb.shape[2] != 3 or rgb.dtype != np.uint8:
             return (
-                f"the picture is {rgb.dtype} {list(rgb.shape)}, the camera's are uint8 {[*self.shape, 3]}: "
-                "K belongs to another picture size"
+                f"the image is {rgb.dtype} {list(rgb.shape)}, but the calibration needs uint8 "
+                f"{[*self.shape, 3]}: K belongs to another image size"
             )
         if self._recent and stamp_ns <= self._recent[-1].stamp_ns:
-            return f"the picture's stamp {stamp_ns} ns is not after {self._recent[-1].stamp_ns} ns"
+            return f"the image stamp {stamp_ns} ns is not after the last one, {self._recent[-1].stamp_ns} ns"
         return None
 
-    def _locate(self, stamp_ns: int, view: PictureView) -> tuple[Alignment | None, str]:
-        """The alignment that can be believed, or why there is none."""
+    def _locate(self, stamp_ns: int, view: ImagePyramid) -> tuple[Alignment | None, str]:
+        """Return the first accepted alignment, or None and the reason why all were rejected."""
         why = ""
-        for T_map_body in self._starts(stamp_ns, view):
+        for T_map_body in self._initial_poses(stamp_ns, view):
             start = Alignment(inverse(T_map_body @ self._T_body_camera))
-            start.gain, start.offset = self._exposure if self._missed == 0 else (1.0, 0.0)
+            start.gain, start.offset = self._exposure if self._failures == 0 else (1.0, 0.0)
             found = self._aligner.align(self.splats, view, start)
-            why = self._doubt(found, T_map_body)
+            why = self._reason_to_reject(found, T_map_body)
             if not why:
                 return found, ""
         return None, why
 
-    def _go_on_from_last_pose(self, stamp_ns: int, view: PictureView) -> None:
-        """The place is not known any more: new surfaces are put where the last pose would have them, so that
-        there is something to track; how far the body went meanwhile stays unknown, and in the covariance."""
-        if not self._poses:
-            return
-        self._chain = self._chain + np.diag([0.25, 0.25, 0.25])
-        alignment = Alignment(inverse(self._poses[-1][1] @ self._T_body_camera))
-        self._recent.append(Tracked(stamp_ns, view, alignment, self._chain))
+    def _continue_from_last_pose(self, stamp_ns: int, view: ImagePyramid) -> None:
+        """Allow a keyframe at the last known pose, so that tracking can continue in a new part of the map.
 
-    def _starts(self, stamp_ns: int, view: PictureView) -> list[np.ndarray]:
-        """T_map_body to begin at: the prediction, the last pose; when lost, keyframes that look alike."""
+        The unknown motion in between is added to the covariance.
+        """
+        if not self._last_poses:
+            return
+        self._keyframe_covariance = self._keyframe_covariance + np.diag([0.25, 0.25, 0.25])
+        alignment = Alignment(inverse(self._last_poses[-1][1] @ self._T_body_camera))
+        self._recent.append(TrackedImage(stamp_ns, view, alignment, self._keyframe_covariance))
+
+    def _initial_poses(self, stamp_ns: int, view: ImagePyramid) -> list[np.ndarray]:
+        """Return start values of T_map_body: prediction and last pose; if lost, also similar keyframes."""
         starts = [self._predicted(stamp_ns)]
-        if self._missed == 0:
-            if len(self._poses) == 2:
-                starts.append(self._poses[-1][1])
+        if self._failures == 0:
+            if len(self._last_poses) == 2:
+                starts.append(self._last_poses[-1][1])
             return starts
-        alike = similar_keyframes(self.splats.keyframes, thumbnail(view.levels[-1].grey), most=2)
-        return [self._poses[-1][1]] * bool(self._poses) + [
-            frame.T_map_camera @ inverse(self._T_body_camera) for frame in alike
+        similar = similar_keyframes(self.splats.keyframes, thumbnail(view.levels[-1].grey), most=2)
+        return [self._last_poses[-1][1]] * bool(self._last_poses) + [
+            frame.T_map_camera @ inverse(self._T_body_camera) for frame in similar
         ]
 
     def _predicted(self, stamp_ns: int) -> np.ndarray:
-        """T_map_body if the body keeps its velocity."""
-        if not self._poses:
+        """Return T_map_body extrapolated with constant velocity."""
+        if not self._last_poses:
             return np.eye(4)
-        if len(self._poses) < 2:
-            return self._poses[-1][1]
-        (t0, T0), (t1, T1) = self._poses
-        share = min((stamp_ns - t1) / (t1 - t0), 5.0)
-        return T1 @ se3_exp(se3_log(inverse(T0) @ T1) * share)
+        if len(self._last_poses) < 2:
+            return self._last_poses[-1][1]
+        (t0, T0), (t1, T1) = self._last_poses
+        factor = min((stamp_ns - t1) / (t1 - t0), 5.0)
+        return T1 @ se3_exp(se3_log(inverse(T0) @ T1) * factor)
 
-    def _doubt(self, found: Alignment, T_start: np.ndarray) -> str:
-        """Why an alignment cannot be believed; empty if it can."""
+    def _reason_to_reject(self, found: Alignment, T_start: np.ndarray) -> str:
+        """Return why an alignment is rejected; empty if it is accepted."""
         s = self.settings
-        if found.points < s.least_points:
-            return f"lost: the picture and the map share {found.points} points; {s.least_points} are needed"
-        # A keyframe found again must be the right one; after a restart there is only the newest to be found.
-        searching = 0 < self._missed <= s.restart_after
-        least = 0.5 * (1.0 + s.least_inliers) if searching else s.least_inliers
-        if found.inliers < least:
-            return f"lost: only {found.inliers:.0%} of the map's points look like the picture"
-        if found.correlation < s.least_correlation:
-            return f"lost: the map and the picture correlate by {found.correlation:.2f} only"
+        if found.points < s.min_points:
+            return f"lost: only {found.points} map points are in the image; {s.min_points} are needed"
+        # A stricter limit while relocalizing at keyframes, because a wrong keyframe may look similar.
+        searching = 0 < self._failures <= s.restart_after
+        least = 0.5 * (1.0 + s.min_inlier_ratio) if searching else s.min_inlier_ratio
+        if found.inlier_ratio < least:
+            return f"lost: only {found.inlier_ratio:.0%} of the map points match the image"
+        if found.correlation < s.min_correlation:
+            return f"lost: the correlation of map and image is only {found.correlation:.2f}"
         move = se3_log(inverse(T_start) @ self._T_map_body(found))
         far, turn = float(np.linalg.norm(move[:3])), float(np.linalg.norm(move[3:]))
         if far > s.max_step_m or turn > s.max_step_rad:
-            return f"lost: the answer lies {far:.2f} and {np.degrees(turn):.0f} degrees off the prediction"
+            return f"lost: the pose is {far:.2f} and {np.degrees(turn):.0f} degrees away from the prediction"
         return ""
 
     def _T_map_body(self, found: Alignment) -> np.ndarray:
         return inverse(found.T_camera_map) @ inverse(self._T_body_camera)
 
     def _covariance(self, found: Alignment) -> np.ndarray:
-        """float64 [3, 3] of (x, y, yaw) in the map, of this alignment alone."""
-        free = np.linalg.pinv(found.hessian) * _CORRELATION
+        """Return the covariance float64 [3, 3] of (x, y, yaw) in the map frame, of this alignment alone."""
+        free = np.linalg.pinv(found.hessian) * _RESIDUAL_CORRELATION
         full = self._aligner.to_body(free)
         yaw = float(yaw_of(self._T_map_body(found)))
         turn = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1.0]])
         return turn @ full @ turn.T
 
-    def _result(self, stamp_ns: int, status: str, detail: str) -> CameraResult:
-        T_map_body = self._poses[-1][1] if self._poses else np.eye(4)
-        return CameraResult(stamp_ns, T_map_body, status, detail, np.full((3, 3), np.nan))
+    def _result(self, stamp_ns: int, status: str, detail: str) -> TrackingResult:
+        T_map_body = self._last_poses[-1][1] if self._last_poses else np.eye(4)
+        return TrackingResult(stamp_ns, T_map_body, status, detail, np.full((3, 3), np.nan))
 
     # --- keyframes ---------------------------------------------------------------------------------
 
-    def add_depth(self, stamp_ns: int, guess: DepthGuess) -> str:
-        """Makes the picture with this stamp a keyframe if one is due there. "ok", or why it was not used."""
+    def add_depth(self, stamp_ns: int, prior: DepthPrior) -> str:
+        """Add the image with this stamp as a keyframe if one is due; return "ok" or the reason why not."""
         tracked = next((t for t in self._recent if t.stamp_ns == stamp_ns), None)
         if tracked is None:
-            return "its picture was not tracked, or is too old"
+            return "its image was not tracked, or is too old"
         first = not self.splats.keyframes
         if not first and not self._keyframe_is_due(tracked.alignment):
             return "no keyframe is due"
-        z = shrunk(guess.z, self.camera.width_px, self.camera.height_px)
+        z = resize_depth(prior.z, self.camera.width_px, self.camera.height_px)
         if (z > 0.0).mean() < 0.02:
-            return "no pixel of the picture has a depth"
+            return "no pixel of the image has a depth"
         if first:
-            self.metric = guess.metric
-        elif guess.metric != self.metric:
-            return "its unit is not that of the map"
+            self.metric = prior.metric
+        elif prior.metric != self.metric:
+            return "its unit differs from the map's unit"
         else:
-            z = self._fitted(z, tracked.alignment, guess.scale_sigma)
-        self._add_keyframe(tracked, z, guess)
+            z = self._align_scale(z, tracked.alignment, prior.scale_sigma)
+        self._add_keyframe(tracked, z, prior)
         return "ok"
 
-    def _add_keyframe(self, tracked: Tracked, z: np.ndarray, guess: DepthGuess) -> None:
+    def _add_keyframe(self, tracked: TrackedImage, z: np.ndarray, prior: DepthPrior) -> None:
         rgb = np.ascontiguousarray(tracked.view.rgb.transpose(2, 0, 1)).astype(np.float32) / np.float32(255)
-        # As the map would show it: what the exposure has done since is undone.
+        # Undo the exposure difference to the map.
         rgb = (rgb - np.float32(tracked.alignment.offset)) / np.float32(tracked.alignment.gain)
-        weight = np.full(z.shape, 1.0 / (1.0 + (guess.scale_sigma / 0.05) ** 2), np.float32)
+        weight = np.full(z.shape, 1.0 / (1.0 + (prior.scale_sigma / 0.05) ** 2), np.float32)
         first = not self.splats.keyframes
         frame = MapKeyframe(
             tracked.stamp_ns, inverse(tracked.alignment.T_camera_map), rgb, z, weight,
@@ -213,105 +219,103 @@ class CameraTracker:
         self.splats.add(frame)
         if first:
             self._first_grey = tracked.view.levels[1].grey
-            self._poses.append((tracked.stamp_ns, self._T_map_body(tracked.alignment)))
-            self._improve(self.settings.first_steps)
+            self._last_poses.append((tracked.stamp_ns, self._T_map_body(tracked.alignment)))
+            self._optimise_map(self.settings.first_steps)
         else:
-            self._chain = tracked.covariance
+            self._keyframe_covariance = tracked.covariance
 
     def add_without_depth(self, stamp_ns: int) -> str:
-        """As `add_depth`, with depth from the pictures' own parallax; the map's unit is then arbitrary."""
+        """Do as `add_depth`, with depth from the parallax of the images; the map's unit is then arbitrary."""
         tracked = next((t for t in self._recent if t.stamp_ns == stamp_ns), None)
         if tracked is None:
-            return "its picture was not tracked, or is too old"
-        guess = DepthGuess(np.zeros((0, 0), np.float32), 0.15, metric=False)
+            return "its image was not tracked, or is too old"
+        prior = DepthPrior(np.zeros((0, 0), np.float32), 0.15, metric=False)
         if not self.splats.keyframes:
             self.metric = False
-            wall = np.full(tracked.view.rgb.shape[:2], WALL, np.float32)
-            self._add_keyframe(tracked, wall, guess)
+            plane = np.full(tracked.view.rgb.shape[:2], INITIAL_DEPTH, np.float32)
+            self._add_keyframe(tracked, plane, prior)
             return "ok"
         if self.metric:
-            return "its unit is not that of the map"
-        if self._rounds < ROUNDS and self._missed <= self.settings.restart_after:
-            return self._settle(tracked)
-        if self._rounds < ROUNDS:  # lost before the unit had settled: from the beginning
+            return "its unit differs from the map's unit"
+        if self._init_rounds < INIT_ROUNDS and self._failures <= self.settings.restart_after:
+            return self._refine_first_depth(tracked)
+        if self._init_rounds < INIT_ROUNDS:  # lost before the initialisation was complete: start again
             self.splats.close()
-            self.splats, self._rounds = SplatMap(self.camera, self.settings), 0
+            self.splats, self._init_rounds = SplatMap(self.camera, self.settings), 0
             return self.add_without_depth(stamp_ns)
         if not self._keyframe_is_due(tracked.alignment):
             return "no keyframe is due"
-        shown = self._shown_depth(tracked.alignment)
-        usual = float(np.median(shown[shown > 0.0])) if (shown > 0.0).any() else WALL
-        before = [self._look(t) for t in self._recent if t.stamp_ns < stamp_ns]
-        z = depth_by_motion(self._look(tracked), before, self._aligner.cameras[1], usual)
+        shown = self._rendered_depth(tracked.alignment)
+        usual = float(np.median(shown[shown > 0.0])) if (shown > 0.0).any() else INITIAL_DEPTH
+        before = [self._posed_image(t) for t in self._recent if t.stamp_ns < stamp_ns]
+        z = depth_from_parallax(self._posed_image(tracked), before, self._aligner.cameras[1], usual)
         z = dense(z, shown, shown.shape)
-        self._add_keyframe(tracked, self._fitted(z, tracked.alignment, guess.scale_sigma), guess)
+        self._add_keyframe(tracked, self._align_scale(z, tracked.alignment, prior.scale_sigma), prior)
         return "ok"
 
-    def _settle(self, tracked: Tracked) -> str:
-        """The first keyframe's depth again, from the poses that it gave; then the map anew, and the pose."""
+    def _refine_first_depth(self, tracked: TrackedImage) -> str:
+        """Recompute the first keyframe's depth from the poses so far; rebuild the map, realign the image."""
         first = self.splats.keyframes[0]
         here = (self._first_grey, first.T_map_camera)
         T_first_now = inverse(first.T_map_camera) @ inverse(tracked.alignment.T_camera_map)
-        if np.linalg.norm(T_first_now[:3, 3]) < FIRST_BASELINES[self._rounds] * WALL:
+        if np.linalg.norm(T_first_now[:3, 3]) < INIT_BASELINES[self._init_rounds] * INITIAL_DEPTH:
             return "the camera has not moved far enough"
-        self._rounds += 1
-        looks = [self._look(t) for t in self._recent if t.stamp_ns > first.stamp_ns]
-        z = depth_by_motion(here, looks, self._aligner.cameras[1], WALL)
+        self._init_rounds += 1
+        others = [self._posed_image(t) for t in self._recent if t.stamp_ns > first.stamp_ns]
+        z = depth_from_parallax(here, others, self._aligner.cameras[1], INITIAL_DEPTH)
         if (z > 0.0).mean() < 0.05:
-            return "the pictures do not tell depth yet"
+            return "there is not enough parallax yet"
         z = dense(z, np.zeros_like(z), first.z_m.shape)
         self.splats.close()
         self.splats = SplatMap(self.camera, self.settings)
-        first.z_m = (z * (WALL / float(np.median(z)))).astype(np.float32)
+        first.z_m = (z * (INITIAL_DEPTH / float(np.median(z)))).astype(np.float32)
         self.splats.add(first)
-        self._improve(self.settings.first_steps)
+        self._optimise_map(self.settings.first_steps)
         start = Alignment(tracked.alignment.T_camera_map, gain=self._exposure[0], offset=self._exposure[1])
         tracked.alignment = self._aligner.align(self.splats, tracked.view, start)
-        self._poses.clear()  # velocities were those of another unit
-        self._poses.append((tracked.stamp_ns, self._T_map_body(tracked.alignment)))
+        self._last_poses.clear()  # the unit has changed, so the old velocity is wrong
+        self._last_poses.append((tracked.stamp_ns, self._T_map_body(tracked.alignment)))
         return "ok"
 
-    def _look(self, tracked: Tracked) -> Look:
+    def _posed_image(self, tracked: TrackedImage) -> PosedImage:
         return tracked.view.levels[1].grey, inverse(tracked.alignment.T_camera_map)
 
-    def _shown_depth(self, alignment: Alignment) -> np.ndarray:
-        """float32 [H, W] of the map as it was seen, 0 where it does not explain the picture."""
+    def _rendered_depth(self, alignment: Alignment) -> np.ndarray:
+        """Return the map's depth float32 [H, W] at the aligned pose, 0 where the map is not opaque."""
         render = self.splats.render(self.camera, alignment.T_camera_map)
         alpha = render.image[4]
-        known = alpha > self.settings.least_alpha
+        known = alpha > self.settings.min_alpha
         shown = np.where(known, render.image[3] / np.maximum(alpha, 0.1), 0.0).astype(np.float32)
         self.splats.release(render)
         return shown
 
-    def _fitted(self, z: np.ndarray, alignment: Alignment, scale_sigma: float) -> np.ndarray:
-        """Depth at the scale of the map."""
-        z, ratio = fitted_to_map(z, self._shown_depth(alignment), scale_sigma)
+    def _align_scale(self, z: np.ndarray, alignment: Alignment, scale_sigma: float) -> np.ndarray:
+        """Return the depth at the scale of the map and update `scale_disagreement`."""
+        z, ratio = align_scale_to_map(z, self._rendered_depth(alignment), scale_sigma)
         if np.isfinite(ratio):
-            self._ratios = [*self._ratios, ratio][-20:]
-            self.scale_disagreement = float(np.mean(self._ratios))
+            self._log_ratios = [*self._log_ratios, ratio][-20:]
+            self.scale_disagreement = float(np.mean(self._log_ratios))
         return z
 
     def _keyframe_is_due(self, found: Alignment) -> bool:
-        """Whether the map explains too little here, or other Gaussians are in view than at the last one."""
-        if found.in_view is None:  # not aligned: the first picture, or one after the track was lost for long
-            return not self.splats.keyframes or self._missed > self.settings.restart_after
-        if found.explained < self.settings.least_explained:
+        """Return whether coverage by the map, or covisibility with the last keyframe, is too low."""
+        if found.in_view is None:  # not aligned: the first image, or one after a long loss of tracking
+            return not self.splats.keyframes or self._failures > self.settings.restart_after
+        if found.coverage < self.settings.min_coverage:
             return True
-        return (
-            covisibility(found.in_view, self.splats.keyframes[-1].in_view) < self.settings.least_covisibility
-        )
+        return covisibility(found.in_view, self.splats.keyframes[-1].in_view) < self.settings.min_covisibility
 
-    def _improve(self, steps: int) -> None:
-        """Optimisation steps: in turn on one of the newest keyframes, and on one of all."""
+    def _optimise_map(self, steps: int) -> None:
+        """Optimise the map; the steps alternate between one of the newest keyframes and one of all."""
         frames = self.splats.keyframes
         for _ in range(steps):
             newest = frames[-self.settings.window :]
             pool = newest if self._steps % 2 == 0 else frames
-            # A fixed, well spread order: the golden ratio's multiples.
+            # Multiples of the golden ratio: a deterministic, evenly spread order.
             pick = int((self._steps * 0.6180339887498949) % 1.0 * len(pool))
             self.splats.step(pool[pick])
             self._steps += 1
 
     def close(self) -> None:
-        """Ends the rasterizer."""
+        """Release the resources of the splat map."""
         self.splats.close()

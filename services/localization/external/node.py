@@ -1,5 +1,5 @@
-"""Localization by somebody else: passes on `T_map_body` from a motion capture, a recorded trajectory
-or another SLAM."""
+"""Localization from an external source: republishes `T_map_body` of a motion capture system, a recorded
+trajectory or another SLAM."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from beamsplat.common.runtime.node import Node, Outputs
 
 
 class ExternalLocalization(Node):
-    """Outside poses as they are: the smooth frame is the map, nothing is ever corrected."""
+    """Localization service that republishes external poses; the map and odom frames are identical."""
 
     name = "localization"
     inputs = ("external/pose",)
     outputs = ("localization/odometry", "localization/correction")
 
     def configure(self) -> None:
-        self._introduced = False
+        self._correction_published = False
 
     def on_external_pose(self, pose: ExternalPose) -> Outputs:
-        """Says once that odom and map are one, then repeats each pose. Its accuracy is not known: NaN."""
-        if not self._introduced:
-            self._introduced = True
+        """Publish each pose with an unknown covariance (NaN), and once T_map_odom = identity."""
+        if not self._correction_published:
+            self._correction_published = True
             yield "localization/correction", Correction(stamp_ns=pose.stamp_ns, T_map_odom=np.eye(4))
         covariance = np.full((3, 3), np.nan)
         yield (

@@ -1,4 +1,4 @@
-"""A textured box room by arithmetic: pictures and depth from any pose inside, for tests of camera tracking."""
+"""An analytic textured box room: images and depth from any pose inside, for tests of camera tracking."""
 
 import numpy as np
 
@@ -16,12 +16,12 @@ _PHASES = np.random.default_rng(7).uniform(0.0, 6.3, (3, 14))
 
 
 def body(x_m, y_m, yaw_rad):
-    """T_map_body on the floor."""
+    """Return T_map_body of a pose on the floor."""
     return make_transform(so3_exp(np.array([0.0, 0.0, yaw_rad])), np.array([x_m, y_m, 0.0]))
 
 
 def view(T_map_camera, camera=CAMERA):
-    """(uint8 [H, W, 3], float32 [H, W] optical z)."""
+    """Return the image uint8 [H, W, 3] and its optical z float32 [H, W]."""
     rays = camera.ray_grid() @ T_map_camera[:3, :3].T
     origin = T_map_camera[:3, 3]
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -34,7 +34,7 @@ def view(T_map_camera, camera=CAMERA):
 
 
 def drive(frames, step_m=0.03, turn_rad=0.01):
-    """T_map_body along an arc, beginning at the map's origin."""
+    """Return T_map_body along an arc that starts at the map's origin."""
     T, out = body(0.0, 0.0, 0.0), []
     for _ in range(frames):
         out.append(T)
@@ -42,13 +42,13 @@ def drive(frames, step_m=0.03, turn_rad=0.01):
     return out
 
 
-def shot(T_map_body):
-    """Picture and depth from the body's camera."""
+def render_view(T_map_body):
+    """Return image and depth of the body's camera."""
     return view(T_map_body @ T_BODY_CAMERA)
 
 
-def off(T_a, T_b):
-    """Metres and radians between two poses."""
+def pose_error(T_a, T_b):
+    """Return the distance in metres and the angle in radians between two poses."""
     T = inverse(T_a) @ T_b
     angle = np.arccos(np.clip((np.trace(T[:3, :3]) - 1.0) / 2.0, -1.0, 1.0))
     return float(np.linalg.norm(T[:3, 3])), float(angle)

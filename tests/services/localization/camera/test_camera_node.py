@@ -1,4 +1,4 @@
-"""Camera localization as a node: what it publishes, and what it says of its scale."""
+"""Camera localization node: published poses and the reported scale."""
 
 import cv2
 import numpy as np
@@ -8,13 +8,13 @@ from beamsplat.common.messages import CameraModel, DepthEstimate, Image, Rig
 from beamsplat.common.runtime.lockstep import Lockstep
 from beamsplat.common.runtime.node import Node, Sourced
 from beamsplat.services.localization.camera.node import CameraLocalization, CameraLocalizationConfig
-from tests.services.localization.camera.box import T_BODY_CAMERA, drive, off, shot
+from tests.services.localization.camera.box import T_BODY_CAMERA, drive, pose_error, render_view
 
 PATH = drive(8)
 
 
-class Drive(Node):
-    """Rig and pictures, 10 Hz."""
+class ImageSource(Node):
+    """Publishes the calibration and images at 10 Hz."""
 
     name = "replay"
     outputs = ("rig", "camera/image")
@@ -26,8 +26,8 @@ class Drive(Node):
         )  # fmt: skip
         yield Sourced(0, "rig", Rig(stamp_ns=0, camera=model))
         for i, T in enumerate(PATH):
-            data = cv2.imencode(".png", cv2.cvtColor(shot(T)[0], cv2.COLOR_RGB2BGR))[1].ravel()
-            data = data[:50] if i == 5 else data  # a picture cut off
+            data = cv2.imencode(".png", cv2.cvtColor(render_view(T)[0], cv2.COLOR_RGB2BGR))[1].ravel()
+            data = data[:50] if i == 5 else data  # a truncated image
             stamp_ns = (i + 1) * 100_000_000
             yield Sourced(
                 stamp_ns, "camera/image",
@@ -35,8 +35,9 @@ class Drive(Node):
             )  # fmt: skip
 
 
-class Depth(Node):
-    """True depth of every picture, called what the test wants; it takes poses as the real one does."""
+class TrueDepthSource(Node):
+    """Publishes the true depth of every image as the kind that the test sets; subscribes to poses as the real
+    depth node does."""
 
     name = "depth"
     inputs = ("camera/image", "localization/odometry")
@@ -47,7 +48,7 @@ class Depth(Node):
         return iter(())
 
     def on_camera_image(self, image):
-        z = shot(PATH[image.stamp_ns // 100_000_000 - 1])[1]
+        z = render_view(PATH[image.stamp_ns // 100_000_000 - 1])[1]
         values = {"metric": z, "disparity": 1.0 / z, "none": np.zeros((0, 0), np.float32)}[self.kind]
         yield (
             "depth/estimate",
@@ -56,17 +57,17 @@ class Depth(Node):
 
 
 def run(kind, **options):
-    depth = Depth(Depth.Config())
+    depth = TrueDepthSource(TrueDepthSource.Config())
     depth.kind = kind
     config = CameraLocalizationConfig(width_px=160, scale_sigma=0.01, **options)
-    letters = []
-    Lockstep([Drive(Drive.Config()), depth, CameraLocalization(config)], letters.append).run()
-    poses = [x.message for x in letters if x.topic == "localization/odometry"]
-    corrections = [x.message for x in letters if x.topic == "localization/correction"]
+    envelopes = []
+    Lockstep([ImageSource(ImageSource.Config()), depth, CameraLocalization(config)], envelopes.append).run()
+    poses = [x.message for x in envelopes if x.topic == "localization/odometry"]
+    corrections = [x.message for x in envelopes if x.topic == "localization/correction"]
     return poses, corrections
 
 
-def test_metric_depth_gives_metric_poses_and_bad_pictures_are_refused():
+def test_metric_depth_yields_metric_poses_and_bad_images_are_rejected():
     poses, corrections = run("metric")
     assert len(poses) == len(PATH)
     assert len(corrections) == 1
@@ -77,12 +78,12 @@ def test_metric_depth_gives_metric_poses_and_bad_pictures_are_refused():
     for i in (1, 2, 3, 4, 6, 7):
         assert poses[i].status == "ok"
         assert poses[i].metric
-        assert off(PATH[i], poses[i].T_odom_body)[0] < 0.03
+        assert pose_error(PATH[i], poses[i].T_odom_body)[0] < 0.03
         assert np.all(np.isfinite(poses[i].covariance))
 
 
 @pytest.mark.parametrize(("kind", "options"), [("disparity", {}), ("none", {}), ("none", {"depth": "none"})])
-def test_depth_without_a_unit_says_that_the_scale_is_arbitrary(kind, options):
+def test_depth_without_a_unit_is_reported_as_arbitrary_scale(kind, options):
     poses, _ = run(kind, **options)
     good = [p for p in poses if p.status == "ok"]
     assert len(good) >= 5

@@ -1,4 +1,4 @@
-"""Depth of a picture from others taken nearby, by sweeping a plane through space (Collins 1996)."""
+"""Multi-view depth by plane sweep (Collins 1996)."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ import numpy as np
 from beamsplat.common.raster.camera import RasterCamera
 
 _PLANES = 48
-_PATCH = (7, 7)
-_CAP = 0.12  # a grey difference beyond which how wrong it is says nothing
-_CLEAR = 0.8  # the best must be so much better than the best elsewhere
-_LEAST_CONTRAST = 0.012
+_PATCH_PX = (7, 7)
+_MAX_GREY_ERROR = 0.12  # grey differences are clipped here (robust cost)
+_MAX_COST_RATIO = 0.8  # cost of the best plane over the cost of the best plane elsewhere
+_MIN_CONTRAST = 0.012  # mean absolute grey deviation within a patch
 
 
 def sweep(
@@ -21,9 +21,10 @@ def sweep(
     nearest: float,
     farthest: float,
 ) -> np.ndarray:
-    """float32 [h, w] optical z in the poses' unit, 0 where the pictures do not tell.
+    """Return optical z float32 [h, w] in the unit of the poses, 0 where it is ambiguous.
 
-    A plane z = d seen here is seen there by the homography K (R + t n^T / d) K^-1, n = (0, 0, 1).
+    The plane z = d maps a pixel of this image into another one by the homography K (R + t n^T / d) K^-1,
+    with n = (0, 0, 1) and (R, t) = T_other_here.
     """
     h, w = grey.shape
     K = np.array(
@@ -41,22 +42,22 @@ def sweep(
             flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
             warped = cv2.warpPerspective(other, H, (w, h), flags=flags)
             valid = cv2.warpPerspective(ones, H, (w, h), flags=flags)
-            cost[i] += np.minimum(np.abs(warped - grey), _CAP) * valid
+            cost[i] += np.minimum(np.abs(warped - grey), _MAX_GREY_ERROR) * valid
             seen[i] += valid
-    cost = np.where(seen > 0.5, cost / np.maximum(seen, 0.5), _CAP).astype(np.float32)
+    cost = np.where(seen > 0.5, cost / np.maximum(seen, 0.5), _MAX_GREY_ERROR).astype(np.float32)
     for plane in cost:
-        cv2.blur(plane, _PATCH, dst=plane)
+        cv2.blur(plane, _PATCH_PX, dst=plane)
     best = cost.argmin(axis=0)
     least = np.take_along_axis(cost, best[None], axis=0)[0]
     away = np.abs(np.arange(_PLANES)[:, None, None] - best[None]) > 3
-    second = np.where(away, cost, _CAP).min(axis=0)
-    contrast = cv2.blur(np.abs(grey - cv2.blur(grey, _PATCH)), _PATCH)
-    good = (least < _CLEAR * second) & (contrast > _LEAST_CONTRAST) & (best > 0) & (best < _PLANES - 1)
-    return np.where(good, 1.0 / _refined(inverse_z, cost, best), 0.0).astype(np.float32)
+    second = np.where(away, cost, _MAX_GREY_ERROR).min(axis=0)
+    contrast = cv2.blur(np.abs(grey - cv2.blur(grey, _PATCH_PX)), _PATCH_PX)
+    good = (least < _MAX_COST_RATIO * second) & (contrast > _MIN_CONTRAST) & (best > 0) & (best < _PLANES - 1)
+    return np.where(good, 1.0 / _subplane_inverse_z(inverse_z, cost, best), 0.0).astype(np.float32)
 
 
-def _refined(inverse_z: np.ndarray, cost: np.ndarray, best: np.ndarray) -> np.ndarray:
-    """Inverse depth at the vertex of the parabola through the best plane and its neighbours."""
+def _subplane_inverse_z(inverse_z: np.ndarray, cost: np.ndarray, best: np.ndarray) -> np.ndarray:
+    """Return the inverse depth at the vertex of the parabola through the best plane and its neighbours."""
     inner = np.clip(best, 1, len(inverse_z) - 2)
     a, b, c = (np.take_along_axis(cost, (inner + k)[None], axis=0)[0] for k in (-1, 0, 1))
     bend = np.maximum(a - 2.0 * b + c, 1e-6)
@@ -64,17 +65,17 @@ def _refined(inverse_z: np.ndarray, cost: np.ndarray, best: np.ndarray) -> np.nd
     return inverse_z[inner] + shift * (inverse_z[1] - inverse_z[0])
 
 
-def filled(z: np.ndarray, sigma_px: float) -> np.ndarray:
-    """float32 [h, w]: unknown (0) pixels get the mean inverse depth of what is known around them."""
+def fill_unknown(z: np.ndarray, sigma_px: float) -> np.ndarray:
+    """Return depth float32 [h, w] with unknown pixels (0) interpolated in inverse depth."""
     known = (z > 0.0).astype(np.float32)
     if not known.any():
         return z
     q = np.where(z > 0.0, 1.0 / np.maximum(z, 1e-6), 0.0).astype(np.float32)
     out, weight = np.zeros_like(q), np.zeros_like(q)
-    for reach in (1.0, 3.0, 9.0):  # near neighbours count most, far ones where there are no others
-        share = np.float32(0.02 ** (np.log(reach) / np.log(3.0)))
-        out += share * cv2.GaussianBlur(q, (0, 0), sigma_px * reach)
-        weight += share * cv2.GaussianBlur(known, (0, 0), sigma_px * reach)
+    for reach in (1.0, 3.0, 9.0):  # near neighbours dominate; far ones count where there are no others
+        factor = np.float32(0.02 ** (np.log(reach) / np.log(3.0)))
+        out += factor * cv2.GaussianBlur(q, (0, 0), sigma_px * reach)
+        weight += factor * cv2.GaussianBlur(known, (0, 0), sigma_px * reach)
     mean_q = float(q[known > 0].mean())
     spread = (out + 1e-6 * mean_q) / (weight + 1e-6)
     return np.where(z > 0.0, z, 1.0 / np.maximum(spread, 1e-6)).astype(np.float32)
