@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from beamsplat.common.config.base import parse
 from beamsplat.common.config.deployment import NodeConfig
 from beamsplat.common.errors import UserError
+from beamsplat.common.optional_packages import missing_packages_explained
 from beamsplat.common.plugins import is_class_path, load_class
 from beamsplat.common.runtime.node import Node
 
@@ -19,7 +20,6 @@ class Service:
     name: str
     summary: str
     kinds: dict[str, str]  # kind -> "module:Class"; the first is the default
-    extra: str = ""  # what `pip install beamsplat[extra]` it needs, beyond the robot's
 
     def load(self, kind: str) -> type[Node]:
         """Import and return the node class of a kind.
@@ -39,11 +39,8 @@ class Service:
                 "'module:Class' of a class of your own"
             )
         module_name, _, class_name = self.kinds[chosen].partition(":")
-        try:
+        with missing_packages_explained(f"nodes.{self.name} ({chosen})"):
             module = importlib.import_module(module_name)
-        except ModuleNotFoundError as error:
-            remedy = f"pip install 'beamsplat[{self.extra}]'" if self.extra else "make setup"
-            raise UserError(f"{self.name} ({chosen}) needs the package {error.name}: {remedy}") from error
         return getattr(module, class_name)
 
     def _load_class(self, path: str) -> type[Node]:
@@ -58,7 +55,7 @@ class Service:
         return found
 
 
-def class_of(service: Service, options: dict[str, object]) -> type[Node]:
+def node_class_of(service: Service, options: dict[str, object]) -> type[Node]:
     """The node class that a node's table in a deployment asks for; its other options are not looked at.
 
     Raises:
@@ -73,6 +70,6 @@ def make_node(service: Service, options: dict[str, object], where: str) -> Node:
     Raises:
         UserError: unknown kind or option, or a value that does not fit.
     """
-    node_class = class_of(service, options)
+    node_class = node_class_of(service, options)
     config: NodeConfig = parse(node_class.Config, options, f"{where}: node {service.name!r}")
     return node_class(config)

@@ -15,7 +15,7 @@ from rich.console import Console
 
 from beamsplat.common.config.deployment import load_deployment
 from beamsplat.common.errors import UserError
-from beamsplat.common.files.persist import write_atomically
+from beamsplat.common.files.persist import make_folder, write_atomically
 from beamsplat.common.files.resources import shipped_file
 from beamsplat.tools.cli.memory_option import MemoryOption, memory_overrides
 
@@ -61,8 +61,8 @@ def demo(
     from beamsplat.tools.cli.system import run_checked
     from beamsplat.tools.report.observer import Observer
 
-    out.mkdir(parents=True, exist_ok=True)
     source = data if data is not None else _simulated(out, seconds)
+    make_folder(out)
     for old in ("recording", "map", "session"):
         shutil.rmtree(out / old, ignore_errors=True)
     for old in ("demo.rrd", "map.png", "trajectory.tum", "report.html", "report.json"):

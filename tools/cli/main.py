@@ -9,6 +9,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from beamsplat.common.errors import UserError
+from beamsplat.common.optional_packages import missing_packages_explained
 from beamsplat.tools.cli import bench as bench_cli
 from beamsplat.tools.cli import bench_mapping as mapping_cli
 from beamsplat.tools.cli import calibrate as calibrate_cli
@@ -70,7 +71,8 @@ app.add_typer(bench_cli.app, name="bench", rich_help_panel=_MACHINE)
 def main() -> None:
     """Entry point: bad input is one sentence and exit code 2, not a traceback."""
     try:
-        app()
+        with missing_packages_explained(f"beamsplat {' '.join(sys.argv[1:2])}".strip()):
+            app()
     except UserError as error:
         Console(stderr=True).print(f"[red]error:[/] {escape(str(error))}", soft_wrap=True, highlight=False)
         sys.exit(2)

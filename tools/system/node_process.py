@@ -13,6 +13,7 @@ from pathlib import Path
 
 from beamsplat.common.config.deployment import Deployment
 from beamsplat.common.errors import UserError
+from beamsplat.common.optional_packages import missing_packages_explained
 from beamsplat.common.runtime.live import Live, LiveSettings
 from beamsplat.common.runtime.registry import Service
 from beamsplat.common.security.access_control import read_hosts
@@ -62,7 +63,7 @@ def serve(
         security=deployment.security,
         rate=deployment.rate,
         wait_for=around.wait_for,
-        unfed=around.unfed,
+        without_producer=around.without_producer,
         resume=resume,
         exit_when_drained=exit_when_drained,
         instance=instance,
@@ -121,18 +122,19 @@ def child(
     threading.Thread(target=_die_with_parent, name="parent", daemon=True).start()
     start_logging()
     try:
-        if name == "router":
-            route(deployment)
-        else:
-            serve(
-                deployment,
-                name,
-                resume=resume,
-                around=around,
-                instance=instance,
-                standby=standby,
-                table=table,
-            )
+        with missing_packages_explained(name):
+            if name == "router":
+                route(deployment)
+            else:
+                serve(
+                    deployment,
+                    name,
+                    resume=resume,
+                    around=around,
+                    instance=instance,
+                    standby=standby,
+                    table=table,
+                )
     except UserError as error:
         log.error("%s", error)
         sys.exit(2)
