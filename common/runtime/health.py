@@ -22,13 +22,13 @@ class NodeRecord:
     """What was last heard of a node; `heard` is the listener's monotonic clock, s."""
 
     health: Health
-    heard: float
+    received_s: float
     starts: int = 1  # instances seen so far: one more after each restart
     history: deque[tuple[float, Health]] = field(default_factory=lambda: deque(maxlen=_HISTORY))
 
     def silent_s(self, now: float) -> float | None:
         """For how long nothing was heard; None while that is no longer than it may be."""
-        return now - self.heard if now - self.heard > STALE_S else None
+        return now - self.received_s if now - self.received_s > STALE_S else None
 
     def rate(self, count: Callable[[Health], int]) -> float:
         """Change of a counter per second over the last seconds."""
@@ -37,10 +37,10 @@ class NodeRecord:
             return 0.0
         return (count(after) - count(before)) / (last - first)
 
-    def totals(self) -> Totals:
+    def totals(self) -> NodeTraffic:
         """Sums over the inputs, and rates over inputs and outputs."""
         inputs = self.health.inputs
-        return Totals(
+        return NodeTraffic(
             in_hz=self.rate(lambda h: sum(i.received for i in h.inputs)),
             out_hz=self.rate(lambda h: sum(o.sent for o in h.outputs)),
             age_ms=max((i.age_ms for i in inputs), default=0.0),
@@ -50,7 +50,7 @@ class NodeRecord:
         )
 
 
-class Totals(NamedTuple):
+class NodeTraffic(NamedTuple):
     """One node's traffic; counts are since it started."""
 
     in_hz: float
@@ -61,7 +61,7 @@ class Totals(NamedTuple):
     bad: int
 
 
-class Taker(NamedTuple):
+class TopicConsumer(NamedTuple):
     """One subscription of a topic."""
 
     node: str
@@ -70,7 +70,7 @@ class Taker(NamedTuple):
     lost: int
 
 
-class Flow(NamedTuple):
+class TopicTraffic(NamedTuple):
     """One topic that flows."""
 
     topic: str
@@ -79,16 +79,16 @@ class Flow(NamedTuple):
     nominal_hz: float  # 0 = on events
     bytes_s: float
     sent: int
-    takers: tuple[Taker, ...]
+    consumers: tuple[TopicConsumer, ...]
 
 
-class HealthBook:
+class HealthRecords:
     """The newest health of every node. Not locked: whoever shares it between threads does that."""
 
     def __init__(self) -> None:
         self.records: dict[str, NodeRecord] = {}
 
-    def take(self, health: Health, now: float | None = None) -> None:
+    def add(self, health: Health, now: float | None = None) -> None:
         """Enters what a node says, heard at `now` (monotonic, s)."""
         now = time.monotonic() if now is None else now
         if health.node not in self.records and len(self.records) >= _NODES:
@@ -97,7 +97,7 @@ class HealthBook:
         if record.health.instance != health.instance:
             record.history.clear()
             record.starts += 1
-        record.health, record.heard = health, now
+        record.health, record.received_s = health, now
         record.history.append((now, health))
         while now - record.history[0][0] > _WINDOW_S:
             record.history.popleft()
@@ -107,24 +107,24 @@ class HealthBook:
         now = time.monotonic() if now is None else now
         return {n: "silent" if r.silent_s(now) else r.health.state for n, r in self.records.items()}
 
-    def flows(self) -> list[Flow]:
+    def traffic(self) -> list[TopicTraffic]:
         """The topics that somebody writes, in table order."""
         return [flow for name in TOPICS if (flow := self._flow(name)) is not None]
 
-    def _flow(self, topic: str) -> Flow | None:
+    def _flow(self, topic: str) -> TopicTraffic | None:
         for producer, record in self.records.items():
             sent = next((o.sent for o in record.health.outputs if o.topic == topic), None)
             if sent is None:
                 continue
-            takers = tuple(
-                Taker(name, entry.age_ms, entry.dropped, entry.lost)
+            consumers = tuple(
+                TopicConsumer(name, entry.age_ms, entry.dropped, entry.lost)
                 for name, other in self.records.items()
                 for entry in other.health.inputs
                 if entry.topic == topic
             )
             hz = record.rate(lambda h: _sent(h, topic)[0])
             bytes_s = record.rate(lambda h: _sent(h, topic)[1])
-            return Flow(topic, producer, hz, TOPICS[topic].rate_hz, bytes_s, sent, takers)
+            return TopicTraffic(topic, producer, hz, TOPICS[topic].rate_hz, bytes_s, sent, consumers)
         return None
 
 

@@ -20,7 +20,7 @@ class Future(Protocol):
     def done(self) -> bool: ...
 
 
-class Deferred:
+class LazyFuture:
     """A future that runs when its result is asked for: one thread, reproducible."""
 
     def __init__(self, run: Callable[[], Any]) -> None:
@@ -33,7 +33,7 @@ class Deferred:
         return False
 
 
-class Abandoned(Exception):
+class JobAbandoned(Exception):
     """A job that was waited for takes too long for a process that is to end."""
 
 
@@ -43,14 +43,14 @@ class _WorkerFuture(concurrent.futures.Future):
         self._gave_up = gave_up
 
     def result(self, timeout: float | None = None) -> Any:
-        """Raises Abandoned once the process is to end and has waited long enough."""
+        """Raises JobAbandoned once the process is to end and has waited long enough."""
         while not concurrent.futures.wait([self], 0.2).done:
             if self._gave_up():
-                raise Abandoned
+                raise JobAbandoned
         return super().result(timeout)
 
 
-class Worker:
+class JobThread:
     """One thread that runs jobs in turn. Unlike a pool's it does not keep the process from ending."""
 
     def __init__(self, gave_up: Callable[[], bool]) -> None:

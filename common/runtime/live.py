@@ -21,9 +21,9 @@ from beamsplat.common.messages import Health
 from beamsplat.common.runtime.control import HandoverControl
 from beamsplat.common.runtime.handover import CONTROL
 from beamsplat.common.runtime.health_reporter import HealthReporter
-from beamsplat.common.runtime.jobs import Abandoned, JobQueue, Worker
+from beamsplat.common.runtime.jobs import JobAbandoned, JobQueue, JobThread
 from beamsplat.common.runtime.live_settings import LiveSettings
-from beamsplat.common.runtime.mailbox import NOBODY
+from beamsplat.common.runtime.mailbox import NO_PRODUCER
 from beamsplat.common.runtime.node import Node
 from beamsplat.common.runtime.pacing import Playback, wait_for_nodes
 from beamsplat.common.runtime.rate_limited_log import RateLimitedLog
@@ -66,8 +66,8 @@ class Live:
             raise
         with Bus(session, settings.robot, node.name, r.instance, epoch) as bus:
             reporter = HealthReporter(r, bus)
-            r.jobs = JobQueue(Worker(self._gave_up).submit)
-            node.meet(partial(ask, session, settings.robot))
+            r.jobs = JobQueue(JobThread(self._gave_up).submit)
+            node.set_query_function(partial(ask, session, settings.robot))
             try:
                 node.configure()
                 r.state = "standby"
@@ -75,7 +75,7 @@ class Live:
                 self._join(bus)
                 self._work(bus)
                 reporter.send()
-            except Abandoned:
+            except JobAbandoned:
                 log.warning("stopped while a background job was running: its result is lost")
             finally:
                 r.state = "closed"
@@ -99,8 +99,8 @@ class Live:
         # Assigned as a whole: the health thread iterates over it meanwhile.
         r.publications = {name: bus.publish(name) for name in r.node.outputs}
         for entry in r.node.inputs:
-            if entry.topic in r.settings.unfed:
-                r.mailbox.end(entry.topic, NOBODY, 0)
+            if entry.topic in r.settings.without_producer:
+                r.mailbox.end(entry.topic, NO_PRODUCER, 0)
             bus.subscribe(entry, r.receive, self._on_undecodable, r.receive_end)
         if r.node.watches_health():
             bus.watch_health(self._on_health)
@@ -160,7 +160,7 @@ class Live:
             r.emit_results(r.jobs.finished())
             if envelope is None:
                 if r.mailbox.ended:
-                    if not (r.mailbox.answers_may_come and r.node.awaits_answers()):
+                    if not (r.mailbox.feedback_may_arrive and r.node.awaits_feedback()):
                         return
                     last_received = self._report_silence(last_received)
                 continue
@@ -178,7 +178,7 @@ class Live:
         if silence_s < _SILENCE_S:
             time.sleep(0.02)  # `next_envelope` does not wait once the inputs have ended
             return last_received
-        self.running.emit(self.running.node.handle_silence(silence_s))
+        self.running.emit(self.running.node.handle_feedback_timeout(silence_s))
         return last_received + silence_s
 
     def _run_source(self) -> None:

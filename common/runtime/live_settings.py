@@ -19,7 +19,9 @@ class LiveSettings:
     rate: float = 1.0  # pacing of recorded sources: times real time, 0 = as fast as possible
     wait_for: frozenset[str] = frozenset()  # a source starts when these nodes are active
     wait_s: float = 60.0
-    unfed: frozenset[str] = frozenset()  # inputs that nobody in this deployment produces: not waited for
+    without_producer: frozenset[str] = (
+        frozenset()
+    )  # inputs that nobody in this deployment produces: not waited for
     resume: bool = False  # a restarted source goes on where its predecessor died
     exit_when_drained: bool = False
     instance: str = ""  # 16 hex digits that the supervisor knows it by; "" = random

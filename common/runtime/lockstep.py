@@ -15,8 +15,8 @@ from typing import Any
 
 from beamsplat.common.messages import Message
 from beamsplat.common.messages.header import Header
-from beamsplat.common.runtime.jobs import Deferred, JobQueue
-from beamsplat.common.runtime.mailbox import NOBODY, Envelope, Mailbox
+from beamsplat.common.runtime.jobs import JobQueue, LazyFuture
+from beamsplat.common.runtime.mailbox import NO_PRODUCER, Envelope, Mailbox
 from beamsplat.common.runtime.node import Job, Node, Output
 from beamsplat.common.topics import ROW_NUMBER, TOPICS
 
@@ -57,7 +57,7 @@ class Lockstep:
             produced = {name for seat in self._seats for name in seat.node.outputs}
             for name in TOPICS:
                 if name not in produced:
-                    self._end_topic(name, NOBODY, 0)
+                    self._end_topic(name, NO_PRODUCER, 0)
             for seat in self._seats:
                 if seat.source is not None:
                     self._pull(seat, 0)
@@ -163,7 +163,7 @@ def _seat(node: Node) -> _Seat:
     return _Seat(
         node=node,
         mailbox=Mailbox(type(node)),
-        jobs=JobQueue(Deferred),
+        jobs=JobQueue(LazyFuture),
         instance=hashlib.sha256(node.name.encode()).hexdigest()[:16],
         sequences={},
         source=node.source() if node.is_source() else None,

@@ -17,7 +17,7 @@ from beamsplat.common.runtime.node import Input, Node, merged_topics
 from beamsplat.common.runtime.stamp_merger import StampMerger
 from beamsplat.common.topics import ROW_NUMBER, TOPICS
 
-NOBODY = "nobody"  # ends an input that no node produces
+NO_PRODUCER = "nobody"  # ends an input that no node produces
 MAX_QUEUED = 20_000  # of an `every` input: beyond it the oldest goes, and is counted
 _MAX_COUNT = 2**63 - 1  # what a Health message can say
 
@@ -99,7 +99,7 @@ class Mailbox:
         count.queued_bytes += envelope.size_bytes
 
     def _admit(self, count: InputCount, header: Header, loses: bool) -> bool:
-        """Epoch and sequence bookkeeping; False for a stale or resent_until_ack message."""
+        """Epoch and sequence bookkeeping; False for a stale or repeated message."""
         if header.epoch < count.epoch:
             count.stale += 1
             return False
@@ -185,10 +185,10 @@ class Mailbox:
         """Every input has ended, at least one by its producer's word, and everything was handed out. Inputs
         that are fed back are not asked: they end after this node."""
         enders = [count.ended_by for name, count in self.counts.items() if name not in self._fed_back]
-        return not len(self) and all(enders) and any(e != NOBODY for e in enders)
+        return not len(self) and all(enders) and any(e != NO_PRODUCER for e in enders)
 
     @property
-    def answers_may_come(self) -> bool:
+    def feedback_may_arrive(self) -> bool:
         """Somebody feeds back to this node, and has not ended."""
         return any(self.counts[name].ended_by is None for name in self._fed_back)
 

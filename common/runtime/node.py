@@ -67,7 +67,7 @@ class Job:
     of: str | None = None
 
 
-class Sourced(NamedTuple):
+class SourceItem(NamedTuple):
     """What `source()` yields: `at_ns` is the arrival time on a recording's clock, by which runners
     pace and order; None means now (a real device)."""
 
@@ -78,10 +78,12 @@ class Sourced(NamedTuple):
 
 Output = tuple[str, Message] | Job
 Outputs = Iterator[Output]
-Ask = Callable[[str, str, dict[str, str], float], Iterator[Message]]  # node, query, parameters, time-out in s
+QueryFunction = Callable[
+    [str, str, dict[str, str], float], Iterator[Message]
+]  # node, query, parameters, time-out in s
 
 
-class UndeclaredTopic(RuntimeError):
+class UndeclaredOutput(RuntimeError):
     """A node wrote a topic, or started a job, that it does not declare."""
 
 
@@ -99,7 +101,7 @@ class Node:
 
     def __init__(self, config: NodeConfig) -> None:
         self.config = config
-        self.home: LiveSettings | None = None  # live only: robot, router and state folder
+        self.live_settings: LiveSettings | None = None  # live only: robot, router and state folder
         self.detail = ""  # one line that the node wants shown beside its health
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
@@ -121,7 +123,7 @@ class Node:
     def configure(self) -> None:
         """Loads and warms what the first message must not wait for."""
 
-    def examine(self) -> None:
+    def check_resources(self) -> None:
         """Looks, before anything runs and without keeping it, whether what the options name is there.
 
         Raises:
@@ -135,7 +137,7 @@ class Node:
     def close(self) -> None:
         """Releases files and devices. Called once, also after an error."""
 
-    def source(self) -> Iterator[Sourced | None]:
+    def source(self) -> Iterator[SourceItem | None]:
         """Sensors override this; a node with a source has no inputs. A device yields None several times a
         second while it has nothing to say, so that the runner can look after the rest."""
         return iter(())
@@ -143,7 +145,7 @@ class Node:
     def on_health(self, health: Health) -> None:
         """Those that watch override this: the health of every node, live only."""
 
-    def meet(self, ask: Ask) -> None:
+    def set_query_function(self, ask: QueryFunction) -> None:
         """Those that command others override this: how to ask a node something, live only."""
 
     def on_arrival(self, topic: str, message: Message) -> Iterable[Output]:
@@ -154,7 +156,7 @@ class Node:
     def on_header(self, header: Header) -> None:
         """Sees what rode beside the message that is handled next; the recorder keeps it."""
 
-    def obstacle(self, before: Node) -> str:
+    def handover_obstacle(self, before: Node) -> str:
         """Why this one, not configured yet, cannot take over from `before` while that runs; "" if it can."""
         return "" if self.replaceable else "what it knows lives in its process"
 
@@ -168,13 +170,13 @@ class Node:
     @property
     def in_standby(self) -> bool:
         """Whether `take_over` is still to come; `configure` leaves alone what a predecessor holds."""
-        return self.home is not None and self.home.standby
+        return self.live_settings is not None and self.live_settings.standby
 
-    def awaits_answers(self) -> bool:
+    def awaits_feedback(self) -> bool:
         """Whether this node, whose inputs have ended, should hear more of what is fed back before it ends."""
         return False
 
-    def on_silence(self, seconds: float) -> Iterable[Output]:
+    def on_feedback_timeout(self, seconds: float) -> Iterable[Output]:
         """Live only: so long nothing came to a node that awaits answers after the end of its inputs."""
         return ()
 
@@ -208,9 +210,9 @@ class Node:
         """What `on_job_<name>` sends."""
         yield from self._declared(getattr(self, f"on_job_{name}")(result))
 
-    def handle_silence(self, seconds: float) -> Iterator[Output]:
-        """What `on_silence` sends."""
-        yield from self._declared(self.on_silence(seconds))
+    def handle_feedback_timeout(self, seconds: float) -> Iterator[Output]:
+        """What `on_feedback_timeout` sends."""
+        yield from self._declared(self.on_feedback_timeout(seconds))
 
     def handle_drain(self) -> Iterator[Output]:
         """What `drain` sends."""
@@ -220,17 +222,19 @@ class Node:
         for output in outputs or ():
             if isinstance(output, Job):
                 if not callable(getattr(self, f"on_job_{output.name}", None)):
-                    raise UndeclaredTopic(f"{self.name} starts job {output.name!r} but has no on_job_ for it")
+                    raise UndeclaredOutput(
+                        f"{self.name} starts job {output.name!r} but has no on_job_ for it"
+                    )
             else:
                 self.check_output(*output)
             yield output
 
     def check_output(self, topic_name: str, message: Message) -> None:
-        """Raises UndeclaredTopic unless this node may send this message there."""
+        """Raises UndeclaredOutput unless this node may send this message there."""
         if topic_name not in self.outputs:
-            raise UndeclaredTopic(f"{self.name} wrote {topic_name}, which is not among its outputs")
+            raise UndeclaredOutput(f"{self.name} wrote {topic_name}, which is not among its outputs")
         if type(message) is not topic(topic_name).message:
-            raise UndeclaredTopic(f"{self.name} wrote a {type(message).__name__} to {topic_name}")
+            raise UndeclaredOutput(f"{self.name} wrote a {type(message).__name__} to {topic_name}")
 
 
 def merged_topics(node: type[Node]) -> tuple[str, ...]:

@@ -6,9 +6,9 @@ import logging
 import time
 from collections.abc import Callable
 
-from beamsplat.common.files.persist import Bookmark
+from beamsplat.common.files.persist import ReplayPosition
 from beamsplat.common.runtime.live_settings import LiveSettings
-from beamsplat.common.runtime.node import Sourced
+from beamsplat.common.runtime.node import SourceItem
 
 log = logging.getLogger(__name__)
 
@@ -36,18 +36,18 @@ def wait_for_nodes(
 class Playback:
     """Maps a recording's clock to this machine's, and keeps the place in the recording."""
 
-    def __init__(self, rate: float, bookmark: Bookmark, resume: bool) -> None:
+    def __init__(self, rate: float, bookmark: ReplayPosition, resume: bool) -> None:
         """`rate` in times real time, 0 = as fast as possible; `resume` goes on at the bookmark."""
         self._rate = rate
         self._bookmark = bookmark
         self._first: tuple[int, float] | None = None
         self._resume_ns = bookmark.read() if resume else None
 
-    def is_past(self, item: Sourced) -> bool:
+    def is_past(self, item: SourceItem) -> bool:
         """Whether a predecessor has sent this already."""
         return self._resume_ns is not None and item.at_ns is not None and item.at_ns <= self._resume_ns
 
-    def wait_s(self, item: Sourced) -> float:
+    def wait_s(self, item: SourceItem) -> float:
         """Seconds until an item is due; not positive when it is."""
         if item.at_ns is None or self._rate == 0.0 or self.is_past(item):
             return 0.0
@@ -57,13 +57,13 @@ class Playback:
         first_ns, started = self._first
         return started + (item.at_ns - first_ns) / 1e9 / self._rate - now
 
-    def sent(self, item: Sourced) -> None:
+    def sent(self, item: SourceItem) -> None:
         """Keeps the place behind a message that was sent."""
         if item.at_ns is not None and not self.is_past(item):
             self._bookmark.write(item.at_ns)
 
 
-class Allowance:
+class TokenBucket:
     """So many a second, and twice as many at once after a pause: a token bucket of one thread."""
 
     def __init__(self, rate_hz: float, clock_s: Callable[[], float] = time.monotonic) -> None:

@@ -30,7 +30,7 @@ class RunningNode:
 
     def __init__(self, node: Node, settings: LiveSettings) -> None:
         self.node = node
-        self.settings = node.home = settings
+        self.settings = node.live_settings = settings
         self.instance = settings.instance or secrets.token_hex(8)
         self.handover = Handover(settings.standby)
         self.accepts_arrivals = True  # whether `on_arrival` is called as soon as a message is received

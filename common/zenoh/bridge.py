@@ -1,8 +1,9 @@
-"""What crosses between a robot and its edge server: samples carried from one session to another, untouched.
+"""Bridge between a robot and its edge server: forwards samples between Zenoh sessions without decoding them.
 
-The column `uplink` of the topic table says what crosses, and how: a subscription on the other side cannot
-pull anything else over a radio. Small messages and large ones go over links of their own, so that a picture
-never stands before a pose. Ends of streams and health cross as well.
+The column `uplink` of the topic table selects the topics that are forwarded, and the direction. All other
+topics stay on their host: no subscription on the other side can request them over a slow radio link. Small
+and large messages use separate connections, so that an image never delays a pose. End-of-stream markers and
+health reports are forwarded too.
 """
 
 from __future__ import annotations
@@ -15,103 +16,109 @@ from dataclasses import dataclass, replace
 import zenoh
 
 from beamsplat.common.messages import Health
-from beamsplat.common.runtime.pacing import Allowance
+from beamsplat.common.runtime.pacing import TokenBucket
 from beamsplat.common.topics import HEALTH, TOPICS, Topic
 from beamsplat.common.zenoh.bus import key
-from beamsplat.common.zenoh.streams import FIFO_MESSAGES, declare_reader, declare_writer
+from beamsplat.common.zenoh.streams import FIFO_MESSAGES, declare_publication, declare_subscription
 
 log = logging.getLogger(__name__)
 
-_HEALTHS_HZ = 100.0  # of all nodes of a side: more is no health, and would cost the other side its CPU
-_NEWEST = 8  # of what is sent again anyway: behind a slow link the oldest is passed over
+# For the health reports of all nodes of one side (1 Hz each): one side must not load the other's CPU.
+_HEALTH_MAX_HZ = 100.0
+_RESENT_QUEUE_MESSAGES = 8  # of a topic that is resent until acknowledged: a slow link drops the oldest
 _HEALTH_ROW = Topic(HEALTH, Health, (), 1, "every")
 
 
 @dataclass(frozen=True)
-class Sides:
-    """Sessions: the robot's own router, and two with the edge's, for small messages and for large ones."""
+class BridgeSessions:
+    """The Zenoh sessions that a bridge connects."""
 
-    robot: zenoh.Session
-    small: zenoh.Session
-    large: zenoh.Session
+    robot: zenoh.Session  # client of the robot's own router
+    edge: zenoh.Session  # client of the edge server's router, for small messages
+    edge_bulk: zenoh.Session  # the same router over a second connection, for large messages
 
 
 @dataclass
-class Carried:
-    """What has crossed of one topic."""
+class ForwardedTraffic:
+    """Messages and bytes of one topic that the bridge has forwarded."""
 
     messages: int = 0
     bytes: int = 0
 
 
-class Relay:
-    """Carries until the sessions are closed. `carried` counts by topic, `ended` names those that ended."""
+class Bridge:
+    """Forwards until its sessions are closed."""
 
-    def __init__(self, name: str, sides: Sides) -> None:
-        self._name = name
-        self._over = threading.Event()  # set: a later session carries the large messages
-        self.carried: dict[str, Carried] = {}
-        self.ended: set[str] = set()
-        self.failed = 0  # cut off in the middle
-        self.refused = 0  # healths beyond what nodes have to say
+    def __init__(self, robot: str, sessions: BridgeSessions) -> None:
+        self._robot = robot
+        self._bulk_replaced = threading.Event()  # set: a later session forwards the large messages
+        self.forwarded: dict[str, ForwardedTraffic] = {}  # by topic; "health" is all nodes of both sides
+        self.ended: set[str] = set()  # topics whose end-of-stream marker was forwarded
+        self.interrupted = 0  # messages lost because the connection broke while they were written
+        self.health_dropped = 0  # health reports beyond _HEALTH_MAX_HZ
         for row in TOPICS.values():
             if row.uplink:
-                self._carry_topic(row, sides)
-        self._carry_health(sides.robot, sides.small)
-        self._carry_health(sides.small, sides.robot)
+                self._forward_topic(row, sessions)
+        self._forward_health(sessions.robot, sessions.edge)
+        self._forward_health(sessions.edge, sessions.robot)
 
-    def renew_large(self, sides: Sides) -> None:
-        """Goes on with another session for large messages: what was being written when a link broke can stay
-        stuck in the old one for good."""
-        self._over.set()
-        self._over = threading.Event()
+    def replace_bulk_session(self, sessions: BridgeSessions) -> None:
+        """Forward large messages over a new session; call it after the connection of the old one broke.
+
+        A write that was in progress when a connection broke can block the old session for good.
+        """
+        self._bulk_replaced.set()
+        self._bulk_replaced = threading.Event()
         for row in TOPICS.values():
             if row.uplink == "bulk":
-                self._carry_topic(row, sides)
+                self._forward_topic(row, sessions)
 
-    def upward(self) -> dict[str, Carried]:
-        """What has crossed from the robot, by topic."""
+    def forwarded_up(self) -> dict[str, ForwardedTraffic]:
+        """Return what was forwarded from the robot to the edge server, by topic."""
         return {
-            name: c for name, c in self.carried.items() if name in TOPICS and TOPICS[name].uplink != "down"
+            name: c for name, c in self.forwarded.items() if name in TOPICS and TOPICS[name].uplink != "down"
         }
 
-    def _carry_topic(self, row: Topic, sides: Sides) -> None:
-        ways = {"up": (sides.robot, sides.small), "bulk": (sides.robot, sides.large),
-                "down": (sides.small, sides.robot)}  # fmt: skip
-        source, target = ways[row.uplink]
+    def _forward_topic(self, row: Topic, sessions: BridgeSessions) -> None:
+        source, target = {
+            "up": (sessions.robot, sessions.edge),
+            "bulk": (sessions.robot, sessions.edge_bulk),
+            "down": (sessions.edge, sessions.robot),
+        }[row.uplink]
         large = row.uplink == "bulk"
-        # What nobody sends again is recovered from this side's cache after an outage, as it is on one host.
-        cached = replace(row, cache=0) if row.repeated else row
-        writer = declare_writer(
-            target, key(self._name, row.name), cached,
-            # Waits for a slow link in a thread of its own: dropping large messages would let none through.
+        # After an outage, subscribers recover from this publisher's cache, as they do from a producer's cache
+        # on one host. A topic that its producer resends needs no cache.
+        cached = replace(row, cache=0) if row.resent_until_ack else row
+        publisher = declare_publication(
+            target, key(self._robot, row.name), cached,
+            # Large messages wait for a slow link, in a thread of their own: dropping would let none through.
             congestion=zenoh.CongestionControl.BLOCK_FIRST if large else zenoh.CongestionControl.DROP,
             priority=zenoh.Priority.DATA_LOW if large else zenoh.Priority.INTERACTIVE_HIGH,
         )  # fmt: skip
-        self._carry(source, row.name, row, lambda sample: _put(writer, sample), row.name)
+        self._forward(source, row.name, row, lambda sample: _put(publisher, sample), row.name)
         end = replace(row, delivery="latched", cache=1)
-        end_writer = declare_writer(target, key(self._name, "end", row.name), end)
+        end_publisher = declare_publication(target, key(self._robot, "end", row.name), end)
 
         def send_end(sample: zenoh.Sample) -> None:
-            _put(end_writer, sample)
+            _put(end_publisher, sample)
             self.ended.add(row.name)
 
-        self._carry(source, f"end/{row.name}", end, send_end, None)
+        self._forward(source, f"end/{row.name}", end, send_end, None)
 
-    def _carry_health(self, source: zenoh.Session, target: zenoh.Session) -> None:
-        allowance = Allowance(_HEALTHS_HZ)
+    def _forward_health(self, source: zenoh.Session, target: zenoh.Session) -> None:
+        bucket = TokenBucket(_HEALTH_MAX_HZ)
 
         def send(sample: zenoh.Sample) -> None:
-            if not allowance.take():
-                self.refused += 1
+            if not bucket.take():
+                self.health_dropped += 1
                 return
             target.put(
                 sample.key_expr, sample.payload, encoding=sample.encoding, attachment=sample.attachment
             )
 
-        self._carry(source, f"{HEALTH}/*", _HEALTH_ROW, send, HEALTH)
+        self._forward(source, f"{HEALTH}/*", _HEALTH_ROW, send, HEALTH)
 
-    def _carry(
+    def _forward(
         self,
         source: zenoh.Session,
         topic_key: str,
@@ -119,38 +126,40 @@ class Relay:
         send: Callable[[zenoh.Sample], None],
         count_as: str | None,
     ) -> None:
-        if row.repeated and row.delivery != "latched":
-            channel = zenoh.handlers.RingChannel(_NEWEST)
+        if row.resent_until_ack and row.delivery != "latched":
+            channel = zenoh.handlers.RingChannel(_RESENT_QUEUE_MESSAGES)
         elif row.delivery == "latched":
             channel = zenoh.handlers.RingChannel(1)
         else:
             channel = zenoh.handlers.FifoChannel(max(row.cache, FIFO_MESSAGES))
-        # What this process itself put on that side is not to come back.
-        reader = declare_reader(
-            source, key(self._name, topic_key), row, row.delivery, channel, zenoh.Locality.REMOTE
+        # REMOTE: messages that this bridge published to `source` must not come back.
+        subscriber = declare_subscription(
+            source, key(self._robot, topic_key), row, row.delivery, channel, zenoh.Locality.REMOTE
         )
-        over = self._over if row.uplink == "bulk" else threading.Event()
-        count = self.carried.setdefault(count_as, Carried()) if count_as else Carried()
+        replaced = self._bulk_replaced if row.uplink == "bulk" else threading.Event()
+        count = self.forwarded.setdefault(count_as, ForwardedTraffic()) if count_as else ForwardedTraffic()
 
         def work() -> None:
             while True:
                 try:
-                    sample = reader.recv()
+                    sample = subscriber.recv()
                 except zenoh.ZError:  # the session was closed
                     return
-                if over.is_set():  # with this thread its reader ends
+                if replaced.is_set():  # the subscriber is undeclared when this thread returns
                     return
                 try:
                     send(sample)
-                except zenoh.ZError as error:  # the link broke in the middle of it, or the session was closed
-                    self.failed += 1
-                    log.info("%s did not cross: %s", topic_key, error)
+                except (
+                    zenoh.ZError
+                ) as error:  # the connection broke, or the session was closed
+                    self.interrupted += 1
+                    log.info("a message on %s was not forwarded: %s", topic_key, error)
                     continue
                 count.messages += 1
                 count.bytes += len(sample.payload)
 
-        threading.Thread(target=work, name=f"carry-{topic_key}", daemon=True).start()
+        threading.Thread(target=work, name=f"forward-{topic_key}", daemon=True).start()
 
 
-def _put(writer: zenoh.Publisher | zenoh.ext.AdvancedPublisher, sample: zenoh.Sample) -> None:
-    writer.put(sample.payload, encoding=sample.encoding, attachment=sample.attachment)
+def _put(publisher: zenoh.Publisher | zenoh.ext.AdvancedPublisher, sample: zenoh.Sample) -> None:
+    publisher.put(sample.payload, encoding=sample.encoding, attachment=sample.attachment)

@@ -36,7 +36,7 @@ from beamsplat.common.security.access_control import access_control, read_hosts
 from beamsplat.common.security.keys import OPEN, Keys, SecurityConfig, check_endpoint, is_secure
 from beamsplat.common.security.logins import Login, guard
 from beamsplat.common.topics import HEALTH, LIMIT_KB, Topic, topic
-from beamsplat.common.zenoh.streams import Producer, Publication, Subscription, open_sample
+from beamsplat.common.zenoh.streams import Producer, Publication, Subscription, decode_sample
 
 ROOT = "beamsplat"
 URGENT_BUFFER_BYTES = 32 * 1024  # 13 ms at 20 Mbit/s
@@ -306,7 +306,7 @@ class Bus:
                 except zenoh.ZError:
                     return
                 try:
-                    health = open_sample(sample, row).message
+                    health = decode_sample(sample, row).message
                 except DecodeError:  # another version's health cannot be shown; its node still runs
                     continue
                 on_health(health)

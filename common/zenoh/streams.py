@@ -20,7 +20,7 @@ FIFO_MESSAGES = 256  # buffered by Zenoh ahead of our thread for an `every` inpu
 ENCODING = zenoh.Encoding(MEDIA_TYPE)
 
 
-def declare_writer(
+def declare_publication(
     session: zenoh.Session,
     key_expr: str,
     row: Topic,
@@ -45,7 +45,7 @@ def declare_writer(
     )
 
 
-def declare_reader(
+def declare_subscription(
     session: zenoh.Session,
     key_expr: str,
     row: Topic,
@@ -86,7 +86,7 @@ class Publication:
         self.row = row
         self.sent = 0
         self.bytes = 0
-        self._publisher = declare_writer(session, key_expr, row)
+        self._publisher = declare_publication(session, key_expr, row)
 
     def put(self, message: Message) -> Header:
         """Sends one message; never waits for a subscriber."""
@@ -126,7 +126,7 @@ class Subscription:
             channel = zenoh.handlers.FifoChannel(max(row.cache, FIFO_MESSAGES))
         else:
             channel = zenoh.handlers.RingChannel(1)
-        self._subscriber = declare_reader(session, key_expr, row, delivery, channel)
+        self._subscriber = declare_subscription(session, key_expr, row, delivery, channel)
         self._thread = threading.Thread(target=self._receive, name=f"sub-{row.name}", daemon=True)
         self._thread.start()
 
@@ -137,14 +137,14 @@ class Subscription:
             except zenoh.ZError:  # the session was closed
                 return
             try:
-                envelope = open_sample(sample, self.row)
+                envelope = decode_sample(sample, self.row)
             except DecodeError as error:
                 self._on_undecodable(self.row.name, str(error))
             else:
                 self._on_envelope(envelope)
 
 
-def open_sample(sample: zenoh.Sample, row: Topic) -> Envelope:
+def decode_sample(sample: zenoh.Sample, row: Topic) -> Envelope:
     """The envelope in a sample of topic `row`.
 
     Raises:

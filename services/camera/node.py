@@ -1,4 +1,4 @@
-"""A camera as a node: its pictures in the bytes it gave, and the calibration they belong to."""
+"""The camera node: publishes the camera's JPEG images unchanged, and the calibration that belongs to them."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from beamsplat.common.errors import UserError
 from beamsplat.common.geometry.rig import RigFile, load_rig
 from beamsplat.common.messages import Image, Rig
 from beamsplat.common.runtime.clock import StampClock
-from beamsplat.common.runtime.node import Node, Sourced
+from beamsplat.common.runtime.node import Node, SourceItem
 from beamsplat.services.camera.capture import CaptureSource
 from beamsplat.services.camera.config import CameraConfig, NoCameraConfig
 from beamsplat.services.camera.mjpeg import HttpSource, is_multipart
 from beamsplat.services.camera.reader import CameraReader, CameraSource
 
-_TIMEOUT_S = 3.0
+_TIMEOUT_S = 3.0  # for HTTP cameras: connection and each read
 
 
 class CameraNode(Node):
-    """V4L2 devices, network streams and files. A camera that is not there yet, or gone, is waited for."""
+    """Reads V4L2 devices, network streams and files; reconnects to a camera that is missing or fails."""
 
     name = "camera"
     Config = CameraConfig
@@ -29,32 +29,34 @@ class CameraNode(Node):
     outputs = ("rig", "camera/image")
 
     def configure(self) -> None:
-        """Reads the calibration, so that what is wrong with it is said before anything runs."""
+        """Read the calibration, so that an error in it is reported before anything runs."""
         c = self.config
         self._rig = load_rig(c.rig) if c.rig is not None else None
         if self._rig is not None and self._rig.camera is None:
-            raise UserError(f'{c.rig}: has no [camera]; add it, or set kind = "none" for a robot without one')
+            raise UserError(
+                f'{c.rig}: [camera] is missing; add it, or set kind = "none" if there is no camera'
+            )
         self._clock = StampClock()
         self._reader = CameraReader(
             self._open, size_px=self._size_px(strict=True), rate_hz=c.rate_hz, delay_s=c.delay_s,
             silence_s=c.silence_s, jpeg_quality=c.jpeg_quality,
         )  # fmt: skip
 
-    def source(self) -> Iterator[Sourced | None]:
-        """The calibration, then pictures; None while there is nothing to say."""
+    def source(self) -> Iterator[SourceItem | None]:
+        """Yield the calibration, then images; None while no image is available."""
         if self._rig is not None:
             yield _rig_message(self._rig, self._clock.now_ns(), str(self.config.rig))
-        for picture in self._reader.images():
-            uncalibrated = "" if self._rig is not None else "; NO CALIBRATION, give a rig file with rig = ..."
+        for checked in self._reader.images():
+            uncalibrated = "" if self._rig is not None else "; NO CALIBRATION: set a rig file with rig = ..."
             self.detail = self._reader.status + uncalibrated
-            if picture is None:
+            if checked is None:
                 yield None
                 continue
             image = Image(
-                stamp_ns=picture.stamp_ns, width_px=picture.width_px, height_px=picture.height_px,
-                encoding="jpeg", data=np.frombuffer(picture.jpeg, np.uint8),
+                stamp_ns=checked.stamp_ns, width_px=checked.width_px, height_px=checked.height_px,
+                encoding="jpeg", data=np.frombuffer(checked.jpeg, np.uint8),
             )  # fmt: skip
-            yield Sourced(None, "camera/image", image)
+            yield SourceItem(None, "camera/image", image)
         self.detail = self._reader.status
 
     def close(self) -> None:
@@ -68,7 +70,10 @@ class CameraNode(Node):
         return CaptureSource(source, self._clock.now_ns, self._size_px(strict=False), self.config.rate_hz)
 
     def _size_px(self, *, strict: bool) -> tuple[int, int] | None:
-        """Size of the calibration; for asking the camera (not `strict`) also what the options say."""
+        """Return the image size (width, height) of the calibration, else None.
+
+        With `strict` False (the size to request from the camera) the options are the second choice.
+        """
         c = self.config
         if self._rig is not None:
             return self._rig.camera.width_px, self._rig.camera.height_px
@@ -76,7 +81,7 @@ class CameraNode(Node):
 
 
 class NoCamera(Node):
-    """Says where the lidar sits, and nothing else."""
+    """Publishes the rig of a robot without a camera."""
 
     name = "camera"
     Config = NoCameraConfig
@@ -87,14 +92,14 @@ class NoCamera(Node):
         self._rig = load_rig(self.config.rig)
         self._clock = StampClock()
 
-    def source(self) -> Iterator[Sourced | None]:
-        """The calibration once; it is latched. A robot without it stays without for ever: this never ends."""
+    def source(self) -> Iterator[SourceItem | None]:
+        """Yield the calibration once, since the topic is latched; then None, without end."""
         yield _rig_message(self._rig, self._clock.now_ns(), str(self.config.rig))
         while True:
             time.sleep(0.2)
             yield None
 
 
-def _rig_message(rig: RigFile, stamp_ns: int, path: str) -> Sourced:
+def _rig_message(rig: RigFile, stamp_ns: int, path: str) -> SourceItem:
     message: Rig = rig.message(stamp_ns, rig.source or path)
-    return Sourced(None, "rig", message)
+    return SourceItem(None, "rig", message)

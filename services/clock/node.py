@@ -1,4 +1,7 @@
-"""A tick a second on the sensors' clock: for nodes that use idle time, on robots that replay nothing."""
+"""The clock node: one tick per second on the sensors' clock.
+
+Nodes do their periodic background work on ticks. In a replay the ticks come from the recording's time.
+"""
 
 from __future__ import annotations
 
@@ -7,23 +10,26 @@ from collections.abc import Iterator
 
 from beamsplat.common.messages import Tick
 from beamsplat.common.runtime.clock import StampClock
-from beamsplat.common.runtime.node import Node, Sourced
+from beamsplat.common.runtime.node import Node, SourceItem
 
-TICK_NS = 1_000_000_000
+TICK_NS = 1_000_000_000  # nominal rate of the topic `tick`: 1 Hz
 
 
 class ClockNode(Node):
-    """See module."""
+    """Publishes `tick` at full seconds."""
 
     name = "clock"
     outputs = ("tick",)
 
     def configure(self) -> None:
-        """Makes ready; the first tick comes with the first full second."""
+        """Open the clock; the first tick is at the next full second."""
         self._clock = StampClock()
 
-    def source(self) -> Iterator[Sourced | None]:
-        """Ticks for ever; None while there is nothing to say. A late one is said once, not made up for."""
+    def source(self) -> Iterator[SourceItem | None]:
+        """Yield ticks without end; None in between.
+
+        Seconds missed by a delay are left out, not published late.
+        """
         count = 0
         due_ns = (self._clock.now_ns() // TICK_NS + 1) * TICK_NS
         while True:
@@ -32,6 +38,6 @@ class ClockNode(Node):
                 time.sleep(min(wait_ns * 1e-9, 0.2))
                 yield None
                 continue
-            yield Sourced(None, "tick", Tick(stamp_ns=due_ns, count=count))
+            yield SourceItem(None, "tick", Tick(stamp_ns=due_ns, count=count))
             count += 1
             due_ns = max(due_ns, self._clock.now_ns() // TICK_NS * TICK_NS) + TICK_NS

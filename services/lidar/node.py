@@ -1,4 +1,6 @@
-"""A lidar as a node: its turns as scans, with stamps that no change of the host's time moves."""
+"""The lidar nodes: publish revolutions as scans, with time stamps that do not depend on the host's wall
+clock.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +11,7 @@ import numpy as np
 
 from beamsplat.common.messages import Scan
 from beamsplat.common.runtime.clock import StampClock
-from beamsplat.common.runtime.node import Node, Sourced
+from beamsplat.common.runtime.node import Node, SourceItem
 from beamsplat.services.lidar.config import HokuyoConfig, LidarConfig, RplidarConfig
 from beamsplat.services.lidar.driver import LidarDriver
 from beamsplat.services.lidar.hokuyo import HokuyoDriver
@@ -21,34 +23,42 @@ from beamsplat.services.lidar.samples import StampedScan
 
 
 class _LidarNode(Node, ABC):
-    """What the kinds share. A device that is not there yet, or gone, is waited for."""
+    """Base class of the lidar nodes; reconnects to a device that is missing or fails."""
 
     Config = LidarConfig
     config: LidarConfig
 
     @abstractmethod
     def driver(self) -> LidarDriver:
-        """The driver of this kind."""
+        """Return a new driver of this kind."""
 
     def configure(self) -> None:
-        """Makes ready; opening waits until the stream is asked for, so that an absent device is a status."""
+        """Prepare the reader.
+
+        The device is opened later, so that a missing device is a status and not an error.
+        """
         bauds = (self.config.baud,) if self.config.baud else ()
         self._reader = LidarReader(self.driver, self._open, bauds, StampClock().now_ns)
 
     def _open(self, baud: int) -> DeviceLink:
         return open_link(self.config.device, baud)
 
-    def source(self) -> Iterator[Sourced | None]:
-        """Scans for ever; None while there is nothing to say."""
+    def source(self) -> Iterator[SourceItem | None]:
+        """Yield scans without end; None while there is none."""
         for scan in self._reader.scans():
             self.detail = self._reader.status
-            yield None if scan is None else Sourced(None, "lidar/scan", self.message(scan))
+            yield None if scan is None else SourceItem(None, "lidar/scan", self.message(scan))
 
     def message(self, scan: StampedScan) -> Scan:
-        """A turn as it goes out. NaN: not measured; no device here tells "nothing there" from "not seen"."""
+        """Return the scan message of a revolution.
+
+        Ranges beyond the limit become NaN (not measured): consumers read +inf as free space, and these
+        devices
+        do not distinguish "nothing within range" from "not seen".
+        """
         turn, sign = scan.revolution, -1.0 if self.config.upside_down else 1.0
         range_max_m = self.config.range_max_m or scan.range_max_m
-        # Consumers take what lies beyond for free space; a device has no business to say so.
+
         ranges_m = np.where(turn.range_m <= range_max_m, turn.range_m, np.float32(np.nan))
         return Scan(
             stamp_ns=scan.stamp_ns,

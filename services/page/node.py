@@ -29,7 +29,7 @@ from beamsplat.common.messages import (
     Scan,
     WheelOdometry,
 )
-from beamsplat.common.runtime.node import Ask, Input, Node, Outputs
+from beamsplat.common.runtime.node import Input, Node, Outputs, QueryFunction
 from beamsplat.services.page.pictures import Encoded, camera_picture, depth_picture, map_picture
 from beamsplat.services.page.server import Access, PageServer
 from beamsplat.services.page.view import View
@@ -87,9 +87,9 @@ class PageNode(Node):
         Input("mapping/preview", "latest"),
         Input("mapping/status", "latest"),
     )
-    _ask: Ask | None = None
+    _ask: QueryFunction | None = None
 
-    def meet(self, ask: Ask) -> None:
+    def set_query_function(self, ask: QueryFunction) -> None:
         self._ask = ask
 
     def configure(self) -> None:

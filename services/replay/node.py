@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator
 
-from beamsplat.common.runtime.node import Node, Sourced
+from beamsplat.common.runtime.node import Node, SourceItem
 from beamsplat.services.replay.config import ReplayConfig
 from beamsplat.services.replay.options import SourceOptions
 from beamsplat.services.replay.source import Source, open_source, play
@@ -36,7 +36,7 @@ class ReplayNode(Node):
             raise
         self._source = source
 
-    def examine(self) -> None:
+    def check_resources(self) -> None:
         self.configure()
         self.close()
 
@@ -48,13 +48,13 @@ class ReplayNode(Node):
         self.configure()
         return self._source.expected()
 
-    def source(self) -> Iterator[Sourced]:
+    def source(self) -> Iterator[SourceItem]:
         """The calibration, then everything by arrival."""
         self.configure()
         config = self.config
         played = play(self._source, start_s=config.start_s, duration_s=config.duration_s, loop=config.loop)
         for at_ns, topic, message in played:
-            yield Sourced(at_ns, topic, message)
+            yield SourceItem(at_ns, topic, message)
         for problem in self._source.problems:
             log.warning("%s", problem)
 

@@ -13,7 +13,7 @@ import zenoh.ext
 
 from beamsplat.common.recording.ros_types import typestore
 from beamsplat.common.runtime.clock import StampClock
-from beamsplat.common.runtime.node import Node, Sourced
+from beamsplat.common.runtime.node import Node, SourceItem
 from beamsplat.common.zenoh.bus import open_session
 from beamsplat.common.zenoh.rmw import ADMIN, Address, Attachment, Entity, Qos, dds_type
 from beamsplat.services.ros2.config import Ros2Config
@@ -58,7 +58,7 @@ class Ros2Node(Node):
         self._session = open_session((c.router,))
         self._listen()
 
-    def source(self) -> Iterator[Sourced | None]:
+    def source(self) -> Iterator[SourceItem | None]:
         """What the robot's sensors say; None while they say nothing."""
         while True:
             try:
@@ -75,7 +75,7 @@ class Ros2Node(Node):
         if hasattr(self, "_session"):
             self._session.close()
 
-    def _take(self, sample: zenoh.Sample) -> list[Sourced]:
+    def _take(self, sample: zenoh.Sample) -> list[SourceItem]:
         key = str(sample.key_expr)
         if key.startswith(ADMIN):
             self._hear_of(key, sample.kind)
@@ -94,7 +94,7 @@ class Ros2Node(Node):
         )
         if self.robot.rig is not None and not self._tidied:
             self._tidy()
-        return [Sourced(None, topic, message) for topic, message in found]
+        return [SourceItem(None, topic, message) for topic, message in found]
 
     def _is_own(self, sample: zenoh.Sample) -> bool:
         attachment = Attachment.unpack(sample.attachment.to_bytes()) if sample.attachment else None

@@ -16,9 +16,9 @@ from pydantic import Field
 
 from beamsplat.common.config.deployment import NodeConfig
 from beamsplat.common.errors import UserError
-from beamsplat.common.runtime.node import Node, Sourced
+from beamsplat.common.runtime.node import Node, SourceItem
 from beamsplat.common.security.logins import login_of
-from beamsplat.common.zenoh.bridge import Relay, Sides
+from beamsplat.common.zenoh.bridge import Bridge, BridgeSessions
 from beamsplat.common.zenoh.bus import BULK_BUFFER_BYTES, URGENT_BUFFER_BYTES, open_link, open_session
 
 _POLL_S = 0.1
@@ -41,17 +41,17 @@ class UplinkNode(Node):
 
     def configure(self) -> None:
         self._sessions: list[zenoh.Session] = []
-        self._relay: Relay | None = None
+        self._bridge: Bridge | None = None
         self._cut_since: float | None = None
         self._cuts = 0
         self._large_broke = False
 
-    def source(self) -> Iterator[Sourced | None]:
+    def source(self) -> Iterator[SourceItem | None]:
         """Runs until all that the robot sends has ended; a robot's sensors never do."""
-        if self.home is None:
+        if self.live_settings is None:
             raise UserError("the uplink runs live only: leave it out of lockstep runs")
         started = time.monotonic()
-        while self._relay is None:
+        while self._bridge is None:
             try:
                 self._connect()
             except UserError as error:
@@ -82,18 +82,20 @@ class UplinkNode(Node):
         try:
             for buffer_bytes in (URGENT_BUFFER_BYTES, BULK_BUFFER_BYTES):
                 opened.append(self._link(buffer_bytes))
-            login = login_of(self.home.security, self.name)
-            opened.append(open_session(self.home.endpoints, _ATTEMPT_S, login=login))
+            login = login_of(self.live_settings.security, self.name)
+            opened.append(open_session(self.live_settings.endpoints, _ATTEMPT_S, login=login))
         except UserError:
             for session in opened:
                 session.close()
             raise
         self._sessions = opened
         small, large, robot = opened
-        self._relay = Relay(self.home.robot, Sides(robot=robot, small=small, large=large))
+        self._bridge = Bridge(
+            self.live_settings.robot, BridgeSessions(robot=robot, edge=small, edge_bulk=large)
+        )
 
     def _link(self, buffer_bytes: int) -> zenoh.Session:
-        return open_link(self.config.edge, _ATTEMPT_S, self.home.security, buffer_bytes)
+        return open_link(self.config.edge, _ATTEMPT_S, self.live_settings.security, buffer_bytes)
 
     def _mend(self) -> None:
         """After a cut the session for large messages is replaced, once the small one is connected again."""
@@ -106,13 +108,13 @@ class UplinkNode(Node):
         small, old, robot = self._sessions
         self._sessions = [small, large, robot]
         self._large_broke = False
-        self._relay.renew_large(Sides(robot=robot, small=small, large=large))
+        self._bridge.replace_bulk_session(BridgeSessions(robot=robot, edge=small, edge_bulk=large))
         threading.Thread(target=old.close, daemon=True).start()
 
     def _ended(self) -> bool:
         """All topics on which the robot said something have ended."""
-        spoke = {name for name, carried in self._relay.upward().items() if carried.messages}
-        return bool(spoke) and spoke <= self._relay.ended
+        spoke = {name for name, traffic in self._bridge.forwarded_up().items() if traffic.messages}
+        return bool(spoke) and spoke <= self._bridge.ended
 
     def _say(self) -> None:
         now = time.monotonic()
@@ -124,9 +126,11 @@ class UplinkNode(Node):
                 self._cut_since, self._cuts = now, self._cuts + 1
             self._large_broke = True
             state = f"no link for {now - self._cut_since:.0f} s"
-        up = self._relay.upward().values()
-        cuts = f", {self._cuts} cuts, {self._relay.failed} messages cut off" if self._cuts else ""
-        cuts += f", {self._relay.refused} healths too many" if self._relay.refused else ""
+        up = self._bridge.forwarded_up().values()
+        cuts = f", {self._cuts} cuts, {self._bridge.interrupted} messages cut off" if self._cuts else ""
+        cuts += (
+            f", {self._bridge.health_dropped} health reports too many" if self._bridge.health_dropped else ""
+        )
         self.detail = (
             f"{state} ({self.config.edge}){cuts}: {sum(c.messages for c in up)} messages, "
             f"{sum(c.bytes for c in up) / 1e6:.1f} MB"

@@ -9,11 +9,11 @@ import numpy as np
 from beamsplat.common.config.deployment import NodeConfig
 from beamsplat.common.geometry.transforms import se2_to_se3
 from beamsplat.common.messages import Correction, ExternalPose, Grid, Image, Odometry, Scan, WheelOdometry
-from beamsplat.common.runtime.node import Input, Job, Node, Outputs, Sourced
+from beamsplat.common.runtime.node import Input, Job, Node, Outputs, SourceItem
 from beamsplat.common.runtime.registry import Service
 
 
-class DriveConfig(NodeConfig):
+class SensorSourceConfig(NodeConfig):
     seconds: float = 3.0
     scans: bool = True
     images: bool = True
@@ -21,21 +21,21 @@ class DriveConfig(NodeConfig):
     seed: int = 0
 
 
-class Drive(Node):
+class SensorSource(Node):
     """Scans at 10 Hz, wheel odometry at 50 Hz, pictures at 30 Hz; each arrives late by its own jitter."""
 
     name = "replay"
-    Config = DriveConfig
+    Config = SensorSourceConfig
     outputs = ("lidar/scan", "wheel/odometry", "camera/image")
 
-    def source(self) -> Iterator[Sourced]:
+    def source(self) -> Iterator[SourceItem]:
         rng = np.random.default_rng(self.config.seed)
         items = []
         for i in range(int(self.config.seconds * 50)):
             stamp_ns = 1_000_000_000 + i * 20_000_000
             pose = se2_to_se3(np.array([0.01 * i, 0.0, 0.0]))
             items.append(
-                Sourced(
+                SourceItem(
                     stamp_ns + int(rng.uniform(1e6, 9e6)),
                     "wheel/odometry",
                     WheelOdometry(stamp_ns=stamp_ns, T_odom_body=pose, velocity_m_s=np.zeros(3),
@@ -45,7 +45,7 @@ class Drive(Node):
         for i in range(int(self.config.seconds * 10) if self.config.scans else 0):
             stamp_ns = 1_003_000_000 + i * 100_000_000
             items.append(
-                Sourced(
+                SourceItem(
                     stamp_ns + 100_000_000 + int(rng.uniform(1e6, 9e6)),
                     "lidar/scan",
                     Scan(stamp_ns=stamp_ns, angle_min_rad=-3.14, angle_increment_rad=0.01, time_increment_s=0.0,
@@ -57,7 +57,7 @@ class Drive(Node):
             stamp_ns = 1_005_000_000 + i * 33_333_333
             data = rng.integers(0, 255, self.config.image_bytes).astype(np.uint8)
             items.append(
-                Sourced(
+                SourceItem(
                     stamp_ns + 20_000_000,
                     "camera/image",
                     Image(stamp_ns=stamp_ns, width_px=640, height_px=480, encoding="jpeg", data=data),
@@ -155,20 +155,20 @@ class Sink(Node):
         return iter(())
 
 
-class Poser(Node):
+class PoseSource(Node):
     """A source that says what it says at once, as a device would."""
 
     name = "ros2"
     outputs = ("external/pose",)
 
-    def source(self) -> Iterator[Sourced]:
+    def source(self) -> Iterator[SourceItem]:
         for i in range(5):
-            yield Sourced(None, "external/pose", ExternalPose(stamp_ns=i, T_map_body=np.eye(4)))
+            yield SourceItem(None, "external/pose", ExternalPose(stamp_ns=i, T_map_body=np.eye(4)))
 
 
 _HERE = "tests.common.nodes:"
 TABLE = {
-    "replay": Service("replay", "", {"drive": _HERE + "Drive"}),
+    "replay": Service("replay", "", {"drive": _HERE + "SensorSource"}),
     "localization": Service("localization", "", {"chain": _HERE + "Chain", "slow": _HERE + "Slow"}),
     "recorder": Service("recorder", "", {"sink": _HERE + "Sink"}),
 }

@@ -14,7 +14,7 @@ def poll(supervisor, until, timeout_s):
     raise AssertionError(f"not within {timeout_s} s")
 
 
-def say_until_heard(publication, message, heard, times=3, timeout_s=5.0):
+def publish_until_received(publication, message, heard, times=3, timeout_s=5.0):
     """Publishes until `heard` holds so many messages."""
     deadline = time.monotonic() + timeout_s
     while len(heard) < times and time.monotonic() < deadline:

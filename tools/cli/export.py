@@ -129,23 +129,23 @@ def _latched_grid(session: Any, robot: str) -> Any:
 
     from beamsplat.common.topics import topic
     from beamsplat.common.zenoh.bus import key
-    from beamsplat.common.zenoh.streams import declare_reader, open_sample
+    from beamsplat.common.zenoh.streams import declare_subscription, decode_sample
     from beamsplat.services.localization.lidar2d.occupancy import OccupancyGrid
 
     row, said = topic("localization/grid"), queue.SimpleQueue()
-    _kept = declare_reader(session, key(robot, row.name), row, "latched", said.put)
+    _kept = declare_subscription(session, key(robot, row.name), row, "latched", said.put)
     try:
-        grid = open_sample(said.get(timeout=_LATCHED_S), row).message
+        grid = decode_sample(said.get(timeout=_LATCHED_S), row).message
     except queue.Empty:
         return None
     return OccupancyGrid(grid.occupancy, *map(float, grid.origin_m), grid.resolution_m)
 
 
 def _gaussians(path: Path, to: str, store: Any, arrays: dict[str, Any], detail_m: float, threads: int) -> str:
-    from beamsplat.common.mapfiles.detail import coarser
+    from beamsplat.common.mapfiles.detail import merge_by_cell
 
     whole = store.params[:, : store.count]
-    params = coarser(whole, detail_m)
+    params = merge_by_cell(whole, detail_m)
     _writer(to)(path, params)
     text = f"{params.shape[1]} Gaussians"
     if params is whole:
@@ -158,12 +158,12 @@ def _cost_db(store: Any, params: Any, arrays: dict[str, Any], threads: int) -> f
     """Mean PSNR of coarse Gaussians against all of them."""
     import numpy as np
 
-    from beamsplat.common.mapfiles.film import pictures
     from beamsplat.common.mapfiles.scores import psnr_db
-    from beamsplat.common.mapfiles.state import views_of
+    from beamsplat.common.mapfiles.state import keyframe_views
     from beamsplat.common.mapfiles.store import GaussianStore
+    from beamsplat.common.mapfiles.video import pictures
 
-    views = views_of(arrays)
+    views = keyframe_views(arrays)
     views = views[:: -(-len(views) // _VIEWS) or 1]
     if not views:
         return float("nan")
@@ -187,10 +187,10 @@ def _views(store: Any, arrays: dict[str, Any], threads: int) -> Any:
     """The map's rendered depth from all keyframes, with a bar."""
     from rich.progress import track
 
-    from beamsplat.common.mapfiles.state import views_of
+    from beamsplat.common.mapfiles.state import keyframe_views
     from beamsplat.common.mapfiles.surface import rendered_views
 
-    views = [(view.camera, view.T_map_camera) for view in views_of(arrays)]
+    views = [(view.camera, view.T_map_camera) for view in keyframe_views(arrays)]
     if not views:
         raise UserError("the session has no keyframes to look from")
     rendered = rendered_views(store, views, threads)
@@ -208,7 +208,7 @@ def _points(path: Path, store: Any, arrays: dict[str, Any], cell_m: float, threa
 def _mesh(path: Path, store: Any, arrays: dict[str, Any], voxel_m: float, threads: int) -> str:
     import numpy as np
 
-    from beamsplat.common.mapfiles.mesh import DistanceField, surface_nets, without_crumbs
+    from beamsplat.common.mapfiles.mesh import TsdfVolume, remove_small_pieces, surface_nets
     from beamsplat.common.mapfiles.surface import points_of, write_ply
 
     views = list(_views(store, arrays, threads))
@@ -221,9 +221,9 @@ def _mesh(path: Path, store: Any, arrays: dict[str, Any], voxel_m: float, thread
         raise UserError("the map shows no surface from its keyframes")
     # The rare pixel that looks out of a window must not make the field large.
     low, high = np.percentile(corners, 5.0, axis=0), np.percentile(corners, 95.0, axis=0)
-    field = DistanceField.around(low, high, voxel_m)
+    field = TsdfVolume.around(low, high, voxel_m)
     field.add(views)
-    mesh = without_crumbs(surface_nets(field), _LEAST_FACES)
+    mesh = remove_small_pieces(surface_nets(field), _LEAST_FACES)
     write_ply(path, mesh.vertices_m, mesh.colours, mesh.faces)
     return f"{len(mesh.faces)} triangles"
 
@@ -277,11 +277,11 @@ def render(
     """
     from rich.progress import track
 
-    from beamsplat.common.mapfiles.film import pictures, write_film
-    from beamsplat.common.mapfiles.state import store_of, views_of
+    from beamsplat.common.mapfiles.state import keyframe_views, store_of
+    from beamsplat.common.mapfiles.video import pictures, write_video
 
     arrays, _ = _open(session)
-    views, store = views_of(arrays), store_of(arrays)
+    views, store = keyframe_views(arrays), store_of(arrays)
     if not views:
         raise UserError(f"{session}: has no keyframes, so no camera to film with")
     frames = max(round(seconds * fps), 1)
@@ -292,7 +292,7 @@ def render(
     bar = track(
         pictures(store, camera, poses, threads), "rendering", len(poses), console=console, transient=True
     )
-    written = write_film(out, bar, fps, len(poses))
+    written = write_video(out, bar, fps, len(poses))
     print(f"{written[0]}: {len(poses)} pictures of {camera.width_px}x{camera.height_px}")
 
 
@@ -301,7 +301,7 @@ def _poses(path: str, store: Any, arrays: dict[str, Any], views: list[Any], fram
 
     from beamsplat.common.geometry.trajectory import read_tum
     from beamsplat.common.geometry.transforms import inverse
-    from beamsplat.common.mapfiles.film import along, drive, orbit
+    from beamsplat.common.mapfiles.video import along, drive, orbit
 
     if path == "orbit":
         return orbit(store, float(np.median([view.T_map_camera[2, 3] for view in views])), frames)

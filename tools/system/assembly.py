@@ -9,7 +9,7 @@ from beamsplat.common.config.deployment import Deployment, Role
 from beamsplat.common.errors import UserError
 from beamsplat.common.plugins import is_class_path
 from beamsplat.common.runtime.node import Node
-from beamsplat.common.runtime.registry import Service, class_of, make_node
+from beamsplat.common.runtime.registry import Service, make_node, node_class_of
 from beamsplat.common.security.access_control import MASTERS
 from beamsplat.common.topics import TOPICS
 from beamsplat.services.nodes import NODES
@@ -56,7 +56,7 @@ def _service(deployment: Deployment, name: str, table: dict[str, Service]) -> Se
 def node_classes(deployment: Deployment, table: dict[str, Service] = NODES) -> dict[str, type[Node]]:
     """The class of each node of a deployment, by name; options other than `kind` are not looked at."""
     return {
-        name: class_of(_service(deployment, name, table), options)
+        name: node_class_of(_service(deployment, name, table), options)
         for name, options in deployment.nodes.items()
     }
 
@@ -97,7 +97,7 @@ def unusable(
     for name in names or tuple(deployment.nodes):
         if name in deployment.nodes:
             try:
-                build_node(deployment, name, table).examine()
+                build_node(deployment, name, table).check_resources()
             except UserError as error:
                 found.append(Fault(f"{name}: {error}"))
     return found
@@ -108,7 +108,7 @@ class Surroundings:
     """What a node must know of the others of its deployment."""
 
     wait_for: frozenset[str]  # a source starts when these are active, so that they miss nothing
-    unfed: frozenset[str]  # inputs that nobody here produces: they are not waited for
+    without_producer: frozenset[str]  # inputs that nobody here produces: they are not waited for
 
 
 def surroundings(classes: dict[str, type[Node]], name: str, role: Role = "whole") -> Surroundings:
@@ -117,7 +117,7 @@ def surroundings(classes: dict[str, type[Node]], name: str, role: Role = "whole"
     listeners = frozenset(other for other, node in classes.items() if node.inputs and other != name)
     return Surroundings(
         wait_for=listeners if classes[name].is_source() and classes[name].outputs else frozenset(),
-        unfed=frozenset(entry.topic for entry in classes[name].inputs if entry.topic not in fed),
+        without_producer=frozenset(entry.topic for entry in classes[name].inputs if entry.topic not in fed),
     )
 
 

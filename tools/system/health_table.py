@@ -13,10 +13,10 @@ from rich.text import Text
 
 from beamsplat.common.messages import Health
 from beamsplat.common.messages.header import DecodeError
-from beamsplat.common.runtime.health import Flow, HealthBook, NodeRecord, Taker
+from beamsplat.common.runtime.health import HealthRecords, NodeRecord, TopicConsumer, TopicTraffic
 from beamsplat.common.topics import HEALTH, Topic
 from beamsplat.common.zenoh.bus import key
-from beamsplat.common.zenoh.streams import open_sample
+from beamsplat.common.zenoh.streams import decode_sample
 
 ALL = "*"
 
@@ -27,7 +27,7 @@ class HealthBoard:
 
     def __init__(self, session: zenoh.Session, robot: str) -> None:
         self._all = robot == ALL
-        self._book = HealthBook()
+        self._book = HealthRecords()
         self.records: dict[str, NodeRecord] = self._book.records
         self._lock = threading.Lock()
         self._row = Topic(HEALTH, Health, (), 1, "latest")
@@ -43,14 +43,14 @@ class HealthBoard:
             except zenoh.ZError:
                 return
             try:
-                health = open_sample(sample, self._row).message
+                health = decode_sample(sample, self._row).message
             except DecodeError:  # another version's health cannot be shown; its node still runs
                 continue
             if self._all:
                 whose = str(sample.key_expr).split("/")[1]
                 health = health.model_copy(update={"node": f"{whose}/{health.node}"})
             with self._lock:
-                self._book.take(health)
+                self._book.add(health)
 
     def states(self) -> dict[str, str]:
         """Node -> state, "silent" where nothing was heard lately."""
@@ -82,7 +82,7 @@ class HealthBoard:
             table.add_column(heading, justify="right", no_wrap=True)
         table.add_column("to, age ms", overflow="fold")
         with self._lock:
-            for flow in self._book.flows():
+            for flow in self._book.traffic():
                 table.add_row(*_flow_row(flow))
         return table
 
@@ -112,17 +112,17 @@ def _node_row(name: str, record: NodeRecord, now: float) -> tuple[str, ...]:
     )
 
 
-def _flow_row(flow: Flow) -> tuple[str, ...]:
+def _flow_row(flow: TopicTraffic) -> tuple[str, ...]:
     nominal = f"{flow.nominal_hz:g}" if flow.nominal_hz else "event"
-    takers = "\n".join(map(_taker_text, flow.takers))
+    consumers = "\n".join(map(_consumer_text, flow.consumers))
     hz, kb_s = f"{flow.hz:.1f}/{nominal}", f"{flow.bytes_s / 1e3:.1f}"
-    return flow.topic, flow.producer, hz, kb_s, str(flow.sent), takers
+    return flow.topic, flow.producer, hz, kb_s, str(flow.sent), consumers
 
 
-def _taker_text(taker: Taker) -> str:
-    counts = ((taker.dropped, "yellow", "dropped"), (taker.lost, "red", "lost"))
+def _consumer_text(consumer: TopicConsumer) -> str:
+    counts = ((consumer.dropped, "yellow", "dropped"), (consumer.lost, "red", "lost"))
     losses = "".join(f", [{colour}]{number} {what}[/]" for number, colour, what in counts if number)
-    return f"{taker.node} {taker.age_ms:.1f}{losses}"
+    return f"{consumer.node} {consumer.age_ms:.1f}{losses}"
 
 
 def _count(number: int, colour: str) -> str:

@@ -181,7 +181,7 @@ class Supervisor:
         node = build_node(deployment, name, self.table)
         if not warm:
             return Successor(name, deployment)
-        if obstacle := node.obstacle(build_node(self.deployment, name, self.table)):
+        if obstacle := node.handover_obstacle(build_node(self.deployment, name, self.table)):
             raise UserError(
                 f"{name} cannot be taken over while it runs, {obstacle}: --cold ends it first, and starts it "
                 "anew with the new options"

@@ -10,10 +10,10 @@ from beamsplat.common.messages import CameraModel, Keyframe, KeyframeAck
 from beamsplat.common.messages.header import Header
 from beamsplat.common.runtime.live import Live, LiveSettings
 from beamsplat.common.runtime.lockstep import Lockstep
-from beamsplat.common.runtime.mailbox import NOBODY, Envelope, Mailbox
+from beamsplat.common.runtime.mailbox import NO_PRODUCER, Envelope, Mailbox
 from beamsplat.common.runtime.node import Input, Node, merged_topics
 from beamsplat.common.zenoh.bus import open_router
-from tests.common.nodes import Drive, DriveConfig
+from tests.common.nodes import SensorSource, SensorSourceConfig
 
 CAMERA = CameraModel(
     width_px=4, height_px=4, fx_px=4.0, fy_px=4.0, cx_px=2.0, cy_px=2.0, T_body_camera=np.eye(4)
@@ -63,7 +63,7 @@ class Answers(Node):
 
 
 def _drive(**change):
-    return Drive(DriveConfig(seconds=2.0, images=False, **change))
+    return SensorSource(SensorSourceConfig(seconds=2.0, images=False, **change))
 
 
 def test_in_lockstep_a_loop_of_two_nodes_ends():
@@ -139,5 +139,5 @@ def test_a_node_without_other_inputs_than_feedback_does_not_end_by_itself():
     mailbox = Mailbox(Asks)
     mailbox.end("keyframes/ack", "cd" * 8, 0)
     assert not mailbox.ended
-    mailbox.end("lidar/scan", NOBODY, 0)
+    mailbox.end("lidar/scan", NO_PRODUCER, 0)
     assert not mailbox.ended  # nobody feeds it at all: it waits, as every node does

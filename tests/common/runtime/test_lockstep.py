@@ -6,7 +6,7 @@ import pytest
 
 from beamsplat.common.messages.codec import encode
 from beamsplat.common.runtime.lockstep import Lockstep
-from tests.common.nodes import Chain, Drive, DriveConfig, Sink, Slow, SlowConfig
+from tests.common.nodes import Chain, SensorSource, SensorSourceConfig, Sink, Slow, SlowConfig
 
 
 def _run(*nodes):
@@ -21,9 +21,11 @@ def _run(*nodes):
 
 
 def test_the_same_input_gives_the_same_bytes():
-    runs = [_run(Drive(DriveConfig()), Chain(Chain.Config()), Sink(Sink.Config())) for _ in range(2)]
+    runs = [
+        _run(SensorSource(SensorSourceConfig()), Chain(Chain.Config()), Sink(Sink.Config())) for _ in range(2)
+    ]
     assert runs[0][0] == runs[1][0]
-    other = _run(Drive(DriveConfig(seed=1)), Chain(Chain.Config()), Sink(Sink.Config()))
+    other = _run(SensorSource(SensorSourceConfig(seed=1)), Chain(Chain.Config()), Sink(Sink.Config()))
     assert other[0] != runs[0][0]
     topics = [letter.topic for letter in runs[0][1]]
     assert topics.count("localization/odometry") == 30
@@ -34,7 +36,7 @@ def test_modelled_cost_drops_what_is_latest_and_always_the_same():
     runs = []
     for _ in range(2):
         slow, sink = Slow(SlowConfig(step_cost_s=0.2)), Sink(Sink.Config())
-        runs.append(_run(Drive(DriveConfig()), slow, sink))
+        runs.append(_run(SensorSource(SensorSourceConfig()), slow, sink))
     assert runs[0][0] == runs[1][0]
     count = runs[0][2]["localization"].counts["camera/image"]
     assert count.received + count.dropped == 90
@@ -44,7 +46,7 @@ def test_modelled_cost_drops_what_is_latest_and_always_the_same():
 
 def test_no_cost_drops_nothing():
     slow = Slow(SlowConfig())
-    _, letters, mailboxes = _run(Drive(DriveConfig()), slow, Sink(Sink.Config()))
+    _, letters, mailboxes = _run(SensorSource(SensorSourceConfig()), slow, Sink(Sink.Config()))
     assert mailboxes["localization"].counts["camera/image"].dropped == 0
     assert sum(letter.topic == "localization/grid" for letter in letters) == 90
 
@@ -61,7 +63,7 @@ def test_messages_reach_a_node_in_order_of_their_stamps():
             order.append(message.stamp_ns)
             yield from super().on_lidar_scan(message)
 
-    _run(Drive(DriveConfig()), Watcher(Watcher.Config()))
+    _run(SensorSource(SensorSourceConfig()), Watcher(Watcher.Config()))
     assert len(order) == 150 + 30
     assert order == sorted(order)
 
@@ -83,5 +85,5 @@ def test_all_nodes_are_closed_when_one_cannot_be_configured():
 
 
 def test_a_topic_nobody_produces_is_not_waited_for():
-    letters = _run(Drive(DriveConfig(scans=False)), Chain(Chain.Config()))[1]
+    letters = _run(SensorSource(SensorSourceConfig(scans=False)), Chain(Chain.Config()))[1]
     assert sum(letter.topic == "wheel/odometry" for letter in letters) == 150

@@ -5,7 +5,7 @@ import pytest
 
 from beamsplat.common.config.deployment import NodeConfig
 from beamsplat.common.messages import Correction, ExternalPose
-from beamsplat.common.runtime.node import Job, Node, UndeclaredTopic, merged_topics
+from beamsplat.common.runtime.node import Job, Node, UndeclaredOutput, merged_topics
 from beamsplat.common.topics import TOPICS
 from tests.common.nodes import Chain, Slow
 
@@ -16,7 +16,7 @@ def test_a_missing_handler_fails_at_definition():
 
 
 def test_an_unknown_topic_fails_at_definition():
-    with pytest.raises(KeyError, match="no topic called 'lidar/scans'"):
+    with pytest.raises(KeyError, match="there is no topic 'lidar/scans'"):
         type("Typo", (Node,), {"name": "localization", "outputs": ("lidar/scans",)})
 
 
@@ -52,7 +52,7 @@ def _node(handler):
 )
 def test_undeclared_outputs_raise(output, complaint):
     pose = ExternalPose(stamp_ns=0, T_map_body=np.eye(4))
-    with pytest.raises(UndeclaredTopic, match=complaint):
+    with pytest.raises(UndeclaredOutput, match=complaint):
         list(_node(output).handle("external/pose", pose))
 
 

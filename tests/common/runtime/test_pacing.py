@@ -6,8 +6,8 @@ import pytest
 from beamsplat.common.errors import UserError
 from beamsplat.common.messages import ExternalPose, Rig
 from beamsplat.common.runtime.live import Live, LiveSettings
-from beamsplat.common.runtime.node import Node, Sourced
-from beamsplat.common.runtime.pacing import Allowance
+from beamsplat.common.runtime.node import Node, SourceItem
+from beamsplat.common.runtime.pacing import TokenBucket
 from beamsplat.common.topics import TOPICS
 
 SECOND_NS = 1_000_000_000
@@ -20,10 +20,10 @@ class Player(Node):
     outputs = ("rig", "external/pose")
 
     def source(self):
-        yield Sourced(SECOND_NS, "rig", Rig(stamp_ns=SECOND_NS))
+        yield SourceItem(SECOND_NS, "rig", Rig(stamp_ns=SECOND_NS))
         for i in range(100):
             pose = ExternalPose(stamp_ns=i, T_map_body=np.eye(4))
-            yield Sourced(SECOND_NS + i * SECOND_NS // 10, "external/pose", pose)
+            yield SourceItem(SECOND_NS + i * SECOND_NS // 10, "external/pose", pose)
 
 
 class FakePublication:
@@ -84,7 +84,7 @@ def test_what_has_ended_is_not_played_again(play):
 
 def test_an_allowance_lets_a_burst_through_and_then_its_rate():
     now = [0.0]
-    allowance = Allowance(10.0, lambda: now[0])
+    allowance = TokenBucket(10.0, lambda: now[0])
     assert [allowance.take() for _ in range(25)].count(True) == 20
     now[0] = 1.05
     assert [allowance.take() for _ in range(25)].count(True) == 10

@@ -64,7 +64,7 @@ def fitted(world, mapped):
 
 def make(home=None, **options):
     node = LidarLocalization(LidarLocalization.Config(kind="lidar", **options))
-    node.home = home
+    node.live_settings = home
     node.configure()
     return node
 

@@ -20,7 +20,7 @@ from beamsplat.common.messages import (
 )  # fmt: skip
 from beamsplat.common.raster.camera import RasterCamera
 from beamsplat.common.raster.rasterizer import Rasterizer
-from beamsplat.common.runtime.node import Input, Node, Sourced
+from beamsplat.common.runtime.node import Input, Node, SourceItem
 from beamsplat.common.runtime.registry import Service
 from beamsplat.tools.bench.raster import synthetic_room
 
@@ -86,15 +86,15 @@ class RoomDrive(Node):
 
     def source(self):
         rig = Rig(stamp_ns=T0, camera=CAMERA_MODEL, lidar=LidarModel(T_body_lidar=np.eye(4)))
-        yield Sourced(T0, "rig", rig)
+        yield SourceItem(T0, "rig", rig)
         for i in range(self.config.pictures):
             stamp_ns = T0 + i * STEP
             rgb = shot(i)[0]
             encoding, data = ("rgb8", rgb.ravel()) if self.config.raw else ("png", jpeg(rgb))
             image = Image(stamp_ns=stamp_ns, width_px=WIDTH, height_px=HEIGHT, encoding=encoding, data=data)
-            yield Sourced(stamp_ns, "camera/image", image)
+            yield SourceItem(stamp_ns, "camera/image", image)
             if i % 4 == 3:
-                yield Sourced(stamp_ns + 1, "tick", Tick(stamp_ns=stamp_ns + 1, count=i // 4))
+                yield SourceItem(stamp_ns + 1, "tick", Tick(stamp_ns=stamp_ns + 1, count=i // 4))
 
 
 class LocalizerConfig(NodeConfig):

@@ -11,7 +11,7 @@ from beamsplat.common.config.deployment import Deployment, RouterConfig
 from beamsplat.common.mapfiles.session import SessionFolder
 from beamsplat.common.topics import topic
 from beamsplat.common.zenoh.bus import open_session
-from beamsplat.common.zenoh.streams import open_sample
+from beamsplat.common.zenoh.streams import decode_sample
 from beamsplat.tools.cli.main import app
 from beamsplat.tools.system.health_table import HealthBoard
 from beamsplat.tools.system.supervisor import Supervisor
@@ -104,7 +104,9 @@ def heard(session, name):
     """Ids on a topic, as they come."""
     ids = []
     row = topic(name)
-    session.declare_subscriber(f"beamsplat/test/{name}", lambda s: ids.append(open_sample(s, row).message.id))
+    session.declare_subscriber(
+        f"beamsplat/test/{name}", lambda s: ids.append(decode_sample(s, row).message.id)
+    )
     return ids
 
 
@@ -154,4 +156,4 @@ def test_a_killed_mapper_with_a_session_loses_no_keyframe(deployment, tmp_path):
         said = dict(words.split(" ", 1)[::-1] for words in detail(board, "keyframes").split(", "))
     folder = SessionFolder(tmp_path / "session")  # the path leaves the room: there nothing has a depth
     kept = int(said["keyframes"]) - int(said.get("refused", 0))
-    assert folder.manifest()["keyframes"] == len(folder.body_ids()) == kept > 8
+    assert folder.manifest()["keyframes"] == len(folder.keyframe_ids()) == kept > 8

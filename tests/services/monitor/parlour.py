@@ -10,7 +10,7 @@ from beamsplat.common.config.deployment import NodeConfig
 from beamsplat.common.geometry.transforms import se2_to_se3
 from beamsplat.common.messages import Correction, FusedDepth, Grid, Image, Odometry, Rig, Scan
 from beamsplat.common.messages.sensor_models import LidarModel
-from beamsplat.common.runtime.node import Node, Sourced
+from beamsplat.common.runtime.node import Node, SourceItem
 from beamsplat.common.runtime.registry import Service
 
 NASTY = "<img src=x onerror=\"document.title='taken over'\"> & <b>bold</b>"
@@ -26,7 +26,7 @@ class Sensors(Node):
     outputs = ("rig", "camera/image", "lidar/scan")
 
     def source(self):
-        yield Sourced(None, "rig", Rig(stamp_ns=1, lidar=LidarModel(T_body_lidar=np.eye(4)), source=NASTY))
+        yield SourceItem(None, "rig", Rig(stamp_ns=1, lidar=LidarModel(T_body_lidar=np.eye(4)), source=NASTY))
         started = time.monotonic()
         for i in range(100_000):
             while time.monotonic() < started + 0.1 * i:
@@ -35,13 +35,13 @@ class Sensors(Node):
             stamp_ns = time.time_ns()
             bgr = np.full((240, 320, 3), 50 + i % 150, np.uint8)
             jpeg = cv2.imencode(".jpg", bgr)[1].ravel()
-            yield Sourced(
+            yield SourceItem(
                 None, "camera/image",
                 Image(stamp_ns=stamp_ns, width_px=320, height_px=240, encoding="jpeg", data=jpeg),
             )  # fmt: skip
             angle = np.linspace(-np.pi, np.pi, 360, endpoint=False)
             ranges = WALL_M / np.maximum(np.abs(np.cos(angle)), np.abs(np.sin(angle)))
-            yield Sourced(
+            yield SourceItem(
                 None, "lidar/scan",
                 Scan(stamp_ns=stamp_ns, angle_min_rad=-np.pi, angle_increment_rad=2 * np.pi / 360,
                      time_increment_s=0.0, scan_time_s=0.1, range_min_m=0.1, range_max_m=12.0,

@@ -23,7 +23,7 @@ from beamsplat.common.messages import (
     WheelOdometry,
 )  # fmt: skip
 from beamsplat.common.runtime.lockstep import Lockstep
-from beamsplat.common.runtime.node import Node, Sourced
+from beamsplat.common.runtime.node import Node, SourceItem
 from beamsplat.common.topics import TOPICS
 from beamsplat.services.monitor.node import DEPTH, SCENE, MonitorConfig, MonitorNode
 
@@ -80,19 +80,19 @@ class Room(Node):
                              T_body_camera=T_BODY_CAMERA)  # fmt: skip
         rig = Rig(stamp_ns=0, camera=camera, lidar=LidarModel(T_body_lidar=T_BODY_LIDAR),
                   assumed=("camera height: assumed 0.45 m",))  # fmt: skip
-        yield Sourced(T0, "rig", rig)
+        yield SourceItem(T0, "rig", rig)
         T_wheel_map = inverse(_T_map_body(0.0))
         for i in range(150):
             t_s = 0.02 * i
             wheel = WheelOdometry(stamp_ns=_ns(t_s), T_odom_body=T_wheel_map @ _T_map_body(t_s),
                                   velocity_m_s=np.zeros(3), angular_velocity_rad_s=np.zeros(3))  # fmt: skip
-            yield Sourced(_ns(t_s), "wheel/odometry", wheel)
+            yield SourceItem(_ns(t_s), "wheel/odometry", wheel)
             if i % 5 == 0:
-                yield Sourced(_ns(t_s), "lidar/scan", _scan(t_s))
+                yield SourceItem(_ns(t_s), "lidar/scan", _scan(t_s))
                 pose = ExternalPose(stamp_ns=_ns(t_s), T_map_body=_T_map_body(t_s))
-                yield Sourced(_ns(t_s), "external/pose", pose)
+                yield SourceItem(_ns(t_s), "external/pose", pose)
             picture = Image(stamp_ns=_ns(t_s), width_px=64, height_px=48, encoding="jpeg", data=JPEG)
-            yield Sourced(_ns(t_s), "camera/image", picture)
+            yield SourceItem(_ns(t_s), "camera/image", picture)
 
 
 class Slam(Node):

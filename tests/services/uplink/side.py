@@ -21,7 +21,7 @@ from beamsplat.common.config.deployment import Deployment
 from beamsplat.common.messages.header import DecodeError, Header
 from beamsplat.common.topics import topic
 from beamsplat.common.zenoh.bus import key, open_session
-from beamsplat.common.zenoh.streams import declare_reader, open_sample
+from beamsplat.common.zenoh.streams import declare_subscription, decode_sample
 from beamsplat.tools.system.health_table import HealthBoard
 from beamsplat.tools.system.supervisor import Supervisor
 
@@ -51,12 +51,12 @@ class Log:
                     "instance": header.instance, "bytes": len(sample.payload),
                 }  # fmt: skip
                 if name == "keyframes/ack":
-                    line["status"] = open_sample(sample, row).message.status
+                    line["status"] = decode_sample(sample, row).message.status
                 if name == "mapping/poses":
-                    line["ids"] = open_sample(sample, row).message.keyframe_ids.tolist()
+                    line["ids"] = decode_sample(sample, row).message.keyframe_ids.tolist()
                 self._file.write(json.dumps(line) + "\n")
 
-        return declare_reader(session, key(robot, name), row, "every", take)
+        return declare_subscription(session, key(robot, name), row, "every", take)
 
     def flush(self) -> None:
         self._file.flush()

@@ -21,7 +21,7 @@ from beamsplat.tools.keys.pki import Authority
 from beamsplat.tools.system.assembly import faults, surroundings
 from beamsplat.tools.system.health_table import HealthBoard
 from beamsplat.tools.system.supervisor import Supervisor
-from tests.common.ears import Ears
+from tests.common.topic_listener import TopicListener
 from tests.conftest import free_port
 from tests.services.mapping.room_drive import TABLE
 from tests.services.uplink.link import Link
@@ -88,9 +88,12 @@ def test_a_cut_link_loses_no_keyframe_and_does_not_reach_the_robot(tmp_path):
     pair = Pair(tmp_path, pictures=80)
     with running(pair) as ((robot, near, near_board), (edge, far, far_board)):
         both = (robot, edge)
-        sent, poses = Ears(near, "keyframes/frame"), Ears(near, "localization/odometry")
-        far_poses, anchors = Ears(far, "localization/odometry"), Ears(far, "localization/anchors")
-        mapped, refined = Ears(far, "keyframes/ack"), Ears(far, "mapping/poses")
+        sent, poses = TopicListener(near, "keyframes/frame"), TopicListener(near, "localization/odometry")
+        far_poses, anchors = (
+            TopicListener(far, "localization/odometry"),
+            TopicListener(far, "localization/anchors"),
+        )
+        mapped, refined = TopicListener(far, "keyframes/ack"), TopicListener(far, "mapping/poses")
         poll(both, lambda: len(mapped.messages) >= 2, 90)
         pair.link.cut = True
         poses_before, sent_before = len(poses.messages), len(set(sent.ids()))
@@ -131,7 +134,7 @@ def test_the_robot_starts_without_an_edge_and_an_edge_that_is_killed_goes_on_fro
         open_session(pair.robot.router.listen) as near,
     ):
         board = HealthBoard(near, "r1")
-        sent, answered = Ears(near, "keyframes/frame"), Ears(near, "keyframes/ack")
+        sent, answered = TopicListener(near, "keyframes/frame"), TopicListener(near, "keyframes/ack")
         poll((robot,), lambda: len(set(sent.ids())) >= 4, 60)
         assert "no link" in detail(board, "uplink")
         pair.link.cut = False
@@ -143,7 +146,7 @@ def test_the_robot_starts_without_an_edge_and_an_edge_that_is_killed_goes_on_fro
             poll((robot, edge), lambda: edge.children["mapping"].restarts == 1, 10)
             poll((robot, edge), lambda: edge.children["router"].restarts == 1, 10)
             with open_session(pair.edge.router.listen) as far:
-                refined = Ears(far, "mapping/poses")
+                refined = TopicListener(far, "mapping/poses")
                 poll((robot, edge), lambda: board.states().get("keyframes") == "drained", 120)
                 assert set(answered.ids()) == set(sent.ids())
                 poll((robot, edge), lambda: refined.messages, 60)
@@ -164,7 +167,7 @@ def test_behind_locked_doors_everything_flows_until_the_robot_is_removed(tmp_pat
     pair = Pair(tmp_path, pictures=120, scheme="tls", **secured)
     with running(pair) as ((robot_side, _near, _near_board), (edge, far, far_board)):
         both = (robot_side, edge)
-        mapped, poses = Ears(far, "keyframes/ack"), Ears(far, "localization/odometry")
+        mapped, poses = TopicListener(far, "keyframes/ack"), TopicListener(far, "localization/odometry")
         poll(both, lambda: len(mapped.messages) >= 3 and poses.messages, 90)
         assert "localization" in far_board.records
         authority.remove("r1")
@@ -184,7 +187,7 @@ def test_only_what_the_table_marks_crosses(tmp_path):
     with running(pair) as ((robot, near, near_board), (edge, far, _)):
         everything = set()
         far.declare_subscriber("beamsplat/**", lambda s: everything.add(str(s.key_expr).split("/", 2)[2]))
-        local = Ears(near, "camera/image")
+        local = TopicListener(near, "camera/image")
         poll((robot, edge), lambda: near_board.states().get("uplink") == "drained", 90)
         assert len(local.messages) >= 10
     topics = {name for name in everything if name in TOPICS}
@@ -197,10 +200,17 @@ def test_a_deployment_is_told_what_comes_from_the_other_side(tmp_path):
     pair = Pair(tmp_path, pictures=1)
     assert faults(pair.robot, TABLE) == faults(pair.edge, TABLE) == []
     classes = {name: TABLE[name].load("default") for name in ("mapping", "keyframes")}
-    assert "keyframes/frame" not in surroundings({"mapping": classes["mapping"]}, "mapping", "edge").unfed
-    assert "keyframes/frame" in surroundings({"mapping": classes["mapping"]}, "mapping", "whole").unfed
     assert (
-        "keyframes/ack" not in surroundings({"keyframes": classes["keyframes"]}, "keyframes", "robot").unfed
+        "keyframes/frame"
+        not in surroundings({"mapping": classes["mapping"]}, "mapping", "edge").without_producer
+    )
+    assert (
+        "keyframes/frame"
+        in surroundings({"mapping": classes["mapping"]}, "mapping", "whole").without_producer
+    )
+    assert (
+        "keyframes/ack"
+        not in surroundings({"keyframes": classes["keyframes"]}, "keyframes", "robot").without_producer
     )
     lonely = pair.robot.model_copy(update={"nodes": {"localization": {"kind": "known"}}})
     assert any("without node uplink" in f.text for f in faults(lonely, TABLE))

@@ -21,11 +21,11 @@ from beamsplat.common.security.keys import (
     is_loopback,
 )
 from beamsplat.common.topics import TOPICS, topic
-from beamsplat.common.zenoh.bridge import Relay, Sides
+from beamsplat.common.zenoh.bridge import Bridge, BridgeSessions
 from beamsplat.common.zenoh.bus import Bus, open_link, open_router, open_session
-from beamsplat.common.zenoh.streams import declare_reader, open_sample
+from beamsplat.common.zenoh.streams import declare_subscription, decode_sample
 from beamsplat.tools.keys.pki import Authority, expiry, openssl
-from tests.common.polling import say_until_heard
+from tests.common.polling import publish_until_received
 from tests.common.samples import sample_messages
 from tests.conftest import free_port
 
@@ -240,18 +240,18 @@ def test_every_topic_crosses_a_guarded_door_with_what_was_said_before(authority,
         here, there = (local, near) if row.uplink == "down" else (near, local)
         publication = Bus(here, "r1", row.producers[0], "ab" * 8, 1).publish(name)
         publication.put(message)
-        sides = Sides(stack.enter_context(open_session((free_endpoint,))), link(authority, edge, "r1"),
+        sessions = BridgeSessions(stack.enter_context(open_session((free_endpoint,))), link(authority, edge, "r1"),
                       link(authority, edge, "r1"))  # fmt: skip
-        stack.enter_context(sides.small)
-        stack.enter_context(sides.large)
-        relay = Relay("r1", sides)
+        stack.enter_context(sessions.edge)
+        stack.enter_context(sessions.edge_bulk)
+        bridge = Bridge("r1", sessions)
         heard = []
-        take = lambda s: heard.append(open_sample(s, row).message)  # noqa: E731
-        kept = [declare_reader(there, f"beamsplat/r1/{name}", row, "every", take)]
+        take = lambda s: heard.append(decode_sample(s, row).message)  # noqa: E731
+        kept = [declare_subscription(there, f"beamsplat/r1/{name}", row, "every", take)]
         if row.delivery == "latched":
             wait(lambda: len(heard) == 1)  # said before anybody listened
-        say_until_heard(publication, message, heard)
-        assert relay.carried[name].messages >= len(heard)
+        publish_until_received(publication, message, heard)
+        assert bridge.forwarded[name].messages >= len(heard)
         assert kept
 
 

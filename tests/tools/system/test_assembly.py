@@ -45,7 +45,7 @@ def test_a_source_waits_for_all_who_listen():
     deployment = Deployment(nodes=nodes)
     classes = node_classes(deployment, TABLE)
     assert surroundings(classes, "replay").wait_for == {"localization", "recorder"}
-    assert surroundings(classes, "recorder").unfed == {"localization/grid"}
+    assert surroundings(classes, "recorder").without_producer == {"localization/grid"}
     assert surroundings(classes, "localization").wait_for == set()
 
 

@@ -17,7 +17,7 @@ from beamsplat.common.security.access_control import Host
 from beamsplat.common.security.keys import SecurityConfig
 from beamsplat.common.topics import topic
 from beamsplat.common.zenoh.bus import open_session
-from beamsplat.common.zenoh.streams import open_sample
+from beamsplat.common.zenoh.streams import decode_sample
 from beamsplat.services.nodes import NODES
 from beamsplat.tools.keys.pki import Authority
 from beamsplat.tools.system.health_table import HealthBoard
@@ -35,11 +35,11 @@ class Latency:
         session.declare_subscriber("beamsplat/r1/localization/odometry", self._take_pose)
 
     def _take_scan(self, sample):
-        header = open_sample(sample, topic("lidar/scan")).header
+        header = decode_sample(sample, topic("lidar/scan")).header
         self._scans[header.stamp_ns] = header.publish_ns
 
     def _take_pose(self, sample):
-        header = open_sample(sample, topic("localization/odometry")).header
+        header = decode_sample(sample, topic("localization/odometry")).header
         if header.stamp_ns in self._scans:
             self.rows.append((header.publish_ns, (header.publish_ns - self._scans[header.stamp_ns]) / 1e6))
 
@@ -128,4 +128,4 @@ def test_a_flood_of_garbage_by_a_robots_own_certificate_is_counted_and_contained
     assert bad(board, "mapping") > 0.1 * sent / 4
     assert all(c.restarts == 0 for s in supervisors for c in s.children.values())
     assert board.states()["mapping"] == "active"
-    assert "healths too many" in board.records["uplink"].health.detail
+    assert "health reports too many" in board.records["uplink"].health.detail

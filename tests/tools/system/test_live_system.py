@@ -17,7 +17,7 @@ from beamsplat.common.zenoh.queries import ask
 from beamsplat.tools.system.assembly import node_classes, surroundings
 from beamsplat.tools.system.health_table import HealthBoard
 from beamsplat.tools.system.supervisor import Supervisor
-from tests.common.nodes import TABLE, Chain, Drive, DriveConfig, Sink
+from tests.common.nodes import TABLE, Chain, SensorSource, SensorSourceConfig, Sink
 from tests.common.polling import poll
 
 
@@ -46,7 +46,7 @@ class SinkThread:
             endpoints=deployment.router.listen,
             run_dir=deployment.run_dir,
             exit_when_drained=True,
-            unfed=surroundings(classes, "recorder").unfed,
+            without_producer=surroundings(classes, "recorder").without_producer,
         )
         self.node = Sink(Sink.Config())
         self.live = Live(self.node, settings)
@@ -73,7 +73,7 @@ def test_live_equals_lockstep_message_for_message(deployment, rate):
     """The order in which packets arrive over the bus must not show in what a node says."""
     drive = {"seconds": 6.0, "image_bytes": 20_000}
     sink = Sink(Sink.Config())
-    Lockstep([Drive(DriveConfig(**drive)), Chain(Chain.Config()), sink]).run()
+    Lockstep([SensorSource(SensorSourceConfig(**drive)), Chain(Chain.Config()), sink]).run()
     nodes = {"replay": {"kind": "drive", **drive}, "localization": {"kind": "chain"}, "recorder": {}}
     live = deployment(nodes, rate=rate)
     with Supervisor(live, ("router", "localization"), table=TABLE), SinkThread(live) as thread:

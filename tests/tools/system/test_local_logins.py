@@ -16,13 +16,13 @@ from beamsplat.common.security.logins import OPERATOR, SUPERVISOR, USERS, Login,
 from beamsplat.common.topics import TOPICS, topic
 from beamsplat.common.zenoh.bus import Bus, open_router, open_session
 from beamsplat.common.zenoh.queries import ask
-from beamsplat.common.zenoh.streams import declare_reader, open_sample
+from beamsplat.common.zenoh.streams import declare_subscription, decode_sample
 from beamsplat.services.nodes import NODES
 from beamsplat.tools.system.health_table import HealthBoard
 from beamsplat.tools.system.supervisor import Supervisor
-from tests.common.ears import Ears
-from tests.common.polling import poll, say_until_heard
+from tests.common.polling import poll, publish_until_received
 from tests.common.samples import sample_messages
+from tests.common.topic_listener import TopicListener
 from tests.conftest import free_port
 from tests.services.mapping.room_drive import TABLE
 from tests.tools.keys.test_security import hear, wait
@@ -96,11 +96,11 @@ def test_every_topic_reaches_a_monitor_with_what_was_said_before(guarded, name):
         publication = Bus(producer, "r1", row.producers[-1], "ab" * 8, 1).publish(name)
         publication.put(message)
         heard = []
-        take = lambda s: heard.append(open_sample(s, row).message)  # noqa: E731
-        kept = declare_reader(monitor, f"beamsplat/r1/{name}", row, "every", take)
+        take = lambda s: heard.append(decode_sample(s, row).message)  # noqa: E731
+        kept = declare_subscription(monitor, f"beamsplat/r1/{name}", row, "every", take)
         if row.delivery == "latched":
             wait(lambda: len(heard) == 1)  # said before anybody listened
-        say_until_heard(publication, message, heard)
+        publish_until_received(publication, message, heard)
         assert kept
 
 
@@ -123,7 +123,7 @@ def test_the_whole_system_runs_under_the_policy_and_top_shows_it(tmp_path, free_
     with Supervisor(live, table=TABLE) as supervisor:
         with open_session((free_endpoint,), login=login_of(security, SUPERVISOR)) as session:
             board = HealthBoard(session, "r1")
-            poses = Ears(session, POSE)
+            poses = TopicListener(session, POSE)
             wait_for = lambda: board.states().get("mapping") == "drained"  # noqa: E731
             poll(supervisor, wait_for, 120)
             assert set(board.records) == set(live.nodes)

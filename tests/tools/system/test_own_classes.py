@@ -103,7 +103,7 @@ def test_a_class_that_cannot_be_the_node_is_refused_in_one_sentence(module, name
 def test_a_depth_source_of_ones_own_is_made_with_its_options(module):
     assert make_source(f"{module}:MySource", {"depth_m": 3.0}).depth_m == 3.0
     node = build_node(Deployment(nodes={"depth": {"source": f"{module}:MySource"}}), "depth")
-    node.examine()
+    node.check_resources()
     node.configure()
     assert node._needs_beams
     with pytest.raises(UserError, match="depth_m = 'far'"):

@@ -20,7 +20,7 @@ from beamsplat.common.security.access_control import Host
 from beamsplat.common.security.keys import SecurityConfig
 from beamsplat.common.topics import LIMIT_KB, TOPICS, topic
 from beamsplat.common.zenoh.bus import Bus, open_link, open_router, open_session
-from beamsplat.common.zenoh.streams import open_sample
+from beamsplat.common.zenoh.streams import decode_sample
 from beamsplat.tools.keys.pki import Authority
 from tests.common.nodes import Sink
 from tests.conftest import free_port
@@ -167,7 +167,7 @@ def test_a_message_of_200_mb_stays_outside_and_does_not_fill_the_routers_memory(
         subprocess.run([*command, "20"], check=True, timeout=120)  # what may be so large for some topic
         wait(lambda: [len(s.payload) for s in heard] == [20_000_000])
         with pytest.raises(DecodeError, match="without a header"):
-            open_sample(heard[0], topic("keyframes/frame"))
+            decode_sample(heard[0], topic("keyframes/frame"))
         ear.undeclare()
 
 

@@ -26,7 +26,7 @@ _SERVE = """
     import numpy as np
     from beamsplat.common.runtime.live import Live, LiveSettings
     from beamsplat.common.messages import Odometry
-    from beamsplat.common.runtime.node import Job, Node, Sourced
+    from beamsplat.common.runtime.node import Job, Node, SourceItem
 
     class Worker(Node):
         name = "localization"

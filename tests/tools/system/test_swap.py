@@ -16,7 +16,7 @@ from beamsplat.common.errors import UserError
 from beamsplat.common.messages import Grid, Odometry
 from beamsplat.common.messages.header import Header
 from beamsplat.common.runtime.handover import Handover
-from beamsplat.common.runtime.mailbox import NOBODY, Envelope, Mailbox
+from beamsplat.common.runtime.mailbox import NO_PRODUCER, Envelope, Mailbox
 from beamsplat.common.runtime.node import Node
 from beamsplat.common.runtime.registry import Service
 from beamsplat.common.zenoh.bus import open_session
@@ -24,8 +24,8 @@ from beamsplat.common.zenoh.queries import ask, command
 from beamsplat.tools.system.commands import Commands
 from beamsplat.tools.system.health_table import HealthBoard
 from beamsplat.tools.system.supervisor import Supervisor
-from tests.common.ears import Ears
 from tests.common.nodes import TABLE, Sink, SlowConfig
+from tests.common.topic_listener import TopicListener
 
 
 class Swift(Node):
@@ -117,7 +117,7 @@ def system(tmp_path, free_endpoint):
 
 @pytest.mark.slow
 def test_swaps_under_load_say_nothing_twice_and_lose_nothing(system):
-    ears = Ears(system.session, "localization/odometry")
+    ears = TopicListener(system.session, "localization/odometry")
     system.wait(lambda: len(ears.messages) > 20)
     instances = {system.supervisor.children["localization"].instance}
     for number in range(4):
@@ -136,7 +136,7 @@ def test_swaps_under_load_say_nothing_twice_and_lose_nothing(system):
 
 @pytest.mark.slow
 def test_a_successor_that_cannot_run_changes_nothing(system):
-    ears = Ears(system.session, "localization/odometry")
+    ears = TopicListener(system.session, "localization/odometry")
     system.wait(lambda: len(ears.messages) > 5)
     before = system.supervisor.children["localization"].instance
     with pytest.raises(UserError, match="more than a second"):
@@ -160,7 +160,7 @@ def test_a_successor_that_cannot_run_changes_nothing(system):
 
 @pytest.mark.slow
 def test_after_a_swap_a_crash_brings_back_the_new_options_and_a_cold_swap_starts_anew(system):
-    ears = Ears(system.session, "localization/odometry")
+    ears = TopicListener(system.session, "localization/odometry")
     system.wait(lambda: len(ears.messages) > 5)
     system.swap("localization", "sleep_s=0.02")
     os.kill(system.supervisor.children["localization"].process.pid, signal.SIGKILL)
@@ -174,7 +174,7 @@ def test_after_a_swap_a_crash_brings_back_the_new_options_and_a_cold_swap_starts
 
 
 def test_a_restart_by_request_still_works(system):
-    ears = Ears(system.session, "localization/odometry")
+    ears = TopicListener(system.session, "localization/odometry")
     system.wait(lambda: len(ears.messages) > 5)
     assert "starts again" in system.ask("localization", "restart")
     system.wait(lambda: system.supervisor.children["localization"].restarts == 1)
@@ -235,7 +235,7 @@ def test_who_hands_over_what_it_knows_tells_what_it_has_handled():
     for sequence in (0, 1, 2, 5):
         mailbox.put(envelope(sequence))
     for name in ("localization/correction", "localization/grid"):
-        mailbox.end(name, NOBODY, 0)
+        mailbox.end(name, NO_PRODUCER, 0)
     assert mailbox.pop().header.sequence == 0
     old, new = Handover(standby=False), Handover(standby=True)
     list(new.activate(old.retire(mailbox.handled())))

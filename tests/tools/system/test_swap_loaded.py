@@ -12,16 +12,16 @@ import pytest
 from beamsplat.common.errors import UserError
 from beamsplat.common.messages import Health
 from beamsplat.common.topics import HEALTH, Topic, topic
-from beamsplat.common.zenoh.streams import declare_reader, open_sample
+from beamsplat.common.zenoh.streams import declare_subscription, decode_sample
 from beamsplat.services.nodes import NODES
-from tests.common.ears import Ears
+from tests.common.topic_listener import TopicListener
 from tests.services.mapping.room_drive import TABLE
 from tests.tools.system.test_swap import System
 
 SWAPS = 20
 
 
-class TimedEars(Ears):
+class TimedTopicListener(TopicListener):
     """Also when each message came, and of which epoch it was."""
 
     def __init__(self, session, name):
@@ -29,12 +29,12 @@ class TimedEars(Ears):
         self.messages, self.came_s, self.epochs = [], [], []
 
         def take(sample):
-            letter = open_sample(sample, row)
+            letter = decode_sample(sample, row)
             self.messages.append(letter.message)
             self.came_s.append(time.monotonic())
             self.epochs.append(letter.header.epoch)
 
-        self._kept = declare_reader(session, f"beamsplat/r1/{name}", row, "every", take)
+        self._kept = declare_subscription(session, f"beamsplat/r1/{name}", row, "every", take)
 
     def gaps_s(self):
         """Between each epoch's last message and the next one's first."""
@@ -59,7 +59,7 @@ class Healths:
         system.session.declare_subscriber(f"beamsplat/r1/health/{node}", self._take)
 
     def _take(self, sample):
-        health = open_sample(sample, Topic(HEALTH, Health, (), 1, "latest")).message
+        health = decode_sample(sample, Topic(HEALTH, Health, (), 1, "latest")).message
         self._latest[health.instance] = health
 
     def overtaken(self):
@@ -77,7 +77,10 @@ def test_the_depth_service_is_taken_over_twenty_times(tmp_path, free_endpoint, s
         "depth": {"source": "stixel"},
     }
     with System(tmp_path, free_endpoint, nodes, table=NODES) as system:
-        ears, pictures = TimedEars(system.session, "depth/estimate"), Ears(system.session, "camera/image")
+        ears, pictures = (
+            TimedTopicListener(system.session, "depth/estimate"),
+            TopicListener(system.session, "camera/image"),
+        )
         healths = Healths(system, "depth")
         system.wait(lambda: len(ears.messages) > 20, 120)
         sentences = []
@@ -105,8 +108,14 @@ def test_the_mapper_is_taken_over_twenty_times_and_its_session_goes_along(tmp_pa
         "mapping": {"session": str(tmp_path / "session"), "half_steps": 4, "full_steps": 3, "tick_steps": 2},
     }
     with System(tmp_path / "state", free_endpoint, nodes, table=TABLE) as system:
-        sent, status = Ears(system.session, "keyframes/frame"), TimedEars(system.session, "mapping/status")
-        acks, previews = Ears(system.session, "keyframes/ack"), Ears(system.session, "mapping/preview")
+        sent, status = (
+            TopicListener(system.session, "keyframes/frame"),
+            TimedTopicListener(system.session, "mapping/status"),
+        )
+        acks, previews = (
+            TopicListener(system.session, "keyframes/ack"),
+            TopicListener(system.session, "mapping/preview"),
+        )
         system.wait(lambda: len(status.messages) > 3, 120)
         sentences = []
         for number in range(SWAPS):

@@ -6,7 +6,7 @@ import pytest
 
 from beamsplat.common.messages import CameraModel, DepthEstimate, Image, Rig
 from beamsplat.common.runtime.lockstep import Lockstep
-from beamsplat.common.runtime.node import Node, Sourced
+from beamsplat.common.runtime.node import Node, SourceItem
 from beamsplat.services.localization.camera.node import CameraLocalization, CameraLocalizationConfig
 from tests.services.localization.camera.box import T_BODY_CAMERA, drive, pose_error, render_view
 
@@ -24,12 +24,12 @@ class ImageSource(Node):
             width_px=160, height_px=120, fx_px=140.0, fy_px=140.0, cx_px=79.5, cy_px=59.5,
             T_body_camera=T_BODY_CAMERA,
         )  # fmt: skip
-        yield Sourced(0, "rig", Rig(stamp_ns=0, camera=model))
+        yield SourceItem(0, "rig", Rig(stamp_ns=0, camera=model))
         for i, T in enumerate(PATH):
             data = cv2.imencode(".png", cv2.cvtColor(render_view(T)[0], cv2.COLOR_RGB2BGR))[1].ravel()
             data = data[:50] if i == 5 else data  # a truncated image
             stamp_ns = (i + 1) * 100_000_000
-            yield Sourced(
+            yield SourceItem(
                 stamp_ns, "camera/image",
                 Image(stamp_ns=stamp_ns, width_px=160, height_px=120, encoding="png", data=data),
             )  # fmt: skip

@@ -1,10 +1,10 @@
 """What a session of a test hears of a topic."""
 
 from beamsplat.common.topics import topic
-from beamsplat.common.zenoh.streams import declare_reader, open_sample
+from beamsplat.common.zenoh.streams import declare_subscription, decode_sample
 
 
-class Ears:
+class TopicListener:
     """What a session hears of a topic, in order."""
 
     def __init__(self, session, name):
@@ -13,9 +13,9 @@ class Ears:
 
         def take(sample):
             self.schemas.add(str(sample.encoding))
-            self.messages.append(open_sample(sample, row).message)
+            self.messages.append(decode_sample(sample, row).message)
 
-        self._kept = declare_reader(session, f"beamsplat/r1/{name}", row, "every", take)
+        self._kept = declare_subscription(session, f"beamsplat/r1/{name}", row, "every", take)
 
     def ids(self):
         return [m.id for m in self.messages]
