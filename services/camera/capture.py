@@ -1,4 +1,4 @@
-"""Cameras and files through OpenCV: V4L2 devices, RTSP and other streams, videos."""
+"""Read cameras, network streams and video files with OpenCV (V4L2 devices, RTSP and other streams, files)."""
 
 from __future__ import annotations
 
@@ -12,20 +12,29 @@ import numpy as np
 
 from beamsplat.services.camera.frame import CameraEnded, CameraError, CapturedFrame
 
-_TIMEOUT_MS = 3000
-_KERNEL_AGE_S = 2.0  # a kernel's time stamp older than that is none
+_TIMEOUT_MS = 3000  # for opening a stream, and for each read
+_KERNEL_AGE_S = 2.0  # an older (or negative) kernel time stamp is not on the monotonic clock and is ignored
 
 
 class CaptureSource:
-    """One open VideoCapture. JPEG bytes are taken undecoded where the device or file has them."""
+    """An open `cv2.VideoCapture`.
+
+    JPEG bytes are passed on without decoding where the device or file has them.
+    """
 
     def __init__(
         self, source: str, now_ns: Callable[[], int], size_px: tuple[int, int] | None, rate_hz: float
     ) -> None:
-        """Opens it.
+        """Open the source.
+
+        Args:
+            source: V4L2 number or path, stream address, or path of a video file.
+            now_ns: the clock of the time stamps, ns.
+            size_px: width and height to request from a V4L2 device; None keeps the device's own.
+            rate_hz: frame rate to request from a V4L2 device; 0 keeps the device's own.
 
         Raises:
-            CameraError: not there, no permission, or nothing that OpenCV reads.
+            CameraError: the source does not exist, may not be opened, or OpenCV cannot read it.
         """
         self._now_ns = now_ns
         self._device = _device_number(source)
@@ -47,24 +56,27 @@ class CaptureSource:
             self._capture = cv2.VideoCapture(source, cv2.CAP_FFMPEG, options)
         if not self._capture.isOpened():
             self._capture.release()
-            raise CameraError(f"{self.where} cannot be opened: in use by another program, or no camera")
+            raise CameraError(
+                f"{self.where} cannot be opened: another program uses it, or it is not a camera"
+            )
         if self._device is None and _fourcc(self._capture) == "MJPG":
-            self._capture.set(cv2.CAP_PROP_FORMAT, -1)  # packets as they are, undecoded
+            self._capture.set(cv2.CAP_PROP_FORMAT, -1)  # return the packets without decoding
         self._fps = self._capture.get(cv2.CAP_PROP_FPS)
         self._due = time.monotonic()
 
     def read(self) -> CapturedFrame:
-        """The next picture; a file's at the speed it was taken.
+        """Return the next frame; frames of a file are returned at the file's own frame rate.
 
         Raises:
-            CameraError: no more come.
+            CameraEnded: the end of a file.
+            CameraError: the device or stream delivers no more frames.
         """
         good, data = self._capture.read()
         stamp_ns = self._stamp_ns()
         if not good or data is None or not data.size:
             if self._file:
-                raise CameraEnded(f"{self.where} is at its end")
-            raise CameraError(f"{self.where} delivers no more pictures")
+                raise CameraEnded(f"{self.where}: end of file")
+            raise CameraError(f"{self.where} delivers no more images")
         if self._file and 0.0 < self._fps <= 1000.0:
             self._due += 1.0 / self._fps
             time.sleep(max(0.0, self._due - time.monotonic()))
@@ -74,11 +86,15 @@ class CaptureSource:
         return CapturedFrame(stamp_ns, None, np.ascontiguousarray(data))
 
     def close(self) -> None:
-        """Lets go of the device."""
+        """Release the device."""
         self._capture.release()
 
     def _set(self, size_px: tuple[int, int] | None, rate_hz: float) -> None:
-        """Asks for JPEG first: it is what USB has room for; what the device refuses stays as it was."""
+        """Request JPEG, size and rate.
+
+        JPEG is requested first because raw images at full rate exceed the bandwidth of USB. A setting
+        that the device rejects keeps its previous value.
+        """
         self._capture.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter_fourcc(*"MJPG"))
         if size_px is not None:
             self._capture.set(cv2.CAP_PROP_FRAME_WIDTH, size_px[0])
@@ -90,7 +106,9 @@ class CaptureSource:
             self._capture.set(cv2.CAP_PROP_CONVERT_RGB, 0)
 
     def _stamp_ns(self) -> int:
-        """When the picture came: V4L2 tells it on the kernel's monotonic clock, else it is now."""
+        """Return the capture time, ns: V4L2's time stamp on the kernel's monotonic clock, or else the time
+        now.
+        """
         now_ns = self._now_ns()
         if self._device is None:
             return now_ns
@@ -99,7 +117,9 @@ class CaptureSource:
 
 
 def _device_number(source: str) -> int | None:
-    """Number of a V4L2 device given as "0", "/dev/video0" or a link to it; None for anything else."""
+    """Return the number of a V4L2 device given as "0", "/dev/video0" or a link to it; None for other
+    sources.
+    """
     if source.isdigit():
         return int(source)
     if source.startswith("/dev/"):
@@ -115,8 +135,8 @@ def _check_device(path: Path) -> None:
         raise CameraError(f"{path}: no such camera")
     if not os.access(path, os.R_OK | os.W_OK):
         raise CameraError(
-            f"{path} may not be opened by this user: `sudo usermod -aG video $USER`, then log in anew "
-            "(`beamsplat doctor` explains)"
+            f"this user has no permission to open {path}: run `sudo usermod -aG video $USER`, then log in "
+            "again (`beamsplat doctor` explains)"
         )
 
 

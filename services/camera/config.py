@@ -11,19 +11,19 @@ from beamsplat.common.config.deployment import NodeConfig, Seconds
 
 
 class NoCameraConfig(NodeConfig):
-    """A robot without a camera still has a calibration: where its lidar sits."""
+    """Options of a robot without a camera: its rig file still holds the pose of the lidar."""
 
     rig: Path
 
 
 class CameraConfig(NodeConfig):
-    """One camera, as OpenCV or plain HTTP reaches it."""
+    """Options of one camera that OpenCV or plain HTTP can read."""
 
     source: str = "0"  # number or path of a V4L2 device, rtsp:// or http:// address, video file
-    rig: Path | None = None  # calibration; pictures of another size than its K are refused
-    width_px: Annotated[int, Field(ge=0, le=16384)] = 0  # 0: as the rig says, else as the camera comes
+    rig: Path | None = None  # calibration; images of another size than its K are rejected
+    width_px: Annotated[int, Field(ge=0, le=16384)] = 0  # 0: size of the rig, else the camera's own
     height_px: Annotated[int, Field(ge=0, le=16384)] = 0
-    rate_hz: Annotated[float, Field(ge=0.0, le=1000.0)] = 0.0  # asked for; 0: as the camera comes
-    jpeg_quality: Annotated[int, Field(ge=1, le=100)] = 92  # where the source gives no JPEG of its own
-    delay_s: Seconds = 0.0  # from exposure to arrival, where nobody but a measurement can tell
-    silence_s: Annotated[float, Field(gt=0.0, le=60.0)] = 2.0  # without a picture so long, it counts as gone
+    rate_hz: Annotated[float, Field(ge=0.0, le=1000.0)] = 0.0  # requested; 0: the camera's own
+    jpeg_quality: Annotated[int, Field(ge=1, le=100)] = 92  # used where the source delivers no JPEG
+    delay_s: Seconds = 0.0  # from exposure to arrival, as measured; subtracted from the time stamps
+    silence_s: Annotated[float, Field(gt=0.0, le=60.0)] = 2.0  # without an image for so long: reconnect

@@ -1,4 +1,4 @@
-"""One picture on its way from a camera."""
+"""A frame as a camera source delivers it, and the errors of sources."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ import numpy as np
 
 
 class CameraError(OSError):
-    """The camera is not there, or no longer; the text says what is known."""
+    """The camera cannot be opened or no longer delivers; the text says why."""
 
 
 class CameraEnded(CameraError):
-    """A file has been shown to its end."""
+    """The end of a video file."""
 
 
 @dataclass(frozen=True)
 class CapturedFrame:
-    """What a source delivered."""
+    """One frame of a source: either JPEG bytes or pixels."""
 
-    stamp_ns: int
-    jpeg: bytes | None  # as the camera gave it
-    bgr: np.ndarray | None  # uint8 [H, W, 3], where it gave no JPEG
+    stamp_ns: int  # capture time on the sensors' clock
+    jpeg: bytes | None  # unchanged from the camera
+    bgr: np.ndarray | None  # uint8 [H, W, 3], if the camera delivers no JPEG

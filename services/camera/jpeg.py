@@ -1,9 +1,9 @@
-"""Whether a JPEG came through whole: its segments, and for baseline ones every Huffman code of every block.
+"""Check that a JPEG is complete: its segments, and for baseline JPEGs every Huffman code of every block.
 
-A decoder paints something over any damage and says nothing. Here a scan must hold all its blocks and end
-where its end mark stands (ITU-T T.81, annexes C and F.2). That finds what is cut off, longer losses and
-scattered wrong bytes; of single wrong bytes it finds the lesser part, since Huffman codes fall into step
-again by themselves and JPEG has no checksum (figures in docs/sensors.md, from the test).
+A decoder fills damaged areas without an error. Here a scan must hold all its blocks and end at its end
+marker (ITU-T T.81, annexes C and F.2). This detects truncation, longer losses and scattered wrong bytes.
+Of single wrong bytes it detects the smaller part, because Huffman decoding resynchronizes by itself and
+JPEG has no checksum (detection rates in docs/sensors.md, measured by the test).
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ _STAND_ALONE = frozenset([0x01, *range(0xD0, 0xD8)])
 
 
 def is_intact(data: bytes) -> bool:
-    """Whether nothing wrong can be found in a JPEG."""
+    """Return whether no damage is found in a JPEG."""
     if not data.startswith(b"\xff\xd8") or not is_whole(data):
         return False
     try:
         scan = _parse_segments(data)
     except (struct.error, IndexError, ValueError, KeyError):
         return False
-    if scan is None:  # progressive, or without tables of its own: its structure was all there is to check
+    if scan is None:  # progressive, or without own Huffman tables: only the segment structure is checked
         return True
     start, tables, which, blocks, restart = scan
     stream = np.frombuffer(data, np.uint8)
@@ -38,18 +38,21 @@ def is_intact(data: bytes) -> bool:
 def _parse_segments(
     data: bytes,
 ) -> tuple[int, np.ndarray, np.ndarray, int, int] | None:
-    """Where the only scan's codes begin, its code tables [T, 65536], (dc, ac) table of each block of an
-    MCU [B, 2], the number of MCUs, and MCUs between restarts; None for what is not baseline.
+    """Return what is needed to decode the only scan of a baseline JPEG; None if it is not baseline.
+
+    Returns:
+        Offset of the first entropy-coded byte; Huffman tables uint16 [T, 65536]; indices of the (DC, AC)
+        tables of each block of an MCU, int64 [B, 2]; number of MCUs; MCUs between restart markers (0: none).
 
     Raises:
-        ValueError, KeyError, struct.error, IndexError: segments that make no sense.
+        ValueError, KeyError, struct.error, IndexError: invalid segments.
     """
     at, restart = 2, 0
     codes: dict[int, np.ndarray] = {}
     frame: tuple[int, int, dict[int, tuple[int, int]]] | None = None
     while True:
         if data[at] != 0xFF:
-            raise ValueError("no marker where one must be")
+            raise ValueError("a marker is missing")
         marker = data[at + 1]
         if marker == 0xFF:
             at += 1
@@ -60,7 +63,7 @@ def _parse_segments(
         length = struct.unpack_from(">H", data, at + 2)[0]
         body = data[at + 4 : at + 2 + length]
         if len(body) != length - 2:
-            raise ValueError("a segment is cut off")
+            raise ValueError("a segment is truncated")
         if marker == 0xC4:
             _parse_huffman_tables(body, codes)
         elif marker in _BASELINE:
@@ -71,7 +74,7 @@ def _parse_segments(
             restart = struct.unpack(">H", body)[0]
         elif marker == 0xDA:
             if frame is None:
-                raise ValueError("a scan before its frame")
+                raise ValueError("a scan header before the frame header")
             if not codes or body[0] != len(frame[2]):
                 return None
             return (at + 2 + length, *_parse_scan_header(body, frame, codes), restart)
@@ -79,18 +82,20 @@ def _parse_segments(
 
 
 def _parse_frame_header(body: bytes) -> tuple[int, int, dict[int, tuple[int, int]]]:
-    """Width, height and sampling factors (h, v) by component."""
+    """Return width and height (px), and the sampling factors (h, v) by component id."""
     height, width, count = struct.unpack_from(">HHB", body, 1)
     factors = {body[6 + 3 * i]: (body[7 + 3 * i] >> 4, body[7 + 3 * i] & 15) for i in range(count)}
     if not width or not height or not all(1 <= x <= 4 for pair in factors.values() for x in pair):
-        raise ValueError("sizes that cannot be")
+        raise ValueError("invalid size or sampling factors")
     return width, height, factors
 
 
 def _parse_scan_header(
     body: bytes, frame: tuple[int, int, dict[int, tuple[int, int]]], codes: dict[int, np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray, int]:
-    """Tables, tables of each block of an MCU, and number of MCUs."""
+    """Return the Huffman tables, the indices of the tables of each block of an MCU, and the number of
+    MCUs.
+    """
     width, height, factors = frame
     order = sorted(codes)
     which: list[tuple[int, int]] = []
@@ -111,21 +116,25 @@ def _parse_huffman_tables(body: bytes, codes: dict[int, np.ndarray]) -> None:
         counts = body[at + 1 : at + 17]
         symbols = body[at + 17 : at + 17 + sum(counts)]
         if len(counts) != 16 or len(symbols) != sum(counts):
-            raise ValueError("a code table is cut off")
+            raise ValueError("a Huffman table is truncated")
         codes[body[at]] = _code_table(bytes(counts), bytes(symbols))
         at += 17 + len(symbols)
 
 
 @lru_cache(maxsize=64)
 def _code_table(counts: bytes, symbols: bytes) -> np.ndarray:
-    """uint16 [65536]: length << 8 | symbol of the code that any 16 bits begin with; 0 where there is none."""
+    """Return a lookup table of a Huffman code by the next 16 bits of the stream.
+
+    Returns:
+        uint16 [65536]: code length << 8 | symbol; 0 where the bits are no code.
+    """
     table = np.zeros(65536, np.uint16)
     code = at = 0
     for length in range(1, 17):
         for _ in range(counts[length - 1]):
             first, beyond = code << (16 - length), (code + 1) << (16 - length)
             if beyond > 65536:
-                raise ValueError("a code table has too many codes")
+                raise ValueError("a Huffman table has too many codes")
             table[first:beyond] = length << 8 | symbols[at]
             code, at = code + 1, at + 1
         code <<= 1
@@ -141,13 +150,13 @@ def _decode_scan(
     mcus: int,
     restart: int,
 ) -> bool:
-    """Reads every code of a scan; whether it ends where the end mark stands."""
+    """Decode all Huffman codes of a scan; return whether it ends exactly at the end marker."""
     n = data.shape[0]
     bits, have, marked = 0, 0, False
     due = 0
     for mcu in range(mcus):
         if restart > 0 and mcu > 0 and mcu % restart == 0:
-            # Bits up to the byte's end are ones; then the mark with its number.
+            # The rest of the byte is filled with ones; then follows the restart marker with its number.
             if have >= 8 or at + 1 >= n or data[at] != 0xFF or data[at + 1] != 0xD0 + due:
                 return False
             at, bits, have, marked = at + 2, 0, 0, False
@@ -171,7 +180,7 @@ def _decode_scan(
                     have += 8
                 if have >= 16:
                     peek = (bits >> (have - 16)) & 0xFFFF
-                else:  # near a mark: as if ones followed
+                else:  # just before a marker: pad with ones
                     peek = ((bits << (16 - have)) | ((1 << (16 - have)) - 1)) & 0xFFFF
                 entry = int(tables[which[block, 0 if k == 0 else 1], peek])
                 length, symbol = entry >> 8, entry & 0xFF
@@ -198,6 +207,6 @@ def _decode_scan(
 
 
 def warm() -> None:
-    """Compiles the kernel."""
+    """Compile the kernel, so that the first image does not wait for it."""
     empty = np.zeros((1, 65536), np.uint16)
     _decode_scan(np.zeros(4, np.uint8), 0, empty, np.zeros((1, 2), np.int64), 1, 0)

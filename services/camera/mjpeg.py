@@ -1,4 +1,4 @@
-"""JPEG pictures over HTTP (multipart/x-mixed-replace), passed on byte for byte."""
+"""Read JPEG images over HTTP (multipart/x-mixed-replace) and pass them on byte for byte."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from urllib.parse import urlsplit
 
 from beamsplat.services.camera.frame import CameraError, CapturedFrame
 
-_MAX_BYTES = 16 * 1024 * 1024
-_MAX_LINE = 4096
+_MAX_BYTES = 16 * 1024 * 1024  # of one part; bounds the memory
+_MAX_LINE = 4096  # bytes of one header line
 
 
 def is_multipart(url: str, timeout_s: float) -> bool:
-    """Whether an address answers with a stream of parts.
+    """Return whether an address answers with a multipart stream.
 
     Raises:
-        CameraError: it does not answer.
+        CameraError: the address does not answer.
     """
     source = HttpSource(url, timeout_s, lambda: 0, probe_only=True)
     source.close()
@@ -25,21 +25,27 @@ def is_multipart(url: str, timeout_s: float) -> bool:
 
 
 class HttpSource:
-    """Parts of one response, each a JPEG. A part without its length is refused: its end would be a guess."""
+    """A multipart HTTP response, each part a JPEG. Parts without Content-Length are rejected."""
 
     def __init__(
         self, url: str, timeout_s: float, now_ns: Callable[[], int], *, probe_only: bool = False
     ) -> None:
-        """Connects and asks.
+        """Connect and send the request.
+
+        Args:
+            url: http or https address; user and password in it are sent as basic authentication.
+            timeout_s: for the connection and for each read.
+            now_ns: the clock of the time stamps, ns.
+            probe_only: accept any answer; only `multipart` is of interest.
 
         Raises:
-            CameraError: nobody answers, or not with a stream of parts (unless `probe_only`).
+            CameraError: no answer, or not a multipart stream (unless `probe_only`).
         """
         parts = urlsplit(url)
         kind = http.client.HTTPSConnection if parts.scheme == "https" else http.client.HTTPConnection
         self._now_ns = now_ns
         self._connection = kind(parts.hostname or "", parts.port, timeout=timeout_s)
-        self.where = f"{parts.scheme}://{parts.hostname}"  # without a password that the address may hold
+        self.where = f"{parts.scheme}://{parts.hostname}"  # without user and password
         path = (parts.path or "/") + (f"?{parts.query}" if parts.query else "")
         try:
             self._connection.request("GET", path, headers=_authorization(parts.username, parts.password))
@@ -54,14 +60,14 @@ class HttpSource:
             self.close()
             raise CameraError(
                 f"{self.where} answers {self._response.status} {self._response.headers.get_content_type()}, "
-                "not with a stream of pictures"
+                "not with a stream of images"
             )
 
     def read(self) -> CapturedFrame:
-        """The next part, stamped when its first line came.
+        """Return the next part; its time stamp is when its first header line arrived.
 
         Raises:
-            CameraError: the stream ended, or stalled for the timeout.
+            CameraError: the stream ended, or no data came within the timeout.
         """
         try:
             length, stamp_ns = self._read_part_header()
@@ -73,18 +79,18 @@ class HttpSource:
         return CapturedFrame(stamp_ns, data, None)
 
     def close(self) -> None:
-        """Ends the connection."""
+        """Close the connection."""
         with contextlib.suppress(OSError):
             self._connection.close()
 
     def _read_part_header(self) -> tuple[int, int]:
-        """Length of the next part and when its head came."""
+        """Return the length of the next part (bytes) and the arrival time of its header (ns)."""
         length, stamp_ns, headed = -1, 0, False
         while True:
             line = self._response.readline(_MAX_LINE)
             if not line:
                 raise CameraError(f"{self.where} closed the connection")
-            if not headed and not line.strip():  # what ends the part before
+            if not headed and not line.strip():  # line break at the end of the previous part
                 continue
             if not headed:
                 headed, stamp_ns = True, self._now_ns()
@@ -93,7 +99,9 @@ class HttpSource:
                 length = int(value)
             if not line.strip():
                 if not 0 < length <= _MAX_BYTES:
-                    raise CameraError(f"{self.where} sends parts without their length: read it with OpenCV")
+                    raise CameraError(
+                        f"{self.where} sends parts without Content-Length: use a source that OpenCV reads"
+                    )
                 return length, stamp_ns
 
 

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 
 from beamsplat.common.errors import UserError
-from beamsplat.common.geometry.rig import RigFile, load_rig
+from beamsplat.common.geometry.rig import RigFile, check_rig_option, load_rig
 from beamsplat.common.messages import Image, Rig
 from beamsplat.common.runtime.clock import StampClock
 from beamsplat.common.runtime.node import Node, SourceItem
@@ -41,6 +42,18 @@ class CameraNode(Node):
             self._open, size_px=self._size_px(strict=True), rate_hz=c.rate_hz, delay_s=c.delay_s,
             silence_s=c.silence_s, jpeg_quality=c.jpeg_quality,
         )  # fmt: skip
+
+    def examine(self) -> None:
+        """Check that the rig file has a camera, and that a source that is a file exists."""
+        c = self.config
+        rig = check_rig_option(c.rig)
+        if rig is not None and rig.camera is None:
+            raise UserError(f"rig = {c.rig}: [camera] is missing")
+        is_file = not c.source.isdigit() and "://" not in c.source and not c.source.startswith("/dev/")
+        if is_file and not Path(c.source).is_file():  # devices and streams may be connected later
+            raise UserError(
+                f"source = {c.source!r}: no such file (a source is a number, a device, an address or a file)"
+            )
 
     def source(self) -> Iterator[SourceItem | None]:
         """Yield the calibration, then images; None while no image is available."""
@@ -91,6 +104,9 @@ class NoCamera(Node):
     def configure(self) -> None:
         self._rig = load_rig(self.config.rig)
         self._clock = StampClock()
+
+    def examine(self) -> None:
+        check_rig_option(self.config.rig)
 
     def source(self) -> Iterator[SourceItem | None]:
         """Yield the calibration once, since the topic is latched; then None, without end."""

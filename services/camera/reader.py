@@ -1,6 +1,6 @@
-"""Keeps a camera open: reads it in a thread of its own, opens it again when it goes, checks each image.
+"""Keep a camera open: read it in a separate thread, reconnect after a failure, check each image.
 
-A image goes out only if it is whole and of the size that the calibration belongs to.
+Only images that are complete and have the size of the calibration are passed on.
 """
 
 from __future__ import annotations
@@ -18,9 +18,10 @@ from beamsplat.services.camera.frame import CameraEnded, CameraError, CapturedFr
 from beamsplat.services.camera.jpeg import is_intact
 
 _POLL_S = 0.1
-_RETRY_S = 0.5
-_RATE_S = 4.0
-_SLOW = 0.6  # of the rate asked for
+_RETRY_S = 0.5  # between attempts to open the camera
+_RATE_S = 4.0  # window over which the frame rate is measured
+_SLOW = 0.6  # ratio to the requested rate below which the status says SLOW
+_MIN_OPEN_TIMEOUT_S = 5.0  # for the first image: network cameras start slowly
 
 
 class CameraSource(Protocol):
@@ -29,14 +30,14 @@ class CameraSource(Protocol):
     where: str
 
     def read(self) -> CapturedFrame:
-        """The next image; waits for it. Raises CameraError."""
+        """Wait for the next frame and return it. Raises CameraError."""
 
     def close(self) -> None:
-        """Lets go of it."""
+        """Release the camera."""
 
 
 class CheckedImage(NamedTuple):
-    """A image that may go out."""
+    """An image that is complete and has the size of the calibration."""
 
     stamp_ns: int
     width_px: int
@@ -45,14 +46,16 @@ class CheckedImage(NamedTuple):
 
 
 class CameraReader:
-    """Pictures of one camera, for ever (or to the end of a file); `status` is one line about it."""
+    """Delivers checked images of one camera until closed or to the end of a file; `status` is one line of
+    text.
+    """
 
     def __init__(
         self,
         open_source: Callable[[], CameraSource],
         *,
-        size_px: tuple[int, int] | None,  # of the calibration; images of another are rejected
-        rate_hz: float = 0.0,  # what was asked for, to tell when it is not met
+        size_px: tuple[int, int] | None,  # of the calibration; images of another size are rejected
+        rate_hz: float = 0.0,  # requested rate; below 0.6 of it the status says SLOW
         delay_s: float = 0.0,
         silence_s: float = 2.0,
         jpeg_quality: int = 92,
@@ -74,7 +77,7 @@ class CameraReader:
         self.status = "not opened yet"
 
     def images(self) -> Iterator[CheckedImage | None]:
-        """Pictures as they come; None whenever nothing has come for a moment."""
+        """Yield images as they arrive; None when no image arrived for a moment."""
         while not self._closed:
             thread = self._thread = _CaptureThread(self._open_source)
             try:
@@ -93,7 +96,7 @@ class CameraReader:
                 time.sleep(_POLL_S)
 
     def close(self) -> None:
-        """Lets go of the camera."""
+        """Stop reading; the camera is released after the read in progress."""
         self._closed = True
         if self._thread is not None:
             self._thread.stop()
@@ -106,7 +109,7 @@ class CameraReader:
             self.dropped += thread.take_dropped_count()
             now = time.monotonic()
             if frame is None:
-                timeout_s = self._silence_s if thread.opened else max(self._silence_s, 5.0)
+                timeout_s = self._silence_s if thread.opened else max(self._silence_s, _MIN_OPEN_TIMEOUT_S)
                 if now - last_frame_s > timeout_s:
                     raise CameraError(f"no image for {timeout_s:g} s")
                 yield None
@@ -121,7 +124,7 @@ class CameraReader:
             yield image
 
     def _check(self, frame: CapturedFrame) -> CheckedImage | None:
-        """The image, if nothing is wrong with it; the fault is counted."""
+        """Return the image if it passes all checks; otherwise count the reason and return None."""
         jpeg = frame.jpeg
         if jpeg is None:
             good, data = cv2.imencode(".jpg", frame.bgr, [cv2.IMWRITE_JPEG_QUALITY, self._quality])
@@ -129,10 +132,10 @@ class CameraReader:
                 return self._reject("cannot be written as JPEG")
             jpeg = data.tobytes()
         elif not is_intact(jpeg):
-            return self._reject("broken")
+            return self._reject("damaged")
         head = picture_head(jpeg)
         if head is None or head.encoding != "jpeg":
-            return self._reject("no JPEG")
+            return self._reject("not a JPEG")
         if self._size_px is not None and (head.width_px, head.height_px) != self._size_px:
             wanted = f"{self._size_px[0]}x{self._size_px[1]}"
             return self._reject(f"{head.width_px}x{head.height_px} px, the calibration is for {wanted}")
@@ -153,7 +156,7 @@ class CameraReader:
         span = self._arrivals[-1] - self._arrivals[0]
         rate = (count - 1) / span if count > 1 and span > 0.0 else 0.0
         slow = 0.0 < rate < _SLOW * self._rate_hz
-        text = f"SLOW, {self._rate_hz:g} Hz were asked for: " if slow else ""
+        text = f"SLOW, {self._rate_hz:g} Hz requested: " if slow else ""
         self.status = f"{where}: {text}{rate:.1f} Hz, {self._counts()}"
 
     def _counts(self) -> str:
@@ -167,7 +170,10 @@ class CameraReader:
 
 
 class _CaptureThread:
-    """Reads a source in a thread, because a camera that has gone may block for long. The newest wins."""
+    """Reads a source in a thread, because a read of a failed camera may block for long.
+
+    Keeps the newest frame.
+    """
 
     def __init__(self, open_source: Callable[[], CameraSource]) -> None:
         self._open_source = open_source
@@ -181,10 +187,10 @@ class _CaptureThread:
         threading.Thread(target=self._run, name="camera", daemon=True).start()
 
     def take(self, timeout_s: float) -> CapturedFrame | None:
-        """The newest image not yet taken; None if none comes in time.
+        """Return the newest frame not yet taken; None if none arrives within `timeout_s`.
 
         Raises:
-            CameraError: what ended the source.
+            CameraError: the error that ended the source.
         """
         with self._changed:
             if self._frame is None and self._fault is None:
@@ -195,13 +201,13 @@ class _CaptureThread:
             return frame
 
     def take_dropped_count(self) -> int:
-        """How many images a newer one has replaced since last asked."""
+        """Return how many frames were replaced by newer ones since the last call."""
         with self._changed:
             count, self._dropped = self._dropped, 0
             return count
 
     def stop(self) -> None:
-        """The thread ends after its present read; nobody waits for it."""
+        """Let the thread end after its current read, without waiting for it."""
         with self._changed:
             self._stopped = True
 

@@ -1,1 +1,1 @@
-"""Time for robots without a recording: a tick a second."""
+"""The tick of live robots."""

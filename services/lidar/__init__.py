@@ -1,1 +1,1 @@
-"""Planar lidars: their byte protocols, and revolutions with honest times."""
+"""Planar lidars: their byte protocols, and revolutions with measured time stamps."""

@@ -1,4 +1,6 @@
-"""What all drivers share: samples to stamped turns, with the noise of the link and the device's clock."""
+"""The base class of lidar drivers: turns samples into stamped revolutions, monitors link noise and device
+clock.
+"""
 
 from __future__ import annotations
 
@@ -15,22 +17,22 @@ from beamsplat.services.lidar.range_filter import LinkNoise
 from beamsplat.services.lidar.revolution import RevolutionBuilder
 from beamsplat.services.lidar.samples import Samples, StampedScan
 
-_SPANS = 31  # spans remembered
-_MIN_SPANS = 8  # before the first check
-_TOLERANCE_DEG = 0.3  # rounding, and the motor's wobble over a packet
-_TOLERANCE_RATIO = 0.02  # of the angle turned
-_RESET_AFTER = 6  # packets in a row that do not fit: it is the speed that has changed
+_SPANS = 31  # packet-to-packet angles over which the median is taken
+_MIN_SPANS = 8  # of them needed before packets are checked
+_TOLERANCE_DEG = 0.3  # rounding, and the variation of the motor's speed within a packet
+_TOLERANCE_RATIO = 0.02  # of the predicted angle: slower changes of the motor's speed
+_RESET_AFTER = 6  # rejected packets in a row: the motor's speed has changed, estimate anew
 
 
 class LidarDriver(ABC):
-    """One kind of lidar. `start` talks to it, `feed` takes what it says from then on."""
+    """Base class of a lidar's protocol: `start` configures the device, `feed` decodes what it sends."""
 
     bauds: tuple[int, ...] = (115200,)
     clockwise = True
-    silence_s = 1.0  # without a byte for so long it counts as gone
+    silence_s = 1.0  # without a byte for so long: reconnect
 
     def __init__(self, *, no_checksum: bool = False) -> None:
-        """`no_checksum`: its packets carry no checksum, so that no single range is believed."""
+        """`no_checksum`: packets carry no checksum, so that each range needs confirmation by others."""
         self.counters = StreamCounters()
         self.noise = LinkNoise(always=no_checksum)
         self.clock = DeviceClock()
@@ -41,26 +43,26 @@ class LidarDriver(ABC):
 
     @abstractmethod
     def start(self, link: DeviceLink) -> None:
-        """Asks who is there and starts the stream.
+        """Identify the device and start its stream.
 
         Raises:
-            LinkError: nobody answers as this kind of device does.
+            LinkError: no device of this kind answers.
         """
 
     @abstractmethod
     def feed(self, data: bytes, at_ns: int) -> list[StampedScan]:
-        """The turns that `data`, arrived at `at_ns`, completes."""
+        """Decode `data`, which arrived at host time `at_ns`; return the revolutions that it completes."""
 
     def stop(self, link: DeviceLink) -> None:  # noqa: B027 (most devices need nothing)
-        """Ends the stream, as far as the device can be told."""
+        """Stop the stream, for devices that have a command for it."""
 
     def reset(self) -> None:
-        """Forgets what was under way, when the link has been opened anew."""
+        """Discard partial data, after the link was reopened."""
         self.builder.reset()
         self.clock.reset()
 
     def stamp_revolutions(self, samples: Iterable[Samples]) -> list[StampedScan]:
-        """Stamped turns out of samples."""
+        """Return the revolutions that the samples complete, with host time stamps."""
         found = []
         for part in samples:
             for turn in self.builder.add(part, self.noise.noisy):
@@ -70,9 +72,9 @@ class LidarDriver(ABC):
 
 
 class StartAngleGate:
-    """Whether a packet begins where its predecessors say that it must.
+    """Checks that a packet starts at the angle predicted from the packets before.
 
-    A wrong byte in a packet's angle turns all its ranges to a wrong place; the motor's even turning shows it.
+    A wrong byte in a packet's start angle would rotate all its ranges; the motor's steady speed reveals it.
     """
 
     def __init__(self) -> None:
@@ -83,15 +85,15 @@ class StartAngleGate:
 
     @property
     def median_step_deg(self) -> float | None:
-        """Angle from packet to packet; None while too few have come."""
+        """The median angle between the starts of consecutive packets; None while there are too few."""
         return float(np.median(self._spans)) if len(self._spans) >= _MIN_SPANS else None
 
     def skip_packets(self, slots: int = 1) -> None:
-        """Packets that did not come, or were bad."""
+        """Count packets that are missing or damaged, so that the next prediction allows for them."""
         self._skipped += slots
 
     def accepts(self, start_deg: float) -> bool:
-        """Whether a packet that begins there continues what came before."""
+        """Return whether a packet's start angle agrees with the prediction."""
         slots, typical = self._skipped + 1, self.median_step_deg
         last_start_deg, self._last_start_deg, self._skipped = self._last_start_deg, start_deg, 0
         if last_start_deg is None:

@@ -1,9 +1,9 @@
-"""Finds packets of fixed length in a stream of bytes that may begin anywhere, lose bytes and have wrong ones.
+"""Find packets of fixed length in a byte stream that may start anywhere, lose bytes and contain wrong bytes.
 
-Once in step, a packet with wrong bytes is passed over in place: the next one has_header where it should. Only
-when several in a row do not even begin like packets is the step lost and searched for again, and found
-where several packets in a row begin as they should and the first is checksum_ok. A search that trusted the
-first match would take chance bytes for packets: an 8 bit checksum fits one in 256 times.
+While synchronized, a damaged packet is skipped in place: the next one starts one packet length later. Only
+several packets in a row with a wrong header mean that synchronization is lost. It is found again where
+several packets in a row start with a header and the first one has a correct checksum. A search that accepted
+the first match would accept random bytes: an 8 bit checksum fits one in 256 times.
 """
 
 from __future__ import annotations
@@ -11,22 +11,22 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
-_SYNC_LOST_AFTER = 3  # packets in a row that do not begin like one
-_HEAD = 2  # bytes that `has_header` must be content with where packets are check_next_header
-_DOUBTED_AFTER = 24  # packets in a row whose checksum fails
+_SYNC_LOST_AFTER = 3  # packets in a row without a header: synchronization is lost
+_HEAD = 2  # bytes on which `has_header` must decide if `check_next_header` is set
+_RESYNC_AFTER = 24  # packets in a row with a wrong checksum: search again
 
 
 @dataclass
 class StreamCounters:
-    """What a stream has brought, since it was opened first."""
+    """Statistics of a stream since it was first opened."""
 
     bytes: int = 0
-    packets: int = 0  # good ones
-    bad_packets: int = 0  # in their place, but with a wrong checksum or beginning
-    skipped_bytes: int = 0  # passed over while searching for a packet
-    lost_samples: int = 0  # measurements that should have come and did not, or were not believed
+    packets: int = 0  # with correct header and checksum
+    bad_packets: int = 0  # at the expected place, but with a wrong header or checksum
+    skipped_bytes: int = 0  # while searching for a packet
+    lost_samples: int = 0  # expected measurements that are missing or were rejected
     scans: int = 0
-    dropped_scans: int = 0  # revolutions of which too little came
+    dropped_scans: int = 0  # revolutions with too few measurements
 
     def __str__(self) -> str:
         return (
@@ -36,7 +36,10 @@ class StreamCounters:
 
 
 class Framer:
-    """Packets of `length` bytes. `has_header(packet)` looks at the head only, `checksum_ok(packet)` at the checksum."""
+    """Splits a stream into packets of `length` bytes.
+
+    `has_header(packet)` checks the first bytes only, `checksum_ok(packet)` the checksum.
+    """
 
     def __init__(
         self,
@@ -44,8 +47,8 @@ class Framer:
         has_header: Callable[[bytes], bool],
         checksum_ok: Callable[[bytes], bool],
         counters: StreamCounters,
-        confirm_packets: int = 3,  # so many must begin like packets before the step is believed
-        check_next_header: bool = False,  # believe a packet only once one has_header follows it
+        confirm_packets: int = 3,  # consecutive headers needed to synchronize
+        check_next_header: bool = False,  # accept a packet only if a header follows it
     ) -> None:
         self.length = length
         self._has_header = has_header
@@ -60,11 +63,11 @@ class Framer:
 
     @property
     def pending(self) -> int:
-        """Packets that have come but wait for what follows them."""
+        """Number of complete packets in the buffer that wait for the header after them."""
         return len(self._buffer) // self.length if self._synchronized else 0
 
     def feed(self, data: bytes) -> Iterator[bytes | None]:
-        """The packets that `data` completes, in order; None for each that was there but is not good."""
+        """Yield the packets that `data` completes, in order; None for each damaged packet."""
         self._counters.bytes += len(data)
         self._buffer += data
         while True:
@@ -88,7 +91,7 @@ class Framer:
             self._counters.bad_packets += 1
             self._bad_headers = 0 if header_ok else self._bad_headers + 1
             self._bad_in_a_row += 1
-            if self._bad_headers >= _SYNC_LOST_AFTER or self._bad_in_a_row >= _DOUBTED_AFTER:
+            if self._bad_headers >= _SYNC_LOST_AFTER or self._bad_in_a_row >= _RESYNC_AFTER:
                 self._synchronized = False
                 self._bad_headers = self._bad_in_a_row = 0
                 self._skip(1)
@@ -97,10 +100,10 @@ class Framer:
             yield None
 
     def _next_header_follows(self) -> bool | None:
-        """Whether another packet has_header where this one ends, or one later; None: not there yet.
+        """Return whether a header follows this packet directly or one packet later; None: not received yet.
 
-        Bytes lost inside a packet make one of its head and of the next one's data, which an 8 bit checksum
-        takes for checksum_ok one time in 256; but then nothing has_header where it ends.
+        If bytes are lost within a packet, its start and the next packet's data look like one packet, which an
+        8 bit checksum accepts one time in 256; but then no header follows where it ends.
         """
         for start in (self.length, 2 * self.length):
             head = bytes(self._buffer[start : start + _HEAD])
@@ -111,7 +114,9 @@ class Framer:
         return False
 
     def _search(self) -> bool:
-        """Drops bytes until the buffer has_header with packets in a row; False if more are needed for that."""
+        """Drop bytes until the buffer starts with consecutive packets; return False if more bytes are
+        needed.
+        """
         needed = self.length * self._confirm_packets
         start = 0
         while start + needed <= len(self._buffer):

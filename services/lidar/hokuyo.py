@@ -1,4 +1,4 @@
-"""Hokuyo lidars that speak SCIP 2.0 or 2.2 (URG, UBG, UHG, UTM, UST, UXM): over USB, RS-232 or TCP."""
+"""Driver of Hokuyo lidars with SCIP 2.0 or 2.2 (URG, UBG, UHG, UTM, UST, UXM) over USB, RS-232 or TCP."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from beamsplat.services.lidar.link import DeviceLink, LinkError, drain
 from beamsplat.services.lidar.samples import LidarRevolution, StampedScan
 from beamsplat.services.lidar.scip import ScipGeometry, ScipScanReply, parameters
 
-_ANSWER_S = 0.6
+_ANSWER_S = 0.6  # time to wait for an answer
 _TRIES = 4
-_TIME_MODULUS_MS = 1 << 24
-_MIN_GOOD_RATIO = 0.2  # of a scan's blocks that must be good
+_TIME_MODULUS_MS = 1 << 24  # the device's clock has 24 bits (SCIP 2.0)
+_MIN_GOOD_RATIO = 0.2  # of a scan's blocks with a correct checksum; scans below are dropped
 
 
 class HokuyoDriver(LidarDriver):
-    """Distances as they are measured, counter-clockwise; with `intensity` also how strong the echo was."""
+    """Measures distances counter-clockwise; with `intensity` also the echo strength."""
 
     bauds = (115200, 19200, 750000)
     clockwise = False
@@ -37,7 +37,7 @@ class HokuyoDriver(LidarDriver):
         self._byte_time_s = link.byte_time_s
         link.write(b"QT\n")
         drain(link)
-        link.write(b"SCIP2.0\n")  # the URG-04LX starts in SCIP 1.1; others answer that they do not know it
+        link.write(b"SCIP2.0\n")  # the URG-04LX starts in SCIP 1.1; other models answer "unknown command"
         drain(link)
         geometry = _query_geometry(link)
         self.model = f"Hokuyo {geometry.model.strip()}"
@@ -83,7 +83,7 @@ class HokuyoDriver(LidarDriver):
             return []
         delay_ns = round(self._reply.length * self._byte_time_s * 1e9)
         if not self.clock.update(start_s + geometry.count * beam_s, at_ns - delay_ns):
-            self.counters.dropped_scans += 1  # its time is wrong
+            self.counters.dropped_scans += 1  # implausible time
             self.counters.lost_samples += geometry.count
             return []
         step_rad = 2.0 * np.pi / geometry.steps_per_turn
@@ -104,7 +104,10 @@ class HokuyoDriver(LidarDriver):
         ]
 
     def _device_time_s(self, packet: bytes, at_ns: int) -> float | None:
-        """Device time of a reply's first measurement; guessed from the one before where its sum is wrong."""
+        """Return the device time of a reply's first measurement, s.
+
+        If the checksum of the time is wrong, extrapolate from the scan before; None before the first time.
+        """
         time_ms = self._reply.time_ms(packet)
         missed, self._missed_scans = self._missed_scans + 1, 0
         expected = None if self._last_s is None else self._last_s + missed * self._reply.geometry.period_s
@@ -116,7 +119,12 @@ class HokuyoDriver(LidarDriver):
 
 
 def _query_geometry(link: DeviceLink) -> ScipGeometry:
-    problem = "no Hokuyo answers here"
+    """Return the geometry that the device reports to PP.
+
+    Raises:
+        LinkError: no Hokuyo answers.
+    """
+    problem = "no Hokuyo lidar answers"
     for _ in range(_TRIES):
         try:
             return ScipGeometry.from_parameters(parameters(_request(link, b"PP\n")))
@@ -126,7 +134,7 @@ def _query_geometry(link: DeviceLink) -> ScipGeometry:
 
 
 def _request(link: DeviceLink, command: bytes) -> bytes:
-    """What comes until an empty line, or nothing more does."""
+    """Send a command; return what arrives until an empty line or the timeout."""
     link.write(command)
     data, deadline = b"", time.monotonic() + _ANSWER_S
     while time.monotonic() < deadline and b"\n\n" not in data[data.find(command[:2]) + 1 :]:
@@ -135,7 +143,11 @@ def _request(link: DeviceLink, command: bytes) -> bytes:
 
 
 def _start_scanning(link: DeviceLink, command: bytes) -> bytes:
-    """Starts the scans; the first bytes of them."""
+    """Start continuous scans; return the first bytes received of them.
+
+    Raises:
+        LinkError: the device rejects the command.
+    """
     status = b""
     for _ in range(_TRIES):
         link.write(command + b"\n")
@@ -152,4 +164,6 @@ def _start_scanning(link: DeviceLink, command: bytes) -> bytes:
                 status = data[at + 16 : at + 18]
         link.write(b"QT\n")
         drain(link)
-    raise LinkError(f"the Hokuyo refuses to measure (status {status.decode('ascii', 'replace')!r})")
+    raise LinkError(
+        f"the Hokuyo lidar does not start to measure (status {status.decode('ascii', 'replace')!r})"
+    )

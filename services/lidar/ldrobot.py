@@ -1,8 +1,9 @@
-"""LDROBOT LD06, LD19 (and their like): they speak as soon as they have power, 47 bytes a packet.
+"""Driver of LDROBOT LD06, LD19 and compatible lidars: they send packets of 47 bytes as soon as they have
+power.
 
 LDROBOT, "LD06 / LD19 Development Manual", chapter 3 (communication protocol): 0x54, 0x2C (twelve points),
-speed in degrees a second, start angle in 0.01 degrees, twelve times distance in mm and intensity, end
-angle, time in ms (starts over at 30000), CRC-8 with polynomial 0x4D.
+speed in degrees per second, start angle in 0.01 degrees, twelve times distance in mm and intensity, end
+angle, time in ms (wraps at 30000), CRC-8 with polynomial 0x4D.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ _CRC = _crc_table()
 
 
 def crc8(data: bytes) -> int:
-    """CRC-8, polynomial 0x4D, starting at 0, most significant bit first."""
+    """Return the CRC-8 with polynomial 0x4D, initial value 0, most significant bit first."""
     value = 0
     for byte in data:
         value = _CRC[value ^ byte]
@@ -46,13 +47,13 @@ def crc8(data: bytes) -> int:
 
 
 class LdrobotPacket(NamedTuple):
-    """One packet as it stands."""
+    """The values of one packet."""
 
     speed_deg_s: float
     start_deg: float
     end_deg: float
     time_ms: int
-    range_m: np.ndarray  # float64 [12], NaN where the distance is 0: no valid measurement
+    range_m: np.ndarray  # float64 [12], NaN where the distance is 0 (no valid measurement)
     intensity: np.ndarray  # float64 [12]
 
     @property
@@ -62,17 +63,17 @@ class LdrobotPacket(NamedTuple):
 
 
 def has_header(packet: bytes) -> bool:
-    """Whether it starts as one."""
+    """Return whether a packet starts with 0x54, 0x2C."""
     return packet.startswith(_HEAD)
 
 
 def checksum_ok(packet: bytes) -> bool:
-    """Whether its checksum is right."""
+    """Return whether a packet's CRC is correct."""
     return crc8(packet[:-1]) == packet[-1]
 
 
 def parse(packet: bytes) -> LdrobotPacket:
-    """The values of one packet of 47 bytes."""
+    """Return the values of one packet of 47 bytes."""
     _, speed, start, points, end, time_ms, _ = _LAYOUT.unpack(packet)
     data = np.frombuffer(points, dtype=[("mm", "<u2"), ("intensity", "u1")])
     range_m = np.where(data["mm"] > 0, data["mm"] / 1000.0, np.nan)
@@ -82,7 +83,7 @@ def parse(packet: bytes) -> LdrobotPacket:
 
 
 class LdrobotDriver(LidarDriver):
-    """Only listens. Angles grow clockwise seen from above."""
+    """Receives only: the device has no commands. Angles grow clockwise seen from above."""
 
     bauds = (230400,)
 
@@ -120,7 +121,7 @@ class LdrobotDriver(LidarDriver):
             possible = 0.0 < values.step_deg < 3.0 and values.speed_deg_s > 0.0
             delay_ns = round(PACKET_BYTES * self._byte_time_s * 1e9)
             if not (in_place and possible and self.clock.update(last_s, came_ns - delay_ns)):
-                continue  # its samples are missing in the turn and counted there
+                continue  # its samples are counted as lost when the revolution is complete
             parts.append(
                 Samples(
                     angle_deg=values.start_deg + values.step_deg * np.arange(POINTS),

@@ -1,4 +1,6 @@
-"""Serial ports and TCP sockets as a driver needs them: bytes that have come, an error once it is gone."""
+"""Serial ports and TCP sockets as drivers need them: received bytes, and an error when the connection
+ends.
+"""
 
 from __future__ import annotations
 
@@ -12,41 +14,41 @@ import serial
 
 from beamsplat.common.errors import UserError
 
-_CHUNK = 4096
-_BITS_PER_BYTE = 10  # start, eight, stop
+_CHUNK = 4096  # bytes of one read
+_BITS_PER_BYTE = 10  # start bit, eight data bits, stop bit
 
 
 class LinkError(OSError):
-    """The device is not there, not ours to open, or does not answer; the text says what to do."""
+    """The device is missing, may not be opened, or does not answer; the text says what to do."""
 
 
 class DeviceLink(Protocol):
     """An open connection to a device."""
 
-    byte_time_s: float  # how long a byte is on its way; 0 where that is not known
+    byte_time_s: float  # transmission time of a byte; 0 if unknown
 
     def read(self, timeout_s: float) -> bytes:
-        """What has come, waiting up to `timeout_s` for the first byte; b"" if nothing.
+        """Return received bytes, waiting up to `timeout_s` for the first; b"" if there are none.
 
         Raises:
             LinkError: the connection has ended.
         """
 
     def write(self, data: bytes) -> None:
-        """Sends all of it. Raises LinkError."""
+        """Send all bytes. Raises LinkError."""
 
     def set_motor(self, on: bool) -> None:
-        """Switches what the adapter's DTR line holds, where there is one."""
+        """Switch the motor by the adapter's DTR line, where there is one."""
 
     def close(self) -> None:
-        """Ends the connection."""
+        """Close the connection."""
 
 
 class SerialLink:
     """A serial port (or a pseudo-terminal)."""
 
     def __init__(self, path: str, baud: int) -> None:
-        """Opens it, without the exclusive right: a second reader would take bytes away, so it is refused.
+        """Open the port exclusively: a second reader would take bytes away.
 
         Raises:
             LinkError: no such port, no permission, or in use.
@@ -66,17 +68,17 @@ class SerialLink:
             if not select.select([self._port.fileno()], [], [], timeout_s)[0]:
                 return b""
             data = self._port.read(_CHUNK)
-        except (OSError, TypeError, ValueError) as error:  # TypeError: closed below pyserial's feet
-            raise LinkError(f"{self._port.name} is gone: {_reason(error)}") from error
-        if not data:  # readable, but nothing to read: hung up
-            raise LinkError(f"{self._port.name} is gone: it was unplugged")
+        except (OSError, TypeError, ValueError) as error:  # TypeError: pyserial's descriptor was closed
+            raise LinkError(f"{self._port.name} is disconnected: {_reason(error)}") from error
+        if not data:  # readable without data: end of file
+            raise LinkError(f"{self._port.name} is disconnected: it was unplugged")
         return data
 
     def write(self, data: bytes) -> None:
         try:
             self._port.write(data)
         except (OSError, ValueError) as error:
-            raise LinkError(f"{self._port.name} takes no commands: {_reason(error)}") from error
+            raise LinkError(f"cannot write to {self._port.name}: {_reason(error)}") from error
 
     def set_motor(self, on: bool) -> None:
         with contextlib.suppress(OSError):  # a pseudo-terminal has no such line
@@ -88,13 +90,13 @@ class SerialLink:
 
 
 class TcpLink:
-    """A device with a network socket."""
+    """A connection to a device with a network socket."""
 
     def __init__(self, host: str, port: int, timeout_s: float = 1.0) -> None:
-        """Connects.
+        """Connect.
 
         Raises:
-            LinkError: nobody answers there.
+            LinkError: nothing answers at the address.
         """
         try:
             self._socket = socket.create_connection((host, port), timeout=timeout_s)
@@ -110,7 +112,7 @@ class TcpLink:
                 return b""
             data = self._socket.recv(_CHUNK)
         except (OSError, ValueError) as error:
-            raise LinkError(f"{self._name} is gone: {_reason(error)}") from error
+            raise LinkError(f"{self._name} is disconnected: {_reason(error)}") from error
         if not data:
             raise LinkError(f"{self._name} has closed the connection")
         return data
@@ -119,7 +121,7 @@ class TcpLink:
         try:
             self._socket.sendall(data)
         except OSError as error:
-            raise LinkError(f"{self._name} takes no commands: {_reason(error)}") from error
+            raise LinkError(f"cannot write to {self._name}: {_reason(error)}") from error
 
     def set_motor(self, on: bool) -> None:
         pass
@@ -129,22 +131,22 @@ class TcpLink:
 
 
 def open_link(device: str, baud: int) -> DeviceLink:
-    """The device at a path ("/dev/ttyUSB0") or an address ("tcp/192.168.0.10:10940").
+    """Open the device at a path ("/dev/ttyUSB0") or an address ("tcp/192.168.0.10:10940").
 
     Raises:
         LinkError: it cannot be opened now.
-        UserError: an address of another form.
+        UserError: the address is invalid.
     """
     if not device.startswith("tcp/"):
         return SerialLink(device, baud)
     host, _, port = device.removeprefix("tcp/").rpartition(":")
     if not host or not port.isdigit():
-        raise UserError(f"device = {device!r}: a network device is written tcp/HOST:PORT")
+        raise UserError(f"device = {device!r}: write the address of a network device as tcp/HOST:PORT")
     return TcpLink(host.strip("[]"), int(port))
 
 
 def drain(link: DeviceLink, quiet_s: float = 0.05, at_most_s: float = 0.5) -> None:
-    """Reads away what a device is still sending, until it has been quiet or that has lasted."""
+    """Discard received bytes until the device has been quiet for `quiet_s`, at most for `at_most_s`."""
     deadline = time.monotonic() + at_most_s
     while time.monotonic() < deadline and link.read(quiet_s):
         pass
@@ -156,6 +158,6 @@ def _reason(error: Exception) -> str:
 
 def _no_permission(path: str) -> str:
     return (
-        f"{path} may not be opened by this user: `sudo usermod -aG dialout $USER`, then log in anew "
-        "(`beamsplat doctor` explains)"
+        f"this user has no permission to open {path}: run `sudo usermod -aG dialout $USER`, then log in "
+        "again (`beamsplat doctor` explains)"
     )

@@ -1,4 +1,4 @@
-"""Keeps a lidar open: starts it, reads it, opens it again when it goes, and says how it is."""
+"""Keep a lidar open: start it, read it, reconnect after a failure, report its status."""
 
 from __future__ import annotations
 
@@ -11,31 +11,31 @@ from beamsplat.services.lidar.link import DeviceLink, LinkError
 from beamsplat.services.lidar.samples import StampedScan
 
 _POLL_S = 0.1
-_RETRY_S = 0.25  # a device that is plugged in again is found within this
-_NO_SCAN_S = 5.0  # bytes that never make a turn: wrong device, wrong baud rate, or a motor that does not turn
+_RETRY_S = 0.25  # between attempts to open the device
+_NO_SCAN_S = 5.0  # bytes without a revolution: wrong device, wrong baud rate, or the motor does not turn
 
 
 class LidarReader:
-    """Scans of one device, for ever; `status` is one line about it."""
+    """Delivers the scans of one device without end; `status` is one line of text."""
 
     def __init__(
         self,
         make_driver: Callable[[], LidarDriver],
-        open_at: Callable[[int], DeviceLink],  # by baud rate
+        open_at: Callable[[int], DeviceLink],  # opens the device at a baud rate
         bauds: tuple[int, ...],
         now_ns: Callable[[], int],
     ) -> None:
         self.driver = make_driver()
         self._open_at = open_at
         self._bauds = bauds or self.driver.bauds
-        self._baud = 0  # index of the one that answered last
+        self._baud = 0  # index of the rate to try
         self._now_ns = now_ns
         self._link: DeviceLink | None = None
         self.status = "not opened yet"
         self.reconnects = -1
 
     def scans(self) -> Iterator[StampedScan | None]:
-        """Scans as they are complete; None whenever nothing has come for a moment."""
+        """Yield scans as they are complete; None when no data came for a moment."""
         while True:
             if self._link is None and not self._open():
                 yield None
@@ -48,14 +48,14 @@ class LidarReader:
                 self._close_link()
 
     def close(self) -> None:
-        """Stops the device and lets go of it."""
+        """Stop the device and close the link."""
         if self._link is not None:
             with suppress(OSError):
                 self.driver.stop(self._link)
             self._close_link()
 
     def _open(self) -> bool:
-        """Tries one baud rate; the next call tries the next."""
+        """Try to open the device at one baud rate; a failure selects the next rate for the next call."""
         baud = self._bauds[self._baud]
         link = None
         try:
@@ -63,7 +63,7 @@ class LidarReader:
             self.driver.start(link)
         except LinkError as error:
             self.status = f"NOT CONNECTED: {error}"
-            if link is not None:  # somebody is there, but at another rate
+            if link is not None:  # the port exists, but the device may use another rate
                 link.close()
                 self._baud = (self._baud + 1) % len(self._bauds)
             return False
@@ -86,10 +86,10 @@ class LidarReader:
             else:
                 yield None
             if now - last_data_s > self.driver.silence_s:
-                raise LinkError("it has fallen silent")
+                raise LinkError(f"no data for {self.driver.silence_s:g} s")
             if now - last_scan_s > _NO_SCAN_S:
                 self._baud = (self._baud + 1) % len(self._bauds)
-                raise LinkError(f"{_NO_SCAN_S:g} s without a whole turn: is this the right kind and baud?")
+                raise LinkError(f"no complete revolution for {_NO_SCAN_S:g} s: check `kind` and `baud`")
 
     def _update_status(self) -> None:
         noise = ", NOISY LINK" if self.driver.noise.noisy else ""

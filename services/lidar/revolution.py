@@ -1,4 +1,4 @@
-"""Cuts a stream of measurements into turns and puts each on a regular grid of directions."""
+"""Split a stream of measurements into revolutions and resample each to a regular grid of directions."""
 
 from __future__ import annotations
 
@@ -8,38 +8,40 @@ from beamsplat.services.lidar.framing import StreamCounters
 from beamsplat.services.lidar.range_filter import confirmed_ranges
 from beamsplat.services.lidar.samples import LidarRevolution, Samples
 
-_MIN_COVERAGE = 0.1  # of a turn's directions that must have been measured
-_MIN_SAMPLES = 40
-_MAX_STEP_BACK_DEG = 20.0
+_MIN_COVERAGE = 0.1  # ratio of a revolution's directions that must have been measured
+_MIN_SAMPLES = 40  # of a revolution; fewer do not define the grid
+_MAX_STEP_BACK_DEG = 20.0  # RPLIDAR's angle corrections are below 8 degrees
 
 
 class RevolutionBuilder:
-    """Turns out of samples; the first and any turn with a hole of most of its length are dropped."""
+    """Assembles revolutions from samples; drops the first one and those with a gap of most of a
+    revolution.
+    """
 
     def __init__(self, counters: StreamCounters, *, clockwise: bool) -> None:
         self._counters = counters
         self._clockwise = clockwise
         self._parts: list[Samples] = []
-        self._complete = False  # the turn at hand began at its beginning
-        self._total_deg: float | None = None  # angle of the newest sample, counted on over all turns
+        self._complete = False  # the current revolution has its start
+        self._total_deg: float | None = None  # unwrapped angle of the newest sample
         self._turn = 0
         self._last_time = -np.inf
         self._period_s: float | None = None
         self._previous: LidarRevolution | None = None
 
     def reset(self) -> None:
-        """The stream was cut: what is at hand is no turn."""
+        """Discard the current revolution, after an interruption of the stream."""
         if self._parts and self._complete:
             self._counters.dropped_scans += 1
         self._parts, self._complete, self._previous, self._total_deg = [], False, None, None
         self._last_time = -np.inf
 
     def add(self, samples: Samples, noisy: bool = False) -> list[LidarRevolution]:
-        """The turns that these samples end. With `noisy`, ranges that nothing confirms are left out."""
+        """Return the revolutions that these samples complete. With `noisy`, unconfirmed ranges become NaN."""
         if not len(samples):
             return []
         if self._period_s is not None and samples.time_s[0] - self._last_time > 0.9 * self._period_s:
-            self.reset()  # nobody knows how many turns went by
+            self.reset()  # the number of revolutions in the gap is unknown
         total, turn = self._unwrap_angles(samples.angle_deg)
         cuts = np.flatnonzero(np.diff(turn, prepend=self._turn)).tolist()
         turns = []
@@ -55,10 +57,10 @@ class RevolutionBuilder:
         return turns
 
     def _unwrap_angles(self, angle_deg: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Angles counted on over all turns, and the number of the turn of each sample.
+        """Return unwrapped angles and revolution numbers of the samples.
 
-        A device that corrects its angles by the range steps back a little at times, never forward by
-        nearly a turn; the turn that has begun goes on then.
+        A device that corrects its angles by the range may step back a little, but never forward by nearly a
+        revolution; a step back does not reopen the previous revolution.
         """
         if self._total_deg is None:
             self._total_deg = float(angle_deg[0] % 360.0)
@@ -83,7 +85,7 @@ class RevolutionBuilder:
         return self.accept(turn, full - sum(len(part) for part in parts), noisy)
 
     def accept(self, turn: LidarRevolution, missing: int, noisy: bool) -> list[LidarRevolution]:
-        """Counts a turn that lacks `missing` measurements, and believes of it what can be believed."""
+        """Count a revolution that lacks `missing` measurements; with `noisy`, remove unconfirmed ranges."""
         self._period_s = turn.scan_time_s
         previous, self._previous = self._previous, turn
         self._counters.lost_samples += max(missing, 0)
@@ -105,7 +107,7 @@ class RevolutionBuilder:
 
 
 def ranges_in_directions_of(turn: LidarRevolution, previous: LidarRevolution | None) -> np.ndarray:
-    """Ranges float64 [N] of `previous` in the directions of `turn`, NaN where it has none."""
+    """Return ranges float64 [N] of `previous` in the directions of `turn`; NaN where it has none."""
     found = np.full(len(turn.range_m), np.nan)
     if previous is None or not len(previous.range_m):
         return found
@@ -120,10 +122,11 @@ def ranges_in_directions_of(turn: LidarRevolution, previous: LidarRevolution | N
 
 
 def _resample_to_grid(parts: list[Samples], next_time_s: float, clockwise: bool) -> LidarRevolution | None:
-    """The turn on the grid that fits its directions best; None if there is too little of it.
+    """Return the revolution on the regular grid that fits its directions best; None if it has too few
+    samples.
 
-    A motor turns evenly, so that directions are regular up to parts of a step. Each measurement goes to
-    the nearest direction of the grid (of two, the nearer one stays).
+    The motor turns steadily, so directions are regular to a fraction of a step. Each measurement goes to
+    the nearest grid direction; of two at one direction the nearer one is kept.
     """
     angle = np.concatenate([part.angle_deg for part in parts])
     if len(angle) < _MIN_SAMPLES:
@@ -144,12 +147,13 @@ def _resample_to_grid(parts: list[Samples], next_time_s: float, clockwise: bool)
     first += beam.min() * step
     beam -= beam.min()
     count = int(beam.max()) + 1
-    order = np.argsort(-np.abs(exact - np.round(exact)), kind="stable")  # the nearest is written last
+    # Written in this order, the measurement nearest to a grid direction overwrites the others.
+    order = np.argsort(-np.abs(exact - np.round(exact)), kind="stable")
     filled, light = np.full(count, np.nan, np.float32), np.zeros(count, np.float32)
     filled[beam[order]], light[beam[order]] = ranges[order], intensity[order]
     time_step, time_first = np.polyfit(beam, time_s, 1)
     off = np.abs(time_s - time_first - time_step * beam)
-    if off.max() > 4.0 * off.mean():  # a wrong time or two
+    if off.max() > 4.0 * off.mean():  # outliers: refit without them
         kept = off <= 4.0 * off.mean()
         time_step, time_first = np.polyfit(beam[kept], time_s[kept], 1)
     sign = -1.0 if clockwise else 1.0
@@ -166,7 +170,7 @@ def _resample_to_grid(parts: list[Samples], next_time_s: float, clockwise: bool)
 
 
 def _beam_numbers(angle_deg: np.ndarray) -> np.ndarray:
-    """Number of each measurement, float64 [N], by even steps of the angle; gaps are counted on."""
+    """Return the number of each measurement, float64 [N], from the steps of the angle; gaps are counted."""
     steps = np.diff(angle_deg)
     typical = float(np.median(steps))
     near = np.abs(steps - typical) < 0.5 * abs(typical)
@@ -176,7 +180,7 @@ def _beam_numbers(angle_deg: np.ndarray) -> np.ndarray:
 
 
 def _slice(samples: Samples, piece: slice, angle_deg: np.ndarray) -> Samples:
-    """A part of samples, with other angles."""
+    """Return a part of samples with other angles."""
     number = None if samples.number is None else samples.number[piece]
     return Samples(
         angle_deg[piece], samples.range_m[piece], samples.intensity[piece], samples.time_s[piece], number

@@ -1,4 +1,6 @@
-"""SLAMTEC RPLIDAR of the A, S and C series: asks who it is, starts its best stream that we can read."""
+"""Driver of SLAMTEC RPLIDAR (A, S and C series): identifies the model and starts its best supported
+stream.
+"""
 
 from __future__ import annotations
 
@@ -11,12 +13,13 @@ from beamsplat.services.lidar.link import DeviceLink, LinkError, drain
 from beamsplat.services.lidar.rplidar_stream import RplidarStream
 from beamsplat.services.lidar.samples import StampedScan
 
-_ANSWER_S = 0.4
+_ANSWER_S = 0.4  # time to wait for an answer
 _TRIES = 4
 _MOTOR_PWM = 660  # SLAMTEC's default for the A2 and A3
 _PWM_MODELS = (2, 3)
+# Sample period (s) of each stream type, used where the device does not report it.
 _SAMPLE_S = {rp.STANDARD: 500e-6, rp.CAPSULED: 250e-6, rp.HQ: 62.5e-6, rp.ULTRA: 62.5e-6, rp.DENSE: 100e-6}
-# By the upper half of the model number: what it is called and how far its data sheet says it sees (m).
+# Upper four bits of the model number -> name and maximum range (m) of the data sheet.
 _MODELS = {
     1: ("A1", 12.0), 2: ("A2", 16.0), 3: ("A3", 25.0), 4: ("C1", 12.0), 6: ("S1", 40.0), 7: ("S2", 30.0),
     8: ("S3", 40.0),
@@ -24,7 +27,10 @@ _MODELS = {
 
 
 class RplidarDriver(LidarDriver):
-    """`mode`: "auto" takes the typical mode of the device if we can read it, else express, else standard."""
+    """Reads one RPLIDAR.
+
+    `mode`: "auto" uses the device's typical mode if its packets are supported, else express, else standard.
+    """
 
     bauds = (115200, 460800, 256000, 1000000)  # A1 and A2; C1; A3 and S1; S2 and S3
 
@@ -40,7 +46,7 @@ class RplidarDriver(LidarDriver):
         self._byte_time_s = link.byte_time_s
         link.set_motor(True)
         link.write(rp.request(rp.STOP))
-        time.sleep(0.01)  # the protocol asks for 1 ms; what was on its way arrives meanwhile
+        time.sleep(0.01)  # the protocol requires 1 ms; bytes in transit arrive meanwhile
         drain(link)
         info = _request(link, rp.request(rp.GET_INFO), rp.INFO)
         model, firmware = info[0], info[2] + info[1] / 100.0
@@ -49,9 +55,9 @@ class RplidarDriver(LidarDriver):
         self.model = f"RPLIDAR {name}, firmware {firmware:.2f}"
         status, code = struct.unpack_from("<BH", _request(link, rp.request(rp.GET_HEALTH), rp.HEALTH))
         if status == 2:
-            link.write(rp.request(rp.RESET))  # the only way out of its protection stop
+            link.write(rp.request(rp.RESET))  # only a reset ends the protection stop
             raise LinkError(
-                f"{self.model} reports fault {code:#06x}: it was reset; if this stays, replace it"
+                f"{self.model} reports fault {code:#06x} and was reset; replace it if the fault persists"
             )
         if model >> 4 in _PWM_MODELS:
             link.write(rp.request(rp.SET_MOTOR_PWM, struct.pack("<H", _MOTOR_PWM)))
@@ -72,9 +78,9 @@ class RplidarDriver(LidarDriver):
         link.set_motor(False)
 
     def _start_best_stream(self, link: DeviceLink, model: int) -> None:
-        """Starts the first of the possible streams that the device agrees to."""
+        """Start the first of the possible streams that the device accepts."""
         attempts: list[tuple[bytes, float | None]] = []
-        if self.mode == "auto" and model >> 4 not in (1,):  # the A1 knows no modes
+        if self.mode == "auto" and model >> 4 not in (1,):  # the A1 has no modes
             attempts += _typical_mode(link)
         if self.mode in ("auto", "express"):
             attempts.append((rp.request(rp.EXPRESS_SCAN, bytes(5)), None))
@@ -85,14 +91,16 @@ class RplidarDriver(LidarDriver):
             if kind is not None:
                 self._stream = RplidarStream(kind, sample_s or self._rate(link, kind), self.counters)
                 return
-        raise LinkError(f'{self.model} starts no stream in mode {self.mode!r}; try mode = "standard"')
+        raise LinkError(f'{self.model} does not start a stream in mode {self.mode!r}; try mode = "standard"')
 
     def _rate(self, link: DeviceLink, kind: int) -> float:
         return _SAMPLE_S[kind]
 
 
 def _typical_mode(link: DeviceLink) -> list[tuple[bytes, float | None]]:
-    """The mode SLAMTEC thinks best for this device, if its packets are of a kind that we read."""
+    """Return the request for the device's typical mode and its sample period (s); [] if it is not
+    supported.
+    """
     mode = _read_configuration(link, rp.CONF_TYPICAL_MODE)
     if mode is None or len(mode) < 2:
         return []
@@ -102,13 +110,13 @@ def _typical_mode(link: DeviceLink) -> list[tuple[bytes, float | None]]:
         return []
     sample_us = _read_configuration(link, rp.CONF_US_PER_SAMPLE, number)
     sample_s = struct.unpack_from("<I", sample_us)[0] / 256e6 if sample_us and len(sample_us) >= 4 else None
-    # As SLAMTEC's SDK asks: mode 1 is what a device does when asked for no mode in particular.
+    # As in SLAMTEC's SDK: mode 1 is requested as 0, the default.
     working_mode = number[:1] if number[0] > 1 else b"\0"
     return [(rp.request(rp.EXPRESS_SCAN, working_mode + bytes(4)), sample_s)]
 
 
 def _read_configuration(link: DeviceLink, entry: int, payload: bytes = b"") -> bytes | None:
-    """An entry of the device's configuration; None from old firmware, which does not answer."""
+    """Return an entry of the device's configuration; None if old firmware does not answer."""
     try:
         answer = _request(
             link, rp.request(rp.GET_LIDAR_CONF, struct.pack("<I", entry) + payload), rp.CONF, tries=2
@@ -119,7 +127,11 @@ def _read_configuration(link: DeviceLink, entry: int, payload: bytes = b"") -> b
 
 
 def _request(link: DeviceLink, message: bytes, kind: int, tries: int = _TRIES) -> bytes:
-    """The data of a single response."""
+    """Send a request; return the data of its single response.
+
+    Raises:
+        LinkError: no answer.
+    """
     for _ in range(tries):
         link.write(message)
         data, deadline = b"", time.monotonic() + _ANSWER_S
@@ -134,7 +146,7 @@ def _request(link: DeviceLink, message: bytes, kind: int, tries: int = _TRIES) -
 
 
 def _start_stream(link: DeviceLink, message: bytes) -> tuple[int | None, bytes]:
-    """Kind of the stream that a request has started, and its first bytes; None if none of ours started."""
+    """Send a request; return the type of the stream that starts and its first bytes; None if none starts."""
     for _ in range(_TRIES):
         link.write(message)
         data, deadline = b"", time.monotonic() + _ANSWER_S

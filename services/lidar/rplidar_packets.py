@@ -1,7 +1,7 @@
-"""SLAMTEC's bytes: requests, descriptors and the four kinds of measurement packets.
+"""SLAMTEC's protocol: requests, response descriptors and the measurement packets.
 
-SLAMTEC, "RPLIDAR Interface Protocol and Application Notes" LR001 v2.1; where that leaves a detail open
-(sign of the angle compensation, padding of the HQ checksum) as in SLAMTEC's own SDK, sl_lidar_driver.cpp.
+SLAMTEC, "RPLIDAR Interface Protocol and Application Notes" LR001 v2.1. Details that it leaves open (sign of
+the angle compensation, padding of the HQ checksum) follow SLAMTEC's SDK, sl_lidar_driver.cpp.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _HQ_NODE = np.dtype([("angle_q14", "<u2"), ("mm_q2", "<u4"), ("quality", "u1"), 
 
 
 def request(command: int, payload: bytes = b"") -> bytes:
-    """A request packet: 0xA5, command; with a payload its size, itself and the XOR of all before (2.2)."""
+    """Return a request packet (2.2): 0xA5, command; with a payload its size, itself, XOR of all before."""
     head = bytes((0xA5, command))
     if not payload:
         return head
@@ -38,7 +38,7 @@ def request(command: int, payload: bytes = b"") -> bytes:
 
 
 class ResponseDescriptor(NamedTuple):
-    """What announces a response (2.3)."""
+    """The header that announces a response (2.3)."""
 
     length: int  # of each data packet
     multiple: bool
@@ -46,7 +46,7 @@ class ResponseDescriptor(NamedTuple):
 
 
 def find_descriptor(data: bytes, kinds: tuple[int, ...]) -> tuple[ResponseDescriptor, int] | None:
-    """The first descriptor of one of `kinds` in `data`, and where its data begin; None if there is none."""
+    """Return the first descriptor of one of `kinds` and the offset of its data; None if there is none."""
     at = data.find(b"\xa5\x5a")
     while at >= 0 and at + DESCRIPTOR_BYTES <= len(data):
         word, kind = struct.unpack_from("<IB", data, at + 2)
@@ -57,35 +57,39 @@ def find_descriptor(data: bytes, kinds: tuple[int, ...]) -> tuple[ResponseDescri
 
 
 class PacketSamples(NamedTuple):
-    """Samples of a packet. Angles of capsules are relative to what the next capsule's start says."""
+    """The samples of a packet.
+
+    Angles of capsules are relative to the start angles of this and the next capsule.
+    """
 
     start_deg: float
-    first: bool  # the device says that a new stream begins here
-    offset_deg: (
-        np.ndarray
-    )  # float64 [N]: capsules: taken off the evenly sample_times_s angle; HQ: the angle itself
+    first: bool  # start flag of the device: first packet of a stream
+    # float64 [N]; capsules: subtracted from the evenly spaced angle; HQ: the angle itself
+    offset_deg: np.ndarray
     range_m: np.ndarray  # float64 [N], NaN = invalid
     quality: np.ndarray  # float64 [N]
 
 
 def has_capsule_header(packet: bytes) -> bool:
-    """Capsules start with the nibbles A and 5; the other halves are the checksum."""
+    """Return whether the upper nibbles of the first two bytes are A and 5; the lower ones are the
+    checksum.
+    """
     return packet[0] >> 4 == 0xA and packet[1] >> 4 == 0x5
 
 
 def capsule_checksum_ok(packet: bytes) -> bool:
-    """XOR of everything behind the two sync bytes."""
+    """Return whether the checksum is the XOR of all bytes after the two sync bytes."""
     checksum = int(np.bitwise_xor.reduce(np.frombuffer(packet, np.uint8, offset=2)))
     return checksum == (packet[0] & 0xF) | (packet[1] & 0xF) << 4
 
 
 def start_deg(packet: bytes) -> float:
-    """Angle at which a capsule begins."""
+    """Return the start angle of a capsule."""
     return (struct.unpack_from("<H", packet, 2)[0] & 0x7FFF) / 64.0
 
 
 def parse_capsule(packet: bytes) -> PacketSamples:
-    """32 samples in 16 cabins of two distances (q2 without its fraction) and two angle offsets (q3)."""
+    """Decode 32 samples in 16 cabins of two distances (q2 without fraction) and two angle offsets (q3)."""
     word = struct.unpack_from("<H", packet, 2)[0]
     cabins = np.frombuffer(packet, [("d", "<u2", 2), ("angles", "u1")], count=16, offset=4)
     mm = (cabins["d"] >> 2).ravel().astype(np.float64)
@@ -97,22 +101,24 @@ def parse_capsule(packet: bytes) -> PacketSamples:
 
 
 def parse_dense(packet: bytes) -> PacketSamples:
-    """40 distances in mm at even angles."""
+    """Decode 40 distances in mm at evenly spaced angles."""
     word = struct.unpack_from("<H", packet, 2)[0]
     mm = np.frombuffer(packet, "<u2", count=40, offset=4).astype(np.float64)
     return PacketSamples((word & 0x7FFF) / 64.0, bool(word >> 15), np.zeros(40), _metres(mm), np.zeros(40))
 
 
-# Steps of the variable bit scale: where a code's range begins, what distance (mm) that is, shift within it.
+# Variable bit scale: first code of each segment, its distance (mm), and the shift within the segment.
 _SCALE_FROM = np.array([0, 512, 1280, 1792, 3328])
 _SCALE_MM = np.array([0, 1 << 9, 1 << 11, 1 << 12, 1 << 14])
 _SCALE_SHIFT = np.array([0, 1, 2, 3, 4])
 
 
 def parse_ultra(packet: bytes, following: bytes | None) -> PacketSamples:
-    """96 samples in 32 cabins: a distance of variable scale, and two told by their difference from it and
-    from the next cabin's, for which the packet that follows is needed (None: the last sample is lost).
+    """Decode 96 samples in 32 cabins.
 
+    A cabin has one distance of variable scale and two predicted ones: differences from this distance and
+    from the next cabin's. The last cabin therefore needs the following packet (None: its last sample is
+    lost).
     As _ultraCapsuleToNormal of SLAMTEC's SDK, with the angle offset that the device leaves to the host.
     """
     word = struct.unpack_from("<H", packet, 2)[0]
@@ -142,7 +148,7 @@ def parse_ultra(packet: bytes, following: bytes | None) -> PacketSamples:
 
 
 def _ultra_offset_deg(mm: np.ndarray) -> np.ndarray:
-    """How far aside a triangulating lidar looks, by distance, in the fixed point numbers of the SDK."""
+    """Return the angle offset of a triangulation lidar by distance, in the SDK's fixed-point arithmetic."""
     quarter = np.maximum(mm * 4.0, 200.0).astype(np.int64)
     k = 98361 // quarter
     radians_q16 = int(8 * np.pi * 65536 / 180) - (k << 6) - k * k * k // 98304
@@ -151,18 +157,20 @@ def _ultra_offset_deg(mm: np.ndarray) -> np.ndarray:
 
 
 def has_hq_header(packet: bytes) -> bool:
-    """HQ packets start with the byte A5."""
+    """Return whether the packet starts with 0xA5."""
     return packet[0] == 0xA5
 
 
 def hq_checksum_ok(packet: bytes) -> bool:
-    """CRC-32 (IEEE 802.3) of all before it, filled with zeros to a multiple of four."""
+    """Return whether the CRC-32 (IEEE 802.3) of the bytes before it, zero-padded to a multiple of four, is
+    correct.
+    """
     body = packet[:-4]
     return zlib.crc32(body + bytes(-len(body) % 4)) == struct.unpack_from("<I", packet, len(body))[0]
 
 
 def parse_hq(packet: bytes) -> PacketSamples:
-    """96 samples, each with its own angle in units of 90 / 2^14 degrees and distance in mm / 4."""
+    """Decode 96 samples, each with its own angle (90 / 2^14 degrees) and distance (mm / 4)."""
     nodes = np.frombuffer(packet, _HQ_NODE, count=96, offset=9)
     angle = nodes["angle_q14"] * (90.0 / 16384.0)
     mm = nodes["mm_q2"] / 4.0
@@ -171,21 +179,23 @@ def parse_hq(packet: bytes) -> PacketSamples:
 
 
 def has_node_header(packet: bytes) -> bool:
-    """Two bits of the first byte must differ and one of the second be set: that is all there is to check."""
+    """Return whether the start bit and its inverse differ and the check bit is set: a node has no
+    checksum.
+    """
     return (packet[0] ^ packet[0] >> 1) & 1 == 1 and packet[1] & 1 == 1
 
 
 class MeasurementNode(NamedTuple):
     """One sample of the standard scan."""
 
-    first: bool  # of a turn
+    first: bool  # start of a revolution
     angle_deg: float
     range_m: float  # NaN = invalid
     quality: float
 
 
 def parse_node(packet: bytes) -> MeasurementNode:
-    """One sample: quality, angle in degrees / 64, distance in mm / 4 (4.2)."""
+    """Decode one sample: quality, angle in degrees / 64, distance in mm / 4 (4.2)."""
     angle, distance = (packet[1] | packet[2] << 8) >> 1, packet[3] | packet[4] << 8
     range_m = distance / 4000.0 if distance else math.nan
     return MeasurementNode(bool(packet[0] & 1), angle / 64.0, range_m, float(packet[0] >> 2))

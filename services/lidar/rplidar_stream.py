@@ -1,7 +1,7 @@
-"""RPLIDAR's measurement packets to samples with times.
+"""Decode RPLIDAR measurement packets to samples with times.
 
-The device gives no time, but measures at a fixed rate: the number of a sample is its clock. Packets that
-were bad keep their place in the count.
+The device sends no time, but measures at a fixed rate: the sample number is the clock. Damaged packets are
+counted with their number of samples.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ from beamsplat.services.lidar.driver import StartAngleGate
 from beamsplat.services.lidar.framing import Framer, StreamCounters
 from beamsplat.services.lidar.samples import Samples
 
-_NODE_TOLERANCE_DEG = 2.0  # a node that is this far from where it must be is not believed
-_CONFIRM_NODES = 16  # with three bits to check, so many must fit before they are
+_NODE_TOLERANCE_DEG = 2.0  # a node farther from the predicted angle is rejected
+_CONFIRM_NODES = 16  # consecutive nodes needed to synchronize: a node has only three bits to check
 
 
 class RplidarStream:
-    """One run of measurement packets of one kind. `feed` yields None for a bad packet."""
+    """A stream of measurement packets of one type."""
 
     def __init__(self, kind: int, sample_s: float, counters: StreamCounters) -> None:
         self.kind = kind
@@ -32,26 +32,26 @@ class RplidarStream:
             rp.HQ: (rp.has_hq_header, rp.hq_checksum_ok, 2),
         }
         has_header, checksum_ok, confirm_packets = checks[kind]
-        check_next_header = kind in (rp.CAPSULED, rp.ULTRA, rp.DENSE)  # whose checksum is weak
+        check_next_header = kind in (rp.CAPSULED, rp.ULTRA, rp.DENSE)  # their 8 bit checksum is weak
         self._framer = Framer(
             rp.PACKET_BYTES[kind], has_header, checksum_ok, counters, confirm_packets, check_next_header
         )
         self._counters = counters
         self._skipped = counters.skipped_bytes
         self._start_gate = StartAngleGate()
-        self._pending_capsule: tuple[bytes, int] | None = None  # waits for the next one's start angle
-        self._sample_count = 0  # samples so far, lost ones included
+        self._pending_capsule: tuple[bytes, int] | None = None  # needs the start angle of the next one
+        self._sample_count = 0  # samples so far, including lost ones
         self._node_deg: float | None = None
         self._node_step_deg = 0.0
         self._node_gap = 0
 
     @property
     def newest_s(self) -> float:
-        """Device time of the newest sample that has come, also in a packet that is not yet believed."""
+        """Device time (s) of the newest received sample, including packets that wait for confirmation."""
         return (self._sample_count + self._framer.pending * self._samples) * self._sample_s
 
     def feed(self, data: bytes) -> list[Samples | None]:
-        """Samples that `data` completes; None for each packet that was bad."""
+        """Return the samples that `data` completes; None for each damaged packet."""
         found: list[Samples | None] = []
         nodes: list[tuple[float, float, float, int]] = []
         for packet in self._framer.feed(data):
@@ -73,14 +73,14 @@ class RplidarStream:
         return found
 
     def _count_skipped_samples(self) -> int:
-        """Samples that went by in bytes that were skipped."""
+        """Return the number of samples in bytes that were skipped during synchronization."""
         skipped, self._skipped = self._counters.skipped_bytes - self._skipped, self._counters.skipped_bytes
         packets = round(skipped / rp.PACKET_BYTES[self.kind])
         self._start_gate.skip_packets(packets)
         return packets * self._samples
 
     def _capsule(self, packet: bytes | None) -> list[Samples | None]:
-        """A capsule's angles are known with the start of the next, or from how fast it turned before."""
+        """Decode the pending capsule with the start angle of this one, or with the median speed."""
         typical = self._start_gate.median_step_deg
         if packet is None:
             self._start_gate.skip_packets()
@@ -91,13 +91,13 @@ class RplidarStream:
         found: list[Samples | None] = []
         if (
             self._pending_capsule is not None and typical is not None
-        ):  # else nobody knows how many lie between
+        ):  # otherwise the number of capsules between is unknown
             found = self._decode_pending((start_deg - rp.start_deg(self._pending_capsule[0])) % 360.0, packet)
         self._pending_capsule = packet, self._sample_count
         return found
 
     def _decode_pending(self, span_deg: float | None, following: bytes | None) -> list[Samples | None]:
-        """Samples of the capsule that waited, which turned by `span_deg`."""
+        """Return the samples of the pending capsule, which spans `span_deg`."""
         pending, self._pending_capsule = self._pending_capsule, None
         if pending is None or span_deg is None:
             return []
@@ -116,7 +116,7 @@ class RplidarStream:
         return self._with_sample_numbers(measured.offset_deg, measured, self._sample_count)
 
     def _node(self, packet: bytes | None, nodes: list[tuple[float, float, float, int]]) -> None:
-        """A node has no checksum: its angle must be where the motor's turning puts it."""
+        """Append a node if its angle agrees with the motor's speed: a node has no checksum."""
         self._node_gap += 1
         if packet is None:
             return

@@ -1,4 +1,4 @@
-"""What a packet says, whatever the device."""
+"""Data types of all lidars."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Samples:
-    """Consecutive measurements. Angles are the device's own, growing in the order of measurement."""
+    """Consecutive measurements. Angles are in the device's direction of rotation, increasing."""
 
     angle_deg: np.ndarray  # float64 [N]
     range_m: np.ndarray  # float64 [N], NaN = no valid measurement
     intensity: np.ndarray  # float64 [N]
-    time_s: np.ndarray  # float64 [N] on the device's own clock, which only counts up
-    number: np.ndarray | None = None  # float64 [N]: counts the measurements, lost ones too; None: not known
+    time_s: np.ndarray  # float64 [N] on the device's clock, increasing
+    number: np.ndarray | None = None  # float64 [N]: sample numbers, including lost ones; None: unknown
 
     def __len__(self) -> int:
         return len(self.angle_deg)
@@ -23,20 +23,23 @@ class Samples:
 
 @dataclass(frozen=True)
 class LidarRevolution:
-    """One turn on a regular grid: beam i at angle_min + i * increment, i * time_increment after the first."""
+    """One revolution on a regular grid.
 
-    time_s: float  # of the first beam, on the device's clock
+    Beam i is at angle_min_rad + i * angle_increment_rad, measured i * time_increment_s after beam 0.
+    """
+
+    time_s: float  # of beam 0, on the device's clock
     angle_min_rad: float  # counter-clockwise from the device's front
     angle_increment_rad: float
     time_increment_s: float
-    scan_time_s: float  # from this first beam to the next one's
+    scan_time_s: float  # from beam 0 to beam 0 of the next revolution
     range_m: np.ndarray  # float32 [N], NaN = not measured
     intensity: np.ndarray  # float32 [N]
 
 
 @dataclass(frozen=True)
 class StampedScan:
-    """A revolution with its time on the host's clock and the limits of its device."""
+    """A revolution with its time on the host's clock and the range limits of its device."""
 
     stamp_ns: int
     revolution: LidarRevolution

@@ -1,12 +1,12 @@
-"""Hokuyo's SCIP 2.x: commands, characters that carry numbers, and scans whose blocks stand at fixed places.
+"""Hokuyo's SCIP 2.x: commands, number encoding, and scans as replies of fixed layout.
 
 Hokuyo, "Communication Protocol Specification For SCIP2.0 Standard", C-42-03320B; SCIP 2.2 (UST, UXM) keeps
 commands and encoding. A reply to MD (distances) or ME (with intensities) is
 
     echo LF "99b" LF time(4) sum LF { up to 64 characters, sum LF } LF
 
-so that each block of 64 characters has its own checksum of six bits. A block with a wrong byte takes the
-ranges that it touches with it, not the scan.
+so each block of 64 characters has its own checksum of six bits. A block with a wrong byte invalidates the
+ranges that it contains, not the whole scan.
 """
 
 from __future__ import annotations
@@ -15,18 +15,18 @@ from typing import NamedTuple
 
 import numpy as np
 
-BLOCK = 64
-_OFFSET = 0x30
-_MIN_HEADER_MATCH = 0.7  # of a reply's first bytes must be as expected
+BLOCK = 64  # characters before each checksum (SCIP 2.0, section 7)
+_OFFSET = 0x30  # of the characters that encode six bits (section 6)
+_MIN_HEADER_MATCH = 0.7  # ratio of a reply's header bytes that must match
 
 
 def checksum(text: bytes) -> int:
-    """The character that follows a line: the lower six bits of its sum, plus 30H (section 7)."""
+    """Return the checksum character of a line: the lower six bits of its sum, plus 30H (section 7)."""
     return (sum(text) & 0x3F) + _OFFSET
 
 
 def decode(text: bytes) -> int:
-    """The number in 2, 3 or 4 characters of six bits each, most significant first (section 6)."""
+    """Return the number in 2, 3 or 4 characters of six bits each, most significant first (section 6)."""
     value = 0
     for character in text:
         value = value << 6 | (character - _OFFSET) & 0x3F
@@ -34,7 +34,7 @@ def decode(text: bytes) -> int:
 
 
 def parameters(reply: bytes) -> dict[str, str]:
-    """Lines `NAME:value;s` of a PP, VV or II reply whose sums are right."""
+    """Return the lines `NAME:value;s` of a PP, VV or II reply with correct checksums, as name -> value."""
     found = {}
     for line in reply.split(b"\n"):
         body, semicolon, tail = line.rpartition(b";")
@@ -45,7 +45,7 @@ def parameters(reply: bytes) -> dict[str, str]:
 
 
 class ScipGeometry(NamedTuple):
-    """What PP tells: which steps are measured, how fine, how far."""
+    """The device's parameters (reply to PP): measured steps, resolution, range limits, period."""
 
     model: str
     range_min_m: float
@@ -58,10 +58,10 @@ class ScipGeometry(NamedTuple):
 
     @staticmethod
     def from_parameters(values: dict[str, str]) -> ScipGeometry:
-        """From the lines of PP.
+        """Return the geometry from the lines of a PP reply.
 
         Raises:
-            ValueError: a line is missing or is no number.
+            ValueError: a line is missing, is no number, or is out of range.
         """
         names = ("DMIN", "DMAX", "ARES", "AMIN", "AMAX", "AFRT", "SCAN")
         missing = [name for name in names if name not in values]
@@ -69,7 +69,7 @@ class ScipGeometry(NamedTuple):
             raise ValueError(f"the reply to PP lacks {', '.join(missing)}")
         dmin, dmax, ares, amin, amax, afrt, rpm = (int(values[name]) for name in names)
         if not (ares > 0 and 0 <= amin < amax and rpm > 0 and 0 <= dmin < dmax):
-            raise ValueError(f"the reply to PP makes no sense: {values}")
+            raise ValueError(f"the reply to PP has invalid values: {values}")
         return ScipGeometry(
             values.get("MODL", "Hokuyo").partition("(")[0], dmin / 1e3, dmax / 1e3, ares, amin, amax, afrt,
             60.0 / rpm,
@@ -77,18 +77,18 @@ class ScipGeometry(NamedTuple):
 
     @property
     def count(self) -> int:
-        """Measurements of a scan."""
+        """Number of measurements of a scan."""
         return self.last_step - self.first_step + 1
 
 
 class ScipScanReply:
-    """How the replies to one continuous MD or ME look."""
+    """Decodes the replies to one continuous MD or ME command."""
 
     def __init__(self, geometry: ScipGeometry, intensity: bool) -> None:
         self.geometry = geometry
         self._per_step = 6 if intensity else 3
         name = b"ME" if intensity else b"MD"
-        # Cluster 1, no scans left out, number of scans 00: until told to stop; every reply repeats this.
+        # Cluster 1, interval 0, number of scans 00 (until stopped); every reply echoes the command.
         self.command = b"%s%04d%04d01000" % (name, geometry.first_step, geometry.last_step)
         self._head = self.command + b"\n99b\n"
         self._characters = geometry.count * self._per_step
@@ -98,18 +98,23 @@ class ScipScanReply:
         self.length = self._data_at + self._characters + 2 * blocks + 1
 
     def has_header(self, reply: bytes) -> bool:
-        """Whether it starts as a reply, up to a few wrong bytes."""
+        """Return whether a reply starts with the expected header, up to a few wrong bytes."""
         same = sum(a == b for a, b in zip(self._head, reply))
         return same >= _MIN_HEADER_MATCH * len(self._head)
 
     def time_ms(self, reply: bytes) -> int | None:
-        """The device's 24 bit clock; None if its sum is wrong."""
+        """Return the device's 24 bit clock, ms; None if its checksum is wrong."""
         line = reply[self._time_at : self._data_at]
         good = _characters(line[:4]) and checksum(line[:4]) == line[4] and line[5] == 0x0A
         return decode(line[:4]) if good else None
 
     def values(self, reply: bytes) -> tuple[np.ndarray, np.ndarray, int, int]:
-        """(range_m [N], NaN = none; intensity [N]; blocks; bad blocks) of one reply of `length` bytes."""
+        """Decode one reply of `length` bytes.
+
+        Returns:
+            range_m float64 [N], NaN = none; intensity float64 [N]; number of blocks; number of damaged
+            blocks.
+        """
         characters = np.zeros(self._characters, np.uint8)
         good = np.zeros(self._characters, dtype=bool)
         at, done, blocks, bad = self._data_at, 0, 0, 0
@@ -126,7 +131,7 @@ class ScipScanReply:
         six = characters.reshape(-1, self._per_step).astype(np.int64)
         whole = good.reshape(-1, self._per_step).all(axis=1)
         mm = six[:, 0] << 12 | six[:, 1] << 6 | six[:, 2]
-        # Below DMIN stand the device's error codes, beyond DMAX what it does not vouch for.
+        # Values below DMIN are error codes; values beyond DMAX are outside the specified range.
         low, high = self.geometry.range_min_m * 1e3, self.geometry.range_max_m * 1e3
         valid = whole & (mm >= max(low, 1.0)) & (mm <= high)
         light = np.zeros(len(mm))
@@ -136,7 +141,7 @@ class ScipScanReply:
 
 
 def _characters(text: bytes) -> bool:
-    """Whether all are of those that carry six bits, 30H to 6FH."""
+    """Return whether all characters are in 30H to 6FH, those that encode six bits."""
     return not text.translate(None, _SIX_BITS)
 
 

@@ -162,7 +162,7 @@ def test_broken_pictures_are_not_passed_on(rig):
         camera.damage = cut
         node = CameraNode(CameraConfig(source=camera.url, rig=rig))
         with RunningSource(node) as running:
-            running.wait(lambda: len(_images(running)) >= 10 and "rejected (broken)" in node.detail)
+            running.wait(lambda: len(_images(running)) >= 10 and "rejected (damaged)" in node.detail)
     for _, image in _images(running):
         assert cv2.imdecode(np.asarray(image.data), cv2.IMREAD_COLOR).shape == (48, 64, 3)
         assert is_whole(bytes(image.data))
@@ -224,7 +224,7 @@ def test_a_video_file_plays_to_its_end(tmp_path, codec):
     assert time.monotonic() - started > 0.4  # at its own speed
     assert len(images) + node._reader.dropped >= 11
     assert len(images) >= 8
-    assert "at its end" in node.detail
+    assert "end of file" in node.detail
     if codec == "MJPG":  # undecoded: each picture's bytes stand in the file as they are
         assert bytes(images[3].data) in path.read_bytes()
     node.close()
@@ -241,7 +241,7 @@ def test_what_is_not_there_is_said(tmp_path, rig):
             assert "NOT CONNECTED" in node.detail
             assert "NO CALIBRATION" in node.detail
     rig.write_text(RIG[RIG.index("[lidar") :])
-    with pytest.raises(UserError, match="has no \\[camera\\]"):
+    with pytest.raises(UserError, match="\\[camera\\] is missing"):
         CameraNode(CameraConfig(rig=rig)).configure()
 
 
