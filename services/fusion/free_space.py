@@ -1,4 +1,4 @@
-"""Beams and pixels on things that move: beams that end where past scans saw free space."""
+"""Dynamic beams by free space: returns in cells that past beams have passed through."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from beamsplat.common.compiled import kernel
 
 
 class FreeSpaceGrid:
-    """Grid over the floor: how often beams passed through each cell, and how often they ended there."""
+    """Grid over the floor with the number of passes and hits of beams in each cell."""
 
     def __init__(self, cell_m: float = 0.1, side_m: float = 60.0) -> None:
         cells = round(side_m / cell_m)
@@ -18,13 +18,13 @@ class FreeSpaceGrid:
         self._hit_count = np.zeros((cells, cells), dtype=np.uint16)
 
     def add(self, position_map_m: np.ndarray, points_map_m: np.ndarray) -> None:
-        """Takes in a scan from `position_map_m` [2 or 3] with returns [N, 2 or 3], both in the map."""
+        """Add a scan taken at `position_map_m` [2 or 3] with returns [N, 2 or 3], both in the map frame."""
         start = np.asarray(position_map_m, dtype=np.float64)[:2].copy()
         ends = np.ascontiguousarray(points_map_m[:, :2], dtype=np.float64)
         count_ray_cells(start, ends, self._low_m, self.cell_m, self._pass_count, self._hit_count)
 
     def dynamic_returns(self, points_map_m: np.ndarray, least: int = 6, ratio: float = 0.1) -> np.ndarray:
-        """bool [N]: returns in cells that beams passed `least` times and hardly ever ended at."""
+        """Return bool [N]: returns in cells with `least` passes or more and at most `ratio` hits per pass."""
         index = np.floor((points_map_m[:, :2] - self._low_m) / self.cell_m).astype(np.int64)
         size = len(self._pass_count)
         inside = np.all((index >= 1) & (index < size - 1), axis=1)
@@ -46,12 +46,12 @@ def count_ray_cells(
     passed: np.ndarray,  # uint16 [rows, columns]
     ended: np.ndarray,  # uint16 [rows, columns]
 ) -> None:
-    """Counts the cells that each beam crosses, its last two left out, and the cell where it ends."""
+    """Count the cells that each beam crosses, except the last two, and the cell in which it ends."""
     rows, columns = passed.shape
     for k in range(ends_m.shape[0]):
         dx, dy = ends_m[k, 0] - start_m[0], ends_m[k, 1] - start_m[1]
         length = np.hypot(dx, dy)
-        if not 0.0 < length < cell_m * (rows + columns):  # also rubbish: a walk must end
+        if not 0.0 < length < cell_m * (rows + columns):  # non-finite or absurd lengths would not terminate
             continue
         steps = int(length / (0.5 * cell_m)) - 4
         last_i, last_j = -1, -1

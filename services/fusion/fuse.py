@@ -1,4 +1,4 @@
-"""The stage as the robot runs it: image, pose, beams, estimate in; metric depth with sigma, status out."""
+"""Fusion by method `field`: image, pose, beams and depth estimate in; metric depth, sigma and status out."""
 
 from __future__ import annotations
 
@@ -19,70 +19,78 @@ from beamsplat.services.fusion.result import FusionResult, rejected
 from beamsplat.services.fusion.scaling import ScaleFit, as_depth, fit_scale
 from beamsplat.services.fusion.surfaces import CandidateSurfaces
 
-# Standard deviations of log depth, measured on both recordings by what a pixel's depth rests on.
+# Standard deviations of log depth by the evidence of a pixel, measured with `beamsplat eval depth` on the
+# recordings house_a and redkitchen.
 _BEAM, _FLOOR, _SURFACE = 0.002, 0.004, 0.010
-_BETWEEN_BEAMS_M = 0.007  # the mean of two beams of 1 cm each
-_CARRIED = (0.10, 0.06, 0.045)  # depth remembered from one, two, three and more keyframes
-_UPRIGHT, _TILTING = 0.125, 0.13  # extruded walls that nothing confirms: body on a floor, body in the hand
-_BEAM_HEIGHT_M = 0.06
-_SAME_SURFACE = 0.08
-_EDGE = 0.4  # of the jump next to a pixel: which side it lies on is a estimate
+_BETWEEN_BEAMS_M = 0.007  # standard deviation of the mean of two beams with 1 cm each
+_WARPED_SIGMA_LOG = (0.10, 0.06, 0.045)  # depth warped from one, two, three and more keyframes
+_UPRIGHT, _TILTING = 0.125, 0.13  # extruded walls without other evidence: level body, hand-held body
+_BEAM_HEIGHT_M = 0.06  # pixels this near to the lidar plane have the depth of the beams
+_SAME_SURFACE = 0.08  # log depth: neighbours that differ by less belong to one surface
+_EDGE = 0.4  # share of a depth jump nearby that is added to sigma: the side of the edge is uncertain
 _EDGE_REACH = (3, 5)  # rows, columns of the working size
-_TELL_ABOUT_PX = 3.0  # of the working size: a pixel amid doubtful ones is as doubtful
-_CONTRADICTION = 0.25  # log: a beam that far from remembered depth contradicts it
-_LEAST_KNOWN = 20
-_LEAST_INLIERS = 0.3
+_SIGMA_BLUR_PX = 3.0  # of the working size: Gaussian over which sigma is averaged
+_CONTRADICTION = 0.25  # log depth: a beam that differs by more contradicts the warped depth
+_LEAST_KNOWN = 20  # beams with warped depth, below which they are not compared
+_LEAST_INLIERS = 0.3  # share of the beams that fit the result, below which it is rejected
 
 
 class Fusion:
-    """Depth of every image by `field`; keyframes are swept, others get the keyframes' depth."""
+    """Dense metric depth of a stream of images: plane sweep at keyframes, warped depth between them."""
 
     def __init__(
         self, camera: Pinhole, T_body_camera: np.ndarray, *, floor_known: bool, planar: bool,
         config: PlaneSweepConfig | None = None,
     ) -> None:  # fmt: skip
-        """`floor_known`: the height of `T_body_camera` holds; `planar`: the body stays level on a floor."""
+        """Prepare fusion for one camera; arguments as in `PlaneSweep`."""
         self._sweep = PlaneSweep(camera, T_body_camera, floor_known=floor_known, planar=planar, config=config)
         self._planar = planar
-        self._health = ImageCheck()
+        self._image_check = ImageCheck()
 
     def add_scan(self, points_map_m: np.ndarray) -> None:
-        """Returns [N, 3] of every scan, in the map frame."""
+        """Add the returns float64 [N, 3] of a scan, in the map frame."""
         self._sweep.add_scan(points_map_m)
 
     def fuse(self, frame: FusionInput, *, keyframe: bool) -> FusionResult:
-        """Depth of one image. A keyframe costs several times more, and later images live on it."""
+        """Return the depth of one image, or a rejected result with the reason.
+
+        A keyframe costs several times more than another image; its depth is warped into later images.
+        """
         shape = self._sweep.camera.shape
-        status = self._health.judge(frame.image_rgb, frame.T_map_body)
+        status = self._image_check.check(frame.image_rgb, frame.T_map_body)
         if status != "ok":
             return rejected(shape, status)
         uv, z, _ = project_beams(frame.beams, self._sweep.camera, self._sweep.T_body_camera)
-        small = self._sweep.downscale(frame)
-        remembered = self._sweep.warp_into(small)
-        status = check_beams(len(uv), self._contradicted(remembered.depth_m, uv, z))
+        working = self._sweep.downscale(frame)
+        warped = self._sweep.warp_into(working)
+        status = check_beams(len(uv), self._contradicting_share(warped.depth_m, uv, z))
         if status != "ok":
             return rejected(shape, status)
         if keyframe:
-            solved = self._sweep.refine(frame, small, remembered)
+            # Plane sweep against past images.
+            swept = self._sweep.refine(frame, working, warped)
             surfaces = self._sweep.surfaces(frame)
-            sigma_log = self._sigma_swept(solved, surfaces)
-            self._pin_to_beams(solved, sigma_log, surfaces)
+            sigma_log = self._sweep_sigma_log(swept, surfaces)
+            self._pin_to_beams(swept, sigma_log, surfaces)
         else:
-            solved = self._carried(frame, remembered, self._sweep.surfaces(frame, occluded_walls=False))
-            sigma_log = solved.spread
-        self._sweep.keep(small)
-        return self._finish(frame, solved, sigma_log, uv, z)
+            # Keyframe depth, else candidate surfaces, else the estimate.
+            swept = self._depth_between_keyframes(
+                frame, warped, self._sweep.surfaces(frame, occluded_walls=False)
+            )
+            sigma_log = swept.spread
+        self._sweep.keep(working)
+        return self._to_full_size(frame, swept, sigma_log, uv, z)
 
     def look(self, image_rgb: np.ndarray, T_map_body: np.ndarray) -> None:
-        """Takes an image in for later sweeps, without making depth of it."""
+        """Store an image for later sweeps, without estimating its depth."""
         frame = FusionInput(0, image_rgb, T_map_body, NO_BEAMS)
-        if self._health.judge(image_rgb, T_map_body) == "ok":
+        if self._image_check.check(image_rgb, T_map_body) == "ok":
             self._sweep.keep_if_moved(frame)
 
-    def _carried(
-        self, frame: FusionInput, remembered: WarpedDepth, surfaces: CandidateSurfaces
+    def _depth_between_keyframes(
+        self, frame: FusionInput, warped: WarpedDepth, surfaces: CandidateSurfaces
     ) -> SweepResult:
-        """Keyframe depth where there is any, else the surfaces, else the estimate; `spread` is sigma of log."""
+        """Return keyframe depth, else the surfaces, else the estimate; `spread` is sigma of log depth."""
         depth = surfaces.nearest.astype(np.float32)
         upright = _UPRIGHT if self._planar else _TILTING
         spread = np.full(depth.shape, upright, dtype=np.float32)
@@ -94,9 +102,9 @@ class Fusion:
             error = 2.0 * estimate.spread + 0.02
             take = np.isfinite(estimated) & (~np.isfinite(depth) | (spread > error))
             depth[take], spread[take] = estimated[take], error
-        known = remembered.votes > 0
-        depth[known] = remembered.depth_m[known]
-        spread[known] = np.array(_CARRIED, np.float32)[np.minimum(remembered.votes[known], 3) - 1]
+        known = warped.votes > 0
+        depth[known] = warped.depth_m[known]
+        spread[known] = np.array(_WARPED_SIGMA_LOG, np.float32)[np.minimum(warped.votes[known], 3) - 1]
         with np.errstate(invalid="ignore"):
             at_beam = (surfaces.wall_offset_m < _BEAM_HEIGHT_M) & ~surfaces.on_floor
             exact = np.abs(np.log(surfaces.floor / depth)) < 0.03
@@ -105,38 +113,38 @@ class Fusion:
         depth[exact], spread[exact] = surfaces.floor[exact], _FLOOR
         return SweepResult(depth, spread, at_beam | exact, 0)
 
-    def _contradicted(self, remembered: np.ndarray, uv: np.ndarray, z: np.ndarray) -> float | None:
-        """Share of beams far from what keyframes remember there; None while they remember little."""
+    def _contradicting_share(self, warped: np.ndarray, uv: np.ndarray, z: np.ndarray) -> float | None:
+        """Return the share of beams that contradict the warped depth; None if too few can be compared."""
         if len(z) == 0:
             return None
-        h, w = remembered.shape
+        h, w = warped.shape
         v = np.clip(((uv[:, 1] + 0.5) * h / self._sweep.camera.height_px).astype(int), 0, h - 1)
         u = np.clip(((uv[:, 0] + 0.5) * w / self._sweep.camera.width_px).astype(int), 0, w - 1)
-        then = remembered[v, u]
+        then = warped[v, u]
         known = np.isfinite(then)
         if known.sum() < _LEAST_KNOWN:
             return None
         return float(np.mean(np.abs(np.log(z[known] / then[known])) > _CONTRADICTION))
 
-    def _sigma_swept(self, solved: SweepResult, surfaces: CandidateSurfaces) -> np.ndarray:
-        """Standard deviation of log depth [h, w]: by what the depth rests on, and the matcher's own doubt."""
+    def _sweep_sigma_log(self, swept: SweepResult, surfaces: CandidateSurfaces) -> np.ndarray:
+        """Return sigma of log depth [h, w] from the evidence of each pixel and the spread of its labels."""
         with np.errstate(invalid="ignore"):
-            floor = solved.snapped & (np.abs(np.log(surfaces.floor / solved.depth_m)) < 0.01)
-            beam = solved.snapped & (surfaces.wall_offset_m < _BEAM_HEIGHT_M)
+            floor = swept.snapped & (np.abs(np.log(surfaces.floor / swept.depth_m)) < 0.01)
+            beam = swept.snapped & (surfaces.wall_offset_m < _BEAM_HEIGHT_M)
         config = self._sweep.config
-        base = np.where(solved.snapped, _SURFACE, config.matched)
-        base = np.where(floor, _FLOOR, np.where(beam, _BEAM + _BETWEEN_BEAMS_M / solved.depth_m, base))
-        doubt = np.where(floor | beam, 0.0, config.per_spread * solved.spread)
+        base = np.where(swept.snapped, _SURFACE, config.matched)
+        base = np.where(floor, _FLOOR, np.where(beam, _BEAM + _BETWEEN_BEAMS_M / swept.depth_m, base))
+        doubt = np.where(floor | beam, 0.0, config.per_spread * swept.spread)
         return np.hypot(base, doubt).astype(np.float32)
 
-    def _pin_to_beams(self, solved: SweepResult, sigma_log: np.ndarray, surfaces: CandidateSurfaces) -> None:
-        """On the scan line itself the beams are right, whatever matches; changes both arrays."""
+    def _pin_to_beams(self, swept: SweepResult, sigma_log: np.ndarray, surfaces: CandidateSurfaces) -> None:
+        """Set depth and sigma on the scan line to those of the beams, in place."""
         pinned = (surfaces.wall_offset_m < 0.5 * _BEAM_HEIGHT_M) & ~surfaces.on_floor
-        solved.depth_m[pinned] = surfaces.wall[pinned]
-        sigma_log[pinned] = _BEAM + _BETWEEN_BEAMS_M / solved.depth_m[pinned]
+        swept.depth_m[pinned] = surfaces.wall[pinned]
+        sigma_log[pinned] = _BEAM + _BETWEEN_BEAMS_M / swept.depth_m[pinned]
 
-    def _doubt_edges(self, depth: np.ndarray, sigma_log: np.ndarray) -> np.ndarray:
-        """Sigma of log depth with a share of the jumps nearby; thin gaps between beams end anywhere."""
+    def _inflate_at_edges(self, depth: np.ndarray, sigma_log: np.ndarray) -> np.ndarray:
+        """Return sigma of log depth, enlarged next to depth jumps."""
         known = np.isfinite(depth)
         middle = float(np.median(depth[known])) if known.any() else 1.0
         log_z = np.log(np.where(known, depth, middle)).astype(np.float32)
@@ -144,25 +152,25 @@ class Fusion:
         jump = cv2.dilate(log_z, window) - cv2.erode(log_z, window)
         return np.hypot(sigma_log, np.where(jump > _SAME_SURFACE, _EDGE * jump, 0.0)).astype(np.float32)
 
-    def _sure(self, depth: np.ndarray, sigma_log: np.ndarray) -> np.ndarray:
-        """bool [h, w]: pixels that get an answer."""
+    def _known_mask(self, depth: np.ndarray, sigma_log: np.ndarray) -> np.ndarray:
+        """Return bool [h, w]: pixels whose depth is certain enough to be output."""
         config = self._sweep.config
-        sure = sigma_log <= config.tell_log
-        if np.isfinite(config.tell_m):
-            far = 3.0 * config.tell_m
+        sure = sigma_log <= config.max_sigma_log
+        if np.isfinite(config.max_sigma_m):
+            far = 3.0 * config.max_sigma_m
             doubt = np.where(np.isfinite(depth), np.minimum(sigma_log * depth, far), far).astype(np.float32)
-            sure &= cv2.GaussianBlur(doubt, (0, 0), _TELL_ABOUT_PX) <= config.tell_m
+            sure &= cv2.GaussianBlur(doubt, (0, 0), _SIGMA_BLUR_PX) <= config.max_sigma_m
         return sure
 
-    def _finish(
-        self, frame: FusionInput, solved: SweepResult, sigma_log: np.ndarray, uv: np.ndarray, z: np.ndarray
+    def _to_full_size(
+        self, frame: FusionInput, swept: SweepResult, sigma_log: np.ndarray, uv: np.ndarray, z: np.ndarray
     ) -> FusionResult:
-        """Full size, and the figures that go with every result."""
-        h, w = self._sweep.small_camera.shape
+        """Return the result at the image size, with scale, inlier share and residual at the beams."""
+        h, w = self._sweep.working_camera.shape
         depth = np.empty(self._sweep.camera.shape, np.float32)
         sigma = np.empty_like(depth)
-        sigma_log = self._doubt_edges(solved.depth_m, sigma_log)
-        known = np.where(self._sure(solved.depth_m, sigma_log), solved.depth_m, np.nan).astype(np.float32)
+        sigma_log = self._inflate_at_edges(swept.depth_m, sigma_log)
+        known = np.where(self._known_mask(swept.depth_m, sigma_log), swept.depth_m, np.nan).astype(np.float32)
         colour = cv2.resize(frame.image_rgb, (w, h), interpolation=cv2.INTER_AREA)
         upsample.upsample_depth(known, sigma_log, colour, frame.image_rgb, _SAME_SURFACE, depth, sigma)
         H, W = depth.shape
@@ -177,8 +185,8 @@ class Fusion:
             residual_m=float(np.median(np.abs(z[good] - here[good]))) if good.any() else float("nan"),
         )  # fmt: skip
         if result.inlier_share < _LEAST_INLIERS:
-            return result.refused(
-                f"only {result.inlier_share:.0%} of the beams fit the depth found: wrong pose or calibration"
+            return result.as_rejected(
+                f"only {result.inlier_share:.0%} of the beams fit the depth: wrong pose or calibration"
             )
         scale = None
         if frame.estimate is not None and frame.estimate_kind != "none":

@@ -1,4 +1,4 @@
-"""Images and beams that nothing may be built on: said in one sentence, before any depth is made."""
+"""Checks of images and beams before fusion; each returns "ok" or one sentence."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ _SIDE = 64
 
 
 class ImageCheck:
-    """Judges images one after the other; remembers the last one to see a camera freeze."""
+    """Check of exposure and of a frozen camera over a stream of images."""
 
     def __init__(self, still_m: float = 0.10, still_rad: float = 0.05) -> None:
         self._still_m, self._still_rad = still_m, still_rad
         self._last: np.ndarray | None = None
         self._T_map_body: np.ndarray | None = None  # where the image last changed
 
-    def judge(self, image_rgb: np.ndarray, T_map_body: np.ndarray) -> str:
-        """ "ok", or why this image uint8 [H, W, 3] must not be used.
+    def check(self, image_rgb: np.ndarray, T_map_body: np.ndarray) -> str:
+        """Return "ok", or why this image uint8 [H, W, 3] must not be used.
 
-        An image that repeats the one before byte for byte is a frozen camera once the robot has moved by
-        `still_m` or turned by `still_rad` since; noise makes two live images differ.
+        A live camera never repeats an image, because of noise. An image identical to the one before means a
+        frozen camera if the robot has moved by `still_m` or turned by `still_rad` since.
         """
         grey = cv2.resize(
             cv2.cvtColor(image_rgb, cv2.COLOR_RGB2GRAY), (_SIDE, _SIDE), interpolation=cv2.INTER_AREA
@@ -37,31 +37,33 @@ class ImageCheck:
         turn_cos = (np.trace(self._T_map_body[:3, :3].T @ T_map_body[:3, :3]) - 1.0) / 2.0
         turned = float(np.arccos(np.clip(turn_cos, -1.0, 1.0)))
         if moved > self._still_m or turned > self._still_rad:
-            return f"the camera is frozen: the same image after {moved:.2f} m, {np.degrees(turned):.0f} deg"
+            return (
+                f"the camera is frozen: the same image after {moved:.2f} m and {np.degrees(turned):.0f} deg"
+            )
         return "ok"
 
 
 def check_exposure(grey: np.ndarray) -> str:
-    """ "ok", or what is wrong with the brightness of uint8 [h, w]."""
+    """Return "ok", or what is wrong with the brightness of an image uint8 [h, w]."""
     if float(np.percentile(grey, 95)) < 12.0:
         return "the image is black"
     if float(np.percentile(grey, 15)) > 248.0:
         return "the image is overexposed"
     if float(np.percentile(grey, 98)) - float(np.percentile(grey, 2)) < 4.0:
-        return "the image shows nothing: one grey everywhere"
+        return "the image has no contrast: one grey everywhere"
     return "ok"
 
 
 def check_beams(in_view: int, disagree_share: float | None, least: int = 8) -> str:
-    """ "ok", or why the beams in view cannot anchor depth.
+    """Return "ok", or why the beams in view cannot determine the scale.
 
-    `disagree_share`: of the beams in view, how many contradict the depth that past images give there.
+    `disagree_share`: share of the beams in view that contradict the depth of past keyframes; None = unknown.
     """
     if in_view < least:
-        return f"no beams in view ({in_view} of at least {least}): nothing gives the scale"
+        return f"no beams in view ({in_view} of at least {least}): the scale is unknown"
     if disagree_share is not None and disagree_share > 0.6:
         return (
-            f"{disagree_share:.0%} of the beams contradict what past images show there: "
-            "glass in front, a wrong pose, or a moved calibration"
+            f"{disagree_share:.0%} of the beams contradict the depth from past images: "
+            "glass in front of the robot, a wrong pose, or a sensor that has moved on its mount"
         )
     return "ok"

@@ -1,4 +1,4 @@
-"""Depth of past keyframes, carried into the present view."""
+"""Depth maps of past keyframes, warped into the view of another image."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from beamsplat.common.geometry.transforms import inverse
 
 @dataclass(frozen=True)
 class WarpedDepth:
-    """What past keyframes say about the pixels of a view."""
+    """Depth of past keyframes in the pixels of a view."""
 
-    depth_m: np.ndarray  # float32 [h, w], NaN = never seen
+    depth_m: np.ndarray  # float32 [h, w], NaN = seen by no keyframe
     votes: np.ndarray  # int64 [h, w]: keyframes that agree on it
 
 
 class KeyframeDepths:
-    """A ring of keyframe depth maps of one camera at the working size."""
+    """The last `most` keyframe depth maps of one camera, at the working size."""
 
     def __init__(self, K: np.ndarray, shape: tuple[int, int], most: int) -> None:
         self._K = np.asarray(K, dtype=np.float32)  # [4] fx, fy, cx, cy
@@ -31,27 +31,27 @@ class KeyframeDepths:
         return len(self._ring)
 
     def add(self, T_map_camera: np.ndarray, depth_m: np.ndarray) -> None:
-        """Keeps a depth map float32 [h, w]; NaN pixels are not carried."""
+        """Store a depth map float32 [h, w]; NaN pixels are not warped."""
         self._ring.append((T_map_camera, np.ascontiguousarray(depth_m, dtype=np.float32)))
 
     def warp_into(self, T_map_camera: np.ndarray, agreement: float = 0.06) -> WarpedDepth:
-        """Median of the carried depths of each pixel, and how many lie within `agreement` (log) of it."""
-        carried = np.full((len(self._ring), *self._shape), np.nan, dtype=np.float32)
+        """Return the median of the warped depths of each pixel, and how many are within `agreement` (log)."""
+        warped = np.full((len(self._ring), *self._shape), np.nan, dtype=np.float32)
         T_camera_map = inverse(T_map_camera)
         for k, (T_map_then, depth) in enumerate(self._ring):
             T = (T_camera_map @ T_map_then).astype(np.float32)
-            warp_depth(depth, T[:3, :3].copy(), T[:3, 3].copy(), self._K, carried[k])
+            warp_depth(depth, T[:3, :3].copy(), T[:3, 3].copy(), self._K, warped[k])
         depth = np.full(self._shape, np.nan, dtype=np.float32)
         votes = np.zeros(self._shape, dtype=np.int64)
-        median_vote(carried, agreement, depth, votes)
+        median_vote(warped, agreement, depth, votes)
         return WarpedDepth(depth, votes)
 
 
 @kernel
 def warp_depth(z: np.ndarray, R: np.ndarray, t: np.ndarray, K: np.ndarray, out: np.ndarray) -> None:
-    """Splats depth float32 [h, w] of one view into another (`R, t`: first to second); nearest wins.
+    """Warp depth float32 [h, w] of one view into another (`R, t`: first to second), with a z-buffer.
 
-    A pixel covers as many pixels as it grows by coming nearer, and a third of a pixel more to close seams.
+    A pixel covers an area that grows as it comes nearer, plus 0.3 px on each side to close gaps.
     """
     h, w = z.shape
     fx, fy, cx, cy = K[0], K[1], K[2], K[3]
@@ -82,16 +82,16 @@ def warp_depth(z: np.ndarray, R: np.ndarray, t: np.ndarray, K: np.ndarray, out: 
 
 
 @kernel
-def median_vote(carried: np.ndarray, agreement: float, depth: np.ndarray, votes: np.ndarray) -> None:
-    """Median over the first axis of float32 [n, h, w] (NaN left out), and the count within `agreement`."""
-    n, h, w = carried.shape
+def median_vote(warped: np.ndarray, agreement: float, depth: np.ndarray, votes: np.ndarray) -> None:
+    """Write the median over the first axis of float32 [n, h, w] without NaN, and the count near it."""
+    n, h, w = warped.shape
     values = np.empty(n, np.float64)
     low, high = np.exp(-agreement), np.exp(agreement)
     for v in range(h):
         for u in range(w):
             count = 0
             for k in range(n):
-                z = carried[k, v, u]
+                z = warped[k, v, u]
                 if z > 0.0:
                     i = count
                     while i > 0 and values[i - 1] > z:

@@ -1,7 +1,7 @@
-"""Beam returns of the drive so far in the floor plane: what stands occluded_walls what the lidar sees now.
+"""Grid map of all beam returns of a drive in the floor plane, for walls that the present scan does not see.
 
-A column of the image may look over a low cupboard at a wall that the lidar saw from elsewhere. Only for
-robots that stay on a floor: a tilting lidar paints other heights.
+A column of the image may show a wall above a low cupboard that hides it from the lidar; the lidar may have
+seen that wall from elsewhere. Only for robots that stay on a floor: a tilting lidar measures other heights.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from beamsplat.common.compiled import kernel
 
 
 class LidarMap:
-    """Grid of return counts and their mean positions; grows with the drive."""
+    """Grid with the number and the mean position of the returns in each cell; grows as needed."""
 
     def __init__(self, cell_m: float = 0.04) -> None:
         self.cell_m = cell_m
@@ -20,7 +20,7 @@ class LidarMap:
         self._cells = np.zeros((0, 0, 3), dtype=np.float32)  # count, sum x, sum y relative to the cell
 
     def add(self, points_map_m: np.ndarray) -> None:
-        """Takes in the returns [N, 2 or 3] of a scan."""
+        """Add the returns float64 [N, 2 or 3] of a scan, in the map frame."""
         if len(points_map_m) == 0:
             return
         xy = points_map_m[:, :2]
@@ -49,7 +49,7 @@ class LidarMap:
         self._cells, self._origin = grown, low
 
     def points(self, min_hits: int = 3) -> np.ndarray:
-        """float64 [N, 2]: mean return of every cell that was hit so often."""
+        """Return the mean return float64 [N, 2] of every cell with `min_hits` returns or more."""
         row, column = np.nonzero(self._cells[..., 0] >= min_hits)
         n = self._cells[row, column, 0].astype(np.float64)
         inner = self._cells[row, column, 1:].astype(np.float64) / n[:, None]
@@ -63,7 +63,7 @@ class LidarMap:
         max_range_m: float = 14.0,
         min_hits: int = 2,
     ) -> np.ndarray:
-        """Ranges float64 [count, M] of the surfaces along each ray, nearest first, NaN = no more."""
+        """Return ranges float64 [count, M] of the surfaces along each ray, nearest first, NaN = none."""
         out = np.full((count, len(azimuth_map_rad)), np.nan)
         if self._cells.size:
             cast_rays(
@@ -85,7 +85,7 @@ def cast_rays(
     min_hits: int,
     out: np.ndarray,  # float64 [L, M]
 ) -> None:
-    """Walks each ray in half cells; a run of hit cells is one surface at its mean range along the ray."""
+    """Write the surface ranges of each ray: steps of half a cell; a run of hit cells is one surface."""
     rows, columns = cells.shape[0], cells.shape[1]
     for k in range(azimuth_rad.shape[0]):
         ca, sa = np.cos(azimuth_rad[k]), np.sin(azimuth_rad[k])

@@ -1,4 +1,4 @@
-"""The network's estimate as a candidate: brought to metres along the scan line, and how far to trust it."""
+"""The depth source's estimate scaled to metres along the scan line, and its uncertainty."""
 
 from __future__ import annotations
 
@@ -10,26 +10,26 @@ import numpy as np
 from beamsplat.services.fusion.pairs import make_pairs
 from beamsplat.services.fusion.scaling import Kind, affine, as_depth
 
-_COLUMNS = 64
-_BAND = 0.10  # of the image's width: how far a beam's ratio reaches sideways
+_COLUMNS = 64  # at which the factor is evaluated; it is interpolated between them
+_BAND = 0.10  # of the image width: standard deviation of the smoothing kernel
 
 
 @dataclass(frozen=True)
 class MetricEstimate:
-    """A network's depth after correction by columns."""
+    """An estimated depth map with a scale factor per image column."""
 
-    estimate: np.ndarray  # float32 [H, W] before it
+    estimate: np.ndarray  # float32 [H, W], uncorrected
     log_factor: np.ndarray  # float64 [W]
-    spread: float  # median |log ratio| at beams that were left out of the correction of their columns
+    spread: float  # median |log ratio| at beams, each with a correction that excludes its neighbours
     pairs: int
 
     @property
     def depth_m(self) -> np.ndarray:
-        """float32 [H, W]."""
+        """Return the corrected depth float32 [H, W]."""
         return self.estimate * np.exp(self.log_factor).astype(np.float32)
 
     def at_size(self, width: int, height: int) -> np.ndarray:
-        """float32 [height, width]: the depth at the nearest pixels."""
+        """Return the corrected depth float32 [height, width], sampled at the nearest pixels."""
         small = cv2.resize(self.estimate, (width, height), interpolation=cv2.INTER_NEAREST)
         columns = (np.arange(width) * self.estimate.shape[1]) // width
         return small * np.exp(self.log_factor[columns]).astype(np.float32)
@@ -38,10 +38,10 @@ class MetricEstimate:
 def metric_estimate(
     values: np.ndarray, kind: Kind, uv_px: np.ndarray, z_m: np.ndarray
 ) -> MetricEstimate | None:
-    """The estimate times a factor that varies smoothly over the columns; None if too few beams meet it.
+    """Return the estimate with a smooth scale factor per column; None if there are too few pairs.
 
-    The spread is measured at each beam with a correction made without its neighbours: what the estimate
-    would be worth away from the scan line, seen from what it is worth along it.
+    The spread is measured by leave-neighbours-out at each beam. It stands for the error of the estimate away
+    from the scan line. Arguments as in `scaling.ratio`.
     """
     if kind == "disparity":
         fitted = affine(values, kind, uv_px, z_m)
@@ -63,7 +63,7 @@ def metric_estimate(
 
 
 def _smooth(at: np.ndarray, u: np.ndarray, values: np.ndarray, band: float, exclude: float) -> np.ndarray:
-    """Gaussian kernel means [M], samples nearer than `exclude` left out, drawn to the median of all."""
+    """Return kernel means [M], without samples nearer than `exclude`, shrunk to the overall median."""
     distance = np.abs(at[:, None] - u[None])
     weight = np.exp(-0.5 * (distance / band) ** 2) * (distance >= exclude)
     centre = float(np.median(values))

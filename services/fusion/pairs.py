@@ -1,4 +1,4 @@
-"""Pairs of a beam's optical z and the dense estimate at its pixel, and the clustering of their ratios."""
+"""Pairs of beam depth and estimated depth at the same pixel, and clustering of their ratios."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Pairs:
-    """Beams that fell on pixels with an answer."""
+    """Beams on pixels with an estimate."""
 
     uv_px: np.ndarray  # float64 [N, 2]
     z_m: np.ndarray  # float64 [N]: optical z of the beam, not its range (l_j of the paper)
@@ -28,7 +28,7 @@ def make_pairs(
     z_m: np.ndarray,  # float64 [N]
     max_jump: float = 0.10,
 ) -> Pairs:
-    """Pairs at the beams' pixels; a pixel whose neighbours differ by more than `max_jump` is left out."""
+    """Return the pairs, without pixels whose neighbours differ by more than `max_jump` (a ratio)."""
     h, w = estimate.shape
     u = np.clip(np.rint(uv_px[:, 0]).astype(int), 0, w - 1)
     v = np.clip(np.rint(uv_px[:, 1]).astype(int), 0, h - 1)
@@ -43,11 +43,11 @@ def make_pairs(
 
 
 def largest_cluster(values: np.ndarray, radius: float, least: int = 4) -> np.ndarray:
-    """bool [N]: members of the largest density cluster of numbers [N] (DBSCAN in one dimension).
+    """Return bool [N]: members of the largest density cluster of numbers [N] (DBSCAN in one dimension).
 
     A core value has `least` values (itself included) within `radius`; cores closer than `radius` are one
-    cluster, values within `radius` of a core belong to it. Sorting makes it O(N log N). With no core at
-    all nobody is a member.
+    cluster, values within `radius` of a core belong to it. O(N log N). Without a core value
+    there is no member.
     """
     count = len(values)
     member = np.zeros(count, dtype=bool)
@@ -71,9 +71,9 @@ def largest_cluster(values: np.ndarray, radius: float, least: int = 4) -> np.nda
 
 
 def effective_count(residuals: np.ndarray) -> float:
-    """How many independent values neighbouring residuals [N] are worth (first-order autocorrelation).
+    """Return the effective sample size of residuals [N] in scan order (first-order autocorrelation).
 
-    Beams next to each other see the same surface, and the network errs on it as one.
+    Neighbouring beams hit the same surface, on which the errors of the network are correlated.
     """
     count = len(residuals)
     if count < 4:

@@ -1,8 +1,8 @@
-"""Relative poses of two images, refined on tracked corners about a prior from localization.
+"""Relative pose of two images, refined on tracked corners with a prior from localization.
 
-A degree tenth of yaw is a pixel, and a pixel of error is ten per cent of depth at a short baseline. The
-epipolar constraint sees all of the relative rotation and the direction of the translation; its length
-stays with the prior, which is metric.
+An error of 0.1 degrees of yaw is about one pixel, which at a short baseline is 10 % of depth. The epipolar
+constraint determines the relative rotation and the direction of the translation; the length comes from the
+metric prior.
 """
 
 from __future__ import annotations
@@ -13,12 +13,13 @@ import numpy as np
 from beamsplat.common.geometry.camera import Pinhole
 from beamsplat.common.geometry.transforms import skew, so3_exp
 
+# Parameters of pyramidal Lucas-Kanade tracking.
 _LK = {"winSize": (13, 13), "maxLevel": 3, "flags": cv2.OPTFLOW_USE_INITIAL_FLOW}
-MIN_TRACKS = 12
+MIN_TRACKS = 12  # fewer tracks do not refine a pose
 
 
 def detect_corners(grey: np.ndarray, most: int = 150) -> np.ndarray:
-    """Corners float32 [N, 2] (u, v) of an uint8 [H, W] image, best first."""
+    """Return corners float32 [N, 2] (u, v) of an image uint8 [H, W], best first (Shi-Tomasi)."""
     found = cv2.goodFeaturesToTrack(grey, most, 0.01, 8)
     return np.zeros((0, 2), np.float32) if found is None else found.reshape(-1, 2)
 
@@ -26,7 +27,17 @@ def detect_corners(grey: np.ndarray, most: int = 150) -> np.ndarray:
 def track_corners(
     grey: np.ndarray, other: np.ndarray, uv: np.ndarray, predicted: np.ndarray, tolerance_px: float = 0.4
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(uv in `other` float32 [N, 2], bool [N]): Lucas-Kanade there and back."""
+    """Track points from `grey` to `other` by Lucas-Kanade, forward and backward.
+
+    Args:
+        grey, other: uint8 [H, W].
+        uv: float32 [N, 2], points in `grey`.
+        predicted: float32 [N, 2], start values in `other`.
+        tolerance_px: largest difference of a point and its backward track.
+
+    Returns:
+        Points in `other` float32 [N, 2], and bool [N]: tracked in both directions.
+    """
     if len(uv) == 0:
         return uv.copy(), np.zeros(0, dtype=bool)
     start = np.ascontiguousarray(predicted, dtype=np.float32)[:, None]
@@ -46,7 +57,7 @@ def refine_relative_pose(
     pixel_sigma: float = 0.4,
     iterations: int = 6,
 ) -> np.ndarray:
-    """Most probable T_b_a [4, 4]: Gauss-Newton on epipolar distances (Cauchy weights) and the prior."""
+    """Return the most probable T_b_a: Gauss-Newton on epipolar distances (Cauchy weights) and prior."""
     prior = np.diag([1.0 / rotation_sigma_rad**2] * 3 + [1.0 / translation_sigma_m**2] * 3)
     x = np.zeros(6)
 
@@ -74,7 +85,7 @@ def refine_relative_pose(
 
 
 def epipolar_px(T_b_a: np.ndarray, rays_a: np.ndarray, rays_b: np.ndarray, focal_px: float) -> np.ndarray:
-    """Signed distances [N], pixels, of the rays in b from the epipolar lines of the rays in a."""
+    """Return signed distances [N], pixels, of the rays in b from the epipolar lines of the rays in a."""
     baseline = T_b_a[:3, 3]
     E = skew(baseline / max(float(np.linalg.norm(baseline)), 1e-9)) @ T_b_a[:3, :3]
     lines = rays_a @ E.T
@@ -91,7 +102,7 @@ def refine_from_images(
     rotation_sigma_rad: float,
     translation_sigma_m: float,
 ) -> np.ndarray:
-    """`refine_relative_pose` on corners tracked from a to b; the prior itself where too few can be tracked."""
+    """Return `refine_relative_pose` on corners tracked from a to b; `T_b_a` itself if there are too few."""
     if len(uv_a) < MIN_TRACKS:
         return T_b_a
     rays_a = camera.rays(uv_a)

@@ -1,4 +1,4 @@
-"""What fusion gives for one image, whatever the method."""
+"""Result of fusion for one image, the same for every method."""
 
 from __future__ import annotations
 
@@ -9,29 +9,28 @@ import numpy as np
 
 @dataclass(frozen=True)
 class FusionResult:
-    """Metric depth with its error bar. With a status other than "ok" all depth is NaN: nothing to misuse."""
+    """Metric depth with its standard deviation. All depth is NaN unless `status` is "ok"."""
 
     depth_m: np.ndarray  # float32 [H, W] optical z, NaN = unknown
-    sigma_m: np.ndarray  # float32 [H, W] standard deviation, NaN where depth is
-    status: str = "ok"
-    scale: float = float("nan")  # metres per unit of the estimate (alpha of the paper)
+    sigma_m: np.ndarray  # float32 [H, W] standard deviation, NaN where depth is NaN
+    status: str = "ok"  # else the reason why there is no depth
+    scale: float = float("nan")  # metres per unit of the depth estimate (alpha of the paper)
     scale_sigma: float = float("nan")  # its standard error
-    inlier_share: float = 0.0  # of the pairs
+    inlier_share: float = 0.0  # share of the pairs that agree with the result
     residual_m: float = float("nan")  # median |error| at the pairs after correction
     pairs: int = 0
-    age_ns: int = 0  # image stamp minus that of the newest beams used
 
     @property
     def ok(self) -> bool:
         return self.status == "ok"
 
-    def refused(self, why: str) -> FusionResult:
-        """The same figures with a reason, and no depth."""
+    def as_rejected(self, why: str) -> FusionResult:
+        """Return a copy without depth, whose status is `why`."""
         empty = np.full(self.depth_m.shape, np.nan, dtype=np.float32)
         return replace(self, depth_m=empty, sigma_m=empty.copy(), status=why)
 
 
 def rejected(shape: tuple[int, int], why: str) -> FusionResult:
-    """A result without depth."""
+    """Return a result of size (height, width) without depth, whose status is `why`."""
     empty = np.full(shape, np.nan, dtype=np.float32)
     return FusionResult(empty, empty.copy(), status=why)

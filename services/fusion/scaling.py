@@ -1,4 +1,4 @@
-"""One correction for a whole image: the paper's ratio, and scale with shift in inverse depth."""
+"""One correction for a whole image: the paper's ratio, or scale and shift in inverse depth."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ Kind = Literal["metric", "relative", "disparity", "none"]
 
 MIN_PAIRS = 12
 MIN_INLIER_SHARE = 0.3
-_RADIUS = (
-    0.2  # of log ratios: along one row a small network errs by tens of per cent; beyond lies what it missed
-)
+# Cluster radius of log ratios: along one image row a small network errs by tens of per cent; larger
+# differences come from objects that it does not see.
+_RADIUS = 0.2
 _MAX_DEPTH_M = 30.0
 
 
 def as_depth(values: np.ndarray, kind: Kind) -> np.ndarray:
-    """The estimate as something proportional to depth; a disparity's unknown shift is taken as zero."""
+    """Return values proportional to depth, float32 [H, W]; the shift of a disparity is taken as 0."""
     if kind != "disparity":
         return values
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -29,7 +29,7 @@ def as_depth(values: np.ndarray, kind: Kind) -> np.ndarray:
 
 
 def ratio(values: np.ndarray, kind: Kind, uv_px: np.ndarray, z_m: np.ndarray) -> FusionResult:
-    """The paper: D_scaled = alpha D with alpha = sum(l_j) / sum(d_j) over the largest cluster of ratios.
+    """Return alpha D with the paper's alpha = sum(l_j) / sum(d_j) over the largest cluster of ratios.
 
     Args:
         values: float32 [H, W], the dense estimate.
@@ -51,7 +51,7 @@ def ratio(values: np.ndarray, kind: Kind, uv_px: np.ndarray, z_m: np.ndarray) ->
 
 @dataclass(frozen=True)
 class ScaleFit:
-    """The paper's alpha with its standard error, and how well the pairs agree on it."""
+    """The paper's alpha, its standard error and the agreement of the pairs."""
 
     alpha: float
     sigma: float
@@ -62,14 +62,14 @@ class ScaleFit:
 
 
 def fit_scale(estimate: np.ndarray, uv_px: np.ndarray, z_m: np.ndarray) -> ScaleFit | str:
-    """alpha of a estimate proportional to depth, float32 [H, W]; or one sentence on why there is none."""
+    """Return alpha of an estimate float32 [H, W] proportional to depth, or the reason why there is none."""
     pairs = make_pairs(estimate, uv_px, z_m)
     if len(pairs) < MIN_PAIRS:
         return _too_few(len(uv_px), len(pairs))
     inlier = largest_cluster(np.log(pairs.z_m / pairs.estimate), _RADIUS)
     used = pairs.take(inlier)
     if len(used) < MIN_PAIRS or inlier.mean() < MIN_INLIER_SHARE:
-        return f"beams and estimate agree on no scale ({len(used)} of {len(pairs)} pairs)"
+        return f"beams and depth estimate do not agree on one scale ({len(used)} of {len(pairs)} pairs)"
     alpha = float(used.z_m.sum() / used.estimate.sum())
     residual = used.z_m - alpha * used.estimate
     n_eff = effective_count(residual)
@@ -82,10 +82,10 @@ def fit_scale(estimate: np.ndarray, uv_px: np.ndarray, z_m: np.ndarray) -> Scale
 
 
 def affine(values: np.ndarray, kind: Kind, uv_px: np.ndarray, z_m: np.ndarray) -> FusionResult:
-    """1/z = a q + b with q the estimate in inverse depth: what affine-invariant disparity needs.
+    """Return depth from 1/z = a q + b, where q is the estimate in inverse depth (affine-invariant disparity).
 
     Robust: median of slopes (Theil-Sen over fixed partners), then reweighted least squares (Tukey). With
-    too little spread in q the shift cannot be told and stays zero. Arguments as in `ratio`.
+    too little spread in q the shift b is not observable and stays 0. Arguments as in `ratio`.
     """
     pairs = make_pairs(as_depth(values, kind), uv_px, z_m)
     if len(pairs) < MIN_PAIRS:
@@ -94,12 +94,14 @@ def affine(values: np.ndarray, kind: Kind, uv_px: np.ndarray, z_m: np.ndarray) -
     a, b, weight = _robust_line(q, y)
     if not a > 0.0:
         return rejected(
-            values.shape, "nearer in the estimate is farther for the beams: wrong network or wrong beams"
+            values.shape,
+            "nearer in the depth estimate is farther for the beams: the network or the beams are wrong",
         )
     inlier = weight > 0.0
     if inlier.mean() < MIN_INLIER_SHARE:
         return rejected(
-            values.shape, f"beams and estimate agree on no line ({inlier.sum()} of {len(pairs)} pairs)"
+            values.shape,
+            f"beams and depth estimate do not fit one line ({inlier.sum()} of {len(pairs)} pairs)",
         )
     with np.errstate(divide="ignore", invalid="ignore"):
         q_all = values if kind == "disparity" else 1.0 / values
@@ -118,7 +120,7 @@ def affine(values: np.ndarray, kind: Kind, uv_px: np.ndarray, z_m: np.ndarray) -
 
 
 def _robust_line(q: np.ndarray, y: np.ndarray) -> tuple[float, float, np.ndarray]:
-    """(a, b, weights [N]) of y = a q + b."""
+    """Return (a, b, weights [N]) of the robust fit y = a q + b."""
     order = np.argsort(q, kind="stable")
     half = len(q) // 2
     low, high = order[:half], order[-half:]
@@ -151,5 +153,5 @@ def _too_few(beams: int, pairs: int) -> str:
     if beams == 0:
         return "no beams in view"
     return (
-        f"only {pairs} of {beams} beams in view fall on pixels with a depth estimate; {MIN_PAIRS} are needed"
+        f"only {pairs} of {beams} beams in view fall on pixels with estimated depth; {MIN_PAIRS} are needed"
     )

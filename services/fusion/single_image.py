@@ -1,4 +1,4 @@
-"""One correction for the whole image, without memory: the paper's ratio, an affine fit, or none at all."""
+"""Fusion of one image at a time by one global correction: the paper's ratio, an affine fit, or none."""
 
 from __future__ import annotations
 
@@ -14,27 +14,29 @@ from beamsplat.services.fusion.result import FusionResult, rejected
 from beamsplat.services.fusion.scaling import affine, as_depth, ratio
 
 SingleMethod = Literal["ratio", "affine", "given"]
-_GIVEN_SIGMA = 0.3  # relative: nobody has looked whether the estimate is right
+_GIVEN_SIGMA = 0.3  # relative sigma of an estimate that nothing has checked
 
 
 class SingleImageFusion:
-    """In the place of `Fusion` where a deployment asks for the paper's way; `given` takes the estimate's word
-    for it, for robots without a lidar."""
+    """Fusion by the methods `ratio`, `affine` and `given`, with the interface of `Fusion`.
+
+    `given` uses the depth estimate without correction, for robots without a lidar.
+    """
 
     def __init__(self, camera: Pinhole, T_body_camera: np.ndarray, method: SingleMethod) -> None:
         self._camera, self._T_body_camera, self._method = camera, T_body_camera, method
-        self._health = ImageCheck()
+        self._image_check = ImageCheck()
 
     def add_scan(self, points_map_m: np.ndarray) -> None:
-        """Scans are of no use beyond their moment."""
+        """Ignore the scan: these methods use only the beams of the image."""
 
     def fuse(self, frame: FusionInput, *, keyframe: bool) -> FusionResult:
-        """Depth of one image; keyframes are no different."""
-        status = self._health.judge(frame.image_rgb, frame.T_map_body)
+        """Return the depth of one image; `keyframe` has no effect."""
+        status = self._image_check.check(frame.image_rgb, frame.T_map_body)
         if status != "ok":
             return rejected(self._camera.shape, status)
         if frame.estimate is None:
-            return rejected(self._camera.shape, "there is no depth estimate to correct")
+            return rejected(self._camera.shape, "there is no depth estimate")
         if self._method == "given":
             depth = as_depth(frame.estimate, frame.estimate_kind).astype(np.float32)
             return FusionResult(depth, np.float32(_GIVEN_SIGMA) * depth, scale=1.0)

@@ -12,27 +12,25 @@ from beamsplat.common.geometry.transforms import yaw_of
 from beamsplat.services.fusion.lidar_map import LidarMap
 from beamsplat.services.fusion.wall_lines import find_lines, ranges_to_lines
 
-_LAYER_RAYS_PER_PX, _WALL_RAYS_PER_PX = 2, 8
-_CONTINUED = 3  # continued walls a ray may meet
-_POST_HEIGHT_M = 0.35  # how far from the lidar plane legs and posts are taken to reach
+_COARSE_AZIMUTHS_PER_PX, _FINE_AZIMUTHS_PER_PX = 2, 8
+_CONTINUED = 3  # extrapolated walls per ray
+_POST_HEIGHT_M = 0.35  # assumed extent of legs and posts above and below the lidar plane
 
 
 @dataclass(frozen=True)
 class CandidateSurfaces:
-    """Optical z [h, w] of each candidate surface, NaN where it is not met."""
+    """Optical z [h, w] of each candidate surface, NaN where the ray does not meet it."""
 
-    wall: np.ndarray  # the nearest beam of the column, extruded upright
-    background_wall: (
-        np.ndarray
-    )  # the same without what is narrow (legs, posts): what stands occluded_walls it
+    wall: np.ndarray  # nearest beam of the column, extruded vertically
+    background_wall: np.ndarray  # the same without narrow objects (legs, posts)
     wall_offset_m: np.ndarray  # how far above or below the lidar plane the pixel meets that wall
     floor: np.ndarray
-    occluded_walls: tuple[np.ndarray, ...]  # walls farther back, from the drive so far
+    occluded_walls: tuple[np.ndarray, ...]  # walls behind it, from the lidar map
     ceilings: tuple[np.ndarray, ...]
 
     @property
     def nearest(self) -> np.ndarray:
-        """What one sees if nothing but these surfaces exists (`stixel`, and ceilings)."""
+        """Return the nearest of wall, floor and ceilings [h, w], as if nothing else existed."""
         with np.errstate(invalid="ignore"):
             high = self.wall_offset_m > _POST_HEIGHT_M
         near = np.fmin(np.where(high, self.background_wall, self.wall), self.floor)
@@ -42,42 +40,44 @@ class CandidateSurfaces:
 
     @property
     def on_floor(self) -> np.ndarray:
-        """bool [h, w]: the floor comes before the wall."""
+        """Return bool [h, w]: the floor is nearer than the wall."""
         with np.errstate(invalid="ignore"):
             return np.isfinite(self.floor) & ~(self.wall < self.floor)
 
 
 class SurfacePredictor:
-    """Rays of the working size in the body frame, and the surfaces they meet."""
+    """Intersection of the rays of one camera with the candidate surfaces."""
 
     def __init__(self, camera: Pinhole, T_body_camera: np.ndarray, *, floor_known: bool) -> None:
         self._T_body_camera = T_body_camera
         self._floor_known = floor_known
         self.rays_body = camera.ray_grid() @ T_body_camera[:3, :3].T
         self._azimuth = np.arctan2(self.rays_body[..., 1], self.rays_body[..., 0])
-        self._across = np.maximum(np.hypot(self.rays_body[..., 0], self.rays_body[..., 1]), 1e-9)
-        self.rise = np.ascontiguousarray(self.rays_body[..., 2])
+        self._ray_xy = np.maximum(np.hypot(self.rays_body[..., 0], self.rays_body[..., 1]), 1e-9)
+        self.ray_z = np.ascontiguousarray(self.rays_body[..., 2])
         self.camera_z_m = float(T_body_camera[2, 3])
-        empty = np.full(self.rise.shape, np.nan)
+        empty = np.full(self.ray_z.shape, np.nan)
         self.floor = plane_depth(self.rays_body, self.camera_z_m) if floor_known else empty
-        self._fan, self._fan_index = self._fan_of(_LAYER_RAYS_PER_PX * camera.width_px)
-        self._wall_fan, self._wall_index = self._fan_of(_WALL_RAYS_PER_PX * camera.width_px)
+        self._coarse_azimuths, self._coarse_index = self._azimuth_grid(
+            _COARSE_AZIMUTHS_PER_PX * camera.width_px
+        )
+        self._fine_azimuths, self._fine_index = self._azimuth_grid(_FINE_AZIMUTHS_PER_PX * camera.width_px)
 
-    def _fan_of(self, count: int) -> tuple[np.ndarray, np.ndarray]:
-        """(azimuths [count], int64 [h, w]: the one nearest to each pixel's)."""
+    def _azimuth_grid(self, count: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return `count` azimuths over the view, and int64 [h, w]: the index of each pixel's nearest one."""
         low, high = float(self._azimuth.min()), float(self._azimuth.max())
         place = (self._azimuth - low) / max(high - low, 1e-9) * (count - 1)
         index = np.clip(np.rint(place).astype(np.int64), 0, count - 1)
         return np.linspace(low, high, count), index
 
-    def _upright(self, azimuth: np.ndarray, reach: np.ndarray) -> np.ndarray:
-        """Optical z [h, w] of beams extruded upright: on a fan of rays finer than pixels."""
-        return wall_ranges(self._wall_fan, azimuth, reach)[self._wall_index] / self._across
+    def _extrude(self, azimuth: np.ndarray, reach: np.ndarray) -> np.ndarray:
+        """Return optical z [h, w] of beams extruded vertically, sampled finer than the pixels."""
+        return wall_ranges(self._fine_azimuths, azimuth, reach)[self._fine_index] / self._ray_xy
 
-    def _behind(self, ranges: np.ndarray, wall: np.ndarray) -> list[np.ndarray]:
-        """Optical z [h, w] of ranges [L, fan] where they lie occluded_walls the wall and before the floor."""
+    def _occluded(self, ranges: np.ndarray, wall: np.ndarray) -> list[np.ndarray]:
+        """Return optical z [h, w] of the ranges [L, M] that are behind the wall and before the floor."""
         layers = []
-        for layer in ranges[:, self._fan_index] / self._across:
+        for layer in ranges[:, self._coarse_index] / self._ray_xy:
             with np.errstate(invalid="ignore"):
                 farther = (layer > 1.08 * wall) & ~(self.floor < layer)
             if farther.any():
@@ -91,45 +91,47 @@ class SurfacePredictor:
         T_map_body: np.ndarray,
         ceiling_heights_m: tuple[float, ...],
     ) -> CandidateSurfaces:
-        """Candidate surfaces of one view; `ceiling_heights_m` are above the floor."""
+        """Return the candidate surfaces of one view; `ceiling_heights_m` are above the floor."""
         points = beams.points_body_m
         points = points[~hidden_beams(points, self._T_body_camera)]
         azimuth, reach = plan_polar(points, self._T_body_camera)
-        wall = self._upright(azimuth, reach)
+        wall = self._extrude(azimuth, reach)
         lidar_z_m = float(np.median(points[:, 2])) if len(points) else 0.0
-        off = np.abs(self.camera_z_m + wall * self.rise - lidar_z_m)
-        background_wall = self._upright(azimuth, remove_narrow_objects(azimuth, reach))
+        wall_offset = np.abs(self.camera_z_m + wall * self.ray_z - lidar_z_m)
+        background_wall = self._extrude(azimuth, remove_narrow_objects(azimuth, reach))
         occluded_walls: list[np.ndarray] = []
         if lidar_map is not None:
             position = (T_map_body @ self._T_body_camera)[:2, 3]
-            ranges = lidar_map.layers(position, self._fan + float(yaw_of(T_map_body)))
-            occluded_walls += self._behind(ranges, wall)
+            ranges = lidar_map.layers(position, self._coarse_azimuths + float(yaw_of(T_map_body)))
+            occluded_walls += self._occluded(ranges, wall)
             lines = find_lines(lidar_map.points(), lidar_map.cell_m)
-            front = wall_ranges(self._fan, azimuth, reach)
+            front = wall_ranges(self._coarse_azimuths, azimuth, reach)
             beyond = np.maximum(np.nan_to_num(front, nan=np.inf) * 1.08, front + 0.15)
-            met = ranges_to_lines(lines, position, self._fan + float(yaw_of(T_map_body)), beyond, _CONTINUED)
-            occluded_walls += self._behind(met, wall)
+            hit_ranges = ranges_to_lines(
+                lines, position, self._coarse_azimuths + float(yaw_of(T_map_body)), beyond, _CONTINUED
+            )
+            occluded_walls += self._occluded(hit_ranges, wall)
         ceilings = []
         for height in ceiling_heights_m:
             plane = plane_depth(self.rays_body, self.camera_z_m, height)
             with np.errstate(invalid="ignore"):
-                ceilings.append(np.where((self.rise > 0.02) & (plane < background_wall), plane, np.nan))
+                ceilings.append(np.where((self.ray_z > 0.02) & (plane < background_wall), plane, np.nan))
         return CandidateSurfaces(
-            wall, background_wall, off, self.floor, tuple(occluded_walls), tuple(ceilings)
+            wall, background_wall, wall_offset, self.floor, tuple(occluded_walls), tuple(ceilings)
         )
 
 
 def remove_narrow_objects(
     azimuth_rad: np.ndarray, reach_m: np.ndarray, width_m: float = 0.3, jump: float = 1.15
 ) -> np.ndarray:
-    """Ranges [N] with narrow things replaced by what stands beside them.
+    """Return ranges [N] in which narrow objects are replaced by the surface beside them.
 
-    A run of beams no wider than `width_m` whose neighbours on both sides are farther by `jump` is a leg,
-    a post, the end of a rail: it seldom reaches the ceiling.
+    A run of beams no wider than `width_m` whose neighbours on both sides are farther by the factor `jump` is
+    a leg or a post. Such objects seldom reach the ceiling.
     """
     order = np.argsort(azimuth_rad, kind="stable")
     a, r = azimuth_rad[order], reach_m[order].copy()
-    for _ in range(2):  # a post before a post
+    for _ in range(2):  # two passes: a post in front of a post
         cut = np.flatnonzero(np.maximum(r[1:], r[:-1]) > jump * np.minimum(r[1:], r[:-1])) + 1
         starts, stops = np.concatenate([[0], cut]), np.concatenate([cut, [len(r)]])
         out = r.copy()
@@ -149,9 +151,9 @@ def remove_narrow_objects(
 
 
 class CeilingDetector:
-    """Heights of horizontal planes overhead: where they explain images better than the walls occluded_walls.
+    """Detector of horizontal planes overhead, from matching costs of keyframes.
 
-    Evidence fades by a tenth a keyframe, so that the next room may have another ceiling.
+    Evidence decays by 10 % per keyframe, so that the next room may have another ceiling.
     """
 
     def __init__(self, low_m: float = 1.6, high_m: float = 4.5, step_m: float = 0.05) -> None:
@@ -160,11 +162,11 @@ class CeilingDetector:
         self._apart = round(0.2 / step_m)
 
     def add(self, gain: np.ndarray) -> None:
-        """Evidence [n] of one keyframe."""
+        """Add the evidence [n] of one keyframe, one value per height (`volume_kernels.plane_gain`)."""
         self._evidence = 0.9 * self._evidence + gain
 
     def heights(self, least: float, most: int = 2) -> tuple[float, ...]:
-        """Heights of up to `most` peaks of the evidence above `least`, strongest first, 0.25 m apart."""
+        """Return the heights of up to `most` peaks of the evidence above `least`, strongest first."""
         e = self._evidence
         peaks = [k for k in range(1, len(e) - 1) if e[k] > least and e[k] > e[k - 1] and e[k] >= e[k + 1]]
         found: list[int] = []

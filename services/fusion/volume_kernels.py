@@ -1,7 +1,7 @@
-"""Kernels of the plane sweep: matching costs over depth labels, priors added, semi-global aggregation.
+"""Numba kernels of the plane sweep: matching cost volume, priors, semi-global aggregation.
 
-`volume_reference.py` holds the slow twins. All arrays float32 unless said; `h, w` is the working size and
-`D` the number of labels, spaced evenly in log depth.
+`volume_reference.py` has plain Python versions for the tests. Arrays are float32 unless stated; `h, w` is the
+working size and `D` the number of depth labels, evenly spaced in log depth.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import numpy as np
 
 from beamsplat.common.compiled import kernel
 
-_BEST = 4  # costs kept of each label; the mean of the better half of the views counts (occlusion)
+_BEST = 4  # lowest costs kept per label; the mean of the two lowest is used (robust to occlusion)
 
 
 @kernel
@@ -25,10 +25,10 @@ def cost_volume(
     truncation: float,
     out: np.ndarray,  # [h, w, D]
 ) -> None:
-    """Mean absolute feature difference over the better half of the views that see each label's point.
+    """Write the mean absolute feature difference over the two best views of each pixel and label.
 
-    A label that no view sees gets what a random label of this pixel costs, halfway to its best; a pixel
-    whose labels are mostly unseen says nothing at all.
+    A label that no view sees gets the mean of the pixel's lowest and average cost. A pixel of which less
+    than 40 % of the labels are seen gets a constant cost.
     """
     one = np.float32(1.0)
     cut = np.float32(truncation)
@@ -82,11 +82,11 @@ def cost_volume(
                         best[d, k] = best[d, k - 1]
                         k -= 1
                     best[d, k] = cost
-            _finish(best, count, last, cut, out[v, u])
+            _combine_views(best, count, last, cut, out[v, u])
 
 
 @kernel
-def _finish(best: np.ndarray, count: np.ndarray, last: int, cut: float, out: np.ndarray) -> None:
+def _combine_views(best: np.ndarray, count: np.ndarray, last: int, cut: float, out: np.ndarray) -> None:
     D = out.shape[0]
     lowest, total, seen = cut, np.float32(0.0), 0
     for d in range(last):
@@ -112,7 +112,7 @@ def _finish(best: np.ndarray, count: np.ndarray, last: int, cut: float, out: np.
 
 @kernel
 def box3(volume: np.ndarray, scale: float, out: np.ndarray) -> None:
-    """Each label's costs averaged over 3 x 3 pixels (edges repeated), times `scale`."""
+    """Write the costs of each label, averaged over 3 x 3 pixels (edges repeated), times `scale`."""
     h, w, D = volume.shape
     gain = np.float32(scale / 9.0)
     row = np.empty((w, D), np.float32)
@@ -131,12 +131,12 @@ def box3(volume: np.ndarray, scale: float, out: np.ndarray) -> None:
 def add_prior(
     volume: np.ndarray,  # [h, w, D], changed in place
     z: np.ndarray,  # [h, w] depth of the surface expected, NaN = none
-    weight: np.ndarray,  # [h, w]: how much the label nearest to it gets cheaper
+    weight: np.ndarray,  # [h, w] depth of the Gaussian well
     log_z0: float,
     log_step: float,
-    width: float,  # labels: standard deviation of the well
+    width: float,  # standard deviation of the well, in labels
 ) -> None:
-    """Digs a Gaussian well of the cost at the depth of an expected surface."""
+    """Subtract a Gaussian around the depth of an expected surface from the cost, in place."""
     h, w, D = volume.shape
     for v in range(h):
         for u in range(w):
@@ -156,12 +156,12 @@ def aggregate(
     guide: np.ndarray,  # [h, w] grey values
     dv: int,
     du: int,
-    p1: float,  # one label up or down
-    p2: float,  # any jump, on plain ground
-    edge_grey: float,  # grey step at which a jump costs half
+    p1: float,  # penalty for one label up or down
+    p2: float,  # penalty for a larger jump without a grey edge
+    edge_grey: float,  # grey step at which p2 is halved
     total: np.ndarray,  # [h, w, D], added to
 ) -> None:
-    """One direction of semi-global matching (Hirschmueller 2008, eq. 13), jumps cheaper at grey edges."""
+    """Add the path costs of one direction (Hirschmueller 2008, eq. 13); p2 is lower at grey edges."""
     h, w, D = cost.shape
     before, now = np.empty(D, np.float32), np.empty(D, np.float32)
     one_step, jump = np.float32(p1), np.float32(p2)
@@ -200,7 +200,7 @@ def winner_takes_all(
     depth: np.ndarray,  # [h, w] out: depth of the cheapest label, between labels by a parabola
     spread: np.ndarray,  # [h, w] out: standard deviation of log depth about it
 ) -> None:
-    """Cheapest labels, and how far exp(-cost / temperature) spreads over other depths."""
+    """Write the depth of the cheapest labels, and the spread of the distribution exp(-cost / temperature)."""
     h, w, D = total.shape
     step = log_z[1] - log_z[0]
     for v in range(h):
@@ -230,14 +230,14 @@ def winner_takes_all(
 def plane_gain(
     volume: np.ndarray,  # [h, w, D]
     rise: np.ndarray,  # [h, w]: upward part of the rays (z_camera = 1) in the body frame
-    wall: np.ndarray,  # [h, w] depth of the vertical surface occluded_walls, NaN = none
+    wall: np.ndarray,  # [h, w] depth of the vertical surface behind it, NaN = none
     camera_z_m: float,
     log_z0: float,
     log_step: float,
     heights_m: np.ndarray,  # [n]
     gain: np.ndarray,  # [n] out
 ) -> None:
-    """How much cheaper a horizontal plane at each height explains the image than the walls occluded_walls it."""
+    """Write, per height, by how much a horizontal plane costs less than the walls behind it."""
     h, w, D = volume.shape
     for k in range(heights_m.shape[0]):
         total = 0.0
@@ -253,8 +253,8 @@ def plane_gain(
                 j = int(np.rint((np.log(wall[v, u]) - log_z0) / log_step))
                 if i < 0 or i >= D - 1 or j < 1 or j >= D - 1:
                     continue
-                # The wall gets the best of three labels, the plane exactly its own: else a plane a little
-                # too low gains as much as the right one.
+                # The wall gets the best of three labels, the plane exactly its own. Otherwise a plane that
+                # is a little too low would gain as much as the right one.
                 on_plane = volume[v, u, i] + (place - i) * (volume[v, u, i + 1] - volume[v, u, i])
                 on_wall = min(volume[v, u, j], volume[v, u, j - 1], volume[v, u, j + 1])
                 total += on_wall - on_plane

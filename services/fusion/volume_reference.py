@@ -1,4 +1,4 @@
-"""Kernels of `volume_kernels.py` in plain Python: slow, short, the truth for their tests."""
+"""Plain Python versions of the kernels in `volume_kernels.py`, as the reference of their tests."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 
 
 def sample(image: np.ndarray, x: float, y: float) -> np.ndarray:
-    """Bilinear [C] of [h, w, C] at pixel (x, y)."""
+    """Return the bilinear interpolation [C] of an image [h, w, C] at pixel (x, y)."""
     j, i = int(x), int(y)
     a, b = x - j, y - i
     top = (1 - a) * image[i, j] + a * image[i, j + 1]
@@ -17,7 +17,7 @@ def cost_volume(
     reference: np.ndarray, sources: np.ndarray, R: np.ndarray, t: np.ndarray, K: np.ndarray,
     z: np.ndarray, z_last: np.ndarray, truncation: float,
 ) -> np.ndarray:  # fmt: skip
-    """float64 [h, w, D]; arguments as in the kernel."""
+    """Return the matching cost float64 [h, w, D]; arguments as in the kernel."""
     fx, fy, cx, cy = K
     h, w, _ = reference.shape
     out = np.full((h, w, len(z)), truncation, dtype=np.float64)
@@ -48,7 +48,7 @@ def cost_volume(
 
 
 def box3(volume: np.ndarray, scale: float) -> np.ndarray:
-    """Mean over 3 x 3 pixels with edges repeated, times `scale`."""
+    """Return the mean over 3 x 3 pixels with edges repeated, times `scale`."""
     padded = np.pad(volume, ((1, 1), (1, 1), (0, 0)), mode="edge")
     h, w, _ = volume.shape
     return scale * sum(padded[i : i + h, j : j + w] for i in range(3) for j in range(3)) / 9.0
@@ -57,7 +57,7 @@ def box3(volume: np.ndarray, scale: float) -> np.ndarray:
 def aggregate(
     cost: np.ndarray, guide: np.ndarray, dv: int, du: int, p1: float, p2: float, edge_grey: float
 ) -> np.ndarray:
-    """Path costs float64 [h, w, D] of one direction (Hirschmueller 2008, eq. 13)."""
+    """Return the path costs float64 [h, w, D] of one direction (Hirschmueller 2008, eq. 13)."""
     h, w, D = cost.shape
     out = cost.astype(np.float64).copy()
     rows = range(h) if dv >= 0 else range(h - 1, -1, -1)

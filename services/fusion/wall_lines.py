@@ -1,7 +1,7 @@
-"""Long straight walls of the lidar's map, continued occluded_walls what stands before them.
+"""Line segments of straight walls in the lidar map, extrapolated behind furniture.
 
-Cupboards, sofas and worktops hide the foot of a wall from a lidar near the floor for good; the camera sees
-the wall above them. Walls are straight: the same line comes out again elsewhere.
+Cupboards, sofas and worktops hide the foot of a wall from a lidar near the floor, while the camera sees the
+wall above them. Walls are straight, so a line that is visible elsewhere predicts the hidden part.
 """
 
 from __future__ import annotations
@@ -12,16 +12,16 @@ import numpy as np
 
 from beamsplat.common.compiled import kernel
 
-_ANGLES = 180
-_NEAR_M = 0.06  # of a line: its points
-_REACH_M = 5.0  # a line is continued so far beyond its points
-_PIECE_M, _GAP_M = 0.7, 0.15  # of a wall in one piece
-_GRAZING = 0.12  # sine of the least angle at which a ray meets a line
+_ANGLES = 180  # of the Hough transform, over 180 degrees
+_NEAR_M = 0.06  # distance of inliers from a line
+_REACH_M = 5.0  # extrapolation beyond the outermost inliers
+_PIECE_M, _GAP_M = 0.7, 0.15  # least length of a segment without gaps larger than `_GAP_M`
+_GRAZING = 0.12  # sine of the least angle between ray and line
 
 
 @dataclass(frozen=True)
 class WallLine:
-    """normal . p = offset, with points between two places along (-normal_y, normal_x)."""
+    """Line normal . p = offset; its inliers lie between `low_m` and `high_m` along (-normal_y, normal_x)."""
 
     normal: np.ndarray  # float64 [2], unit
     offset_m: float
@@ -30,13 +30,13 @@ class WallLine:
 
 
 def find_lines(points_m: np.ndarray, cell_m: float, least_m: float = 1.2, most: int = 24) -> list[WallLine]:
-    """Lines through points float64 [N, 2], one a cell of the map: those with most points first (Hough).
+    """Return lines through points float64 [N, 2], those with most inliers first (Hough, then least squares).
 
     Args:
-        points_m: where surfaces stand in the floor plane.
-        cell_m: spacing of the points along a wall.
-        least_m: of wall seen, all pieces together.
-        most: lines.
+        points_m: one point per occupied cell, in the floor plane.
+        cell_m: cell size, which is the spacing of the points along a wall.
+        least_m: least total length of a line's inliers.
+        most: largest number of lines.
     """
     left = points_m
     lines: list[WallLine] = []
@@ -60,7 +60,7 @@ def find_lines(points_m: np.ndarray, cell_m: float, least_m: float = 1.2, most: 
             break
         along = np.sort(left[near] @ np.array([-normal[1], normal[0]]))
         pieces = np.split(along, np.flatnonzero(np.diff(along) > _GAP_M) + 1)
-        # Clutter is in line with clutter now and then, but not without gaps.
+        # Clutter may be collinear by chance, but then it has gaps.
         if max(piece[-1] - piece[0] for piece in pieces) >= _PIECE_M:
             lines.append(WallLine(normal, offset, float(along[0]), float(along[-1])))
         left = left[~near]
@@ -69,7 +69,7 @@ def find_lines(points_m: np.ndarray, cell_m: float, least_m: float = 1.2, most: 
 
 @kernel
 def hough_vote(points: np.ndarray, cell_m: float, reach_m: float, votes: np.ndarray) -> None:
-    """votes[a, b] += 1 for every line at angle a and distance b from the origin through a point [N, 2]."""
+    """Add 1 to votes[angle, distance] for every line through each point [N, 2]."""
     for a in range(votes.shape[0]):
         c, s = np.cos(a * np.pi / votes.shape[0]), np.sin(a * np.pi / votes.shape[0])
         for i in range(points.shape[0]):
@@ -80,10 +80,10 @@ def ranges_to_lines(
     lines: list[WallLine],
     start_m: np.ndarray,  # float64 [2]
     azimuth_rad: np.ndarray,  # float64 [M]
-    beyond_m: np.ndarray,  # float64 [M]: nearer meetings do not count
+    beyond_m: np.ndarray,  # float64 [M]: least range
     count: int,
 ) -> np.ndarray:
-    """Ranges float64 [count, M] at which rays meet the continued lines, nearest first, NaN = no more."""
+    """Return ranges float64 [count, M] to the extrapolated lines, nearest first, NaN = no more."""
     directions = np.stack([np.cos(azimuth_rad), np.sin(azimuth_rad)])
     rows = [np.full((count, len(azimuth_rad)), np.nan)]
     for line in lines:

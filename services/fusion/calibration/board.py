@@ -1,8 +1,8 @@
-"""Camera and planar lidar from still pairs with a chessboard: yaw and the two offsets in the lidar's plane.
+"""Extrinsic calibration of camera and planar lidar with a chessboard: yaw and the offsets in the scan plane.
 
-The board is a plane in the camera; beams on it are points of that plane. A lidar that is mounted level
-with the camera tells its yaw and its offsets to the side and along the view; its height and its small
-tilts move points within the board and stay unknown.
+The board is a plane in the camera frame, and beams on it are points of that plane. For a lidar that is level
+with the camera, yaw and the offsets to the side and along the view are observable. Its height and small tilts
+move the points within the board and are not observable.
 """
 
 from __future__ import annotations
@@ -16,40 +16,39 @@ from beamsplat.common.geometry.camera import Pinhole
 from beamsplat.common.geometry.frames import R_body_camera_level
 from beamsplat.common.geometry.transforms import make_transform, so3_exp, transform_points
 
-_GAP_M = 0.05  # beams of one board are no further apart than this
-_SIGMA_M = 0.008
-_MARGIN = 3.0  # board squares around the corners that are still board, where its size is not given
+_GAP_M = 0.05  # largest distance of neighbouring beams on one board
+_SIGMA_M = 0.008  # standard deviation of a lidar range
 
 
 @dataclass(frozen=True)
 class BoardPair:
-    """A chessboard plane in the camera and the scan of the same moment."""
+    """A chessboard plane in the camera frame and the scan of the same time."""
 
     normal_camera: np.ndarray  # float64 [3], unit
     offset_m: float  # normal . point = offset
     centre_camera: np.ndarray  # float64 [3]
-    half_width_m: float  # of the board along the scan line, about
+    half_width_m: float  # of the board along the scan line, approximate
     points_lidar: np.ndarray  # float64 [N, 3]
 
 
 @dataclass(frozen=True)
 class BoardCalibration:
-    """`T_camera_lidar`, the standard errors of (yaw rad, x m, z m), and how beams fit the boards."""
+    """Result of `solve_board`."""
 
     T_camera_lidar: np.ndarray
     yaw_rad: float  # of the lidar against the camera's forward direction, to the left
     x_m: float  # of the lidar in the camera, to the right
     z_m: float  # of the lidar in the camera, forward
-    sigma: np.ndarray  # float64 [3]
-    rms_m: float
+    sigma: np.ndarray  # float64 [3]: standard errors of (yaw rad, x m, z m)
+    rms_m: float  # point-to-plane distance of the beams
     beams: int
-    on_board: tuple[np.ndarray, ...]  # indices of the beams on each board, to its edges
+    on_board: tuple[np.ndarray, ...]  # indices of all beams on each board
 
 
 def chessboard_plane(
     grey: np.ndarray, camera: Pinhole, corners: tuple[int, int], square_m: float
 ) -> tuple[np.ndarray, float, np.ndarray, float] | None:
-    """(normal, offset, centre, rms px) of a chessboard with inner `corners`; None if it is not found."""
+    """Return (normal, offset, centre, rms px) of a chessboard with inner `corners`; None if not found."""
     found, uv = cv2.findChessboardCornersSB(grey, corners, flags=cv2.CALIB_CB_ACCURACY)
     if not found:
         return None
@@ -69,7 +68,7 @@ def chessboard_plane(
 
 
 def level_mount(yaw_rad: float, x_m: float, y_m: float, z_m: float) -> np.ndarray:
-    """`T_camera_lidar` of a lidar level with the camera, turned by yaw to the left."""
+    """Return `T_camera_lidar` of a lidar that is level with the camera, turned by yaw to the left."""
     R_lidar_level = so3_exp([0.0, 0.0, yaw_rad])
     return make_transform(R_body_camera_level.T @ R_lidar_level, np.array([x_m, y_m, z_m]))
 
@@ -77,23 +76,23 @@ def level_mount(yaw_rad: float, x_m: float, y_m: float, z_m: float) -> np.ndarra
 def solve_board(
     pairs: list[BoardPair], start: tuple[float, float, float], y_m: float = 0.0, rounds: int = 14
 ) -> BoardCalibration:
-    """Yaw, x and z of the lidar from point-to-plane distances; beams on boards are found anew each round.
+    """Return yaw, x and z of the lidar from point-to-plane distances; beams are reassigned each round.
 
     Args:
-        pairs: two boards at least, turned against each other.
-        start: (yaw rad, x m, z m), right to a few degrees and centimetres.
-        y_m: height of the lidar below the camera, which nothing here can tell.
+        pairs: at least two boards of different orientation.
+        start: (yaw rad, x m, z m), within a few degrees and centimetres.
+        y_m: height of the lidar below the camera, which is not observable here.
 
     Raises:
-        ValueError: no beams on boards from this start, or boards that leave a direction open.
+        ValueError: too few beams on the boards from this start, or boards that do not constrain all values.
     """
     x = np.array(start, dtype=np.float64)
     on_board: list[np.ndarray] = []
     for number in range(rounds):
         reach = max(0.20 * 0.7**number, 0.015)
-        on_board = [_beams_on(pair, level_mount(x[0], x[1], y_m, x[2]), reach) for pair in pairs]
+        on_board = [_beams_on_board(pair, level_mount(x[0], x[1], y_m, x[2]), reach) for pair in pairs]
         if sum(len(i) for i in on_board) < 20:
-            raise ValueError("too few beams fall on the boards; check the start values and the board's place")
+            raise ValueError("too few beams fall on the boards; check the start values and the rig")
         for _ in range(5):
             r, J = _linear(pairs, on_board, x, y_m)
             weight = 1.0 / (1.0 + (r / (3.0 * _SIGMA_M)) ** 2)
@@ -103,11 +102,11 @@ def solve_board(
             x -= np.linalg.solve(H, J.T @ (weight * r))
     r, J = _linear(pairs, on_board, x, y_m)
     variance = float(r @ r) / max(len(r) - 3, 1)
-    # Beams of one board share its plane's error: as good as one tenth of them.
+    # Beams on one board share the error of its plane: their effective number is one tenth.
     sigma = np.sqrt(np.diag(np.linalg.inv(J.T @ J)) * variance * 10.0)
     T = level_mount(x[0], x[1], y_m, x[2])
-    # The chessboard need not be in the board's middle: the beams on it go on to where the board ends.
-    whole = [_beams_on(pair, T, 0.015, widen=1.8) for pair in pairs]
+    # The chessboard pattern may be off the centre of the board: take the beams up to the edges of the board.
+    whole = [_beams_on_board(pair, T, 0.015, widen=1.8) for pair in pairs]
     return BoardCalibration(
         T,
         float(x[0]),
@@ -123,7 +122,7 @@ def solve_board(
 def _linear(
     pairs: list[BoardPair], on_board: list[np.ndarray], x: np.ndarray, y_m: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Point-to-plane distances [M] and their derivatives [M, 3]."""
+    """Return point-to-plane distances [M] and their derivatives [M, 3]."""
 
     def distances(x: np.ndarray) -> np.ndarray:
         T = level_mount(x[0], x[1], y_m, x[2])
@@ -137,8 +136,10 @@ def _linear(
     return r, J
 
 
-def _beams_on(pair: BoardPair, T_camera_lidar: np.ndarray, reach_m: float, widen: float = 1.0) -> np.ndarray:
-    """Indices of the longest run of neighbouring beams near the board's plane and place."""
+def _beams_on_board(
+    pair: BoardPair, T_camera_lidar: np.ndarray, reach_m: float, widen: float = 1.0
+) -> np.ndarray:
+    """Return the indices of the longest run of neighbouring beams near the plane and centre of the board."""
     points = transform_points(T_camera_lidar, pair.points_lidar)
     half_m = widen * pair.half_width_m
     near = np.abs(points @ pair.normal_camera - pair.offset_m) < reach_m

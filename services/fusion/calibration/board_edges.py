@@ -1,8 +1,8 @@
-"""Upright edges of a board: where the image shows them, and where the beams on it end.
+"""Validation of a board calibration by the vertical edges of the board in image and scan.
 
-Planes alone give the calibration; edges were not used for it, and judge it. A beam whose spot half misses
-the board still comes back from it: boards look wider to a lidar by the same angle at both edges, which the
-median over all edges takes off. What remains is half a beam's spacing at best.
+The calibration uses planes only, so that the edges are independent of it. A beam whose spot half misses the
+board still returns from it: to a lidar, boards appear wider by the same angle at both edges. The median
+over all edges removes this offset. The remaining error is at best half the spacing of the beams.
 """
 
 from __future__ import annotations
@@ -16,17 +16,17 @@ from beamsplat.common.geometry.camera import Pinhole, Undistorter
 from beamsplat.common.geometry.transforms import transform_points
 from beamsplat.services.fusion.calibration.board import BoardPair
 
-_WINDOW_PX = 25
-_ACROSS_PX = 3
+_WINDOW_PX = 25  # search range on each side of the outermost beam
+_ACROSS_PX = 3  # image rows averaged on each side of the scan line
 _LEAST_STEP = 12.0  # grey values between board and background
 
 
 @dataclass(frozen=True)
 class EdgeErrors:
-    """Ends of the beams on boards against the boards' edges."""
+    """Differences of the outermost beams and the board edges in the image."""
 
-    errors_px: np.ndarray  # float64 [edges]: how far the beams reach beyond the edge, less the spot
-    spot_px: float  # how much wider boards look at each edge
+    errors_px: np.ndarray  # float64 [edges]: beams beyond the edge, minus `spot_px`
+    spot_px: float  # apparent widening of boards at each edge
 
     @property
     def median_px(self) -> float:
@@ -34,9 +34,9 @@ class EdgeErrors:
 
 
 def image_edges(grey: np.ndarray, camera: Pinhole, uv_px: np.ndarray) -> np.ndarray:
-    """Columns float64 [2] of the undistorted image at which the board ends, along its beams; NaN = unseen.
+    """Return the columns float64 [2] of the undistorted image at which the board ends; NaN = not found.
 
-    `uv_px` [N, 2] are the beams on the board as the pinhole projects them, in any order.
+    `uv_px` [N, 2] are the beams on the board, projected by the pinhole, in any order.
     """
     flat = Undistorter(camera)(cv2.cvtColor(grey, cv2.COLOR_GRAY2RGB))[..., 0].astype(np.float32)
     uv = uv_px[np.argsort(uv_px[:, 0])]
@@ -64,13 +64,13 @@ def edge_errors(
     pairs: list[BoardPair], on_board: tuple[np.ndarray, ...], edges_px: list[np.ndarray],
     T_camera_lidar: np.ndarray, pinhole: Pinhole,
 ) -> EdgeErrors:  # fmt: skip
-    """How far the outermost beams on each board end from the edges that its image shows.
+    """Return the differences of the outermost beams on each board and its edges in the image.
 
     Args:
         pairs: boards with their scans.
         on_board: indices of the beams on each board (`BoardCalibration.on_board`).
-        edges_px: of each pair, from `image_edges` (float64 [2], NaN = unseen).
-        T_camera_lidar: the mount that is judged.
+        edges_px: of each pair, from `image_edges` (float64 [2], NaN = not found).
+        T_camera_lidar: the calibration to validate.
         pinhole: the camera without distortion.
     """
     outwards = []

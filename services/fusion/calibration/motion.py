@@ -1,9 +1,9 @@
-"""Camera clock and camera mount from motion: corners tracked between images against poses from the lidar.
+"""Time offset and mount of the camera from motion: tracked corners against poses from lidar localization.
 
-Two images a fraction of a second apart obey the epipolar constraint only if the poses are taken at the
-right times and the camera looks the right way. Turning tells the clock (where the rate of turn changes)
-and the lever arm, driving tells yaw and pitch, both tell roll. A robot on a floor never moves along its
-own vertical: the camera's height cannot be told from its motion, and is said not to be.
+Two images a fraction of a second apart fulfil the epipolar constraint only if the poses belong to the right
+times and the mount of the camera is right. Rotation makes the time offset (by changes of the yaw rate) and
+the lever arm observable, translation makes yaw and pitch observable, both together roll. A robot on a floor
+does not move vertically, so that the height of the camera is not observable.
 """
 
 from __future__ import annotations
@@ -16,19 +16,20 @@ import numpy as np
 from beamsplat.common.geometry.transforms import inverse, so3_exp
 
 PARAMETERS = ("clock_s", "roll_rad", "pitch_rad", "yaw_rad", "x_m", "y_m")
-_PRIOR = np.array([0.3, 0.1, 0.1, 0.1, 0.03, 0.03])  # standard deviations: keeps what nothing tells in place
+_PRIOR = np.array([0.3, 0.1, 0.1, 0.1, 0.03, 0.03])  # standard deviations of the prior, zero mean
+# Steps of the numeric derivatives, in the units of PARAMETERS.
 _STEP = np.array([1e-3, 1e-5, 1e-5, 1e-5, 1e-4, 1e-4])
-_SEARCH_S = 0.32
-_TRACK_PX = 0.3
-_INVERSE_DEPTH, _INVERSE_DEPTH_SIGMA = 0.35, 0.3  # 1/m: rooms
-_BLOCKS = 8  # of the drive: the jackknife leaves out one at a time
-# A standard error above this is no measurement.
+_SEARCH_S = 0.32  # largest time offset of the grid search
+_TRACK_PX = 0.3  # standard deviation of a corner track
+_INVERSE_DEPTH, _INVERSE_DEPTH_SIGMA = 0.35, 0.3  # 1/m, prior of corners in rooms
+_BLOCKS = 8  # blocks of a drive, for the jackknife
+# A parameter with a larger standard error counts as not observable.
 OBSERVABLE = np.array([0.025, 0.01, 0.01, 0.01, 0.02, 0.02])
 
 
 @dataclass(frozen=True)
 class TrackedPair:
-    """Corners seen in two images; stamps on the camera's clock."""
+    """Rays of corners that were tracked between two images; stamps by the camera's clock."""
 
     stamp_a_ns: int
     stamp_b_ns: int
@@ -38,26 +39,26 @@ class TrackedPair:
 
 @dataclass(frozen=True)
 class MotionCalibration:
-    """Corrections by PARAMETERS, with standard errors; `clock_s` is added to camera stamps."""
+    """Corrections in the order of PARAMETERS with standard errors; `clock_s` is added to image stamps."""
 
     values: np.ndarray  # float64 [6]
-    sigma: np.ndarray  # float64 [6], inf = not looked for
-    residual_px: float  # median distance after
+    sigma: np.ndarray  # float64 [6], inf = not estimated
+    residual_px: float  # median distance after the correction
     residual_before_px: float
-    corners: int
+    corners: int  # number of tracks
 
     @property
     def observable(self) -> np.ndarray:
-        """bool [6]: whether the drive tells this value at all."""
+        """Return bool [6]: whether the motion of the drive determines this value."""
         return self.sigma < OBSERVABLE
 
     def mount(self, T_body_camera: np.ndarray) -> np.ndarray:
-        """`T_body_camera` [4, 4] with the observable corrections in."""
+        """Return `T_body_camera` with the observable corrections applied."""
         return apply_correction(T_body_camera, np.where(self.observable, self.values, 0.0))
 
 
 def apply_correction(T_body_camera: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """The mount turned by (roll, pitch, yaw) about the body's axes, and moved by (x, y)."""
+    """Return the mount rotated by (roll, pitch, yaw) about the body axes and translated by (x, y)."""
     T = T_body_camera.copy()
     T[:3, :3] = so3_exp(values[1:4]) @ T_body_camera[:3, :3]
     T[:2, 3] += values[4:6]
@@ -71,9 +72,10 @@ def solve_motion(
     focal_px: float,
     free: tuple[str, ...] = PARAMETERS,
 ) -> MotionCalibration:
-    """Most probable corrections: a search over the clock, then Gauss-Newton on all free parameters.
+    """Return the most probable corrections: grid search over the time offset, then Gauss-Newton.
 
-    Standard errors come from a jackknife over blocks of the drive: corners of one image err together.
+    Standard errors come from a jackknife over blocks of the drive, because errors of one image are
+    correlated.
 
     Raises:
         ValueError: too few pairs with corners and poses.
@@ -89,7 +91,7 @@ def solve_motion(
         start[0] = _search_clock(_Problem(pairs[::3], pose_at, T_body_camera, focal_px), mask)
     best = problem.gauss_newton(start, mask, 12)
     sigma = problem.jackknife(best, mask)
-    # What the prior holds does not scatter, and is not known for that: its own width counts instead.
+    # A value determined by the prior does not vary in the jackknife: add the width of the prior.
     held = problem.prior_share(best, mask)
     sigma = np.hypot(sigma, held * _PRIOR)
     after = problem.residuals(best)
@@ -100,7 +102,7 @@ def solve_motion(
 
 
 def _search_clock(problem: _Problem, mask: np.ndarray) -> float:
-    """The clock offset, seconds, of least cost on a grid; yaw follows along, it most looks like a clock."""
+    """Return the time offset, seconds, of least cost on a grid; yaw is estimated along (most correlated)."""
     clocks = np.arange(-_SEARCH_S, _SEARCH_S + 1e-9, 0.02)
     rest = mask & (np.array(PARAMETERS) == "yaw_rad")
     start = np.zeros(len(PARAMETERS))
@@ -112,7 +114,7 @@ def _search_clock(problem: _Problem, mask: np.ndarray) -> float:
 
 
 class _Problem:
-    """All pairs as one least-squares problem; corners of all pairs stand occluded_walls one another."""
+    """Least-squares problem over all pairs; the corners of all pairs are concatenated."""
 
     def __init__(
         self, pairs: list[TrackedPair], pose_at: Callable[[int], np.ndarray | None],
@@ -126,15 +128,15 @@ class _Problem:
         self._shift_ns: int | None = None
 
     def residuals(self, x: np.ndarray) -> np.ndarray:
-        """`reprojection` of all corners [2M], pixels; zero where a pose is missing."""
-        self._place(round(x[0] * 1e9))
+        """Return `reprojection` of all corners [2M], pixels; 0 where a pose is missing."""
+        self._interpolate_motions(round(x[0] * 1e9))
         mount = apply_correction(self._T_body_camera, x)
         T = inverse(mount) @ self._T_bodies @ mount
         r = reprojection(T[self._of], self._rays_a, self._rays_b, _TRACK_PX / self._focal_px) * self._focal_px
         return np.where(np.tile(self._known[self._of], 2), r, 0.0)
 
-    def _place(self, shift_ns: int) -> None:
-        """Motions of the body [P, 4, 4] between the images of each pair, at shifted stamps."""
+    def _interpolate_motions(self, shift_ns: int) -> None:
+        """Set the body motions [P, 4, 4] between the images of each pair, at shifted stamps."""
         if shift_ns == self._shift_ns:
             return
         self._shift_ns = shift_ns
@@ -145,17 +147,17 @@ class _Problem:
             if T_a is not None and T_b is not None:
                 self._T_bodies[k], self._known[k] = inverse(T_b) @ T_a, True
 
-    def change(self, X: np.ndarray) -> None:
-        """Motions as placed last, seen through another mounting of the lidar."""
+    def conjugate_motions(self, X: np.ndarray) -> None:
+        """Replace the body motions T by X T X^-1: those measured with another mounting of the lidar."""
         self._T_bodies = X @ self._T_bodies @ np.linalg.inv(X)
 
     def cost(self, x: np.ndarray) -> float:
-        """Mean robust cost (Cauchy, scale 1 px) of the corners whose poses are known."""
+        """Return the mean robust cost (Cauchy, scale 1 px) of the corners whose poses are known."""
         r = self.residuals(x)
         return float(np.sum(np.log1p(r**2))) / max(2 * int(self._known[self._of].sum()), 1)
 
     def prior_share(self, x: np.ndarray, mask: np.ndarray) -> np.ndarray:
-        """Share [6] in [0, 1] of each value that comes from the prior and not from the images."""
+        """Return the share [6] in [0, 1] of each value that comes from the prior, not from the images."""
         columns = np.flatnonzero(mask)
         share = np.ones(len(x))
         if len(columns):
@@ -164,7 +166,7 @@ class _Problem:
         return share
 
     def jackknife(self, x: np.ndarray, mask: np.ndarray) -> np.ndarray:
-        """Standard errors [6]: how far one Gauss-Newton step goes when a block of the drive is left out."""
+        """Return standard errors [6] from one Gauss-Newton step per omitted block of the drive."""
         sigma = np.zeros(len(x))
         columns = np.flatnonzero(mask)
         if len(columns) == 0:
@@ -183,7 +185,7 @@ class _Problem:
     def _linear(
         self, x: np.ndarray, columns: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """(residuals [2M], their derivatives [2M, k], robust weights [2M], weights [k] of the prior)."""
+        """Return (residuals [2M], derivatives [2M, k], robust weights [2M], weights [k] of the prior)."""
         r = self.residuals(x)
         J = np.empty((len(r), len(columns)))
         for k, column in enumerate(columns):
@@ -192,16 +194,16 @@ class _Problem:
             J[:, k] = (self.residuals(x + step) - self.residuals(x - step)) / (2.0 * _STEP[column])
         scale = max(0.5, 1.4826 * float(np.median(np.abs(r))))
         weight = 1.0 / (1.0 + (r / scale) ** 2) ** 2
-        # The corners of a pair share the error of its two poses: together they weigh as one.
+        # The corners of a pair share the error of its two poses: together they have the weight of one.
         return r, J, weight, scale**2 * len(r) / 2 / len(self._pairs) / _PRIOR[columns] ** 2
 
     def _normal(self, x: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(H [k, k], gradient [k], weights [k] of the prior) of the robust least squares at x."""
+        """Return (H [k, k], gradient [k], weights [k] of the prior) of the robust least squares at x."""
         r, J, weight, prior = self._linear(x, columns)
         return J.T @ (J * weight[:, None]) + np.diag(prior), J.T @ (weight * r) + prior * x[columns], prior
 
     def gauss_newton(self, x: np.ndarray, mask: np.ndarray, iterations: int) -> np.ndarray:
-        """Gauss-Newton over the parameters of `mask`."""
+        """Return x after up to `iterations` Gauss-Newton steps over the parameters of `mask`."""
         x = x.copy()
         columns = np.flatnonzero(mask)
         if len(columns) == 0:
@@ -222,15 +224,15 @@ def motion_misfit(
     focal_px: float,
     X: np.ndarray | None = None,
 ) -> float:
-    """Median distance, pixels, of corners from where the poses put them.
+    """Return the median distance, pixels, of tracked corners from their prediction by the poses.
 
-    With `X` [4, 4] motions are taken as X T X^-1: those of a body whose lidar was mounted otherwise.
+    With `X` [4, 4] the motions are X T X^-1: those measured with another mounting of the lidar.
     """
     problem = _Problem(pairs, pose_at, T_body_camera, focal_px)
     start = np.zeros(len(PARAMETERS))
     problem.residuals(start)
     if X is not None:
-        problem.change(X)
+        problem.conjugate_motions(X)
     r = np.abs(problem.residuals(start))
     return float(np.median(r[r > 0.0])) if np.any(r > 0.0) else float("nan")
 
@@ -241,11 +243,11 @@ def reprojection(
     rays_b: np.ndarray,  # float64 [N, 3]
     sigma: float,  # of a track, normalised pixels
 ) -> np.ndarray:
-    """Distances [2N] in normalised pixels of tracked rays from where pose and a likely depth put them.
+    """Return distances [2N], normalised pixels, of tracked rays from their prediction by pose and mean depth.
 
-    The inverse depth of a corner is Gaussian, marginalised: across the epipolar line the distance counts
-    in full; along it the less, the more the unknown depth moves the corner. A camera that turns on the
-    spot, where the epipolar constraint says nothing, thus still tells its rotation.
+    The inverse depth of a corner is Gaussian and marginalised: the distance across the epipolar line has full
+    weight, the distance along it less, the more the unknown depth moves the corner. Rotation thus remains
+    observable without translation, where the epipolar constraint is degenerate.
     """
     t = T_b_a[:, :3, 3]
     p = np.einsum("nij,nj->ni", T_b_a[:, :3, :3], rays_a) + _INVERSE_DEPTH * t

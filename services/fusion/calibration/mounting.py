@@ -1,8 +1,8 @@
-"""Is the lidar mounted as the calibration says? Mirrored, upside down and turned round are told apart.
+"""Check of the lidar mounting: as calibrated, mirrored (upside down), or rotated by 180 degrees.
 
-Scans of a drive, placed by poses that come from somewhere else (wheels, camera, motion capture), lie on
-each other only if the beams go round the right way and start in the right direction. Poses made from the
-same scans would hide the fault: they are then as mirrored as the scans.
+Scans of a drive, transformed by poses of another source (wheels, camera, motion capture), agree only if the
+direction of rotation and the zero direction of the lidar are right. Poses estimated from the same scans
+would hide the fault, because they are mirrored like the scans.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from scipy.spatial import cKDTree
 
 from beamsplat.common.geometry.transforms import inverse, so3_exp, transform_points, yaw_of
 
-_CLIP_M = 0.5
+_CLIP_M = 0.5  # largest distance of a point that is counted
 _MAX_PAIRS = 40
-_CLEARLY = 0.7  # another mounting must fit this much better to be believed
+_CLEARLY = 0.7  # another mounting is accepted if its misfit is below this share of the present one
 
 _FLIP = np.diag([1.0, -1.0, 1.0])
 _HALF_TURN = so3_exp(np.array([0.0, 0.0, np.pi]))
@@ -30,7 +30,7 @@ _MOUNTINGS: dict[str, np.ndarray] = {
 
 @dataclass(frozen=True)
 class MountingCheck:
-    """Mean distance of scans from each other under each mounting, and what follows."""
+    """Mean distance between scans under each mounting, and the conclusion."""
 
     misfit_m: dict[str, float]
     status: str  # "ok", or one sentence
@@ -42,10 +42,10 @@ def check_mounting(
     T_map_body: list[np.ndarray],  # of each scan, from a source other than these scans
     T_body_lidar: np.ndarray,
 ) -> MountingCheck:
-    """Compares scans taken from places a quarter metre or a tenth of a turn apart."""
+    """Compare scans taken 0.25 m or 0.3 rad apart under each possible mounting."""
     chosen = _pairs(T_map_body)
     if len(chosen) < 4:
-        return MountingCheck({}, "the robot has hardly moved: the lidar's mounting cannot be checked yet", 0)
+        return MountingCheck({}, "the robot has hardly moved: the lidar mounting cannot be checked yet", 0)
     misfit = {}
     for name, flip in _MOUNTINGS.items():
         total = []
@@ -59,7 +59,7 @@ def check_mounting(
     right = misfit["as calibrated"]
     best = min(misfit, key=lambda name: misfit[name])
     if misfit[best] < _CLEARLY * right:
-        sentence = f"the lidar is {best}: scans then lie {misfit[best]:.3f} m apart, not {right:.3f} m"
+        sentence = f"the lidar is {best}: scans then differ by {misfit[best]:.3f} m instead of {right:.3f} m"
         return MountingCheck(misfit, sentence, len(chosen))
     return MountingCheck(misfit, "ok", len(chosen))
 

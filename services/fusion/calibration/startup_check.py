@@ -1,8 +1,8 @@
-"""The check at every start: do clock, mount and lidar fit what the camera sees, and what do they say if not?
+"""Calibration check at every start: camera clock, camera mount and lidar mounting against the images.
 
-Over the first metres of a drive corners are tracked between images and a few scans are kept. Then, once,
-and beside the running work: are the poses those of a mirrored or turned lidar, is the camera's clock
-right, does the camera look where the calibration says.
+Over the first metres of a drive corners are tracked between images and a few scans are kept. One background
+job then checks whether the lidar is mirrored or rotated, and estimates the clock offset and the orientation
+of the camera.
 """
 
 from __future__ import annotations
@@ -26,43 +26,43 @@ from beamsplat.services.fusion.calibration.motion import (
 from beamsplat.services.fusion.calibration.mounting import check_mounting
 from beamsplat.services.fusion.relative_pose import detect_corners, track_corners
 
-_WIDTH_PX = 320
-_EVERY_NS = 250_000_000
-_APART_NS = (500_000_000, 1_200_000_000)
+_WIDTH_PX = 320  # working size
+_EVERY_NS = 250_000_000  # between the images used
+_APART_NS = (500_000_000, 1_200_000_000)  # least and largest time between the images of a pair
 _LEAST_TURN_RAD, _LEAST_WAY_M = 0.02, 0.05  # between the images of a pair
 _LEAST_CORNERS = 12
 _POSE_GAP_NS = 1_000_000_000
 _SCANS = 24
 _FREE = ("clock_s", "roll_rad", "pitch_rad", "yaw_rad")
-_CLOCK_MS, _ANGLE_DEG, _SIGMAS = 20.0, 0.7, 5.0  # what is worth a sentence
-_MISFIT_PX = 1.5
-_DOUBT_PX = 0.3  # from here on other mountings are tried
-_CLEARLY = 0.5  # another mounting must fit this much better to be believed
+_CLOCK_MS, _ANGLE_DEG, _SIGMAS = 20.0, 0.7, 5.0  # least errors that are reported, and sigmas
+_MISFIT_PX = 1.5  # a larger residual is a fault
+_DOUBT_PX = 0.3  # with a larger residual other mountings of the lidar are tried
+_CLEARLY = 0.5  # another mounting is accepted if its residual is below this share of the present one
 
 
 @dataclass(frozen=True)
 class CalibrationHealth:
-    """What the check found. `status` is "ok" or one sentence that says what is wrong and what to do."""
+    """Result of the check. `status` is "ok" or one sentence: what is wrong and what to do."""
 
     status: str
-    misfit_px: float  # median distance of tracked corners from where the poses put them, 320 px wide
-    clock_ms: float  # to be added to the camera's stamps; NaN = this drive does not tell
+    misfit_px: float  # median distance of tracked corners from their prediction by the poses, 320 px wide
+    clock_ms: float  # to be added to image stamps; NaN = not observable
     clock_sigma_ms: float
-    turn_deg: np.ndarray  # float64 [3]: roll, pitch, yaw by which to turn the mount; NaN = not told
+    turn_deg: np.ndarray  # float64 [3]: roll, pitch, yaw to add to the mount; NaN = not observable
     pairs: int
 
     @property
     def line(self) -> str:
-        """For a status display."""
+        """Return one line for the status display."""
         if self.status != "ok":
             return f"calibration: {self.status}"
-        told = np.isfinite(self.clock_ms)
-        clock = f", clock {self.clock_ms:+.0f} +- {self.clock_sigma_ms:.0f} ms" if told else ""
+        observable = np.isfinite(self.clock_ms)
+        clock = f", clock {self.clock_ms:+.0f} +- {self.clock_sigma_ms:.0f} ms" if observable else ""
         return f"calibration ok: {self.misfit_px:.2f} px in {self.pairs} pairs of images{clock}"
 
 
 class StartupCheck:
-    """Collects what the check needs; `job` gives it once there is enough, as work for another thread."""
+    """Collector of image pairs, scans and poses; `job` returns the check once there are enough."""
 
     def __init__(
         self, camera: Pinhole, T_body_camera: np.ndarray, T_body_lidar: np.ndarray, pairs: int = 60
@@ -83,17 +83,17 @@ class StartupCheck:
         return f"calibration not checked yet: {len(self._pairs)} of {self._wanted} pairs of images"
 
     def add_pose(self, stamp_ns: int, T_map_body: np.ndarray) -> None:
-        """Every pose of the localization. A clock that was set back starts the check anew."""
+        """Add a pose of localization. A stamp that goes back restarts the check."""
         if self._stamps and stamp_ns <= self._stamps[-1]:
             for kept in (self._pairs, self._images, self._stamps, self._poses, self._scans):
                 kept.clear()
         self._stamps.append(stamp_ns)
         self._poses.append(T_map_body)
-        if not self._pairs and len(self._stamps) > 600:  # a robot that stands: only the last minute counts
+        if not self._pairs and len(self._stamps) > 600:  # robot at rest: keep only the last poses
             del self._stamps[:300], self._poses[:300]
 
     def add_scan(self, points_lidar_m: np.ndarray, T_map_body: np.ndarray) -> None:
-        """Returns float64 [N, 3] of a scan in the lidar frame; only those a quarter metre apart are kept."""
+        """Add the returns float64 [N, 3] of a scan, lidar frame; scans nearer than 0.25 m are ignored."""
         if self.done or len(points_lidar_m) < 50 or len(self._scans) >= _SCANS:
             return
         if self._scans and not _apart(self._scans[-1][1], T_map_body, 0.25, 0.3):
@@ -101,7 +101,7 @@ class StartupCheck:
         self._scans.append((points_lidar_m, T_map_body))
 
     def add_image(self, stamp_ns: int, image_rgb: np.ndarray, T_map_body: np.ndarray) -> None:
-        """An undistorted image uint8 [H, W, 3]; most are passed over."""
+        """Add an undistorted image uint8 [H, W, 3]; at most four per second are used."""
         if self.done or (self._images and stamp_ns - self._images[-1][0] < _EVERY_NS):
             return
         grey = cv2.cvtColor(image_rgb, cv2.COLOR_RGB2GRAY)
@@ -123,7 +123,7 @@ class StartupCheck:
             self._pairs.append(TrackedPair(a_ns, b_ns, rays(uv[good]), rays(moved[good])))
 
     def job(self) -> Callable[[], CalibrationHealth] | None:
-        """The check itself, once, when enough was seen; holds no reference to what changes afterwards."""
+        """Return the check once, when there is enough data; it shares no data with this object."""
         if self.done or len(self._pairs) < self._wanted:
             return None
         self.done = True
@@ -148,7 +148,7 @@ def check_calibration(
     T_body_lidar: np.ndarray,
     focal_px: float,
 ) -> CalibrationHealth:
-    """Lidar first, then clock and mount: one fault hides the next."""
+    """Check the lidar first, then clock and mount of the camera, because a lidar fault hides the rest."""
     nothing = np.full(3, np.nan)
     misfit = motion_misfit(pairs, pose_at, T_body_camera, focal_px)
     against_poses = check_mounting([p for p, _ in scans], [T for _, T in scans], T_body_lidar)
@@ -160,11 +160,11 @@ def check_calibration(
         found = solve_motion(pairs, pose_at, T_body_camera, focal_px, _FREE)
     except ValueError as error:
         return CalibrationHealth(f"cannot be checked: {error}", misfit, np.nan, np.nan, nothing, len(pairs))
-    told = found.observable
+    observable = found.observable
     return CalibrationHealth(
         describe_calibration(found, _CLOCK_MS, _ANGLE_DEG, _SIGMAS), found.residual_px,
-        1e3 * found.values[0] if told[0] else np.nan, 1e3 * found.sigma[0] if told[0] else np.nan,
-        np.where(told[1:4], np.degrees(found.values[1:4]), np.nan), len(pairs),
+        1e3 * found.values[0] if observable[0] else np.nan, 1e3 * found.sigma[0] if observable[0] else np.nan,
+        np.where(observable[1:4], np.degrees(found.values[1:4]), np.nan), len(pairs),
     )  # fmt: skip
 
 
@@ -172,9 +172,9 @@ def _mounting_fault(
     pairs: list[TrackedPair], pose_at: Callable[[int], np.ndarray | None], T_body_camera: np.ndarray,
     T_body_lidar: np.ndarray, focal_px: float, misfit_px: float,
 ) -> str | None:  # fmt: skip
-    """A sentence if images fit the poses of a mirrored or turned lidar clearly better than these.
+    """Return a sentence if the images fit another mounting of the lidar clearly better, else None.
 
-    Poses made from scans of a wrongly mounted lidar fit those scans; only something else tells.
+    Poses estimated from scans of a wrongly mounted lidar fit those scans; only another sensor reveals it.
     """
     if not misfit_px > _DOUBT_PX:
         return None
@@ -193,15 +193,15 @@ def _mounting_fault(
     if fits[best] > _CLEARLY * misfit_px:
         return None
     return (
-        f"the lidar is {best}: images then fit its poses within {fits[best]:.1f} px, "
-        f"not {misfit_px:.1f} px; correct its mounting in the rig"
+        f"the lidar is {best}: images then fit its poses within {fits[best]:.1f} px "
+        f"instead of {misfit_px:.1f} px; correct its mounting in the rig file"
     )
 
 
 def describe_calibration(
     found: MotionCalibration, clock_ms: float = 10.0, angle_deg: float = 0.5, sigmas: float = 4.0
 ) -> str:
-    """ "ok", or what is wrong with clock or mount; errors smaller than the given ones are no fault."""
+    """Return "ok", or what is wrong with clock or mount; smaller errors than the given ones are ignored."""
     off_ms, sigma_ms = 1e3 * found.values[0], 1e3 * found.sigma[0]
     if found.observable[0] and abs(off_ms) > max(clock_ms, sigmas * sigma_ms):
         return f"the camera's clock is wrong: add {off_ms:.0f} +- {sigma_ms:.0f} ms to its stamps"
