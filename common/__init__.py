@@ -1,8 +1,8 @@
-"""What all services share: messages, topics, the bus, runners, geometry, recordings, the rasterizer.
+"""Library code that all services share: messages, topics, bus, runners, geometry, recordings, rasterizer.
 
-BLAS gets one thread in every process: its pools spin for the small systems solved here, the cores are shared
-by all services, and the same bytes must come out on any machine. It reads the variables when numpy is first
-imported, which is why they are set here.
+BLAS is limited to one thread in every process: the linear systems are small, all services share the cores,
+and results must be identical bit by bit on any machine. BLAS reads these variables when numpy is first
+imported, therefore they are set here.
 """
 
 import os

@@ -1,10 +1,10 @@
-"""Errors a user can act on: one clear sentence, exit code 2, no traceback."""
+"""Errors that a user can correct: the command line prints one sentence without a traceback, exit code 2."""
 
 
 class UserError(ValueError):
-    """Bad input from outside (file, field, value). The text says what is wrong and what to do."""
+    """Invalid input from a user, file or device. The text says what is wrong, where, and what to do."""
 
 
 def reason(error: BaseException) -> str:
-    """What an exception says, without the number and the file name that an OSError repeats."""
+    """Return the text of an exception; for an OSError without its error number and file name."""
     return (error.strerror or str(error)) if isinstance(error, OSError) else str(error)

@@ -1,15 +1,16 @@
-"""THE dataflow: every topic, its message, who may produce it, its rate and how it is delivered.
+"""The topic table: each topic with its message type, producers, rate and delivery. It defines the dataflow.
 
-Change this table first. Deliveries are the default of a subscription, which may choose otherwise:
+Change this table first. `delivery` is the default of a subscription; a subscriber may choose another one:
 
-latest   a ring of one: the newest wins, the writer never waits, what is overtaken is counted
-every    in order; `cache` messages are kept by the publisher, so that a subscriber recovers what a
-         broken link lost; what is lost for good is counted
-latched  the last value reaches late joiners
+latest   a ring buffer of one message: the publisher never waits; replaced messages are counted as dropped
+every    in order; the publisher caches `cache` messages, so that a subscriber recovers what a broken link
+         lost; messages that cannot be recovered are counted as lost
+latched  late-joining subscribers receive the last message
 
-`uplink` marks what crosses between a robot and its edge server (common/relay.py): "up" from the robot, "bulk"
-likewise but large, on a link of its own behind the small, "down" to the robot. A topic has exactly one
-producer in a running system; where several services are named, a deployment starts one of them.
+`uplink` marks the topics that the bridge forwards between a robot and its edge server
+(common/zenoh/bridge.py): "up" from the robot; "bulk" also from the robot, but large, on a separate link with
+lower priority; "down" to the robot. A running system has exactly one producer per topic; where several
+services are listed, a deployment starts one of them.
 """
 
 from __future__ import annotations
@@ -23,8 +24,10 @@ Delivery = Literal["latest", "every", "latched"]
 Uplink = Literal["", "up", "bulk", "down"]
 
 
-LIMIT_KB = 32_000  # of any message; a router that takes links from other hosts lets nothing larger in
-_LIMITS_KB = {  # of what comes from other hosts
+# Maximum message size in kB. A router that accepts links from other hosts drops larger messages.
+LIMIT_KB = 32_000
+# Smaller limits for the topics that other hosts publish: a few times the largest message of each.
+_LIMITS_KB = {
     "rig": 100, "localization/odometry": 64, "localization/correction": 64, "localization/anchors": 4000,
     "localization/grid": 16_000, "keyframes/frame": 8000, "keyframes/ack": 16, "tick": 16, "health": 64,
 }  # fmt: skip
@@ -32,30 +35,31 @@ _LIMITS_KB = {  # of what comes from other hosts
 
 @dataclass(frozen=True)
 class Topic:
-    """One row of the table."""
+    """One row of the topic table."""
 
     name: str
     message: type[m.Message]
     producers: tuple[str, ...]
-    rate_hz: float  # nominal; 0 = on events
+    rate_hz: float  # nominal; 0 = published on events
     delivery: Delivery
-    cache: int = 0  # messages the publisher keeps for recovery: rate x longest outage to survive
+    cache: int = 0  # messages that the publisher keeps for recovery: rate x longest outage to survive
     uplink: Uplink = ""
-    repeated: bool = False  # until it is acknowledged: a gap is no loss
+    # The producer sends each message again until it is acknowledged: a gap in the sequence is not a loss.
+    resent_until_ack: bool = False
 
     @property
     def handler(self) -> str:
-        """Name of the node method that takes this topic: camera/image -> on_camera_image."""
+        """Name of the node method that handles this topic: camera/image -> on_camera_image."""
         return "on_" + self.name.replace("/", "_")
 
     @property
     def limit_kb(self) -> int:
-        """A larger message is none of ours: refused before it is decoded, and counted."""
+        """Maximum size of a message in kB; larger ones are rejected before decoding and counted."""
         return _LIMITS_KB.get(self.name, LIMIT_KB)
 
 
 _ROWS = (
-    # name                    message          producers                 Hz  delivery  cache  uplink  repeated
+    # name                    message          producers                 Hz  delivery  cache  uplink  resent
     Topic("rig",                     m.Rig,           ("camera", "ros2", "replay"), 0, "latched", 1, "up"),
     Topic("wheel/odometry",          m.WheelOdometry, ("wheels", "ros2", "replay"), 50, "every", 2000),
     Topic("lidar/scan",              m.Scan,          ("lidar", "ros2", "replay"), 10, "every", 400),
@@ -81,16 +85,16 @@ _ROWS = (
 TOPICS: dict[str, Topic] = {row.name: row for row in _ROWS}
 ROW_NUMBER: dict[str, int] = {row.name: i for i, row in enumerate(_ROWS)}
 
-# Not part of the dataflow: each node reports its own health under health/<node>.
+# Not in the table: each node publishes its own health under health/<node>.
 HEALTH = "health"
 
 
 def topic(name: str) -> Topic:
-    """The row called `name`.
+    """Return the table row of the topic `name`.
 
     Raises:
-        KeyError: no such topic; the text lists those there are.
+        KeyError: there is no such topic; the text lists all topics.
     """
     if name not in TOPICS:
-        raise KeyError(f"no topic called {name!r}; there are {', '.join(TOPICS)}")
+        raise KeyError(f"there is no topic {name!r}; the topics are {', '.join(TOPICS)}")
     return TOPICS[name]

@@ -1,1 +1,1 @@
-"""Configuration: strict tables read from TOML, and the deployment file."""
+"""Configuration: strictly validated TOML tables, and the deployment file."""

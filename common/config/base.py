@@ -1,4 +1,4 @@
-"""Tables that somebody wrote by hand: taken as they are, or refused in one sentence; nothing is repaired."""
+"""Base class of configuration tables and their validation: invalid tables are rejected, never corrected."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from beamsplat.common.errors import UserError
 
 
 class Config(BaseModel):
-    """Base of every configuration: frozen, and an unknown key is an error."""
+    """Base class of all configurations: immutable; an unknown key is an error."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
 def parse(cls: type[Config], table: dict[str, Any], where: str) -> Any:
-    """`cls` from a raw table.
+    """Return a `cls` instance made from a raw table; `where` names the table's source in errors.
 
     Raises:
-        UserError: one sentence per fault, naming `where`, field, value and what was expected.
+        UserError: the table is invalid; one clause per fault with field, value and expected value.
     """
     try:
         return cls.model_validate(table)
@@ -28,18 +28,18 @@ def parse(cls: type[Config], table: dict[str, Any], where: str) -> Any:
         for fault in error.errors(include_url=False):
             field = ".".join(str(part) for part in fault["loc"])
             if fault["type"] == "extra_forbidden":
-                known = ", ".join(sorted(_at(cls, fault["loc"][:-1]).model_fields))
-                faults.append(f"unknown option {field!r} (there are: {known})")
+                known = ", ".join(sorted(_model_at(cls, fault["loc"][:-1]).model_fields))
+                faults.append(f"unknown option {field!r} (options are: {known})")
             elif fault["type"] == "missing":
-                faults.append(f"option {field!r} is required: give it in the file, or by --set")
+                faults.append(f"option {field!r} is required: set it in the file, or with --set")
             else:
                 faults.append(f"{field} = {fault['input']!r}: {fault['msg']}")
         raise UserError(f"{where}: " + "; ".join(faults)) from error
 
 
-def _at(cls: type[BaseModel], place: tuple[str | int, ...]) -> type[BaseModel]:
-    """The model of the table at `place` within `cls`, as far down as models go."""
-    for part in place:
+def _model_at(cls: type[BaseModel], path: tuple[str | int, ...]) -> type[BaseModel]:
+    """Return the model of the nested table at `path` in `cls`, or the deepest model on that path."""
+    for part in path:
         field = cls.model_fields.get(str(part))
         inner = field.annotation if field is not None else None
         if not (isinstance(inner, type) and issubclass(inner, BaseModel)):

@@ -1,4 +1,4 @@
-"""Deployment files: one TOML says which services run, with which options. Strict: nothing is repaired.
+"""Deployment files: a TOML file that lists the services to run and their options. Validation is strict.
 
 robot = "robot1"
 
@@ -29,34 +29,35 @@ from beamsplat.common.security.keys import OPEN, SecurityConfig
 Token = Annotated[str, StringConstraints(pattern=r"^[a-z0-9][a-z0-9_-]{0,63}$")]
 
 
-# Which part of a system a deployment is: topics that cross the uplink are fed by the other part.
+# The part of a system that a deployment runs. In a "robot" or "edge" deployment the bridge supplies the
+# topics that the other part publishes.
 Role = Literal["whole", "robot", "edge"]
 Seconds = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 
 
 class NodeConfig(Config):
-    """Options that every node has."""
+    """Options that all nodes have."""
 
-    kind: str = "default"  # which implementation, by name (services/nodes.py lists them)
-    step_cost_s: Seconds = 0.0  # lockstep: modelled time of one step
-    job_cost_s: Seconds = 0.0  # lockstep: modelled time of a background job
+    kind: str = "default"  # name of the implementation (services/nodes.py lists them)
+    step_cost_s: Seconds = 0.0  # lockstep only: modelled duration of one step
+    job_cost_s: Seconds = 0.0  # lockstep only: modelled duration of a background job
     threads: Annotated[int, Field(ge=1)] = 1  # for cv2, torch and ONNX in this process
-    nice: Annotated[int, Field(ge=0, le=19)] = 0  # niceness of this process: who waits when cores are short
+    nice: Annotated[int, Field(ge=0, le=19)] = 0  # nice value of the process: higher = lower CPU priority
 
 
 class RouterConfig(Config):
-    """The router of this host: where it listens, and the routers it connects out to."""
+    """Zenoh endpoints of this host's router: where it listens, and the routers it connects to."""
 
     listen: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
     connect: tuple[str, ...] = ()
 
 
 class Deployment(Config):
-    """One parsed deployment file; `nodes` holds raw tables until a node's own Config checks them."""
+    """A parsed deployment file; the tables in `nodes` are raw until each node's own Config validates them."""
 
     robot: Token = "robot1"
     router: RouterConfig = RouterConfig()
-    rate: Annotated[float, Field(ge=0.0)] = 1.0  # replayed data: times real time; 0 = as fast as possible
+    rate: Annotated[float, Field(ge=0.0)] = 1.0  # replay speed in multiples of real time; 0 = maximum
     state_dir: Path | None = None
     role: Role = "whole"
     security: SecurityConfig = OPEN
@@ -64,7 +65,7 @@ class Deployment(Config):
 
     @property
     def run_dir(self) -> Path:
-        """Where epochs, logs and other state of this robot live."""
+        """Folder of this robot's persistent state: epochs, logs, replay positions."""
         if self.state_dir is not None:
             return self.state_dir.expanduser()
         base = os.environ.get("XDG_STATE_HOME") or "~/.local/state"
@@ -72,13 +73,13 @@ class Deployment(Config):
 
 
 def load_deployment(path: Path, overrides: tuple[str, ...] = ()) -> Deployment:
-    """The deployment in a TOML file, with `node.key=value` (or `key=value`) overrides applied.
+    """Read a deployment from a TOML file and apply `node.key=value` (or `key=value`) overrides.
 
-    Where the working directory has no such file, the one shipped with the package of that name is read.
+    If the working directory has no such file, the deployment of that name shipped with the package is read.
     Relative paths inside the file are relative to the working directory, as on a command line.
 
     Raises:
-        UserError: no such file, not TOML, or a value that does not fit; names file, field and value.
+        UserError: the file is missing, not TOML, or has an invalid value; names file, field and value.
     """
     path = deployment_file(path)
     try:
@@ -93,21 +94,21 @@ def load_deployment(path: Path, overrides: tuple[str, ...] = ()) -> Deployment:
 
 
 def with_overrides(deployment: Deployment, overrides: tuple[str, ...]) -> Deployment:
-    """A copy with `node.key=value` overrides applied to its nodes.
+    """Return a copy of the deployment with `node.key=value` overrides applied to its nodes.
 
     Raises:
-        UserError: an override that does not fit.
+        UserError: an override is malformed or does not name a node's option.
     """
     table: dict[str, Any] = {"nodes": {name: dict(options) for name, options in deployment.nodes.items()}}
     for override in overrides:
         _apply(table, override)
     if set(table) != {"nodes"}:
-        raise UserError(f"{', '.join(overrides)}: only options of nodes can be changed in a running system")
+        raise UserError(f"{', '.join(overrides)}: a running system accepts changes of node options only")
     return deployment.model_copy(update={"nodes": table["nodes"]})
 
 
 def _apply(table: dict[str, Any], override: str) -> None:
-    """Sets one dotted `key=value` in a raw table; a first key that names no option names a node."""
+    """Set one dotted `key=value` in a raw table; a first key that is no deployment option is a node name."""
     key, equals, text = override.partition("=")
     parts = key.strip().split(".")
     if not equals or not all(parts):
@@ -122,7 +123,7 @@ def _apply(table: dict[str, Any], override: str) -> None:
 
 
 def _toml_value(text: str) -> Any:
-    """A TOML value; what is no TOML (a bare word, a path) is a string."""
+    """Parse a TOML value; text that is not valid TOML (a bare word, a path) is taken as a string."""
     try:
         return tomllib.loads(f"v = {text}")["v"]
     except tomllib.TOMLDecodeError:

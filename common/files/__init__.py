@@ -1,1 +1,1 @@
-"""Files that survive a crash: atomic replacement, epochs, bookmarks."""
+"""Crash-safe files (atomic replacement, epoch counters, replay positions) and files of the package."""

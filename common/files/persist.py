@@ -1,4 +1,4 @@
-"""Small facts that outlive a process: takeover counts and a replay's position."""
+"""Small persistent state: atomic file replacement, epoch counters, and the position of a replay."""
 
 from __future__ import annotations
 
@@ -8,27 +8,49 @@ from pathlib import Path
 
 from beamsplat.common.errors import UserError
 
-_FINISHED_NS = 2**63 - 1  # behind everything
+_FINISHED_NS = 2**63 - 1  # int64 maximum: later than any message
 
 
 def make_folder(path: Path) -> Path:
-    """`path`, which is a folder now.
+    """Create a folder with its parents, if it does not exist, and return its path.
 
     Raises:
-        UserError: it cannot be made, or is a file.
+        UserError: the folder cannot be created, or `path` is a file.
     """
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise UserError(f"{path}: cannot make this folder ({error.strerror}): choose another") from error
+        raise UserError(f"{path}: cannot create this folder ({error.strerror}): choose another") from error
     return path
 
 
-def write_atomically(path: Path, data: bytes | memoryview) -> None:
-    """Replaces a file so that a reader, or a crash, sees the old or the new one, never a half.
+def check_can_write(path: Path, option: str) -> None:
+    """Check that a file or folder can be written, without creating anything.
+
+    Args:
+        path: may exist; else its nearest existing parent counts.
+        option: the option that names it, for the error text.
 
     Raises:
-        OSError: the disk is full or broken; the old file is as it was, and nothing is left beside it.
+        UserError: no permission, or a parent is a file.
+    """
+    nearest = path.expanduser().absolute()
+    try:
+        while not nearest.exists() and nearest != nearest.parent:
+            nearest = nearest.parent
+    except OSError as error:
+        raise UserError(f"{option} = {path}: {error.strerror}") from error
+    if nearest != path.expanduser().absolute() and not nearest.is_dir():
+        raise UserError(f"{option} = {path}: {nearest} is a file, not a folder; choose another place")
+    if not os.access(nearest, os.W_OK):
+        raise UserError(f"{option} = {path}: {nearest} cannot be written; choose another place")
+
+
+def write_atomically(path: Path, data: bytes | memoryview) -> None:
+    """Write a file by fsync and rename: a reader, or a crash, sees the old or the new content, never a part.
+
+    Raises:
+        OSError: writing failed, for example disk full; the old file is unchanged, the temporary one removed.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
@@ -51,28 +73,28 @@ def _read_int(path: Path) -> int | None:
 
 
 def claim_epoch(run_dir: Path, node: str) -> int:
-    """The next epoch of a node: one above the highest ever claimed, also after a crash."""
+    """Return the node's next epoch, one above the highest claimed so far; it is stored on disk first."""
     path = make_folder(run_dir / "epochs") / node
     epoch = (_read_int(path) or 0) + 1
     write_atomically(path, str(epoch).encode())
     return epoch
 
 
-class Bookmark:
-    """How far a replay has come, so that a restarted one neither repeats nor skips more than a moment."""
+class ReplayPosition:
+    """Persistent position of a replay: a restarted replay repeats or skips at most `_PERIOD_S` of data."""
 
-    _PERIOD_S = 0.2
+    _PERIOD_S = 0.2  # between two writes: limits the disk load
 
     def __init__(self, run_dir: Path, node: str) -> None:
         self._path = run_dir / "bookmarks" / node
         self._written = 0.0
 
     def read(self) -> int | None:
-        """Arrival time, ns, of a message lately sent; None at the beginning."""
+        """Return the arrival time (ns) of a recently sent message; None if there is no stored position."""
         return _read_int(self._path)
 
     def write(self, at_ns: int) -> None:
-        """Remembers a position, a few times a second at most."""
+        """Store a position (ns); calls within `_PERIOD_S` of the last write do nothing."""
         now = time.monotonic()
         if now - self._written >= self._PERIOD_S:
             self._written = now
@@ -82,9 +104,9 @@ class Bookmark:
             temporary.replace(self._path)
 
     def finish(self) -> None:
-        """The end was reached: a restarted replay has nothing left to send."""
+        """Mark the replay as complete: a restarted replay sends nothing."""
         write_atomically(self._path, str(_FINISHED_NS).encode())
 
     def clear(self) -> None:
-        """Forgets the position."""
+        """Remove the stored position."""
         self._path.unlink(missing_ok=True)

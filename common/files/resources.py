@@ -1,11 +1,11 @@
-"""Deployment files and the list of models that are installed with the package."""
+"""Paths of the files that are installed with the package: deployment files and the list of models."""
 
 from __future__ import annotations
 
 from importlib.resources import files
 from pathlib import Path
 
-_FOLDER = Path(str(files("beamsplat.deploy")))  # wheels are unpacked: a real folder
+_FOLDER = Path(str(files("beamsplat.deploy")))  # pip unpacks wheels, so this is a real folder
 
 
 def shipped_file(name: str) -> Path:

@@ -34,7 +34,7 @@ def test_a_deployment_with_overrides(tmp_path):
     ("text", "complaint"),
     [
         ("robot = ", "not a TOML file"),
-        ('robott = "x"', r"unknown option 'robott' \(there are: .*robot"),
+        ('robott = "x"', r"unknown option 'robott' \(options are: .*robot"),
         ('robot = "A B"', "robot = 'A B'"),
         ("rate = -1", r"rate = -1: .*greater than or equal to 0"),
         ("[nodes]\nreplay = 3", r"nodes.replay = 3"),

@@ -41,13 +41,13 @@ def test_help_names_every_command_and_each_has_an_example():
         (("check", "deploy/demo.toml", "--set", "replay.speed=2"), "unknown option 'speed'"),
         (
             ("check", "deploy/demo.toml", "--set", "router.port=1"),
-            "unknown option 'router.port' (there are: connect,",
+            "unknown option 'router.port' (options are: connect,",
         ),
         (("check", "deploy/demo.toml", "--set", "replay.[/x]=1"), "unknown option '[/x]'"),
         (("serve", "deploy/demo.toml", "router", "--set", 'router.listen=["no"]'), "no are no endpoints"),
         (
             ("run", "deploy/poses.toml", *POSES, "router", "--set", "state_dir=/dev/null/x"),
-            "cannot make this folder",
+            "cannot create this folder",
         ),
         (("run", "deploy/poses.toml", *POSES, "router", "nope"), "has no node 'nope'"),
         (("offline", "deploy/demo.toml", "--data", "no/bag", "--out", "{tmp}"), "no/bag"),

@@ -34,7 +34,7 @@ def test_twice_the_same_bytes_also_when_frames_are_dropped(tmp_path):
 
 def test_a_folder_that_cannot_be_made_is_named(tmp_path):
     (tmp_path / "file").touch()
-    with pytest.raises(UserError, match="cannot make this folder"):
+    with pytest.raises(UserError, match="cannot create this folder"):
         _run(tmp_path / "file", "a")
 
 
