@@ -12,7 +12,7 @@ from pydantic import Field
 from beamsplat.common.config.deployment import NodeConfig
 from beamsplat.common.errors import UserError
 from beamsplat.common.geometry.camera import Pinhole, Undistorter
-from beamsplat.common.geometry.history import History, TimedScan
+from beamsplat.common.geometry.sensor_history import SensorHistory, TimedScan
 from beamsplat.common.messages import DepthEstimate, Image, Odometry, Rig, Scan
 from beamsplat.common.messages.image_codec import decode_rgb
 from beamsplat.common.runtime.node import Input, Node, Outputs
@@ -51,11 +51,11 @@ class DepthNode(Node):
         self._source: DepthSource = make_source(self.config.source, self.config.options)
         self._needs_beams = uses_beams(self.config.source, self._source)
         self._undistort: Undistorter | None = None
-        self._history: History | None = None
+        self._history: SensorHistory | None = None
         self._waiting: deque[Image] = deque(maxlen=_PICTURES)
         self.overtaken = 0
 
-    def examine(self) -> None:
+    def check_resources(self) -> None:
         """Check the source's name, options and files."""
         check_source(self.config.source, self.config.options)
 
@@ -68,7 +68,7 @@ class DepthNode(Node):
             self._undistort = Undistorter(Pinhole.of(camera))
             self._T_body_camera = camera.T_body_camera
             T_body_lidar = rig.lidar.T_body_lidar if rig.lidar is not None else np.eye(4)
-            self._history = History(T_body_lidar)
+            self._history = SensorHistory(T_body_lidar, complete_only=False)
         return iter(())
 
     def on_lidar_scan(self, scan: Scan) -> Outputs:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from collections import deque
-from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -14,7 +13,7 @@ from beamsplat.common.config.deployment import NodeConfig
 from beamsplat.common.errors import UserError
 from beamsplat.common.geometry.beams import scan_points
 from beamsplat.common.geometry.camera import Pinhole, Undistorter
-from beamsplat.common.geometry.history import History, TimedScan
+from beamsplat.common.geometry.sensor_history import SensorHistory, TimedScan
 from beamsplat.common.geometry.transforms import inverse, transform_points
 from beamsplat.common.messages import (
     Cloud,
@@ -75,8 +74,6 @@ class FusionNode(Node):
         self._check: StartupCheck | None = None  # of the calibration; only `field` has one
         self._pictures: deque[Image] = deque(maxlen=_PICTURES)
         self._estimates: deque[DepthEstimate] = deque(maxlen=_PICTURES)
-        self._unmarked: deque[TimedScan] = deque()  # scans whose movers are not known yet
-        self._marked: deque[TimedScan] = deque()  # scans whose last beam has no pose yet
         self._T_odom_keyframe: np.ndarray | None = None
         self._rig: Rig | None = None
         self._localizer = ""  # the process that localizes
@@ -91,7 +88,6 @@ class FusionNode(Node):
             log.info("localization has started anew: so does fusion")
             checked = self._check is not None and self._check.done
             self._T_odom_keyframe = None
-            self._marked.clear()
             self.on_rig(self._rig)
             if self._check is not None and checked:
                 self._check.done = True
@@ -106,7 +102,7 @@ class FusionNode(Node):
         self._rig, camera = rig, rig.camera
         self._undistort = Undistorter(Pinhole.of(camera))
         self._T_body_camera = camera.T_body_camera
-        self._history = History(np.eye(4) if rig.lidar is None else rig.lidar.T_body_lidar)
+        self._history = SensorHistory(np.eye(4) if rig.lidar is None else rig.lidar.T_body_lidar)
         if method != "field":
             self._fusion = SingleImageFusion(self._undistort.pinhole, camera.T_body_camera, method)
             return iter(())
@@ -122,27 +118,20 @@ class FusionNode(Node):
 
     def on_lidar_scan(self, scan: Scan) -> Outputs:
         if self._fusion is not None:
-            self._unmarked.append(TimedScan.of(scan))
-            while len(self._unmarked) > _PICTURES:  # localization says nothing of movers: take them all
-                self._marked.append(self._unmarked.popleft())
+            self._history.add_scan(TimedScan.of(scan))
         return iter(())
 
     def on_localization_movers(self, movers: MovingBeams) -> Outputs:
-        """Which beams of a scan to leave out: what moves must not become part of the walls."""
-        while self._unmarked and self._unmarked[0].stamp_ns <= movers.stamp_ns:
-            scan = self._unmarked.popleft()
-            moving = movers.moving if scan.stamp_ns == movers.stamp_ns else None
-            self._marked.append(replace(scan, moving=moving))
+        """Mark the beams on dynamic objects: they must not become part of the walls."""
+        if self._fusion is not None:
+            self._history.add_mask(movers.stamp_ns, movers.moving)
         return iter(())
 
     def on_localization_odometry(self, odometry: Odometry) -> Outputs:
         """A pose: scans that end before it can be placed, and a picture may have waited for it."""
         if self._fusion is None or odometry.status != "ok":
             return
-        self._history.add_pose(odometry.stamp_ns, odometry.T_odom_body)
-        while self._marked and self._marked[0].last_ns <= odometry.stamp_ns:
-            scan = self._marked.popleft()
-            self._history.add_scan(scan)
+        for scan in self._history.add_pose(odometry.stamp_ns, odometry.T_odom_body):
             self._fusion.add_scan(self._history.scan_points_a(scan))
             self._keep_for_check(scan)
         if self._check is not None and not self._check.done:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections import deque
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated
 
 import cv2
@@ -15,7 +15,7 @@ from beamsplat.common.config.deployment import NodeConfig
 from beamsplat.common.errors import UserError
 from beamsplat.common.geometry.beams import project_beams
 from beamsplat.common.geometry.camera import Pinhole, Undistorter
-from beamsplat.common.geometry.history import History, TimedScan
+from beamsplat.common.geometry.sensor_history import SensorHistory, TimedScan
 from beamsplat.common.geometry.transforms import inverse
 from beamsplat.common.messages import (
     Anchors,
@@ -43,8 +43,8 @@ log = logging.getLogger("beamsplat.keyframes")
 ODOM_ORIGIN = -1  # the anchor while localization has named none
 _SCHEMA = schema_of(Keyframe)
 _PICTURES = 64  # kept until their depth comes: 6 s at 10 Hz
-_SCANS = 16
-_BEAMS_NS = 120_000_000  # a pose that much later places every beam of the scan around a picture
+_BEAMS_NS = 120_000_000  # poses up to this long after an image place the scan around it (10 Hz lidars)
+_BEAMS_PATIENCE_NS = 400_000_000  # the scan of a 5 Hz lidar is complete by then
 
 
 class KeyframesConfig(NodeConfig):
@@ -87,17 +87,18 @@ class KeyframesNode(Node):
     outputs = ("keyframes/frame",)
 
     def configure(self) -> None:
-        self._history: History | None = None
+        self._history: SensorHistory | None = None
         self._rig: Rig | None = None
         self._pictures: deque[Image] = deque(maxlen=_PICTURES)
         self._depths: deque[FusedDepth] = deque(maxlen=_PICTURES)
         self._candidates: deque[tuple[int, _Candidate]] = deque(maxlen=8)
-        self._unmarked: deque[TimedScan] = deque()
         self._T_map_odom = np.eye(4)
         self._localizer, self._map_uuid = "", ""  # the process that localizes, and the map it says it is in
         self._forget_frame()
         c = self.config
-        folder = self.home.run_dir / "keyframes" if c.durable and self.home is not None else None
+        folder = (
+            self.live_settings.run_dir / "keyframes" if c.durable and self.live_settings is not None else None
+        )
         self._outbox = Outbox(round(c.queue_mb * 1e6), round(c.retry_s * 1e9), c.window, folder)
         self._now_ns = 0  # by the pictures
         self._seen = self._sent = self._again = 0
@@ -131,7 +132,7 @@ class KeyframesNode(Node):
         self._camera, self._rig = c, rig
         lens = Pinhole.of(c)
         self._undistort = Undistorter(lens)
-        self._history = History(np.eye(4) if rig.lidar is None else rig.lidar.T_body_lidar)
+        self._history = SensorHistory(np.eye(4) if rig.lidar is None else rig.lidar.T_body_lidar)
         s = self.config
         fov = 2.0 * np.arctan([0.5 * c.width_px / c.fx_px, 0.5 * c.height_px / c.fy_px])
         self._selector = KeyframeSelector(
@@ -144,21 +145,14 @@ class KeyframesNode(Node):
         return iter(())
 
     def on_lidar_scan(self, scan: Scan) -> Outputs:
-        self._unmarked.append(TimedScan.of(scan))
-        while len(self._unmarked) > _SCANS:  # localization says nothing of movers
-            self._take_scan(self._unmarked.popleft())
+        if self._history is not None:
+            self._history.add_scan(TimedScan.of(scan))
         return iter(())
 
     def on_localization_movers(self, movers: MovingBeams) -> Outputs:
-        while self._unmarked and self._unmarked[0].stamp_ns <= movers.stamp_ns:
-            scan = self._unmarked.popleft()
-            mine = scan.stamp_ns == movers.stamp_ns and len(movers.moving) == len(scan.ranges_m)
-            self._take_scan(replace(scan, moving=movers.moving) if mine else scan)
-        return iter(())
-
-    def _take_scan(self, scan: TimedScan) -> None:
         if self._history is not None:
-            self._history.add_scan(scan)
+            self._history.add_mask(movers.stamp_ns, movers.moving)
+        return iter(())
 
     def on_localization_correction(self, correction: Correction) -> Outputs:
         self._T_map_odom = correction.T_map_odom
@@ -205,8 +199,14 @@ class KeyframesNode(Node):
         if self._history is None or odometry.status != "ok":
             return
         self._history.add_pose(odometry.stamp_ns, odometry.T_odom_body)
-        while self._depths and self._depths[0].stamp_ns + _BEAMS_NS <= odometry.stamp_ns:
+        while self._depths and self._beams_are_known(self._depths[0].stamp_ns, odometry.stamp_ns):
             yield from self._consider(self._depths.popleft())
+
+    def _beams_are_known(self, image_ns: int, pose_ns: int) -> bool:
+        """Whether the scan around an image is complete, or is not waited for any longer."""
+        if pose_ns < image_ns + _BEAMS_NS:
+            return False
+        return self._history.decided_scan_near(image_ns) or pose_ns >= image_ns + _BEAMS_PATIENCE_NS
 
     def on_keyframes_ack(self, ack: KeyframeAck) -> Outputs:
         """The mapper has it, or refused it: either way it need not come again."""
@@ -216,11 +216,11 @@ class KeyframesNode(Node):
         yield from self._send_again()
         self._say()
 
-    def awaits_answers(self) -> bool:
+    def awaits_feedback(self) -> bool:
         """Recorded data may end before the mapper has everything."""
         return len(self._outbox) > 0
 
-    def on_silence(self, seconds: float) -> Outputs:
+    def on_feedback_timeout(self, seconds: float) -> Outputs:
         """No pictures come any more, so time passes this way."""
         self._now_ns += round(seconds * 1e9)
         yield from self._send_again()
@@ -263,7 +263,7 @@ class KeyframesNode(Node):
         encoding, picture = self._compressed(image)
         beams, _ = self._history.beams(stamp_ns)
         uv, z, index = project_beams(beams, self._undistort.pinhole, T_body_camera)
-        moving = self._moving(stamp_ns)
+        moving = self._history.moving_returns(stamp_ns)
         mask = body_mask(moving, depth.depth_m, self._undistort.pinhole, T_body_camera)
         return Keyframe(
             stamp_ns=stamp_ns, id=stamp_ns, encoding=encoding, picture=picture, camera=self._camera,
@@ -274,13 +274,6 @@ class KeyframesNode(Node):
             beams=np.column_stack([uv, z, beams.sigma_m[index]]).astype(np.float32).reshape(-1, 4), why=why,
             map_uuid=self._map_uuid,
         )  # fmt: skip
-
-    def _moving(self, stamp_ns: int) -> np.ndarray:
-        """Returns on movers [N, 3] in the body frame at the picture's time."""
-        scan = self._history.scan_near(stamp_ns)
-        if scan is None or scan.moving is None or not scan.moving.any():
-            return np.zeros((0, 3))
-        return self._history.beams_of(replace(scan, moving=~scan.moving), stamp_ns).points_body_m
 
     def _compressed(self, image: Image) -> tuple[str, np.ndarray]:
         if image.encoding in ("jpeg", "png"):

@@ -13,7 +13,7 @@ import numpy as np
 from beamsplat.common.errors import UserError
 from beamsplat.common.geometry.beams import NO_BEAMS, Beams, move_beams, scan_points
 from beamsplat.common.geometry.camera import Pinhole, Undistorter
-from beamsplat.common.geometry.history import TimedScan
+from beamsplat.common.geometry.sensor_history import TimedScan
 from beamsplat.common.geometry.trajectory import Trajectory, read_tum
 from beamsplat.common.geometry.transforms import se3_to_se2, transform_points
 from beamsplat.services.replay.options import SourceOptions

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from beamsplat.common.geometry.history import BEAMS_WITHIN_NS, EXTRAPOLATE_NS, History, TimedScan
+from beamsplat.common.geometry.sensor_history import BEAMS_WITHIN_NS, EXTRAPOLATE_NS, SensorHistory, TimedScan
 from beamsplat.common.geometry.transforms import se2_to_se3, transform_points
 
 S = 1_000_000_000
@@ -29,11 +29,11 @@ def _scan(stamp_ns, beams=360, time_increment_s=0.1 / 360):
 
 @pytest.fixture
 def history():
-    history = History(np.eye(4))
-    for i in range(11):
-        history.add_pose(i * S // 10, _pose(i * S // 10))
+    history = SensorHistory(np.eye(4))
     history.add_scan(_scan(300_000_000))
     history.add_scan(_scan(400_000_000))
+    for i in range(11):
+        history.add_pose(i * S // 10, _pose(i * S // 10))
     return history
 
 
@@ -65,14 +65,56 @@ def test_beams_of_another_moment_are_not_used(history):
     assert len(history.beams(last.middle_ns + BEAMS_WITHIN_NS + 1)[0]) == 0
 
 
-def test_moving_beams_are_left_out(history):
-    scan = _scan(500_000_000)
+def _with_mask(history, moving):
+    history.add_scan(_scan(1_000_000_000))
+    history.add_mask(1_000_000_000, moving)
+    return history.add_pose(1_100_000_000, _pose(1_100_000_000))
+
+
+def test_returns_of_dynamic_objects_are_left_out_and_given_apart(history):
     moving = np.zeros(360, bool)
     moving[100:150] = True
-    history.add_scan(TimedScan(**{**scan.__dict__, "moving": moving}))
-    beams, _ = history.beams(550_000_000)
+    assert [scan.stamp_ns for scan in _with_mask(history, moving)] == [1_000_000_000]
+    beams, _ = history.beams(1_050_000_000)
     assert not set(beams.index) & set(range(100, 150))
     assert set(beams.index) & set(range(150, 160))
+    assert len(history.moving_returns(1_050_000_000)) == 50
+    assert len(history.moving_returns(450_000_000)) == 0
+
+
+def test_a_mask_of_another_length_or_scan_marks_nothing(history):
+    _with_mask(history, np.ones(7, bool))
+    assert len(history.moving_returns(1_050_000_000)) == 0
+    history.add_mask(123, np.ones(360, bool))
+    assert len(history.moving_returns(1_050_000_000)) == 0
+
+
+def test_a_scan_is_complete_with_the_pose_of_its_last_beam_with_or_without_a_mask(history):
+    history.add_scan(_scan(1_000_000_000))
+    assert not history.decided_scan_near(1_050_000_000)
+    assert history.add_pose(1_090_000_000, _pose(1_090_000_000)) == []
+    completed = history.add_pose(1_100_000_000, _pose(1_100_000_000))
+    assert [scan.stamp_ns for scan in completed] == [1_000_000_000]
+    assert history.decided_scan_near(1_050_000_000)
+    assert history.scan_near(1_050_000_000).stamp_ns == 1_000_000_000
+
+
+def test_without_waiting_the_newest_scan_serves_at_once():
+    history = SensorHistory(np.eye(4), complete_only=False)
+    for i in range(4):
+        history.add_pose(i * S // 10, _pose(i * S // 10))
+    history.add_scan(_scan(300_000_000))
+    beams, _ = history.beams(310_000_000)
+    points_map = transform_points(_pose(310_000_000), beams.points_body_m)
+    assert np.abs(points_map[:, 0] - WALL_X_M).max() < 0.005
+
+
+def test_scans_without_poses_are_dropped_and_counted():
+    history = SensorHistory(np.eye(4), keep_s=1.0)
+    for i in range(1000):
+        history.add_scan(_scan(i * S // 10, beams=8))
+    assert len(history._incomplete) <= 12
+    assert history.expired > 980
 
 
 def test_a_clock_set_back_starts_the_history_afresh(history):
@@ -83,7 +125,7 @@ def test_a_clock_set_back_starts_the_history_afresh(history):
 
 
 def test_memory_is_bounded():
-    history = History(np.eye(4), keep_s=1.0)
+    history = SensorHistory(np.eye(4), keep_s=1.0)
     for i in range(1000):
         history.add_pose(i * S // 10, np.eye(4))
         history.add_scan(_scan(i * S // 10, beams=8))
