@@ -1,4 +1,4 @@
-"""`beamsplat simulate`: the command around the simulator."""
+"""Command `beamsplat simulate`: records a drive of a simulated robot."""
 
 from __future__ import annotations
 
@@ -30,7 +30,9 @@ def _numbers(text: str, count: int, option: str) -> tuple[float, ...]:
     except ValueError:
         values = ()
     if len(values) != count:
-        raise typer.BadParameter(f"expected {count} numbers with commas, got {text!r}", param_hint=option)
+        raise typer.BadParameter(
+            f"expected {count} numbers separated by commas, got {text!r}", param_hint=option
+        )
     return values
 
 
@@ -40,51 +42,59 @@ def _size(text: str) -> tuple[int, int]:
         raise typer.BadParameter(f"expected WIDTHxHEIGHT, got {text!r}", param_hint="--size")
     width, height = int(parts[0]), int(parts[1])
     if not (32 <= width <= 4096 and 32 <= height <= 4096):
-        raise typer.BadParameter("sides must be 32 to 4096 pixels", param_hint="--size")
+        raise typer.BadParameter("width and height must be 32 to 4096 pixels", param_hint="--size")
     return width, height
 
 
 def simulate(
-    out: Annotated[Path, typer.Option(help="Folder to write; refused if it exists.")],
+    out: Annotated[Path, typer.Option(help="Folder to write; it must not exist yet.")],
     seconds: Annotated[
-        float | None, typer.Option(min=1.0, help="Length; default: one lap, about 80 s.")
+        float | None, typer.Option(min=1.0, help="Length of the recording; default: one lap, about 80 s.")
     ] = None,
     laps: Annotated[
-        int | None, typer.Option(min=1, help="Whole laps; each picture is rendered once.")
+        int | None,
+        typer.Option(min=1, help="Number of laps; the images of one lap are rendered once and reused."),
     ] = None,
-    movers: Annotated[int, typer.Option(min=0, max=6, help="People walking about.")] = 0,
-    carts: Annotated[int, typer.Option(min=0, max=3, help="Trolleys rolling about.")] = 0,
-    seed: Annotated[int, typer.Option(min=0, help="Another home, drive and noise for each seed.")] = 0,
-    size: Annotated[str, typer.Option(help="Picture size.")] = "640x480",
-    rate_hz: Annotated[float, typer.Option(min=0.5, max=60.0, help="Camera rate.")] = 10.0,
+    movers: Annotated[int, typer.Option(min=0, max=6, help="Number of walking people.")] = 0,
+    carts: Annotated[int, typer.Option(min=0, max=3, help="Number of rolling carts.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the home, the route and the noise.")] = 0,
+    size: Annotated[str, typer.Option(help="Image size, WIDTHxHEIGHT.")] = "640x480",
+    rate_hz: Annotated[float, typer.Option(min=0.5, max=60.0, help="Image rate of the camera.")] = 10.0,
     scene: Annotated[
-        Path | None, typer.Option(exists=True, dir_okay=False, help="glTF/GLB instead of the home.")
+        Path | None,
+        typer.Option(exists=True, dir_okay=False, help="glTF/GLB scene instead of a generated home."),
     ] = None,
-    glass: Annotated[bool, typer.Option("--glass", help="Glazed doors let some beams through.")] = False,
-    lidar_only: Annotated[
-        bool, typer.Option("--lidar-only", help="No camera: quick, for long drives.")
+    glass: Annotated[
+        bool, typer.Option("--glass", help="Let some lidar beams pass through glazed doors.")
     ] = False,
-    clock_offset_ms: Annotated[float, typer.Option(help="Fault: added to the camera's stamps.")] = 0.0,
+    lidar_only: Annotated[
+        bool, typer.Option("--lidar-only", help="No camera: fast, for long drives.")
+    ] = False,
+    clock_offset_ms: Annotated[float, typer.Option(help="Fault: added to the stamps of the images.")] = 0.0,
     extrinsic_yaw_deg: Annotated[
-        float, typer.Option(help="Fault: the tf's camera is turned left of the true one.")
+        float, typer.Option(help="Fault: the camera in tf is rotated to the left of the true one.")
     ] = 0.0,
     extrinsic_pitch_deg: Annotated[
-        float, typer.Option(help="Fault: the tf's camera looks lower than the true one.")
+        float, typer.Option(help="Fault: the camera in tf points lower than the true one.")
     ] = 0.0,
-    extrinsic_roll_deg: Annotated[float, typer.Option(help="Fault: the tf's camera is rolled.")] = 0.0,
-    extrinsic_xyz_m: Annotated[str, typer.Option(help="Fault: the tf's camera is moved by x,y,z.")] = "0,0,0",
-    distortion: Annotated[str, typer.Option(help="Lens: k1,k2,p1,p2,k3 (plumb_bob).")] = "0,0,0,0,0",
+    extrinsic_roll_deg: Annotated[float, typer.Option(help="Fault: the camera in tf is rolled.")] = 0.0,
+    extrinsic_xyz_m: Annotated[
+        str, typer.Option(help="Fault: the camera in tf is displaced by x,y,z.")
+    ] = "0,0,0",
+    distortion: Annotated[
+        str, typer.Option(help="Lens distortion k1,k2,p1,p2,k3 (plumb_bob).")
+    ] = "0,0,0,0,0",
     exposure_changes: Annotated[
-        bool, typer.Option("--exposure-changes", help="Fault: brightness wanders.")
+        bool, typer.Option("--exposure-changes", help="Fault: the exposure varies.")
     ] = False,
-    jobs: Annotated[int, typer.Option(min=1, help="Rendering processes.")] = os.cpu_count() or 1,
+    jobs: Annotated[int, typer.Option(min=1, help="Number of rendering processes.")] = os.cpu_count() or 1,
     force: Annotated[bool, typer.Option("--force", help="Replace an existing folder.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")] = False,
 ) -> None:
-    """Drive a simulated robot through a generated home and record it, with exact truth.
+    """Simulate a robot that drives through a generated home, and record it with exact ground truth.
 
-    The folder holds bag/ (ROS 2, MCAP) without any truth in it, and beside it groundtruth.txt, camera.json,
-    depth_gt/, moving_masks/, beams.npz, extra_views/ and gt_surface.ply. Worlds and pictures are kept in
+    The folder holds bag/ (ROS 2, MCAP) without ground truth, and beside it groundtruth.txt, camera.json,
+    depth_gt/, moving_masks/, beams.npz, extra_views/ and gt_surface.ply. Worlds and images are cached in
     $BEAMSPLAT_CACHE (default ~/.cache/beamsplat) and reused.
 
     Examples:
@@ -100,12 +110,12 @@ def simulate(
     beamsplat simulate --out faulty --clock-offset-ms 40 --extrinsic-yaw-deg 2 --distortion=-0.12,0.03,0,0,0
     """
     from beamsplat.tools.simulator import recording
-    from beamsplat.tools.simulator.settings import CameraSettings, Faults, LidarSettings, Simulation
+    from beamsplat.tools.simulator.settings import CameraSettings, Faults, LidarSettings, SimulationSettings
 
     width, height = _size(size)
     lens = _numbers(distortion, 5, "--distortion")
     shift = _numbers(extrinsic_xyz_m, 3, "--extrinsic-xyz-m")
-    settings = Simulation(
+    settings = SimulationSettings(
         seed=seed,
         seconds=seconds,
         laps=laps,
@@ -132,7 +142,7 @@ def simulate(
         console.print(f"[red]{error}[/]", highlight=False)
         raise typer.Exit(2) from error
     except KeyboardInterrupt as error:
-        console.print("stopped; nothing was written (finished pictures stay in the cache)")
+        console.print("stopped; nothing was written (rendered images stay in the cache)")
         raise typer.Exit(130) from error
     took = time.monotonic() - began
     if as_json:
@@ -148,7 +158,7 @@ def simulate(
 
 
 class _Bar:
-    """One progress line on standard error; a stage without a count shows no bar."""
+    """Progress on standard error, one line per stage; a stage without a count shows no bar."""
 
     def __init__(self) -> None:
         self._progress = Progress(

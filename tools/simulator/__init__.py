@@ -1,1 +1,1 @@
-"""A simulated robot in a generated home: camera, 2D lidar and wheels, with exact truth of everything."""
+"""A simulated robot with camera, 2D lidar and wheel odometry in a generated home, with exact ground truth."""

@@ -1,6 +1,6 @@
-"""Pictures in the home: paintings and posters, book spines, rugs, window views, screens, small fronts.
+"""Image-like textures: paintings and posters, book spines, rugs, window views, screens, clock faces.
 
-float32 [H, W, 3] sRGB, row 0 on top, from a seeded generator.
+All are float32 [H, W, 3] sRGB, row 0 on top, from a seeded generator.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ WORDS = (
 def text_mask(
     height: int, width: int, at: tuple[int, int], text: str, scale: float, thick: int
 ) -> np.ndarray:
-    """float32 [H, W, 1], 1 where a word is printed (OpenCV writes on bytes only)."""
+    """Return a mask float32 [H, W, 1] of printed text, drawn in uint8 because OpenCV's putText needs it."""
     mask = np.zeros((height, width), np.uint8)
     cv2.putText(mask, text, at, cv2.FONT_HERSHEY_DUPLEX, scale, 255, thick, cv2.LINE_AA)
     return (mask / np.float32(255.0))[..., None]
@@ -210,7 +210,7 @@ def book_spines(
 
 
 def persian_rug(rng: np.random.Generator, height: int = 512, width: int = 768) -> np.ndarray:
-    """Borders in steps, a medallion, and motifs mirrored twice."""
+    """Stepped borders, a medallion, and motifs mirrored about both axes."""
     palettes = ("7c1f23 20345c d9c39a 3b5a4a", "23395b c8b48a 8a2c2c e6dcc3", "5b4636 c9b79c 8f6f4e 2e3a3f")
     colours = [rgb(c) for c in str(rng.choice(palettes)).split()]
     quarter_h, quarter_w = height // 2, width // 2
@@ -238,7 +238,7 @@ def persian_rug(rng: np.random.Generator, height: int = 512, width: int = 768) -
 
 
 def garden_view(rng: np.random.Generator, height: int = 512, width: int = 512) -> np.ndarray:
-    """What a window shows: bright sky, far trees, lawn; soft, as out of focus."""
+    """View through a window: bright sky, far trees, lawn; blurred as if out of focus."""
     t = np.linspace(0, 1, height, dtype=np.float32)[:, None, None]
     out = np.broadcast_to(rgb("b9d6f2") * (1 - t) + rgb("f4f6f2") * t, (height, width, 3)).copy()
     out += 0.12 * np.clip(fractal(rng, height, width, 1.8), 0, 2)[..., None] * (1 - t)
@@ -253,7 +253,7 @@ def garden_view(rng: np.random.Generator, height: int = 512, width: int = 512) -
 
 
 def foliage(rng: np.random.Generator, size_px: int = 256) -> np.ndarray:
-    """A leaf's face: midrib along u, side veins, uneven green."""
+    """Surface of a leaf: midrib along u, side veins, uneven green."""
     y, x = np.mgrid[:size_px, :size_px].astype(np.float32) / size_px
     rib = np.exp(-np.abs(y - 0.5) * 70)
     veins = 0.5 + 0.5 * np.cos((x * 14 + np.abs(y - 0.5) * 10) * 2 * np.pi)
@@ -276,7 +276,7 @@ def screen(rng: np.random.Generator, height: int = 256, width: int = 448) -> np.
 
 
 def clock_face(size_px: int = 256) -> np.ndarray:
-    """Ten past ten."""
+    """Dial of a clock that shows ten past ten."""
     out = np.full((size_px, size_px, 3), 0.95, np.float32)
     centre = (size_px // 2, size_px // 2)
     for hour in range(12):

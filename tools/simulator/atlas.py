@@ -1,7 +1,7 @@
-"""All textures of a scene in one flat array with mip levels, ready for a compiled sampler.
+"""All textures of a scene with mip levels in one flat array, for the compiled sampler.
 
-Texels are stored as round(255 * sqrt(linear)): 8 bits, dark tones keep their steps, and decoding is a
-multiplication. Levels are averaged in linear light.
+Texels are stored as round(255 * sqrt(linear)): 8 bits with fine steps in dark tones, decoded by one
+multiplication. Mip levels are averaged in linear light.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ MAX_LEVELS = 12
 
 @dataclass(frozen=True)
 class Atlas:
-    """T textures."""
+    """T textures with their mip levels."""
 
     names: tuple[str, ...]
     size_m: np.ndarray  # float64 [T, 2] width and height of one repeat
@@ -32,25 +32,26 @@ class Atlas:
 
 
 def srgb_to_linear(srgb: np.ndarray) -> np.ndarray:
-    """IEC 61966-2-1, values 0..1."""
+    """Return linear values 0..1 of sRGB values 0..1 (IEC 61966-2-1)."""
     return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
 
 
 def linear_to_srgb(linear: np.ndarray) -> np.ndarray:
-    """IEC 61966-2-1, values 0..1."""
+    """Return sRGB values 0..1 of linear values 0..1 (IEC 61966-2-1)."""
     linear = np.maximum(linear, 0.0)
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
 
 
-def build_atlas(pictures: dict[str, tuple[np.ndarray, tuple[float, float]]]) -> Atlas:
-    """Pictures by name: sRGB float32 [H, W, 3] (row 0 on top) and the size of one repeat in metres."""
-    names = tuple(pictures)
+def build_atlas(textures: dict[str, tuple[np.ndarray, tuple[float, float]]]) -> Atlas:
+    """Build the atlas of textures by name: sRGB float32 [H, W, 3], row 0 on top, and the size of a repeat in
+    metres."""
+    names = tuple(textures)
     shape = (len(names), MAX_LEVELS)
     offset, widths, heights = (np.zeros(shape, np.int32) for _ in range(3))
     levels, mean = np.zeros(len(names), np.int32), np.zeros((len(names), 3), np.float32)
     chunks, start = [], 0
     for k, name in enumerate(names):
-        level = srgb_to_linear(pictures[name][0].astype(np.float32)).astype(np.float32)
+        level = srgb_to_linear(textures[name][0].astype(np.float32)).astype(np.float32)
         mean[k] = level.mean(axis=(0, 1))
         for j in range(MAX_LEVELS):
             height, width = level.shape[:2]
@@ -63,5 +64,5 @@ def build_atlas(pictures: dict[str, tuple[np.ndarray, tuple[float, float]]]) -> 
             level = cv2.resize(
                 level, (max(1, width // 2), max(1, height // 2)), interpolation=cv2.INTER_AREA
             ).reshape(max(1, height // 2), max(1, width // 2), 3)
-    sizes = np.array([pictures[name][1] for name in names], dtype=np.float64)
+    sizes = np.array([textures[name][1] for name in names], dtype=np.float64)
     return Atlas(names, sizes, np.concatenate(chunks), offset, widths, heights, levels, mean)

@@ -1,4 +1,4 @@
-"""The camera: where its pixels look (plumb_bob distortion included) and what its sensor makes of light."""
+"""The camera: rays of its pixels, with plumb_bob distortion, and the image formation of its sensor."""
 
 from __future__ import annotations
 
@@ -9,12 +9,13 @@ from beamsplat.common.compiled import kernel
 from beamsplat.tools.simulator.atlas import linear_to_srgb
 
 WHITE = 4096  # entries of the tone table per unit of exposed light
-SHOT_NOISE = 0.0009  # variance of a fully exposed pixel, of shot noise; about 1100 : 1
-READ_NOISE = 4e-6
+SHOT_NOISE = 0.0009  # shot noise variance of a fully exposed pixel: about 1100 photoelectrons
+READ_NOISE = 4e-6  # read noise variance, in squared units of exposed light
 
 
 def distort(points: np.ndarray, distortion: tuple[float, ...]) -> np.ndarray:
-    """Ideal normalised coordinates [N, 2] to distorted ones; plumb_bob (k1 k2 p1 p2 k3), as OpenCV's."""
+    """Return the distorted normalised coordinates [N, 2] of ideal ones; plumb_bob (k1, k2, p1, p2, k3) as in
+    OpenCV."""
     k1, k2, p1, p2, k3 = distortion
     x, y = points[:, 0], points[:, 1]
     r2 = x * x + y * y
@@ -29,10 +30,10 @@ def distort(points: np.ndarray, distortion: tuple[float, ...]) -> np.ndarray:
 
 
 def undistort(points: np.ndarray, distortion: tuple[float, ...], iterations: int = 30) -> np.ndarray:
-    """Inverse of `distort` by Newton's method with a numeric Jacobian.
+    """Return the ideal normalised coordinates [N, 2] of distorted ones: Newton's method, numeric Jacobian.
 
     Raises:
-        ValueError: the lens folds over inside the picture: no ray belongs to some pixel.
+        ValueError: the distortion folds over inside the image, so some pixels have no ray.
     """
     ideal, step = points.copy(), 1e-6
     right, down = np.array([step, 0.0]), np.array([0.0, step])
@@ -50,8 +51,8 @@ def undistort(points: np.ndarray, distortion: tuple[float, ...], iterations: int
             return ideal
     if np.abs(distort(ideal, distortion) - points).max() > 1e-9:
         raise ValueError(
-            f"distortion {distortion} folds over inside the picture: "
-            "take smaller coefficients or a longer lens"
+            f"distortion {distortion} folds over inside the image: "
+            "use smaller coefficients or a longer focal length"
         )
     return ideal
 
@@ -59,7 +60,8 @@ def undistort(points: np.ndarray, distortion: tuple[float, ...], iterations: int
 def pixel_rays(
     width: int, height: int, K: np.ndarray, distortion: tuple[float, ...] = (0.0,) * 5
 ) -> np.ndarray:
-    """float64 [H, W, 3], camera frame, z = 1: where each pixel looks. Pixel centres are integers."""
+    """Return the ray of each pixel in the camera frame, float64 [H, W, 3] with z = 1; pixel centres are
+    integers."""
     u, v = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
     points = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1]], axis=-1).reshape(-1, 2)
     if any(distortion):
@@ -68,7 +70,8 @@ def pixel_rays(
 
 
 def _tone_table() -> np.ndarray:
-    """sRGB value (0..255, float32) of exposed light 0..4 in steps of 1 / WHITE: soft shoulder above 0.7."""
+    """Return sRGB values 0..255, float32 [4 * WHITE + 1], of exposed light 0..4: linear to 0.7, then a soft
+    shoulder."""
     x = np.arange(4 * WHITE + 1) / WHITE
     knee = 0.7
     soft = knee + (1 - knee) * (1 - np.exp(-(x - knee) / (1 - knee)))
@@ -100,8 +103,8 @@ def _develop(
                 out[y, x, 2 - c] = np.uint8(tone[at] + 0.5)
 
 
-class Sensor:
-    """Vignetting, exposure, shot noise, tone curve, JPEG."""
+class ImageSensor:
+    """An image sensor: vignetting, exposure, shot and read noise, tone curve, JPEG compression."""
 
     def __init__(self, table_rays: np.ndarray, *, noise: float, vignetting: float, quality: int) -> None:
         squared = (table_rays[..., :2] ** 2).sum(axis=-1)
@@ -109,7 +112,7 @@ class Sensor:
         self._noise, self._quality = noise, quality
 
     def develop(self, radiance: np.ndarray, gain: float, rng: np.random.Generator) -> np.ndarray:
-        """uint8 BGR [H, W, 3] of linear radiance float32 [H, W, 3]."""
+        """Return the BGR image uint8 [H, W, 3] of linear radiance float32 [H, W, 3]."""
         out = np.empty(radiance.shape, np.uint8)
         grain = rng.standard_normal(radiance.shape, dtype=np.float32)
         shot, read = SHOT_NOISE * self._noise**2, READ_NOISE * self._noise**2
@@ -117,5 +120,5 @@ class Sensor:
         return out
 
     def jpeg(self, bgr: np.ndarray) -> bytes:
-        """The picture as the camera sends it."""
+        """Return a BGR image uint8 [H, W, 3] compressed as JPEG."""
         return cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, self._quality])[1].tobytes()

@@ -1,6 +1,7 @@
-"""Living room, bedroom and study pieces. A piece is drawn about the centre of its footprint: front to -y.
+"""Living room furniture and shared parts.
 
-All are functions of a seeded generator, so that no two chairs of two homes need to be alike.
+A piece is drawn around the centre of its footprint with its front to -y. Each is a function of a seeded
+generator, so that pieces differ between homes.
 """
 
 from __future__ import annotations
@@ -23,8 +24,8 @@ BULB = Material("plain", tint=(1.0, 0.93, 0.8), emission=6.0)
 
 
 @dataclass(frozen=True)
-class Piece:
-    """Something that stands in a room: its footprint in metres and how to draw it."""
+class FurniturePiece:
+    """A piece of furniture: its extent in metres and the function that draws it."""
 
     name: str
     width_m: float
@@ -34,21 +35,21 @@ class Piece:
 
 
 def wood(rng: np.random.Generator) -> Material:
-    """One of the home's furniture woods."""
+    """Return a random wood material."""
     return (OAK, WALNUT, BIRCH, LACQUER)[int(rng.choice(4, p=[0.4, 0.25, 0.2, 0.15]))]
 
 
 def legs(
     b: MeshBuilder, width: float, depth: float, height: float, material: Material, thick: float = 0.045
 ) -> None:
-    """Four square legs under the corners of a width x depth top."""
+    """Draw four square legs under the corners of a width x depth top."""
     for x in (-1, 1):
         for y in (-1, 1):
             at = (x * (width - thick) / 2, y * (depth - thick) / 2, 0.0)
             box(b, at, (thick, thick, height), material, skip=("bottom",), turn=True)
 
 
-def sofa(width: float) -> Piece:
+def sofa(width: float) -> FurniturePiece:
     """Upholstered, on short feet, with seat and back cushions and two pillows."""
 
     def draw(b: MeshBuilder, rng: np.random.Generator) -> None:
@@ -71,10 +72,10 @@ def sofa(width: float) -> Piece:
             pillow = b.placed(side * (width / 2 - 0.42), -0.02, 0.50, side * 0.25).tilted("x", -0.35)
             cushion(pillow, (0, 0, 0), (0.42, 0.16, 0.40), material, power=0.4, squash=0.6)
 
-    return Piece("sofa", width, 0.90, 0.85, draw)
+    return FurniturePiece("sofa", width, 0.90, 0.85, draw)
 
 
-def armchair() -> Piece:
+def armchair() -> FurniturePiece:
     """A round-backed easy chair."""
 
     def draw(b: MeshBuilder, rng: np.random.Generator) -> None:
@@ -94,10 +95,10 @@ def armchair() -> Piece:
         for side in (-1, 1):
             cushion(b, (side * 0.33, 0.0, 0.25), (0.14, 0.68, 0.34), cloth, power=0.3, squash=0.45)
 
-    return Piece("armchair", 0.82, 0.80, 0.85, draw)
+    return FurniturePiece("armchair", 0.82, 0.80, 0.85, draw)
 
 
-def coffee_table() -> Piece:
+def coffee_table() -> FurniturePiece:
     """Low table with a shelf, magazines, a bowl."""
 
     def draw(b: MeshBuilder, rng: np.random.Generator) -> None:
@@ -123,11 +124,11 @@ def coffee_table() -> Piece:
                 detail=8,
             )
 
-    return Piece("coffee_table", 1.05, 0.60, 0.45, draw)
+    return FurniturePiece("coffee_table", 1.05, 0.60, 0.45, draw)
 
 
 def stack(b: MeshBuilder, rng: np.random.Generator, count: int) -> None:
-    """Lying books."""
+    """Draw a stack of lying books."""
     z = 0.0
     for _ in range(count):
         thick, k = float(rng.uniform(0.015, 0.035)), int(rng.integers(64))
@@ -140,7 +141,7 @@ def stack(b: MeshBuilder, rng: np.random.Generator, count: int) -> None:
 def book(
     b: MeshBuilder, k: int, width: float, depth: float, height: float, colour: tuple[float, ...]
 ) -> None:
-    """A box whose front shows spine number k of the texture."""
+    """Draw a book: a box whose front shows spine k of the texture `books`."""
     cover = Material("plain", tint=(colour[0], colour[1], colour[2]))
     box(b, (0, 0, 0), (width, depth, height), cover, skip=("front",))
     spine(b, k, (-width / 2, -depth / 2, 0), (width, 0, 0), (0, 0, height))
@@ -149,13 +150,13 @@ def book(
 def spine(
     b: MeshBuilder, k: int, origin: tuple[float, ...], right: tuple[float, ...], up: tuple[float, ...]
 ) -> None:
-    """Cell k of the 64 spines on one quad."""
+    """Draw one quad with spine k of the 64 in the texture `books`."""
     vertices = np.array(
         [origin, np.add(origin, right), np.add(np.add(origin, right), up), np.add(origin, up)]
     )
     normal = np.cross(right, up) / np.linalg.norm(np.cross(right, up))
     u0, u1 = (k % 64 + 0.02) / 64, (k % 64 + 0.98) / 64
-    # Standing books are taller than wide; a lying one shows its spine turned.
+    # Standing books are taller than wide; on lying ones the spine is rotated by 90 degrees.
     upright = np.linalg.norm(up) > np.linalg.norm(right)
     uvs = [(u0, 0), (u1, 0), (u1, 1), (u0, 1)] if upright else [(u0, 1), (u0, 0), (u1, 0), (u1, 1)]
     b.add(
@@ -168,7 +169,7 @@ def spine(
     )
 
 
-def bookshelf(width: float, height: float) -> Piece:
+def bookshelf(width: float, height: float) -> FurniturePiece:
     """Boards, a back, and rows of standing books with gaps and ornaments."""
 
     def draw(b: MeshBuilder, rng: np.random.Generator) -> None:
@@ -185,7 +186,7 @@ def bookshelf(width: float, height: float) -> Piece:
             row = b.placed(0, 0, 0.06 + k * pitch + board)
             _books(row, rng, width - 2 * board - 0.02, pitch - board - 0.03, depth)
 
-    return Piece("bookshelf", width, 0.32, height, draw)
+    return FurniturePiece("bookshelf", width, 0.32, height, draw)
 
 
 def _books(b: MeshBuilder, rng: np.random.Generator, width: float, height: float, depth: float) -> None:
@@ -213,14 +214,14 @@ def _books(b: MeshBuilder, rng: np.random.Generator, width: float, height: float
 
 
 def vase(b: MeshBuilder, rng: np.random.Generator, height: float) -> None:
-    """A turned vessel."""
+    """Draw a vase, a body of revolution."""
     r = height * rng.uniform(0.16, 0.26)
     profile = [(0.55, 0.0), (0.9, 0.2), (1.0, 0.42), (0.75, 0.68), (0.38, 0.85), (0.45, 1.0)]
     tint = tuple(rng.uniform(0.15, 0.9, 3).tolist())
     lathe(b, (0, 0, 0), [(a * r, z * height) for a, z in profile], Material("ceramic", tint=tint), sides=14)
 
 
-def sideboard(width: float, *, television: bool = False) -> Piece:
+def sideboard(width: float, *, television: bool = False) -> FurniturePiece:
     """A low cabinet with doors and drawers; a television or ornaments on it."""
 
     def draw(b: MeshBuilder, rng: np.random.Generator) -> None:
@@ -239,7 +240,7 @@ def sideboard(width: float, *, television: bool = False) -> Piece:
             stack(b.placed(width * 0.28, 0, height, 0.2), rng, 4)
             frame(b.placed(0.02, 0.05, height).tilted("x", -0.15), rng, 0.22, 0.28)
 
-    return Piece("sideboard", width, 0.42, 1.25 if television else 0.85, draw)
+    return FurniturePiece("sideboard", width, 0.42, 1.25 if television else 0.85, draw)
 
 
 def fronts(
@@ -252,7 +253,7 @@ def fronts(
     rows: int,
     material: Material,
 ) -> None:
-    """Doors or drawers as raised panels with handles on the plane y = const."""
+    """Draw doors or drawers as raised panels with handles on the plane y = const."""
     gap, w, h = 0.006, width / columns, height / rows
     for i in range(columns):
         for j in range(rows):
@@ -269,7 +270,7 @@ def fronts(
 def frame(
     b: MeshBuilder, rng: np.random.Generator, width: float, height: float, number: int | None = None
 ) -> None:
-    """A framed picture standing in the local xz plane, back at y = 0."""
+    """Draw a framed painting in the local xz plane with its back at y = 0; `number` selects the painting."""
     from beamsplat.tools.simulator.palette import PAINTINGS
 
     k = int(rng.integers(PAINTINGS)) if number is None else number

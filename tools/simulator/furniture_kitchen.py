@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from beamsplat.tools.simulator.furniture import BLACK, FRONT, OAK, STEEL, Piece, fronts, vase
+from beamsplat.tools.simulator.furniture import BLACK, FRONT, OAK, STEEL, FurniturePiece, fronts, vase
 from beamsplat.tools.simulator.mesh import Material, MeshBuilder
 from beamsplat.tools.simulator.shapes import box, cylinder, lathe, rod
 
 
-def kitchen_run(width: float) -> Piece:
+def kitchen_run(width: float) -> FurniturePiece:
     """Base cabinets with worktop, sink, hob and oven; hanging cupboards, hood, tiles between."""
 
     def draw(b: MeshBuilder, rng: np.random.Generator) -> None:
@@ -45,7 +45,7 @@ def kitchen_run(width: float) -> Piece:
             if k not in (oven, sink) and rng.random() < 0.8:
                 _clutter(b.placed(-width / 2 + (k + 0.5) * w, 0.1, 0.9), rng)
 
-    return Piece("kitchen_run", width, 0.64, 2.1, draw)
+    return FurniturePiece("kitchen_run", width, 0.64, 2.1, draw)
 
 
 def _oven(b: MeshBuilder, width: float, depth: float) -> None:
@@ -73,7 +73,7 @@ def _clutter(b: MeshBuilder, rng: np.random.Generator) -> None:
         lathe(b, (0, 0, 0), [(0.06, 0), (0.09, 0.08), (0.07, 0.18), (0.03, 0.2)], STEEL)
 
 
-def fridge() -> Piece:
+def fridge() -> FurniturePiece:
     """Two doors, handles, notes on the front."""
 
     def draw(b: MeshBuilder, rng: np.random.Generator) -> None:
@@ -86,4 +86,4 @@ def fridge() -> Piece:
             note = Material(f"painting_{int(rng.integers(14))}")
             b.quad((x, -0.317 - 0.001 * k, z), (0.13, 0, 0.01), (-0.01, 0, 0.16), note, fit=True)
 
-    return Piece("fridge", 0.68, 0.68, 1.88, draw)
+    return FurniturePiece("fridge", 0.68, 0.68, 1.88, draw)

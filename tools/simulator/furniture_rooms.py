@@ -13,7 +13,7 @@ from beamsplat.tools.simulator.furniture import (
     STEEL,
     WALNUT,
     WARM,
-    Piece,
+    FurniturePiece,
     fronts,
     legs,
     stack,
@@ -25,7 +25,7 @@ from beamsplat.tools.simulator.shapes import box, cushion, cylinder, lathe, rod
 
 
 def chair(b: MeshBuilder, rng: np.random.Generator, material: Material) -> None:
-    """A dining chair facing -y, about its seat's centre."""
+    """Draw a dining chair that faces -y, around the centre of its seat."""
     legs(b, 0.42, 0.42, 0.44, material, 0.035)
     box(b, (0, 0, 0.43), (0.44, 0.44, 0.025), material)
     cushion(b, (0, 0, 0.45), (0.42, 0.42, 0.05), Material("armchair"), power=0.25, squash=0.5, detail=10)
@@ -36,8 +36,8 @@ def chair(b: MeshBuilder, rng: np.random.Generator, material: Material) -> None:
         box(back, (0, 0, 0), (0.38, 0.018, 0.065), material)
 
 
-def dining_set(width: float) -> Piece:
-    """A table laid for tea, with chairs all round; the footprint includes the chairs."""
+def dining_set(width: float) -> FurniturePiece:
+    """A laid table with chairs around it; the footprint includes the chairs."""
 
     def draw(b: MeshBuilder, rng: np.random.Generator) -> None:
         timber, seat = wood(rng), wood(rng)
@@ -64,10 +64,10 @@ def dining_set(width: float) -> Piece:
                 b, (at[0] + 0.15, at[1], at[2]), [(0.03, 0), (0.04, 0.09), (0.036, 0.09)], Material("ceramic")
             )
 
-    return Piece("dining_set", width + 0.1, 1.75, 0.95, draw)
+    return FurniturePiece("dining_set", width + 0.1, 1.75, 0.95, draw)
 
 
-def bed(width: float) -> Piece:
+def bed(width: float) -> FurniturePiece:
     """Head board at the wall, mattress, quilt with overhang, pillows."""
 
     def draw(b: MeshBuilder, rng: np.random.Generator) -> None:
@@ -112,10 +112,10 @@ def bed(width: float) -> Piece:
             squash=0.6,
         )
 
-    return Piece("bed", width + 0.06, 2.08, 1.05, draw)
+    return FurniturePiece("bed", width + 0.06, 2.08, 1.05, draw)
 
 
-def nightstand() -> Piece:
+def nightstand() -> FurniturePiece:
     """Drawers and a lamp."""
 
     def draw(b: MeshBuilder, rng: np.random.Generator) -> None:
@@ -126,11 +126,11 @@ def nightstand() -> Piece:
         table_lamp(b.placed(-0.05, 0.05, 0.5))
         stack(b.placed(0.1, -0.08, 0.5, 0.4), rng, 2)
 
-    return Piece("nightstand", 0.46, 0.42, 0.95, draw)
+    return FurniturePiece("nightstand", 0.46, 0.42, 0.95, draw)
 
 
 def table_lamp(b: MeshBuilder) -> None:
-    """A small shining shade on a turned foot."""
+    """Draw a small lit lampshade on a foot."""
     lathe(
         b,
         (0, 0, 0),
@@ -141,7 +141,7 @@ def table_lamp(b: MeshBuilder) -> None:
     b.lamp((0, 0, 0.3), 0.18, 0.35, WARM)
 
 
-def wardrobe(width: float) -> Piece:
+def wardrobe(width: float) -> FurniturePiece:
     """Tall, with panelled doors."""
 
     def draw(b: MeshBuilder, rng: np.random.Generator) -> None:
@@ -150,11 +150,11 @@ def wardrobe(width: float) -> Piece:
         box(b, (0, 0, 0.08), (width, 0.56, 1.98), timber, turn=True)
         fronts(b, width, 1.96, -0.28, 0.09, max(2, round(width / 0.5)), 1, timber)
 
-    return Piece("wardrobe", width, 0.62, 2.06, draw)
+    return FurniturePiece("wardrobe", width, 0.62, 2.06, draw)
 
 
-def chest(width: float) -> Piece:
-    """Chest of drawers with things on it."""
+def chest(width: float) -> FurniturePiece:
+    """Chest of drawers with a vase and a lamp on it."""
 
     def draw(b: MeshBuilder, rng: np.random.Generator) -> None:
         timber = wood(rng)
@@ -164,10 +164,10 @@ def chest(width: float) -> Piece:
         vase(b.placed(-0.25, 0, 0.86), rng, 0.3)
         table_lamp(b.placed(0.25, 0.05, 0.86))
 
-    return Piece("chest", width, 0.48, 1.25, draw)
+    return FurniturePiece("chest", width, 0.48, 1.25, draw)
 
 
-def desk(width: float) -> Piece:
+def desk(width: float) -> FurniturePiece:
     """Desk with monitor, keyboard, books, lamp, and a swivel chair in front of it."""
 
     def draw(b: MeshBuilder, rng: np.random.Generator) -> None:
@@ -187,11 +187,11 @@ def desk(width: float) -> Piece:
         table_lamp(table.placed(-width / 2 + 0.16, 0.18, 0.745))
         swivel_chair(b.placed(-0.1 + float(rng.normal(0, 0.06)), -0.36, 0, np.pi + float(rng.normal(0, 0.4))))
 
-    return Piece("desk", width, 1.35, 1.25, draw)
+    return FurniturePiece("desk", width, 1.35, 1.25, draw)
 
 
 def swivel_chair(b: MeshBuilder) -> None:
-    """Five-star base, gas spring, leather seat, facing -y."""
+    """Draw a swivel chair that faces -y: five-star base, gas spring, leather seat."""
     leather = Material("leather")
     for k in range(5):
         a = k * 2 * np.pi / 5
@@ -213,7 +213,7 @@ def swivel_chair(b: MeshBuilder) -> None:
         box(b, (x, 0.0, 0.66), (0.06, 0.26, 0.03), BLACK)
 
 
-def bench(width: float) -> Piece:
+def bench(width: float) -> FurniturePiece:
     """A bench with a blanket and a basket under it."""
 
     def draw(b: MeshBuilder, rng: np.random.Generator) -> None:
@@ -229,10 +229,10 @@ def bench(width: float) -> Piece:
             Material("lampshade", tint),
         )
 
-    return Piece("bench", width, 0.40, 0.55, draw)
+    return FurniturePiece("bench", width, 0.40, 0.55, draw)
 
 
-def stool() -> Piece:
+def stool() -> FurniturePiece:
     """Round seat, three legs."""
 
     def draw(b: MeshBuilder, rng: np.random.Generator) -> None:
@@ -248,10 +248,10 @@ def stool() -> Piece:
                 timber,
             )
 
-    return Piece("stool", 0.40, 0.40, 0.46, draw)
+    return FurniturePiece("stool", 0.40, 0.40, 0.46, draw)
 
 
-def toy_box() -> Piece:
+def toy_box() -> FurniturePiece:
     """A crate with balls and blocks around it."""
 
     def draw(b: MeshBuilder, rng: np.random.Generator) -> None:
@@ -272,11 +272,11 @@ def toy_box() -> Piece:
             material = Material("plain", tint=tint)
             cushion(b, at, (size, size, size), material, power=power, squash=power, detail=10)
 
-    return Piece("toy_box", 0.62, 0.42, 0.42, draw)
+    return FurniturePiece("toy_box", 0.62, 0.42, 0.42, draw)
 
 
 def ceiling_lamp(b: MeshBuilder, drop: float) -> None:
-    """A pendant hanging from z = 0 downwards."""
+    """Draw a lit pendant lamp that hangs down from z = 0."""
     rod(b, (0, 0, 0), (0, 0, -drop), 0.006, BLACK, sides=5)
     lathe(b, (0, 0, -drop - 0.2), [(0.2, 0.0), (0.14, 0.14), (0.04, 0.2)], LACQUER, sides=24)
     lathe(b, (0, 0, -drop - 0.2), [(0.185, 0.005), (0.13, 0.135), (0.04, 0.19)][::-1], SHADE, sides=24)
@@ -284,7 +284,7 @@ def ceiling_lamp(b: MeshBuilder, drop: float) -> None:
     b.lamp((0, 0, -drop - 0.1), 0.23, 2.4, WARM * 0.5 + 0.5)
 
 
-def fireplace() -> Piece:
+def fireplace() -> FurniturePiece:
     """Brick chimney breast with a mantel and an opening."""
 
     def draw(b: MeshBuilder, rng: np.random.Generator) -> None:
@@ -306,4 +306,4 @@ def fireplace() -> Piece:
                 Material("walnut"),
             )
 
-    return Piece("fireplace", 1.66, 0.52, 2.42, draw)
+    return FurniturePiece("fireplace", 1.66, 0.52, 2.42, draw)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from beamsplat.tools.simulator.furniture import BLACK, SHADE, STEEL, WARM, Piece
+from beamsplat.tools.simulator.furniture import BLACK, SHADE, STEEL, WARM, FurniturePiece
 from beamsplat.tools.simulator.mesh import Material, MeshBuilder
 from beamsplat.tools.simulator.shapes import cylinder, lathe, rod
 
 
-def floor_lamp() -> Piece:
-    """A shade on a pole; it shines."""
+def floor_lamp() -> FurniturePiece:
+    """A lit lampshade on a pole."""
 
     def draw(b: MeshBuilder, rng: np.random.Generator) -> None:
         cylinder(b, (0, 0, 0), 0.15, 0.025, BLACK, sides=20)
@@ -18,10 +18,10 @@ def floor_lamp() -> Piece:
         lathe(b, (0, 0, 1.35), [(0.22, 0.0), (0.16, 0.3)], SHADE, sides=24)
         b.lamp((0, 0, 1.5), 0.30, 0.9, WARM)
 
-    return Piece("floor_lamp", 0.42, 0.42, 1.65, draw)
+    return FurniturePiece("floor_lamp", 0.42, 0.42, 1.65, draw)
 
 
-def plant(height: float) -> Piece:
+def plant(height: float) -> FurniturePiece:
     """Leaves on stems in a pot."""
 
     def draw(b: MeshBuilder, rng: np.random.Generator) -> None:
@@ -37,11 +37,11 @@ def plant(height: float) -> Piece:
             rod(b, base, tuple(tip), 0.006, Material("leaf", tint=(0.7, 0.7, 0.5)), sides=5)
             leaf(b, tip, yaw, float(rng.uniform(0.2, 0.34)), float(rng.uniform(-0.3, 0.5)))
 
-    return Piece("plant", 0.55, 0.55, height, draw)
+    return FurniturePiece("plant", 0.55, 0.55, height, draw)
 
 
 def leaf(b: MeshBuilder, tip: np.ndarray, yaw: float, length: float, pitch: float) -> None:
-    """A pointed, drooping blade of both sides starting at `tip`."""
+    """Draw a pointed, drooping, two-sided leaf that starts at `tip`."""
     s = np.linspace(0.0, 1.0, 7)
     half = 0.30 * length * np.sin(np.pi * np.clip(s, 0.03, 1.0) ** 0.8)
     along = length * s

@@ -1,4 +1,4 @@
-"""A user's scene from glTF/GLB (or anything trimesh opens): y-up metres to our z-up, textures, fine mesh."""
+"""Loads a scene from glTF/GLB, or any format of trimesh: y-up metres to z-up, textures, refined mesh."""
 
 from __future__ import annotations
 
@@ -7,33 +7,33 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from beamsplat.tools.simulator.mesh import Material, Mesh, merge
-from beamsplat.tools.simulator.palette import Pictures
+from beamsplat.tools.simulator.mesh import Material, SceneMesh, merge
+from beamsplat.tools.simulator.palette import Textures
 
-EDGE_M = 0.18
-MAX_TRIANGLES = 1_500_000
+EDGE_M = 0.18  # longest edge after refinement: resolution of the baked light
+MAX_TRIANGLES = 1_500_000  # baking more takes too long and too much memory
 WHITE = np.ones((4, 4, 3), np.float32)
 
 
-def load_glb(path: Path) -> tuple[Mesh, Pictures]:
-    """The scene's mesh and textures.
+def load_glb(path: Path) -> tuple[SceneMesh, Textures]:
+    """Return the mesh and the textures of a scene file.
 
     Raises:
-        ValueError: not a readable scene, or without triangles, or too large to bake.
+        ValueError: the file is unreadable, has no triangles, or is too large to bake.
     """
     try:
         scene = trimesh.load_scene(path)
-    except Exception as error:  # trimesh's loaders raise whatever their formats' libraries raise
+    except Exception as error:  # the loaders of trimesh raise the errors of many libraries
         raise ValueError(f"{path} is not a 3D scene that can be read: {error}") from error
     to_z_up = trimesh.transformations.rotation_matrix(np.pi / 2, [1, 0, 0])
-    pictures: Pictures = {"plain": (WHITE, (1.0, 1.0))}
+    textures: Textures = {"plain": (WHITE, (1.0, 1.0))}
     parts = []
     for name in scene.graph.nodes_geometry:
         transform, geometry_name = scene.graph[name]
         geometry = scene.geometry[geometry_name]
         if not isinstance(geometry, trimesh.Trimesh) or len(geometry.faces) == 0:
             continue
-        texture, tint = _material(geometry, f"file_{geometry_name}", pictures)
+        texture, tint = _material(geometry, f"file_{geometry_name}", textures)
         parts.append(_part(geometry, to_z_up @ transform, texture, tint, len(parts)))
     if not parts:
         raise ValueError(f"{path} has no triangles: export meshes, not points or curves")
@@ -43,7 +43,7 @@ def load_glb(path: Path) -> tuple[Mesh, Pictures]:
             f"{path} has {len(mesh.triangles)} triangles at {EDGE_M} m (limit {MAX_TRIANGLES}): "
             "is it in metres?"
         )
-    return mesh, pictures
+    return mesh, textures
 
 
 def _part(
@@ -52,7 +52,7 @@ def _part(
     texture: str,
     tint: tuple[float, float, float],
     number: int,
-) -> Mesh:
+) -> SceneMesh:
     vertices = trimesh.transformations.transform_points(geometry.vertices, T_world_part)
     uv = getattr(geometry.visual, "uv", None)
     uv = np.zeros((len(vertices), 2)) if uv is None else np.asarray(uv, dtype=np.float64)
@@ -69,13 +69,13 @@ def _part(
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = np.linalg.norm(normal, axis=1)
     faces, normal, area = faces[area > 1e-12], normal[area > 1e-12], area[area > 1e-12]
-    # Flat shading needs a vertex of its own for each face orientation: split all.
+    # Flat shading needs one normal per face, so every face gets its own vertices.
     flat = faces.ravel()
     normals = np.repeat(normal / area[:, None], 3, axis=0)
     centre = np.repeat(joined[:, :3][faces].mean(axis=1), 3, axis=0)
     points = joined[flat, :3]
     count = len(faces)
-    return Mesh(
+    return SceneMesh(
         points.astype(np.float32),
         normals.astype(np.float32),
         (points + 0.03 * (centre - points) + 0.004 * normals).astype(np.float32),
@@ -88,7 +88,8 @@ def _part(
 
 
 def _refine(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Halves long edges' triangles until none is longer than EDGE_M; columns 3.. go along."""
+    """Bisect triangles at their longest edge until none is longer than EDGE_M; columns 3.. are
+    interpolated."""
     done_v, done_f, offset = [], [], 0
     for _ in range(14):
         corners = vertices[faces]
@@ -101,7 +102,7 @@ def _refine(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.nda
         if not long.any():
             break
         corners, edge = corners[long], edge[long]
-        # Edge k of `edge` joins corners k - 1 and k: turn each triangle so that its longest is 0 - 1.
+        # Edge k of `edge` joins corners k - 1 and k: rotate the corners so that the longest edge is 0 - 1.
         turn = (np.argmax(edge, axis=1) - 1) % 3
         pick = (turn[:, None] + np.arange(3)) % 3
         corners = np.take_along_axis(corners, pick[..., None], axis=1)
@@ -117,9 +118,9 @@ def _refine(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 def _material(
-    geometry: trimesh.Trimesh, name: str, pictures: Pictures
+    geometry: trimesh.Trimesh, name: str, textures: Textures
 ) -> tuple[str, tuple[float, float, float]]:
-    """Texture name and linear tint; the picture is put into `pictures`."""
+    """Return the texture name and the linear tint of a geometry; its image is added to `textures`."""
     material = getattr(geometry.visual, "material", None)
     image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
     factor = getattr(material, "baseColorFactor", None)
@@ -132,8 +133,8 @@ def _material(
         tint = (float(values[0]), float(values[1]), float(values[2]))
     if image is None:
         return "plain", tint
-    picture = np.asarray(image.convert("RGB"), dtype=np.float32) / 255.0
-    if picture.size == 0:
+    texels = np.asarray(image.convert("RGB"), dtype=np.float32) / 255.0
+    if texels.size == 0:
         return "plain", tint
-    pictures[name] = (np.clip(picture, 0.0, 1.0), (1.0, 1.0))
+    textures[name] = (np.clip(texels, 0.0, 1.0), (1.0, 1.0))
     return name, tint

@@ -1,4 +1,4 @@
-"""A home from a seed: four rooms in a ring, doorways between them, and the route through all of them."""
+"""Generates a home from a seed: four rooms in a ring with doorways, and a route through all of them."""
 
 from __future__ import annotations
 
@@ -6,31 +6,31 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from beamsplat.tools.simulator.mesh import Light, Material, Mesh, MeshBuilder
-from beamsplat.tools.simulator.palette import Pictures, home_pictures
-from beamsplat.tools.simulator.place import Opening, Room
+from beamsplat.tools.simulator.mesh import Light, Material, MeshBuilder, SceneMesh
+from beamsplat.tools.simulator.palette import Textures, home_textures
+from beamsplat.tools.simulator.place import Room, WallOpening
 from beamsplat.tools.simulator.rooms import furnish
 from beamsplat.tools.simulator.shapes import box
-from beamsplat.tools.simulator.walls import HALF_WALL_M, Finish, draw_shell
+from beamsplat.tools.simulator.walls import HALF_WALL_M, RoomFinish, draw_shell
 
-ROUTE_CLEARANCE_M = 0.42
+ROUTE_CLEARANCE_M = 0.42  # distance of furniture from the route
 
 
 @dataclass(frozen=True)
 class Home:
-    """Geometry, pictures, lights, and a closed route [N, 2] a robot can follow, all in metres."""
+    """Geometry, textures, lights, and a closed route [N, 2] in metres that a robot can follow."""
 
-    mesh: Mesh
-    pictures: Pictures
+    mesh: SceneMesh
+    textures: Textures
     lights: tuple[Light, ...]
     route_m: np.ndarray
 
 
 def build_home(seed: int) -> Home:
-    """The home of this seed; the same seed gives the same bytes."""
+    """Return the home of this seed; the same seed yields the same bytes."""
     rng = np.random.default_rng([seed, 0x48])
-    pictures = home_pictures(np.random.default_rng([seed, 0x54]))
-    builder = MeshBuilder({name: size for name, (_, size) in pictures.items()})
+    textures = home_textures(np.random.default_rng([seed, 0x54]))
+    builder = MeshBuilder({name: size for name, (_, size) in textures.items()})
     rooms, route = floor_plan(rng)
     finishes = _finishes(rng, rooms)
     for room in rooms:
@@ -38,11 +38,11 @@ def build_home(seed: int) -> Home:
     for room in rooms:
         furnish(builder, room, route, ROUTE_CLEARANCE_M, rng)
     _terrace(builder, rooms)
-    return Home(builder.build(), pictures, builder.lights, route)
+    return Home(builder.build(), textures, builder.lights, route)
 
 
 def floor_plan(rng: np.random.Generator) -> tuple[list[Room], np.ndarray]:
-    """Rooms in ring order (counter-clockwise from the south-west) and the route [N, 2] at 5 cm steps."""
+    """Return the rooms, counter-clockwise from the south-west, and the route [N, 2] at 5 cm steps."""
     width, depth = rng.uniform(11.4, 12.6), rng.uniform(8.8, 9.8)
     low_x, high_x = rng.uniform(0.45, 0.58, 2) * width
     mid_y = rng.uniform(0.47, 0.56) * depth
@@ -71,7 +71,7 @@ def floor_plan(rng: np.random.Generator) -> tuple[list[Room], np.ndarray]:
         for room, side in zip((rooms[k], rooms[(k + 1) % 4]), sides[k]):
             point = np.array([line, along] if axis == "x" else [along, line])
             s = _along(room, side, point)
-            room.openings[side].append(Opening(s - half, s + half, 0.0, 2.08, "door"))
+            room.openings[side].append(WallOpening(s - half, s + half, 0.0, 2.08, "door"))
     for room, outer in zip(
         rooms, (("south", "west"), ("south", "east"), ("north", "east"), ("north", "west"))
     ):
@@ -96,16 +96,16 @@ def _windows(rng: np.random.Generator, room: Room, outer: tuple[str, str]) -> No
         length = room.length(side)
         if k == 0 and room.name in ("living", "bedroom"):
             s = float(rng.uniform(0.3, 0.7) * length)
-            room.openings[side].append(Opening(s - 0.9, s + 0.9, 0.05, 2.12, "glass"))
+            room.openings[side].append(WallOpening(s - 0.9, s + 0.9, 0.05, 2.12, "glass"))
             continue
         half = float(rng.uniform(0.6, 0.95))
         s = float(rng.uniform(half + 0.5, length - half - 0.5))
         sill = 1.02 if room.name == "kitchen" else float(rng.uniform(0.85, 0.95))
-        room.openings[side].append(Opening(s - half, s + half, sill, 2.12, "window"))
+        room.openings[side].append(WallOpening(s - half, s + half, sill, 2.12, "window"))
 
 
 def _route(rng: np.random.Generator, rooms: list[Room], doors: list[tuple[str, float, float]]) -> np.ndarray:
-    """Straight through each doorway, and in each room out towards its outer corner, then back."""
+    """Return a route straight through each doorway, and in each room towards its outer corner and back."""
     corners = [
         (rooms[0].x0, rooms[0].y0),
         (rooms[1].x1, rooms[1].y0),
@@ -135,7 +135,7 @@ def _door_point(door: tuple[str, float, float], room: Room, distance: float) -> 
     return np.array([along, line + np.sign(centre[1] - line) * distance])
 
 
-def _finishes(rng: np.random.Generator, rooms: list[Room]) -> dict[str, Finish]:
+def _finishes(rng: np.random.Generator, rooms: list[Room]) -> dict[str, RoomFinish]:
     floors = dict(zip(("living", "study", "bedroom"), rng.permutation(["floor_a", "floor_c", "floor_d"])))
     floors["kitchen"] = str(rng.choice(["floor_b", "checker"]))
     walls = dict(
@@ -149,7 +149,7 @@ def _finishes(rng: np.random.Generator, rooms: list[Room]) -> dict[str, Finish]:
     for k, room in enumerate(rooms):
         inner = (("north", "east"), ("north", "west"), ("south", "west"), ("south", "east"))[k]
         accent = accents.get(room.name)
-        out[room.name] = Finish(
+        out[room.name] = RoomFinish(
             floor=Material(str(floors[room.name])),
             wall=Material(str(walls[room.name])),
             ceiling=Material("panelling" if room.name == "living" else "ceiling"),
@@ -162,7 +162,7 @@ def _finishes(rng: np.random.Generator, rooms: list[Room]) -> dict[str, Finish]:
 
 
 def _terrace(b: MeshBuilder, rooms: list[Room]) -> None:
-    """What a beam through a glazed door meets: paving and a garden wall."""
+    """Draw a garden wall around the home: beams that pass through a glazed door end there."""
     x0, y0 = min(r.x0 for r in rooms) - 2.6, min(r.y0 for r in rooms) - 2.6
     x1, y1 = max(r.x1 for r in rooms) + 2.6, max(r.y1 for r in rooms) + 2.6
     wall = Material("stonebrick")

@@ -1,4 +1,4 @@
-"""A walking person and a rolling cart: rigid parts of texture-mapped shapes, posed by time."""
+"""Models of a walking person and a rolling cart: articulated rigid bodies with textures."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from beamsplat.tools.simulator import textures as tx
-from beamsplat.tools.simulator.mesh import Material, Mesh, MeshBuilder, merge
-from beamsplat.tools.simulator.palette import Pictures
+from beamsplat.tools.simulator.mesh import Material, MeshBuilder, SceneMesh, merge
+from beamsplat.tools.simulator.palette import Textures
 from beamsplat.tools.simulator.shapes import box, cushion, lathe, rod
 from beamsplat.tools.simulator.textures import rgb
 
-STRIDE_M = 1.25  # two steps
+STRIDE_M = 1.25  # length of a gait cycle (two steps)
 
 
-def clothes(rng: np.random.Generator) -> Pictures:
-    """Textures for people and carts, by name."""
+def clothes(rng: np.random.Generator) -> Textures:
+    """Return the textures of people and carts, by name."""
     shirts = [
         tx.plaid(rng, [rgb("8c2f39"), rgb("e0d5c1"), rgb("2c3e50")]),
         tx.stripes(rng, rgb("e9e4d8"), rgb("31506e"), 256),
@@ -24,7 +24,7 @@ def clothes(rng: np.random.Generator) -> Pictures:
         tx.dots(rng, rgb("3d5a50"), rgb("d8d2c0")),
     ]
     return {
-        **{f"shirt_{k}": (picture, (0.3, 0.3)) for k, picture in enumerate(shirts)},
+        **{f"shirt_{k}": (texture, (0.3, 0.3)) for k, texture in enumerate(shirts)},
         "denim": (tx.weave(rng, rgb("3a5273"), strength=0.12, melange=0.08), (0.08, 0.08)),
         "chino": (tx.weave(rng, rgb("8d7c62"), strength=0.08), (0.08, 0.08)),
         "skin": (tx.flat(rng, rgb("d6a585"), depth=0.03), (0.3, 0.3)),
@@ -34,24 +34,25 @@ def clothes(rng: np.random.Generator) -> Pictures:
 
 
 @dataclass(frozen=True)
-class Part:
-    """A rigid piece about its joint; `parent` carries the joint at `joint_m`."""
+class BodyLink:
+    """A rigid link whose origin is its joint; the joint is at `joint_m` in the frame of link `parent` (-1:
+    root)."""
 
-    mesh: Mesh
+    mesh: SceneMesh
     parent: int
     joint_m: tuple[float, float, float]
 
 
 @dataclass(frozen=True)
-class Body:
-    """Parts in order (a parent before its children), and how their joints swing."""
+class ArticulatedBody:
+    """An articulated body: links in an order in which every parent precedes its children."""
 
-    parts: tuple[Part, ...]
+    parts: tuple[BodyLink, ...]
     kind: str  # person or cart
-    whole: Mesh  # all parts merged, in part order
+    whole: SceneMesh  # all links merged, in the same order
 
-    def posed(self, x_m: float, y_m: float, yaw_rad: float, travelled_m: float) -> Mesh:
-        """The body at a place, after so many metres of walking; yaw is where it looks."""
+    def posed(self, x_m: float, y_m: float, yaw_rad: float, travelled_m: float) -> SceneMesh:
+        """Return the mesh of the body at (x, y), facing yaw, at the gait phase of a travelled distance."""
         angles, lift = _gait(travelled_m) if self.kind == "person" else ([0.0] * len(self.parts), 0.0)
         frames: list[tuple[np.ndarray, np.ndarray]] = []
         vertices, normals = [], []
@@ -72,7 +73,10 @@ class Body:
 
 
 def _gait(travelled_m: float) -> tuple[list[float], float]:
-    """Joint angles about the left axis (positive swings a hanging limb back), in part order, and the bob."""
+    """Return the joint angles in link order and the vertical motion of the pelvis in metres.
+
+    Angles are about the y axis (left): a positive one swings a hanging limb backwards.
+    """
     phase = 2 * np.pi * travelled_m / STRIDE_M
     angles = [0.0, 0.0]  # pelvis, head
     for side in (0.0, np.pi):
@@ -83,8 +87,8 @@ def _gait(travelled_m: float) -> tuple[list[float], float]:
     return angles, 0.018 * np.cos(2 * phase) - 0.018
 
 
-def person(rng: np.random.Generator, sizes: dict[str, tuple[float, float]]) -> Body:
-    """Someone 1.6 to 1.85 m tall, facing +x."""
+def person(rng: np.random.Generator, sizes: dict[str, tuple[float, float]]) -> ArticulatedBody:
+    """Return a random person, 1.6 to 1.85 m tall, facing +x; `sizes` are texture sizes in metres by name."""
     scale = float(rng.uniform(0.93, 1.06))
     shirt = Material(f"shirt_{int(rng.integers(4))}")
     trousers = Material(str(rng.choice(["denim", "chino"])))
@@ -94,12 +98,12 @@ def person(rng: np.random.Generator, sizes: dict[str, tuple[float, float]]) -> B
         Material("hair", tint=(1, 1, float(rng.uniform(0.7, 1.2)))),
     )
 
-    def part(draw: object, parent: int, joint: tuple[float, float, float]) -> Part:
+    def part(draw: object, parent: int, joint: tuple[float, float, float]) -> BodyLink:
         b = MeshBuilder(sizes, edge_m=0.12)
         draw(b)  # type: ignore[operator]
         mesh = b.build()
         scaled = mesh.posed(mesh.vertices_m * scale, mesh.normals)
-        return Part(scaled, parent, (joint[0] * scale, joint[1] * scale, joint[2] * scale))
+        return BodyLink(scaled, parent, (joint[0] * scale, joint[1] * scale, joint[2] * scale))
 
     def torso(b: MeshBuilder) -> None:
         profile = [
@@ -155,11 +159,11 @@ def person(rng: np.random.Generator, sizes: dict[str, tuple[float, float]]) -> B
         parts.append(part(foot, first + 1, (0.0, 0.0, -0.395)))
         parts.append(part(upper_arm, 0, (0.0, side * 0.215, 0.47)))
         parts.append(part(fore_arm, first + 3, (0.0, 0.0, -0.28)))
-    return Body(tuple(parts), "person", merge(p.mesh for p in parts))
+    return ArticulatedBody(tuple(parts), "person", merge(p.mesh for p in parts))
 
 
 def _oval(b: MeshBuilder, profile: list[tuple[float, float]], flat: float, material: Material) -> None:
-    """A body of revolution squeezed front to back."""
+    """Draw a body of revolution, scaled by `flat` from front to back."""
     inner = MeshBuilder(b.texture_size_m, b.edge_m)
     lathe(inner, (0, 0, 0), profile, material, sides=20)
     mesh = inner.build()
@@ -169,8 +173,8 @@ def _oval(b: MeshBuilder, profile: list[tuple[float, float]], flat: float, mater
     b.add(mesh.vertices_m * squeeze, normals, mesh.uvs, mesh.triangles, material)
 
 
-def cart(rng: np.random.Generator, sizes: dict[str, tuple[float, float]]) -> Body:
-    """A serving trolley 0.75 m high with boxes on it; faces +x."""
+def cart(rng: np.random.Generator, sizes: dict[str, tuple[float, float]]) -> ArticulatedBody:
+    """Return a serving trolley 0.75 m high with boxes on it, facing +x."""
     b = MeshBuilder(sizes, edge_m=0.12)
     for z in (0.14, 0.44, 0.72):
         box(b, (0, 0, z), (0.62, 0.42, 0.025), Material("oak"))
@@ -183,4 +187,4 @@ def cart(rng: np.random.Generator, sizes: dict[str, tuple[float, float]]) -> Bod
             size = rng.uniform((0.18, 0.2, 0.12), (0.26, 0.34, 0.2))
             box(b, (x, 0.0, z), tuple(size.tolist()), Material(name))
     mesh = b.build()
-    return Body((Part(mesh, -1, (0.0, 0.0, 0.0)),), "cart", mesh)
+    return ArticulatedBody((BodyLink(mesh, -1, (0.0, 0.0, 0.0)),), "cart", mesh)

@@ -1,8 +1,8 @@
-"""Baked light: windows and lamps with soft shadows, and the light that walls and floors throw on each other.
+"""Light baking: direct light of windows and lamps with soft shadows, and indirect light between surfaces.
 
-Per vertex, Lambertian. Direct light samples each patch of light at several points; indirect light is the
-classic radiosity gather (cosine-weighted rays; E = E_direct + mean of albedo * E where they land),
-iterated over the same hits, so that bounces cost no rays.
+Per vertex, Lambertian. Direct light samples each area light at several points. Indirect light is radiosity by
+gathering: E = E_direct + mean of albedo * E at the hits of cosine-weighted rays, iterated over the same hits,
+so that further bounces need no further rays.
 """
 
 from __future__ import annotations
@@ -11,20 +11,21 @@ import numpy as np
 from scipy import sparse
 
 from beamsplat.tools.simulator.atlas import Atlas
-from beamsplat.tools.simulator.cast import Caster
-from beamsplat.tools.simulator.mesh import Light, Mesh
+from beamsplat.tools.simulator.mesh import Light, SceneMesh
+from beamsplat.tools.simulator.ray_caster import RayCaster
 
-LIGHT_SAMPLES = 8
-GATHER_RAYS = 48
+LIGHT_SAMPLES = 8  # points on each area light
+GATHER_RAYS = 48  # rays per vertex for indirect light
 BOUNCES = 5
-AMBIENT = 0.03  # what reaches a corner no ray of ours does; also outside
-BLOCK = 1 << 16
+AMBIENT = 0.03  # constant irradiance / pi where gather rays leave the scene; 15 % of it everywhere
+BLOCK = 1 << 16  # vertices processed at once, bounds memory
 
 
 def bake(
-    mesh: Mesh, atlas: Atlas, lights: tuple[Light, ...], caster: Caster, *, rays: int = GATHER_RAYS
+    mesh: SceneMesh, atlas: Atlas, lights: tuple[Light, ...], caster: RayCaster, *, rays: int = GATHER_RAYS
 ) -> np.ndarray:
-    """Irradiance / pi of every vertex, linear RGB float32 [V, 3]: radiance of a white surface there."""
+    """Return irradiance / pi of every vertex, linear RGB float32 [V, 3]: the radiance of a white surface
+    there."""
     direct = np.zeros((len(mesh.vertices_m), 3), np.float32)
     for number, light in enumerate(lights):
         direct += _direct(mesh, light, caster, number)
@@ -32,7 +33,7 @@ def bake(
     return _bounce(mesh, atlas, direct, hits)
 
 
-def _direct(mesh: Mesh, light: Light, caster: Caster, number: int) -> np.ndarray:
+def _direct(mesh: SceneMesh, light: Light, caster: RayCaster, number: int) -> np.ndarray:
     out = np.zeros((len(mesh.vertices_m), 3), np.float32)
     points, normals = mesh.bake_points_m, mesh.normals
     centre = np.array(light.centre_m, np.float32)
@@ -46,7 +47,7 @@ def _direct(mesh: Mesh, light: Light, caster: Caster, number: int) -> np.ndarray
     rng = np.random.default_rng([number, 0x4C])
     samples, sample_normals = _light_points(light, rng, points[chosen])
     total = np.zeros(len(chosen), np.float32)
-    # Most vertices see nothing of most lights: three probes decide who gets all samples.
+    # Most lights are hidden from most vertices: all samples are computed only where one of three arrives.
     probes = (0, 3, 6)
     everyone = np.arange(len(chosen))
     for k in probes:
@@ -69,9 +70,10 @@ def _arriving(
     light: Light,
     samples: np.ndarray,
     sample_normals: np.ndarray,
-    caster: Caster,
+    caster: RayCaster,
 ) -> np.ndarray:
-    """Relative irradiance float32 [N] from one sample of the light for each point; 0 in its shadow."""
+    """Return the relative irradiance float32 [N] of points [N, 3] from one sample of the light each; 0 in
+    shadow."""
     to = samples - points
     squared = np.maximum(np.einsum("ij,ij->i", to, to), 1e-3)
     cos_here = np.einsum("ij,ij->i", to, normals)
@@ -87,11 +89,12 @@ def _arriving(
 def _light_points(
     light: Light, rng: np.random.Generator, points: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Stratified points [N, LIGHT_SAMPLES, 3] on the light for receivers [N, 3], and where they shine to."""
+    """Return stratified points on the light for receivers [N, 3], and the normals there; [N, LIGHT_SAMPLES,
+    3] each."""
     count = len(points)
     centre = np.array(light.centre_m, np.float32)
     if light.radius_m > 0:
-        # Even over the disc a point sees of the ball, lifted onto the ball: all samples weigh the same.
+        # Uniform over the disc that the receiver sees, projected onto the sphere: equal weights.
         toward = points - centre
         toward /= np.linalg.norm(toward, axis=1, keepdims=True) + np.float32(1e-9)
         helper = np.where(np.abs(toward[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]]).astype(
@@ -100,7 +103,7 @@ def _light_points(
         side = np.cross(toward, helper)
         side /= np.linalg.norm(side, axis=1, keepdims=True)
         other = np.cross(toward, side)
-        ring = np.array([0, 4, 2, 6, 1, 5, 3, 7])  # any few of the samples already spread over the disc
+        ring = np.array([0, 4, 2, 6, 1, 5, 3, 7])  # few samples already cover the disc
         squared = (ring + rng.random((count, LIGHT_SAMPLES), dtype=np.float32)) / LIGHT_SAMPLES
         angle = 2.39996 * np.arange(LIGHT_SAMPLES) + 2 * np.pi * rng.random((count, 1), dtype=np.float32)
         r = np.sqrt(squared)
@@ -122,8 +125,9 @@ def _light_points(
     return spots.astype(np.float32), np.broadcast_to(normal, spots.shape).astype(np.float32)
 
 
-def _gather(mesh: Mesh, caster: Caster, rays: int) -> np.ndarray:
-    """int32 [V, rays]: the triangle each cosine-weighted ray meets from its front, -1 nothing, -2 a back."""
+def _gather(mesh: SceneMesh, caster: RayCaster, rays: int) -> np.ndarray:
+    """Return int32 [V, rays]: the triangle that each cosine-weighted ray hits; -1 = none, -2 = a back
+    face."""
     count = len(mesh.vertices_m)
     hits = np.empty((count, rays), np.int32)
     k = np.arange(rays, dtype=np.float32)
@@ -149,20 +153,20 @@ def _gather(mesh: Mesh, caster: Caster, rays: int) -> np.ndarray:
         ).astype(np.float32)
         origins = np.repeat(mesh.bake_points_m[start:stop], rays, axis=0)
         flat = d.reshape(-1, 3)
-        hit = caster.first(origins, flat)
+        hit = caster.first_hit(origins, flat)
         back = np.einsum("ij,ij->i", face[hit], flat) > 0
         hits[start:stop] = np.where((hit >= 0) & back, -2, hit).reshape(-1, rays)
     return hits
 
 
-def _bounce(mesh: Mesh, atlas: Atlas, direct: np.ndarray, hits: np.ndarray) -> np.ndarray:
+def _bounce(mesh: SceneMesh, atlas: Atlas, direct: np.ndarray, hits: np.ndarray) -> np.ndarray:
     names = [atlas.index(m.texture) for m in mesh.materials]
     tints = np.array([m.tint for m in mesh.materials], np.float32)
     glowing = np.array([m.emission > 0 for m in mesh.materials])
     albedo = (atlas.mean[names] * tints)[mesh.material]
-    # Shining things light the room through the sampled lights; what they show is not reflected light.
+    # Emissive surfaces already light the room as sampled lights: their texture reflects little.
     albedo[glowing[mesh.material]] *= 0.3
-    smooth = _smoother(mesh)
+    smooth = _smoothing_matrix(mesh)
     rays = hits.shape[1]
     missed = (hits == -1).sum(axis=1, keepdims=True) / rays
     kept = np.where(hits >= 0, hits, len(albedo))
@@ -178,8 +182,9 @@ def _bounce(mesh: Mesh, atlas: Atlas, direct: np.ndarray, hits: np.ndarray) -> n
     return (smooth @ direct + indirect).astype(np.float32)
 
 
-def _smoother(mesh: Mesh) -> sparse.csr_matrix:
-    """Row-stochastic average over the edges of each vertex: takes out the sampling noise."""
+def _smoothing_matrix(mesh: SceneMesh) -> sparse.csr_matrix:
+    """Return a row-stochastic matrix [V, V] that averages each vertex with its neighbours, to remove sampling
+    noise."""
     i = mesh.triangles[:, [0, 1, 2, 1, 2, 0]].ravel()
     j = mesh.triangles[:, [1, 2, 0, 0, 1, 2]].ravel()
     n = len(mesh.vertices_m)

@@ -1,6 +1,6 @@
-"""Triangle meshes with materials, and the builder every piece of furniture is made with.
+"""Triangle meshes with materials, and the builder that all pieces of furniture are drawn with.
 
-A surface is finely tessellated because light is baked per vertex: the builder's `edge_m` is the
+Surfaces are finely tessellated because light is baked per vertex: the builder's `edge_m` sets the
 resolution of shadows, not of shape.
 """
 
@@ -11,35 +11,35 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-BAKE_OFFSET_M = 0.004  # light is gathered this far in front of the surface
-BAKE_INSET_M = 0.012  # and this far from the rim of a flat piece: a rim lies in its neighbour
+BAKE_OFFSET_M = 0.004  # irradiance is computed this far in front of the surface
+BAKE_INSET_M = 0.012  # and this far inside the rim of a flat piece, because its rim may be inside a neighbour
 
 
 @dataclass(frozen=True)
 class Material:
-    """What a triangle looks like: a texture by name, multiplied by a linear RGB tint."""
+    """Appearance of a triangle: a texture by name, multiplied by a linear RGB tint."""
 
     texture: str = "plain"
     tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
     emission: float = 0.0  # radiance = emission * albedo, besides reflected light
-    glass: bool = False  # a lidar beam may pass; the camera sees what the pane shows
+    glass: bool = False  # lidar beams may pass; the camera sees the texture of the pane
 
 
 @dataclass(frozen=True)
-class Mesh:
+class SceneMesh:
     """Geometry in metres; V vertices, F triangles; front faces are counter-clockwise."""
 
     vertices_m: np.ndarray  # float32 [V, 3]
     normals: np.ndarray  # float32 [V, 3]
-    bake_points_m: np.ndarray  # float32 [V, 3], where light is gathered for each vertex
+    bake_points_m: np.ndarray  # float32 [V, 3], where the irradiance of each vertex is computed
     uvs: np.ndarray  # float32 [V, 2], in texture repeats, v up
     triangles: np.ndarray  # int32 [F, 3]
-    material: np.ndarray  # int32 [F], into materials
-    surface: np.ndarray  # int32 [F], same number = same smooth surface
+    material: np.ndarray  # int32 [F], index into `materials`
+    surface: np.ndarray  # int32 [F], triangles of one smooth surface have the same number
     materials: tuple[Material, ...]
 
-    def posed(self, vertices_m: np.ndarray, normals: np.ndarray) -> Mesh:
-        """The same mesh with moved vertices."""
+    def posed(self, vertices_m: np.ndarray, normals: np.ndarray) -> SceneMesh:
+        """Return the mesh with other vertices and normals [V, 3] and the same topology."""
         return replace(
             self,
             vertices_m=vertices_m.astype(np.float32),
@@ -48,13 +48,13 @@ class Mesh:
         )
 
 
-def merge(meshes: Iterable[Mesh]) -> Mesh:
-    """One mesh of several; materials and surfaces are renumbered."""
+def merge(meshes: Iterable[SceneMesh]) -> SceneMesh:
+    """Merge meshes into one; material and surface numbers are shifted so that they stay distinct."""
     parts = list(meshes)
     vertices = np.cumsum([0, *(len(p.vertices_m) for p in parts)])
     materials = np.cumsum([0, *(len(p.materials) for p in parts)])
     surfaces = np.cumsum([0, *(int(p.surface.max(initial=-1)) + 1 for p in parts)])
-    return Mesh(
+    return SceneMesh(
         vertices_m=np.concatenate([p.vertices_m for p in parts]),
         normals=np.concatenate([p.normals for p in parts]),
         bake_points_m=np.concatenate([p.bake_points_m for p in parts]),
@@ -68,18 +68,18 @@ def merge(meshes: Iterable[Mesh]) -> Mesh:
 
 @dataclass(frozen=True)
 class Light:
-    """A shining patch: a parallelogram (a window), or a ball where `right` and `up` are zero."""
+    """An area light: a parallelogram (a window), or a sphere if `right_m` and `up_m` are zero."""
 
     centre_m: tuple[float, float, float]
-    right_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # half extent
+    right_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # half the extent
     up_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     radius_m: float = 0.0
-    intensity: tuple[float, float, float] = (1.0, 1.0, 1.0)  # irradiance at 1 m, facing it
+    intensity: tuple[float, float, float] = (1.0, 1.0, 1.0)  # irradiance of a surface that faces it at 1 m
 
 
 @dataclass
-class _Store:
-    """What all views of one builder share."""
+class _MeshBuffers:
+    """Data that a builder shares with the builders that `placed` and `tilted` return."""
 
     lights: list[Light] = field(default_factory=list)
     pieces: list[tuple[np.ndarray, ...]] = field(default_factory=list)
@@ -89,21 +89,24 @@ class _Store:
 
 
 class MeshBuilder:
-    """Collects pieces given in a local frame (x right, y away, z up); `placed` gives a moved frame."""
+    """Collects surfaces given in a local frame (x right, y away, z up).
+
+    `placed` and `tilted` return a builder that draws into the same mesh from another frame.
+    """
 
     def __init__(self, texture_size_m: dict[str, tuple[float, float]], edge_m: float = 0.11) -> None:
         self.texture_size_m = texture_size_m
         self.edge_m = edge_m
-        self._store = _Store()
+        self._buffers = _MeshBuffers()
         self._R = np.eye(3)
         self._t = np.zeros(3)
 
     def placed(
         self, x_m: float, y_m: float, z_m: float = 0.0, yaw_rad: float = 0.0, edge_m: float | None = None
     ) -> MeshBuilder:
-        """A builder in a frame at (x, y, z), turned left by yaw, filling the same mesh."""
+        """Return a builder of the same mesh whose frame is at (x, y, z) and rotated by yaw about z."""
         child = MeshBuilder.__new__(MeshBuilder)
-        child.texture_size_m, child._store = self.texture_size_m, self._store
+        child.texture_size_m, child._buffers = self.texture_size_m, self._buffers
         child.edge_m = self.edge_m if edge_m is None else edge_m
         cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
         child._R = self._R @ np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
@@ -111,7 +114,7 @@ class MeshBuilder:
         return child
 
     def tilted(self, axis: str, angle_rad: float) -> MeshBuilder:
-        """A builder turned about this frame's x, y or z axis."""
+        """Return a builder of the same mesh whose frame is rotated about this frame's x, y or z axis."""
         child = self.placed(0.0, 0.0)
         cos, sin = np.cos(angle_rad), np.sin(angle_rad)
         i, j = {"x": (1, 2), "y": (2, 0), "z": (0, 1)}[axis]
@@ -130,8 +133,8 @@ class MeshBuilder:
         material: Material,
         bake_points: np.ndarray | None = None,
     ) -> None:
-        """One smooth surface."""
-        store = self._store
+        """Add one smooth surface."""
+        store = self._buffers
         number = store.materials.setdefault(material, len(store.materials))
         bake = vertices if bake_points is None else bake_points
         bake = bake + BAKE_OFFSET_M * normals
@@ -161,11 +164,14 @@ class MeshBuilder:
         turn: bool = False,
         edge_m: float | None = None,
     ) -> None:
-        """A parallelogram seen from its front with `origin` lower left.
+        """Add a parallelogram; seen from its front, `origin` is its lower left corner.
 
-        `fit` stretches the texture over it once; otherwise it repeats in its own size in metres, from
-        `offset` (in repeats; None: somewhere else for each piece). `turn` lays the
-        texture's u axis along `up`.
+        Args:
+            origin, right, up: float [3], local metres.
+            fit: stretch the texture over the parallelogram once, instead of repeating it in its own size.
+            offset: start of the repeated texture, in repeats; None chooses another one for each surface.
+            turn: map the u axis of the texture to `up`.
+            edge_m: longest edge of the tessellation; None takes the builder's.
         """
         origin, right, up = (np.asarray(v, dtype=np.float64) for v in (origin, right, up))
         width, height = float(np.linalg.norm(right)), float(np.linalg.norm(up))
@@ -183,7 +189,7 @@ class MeshBuilder:
         if not fit:
             size = self.texture_size_m[material.texture]
             metres = np.hstack([t * height, s * width]) if turn else np.hstack([s * width, t * height])
-            k = self._store.surfaces
+            k = self._buffers.surfaces
             shift = (k * 0.6180339 % 1.0, k * 0.7548776 % 1.0) if offset is None else offset
             uv = metres / np.array(size) + np.array(shift)
         self.add(
@@ -196,17 +202,17 @@ class MeshBuilder:
         )
 
     def lamp(self, at: tuple[float, float, float], radius_m: float, power: float, tint: np.ndarray) -> None:
-        """A ball of light; its fixture's geometry must lie inside the radius."""
+        """Add a spherical light; the geometry of its fixture must be inside the radius."""
         centre = tuple((self._R @ np.asarray(at, dtype=np.float64) + self._t).tolist())
         intensity = tuple((power * np.asarray(tint, dtype=np.float64)).tolist())
-        self._store.lights.append(Light(centre, radius_m=radius_m, intensity=intensity))
+        self._buffers.lights.append(Light(centre, radius_m=radius_m, intensity=intensity))
 
     def window(self, origin: np.ndarray, right: np.ndarray, up: np.ndarray, radiance: np.ndarray) -> None:
-        """A pane that lets daylight in; arguments as for `quad`."""
+        """Add an area light for a window pane; origin, right and up as for `quad`."""
         origin, right, up = (np.asarray(v, dtype=np.float64) for v in (origin, right, up))
         centre = self._R @ (origin + right / 2 + up / 2) + self._t
         area = float(np.linalg.norm(np.cross(right, up)))
-        self._store.lights.append(
+        self._buffers.lights.append(
             Light(
                 tuple(centre.tolist()),
                 tuple((self._R @ right / 2).tolist()),
@@ -217,13 +223,13 @@ class MeshBuilder:
 
     @property
     def lights(self) -> tuple[Light, ...]:
-        return tuple(self._store.lights)
+        return tuple(self._buffers.lights)
 
-    def build(self) -> Mesh:
-        """Everything collected so far."""
-        columns = [np.concatenate(column) for column in zip(*self._store.pieces)]
+    def build(self) -> SceneMesh:
+        """Return the mesh of all surfaces added so far."""
+        columns = [np.concatenate(column) for column in zip(*self._buffers.pieces)]
         vertices, normals, bake, uvs, triangles, material, surface = columns
-        return Mesh(
+        return SceneMesh(
             vertices.astype(np.float32),
             normals.astype(np.float32),
             bake.astype(np.float32),
@@ -231,12 +237,13 @@ class MeshBuilder:
             triangles.astype(np.int32),
             material.astype(np.int32),
             surface.astype(np.int32),
-            tuple(self._store.materials),
+            tuple(self._buffers.materials),
         )
 
 
 def grid_triangles(rows: int, columns: int) -> np.ndarray:
-    """[2 (rows-1) (columns-1), 3] over a row-major grid whose rows go up and columns right."""
+    """Return triangles int [2 (rows-1) (columns-1), 3] of a row-major vertex grid: rows go up, columns
+    right."""
     index = np.arange(rows * columns).reshape(rows, columns)
     a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]
     return np.stack([a, b, c, a, c, d], axis=-1).reshape(-1, 3)

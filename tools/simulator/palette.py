@@ -1,4 +1,4 @@
-"""The textures one home is made of, chosen and drawn from a seed."""
+"""All textures of a home, chosen and generated from a seed."""
 
 from __future__ import annotations
 
@@ -8,23 +8,23 @@ from beamsplat.tools.simulator import art
 from beamsplat.tools.simulator import textures as tx
 from beamsplat.tools.simulator.textures import rgb
 
-Pictures = dict[str, tuple[np.ndarray, tuple[float, float]]]
+Textures = dict[str, tuple[np.ndarray, tuple[float, float]]]  # sRGB [H, W, 3], size of a repeat in metres
 
 PAINTINGS = 14
 WALLS = ("wall_a", "wall_b", "wall_c", "wall_d")
 FLOORS = ("floor_a", "floor_b", "floor_c", "floor_d")
 
 
-def home_pictures(rng: np.random.Generator) -> Pictures:
-    """sRGB pictures and the metres one repeat covers, by the names furniture and rooms use."""
-    return {**_surfaces(rng), **_floors_and_walls(rng), **_cloths(rng), **_pictures(rng)}
+def home_textures(rng: np.random.Generator) -> Textures:
+    """Return the textures of a home, by the names that furniture and rooms use."""
+    return {**_surfaces(rng), **_floors_and_walls(rng), **_cloths(rng), **_artworks(rng)}
 
 
 def _pick(rng: np.random.Generator, colours: str) -> np.ndarray:
     return rgb(str(rng.choice(colours.split())))
 
 
-def _surfaces(rng: np.random.Generator) -> Pictures:
+def _surfaces(rng: np.random.Generator) -> Textures:
     furniture = _pick(rng, "b98a57 a9773f c79a6b 8d6238")
     dark = _pick(rng, "5a3a24 4a3226 6b4429")
     front = _pick(rng, "e9e6df dfe3e2 6f8791 8fa08a 37474f")
@@ -51,7 +51,7 @@ def _surfaces(rng: np.random.Generator) -> Pictures:
     }
 
 
-def _floors_and_walls(rng: np.random.Generator) -> Pictures:
+def _floors_and_walls(rng: np.random.Generator) -> Textures:
     boards = _pick(rng, "c9a878 b48a5c d6bd97 a67c52")
     dark = _pick(rng, "8a5f3c 7a5436 9a7148")
     tile = [_pick(rng, "d9d4c8 cfd4d6 c9b9a3") * f for f in (1.0, 0.97, 1.03)]
@@ -101,7 +101,7 @@ def _floors_and_walls(rng: np.random.Generator) -> Pictures:
     }
 
 
-def _cloths(rng: np.random.Generator) -> Pictures:
+def _cloths(rng: np.random.Generator) -> Textures:
     sofa = _pick(rng, "4f6475 7b7468 8a4f3d 5c6b4f b39a7a")
     chair = _pick(rng, "a8452f 2f4a6d c08a2e 556b4a")
     bed = [_pick(rng, "e6e2da d5dbe0"), _pick(rng, "33506b 7d4a4a 55705d")]
@@ -119,8 +119,8 @@ def _cloths(rng: np.random.Generator) -> Pictures:
     }
 
 
-def _pictures(rng: np.random.Generator) -> Pictures:
-    out: Pictures = {}
+def _artworks(rng: np.random.Generator) -> Textures:
+    out: Textures = {}
     for k in range(PAINTINGS):
         painter = art.PAINTINGS[k % len(art.PAINTINGS)]
         height, width = (384, 288) if painter in (art.portrait, art.lettering) else (288, 384)

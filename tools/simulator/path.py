@@ -1,4 +1,4 @@
-"""The drive: a smooth closed curve and the speed a differential-drive robot takes along it."""
+"""The robot's path: a smooth closed curve with a speed profile for a differential-drive robot."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from beamsplat.common.geometry.transforms import se2_to_se3
 
 
 def resample_closed(points_m: np.ndarray, step_m: float) -> np.ndarray:
-    """A closed polyline [N, 2] at even steps (the last point is not the first again)."""
+    """Return a closed polyline [N, 2] resampled at even steps; the first point is not repeated at the end."""
     closed = np.vstack([points_m, points_m[:1]])
     s = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1))])
     count = max(8, int(np.ceil(s[-1] / step_m)))
@@ -20,8 +20,8 @@ def resample_closed(points_m: np.ndarray, step_m: float) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class Limits:
-    """What the wheels can do."""
+class MotionLimits:
+    """Limits of the robot's motion."""
 
     speed_m_s: float = 0.45
     turn_rad_s: float = 0.7
@@ -29,14 +29,14 @@ class Limits:
     lateral_m_s2: float = 0.25
 
 
-class Drive:
-    """A closed lap as a function of time: starts and ends at rest at the same place.
+class DrivePath:
+    """A closed lap as a function of time that starts and ends at rest in the same place.
 
-    The heading is the curve's tangent: the robot cannot slide sideways.
+    The heading is the tangent of the curve, because a differential-drive robot cannot slide sideways.
     """
 
-    def __init__(self, points_m: np.ndarray, limits: Limits, *, start: float = 0.0) -> None:
-        """From control points [N, 2] of a closed curve; `start` is where on it the lap begins, 0..1."""
+    def __init__(self, points_m: np.ndarray, limits: MotionLimits, *, start: float = 0.0) -> None:
+        """Fit a closed curve through control points [N, 2]; `start` in 0..1 is where on it the lap begins."""
         count = len(points_m)
         points_m = np.roll(points_m, -int(start * count) % count, axis=0)
         closed = np.vstack([points_m, points_m[:1]])
@@ -50,43 +50,42 @@ class Drive:
         along = np.concatenate([[0.0], np.cumsum(0.5 * (metric[1:] + metric[:-1]) * np.diff(s))])
         speed = np.minimum(limits.speed_m_s, limits.turn_rad_s / np.maximum(curvature, 1e-6))
         speed = np.minimum(speed, np.sqrt(limits.lateral_m_s2 / np.maximum(curvature, 1e-6)))
-        speed = _accelerate(speed, along, limits.acceleration_m_s2)
+        speed = _limit_acceleration(speed, along, limits.acceleration_m_s2)
         time = np.concatenate([[0.0], np.cumsum(2 * np.diff(along) / (speed[1:] + speed[:-1]))])
         self.length_m = float(along[-1])
-        # Between samples the acceleration is constant: position is a parabola, which Hermite's cubic meets.
+        # Between samples the acceleration is constant, so the position is a parabola: a cubic Hermite
+        # segment represents it exactly.
         self._motion = CubicHermiteSpline(time, s, speed / metric)
         self._drive_s = float(time[-1])
-        # Whole seconds: every sensor's period divides a lap, so that laps can share their pictures.
+        # A lap takes whole seconds: the period of every sensor divides it, so laps can share images.
         self.lap_s = float(np.ceil(time[-1] + 0.5))
 
     def pose_at(self, time_s: np.ndarray | float) -> np.ndarray:
-        """SE(2) poses [..., 3] at times in seconds from the start of the first lap (any number of laps)."""
+        """Return planar poses pose_world_body float64 [..., 3] at times in seconds since the start.
+
+        Times beyond the first lap are allowed.
+        """
         time = np.asarray(time_s, dtype=np.float64)
         s = self._position(time)
         xy, tangent = self._curve(s), self._curve(s, 1)
         return np.concatenate([xy, np.arctan2(tangent[..., 1], tangent[..., 0])[..., None]], axis=-1)
 
     def transform_at(self, time_s: np.ndarray | float) -> np.ndarray:
-        """`T_world_body` [..., 4, 4]."""
+        """Return `T_world_body` float64 [..., 4, 4] at times in seconds since the start."""
         return se2_to_se3(self.pose_at(time_s))
-
-    def speed_at(self, time_s: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:
-        """Forward speed m/s and turn rate rad/s at times in seconds."""
-        time = np.asarray(time_s, dtype=np.float64)
-        s = self._position(time)
-        first, second = self._curve(s, 1), self._curve(s, 2)
-        metric = np.linalg.norm(first, axis=-1)
-        lap_time = np.mod(time, self.lap_s)
-        moved = np.where(lap_time < self._drive_s, self._motion(lap_time, 1) * metric, 0.0)
-        bend = (first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0]) / metric**3
-        return moved, moved * bend
 
     def _position(self, time: np.ndarray) -> np.ndarray:
         return self._motion(np.minimum(np.mod(time, self.lap_s), self._drive_s)) % self._s_end
 
 
-def _accelerate(speed: np.ndarray, along: np.ndarray, limit: float) -> np.ndarray:
-    """Lowers a speed profile until neither its rise nor its fall exceeds the limit; rest at both ends."""
+def _limit_acceleration(speed: np.ndarray, along: np.ndarray, limit: float) -> np.ndarray:
+    """Return a speed profile lowered until its acceleration and deceleration stay within the limit.
+
+    Args:
+        speed: m/s at each sample; its array is not modified.
+        along: arc length in metres at each sample.
+        limit: m/s^2. The speed at both ends is (almost) zero.
+    """
     v2 = speed**2
     v2[0] = v2[-1] = 1e-5
     step = 2.0 * limit * np.diff(along)

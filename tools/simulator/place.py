@@ -1,4 +1,4 @@
-"""Where furniture goes: along walls or free in a room, clear of doors, windows, the drive and each other."""
+"""Furniture placement: at walls or free-standing, clear of doors, windows, the route and other pieces."""
 
 from __future__ import annotations
 
@@ -6,33 +6,33 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from beamsplat.tools.simulator.furniture import Piece
+from beamsplat.tools.simulator.furniture import FurniturePiece
 
 SIDES = ("south", "east", "north", "west")
 YAW = {"south": np.pi, "east": -np.pi / 2, "north": 0.0, "west": np.pi / 2}
 
 
 @dataclass(frozen=True)
-class Opening:
-    """A hole in a wall: from s0 to s1 along it, from z0 to z1; all metres."""
+class WallOpening:
+    """An opening in a wall, from s0 to s1 along it and from z0 to z1 in height, in metres."""
 
     s0: float
     s1: float
     z0: float
     z1: float
-    kind: str  # door, window or glass (a glazed door)
+    kind: str  # "door", "window" or "glass" (a glazed door)
 
 
 @dataclass
 class Room:
-    """Inner rectangle of a room in house coordinates, and what has been put there."""
+    """Inner rectangle of a room in house coordinates, its openings and the furniture placed in it."""
 
     name: str
     x0: float
     y0: float
     x1: float
     y1: float
-    openings: dict[str, list[Opening]] = field(default_factory=lambda: {s: [] for s in SIDES})
+    openings: dict[str, list[WallOpening]] = field(default_factory=lambda: {s: [] for s in SIDES})
     taken: list[tuple[float, float, float, float, float]] = field(default_factory=list)  # x0 y0 x1 y1 height
     spans: dict[str, list[tuple[float, float, float]]] = field(default_factory=lambda: {s: [] for s in SIDES})
 
@@ -40,7 +40,7 @@ class Room:
         return self.x1 - self.x0 if side in ("south", "north") else self.y1 - self.y0
 
     def corner(self, side: str) -> tuple[float, float]:
-        """The lower left corner of a wall as seen from inside: the origin of its frame."""
+        """Return the lower left corner of a wall as seen from inside: the origin of the wall's frame."""
         return {
             "south": (self.x1, self.y0),
             "east": (self.x1, self.y1),
@@ -49,23 +49,23 @@ class Room:
         }[side]
 
     def to_house(self, side: str, s: float, out_m: float) -> tuple[float, float]:
-        """The point s metres along a wall and `out_m` metres into the room."""
+        """Return the point s metres along a wall and `out_m` metres from it into the room."""
         x, y = self.corner(side)
         cos, sin = np.cos(YAW[side]), np.sin(YAW[side])
         return float(x + cos * s + sin * out_m), float(y + sin * s - cos * out_m)
 
 
 @dataclass(frozen=True)
-class Spot:
-    """A chosen place: centre and yaw in house coordinates."""
+class Placement:
+    """Position of a piece's centre and its yaw, in house coordinates."""
 
     x_m: float
     y_m: float
     yaw_rad: float
 
 
-class Placer:
-    """Draws random places for pieces in one room until one is clear."""
+class FurniturePlacer:
+    """Places furniture in one room by rejection sampling: random placements until one is free."""
 
     def __init__(self, room: Room, route_m: np.ndarray, clearance_m: float, rng: np.random.Generator) -> None:
         self.room = room
@@ -79,8 +79,10 @@ class Placer:
         )
         self.route_m = route_m[near]
 
-    def at_wall(self, piece: Piece, *, tries: int = 60, sides: tuple[str, ...] = SIDES) -> Spot | None:
-        """Somewhere with its back to a wall, or None."""
+    def at_wall(
+        self, piece: FurniturePiece, *, tries: int = 60, sides: tuple[str, ...] = SIDES
+    ) -> Placement | None:
+        """Place a piece with its back to a wall; return None if no try is free."""
         for _ in range(tries):
             side = str(self.rng.choice(sides))
             length = self.room.length(side)
@@ -91,15 +93,15 @@ class Placer:
             if not self._wall_is_free(side, s, piece):
                 continue
             x, y = self.room.to_house(side, s, piece.depth_m / 2 + 0.01)
-            spot = Spot(x, y, YAW[side])
+            spot = Placement(x, y, YAW[side])
             if self._floor_is_free(spot, piece):
                 self._take(spot, piece)
                 self.room.spans[side].append((s - piece.width_m / 2, s + piece.width_m / 2, piece.height_m))
                 return spot
         return None
 
-    def inside(self, piece: Piece, *, tries: int = 80, margin_m: float = 0.25) -> Spot | None:
-        """Somewhere free in the room, turned by a multiple of 90 degrees, or None."""
+    def inside(self, piece: FurniturePiece, *, tries: int = 80, margin_m: float = 0.25) -> Placement | None:
+        """Place a piece inside the room at a multiple of 90 degrees; return None if no try is free."""
         room = self.room
         for _ in range(tries):
             yaw = float(self.rng.integers(4)) * np.pi / 2
@@ -111,20 +113,20 @@ class Placer:
             if np.any(high <= low):
                 continue
             x, y = self.rng.uniform(low, high)
-            spot = Spot(float(x), float(y), yaw)
+            spot = Placement(float(x), float(y), yaw)
             if self._floor_is_free(spot, piece):
                 self._take(spot, piece)
                 return spot
         return None
 
-    def at(self, spot: Spot, piece: Piece) -> bool:
-        """Takes a given place if it is clear."""
+    def at(self, spot: Placement, piece: FurniturePiece) -> bool:
+        """Place a piece at a given placement; return whether that was free."""
         if not self._floor_is_free(spot, piece):
             return False
         self._take(spot, piece)
         return True
 
-    def _wall_is_free(self, side: str, s: float, piece: Piece) -> bool:
+    def _wall_is_free(self, side: str, s: float, piece: FurniturePiece) -> bool:
         s0, s1 = s - piece.width_m / 2, s + piece.width_m / 2
         for hole in self.room.openings[side]:
             margin = 0.12 if hole.kind == "window" else 0.30
@@ -132,7 +134,7 @@ class Placer:
                 return False
         return True
 
-    def _floor_is_free(self, spot: Spot, piece: Piece) -> bool:
+    def _floor_is_free(self, spot: Placement, piece: FurniturePiece) -> bool:
         x0, y0, x1, y1 = _rectangle(spot, piece)
         room = self.room
         if x0 < room.x0 or y0 < room.y0 or x1 > room.x1 or y1 > room.y1:
@@ -144,11 +146,11 @@ class Placer:
         dy = np.maximum(np.maximum(y0 - self.route_m[:, 1], self.route_m[:, 1] - y1), 0.0)
         return bool(np.all(np.hypot(dx, dy) > self.clearance_m))
 
-    def _take(self, spot: Spot, piece: Piece) -> None:
+    def _take(self, spot: Placement, piece: FurniturePiece) -> None:
         self.room.taken.append((*_rectangle(spot, piece), piece.height_m))
 
 
-def _rectangle(spot: Spot, piece: Piece) -> tuple[float, float, float, float]:
+def _rectangle(spot: Placement, piece: FurniturePiece) -> tuple[float, float, float, float]:
     half_x, half_y = piece.width_m / 2, piece.depth_m / 2
     if abs(np.sin(spot.yaw_rad)) > 0.5:
         half_x, half_y = half_y, half_x

@@ -1,4 +1,4 @@
-"""A whole recording: the drive, its pictures, its scans, and the truth, written to a folder at one stroke."""
+"""Simulates a complete recording: images, scans, odometry and ground truth, in one folder."""
 
 from __future__ import annotations
 
@@ -12,23 +12,30 @@ import numpy as np
 from beamsplat.common.geometry.transforms import se2_to_se3
 from beamsplat.tools.simulator import store
 from beamsplat.tools.simulator import writer as w
-from beamsplat.tools.simulator.cast import Caster
-from beamsplat.tools.simulator.drive_log import Step, simulate_lidar
-from beamsplat.tools.simulator.freespace import FreeSpace
-from beamsplat.tools.simulator.movers import Walk, choose_walks
-from beamsplat.tools.simulator.path import Drive, Limits
-from beamsplat.tools.simulator.settings import START_NS, Simulation
-from beamsplat.tools.simulator.shots import Shoot, Studio, build_cast, load_shot, render_all, start_of
-from beamsplat.tools.simulator.truth import Seen, decode_depth, surface_points, write_extra_views
-from beamsplat.tools.simulator.world import World, get_world, world_key
+from beamsplat.tools.simulator.actors import ActorPath, choose_actor_paths
+from beamsplat.tools.simulator.clearance_grid import ClearanceGrid
+from beamsplat.tools.simulator.drive_log import SimulationStep, simulate_lidar
+from beamsplat.tools.simulator.frames import (
+    FrameRenderer,
+    FrameSpec,
+    build_actors,
+    lap_start,
+    load_frame,
+    render_frames,
+)
+from beamsplat.tools.simulator.path import DrivePath, MotionLimits
+from beamsplat.tools.simulator.ray_caster import RayCaster
+from beamsplat.tools.simulator.settings import START_NS, SimulationSettings
+from beamsplat.tools.simulator.truth import DepthViews, decode_depth, surface_points, write_extra_views
+from beamsplat.tools.simulator.world import get_world, world_key
 
-Progress = Callable[[str, int, int], None]  # stage, done, of how many
-SURFACE_VIEWS = 160
+Progress = Callable[[str, int, int], None]  # stage, done, total
+SURFACE_VIEWS = 160  # depth maps, evenly over the drive, that decide which surface was seen
 
 
 @dataclass(frozen=True)
-class Summary:
-    """What has been written."""
+class RecordingSummary:
+    """Extent of a written recording."""
 
     seconds: float
     laps: float
@@ -40,8 +47,8 @@ class Summary:
 
 
 @dataclass
-class _Log:
-    """What the lidar stream leaves behind for the truth files."""
+class _TruthLog:
+    """Ground truth collected while the lidar stream is written; masks are packed bits."""
 
     scan_stamps_ns: list[int] = field(default_factory=list)
     moving: list[np.ndarray] = field(default_factory=list)
@@ -50,41 +57,43 @@ class _Log:
     truth: list[np.ndarray] = field(default_factory=list)
 
 
-def simulate(settings: Simulation, out: Path, *, jobs: int, replace: bool, progress: Progress) -> Summary:
-    """Writes the recording; `out` appears only when it is complete.
+def simulate(
+    settings: SimulationSettings, out: Path, *, jobs: int, replace: bool, progress: Progress
+) -> RecordingSummary:
+    """Write a recording into the folder `out`, which appears only when it is complete.
 
     Raises:
-        ValueError: a setting or the scene cannot be used; the text names it.
-        FileExistsError: `out` exists and `replace` is not given.
+        ValueError: a setting or the scene cannot be used.
+        FileExistsError: `out` exists and `replace` is False.
     """
     if out.exists() and not replace:
-        raise FileExistsError(f"{out} exists: choose another folder, or replace it with --force")
+        raise FileExistsError(f"{out} exists: choose another folder, or replace this one with --force")
     progress("preparing the scene (first time: about half a minute)", 0, 0)
     world = get_world(settings.seed, settings.scene, lambda stage: progress(stage, 0, 0))
-    drive = Drive(world.route_m, Limits(), start=start_of(settings.seed))
+    drive = DrivePath(world.route_m, MotionLimits(), start=lap_start(settings.seed))
     duration = _duration(settings, drive)
-    caster = Caster.of(world.mesh)
-    space = FreeSpace(world.mesh, caster)
+    caster = RayCaster.of(world.mesh)
+    space = ClearanceGrid(world.mesh, caster)
     rng = np.random.default_rng([settings.seed, 0x4D])
-    walks = choose_walks(space, drive, caster, settings.people + settings.carts, duration, rng)
-    with store.whole_folder(out, replace=replace) as folder:
-        streams: list[Iterator[w.Record]] = [_static_tf(settings)]
+    actor_paths = choose_actor_paths(space, drive, caster, settings.people + settings.carts, duration, rng)
+    with store.atomic_folder(out, replace=replace) as folder:
+        streams: list[Iterator[w.BagRecord]] = [_static_tf(settings)]
         topics = ["/tf_static", "/tf", "/odom", "/scan"]
         images, views = 0, 0
         if not settings.lidar_only:
-            shoot = _shoot(settings, walks)
+            spec = frame_spec(settings, actor_paths)
             times = _image_times(settings, drive, duration)
             images = len(times)
             in_lap = [round(t % drive.lap_s, 6) for t in times]
             unique = sorted(set(in_lap))
-            paths = render_all(shoot, unique, jobs, lambda i, n: progress("rendering pictures", i, n))
+            paths = render_frames(spec, unique, jobs, lambda i, n: progress("rendering images", i, n))
             path_of = dict(zip(unique, paths))
-            _write_picture_truth(folder, settings, times, [path_of[t] for t in in_lap])
-            views = _write_views(folder, settings, shoot, space, unique, paths, progress)
+            _write_image_truth(folder, settings, times, [path_of[t] for t in in_lap])
+            views = _write_views(folder, settings, spec, space, unique, paths, progress)
             streams.append(_images(settings, times, [path_of[t] for t in in_lap]))
             topics += ["/camera/image_raw/compressed", "/camera/camera_info"]
-        log = _Log()
-        cast = build_cast(world, tuple(walks), settings.people, settings.seed)
+        log = _TruthLog()
+        actors = build_actors(world, tuple(actor_paths), settings.people, settings.seed)
         steps = simulate_lidar(
             world.mesh,
             caster,
@@ -93,84 +102,91 @@ def simulate(settings: Simulation, out: Path, *, jobs: int, replace: bool, progr
             settings.wheels,
             seed=settings.seed,
             duration_s=duration,
-            cast=cast,
+            actors=actors,
         )
         scans = round(duration * settings.lidar.rate_hz)
         streams.append(_lidar_records(settings, steps, log, lambda i: progress("scanning", i, scans)))
         messages = w.write_bag(folder / "bag", streams, topics)
         _write_lidar_truth(folder, settings, log, drive)
     metres = drive.length_m * duration / drive.lap_s
-    return Summary(duration, duration / drive.lap_s, metres, images, len(log.scan_stamps_ns), messages, views)
+    return RecordingSummary(
+        duration, duration / drive.lap_s, metres, images, len(log.scan_stamps_ns), messages, views
+    )
 
 
-def _duration(settings: Simulation, drive: Drive) -> float:
+def _duration(settings: SimulationSettings, drive: DrivePath) -> float:
     if settings.laps is not None:
         whole = settings.laps * drive.lap_s
         return whole if settings.seconds is None else min(whole, settings.seconds)
     return drive.lap_s if settings.seconds is None else settings.seconds
 
 
-def _shoot(settings: Simulation, walks: list[Walk]) -> Shoot:
+def frame_spec(settings: SimulationSettings, actor_paths: list[ActorPath]) -> FrameSpec:
     name = f"{world_key(settings.seed, settings.scene)}.npz"
-    return Shoot(
+    return FrameSpec(
         str(store.cache_root() / "worlds" / name),
         settings.seed,
         settings.camera,
-        tuple(walks),
+        tuple(actor_paths),
         settings.people,
         settings.faults.exposure_changes,
     )
 
 
-def _image_times(settings: Simulation, drive: Drive, duration_s: float) -> list[float]:
-    """Seconds of all images; those of one lap repeat at the same times in the next."""
+def _image_times(settings: SimulationSettings, drive: DrivePath, duration_s: float) -> list[float]:
+    """Return the times of all images; every lap has images at the same times of the lap."""
     camera = settings.camera
     per_lap = int(np.floor((drive.lap_s - camera.phase_s) * camera.rate_hz)) + 1
     offsets = [round(camera.phase_s + k / camera.rate_hz, 6) for k in range(per_lap)]
     laps = int(np.ceil(duration_s / drive.lap_s))
     times = [lap * drive.lap_s + offset for lap in range(laps) for offset in offsets if offset < drive.lap_s]
-    # Seconds come back from a whole number of laps without rounding: laps are whole seconds long.
+    # Laps take whole seconds, so `time % lap_s` restores the time of the lap exactly.
     return [round(t, 6) for t in times if t < duration_s]
 
 
-def _stamp(settings: Simulation, time_s: float) -> int:
-    """The stamp the camera gives an image, its clock's fault included."""
+def _stamp(settings: SimulationSettings, time_s: float) -> int:
+    """Return the stamp of an image, with the fault of the camera's clock."""
     return START_NS + round(time_s * 1e6) * 1000 + round(settings.faults.clock_offset_ms * 1e6)
 
 
-def _static_tf(settings: Simulation) -> Iterator[w.Record]:
+def _static_tf(settings: SimulationSettings) -> Iterator[w.BagRecord]:
     links = [(w.BASE, w.LASER, settings.lidar.T_body_lidar)]
     if not settings.lidar_only:
-        published = settings.faults.published(settings.camera.T_body_camera)
+        published = settings.faults.published_mount(settings.camera.T_body_camera)
         links.insert(0, (w.BASE, w.CAMERA, published))
-    yield w.Record(START_NS, "/tf_static", w.tf_bytes(START_NS, links))
+    yield w.BagRecord(START_NS, "/tf_static", w.tf_bytes(START_NS, links))
 
 
-def _images(settings: Simulation, times_s: list[float], paths: list[Path]) -> Iterator[w.Record]:
+def _images(settings: SimulationSettings, times_s: list[float], paths: list[Path]) -> Iterator[w.BagRecord]:
     rng = np.random.default_rng([settings.seed, 0x4A, 1])
     received = 0
     for time_s, path in zip(times_s, paths):
         stamp = _stamp(settings, time_s)
         lag = int(28e6 + rng.exponential(2.5e6))
         received = max(received + 1000, START_NS + round(time_s * 1e9) + lag)
-        yield w.Record(received, "/camera/image_raw/compressed", w.image_bytes(stamp, load_shot(path).jpeg))
-        yield w.Record(received + 100, "/camera/camera_info", w.camera_info_bytes(stamp, settings.camera))
+        yield w.BagRecord(
+            received, "/camera/image_raw/compressed", w.image_bytes(stamp, load_frame(path).jpeg)
+        )
+        yield w.BagRecord(received + 100, "/camera/camera_info", w.camera_info_bytes(stamp, settings.camera))
 
 
 def _lidar_records(
-    settings: Simulation, steps: Iterator[Step], log: _Log, progress: Callable[[int], None]
-) -> Iterator[w.Record]:
-    """Scans, odometry and tf in order of receipt, while truth is put aside."""
+    settings: SimulationSettings,
+    steps: Iterator[SimulationStep],
+    log: _TruthLog,
+    progress: Callable[[int], None],
+) -> Iterator[w.BagRecord]:
+    """Yield scans, odometry and tf in order of receipt; append their ground truth to `log`."""
     rng = np.random.default_rng([settings.seed, 0x4A, 2])
     period_ns = round(1e9 / settings.lidar.rate_hz)
-    waiting: list[tuple[int, int, w.Record]] = []
+    waiting: list[tuple[int, int, w.BagRecord]] = []
     last, number = {"/scan": 0, "/odom": 0}, 0
 
     def put(topic: str, received: int, data: bytes) -> int:
         nonlocal number
         received = max(received, last.get(topic, 0) + 1000)
         last[topic] = received
-        heapq.heappush(waiting, (received, number, w.Record(received, topic, data)))
+        heapq.heappush(waiting, (received, number, w.BagRecord(received, topic, data)))
         number += 1
         return received
 
@@ -188,7 +204,7 @@ def _lidar_records(
             put("/tf", received + 100, w.tf_bytes(stamp, [(w.ODOM, w.BASE, T)]))
         scan_lag = period_ns + int(5e6 + 4 * (lags[-1] - 2e6))
         put("/scan", step.stamp_ns + scan_lag, w.scan_bytes(step.stamp_ns, step.ranges_m, settings.lidar))
-        # Later steps count odometry after the end of this one: what was received before is complete.
+        # Odometry of later steps is measured after the end of this one: earlier records are complete.
         while waiting and waiting[0][0] <= step.stamp_ns + period_ns:
             yield heapq.heappop(waiting)[2]
         progress(index + 1)
@@ -196,7 +212,9 @@ def _lidar_records(
         yield heapq.heappop(waiting)[2]
 
 
-def _write_picture_truth(folder: Path, settings: Simulation, times_s: list[float], paths: list[Path]) -> None:
+def _write_image_truth(
+    folder: Path, settings: SimulationSettings, times_s: list[float], paths: list[Path]
+) -> None:
     (folder / "depth_gt").mkdir()
     movers = settings.people + settings.carts > 0
     if movers:
@@ -204,53 +222,53 @@ def _write_picture_truth(folder: Path, settings: Simulation, times_s: list[float
     for k, (time_s, path) in enumerate(zip(times_s, paths)):
         name = f"{_stamp(settings, time_s)}.png"
         if k % settings.truth_every == 0:
-            (folder / "depth_gt" / name).write_bytes(load_shot(path).depth_png.tobytes())
+            (folder / "depth_gt" / name).write_bytes(load_frame(path).depth_png.tobytes())
         if movers:
-            mask = load_shot(path).mask_png
+            mask = load_frame(path).mask_png
             if len(mask):
                 (folder / "moving_masks" / name).write_bytes(mask.tobytes())
 
 
 def _write_views(
     folder: Path,
-    settings: Simulation,
-    shoot: Shoot,
-    space: FreeSpace,
+    settings: SimulationSettings,
+    spec: FrameSpec,
+    space: ClearanceGrid,
     times_s: list[float],
     paths: list[Path],
     progress: Progress,
 ) -> int:
-    """Off-path views and the seen surface; returns the number of views."""
+    """Write held-out views and the ground-truth surface; return the number of views."""
     if not times_s:
         return 0
-    studio = Studio(shoot)
+    frame_renderer = FrameRenderer(spec)
     step = max(1, -(-len(times_s) // SURFACE_VIEWS))
     chosen = list(range(0, len(times_s), step))
-    seen = Seen(
-        np.stack([studio.pose(times_s[k]) for k in chosen]),
-        np.stack([decode_depth(load_shot(paths[k]).depth_png) for k in chosen]),
+    depth_views = DepthViews(
+        np.stack([frame_renderer.camera_pose(times_s[k]) for k in chosen]),
+        np.stack([decode_depth(load_frame(paths[k]).depth_png) for k in chosen]),
         settings.camera.K,
         settings.camera.distortion,
     )
     rng = np.random.default_rng([settings.seed, 0x56])
     count = write_extra_views(
         folder / "extra_views",
-        studio,
+        frame_renderer,
         space,
-        seen,
+        depth_views,
         np.array(times_s),
         settings.extra_views,
         rng,
         lambda i, n: progress("views off the path", i, n),
     )
     progress("sampling the seen surface", 0, 0)
-    scene = studio.renderer.scene
-    points, colours = surface_points(scene, seen, settings.surface_points, studio.gain, rng)
+    scene = frame_renderer.renderer.scene
+    points, colours = surface_points(scene, depth_views, settings.surface_points, frame_renderer.gain, rng)
     w.write_ply(folder / "gt_surface.ply", points, colours)
     return count
 
 
-def _write_lidar_truth(folder: Path, settings: Simulation, log: _Log, drive: Drive) -> None:
+def _write_lidar_truth(folder: Path, settings: SimulationSettings, log: _TruthLog, drive: DrivePath) -> None:
     w.write_camera_json(folder / "camera.json", settings.camera, settings.lidar, settings.faults)
     poses = np.concatenate(log.truth) if log.truth else np.zeros((0, 3))
     stamps = np.concatenate(log.stamps_ns) if log.stamps_ns else np.zeros(0, np.int64)
@@ -264,13 +282,7 @@ def _write_lidar_truth(folder: Path, settings: Simulation, log: _Log, drive: Dri
 
 
 def _unpack(rows: list[np.ndarray], beams: int) -> np.ndarray:
-    """bool [S, B]."""
+    """Return bool [S, B] of S rows of packed bits."""
     if not rows:
         return np.zeros((0, beams), np.bool_)
     return np.unpackbits(np.stack(rows), axis=1)[:, :beams].astype(np.bool_)
-
-
-def open_drive(seed: int, scene: str | None = None) -> tuple[World, Caster, Drive]:
-    """What `drive_log.simulate_lidar` needs, for long lidar-only drives without a recording."""
-    world = get_world(seed, scene)
-    return world, Caster.of(world.mesh), Drive(world.route_m, Limits(), start=start_of(seed))

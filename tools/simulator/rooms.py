@@ -1,4 +1,4 @@
-"""What stands and hangs in each kind of room."""
+"""Furnishes each kind of room: furniture, radiators, wall decoration."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from beamsplat.tools.simulator import furniture as f
 from beamsplat.tools.simulator import furniture_kitchen as fk
 from beamsplat.tools.simulator import furniture_rooms as fr
 from beamsplat.tools.simulator import furniture_small as fs
-from beamsplat.tools.simulator.furniture import Piece
+from beamsplat.tools.simulator.furniture import FurniturePiece
 from beamsplat.tools.simulator.mesh import Material, MeshBuilder
-from beamsplat.tools.simulator.place import SIDES, YAW, Placer, Room, Spot
+from beamsplat.tools.simulator.place import SIDES, YAW, FurniturePlacer, Placement, Room
 from beamsplat.tools.simulator.shapes import box
 from beamsplat.tools.simulator.walls import CEILING_M
 
@@ -18,8 +18,8 @@ from beamsplat.tools.simulator.walls import CEILING_M
 def furnish(
     b: MeshBuilder, room: Room, route_m: np.ndarray, clearance_m: float, rng: np.random.Generator
 ) -> None:
-    """Fills one room; pieces that find no place stay out."""
-    placer = Placer(room, route_m, clearance_m, rng)
+    """Furnish one room; pieces without a free placement are left out."""
+    placer = FurniturePlacer(room, route_m, clearance_m, rng)
     {"living": _living, "kitchen": _kitchen, "bedroom": _bedroom, "study": _study}[room.name](b, placer, rng)
     for piece in (
         fs.plant(float(rng.uniform(0.9, 1.5))),
@@ -33,14 +33,18 @@ def furnish(
     _hang(b, room, rng)
 
 
-def _wall_piece(b: MeshBuilder, placer: Placer, piece: Piece, rng: np.random.Generator) -> Spot | None:
+def _wall_piece(
+    b: MeshBuilder, placer: FurniturePlacer, piece: FurniturePiece, rng: np.random.Generator
+) -> Placement | None:
     spot = placer.at_wall(piece)
     if spot is not None:
         piece.draw(b.placed(spot.x_m, spot.y_m, 0.0, spot.yaw_rad), rng)
     return spot
 
 
-def _inside_piece(b: MeshBuilder, placer: Placer, piece: Piece, rng: np.random.Generator) -> Spot | None:
+def _inside_piece(
+    b: MeshBuilder, placer: FurniturePlacer, piece: FurniturePiece, rng: np.random.Generator
+) -> Placement | None:
     spot = placer.inside(piece)
     if spot is not None:
         piece.draw(b.placed(spot.x_m, spot.y_m, 0.0, spot.yaw_rad), rng)
@@ -48,7 +52,7 @@ def _inside_piece(b: MeshBuilder, placer: Placer, piece: Piece, rng: np.random.G
 
 
 def rug(b: MeshBuilder, name: str, x: float, y: float, yaw: float, width: float, depth: float) -> None:
-    """A carpet 8 mm thick, its rim bound."""
+    """Draw a carpet 8 mm thick with a bound rim."""
     at = b.placed(x, y, 0.0, yaw, edge_m=0.07)
     h = 0.008
     at.quad(
@@ -58,7 +62,7 @@ def rug(b: MeshBuilder, name: str, x: float, y: float, yaw: float, width: float,
     box(at, (0, 0, 0.0), (width, depth, h), rim, skip=("top", "bottom"))
 
 
-def _living(b: MeshBuilder, placer: Placer, rng: np.random.Generator) -> None:
+def _living(b: MeshBuilder, placer: FurniturePlacer, rng: np.random.Generator) -> None:
     sofa = next(
         (s for w in (2.3, 2.0, 1.7) for s in [_wall_piece(b, placer, f.sofa(w), rng)] if s is not None), None
     )
@@ -75,7 +79,7 @@ def _living(b: MeshBuilder, placer: Placer, rng: np.random.Generator) -> None:
         _wall_piece(b, placer, piece, rng)
 
 
-def _kitchen(b: MeshBuilder, placer: Placer, rng: np.random.Generator) -> None:
+def _kitchen(b: MeshBuilder, placer: FurniturePlacer, rng: np.random.Generator) -> None:
     for width in (3.6, 3.0, 2.4, 1.8):
         if _wall_piece(b, placer, fk.kitchen_run(width), rng) is not None:
             break
@@ -88,7 +92,7 @@ def _kitchen(b: MeshBuilder, placer: Placer, rng: np.random.Generator) -> None:
         _wall_piece(b, placer, piece, rng)
 
 
-def _bedroom(b: MeshBuilder, placer: Placer, rng: np.random.Generator) -> None:
+def _bedroom(b: MeshBuilder, placer: FurniturePlacer, rng: np.random.Generator) -> None:
     for width in (1.6, 1.4, 0.95):
         spot = _wall_piece(b, placer, fr.bed(width), rng)
         if spot is not None:
@@ -106,19 +110,24 @@ def _bedroom(b: MeshBuilder, placer: Placer, rng: np.random.Generator) -> None:
 
 
 def _beside(
-    b: MeshBuilder, placer: Placer, spot: Spot, big: Piece, small: Piece, rng: np.random.Generator
+    b: MeshBuilder,
+    placer: FurniturePlacer,
+    spot: Placement,
+    big: FurniturePiece,
+    small: FurniturePiece,
+    rng: np.random.Generator,
 ) -> None:
-    """Small pieces left and right of a big one, all backs on one line."""
+    """Draw small pieces left and right of a big one, with their backs aligned."""
     for side in (-1, 1):
         dx = side * (big.width_m / 2 + small.width_m / 2 + 0.06)
         dy = big.depth_m / 2 - small.depth_m / 2
         cos, sin = np.cos(spot.yaw_rad), np.sin(spot.yaw_rad)
-        place = Spot(spot.x_m + cos * dx - sin * dy, spot.y_m + sin * dx + cos * dy, spot.yaw_rad)
+        place = Placement(spot.x_m + cos * dx - sin * dy, spot.y_m + sin * dx + cos * dy, spot.yaw_rad)
         if placer.at(place, small):
             small.draw(b.placed(place.x_m, place.y_m, 0.0, place.yaw_rad), rng)
 
 
-def _study(b: MeshBuilder, placer: Placer, rng: np.random.Generator) -> None:
+def _study(b: MeshBuilder, placer: FurniturePlacer, rng: np.random.Generator) -> None:
     for width in (1.7, 1.4):
         if _wall_piece(b, placer, fr.desk(width), rng) is not None:
             break
@@ -134,7 +143,7 @@ def _study(b: MeshBuilder, placer: Placer, rng: np.random.Generator) -> None:
 
 
 def _radiators(b: MeshBuilder, room: Room) -> None:
-    """Under each window nothing stands before."""
+    """Draw a radiator under each window that has no furniture in front of it."""
     for side in SIDES:
         for hole in room.openings[side]:
             busy = any(s1 > hole.s0 and s0 < hole.s1 for s0, s1, _ in room.spans[side])
@@ -150,7 +159,7 @@ def _radiators(b: MeshBuilder, room: Room) -> None:
 
 
 def _hang(b: MeshBuilder, room: Room, rng: np.random.Generator) -> None:
-    """Pictures, shelves and a clock on what is left of the walls."""
+    """Hang framed paintings and a clock on the free parts of the walls."""
     clock = rng.random() < 0.7
     for side in SIDES:
         at = b.placed(*room.corner(side), 0.0, YAW[side])

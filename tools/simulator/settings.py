@@ -1,4 +1,4 @@
-"""Everything that decides what a simulated recording is, in frozen settings with plain values."""
+"""Settings that fully determine a simulated recording: frozen dataclasses of plain values."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ import numpy as np
 from beamsplat.common.geometry.frames import camera_mount, lidar_mount
 from beamsplat.common.geometry.transforms import make_transform, so3_exp
 
-START_NS = 1_767_225_600_000_000_000  # stamp of the first moment; any fixed date does
+START_NS = 1_767_225_600_000_000_000  # stamp at time 0: 2026-01-01 00:00 UTC, an arbitrary fixed date
 
 
 @dataclass(frozen=True)
 class CameraSettings:
-    """A rigid camera. The focal length follows the width: fx = fy = focal_widths * width."""
+    """Settings of the camera, rigidly mounted on the body: fx = fy = focal_widths * width_px."""
 
     width_px: int = 640
     height_px: int = 480
@@ -25,14 +25,14 @@ class CameraSettings:
     z_m: float = 0.45
     pitch_down_rad: float = float(np.radians(2.0))
     distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)  # plumb_bob
-    noise: float = 1.0  # times the sensor's own; 0 = none
-    vignetting: float = 0.12
+    noise: float = 1.0  # factor on the noise of the simulated sensor; 0 = none
+    vignetting: float = 0.12  # v in the falloff 1 / (1 + v r^2), r in normalised image coordinates
     jpeg_quality: int = 92
-    phase_s: float = 0.035  # of the first image after the start
+    phase_s: float = 0.035  # time of the first image after the start
 
     @property
     def K(self) -> np.ndarray:
-        """float64 [3, 3]."""
+        """Intrinsics, float64 [3, 3]; the principal point is the image centre."""
         f = self.focal_widths * self.width_px
         cx, cy = (self.width_px - 1) / 2.0, (self.height_px - 1) / 2.0
         return np.array([[f, 0.0, cx], [0.0, f, cy], [0.0, 0.0, 1.0]])
@@ -44,20 +44,20 @@ class CameraSettings:
 
 @dataclass(frozen=True)
 class LidarSettings:
-    """A spinning planar lidar: beam i is taken i * time_increment after the stamp."""
+    """Settings of a spinning 2D lidar: beam i is measured i * time_increment_s after the scan's stamp."""
 
     beams: int = 720
     rate_hz: float = 10.0
     range_min_m: float = 0.12
     range_max_m: float = 12.0
-    noise_m: float = 0.01
-    dropout: float = 0.003
+    noise_m: float = 0.01  # standard deviation of a range
+    dropout: float = 0.003  # probability that a beam has no return
     x_m: float = 0.0
     y_m: float = 0.0
     z_m: float = 0.18
-    glass: bool = False  # glazed doors let some beams through
-    glass_pass: float = 0.7
-    phase_s: float = 0.020
+    glass: bool = False  # whether beams can pass through glazed doors
+    glass_pass: float = 0.7  # probability that a beam passes through glass
+    phase_s: float = 0.020  # time of the first scan after the start
 
     @property
     def angle_min_rad(self) -> float:
@@ -82,27 +82,31 @@ class LidarSettings:
 
 @dataclass(frozen=True)
 class WheelSettings:
-    """Odometry that counts wheel turns with wrong wheel sizes and a wrong track."""
+    """Settings of wheel odometry with systematic errors of wheel radius and track width."""
 
     rate_hz: float = 50.0
-    scale_error: tuple[float, float] = (0.018, 0.026)  # magnitude drawn from here, sign too
+    # Relative errors of distance and of turn: the magnitude is drawn from the range, the sign at random.
+    scale_error: tuple[float, float] = (0.018, 0.026)
     turn_error: tuple[float, float] = (0.003, 0.008)
-    noise: float = 0.01  # relative deviation of each increment
+    noise: float = 0.01  # relative standard deviation of each increment
 
 
 @dataclass(frozen=True)
 class Faults:
-    """What is wrong with the recording on purpose."""
+    """Faults that are added to the recording on purpose."""
 
-    clock_offset_ms: float = 0.0  # added to the camera's stamps
+    clock_offset_ms: float = 0.0  # added to the stamps of the images
     extrinsic_xyz_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # published minus true camera mount
     extrinsic_yaw_deg: float = 0.0
     extrinsic_pitch_deg: float = 0.0
     extrinsic_roll_deg: float = 0.0
     exposure_changes: bool = False
 
-    def published(self, T_body_camera: np.ndarray) -> np.ndarray:
-        """The camera mount the recording's tf claims: the true one moved and turned in the body frame."""
+    def published_mount(self, T_body_camera: np.ndarray) -> np.ndarray:
+        """Return the T_body_camera that tf publishes: the true one with the extrinsic fault applied.
+
+        The fault translates and rotates the camera in the body frame.
+        """
         yaw, pitch, roll = np.radians(
             [self.extrinsic_yaw_deg, self.extrinsic_pitch_deg, self.extrinsic_roll_deg]
         )
@@ -111,8 +115,8 @@ class Faults:
             R @ T_body_camera[:3, :3], T_body_camera[:3, 3] + np.array(self.extrinsic_xyz_m)
         )
 
-    def gain_at(self, time_s: float) -> float:
-        """Factor on the exposure at a time of the lap: slow waves and one sudden step."""
+    def exposure_gain_at(self, time_s: float) -> float:
+        """Return the factor on the exposure at a time of the lap: slow sine waves and one sudden step."""
         if not self.exposure_changes:
             return 1.0
         wave = 0.35 * np.sin(2 * np.pi * time_s / 11.0) + 0.2 * np.sin(2 * np.pi * time_s / 3.7)
@@ -120,20 +124,20 @@ class Faults:
 
 
 @dataclass(frozen=True)
-class Simulation:
-    """One recording."""
+class SimulationSettings:
+    """Settings of one recording."""
 
     seed: int = 0
-    seconds: float | None = None  # None: whole laps
-    laps: int | None = None  # None: as many as the seconds need, at least one
+    seconds: float | None = None  # None: as long as the laps take
+    laps: int | None = None  # None: as many as `seconds` needs, at least one
     people: int = 0
     carts: int = 0
     scene: str | None = None  # a glTF/GLB file instead of the generated home
     lidar_only: bool = False
-    extra_views: int = 40
-    surface_points: int = 250_000
+    extra_views: int = 40  # held-out views off the path
+    surface_points: int = 250_000  # points of the ground-truth surface
     camera: CameraSettings = field(default_factory=CameraSettings)
     lidar: LidarSettings = field(default_factory=LidarSettings)
     wheels: WheelSettings = field(default_factory=WheelSettings)
     faults: Faults = field(default_factory=Faults)
-    truth_every: int = 8  # images between depth maps
+    truth_every: int = 8  # every n-th image has a ground-truth depth map

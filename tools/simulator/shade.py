@@ -8,16 +8,16 @@ import numpy as np
 
 from beamsplat.common.compiled import kernel
 from beamsplat.tools.simulator.atlas import Atlas
-from beamsplat.tools.simulator.mesh import Mesh
+from beamsplat.tools.simulator.mesh import SceneMesh
 
 MAX_ANISOTROPY = 6
 
 
-class Surfaces(NamedTuple):
-    """Per-triangle data of F triangles and the textures, laid out for the kernels."""
+class ShadingTables(NamedTuple):
+    """Data of F triangles and all textures, laid out for the compiled shading kernels."""
 
     corner: np.ndarray  # float64 [F, 3]
-    normal: np.ndarray  # float64 [F, 3], not unit
+    normal: np.ndarray  # float64 [F, 3], not normalised
     dual: np.ndarray  # float32 [F, 2, 3]: barycentrics 1 and 2 = dual @ (P - corner)
     uv: np.ndarray  # float32 [F, 3, 2]: at the corner, and the two edge differences
     light: np.ndarray  # float32 [F, 3, 3]: at the three corners
@@ -32,8 +32,8 @@ class Surfaces(NamedTuple):
     levels: np.ndarray
 
 
-def surfaces(mesh: Mesh, atlas: Atlas, light: np.ndarray) -> Surfaces:
-    """`light` is float32 [V, 3] as `light.bake` gives it."""
+def shading_tables(mesh: SceneMesh, atlas: Atlas, light: np.ndarray) -> ShadingTables:
+    """Return the tables of a mesh; `light` is float32 [V, 3] as `light.bake` returns it."""
     v = mesh.vertices_m.astype(np.float64)[mesh.triangles]
     e1, e2 = v[:, 1] - v[:, 0], v[:, 2] - v[:, 0]
     normal = np.cross(e1, e2)
@@ -43,7 +43,7 @@ def surfaces(mesh: Mesh, atlas: Atlas, light: np.ndarray) -> Surfaces:
     names = np.array([atlas.index(m.texture) for m in mesh.materials], np.int32)
     tints = np.array([m.tint for m in mesh.materials], np.float32)
     emission = np.array([m.emission for m in mesh.materials], np.float32)
-    return Surfaces(
+    return ShadingTables(
         np.ascontiguousarray(v[:, 0]),
         normal,
         dual.astype(np.float32),
@@ -63,7 +63,7 @@ def surfaces(mesh: Mesh, atlas: Atlas, light: np.ndarray) -> Surfaces:
 
 @kernel(fastmath=True)
 def _bilinear(
-    s: Surfaces, texture: int, level: int, u: float, v: float, weight: float
+    s: ShadingTables, texture: int, level: int, u: float, v: float, weight: float
 ) -> tuple[float, float, float]:
     width, height = s.width_px[texture, level], s.height_px[texture, level]
     x = np.float32((u - np.floor(u)) * width - 0.5)
@@ -95,9 +95,21 @@ def _bilinear(
 
 @kernel(fastmath=True)
 def sample(
-    s: Surfaces, texture: int, u: float, v: float, ux: float, vx: float, uy: float, vy: float, out: np.ndarray
+    s: ShadingTables,
+    texture: int,
+    u: float,
+    v: float,
+    ux: float,
+    vx: float,
+    uy: float,
+    vy: float,
+    out: np.ndarray,
 ) -> None:
-    """Texture at (u, v) averaged over the pixel's footprint, whose edges are (ux, vx) and (uy, vy)."""
+    """Write the texture at (u, v) to out [3], averaged over the pixel's footprint with edges (ux, vx), (uy,
+    vy).
+
+    Anisotropic filtering: several trilinear lookups along the longer edge.
+    """
     width, height = s.width_px[texture, 0], s.height_px[texture, 0]
     long, short = np.hypot(ux * width, vx * height), np.hypot(uy * width, vy * height)
     step_u, step_v = ux, vx
@@ -112,7 +124,8 @@ def sample(
     low = int(level)
     high = min(low + 1, top)
     fraction = level - low
-    # Between levels only where it shows: many probes already blur the step, and near a level there is none.
+    # Interpolate between mip levels only where the difference is visible: not close to a level, and not
+    # with many lookups, which already blur the step.
     if fraction < 0.12 or (probes > 2 and fraction < 0.5):
         fraction = 0.0
     elif fraction > 0.88 or probes > 2:
@@ -132,8 +145,9 @@ def sample(
 
 
 @kernel
-def turn_rays(table: np.ndarray, R: np.ndarray, out: np.ndarray) -> None:
-    """out [N, 3] = table [N, 3] turned by R [3, 3]; BLAS would start threads for this."""
+def rotate_rays(table: np.ndarray, R: np.ndarray, out: np.ndarray) -> None:
+    """Write table [N, 3] rotated by R [3, 3] to out [N, 3]; not by matmul, because BLAS would start
+    threads."""
     for i in range(len(table)):
         x, y, z = table[i, 0], table[i, 1], table[i, 2]
         for c in range(3):
@@ -142,18 +156,18 @@ def turn_rays(table: np.ndarray, R: np.ndarray, out: np.ndarray) -> None:
 
 @kernel(fastmath={"contract", "arcp", "nsz"})
 def shade(
-    s: Surfaces,
-    triangle: np.ndarray,  # int32 [N], -1 none
+    s: ShadingTables,
+    triangle: np.ndarray,  # int32 [N], -1 = none
     origin: np.ndarray,  # float64 [3]
-    rays: np.ndarray,  # float32 [N, 3], world, z component of the camera frame = 1
+    rays: np.ndarray,  # float32 [N, 3], world frame, scaled to z = 1 in the camera frame
     rays_x: np.ndarray,  # float32 [N, 3], difference to the next pixel's ray in x
     rays_y: np.ndarray,  # float32 [N, 3]
-    scale: float,  # footprint of a ray in pixels
-    balls: np.ndarray,  # float64 [K, 4] centre and radius of what casts contact shadows
-    colour: np.ndarray,  # float32 [N, 3] out, linear radiance
-    depth: np.ndarray,  # float32 [N] in and out: only nearer hits are written, optical z
+    scale: float,  # width of a ray's footprint in pixels
+    spheres: np.ndarray,  # float64 [K, 4], centre and radius of spheres that cast contact shadows
+    colour: np.ndarray,  # float32 [N, 3] out: linear radiance
+    depth: np.ndarray,  # float32 [N] in and out: optical z; only nearer hits are written
 ) -> None:
-    """Fills colour and depth where the triangle is nearer than what is there."""
+    """Write colour and depth of the rays whose triangle is nearer than `depth`."""
     texel = np.zeros(3)
     for i in range(len(triangle)):
         f = triangle[i]
@@ -175,7 +189,7 @@ def shade(
         b2 = c1 * px + c2 * py + c3 * pz
         u = s.uv[f, 0, 0] + b1 * s.uv[f, 1, 0] + b2 * s.uv[f, 2, 0]
         v = s.uv[f, 0, 1] + b1 * s.uv[f, 1, 1] + b2 * s.uv[f, 2, 1]
-        reach = 8.0 * t  # where a neighbour's ray leaves the plane, its footprint is cut
+        reach = 8.0 * t  # bounds the footprint where the neighbouring ray misses the plane
         ex, ey, ez = dx + scale * rays_x[i, 0], dy + scale * rays_x[i, 1], dz + scale * rays_x[i, 2]
         slope = nx * ex + ny * ey + nz * ez
         t2 = min(height / slope, reach) if slope * along > 0 else reach
@@ -196,11 +210,13 @@ def shade(
         b1, b2 = min(max(b1, 0.0), 1.0), min(max(b2, 0.0), 1.0)
         b0 = max(0.0, 1.0 - b1 - b2)
         shadow = 1.0
-        if len(balls):
+        if len(spheres):
             x, y, z = origin[0] + t * dx, origin[1] + t * dy, origin[2] + t * dz
             length = np.sqrt(nx * nx + ny * ny + nz * nz)
             flip = -1.0 if along > 0 else 1.0
-            shadow = _ball_shadow(balls, x, y, z, flip * nx / length, flip * ny / length, flip * nz / length)
+            shadow = _sphere_occlusion(
+                spheres, x, y, z, flip * nx / length, flip * ny / length, flip * nz / length
+            )
         glow = s.emission[f]
         for c in range(3):
             light = b0 * s.light[f, 0, c] + b1 * s.light[f, 1, c] + b2 * s.light[f, 2, c]
@@ -208,24 +224,30 @@ def shade(
 
 
 @kernel
-def _ball_shadow(balls: np.ndarray, x: float, y: float, z: float, nx: float, ny: float, nz: float) -> float:
-    """Ambient light left beside balls: 1 - cos * r^2 / d^2 for each (Quilez, sphere occlusion)."""
+def _sphere_occlusion(
+    spheres: np.ndarray, x: float, y: float, z: float, nx: float, ny: float, nz: float
+) -> float:
+    """Return the factor on ambient light next to spheres [K, 4]: product of 1 - 0.8 cos r^2 / d^2.
+
+    Sphere ambient occlusion after Inigo Quilez; 0.8 keeps contact shadows from becoming black.
+    """
     left = 1.0
-    for k in range(len(balls)):
-        dx, dy, dz = balls[k, 0] - x, balls[k, 1] - y, balls[k, 2] - z
+    for k in range(len(spheres)):
+        dx, dy, dz = spheres[k, 0] - x, spheres[k, 1] - y, spheres[k, 2] - z
         squared = dx * dx + dy * dy + dz * dz
-        if squared > 36.0 * balls[k, 3] ** 2:
+        if squared > 36.0 * spheres[k, 3] ** 2:
             continue
-        squared = max(squared, balls[k, 3] ** 2)
+        squared = max(squared, spheres[k, 3] ** 2)
         cos = (nx * dx + ny * dy + nz * dz) / np.sqrt(squared)
         if cos > 0.0:
-            left *= 1.0 - 0.8 * cos * balls[k, 3] ** 2 / squared
+            left *= 1.0 - 0.8 * cos * spheres[k, 3] ** 2 / squared
     return left
 
 
 @kernel
 def mark_cones(rays: np.ndarray, axis: np.ndarray, cosine: np.ndarray, inside: np.ndarray) -> None:
-    """bool [N] out: rays [N, 3] within one of the cones about unit axes [A, 3]."""
+    """Set inside [N] for the rays [N, 3] within one of the cones with unit axes [A, 3] and half-angle cosines
+    [A]."""
     for i in range(len(rays)):
         x, y, z = rays[i, 0], rays[i, 1], rays[i, 2]
         squared = x * x + y * y + z * z
@@ -237,7 +259,8 @@ def mark_cones(rays: np.ndarray, axis: np.ndarray, cosine: np.ndarray, inside: n
 
 @kernel
 def find_edges(surface: np.ndarray, depth: np.ndarray, edge: np.ndarray) -> None:
-    """bool [H, W] out: pixels where another surface or a jump of depth begins next door."""
+    """Set edge [H, W] at pixels whose right or lower neighbour shows another surface or a depth jump, and
+    there."""
     height, width = surface.shape
     for y in range(height):
         for x in range(width):

@@ -1,4 +1,4 @@
-"""Solid shapes for furniture, drawn into a `MeshBuilder`'s frame."""
+"""Solid shapes for furniture, drawn in the frame of a `MeshBuilder`."""
 
 from __future__ import annotations
 
@@ -20,9 +20,13 @@ def box(
     skip: tuple[str, ...] = (),
     turn: bool = False,
 ) -> None:
-    """A box with its base centred at `centre`; front looks to -y. `faces` overrides single sides.
+    """Draw a box whose base is centred at `centre` and whose front faces -y.
 
-    Faces named in `fit` show their texture once; `turn` lays the grain upright on the sides.
+    Args:
+        faces: materials of single faces, instead of `material`.
+        fit: faces whose texture is stretched over them once.
+        skip: faces that are left out.
+        turn: whether the grain of the texture is upright on the sides.
     """
     x, y, z = centre
     w, d, h = (max(v, 1e-4) for v in size)
@@ -53,7 +57,8 @@ def lathe(
     smooth: bool = True,
     fit: bool = False,
 ) -> None:
-    """A surface of revolution; consecutive profile points are one band, shaded smoothly if asked."""
+    """Draw a surface of revolution about z; `smooth` shades the bands between profile points as one
+    surface."""
     points = np.array(profile, dtype=np.float64)
     angle = np.linspace(0.0, 2.0 * np.pi, sides + 1)
     ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -103,7 +108,7 @@ def cylinder(
     sides: int = 16,
     caps: bool = True,
 ) -> None:
-    """An upright cylinder or cone frustum standing at `centre`."""
+    """Draw an upright cylinder or cone frustum whose base is centred at `centre`."""
     top = radius_m if top_radius_m is None else top_radius_m
     rings = max(2, int(np.ceil(height_m / b.edge_m)) + 1)
     side = list(zip(np.linspace(radius_m, top, rings), np.linspace(0.0, height_m, rings)))
@@ -123,7 +128,7 @@ def rod(
     *,
     sides: int = 8,
 ) -> None:
-    """A round bar between two points."""
+    """Draw a round bar between two points."""
     p, q = np.array(start, dtype=np.float64), np.array(end, dtype=np.float64)
     axis = q - p
     length = float(np.linalg.norm(axis))
@@ -158,9 +163,9 @@ def cushion(
     detail: int = 18,
     squash: float = 0.55,
 ) -> None:
-    """A superellipsoid: a pillow (`power` about 0.5) or an upholstered block (0.2), base at `centre`.
+    """Draw a superellipsoid with its base at `centre`: a pillow (`power` 0.5) or an upholstered block (0.2).
 
-    `squash` is the power of the vertical profile, small = boxy rim.
+    `squash` is the exponent of the vertical profile; small values make the rim boxy.
     """
     rows = max(7, detail // 2 + 1)
     latitude = np.linspace(-np.pi / 2, np.pi / 2, rows)
@@ -190,7 +195,7 @@ def cushion(
     )
     normals /= np.linalg.norm(normals, axis=-1, keepdims=True) + 1e-12
     texture = np.array(b.texture_size_m[material.texture])
-    # A triplanar map would need three materials: x + y against z hides the stretch well enough on cloth.
+    # A triplanar mapping would need three surfaces; projecting x + y and z hides the stretch on cloth.
     flat = np.abs(normals[..., 2]) > 0.7
     u = np.where(flat, vertices[..., 0], vertices[..., 0] + vertices[..., 1])
     v = np.where(flat, vertices[..., 1], vertices[..., 2])
@@ -214,7 +219,8 @@ def curtain(
     wave_m: float = 0.03,
     folds: float = 7.0,
 ) -> None:
-    """Hanging cloth in the local xz plane, waving in y, lower left corner at `left`, facing -y."""
+    """Draw hanging cloth in the local xz plane with folds in y, facing -y; `left` is its lower left
+    corner."""
     columns, rows = int(folds * 8) + 1, max(2, int(height_m / 0.15))
     s, t = np.meshgrid(np.linspace(0.0, 1.0, columns), np.linspace(0.0, 1.0, rows))
     phase = 2 * np.pi * folds * s + 0.8 * np.sin(3.0 * s + 2.0 * t)

@@ -1,4 +1,4 @@
-"""The cache on disk: everything is found again by a hash of all that made it, this code included."""
+"""The cache on disk: entries are named by a hash of all their inputs and of the source code."""
 
 from __future__ import annotations
 
@@ -13,10 +13,9 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-# A change in any other module of this folder may change what is drawn ...
-NOT_DRAWING = frozenset(
+# Modules that cannot change rendered frames; a change in any other module invalidates cached frames.
+NOT_IN_FRAME_HASH = frozenset(
     {
-        "cli.py",
         "writer.py",
         "wheels.py",
         "recording.py",
@@ -27,19 +26,26 @@ NOT_DRAWING = frozenset(
         "__init__.py",
     }
 )
-# ... and in any but these, too, the world that it is drawn from.
-NOT_BUILDING = NOT_DRAWING | {"shots.py", "movers.py", "render.py", "shade.py", "camera.py", "settings.py"}
+# Modules that cannot change a world; a change in any other module invalidates cached worlds.
+NOT_IN_WORLD_HASH = NOT_IN_FRAME_HASH | {
+    "frames.py",
+    "actors.py",
+    "render.py",
+    "shade.py",
+    "camera.py",
+    "settings.py",
+}
 
 
 def cache_root() -> Path:
-    """$BEAMSPLAT_CACHE, or ~/.cache/beamsplat."""
+    """Return the cache folder: $BEAMSPLAT_CACHE, or ~/.cache/beamsplat."""
     chosen = os.environ.get("BEAMSPLAT_CACHE")
     return Path(chosen) if chosen else Path.home() / ".cache" / "beamsplat"
 
 
 @cache
 def code_version(leave_out: frozenset[str]) -> str:
-    """Hash of this folder's sources but those."""
+    """Return a hash of the source files of this folder, except those named in `leave_out`."""
     digest = hashlib.sha256()
     for path in sorted(Path(__file__).parent.glob("*.py")):
         if path.name not in leave_out:
@@ -48,24 +54,27 @@ def code_version(leave_out: frozenset[str]) -> str:
 
 
 def key(kind: str, *parts: Any) -> str:
-    """A name for the `world` or `shot` that these settings, numbers and strings make."""
+    """Return the cache key of a `world` or a `shot` (a rendered frame) that is made from `parts`.
+
+    `parts` are dataclasses of settings, numbers, strings, and lists of them.
+    """
 
     def plain(value: Any) -> Any:
         return {type(value).__name__: asdict(value)} if is_dataclass(value) else value
 
     text = json.dumps([kind, *(plain(p) for p in parts)], sort_keys=True, default=repr)
-    code = code_version(NOT_BUILDING if kind == "world" else NOT_DRAWING)
+    code = code_version(NOT_IN_WORLD_HASH if kind == "world" else NOT_IN_FRAME_HASH)
     return hashlib.sha256((code + text).encode()).hexdigest()[:24]
 
 
 def file_hash(path: Path) -> str:
-    """SHA-256 of a file's bytes."""
+    """Return the SHA-256 of the contents of a file."""
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 @contextmanager
-def whole_file(path: Path) -> Iterator[Path]:
-    """A temporary neighbour that becomes `path` when all went well: no half file ever has the name."""
+def atomic_file(path: Path) -> Iterator[Path]:
+    """Yield a temporary path that is renamed to `path` on success: `path` never holds an incomplete file."""
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
@@ -76,8 +85,11 @@ def whole_file(path: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def whole_folder(path: Path, *, replace: bool) -> Iterator[Path]:
-    """A temporary neighbour that becomes the folder `path` when all went well."""
+def atomic_folder(path: Path, *, replace: bool) -> Iterator[Path]:
+    """Yield a temporary folder that is renamed to `path` on success.
+
+    With `replace`, an existing folder `path` is deleted just before.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     shutil.rmtree(part, ignore_errors=True)

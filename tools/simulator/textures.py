@@ -1,6 +1,6 @@
-"""Procedural surfaces: wood, tiles, brick, plaster, wallpaper, cloth, stone. All tile seamlessly.
+"""Procedural textures: wood, tiles, brick, plaster, wallpaper, cloth, stone. All of them tile seamlessly.
 
-Pictures are float32 [H, W, 3] in sRGB, 0..1, row 0 on top. Every function takes a seeded generator.
+Textures are float32 [H, W, 3] in sRGB, 0..1, row 0 on top. Every function takes a seeded generator.
 """
 
 from __future__ import annotations
@@ -12,11 +12,9 @@ import cv2
 import numpy as np
 from scipy import fft
 
-Rgb = tuple[float, float, float]
-
 
 def rgb(hex_colour: str) -> np.ndarray:
-    """float32 [3] of 'a0b1c2'."""
+    """Return float32 [3], 0..1, of a colour such as 'a0b1c2'."""
     return np.array([int(hex_colour[i : i + 2], 16) for i in (0, 2, 4)], dtype=np.float32) / 255.0
 
 
@@ -27,10 +25,12 @@ def fractal(
     beta: float = 1.6,
     stretch: tuple[float, float] = (1.0, 1.0),
 ) -> np.ndarray:
-    """Periodic 1/f^beta noise [H, W], zero mean, unit deviation; `stretch` (x, y) lengthens its grain.
+    """Return periodic 1/f^beta noise [H, W] of zero mean and unit variance; `stretch` (x, y) elongates its
+    grain.
 
-    One field for each set of arguments, shifted and mirrored by the generator: a transform for each
-    texture would take longer than all the rest of a home.
+    There is one noise field per set of arguments, which the generator shifts and mirrors: one Fourier
+    transform
+    per texture would take longer than everything else in a home.
     """
     noise = _noise(height, width, beta, stretch)
     rolled = np.roll(noise, tuple(rng.integers(0, (height, width)).tolist()), axis=(0, 1))
@@ -50,9 +50,9 @@ def _noise(height: int, width: int, beta: float, stretch: tuple[float, float]) -
     return (noise / noise.std()).astype(np.float32)
 
 
-def finish(picture: np.ndarray) -> np.ndarray:
-    """Clipped to what a camera can be shown."""
-    return np.clip(picture, 0.0, 1.0).astype(np.float32)
+def finish(texture: np.ndarray) -> np.ndarray:
+    """Return the texture clipped to 0..1, float32."""
+    return np.clip(texture, 0.0, 1.0).astype(np.float32)
 
 
 def planks(
@@ -64,7 +64,7 @@ def planks(
     contrast: float = 1.0,
     gap: float = 0.5,
 ) -> np.ndarray:
-    """A floor of boards along x: each board its own tone and cut of the grain, with knots and joints."""
+    """Floor boards along x; each has its own tone and part of the grain, with knots and joints."""
     grain = fractal(rng, size_px, size_px, 1.1, (14.0, 1.0))
     fine = fractal(rng, size_px, size_px, 0.6, (24.0, 1.0))
     wave = fractal(rng, size_px, size_px, 2.2, (5.0, 1.0))
@@ -284,7 +284,7 @@ def terrazzo(
         centre = rng.integers(0, size_px, size=2)
         axes = (int(rng.integers(1, 6)), int(rng.integers(1, 4)))
         colour = chips[int(rng.integers(len(chips)))] * rng.uniform(0.85, 1.1)
-        for dx in (-size_px, 0, size_px):  # a chip on the rim comes back on the other side
+        for dx in (-size_px, 0, size_px):  # chips at the border continue on the other side
             at = (int(centre[0]) + dx, int(centre[1]))
             if -8 < at[0] < size_px + 8:
                 cv2.ellipse(

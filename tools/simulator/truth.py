@@ -1,4 +1,4 @@
-"""Truth beside the bag: depth, masks, views off the path, and points of the surface the camera saw."""
+"""Ground truth beside the bag: held-out views off the path, and points of the surface that the camera saw."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ import numpy as np
 
 from beamsplat.common.compiled import kernel
 from beamsplat.common.geometry.transforms import so3_exp
-from beamsplat.tools.simulator.camera import TONE, WHITE, Sensor, pixel_rays
-from beamsplat.tools.simulator.freespace import FreeSpace
+from beamsplat.tools.simulator.camera import TONE, WHITE, ImageSensor, pixel_rays
+from beamsplat.tools.simulator.clearance_grid import ClearanceGrid
+from beamsplat.tools.simulator.frames import FrameRenderer, depth_mm
 from beamsplat.tools.simulator.render import ray_table
 from beamsplat.tools.simulator.settings import CameraSettings
-from beamsplat.tools.simulator.shade import Surfaces, sample
-from beamsplat.tools.simulator.shots import Studio, depth_mm
+from beamsplat.tools.simulator.shade import ShadingTables, sample
 from beamsplat.tools.simulator.writer import transform_json, write_png
 
-OFF_PATH_M = (0.15, 0.60)
-SEEN_SHARE = 0.85
+OFF_PATH_M = (0.15, 0.60)  # least and largest distance of a held-out view from the path
+MIN_SEEN_RATIO = 0.85  # ratio of a held-out view's pixels that the drive has seen
 
 
 @dataclass(frozen=True)
-class Seen:
-    """Depth maps of the drive and where they were taken."""
+class DepthViews:
+    """Depth maps of the drive with their camera poses, to test whether the drive has seen a point."""
 
     T_world_camera: np.ndarray  # float64 [N, 4, 4]
     depth_mm: np.ndarray  # uint16 [N, H, W], in the pixels of the (distorted) images
@@ -34,7 +34,8 @@ class Seen:
     distortion: tuple[float, ...]
 
     def count(self, points_m: np.ndarray, normals: np.ndarray) -> np.ndarray:
-        """int32 [P]: in how many of the views each point [P, 3] is in sight, from its front."""
+        """Return int32 [P]: in how many views each point [P, 3] is visible from the side of its normal [P,
+        3]."""
         return _count_views(
             np.ascontiguousarray(points_m, dtype=np.float64),
             np.ascontiguousarray(normals, dtype=np.float64),
@@ -76,16 +77,17 @@ def _count_views(
 
 
 def surface_points(
-    scene: Surfaces, seen: Seen, wanted: int, gain: float, rng: np.random.Generator
+    scene: ShadingTables, depth_views: DepthViews, wanted: int, gain: float, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Up to `wanted` points float32 [N, 3], even over the seen surface, and their uint8 RGB [N, 3].
+    """Sample the surface that the drive has seen, uniformly by area.
 
-    Fewer come back only if the camera saw next to nothing.
+    Returns:
+        Points float32 [N, 3] and their RGB uint8 [N, 3]; N < `wanted` only if the camera saw almost nothing.
     """
     area = np.linalg.norm(scene.normal, axis=1) / 2
     unit = scene.normal / np.maximum(2 * area[:, None], 1e-30)
     e1, e2 = _edges(scene)
-    # Triangles are small: one with no corner and no middle in sight has nothing in sight worth a point.
+    # Triangles are small: if neither a corner nor the middle is visible, the triangle is left out.
     probes = np.stack(
         [
             scene.corner + 0.02 * (e1 + e2),
@@ -94,7 +96,7 @@ def surface_points(
             scene.corner + (e1 + e2) / 3,
         ]
     )
-    in_sight = np.any([seen.count(p, unit) > 0 for p in probes], axis=0)
+    in_sight = np.any([depth_views.count(p, unit) > 0 for p in probes], axis=0)
     weight = np.where(in_sight, area, 0.0)
     if weight.sum() <= 0.0:
         return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
@@ -105,7 +107,7 @@ def surface_points(
         fold = a + b > 1
         a, b = np.where(fold, 1 - a, a), np.where(fold, 1 - b, b)
         points = scene.corner[triangle] + a[:, None] * e1[triangle] + b[:, None] * e2[triangle]
-        keep = seen.count(points, unit[triangle]) > 0
+        keep = depth_views.count(points, unit[triangle]) > 0
         found.append(points[keep].astype(np.float32))
         colours.append(_colours(scene, triangle[keep], a[keep], b[keep], gain))
         total += int(keep.sum())
@@ -115,16 +117,18 @@ def surface_points(
     return np.concatenate(found)[order], np.concatenate(colours)[order]
 
 
-def _edges(scene: Surfaces) -> tuple[np.ndarray, np.ndarray]:
-    """The edge vectors [F, 3] whose barycentrics `scene.dual` measures.
+def _edges(scene: ShadingTables) -> tuple[np.ndarray, np.ndarray]:
+    """Return both edge vectors [F, 3] of each triangle, recovered from its dual basis `scene.dual`.
 
-    dual_1 = e2 x n / n^2 and dual_2 = n x e1 / n^2 give n x dual_1 = e2 and dual_2 x n = e1.
+    dual_1 = e2 x n / n^2 and dual_2 = n x e1 / n^2, hence n x dual_1 = e2 and dual_2 x n = e1.
     """
     dual = scene.dual.astype(np.float64)
     return np.cross(dual[:, 1], scene.normal), np.cross(scene.normal, dual[:, 0])
 
 
-def _colours(scene: Surfaces, triangle: np.ndarray, a: np.ndarray, b: np.ndarray, gain: float) -> np.ndarray:
+def _colours(
+    scene: ShadingTables, triangle: np.ndarray, a: np.ndarray, b: np.ndarray, gain: float
+) -> np.ndarray:
     radiance = np.empty((len(triangle), 3))
     _point_radiance(scene, triangle, a, b, radiance)
     at = np.clip(radiance * gain * WHITE + 0.5, 0, len(TONE) - 1).astype(int)
@@ -132,7 +136,9 @@ def _colours(scene: Surfaces, triangle: np.ndarray, a: np.ndarray, b: np.ndarray
 
 
 @kernel
-def _point_radiance(s: Surfaces, triangle: np.ndarray, a: np.ndarray, b: np.ndarray, out: np.ndarray) -> None:
+def _point_radiance(
+    s: ShadingTables, triangle: np.ndarray, a: np.ndarray, b: np.ndarray, out: np.ndarray
+) -> None:
     texel = np.zeros(3)
     for i in range(len(triangle)):
         f = triangle[i]
@@ -146,36 +152,44 @@ def _point_radiance(s: Surfaces, triangle: np.ndarray, a: np.ndarray, b: np.ndar
 
 def write_extra_views(
     folder: Path,
-    studio: Studio,
-    space: FreeSpace,
-    seen: Seen,
+    frame_renderer: FrameRenderer,
+    space: ClearanceGrid,
+    depth_views: DepthViews,
     times_s: np.ndarray,
     count: int,
     rng: np.random.Generator,
     progress: Callable[[int, int], None],
 ) -> int:
-    """Pinhole views off the path of what the drive has seen, without movers, with depth; returns how many."""
+    """Write held-out pinhole views off the path, with depth and without dynamic objects.
+
+    Only views of which the drive has seen at least MIN_SEEN_RATIO are used.
+
+    Returns:
+        The number of views: `count`, or fewer if too few random candidates qualify.
+    """
     folder.mkdir()
-    camera = studio.shoot.camera
+    camera = frame_renderer.spec.camera
     table = ray_table(pixel_rays(camera.width_px, camera.height_px, camera.K))
-    sensor = Sensor(table.rays, noise=0.0, vignetting=camera.vignetting, quality=camera.jpeg_quality)
+    sensor = ImageSensor(table.rays, noise=0.0, vignetting=camera.vignetting, quality=camera.jpeg_quality)
     small = ray_table(pixel_rays(48, 36, _scaled(camera, 48)))
-    path = studio.drive.pose_at(np.linspace(times_s[0], times_s[-1], 2000))[:, :2]
+    path = frame_renderer.drive.pose_at(np.linspace(times_s[0], times_s[-1], 2000))[:, :2]
     views: list[dict[str, object]] = []
     for _ in range(count * 40):
         if len(views) == count:
             break
-        T, offset = _candidate(studio, space, path, times_s, rng)
+        T, offset = _random_view(frame_renderer, space, path, times_s, rng)
         if T is None:
             continue
-        share = _seen_share(studio, seen, T, studio.still(T, small), small.rays)
-        if share < SEEN_SHARE:
+        seen_ratio = _seen_ratio(
+            frame_renderer, depth_views, T, frame_renderer.render_static(T, small), small.rays
+        )
+        if seen_ratio < MIN_SEEN_RATIO:
             continue
-        picture = studio.still(T, table)
+        view = frame_renderer.render_static(T, table)
         name = f"{len(views):03d}"
-        bgr = sensor.develop(picture.radiance, studio.gain, np.random.default_rng(0))
+        bgr = sensor.develop(view.radiance, frame_renderer.gain, np.random.default_rng(0))
         (folder / f"{name}.jpg").write_bytes(sensor.jpeg(bgr))
-        write_png(folder / f"{name}_depth.png", depth_mm(picture.depth_z_m))
+        write_png(folder / f"{name}_depth.png", depth_mm(view.depth_z_m))
         pose = transform_json(T)
         views.append(
             {
@@ -185,7 +199,7 @@ def write_extra_views(
                 "translation_xyz": pose["translation_xyz"],
                 "quaternion_xyzw": pose["quaternion_xyzw"],
                 "distance_to_trajectory_m": offset,
-                "fraction_seen_in_sequence": share,
+                "fraction_seen_in_sequence": seen_ratio,
             }
         )
         progress(len(views), count)
@@ -212,10 +226,14 @@ def _scaled(camera: CameraSettings, width: int) -> np.ndarray:
     return K
 
 
-def _candidate(
-    studio: Studio, space: FreeSpace, path: np.ndarray, times_s: np.ndarray, rng: np.random.Generator
+def _random_view(
+    frame_renderer: FrameRenderer,
+    space: ClearanceGrid,
+    path: np.ndarray,
+    times_s: np.ndarray,
+    rng: np.random.Generator,
 ) -> tuple[np.ndarray | None, float]:
-    T = studio.pose(float(rng.choice(times_s)))
+    T = frame_renderer.camera_pose(float(rng.choice(times_s)))
     sideways = rng.uniform(*OFF_PATH_M) * rng.choice([-1.0, 1.0])
     place = T[:3, 3] + T[:3, 0] * sideways + T[:3, 2] * rng.uniform(-0.2, 0.2)
     offset = float(np.linalg.norm(path - place[:2], axis=1).min())
@@ -229,15 +247,17 @@ def _candidate(
     return out, offset
 
 
-def _seen_share(studio: Studio, seen: Seen, T: np.ndarray, picture: object, rays: np.ndarray) -> float:
-    depth, triangle = picture.depth_z_m.ravel(), picture.triangle.ravel()  # type: ignore[attr-defined]
+def _seen_ratio(
+    frame_renderer: FrameRenderer, depth_views: DepthViews, T: np.ndarray, view: object, rays: np.ndarray
+) -> float:
+    depth, triangle = view.depth_z_m.ravel(), view.triangle.ravel()  # type: ignore[attr-defined]
     valid = triangle >= 0
     points = (rays.reshape(-1, 3) * depth[:, None])[valid] @ T[:3, :3].T + T[:3, 3]
-    n = studio.renderer.scene.normal[triangle[valid]]
+    n = frame_renderer.renderer.scene.normal[triangle[valid]]
     flip = np.sign(np.einsum("ij,ij->i", n, T[:3, 3] - points))[:, None]
-    return float(np.sum(seen.count(points, n * flip) > 0) / len(depth))
+    return float(np.sum(depth_views.count(points, n * flip) > 0) / len(depth))
 
 
 def decode_depth(png: np.ndarray) -> np.ndarray:
-    """uint16 [H, W] of PNG bytes uint8 [B]."""
+    """Return the depth uint16 [H, W] in millimetres of PNG bytes uint8 [B]."""
     return cv2.imdecode(png, cv2.IMREAD_UNCHANGED)

@@ -8,7 +8,7 @@ import numpy as np
 
 from beamsplat.tools.simulator.furniture import LACQUER, OAK, STEEL
 from beamsplat.tools.simulator.mesh import Material, MeshBuilder
-from beamsplat.tools.simulator.place import SIDES, YAW, Opening, Room
+from beamsplat.tools.simulator.place import SIDES, YAW, Room, WallOpening
 from beamsplat.tools.simulator.shapes import box, curtain, rod
 
 HALF_WALL_M = 0.06
@@ -17,8 +17,8 @@ DAYLIGHT = np.array([1.0, 1.04, 1.10])
 
 
 @dataclass(frozen=True)
-class Finish:
-    """How a room's surfaces look; `accent` covers one wall."""
+class RoomFinish:
+    """Materials of a room's surfaces; `accent` covers one wall."""
 
     floor: Material
     wall: Material
@@ -30,8 +30,8 @@ class Finish:
     trim: Material = LACQUER
 
 
-def draw_shell(b: MeshBuilder, room: Room, finish: Finish, rng: np.random.Generator) -> None:
-    """Everything that does not move out with the tenants."""
+def draw_shell(b: MeshBuilder, room: Room, finish: RoomFinish, rng: np.random.Generator) -> None:
+    """Draw walls with doorways and windows, floor, ceiling and ceiling beams of a room."""
     width, depth = room.x1 - room.x0, room.y1 - room.y0
     b.quad(
         (room.x0, room.y0, 0.0), (width, 0, 0), (0, depth, 0), finish.floor, offset=(0.3, 0.1), edge_m=0.07
@@ -58,10 +58,10 @@ def draw_shell(b: MeshBuilder, room: Room, finish: Finish, rng: np.random.Genera
 def _wall(
     b: MeshBuilder,
     length: float,
-    openings: list[Opening],
+    openings: list[WallOpening],
     upper: Material,
     lower: Material,
-    finish: Finish,
+    finish: RoomFinish,
     *,
     dado: bool,
 ) -> None:
@@ -77,7 +77,8 @@ def _wall(
         for z0, z1 in spans:
             for low, high, material in ((z0, min(z1, split), lower), (max(z0, split), z1, upper)):
                 if high - low > 1e-3:
-                    # One offset for all panels: the texture runs on across a doorway.
+                    # The offset follows the position on the wall, so the texture is continuous across a
+                    # doorway.
                     size = b.texture_size_m[material.texture]
                     shift = (s0 / size[0], low / size[1])
                     b.quad((s0, 0, low), (s1 - s0, 0, 0), (0, 0, high - low), material, offset=shift)
@@ -87,7 +88,7 @@ def _wall(
             box(b, ((s0 + s1) / 2, -0.011, split - 0.02), (s1 - s0, 0.022, 0.05), finish.trim, skip=("back",))
 
 
-def _doorway(b: MeshBuilder, hole: Opening, finish: Finish) -> None:
+def _doorway(b: MeshBuilder, hole: WallOpening, finish: RoomFinish) -> None:
     width, t = hole.s1 - hole.s0, HALF_WALL_M
     b.quad((hole.s0, 0, 0), (0, t, 0), (0, 0, hole.z1), finish.trim)
     b.quad((hole.s1, t, 0), (0, -t, 0), (0, 0, hole.z1), finish.trim)
@@ -98,7 +99,7 @@ def _doorway(b: MeshBuilder, hole: Opening, finish: Finish) -> None:
     box(b, ((hole.s0 + hole.s1) / 2, -0.01, hole.z1), (width, 0.02, 0.07), finish.trim, skip=("back",))
 
 
-def _window(b: MeshBuilder, hole: Opening, finish: Finish, rng: np.random.Generator) -> None:
+def _window(b: MeshBuilder, hole: WallOpening, finish: RoomFinish, rng: np.random.Generator) -> None:
     width, height, t = hole.s1 - hole.s0, hole.z1 - hole.z0, 0.14
     reveal = finish.wall if hole.kind == "window" else finish.trim
     b.quad((hole.s0, 0, hole.z0), (0, t, 0), (0, 0, height), reveal)
@@ -121,7 +122,7 @@ def _window(b: MeshBuilder, hole: Opening, finish: Finish, rng: np.random.Genera
     if not glazed:
         box(b, (middle, 0.0, hole.z0 - 0.03), (width + 0.10, 0.16, 0.03), finish.trim)
     rod(b, (hole.s0 - 0.3, -0.14, hole.z1 + 0.16), (hole.s1 + 0.3, -0.14, hole.z1 + 0.16), 0.012, STEEL)
-    # Furniture stands under windows: only a glazed door has curtains down to the floor.
+    # Furniture stands under windows, so only glazed doors have curtains down to the floor.
     low = 0.03 if glazed else hole.z0 - 0.15
     for left in (hole.s0 - 0.28, hole.s1 - 0.06):
         cloth = 0.34

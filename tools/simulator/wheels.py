@@ -1,4 +1,4 @@
-"""Wheel odometry: integrates the true motion as counted with wrong wheel sizes and a wrong track."""
+"""Wheel odometry: integrates the true motion with errors of wheel radius and track width."""
 
 from __future__ import annotations
 
@@ -11,39 +11,44 @@ from beamsplat.tools.simulator.settings import WheelSettings
 
 
 @dataclass(frozen=True)
-class Odometry:
-    """M readings; the first is the origin of the odometry's own frame."""
+class WheelReadings:
+    """M odometry readings; the very first one defines the odom frame."""
 
-    pose: np.ndarray  # float64 [M, 3] SE(2) `odom` from `body`
+    pose: np.ndarray  # float64 [M, 3], pose_odom_body (x, y, yaw)
     speed_m_s: np.ndarray  # float64 [M]
     turn_rad_s: np.ndarray  # float64 [M]
 
 
-class Wheels:
-    """Draws this robot's errors once, then counts on and on: state is carried from call to call."""
+class WheelOdometrySimulator:
+    """Wheel odometry of one robot: its systematic errors are drawn once, its pose is kept between calls."""
 
     def __init__(self, settings: WheelSettings, rng: np.random.Generator) -> None:
         self._noise, self._rng = settings.noise, rng
         self.scale = 1.0 + _signed(rng, settings.scale_error)
         self.turn = 1.0 + _signed(rng, settings.turn_error)
         self._pose = np.zeros(3)
-        self._before: np.ndarray | None = None
+        self._last_pose: np.ndarray | None = None
 
-    def count(self, pose: np.ndarray, period_s: float) -> Odometry:
-        """Readings at true poses [M, 3] that follow the last call's, `period_s` apart."""
-        first = pose[:1] if self._before is None else self._before[None]
+    def measure(self, pose: np.ndarray, period_s: float) -> WheelReadings:
+        """Return the readings at the next true poses.
+
+        Args:
+            pose: float64 [M, 3], pose_world_body; continues from the last pose of the previous call.
+            period_s: time between two poses.
+        """
+        first = pose[:1] if self._last_pose is None else self._last_pose[None]
         chain = np.concatenate([first, pose])
-        self._before = pose[-1].copy()
+        self._last_pose = pose[-1].copy()
         move = np.diff(chain[:, :2], axis=0)
         turn = np.asarray(wrap_angle(np.diff(chain[:, 2])))
         middle = chain[:-1, 2] + turn / 2
         forward = move[:, 0] * np.cos(middle) + move[:, 1] * np.sin(middle)
-        # Slip grows with what the wheels do: a standing robot's odometry stands.
-        grain = self._rng.standard_normal((2, len(pose)))
-        forward = forward * self.scale + self._noise * np.sqrt(np.abs(forward) * 0.01) * grain[0]
+        # Slip grows with the motion: while the robot stands still, its odometry does not drift.
+        noise = self._rng.standard_normal((2, len(pose)))
+        forward = forward * self.scale + self._noise * np.sqrt(np.abs(forward) * 0.01) * noise[0]
         turn = (
             turn * self.turn
-            + self._noise * np.sqrt(np.abs(turn) * 0.02 + np.abs(forward) * 0.0005) * grain[1]
+            + self._noise * np.sqrt(np.abs(turn) * 0.02 + np.abs(forward) * 0.0005) * noise[1]
         )
         yaw = self._pose[2] + np.cumsum(turn)
         along = yaw - turn / 2
@@ -52,7 +57,7 @@ class Wheels:
         out = np.stack([x, y, yaw], axis=1)
         self._pose = out[-1].copy()
         out[:, 2] = wrap_angle(out[:, 2])
-        return Odometry(out, forward / period_s, turn / period_s)
+        return WheelReadings(out, forward / period_s, turn / period_s)
 
 
 def _signed(rng: np.random.Generator, span: tuple[float, float]) -> float:

@@ -1,4 +1,4 @@
-"""The recording as a ROS 2 bag (MCAP), and the truth files beside it."""
+"""Writes the recording as a ROS 2 bag (MCAP), and the ground-truth files beside it."""
 
 from __future__ import annotations
 
@@ -33,16 +33,16 @@ BASE, CAMERA, LASER, ODOM = "base_link", "camera_optical_frame", "laser", "odom"
 
 
 @dataclass(frozen=True)
-class Record:
-    """One message: when it was received, its topic and the CDR bytes."""
+class BagRecord:
+    """One message of the bag: time of receipt, topic, and CDR bytes."""
 
     received_ns: int
     topic: str
     data: bytes
 
 
-def write_bag(path: Path, streams: Iterable[Iterator[Record]], topics: Iterable[str]) -> int:
-    """Merges streams (each in order of receipt) into a new bag folder; returns the number of messages."""
+def write_bag(path: Path, streams: Iterable[Iterator[BagRecord]], topics: Iterable[str]) -> int:
+    """Merge streams, each in order of receipt, into a new bag folder; return the number of messages."""
     count = 0
     with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as bag:
         connections = {
@@ -98,12 +98,13 @@ def _stamped(stamp_ns: int, parent: str, child: str, T: np.ndarray) -> Any:
 
 
 def tf_bytes(stamp_ns: int, links: list[tuple[str, str, np.ndarray]]) -> bytes:
-    """A TFMessage of (parent, child, T_parent_child)."""
+    """Return the CDR bytes of a tf2_msgs/TFMessage of links (parent, child, T_parent_child)."""
     return _cdr(_make("tf2_msgs/msg/TFMessage", [_stamped(stamp_ns, *link) for link in links]))
 
 
 def odometry_bytes(stamp_ns: int, T_odom_body: np.ndarray, speed_m_s: float, turn_rad_s: float) -> bytes:
-    """nav_msgs/Odometry with the covariances a planar driver gives."""
+    """Return the CDR bytes of a nav_msgs/Odometry with covariances as drivers of planar robots report
+    them."""
     point = _make("geometry_msgs/msg/Point", *(float(v) for v in T_odom_body[:3, 3]))
     pose = _make("geometry_msgs/msg/Pose", point, _quaternion(T_odom_body[:3, :3]))
     covariances = [np.diag([v, v, 1e6, 1e6, 1e6, w]).ravel() for v, w in ((1e-2, 2e-2), (1e-3, 2e-3))]
@@ -122,7 +123,7 @@ def odometry_bytes(stamp_ns: int, T_odom_body: np.ndarray, speed_m_s: float, tur
 
 
 def scan_bytes(stamp_ns: int, ranges_m: np.ndarray, lidar: LidarSettings) -> bytes:
-    """sensor_msgs/LaserScan."""
+    """Return the CDR bytes of a sensor_msgs/LaserScan."""
     step = lidar.angle_increment_rad
     return _cdr(
         _make(
@@ -142,12 +143,12 @@ def scan_bytes(stamp_ns: int, ranges_m: np.ndarray, lidar: LidarSettings) -> byt
 
 
 def image_bytes(stamp_ns: int, jpeg: np.ndarray) -> bytes:
-    """sensor_msgs/CompressedImage of uint8 [B]."""
+    """Return the CDR bytes of a sensor_msgs/CompressedImage with JPEG bytes uint8 [B]."""
     return _cdr(_make("sensor_msgs/msg/CompressedImage", _header(stamp_ns, CAMERA), "jpeg", jpeg))
 
 
 def camera_info_bytes(stamp_ns: int, camera: CameraSettings) -> bytes:
-    """sensor_msgs/CameraInfo."""
+    """Return the CDR bytes of a sensor_msgs/CameraInfo."""
     K = camera.K
     P = np.hstack([K, np.zeros((3, 1))])
     region = _make("sensor_msgs/msg/RegionOfInterest", 0, 0, 0, 0, False)
@@ -170,7 +171,7 @@ def camera_info_bytes(stamp_ns: int, camera: CameraSettings) -> bytes:
 
 
 def write_tum(path: Path, stamps_ns: np.ndarray, T_world_body: np.ndarray) -> None:
-    """A TUM trajectory; stamps keep all nine digits."""
+    """Write a TUM trajectory of poses [N, 4, 4]; stamps keep nanoseconds."""
     lines = ["# timestamp_s tx ty tz qx qy qz qw  (T_world_base)"]
     for stamp, T in zip(stamps_ns.tolist(), T_world_body):
         numbers = " ".join(f"{v:.9f}" for v in (*T[:3, 3], *quat_xyzw_from_matrix(T[:3, :3])))
@@ -179,7 +180,7 @@ def write_tum(path: Path, stamps_ns: np.ndarray, T_world_body: np.ndarray) -> No
 
 
 def transform_json(T: np.ndarray) -> dict[str, Any]:
-    """A transform as matrix and as translation + quaternion."""
+    """Return a transform both as matrix and as translation and quaternion."""
     return {
         "matrix": T.tolist(),
         "translation_xyz": T[:3, 3].tolist(),
@@ -188,7 +189,8 @@ def transform_json(T: np.ndarray) -> dict[str, Any]:
 
 
 def write_camera_json(path: Path, camera: CameraSettings, lidar: LidarSettings, faults: Faults) -> None:
-    """The true calibration; where the bag's tf lies on purpose, `published_T_base_camera` says how."""
+    """Write the true calibration, and in `published_T_base_camera` the one in the bag's tf (differs if
+    faulty)."""
     K = camera.K
     text: dict[str, Any] = {
         "width": camera.width_px,
@@ -211,7 +213,7 @@ def write_camera_json(path: Path, camera: CameraSettings, lidar: LidarSettings, 
         },
         "T_base_camera": transform_json(camera.T_body_camera),
         "T_base_lidar": transform_json(lidar.T_body_lidar),
-        "published_T_base_camera": transform_json(faults.published(camera.T_body_camera)),
+        "published_T_base_camera": transform_json(faults.published_mount(camera.T_body_camera)),
         "camera_clock_offset_ms": faults.clock_offset_ms,
         "exposure_changes": faults.exposure_changes,
         "lidar": {
@@ -233,7 +235,7 @@ def write_camera_json(path: Path, camera: CameraSettings, lidar: LidarSettings, 
 
 
 def write_ply(path: Path, points_m: np.ndarray, colours: np.ndarray) -> None:
-    """Binary PLY of float32 points [N, 3] with uint8 RGB [N, 3]."""
+    """Write a binary PLY of points [N, 3] with RGB uint8 [N, 3]."""
     head = (
         f"ply\nformat binary_little_endian 1.0\nelement vertex {len(points_m)}\n"
         "property float x\nproperty float y\nproperty float z\n"
@@ -244,6 +246,6 @@ def write_ply(path: Path, points_m: np.ndarray, colours: np.ndarray) -> None:
     path.write_bytes(head.encode() + rows.tobytes())
 
 
-def write_png(path: Path, picture: np.ndarray) -> None:
-    """uint8 or uint16."""
-    path.write_bytes(cv2.imencode(".png", picture)[1].tobytes())
+def write_png(path: Path, image: np.ndarray) -> None:
+    """Write an image [H, W] or [H, W, 3] of uint8 or uint16."""
+    path.write_bytes(cv2.imencode(".png", image)[1].tobytes())

@@ -13,9 +13,9 @@ from beamsplat.common.geometry.transforms import inverse
 from beamsplat.common.messages import CameraModel, Keyframe
 from beamsplat.common.messages.depth_png import depth_to_png, sigma_to_png
 from beamsplat.common.raster.camera import RasterCamera
-from beamsplat.tools.simulator.recording import _shoot
-from beamsplat.tools.simulator.settings import CameraSettings, Simulation
-from beamsplat.tools.simulator.shots import Studio
+from beamsplat.tools.simulator.frames import FrameRenderer
+from beamsplat.tools.simulator.recording import frame_spec
+from beamsplat.tools.simulator.settings import CameraSettings, SimulationSettings
 from beamsplat.tools.simulator.world import get_world
 
 T0 = 1_000_000_000_000
@@ -24,15 +24,15 @@ SEED = 0
 
 
 class Home:
-    """The drive seen with a small camera. Pictures are taken once, however often they are asked for."""
+    """The drive seen with a small camera. Textures are taken once, however often they are asked for."""
 
     def __init__(self, width_px, keyframes_a_lap):
         get_world(SEED, None)
-        settings = Simulation(
+        settings = SimulationSettings(
             seed=SEED, camera=CameraSettings(width_px=width_px, height_px=width_px * 3 // 4, jpeg_quality=95)
         )
-        self.studio = Studio(_shoot(settings, []))
-        self.lap_s = self.studio.drive.lap_s
+        self.renderer = FrameRenderer(frame_spec(settings, []))
+        self.lap_s = self.renderer.drive.lap_s
         self.keyframes_a_lap = keyframes_a_lap
         K, c = settings.camera.K, settings.camera
         self.camera = RasterCamera(K[0, 0], K[1, 1], K[0, 2], K[1, 2], c.width_px, c.height_px)
@@ -44,16 +44,16 @@ class Home:
         return (number % self.keyframes_a_lap) * self.lap_s / self.keyframes_a_lap
 
     def T_map_body(self, number):
-        return self.studio.drive.transform_at(self.time_s(number))
+        return self.renderer.drive.transform_at(self.time_s(number))
 
     def T_map_camera(self, number):
-        return self.studio.pose(self.time_s(number))
+        return self.renderer.camera_pose(self.time_s(number))
 
     def shot(self, number):
         """(jpeg uint8 [B], depth png, sigma png) of keyframe `number` of a lap."""
         number %= self.keyframes_a_lap
         if number not in self._shots:
-            jpeg, mm, _ = self.studio.shot(self.time_s(number))
+            jpeg, mm, _ = self.renderer.render_frame(self.time_s(number))
             depth = np.where(mm > 0, mm * np.float32(1e-3), np.nan).astype(np.float32)
             sigma = np.full_like(depth, 0.01)
             self._shots[number] = np.frombuffer(jpeg, np.uint8), depth_to_png(depth), sigma_to_png(sigma)

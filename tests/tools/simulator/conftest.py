@@ -80,7 +80,7 @@ def scene_file(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def own_cache(tmp_path_factory):
-    """The cache of these tests: never the user's."""
+    """A cache folder for these tests instead of the user's."""
     patch = pytest.MonkeyPatch()
     folder = tmp_path_factory.mktemp("cache")
     patch.setenv("BEAMSPLAT_CACHE", str(folder))

@@ -1,4 +1,4 @@
-"""A bare box room whose every range is known by arithmetic."""
+"""An empty box room in which every range is known analytically."""
 
 import numpy as np
 
@@ -11,7 +11,7 @@ WALL = Material("noise")
 
 
 def draw_room(b, wall=WALL, east=None):
-    """Inner faces of a 6 x 4 x 2.5 m room about the origin."""
+    """Draw the inner faces of a 6 x 4 x 2.5 m room around the origin."""
     x, y, z = 2 * HALF_X, 2 * HALF_Y, HEIGHT
     b.quad((-HALF_X, -HALF_Y, 0), (x, 0, 0), (0, y, 0), wall)
     b.quad((-HALF_X, HALF_Y, z), (x, 0, 0), (0, -y, 0), wall)
@@ -22,7 +22,7 @@ def draw_room(b, wall=WALL, east=None):
 
 
 def room_distance(origin, direction):
-    """Analytic distance from inside the room to its walls, for arrays [..., 3]."""
+    """Return the distance along rays from inside the room to its walls, for arrays [..., 3]."""
     low, high = np.array([-HALF_X, -HALF_Y, 0.0]), np.array([HALF_X, HALF_Y, HEIGHT])
     with np.errstate(divide="ignore", invalid="ignore"):
         t = np.where(direction > 0, (high - origin) / direction, (low - origin) / direction)

@@ -1,4 +1,4 @@
-"""Distortion against OpenCV, and the sensor."""
+"""Lens distortion against OpenCV, and the noise of the image sensor."""
 
 import cv2
 import numpy as np
@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from beamsplat.tools.simulator.camera import Sensor, distort, pixel_rays, undistort
+from beamsplat.tools.simulator.camera import ImageSensor, distort, pixel_rays, undistort
 
 K = np.array([[265.0, 0.0, 159.5], [0.0, 265.0, 119.5], [0.0, 0.0, 1.0]])
 small = st.floats(-1.0, 1.0)
@@ -42,10 +42,10 @@ def test_without_distortion_the_centre_of_a_pixel_is_its_integer_coordinate():
 
 
 def test_shot_noise_grows_with_light_and_the_same_seed_gives_the_same_bytes():
-    sensor = Sensor(np.zeros((60, 80, 3), np.float32), noise=1.0, vignetting=0.0, quality=92)
+    sensor = ImageSensor(np.zeros((60, 80, 3), np.float32), noise=1.0, vignetting=0.0, quality=92)
     dark, light = np.full((60, 80, 3), 0.02, np.float32), np.full((60, 80, 3), 0.6, np.float32)
-    picture = sensor.develop(light, 1.0, np.random.default_rng(0))
-    assert np.array_equal(picture, sensor.develop(light, 1.0, np.random.default_rng(0)))
+    image = sensor.develop(light, 1.0, np.random.default_rng(0))
+    assert np.array_equal(image, sensor.develop(light, 1.0, np.random.default_rng(0)))
 
     def linear_noise(level):
         srgb = sensor.develop(np.full((60, 80, 3), level, np.float32), 1.0, np.random.default_rng(1)) / 255.0

@@ -1,4 +1,4 @@
-"""The command's own part: options, refusals, and what it prints."""
+"""The command `simulate`: options, errors and output."""
 
 import json
 
@@ -37,7 +37,7 @@ def test_an_existing_folder_is_refused_with_2(tmp_path):
     assert "--force" in result.output
 
 
-def test_a_recording_is_announced_as_json(scene_file, own_cache, tmp_path):
+def test_a_recording_is_summarised_as_json(scene_file, own_cache, tmp_path):
     options = [
         "--out",
         str(tmp_path / "r"),
@@ -51,7 +51,7 @@ def test_a_recording_is_announced_as_json(scene_file, own_cache, tmp_path):
     ]
     result = runner.invoke(app, [*options, "--json"])
     assert result.exit_code == 0, result.output
-    told = json.loads(result.stdout)
-    assert told["scans"] == 19
-    assert told["images"] == 0
+    summary = json.loads(result.stdout)
+    assert summary["scans"] == 19
+    assert summary["images"] == 0
     assert (tmp_path / "r" / "bag" / "metadata.yaml").exists()

@@ -1,14 +1,14 @@
-"""The generated home: plans for many seeds, and one built in full."""
+"""The generated home: floor plans of many seeds, and one complete home."""
 
 import hashlib
 
 import numpy as np
 import pytest
 
-from beamsplat.tools.simulator.cast import Caster
-from beamsplat.tools.simulator.freespace import FreeSpace
+from beamsplat.tools.simulator.clearance_grid import ClearanceGrid
 from beamsplat.tools.simulator.home import build_home, floor_plan
-from beamsplat.tools.simulator.path import Drive, Limits, resample_closed
+from beamsplat.tools.simulator.path import DrivePath, MotionLimits, resample_closed
+from beamsplat.tools.simulator.ray_caster import RayCaster
 
 
 @pytest.mark.parametrize("seed", range(40))
@@ -39,10 +39,10 @@ def test_a_home_can_be_driven_through_and_is_the_same_every_time():
     assert hashlib.sha256(mesh.uvs).digest() == hashlib.sha256(again.uvs).digest()
     assert np.all(np.isfinite(mesh.vertices_m))
     assert np.all(np.isfinite(mesh.normals))
-    assert {m.texture for m in mesh.materials} <= set(home.pictures)
-    space = FreeSpace(mesh, Caster.of(mesh))
+    assert {m.texture for m in mesh.materials} <= set(home.textures)
+    space = ClearanceGrid(mesh, RayCaster.of(mesh))
     route = resample_closed(space.relax(home.route_m), 0.3)
-    drive = Drive(route, Limits())
+    drive = DrivePath(route, MotionLimits())
     assert 24.0 < drive.length_m < 36.0
     path = drive.pose_at(np.linspace(0.0, drive.lap_s, 2000))[:, :2]
     assert space.clearance(path).min() > 0.24

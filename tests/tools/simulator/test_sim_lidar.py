@@ -1,11 +1,11 @@
-"""The lidar against arithmetic: ranges, deskew, noise, glass, and what moves."""
+"""Lidar ranges against analytic geometry: motion, noise, glass, dynamic objects."""
 
 import numpy as np
 import pytest
 
-from beamsplat.tools.simulator.cast import Caster
-from beamsplat.tools.simulator.lidar import Lidar
+from beamsplat.tools.simulator.lidar import SimulatedLidar
 from beamsplat.tools.simulator.mesh import Material, MeshBuilder, merge
+from beamsplat.tools.simulator.ray_caster import RayCaster
 from beamsplat.tools.simulator.settings import LidarSettings
 from tests.tools.simulator.room import draw_room, room_distance
 
@@ -13,7 +13,7 @@ QUIET = LidarSettings(noise_m=0.0, dropout=0.0)
 
 
 def turning(times):
-    """A robot that drives and turns fast: 0.5 m/s, 1.5 rad/s."""
+    """Poses of a robot that drives and turns fast: 0.5 m/s, 1.5 rad/s."""
     return np.stack([-1.0 + 0.5 * times, 0.3 + 0.2 * times, 1.5 * times], axis=1)
 
 
@@ -24,20 +24,20 @@ def beam_rays(settings, pose):
 
 
 def test_each_beam_measures_from_where_the_robot_is_at_its_own_time(room):
-    lidar = Lidar(room, Caster.of(room), QUIET)
+    lidar = SimulatedLidar(room, RayCaster.of(room), QUIET)
     start = 0.7
     measured, _ = lidar.measure(lidar.revolution(start, turning), np.random.default_rng(0))
     times = start + QUIET.time_increment_s * np.arange(QUIET.beams)
     truth = room_distance(*beam_rays(QUIET, turning(times)))
     np.testing.assert_allclose(measured, truth, atol=1e-3)
-    # The same scan without deskew is wrong by centimetres: the test would notice.
+    # Without the motion during the scan the ranges differ by centimetres, so this test detects it.
     skewed = room_distance(*beam_rays(QUIET, turning(np.full(QUIET.beams, start))))
     assert np.abs(measured - skewed).max() > 0.05
 
 
 def test_noise_has_the_stated_deviation_and_dropouts_the_stated_rate(room):
     settings = LidarSettings(noise_m=0.02, dropout=0.05)
-    lidar = Lidar(room, Caster.of(room), settings)
+    lidar = SimulatedLidar(room, RayCaster.of(room), settings)
     revolution = lidar.revolution(0.0, turning)
     rng = np.random.default_rng(1)
     scans = np.stack([lidar.measure(revolution, rng)[0] for _ in range(60)])
@@ -47,7 +47,7 @@ def test_noise_has_the_stated_deviation_and_dropouts_the_stated_rate(room):
     assert np.mean(np.isinf(scans[:, upright])) == pytest.approx(0.05, abs=0.01)
 
 
-def test_glass_lets_some_beams_through_and_says_which(sizes):
+def test_glass_lets_some_beams_pass_and_reports_which(sizes):
     builder = MeshBuilder(sizes, edge_m=0.5)
     draw_room(builder, east=Material("plain", glass=True))
     outside = MeshBuilder(sizes, edge_m=0.5)
@@ -56,7 +56,7 @@ def test_glass_lets_some_beams_through_and_says_which(sizes):
     still = lambda times: np.tile([0.0, 0.0, 0.0], (len(times), 1))  # noqa: E731
     for glass, share in ((False, 0.0), (True, 0.7)):
         settings = LidarSettings(noise_m=0.0, dropout=0.0, glass=glass)
-        lidar = Lidar(mesh, Caster.of(mesh), settings)
+        lidar = SimulatedLidar(mesh, RayCaster.of(mesh), settings)
         revolution = lidar.revolution(0.0, still)
         rng = np.random.default_rng(2)
         ahead = np.abs(settings.angle_min_rad + settings.angle_increment_rad * np.arange(720)) < 0.3
@@ -71,21 +71,21 @@ def test_glass_lets_some_beams_through_and_says_which(sizes):
         np.testing.assert_allclose(np.where(np.stack(through)[:, ahead], 3.0, x), 3.0, atol=1e-3)
 
 
-def test_beams_on_a_mover_are_marked_and_follow_it_within_the_revolution(room, sizes):
+def test_beams_on_a_dynamic_object_are_marked_and_follow_it_within_the_revolution(room, sizes):
     settings = LidarSettings(noise_m=0.0, dropout=0.0)
-    lidar = Lidar(room, Caster.of(room), settings)
+    lidar = SimulatedLidar(room, RayCaster.of(room), settings)
     still = lambda times: np.zeros((len(times), 3))  # noqa: E731
 
     class Wall:
-        """Comes nearer at 1 m/s."""
+        """A wall that approaches at 1 m/s."""
 
-        def circles(self, time_s):
+        def bounding_circles(self, time_s):
             return np.array([[2.0 - time_s, 0.0, 0.6]])
 
-        def caster_of(self, index, time_s):
+        def ray_caster_of(self, index, time_s):
             b = MeshBuilder(sizes)
             b.quad((2.0 - time_s, 0.5, 0), (0, -1.0, 0), (0, 0, 1.0), Material("plain"))
-            return Caster.of(b.build())
+            return RayCaster.of(b.build())
 
     revolution = lidar.revolution(0.0, still, Wall())
     angle = settings.angle_min_rad + settings.angle_increment_rad * np.arange(720)
@@ -95,8 +95,8 @@ def test_beams_on_a_mover_are_marked_and_follow_it_within_the_revolution(room, s
     np.testing.assert_allclose(x, 1.95, atol=0.02)
 
 
-def test_what_is_seen_does_not_change_the_next_scans_noise(room):
-    lidar = Lidar(room, Caster.of(room), LidarSettings())
+def test_ranges_do_not_change_the_noise_of_the_next_scan(room):
+    lidar = SimulatedLidar(room, RayCaster.of(room), LidarSettings())
     here, there = lidar.revolution(0.0, turning), lidar.revolution(2.0, turning)
     a, b = np.random.default_rng(5), np.random.default_rng(5)
     lidar.measure(here, a), lidar.measure(there, b)

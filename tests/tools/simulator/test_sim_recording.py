@@ -1,4 +1,4 @@
-"""Whole recordings of a small GLB scene: layout, counts, stamps, faults, laps, determinism."""
+"""Complete recordings of a small GLB scene: layout, counts, stamps, faults, laps, determinism."""
 
 import hashlib
 import json
@@ -11,7 +11,13 @@ from rosbags.highlevel import AnyReader
 
 from beamsplat.common.geometry.transforms import make_transform, matrix_from_quat_xyzw, so3_log
 from beamsplat.tools.simulator import recording
-from beamsplat.tools.simulator.settings import START_NS, CameraSettings, Faults, LidarSettings, Simulation
+from beamsplat.tools.simulator.settings import (
+    START_NS,
+    CameraSettings,
+    Faults,
+    LidarSettings,
+    SimulationSettings,
+)
 
 CAMERA = CameraSettings(width_px=96, height_px=72, rate_hz=5.0)
 NS = 10**9
@@ -33,7 +39,7 @@ def base(scene_file, **changes):
         "extra_views": 3,
         "surface_points": 3000,
     }
-    return Simulation(**{**settings, **changes})
+    return SimulationSettings(**{**settings, **changes})
 
 
 def read(folder):
@@ -92,8 +98,8 @@ def test_truth_covers_the_drive_and_does_not_begin_at_the_origin(recorded):
     assert set(np.diff(stamps).tolist()) == {20_000_000}
 
 
-def test_depth_pictures_lie_on_the_surface_the_scans_see(recorded):
-    """A scan's beams, put into the picture of nearly the same moment, agree with its depth."""
+def test_depth_images_agree_with_the_scans(recorded):
+    """Beams of a scan, projected into the image nearest in time, agree with its depth."""
     out, _ = recorded
     bag = read(out)
     camera = json.loads((out / "camera.json").read_text())
@@ -114,7 +120,7 @@ def test_depth_pictures_lie_on_the_surface_the_scans_see(recorded):
     assert np.median(error) < 0.03
 
 
-def test_masks_say_what_moves(recorded):
+def test_masks_mark_dynamic_objects(recorded):
     out, _ = recorded
     with np.load(out / "beams.npz") as beams:
         assert beams["moving"].shape == (39, 720)
@@ -140,7 +146,7 @@ def test_views_and_surface(recorded):
     head, body = data.split(b"end_header\n", 1)
     assert b"element vertex 3000" in head
     points = np.frombuffer(body, dtype=[("p", "<f4", 3), ("c", "u1", 3)])["p"]
-    # Every point lies on a face of the room or of the block in it (z-up: the block's y is -z of the file).
+    # Every point is on a face of the room or of the block in it (z-up: the block's y is -z of the file).
     room = np.minimum(np.abs(np.abs(points[:, 0]) - 3.0), np.abs(np.abs(points[:, 1]) - 2.5))
     room = np.minimum(room, np.minimum(np.abs(points[:, 2]), np.abs(points[:, 2] - 2.5)))
     block = np.abs(np.abs(points - [0.2, -0.1, 0.4]) - [0.8, 0.5, 0.4]).min(axis=1)
@@ -188,13 +194,13 @@ def test_planted_faults_are_in_the_bag_and_named_beside_it(recorded, scene_file,
     turn = mount(bad)[:3, :3] @ mount(good)[:3, :3].T
     np.testing.assert_allclose(so3_log(turn), [0.0, 0.0, np.radians(2.0)], atol=1e-9)
     np.testing.assert_allclose(mount(bad)[:3, 3] - mount(good)[:3, 3], [0.01, -0.02, 0.03], atol=1e-12)
-    told = json.loads((tmp_path / "faulty" / "camera.json").read_text())
-    np.testing.assert_allclose(told["T_base_camera"]["matrix"], mount(good), atol=1e-12)
-    np.testing.assert_allclose(told["published_T_base_camera"]["matrix"], mount(bad), atol=1e-12)
-    assert told["camera_clock_offset_ms"] == 35.0
+    written = json.loads((tmp_path / "faulty" / "camera.json").read_text())
+    np.testing.assert_allclose(written["T_base_camera"]["matrix"], mount(good), atol=1e-12)
+    np.testing.assert_allclose(written["published_T_base_camera"]["matrix"], mount(bad), atol=1e-12)
+    assert written["camera_clock_offset_ms"] == 35.0
 
 
-def test_laps_reuse_pictures_but_not_noise(scene_file, own_cache, tmp_path):
+def test_laps_reuse_images_but_not_noise(scene_file, own_cache, tmp_path):
     tiny = CameraSettings(width_px=48, height_px=36, rate_hz=1.0)
     summary = run(
         tmp_path / "laps",
@@ -234,7 +240,7 @@ def test_an_existing_folder_is_refused_and_an_interrupt_leaves_nothing(scene_fil
     assert [p.name for p in tmp_path.iterdir()] == ["there"]
 
 
-def test_a_scene_that_is_none_gives_one_sentence(own_cache, tmp_path):
+def test_an_unreadable_scene_is_reported_with_its_name(own_cache, tmp_path):
     (tmp_path / "broken.glb").write_bytes(b"not a scene")
     with pytest.raises(ValueError, match=r"broken\.glb"):
         run(tmp_path / "out", base(tmp_path / "broken.glb"))

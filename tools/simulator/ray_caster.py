@@ -1,7 +1,7 @@
-"""Ray casting by Embree: first hits and occlusion, for batches of rays.
+"""Ray casting with Embree: first hits and occlusion, for batches of rays.
 
-Embree works in float32 and tells us the triangle; where exactly the ray meets its plane is computed
-again by whoever needs it precisely.
+Embree works in float32 and only its triangle index is used; `hit_distance` computes the intersection with
+the plane of the triangle in float64.
 """
 
 from __future__ import annotations
@@ -10,11 +10,11 @@ import numpy as np
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
-from beamsplat.tools.simulator.mesh import Mesh
+from beamsplat.tools.simulator.mesh import SceneMesh
 
 
-class Caster:
-    """An immutable triangle soup that rays can be shot at."""
+class RayCaster:
+    """An immutable set of triangles to cast rays into."""
 
     def __init__(self, vertices_m: np.ndarray, triangles: np.ndarray) -> None:
         self._vertices = np.ascontiguousarray(vertices_m, dtype=np.float32)
@@ -26,23 +26,24 @@ class Caster:
         self._normal = np.cross(v[:, 1] - v[:, 0], v[:, 2] - v[:, 0])
 
     @classmethod
-    def of(cls, mesh: Mesh) -> Caster:
+    def of(cls, mesh: SceneMesh) -> RayCaster:
         return cls(mesh.vertices_m, mesh.triangles)
 
-    def first(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """int32 [N]: the triangle each ray [N, 3] meets first, or -1."""
+    def first_hit(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        """Return int32 [N]: the index of the first triangle that each ray [N, 3] hits, or -1."""
         return self._scene.run(
             np.ascontiguousarray(origins, dtype=np.float32),
             np.ascontiguousarray(directions, dtype=np.float32),
             query="INTERSECT",
         )
 
-    def first_from(self, origin_m: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """int32 [N]: as `first`, all rays from one point [3]."""
-        return self.first(np.broadcast_to(origin_m.astype(np.float32), directions.shape), directions)
+    def first_hit_from(self, origin_m: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        """Return int32 [N]: as `first_hit`, with all rays starting at one point [3]."""
+        return self.first_hit(np.broadcast_to(origin_m.astype(np.float32), directions.shape), directions)
 
     def occluded(self, origins: np.ndarray, directions: np.ndarray, reach: np.ndarray) -> np.ndarray:
-        """bool [N]: something lies on the ray nearer than reach [N] (in lengths of its direction)."""
+        """Return bool [N]: whether a ray hits a triangle within `reach` [N], in units of its direction's
+        length."""
         hit = self._scene.run(
             np.ascontiguousarray(origins, dtype=np.float32),
             np.ascontiguousarray(directions, dtype=np.float32),
@@ -51,8 +52,11 @@ class Caster:
         )
         return hit >= 0
 
-    def distance(self, origins: np.ndarray, directions: np.ndarray, triangle: np.ndarray) -> np.ndarray:
-        """float64 [N]: where the rays meet the planes of their triangles, +inf for triangle -1."""
+    def hit_distance(self, origins: np.ndarray, directions: np.ndarray, triangle: np.ndarray) -> np.ndarray:
+        """Return float64 [N]: the distance along each ray to the plane of its triangle, +inf for triangle -1.
+
+        Distances are in units of the length of the direction.
+        """
         n, corner = self._normal[triangle], self._corner[triangle]
         along = np.einsum("ij,ij->i", n, directions)
         with np.errstate(divide="ignore", invalid="ignore"):

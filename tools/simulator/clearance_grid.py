@@ -1,4 +1,4 @@
-"""Where a robot (or a person) can go: occupancy of a mesh, clearance, routes through it."""
+"""Free space of a scene for a robot or a person: obstacle clearance on a grid, and routes through it."""
 
 from __future__ import annotations
 
@@ -7,17 +7,17 @@ import numpy as np
 from scipy import ndimage, sparse
 from scipy.sparse.csgraph import dijkstra
 
-from beamsplat.tools.simulator.cast import Caster
-from beamsplat.tools.simulator.mesh import Mesh
+from beamsplat.tools.simulator.mesh import SceneMesh
+from beamsplat.tools.simulator.ray_caster import RayCaster
 
 RESOLUTION_M = 0.05
-BODY_M = (0.03, 1.25)  # what stands between these heights is in the way
+BODY_M = (0.03, 1.25)  # surfaces between these heights are obstacles
 
 
-class FreeSpace:
-    """A grid of clearances (metres to the next obstacle; 0 where there is no floor)."""
+class ClearanceGrid:
+    """A grid of clearances: metres to the nearest obstacle; 0 where there is no floor."""
 
-    def __init__(self, mesh: Mesh, caster: Caster) -> None:
+    def __init__(self, mesh: SceneMesh, caster: RayCaster) -> None:
         points = _surface_points(mesh)
         points = points[(points[:, 2] > BODY_M[0]) & (points[:, 2] < BODY_M[1])]
         low, high = mesh.vertices_m[:, :2].min(axis=0) - 0.2, mesh.vertices_m[:, :2].max(axis=0) + 0.2
@@ -30,7 +30,7 @@ class FreeSpace:
         free = np.pad(free[1:-1, 1:-1], 1)
         self.clearance_m = cv2.distanceTransform(free, cv2.DIST_L2, 5) * RESOLUTION_M
 
-    def _has_floor(self, caster: Caster, shape: tuple[int, int]) -> np.ndarray:
+    def _has_floor(self, caster: RayCaster, shape: tuple[int, int]) -> np.ndarray:
         row, column = np.mgrid[: shape[0], : shape[1]]
         xy = np.stack([column, row], axis=-1).reshape(-1, 2) * RESOLUTION_M + RESOLUTION_M / 2 + self.origin_m
         origins = np.column_stack([xy, np.full(len(xy), BODY_M[0] + 0.02)]).astype(np.float32)
@@ -38,12 +38,13 @@ class FreeSpace:
         return caster.occluded(origins, down, np.full(len(xy), 0.12)).astype(np.uint8).reshape(shape)
 
     def clearance(self, points_m: np.ndarray) -> np.ndarray:
-        """Metres to the next obstacle at points [..., 2], bilinear."""
+        """Return the metres to the nearest obstacle at points [..., 2], by bilinear interpolation."""
         at = (np.asarray(points_m) - self.origin_m) / RESOLUTION_M - 0.5
         return ndimage.map_coordinates(self.clearance_m, [at[..., 1], at[..., 0]], order=1, mode="nearest")
 
     def relax(self, route_m: np.ndarray, wanted_m: float = 0.5, *, iterations: int = 160) -> np.ndarray:
-        """A closed route [N, 2] made smooth and pushed off obstacles (an elastic band)."""
+        """Return a closed route [N, 2] smoothed and pushed away from obstacles (elastic band, Quinlan and
+        Khatib 1993)."""
         gradient = np.stack(np.gradient(self.clearance_m, RESOLUTION_M)[::-1], axis=0)
         points = route_m.copy()
         for _ in range(iterations):
@@ -58,10 +59,13 @@ class FreeSpace:
         return points
 
     def tour(self, rng: np.random.Generator, *, stops: int = 7, margin_m: float = 0.38) -> np.ndarray:
-        """A closed route [N, 2] past far-apart places of the largest connected free space.
+        """Return a closed route [N, 2] through `stops` cells far apart in the largest connected free space.
+
+        Args:
+            margin_m: smallest clearance on the route.
 
         Raises:
-            ValueError: there is no floor a robot could drive on.
+            ValueError: there is too little connected floor for a robot.
         """
         cells, graph = self._graph(margin_m)
         if len(cells) < 200:
@@ -89,7 +93,7 @@ class FreeSpace:
         return (cells[:, ::-1] + 0.5) * RESOLUTION_M + self.origin_m
 
     def places(self, margin_m: float) -> np.ndarray:
-        """Centres [N, 2] of all cells with this clearance."""
+        """Return the centres [N, 2] of all cells with more than this clearance."""
         return self._centres(np.argwhere(self.clearance_m > margin_m))
 
     def _graph(self, margin_m: float) -> tuple[np.ndarray, sparse.csr_matrix]:
@@ -116,8 +120,8 @@ class FreeSpace:
         return np.argwhere(inside), graph
 
 
-def _surface_points(mesh: Mesh, spacing_m: float = 0.025) -> np.ndarray:
-    """Points [N, 3] that leave no gap wider than the spacing in any triangle."""
+def _surface_points(mesh: SceneMesh, spacing_m: float = 0.025) -> np.ndarray:
+    """Return points [N, 3] on all triangles at obstacle height, no farther apart than the spacing."""
     v = mesh.vertices_m[mesh.triangles].astype(np.float64)
     tall = (v[:, :, 2].max(axis=1) > BODY_M[0]) & (v[:, :, 2].min(axis=1) < BODY_M[1])
     v = v[tall]
@@ -133,7 +137,7 @@ def _surface_points(mesh: Mesh, spacing_m: float = 0.025) -> np.ndarray:
 
 
 def _round_trip(distance: np.ndarray) -> list[int]:
-    """A short closed tour of all stops: 2-opt."""
+    """Return an order of all stops that makes a short closed tour, by 2-opt."""
     order = list(range(len(distance)))
 
     def length(o: list[int]) -> float:
