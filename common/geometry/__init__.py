@@ -1,1 +1,1 @@
-"""Transforms, frames, cameras, calibration (rig), trajectories and lidar beams."""
+"""Rigid transforms, coordinate frames, camera models, calibration (rig), trajectories and lidar beams."""

@@ -1,8 +1,8 @@
-"""Lidar beams as points at the time of an image, and what they say about each pixel.
+"""Lidar beams: deskewing to the time of an image, projection into the camera, and the depth they predict.
 
-A planar lidar takes 0.1 s for a revolution while the robot moves: each beam is brought to the image's
-time by the robot's motion between the two. Seen from the camera, a beam is a vertical surface at its
-azimuth (`wall_depth`), and the floor is a plane (`floor_depth`): together the `stixel` prior.
+A planar lidar takes about 0.1 s per revolution while the robot moves, so each beam is transformed by the
+robot's motion between the beam's time and the image's time (deskewing). The `stixel` depth prior assumes a
+vertical surface at each beam (`wall_depth`) and a horizontal floor (`plane_depth`).
 """
 
 from __future__ import annotations
@@ -17,17 +17,17 @@ from beamsplat.common.geometry.transforms import inverse, so3_log, transform_poi
 
 @dataclass(frozen=True)
 class Beams:
-    """Returns of one or more scans in the body frame of one moment."""
+    """Lidar returns of one or more scans, as points in the body frame at one common time."""
 
     points_body_m: np.ndarray  # float64 [N, 3]
     index: np.ndarray  # int64 [N]: number of the beam within its scan
-    sigma_m: np.ndarray  # float64 [N]: of the range, plus what the motion between the times adds
+    sigma_m: np.ndarray  # float64 [N]: standard deviation, range noise and motion uncertainty combined
 
     def __len__(self) -> int:
         return len(self.index)
 
     def take(self, keep: np.ndarray) -> Beams:
-        """The beams of a mask or of indices."""
+        """Return the beams selected by a boolean mask [N] or an index array."""
         return Beams(self.points_body_m[keep], self.index[keep], self.sigma_m[keep])
 
 
@@ -41,7 +41,11 @@ def scan_points(
     range_min_m: float,
     range_max_m: float,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Points float64 [M, 3] in the lidar frame and the numbers int64 [M] of the beams that returned."""
+    """Convert the valid ranges of a scan to points.
+
+    Returns:
+        Points float64 [M, 3] in the lidar frame, and the beam numbers int64 [M] of these returns.
+    """
     ranges = np.asarray(ranges_m, dtype=np.float64)
     with np.errstate(invalid="ignore"):
         index = np.flatnonzero((ranges > range_min_m) & (ranges < range_max_m))
@@ -50,29 +54,32 @@ def scan_points(
     return np.stack([r * np.cos(angle), r * np.sin(angle), np.zeros_like(r)], axis=1), index
 
 
-def move_beams(
+def deskew_beams(
     points_lidar_m: np.ndarray,  # float64 [N, 3]
-    fraction: np.ndarray,  # float64 [N]: time of the beam, 0 at T_map_body_first, 1 at T_map_body_last
+    fraction: np.ndarray,  # float64 [N]: time of each beam, 0 at T_map_body_first, 1 at T_map_body_last
     T_map_body_first: np.ndarray,
     T_map_body_last: np.ndarray,
     T_map_body_image: np.ndarray,
     T_body_lidar: np.ndarray,
 ) -> np.ndarray:
-    """Points float64 [N, 3] in the body frame at the image's time.
+    """Return the points float64 [N, 3] in the body frame at the image's time.
 
-    Between first and last beam the body moves on the geodesic (rotation) and straight (translation).
+    Between the first and the last beam the rotation is interpolated on the geodesic, the translation
+    linearly.
     """
     on_body = transform_points(T_body_lidar, np.asarray(points_lidar_m, dtype=np.float64))
     T_image_map = inverse(T_map_body_image)
     first, last = T_image_map @ T_map_body_first, T_image_map @ T_map_body_last
     turn = so3_log(first[:3, :3].T @ last[:3, :3])
-    turned = rotate_fractions(on_body, turn, fraction)
+    turned = rotate_by_fraction(on_body, turn, fraction)
     shift = first[:3, 3] + fraction[:, None] * (last[:3, 3] - first[:3, 3])
     return turned @ first[:3, :3].T + shift
 
 
-def rotate_fractions(points: np.ndarray, rotation_vector_rad: np.ndarray, fraction: np.ndarray) -> np.ndarray:
-    """Each point [N, 3] turned by its own fraction [N] of one rotation (Rodrigues' formula)."""
+def rotate_by_fraction(
+    points: np.ndarray, rotation_vector_rad: np.ndarray, fraction: np.ndarray
+) -> np.ndarray:
+    """Rotate each point [N, 3] by its own fraction [N] of one rotation vector [3] (Rodrigues' formula)."""
     angle = float(np.linalg.norm(rotation_vector_rad))
     if angle < 1e-12:
         return points.copy()
@@ -85,34 +92,36 @@ def rotate_fractions(points: np.ndarray, rotation_vector_rad: np.ndarray, fracti
 def project_beams(
     beams: Beams, camera: Pinhole, T_body_camera: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(uv_px [M, 2], optical z in metres [M], indices [M] into `beams`) of the beams in the image.
+    """Project beams into the image; omit those outside it and those occluded from the camera.
 
-    Beams that another surface hides from the camera in the lidar plane are left out (`hidden_beams`).
+    Returns:
+        Pixels (u, v) float64 [M, 2], optical z in metres [M], and indices [M] into `beams`.
     """
     points_camera = transform_points(inverse(T_body_camera), beams.points_body_m)
     uv, inside = camera.project(points_camera)
-    inside &= ~hidden_beams(beams.points_body_m, T_body_camera)
+    inside &= ~occluded_beams(beams.points_body_m, T_body_camera)
     seen = np.flatnonzero(inside)
     return uv[seen], points_camera[seen, 2], seen
 
 
-def hidden_beams(
+def occluded_beams(
     points_body_m: np.ndarray, T_body_camera: np.ndarray, half_width_rad: float = 0.006, gap: float = 0.10
 ) -> np.ndarray:
-    """bool [N]: beams behind a nearer beam of nearly the same azimuth, as seen from the camera.
+    """Return a mask bool [N] of the beams that a nearer surface occludes from the camera.
 
-    The lidar sees behind edges that hide its points from the camera, which stands elsewhere. `gap` is
-    the share of the range by which the other beam must be nearer (at least 5 cm).
+    Camera and lidar have different positions, so the lidar measures points that the camera cannot see. A beam
+    is occluded if another beam within `half_width_rad` of its azimuth, seen from the camera, is nearer by
+    more than the fraction `gap` of its range (at least 5 cm).
     """
     count = len(points_body_m)
     if count == 0:
         return np.zeros(0, dtype=bool)
-    azimuth, reach = plan_polar(points_body_m, T_body_camera)
+    azimuth, range_m = azimuth_and_range(points_body_m, T_body_camera)
     order = np.argsort(azimuth, kind="stable")
-    a, r = azimuth[order], reach[order]
+    a, r = azimuth[order], range_m[order]
     first = np.searchsorted(a, a - half_width_rad, side="left")
     stop = np.searchsorted(a, a + half_width_rad, side="right")
-    # A sparse table would be exact for any width; windows hold a handful of beams.
+    # Sliding-window minimum by direct comparison: a window holds only a few beams.
     nearest = r.copy()
     i = np.arange(count)
     for step in range(1, int(max((stop - i).max(), (i - first).max())) + 1):
@@ -126,23 +135,27 @@ def hidden_beams(
     return hidden
 
 
-def plan_polar(points_body_m: np.ndarray, T_body_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(azimuth_rad [N], horizontal range_m [N]) of points about the camera, in the body's floor plane."""
+def azimuth_and_range(points_body_m: np.ndarray, T_body_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return azimuth (rad) [N] and horizontal range (m) [N] of points [N, 3] from the camera centre.
+
+    Azimuths are in the x-y plane of the body frame: 0 = body x axis, positive to the left.
+    """
     x = points_body_m[:, 0] - T_body_camera[0, 3]
     y = points_body_m[:, 1] - T_body_camera[1, 3]
     return np.arctan2(y, x), np.hypot(x, y)
 
 
 def wall_ranges(
-    azimuth_rad: np.ndarray,  # float64 [M]: where the ranges are wanted
+    azimuth_rad: np.ndarray,  # float64 [M]: query azimuths
     beam_azimuth_rad: np.ndarray,  # float64 [N]
     beam_range_m: np.ndarray,  # float64 [N]
     max_gap_rad: float = 0.03,
 ) -> np.ndarray:
-    """Horizontal range float64 [M] of the surface at each azimuth; NaN where no beam is near.
+    """Return the horizontal range float64 [M] of the surface at each azimuth, interpolated between beams.
 
-    Between two beams of one surface the wall is straight (1/r is linear in tan, near enough in the
-    angle); across a jump the nearer beam in angle counts.
+    Between two beams on the same surface, 1/r is interpolated linearly in the angle, which is a good
+    approximation of a straight wall. At a range discontinuity the beam nearest in angle is used. The result
+    is NaN where no beam is within `max_gap_rad`.
     """
     if len(beam_azimuth_rad) == 0:
         return np.full(np.shape(azimuth_rad), np.nan)
@@ -162,11 +175,14 @@ def wall_ranges(
 
 
 def wall_depth(
-    rays_body: np.ndarray,  # float64 [..., 3]: camera rays (z_camera = 1) turned into the body frame
+    rays_body: np.ndarray,  # float64 [..., 3]: camera rays (z_camera = 1) rotated into the body frame
     beam_azimuth_rad: np.ndarray,
     beam_range_m: np.ndarray,
 ) -> np.ndarray:
-    """Optical z [...] of the vertical surface that each pixel's column meets; NaN without a beam."""
+    """Return the optical z (m) [...] where each ray meets the vertical surface at its azimuth.
+
+    The result is NaN where no beam is near (see `wall_ranges`).
+    """
     across = np.hypot(rays_body[..., 0], rays_body[..., 1])
     azimuth = np.arctan2(rays_body[..., 1], rays_body[..., 0])
     flat = wall_ranges(azimuth.ravel(), beam_azimuth_rad, beam_range_m).reshape(azimuth.shape)
@@ -174,7 +190,11 @@ def wall_depth(
 
 
 def plane_depth(rays_body: np.ndarray, camera_z_m: float, plane_z_m: float = 0.0) -> np.ndarray:
-    """Optical z [...] of a horizontal plane at `plane_z_m` in the body frame; NaN where rays miss it."""
+    """Return the optical z (m) [...] where each ray meets the plane z = `plane_z_m` of the body frame.
+
+    `rays_body` [..., 3] are camera rays (z_camera = 1) rotated into the body frame, `camera_z_m` is the
+    camera's height in it. The result is NaN where a ray does not meet the plane.
+    """
     rise = rays_body[..., 2]
     with np.errstate(divide="ignore", invalid="ignore"):
         z = (plane_z_m - camera_z_m) / rise

@@ -1,7 +1,7 @@
-"""Pinhole cameras: projection, rays, undistortion, and K at another image size.
+"""Pinhole camera model: projection, rays, undistortion, and scaling of K to another image size.
 
 Pixel centres have integer coordinates: the image covers [-0.5, width - 0.5] x [-0.5, height - 0.5].
-Undistortion happens once, where an image is opened; everything behind sees `Pinhole.undistorted`.
+Images are undistorted once, after decoding; all later stages use the camera `Pinhole.undistorted`.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ MODELS = ("none", "plumb_bob", "rational_polynomial", "equidistant")
 
 @dataclass(frozen=True)
 class Pinhole:
-    """K of one image size, and the lens distortion in front of it (OpenCV's coefficients).
+    """Camera intrinsics at one image size: focal lengths, principal point, distortion (OpenCV coefficients).
 
     Raises:
-        ValueError: K does not belong to the size, or the distortion model is unknown.
+        ValueError: a focal length or the size is not positive, or the distortion model is unknown.
     """
 
     fx_px: float
@@ -40,12 +40,12 @@ class Pinhole:
             raise ValueError(f"focal lengths and image size must be positive: {self}")
         if self.distortion_model not in MODELS:
             raise ValueError(
-                f"distortion model {self.distortion_model!r} is unknown; there are {', '.join(MODELS)}"
+                f"distortion model {self.distortion_model!r} is unknown; the models are {', '.join(MODELS)}"
             )
 
     @classmethod
     def of(cls, camera: CameraModel) -> Pinhole:
-        """Of the camera in a message."""
+        """Return the intrinsics of the camera in a message."""
         return cls(
             camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px, camera.width_px, camera.height_px,
             camera.distortion_model, tuple(camera.distortion),
@@ -53,7 +53,7 @@ class Pinhole:
 
     @property
     def K(self) -> np.ndarray:
-        """float64 [3, 3]."""
+        """Camera matrix, float64 [3, 3]."""
         return np.array([[self.fx_px, 0.0, self.cx_px], [0.0, self.fy_px, self.cy_px], [0.0, 0.0, 1.0]])
 
     @property
@@ -66,7 +66,11 @@ class Pinhole:
         return self.distortion_model != "none" and any(self.distortion)
 
     def resized(self, width_px: int, height_px: int) -> Pinhole:
-        """The same view sampled at another size; area edges stay, so centres shift by half pixels."""
+        """Return the same camera for an image resampled to another size.
+
+        The edges of the image area stay fixed; because pixel centres are integers, cx and cy are scaled about
+        the corner at (-0.5, -0.5).
+        """
         sx, sy = width_px / self.width_px, height_px / self.height_px
         return replace(
             self,
@@ -79,15 +83,18 @@ class Pinhole:
         )
 
     def undistorted(self) -> Pinhole:
-        """The ideal pinhole with the same K that `Undistorter` renders into."""
+        """Return the camera of the images that `Undistorter` makes: the same K without distortion."""
         return replace(self, distortion_model="none", distortion=())
 
     def project(self, points_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Pixels (u, v) float64 [N, 2] of points [N, 3], and bool [N]: in front and inside the image.
+        """Project points [N, 3] (m, camera frame).
 
-        Where the flag is False because the point lies behind the camera, (u, v) is NaN. Strong radial
-        polynomials fold back far outside the image; such points are flagged False by comparing the ray
-        with what `rays` gives back.
+        Returns:
+            Pixels (u, v) float64 [N, 2], NaN for points behind the camera; and a mask bool [N] of the points
+            in front of the camera and inside the image.
+
+        A strong radial polynomial is not monotonic and can map points far outside the field of view into the
+        image. The mask excludes these: the ray of their pixel (`rays`) differs from the point's direction.
         """
         points = np.asarray(points_camera, dtype=np.float64).reshape(-1, 3)
         front = points[:, 2] > 1e-6
@@ -103,12 +110,12 @@ class Pinhole:
         return uv, inside
 
     def contains(self, uv_px: np.ndarray) -> np.ndarray:
-        """bool [N]: whether pixels [N, 2] lie inside the image."""
+        """Return a mask bool [N] of the pixels [N, 2] that are inside the image."""
         u, v = uv_px[..., 0], uv_px[..., 1]
         return (u >= -0.5) & (u < self.width_px - 0.5) & (v >= -0.5) & (v < self.height_px - 0.5)
 
     def rays(self, uv_px: np.ndarray) -> np.ndarray:
-        """Rays float64 [N, 3] with z = 1 through pixels [N, 2], the lens undone."""
+        """Return the undistorted rays float64 [N, 3] with z = 1 through pixels [N, 2]."""
         uv = np.asarray(uv_px, dtype=np.float64).reshape(-1, 2)
         out = np.ones((len(uv), 3))
         if len(uv) == 0:
@@ -126,7 +133,7 @@ class Pinhole:
         return out
 
     def ray_grid(self) -> np.ndarray:
-        """Rays float64 [H, W, 3] with z = 1 through all pixel centres."""
+        """Return the undistorted rays float64 [H, W, 3] with z = 1 through all pixel centres."""
         v, u = np.mgrid[: self.height_px, : self.width_px].astype(np.float64)
         return self.rays(np.stack([u.ravel(), v.ravel()], axis=1)).reshape(self.height_px, self.width_px, 3)
 
@@ -143,7 +150,7 @@ class Pinhole:
 
 
 class Undistorter:
-    """Renders images of a distorted camera as its ideal pinhole sees them. Maps are made once."""
+    """Image undistortion for one camera; the remap tables are computed once, in the constructor."""
 
     def __init__(self, camera: Pinhole) -> None:
         self.camera = camera
@@ -155,10 +162,10 @@ class Undistorter:
             self._maps = cv2.convertMaps(uv, None, cv2.CV_16SC2)
 
     def __call__(self, image: np.ndarray) -> np.ndarray:
-        """uint8 [H, W] or [H, W, 3] of the camera to the same of the pinhole; outside is black.
+        """Return the undistorted image, uint8 [H, W] or [H, W, 3]; pixels outside the original are black.
 
         Raises:
-            ValueError: the image is not of the camera's size.
+            ValueError: the image does not have the camera's size.
         """
         if image.shape[:2] != self.camera.shape:
             raise ValueError(f"image is {image.shape[1]}x{image.shape[0]}, K belongs to "

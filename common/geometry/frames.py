@@ -1,7 +1,7 @@
-"""The frames of the robot, by name, and the one rotation everybody gets wrong once.
+"""The robot's coordinate frames, and the transforms of sensors mounted on the body.
 
-map     world-fixed; `T_map_odom` may jump when a loop closes
-odom    world-fixed and smooth; drifts
+map     world-fixed; `T_map_odom` jumps at a loop closure
+odom    world-fixed; the body moves smoothly in it, with drift
 body    x forward, y left, z up, origin on the floor between the wheels
 lidar   like body, at the sensor
 camera  x right, y down, z forward (optical)
@@ -13,21 +13,25 @@ import numpy as np
 
 from beamsplat.common.geometry.transforms import make_transform, so3_exp
 
-# Columns are the camera's x, y, z axes in a body-like frame (right, down, forward).
+# Rotation of the optical frame of a level, forward-looking camera. The columns are the camera's x (right),
+# y (down) and z (forward) axes in the body frame.
 R_body_camera_level = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 
 def camera_mount(
     x_m: float, y_m: float, z_m: float, *, pitch_down_rad: float = 0.0, yaw_left_rad: float = 0.0
 ) -> np.ndarray:
-    """`T_body_camera` [4, 4] of a camera on the body, as one measures it with a tape.
+    """Return `T_body_camera` [4, 4] from the camera's measured position and viewing direction.
 
-    `pitch_down_rad` tilts the view towards the floor, `yaw_left_rad` turns it to the left.
+    Args:
+        x_m, y_m, z_m: position of the camera centre in the body frame.
+        pitch_down_rad: rotates the view towards the floor.
+        yaw_left_rad: rotates the view to the left.
     """
     R_body = so3_exp([0.0, 0.0, yaw_left_rad]) @ so3_exp([0.0, pitch_down_rad, 0.0])
     return make_transform(R_body @ R_body_camera_level, np.array([x_m, y_m, z_m]))
 
 
 def lidar_mount(x_m: float, y_m: float, z_m: float, *, yaw_left_rad: float = 0.0) -> np.ndarray:
-    """`T_body_lidar` [4, 4] of an upright planar lidar."""
+    """Return `T_body_lidar` [4, 4] of an upright planar lidar from its measured position and yaw."""
     return make_transform(so3_exp([0.0, 0.0, yaw_left_rad]), np.array([x_m, y_m, z_m]))

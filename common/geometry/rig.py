@@ -185,6 +185,18 @@ def load_rig(path: Path) -> RigFile:
     return parse_rig(text, str(path))
 
 
+def check_rig_option(path: Path | None) -> RigFile | None:
+    """Return the rig file that an option `rig` names, None where it names none.
+
+    Raises:
+        UserError: as `load_rig`, naming the option.
+    """
+    try:
+        return None if path is None else load_rig(path)
+    except UserError as error:
+        raise UserError(f"rig = {error}") from error
+
+
 def parse_rig(text: str, where: str) -> RigFile:
     """The rig file with this text; `where` names it in errors (see `load_rig`)."""
     try:

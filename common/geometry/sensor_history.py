@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from beamsplat.common.geometry.beams import NO_BEAMS, Beams, move_beams, scan_points
+from beamsplat.common.geometry.beams import NO_BEAMS, Beams, deskew_beams, scan_points
 from beamsplat.common.geometry.transforms import interpolate, transform_points
 
 EXTRAPOLATE_NS = 200_000_000  # poses are extrapolated this far along the last motion, no further
@@ -169,7 +169,7 @@ class SensorHistory:
         if first is None or last is None or then is None:
             return NO_BEAMS
         fraction = index / max(len(scan.ranges_m) - 1, 1)
-        moved = move_beams(points, fraction, first, last, then, self._T_body_lidar)
+        moved = deskew_beams(points, fraction, first, last, then, self._T_body_lidar)
         return Beams(moved, index, np.full(len(index), _RANGE_SIGMA_M))
 
     def moving_returns(self, stamp_ns: int) -> np.ndarray:

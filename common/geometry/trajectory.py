@@ -1,7 +1,7 @@
-"""Stamped poses: TUM files, interpolation, association. Libraries and evaluation share it.
+"""Trajectories of stamped poses: interpolation, association of stamps, reading and writing TUM files.
 
-A TUM file has one pose a line, `stamp_s tx ty tz qx qy qz qw`, and `#` comments. Stamps are read and
-written as decimal text, never through a float: 2026 in nanoseconds needs 61 bits, a double has 53.
+A TUM file has one pose per line, `stamp_s tx ty tz qx qy qz qw`, and `#` comments. Stamps are converted from
+and to decimal text without a float: today's Unix time in nanoseconds needs 61 bits, a float64 has 53.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ _MAX_STAMP_NS = 2**63 - 1
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Poses `T_a_b` of b in a at strictly increasing stamps.
+    """Poses `T_a_b` of frame b in frame a at strictly increasing stamps.
 
     Raises:
-        ValueError: lengths differ, stamps do not increase, or a matrix is no rigid transform.
+        ValueError: the lengths differ, stamps do not increase, or a matrix is not a rigid transform.
     """
 
     stamps_ns: np.ndarray  # int64 [N]
@@ -59,10 +59,10 @@ class Trajectory:
     def at(
         self, stamp_ns: int, *, max_gap_ns: int | None = None, max_extrapolation_ns: int = 0
     ) -> np.ndarray | None:
-        """`T_a_b` [4, 4] at a stamp: between its neighbours, translation linear, rotation geodesic.
+        """Return `T_a_b` [4, 4] at a stamp, interpolated between its two neighbours (see `interpolate`).
 
-        None outside the covered time (plus `max_extrapolation_ns`, along the first or last step), or
-        where the neighbours lie further apart than `max_gap_ns`.
+        Up to `max_extrapolation_ns` outside the covered time, the first or last step is continued. Returns
+        None beyond that, or if the two neighbours are more than `max_gap_ns` apart.
         """
         count = len(self)
         if count == 0:
@@ -83,7 +83,11 @@ class Trajectory:
     def resampled(
         self, stamps_ns: Iterable[int], *, max_gap_ns: int | None = None, max_extrapolation_ns: int = 0
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Poses at the stamps that can be answered (see `at`): (indices int64 [M], `T_a_b` [M, 4, 4])."""
+        """Interpolate the poses at many stamps, and omit stamps for which `at` returns None.
+
+        Returns:
+            Indices int64 [M] into `stamps_ns`, and `T_a_b` float64 [M, 4, 4].
+        """
         indices, poses = [], []
         for i, stamp_ns in enumerate(stamps_ns):
             T = self.at(int(stamp_ns), max_gap_ns=max_gap_ns, max_extrapolation_ns=max_extrapolation_ns)
@@ -94,7 +98,7 @@ class Trajectory:
 
 
 def _rigid(T: np.ndarray, tolerance: float = 1e-6) -> np.ndarray:
-    """bool [N]: `geometry.is_rigid` of each of T [N, 4, 4], without a loop in Python."""
+    """Return `transforms.is_rigid` of each of T [N, 4, 4] as bool [N], vectorised."""
     R = T[:, :3, :3]
     orthonormal = np.all(np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)) <= tolerance, axis=(1, 2))
     last_row = np.all(T[:, 3] == [0.0, 0.0, 0.0, 1.0], axis=1)
@@ -103,10 +107,10 @@ def _rigid(T: np.ndarray, tolerance: float = 1e-6) -> np.ndarray:
 
 
 def associate(stamps_a_ns: np.ndarray, stamps_b_ns: np.ndarray, max_difference_ns: int) -> np.ndarray:
-    """Pairs (i, j) int64 [M, 2] of nearest stamps no further apart than `max_difference_ns`.
+    """Return pairs of indices (i, j) int64 [M, 2] of mutually nearest stamps of two sorted lists.
 
-    Both lists are sorted. Each stamp is used once at most; a pair is kept only if each is the other's
-    nearest, so the result does not depend on which list comes first.
+    The stamps of a pair are at most `max_difference_ns` apart. Each stamp is used at most once. Because a
+    pair must be mutually nearest, swapping the two lists only swaps i and j.
     """
     a, b = np.asarray(stamps_a_ns, dtype=np.int64), np.asarray(stamps_b_ns, dtype=np.int64)
     if len(a) == 0 or len(b) == 0:
@@ -125,11 +129,11 @@ def _nearest(queries: np.ndarray, sorted_stamps: np.ndarray) -> np.ndarray:
 
 
 def read_tum(path: Path) -> Trajectory:
-    """Trajectory of a TUM file; lines may come in any order.
+    """Read the trajectory in a TUM file; its lines may be in any order.
 
     Raises:
-        UserError: no such file, a line that is not eight numbers, or a stamp that occurs twice;
-            the text names file and line.
+        UserError: the file cannot be read, a line does not hold eight numbers, or a stamp occurs twice; the
+            text names file and line.
     """
     try:
         text = Path(path).read_text()
@@ -139,7 +143,7 @@ def read_tum(path: Path) -> Trajectory:
 
 
 def parse_tum(text: str, where: str) -> Trajectory:
-    """Trajectory of the text of a TUM file (see `read_tum`); `where` names it in errors."""
+    """Parse the text of a TUM file (see `read_tum`); `where` names its source in errors."""
     rows: list[tuple[int, np.ndarray, int]] = []
     for number, line in enumerate(text.splitlines(), start=1):
         content = line.split("#", 1)[0].replace(",", " ").split()
@@ -172,10 +176,10 @@ def _parse_line(content: list[str], where: str) -> tuple[int, np.ndarray]:
 
 
 def parse_stamp_s(word: str, where: str) -> int:
-    """Seconds as decimal text to int64 nanoseconds, exact to the nanosecond.
+    """Convert seconds as decimal text to int64 nanoseconds, exact to the nanosecond.
 
     Raises:
-        UserError: not a number, negative, or beyond int64.
+        UserError: the text is not a number, negative, or beyond int64.
     """
     try:
         seconds = Decimal(word)
@@ -188,12 +192,12 @@ def parse_stamp_s(word: str, where: str) -> int:
 
 
 def format_stamp_s(stamp_ns: int) -> str:
-    """Nanoseconds as seconds with nine decimals."""
+    """Return nanoseconds as decimal text in seconds, with nine decimals."""
     return f"{stamp_ns // 10**9}.{stamp_ns % 10**9:09d}"
 
 
 def format_tum(trajectory: Trajectory, comment: str = "") -> str:
-    """Text of a TUM file; positions to the micrometre, quaternions to 1e-9."""
+    """Return the text of a TUM file: positions to 1e-6 m, quaternions to 1e-9."""
     lines = [f"# {line}" for line in comment.splitlines()]
     lines.append("# stamp_s tx ty tz qx qy qz qw")
     for stamp_ns, T in zip(trajectory.stamps_ns, trajectory.T_a_b):
@@ -204,7 +208,7 @@ def format_tum(trajectory: Trajectory, comment: str = "") -> str:
 
 
 def write_tum(path: Path, trajectory: Trajectory, comment: str = "") -> None:
-    """Writes a TUM file; a reader never sees half of it."""
+    """Write a TUM file and rename it into place, so that a reader never sees an incomplete file."""
     path = Path(path)
     partial = path.with_name(path.name + ".partial")
     partial.write_text(format_tum(trajectory, comment))

@@ -1,8 +1,8 @@
 """Rigid transforms and rotations: SE(2), SE(3), quaternions.
 
-`T_a_b` takes coordinates in b to coordinates in a and is a float64 [4, 4] matrix, so chains read
-inside out: `T_map_camera = T_map_body @ T_body_camera`. SE(2) poses are (x_m, y_m, yaw_rad) in
-the floor plane. Quaternions are always named by their order; inside the house it is wxyz.
+`T_a_b` is a float64 [4, 4] matrix that transforms coordinates from frame b to frame a, so inner names match
+in a product: `T_map_camera = T_map_body @ T_body_camera`. SE(2) poses are float64 [3] (x_m, y_m, yaw_rad) in
+the floor plane. Quaternion names contain their order; this project uses wxyz except at external interfaces.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ import numpy as np
 
 
 def wrap_angle(angle_rad: np.ndarray | float) -> np.ndarray | float:
-    """Angle(s) brought into [-pi, pi)."""
+    """Return the angle(s), in radians, wrapped into [-pi, pi)."""
     return (angle_rad + np.pi) % (2.0 * np.pi) - np.pi
 
 
 def se2_to_se3(pose: np.ndarray) -> np.ndarray:
-    """SE(2) poses [..., 3] (x_m, y_m, yaw_rad) lifted to SE(3) [..., 4, 4] with z, roll, pitch = 0."""
+    """Convert SE(2) poses [..., 3] (x_m, y_m, yaw_rad) to SE(3) [..., 4, 4] with z, roll and pitch = 0."""
     pose = np.asarray(pose, dtype=np.float64)
     T = np.zeros((*pose.shape[:-1], 4, 4))
     cos, sin = np.cos(pose[..., 2]), np.sin(pose[..., 2])
@@ -29,18 +29,18 @@ def se2_to_se3(pose: np.ndarray) -> np.ndarray:
 
 
 def se3_to_se2(T: np.ndarray) -> np.ndarray:
-    """SE(3) transforms [..., 4, 4] projected to the floor: [..., 3] (x_m, y_m, yaw_rad)."""
+    """Project SE(3) transforms [..., 4, 4] to the floor plane: [..., 3] (x_m, y_m, yaw_rad)."""
     T = np.asarray(T, dtype=np.float64)
     return np.stack([T[..., 0, 3], T[..., 1, 3], yaw_of(T)], axis=-1)
 
 
 def yaw_of(T: np.ndarray) -> np.ndarray:
-    """Heading of the x axis about z, radians, of transforms [..., 4, 4] (or rotations [..., 3, 3])."""
+    """Return the yaw (rad) of the x axis about z, of transforms [..., 4, 4] or rotations [..., 3, 3]."""
     return np.arctan2(T[..., 1, 0], T[..., 0, 0])
 
 
 def inverse(T: np.ndarray) -> np.ndarray:
-    """Inverse of rigid transforms [..., 4, 4] by transposition (exact for orthonormal rotations)."""
+    """Return the inverse of rigid transforms [..., 4, 4], by transposing the rotations."""
     T = np.asarray(T, dtype=np.float64)
     R_T = np.swapaxes(T[..., :3, :3], -1, -2)
     out = np.zeros_like(T)
@@ -51,12 +51,12 @@ def inverse(T: np.ndarray) -> np.ndarray:
 
 
 def transform_points(T_a_b: np.ndarray, points_b: np.ndarray) -> np.ndarray:
-    """Points [N, 3] from frame b to frame a."""
+    """Transform points [N, 3] from frame b to frame a."""
     return points_b @ T_a_b[:3, :3].T + T_a_b[:3, 3]
 
 
 def make_transform(R: np.ndarray, translation_m: np.ndarray) -> np.ndarray:
-    """[4, 4] from a rotation [3, 3] and a translation [3]."""
+    """Return the transform float64 [4, 4] of a rotation [3, 3] and a translation [3]."""
     T = np.eye(4)
     T[:3, :3] = R
     T[:3, 3] = translation_m
@@ -64,11 +64,11 @@ def make_transform(R: np.ndarray, translation_m: np.ndarray) -> np.ndarray:
 
 
 def is_rigid(T: np.ndarray, tolerance: float = 1e-6) -> bool:
-    """True if T [4, 4] is finite, orthonormal, right-handed, with last row 0 0 0 1."""
+    """Return whether T is a finite [4, 4] matrix with a right-handed rotation and last row 0 0 0 1."""
     T = np.asarray(T)
     if T.shape != (4, 4):
         return False
-    # Scalars: this guards every pose on the bus, and numpy's own comparisons cost ten times as much.
+    # Python scalars: this runs for every pose on the bus, and NumPy comparisons take ten times as long.
     (a, b, c, x), (d, e, f, y), (g, h, i, z), last = T.tolist()
     if last != [0.0, 0.0, 0.0, 1.0] or not all(map(math.isfinite, (x, y, z))):
         return False
@@ -81,22 +81,22 @@ def is_rigid(T: np.ndarray, tolerance: float = 1e-6) -> bool:
 
 
 def skew(v: np.ndarray) -> np.ndarray:
-    """[3, 3] with skew(v) @ w == cross(v, w)."""
+    """Return the matrix [3, 3] with skew(v) @ w == cross(v, w)."""
     return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
 
 
 def so3_exp(rotation_vector_rad: np.ndarray) -> np.ndarray:
-    """Rodrigues' formula: rotation [3, 3] of a rotation vector [3]."""
+    """Return the rotation [3, 3] of a rotation vector [3] (Rodrigues' formula)."""
     w = np.asarray(rotation_vector_rad, dtype=np.float64)
     angle = float(np.linalg.norm(w))
     W = skew(w)
-    if angle < 1e-8:  # Taylor: the quotients below lose all digits near zero
+    if angle < 1e-8:  # Taylor series: the quotients below cancel near zero
         return np.eye(3) + W + 0.5 * W @ W
     return np.eye(3) + np.sin(angle) / angle * W + (1.0 - np.cos(angle)) / angle**2 * (W @ W)
 
 
 def so3_log(R: np.ndarray) -> np.ndarray:
-    """Rotation vector [3] (radians, length in [0, pi]) of a rotation [3, 3]."""
+    """Return the rotation vector [3] (radians, length in [0, pi]) of a rotation [3, 3]."""
     quat = quat_wxyz_from_matrix(R)
     if quat[0] < 0.0:
         quat = -quat
@@ -107,13 +107,13 @@ def so3_log(R: np.ndarray) -> np.ndarray:
 
 
 def se3_exp(tangent: np.ndarray) -> np.ndarray:
-    """SE(3) exponential [4, 4] of a tangent [6] = (rho, phi): translation part first."""
+    """Return the SE(3) exponential [4, 4] of a tangent [6] = (rho, phi), translation part first."""
     rho, phi = np.asarray(tangent[:3], dtype=np.float64), np.asarray(tangent[3:], dtype=np.float64)
     return make_transform(so3_exp(phi), _left_jacobian(phi) @ rho)
 
 
 def se3_log(T: np.ndarray) -> np.ndarray:
-    """Tangent [6] = (rho, phi) with se3_exp(tangent) == T; rotation below pi."""
+    """Return the tangent [6] = (rho, phi) with se3_exp(tangent) == T; the rotation must be below pi."""
     phi = so3_log(T[:3, :3])
     return np.concatenate([np.linalg.solve(_left_jacobian(phi), T[:3, 3]), phi])
 
@@ -127,7 +127,7 @@ def _left_jacobian(phi: np.ndarray) -> np.ndarray:
 
 
 def quat_wxyz_from_matrix(R: np.ndarray) -> np.ndarray:
-    """Unit quaternion (w, x, y, z) with w >= 0 of a rotation [3, 3] (Shepperd's stable branch)."""
+    """Return the unit quaternion (w, x, y, z), w >= 0, of a rotation [3, 3] (Shepperd's method)."""
     R = np.asarray(R, dtype=np.float64)
     trace = np.trace(R)
     squares = np.array([trace, R[0, 0], R[1, 1], R[2, 2]])
@@ -147,10 +147,10 @@ def quat_wxyz_from_matrix(R: np.ndarray) -> np.ndarray:
 
 
 def matrix_from_quat_wxyz(quat_wxyz: np.ndarray) -> np.ndarray:
-    """Rotation [3, 3] of a quaternion (w, x, y, z), normalised here.
+    """Return the rotation [3, 3] of a quaternion (w, x, y, z), which need not be normalised.
 
     Raises:
-        ValueError: the quaternion has no direction (all zero or not finite).
+        ValueError: the quaternion is zero or not finite.
     """
     quat = np.asarray(quat_wxyz, dtype=np.float64)
     norm = float(np.linalg.norm(quat))
@@ -167,17 +167,20 @@ def matrix_from_quat_wxyz(quat_wxyz: np.ndarray) -> np.ndarray:
 
 
 def quat_xyzw_from_matrix(R: np.ndarray) -> np.ndarray:
-    """(x, y, z, w): the order of ROS, TUM files and rerun. Use at those edges only."""
+    """Return the quaternion (x, y, z, w) of a rotation [3, 3]: the order of ROS, TUM files and rerun only."""
     return np.roll(quat_wxyz_from_matrix(R), -1)
 
 
 def matrix_from_quat_xyzw(quat_xyzw: np.ndarray) -> np.ndarray:
-    """Rotation [3, 3] of (x, y, z, w): the order of ROS, TUM files and rerun."""
+    """Return the rotation [3, 3] of a quaternion (x, y, z, w): the order of ROS, TUM files and rerun only."""
     return matrix_from_quat_wxyz(np.roll(np.asarray(quat_xyzw, dtype=np.float64), 1))
 
 
 def interpolate(T_a_b0: np.ndarray, T_a_b1: np.ndarray, fraction: float) -> np.ndarray:
-    """Pose between two poses: translation linear, rotation on the geodesic; fraction may leave [0, 1]."""
+    """Interpolate between two poses: translation linear, rotation on the geodesic.
+
+    `fraction` 0 returns `T_a_b0`, 1 returns `T_a_b1`; values outside [0, 1] extrapolate.
+    """
     R_01 = T_a_b0[:3, :3].T @ T_a_b1[:3, :3]
     R = T_a_b0[:3, :3] @ so3_exp(fraction * so3_log(R_01))
     return make_transform(R, (1.0 - fraction) * T_a_b0[:3, 3] + fraction * T_a_b1[:3, 3])

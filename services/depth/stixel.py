@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from beamsplat.common.geometry.beams import hidden_beams, plan_polar, plane_depth, wall_ranges
+from beamsplat.common.geometry.beams import azimuth_and_range, occluded_beams, plane_depth, wall_ranges
 from beamsplat.common.geometry.camera import Pinhole
 from beamsplat.services.depth.source import DepthInput, Estimate
 
@@ -42,8 +42,8 @@ class Stixel:
         ):
             rays = self._rays = _prepare(view.camera, view.T_body_camera)
         points = view.beams.points_body_m
-        points = points[~hidden_beams(points, view.T_body_camera)]
-        azimuth, reach = plan_polar(points, view.T_body_camera)
+        points = points[~occluded_beams(points, view.T_body_camera)]
+        azimuth, reach = azimuth_and_range(points, view.T_body_camera)
         ranges = wall_ranges(rays.azimuth_rad, azimuth, reach).astype(np.float32)
         values = ranges[rays.place] * rays.per_range
         if view.floor_known:

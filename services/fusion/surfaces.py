@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from beamsplat.common.geometry.beams import Beams, hidden_beams, plan_polar, plane_depth, wall_ranges
+from beamsplat.common.geometry.beams import Beams, azimuth_and_range, occluded_beams, plane_depth, wall_ranges
 from beamsplat.common.geometry.camera import Pinhole
 from beamsplat.common.geometry.transforms import yaw_of
 from beamsplat.services.fusion.lidar_map import LidarMap
@@ -93,8 +93,8 @@ class SurfacePredictor:
     ) -> CandidateSurfaces:
         """Return the candidate surfaces of one view; `ceiling_heights_m` are above the floor."""
         points = beams.points_body_m
-        points = points[~hidden_beams(points, self._T_body_camera)]
-        azimuth, reach = plan_polar(points, self._T_body_camera)
+        points = points[~occluded_beams(points, self._T_body_camera)]
+        azimuth, reach = azimuth_and_range(points, self._T_body_camera)
         wall = self._extrude(azimuth, reach)
         lidar_z_m = float(np.median(points[:, 2])) if len(points) else 0.0
         wall_offset = np.abs(self.camera_z_m + wall * self.ray_z - lidar_z_m)

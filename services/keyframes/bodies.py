@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from beamsplat.common.geometry.beams import plan_polar
+from beamsplat.common.geometry.beams import azimuth_and_range
 from beamsplat.common.geometry.camera import Pinhole
 
 HEIGHT_M = 2.1
@@ -36,7 +36,7 @@ def body_mask(
     across = np.hypot(rays[..., 0], rays[..., 1])
     coarse = np.zeros(azimuth.shape, dtype=bool)
     small = depth_m[::step, ::step]
-    for at, reach in zip(*plan_polar(_in_company(moving_body_m), T_body_camera)):
+    for at, reach in zip(*azimuth_and_range(_in_company(moving_body_m), T_body_camera)):
         half, core = np.arctan2([_HALF_WIDTH_M, _CORE_M], max(float(reach), 0.2))
         apart = np.abs((azimuth - at + np.pi) % (2.0 * np.pi) - np.pi)
         z = reach / np.maximum(across, 1e-9)

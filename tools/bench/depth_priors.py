@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from beamsplat.common.errors import UserError
-from beamsplat.common.geometry.beams import hidden_beams, plan_polar, plane_depth, wall_depth
+from beamsplat.common.geometry.beams import azimuth_and_range, occluded_beams, plane_depth, wall_depth
 from beamsplat.tools.evaluation.dataset import Recording
 
 # (recording, number of the picture) -> depth_m, sigma_m float32 [H, W]; None where it has none.
@@ -29,8 +29,8 @@ def stixel(recording: Recording, index: int) -> tuple[np.ndarray, np.ndarray] | 
     if len(beams) == 0:
         return None
     rays = recording.camera.ray_grid() @ T_body_camera[:3, :3].T
-    points = beams.points_body_m[~hidden_beams(beams.points_body_m, T_body_camera)]
-    azimuth, reach = plan_polar(points, T_body_camera)
+    points = beams.points_body_m[~occluded_beams(beams.points_body_m, T_body_camera)]
+    azimuth, reach = azimuth_and_range(points, T_body_camera)
     wall = wall_depth(rays, azimuth, reach)
     floor = plane_depth(rays, float(T_body_camera[2, 3]))
     depth = np.fmin(wall, floor)

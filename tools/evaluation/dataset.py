@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from beamsplat.common.errors import UserError
-from beamsplat.common.geometry.beams import NO_BEAMS, Beams, move_beams, scan_points
+from beamsplat.common.geometry.beams import NO_BEAMS, Beams, deskew_beams, scan_points
 from beamsplat.common.geometry.camera import Pinhole, Undistorter
 from beamsplat.common.geometry.trajectory import Trajectory, read_tum
 from beamsplat.common.geometry.transforms import make_transform, matrix_from_quat_xyzw
@@ -185,7 +185,7 @@ class _BeamTrack:
         last = max(len(scan.ranges) - 1, 1)
         first_pose = self._pose(start_ns)
         last_pose = self._pose(start_ns + int(scan.time_increment * last * 1e9))
-        body = move_beams(points, index / last, first_pose, last_pose, T_map_body, self._T_body_lidar)
+        body = deskew_beams(points, index / last, first_pose, last_pose, T_map_body, self._T_body_lidar)
         return Beams(body, index, np.full(len(index), 0.01))
 
     def _pose(self, stamp_ns: int) -> np.ndarray:

@@ -6,9 +6,9 @@ from hypothesis import strategies as st
 
 from beamsplat.common.geometry.beams import (
     Beams,
-    hidden_beams,
-    move_beams,
-    plan_polar,
+    azimuth_and_range,
+    deskew_beams,
+    occluded_beams,
     plane_depth,
     project_beams,
     scan_points,
@@ -49,7 +49,7 @@ def test_beams_of_a_moving_robot_hit_the_same_points_of_the_world(dx, dy, turn, 
             for f, p in zip(fraction, world)
         ]
     )
-    moved = move_beams(seen, fraction, T0, T1, T_image, T_body_lidar)
+    moved = deskew_beams(seen, fraction, T0, T1, T_image, T_body_lidar)
     assert np.allclose(transform_points(T_image, moved), world, atol=1e-9)
 
 
@@ -57,9 +57,9 @@ def test_a_beam_behind_a_nearer_edge_is_hidden_from_the_camera_only_there():
     T = camera_mount(0.0, 0.3, 0.45)  # left of the lidar
     near = np.column_stack([np.full(60, 1.0), np.linspace(-0.1, 0.2, 60), np.full(60, 0.18)])
     far = np.column_stack([np.full(60, 3.0), np.linspace(-0.9, -0.1, 60), np.full(60, 0.18)])
-    hidden = hidden_beams(np.concatenate([near, far]), T)
+    hidden = occluded_beams(np.concatenate([near, far]), T)
     assert not hidden[:60].any()
-    azimuth, _ = plan_polar(np.concatenate([near, far]), T)
+    azimuth, _ = azimuth_and_range(np.concatenate([near, far]), T)
     covered = (azimuth[60:] > azimuth[:60].min()) & (azimuth[60:] < azimuth[:60].max())
     assert covered.any()
     assert (~covered).any()
