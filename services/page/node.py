@@ -30,13 +30,13 @@ from beamsplat.common.messages import (
     WheelOdometry,
 )
 from beamsplat.common.runtime.node import Input, Node, Outputs, QueryFunction
-from beamsplat.services.page.pictures import Encoded, camera_picture, depth_picture, map_picture
-from beamsplat.services.page.server import Access, PageServer
-from beamsplat.services.page.view import View
+from beamsplat.services.page.images import EncodedImage, encode_camera_image, encode_depth, encode_grid
+from beamsplat.services.page.server import PageAccess, PageServer
+from beamsplat.services.page.view import PageState
 
 log = logging.getLogger(__name__)
 
-_SHORTEST_TOKEN = 12
+_MIN_TOKEN_CHARS = 12
 # Command -> what the node's supervisor is asked, and for how long. A swap's successor may load a model.
 _COMMANDS = {
     "restart": ("restart", 10.0), "params": ("params", 10.0),
@@ -63,8 +63,8 @@ class PageConfig(NodeConfig):
     @field_validator("token")
     @classmethod
     def _long_enough(cls, token: SecretStr) -> SecretStr:
-        if 0 < len(token.get_secret_value()) < _SHORTEST_TOKEN:
-            raise ValueError(f"a token needs at least {_SHORTEST_TOKEN} characters, or none")
+        if 0 < len(token.get_secret_value()) < _MIN_TOKEN_CHARS:
+            raise ValueError(f"a token needs at least {_MIN_TOKEN_CHARS} characters, or none")
         return token
 
 
@@ -92,12 +92,15 @@ class PageNode(Node):
     def set_query_function(self, ask: QueryFunction) -> None:
         self._ask = ask
 
+    def check_resources(self) -> None:
+        _tls(self.config.certificate, self.config.certificate_key)
+
     def configure(self) -> None:
         c = self.config
-        self._view = View(c.picture_hz, c.map_hz)
-        access = Access(c.token.get_secret_value(), frozenset(name.lower() for name in c.names))
+        self._state = PageState(c.picture_hz, c.map_hz)
+        access = PageAccess(c.token.get_secret_value(), frozenset(name.lower() for name in c.names))
         tls = _tls(c.certificate, c.certificate_key)
-        self._server = PageServer(self._view, self._command, access, c.robot_hz)
+        self._server = PageServer(self._state, self._command, access, c.robot_hz)
         try:
             port = self._server.start(c.bind, c.port, tls)
         except OSError as error:
@@ -118,7 +121,7 @@ class PageNode(Node):
         """Carries out what somebody with the right asks for, in a thread of the server.
 
         Raises:
-            ValueError: there is no such command or node, or it was refused.
+            ValueError: there is no such command or node, or it was rejected.
         """
         if action == "check":
             return "the token is right"
@@ -126,81 +129,84 @@ class PageNode(Node):
             raise ValueError(f"there is no command {action!r} for {node!r}; there are {', '.join(_COMMANDS)}")
         if self._ask is None:
             raise ValueError("no bus: nobody can be asked")
-        verb, patience_s = _COMMANDS[action]
-        asked = {}
+        verb, timeout_s = _COMMANDS[action]
+        parameters_sent = {}
         if verb == "swap":
             changes = [f"{option}={value}" for option, value in parameters.items()]
-            asked = {"set": quote(json.dumps(changes)), **({"cold": "1"} if action == "cold swap" else {})}
+            parameters_sent = {
+                "set": quote(json.dumps(changes)),
+                **({"cold": "1"} if action == "cold swap" else {}),
+            }
         if verb != "params":
             log.info("%s %s, by command of the page", action, node)
-        return " ".join(answer.text for answer in self._ask(node, verb, asked, patience_s))
+        return " ".join(answer.text for answer in self._ask(node, verb, parameters_sent, timeout_s))
 
     # --- what is shown ---
 
     def on_health(self, health: Health) -> None:
-        self._view.health(health)
+        self._state.health(health)
         if health.node == self.name:
             self._server.check()
-            viewers, refused = len(self._server.audience), self._server.refused
+            viewers, rejected = len(self._server.events), self._server.rejected_commands
             self.detail = f"open {self._address}; {viewers} {'viewer' if viewers == 1 else 'viewers'}" + (
-                f"; {refused} commands refused for a wrong token" if refused else ""
+                f"; {rejected} commands rejected for a wrong token" if rejected else ""
             )
 
     def on_rig(self, rig: Rig) -> Outputs:
         if rig.lidar is not None:
-            self._view.lidar(rig.lidar.T_body_lidar)
+            self._state.lidar(rig.lidar.T_body_lidar)
         return iter(())
 
     def on_wheel_odometry(self, m: WheelOdometry) -> Outputs:
-        self._view.pose("wheel", m.stamp_ns, m.T_odom_body)
+        self._state.pose("wheel", m.stamp_ns, m.T_odom_body)
         return iter(())
 
     def on_lidar_scan(self, m: Scan) -> Outputs:
-        self._view.scan(
+        self._state.scan(
             m.stamp_ns, m.ranges_m, m.angle_min_rad, m.angle_increment_rad, (m.range_min_m, m.range_max_m)
         )
         return iter(())
 
     def on_camera_image(self, m: Image) -> Outputs:
         size_px = (m.width_px, m.height_px)
-        self._view.pictures["camera"].offer(
-            partial(camera_picture, m.data, m.encoding, size_px, m.step_bytes, self.config.widest_px)
+        self._state.images["camera"].update(
+            partial(encode_camera_image, m.data, m.encoding, size_px, m.step_bytes, self.config.widest_px)
         )
         return iter(())
 
     def on_external_pose(self, m: ExternalPose) -> Outputs:
-        self._view.pose("external", m.stamp_ns, m.T_map_body)
+        self._state.pose("external", m.stamp_ns, m.T_map_body)
         return iter(())
 
     def on_localization_odometry(self, m: Odometry) -> Outputs:
-        self._view.pose("localization", m.stamp_ns, m.T_odom_body)
-        self._view.word("localization", m.status, detail=m.detail, metric=m.metric)
+        self._state.pose("localization", m.stamp_ns, m.T_odom_body)
+        self._state.service_status("localization", m.status, detail=m.detail, metric=m.metric)
         return iter(())
 
     def on_localization_correction(self, m: Correction) -> Outputs:
-        self._view.correction(m.T_map_odom)
+        self._state.correction(m.T_map_odom)
         return iter(())
 
     def on_localization_grid(self, m: Grid) -> Outputs:
-        self._view.pictures["map"].offer(partial(map_picture, m.occupancy, m.resolution_m, m.origin_m))
+        self._state.images["map"].update(partial(encode_grid, m.occupancy, m.resolution_m, m.origin_m))
         return iter(())
 
     def on_fusion_depth(self, m: FusedDepth) -> Outputs:
-        self._view.word(
+        self._state.service_status(
             "fusion", "ok" if m.status == "ok" else "refused", detail=m.status.removeprefix("ok"),
             scale=m.scale, scale_sigma=m.scale_sigma, inlier_share=m.inlier_share, residual_m=m.residual_m,
         )  # fmt: skip
-        self._view.scale(m.scale, m.scale_sigma)
+        self._state.scale(m.scale, m.scale_sigma)
         if m.depth_m.size:
-            self._view.pictures["depth"].offer(partial(depth_picture, m.depth_m, self.config.widest_px))
+            self._state.images["depth"].update(partial(encode_depth, m.depth_m, self.config.widest_px))
         return iter(())
 
     def on_mapping_preview(self, m: MapPreview) -> Outputs:
-        self._view.pictures["render"].offer(lambda: Encoded(m.render.tobytes(), "image/jpeg", {}))
+        self._state.images["render"].update(lambda: EncodedImage(m.render.tobytes(), "image/jpeg", {}))
         return iter(())
 
     def on_mapping_status(self, m: MapStatus) -> Outputs:
-        self._view.word(
+        self._state.service_status(
             "mapping", "ok" if m.status == "ok" else "refused", detail=m.status.removeprefix("ok"),
             keyframes=m.keyframes, gaussians=m.gaussians, psnr_db=m.psnr_db, depth_error_m=m.depth_error_m,
         )  # fmt: skip
