@@ -11,25 +11,26 @@ from itertools import chain
 import numpy as np
 
 from beamsplat.common.errors import UserError
+from beamsplat.common.files.persist import check_can_write
 from beamsplat.common.geometry.camera import Undistorter
 from beamsplat.common.geometry.transforms import inverse
 from beamsplat.common.mapfiles.ply import write_map
 from beamsplat.common.messages import Anchors, Keyframe, MapChunk, MapPoses, MapState, MapStatus, Tick
 from beamsplat.common.runtime.node import Input, Outputs
-from beamsplat.services.mapping.chunks import ChunkFeed, Eye, on_disk, parts
+from beamsplat.services.mapping.chunks import ChunkFeed, Viewpoint, chunk_snapshot, disk_params
 from beamsplat.services.mapping.config import MappingConfig
-from beamsplat.services.mapping.keyframe import Held
-from beamsplat.services.mapping.mapper import FULL, HALF, Mapper, Outcome
+from beamsplat.services.mapping.keyframe import StoredKeyframe
+from beamsplat.services.mapping.mapper import FULL, HALF, InsertionResult, Mapper
 from beamsplat.services.mapping.messages import (
     ack,
-    body_of,
     chunk_message,
-    eye_of,
-    open_keyframe,
+    decode_keyframe,
+    encode_keyframe,
     preview_message,
     state_messages,
+    viewpoint_of,
 )
-from beamsplat.services.mapping.preview import look
+from beamsplat.services.mapping.preview import render_keyframe
 from beamsplat.services.mapping.session.node import SessionNode
 from beamsplat.services.mapping.session.paging import check_budget
 from beamsplat.services.mapping.session.state import arrays_of
@@ -55,6 +56,15 @@ class MappingNode(SessionNode):
     outputs = ("keyframes/ack", "mapping/chunk", "mapping/poses", "mapping/preview", "mapping/status")
     config: MappingConfig
 
+    def check_resources(self) -> None:
+        """Check the memory budget, and that the folders can be written."""
+        c = self.config
+        if c.memory_mb is not None:
+            check_budget(c.memory_mb, c.session)
+        for option, folder in (("save", c.save), ("session", c.session)):
+            if folder is not None:
+                check_can_write(folder, option)
+
     def configure(self) -> None:
         c = self.config
         warm()
@@ -66,7 +76,7 @@ class MappingNode(SessionNode):
         self._lens = lru_cache(maxsize=4)(Undistorter)  # its maps are made once a calibration
         self._taken: dict[int, tuple[int, np.ndarray]] = {}  # keyframe -> stamp_ns, T_camera_body
         self._feed = ChunkFeed()
-        self._eye: Eye | None = None  # where the newest keyframe looks from
+        self._eye: Viewpoint | None = None  # where the newest keyframe looks from
         self._refusals: dict[int, str] = {}  # keyframe -> why
         # The oldest submap's place when the origin was tied to it.
         self._T_oldest_origin: np.ndarray | None = None
@@ -82,9 +92,9 @@ class MappingNode(SessionNode):
         if message.id in self._resumed:
             self._resumed -= {message.id}
             return
-        kept = self._arrivals is not None and self._arrivals.begin(message.id)
-        known = self._mapper.knows(message.id)
-        outcome = Outcome("ok") if known else self._take(message)
+        kept = self._arrivals is not None and self._arrivals.start(message.id)
+        known = self._mapper.was_inserted(message.id)
+        outcome = InsertionResult("ok") if known else self._take(message)
         if not outcome.ok or (not kept and self._kept(message, known)):
             yield ack(message, outcome.status)
         if known:  # sent again while the answer was on its way
@@ -103,22 +113,22 @@ class MappingNode(SessionNode):
             yield from self._chunk(message.anchor_id, message.stamp_ns)
         yield from self._checkpoint(message.stamp_ns)
 
-    def _take(self, message: Keyframe) -> Outcome:
+    def _take(self, message: Keyframe) -> InsertionResult:
         foreign = self._foreign(message.map_uuid)
         if foreign:
-            return Outcome(foreign)
+            return InsertionResult(foreign)
         try:
-            frame = open_keyframe(message, self._lens)
+            frame = decode_keyframe(message, self._lens)
         except (UserError, ValueError) as error:
-            return Outcome(str(error))
+            return InsertionResult(str(error))
         return self._add(frame, message)
 
     def _kept(self, message: Keyframe, known: bool) -> bool:
         """Whether an accepted keyframe survives this process, as far as that was asked for."""
         keeper = self._keeper
-        if keeper is None or (known and not keeper.lacks(message.id)):
+        if keeper is None or (known and not keeper.is_unwritten(message.id)):
             return True
-        return keeper.keep(message.id, *body_of(message))
+        return keeper.write_keyframe(message.id, *encode_keyframe(message))
 
     # --- anchors and time ---
 
@@ -132,7 +142,7 @@ class MappingNode(SessionNode):
         self._tie_origin(places)
         if self._mapper.move_anchors(places) and self._mapper.keyframes:
             if self._keeper is not None:
-                self._keeper.moved(self._mapper)
+                self._keeper.anchors_moved(self._mapper)
             self._mapper.refine(self.config.mend_steps, HALF)
             for anchor in places:
                 yield from self._chunk(anchor, anchors.stamp_ns)
@@ -151,39 +161,39 @@ class MappingNode(SessionNode):
         """Time passes and no keyframe waits: steps on all keyframes, and the chunk sent longest ago."""
         if not self._mapper.keyframes:
             return
-        if self._arrivals is not None and self._arrivals.behind:
+        if self._arrivals is not None and self._arrivals.has_skipped:
             yield from self._overtaken()
         else:
             self._mapper.refine(self.config.tick_steps, FULL)
             self._page()
-        longest = self._feed.longest_due(self._mapper, self._eye)
+        longest = self._feed.oldest_due(self._mapper, self._eye)
         if longest is not None:
             yield from self._chunk(longest, tick.stamp_ns)
         yield from self._checkpoint(tick.stamp_ns)
 
     # --- what is said ---
 
-    def _show(self, message: Keyframe, outcome: Outcome, loss: float) -> Outputs:
-        view = look(self._mapper, message.id)
-        self._eye = Eye(view.T_map_camera[:3, 3], message.camera.fx_px, self.config.chunk_error_px)
+    def _show(self, message: Keyframe, outcome: InsertionResult, loss: float) -> Outputs:
+        view = render_keyframe(self._mapper, message.id)
+        self._eye = Viewpoint(view.T_map_camera[:3, 3], message.camera.fx_px, self.config.chunk_error_px)
         yield "mapping/preview", preview_message(message, view)
         status = self._status(message.stamp_ns, outcome, loss, view.psnr_db, view.depth_error_m)
         yield "mapping/status", status
 
-    def _held(self) -> dict[int, Held]:
+    def _held(self) -> dict[int, StoredKeyframe]:
         """All keyframes, those on disk too."""
-        return self._mapper.keyframes | self._mapper.resting
+        return self._mapper.keyframes | self._mapper.paged_out
 
     def _status(
-        self, stamp_ns: int, outcome: Outcome, loss: float, psnr_db: float = math.nan,
+        self, stamp_ns: int, outcome: InsertionResult, loss: float, psnr_db: float = math.nan,
         depth_error_m: float = math.nan,
     ) -> MapStatus:  # fmt: skip
         m, held = self._mapper, len(self._held())
-        gaussians = m.store.count + m.store.away_count
+        gaussians = m.store.count + m.store.paged_out_count
         self.detail = f"{held} keyframes, {gaussians} Gaussians, {psnr_db:.1f} dB" + (
             f", {len(self._refusals)} refused (last: {outcome.status})" if not outcome.ok else ""
         )
-        session = "" if self._keeper is None else self._keeper.text(m)
+        session = "" if self._keeper is None else self._keeper.status_text(m)
         self.detail += f"; {session}" if session else ""
         return MapStatus(
             stamp_ns=stamp_ns, status=outcome.status, keyframes=held, refused=len(self._refusals),
@@ -194,14 +204,14 @@ class MappingNode(SessionNode):
 
     def _chunk(self, anchor: int, stamp_ns: int, whole: bool = False) -> Outputs:
         """An anchor's Gaussians, unless viewers have all of them that show; `whole`: all detail."""
-        part = self._feed.take(self._mapper, anchor, None if whole else self._eye)
+        part = self._feed.take_update(self._mapper, anchor, None if whole else self._eye)
         if part is not None:
             yield "mapping/chunk", chunk_message(self._mapper.T_map_anchor[anchor], anchor, part, stamp_ns)
 
     def on_query_snapshot(self, parameters: dict[str, str]) -> Iterator[MapChunk]:
         """The whole map, chunk by chunk, for who comes late; `from=X,Y,Z` (m, map), `focal_px` and `error_px`
         leave out the detail that cannot be seen from there."""
-        for anchor, part in parts(self._mapper, eye_of(parameters)).items():
+        for anchor, part in chunk_snapshot(self._mapper, viewpoint_of(parameters)).items():
             yield chunk_message(self._mapper.T_map_anchor[anchor], anchor, part, 0)
 
     def on_query_state(self, parameters: dict[str, str]) -> Iterator[MapState]:
@@ -209,12 +219,12 @@ class MappingNode(SessionNode):
         if not self._mapper.keyframes:
             raise UserError("the map is empty so far")
         arrays = arrays_of(self._mapper, self._extra())
-        yield from state_messages(arrays if self._keeper is None else self._keeper.whole(arrays))
+        yield from state_messages(arrays if self._keeper is None else self._keeper.with_disk_gaussians(arrays))
 
     def drain(self) -> Outputs:
         """The map as the data left it; then, if asked for, refined; and the files asked for."""
         if self._arrivals is not None:
-            self._arrivals.rest()
+            self._arrivals.skip_waiting()
         while self._arrivals:
             yield from self._overtaken()
         if not self._mapper.keyframes:
@@ -247,10 +257,10 @@ class MappingNode(SessionNode):
         m = self._mapper
         stamps_ns, T_map_body, _ = self._poses()
         if self._keeper is not None:
-            self._keeper.done(self._keeper.checkpoint(m, self._extra(), int(stamps_ns[-1]))())
+            self._keeper.finish_checkpoint(self._keeper.checkpoint(m, self._extra(), int(stamps_ns[-1]))())
         if self.config.save is not None:
-            away = (part for anchor in list(m.store.away) for part in on_disk(m, anchor))
+            away = (part for anchor in list(m.store.paged_out) for part in disk_params(m, anchor))
             parts_map = chain([m.store.params[:, : m.store.count]], away)
-            count = m.store.count + m.store.away_count
+            count = m.store.count + m.store.paged_out_count
             write_map(self.config.save, count, parts_map, stamps_ns, T_map_body)
             log.info("map of %d Gaussians saved to %s", count, self.config.save)
