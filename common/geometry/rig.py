@@ -1,4 +1,4 @@
-"""rig.toml: the calibration of one robot, as measured or as written by `beamsplat rig`.
+"""The rig file rig.toml: camera intrinsics and sensor mounts of one robot, by hand or from `beamsplat rig`.
 
     [camera]
     width_px = 640
@@ -18,9 +18,9 @@
     xyz_m = [0.0, 0.0, 0.18]
     quat_xyzw = [0.0, 0.0, 0.0, 1.0]
 
-A mount gives its rotation as `rpy_deg` (R = Rz(yaw) Ry(pitch) Rx(roll)) or as a quaternion whose name
-tells its order. A camera's quaternion is that of the **optical** frame (x right, y down, z forward),
-as ROS gives it; its rpy is that of the housing (x forward), as one measures it.
+The rotation of a mount is `rpy_deg` (R = Rz(yaw) Ry(pitch) Rx(roll)), or a quaternion in the order that its
+name states. For a camera, the quaternion is the orientation of the **optical** frame (x right, y down, z
+forward), as in ROS, but rpy_deg is the orientation of the housing (x forward), which is easy to measure.
 """
 
 from __future__ import annotations
@@ -52,13 +52,13 @@ Quat = tuple[Finite, Finite, Finite, Finite]
 
 
 def rotation_from_rpy(roll_rad: float, pitch_rad: float, yaw_rad: float) -> np.ndarray:
-    """R [3, 3] = Rz(yaw) Ry(pitch) Rx(roll): fixed axes x, y, z in turn, as in URDF."""
+    """Return R [3, 3] = Rz(yaw) Ry(pitch) Rx(roll), rotations about fixed axes as in URDF."""
     x, y, z = np.eye(3)
     return so3_exp(yaw_rad * z) @ so3_exp(pitch_rad * y) @ so3_exp(roll_rad * x)
 
 
 def rpy_from_rotation(R: np.ndarray) -> np.ndarray:
-    """(roll, pitch, yaw) in radians of R [3, 3]; at pitch +-90 degrees roll is taken as 0."""
+    """Return (roll, pitch, yaw) in radians of R [3, 3]; at pitch +-90 degrees (gimbal lock) roll is 0."""
     pitch = float(np.arctan2(-R[2, 0], np.hypot(R[0, 0], R[1, 0])))
     if np.hypot(R[0, 0], R[1, 0]) < 1e-9:
         return np.array([0.0, pitch, np.arctan2(-R[0, 1], R[1, 1])])
@@ -66,7 +66,7 @@ def rpy_from_rotation(R: np.ndarray) -> np.ndarray:
 
 
 class Mount(Config):
-    """Where a sensor sits on the body."""
+    """Position and orientation of a sensor in the body frame."""
 
     xyz_m: tuple[Metres, Metres, Metres]
     rpy_deg: tuple[Degrees, Degrees, Degrees] | None = None
@@ -88,7 +88,11 @@ class Mount(Config):
         return self
 
     def transform(self, R_housing_sensor: np.ndarray) -> np.ndarray:
-        """`T_body_sensor` [4, 4]; `R_housing_sensor` [3, 3] applies to rpy_deg only."""
+        """Return `T_body_sensor` [4, 4].
+
+        `R_housing_sensor` [3, 3] is applied to `rpy_deg` only: a quaternion describes the sensor frame
+        itself.
+        """
         if self.rpy_deg is not None:
             R = rotation_from_rpy(*np.radians(self.rpy_deg)) @ R_housing_sensor
         elif self.quat_wxyz is not None:
@@ -99,15 +103,15 @@ class Mount(Config):
 
     @staticmethod
     def of(T_body_sensor: np.ndarray) -> Mount:
-        """Mount with the quaternion of `T_body_sensor` [4, 4]."""
+        """Return the mount of a `T_body_sensor` [4, 4], with a quaternion."""
         quat = quat_xyzw_from_matrix(T_body_sensor[:3, :3])
         return Mount(
             xyz_m=tuple(float(v) for v in T_body_sensor[:3, 3]), quat_xyzw=tuple(float(v) for v in quat)
         )
 
 
-class CameraFile(Config):
-    """[camera] of a rig file."""
+class CameraSection(Config):
+    """The [camera] section of a rig file."""
 
     width_px: Annotated[int, Field(gt=0, le=16384)]
     height_px: Annotated[int, Field(gt=0, le=16384)]
@@ -120,35 +124,40 @@ class CameraFile(Config):
     mount: Mount
 
     @model_validator(mode="after")
-    def _the_message_takes_it(self) -> CameraFile:
+    def _is_valid_message(self) -> CameraSection:
         self.model()
         return self
 
     def model(self) -> CameraModel:
-        """The camera as the message has it; refuses K of another image size and wrong coefficient counts."""
+        """Return the camera model of the `Rig` message.
+
+        Raises:
+            ValidationError: K belongs to another image size, or the number of coefficients is wrong.
+        """
         fields = self.model_dump(exclude={"mount"})
         return CameraModel(**fields, T_body_camera=self.mount.transform(R_body_camera_level))
 
 
-class LidarFile(Config):
-    """[lidar] of a rig file."""
+class LidarSection(Config):
+    """The [lidar] section of a rig file."""
 
     mount: Mount
 
     def model(self) -> LidarModel:
+        """Return the lidar model of the `Rig` message."""
         return LidarModel(T_body_lidar=self.mount.transform(np.eye(3)))
 
 
 class RigFile(Config):
-    """A rig file. A robot without a camera has no [camera]; one without a lidar no [lidar]."""
+    """A rig file. A robot without a camera has no [camera] section; one without a lidar has no [lidar]."""
 
-    camera: CameraFile | None = None
-    lidar: LidarFile | None = None
-    assumed: Annotated[tuple[str, ...], Field(max_length=64)] = ()
-    source: str = ""
+    camera: CameraSection | None = None
+    lidar: LidarSection | None = None
+    assumed: Annotated[tuple[str, ...], Field(max_length=64)] = ()  # a sentence for each assumed value
+    source: str = ""  # where the calibration comes from
 
     def message(self, stamp_ns: int, source: str) -> Rig:
-        """The calibration as it goes out on the bus."""
+        """Return the calibration as a `Rig` message."""
         return Rig(
             stamp_ns=stamp_ns,
             camera=self.camera.model() if self.camera else None,
@@ -159,28 +168,28 @@ class RigFile(Config):
 
     @staticmethod
     def of(rig: Rig) -> RigFile:
-        """The file that gives this calibration."""
+        """Return the rig file of a calibration message."""
         camera = lidar = None
         if rig.camera is not None:
             fields = {k: v for k, v in rig.camera.__dict__.items() if k != "T_body_camera"}
-            camera = CameraFile(**fields, mount=Mount.of(rig.camera.T_body_camera))
+            camera = CameraSection(**fields, mount=Mount.of(rig.camera.T_body_camera))
         if rig.lidar is not None:
-            lidar = LidarFile(mount=Mount.of(rig.lidar.T_body_lidar))
+            lidar = LidarSection(mount=Mount.of(rig.lidar.T_body_lidar))
         return RigFile(camera=camera, lidar=lidar, assumed=rig.assumed, source=rig.source)
 
 
 def load_rig(path: Path) -> RigFile:
-    """The rig file at `path`.
+    """Read and validate the rig file at `path`.
 
     Raises:
-        UserError: no such file, not TOML, unknown key, or a value that does not fit; one sentence that
-            names file, field and value.
+        UserError: the file is missing, not TOML, or has an unknown key or an invalid value; the text names
+            file, field and value.
     """
     try:
         text = Path(path).read_text()
     except (OSError, UnicodeDecodeError) as error:
         raise UserError(
-            f"{path}: cannot be read as a rig file ({reason(error)}); `beamsplat rig` writes a first one"
+            f"{path}: cannot be read as a rig file ({reason(error)}); create one with `beamsplat rig`"
         ) from error
     return parse_rig(text, str(path))
 
@@ -198,26 +207,32 @@ def check_rig_option(path: Path | None) -> RigFile | None:
 
 
 def parse_rig(text: str, where: str) -> RigFile:
-    """The rig file with this text; `where` names it in errors (see `load_rig`)."""
+    """Parse the text of a rig file (see `load_rig`); `where` names its source in errors."""
     try:
         table = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise UserError(f"{where}: not a TOML file: {reason(error)}") from error
     rig = parse(RigFile, table, where)
     if rig.camera is None and rig.lidar is None:
-        raise UserError(f"{where}: has neither [camera] nor [lidar]; give at least one")
+        raise UserError(f"{where}: has neither [camera] nor [lidar]; add at least one")
     return rig
 
 
 def write_rig(path: Path, text: str) -> None:
-    """Writes a rig file that has been formatted by `format_rig`; a reader never sees half of it."""
+    """Write the text of `format_rig` and rename the file into place: it is never incomplete."""
     partial = Path(path).with_name(Path(path).name + ".partial")
     partial.write_text(text)
     os.replace(partial, path)
 
 
 def format_rig(rig: RigFile, header: str, notes: dict[str, str]) -> str:
-    """TOML text of a rig. `notes` puts a comment above "camera", "camera.mount" and "lidar.mount"."""
+    """Return the TOML text of a rig file.
+
+    Args:
+        rig: the calibration; mounts are written as rpy_deg.
+        header: comment at the top.
+        notes: comments above the sections "camera", "camera.mount" and "lidar.mount".
+    """
     lines = [f"# {line}".rstrip() for line in header.splitlines()]
     lines += [f"source = {_toml(rig.source)}"]
     if rig.assumed:

@@ -43,7 +43,7 @@ class CameraNode(Node):
             silence_s=c.silence_s, jpeg_quality=c.jpeg_quality,
         )  # fmt: skip
 
-    def examine(self) -> None:
+    def check_resources(self) -> None:
         """Check that the rig file has a camera, and that a source that is a file exists."""
         c = self.config
         rig = check_rig_option(c.rig)
@@ -105,7 +105,7 @@ class NoCamera(Node):
         self._rig = load_rig(self.config.rig)
         self._clock = StampClock()
 
-    def examine(self) -> None:
+    def check_resources(self) -> None:
         check_rig_option(self.config.rig)
 
     def source(self) -> Iterator[SourceItem | None]:

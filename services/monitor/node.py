@@ -11,15 +11,16 @@ from pydantic import Field
 
 from beamsplat.common.config.deployment import NodeConfig
 from beamsplat.common.errors import UserError
+from beamsplat.common.files.persist import check_can_write
 from beamsplat.common.geometry.tracks import RateLimit
 from beamsplat.common.messages import FusedDepth, Health, MapStatus, Odometry, Rig
 from beamsplat.common.runtime.node import Input, Node, Output
-from beamsplat.services.monitor.depth_view import DepthView
+from beamsplat.services.monitor.depth_layer import DepthLayer
 from beamsplat.services.monitor.layout import layout
-from beamsplat.services.monitor.map_view import MapView
-from beamsplat.services.monitor.panel import NodeReport, Panel
-from beamsplat.services.monitor.scene import Look, Scene
-from beamsplat.services.monitor.screen import Screen
+from beamsplat.services.monitor.map_layer import MapLayer
+from beamsplat.services.monitor.panel import HealthPanel, NodeReport
+from beamsplat.services.monitor.rerun_writer import RerunWriter
+from beamsplat.services.monitor.scene import Scene, SceneStyle
 from beamsplat.services.monitor.web import allowed_origins, free_port, serve_page
 
 log = logging.getLogger(__name__)
@@ -55,37 +56,37 @@ class MonitorConfig(NodeConfig):
     body_size_m: tuple[float, float, float] = (0.4, 0.3, 0.25)  # length, width, height of the robot
 
 
-def _draw_rig(scene: Scene, panel: Panel, rig: Rig) -> None:
+def _draw_rig(scene: Scene, panel: HealthPanel, rig: Rig) -> None:
     if rig.camera is not None:
         size_px = (rig.camera.width_px, rig.camera.height_px)
         scene.camera(rig.camera.K, size_px, rig.camera.T_body_camera)
     if rig.lidar is not None:
         scene.lidar(rig.lidar.T_body_lidar)
     for sentence in rig.assumed:
-        panel.say(f"rig: {sentence}", scene.newest_ns, "WARN")
+        panel.log(f"rig: {sentence}", scene.newest_ns, "WARN")
 
 
-def _draw_odometry(scene: Scene, panel: Panel, m: Odometry) -> None:
+def _draw_odometry(scene: Scene, panel: HealthPanel, m: Odometry) -> None:
     scene.pose("localization", m.stamp_ns, m.T_odom_body)
     panel.status("localization", m.status, m.detail, m.stamp_ns)
 
 
-def _draw_depth(view: DepthView, panel: Panel, m: FusedDepth) -> None:
+def _draw_depth(view: DepthLayer, panel: HealthPanel, m: FusedDepth) -> None:
     view.depth(m.stamp_ns, m.depth_m)
     panel.status("fusion", "ok" if m.status == "ok" else "refused", m.status.removeprefix("ok"), m.stamp_ns)
 
 
-def _draw_status(view: MapView, panel: Panel, m: MapStatus) -> None:
-    view.figures(m.stamp_ns, m.foretold_psnr_db, m.psnr_db, m.depth_error_m)
+def _draw_status(view: MapLayer, panel: HealthPanel, m: MapStatus) -> None:
+    view.metrics(m.stamp_ns, m.foretold_psnr_db, m.psnr_db, m.depth_error_m)
     panel.status("mapping", "ok" if m.status == "ok" else "refused", m.status.removeprefix("ok"), m.stamp_ns)
 
 
-Draw = Callable[[Any, Panel, Any], None]
+Draw = Callable[[Any, HealthPanel, Any], None]
 
 # What is shown in the scene, and how: one row a topic. Its delivery never holds a publisher up.
 SCENE: dict[Input, Draw] = {
     Input("rig", "latched"): _draw_rig,
-    Input("camera/image", "latest"): lambda scene, _, m: scene.picture(
+    Input("camera/image", "latest"): lambda scene, _, m: scene.image(
         m.stamp_ns, m.data, m.encoding, (m.width_px, m.height_px), m.step_bytes
     ),
     Input("lidar/scan", "latest"): lambda scene, _, m: scene.scan(
@@ -123,8 +124,8 @@ def _handler(view: str, draw: Draw) -> Callable[[MonitorNode, Any], tuple[Output
         try:
             draw(getattr(self, view), self.panel, message)
         except ValueError as error:  # a message that is valid, but cannot be drawn
-            self.panel.say(str(error), message.stamp_ns, "WARN")
-        self.detail = self.screen.status
+            self.panel.log(str(error), message.stamp_ns, "WARN")
+        self.detail = self.writer.status
         return ()
 
     return handle
@@ -135,7 +136,7 @@ _Handlers = type(
     (),
     {
         entry.row.handler: _handler(view, draw)
-        for view, rows in (("scene", SCENE), ("depth_view", DEPTH), ("map_view", MAP))
+        for view, rows in (("scene", SCENE), ("depth_layer", DEPTH), ("map_layer", MAP))
         for entry, draw in rows.items()
     },
 )
@@ -149,23 +150,27 @@ class MonitorNode(_Handlers, Node):
     inputs = (*SCENE, *DEPTH, *MAP)
     config: MonitorConfig
 
+    def check_resources(self) -> None:
+        if self.config.save is not None:
+            check_can_write(self.config.save, "save")
+
     def configure(self) -> None:
         c = self.config
         if c.view == "none" and c.save is None:
             raise UserError('monitor: view = "none" and no save: choose a view, or a file to save')
-        self.screen = Screen()
+        self.writer = RerunWriter()
         try:
             self._open()
         except (RuntimeError, OSError) as error:
-            self.screen.close()
+            self.writer.close()
             raise UserError(f"monitor: {error}") from error
         kinds = ("image", "scan", "pose", "path", "grid", "anchors", "depth", "splats")
         limits = RateLimit({"health": 1.0, **{kind: getattr(c, f"{kind}_hz") for kind in kinds}})
-        self.panel = Panel(self.screen, limits)
-        self.scene = Scene(self.screen, limits, Look(c.path_points, c.path_step_m, c.body_size_m))
-        self.depth_view = DepthView(self.screen, limits, c.clouds)
-        self.map_view = MapView(self.screen, limits)
-        self.detail = self.screen.status
+        self.panel = HealthPanel(self.writer, limits)
+        self.scene = Scene(self.writer, limits, SceneStyle(c.path_points, c.path_step_m, c.body_size_m))
+        self.depth_layer = DepthLayer(self.writer, limits, c.clouds)
+        self.map_layer = MapLayer(self.writer, limits)
+        self.detail = self.writer.status
         log.info("%s", self.detail)
 
     def _open(self) -> None:
@@ -174,9 +179,9 @@ class MonitorNode(_Handlers, Node):
         Raises:
             RuntimeError, OSError: it cannot be; the text says what to do.
         """
-        c, screen = self.config, self.screen
+        c, writer = self.config, self.writer
         if c.save is not None:
-            screen.save(c.save, layout(), limit_mb=c.save_limit_mb, keep_free_mb=c.keep_free_mb)
+            writer.save(c.save, layout(), limit_mb=c.save_limit_mb, keep_free_mb=c.keep_free_mb)
         if c.view == "none":
             return
         grpc_port, web_port = _port(c.bind, "grpc_port", c.grpc_port), 0
@@ -184,14 +189,14 @@ class MonitorNode(_Handlers, Node):
         if c.view == "serve":
             web_port = _port("0.0.0.0", "web_port", c.web_port)
             origins = allowed_origins(c.bind, web_port)
-        address = screen.serve(
+        address = writer.serve(
             layout(), bind=c.bind, port=grpc_port, origins=origins, memory_mb=c.viewer_memory_mb
         )
         if c.view == "serve":
-            screen.notes.append(f"open {serve_page(c.bind, web_port, grpc_port)}")
+            writer.notes.append(f"open {serve_page(c.bind, web_port, grpc_port)}")
         else:
-            screen.spawn(address, c.viewer_memory_mb)
-            screen.notes.append(f"viewer at {address}")
+            writer.spawn(address, c.viewer_memory_mb)
+            writer.notes.append(f"viewer at {address}")
 
     def on_health(self, health: Health) -> None:
         """A row of the table, and a point of each curve."""
@@ -206,18 +211,18 @@ class MonitorNode(_Handlers, Node):
             rss_mb=health.rss_mb, cpu_percent=health.cpu_percent,
         )  # fmt: skip
         self.panel.report(report, self.scene.newest_ns)
-        self.detail = self.screen.status
+        self.detail = self.writer.status
 
     def drain(self) -> tuple[Output, ...]:
         self.scene.finish()
-        self.map_view.finish()
-        self.screen.flush()
+        self.map_layer.finish()
+        self.writer.flush()
         return ()
 
     def close(self) -> None:
-        screen = getattr(self, "screen", None)
-        if screen is not None:
-            screen.close()
+        writer = getattr(self, "writer", None)
+        if writer is not None:
+            writer.close()
 
 
 def _port(bind: str, option: str, port: int) -> int:

@@ -12,6 +12,7 @@ from typing import Any
 from mcap.writer import CompressionType
 
 from beamsplat.common.errors import UserError
+from beamsplat.common.files.persist import check_can_write
 from beamsplat.common.messages import Health, Message
 from beamsplat.common.messages.header import Header, local_clock_id
 from beamsplat.common.recording import RecordingError, RecordingWriter
@@ -62,6 +63,9 @@ class RecorderNode(_Handlers, Node):
             sync=self.config.sync,
         )
         log.info("recording to %s", self.writer.path)
+
+    def check_resources(self) -> None:
+        check_can_write(self.config.out, "out")
 
     def on_header(self, header: Header) -> None:
         self._header = header

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator
 
+from beamsplat.common.geometry.rig import check_rig_option
 from beamsplat.common.runtime.node import Node, SourceItem
 from beamsplat.services.replay.config import ReplayConfig
 from beamsplat.services.replay.options import SourceOptions
@@ -37,6 +38,7 @@ class ReplayNode(Node):
         self._source = source
 
     def check_resources(self) -> None:
+        check_rig_option(self.config.rig)
         self.configure()
         self.close()
 

@@ -11,6 +11,7 @@ from collections.abc import Iterator
 import zenoh
 import zenoh.ext
 
+from beamsplat.common.geometry.rig import check_rig_option
 from beamsplat.common.recording.ros_types import typestore
 from beamsplat.common.runtime.clock import StampClock
 from beamsplat.common.runtime.node import Node, SourceItem
@@ -57,6 +58,9 @@ class Ros2Node(Node):
         self._own: set[bytes] = set()  # publishers of /tf that are ours
         self._session = open_session((c.router,))
         self._listen()
+
+    def check_resources(self) -> None:
+        check_rig_option(self.config.rig)
 
     def source(self) -> Iterator[SourceItem | None]:
         """What the robot's sensors say; None while they say nothing."""

@@ -52,7 +52,7 @@ def check(file: FileArgument, set_: SetOption = None) -> None:
     if not any(fault.fatal for fault in found):
         found += unusable(deployment)
     for fault in found:
-        _say(fault.text, "red" if fault.fatal else "yellow")
+        _say(f"{file}: {fault.text}", "red" if fault.fatal else "yellow")
     if any(fault.fatal for fault in found):
         raise typer.Exit(2)
     print(f"{file}: {len(deployment.nodes)} nodes, fits together")

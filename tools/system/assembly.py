@@ -11,6 +11,7 @@ from beamsplat.common.plugins import is_class_path
 from beamsplat.common.runtime.node import Node
 from beamsplat.common.runtime.registry import Service, make_node, node_class_of
 from beamsplat.common.security.access_control import MASTERS
+from beamsplat.common.security.keys import Keys, check_endpoint, is_secure
 from beamsplat.common.topics import TOPICS
 from beamsplat.services.nodes import NODES
 
@@ -99,7 +100,25 @@ def unusable(
             try:
                 build_node(deployment, name, table).check_resources()
             except UserError as error:
-                found.append(Fault(f"{name}: {error}"))
+                found.append(Fault(f"nodes.{name}: {error}"))
+    return found + [Fault(text) for text in _link_faults(deployment, names)]
+
+
+def _link_faults(deployment: Deployment, names: tuple[str, ...] | None) -> list[str]:
+    """Return why links to other hosts would be refused: no certificates, or keys that are missing."""
+    endpoints: tuple[str, ...] = ()
+    if names is None or "router" in names:
+        endpoints = (*deployment.router.listen, *deployment.router.connect)
+    if "uplink" in (names or deployment.nodes):
+        endpoints += (str(deployment.nodes.get("uplink", {}).get("edge", "")),)
+    found = []
+    try:
+        for endpoint in filter(None, endpoints):
+            check_endpoint(endpoint, deployment.security)
+        if any(map(is_secure, endpoints)):
+            Keys.of(deployment.security)
+    except UserError as error:
+        found.append(str(error))
     return found
 
 

@@ -12,6 +12,7 @@ from pydantic import Field
 
 from beamsplat.common.config.deployment import NodeConfig
 from beamsplat.common.errors import UserError, reason
+from beamsplat.common.files.persist import check_can_write
 from beamsplat.common.geometry.transforms import se2_to_se3, se3_to_se2
 from beamsplat.common.messages import (
     Anchors,
@@ -59,6 +60,16 @@ class LidarLocalization(Node):
         "localization/grid",
     )  # fmt: skip
 
+    def check_resources(self) -> None:
+        """Check that the state to resume can be read, and that the new one can be written."""
+        if self.config.resume is not None:
+            try:
+                read_manifest(self.config.resume / MANIFEST)
+            except MapStateError as error:
+                raise UserError(f"resume = {error}") from error
+        if self.config.save is not None:
+            check_can_write(self.config.save, "save")
+
     def configure(self) -> None:
         self._slam: LidarSlam | None = None
         self._said: np.ndarray | None = None  # T_map_odom as last published
@@ -68,8 +79,8 @@ class LidarLocalization(Node):
         self._named = ""  # the map whose name was said
         self._kept_ns: int | None = None  # when the last state was kept for a restart
         self._keeping = False
-        self._spare = None if self.home is None else self.home.run_dir / "localization"
-        if self._spare is not None and not self.home.resume:  # of another drive
+        self._spare = None if self.live_settings is None else self.live_settings.run_dir / "localization"
+        if self._spare is not None and not self.live_settings.resume:  # of another drive
             shutil.rmtree(self._spare, ignore_errors=True)
         if self.config.resume is not None:
             try:
@@ -78,7 +89,7 @@ class LidarLocalization(Node):
                 raise UserError(f"localization.resume: {error}") from error
 
     def on_rig(self, rig: Rig) -> Outputs:
-        """Where the lidar sits. A second calibration would bend the map: it is refused, and said."""
+        """Where the lidar sits. A second calibration would bend the map: it is rejected, and said."""
         if rig.lidar is None:
             log.error("the calibration has no lidar: scans cannot be used")
         elif self._slam is None:
@@ -101,7 +112,7 @@ class LidarLocalization(Node):
             log.error("begins a new map: %s", error)
             return LidarSlam(LidarSlamSettings(), T_body_lidar)
         if crashed:
-            slam.back.skip_submaps(_LOST_SUBMAPS)
+            slam.pose_graph.reserve_submap_ids(_LOST_SUBMAPS)
         log.info("goes on from %s: %d submaps", folder, len(slam.anchors()))
         return slam
 
@@ -122,8 +133,8 @@ class LidarLocalization(Node):
         self._stamp_ns = scan.stamp_ns
         yield from self._name_map()
         yield "localization/odometry", _odometry(result)
-        yield "localization/movers", MovingBeams(stamp_ns=scan.stamp_ns, moving=result.moving)
-        yield from self._correction(scan.stamp_ns, result.T_map_odom)
+        yield "localization/movers", MovingBeams(stamp_ns=scan.stamp_ns, moving=result.dynamic)
+        yield from self._correction(scan.stamp_ns, result.pose_map_odom)
         if result.job is not None:
             # Its result is due before the scan with number `apply_at_scan`; the next one is `scans`.
             after = result.job.apply_at_scan - self._slam.scans + 1
@@ -174,16 +185,16 @@ class LidarLocalization(Node):
             log.info("map and state saved to %s", self.config.save)
 
     def _map_moved(self) -> Outputs:
-        yield from self._correction(self._stamp_ns, self._slam.back.T_map_odom)
+        yield from self._correction(self._stamp_ns, self._slam.pose_graph.pose_map_odom)
         yield from self._anchors()
 
     def _name_map(self) -> Outputs:
         """Which map it is, before the first pose in it: what hangs on anchors of two must not mix."""
-        if self._slam.back.uuid != self._named:
+        if self._slam.pose_graph.uuid != self._named:
             yield from self._anchors()
 
     def _anchors(self) -> Outputs:
-        self._named = self._slam.back.uuid
+        self._named = self._slam.pose_graph.uuid
         anchors = self._slam.anchors()
         T_map_anchor = se2_to_se3(np.array(list(anchors.values())).reshape(-1, 3))
         yield (
@@ -191,18 +202,18 @@ class LidarLocalization(Node):
             Anchors(
                 stamp_ns=self._stamp_ns, anchor_ids=np.array(list(anchors), dtype=np.int64),
                 T_map_anchor=T_map_anchor, optimisation=self._optimisations,
-                map_uuid=self._slam.back.uuid,
+                map_uuid=self._slam.pose_graph.uuid,
             ),
         )  # fmt: skip
 
-    def _correction(self, stamp_ns: int, T_map_odom: np.ndarray) -> Outputs:
+    def _correction(self, stamp_ns: int, pose_map_odom: np.ndarray) -> Outputs:
         """Says `T_map_odom` when it has changed: it is latched."""
-        if self._said is None or not np.array_equal(self._said, T_map_odom):
-            self._said = T_map_odom.copy()
+        if self._said is None or not np.array_equal(self._said, pose_map_odom):
+            self._said = pose_map_odom.copy()
             yield (
                 "localization/correction",
                 Correction(
-                    stamp_ns=stamp_ns, T_map_odom=se2_to_se3(T_map_odom), optimisation=self._optimisations
+                    stamp_ns=stamp_ns, T_map_odom=se2_to_se3(pose_map_odom), optimisation=self._optimisations
                 ),
             )
 
@@ -238,7 +249,7 @@ def _changed(before: OccupancyGrid | None, grid: OccupancyGrid) -> tuple[int, in
 def _odometry(result: ScanResult) -> Odometry:
     status, _, detail = result.status.partition(": ")
     return Odometry(
-        stamp_ns=result.stamp_ns, T_odom_body=se2_to_se3(result.T_odom_body), covariance=result.covariance,
+        stamp_ns=result.stamp_ns, T_odom_body=se2_to_se3(result.pose_odom_body), covariance=result.covariance,
         status=status, detail=detail,
     )  # fmt: skip
 
