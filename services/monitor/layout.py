@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import rerun.blueprint as rrb
 
-from beamsplat.services.monitor.depth_view import CLOUD, DEPTH
-from beamsplat.services.monitor.map_view import PLOTS as MAP_PLOTS
-from beamsplat.services.monitor.map_view import RENDER, SPLATS
+from beamsplat.services.monitor.depth_layer import CLOUD, DEPTH
+from beamsplat.services.monitor.map_layer import PLOTS as MAP_PLOTS
+from beamsplat.services.monitor.map_layer import RENDER, SPLATS
 from beamsplat.services.monitor.panel import PLOTS
+from beamsplat.services.monitor.rerun_writer import TIMELINE
 from beamsplat.services.monitor.scene import BODY, CAMERA, SCAN, WORLD
-from beamsplat.services.monitor.screen import TIMELINE
 
 
 def layout() -> rrb.Blueprint:

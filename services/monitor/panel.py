@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import rerun as rr
 
 from beamsplat.common.geometry.tracks import RateLimit
-from beamsplat.services.monitor.screen import Screen
+from beamsplat.services.monitor.rerun_writer import RerunWriter
 
 # quantity -> how its plot is called
 PLOTS = {
@@ -50,11 +50,11 @@ class NodeReport:
     cpu_percent: float
 
 
-class Panel:
+class HealthPanel:
     """All nodes' reports, newest and one before."""
 
-    def __init__(self, screen: Screen, limits: RateLimit) -> None:
-        self._screen = screen
+    def __init__(self, writer: RerunWriter, limits: RateLimit) -> None:
+        self._writer = writer
         self._limits = limits
         self._reports: dict[str, NodeReport] = {}
         self._statuses: dict[str, str] = {}
@@ -63,9 +63,9 @@ class Panel:
         """Takes a report in; `stamp_ns` is the newest measurement's, None before the first."""
         old = self._reports.get(new.node)
         if old is None:
-            self._introduce(new.node)
+            self._declare_plots(new.node)
         if old is not None and old.instance != new.instance:
-            self.say(f"{new.node} was started again", stamp_ns, "WARN")
+            self.log(f"{new.node} was started again", stamp_ns, "WARN")
             old = None
         self._reports[new.node] = new
         curves = {
@@ -76,18 +76,18 @@ class Panel:
             "cpu_percent": new.cpu_percent,
         }
         for quantity, value in curves.items():
-            self._screen.log(f"plots/{quantity}/{new.node}", rr.Scalars(value), stamp_ns=stamp_ns)
+            self._writer.log(f"plots/{quantity}/{new.node}", rr.Scalars(value), stamp_ns=stamp_ns)
         if old is None or old.state != new.state:
-            self._screen.log(f"health/state/{new.node}", rr.StateChange(state=new.state), stamp_ns=stamp_ns)
-            self.say(f"{new.node} is {new.state}", stamp_ns)
+            self._writer.log(f"health/state/{new.node}", rr.StateChange(state=new.state), stamp_ns=stamp_ns)
+            self.log(f"{new.node} is {new.state}", stamp_ns)
         if new.detail and (old is None or old.detail != new.detail):
-            self.say(f"{new.node}: {new.detail}", stamp_ns)
+            self.log(f"{new.node}: {new.detail}", stamp_ns)
         for count, text in (("lost", "lost"), ("broken", "could not read")):
             more = getattr(new, count) - (0 if old is None else getattr(old, count))
             if more > 0:
-                self.say(f"{new.node} {text} {more} messages", stamp_ns, "WARN")
+                self.log(f"{new.node} {text} {more} messages", stamp_ns, "WARN")
         if self._limits.due("health", new.wall_ns):
-            self._screen.log(
+            self._writer.log(
                 "health/table",
                 rr.TextDocument(self._table(), media_type=rr.MediaType.MARKDOWN),
                 stamp_ns=stamp_ns,
@@ -98,18 +98,18 @@ class Panel:
         if self._statuses.get(path) == status:
             return
         self._statuses[path] = status
-        self._screen.log(f"health/state/{path}", rr.StateChange(state=status), stamp_ns=stamp_ns)
+        self._writer.log(f"health/state/{path}", rr.StateChange(state=status), stamp_ns=stamp_ns)
         level = "INFO" if status == "ok" else "WARN"
-        self.say(f"{path}: {status}{f' ({detail})' if detail and status != 'ok' else ''}", stamp_ns, level)
+        self.log(f"{path}: {status}{f' ({detail})' if detail and status != 'ok' else ''}", stamp_ns, level)
 
-    def say(self, text: str, stamp_ns: int | None, level: str = "INFO") -> None:
+    def log(self, text: str, stamp_ns: int | None, level: str = "INFO") -> None:
         """One line in the log."""
-        self._screen.log("log", rr.TextLog(text, level=level), stamp_ns=stamp_ns)
+        self._writer.log("log", rr.TextLog(text, level=level), stamp_ns=stamp_ns)
 
-    def _introduce(self, node: str) -> None:
+    def _declare_plots(self, node: str) -> None:
         for quantity in PLOTS:
-            self._screen.log(f"plots/{quantity}/{node}", rr.SeriesLines(names=node), static=True)
-        self._screen.log(
+            self._writer.log(f"plots/{quantity}/{node}", rr.SeriesLines(names=node), static=True)
+        self._writer.log(
             f"health/state/{node}",
             rr.StateConfiguration(values=list(_STATES), labels=list(_STATES), colors=list(_STATES.values())),
             static=True,

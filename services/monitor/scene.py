@@ -20,7 +20,7 @@ import rerun as rr
 
 from beamsplat.common.geometry.tracks import BoundedPath, PoseBuffer, RateLimit, scan_points, sweep_to_world
 from beamsplat.common.geometry.transforms import inverse, quat_xyzw_from_matrix, transform_points
-from beamsplat.services.monitor.screen import Screen
+from beamsplat.services.monitor.rerun_writer import RerunWriter
 
 WORLD = "map"
 BODY = f"{WORLD}/odom/body"
@@ -38,8 +38,8 @@ _SCAN = (255, 70, 90)
 _ANCHOR = (200, 140, 255)
 _FRUSTUM_M = 0.5
 _WAITING_SWEEPS = 3
-_LOOPED_NS = 5_000_000_000  # stamps that fall back further are of another lap
-_RAW = {
+_LOOP_RESTART_NS = 5_000_000_000  # stamps that fall back further are of another lap
+_RAW_FORMATS = {
     "rgb8": (rr.ColorModel.RGB, 3),
     "bgr8": (rr.ColorModel.BGR, 3),
     "rgba8": (rr.ColorModel.RGBA, 4),
@@ -49,7 +49,7 @@ _RAW = {
 
 
 @dataclass(frozen=True)
-class Look:
+class SceneStyle:
     """How things are drawn."""
 
     path_points: int = 2000
@@ -70,26 +70,26 @@ class _Sweep:
 class Scene:
     """What is known of the robot and its map, and how it looks."""
 
-    def __init__(self, screen: Screen, limits: RateLimit, look: Look) -> None:
-        self._screen = screen
+    def __init__(self, writer: RerunWriter, limits: RateLimit, style: SceneStyle) -> None:
+        self._writer = writer
         self._limits = limits
         self._poses = {name: PoseBuffer() for name in SOURCES}
         paths = (*(f"{WORLD}/path/{name}" for name in SOURCES), _SMOOTH)
-        self._paths = {entity: BoundedPath(look.path_points, look.path_step_m) for entity in paths}
+        self._paths = {entity: BoundedPath(style.path_points, style.path_step_m) for entity in paths}
         self._T_map_odom = np.eye(4)
         self._T_map_wheel: np.ndarray | None = None
         self._T_body_lidar = np.eye(4)
         self._sweeps: deque[_Sweep] = deque()
         self.newest_ns: int | None = None  # of all measurements
-        screen.log(WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-        half = np.array(look.body_size_m) / 2.0
-        screen.log(
+        writer.log(WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        half = np.array(style.body_size_m) / 2.0
+        writer.log(
             f"{BODY}/shape",
             rr.Boxes3D(half_sizes=half, centers=[0.0, 0.0, half[2]], colors=_ROBOT),
             static=True,
         )
         heading = rr.Arrows3D(origins=[half[0], 0.0, half[2]], vectors=[0.25, 0.0, 0.0], colors=_ROBOT)
-        screen.log(f"{BODY}/heading", heading, static=True)
+        writer.log(f"{BODY}/heading", heading, static=True)
 
     # --- calibration ---
 
@@ -100,7 +100,7 @@ class Scene:
         T_body_camera: np.ndarray,
     ) -> None:
         """The camera's place on the robot, and its frustum (without lens distortion)."""
-        self._screen.log(
+        self._writer.log(
             CAMERA,
             _transform(T_body_camera),
             rr.Pinhole(
@@ -116,16 +116,16 @@ class Scene:
 
     # --- measurements ---
 
-    def picture(
+    def image(
         self,
         stamp_ns: int,
         data: np.ndarray,  # uint8 [B]
-        encoding: str,  # jpeg, png, yuv422_yuy2, or one of `_RAW`
+        encoding: str,  # jpeg, png, yuv422_yuy2, or one of `_RAW_FORMATS`
         size_px: tuple[int, int],  # width, height
         step_bytes: int,  # of a raw row; 0 = no padding
     ) -> None:
         """A camera picture as it came: compressed ones stay so."""
-        self._saw(stamp_ns)
+        self._update_newest(stamp_ns)
         if not self._limits.due("image", stamp_ns):
             return
         width, height = size_px
@@ -137,13 +137,13 @@ class Scene:
                 bytes=rows.tobytes(), width=width, height=height, pixel_format=rr.PixelFormat.YUY2
             )
         else:
-            model, channels = _RAW[encoding]
-            rows = _rows(data, height, width * channels, step_bytes)
+            model, sinks = _RAW_FORMATS[encoding]
+            rows = _rows(data, height, width * sinks, step_bytes)
             drawing = rr.Image(
                 bytes=rows.tobytes(), width=width, height=height, color_model=model,
                 datatype=rr.ChannelDatatype.U8,
             )  # fmt: skip
-        self._screen.log(f"{CAMERA}/image", drawing, stamp_ns=stamp_ns)
+        self._writer.log(f"{CAMERA}/image", drawing, stamp_ns=stamp_ns)
 
     def scan(
         self,
@@ -155,7 +155,7 @@ class Scene:
         range_limits_m: tuple[float, float],
     ) -> None:
         """A sweep of the lidar: drawn in the map as soon as it is known where the robot was."""
-        self._saw(stamp_ns)
+        self._update_newest(stamp_ns)
         if not self._limits.due("scan", stamp_ns):
             return
         points, beams = scan_points(ranges_m, angle_min_rad, angle_increment_rad, range_limits_m)
@@ -168,39 +168,41 @@ class Scene:
             )
         )
         # The pose at a sweep's end is found from the next one; whoever needs longer gets the last known.
-        if len(self._sweeps) > _WAITING_SWEEPS or self._leader() is None:
+        if len(self._sweeps) > _WAITING_SWEEPS or self._best_source() is None:
             self._draw_sweep(self._sweeps.popleft())
 
     def pose(self, source: str, stamp_ns: int, T_source_body: np.ndarray) -> None:
         """The robot's pose by one of `SOURCES`: localization in odom, external in map, wheel in its own
         drifting frame, which is laid on the map where the robot was first known to be."""
-        self._saw(stamp_ns)
+        self._update_newest(stamp_ns)
         self._poses[source].add(stamp_ns, T_source_body)
-        leader = self._leader()
+        best_source = self._best_source()
         T_map_body = self._T_map_source(source) @ T_source_body
         lift_m = np.array([0.0, 0.0, _LIFT_M[source]])
-        self._extend(f"{WORLD}/path/{source}", stamp_ns, T_map_body[:3, 3] + lift_m, _COLOURS[source])
+        self._extend_path(f"{WORLD}/path/{source}", stamp_ns, T_map_body[:3, 3] + lift_m, _COLOURS[source])
         if source == "localization":
-            self._extend(_SMOOTH, stamp_ns, T_source_body[:3, 3], _SMOOTH_COLOUR)
-        if source != leader:
+            self._extend_path(_SMOOTH, stamp_ns, T_source_body[:3, 3], _SMOOTH_COLOUR)
+        if source != best_source:
             return
         if self._limits.due("pose", stamp_ns, source):
             T_odom_body = inverse(self._T_map_odom) @ T_map_body
-            self._screen.log(BODY, _transform(T_odom_body), stamp_ns=stamp_ns)
+            self._writer.log(BODY, _transform(T_odom_body), stamp_ns=stamp_ns)
         while self._sweeps and stamp_ns >= self._sweeps[0].end_ns:
             self._draw_sweep(self._sweeps.popleft())
 
-    def _extend(self, entity: str, stamp_ns: int, point_m: np.ndarray, colour: tuple[int, int, int]) -> None:
+    def _extend_path(
+        self, entity: str, stamp_ns: int, point_m: np.ndarray, colour: tuple[int, int, int]
+    ) -> None:
         path = self._paths[entity]
         path.add(point_m)
         if self._limits.due("path", stamp_ns, entity):
             strip = rr.LineStrips3D([path.points_m], colors=colour, radii=rr.Radius.ui_points(1.5))
-            self._screen.log(entity, strip, stamp_ns=stamp_ns)
+            self._writer.log(entity, strip, stamp_ns=stamp_ns)
 
     def correction(self, stamp_ns: int, T_map_odom: np.ndarray) -> None:
         """Where the smooth frame lies in the map."""
         self._T_map_odom = T_map_odom
-        self._screen.log(f"{WORLD}/odom", _transform(T_map_odom), stamp_ns=self._not_before(stamp_ns))
+        self._writer.log(f"{WORLD}/odom", _transform(T_map_odom), stamp_ns=self._not_before(stamp_ns))
 
     # --- the map ---
 
@@ -212,7 +214,7 @@ class Scene:
             origins=T_map_anchor[:, :3, 3], vectors=0.3 * T_map_anchor[:, :3, 0],
             labels=[str(i) for i in anchor_ids], show_labels=False, colors=_ANCHOR,
         )  # fmt: skip
-        self._screen.log(f"{WORLD}/anchors", arrows, stamp_ns=stamp_ns)
+        self._writer.log(f"{WORLD}/anchors", arrows, stamp_ns=stamp_ns)
 
     def grid(
         self,
@@ -240,7 +242,7 @@ class Scene:
             translation=[corner_m[0], corner_m[1], -0.01],  # just below what stands on the floor
             colormap=rr.components.Colormap.RvizMap,
         )
-        self._screen.log(f"{WORLD}/grid", drawing, stamp_ns=stamp_ns)
+        self._writer.log(f"{WORLD}/grid", drawing, stamp_ns=stamp_ns)
 
     def finish(self) -> None:
         """Nothing more will come: draws what still waits."""
@@ -249,12 +251,12 @@ class Scene:
 
     # --- where and when things are ---
 
-    def _saw(self, stamp_ns: int) -> None:
+    def _update_newest(self, stamp_ns: int) -> None:
         """Keeps the time of the newest measurement; a recording that loops takes it back."""
-        if self.newest_ns is None or not self.newest_ns - _LOOPED_NS < stamp_ns <= self.newest_ns:
+        if self.newest_ns is None or not self.newest_ns - _LOOP_RESTART_NS < stamp_ns <= self.newest_ns:
             self.newest_ns = stamp_ns
 
-    def _leader(self) -> str | None:
+    def _best_source(self) -> str | None:
         return next((name for name in SOURCES if self._poses[name]), None)
 
     def _T_map_source(self, source: str) -> np.ndarray:
@@ -272,16 +274,16 @@ class Scene:
         return self._T_map_wheel
 
     def _draw_sweep(self, sweep: _Sweep) -> None:
-        leader = self._leader()
+        best_source = self._best_source()
         ends = [np.eye(4), np.eye(4)]
-        if leader is not None:
-            ends = [self._poses[leader].at(t) for t in (sweep.stamp_ns, sweep.end_ns)]
+        if best_source is not None:
+            ends = [self._poses[best_source].at(t) for t in (sweep.stamp_ns, sweep.end_ns)]
             if ends[0] is None or ends[1] is None:
                 return  # no pose of that time: nowhere to draw it
-            ends = [self._T_map_source(leader) @ T for T in ends]
+            ends = [self._T_map_source(best_source) @ T for T in ends]
         points_map = sweep_to_world(sweep.points_body, sweep.share, *ends)
         points = rr.Points3D(points_map.astype(np.float32), colors=_SCAN, radii=rr.Radius.ui_points(2.0))
-        self._screen.log(SCAN, points, stamp_ns=sweep.stamp_ns)
+        self._writer.log(SCAN, points, stamp_ns=sweep.stamp_ns)
 
     def _not_before(self, stamp_ns: int) -> int:
         """Optimisations carry the stamp of what they were computed from; they hold from now on."""

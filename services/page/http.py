@@ -15,15 +15,15 @@ MAX_HEAD_BYTES = 16 * 1024
 MAX_BODY_BYTES = 16 * 1024
 IDLE_S = 60.0  # a connection without a request is closed
 # Nothing from elsewhere, nothing inline, in nobody's frame; no content is guessed.
-SAFETY = (
+SECURITY_HEADERS = (
     b"Content-Security-Policy: default-src 'self'; frame-ancestors 'none'; base-uri 'none'\r\n"
     b"X-Content-Type-Options: nosniff\r\nReferrer-Policy: no-referrer\r\n"
     b"Cross-Origin-Resource-Policy: same-origin\r\n"
 )
 
 
-class Refused(ValueError):
-    """A request that gets an error as its reply."""
+class HttpError(ValueError):
+    """A request that gets an error as its make_response."""
 
     def __init__(self, status: HTTPStatus, text: str) -> None:
         super().__init__(text)
@@ -31,7 +31,7 @@ class Refused(ValueError):
 
 
 @dataclass(frozen=True)
-class Request:
+class HttpRequest:
     """One request; header names are in lower case."""
 
     method: str
@@ -40,11 +40,11 @@ class Request:
     body: bytes
 
 
-async def read_request(reader: asyncio.StreamReader) -> Request | None:
+async def read_request(reader: asyncio.StreamReader) -> HttpRequest | None:
     """The next request of a connection; None where it has ended or nothing came for too long.
 
     Raises:
-        Refused: not HTTP as browsers speak it, or too long.
+        HttpError: not HTTP as browsers speak it, or too long.
     """
     try:
         async with asyncio.timeout(IDLE_S):
@@ -52,55 +52,55 @@ async def read_request(reader: asyncio.StreamReader) -> Request | None:
             request = _parse(head)
             size = _body_bytes(request.headers)
             if size:
-                request = Request(
+                request = HttpRequest(
                     request.method, request.path, request.headers, await reader.readexactly(size)
                 )
             return request
     except asyncio.LimitOverrunError as error:
-        raise Refused(HTTPStatus.REQUEST_HEADER_FIELDS_TOO_LARGE, "head too long") from error
+        raise HttpError(HTTPStatus.REQUEST_HEADER_FIELDS_TOO_LARGE, "head too long") from error
     except (asyncio.IncompleteReadError, TimeoutError, ConnectionError):
         return None
 
 
-def _parse(head: bytes) -> Request:
+def _parse(head: bytes) -> HttpRequest:
     first, *lines = head.decode("latin-1").split("\r\n")
     parts = first.split(" ")
     if len(parts) != 3 or not parts[2].startswith("HTTP/1."):
-        raise Refused(HTTPStatus.BAD_REQUEST, "no HTTP/1 request")
+        raise HttpError(HTTPStatus.BAD_REQUEST, "no HTTP/1 request")
     headers = {}
     for line in lines:
         name, colon, value = line.partition(":")
         if colon:
             headers[name.strip().lower()] = value.strip()
-    return Request(parts[0], parts[1].partition("?")[0], headers, b"")
+    return HttpRequest(parts[0], parts[1].partition("?")[0], headers, b"")
 
 
 def _body_bytes(headers: dict[str, str]) -> int:
     if "transfer-encoding" in headers:
-        raise Refused(HTTPStatus.LENGTH_REQUIRED, "a body must tell its length")
+        raise HttpError(HTTPStatus.LENGTH_REQUIRED, "a body must tell its length")
     text = headers.get("content-length", "0")
     if not (text.isascii() and text.isdigit()):
-        raise Refused(HTTPStatus.BAD_REQUEST, "no such length")
+        raise HttpError(HTTPStatus.BAD_REQUEST, "no such length")
     if len(text) > 9 or int(text) > MAX_BODY_BYTES:
-        raise Refused(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"more than {MAX_BODY_BYTES} bytes")
+        raise HttpError(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"more than {MAX_BODY_BYTES} bytes")
     return int(text)
 
 
-def reply(status: HTTPStatus, content_type: str, body: bytes, extra: bytes = b"") -> bytes:
-    """A whole reply; nothing of it is kept by caches."""
+def make_response(status: HTTPStatus, content_type: str, body: bytes, extra: bytes = b"") -> bytes:
+    """A whole make_response; nothing of it is kept by caches."""
     return (
         f"HTTP/1.1 {status.value} {status.phrase}\r\nContent-Type: {content_type}\r\n"
         f"Content-Length: {len(body)}\r\nCache-Control: no-store\r\n"
-    ).encode() + SAFETY + extra + b"\r\n" + body  # fmt: skip
+    ).encode() + SECURITY_HEADERS + extra + b"\r\n" + body  # fmt: skip
 
 
 STREAM_HEAD = (
     b"HTTP/1.1 200 OK\r\nContent-Type: text/event-stream\r\nCache-Control: no-store\r\n"
-    + SAFETY + b"Connection: close\r\n\r\n"
+    + SECURITY_HEADERS + b"Connection: close\r\n\r\n"
 )  # fmt: skip
 
 
-def is_own_name(host: str, own: frozenset[str]) -> bool:
+def is_own_host(host: str, own: frozenset[str]) -> bool:
     """Whether a Host header names this machine: by address, as localhost, or by one of its `own` names.
 
     A page from elsewhere can point a name of its own at this machine (DNS rebinding), and would then be
@@ -120,7 +120,7 @@ def is_own_name(host: str, own: frozenset[str]) -> bool:
     return True
 
 
-def own_names() -> frozenset[str]:
+def own_host_names() -> frozenset[str]:
     """The names by which browsers may ask for this machine, besides its addresses."""
     host = socket.gethostname().lower()
     return frozenset({"localhost", host, f"{host}.local", socket.getfqdn().lower()})

@@ -15,59 +15,59 @@ import numpy as np
 
 from beamsplat.common.geometry.tracks import BoundedPath, PoseBuffer, scan_points
 from beamsplat.common.geometry.transforms import transform_points, yaw_of
-from beamsplat.common.runtime.health import HealthBook, NodeRecord
-from beamsplat.services.page.pictures import Picture
+from beamsplat.common.runtime.health import HealthRecords, NodeRecord
+from beamsplat.services.page.images import LatestImage
 
 # Who is believed about the robot's pose, best first.
 SOURCES = ("localization", "external", "wheel")
-PICTURES = ("camera", "depth", "render", "map")
+IMAGE_NAMES = ("camera", "depth", "render", "map")
 _PATH_POINTS, _PATH_STEP_M = 400, 0.05
 _SCAN_POINTS = 360
-_SWEEPS = 30  # wait for the pose of their time
-_SCALES = 120  # seconds of the chart
+_MAX_WAITING_SCANS = 30  # wait for the pose of their time
+_MAX_SCALES = 120  # seconds of the chart
 _LOG_LINES = 60
 
 
-class View:
+class PageState:
     """The newest of everything; every method may be called from any thread."""
 
     def __init__(self, picture_hz: float, map_hz: float) -> None:
         self._lock = threading.Lock()
-        self._book = HealthBook()
-        self._silent: set[str] = set()
+        self._health = HealthRecords()
+        self._silent_nodes: set[str] = set()
         self._log: deque[dict[str, Any]] = deque(maxlen=_LOG_LINES)
-        self._words: dict[str, dict[str, Any]] = {}
-        self._scales: deque[tuple[float, float, float]] = deque(maxlen=_SCALES)
+        self._services: dict[str, dict[str, Any]] = {}
+        self._scales: deque[tuple[float, float, float]] = deque(maxlen=_MAX_SCALES)
         self._T_body_lidar = np.eye(4)
         self._T_map_odom = np.eye(4)
-        self._leader = len(SOURCES)
+        self._source_rank = len(SOURCES)
         self._poses = PoseBuffer()  # of the leader, in the map
-        self._posed = 0.0
+        self._received_s = 0.0
         self._path = BoundedPath(_PATH_POINTS, _PATH_STEP_M)
-        self._sweeps: deque[tuple[int, np.ndarray]] = deque(maxlen=_SWEEPS)
-        self.pictures = {name: Picture(map_hz if name == "map" else picture_hz) for name in PICTURES}
+        self._scans: deque[tuple[int, np.ndarray]] = deque(maxlen=_MAX_WAITING_SCANS)
+        self.images = {name: LatestImage(map_hz if name == "map" else picture_hz) for name in IMAGE_NAMES}
 
     # --- told by the node ---
 
     def health(self, health: Any) -> None:
         """What a node says of itself (a `Health`)."""
         with self._lock:
-            before = self._book.records.get(health.node)
+            before = self._health.records.get(health.node)
             instance, state = (before.health.instance, before.health.state) if before else ("", "")
-            self._book.take(health)
-            self._silent.discard(health.node)
+            self._health.add(health)
+            self._silent_nodes.discard(health.node)
             if before and instance != health.instance:
-                self._say(f"{health.node} was started again")
+                self._log_event(f"{health.node} was started again")
             if state != health.state:
-                self._say(f"{health.node} is {health.state}")
+                self._log_event(f"{health.node} is {health.state}")
 
-    def word(self, subject: str, status: str, **facts: Any) -> None:
+    def service_status(self, subject: str, status: str, **facts: Any) -> None:
         """What a service says of its newest result; a change is logged."""
         with self._lock:
-            before = self._words.get(subject, {}).get("status")
-            self._words[subject] = {"status": status, "at": time.monotonic(), **facts}
+            before = self._services.get(subject, {}).get("status")
+            self._services[subject] = {"status": status, "at": time.monotonic(), **facts}
             if before != status:
-                self._say(f"{subject}: {status}")
+                self._log_event(f"{subject}: {status}")
 
     def scale(self, value: float, sigma: float) -> None:
         """The depth's scale with its standard error; one a second is kept."""
@@ -89,13 +89,13 @@ class View:
         own frame, which stands for the map where nobody else knows. A worse source's says nothing then."""
         rank = SOURCES.index(source)
         with self._lock:
-            if rank > self._leader:
+            if rank > self._source_rank:
                 return
-            if rank < self._leader:
-                self._leader, self._poses = rank, PoseBuffer()
+            if rank < self._source_rank:
+                self._source_rank, self._poses = rank, PoseBuffer()
             T_map_body = self._T_map_odom @ T_source_body if source == "localization" else T_source_body
             self._poses.add(stamp_ns, T_map_body)
-            self._posed = time.monotonic()
+            self._received_s = time.monotonic()
             self._path.add(T_map_body[:3, 3])
 
     def scan(
@@ -110,17 +110,17 @@ class View:
         points, _ = scan_points(ranges_m, angle_min_rad, angle_increment_rad, range_limits_m)
         points = points[:: max(-(-len(points) // _SCAN_POINTS), 1)]
         with self._lock:
-            self._sweeps.append((stamp_ns, transform_points(self._T_body_lidar, points)))
+            self._scans.append((stamp_ns, transform_points(self._T_body_lidar, points)))
 
-    def _scan_map_m(self) -> np.ndarray:
+    def _newest_scan_map_m(self) -> np.ndarray:
         """The newest sweep [N, 3] whose pose is known."""
         newest_ns, _ = self._poses.newest
-        for stamp_ns, points_body in reversed(self._sweeps):
+        for stamp_ns, points_body in reversed(self._scans):
             if stamp_ns <= newest_ns and (T_map_body := self._poses.at(stamp_ns)) is not None:
                 return transform_points(T_map_body, points_body)
         return np.zeros((0, 3))
 
-    def _say(self, text: str) -> None:
+    def _log_event(self, text: str) -> None:
         self._log.append({"at": time.time(), "text": text})
 
     # --- asked by the server ---
@@ -129,21 +129,21 @@ class View:
         """Nodes, links, what the services say, and what has happened."""
         now = time.monotonic()
         with self._lock:
-            for name, record in self._book.records.items():
-                if record.silent_s(now) and name not in self._silent:
-                    self._silent.add(name)
-                    self._say(f"{name} is silent")
+            for name, record in self._health.records.items():
+                if record.silent_s(now) and name not in self._silent_nodes:
+                    self._silent_nodes.add(name)
+                    self._log_event(f"{name} is silent")
             return {
-                "nodes": [_node(n, r, now) for n, r in sorted(self._book.records.items())],
-                "links": [_link(flow) for flow in self._book.flows()],
+                "nodes": [_node(n, r, now) for n, r in sorted(self._health.records.items())],
+                "links": [_link(flow) for flow in self._health.traffic()],
                 "words": {
-                    subject: {"age_s": round(now - word["at"], 1), **_plain(word)}
-                    for subject, word in self._words.items()
+                    subject: {"age_s": round(now - word["at"], 1), **_json_values(word)}
+                    for subject, word in self._services.items()
                 },
                 "pictures": {
-                    name: {"age_s": round(now - picture.came, 1), "fault": picture.fault}
-                    for name, picture in self.pictures.items()
-                    if picture.number
+                    name: {"age_s": round(now - image.received_s, 1), "fault": image.fault}
+                    for name, image in self.images.items()
+                    if image.number
                 },
                 "log": list(self._log),
             }
@@ -152,7 +152,7 @@ class View:
         """[[age s, scale, standard error], ...], oldest first."""
         now = time.monotonic()
         with self._lock:
-            return [[round(now - at, 1), _number(v, 5), _number(s, 5)] for at, v, s in self._scales]
+            return [[round(now - at, 1), _json_number(v, 5), _json_number(s, 5)] for at, v, s in self._scales]
 
     def robot(self) -> dict[str, Any] | None:
         """Pose in the map, and the last sweep as x, y, x, y ... in cm; None before the first."""
@@ -161,9 +161,9 @@ class View:
                 return None
             T = self._poses.newest[1]
             return {
-                "source": SOURCES[self._leader], "age_s": round(time.monotonic() - self._posed, 1),
+                "source": SOURCES[self._source_rank], "age_s": round(time.monotonic() - self._received_s, 1),
                 "x_m": round(float(T[0, 3]), 3), "y_m": round(float(T[1, 3]), 3),
-                "yaw_rad": round(float(yaw_of(T)), 4), "scan_cm": _centimetres(self._scan_map_m()),
+                "yaw_rad": round(float(yaw_of(T)), 4), "scan_cm": _centimetres(self._newest_scan_map_m()),
             }  # fmt: skip
 
     def path(self) -> list[int]:
@@ -192,14 +192,14 @@ def _link(flow: Any) -> dict[str, Any]:
     return {
         "topic": flow.topic, "from": flow.producer, "hz": round(flow.hz, 1), "nominal_hz": flow.nominal_hz,
         "kb_s": round(flow.bytes_s / 1e3, 1), "sent": flow.sent,
-        "to": [{**taker._asdict(), "age_ms": round(taker.age_ms, 1)} for taker in flow.takers],
+        "to": [{**consumer._asdict(), "age_ms": round(consumer.age_ms, 1)} for consumer in flow.consumers],
     }  # fmt: skip
 
 
-def _plain(facts: dict[str, Any]) -> dict[str, Any]:
-    return {k: _number(v, 5) if isinstance(v, float) else v for k, v in facts.items() if k != "at"}
+def _json_values(facts: dict[str, Any]) -> dict[str, Any]:
+    return {k: _json_number(v, 5) if isinstance(v, float) else v for k, v in facts.items() if k != "at"}
 
 
-def _number(value: float, digits: int) -> float | None:
+def _json_number(value: float, digits: int) -> float | None:
     """JSON knows neither NaN nor infinity."""
     return round(value, digits) if math.isfinite(value) else None

@@ -7,7 +7,7 @@ class MapCanvas {
     this.robot = null;
     this.path = [];
     this.follow = false;
-    this.view = null; // {x, y: metres at the middle, scale: pixels a metre}; null: all of it
+    this.state = null; // {x, y: metres at the middle, scale: pixels a metre}; null: all of it
     this.fingers = new Map();
     this.due = false;
     new ResizeObserver(() => this.draw()).observe(canvas);
@@ -15,7 +15,7 @@ class MapCanvas {
     for (const end of ["pointerup", "pointercancel"]) canvas.addEventListener(end, (e) => this.fingers.delete(e.pointerId));
     canvas.addEventListener("pointermove", (e) => this.drag(e));
     canvas.addEventListener("wheel", (e) => { e.preventDefault(); this.zoom(Math.exp(-e.deltaY / 400), e.offsetX, e.offsetY); }, { passive: false });
-    canvas.addEventListener("dblclick", () => { this.view = null; this.draw(); });
+    canvas.addEventListener("dblclick", () => { this.state = null; this.draw(); });
   }
 
   drag(e) {

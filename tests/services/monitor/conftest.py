@@ -6,7 +6,7 @@ import rerun as rr
 from rerun.chunk import RrdReader
 
 
-class Saved:
+class RrdFile:
     """What a .rrd file holds."""
 
     def __init__(self, path):
@@ -53,4 +53,4 @@ def _strict():
 
 @pytest.fixture
 def read_rrd():
-    return Saved
+    return RrdFile

@@ -69,7 +69,7 @@ def _jpeg():
 JPEG = _jpeg()
 
 
-class Room(Node):
+class RoomRecording(Node):
     """Three seconds of a drive in the room."""
 
     name = "replay"
@@ -95,7 +95,7 @@ class Room(Node):
             yield SourceItem(_ns(t_s), "camera/image", picture)
 
 
-class Slam(Node):
+class TrueLocalization(Node):
     """Knows where it is."""
 
     name = "localization"
@@ -126,13 +126,15 @@ class Slam(Node):
 
 @pytest.fixture(scope="module")
 def saved(tmp_path_factory):
-    from tests.services.monitor.conftest import Saved
+    from tests.services.monitor.conftest import RrdFile
 
     path = tmp_path_factory.mktemp("monitor") / "room.rrd"
     monitor = MonitorNode(MonitorConfig(view="none", save=path, image_hz=10.0))
-    Lockstep([Room(Room.Config()), Slam(Slam.Config()), monitor]).run()
+    Lockstep(
+        [RoomRecording(RoomRecording.Config()), TrueLocalization(TrueLocalization.Config()), monitor]
+    ).run()
     assert monitor.detail == f"writing {path}"
-    return Saved(path)
+    return RrdFile(path)
 
 
 def test_every_entity_is_there_and_a_layout_with_it(saved):

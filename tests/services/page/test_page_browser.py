@@ -18,7 +18,7 @@ from beamsplat.tools.system.commands import Commands
 from beamsplat.tools.system.health_table import HealthBoard
 from beamsplat.tools.system.supervisor import Supervisor
 from tests.common.polling import poll
-from tests.services.monitor.parlour import NASTY, TABLE
+from tests.services.monitor.demo_system import NASTY, TABLE
 from tests.services.page.browser import DESK, PHONE, browser
 
 TOKEN = "correct horse battery"
@@ -31,7 +31,7 @@ def chromium():
         yield it
 
 
-class System:
+class PageSystem:
     """Supervised processes with a page."""
 
     def __init__(self, supervisor, session, address):
@@ -62,7 +62,7 @@ def start(tmp_path, free_endpoint):
             table = {**TABLE, "page": NODES["page"]}
             supervisor = stack.enter_context(Supervisor(deployment, table=table))
             session = stack.enter_context(open_session((free_endpoint,)))
-            running = System(supervisor, session, f"http://127.0.0.1:{port}/")
+            running = PageSystem(supervisor, session, f"http://127.0.0.1:{port}/")
             poll(running, lambda: running.board.states() == dict.fromkeys(nodes, "active"), 60)
             return running
 

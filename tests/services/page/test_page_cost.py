@@ -15,17 +15,17 @@ from beamsplat.services.nodes import NODES
 from beamsplat.tools.system.health_table import HealthBoard
 from beamsplat.tools.system.supervisor import Supervisor
 from tests.common.polling import poll
-from tests.services.monitor.parlour import TABLE
+from tests.services.monitor.demo_system import TABLE
 
 SECONDS = 20.0
 
 
-class Viewer(threading.Thread):
+class BrowserClient(threading.Thread):
     """Does what a browser with the page does: takes the events, and gets each picture that they name."""
 
     def __init__(self, port):
         super().__init__(daemon=True)
-        self.pictures, self.events, self._port, self._on = 0, 0, port, True
+        self.images, self.events, self._port, self._on = 0, 0, port, True
         self.start()
 
     def run(self):
@@ -42,7 +42,7 @@ class Viewer(threading.Thread):
                     head = b"".join(iter(replies.readline, b"\r\n"))
                     assert head.startswith(b"HTTP/1.1 200")
                     assert len(replies.read(int(re.search(rb"Content-Length: (\d+)", head)[1]))) > 100
-                    self.pictures += 1
+                    self.images += 1
 
     def leave(self):
         self._on = False
@@ -72,12 +72,12 @@ def test_nine_more_viewers_cost_little(tmp_path, free_endpoint):
         port = int(re.search(r":(\d+)/", board.records["page"].health.detail)[1])
         process = psutil.Process(supervisor.children["page"].process.pid)
         none = _cpu_percent(process, supervisor)
-        viewers = [Viewer(port)]
+        viewers = [BrowserClient(port)]
         one = _cpu_percent(process, supervisor)
-        viewers += [Viewer(port) for _ in range(9)]
+        viewers += [BrowserClient(port) for _ in range(9)]
         ten = _cpu_percent(process, supervisor)
         for viewer in viewers:
             viewer.leave()
     print(f"page: {none:.1f} % of a core for nobody, {one:.1f} for one viewer, {ten:.1f} for ten")
-    assert all(v.pictures > 50 and v.events > 100 for v in viewers)
+    assert all(v.images > 50 and v.events > 100 for v in viewers)
     assert ten - one < 5.0

@@ -19,11 +19,17 @@ from beamsplat.common.geometry.transforms import se2_to_se3
 from beamsplat.common.messages import FusedDepth, Health
 from beamsplat.common.runtime.registry import make_node
 from beamsplat.services.nodes import NODES
-from beamsplat.services.page.http import is_own_name
+from beamsplat.services.page.http import is_own_host
+from beamsplat.services.page.images import (
+    EncodedImage,
+    LatestImage,
+    encode_camera_image,
+    encode_depth,
+    encode_grid,
+)
 from beamsplat.services.page.node import PageConfig, PageNode
-from beamsplat.services.page.pictures import Encoded, Picture, camera_picture, depth_picture, map_picture
-from beamsplat.services.page.server import Access, PageServer
-from beamsplat.services.page.view import View
+from beamsplat.services.page.server import PageAccess, PageServer
+from beamsplat.services.page.view import PageState
 
 TOKEN = "correct horse battery"
 
@@ -31,10 +37,10 @@ TOKEN = "correct horse battery"
 class Serving:
     """A server with a view that a test fills."""
 
-    def __init__(self, picture_hz=20.0, beat_hz=20.0):
-        self.view = View(picture_hz, picture_hz)
+    def __init__(self, picture_hz=20.0, robot_hz=20.0):
+        self.state = PageState(picture_hz, picture_hz)
         self.orders = []
-        self.server = PageServer(self.view, self._command, Access(TOKEN), beat_hz)
+        self.server = PageServer(self.state, self._command, PageAccess(TOKEN), robot_hz)
         self.port = self.server.start("127.0.0.1", 0, None)
 
     def _command(self, *order):
@@ -75,7 +81,7 @@ def _wait(until, timeout_s=20.0):
         time.sleep(0.01)
 
 
-class Reader(threading.Thread):
+class EventReader(threading.Thread):
     """Counts the events of one viewer."""
 
     def __init__(self, viewer):
@@ -92,22 +98,22 @@ class Reader(threading.Thread):
 
 def test_who_does_not_read_holds_nobody_up():
     with Serving() as serving:
-        asleep = serving.viewer()
-        awake = Reader(serving.viewer())
-        _wait(lambda: len(serving.server.audience) == 2)
+        asleep = serving.stateer()
+        awake = EventReader(serving.stateer())
+        _wait(lambda: len(serving.server.events) == 2)
         rng = np.random.default_rng(0)
         for i in range(600):  # 3 KB each: a megabyte and more that nobody takes
-            serving.view.scan(i, rng.uniform(1, 9, 360).astype(np.float32), 0.0, 0.017, (0, 10))
-            serving.view.pose("localization", i, se2_to_se3(np.array([i, 0.0, 0.0])))
+            serving.state.scan(i, rng.uniform(1, 9, 360).astype(np.float32), 0.0, 0.017, (0, 10))
+            serving.state.pose("localization", i, se2_to_se3(np.array([i, 0.0, 0.0])))
             time.sleep(0.01)
         _wait(lambda: any(isinstance(e, dict) and e.get("x_m") == 599.0 for e in awake.events))
-        slow, fast = sorted(serving.server.audience.viewers, key=lambda v: -v.overtaken)
-        assert slow.overtaken > 20
-        assert fast.overtaken < 5
+        slow, fast = sorted(serving.server.events.subscribers, key=lambda v: -v.dropped)
+        assert slow.dropped > 20
+        assert fast.dropped < 5
         assert len(slow.waiting) <= 4, "the newest of each kind waits, not all"
         asleep.close()
-        _wait(lambda: len(serving.server.audience) == 1)
-        assert serving.server.audience.overtaken >= slow.overtaken
+        _wait(lambda: len(serving.server.events) == 1)
+        assert serving.server.events.dropped >= slow.dropped
 
 
 def test_a_picture_is_encoded_once_for_all_and_never_for_nobody():
@@ -115,21 +121,21 @@ def test_a_picture_is_encoded_once_for_all_and_never_for_nobody():
 
     def encode():
         encoded.append(time.monotonic())
-        return Encoded(b"picture", "image/jpeg", {})
+        return EncodedImage(b"picture", "image/jpeg", {})
 
     with Serving(picture_hz=10.0) as serving:
         for _ in range(20):
-            serving.view.pictures["camera"].offer(encode)
+            serving.state.images["camera"].update(encode)
             time.sleep(0.01)
         assert encoded == [], "nobody looks"
-        readers = [Reader(serving.viewer()) for _ in range(10)]
+        readers = [EventReader(serving.stateer()) for _ in range(10)]
         _wait(lambda: all(any("name" in e for e in r.events if isinstance(e, dict)) for r in readers))
         assert len(encoded) == 1
         for _ in range(10):
             assert serving.get("/picture/camera") == (200, b"picture")
         assert len(encoded) == 1, "the same one for ten requests"
         for _ in range(100):
-            serving.view.pictures["camera"].offer(encode)
+            serving.state.images["camera"].update(encode)
             serving.get("/picture/camera")
             time.sleep(0.005)
         gaps = np.diff(encoded)
@@ -138,18 +144,18 @@ def test_a_picture_is_encoded_once_for_all_and_never_for_nobody():
 
 
 def test_what_is_damaged_is_said_and_the_last_good_one_stays():
-    picture = Picture(1000.0)
-    assert picture.facts() is None
+    picture = LatestImage(1000.0)
+    assert picture.metadata() is None
     good = cv2.imencode(".jpg", np.zeros((8, 8, 3), np.uint8))[1].ravel()
-    picture.offer(lambda: camera_picture(good, "jpeg", (8, 8), 0, 4))
-    picture.refresh()
+    picture.update(lambda: encode_camera_image(good, "jpeg", (8, 8), 0, 4))
+    picture.encode_newest()
     shown = picture.encoded
     assert cv2.imdecode(np.frombuffer(shown.data, np.uint8), cv2.IMREAD_COLOR).shape == (4, 4, 3)
-    picture.offer(lambda: camera_picture(good[:20], "jpeg", (8, 8), 0, 4))
-    picture.refresh()
+    picture.update(lambda: encode_camera_image(good[:20], "jpeg", (8, 8), 0, 4))
+    picture.encode_newest()
     assert picture.encoded is shown
     assert "do not decode as jpeg" in picture.fault
-    assert picture.facts() == {"number": 2}
+    assert picture.metadata() == {"number": 2}
 
 
 @pytest.mark.parametrize(
@@ -190,7 +196,7 @@ def test_commands_need_the_token_and_make_sense():
         assert post(order, "wrong")[0] == 401
         assert post(order, "ключ")[0] == 401
         assert serving.orders == []
-        assert serving.server.refused == 2
+        assert serving.server.rejected_commands == 2
         assert post("[]")[0] == 400
         assert post('{"node": "depth"}')[0] == 400
         assert post('{"action": "set", "parameters": 3}')[0] == 400
@@ -201,15 +207,15 @@ def test_commands_need_the_token_and_make_sense():
 def test_names_of_this_machine():
     own = frozenset({"localhost", "robot1"})
     for host in ("localhost", "LOCALHOST:8420", "127.0.0.1:8420", "[::1]:8420", "192.168.0.7", "robot1:80"):
-        assert is_own_name(host, own), host
+        assert is_own_host(host, own), host
     for host in ("", "evil.example", "127.0.0.1.evil.example:80", "robot10", "[evil]", "::1]"):
-        assert not is_own_name(host, own), host
+        assert not is_own_host(host, own), host
 
 
 def test_depth_is_a_colour_and_unknown_is_black():
     depth = np.full((60, 1280), 1.0, np.float32)
     depth[:, 640:] = np.nan
-    rgb = cv2.imdecode(np.frombuffer(depth_picture(depth, 640).data, np.uint8), cv2.IMREAD_COLOR)
+    rgb = cv2.imdecode(np.frombuffer(encode_depth(depth, 640).data, np.uint8), cv2.IMREAD_COLOR)
     assert rgb.shape == (30, 640, 3)
     assert rgb[:, 330:].max() < 12
     near = rgb[15, 100].astype(int)
@@ -220,41 +226,41 @@ def test_the_map_is_cut_to_what_is_known():
     occupancy = np.full((40, 60), -1, np.int8)
     occupancy[10:20, 15:45] = 0
     occupancy[10, 15:45] = 100
-    picture = map_picture(occupancy, 0.1, np.array([-3.0, -2.0]))
-    assert picture.facts == {"x_m": -1.5, "y_m": -1.0, "cell_m": 0.1, "width": 30, "height": 10}
+    picture = encode_grid(occupancy, 0.1, np.array([-3.0, -2.0]))
+    assert picture.metadata == {"x_m": -1.5, "y_m": -1.0, "cell_m": 0.1, "width": 30, "height": 10}
     pixels = cv2.imdecode(np.frombuffer(picture.data, np.uint8), cv2.IMREAD_UNCHANGED)
     assert pixels.shape == (10, 30, 4)
     assert (pixels[-1, :, 0] == 20).all()
     assert (pixels[:-1, :, 0] == 235).all()
     assert (pixels[..., 3] == 255).all()
     with pytest.raises(ValueError, match="nothing of the map"):
-        map_picture(np.full((3, 3), -1, np.int8), 0.1, np.zeros(2))
+        encode_grid(np.full((3, 3), -1, np.int8), 0.1, np.zeros(2))
 
 
 def test_what_is_not_a_number_is_null_for_the_browser():
-    view = View(2.0, 2.0)
-    view.word("fusion", "ok", scale=math.nan, scale_sigma=math.inf, detail="")
-    view.scale(math.nan, 1.0)
-    view.scale(1.0, math.nan)
-    assert view.status()["words"]["fusion"]["scale"] is None
-    assert view.scales()[0][1:] == [1.0, None]
-    json.dumps([view.status(), view.scales(), view.robot(), view.path()], allow_nan=False)
+    state = PageState(2.0, 2.0)
+    state.service_status("fusion", "ok", scale=math.nan, scale_sigma=math.inf, detail="")
+    state.scale(math.nan, 1.0)
+    state.scale(1.0, math.nan)
+    assert state.status()["words"]["fusion"]["scale"] is None
+    assert state.scales()[0][1:] == [1.0, None]
+    json.dumps([state.status(), state.scales(), state.robot(), state.path()], allow_nan=False)
 
 
 def test_the_best_pose_leads_and_the_scan_lies_where_the_robot_was():
-    view = View(2.0, 2.0)
+    state = PageState(2.0, 2.0)
     ns = 1_000_000_000
-    view.pose("wheel", ns, se2_to_se3(np.array([9.0, 9.0, 0.0])))
-    view.correction(se2_to_se3(np.array([1.0, 0.0, np.pi / 2])))
-    view.pose("localization", ns, se2_to_se3(np.array([1.0, 0.0, 0.0])))
-    view.pose("wheel", 2 * ns, se2_to_se3(np.array([8.0, 8.0, 0.0])))
-    view.lidar(se2_to_se3(np.array([0.5, 0.0, 0.0])))
+    state.pose("wheel", ns, se2_to_se3(np.array([9.0, 9.0, 0.0])))
+    state.correction(se2_to_se3(np.array([1.0, 0.0, np.pi / 2])))
+    state.pose("localization", ns, se2_to_se3(np.array([1.0, 0.0, 0.0])))
+    state.pose("wheel", 2 * ns, se2_to_se3(np.array([8.0, 8.0, 0.0])))
+    state.lidar(se2_to_se3(np.array([0.5, 0.0, 0.0])))
     ranges = np.array([1.0, np.inf, np.nan, 2.0], np.float32)
-    view.scan(int(1.5 * ns), ranges, 0.0, np.pi / 2, (0.1, 10.0))
-    assert view.robot()["scan_cm"] == [], "where the robot was then is not known yet"
-    view.pose("localization", 2 * ns, se2_to_se3(np.array([2.0, 0.0, 0.0])))
-    view.scan(3 * ns, ranges, 0.0, np.pi / 2, (0.1, 10.0))
-    robot = view.robot()
+    state.scan(int(1.5 * ns), ranges, 0.0, np.pi / 2, (0.1, 10.0))
+    assert state.robot()["scan_cm"] == [], "where the robot was then is not known yet"
+    state.pose("localization", 2 * ns, se2_to_se3(np.array([2.0, 0.0, 0.0])))
+    state.scan(3 * ns, ranges, 0.0, np.pi / 2, (0.1, 10.0))
+    robot = state.robot()
     assert (robot["source"], robot["x_m"], robot["y_m"]) == ("localization", 1.0, 2.0)
     assert robot["yaw_rad"] == pytest.approx(np.pi / 2, abs=1e-4)
     # Half way between the poses, at (1, 1.5): ahead is +y in the map, 1.5 + 0.5 + 1; to the right x = 1 + 2.
@@ -306,10 +312,10 @@ def test_a_refused_depth_is_said_and_shows_no_picture():
         refused = FusedDepth(stamp_ns=1, depth_m=none, sigma_m=none, status="too few beams in the picture")
         list(node.handle("fusion/depth", refused))
         node.on_health(Health(stamp_ns=1, node="page", instance="ab", epoch=1, state="active"))
-        status = node._view.status()
+        status = node._state.status()
         assert status["words"]["fusion"]["status"] == "refused"
         assert status["words"]["fusion"]["detail"] == "too few beams in the picture"
         assert "fusion: refused" in [line["text"] for line in status["log"]]
-        assert node._view.pictures["depth"].facts() is None
+        assert node._state.images["depth"].metadata() is None
     finally:
         node.close()

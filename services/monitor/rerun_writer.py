@@ -1,4 +1,4 @@
-"""Where drawings go: a viewer, a file, or both, each behind a thread of its own.
+"""Where entries go: a viewer, a file, or both, each behind a thread of its own.
 
 rerun can feed several sinks from one stream (`set_sinks`), but then the slowest sink sets the pace: a
 browser that stops reading blocks `log()` for more than 20 s, and the file with it. So each sink has its
@@ -28,14 +28,14 @@ log = logging.getLogger(__name__)
 
 APPLICATION = "beamsplat"
 TIMELINE = "time"
-_QUEUE = 256  # about five seconds of drawings at the default rates
+_QUEUE = 256  # about five seconds of entries at the default rates
 _QUEUE_BYTES = 64_000_000  # a large map is some 13 MB, drawn anew every two seconds
 _CHECK_S = 1.0
 _FLUSH_S = 3.0
 
 
 @dataclass
-class _Drawing:
+class _LogEntry:
     path: str
     parts: tuple[Any, ...]
     stamp_ns: int | None
@@ -43,7 +43,7 @@ class _Drawing:
     bytes: int = 0
 
 
-class Channel:
+class SinkThread:
     """One sink of a recording, fed by a thread."""
 
     def __init__(
@@ -61,38 +61,38 @@ class Channel:
         """
         self.name = name
         self.fault = ""  # why nothing is drawn here any more
-        self.skipped = 0  # drawings overtaken by newer ones
+        self.dropped = 0  # entries overtaken by newer ones
         self._stream = stream
         self._watch = watch
-        self._queue: deque[_Drawing | threading.Event] = deque()
-        self._newest: dict[str, _Drawing] = {}
-        self._bytes = 0  # of the drawings that wait
+        self._queue: deque[_LogEntry | threading.Event] = deque()
+        self._newest: dict[str, _LogEntry] = {}
+        self._bytes = 0  # of the entries that wait
         self._changed = threading.Condition()
         self._closing = False
         stream.set_sinks(sink, default_blueprint=blueprint)
         self._thread = threading.Thread(target=self._run, name=f"monitor-{name}", daemon=True)
         self._thread.start()
 
-    def put(self, drawing: _Drawing) -> None:
-        """Takes one drawing; never waits."""
+    def put(self, entry: _LogEntry) -> None:
+        """Takes one entry; never waits."""
         if self.fault:
             return
         with self._changed:
-            waiting = self._newest.get(drawing.path)
-            full = len(self._queue) >= _QUEUE or self._bytes + drawing.bytes > _QUEUE_BYTES
+            waiting = self._newest.get(entry.path)
+            full = len(self._queue) >= _QUEUE or self._bytes + entry.bytes > _QUEUE_BYTES
             if full and waiting is not None:
-                self._bytes += drawing.bytes - waiting.bytes
+                self._bytes += entry.bytes - waiting.bytes
                 waiting.parts, waiting.stamp_ns, waiting.bytes = (
-                    drawing.parts,
-                    drawing.stamp_ns,
-                    drawing.bytes,
+                    entry.parts,
+                    entry.stamp_ns,
+                    entry.bytes,
                 )
-                self.skipped += 1
+                self.dropped += 1
                 return
-            drawing = replace(drawing)
-            self._queue.append(drawing)
-            self._bytes += drawing.bytes
-            self._newest[drawing.path] = drawing
+            entry = replace(entry)
+            self._queue.append(entry)
+            self._bytes += entry.bytes
+            self._newest[entry.path] = entry
             self._changed.notify()
 
     def flush(self, timeout_s: float) -> bool:
@@ -114,7 +114,7 @@ class Channel:
         self.begin_close()
         self._thread.join(timeout_s)
         if self._thread.is_alive():
-            log.warning("%s did not finish within %g s: the last drawings are missing", self.name, timeout_s)
+            log.warning("%s did not finish within %g s: the last entries are missing", self.name, timeout_s)
 
     def _run(self) -> None:
         next_check = time.monotonic() + _CHECK_S
@@ -124,9 +124,9 @@ class Channel:
                     self._stream.flush(timeout_sec=_FLUSH_S)
                     item.set()
                 elif item is not None:
-                    self._draw(item)
+                    self._write(item)
                 if time.monotonic() >= next_check:
-                    self._check()
+                    self._check_sink()
                     next_check = time.monotonic() + _CHECK_S
             except RuntimeError as error:  # what rerun raises when a sink has died
                 self._give_up(str(error))
@@ -137,26 +137,26 @@ class Channel:
         except RuntimeError as error:
             self._give_up(str(error))
 
-    def _take(self) -> _Drawing | threading.Event | str | None:
+    def _take(self) -> _LogEntry | threading.Event | str | None:
         with self._changed:
             if not self._queue and not self._closing:
                 self._changed.wait(_CHECK_S)
             if not self._queue:
                 return "closing" if self._closing else None
             item = self._queue.popleft()
-            if isinstance(item, _Drawing):
+            if isinstance(item, _LogEntry):
                 self._bytes -= item.bytes
                 if self._newest.get(item.path) is item:
                     del self._newest[item.path]
             return item
 
-    def _draw(self, drawing: _Drawing) -> None:
+    def _write(self, entry: _LogEntry) -> None:
         self._stream.reset_time()
-        if drawing.stamp_ns is not None:
-            self._stream.set_time(TIMELINE, timestamp=np.datetime64(drawing.stamp_ns, "ns"))
-        self._stream.log(drawing.path, *drawing.parts, static=drawing.static)
+        if entry.stamp_ns is not None:
+            self._stream.set_time(TIMELINE, timestamp=np.datetime64(entry.stamp_ns, "ns"))
+        self._stream.log(entry.path, *entry.parts, static=entry.static)
 
-    def _check(self) -> None:
+    def _check_sink(self) -> None:
         try:
             self._stream.flush(timeout_sec=0.2)
         except RuntimeError as error:
@@ -176,20 +176,20 @@ class Channel:
             self._bytes = 0
 
 
-class Screen:
-    """The channels in use. Drawing on it never waits and never raises."""
+class RerunWriter:
+    """The sinks in use. Drawing on it never waits and never raises."""
 
     def __init__(self) -> None:
-        self.channels: list[Channel] = []
-        self.notes: list[str] = []  # where to look
+        self.sinks: list[SinkThread] = []
+        self.notes: list[str] = []  # where to style
         self._recording_id = np.random.default_rng().bytes(16).hex()
         self._viewer: subprocess.Popen[bytes] | None = None
 
     def log(self, path: str, *parts: Any, stamp_ns: int | None = None, static: bool = False) -> None:
         """Draws rerun archetypes at an entity; without a stamp on the clock of this machine only."""
-        drawing = _Drawing(path, parts, stamp_ns, static, sum(map(_bytes_of, parts)))
-        for channel in self.channels:
-            channel.put(drawing)
+        entry = _LogEntry(path, parts, stamp_ns, static, sum(map(_size_bytes, parts)))
+        for thread in self.sinks:
+            thread.put(entry)
 
     def save(self, path: Path, blueprint: rrb.Blueprint, *, limit_mb: int, keep_free_mb: int) -> Path:
         """Starts a file beside what may be there already (drive.rrd, drive-2.rrd, ...); returns its name.
@@ -203,11 +203,11 @@ class Screen:
             path.parent.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise RuntimeError(f"cannot make the folder of {path}: {error}") from error
-        path = _unused(path)
+        path = _unused_path(path)
         # Few, large chunks: their directory stays in memory until the file is closed.
         stream = self._stream(flush_tick_s=2.0)
         watch = _disk_watch(path, limit_mb, keep_free_mb)
-        self.channels.append(Channel(str(path), stream, rr.FileSink(path), blueprint, watch))
+        self.sinks.append(SinkThread(str(path), stream, rr.FileSink(path), blueprint, watch))
         self.notes.append(f"writing {path}")
         return path
 
@@ -223,8 +223,8 @@ class Screen:
         sink = rr.GrpcServerSink(
             bind, port, server_memory_limit=f"{memory_mb}MB", cors_allow_origin=origins or None
         )
-        channel = Channel(f"viewer at port {port}", self._stream(0.1), sink, blueprint, self._watch_viewer)
-        self.channels.append(channel)
+        thread = SinkThread(f"viewer at port {port}", self._stream(0.1), sink, blueprint, self._watch_viewer)
+        self.sinks.append(thread)
         return f"rerun+http://127.0.0.1:{port}/proxy"
 
     def spawn(self, address: str, memory_mb: int) -> None:
@@ -253,34 +253,34 @@ class Screen:
 
     @property
     def status(self) -> str:
-        """One line: where to look, and what has failed."""
+        """One line: where to style, and what has failed."""
         parts = [*self.notes]
-        for channel in self.channels:
-            if channel.fault:
-                parts.append(f"stopped: {channel.fault}")
-            elif channel.skipped:
-                parts.append(f"{channel.name} is slow: {channel.skipped} drawings overtaken")
+        for thread in self.sinks:
+            if thread.fault:
+                parts.append(f"stopped: {thread.fault}")
+            elif thread.dropped:
+                parts.append(f"{thread.name} is slow: {thread.dropped} entries overtaken")
         return "; ".join(parts)
 
     def flush(self, timeout_s: float = _FLUSH_S) -> None:
         """Waits a little until everything drawn has arrived."""
-        for channel in self.channels:
-            channel.flush(timeout_s)
+        for thread in self.sinks:
+            thread.flush(timeout_s)
 
     def close(self, timeout_s: float = _FLUSH_S) -> None:
         """Finishes files and closes servers, all within `timeout_s`."""
         deadline = time.monotonic() + timeout_s
-        for channel in self.channels:
-            channel.begin_close()
-        for channel in self.channels:
-            channel.close(max(deadline - time.monotonic(), 0.0))
+        for thread in self.sinks:
+            thread.begin_close()
+        for thread in self.sinks:
+            thread.close(max(deadline - time.monotonic(), 0.0))
 
 
-def _bytes_of(archetype: Any) -> int:
+def _size_bytes(archetype: Any) -> int:
     return sum(batch.as_arrow_array().nbytes for batch in archetype.as_component_batches())
 
 
-def _unused(path: Path) -> Path:
+def _unused_path(path: Path) -> Path:
     """`path`, or the first of path-2, path-3 ... that does not exist: a restart must not overwrite."""
     candidate, number = path, 1
     while candidate.exists():

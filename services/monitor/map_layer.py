@@ -17,7 +17,7 @@ from beamsplat.common.geometry.tracks import RateLimit
 from beamsplat.common.geometry.transforms import quat_xyzw_from_matrix
 from beamsplat.common.messages.splat_codec import unpack
 from beamsplat.common.raster.layout import COLOUR, MEAN, OPACITY, QUAT, SCALE
-from beamsplat.services.monitor.screen import Screen
+from beamsplat.services.monitor.rerun_writer import RerunWriter
 
 SPLATS = "map/splats"
 RENDER = "map_render"
@@ -31,15 +31,15 @@ class _Chunk:
     packed: np.ndarray
 
 
-class MapView:
+class MapLayer:
     """The newest version of every chunk, each drawn at a bounded rate and once more at the end."""
 
-    def __init__(self, screen: Screen, limits: RateLimit) -> None:
-        self._screen = screen
+    def __init__(self, writer: RerunWriter, limits: RateLimit) -> None:
+        self._writer = writer
         self._limits = limits
         self._revisions: dict[int, int] = {}
-        self._waiting: dict[int, _Chunk] = {}
-        self._introduced: set[str] = set()
+        self._deferred: dict[int, _Chunk] = {}
+        self._declared: set[str] = set()
 
     def chunk(
         self, stamp_ns: int, anchor: int, revision: int, T_map_anchor: np.ndarray, packed: np.ndarray
@@ -54,10 +54,10 @@ class MapView:
         self._revisions[anchor] = revision
         chunk = _Chunk(stamp_ns, T_map_anchor, packed)
         if self._limits.due("splats", stamp_ns, str(anchor)):
-            self._waiting.pop(anchor, None)
+            self._deferred.pop(anchor, None)
             self._draw(anchor, chunk)
         else:
-            self._waiting[anchor] = chunk
+            self._deferred[anchor] = chunk
 
     def _draw(self, anchor: int, chunk: _Chunk) -> None:
         params = unpack(chunk.packed)
@@ -65,7 +65,7 @@ class MapView:
         opacity = 1.0 / (1.0 + np.exp(-params[OPACITY]))
         rgba = np.concatenate([params[COLOUR:], opacity[None]]).T
         T = chunk.T_map_anchor
-        self._screen.log(
+        self._writer.log(
             entity,
             rr.Transform3D(
                 translation=T[:3, 3], quaternion=rr.Quaternion(xyzw=quat_xyzw_from_matrix(T[:3, :3]))
@@ -83,21 +83,21 @@ class MapView:
         """The map as seen from its newest keyframe: uint8 [B], JPEG."""
         if self._limits.due("image", stamp_ns, RENDER):
             drawing = rr.EncodedImage(contents=jpeg.tobytes(), media_type="image/jpeg")
-            self._screen.log(RENDER, drawing, stamp_ns=stamp_ns)
+            self._writer.log(RENDER, drawing, stamp_ns=stamp_ns)
 
-    def figures(self, stamp_ns: int, foretold_psnr_db: float, psnr_db: float, depth_error_m: float) -> None:
+    def metrics(self, stamp_ns: int, foretold_psnr_db: float, psnr_db: float, depth_error_m: float) -> None:
         """One point of each curve; NaN draws none."""
         values = (foretold_psnr_db, psnr_db, depth_error_m)
         for name, value in zip(("psnr_db/foretold", "psnr_db/after", "depth_error_m/map"), values):
             if np.isfinite(value):
-                if name not in self._introduced:
-                    self._introduced.add(name)
+                if name not in self._declared:
+                    self._declared.add(name)
                     label = rr.SeriesLines(names=name.partition("/")[2])
-                    self._screen.log(f"plots/{name}", label, static=True)
-                self._screen.log(f"plots/{name}", rr.Scalars(value), stamp_ns=stamp_ns)
+                    self._writer.log(f"plots/{name}", label, static=True)
+                self._writer.log(f"plots/{name}", rr.Scalars(value), stamp_ns=stamp_ns)
 
     def finish(self) -> None:
         """Nothing more will come: what the rate held back is drawn."""
-        for anchor, chunk in self._waiting.items():
+        for anchor, chunk in self._deferred.items():
             self._draw(anchor, chunk)
-        self._waiting.clear()
+        self._deferred.clear()

@@ -19,7 +19,7 @@ RADIUS_M = 1.0
 WALL_M = 2.0  # the room's walls, from its middle
 
 
-class Sensors(Node):
+class RoomSensors(Node):
     """Pictures at 10 Hz, grey by grey, and scans of a square room, as if it happened now."""
 
     name = "replay"
@@ -49,7 +49,7 @@ class Sensors(Node):
             )  # fmt: skip
 
 
-class Guide(Node):
+class CirclingLocalization(Node):
     """Where the robot is, and the map of the room."""
 
     name = "localization"
@@ -78,15 +78,15 @@ class Guide(Node):
         )
 
 
-class DeepConfig(NodeConfig):
+class FloorDepthConfig(NodeConfig):
     scale: float = SCALE
 
 
-class Deep(Node):
+class FloorDepth(Node):
     """Depth of a floor, with its scale."""
 
     name = "fusion"
-    Config = DeepConfig
+    Config = FloorDepthConfig
     replaceable = True
     inputs = ("camera/image",)
     outputs = ("fusion/depth",)
@@ -99,9 +99,9 @@ class Deep(Node):
         yield "fusion/depth", fused
 
 
-_HERE = "tests.services.monitor.parlour:"
+_HERE = "tests.services.monitor.demo_system:"
 TABLE = {
-    "replay": Service("replay", "", {"default": _HERE + "Sensors"}),
-    "localization": Service("localization", "", {"default": _HERE + "Guide"}),
-    "fusion": Service("fusion", "", {"default": _HERE + "Deep"}),
+    "replay": Service("replay", "", {"default": _HERE + "RoomSensors"}),
+    "localization": Service("localization", "", {"default": _HERE + "CirclingLocalization"}),
+    "fusion": Service("fusion", "", {"default": _HERE + "FloorDepth"}),
 }

@@ -9,20 +9,20 @@ from typing import Any
 
 
 @dataclass(eq=False)
-class Viewer:
+class EventSubscriber:
     """One open stream of server-sent events."""
 
     waiting: dict[str, bytes] = field(default_factory=dict)
-    overtaken: int = 0  # events that were replaced by newer ones before it took them
+    dropped: int = 0  # events that were replaced by newer ones before it took them
     _wake: asyncio.Event = field(default_factory=asyncio.Event)
 
-    def offer(self, kind: str, event: bytes) -> None:
+    def push(self, kind: str, event: bytes) -> None:
         """Puts the newest of a kind before the viewer."""
-        self.overtaken += kind in self.waiting
+        self.dropped += kind in self.waiting
         self.waiting[kind] = event
         self._wake.set()
 
-    async def take(self) -> bytes:
+    async def next_events(self) -> bytes:
         """All that waits; waits for it."""
         await self._wake.wait()
         self._wake.clear()
@@ -31,44 +31,44 @@ class Viewer:
         return events
 
 
-class Audience:
+class EventHub:
     """All viewers; each event is encoded once for them."""
 
     def __init__(self) -> None:
-        self.viewers: set[Viewer] = set()
+        self.subscribers: set[EventSubscriber] = set()
         self._newest: dict[str, bytes] = {}
-        self._overtaken = 0  # of those who have left
+        self._dropped = 0  # of those who have left
 
     def __len__(self) -> int:
-        return len(self.viewers)
+        return len(self.subscribers)
 
     @property
-    def overtaken(self) -> int:
+    def dropped(self) -> int:
         """Events that viewers were too slow for, since the start."""
-        return self._overtaken + sum(viewer.overtaken for viewer in self.viewers)
+        return self._dropped + sum(viewer.dropped for viewer in self.subscribers)
 
-    def join(self) -> Viewer:
+    def subscribe(self) -> EventSubscriber:
         """A new viewer; it has been told nothing."""
-        if not self.viewers:
+        if not self.subscribers:
             self._newest.clear()  # of when somebody last looked
-        viewer = Viewer()
+        viewer = EventSubscriber()
         for kind, event in self._newest.items():
-            viewer.offer(kind, event)
-        self.viewers.add(viewer)
+            viewer.push(kind, event)
+        self.subscribers.add(viewer)
         return viewer
 
-    def leave(self, viewer: Viewer) -> None:
+    def unsubscribe(self, viewer: EventSubscriber) -> None:
         """It looks no longer."""
-        self.viewers.discard(viewer)
-        self._overtaken += viewer.overtaken
+        self.subscribers.discard(viewer)
+        self._dropped += viewer.dropped
 
-    def tell(self, kind: str, data: Any) -> None:
+    def publish(self, kind: str, data: Any) -> None:
         """Tells all viewers, if it is anything new. What stands before "/" in `kind` is the event's name."""
         event = b"event: %s\ndata: %s\n\n" % (kind.partition("/")[0].encode(), as_json(data))
         if self._newest.get(kind) != event:
             self._newest[kind] = event
-            for viewer in self.viewers:
-                viewer.offer(kind, event)
+            for viewer in self.subscribers:
+                viewer.push(kind, event)
 
 
 def as_json(data: Any) -> bytes:

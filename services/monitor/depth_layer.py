@@ -10,19 +10,19 @@ import numpy as np
 import rerun as rr
 
 from beamsplat.common.geometry.tracks import RateLimit
-from beamsplat.services.monitor.screen import Screen
+from beamsplat.services.monitor.rerun_writer import RerunWriter
 
 DEPTH = "depth"
 CLOUD = "map/odom/cloud"
-_SHRINK = 2  # a quarter of the pixels is enough to look at
+_SHRINK = 2  # a quarter of the pixels is enough to style at
 _RANGE_M = (0.3, 8.0)  # of the colour scale
 
 
-class DepthView:
+class DepthLayer:
     """The newest depth picture, and the points of the newest `clouds` keyframes."""
 
-    def __init__(self, screen: Screen, limits: RateLimit, clouds: int) -> None:
-        self._screen = screen
+    def __init__(self, writer: RerunWriter, limits: RateLimit, clouds: int) -> None:
+        self._writer = writer
         self._limits = limits
         self._clouds = clouds
         self._drawn = 0
@@ -34,10 +34,10 @@ class DepthView:
             drawing = rr.DepthImage(
                 np.ascontiguousarray(small), meter=1.0, depth_range=_RANGE_M, colormap="turbo"
             )
-            self._screen.log(DEPTH, drawing, stamp_ns=stamp_ns)
+            self._writer.log(DEPTH, drawing, stamp_ns=stamp_ns)
 
     def cloud(self, stamp_ns: int, points_odom_m: np.ndarray, colours: np.ndarray) -> None:
         """Points float32 [N, 3] with colours uint8 [N, 3]; the oldest keyframe's give way."""
         entity = f"{CLOUD}/{self._drawn % self._clouds}"
         self._drawn += 1
-        self._screen.log(entity, rr.Points3D(points_odom_m, colors=colours, radii=0.01), stamp_ns=stamp_ns)
+        self._writer.log(entity, rr.Points3D(points_odom_m, colors=colours, radii=0.01), stamp_ns=stamp_ns)

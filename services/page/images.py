@@ -11,99 +11,99 @@ import numpy as np
 
 from beamsplat.common.messages.image_codec import decode_rgb
 
-_DEPTH_M = (0.3, 8.0)  # of the colour scale
+_DEPTH_RANGE_M = (0.3, 8.0)  # of the colour scale
 _QUALITY = (cv2.IMWRITE_JPEG_QUALITY, 75)
 _FREE, _OCCUPIED = 235, 20  # grey
 
 
-class Encoded(NamedTuple):
-    """A picture as browsers take it; `facts` go to the page beside it."""
+class EncodedImage(NamedTuple):
+    """A picture as browsers take it; `metadata` go to the page beside it."""
 
     data: bytes
     content_type: str
-    facts: dict[str, Any]
+    metadata: dict[str, Any]
 
 
-class Picture:
+class LatestImage:
     """The newest of one kind. `offer` may be called from another thread than `fresh`."""
 
     def __init__(self, max_hz: float) -> None:
         self._period_s = 1.0 / max_hz
-        self._offered: tuple[int, float, Callable[[], Encoded]] | None = None
-        self._encoded_at = -1e9
+        self._pending: tuple[int, float, Callable[[], EncodedImage]] | None = None
+        self._encoded_at_s = -1e9
         self.number = 0  # of the encoded one
-        self.came = 0.0  # when the encoded one was offered: monotonic, s
-        self.encoded: Encoded | None = None
+        self.received_s = 0.0  # when the encoded one was pending: monotonic, s
+        self.encoded: EncodedImage | None = None
         self.fault = ""  # why the newest could not be shown
 
-    def offer(self, encode: Callable[[], Encoded]) -> None:
+    def update(self, encode: Callable[[], EncodedImage]) -> None:
         """Takes the newest; it is encoded when it is asked for, or never."""
-        number = self._offered[0] + 1 if self._offered else 1
-        self._offered = number, time.monotonic(), encode
+        number = self._pending[0] + 1 if self._pending else 1
+        self._pending = number, time.monotonic(), encode
 
     def due(self) -> bool:
         """Whether there is a newer one than the encoded, and it is time to encode it."""
-        offered = self._offered
-        newer = offered is not None and offered[0] != self.number
-        return newer and time.monotonic() - self._encoded_at >= self._period_s
+        pending = self._pending
+        newer = pending is not None and pending[0] != self.number
+        return newer and time.monotonic() - self._encoded_at_s >= self._period_s
 
-    def refresh(self) -> None:
+    def encode_newest(self) -> None:
         """Encodes the newest."""
-        offered = self._offered
-        if offered is None:
+        pending = self._pending
+        if pending is None:
             return
-        self._encoded_at = time.monotonic()
+        self._encoded_at_s = time.monotonic()
         try:
-            self.encoded, self.fault = offered[2](), ""
+            self.encoded, self.fault = pending[2](), ""
         except ValueError as error:  # damaged on its way here: the last good one stays
             self.fault = str(error)
-        self.number, self.came = offered[:2]
+        self.number, self.received_s = pending[:2]
 
-    def facts(self) -> dict[str, Any] | None:
+    def metadata(self) -> dict[str, Any] | None:
         """What the page needs to know to show it; None before the first."""
         if self.encoded is None:
             return None
-        return {"number": self.number, **self.encoded.facts}
+        return {"number": self.number, **self.encoded.metadata}
 
 
-def camera_picture(
+def encode_camera_image(
     data: np.ndarray,  # uint8 [B]
     encoding: str,
     size_px: tuple[int, int],  # width, height
     step_bytes: int,
     widest_px: int,
-) -> Encoded:
+) -> EncodedImage:
     """A camera's picture, at most so wide. A JPEG that is small enough passes as it is.
 
     Raises:
         ValueError: its bytes are no such picture.
     """
     if encoding == "jpeg" and size_px[0] <= widest_px:
-        return Encoded(data.tobytes(), "image/jpeg", {})
-    return _jpeg(_narrowed(decode_rgb(data, encoding, *size_px, step_bytes)[..., ::-1], widest_px))
+        return EncodedImage(data.tobytes(), "image/jpeg", {})
+    return _jpeg(_shrink(decode_rgb(data, encoding, *size_px, step_bytes)[..., ::-1], widest_px))
 
 
-def depth_picture(
+def encode_depth(
     depth_m: np.ndarray,  # float32 [H, W], NaN = unknown
     widest_px: int,
-) -> Encoded:
+) -> EncodedImage:
     """Depth by colour, near ones red; what is unknown is black."""
     stride = -(-depth_m.shape[1] // widest_px)
     small = depth_m[::stride, ::stride]
-    near, far = _DEPTH_M
+    near, far = _DEPTH_RANGE_M
     known = np.isfinite(small)
-    share = (far - np.clip(np.where(known, small, far), near, far)) / (far - near)
-    colours = cv2.applyColorMap((share * 255.0).astype(np.uint8), cv2.COLORMAP_TURBO)
+    nearness = (far - np.clip(np.where(known, small, far), near, far)) / (far - near)
+    colours = cv2.applyColorMap((nearness * 255.0).astype(np.uint8), cv2.COLORMAP_TURBO)
     colours[~known] = 0
     return _jpeg(colours)
 
 
-def map_picture(
+def encode_grid(
     occupancy: np.ndarray,  # int8 [H, W], row 0 at the smallest y; -1 unknown, 0 free .. 100 occupied
     resolution_m: float,
     origin_m: np.ndarray,  # [2], corner of cell (0, 0)
-) -> Encoded:
-    """The known part of the grid, its first row at the top; unknown cells are clear. `facts` say where the
+) -> EncodedImage:
+    """The known part of the grid, its first row at the top; unknown cells are clear. `metadata` say where the
     lower left corner lies (m), how large a cell is (m), and how many there are.
 
     Raises:
@@ -120,14 +120,14 @@ def map_picture(
     pixels = np.stack([grey, grey, grey, alpha], axis=-1)
     png = cv2.imencode(".png", pixels, (cv2.IMWRITE_PNG_COMPRESSION, 2))[1].tobytes()
     corner_m = np.asarray(origin_m) + resolution_m * np.array([columns.start, rows.start])
-    facts = {
+    metadata = {
         "x_m": round(float(corner_m[0]), 4), "y_m": round(float(corner_m[1]), 4), "cell_m": resolution_m,
         "width": part.shape[1], "height": part.shape[0],
     }  # fmt: skip
-    return Encoded(png, "image/png", facts)
+    return EncodedImage(png, "image/png", metadata)
 
 
-def _narrowed(bgr: np.ndarray, widest_px: int) -> np.ndarray:
+def _shrink(bgr: np.ndarray, widest_px: int) -> np.ndarray:
     height, width = bgr.shape[:2]
     if width <= widest_px:
         return bgr
@@ -135,5 +135,7 @@ def _narrowed(bgr: np.ndarray, widest_px: int) -> np.ndarray:
     return cv2.resize(bgr, size, interpolation=cv2.INTER_AREA)
 
 
-def _jpeg(bgr: np.ndarray) -> Encoded:
-    return Encoded(cv2.imencode(".jpg", np.ascontiguousarray(bgr), _QUALITY)[1].tobytes(), "image/jpeg", {})
+def _jpeg(bgr: np.ndarray) -> EncodedImage:
+    return EncodedImage(
+        cv2.imencode(".jpg", np.ascontiguousarray(bgr), _QUALITY)[1].tobytes(), "image/jpeg", {}
+    )

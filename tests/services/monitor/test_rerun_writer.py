@@ -10,7 +10,7 @@ import pytest
 import rerun as rr
 
 from beamsplat.services.monitor.layout import layout
-from beamsplat.services.monitor.screen import _QUEUE, _QUEUE_BYTES, Channel, Screen, _Drawing
+from beamsplat.services.monitor.rerun_writer import _QUEUE, _QUEUE_BYTES, RerunWriter, SinkThread, _LogEntry
 
 
 class StuckStream:
@@ -43,17 +43,17 @@ class StuckStream:
 
 def test_a_stalled_viewer_holds_nobody_up_and_then_gets_the_newest():
     stream = StuckStream()
-    channel = Channel("viewer", stream, None, None)
-    channel.put(_Drawing("rig", ("rig",), None, True))
+    thread = SinkThread("viewer", stream, None, None)
+    thread.put(_LogEntry("rig", ("rig",), None, True))
     for i in range(10 * _QUEUE):
-        channel.put(_Drawing(f"entity{i % 3}", (i,), i, False))
-    assert not channel.flush(0.05)
-    assert len(channel._queue) <= _QUEUE + 4
-    assert channel.skipped >= 8 * _QUEUE
+        thread.put(_LogEntry(f"entity{i % 3}", (i,), i, False))
+    assert not thread.flush(0.05)
+    assert len(thread._queue) <= _QUEUE + 4
+    assert thread.dropped >= 8 * _QUEUE
     stream.gate.set()
-    assert channel.flush(10.0)
-    channel.close(10.0)
-    assert not channel.fault
+    assert thread.flush(10.0)
+    thread.close(10.0)
+    assert not thread.fault
     assert ("rig", "rig") in stream.logged
     newest = dict(stream.logged)
     assert {newest[f"entity{i}"] for i in range(3)} == {10 * _QUEUE - i for i in (1, 2, 3)}
@@ -61,57 +61,57 @@ def test_a_stalled_viewer_holds_nobody_up_and_then_gets_the_newest():
 
 def test_large_drawings_that_wait_are_bounded_by_their_bytes():
     stream = StuckStream()
-    channel = Channel("viewer", stream, None, None)
+    thread = SinkThread("viewer", stream, None, None)
     for i in range(200):
-        channel.put(_Drawing(f"splats{i % 4}", (i,), i, False, bytes=10_000_000))
-    assert len(channel._queue) <= _QUEUE_BYTES // 10_000_000 + 4
+        thread.put(_LogEntry(f"splats{i % 4}", (i,), i, False, bytes=10_000_000))
+    assert len(thread._queue) <= _QUEUE_BYTES // 10_000_000 + 4
     stream.gate.set()
-    assert channel.flush(10.0)
-    channel.close(10.0)
+    assert thread.flush(10.0)
+    thread.close(10.0)
     newest = dict(stream.logged)
     assert {newest[f"splats{i}"] for i in range(4)} == {196, 197, 198, 199}
-    assert channel._bytes == 0
+    assert thread._bytes == 0
 
 
 def test_closing_does_not_wait_for_ever():
     stream = StuckStream()
-    channel = Channel("viewer", stream, None, None)
-    channel.put(_Drawing("a", (1,), None, False))
-    channel.close(0.1)  # returns
+    thread = SinkThread("viewer", stream, None, None)
+    thread.put(_LogEntry("a", (1,), None, False))
+    thread.close(0.1)  # returns
     stream.gate.set()
 
 
-def _draw_until_fault(screen, path="a"):
+def _draw_until_fault(writer, path="a"):
     deadline = time.monotonic() + 20.0
-    while not screen.channels[0].fault and time.monotonic() < deadline:
-        screen.log(path, rr.TextDocument("x" * 100_000), stamp_ns=1)
+    while not writer.sinks[0].fault and time.monotonic() < deadline:
+        writer.log(path, rr.TextDocument("x" * 100_000), stamp_ns=1)
         time.sleep(0.02)
-    return screen.status
+    return writer.status
 
 
 def test_a_file_ends_whole_at_its_limit(tmp_path, read_rrd):
-    screen = Screen()
-    path = screen.save(tmp_path / "sub" / "drive.rrd", layout(), limit_mb=0, keep_free_mb=0)
-    assert "complete at" in _draw_until_fault(screen)
-    screen.log("b", rr.TextDocument("more"))
-    screen.close()
+    writer = RerunWriter()
+    path = writer.save(tmp_path / "sub" / "drive.rrd", layout(), limit_mb=0, keep_free_mb=0)
+    assert "complete at" in _draw_until_fault(writer)
+    writer.log("b", rr.TextDocument("more"))
+    writer.close()
     assert read_rrd(path).entities == {"a"}
 
 
 def test_a_disk_that_runs_full_ends_the_file(tmp_path, read_rrd):
-    screen = Screen()
-    path = screen.save(tmp_path / "drive.rrd", layout(), limit_mb=100, keep_free_mb=10**9)
-    assert "left on the disk" in _draw_until_fault(screen)
-    screen.close()
+    writer = RerunWriter()
+    path = writer.save(tmp_path / "drive.rrd", layout(), limit_mb=100, keep_free_mb=10**9)
+    assert "left on the disk" in _draw_until_fault(writer)
+    writer.close()
     assert read_rrd(path).entities == {"a"}
 
 
 def test_a_file_that_vanishes_is_noticed(tmp_path):
-    screen = Screen()
-    path = screen.save(tmp_path / "drive.rrd", layout(), limit_mb=100, keep_free_mb=0)
+    writer = RerunWriter()
+    path = writer.save(tmp_path / "drive.rrd", layout(), limit_mb=100, keep_free_mb=0)
     path.unlink()
-    assert "the file is gone" in _draw_until_fault(screen)
-    screen.close()
+    assert "the file is gone" in _draw_until_fault(writer)
+    writer.close()
 
 
 def test_a_disk_that_refuses_is_noticed(tmp_path):
@@ -121,16 +121,16 @@ def test_a_disk_that_refuses_is_noticed(tmp_path):
         from pathlib import Path
         import rerun as rr
         from beamsplat.services.monitor.layout import layout
-        from beamsplat.services.monitor.screen import Screen
+        from beamsplat.services.monitor.rerun_writer import RerunWriter
         resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, 300_000))
-        screen = Screen()
-        screen.save(Path(sys.argv[1]), layout(), limit_mb=100, keep_free_mb=0)
+        writer = RerunWriter()
+        writer.save(Path(sys.argv[1]), layout(), limit_mb=100, keep_free_mb=0)
         deadline = time.monotonic() + 30
-        while not screen.channels[0].fault and time.monotonic() < deadline:
-            screen.log("a", rr.TextDocument(os.urandom(50_000).hex()), stamp_ns=1)
+        while not writer.sinks[0].fault and time.monotonic() < deadline:
+            writer.log("a", rr.TextDocument(os.urandom(50_000).hex()), stamp_ns=1)
             time.sleep(0.01)
-        screen.close()
-        print(screen.status)
+        writer.close()
+        print(writer.status)
     """
     done = subprocess.run(
         [sys.executable, "-c", textwrap.dedent(script), str(tmp_path / "drive.rrd")],
@@ -142,13 +142,13 @@ def test_a_disk_that_refuses_is_noticed(tmp_path):
 
 def test_a_file_is_never_overwritten(tmp_path):
     (tmp_path / "drive.rrd").write_bytes(b"precious")
-    screen = Screen()
-    assert screen.save(tmp_path / "drive.rrd", layout(), limit_mb=1, keep_free_mb=0).name == "drive-2.rrd"
-    screen.close()
+    writer = RerunWriter()
+    assert writer.save(tmp_path / "drive.rrd", layout(), limit_mb=1, keep_free_mb=0).name == "drive-2.rrd"
+    writer.close()
     assert (tmp_path / "drive.rrd").read_bytes() == b"precious"
 
 
 def test_a_folder_that_cannot_be_made_is_named(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(RuntimeError, match="cannot make the folder"):
-        Screen().save(tmp_path / "file" / "drive.rrd", layout(), limit_mb=1, keep_free_mb=0)
+        RerunWriter().save(tmp_path / "file" / "drive.rrd", layout(), limit_mb=1, keep_free_mb=0)
