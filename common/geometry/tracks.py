@@ -1,4 +1,4 @@
-"""Drawing a moving robot: rate limits, recent poses, a bounded path, a sweep in the world frame."""
+"""Helpers to draw a moving robot: rate limits, a pose buffer, a path of bounded size, deskewed scans."""
 
 from __future__ import annotations
 
@@ -8,22 +8,23 @@ import numpy as np
 
 from beamsplat.common.geometry.transforms import interpolate, transform_points
 
-RECENT_POSES = 200
-REACH_NS = 500_000_000  # a pose stands for times this close beyond the first and the last one
+RECENT_POSES = 200  # 20 s at 10 Hz
+REACH_NS = 500_000_000  # the first and last poses are held constant for this long outside the covered time
 
 
 class RateLimit:
-    """At most so many drawings a second of each kind, by measurement time."""
+    """Limits the rate of drawing per kind of data, by measurement time."""
 
     def __init__(self, max_hz: dict[str, float]) -> None:
         self._period_ns = {kind: round(1e9 / hz) if hz > 0.0 else None for kind, hz in max_hz.items()}
         self._last_ns: dict[str, int] = {}
 
     def due(self, kind: str, stamp_ns: int, key: str = "") -> bool:
-        """Whether to draw `kind` (of entity `key`) now; True counts as drawn. A kind at 0 Hz never is.
+        """Return whether to draw `kind` (of entity `key`) now; True is recorded as drawn.
 
-        A stamp before the last one (a recording that loops) starts afresh. A stream whose own rate
-        is the limit passes whole: a tenth of the period is forgiven, for jitter.
+        A kind with a limit of 0 Hz is never drawn. A stamp earlier than the last one (a recording that loops)
+        resets the limit. A tenth of the period is tolerated as jitter, so that a stream whose rate equals the
+        limit is drawn completely.
         """
         period_ns = self._period_ns[kind]
         if period_ns is None:
@@ -36,7 +37,7 @@ class RateLimit:
 
 
 class PoseBuffer:
-    """The last poses `T_world_body` of one source."""
+    """Buffer of the last `RECENT_POSES` poses `T_world_body` of one source, with interpolation."""
 
     def __init__(self) -> None:
         self._poses: deque[tuple[int, np.ndarray]] = deque(maxlen=RECENT_POSES)
@@ -46,17 +47,20 @@ class PoseBuffer:
 
     @property
     def newest(self) -> tuple[int, np.ndarray]:
-        """(stamp_ns, T_world_body [4, 4]) of the last one."""
+        """The last pose as (stamp_ns, T_world_body [4, 4])."""
         return self._poses[-1]
 
     def add(self, stamp_ns: int, T_world_body: np.ndarray) -> None:
-        """Takes the next pose [4, 4]; one from before the last (a recording that loops) starts afresh."""
+        """Append a pose [4, 4]; a stamp earlier than the last one (a looping recording) clears the buffer."""
         if self._poses and stamp_ns < self._poses[-1][0]:
             self._poses.clear()
         self._poses.append((stamp_ns, T_world_body))
 
     def at(self, stamp_ns: int) -> np.ndarray | None:
-        """`T_world_body` [4, 4] at a time: interpolated, held `REACH_NS` beyond both ends, else None."""
+        """Return the interpolated `T_world_body` [4, 4] at a stamp.
+
+        Outside the covered time the nearest pose is returned up to `REACH_NS` away, None beyond that.
+        """
         if not self._poses:
             return None
         after = next((i for i, (stamp, _) in enumerate(self._poses) if stamp >= stamp_ns), None)
@@ -68,9 +72,10 @@ class PoseBuffer:
 
 
 class BoundedPath:
-    """Where something has been, in at most `max_points` vertices however long it drives.
+    """Path of a moving object as a polyline of at most `max_points` vertices.
 
-    Vertices are `step_m` apart; when there are too many, every other one goes and the step doubles.
+    Vertices are at least `step_m` apart; at `max_points`, every second vertex is removed and the step
+    doubled.
     """
 
     def __init__(self, max_points: int, step_m: float) -> None:
@@ -80,7 +85,7 @@ class BoundedPath:
         self._newest: np.ndarray | None = None
 
     def add(self, point_m: np.ndarray) -> None:
-        """Takes the next position [3]."""
+        """Append the next position [3]."""
         point_m = np.array(point_m, dtype=np.float32)
         self._newest = point_m
         if self._points and np.linalg.norm(point_m - self._points[-1]) < self._step_m:
@@ -91,24 +96,24 @@ class BoundedPath:
             self._step_m *= 2.0
 
     def clear(self) -> None:
-        """Forgets where it was."""
+        """Remove all vertices."""
         self._points.clear()
         self._newest = None
 
     @property
     def points_m(self) -> np.ndarray:
-        """float32 [N, 3], the newest position always last."""
+        """Vertices float32 [N, 3]; the last one is the newest position."""
         ends = [] if self._newest is None else [self._newest]
         return np.array(self._points + ends, dtype=np.float32).reshape(-1, 3)
 
 
 def scan_points(
-    ranges_m: np.ndarray,  # float32 [N], anything that is not a return is left out
+    ranges_m: np.ndarray,  # float32 [N]; values that are not valid returns are omitted
     angle_min_rad: float,
     angle_increment_rad: float,
     range_limits_m: tuple[float, float],
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(points in the lidar frame float64 [M, 3], index of each one's beam int64 [M])."""
+    """Return the points [M, 3] of valid ranges in the lidar frame (float64, m), and their beam numbers [M]."""
     nearest, farthest = range_limits_m
     with np.errstate(invalid="ignore"):
         hit = np.isfinite(ranges_m) & (ranges_m > 0.0) & (ranges_m >= nearest) & (ranges_m <= farthest)
@@ -121,11 +126,14 @@ def scan_points(
 
 def sweep_to_world(
     points_body: np.ndarray,  # float64 [M, 3]
-    share: np.ndarray,  # float64 [M], 0 at the first beam of the sweep .. 1 at the end
+    share: np.ndarray,  # float64 [M]: time of each beam, 0 at the start of the sweep, 1 at its end
     T_world_body0: np.ndarray,
     T_world_body1: np.ndarray,
 ) -> np.ndarray:
-    """float64 [M, 3] in the world: each point by the pose of its time, blended linearly between the poses
-    at the two ends. For a turn of a within one sweep that is short by a^2/8 of the range: for the eye."""
+    """Deskew a sweep for display: return its points float64 [M, 3] in the world frame.
+
+    Points are interpolated linearly between their positions under the two poses. With a rotation by `a` rad
+    per sweep the error is up to a^2/8 of the range, small enough for drawing.
+    """
     start, end = transform_points(T_world_body0, points_body), transform_points(T_world_body1, points_body)
     return start + share[:, None] * (end - start)

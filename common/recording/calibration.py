@@ -14,7 +14,7 @@ from pydantic import ValidationError
 
 from beamsplat.common.errors import UserError
 from beamsplat.common.geometry.frames import R_body_camera_level, camera_mount
-from beamsplat.common.geometry.rig import CameraFile, LidarFile, Mount, RigFile
+from beamsplat.common.geometry.rig import CameraSection, LidarSection, Mount, RigFile
 from beamsplat.common.geometry.transforms import make_transform
 from beamsplat.common.recording.static_frames import StaticFrames, clean
 
@@ -34,7 +34,7 @@ _MODELS = {
 class Calibration:
     """Calibration as far as it was found. `mounts` are `T_body_sensor` [4, 4] by "camera", "lidar"."""
 
-    camera: dict[str, Any] | None = None  # fields of CameraFile, without the mount
+    camera: dict[str, Any] | None = None  # fields of CameraSection, without the mount
     mounts: dict[str, np.ndarray] = field(default_factory=dict)
     found: list[str] = field(default_factory=list)
     assumed: list[str] = field(default_factory=list)
@@ -50,9 +50,9 @@ class Calibration:
         camera = lidar = None
         try:
             if self.camera is not None and "camera" in self.mounts:
-                camera = CameraFile(**self.camera, mount=Mount.of(self.mounts["camera"]))
+                camera = CameraSection(**self.camera, mount=Mount.of(self.mounts["camera"]))
             if "lidar" in self.mounts:
-                lidar = LidarFile(mount=Mount.of(self.mounts["lidar"]))
+                lidar = LidarSection(mount=Mount.of(self.mounts["lidar"]))
         except ValidationError as error:
             reason = error.errors(include_url=False, include_input=False)[0]["msg"]
             raise UserError(f"{source}: its CameraInfo is not usable: {reason}; give a rig file") from error
@@ -60,7 +60,7 @@ class Calibration:
 
 
 def intrinsics(info: Any, picture_px: tuple[int, int], image_topic: str, where: str) -> dict[str, Any] | None:
-    """Fields of CameraFile from a CameraInfo; None if the camera was never calibrated (K all zero).
+    """Fields of CameraSection from a CameraInfo; None if the camera was never calibrated (K all zero).
 
     `picture_px` is width and height of the pictures themselves. Of a rectified image topic the
     projection matrix P counts and there is no distortion.

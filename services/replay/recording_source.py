@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from beamsplat.common.errors import UserError
-from beamsplat.common.geometry.rig import LidarFile, Mount, RigFile, load_rig
+from beamsplat.common.geometry.rig import LidarSection, Mount, RigFile, load_rig
 from beamsplat.common.recording import RecordingReader
 from beamsplat.common.recording.sensors import SENSORS
 from beamsplat.services.replay.options import SourceOptions
@@ -68,7 +68,7 @@ class RecordingSource:
             return rig.message(self.start_ns, rig.source or str(self.options.rig))
         recorded = next(self._reader.messages(["rig"]), None)
         if recorded is None and ({"image", "scan"} & set(self.words)) == {"scan"}:
-            origin = LidarFile(mount=Mount(xyz_m=(0.0, 0.0, 0.0), rpy_deg=(0.0, 0.0, 0.0)))
+            origin = LidarSection(mount=Mount(xyz_m=(0.0, 0.0, 0.0), rpy_deg=(0.0, 0.0, 0.0)))
             said = ("the lidar sits at the body's origin, facing forward (no rig was recorded)",)
             return RigFile(lidar=origin, assumed=said).message(self.start_ns, self.where)
         if recorded is None:

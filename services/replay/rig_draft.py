@@ -10,7 +10,7 @@ import numpy as np
 
 from beamsplat.common.errors import UserError
 from beamsplat.common.geometry.frames import camera_mount
-from beamsplat.common.geometry.rig import CameraFile, LidarFile, Mount, RigFile, format_rig
+from beamsplat.common.geometry.rig import CameraSection, LidarSection, Mount, RigFile, format_rig
 from beamsplat.common.recording.calibration import ASSUMED_MOUNTS
 from beamsplat.services.replay.bag_source import BagSource
 from beamsplat.services.replay.options import SourceOptions
@@ -107,8 +107,8 @@ def draft_from_device(source: str, fov_deg: float) -> tuple[str, list[str]]:
         )
     height, width = picture.shape[:2]
     text = f"fx, fy from a horizontal field of view of {fov_deg:g} degrees as stated, no distortion"
-    camera = CameraFile(**pinhole(width, height, fov_deg), mount=Mount.of(camera_mount(0.1, 0.0, 0.3)))
-    lidar = LidarFile(mount=Mount.of(ASSUMED_MOUNTS["lidar"]))
+    camera = CameraSection(**pinhole(width, height, fov_deg), mount=Mount.of(camera_mount(0.1, 0.0, 0.3)))
+    lidar = LidarSection(mount=Mount.of(ASSUMED_MOUNTS["lidar"]))
     assumed = (text, "where camera and lidar sit: customary places were put here")
     comments = {
         "camera": f"MEASURE with a chessboard: {text}.",
@@ -121,7 +121,7 @@ def draft_from_device(source: str, fov_deg: float) -> tuple[str, list[str]]:
 
 
 def pinhole(width_px: int, height_px: int, fov_deg: float) -> dict[str, object]:
-    """Fields of CameraFile for a lens without distortion and square pixels.
+    """Fields of CameraSection for a lens without distortion and square pixels.
 
     Pixel centres lie at integers, so the picture reaches from -0.5 to width - 0.5.
     """

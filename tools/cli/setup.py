@@ -13,7 +13,7 @@ from beamsplat.common.errors import UserError
 if TYPE_CHECKING:
     import numpy as np
 
-    from beamsplat.common.geometry.rig import CameraFile
+    from beamsplat.common.geometry.rig import CameraSection
     from beamsplat.common.messages import Image
     from beamsplat.tools.setup.board_calibration import Boards
     from beamsplat.tools.setup.discovery import Found
@@ -208,15 +208,15 @@ def _ask_place(what: str, usual: Place, *, turns: bool) -> Place:
     return Place(forward, left, up, down_deg=ask("looks down by (degrees)", 0.0))
 
 
-def _by_field_of_view(camera: Found, T_body_camera: np.ndarray) -> tuple[CameraFile, str]:
+def _by_field_of_view(camera: Found, T_body_camera: np.ndarray) -> tuple[CameraSection, str]:
     """[camera] of the rig, and one sentence on where it comes from."""
-    from beamsplat.common.geometry.rig import CameraFile, Mount
+    from beamsplat.common.geometry.rig import CameraSection, Mount
     from beamsplat.services.replay.rig_draft import pinhole
 
     fov_deg = typer.prompt("Horizontal field of view (degrees)", default=65.0, type=typer.FloatRange(10, 170))
     size_px = camera.first.width_px, camera.first.height_px
     note = f"fx, fy from a horizontal field of view of {fov_deg:g} degrees as stated, no distortion"
-    return CameraFile(**pinhole(*size_px, fov_deg), mount=Mount.of(T_body_camera)), note
+    return CameraSection(**pinhole(*size_px, fov_deg), mount=Mount.of(T_body_camera)), note
 
 
 def _look_at_board(camera: Found, folder: Path) -> tuple[Lens, Board] | None:
@@ -275,7 +275,7 @@ def _wait_for_enter(text: str) -> None:
 
 
 def _against_camera(
-    camera: Found, lidar: dict[str, Any], lens: CameraFile, board: Board, T_body_lidar: np.ndarray
+    camera: Found, lidar: dict[str, Any], lens: CameraSection, board: Board, T_body_lidar: np.ndarray
 ) -> np.ndarray:
     """`T_body_lidar` as beams on the board tell it, or as it was measured."""
     from beamsplat.tools.setup.board_calibration import N_BOARDS, Boards

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from beamsplat.common.geometry.frames import camera_mount, lidar_mount
-from beamsplat.common.geometry.rig import CameraFile, LidarFile, Mount, RigFile, format_rig
+from beamsplat.common.geometry.rig import CameraSection, LidarSection, Mount, RigFile, format_rig
 from beamsplat.tools.setup.lens import Lens
 
 _HEADER = """Calibration of one robot, by `beamsplat setup`: where camera and lidar sit, how the camera sees.
@@ -37,21 +37,21 @@ class Place:
         return lidar_mount(self.forward_m, self.left_m, self.up_m, yaw_left_rad=np.radians(self.left_deg))
 
 
-def camera_file(lens: Lens, T_body_camera: np.ndarray) -> CameraFile:
+def camera_file(lens: Lens, T_body_camera: np.ndarray) -> CameraSection:
     """[camera] of a calibrated lens."""
     K = np.round(lens.K, 4)
-    return CameraFile(
+    return CameraSection(
         width_px=lens.size_px[0], height_px=lens.size_px[1], fx_px=float(K[0, 0]), fy_px=float(K[1, 1]),
         cx_px=float(K[0, 2]), cy_px=float(K[1, 2]), distortion_model="plumb_bob",
         distortion=tuple(round(float(v), 6) for v in lens.distortion), mount=Mount.of(T_body_camera),
     )  # fmt: skip
 
 
-def rig_text(camera: CameraFile | None, T_body_lidar: np.ndarray, assumed: tuple[str, ...], note: str) -> str:
+def rig_text(camera: CameraSection | None, T_body_lidar: np.ndarray, assumed: tuple[str, ...], note: str) -> str:
     """Text of rig.toml; `note` says how the camera was calibrated."""
     rig = RigFile(
         camera=camera,
-        lidar=LidarFile(mount=Mount.of(T_body_lidar)),
+        lidar=LidarSection(mount=Mount.of(T_body_lidar)),
         assumed=assumed,
         source="beamsplat setup",
     )
