@@ -154,7 +154,7 @@ def _moment(k, image, ranges=2.0, values=None, status="ok"):
 
 
 def _drive(node, moments):
-    out = _feed(node, RIG, _scan(8 * S), _odometry(8 * S))
+    out = _feed(node, RIG, _scan(7 * S), _odometry(7 * S))
     for moment in moments:
         out += _feed(node, *moment)
     # A last pose, so that the last image can be placed.
