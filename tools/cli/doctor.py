@@ -20,6 +20,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from beamsplat.common.config.deployment import Deployment, load_deployment
+from beamsplat.common.optional_packages import remedy_for, requirements
 
 MIN_PYTHON = (3, 11)
 MIN_SHM_MB = 256
@@ -45,30 +46,25 @@ def _python() -> Iterator[Finding]:
 
 
 def _packages() -> Iterator[Finding]:
-    """Installed versions against the ranges in this package's own metadata."""
-    from packaging.requirements import Requirement
-
-    for line in importlib.metadata.requires("beamsplat") or ():
-        requirement = Requirement(line)
-        extra = str(requirement.marker or "").partition("extra == ")[2].strip("\"'")
-        unwanted = ("dev", "all") if _has_nvidia() else ("dev", "all", "gpu")
+    """Compare installed versions with the ranges in this package's own metadata."""
+    unwanted = ("dev", "all") if _has_nvidia() else ("dev", "all", "gpu")
+    for requirement, extra in requirements():
         if requirement.name == "beamsplat" or extra in unwanted:
             continue
         need = f"extra [{extra}]" if extra else "required"
         try:
             version = importlib.metadata.version(requirement.name)
         except importlib.metadata.PackageNotFoundError:
-            target = f"beamsplat[{extra}]" if extra else "beamsplat"
             verdict = "note" if extra else "fault"
-            yield Finding(requirement.name, verdict, f"not installed ({need})", f"pip install '{target}'")
+            remedy = str(remedy_for(requirement.name))
+            yield Finding(requirement.name, verdict, f"not installed ({need})", remedy)
             continue
         if requirement.specifier.contains(version, prereleases=True):
             yield Finding(requirement.name, "ok", f"{version} ({need})")
         else:
-            wanted = str(requirement.specifier)
-            yield Finding(
-                requirement.name, "fault", f"{version}, needs {wanted}", f"pip install '{requirement}'"
-            )
+            wanted = f"{requirement.name}{requirement.specifier}"
+            text = f"{version}, needs {requirement.specifier}"
+            yield Finding(requirement.name, "fault", text, f"pip install '{wanted}'")
 
 
 def _has_nvidia() -> bool:
@@ -76,25 +72,54 @@ def _has_nvidia() -> bool:
 
 
 def _gpu() -> Iterator[Finding]:
+    """Report the mapper's processor: its rasterizer is compiled for the CPU and does not need torch.
+
+    Torch serves only the renderers of `beamsplat bench raster` ("reference" and "gsplat").
+    """
+    text = f"on the CPU ({os.cpu_count()} cores): it needs neither a GPU nor torch"
+    yield Finding("mapper", "ok", text)
+    if not _has_nvidia():
+        return
     if importlib.util.find_spec("torch") is None:
         yield Finding(
-            "GPU", "note", "torch is not installed: no mapping here", "pip install 'beamsplat[edge]'"
-        )
+            "GPU", "note", "there is one, but torch is not installed: `beamsplat bench raster` cannot use it",
+            str(remedy_for("gsplat")),
+        )  # fmt: skip
         return
     import torch
 
     if torch.cuda.is_available():
         memory_gb = torch.cuda.get_device_properties(0).total_memory / 1e9
-        yield Finding("GPU", "ok", f"{torch.cuda.get_device_name(0)}, {memory_gb:.0f} GB")
+        name = f"{torch.cuda.get_device_name(0)}, {memory_gb:.0f} GB"
+        yield Finding("GPU", "ok", f"{name}: used by `beamsplat bench raster`, not by the mapper")
         if importlib.util.find_spec("gsplat") is None:
-            yield Finding("gsplat", "note", "not installed: GPU is idle", "pip install 'beamsplat[gpu]'")
-    elif _has_nvidia():
+            text = "not installed: `beamsplat bench raster` leaves the GPU out"
+            yield Finding("gsplat", "note", text, str(remedy_for("gsplat")))
+    else:
         yield Finding(
-            "GPU", "fault", f"there is a GPU, but torch {torch.__version__} is built without CUDA",
+            "GPU", "note", f"there is a GPU, but torch {torch.__version__} is built without CUDA",
             "pip install --force-reinstall torch, then 'beamsplat[gpu]'",
         )  # fmt: skip
-    else:
-        yield Finding("GPU", "ok", "none: the CPU mapper will be used")
+
+
+def _deployment(deployment: Deployment) -> Iterator[Finding]:
+    """Report what the deployment names and this machine lacks: rig, keys, models, data, own classes."""
+    from beamsplat.tools.system.assembly import faults, unusable
+
+    found = faults(deployment)
+    required = [fault for fault in found if "is required" in fault.text]  # to be given with --set
+    for fault in found:
+        verdict = "fault" if fault.fatal and fault not in required else "note"
+        yield Finding("deployment", verdict, fault.text, "correct it in the file, or with --set")
+    wrong = any(fault.fatal and fault not in required for fault in found)
+    named = tuple(n for n in deployment.nodes if not any(f"node {n!r}" in f.text for f in required))
+    if wrong:
+        return
+    missing = unusable(deployment, ("router", *named))
+    for fault in missing:
+        yield Finding("deployment", "fault", fault.text, "correct it in the file, or with --set")
+    if deployment.nodes and not found and not missing:
+        yield Finding("deployment", "ok", f"{len(deployment.nodes)} nodes; all files they name are there")
 
 
 def _router(deployment: Deployment) -> Iterator[Finding]:
@@ -162,17 +187,19 @@ def _state(deployment: Deployment) -> Iterator[Finding]:
 
 
 def _models() -> Iterator[Finding]:
-    folder = os.environ.get("BEAMSPLAT_MODELS", "")
-    if not folder:
-        yield Finding("depth networks", "note", "BEAMSPLAT_MODELS is not set: no networks",
-                      "export BEAMSPLAT_MODELS=folder with .onnx files")  # fmt: skip
-        return
-    found = sorted(path.name for path in Path(folder).glob("*.onnx"))
+    from beamsplat.services.depth.model_files import models_dirs
+
+    folders = models_dirs()
+    found = sorted({path.name for folder in folders for path in folder.glob("*.onnx")})
+    where = ", ".join(map(str, folders))
     if found:
-        yield Finding("depth networks", "ok", f"{', '.join(found)} in {folder}")
-    else:
-        yield Finding("depth networks", "fault", f"no .onnx file in BEAMSPLAT_MODELS={folder}",
+        yield Finding("depth networks", "ok", f"{', '.join(found)} in {where}")
+    elif os.environ.get("BEAMSPLAT_MODELS"):
+        yield Finding("depth networks", "fault", f"no .onnx file in BEAMSPLAT_MODELS={where}",
                       "correct the variable, or unset it")  # fmt: skip
+    else:
+        yield Finding("depth networks", "note", f"no .onnx file in {where}; source \"stixel\" needs none",
+                      "beamsplat models list, beamsplat models pull NAME")  # fmt: skip
 
 
 def congestion(algorithm: str) -> Finding:
@@ -197,10 +224,11 @@ def _devices(deployment: Deployment) -> Iterator[Finding]:
 
 
 def examine(deployment: Deployment) -> list[Finding]:
-    """All findings about this machine and this deployment."""
+    """Return all findings about this machine and this deployment."""
     checks: tuple[Callable[[], Iterator[Finding]], ...] = (
-        _python, _packages, _gpu, lambda: _router(deployment), _shared_memory, lambda: _state(deployment),
-        _models, lambda: _uplink(deployment), lambda: _devices(deployment),
+        _python, _packages, _gpu, lambda: _deployment(deployment), lambda: _router(deployment),
+        _shared_memory, lambda: _state(deployment), _models, lambda: _uplink(deployment),
+        lambda: _devices(deployment),
     )  # fmt: skip
     return [finding for check in checks for finding in check()]
 
@@ -210,10 +238,11 @@ def doctor(
     brief: Annotated[bool, typer.Option(help="Show only what is not well")] = False,
     security: Annotated[bool, typer.Option("--security", help="Only links, keys and the policy")] = False,
 ) -> None:
-    """Examines this machine: Python, packages, GPU, Zenoh port, shared memory, disk, models, devices.
+    """Examine this machine and what a deployment needs of it, and name the remedy for each fault.
 
-    Exit code 1 if there is a fault. With --security it says why a link to another host is refused, which
-    Zenoh passes over in silence.
+    Looks at Python, packages, GPU, the deployment's files (rig, keys, models), the Zenoh port, shared memory,
+    disk and devices. Exit code 1 if there is a fault. With --security it explains why a link to another host
+    is refused, which Zenoh does not report.
 
     Examples: beamsplat doctor deploy/demo.toml
 

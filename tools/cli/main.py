@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import importlib.metadata
+import platform
 import sys
+from typing import Annotated
 
 import typer
 from rich.console import Console
@@ -66,6 +69,32 @@ bench_cli.app.command("depth")(depth_cli.bench_depth)
 bench_cli.app.command("raster")(mapping_cli.bench_raster)
 bench_cli.app.command("map")(mapping_cli.bench_map)
 app.add_typer(bench_cli.app, name="bench", rich_help_panel=_MACHINE)
+
+
+def version_line() -> str:
+    """Return the versions of this package and of Python, and the platform, in one line."""
+    return (
+        f"beamsplat {importlib.metadata.version('beamsplat')}, Python {platform.python_version()}, "
+        f"{platform.platform()}"
+    )
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        print(version_line())
+        raise typer.Exit
+
+
+@app.callback()
+def _root(
+    version: Annotated[
+        bool,
+        typer.Option(
+            "--version", callback=_print_version, is_eager=True, help="Print version, Python and platform."
+        ),
+    ] = False,
+) -> None:
+    pass
 
 
 def main() -> None:
