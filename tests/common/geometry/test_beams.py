@@ -55,7 +55,7 @@ def test_beams_of_a_moving_robot_hit_the_same_points_of_the_world(dx, dy, turn, 
 
 def test_a_beam_behind_a_nearer_edge_is_hidden_from_the_camera_only_there():
     T = camera_mount(0.0, 0.3, 0.45)  # left of the lidar
-    near = np.column_stack([np.full(60, 1.0), np.linspace(-0.1, 0.2, 60), np.full(60, 0.18)])
+    near = np.column_stack([np.full(60, 1.0), np.linspace(-0.05, 0.2, 60), np.full(60, 0.18)])
     far = np.column_stack([np.full(60, 3.0), np.linspace(-0.9, -0.1, 60), np.full(60, 0.18)])
     hidden = occluded_beams(np.concatenate([near, far]), T)
     assert not hidden[:60].any()
