@@ -1,4 +1,4 @@
-"""THE process list: every service, by the name it has in a deployment file."""
+"""The process list: all services, by the name that they have in a deployment file."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from beamsplat.common.runtime.registry import Service
 _ROWS = (
     Service(
         "replay",
-        "plays a bag, a recording or a folder as if the robot were driving",
+        "replays a bag, a recording or a folder with the timing of the drive",
         {"default": "beamsplat.services.replay.node:ReplayNode"},
     ),
     Service(
@@ -29,22 +29,22 @@ _ROWS = (
     ),
     Service(
         "ros2",
-        "takes the sensors of a robot that speaks ROS 2, without ROS",
+        "receives the sensor data of a ROS 2 robot, without a ROS installation",
         {"default": "beamsplat.services.ros2.node:Ros2Node"},
     ),
     Service(
         "ros2_out",
-        "gives pose, transforms, map and cloud back to ROS 2",
+        "publishes pose, transforms, map and point cloud to ROS 2",
         {"default": "beamsplat.services.ros2_out.node:Ros2OutNode"},
     ),
     Service(
         "clock",
-        "a tick a second, on robots that replay nothing",
+        "publishes a tick once a second, on systems without a replay",
         {"default": "beamsplat.services.clock.node:ClockNode"},
     ),
     Service(
         "localization",
-        "where the robot is",
+        "estimates the pose of the robot: odometry and map corrections",
         {
             "lidar": "beamsplat.services.localization.lidar2d.node:LidarLocalization",
             "camera": "beamsplat.services.localization.camera.node:CameraLocalization",
@@ -53,32 +53,32 @@ _ROWS = (
     ),
     Service(
         "depth",
-        "a dense guess for each picture",
+        "estimates a dense depth map for each image",
         {"default": "beamsplat.services.depth.node:DepthNode"},
     ),
     Service(
         "fusion",
-        "metric depth with an error bar, from beams, floor, past pictures and the guess",
+        "fuses lidar beams, floor, past images and the depth estimate into metric depth with a sigma",
         {"default": "beamsplat.services.fusion.node:FusionNode"},
     ),
     Service(
         "keyframes",
-        "picks the pictures that the map needs",
+        "selects the keyframes for the map",
         {"default": "beamsplat.services.keyframes.node:KeyframesNode"},
     ),
     Service(
         "mapping",
-        "Gaussians that look like the pictures",
+        "optimises the Gaussian map to match the keyframes",
         {"default": "beamsplat.services.mapping.node:MappingNode"},
     ),
     Service(
         "uplink",
-        "on a robot: carries what the topic table marks to the edge server, and answers back",
+        "on a robot: bridge to the edge server, for the topics that the topic table marks",
         {"default": "beamsplat.services.uplink.node:UplinkNode"},
     ),
     Service(
         "recorder",
-        "writes what goes over the bus to an MCAP file",
+        "records all topics to an MCAP file",
         {"default": "beamsplat.services.recorder.node:RecorderNode"},
     ),
     Service(
@@ -88,7 +88,7 @@ _ROWS = (
     ),
     Service(
         "page",
-        "shows the running system to any browser, and takes commands of who has its token",
+        "shows the running system in a web browser, and accepts commands with its token",
         {"default": "beamsplat.services.page.node:PageNode"},
     ),
 )

@@ -1,8 +1,9 @@
-"""Stamps of live sensors: one clock for all processes of a host, which no change of the time of day moves.
+"""Clock for the stamps of live sensors: common to all processes of a host, and never set back or forward.
 
-The monotonic clock cannot be set, but starts at nowhere; the time of day can be set by hours, by hand or
-when a robot without a battery clock hears from a time server. Stamps are the monotonic clock plus one
-offset, which the first process of a boot measures and leaves for all others.
+The wall clock can jump by hours: when somebody sets it, or when a robot without a battery-backed clock first
+reaches a time server. The monotonic clock does not jump, but its zero is arbitrary. Stamps are therefore the
+monotonic clock plus a constant offset. The first process after a boot measures the offset and stores it in a
+file; all other processes read this file.
 """
 
 from __future__ import annotations
@@ -18,26 +19,26 @@ from beamsplat.common.messages.header import local_clock_id
 
 
 class StampClock:
-    """Monotonic nanoseconds since 1970, as the time of day was when the first sensor of this boot started."""
+    """Monotonic clock with the Unix epoch as its zero, aligned to the wall clock once per boot."""
 
     def __init__(
         self,
-        folder: Path | None = None,  # where processes meet; default: the user's runtime folder
+        folder: Path | None = None,  # of the file with the offset; default: the user's runtime folder
         monotonic_ns: Callable[[], int] = time.monotonic_ns,
         wall_ns: Callable[[], int] = time.time_ns,
     ) -> None:
         self._monotonic_ns = monotonic_ns
-        # A moment's offset is wrong by however long the process was interrupted between the two readings.
+        # An interruption between the two clock readings makes the offset wrong: use the fastest of five.
         readings = []
         for _ in range(5):
             before = monotonic_ns()
             wall = wall_ns()
             readings.append((monotonic_ns() - before, wall - before))
         measured_ns = min(readings)[1]
-        self.offset_ns = _agreed(folder or _runtime_folder(), measured_ns)
+        self.offset_ns = _shared_offset(folder or _runtime_folder(), measured_ns)
 
     def now_ns(self) -> int:
-        """Now, on this clock."""
+        """Return the current time of this clock in nanoseconds."""
         return self._monotonic_ns() + self.offset_ns
 
 
@@ -48,8 +49,11 @@ def _runtime_folder() -> Path:
     return Path(tempfile.gettempdir())
 
 
-def _agreed(folder: Path, measured_ns: int) -> int:
-    """The offset all processes of this boot use: the first to come links its own into place."""
+def _shared_offset(folder: Path, measured_ns: int) -> int:
+    """Return the offset of this boot, ns: the stored one, or `measured_ns` after storing it.
+
+    The first process creates the file with a hard link, which is atomic: all processes read the same value.
+    """
     place = folder / f"beamsplat-clock-{os.getuid()}-{local_clock_id():016x}"
     own = folder / f".{place.name}-{os.getpid()}"
     try:
@@ -57,7 +61,10 @@ def _agreed(folder: Path, measured_ns: int) -> int:
         with suppress(FileExistsError):
             os.link(own, place)
         return int(place.read_text())
-    except (OSError, ValueError):  # no place to meet: right by itself, though not to the nanosecond
+    except (
+        OSError,
+        ValueError,
+    ):  # no shared file: this process' own measurement differs from others' by microseconds
         return measured_ns
     finally:
         with suppress(OSError):

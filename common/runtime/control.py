@@ -1,4 +1,4 @@
-"""The requests that a supervisor sends to one process during a hand-over, answered between two steps."""
+"""Answers the supervisor's hand-over requests to one process, between two steps of its node."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ log = logging.getLogger(__name__)
 
 
 class HandoverControl:
-    """Answers `reached`, `retire` and `activate` (see `runtime.handover`) for one process."""
+    """Answers `reached`, `retire` and `activate` for one process; the protocol: `runtime.handover`."""
 
     def __init__(self, running: RunningNode, bus: Bus) -> None:
         self._running, self._bus = running, bus
@@ -25,7 +25,7 @@ class HandoverControl:
         """Carry out a request and yield its answer.
 
         Raises:
-            ValueError: unknown request, not possible in this state, or it failed; the state is unchanged.
+            ValueError: the request is unknown, not possible now, or it failed; the process keeps its role.
         """
         handover = self._running.handover
         if verb == "reached":
@@ -55,11 +55,11 @@ class HandoverControl:
             return r.handover.retire(r.mailbox.handled())
 
     def _pass_on_arrivals(self) -> None:
-        """Call `on_arrival` for messages received in standby, before those that are received from now on."""
+        """Call `on_arrival` for the messages received in standby, before newer messages are received."""
         r, passed = self._running, set()
         while not r.accepts_arrivals:
             with r.changed:
-                new = [w for w in r.mailbox.waiting() if id(w) not in passed]
+                new = [w for w in r.mailbox.queued() if id(w) not in passed]
                 r.accepts_arrivals = not new
             for envelope in new:
                 passed.add(id(envelope))
@@ -70,7 +70,7 @@ class HandoverControl:
         r = self._running
         if r.node.hands_over:
             r.node.take_over()
-        r.accepts_arrivals = not r.node.hands_over  # those that wait are passed on first
+        r.accepts_arrivals = not r.node.hands_over  # queued messages are passed on first
         held = list(r.handover.activate(after))
         self._bus.producer.epoch = claim_epoch(r.settings.run_dir, r.node.name)
         self._pass_on_arrivals()

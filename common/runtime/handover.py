@@ -1,16 +1,35 @@
-"""How a node hands over to its successor while both run: no stamp twice, nothing between them lost.
+"""Hand-over of a node to a second process of the same node, without repeating or losing messages.
 
-The successor starts in standby: it takes all inputs and works, but keeps back what it would say. Then the
-supervisor has the predecessor retire between two messages and tell how far it has come, and the successor go
-on from there, with a higher epoch, beginning with what it has kept back and the predecessor has not said. The
-predecessor says nothing any more, and what is still on its way from it, consumers ignore by its epoch.
+A supervisor starts the successor in standby while the predecessor is still active, and then moves the role of
+the active process from one to the other. It sends three requests, each answered between two messages:
 
-A node that hands over what it knows (`Node.hands_over`) does not work in standby: messages wait until it has
-taken that up, and those that its predecessor has handled are then passed over.
+    control/<instance>/reached    -> {topic: newest stamp published or held back}
+    control/<instance>/retire     -> {"said": {topic: newest stamp}} or {"handled": ...}
+    control/<instance>/activate   ?after=<answer of retire> -> {"kept": count, "lost": count}
 
-    control/<instance>/reached    -> {topic: newest stamp said or kept back}; answered once configured
-    control/<instance>/retire     -> {said: {topic: newest stamp}} or {handled: ...}; falls silent, ends
-    control/<instance>/activate   ?after= that answer -> {kept: messages kept back and said now, lost: others}
+    successor:                                            predecessor:
+
+    started --configured--> STANDBY --activate--> ACTIVE  ACTIVE --retire--> RETIRED --> process ends
+                             |  ^                          |  ^
+                             +--+ reached                  +--+ reached
+
+1. STANDBY: the successor receives all inputs and computes its outputs, but publishes nothing, not even
+   health. It holds back the newest 16 outputs; when a further one is computed, the oldest is dropped, and
+   only its topic and stamp are kept.
+2. `reached` goes to both processes (a process answers once it is configured). The supervisor continues when
+   the successor's newest stamps are close to the predecessor's, or after a time-out.
+3. `retire`: the predecessor answers with the newest stamp that it published on each topic ("said"), publishes
+   nothing from here on, and ends without end-of-stream markers.
+4. `activate` passes this answer to the successor. It claims the next epoch, publishes the held messages whose
+   stamp is newer than the predecessor's on the same topic, and becomes ACTIVE. From then on it discards an
+   output that is not newer than the predecessor's last one: no stamp is published twice. Dropped messages
+   newer than the predecessor's last one were published by neither process: they are counted in `lost`.
+5. Messages of the predecessor that are still in transit have the lower epoch; subscribers ignore them.
+
+A node that hands over its state (`Node.hands_over`) does no work in standby: inputs are queued. Its
+predecessor writes its state in `hand_over` and answers `retire` with the sequence numbers that it has
+handled, because its output stamps do not tell which inputs are part of the state. The successor reads the
+state in `take_over` and skips these inputs.
 """
 
 from __future__ import annotations
@@ -23,74 +42,88 @@ from typing import TYPE_CHECKING
 from beamsplat.common.messages import Message
 
 if TYPE_CHECKING:
-    from beamsplat.common.runtime.mailbox import Envelope, Handled
+    from beamsplat.common.runtime.mailbox import Envelope, HandledSequences
 
 CONTROL = "control"
-_HELD = 16  # a message may be a picture
-_COUNTED = 100_000  # stamps of those that were not kept
+_MAX_HELD = 16  # messages; one of them can be an image of some MB
+_MAX_DROPPED = 100_000  # remembered (topic, stamp) pairs of dropped messages, only to count `lost`
 
 
 class Handover:
-    """Where one process stands between standby and retirement."""
+    """State of one process in the hand-over protocol, and its filter for outgoing messages."""
 
     def __init__(self, standby: bool) -> None:
+        """`standby`: start as the successor of a running process; False: start as the active process."""
         self.standby = standby
         self.retired = False
-        self.lost = 0  # not kept back for lack of room, and not said by the predecessor either
+        self.lost = 0  # set by `activate`: messages that neither process published
         self._held: deque[tuple[str, Message]] = deque()
-        self._let_go: deque[tuple[str, int]] = deque(maxlen=_COUNTED)
-        self._said: dict[str, int] = {}  # newest stamp by topic; at first, the predecessor's
-        self._inherited: dict[str, int] = {}
-        self._handled: Handled = {}
+        self._dropped: deque[tuple[str, int]] = deque(maxlen=_MAX_DROPPED)
+        self._published: dict[str, int] = {}  # topic -> newest published stamp, the predecessor's included
+        self._by_predecessor: dict[str, int] = {}  # topic -> newest stamp that the predecessor published
+        self._handled: HandledSequences = {}
 
     def holds_back(self, topic: str, message: Message) -> bool:
-        """Whether a message is kept back for now; else it is noted as said."""
+        """Return whether a message must not be published now.
+
+        In standby it is held back (the oldest held message is dropped when `_MAX_HELD` are held). A retired
+        process discards it. After activation, it is discarded if the predecessor has published this stamp or
+        a newer one on the topic. In all other cases its stamp is recorded as published.
+        """
         if self.standby:
-            if len(self._held) == _HELD:
+            if len(self._held) == _MAX_HELD:
                 name, oldest = self._held.popleft()
-                self._let_go.append((name, oldest.stamp_ns))
+                self._dropped.append((name, oldest.stamp_ns))
             self._held.append((topic, message))
             return True
-        if self.retired or message.stamp_ns <= self._inherited.get(topic, -1):
-            return True  # its predecessor has said this, or its successor will
-        self._said[topic] = max(self._said.get(topic, 0), message.stamp_ns)
+        if self.retired or message.stamp_ns <= self._by_predecessor.get(topic, -1):
+            return True
+        self._published[topic] = max(self._published.get(topic, 0), message.stamp_ns)
         return False
 
     def was_handled(self, envelope: Envelope) -> bool:
-        """Whether the predecessor has dealt with what waited here meanwhile."""
-        known = self._handled.get(envelope.topic, {}).get(envelope.header.instance)
+        """Return whether the predecessor has already handled an input message (`hands_over` nodes only)."""
+        handled = self._handled.get(envelope.topic, {}).get(envelope.header.instance)
         sequence = envelope.header.sequence
-        return known is not None and sequence < known[0] and sequence not in known[1]
+        return handled is not None and sequence < handled[0] and sequence not in handled[1]
 
     def reached(self) -> str:
-        """The newest stamps said or kept back, as JSON."""
-        newest = dict(self._said)
+        """Return JSON {topic: newest stamp published or held back}."""
+        newest = dict(self._published)
         for topic, message in self._held:
             newest[topic] = max(newest.get(topic, 0), message.stamp_ns)
         return json.dumps(newest)
 
-    def retire(self, handled: Handled | None = None) -> str:
-        """Nothing more is said; how far it has come, as JSON. Who hands over what it knows says what it has
-        `handled`: its stamps do not tell."""
+    def retire(self, handled: HandledSequences | None = None) -> str:
+        """Stop publishing and return the progress of this process as JSON, the argument of `activate`.
+
+        Args:
+            handled: `Mailbox.handled()` of a node that hands over its state; None for other nodes.
+        """
         self.retired = True
-        return json.dumps({"said": self._said} if handled is None else {"handled": handled})
+        return json.dumps({"said": self._published} if handled is None else {"handled": handled})
 
     def activate(self, after: str) -> Iterator[tuple[str, Message]]:
-        """What the predecessor, which came as far as `after` says, has not said any more.
+        """Leave standby and yield the held messages that the predecessor has not published, oldest first.
+
+        Args:
+            after: what the predecessor's `retire` returned.
 
         Raises:
-            ValueError: this is not JSON, or not what `retire` gives.
+            ValueError: `after` is not JSON, or not an answer of `retire`; the state is unchanged.
         """
-        came = json.loads(after)
-        said, handled = (came.get(k, {}) for k in ("said", "handled")) if isinstance(came, dict) else (0, 0)
-        if not (isinstance(said, dict) and isinstance(handled, dict)):
-            raise ValueError(f"not what a predecessor answers: {after[:40]!r}")
-        self._inherited = {str(topic): int(stamp) for topic, stamp in said.items()}
+        progress = json.loads(after)
+        if not isinstance(progress, dict):
+            raise ValueError(f"not the answer of a retired process: {after[:40]!r}")
+        published, handled = progress.get("said", {}), progress.get("handled", {})
+        if not (isinstance(published, dict) and isinstance(handled, dict)):
+            raise ValueError(f"not the answer of a retired process: {after[:40]!r}")
+        self._by_predecessor = {str(topic): int(stamp) for topic, stamp in published.items()}
         self._handled = handled
-        self._said = dict(self._inherited)
+        self._published = dict(self._by_predecessor)
         self.standby = False
-        self.lost = sum(stamp > self._inherited.get(topic, -1) for topic, stamp in self._let_go)
+        self.lost = sum(stamp > self._by_predecessor.get(topic, -1) for topic, stamp in self._dropped)
         held, self._held = list(self._held), deque()
         for topic, message in held:
-            if message.stamp_ns > self._inherited.get(topic, -1):
+            if message.stamp_ns > self._by_predecessor.get(topic, -1):
                 yield topic, message

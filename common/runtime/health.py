@@ -1,4 +1,4 @@
-"""What the nodes of a robot last said of themselves, and the rates between what they said."""
+"""The newest health report of each node, and rates computed from recent reports."""
 
 from __future__ import annotations
 
@@ -11,34 +11,34 @@ from typing import NamedTuple
 from beamsplat.common.messages import Health
 from beamsplat.common.topics import TOPICS
 
-STALE_S = 3.0  # a node silent for so long is not well
-_WINDOW_S = 5.0
-_HISTORY = 50  # within it, however often somebody speaks
-_NODES = 1000  # of all robots: more are made up
+STALE_S = 3.0  # nodes report at 1 Hz: after three missing reports a node is shown as silent
+_WINDOW_S = 5.0  # rates are averages over this time
+_MAX_HISTORY = 50  # reports kept per node, in case it sends more than it should
+_MAX_NODES = 1000  # of all robots; names beyond that are ignored, since anybody can send them
 
 
 @dataclass
 class NodeRecord:
-    """What was last heard of a node; `heard` is the listener's monotonic clock, s."""
+    """Newest health of a node; `received_s` is its arrival time on the receiver's monotonic clock."""
 
     health: Health
     received_s: float
-    starts: int = 1  # instances seen so far: one more after each restart
-    history: deque[tuple[float, Health]] = field(default_factory=lambda: deque(maxlen=_HISTORY))
+    starts: int = 1  # number of instances (processes) seen so far
+    history: deque[tuple[float, Health]] = field(default_factory=lambda: deque(maxlen=_MAX_HISTORY))
 
     def silent_s(self, now: float) -> float | None:
-        """For how long nothing was heard; None while that is no longer than it may be."""
+        """Return the time since the last report in s, or None while it is at most `STALE_S`."""
         return now - self.received_s if now - self.received_s > STALE_S else None
 
     def rate(self, count: Callable[[Health], int]) -> float:
-        """Change of a counter per second over the last seconds."""
+        """Return the rate of a counter in 1/s, from the oldest to the newest report of the window."""
         (first, before), (last, after) = self.history[0], self.history[-1]
         if last - first < 0.5:
             return 0.0
         return (count(after) - count(before)) / (last - first)
 
     def totals(self) -> NodeTraffic:
-        """Sums over the inputs, and rates over inputs and outputs."""
+        """Return the counters and rates of this node, summed over its inputs and outputs."""
         inputs = self.health.inputs
         return NodeTraffic(
             in_hz=self.rate(lambda h: sum(i.received for i in h.inputs)),
@@ -51,18 +51,18 @@ class NodeRecord:
 
 
 class NodeTraffic(NamedTuple):
-    """One node's traffic; counts are since it started."""
+    """Traffic of one node; counts since it started."""
 
     in_hz: float
     out_hz: float
-    age_ms: float  # of the newest message of the input that lags most
+    age_ms: float  # of the newest message on the input with the highest latency
     dropped: int
     lost: int
     bad: int
 
 
 class TopicConsumer(NamedTuple):
-    """One subscription of a topic."""
+    """One subscription to a topic."""
 
     node: str
     age_ms: float
@@ -71,27 +71,27 @@ class TopicConsumer(NamedTuple):
 
 
 class TopicTraffic(NamedTuple):
-    """One topic that flows."""
+    """Traffic of one topic."""
 
     topic: str
     producer: str
     hz: float
-    nominal_hz: float  # 0 = on events
+    nominal_hz: float  # 0 = published on events
     bytes_s: float
     sent: int
     consumers: tuple[TopicConsumer, ...]
 
 
 class HealthRecords:
-    """The newest health of every node. Not locked: whoever shares it between threads does that."""
+    """The newest health of every node. Not thread-safe: the owner locks it."""
 
     def __init__(self) -> None:
         self.records: dict[str, NodeRecord] = {}
 
     def add(self, health: Health, now: float | None = None) -> None:
-        """Enters what a node says, heard at `now` (monotonic, s)."""
+        """Add a health report that arrived at `now` (monotonic clock, s; default: now)."""
         now = time.monotonic() if now is None else now
-        if health.node not in self.records and len(self.records) >= _NODES:
+        if health.node not in self.records and len(self.records) >= _MAX_NODES:
             return
         record = self.records.setdefault(health.node, NodeRecord(health, now))
         if record.health.instance != health.instance:
@@ -103,15 +103,15 @@ class HealthRecords:
             record.history.popleft()
 
     def states(self, now: float | None = None) -> dict[str, str]:
-        """Node -> state, "silent" where nothing was heard lately."""
+        """Return the state of each node by name; "silent" if its last report is older than `STALE_S`."""
         now = time.monotonic() if now is None else now
         return {n: "silent" if r.silent_s(now) else r.health.state for n, r in self.records.items()}
 
     def traffic(self) -> list[TopicTraffic]:
-        """The topics that somebody writes, in table order."""
-        return [flow for name in TOPICS if (flow := self._flow(name)) is not None]
+        """Return the traffic of all topics that have a producer, in the order of the topic table."""
+        return [traffic for name in TOPICS if (traffic := self._traffic_of(name)) is not None]
 
-    def _flow(self, topic: str) -> TopicTraffic | None:
+    def _traffic_of(self, topic: str) -> TopicTraffic | None:
         for producer, record in self.records.items():
             sent = next((o.sent for o in record.health.outputs if o.topic == topic), None)
             if sent is None:

@@ -1,4 +1,4 @@
-"""Publishes the health of a live node once a second."""
+"""Publishing of a live node's health once a second."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _DETAIL_CHARS = 2000
 
 
 class HealthReporter:
-    """Reports from its own thread until the node is closed."""
+    """Thread that publishes the node's health until the node is closed."""
 
     def __init__(self, running: RunningNode, bus: Bus) -> None:
         self._running, self._bus = running, bus
@@ -34,9 +34,9 @@ class HealthReporter:
             time.sleep(1.0)
 
     def send(self) -> None:
-        """Publish one report now, unless this process is in standby or retired."""
+        """Publish one health report now, unless this process is in standby or retired."""
         r = self._running
-        if r.handover.standby or r.handover.retired:  # another process is the node
+        if r.handover.standby or r.handover.retired:  # another process is the active node
             return
         with r.changed:
             inputs = r.mailbox.health()
@@ -44,7 +44,7 @@ class HealthReporter:
         outputs = tuple(
             OutputHealth(topic=name, sent=p.sent, bytes=p.bytes) for name, p in r.publications.items()
         )
-        self._bus.report(
+        self._bus.publish_health(
             Health(
                 stamp_ns=time.time_ns(), node=r.node.name, instance=r.instance,
                 epoch=self._bus.producer.epoch, state=r.state, inputs=inputs, outputs=outputs,

@@ -1,4 +1,4 @@
-"""Background jobs of a node, taken in at points that depend on messages, not on speed."""
+"""Background jobs of a node; results are delivered at points that depend on messages, not on speed."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from typing import Any, Protocol
 from beamsplat.common.runtime.node import Job
 
 
-class Future(Protocol):
-    """What `concurrent.futures.Future` has of interest here."""
+class JobFuture(Protocol):
+    """The part of `concurrent.futures.Future` that is used here."""
 
     def result(self) -> Any: ...
 
@@ -21,7 +21,7 @@ class Future(Protocol):
 
 
 class LazyFuture:
-    """A future that runs when its result is asked for: one thread, reproducible."""
+    """Future that runs its job when the result is requested: single-threaded and reproducible (lockstep)."""
 
     def __init__(self, run: Callable[[], Any]) -> None:
         self._run = run
@@ -34,33 +34,33 @@ class LazyFuture:
 
 
 class JobAbandoned(Exception):
-    """A job that was waited for takes too long for a process that is to end."""
+    """Raised when the process must end before a job that is waited for has finished."""
 
 
 class _WorkerFuture(concurrent.futures.Future):
-    def __init__(self, gave_up: Callable[[], bool]) -> None:
+    def __init__(self, must_stop: Callable[[], bool]) -> None:
         super().__init__()
-        self._gave_up = gave_up
+        self._must_stop = must_stop
 
     def result(self, timeout: float | None = None) -> Any:
-        """Raises JobAbandoned once the process is to end and has waited long enough."""
+        """Wait for the result; raise JobAbandoned once `must_stop()` returns True."""
         while not concurrent.futures.wait([self], 0.2).done:
-            if self._gave_up():
+            if self._must_stop():
                 raise JobAbandoned
         return super().result(timeout)
 
 
 class JobThread:
-    """One thread that runs jobs in turn. Unlike a pool's it does not keep the process from ending."""
+    """One daemon thread that runs jobs in order; unlike an executor's it does not block process exit."""
 
-    def __init__(self, gave_up: Callable[[], bool]) -> None:
-        self._gave_up = gave_up
+    def __init__(self, must_stop: Callable[[], bool]) -> None:
+        self._must_stop = must_stop
         self._waiting: queue.SimpleQueue[tuple[_WorkerFuture, Callable[[], Any]]] = queue.SimpleQueue()
         threading.Thread(target=self._work, name="job", daemon=True).start()
 
-    def submit(self, run: Callable[[], Any]) -> Future:
-        """Runs it when those before it are done."""
-        future = _WorkerFuture(self._gave_up)
+    def submit(self, run: Callable[[], Any]) -> JobFuture:
+        """Queue a job; it runs after all jobs submitted before it."""
+        future = _WorkerFuture(self._must_stop)
         self._waiting.put((future, run))
         return future
 
@@ -69,32 +69,32 @@ class JobThread:
             future, run = self._waiting.get()
             try:
                 future.set_result(run())
-            except BaseException as error:  # raised where the result is asked for
+            except BaseException as error:  # re-raised by `result()`
                 future.set_exception(error)
 
 
 @dataclass
 class _Pending:
     job: Job
-    future: Future
-    remaining: int | None
+    future: JobFuture
+    remaining: int | None  # messages until the result is due; None = when the job is finished
 
 
 class JobQueue:
-    """Jobs started by one node and not yet taken in."""
+    """Jobs that one node has started and whose results it has not received yet."""
 
-    def __init__(self, submit: Callable[[Callable[[], Any]], Future]) -> None:
+    def __init__(self, submit: Callable[[Callable[[], Any]], JobFuture]) -> None:
         self._submit = submit
         self._pending: list[_Pending] = []
 
-    def start(self, job: Job) -> Future:
-        """Begins a job."""
+    def start(self, job: Job) -> JobFuture:
+        """Submit a job and return its future."""
         future = self._submit(job.run)
         self._pending.append(_Pending(job, future, job.after))
         return future
 
     def before_message(self, topic: str) -> Iterator[tuple[str, Any]]:
-        """(name, result) of the jobs due before this message; waits for those that must be in."""
+        """Yield (name, result) of the jobs due before a message on `topic`; waits for unfinished ones."""
         for pending in self._pending:
             if pending.remaining is not None and pending.job.of in (None, topic):
                 pending.remaining -= 1
@@ -102,15 +102,15 @@ class JobQueue:
         yield from self._take(due)
 
     def finished(self) -> Iterator[tuple[str, Any]]:
-        """(name, result) of the jobs that are taken in when they are done, and are."""
+        """Yield (name, result) of the finished jobs that have no fixed delivery point (`after` is None)."""
         yield from self._take([p for p in self._pending if p.remaining is None and p.future.done()])
 
-    def take(self, future: Future) -> Iterator[tuple[str, Any]]:
-        """(name, result) of the job behind `future`, unless it has been taken in already."""
+    def result_of(self, future: JobFuture) -> Iterator[tuple[str, Any]]:
+        """Yield (name, result) of the job of `future`, unless its result was delivered already."""
         yield from self._take([p for p in self._pending if p.future is future])
 
-    def rest(self) -> Iterator[tuple[str, Any]]:
-        """(name, result) of all jobs, also of those that these lead to."""
+    def remaining_results(self) -> Iterator[tuple[str, Any]]:
+        """Wait for all jobs and yield (name, result), including jobs that are started meanwhile."""
         while self._pending:
             yield from self._take(self._pending[:1])
 

@@ -1,7 +1,7 @@
-"""Runs one node as one process on Zenoh.
+"""Live runner: runs one node as one process on Zenoh.
 
 Threads: the main thread runs the node; one per subscription fills the mailbox; one runs background jobs; one
-reports health every second. The node itself never sees any of them.
+publishes health every second. A node's handlers are called from the main thread only, except `on_arrival`.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from beamsplat.common.zenoh.queries import ask, reply
 log = logging.getLogger(__name__)
 
 _STOP_PATIENCE_S = 2.0  # after a signal, background jobs have this long to finish
-_SILENCE_S = 1.0  # without answers, after which a node that awaits them is told
+_SILENCE_S = 1.0  # without feedback, after which `on_feedback_timeout` is called
 
 
 class Live:
@@ -55,18 +55,20 @@ class Live:
         r = self.running
         settings, node = r.settings, r.node
         epoch = claim_epoch(settings.run_dir, node.name)
-        if not settings.resume:  # of an earlier run: a crash before the first message must not resume there
+        if (
+            not settings.resume
+        ):  # position of an earlier run: a crash before the first message must not resume there
             self._bookmark.clear()
         try:
             login = login_of(settings.security, node.name)
-            session = open_session(settings.endpoints, gave_up=lambda: self._stopping, login=login)
+            session = open_session(settings.endpoints, should_stop=lambda: self._stopping, login=login)
         except UserError:
             if self._stopping:
                 return
             raise
         with Bus(session, settings.robot, node.name, r.instance, epoch) as bus:
             reporter = HealthReporter(r, bus)
-            r.jobs = JobQueue(JobThread(self._gave_up).submit)
+            r.jobs = JobQueue(JobThread(self._must_abandon).submit)
             node.set_query_function(partial(ask, session, settings.robot))
             try:
                 node.configure()
@@ -86,7 +88,7 @@ class Live:
         self._stopping = True
         self._stop_by = min(self._stop_by, time.monotonic() + _STOP_PATIENCE_S)
 
-    def _gave_up(self) -> bool:
+    def _must_abandon(self) -> bool:
         return time.monotonic() > self._stop_by
 
     def install_signal_handlers(self) -> None:
@@ -131,11 +133,11 @@ class Live:
                 bus.end(publication)
             while not (self._stopping or r.settings.exit_when_drained or r.handover.retired):
                 self._attend()
-                self._take_late_answers()
+                self._handle_late_feedback()
                 with r.changed:
                     r.changed.wait(POLL_S)
 
-    def _take_late_answers(self) -> None:
+    def _handle_late_feedback(self) -> None:
         """Handle feedback that arrives after the node has ended; its outputs are discarded."""
         r = self.running
         while (envelope := r.next_envelope()) is not None:
@@ -203,7 +205,7 @@ class Live:
                 continue
             publication.put(item.message)
             r.steps_ms.append((time.perf_counter() - started) * 1e3)
-            playback.sent(item)
+            playback.mark_published(item)
 
     def _wait_for_consumers(self, bus: Bus) -> None:
         r = self.running
@@ -215,7 +217,7 @@ class Live:
         r.detail = ""
 
     def _attend(self) -> None:
-        """Process health reports and queries, which arrive beside the messages."""
+        """Process the health reports and queries received since the last call."""
         node = self.running.node
         while self._healths:
             node.on_health(self._healths.popleft())

@@ -1,4 +1,4 @@
-"""How a process takes part in the live system."""
+"""Settings of one node process of a live system."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from beamsplat.common.security.keys import OPEN, SecurityConfig
 
 @dataclass(frozen=True)
 class LiveSettings:
-    """How a process takes part; everything about the node itself is in the node's own config."""
+    """Connection, pacing and hand-over settings of a node process; the node's options are in its config."""
 
     robot: str
     endpoints: tuple[str, ...]
     run_dir: Path
-    security: SecurityConfig = OPEN  # of links to other hosts
+    security: SecurityConfig = OPEN  # keys for links to other hosts
     rate: float = 1.0  # pacing of recorded sources: times real time, 0 = as fast as possible
     wait_for: frozenset[str] = frozenset()  # a source starts when these nodes are active
-    wait_s: float = 60.0
+    wait_s: float = 60.0  # but after this time it starts without them
     without_producer: frozenset[str] = (
         frozenset()
-    )  # inputs that nobody in this deployment produces: not waited for
-    resume: bool = False  # a restarted source goes on where its predecessor died
-    exit_when_drained: bool = False
-    instance: str = ""  # 16 hex digits that the supervisor knows it by; "" = random
-    standby: bool = False  # says nothing until the supervisor has its predecessor retire
+    )  # inputs that no node of the deployment produces: not waited for
+    resume: bool = False  # a restarted source continues where the crashed process stopped
+    exit_when_drained: bool = False  # else the process answers queries until it is stopped
+    instance: str = ""  # id of this process, 16 hex digits, chosen by the supervisor; "" = random
+    standby: bool = False  # start as the successor in a hand-over: see runtime/handover.py

@@ -1,8 +1,8 @@
-"""All nodes in one thread, as a discrete-event loop: same input, same bytes out.
+"""Lockstep runner: all nodes in one thread, as a discrete-event simulation. Same input, same bytes.
 
 Events are ordered by (time, topic row, order of creation). Time is the arrival time that sources
-give. A node's modelled `step_cost_s` keeps it busy, so that what is `latest` is overtaken as it would
-be on a slow machine, and reproducibly. The handlers are the same that run live.
+return. A node is busy for its modelled `step_cost_s` per message, so that `latest` inputs drop messages as
+they would on a slow machine, but reproducibly. The node handlers are the same as in the live runner.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ _LAST_ROW = len(TOPICS)
 
 
 @dataclass
-class _Seat:
-    """One node and what the loop knows of it."""
+class _NodeState:
+    """A node with its mailbox, jobs and progress."""
 
     node: Node
     mailbox: Mailbox
@@ -38,61 +38,61 @@ class _Seat:
 
 
 class Lockstep:
-    """The loop. `on_message` sees every message that any node sends, in order."""
+    """The event loop over all nodes. `on_message` is called for every published message, in order."""
 
     def __init__(self, nodes: list[Node], on_message: Callable[[Envelope], None] | None = None) -> None:
         self._on_message = on_message or (lambda envelope: None)
-        self._seats = [_seat(node) for node in nodes]
+        self._states = [_state_of(node) for node in nodes]
         self._events: list[tuple[int, int, int, Callable[[int], None]]] = []
         self._created = 0
-        self._consumers: dict[str, list[_Seat]] = {
-            name: [s for s in self._seats if name in s.mailbox.counts] for name in TOPICS
+        self._consumers: dict[str, list[_NodeState]] = {
+            name: [s for s in self._states if name in s.mailbox.counts] for name in TOPICS
         }
 
     def run(self) -> dict[str, Mailbox]:
-        """Runs until all sources are exhausted and all nodes drained; mailboxes (counters) by node."""
+        """Run until all sources are exhausted and all nodes drained; return each node's mailbox by name."""
         try:
-            for seat in self._seats:
-                seat.node.configure()
-            produced = {name for seat in self._seats for name in seat.node.outputs}
+            for state in self._states:
+                state.node.configure()
+            produced = {name for state in self._states for name in state.node.outputs}
             for name in TOPICS:
                 if name not in produced:
                     self._end_topic(name, NO_PRODUCER, 0)
-            for seat in self._seats:
-                if seat.source is not None:
-                    self._pull(seat, 0)
+            for state in self._states:
+                if state.source is not None:
+                    self._pull(state, 0)
             while self._events:
                 time_ns, _, _, act = heapq.heappop(self._events)
                 act(time_ns)
         finally:
-            for seat in self._seats:
-                seat.node.close()
-        return {seat.node.name: seat.mailbox for seat in self._seats}
+            for state in self._states:
+                state.node.close()
+        return {state.node.name: state.mailbox for state in self._states}
 
     def _at(self, time_ns: int, row: int, act: Callable[[int], None]) -> None:
         self._created += 1
         heapq.heappush(self._events, (time_ns, row, self._created, act))
 
-    def _pull(self, seat: _Seat, now_ns: int) -> None:
-        """Schedules the next message of a source, or its end."""
-        item = next(seat.source, None)
+    def _pull(self, state: _NodeState, now_ns: int) -> None:
+        """Schedule the next message of a source, or its end."""
+        item = next(state.source, None)
         if item is None:
-            self._at(now_ns, _LAST_ROW, lambda t: self._end_node(seat, t))
+            self._at(now_ns, _LAST_ROW, lambda t: self._end_node(state, t))
             return
-        seat.node.check_output(item.topic, item.message)
+        state.node.check_output(item.topic, item.message)
         at_ns = max(item.message.stamp_ns if item.at_ns is None else item.at_ns, now_ns)
 
         def act(time_ns: int) -> None:
-            self._send(seat, item.topic, item.message, time_ns)
-            self._pull(seat, time_ns)
+            self._send(state, item.topic, item.message, time_ns)
+            self._pull(state, time_ns)
 
         self._at(at_ns, ROW_NUMBER[item.topic], act)
 
-    def _send(self, seat: _Seat, name: str, message: Message, time_ns: int) -> None:
-        """Numbers a message, shows it to the observer and delivers it."""
-        sequence = seat.sequences.get(name, 0)
-        seat.sequences[name] = sequence + 1
-        header = Header(message.stamp_ns, time_ns, 0, sequence, 0, seat.node.name, seat.instance)
+    def _send(self, state: _NodeState, name: str, message: Message, time_ns: int) -> None:
+        """Give a message its header, pass it to `on_message` and deliver it to all consumers."""
+        sequence = state.sequences.get(name, 0)
+        state.sequences[name] = sequence + 1
+        header = Header(message.stamp_ns, time_ns, 0, sequence, 0, state.node.name, state.instance)
         envelope = Envelope(name, header, message)
         self._on_message(envelope)
         for consumer in self._consumers[name]:
@@ -100,58 +100,58 @@ class Lockstep:
             consumer.mailbox.put(envelope)
             self._step(consumer, time_ns)
 
-    def _step(self, seat: _Seat, now_ns: int) -> None:
-        """Lets a node handle what it can at this time."""
-        if seat.ended:
-            self._hear_answers(seat)
-        while now_ns >= seat.busy_until_ns and (envelope := seat.mailbox.pop()) is not None:
-            for name, result in seat.jobs.before_message(envelope.topic):
-                self._emit(seat, seat.node.handle_job(name, result), now_ns)
-            seat.busy_until_ns = now_ns + _ns(seat.node.config.step_cost_s)
-            seat.node.on_header(envelope.header)
-            self._emit(seat, seat.node.handle(envelope.topic, envelope.message), seat.busy_until_ns)
-            if seat.busy_until_ns > now_ns:
-                self._at(seat.busy_until_ns, _LAST_ROW, lambda t: self._step(seat, t))
-        if seat.mailbox.ended and not seat.ended and now_ns >= seat.busy_until_ns:
-            self._end_node(seat, now_ns)
+    def _step(self, state: _NodeState, now_ns: int) -> None:
+        """Let a node handle its queued messages until it is busy or its mailbox is empty."""
+        if state.ended:
+            self._handle_late_feedback(state)
+        while now_ns >= state.busy_until_ns and (envelope := state.mailbox.pop()) is not None:
+            for name, result in state.jobs.before_message(envelope.topic):
+                self._emit(state, state.node.handle_job(name, result), now_ns)
+            state.busy_until_ns = now_ns + _ns(state.node.config.step_cost_s)
+            state.node.on_header(envelope.header)
+            self._emit(state, state.node.handle(envelope.topic, envelope.message), state.busy_until_ns)
+            if state.busy_until_ns > now_ns:
+                self._at(state.busy_until_ns, _LAST_ROW, lambda t: self._step(state, t))
+        if state.mailbox.ended and not state.ended and now_ns >= state.busy_until_ns:
+            self._end_node(state, now_ns)
 
-    def _hear_answers(self, seat: _Seat) -> None:
-        """What is fed back to a node that has ended is still heard; it has nothing more to say to it."""
-        while (envelope := seat.mailbox.pop()) is not None:
-            seat.node.on_header(envelope.header)
-            for _ in seat.node.handle(envelope.topic, envelope.message):
+    def _handle_late_feedback(self, state: _NodeState) -> None:
+        """Handle feedback for a node that has ended; its outputs are discarded."""
+        while (envelope := state.mailbox.pop()) is not None:
+            state.node.on_header(envelope.header)
+            for _ in state.node.handle(envelope.topic, envelope.message):
                 pass
 
-    def _emit(self, seat: _Seat, outputs: Iterator[Output], time_ns: int) -> None:
+    def _emit(self, state: _NodeState, outputs: Iterator[Output], time_ns: int) -> None:
         for output in outputs:
             if isinstance(output, Job):
-                self._start(seat, output, time_ns)
+                self._start(state, output, time_ns)
             else:
                 name, message = output
                 self._at(
                     time_ns,
                     ROW_NUMBER[name],
-                    lambda t, name=name, message=message: self._send(seat, name, message, t),
+                    lambda t, name=name, message=message: self._send(state, name, message, t),
                 )
 
-    def _start(self, seat: _Seat, job: Job, time_ns: int) -> None:
-        future = seat.jobs.start(job)
+    def _start(self, state: _NodeState, job: Job, time_ns: int) -> None:
+        future = state.jobs.start(job)
         if job.after is None:
 
             def act(time_ns: int) -> None:
-                for name, result in seat.jobs.take(future):
-                    self._emit(seat, seat.node.handle_job(name, result), time_ns)
+                for name, result in state.jobs.result_of(future):
+                    self._emit(state, state.node.handle_job(name, result), time_ns)
 
-            self._at(time_ns + _ns(seat.node.config.job_cost_s), _LAST_ROW, act)
+            self._at(time_ns + _ns(state.node.config.job_cost_s), _LAST_ROW, act)
 
-    def _end_node(self, seat: _Seat, now_ns: int) -> None:
-        """Last jobs and outputs of a node whose inputs have ended; then its own topics end."""
-        seat.ended = True
-        for name, result in seat.jobs.rest():
-            self._emit(seat, seat.node.handle_job(name, result), now_ns)
-        self._emit(seat, seat.node.handle_drain(), now_ns)
-        for name in seat.node.outputs:
-            self._at(now_ns, _LAST_ROW, lambda t, name=name: self._end_topic(name, seat.instance, t))
+    def _end_node(self, state: _NodeState, now_ns: int) -> None:
+        """Finish the jobs of a node whose inputs have ended, drain it, then end its output topics."""
+        state.ended = True
+        for name, result in state.jobs.remaining_results():
+            self._emit(state, state.node.handle_job(name, result), now_ns)
+        self._emit(state, state.node.handle_drain(), now_ns)
+        for name in state.node.outputs:
+            self._at(now_ns, _LAST_ROW, lambda t, name=name: self._end_topic(name, state.instance, t))
 
     def _end_topic(self, name: str, instance: str, now_ns: int) -> None:
         for consumer in self._consumers[name]:
@@ -159,8 +159,8 @@ class Lockstep:
             self._step(consumer, now_ns)
 
 
-def _seat(node: Node) -> _Seat:
-    return _Seat(
+def _state_of(node: Node) -> _NodeState:
+    return _NodeState(
         node=node,
         mailbox=Mailbox(type(node)),
         jobs=JobQueue(LazyFuture),

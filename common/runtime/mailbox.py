@@ -1,8 +1,7 @@
-"""Where a node's inputs wait: a slot per `latest` input, merged queues for the `every` ones; an `every`
-input that is fed back waits in a queue of its own.
+"""Input queues of a node: a slot per `latest` or `latched` input, queues merged by stamp for `every` inputs.
 
-One mailbox belongs to one node and is not thread-safe by itself; the live runner holds a lock around
-it. Whatever is overtaken, lost, stale or undecodable is counted here, per input.
+An `every` input that is feedback has a queue of its own. A mailbox belongs to one node and is not
+thread-safe; the live runner locks it. It counts dropped, lost, stale and undecodable messages per input.
 """
 
 from __future__ import annotations
@@ -17,28 +16,28 @@ from beamsplat.common.runtime.node import Input, Node, merged_topics
 from beamsplat.common.runtime.stamp_merger import StampMerger
 from beamsplat.common.topics import ROW_NUMBER, TOPICS
 
-NO_PRODUCER = "nobody"  # ends an input that no node produces
-MAX_QUEUED = 20_000  # of an `every` input: beyond it the oldest goes, and is counted
-_MAX_COUNT = 2**63 - 1  # what a Health message can say
+NO_PRODUCER = "nobody"  # instance that ends an input without a producer
+MAX_QUEUED = 20_000  # messages per `every` input; beyond that the oldest is dropped and counted
+_MAX_COUNT = 2**63 - 1  # largest int64: limit of the counters in a Health message
 
 
-# Topic -> instance of its producer -> (sequence that should come next, those before it that still wait).
-Handled = dict[str, dict[str, tuple[int, list[int]]]]
+# Topic -> instance of its producer -> (next expected sequence number, earlier ones that are still queued).
+HandledSequences = dict[str, dict[str, tuple[int, list[int]]]]
 
 
 @dataclass(frozen=True, slots=True)
 class Envelope:
-    """A received message with what rode beside it."""
+    """A received message with its topic, header and payload size."""
 
     topic: str
     header: Header
     message: Message
-    size_bytes: int = 0  # of the payload; 0 where there was none
+    size_bytes: int = 0  # of the payload; 0 in lockstep, where messages are not encoded
 
 
 @dataclass
 class InputCount:
-    """Counters of one input, and what they are made from."""
+    """Counters of one input, and the sequence state that they are computed from."""
 
     received: int = 0
     dropped: int = 0
@@ -47,43 +46,45 @@ class InputCount:
     stale: int = 0
     age_ms: float = 0.0
     epoch: int = -1
-    expected: dict[str, int] = field(default_factory=dict)  # instance -> next sequence
-    ended_by: str | None = None
+    expected: dict[str, int] = field(default_factory=dict)  # instance -> next sequence number
+    ended_by: str | None = None  # instance that ended the stream, or NO_PRODUCER
     queued_bytes: int = 0
 
 
 class Mailbox:
-    """The inputs of one node."""
+    """Queues and counters of all inputs of one node."""
 
     def __init__(self, node: type[Node], clock_ns: Callable[[], int] | None = None) -> None:
-        """`clock_ns` is given live: see `StampMerger`."""
+        """`clock_ns`: clock for time-outs in the live runner, None in lockstep; see `StampMerger`."""
         self._deliveries = {i.topic: i.effective_delivery for i in _inputs(node)}
         self._merger = StampMerger(merged_topics(node), clock_ns=clock_ns)
         self._slots: dict[str, Envelope] = {}
-        self._fed_back = frozenset(i.topic for i in _inputs(node) if i.feedback)
-        self._answers: deque[Envelope] = deque()  # of `every` inputs that are fed back
+        self._feedback_topics = frozenset(i.topic for i in _inputs(node) if i.feedback)
+        self._feedback_queue: deque[Envelope] = deque()  # of `every` inputs that are feedback
         self._most_bytes = {i.topic: i.queued_bytes for i in _inputs(node)}
         self.counts = {name: InputCount() for name in self._deliveries}
 
     def __len__(self) -> int:
-        return len(self._merger) + len(self._slots) + len(self._answers)
+        return len(self._merger) + len(self._slots) + len(self._feedback_queue)
 
     def put(self, envelope: Envelope) -> bool:
-        """Takes a envelope, unless its epoch has been taken over; True if it was taken."""
+        """Queue a message; return False for a stale one (repeated, or of a predecessor) instead."""
         count = self.counts[envelope.topic]
         every = self._deliveries[envelope.topic] == "every"
         if not self._admit(count, envelope.header, every and not TOPICS[envelope.topic].resent_until_ack):
             return False
         if envelope.topic in self._slots:
             count.dropped += 1
-        if every and envelope.topic in self._fed_back:
-            if len(self._answers) >= MAX_QUEUED:
-                self.counts[self._answers.popleft().topic].dropped += 1
-            self._answers.append(envelope)
+        if every and envelope.topic in self._feedback_topics:
+            if len(self._feedback_queue) >= MAX_QUEUED:
+                self.counts[self._feedback_queue.popleft().topic].dropped += 1
+            self._feedback_queue.append(envelope)
         elif every:
             self._make_room(envelope, count)
             self._merger.put(envelope.topic, envelope.message.stamp_ns, envelope)
-            if count.ended_by is not None:  # a straggler: its producer has ended all the same
+            if (
+                count.ended_by is not None
+            ):  # recovered after the end-of-stream marker: the stream has ended all the same
                 self._merger.end(envelope.topic)
         else:
             self._slots[envelope.topic] = envelope
@@ -99,17 +100,17 @@ class Mailbox:
         count.queued_bytes += envelope.size_bytes
 
     def _admit(self, count: InputCount, header: Header, loses: bool) -> bool:
-        """Epoch and sequence bookkeeping; False for a stale or repeated message."""
+        """Update epoch and sequence state; return False for a stale or repeated message."""
         if header.epoch < count.epoch:
             count.stale += 1
             return False
-        first = 0 if 0 <= count.epoch < header.epoch else None  # a successor starts counting at 0
+        first = 0 if 0 <= count.epoch < header.epoch else None  # a successor starts at sequence number 0
         if header.epoch > count.epoch:
             count.epoch = header.epoch
             count.expected.clear()
         expected = count.expected.get(header.instance, first)
         if expected is not None and header.sequence < expected:
-            count.stale += 1  # recovery may deliver once more what has arrived
+            count.stale += 1  # recovery can deliver a message a second time
             return False
         if expected is not None:
             gap = header.sequence - expected
@@ -123,10 +124,12 @@ class Mailbox:
         return True
 
     def end(self, topic: str, instance: str, epoch: int, sent: int = 0) -> None:
-        """The producer `instance` says that nothing more will come on `topic`, after `sent` messages; what
-        of them has not come by now counts as lost."""
+        """End an input: its producer `instance` has sent its last message, `sent` messages in all.
+
+        Messages that have not arrived by now are counted as lost (as dropped if the producer resends them).
+        """
         count = self.counts[topic]
-        if epoch < count.epoch:  # of a producer that has been taken over
+        if epoch < count.epoch:  # of a producer that has handed over
             return
         count.ended_by = instance
         if self._deliveries[topic] == "every":
@@ -135,20 +138,20 @@ class Mailbox:
                 count.dropped += missing
             else:
                 count.lost += missing
-            if topic not in self._fed_back:
+            if topic not in self._feedback_topics:
                 self._merger.end(topic)
 
     def next_sequence(self, topic: str, instance: str) -> int:
-        """The sequence number that `topic` should bring next from `instance`; 0 before the first."""
+        """Return the next expected sequence number on `topic` from `instance`; 0 before the first message."""
         return self.counts[topic].expected.get(instance, 0)
 
-    def waiting(self) -> list[Envelope]:
-        """What of the `every` inputs waits here, input by input in order of arrival."""
-        return [*self._answers, *self._merger.items()]
+    def queued(self) -> list[Envelope]:
+        """Return the queued messages of the `every` inputs, input by input in order of arrival."""
+        return [*self._feedback_queue, *self._merger.items()]
 
-    def handled(self) -> Handled:
-        """What of the `every` inputs has come and does not wait here any more."""
-        queued = self.waiting()
+    def handled(self) -> HandledSequences:
+        """Return which messages of the `every` inputs were received and popped: the progress of this node."""
+        queued = self.queued()
         return {
             topic: {
                 instance: (
@@ -162,9 +165,12 @@ class Mailbox:
         }
 
     def pop(self) -> Envelope | None:
-        """The envelope to handle next: answers, what is certain of `every` inputs, the oldest of the rest."""
-        if self._answers:
-            envelope = self._answers.popleft()
+        """Remove and return the message to handle next, or None if none is ready.
+
+        Feedback first, then the next message of the merged `every` inputs, then the oldest of the slots.
+        """
+        if self._feedback_queue:
+            envelope = self._feedback_queue.popleft()
             self.counts[envelope.topic].received += 1
             return envelope
         merged = self._merger.pop()
@@ -182,18 +188,20 @@ class Mailbox:
 
     @property
     def ended(self) -> bool:
-        """Every input has ended, at least one by its producer's word, and everything was handed out. Inputs
-        that are fed back are not asked: they end after this node."""
-        enders = [count.ended_by for name, count in self.counts.items() if name not in self._fed_back]
+        """Whether all inputs have ended, at least one of them had a producer, and the queues are empty.
+
+        Feedback inputs are not considered, because they end after this node.
+        """
+        enders = [count.ended_by for name, count in self.counts.items() if name not in self._feedback_topics]
         return not len(self) and all(enders) and any(e != NO_PRODUCER for e in enders)
 
     @property
     def feedback_may_arrive(self) -> bool:
-        """Somebody feeds back to this node, and has not ended."""
-        return any(self.counts[name].ended_by is None for name in self._fed_back)
+        """Whether a feedback input has not ended yet."""
+        return any(self.counts[name].ended_by is None for name in self._feedback_topics)
 
     def health(self) -> tuple[InputHealth, ...]:
-        """The counters as they go into a Health message."""
+        """Return the counters in the form of a Health message."""
         return tuple(
             InputHealth(
                 topic=name, received=c.received, dropped=min(c.dropped, _MAX_COUNT),

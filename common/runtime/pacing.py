@@ -1,4 +1,4 @@
-"""When a source's next message is due, and where a restarted source goes on."""
+"""Pacing of recorded sources, the position where a restarted source continues, and a token bucket."""
 
 from __future__ import annotations
 
@@ -17,9 +17,12 @@ def wait_for_nodes(
     alive: Callable[[], set[str]],
     settings: LiveSettings,
     stopping: Callable[[], bool],
-    say: Callable[[list[str]], None],
+    on_waiting: Callable[[list[str]], None],
 ) -> None:
-    """Returns when all that a source waits for are alive, after `wait_s` without them, or to stop."""
+    """Block until the nodes in `settings.wait_for` are active, `settings.wait_s` has passed, or `stopping()`.
+
+    `on_waiting` is called with the names of the missing nodes.
+    """
     deadline = time.monotonic() + settings.wait_s
     missing = settings.wait_for
     while missing and not stopping():
@@ -29,26 +32,26 @@ def wait_for_nodes(
                         settings.wait_s)  # fmt: skip
             return
         if missing:
-            say(sorted(missing))
+            on_waiting(sorted(missing))
             time.sleep(0.1)
 
 
 class Playback:
-    """Maps a recording's clock to this machine's, and keeps the place in the recording."""
+    """Maps the clock of a recording to the host's clock, and stores the position in the recording."""
 
-    def __init__(self, rate: float, bookmark: ReplayPosition, resume: bool) -> None:
-        """`rate` in times real time, 0 = as fast as possible; `resume` goes on at the bookmark."""
+    def __init__(self, rate: float, position: ReplayPosition, resume: bool) -> None:
+        """`rate`: times real time, 0 = as fast as possible; `resume`: continue at the stored position."""
         self._rate = rate
-        self._bookmark = bookmark
+        self._position = position
         self._first: tuple[int, float] | None = None
-        self._resume_ns = bookmark.read() if resume else None
+        self._resume_ns = position.read() if resume else None
 
     def is_past(self, item: SourceItem) -> bool:
-        """Whether a predecessor has sent this already."""
+        """Return whether the process before the restart has published this item."""
         return self._resume_ns is not None and item.at_ns is not None and item.at_ns <= self._resume_ns
 
     def wait_s(self, item: SourceItem) -> float:
-        """Seconds until an item is due; not positive when it is."""
+        """Return the time until an item is due in s; zero or negative if it is due now."""
         if item.at_ns is None or self._rate == 0.0 or self.is_past(item):
             return 0.0
         now = time.monotonic()
@@ -57,25 +60,25 @@ class Playback:
         first_ns, started = self._first
         return started + (item.at_ns - first_ns) / 1e9 / self._rate - now
 
-    def sent(self, item: SourceItem) -> None:
-        """Keeps the place behind a message that was sent."""
+    def mark_published(self, item: SourceItem) -> None:
+        """Store the position after a published item."""
         if item.at_ns is not None and not self.is_past(item):
-            self._bookmark.write(item.at_ns)
+            self._position.write(item.at_ns)
 
 
 class TokenBucket:
-    """So many a second, and twice as many at once after a pause: a token bucket of one thread."""
+    """Token bucket: `rate_hz` tokens per second, capacity `2 * rate_hz`. Not thread-safe."""
 
     def __init__(self, rate_hz: float, clock_s: Callable[[], float] = time.monotonic) -> None:
         self._rate_hz, self._clock_s = rate_hz, clock_s
-        self._left, self._at_s = 2.0 * rate_hz, clock_s()
+        self._tokens, self._at_s = 2.0 * rate_hz, clock_s()
 
     def take(self) -> bool:
-        """Whether one more is allowed now."""
+        """Take a token; return False if the bucket is empty."""
         now = self._clock_s()
-        self._left = min(self._left + (now - self._at_s) * self._rate_hz, 2.0 * self._rate_hz)
+        self._tokens = min(self._tokens + (now - self._at_s) * self._rate_hz, 2.0 * self._rate_hz)
         self._at_s = now
-        if self._left < 1.0:
+        if self._tokens < 1.0:
             return False
-        self._left -= 1.0
+        self._tokens -= 1.0
         return True

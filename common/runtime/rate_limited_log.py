@@ -1,20 +1,20 @@
-"""RateLimitedLog at a bounded rate: what repeats is counted and said once in a while."""
+"""Rate limit for repeated log messages: suppressed ones are counted."""
 
 from __future__ import annotations
 
 import time
 
-_PERIOD_S = 5.0
+_PERIOD_S = 5.0  # shortest time between two messages of one subject
 
 
 class RateLimitedLog:
-    """One clock and one count a subject."""
+    """Decides per subject whether a message is logged now. Not thread-safe."""
 
     def __init__(self) -> None:
         self._last: dict[str, tuple[float, int]] = {}
 
     def due(self, subject: str) -> int | None:
-        """How many were kept back since the last, if it is time for another; None: keep this one back."""
+        """Return the number of messages suppressed since the last one, or None to suppress this one."""
         now = time.monotonic()
         last, count = self._last.get(subject, (now - _PERIOD_S, 0))
         if now - last < _PERIOD_S:

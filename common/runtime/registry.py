@@ -1,4 +1,4 @@
-"""Implementations of a service by name ("module:Class"), imported only when a deployment chooses them."""
+"""Services and their implementations ("module:Class"), imported only when a deployment selects them."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ class Service:
             return self._load_class(chosen)
         if chosen not in self.kinds:
             raise UserError(
-                f"nodes.{self.name}: there is no kind {kind!r}; there are {', '.join(self.kinds)}, and "
-                "'module:Class' of a class of your own"
+                f"nodes.{self.name}: there is no kind {kind!r}; the kinds are {', '.join(self.kinds)}, "
+                "or 'module:Class' for a class of your own"
             )
         module_name, _, class_name = self.kinds[chosen].partition(":")
         with missing_packages_explained(f"nodes.{self.name} ({chosen})"):
@@ -56,7 +56,7 @@ class Service:
 
 
 def node_class_of(service: Service, options: dict[str, object]) -> type[Node]:
-    """The node class that a node's table in a deployment asks for; its other options are not looked at.
+    """Return the node class of a node's table in a deployment; options other than `kind` are not checked.
 
     Raises:
         UserError: unknown kind.
@@ -65,10 +65,10 @@ def node_class_of(service: Service, options: dict[str, object]) -> type[Node]:
 
 
 def make_node(service: Service, options: dict[str, object], where: str) -> Node:
-    """A configured-to-be node from its table in a deployment.
+    """Return a node made from its table in a deployment; it is not configured yet.
 
     Raises:
-        UserError: unknown kind or option, or a value that does not fit.
+        UserError: unknown kind or option, or an invalid value; `where` names the source.
     """
     node_class = node_class_of(service, options)
     config: NodeConfig = parse(node_class.Config, options, f"{where}: node {service.name!r}")

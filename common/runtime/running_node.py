@@ -17,8 +17,8 @@ from beamsplat.common.runtime.mailbox import Envelope, Mailbox
 from beamsplat.common.runtime.node import Job, Node, Output
 from beamsplat.common.zenoh.streams import Publication
 
-POLL_S = 0.2  # how soon a signal is noticed while no message arrives
-_END_PATIENCE_S = 5.0  # an end marker waits this long for messages that are still in transit
+POLL_S = 0.2  # longest wait for a message before signals are checked
+_END_PATIENCE_S = 5.0  # an end-of-stream marker waits this long for messages still in transit
 
 
 class RunningNode:
@@ -88,13 +88,13 @@ class RunningNode:
 
     def _apply_ends(self) -> None:
         """End an input once all messages that its producer sent have arrived, or after a time-out."""
-        waiting = []
+        pending = []
         for topic, instance, epoch, sent, deadline in self._ends:
             if self.mailbox.next_sequence(topic, instance) >= sent or time.monotonic() > deadline:
                 self.mailbox.end(topic, instance, epoch, sent)
             else:
-                waiting.append((topic, instance, epoch, sent, deadline))
-        self._ends = waiting
+                pending.append((topic, instance, epoch, sent, deadline))
+        self._ends = pending
 
     def emit(self, outputs: Iterator[Output]) -> None:
         """Publish messages and start jobs; in standby, messages are held back."""
@@ -111,4 +111,4 @@ class RunningNode:
 
     def finish_jobs(self) -> None:
         """Wait for all background jobs and process their results."""
-        self.emit_results(self.jobs.rest())
+        self.emit_results(self.jobs.remaining_results())

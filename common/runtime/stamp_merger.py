@@ -1,11 +1,11 @@
-"""Merging streams by stamp, so that a node sees the same order live and replayed.
+"""Merging of streams by stamp, so that a node receives messages in the same order live and in replay.
 
-A message is released once every other stream has shown that nothing older will come: its newest
-stamp is not before the message's, or it has ended. A stream that falls behind the newest stamp by
-more than `patience_ns` stops being waited for until it speaks again. Without a clock all of this
-depends on the data alone. With one (live), a stream must have been silent for as long by that clock
-as well: one that is merely late on its way, on a busy machine or at many times real time, is waited
-for, and the order stays that of the stamps.
+A message is released once no other stream can deliver an older one: each other stream has a newest stamp at
+or after the message's stamp, or has ended. A stream whose newest stamp is more than `timeout_ns` behind the
+newest stamp of all streams is not waited for, until its next message. Without a clock (lockstep) this depends
+on the data alone. With a clock (live), the stream must also have been silent for `timeout_ns` of that clock:
+messages that are only delayed, by a busy machine or by replay faster than real time, are waited for, and the
+order stays that of the stamps.
 """
 
 from __future__ import annotations
@@ -14,84 +14,86 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from typing import Any
 
-PATIENCE_NS = 500_000_000
+TIMEOUT_NS = 500_000_000  # longer than two periods of a 5 Hz lidar
 _END_NS = 2**63 - 1
 
 
 class StampMerger:
-    """In-order streams in, one stream ordered by (stamp, stream number) out."""
+    """Merges in-order streams into one stream ordered by (stamp, position in `streams`)."""
 
     def __init__(
         self,
         streams: tuple[str, ...],
-        patience_ns: int = PATIENCE_NS,
+        timeout_ns: int = TIMEOUT_NS,
         clock_ns: Callable[[], int] | None = None,
     ) -> None:
         self._queues: dict[str, deque[tuple[int, Any]]] = {name: deque() for name in streams}
         self._newest_ns: dict[str, int] = {}
-        self._heard_ns: dict[str, int] = {}  # by the clock
+        self._arrival_ns: dict[str, int] = {}  # arrival time of the newest item by the clock
         self._order = {name: i for i, name in enumerate(streams)}
-        self._patience_ns = patience_ns
+        self._timeout_ns = timeout_ns
         self._clock_ns = clock_ns
-        self._first_ns: int | None = None  # from when on a stream that never spoke is missed
+        self._first_ns: int | None = None  # stamp from which a stream without messages counts as behind
         self._released_ns = 0
-        self.late = 0  # released behind a younger one, because their stream had been given up
+        self.late = 0  # items released after a newer one, because their stream was not waited for
 
     def __len__(self) -> int:
         return sum(len(queue) for queue in self._queues.values())
 
     def queued(self, stream: str) -> int:
-        """Items of `stream` not yet released."""
+        """Return the number of queued items of `stream`."""
         return len(self._queues[stream])
 
     def items(self) -> Iterator[Any]:
-        """What is not yet released, stream by stream."""
+        """Yield the queued items, stream by stream."""
         return (item for queue in self._queues.values() for _, item in queue)
 
     def put(self, stream: str, stamp_ns: int, item: Any) -> None:
-        """Takes one item; stamps may jump back within a stream, order of arrival is then kept."""
+        """Queue an item. If stamps jump back within a stream, its order of arrival is kept."""
         now_ns = self._clock_ns() if self._clock_ns else 0
         if self._first_ns is None:
             self._first_ns = stamp_ns
-            self._heard_ns = dict.fromkeys(self._queues, now_ns)  # silence is counted from here
+            self._arrival_ns = dict.fromkeys(
+                self._queues, now_ns
+            )  # start of the time-out for streams without messages
         self._first_ns = min(self._first_ns, stamp_ns)
         self._queues[stream].append((stamp_ns, item))
         self._newest_ns[stream] = stamp_ns
-        self._heard_ns[stream] = now_ns
+        self._arrival_ns[stream] = now_ns
 
     def drop_oldest(self, stream: str) -> Any:
-        """Takes the oldest item out of `stream`: the caller's bound was hit, and the caller counts."""
+        """Remove and return the oldest item of `stream`; for callers that limit the queue."""
         return self._queues[stream].popleft()[1]
 
     def end(self, stream: str) -> None:
-        """Nothing more will come from `stream`, unless a successor speaks."""
+        """Mark `stream` as ended; a later item (of a restarted producer) reopens it."""
         self._newest_ns[stream] = _END_NS
 
     def pop(self) -> tuple[str, Any] | None:
-        """The next (stream, item), or None while it is not certain which that is."""
+        """Remove and return the next (stream, item), or None while an older item could still arrive."""
         heads = [(queue[0][0], self._order[name], name) for name, queue in self._queues.items() if queue]
         if not heads:
             return None
         stamp_ns, _, stream = min(heads)
-        # What is here and was last heard, not the highest stamp ever: clocks are set back, and stamps err.
+        # Queued and last received stamps, not the highest ever: clocks are set back, and stamps can be wrong.
         newest_ns = (newest for newest in self._newest_ns.values() if newest != _END_NS)
         front_ns = max(max(newest_ns, default=0), max(heads)[0])
         for name, queue in self._queues.items():
             silent = not queue and self._newest_ns.get(name, -1) < stamp_ns
-            if silent and not self._given_up(name, front_ns):
+            if silent and not self._timed_out(name, front_ns):
                 return None
         self.late += stamp_ns < self._released_ns
         self._released_ns = stamp_ns
         return stream, self._queues[stream].popleft()[1]
 
-    def _given_up(self, name: str, front_ns: int) -> bool:
-        if front_ns - self._newest_ns.get(name, self._first_ns) <= self._patience_ns:
+    def _timed_out(self, name: str, front_ns: int) -> bool:
+        if front_ns - self._newest_ns.get(name, self._first_ns) <= self._timeout_ns:
             return False
         if self._clock_ns is None:
             return True
-        return self._clock_ns() - self._heard_ns[name] > self._patience_ns
+        return self._clock_ns() - self._arrival_ns[name] > self._timeout_ns
 
     @property
     def ended(self) -> bool:
-        """All streams have ended and are empty."""
+        """Whether all streams have ended and all items are released."""
         return not len(self) and all(self._newest_ns.get(name) == _END_NS for name in self._queues)

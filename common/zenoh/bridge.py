@@ -149,9 +149,7 @@ class Bridge:
                     return
                 try:
                     send(sample)
-                except (
-                    zenoh.ZError
-                ) as error:  # the connection broke, or the session was closed
+                except zenoh.ZError as error:  # the connection broke, or the session was closed
                     self.interrupted += 1
                     log.info("a message on %s was not forwarded: %s", topic_key, error)
                     continue

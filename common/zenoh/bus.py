@@ -1,17 +1,17 @@
-"""Zenoh, as BeamSplat uses it: sessions, keys, publications, subscriptions.
+"""Zenoh sessions, key expressions, and the publications, subscriptions and queries of one node.
 
-Everything a robot says lives under `beamsplat/<robot>/`:
+All keys of a robot start with `beamsplat/<robot>/`:
 
     <topic>                       messages; header in the attachment, schema in the encoding
-    health/<node>                 once a second
-    end/<topic>                   the producer has nothing more to say (latched)
+    health/<node>                 health report, once a second
+    end/<topic>                   end-of-stream marker of the producer (latched)
     alive/<node>/<instance>       liveliness token of an active node
-    query/<node>/<name>           queryables
-    control/<instance>/<verb>     what the supervisor asks of one process (common/takeover.py)
+    query/<node>/<name>           queries to a node
+    control/<instance>/<verb>     hand-over requests to one process (common/runtime/handover.py)
 
-All sessions are clients of a router on this host: two peers that know only a router do not reach each
-other, and access control acts between client and router. Channels with threads of our own take the
-place of Python callbacks, which keep a process from ending.
+All sessions are clients of a router on this host: two Zenoh peers that are connected only through a router
+do not exchange data, and access control acts between client and router. Samples are read from channels in
+threads of this module, because Zenoh's Python callbacks prevent a process from ending.
 """
 
 from __future__ import annotations
@@ -39,13 +39,15 @@ from beamsplat.common.topics import HEALTH, LIMIT_KB, Topic, topic
 from beamsplat.common.zenoh.streams import Producer, Publication, Subscription, decode_sample
 
 ROOT = "beamsplat"
-URGENT_BUFFER_BYTES = 32 * 1024  # 13 ms at 20 Mbit/s
-BULK_BUFFER_BYTES = 256 * 1024  # at least rate x round trip, or the rate is not reached: 20 Mbit/s x 100 ms
-SHM_POOL_BYTES = 64 * 1024 * 1024
+# Kernel send buffers of a link. Small messages: 13 ms of delay at 20 Mbit/s. Large messages: at least rate x
+# round trip time (20 Mbit/s x 100 ms), or the rate is not reached.
+URGENT_BUFFER_BYTES = 32 * 1024
+BULK_BUFFER_BYTES = 256 * 1024
+SHM_POOL_BYTES = 64 * 1024 * 1024  # Zenoh's shared-memory pool of one process
 
 
 def key(robot: str, *parts: str) -> str:
-    """`beamsplat/<robot>/<parts...>`."""
+    """Return the key expression `beamsplat/<robot>/<parts...>`."""
     return "/".join((ROOT, robot, *parts))
 
 
@@ -54,7 +56,9 @@ def _base_config(mode: str) -> zenoh.Config:
     config.insert_json5("mode", json.dumps(mode))
     config.insert_json5("scouting/multicast/enabled", "false")
     config.insert_json5("scouting/gossip/enabled", "false")
-    config.insert_json5("transport/link/tx/lease", "2000")  # a hung peer is noticed in 2 s
+    config.insert_json5(
+        "transport/link/tx/lease", "2000"
+    )  # ms: the connection to a peer that hangs is closed after this time
     config.insert_json5(
         "connect/retry", "{period_init_ms: 100, period_max_ms: 1000, period_increase_factor: 2}"
     )
@@ -67,17 +71,17 @@ def _set_endpoints(config: zenoh.Config, side: str, endpoints: tuple[str, ...]) 
         config.insert_json5(f"{side}/endpoints", json.dumps(list(endpoints)))
     except zenoh.ZError as error:
         raise UserError(
-            f'router: {", ".join(endpoints)} are no endpoints; they look like "tcp/127.0.0.1:7447"'
+            f'router: {", ".join(endpoints)} is not a Zenoh endpoint; use the form "tcp/127.0.0.1:7447"'
         ) from error
 
 
 def open_router(
     listen: tuple[str, ...], connect: tuple[str, ...] = (), security: SecurityConfig = OPEN
 ) -> zenoh.Session:
-    """A router in this process.
+    """Open a Zenoh router in this process.
 
     Raises:
-        UserError: an endpoint cannot be listened on (in use), is malformed, or leaves this host unprotected.
+        UserError: an endpoint is in use or malformed, or it would be reachable from other hosts without TLS.
     """
     zenoh.init_log_from_env_or("error")
     config = router_config(listen, connect, security)
@@ -93,11 +97,13 @@ def open_router(
 def router_config(
     listen: tuple[str, ...], connect: tuple[str, ...] = (), security: SecurityConfig = OPEN
 ) -> zenoh.Config:
-    """What a router of ours runs with. Where it listens beyond this host, hosts show certificates, and may do
-    what the topic table and hosts.toml say.
+    """Return the configuration of a router.
+
+    On endpoints for other hosts, hosts authenticate with certificates (mutual TLS); the topic table and
+    hosts.toml define what each of them may read and write.
 
     Raises:
-        UserError: an endpoint is malformed, or leaves this host unprotected.
+        UserError: an endpoint is malformed, or would be reachable from other hosts without TLS.
     """
     config = _base_config("router")
     _set_endpoints(config, "listen", listen)
@@ -116,13 +122,13 @@ def router_config(
 
 
 def open_session(
-    endpoints: tuple[str, ...], wait_s: float = 15.0, gave_up: Callable[[], bool] = lambda: False,
+    endpoints: tuple[str, ...], wait_s: float = 15.0, should_stop: Callable[[], bool] = lambda: False,
     login: Login | None = None,
 ) -> zenoh.Session:  # fmt: skip
-    """A client session of the router at one of `endpoints`, waiting `wait_s` for it to appear.
+    """Open a client session of the router at one of `endpoints`; retry for `wait_s` seconds.
 
     Raises:
-        UserError: a malformed endpoint; no router answered, until then or until the caller `gave_up`.
+        UserError: an endpoint is malformed, or no router answered in time or before `should_stop()` was True.
     """
     zenoh.init_log_from_env_or("error")
     config = _base_config("client")
@@ -136,7 +142,7 @@ def open_session(
         try:
             return zenoh.open(config)
         except zenoh.ZError as error:
-            if gave_up() or time.monotonic() > deadline:
+            if should_stop() or time.monotonic() > deadline:
                 raise UserError(
                     f"no router answers at {', '.join(endpoints)} ({_short(error)}). Start the system "
                     "with `beamsplat run FILE`, or a router alone with `beamsplat run FILE router`"
@@ -147,12 +153,12 @@ def open_session(
 def open_link(
     endpoint: str, wait_s: float, security: SecurityConfig, buffer_bytes: int = URGENT_BUFFER_BYTES
 ) -> zenoh.Session:
-    """A client session of a router on another host, over a link that may be slow and may break.
+    """Open a client session of a router on another host, over a connection that can be slow and can break.
 
-    What is written waits in the kernel's send buffer, `buffer_bytes` of it at most: behind the rest.
+    `buffer_bytes` limits the kernel's send buffer, and with it the delay of a message behind queued data.
 
     Raises:
-        UserError: a malformed endpoint, credentials that are missing, or no router answered within `wait_s`.
+        UserError: a malformed endpoint, missing keys, or no router answered within `wait_s`.
     """
     zenoh.init_log_from_env_or("error")
     check_endpoint(endpoint, security)
@@ -168,25 +174,26 @@ def open_link(
     try:
         return zenoh.open(config)
     except zenoh.ZError as error:
-        raise UserError(f"nobody answers at {endpoint} ({_short(error)})") from error
+        raise UserError(f"no router answers at {endpoint} ({_short(error)})") from error
 
 
 def _short(error: zenoh.ZError) -> str:
+    """Return Zenoh's error text without source locations."""
     return str(error).split(" at ")[0][:120]
 
 
-def _last(query: zenoh.Query) -> str:
+def _verb_of(query: zenoh.Query) -> str:
     return str(query.key_expr).rpartition("/")[2]
 
 
 class Bus:
-    """One node's place on the network. Keep it open with `with`."""
+    """Publications, subscriptions and queries of one node. A context manager that closes its session."""
 
     def __init__(self, session: zenoh.Session, robot: str, node: str, instance: str, epoch: int) -> None:
         self.session = session
         self.robot = robot
         self.producer = Producer(node, instance, epoch, local_clock_id())
-        self._declared: list[object] = []  # dropped handles would be undeclared at once
+        self._declared: list[object] = []  # Zenoh undeclares a handle that is garbage-collected
         self._health = Publication(
             session, self.producer, Topic(HEALTH, Health, (node,), 1, "latest"), key(robot, HEALTH, node)
         )
@@ -198,7 +205,7 @@ class Bus:
         self.session.close()
 
     def publish(self, topic_name: str) -> Publication:
-        """Declares a publication of a topic."""
+        """Declare a publication of a topic."""
         return Publication(self.session, self.producer, topic(topic_name), key(self.robot, topic_name))
 
     def subscribe(
@@ -208,9 +215,12 @@ class Bus:
         on_undecodable: Callable[[str, str], None],
         on_end: Callable[[str, str, int, int], None],
     ) -> None:
-        """Declares a subscription; the callbacks run in threads of the bus.
+        """Declare a subscription; the callbacks are called from threads of the bus.
 
-        `on_end(topic, instance, epoch, sent)` tells that a producer has ended after `sent` messages.
+        Args:
+            on_undecodable: called with (topic, reason) for a message that was discarded.
+            on_end: called with (topic, instance, epoch, sent) when a producer has ended after `sent`
+                messages.
         """
         delivery = entry.effective_delivery
         self._declared.append(
@@ -245,7 +255,7 @@ class Bus:
         threading.Thread(target=receive, name=f"end-{entry.topic}", daemon=True).start()
 
     def end(self, publication: Publication) -> None:
-        """Tells the subscribers of a publication that nothing more will come."""
+        """Publish the end-of-stream marker of a publication."""
         publisher = zenoh.ext.declare_advanced_publisher(
             self.session,
             key(self.robot, "end", publication.row.name),
@@ -265,7 +275,7 @@ class Bus:
         """
         self._on_query = on_query
         place = key(self.robot, CONTROL, self.producer.instance, "*")
-        self._answer(place, lambda query: on_query(f"{CONTROL}/{_last(query)}", query))
+        self._answer(place, lambda query: on_query(f"{CONTROL}/{_verb_of(query)}", query))
 
     def announce(self, queries: tuple[str, ...]) -> None:
         """Show this process as the active node: declare its queries and its liveliness token."""
@@ -292,7 +302,7 @@ class Bus:
         threading.Thread(target=receive, name=f"query-{place}", daemon=True).start()
 
     def watch_health(self, on_health: Callable[[Health], None]) -> None:
-        """Brings the health of every node of this robot; `on_health` runs in a thread of the bus."""
+        """Call `on_health` for the health of every node of this robot, from a thread of the bus."""
         subscriber = self.session.declare_subscriber(
             key(self.robot, HEALTH, "*"), zenoh.handlers.FifoChannel(256)
         )
@@ -307,17 +317,17 @@ class Bus:
                     return
                 try:
                     health = decode_sample(sample, row).message
-                except DecodeError:  # another version's health cannot be shown; its node still runs
+                except DecodeError:  # a node of another software version
                     continue
                 on_health(health)
 
         threading.Thread(target=receive, name="watch-health", daemon=True).start()
 
-    def report(self, health: Health) -> None:
-        """Publishes this node's health."""
+    def publish_health(self, health: Health) -> None:
+        """Publish this node's health."""
         self._health.put(health)
 
     def alive_nodes(self) -> set[str]:
-        """Names of the nodes of this robot that are active now."""
+        """Return the names of the active nodes of this robot."""
         replies = self.session.liveliness().get(key(self.robot, "alive", "*", "*"), timeout=2.0)
         return {str(r.ok.key_expr).split("/")[3] for r in replies if r.ok is not None}

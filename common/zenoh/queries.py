@@ -1,4 +1,4 @@
-"""Questions to a node and their answers: messages, streamed as they are made."""
+"""Queries to a node, and their answers: a stream of messages."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from beamsplat.common.runtime.handover import CONTROL
 from beamsplat.common.zenoh.bus import key
 from beamsplat.common.zenoh.streams import ENCODING
 
-_APPEAR_S = 2.0  # right after a (re)connection a queryable is not known yet, and nobody answers
+_DISCOVERY_S = 2.0  # right after a (re)connection, queries to a running node get no answer yet
 
 
 def ask(
     session: zenoh.Session, robot: str, node: str, name: str, parameters: dict[str, str], timeout_s: float
 ) -> Iterator[Message]:
-    """The replies to a query, as they come.
+    """Send a query to a node and yield its answers as they arrive.
 
     Raises:
-        UserError: nobody answers to this query, the node refused it, or it took too long.
+        UserError: no node answered this query in time, or the node rejected it.
     """
     yield from _ask(session, key(robot, "query", node, name), (node, name), parameters, timeout_s)
 
@@ -31,10 +31,10 @@ def ask(
 def command(
     session: zenoh.Session, robot: str, instance: str, verb: str, parameters: dict[str, str], timeout_s: float
 ) -> str:
-    """What one process answers to its supervisor (common/takeover.py).
+    """Send a hand-over request to one process and return its answer (common/runtime/handover.py).
 
     Raises:
-        UserError: it does not answer, or refuses.
+        UserError: the process did not answer in time, or rejected the request.
     """
     place = key(robot, CONTROL, instance, verb)
     return next(_ask(session, place, (instance, verb), parameters, timeout_s)).text
@@ -43,13 +43,13 @@ def command(
 def _ask(
     session: zenoh.Session,
     place: str,
-    what: tuple[str, str],  # who is asked for what
+    target: tuple[str, str],  # node or instance, and query name; for error texts
     parameters: dict[str, str],
     timeout_s: float,
 ) -> Iterator[Message]:
-    who, name = what
+    who, name = target
     selector = zenoh.Selector(place, zenoh.Parameters(parameters))
-    deadline = time.monotonic() + min(timeout_s, _APPEAR_S)
+    deadline = time.monotonic() + min(timeout_s, _DISCOVERY_S)
     while True:
         answered = False
         for reply in session.get(
@@ -72,8 +72,10 @@ def _ask(
 
 
 def reply(query: zenoh.Query, messages: Iterator[Message]) -> None:
-    """Answers a query with messages; bad input (a ValueError) becomes an error reply: who asks must not
-    be able to end a node."""
+    """Answer a query with messages.
+
+    A ValueError (invalid parameters) is sent as an error reply: a query must not be able to stop a node.
+    """
     with query:
         try:
             for message in messages:

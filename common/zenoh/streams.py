@@ -1,4 +1,4 @@
-"""One topic on the wire: how a producer writes it, how a subscriber receives it."""
+"""Publications and subscriptions of one topic on Zenoh."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from beamsplat.common.messages.header import DecodeError, Header
 from beamsplat.common.runtime.mailbox import Envelope
 from beamsplat.common.topics import Topic
 
-FIFO_MESSAGES = 256  # buffered by Zenoh ahead of our thread for an `every` input without a cache
+FIFO_MESSAGES = 256  # queue between Zenoh and the receiving thread, for an `every` input without a cache
 ENCODING = zenoh.Encoding(MEDIA_TYPE)
 
 
@@ -27,7 +27,7 @@ def declare_publication(
     congestion: zenoh.CongestionControl = zenoh.CongestionControl.DROP,
     priority: zenoh.Priority = zenoh.Priority.DATA,
 ) -> zenoh.Publisher | zenoh.ext.AdvancedPublisher:
-    """A publisher as the row asks: with a cache from which subscribers recover, or without."""
+    """Declare a publisher for a row of the topic table; subscribers recover lost messages from its cache."""
     encoding = ENCODING.with_schema(schema_of(row.message))
     if not row.cache:
         return session.declare_publisher(
@@ -53,7 +53,11 @@ def declare_subscription(
     channel: zenoh.handlers.FifoChannel | zenoh.handlers.RingChannel,
     origin: zenoh.Locality = zenoh.Locality.ANY,
 ) -> zenoh.Subscriber | zenoh.ext.AdvancedSubscriber:
-    """A subscriber that recovers what the row's publisher keeps, where the delivery wants that."""
+    """Declare a subscriber for a row of the topic table.
+
+    Unless the delivery is "latest", it recovers lost messages from the publisher's cache. On a latched topic
+    it also receives the last message published before it was declared.
+    """
     if not row.cache or delivery == "latest":
         return session.declare_subscriber(key_expr, channel, allowed_origin=origin)
     latched = zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=1)
@@ -69,16 +73,16 @@ def declare_subscription(
 
 @dataclass
 class Producer:
-    """Who publishes: the fields that every header of one process has in common."""
+    """Header fields that are common to all messages of one process."""
 
     node: str
     instance: str
-    epoch: int  # rises when this process takes over from another
+    epoch: int  # increases with each process of the node; subscribers ignore messages of lower epochs
     clock_id: int
 
 
 class Publication:
-    """A topic as written by one producer; `put` may be called from several threads."""
+    """Publication of one topic. `put` is thread-safe."""
 
     def __init__(self, session: zenoh.Session, producer: Producer, row: Topic, key_expr: str) -> None:
         self._producer = producer
@@ -89,7 +93,7 @@ class Publication:
         self._publisher = declare_publication(session, key_expr, row)
 
     def put(self, message: Message) -> Header:
-        """Sends one message; never waits for a subscriber."""
+        """Publish one message and return its header; never waits for a subscriber."""
         payload = encode(message)
         with self._lock:
             header = Header(
@@ -108,7 +112,7 @@ class Publication:
 
 
 class Subscription:
-    """One input: a thread that takes samples from Zenoh's channel and decodes them."""
+    """One input of a node: a thread that receives samples from a Zenoh channel and decodes them."""
 
     def __init__(
         self,
@@ -145,10 +149,10 @@ class Subscription:
 
 
 def decode_sample(sample: zenoh.Sample, row: Topic) -> Envelope:
-    """The envelope in a sample of topic `row`.
+    """Decode a Zenoh sample of the topic `row`.
 
     Raises:
-        DecodeError: no header, too large, another message's schema, or a payload that does not decode.
+        DecodeError: no header, too large, the schema of another message, or an undecodable payload.
     """
     if sample.attachment is None:
         raise DecodeError("sample without a header")
@@ -156,9 +160,9 @@ def decode_sample(sample: zenoh.Sample, row: Topic) -> Envelope:
     schema = str(sample.encoding).partition(";")[2]
     if len(sample.payload) > row.limit_kb * 1000:
         size, most = len(sample.payload) / 1e6, row.limit_kb / 1e3
-        raise DecodeError(f"{size:.1f} MB on {row.name}, where {most:g} MB is the most (common/topics.py)")
+        raise DecodeError(f"{size:.1f} MB on {row.name}, the limit is {most:g} MB (common/topics.py)")
     payload = sample.payload.to_bytes()
     message = decode(schema, payload)
     if type(message) is not row.message:
-        raise DecodeError(f"{schema} on {row.name}, which carries {row.message.schema_name()}")
+        raise DecodeError(f"{schema} on {row.name}, expected {row.message.schema_name()}")
     return Envelope(row.name, header, message, len(payload))

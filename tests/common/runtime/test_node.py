@@ -46,8 +46,8 @@ def _node(handler):
     ("output", "complaint"),
     [
         (("localization/correction", Correction(stamp_ns=0, T_map_odom=np.eye(4))), "not among its outputs"),
-        (("localization/odometry", Correction(stamp_ns=0, T_map_odom=np.eye(4))), "wrote a Correction to"),
-        (Job("dig", lambda: None), "no on_job_"),
+        (("localization/odometry", Correction(stamp_ns=0, T_map_odom=np.eye(4))), "published a Correction on"),
+        (Job("dig", lambda: None), "no method on_job_dig"),
     ],
 )
 def test_undeclared_outputs_raise(output, complaint):

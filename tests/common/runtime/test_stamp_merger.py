@@ -3,7 +3,7 @@
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from beamsplat.common.runtime.stamp_merger import PATIENCE_NS, StampMerger
+from beamsplat.common.runtime.stamp_merger import TIMEOUT_NS, StampMerger
 
 
 def _drain(merger):
@@ -52,14 +52,14 @@ def test_a_silent_stream_is_given_up_and_taken_back():
     merger.put("a", 0, "a0")
     merger.put("b", 0, "b0")
     assert len(_drain(merger)) == 2
-    merger.put("b", PATIENCE_NS, "b1")
+    merger.put("b", TIMEOUT_NS, "b1")
     assert merger.pop() is None
-    merger.put("b", PATIENCE_NS + 1, "b2")
+    merger.put("b", TIMEOUT_NS + 1, "b2")
     assert _drain(merger) == [("b", "b1"), ("b", "b2")]  # a has been silent for too long
-    merger.put("a", PATIENCE_NS - 5, "late")
+    merger.put("a", TIMEOUT_NS - 5, "late")
     assert _drain(merger) == [("a", "late")]
     assert merger.late == 1
-    merger.put("b", PATIENCE_NS + 3, "b3")
+    merger.put("b", TIMEOUT_NS + 3, "b3")
     assert merger.pop() is None  # a speaks again, and is waited for again
 
 
@@ -106,9 +106,9 @@ def test_by_the_clock_a_silent_stream_is_given_up_as_well():
     for i in range(8):
         merger.put("b", i * 100_000_000, i)
     assert merger.pop() is None
-    now_ns = PATIENCE_NS
+    now_ns = TIMEOUT_NS
     assert merger.pop() is None
-    now_ns = PATIENCE_NS + 1
+    now_ns = TIMEOUT_NS + 1
     assert [item for _, item in _drain(merger)] == list(range(8))
 
 

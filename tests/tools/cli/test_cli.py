@@ -44,7 +44,7 @@ def test_help_names_every_command_and_each_has_an_example():
             "unknown option 'router.port' (options are: connect,",
         ),
         (("check", "deploy/demo.toml", "--set", "replay.[/x]=1"), "unknown option '[/x]'"),
-        (("serve", "deploy/demo.toml", "router", "--set", 'router.listen=["no"]'), "no are no endpoints"),
+        (("serve", "deploy/demo.toml", "router", "--set", 'router.listen=["no"]'), "no is not a Zenoh endpoint"),
         (
             ("run", "deploy/poses.toml", *POSES, "router", "--set", "state_dir=/dev/null/x"),
             "cannot create this folder",

@@ -35,8 +35,8 @@ def test_rates_losses_and_silence_are_shown(free_endpoint):
         with sender, taker:
             time.sleep(0.5)
             for sent in (0, 10):
-                sender.report(_health("replay", sent))
-                taker.report(_health("localization", sent, lost=2))
+                sender.publish_health(_health("replay", sent))
+                taker.publish_health(_health("localization", sent, lost=2))
                 time.sleep(1.0)
             assert board.states() == {"replay": "active", "localization": "active"}
             nodes = _text(board.nodes_table())
@@ -63,7 +63,7 @@ def test_a_fleet_is_shown_by_robot_and_kept_apart(free_endpoint):
         }
         time.sleep(0.5)
         for number, bus in enumerate(buses.values()):
-            bus.report(_health("replay", number))
+            bus.publish_health(_health("replay", number))
         deadline = time.monotonic() + 5.0
         while len(fleet.states()) < 3 and time.monotonic() < deadline:
             time.sleep(0.05)

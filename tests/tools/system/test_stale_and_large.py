@@ -186,7 +186,7 @@ def test_what_is_too_large_for_its_topic_is_refused_before_it_is_decoded(keys, e
         hostile.put(sample.key_expr, large, encoding=sample.encoding, attachment=sample.attachment)
         wait(lambda: listener.why)
         assert listener.why == [
-            "0.1 MB on localization/odometry, where 0.064 MB is the most (common/topics.py)"
+            "0.1 MB on localization/odometry, the limit is 0.064 MB (common/topics.py)"
         ]
         assert listener.taken() == 1
 
