@@ -59,14 +59,14 @@ def _ask(
             consolidation=zenoh.ConsolidationMode.NONE,
         ):
             if reply.ok is None:
-                raise UserError(f"{who} refused {name}: {reply.err.payload.to_string()}")
+                raise UserError(f"{who} rejected {name}: {reply.err.payload.to_string()}")
             answered = True
             yield decode(str(reply.ok.encoding).partition(";")[2], reply.ok.payload.to_bytes())
         if answered:
             return
         if time.monotonic() > deadline:
             raise UserError(
-                f"nobody answers {name} of node {who!r}: is it running? (`beamsplat top` shows it)"
+                f"no answer from node {who!r} to the query {name!r}: is the node running? (`beamsplat top` shows it)"
             )
         time.sleep(0.1)
 

@@ -111,7 +111,7 @@ def test_what_runs_is_seen(chromium, start, size):
         assert page.eval_on_selector('[data-picture="camera"] img', "i => [i.naturalWidth, i.naturalHeight]") == [320, 240]  # fmt: skip
         assert not page.is_visible('[data-picture="render"] img'), "there is no mapper"
         poll(system, lambda: page.inner_text("#scale-text") == "1.250 ± 0.050", 10)
-        assert "90 % of the pairs fit" in page.inner_text("#words")
+        assert "90 % of the lidar-depth pairs are inliers" in page.inner_text("#words")
         poll(system, lambda: "by localization" in page.inner_text("#pose"), 10)
         # The robot, its path and the map: their own colours are on the canvas.
         poll(system, lambda: page.evaluate(_COLOURS)["map"] > 1000, 10)
@@ -127,7 +127,7 @@ def test_what_runs_is_seen(chromium, start, size):
         assert not page.is_visible("#commands")
         assert page.faults == []
     reply = _command(system.address, {"action": "restart", "node": "fusion"}, TOKEN)
-    assert reply == (403, "this page takes no commands: it has no token in its options")
+    assert reply == (403, "commands are disabled: the page's option `token` is empty")
 
 
 _COLOURS = """() => {
@@ -150,15 +150,15 @@ def test_a_killed_node_shows_and_a_killed_page_comes_back(chromium, start):
     system = start()
     with opened(chromium, system.address, DESK) as page:
         poll(system, lambda: _state(page, "localization") == "active", 20)
-        assert "4 of 4 nodes there" in page.inner_text("#summary")
+        assert "4 of 4 nodes running" in page.inner_text("#summary")
         system.supervising = False
         os.kill(system.pids()["localization"], signal.SIGKILL)
         poll(system, lambda: _state(page, "localization").startswith("silent"), 15)
-        assert "3 of 4 nodes there" in page.inner_text("#summary")
+        assert "3 of 4 nodes running" in page.inner_text("#summary")
         assert "localization is silent" in page.inner_text("#log")
         system.supervising = True
         poll(system, lambda: _state(page, "localization") == "active (start 2)", 30)
-        assert "localization was started again" in page.inner_text("#log")
+        assert "localization was restarted" in page.inner_text("#log")
         os.kill(system.pids()["page"], signal.SIGKILL)
         poll(system, lambda: page.inner_text("#connection") == "not connected", 10)
         poll(system, lambda: page.inner_text("#connection") == "connected", 30)
@@ -173,7 +173,7 @@ def test_who_has_the_token_commands_and_nobody_else(chromium, start):
         before = system.pids()
         page.fill("#token", "correct horse batterz")
         page.click("#login button")
-        poll(system, lambda: "not the token" in page.inner_text("#answer"), 10)
+        poll(system, lambda: "wrong token" in page.inner_text("#answer"), 10)
         assert not page.is_visible("#orders")
         order = {"action": "restart", "node": "fusion"}
         assert _command(system.address, order, None)[0] == 401
@@ -195,9 +195,9 @@ def test_who_has_the_token_commands_and_nobody_else(chromium, start):
     threading.Thread(target=lambda: answers.append(_command(system.address, order, TOKEN))).start()
     poll(system, lambda: answers, 30)
     assert answers[0][0] == 409
-    assert "nobody answers restart of node 'nobody'" in answers[0][1]
+    assert "no answer from node 'nobody' to the query 'restart'" in answers[0][1]
     assert _command(system.address, {"action": "explode", "node": "fusion"}, TOKEN)[0] == 409
-    assert "commands refused" in system.board.records["page"].health.detail
+    assert "commands rejected" in system.board.records["page"].health.detail
 
 
 def test_a_swap_from_the_page_works(chromium, start):

@@ -9,13 +9,13 @@ import pytest
 import zenoh
 
 from beamsplat.common.errors import UserError
-from beamsplat.common.security.access_control import Host, access_control, read_hosts
+from beamsplat.common.security.access_control import HostRole, access_control, read_hosts
 from beamsplat.common.security.keys import (
     CA,
     CERTIFICATE,
     HOSTS,
     KEY,
-    Keys,
+    HostKeys,
     SecurityConfig,
     check_endpoint,
     is_loopback,
@@ -36,7 +36,7 @@ NAMES = {"edge": "edge", "r1": "robot", "r2": "robot", "watcher": "monitor", "ch
 def authority(tmp_path_factory):
     made = Authority.create(tmp_path_factory.mktemp("authority"))
     for name, role in NAMES.items():
-        host = Host(role=role, robot=name if role == "robot" else "*")
+        host = HostRole(role=role, robot=name if role == "robot" else "*")
         made.issue(name, host, ("127.0.0.1", "localhost") if role == "edge" else ())
     return made
 
@@ -86,7 +86,7 @@ def copy(authority, name, folder):
 
 
 def refused(edge, folder):
-    with pytest.raises(UserError, match="nobody answers"):
+    with pytest.raises(UserError, match="no router answers"):
         open_link(edge[1], 2.0, SecurityConfig(keys=folder)).close()
 
 
@@ -101,13 +101,13 @@ def test_without_a_certificate_nobody_comes_in(authority, edge, tmp_path):
     with pytest.raises(zenoh.ZError):
         zenoh.open(config).close()
     plain = SecurityConfig(plain=True)
-    with pytest.raises(UserError, match="nobody answers"):
+    with pytest.raises(UserError, match="no router answers"):
         open_link(edge[1].replace("tls/", "tcp/"), 1.0, plain).close()
 
 
 def test_a_certificate_of_another_authority_opens_nothing(authority, edge, tmp_path):
     other = Authority.create(tmp_path / "other")
-    other.issue("r1", Host(role="robot", robot="r1"))
+    other.issue("r1", HostRole(role="robot", robot="r1"))
     folder = copy(other, "r1", tmp_path / "r1")
     refused(edge, folder)  # neither side knows the other's authority
     (folder / CA).write_bytes((authority.folder / CA).read_bytes())
@@ -133,7 +133,7 @@ def test_an_expired_certificate_opens_nothing(authority, edge, tmp_path):
 
 
 def test_a_robot_does_not_talk_to_an_edge_of_another_name(authority, tmp_path):
-    authority.issue("elsewhere", Host(role="edge"), ("edge.example",))
+    authority.issue("elsewhere", HostRole(role="edge"), ("edge.example",))
     near, far = f"tcp/127.0.0.1:{free_port()}", f"tls/127.0.0.1:{free_port()}"
     with open_router((near, far), security=SecurityConfig(keys=authority.folder / "hosts" / "elsewhere")):
         refused((near, far), authority.folder / "hosts" / "r1")
@@ -157,7 +157,7 @@ def test_a_key_that_others_can_read_is_refused(authority, tmp_path):
     folder = copy(authority, "r1", tmp_path / "r1")
     (folder / KEY).chmod(0o644)
     with pytest.raises(UserError, match="can be read by others"):
-        Keys.of(SecurityConfig(keys=folder))
+        HostKeys.of(SecurityConfig(keys=folder))
 
 
 # --- what each may do ---
@@ -258,8 +258,8 @@ def test_every_topic_crosses_a_guarded_door_with_what_was_said_before(authority,
 def test_a_robot_without_a_rule_is_let_in_but_can_do_nothing(authority, tmp_path):
     """Removed from the policy: its certificate is still good, but says nothing any more."""
     made = Authority.create(tmp_path / "authority")
-    made.issue("edge", Host(role="edge"), ("127.0.0.1",))
-    made.issue("r1", Host(role="robot", robot="r1"))
+    made.issue("edge", HostRole(role="edge"), ("127.0.0.1",))
+    made.issue("r1", HostRole(role="robot", robot="r1"))
     folder = copy(made, "r1", tmp_path / "r1")
     made.remove("r1")
     assert set(read_hosts(made.folder / "hosts" / "edge")) == {"edge"}
@@ -284,9 +284,9 @@ def test_a_robot_without_a_rule_is_let_in_but_can_do_nothing(authority, tmp_path
 
 def test_renewed_keys_replace_the_old_and_the_policy_stays(authority, tmp_path):
     made = Authority.create(tmp_path)
-    folder = made.issue("r1", Host(role="robot", robot="r1"), days=1)
+    folder = made.issue("r1", HostRole(role="robot", robot="r1"), days=1)
     before = {name: (folder / name).read_bytes() for name in (KEY, CERTIFICATE)}
-    made.issue("r1", Host(role="robot", robot="r1"), days=30)
+    made.issue("r1", HostRole(role="robot", robot="r1"), days=30)
     assert all((folder / name).read_bytes() != data for name, data in before.items())
     assert (folder / KEY).stat().st_mode & 0o077 == 0
     assert list(made.hosts()) == ["r1"]
@@ -296,7 +296,7 @@ def test_renewed_keys_replace_the_old_and_the_policy_stays(authority, tmp_path):
     with pytest.raises(UserError, match="no host 'r2'"):
         made.remove("r2")
     with pytest.raises(UserError, match="--address"):
-        made.issue("edge", Host(role="edge"))
+        made.issue("edge", HostRole(role="edge"))
     with pytest.raises(UserError, match="holds no authority"):
         Authority(tmp_path / "hosts")
 
@@ -311,9 +311,9 @@ def test_a_policy_that_makes_no_sense_is_refused(tmp_path):
 
 
 def test_everything_in_the_policy_comes_from_the_topic_table():
-    policy = access_control({"r1": Host(role="robot", robot="r1")})
+    policy = access_control({"r1": HostRole(role="robot", robot="r1")})
     assert policy["default_permission"] == "deny"
-    writes = next(r for r in policy["rules"] if r["id"] == "r1 writes")
+    writes = next(r for r in policy["rules"] if r["id"] == "r1 publish")
     assert {
         k for k in writes["key_exprs"] if "@adv" not in k and "/end/" not in k and "/health/" not in k
     } == {f"beamsplat/r1/{name}" for name, row in TOPICS.items() if row.uplink in ("up", "bulk")}

@@ -147,11 +147,11 @@ def test_a_successor_that_cannot_run_changes_nothing(system):
         system.swap("replay", "seconds=3.0")
     with pytest.raises(UserError, match="JSON list"):
         system.ask("localization", "swap", set=quote('{"a": 1}'))
-    with pytest.raises(UserError, match="nobody answers"):
+    with pytest.raises(UserError, match="no answer from node"):
         system.ask("depth", "swap")
     assert system.supervisor.children["localization"].instance == before
-    for verb in ("activate", "dance"):  # common/control.py: it stands by no more, and never heard of it
-        with pytest.raises(UserError, match=f"nothing called '{verb}'"):
+    for verb in ("activate", "dance"):  # it is not in standby; it knows no such request
+        with pytest.raises(UserError, match=f"cannot answer the request '{verb}'"):
             command(system.asker, "r1", before, verb, {"after": "{}"}, 5.0)
     assert json.loads(system.ask("localization", "params"))["sleep_s"] == 0.01
     count = len(ears.messages)
