@@ -24,7 +24,7 @@ from pydantic import Field, StringConstraints
 from beamsplat.common.config.base import Config, parse
 from beamsplat.common.errors import UserError, reason
 from beamsplat.common.files.resources import deployment_file
-from beamsplat.common.security.keys import OPEN, SecurityConfig
+from beamsplat.common.security.keys import NO_SECURITY, SecurityConfig
 
 Token = Annotated[str, StringConstraints(pattern=r"^[a-z0-9][a-z0-9_-]{0,63}$")]
 
@@ -60,7 +60,7 @@ class Deployment(Config):
     rate: Annotated[float, Field(ge=0.0)] = 1.0  # replay speed in multiples of real time; 0 = maximum
     state_dir: Path | None = None
     role: Role = "whole"
-    security: SecurityConfig = OPEN
+    security: SecurityConfig = NO_SECURITY
     nodes: dict[Token, dict[str, Any]] = Field(default_factory=dict)
 
     @property

@@ -113,7 +113,7 @@ def scan_points(
     angle_increment_rad: float,
     range_limits_m: tuple[float, float],
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the points [M, 3] of valid ranges in the lidar frame (float64, m), and their beam numbers [M]."""
+    """Return the points float64 [M, 3] of valid ranges in the lidar frame, and their beam numbers [M]."""
     nearest, farthest = range_limits_m
     with np.errstate(invalid="ignore"):
         hit = np.isfinite(ranges_m) & (ranges_m > 0.0) & (ranges_m >= nearest) & (ranges_m <= farthest)

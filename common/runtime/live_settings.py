@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from beamsplat.common.security.keys import OPEN, SecurityConfig
+from beamsplat.common.security.keys import NO_SECURITY, SecurityConfig
 
 
 @dataclass(frozen=True)
@@ -15,7 +15,7 @@ class LiveSettings:
     robot: str
     endpoints: tuple[str, ...]
     run_dir: Path
-    security: SecurityConfig = OPEN  # keys for links to other hosts
+    security: SecurityConfig = NO_SECURITY  # keys for links to other hosts
     rate: float = 1.0  # pacing of recorded sources: times real time, 0 = as fast as possible
     wait_for: frozenset[str] = frozenset()  # a source starts when these nodes are active
     wait_s: float = 60.0  # but after this time it starts without them

@@ -1,1 +1,1 @@
-"""Links between hosts: keys, logins, and the access control that follows from the topic table."""
+"""Security of Zenoh links: host keys (mTLS), logins of local processes, and access control rules."""

@@ -1,11 +1,11 @@
-"""Who a host is on a link to another: its certificate, and what a router lets whom do.
+"""Keys of a host for links to other hosts (mutual TLS), and the check that such links are protected.
 
-A host's folder of keys holds
+A host's folder of keys, written by `beamsplat keys`, holds
 
-    ca.pem      the authority that both sides trust
-    host.pem    this host's certificate; its name (CN) is the host's
+    ca.pem      certificate of the certificate authority that both sides trust
+    host.pem    this host's certificate; its common name (CN) is the host's name
     host.key    its private key, readable by its owner only
-    hosts.toml  on an edge server: which hosts there are, and what each may do (`beamsplat keys` writes it)
+    hosts.toml  on an edge server only: the other hosts and their roles (access_control.py)
 """
 
 from __future__ import annotations
@@ -23,62 +23,61 @@ CA, CERTIFICATE, KEY, HOSTS = "ca.pem", "host.pem", "host.key", "hosts.toml"
 
 
 class SecurityConfig(Config):
-    """`keys` is the host's folder of keys; `plain` allows links off this host without, for laboratories.
-    `local` is a folder for logins of this host's own processes (common/credentials.py)."""
+    """The [security] table of a deployment."""
 
-    keys: Path | None = None
-    plain: bool = False
-    local: Path | None = None
+    keys: Path | None = None  # the host's folder of keys, required for links to other hosts
+    plain: bool = False  # allow unencrypted links to other hosts, for laboratory networks
+    local: Path | None = None  # folder of the logins of this host's processes (logins.py); None = no logins
 
 
-OPEN = SecurityConfig()
+NO_SECURITY = SecurityConfig()
 
 
 def is_secure(endpoint: str) -> bool:
-    """Whether both sides of such a link show certificates."""
+    """Return whether both sides of a link to this Zenoh endpoint authenticate with certificates."""
     return endpoint.startswith(("tls/", "quic/"))
 
 
 def is_loopback(endpoint: str) -> bool:
-    """Whether an endpoint ("tcp/127.0.0.1:7447") cannot be reached from another host."""
+    """Return whether an endpoint ("tcp/127.0.0.1:7447") is unreachable from other hosts."""
     protocol, _, address = endpoint.partition("/")
     host = address.rpartition(":")[0].strip("[]")
     return protocol == "unixsock-stream" or host in ("localhost", "::1") or host.startswith("127.")
 
 
 @dataclass(frozen=True)
-class Keys:
-    """A host's folder of keys, found to be complete."""
+class HostKeys:
+    """A complete folder of a host's keys."""
 
     folder: Path
 
     @staticmethod
-    def of(security: SecurityConfig) -> Keys:
-        """The keys a deployment names.
+    def of(security: SecurityConfig) -> HostKeys:
+        """Return the keys in the folder `security.keys`, after checking its files.
 
         Raises:
-            UserError: none are named, or a file is missing or readable by others.
+            UserError: no folder is configured, a file is missing, or others can read the private key.
         """
         if security.keys is None:
             raise UserError(
-                "security.keys: a link off this host needs the host's keys: `beamsplat keys init` and "
-                "`beamsplat keys issue` make them; name their folder under [security]"
+                "security.keys: a link to another host needs the host's keys: create them with "
+                "`beamsplat keys init` and `beamsplat keys issue`, then set keys = FOLDER under [security]"
             )
         folder = security.keys.expanduser()
         for name in (CA, CERTIFICATE, KEY):
             if not (folder / name).is_file():
                 raise UserError(
-                    f"security.keys = {folder}: {name} is missing; `beamsplat keys issue` makes it"
+                    f"security.keys = {folder}: {name} is missing; create it with `beamsplat keys issue`"
                 )
         mode = (folder / KEY).stat().st_mode & 0o777
         if mode & 0o077:
             raise UserError(
                 f"{folder / KEY} can be read by others (mode {mode:03o}): chmod 600, or issue a new one"
             )
-        return Keys(folder)
+        return HostKeys(folder)
 
     def identify(self, config: zenoh.Config) -> None:
-        """Lets a session show its certificate on both kinds of link, and ask the other for its own."""
+        """Configure a Zenoh session to authenticate with this certificate and to require the peer's."""
         certificate, key = str(self.folder / CERTIFICATE), str(self.folder / KEY)
         config.insert_json5("transport/link/tls", json.dumps({
             "enable_mtls": True, "root_ca_certificate": str(self.folder / CA),
@@ -89,9 +88,13 @@ class Keys:
 
 
 def check_endpoint(endpoint: str, security: SecurityConfig) -> None:
-    """Raises UserError for a link off this host without certificates, unless that is asked for."""
+    """Check that an endpoint is local, or authenticated, or that `security.plain` allows plain links.
+
+    Raises:
+        UserError: the link would leave this host without certificates.
+    """
     if not (is_loopback(endpoint) or security.plain or is_secure(endpoint)):
         raise UserError(
-            f"{endpoint} leaves this host unprotected: use tls/ and `beamsplat keys`, or allow it with "
+            f"{endpoint} leaves this host unprotected: use tls/ and `beamsplat keys`, or set "
             "security.plain = true in a network that you trust"
         )

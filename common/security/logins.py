@@ -1,11 +1,13 @@
-"""Who a process is to the router of its own host: a user name and a password for each node, where
-`security.local` names a folder. The supervisor that starts the router makes them, once:
+"""Logins of local processes: each node authenticates to the router of its host by user name and password.
 
-    users         name:password a line, for the router
-    NAME.login    one such line for one node, or for `supervisor` or `operator` (the command line)
+Logins are used where `security.local` names a folder. The supervisor that starts the router creates them
+once:
 
-All can be read by their owner only; none is ever on a command line. What each may do follows from the topic
-table (common/access.py).
+    users         one line name:password per user, for the router
+    NAME.login    one such line, for one node, the supervisor, or `operator` (the command line)
+
+The files are readable by their owner only, and passwords never appear on a command line. The permissions of
+each user follow from the topic table (access_control.py).
 """
 
 from __future__ import annotations
@@ -20,31 +22,31 @@ import zenoh
 
 from beamsplat.common.errors import UserError, reason
 from beamsplat.common.files.persist import make_folder
-from beamsplat.common.security.access_control import MASTERS, local_access_control
+from beamsplat.common.security.access_control import ADMIN_USERS, local_access_control
 from beamsplat.common.security.keys import SecurityConfig, is_loopback
 
-SUPERVISOR, OPERATOR = MASTERS
+SUPERVISOR, OPERATOR = ADMIN_USERS
 USERS = "users"
 
 
 @dataclass(frozen=True)
 class Login:
-    """What a session shows to its router."""
+    """User name and password of one process."""
 
     user: str
     password: str
 
     def identify(self, config: zenoh.Config) -> None:
-        """Lets a session show it."""
+        """Configure a Zenoh session to authenticate with this login."""
         config.insert_json5("transport/auth/usrpwd/user", json.dumps(self.user))
         config.insert_json5("transport/auth/usrpwd/password", json.dumps(self.password))
 
 
 def make_logins(folder: Path, names: tuple[str, ...]) -> None:
-    """Logins for those who have none yet.
+    """Create logins for those of `names` that have none; existing ones are kept.
 
     Raises:
-        UserError: the folder cannot be written, or a file in it makes no sense.
+        UserError: the folder cannot be written, or a file in it is invalid.
     """
     folder = make_folder(folder.expanduser())
     known = _users(folder) if (folder / USERS).exists() else {}
@@ -60,36 +62,35 @@ def make_logins(folder: Path, names: tuple[str, ...]) -> None:
 
 
 def login_of(security: SecurityConfig, name: str) -> Login | None:
-    """The login of a node; None where the host's router asks for none.
+    """Return the login of a node; None if `security.local` is not set.
 
     Raises:
-        UserError: it is missing, readable by others, or makes no sense.
+        UserError: the login file is missing, readable by others, or invalid.
     """
     if security.local is None:
         return None
     path = security.local.expanduser() / f"{name}.login"
     if not path.is_file():
         raise UserError(
-            f"{path} is missing: `beamsplat run` makes the logins of the nodes in its file when it starts "
-            "the router"
+            f"{path} is missing: `beamsplat run` creates the logins of its nodes when it starts the router"
         )
     ((user, password),) = _lines(path).items()
     return Login(user, password)
 
 
-def guard(config: zenoh.Config, security: SecurityConfig, endpoints: tuple[str, ...]) -> None:
-    """Makes a router ask for logins, where `security.local` says so.
+def require_logins(config: zenoh.Config, security: SecurityConfig, endpoints: tuple[str, ...]) -> None:
+    """Configure a router to require logins, if `security.local` is set.
 
     Raises:
-        UserError: it has doors to other hosts, which show certificates instead; or no logins were made.
+        UserError: an endpoint is reachable from other hosts, which have no logins; or the logins are missing.
     """
     if security.local is None:
         return
     for endpoint in endpoints:
         if not is_loopback(endpoint):
             raise UserError(
-                f"security.local: the router's {endpoint} is a door to other hosts, which have no login "
-                "here; leave security.local out on this host"
+                f"security.local: the router's {endpoint} can be reached from other hosts, which have no "
+                "login here; remove security.local on this host"
             )
     folder = security.local.expanduser()
     config.insert_json5("transport/auth/usrpwd/dictionary_file", json.dumps(str(folder / USERS)))
@@ -106,17 +107,17 @@ def _lines(path: Path) -> dict[str, str]:
         rows = dict(line.split(":", 1) for line in path.read_text().splitlines())
     except (OSError, ValueError) as error:
         raise UserError(
-            f"{path}: no logins ({reason(error)}); remove its folder, and new ones are made"
+            f"{path}: no valid logins ({reason(error)}); remove its folder to have new ones created"
         ) from error
     if mode & 0o077:
         raise UserError(f"{path} can be read by others (mode {mode:03o}): chmod 600")
     if not rows:
-        raise UserError(f"{path}: empty; remove its folder, and new logins are made")
+        raise UserError(f"{path}: empty; remove its folder to have new logins created")
     return rows
 
 
 def _write(path: Path, text: str) -> None:
-    """Never readable by others, not for a moment."""
+    """Replace a file by one that is created with mode 600: others can never read it."""
     fresh = path.with_name(f".{path.name}")
     fresh.unlink(missing_ok=True)
     with os.fdopen(os.open(fresh, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:

@@ -33,8 +33,8 @@ from beamsplat.common.runtime.handover import CONTROL
 from beamsplat.common.runtime.mailbox import Envelope
 from beamsplat.common.runtime.node import Input
 from beamsplat.common.security.access_control import access_control, read_hosts
-from beamsplat.common.security.keys import OPEN, Keys, SecurityConfig, check_endpoint, is_secure
-from beamsplat.common.security.logins import Login, guard
+from beamsplat.common.security.keys import NO_SECURITY, HostKeys, SecurityConfig, check_endpoint, is_secure
+from beamsplat.common.security.logins import Login, require_logins
 from beamsplat.common.topics import HEALTH, LIMIT_KB, Topic, topic
 from beamsplat.common.zenoh.streams import Producer, Publication, Subscription, decode_sample
 
@@ -76,7 +76,7 @@ def _set_endpoints(config: zenoh.Config, side: str, endpoints: tuple[str, ...]) 
 
 
 def open_router(
-    listen: tuple[str, ...], connect: tuple[str, ...] = (), security: SecurityConfig = OPEN
+    listen: tuple[str, ...], connect: tuple[str, ...] = (), security: SecurityConfig = NO_SECURITY
 ) -> zenoh.Session:
     """Open a Zenoh router in this process.
 
@@ -95,7 +95,7 @@ def open_router(
 
 
 def router_config(
-    listen: tuple[str, ...], connect: tuple[str, ...] = (), security: SecurityConfig = OPEN
+    listen: tuple[str, ...], connect: tuple[str, ...] = (), security: SecurityConfig = NO_SECURITY
 ) -> zenoh.Config:
     """Return the configuration of a router.
 
@@ -111,11 +111,11 @@ def router_config(
     for endpoint in (*listen, *connect):
         check_endpoint(endpoint, security)
     if any(is_secure(endpoint) for endpoint in (*listen, *connect)):
-        keys = Keys.of(security)
+        keys = HostKeys.of(security)
         keys.identify(config)
         config.insert_json5("transport/link/rx/max_message_size", str(LIMIT_KB * 1000))
         config.insert_json5("access_control", json.dumps(access_control(read_hosts(keys.folder))))
-    guard(config, security, (*listen, *connect))
+    require_logins(config, security, (*listen, *connect))
     config.insert_json5("adminspace/enabled", "true")
     config.insert_json5("adminspace/permissions", "{read: true, write: false}")
     return config
@@ -166,7 +166,7 @@ def open_link(
     config.insert_json5("transport/shared_memory/enabled", "false")
     _set_endpoints(config, "connect", (endpoint,))
     if is_secure(endpoint):
-        Keys.of(security).identify(config)
+        HostKeys.of(security).identify(config)
     for protocol in ("tcp", "tls"):
         config.insert_json5(f"transport/link/{protocol}/so_sndbuf", str(buffer_bytes))
     config.insert_json5("connect/timeout_ms", str(round(wait_s * 1e3)))

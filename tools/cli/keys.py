@@ -51,13 +51,13 @@ def issue(
 
         beamsplat keys issue robot1
     """
-    from beamsplat.common.security.access_control import Host
+    from beamsplat.common.security.access_control import HostRole
     from beamsplat.tools.keys.pki import Authority, expiry
 
     if not (name.isascii() and name.replace("-", "a").replace("_", "a").isalnum() and name == name.lower()):
         raise UserError(f"{name!r}: a host's name has lower case letters, digits, - and _ only")
     whose = robot or (name if role == "robot" else "*")
-    host = parse(Host, {"role": role, "robot": whose}, f"host {name!r}")
+    host = parse(HostRole, {"role": role, "robot": whose}, f"host {name!r}")
     folder = Authority(authority).issue(name, host, tuple(address or ()), days)
     print(f"{folder}: copy it to {name} as the folder that `security.keys` names; valid until "
           f"{expiry(folder / 'host.pem')}")  # fmt: skip

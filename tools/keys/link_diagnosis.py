@@ -13,7 +13,15 @@ from typing import Literal
 from beamsplat.common.config.deployment import Deployment
 from beamsplat.common.errors import UserError
 from beamsplat.common.security.access_control import read_hosts
-from beamsplat.common.security.keys import CA, CERTIFICATE, KEY, Keys, check_endpoint, is_loopback, is_secure
+from beamsplat.common.security.keys import (
+    CA,
+    CERTIFICATE,
+    KEY,
+    HostKeys,
+    check_endpoint,
+    is_loopback,
+    is_secure,
+)
 from beamsplat.tools.keys.pki import expiry, openssl
 
 SOON_DAYS = 14
@@ -36,7 +44,7 @@ def examine_security(deployment: Deployment) -> Iterator[Remark]:
     if not any(is_secure(endpoint) for endpoint in endpoints):
         return
     try:
-        keys = Keys.of(deployment.security)
+        keys = HostKeys.of(deployment.security)
     except UserError as error:
         yield "keys", "fault", str(error), "beamsplat keys issue NAME, then copy the folder it names"
         return

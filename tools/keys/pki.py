@@ -19,7 +19,7 @@ from pathlib import Path
 
 from beamsplat.common.errors import UserError
 from beamsplat.common.files.persist import make_folder, write_atomically
-from beamsplat.common.security.access_control import Host, read_hosts
+from beamsplat.common.security.access_control import HostRole, read_hosts
 from beamsplat.common.security.keys import CA, CERTIFICATE, HOSTS, KEY
 
 CA_KEY = "ca.key"
@@ -69,7 +69,7 @@ class Authority:
         write_atomically(folder / HOSTS, b"")
         return Authority(folder)
 
-    def issue(self, name: str, host: Host, addresses: tuple[str, ...] = (), days: int = 90) -> Path:
+    def issue(self, name: str, host: HostRole, addresses: tuple[str, ...] = (), days: int = 90) -> Path:
         """A new key and certificate for a host, which replace those it had; the folder to copy to it.
 
         Raises:
@@ -108,7 +108,7 @@ class Authority:
         shutil.rmtree(self.folder / "hosts" / name, ignore_errors=True)
         self._write(hosts)
 
-    def hosts(self) -> dict[str, Host]:
+    def hosts(self) -> dict[str, HostRole]:
         """Every host there is."""
         return read_hosts(self.folder)
 
@@ -116,7 +116,7 @@ class Authority:
         """Folders of the edge servers, which hold copies of the policy."""
         return [self.folder / "hosts" / name for name, host in self.hosts().items() if host.role == "edge"]
 
-    def _write(self, hosts: dict[str, Host]) -> None:
+    def _write(self, hosts: dict[str, HostRole]) -> None:
         text = "# Written by `beamsplat keys`: which certificate may do what.\n" + "".join(
             f'\n[{name}]\nrole = "{host.role}"\nrobot = "{host.robot}"\n' for name, host in hosts.items()
         )

@@ -5,7 +5,7 @@ import zenoh
 
 from beamsplat.common.errors import UserError
 from beamsplat.common.security.keys import SecurityConfig
-from beamsplat.common.security.logins import OPERATOR, USERS, guard, login_of, make_logins
+from beamsplat.common.security.logins import OPERATOR, USERS, login_of, make_logins, require_logins
 
 
 @pytest.fixture
@@ -32,16 +32,16 @@ def test_what_is_missing_open_to_others_or_broken_is_refused(security):
     with pytest.raises(UserError, match="can be read by others"):
         login_of(security, "camera")
     (security.local / USERS).write_text("no password\n")
-    with pytest.raises(UserError, match="no logins"):
+    with pytest.raises(UserError, match="no valid logins"):
         make_logins(security.local, ("depth",))
 
 
 def test_only_a_router_without_doors_to_other_hosts_asks_for_logins(security):
     config = zenoh.Config()
-    guard(config, SecurityConfig(), ("tls/0.0.0.0:7448",))  # asks for none
-    with pytest.raises(UserError, match="a door to other hosts"):
-        guard(config, security, ("tcp/127.0.0.1:7447", "tls/0.0.0.0:7448"))
-    guard(config, security, ("tcp/127.0.0.1:7447",))
+    require_logins(config, SecurityConfig(), ("tls/0.0.0.0:7448",))  # asks for none
+    with pytest.raises(UserError, match="can be reached from other hosts"):
+        require_logins(config, security, ("tcp/127.0.0.1:7447", "tls/0.0.0.0:7448"))
+    require_logins(config, security, ("tcp/127.0.0.1:7447",))
     assert str(security.local / USERS) in config.get_json("transport/auth/usrpwd/dictionary_file")
     assert '"deny"' in config.get_json("access_control")
     assert login_of(SecurityConfig(), "camera") is None

@@ -15,7 +15,7 @@ import numpy as np
 
 from beamsplat.common.config.deployment import Deployment, RouterConfig
 from beamsplat.common.mapfiles.session import SessionFolder
-from beamsplat.common.security.access_control import Host
+from beamsplat.common.security.access_control import HostRole
 from beamsplat.common.security.keys import SecurityConfig
 from beamsplat.tools.keys.pki import Authority
 from tests.services.uplink.radio import FAR_ADDRESS, ROOT
@@ -93,8 +93,8 @@ class BadLinkPair:
     def __init__(self, radio, folder, data, *, duration_s=None, mapping=LIGHT, rate=RATE):
         self._radio, self._folder = radio, folder
         authority = Authority.create(folder / "authority")
-        edge_keys = authority.issue("edge", Host(role="edge"), (FAR_ADDRESS,))
-        robot_keys = authority.issue("r1", Host(role="robot", robot="r1"))
+        edge_keys = authority.issue("edge", HostRole(role="edge"), (FAR_ADDRESS,))
+        robot_keys = authority.issue("r1", HostRole(role="robot", robot="r1"))
         self.session = folder / "session"
         replay = {"data": str(data)} | ({} if duration_s is None else {"duration_s": float(duration_s)})
         queue = {"durable": True, "queue_mb": 2000.0, "retry_s": 3.0}  # as deploy/robot.toml
@@ -154,7 +154,7 @@ class BadLinkPair:
         """id -> when it was on the edge's disk (monotonic ns; from the file's time of writing)."""
         shift_ns = time.monotonic_ns() - time.time_ns()
         folder = SessionFolder(self.session)
-        return {i: (folder.bodies / f"{i}.kf").stat().st_mtime_ns + shift_ns for i in folder.body_ids()}
+        return {i: (folder.keyframes / f"{i}.kf").stat().st_mtime_ns + shift_ns for i in folder.keyframe_ids()}
 
 
 def quantiles(values_ns):

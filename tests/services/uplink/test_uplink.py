@@ -11,7 +11,7 @@ import pytest
 from beamsplat.common.config.deployment import Deployment, RouterConfig
 from beamsplat.common.errors import UserError
 from beamsplat.common.runtime.lockstep import Lockstep
-from beamsplat.common.security.access_control import Host
+from beamsplat.common.security.access_control import HostRole
 from beamsplat.common.security.keys import SecurityConfig
 from beamsplat.common.topics import TOPICS
 from beamsplat.common.zenoh.bus import open_session
@@ -160,8 +160,8 @@ def test_the_robot_starts_without_an_edge_and_an_edge_that_is_killed_goes_on_fro
 @pytest.mark.slow
 def test_behind_locked_doors_everything_flows_until_the_robot_is_removed(tmp_path):
     authority = Authority.create(tmp_path / "authority")
-    keys = {"edge": authority.issue("edge", Host(role="edge"), ("127.0.0.1",))}
-    robot = Host(role="robot", robot="r1")
+    keys = {"edge": authority.issue("edge", HostRole(role="edge"), ("127.0.0.1",))}
+    robot = HostRole(role="robot", robot="r1")
     keys["robot"] = shutil.copytree(authority.issue("r1", robot), tmp_path / "keys")
     secured = {f"{side}_security": SecurityConfig(keys=folder) for side, folder in keys.items()}
     pair = Pair(tmp_path, pictures=120, scheme="tls", **secured)

@@ -3,7 +3,7 @@
 import pytest
 
 from beamsplat.common.config.deployment import Deployment, RouterConfig
-from beamsplat.common.security.access_control import Host
+from beamsplat.common.security.access_control import HostRole
 from beamsplat.common.security.keys import KEY, SecurityConfig
 from beamsplat.common.zenoh.bus import open_router
 from beamsplat.tools.keys.link_diagnosis import examine_security
@@ -14,8 +14,8 @@ from tests.conftest import free_port
 @pytest.fixture(scope="module")
 def authority(tmp_path_factory):
     made = Authority.create(tmp_path_factory.mktemp("authority"))
-    made.issue("edge", Host(role="edge"), ("127.0.0.1",))
-    made.issue("r1", Host(role="robot", robot="r1"))
+    made.issue("edge", HostRole(role="edge"), ("127.0.0.1",))
+    made.issue("r1", HostRole(role="robot", robot="r1"))
     return made
 
 
@@ -45,7 +45,7 @@ def test_a_good_link_is_said_to_be_good(authority, door):
 
 def test_another_authority_on_either_side(authority, door, tmp_path):
     other = Authority.create(tmp_path)
-    folder = other.issue("r1", Host(role="robot", robot="r1"))
+    folder = other.issue("r1", HostRole(role="robot", robot="r1"))
     assert any("the edge's certificate is not good" in text for text in faults(robot(door, folder)))
     (folder / "ca.pem").write_bytes((authority.folder / "ca.pem").read_bytes())
     found = faults(robot(door, folder))
@@ -74,7 +74,7 @@ def test_missing_readable_and_unprotected(authority, tmp_path):
     assert any("unprotected" in t for t in faults(open_door))
     remarks = list(examine_security(open_door.model_copy(update={"security": SecurityConfig(plain=True)})))
     assert [verdict for _, verdict, _, _ in remarks] == ["note"]
-    folder = authority.issue("loose", Host(role="robot", robot="loose"))
+    folder = authority.issue("loose", HostRole(role="robot", robot="loose"))
     (folder / KEY).chmod(0o644)
     assert any("can be read by others" in t for t in faults(robot("tls/127.0.0.1:1", folder)))
 
@@ -90,6 +90,6 @@ def test_the_edge_lists_what_each_host_may(authority):
 
 
 def test_a_certificate_about_to_expire_is_noted(authority, door):
-    folder = authority.issue("brief", Host(role="robot", robot="brief"), days=3)
+    folder = authority.issue("brief", HostRole(role="robot", robot="brief"), days=3)
     remarks = list(examine_security(robot(door, folder)))
     assert any(v == "note" and "expires in 3 days" in text for _, v, text, _ in remarks)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import zenoh
 
-from beamsplat.common.security.keys import Keys, SecurityConfig
+from beamsplat.common.security.keys import HostKeys, SecurityConfig
 
 ALLOWED = ("keyframes/frame", "localization/odometry", "localization/anchors", "health/localization")
 PATIENCE_US = 120_000_000
@@ -24,7 +24,7 @@ def open_hostile(endpoint, keys):
     config.insert_json5(
         "transport/link/tx/queue/congestion_control/block/wait_before_close", str(PATIENCE_US)
     )
-    Keys.of(SecurityConfig(keys=keys)).identify(config)
+    HostKeys.of(SecurityConfig(keys=keys)).identify(config)
     return zenoh.open(config)
 
 

@@ -12,7 +12,7 @@ import pytest
 
 from beamsplat.common.config.deployment import Deployment, RouterConfig
 from beamsplat.common.messages.header import Header
-from beamsplat.common.security.access_control import Host
+from beamsplat.common.security.access_control import HostRole
 from beamsplat.common.security.keys import SecurityConfig
 from beamsplat.common.zenoh.bus import open_session
 from beamsplat.tools.keys.pki import Authority
@@ -46,11 +46,11 @@ def robot_side(name, tmp_path, keys, door, pictures):
 @pytest.mark.slow
 def test_five_robots_on_one_edge_hear_nothing_of_each_other(tmp_path):
     authority = Authority.create(tmp_path / "authority")
-    edge_keys = authority.issue("edge", Host(role="edge"), ("127.0.0.1",))
+    edge_keys = authority.issue("edge", HostRole(role="edge"), ("127.0.0.1",))
     inner, door = f"tcp/127.0.0.1:{free_port()}", f"tls/127.0.0.1:{free_port()}"
     keys = {
         name: shutil.copytree(
-            authority.issue(name, Host(role="robot", robot=name)), tmp_path / f"keys-{name}"
+            authority.issue(name, HostRole(role="robot", robot=name)), tmp_path / f"keys-{name}"
         )
         for name in NAMES
     }

@@ -13,7 +13,7 @@ import psutil
 import pytest
 
 from beamsplat.common.config.deployment import Deployment, RouterConfig
-from beamsplat.common.security.access_control import Host
+from beamsplat.common.security.access_control import HostRole
 from beamsplat.common.security.keys import SecurityConfig
 from beamsplat.common.topics import topic
 from beamsplat.common.zenoh.bus import open_session
@@ -59,8 +59,8 @@ class Latency:
 def attacked(tmp_path, shared_dir):
     """Robot and edge behind mutual TLS; the robot localizes a recorded drive, round and round."""
     authority = Authority.create(tmp_path / "authority")
-    edge_keys = authority.issue("edge", Host(role="edge"), ("127.0.0.1",))
-    robot_keys = shutil.copytree(authority.issue("r1", Host(role="robot", robot="r1")), tmp_path / "keys")
+    edge_keys = authority.issue("edge", HostRole(role="edge"), ("127.0.0.1",))
+    robot_keys = shutil.copytree(authority.issue("r1", HostRole(role="robot", robot="r1")), tmp_path / "keys")
     near, inner, far = (free_port() for _ in range(3))
     door = f"tls/127.0.0.1:{far}"
     robot = Deployment(

@@ -151,9 +151,9 @@ def test_logins_are_kept_secret_and_faults_are_named(tmp_path):
     assert login_of(security, "mapping").password != first.password
     assert all(p.stat().st_mode & 0o077 == 0 for p in (folder, *folder.iterdir()))
     assert login_of(SecurityConfig(), "camera") is None
-    with pytest.raises(UserError, match="door to other hosts"):
+    with pytest.raises(UserError, match="can be reached from other hosts"):
         open_router(("tcp/0.0.0.0:0",), security=SecurityConfig(local=folder, plain=True))
-    for text, words in (("", "empty"), ("nonsense", "no logins")):
+    for text, words in (("", "empty"), ("nonsense", "no valid logins")):
         (folder / USERS).write_text(text)
         with pytest.raises(UserError, match=words):
             make_logins(folder, ("camera",))
@@ -165,6 +165,6 @@ def test_logins_are_kept_secret_and_faults_are_named(tmp_path):
 def test_the_policy_comes_from_the_topic_table():
     policy = local_access_control(("camera", OPERATOR))
     assert policy["default_permission"] == "deny"
-    (writes,) = [r for r in policy["rules"] if r["id"] == "camera writes"]
+    (writes,) = [r for r in policy["rules"] if r["id"] == "camera publish"]
     data = {k.removeprefix("beamsplat/*/") for k in writes["key_exprs"] if "@adv" not in k}
     assert {k for k in data if k in TOPICS} == {n for n, row in TOPICS.items() if "camera" in row.producers}

@@ -16,7 +16,7 @@ from beamsplat.common.messages import Odometry
 from beamsplat.common.messages.header import DecodeError
 from beamsplat.common.runtime.mailbox import Mailbox
 from beamsplat.common.runtime.node import Input
-from beamsplat.common.security.access_control import Host
+from beamsplat.common.security.access_control import HostRole
 from beamsplat.common.security.keys import SecurityConfig
 from beamsplat.common.topics import LIMIT_KB, TOPICS, topic
 from beamsplat.common.zenoh.bus import Bus, open_link, open_router, open_session
@@ -33,8 +33,8 @@ POSE = "localization/odometry"
 @pytest.fixture(scope="module")
 def keys(tmp_path_factory):
     made = Authority.create(tmp_path_factory.mktemp("authority"))
-    made.issue("edge", Host(role="edge"), ("127.0.0.1",))
-    made.issue("r1", Host(role="robot", robot="r1"))
+    made.issue("edge", HostRole(role="edge"), ("127.0.0.1",))
+    made.issue("r1", HostRole(role="robot", robot="r1"))
     return made.folder / "hosts"
 
 
