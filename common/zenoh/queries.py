@@ -66,7 +66,8 @@ def _ask(
             return
         if time.monotonic() > deadline:
             raise UserError(
-                f"no answer from node {who!r} to the query {name!r}: is the node running? (`beamsplat top` shows it)"
+                f"no answer from node {who!r} to the query {name!r}: is the node running? "
+                "(`beamsplat top` shows it)"
             )
         time.sleep(0.1)
 
