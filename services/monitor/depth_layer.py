@@ -1,7 +1,8 @@
-"""Fused depth and coloured points, drawn in rerun.
+"""Draw fused depth and coloured point clouds in rerun.
 
-depth                                the last fused depth, as a picture of its own
-map/odom/cloud/<number>              points of a keyframe, in the odom frame: a loop closure moves them all
+Entities:
+    depth                       the newest fused depth as an image
+    map/odom/cloud/<number>     points of a keyframe in the odom frame, so that a loop closure moves them
 """
 
 from __future__ import annotations
@@ -14,12 +15,12 @@ from beamsplat.services.monitor.rerun_writer import RerunWriter
 
 DEPTH = "depth"
 CLOUD = "map/odom/cloud"
-_SHRINK = 2  # a quarter of the pixels is enough to style at
-_RANGE_M = (0.3, 8.0)  # of the colour scale
+_SHRINK = 2  # every second row and column is drawn: a quarter of the data
+_RANGE_M = (0.3, 8.0)  # of the colour scale: indoor distances
 
 
 class DepthLayer:
-    """The newest depth picture, and the points of the newest `clouds` keyframes."""
+    """Draws the newest depth image and the point clouds of the newest `clouds` keyframes."""
 
     def __init__(self, writer: RerunWriter, limits: RateLimit, clouds: int) -> None:
         self._writer = writer
@@ -28,7 +29,7 @@ class DepthLayer:
         self._drawn = 0
 
     def depth(self, stamp_ns: int, depth_m: np.ndarray) -> None:
-        """float32 [H, W] optical z, NaN = unknown (drawn as nothing)."""
+        """Draw depth float32 [H, W], optical z in m; NaN (unknown) is not drawn."""
         if depth_m.size and self._limits.due("depth", stamp_ns):
             small = np.nan_to_num(depth_m[::_SHRINK, ::_SHRINK], nan=0.0)
             drawing = rr.DepthImage(
@@ -37,7 +38,7 @@ class DepthLayer:
             self._writer.log(DEPTH, drawing, stamp_ns=stamp_ns)
 
     def cloud(self, stamp_ns: int, points_odom_m: np.ndarray, colours: np.ndarray) -> None:
-        """Points float32 [N, 3] with colours uint8 [N, 3]; the oldest keyframe's give way."""
+        """Draw points float32 [N, 3] with colours uint8 [N, 3]; they replace those of the oldest keyframe."""
         entity = f"{CLOUD}/{self._drawn % self._clouds}"
         self._drawn += 1
         self._writer.log(entity, rr.Points3D(points_odom_m, colors=colours, radii=0.01), stamp_ns=stamp_ns)

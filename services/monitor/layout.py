@@ -1,4 +1,4 @@
-"""How the viewer is laid out: the map large, the camera beside it, health below."""
+"""The layout of the rerun viewer: the map large, the camera beside it, health below."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from beamsplat.services.monitor.scene import BODY, CAMERA, SCAN, WORLD
 
 
 def layout() -> rrb.Blueprint:
-    """The blueprint."""
+    """Return the blueprint of the viewer."""
     eye = rrb.EyeControls3D(
         kind=rrb.Eye3DKind.Orbital, position=(-5.0, -5.0, 7.0), look_target=(0.0, 0.0, 0.0),
         eye_up=(0.0, 0.0, 1.0), tracking_entity=f"/{BODY}",
     )  # fmt: skip
-    # Points lie on the Gaussians made of them: one view each.
+    # Gaussians are created at the points and would hide them: each has its own view.
     world = rrb.Tabs(
         rrb.Spatial3DView(
             origin=WORLD, contents=["$origin/**", f"- /{CLOUD}/**"], name="Map", eye_controls=eye
@@ -27,7 +27,7 @@ def layout() -> rrb.Blueprint:
             origin=WORLD, contents=["$origin/**", f"- /{SPLATS}/**"], name="Points", eye_controls=eye
         ),
     )
-    # The beams lie in the picture by projection: a wrong calibration shows at once.
+    # The scan is projected into the image, so that a wrong calibration is visible.
     camera = rrb.Spatial2DView(origin=CAMERA, contents=["$origin/**", f"/{SCAN}"], name="Camera")
     plots = [
         rrb.TimeSeriesView(

@@ -1,9 +1,10 @@
-"""The Gaussian map, drawn in rerun.
+"""Draw the Gaussian map in rerun.
 
-map/splats/<anchor>          Gaussians of one submap, in the submap's frame: a loop closure moves the frame
-map_render                   the newest render, from the keyframe whose picture it should be
-plots/psnr_db/<what>         of the newest keyframe: foretold before it was taken in, and after
-plots/depth_error_m/map      median |rendered - fused|
+Entities:
+    map/splats/<anchor>         Gaussians of one submap in the submap's frame; a loop closure moves the frame
+    map_render                  the newest render, from the pose of the newest keyframe
+    plots/psnr_db/<what>        of the newest keyframe: predicted before it was used for mapping, and after
+    plots/depth_error_m/map     median |rendered - fused|
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from beamsplat.services.monitor.rerun_writer import RerunWriter
 
 SPLATS = "map/splats"
 RENDER = "map_render"
-PLOTS = {"psnr_db": "Map against picture, PSNR [dB]", "depth_error_m": "Map against depth [m]"}
+PLOTS = {"psnr_db": "Render against image, PSNR [dB]", "depth_error_m": "Rendered against fused depth [m]"}
 
 
 @dataclass
@@ -32,7 +33,9 @@ class _Chunk:
 
 
 class MapLayer:
-    """The newest version of every chunk, each drawn at a bounded rate and once more at the end."""
+    """Draws the newest revision of every chunk at a bounded rate, and each chunk's last revision at the
+    end.
+    """
 
     def __init__(self, writer: RerunWriter, limits: RateLimit) -> None:
         self._writer = writer
@@ -44,7 +47,8 @@ class MapLayer:
     def chunk(
         self, stamp_ns: int, anchor: int, revision: int, T_map_anchor: np.ndarray, packed: np.ndarray
     ) -> None:
-        """Packed Gaussians of an anchor, in its frame; older versions than the one known are ignored.
+        """Draw the packed Gaussians of an anchor, given in its frame; revisions older than the drawn one are
+        ignored.
 
         Raises:
             ValueError: the bytes are no packed Gaussians.
@@ -80,14 +84,14 @@ class MapLayer:
         )
 
     def render(self, stamp_ns: int, jpeg: np.ndarray) -> None:
-        """The map as seen from its newest keyframe: uint8 [B], JPEG."""
+        """Draw the render from the newest keyframe's pose: uint8 [B], JPEG."""
         if self._limits.due("image", stamp_ns, RENDER):
             drawing = rr.EncodedImage(contents=jpeg.tobytes(), media_type="image/jpeg")
             self._writer.log(RENDER, drawing, stamp_ns=stamp_ns)
 
-    def metrics(self, stamp_ns: int, foretold_psnr_db: float, psnr_db: float, depth_error_m: float) -> None:
-        """One point of each curve; NaN draws none."""
-        values = (foretold_psnr_db, psnr_db, depth_error_m)
+    def metrics(self, stamp_ns: int, predicted_psnr_db: float, psnr_db: float, depth_error_m: float) -> None:
+        """Append a point to each curve; NaN values are left out."""
+        values = (predicted_psnr_db, psnr_db, depth_error_m)
         for name, value in zip(("psnr_db/foretold", "psnr_db/after", "depth_error_m/map"), values):
             if np.isfinite(value):
                 if name not in self._declared:
@@ -97,7 +101,7 @@ class MapLayer:
                 self._writer.log(f"plots/{name}", rr.Scalars(value), stamp_ns=stamp_ns)
 
     def finish(self) -> None:
-        """Nothing more will come: what the rate held back is drawn."""
+        """Draw the chunk revisions that the rate limit has deferred."""
         for anchor, chunk in self._deferred.items():
             self._draw(anchor, chunk)
         self._deferred.clear()

@@ -1,4 +1,4 @@
-"""Shows the running system in rerun. It only listens: nobody ever waits for it."""
+"""The monitor node: shows the running system in rerun. No publisher ever waits for it."""
 
 from __future__ import annotations
 
@@ -31,17 +31,20 @@ Megabytes = Annotated[int, Field(gt=0)]
 
 
 class MonitorConfig(NodeConfig):
-    """`view`: a page for any browser ("serve"), a window here ("spawn"), or neither. With `save` a file
-    besides. Rates are the most that is drawn, by measurement time; 0 draws none of a kind."""
+    """Options of the monitor.
+
+    `view`: a web viewer ("serve"), a viewer window on this machine ("spawn"), or none; `save` writes a file
+    as well. Rates are upper limits in measurement time; 0 does not draw the kind.
+    """
 
     view: Literal["none", "spawn", "serve"] = "serve"
     save: Path | None = None
-    bind: str = "127.0.0.1"  # "0.0.0.0" shows it, unencrypted, to everybody who reaches this machine
+    bind: str = "127.0.0.1"  # "0.0.0.0": anyone who can reach this machine can see it, without encryption
     grpc_port: Port = 9876  # 0 = any free one
     web_port: Port = 9090
-    viewer_memory_mb: Megabytes = 512  # history kept for viewers that connect late
-    save_limit_mb: Megabytes = 8000  # then the file is finished
-    keep_free_mb: Megabytes = 500  # of the disk
+    viewer_memory_mb: Megabytes = 512  # history for viewers that connect later
+    save_limit_mb: Megabytes = 8000  # at this size the file is closed
+    keep_free_mb: Megabytes = 500  # on the disk; with less the file is closed
     image_hz: Hz = 10.0
     scan_hz: Hz = 10.0
     pose_hz: Hz = 20.0
@@ -83,7 +86,7 @@ def _draw_status(view: MapLayer, panel: HealthPanel, m: MapStatus) -> None:
 
 Draw = Callable[[Any, HealthPanel, Any], None]
 
-# What is shown in the scene, and how: one row a topic. Its delivery never holds a publisher up.
+# Topic -> how to draw it in the scene. These deliveries never block a publisher.
 SCENE: dict[Input, Draw] = {
     Input("rig", "latched"): _draw_rig,
     Input("camera/image", "latest"): lambda scene, _, m: scene.image(
@@ -123,7 +126,7 @@ def _handler(view: str, draw: Draw) -> Callable[[MonitorNode, Any], tuple[Output
     def handle(self: MonitorNode, message: Any) -> tuple[Output, ...]:
         try:
             draw(getattr(self, view), self.panel, message)
-        except ValueError as error:  # a message that is valid, but cannot be drawn
+        except ValueError as error:  # a valid message that cannot be drawn
             self.panel.log(str(error), message.stamp_ns, "WARN")
         self.detail = self.writer.status
         return ()
@@ -143,7 +146,7 @@ _Handlers = type(
 
 
 class MonitorNode(_Handlers, Node):
-    """Draws what comes by `SCENE`, `DEPTH` and `MAP`, and the health of all nodes."""
+    """Draws the topics of `SCENE`, `DEPTH` and `MAP`, and the health of all nodes."""
 
     name = "monitor"
     Config = MonitorConfig
@@ -157,7 +160,9 @@ class MonitorNode(_Handlers, Node):
     def configure(self) -> None:
         c = self.config
         if c.view == "none" and c.save is None:
-            raise UserError('monitor: view = "none" and no save: choose a view, or a file to save')
+            raise UserError(
+                'monitor: view = "none" without save shows nothing: choose a view, or set save to a file'
+            )
         self.writer = RerunWriter()
         try:
             self._open()
@@ -174,10 +179,10 @@ class MonitorNode(_Handlers, Node):
         log.info("%s", self.detail)
 
     def _open(self) -> None:
-        """Opens the file and the view.
+        """Open the file and the viewer.
 
         Raises:
-            RuntimeError, OSError: it cannot be; the text says what to do.
+            RuntimeError, OSError: one of them cannot be opened; the text says what to do.
         """
         c, writer = self.config, self.writer
         if c.save is not None:
@@ -199,7 +204,7 @@ class MonitorNode(_Handlers, Node):
             writer.notes.append(f"viewer at {address}")
 
     def on_health(self, health: Health) -> None:
-        """A row of the table, and a point of each curve."""
+        """Add the node's health to the table and the curves."""
         inputs = health.inputs
         report = NodeReport(
             node=health.node, instance=health.instance, wall_ns=health.stamp_ns, state=health.state,
@@ -231,5 +236,5 @@ def _port(bind: str, option: str, port: int) -> int:
     except OSError as error:
         raise OSError(
             f"cannot listen at {bind}:{port} ({error.strerror}): another viewer may be running. "
-            f"Choose another with --set monitor.{option}=PORT (0 = any free one)"
+            f"Choose another port with --set monitor.{option}=PORT (0: any free port)"
         ) from error

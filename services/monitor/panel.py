@@ -1,9 +1,10 @@
-"""The health of the nodes as plots, states, a table and a log.
+"""Draw the health of the nodes as plots, states, a table and a log.
 
-plots/<quantity>/<node>    one curve a node
-health/state/<node>        configure, active, drained ... as coloured lanes
-health/table               the newest of all nodes
-log                        what changed: states, faults, words of the nodes
+Entities:
+    plots/<quantity>/<node>     one curve per node
+    health/state/<node>         life cycle state (configure, active, drained ...) as a coloured lane
+    health/table                the newest health of all nodes
+    log                         changes of state, faults, and the nodes' status texts
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import rerun as rr
 from beamsplat.common.geometry.tracks import RateLimit
 from beamsplat.services.monitor.rerun_writer import RerunWriter
 
-# quantity -> how its plot is called
+# quantity -> title of its plot
 PLOTS = {
     "step_p95_ms": "Step time, p95 [ms]",
     "age_ms": "Age of inputs [ms]",
@@ -31,11 +32,11 @@ _STATES = {
 
 @dataclass(frozen=True)
 class NodeReport:
-    """What one node says of itself once a second. Counts are since it started."""
+    """The health of one node, received once per second. Counts are since its start."""
 
     node: str
     instance: str
-    wall_ns: int  # its clock, for rates
+    wall_ns: int  # the node's clock, for rates
     state: str
     detail: str
     step_p50_ms: float
@@ -51,7 +52,7 @@ class NodeReport:
 
 
 class HealthPanel:
-    """All nodes' reports, newest and one before."""
+    """Draws the newest report of each node; rates use the report before."""
 
     def __init__(self, writer: RerunWriter, limits: RateLimit) -> None:
         self._writer = writer
@@ -60,12 +61,12 @@ class HealthPanel:
         self._statuses: dict[str, str] = {}
 
     def report(self, new: NodeReport, stamp_ns: int | None) -> None:
-        """Takes a report in; `stamp_ns` is the newest measurement's, None before the first."""
+        """Draw a report. `stamp_ns` is the newest measurement time, None before the first measurement."""
         old = self._reports.get(new.node)
         if old is None:
             self._declare_plots(new.node)
         if old is not None and old.instance != new.instance:
-            self.log(f"{new.node} was started again", stamp_ns, "WARN")
+            self.log(f"{new.node} was restarted", stamp_ns, "WARN")
             old = None
         self._reports[new.node] = new
         curves = {
@@ -82,7 +83,7 @@ class HealthPanel:
             self.log(f"{new.node} is {new.state}", stamp_ns)
         if new.detail and (old is None or old.detail != new.detail):
             self.log(f"{new.node}: {new.detail}", stamp_ns)
-        for count, text in (("lost", "lost"), ("broken", "could not read")):
+        for count, text in (("lost", "lost"), ("broken", "could not decode")):
             more = getattr(new, count) - (0 if old is None else getattr(old, count))
             if more > 0:
                 self.log(f"{new.node} {text} {more} messages", stamp_ns, "WARN")
@@ -94,7 +95,7 @@ class HealthPanel:
             )
 
     def status(self, path: str, status: str, detail: str, stamp_ns: int) -> None:
-        """What a node says of its results; drawn when it changes."""
+        """Draw the status of a service's results when it changes."""
         if self._statuses.get(path) == status:
             return
         self._statuses[path] = status
@@ -103,7 +104,7 @@ class HealthPanel:
         self.log(f"{path}: {status}{f' ({detail})' if detail and status != 'ok' else ''}", stamp_ns, level)
 
     def log(self, text: str, stamp_ns: int | None, level: str = "INFO") -> None:
-        """One line in the log."""
+        """Append one line to the log."""
         self._writer.log("log", rr.TextLog(text, level=level), stamp_ns=stamp_ns)
 
     def _declare_plots(self, node: str) -> None:
@@ -130,6 +131,6 @@ class HealthPanel:
 
 
 def _rate_hz(old: NodeReport, new: NodeReport) -> float:
-    """Messages that did not reach the node, per second between two reports."""
+    """Return dropped and lost messages per second between two reports."""
     seconds = max((new.wall_ns - old.wall_ns) / 1e9, 1e-3)
     return (new.dropped + new.lost - old.dropped - old.lost) / seconds

@@ -1,9 +1,10 @@
-"""Where entries go: a viewer, a file, or both, each behind a thread of its own.
+"""Write rerun entries to a viewer, a file, or both, each in its own thread.
 
-rerun can feed several sinks from one stream (`set_sinks`), but then the slowest sink sets the pace: a
-browser that stops reading blocks `log()` for more than 20 s, and the file with it. So each sink has its
-own stream of the same recording, and a queue that never makes the caller wait: when it is full, by number
-or by bytes, what is drawn replaces what still waits to be drawn at the same place.
+rerun can feed several sinks from one stream (`set_sinks`), but then the slowest sink sets the pace: a browser
+that stops reading blocks `log()` for more than 20 s, and the file with it. Therefore each sink has its own
+stream of the same recording, and a queue that never blocks the caller: when it is full, by number or by
+bytes,
+a new entry replaces the queued entry of the same path.
 """
 
 from __future__ import annotations
@@ -29,8 +30,8 @@ log = logging.getLogger(__name__)
 APPLICATION = "beamsplat"
 TIMELINE = "time"
 _QUEUE = 256  # about five seconds of entries at the default rates
-_QUEUE_BYTES = 64_000_000  # a large map is some 13 MB, drawn anew every two seconds
-_CHECK_S = 1.0
+_QUEUE_BYTES = 64_000_000  # a large map has about 13 MB and is drawn every two seconds
+_CHECK_S = 1.0  # between checks that the sink still works
 _FLUSH_S = 3.0
 
 
@@ -44,7 +45,7 @@ class _LogEntry:
 
 
 class SinkThread:
-    """One sink of a recording, fed by a thread."""
+    """One sink of a recording and the thread that feeds it."""
 
     def __init__(
         self,
@@ -54,19 +55,22 @@ class SinkThread:
         blueprint: rrb.Blueprint,
         watch: Callable[[], str] = lambda: "",
     ) -> None:
-        """`watch` is asked about once a second whether the sink must be given up: a reason, or "".
+        """Open the sink and start the thread.
+
+        Args:
+            watch: called about once per second; returns the reason why the sink must be closed, or "".
 
         Raises:
             RuntimeError: the sink cannot be opened.
         """
         self.name = name
-        self.fault = ""  # why nothing is drawn here any more
-        self.dropped = 0  # entries overtaken by newer ones
+        self.fault = ""  # why the sink was closed
+        self.dropped = 0  # entries replaced by newer ones
         self._stream = stream
         self._watch = watch
         self._queue: deque[_LogEntry | threading.Event] = deque()
         self._newest: dict[str, _LogEntry] = {}
-        self._bytes = 0  # of the entries that wait
+        self._bytes = 0  # of the queued entries
         self._changed = threading.Condition()
         self._closing = False
         stream.set_sinks(sink, default_blueprint=blueprint)
@@ -74,7 +78,7 @@ class SinkThread:
         self._thread.start()
 
     def put(self, entry: _LogEntry) -> None:
-        """Takes one entry; never waits."""
+        """Queue one entry; never blocks."""
         if self.fault:
             return
         with self._changed:
@@ -96,7 +100,7 @@ class SinkThread:
             self._changed.notify()
 
     def flush(self, timeout_s: float) -> bool:
-        """Waits until all that was put is with the sink; False if it took longer."""
+        """Wait until all queued entries are written; return False after `timeout_s`."""
         done = threading.Event()
         with self._changed:
             self._queue.append(done)
@@ -104,17 +108,17 @@ class SinkThread:
         return bool(self.fault) or done.wait(timeout_s)
 
     def begin_close(self) -> None:
-        """What waits is still drawn, then the sink is closed."""
+        """Let the thread write the queued entries and then close the sink."""
         with self._changed:
             self._closing = True
             self._changed.notify()
 
     def close(self, timeout_s: float) -> None:
-        """Waits for that; gives up after a while."""
+        """Close the sink; wait at most `timeout_s` for the thread."""
         self.begin_close()
         self._thread.join(timeout_s)
         if self._thread.is_alive():
-            log.warning("%s did not finish within %g s: the last entries are missing", self.name, timeout_s)
+            log.warning("%s was not closed within %g s: its last entries are missing", self.name, timeout_s)
 
     def _run(self) -> None:
         next_check = time.monotonic() + _CHECK_S
@@ -128,7 +132,7 @@ class SinkThread:
                 if time.monotonic() >= next_check:
                     self._check_sink()
                     next_check = time.monotonic() + _CHECK_S
-            except RuntimeError as error:  # what rerun raises when a sink has died
+            except RuntimeError as error:  # raised by rerun when a sink has failed
                 self._give_up(str(error))
         try:
             if not self.fault:
@@ -160,7 +164,7 @@ class SinkThread:
         try:
             self._stream.flush(timeout_sec=0.2)
         except RuntimeError as error:
-            if "timed out" not in str(error):  # slow is not dead
+            if "timed out" not in str(error):  # slow, but not failed
                 raise
         reason = self._watch()
         if reason:
@@ -169,7 +173,7 @@ class SinkThread:
     def _give_up(self, reason: str) -> None:
         if not self.fault:
             self.fault = f"{self.name}: {reason}"
-            log.warning("the monitor goes on without %s", self.fault)
+            log.warning("the monitor continues without %s", self.fault)
         with self._changed:
             self._queue.clear()
             self._newest.clear()
@@ -177,24 +181,24 @@ class SinkThread:
 
 
 class RerunWriter:
-    """The sinks in use. Drawing on it never waits and never raises."""
+    """Writes entries to all sinks. Logging never blocks and never raises."""
 
     def __init__(self) -> None:
         self.sinks: list[SinkThread] = []
-        self.notes: list[str] = []  # where to style
+        self.notes: list[str] = []  # addresses and files, for the status
         self._recording_id = np.random.default_rng().bytes(16).hex()
         self._viewer: subprocess.Popen[bytes] | None = None
 
     def log(self, path: str, *parts: Any, stamp_ns: int | None = None, static: bool = False) -> None:
-        """Draws rerun archetypes at an entity; without a stamp on the clock of this machine only."""
+        """Write rerun archetypes to an entity, at time `stamp_ns`; without it only log time is set."""
         entry = _LogEntry(path, parts, stamp_ns, static, sum(map(_size_bytes, parts)))
         for thread in self.sinks:
             thread.put(entry)
 
     def save(self, path: Path, blueprint: rrb.Blueprint, *, limit_mb: int, keep_free_mb: int) -> Path:
-        """Starts a file beside what may be there already (drive.rrd, drive-2.rrd, ...); returns its name.
+        """Start a file under a name that is not yet used (drive.rrd, drive-2.rrd, ...); return its path.
 
-        The file ends, whole, at `limit_mb`, or when less than `keep_free_mb` are left on the disk.
+        The file is closed, complete, at `limit_mb`, or when less than `keep_free_mb` are free on the disk.
 
         Raises:
             RuntimeError: the file cannot be written.
@@ -202,9 +206,9 @@ class RerunWriter:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise RuntimeError(f"cannot make the folder of {path}: {error}") from error
+            raise RuntimeError(f"cannot create the folder of {path}: {error}") from error
         path = _unused_path(path)
-        # Few, large chunks: their directory stays in memory until the file is closed.
+        # Few, large chunks: rerun keeps their index in memory until the file is closed.
         stream = self._stream(flush_tick_s=2.0)
         watch = _disk_watch(path, limit_mb, keep_free_mb)
         self.sinks.append(SinkThread(str(path), stream, rr.FileSink(path), blueprint, watch))
@@ -214,11 +218,12 @@ class RerunWriter:
     def serve(
         self, blueprint: rrb.Blueprint, *, bind: str, port: int, origins: list[str], memory_mb: int
     ) -> str:
-        """Starts the server that viewers connect to, which keeps `memory_mb` of history for those who
-        come late; returns its address.
+        """Start the server that viewers connect to; return its address.
+
+        It keeps `memory_mb` of history for viewers that connect later.
 
         Raises:
-            RuntimeError: the port is taken.
+            RuntimeError: the port is in use.
         """
         sink = rr.GrpcServerSink(
             bind, port, server_memory_limit=f"{memory_mb}MB", cors_allow_origin=origins or None
@@ -228,7 +233,7 @@ class RerunWriter:
         return f"rerun+http://127.0.0.1:{port}/proxy"
 
     def spawn(self, address: str, memory_mb: int) -> None:
-        """Opens a viewer window on the server at `address`. It stays when the monitor ends."""
+        """Open a viewer window on the server at `address`. It stays open when the monitor ends."""
         self._viewer = subprocess.Popen(
             [sys.executable, "-m", "rerun_cli", "--connect", address, "--bind", "127.0.0.1",
              "--memory-limit", f"{memory_mb}MB"],
@@ -237,12 +242,14 @@ class RerunWriter:
         )  # fmt: skip
 
     def _watch_viewer(self) -> str:
-        """The server outlives a window: a new one can be opened on it."""
+        """Note when the viewer window has ended; the server stays, so that a new one can connect.
+
+        Return "".
+        """
         if self._viewer is not None and self._viewer.poll() is not None:
             self._viewer = None
             self.notes.append(
-                "the viewer window has ended; the data are still served (without a display use "
-                'view = "serve")'
+                'the viewer window was closed; the data are still served (no display: set view = "serve")'
             )
             log.warning("%s", self.notes[-1])
         return ""
@@ -253,22 +260,22 @@ class RerunWriter:
 
     @property
     def status(self) -> str:
-        """One line: where to style, and what has failed."""
+        """One line: addresses, files, and failed sinks."""
         parts = [*self.notes]
         for thread in self.sinks:
             if thread.fault:
                 parts.append(f"stopped: {thread.fault}")
             elif thread.dropped:
-                parts.append(f"{thread.name} is slow: {thread.dropped} entries overtaken")
+                parts.append(f"{thread.name} is slow: {thread.dropped} entries dropped")
         return "; ".join(parts)
 
     def flush(self, timeout_s: float = _FLUSH_S) -> None:
-        """Waits a little until everything drawn has arrived."""
+        """Wait at most `timeout_s` for each sink to write its queue."""
         for thread in self.sinks:
             thread.flush(timeout_s)
 
     def close(self, timeout_s: float = _FLUSH_S) -> None:
-        """Finishes files and closes servers, all within `timeout_s`."""
+        """Close files and servers, all within `timeout_s`."""
         deadline = time.monotonic() + timeout_s
         for thread in self.sinks:
             thread.begin_close()
@@ -281,7 +288,9 @@ def _size_bytes(archetype: Any) -> int:
 
 
 def _unused_path(path: Path) -> Path:
-    """`path`, or the first of path-2, path-3 ... that does not exist: a restart must not overwrite."""
+    """Return `path`, or the first of path-2, path-3 ... that does not exist, so that a restart
+    overwrites nothing.
+    """
     candidate, number = path, 1
     while candidate.exists():
         number += 1
@@ -295,11 +304,11 @@ def _disk_watch(path: Path, limit_mb: int, keep_free_mb: int) -> Callable[[], st
             size_mb = path.stat().st_size / 1e6
             free_mb = shutil.disk_usage(path.parent).free / 1e6
         except OSError as error:
-            return f"the file is gone ({error})"
+            return f"the file was removed ({error})"
         if size_mb > limit_mb:
-            return f"complete at {size_mb:.0f} MB (save_limit_mb = {limit_mb})"
+            return f"closed at {size_mb:.0f} MB (save_limit_mb = {limit_mb})"
         if free_mb < keep_free_mb:
-            return f"complete: {free_mb:.0f} MB left on the disk (keep_free_mb = {keep_free_mb})"
+            return f"closed: {free_mb:.0f} MB left on the disk (keep_free_mb = {keep_free_mb})"
         return ""
 
     return watch

@@ -1,13 +1,14 @@
-"""The robot and its map, drawn in rerun. Entities:
+"""Draw the robot and its 2D map in rerun.
 
-map                        the world, z up
-map/grid                   occupancy
-map/anchors                lidar submaps
-map/scan                   the last sweep, where it was measured
-map/path/<source>          where each source of poses says the robot has been
-map/odom                   moves when a loop closes (T_map_odom)
-map/odom/body              the robot
-map/odom/body/camera       pinhole, with the picture in camera/image
+Entities:
+    map                        the map frame, z up
+    map/grid                   occupancy grid
+    map/anchors                lidar submaps
+    map/scan                   the newest scan, deskewed
+    map/path/<source>          the robot's path by each source of poses
+    map/odom                   the odom frame (T_map_odom); a loop closure moves it
+    map/odom/body              the robot
+    map/odom/body/camera       pinhole, with the image in camera/image
 """
 
 from __future__ import annotations
@@ -28,17 +29,17 @@ CAMERA = f"{BODY}/camera"
 SCAN = f"{WORLD}/scan"
 _SMOOTH = f"{WORLD}/odom/path"
 
-# Who is believed about the robot's pose, best first.
+# Sources of the robot's pose, best first; the best available one is drawn.
 SOURCES = ("localization", "external", "wheel")
 _COLOURS = {"localization": (80, 200, 255), "external": (120, 230, 120), "wheel": (150, 150, 150)}
 _SMOOTH_COLOUR = (40, 90, 130)
-_LIFT_M = {"localization": 0.03, "external": 0.02, "wheel": 0.01}  # the better one is seen where they meet
+_LIFT_M = {"localization": 0.03, "external": 0.02, "wheel": 0.01}  # the better one is drawn on top
 _ROBOT = (255, 160, 40)
 _SCAN = (255, 70, 90)
 _ANCHOR = (200, 140, 255)
 _FRUSTUM_M = 0.5
-_WAITING_SWEEPS = 3
-_LOOP_RESTART_NS = 5_000_000_000  # stamps that fall back further are of another lap
+_WAITING_SWEEPS = 3  # a scan that waits longer for a pose is drawn with the last known one
+_LOOP_RESTART_NS = 5_000_000_000  # a larger step back in time: a looping recording has restarted
 _RAW_FORMATS = {
     "rgb8": (rr.ColorModel.RGB, 3),
     "bgr8": (rr.ColorModel.BGR, 3),
@@ -50,7 +51,7 @@ _RAW_FORMATS = {
 
 @dataclass(frozen=True)
 class SceneStyle:
-    """How things are drawn."""
+    """Sizes and limits of what is drawn."""
 
     path_points: int = 2000
     path_step_m: float = 0.05
@@ -59,16 +60,16 @@ class SceneStyle:
 
 @dataclass
 class _Sweep:
-    """A scan that waits for the pose at its end."""
+    """A scan that waits for the robot's pose at its end."""
 
     stamp_ns: int
     end_ns: int
-    points_body: np.ndarray
-    share: np.ndarray
+    points_body: np.ndarray  # float64 [M, 3]
+    share: np.ndarray  # float64 [M], time within the sweep, 0 .. 1
 
 
 class Scene:
-    """What is known of the robot and its map, and how it looks."""
+    """Keeps poses and paths of the robot, and draws robot, sensors and grid."""
 
     def __init__(self, writer: RerunWriter, limits: RateLimit, style: SceneStyle) -> None:
         self._writer = writer
@@ -80,7 +81,7 @@ class Scene:
         self._T_map_wheel: np.ndarray | None = None
         self._T_body_lidar = np.eye(4)
         self._sweeps: deque[_Sweep] = deque()
-        self.newest_ns: int | None = None  # of all measurements
+        self.newest_ns: int | None = None  # newest measurement time
         writer.log(WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         half = np.array(style.body_size_m) / 2.0
         writer.log(
@@ -99,7 +100,7 @@ class Scene:
         size_px: tuple[int, int],  # width, height
         T_body_camera: np.ndarray,
     ) -> None:
-        """The camera's place on the robot, and its frustum (without lens distortion)."""
+        """Draw the camera's mount and frustum (without lens distortion)."""
         self._writer.log(
             CAMERA,
             _transform(T_body_camera),
@@ -111,7 +112,7 @@ class Scene:
         )  # fmt: skip
 
     def lidar(self, T_body_lidar: np.ndarray) -> None:
-        """The lidar's place on the robot."""
+        """Set the lidar's mount."""
         self._T_body_lidar = T_body_lidar
 
     # --- measurements ---
@@ -124,7 +125,7 @@ class Scene:
         size_px: tuple[int, int],  # width, height
         step_bytes: int,  # of a raw row; 0 = no padding
     ) -> None:
-        """A camera picture as it came: compressed ones stay so."""
+        """Draw a camera image; compressed images stay compressed."""
         self._update_newest(stamp_ns)
         if not self._limits.due("image", stamp_ns):
             return
@@ -154,7 +155,7 @@ class Scene:
         time_increment_s: float,
         range_limits_m: tuple[float, float],
     ) -> None:
-        """A sweep of the lidar: drawn in the map as soon as it is known where the robot was."""
+        """Draw a scan in the map, as soon as the robot's pose at its end is known."""
         self._update_newest(stamp_ns)
         if not self._limits.due("scan", stamp_ns):
             return
@@ -167,13 +168,17 @@ class Scene:
                 share=beams / max(len(ranges_m), 1),
             )
         )
-        # The pose at a sweep's end is found from the next one; whoever needs longer gets the last known.
+        # The pose at a sweep's end is interpolated after the next pose; if none comes, use the last one.
         if len(self._sweeps) > _WAITING_SWEEPS or self._best_source() is None:
             self._draw_sweep(self._sweeps.popleft())
 
     def pose(self, source: str, stamp_ns: int, T_source_body: np.ndarray) -> None:
-        """The robot's pose by one of `SOURCES`: localization in odom, external in map, wheel in its own
-        drifting frame, which is laid on the map where the robot was first known to be."""
+        """Draw the robot's pose [4, 4] by one of `SOURCES`.
+
+        Localization is in odom, external in map, wheel in its own drifting frame, which is aligned to the
+        map at
+        the first pose that a better source knows.
+        """
         self._update_newest(stamp_ns)
         self._poses[source].add(stamp_ns, T_source_body)
         best_source = self._best_source()
@@ -200,14 +205,14 @@ class Scene:
             self._writer.log(entity, strip, stamp_ns=stamp_ns)
 
     def correction(self, stamp_ns: int, T_map_odom: np.ndarray) -> None:
-        """Where the smooth frame lies in the map."""
+        """Draw the odom frame in the map: T_map_odom [4, 4]."""
         self._T_map_odom = T_map_odom
         self._writer.log(f"{WORLD}/odom", _transform(T_map_odom), stamp_ns=self._not_before(stamp_ns))
 
     # --- the map ---
 
     def anchors(self, stamp_ns: int, anchor_ids: np.ndarray, T_map_anchor: np.ndarray) -> None:
-        """Submaps: `anchor_ids` int64 [N], `T_map_anchor` [N, 4, 4]."""
+        """Draw submaps: `anchor_ids` int64 [N], `T_map_anchor` float64 [N, 4, 4]."""
         if not self._limits.due("anchors", stamp_ns):
             return
         arrows = rr.Arrows3D(
@@ -223,7 +228,7 @@ class Scene:
         resolution_m: float,
         origin_m: np.ndarray,  # [2], corner of cell (0, 0)
     ) -> None:
-        """The occupancy grid, lying on the floor, as far as anything is known."""
+        """Draw the known part of the occupancy grid on the floor."""
         if not self._limits.due("grid", stamp_ns):
             return
         known = occupancy >= 0
@@ -234,25 +239,29 @@ class Scene:
         height, width = part.shape
         corner_m = origin_m + resolution_m * np.array([columns[0], rows[0]])
         drawing = rr.GridMap(
-            data=np.ascontiguousarray(part[::-1]).tobytes(),  # a picture's first row is its top
+            data=np.ascontiguousarray(part[::-1]).tobytes(),  # the first row of an image is its top
             format=rr.components.ImageFormat(
                 width=width, height=height, color_model="L", channel_datatype="U8"
             ),
             cell_size=resolution_m,
-            translation=[corner_m[0], corner_m[1], -0.01],  # just below what stands on the floor
+            translation=[
+                corner_m[0],
+                corner_m[1],
+                -0.01,
+            ],  # below the floor, so that objects on it are not hidden
             colormap=rr.components.Colormap.RvizMap,
         )
         self._writer.log(f"{WORLD}/grid", drawing, stamp_ns=stamp_ns)
 
     def finish(self) -> None:
-        """Nothing more will come: draws what still waits."""
+        """Draw the scans that still wait for a pose."""
         while self._sweeps:
             self._draw_sweep(self._sweeps.popleft())
 
-    # --- where and when things are ---
+    # --- frames and times ---
 
     def _update_newest(self, stamp_ns: int) -> None:
-        """Keeps the time of the newest measurement; a recording that loops takes it back."""
+        """Update the newest measurement time; a looping recording resets it."""
         if self.newest_ns is None or not self.newest_ns - _LOOP_RESTART_NS < stamp_ns <= self.newest_ns:
             self.newest_ns = stamp_ns
 
@@ -286,7 +295,9 @@ class Scene:
         self._writer.log(SCAN, points, stamp_ns=sweep.stamp_ns)
 
     def _not_before(self, stamp_ns: int) -> int:
-        """Optimisations carry the stamp of what they were computed from; they hold from now on."""
+        """Return the time from which a result holds: now, since optimisations carry the stamp of their
+        input.
+        """
         return stamp_ns if self.newest_ns is None else max(stamp_ns, self.newest_ns)
 
 
@@ -297,10 +308,10 @@ def _transform(T: np.ndarray) -> rr.Transform3D:
 
 
 def _rows(data: np.ndarray, height: int, row_bytes: int, step_bytes: int) -> np.ndarray:
-    """uint8 [height, row_bytes] without the padding of a raw picture.
+    """Return uint8 [height, row_bytes], a raw image without the padding of its rows.
 
     Raises:
-        ValueError: fewer bytes than the picture needs.
+        ValueError: fewer bytes than the image needs.
     """
     step = step_bytes or row_bytes
     if step < row_bytes or data.size < step * (height - 1) + row_bytes:

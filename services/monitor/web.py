@@ -1,4 +1,4 @@
-"""The page on which a browser sees the running system, and the ports it takes."""
+"""Serve rerun's web viewer, and choose its ports."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ import rerun as rr
 
 
 def free_port(bind: str, port: int) -> int:
-    """`port`, or a free one for 0.
+    """Return `port`, or a free port for 0.
 
     Raises:
-        OSError: the port is taken, or `bind` is no address of this machine.
+        OSError: the port is in use, or `bind` is no address of this machine.
     """
     with socket.socket() as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -21,11 +21,12 @@ def free_port(bind: str, port: int) -> int:
 
 
 def serve_page(bind: str, web_port: int, grpc_port: int) -> str:
-    """Serves the web viewer at `web_port` of all interfaces (the program alone: the data come from
-    `grpc_port`, at `bind`); returns the address to open.
+    """Serve the web viewer on `web_port` of all interfaces; return the address to open.
+
+    Only the viewer program is served there; it loads the data from `grpc_port` at `bind`.
 
     Raises:
-        RuntimeError: the port is taken.
+        RuntimeError: the port is in use.
     """
     rr.serve_web_viewer(web_port=web_port, open_browser=False)
     host = socket.gethostname() if bind == "0.0.0.0" else bind
@@ -34,5 +35,5 @@ def serve_page(bind: str, web_port: int, grpc_port: int) -> str:
 
 
 def allowed_origins(bind: str, web_port: int) -> list[str]:
-    """The pages that may read the data, besides those of this machine."""
+    """Return the origins (CORS) whose pages may read the data, besides those of this machine."""
     return [] if bind == "127.0.0.1" else [f"http://*:{web_port}"]

@@ -1,1 +1,1 @@
-"""A page for any browser: status, pictures and map, and commands for those with its token."""
+"""The web page of a running system: status, images and map; commands for users with the token."""

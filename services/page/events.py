@@ -1,4 +1,4 @@
-"""Who looks at the page, and what each has not been told yet: the newest of each kind, never more."""
+"""Distribute server-sent events to all open pages; each page receives only the newest event of each kind."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from typing import Any
 
 @dataclass(eq=False)
 class EventSubscriber:
-    """One open stream of server-sent events."""
+    """One open event stream."""
 
     waiting: dict[str, bytes] = field(default_factory=dict)
-    dropped: int = 0  # events that were replaced by newer ones before it took them
+    dropped: int = 0  # events replaced by newer ones before they were sent
     _wake: asyncio.Event = field(default_factory=asyncio.Event)
 
     def push(self, kind: str, event: bytes) -> None:
-        """Puts the newest of a kind before the viewer."""
+        """Queue an event; it replaces a queued event of the same kind."""
         self.dropped += kind in self.waiting
         self.waiting[kind] = event
         self._wake.set()
 
     async def next_events(self) -> bytes:
-        """All that waits; waits for it."""
+        """Wait for events and return all queued ones."""
         await self._wake.wait()
         self._wake.clear()
         events = b"".join(self.waiting.values())
@@ -32,25 +32,25 @@ class EventSubscriber:
 
 
 class EventHub:
-    """All viewers; each event is encoded once for them."""
+    """All event streams; each event is encoded once for all."""
 
     def __init__(self) -> None:
         self.subscribers: set[EventSubscriber] = set()
         self._newest: dict[str, bytes] = {}
-        self._dropped = 0  # of those who have left
+        self._dropped = 0  # of streams that have ended
 
     def __len__(self) -> int:
         return len(self.subscribers)
 
     @property
     def dropped(self) -> int:
-        """Events that viewers were too slow for, since the start."""
+        """Number of events that were replaced before they were sent, since the start."""
         return self._dropped + sum(viewer.dropped for viewer in self.subscribers)
 
     def subscribe(self) -> EventSubscriber:
-        """A new viewer; it has been told nothing."""
+        """Register a new stream; it receives the newest event of each kind first."""
         if not self.subscribers:
-            self._newest.clear()  # of when somebody last looked
+            self._newest.clear()  # outdated: nothing is published without subscribers
         viewer = EventSubscriber()
         for kind, event in self._newest.items():
             viewer.push(kind, event)
@@ -58,12 +58,12 @@ class EventHub:
         return viewer
 
     def unsubscribe(self, viewer: EventSubscriber) -> None:
-        """It looks no longer."""
+        """Unregister a stream; its queued events are discarded."""
         self.subscribers.discard(viewer)
         self._dropped += viewer.dropped
 
     def publish(self, kind: str, data: Any) -> None:
-        """Tells all viewers, if it is anything new. What stands before "/" in `kind` is the event's name."""
+        """Send data to all streams if it has changed. The part of `kind` before "/" is the event's name."""
         event = b"event: %s\ndata: %s\n\n" % (kind.partition("/")[0].encode(), as_json(data))
         if self._newest.get(kind) != event:
             self._newest[kind] = event
@@ -72,5 +72,5 @@ class EventHub:
 
 
 def as_json(data: Any) -> bytes:
-    """Strict JSON: NaN would be none."""
+    """Return strict JSON: NaN and infinity raise ValueError."""
     return json.dumps(data, separators=(",", ":"), allow_nan=False).encode()

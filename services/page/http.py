@@ -1,6 +1,6 @@
-"""As much HTTP/1.1 as a page needs: short requests in, replies out, everything bounded.
+"""A minimal HTTP/1.1 server side: short requests, responses, limits on everything.
 
-The standard library's server takes a thread a connection; a page that ten phones keep open should not.
+The standard library's server needs one thread per connection, too many for a page open on ten phones.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from http import HTTPStatus
 MAX_HEAD_BYTES = 16 * 1024
 MAX_BODY_BYTES = 16 * 1024
 IDLE_S = 60.0  # a connection without a request is closed
-# Nothing from elsewhere, nothing inline, in nobody's frame; no content is guessed.
+# No content from other origins, no inline scripts, no embedding in frames, no content sniffing.
 SECURITY_HEADERS = (
     b"Content-Security-Policy: default-src 'self'; frame-ancestors 'none'; base-uri 'none'\r\n"
     b"X-Content-Type-Options: nosniff\r\nReferrer-Policy: no-referrer\r\n"
@@ -23,7 +23,7 @@ SECURITY_HEADERS = (
 
 
 class HttpError(ValueError):
-    """A request that gets an error as its make_response."""
+    """A request that is answered with an error status."""
 
     def __init__(self, status: HTTPStatus, text: str) -> None:
         super().__init__(text)
@@ -35,16 +35,16 @@ class HttpRequest:
     """One request; header names are in lower case."""
 
     method: str
-    path: str  # without what follows "?"
+    path: str  # without the query string
     headers: dict[str, str]
     body: bytes
 
 
 async def read_request(reader: asyncio.StreamReader) -> HttpRequest | None:
-    """The next request of a connection; None where it has ended or nothing came for too long.
+    """Return the next request of a connection; None at its end or after `IDLE_S` without a request.
 
     Raises:
-        HttpError: not HTTP as browsers speak it, or too long.
+        HttpError: not an HTTP/1 request, or too long.
     """
     try:
         async with asyncio.timeout(IDLE_S):
@@ -57,7 +57,7 @@ async def read_request(reader: asyncio.StreamReader) -> HttpRequest | None:
                 )
             return request
     except asyncio.LimitOverrunError as error:
-        raise HttpError(HTTPStatus.REQUEST_HEADER_FIELDS_TOO_LARGE, "head too long") from error
+        raise HttpError(HTTPStatus.REQUEST_HEADER_FIELDS_TOO_LARGE, "request header too long") from error
     except (asyncio.IncompleteReadError, TimeoutError, ConnectionError):
         return None
 
@@ -66,7 +66,7 @@ def _parse(head: bytes) -> HttpRequest:
     first, *lines = head.decode("latin-1").split("\r\n")
     parts = first.split(" ")
     if len(parts) != 3 or not parts[2].startswith("HTTP/1."):
-        raise HttpError(HTTPStatus.BAD_REQUEST, "no HTTP/1 request")
+        raise HttpError(HTTPStatus.BAD_REQUEST, "not an HTTP/1 request")
     headers = {}
     for line in lines:
         name, colon, value = line.partition(":")
@@ -77,17 +77,17 @@ def _parse(head: bytes) -> HttpRequest:
 
 def _body_bytes(headers: dict[str, str]) -> int:
     if "transfer-encoding" in headers:
-        raise HttpError(HTTPStatus.LENGTH_REQUIRED, "a body must tell its length")
+        raise HttpError(HTTPStatus.LENGTH_REQUIRED, "Content-Length is required")
     text = headers.get("content-length", "0")
     if not (text.isascii() and text.isdigit()):
-        raise HttpError(HTTPStatus.BAD_REQUEST, "no such length")
+        raise HttpError(HTTPStatus.BAD_REQUEST, "invalid Content-Length")
     if len(text) > 9 or int(text) > MAX_BODY_BYTES:
         raise HttpError(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"more than {MAX_BODY_BYTES} bytes")
     return int(text)
 
 
 def make_response(status: HTTPStatus, content_type: str, body: bytes, extra: bytes = b"") -> bytes:
-    """A whole make_response; nothing of it is kept by caches."""
+    """Return a complete response that caches must not store."""
     return (
         f"HTTP/1.1 {status.value} {status.phrase}\r\nContent-Type: {content_type}\r\n"
         f"Content-Length: {len(body)}\r\nCache-Control: no-store\r\n"
@@ -101,10 +101,12 @@ STREAM_HEAD = (
 
 
 def is_own_host(host: str, own: frozenset[str]) -> bool:
-    """Whether a Host header names this machine: by address, as localhost, or by one of its `own` names.
+    """Return whether a Host header names this machine: by address, as localhost, or by one of its `own`
+    names.
 
-    A page from elsewhere can point a name of its own at this machine (DNS rebinding), and would then be
-    allowed to read what is served here; but it cannot choose the name by which it asks.
+    A foreign page can point its own host name at this machine (DNS rebinding) to read what is served here.
+    The
+    browser then sends that name in the Host header, which the page cannot change.
     """
     name = host.strip().lower()
     if name.startswith("["):
@@ -121,6 +123,6 @@ def is_own_host(host: str, own: frozenset[str]) -> bool:
 
 
 def own_host_names() -> frozenset[str]:
-    """The names by which browsers may ask for this machine, besides its addresses."""
+    """Return the host names of this machine that browsers may use."""
     host = socket.gethostname().lower()
     return frozenset({"localhost", host, f"{host}.local", socket.getfqdn().lower()})

@@ -1,4 +1,4 @@
-"""What the page shows as pictures: encoded when somebody looks, once for all who do."""
+"""Encode images for the page: only when a page is open, and once for all open pages."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ import numpy as np
 
 from beamsplat.common.messages.image_codec import decode_rgb
 
-_DEPTH_RANGE_M = (0.3, 8.0)  # of the colour scale
+_DEPTH_RANGE_M = (0.3, 8.0)  # of the colour scale: indoor distances
 _QUALITY = (cv2.IMWRITE_JPEG_QUALITY, 75)
-_FREE, _OCCUPIED = 235, 20  # grey
+_FREE, _OCCUPIED = 235, 20  # grey values of map cells
 
 
 class EncodedImage(NamedTuple):
-    """A picture as browsers take it; `metadata` go to the page beside it."""
+    """An image in a format for browsers; `metadata` is sent with its event."""
 
     data: bytes
     content_type: str
@@ -25,42 +25,47 @@ class EncodedImage(NamedTuple):
 
 
 class LatestImage:
-    """The newest of one kind. `offer` may be called from another thread than `fresh`."""
+    """The newest image of one kind. `update` may be called from another thread than `encode_newest`."""
 
     def __init__(self, max_hz: float) -> None:
         self._period_s = 1.0 / max_hz
         self._pending: tuple[int, float, Callable[[], EncodedImage]] | None = None
         self._encoded_at_s = -1e9
-        self.number = 0  # of the encoded one
-        self.received_s = 0.0  # when the encoded one was pending: monotonic, s
+        self.number = 0  # of the encoded image
+        self.received_s = 0.0  # when the encoded image was set: monotonic, s
         self.encoded: EncodedImage | None = None
-        self.fault = ""  # why the newest could not be shown
+        self.fault = ""  # why the newest image could not be encoded
 
     def update(self, encode: Callable[[], EncodedImage]) -> None:
-        """Takes the newest; it is encoded when it is asked for, or never."""
+        """Set a function that encodes the newest image; it is called only when the image is needed."""
         number = self._pending[0] + 1 if self._pending else 1
         self._pending = number, time.monotonic(), encode
 
     def due(self) -> bool:
-        """Whether there is a newer one than the encoded, and it is time to encode it."""
+        """Return whether there is a newer image than the encoded one and the rate limit allows to
+        encode it.
+        """
         pending = self._pending
         newer = pending is not None and pending[0] != self.number
         return newer and time.monotonic() - self._encoded_at_s >= self._period_s
 
     def encode_newest(self) -> None:
-        """Encodes the newest."""
+        """Encode the newest image.
+
+        If its bytes are damaged, the last valid one stays and `fault` says why.
+        """
         pending = self._pending
         if pending is None:
             return
         self._encoded_at_s = time.monotonic()
         try:
             self.encoded, self.fault = pending[2](), ""
-        except ValueError as error:  # damaged on its way here: the last good one stays
+        except ValueError as error:  # damaged bytes
             self.fault = str(error)
         self.number, self.received_s = pending[:2]
 
     def metadata(self) -> dict[str, Any] | None:
-        """What the page needs to know to show it; None before the first."""
+        """Return the image's number and metadata for its event; None before the first image."""
         if self.encoded is None:
             return None
         return {"number": self.number, **self.encoded.metadata}
@@ -73,10 +78,10 @@ def encode_camera_image(
     step_bytes: int,
     widest_px: int,
 ) -> EncodedImage:
-    """A camera's picture, at most so wide. A JPEG that is small enough passes as it is.
+    """Return a camera image as JPEG, at most `widest_px` wide. A JPEG within this width is passed unchanged.
 
     Raises:
-        ValueError: its bytes are no such picture.
+        ValueError: the bytes cannot be decoded.
     """
     if encoding == "jpeg" and size_px[0] <= widest_px:
         return EncodedImage(data.tobytes(), "image/jpeg", {})
@@ -87,7 +92,7 @@ def encode_depth(
     depth_m: np.ndarray,  # float32 [H, W], NaN = unknown
     widest_px: int,
 ) -> EncodedImage:
-    """Depth by colour, near ones red; what is unknown is black."""
+    """Return depth as a colour image: near is red, unknown is black."""
     stride = -(-depth_m.shape[1] // widest_px)
     small = depth_m[::stride, ::stride]
     near, far = _DEPTH_RANGE_M
@@ -103,16 +108,18 @@ def encode_grid(
     resolution_m: float,
     origin_m: np.ndarray,  # [2], corner of cell (0, 0)
 ) -> EncodedImage:
-    """The known part of the grid, its first row at the top; unknown cells are clear. `metadata` say where the
-    lower left corner lies (m), how large a cell is (m), and how many there are.
+    """Return the known part of an occupancy grid as PNG, its largest y at the top; unknown cells are
+    transparent.
+
+    `metadata`: lower left corner (m), cell size (m), width and height in cells.
 
     Raises:
-        ValueError: nothing is known yet.
+        ValueError: no cell is known yet.
     """
     known = occupancy >= 0
     rows, columns = np.flatnonzero(known.any(axis=1)), np.flatnonzero(known.any(axis=0))
     if not len(rows):
-        raise ValueError("nothing of the map is known yet")
+        raise ValueError("no cell of the map is known yet")
     rows, columns = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
     part = occupancy[rows, columns][::-1].astype(np.float32)
     grey = np.clip(_FREE + (_OCCUPIED - _FREE) * part / 100.0, 0, 255).astype(np.uint8)

@@ -1,5 +1,7 @@
-"""A page for any browser, phones included, that shows the running system. It only listens, but for the
-commands of who has the token; nobody ever waits for it."""
+"""The page node: a web page for any browser that shows the running system.
+
+It publishes nothing. Users with the token can restart and swap nodes. No publisher ever waits for it.
+"""
 
 from __future__ import annotations
 
@@ -37,7 +39,7 @@ from beamsplat.services.page.view import PageState
 log = logging.getLogger(__name__)
 
 _MIN_TOKEN_CHARS = 12
-# Command -> what the node's supervisor is asked, and for how long. A swap's successor may load a model.
+# Command of the page -> query to the node, and its timeout (s). The successor of a swap may load a model.
 _COMMANDS = {
     "restart": ("restart", 10.0), "params": ("params", 10.0),
     "swap": ("swap", 150.0), "cold swap": ("swap", 150.0),
@@ -46,30 +48,36 @@ Hz = Annotated[float, Field(gt=0.0, le=30.0)]
 
 
 class PageConfig(NodeConfig):
-    """Where the page is, and who may command. `bind = "0.0.0.0"` shows it to everybody who reaches this
-    machine; without a certificate pictures and token go over the network as they are."""
+    """Options of the page.
+
+    With `bind = "0.0.0.0"` anyone who can reach this machine can open the page. Without a certificate,
+    images and
+    token are sent unencrypted.
+    """
 
     bind: str = "127.0.0.1"
     port: Annotated[int, Field(ge=0, le=65535)] = 8420  # 0 = any free one
-    names: tuple[str, ...] = ()  # by which browsers ask for this machine, besides address and host name
-    token: SecretStr = SecretStr("")  # who has it may command; "" = nobody may
-    certificate: Path | None = None  # PEM; then the page is https
+    names: tuple[str, ...] = ()  # host names of this machine in addresses, besides its own host name
+    token: SecretStr = SecretStr("")  # required for commands; "": commands are disabled
+    certificate: Path | None = None  # PEM; with it the page uses https
     certificate_key: Path | None = None
     picture_hz: Hz = 2.0
     map_hz: Hz = 0.5
     robot_hz: Hz = 5.0
-    widest_px: Annotated[int, Field(ge=64, le=4096)] = 640  # pictures are narrowed to it
+    widest_px: Annotated[int, Field(ge=64, le=4096)] = 640  # wider images are scaled down
 
     @field_validator("token")
     @classmethod
     def _long_enough(cls, token: SecretStr) -> SecretStr:
         if 0 < len(token.get_secret_value()) < _MIN_TOKEN_CHARS:
-            raise ValueError(f"a token needs at least {_MIN_TOKEN_CHARS} characters, or none")
+            raise ValueError(
+                f"a token needs at least {_MIN_TOKEN_CHARS} characters; an empty one disables commands"
+            )
         return token
 
 
 class PageNode(Node):
-    """Keeps the newest of everything for the page."""
+    """Keeps the newest of all inputs for the page, and forwards commands."""
 
     name = "page"
     Config = PageConfig
@@ -105,8 +113,8 @@ class PageNode(Node):
             port = self._server.start(c.bind, c.port, tls)
         except OSError as error:
             raise UserError(
-                f"page: cannot listen at {c.bind}:{c.port} ({error.strerror}): choose another with "
-                "--set page.port=PORT (0 = any free one)"
+                f"page: cannot listen at {c.bind}:{c.port} ({error.strerror}): choose another port with "
+                "--set page.port=PORT (0: any free port)"
             ) from error
         host = "127.0.0.1" if c.bind in ("0.0.0.0", "::") else c.bind
         self._address = f"{'https' if tls else 'http'}://{f'[{host}]' if ':' in host else host}:{port}/"
@@ -118,17 +126,17 @@ class PageNode(Node):
             self._server.close()
 
     def _command(self, action: str, node: str, parameters: dict[str, str]) -> str:
-        """Carries out what somebody with the right asks for, in a thread of the server.
+        """Carry out a command of an authorized user; called from a thread of the server.
 
         Raises:
-            ValueError: there is no such command or node, or it was rejected.
+            ValueError: unknown command or node, or the node rejects it.
         """
         if action == "check":
-            return "the token is right"
+            return "the token is correct"
         if action not in _COMMANDS or not node.replace("_", "").replace("-", "").isalnum():
-            raise ValueError(f"there is no command {action!r} for {node!r}; there are {', '.join(_COMMANDS)}")
+            raise ValueError(f"no command {action!r} for node {node!r}; commands: {', '.join(_COMMANDS)}")
         if self._ask is None:
-            raise ValueError("no bus: nobody can be asked")
+            raise ValueError("no bus: commands are not possible")
         verb, timeout_s = _COMMANDS[action]
         parameters_sent = {}
         if verb == "swap":
@@ -138,10 +146,10 @@ class PageNode(Node):
                 **({"cold": "1"} if action == "cold swap" else {}),
             }
         if verb != "params":
-            log.info("%s %s, by command of the page", action, node)
+            log.info("%s %s, commanded by the page", action, node)
         return " ".join(answer.text for answer in self._ask(node, verb, parameters_sent, timeout_s))
 
-    # --- what is shown ---
+    # --- inputs ---
 
     def on_health(self, health: Health) -> None:
         self._state.health(health)
@@ -221,7 +229,7 @@ def _tls(certificate: Path | None, key: Path | None) -> ssl.SSLContext | None:
         context.load_cert_chain(str(certificate), None if key is None else str(key))
     except (OSError, ssl.SSLError) as error:
         raise UserError(
-            f"page: certificate = {certificate}, certificate_key = {key}: cannot be used ({error}): "
-            "both are PEM files, made for each other"
+            f"page: certificate = {certificate}, certificate_key = {key} cannot be used ({error}): "
+            "both must be PEM files, and the key must belong to the certificate"
         ) from error
     return context

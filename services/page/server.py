@@ -1,13 +1,14 @@
-"""Serves the page, from a thread of its own: the node never waits for a browser.
+"""The page's HTTP server, in its own thread: the node never waits for a browser.
 
-GET /                     the page; its parts are /page.js, /page.css
-GET /events               server-sent events: status, scale, path, robot, picture (a newer one is there)
-GET /picture/NAME         the newest camera, depth, render or map
-GET /status               what the status event holds, for scripts
+GET /                     the page; its parts are /page.js, /page.css ...
+GET /events               server-sent events: status, scale, path, robot, picture (a newer image is available)
+GET /picture/NAME         the newest image: camera, depth, render or map
+GET /status               the data of the status event, for scripts
 POST /command             {"action": "restart", "node": "depth"}, with "Authorization: Bearer TOKEN";
-                          also params (its options); swap and "cold swap" take {"parameters": {OPTION: VALUE}}
+                          also params (returns the node's options); swap and "cold swap" take
+                          {"parameters": {OPTION: VALUE}}
 
-Everything is encoded once for all viewers. What a viewer has not taken yet is replaced by what is newer.
+Everything is encoded once for all pages. Events that a page has not received yet are replaced by newer ones.
 """
 
 from __future__ import annotations
@@ -49,24 +50,24 @@ _FILES = {
 }
 _MAX_CONNECTIONS = 128
 _SEND_BYTES = 64 * 1024
-_MAX_COMMANDS = 4  # at a time
-_SEND_TIMEOUT_S = 20.0  # a browser that takes nothing for so long is given up
-_WRONG_TOKEN_DELAY_S = 1.0  # a wrong token's answer takes its time
-_BUSY = (HTTPStatus.SERVICE_UNAVAILABLE, "too much at once: try again")
+_MAX_COMMANDS = 4  # at the same time
+_SEND_TIMEOUT_S = 20.0  # a connection that accepts no data for so long is closed
+_WRONG_TOKEN_DELAY_S = 1.0  # slows down guessing
+_BUSY = (HTTPStatus.SERVICE_UNAVAILABLE, "too many requests at the same time: try again")
 
-Command = Callable[[str, str, dict[str, str]], str]  # (action, node, parameters) -> what was done
+Command = Callable[[str, str, dict[str, str]], str]  # (action, node, parameters) -> result text
 
 
 @dataclass(frozen=True)
 class PageAccess:
-    """Who may do what, from where."""
+    """Access control of the page."""
 
-    token: str = ""  # for commands; "": nobody
-    names: frozenset[str] = frozenset()  # by which this machine is asked for, besides its own
+    token: str = ""  # for commands; "": commands are disabled
+    names: frozenset[str] = frozenset()  # accepted host names, besides the machine's own
 
 
 class PageServer:
-    """The page of one `PageState`. `start()`, then `close()`."""
+    """Serves one `PageState`: `start()`, then `close()`."""
 
     def __init__(self, state: PageState, command: Command, access: PageAccess, robot_hz: float) -> None:
         self._state = state
@@ -83,13 +84,13 @@ class PageServer:
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._loop.run_forever, name="page", daemon=True)
         self._server: asyncio.Server | None = None
-        self.rejected_commands = 0  # commands without the right
+        self.rejected_commands = 0  # commands with a wrong token
 
     def start(self, bind: str, port: int, tls: ssl.SSLContext | None) -> int:
-        """Listens; returns the port, a free one for 0.
+        """Listen; return the port (a free one for `port` 0).
 
         Raises:
-            OSError: the port is taken, or `bind` is no address of this machine.
+            OSError: the port is in use, or `bind` is no address of this machine.
         """
         self._thread.start()
         return asyncio.run_coroutine_threadsafe(self._open(bind, port, tls), self._loop).result()
@@ -101,12 +102,14 @@ class PageServer:
         return self._server.sockets[0].getsockname()[1]
 
     def check(self) -> None:
-        """Raises what has ended the events, if anything has: a page that stands still helps nobody."""
+        """Raise the exception that ended the event task, if any: the page would show outdated data for
+        ever.
+        """
         if self._publishing.done() and not self._publishing.cancelled():
             self._publishing.result()
 
     def close(self) -> None:
-        """Ends all connections and the thread."""
+        """Close all connections and end the thread."""
         if self._thread.is_alive():
             asyncio.run_coroutine_threadsafe(self._close_all(), self._loop).result()
             self._loop.call_soon_threadsafe(self._loop.stop)
@@ -115,7 +118,7 @@ class PageServer:
         self._command_executor.shutdown(wait=False, cancel_futures=True)
 
     async def _close_all(self) -> None:
-        if self._server is None:  # it could not listen
+        if self._server is None:  # start() failed
             return
         self._server.close()
         ending = {self._publishing, *self._connections}
@@ -123,10 +126,10 @@ class PageServer:
             task.cancel()
         await asyncio.gather(*ending, return_exceptions=True)
 
-    # --- what goes to all ---
+    # --- events to all pages ---
 
     async def _publish_periodically(self) -> None:
-        """The robot at `robot_hz`, the rest once a second; nothing is made while nobody looks."""
+        """Publish the robot at `robot_hz` and the rest once per second, while a page is open."""
         beat = 0
         while True:
             await asyncio.sleep(1.0 / self._robot_hz)
@@ -153,7 +156,7 @@ class PageServer:
         return {**self._state.status(), "page": facts}
 
     async def _encode_if_due(self, name: str) -> None:
-        """Encodes a picture if it is due; who comes meanwhile waits for the same one."""
+        """Encode an image if it is due; concurrent callers wait for the same encoding."""
         image = self._state.images[name]
         async with self._encode_locks[name]:
             if not image.due():
@@ -170,7 +173,7 @@ class PageServer:
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         task = asyncio.current_task()
         self._connections.add(task)
-        # What the system's small buffer does not take waits here, where newer things can replace it.
+        # A small socket buffer keeps events in our queue, where newer ones can replace them.
         writer.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BYTES)
         writer.transport.set_write_buffer_limits(high=0)
         try:
@@ -194,7 +197,7 @@ class PageServer:
         if len(self._connections) > _MAX_CONNECTIONS:
             raise HttpError(*_BUSY)
         if not is_own_host(request.headers.get("host", ""), self._names):
-            raise HttpError(HTTPStatus.MISDIRECTED_REQUEST, "not a name of this machine (option `names`)")
+            raise HttpError(HTTPStatus.MISDIRECTED_REQUEST, "unknown host name: add it to the option `names`")
 
     async def _stream(self, request: HttpRequest, writer: asyncio.StreamWriter) -> None:
         self._check_host(request)
@@ -215,7 +218,7 @@ class PageServer:
             if request.path == "/command":
                 return _json_response(await self._run_command(request))
             if request.method != "GET":
-                raise HttpError(HTTPStatus.METHOD_NOT_ALLOWED, "only GET here")
+                raise HttpError(HTTPStatus.METHOD_NOT_ALLOWED, "only GET is allowed")
             if request.path == "/status":
                 return _json_response(self._status())
             if request.path in self._files:
@@ -228,7 +231,7 @@ class PageServer:
     async def _image_response(self, path: str) -> bytes:
         name = path.removeprefix("/picture/")
         if name not in self._state.images or not path.startswith("/picture/"):
-            raise HttpError(HTTPStatus.NOT_FOUND, "nothing here")
+            raise HttpError(HTTPStatus.NOT_FOUND, "not found")
         await self._encode_if_due(name)
         encoded = self._state.images[name].encoded
         if encoded is None:
@@ -238,16 +241,18 @@ class PageServer:
     # --- commands ---
 
     async def _run_command(self, request: HttpRequest) -> dict[str, str]:
-        """Carries out a command of somebody who may give it."""
+        """Carry out a command of an authorized user."""
         if request.method != "POST":
-            raise HttpError(HTTPStatus.METHOD_NOT_ALLOWED, "commands are given by POST")
+            raise HttpError(HTTPStatus.METHOD_NOT_ALLOWED, "commands need POST")
         await self._check_token(request)
         try:
             command = json.loads(request.body)
             action, node = str(command["action"]), str(command.get("node", ""))
             parameters = {str(k): str(v) for k, v in command.get("parameters", {}).items()}
         except (ValueError, KeyError, TypeError, AttributeError) as error:
-            raise HttpError(HTTPStatus.BAD_REQUEST, 'no command: {"action": ..., "node": ...}') from error
+            raise HttpError(
+                HTTPStatus.BAD_REQUEST, 'not a command: send {"action": ..., "node": ...}'
+            ) from error
         if self._commands >= _MAX_COMMANDS:
             raise HttpError(*_BUSY)
         self._commands += 1
@@ -263,14 +268,12 @@ class PageServer:
 
     async def _check_token(self, request: HttpRequest) -> None:
         if not self._access.token:
-            raise HttpError(
-                HTTPStatus.FORBIDDEN, "this page takes no commands: it has no token in its options"
-            )
+            raise HttpError(HTTPStatus.FORBIDDEN, "commands are disabled: the page's option `token` is empty")
         given = request.headers.get("authorization", "").removeprefix("Bearer ")
         if not hmac.compare_digest(given.encode(), self._access.token.encode()):
             self.rejected_commands += 1
             await asyncio.sleep(_WRONG_TOKEN_DELAY_S)
-            raise HttpError(HTTPStatus.UNAUTHORIZED, "not the token that this page's options hold")
+            raise HttpError(HTTPStatus.UNAUTHORIZED, "wrong token: see the page's option `token`")
 
 
 async def _send(writer: asyncio.StreamWriter, data: bytes) -> None:

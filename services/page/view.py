@@ -1,6 +1,6 @@
-"""What the page knows of the running system, as the JSON that goes to browsers.
+"""The state of the running system as the page shows it, as JSON.
 
-The node's thread tells; the server's thread asks.
+The node's thread writes it, the server's thread reads it.
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ from beamsplat.common.geometry.transforms import transform_points, yaw_of
 from beamsplat.common.runtime.health import HealthRecords, NodeRecord
 from beamsplat.services.page.images import LatestImage
 
-# Who is believed about the robot's pose, best first.
+# Sources of the robot's pose, best first; the best available one is shown.
 SOURCES = ("localization", "external", "wheel")
 IMAGE_NAMES = ("camera", "depth", "render", "map")
 _PATH_POINTS, _PATH_STEP_M = 400, 0.05
-_SCAN_POINTS = 360
-_MAX_WAITING_SCANS = 30  # wait for the pose of their time
-_MAX_SCALES = 120  # seconds of the chart
+_SCAN_POINTS = 360  # of a scan that are sent at most
+_MAX_WAITING_SCANS = 30  # scans kept until their pose is known
+_MAX_SCALES = 120  # seconds of the scale chart: one value per second
 _LOG_LINES = 60
 
 
 class PageState:
-    """The newest of everything; every method may be called from any thread."""
+    """The newest of all inputs; every method may be called from any thread."""
 
     def __init__(self, picture_hz: float, map_hz: float) -> None:
         self._lock = threading.Lock()
@@ -41,28 +41,28 @@ class PageState:
         self._T_body_lidar = np.eye(4)
         self._T_map_odom = np.eye(4)
         self._source_rank = len(SOURCES)
-        self._poses = PoseBuffer()  # of the leader, in the map
+        self._poses = PoseBuffer()  # T_map_body of the best source
         self._received_s = 0.0
         self._path = BoundedPath(_PATH_POINTS, _PATH_STEP_M)
         self._scans: deque[tuple[int, np.ndarray]] = deque(maxlen=_MAX_WAITING_SCANS)
         self.images = {name: LatestImage(map_hz if name == "map" else picture_hz) for name in IMAGE_NAMES}
 
-    # --- told by the node ---
+    # --- written by the node ---
 
     def health(self, health: Any) -> None:
-        """What a node says of itself (a `Health`)."""
+        """Store the health of a node (a `Health`); log changes of state and restarts."""
         with self._lock:
             before = self._health.records.get(health.node)
             instance, state = (before.health.instance, before.health.state) if before else ("", "")
             self._health.add(health)
             self._silent_nodes.discard(health.node)
             if before and instance != health.instance:
-                self._log_event(f"{health.node} was started again")
+                self._log_event(f"{health.node} was restarted")
             if state != health.state:
                 self._log_event(f"{health.node} is {health.state}")
 
     def service_status(self, subject: str, status: str, **facts: Any) -> None:
-        """What a service says of its newest result; a change is logged."""
+        """Store the status of a service's newest result; log a change."""
         with self._lock:
             before = self._services.get(subject, {}).get("status")
             self._services[subject] = {"status": status, "at": time.monotonic(), **facts}
@@ -70,23 +70,27 @@ class PageState:
                 self._log_event(f"{subject}: {status}")
 
     def scale(self, value: float, sigma: float) -> None:
-        """The depth's scale with its standard error; one a second is kept."""
+        """Store the depth scale and its standard error; at most one value per second is kept."""
         now = time.monotonic()
         with self._lock:
             if math.isfinite(value) and (not self._scales or now - self._scales[-1][0] >= 1.0):
                 self._scales.append((now, value, sigma))
 
     def lidar(self, T_body_lidar: np.ndarray) -> None:
-        """Where the lidar sits: [4, 4]."""
+        """Set the lidar's mount T_body_lidar [4, 4]."""
         self._T_body_lidar = T_body_lidar
 
     def correction(self, T_map_odom: np.ndarray) -> None:
-        """Where the smooth frame lies in the map: [4, 4]."""
+        """Set T_map_odom [4, 4]."""
         self._T_map_odom = T_map_odom
 
     def pose(self, source: str, stamp_ns: int, T_source_body: np.ndarray) -> None:
-        """The robot's pose [4, 4] by one of `SOURCES`: localization in odom, external in map, wheels in their
-        own frame, which stands for the map where nobody else knows. A worse source's says nothing then."""
+        """Store the robot's pose [4, 4] by one of `SOURCES`; poses of a worse source than the best are
+        ignored.
+
+        Localization is in odom, external in map; the wheels' own frame is taken as map while no better
+        source exists.
+        """
         rank = SOURCES.index(source)
         with self._lock:
             if rank > self._source_rank:
@@ -106,14 +110,14 @@ class PageState:
         angle_increment_rad: float,
         range_limits_m: tuple[float, float],
     ) -> None:
-        """A sweep of the lidar: laid on the map where the robot was then, as soon as that is known."""
+        """Store a scan; it is drawn in the map when the pose of its time is known."""
         points, _ = scan_points(ranges_m, angle_min_rad, angle_increment_rad, range_limits_m)
         points = points[:: max(-(-len(points) // _SCAN_POINTS), 1)]
         with self._lock:
             self._scans.append((stamp_ns, transform_points(self._T_body_lidar, points)))
 
     def _newest_scan_map_m(self) -> np.ndarray:
-        """The newest sweep [N, 3] whose pose is known."""
+        """Return the newest scan whose pose is known, points [N, 3] in the map."""
         newest_ns, _ = self._poses.newest
         for stamp_ns, points_body in reversed(self._scans):
             if stamp_ns <= newest_ns and (T_map_body := self._poses.at(stamp_ns)) is not None:
@@ -123,10 +127,10 @@ class PageState:
     def _log_event(self, text: str) -> None:
         self._log.append({"at": time.time(), "text": text})
 
-    # --- asked by the server ---
+    # --- read by the server ---
 
     def status(self) -> dict[str, Any]:
-        """Nodes, links, what the services say, and what has happened."""
+        """Return nodes, links, the services' status, images and log."""
         now = time.monotonic()
         with self._lock:
             for name, record in self._health.records.items():
@@ -149,13 +153,15 @@ class PageState:
             }
 
     def scales(self) -> list[list[float | None]]:
-        """[[age s, scale, standard error], ...], oldest first."""
+        """Return [[age s, scale, standard error], ...], oldest first."""
         now = time.monotonic()
         with self._lock:
             return [[round(now - at, 1), _json_number(v, 5), _json_number(s, 5)] for at, v, s in self._scales]
 
     def robot(self) -> dict[str, Any] | None:
-        """Pose in the map, and the last sweep as x, y, x, y ... in cm; None before the first."""
+        """Return the pose in the map and the last scan as x, y, x, y ... in cm; None before the first
+        pose.
+        """
         with self._lock:
             if not self._poses:
                 return None
@@ -167,7 +173,7 @@ class PageState:
             }  # fmt: skip
 
     def path(self) -> list[int]:
-        """Where the robot has been: x, y, x, y ... in cm."""
+        """Return the robot's path as x, y, x, y ... in cm."""
         with self._lock:
             return _centimetres(self._path.points_m)
 
@@ -201,5 +207,5 @@ def _json_values(facts: dict[str, Any]) -> dict[str, Any]:
 
 
 def _json_number(value: float, digits: int) -> float | None:
-    """JSON knows neither NaN nor infinity."""
+    """Return a rounded number; None for NaN and infinity, which JSON does not have."""
     return round(value, digits) if math.isfinite(value) else None

@@ -1,5 +1,5 @@
 "use strict";
-// The map as seen from above: x to the right, y up, metres; drag, pinch, wheel and double-click move it.
+// The map seen from above: x to the right, y up, metres; drag, pinch, wheel and double-click change the view.
 class MapCanvas {
   constructor(canvas) {
     this.canvas = canvas;
@@ -7,7 +7,7 @@ class MapCanvas {
     this.robot = null;
     this.path = [];
     this.follow = false;
-    this.state = null; // {x, y: metres at the middle, scale: pixels a metre}; null: all of it
+    this.view = null; // {x, y: centre in metres, scale: pixels per metre}; null: show all
     this.fingers = new Map();
     this.due = false;
     new ResizeObserver(() => this.draw()).observe(canvas);
@@ -15,7 +15,7 @@ class MapCanvas {
     for (const end of ["pointerup", "pointercancel"]) canvas.addEventListener(end, (e) => this.fingers.delete(e.pointerId));
     canvas.addEventListener("pointermove", (e) => this.drag(e));
     canvas.addEventListener("wheel", (e) => { e.preventDefault(); this.zoom(Math.exp(-e.deltaY / 400), e.offsetX, e.offsetY); }, { passive: false });
-    canvas.addEventListener("dblclick", () => { this.state = null; this.draw(); });
+    canvas.addEventListener("dblclick", () => { this.view = null; this.draw(); });
   }
 
   drag(e) {

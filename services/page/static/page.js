@@ -5,7 +5,7 @@ const map = new MapCanvas($("map"));
 let token = sessionStorage.getItem("token") ?? "";
 let scales = [];
 
-// Everything from the system is put in as text: a node's words are never markup.
+// Everything from the system is inserted as text, never as markup.
 function cell(row, text, className) {
   const td = row.insertCell();
   td.textContent = text;
@@ -14,7 +14,7 @@ function cell(row, text, className) {
 }
 
 function stateClass(state) {
-  return { active: "good", drained: "good", silent: "bad" }[state] ?? "warn";
+  return { active: "good", drained: "good", silent: "bad" }[state] ?? "warn"; // silent: no health message
 }
 
 function showNodes(nodes) {
@@ -64,9 +64,9 @@ function showWords(words) {
   const lines = [];
   for (const [subject, w] of Object.entries(words)) {
     let text = w.status + (w.detail ? ` (${w.detail})` : "");
-    if (w.metric === false) text += ", unit of length unknown";
-    if (subject === "mapping") text += `; ${w.keyframes} keyframes, ${w.gaussians} Gaussians, ${fixed(w.psnr_db, 1)} dB, depth off by ${fixed(w.depth_error_m, 3)} m`;
-    if (subject === "fusion") text += `; ${fixed(100 * w.inlier_share, 0)} % of the pairs fit, within ${fixed(w.residual_m, 3)} m`;
+    if (w.metric === false) text += ", scale unknown (not metric)";
+    if (subject === "mapping") text += `; ${w.keyframes} keyframes, ${w.gaussians} Gaussians, ${fixed(w.psnr_db, 1)} dB, depth error ${fixed(w.depth_error_m, 3)} m`;
+    if (subject === "fusion") text += `; ${fixed(100 * w.inlier_share, 0)} % of the lidar-depth pairs are inliers, residual ${fixed(w.residual_m, 3)} m`;
     lines.push([subject, `${text}, ${fixed(w.age_s, 0)} s ago`, w.status === "ok" ? "good" : "bad"]);
   }
   $("words").replaceChildren(...lines.flatMap(([subject, text, className]) => {
@@ -81,9 +81,9 @@ function showWords(words) {
 function showSummary(status) {
   const count = (test) => status.nodes.filter(test).length;
   const parts = [
-    [`${count((n) => n.state !== "silent")} of ${status.nodes.length} nodes there`, count((n) => n.state === "silent") ? "bad" : "good"],
-    [`${status.nodes.reduce((sum, n) => sum + n.lost, 0)} lost`, status.nodes.some((n) => n.lost) ? "bad" : "good"],
-    [`${status.page.viewers} watching`, ""],
+    [`${count((n) => n.state !== "silent")} of ${status.nodes.length} nodes running`, count((n) => n.state === "silent") ? "bad" : "good"],
+    [`${status.nodes.reduce((sum, n) => sum + n.lost, 0)} messages lost`, status.nodes.some((n) => n.lost) ? "bad" : "good"],
+    [`pages open: ${status.page.viewers}`, ""],
   ];
   $("summary").replaceChildren(...parts.map(([text, className]) => {
     const li = document.createElement("li");
@@ -102,7 +102,7 @@ function showLog(log) {
 
 function offerNodes(names) {
   const select = $("node");
-  if ([...select.options].map((o) => o.value).join() === names.join()) return; // an open list stays open
+  if ([...select.options].map((o) => o.value).join() === names.join()) return; // do not close an open list
   const chosen = select.value;
   select.replaceChildren(...names.map((name) => new Option(name, name, false, name === chosen)));
 }
@@ -122,7 +122,7 @@ function showStatus(status) {
   offerNodes(status.nodes.map((n) => n.name));
 }
 
-// One picture at a time of each kind: a slow connection skips some, and never piles them up.
+// Load one image of each kind at a time: a slow connection skips images and never queues them.
 const loading = new Map();
 function fetchPicture(p) {
   if (loading.has(p.name)) { loading.set(p.name, p); return; }
@@ -203,7 +203,7 @@ $("orders").addEventListener("submit", (e) => {
   const node = $("node").value;
   if (confirm(`Restart ${node}?`)) command("restart", node).catch(failed);
 });
-// The options of a node as fields; what was changed goes to a successor, written as in a deployment (TOML).
+// The options of a node as fields; changed ones are sent to the successor, in the notation of a deployment (TOML).
 let shown = { node: "", values: {} };
 $("options").addEventListener("click", async () => {
   const node = $("node").value;
@@ -224,9 +224,9 @@ $("swap").addEventListener("submit", (e) => {
   e.preventDefault();
   const changed = [...$("fields").querySelectorAll("input")].filter((i) => i.value !== shown.values[i.name]).map((i) => [i.name, i.value]);
   const said = changed.map(([name, value]) => `${name} = ${value}`).join(", ");
-  if (!said) { $("answer").textContent = "nothing was changed"; return; }
+  if (!said) { $("answer").textContent = "no option was changed"; return; }
   if (!confirm(`Swap ${shown.node}: ${said}?`)) return;
-  $("answer").textContent = "the successor gets ready ...";
+  $("answer").textContent = "the successor is starting ...";
   command($("cold").checked ? "cold swap" : "swap", shown.node, Object.fromEntries(changed)).catch(failed);
   $("swap").hidden = true;
 });
@@ -241,7 +241,7 @@ function connection(text, className) {
 const events = new EventSource("events");
 const on = (kind, take) => events.addEventListener(kind, (e) => take(JSON.parse(e.data)));
 events.onopen = () => connection("connected", "good");
-events.onerror = () => connection("not connected", "bad"); // the browser tries again by itself
+events.onerror = () => connection("not connected", "bad"); // the browser reconnects by itself
 on("status", showStatus);
 on("scale", (data) => { scales = data; drawScales(); });
 on("path", (data) => { map.path = data; map.draw(); });

@@ -118,7 +118,7 @@ def test_a_lidar_that_falls_silent_is_opened_again(tmp_path):
     with EmulatedPort(device, path), RunningSource(node) as running:
         running.wait(lambda: len(running.messages) >= 2)
         device.silent = True
-        running.wait(lambda: "silent" in node.detail)
+        running.wait(lambda: "no data for 1 s" in node.detail)
 
 
 def test_the_baud_rate_is_found(tmp_path):

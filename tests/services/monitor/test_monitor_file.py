@@ -300,7 +300,7 @@ def test_health_becomes_curves_states_a_table_and_a_log(tmp_path, read_rrd):
     assert states == ["standby", "active", "active"]
     lines = [str(v.ravel()[0]) for v in saved.column("log", "TextLog:text")]
     assert lines == ["depth is standby", "depth is active", "depth: warm", "depth lost 3 messages",
-                     "depth was started again", "depth is active"]  # fmt: skip
+                     "depth was restarted", "depth is active"]  # fmt: skip
     assert "| **depth** | active |" in str(saved.column("health/table", "TextDocument:text")[-1])
 
 

@@ -106,7 +106,7 @@ def test_a_window_that_cannot_open_is_said_and_the_node_goes_on(monkeypatch, tmp
     monitor = MonitorNode(MonitorConfig(view="spawn", grpc_port=0, save=tmp_path / "a.rrd"))
     monitor.configure()
     deadline = time.monotonic() + 30.0
-    while "window has ended" not in monitor.writer.status and time.monotonic() < deadline:
+    while "window was closed" not in monitor.writer.status and time.monotonic() < deadline:
         time.sleep(0.1)
     assert "the data are still served" in monitor.writer.status
     monitor.panel.log("still here", None)

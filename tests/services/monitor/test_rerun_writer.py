@@ -92,7 +92,7 @@ def _draw_until_fault(writer, path="a"):
 def test_a_file_ends_whole_at_its_limit(tmp_path, read_rrd):
     writer = RerunWriter()
     path = writer.save(tmp_path / "sub" / "drive.rrd", layout(), limit_mb=0, keep_free_mb=0)
-    assert "complete at" in _draw_until_fault(writer)
+    assert "closed at" in _draw_until_fault(writer)
     writer.log("b", rr.TextDocument("more"))
     writer.close()
     assert read_rrd(path).entities == {"a"}
@@ -110,7 +110,7 @@ def test_a_file_that_vanishes_is_noticed(tmp_path):
     writer = RerunWriter()
     path = writer.save(tmp_path / "drive.rrd", layout(), limit_mb=100, keep_free_mb=0)
     path.unlink()
-    assert "the file is gone" in _draw_until_fault(writer)
+    assert "the file was removed" in _draw_until_fault(writer)
     writer.close()
 
 
@@ -150,5 +150,5 @@ def test_a_file_is_never_overwritten(tmp_path):
 
 def test_a_folder_that_cannot_be_made_is_named(tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(RuntimeError, match="cannot make the folder"):
+    with pytest.raises(RuntimeError, match="cannot create the folder"):
         RerunWriter().save(tmp_path / "file" / "drive.rrd", layout(), limit_mb=1, keep_free_mb=0)

@@ -233,7 +233,7 @@ def test_the_map_is_cut_to_what_is_known():
     assert (pixels[-1, :, 0] == 20).all()
     assert (pixels[:-1, :, 0] == 235).all()
     assert (pixels[..., 3] == 255).all()
-    with pytest.raises(ValueError, match="nothing of the map"):
+    with pytest.raises(ValueError, match="no cell of the map"):
         encode_grid(np.full((3, 3), -1, np.int8), 0.1, np.zeros(2))
 
 
