@@ -22,8 +22,8 @@ SURE = 0.5  # confidence from which an answer is used
 def eval_relocalize(
     folder: Annotated[Path, typer.Argument(help="Folder written by `beamsplat slam`")],
     bag: Annotated[Path, typer.Argument(help="Bag or recording the scans are taken from")],
-    scans: Annotated[int, typer.Option(help="Scans drawn at random")] = 100,
-    seed: Annotated[int, typer.Option(help="Of the draw")] = 0,
+    scans: Annotated[int, typer.Option(min=1, help="Scans drawn at random")] = 100,
+    seed: Annotated[int, typer.Option(min=0, help="Of the draw")] = 0,
     as_json: JsonOption = False,
 ) -> None:
     """Single scans against a saved map, without any guess; right is within 0.10 m and 2 degrees.
@@ -39,12 +39,12 @@ def eval_relocalize(
     from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
     from beamsplat.services.localization.lidar2d.slam import LidarSlam
 
-    stamps_ns, T_map_body = poses_of(folder, "trajectory.tum")
+    stamps_ns, pose_map_body = poses_of(folder, "trajectory.tum")
     chosen = np.sort(np.random.default_rng(seed).choice(len(stamps_ns), min(scans, len(stamps_ns)), False))
     drawn, T_body_lidar = _scans_at(bag, {int(stamps_ns[i]) for i in chosen})
     slam = LidarSlam.load(folder / "state", LidarSlamSettings(), T_body_lidar, localize_only=True)
     started = time.perf_counter()
-    slam.world()
+    slam.global_map()
     load_s = time.perf_counter() - started
     rows = []
     for i in track(chosen, "relocalizing", console=console, transient=True):
@@ -56,16 +56,20 @@ def eval_relocalize(
             m.ranges_m, m.angle_min_rad, m.angle_increment_rad, m.range_min_m, m.range_max_m
         )
         rows.append(
-            (*_error(answer.T_map_body, T_map_body[i]), answer.confidence, time.perf_counter() - started)
+            (
+                *_error(answer.pose_map_body, pose_map_body[i]),
+                answer.confidence,
+                time.perf_counter() - started,
+            )
         )
     figures = _summary(np.array(rows)) | {"world_s": load_s}
     print(json.dumps(figures)) if as_json else print_figures(figures)
 
 
-def _error(T_map_body: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
+def _error(pose_map_body: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
     """Distance in metres and angle in degrees."""
-    away = float(np.hypot(*(T_map_body - truth)[:2]))
-    return away, math.degrees(abs(math.remainder(T_map_body[2] - truth[2], 2.0 * math.pi)))
+    away = float(np.hypot(*(pose_map_body - truth)[:2]))
+    return away, math.degrees(abs(math.remainder(pose_map_body[2] - truth[2], 2.0 * math.pi)))
 
 
 def _summary(rows: np.ndarray) -> dict[str, Any]:

@@ -10,6 +10,7 @@ import typer
 from rich.console import Console
 
 from beamsplat.common.errors import UserError
+from beamsplat.tools.cli.options import writable
 
 console = Console(stderr=True)
 app = typer.Typer(no_args_is_help=True, help="Saved maps: look into them, join, merge, prune.")
@@ -28,11 +29,11 @@ def info(session: SessionArgument, as_json: JsonOption = False) -> None:
     from beamsplat.common.mapfiles.session import SessionFolder
 
     folder = SessionFolder(session)
-    head, manifest = folder.head(), folder.manifest()
+    head, manifest = folder.header(), folder.manifest()
     edge: dict[str, Any] | None = None
     if manifest is not None:
         edge = {k: manifest[k] for k in ("keyframes", "gaussians", "anchors", "steps", "stamp_ns", "bytes")}
-        edge["keyframes_on_disk"] = len(folder.body_ids())
+        edge["keyframes_on_disk"] = len(folder.keyframe_ids())
         state = folder.read_state()
         edge["keyframes_newer"] = _newer(folder, state)
         edge["map_uuid"] = _map_uuid(state)
@@ -102,7 +103,7 @@ def join(
 def merge(
     first: Annotated[Path, typer.Argument(help="Session whose map frame stays")],
     second: Annotated[Path, typer.Argument(help="Session of another drive through the same place")],
-    out: Annotated[Path, typer.Option(help="Folder for the merged session; must not hold one")],
+    out: Annotated[Path, typer.Option(callback=writable, help="Folder for the merged session; must not hold one")],
     place: Annotated[
         str,
         typer.Option(
@@ -133,24 +134,24 @@ def merge(
         raise UserError(f"{out}: holds a session already; choose another folder")
     both = all((folder.robot / ROBOT_MANIFEST).is_file() for folder in (folder_a, folder_b))
     slams = [load_slam(folder.robot) for folder in (folder_a, folder_b)] if both else []
-    T_a_b = _placed(place) if place else _found(first, second, slams)
-    known = [*a["anchor_id"].tolist(), *(slams[0].back.submaps if slams else [])]
+    pose_a_b = _placed(place) if place else _found(first, second, slams)
+    known = [*a["anchor_id"].tolist(), *(slams[0].pose_graph.submaps if slams else [])]
     offset = max([*known, -1]) + 2  # -1 is the second's odom origin
-    arrays = merged(a, b, se2_to_se3(T_a_b), offset)
+    arrays = merged(a, b, se2_to_se3(pose_a_b), offset)
     target.create()
     target.lock()
     try:
         if slams:
             from beamsplat.services.localization.lidar2d.merge import merge_into
 
-            loops = merge_into(*slams, T_a_b, offset)
+            loops = merge_into(*slams, pose_a_b, offset)
             slams[0].save(target.robot)
             arrays = with_anchors(arrays, {id: se2_to_se3(pose) for id, pose in slams[0].anchors().items()})
             console.print(f"{loops} loop closures between the drives")
         held = set(arrays["keyframe_id"].tolist())
         for folder in (folder_a, folder_b):
-            for id in held.intersection(folder.body_ids()):
-                target.write_body(id, *folder.read_body(id))
+            for id in held.intersection(folder.keyframe_ids()):
+                target.write_keyframe(id, *folder.read_keyframe(id))
         before = arrays["store_params"].shape[1]
         arrays = once(
             target, arrays, offset, lambda views: track(views, "looking", console=console, transient=True)
@@ -187,7 +188,7 @@ def prune(
         before = _bytes(session)
         out = pruned(arrays, opacity, keyframes)
         _write(folder, out)
-        folder.remove_bodies(progress_of(out)["forgotten"])
+        folder.remove_keyframes(progress_of(out)["forgotten"])
     finally:
         folder.unlock()
     gaussians = [a["store_params"].shape[1] for a in (arrays, out)]
@@ -224,7 +225,7 @@ def _newer(folder: Any, arrays: dict[str, Any]) -> int:
     from beamsplat.common.mapfiles.state import progress_of
 
     known = {*arrays["extra_taken_id"].tolist(), *progress_of(arrays)["forgotten"]}
-    return len(set(folder.body_ids()) - known)
+    return len(set(folder.keyframe_ids()) - known)
 
 
 def _write(folder: Any, arrays: dict[str, Any]) -> None:
@@ -264,14 +265,14 @@ def _same_drive(session: Path, robot: Path, arrays: dict[str, Any], slam: Any) -
     before it had one, because the keyframes were not taken while those scans were."""
     import numpy as np
 
-    mine, its = _map_uuid(arrays), slam.back.uuid
+    mine, its = _map_uuid(arrays), slam.pose_graph.uuid
     if mine and its and mine != its:
         raise UserError(
             f"{robot}: is the robot's half of map {its}, but {session} hangs on map {mine}: it is of another "
             "drive. Give the state that localization.save wrote in the session's own drive, or use `merge`"
         )
 
-    scans_ns = np.array([node.stamp_ns for node in slam.back.nodes.values()])
+    scans_ns = np.array([node.stamp_ns for node in slam.pose_graph.nodes.values()])
     stamps_ns = arrays["extra_taken_stamp_ns"]
     if len(scans_ns) == 0 or len(stamps_ns) == 0:
         raise UserError(f"{robot if len(scans_ns) == 0 else session}: is empty; there is nothing to join")
@@ -299,13 +300,13 @@ def _found(first: Path, second: Path, slams: list[Any]) -> Any:
             f"{first} or {second} has no robot half to find the place with: join them first "
             "(`beamsplat session join`), or say where the second lies with --place X,Y,DEG"
         )
-    from beamsplat.services.localization.lidar2d.merge import find_overlap
+    from beamsplat.services.localization.lidar2d.merge import find_alignment
 
-    overlap = find_overlap(*slams)
-    if overlap is None:
+    alignment = find_alignment(*slams)
+    if alignment is None:
         raise UserError(
             f"the scans of {second} find no place in {first} that enough of them agree on: "
             "say where it lies with --place X,Y,DEG"
         )
-    console.print(f"{overlap.agreeing} of {overlap.asked} scans agree on where the second drive lies")
-    return overlap.T_a_b
+    console.print(f"{alignment.agreeing} of {alignment.queried} scans agree on where the second drive lies")
+    return alignment.pose_a_b

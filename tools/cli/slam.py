@@ -19,6 +19,7 @@ from rich.progress import (
 from rich.table import Table
 
 from beamsplat.common.errors import UserError
+from beamsplat.tools.cli.options import writable
 
 console = Console(stderr=True)
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the figures as one JSON object")]
@@ -26,7 +27,7 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Print the figures as o
 
 def slam(
     bag: Annotated[Path, typer.Argument(help="Bag, recording or folder with a 2D lidar")],
-    out: Annotated[Path, typer.Option(help="Folder for trajectory, map and state")],
+    out: Annotated[Path, typer.Option(callback=writable, help="Folder for trajectory, map and state")],
     no_odometry: Annotated[bool, typer.Option("--no-odometry", help="Use the scans alone")] = False,
     rig: Annotated[Path | None, typer.Option(help="Calibration file, where the bag has none")] = None,
     scan_topic: Annotated[str, typer.Option(help="Where the bag has several")] = "",
@@ -44,7 +45,7 @@ def slam(
 
         beamsplat slam drive/bag --out map2 --no-odometry --json
     """
-    from beamsplat.services.localization.lidar2d.drive import Drive, map_drive
+    from beamsplat.services.localization.lidar2d.offline_mapping import MeasurementLog, map_measurements
     from beamsplat.services.replay.options import SourceOptions
     from beamsplat.services.replay.source import open_source
 
@@ -66,8 +67,8 @@ def slam(
         )  # fmt: skip
         with bar:
             task = bar.add_task("mapping", total=source.expected())
-            drive = Drive(lidar.T_body_lidar, _measurements(source), lambda: bar.advance(task))
-            figures = map_drive(drive, out)
+            drive = MeasurementLog(lidar.T_body_lidar, _measurements(source), lambda: bar.advance(task))
+            figures = map_measurements(drive, out)
         for problem in source.problems:
             console.print(f"[yellow]{problem}[/]", highlight=False)
     finally:
@@ -134,24 +135,24 @@ def _against_relations(folder: Path, path: Path) -> dict[str, Any]:
 
     from beamsplat.services.localization.lidar2d.metrics import read_relations, relation_errors
 
-    stamps_ns, T_map_body = poses_of(folder, "trajectory.tum")
+    stamps_ns, pose_map_body = poses_of(folder, "trajectory.tum")
     relation_stamps_ns, relative = read_relations(path)
-    T_body_lidar = np.array(json.loads((folder / "figures.json").read_text())["T_body_lidar"])
-    return asdict(relation_errors(stamps_ns, T_map_body, relation_stamps_ns, relative, T_body_lidar))
+    pose_body_lidar = np.array(json.loads((folder / "figures.json").read_text())["T_body_lidar"])
+    return asdict(relation_errors(stamps_ns, pose_map_body, relation_stamps_ns, relative, pose_body_lidar))
 
 
 def _against_truth(folder: Path, path: Path) -> dict[str, Any]:
     from beamsplat.services.localization.lidar2d.metrics import interpolate_poses, trajectory_errors
 
     figures: dict[str, Any] = {}
-    true_stamps_ns, T_world_body = poses_of(path.parent, path.name)
+    true_stamps_ns, pose_world_body = poses_of(path.parent, path.name)
     for prefix, name in (("", "trajectory.tum"), ("online_", "online.tum")):
-        stamps_ns, T_map_body = poses_of(folder, name)
+        stamps_ns, pose_map_body = poses_of(folder, name)
         inside = (stamps_ns >= true_stamps_ns[0]) & (stamps_ns <= true_stamps_ns[-1])
         if not inside.any():
             raise UserError(f"{path}: no true pose within the time of {folder / name}")
-        truth = interpolate_poses(true_stamps_ns, T_world_body, stamps_ns[inside])
-        errors = trajectory_errors(T_map_body[inside], truth)
+        truth = interpolate_poses(true_stamps_ns, pose_world_body, stamps_ns[inside])
+        errors = trajectory_errors(pose_map_body[inside], truth)
         figures |= {
             f"{prefix}poses": errors.poses,
             f"{prefix}ate_first_pose_rmse_m": errors.ate_first_pose_rmse_m,

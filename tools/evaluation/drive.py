@@ -1,4 +1,4 @@
-"""A recorded drive as evaluation and calibration need it: pictures, scans, poses, rig."""
+"""A recorded drive as evaluation and calibration need it: images, scans, poses, calibration."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from beamsplat.common.errors import UserError
-from beamsplat.common.geometry.beams import NO_BEAMS, Beams, move_beams, scan_points
+from beamsplat.common.geometry.beams import NO_BEAMS, Beams, deskew_beams, scan_points
 from beamsplat.common.geometry.camera import Pinhole, Undistorter
 from beamsplat.common.geometry.sensor_history import TimedScan
 from beamsplat.common.geometry.trajectory import Trajectory, read_tum
@@ -19,18 +19,18 @@ from beamsplat.common.geometry.transforms import se3_to_se2, transform_points
 from beamsplat.services.replay.options import SourceOptions
 from beamsplat.services.replay.source import open_source
 
-_REACH_NS = 200_000_000  # poses are continued this far beyond the trajectory
+_MAX_EXTRAPOLATION_NS = 200_000_000  # poses are extrapolated this far beyond the trajectory
 
 
 @dataclass
-class Drive:
-    """Everything of a recording that depth needs; pictures stay compressed until asked for."""
+class RecordedDrive:
+    """A recording with the data that depth needs; images stay compressed until they are used."""
 
     path: Path
     camera: Pinhole
     T_body_camera: np.ndarray
     T_body_lidar: np.ndarray
-    images: list[Any]  # messages Image
+    images: list[Any]  # messages Image, by stamp
     scans: list[TimedScan]
     poses: Trajectory
     poses_name: str
@@ -42,76 +42,76 @@ class Drive:
 
     @property
     def planar(self) -> bool:
-        """Whether the body stays on a floor: height and tilt of all poses agree within 3 cm and 2 degrees."""
+        """Whether the body stays on a level floor: all poses within 3 cm of height and 2 degrees of tilt."""
         T = self.poses.T_a_b
         level = bool(np.all(T[:, 2, 2] > np.cos(np.radians(2.0))))
         return level and float(np.ptp(T[:, 2, 3])) < 0.03
 
     def pose(self, stamp_ns: int) -> np.ndarray | None:
-        """`T_map_body` at a stamp, None where no pose is near."""
-        return self.poses.at(stamp_ns, max_gap_ns=1_000_000_000, max_extrapolation_ns=_REACH_NS)
+        """Return `T_map_body` at a stamp; None if no pose is near."""
+        return self.poses.at(stamp_ns, max_gap_ns=1_000_000_000, max_extrapolation_ns=_MAX_EXTRAPOLATION_NS)
 
-    def picture(self, number: int) -> np.ndarray:
-        """uint8 [H, W, 3] RGB, undistorted.
+    def rgb(self, index: int) -> np.ndarray:
+        """Return image `index`, undistorted, RGB uint8 [H, W, 3].
 
         Raises:
-            UserError: it does not decode.
+            UserError: the image cannot be decoded.
         """
-        return self.undistort(decode_rgb(self.images[number], str(self.path)))
+        return self.undistort(decode_rgb(self.images[index], str(self.path)))
 
     def scan_near(self, stamp_ns: int) -> TimedScan | None:
-        """The scan whose middle is nearest in time, if within 0.15 s."""
+        """Return the scan whose middle is nearest in time; None if it is 0.15 s or more away."""
         if len(self.scans) == 0:
             return None
         i = int(np.argmin(np.abs(self._middles - stamp_ns)))
         return self.scans[i] if abs(int(self._middles[i]) - stamp_ns) < 150_000_000 else None
 
-    def beams(self, stamp_ns: int, without: np.ndarray | None = None) -> Beams:
-        """Beams of the nearest scan at the time of a picture; `without` bool [beams] are never seen."""
+    def beams_at(self, stamp_ns: int, excluded: np.ndarray | None = None) -> Beams:
+        """Return the beams of the nearest scan, moved to a stamp; beams in the mask `excluded` are left out."""
         scan = self.scan_near(stamp_ns)
-        return NO_BEAMS if scan is None else self.beams_of(scan, stamp_ns, without)
+        return NO_BEAMS if scan is None else self.beams_of(scan, stamp_ns, excluded)
 
-    def beams_of(self, scan: TimedScan, stamp_ns: int, without: np.ndarray | None = None) -> Beams:
-        """Beams of one scan moved to a time."""
+    def beams_of(self, scan: TimedScan, stamp_ns: int, excluded: np.ndarray | None = None) -> Beams:
+        """Return the beams of one scan, moved to a stamp; beams in the mask `excluded` bool [beams] are left out."""
         points, index = scan_points(
             scan.ranges_m, scan.angle_min_rad, scan.angle_increment_rad, scan.range_min_m, scan.range_max_m
         )
-        if without is not None:
-            keep = ~without[index]
+        if excluded is not None:
+            keep = ~excluded[index]
             points, index = points[keep], index[keep]
         first, last, then = self.pose(scan.stamp_ns), self.pose(scan.last_ns), self.pose(stamp_ns)
         if first is None or last is None or then is None:
             return NO_BEAMS
         fraction = index / max(len(scan.ranges_m) - 1, 1)
-        moved = move_beams(points, fraction, first, last, then, self.T_body_lidar)
+        moved = deskew_beams(points, fraction, first, last, then, self.T_body_lidar)
         return Beams(moved, index, np.full(len(index), 0.01))
 
-    def scan_in_map(self, scan: TimedScan, without: np.ndarray | None = None) -> np.ndarray:
-        """Returns [N, 3] of a scan in the map frame."""
+    def scan_in_map(self, scan: TimedScan, excluded: np.ndarray | None = None) -> np.ndarray:
+        """Return the points float64 [N, 3] of a scan in the map frame; none without a pose."""
         T_map_body = self.pose(scan.middle_ns)
         if T_map_body is None:
             return np.zeros((0, 3))
-        return transform_points(T_map_body, self.beams_of(scan, scan.middle_ns, without).points_body_m)
+        return transform_points(T_map_body, self.beams_of(scan, scan.middle_ns, excluded).points_body_m)
 
 
 def decode_rgb(image: Any, where: str) -> np.ndarray:
-    """uint8 [H, W, 3] of an Image message.
+    """Decode an Image message to RGB uint8 [H, W, 3]; `where` names its origin in errors.
 
     Raises:
-        UserError: the bytes are no such picture.
+        UserError: the bytes do not match the encoding.
     """
     data, h, w = image.data, image.height_px, image.width_px
     if image.encoding in ("jpeg", "png"):
         bgr = cv2.imdecode(data, cv2.IMREAD_COLOR)
         if bgr is None:
             raise UserError(
-                f"{where}: the picture at {image.stamp_ns} ns does not decode as {image.encoding}"
+                f"{where}: the image at {image.stamp_ns} ns cannot be decoded as {image.encoding}"
             )
         return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
     channels = {"rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4, "mono8": 1, "yuv422_yuy2": 2}[image.encoding]
     step = image.step_bytes or w * channels
     if len(data) < step * h:
-        raise UserError(f"{where}: the picture at {image.stamp_ns} ns is cut off")
+        raise UserError(f"{where}: the image at {image.stamp_ns} ns is truncated")
     raw = data[: step * h].reshape(h, step)[:, : w * channels].reshape(h, w, channels)
     codes = {
         "bgr8": cv2.COLOR_BGR2RGB, "rgba8": cv2.COLOR_RGBA2RGB, "bgra8": cv2.COLOR_BGRA2RGB,
@@ -120,12 +120,14 @@ def decode_rgb(image: Any, where: str) -> np.ndarray:
     return raw if image.encoding == "rgb8" else cv2.cvtColor(raw, codes[image.encoding])
 
 
-def open_drive(path: Path, poses: Path | None = None, rig: Path | None = None) -> Drive:
-    """Reads a recording (a bag, or a folder with bag/ in it). Poses: a TUM file of T_map_body, else the
-    recording's own /pose, else the lidar SLAM is run on it.
+def open_drive(path: Path, poses: Path | None = None, rig: Path | None = None) -> RecordedDrive:
+    """Open a recording: a bag, or a folder that contains bag/.
+
+    Poses are taken from the TUM file `poses` (T_map_body), else from the pose topic of the recording, else from
+    the lidar SLAM, which is run on it.
 
     Raises:
-        UserError: pictures, scans, calibration or poses are missing; says which.
+        UserError: images, scans, calibration or poses are missing.
     """
     source = open_source(path, SourceOptions(rig=rig, require=frozenset({"scan", "image"})))
     try:
@@ -146,7 +148,7 @@ def open_drive(path: Path, poses: Path | None = None, rig: Path | None = None) -
         source.close()
     calibration = found if hasattr(found.camera, "T_body_camera") else found.message(0, str(path))
     if calibration.camera is None or calibration.lidar is None:
-        raise UserError(f"{path}: the calibration of camera or lidar is missing; give --rig rig.toml")
+        raise UserError(f"{path}: the calibration of the camera or of the lidar is missing; add --rig rig.toml")
     if poses is not None:
         trajectory, name = read_tum(poses), str(poses)
     elif stamps:
@@ -157,14 +159,14 @@ def open_drive(path: Path, poses: Path | None = None, rig: Path | None = None) -
         trajectory, name = slam_poses(scans, wheels, calibration.lidar.T_body_lidar), "our SLAM"
     images.sort(key=lambda image: image.stamp_ns)
     scans.sort(key=lambda scan: scan.stamp_ns)
-    return Drive(
+    return RecordedDrive(
         Path(path), Pinhole.of(calibration.camera), calibration.camera.T_body_camera,
         calibration.lidar.T_body_lidar, images, scans, trajectory, name,
     )  # fmt: skip
 
 
 def has_poses(path: Path) -> bool:
-    """Whether poses are known: groundtruth.txt beside the bag, or a topic in it."""
+    """Return whether poses are known: groundtruth.txt beside the bag, or a pose topic in it."""
     if any((folder / "groundtruth.txt").is_file() for folder in (Path(path), Path(path).parent)):
         return True
     source = open_source(path, SourceOptions())
@@ -175,18 +177,17 @@ def has_poses(path: Path) -> bool:
 
 
 def slam_poses(scans: list[TimedScan], wheels: list[tuple], T_body_lidar: np.ndarray) -> Trajectory:
-    """`T_map_body` of every scan, by the lidar SLAM after its last optimisation.
+    """Return `T_map_body` at every scan, estimated by the lidar SLAM after its last optimisation.
 
     Args:
-        scans: in order of the recording.
-        wheels: ("odometry", stamp_ns, x_m, y_m, yaw_rad), in order too; may be empty.
+        scans: in the order of the recording.
+        wheels: ("odometry", stamp_ns, x_m, y_m, yaw_rad), in the order of the recording; may be empty.
         T_body_lidar: float64 [4, 4].
 
     Raises:
         UserError: there is no usable scan.
     """
-    from beamsplat.services.localization.lidar2d.drive import Drive as Measurements
-    from beamsplat.services.localization.lidar2d.drive import map_drive
+    from beamsplat.services.localization.lidar2d.offline_mapping import MeasurementLog, map_measurements
 
     measured = [
         ("scan", s.stamp_ns, s.ranges_m, s.angle_min_rad, s.angle_increment_rad, s.time_increment_s,
@@ -195,5 +196,5 @@ def slam_poses(scans: list[TimedScan], wheels: list[tuple], T_body_lidar: np.nda
     ]  # fmt: skip
     merged = sorted([*wheels, *measured], key=lambda measurement: measurement[1])
     with tempfile.TemporaryDirectory() as folder:
-        map_drive(Measurements(T_body_lidar, merged, lambda: None), Path(folder))
+        map_measurements(MeasurementLog(T_body_lidar, merged, lambda: None), Path(folder))
         return read_tum(Path(folder) / "trajectory.tum")

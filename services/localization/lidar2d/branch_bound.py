@@ -9,12 +9,12 @@ import numpy as np
 
 from beamsplat.common.compiled import kernel
 
-NEAR_CELLS = 3  # leaves this close are the same place
+SAME_POSE_CELLS = 3  # leaves this close are the same place
 LEVELS = 6  # the coarsest level looks at 2^5 search cells at once
 
 
 @dataclass(frozen=True)
-class Pyramid:
+class SearchPyramid:
     """Level h holds the maximum of the field over 2^h x 2^h search cells starting at each cell."""
 
     levels: np.ndarray  # uint8 [LEVELS, H, W], padded by 2^(LEVELS - 1) on all sides
@@ -43,8 +43,8 @@ def _fill(field: np.ndarray, shift_r: int, shift_c: int, levels: np.ndarray) -> 
                 )
 
 
-def build_pyramid(field: np.ndarray, row0: int, col0: int, cell_m: float) -> Pyramid:
-    """Pyramid of a likelihood field uint8 [H, W] whose first cell is (row0, col0); search cells are twice
+def build_pyramid(field: np.ndarray, row0: int, col0: int, cell_m: float) -> SearchPyramid:
+    """SearchPyramid of a likelihood field uint8 [H, W] whose first cell is (row0, col0); search cells are twice
     as large."""
     pad = 1 << (LEVELS - 1)
     r0, c0 = row0 >> 1, col0 >> 1
@@ -52,7 +52,7 @@ def build_pyramid(field: np.ndarray, row0: int, col0: int, cell_m: float) -> Pyr
     cols = ((col0 + field.shape[1]) >> 1) - c0 + 1
     levels = np.zeros((LEVELS, rows + 2 * pad, cols + 2 * pad), dtype=np.uint8)
     _fill(field, row0 - 2 * r0 + 2 * pad, col0 - 2 * c0 + 2 * pad, levels)
-    return Pyramid(levels, r0 - pad, c0 - pad, 2.0 * cell_m)
+    return SearchPyramid(levels, r0 - pad, c0 - pad, 2.0 * cell_m)
 
 
 @kernel
@@ -71,8 +71,8 @@ def _row_for(found: np.ndarray, count: int, score: float, yaw: int, dr: int, dc:
     this the hundred poses around the best would crowd out all other places."""
     for i in range(count):
         if (
-            abs(found[i, 2] - dr) <= NEAR_CELLS
-            and abs(found[i, 3] - dc) <= NEAR_CELLS
+            abs(found[i, 2] - dr) <= SAME_POSE_CELLS
+            and abs(found[i, 3] - dc) <= SAME_POSE_CELLS
             and abs(found[i, 1] - yaw) <= near_yaw
         ):
             return i if score > found[i, 0] else -1
@@ -169,8 +169,8 @@ def _search(
 
 def branch_and_bound(
     points: np.ndarray,  # float64 [K, >= 2] body frame
-    T_centre: np.ndarray,  # float64 [3] centre of the window, in the pyramid's frame
-    pyramid: Pyramid,
+    centre_pose: np.ndarray,  # float64 [3] centre of the window, in the pyramid's frame
+    pyramid: SearchPyramid,
     window_m: float,
     window_rad: float,
     min_score: float,
@@ -178,7 +178,7 @@ def branch_and_bound(
     max_found: int = 512,
     min_step_rad: float = math.radians(0.8),
 ) -> list[tuple[float, np.ndarray]]:
-    """Distinct poses (score, T_map_body), best first; empty if none reaches `min_score`."""
+    """Distinct poses (score, pose_map_body), best first; empty if none reaches `min_score`."""
     if len(points) == 0:
         return []
     reach = np.percentile(np.hypot(points[:, 0], points[:, 1]), 80)
@@ -187,12 +187,12 @@ def branch_and_bound(
     if window_rad >= math.pi - 1e-6:
         half = math.ceil(math.pi / step_rad)
         step_rad = math.pi / half
-    yaws = T_centre[2] + step_rad * np.arange(-half, half + 1)
+    yaws = centre_pose[2] + step_rad * np.arange(-half, half + 1)
     if window_rad >= math.pi - 1e-6:
         yaws = yaws[:-1]
     c, s = np.cos(yaws)[:, None], np.sin(yaws)[:, None]
-    x = T_centre[0] + c * points[:, 0] - s * points[:, 1]
-    y = T_centre[1] + s * points[:, 0] + c * points[:, 1]
+    x = centre_pose[0] + c * points[:, 0] - s * points[:, 1]
+    y = centre_pose[1] + s * points[:, 0] + c * points[:, 1]
     rows = np.floor(y / pyramid.cell_m).astype(np.int32) - pyramid.row0
     cols = np.floor(x / pyramid.cell_m).astype(np.int32) - pyramid.col0
     found = np.empty((max_found, 4))
@@ -203,12 +203,14 @@ def branch_and_bound(
     found = found[:count]
     best = []
     for score, a, dr, dc in found[np.argsort(-found[:, 0], kind="stable")]:
-        T = np.array([T_centre[0] + dc * pyramid.cell_m, T_centre[1] + dr * pyramid.cell_m, yaws[int(a)]])
+        pose = np.array(
+            [centre_pose[0] + dc * pyramid.cell_m, centre_pose[1] + dr * pyramid.cell_m, yaws[int(a)]]
+        )
         near = any(
-            math.hypot(T[0] - o[0], T[1] - o[1]) < 4 * pyramid.cell_m
-            and abs(math.remainder(T[2] - o[2], 2 * math.pi)) < max(4 * step_rad, 0.1)
+            math.hypot(pose[0] - o[0], pose[1] - o[1]) < 4 * pyramid.cell_m
+            and abs(math.remainder(pose[2] - o[2], 2 * math.pi)) < max(4 * step_rad, 0.1)
             for _, o in best
         )
         if not near and score >= keep * (best[0][0] if best else 0.0):
-            best.append((float(score), T))
+            best.append((float(score), pose))
     return best

@@ -13,7 +13,7 @@ from beamsplat.services.localization.lidar2d.surfel_map import MatchTables
 @kernel
 def correlate(
     points: np.ndarray,  # float64 [K, 2] body frame
-    T: np.ndarray,  # float64 [3] centre of the window
+    pose: np.ndarray,  # float64 [3] centre of the window
     field: np.ndarray,  # uint8 [H, W]
     row0: int,
     col0: int,
@@ -28,11 +28,11 @@ def correlate(
     n = points.shape[0]
     rows, cols = np.empty(n, dtype=np.int32), np.empty(n, dtype=np.int32)
     for a in range(2 * steps_yaw + 1):
-        yaw = T[2] + (a - steps_yaw) * step_yaw_rad
+        yaw = pose[2] + (a - steps_yaw) * step_yaw_rad
         c, s = math.cos(yaw), math.sin(yaw)
         for i in range(n):
-            rows[i] = math.floor((T[1] + s * points[i, 0] + c * points[i, 1]) / cell_m) - row0
-            cols[i] = math.floor((T[0] + c * points[i, 0] - s * points[i, 1]) / cell_m) - col0
+            rows[i] = math.floor((pose[1] + s * points[i, 0] + c * points[i, 1]) / cell_m) - row0
+            cols[i] = math.floor((pose[0] + c * points[i, 0] - s * points[i, 1]) / cell_m) - col0
         for iy in range(2 * steps_xy + 1):
             dr = (iy - steps_xy) * stride
             for ix in range(2 * steps_xy + 1):
@@ -47,7 +47,7 @@ def correlate(
 
 def search(
     points: np.ndarray,
-    T_centre: np.ndarray,
+    centre_pose: np.ndarray,
     tables: MatchTables,
     window_m: float,
     window_rad: float,
@@ -55,7 +55,7 @@ def search(
     candidates: int = 3,
     step_yaw_rad: float = math.radians(1.5),
 ) -> list[tuple[float, np.ndarray]]:
-    """The best distinct poses (score, T_map_body) of a window; the score falls with the squared distance
+    """The best distinct poses (score, pose_map_body) of a window; the score falls with the squared distance
     from the centre by `prior_weight` at its border."""
     stride = 2
     steps_xy = max(1, math.ceil(window_m / (stride * tables.cell_m)))
@@ -64,7 +64,7 @@ def search(
     scores = np.empty((2 * steps_yaw + 1, 2 * steps_xy + 1, 2 * steps_xy + 1), dtype=np.float32)
     correlate(
         subset,
-        T_centre,
+        centre_pose,
         tables.field,
         tables.row0,
         tables.col0,
@@ -81,14 +81,14 @@ def search(
     best = []
     for _ in range(candidates):
         a, iy, ix = np.unravel_index(int(np.argmax(ranked)), ranked.shape)
-        T = T_centre + np.array(
+        pose = centre_pose + np.array(
             [
                 (ix - steps_xy) * stride * tables.cell_m,
                 (iy - steps_xy) * stride * tables.cell_m,
                 (a - steps_yaw) * step_yaw_rad,
             ]
         )
-        best.append((float(scores[a, iy, ix]), T))
+        best.append((float(scores[a, iy, ix]), pose))
         ranked[max(a - 2, 0) : a + 3, max(iy - 1, 0) : iy + 2, max(ix - 1, 0) : ix + 2] = -np.inf
         if not np.isfinite(ranked).any():
             break

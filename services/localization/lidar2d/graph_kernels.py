@@ -11,12 +11,14 @@ from beamsplat.services.localization.lidar2d import se2
 
 
 @kernel
-def linearise(T_s: np.ndarray, T_n: np.ndarray, z: np.ndarray, e: np.ndarray, Js: np.ndarray) -> None:
+def linearise(
+    submap_poses: np.ndarray, node_poses: np.ndarray, z: np.ndarray, e: np.ndarray, Js: np.ndarray
+) -> None:
     """Residual [3] and its Jacobian by the submap [3, 3]; that by the node is the rotation R_s'."""
-    c, s = math.cos(T_s[2]), math.sin(T_s[2])
-    dx, dy = T_n[0] - T_s[0], T_n[1] - T_s[1]
+    c, s = math.cos(submap_poses[2]), math.sin(submap_poses[2])
+    dx, dy = node_poses[0] - submap_poses[0], node_poses[1] - submap_poses[1]
     lx, ly = c * dx + s * dy, -s * dx + c * dy
-    e[0], e[1], e[2] = lx - z[0], ly - z[1], se2.wrap(T_n[2] - T_s[2] - z[2])
+    e[0], e[1], e[2] = lx - z[0], ly - z[1], se2.wrap(node_poses[2] - submap_poses[2] - z[2])
     Js[0, 0], Js[0, 1], Js[0, 2] = -c, -s, ly
     Js[1, 0], Js[1, 1], Js[1, 2] = s, -c, -lx
     Js[2, 0], Js[2, 1], Js[2, 2] = 0.0, 0.0, -1.0
@@ -56,8 +58,8 @@ def reduce_nodes(
     robust: np.ndarray,
     first: np.ndarray,  # int64 [N + 1] edges of each node
     pair_of: np.ndarray,  # int64 [P] index of the block for each ordered pair of edges of each node
-    T_s: np.ndarray,
-    T_n: np.ndarray,
+    submap_poses: np.ndarray,
+    node_poses: np.ndarray,
     scale2: float,
     limit2: float,
     blocks: np.ndarray,  # out float64 [B, 3, 3]
@@ -79,14 +81,14 @@ def reduce_nodes(
         np.empty((3, 3)),
     )
     cost, p = 0.0, 0
-    for n in range(T_n.shape[0]):
+    for n in range(node_poses.shape[0]):
         lo, hi = first[n], first[n + 1]
         Hnn[:] = 0.0
         bn[n] = 0.0
         p0 = p
         for k in range(lo, hi):
             s = submap[k]
-            linearise(T_s[s], T_n[n], z[k], e, Js)
+            linearise(submap_poses[s], node_poses[n], z[k], e, Js)
             Jn[0, 0], Jn[0, 1], Jn[1, 0], Jn[1, 1], Jn[2, 2] = -Js[0, 0], -Js[0, 1], -Js[1, 0], -Js[1, 1], 1.0
             c2 = 0.0
             for i in range(3):
@@ -142,11 +144,11 @@ def substitute(
     Hnn_inv: np.ndarray,
     bn: np.ndarray,
     dx: np.ndarray,
-    T_s: np.ndarray,
-    T_n: np.ndarray,
+    submap_poses: np.ndarray,
+    node_poses: np.ndarray,
 ) -> None:
     b = np.empty(3)
-    for n in range(T_n.shape[0]):
+    for n in range(node_poses.shape[0]):
         if first[n] == first[n + 1]:
             continue
         b[:] = bn[n]
@@ -156,12 +158,12 @@ def substitute(
                     b[i] -= W[k, j, i] * dx[submap[k], j]
         for i in range(3):
             for j in range(3):
-                T_n[n, i] += Hnn_inv[n, i, j] * b[j]
-        T_n[n, 2] = se2.wrap(T_n[n, 2])
-    for s in range(T_s.shape[0]):
+                node_poses[n, i] += Hnn_inv[n, i, j] * b[j]
+        node_poses[n, 2] = se2.wrap(node_poses[n, 2])
+    for s in range(submap_poses.shape[0]):
         for i in range(3):
-            T_s[s, i] += dx[s, i]
-        T_s[s, 2] = se2.wrap(T_s[s, 2])
+            submap_poses[s, i] += dx[s, i]
+        submap_poses[s, 2] = se2.wrap(submap_poses[s, 2])
 
 
 @kernel

@@ -9,15 +9,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from beamsplat.services.localization.lidar2d import se2
+from beamsplat.services.localization.lidar2d.graph_optimisation import ConstraintArrays, optimise
 from beamsplat.services.localization.lidar2d.loops import (
     DriftModel,
-    Place,
-    close_narrow,
-    close_wide,
-    confirmed,
+    LoopCandidate,
+    match_globally,
+    match_locally,
+    verify_constraint,
 )
-from beamsplat.services.localization.lidar2d.nodes import Constraint, edges_of
-from beamsplat.services.localization.lidar2d.pose_graph import Edges, optimise
+from beamsplat.services.localization.lidar2d.pose_graph_data import Constraint, constraint_arrays
 from beamsplat.services.localization.lidar2d.refinement import refine_submaps
 from beamsplat.services.localization.lidar2d.segments import link_segment
 from beamsplat.services.localization.lidar2d.snapshot import Snapshot
@@ -33,15 +33,15 @@ class JobResult:
 
     number: int
     constraints: list[Constraint] | None  # None: as they were; else the whole new list up to the snapshot
-    known_constraints: int  # how many the snapshot had
-    T_map_submap: dict[int, np.ndarray]
-    T_map_node: dict[int, np.ndarray]
-    frozen: dict[int, FrozenMap]  # submaps that were drawn anew
+    snapshot_constraints: int  # how many the snapshot had
+    pose_map_submap: dict[int, np.ndarray]
+    pose_map_node: dict[int, np.ndarray]
+    frozen: dict[int, FrozenMap]  # submaps that were rebuilt anew
     still_pending: list[int]
-    tried: list[int]  # submaps that were searched widely
+    searched: list[int]  # submaps that were searched widely
     loops_found: int
     linked: bool  # the newest segment now hangs on the map
-    candidate: tuple[int, np.ndarray] | None  # keynode and T_map_node of an answer that waits for another
+    candidate: tuple[int, np.ndarray] | None  # keynode and pose_map_node of an answer that waits for another
 
 
 @dataclass(frozen=True)
@@ -57,47 +57,47 @@ def run_job(snapshot: Snapshot, refine_rounds: int = 0) -> JobResult:
     """Close loops, optimise; with `refine_rounds` also draw the submaps anew and measure every edge again."""
     submap_row = {s: i for i, s in enumerate(snapshot.submap_ids)}
     node_row = {n: i for i, n in enumerate(snapshot.node_ids)}
-    constraints, tried, frozen = list(snapshot.constraints), [], dict(snapshot.frozen)
-    edges = edges_of(constraints, submap_row, node_row)
-    T_s, T_n, link, candidate = snapshot.T_map_submap, snapshot.T_map_node, None, None
+    constraints, searched, frozen = list(snapshot.constraints), [], dict(snapshot.frozen)
+    edges = constraint_arrays(constraints, submap_row, node_row)
+    submap_poses, node_poses, link, candidate = snapshot.pose_map_submap, snapshot.pose_map_node, None, None
     if snapshot.unlinked_from is None:
-        found, tried, still = _close_loops(snapshot, edges, submap_row, node_row)
+        found, searched, still = _find_constraints(snapshot, edges, submap_row, node_row)
     else:
-        link, T_s, T_n, candidate = link_segment(snapshot)
-        found, tried, still = [] if link is None else [link], [], list(snapshot.pending)
+        link, submap_poses, node_poses, candidate = link_segment(snapshot)
+        found, searched, still = [] if link is None else [link], [], list(snapshot.pending)
     constraints += found
     fixed = [submap_row[i] for i in sorted(snapshot.fixed) if i in submap_row] or [0]
     if found:
-        edges = edges_of(constraints, submap_row, node_row)
+        edges = constraint_arrays(constraints, submap_row, node_row)
     # While driving the next job goes on where this one ends; the last one has to get there by itself.
     iterations = LAST_ITERATIONS if refine_rounds else ITERATIONS
-    solution = optimise(T_s, T_n, edges, fixed, iterations=iterations)
-    drawn: dict[int, FrozenMap] = {}
+    solution = optimise(submap_poses, node_poses, edges, fixed, iterations=iterations)
+    rebuilt: dict[int, FrozenMap] = {}
     for _ in range(refine_rounds):
-        drawn, constraints = refine_submaps(
+        rebuilt, constraints = refine_submaps(
             snapshot.settings,
             snapshot.nodes,
             snapshot.members,
             frozen,
             constraints,
-            dict(zip(snapshot.submap_ids, solution.T_map_submap)),
-            dict(zip(snapshot.node_ids, solution.T_map_node)),
+            dict(zip(snapshot.submap_ids, solution.pose_map_submap)),
+            dict(zip(snapshot.node_ids, solution.pose_map_node)),
         )
-        frozen.update(drawn)
-        edges = edges_of(constraints, submap_row, node_row)
+        frozen.update(rebuilt)
+        edges = constraint_arrays(constraints, submap_row, node_row)
         solution = optimise(
-            solution.T_map_submap, solution.T_map_node, edges, fixed, iterations=LAST_ITERATIONS
+            solution.pose_map_submap, solution.pose_map_node, edges, fixed, iterations=LAST_ITERATIONS
         )
     constraints = _without_outliers(constraints, solution.chi2, node_row)
     return JobResult(
         snapshot.number,
         constraints,
         len(snapshot.constraints),
-        dict(zip(snapshot.submap_ids, solution.T_map_submap)),
-        dict(zip(snapshot.node_ids, solution.T_map_node)),
-        drawn,
+        dict(zip(snapshot.submap_ids, solution.pose_map_submap)),
+        dict(zip(snapshot.node_ids, solution.pose_map_node)),
+        rebuilt,
         still,
-        tried,
+        searched,
         len(found),
         snapshot.unlinked_from is None or link is not None,
         candidate,
@@ -113,8 +113,8 @@ def _without_outliers(
     return [c for c, k in zip(constraints, keep) if k or not c.loop]
 
 
-def _close_loops(
-    snapshot: Snapshot, edges: Edges, submap_row: dict[int, int], node_row: dict[int, int]
+def _find_constraints(
+    snapshot: Snapshot, edges: ConstraintArrays, submap_row: dict[int, int], node_row: dict[int, int]
 ) -> tuple[list[Constraint], list[int], list[int]]:
     """New loop constraints, the submaps searched widely, and the nodes whose turn has not come."""
     s = snapshot.settings
@@ -122,74 +122,78 @@ def _close_loops(
         return [], [], list(snapshot.pending)
     drift = DriftModel(edges, len(snapshot.submap_ids), len(snapshot.node_ids), s)
     windows: dict[int, tuple[np.ndarray, np.ndarray]] = {}
-    turn = snapshot.pending[-3 * s.job_keynodes :]
-    still = snapshot.pending[: -3 * s.job_keynodes]
+    turn = snapshot.pending[-3 * s.job_nodes :]
+    still = snapshot.pending[: -3 * s.job_nodes]
     tasks = []
     for node_id in turn:
         own = sorted(set(_submaps_of(edges, node_row[node_id]).tolist()))
         if own[0] not in windows:
             windows[own[0]] = drift.windows(own[0])
-        places, unsure = _places(snapshot, edges, node_row[node_id], own, windows[own[0]])
-        tasks += [(place.submap, node_id, place) for place in places]
-        if unsure and not places:
+        candidates, uncertain = _loop_candidates(snapshot, edges, node_row[node_id], own, windows[own[0]])
+        tasks += [(candidate.submap, node_id, candidate) for candidate in candidates]
+        if uncertain and not candidates:
             still.append(node_id)
     # One submap after the other: their tables are large.
     closed = [
-        close_narrow(snapshot.nodes[node_id], place, snapshot.cache, s)
-        for _, node_id, place in sorted(tasks, key=lambda task: task[:2])
+        match_locally(snapshot.nodes[node_id], candidate, snapshot.cache, s)
+        for _, node_id, candidate in sorted(tasks, key=lambda task: task[:2])
     ]
     found = [c for c in closed if c is not None]
-    fresh = turn[-s.job_keynodes :]
-    wide, tried = _close_wide(snapshot, edges, node_row, fresh[len(fresh) // 2], windows, drift)
-    return found + wide, tried, sorted(still)[-2000:]
+    fresh = turn[-s.job_nodes :]
+    wide, searched = _find_global_constraints(
+        snapshot, edges, node_row, fresh[len(fresh) // 2], windows, drift
+    )
+    return found + wide, searched, sorted(still)[-2000:]
 
 
-def _submaps_of(edges: Edges, row: int) -> np.ndarray:
+def _submaps_of(edges: ConstraintArrays, row: int) -> np.ndarray:
     lo, hi = np.searchsorted(edges.node, [row, row + 1])
     return edges.submap[lo:hi][~edges.robust[lo:hi]]
 
 
-def _nearest_member(snapshot: Snapshot, edges: Edges, row: int) -> np.ndarray:
+def _nearest_member(snapshot: Snapshot, edges: ConstraintArrays, row: int) -> np.ndarray:
     """Distance (m) from a node to the nearest member of each submap, float64 [S]."""
-    away = np.hypot(*(snapshot.T_map_node[:, :2] - snapshot.T_map_node[row, :2]).T)
+    away = np.hypot(*(snapshot.pose_map_node[:, :2] - snapshot.pose_map_node[row, :2]).T)
     distance = np.full(len(snapshot.submap_ids), np.inf)
     inner = ~edges.robust
     np.minimum.at(distance, edges.submap[inner], away[edges.node[inner]])
     return distance
 
 
-def _places(
+def _loop_candidates(
     snapshot: Snapshot,
-    edges: Edges,
+    edges: ConstraintArrays,
     row: int,
     own: list[int],
     windows: tuple[np.ndarray, np.ndarray],
-) -> tuple[list[Place], bool]:
+) -> tuple[list[LoopCandidate], bool]:
     """Submaps of other passes right here, nearest first; the flag: some are too uncertain for that."""
     s = snapshot.settings
     distance = _nearest_member(snapshot, edges, row)
     distance[[k for o in own for k in range(o - 2, o + 3) if 0 <= k < len(distance)]] = np.inf
-    places, taken, unsure = [], [], False
+    candidates, taken, uncertain = [], [], False
     for k in np.argsort(distance, kind="stable"):
-        if distance[k] > s.loop_near_m or len(places) == s.loop_submaps:
+        if distance[k] > s.loop_distance_m or len(candidates) == s.max_loops_per_node:
             break
         submap_id = snapshot.submap_ids[k]
         if submap_id not in snapshot.frozen or any(abs(int(k) - t) <= 1 for t in taken):
             continue
-        if windows[0][k] > s.narrow_m or windows[1][k] > s.narrow_rad:
-            unsure = True
+        if windows[0][k] > s.local_window_m or windows[1][k] > s.local_window_rad:
+            uncertain = True
             continue
         taken.append(int(k))
-        T = se2.between(snapshot.T_map_submap[k], snapshot.T_map_node[row])
-        places.append(
-            Place(submap_id, snapshot.frozen[submap_id], T, float(windows[0][k]), float(windows[1][k]))
+        pose = se2.between(snapshot.pose_map_submap[k], snapshot.pose_map_node[row])
+        candidates.append(
+            LoopCandidate(
+                submap_id, snapshot.frozen[submap_id], pose, float(windows[0][k]), float(windows[1][k])
+            )
         )
-    return places, unsure
+    return candidates, uncertain
 
 
-def _close_wide(
+def _find_global_constraints(
     snapshot: Snapshot,
-    edges: Edges,
+    edges: ConstraintArrays,
     node_row: dict[int, int],
     centre: int,
     windows: dict[int, tuple[np.ndarray, np.ndarray]],
@@ -201,33 +205,37 @@ def _close_wide(
     window_m, window_rad = windows.setdefault(own[0], drift.windows(own[0]))
     distance = _nearest_member(snapshot, edges, row)
     distance[own] = np.inf
-    half = s.chunk_keynodes // 2
+    half = s.merged_scans // 2
     chunk = [snapshot.nodes[n] for n in snapshot.node_ids[max(0, row - half) : row + half + 1]]
     candidates = []
     for k in np.flatnonzero(np.isfinite(distance)):
         submap_id = snapshot.submap_ids[k]
-        narrow = window_m[k] <= s.narrow_m and window_rad[k] <= s.narrow_rad
-        if submap_id in snapshot.frozen and not narrow and distance[k] < s.loop_near_m + window_m[k]:
-            candidates.append((snapshot.tries.get(submap_id, 0), float(distance[k]), int(k)))
-    found, tried = [], []
-    for _, _, k in sorted(candidates)[: s.wide_searches]:
+        narrow = window_m[k] <= s.local_window_m and window_rad[k] <= s.local_window_rad
+        if submap_id in snapshot.frozen and not narrow and distance[k] < s.loop_distance_m + window_m[k]:
+            candidates.append((snapshot.search_counts.get(submap_id, 0), float(distance[k]), int(k)))
+    found, searched = [], []
+    for _, _, k in sorted(candidates)[: s.global_searches_per_job]:
         submap_id = snapshot.submap_ids[k]
-        T = se2.between(snapshot.T_map_submap[k], snapshot.T_map_node[row])
-        window = min(float(window_m[k]), s.wide_limit_m) if math.isfinite(window_m[k]) else s.wide_limit_m
+        pose = se2.between(snapshot.pose_map_submap[k], snapshot.pose_map_node[row])
+        window = (
+            min(float(window_m[k]), s.max_global_window_m)
+            if math.isfinite(window_m[k])
+            else s.max_global_window_m
+        )
         turn = min(float(window_rad[k]), math.pi) if math.isfinite(window_rad[k]) else math.pi
-        place = Place(submap_id, snapshot.frozen[submap_id], T, window, turn)
-        constraint = close_wide(snapshot.nodes[centre], chunk, place, snapshot.cache, s)
-        tried.append(submap_id)
-        if constraint is not None and confirmed(
+        candidate = LoopCandidate(submap_id, snapshot.frozen[submap_id], pose, window, turn)
+        constraint = match_globally(snapshot.nodes[centre], chunk, candidate, snapshot.cache, s)
+        searched.append(submap_id)
+        if constraint is not None and verify_constraint(
             constraint,
             snapshot.node_ids,
             snapshot.nodes,
             snapshot.members,
             snapshot.frozen,
-            dict(zip(snapshot.submap_ids, snapshot.T_map_submap)),
-            dict(zip(snapshot.node_ids, snapshot.T_map_node)),
+            dict(zip(snapshot.submap_ids, snapshot.pose_map_submap)),
+            dict(zip(snapshot.node_ids, snapshot.pose_map_node)),
             snapshot.cache,
             s,
         ):
             found.append(constraint)
-    return found, tried
+    return found, searched

@@ -67,14 +67,16 @@ def stamp_ns_of(seconds: str) -> int:
 
 def relation_errors(
     stamps_ns: np.ndarray,  # int64 [N], increasing
-    T_map_body: np.ndarray,  # float64 [N, 3]
+    pose_map_body: np.ndarray,  # float64 [N, 3]
     relation_stamps_ns: np.ndarray,  # int64 [R, 2]
     relations: np.ndarray,  # float64 [R, 3]
-    T_body_reference: np.ndarray | None = None,  # float64 [3], the frame the relations speak of
+    pose_body_reference: np.ndarray | None = None,  # float64 [3], the frame the relations speak of
     tolerance_ns: int = 1_000_000,
 ) -> RelationErrors:
     """Difference between estimated and given relative poses: length of its translation and absolute yaw."""
-    poses = T_map_body if T_body_reference is None else se2.compose_many(T_map_body, T_body_reference)
+    poses = (
+        pose_map_body if pose_body_reference is None else se2.compose_many(pose_map_body, pose_body_reference)
+    )
     index, ok = nearest_stamps(stamps_ns, relation_stamps_ns.ravel(), tolerance_ns)
     index, ok = index.reshape(-1, 2), ok.reshape(-1, 2).all(axis=1)
     if not ok.any():
@@ -94,20 +96,20 @@ def relation_errors(
 
 
 def trajectory_errors(
-    T_map_body: np.ndarray,  # float64 [N, 3], estimated
-    T_world_body: np.ndarray,  # float64 [N, 3], truth at the same stamps
+    pose_map_body: np.ndarray,  # float64 [N, 3], estimated
+    pose_world_body: np.ndarray,  # float64 [N, 3], truth at the same stamps
 ) -> TrajectoryErrors:
     """ATE aligned by the first pose only, ATE after the best rigid alignment, yaw RMSE."""
-    if T_map_body.shape != T_world_body.shape or len(T_map_body) == 0:
+    if pose_map_body.shape != pose_world_body.shape or len(pose_map_body) == 0:
         raise ValueError(
-            f"estimate {T_map_body.shape} and truth {T_world_body.shape} must be equal [N > 0, 3]"
+            f"estimate {pose_map_body.shape} and truth {pose_world_body.shape} must be equal [N > 0, 3]"
         )
-    T_world_map = se2.compose(T_world_body[0], se2.inverse(T_map_body[0]))
-    aligned = se2.compose_many(T_world_map, T_map_body)
-    first = np.hypot(*(aligned[:, :2] - T_world_body[:, :2]).T)
-    yaw = se2.wrap_many(aligned[:, 2] - T_world_body[:, 2])
-    best = se2.transform(rigid_alignment(T_map_body[:, :2], T_world_body[:, :2]), T_map_body[:, :2])
-    rigid = np.hypot(*(best - T_world_body[:, :2]).T)
+    pose_world_map = se2.compose(pose_world_body[0], se2.inverse(pose_map_body[0]))
+    aligned = se2.compose_many(pose_world_map, pose_map_body)
+    first = np.hypot(*(aligned[:, :2] - pose_world_body[:, :2]).T)
+    yaw = se2.wrap_many(aligned[:, 2] - pose_world_body[:, 2])
+    best = se2.transform(rigid_alignment(pose_map_body[:, :2], pose_world_body[:, :2]), pose_map_body[:, :2])
+    rigid = np.hypot(*(best - pose_world_body[:, :2]).T)
     return TrajectoryErrors(len(first), _rms(first), _rms(rigid), _rms(yaw))
 
 

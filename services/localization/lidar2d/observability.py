@@ -8,19 +8,21 @@ import math
 import numpy as np
 
 from beamsplat.common.compiled import kernel
-from beamsplat.services.localization.lidar2d.matching import Match, accumulate
+from beamsplat.services.localization.lidar2d.scan_matching import Match, accumulate
 from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
 from beamsplat.services.localization.lidar2d.surfel_map import MatchTables
 
 SHIFTS_M = np.array([-0.45, -0.3, -0.15, 0.15, 0.3, 0.45])
-TELLING = 0.10  # share of the returns that must disagree with a shift for its direction to be trusted
+MIN_DISAGREEMENT_RATIO = (
+    0.10  # share of the returns that must disagree with a shift for its direction to be trusted
+)
 
 
 @kernel
-def agreement_when_shifted(
+def weights_when_shifted(
     points: np.ndarray,
     origin: np.ndarray,
-    T: np.ndarray,
+    pose: np.ndarray,
     direction: np.ndarray,
     shifts_m: np.ndarray,
     nearest: np.ndarray,
@@ -36,12 +38,12 @@ def agreement_when_shifted(
     """Sum of weights at the match (returned) and at each shift along a direction (out float64 [K])."""
     H, g, moved = np.empty((3, 3)), np.empty(3), np.empty(3)
     here, _, _ = accumulate(
-        points, origin, T, nearest, means, omegas, views, row0, col0, cell_m, scale2, H, g
+        points, origin, pose, nearest, means, omegas, views, row0, col0, cell_m, scale2, H, g
     )
     for k in range(shifts_m.shape[0]):
-        moved[0] = T[0] + shifts_m[k] * direction[0]
-        moved[1] = T[1] + shifts_m[k] * direction[1]
-        moved[2] = T[2]
+        moved[0] = pose[0] + shifts_m[k] * direction[0]
+        moved[1] = pose[1] + shifts_m[k] * direction[1]
+        moved[2] = pose[2]
         out[k], _, _ = accumulate(
             points, origin, moved, nearest, means, omegas, views, row0, col0, cell_m, scale2, H, g
         )
@@ -60,7 +62,7 @@ def weak_direction(information: np.ndarray) -> np.ndarray:
 
 
 @dataclasses.dataclass(frozen=True)
-class Observed:
+class ObservedMatch:
     """A match and how far it can be trusted along its weak direction."""
 
     match: Match  # with the information that is left
@@ -68,23 +70,23 @@ class Observed:
     direction: np.ndarray  # float64 [2] unit vector, axes of the map
 
 
-def without_slip(
+def reduce_unobservable(
     points: np.ndarray,  # float64 [K, 5]
     origin: np.ndarray,
     match: Match,
     tables: MatchTables,
     settings: LidarSlamSettings,
-) -> Observed:
+) -> ObservedMatch:
     """Reduce the information along the weak direction to what shifting the scan tells."""
     direction = weak_direction(match.information)
     if len(points) == 0:
-        return Observed(match, 0.0, direction)
+        return ObservedMatch(match, 0.0, direction)
     sigma_m = math.hypot(settings.range_sigma_m, settings.map_sigma_m)
     shifted = np.empty(len(SHIFTS_M))
-    here = agreement_when_shifted(
+    here = weights_when_shifted(
         points,
         origin,
-        match.T_map_body,
+        match.pose_target_body,
         direction,
         SHIFTS_M,
         tables.nearest,
@@ -97,24 +99,24 @@ def without_slip(
         (settings.outlier_m / sigma_m) ** 2,
         shifted,
     )
-    known = max(match.known * len(points), 1.0)
-    trust = min(max((here - float(shifted.max())) / (TELLING * known), 0.0), 1.0)
+    known = max(match.overlap * len(points), 1.0)
+    trust = min(max((here - float(shifted.max())) / (MIN_DISAGREEMENT_RATIO * known), 0.0), 1.0)
     if trust >= 1.0:
-        return Observed(match, 1.0, direction)
+        return ObservedMatch(match, 1.0, direction)
     v = np.array([direction[0], direction[1], 0.0])
     along = match.information @ v
     reduced = match.information - (1.0 - trust**2) * np.outer(along, along) / max(float(v @ along), 1e-9)
-    return Observed(
-        dataclasses.replace(match, information=reduced, rigid=match.information), trust, direction
+    return ObservedMatch(
+        dataclasses.replace(match, information=reduced, full_information=match.information), trust, direction
     )
 
 
-def held_along(observed: Observed, T_guess: np.ndarray) -> Match:
+def keep_guess_if_unobservable(observed: ObservedMatch, guess_pose: np.ndarray) -> Match:
     """The match, except that it stays at the guess along a direction it knows nothing about."""
     match, v = observed.match, observed.direction
     if observed.trust >= 1.0:
         return match
-    back = (1.0 - observed.trust**2) * float((T_guess - match.T_map_body)[:2] @ v)
-    T = match.T_map_body.copy()
-    T[:2] += back * v
-    return dataclasses.replace(match, T_map_body=T)
+    back = (1.0 - observed.trust**2) * float((guess_pose - match.pose_target_body)[:2] @ v)
+    pose = match.pose_target_body.copy()
+    pose[:2] += back * v
+    return dataclasses.replace(match, pose_target_body=pose)

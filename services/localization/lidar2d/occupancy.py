@@ -34,7 +34,7 @@ def add_counts(
     row0: int,
     col0: int,
     cell_m: float,
-    T_submap_map: np.ndarray,  # float64 [3]
+    pose_submap_map: np.ndarray,  # float64 [3]
     origin_x: float,
     origin_y: float,
     resolution: float,
@@ -46,13 +46,13 @@ def add_counts(
     sum_misses: np.ndarray,  # in out float32 [H, W]
 ) -> None:
     """Each map cell asks the submap's cell at its centre (so that turning leaves no holes)."""
-    c, s = math.cos(T_submap_map[2]), math.sin(T_submap_map[2])
+    c, s = math.cos(pose_submap_map[2]), math.sin(pose_submap_map[2])
     for r in range(low_row, high_row):
         y = origin_y + (r + 0.5) * resolution
         for q in range(low_col, high_col):
             x = origin_x + (q + 0.5) * resolution
-            i = math.floor((T_submap_map[1] + s * x + c * y) / cell_m) - row0
-            j = math.floor((T_submap_map[0] + c * x - s * y) / cell_m) - col0
+            i = math.floor((pose_submap_map[1] + s * x + c * y) / cell_m) - row0
+            j = math.floor((pose_submap_map[0] + c * x - s * y) / cell_m) - col0
             if 0 <= i < hits.shape[0] and 0 <= j < hits.shape[1]:
                 sum_hits[r, q] += hits[i, j]
                 sum_misses[r, q] += misses[i, j]
@@ -67,17 +67,17 @@ class CountGrid:
     row0: int
     col0: int
     cell_m: float
-    T_map_submap: np.ndarray  # float64 [3]
+    pose_map_submap: np.ndarray  # float64 [3]
 
     def corners(self) -> np.ndarray:
         """Corners of what was seen in the map frame, float64 [4, 2]."""
         seen = (self.hits > 0) | (self.misses > 0)
         rows, cols = np.flatnonzero(seen.any(axis=1)), np.flatnonzero(seen.any(axis=0))
         if len(rows) == 0:
-            return se2.transform(self.T_map_submap, np.zeros((4, 2)))
+            return se2.transform(self.pose_map_submap, np.zeros((4, 2)))
         x = np.array([cols[0], cols[-1] + 1, cols[-1] + 1, cols[0]]) + self.col0
         y = np.array([rows[0], rows[0], rows[-1] + 1, rows[-1] + 1]) + self.row0
-        return se2.transform(self.T_map_submap, np.column_stack([x, y]) * self.cell_m)
+        return se2.transform(self.pose_map_submap, np.column_stack([x, y]) * self.cell_m)
 
 
 def render(grids: list[CountGrid], resolution_m: float) -> OccupancyGrid:
@@ -99,7 +99,7 @@ def render(grids: list[CountGrid], resolution_m: float) -> OccupancyGrid:
             grid.row0,
             grid.col0,
             grid.cell_m,
-            se2.inverse(grid.T_map_submap),
+            se2.inverse(grid.pose_map_submap),
             low[0],
             low[1],
             resolution_m,

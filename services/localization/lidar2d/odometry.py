@@ -11,7 +11,7 @@ from beamsplat.services.localization.lidar2d import se2
 
 NS = 1e-9
 BASELINE_NS = 80_000_000
-DELAYS_S = np.arange(-30, 31) * 0.01  # candidates for the delay of the odometry clock
+DELAY_CANDIDATES_S = np.arange(-30, 31) * 0.01  # candidates for the delay of the odometry clock
 
 
 @kernel
@@ -76,11 +76,13 @@ class OdometryBuffer:
         self._gap_ns = round(gap_s / NS)  # no learning over longer gaps
         self._bridge_ns = round(bridge_s / NS)  # wheels keep counting while messages are missing
         self.delay_ns = 0
-        self.refused = 0
-        self._delays_ns = np.round(DELAYS_S / NS).astype(np.int64)
-        self._cost = np.zeros(len(DELAYS_S))
+        self.rejected = 0
+        self._delays_ns = np.round(DELAY_CANDIDATES_S / NS).astype(np.int64)
+        self._cost = np.zeros(len(DELAY_CANDIDATES_S))
         self._weight = 0.0
-        self._turns: list[tuple[int, int, float]] = []  # matched turns waiting for odometry after them
+        self._pending_rotations: list[
+            tuple[int, int, float]
+        ] = []  # matched turns waiting for odometry after them
 
     @property
     def stamps_ns(self) -> np.ndarray:
@@ -98,7 +100,7 @@ class OdometryBuffer:
             if self._count and stamp_ns < self.stamps_ns[0] and all(math.isfinite(v) for v in values):
                 self._count = 0
             else:
-                self.refused += 1
+                self.rejected += 1
                 return False
         if self._count == 2 * self._capacity:
             self._stamps[: self._capacity] = self._stamps[self._capacity :]
@@ -120,13 +122,17 @@ class OdometryBuffer:
                 return None
         return se2.between(a, b)
 
-    def observe_turn(self, t0_ns: int, t1_ns: int, yaw_rad: float) -> None:
+    def observe_rotation(self, t0_ns: int, t1_ns: int, yaw_rad: float) -> None:
         """Learn the delay from a matched turn: the candidate whose turns differ least, robustly averaged."""
         if abs(yaw_rad) > 0.01 and t1_ns - t0_ns < self._gap_ns:
-            self._turns.append((t0_ns, t1_ns, yaw_rad))
+            self._pending_rotations.append((t0_ns, t1_ns, yaw_rad))
         horizon = int(self._delays_ns[-1])
-        while self._turns and self._count and self.stamps_ns[-1] >= self._turns[0][1] + horizon:
-            t0, t1, yaw = self._turns.pop(0)
+        while (
+            self._pending_rotations
+            and self._count
+            and self.stamps_ns[-1] >= self._pending_rotations[0][1] + horizon
+        ):
+            t0, t1, yaw = self._pending_rotations.pop(0)
             costs = np.empty(len(self._delays_ns))
             recent = max(0, self._count - 1024)
             if not delay_costs(
@@ -140,11 +146,11 @@ class OdometryBuffer:
                 costs,
             ):
                 continue
-            self._learn(costs / (costs + 0.02**2))
-        if len(self._turns) > 256:
-            del self._turns[:128]
+            self._update_delay(costs / (costs + 0.02**2))
+        if len(self._pending_rotations) > 256:
+            del self._pending_rotations[:128]
 
-    def _learn(self, costs: np.ndarray) -> None:
+    def _update_delay(self, costs: np.ndarray) -> None:
         self._cost = 0.998 * self._cost + costs
         self._weight = 0.998 * self._weight + 1.0
         if self._weight < 20.0:
@@ -156,38 +162,38 @@ class OdometryBuffer:
             self.delay_ns = int(self._delays_ns[best])
 
 
-class Predictor:
+class MotionErrorModel:
     """How wrong a source of motion has been lately; its prediction is weighted by that."""
 
     def __init__(
         self, base_m: float, per_m: float, per_s: float, base_rad: float, per_rad: float, rad_per_s: float
     ) -> None:
         self._base = (base_m, per_m, base_rad, per_rad)
-        self._blind = (per_s, rad_per_s)  # growth over a gap in the scans, not scaled by what was learnt
+        self._gap_growth = (per_s, rad_per_s)  # growth over a gap in the scans, not scaled by what was learnt
         self.scale2_m = self.scale2_rad = 1.0
 
     def sigmas(self, motion: np.ndarray, dt_s: float) -> tuple[float, float]:
         """Standard deviations (m, rad) of a predicted motion float64 [3]."""
         base_m, base_rad = self._unit(motion)
         gap_s = max(0.0, dt_s - 0.5)
-        sigma_m = base_m * math.sqrt(self.scale2_m) + self._blind[0] * gap_s
-        return sigma_m, base_rad * math.sqrt(self.scale2_rad) + self._blind[1] * gap_s
+        sigma_m = base_m * math.sqrt(self.scale2_m) + self._gap_growth[0] * gap_s
+        return sigma_m, base_rad * math.sqrt(self.scale2_rad) + self._gap_growth[1] * gap_s
 
     def _unit(self, motion: np.ndarray) -> tuple[float, float]:
         distance, turn = math.hypot(motion[0], motion[1]), abs(motion[2])
         base_m, per_m, base_rad, per_rad = self._base
         return base_m + per_m * distance, base_rad + per_rad * turn + 0.1 * per_rad * distance
 
-    def learn(self, motion: np.ndarray, truth: np.ndarray) -> None:
+    def update(self, motion: np.ndarray, truth: np.ndarray) -> None:
         """Compare with the matched motion; the scale follows quickly upwards and slowly down."""
         error = se2.between(motion, truth)
         unit_m, unit_rad = self._unit(motion)
         ratio_m = min((error[0] ** 2 + error[1] ** 2) / (2.0 * unit_m**2), 400.0)
         ratio_rad = min(error[2] ** 2 / unit_rad**2, 400.0)
-        self.scale2_m = _follow(self.scale2_m, ratio_m)
-        self.scale2_rad = _follow(self.scale2_rad, ratio_rad)
+        self.scale2_m = _filter_scale(self.scale2_m, ratio_m)
+        self.scale2_rad = _filter_scale(self.scale2_rad, ratio_rad)
 
 
-def _follow(value: float, sample: float) -> float:
+def _filter_scale(value: float, sample: float) -> float:
     gain = 0.25 if sample > value else 0.03
     return min(max(value + gain * (sample - value), 0.05), 400.0)

@@ -1,137 +1,183 @@
-"""Sparse robust pose graph: submaps and nodes, edges from submap to node, nodes eliminated first.
-
-The structure of sparse pose adjustment (Konolige et al. 2010) as Cartographer uses it, solved like bundle
-adjustment: a node only touches a handful of submaps, so its 3x3 block is eliminated exactly (Schur
-complement) and only the submap poses are left to solve for. Loop edges have a Geman-McClure loss whose
-scale shrinks during the iterations (graduated non-convexity, Yang et al. 2020).
-"""
+"""The back end owns the map: keynodes, submaps, edges; it hands out snapshots and takes in results."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
-from dataclasses import dataclass
-
 import numpy as np
-import scipy.linalg
-import scipy.sparse
-import scipy.sparse.linalg
 
-from beamsplat.services.localization.lidar2d.graph_kernels import edge_pairs, reduce_nodes, substitute
-
-DENSE_SUBMAPS = 250  # beyond this the reduced system is solved as a sparse one
-INNER_SCALE2 = 1e4  # poses in their own submap are hardly doubted
-SHRINK = 5.0  # the squared scale of the loop edges falls by this factor per iteration until the final one
-
-
-@dataclass(frozen=True)
-class Edges:
-    """Measured poses of nodes in submaps; rows ordered by node."""
-
-    submap: np.ndarray  # int32 [E]
-    node: np.ndarray  # int32 [E], non-decreasing
-    T_submap_node: np.ndarray  # float64 [E, 3]
-    information: np.ndarray  # float64 [E, 3, 3]
-    robust: np.ndarray  # bool [E], loop edges
+from beamsplat.services.localization.lidar2d import se2
+from beamsplat.services.localization.lidar2d.jobs import JobResult
+from beamsplat.services.localization.lidar2d.pose_graph_data import (
+    Constraint,
+    Submap,
+    TableCache,
+    TrajectoryNode,
+)
+from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
+from beamsplat.services.localization.lidar2d.snapshot import Snapshot
+from beamsplat.services.localization.lidar2d.submap_trimming import redundant_submaps
 
 
-@dataclass(frozen=True)
-class GraphSolution:
-    """Optimised poses and what each edge says about them."""
+class PoseGraph:
+    """State of the map between jobs."""
 
-    T_map_submap: np.ndarray  # float64 [S, 3]
-    T_map_node: np.ndarray  # float64 [N, 3]
-    chi2: np.ndarray  # float64 [E] squared, information weighted residuals
-    iterations: int
+    def __init__(self, settings: LidarSlamSettings) -> None:
+        self.settings = settings
+        self.uuid = ""  # of the map, from its first scan on; whatever goes on in it keeps it
+        self.nodes: dict[int, TrajectoryNode] = {}
+        self.submaps: dict[int, Submap] = {}
+        self.constraints: list[Constraint] = []
+        self.pose_map_node: dict[int, np.ndarray] = {}
+        self.pose_map_odom = np.zeros(3)
+        self.pending: list[int] = []
+        self.search_counts: dict[int, int] = {}
+        self.cache = TableCache(settings.reach_cells)
+        self.loop_closures = 0
+        self.optimisations = 0
+        self.unlinked_from: int | None = None
+        self._candidate: tuple[int, np.ndarray] | None = None
+        self.fixed: frozenset[int] = frozenset()
+        # Keynodes that were taken out: the one they hang on now, and where (x, y, yaw).
+        self.trimmed_nodes: dict[int, tuple[int, float, float, float]] = {}
+        self._jobs = 0
+        self._next_node = self._next_submap = 0
 
-
-def optimise(
-    T_map_submap: np.ndarray,  # float64 [S, 3] start
-    T_map_node: np.ndarray,  # float64 [N, 3] start
-    edges: Edges,
-    fixed: Sequence[int] = (0,),  # rows of the submaps that do not move
-    final_scale2: float = 9.0,
-    iterations: int = 16,
-) -> GraphSolution:
-    """Minimise sum rho(e' Omega e), e = T_submap_node (-) inverse(T_map_submap) T_map_node."""
-    T_s, T_n = T_map_submap.astype(np.float64).copy(), T_map_node.astype(np.float64).copy()
-    n_submaps, n_nodes = len(T_s), len(T_n)
-    first = np.searchsorted(edges.node, np.arange(n_nodes + 1)).astype(np.int64)
-    keys = np.empty(int((np.diff(first) ** 2).sum()), dtype=np.int64)
-    edge_pairs(edges.submap, first, n_submaps, keys)
-    unique, pair_of = np.unique(keys, return_inverse=True)
-    row, col = unique // n_submaps, unique % n_submaps
-    blocks, rhs = np.empty((len(unique), 3, 3)), np.empty((n_submaps, 3))
-    W, Hnn_inv = np.empty((len(edges.node), 3, 3)), np.empty((n_nodes, 3, 3))
-    bn, chi2 = np.empty((n_nodes, 3)), np.empty(len(edges.node))
-    done, scale2 = 0, math.inf
-    while done < iterations:
-        done += 1
-        # The first pass with a large scale trusts every loop; only then is told who disagrees with the rest.
-        reduce_nodes(
-            edges.submap,
-            edges.T_submap_node,
-            edges.information,
-            edges.robust,
-            first,
-            pair_of,
-            T_s,
-            T_n,
-            min(scale2, 1e12),
-            max(min(scale2, 1e12), INNER_SCALE2),
-            blocks,
-            rhs,
-            W,
-            Hnn_inv,
-            bn,
-            chi2,
+    def start_submap(self, pose_odom_submap: np.ndarray) -> Submap:
+        submap = Submap(
+            self._next_submap, pose_odom_submap, se2.compose(self.pose_map_odom, pose_odom_submap)
         )
-        settled = scale2 == final_scale2
-        if math.isinf(scale2):
-            scale2 = 4.0 * float(chi2[edges.robust].max()) if edges.robust.any() else final_scale2
-        scale2 = max(scale2 / SHRINK, final_scale2)
-        dx = _solve(blocks, row, col, rhs, fixed)
-        substitute(edges.submap, first, W, Hnn_inv, bn, dx, T_s, T_n)
-        if settled and np.abs(dx).max() < 1e-5:
-            break
-    reduce_nodes(
-        edges.submap,
-        edges.T_submap_node,
-        edges.information,
-        edges.robust,
-        first,
-        pair_of,
-        T_s,
-        T_n,
-        final_scale2,
-        INNER_SCALE2,
-        blocks,
-        rhs,
-        W,
-        Hnn_inv,
-        bn,
-        chi2,
-    )
-    return GraphSolution(T_s, T_n, chi2, done)
+        self._next_submap += 1
+        self.submaps[submap.id] = submap
+        return submap
 
+    def resume_numbering(self) -> None:
+        """Continue the ids of a loaded map."""
+        self._next_node = 1 + max([*self.nodes, *self.trimmed_nodes], default=-1)
+        self._next_submap = 1 + max(self.submaps, default=-1)
 
-def _solve(
-    blocks: np.ndarray, row: np.ndarray, col: np.ndarray, rhs: np.ndarray, fixed: Sequence[int]
-) -> np.ndarray:
-    n = len(rhs)
-    diagonal = 1e-6 * np.ones(3 * n)
-    for row_fixed in fixed:
-        diagonal[3 * row_fixed : 3 * row_fixed + 3] = 1e12
-    if n <= DENSE_SUBMAPS:
-        A = np.zeros((n, 3, n, 3))
-        A[row, :, col, :] = blocks
-        A = A.reshape(3 * n, 3 * n)
-        A[np.arange(3 * n), np.arange(3 * n)] += diagonal
-        factor = scipy.linalg.cho_factor(A, lower=True, overwrite_a=True, check_finite=False)
-        return scipy.linalg.cho_solve(factor, rhs.ravel(), check_finite=False).reshape(n, 3)
-    rows = np.repeat(3 * row[:, None] + np.arange(3), 3, axis=1).ravel()
-    cols = np.tile(3 * col[:, None] + np.arange(3), (1, 3)).ravel()
-    A = scipy.sparse.coo_matrix((blocks.ravel(), (rows, cols)), shape=(3 * n, 3 * n)).tocsc()
-    A = A + scipy.sparse.diags(diagonal, format="csc")
-    factor = scipy.sparse.linalg.splu(A, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
-    return factor.solve(rhs.ravel()).reshape(n, 3)
+    def reserve_submap_ids(self, count: int) -> None:
+        """Leaves ids free: others may know submaps by them that this map has lost."""
+        self._next_submap += count
+
+    def start_segment(self) -> None:
+        """What comes next hangs on nothing until its place in the map is found."""
+        if self.nodes and self.unlinked_from is None:
+            self.unlinked_from = self._next_node
+            self._candidate = None
+
+    def add_node(self, node: TrajectoryNode, edges: list[Constraint]) -> None:
+        """A new keynode and its poses in the submaps it was put into."""
+        self.nodes[node.id] = node
+        self._next_node = node.id + 1
+        self.pose_map_node[node.id] = se2.compose(self.pose_map_odom, node.pose_odom_body)
+        self.constraints += edges
+        for edge in edges:
+            self.submaps[edge.submap].members.append(node.id)
+        self.pending.append(node.id)
+
+    @property
+    def next_node_id(self) -> int:
+        return self._next_node
+
+    def snapshot(self) -> Snapshot:
+        """What a job may read while the map goes on growing."""
+        self._jobs += 1
+        return Snapshot(
+            self._jobs,
+            self.settings,
+            dict(self.nodes),
+            {i: s.frozen for i, s in self.submaps.items() if s.frozen is not None},
+            list(self.submaps),
+            list(self.nodes),
+            {i: list(s.members) for i, s in self.submaps.items()},
+            np.array([s.pose_map_submap for s in self.submaps.values()]).reshape(-1, 3),
+            np.array(list(self.pose_map_node.values())).reshape(-1, 3),
+            list(self.constraints),
+            list(self.pending),
+            dict(self.search_counts),
+            self.cache,
+            self.optimisations,
+            self.unlinked_from,
+            self.fixed,
+            self._candidate,
+        )
+
+    def apply(self, result: JobResult) -> None:
+        """Take in a job's result; what was added since the snapshot moves with the last optimised node."""
+        if not result.pose_map_node:
+            return
+        if result.constraints is not None:
+            self.constraints = result.constraints + self.constraints[result.snapshot_constraints :]
+        last = max(result.pose_map_node)
+        self.pose_map_odom = se2.compose(
+            result.pose_map_node[last], se2.inverse(self.nodes[last].pose_odom_body)
+        )
+        for i, submap in self.submaps.items():
+            moved = result.pose_map_submap.get(i)
+            submap.pose_map_submap = (
+                moved if moved is not None else se2.compose(self.pose_map_odom, submap.pose_odom_submap)
+            )
+        for i, node in self.nodes.items():
+            moved = result.pose_map_node.get(i)
+            self.pose_map_node[i] = (
+                moved if moved is not None else se2.compose(self.pose_map_odom, node.pose_odom_body)
+            )
+        for i, frozen in result.frozen.items():
+            self.submaps[i].frozen = frozen
+        newer = [n for n in self.pending if n > last]
+        self.pending = result.still_pending + newer
+        for i in result.searched:
+            self.search_counts[i] = self.search_counts.get(i, 0) + 1
+        if result.linked and self.unlinked_from is not None and last >= self.unlinked_from:
+            self.unlinked_from = None
+        self._candidate = result.candidate
+        self.loop_closures += result.loops_found
+        self.optimisations += 1
+
+    def trim(self, active: set[int]) -> list[int]:
+        """Take out submaps nobody needs; returns their ids."""
+        s = self.settings
+        if self.unlinked_from is not None:
+            return []
+        if self.fixed:  # localization only: of the own submaps keep the last few
+            own = [i for i in self.submaps if i not in self.fixed and i not in active]
+            gone = own[: max(0, len(own) - 2)]
+        else:
+            gone = redundant_submaps(self.submaps, self.pose_map_node, active, s.min_covering_submaps)
+        for submap_id in gone:
+            self._remove(submap_id)
+        return gone
+
+    def _remove(self, submap_id: int) -> None:
+        members = set(self.submaps.pop(submap_id).members)
+        self.search_counts.pop(submap_id, None)
+        self.constraints = [c for c in self.constraints if c.submap != submap_id]
+        inner = {m for s in self.submaps.values() for m in s.members if m in members}
+        orphans = sorted(members - inner)
+        if not orphans:
+            return
+        gone = set(orphans)
+        self.constraints = [c for c in self.constraints if c.node not in gone]
+        left = np.array([n for n in self.nodes if n not in gone], dtype=np.int64)
+        poses = np.array([self.pose_map_node[int(n)] for n in left])
+        for n in orphans:
+            anchor = int(left[np.argmin(np.hypot(*(poses[:, :2] - self.pose_map_node[n][:2]).T))])
+            self.trimmed_nodes[n] = (
+                anchor,
+                *se2.between(self.pose_map_node[anchor], self.pose_map_node[n]).tolist(),
+            )
+        for n in orphans:
+            del self.nodes[n], self.pose_map_node[n]
+        self.pending = [n for n in self.pending if n not in gone]
+
+    def all_node_poses(self) -> dict[int, np.ndarray]:
+        """T_map_node of every keynode there ever was."""
+        poses = dict(self.pose_map_node)
+        for n in self.trimmed_nodes:
+            chain, k = [], n
+            while k not in poses:
+                chain.append(k)
+                k = self.trimmed_nodes[k][0]
+            for k in reversed(chain):
+                anchor, *relative = self.trimmed_nodes[k]
+                poses[k] = se2.compose(poses[anchor], np.array(relative))
+        return poses

@@ -39,21 +39,21 @@ def _valid_points(
     time_increment_s: float,
     range_min_m: float,
     range_max_m: float,  # readings at or beyond it are no returns
-    T_body_lidar: np.ndarray,  # float64 [3]
+    pose_body_lidar: np.ndarray,  # float64 [3]
     velocity_body: np.ndarray,  # float64 [3], vx, vy (m/s), yaw rate (rad/s) during the scan
     points: np.ndarray,  # out float64 [N, 2]
     beams: np.ndarray,  # out int32 [N]
 ) -> int:
     count = 0
-    cl, sl = math.cos(T_body_lidar[2]), math.sin(T_body_lidar[2])
+    cl, sl = math.cos(pose_body_lidar[2]), math.sin(pose_body_lidar[2])
     for i in range(ranges_m.shape[0]):
         r = float(ranges_m[i])
         if not (r >= range_min_m and r < range_max_m and r > 0.0):
             continue
         a = angle_min_rad + i * angle_increment_rad
         lx, ly = r * math.cos(a), r * math.sin(a)
-        bx = T_body_lidar[0] + cl * lx - sl * ly
-        by = T_body_lidar[1] + sl * lx + cl * ly
+        bx = pose_body_lidar[0] + cl * lx - sl * ly
+        by = pose_body_lidar[1] + sl * lx + cl * ly
         # Constant body twist: the exact motion after t seconds (the half-angle form of exp).
         t = i * time_increment_s
         yaw = velocity_body[2] * t
@@ -155,9 +155,9 @@ def prepare_scan(
     time_increment_s: float,
     range_min_m: float,
     range_max_m: float,
-    T_body_lidar: np.ndarray,  # float64 [3]
+    pose_body_lidar: np.ndarray,  # float64 [3]
     velocity_body: np.ndarray,  # float64 [3]
-    spread_m: float,
+    min_spacing_m: float,
     match_limit: int,
     tangent_window_m: float = 0.10,
 ) -> PreparedScan:
@@ -172,7 +172,7 @@ def prepare_scan(
         time_increment_s,
         range_min_m,
         range_max_m,
-        T_body_lidar,
+        pose_body_lidar,
         velocity_body,
         points,
         beams,
@@ -180,8 +180,14 @@ def prepare_scan(
     points, beams = points[:count].copy(), beams[:count].copy()
     tangents, spacing = np.empty((count, 2)), np.empty(count)
     _tangents(
-        points, beams, T_body_lidar[:2].copy(), abs(angle_increment_rad), tangent_window_m, tangents, spacing
+        points,
+        beams,
+        pose_body_lidar[:2].copy(),
+        abs(angle_increment_rad),
+        tangent_window_m,
+        tangents,
+        spacing,
     )
     keep = np.empty(match_limit + 1, dtype=np.int32)
-    kept = _spread(points, spread_m, match_limit, keep)
-    return PreparedScan(points, tangents, spacing, beams, keep[:kept].copy(), T_body_lidar[:2].copy())
+    kept = _spread(points, min_spacing_m, match_limit, keep)
+    return PreparedScan(points, tangents, spacing, beams, keep[:kept].copy(), pose_body_lidar[:2].copy())

@@ -8,14 +8,16 @@ from pathlib import Path
 import numpy as np
 
 from beamsplat.services.localization.lidar2d import se2
-from beamsplat.services.localization.lidar2d.backend import BackEnd
-from beamsplat.services.localization.lidar2d.frontend import FrontEnd, RawScan, exp_twist
+from beamsplat.services.localization.lidar2d.active_submaps import ActiveSubmaps
 from beamsplat.services.localization.lidar2d.jobs import BackgroundJob, JobResult, run_job
-from beamsplat.services.localization.lidar2d.mapping import LocalMapper
-from beamsplat.services.localization.lidar2d.matching import Match
-from beamsplat.services.localization.lidar2d.nodes import edge_information
+from beamsplat.services.localization.lidar2d.local_trajectory_builder import (
+    LocalTrajectoryBuilder,
+    RawScan,
+    exp_twist,
+)
 from beamsplat.services.localization.lidar2d.occupancy import CountGrid, OccupancyGrid, render
-from beamsplat.services.localization.lidar2d.record import TrajectoryRecord
+from beamsplat.services.localization.lidar2d.pose_graph import PoseGraph
+from beamsplat.services.localization.lidar2d.pose_graph_data import edge_information
 from beamsplat.services.localization.lidar2d.relocalization import (
     GlobalMap,
     Relocalization,
@@ -23,14 +25,16 @@ from beamsplat.services.localization.lidar2d.relocalization import (
     relocalize_in,
 )
 from beamsplat.services.localization.lidar2d.scan import PreparedScan
+from beamsplat.services.localization.lidar2d.scan_matching import Match
 from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
 from beamsplat.services.localization.lidar2d.state import (
     PackedMap,
     load_state,
     map_uuid,
-    packed_state,
+    pack_state,
     write_state,
 )
+from beamsplat.services.localization.lidar2d.trajectory_record import TrajectoryRecord
 from beamsplat.services.localization.lidar2d.validate import StampGuard, reason_to_reject
 
 NS = 1e-9
@@ -42,14 +46,14 @@ class ScanResult:
 
     stamp_ns: int
     status: str  # "ok", "lost", "relocalizing" or "rejected: reason"
-    T_odom_body: np.ndarray  # float64 [3], smooth
-    T_map_odom: np.ndarray  # float64 [3], may jump
+    pose_odom_body: np.ndarray  # float64 [3], smooth
+    pose_map_odom: np.ndarray  # float64 [3], may jump
     covariance: np.ndarray  # float64 [3, 3] of x, y (odom axes), yaw
-    moving: np.ndarray  # bool [N] per beam
+    dynamic: np.ndarray  # bool [N] per beam
     points_body: np.ndarray  # float64 [M, 2] deskewed returns
     beams: np.ndarray  # int32 [M] beam of each return
-    keynode: bool
-    share: float  # share of returns in known space that lie on known surfaces
+    inserted: bool
+    inlier_ratio: float  # share of returns in known space that lie on known surfaces
     job: BackgroundJob | None  # work to run; its result is due before scan number `job.apply_at_scan`
 
 
@@ -57,8 +61,8 @@ class ScanResult:
 class PoseAt:
     """Pose at any stamp; both factors as of now."""
 
-    T_map_odom: np.ndarray  # float64 [3]
-    T_odom_body: np.ndarray  # float64 [3]
+    pose_map_odom: np.ndarray  # float64 [3]
+    pose_odom_body: np.ndarray  # float64 [3]
     extrapolated_s: float  # 0 between scans
 
 
@@ -68,19 +72,21 @@ class LidarSlam:
     def __init__(self, settings: LidarSlamSettings, T_body_lidar: np.ndarray) -> None:
         matrix = np.asarray(T_body_lidar, dtype=np.float64)
         self.settings = settings
-        self.front = FrontEnd(settings, se2.from_matrix(matrix), matrix.shape == (4, 4) and matrix[2, 2] < 0)
-        self.back = BackEnd(settings)
-        self.mapper = LocalMapper(settings, self.back)
+        self.local_builder = LocalTrajectoryBuilder(
+            settings, se2.from_matrix(matrix), matrix.shape == (4, 4) and matrix[2, 2] < 0
+        )
+        self.pose_graph = PoseGraph(settings)
+        self.active_submaps = ActiveSubmaps(settings, self.pose_graph)
         self.record = TrajectoryRecord()
         self.scans = 0
         self._stamps = StampGuard()
-        self._lost_run = 0
+        self._consecutive_lost = 0
         self._next_link_scan = 0
-        self._due: BackgroundJob | None = None
+        self._pending_job: BackgroundJob | None = None
 
     def add_odometry(self, stamp_ns: int, x_m: float, y_m: float, yaw_rad: float) -> None:
-        """A pose of the wheels in their own frame; refused ones are counted in `front.odometry.refused`."""
-        self.front.odometry.add(stamp_ns, x_m, y_m, yaw_rad)
+        """A pose of the wheels in their own frame; rejected ones are counted in `front.odometry.rejected`."""
+        self.local_builder.odometry.add(stamp_ns, x_m, y_m, yaw_rad)
 
     def add_scan(
         self,
@@ -93,9 +99,9 @@ class LidarSlam:
         range_max_m: float,
     ) -> ScanResult:
         """Match one scan; keynodes enter the map. Raises RuntimeError if a job's result is overdue."""
-        if self._due is not None and self.scans >= self._due.apply_at_scan:
+        if self._pending_job is not None and self.scans >= self._pending_job.apply_at_scan:
             raise RuntimeError(
-                f"the result of job {self._due.number} is due: call apply() before scan {self.scans}"
+                f"the result of job {self._pending_job.number} is due: call apply() before scan {self.scans}"
             )
         raw = RawScan(
             stamp_ns, ranges_m, angle_min_rad, angle_increment_rad, time_increment_s, range_min_m, range_max_m
@@ -108,170 +114,192 @@ class LidarSlam:
         if reason:
             return self._rejected(raw, reason)
         if restarted:
-            self.front.restart_clock(stamp_ns)
-        if not self.front.poses:
-            return self._first(raw)
+            self.local_builder.restart_clock(stamp_ns)
+        if not self.local_builder.poses:
+            return self._add_first_scan(raw)
         # 1. predict, 2. deskew, 3. match
-        prediction, options = self.front.predict(stamp_ns)
-        scan = self.front.prepare(raw, self.front.scan_velocity(raw, prediction.motion))
+        prediction, options = self.local_builder.predict(stamp_ns)
+        scan = self.local_builder.prepare(raw, self.local_builder.scan_velocity(raw, prediction.motion))
         if len(scan) < self.settings.min_points:
             return self._rejected(raw, f"{len(scan)} returns, {self.settings.min_points} are needed")
-        scan, match, good = self.front.match(raw, scan, prediction, self.mapper.matched)
+        scan, match, good = self.local_builder.match(
+            raw, scan, prediction, self.active_submaps.matching_target
+        )
         # 4. take the pose, or hold on to what the wheels say
         if good:
-            T_odom_body = se2.compose(self.mapper.matched.T_odom_map, match.T_map_body)
+            pose_odom_body = se2.compose(
+                self.active_submaps.matching_target.pose_odom_submap, match.pose_target_body
+            )
         else:
-            last = self.front.poses[-1]
-            T_odom_body = se2.compose(last, prediction.motion) if prediction.source == "wheels" else last
-        self.front.accept(stamp_ns, T_odom_body, options if good else [])
-        self._lost_run = 0 if good else self._lost_run + 1
-        if self._lost_run >= self.settings.lost_scans or (self._lost_run and prediction.blind):
-            self._start_segment(raw.stamp_ns, scan, T_odom_body)
+            last = self.local_builder.poses[-1]
+            pose_odom_body = se2.compose(last, prediction.motion) if prediction.source == "wheels" else last
+        self.local_builder.accept(stamp_ns, pose_odom_body, options if good else [])
+        self._consecutive_lost = 0 if good else self._consecutive_lost + 1
+        if self._consecutive_lost >= self.settings.lost_scans or (
+            self._consecutive_lost and prediction.blind
+        ):
+            self._start_segment(raw.stamp_ns, scan, pose_odom_body)
             good = True
         # 5. movers, 6. map, 7. background work
-        return self._map(raw, scan, T_odom_body, match, good)
+        return self._insert_scan(raw, scan, pose_odom_body, match, good)
 
-    def _first(self, raw: RawScan) -> ScanResult:
-        scan = self.front.prepare(raw, self.front.scan_velocity(raw, None))
+    def _add_first_scan(self, raw: RawScan) -> ScanResult:
+        scan = self.local_builder.prepare(raw, self.local_builder.scan_velocity(raw, None))
         if len(scan) < self.settings.min_points:
             return self._rejected(raw, f"{len(scan)} returns, {self.settings.min_points} are needed")
-        self.front.accept(raw.stamp_ns, np.zeros(3), [])
-        self.back.uuid = self.back.uuid or map_uuid(raw.stamp_ns, raw.ranges_m)
-        return self._map(
+        self.local_builder.accept(raw.stamp_ns, np.zeros(3), [])
+        self.pose_graph.uuid = self.pose_graph.uuid or map_uuid(raw.stamp_ns, raw.ranges_m)
+        return self._insert_scan(
             raw, scan, np.zeros(3), Match(np.zeros(3), np.diag([1e6, 1e6, 1e8]), 1.0, 1.0, 0.0), True
         )
 
-    def _start_segment(self, stamp_ns: int, scan: PreparedScan, T_odom_body: np.ndarray) -> None:
-        self._lost_run = 0
-        self.mapper.close()
-        self.back.start_segment()
+    def _start_segment(self, stamp_ns: int, scan: PreparedScan, pose_odom_body: np.ndarray) -> None:
+        self._consecutive_lost = 0
+        self.active_submaps.close()
+        self.pose_graph.start_segment()
         self._next_link_scan = self.scans
 
-    def _map(
-        self, raw: RawScan, scan: PreparedScan, T_odom_body: np.ndarray, match: Match, good: bool
+    def _insert_scan(
+        self, raw: RawScan, scan: PreparedScan, pose_odom_body: np.ndarray, match: Match, good: bool
     ) -> ScanResult:
-        moving = self.mapper.moving(scan, T_odom_body) if good else np.zeros(len(scan), dtype=bool)
-        key = good and self.mapper.insert(
-            raw.stamp_ns, scan, T_odom_body, moving, match, self.front.reckoning.regained()
+        dynamic = (
+            self.active_submaps.dynamic_returns(scan, pose_odom_body)
+            if good
+            else np.zeros(len(scan), dtype=bool)
         )
-        job = self._job()
+        inserted = good and self.active_submaps.insert(
+            raw.stamp_ns, scan, pose_odom_body, dynamic, match, self.local_builder.reckoning.take_recovery()
+        )
+        job = self._next_job()
         per_beam = np.zeros(len(raw.ranges_m), dtype=bool)
-        per_beam[scan.beams[moving]] = True
-        T_map_odom = self.back.T_map_odom.copy()
-        last = self.mapper.last_key
+        per_beam[scan.beams[dynamic]] = True
+        pose_map_odom = self.pose_graph.pose_map_odom.copy()
+        last = self.active_submaps.last_node
         self.record.add(
             raw.stamp_ns,
             last.id,
-            se2.between(last.T_odom_body, T_odom_body),
-            se2.compose(T_map_odom, T_odom_body),
+            se2.between(last.pose_odom_body, pose_odom_body),
+            se2.compose(pose_map_odom, pose_odom_body),
         )
         covariance = np.linalg.inv(edge_information(match.information, 0.003, 0.001))
-        status = "lost" if not good else "ok" if self.back.unlinked_from is None else "relocalizing"
+        status = "lost" if not good else "ok" if self.pose_graph.unlinked_from is None else "relocalizing"
         return ScanResult(
             raw.stamp_ns,
             status,
-            T_odom_body,
-            T_map_odom,
+            pose_odom_body,
+            pose_map_odom,
             covariance,
             per_beam,
             scan.points_body,
             scan.beams,
-            key,
-            match.share,
+            inserted,
+            match.inlier_ratio,
             job,
         )
 
     def _rejected(self, raw: RawScan, reason: str) -> ScanResult:
-        T_odom_body = self.front.poses[-1].copy() if self.front.poses else np.zeros(3)
+        pose_odom_body = self.local_builder.poses[-1].copy() if self.local_builder.poses else np.zeros(3)
         count = len(raw.ranges_m) if isinstance(raw.ranges_m, np.ndarray) and raw.ranges_m.ndim == 1 else 0
         return ScanResult(
             raw.stamp_ns,
             f"rejected: {reason}",
-            T_odom_body,
-            self.back.T_map_odom.copy(),
+            pose_odom_body,
+            self.pose_graph.pose_map_odom.copy(),
             np.diag([1.0, 1.0, 0.1]),
             np.zeros(count, dtype=bool),
             np.zeros((0, 2)),
             np.zeros(0, dtype=np.int32),
             False,
             0.0,
-            self._job(),
+            self._next_job(),
         )
 
     # ---- background work --------------------------------------------------------------------------
 
-    def _job(self) -> BackgroundJob | None:
+    def _next_job(self) -> BackgroundJob | None:
         s = self.settings
-        searching = self.back.unlinked_from is not None and self.scans >= self._next_link_scan
-        if self._due is not None or not self.back.nodes:
+        searching = self.pose_graph.unlinked_from is not None and self.scans >= self._next_link_scan
+        if self._pending_job is not None or not self.pose_graph.nodes:
             return None
-        if not searching and self.mapper.keynodes_since_job < s.job_keynodes:
+        if not searching and self.active_submaps.nodes_since_job < s.job_nodes:
             return None
-        self.mapper.keynodes_since_job = 0
+        self.active_submaps.nodes_since_job = 0
         self._next_link_scan = self.scans + s.link_every_scans
-        snapshot = self.back.snapshot()
-        self._due = BackgroundJob(
+        snapshot = self.pose_graph.snapshot()
+        self._pending_job = BackgroundJob(
             snapshot.number, self.scans + s.apply_after_scans, lambda: run_job(snapshot)
         )
-        return self._due
+        return self._pending_job
 
     @property
-    def due(self) -> BackgroundJob | None:
+    def pending_job(self) -> BackgroundJob | None:
         """The job that was handed out and not yet applied."""
-        return self._due
+        return self._pending_job
 
     def apply(self, result: JobResult) -> None:
         """Take in the result of the job that is due."""
-        self.back.apply(result)
-        if self._due is not None and self._due.number == result.number:
-            self._due = None
-        if result.number % self.settings.trim_every_jobs == 0 or self.back.fixed:
-            self.back.trim(self.mapper.active_ids)
+        self.pose_graph.apply(result)
+        if self._pending_job is not None and self._pending_job.number == result.number:
+            self._pending_job = None
+        if result.number % self.settings.trim_every_jobs == 0 or self.pose_graph.fixed:
+            self.pose_graph.trim(self.active_submaps.active_ids)
 
     def finish(self, refine_rounds: int = 4) -> None:
         """Final loop closure, refinement and optimisation, inline; mapping may go on afterwards."""
-        if self._due is not None:
-            self.apply(self._due.run())
-        if not self.back.nodes:
+        if self._pending_job is not None:
+            self.apply(self._pending_job.run())
+        if not self.pose_graph.nodes:
             return
-        self.mapper.freeze_active()
+        self.active_submaps.freeze_active()
         before = -1
-        while self.back.pending and len(self.back.pending) != before and self.back.unlinked_from is None:
-            before = len(self.back.pending)
-            self.back.apply(run_job(self.back.snapshot()))
-        self.back.apply(run_job(self.back.snapshot(), 0 if self.back.fixed else refine_rounds))
+        while (
+            self.pose_graph.pending
+            and len(self.pose_graph.pending) != before
+            and self.pose_graph.unlinked_from is None
+        ):
+            before = len(self.pose_graph.pending)
+            self.pose_graph.apply(run_job(self.pose_graph.snapshot()))
+        self.pose_graph.apply(
+            run_job(self.pose_graph.snapshot(), 0 if self.pose_graph.fixed else refine_rounds)
+        )
 
     # ---- answers ----------------------------------------------------------------------------------
 
     def pose_at(self, stamp_ns: int) -> PoseAt | None:
         """Between scans interpolated; up to `extrapolate_s` beyond the newest by its velocity; else None."""
-        stamps, poses = self.front.stamps, self.front.poses
+        stamps, poses = self.local_builder.stamps, self.local_builder.poses
         if not stamps or stamp_ns < stamps[0]:
             return None
         ahead_s = (stamp_ns - stamps[-1]) * NS
         if ahead_s > self.settings.extrapolate_s:
             return None
         if ahead_s >= 0.0:
-            T = se2.compose(poses[-1], exp_twist(self.front.velocity(), ahead_s))
-            return PoseAt(self.back.T_map_odom.copy(), T, ahead_s)
+            pose = se2.compose(poses[-1], exp_twist(self.local_builder.velocity(), ahead_s))
+            return PoseAt(self.pose_graph.pose_map_odom.copy(), pose, ahead_s)
         i = int(np.searchsorted(np.array(stamps), stamp_ns, side="right"))
         f = (stamp_ns - stamps[i - 1]) / (stamps[i] - stamps[i - 1])
-        T = se2.compose(poses[i - 1], f * se2.between(poses[i - 1], poses[i]))
-        return PoseAt(self.back.T_map_odom.copy(), T, 0.0)
+        pose = se2.compose(poses[i - 1], f * se2.between(poses[i - 1], poses[i]))
+        return PoseAt(self.pose_graph.pose_map_odom.copy(), pose, 0.0)
 
     def trajectory(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Stamps int64 [N], T_map_body [N, 3] as now known, and as published online [N, 3], of every scan."""
-        return self.record.stamps_ns, self.record.optimised(self.back.all_node_poses()), self.record.online
+        """Stamps int64 [N], pose_map_body [N, 3] as now known, and as published online [N, 3], of every scan."""
+        return (
+            self.record.stamps_ns,
+            self.record.optimised(self.pose_graph.all_node_poses()),
+            self.record.online,
+        )
 
     def anchors(self) -> dict[int, np.ndarray]:
         """T_map_anchor float64 [3] by id: the submaps."""
-        return {i: s.T_map_submap.copy() for i, s in self.back.submaps.items()}
+        return {i: s.pose_map_submap.copy() for i, s in self.pose_graph.submaps.items()}
 
     def grid(self, resolution_m: float = 0.05) -> OccupancyGrid:
         """Occupancy of everything seen so far."""
-        frozen = [(s.frozen, s.T_map_submap) for s in self.back.submaps.values() if s.frozen is not None]
-        grids = [CountGrid(*f.counts(), f.row0, f.col0, f.cell_m, T) for f, T in frozen]
-        return render(grids + self.mapper.count_grids(), resolution_m)
+        frozen = [
+            (s.frozen, s.pose_map_submap) for s in self.pose_graph.submaps.values() if s.frozen is not None
+        ]
+        grids = [CountGrid(*f.counts(), f.row0, f.col0, f.cell_m, pose) for f, pose in frozen]
+        return render(grids + self.active_submaps.count_grids(), resolution_m)
 
     def relocalize(
         self,
@@ -286,27 +314,27 @@ class LidarSlam:
         reason = reason_to_reject(raw)
         if reason:
             raise ValueError(reason)
-        scan = self.front.prepare(raw, np.zeros(3))
-        return relocalize_in(self.world(), scan.features(), scan.origin_body, self.settings)
+        scan = self.local_builder.prepare(raw, np.zeros(3))
+        return relocalize_in(self.global_map(), scan.features(), scan.origin_body, self.settings)
 
-    def world(self) -> GlobalMap:
+    def global_map(self) -> GlobalMap:
         """The map relocalization searches; drawn once per state of the map (about a second)."""
-        back = self.back
-        known = [n for n in back.nodes if back.unlinked_from is None or n < back.unlinked_from]
+        graph = self.pose_graph
+        known = [n for n in graph.nodes if graph.unlinked_from is None or n < graph.unlinked_from]
 
         def build() -> GlobalMap:
-            nodes, T_map_node = [back.nodes[n] for n in known], [back.T_map_node[n] for n in known]
-            return build_global_map(self.settings, nodes, T_map_node)
+            nodes, pose_map_node = [graph.nodes[n] for n in known], [graph.pose_map_node[n] for n in known]
+            return build_global_map(self.settings, nodes, pose_map_node)
 
-        return back.cache.world((back.optimisations, len(known)), build)
+        return graph.cache.global_map((graph.optimisations, len(known)), build)
 
     def save(self, folder: Path) -> None:
         """Write the state; mapping may go on."""
-        write_state(folder, self.packed())
+        write_state(folder, self.pack())
 
-    def packed(self) -> PackedMap:
+    def pack(self) -> PackedMap:
         """Copies of the state as it is now."""
-        return self.mapper.with_frozen(lambda: packed_state(self.back, self.record.arrays()))
+        return self.active_submaps.with_frozen(lambda: pack_state(self.pose_graph, self.record.arrays()))
 
     @staticmethod
     def load(
@@ -317,10 +345,10 @@ class LidarSlam:
         With `localize_only` the saved map stays as it is. Raises MapStateError.
         """
         slam = LidarSlam(settings, T_body_lidar)
-        slam.back, extra = load_state(folder, settings)
-        slam.mapper = LocalMapper(settings, slam.back)
+        slam.pose_graph, extra = load_state(folder, settings)
+        slam.active_submaps = ActiveSubmaps(settings, slam.pose_graph)
         slam.record = TrajectoryRecord() if localize_only else TrajectoryRecord.of(extra)
-        slam.back.start_segment()
+        slam.pose_graph.start_segment()
         if localize_only:
-            slam.back.fixed = frozenset(slam.back.submaps)
+            slam.pose_graph.fixed = frozenset(slam.pose_graph.submaps)
         return slam

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from beamsplat.services.localization.lidar2d.nodes import Constraint, Keynode, TableCache
+from beamsplat.services.localization.lidar2d.pose_graph_data import Constraint, TableCache, TrajectoryNode
 from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
 from beamsplat.services.localization.lidar2d.surfel_map import FrozenMap
 
@@ -17,16 +17,16 @@ class Snapshot:
 
     number: int
     settings: LidarSlamSettings
-    nodes: dict[int, Keynode]
+    nodes: dict[int, TrajectoryNode]
     frozen: dict[int, FrozenMap]
     submap_ids: list[int]
     node_ids: list[int]
     members: dict[int, list[int]]
-    T_map_submap: np.ndarray  # float64 [S, 3]
-    T_map_node: np.ndarray  # float64 [N, 3]
+    pose_map_submap: np.ndarray  # float64 [S, 3]
+    pose_map_node: np.ndarray  # float64 [N, 3]
     constraints: list[Constraint]
     pending: list[int]
-    tries: dict[int, int]
+    search_counts: dict[int, int]
     cache: TableCache
     version: int  # of the map's poses
     unlinked_from: int | None  # first keynode of a segment whose place in the map is unknown

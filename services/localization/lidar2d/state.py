@@ -13,8 +13,13 @@ from pathlib import Path
 import numpy as np
 
 from beamsplat.common.errors import reason
-from beamsplat.services.localization.lidar2d.backend import BackEnd
-from beamsplat.services.localization.lidar2d.nodes import Constraint, Keynode, KeyScan, Submap
+from beamsplat.services.localization.lidar2d.pose_graph import PoseGraph
+from beamsplat.services.localization.lidar2d.pose_graph_data import (
+    Constraint,
+    NodeScan,
+    Submap,
+    TrajectoryNode,
+)
 from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
 from beamsplat.services.localization.lidar2d.surfel_map import FrozenMap
 
@@ -41,15 +46,15 @@ class PackedMap:
     head: dict[str, object]
 
 
-def packed_state(back: BackEnd, extra: dict[str, np.ndarray]) -> PackedMap:
+def pack_state(graph: PoseGraph, extra: dict[str, np.ndarray]) -> PackedMap:
     """The map as it is now."""
-    arrays = {**_pack_nodes(back), **_pack_submaps(back), **_pack_edges(back.constraints), **extra}
+    arrays = {**_pack_nodes(graph), **_pack_submaps(graph), **_pack_edges(graph.constraints), **extra}
     head = {
-        "uuid": back.uuid,
-        "keynodes": len(back.nodes),
-        "submaps": len(back.submaps),
-        "constraints": len(back.constraints),
-        "settings": dataclasses.asdict(back.settings),
+        "uuid": graph.uuid,
+        "keynodes": len(graph.nodes),
+        "submaps": len(graph.submaps),
+        "constraints": len(graph.constraints),
+        "settings": dataclasses.asdict(graph.settings),
     }
     return PackedMap(arrays, head)
 
@@ -83,8 +88,8 @@ def write_state(folder: Path, state: PackedMap) -> None:
             old.unlink()
 
 
-def load_state(folder: Path, settings: LidarSlamSettings) -> tuple[BackEnd, dict[str, np.ndarray]]:
-    """The saved back end and the extra arrays. Raises MapStateError naming the file and the reason."""
+def load_state(folder: Path, settings: LidarSlamSettings) -> tuple[PoseGraph, dict[str, np.ndarray]]:
+    """The saved graph end and the extra arrays. Raises MapStateError naming the file and the reason."""
     path = Path(folder) / MANIFEST
     manifest = read_manifest(path)
     arrays_path = Path(folder) / str(manifest["arrays"])
@@ -107,11 +112,11 @@ def load_state(folder: Path, settings: LidarSlamSettings) -> tuple[BackEnd, dict
     try:
         with np.load(arrays_path, allow_pickle=False) as stored:
             arrays = {key: stored[key] for key in stored.files}
-        back = _unpack(arrays, settings)
-        back.uuid = str(manifest.get("uuid", ""))  # none in states from before it
+        graph = _unpack(arrays, settings)
+        graph.uuid = str(manifest.get("uuid", ""))  # none in states from before it
     except (KeyError, ValueError, zipfile.BadZipFile) as error:
         raise MapStateError(f"{arrays_path}: not a complete map of version {VERSION} ({error})") from error
-    return back, {key: value for key, value in arrays.items() if key.startswith("extra_")}
+    return graph, {key: value for key, value in arrays.items() if key.startswith("extra_")}
 
 
 def read_manifest(path: Path) -> dict:
@@ -137,21 +142,21 @@ def read_manifest(path: Path) -> dict:
     return manifest
 
 
-def _pack_nodes(back: BackEnd) -> dict[str, np.ndarray]:
-    nodes = list(back.nodes.values())
+def _pack_nodes(graph: PoseGraph) -> dict[str, np.ndarray]:
+    nodes = list(graph.nodes.values())
     scans = [n.scan for n in nodes]
     return {
         "node_id": np.array([n.id for n in nodes], dtype=np.int64),
         "node_stamp_ns": np.array([n.stamp_ns for n in nodes], dtype=np.int64),
-        "node_odom": np.array([n.T_odom_body for n in nodes]).reshape(-1, 3),
-        "node_map": np.array([back.T_map_node[n.id] for n in nodes]).reshape(-1, 3),
+        "node_odom": np.array([n.pose_odom_body for n in nodes]).reshape(-1, 3),
+        "node_map": np.array([graph.pose_map_node[n.id] for n in nodes]).reshape(-1, 3),
         "node_origin": np.array([s.origin for s in scans]).reshape(-1, 2),
         "node_points": np.array([len(s.points) for s in scans], dtype=np.int64),
         "node_features": np.array([len(s.features) for s in scans], dtype=np.int64),
         "points": _concat([s.points for s in scans], 2),
         "tangents": _concat([s.tangents for s in scans], 2),
         "spacing": np.concatenate([s.spacing_m for s in scans]) if scans else np.zeros(0, np.float32),
-        "moving": np.concatenate([s.moving for s in scans]) if scans else np.zeros(0, bool),
+        "moving": np.concatenate([s.dynamic for s in scans]) if scans else np.zeros(0, bool),
         "features": _concat([s.features for s in scans], 5),
     }
 
@@ -160,13 +165,13 @@ def _concat(parts: list[np.ndarray], width: int) -> np.ndarray:
     return np.concatenate(parts) if parts else np.zeros((0, width), np.float32)
 
 
-def _pack_submaps(back: BackEnd) -> dict[str, np.ndarray]:
-    submaps = [s for s in back.submaps.values() if s.frozen is not None]
+def _pack_submaps(graph: PoseGraph) -> dict[str, np.ndarray]:
+    submaps = [s for s in graph.submaps.values() if s.frozen is not None]
     frozen = [s.frozen for s in submaps]
     return {
         "submap_id": np.array([s.id for s in submaps], dtype=np.int64),
-        "submap_odom": np.array([s.T_odom_submap for s in submaps]).reshape(-1, 3),
-        "submap_map": np.array([s.T_map_submap for s in submaps]).reshape(-1, 3),
+        "submap_odom": np.array([s.pose_odom_submap for s in submaps]).reshape(-1, 3),
+        "submap_map": np.array([s.pose_map_submap for s in submaps]).reshape(-1, 3),
         "submap_members": np.array([len(s.members) for s in submaps], dtype=np.int64),
         "members": np.array([m for s in submaps for m in s.members], dtype=np.int64),
         "submap_grid": np.array([[f.row0, f.col0, *f.shape] for f in frozen], dtype=np.int64).reshape(-1, 4),
@@ -183,18 +188,18 @@ def _pack_edges(constraints: list[Constraint]) -> dict[str, np.ndarray]:
     return {
         "edge_submap": np.array([c.submap for c in constraints], dtype=np.int64),
         "edge_node": np.array([c.node for c in constraints], dtype=np.int64),
-        "edge_pose": np.array([c.T_submap_node for c in constraints]).reshape(-1, 3),
+        "edge_pose": np.array([c.pose_submap_node for c in constraints]).reshape(-1, 3),
         "edge_information": np.array([c.information for c in constraints]).reshape(-1, 3, 3),
         "edge_loop": np.array([c.loop for c in constraints], dtype=bool),
     }
 
 
-def _unpack(a: dict[str, np.ndarray], settings: LidarSlamSettings) -> BackEnd:
-    back = BackEnd(settings)
+def _unpack(a: dict[str, np.ndarray], settings: LidarSlamSettings) -> PoseGraph:
+    graph = PoseGraph(settings)
     p, f = np.r_[0, np.cumsum(a["node_points"])], np.r_[0, np.cumsum(a["node_features"])]
     for k, node_id in enumerate(a["node_id"].tolist()):
         here = slice(p[k], p[k + 1])
-        scan = KeyScan(
+        scan = NodeScan(
             a["points"][here],
             a["tangents"][here],
             a["spacing"][here],
@@ -202,8 +207,8 @@ def _unpack(a: dict[str, np.ndarray], settings: LidarSlamSettings) -> BackEnd:
             a["features"][f[k] : f[k + 1]],
             a["node_origin"][k],
         )
-        back.nodes[node_id] = Keynode(node_id, int(a["node_stamp_ns"][k]), a["node_odom"][k], scan)
-        back.T_map_node[node_id] = a["node_map"][k]
+        graph.nodes[node_id] = TrajectoryNode(node_id, int(a["node_stamp_ns"][k]), a["node_odom"][k], scan)
+        graph.pose_map_node[node_id] = a["node_map"][k]
     m, s, b = (np.r_[0, np.cumsum(a[key])] for key in ("submap_members", "submap_surfels", "submap_packed"))
     for k, submap_id in enumerate(a["submap_id"].tolist()):
         row0, col0, rows, cols = a["submap_grid"][k].tolist()
@@ -217,15 +222,15 @@ def _unpack(a: dict[str, np.ndarray], settings: LidarSlamSettings) -> BackEnd:
             col0,
             settings.cell_m,
         )
-        back.submaps[submap_id] = Submap(
+        graph.submaps[submap_id] = Submap(
             submap_id, a["submap_odom"][k], a["submap_map"][k], a["members"][m[k] : m[k + 1]].tolist(), frozen
         )
-    back.constraints = [
+    graph.constraints = [
         Constraint(int(i), int(j), z, w, bool(loop))
         for i, j, z, w, loop in zip(
             a["edge_submap"], a["edge_node"], a["edge_pose"], a["edge_information"], a["edge_loop"]
         )
-        if int(i) in back.submaps and int(j) in back.nodes
+        if int(i) in graph.submaps and int(j) in graph.nodes
     ]
-    back.resume_numbering()
-    return back
+    graph.resume_numbering()
+    return graph

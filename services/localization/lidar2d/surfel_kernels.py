@@ -66,7 +66,7 @@ def merged_surfel(
 
 
 @kernel
-def elements(
+def compute_surfels(
     cell_id: np.ndarray,
     moments: np.ndarray,
     cells: np.ndarray,  # int32 [S, 2] row, col (absolute)
@@ -84,8 +84,8 @@ def elements(
 
 
 @kernel
-def _bump(counter: np.ndarray, other: np.ndarray, r: int, c: int) -> None:
-    if counter[r, c] == 255:  # halve both: the ratio stays, old evidence fades
+def _increment(counter: np.ndarray, other: np.ndarray, r: int, c: int) -> None:
+    if counter[r, c] == 255:  # halve both: the ratio stays, old match_score fades
         counter[r, c] = 128
         other[r, c] >>= 1
     counter[r, c] += 1
@@ -106,7 +106,7 @@ def add_returns(
     moments: np.ndarray,
     views: np.ndarray,  # float64 [S, 2] mean of the unit directions towards the lidar
     cells: np.ndarray,  # int32 [S, 2] row, col (absolute)
-    told: np.ndarray,  # float64 [S, 2], see refresh()
+    table_means: np.ndarray,  # float64 [S, 2], see refresh()
     count: int,
     row0: int,
     col0: int,
@@ -129,10 +129,10 @@ def add_returns(
             cells[k, 0], cells[k, 1] = ar, ac
             moments[k] = 0.0
             views[k] = 0.0
-            told[k] = 1e9
+            table_means[k] = 1e9
         if touched[r, c] != scan_number:
             touched[r, c] = scan_number
-            _bump(hits, misses, r, c)
+            _increment(hits, misses, r, c)
             changed[n_changed] = k
             n_changed += 1
         m = moments[k]
@@ -198,7 +198,7 @@ def cast_rays(
             rr, cc = r - row0, c - col0
             if touched[rr, cc] != scan_number:
                 touched[rr, cc] = scan_number
-                _bump(misses, hits, rr, cc)
+                _increment(misses, hits, rr, cc)
             if tx < ty:
                 t = tx
                 tx += tdx
@@ -219,7 +219,7 @@ def refresh(
     cells: np.ndarray,
     means: np.ndarray,
     omegas: np.ndarray,
-    told: np.ndarray,  # in out float64 [S, 2] the mean that the cells around know
+    table_means: np.ndarray,  # in out float64 [S, 2] the mean that the cells around know
     row0: int,
     col0: int,
     cell_m: float,
@@ -237,10 +237,10 @@ def refresh(
                     merged_surfel(cell_id, moments, r, c, range_sigma_m, map_sigma_m, means[k], omegas[k])
     for i in range(changed.shape[0]):
         k = changed[i]
-        moved = abs(means[k, 0] - told[k, 0]) + abs(means[k, 1] - told[k, 1])
+        moved = abs(means[k, 0] - table_means[k, 0]) + abs(means[k, 1] - table_means[k, 1])
         if moved < RESPLAT_M:
             continue
-        told[k] = means[k]
+        table_means[k] = means[k]
         splat(
             nearest,
             field,

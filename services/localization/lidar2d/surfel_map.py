@@ -10,7 +10,12 @@ import numpy as np
 
 from beamsplat.common.compiled import kernel
 from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
-from beamsplat.services.localization.lidar2d.surfel_kernels import add_returns, cast_rays, elements, refresh
+from beamsplat.services.localization.lidar2d.surfel_kernels import (
+    add_returns,
+    cast_rays,
+    compute_surfels,
+    refresh,
+)
 from beamsplat.services.localization.lidar2d.table_kernels import nearest_all, splat_all
 
 BLOCK = 64  # grids grow in blocks of so many cells
@@ -26,7 +31,7 @@ class MatchTables:
     means: np.ndarray  # float64 [S, 2]
     omegas: np.ndarray  # float64 [S, 3]
     views: np.ndarray  # float64 [S, 2]
-    seen: np.ndarray  # uint8 [H, W] beams that crossed a cell
+    misses: np.ndarray  # uint8 [H, W] beams that crossed a cell
     row0: int
     col0: int
     cell_m: float
@@ -57,7 +62,7 @@ class SurfelMap:
             ("cells", 2, np.int32),
             ("means", 2, np.float64),
             ("omegas", 3, np.float64),
-            ("told", 2, np.float64),
+            ("table_means", 2, np.float64),
         ):
             grown = np.zeros((capacity, width), dtype=dtype)
             if self.count:
@@ -113,7 +118,7 @@ class SurfelMap:
             self.moments,
             self.views,
             self.cells,
-            self.told,
+            self.table_means,
             self.count,
             self.row0,
             self.col0,
@@ -151,7 +156,7 @@ class SurfelMap:
             self.cells,
             self.means,
             self.omegas,
-            self.told,
+            self.table_means,
             self.row0,
             self.col0,
             self.cell_m,
@@ -163,7 +168,7 @@ class SurfelMap:
     def surface_elements(self) -> tuple[np.ndarray, np.ndarray]:
         """Means float64 [S, 2] and information float64 [S, 3] of every cell with a return, now."""
         s, n = self.settings, self.count
-        elements(
+        compute_surfels(
             self.cell_id, self.moments, self.cells[:n], self.row0, self.col0, s.range_sigma_m, s.map_sigma_m,
             self.means, self.omegas,
         )  # fmt: skip
@@ -247,7 +252,7 @@ class FrozenMap:
         )
 
 
-def freeze(surfels: SurfelMap, counts_of: FrozenMap | None = None, min_hit_share: float = 0.2) -> FrozenMap:
+def freeze(surfels: SurfelMap, counts_of: FrozenMap | None = None, min_hit_ratio: float = 0.2) -> FrozenMap:
     """Keep the surface elements that later beams did not contradict, crop the grids to what was seen.
 
     With `counts_of` the counts of an older drawing of the same scans are kept.
@@ -265,11 +270,11 @@ def freeze(surfels: SurfelMap, counts_of: FrozenMap | None = None, min_hit_share
         inside = (rows >= 0) & (cols >= 0) & (rows < grid.shape[0]) & (cols < grid.shape[1])
         misses = np.zeros(n, dtype=np.uint8)
         misses[inside] = counts_of.counts()[1][rows[inside], cols[inside]]
-    alive = inside & (hits >= min_hit_share * (hits + misses))
+    kept = inside & (hits >= min_hit_ratio * (hits + misses))
     return FrozenMap(
-        means[alive].astype(np.float32),
-        omegas[alive].astype(np.float32),
-        surfels.views[:n][alive].astype(np.float32),
+        means[kept].astype(np.float32),
+        omegas[kept].astype(np.float32),
+        surfels.views[:n][kept].astype(np.float32),
         grid.packed,
         grid.shape,
         grid.row0,

@@ -1,4 +1,4 @@
-"""Is this a scan at all? Rubbish is refused with a reason and never reaches the map."""
+"""Is this a scan at all? Rubbish is rejected with a reason and never reaches the map."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import math
 
 import numpy as np
 
-from beamsplat.services.localization.lidar2d.frontend import RawScan
+from beamsplat.services.localization.lidar2d.local_trajectory_builder import RawScan
 
-RESTART_SCANS = 5  # so many refused scans in a row whose own stamps rise: the clock was set, follow it
+RESTART_SCANS = 5  # so many rejected scans in a row whose own stamps rise: the clock was set, follow it
 
 
 class StampGuard:

@@ -13,14 +13,14 @@ from typer.testing import CliRunner
 from beamsplat.common.errors import UserError
 from beamsplat.common.geometry.trajectory import Trajectory, write_tum
 from beamsplat.common.geometry.transforms import inverse, make_transform
-from beamsplat.common.mapfiles.film import along, drive, looking, orbit, write_film
 from beamsplat.common.mapfiles.session import SessionFolder
-from beamsplat.common.mapfiles.state import store_of, views_of
+from beamsplat.common.mapfiles.state import keyframe_views, store_of
+from beamsplat.common.mapfiles.video import along, drive, looking, orbit, write_video
 from beamsplat.common.raster.rasterizer import Rasterizer
 from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
 from beamsplat.services.localization.lidar2d.slam import LidarSlam
 from beamsplat.tools.cli.main import app
-from tests.services.localization.world import Drive, Lidar
+from tests.services.localization.world import SimulatedDrive, SimulatedLidar
 from tests.services.mapping import room_drive as r
 from tests.services.mapping.session.maps import feed, make_node
 
@@ -111,7 +111,7 @@ def test_nav2_without_a_robots_half_is_what_the_camera_saw(session, tmp_path):
 def test_nav2_layers_lie_on_each_other(session, tmp_path):
     """A lidar map of a flat and, wherever the room's keyframes put it, the camera's layer on the same cells."""
     shutil.copytree(session, tmp_path / "s")
-    lidar, path, slam = Lidar(), Drive(), LidarSlam(LidarSlamSettings(), np.eye(4))
+    lidar, path, slam = SimulatedLidar(), SimulatedDrive(), LidarSlam(LidarSlamSettings(), np.eye(4))
     angle_min, increment, dt, least, most = lidar.arguments()
     for number in range(60):
         slam.add_scan(number * 10**8, lidar.scan(path, number * 0.1), angle_min, increment, dt, least, most)
@@ -199,7 +199,7 @@ def test_cameras_look_where_they_should(session):
     np.testing.assert_allclose(T[:3, :3] @ [0.0, 1.0, 0.0], [0.0, 0.0, -1.0], atol=1e-12)
     assert np.isfinite(looking(np.array([0.0, 0.0, 5.0]), np.zeros(3))).all()
     arrays = SessionFolder(session).read_state()
-    store, views = store_of(arrays), views_of(arrays)
+    store, views = store_of(arrays), keyframe_views(arrays)
     poses = orbit(store, 0.4, 6)
     middle = np.median(store.params[:3, : store.count], axis=1)
     for T in poses:
@@ -218,6 +218,6 @@ def test_cameras_look_where_they_should(session):
 
 
 def test_one_picture_is_one_file(tmp_path):
-    written = write_film(tmp_path / "one.png", [np.zeros((8, 8, 3), np.uint8)], 1.0, 1)
+    written = write_video(tmp_path / "one.png", [np.zeros((8, 8, 3), np.uint8)], 1.0, 1)
     assert written == [tmp_path / "one.png"]
     assert cv2.imread(str(written[0])).shape == (8, 8, 3)

@@ -82,9 +82,9 @@ def test_trajectory_errors():
 
 
 def test_rigid_alignment_recovers_any_motion(rng):
-    T = np.array([1.5, -0.3, 2.5])
+    pose = np.array([1.5, -0.3, 2.5])
     points = rng.normal(size=(40, 2))
-    assert np.allclose(rigid_alignment(points, se2.transform(T, points)), T)
+    assert np.allclose(rigid_alignment(points, se2.transform(pose, points)), pose)
 
 
 def test_interpolation_goes_the_short_way_round():

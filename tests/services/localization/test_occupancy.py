@@ -2,7 +2,7 @@ import cv2
 import numpy as np
 
 from beamsplat.services.localization.lidar2d import se2
-from beamsplat.services.localization.lidar2d.movers import contradicts_free_space, grow_along_beams
+from beamsplat.services.localization.lidar2d.dynamic_objects import contradicts_free_space, grow_along_beams
 from beamsplat.services.localization.lidar2d.occupancy import (
     CountGrid,
     OccupancyGrid,
@@ -22,10 +22,10 @@ def counts(shape=(20, 30)):
 
 def test_walls_and_floor_land_where_they_are():
     hits, misses = counts()
-    T = np.array([2.0, 1.0, np.pi / 2])
-    grid = render([CountGrid(hits, misses, 0, 0, 0.05, T)], 0.05)
-    wall = se2.transform(T, np.array([[0.5, 5.5 * 0.05]]))[0]
-    floor = se2.transform(T, np.array([[0.5, 10.5 * 0.05]]))[0]
+    pose = np.array([2.0, 1.0, np.pi / 2])
+    grid = render([CountGrid(hits, misses, 0, 0, 0.05, pose)], 0.05)
+    wall = se2.transform(pose, np.array([[0.5, 5.5 * 0.05]]))[0]
+    floor = se2.transform(pose, np.array([[0.5, 10.5 * 0.05]]))[0]
 
     def at(p):
         return grid.values[int((p[1] - grid.origin_y_m) / 0.05), int((p[0] - grid.origin_x_m) / 0.05)]
@@ -39,12 +39,12 @@ def test_walls_and_floor_land_where_they_are():
 def test_rendering_against_a_slow_twin(rng):
     hits = rng.integers(0, 3, (12, 9)).astype(np.uint8)
     misses = rng.integers(0, 3, (12, 9)).astype(np.uint8)
-    T = np.array([0.3, -0.2, 0.7])
-    grid = render([CountGrid(hits, misses, -4, -3, 0.1, T)], 0.05)
+    pose = np.array([0.3, -0.2, 0.7])
+    grid = render([CountGrid(hits, misses, -4, -3, 0.1, pose)], 0.05)
     for r in range(0, grid.values.shape[0], 3):
         for c in range(0, grid.values.shape[1], 3):
             p = np.array([[grid.origin_x_m + (c + 0.5) * 0.05, grid.origin_y_m + (r + 0.5) * 0.05]])
-            q = np.floor(se2.transform(se2.inverse(T), p)[0] / 0.1).astype(int)
+            q = np.floor(se2.transform(se2.inverse(pose), p)[0] / 0.1).astype(int)
             i, j = q[1] + 4, q[0] + 3
             inside = 0 <= i < 12 and 0 <= j < 9 and (hits[i, j] or misses[i, j])
             expected = 1 / (1 + np.exp(-(1.5 * hits[i, j] - 0.5 * misses[i, j]))) if inside else None

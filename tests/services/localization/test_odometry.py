@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 
 from beamsplat.services.localization.lidar2d import se2
-from beamsplat.services.localization.lidar2d.frontend import exp_twist, twist
+from beamsplat.services.localization.lidar2d.local_trajectory_builder import exp_twist, twist
 from beamsplat.services.localization.lidar2d.metrics import interpolate_poses
-from beamsplat.services.localization.lidar2d.odometry import OdometryBuffer, Predictor, interpolate
+from beamsplat.services.localization.lidar2d.odometry import MotionErrorModel, OdometryBuffer, interpolate
 
 NS = 1_000_000_000
 
@@ -38,7 +38,7 @@ def test_the_delay_is_found(delay_s, rng):
         if k % 10 == 0 and t > 1.0:
             stamp, yaw = round((t - 0.5) * NS), turning(np.array([t - 0.5]))[0, 2]
             if last is not None:
-                buffer.observe_turn(last[0], stamp, yaw - last[1] + 0.003 * rng.standard_normal())
+                buffer.observe_rotation(last[0], stamp, yaw - last[1] + 0.003 * rng.standard_normal())
             last = (stamp, yaw)
     assert buffer.delay_ns / NS == pytest.approx(delay_s, abs=0.021)
 
@@ -61,18 +61,18 @@ def test_bad_odometry_is_refused_and_counted():
     assert buffer.add(NS, 0, 0, 0)
     assert not buffer.add(NS, 1, 0, 0)
     assert not buffer.add(2 * NS, float("nan"), 0, 0)
-    assert buffer.refused == 2
+    assert buffer.rejected == 2
 
 
 def test_a_lying_predictor_loses_its_say():
     honest, liar = (
-        Predictor(0.01, 0.05, 0.02, 0.004, 0.05, 0.03),
-        Predictor(0.01, 0.05, 0.02, 0.004, 0.05, 0.03),
+        MotionErrorModel(0.01, 0.05, 0.02, 0.004, 0.05, 0.03),
+        MotionErrorModel(0.01, 0.05, 0.02, 0.004, 0.05, 0.03),
     )
     truth = np.array([0.1, 0.0, 0.02])
     for _ in range(30):
-        honest.learn(truth + np.array([0.002, 0, 0.001]), truth)
-        liar.learn(-truth, truth)
+        honest.update(truth + np.array([0.002, 0, 0.001]), truth)
+        liar.update(-truth, truth)
     assert liar.sigmas(truth, 0.1)[0] > 0.1  # it says so itself: decimetres
     assert honest.sigmas(truth, 0.1)[0] < 0.01
     assert honest.sigmas(truth, 3.0)[0] > honest.sigmas(truth, 0.1)[0]  # nothing is certain after a gap

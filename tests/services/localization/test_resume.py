@@ -11,15 +11,15 @@ from beamsplat.common.geometry.transforms import inverse, se2_to_se3
 from beamsplat.common.messages import LidarModel, Rig, Scan
 from beamsplat.common.runtime.live_settings import LiveSettings
 from beamsplat.services.localization.lidar2d.node import LidarLocalization
-from tests.services.localization.world import Drive, Lidar
+from tests.services.localization.world import SimulatedDrive, SimulatedLidar
 
 T0 = 1_000_000_000_000
-PATH = Drive()
+PATH = SimulatedDrive()
 
 
 def drive(node, start_s, end_s, seed, day):
     """Messages of a drive through the flat, by topic, and the pose (true, published) of each scan that was ok."""
-    lidar, sent, poses, T_map_odom = Lidar(seed=seed), {}, [], np.eye(4)
+    lidar, sent, poses, T_map_odom = SimulatedLidar(seed=seed), {}, [], np.eye(4)
     angle_min, increment, dt, least, most = lidar.arguments()
 
     def take(outputs):

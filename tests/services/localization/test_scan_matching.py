@@ -10,12 +10,17 @@ from hypothesis import strategies as st
 from beamsplat.services.localization.lidar2d import se2
 from beamsplat.services.localization.lidar2d.branch_bound import LEVELS, branch_and_bound, build_pyramid
 from beamsplat.services.localization.lidar2d.correlative import correlate, search
-from beamsplat.services.localization.lidar2d.matching import ALONG2, accumulate, refine, solve3
 from beamsplat.services.localization.lidar2d.scan import prepare_scan
+from beamsplat.services.localization.lidar2d.scan_matching import (
+    TANGENT_VARIANCE_M2,
+    accumulate,
+    refine,
+    solve3,
+)
 from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
 from beamsplat.services.localization.lidar2d.surfel_kernels import merged_surfel
 from beamsplat.services.localization.lidar2d.surfel_map import SurfelMap, freeze
-from tests.services.localization.world import Lidar
+from tests.services.localization.world import SimulatedLidar
 
 SETTINGS = LidarSlamSettings()
 poses = st.tuples(st.floats(-5, 5), st.floats(-5, 5), st.floats(-3.1, 3.1)).map(np.array)
@@ -26,7 +31,7 @@ def still(pose):
 
 
 def prepared(pose, lidar=None, velocity=(0.0, 0.0, 0.0), pose_at=None):
-    lidar = lidar or Lidar()
+    lidar = lidar or SimulatedLidar()
     ranges = lidar.scan(pose_at or still(pose), 0.0)
     a, inc, dt, low, high = lidar.arguments()
     return prepare_scan(ranges, a, inc, dt, low, high, np.zeros(3), np.array(velocity), 0.03, 360)
@@ -81,7 +86,7 @@ def test_rubbish_ranges_are_no_returns():
 
 
 def test_deskew_against_a_slow_twin_and_against_the_world(rng):
-    lidar = Lidar(beams=180, sigma_m=0.0)
+    lidar = SimulatedLidar(beams=180, sigma_m=0.0)
     start, velocity = np.array([2.0, 2.0, 0.4]), np.array([0.6, 0.1, 1.2])
 
     def pose_at(t):
@@ -96,7 +101,7 @@ def test_deskew_against_a_slow_twin_and_against_the_world(rng):
     scan = prepared(start, lidar, velocity, pose_at)
     seen = se2.transform(start, scan.points_body)
     stretched = se2.transform(start, prepared(start, lidar, (0, 0, 0), pose_at).points_body)
-    truth = se2.transform(start, prepared(start, Lidar(beams=3600, sigma_m=0.0)).points_body)
+    truth = se2.transform(start, prepared(start, SimulatedLidar(beams=3600, sigma_m=0.0)).points_body)
 
     def distance(points):
         return np.min(np.hypot(*(points[:, None] - truth[None]).transpose(2, 0, 1)), axis=1)
@@ -106,7 +111,7 @@ def test_deskew_against_a_slow_twin_and_against_the_world(rng):
 
 
 def test_tangents_lie_along_walls():
-    scan = prepared(np.array([2.0, 2.0, 0.0]), Lidar(sigma_m=0.005))
+    scan = prepared(np.array([2.0, 2.0, 0.0]), SimulatedLidar(sigma_m=0.005))
     on_floor_wall = np.abs(scan.points_body[:, 1] + 2.0) < 0.03
     known = np.hypot(*scan.tangents.T) > 0
     tangents = scan.tangents[on_floor_wall & known]
@@ -141,14 +146,14 @@ def test_surfel_of_merged_cells_against_numpy(rng):
 
 
 def test_normal_equations_against_numpy(room, rng):
-    tables, T, scale2 = room.tables(), np.array([2.52, 2.05, 0.52]), 10.0
+    tables, pose, scale2 = room.tables(), np.array([2.52, 2.05, 0.52]), 10.0
     scan = prepared(np.array([2.5, 2.1, 0.5]))
     features = scan.features()
     H, g = np.empty((3, 3)), np.empty(3)
     weights, _, cost = accumulate(
         features,
         scan.origin_body,
-        T,
+        pose,
         tables.nearest,
         tables.means,
         tables.omegas,
@@ -161,16 +166,16 @@ def test_normal_equations_against_numpy(room, rng):
         g,
     )
     H2, g2, w2, c2 = np.zeros((3, 3)), np.zeros(3), 0.0, 0.0
-    R = np.array([[math.cos(T[2]), -math.sin(T[2])], [math.sin(T[2]), math.cos(T[2])]])
+    R = np.array([[math.cos(pose[2]), -math.sin(pose[2])], [math.sin(pose[2]), math.cos(pose[2])]])
     for x, y, tx, ty, half in features:
-        p = R @ [x, y] + T[:2]
+        p = R @ [x, y] + pose[:2]
         row, col = int(np.floor(p[1] / 0.05)) - tables.row0, int(np.floor(p[0] / 0.05)) - tables.col0
         k = tables.nearest[row, col]
-        if k < 0 or (T[:2] - p) @ tables.views[k] < -0.3 * np.hypot(*(T[:2] - p)):
+        if k < 0 or (pose[:2] - p) @ tables.views[k] < -0.3 * np.hypot(*(pose[:2] - p)):
             continue
         a, b, c = tables.omegas[k]
         W, t = np.array([[a, b], [b, c]]), R @ [tx, ty]
-        S = ALONG2 * np.outer(t, t) if (tx, ty) != (0, 0) else half**2 * np.eye(2)
+        S = TANGENT_VARIANCE_M2 * np.outer(t, t) if (tx, ty) != (0, 0) else half**2 * np.eye(2)
         W = np.linalg.inv(np.eye(2) + W @ S) @ W
         d = p - tables.means[k]
         J = np.column_stack([np.eye(2), R @ [-y, x]])
@@ -198,9 +203,9 @@ def test_refinement_finds_the_pose_within_millimetres(room, dx, dy, dyaw):
     match = refine(
         scan.features(), scan.origin_body, truth + np.array([dx, dy, dyaw]), room.tables(), SETTINGS
     )
-    assert np.hypot(*(match.T_map_body[:2] - truth[:2])) < 0.01
-    assert abs(match.T_map_body[2] - truth[2]) < 0.004
-    assert match.share > 0.9
+    assert np.hypot(*(match.pose_target_body[:2] - truth[:2])) < 0.01
+    assert abs(match.pose_target_body[2] - truth[2]) < 0.004
+    assert match.inlier_ratio > 0.9
 
 
 def test_search_against_brute_force_and_from_far(room):
@@ -217,12 +222,12 @@ def test_search_against_brute_force_and_from_far(room):
             tables.field[cells[:, 1], cells[:, 0]].mean() / 255.0, rel=1e-5
         )
     best = search(scan.features(), truth + np.array([0.5, -0.4, 0.3]), tables, 0.8, 0.5)
-    assert min(np.hypot(*(T[:2] - truth[:2])) for _, T in best) < 0.12
+    assert min(np.hypot(*(pose[:2] - truth[:2])) for _, pose in best) < 0.12
 
 
 def test_a_corridor_gives_no_information_along_it():
     walls = np.array([[-40, 0, 40, 0], [-40, 2, 40, 2.0]])
-    surfels, lidar = SurfelMap(SETTINGS), Lidar(range_max=8.0)
+    surfels, lidar = SurfelMap(SETTINGS), SimulatedLidar(range_max=8.0)
     for x in np.linspace(0, 2, 15):
         pose = np.array([x, 1.0, 0.0])
         a, inc, _, low, high = lidar.arguments()
@@ -275,7 +280,7 @@ def test_a_map_survives_freezing_and_growing(room):
     scan = prepared(np.array([2.5, 2.2, 0.5]))
     a = refine(scan.features(), scan.origin_body, np.array([2.55, 2.2, 0.5]), live, SETTINGS)
     b = refine(scan.features(), scan.origin_body, np.array([2.55, 2.2, 0.5]), cold, SETTINGS)
-    assert np.hypot(*(a.T_map_body - b.T_map_body)[:2]) < 0.003
+    assert np.hypot(*(a.pose_target_body - b.pose_target_body)[:2]) < 0.003
     hits, misses = frozen.counts()
     assert hits.sum() == room.hits.sum()
     assert misses.sum() == room.misses.sum()

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from beamsplat.services.localization.lidar2d import se2
+from beamsplat.services.localization.lidar2d.job_runner import JobRunner
 from beamsplat.services.localization.lidar2d.metrics import trajectory_errors
-from beamsplat.services.localization.lidar2d.offline import JobRunner
 from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
 from beamsplat.services.localization.lidar2d.slam import LidarSlam
 from beamsplat.services.localization.lidar2d.state import MANIFEST, MapStateError
-from tests.services.localization.world import WALLS, Drive, Lidar, box, wheels
+from tests.services.localization.world import WALLS, SimulatedDrive, SimulatedLidar, box, wheels
 
 NS = 1_000_000_000
 SETTINGS = LidarSlamSettings()
@@ -46,7 +46,7 @@ def run(
 
 @pytest.fixture(scope="module")
 def mapped():
-    drive, lidar = Drive(laps=1), Lidar(seed=1)
+    drive, lidar = SimulatedDrive(laps=1), SimulatedLidar(seed=1)
     slam = LidarSlam(SETTINGS, np.eye(4))
     results, truth = run(slam, drive, lidar, odometry=wheels(drive, np.arange(0, drive.duration_s, 0.02)))
     return slam, results, truth
@@ -61,7 +61,7 @@ def test_pose_and_map_with_odometry(mapped):
     assert errors.ate_first_pose_rmse_m < 0.015
     assert errors.yaw_rmse_rad < 0.003
     assert trajectory_errors(online, truth).ate_first_pose_rmse_m < 0.02
-    smooth = np.array([r.T_odom_body for r in results])
+    smooth = np.array([r.pose_odom_body for r in results])
     steps = se2.between_many(smooth[:-1], smooth[1:])
     assert np.hypot(steps[:, 0], steps[:, 1]).max() < 0.1  # 0.5 m/s at 10 Hz: no jumps
     assert np.sqrt(results[-1].covariance[0, 0]) < 0.02
@@ -70,10 +70,10 @@ def test_pose_and_map_with_odometry(mapped):
 def test_grid_shows_the_walls(mapped):
     slam, _, truth = mapped
     grid = slam.grid(0.05)
-    T_world_map = se2.compose(truth[0], se2.inverse(slam.trajectory()[1][0]))
+    pose_world_map = se2.compose(truth[0], se2.inverse(slam.trajectory()[1][0]))
     rows, cols = np.nonzero(grid.values >= 65)
     cells = np.column_stack([grid.origin_x_m + (cols + 0.5) * 0.05, grid.origin_y_m + (rows + 0.5) * 0.05])
-    world = se2.transform(T_world_map, cells)
+    world = se2.transform(pose_world_map, cells)
     a, b = WALLS[:, None, :2], WALLS[:, None, 2:]
     f = np.clip(((world - a) * (b - a)).sum(-1) / ((b - a) ** 2).sum(-1), 0, 1)
     distance = np.hypot(*(world - (a + f[..., None] * (b - a))).transpose(2, 0, 1)).min(axis=0)
@@ -85,10 +85,13 @@ def test_poses_between_scans(mapped):
     slam, results, _ = mapped
     a, b = results[-2], results[-1]
     middle = slam.pose_at((a.stamp_ns + b.stamp_ns) // 2)
-    assert np.allclose(middle.T_odom_body[:2], (a.T_odom_body + b.T_odom_body)[:2] / 2, atol=1e-3)
+    assert np.allclose(middle.pose_odom_body[:2], (a.pose_odom_body + b.pose_odom_body)[:2] / 2, atol=1e-3)
     assert slam.pose_at(b.stamp_ns).extrapolated_s == 0.0
     ahead = slam.pose_at(b.stamp_ns + NS // 10)
-    step, last = se2.between(b.T_odom_body, ahead.T_odom_body), se2.between(a.T_odom_body, b.T_odom_body)
+    step, last = (
+        se2.between(b.pose_odom_body, ahead.pose_odom_body),
+        se2.between(a.pose_odom_body, b.pose_odom_body),
+    )
     assert np.allclose(step, last, atol=0.02)
     assert slam.pose_at(b.stamp_ns + NS) is None
     assert slam.pose_at(results[0].stamp_ns - 1) is None
@@ -97,13 +100,13 @@ def test_poses_between_scans(mapped):
 @pytest.mark.parametrize(
     "lidar",
     [
-        Lidar(beams=180, fov=np.pi, rate_hz=5.0, sweep=False, seed=2),
-        Lidar(beams=1440, rate_hz=10, seed=3, sigma_m=0.02),
+        SimulatedLidar(beams=180, fov=np.pi, rate_hz=5.0, sweep=False, seed=2),
+        SimulatedLidar(beams=1440, rate_hz=10, seed=3, sigma_m=0.02),
     ],
     ids=["180 beams of a half turn at 5 Hz", "1440 beams"],
 )
 def test_without_odometry(lidar):
-    drive = Drive(speed_m_s=0.4)
+    drive = SimulatedDrive(speed_m_s=0.4)
     lidar.dt = 0.0 if lidar.beams == 180 else lidar.dt
     slam = LidarSlam(SETTINGS, np.eye(4))
     _, truth = run(slam, drive, lidar, end_s=40.0)
@@ -111,7 +114,7 @@ def test_without_odometry(lidar):
 
 
 def test_odometry_that_lies_does_no_harm():
-    drive, lidar = Drive(), Lidar(beams=240, seed=4)
+    drive, lidar = SimulatedDrive(), SimulatedLidar(beams=240, seed=4)
     ticks = np.arange(0, drive.duration_s, 0.02)
     odometry = wheels(drive, ticks)
     odometry[500:700] = odometry[500]  # frozen for four seconds, then it jumps
@@ -126,14 +129,24 @@ def test_threads_and_no_threads_give_the_same_bytes():
     outcomes = []
     for threaded in (False, True):
         slam = LidarSlam(SETTINGS, np.eye(4))
-        run(slam, Drive(speed_m_s=1.0), Lidar(beams=180, seed=5), threaded=threaded, end_s=25.0)
+        run(
+            slam,
+            SimulatedDrive(speed_m_s=1.0),
+            SimulatedLidar(beams=180, seed=5),
+            threaded=threaded,
+            end_s=25.0,
+        )
         _, final, online = slam.trajectory()
         outcomes.append((final.tobytes(), online.tobytes(), slam.grid().values.tobytes()))
     assert outcomes[0] == outcomes[1]
 
 
 def test_a_result_that_is_overdue_is_an_error_not_a_different_map():
-    slam, drive, lidar = LidarSlam(SETTINGS, np.eye(4)), Drive(speed_m_s=1.0), Lidar(beams=120)
+    slam, drive, lidar = (
+        LidarSlam(SETTINGS, np.eye(4)),
+        SimulatedDrive(speed_m_s=1.0),
+        SimulatedLidar(beams=120),
+    )
 
     def drive_on():
         for k in range(250):
@@ -144,7 +157,7 @@ def test_a_result_that_is_overdue_is_an_error_not_a_different_map():
 
 
 def test_rubbish_is_refused_and_changes_nothing(mapped):
-    drive, lidar = Drive(), Lidar(beams=180, seed=6)
+    drive, lidar = SimulatedDrive(), SimulatedLidar(beams=180, seed=6)
     slam = LidarSlam(SETTINGS, np.eye(4))
     args = lidar.arguments()
 
@@ -153,7 +166,7 @@ def test_rubbish_is_refused_and_changes_nothing(mapped):
 
     for k in range(20):
         assert good(k).status == "ok"
-    nodes, stamp = len(slam.back.nodes), START + 20 * NS // 10 - 1
+    nodes, stamp = len(slam.pose_graph.nodes), START + 20 * NS // 10 - 1
     for ranges in (
         np.full(180, np.inf),
         np.full(180, np.nan),
@@ -170,18 +183,18 @@ def test_rubbish_is_refused_and_changes_nothing(mapped):
     assert slam.add_scan(
         stamp + 9, lidar.scan(drive, 2.0), args[0], float("nan"), *args[2:]
     ).status.startswith("rejected")
-    assert len(slam.back.nodes) == nodes
+    assert len(slam.pose_graph.nodes) == nodes
     for k in range(21, 30):
         assert good(k).status == "ok"
 
 
 def test_the_lidar_stops_and_the_clock_is_set_back():
-    drive, lidar = Drive(), Lidar(beams=240, seed=7)
+    drive, lidar = SimulatedDrive(), SimulatedLidar(beams=240, seed=7)
     slam, odometry = LidarSlam(SETTINGS, np.eye(4)), wheels(drive, np.arange(0, drive.duration_s, 0.02))
     results, truth = run(slam, drive, lidar, end_s=10.0, odometry=odometry)
     later, more = run(slam, drive, lidar, start_s=15.0, end_s=25.0, odometry=odometry)  # 5 s without a scan
     assert {r.status for r in later} <= {"ok", "relocalizing"}
-    both, true = np.array([r.T_odom_body for r in results + later]), np.vstack([truth, more])
+    both, true = np.array([r.pose_odom_body for r in results + later]), np.vstack([truth, more])
     assert trajectory_errors(both, true).ate_first_pose_rmse_m < 0.05
     back, _ = run(slam, drive, lidar, start_s=25.0, end_s=28.0, offset_s=-3600.0)
     assert [r.status.startswith("rejected") for r in back[:6]] == [True] * 4 + [False] * 2
@@ -189,7 +202,7 @@ def test_the_lidar_stops_and_the_clock_is_set_back():
 
 
 def test_people_are_marked_and_stay_out_of_the_map():
-    drive, lidar = Drive(speed_m_s=0.3), Lidar(beams=360, seed=8)
+    drive, lidar = SimulatedDrive(speed_m_s=0.3), SimulatedLidar(beams=360, seed=8)
 
     def person(t):
         return box(2.4 + 0.9 * np.sin(0.7 * t), 2.6 + 0.4 * np.cos(0.5 * t), 0.35)
@@ -198,13 +211,13 @@ def test_people_are_marked_and_stay_out_of_the_map():
     run(slam, drive, lidar, end_s=8.0)
     results, truth = run(slam, drive, lidar, start_s=8.1, end_s=16.0, walls_at=person)
     marked = on_person = false = others = 0
-    clean = Lidar(beams=360, sigma_m=0.0)
+    clean = SimulatedLidar(beams=360, sigma_m=0.0)
     for k, result in enumerate(results):
         t = 8.1 + k * 0.1
         without, with_ = clean.scan(drive, t), clean.scan(drive, t, np.vstack([WALLS, person(t)]))
         hit = without - with_ > 0.3
-        marked, on_person = marked + (result.moving & hit).sum(), on_person + hit.sum()
-        false, others = false + (result.moving & ~hit).sum(), others + (~hit).sum()
+        marked, on_person = marked + (result.dynamic & hit).sum(), on_person + hit.sum()
+        false, others = false + (result.dynamic & ~hit).sum(), others + (~hit).sum()
     assert on_person > 200
     assert marked / on_person > 0.9
     assert false / others < 0.01
@@ -213,15 +226,15 @@ def test_people_are_marked_and_stay_out_of_the_map():
 
 def test_relocalization_without_a_guess(mapped, rng):
     slam, _, truth = mapped
-    drive, lidar = Drive(), Lidar(beams=360, seed=9, sweep=False)
-    T_world_map = se2.compose(truth[0], se2.inverse(slam.trajectory()[1][0]))
+    drive, lidar = SimulatedDrive(), SimulatedLidar(beams=360, seed=9, sweep=False)
+    pose_world_map = se2.compose(truth[0], se2.inverse(slam.trajectory()[1][0]))
     args, sure = lidar.arguments(), 0
     for t in rng.uniform(1, drive.duration_s - 1, 12):
         pose = drive(np.array([t]))[0] + [0.05, -0.05, rng.uniform(-3, 3)]
         answer = slam.relocalize(
             lidar.scan(lambda _, p=pose: np.tile(p, (360, 1)), 0.0), args[0], args[1], *args[3:]
         )
-        error = se2.between(pose, se2.compose(T_world_map, answer.T_map_body))
+        error = se2.between(pose, se2.compose(pose_world_map, answer.pose_map_body))
         assert np.hypot(error[0], error[1]) < 0.10
         assert abs(error[2]) < np.radians(2.0)
         sure += answer.confidence > 0.5
@@ -240,12 +253,12 @@ def test_save_load_and_go_on(mapped, tmp_path):
     assert again.anchors().keys() == slam.anchors().keys()
     assert np.allclose(again.trajectory()[1], slam.trajectory()[1])
     assert np.array_equal(again.grid().values, slam.grid().values)
-    drive, lidar = Drive(), Lidar(beams=360, seed=10)
+    drive, lidar = SimulatedDrive(), SimulatedLidar(beams=360, seed=10)
     results, more = run(again, drive, lidar, start_s=6.0, end_s=14.0, offset_s=1000.0)
     assert results[0].status == "relocalizing"
     assert results[-1].status == "ok"
-    T_world_map = se2.compose(truth[0], se2.inverse(slam.trajectory()[1][0]))
-    placed = se2.compose_many(T_world_map, again.trajectory()[1][-len(more) :])
+    pose_world_map = se2.compose(truth[0], se2.inverse(slam.trajectory()[1][0]))
+    placed = se2.compose_many(pose_world_map, again.trajectory()[1][-len(more) :])
     assert np.hypot(*(placed - more)[:, :2].T).max() < 0.08
 
 
@@ -253,20 +266,22 @@ def test_localization_only_leaves_the_map_alone(mapped, tmp_path):
     slam, _, truth = mapped
     slam.save(tmp_path)
     again = LidarSlam.load(tmp_path, SETTINGS, np.eye(4), localize_only=True)
-    results, more = run(again, Drive(), Lidar(beams=360, seed=11), start_s=20.0, end_s=40.0, offset_s=1000.0)
+    results, more = run(
+        again, SimulatedDrive(), SimulatedLidar(beams=360, seed=11), start_s=20.0, end_s=40.0, offset_s=1000.0
+    )
     assert results[-1].status == "ok"
-    for i, T in slam.anchors().items():
-        assert np.allclose(again.anchors()[i], T, atol=1e-4)
-    assert len(again.back.submaps) <= len(slam.back.submaps) + 5
-    T_world_map = se2.compose(truth[0], se2.inverse(slam.trajectory()[1][0]))
+    for i, pose in slam.anchors().items():
+        assert np.allclose(again.anchors()[i], pose, atol=1e-4)
+    assert len(again.pose_graph.submaps) <= len(slam.pose_graph.submaps) + 5
+    pose_world_map = se2.compose(truth[0], se2.inverse(slam.trajectory()[1][0]))
     ok = np.array([r.status == "ok" for r in results])
-    online = np.array([se2.compose(r.T_map_odom, r.T_odom_body) for r in results])[ok]
-    placed = se2.compose_many(T_world_map, online)
+    online = np.array([se2.compose(r.pose_map_odom, r.pose_odom_body) for r in results])[ok]
+    placed = se2.compose_many(pose_world_map, online)
     assert np.sqrt(np.mean(np.hypot(*(placed - more[ok])[:, :2].T) ** 2)) < 0.03
 
 
 def test_a_kidnapped_robot_finds_itself_again():
-    drive, lidar = Drive(), Lidar(beams=360, seed=12)
+    drive, lidar = SimulatedDrive(), SimulatedLidar(beams=360, seed=12)
     slam = LidarSlam(SETTINGS, np.eye(4))
     _, truth = run(slam, drive, lidar, end_s=drive.duration_s - 1.0)
     results, more = run(
@@ -276,8 +291,8 @@ def test_a_kidnapped_robot_finds_itself_again():
     assert "relocalizing" in statuses
     assert statuses[-1] == "ok"
     poses = slam.trajectory()[1]
-    T_world_map = se2.compose(truth[0], se2.inverse(poses[0]))
-    placed = se2.compose_many(T_world_map, poses[-50:])
+    pose_world_map = se2.compose(truth[0], se2.inverse(poses[0]))
+    placed = se2.compose_many(pose_world_map, poses[-50:])
     assert np.hypot(*(placed - more[-50:])[:, :2].T).max() < 0.1
 
 

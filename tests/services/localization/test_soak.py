@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from beamsplat.services.localization.lidar2d.offline import JobRunner
+from beamsplat.services.localization.lidar2d.job_runner import JobRunner
 from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
 from beamsplat.services.localization.lidar2d.slam import LidarSlam
-from tests.services.localization.world import Drive, Lidar
+from tests.services.localization.world import SimulatedDrive, SimulatedLidar
 
 RATE_HZ = 10.0
 
@@ -21,9 +21,9 @@ def resident_mb() -> float:
     return pages * 4096 / 1e6
 
 
-def lap_of_ranges(lidar: Lidar) -> np.ndarray:
-    """Noise-free ranges float32 [T, N] of one lap; the middle one of three, so that its ends meet."""
-    drive, quiet = Drive(laps=3), Lidar(beams=lidar.beams, sigma_m=0.0)
+def lap_of_ranges(lidar: SimulatedLidar) -> np.ndarray:
+    """Noise-free ranges float32 [pose, N] of one lap; the middle one of three, so that its ends meet."""
+    drive, quiet = SimulatedDrive(laps=3), SimulatedLidar(beams=lidar.beams, sigma_m=0.0)
     lap_s = drive.duration_s / 3.0
     times = lap_s + np.arange(round(lap_s * RATE_HZ)) / RATE_HZ
     return np.array([quiet.scan(drive, t) for t in times])
@@ -31,7 +31,7 @@ def lap_of_ranges(lidar: Lidar) -> np.ndarray:
 
 def drive_for(scans: int, parts: int = 20) -> tuple[np.ndarray, np.ndarray, LidarSlam]:
     """CPU milliseconds a scan and resident MB at the end of each part."""
-    lidar, rng = Lidar(), np.random.default_rng(0)
+    lidar, rng = SimulatedLidar(), np.random.default_rng(0)
     lap = lap_of_ranges(lidar)
     slam = LidarSlam(LidarSlamSettings(), np.eye(4))
     cost_ms, memory_mb, began = [], [], time.process_time()
@@ -55,7 +55,7 @@ def drive_for(scans: int, parts: int = 20) -> tuple[np.ndarray, np.ndarray, Lida
 def test_eight_hours_in_the_same_rooms():
     cost_ms, memory_mb, slam = drive_for(8 * 3600 * int(RATE_HZ))
     print(
-        f"\nms a scan: {np.round(cost_ms, 2)}\nMB: {np.round(memory_mb)}\nsubmaps: {len(slam.back.submaps)}"
+        f"\nms a scan: {np.round(cost_ms, 2)}\nMB: {np.round(memory_mb)}\nsubmaps: {len(slam.pose_graph.submaps)}"
     )
     # The first quarter fills the rooms; after it only the poses of the scans themselves may be added.
     later = slice(len(cost_ms) // 4, None)

@@ -48,7 +48,7 @@ def box(x: float, y: float, size: float) -> np.ndarray:
     return np.array([[a, b, c, b], [c, b, c, d], [c, d, a, d], [a, d, a, b]])
 
 
-class Lidar:
+class SimulatedLidar:
     """A full turn (or less) of beams, each at its own time."""
 
     def __init__(
@@ -91,7 +91,7 @@ LOOP = np.array(
 )
 
 
-class Drive:
+class SimulatedDrive:
     """A smooth path through the flat at constant speed; `laps` times round."""
 
     def __init__(self, speed_m_s=0.5, laps=1):

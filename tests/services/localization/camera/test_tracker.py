@@ -203,13 +203,13 @@ def test_thumbnails_ignore_brightness_and_covisibility_is_intersection_over_unio
 
 @pytest.mark.slow
 def test_house_with_recorded_depth(shared_dir):
-    from beamsplat.tools.evaluation.dataset import load
+    from beamsplat.tools.evaluation.dataset import load_dataset
 
-    recording = load(shared_dir / "data" / "house_a")
+    recording = load_dataset(shared_dir / "data" / "house_a")
     tracker = CameraTracker(recording.camera, recording.T_body_camera)
     T_world_map, errors = None, []
     for i in range(120):
-        s = recording.shots[i]
+        s = recording.posed_images[i]
         T_world_body = s.T_map_camera @ inverse(recording.T_body_camera)
         result = tracker.track(s.stamp_ns, recording.image(i))
         depth = recording.true_depth(i)

@@ -13,7 +13,7 @@ from beamsplat.services.localization.lidar2d.node import LidarLocalization
 from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
 from beamsplat.services.localization.lidar2d.slam import LidarSlam
 from beamsplat.services.localization.lidar2d.state import MANIFEST, map_uuid
-from tests.services.localization.world import Drive, Lidar
+from tests.services.localization.world import SimulatedDrive, SimulatedLidar
 from tests.services.mapping import room_drive as r
 from tests.services.mapping.session.maps import SECOND, handle, make_node, message
 from tests.services.mapping.session.test_session_cli import run
@@ -23,7 +23,7 @@ def localized(folder, seed, resume=None, scans=40):
     """The last anchors of a few seconds' drive, whose state is saved in `folder`."""
     node = LidarLocalization(LidarLocalization.Config(kind="lidar", save=folder, resume=resume))
     node.configure()
-    lidar, path, sent = Lidar(seed=seed), Drive(), []
+    lidar, path, sent = SimulatedLidar(seed=seed), SimulatedDrive(), []
     angle_min, increment, dt, least, most = lidar.arguments()
     list(node.handle("rig", Rig(stamp_ns=r.T0, lidar=LidarModel(T_body_lidar=np.eye(4)))))
     for number in range(scans):

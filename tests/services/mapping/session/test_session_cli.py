@@ -13,12 +13,12 @@ from beamsplat.common.mapfiles.session import SessionFolder
 from beamsplat.common.mapfiles.store import GaussianStore
 from beamsplat.common.raster.rasterizer import Rasterizer
 from beamsplat.services.localization.lidar2d import se2
-from beamsplat.services.localization.lidar2d.merge import find_overlap, merge_into
+from beamsplat.services.localization.lidar2d.merge import find_alignment, merge_into
 from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
 from beamsplat.services.localization.lidar2d.slam import LidarSlam
 from beamsplat.tools.cli.main import app
 from beamsplat.tools.sessions.edit import merged, pruned, summary_of, with_anchors
-from tests.services.localization.world import WALLS, Drive, Lidar
+from tests.services.localization.world import WALLS, SimulatedDrive, SimulatedLidar
 from tests.services.mapping import room_drive as r
 from tests.services.mapping.session.maps import SECOND, feed, make_node, message
 
@@ -140,10 +140,10 @@ def test_pruning_leaves_what_is_seen(drives, tmp_path):
 
 @pytest.fixture(scope="module")
 def lidar_maps():
-    """Two drives through the same flat, the second starting elsewhere: (SLAM, true T_world_map) of each."""
-    drive, out = Drive(), []
+    """Two drives through the same flat, the second starting elsewhere: (SLAM, true pose_world_map) of each."""
+    drive, out = SimulatedDrive(), []
     for start_s, end_s, seed in ((0.0, 36.0, 1), (14.0, 40.0, 2)):
-        lidar = Lidar(seed=seed)
+        lidar = SimulatedLidar(seed=seed)
         slam = LidarSlam(LidarSlamSettings(), np.eye(4))
         for number in range(int((end_s - start_s) * 10)):
             t = start_s + number * 0.1
@@ -155,8 +155,8 @@ def lidar_maps():
         slam.finish()
         times_s = start_s + np.arange(len(slam.trajectory()[0])) * 0.1
         half = len(times_s) // 2
-        T_world_map = se2.compose(drive(times_s)[half], se2.inverse(slam.trajectory()[1][half]))
-        out.append((slam, T_world_map))
+        pose_world_map = se2.compose(drive(times_s)[half], se2.inverse(slam.trajectory()[1][half]))
+        out.append((slam, pose_world_map))
     return out
 
 
@@ -170,12 +170,12 @@ def copies(lidar_maps, tmp_path):
 def test_a_second_drive_finds_its_place_in_the_first_and_closes_loops_with_it(lidar_maps, tmp_path):
     a, b = copies(lidar_maps, tmp_path)
     true = se2.between(lidar_maps[0][1], lidar_maps[1][1])
-    found = find_overlap(a, b)
-    off = se2.between(true, found.T_a_b)
+    found = find_alignment(a, b)
+    off = se2.between(true, found.pose_a_b)
     assert np.hypot(*off[:2]) < 0.1
     assert abs(off[2]) < np.radians(1.0)
     stamps = len(a.record.stamps_ns) + len(b.record.stamps_ns)
-    loops = merge_into(a, b, found.T_a_b, offset=100)
+    loops = merge_into(a, b, found.pose_a_b, offset=100)
     assert loops >= 3
     grid = a.grid()
     rows, cols = np.nonzero(grid.values >= 65)
@@ -194,7 +194,7 @@ def test_a_second_drive_finds_its_place_in_the_first_and_closes_loops_with_it(li
 @pytest.mark.slow
 def test_a_map_of_somewhere_else_is_not_placed(lidar_maps, tmp_path):
     a, _ = copies(lidar_maps, tmp_path)
-    lidar, slam = Lidar(seed=9), LidarSlam(LidarSlamSettings(), np.eye(4))
+    lidar, slam = SimulatedLidar(seed=9), LidarSlam(LidarSlamSettings(), np.eye(4))
     walls = np.array([[0, 0, 14, 0], [14, 0, 14, 1.7], [14, 1.7, 0, 1.7], [0, 1.7, 0, 0]], float)
     angle_min, increment, dt, least, most = lidar.arguments()
     for number in range(80):
@@ -202,7 +202,7 @@ def test_a_map_of_somewhere_else_is_not_placed(lidar_maps, tmp_path):
         slam.add_scan(number * 10**8, lidar.scan(at, 0.0, walls), angle_min, increment, dt, least, most)
     slam.finish()
     slam.save(tmp_path / "hall")
-    assert find_overlap(a, LidarSlam.load(tmp_path / "hall", LidarSlamSettings(), np.eye(4))) is None
+    assert find_alignment(a, LidarSlam.load(tmp_path / "hall", LidarSlamSettings(), np.eye(4))) is None
 
 
 @pytest.mark.slow

@@ -8,17 +8,17 @@ import numpy as np
 
 from beamsplat.common.compiled import kernel
 
-FREE_SCANS = 5  # so many keynodes must have looked through a cell
+MIN_FREE_SCANS = 5  # so many keynodes must have looked through a cell
 CLEARANCE_M = 0.12  # a return this close to a known surface belongs to it
-SOLID = 4  # a surface is one while it is hit at least once for so many beams that went through
-BODY_M = 1.2  # what is no wider than this moves as a whole,
-BODY_SHARE = 0.25  # if so many of its returns do
+MAX_MISSES_PER_HIT = 4  # a surface is one while it is hit at least once for so many beams that went through
+MAX_OBJECT_WIDTH_M = 1.2  # what is no wider than this moves as a whole,
+MIN_DYNAMIC_RATIO = 0.25  # if so many of its returns do
 
 
 @kernel
 def contradicts_free_space(
     points: np.ndarray,  # float64 [M, 2] body frame
-    T: np.ndarray,  # float64 [3] T_map_body
+    pose: np.ndarray,  # float64 [3] pose_map_body
     nearest: np.ndarray,
     means: np.ndarray,
     hits: np.ndarray,
@@ -30,10 +30,10 @@ def contradicts_free_space(
 ) -> None:
     """A return is on something that was not there: its cell and all around it were seen free often, hit
     hardly ever, and no surface is near."""
-    c, s = math.cos(T[2]), math.sin(T[2])
+    c, s = math.cos(pose[2]), math.sin(pose[2])
     for i in range(points.shape[0]):
         out[i] = False
-        x, y = T[0] + c * points[i, 0] - s * points[i, 1], T[1] + s * points[i, 0] + c * points[i, 1]
+        x, y = pose[0] + c * points[i, 0] - s * points[i, 1], pose[1] + s * points[i, 0] + c * points[i, 1]
         r, q = math.floor(y / cell_m) - row0, math.floor(x / cell_m) - col0
         if r < 1 or q < 1 or r >= hits.shape[0] - 1 or q >= hits.shape[1] - 1:
             continue
@@ -42,29 +42,29 @@ def contradicts_free_space(
             # What a mover left behind before it was found out has been looked through since.
             kr, kq = math.floor(means[k, 1] / cell_m) - row0, math.floor(means[k, 0] / cell_m) - col0
             known = 0 <= kr < hits.shape[0] and 0 <= kq < hits.shape[1]
-            if known and SOLID * int(hits[kr, kq]) >= int(misses[kr, kq]):
+            if known and MAX_MISSES_PER_HIT * int(hits[kr, kq]) >= int(misses[kr, kq]):
                 continue
         free = True
         for rr in range(r - 1, r + 2):
             for qq in range(q - 1, q + 2):
-                if misses[rr, qq] < FREE_SCANS or 8 * int(hits[rr, qq]) > int(misses[rr, qq]):
+                if misses[rr, qq] < MIN_FREE_SCANS or 8 * int(hits[rr, qq]) > int(misses[rr, qq]):
                     free = False
         out[i] = free
 
 
 @kernel
 def grow_along_beams(
-    moving: np.ndarray,  # bool [M]
+    dynamic: np.ndarray,  # bool [M]
     points: np.ndarray,  # float64 [M, 2] in beam order
     beams: np.ndarray,  # int32 [M]
     gap_m: float,
     out: np.ndarray,  # out bool [M]
 ) -> None:
-    """The edge of a moving thing touches cells that are not surely free: neighbours of a moving return on the
+    """The edge of a dynamic thing touches cells that are not surely free: neighbours of a dynamic return on the
     same object (next beam, close by) move with it if at least two returns on it were found to move."""
-    m = moving.shape[0]
+    m = dynamic.shape[0]
     for i in range(m):
-        out[i] = moving[i]
+        out[i] = dynamic[i]
     for direction in (1, -1):
         run = 0
         grown = 0
@@ -78,18 +78,18 @@ def grow_along_beams(
             )
             if not joined:
                 run, grown = 0, 0
-            if moving[i]:
+            if dynamic[i]:
                 run, grown = run + 1, 0
             elif joined and run >= 2 and grown < 3:
                 out[i] = True
                 grown += 1
             else:
                 run = 0
-    _whole_bodies(points, beams, gap_m, out)
+    _mark_whole_objects(points, beams, gap_m, out)
 
 
 @kernel
-def _whole_bodies(points: np.ndarray, beams: np.ndarray, gap_m: float, out: np.ndarray) -> None:
+def _mark_whole_objects(points: np.ndarray, beams: np.ndarray, gap_m: float, out: np.ndarray) -> None:
     """Small connected things of which a good part moves do so altogether."""
     m = out.shape[0]
     first = 0
@@ -100,9 +100,9 @@ def _whole_bodies(points: np.ndarray, beams: np.ndarray, gap_m: float, out: np.n
         ):
             continue
         width = math.hypot(points[i - 1, 0] - points[first, 0], points[i - 1, 1] - points[first, 1])
-        moving = 0
+        dynamic = 0
         for k in range(first, i):
-            moving += out[k]
-        if width < BODY_M and moving >= max(2.0, BODY_SHARE * (i - first)):
+            dynamic += out[k]
+        if width < MAX_OBJECT_WIDTH_M and dynamic >= max(2.0, MIN_DYNAMIC_RATIO * (i - first)):
             out[first:i] = True
         first = i

@@ -11,46 +11,46 @@ import numpy as np
 
 from beamsplat.common.compiled import kernel
 from beamsplat.services.localization.lidar2d import se2
-from beamsplat.services.localization.lidar2d.branch_bound import Pyramid, build_pyramid
+from beamsplat.services.localization.lidar2d.branch_bound import SearchPyramid, build_pyramid
 from beamsplat.services.localization.lidar2d.graph_kernels import invert3
-from beamsplat.services.localization.lidar2d.pose_graph import Edges
+from beamsplat.services.localization.lidar2d.graph_optimisation import ConstraintArrays
 from beamsplat.services.localization.lidar2d.scan import PreparedScan
 from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
 from beamsplat.services.localization.lidar2d.surfel_map import FrozenMap, MatchTables
 
 
 @dataclass(frozen=True)
-class KeyScan:
+class NodeScan:
     """The returns of one keynode, body frame, small types."""
 
     points: np.ndarray  # float32 [M, 2]
     tangents: np.ndarray  # float32 [M, 2]
     spacing_m: np.ndarray  # float32 [M]
-    moving: np.ndarray  # bool [M]
+    dynamic: np.ndarray  # bool [M]
     features: np.ndarray  # float32 [K, 5], see PreparedScan.features
     origin: np.ndarray  # float64 [2]
 
     @staticmethod
-    def of(scan: PreparedScan, moving: np.ndarray) -> KeyScan:
-        static = ~moving[scan.match_index]
-        return KeyScan(
+    def of(scan: PreparedScan, dynamic: np.ndarray) -> NodeScan:
+        static = ~dynamic[scan.match_index]
+        return NodeScan(
             scan.points_body.astype(np.float32),
             scan.tangents.astype(np.float32),
             scan.spacing_m.astype(np.float32),
-            moving,
+            dynamic,
             scan.features()[static].astype(np.float32),
             scan.origin_body,
         )
 
 
 @dataclass(frozen=True)
-class Keynode:
+class TrajectoryNode:
     """A scan that entered the map."""
 
     id: int
     stamp_ns: int
-    T_odom_body: np.ndarray  # float64 [3]
-    scan: KeyScan
+    pose_odom_body: np.ndarray  # float64 [3]
+    scan: NodeScan
 
 
 @dataclass
@@ -58,8 +58,8 @@ class Submap:
     """A local map with a pose of its own; the anchor that everything built on it hangs on."""
 
     id: int
-    T_odom_submap: np.ndarray  # float64 [3], where it was started
-    T_map_submap: np.ndarray  # float64 [3], optimised
+    pose_odom_submap: np.ndarray  # float64 [3], where it was started
+    pose_map_submap: np.ndarray  # float64 [3], optimised
     members: list[int] = field(default_factory=list)  # keynode ids
     frozen: FrozenMap | None = None
 
@@ -70,7 +70,7 @@ class Constraint:
 
     submap: int  # submap id
     node: int  # keynode id
-    T_submap_node: np.ndarray  # float64 [3]
+    pose_submap_node: np.ndarray  # float64 [3]
     information: np.ndarray  # float64 [3, 3]
     loop: bool
 
@@ -82,26 +82,26 @@ class TableCache:
         self._reach, self._capacity = reach_cells, capacity
         # Each entry keeps the map it was made from: a submap that was drawn anew has another one.
         self._tables: OrderedDict[int, tuple[FrozenMap, MatchTables]] = OrderedDict()
-        self._pyramids: OrderedDict[int, tuple[FrozenMap, Pyramid]] = OrderedDict()
-        self._world: tuple[object, object] | None = None
+        self._pyramids: OrderedDict[int, tuple[FrozenMap, SearchPyramid]] = OrderedDict()
+        self._global_map: tuple[object, object] | None = None
         self._lock = threading.Lock()
 
     def tables(self, submap: int, frozen: FrozenMap) -> MatchTables:
         """Tables of a submap's frozen map (recomputed if the map was replaced)."""
         return self._get(self._tables, submap, frozen, lambda: frozen.tables(self._reach))
 
-    def pyramid(self, submap: int, frozen: FrozenMap) -> Pyramid:
+    def pyramid(self, submap: int, frozen: FrozenMap) -> SearchPyramid:
         """Search pyramid of a submap's frozen map."""
         return self._get(self._pyramids, submap, frozen, lambda: _pyramid_of(self.tables(submap, frozen)))
 
-    def world(self, key: object, make: Callable[[], object]) -> object:
+    def global_map(self, key: object, make: Callable[[], object]) -> object:
         """The map of everything; only the latest is kept."""
         with self._lock:
-            if self._world is not None and self._world[0] == key:
-                return self._world[1]
+            if self._global_map is not None and self._global_map[0] == key:
+                return self._global_map[1]
         value = make()
         with self._lock:
-            self._world = (key, value)
+            self._global_map = (key, value)
         return value
 
     def _get(self, store: OrderedDict, submap: int, frozen: FrozenMap, make: Callable[[], object]) -> object:
@@ -118,19 +118,21 @@ class TableCache:
         return value
 
 
-def _pyramid_of(tables: MatchTables) -> Pyramid:
+def _pyramid_of(tables: MatchTables) -> SearchPyramid:
     return build_pyramid(tables.field, tables.row0, tables.col0, tables.cell_m)
 
 
-def edges_of(constraints: list[Constraint], submap_row: dict[int, int], node_row: dict[int, int]) -> Edges:
+def constraint_arrays(
+    constraints: list[Constraint], submap_row: dict[int, int], node_row: dict[int, int]
+) -> ConstraintArrays:
     """Edge arrays in the order the solver wants."""
     node = np.array([node_row[c.node] for c in constraints], dtype=np.int32)
     order = np.argsort(node, kind="stable")
     chosen = [constraints[i] for i in order]
-    return Edges(
+    return ConstraintArrays(
         np.array([submap_row[c.submap] for c in chosen], dtype=np.int32),
         node[order],
-        np.array([c.T_submap_node for c in chosen]).reshape(-1, 3),
+        np.array([c.pose_submap_node for c in chosen]).reshape(-1, 3),
         np.array([c.information for c in chosen]).reshape(-1, 3, 3),
         np.array([c.loop for c in chosen], dtype=bool),
     )
@@ -152,7 +154,7 @@ def edge_information(match_information: np.ndarray, sigma_m: float, sigma_rad: f
     return information
 
 
-def link_information(match_information: np.ndarray, settings: LidarSlamSettings) -> np.ndarray:
+def second_submap_information(match_information: np.ndarray, settings: LidarSlamSettings) -> np.ndarray:
     """Information of a keynode's edge into the younger submap, which it was not matched to.
 
     All those edges together tie two neighbouring submaps, by no more than the drift from one to the next; if
@@ -160,19 +162,23 @@ def link_information(match_information: np.ndarray, settings: LidarSlamSettings)
     """
     s = settings
     inner = np.linalg.inv(edge_information(match_information, s.edge_sigma_m, s.edge_sigma_rad))
-    drift = s.submap_keynodes * np.diag([s.link_sigma_m**2, s.link_sigma_m**2, s.link_sigma_rad**2])
+    drift = s.submap_nodes * np.diag(
+        [s.submap_drift_sigma_m**2, s.submap_drift_sigma_m**2, s.submap_drift_sigma_rad**2]
+    )
     return np.linalg.inv(inner + drift)
 
 
-def merged_features(nodes: list[Keynode], centre: Keynode, limit: int = 360) -> np.ndarray:
+def merged_features(nodes: list[TrajectoryNode], centre: TrajectoryNode, limit: int = 360) -> np.ndarray:
     """Features float64 [K, 5] of several keynodes in the body frame of one of them."""
     parts = []
     for node in nodes:
-        T_centre_node = se2.between(centre.T_odom_body, node.T_odom_body)
+        pose_centre_node = se2.between(centre.pose_odom_body, node.pose_odom_body)
         f = node.scan.features.astype(np.float64)
-        turn = np.array([0.0, 0.0, T_centre_node[2]])
+        turn = np.array([0.0, 0.0, pose_centre_node[2]])
         parts.append(
-            np.column_stack([se2.transform(T_centre_node, f[:, :2]), se2.transform(turn, f[:, 2:4]), f[:, 4]])
+            np.column_stack(
+                [se2.transform(pose_centre_node, f[:, :2]), se2.transform(turn, f[:, 2:4]), f[:, 4]]
+            )
         )
     merged = np.concatenate(parts)
     # One return per 10 cm cell: near walls would outvote far ones.

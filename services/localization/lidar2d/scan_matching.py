@@ -12,28 +12,30 @@ from beamsplat.services.localization.lidar2d import se2
 from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
 from beamsplat.services.localization.lidar2d.surfel_map import MatchTables
 
-ALONG2 = 0.3**2  # m^2, along its tangent a return may belong to any part of the surface near it
-OTHER_SIDE = -0.3  # cosine times how much of one mind the views of a surface are
-ANNEAL = (3.0, 2.0, 1.4)  # the outlier scale starts wide and ends at 1
+TANGENT_VARIANCE_M2 = 0.3**2  # m^2, along its tangent a return may belong to any part of the surface near it
+MIN_VIEW_COSINE = -0.3  # cosine times how much of one mind the views of a surface are
+ANNEAL_SCALES = (3.0, 2.0, 1.4)  # the outlier scale starts wide and ends at 1
 
 
 @dataclass(frozen=True)
 class Match:
     """Where a scan lies in a map."""
 
-    T_map_body: np.ndarray  # float64 [3]
+    pose_target_body: np.ndarray  # float64 [3]
     information: np.ndarray  # float64 [3, 3], of the scan alone, axes of the map, yaw about the body
-    share: float  # returns on known surfaces / returns in known space
-    known: float  # returns in known space / all returns
+    inlier_ratio: float  # returns on known surfaces / returns in known space
+    overlap: float  # returns in known space / all returns
     residual_m: float  # robust RMS distance to the surfaces
-    rigid: np.ndarray | None = None  # the information before anything was taken from it, see observability
+    full_information: np.ndarray | None = (
+        None  # the information before anything was taken from it, see observability
+    )
 
 
 @kernel
 def accumulate(
     points: np.ndarray,  # float64 [K, 5] body frame: x, y, tangent x, tangent y, half spacing
     origin: np.ndarray,  # float64 [2] lidar in the body frame
-    T: np.ndarray,  # float64 [3] T_map_body
+    pose: np.ndarray,  # float64 [3] pose_map_body
     nearest: np.ndarray,
     means: np.ndarray,
     omegas: np.ndarray,
@@ -45,7 +47,7 @@ def accumulate(
     H: np.ndarray,  # out float64 [3, 3]
     g: np.ndarray,  # out float64 [3]
 ) -> tuple[float, float, float]:
-    """Normal equations of sum rho(d' Omega d), d = T p - mean, Geman-McClure weights.
+    """Normal equations of sum rho(d' Omega d), d = pose p - mean, Geman-McClure weights.
 
     A return is known across its own surface only: along its tangent (or, where that is unknown, within its
     spacing) it may be anywhere, S = s^2 t t' or s^2 I, and Omega' = (Omega^-1 + S)^-1. Without this a
@@ -54,8 +56,8 @@ def accumulate(
     Returns (sum of weights, number of associated returns, weighted sum of d' Omega d).
     A surface seen from its other side does not count: walls are thin.
     """
-    c, s = math.cos(T[2]), math.sin(T[2])
-    ox, oy = T[0] + c * origin[0] - s * origin[1], T[1] + s * origin[0] + c * origin[1]
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    ox, oy = pose[0] + c * origin[0] - s * origin[1], pose[1] + s * origin[0] + c * origin[1]
     H[:] = 0.0
     g[:] = 0.0
     weights = found = cost = 0.0
@@ -64,7 +66,7 @@ def accumulate(
     for i in range(points.shape[0]):
         px, py = points[i, 0], points[i, 1]
         rx, ry = c * px - s * py, s * px + c * py
-        x, y = T[0] + rx, T[1] + ry
+        x, y = pose[0] + rx, pose[1] + ry
         r, q = math.floor(y * inv) - row0, math.floor(x * inv) - col0
         if r < 0 or q < 0 or r >= rows or q >= cols:
             continue
@@ -72,7 +74,7 @@ def accumulate(
         if k < 0:
             continue
         vx, vy = ox - x, oy - y
-        if vx * views[k, 0] + vy * views[k, 1] < OTHER_SIDE * math.sqrt(vx * vx + vy * vy):
+        if vx * views[k, 0] + vy * views[k, 1] < MIN_VIEW_COSINE * math.sqrt(vx * vx + vy * vy):
             continue
         found += 1.0
         dx, dy = x - means[k, 0], y - means[k, 1]
@@ -80,7 +82,7 @@ def accumulate(
         if points[i, 2] != 0.0 or points[i, 3] != 0.0:
             tx, ty = c * points[i, 2] - s * points[i, 3], s * points[i, 2] + c * points[i, 3]
             vx, vy = a * tx + b * ty, b * tx + d * ty
-            f = ALONG2 / (1.0 + ALONG2 * (tx * vx + ty * vy))
+            f = TANGENT_VARIANCE_M2 / (1.0 + TANGENT_VARIANCE_M2 * (tx * vx + ty * vy))
             a, b, d = a - f * vx * vx, b - f * vx * vy, d - f * vy * vy
         else:
             s2 = points[i, 4] * points[i, 4]
@@ -93,7 +95,7 @@ def accumulate(
         w = root * root
         weights += w
         cost += w * e2
-        # Jacobian of T p: [I, (-ry, rx)]
+        # Jacobian of pose p: [I, (-ry, rx)]
         jx, jy = a * -ry + b * rx, b * -ry + d * rx
         H[0, 0] += w * a
         H[0, 1] += w * b
@@ -138,7 +140,7 @@ def solve3(A: np.ndarray, b: np.ndarray, x: np.ndarray) -> bool:
 def gauss_newton(
     points: np.ndarray,
     origin: np.ndarray,
-    T_start: np.ndarray,
+    start_pose: np.ndarray,
     nearest: np.ndarray,
     means: np.ndarray,
     omegas: np.ndarray,
@@ -146,34 +148,34 @@ def gauss_newton(
     row0: int,
     col0: int,
     cell_m: float,
-    prior_T: np.ndarray,  # float64 [3]
+    prior_pose: np.ndarray,  # float64 [3]
     prior_information: np.ndarray,  # float64 [3, 3], zeros = no prior
     outlier: float,  # units of the surface's standard deviation
-    per_fact: float,  # so many returns count as one independent measurement
+    returns_per_measurement: float,  # so many returns count as one independent measurement
     anneal: np.ndarray,  # float64 [A]
     iterations: int,
-    T: np.ndarray,  # out float64 [3]
+    pose: np.ndarray,  # out float64 [3]
     H: np.ndarray,  # out float64 [3, 3] information of the scan alone
 ) -> tuple[float, float, float]:
     """Iteratively reweighted Gauss-Newton with a robust prior; damped where the scan says nothing."""
     g, A, b, step, e = np.empty(3), np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(3)
-    T[:] = T_start
+    pose[:] = start_pose
     weights = found = cost = 0.0
     for it in range(iterations):
         scale = outlier * (anneal[it] if it < anneal.shape[0] else 1.0)
         weights, found, cost = accumulate(
-            points, origin, T, nearest, means, omegas, views, row0, col0, cell_m, scale * scale, H, g
+            points, origin, pose, nearest, means, omegas, views, row0, col0, cell_m, scale * scale, H, g
         )
-        e[0], e[1], e[2] = T[0] - prior_T[0], T[1] - prior_T[1], se2.wrap(T[2] - prior_T[2])
+        e[0], e[1], e[2] = pose[0] - prior_pose[0], pose[1] - prior_pose[1], se2.wrap(pose[2] - prior_pose[2])
         m2 = 0.0
         for i in range(3):
             for j in range(3):
                 m2 += e[i] * prior_information[i, j] * e[j]
         w = 1.0 / (1.0 + m2 / 9.0)  # Cauchy: a prediction three sigma off has half its say
         for i in range(3):
-            b[i] = -g[i] / per_fact
+            b[i] = -g[i] / returns_per_measurement
             for j in range(3):
-                A[i, j] = H[i, j] / per_fact + w * prior_information[i, j]
+                A[i, j] = H[i, j] / returns_per_measurement + w * prior_information[i, j]
                 b[i] -= w * prior_information[i, j] * e[j]
         # Damping of (1 m)^-2 and (0.3 rad)^-2: only felt in directions without any information.
         A[0, 0] += 1.0
@@ -181,35 +183,36 @@ def gauss_newton(
         A[2, 2] += 10.0
         if not solve3(A, b, step):
             break
-        T[0] += step[0]
-        T[1] += step[1]
-        T[2] = se2.wrap(T[2] + step[2])
+        pose[0] += step[0]
+        pose[1] += step[1]
+        pose[2] = se2.wrap(pose[2] + step[2])
         if it >= anneal.shape[0] and step[0] ** 2 + step[1] ** 2 < 1e-8 and abs(step[2]) < 2e-5:
             break
     weights, found, cost = accumulate(
-        points, origin, T, nearest, means, omegas, views, row0, col0, cell_m, outlier * outlier, H, g
+        points, origin, pose, nearest, means, omegas, views, row0, col0, cell_m, outlier * outlier, H, g
     )
-    H /= per_fact
+    H /= returns_per_measurement
     return weights, found, cost
 
 
 @kernel
-def known_returns(
+def count_overlapping_returns(
     points: np.ndarray,
-    T: np.ndarray,
+    pose: np.ndarray,
     nearest: np.ndarray,
-    seen: np.ndarray,
+    misses: np.ndarray,
     row0: int,
     col0: int,
     cell_m: float,
 ) -> int:
-    """Returns that fall where the map knows anything: a surface in reach or a cell a beam crossed."""
-    c, s = math.cos(T[2]), math.sin(T[2])
+    """Return the number of returns in observed space: a surface within reach, or a cell that a beam crossed."""
+    c, s = math.cos(pose[2]), math.sin(pose[2])
     n = 0
     for i in range(points.shape[0]):
-        x, y = T[0] + c * points[i, 0] - s * points[i, 1], T[1] + s * points[i, 0] + c * points[i, 1]
+        x, y = pose[0] + c * points[i, 0] - s * points[i, 1], pose[1] + s * points[i, 0] + c * points[i, 1]
         r, q = math.floor(y / cell_m) - row0, math.floor(x / cell_m) - col0
-        if 0 <= r < nearest.shape[0] and 0 <= q < nearest.shape[1] and (nearest[r, q] >= 0 or seen[r, q] > 0):
+        inside = 0 <= r < nearest.shape[0] and 0 <= q < nearest.shape[1]
+        if inside and (nearest[r, q] >= 0 or misses[r, q] > 0):
             n += 1
     return n
 
@@ -217,23 +220,23 @@ def known_returns(
 def refine(
     points: np.ndarray,  # float64 [K, 5], PreparedScan.features()
     origin: np.ndarray,  # float64 [2]
-    T_start: np.ndarray,
+    start_pose: np.ndarray,
     tables: MatchTables,
     settings: LidarSlamSettings,
-    prior_T: np.ndarray | None = None,
+    prior_pose: np.ndarray | None = None,
     prior_information: np.ndarray | None = None,
     iterations: int = 15,
-    anneal: tuple[float, ...] = ANNEAL,
+    anneal: tuple[float, ...] = ANNEAL_SCALES,
 ) -> Match:
     """Gauss-Newton from one start."""
-    T, H = np.empty(3), np.empty((3, 3))
+    pose, H = np.empty(3), np.empty((3, 3))
     sigma_m = math.hypot(settings.range_sigma_m, settings.map_sigma_m)
-    if prior_T is None or prior_information is None:
-        prior_T, prior_information = T_start, np.zeros((3, 3))
+    if prior_pose is None or prior_information is None:
+        prior_pose, prior_information = start_pose, np.zeros((3, 3))
     weights, _, cost = gauss_newton(
         points,
         origin,
-        T_start,
+        start_pose,
         tables.nearest,
         tables.means,
         tables.omegas,
@@ -241,16 +244,18 @@ def refine(
         tables.row0,
         tables.col0,
         tables.cell_m,
-        prior_T,
+        prior_pose,
         prior_information,
         settings.outlier_m / sigma_m,
-        settings.beams_per_fact,
+        settings.returns_per_measurement,
         np.array(anneal),
         iterations,
-        T,
+        pose,
         H,
     )
     n = max(len(points), 1)
-    known = known_returns(points, T, tables.nearest, tables.seen, tables.row0, tables.col0, tables.cell_m)
+    overlapping = count_overlapping_returns(
+        points, pose, tables.nearest, tables.misses, tables.row0, tables.col0, tables.cell_m
+    )
     residual = sigma_m * math.sqrt(max(cost, 0.0) / weights) if weights > 0 else math.inf
-    return Match(T, H, weights / max(known, 1), known / n, residual)
+    return Match(pose, H, weights / max(overlapping, 1), overlapping / n, residual)

@@ -1,9 +1,9 @@
 import numpy as np
 import scipy.optimize
 
-from beamsplat.services.localization.lidar2d import pose_graph, se2
-from beamsplat.services.localization.lidar2d.nodes import edge_information
-from beamsplat.services.localization.lidar2d.pose_graph import Edges, optimise
+from beamsplat.services.localization.lidar2d import graph_optimisation, se2
+from beamsplat.services.localization.lidar2d.graph_optimisation import ConstraintArrays, optimise
+from beamsplat.services.localization.lidar2d.pose_graph_data import edge_information
 
 
 def problem(rng, n_submaps=6, n_nodes=40, noise=0.01):
@@ -13,15 +13,15 @@ def problem(rng, n_submaps=6, n_nodes=40, noise=0.01):
     nodes, submap, node, z, info = [], [], [], [], []
     for n in range(n_nodes):
         s = n * (n_submaps - 1) // n_nodes
-        T = se2.compose(submaps[s], np.array([*rng.uniform(-1, 1, 2), rng.uniform(-1, 1)]))
-        nodes.append(T)
+        pose = se2.compose(submaps[s], np.array([*rng.uniform(-1, 1, 2), rng.uniform(-1, 1)]))
+        nodes.append(pose)
         for k in (s, s + 1) if n < n_nodes - 3 else (s, s + 1, 0):
             submap.append(k)
             node.append(n)
-            z.append(se2.between(submaps[k], T) + noise * rng.standard_normal(3))
+            z.append(se2.between(submaps[k], pose) + noise * rng.standard_normal(3))
             A = rng.normal(size=(3, 3))
             info.append(np.diag([1e4, 1e4, 4e4]) + 1e3 * A @ A.T)
-    edges = Edges(
+    edges = ConstraintArrays(
         np.array(submap, np.int32),
         np.array(node, np.int32),
         np.array(z),
@@ -46,16 +46,18 @@ def test_solution_against_scipy(rng):
             np.vstack([submaps[:1], x[: 3 * (len(submaps) - 1)].reshape(-1, 3)]),
             x[3 * (len(submaps) - 1) :].reshape(-1, 3),
         )
-        e = se2.between_many(s[edges.submap], n[edges.node]) - edges.T_submap_node
+        e = se2.between_many(s[edges.submap], n[edges.node]) - edges.pose_submap_node
         e[:, 2] = se2.wrap_many(e[:, 2])
         return np.einsum("nji,nj->ni", roots, e).ravel()
 
     best = scipy.optimize.least_squares(
         residuals, np.concatenate([start_s[1:].ravel(), start_n.ravel()]), xtol=1e-12
     )
-    assert np.allclose(solution.T_map_submap[1:].ravel(), best.x[: 3 * (len(submaps) - 1)], atol=2e-4)
+    assert np.allclose(solution.pose_map_submap[1:].ravel(), best.x[: 3 * (len(submaps) - 1)], atol=2e-4)
     assert (
-        np.abs(se2.between_many(solution.T_map_node, best.x[3 * (len(submaps) - 1) :].reshape(-1, 3))).max()
+        np.abs(
+            se2.between_many(solution.pose_map_node, best.x[3 * (len(submaps) - 1) :].reshape(-1, 3))
+        ).max()
         < 2e-4
     )
 
@@ -63,9 +65,9 @@ def test_solution_against_scipy(rng):
 def test_sparse_and_dense_agree(rng, monkeypatch):
     submaps, nodes, edges = problem(rng)
     dense = optimise(submaps, nodes, edges)
-    monkeypatch.setattr(pose_graph, "DENSE_SUBMAPS", 0)
+    monkeypatch.setattr(graph_optimisation, "DENSE_SUBMAPS", 0)
     sparse = optimise(submaps, nodes, edges)
-    assert np.allclose(dense.T_map_submap, sparse.T_map_submap, atol=1e-7)
+    assert np.allclose(dense.pose_map_submap, sparse.pose_map_submap, atol=1e-7)
 
 
 def test_a_wrong_loop_is_overruled_and_a_true_one_bends_the_chain(rng):
@@ -74,9 +76,9 @@ def test_a_wrong_loop_is_overruled_and_a_true_one_bends_the_chain(rng):
     # The chain drifts; three edges at the end know better, a fourth lies by two metres.
     robust = np.zeros(n, dtype=bool)
     robust[edges.submap == 0] = edges.node[edges.submap == 0] >= 37
-    z = edges.T_submap_node.copy()
+    z = edges.pose_submap_node.copy()
     liar = np.flatnonzero(robust)[0]
-    extra = Edges(
+    extra = ConstraintArrays(
         np.append(edges.submap, 0).astype(np.int32),
         np.append(edges.node, edges.node[liar]).astype(np.int32),
         np.vstack([z, z[liar] + [2.0, 0, 0]]),
@@ -84,13 +86,15 @@ def test_a_wrong_loop_is_overruled_and_a_true_one_bends_the_chain(rng):
         np.append(robust, True),
     )
     order = np.argsort(extra.node, kind="stable")
-    extra = Edges(
-        *(getattr(extra, f)[order] for f in ("submap", "node", "T_submap_node", "information", "robust"))
+    extra = ConstraintArrays(
+        *(getattr(extra, f)[order] for f in ("submap", "node", "pose_submap_node", "information", "robust"))
     )
     solution = optimise(submaps, nodes, extra)
-    assert np.abs(se2.between_many(solution.T_map_node, nodes)[:, :2]).max() < 0.01
+    assert np.abs(se2.between_many(solution.pose_map_node, nodes)[:, :2]).max() < 0.01
     wrong = np.flatnonzero(
-        np.abs(extra.T_submap_node[:, 0] - se2.between_many(submaps[extra.submap], nodes[extra.node])[:, 0])
+        np.abs(
+            extra.pose_submap_node[:, 0] - se2.between_many(submaps[extra.submap], nodes[extra.node])[:, 0]
+        )
         > 1
     )
     assert solution.chi2[wrong].min() > 1000
@@ -99,8 +103,8 @@ def test_a_wrong_loop_is_overruled_and_a_true_one_bends_the_chain(rng):
 def test_fixed_submaps_stay(rng):
     submaps, nodes, edges = problem(rng, noise=0.05)
     solution = optimise(submaps, nodes, edges, fixed=[0, 3])
-    assert np.allclose(solution.T_map_submap[[0, 3]], submaps[[0, 3]], atol=1e-6)
-    assert not np.allclose(solution.T_map_submap[1], submaps[1], atol=1e-4)
+    assert np.allclose(solution.pose_map_submap[[0, 3]], submaps[[0, 3]], atol=1e-6)
+    assert not np.allclose(solution.pose_map_submap[1], submaps[1], atol=1e-4)
 
 
 def test_edge_information_knows_its_limits():

@@ -10,11 +10,11 @@ import numpy as np
 
 from beamsplat.services.localization.lidar2d import se2
 from beamsplat.services.localization.lidar2d.correlative import search
-from beamsplat.services.localization.lidar2d.dead_reckoning import SIGMA_M, DeadReckoning
-from beamsplat.services.localization.lidar2d.matching import Match, refine
-from beamsplat.services.localization.lidar2d.observability import Observed, without_slip
-from beamsplat.services.localization.lidar2d.odometry import OdometryBuffer, Predictor
+from beamsplat.services.localization.lidar2d.dead_reckoning import WHEEL_SIGMA_M, DeadReckoning
+from beamsplat.services.localization.lidar2d.observability import ObservedMatch, reduce_unobservable
+from beamsplat.services.localization.lidar2d.odometry import MotionErrorModel, OdometryBuffer
 from beamsplat.services.localization.lidar2d.scan import PreparedScan, prepare_scan
+from beamsplat.services.localization.lidar2d.scan_matching import Match, refine
 from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
 from beamsplat.services.localization.lidar2d.surfel_map import SurfelMap
 
@@ -38,7 +38,7 @@ class RawScan:
 class LocalMap:
     """A submap that is still being filled."""
 
-    T_odom_map: np.ndarray  # float64 [3]
+    pose_odom_submap: np.ndarray  # float64 [3]
     surfels: SurfelMap
 
 
@@ -46,27 +46,27 @@ class LocalMap:
 class Prediction:
     """Motion since the last scan and how far it may be off."""
 
-    motion: np.ndarray  # float64 [3] T_last_now
+    motion: np.ndarray  # float64 [3] pose_last_now
     sigma_m: float
     sigma_rad: float
     source: str
     blind: bool  # over a gap without wheels: anything may have happened
 
 
-class FrontEnd:
+class LocalTrajectoryBuilder:
     """Prediction, deskew, matching; the caller decides what enters which map."""
 
     def __init__(
-        self, settings: LidarSlamSettings, T_body_lidar: np.ndarray, upside_down: bool = False
+        self, settings: LidarSlamSettings, pose_body_lidar: np.ndarray, upside_down: bool = False
     ) -> None:
         self.settings = settings
-        self.T_body_lidar = T_body_lidar
+        self.pose_body_lidar = pose_body_lidar
         self._flip = -1.0 if upside_down else 1.0
         self.odometry = OdometryBuffer()
         self.reckoning = DeadReckoning(self.odometry)
-        self._wheels = Predictor(0.01, 0.05, 0.02, 0.004, 0.05, 0.03)
-        self._inertia = Predictor(0.02, 0.10, 0.3, 0.02, 0.20, 0.4)
-        self._still = Predictor(0.05, 0.0, 0.3, 0.05, 0.0, 0.4)
+        self._wheel_error = MotionErrorModel(0.01, 0.05, 0.02, 0.004, 0.05, 0.03)
+        self._velocity_error = MotionErrorModel(0.02, 0.10, 0.3, 0.02, 0.20, 0.4)
+        self._standstill_error = MotionErrorModel(0.05, 0.0, 0.3, 0.05, 0.0, 0.4)
         self.stamps: list[int] = []  # recent matched stamps and poses, newest last
         self.poses: list[np.ndarray] = []
 
@@ -90,24 +90,27 @@ class FrontEnd:
             return np.zeros(3)
         return twist(se2.between(self.poses[i], self.poses[-1]), dt)
 
-    def predict(self, stamp_ns: int) -> tuple[Prediction, list[tuple[Predictor, np.ndarray]]]:
+    def predict(self, stamp_ns: int) -> tuple[Prediction, list[tuple[MotionErrorModel, np.ndarray]]]:
         """The better of wheels and inertia, judged by how they did lately."""
         dt = (stamp_ns - self.stamps[-1]) * NS
         steady = exp_twist(self.velocity(), min(dt, self.settings.extrapolate_s))
         # Stamps of real logs come in bursts and out of order; then "as before" is worse than "not at all".
-        options = [(self._inertia, steady, "inertia"), (self._still, np.zeros(3), "still")]
+        predictions = [
+            (self._velocity_error, steady, "inertia"),
+            (self._standstill_error, np.zeros(3), "still"),
+        ]
         wheels = self.odometry.increment(self.stamps[-1], stamp_ns)
-        if wheels is not None and self._possible(wheels, dt):
-            options.append((self._wheels, wheels, "wheels"))
-        counted = self.reckoning.predict(stamp_ns)
-        if counted is not None:
-            motion = se2.between(self.poses[-1], counted)
-            if self._possible(motion, dt):
-                sigma_rad = self._wheels.sigmas(motion, dt)[1]
-                known = Prediction(motion, SIGMA_M, sigma_rad, "wheels", False)
-                return known, [(predictor, motion) for predictor, motion, _ in options]
+        if wheels is not None and self._is_plausible(wheels, dt):
+            predictions.append((self._wheel_error, wheels, "wheels"))
+        reckoned = self.reckoning.predict(stamp_ns)
+        if reckoned is not None:
+            motion = se2.between(self.poses[-1], reckoned)
+            if self._is_plausible(motion, dt):
+                sigma_rad = self._wheel_error.sigmas(motion, dt)[1]
+                known = Prediction(motion, WHEEL_SIGMA_M, sigma_rad, "wheels", False)
+                return known, [(predictor, motion) for predictor, motion, _ in predictions]
         rated = []
-        for predictor, motion, name in options:
+        for predictor, motion, name in predictions:
             sigma_m, sigma_rad = predictor.sigmas(motion, dt)
             rated.append(
                 (
@@ -116,9 +119,9 @@ class FrontEnd:
                 )
             )
         best = min(rated, key=lambda item: item[0])[1]
-        return best, [(predictor, motion) for predictor, motion, _ in options]
+        return best, [(predictor, motion) for predictor, motion, _ in predictions]
 
-    def _possible(self, motion: np.ndarray, dt_s: float) -> bool:
+    def _is_plausible(self, motion: np.ndarray, dt_s: float) -> bool:
         s = self.settings
         margin = dt_s + 0.2  # stamps of real robots jitter
         return math.hypot(motion[0], motion[1]) < s.max_speed_m_s * margin and abs(motion[2]) < (
@@ -132,8 +135,8 @@ class FrontEnd:
             return np.zeros(3)
         end = raw.stamp_ns + round(duration / NS)
         wheels = self.odometry.increment(raw.stamp_ns, end)
-        trusted = self._wheels.scale2_m < 10.0 and self._wheels.scale2_rad < 10.0
-        if wheels is not None and trusted and self._possible(wheels, duration):
+        trusted = self._wheel_error.scale2_m < 10.0 and self._wheel_error.scale2_rad < 10.0
+        if wheels is not None and trusted and self._is_plausible(wheels, duration):
             return twist(wheels, duration)
         if motion is not None and self.stamps:
             dt = (raw.stamp_ns - self.stamps[-1]) * NS
@@ -150,10 +153,10 @@ class FrontEnd:
             raw.time_increment_s,
             raw.range_min_m,
             min(raw.range_max_m, s.use_range_m),
-            self.T_body_lidar,
+            self.pose_body_lidar,
             velocity,
-            s.spread_m,
-            s.match_points,
+            s.min_spacing_m,
+            s.max_match_points,
         )
 
     # ---- matching ---------------------------------------------------------------------------------
@@ -163,76 +166,94 @@ class FrontEnd:
     ) -> tuple[PreparedScan, Match, bool]:
         """Pose of the scan in the local map; the flag says whether the match can be trusted."""
         s = self.settings
-        T_map_last = se2.between(local.T_odom_map, self.poses[-1])
-        T_guess = se2.compose(T_map_last, prediction.motion)
+        pose_submap_last = se2.between(local.pose_odom_submap, self.poses[-1])
+        guess_pose = se2.compose(pose_submap_last, prediction.motion)
         information = np.diag([prediction.sigma_m**-2, prediction.sigma_m**-2, prediction.sigma_rad**-2])
         tables = local.surfels.tables()
         points = scan.features()
-        match = refine(points, scan.origin_body, T_guess, tables, s, T_guess, information)
+        match = refine(points, scan.origin_body, guess_pose, tables, s, guess_pose, information)
         blind = (raw.stamp_ns - self.stamps[-1]) * NS > 1.0
         window_m = min(max(3.0 * prediction.sigma_m, s.search_min_m), 2.0 if blind else s.search_max_m)
         window_rad = min(
             max(3.0 * prediction.sigma_rad, s.search_min_rad), math.pi if blind else s.search_max_rad
         )
         if window_m > s.search_min_m or window_rad > s.search_min_rad:
-            match = self._search(scan, match, T_guess, T_guess, information, local, window_m, window_rad)
-        if match.share < s.good_share:  # a prediction this wrong may be worse than none
-            wide_m, wide_rad = max(window_m, 0.4), max(window_rad, math.radians(20.0))
-            match = self._search(scan, match, T_guess, T_map_last, information, local, wide_m, wide_rad)
-        if match.share < s.lost_share:
             match = self._search(
-                scan, match, T_guess, T_map_last, information, local, s.search_max_m, s.search_max_rad
+                scan, match, guess_pose, guess_pose, information, local, window_m, window_rad
+            )
+        if match.inlier_ratio < s.good_inlier_ratio:  # a prediction this wrong may be worse than none
+            wide_m, wide_rad = max(window_m, 0.4), max(window_rad, math.radians(20.0))
+            match = self._search(
+                scan, match, guess_pose, pose_submap_last, information, local, wide_m, wide_rad
+            )
+        if match.inlier_ratio < s.lost_inlier_ratio:
+            match = self._search(
+                scan,
+                match,
+                guess_pose,
+                pose_submap_last,
+                information,
+                local,
+                s.search_max_m,
+                s.search_max_rad,
             )
         points = scan.features()
         if raw.time_increment_s > 0.0:
-            motion = se2.between(T_map_last, match.T_map_body)
+            motion = se2.between(pose_submap_last, match.pose_target_body)
             scan = self.prepare(raw, self.scan_velocity(raw, motion))
             points = scan.features()
             match = refine(
-                points, scan.origin_body, match.T_map_body, tables, s, T_guess, information, anneal=(1.0,)
+                points,
+                scan.origin_body,
+                match.pose_target_body,
+                tables,
+                s,
+                guess_pose,
+                information,
+                anneal=(1.0,),
             )
-        trusted = self._trusted(prediction, T_guess, match)
+        trusted = self._is_trusted(prediction, guess_pose, match)
         if not trusted:
             return scan, match, False
         return (
             scan,
-            self._count_on_wheels(
-                raw.stamp_ns, local, without_slip(points, scan.origin_body, match, tables, s)
+            self._apply_dead_reckoning(
+                raw.stamp_ns, local, reduce_unobservable(points, scan.origin_body, match, tables, s)
             ),
             True,
         )
 
-    def _count_on_wheels(self, stamp_ns: int, local: LocalMap, seen: Observed) -> Match:
+    def _apply_dead_reckoning(self, stamp_ns: int, local: LocalMap, seen: ObservedMatch) -> Match:
         """Where the scan slides freely, let the wheels say how far it is."""
-        T_odom_map = local.T_odom_map
-        turn = np.array([0.0, 0.0, T_odom_map[2]])
+        pose_odom_submap = local.pose_odom_submap
+        turn = np.array([0.0, 0.0, pose_odom_submap[2]])
         direction_odom = se2.transform(turn, seen.direction[None])[0]
-        T_odom_body = se2.compose(T_odom_map, seen.match.T_map_body)
-        corrected, counted = self.reckoning.correct(stamp_ns, T_odom_body, seen.trust, direction_odom)
-        if not counted:
+        pose_odom_body = se2.compose(pose_odom_submap, seen.match.pose_target_body)
+        corrected, reckoned = self.reckoning.correct(stamp_ns, pose_odom_body, seen.trust, direction_odom)
+        if not reckoned:
             return seen.match
         v = np.array([*seen.direction, 0.0])
-        information = seen.match.information + (1.0 - seen.trust**2) * np.outer(v, v) / SIGMA_M**2
-        T_map_body = se2.between(T_odom_map, corrected)
-        return dataclasses.replace(seen.match, T_map_body=T_map_body, information=information)
+        information = seen.match.information + (1.0 - seen.trust**2) * np.outer(v, v) / WHEEL_SIGMA_M**2
+        pose_map_body = se2.between(pose_odom_submap, corrected)
+        return dataclasses.replace(seen.match, pose_target_body=pose_map_body, information=information)
 
-    def _trusted(self, prediction: Prediction, T_guess: np.ndarray, match: Match) -> bool:
+    def _is_trusted(self, prediction: Prediction, guess_pose: np.ndarray, match: Match) -> bool:
         """Enough agrees; more has to agree where the prediction says something else or nothing."""
         s = self.settings
-        off = se2.between(T_guess, match.T_map_body)
+        off = se2.between(guess_pose, match.pose_target_body)
         far = math.hypot(off[0], off[1]) > 0.2 + 3.0 * prediction.sigma_m or abs(off[2]) > (
             0.15 + 3.0 * prediction.sigma_rad
         )
         if prediction.blind:
-            return match.share >= s.good_share
-        return match.share >= (s.sure_share if far else s.lost_share)
+            return match.inlier_ratio >= s.good_inlier_ratio
+        return match.inlier_ratio >= (s.sure_inlier_ratio if far else s.lost_inlier_ratio)
 
     def _search(
         self,
         scan: PreparedScan,
         best: Match,
-        T_prior: np.ndarray,
-        T_centre: np.ndarray,
+        prior_pose: np.ndarray,
+        centre_pose: np.ndarray,
         information: np.ndarray,
         local: LocalMap,
         window_m: float,
@@ -241,23 +262,26 @@ class FrontEnd:
         """The best of the given match and of those found in a window."""
         tables, s = local.surfels.tables(), self.settings
         points = scan.features()
-        for _, T_start in search(points, T_centre, tables, window_m, window_rad, prior_weight=0.02):
-            other = refine(points, scan.origin_body, T_start, tables, s, T_prior, information)
-            if other.share * other.known > best.share * best.known + 0.02:
+        for _, start_pose in search(points, centre_pose, tables, window_m, window_rad, prior_weight=0.02):
+            other = refine(points, scan.origin_body, start_pose, tables, s, prior_pose, information)
+            if other.inlier_ratio * other.overlap > best.inlier_ratio * best.overlap + 0.02:
                 best = other
         return best
 
     def accept(
-        self, stamp_ns: int, T_odom_body: np.ndarray, options: list[tuple[Predictor, np.ndarray]]
+        self,
+        stamp_ns: int,
+        pose_odom_body: np.ndarray,
+        predictions: list[tuple[MotionErrorModel, np.ndarray]],
     ) -> None:
-        """Take in the pose of the newest scan; predictors and the delay learn from it."""
+        """Take in the pose of the newest scan; predictors and the delay update from it."""
         if self.poses:
-            moved = se2.between(self.poses[-1], T_odom_body)
-            for predictor, motion in options:
-                predictor.learn(motion, moved)
-            self.odometry.observe_turn(self.stamps[-1], stamp_ns, float(moved[2]))
+            moved = se2.between(self.poses[-1], pose_odom_body)
+            for predictor, motion in predictions:
+                predictor.update(motion, moved)
+            self.odometry.observe_rotation(self.stamps[-1], stamp_ns, float(moved[2]))
         self.stamps.append(stamp_ns)
-        self.poses.append(T_odom_body)
+        self.poses.append(pose_odom_body)
         if len(self.stamps) > 512:
             del self.stamps[:256], self.poses[:256]
 

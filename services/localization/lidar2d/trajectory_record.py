@@ -16,14 +16,14 @@ class TrajectoryRecord:
         self._nodes = np.zeros(1024, dtype=np.int64)
         self._poses = np.zeros((1024, 6))
 
-    def add(self, stamp_ns: int, node: int, T_node_body: np.ndarray, T_map_body: np.ndarray) -> None:
+    def add(self, stamp_ns: int, node: int, pose_node_body: np.ndarray, pose_map_body: np.ndarray) -> None:
         """One more scan: pose relative to a keynode and pose in the map as published."""
         if self.count == len(self._stamps):
             for name in ("_stamps", "_nodes", "_poses"):
                 old = getattr(self, name)
                 setattr(self, name, np.concatenate([old, np.zeros_like(old)]))
         self._stamps[self.count], self._nodes[self.count] = stamp_ns, node
-        self._poses[self.count, :3], self._poses[self.count, 3:] = T_node_body, T_map_body
+        self._poses[self.count, :3], self._poses[self.count, 3:] = pose_node_body, pose_map_body
         self.count += 1
 
     @property
@@ -33,7 +33,7 @@ class TrajectoryRecord:
 
     @property
     def nodes(self) -> np.ndarray:
-        """Keynode ids int64 [N]."""
+        """TrajectoryNode ids int64 [N]."""
         return self._nodes[: self.count].copy()
 
     @property
@@ -41,10 +41,10 @@ class TrajectoryRecord:
         """T_map_body as published, float64 [N, 3]."""
         return self._poses[: self.count, 3:].copy()
 
-    def optimised(self, T_map_node: dict[int, np.ndarray]) -> np.ndarray:
+    def optimised(self, pose_map_node: dict[int, np.ndarray]) -> np.ndarray:
         """T_map_body float64 [N, 3] for the present poses of the keynodes."""
         unique, inverse = np.unique(self.nodes, return_inverse=True)
-        base = np.array([T_map_node[int(n)] for n in unique]).reshape(-1, 3)
+        base = np.array([pose_map_node[int(n)] for n in unique]).reshape(-1, 3)
         return se2.compose_many(base[inverse], self._poses[: self.count, :3])
 
     def arrays(self) -> dict[str, np.ndarray]:

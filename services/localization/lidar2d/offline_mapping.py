@@ -13,12 +13,13 @@ from typing import Any
 import numpy as np
 
 from beamsplat.common.errors import UserError
+from beamsplat.common.files.persist import make_folder
 from beamsplat.common.geometry.trajectory import Trajectory, write_tum
 from beamsplat.common.geometry.transforms import se2_to_se3
 from beamsplat.common.runtime.stamp_merger import StampMerger
 from beamsplat.services.localization.lidar2d import se2
+from beamsplat.services.localization.lidar2d.job_runner import JobRunner
 from beamsplat.services.localization.lidar2d.occupancy import save_nav2
-from beamsplat.services.localization.lidar2d.offline import JobRunner
 from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
 from beamsplat.services.localization.lidar2d.slam import LidarSlam
 
@@ -26,7 +27,7 @@ STREAMS = ("odometry", "scan")
 
 
 @dataclass(frozen=True)
-class Drive:
+class MeasurementLog:
     """Measurements in order of arrival: ("scan", stamp_ns, ranges_m, angle_min_rad, angle_increment_rad,
     time_increment_s, range_min_m, range_max_m) and ("odometry", stamp_ns, x_m, y_m, yaw_rad)."""
 
@@ -35,7 +36,7 @@ class Drive:
     advance: Callable[[], None]  # called once a measurement, for a progress bar
 
 
-def map_drive(drive: Drive, out: Path, resolution_m: float = 0.05) -> dict[str, Any]:
+def map_measurements(drive: MeasurementLog, out: Path, resolution_m: float = 0.05) -> dict[str, Any]:
     """Runs the SLAM over a drive and writes poses, map, state and figures into `out`.
 
     Background jobs run in a second thread and are taken in at the scans where they are due, exactly as in
@@ -73,8 +74,8 @@ def map_drive(drive: Drive, out: Path, resolution_m: float = 0.05) -> dict[str, 
         "step_p50_ms": float(np.percentile(steps_ms, 50)),
         "step_p95_ms": float(np.percentile(steps_ms, 95)),
         "peak_rss_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0,
-        "loop_closures": slam.back.loop_closures,
-        "odometry_refused": slam.front.odometry.refused,
+        "loop_closures": slam.pose_graph.loop_closures,
+        "odometry_refused": slam.local_builder.odometry.rejected,
         **{f"scans_{status}": count for status, count in statuses.items()},
         "T_body_lidar": se2.from_matrix(drive.T_body_lidar).tolist(),
     }
@@ -82,7 +83,7 @@ def map_drive(drive: Drive, out: Path, resolution_m: float = 0.05) -> dict[str, 
     return figures
 
 
-def _merged(drive: Drive) -> Iterable[tuple]:
+def _merged(drive: MeasurementLog) -> Iterable[tuple]:
     """Measurements by stamp, with the merger that the live runner uses."""
     merger = StampMerger(STREAMS)
     for measurement in drive.measurements:
@@ -97,9 +98,9 @@ def _merged(drive: Drive) -> Iterable[tuple]:
 
 
 def _write(slam: LidarSlam, out: Path, resolution_m: float) -> None:
-    out.mkdir(parents=True, exist_ok=True)
+    make_folder(out)
     slam.save(out / "state")
-    stamps_ns, T_map_body, published = slam.trajectory()
-    for name, poses in (("trajectory.tum", T_map_body), ("online.tum", published)):
+    stamps_ns, pose_map_body, published = slam.trajectory()
+    for name, poses in (("trajectory.tum", pose_map_body), ("online.tum", published)):
         write_tum(out / name, Trajectory(stamps_ns, se2_to_se3(poses)), "T_map_body")
     save_nav2(slam.grid(resolution_m), out)

@@ -10,20 +10,20 @@ from typing import TypeVar
 import numpy as np
 
 from beamsplat.services.localization.lidar2d import se2
-from beamsplat.services.localization.lidar2d.backend import BackEnd
-from beamsplat.services.localization.lidar2d.frontend import LocalMap
-from beamsplat.services.localization.lidar2d.matching import Match
-from beamsplat.services.localization.lidar2d.movers import contradicts_free_space, grow_along_beams
-from beamsplat.services.localization.lidar2d.nodes import (
-    Constraint,
-    Keynode,
-    KeyScan,
-    Submap,
-    edge_information,
-    link_information,
-)
+from beamsplat.services.localization.lidar2d.dynamic_objects import contradicts_free_space, grow_along_beams
+from beamsplat.services.localization.lidar2d.local_trajectory_builder import LocalMap
 from beamsplat.services.localization.lidar2d.occupancy import CountGrid
+from beamsplat.services.localization.lidar2d.pose_graph import PoseGraph
+from beamsplat.services.localization.lidar2d.pose_graph_data import (
+    Constraint,
+    NodeScan,
+    Submap,
+    TrajectoryNode,
+    edge_information,
+    second_submap_information,
+)
 from beamsplat.services.localization.lidar2d.scan import PreparedScan
+from beamsplat.services.localization.lidar2d.scan_matching import Match
 from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
 from beamsplat.services.localization.lidar2d.surfel_map import SurfelMap, freeze
 
@@ -37,20 +37,20 @@ class _Active:
     local: LocalMap
 
 
-class LocalMapper:
-    """Every keynode goes into two submaps; the older of them is what scans are matched to."""
+class ActiveSubmaps:
+    """Every keynode goes into two submaps; the older of them is what scans are matching_target to."""
 
-    def __init__(self, settings: LidarSlamSettings, back: BackEnd) -> None:
+    def __init__(self, settings: LidarSlamSettings, pose_graph: PoseGraph) -> None:
         self.settings = settings
-        self.back = back
-        self.last_key: Keynode | None = None
-        self.keynodes_since_job = 0
+        self.pose_graph = pose_graph
+        self.last_node: TrajectoryNode | None = None
+        self.nodes_since_job = 0
         self._active: list[_Active] = []
-        self._cut = False
+        self._force_new_submap = False
 
     @property
-    def matched(self) -> LocalMap:
-        """The map the next scan is matched to."""
+    def matching_target(self) -> LocalMap:
+        """The map the next scan is matching_target to."""
         return self._active[0].local
 
     @property
@@ -58,16 +58,16 @@ class LocalMapper:
         """Submaps still being filled."""
         return {a.submap.id for a in self._active}
 
-    def moving(self, scan: PreparedScan, T_odom_body: np.ndarray) -> np.ndarray:
+    def dynamic_returns(self, scan: PreparedScan, pose_odom_body: np.ndarray) -> np.ndarray:
         """Returns on things that were not there before, bool [M]."""
-        moving = np.zeros(len(scan), dtype=bool)
+        dynamic = np.zeros(len(scan), dtype=bool)
         if not self._active:
-            return moving
+            return dynamic
         local = self._active[0].local
         surfels, seeds = local.surfels, np.empty(len(scan), dtype=bool)
         contradicts_free_space(
             scan.points_body,
-            se2.between(local.T_odom_map, T_odom_body),
+            se2.between(local.pose_odom_submap, pose_odom_body),
             surfels.nearest,
             surfels.means,
             surfels.hits,
@@ -77,68 +77,74 @@ class LocalMapper:
             surfels.cell_m,
             seeds,
         )
-        grow_along_beams(seeds, scan.points_body, scan.beams, 0.15, moving)
-        return moving
+        grow_along_beams(seeds, scan.points_body, scan.beams, 0.15, dynamic)
+        return dynamic
 
     def insert(
         self,
         stamp_ns: int,
         scan: PreparedScan,
-        T_odom_body: np.ndarray,
-        moving: np.ndarray,
+        pose_odom_body: np.ndarray,
+        dynamic: np.ndarray,
         match: Match,
-        cut: bool = False,
+        force_new_submap: bool = False,
     ) -> bool:
         """Put the scan into the active submaps if it adds anything (motion filter).
 
-        A `cut` ends the older submap early: what comes after a blind stretch hangs together, but only loosely
+        A `force_new_submap` ends the older submap early: what comes after a blind stretch hangs together, but only loosely
         on what was before, and within one submap nothing could bend.
         """
-        self._cut = self._cut or cut
-        if self._active and not self._is_key(stamp_ns, T_odom_body):
+        self._force_new_submap = self._force_new_submap or force_new_submap
+        if self._active and not self._passes_motion_filter(stamp_ns, pose_odom_body):
             return False
         s = self.settings
         scans = self._active[-1].local.surfels.scans if self._active else 0
-        if not self._active or scans >= s.submap_keynodes or (self._cut and scans >= s.least_keynodes):
-            self._cut = False
+        if (
+            not self._active
+            or scans >= s.submap_nodes
+            or (self._force_new_submap and scans >= s.min_submap_nodes)
+        ):
+            self._force_new_submap = False
             if len(self._active) == 2:
                 done = self._active.pop(0)
                 done.submap.frozen = freeze(done.local.surfels)
                 self._active[0].local.surfels.make_matchable()
             self._active.append(
-                _Active(self.back.start_submap(T_odom_body), LocalMap(T_odom_body, SurfelMap(s)))
+                _Active(self.pose_graph.start_submap(pose_odom_body), LocalMap(pose_odom_body, SurfelMap(s)))
             )
-        node = Keynode(self.back.next_node_id, stamp_ns, T_odom_body, KeyScan.of(scan, moving))
+        node = TrajectoryNode(
+            self.pose_graph.next_node_id, stamp_ns, pose_odom_body, NodeScan.of(scan, dynamic)
+        )
         # Scans in a row slip together if they slip: in their own submap they stay together.
-        rigid = match.information if match.rigid is None else match.rigid
+        rigid = match.information if match.full_information is None else match.full_information
         matched = edge_information(rigid, s.edge_sigma_m, s.edge_sigma_rad)
         edges = []
         for active in self._active:
             active.submap.frozen = None  # what was frozen for a last optimisation goes on growing
-            T = se2.between(active.local.T_odom_map, T_odom_body)
+            pose = se2.between(active.local.pose_odom_submap, pose_odom_body)
             active.local.surfels.insert(
-                se2.transform(T, scan.points_body),
-                se2.transform(np.array([0.0, 0.0, T[2]]), scan.tangents),
+                se2.transform(pose, scan.points_body),
+                se2.transform(np.array([0.0, 0.0, pose[2]]), scan.tangents),
                 scan.spacing_m,
-                se2.transform(T, scan.origin_body[None])[0],
-                ~moving,
-                ~moving,
+                se2.transform(pose, scan.origin_body[None])[0],
+                ~dynamic,
+                ~dynamic,
                 matchable=active is self._active[0],
             )
-            info = matched if active is self._active[0] else link_information(match.information, s)
-            edges.append(Constraint(active.submap.id, node.id, T, info, False))
-        self.back.add_keynode(node, edges)
-        self.last_key = node
-        self.keynodes_since_job += 1
+            info = matched if active is self._active[0] else second_submap_information(match.information, s)
+            edges.append(Constraint(active.submap.id, node.id, pose, info, False))
+        self.pose_graph.add_node(node, edges)
+        self.last_node = node
+        self.nodes_since_job += 1
         return True
 
-    def _is_key(self, stamp_ns: int, T_odom_body: np.ndarray) -> bool:
+    def _passes_motion_filter(self, stamp_ns: int, pose_odom_body: np.ndarray) -> bool:
         s = self.settings
-        moved = se2.between(self.last_key.T_odom_body, T_odom_body)
+        moved = se2.between(self.last_node.pose_odom_body, pose_odom_body)
         return (
-            math.hypot(moved[0], moved[1]) > s.keynode_distance_m
-            or abs(moved[2]) > s.keynode_angle_rad
-            or not 0.0 <= (stamp_ns - self.last_key.stamp_ns) * NS <= s.keynode_time_s
+            math.hypot(moved[0], moved[1]) > s.motion_filter_distance_m
+            or abs(moved[2]) > s.motion_filter_angle_rad
+            or not 0.0 <= (stamp_ns - self.last_node.stamp_ns) * NS <= s.motion_filter_time_s
         )
 
     def close(self) -> None:
@@ -172,7 +178,7 @@ class LocalMapper:
                 a.local.surfels.row0,
                 a.local.surfels.col0,
                 a.local.surfels.cell_m,
-                a.submap.T_map_submap,
+                a.submap.pose_map_submap,
             )
             for a in self._active
             if a.submap.frozen is None

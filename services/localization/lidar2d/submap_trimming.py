@@ -11,19 +11,19 @@ from collections import defaultdict
 
 import numpy as np
 
-from beamsplat.services.localization.lidar2d.nodes import Submap
+from beamsplat.services.localization.lidar2d.pose_graph_data import Submap
 
 CELL_M = 1.5
 HEADINGS = 4
-COVERED = 0.9  # share of a submap's keynodes whose place others cover
+MIN_COVERED_RATIO = 0.9  # share of a submap's keynodes whose place others cover
 
 
 def redundant_submaps(
-    submaps: dict[int, Submap], T_map_node: dict[int, np.ndarray], protected: set[int], copies: int
+    submaps: dict[int, Submap], pose_map_node: dict[int, np.ndarray], protected: set[int], copies: int
 ) -> list[int]:
     """Ids of submaps that may go: nearly everywhere they were, at least `copies` other submaps have been too,
     looking the same way, two of them older and two of them newer."""
-    place_of = {n: _place(T) for n, T in T_map_node.items()}
+    place_of = {n: _pose_cell(pose) for n, pose in pose_map_node.items()}
     seen_by: dict[tuple[int, int, int], set[int]] = defaultdict(set)
     for submap in submaps.values():
         if submap.frozen is not None:
@@ -41,11 +41,11 @@ def redundant_submaps(
             others = {o for o in others if abs(o - submap_id) > 1}
             older = sum(o < submap_id for o in others)
             covered += len(others) >= copies and older >= 2 and len(others) - older >= 2
-        if covered >= COVERED * len(submap.members):
+        if covered >= MIN_COVERED_RATIO * len(submap.members):
             gone.add(submap_id)
     return sorted(gone)
 
 
-def _place(T_map_body: np.ndarray) -> tuple[int, int, int]:
-    heading = math.floor((T_map_body[2] + math.pi / HEADINGS) / (2 * math.pi / HEADINGS)) % HEADINGS
-    return math.floor(T_map_body[0] / CELL_M), math.floor(T_map_body[1] / CELL_M), heading
+def _pose_cell(pose_map_body: np.ndarray) -> tuple[int, int, int]:
+    heading = math.floor((pose_map_body[2] + math.pi / HEADINGS) / (2 * math.pi / HEADINGS)) % HEADINGS
+    return math.floor(pose_map_body[0] / CELL_M), math.floor(pose_map_body[1] / CELL_M), heading
