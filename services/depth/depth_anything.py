@@ -1,8 +1,8 @@
 """Depth Anything V1 and V2: affine-invariant disparity, and the metric variants of V2.
 
-Preprocessing as in the reference (util/transform.py, dpt.py): RGB / 255, the short side brought to the
-input size with the aspect kept, both sides multiples of 14, bicubic, ImageNet mean and deviation. Exports
-name their ports differently, so the first input and the first output count.
+Preprocessing as in the reference (util/transform.py, dpt.py): RGB / 255, short side resized to the input
+size with the aspect ratio kept, both sides multiples of 14, bicubic, ImageNet mean and standard deviation.
+Exports differ in the names of their tensors, so the first input and the first output are used.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ from beamsplat.services.depth.model_files import find_model
 from beamsplat.services.depth.onnx_model import OnnxModel, to_hw
 from beamsplat.services.depth.source import DepthInput, Estimate, check_depth_map
 
-PATCH = 14
+PATCH = 14  # px, side of a vision transformer patch
 _MEAN = np.array([0.485, 0.456, 0.406], dtype=np.float32)
-_DEVIATION = np.array([0.229, 0.224, 0.225], dtype=np.float32)
+_STD = np.array([0.229, 0.224, 0.225], dtype=np.float32)
 
 
 class DepthAnything:
-    """Disparity d >= 0, nearer = larger; 1/z = a d + b is fitted by fusion.
+    """Depth source with disparity d >= 0, nearer = larger; fusion fits 1/z = a d + b.
 
     Raises:
-        UserError: the model is missing or of another kind, or `input_px` is below one patch.
+        UserError: the model is missing or has other inputs, or `input_px` is below one patch.
     """
 
     kind = "disparity"
@@ -38,17 +38,17 @@ class DepthAnything:
             raise UserError(f"depth_anything: input_px = {input_px} is below one patch of {PATCH} px")
         self._onnx = OnnxModel(find_model(model), threads=threads)
         self._onnx.check_inputs(1)
-        self._port = self._onnx.image_input()
+        self._image_input = self._onnx.image_input()
         self._input_px = input_px
-        if self._port.shape[2] and self._port.shape[3]:
-            self._onnx.input_size(self._port, PATCH, PATCH, PATCH)
+        if self._image_input.shape[2] and self._image_input.shape[3]:
+            self._onnx.input_size(self._image_input, PATCH, PATCH, PATCH)
         self._warm: tuple[int, int] | None = None
 
     def estimate(self, view: DepthInput) -> Estimate:
-        """The network's answer at the image's size (bilinear, corners aligned as in the reference)."""
+        """Return the disparity at the image size (bilinear, corners aligned as in the reference)."""
         h, w = view.camera.shape
-        wish = network_input_size(h, w, self._input_px)
-        side = self._onnx.input_size(self._port, *wish, PATCH)
+        preferred = network_input_size(h, w, self._input_px)
+        side = self._onnx.input_size(self._image_input, *preferred, PATCH)
         if self._warm != side:
             self._onnx.warm_up((1, 3, *side))
             self._warm = side
@@ -61,9 +61,9 @@ class DepthAnything:
 
 
 class DepthAnythingMetric(DepthAnything):
-    """The metric variants (Hypersim indoors, VKITTI outdoors): metres; still to be scaled by fusion.
+    """Depth source with depth in metres: the metric variants (Hypersim indoors, VKITTI outdoors).
 
-    The network does not know the focal length, and errs by 10 to 20 % of scale.
+    The network does not know the focal length. Its scale is wrong by 10 to 20 %, which fusion corrects.
     """
 
     kind = "metric"
@@ -81,7 +81,7 @@ class DepthAnythingMetric(DepthAnything):
 
 
 def network_input_size(height: int, width: int, input_px: int) -> tuple[int, int]:
-    """Network size (height, width): short side at least `input_px`, multiples of 14, aspect kept."""
+    """Return (height, width) of the network input: short side >= `input_px`, multiples of 14, aspect kept."""
     scale = max(input_px / height, input_px / width)
 
     def rounded(side: float) -> int:
@@ -92,13 +92,13 @@ def network_input_size(height: int, width: int, input_px: int) -> tuple[int, int
 
 
 def normalize_image(image_rgb: np.ndarray, side: tuple[int, int]) -> np.ndarray:
-    """float32 [1, 3, h, w] of uint8 [H, W, 3]: bicubic, ImageNet mean and deviation."""
+    """Return float32 [1, 3, h, w] of uint8 [H, W, 3]: bicubic, ImageNet mean and standard deviation."""
     small = cv2.resize(image_rgb.astype(np.float32) / 255.0, side[::-1], interpolation=cv2.INTER_CUBIC)
-    return np.ascontiguousarray(((small - _MEAN) / _DEVIATION).transpose(2, 0, 1)[None], dtype=np.float32)
+    return np.ascontiguousarray(((small - _MEAN) / _STD).transpose(2, 0, 1)[None], dtype=np.float32)
 
 
 def resize_align_corners(values: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Bilinear resize of float32 [h, w] whose corner pixels map onto corner pixels."""
+    """Return float32 [height, width], resized bilinearly so that corner pixels map to corner pixels."""
     h, w = values.shape
     x = np.linspace(0.0, w - 1.0, width, dtype=np.float32)
     y = np.linspace(0.0, h - 1.0, height, dtype=np.float32)

@@ -1,7 +1,7 @@
-"""FastDepth (Wofk et al., ICRA 2019), trained on NYU-v2: small, metric on paper, off by tens of per cent.
+"""FastDepth (Wofk et al., ICRA 2019), trained on NYU-v2: small, metric with errors of tens of per cent.
 
-The network knows one view: 224x224 pixels of a crop with normalize_image focals fx/w = 0.889, fy/h = 1.187.
-Every camera is cropped to that view; RGB in [0, 1], no mean subtracted.
+The network was trained on one field of view: 224x224 px with normalised focal lengths fx/w = 0.889,
+fy/h = 1.187. Every image is cropped to that field of view; RGB in [0, 1], no mean subtracted.
 """
 
 from __future__ import annotations
@@ -16,30 +16,30 @@ from beamsplat.services.depth.model_files import find_model
 from beamsplat.services.depth.onnx_model import OnnxModel, to_hw
 from beamsplat.services.depth.source import DepthInput, Estimate, check_depth_map
 
-_FX_PER_WIDTH = 0.889
+_FX_PER_WIDTH = 0.889  # of the NYU-v2 training crops
 _FY_PER_HEIGHT = 1.187
-_SIDE = 224
-_MULTIPLE = 32
-_Z_RANGE_M = (0.3, 10.0)
+_SIDE = 224  # px, network input
+_MULTIPLE = 32  # the encoder halves the size five times
+_Z_RANGE_M = (0.3, 10.0)  # range of the training data
 
 
 class FastDepth:
-    """FastDepth on one ONNX session.
+    """Depth source FastDepth on ONNX Runtime.
 
     Raises:
-        UserError: the model is missing, or another graph.
+        UserError: the model file is missing, or holds another graph.
     """
 
     def __init__(self, model: str | Path = "fastdepth_nyu_fp32", threads: int = 1) -> None:
         self._onnx = OnnxModel(find_model(model), threads=threads)
         self._onnx.check_inputs(1)
-        port = self._onnx.image_input()
-        self._side = self._onnx.input_size(port, _SIDE, _SIDE, _MULTIPLE)
+        spec = self._onnx.image_input()
+        self._side = self._onnx.input_size(spec, _SIDE, _SIDE, _MULTIPLE)
         (first, *_) = self._onnx.warm_up((1, 3, *self._side))
         to_hw(first, str(self._onnx.path))
 
     def estimate(self, view: DepthInput) -> Estimate:
-        """Depth in metres inside the network's view, NaN outside it."""
+        """Return depth in metres inside the field of view of the network, NaN outside it."""
         u0, v0, u1, v1, factor = network_crop(view.camera)
         h, w = self._side
         patch = cv2.resize(view.image_rgb[v0:v1, u0:u1], (w, h), interpolation=cv2.INTER_AREA)
@@ -55,10 +55,10 @@ class FastDepth:
 
 
 def network_crop(camera: Pinhole) -> tuple[int, int, int, int, float]:
-    """Crop (u0, v0, u1, v1), half open, that shows the camera as NYU's, and the factor on its depth.
+    """Return the crop (u0, v0, u1, v1), half open, with the field of view of NYU-v2, and a depth factor.
 
-    A camera with a narrower view than NYU's fills the network's image with less of the world, so that
-    all looks nearer by the ratio of the focals in network pixels (first-order pinhole argument).
+    A camera with a narrower field of view fills the network input with a smaller part of the scene, so that
+    everything appears nearer. The factor corrects this to first order, by the ratio of the focal lengths.
     """
     wanted_w, wanted_h = camera.fx_px / _FX_PER_WIDTH, camera.fy_px / _FY_PER_HEIGHT
     u0 = max(round(camera.cx_px + 0.5 - wanted_w / 2), 0)
@@ -70,5 +70,5 @@ def network_crop(camera: Pinhole) -> tuple[int, int, int, int, float]:
 
 
 def resize_keeping_unknown(values: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Bilinear resize of float32 [h, w]; an output pixel that touches NaN is NaN."""
+    """Return float32 [height, width], resized bilinearly; an output pixel that touches NaN is NaN."""
     return cv2.resize(values, (width, height), interpolation=cv2.INTER_LINEAR)

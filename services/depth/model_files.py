@@ -1,4 +1,4 @@
-"""Where model files are: BEAMSPLAT_MODELS, else the user's data folder; deploy/models.toml names them."""
+"""Search path of model files: BEAMSPLAT_MODELS, else the user's data folder."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from beamsplat.common.errors import UserError
 
 
 def models_dirs() -> list[Path]:
-    """Folders that are searched for models, first one first; the first is where `pull` puts them."""
+    """Return the folders that are searched for models, in order; `pull` installs into the first."""
     given = os.environ.get("BEAMSPLAT_MODELS")
     if given:
         return [Path(part).expanduser() for part in given.split(os.pathsep) if part]
@@ -19,10 +19,10 @@ def models_dirs() -> list[Path]:
 
 
 def find_model(name: str | Path) -> Path:
-    """The file of a model: a path that exists, or `name` or `name.onnx` in the models folders.
+    """Return the file of a model: an existing path, or `name` or `name.onnx` in the models folders.
 
     Raises:
-        UserError: nowhere; says where it was sought and how to get it.
+        UserError: not found; the message names the folders and how to obtain the file.
     """
     path = Path(name).expanduser()
     if path.is_file():
@@ -33,12 +33,12 @@ def find_model(name: str | Path) -> Path:
                 return candidate
     sought = ", ".join(str(folder) for folder in models_dirs())
     raise UserError(
-        f"model {str(name)!r} is not in {sought}; `beamsplat models pull {path.stem}` fetches it, "
+        f"model {str(name)!r} is not in {sought}; `beamsplat models pull {path.stem}` downloads it, "
         "or set BEAMSPLAT_MODELS to the folder that holds it"
     )
 
 
 def sha256_of(path: Path) -> str:
-    """Hex digest of a file."""
+    """Return the SHA-256 digest of a file, in hexadecimal."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()

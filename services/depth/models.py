@@ -1,4 +1,4 @@
-"""The table of models, and fetching one: resumed, with progress, checked before it is put in its place."""
+"""The table of depth models, and resumable downloads that are verified before they are installed."""
 
 from __future__ import annotations
 
@@ -23,21 +23,21 @@ _TIMEOUT_S = 30.0
 
 
 class ModelEntry(Config):
-    """One model of the table."""
+    """One row of `models.toml`."""
 
-    source: str  # the depth source that takes it
+    source: str  # the depth source that uses it
     licence: str
-    commercial: bool
+    commercial: bool  # the licence permits commercial use
     url: Annotated[str, Field(pattern=r"^(https://.*|file://.*|http://127\.0\.0\.1[:/].*|)$")]
-    sha256: Annotated[str, Field(pattern=r"^([0-9a-f]{64}|)$")]  # "" = nobody has verified it
-    how: str = ""
+    sha256: Annotated[str, Field(pattern=r"^([0-9a-f]{64}|)$")]  # "" = not verified
+    how: str = ""  # how to obtain the file, where there is no URL
 
 
 def read_model_table(path: Path = TABLE) -> dict[str, ModelEntry]:
-    """All rows by name.
+    """Return all rows of the table by name.
 
     Raises:
-        UserError: no such file, not TOML, or a row that does not fit.
+        UserError: the file is missing, is not TOML, or has an invalid row.
     """
     try:
         table = tomllib.loads(path.read_text())
@@ -47,10 +47,10 @@ def read_model_table(path: Path = TABLE) -> dict[str, ModelEntry]:
 
 
 def find_entry(name: str, table: dict[str, ModelEntry]) -> ModelEntry:
-    """The row called `name`.
+    """Return the row called `name`.
 
     Raises:
-        UserError: none; lists those there are.
+        UserError: there is none; the message lists all names.
     """
     if name not in table:
         raise UserError(f"there is no model {name!r}; there are {', '.join(table)}")
@@ -63,20 +63,23 @@ def pull(
     agree: Callable[[str], bool],
     progress: Callable[[int, int | None], None] = lambda done, total: None,
 ) -> Path:
-    """Fetches a model into the first models folder; an interrupted download goes on where it stopped.
+    """Download a model into the first models folder and return its path; resume an interrupted download.
 
-    `agree(question)` is asked for a non-commercial licence, and for a file that nobody has verified.
+    `agree(question)` must return True for a non-commercial licence, and for a file without a known digest.
+    `progress(done, total)` gets bytes; `total` is None if the server does not state it.
 
     Raises:
-        UserError: no address, refused, no connection, or the wrong digest (the file is then removed).
+        UserError: no URL, no agreement, no connection, or a wrong digest (the file is then removed).
     """
     target = models_dirs()[0] / f"{name}.onnx"
     if target.is_file() and row.sha256 and sha256_of(target) == row.sha256:
         return target
     if not row.url:
-        raise UserError(f"{name}: no finished file is published. {row.how} Then put it at {target}")
-    if not row.commercial and not agree(f"{name} is licensed {row.licence}: not for commercial use. Go on?"):
-        raise UserError(f"{name}: licence not accepted; nothing was fetched")
+        raise UserError(f"{name}: there is no file to download. {row.how} Then copy it to {target}")
+    if not row.commercial and not agree(
+        f"{name} has the licence {row.licence}: no commercial use. Continue?"
+    ):
+        raise UserError(f"{name}: licence not accepted; nothing was downloaded")
     target.parent.mkdir(parents=True, exist_ok=True)
     partial = target.with_name(target.name + ".partial")
     _download(row.url, partial, progress)
@@ -84,13 +87,15 @@ def pull(
     if row.sha256 and digest != row.sha256:
         partial.unlink()
         raise UserError(
-            f"{name}: the file from {row.url} has sha256 {digest}, the table says {row.sha256}; "
-            "it was removed. Try again, or check the table"
+            f"{name}: the file from {row.url} has sha256 {digest}, the table states {row.sha256}; "
+            "the file was removed. Try again, or check the table"
         )
-    question = f"{name}: sha256 of what arrived is {digest}; the table holds none to compare with. Keep it?"
+    question = (
+        f"{name}: the downloaded file has sha256 {digest}; the table has none to compare with. Keep it?"
+    )
     if not row.sha256 and not agree(question):
         partial.unlink()
-        raise UserError(f"{name}: not kept")
+        raise UserError(f"{name}: the file was not kept")
     os.replace(partial, target)
     return target
 
@@ -99,45 +104,45 @@ def _download(url: str, partial: Path, progress: Callable[[int, int | None], Non
     have = partial.stat().st_size if partial.exists() else 0
     request = urllib.request.Request(url, headers={"Range": f"bytes={have}-"} if have else {})
     try:
-        with urllib.request.urlopen(request, timeout=_TIMEOUT_S) as answer:
-            goes_on = have > 0 and getattr(answer, "status", None) == 206
-            done = have if goes_on else 0
-            length = answer.headers.get("Content-Length")
+        with urllib.request.urlopen(request, timeout=_TIMEOUT_S) as response:
+            resumes = have > 0 and getattr(response, "status", None) == 206
+            done = have if resumes else 0
+            length = response.headers.get("Content-Length")
             total = done + int(length) if length else None
-            with partial.open("ab" if goes_on else "wb") as file:
-                while block := answer.read(_BLOCK):
+            with partial.open("ab" if resumes else "wb") as file:
+                while block := response.read(_BLOCK):
                     file.write(block)
                     done += len(block)
                     progress(done, total)
     except urllib.error.HTTPError as error:
-        if error.code == 416 and have:  # the whole file is there already
+        if error.code == 416 and have:  # the partial file is already complete
             return
-        raise UserError(f"{url}: the server says {error.code} {error.reason}") from error
+        raise UserError(f"{url}: the server answered {error.code} {error.reason}") from error
     except (urllib.error.URLError, OSError) as error:
         reason = getattr(error, "reason", error)
-        raise UserError(f"{url}: cannot be fetched ({reason}); what arrived is kept, try again") from error
-    if total is not None and done < total:
         raise UserError(
-            f"{url}: the connection broke at {done} of {total} bytes; try again, it goes on there"
-        )
+            f"{url}: download failed ({reason}); the part received is kept, try again to resume"
+        ) from error
+    if total is not None and done < total:
+        raise UserError(f"{url}: the connection was lost after {done} of {total} bytes; try again to resume")
 
 
 def describe_model_file(file: Path, table: dict[str, ModelEntry]) -> dict[str, object]:
-    """What a model file is: digest, the row it matches, ports, and how long a run takes to answer.
+    """Return digest, matching row, inputs, outputs and execution providers of a model file.
 
     Raises:
-        UserError: no such file, or no graph that runs here.
+        UserError: the file is missing, or holds no graph that can run here.
     """
     from beamsplat.services.depth.onnx_model import OnnxModel
 
     path = find_model(file)
     model = OnnxModel(path)
     digest = sha256_of(path)
-    named = [name for name, row in table.items() if row.sha256 == digest]
+    names = [name for name, row in table.items() if row.sha256 == digest]
     return {
         "file": str(path),
         "sha256": digest,
-        "known_as": named[0] if named else None,
+        "known_as": names[0] if names else None,
         "inputs": {port.name: list(port.shape) for port in model.inputs},
         "outputs": {port.name: list(port.shape) for port in model.outputs},
         "providers": list(model.providers),
@@ -145,7 +150,7 @@ def describe_model_file(file: Path, table: dict[str, ModelEntry]) -> dict[str, o
 
 
 def installed_path(name: str) -> Path | None:
-    """Where a model lies, None if nowhere."""
+    """Return the path of an installed model; None if it is not installed."""
     try:
         return find_model(name)
     except UserError:

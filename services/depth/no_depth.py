@@ -1,4 +1,4 @@
-"""`none`: no dense guess; beams alone carry the depth (the MonoGS configuration)."""
+"""Source `none`: no depth estimate; depth comes from beams and past images (the MonoGS configuration)."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from beamsplat.services.depth.source import DepthInput, Estimate
 
 
 class NoDepth:
-    """The null object among depth sources."""
+    """Depth source that estimates nothing (null object)."""
 
     def estimate(self, view: DepthInput) -> Estimate:
-        """All unknown, and that is right."""
+        """Return a depth map of NaN: this source estimates nothing, and fusion uses lidar and past images."""
         return Estimate(np.full(view.camera.shape, np.nan, dtype=np.float32), "none")

@@ -1,4 +1,4 @@
-"""The depth service: a dense guess for the newest picture, by the source that the deployment names."""
+"""The depth service: a dense depth estimate for the newest image, by the configured depth source."""
 
 from __future__ import annotations
 
@@ -27,19 +27,19 @@ from beamsplat.services.depth.source import (
 
 log = logging.getLogger("beamsplat.depth")
 
-_PICTURES = 8  # that may wait for their pose
+_IMAGES = 8  # that may wait for their pose
 
 
 class DepthConfig(NodeConfig):
-    """`source` is a name of services/depth/source.py; `options` are that source's own, checked by it."""
+    """Options of the depth service; `options` are those of `source`, which checks them."""
 
     source: str = "stixel"
     options: dict[str, Any] = Field(default_factory=dict)
-    floor_known: bool = True  # the camera's height in the calibration can be relied on
+    floor_known: bool = True  # the camera height in the calibration is reliable
 
 
 class DepthNode(Node):
-    """Pictures in, estimates out; sources that look at beams wait for the pose of the picture's time."""
+    """Publishes a depth estimate per image; sources that use beams wait for the pose at the image time."""
 
     name = "depth"
     Config = DepthConfig
@@ -52,7 +52,7 @@ class DepthNode(Node):
         self._needs_beams = uses_beams(self.config.source, self._source)
         self._undistort: Undistorter | None = None
         self._history: SensorHistory | None = None
-        self._waiting: deque[Image] = deque(maxlen=_PICTURES)
+        self._waiting: deque[Image] = deque(maxlen=_IMAGES)
         self.overtaken = 0
 
     def check_resources(self) -> None:
@@ -60,9 +60,9 @@ class DepthNode(Node):
         check_source(self.config.source, self.config.options)
 
     def on_rig(self, rig: Rig) -> Outputs:
-        """Camera and lidar of this robot; without a camera there is nothing to do here."""
+        """Set up the camera and the lidar of this robot; without a camera the node publishes nothing."""
         if rig.camera is None:
-            log.error("the calibration has no camera: no depth")
+            log.error("the calibration has no camera: depth is not estimated; add [camera] to the rig file")
         else:
             camera = rig.camera
             self._undistort = Undistorter(Pinhole.of(camera))
@@ -77,25 +77,25 @@ class DepthNode(Node):
         return iter(())
 
     def on_localization_odometry(self, odometry: Odometry) -> Outputs:
-        """A pose; a picture may have waited for it."""
+        """Add a pose, and process the images that have waited for it."""
         if self._history is not None and odometry.status == "ok":
             self._history.add_pose(odometry.stamp_ns, odometry.T_odom_body)
             yield from self._estimate_waiting()
 
     def on_camera_image(self, image: Image) -> Outputs:
-        """A picture; it may have to wait for its pose, which comes a scan later."""
+        """Queue an image until the pose at its time is known, which is one scan later."""
         if self._undistort is not None:
-            if len(self._waiting) == _PICTURES:  # poses are late: the oldest makes room, and is counted
+            if len(self._waiting) == _IMAGES:  # poses are late: the oldest image is dropped and counted
                 self._count_overtaken()
             self._waiting.append(image)
             yield from self._estimate_waiting()
 
     def _count_overtaken(self) -> None:
         self.overtaken += 1
-        self.detail = f"{self.overtaken} pictures overtaken"
+        self.detail = f"{self.overtaken} images overtaken"
 
     def _estimate_waiting(self) -> Outputs:
-        """The newest picture that is ready; older ones are overtaken, and counted."""
+        """Process the newest image that is ready; older ones are dropped and counted as overtaken."""
         image = None
         while self._waiting:
             if self._needs_beams and self._waiting[0].stamp_ns > self._history.newest_pose_ns:
@@ -108,7 +108,7 @@ class DepthNode(Node):
         try:
             rgb = self._decode_image(image)
         except (UserError, ValueError) as error:
-            yield self._refusal(image.stamp_ns, str(error))
+            yield self._rejection(image.stamp_ns, str(error))
             return
         beams, _ = self._history.beams(image.stamp_ns)
         view = DepthInput(
@@ -116,7 +116,7 @@ class DepthNode(Node):
         )
         estimate = self._source.estimate(view)
         if not estimate.ok or estimate.kind == "none":
-            yield self._refusal(image.stamp_ns, estimate.status, estimate.kind)
+            yield self._rejection(image.stamp_ns, estimate.status, estimate.kind)
             return
         yield (
             "depth/estimate",
@@ -126,10 +126,10 @@ class DepthNode(Node):
         )
 
     def _decode_image(self, image: Image) -> np.ndarray:
-        """uint8 [H, W, 3], undistorted; black for a source that does not look at it.
+        """Return the undistorted image uint8 [H, W, 3]; black for a source that does not use it.
 
         Raises:
-            UserError, ValueError: it does not decode, or is of another size than the calibration.
+            UserError, ValueError: it cannot be decoded, or its size differs from the calibration.
         """
         shape = self._undistort.pinhole.shape
         if self.config.source in IGNORES_IMAGE and (image.height_px, image.width_px) == shape:
@@ -138,7 +138,7 @@ class DepthNode(Node):
             decode_rgb(image.data, image.encoding, image.width_px, image.height_px, image.step_bytes)
         )
 
-    def _refusal(self, stamp_ns: int, status: str, kind: str = "none") -> tuple[str, DepthEstimate]:
+    def _rejection(self, stamp_ns: int, status: str, kind: str = "none") -> tuple[str, DepthEstimate]:
         empty = np.zeros((0, 0), np.float32)
         message = DepthEstimate(
             stamp_ns=stamp_ns, source=self.config.source, kind=kind, values=empty, status=status

@@ -1,7 +1,7 @@
-"""One checked ONNX session: what the graph says is compared with what an adapter needs, before the first run.
+"""ONNX Runtime session whose inputs and outputs are checked before the first run.
 
-On a CPU: one thread and no spinning. Two cores that are busy gain nothing from a second thread, and
-spinning threads doubled the latency of the small network.
+On a CPU: one thread and no spinning. On two busy cores a second thread gains nothing, and spinning threads
+doubled the latency of the small network.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import onnxruntime as ort
 
 from beamsplat.common.errors import UserError
 
-# In order of preference; what onnxruntime was built with decides.
+# In order of preference; the installed onnxruntime package decides which are available.
 PROVIDERS = (
     "TensorrtExecutionProvider", "CUDAExecutionProvider", "OpenVINOExecutionProvider",
     "CoreMLExecutionProvider", "CPUExecutionProvider",
@@ -24,7 +24,7 @@ _DTYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16, "tensor(d
 
 @dataclass(frozen=True)
 class TensorSpec:
-    """One input or output of a graph; None stands for a size that is free."""
+    """Name, shape and type of one input or output; None stands for a dynamic size."""
 
     name: str
     shape: tuple[int | None, ...]
@@ -32,23 +32,23 @@ class TensorSpec:
 
 
 def available_providers(wanted: tuple[str, ...] = PROVIDERS) -> list[str]:
-    """Those of `wanted` that this onnxruntime has, in that order."""
-    there = set(ort.get_available_providers())
-    return [name for name in wanted if name in there]
+    """Return the providers of `wanted` that this onnxruntime has, in that order."""
+    available = set(ort.get_available_providers())
+    return [name for name in wanted if name in available]
 
 
 class OnnxModel:
-    """A session with known ports.
+    """An ONNX Runtime session with checked inputs and outputs.
 
     Raises:
-        UserError: no such file, not an ONNX graph, or ports of an unknown kind; names the file.
+        UserError: the file is missing, is no ONNX graph, or has tensors of an unsupported type.
     """
 
     def __init__(self, path: Path, *, threads: int = 1, providers: tuple[str, ...] = PROVIDERS) -> None:
         self.path = Path(path)
         if not self.path.is_file():
             raise UserError(
-                f"{self.path}: no such model file; `beamsplat models list` shows what can be fetched, "
+                f"{self.path}: no such model file; `beamsplat models list` shows what can be downloaded, "
                 "or set BEAMSPLAT_MODELS to the folder that holds it"
             )
         options = ort.SessionOptions()
@@ -60,7 +60,7 @@ class OnnxModel:
         chosen = available_providers(providers)
         if not chosen:
             raise UserError(
-                f"{self.path}: none of the execution providers {', '.join(providers)} is there; "
+                f"{self.path}: none of the execution providers {', '.join(providers)} is available; "
                 f"this onnxruntime has {', '.join(ort.get_available_providers())}"
             )
         try:
@@ -69,96 +69,98 @@ class OnnxModel:
             reason = str(error).strip().split("\n")[0][:200]
             raise UserError(f"{self.path}: not an ONNX graph that can run here: {reason}") from error
         self.providers = self._session.get_providers()
-        self.inputs = [self._port(node) for node in self._session.get_inputs()]
-        self.outputs = [self._port(node) for node in self._session.get_outputs()]
+        self.inputs = [self._tensor_spec(node) for node in self._session.get_inputs()]
+        self.outputs = [self._tensor_spec(node) for node in self._session.get_outputs()]
 
-    def _port(self, node: ort.NodeArg) -> TensorSpec:
+    def _tensor_spec(self, node: ort.NodeArg) -> TensorSpec:
         if node.type not in _DTYPES:
             raise UserError(f"{self.path}: {node.name} is {node.type}; expected a float tensor")
         shape = tuple(size if isinstance(size, int) and size > 0 else None for size in node.shape)
         return TensorSpec(node.name, shape, np.dtype(_DTYPES[node.type]))
 
     def image_input(self, number: int = 0, name: str | None = None) -> TensorSpec:
-        """The input of an RGB image, N x 3 x H x W, by name if there is one of that name, else by number.
+        """Return the input for an RGB image, N x 3 x H x W: the one called `name`, else number `number`.
 
         Raises:
-            UserError: there is no such input, or it does not take three channels first.
+            UserError: there is no such input, or its shape is not N x 3 x H x W.
         """
-        port = next((p for p in self.inputs if p.name == name), None)
-        if port is None:
+        spec = next((p for p in self.inputs if p.name == name), None)
+        if spec is None:
             if number >= len(self.inputs):
                 raise UserError(f"{self.path}: has {len(self.inputs)} inputs; expected one for the image")
-            port = self.inputs[number]
-        if len(port.shape) != 4 or port.shape[1] not in (3, None):
-            channels_last = len(port.shape) == 4 and port.shape[3] == 3
+            spec = self.inputs[number]
+        if len(spec.shape) != 4 or spec.shape[1] not in (3, None):
+            channels_last = len(spec.shape) == 4 and spec.shape[3] == 3
             hint = " (channels last: export it with N x 3 x H x W)" if channels_last else ""
             raise UserError(
-                f"{self.path}: input {port.name!r} has shape {_show(port.shape)}; not N x 3 x H x W{hint}"
+                f"{self.path}: input {spec.name!r} has shape {_show(spec.shape)}; not N x 3 x H x W{hint}"
             )
-        return port
+        return spec
 
     def output(self, name: str) -> TensorSpec:
-        """The output of that name.
+        """Return the output called `name`.
 
         Raises:
-            UserError: there is none; names those there are.
+            UserError: there is none; the message lists all outputs.
         """
-        for port in self.outputs:
-            if port.name == name:
-                return port
-        there = ", ".join(port.name for port in self.outputs)
-        raise UserError(f"{self.path}: has no output {name!r}; it has {there}: not the graph expected here")
+        for spec in self.outputs:
+            if spec.name == name:
+                return spec
+        available = ", ".join(spec.name for spec in self.outputs)
+        raise UserError(
+            f"{self.path}: has no output {name!r}; it has {available}: the file holds another network"
+        )
 
     def check_inputs(self, count: int) -> None:
-        """Raises UserError unless the graph takes `count` inputs."""
+        """Raise UserError unless the graph has `count` inputs."""
         if len(self.inputs) != count:
-            names = ", ".join(port.name for port in self.inputs)
+            names = ", ".join(spec.name for spec in self.inputs)
             raise UserError(f"{self.path}: takes {len(self.inputs)} inputs ({names}); expected {count}")
 
-    def input_size(self, port: TensorSpec, height: int, width: int, multiple: int) -> tuple[int, int]:
-        """(height, width) to feed: the graph's own where it fixes them, else the wished ones.
+    def input_size(self, spec: TensorSpec, height: int, width: int, multiple: int) -> tuple[int, int]:
+        """Return (height, width) of the network input: those of the graph if fixed, else the given ones.
 
         Raises:
-            UserError: a side is no multiple of what the network can take.
+            UserError: a side is not a multiple of `multiple`.
         """
-        chosen = (port.shape[2] or height, port.shape[3] or width)
+        chosen = (spec.shape[2] or height, spec.shape[3] or width)
         for side in chosen:
             if side % multiple:
                 raise UserError(
-                    f"{self.path}: a side of {side} px is no multiple of {multiple}, which this network needs"
+                    f"{self.path}: a side of {side} px is not a multiple of {multiple}, as the network needs"
                 )
         return chosen
 
     def run(self, *arrays: np.ndarray, outputs: tuple[str, ...] | None = None) -> list[np.ndarray]:
-        """Output arrays as float32; inputs in the order of the graph.
+        """Run the graph on inputs in its order and return the outputs as float32 arrays.
 
         Raises:
-            UserError: the graph refuses the input (shape inside the graph does not fit).
+            UserError: the graph rejects the shape of an input.
         """
         feed = {
-            port.name: np.ascontiguousarray(array, dtype=port.dtype)
-            for port, array in zip(self.inputs, arrays, strict=True)
+            spec.name: np.ascontiguousarray(array, dtype=spec.dtype)
+            for spec, array in zip(self.inputs, arrays, strict=True)
         }
         try:
             results = self._session.run(list(outputs) if outputs else None, feed)
         except Exception as error:  # onnxruntime's own exception types share no base but this
             shapes = ", ".join(f"{name} {list(a.shape)}" for name, a in feed.items())
             reason = str(error).strip().split("\n")[0][:200]
-            raise UserError(f"{self.path}: the graph refused {shapes}: {reason}") from error
+            raise UserError(f"{self.path}: the graph rejected {shapes}: {reason}") from error
         return [np.asarray(result, dtype=np.float32) for result in results]
 
     def warm_up(self, *shapes: tuple[int, ...]) -> list[np.ndarray]:
-        """Two runs on grey, so that the first image does not pay for allocation; gives the outputs."""
+        """Run twice on grey inputs, which allocates all buffers, and return the outputs."""
         arrays = [np.full(shape, 0.5, dtype=np.float32) for shape in shapes]
         self.run(*arrays)
         return self.run(*arrays)
 
 
 def to_hw(output: np.ndarray, where: str) -> np.ndarray:
-    """[1, 1, H, W], [1, H, W] or [H, W] as [H, W].
+    """Return an output of shape [1, 1, H, W], [1, H, W] or [H, W] as [H, W].
 
     Raises:
-        UserError: anything else.
+        UserError: any other shape.
     """
     squeezed = output
     while squeezed.ndim > 2 and squeezed.shape[0] == 1:

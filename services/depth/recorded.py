@@ -1,4 +1,4 @@
-"""`recorded`: depth maps by stamp from a folder, for networks that cannot run here."""
+"""Source `recorded`: depth maps by stamp from a folder, for networks that cannot run here."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from beamsplat.services.depth.source import DepthInput, Estimate, Kind, check_de
 
 
 class RecordedDepth:
-    """Files `<stamp_ns>.png` (uint16 millimetres, 0 = unknown) or `<stamp_ns>.npy` (float, as `kind` says).
+    """Depth source that reads `<stamp_ns>.png` (uint16 mm, 0 = unknown) or `.npy` (float, by `kind`).
 
     Raises:
-        UserError: no such folder, or no such file in it.
+        UserError: the folder is missing, or has no such file.
     """
 
     def __init__(self, folder: str | Path = "", kind: Kind = "metric", tolerance_ns: int = 1_000_000) -> None:
         self._folder = Path(folder)
         if not folder or not self._folder.is_dir():
-            raise UserError(f"recorded depth: folder = {str(folder)!r} is no folder with depth maps")
+            raise UserError(f"recorded depth: folder = {str(folder)!r} is not a folder with depth maps")
         files = [p for p in self._folder.iterdir() if p.suffix in (".png", ".npy") and p.stem.isdigit()]
         if not files:
-            raise UserError(f"{self._folder}: holds no <stamp_ns>.png or <stamp_ns>.npy")
+            raise UserError(f"{self._folder}: contains no <stamp_ns>.png and no <stamp_ns>.npy")
         files.sort(key=lambda p: int(p.stem))
         self._stamps = np.array([int(p.stem) for p in files], dtype=np.int64)
         self._files = files
@@ -32,7 +32,7 @@ class RecordedDepth:
         self._tolerance_ns = tolerance_ns
 
     def estimate(self, view: DepthInput) -> Estimate:
-        """The map nearest in time, resized to the image."""
+        """Return the depth map nearest in time, resized to the image; a status if it is too far in time."""
         i = int(np.argmin(np.abs(self._stamps - view.stamp_ns)))
         empty = np.full(view.camera.shape, np.nan, dtype=np.float32)
         if abs(int(self._stamps[i]) - view.stamp_ns) > self._tolerance_ns:
@@ -50,7 +50,7 @@ class RecordedDepth:
 
 
 def read_depth(path: Path) -> np.ndarray:
-    """float32 [H, W] metres of a 16 bit PNG in millimetres (0 = NaN), or a .npy as it is.
+    """Return float32 [H, W]: a 16 bit PNG in mm as metres (0 = NaN), a .npy file unchanged.
 
     Raises:
         UserError: unreadable, or of another kind.

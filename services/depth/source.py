@@ -1,8 +1,7 @@
-"""Depth sources: what they get, what they give, and the table of their names.
+"""Interface of depth sources, and the table of their names.
 
-A source sees one undistorted image (and, for geometric sources, the beams of that moment) and gives a
-dense estimate of the image's size. What its numbers mean is said by `kind`; scaling to metres is
-fusion's business.
+A source takes one undistorted image (geometric sources also the beams at that time) and returns a dense
+estimate of the same size. `Estimate.kind` states the meaning of the values; fusion scales them to metres.
 """
 
 from __future__ import annotations
@@ -28,24 +27,24 @@ Kind = Literal["metric", "relative", "disparity", "none"]
 
 @dataclass(frozen=True)
 class DepthInput:
-    """One image and what is known at its time."""
+    """One image with its camera model and the beams at its time."""
 
     stamp_ns: int
     image_rgb: np.ndarray  # uint8 [H, W, 3], undistorted
-    camera: Pinhole  # without distortion, of the image's size
+    camera: Pinhole  # without distortion, of the image size
     T_body_camera: np.ndarray = field(default_factory=lambda: np.eye(4))
     beams: Beams = NO_BEAMS
-    floor_known: bool = False  # T_body_camera's height above the floor can be relied on
+    floor_known: bool = False  # the height in T_body_camera is reliable
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """A dense guess. metric: metres; relative: up to a factor; disparity: a / z + b, nearer = larger."""
+    """A dense depth estimate: metric (metres), relative (up to a factor) or disparity (a / z + b)."""
 
-    values: np.ndarray  # float32 [H, W] of the image's size; NaN = no answer
+    values: np.ndarray  # float32 [H, W] of the image size, NaN = unknown
     kind: Kind
-    status: str = "ok"  # else one sentence: why the values must not be used
-    confidence: np.ndarray | None = None  # float32 [H, W] in [0, 1], ranking within this image only
+    status: str = "ok"  # else the reason why the values must not be used
+    confidence: np.ndarray | None = None  # float32 [H, W] in [0, 1], comparable within one image only
 
     @property
     def ok(self) -> bool:
@@ -53,10 +52,10 @@ class Estimate:
 
 
 class DepthSource(Protocol):
-    """A way to guess dense depth from one image."""
+    """Estimator of dense depth from one image."""
 
     def estimate(self, view: DepthInput) -> Estimate:
-        """The guess for one image. Never raises for bad images: `status` says what is wrong."""
+        """Return the estimate for one image; a bad image gives a `status`, not an exception."""
         ...
 
 
@@ -71,10 +70,10 @@ SOURCES: dict[str, str] = {
     "none": "beamsplat.services.depth.no_depth:NoDepth",
 }
 
-# These look at the beams of an image's time; the others need not wait for them.
+# Sources that use the beams at the time of the image; the others do not wait for them.
 USES_BEAMS = frozenset({"stixel"})
 
-# These never look at the image itself: nobody needs to decode it for them.
+# Sources that do not use the image, so that it is not decoded for them.
 IGNORES_IMAGE = frozenset({"stixel", "recorded", "none"})
 
 
@@ -161,14 +160,14 @@ def _checked_options(name: str, cls: type[DepthSource], options: Mapping[str, An
 
 
 def check_depth_map(values: np.ndarray, min_known_share: float = 0.2) -> str:
-    """ "ok", or one sentence on why a network's output [H, W] cannot be depth."""
+    """Return "ok", or the reason why the output [H, W] of a network cannot be depth."""
     finite = np.isfinite(values)
     share = float(finite.mean()) if values.size else 0.0
     if share < min_known_share:
-        return f"the network answered only {share:.0%} of the image with a number"
+        return f"the network returned a number for only {share:.0%} of the image"
     known = values[finite]
     if not np.any(known > 0.0):
-        return "the network returned nothing above zero"
+        return "the network returned no value above zero"
     spread = float(np.percentile(known, 95) - np.percentile(known, 5))
     if spread <= 1e-4 * float(np.median(np.abs(known)) + 1e-12):
         return "the network returned the same value everywhere"

@@ -1,4 +1,4 @@
-"""`stixel`: no weights at all. Each image column is a vertical surface at the beam's range on the floor."""
+"""Source `stixel`: each image column is a vertical surface at the range of its beam, on the floor plane."""
 
 from __future__ import annotations
 
@@ -10,30 +10,30 @@ from beamsplat.common.geometry.beams import azimuth_and_range, occluded_beams, p
 from beamsplat.common.geometry.camera import Pinhole
 from beamsplat.services.depth.source import DepthInput, Estimate
 
-_FINE = 2  # azimuths a pixel column
+_FINE = 2  # azimuths per pixel column
 
 
 @dataclass(frozen=True)
 class _PixelRays:
-    """What stays the same from image to image of one mounted camera."""
+    """Rays of one mounted camera, computed once."""
 
     camera: Pinhole
     T_body_camera: np.ndarray
-    azimuth_rad: np.ndarray  # float64 [M]: the fan over the image's width
-    place: np.ndarray  # int32 [H, W]: each pixel's azimuth in the fan
+    azimuth_rad: np.ndarray  # float64 [M]: azimuths over the field of view
+    azimuth_index: np.ndarray  # int32 [H, W]: index of each pixel's azimuth
     per_range: np.ndarray  # float32 [H, W]: optical z per metre of horizontal range
-    floor: np.ndarray  # float32 [H, W]: optical z of the floor, inf = not met
+    floor: np.ndarray  # float32 [H, W]: optical z of the floor, inf = not hit
 
 
 class Stixel:
-    """Beams extruded upright, and the floor plane where the camera height is known."""
+    """Depth source of vertically extruded beams, and of the floor plane if the camera height is known."""
 
     def __init__(self, max_depth_m: float = 30.0) -> None:
         self._max_depth_m = max_depth_m
         self._rays: _PixelRays | None = None
 
     def estimate(self, view: DepthInput) -> Estimate:
-        """Metric depth; NaN in columns that no beam serves (floor excepted)."""
+        """Return metric depth, NaN in columns without a beam (except on the floor)."""
         rays = self._rays
         if (
             rays is None
@@ -45,23 +45,26 @@ class Stixel:
         points = points[~occluded_beams(points, view.T_body_camera)]
         azimuth, reach = azimuth_and_range(points, view.T_body_camera)
         ranges = wall_ranges(rays.azimuth_rad, azimuth, reach).astype(np.float32)
-        values = ranges[rays.place] * rays.per_range
+        values = ranges[rays.azimuth_index] * rays.per_range
         if view.floor_known:
             values = np.fmin(values, rays.floor)
         with np.errstate(invalid="ignore"):
             values[values > self._max_depth_m] = np.nan
-        status = "ok" if np.isfinite(values).any() else "no beams in view and no floor known"
+        status = "ok" if np.isfinite(values).any() else "no beams in view, and the camera height is unknown"
         return Estimate(values, "metric", status)
 
 
 def _prepare(camera: Pinhole, T_body_camera: np.ndarray) -> _PixelRays:
     rays_body = camera.ray_grid() @ T_body_camera[:3, :3].T
     azimuth = np.arctan2(rays_body[..., 1], rays_body[..., 0])
-    fan = np.linspace(float(azimuth.min()), float(azimuth.max()), _FINE * camera.width_px)
-    place = np.rint((azimuth - fan[0]) / max(fan[-1] - fan[0], 1e-9) * (len(fan) - 1))
-    across = np.maximum(np.hypot(rays_body[..., 0], rays_body[..., 1]), 1e-9)
+    azimuths = np.linspace(float(azimuth.min()), float(azimuth.max()), _FINE * camera.width_px)
+    azimuth_index = np.rint(
+        (azimuth - azimuths[0]) / max(azimuths[-1] - azimuths[0], 1e-9) * (len(azimuths) - 1)
+    )
+    ray_xy = np.maximum(np.hypot(rays_body[..., 0], rays_body[..., 1]), 1e-9)
     floor = plane_depth(rays_body, float(T_body_camera[2, 3]))
     return _PixelRays(
-        camera, T_body_camera.copy(), fan, place.astype(np.int32), (1.0 / across).astype(np.float32),
+        camera, T_body_camera.copy(), azimuths, azimuth_index.astype(np.int32),
+        (1.0 / ray_xy).astype(np.float32),
         np.where(np.isfinite(floor), floor, np.inf).astype(np.float32),
     )  # fmt: skip

@@ -1,9 +1,9 @@
-"""UniDepth V2, exported by its own export.py: metric points, a confidence and the camera it believes in.
+"""UniDepth V2, exported by its own export.py: metric points, confidence and estimated intrinsics.
 
-Ports: `rgbs` [B, 3, H, W], ImageNet-normalize_image, and with the camera `rays` [B, 3, H, W], unit vectors
-K^-1 [u, v, 1] at network resolution with pixel centres at half integers; out `pts_3d` [B, 3, H, W] in
-metres, `confidence` [B, 1, H, W], `intrinsics` [B, 3, 3]. H and W are fixed multiples of 14. Depth is
-pts_3d's z, not its length.
+Inputs and outputs: `rgbs` [B, 3, H, W], ImageNet-normalize_image, and with the camera `rays` [B, 3, H, W],
+unit vectors K^-1 [u, v, 1] at network resolution with pixel centres at half integers; out `pts_3d` [B, 3,
+H, W] in metres, `confidence` [B, 1, H, W], `intrinsics` [B, 3, 3]. H and W are fixed multiples of 14. Depth
+is pts_3d's z, not its length.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from beamsplat.services.depth.source import DepthInput, Estimate, check_depth_ma
 
 @dataclass(frozen=True)
 class LetterboxLayout:
-    """How an image sits in the network's input: scaled by `factor`, then padded."""
+    """Position of an image in the network input: scaled by `factor`, then padded."""
 
     factor: float
     left_px: int
@@ -34,21 +34,21 @@ class LetterboxLayout:
 
 
 class UniDepth:
-    """UniDepth V2 on one ONNX session.
+    """Depth source UniDepth V2 on ONNX Runtime.
 
     Raises:
-        UserError: the model is missing, or its ports are not those of the export.
+        UserError: the model file is missing, or has other inputs or outputs than the export.
     """
 
     def __init__(self, model: str | Path = "unidepth_v2_vits", threads: int = 1) -> None:
         self._onnx = OnnxModel(find_model(model), threads=threads)
-        port = self._onnx.image_input(name="rgbs")
-        if port.name != "rgbs" or self._onnx.inputs[0].name != "rgbs":
+        spec = self._onnx.image_input(name="rgbs")
+        if spec.name != "rgbs" or self._onnx.inputs[0].name != "rgbs":
             raise UserError(
                 f"{self._onnx.path}: the first input is {self._onnx.inputs[0].name!r}, not 'rgbs'"
             )
-        if not port.shape[2] or not port.shape[3]:
-            raise UserError(f"{self._onnx.path}: H and W are free; UniDepth's export fixes them")
+        if not spec.shape[2] or not spec.shape[3]:
+            raise UserError(f"{self._onnx.path}: H and W are dynamic; the export of UniDepth has fixed ones")
         self._takes_rays = len(self._onnx.inputs) == 2
         if self._takes_rays and self._onnx.inputs[1].name != "rays":
             raise UserError(
@@ -58,12 +58,12 @@ class UniDepth:
             self._onnx.check_inputs(1)
         self._has_confidence = any(p.name == "confidence" for p in self._onnx.outputs)
         self._onnx.output("pts_3d")
-        self._side = self._onnx.input_size(port, port.shape[2], port.shape[3], PATCH)
+        self._side = self._onnx.input_size(spec, spec.shape[2], spec.shape[3], PATCH)
         shape = (1, 3, *self._side)
         self._onnx.warm_up(*([shape, shape] if self._takes_rays else [shape]))
 
     def estimate(self, view: DepthInput) -> Estimate:
-        """Metric depth at the image's size, and a confidence that ranks pixels within this image."""
+        """Return metric depth at the image size, with a confidence that ranks the pixels of this image."""
         h, w = view.camera.shape
         fit = letterbox_layout(h, w, self._side)
         inputs = [normalize_image(letterbox(view.image_rgb, fit, self._side), self._side)]
@@ -82,21 +82,21 @@ class UniDepth:
             z = np.where(z > 0.0, z, np.nan).astype(np.float32)
         confidence = None
         if self._has_confidence:
-            # The export gives an estimated log error: larger is worse. Only the order is used.
+            # The export outputs an estimated log error: larger is worse. Only the order is used.
             error = _crop_and_resize(results[1].reshape(points.shape[2:]), fit, h, w)
             confidence = (1.0 / (1.0 + np.maximum(error, 0.0))).astype(np.float32)
         return Estimate(z, "metric", status, confidence)
 
 
 def letterbox_layout(height: int, width: int, side: tuple[int, int]) -> LetterboxLayout:
-    """The largest image of the given aspect inside the network's size, centred."""
+    """Return the layout of the largest image of the given aspect ratio in the network input, centred."""
     factor = min(side[0] / height, side[1] / width)
     inner_h, inner_w = min(round(height * factor), side[0]), min(round(width * factor), side[1])
     return LetterboxLayout(factor, (side[1] - inner_w) // 2, (side[0] - inner_h) // 2, inner_w, inner_h)
 
 
 def letterbox(image_rgb: np.ndarray, fit: LetterboxLayout, side: tuple[int, int]) -> np.ndarray:
-    """uint8 [h, w, 3] at network size: the image scaled, mean grey around it."""
+    """Return uint8 [h, w, 3] at network size: the scaled image, padded with the ImageNet mean."""
     out = np.full((*side, 3), (124, 116, 104), dtype=np.uint8)
     inner = cv2.resize(image_rgb, (fit.width_px, fit.height_px), interpolation=cv2.INTER_LINEAR)
     out[fit.top_px : fit.top_px + fit.height_px, fit.left_px : fit.left_px + fit.width_px] = inner
@@ -104,9 +104,9 @@ def letterbox(image_rgb: np.ndarray, fit: LetterboxLayout, side: tuple[int, int]
 
 
 def network_rays(camera: Pinhole, fit: LetterboxLayout, side: tuple[int, int]) -> np.ndarray:
-    """float32 [1, 3, h, w] unit rays at network resolution; pixel centres at half integers there."""
+    """Return unit rays float32 [1, 3, h, w] at network resolution, pixel centres at half integers."""
     fx, fy = camera.fx_px * fit.width_px / camera.width_px, camera.fy_px * fit.height_px / camera.height_px
-    # Our centres are integers, the network's are half integers: cx moves by half a pixel.
+    # Our pixel centres are integers, those of the network half integers: cx shifts by half a pixel.
     cx = (camera.cx_px + 0.5) * fit.width_px / camera.width_px + fit.left_px
     cy = (camera.cy_px + 0.5) * fit.height_px / camera.height_px + fit.top_px
     v, u = np.mgrid[: side[0], : side[1]] + 0.5

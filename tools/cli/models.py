@@ -11,14 +11,14 @@ from rich.console import Console
 from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TransferSpeedColumn
 from rich.table import Table
 
-app = typer.Typer(no_args_is_help=True, help="Depth networks: what there is, fetching one, checking a file.")
+app = typer.Typer(no_args_is_help=True, help="Depth networks: list them, download one, check a file.")
 
 
 @app.command("list")
 def list_models(
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")] = False,
 ) -> None:
-    """All known models: licence, whether the file is here, where it comes from.
+    """List all known models: licence, whether the file is installed, how to obtain it.
 
     Example: beamsplat models list
     """
@@ -31,7 +31,7 @@ def list_models(
         )
         return
     table = Table()
-    for title in ("name", "source", "licence", "here", "to get it"):
+    for title in ("name", "source", "licence", "installed", "how to get it"):
         table.add_column(title, overflow="fold")
     for name, row in rows.items():
         where = installed_path(name)
@@ -44,11 +44,13 @@ def list_models(
 @app.command("pull")
 def pull_model(
     name: Annotated[str, typer.Argument(help="A name from `beamsplat models list`.")],
-    yes: Annotated[bool, typer.Option("--yes", help="Accept licence and unverified file unasked.")] = False,
+    yes: Annotated[
+        bool, typer.Option("--yes", help="Accept the licence and an unverified file without asking.")
+    ] = False,
 ) -> None:
-    """Fetches a model into the first folder of BEAMSPLAT_MODELS, or the user's data folder.
+    """Download a model into the first folder of BEAMSPLAT_MODELS, or the user's data folder.
 
-    An interrupted download goes on where it stopped; the digest is checked before the file is used.
+    An interrupted download is resumed; the digest is checked before the file is installed.
 
     Example: beamsplat models pull depth_anything_v2_small
     """
@@ -75,8 +77,10 @@ def pull_model(
 
 
 @app.command("check")
-def check_model(file: Annotated[Path, typer.Argument(help="A file, or a name that is installed.")]) -> None:
-    """What a model file is: digest, ports, execution providers.
+def check_model(
+    file: Annotated[Path, typer.Argument(help="A file, or the name of an installed model.")],
+) -> None:
+    """Show digest, inputs, outputs and execution providers of a model file.
 
     Example: beamsplat models check my.onnx
     """

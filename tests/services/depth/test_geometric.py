@@ -7,7 +7,12 @@ import pytest
 from beamsplat.common.errors import UserError
 from beamsplat.common.geometry.transforms import se2_to_se3
 from beamsplat.services.depth.source import DepthInput, check_depth_map, make_source
-from beamsplat.tools.evaluation.metrics import MethodErrors, blocks, confirmed, every_third
+from beamsplat.tools.evaluation.metrics import (
+    MethodErrors,
+    confirmed_by_truth,
+    every_third,
+    every_third_block,
+)
 from tests.services.fusion.room import CAMERA, T_BODY_CAMERA, render, scan
 
 POSE = se2_to_se3(np.array([0.3, 0.2, 0.1]))
@@ -65,7 +70,7 @@ def test_judge_says_what_is_wrong_with_a_map():
 
 def test_held_out_patterns_are_thirds_of_the_circle():
     assert every_third(720).sum() == 240
-    hidden = blocks(720, np.radians(0.5))
+    hidden = every_third_block(720, np.radians(0.5))
     assert hidden.sum() == 240
     assert np.all(hidden[:15])
     assert not hidden[15:45].any()
@@ -97,7 +102,12 @@ def test_metrics_are_what_they_are_called():
 def test_beams_that_the_truth_does_not_confirm_are_told():
     truth = np.full((10, 10), 2.0, np.float32)
     uv = np.array([[1.0, 1.0]] * 4)
-    assert confirmed(truth, uv, np.array([2.0, 2.089, 2.091, 1.0])).tolist() == [True, True, False, False]
+    assert confirmed_by_truth(truth, uv, np.array([2.0, 2.089, 2.091, 1.0])).tolist() == [
+        True,
+        True,
+        False,
+        False,
+    ]
 
 
 def test_images_that_wait_in_vain_for_their_poses_are_counted():
@@ -116,4 +126,4 @@ def test_images_that_wait_in_vain_for_their_poses_are_counted():
         image = Image(stamp_ns=k * 10**8, width_px=64, height_px=48, encoding="rgb8", data=pixels)
         assert list(node.on_camera_image(image)) == []
     assert node.overtaken == 12  # eight still wait
-    assert "12 pictures overtaken" in node.detail
+    assert "12 images overtaken" in node.detail

@@ -167,12 +167,12 @@ def test_the_network_at_hand_answers_at_its_known_error(shared_dir, monkeypatch)
     from beamsplat.services.depth.recorded import read_depth
     from beamsplat.services.replay.options import SourceOptions
     from beamsplat.services.replay.source import open_source
-    from beamsplat.tools.evaluation.evaluate import read_truth
+    from beamsplat.tools.evaluation.evaluate import truth_depth_files
 
     monkeypatch.setenv("BEAMSPLAT_MODELS", str(shared_dir / "models"))
     source = make_source("fastdepth")
     camera = Pinhole(526.4, 526.4, 317.2, 237.2, 640, 480)
-    files = read_truth(shared_dir / "data" / "redkitchen")
+    files = truth_depth_files(shared_dir / "data" / "redkitchen")
     bag = open_source(shared_dir / "data" / "redkitchen", SourceOptions())
     errors = []
     for _, topic, message in bag.messages():
