@@ -10,6 +10,8 @@ from pydantic import Field
 from beamsplat.common.messages.schema import Array, Count, Message, NonNegative, Text, Transform, Transforms
 from beamsplat.common.messages.sensor_models import CameraModel
 
+ODOM_ORIGIN = -1  # `anchor_id` of keyframes sent before localization has published an anchor
+
 
 class Keyframe(Message):
     """A picture that is to become part of the map, with all that the map needs of it: nothing else of this

@@ -1,37 +1,40 @@
-"""The mapping service: keyframes in; Gaussians, renders and how good they are out."""
+"""The mapping service: inserts keyframes, optimises Gaussians, publishes chunks, previews and status."""
 
 from __future__ import annotations
 
 import logging
 import math
 from collections.abc import Iterator
-from functools import lru_cache
 from itertools import chain
-
-import numpy as np
 
 from beamsplat.common.errors import UserError
 from beamsplat.common.files.persist import check_can_write
-from beamsplat.common.geometry.camera import Undistorter
-from beamsplat.common.geometry.transforms import inverse
 from beamsplat.common.mapfiles.ply import write_map
-from beamsplat.common.messages import Anchors, Keyframe, MapChunk, MapPoses, MapState, MapStatus, Tick
-from beamsplat.common.runtime.node import Input, Outputs
+from beamsplat.common.messages import (
+    Anchors,
+    Keyframe,
+    MapChunk,
+    MapPoses,
+    MapState,
+    MapStatus,
+    Message,
+    Tick,
+)
+from beamsplat.common.runtime.node import Input, Job, Node, Outputs
 from beamsplat.services.mapping.chunks import ChunkFeed, Viewpoint, chunk_snapshot, disk_params
 from beamsplat.services.mapping.config import MappingConfig
-from beamsplat.services.mapping.keyframe import StoredKeyframe
+from beamsplat.services.mapping.intake import KeyframeIntake
 from beamsplat.services.mapping.mapper import FULL, HALF, InsertionResult, Mapper
 from beamsplat.services.mapping.messages import (
     ack,
     chunk_message,
-    decode_keyframe,
-    encode_keyframe,
     preview_message,
     state_messages,
     viewpoint_of,
 )
 from beamsplat.services.mapping.preview import render_keyframe
-from beamsplat.services.mapping.session.node import SessionNode
+from beamsplat.services.mapping.session.checkpointer import CheckpointResult
+from beamsplat.services.mapping.session.live_session import LiveSession, MapSession, NoSession
 from beamsplat.services.mapping.session.paging import check_budget
 from beamsplat.services.mapping.session.state import arrays_of
 from beamsplat.services.mapping.settings import MapperSettings
@@ -39,22 +42,25 @@ from beamsplat.services.mapping.warm import warm
 
 log = logging.getLogger("beamsplat.mapping")
 
-ODOM_ORIGIN = -1  # the anchor of keyframes from before localization named one
 
+class MappingNode(Node):
+    """Inserts keyframes, in any order of arrival, and optimises the map.
 
-class MappingNode(SessionNode):
-    """Takes every keyframe, in any order. With a session each is acknowledged as soon as it is on this disk,
-    without one when it is in the map."""
+    With a session a keyframe is acknowledged as soon as it is on this disk, without one when it is in
+    the map.
+    """
 
     name = "mapping"
     Config = MappingConfig
-    # Of keyframes few need to wait here: they wait on this disk too (a session), or on the robot's.
+    config: MappingConfig
+    replaceable = hands_over = True
+    # Few keyframes need to wait in memory: they also wait on this disk (with a session), or on the robot's.
     inputs = (
         Input("keyframes/frame", queued_bytes=32_000_000), Input("localization/anchors", "every"),
         Input("tick", "latest"),
     )  # fmt: skip
     outputs = ("keyframes/ack", "mapping/chunk", "mapping/poses", "mapping/preview", "mapping/status")
-    config: MappingConfig
+    _session: MapSession = NoSession()
 
     def check_resources(self) -> None:
         """Check the memory budget, and that the folders can be written."""
@@ -73,194 +79,195 @@ class MappingNode(SessionNode):
             max_keyframes=c.max_keyframes, refine_pose=c.refine_pose, refine_exposure=c.refine_exposure,
         )  # fmt: skip
         self._mapper = Mapper(settings, seed=c.seed, threads=c.threads)
-        self._lens = lru_cache(maxsize=4)(Undistorter)  # its maps are made once a calibration
-        self._taken: dict[int, tuple[int, np.ndarray]] = {}  # keyframe -> stamp_ns, T_camera_body
+        self._intake = KeyframeIntake(self._mapper)
         self._feed = ChunkFeed()
-        self._eye: Viewpoint | None = None  # where the newest keyframe looks from
-        self._refusals: dict[int, str] = {}  # keyframe -> why
-        # The oldest submap's place when the origin was tied to it.
-        self._T_oldest_origin: np.ndarray | None = None
+        self._viewpoint: Viewpoint | None = None  # of the newest keyframe
         if c.memory_mb is not None:
             check_budget(c.memory_mb, c.session)
         if not self.in_standby:
             self.take_over()
 
+    def close(self) -> None:
+        self._session.close()
+
+    # --- hand-over ---
+
+    def handover_obstacle(self, before: Node) -> str:
+        """The map is handed over in the session: both processes need the same one."""
+        own, other = self.config.session, before.config.session
+        if other is None:
+            return "the map is handed over in mapping.session, and the running mapper has none"
+        if own is None or own.resolve() != other.resolve():
+            return f"the map is in mapping.session = {other}, not in {own}"
+        return super().handover_obstacle(before)
+
+    def hand_over(self) -> None:
+        """Save the map into the session and release it for the successor."""
+        self._session.save()
+        self._session.close()
+
+    def take_over(self) -> None:
+        """Open the session, if one is configured, and resume from it."""
+        if self.config.session is not None:
+            self._session = LiveSession(self.config, self._intake, resume_known=self.in_standby)
+
     # --- keyframes ---
 
-    def on_keyframes_frame(self, message: Keyframe) -> Outputs:
-        """Insertion and the fixed steps; then how well the picture is explained, and what has changed."""
-        if message.id in self._resumed:
-            self._resumed -= {message.id}
+    def on_arrival(self, topic: str, message: Message) -> Outputs:
+        """Acknowledge a keyframe before its turn, once it is on the session's disk."""
+        if isinstance(self._session, NoSession) or not isinstance(message, Keyframe):
             return
-        kept = self._arrivals is not None and self._arrivals.start(message.id)
+        reason = self._intake.rejections.get(message.id)
+        if reason is not None or self._session.accept(message):
+            yield ack(message, reason or "ok")
+
+    def on_keyframes_frame(self, message: Keyframe) -> Outputs:
+        """Insert a keyframe, run the fixed number of steps, publish the result."""
+        if self._session.handled_before(message.id):
+            return
+        acknowledged = self._session.start(message.id)
         known = self._mapper.was_inserted(message.id)
-        outcome = InsertionResult("ok") if known else self._take(message)
-        if not outcome.ok or (not kept and self._kept(message, known)):
+        load_visible = self._session.load_visible
+        outcome = InsertionResult("ok") if known else self._intake.insert(message, load_visible)
+        if not outcome.ok or (not acknowledged and self._session.store(message, known)):
             yield ack(message, outcome.status)
-        if known:  # sent again while the answer was on its way
+        if known:  # sent again while the acknowledgement was in transit
             return
         if not outcome.ok:
-            self._refuse(message.id, outcome.status)
+            self._intake.reject(message.id, outcome.status)
+            self._session.remove(message.id)
             yield "mapping/status", self._status(message.stamp_ns, outcome, 0.0)
             return
-        waiting = message.backlog + (0 if self._arrivals is None else len(self._arrivals))
-        share = min(self.config.calm_backlog / max(waiting, 1), 1.0)
-        c = self.config
+        c, waiting = self.config, message.backlog + self._session.waiting
+        share = min(c.calm_backlog / max(waiting, 1), 1.0)
         loss = self._mapper.optimise(math.ceil(c.half_steps * share), math.ceil(c.full_steps * share))
-        self._page()
+        self._session.keep_budget()
         yield from self._show(message, outcome, loss)
-        if len(self._mapper.keyframes) % self.config.chunk_every == 0:
+        if len(self._mapper.keyframes) % c.chunk_every == 0:
             yield from self._chunk(message.anchor_id, message.stamp_ns)
         yield from self._checkpoint(message.stamp_ns)
 
-    def _take(self, message: Keyframe) -> InsertionResult:
-        foreign = self._foreign(message.map_uuid)
-        if foreign:
-            return InsertionResult(foreign)
-        try:
-            frame = decode_keyframe(message, self._lens)
-        except (UserError, ValueError) as error:
-            return InsertionResult(str(error))
-        return self._add(frame, message)
+    def _skipped(self) -> Outputs:
+        """Insert one keyframe from disk for which the mailbox had no room."""
+        for message in self._session.skipped():
+            yield from self.on_keyframes_frame(message)
 
-    def _kept(self, message: Keyframe, known: bool) -> bool:
-        """Whether an accepted keyframe survives this process, as far as that was asked for."""
-        keeper = self._keeper
-        if keeper is None or (known and not keeper.is_unwritten(message.id)):
-            return True
-        return keeper.write_keyframe(message.id, *encode_keyframe(message))
+    def _checkpoint(self, stamp_ns: int) -> Outputs:
+        if (work := self._session.checkpoint(stamp_ns)) is not None:
+            yield Job("checkpoint", work)
+
+    def on_job_checkpoint(self, result: CheckpointResult) -> Outputs:
+        self._session.finish_checkpoint(result)
+        return iter(())
 
     # --- anchors and time ---
 
     def on_localization_anchors(self, anchors: Anchors) -> Outputs:
-        """The pose graph has moved: Gaussians move along at once, some steps mend the seams."""
-        foreign = self._foreign(anchors.map_uuid)
-        if foreign:
-            log.warning("anchors are left out: %s", foreign)
+        """Move the Gaussians with the pose graph at once; a few steps then close gaps at submap borders."""
+        if reason := self._intake.other_map(anchors.map_uuid):
+            log.warning("anchors are ignored: %s", reason)
             return
-        places = {int(a): T for a, T in zip(anchors.anchor_ids, anchors.T_map_anchor)}
-        self._tie_origin(places)
-        if self._mapper.move_anchors(places) and self._mapper.keyframes:
-            if self._keeper is not None:
-                self._keeper.anchors_moved(self._mapper)
+        given = {int(a): T for a, T in zip(anchors.anchor_ids, anchors.T_map_anchor)}
+        moved = self._intake.move_anchors(given)
+        if moved and self._mapper.keyframes:
+            self._session.anchors_moved()
             self._mapper.refine(self.config.mend_steps, HALF)
-            for anchor in places:
+            for anchor in moved:
                 yield from self._chunk(anchor, anchors.stamp_ns)
 
-    def _tie_origin(self, places: dict[int, np.ndarray]) -> None:
-        """What hangs on the odom frame's origin goes with the oldest submap, which began there."""
-        origin = self._mapper.T_map_anchor.get(ODOM_ORIGIN)
-        if origin is None or not places:
-            return
-        oldest = places[min(places)]
-        if self._T_oldest_origin is None:
-            self._T_oldest_origin = inverse(oldest) @ origin
-        places[ODOM_ORIGIN] = oldest @ self._T_oldest_origin
-
     def on_tick(self, tick: Tick) -> Outputs:
-        """Time passes and no keyframe waits: steps on all keyframes, and the chunk sent longest ago."""
+        """Refine while no keyframe waits, and publish the chunk that was published longest ago."""
         if not self._mapper.keyframes:
             return
-        if self._arrivals is not None and self._arrivals.has_skipped:
-            yield from self._overtaken()
+        if self._session.has_skipped:
+            yield from self._skipped()
         else:
             self._mapper.refine(self.config.tick_steps, FULL)
-            self._page()
-        longest = self._feed.oldest_due(self._mapper, self._eye)
-        if longest is not None:
-            yield from self._chunk(longest, tick.stamp_ns)
+            self._session.keep_budget()
+        oldest = self._feed.oldest_due(self._mapper, self._viewpoint)
+        if oldest is not None:
+            yield from self._chunk(oldest, tick.stamp_ns)
         yield from self._checkpoint(tick.stamp_ns)
 
-    # --- what is said ---
+    # --- outputs ---
 
     def _show(self, message: Keyframe, outcome: InsertionResult, loss: float) -> Outputs:
-        view = render_keyframe(self._mapper, message.id)
-        self._eye = Viewpoint(view.T_map_camera[:3, 3], message.camera.fx_px, self.config.chunk_error_px)
-        yield "mapping/preview", preview_message(message, view)
-        status = self._status(message.stamp_ns, outcome, loss, view.psnr_db, view.depth_error_m)
+        preview = render_keyframe(self._mapper, message.id)
+        focal_px, error_px = message.camera.fx_px, self.config.chunk_error_px
+        self._viewpoint = Viewpoint(preview.T_map_camera[:3, 3], focal_px, error_px)
+        yield "mapping/preview", preview_message(message, preview)
+        status = self._status(message.stamp_ns, outcome, loss, preview.psnr_db, preview.depth_error_m)
         yield "mapping/status", status
-
-    def _held(self) -> dict[int, StoredKeyframe]:
-        """All keyframes, those on disk too."""
-        return self._mapper.keyframes | self._mapper.paged_out
 
     def _status(
         self, stamp_ns: int, outcome: InsertionResult, loss: float, psnr_db: float = math.nan,
         depth_error_m: float = math.nan,
     ) -> MapStatus:  # fmt: skip
-        m, held = self._mapper, len(self._held())
-        gaussians = m.store.count + m.store.paged_out_count
-        self.detail = f"{held} keyframes, {gaussians} Gaussians, {psnr_db:.1f} dB" + (
-            f", {len(self._refusals)} refused (last: {outcome.status})" if not outcome.ok else ""
+        m, keyframes, rejected = self._mapper, len(self._intake.stored()), len(self._intake.rejections)
+        gaussians, session = m.store.count + m.store.paged_out_count, self._session.status_text()
+        self.detail = f"{keyframes} keyframes, {gaussians} Gaussians, {psnr_db:.1f} dB" + (
+            f", {rejected} refused (last: {outcome.status})" if not outcome.ok else ""
         )
-        session = "" if self._keeper is None else self._keeper.status_text(m)
         self.detail += f"; {session}" if session else ""
         return MapStatus(
-            stamp_ns=stamp_ns, status=outcome.status, keyframes=held, refused=len(self._refusals),
+            stamp_ns=stamp_ns, status=outcome.status, keyframes=keyframes, refused=rejected,
             gaussians=gaussians, steps=m.steps, loss=loss, foretold_share=outcome.foretold_share,
             foretold_psnr_db=outcome.foretold_psnr_db, psnr_db=psnr_db, depth_error_m=depth_error_m,
             session=session,
         )  # fmt: skip
 
     def _chunk(self, anchor: int, stamp_ns: int, whole: bool = False) -> Outputs:
-        """An anchor's Gaussians, unless viewers have all of them that show; `whole`: all detail."""
-        part = self._feed.take_update(self._mapper, anchor, None if whole else self._eye)
+        """Publish an anchor's Gaussians unless viewers have the detail that shows; `whole`: all detail."""
+        part = self._feed.take_update(self._mapper, anchor, None if whole else self._viewpoint)
         if part is not None:
             yield "mapping/chunk", chunk_message(self._mapper.T_map_anchor[anchor], anchor, part, stamp_ns)
 
     def on_query_snapshot(self, parameters: dict[str, str]) -> Iterator[MapChunk]:
-        """The whole map, chunk by chunk, for who comes late; `from=X,Y,Z` (m, map), `focal_px` and `error_px`
-        leave out the detail that cannot be seen from there."""
+        """Yield the whole map, chunk by chunk, for a viewer that has just joined.
+
+        `from=X,Y,Z` (m, map frame), `focal_px` and `error_px` leave out detail that is invisible from there.
+        """
         for anchor, part in chunk_snapshot(self._mapper, viewpoint_of(parameters)).items():
             yield chunk_message(self._mapper.T_map_anchor[anchor], anchor, part, 0)
 
     def on_query_state(self, parameters: dict[str, str]) -> Iterator[MapState]:
-        """All that a checkpoint holds, as it is now, in pieces."""
+        """Yield the content of a checkpoint, as it is now, in pieces."""
         if not self._mapper.keyframes:
-            raise UserError("the map is empty so far")
-        arrays = arrays_of(self._mapper, self._extra())
-        yield from state_messages(arrays if self._keeper is None else self._keeper.with_disk_gaussians(arrays))
+            raise UserError("the map is still empty")
+        yield from state_messages(self._session.complete(arrays_of(self._mapper, self._intake.arrays())))
+
+    # --- end of the data ---
 
     def drain(self) -> Outputs:
-        """The map as the data left it; then, if asked for, refined; and the files asked for."""
-        if self._arrivals is not None:
-            self._arrivals.skip_waiting()
-        while self._arrivals:
-            yield from self._overtaken()
+        """Publish the whole map; refine it if configured, and publish it again; write the files."""
+        self._session.end_of_input()
+        while self._session.waiting:
+            yield from self._skipped()
         if not self._mapper.keyframes:
             return
-        yield from self._whole()
+        yield from self._publish_all()
         if self.config.final_steps:
             self._mapper.refine(self.config.final_steps, FULL)
-            yield from self._whole()
+            yield from self._publish_all()
         self._save()
 
-    def _whole(self) -> Outputs:
-        """Chunks that changed since they were sent, and all poses."""
-        m = self._mapper
-        stamps_ns, T_map_body, ids = self._poses()
+    def _publish_all(self) -> Outputs:
+        """Publish the chunks that changed since they were published, and all keyframe poses."""
+        stamps_ns, T_map_body, ids = self._intake.poses()
         last_ns = int(stamps_ns[-1])
-        for anchor in m.store.versions():
+        for anchor in self._mapper.store.versions():
             yield from self._chunk(anchor, last_ns, whole=True)
         poses = MapPoses(stamp_ns=last_ns, keyframe_ids=ids, stamps_ns=stamps_ns, T_map_body=T_map_body)
         yield "mapping/poses", poses
 
-    def _poses(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(stamps_ns [K] rising, T_map_body [K, 4, 4] refined, ids [K]) of the keyframes held."""
-        held = self._held()
-        ids = sorted(held, key=lambda id: (self._taken[id][0], id))
-        T_map_body = np.array([self._mapper.T_map_camera(held[id]) @ self._taken[id][1] for id in ids])
-        stamps_ns = np.array([self._taken[id][0] for id in ids], np.int64)
-        return stamps_ns, T_map_body, np.array(ids, np.int64)
-
     def _save(self) -> None:
-        m = self._mapper
-        stamps_ns, T_map_body, _ = self._poses()
-        if self._keeper is not None:
-            self._keeper.finish_checkpoint(self._keeper.checkpoint(m, self._extra(), int(stamps_ns[-1]))())
-        if self.config.save is not None:
-            away = (part for anchor in list(m.store.paged_out) for part in disk_params(m, anchor))
-            parts_map = chain([m.store.params[:, : m.store.count]], away)
+        """Write the last checkpoint, and splats.ply with the keyframes' poses where `save` is given."""
+        m, folder = self._mapper, self.config.save
+        stamps_ns, T_map_body, _ = self._intake.poses()
+        self._session.save(int(stamps_ns[-1]))
+        if folder is not None:
+            on_disk = (part for anchor in list(m.store.paged_out) for part in disk_params(m, anchor))
+            params_map = chain([m.store.params[:, : m.store.count]], on_disk)
             count = m.store.count + m.store.paged_out_count
-            write_map(self.config.save, count, parts_map, stamps_ns, T_map_body)
-            log.info("map of %d Gaussians saved to %s", count, self.config.save)
+            write_map(folder, count, params_map, stamps_ns, T_map_body)
+            log.info("map of %d Gaussians saved to %s", count, folder)

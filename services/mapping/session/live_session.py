@@ -1,0 +1,245 @@
+"""The session of a running mapper: durable keyframes, checkpoints, paging, resume and hand-over."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator
+from typing import Protocol
+
+import numpy as np
+
+from beamsplat.common.messages import Keyframe
+from beamsplat.common.messages.codec import decode
+from beamsplat.services.mapping.config import MappingConfig
+from beamsplat.services.mapping.intake import KeyframeIntake, LoadVisible
+from beamsplat.services.mapping.messages import decode_keyframe, encode_keyframe
+from beamsplat.services.mapping.session.checkpointer import Checkpointer, CheckpointResult
+from beamsplat.services.mapping.session.inbox import Inbox
+
+log = logging.getLogger("beamsplat.mapping")
+
+Arrays = dict[str, np.ndarray]
+
+
+class MapSession(Protocol):
+    """What the mapping node asks of its session."""
+
+    load_visible: LoadVisible | None  # for `KeyframeIntake.insert`
+
+    def accept(self, message: Keyframe) -> bool:
+        """Return whether a keyframe that has just arrived is durable, so that it may be acknowledged now.
+
+        Called from another thread than everything else.
+        """
+
+    def start(self, id: int) -> bool:
+        """Note that a keyframe's turn has come; return whether it was acknowledged on arrival."""
+
+    def handled_before(self, id: int) -> bool:
+        """Return whether a keyframe was already inserted when this process resumed; True once per id."""
+
+    def store(self, message: Keyframe, known: bool) -> bool:
+        """Return whether an inserted keyframe is durable, as far as that was asked for."""
+
+    def remove(self, id: int) -> None:
+        """Remove a rejected keyframe from disk."""
+
+    def skipped(self) -> Iterator[Keyframe]:
+        """Yield at most one keyframe that is on disk but was dropped from the mailbox."""
+
+    def end_of_input(self) -> None:
+        """Count every keyframe that still waits as skipped."""
+
+    @property
+    def waiting(self) -> int:
+        """Number of keyframes on disk that have not had their turn."""
+
+    @property
+    def has_skipped(self) -> bool:
+        """Whether `skipped` has something to yield."""
+
+    def keep_budget(self) -> None:
+        """Page Gaussians and keyframes to disk and back so that memory stays within the budget."""
+
+    def anchors_moved(self) -> None:
+        """Move paged-out Gaussians with their anchors."""
+
+    def checkpoint(self, stamp_ns: int) -> Callable[[], CheckpointResult] | None:
+        """Return the work of writing a checkpoint if one is due; its result goes to `finish_checkpoint`."""
+
+    def finish_checkpoint(self, result: CheckpointResult) -> None:
+        """Process the result of a checkpoint."""
+
+    def complete(self, arrays: Arrays) -> Arrays:
+        """Return a state's arrays with the paged-out Gaussians included."""
+
+    def save(self, stamp_ns: int | None = None) -> None:
+        """Write a checkpoint now and wait for it; `stamp_ns` starts the next period."""
+
+    def status_text(self) -> str:
+        """Return one line for the node's health, "" without a session."""
+
+    def close(self) -> None:
+        """Release the session's lock."""
+
+
+class NoSession:
+    """The session of a mapper that keeps everything in memory."""
+
+    load_visible: LoadVisible | None = None
+    waiting = 0
+    has_skipped = False
+
+    def accept(self, message: Keyframe) -> bool:
+        return False
+
+    def start(self, id: int) -> bool:
+        return False
+
+    def handled_before(self, id: int) -> bool:
+        return False
+
+    def store(self, message: Keyframe, known: bool) -> bool:
+        return True
+
+    def remove(self, id: int) -> None: ...
+
+    def skipped(self) -> Iterator[Keyframe]:
+        return iter(())
+
+    def end_of_input(self) -> None: ...
+
+    def keep_budget(self) -> None: ...
+
+    def anchors_moved(self) -> None: ...
+
+    def checkpoint(self, stamp_ns: int) -> None: ...
+
+    def finish_checkpoint(self, result: CheckpointResult) -> None: ...
+
+    def complete(self, arrays: Arrays) -> Arrays:
+        return arrays
+
+    def save(self, stamp_ns: int | None = None) -> None: ...
+
+    def status_text(self) -> str:
+        return ""
+
+    def close(self) -> None: ...
+
+
+class LiveSession:
+    """A `MapSession` in a folder on disk."""
+
+    def __init__(self, config: MappingConfig, intake: KeyframeIntake, *, resume_known: bool) -> None:
+        """Open the session and resume from its last checkpoint.
+
+        With `resume_known`, a predecessor process has acknowledged the keyframes that are newer than the
+        checkpoint; they also wait in this process's mailbox and are skipped there.
+
+        Raises:
+            UserError: the folder cannot be written, is locked by another process, or cannot be read.
+        """
+        assert config.session is not None
+        budget_bytes = None if config.memory_mb is None else config.memory_mb * 1e6
+        period_ns = round(config.session_every_s * 1e9)
+        self._intake, self._mapper = intake, intake.mapper
+        self._checkpointer = Checkpointer(config.session, period_ns, budget_bytes, config.seed)
+        self.load_visible = lambda keyframe: self._checkpointer.load_visible(self._mapper, keyframe)
+        self._resumed: set[int] = set()
+        self._resume(resume_known)
+        self._inbox = Inbox(self._checkpointer)
+
+    def _resume(self, resume_known: bool) -> None:
+        """Restore the checkpoint, then insert the keyframes that arrived after it."""
+        c, m = self._checkpointer, self._mapper
+        undistorter = self._intake.undistorter
+        extra, newer = c.resume(m, lambda schema, body: decode_keyframe(decode(schema, body), undistorter))
+        self._intake.restore(extra)
+        if resume_known:
+            self._resumed = set(newer)
+        for id in newer:
+            body = c.read_keyframe(id)
+            if body is None:
+                continue
+            message = decode(*body)
+            c.start_period(message.stamp_ns)  # a process that is killed repeatedly still reaches a checkpoint
+            outcome = self._intake.insert(message, self.load_visible)
+            if outcome.ok:
+                m.optimise()
+            else:
+                self._intake.reject(id, outcome.status)
+                self.remove(id)
+        if m.keyframes:
+            log.info("resumed with %d keyframes (%d newer than the checkpoint), %d Gaussians, step %d",
+                     len(m.keyframes), len(newer), m.store.count, m.steps)  # fmt: skip
+
+    def accept(self, message: Keyframe) -> bool:
+        if message.id in self._resumed:
+            return False
+        known = self._intake.knows(message.id)
+        return self._inbox.accept(message.id, known, lambda: encode_keyframe(message))
+
+    def start(self, id: int) -> bool:
+        return self._inbox.start(id)
+
+    def handled_before(self, id: int) -> bool:
+        if id not in self._resumed:
+            return False
+        self._resumed.discard(id)
+        return True
+
+    def store(self, message: Keyframe, known: bool) -> bool:
+        if known and not self._checkpointer.is_unwritten(message.id):
+            return True
+        return self._checkpointer.write_keyframe(message.id, *encode_keyframe(message))
+
+    def remove(self, id: int) -> None:
+        self._checkpointer.remove_keyframe(id)
+
+    def skipped(self) -> Iterator[Keyframe]:
+        if (body := self._inbox.pop_skipped()) is not None:
+            yield decode(*body)
+
+    def end_of_input(self) -> None:
+        self._inbox.skip_waiting()
+
+    @property
+    def waiting(self) -> int:
+        return len(self._inbox)
+
+    @property
+    def has_skipped(self) -> bool:
+        return self._inbox.has_skipped
+
+    def keep_budget(self) -> None:
+        self._checkpointer.page(self._mapper)
+
+    def anchors_moved(self) -> None:
+        self._checkpointer.anchors_moved(self._mapper)
+
+    def checkpoint(self, stamp_ns: int) -> Callable[[], CheckpointResult] | None:
+        if not self._mapper.keyframes or not self._checkpointer.due(stamp_ns):
+            return None
+        return self._checkpointer.checkpoint(self._mapper, self._intake.arrays(), stamp_ns)
+
+    def finish_checkpoint(self, result: CheckpointResult) -> None:
+        self._checkpointer.finish_checkpoint(result)
+
+    def complete(self, arrays: Arrays) -> Arrays:
+        return self._checkpointer.with_disk_gaussians(arrays)
+
+    def save(self, stamp_ns: int | None = None) -> None:
+        if not self._mapper.keyframes:
+            return
+        if stamp_ns is None:
+            self._checkpointer.save(self._mapper, self._intake.arrays())
+        else:
+            work = self._checkpointer.checkpoint(self._mapper, self._intake.arrays(), stamp_ns)
+            self._checkpointer.finish_checkpoint(work())
+
+    def status_text(self) -> str:
+        return self._checkpointer.status_text(self._mapper)
+
+    def close(self) -> None:
+        self._checkpointer.close()
