@@ -1,11 +1,13 @@
-"""How ROS 2 speaks over Zenoh (rmw_zenoh_cpp): keys, attachments, liveliness tokens. No bus in here.
+"""The wire format of ROS 2 over Zenoh (rmw_zenoh_cpp): keys, attachments, liveliness tokens.
 
 From rmw_zenoh's design document and its liveliness_utils.cpp and attachment_helpers.cpp:
 
     key         <domain>/<topic without outer slashes>/<pkg>::msg::dds_::<Type>_/<type hash>
-    attachment  sequence (int64), source time in ns (int64), gid (16 bytes, behind its length)
+    attachment  sequence (int64), source time in ns (int64), gid (length byte, 16 bytes)
     token       @ros2_lv/<domain>/<zid>/<node>/<entity>/<NN|MP|MS|SS|SC>/<enclave>/<namespace>/<node name>
-                [/<topic>/<type>/<hash>/<qos>], "/" within a part written "%"
+                [/<topic>/<type>/<hash>/<qos>], with "/" within a part replaced by "%"
+
+The module opens no session.
 """
 
 from __future__ import annotations
@@ -16,43 +18,45 @@ from typing import NamedTuple
 
 import xxhash
 
-ADMIN = "@ros2_lv"
+LIVELINESS_PREFIX = "@ros2_lv"
 GID_BYTES = 16
 _ATTACHMENT = struct.Struct("<qqB16s")
-# A form of late 2024 names its fields; each string behind its length.
-_NAMED = struct.Struct("<B15sqB16sqB10sB16s")
-_NAMES = (b"sequence_number", b"source_timestamp", b"source_gid")
+# The format of late 2024 contains the names of its fields, each after its length.
+_NAMED_ATTACHMENT = struct.Struct("<B15sqB16sqB10sB16s")
+_FIELD_NAMES = (b"sequence_number", b"source_timestamp", b"source_gid")
 
 
 def mangle(name: str) -> str:
-    """A name as one part of a token."""
+    """Return a name with "/" replaced by "%", as one part of a token."""
     return name.replace("/", "%")
 
 
 def demangle(part: str) -> str:
-    """The name in a part of a token."""
+    """Return the name from a part of a token."""
     return part.replace("%", "/")
 
 
 def dds_type(ros_type: str) -> str:
-    """sensor_msgs/msg/LaserScan -> sensor_msgs::msg::dds_::LaserScan_"""
+    """Return the DDS type name: sensor_msgs/msg/LaserScan -> sensor_msgs::msg::dds_::LaserScan_."""
     package, _, name = ros_type.partition("/msg/")
     return f"{package}::msg::dds_::{name}_"
 
 
 def ros_type(dds: str) -> str | None:
-    """sensor_msgs::msg::dds_::LaserScan_ -> sensor_msgs/msg/LaserScan; None for what is no message type."""
+    """Return the ROS type name: sensor_msgs::msg::dds_::LaserScan_ -> sensor_msgs/msg/LaserScan; else
+    None.
+    """
     package, separator, name = dds.partition("::msg::dds_::")
     return f"{package}/msg/{name[:-1]}" if separator and name.endswith("_") else None
 
 
 def data_key(domain: int, topic: str, type_name: str, type_hash: str) -> str:
-    """Key of the messages of a topic; `type_hash` may be "*" for a subscription."""
+    """Return the key of a topic's messages; `type_hash` may be "*" for a subscription."""
     return f"{domain}/{topic.strip('/')}/{dds_type(type_name)}/{type_hash}"
 
 
-class Address(NamedTuple):
-    """What a key says of a sample."""
+class RmwKey(NamedTuple):
+    """The parts of a message's key."""
 
     domain: str
     topic: str  # with a leading slash
@@ -60,42 +64,44 @@ class Address(NamedTuple):
     type_hash: str
 
     @staticmethod
-    def of(key: str) -> Address | None:
-        """From a data key; None if it is none."""
+    def parse(key: str) -> RmwKey | None:
+        """Return the parts of a key; None if it is no key of a message."""
         parts = key.split("/")
         type_name = ros_type(parts[-2]) if len(parts) >= 4 else None
         if type_name is None:
             return None
-        return Address(parts[0], "/" + "/".join(parts[1:-2]), type_name, parts[-1])
+        return RmwKey(parts[0], "/" + "/".join(parts[1:-2]), type_name, parts[-1])
 
 
-class Attachment(NamedTuple):
-    """What rides beside a message."""
+class RmwAttachment(NamedTuple):
+    """The metadata sent with a message."""
 
     sequence: int
     source_ns: int
     gid: bytes
 
     def pack(self) -> bytes:
-        """The 33 bytes, as Zenoh's serializer writes (int64, int64, bytes)."""
+        """Return the 33 bytes that Zenoh's serializer writes for (int64, int64, bytes)."""
         return _ATTACHMENT.pack(self.sequence, self.source_ns, GID_BYTES, self.gid)
 
     @staticmethod
-    def unpack(data: bytes) -> Attachment | None:
-        """Of today's form or that of late 2024; None for anything else (data count without it)."""
+    def unpack(data: bytes) -> RmwAttachment | None:
+        """Parse the current format or that of late 2024; return None for others (messages are valid
+        without it).
+        """
         if len(data) == _ATTACHMENT.size:
             sequence, source_ns, length, gid = _ATTACHMENT.unpack(data)
-            return Attachment(sequence, source_ns, gid) if length == GID_BYTES else None
-        if len(data) == _NAMED.size:
-            _, a, sequence, _, b, source_ns, _, c, length, gid = _NAMED.unpack(data)
-            if (a, b, c) == _NAMES and length == GID_BYTES:
-                return Attachment(sequence, source_ns, gid)
+            return RmwAttachment(sequence, source_ns, gid) if length == GID_BYTES else None
+        if len(data) == _NAMED_ATTACHMENT.size:
+            _, a, sequence, _, b, source_ns, _, c, length, gid = _NAMED_ATTACHMENT.unpack(data)
+            if (a, b, c) == _FIELD_NAMES and length == GID_BYTES:
+                return RmwAttachment(sequence, source_ns, gid)
         return None
 
 
 @dataclass(frozen=True)
-class Qos:
-    """The settings that tokens tell. Defaults are rmw_zenoh's; they are left out of the token."""
+class RmwQos:
+    """The quality of service settings in tokens. The defaults are rmw_zenoh's and are left out of tokens."""
 
     best_effort: bool = False
     transient_local: bool = False
@@ -103,7 +109,9 @@ class Qos:
     depth: int = 42
 
     def text(self) -> str:
-        """reliability:durability:history,depth:deadline:lifespan:liveliness, numbered as in rmw/types.h."""
+        """Return reliability:durability:history,depth:deadline:lifespan:liveliness, numbered as in
+        rmw/types.h.
+        """
         reliability = "2" if self.best_effort else ""
         durability = "1" if self.transient_local else ""
         history = "2" if self.keep_all else ""
@@ -111,38 +119,38 @@ class Qos:
         return f"{reliability}:{durability}:{history},{depth}:,:,:,,"
 
     @staticmethod
-    def parse(text: str) -> Qos | None:
-        """None if it is not of that form."""
+    def parse(text: str) -> RmwQos | None:
+        """Return the settings in a token's text; None if the text is invalid."""
         parts = text.split(":")
         if len(parts) < 6 or "," not in parts[2]:
             return None
         history, depth = parts[2].split(",")[:2]
         if depth and not depth.isdigit():
             return None
-        return Qos(parts[0] == "2", parts[1] == "1", history == "2", int(depth) if depth else 42)
+        return RmwQos(parts[0] == "2", parts[1] == "1", history == "2", int(depth) if depth else 42)
 
 
 @dataclass(frozen=True)
-class Entity:
-    """A node, or a publisher or subscription of one."""
+class RmwEntity:
+    """A node, publisher or subscription in the ROS graph."""
 
     domain: int
-    zid: str  # of the session
+    zid: str  # of the Zenoh session
     node_id: int
     entity_id: int
-    kind: str  # NN, MP, MS
+    kind: str  # NN: node, MP: publisher, MS: subscription
     node_name: str
     namespace: str = "/"
     enclave: str = "/"
     topic: str = ""
     type_name: str = ""
     type_hash: str = ""
-    qos: Qos = Qos()
+    qos: RmwQos = RmwQos()
 
     def token(self) -> str:
-        """Key of its liveliness token."""
+        """Return the key of the liveliness token."""
         parts = [
-            ADMIN, str(self.domain), self.zid, str(self.node_id), str(self.entity_id), self.kind,
+            LIVELINESS_PREFIX, str(self.domain), self.zid, str(self.node_id), str(self.entity_id), self.kind,
             mangle(self.enclave), mangle(self.namespace), mangle(self.node_name),
         ]  # fmt: skip
         if self.kind != "NN":
@@ -150,27 +158,27 @@ class Entity:
         return "/".join(parts)
 
     def gid(self) -> bytes:
-        """XXH3 (128 bits) of the token, low half first."""
+        """Return the XXH3 (128 bits) of the token, low half first."""
         high_low = xxhash.xxh3_128_digest(self.token().encode())
         return high_low[8:][::-1] + high_low[:8][::-1]
 
     @staticmethod
-    def parse(token: str) -> Entity | None:
-        """The entity of a token; None if it is none that we understand (services, other versions)."""
+    def parse(token: str) -> RmwEntity | None:
+        """Return the entity of a token; None for unsupported tokens (services, other versions)."""
         parts = token.split("/")
-        if len(parts) < 9 or parts[0] != ADMIN or not (parts[1] + parts[3] + parts[4]).isdigit():
+        if len(parts) < 9 or parts[0] != LIVELINESS_PREFIX or not (parts[1] + parts[3] + parts[4]).isdigit():
             return None
         kind = parts[5]
         if kind == "NN" and len(parts) == 9:
-            topic, type_name, type_hash, qos = "", "", "", Qos()
+            topic, type_name, type_hash, qos = "", "", "", RmwQos()
         elif kind in ("MP", "MS") and len(parts) == 13:
             topic, type_name, type_hash = demangle(parts[9]), ros_type(parts[10]), parts[11]
-            qos = Qos.parse(parts[12])
+            qos = RmwQos.parse(parts[12])
             if type_name is None or qos is None:
                 return None
         else:
             return None
-        return Entity(
+        return RmwEntity(
             int(parts[1]), parts[2], int(parts[3]), int(parts[4]), kind, demangle(parts[8]),
             demangle(parts[7]), demangle(parts[6]), topic, type_name, type_hash, qos,
         )  # fmt: skip

@@ -10,21 +10,23 @@ from pydantic import Field
 from beamsplat.common.config.deployment import NodeConfig
 from beamsplat.common.config.ros import ROUTER, Domain, domain_field
 
-Word = Literal["image", "scan", "odometry", "pose"]
+SensorKind = Literal["image", "scan", "odometry", "pose"]
 
 
 class Ros2Config(NodeConfig):
-    """What to take from the robot. Everything but the domain is found out."""
+    """Options of the ROS 2 source. Topics and calibration are found automatically where not set."""
 
     domain: Domain = domain_field()
     router: str = ROUTER  # the router that the robot's nodes use
-    image_topic: str = ""  # where several topics are of the right type
+    image_topic: str = (
+        ""  # needed only if several topics have the type of an image; the same holds for the following
+    )
     scan_topic: str = ""
     odometry_topic: str = ""
     pose_topic: str = ""
     camera_info_topic: str = ""
     body_frame: str = ""
-    rig: Path | None = None  # calibration; wins over what the robot says
-    without: tuple[Word, ...] = ()
-    assume_mounts: bool = False
-    settle_s: Annotated[float, Field(ge=0.0, le=60.0)] = 2.0
+    rig: Path | None = None  # calibration; replaces the one that the robot publishes
+    without: tuple[SensorKind, ...] = ()  # sensors to ignore
+    assume_mounts: bool = False  # use default mounts where the robot publishes no transforms
+    settle_s: Annotated[float, Field(ge=0.0, le=60.0)] = 2.0  # from the first message to topic selection

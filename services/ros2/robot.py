@@ -1,6 +1,6 @@
-"""A ROS 2 robot's messages as ours: learns what there is, finds the calibration, then passes on.
+"""Convert a ROS 2 robot's messages: select topics, find the calibration, then pass messages on.
 
-Nothing goes out before the calibration is known, and no picture that it does not belong to.
+Nothing is published before the calibration is known, and no image of another size than the calibration.
 """
 
 from __future__ import annotations
@@ -20,150 +20,169 @@ from beamsplat.common.recording.picture import is_whole
 from beamsplat.common.recording.ros_types import deserialize, transform_of
 from beamsplat.common.recording.sensors import SENSORS, build, ros_fields
 from beamsplat.common.recording.static_frames import StaticFrames, clean
-from beamsplat.services.ros2.moving import MovingFrames
-from beamsplat.services.ros2.topics import CAMERA_INFO, PICTURES, TF, WANTED, camera_info_of, choose
+from beamsplat.services.ros2.tf_odometry import TfOdometry
+from beamsplat.services.ros2.topics import (
+    CAMERA_INFO,
+    IMAGE_ENCODINGS,
+    SUPPORTED_TYPES,
+    TF,
+    select_camera_info,
+    select_topics,
+)
 
-_PATIENCE_S = 10.0  # for the first message of a topic that somebody publishes
+_MAX_WAIT_S = 10.0  # for the first message of a topic that has a publisher
 
 
 @dataclass(frozen=True)
-class RobotOptions:
-    """What the user knows better."""
+class RosRobotOptions:
+    """Settings that replace automatic choices."""
 
-    topics: dict[str, str] = field(default_factory=dict)  # topic by word
+    topics: dict[str, str] = field(default_factory=dict)  # topic by kind
     camera_info_topic: str = ""
     body_frame: str = ""
     rig: Path | None = None
     without: frozenset[str] = frozenset()
     assume_mounts: bool = False
-    settle_s: float = 2.0  # from the first message until the topics are chosen
+    settle_s: float = 2.0  # from the first message to topic selection
 
 
-class Robot:
-    """Takes serialised ROS 2 messages as they come."""
+class RosRobot:
+    """Converts serialised ROS 2 messages of one robot to messages of this system."""
 
-    def __init__(self, options: RobotOptions) -> None:
+    def __init__(self, options: RosRobotOptions) -> None:
         self._options = options
-        self._offered: dict[str, str] = {}  # type by topic: somebody publishes it
+        self._publisher_types: dict[str, str] = {}  # ROS type by topic, of topics with a publisher
         self._ignored: set[str] = set()
-        self._first: dict[str, tuple[str, Any]] = {}  # type and first message by sensor topic
-        self._infos: dict[str, Any] = {}
-        self._fixed = StaticFrames()  # from /tf_static
-        self._steady = StaticFrames()  # these, and those of /tf that do not change
-        self._moving = MovingFrames()  # of /tf
-        self._wheels: tuple[str, str] | None = None  # (odom, child) where /tf stands for Odometry
-        self._since_s: float | None = None
-        self._words: dict[str, str] = {}  # word by chosen topic
+        self._first_messages: dict[str, tuple[str, Any]] = {}  # (ROS type, first message) by sensor topic
+        self._camera_infos: dict[str, Any] = {}
+        self._static_tree = StaticFrames()  # from /tf_static
+        self._constant_tree = StaticFrames()  # also from /tf, transforms that do not change
+        self._tf_odometry = TfOdometry()  # of /tf
+        self._odometry_edge: tuple[str, str] | None = None  # (odom, child) if odometry is taken from /tf
+        self._first_message_s: float | None = None
+        self._kind_by_topic: dict[str, str] = {}  # sensor kind by selected topic
         self._T_child_body = np.eye(4)
         self.rig: RigFile | None = None
-        self.passed: Counter[str] = Counter()
-        self.refused: Counter[str] = Counter()
+        self.published: Counter[str] = Counter()
+        self.rejected: Counter[str] = Counter()
         self.fault = ""
-        self.status = "nothing heard yet"
+        self.status = "no message received yet"
 
     @property
-    def chosen(self) -> dict[str, str]:
-        """Word by topic, once they are chosen."""
-        return dict(self._words)
+    def selected_topics(self) -> dict[str, str]:
+        """Sensor kind by topic, after topic selection."""
+        return dict(self._kind_by_topic)
 
     @property
-    def wants_frames(self) -> bool:
-        """Whether /tf is of use: until the calibration is known, and where it holds the wheels' odometry."""
-        return self.rig is None or self._wheels is not None
+    def needs_tf(self) -> bool:
+        """Whether /tf is needed: until the calibration is known, and for odometry from /tf."""
+        return self.rig is None or self._odometry_edge is not None
 
-    def offer(self, topic: str, type_name: str) -> None:
-        """Somebody says that it publishes there."""
-        if type_name in WANTED:
-            self._offered[topic] = type_name
+    def add_publisher(self, topic: str, type_name: str) -> None:
+        """Register a topic that has a publisher."""
+        if type_name in SUPPORTED_TYPES:
+            self._publisher_types[topic] = type_name
 
-    def ignore(self, topic: str) -> None:
-        """What comes there is not the robot's."""
+    def ignore_topic(self, topic: str) -> None:
+        """Ignore a topic that is not the robot's."""
         self._ignored.add(topic)
-        self._first.pop(topic, None)
+        self._first_messages.pop(topic, None)
 
-    def take(
+    def convert(
         self, topic: str, type_name: str, data: bytes, received_ns: int, now_s: float
     ) -> list[tuple[str, Any]]:
-        """Our messages, with their topics, that this one leads to.
+        """Return (topic, message) pairs of this system that result from one ROS message.
+
+        Args:
+            topic, type_name: of the ROS message.
+            data: CDR bytes.
+            received_ns: used as stamp for messages without one.
+            now_s: monotonic time of reception.
 
         Raises:
-            UserError: topics or calibration contradict themselves; one sentence.
+            UserError: contradicting topics or calibration; one sentence.
         """
         if topic in self._ignored:
             return []
         try:
             message = deserialize(data, type_name)
         except ValueError as error:
-            self._refuse(topic, str(error))
+            self._reject(topic, str(error))
             return []
         if type_name == TF and self.rig is not None:
-            return self._odometry_of(topic, message)
+            return self._odometry_from_tf(topic, message)
         if type_name == TF:
-            self._take_frames(topic, message)
+            self._add_transforms(topic, message)
         elif type_name == CAMERA_INFO:
-            self._infos[topic] = message
+            self._camera_infos[topic] = message
         elif self.rig is None:
-            self._first.setdefault(topic, (type_name, message))
-            self._since_s = now_s if self._since_s is None else self._since_s
+            self._first_messages.setdefault(topic, (type_name, message))
+            self._first_message_s = now_s if self._first_message_s is None else self._first_message_s
         if self.rig is None:
-            if self._since_s is None or not self._settled(now_s) or not self._calibrate():
+            if self._first_message_s is None or not self._all_topics_seen(now_s) or not self._calibrate():
                 return []
-            stamp_ns = min(self._stamp_ns(m, received_ns) for _, m in self._first.values())
+            stamp_ns = min(self._stamp_ns(m, received_ns) for _, m in self._first_messages.values())
             return [("rig", self.rig.message(max(stamp_ns, 0), self.rig.source))]
-        word = self._words.get(topic)
-        return self._pass(topic, word, message, received_ns) if word else []
+        kind = self._kind_by_topic.get(topic)
+        return self._convert(topic, kind, message, received_ns) if kind else []
 
-    def _settled(self, now_s: float) -> bool:
-        waited_s = now_s - self._since_s
+    def _all_topics_seen(self, now_s: float) -> bool:
+        waited_s = now_s - self._first_message_s
         silent = [
-            topic for topic, kind in self._offered.items()
-            if kind not in (CAMERA_INFO, TF) and topic not in self._first
+            topic for topic, type_name in self._publisher_types.items()
+            if type_name not in (CAMERA_INFO, TF) and topic not in self._first_messages
         ]  # fmt: skip
-        self.status = f"learning what the robot has: {', '.join(sorted(self._first))}"
-        return waited_s >= self._options.settle_s and (not silent or waited_s >= _PATIENCE_S)
+        self.status = f"receiving the robot's topics: {', '.join(sorted(self._first_messages))}"
+        return waited_s >= self._options.settle_s and (not silent or waited_s >= _MAX_WAIT_S)
 
     def _calibrate(self) -> bool:
-        """Chooses topics and finds the calibration; False, and the reason in `status`, if it is not there."""
-        seen = {t: k for t, (k, m) in self._first.items() if "image" not in _word_of(k) or _is_picture(m)}
-        chosen = choose(seen, self._options.topics, self._options.without)
+        """Select topics and find the calibration; return False, with the reason in `status`, if it is
+        not available.
+        """
+        seen = {
+            t: k
+            for t, (k, m) in self._first_messages.items()
+            if "image" not in _kind_of(k) or _is_camera_image(m)
+        }
+        chosen = select_topics(seen, self._options.topics, self._options.without)
         if "scan" not in chosen and "image" not in chosen:
-            self.status = f"neither scan nor image among {', '.join(sorted(seen)) or 'what came'}"
+            self.status = f"no scan or image among the topics: {', '.join(sorted(seen)) or 'none received'}"
             return False
-        rig = self._given_rig(chosen) if self._options.rig is not None else self._found_rig(chosen)
+        rig = self._rig_from_file(chosen) if self._options.rig is not None else self._rig_from_robot(chosen)
         if rig is None:
             return False
-        self._words = {topic: word for word, topic in chosen.items()}
+        self._kind_by_topic = {topic: kind for kind, topic in chosen.items()}
         if "odometry" not in chosen and "odometry" not in self._options.without:
-            self._wheels = self._moving.edge()
+            self._odometry_edge = self._tf_odometry.odometry_edge()
         self.rig = rig
-        self._describe()
+        self._update_status()
         return True
 
-    def _given_rig(self, chosen: dict[str, str]) -> RigFile:
+    def _rig_from_file(self, chosen: dict[str, str]) -> RigFile:
         rig = load_rig(self._options.rig)
-        for word, sensor in (("image", "camera"), ("scan", "lidar")):
-            if word in chosen and getattr(rig, sensor) is None:
+        for kind, sensor in (("image", "camera"), ("scan", "lidar")):
+            if kind in chosen and getattr(rig, sensor) is None:
                 raise UserError(
-                    f"{self._options.rig}: has no [{sensor}], but the robot has {chosen[word]}; "
-                    f'add it, or set without = ["{word}"]'
+                    f"{self._options.rig}: [{sensor}] is missing, but the robot publishes {chosen[kind]}; "
+                    f'add it, or set without = ["{kind}"]'
                 )
         return rig.model_copy(update={"source": rig.source or str(self._options.rig)})
 
-    def _found_rig(self, chosen: dict[str, str]) -> RigFile | None:
+    def _rig_from_robot(self, chosen: dict[str, str]) -> RigFile | None:
         found = cal.Calibration()
         frames = {
-            sensor: clean(self._first[chosen[word]][1].header.frame_id)
-            for sensor, word in (("camera", "image"), ("lidar", "scan"))
-            if word in chosen
+            sensor: clean(self._first_messages[chosen[kind]][1].header.frame_id)
+            for sensor, kind in (("camera", "image"), ("lidar", "scan"))
+            if kind in chosen
         }
         child = ""
         if "odometry" in chosen:
-            child = clean(self._first[chosen["odometry"]][1].child_frame_id)
-        elif (edge := self._moving.edge()) is not None:
+            child = clean(self._first_messages[chosen["odometry"]][1].child_frame_id)
+        elif (edge := self._tf_odometry.odometry_edge()) is not None:
             child = edge[1]
-        tree = self._fixed
+        tree = self._static_tree
         if not tree.names or any(tree.find(child or f, f) is None for f in frames.values()):
-            tree = self._steady
+            tree = self._constant_tree
         cal.find_mounts(found, tree, frames, child, self._options.body_frame, self._options.assume_mounts)
         if "image" in chosen:
             self._intrinsics(found, chosen["image"])
@@ -178,88 +197,88 @@ class Robot:
         return found.rig("the robot's CameraInfo and transforms")
 
     def _intrinsics(self, found: cal.Calibration, image: str) -> None:
-        info = camera_info_of(image, list(self._infos), self._options.camera_info_topic)
+        info = select_camera_info(image, list(self._camera_infos), self._options.camera_info_topic)
         if info is None:
-            found.missing.append(f"no sensor_msgs/CameraInfo has come for {image}")
+            found.missing.append(f"no sensor_msgs/CameraInfo was received for {image}")
             return
-        fields = ros_fields("camera/image", self._first[image][1])
+        fields = ros_fields("camera/image", self._first_messages[image][1])
         if "width_px" not in fields:
-            found.missing.append(f"{image} starts with a picture that is neither JPEG nor PNG")
-            del self._first[image]
+            found.missing.append(f"the first image of {image} is neither JPEG nor PNG")
+            del self._first_messages[image]
             return
         size = fields["width_px"], fields["height_px"]
-        found.camera = cal.intrinsics(self._infos[info], size, image, "the robot")
+        found.camera = cal.intrinsics(self._camera_infos[info], size, image, "the robot")
         if found.camera is None:
             found.missing.append(f"K on {info} is all zero: this camera was never calibrated")
 
-    def _pass(self, topic: str, word: str, message: Any, received_ns: int) -> list[tuple[str, Any]]:
-        sensor = SENSORS[word]
+    def _convert(self, topic: str, kind: str, message: Any, received_ns: int) -> list[tuple[str, Any]]:
+        sensor = SENSORS[kind]
         try:
             fields = ros_fields(sensor.topic, message)
             if fields["stamp_ns"] == 0:
                 fields["stamp_ns"] = received_ns
-            if word == "odometry":
+            if kind == "odometry":
                 cal.to_body(fields, self._T_child_body)
-            if word == "image":
-                self._check_picture(fields)
+            if kind == "image":
+                self._check_image(fields)
             built = build(sensor.topic, fields)
         except ValueError as error:
-            self._refuse(topic, _first_line(error))
+            self._reject(topic, _first_line(error))
             return []
-        self.passed[topic] += 1
-        self._describe()
+        self.published[topic] += 1
+        self._update_status()
         return [(sensor.topic, built)]
 
-    def _check_picture(self, fields: dict[str, Any]) -> None:
+    def _check_image(self, fields: dict[str, Any]) -> None:
         camera = self.rig.camera
         size = fields.get("width_px"), fields.get("height_px")
         if None in size or (fields["encoding"] in ("jpeg", "png") and not is_whole(fields["data"].data)):
-            raise ValueError("the picture is broken")
+            raise ValueError("the image is damaged")
         if camera is not None and size != (camera.width_px, camera.height_px):
             raise ValueError(
-                f"the picture is {size[0]}x{size[1]} px, K is for {camera.width_px}x{camera.height_px} px"
+                f"the image is {size[0]}x{size[1]} px, K is for {camera.width_px}x{camera.height_px} px"
             )
 
-    def _take_frames(self, topic: str, message: Any) -> None:
+    def _add_transforms(self, topic: str, message: Any) -> None:
         fixed = topic.endswith("tf_static")
         for stamped, T in _transforms(message):
             if not fixed:
-                self._moving.note(stamped.header.frame_id, stamped.child_frame_id)
-            for tree in (self._fixed, self._steady) if fixed else (self._steady,):
+                self._tf_odometry.add_edge(stamped.header.frame_id, stamped.child_frame_id)
+            for tree in (self._static_tree, self._constant_tree) if fixed else (self._constant_tree,):
                 tree.add(stamped.header.frame_id, stamped.child_frame_id, T, replace=fixed)
 
-    def _odometry_of(self, topic: str, message: Any) -> list[tuple[str, Any]]:
-        """The wheels' odometry in a message of /tf, where nothing better says it."""
+    def _odometry_from_tf(self, topic: str, message: Any) -> list[tuple[str, Any]]:
+        """Return wheel odometry from a message of /tf, if there is no Odometry topic."""
         found = []
         for stamped, T in _transforms(message):
             edge = clean(stamped.header.frame_id), clean(stamped.child_frame_id)
-            if edge != self._wheels or topic.endswith("tf_static"):
+            if edge != self._odometry_edge or topic.endswith("tf_static"):
                 continue
             stamp = stamped.header.stamp
-            fields = self._moving.fields(int(stamp.sec) * 10**9 + int(stamp.nanosec), T)
+            fields = self._tf_odometry.odometry_fields(int(stamp.sec) * 10**9 + int(stamp.nanosec), T)
             if fields is None:
                 continue
             cal.to_body(fields, self._T_child_body)
             try:
                 found.append((SENSORS["odometry"].topic, build(SENSORS["odometry"].topic, fields)))
             except ValueError as error:
-                self._refuse(topic, _first_line(error))
+                self._reject(topic, _first_line(error))
                 continue
-            self._words[topic] = "odometry"
-            self.passed[topic] += 1
-            self._describe()
+            self._kind_by_topic[topic] = "odometry"
+            self.published[topic] += 1
+            self._update_status()
         return found
 
-    def _refuse(self, topic: str, reason: str) -> None:
-        self.refused[topic] += 1
+    def _reject(self, topic: str, reason: str) -> None:
+        self.rejected[topic] += 1
         self.fault = f"{topic}: {reason}"
         if self.rig is not None:
-            self._describe()
+            self._update_status()
 
-    def _describe(self) -> None:
-        counts = ", ".join(f"{topic} {self.passed[topic]}" for topic in sorted(self._words))
-        refused = f"; {self.refused.total()} refused, last: {self.fault}" if self.refused else ""
-        self.status = f"from ROS 2: {counts}{refused}"
+    def _update_status(self) -> None:
+        counts = ", ".join(f"{topic} {self.published[topic]}" for topic in sorted(self._kind_by_topic))
+        rejected = f"; {self.rejected.total()} rejected, last: {self.fault}" if self.rejected else ""
+        self.status = f"from ROS 2: {counts}{rejected}"
 
     def _stamp_ns(self, message: Any, received_ns: int) -> int:
         stamp = message.header.stamp
@@ -267,7 +286,7 @@ class Robot:
 
 
 def _transforms(message: Any) -> Iterator[tuple[Any, np.ndarray]]:
-    """The transforms of a TFMessage with their matrices; what is none is left out."""
+    """Yield the transforms of a TFMessage with their matrices; invalid ones are left out."""
     for stamped in message.transforms:
         try:
             T = transform_of(stamped.transform.translation, stamped.transform.rotation)
@@ -277,14 +296,14 @@ def _transforms(message: Any) -> Iterator[tuple[Any, np.ndarray]]:
             yield stamped, T
 
 
-def _word_of(type_name: str) -> str:
-    return next((word for word, sensor in SENSORS.items() if type_name in sensor.ros_types), "")
+def _kind_of(type_name: str) -> str:
+    return next((kind for kind, sensor in SENSORS.items() if type_name in sensor.ros_types), "")
 
 
-def _is_picture(message: Any) -> bool:
-    """Raw image topics also carry depth maps and masks; their encoding tells."""
+def _is_camera_image(message: Any) -> bool:
+    """Return whether an image message is a camera image: raw image topics also carry depth maps and masks."""
     fields = ros_fields("camera/image", message)
-    return "width_px" in fields and fields["encoding"] in PICTURES
+    return "width_px" in fields and fields["encoding"] in IMAGE_ENCODINGS
 
 
 def _first_line(error: Exception) -> str:

@@ -7,14 +7,14 @@ from beamsplat.common.config.ros import ROUTER, Domain, domain_field
 
 
 class Ros2OutConfig(NodeConfig):
-    """What to give back. An empty topic name leaves it out."""
+    """Options of publishing to ROS 2. An empty topic name disables the topic."""
 
     domain: Domain = domain_field()
     router: str = ROUTER
     pose_topic: str = "/beamsplat/pose"
     cloud_topic: str = "/beamsplat/cloud"
     map_topic: str = "/map"
-    tf: bool = True  # map -> odom, and odom -> body where the robot has no odometry of its own
+    tf: bool = True  # map -> odom, and odom -> body if the robot has no odometry
     map_frame: str = "map"
     odom_frame: str = "odom"
     body_frame: str = "base_link"

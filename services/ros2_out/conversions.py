@@ -1,4 +1,4 @@
-"""What ROS 2 gets back, as ROS messages: pose, transforms, map, cloud. Arrays in, ROS messages out."""
+"""Convert results to ROS messages: pose, transforms, map, point cloud."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import numpy as np
 from beamsplat.common.geometry.transforms import inverse, transform_points
 from beamsplat.common.recording import ros_types as ros
 
-_KEPT = 500  # wheel poses: several seconds
-_APART_NS = 100_000_000  # a wheel pose further from the scan does not say where the odometry was
+_MAX_POSES = 500  # of the wheel odometry: several seconds
+_MAX_AGE_NS = 100_000_000  # largest time between a scan and the wheel pose used with it
 
 POSE, TF, MAP, CLOUD = (
     "geometry_msgs/msg/PoseStamped",
@@ -21,42 +21,45 @@ POSE, TF, MAP, CLOUD = (
 )
 
 
-class Transforms:
-    """The tree that ROS expects: map -> odom -> body, where the robot's own odometry owns odom -> body."""
+class TfTree:
+    """Computes the ROS transforms map -> odom -> body; a robot with odometry publishes odom -> body
+    itself.
+    """
 
     def __init__(self, map_frame: str, odom_frame: str, body_frame: str) -> None:
         self._frames = map_frame, odom_frame, body_frame
-        self._wheels: deque[tuple[int, np.ndarray]] = deque(maxlen=_KEPT)
-        self.T_map_odom = np.eye(4)  # our own smooth frame's
+        self._wheel_odometry: deque[tuple[int, np.ndarray]] = deque(maxlen=_MAX_POSES)
+        self.T_map_odom = np.eye(4)  # odom: our own smooth frame
 
-    def add_wheels(self, stamp_ns: int, T_odom_body: np.ndarray) -> None:
-        """A pose of the robot's own odometry."""
-        self._wheels.append((stamp_ns, T_odom_body))
+    def add_wheel_odometry(self, stamp_ns: int, T_odom_body: np.ndarray) -> None:
+        """Store a pose [4, 4] of the robot's own odometry."""
+        self._wheel_odometry.append((stamp_ns, T_odom_body))
 
     def pose(self, stamp_ns: int, T_odom_body: np.ndarray) -> Any:
-        """PoseStamped of the body in the map, from our smooth pose [4, 4]."""
+        """Return the PoseStamped of the body in the map, for our smooth pose [4, 4]."""
         header = ros.header(stamp_ns, self._frames[0])
         return ros.new(POSE, header=header, pose=ros.pose(self.T_map_odom @ T_odom_body))
 
     def tf(self, stamp_ns: int, T_odom_body: np.ndarray) -> Any | None:
-        """TFMessage for our smooth pose [4, 4]; None if the robot's odometry has no pose of that time.
+        """Return the TFMessage for our smooth pose [4, 4]; None if there is no wheel pose of that time.
 
-        A robot with odometry says odom -> body itself; then map -> odom is what puts the body where we
-        have it, as nav2 expects of a localization (REP 105).
+        If the robot publishes odom -> body, the published map -> odom is the one that places the body
+        where our
+        localization has it, as nav2 expects (REP 105).
         """
         map_frame, odom_frame, body_frame = self._frames
-        if not self._wheels:
+        if not self._wheel_odometry:
             return ros.tf_message(
                 [
                     ros.tf(stamp_ns, map_frame, odom_frame, self.T_map_odom),
                     ros.tf(stamp_ns, odom_frame, body_frame, T_odom_body),
                 ]
             )
-        wheel_ns, T_wheels_body = min(self._wheels, key=lambda entry: abs(entry[0] - stamp_ns))
-        if abs(wheel_ns - stamp_ns) > _APART_NS:
+        wheel_ns, T_wheel_odom_body = min(self._wheel_odometry, key=lambda entry: abs(entry[0] - stamp_ns))
+        if abs(wheel_ns - stamp_ns) > _MAX_AGE_NS:
             return None
-        T_map_wheels = self.T_map_odom @ T_odom_body @ inverse(T_wheels_body)
-        return ros.tf_message([ros.tf(stamp_ns, map_frame, odom_frame, T_map_wheels)])
+        T_map_wheel_odom = self.T_map_odom @ T_odom_body @ inverse(T_wheel_odom_body)
+        return ros.tf_message([ros.tf(stamp_ns, map_frame, odom_frame, T_map_wheel_odom)])
 
 
 def occupancy_grid(
@@ -66,7 +69,7 @@ def occupancy_grid(
     origin_m: np.ndarray,  # float64 [2]
     occupancy: np.ndarray,  # int8 [H, W]
 ) -> Any:
-    """nav_msgs/OccupancyGrid."""
+    """Return a nav_msgs/OccupancyGrid."""
     rows, columns = occupancy.shape
     T = np.eye(4)
     T[:2, 3] = origin_m
@@ -85,7 +88,9 @@ def point_cloud(
     colours: np.ndarray,  # uint8 [N, 3], RGB
     T_frame_points: np.ndarray,  # float64 [4, 4]
 ) -> Any:
-    """sensor_msgs/PointCloud2 with x, y, z and rgb packed into a float32, as RViz and PCL read it."""
+    """Return a sensor_msgs/PointCloud2 with x, y, z and rgb packed into a float32, as RViz and PCL read
+    it.
+    """
     packed = np.zeros(len(points_m), [("xyz", "<f4", 3), ("rgb", "<u4")])
     packed["xyz"] = transform_points(T_frame_points, points_m.astype(np.float64))
     red, green, blue = colours.astype(np.uint32).T

@@ -1,4 +1,6 @@
-"""Gives back to ROS 2, over rmw_zenoh's keys and without ROS: pose, transforms, map and cloud."""
+"""Publish pose, transforms, map and point cloud to ROS 2, over rmw_zenoh's keys and without a ROS
+installation.
+"""
 
 from __future__ import annotations
 
@@ -12,22 +14,22 @@ from beamsplat.common.messages import Cloud, Correction, Grid, Odometry, WheelOd
 from beamsplat.common.recording import ros_types as ros
 from beamsplat.common.runtime.node import Node, Outputs
 from beamsplat.common.zenoh.bus import open_session
-from beamsplat.common.zenoh.rmw import Attachment, Entity, Qos, data_key
-from beamsplat.services.ros2_out import conversions as answers
+from beamsplat.common.zenoh.rmw import RmwAttachment, RmwEntity, RmwQos, data_key
+from beamsplat.services.ros2_out import conversions
 from beamsplat.services.ros2_out.config import Ros2OutConfig
 
-_VOLATILE = Qos(depth=10)
-_LATCHED = Qos(transient_local=True, depth=1)
+_VOLATILE = RmwQos(depth=10)
+_LATCHED = RmwQos(transient_local=True, depth=1)
 
 
 class RosPublisher:
-    """One topic, as rmw_zenoh_cpp would publish it."""
+    """A publisher of one ROS topic, declared as rmw_zenoh_cpp does."""
 
     def __init__(
-        self, session: zenoh.Session, domain: int, number: int, topic: str, type_name: str, qos: Qos
+        self, session: zenoh.Session, domain: int, number: int, topic: str, type_name: str, qos: RmwQos
     ) -> None:
         type_hash = ros.typestore().hash_rihs01(type_name)
-        entity = Entity(
+        entity = RmwEntity(
             domain, str(session.zid()), 0, number, "MP", "beamsplat", topic="/" + topic.strip("/"),
             type_name=type_name, type_hash=type_hash, qos=qos,
         )  # fmt: skip
@@ -47,14 +49,14 @@ class RosPublisher:
         self.sent = 0
 
     def put(self, message: Any) -> None:
-        """Sends one ROS message."""
+        """Publish one ROS message."""
         self.sent += 1
-        attachment = Attachment(self.sent, time.time_ns(), self._gid)
+        attachment = RmwAttachment(self.sent, time.time_ns(), self._gid)
         self._publisher.put(ros.serialize(message), attachment=attachment.pack())
 
 
 class Ros2OutNode(Node):
-    """What this system finds, for a robot's ROS 2 nodes."""
+    """Publishes the results of this system to a robot's ROS 2 nodes."""
 
     name = "ros2_out"
     Config = Ros2OutConfig
@@ -69,24 +71,24 @@ class Ros2OutNode(Node):
 
     def configure(self) -> None:
         c = self.config
-        self._transforms = answers.Transforms(c.map_frame, c.odom_frame, c.body_frame)
+        self._transforms = conversions.TfTree(c.map_frame, c.odom_frame, c.body_frame)
         self._session = open_session((c.router,))
-        node = Entity(c.domain, str(self._session.zid()), 0, 0, "NN", "beamsplat")
+        node = RmwEntity(c.domain, str(self._session.zid()), 0, 0, "NN", "beamsplat")
         self._token = self._session.liveliness().declare_token(node.token())
         wanted = (
-            ("pose", c.pose_topic, answers.POSE, _VOLATILE),
-            ("tf", "/tf" if c.tf else "", answers.TF, Qos(depth=100)),
-            ("map", c.map_topic, answers.MAP, _LATCHED),
-            ("cloud", c.cloud_topic, answers.CLOUD, _VOLATILE),
+            ("pose", c.pose_topic, conversions.POSE, _VOLATILE),
+            ("tf", "/tf" if c.tf else "", conversions.TF, RmwQos(depth=100)),
+            ("map", c.map_topic, conversions.MAP, _LATCHED),
+            ("cloud", c.cloud_topic, conversions.CLOUD, _VOLATILE),
         )
         self._publishers = {
-            word: RosPublisher(self._session, c.domain, number, topic, type_name, qos)
-            for number, (word, topic, type_name, qos) in enumerate(wanted, start=1)
+            name: RosPublisher(self._session, c.domain, number, topic, type_name, qos)
+            for number, (name, topic, type_name, qos) in enumerate(wanted, start=1)
             if topic
         }
 
     def on_wheel_odometry(self, odometry: WheelOdometry) -> Outputs:
-        self._transforms.add_wheels(odometry.stamp_ns, odometry.T_odom_body)
+        self._transforms.add_wheel_odometry(odometry.stamp_ns, odometry.T_odom_body)
         return iter(())
 
     def on_localization_correction(self, correction: Correction) -> Outputs:
@@ -94,25 +96,25 @@ class Ros2OutNode(Node):
         return iter(())
 
     def on_localization_odometry(self, odometry: Odometry) -> Outputs:
-        """Pose and transforms; nothing while the localization does not know."""
+        """Publish pose and transforms, while the localization has status ok."""
         if odometry.status == "ok":
-            self._put("pose", self._transforms.pose(odometry.stamp_ns, odometry.T_odom_body))
-            self._put("tf", self._transforms.tf(odometry.stamp_ns, odometry.T_odom_body))
+            self._publish("pose", self._transforms.pose(odometry.stamp_ns, odometry.T_odom_body))
+            self._publish("tf", self._transforms.tf(odometry.stamp_ns, odometry.T_odom_body))
         return iter(())
 
     def on_localization_grid(self, grid: Grid) -> Outputs:
-        self._put(
+        self._publish(
             "map",
-            answers.occupancy_grid(
+            conversions.occupancy_grid(
                 grid.stamp_ns, self.config.map_frame, grid.resolution_m, grid.origin_m, grid.occupancy
             ),
         )
         return iter(())
 
     def on_fusion_cloud(self, cloud: Cloud) -> Outputs:
-        self._put(
+        self._publish(
             "cloud",
-            answers.point_cloud(
+            conversions.point_cloud(
                 cloud.stamp_ns, self.config.map_frame, cloud.points_odom_m, cloud.colours,
                 self._transforms.T_map_odom,
             ),
@@ -123,8 +125,8 @@ class Ros2OutNode(Node):
         if hasattr(self, "_session"):
             self._session.close()
 
-    def _put(self, word: str, message: Any | None) -> None:
-        if message is not None and word in self._publishers:
-            self._publishers[word].put(message)
+    def _publish(self, name: str, message: Any | None) -> None:
+        if message is not None and name in self._publishers:
+            self._publishers[name].put(message)
             sent = ", ".join(f"{name} {p.sent}" for name, p in self._publishers.items())
             self.detail = f"to ROS 2: {sent}"

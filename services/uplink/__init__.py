@@ -1,1 +1,1 @@
-"""What crosses from the robot to its edge server, and back."""
+"""The connection of a robot to its edge server."""

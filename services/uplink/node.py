@@ -1,7 +1,8 @@
-"""The uplink: on the robot, carries what the topic table marks to the edge's router, and answers back.
+"""The uplink node: on the robot, forwards the topics marked in the topic table to the edge's router, and
+back.
 
-The robot never waits for it: it runs without a link, connects whenever there is one, and what was missed is
-sent again by who sent it first (keyframes) or recovered from a cache here (poses, anchors).
+The robot never waits for it: it runs without a link and connects when there is one. Messages missed during an
+outage are sent again by their producer (keyframes) or recovered from a cache here (poses, anchors).
 """
 
 from __future__ import annotations
@@ -22,18 +23,20 @@ from beamsplat.common.zenoh.bridge import Bridge, BridgeSessions
 from beamsplat.common.zenoh.bus import BULK_BUFFER_BYTES, URGENT_BUFFER_BYTES, open_link, open_session
 
 _POLL_S = 0.1
-_ATTEMPT_S = 1.0
-_CLOSE_S = 1.0
+_ATTEMPT_S = 1.0  # timeout of one attempt to connect
+_CLOSE_S = 1.0  # limit for closing all sessions, so that a node stops in time
 
 
 class UplinkConfig(NodeConfig):
-    """Where the edge's router listens for robots."""
+    """Options of the uplink."""
 
-    edge: Annotated[str, Field(pattern=r"^[a-z]+/\S+:\d+$")]  # "tls/edge.local:7448"
+    edge: Annotated[
+        str, Field(pattern=r"^[a-z]+/\S+:\d+$")
+    ]  # endpoint of the edge's router: "tls/edge.local:7448"
 
 
 class UplinkNode(Node):
-    """No inputs and outputs of its own: the samples of others pass as they are."""
+    """Forwards encoded messages between two Zenoh sessions; it has no inputs and outputs of its own."""
 
     name = "uplink"
     Config = UplinkConfig
@@ -42,14 +45,14 @@ class UplinkNode(Node):
     def configure(self) -> None:
         self._sessions: list[zenoh.Session] = []
         self._bridge: Bridge | None = None
-        self._cut_since: float | None = None
+        self._cut_since_s: float | None = None
         self._cuts = 0
-        self._large_broke = False
+        self._bulk_session_cut = False
 
     def source(self) -> Iterator[SourceItem | None]:
-        """Runs until all that the robot sends has ended; a robot's sensors never do."""
+        """Run until all topics that the robot published have ended; those of sensors never end."""
         if self.live_settings is None:
-            raise UserError("the uplink runs live only: leave it out of lockstep runs")
+            raise UserError("the uplink runs live only: remove it from lockstep runs")
         started = time.monotonic()
         while self._bridge is None:
             try:
@@ -57,14 +60,16 @@ class UplinkNode(Node):
             except UserError as error:
                 self.detail = f"no link for {time.monotonic() - started:.0f} s: {error}"
                 yield None
-        while not self._ended():
-            self._say()
-            self._mend()
+        while not self._all_topics_ended():
+            self._update_detail()
+            self._replace_bulk_session()
             yield None
             time.sleep(_POLL_S)
 
     def close(self) -> None:
-        """A session whose link is cut says good-bye into the void for longer than a robot has to stop."""
+        """Close all sessions in threads, at most for `_CLOSE_S`: closing a session without a link
+        blocks for long.
+        """
         threads = [threading.Thread(target=s.close, daemon=True) for s in self._sessions]
         for thread in threads:
             thread.start()
@@ -73,7 +78,7 @@ class UplinkNode(Node):
             thread.join(max(deadline - time.monotonic(), 0.0))
 
     def _connect(self) -> None:
-        """All sessions or none.
+        """Open all sessions, or none.
 
         Raises:
             UserError: no router answers on one of the two sides.
@@ -81,7 +86,7 @@ class UplinkNode(Node):
         opened: list[zenoh.Session] = []
         try:
             for buffer_bytes in (URGENT_BUFFER_BYTES, BULK_BUFFER_BYTES):
-                opened.append(self._link(buffer_bytes))
+                opened.append(self._open_edge_session(buffer_bytes))
             login = login_of(self.live_settings.security, self.name)
             opened.append(open_session(self.live_settings.endpoints, _ATTEMPT_S, login=login))
         except UserError:
@@ -94,42 +99,44 @@ class UplinkNode(Node):
             self.live_settings.robot, BridgeSessions(robot=robot, edge=small, edge_bulk=large)
         )
 
-    def _link(self, buffer_bytes: int) -> zenoh.Session:
+    def _open_edge_session(self, buffer_bytes: int) -> zenoh.Session:
         return open_link(self.config.edge, _ATTEMPT_S, self.live_settings.security, buffer_bytes)
 
-    def _mend(self) -> None:
-        """After a cut the session for large messages is replaced, once the small one is connected again."""
-        if not self._large_broke or not self._sessions[0].info.routers_zid():
+    def _replace_bulk_session(self) -> None:
+        """After an interruption, replace the session for large messages when the small one is connected
+        again.
+        """
+        if not self._bulk_session_cut or not self._sessions[0].info.routers_zid():
             return
         try:
-            large = self._link(BULK_BUFFER_BYTES)
+            large = self._open_edge_session(BULK_BUFFER_BYTES)
         except UserError:
             return
         small, old, robot = self._sessions
         self._sessions = [small, large, robot]
-        self._large_broke = False
+        self._bulk_session_cut = False
         self._bridge.replace_bulk_session(BridgeSessions(robot=robot, edge=small, edge_bulk=large))
         threading.Thread(target=old.close, daemon=True).start()
 
-    def _ended(self) -> bool:
-        """All topics on which the robot said something have ended."""
+    def _all_topics_ended(self) -> bool:
+        """Return whether all topics on which the robot published have ended."""
         spoke = {name for name, traffic in self._bridge.forwarded_up().items() if traffic.messages}
         return bool(spoke) and spoke <= self._bridge.ended
 
-    def _say(self) -> None:
+    def _update_detail(self) -> None:
         now = time.monotonic()
         if all(session.info.routers_zid() for session in self._sessions[:2]):
-            self._cut_since = None
+            self._cut_since_s = None
             state = "connected"
         else:
-            if self._cut_since is None:
-                self._cut_since, self._cuts = now, self._cuts + 1
-            self._large_broke = True
-            state = f"no link for {now - self._cut_since:.0f} s"
+            if self._cut_since_s is None:
+                self._cut_since_s, self._cuts = now, self._cuts + 1
+            self._bulk_session_cut = True
+            state = f"no link for {now - self._cut_since_s:.0f} s"
         up = self._bridge.forwarded_up().values()
         cuts = f", {self._cuts} cuts, {self._bridge.interrupted} messages cut off" if self._cuts else ""
         cuts += (
-            f", {self._bridge.health_dropped} health reports too many" if self._bridge.health_dropped else ""
+            f", {self._bridge.health_dropped} health reports rejected" if self._bridge.health_dropped else ""
         )
         self.detail = (
             f"{state} ({self.config.edge}){cuts}: {sum(c.messages for c in up)} messages, "

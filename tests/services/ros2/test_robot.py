@@ -48,7 +48,7 @@ class RobotProcess:
         self.process.wait()
 
 
-class Running:
+class RunningNodes:
     """Nodes on the bus, each in a thread."""
 
     def __init__(self, endpoint, folder, *nodes):
@@ -99,7 +99,10 @@ def test_a_robot_that_speaks_ros2_is_taken_as_it_is(tmp_path, free_endpoint):
     topics = ("rig", "lidar/scan", "camera/image", "wheel/odometry")
     with open_router((free_endpoint,)), Bus(open_session((free_endpoint,)), "test", "x", "cd" * 8, 1) as bus:
         got = _collect(bus, *topics)
-        with Running(free_endpoint, tmp_path / "state", node), RobotProcess(free_endpoint, 3, bag) as robot:
+        with (
+            RunningNodes(free_endpoint, tmp_path / "state", node),
+            RobotProcess(free_endpoint, 3, bag) as robot,
+        ):
             _wait(lambda: all(len(got[t]) >= (1 if t == "rig" else 20) for t in topics),
                   say=lambda: f"{node.robot.status} {[(t, len(v)) for t, v in got.items()]}")  # fmt: skip
             tokens = [str(r.ok.key_expr) for r in bus.session.liveliness().get("@ros2_lv/3/**")]
@@ -122,7 +125,7 @@ def test_a_robot_that_speaks_ros2_is_taken_as_it_is(tmp_path, free_endpoint):
     ("drive", "said"),
     [
         (Drive(seconds=60.0, tf=""), "calibration is missing: where the"),
-        (Drive(seconds=60.0, info_px=None), "no sensor_msgs/CameraInfo has come"),
+        (Drive(seconds=60.0, info_px=None), "no sensor_msgs/CameraInfo was received"),
         (Drive(seconds=60.0, odometry=False, extra_scan="/scan_back"), "several topics for scan: /scan, /scan_back"),
         (Drive(seconds=60.0, info_px=(32, 24)), "K is for 32x24 px"),
     ],
@@ -132,7 +135,7 @@ def test_what_is_missing_or_contradicts_itself_is_said(tmp_path, free_endpoint, 
     node = Ros2Node(Ros2Config(domain=0, router=free_endpoint, settle_s=0.5))
     with open_router((free_endpoint,)), Bus(open_session((free_endpoint,)), "test", "x", "cd" * 8, 1) as bus:
         got = _collect(bus, "lidar/scan", "camera/image")
-        running = Running(free_endpoint, tmp_path / "state", node)
+        running = RunningNodes(free_endpoint, tmp_path / "state", node)
         with running, RobotProcess(free_endpoint, 0, bag):
             _wait(lambda: said in node.detail or any(said in fault for fault in running.faults),
                   say=lambda: f"{node.detail} {running.faults}")  # fmt: skip
@@ -143,9 +146,9 @@ def test_pictures_of_another_size_and_broken_ones_are_not_passed_on():
     import cv2
     from rosbags.typesys import Stores, get_typestore
 
-    from beamsplat.services.ros2.robot import Robot, RobotOptions
+    from beamsplat.services.ros2.robot import RosRobot, RosRobotOptions
 
-    robot = Robot(RobotOptions(assume_mounts=True, settle_s=0.0, without=frozenset({"scan"})))
+    robot = RosRobot(RosRobotOptions(assume_mounts=True, settle_s=0.0, without=frozenset({"scan"})))
     store = get_typestore(Stores.ROS2_HUMBLE)
     new = lambda name, **fields: store.types[name](**fields)  # noqa: E731
     header = lambda ns: new("std_msgs/msg/Header", frame_id="camera",  # noqa: E731
@@ -161,7 +164,7 @@ def test_pictures_of_another_size_and_broken_ones_are_not_passed_on():
     roi = new("sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
     info = new("sensor_msgs/msg/CameraInfo", header=header(1), height=48, width=64, distortion_model="plumb_bob",
                d=np.zeros(5), k=K, r=np.eye(3).ravel(), p=np.zeros(12), binning_x=0, binning_y=0, roi=roi)  # fmt: skip
-    take = lambda topic, kind, data: robot.take(topic, f"sensor_msgs/msg/{kind}", data, 7, 0.0)  # noqa: E731
+    take = lambda topic, kind, data: robot.convert(topic, f"sensor_msgs/msg/{kind}", data, 7, 0.0)  # noqa: E731
     take("/cam/camera_info", "CameraInfo", bytes(store.serialize_cdr(info, info.__msgtype__)))
     name = ("/cam/image/compressed", "CompressedImage")
     assert [t for t, _ in take(*name, picture(64, 48, 5))] == ["rig"]
@@ -171,7 +174,7 @@ def test_pictures_of_another_size_and_broken_ones_are_not_passed_on():
     assert take(*name, picture(64, 48, 8, cut=20)) == []
     assert take(*name, b"\x00\x01\x00\x00rubbish") == []
     assert [m.stamp_ns for _, m in take(*name, picture(64, 48, 0))] == [7]  # no stamp: when it came
-    assert robot.refused[name[0]] == 3
+    assert robot.rejected[name[0]] == 3
 
 
 def test_answers_come_back_with_attachments_and_tokens(tmp_path, free_endpoint):
@@ -181,7 +184,7 @@ def test_answers_come_back_with_attachments_and_tokens(tmp_path, free_endpoint):
     with (
         open_router((free_endpoint,)),
         Bus(open_session((free_endpoint,)), "test", "all", "cd" * 8, 1) as bus,
-        Running(free_endpoint, tmp_path / "state", node),
+        RunningNodes(free_endpoint, tmp_path / "state", node),
     ):
         _wait(lambda: "ros2_out" in bus.alive_nodes())
         said = {t: bus.publish(t) for t in ("localization/correction", "localization/odometry",
@@ -267,7 +270,7 @@ def test_wheels_that_only_tf_tells_of_are_taken_from_there(tmp_path, free_endpoi
         got = _collect(bus, "rig", "wheel/odometry")
         said = bus.publish("localization/odometry")
         with (
-            Running(free_endpoint, tmp_path / "state", node, out),
+            RunningNodes(free_endpoint, tmp_path / "state", node, out),
             RobotProcess(free_endpoint, 5, bag, tf=True),
         ):
             elsewhere = np.eye(4)

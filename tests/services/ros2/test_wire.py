@@ -12,8 +12,8 @@ from beamsplat.common import messages as m
 from beamsplat.common.recording import ros_types as ros
 from beamsplat.common.recording.sensors import SENSORS, build, ros_fields
 from beamsplat.common.recording.to_ros import records_of
-from beamsplat.common.zenoh.rmw import Address, Attachment, Entity, Qos, data_key
-from beamsplat.services.ros2_out.conversions import Transforms, occupancy_grid, point_cloud
+from beamsplat.common.zenoh.rmw import RmwAttachment, RmwEntity, RmwKey, RmwQos, data_key
+from beamsplat.services.ros2_out.conversions import TfTree, occupancy_grid, point_cloud
 
 # ros2/rmw_zenoh, docs/design.md, "Graph Cache": the tokens of a listener and of a talker on /chatter.
 HASH = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
@@ -30,18 +30,18 @@ PUBLISHER = (
 
 @pytest.mark.parametrize("token", [NODE, SUBSCRIPTION, PUBLISHER])
 def test_tokens_of_the_design_document(token):
-    entity = Entity.parse(token)
+    entity = RmwEntity.parse(token)
     assert entity.domain == 2
     assert entity.token() == token
     assert entity.gid() == xxhash.xxh3_128(token.encode()).intdigest().to_bytes(16, "little")
 
 
 def test_what_a_talkers_token_says():
-    talker = Entity.parse(PUBLISHER)
+    talker = RmwEntity.parse(PUBLISHER)
     assert (talker.kind, talker.node_name, talker.topic, talker.type_name) == (
         "MP", "talker", "/chatter", "std_msgs/msg/String",
     )  # fmt: skip
-    assert talker.qos == Qos(depth=7)
+    assert talker.qos == RmwQos(depth=7)
     assert ros.typestore().hash_rihs01("std_msgs/msg/String") == talker.type_hash == HASH
     assert (
         data_key(2, "/chatter", "std_msgs/msg/String", HASH)
@@ -52,38 +52,38 @@ def test_what_a_talkers_token_says():
 def test_what_is_no_token_of_ours():
     service = "@ros2_lv/2/f9/0/10/SS/%/%/add_server/%add/example_interfaces::srv::dds_::AddTwoInts_/RIHS01_e1/::,10:,:,:,,"
     for text in (service, "@ros2_lv/2/x", "chatter", NODE + "/more", PUBLISHER.replace("::,7", "7")):
-        assert Entity.parse(text) is None
+        assert RmwEntity.parse(text) is None
 
 
 @given(st.text(max_size=200))
 def test_any_text_is_taken_without_an_error(text):
-    Entity.parse(text)
-    Address.of(text)
-    Qos.parse(text)
+    RmwEntity.parse(text)
+    RmwKey.parse(text)
+    RmwQos.parse(text)
 
 
 @given(st.integers(-(2**63), 2**63 - 1), st.integers(0, 2**63 - 1), st.binary(min_size=16, max_size=16))
 def test_attachments_as_zenohs_own_serializer_writes_them(sequence, source_ns, gid):
-    ours = Attachment(sequence, source_ns, gid)
+    ours = RmwAttachment(sequence, source_ns, gid)
     theirs = ze.z_serialize((ze.Int64(sequence), ze.Int64(source_ns), gid)).to_bytes()
     assert ours.pack() == theirs
-    assert Attachment.unpack(theirs) == ours
+    assert RmwAttachment.unpack(theirs) == ours
     named = ze.z_serialize(
         ("sequence_number", ze.Int64(sequence), "source_timestamp", ze.Int64(source_ns), "source_gid", gid)
     )  # late 2024
-    assert Attachment.unpack(named.to_bytes()) == ours
+    assert RmwAttachment.unpack(named.to_bytes()) == ours
 
 
 @given(st.binary(max_size=90))
 def test_other_attachments_are_ignored(data):
-    found = Attachment.unpack(data)
+    found = RmwAttachment.unpack(data)
     assert found is None or len(data) in (33, 77)
 
 
 def test_addresses():
     key = f"7/robot1/front/scan/sensor_msgs::msg::dds_::LaserScan_/{HASH}"
-    assert Address.of(key) == ("7", "/robot1/front/scan", "sensor_msgs/msg/LaserScan", HASH)
-    assert Address.of("beamsplat/robot1/lidar/scan") is None
+    assert RmwKey.parse(key) == ("7", "/robot1/front/scan", "sensor_msgs/msg/LaserScan", HASH)
+    assert RmwKey.parse("beamsplat/robot1/lidar/scan") is None
 
 
 def _independent(message):
@@ -146,13 +146,13 @@ def test_the_answers_are_what_ros_reads():
 def test_transforms_leave_the_robots_own_odometry_to_it():
     from beamsplat.common.geometry.transforms import se2_to_se3
 
-    tree = Transforms("map", "odom", "base_link")
+    tree = TfTree("map", "odom", "base_link")
     tree.T_map_odom = se2_to_se3(np.array([1.0, 0.0, 0.0]))
     ours = se2_to_se3(np.array([2.0, 1.0, 0.5]))
     both = tree.tf(10**9, ours).transforms
     assert [(t.header.frame_id, t.child_frame_id) for t in both] == [("map", "odom"), ("odom", "base_link")]
     wheels = se2_to_se3(np.array([5.0, 5.0, -0.5]))
-    tree.add_wheels(10**9, wheels)
+    tree.add_wheel_odometry(10**9, wheels)
     (only,) = _independent(tree.tf(10**9 + 1000, ours)).transforms
     assert (only.header.frame_id, only.child_frame_id) == ("map", "odom")
     T_map_odom = ros.transform_of(only.transform.translation, only.transform.rotation)

@@ -9,7 +9,7 @@ import time
 from tests.conftest import free_port
 
 
-class Link:
+class CuttableLink:
     """Connect to `port`, and what is said arrives at `target_port`, unless the link is cut: then it is silent,
     as a radio out of reach is, and nothing tells either side."""
 

@@ -30,7 +30,7 @@ LIGHT = {
 }  # a slow machine for a GPU's work
 
 
-class Log:
+class ReceivedMessages:
     """What one side has heard so far."""
 
     def __init__(self, path):
@@ -84,7 +84,7 @@ class HostProcess:
 
     @property
     def log(self):
-        return Log(self._log)
+        return ReceivedMessages(self._log)
 
 
 class BadLinkPair:
@@ -154,7 +154,9 @@ class BadLinkPair:
         """id -> when it was on the edge's disk (monotonic ns; from the file's time of writing)."""
         shift_ns = time.monotonic_ns() - time.time_ns()
         folder = SessionFolder(self.session)
-        return {i: (folder.keyframes / f"{i}.kf").stat().st_mtime_ns + shift_ns for i in folder.keyframe_ids()}
+        return {
+            i: (folder.keyframes / f"{i}.kf").stat().st_mtime_ns + shift_ns for i in folder.keyframe_ids()
+        }
 
 
 def quantiles(values_ns):

@@ -32,7 +32,7 @@ HEARD = {
 _POLL_S = 0.1
 
 
-class Log:
+class MessageLog:
     """A line for each message heard: topic, when (monotonic ns), and what its header says."""
 
     def __init__(self, path: Path) -> None:
@@ -93,7 +93,7 @@ class Side:
 
 def main() -> None:
     deployment = Deployment.model_validate_json(Path(sys.argv[1]).read_text())
-    log = Log(Path(sys.argv[2]))
+    log = MessageLog(Path(sys.argv[2]))
     with Supervisor(deployment) as supervisor, open_session(deployment.router.listen[:1]) as session:
         board = HealthBoard(session, deployment.robot)
         side = Side(supervisor, board)

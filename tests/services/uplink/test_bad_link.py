@@ -76,7 +76,7 @@ def check_complete(pair):
     assert not pair.queued
 
 
-def print_states(states):
+def print_details(states):
     for state in states:
         for node, detail in sorted(state["details"].items()):
             say(node, detail)
@@ -99,7 +99,7 @@ def test_a_bad_link_does_not_reach_the_robot_and_loses_no_keyframe(tmp_path, dri
         print_transit(near, far, begin_ns, cut_ns - 2_000_000_000)
         if cut_s:
             print_recovery(pair, cut_ns, mended_ns)
-        print_states(states)
+        print_details(states)
     check_complete(pair)
 
 
@@ -117,6 +117,6 @@ def test_an_edge_that_is_killed_goes_on_from_its_session(tmp_path, drive):
         print()
         print_onboard(pair.near.log, "before the edge is killed", begin_ns, killed_ns)
         print_onboard(pair.near.log, "after it", killed_ns, end_ns)
-        print_states(states)
+        print_details(states)
         assert set(pair.near.state()["restarts"].values()) == {0}
     check_complete(pair)

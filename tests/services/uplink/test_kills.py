@@ -9,7 +9,7 @@ import pytest
 
 from tests.services.uplink.pair import RATE, BadLinkPair
 from tests.services.uplink.radio import Radio
-from tests.services.uplink.test_bad_link import BAD, LAP_S, print_states, say
+from tests.services.uplink.test_bad_link import BAD, LAP_S, print_details, say
 
 VICTIMS = [
     *(("near", name) for name in ("router", "uplink", "keyframes", "fusion", "depth", "localization", "replay")),
@@ -69,13 +69,13 @@ def test_any_process_may_be_killed_at_any_time(tmp_path, drive):
         say("killed", f"{sum(k for *_, k in done)} of {len(done)} in {MINUTES:g} min, seed {SEED}")
         for side in ("near", "far"):
             say(f"restarts, {side}", getattr(pair, side).state()["restarts"])
-        print_states(states)
+        print_details(states)
         before = set(pair.durable())
         pair.wait(
             lambda near, far: drained(near) or set(pair.durable()) - before, 120
         )  # the chain works from end to end
         states = pair.drained(600)
-        print_states(states)
+        print_details(states)
         made = set(pair.near.log.first("keyframes/frame", "sent_ns"))
         earlier = pair.queued
         say("keyframes made, on the edge, of earlier drives on the robot",

@@ -24,7 +24,7 @@ from beamsplat.tools.system.supervisor import Supervisor
 from tests.common.topic_listener import TopicListener
 from tests.conftest import free_port
 from tests.services.mapping.room_drive import TABLE
-from tests.services.uplink.link import Link
+from tests.services.uplink.link import CuttableLink
 
 TABLE = {**TABLE, "uplink": NODES["uplink"]}
 
@@ -36,7 +36,7 @@ class Pair:
         self, tmp_path, pictures, rate_bytes_s=None, edge_security=None, robot_security=None, scheme="tcp"
     ):
         ports = [free_port() for _ in range(3)]
-        self.link = Link(ports[2], rate_bytes_s)
+        self.link = CuttableLink(ports[2], rate_bytes_s)
         listen = {"robot": (f"tcp/127.0.0.1:{ports[0]}",), "edge": (f"tcp/127.0.0.1:{ports[1]}",)}
         self.robot = Deployment(
             robot="r1", role="robot", router=RouterConfig(listen=listen["robot"]), state_dir=tmp_path / "robot",

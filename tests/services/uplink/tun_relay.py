@@ -40,7 +40,7 @@ def open_tun(namespace: str) -> int:
     return tun
 
 
-class Way:
+class Direction:
     """One direction."""
 
     def __init__(self, source: int, target: int, delay_ns: int, loss: float, seed: int) -> None:
@@ -87,8 +87,8 @@ def relay(near: str, far: str, delay_s: float, loss: float, seed: int) -> None:
     tuns = [open_tun(near), open_tun(far)]
     delay_ns = round(delay_s * 1e9)
     ways = [
-        Way(tuns[0], tuns[1], delay_ns, loss, 2 * seed),
-        Way(tuns[1], tuns[0], delay_ns, loss, 2 * seed + 1),
+        Direction(tuns[0], tuns[1], delay_ns, loss, 2 * seed),
+        Direction(tuns[1], tuns[0], delay_ns, loss, 2 * seed + 1),
     ]
     cut = False
     print("ready", flush=True)

@@ -1,0 +1,54 @@
+"""Wheel odometry from /tf, for robots that publish odom -> base_link (REP 105) but no Odometry topic."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from beamsplat.common.geometry.transforms import inverse, se3_log
+from beamsplat.common.recording.static_frames import BODY_NAMES, clean
+
+_ODOM = "odom"
+_MAX_STEP_NS = 1_000_000_000  # over a longer interval the velocity is unknown
+
+
+class TfOdometry:
+    """Finds the transform odom -> base in /tf and computes odometry from its changes."""
+
+    def __init__(self) -> None:
+        self._edges: set[tuple[str, str]] = set()  # (parent, child) of the transforms on /tf
+        self._previous: tuple[int, np.ndarray] | None = None
+
+    def add_edge(self, parent: str, child: str) -> None:
+        """Register a transform of /tf."""
+        self._edges.add((clean(parent), clean(child)))
+
+    def odometry_edge(self) -> tuple[str, str] | None:
+        """Return the frames (odom, child) by their usual names; None if there is no or more than one
+        such transform.
+        """
+        found = [
+            (parent, child)
+            for parent, child in sorted(self._edges)
+            if parent.split("/")[-1] == _ODOM and child.split("/")[-1] in BODY_NAMES
+        ]
+        return found[0] if len(found) == 1 else None
+
+    def odometry_fields(self, stamp_ns: int, T_odom_child: np.ndarray) -> dict[str, Any] | None:
+        """Return the fields of a WheelOdometry of the child frame.
+
+        None for the first transform, whose velocity is unknown, and for a stamp that is not newer than the
+        last.
+        """
+        previous = self._previous
+        if previous is not None and 0 <= previous[0] - stamp_ns < _MAX_STEP_NS:
+            return None  # repeated by several nodes
+        self._previous = stamp_ns, T_odom_child
+        if previous is None or not 0 < stamp_ns - previous[0] <= _MAX_STEP_NS:
+            return None
+        step = se3_log(inverse(previous[1]) @ T_odom_child) / ((stamp_ns - previous[0]) / 1e9)
+        return {
+            "stamp_ns": stamp_ns, "T_odom_body": T_odom_child, "velocity_m_s": step[:3],
+            "angular_velocity_rad_s": step[3:],
+        }  # fmt: skip
