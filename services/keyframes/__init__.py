@@ -1,1 +1,0 @@
-"""Which pictures become keyframes."""

@@ -1,4 +1,4 @@
-"""The keyframes service: on the robot, picks the pictures the map needs and makes each self-sufficient."""
+"""The keyframes service: selects keyframes on the robot and sends each with all data that mapping needs."""
 
 from __future__ import annotations
 
@@ -33,33 +33,37 @@ from beamsplat.common.messages.codec import decode, encode, schema_of
 from beamsplat.common.messages.depth_png import depth_to_png, mask_to_png, sigma_to_png
 from beamsplat.common.messages.header import DecodeError, Header
 from beamsplat.common.messages.image_codec import decode_rgb
+from beamsplat.common.messages.map import ODOM_ORIGIN
 from beamsplat.common.runtime.node import Input, Node, Outputs
-from beamsplat.services.keyframes.bodies import body_mask
+from beamsplat.services.keyframes.dynamic_mask import dynamic_object_mask
 from beamsplat.services.keyframes.outbox import Outbox
 from beamsplat.services.keyframes.selection import KeyframeSelector, SelectionSettings
 
 log = logging.getLogger("beamsplat.keyframes")
 
-ODOM_ORIGIN = -1  # the anchor while localization has named none
 _SCHEMA = schema_of(Keyframe)
-_PICTURES = 64  # kept until their depth comes: 6 s at 10 Hz
+_IMAGES = 64  # kept until their depth arrives: 6 s at 10 Hz
 _BEAMS_NS = 120_000_000  # poses up to this long after an image place the scan around it (10 Hz lidars)
 _BEAMS_PATIENCE_NS = 400_000_000  # the scan of a 5 Hz lidar is complete by then
 
 
 class KeyframesConfig(NodeConfig):
-    """When a picture becomes a keyframe, and how many may wait for the mapper."""
+    """Options of the keyframes service: selection, and the outbox of unacknowledged keyframes."""
 
     distance_m: Annotated[float, Field(gt=0.0)] = 0.25
     angle_rad: Annotated[float, Field(gt=0.0)] = 0.22
     least_overlap: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.6
-    patience: Annotated[int, Field(ge=1)] = 2  # candidates looked at when one is blurred
-    swept_only: bool = True  # only pictures for which fusion did its best; False: any with depth
-    durable: bool = False  # live: unacknowledged keyframes lie on disk, in the state folder
-    queue_mb: Annotated[float, Field(gt=0.0)] = 64.0  # of them that are kept: about four a megabyte
-    retry_s: Annotated[float, Field(gt=0.0)] = 10.0  # of silence, after which the oldest is tried again
-    window: Annotated[int, Field(ge=1)] = 4  # of those sent again, on their way at once
-    jpeg_quality: Annotated[int, Field(ge=50, le=100)] = 95  # of pictures that come uncompressed
+    patience: Annotated[int, Field(ge=1)] = 2  # images considered when one is blurred
+    swept_only: bool = True  # only images with a plane sweep in fusion; False: any with depth
+    durable: bool = False  # live: unacknowledged keyframes are kept on disk, in the state folder
+    queue_mb: Annotated[float, Field(gt=0.0)] = (
+        64.0  # largest size of the outbox: about four keyframes per megabyte
+    )
+    retry_s: Annotated[float, Field(gt=0.0)] = (
+        10.0  # without acknowledgement, after which the oldest is sent again
+    )
+    window: Annotated[int, Field(ge=1)] = 4  # largest number of keyframes sent again that are in flight
+    jpeg_quality: Annotated[int, Field(ge=50, le=100)] = 95  # of images that arrive uncompressed
 
 
 @dataclass(frozen=True)
@@ -69,7 +73,7 @@ class _Candidate:
 
 
 class KeyframesNode(Node):
-    """Picture, fused depth, beams and pose of one moment, bound to the newest anchor."""
+    """Publishes keyframes: image, fused depth, beams and pose at one time, relative to the newest anchor."""
 
     name = "keyframes"
     Config = KeyframesConfig
@@ -89,44 +93,48 @@ class KeyframesNode(Node):
     def configure(self) -> None:
         self._history: SensorHistory | None = None
         self._rig: Rig | None = None
-        self._pictures: deque[Image] = deque(maxlen=_PICTURES)
-        self._depths: deque[FusedDepth] = deque(maxlen=_PICTURES)
+        self._images: deque[Image] = deque(maxlen=_IMAGES)
+        self._depths: deque[FusedDepth] = deque(maxlen=_IMAGES)
         self._candidates: deque[tuple[int, _Candidate]] = deque(maxlen=8)
         self._T_map_odom = np.eye(4)
-        self._localizer, self._map_uuid = "", ""  # the process that localizes, and the map it says it is in
-        self._forget_frame()
+        self._localizer, self._map_uuid = "", ""  # the localization process, and its map
+        self._reset_frame()
         c = self.config
         folder = (
             self.live_settings.run_dir / "keyframes" if c.durable and self.live_settings is not None else None
         )
         self._outbox = Outbox(round(c.queue_mb * 1e6), round(c.retry_s * 1e9), c.window, folder)
-        self._now_ns = 0  # by the pictures
-        self._seen = self._sent = self._again = 0
-        self._refused: set[int] = set()
-        if self._outbox.earlier:
-            log.info("%d keyframes of before wait in %s", self._outbox.earlier, folder)
-
-    # --- what is known of the robot ---
+        self._now_ns = 0  # image time
+        self._seen = self._sent = self._sent_again = 0
+        self._rejected: set[int] = set()
+        if self._outbox.of_earlier_drives:
+            log.info(
+                "%d unacknowledged keyframes of earlier drives are in %s",
+                self._outbox.of_earlier_drives,
+                folder,
+            )
 
     def on_header(self, header: Header) -> None:
-        """Another process localizes: the odom frame is another one, and so may be the map. A drive is named
-        after its map, or where localization names none, after that process."""
+        """Reset if localization runs in another process, because its odom frame is a new one.
+
+        A drive is named after its map, or after the localization process while the map is unknown.
+        """
         if header.producer == "localization" and header.instance != self._localizer:
             if self._localizer:
-                self._forget_frame()
+                self._reset_frame()
                 if self._rig is not None:
                     self.on_rig(self._rig)
             self._localizer = self._outbox.drive = header.instance
 
-    def _forget_frame(self) -> None:
+    def _reset_frame(self) -> None:
         self._anchor_id, self._T_map_anchor, self._optimisation = ODOM_ORIGIN, np.eye(4), 0
         self._depths.clear()
         self._candidates.clear()
 
     def on_rig(self, rig: Rig) -> Outputs:
-        """The camera is needed; beams only where there is a lidar. A second calibration restarts."""
+        """Set up camera and lidar; the camera is required. A second calibration restarts the selection."""
         if rig.camera is None:
-            log.error("the calibration has no camera: no keyframes")
+            log.error("the calibration has no camera: there are no keyframes; add [camera] to the rig file")
             return iter(())
         c = rig.camera
         self._camera, self._rig = c, rig
@@ -159,10 +167,10 @@ class KeyframesNode(Node):
         return iter(())
 
     def on_localization_anchors(self, anchors: Anchors) -> Outputs:
-        """New keyframes hang on the newest submap: between the two there is the least drift."""
+        """Bind new keyframes to the newest submap, to which drift is least."""
         self._map_uuid = anchors.map_uuid
         if anchors.map_uuid:
-            self._outbox.rename(self._localizer, anchors.map_uuid)
+            self._outbox.rename_drive(self._localizer, anchors.map_uuid)
         if len(anchors.anchor_ids):
             newest = int(np.argmax(anchors.anchor_ids))
             self._anchor_id = int(anchors.anchor_ids[newest])
@@ -170,23 +178,21 @@ class KeyframesNode(Node):
             self._optimisation = anchors.optimisation
         return iter(())
 
-    # --- pictures ---
-
     def on_camera_image(self, image: Image) -> Outputs:
-        """Kept until its depth comes; and time has passed for what was not acknowledged."""
-        self._pictures.append(image)
+        """Keep the image until its depth arrives; send unacknowledged keyframes again that are due."""
+        self._images.append(image)
         self._now_ns = max(self._now_ns, image.stamp_ns)
-        yield from self._send_again()
+        yield from self._resend_due()
 
-    def _send_again(self) -> Outputs:
+    def _resend_due(self) -> Outputs:
         for key, payload in list(self._outbox.due(self._now_ns)):
             try:
                 frame = decode(_SCHEMA, payload)
-            except DecodeError as error:  # another version of this program left it
-                log.warning("keyframe %d in the queue is of no use: %s", key, error)
+            except DecodeError as error:  # written by another version
+                log.warning("keyframe %d in the outbox cannot be decoded and is dropped: %s", key, error)
                 self._outbox.discard(key)
                 continue
-            self._again += 1
+            self._sent_again += 1
             yield "keyframes/frame", frame.model_copy(update={"backlog": len(self._outbox)})
 
     def on_fusion_depth(self, depth: FusedDepth) -> Outputs:
@@ -195,7 +201,7 @@ class KeyframesNode(Node):
         return iter(())
 
     def on_localization_odometry(self, odometry: Odometry) -> Outputs:
-        """A pose: pictures whose beams can be placed now are looked at."""
+        """Add a pose, and consider the images whose beams can be deskewed now."""
         if self._history is None or odometry.status != "ok":
             return
         self._history.add_pose(odometry.stamp_ns, odometry.T_odom_body)
@@ -203,42 +209,42 @@ class KeyframesNode(Node):
             yield from self._consider(self._depths.popleft())
 
     def _beams_are_known(self, image_ns: int, pose_ns: int) -> bool:
-        """Whether the scan around an image is complete, or is not waited for any longer."""
+        """Return whether the scan around an image is complete, or the waiting time is over."""
         if pose_ns < image_ns + _BEAMS_NS:
             return False
         return self._history.decided_scan_near(image_ns) or pose_ns >= image_ns + _BEAMS_PATIENCE_NS
 
     def on_keyframes_ack(self, ack: KeyframeAck) -> Outputs:
-        """The mapper has it, or refused it: either way it need not come again."""
+        """Remove a keyframe that the mapper has accepted or rejected from the outbox."""
         self._outbox.acknowledge(ack.id, self._now_ns)
         if ack.status != "ok":
-            self._refused.add(ack.id)
-        yield from self._send_again()
-        self._say()
+            self._rejected.add(ack.id)
+        yield from self._resend_due()
+        self._update_detail()
 
     def awaits_feedback(self) -> bool:
-        """Recorded data may end before the mapper has everything."""
+        """Return whether keyframes are not yet acknowledged; recorded data may end before."""
         return len(self._outbox) > 0
 
     def on_feedback_timeout(self, seconds: float) -> Outputs:
-        """No pictures come any more, so time passes this way."""
+        """Advance the time without images, and send unacknowledged keyframes again that are due."""
         self._now_ns += round(seconds * 1e9)
-        yield from self._send_again()
-        self._say()
+        yield from self._resend_due()
+        self._update_detail()
 
     def drain(self) -> Outputs:
-        """Depths whose last pose never came."""
+        """Consider the remaining images without waiting for further poses."""
         while self._history is not None and self._depths:
             yield from self._consider(self._depths.popleft())
 
     def _consider(self, depth: FusedDepth) -> Outputs:
-        image = next((p for p in self._pictures if p.stamp_ns == depth.stamp_ns), None)
+        image = next((p for p in self._images if p.stamp_ns == depth.stamp_ns), None)
         if image is None:
             return
         try:
             rgb = decode_rgb(image.data, image.encoding, image.width_px, image.height_px, image.step_bytes)
         except UserError as error:
-            log.warning("a picture is passed over: %s", error)
+            log.warning("an image is skipped: %s", error)
             return
         self._seen += 1
         self._candidates.append((self._seen, _Candidate(image, depth)))
@@ -253,18 +259,18 @@ class KeyframesNode(Node):
         view = np.concatenate([T_map_camera[:3, 3] / units[0], T_map_camera[:3, 2] / units[1]])
         self._outbox.put(frame.id, view, encode(frame), self._now_ns)
         self._sent += 1
-        self._say()
+        self._update_detail()
         yield "keyframes/frame", frame.model_copy(update={"backlog": len(self._outbox)})
 
     def _keyframe(self, chosen: _Candidate, why: str) -> Keyframe:
-        """Self-sufficient; poses are those of the optimisation that is known now."""
+        """Return the keyframe message, with the poses of the latest optimisation."""
         image, depth = chosen.image, chosen.depth
         stamp_ns, T_body_camera = image.stamp_ns, self._camera.T_body_camera
-        encoding, picture = self._compressed(image)
+        encoding, picture = self._compress(image)
         beams, _ = self._history.beams(stamp_ns)
         uv, z, index = project_beams(beams, self._undistort.pinhole, T_body_camera)
         moving = self._history.moving_returns(stamp_ns)
-        mask = body_mask(moving, depth.depth_m, self._undistort.pinhole, T_body_camera)
+        mask = dynamic_object_mask(moving, depth.depth_m, self._undistort.pinhole, T_body_camera)
         return Keyframe(
             stamp_ns=stamp_ns, id=stamp_ns, encoding=encoding, picture=picture, camera=self._camera,
             anchor_id=self._anchor_id, T_map_anchor=self._T_map_anchor, optimisation=self._optimisation,
@@ -275,18 +281,18 @@ class KeyframesNode(Node):
             map_uuid=self._map_uuid,
         )  # fmt: skip
 
-    def _compressed(self, image: Image) -> tuple[str, np.ndarray]:
+    def _compress(self, image: Image) -> tuple[str, np.ndarray]:
         if image.encoding in ("jpeg", "png"):
             return image.encoding, image.data
         rgb = decode_rgb(image.data, image.encoding, image.width_px, image.height_px, image.step_bytes)
         quality = (cv2.IMWRITE_JPEG_QUALITY, self.config.jpeg_quality)
         return "jpeg", cv2.imencode(".jpg", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), quality)[1].ravel()
 
-    def _say(self) -> None:
+    def _update_detail(self) -> None:
         o = self._outbox
         counts = {
-            "sent again": self._again, "refused": len(self._refused), "thrown away": o.given_up,
-            "not on disk": o.unstored, "broken": o.broken, "of earlier drives": o.earlier,
+            "sent again": self._sent_again, "refused": len(self._rejected), "dropped": o.dropped,
+            "not on disk": o.not_on_disk, "corrupt": o.corrupt, "of earlier drives": o.of_earlier_drives,
         }  # fmt: skip
-        said = "".join(f", {count} {what}" for what, count in counts.items() if count)
-        self.detail = f"{self._sent} keyframes, {len(o)} not acknowledged{said}"
+        text = "".join(f", {count} {what}" for what, count in counts.items() if count)
+        self.detail = f"{self._sent} keyframes, {len(o)} not acknowledged{text}"

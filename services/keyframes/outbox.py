@@ -1,12 +1,12 @@
-"""Keyframes that nobody has acknowledged: kept within a bound, on disk where there is a folder, sent again.
+"""Outbox of keyframes without acknowledgement: bounded in size, optionally on disk, sent again when lost.
 
-Every keyframe goes out once when it is made; this is about those that did not arrive. What is sent later
-arrives later, so an answer to one tells that all sent before it and not answered are lost: they go out again,
-oldest first, a few at a time, each answer making room for the next. Live keyframes never wait for them. While
-nobody answers at all, only the oldest is tried now and then.
+Every keyframe is sent once when it is made. Delivery is in order, so that the acknowledgement of one
+keyframe shows that all keyframes sent before it and not acknowledged are lost. These are sent again, oldest
+first, up to `window` at a time; each acknowledgement permits the next one. Live keyframes do not wait for
+them. While there is no acknowledgement at all, only the oldest is sent again, every `retry_ns`.
 
-Beyond the bound the least useful goes: one of an earlier drive, which no mapper waits for, else the one whose
-view is nearest to another that is kept.
+If the outbox is full, the least useful keyframe is dropped: one of an earlier drive, for which no mapper
+waits, else the one whose view is nearest to another view in the outbox.
 """
 
 from __future__ import annotations
@@ -20,144 +20,158 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from beamsplat.common.runtime.rate_limited_log import RateLimitedLog
-from beamsplat.services.keyframes.folder import Folder, Label
+from beamsplat.services.keyframes.queue_folder import QueueEntry, QueueFolder
 
 log = logging.getLogger("beamsplat.keyframes")
 
-_MEMORY_BYTES = 64_000_000  # of those that the disk would not take
-_NEWEST_EVERY = 4  # sendings again
+_MEMORY_BYTES = 64_000_000  # largest size of the keyframes that could not be written to disk
+_NEWEST_EVERY = 4  # every fourth lost keyframe sent again is the newest
 
 
 @dataclass
-class _Entry:
-    label: Label
+class _Pending:
+    meta: QueueEntry
     payload: bytes | None  # None = on disk
-    order: int | None = None  # of its latest sending; None = to be sent
-    again: bool = False  # its latest sending was not its first
+    send_index: int | None = None  # of its latest transmission; None = to be sent again
+    resent: bool = False  # its latest transmission was not its first
 
 
 class Outbox:
-    """Times are those of measurements, so that a replay repeats what was sent again."""
+    """Queue of keyframes until they are acknowledged; uses measurement times, so that replays are equal."""
 
     def __init__(self, limit_bytes: int, retry_ns: int, window: int, folder: Path | None = None) -> None:
-        """`window` of those sent again are on their way at once.
+        """Open the outbox, with the keyframes that are in `folder`; without a folder it is in memory only.
+
+        Args:
+            limit_bytes: largest size of all payloads.
+            retry_ns: time without acknowledgement after which the oldest keyframe is sent again.
+            window: largest number of keyframes sent again that are in flight.
+            folder: created if missing.
 
         Raises:
-            ValueError: a bound that is not positive.
-            UserError: the folder cannot be made.
+            ValueError: a limit that is not positive.
+            UserError: the folder cannot be created.
         """
         if limit_bytes < 1 or retry_ns <= 0 or window < 1:
-            raise ValueError(f"bounds must be positive, got {limit_bytes} bytes, {retry_ns} ns, {window}")
+            raise ValueError(f"limits must be positive, got {limit_bytes} bytes, {retry_ns} ns, {window}")
         self._limit, self._retry_ns, self._window = limit_bytes, retry_ns, window
-        self._folder = Folder(folder) if folder is not None else None
-        self._entries: dict[int, _Entry] = {}
-        self._sendings = self._caught_up = 0  # in all; of the lost ones
-        self._heard_ns: int | None = None  # the last answer, or the last attempt to get one
-        self._useless = 0
-        self._complaints = RateLimitedLog()
-        self.drive = ""  # the present one
+        self._folder = QueueFolder(folder) if folder is not None else None
+        self._entries: dict[int, _Pending] = {}
+        self._sent_count = self._resent_lost = 0  # transmissions in total; of lost keyframes
+        self._last_ack_ns: int | None = None  # time of the last acknowledgement or retry
+        self._discarded = 0
+        self._rate_limit = RateLimitedLog()
+        self.drive = ""  # name of the current drive
         self.bytes = 0
-        self.given_up = 0  # never acknowledged, and gone for lack of room
-        self.unstored = 0  # the disk would not take them: in memory only
+        self.dropped = 0  # never acknowledged, removed because the outbox was full
+        self.not_on_disk = 0  # could not be written to disk, kept in memory
         if self._folder is not None:
-            for label in self._folder.labels():
-                self._entries[label.key] = _Entry(label, None)
+            for label in self._folder.entries():
+                self._entries[label.key] = _Pending(label, None)
                 self.bytes += label.size
-            self._make_room(keep=None)
+            self._enforce_limits(keep=None)
 
     def __len__(self) -> int:
-        """How many wait for an answer of the present drive's mapper."""
-        return sum(entry.label.drive == self.drive for entry in self._entries.values())
+        """Return the number of keyframes of the current drive that are not acknowledged."""
+        return sum(entry.meta.drive == self.drive for entry in self._entries.values())
 
-    def rename(self, before: str, drive: str) -> None:
-        """The present drive, which went by `before` so far, has a name that survives a restart."""
+    def rename_drive(self, before: str, drive: str) -> None:
+        """Rename the current drive from `before`, a name of this process, to the name of its map."""
         for entry in self._entries.values():
-            if entry.label.drive == before:
-                entry.label = replace(entry.label, drive=drive)
+            if entry.meta.drive == before:
+                entry.meta = replace(entry.meta, drive=drive)
         self.drive = drive
 
     @property
-    def earlier(self) -> int:
-        """How many are left of earlier drives."""
+    def of_earlier_drives(self) -> int:
+        """Return the number of keyframes of earlier drives."""
         return len(self._entries) - len(self)
 
     @property
-    def broken(self) -> int:
-        """Those that could not be read."""
-        return self._useless + (self._folder.broken if self._folder is not None else 0)
+    def corrupt(self) -> int:
+        """Return the number of keyframes that could not be read."""
+        return self._discarded + (self._folder.corrupt if self._folder is not None else 0)
 
     def put(self, key: int, view: np.ndarray, payload: bytes, now_ns: int) -> None:
-        """Takes what is sent for the first time now. `view` [6]: place and viewing direction, each in units
-        that make one of either a keyframe's worth."""
-        label = Label(key, self.drive, tuple(float(value) for value in view), len(payload))
+        """Store a keyframe that is sent for the first time now.
+
+        Args:
+            key: id of the keyframe. view: float64 [6], position and viewing direction in the map, in units
+            of the motion between keyframes. payload: the encoded message. now_ns: measurement time.
+        """
+        label = QueueEntry(key, self.drive, tuple(float(value) for value in view), len(payload))
         self._forget(key)
         if not len(self):
-            self._heard_ns = now_ns  # silence is counted from here
-        self._entries[key] = _Entry(
-            label, None if self._stored(label, payload) else payload, self._next_order()
+            self._last_ack_ns = now_ns  # the retry time starts here
+        self._entries[key] = _Pending(
+            label, None if self._written(label, payload) else payload, self._next_send_index()
         )
         self.bytes += label.size
-        self._make_room(keep=key)
+        self._enforce_limits(keep=key)
 
     def acknowledge(self, key: int, now_ns: int) -> bool:
-        """It has arrived, so what was sent before it and is not answered has not. False if not waited for."""
+        """Remove a keyframe, and mark all sent before it as lost; return False for an unknown key."""
         entry = self._entries.get(key)
-        self._heard_ns = now_ns
+        self._last_ack_ns = now_ns
         if entry is None:
             return False
         self._forget(key)
         for other in self._entries.values():
-            if entry.order is not None and other.order is not None and other.order < entry.order:
-                other.order = None
+            if (
+                entry.send_index is not None
+                and other.send_index is not None
+                and other.send_index < entry.send_index
+            ):
+                other.send_index = None
         return True
 
     def due(self, now_ns: int) -> Iterator[tuple[int, bytes]]:
-        """Keys and payloads to send again now."""
-        mine = [entry for entry in self._entries.values() if entry.label.drive == self.drive]
-        if not mine:
+        """Yield key and payload of the keyframes to send again now."""
+        current = [entry for entry in self._entries.values() if entry.meta.drive == self.drive]
+        if not current:
             return
-        if self._heard_ns is None or now_ns - self._heard_ns >= self._retry_ns:
-            self._heard_ns = now_ns
-            yield from self._send(min(mine, key=lambda entry: entry.label.key))
+        if self._last_ack_ns is None or now_ns - self._last_ack_ns >= self._retry_ns:
+            self._last_ack_ns = now_ns
+            yield from self._send(min(current, key=lambda entry: entry.meta.key))
             return
-        on_their_way = sum(entry.again and entry.order is not None for entry in mine)
-        lost = sorted((e for e in mine if e.order is None), key=lambda entry: entry.label.key)
-        for _ in range(min(self._window - on_their_way, len(lost))):
-            # Now and then the newest: where the robot is now should not wait for all of an outage.
-            self._caught_up += 1
-            newest = self._caught_up % _NEWEST_EVERY == 0
+        in_flight = sum(entry.resent and entry.send_index is not None for entry in current)
+        lost = sorted((e for e in current if e.send_index is None), key=lambda entry: entry.meta.key)
+        for _ in range(min(self._window - in_flight, len(lost))):
+            # Sometimes the newest: the current surroundings should not wait for the whole backlog.
+            self._resent_lost += 1
+            newest = self._resent_lost % _NEWEST_EVERY == 0
             yield from self._send(lost.pop(-1 if newest else 0))
 
     def discard(self, key: int) -> None:
-        """Its payload is of no use to anybody."""
+        """Remove a keyframe whose payload cannot be used."""
         self._forget(key)
-        self._useless += 1
+        self._discarded += 1
 
-    def _send(self, entry: _Entry) -> Iterator[tuple[int, bytes]]:
+    def _send(self, entry: _Pending) -> Iterator[tuple[int, bytes]]:
         payload = entry.payload
         if payload is None and self._folder is not None:
-            payload = self._folder.read(entry.label.key)
-        if payload is None:  # the folder has said and counted it
-            self._forget(entry.label.key)
+            payload = self._folder.read(entry.meta.key)
+        if payload is None:  # the folder has logged and counted it
+            self._forget(entry.meta.key)
             return
-        entry.order, entry.again = self._next_order(), True
-        yield entry.label.key, payload
+        entry.send_index, entry.resent = self._next_send_index(), True
+        yield entry.meta.key, payload
 
-    def _next_order(self) -> int:
-        self._sendings += 1
-        return self._sendings
+    def _next_send_index(self) -> int:
+        self._sent_count += 1
+        return self._sent_count
 
-    def _stored(self, label: Label, payload: bytes) -> bool:
+    def _written(self, label: QueueEntry, payload: bytes) -> bool:
         if self._folder is None:
             return False
         try:
             self._folder.write(label, payload)
         except OSError as error:
-            self.unstored += 1
-            if (more := self._complaints.due("disk")) is not None:
+            self.not_on_disk += 1
+            if (more := self._rate_limit.due("disk")) is not None:
                 log.error(
-                    "%s takes no keyframes (%s; %d more since the last report): they are kept in memory and "
-                    "would not survive a restart; free some space", self._folder.path, error.strerror, more,
+                    "keyframes cannot be written to %s (%s; %d more since then): they are kept in memory "
+                    "and will be lost by a restart; free disk space", self._folder.path, error.strerror, more,
                 )  # fmt: skip
             return False
         return True
@@ -165,60 +179,60 @@ class Outbox:
     def _forget(self, key: int) -> None:
         entry = self._entries.pop(key, None)
         if entry is not None:
-            self.bytes -= entry.label.size
+            self.bytes -= entry.meta.size
             if entry.payload is None and self._folder is not None:
                 self._folder.remove(key)
 
-    def _make_room(self, keep: int | None) -> None:
-        """Throws away until the bounds hold; never the newest."""
-        while self.bytes > self._limit and (key := self._least_useful(keep, False)) is not None:
-            self._give_up(key)
+    def _enforce_limits(self, keep: int | None) -> None:
+        """Drop keyframes until the limits hold, but never the one called `keep`."""
+        while self.bytes > self._limit and (key := self._most_redundant(keep, False)) is not None:
+            self._drop(key)
         if self._folder is None:
             return
-        while self._in_memory() > _MEMORY_BYTES and (key := self._least_useful(keep, True)) is not None:
-            self._give_up(key)
+        while self._in_memory() > _MEMORY_BYTES and (key := self._most_redundant(keep, True)) is not None:
+            self._drop(key)
 
     def _in_memory(self) -> int:
-        return sum(e.label.size for e in self._entries.values() if e.payload is not None)
+        return sum(e.meta.size for e in self._entries.values() if e.payload is not None)
 
-    def _give_up(self, key: int) -> None:
+    def _drop(self, key: int) -> None:
         self._forget(key)
-        self.given_up += 1
-        if (more := self._complaints.due("room")) is not None:
+        self.dropped += 1
+        if (more := self._rate_limit.due("room")) is not None:
             log.warning(
-                "keyframe %d is thrown away, never acknowledged: the queue is full (%d more since the last)",
+                "keyframe %d is dropped without acknowledgement: the queue is full (%d more since then)",
                 key, more,
             )  # fmt: skip
 
-    def _least_useful(self, keep: int | None, memory_only: bool) -> int | None:
-        there = [e for e in self._entries.values() if e.payload is not None or not memory_only]
-        for entry in there:
-            if entry.label.drive != self.drive and entry.label.key != keep and self.drive:
-                return entry.label.key
-        keys = [e.label.key for e in there]
+    def _most_redundant(self, keep: int | None, memory_only: bool) -> int | None:
+        candidates = [e for e in self._entries.values() if e.payload is not None or not memory_only]
+        for entry in candidates:
+            if entry.meta.drive != self.drive and entry.meta.key != keep and self.drive:
+                return entry.meta.key
+        keys = [e.meta.key for e in candidates]
         if not keys or keys == [keep]:
             return None
-        views = np.array([e.label.view for e in there])
-        return keys[least_useful(views, keys.index(keep) if keep in keys else None)]
+        views = np.array([e.meta.view for e in candidates])
+        return keys[most_redundant(views, keys.index(keep) if keep in keys else None)]
 
 
-def least_useful(
+def most_redundant(
     views: np.ndarray,  # float64 [N, 6]
     keep: int | None,
 ) -> int:
-    """Index of the view that is nearest to another; of such a pair, the one with the nearer third.
+    """Return the index of the view nearest to another; of a pair, the one with the nearer third neighbour.
 
     Raises:
-        ValueError: there is none to choose.
+        ValueError: there is no view except `keep`.
     """
     count = len(views)
     if count == 0 or (count == 1 and keep == 0):
-        raise ValueError("no view may be thrown away")
+        raise ValueError("no view may be dropped")
     if count == 1:
         return 0
-    apart, _ = cKDTree(views).query(views, k=min(3, count))  # the first is itself
-    # A pair shares its distance (but for rounding): the third decides.
-    for index in np.lexsort((apart[:, -1], np.round(apart[:, 1], 9))):
+    distance, _ = cKDTree(views).query(views, k=min(3, count))  # the first is itself
+    # Both views of a pair have the same distance, except for rounding: the third neighbour decides.
+    for index in np.lexsort((distance[:, -1], np.round(distance[:, 1], 9))):
         if index != keep:
             return int(index)
-    raise AssertionError("unreachable: there are at least two")
+    raise AssertionError("unreachable: there are at least two views")

@@ -1,6 +1,6 @@
-"""What other services give the mapper, played over a drive for `bench map`: fused depth, masks of movers.
+"""Inputs that other services provide to the mapper, computed along a drive for `bench map`.
 
-No picture that is scored is seen.
+These are fused depth and masks of dynamic objects. Images that are scored are not used.
 """
 
 from __future__ import annotations
@@ -13,24 +13,30 @@ from beamsplat.services.depth.source import DepthInput, DepthSource, make_source
 from beamsplat.services.fusion.free_space import FreeSpaceGrid
 from beamsplat.services.fusion.fuse import Fusion
 from beamsplat.services.fusion.inputs import FusionInput
-from beamsplat.services.keyframes.bodies import body_mask
+from beamsplat.services.keyframes.dynamic_mask import dynamic_object_mask
 from beamsplat.tools.bench.mapping import HELD_OUT_AT, HELD_OUT_EVERY
-from beamsplat.tools.evaluation.dataset import Recording
+from beamsplat.tools.evaluation.dataset import TruthDataset
 
 
-class FieldPrior:
-    """Called with rising numbers of pictures; what lies between is looked at, as the service does."""
+class FusedDepthPrior:
+    """Depth from the fusion service as a prior.
+
+    Calls must have increasing image indices; images in between are passed to fusion as they are in the
+    service.
+    """
 
     def __init__(self, source: str = "stixel") -> None:
         self._source: DepthSource = make_source(source, {})
         self._fusion: Fusion | None = None
         self._next = 0
 
-    def __call__(self, recording: Recording, index: int) -> tuple[np.ndarray, np.ndarray] | None:
-        """(depth_m, sigma_m) float32 [H, W] of a picture; None where fusion refuses it."""
+    def __call__(self, recording: TruthDataset, index: int) -> tuple[np.ndarray, np.ndarray] | None:
+        """Return (depth_m, sigma_m) float32 [H, W] of an image; None if fusion rejects it."""
         T_camera_body = inverse(recording.T_body_camera)
         if self._fusion is None or index < self._next:
-            poses = np.array([shot.T_map_camera @ T_camera_body for shot in recording.shots])
+            poses = np.array(
+                [posed_image.T_map_camera @ T_camera_body for posed_image in recording.posed_images]
+            )
             upright = bool(np.all(poses[:, 2, 2] > np.cos(np.radians(2.0))))
             self._level = upright and float(np.ptp(poses[:, 2, 3])) < 0.03
             self._fusion = Fusion(
@@ -38,47 +44,60 @@ class FieldPrior:
             )
             self._next = 0
         for number in range(self._next, index + 1):
-            shot = recording.shots[number]
-            T_map_body = shot.T_map_camera @ T_camera_body
-            self._fusion.add_scan(transform_points(T_map_body, shot.beams.points_body_m))
+            posed_image = recording.posed_images[number]
+            T_map_body = posed_image.T_map_camera @ T_camera_body
+            self._fusion.add_scan(transform_points(T_map_body, posed_image.beams.points_body_m))
             if number < index and number % HELD_OUT_EVERY != HELD_OUT_AT:
                 self._fusion.look(recording.image(number), T_map_body)
         self._next = index + 1
         fused = self._fusion.fuse(self._frame(recording, index, T_map_body), keyframe=True)
         return (fused.depth_m, fused.sigma_m) if fused.ok else None
 
-    def _frame(self, recording: Recording, index: int, T_map_body: np.ndarray) -> FusionInput:
-        shot, rgb = recording.shots[index], recording.image(index)
+    def _frame(self, recording: TruthDataset, index: int, T_map_body: np.ndarray) -> FusionInput:
+        posed_image, rgb = recording.posed_images[index], recording.image(index)
         view = DepthInput(
-            shot.stamp_ns, rgb, recording.camera, recording.T_body_camera, shot.beams, self._level
+            posed_image.stamp_ns,
+            rgb,
+            recording.camera,
+            recording.T_body_camera,
+            posed_image.beams,
+            self._level,
         )
         estimate = self._source.estimate(view)
         usable = estimate.ok and estimate.kind != "none"
         return FusionInput(
-            shot.stamp_ns, rgb, T_map_body, shot.beams, estimate.values if usable else None, estimate.kind
+            posed_image.stamp_ns,
+            rgb,
+            T_map_body,
+            posed_image.beams,
+            estimate.values if usable else None,
+            estimate.kind,
         )
 
 
-class MoverMasks:
-    """Masks of what walks where beams have passed before. Called with rising numbers of pictures."""
+class DynamicObjectMasks:
+    """Masks of dynamic objects: they are where beams have passed through free space before.
+
+    Calls must have increasing image indices.
+    """
 
     def __init__(self) -> None:
         self._free, self._next = FreeSpaceGrid(), 0
 
-    def __call__(self, recording: Recording, index: int, depth_m: np.ndarray) -> np.ndarray | None:
-        """bool [H, W], False on movers; None where nothing moves. `depth_m` float32 [H, W] of the picture."""
+    def __call__(self, recording: TruthDataset, index: int, depth_m: np.ndarray) -> np.ndarray | None:
+        """Return bool [H, W], False on dynamic objects, or None without any; `depth_m` is float32 [H, W]."""
         T_camera_body = inverse(recording.T_body_camera)
         if index < self._next:
             self._free, self._next = FreeSpaceGrid(), 0
         for number in range(self._next, index + 1):
-            shot = recording.shots[number]
-            T_map_body = shot.T_map_camera @ T_camera_body
-            points = transform_points(T_map_body, shot.beams.points_body_m)
+            posed_image = recording.posed_images[number]
+            T_map_body = posed_image.T_map_camera @ T_camera_body
+            points = transform_points(T_map_body, posed_image.beams.points_body_m)
             moving = self._free.dynamic_returns(points)
-            still: Beams = shot.beams.take(~moving)
+            still: Beams = posed_image.beams.take(~moving)
             self._free.add(T_map_body[:3, 3], transform_points(T_map_body, still.points_body_m))
         self._next = index + 1
         if not moving.any():
             return None
-        body = shot.beams.points_body_m[moving]
-        return ~body_mask(body, depth_m, recording.camera, recording.T_body_camera)
+        body = posed_image.beams.points_body_m[moving]
+        return ~dynamic_object_mask(body, depth_m, recording.camera, recording.T_body_camera)

@@ -56,7 +56,7 @@ def test_none_answers_nothing_and_recorded_answers_what_is_in_the_folder(tmp_pat
     assert np.abs(source.estimate(_view()).values - truth).max() < 0.001
     assert "no recorded depth" in source.estimate(_view(stamp_ns=4_000_000_000)).status
     assert source.estimate(_view(stamp_ns=9_000_000_000)).values.shape == CAMERA.shape
-    with pytest.raises(UserError, match="no folder"):
+    with pytest.raises(UserError, match="is not a folder"):
         make_source("recorded", {"folder": tmp_path / "absent"})
 
 

@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from beamsplat.common.errors import UserError
-from beamsplat.services.keyframes.folder import BrokenFile, Folder, Label, _read_head
-from beamsplat.services.keyframes.outbox import Outbox, least_useful
+from beamsplat.services.keyframes.outbox import Outbox, most_redundant
+from beamsplat.services.keyframes.queue_folder import CorruptFile, QueueEntry, QueueFolder, _read_head
 
 S = 1_000_000_000
 
@@ -85,9 +85,9 @@ def test_beyond_the_bound_the_least_useful_goes_and_is_counted(folder):
     box = Outbox(45, S, 4, folder)  # six of 7 bytes
     for key, x in enumerate([0.0, 1.0, 2.0, 2.1, 3.0, 4.0]):
         put(box, key, x=x)
-    assert box.given_up == 0
+    assert box.dropped == 0
     put(box, 6, x=5.0)
-    assert (box.given_up, len(box)) == (1, 6)
+    assert (box.dropped, len(box)) == (1, 6)
     left = [key for key in range(7) if box.acknowledge(key, 0)]
     assert left in ([0, 1, 3, 4, 5, 6], [0, 1, 2, 4, 5, 6])  # one of the two views that are alike
 
@@ -96,7 +96,7 @@ def test_the_newest_is_never_thrown_away():
     box = Outbox(10, S, 4)
     for key in range(5):
         put(box, key, x=0.0)  # the robot stands still
-    assert (len(box), box.given_up) == (1, 4)
+    assert (len(box), box.dropped) == (1, 4)
     assert box.acknowledge(4, 0)
 
 
@@ -107,10 +107,10 @@ def test_the_queue_survives_a_restart(tmp_path):
         put(box, key)
     box.acknowledge(1, 0)
     again = Outbox(10_000, 5 * S, 4, tmp_path)
-    assert (len(again), again.earlier, again.bytes) == (0, 2, 14)
+    assert (len(again), again.of_earlier_drives, again.bytes) == (0, 2, 14)
     assert sent(again, 0) == []  # whose anchors they hang on is not known yet
     again.drive = "a"
-    assert (len(again), again.earlier) == (2, 0)
+    assert (len(again), again.of_earlier_drives) == (2, 0)
     assert sent(again, 7 * S) == [0]  # is there anybody?
     again.acknowledge(0, 8 * S)
     assert list(again.due(8 * S)) == [(2, b"frame 2")]
@@ -125,7 +125,7 @@ def test_keyframes_of_an_earlier_drive_stay_but_make_room_first(tmp_path):
     box.drive = "tuesday"
     for key in range(10, 15):
         put(box, key, x=0.0)
-    assert (len(box), box.earlier, box.given_up) == (5, 1, 2)
+    assert (len(box), box.of_earlier_drives, box.dropped) == (5, 1, 2)
     assert sent(box, 9 * S) == [10]  # not what hangs on another map
 
 
@@ -133,12 +133,12 @@ def test_a_drive_may_get_the_name_of_its_map_when_that_is_known():
     box = Outbox(10_000, S, 4)
     box.drive = "process 1"
     put(box, 0)
-    box.rename("process 1", "map")
+    box.rename_drive("process 1", "map")
     put(box, 1)
     box.drive = "process 2"
-    assert (len(box), box.earlier) == (0, 2)
-    box.rename("process 2", "map")  # localization was started again, in the same map
-    assert (len(box), box.earlier) == (2, 0)
+    assert (len(box), box.of_earlier_drives) == (0, 2)
+    box.rename_drive("process 2", "map")  # localization was started again, in the same map
+    assert (len(box), box.of_earlier_drives) == (2, 0)
 
 
 def test_broken_files_are_counted_and_the_rest_goes_on(tmp_path, caplog):
@@ -153,9 +153,9 @@ def test_broken_files_are_counted_and_the_rest_goes_on(tmp_path, caplog):
     files[2].write_bytes(data)
     (tmp_path / ".00000000000000000009.keyframe.77").write_bytes(b"half")  # left by a crash
     again = Outbox(10_000, S, 4, tmp_path)
-    assert (len(again), again.broken) == (3, 2)
-    assert sent(again, 9 * S) == []  # frame 2 is tried, and is broken
-    assert (len(again), again.broken) == (2, 3)
+    assert (len(again), again.corrupt) == (3, 2)
+    assert sent(again, 9 * S) == []  # frame 2 is tried, and is corrupt
+    assert (len(again), again.corrupt) == (2, 3)
     assert list(again.due(99 * S)) == [(3, b"\x03" * 100)]
     assert sorted(tmp_path.iterdir()) == files[3:]
     assert "checksum" in caplog.text
@@ -166,7 +166,7 @@ def test_a_file_that_vanishes_is_counted(tmp_path):
     put(box, 1)
     next(tmp_path.iterdir()).unlink()
     assert sent(box, 9 * S) == []
-    assert (len(box), box.broken) == (0, 1)
+    assert (len(box), box.corrupt) == (0, 1)
 
 
 def test_a_full_disk_is_said_and_counted_and_keyframes_go_on_in_memory(tmp_path, monkeypatch, caplog):
@@ -185,8 +185,8 @@ def test_a_full_disk_is_said_and_counted_and_keyframes_go_on_in_memory(tmp_path,
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
         signal.signal(signal.SIGXFSZ, ignored)
-    assert (len(box), box.unstored) == (3, 2)
-    assert caplog.text.count("takes no keyframes") == 1  # said at a bounded rate
+    assert (len(box), box.not_on_disk) == (3, 2)
+    assert caplog.text.count("keyframes cannot be written") == 1  # said at a bounded rate
     put(box, 4)  # there is room again
     box.acknowledge(4, 0)
     assert list(box.due(0)) == [(1, b"frame 1"), (2, b"x" * 5000), (3, b"y" * 5000)]
@@ -207,18 +207,18 @@ def test_any_bytes_are_a_label_or_broken(data):
     for candidate in (data, b"BSK1" + data, b"BSK1" + len(data).to_bytes(4, "little") + data):
         try:
             label, start = _read_head(candidate)
-        except BrokenFile:
+        except CorruptFile:
             continue
-        assert isinstance(label, Label)
+        assert isinstance(label, QueueEntry)
         assert 8 <= start <= len(candidate)
 
 
 def test_folder_names_sort_as_time_does(tmp_path):
-    folder = Folder(tmp_path)
+    folder = QueueFolder(tmp_path)
     keys = [10**18, 5, 10**18 + 1, 99]
     for key in keys:
-        folder.write(Label(key, "", (0.0,) * 6, 1), b"x")
-    assert [label.key for label in folder.labels()] == sorted(keys)
+        folder.write(QueueEntry(key, "", (0.0,) * 6, 1), b"x")
+    assert [label.key for label in folder.entries()] == sorted(keys)
     if os.getuid() != 0:
         tmp_path.chmod(0o500)
         folder.remove(5)  # says so, and goes on
@@ -230,12 +230,12 @@ def test_the_least_useful_view_is_one_of_the_nearest_pair(seed):
     views = rng.normal(size=(30, 6))
     apart = np.linalg.norm(views[:, None] - views[None], axis=2) + np.eye(30) * 1e9
     pair = set(np.unravel_index(np.argmin(apart), apart.shape))
-    chosen = least_useful(views, None)
+    chosen = most_redundant(views, None)
     assert chosen in pair
     (other,) = pair - {chosen}
     assert np.sort(apart[chosen])[1] <= np.sort(apart[other])[1]
-    assert least_useful(views, chosen) == other
-    assert least_useful(views[:2], 0) == 1
-    assert least_useful(views[:1], None) == 0
+    assert most_redundant(views, chosen) == other
+    assert most_redundant(views[:2], 0) == 1
+    assert most_redundant(views[:1], None) == 0
     with pytest.raises(ValueError, match="no view"):
-        least_useful(views[:1], 0)
+        most_redundant(views[:1], 0)

@@ -41,7 +41,7 @@ def test_little_overlap_decides_where_motion_does_not():
     _, reasons = keys(
         [pose(), pose(yaw_rad=0.2), pose(yaw_rad=0.5)], angle_rad=3.0, distance_m=9.0, least_overlap=0.7
     )
-    assert reasons == ["first picture", "too near to the last keyframe", "little overlap"]
+    assert reasons == ["first image", "too close to the last keyframe", "little overlap"]
 
 
 def test_waits_for_a_sharp_picture_but_not_for_ever():

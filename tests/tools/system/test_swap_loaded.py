@@ -139,7 +139,7 @@ def test_the_mapper_is_taken_over_twenty_times_and_its_session_goes_along(tmp_pa
     before = {m.id for m in sent.messages if m.stamp_ns <= last.stamp_ns}
     assert last.keyframes == len(before), "a keyframe was lost on the way"
     assert {m.id for m in sent.messages[:upto]} <= set(acks.ids())
-    assert "thrown away" not in keyframes
+    assert "dropped" not in keyframes
 
 
 @pytest.mark.slow

@@ -6,7 +6,7 @@ import pytest
 from beamsplat.common.geometry.camera import Pinhole
 from beamsplat.common.geometry.frames import camera_mount
 from beamsplat.common.geometry.transforms import inverse, transform_points
-from beamsplat.services.keyframes.bodies import body_mask
+from beamsplat.services.keyframes.dynamic_mask import dynamic_object_mask
 
 CAMERA = Pinhole(530.0, 530.0, 319.5, 239.5, 640, 480)
 T_BODY_CAMERA = camera_mount(0.1, 0.0, 0.45)
@@ -32,7 +32,7 @@ def test_the_whole_body_is_masked_and_little_else(distance_m, side_m, noticed):
     depth = np.full((480, 640), 6.0, np.float32)
     if noticed:
         depth[body] = distance_m - 0.1
-    mask = body_mask(ankles, depth, CAMERA, T_BODY_CAMERA)
+    mask = dynamic_object_mask(ankles, depth, CAMERA, T_BODY_CAMERA)
     assert mask[body].mean() > (0.98 if noticed else 0.6)
     assert (mask & ~body).sum() < (0.5 if noticed else 0.6) * body.sum() + 4000
     assert mask[:, :5].sum() == 0
@@ -42,19 +42,21 @@ def test_what_stands_before_the_walker_is_not_masked():
     ankles, body = walker(3.0)
     depth = np.full((480, 640), 6.0, np.float32)
     depth[300:, :] = 1.2  # a table in front
-    mask = body_mask(ankles, depth, CAMERA, T_BODY_CAMERA)
+    mask = dynamic_object_mask(ankles, depth, CAMERA, T_BODY_CAMERA)
     assert mask[310:, :].sum() == 0
     assert mask[100:280][body[100:280]].mean() > 0.5
 
 
 def test_without_movers_nothing_is_masked():
-    assert not body_mask(np.zeros((0, 3)), np.ones((480, 640), np.float32), CAMERA, T_BODY_CAMERA).any()
+    assert not dynamic_object_mask(
+        np.zeros((0, 3)), np.ones((480, 640), np.float32), CAMERA, T_BODY_CAMERA
+    ).any()
 
 
 def test_a_return_alone_masks_nothing():
     """Edges and noise give single returns in free space; two ankles give several side by side."""
     depth = np.full((480, 640), 6.0, np.float32)
     alone = np.array([[2.0, -0.8, 0.18], [2.5, 0.9, 0.18], [3.0, 0.0, 0.18]])
-    assert not body_mask(alone, depth, CAMERA, T_BODY_CAMERA).any()
+    assert not dynamic_object_mask(alone, depth, CAMERA, T_BODY_CAMERA).any()
     together = alone[:1] + np.array([[0.0, 0.0, 0.0], [0.02, 0.05, 0.0], [0.0, 0.2, 0.0]])
-    assert body_mask(together, depth, CAMERA, T_BODY_CAMERA).any()
+    assert dynamic_object_mask(together, depth, CAMERA, T_BODY_CAMERA).any()

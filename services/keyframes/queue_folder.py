@@ -1,0 +1,139 @@
+"""Files of the keyframe outbox, one per keyframe; they survive a crash and a power cut.
+
+    "BSK1" | uint32 head length | head (msgpack map: key, drive, view, size, hash) | payload
+
+The hash (xxh64) is over the payload; a truncated or damaged head cannot be unpacked. Files are written
+atomically, so that only a failing disk produces corrupt ones. These are logged, counted and removed.
+"""
+
+from __future__ import annotations
+
+import logging
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import msgpack
+import numpy as np
+import xxhash
+
+from beamsplat.common.files.persist import make_folder, write_atomically
+
+log = logging.getLogger("beamsplat.keyframes")
+
+_MAGIC = b"BSK1"
+_LENGTH = struct.Struct("<I")
+_MAX_HEAD = 65536  # bytes
+_SUFFIX = ".keyframe"
+
+
+class CorruptFile(ValueError):
+    """A file with other content than was written."""
+
+
+@dataclass(frozen=True)
+class QueueEntry:
+    """Metadata of a keyframe in the outbox."""
+
+    key: int
+    drive: str  # to whose anchors it belongs
+    view: tuple[float, ...]  # position and viewing direction, see `beamsplat.services.keyframes.outbox`
+    size: int  # bytes of the payload
+
+
+class QueueFolder:
+    """Folder with one file per key. Corrupt files are removed; `corrupt` counts them."""
+
+    def __init__(self, path: Path) -> None:
+        """Create the folder if missing. Raises UserError if it cannot be created."""
+        self.path = make_folder(path.expanduser())
+        self.corrupt = 0
+
+    def entries(self) -> Iterator[QueueEntry]:
+        """Yield the metadata of all keyframes, oldest first; remove files that a crash left incomplete."""
+        for leftover in self.path.glob(f".*{_SUFFIX}.*"):
+            leftover.unlink(missing_ok=True)
+        for file in sorted(self.path.glob(f"*{_SUFFIX}")):
+            try:
+                with file.open("rb") as opened:
+                    entry, start = _read_head(opened.read(_MAX_HEAD))
+                    whole = start + entry.size == file.stat().st_size
+                if not whole or file != self._file(entry.key):
+                    raise CorruptFile("is truncated, or has the name of another key")
+            except (OSError, CorruptFile) as error:
+                self._discard(file, error)
+            else:
+                yield entry
+
+    def write(self, entry: QueueEntry, payload: bytes) -> None:
+        """Write a keyframe atomically. Raises OSError if the disk is full or not writable."""
+        head = msgpack.packb({
+            "key": entry.key, "drive": entry.drive, "view": list(entry.view), "size": len(payload),
+            "hash": xxhash.xxh64_digest(payload),
+        })  # fmt: skip
+        write_atomically(self._file(entry.key), _MAGIC + _LENGTH.pack(len(head)) + head + payload)
+
+    def read(self, key: int) -> bytes | None:
+        """Return the payload; None if the file is corrupt or missing, which is logged and counted."""
+        file = self._file(key)
+        try:
+            data = file.read_bytes()
+            entry, start = _read_head(data)
+            payload = data[start:]
+            if len(payload) != entry.size or xxhash.xxh64_digest(payload) != _hash_of(data):
+                raise CorruptFile("does not match its checksum")
+        except (OSError, CorruptFile) as error:
+            self._discard(file, error)
+            return None
+        return payload
+
+    def remove(self, key: int) -> None:
+        """Remove a file; one that cannot be removed is read again after a restart."""
+        try:
+            self._file(key).unlink(missing_ok=True)
+        except OSError as error:
+            log.warning("%s cannot be removed: %s", self._file(key), error.strerror)
+
+    def _file(self, key: int) -> Path:
+        return self.path / f"{key:020d}{_SUFFIX}"
+
+    def _discard(self, file: Path, error: Exception) -> None:
+        self.corrupt += 1
+        log.warning("%s is unusable and is removed: %s", file, error)
+        try:
+            file.unlink(missing_ok=True)
+        except OSError as other:
+            log.warning("%s cannot be removed either: %s", file, other.strerror)
+
+
+def _head_of(data: bytes) -> tuple[dict, int]:
+    if data[:4] != _MAGIC or len(data) < 8:
+        raise CorruptFile("is not a keyframe file")
+    (length,) = _LENGTH.unpack_from(data, 4)
+    if length > _MAX_HEAD - 8 or 8 + length > len(data):
+        raise CorruptFile("is truncated")
+    try:
+        head = msgpack.unpackb(data[8 : 8 + length])
+    except (ValueError, msgpack.UnpackException) as error:
+        raise CorruptFile(f"its head cannot be unpacked: {error}") from error
+    if not isinstance(head, dict):
+        raise CorruptFile("its head is not a map")
+    return head, 8 + length
+
+
+def _hash_of(data: bytes) -> bytes:
+    return _head_of(data)[0]["hash"]
+
+
+def _read_head(data: bytes) -> tuple[QueueEntry, int]:
+    head, start = _head_of(data)
+    try:
+        view = tuple(float(value) for value in head["view"])
+        entry = QueueEntry(int(head["key"]), str(head["drive"]), view, int(head["size"]))
+        usable = entry.key >= 0 and np.isfinite(view).all() and isinstance(head["hash"], bytes)
+    except (KeyError, TypeError, ValueError) as error:
+        raise CorruptFile(f"its head lacks {error}") from error
+    if not usable:
+        raise CorruptFile("its head has invalid values")
+    return entry, start
