@@ -1,10 +1,18 @@
-"""Waiting for a system to get somewhere."""
+"""Waiting for a condition with a time limit."""
 
 import time
 
 
+def wait_until(condition, timeout_s=5.0):
+    """Poll until `condition()` is true; fail after `timeout_s`."""
+    deadline = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < deadline, f"not within {timeout_s} s"
+        time.sleep(0.01)
+
+
 def poll(supervisor, until, timeout_s):
-    """Supervises until `until()` holds; fails after `timeout_s`."""
+    """Run the supervisor until `until()` is true; fail after `timeout_s`."""
     deadline = time.monotonic() + timeout_s
     while time.monotonic() < deadline:
         supervisor.poll()
@@ -14,10 +22,10 @@ def poll(supervisor, until, timeout_s):
     raise AssertionError(f"not within {timeout_s} s")
 
 
-def publish_until_received(publication, message, heard, times=3, timeout_s=5.0):
-    """Publishes until `heard` holds so many messages."""
+def publish_until_received(publication, message, received, times=3, timeout_s=5.0):
+    """Publish `message` repeatedly until the list `received` has at least `times` entries."""
     deadline = time.monotonic() + timeout_s
-    while len(heard) < times and time.monotonic() < deadline:
+    while len(received) < times and time.monotonic() < deadline:
         publication.put(message)
         time.sleep(0.05)
-    assert len(heard) >= times
+    assert len(received) >= times

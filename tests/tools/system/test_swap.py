@@ -13,10 +13,7 @@ import pytest
 
 from beamsplat.common.config.deployment import Deployment, RouterConfig
 from beamsplat.common.errors import UserError
-from beamsplat.common.messages import Grid, Odometry
-from beamsplat.common.messages.header import Header
-from beamsplat.common.runtime.handover import Handover
-from beamsplat.common.runtime.mailbox import NO_PRODUCER, Envelope, Mailbox
+from beamsplat.common.messages import Odometry
 from beamsplat.common.runtime.node import Node
 from beamsplat.common.runtime.registry import Service
 from beamsplat.common.zenoh.bus import open_session
@@ -24,7 +21,7 @@ from beamsplat.common.zenoh.queries import ask, command
 from beamsplat.tools.system.commands import Commands
 from beamsplat.tools.system.health_table import HealthBoard
 from beamsplat.tools.system.supervisor import Supervisor
-from tests.common.nodes import TABLE, Sink, SlowConfig
+from tests.common.nodes import TABLE, SlowConfig
 from tests.common.topic_listener import TopicListener
 
 
@@ -178,73 +175,3 @@ def test_a_restart_by_request_still_works(system):
     system.wait(lambda: len(ears.messages) > 5)
     assert "starts again" in system.ask("localization", "restart")
     system.wait(lambda: system.supervisor.children["localization"].restarts == 1)
-
-
-def grid(stamp_ns):
-    return Grid(
-        stamp_ns=stamp_ns, resolution_m=1.0, origin_m=np.zeros(2), occupancy=np.zeros((1, 1), np.int8)
-    )
-
-
-def test_a_successor_goes_on_where_its_predecessor_ended():
-    old, new = Handover(standby=False), Handover(standby=True)
-    said = [s for s in range(5) if not old.holds_back("a", grid(s))]
-    assert [new.holds_back("a", grid(s)) for s in range(2, 8)] == [True] * 6
-    assert (old.reached(), new.reached()) == ('{"a": 4}', '{"a": 7}')
-    after = old.retire()
-    assert old.holds_back("a", grid(9))  # what it would still say goes nowhere
-    went_on = [m.stamp_ns for _, m in new.activate(after)]
-    assert said + went_on == list(range(8))
-    assert not new.holds_back("a", grid(8))
-    with pytest.raises(ValueError):
-        list(Handover(standby=True).activate("not JSON"))
-
-
-def test_a_successor_that_lags_does_not_repeat_what_was_said():
-    new = Handover(standby=True)
-    new.holds_back("a", grid(1))
-    assert [m.stamp_ns for _, m in new.activate('{"said": {"a": 5}}')] == []
-    assert [s for s in range(2, 9) if not new.holds_back("a", grid(s))] == [6, 7, 8]
-    assert not new.holds_back("b", grid(2))
-    assert Handover(standby=False).retire() == '{"said": {}}'
-    assert new.retire() == '{"said": {"a": 8, "b": 2}}'
-    for wrong in ("[]", '{"said": 3}', '{"said": {"a": "b"}}'):
-        with pytest.raises(ValueError):
-            list(Handover(standby=True).activate(wrong))
-
-
-def test_what_standby_has_no_room_for_is_counted_unless_the_predecessor_said_it():
-    new = Handover(standby=True)
-    for stamp in range(20):
-        new.holds_back("a", grid(stamp))
-    assert [m.stamp_ns for _, m in new.activate('{"said": {"a": 1}}')] == list(range(4, 20))
-    assert new.lost == 2  # 2 and 3
-
-
-def envelope(sequence, instance="a" * 16):
-    header = Header(sequence, 0, 0, sequence, 1, "localization", instance)
-    return Envelope("localization/odometry", header, pose(sequence))
-
-
-def pose(stamp_ns):
-    return Odometry(stamp_ns=stamp_ns, T_odom_body=np.eye(4), covariance=np.eye(3))
-
-
-def test_who_hands_over_what_it_knows_tells_what_it_has_handled():
-    mailbox = Mailbox(Sink)
-    for sequence in (0, 1, 2, 5):
-        mailbox.put(envelope(sequence))
-    for name in ("localization/correction", "localization/grid"):
-        mailbox.end(name, NO_PRODUCER, 0)
-    assert mailbox.pop().header.sequence == 0
-    old, new = Handover(standby=False), Handover(standby=True)
-    list(new.activate(old.retire(mailbox.handled())))
-    assert [s for s in range(8) if not new.was_handled(envelope(s))] == [1, 2, 5, 6, 7]
-    assert not new.was_handled(envelope(0, "b" * 16))
-
-
-def test_what_the_predecessor_never_spoke_of_is_said():
-    new = Handover(standby=True)
-    new.holds_back("b", grid(3))
-    assert [m.stamp_ns for _, m in new.activate(Handover(standby=False).retire())] == [3]
-    assert Sink.replaceable is False
