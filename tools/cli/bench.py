@@ -10,6 +10,8 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from beamsplat.tools.cli.options import writable
+
 app = typer.Typer(no_args_is_help=True, help="Measure this machine; every figure has a baseline beside it.")
 console = Console(stderr=True)
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object")]
@@ -17,9 +19,9 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object"
 
 @app.command()
 def bus(
-    seconds: Annotated[float, typer.Option(help="Length of each part")] = 10.0,
-    megabytes: Annotated[float, typer.Option(help="Size of a picture")] = 1.0,
-    port: Annotated[int, typer.Option(help="Port of the router this starts")] = 17447,
+    seconds: Annotated[float, typer.Option(min=1.0, max=3600.0, help="Length of each part")] = 10.0,
+    megabytes: Annotated[float, typer.Option(min=0.001, max=30.0, help="Size of a picture")] = 1.0,
+    port: Annotated[int, typer.Option(min=1, max=65535, help="Port of the router this starts")] = 17447,
     as_json: JsonOption = False,
 ) -> None:
     """Latency of pictures through the local router beside plain Zenoh; what a slow subscriber costs.
@@ -43,7 +45,9 @@ def slam(
     data: Annotated[
         Path, typer.Option(help="Folder with X.bag beside X.relations, bag/ beside groundtruth.txt")
     ],
-    out: Annotated[Path, typer.Option(help="Folder for maps, trajectories and the deck of pictures")],
+    out: Annotated[
+        Path, typer.Option(callback=writable, help="Folder for maps, trajectories and the deck of pictures")
+    ],
     no_odometry: Annotated[bool, typer.Option("--no-odometry", help="Use the scans alone")] = False,
     readme: Annotated[Path | None, typer.Option(help="Put the table between its marks in this file")] = None,
     pictures: Annotated[Path | None, typer.Option(help="Where the deck of maps goes")] = None,
@@ -57,28 +61,28 @@ def slam(
 
         beamsplat bench slam --data logs --out out/slam --readme README.md --pictures docs/slam_maps.jpg
     """
-    from beamsplat.tools.bench.readme import into_readme
-    from beamsplat.tools.bench.slam import bench_slam, deck, markdown
+    from beamsplat.tools.bench.readme import replace_readme_table
+    from beamsplat.tools.bench.slam import bench_slam, markdown, write_map_overview
 
     rows = bench_slam(data, out, not no_odometry, lambda text: console.print(text, highlight=False))
     table = markdown(rows)
     print(json.dumps(rows) if as_json else table)
     if readme is not None:
-        into_readme(readme, "slam", table)
-    deck(out, [row["name"] for row in rows], pictures or out / "maps.jpg")
+        replace_readme_table(readme, "slam", table)
+    write_map_overview(out, [row["name"] for row in rows], pictures or out / "maps.jpg")
 
 
 @app.command()
 def paper(
     data: Annotated[Path, typer.Option(help="Folder with bag/ and its truth, or a bag with poses in it")],
-    out: Annotated[Path, typer.Option(help="Folder for report.json and report.html")],
+    out: Annotated[Path, typer.Option(callback=writable, help="Folder for report.json and report.html")],
     seeds: Annotated[int, typer.Option(min=1, help="Runs of each configuration")] = 1,
     only: Annotated[list[str] | None, typer.Option(help="Only this configuration; repeatable")] = None,
     recorded: Annotated[
         Path | None, typer.Option(help="Depth maps by stamp, in the place of weights that are missing")
     ] = None,
     groundtruth: Annotated[Path | None, typer.Option(help="TUM file of the true body poses")] = None,
-    seconds: Annotated[float | None, typer.Option(help="Only so much of the recording")] = None,
+    seconds: Annotated[float | None, typer.Option(min=0.1, help="Only so much of the recording")] = None,
     refine_steps: Annotated[
         int, typer.Option(min=0, help="Steps on the default configuration's map after the drive, 0.1 s each")
     ] = 500,
@@ -96,15 +100,15 @@ def paper(
         beamsplat bench paper --data drive --out out/paper --only default --only monogs-lidar --seeds 3
     """
     from beamsplat.tools.bench.paper import bench_paper
-    from beamsplat.tools.bench.readme import into_readme, paper_table
+    from beamsplat.tools.bench.readme import paper_table, replace_readme_table
 
     report = bench_paper(
         data, out, names=only, seeds=seeds, recorded=recorded, groundtruth=groundtruth, seconds=seconds,
         refine_steps=refine_steps,
-        say=lambda text: console.print(text, markup=False, highlight=False, soft_wrap=True),
+        log=lambda text: console.print(text, markup=False, highlight=False, soft_wrap=True),
     )  # fmt: skip
     if readme is not None:
-        into_readme(readme, "paper", paper_table(report["configurations"]))
+        replace_readme_table(readme, "paper", paper_table(report["configurations"]))
     if as_json:
         print(json.dumps(report))
         return

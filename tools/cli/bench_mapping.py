@@ -10,6 +10,8 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from beamsplat.tools.cli.options import writable
+
 console = Console(stderr=True)
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object")]
 
@@ -57,7 +59,7 @@ def bench_map(
     refine_exposure: Annotated[
         bool, typer.Option("--refine-exposure", help="The mapper refines each picture's brightness")
     ] = False,
-    seed: Annotated[int, typer.Option(help="Seed of the mapper")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the mapper")] = 0,
     jump: Annotated[
         bool, typer.Option("--jump", help="Misplace half of the keyframes by 1 m and 10 deg until the end")
     ] = False,
@@ -68,7 +70,8 @@ def bench_map(
         bool, typer.Option("--movers", help="Mask people and carts that the beams show")
     ] = False,
     out: Annotated[
-        Path | None, typer.Option(help="Write pictures and the map (.ply) into this folder")
+        Path | None,
+        typer.Option(callback=writable, help="Write pictures and the map (.ply) into this folder"),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -83,17 +86,17 @@ def bench_map(
     import cv2
 
     from beamsplat.services.mapping.settings import MapperSettings
-    from beamsplat.tools.bench.fused_prior import FieldPrior, MoverMasks
-    from beamsplat.tools.bench.mapping import MapBench, run_bench
+    from beamsplat.tools.bench.fused_prior import DynamicObjectMasks, FusedDepthPrior
+    from beamsplat.tools.bench.mapping import MapBenchSettings, run_bench
 
     cv2.setNumThreads(1)
-    bench = MapBench(
+    bench = MapBenchSettings(
         prior=prior, threads=threads, seed=seed, refine_s=refine_s, count_cpu=count_cpu, jump=jump,
         settle_steps=settle_steps, distance_m=distance_m, angle_rad=angle_rad,
         settings=MapperSettings(refine_pose=refine_pose, refine_exposure=refine_exposure),
     )  # fmt: skip
-    field = FieldPrior(source) if prior == "field" else None
-    result = run_bench(data, bench, console.print, out, field, MoverMasks() if movers else None)
+    field = FusedDepthPrior(source) if prior == "field" else None
+    result = run_bench(data, bench, console.print, out, field, DynamicObjectMasks() if movers else None)
     if as_json:
         print(json.dumps(result))
         return

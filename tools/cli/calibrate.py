@@ -59,19 +59,21 @@ def clock(
     data: Annotated[Path, typer.Argument(help="A drive.")],
     poses: PosesOption = None,
     rig: RigOption = None,
-    shift_ms: Annotated[float, typer.Option(help="Plant this offset first: does it find it?")] = 0.0,
+    shift_ms: Annotated[
+        float, typer.Option(min=-1000.0, max=1000.0, help="Plant this offset first: does it find it?")
+    ] = 0.0,
     as_json: JsonOption = False,
 ) -> None:
     """What to add to the camera's stamps so that they fit the lidar's clock.
 
     Example: beamsplat calibrate time drive --poses out/trajectory.tum
     """
-    from beamsplat.tools.evaluation.calibrate import calibrate_motion, motion_report, with_clock
+    from beamsplat.tools.evaluation.calibrate import calibrate_motion, motion_report, with_clock_offset
     from beamsplat.tools.evaluation.drive import open_drive
 
     drive = open_drive(data, poses, rig)
     if shift_ms:
-        drive = with_clock(drive, round(shift_ms * 1e6))
+        drive = with_clock_offset(drive, round(shift_ms * 1e6))
     _show(motion_report(drive, calibrate_motion(drive, ("clock_s",))), as_json)
 
 

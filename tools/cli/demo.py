@@ -18,9 +18,10 @@ from beamsplat.common.errors import UserError
 from beamsplat.common.files.persist import make_folder, write_atomically
 from beamsplat.common.files.resources import shipped_file
 from beamsplat.tools.cli.memory_option import MemoryOption, memory_overrides
+from beamsplat.tools.cli.options import writable
 
 if TYPE_CHECKING:
-    from beamsplat.tools.report.observer import Costs, Seen
+    from beamsplat.tools.report.observer import RunCosts, RunRecord
     from beamsplat.tools.system.supervisor import Supervisor
 
 DEPLOYMENT = shipped_file("demo.toml")
@@ -40,10 +41,14 @@ POSE_FIGURES = frozenset({
 
 
 def demo(
-    out: Annotated[Path, typer.Option(help="Folder for everything the demo makes")] = Path("out/demo"),
+    out: Annotated[Path, typer.Option(callback=writable, help="Folder for everything the demo makes")] = Path(
+        "out/demo"
+    ),
     data: Annotated[Path | None, typer.Option(help="Your own bag, recording or folder")] = None,
-    seconds: Annotated[float, typer.Option(help="Length of the simulated drive")] = 30.0,
-    rate: Annotated[float, typer.Option(help="Times real time")] = 1.0,
+    seconds: Annotated[float, typer.Option(min=1.0, max=3600.0, help="Length of the simulated drive")] = 30.0,
+    rate: Annotated[
+        float, typer.Option(min=0.0, max=100.0, help="Times real time; 0 = as fast as possible")
+    ] = 1.0,
     view: Annotated[str, typer.Option(help="none, spawn (a window) or serve (a web viewer)")] = "none",
     set_: Annotated[
         list[str] | None, typer.Option("--set", metavar="NODE.OPTION=VALUE", help="Override an option")
@@ -59,7 +64,7 @@ def demo(
         beamsplat demo --data drive/bag --view spawn
     """
     from beamsplat.tools.cli.system import run_checked
-    from beamsplat.tools.report.observer import Observer
+    from beamsplat.tools.report.observer import RunObserver
 
     source = data if data is not None else _simulated(out, seconds)
     make_folder(out)
@@ -79,10 +84,10 @@ def demo(
         *(set_ or ()),
     )
     deployment = load_deployment(DEPLOYMENT, overrides)
-    seen_by: list[Observer] = []
+    seen_by: list[RunObserver] = []
 
-    def beside(supervisor: Supervisor) -> Observer:
-        seen_by.append(Observer(supervisor, deployment, _truth_stamps(source)))
+    def beside(supervisor: Supervisor) -> RunObserver:
+        seen_by.append(RunObserver(supervisor, deployment, _truth_stamps(source)))
         return seen_by[0]
 
     busy_s, began = _busy_s(), time.monotonic()
@@ -90,7 +95,7 @@ def demo(
     costs = seen_by[0].costs
     others_s = _busy_s() - busy_s - costs.startup_cpu_s - sum(costs.cpu_s.values())
     console.print("the drive has ended; writing the report")
-    figures = write_results(out, source, seen_by[0].seen, costs)
+    figures = write_results(out, source, seen_by[0].record, costs)
     _say_where(out, source, figures)
     cores = others_s / (time.monotonic() - began)
     if cores > _CORES_OF_OTHERS:
@@ -117,16 +122,16 @@ def _simulated(out: Path, seconds: float) -> Path:
 
 
 def _truth_stamps(source: Path) -> frozenset[int]:
-    from beamsplat.tools.evaluation.evaluate import read_truth
+    from beamsplat.tools.evaluation.evaluate import truth_depth_files
     from beamsplat.tools.report.map_scores import truth_folder
 
     try:
-        return frozenset(read_truth(truth_folder(source)))
+        return frozenset(truth_depth_files(truth_folder(source)))
     except UserError:
         return frozenset()
 
 
-def write_results(out: Path, source: Path, seen: Seen, costs: Costs) -> dict[str, Any]:
+def write_results(out: Path, source: Path, record: RunRecord, costs: RunCosts) -> dict[str, Any]:
     """trajectory.tum, and where there were pictures: map.png, report.html, report.json. Gives the figures.
 
     Errors are against the recording's own truth (groundtruth.txt beside the bag, or poses in it); without
@@ -137,29 +142,29 @@ def write_results(out: Path, source: Path, seen: Seen, costs: Costs) -> dict[str
 
     from beamsplat.common.geometry.trajectory import Trajectory, write_tum
 
-    poses = [(stamp_ns, T) for stamp_ns, T, status, _ in seen.poses if status == "ok"]
+    poses = [(stamp_ns, T) for stamp_ns, T, status, _ in record.poses if status == "ok"]
     if not poses:
         return {}
     stamps_ns, T_map_body = np.array([s for s, _ in poses]), np.array([T for _, T in poses])
     order = np.argsort(stamps_ns, kind="stable")
     trajectory = Trajectory(stamps_ns[order], T_map_body[order])
     write_tum(out / "trajectory.tum", trajectory, "T_map_body as it was said live")
-    if not seen.images:
+    if not record.images:
         return {}
-    from beamsplat.tools.bench.paper import one_row_report, open_truth, score
+    from beamsplat.tools.bench.paper import open_truth, score_run, single_run_report
     from beamsplat.tools.evaluation.drive import has_poses
     from beamsplat.tools.report.html import write_report
 
     known = has_poses(source)
     truth = open_truth(source, None if known else out / "trajectory.tum")
-    row = score(seen, costs, truth)
+    row = score_run(record, costs, truth)
     if not known:
         row = {name: value for name, value in row.items() if name not in POSE_FIGURES}
-    if row["pictures"]["above"] is not None:
-        cv2.imwrite(str(out / "map.png"), row["pictures"]["above"])
-    report = one_row_report("demo", "lidar + fused depth", source, truth, row)
+    if row["plots"]["above"] is not None:
+        cv2.imwrite(str(out / "map.png"), row["plots"]["above"])
+    report = single_run_report("demo", "lidar + fused depth", source, truth, row)
     write_report(out / "report.html", report, truth, paper=False)
-    figures = {name: value for name, value in row.items() if name != "pictures"}
+    figures = {name: value for name, value in row.items() if name != "plots"}
     write_atomically(out / "report.json", json.dumps(figures, indent=1).encode())
     return figures
 

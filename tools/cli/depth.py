@@ -12,9 +12,11 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from beamsplat.common.errors import UserError
+from beamsplat.common.files.persist import make_folder
+from beamsplat.tools.cli.options import writable
 
 if TYPE_CHECKING:
-    from beamsplat.tools.evaluation.drive import Drive
+    from beamsplat.tools.evaluation.drive import RecordedDrive
 
 # OpenCV, Numba and onnxruntime are imported where they are used: every other command starts without them.
 
@@ -57,14 +59,15 @@ def eval_depth(
     import cv2
 
     from beamsplat.services.depth.source import make_source
-    from beamsplat.tools.evaluation.evaluate import evaluate, read_truth
+    from beamsplat.tools.evaluation.evaluate import evaluate, truth_depth_files
 
     cv2.setNumThreads(1)  # CPU times are those of one core
     drive = _open(bag, poses, rig)
     with _progress() as bar:
         task = bar.add_task("", total=None)
         report = evaluate(
-            drive, make_source(source, options_of(set_)), read_truth(truth), heldout=heldout, floor=floor,
+            drive, make_source(source, options_of(set_)), truth_depth_files(truth), heldout=heldout,
+            floor=floor,
             progress=lambda run, done, total: bar.update(
                 task, description=run, completed=done, total=total
             ),
@@ -78,7 +81,7 @@ def eval_depth(
 
 def depth(
     data: Annotated[Path, typer.Argument(help="A bag, recording or folder; or one picture (.jpg, .png).")],
-    out: Annotated[Path, typer.Option(help="Folder for the pictures.")],
+    out: Annotated[Path, typer.Option(callback=writable, help="Folder for the pictures.")],
     poses: PosesOption = None,
     source: SourceOption = "stixel",
     set_: SetOption = None,
@@ -96,18 +99,20 @@ def depth(
         beamsplat depth photo.jpg --out pictures --rig rig.toml
     """
     from beamsplat.services.depth.source import make_source
-    from beamsplat.tools.evaluation.pictures import draw_drive, draw_image
+    from beamsplat.tools.evaluation.depth_panels import draw_depth_of_image, draw_depth_panels
 
     chosen = make_source(source, options_of(set_))
-    out.mkdir(parents=True, exist_ok=True)
+    make_folder(out)
     if data.is_file() and data.suffix.lower() in (".jpg", ".jpeg", ".png"):
-        print(draw_image(data, chosen, rig, out))
+        print(draw_depth_of_image(data, chosen, rig, out))
         return
     drive = _open(data, poses, rig)
     with _progress() as bar:
         task = bar.add_task("pictures", total=None)
         count = 0
-        for count, (_, total) in enumerate(draw_drive(drive, chosen, truth, every, out, floor), start=1):
+        for count, (_, total) in enumerate(
+            draw_depth_panels(drive, chosen, truth, every, out, floor), start=1
+        ):
             bar.update(task, completed=count, total=total)
     print(f"{count} pictures in {out}")
 
@@ -151,7 +156,7 @@ def options_of(pairs: list[str] | None) -> dict[str, Any]:
     return options
 
 
-def _open(bag: Path, poses: Path | None, rig: Path | None) -> Drive:
+def _open(bag: Path, poses: Path | None, rig: Path | None) -> RecordedDrive:
     from beamsplat.tools.evaluation.drive import open_drive
 
     return open_drive(bag, poses, rig)

@@ -217,9 +217,9 @@ def _uplink(deployment: Deployment) -> Iterator[Finding]:
 
 
 def _devices(deployment: Deployment) -> Iterator[Finding]:
-    from beamsplat.tools.setup.device_access import examine_devices, wanted_devices
+    from beamsplat.tools.setup.device_access import diagnose_devices, wanted_devices
 
-    for remark in examine_devices(wanted_devices(deployment.nodes)):
+    for remark in diagnose_devices(wanted_devices(deployment.nodes)):
         yield Finding(*remark)
 
 
@@ -250,9 +250,9 @@ def doctor(
     """
     deployment = load_deployment(file) if file else Deployment()
     if security:
-        from beamsplat.tools.keys.link_diagnosis import examine_security
+        from beamsplat.tools.keys.link_diagnosis import diagnose_security
 
-        findings = [Finding(*remark) for remark in examine_security(deployment)]
+        findings = [Finding(*remark) for remark in diagnose_security(deployment)]
     else:
         findings = examine(deployment)
     table = Table(pad_edge=False)

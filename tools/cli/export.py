@@ -10,6 +10,8 @@ import typer
 from rich.console import Console
 
 from beamsplat.common.errors import UserError, reason
+from beamsplat.common.files.persist import make_folder
+from beamsplat.tools.cli.options import writable
 
 console = Console(stderr=True)
 FORMATS = {
@@ -36,15 +38,22 @@ def export(
     to: Annotated[str, typer.Option(help=f"One of {', '.join(FORMATS)}")],
     out: Annotated[
         Path | None,
-        typer.Option(help="File (nav2: folder); default: named after the format, in the session, or here"),
+        typer.Option(
+            callback=writable,
+            help="File (nav2: folder); default: named after the format, in the session, or here",
+        ),
     ] = None,
     detail_m: Annotated[
         float, typer.Option(min=0.0, help="ply, gltf, spz: Gaussians in a cell of that edge become one")
     ] = 0.0,
     cell_m: Annotated[float, typer.Option(min=0.002, help="points: between points")] = 0.02,
     voxel_m: Annotated[float, typer.Option(min=0.005, help="mesh: finest detail")] = 0.04,
-    low_m: Annotated[float, typer.Option(help="nav2: what stands higher than this is in the way")] = 0.10,
-    high_m: Annotated[float, typer.Option(help="nav2: what hangs higher than this is not")] = 1.50,
+    low_m: Annotated[
+        float, typer.Option(min=-10.0, max=10.0, help="nav2: what stands higher than this is in the way")
+    ] = 0.10,
+    high_m: Annotated[
+        float, typer.Option(min=-10.0, max=100.0, help="nav2: what hangs higher than this is not")
+    ] = 1.50,
     threads: ThreadsOption = 2,
 ) -> None:
     """Writes a map for other programs; at any time, also while it is being made.
@@ -73,7 +82,7 @@ def export(
     arrays, lidar = _open(session)
     store = store_of(arrays)
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(path.parent)
         if to in ("ply", "gltf", "spz"):
             text = _gaussians(path, to, store, arrays, detail_m, threads)
         elif to == "points":
@@ -261,7 +270,7 @@ def _nav2(
 def render(
     session: SessionArgument,
     path: Annotated[str, typer.Option(help="orbit, drive, or a TUM file of body poses in the map")],
-    out: Annotated[Path, typer.Option(help="NAME.mp4, or NAME.png for pictures")],
+    out: Annotated[Path, typer.Option(callback=writable, help="NAME.mp4, or NAME.png for pictures")],
     seconds: Annotated[float, typer.Option(min=0.1, help="How long the video is")] = 10.0,
     fps: Annotated[float, typer.Option(min=1.0, help="Pictures a second")] = 30.0,
     width: Annotated[int, typer.Option(min=0, help="Pixels; 0: as the keyframes")] = 0,

@@ -12,6 +12,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from beamsplat.common.errors import UserError
+from beamsplat.tools.cli.options import writable
 
 if TYPE_CHECKING:
     from beamsplat.services.replay.inspection import Report
@@ -52,7 +53,7 @@ def rig(
     source: Annotated[
         str, typer.Argument(help="A bag, recording or folder; or a camera: index, /dev/videoN, URL.")
     ],
-    out: Annotated[Path, typer.Option(help="Where to write.")] = Path("rig.toml"),
+    out: Annotated[Path, typer.Option(callback=writable, help="Where to write.")] = Path("rig.toml"),
     fov_deg: Annotated[
         float,
         typer.Option(help="Camera only: horizontal field of view from its data sheet.", min=10, max=170),

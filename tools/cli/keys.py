@@ -1,4 +1,4 @@
-"""`beamsplat keys`: certificates for the hosts of a fleet, and what each may do."""
+"""`beamsplat keys`: certificates of the hosts of a fleet, and their access rights."""
 
 from __future__ import annotations
 
@@ -18,32 +18,35 @@ NameArgument = Annotated[str, typer.Argument(help="Name of the host: lower case,
 
 @app.command()
 def init(authority: FolderOption = DEFAULT) -> None:
-    """Makes the authority that all hosts trust, once. Keep its folder to yourself.
+    """Create the certificate authority that all hosts trust. Do this once, and keep its folder secret.
 
     Example: beamsplat keys init
     """
-    from beamsplat.tools.keys.pki import Authority
+    from beamsplat.tools.keys.pki import CertificateAuthority
 
-    made = Authority.create(authority)
-    print(f"{made.folder}: an authority. Next: beamsplat keys issue edge --role edge --address edge.local")
+    made = CertificateAuthority.create(authority)
+    print(
+        f"{made.folder}: authority created. Next: beamsplat keys issue edge --role edge --address edge.local"
+    )
 
 
 @app.command()
 def issue(
     name: NameArgument,
     role: Annotated[
-        str, typer.Option(help="robot, edge, monitor (reads) or operator (also changes)")
+        str, typer.Option(help="robot, edge, monitor (reads) or operator (reads and changes)")
     ] = "robot",
     robot: Annotated[
-        str | None, typer.Option(help="Whose topics; default: a robot's own name, else all (*)")
+        str | None,
+        typer.Option(help="Robot whose topics the host may use; default: a robot's own name, else all (*)"),
     ] = None,
     address: Annotated[
-        list[str] | None, typer.Option(help="Name or IP address by which others reach it; repeatable")
+        list[str] | None, typer.Option(help="Host name or IP address of the host; may be repeated")
     ] = None,
-    days: Annotated[int, typer.Option(min=1, max=825, help="Valid for so long")] = 90,
+    days: Annotated[int, typer.Option(min=1, max=825, help="Validity in days")] = 90,
     authority: FolderOption = DEFAULT,
 ) -> None:
-    """Makes a host's key and certificate, or new ones before the old expire, and says where to copy them.
+    """Create or renew the key and certificate of a host, and print which folder to copy to it.
 
     Examples:
 
@@ -52,41 +55,43 @@ def issue(
         beamsplat keys issue robot1
     """
     from beamsplat.common.security.access_control import HostRole
-    from beamsplat.tools.keys.pki import Authority, expiry
+    from beamsplat.tools.keys.pki import CertificateAuthority, expiry
 
     if not (name.isascii() and name.replace("-", "a").replace("_", "a").isalnum() and name == name.lower()):
-        raise UserError(f"{name!r}: a host's name has lower case letters, digits, - and _ only")
+        raise UserError(f"{name!r}: the name of a host may have lower case letters, digits, - and _ only")
     whose = robot or (name if role == "robot" else "*")
     host = parse(HostRole, {"role": role, "robot": whose}, f"host {name!r}")
-    folder = Authority(authority).issue(name, host, tuple(address or ()), days)
-    print(f"{folder}: copy it to {name} as the folder that `security.keys` names; valid until "
+    folder = CertificateAuthority(authority).issue(name, host, tuple(address or ()), days)
+    print(f"{folder}: copy it to {name}, to the folder in `security.keys`; valid until "
           f"{expiry(folder / 'host.pem')}")  # fmt: skip
 
 
 @app.command()
 def remove(name: NameArgument, authority: FolderOption = DEFAULT) -> None:
-    """Takes a host out of the policy: a running edge router on this machine notices within a second.
+    """Remove a host from the policy. A running edge router on this machine applies it within a second.
 
     Example: beamsplat keys remove robot1
     """
-    from beamsplat.tools.keys.pki import Authority
+    from beamsplat.tools.keys.pki import CertificateAuthority
 
-    found = Authority(authority)
+    found = CertificateAuthority(authority)
     found.remove(name)
     edges = ", ".join(str(folder / "hosts.toml") for folder in found.edges()) or "no edge yet"
-    print(f"{name} is removed. The policy of the edges is renewed ({edges}): copy it to edges elsewhere")
+    print(
+        f"{name} was removed. The policy of the edges was written ({edges}): copy it to edges on other machines"
+    )
 
 
 @app.command(name="list")
 def list_hosts(authority: FolderOption = DEFAULT) -> None:
-    """Every host, its role and when its certificate ends.
+    """List every host, its role and the expiry of its certificate.
 
     Example: beamsplat keys list
     """
-    from beamsplat.tools.keys.pki import Authority, expiry
+    from beamsplat.tools.keys.pki import CertificateAuthority, expiry
 
-    found = Authority(authority)
+    found = CertificateAuthority(authority)
     for name, host in found.hosts().items():
         certificate = found.folder / "hosts" / name / "host.pem"
-        until = expiry(certificate) if certificate.exists() else "its files are gone"
+        until = expiry(certificate) if certificate.exists() else "files are missing"
         print(f"{name:<20} {host.role:<9} robot {host.robot:<12} {until}")

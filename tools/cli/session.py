@@ -103,7 +103,9 @@ def join(
 def merge(
     first: Annotated[Path, typer.Argument(help="Session whose map frame stays")],
     second: Annotated[Path, typer.Argument(help="Session of another drive through the same place")],
-    out: Annotated[Path, typer.Option(callback=writable, help="Folder for the merged session; must not hold one")],
+    out: Annotated[
+        Path, typer.Option(callback=writable, help="Folder for the merged session; must not hold one")
+    ],
     place: Annotated[
         str,
         typer.Option(

@@ -1,4 +1,4 @@
-"""`beamsplat setup`: from what is plugged in to a deployment that runs."""
+"""`beamsplat setup`: find the connected sensors, calibrate them, write a deployment."""
 
 from __future__ import annotations
 
@@ -9,39 +9,39 @@ import typer
 from rich.console import Console
 
 from beamsplat.common.errors import UserError
+from beamsplat.tools.cli.options import writable
 
 if TYPE_CHECKING:
     import numpy as np
 
     from beamsplat.common.geometry.rig import CameraSection
     from beamsplat.common.messages import Image
-    from beamsplat.tools.setup.board_calibration import Boards
-    from beamsplat.tools.setup.discovery import Found
-    from beamsplat.tools.setup.files import Place
-    from beamsplat.tools.setup.lens import Lens, LensCalibration
-    from beamsplat.tools.setup.pattern import Board
+    from beamsplat.tools.setup.board_calibration import LidarBoardCalibration
+    from beamsplat.tools.setup.chessboard import Chessboard
+    from beamsplat.tools.setup.discovery import FoundSensor
+    from beamsplat.tools.setup.files import MeasuredMount
+    from beamsplat.tools.setup.intrinsics import CameraIntrinsics, IntrinsicsCalibration
 
 console = Console(soft_wrap=True, highlight=False)
-_LOOK_S = 180.0  # for views of the board
+_VIEWS_TIMEOUT_S = 180.0  # to collect views of the board
 _COLUMNS = 64
 
 
 def setup(
-    out: Annotated[Path, typer.Option(help="Deployment to write")] = Path("robot.toml"),
-    rig: Annotated[Path, typer.Option(help="Calibration to write, or to keep if it is there")] = Path(
-        "rig.toml"
-    ),
+    out: Annotated[Path, typer.Option(callback=writable, help="Deployment to write")] = Path("robot.toml"),
+    rig: Annotated[Path, typer.Option(help="Rig file to write, or to keep if it exists")] = Path("rig.toml"),
     camera: Annotated[
-        list[str] | None, typer.Option(help="Camera to try besides /dev/video*: rtsp:// or http:// address")
+        list[str] | None,
+        typer.Option(help="Camera to try in addition to /dev/video*: rtsp:// or http:// address"),
     ] = None,
     device: Annotated[
         list[str] | None,
-        typer.Option(help="Where else a lidar may be: /dev/ttyAMA0, tcp/192.168.0.10:10940"),
+        typer.Option(help="Lidar device to try in addition: /dev/ttyAMA0, tcp/192.168.0.10:10940"),
     ] = None,
     robot: Annotated[str, typer.Option(help="Name of the robot")] = "robot1",
     overwrite: Annotated[bool, typer.Option(help="Replace an existing deployment")] = False,
 ) -> None:
-    """Finds camera and lidar, shows what they see, calibrates them, writes robot.toml and rig.toml.
+    """Find camera and lidar, show their data, calibrate them, write robot.toml and rig.toml.
 
     Examples:
 
@@ -53,24 +53,24 @@ def setup(
     from beamsplat.tools.setup.files import robot_text
 
     if out.exists() and not overwrite:
-        raise UserError(f"{out}: exists already; choose another name with --out, or say --overwrite")
+        raise UserError(f"{out} exists already: choose another name with --out, or use --overwrite")
     found_camera, found_lidar = _find_camera(camera or []), _find_lidar(device or [])
     if found_lidar is None:
         raise UserError(
-            "no lidar answers: nothing to localize with. `beamsplat doctor` says what is plugged in"
+            "no lidar answers, but localization needs one. `beamsplat doctor` lists the connected devices"
         )
-    upside_down = typer.confirm("Is the lidar mounted head down?", default=False)
+    upside_down = typer.confirm("Is the lidar mounted upside down?", default=False)
     lidar_options = {**found_lidar.options, **({"upside_down": True} if upside_down else {})}
-    if rig.exists() and typer.confirm(f"{rig} is there already: keep it?", default=True):
-        _check_kept(rig, found_camera)
+    if rig.exists() and typer.confirm(f"{rig} exists already: keep it?", default=True):
+        _check_existing_rig(rig, found_camera)
     else:
-        write_atomically(rig, _calibrated(found_camera, lidar_options, out.parent).encode())
+        write_atomically(rig, _ask_calibration(found_camera, lidar_options, out.parent).encode())
         console.print(f"[green]written:[/] {rig}")
     camera_options = found_camera.options if found_camera is not None else None
     write_atomically(out, robot_text(robot, str(rig), camera_options, lidar_options).encode())
     console.print(f"[green]written:[/] {out}")
     _verify(out)
-    console.print(f"Next: beamsplat run {out}, and open http://127.0.0.1:8420")
+    console.print(f"Next: run `beamsplat run {out}`, and open http://127.0.0.1:8420")
 
 
 def _verify(out: Path) -> None:
@@ -83,38 +83,38 @@ def _verify(out: Path) -> None:
     console.print(f"{out} fits together (`beamsplat check {out}`)")
 
 
-# --- what is there ---
+# --- sensors ---
 
 
-def _say(text: str) -> None:
+def _print(text: str) -> None:
     console.print(text, markup=False)
 
 
-def _find_camera(more: list[str]) -> Found | None:
-    from beamsplat.tools.setup.discovery import answers_of, camera_places, find_camera
+def _find_camera(more: list[str]) -> FoundSensor | None:
+    from beamsplat.tools.setup.discovery import camera_devices, find_camera, probe_all
 
     console.rule("Camera", align="left")
-    answers = answers_of((*more, *camera_places()), find_camera, _say)
+    answers = probe_all((*more, *camera_devices()), find_camera, _print)
     chosen = _choose("camera", answers, [str(a.options["source"]) for a in answers])
     if chosen is None:
-        console.print("No camera: the robot will be localized by its lidar alone, and no map is painted.")
+        console.print("No camera: the robot localizes with its lidar only, and no 3D map is made.")
         return None
-    _show_picture(chosen.first)
+    _show_image(chosen.first)
     return chosen
 
 
-def _find_lidar(more: list[str]) -> Found | None:
-    from beamsplat.tools.setup.discovery import answers_of, find_lidar, lidar_places
+def _find_lidar(more: list[str]) -> FoundSensor | None:
+    from beamsplat.tools.setup.discovery import find_lidar, lidar_devices, probe_all
 
     console.rule("Lidar", align="left")
-    answers = answers_of((*more, *lidar_places()), find_lidar, _say)
+    answers = probe_all((*more, *lidar_devices()), find_lidar, _print)
     chosen = _choose("lidar", answers, [f"{a.options['kind']} at {a.options['device']}" for a in answers])
     if chosen is not None:
         _show_scan(chosen.first)
     return chosen
 
 
-def _choose(what: str, answers: list[Found], names: list[str]) -> Found | None:
+def _choose(what: str, answers: list[FoundSensor], names: list[str]) -> FoundSensor | None:
     if len(answers) < 2:
         return answers[0] if answers else None
     for number, name in enumerate(names, start=1):
@@ -123,10 +123,10 @@ def _choose(what: str, answers: list[Found], names: list[str]) -> Found | None:
     return answers[number - 1]
 
 
-def _show_picture(image: Image) -> None:
-    from beamsplat.tools.setup.terminal import picture_text
+def _show_image(image: Image) -> None:
+    from beamsplat.tools.setup.terminal import image_text
 
-    console.print(picture_text(_decoded(image)[..., ::-1], min(_COLUMNS, console.width)), soft_wrap=False)
+    console.print(image_text(_decoded(image)[..., ::-1], min(_COLUMNS, console.width)), soft_wrap=False)
     console.print(f"{image.width_px}x{image.height_px} pixels")
 
 
@@ -139,7 +139,7 @@ def _show_scan(scan: Any) -> None:
     seen = np.isfinite(scan.ranges_m)
     points = (scan.ranges_m * np.stack([np.cos(angle), np.sin(angle)]))[:, seen].T
     console.print(scan_text(points, min(_COLUMNS, console.width - 1)), soft_wrap=False)
-    console.print(f"{seen.sum()} of {len(seen)} beams; what is ahead of the robot should be up here")
+    console.print(f"{seen.sum()} of {len(seen)} beams; objects in front of the robot should be at the top")
 
 
 def _decoded(image: Image) -> np.ndarray:
@@ -157,8 +157,12 @@ def _grey(image: Image) -> np.ndarray:
 # --- calibration ---
 
 
-def _check_kept(rig: Path, camera: Found | None) -> None:
-    """A kept calibration must be this camera's."""
+def _check_existing_rig(rig: Path, camera: FoundSensor | None) -> None:
+    """Check that a kept rig file belongs to this camera.
+
+    Raises:
+        UserError: it has no camera, or another image size.
+    """
     from beamsplat.common.geometry.rig import load_rig
 
     loaded = load_rig(rig)
@@ -166,50 +170,54 @@ def _check_kept(rig: Path, camera: Found | None) -> None:
         return
     size_px = camera.first.width_px, camera.first.height_px
     if loaded.camera is None:
-        raise UserError(f"{rig}: has no [camera], but there is one: do not keep it")
+        raise UserError(f"{rig}: [camera] is missing, but a camera was found: do not keep the file")
     if (loaded.camera.width_px, loaded.camera.height_px) != size_px:
         raise UserError(
-            f"{rig}: K is for {loaded.camera.width_px}x{loaded.camera.height_px} pixels, the camera gives "
-            f"{size_px[0]}x{size_px[1]}: do not keep it"
+            f"{rig}: K is for {loaded.camera.width_px}x{loaded.camera.height_px} pixels, the camera delivers "
+            f"{size_px[0]}x{size_px[1]}: do not keep the file"
         )
 
 
-def _calibrated(camera: Found | None, lidar: dict[str, Any], folder: Path) -> str:
-    """Text of rig.toml, asked for step by step."""
-    from beamsplat.tools.setup.files import Place, camera_file, rig_text
+def _ask_calibration(camera: FoundSensor | None, lidar: dict[str, Any], folder: Path) -> str:
+    """Ask for all parts of the calibration; return the text of rig.toml."""
+    from beamsplat.tools.setup.files import MeasuredMount, camera_section, rig_text
 
-    console.rule("Where they sit", align="left")
-    console.print("From the point on the floor between the wheels, in metres and degrees.")
+    console.rule("Mounts", align="left")
+    console.print("Measured from the point on the floor between the wheels, in metres and degrees.")
     if camera is None:
-        return rig_text(None, _ask_place("lidar", Place(0.0, 0.0, 0.18), turns=True).lidar(), (), "")
-    T_body_camera = _ask_place("camera", Place(0.10, 0.0, 0.30), turns=False).camera()
-    T_body_lidar = _ask_place("lidar", Place(0.0, 0.0, 0.18), turns=True).lidar()
-    console.rule("How the camera sees", align="left")
-    seen = _look_at_board(camera, folder)
+        return rig_text(
+            None, _ask_mount("lidar", MeasuredMount(0.0, 0.0, 0.18), turns=True).T_body_lidar(), (), ""
+        )
+    T_body_camera = _ask_mount("camera", MeasuredMount(0.10, 0.0, 0.30), turns=False).T_body_camera()
+    T_body_lidar = _ask_mount("lidar", MeasuredMount(0.0, 0.0, 0.18), turns=True).T_body_lidar()
+    console.rule("Camera intrinsics", align="left")
+    seen = _calibrate_with_chessboard(camera, folder)
     if seen is None:
-        file, note = _by_field_of_view(camera, T_body_camera)
+        file, note = _intrinsics_from_field_of_view(camera, T_body_camera)
         return rig_text(file, T_body_lidar, (note,), f"MEASURE with a chessboard: {note}.")
     lens, board = seen
-    file = camera_file(lens, T_body_camera)
+    file = camera_section(lens, T_body_camera)
     note = f"With a chessboard: reprojection error {lens.rms_px:.3f} px over {lens.views} views."
-    return rig_text(file, _against_camera(camera, lidar, file, board, T_body_lidar), (), note)
+    return rig_text(file, _calibrate_lidar_extrinsics(camera, lidar, file, board, T_body_lidar), (), note)
 
 
-def _ask_place(what: str, usual: Place, *, turns: bool) -> Place:
-    from beamsplat.tools.setup.files import Place
+def _ask_mount(what: str, default: MeasuredMount, *, turns: bool) -> MeasuredMount:
+    from beamsplat.tools.setup.files import MeasuredMount
 
     def ask(word: str, default: float) -> float:
         return typer.prompt(f"{what}: {word}", default=default, type=float)
 
-    forward, left = ask("forward (m)", usual.forward_m), ask("left (m)", usual.left_m)
-    up = ask("up (m)", usual.up_m)
+    forward, left = ask("forward (m)", default.forward_m), ask("left (m)", default.left_m)
+    up = ask("up (m)", default.up_m)
     if turns:
-        return Place(forward, left, up, left_deg=ask("turned to the left (degrees)", 0.0))
-    return Place(forward, left, up, down_deg=ask("looks down by (degrees)", 0.0))
+        return MeasuredMount(forward, left, up, left_deg=ask("turned to the left (degrees)", 0.0))
+    return MeasuredMount(forward, left, up, down_deg=ask("looks down by (degrees)", 0.0))
 
 
-def _by_field_of_view(camera: Found, T_body_camera: np.ndarray) -> tuple[CameraSection, str]:
-    """[camera] of the rig, and one sentence on where it comes from."""
+def _intrinsics_from_field_of_view(
+    camera: FoundSensor, T_body_camera: np.ndarray
+) -> tuple[CameraSection, str]:
+    """Return the section [camera] of the rig, and one sentence on where it comes from."""
     from beamsplat.common.geometry.rig import CameraSection, Mount
     from beamsplat.services.replay.rig_draft import pinhole
 
@@ -219,16 +227,20 @@ def _by_field_of_view(camera: Found, T_body_camera: np.ndarray) -> tuple[CameraS
     return CameraSection(**pinhole(*size_px, fov_deg), mount=Mount.of(T_body_camera)), note
 
 
-def _look_at_board(camera: Found, folder: Path) -> tuple[Lens, Board] | None:
-    """The lens by a printed chessboard, and the board; None where that is not wanted."""
-    from beamsplat.tools.setup.pattern import BOARD, board_pdf
+def _calibrate_with_chessboard(
+    camera: FoundSensor, folder: Path
+) -> tuple[CameraIntrinsics, Chessboard] | None:
+    """Return the intrinsics from a printed chessboard, and the board; None if the user declines."""
+    from beamsplat.tools.setup.chessboard import DEFAULT_CHESSBOARD, chessboard_pdf
 
-    while typer.confirm("Calibrate with a printed chessboard? (else: by its field of view)", default=True):
+    while typer.confirm(
+        "Calibrate with a printed chessboard? (otherwise: by its field of view)", default=True
+    ):
         path = folder / "chessboard.pdf"
-        path.write_bytes(board_pdf())
-        console.print(f"[green]written:[/] {path}: print it at 100 %, glue it on something flat.")
-        board = BOARD._replace(square_m=_ask_square_m(BOARD.square_m))
-        _wait_for_enter("Hold it before the camera: near, far, tilted, in all corners")
+        path.write_bytes(chessboard_pdf())
+        console.print(f"[green]written:[/] {path}: print it at 100 %, glue it on a flat plate.")
+        board = DEFAULT_CHESSBOARD._replace(square_m=_ask_square_m(DEFAULT_CHESSBOARD.square_m))
+        _wait_for_enter("Hold it in front of the camera: near, far, tilted, in all corners of the image")
         views = _take_views(camera.options, board)
         try:
             lens = views.solve()
@@ -239,27 +251,28 @@ def _look_at_board(camera: Found, folder: Path) -> tuple[Lens, Board] | None:
             f"reprojection error {lens.rms_px:.2f} px over {lens.views} views; "
             f"fx {lens.K[0, 0]:.1f}, fy {lens.K[1, 1]:.1f} px, +- {lens.focal_sigma_px:.1f}"
         )
-        if lens.good:
+        if lens.is_good:
             return lens, board
-        console.print("[yellow]That is not good enough:[/] keep the board flat, tilt it, fill the picture.")
+        console.print(
+            "[yellow]The result is not accurate enough:[/] keep the board flat, tilt it, fill the image."
+        )
     return None
 
 
-def _take_views(camera: dict[str, Any], board: Board) -> LensCalibration:
+def _take_views(camera: dict[str, Any], board: Chessboard) -> IntrinsicsCalibration:
     import time
 
     from beamsplat.common.messages import Image
-    from beamsplat.tools.setup.discovery import messages
-    from beamsplat.tools.setup.lens import VIEWS, LensCalibration
+    from beamsplat.tools.setup.intrinsics import VIEWS, IntrinsicsCalibration
 
-    views = LensCalibration(board)
-    deadline = time.monotonic() + _LOOK_S
-    with messages("camera", camera, Image) as stream:
+    views = IntrinsicsCalibration(board)
+    deadline = time.monotonic() + _VIEWS_TIMEOUT_S
+    with sensor_messages("camera", camera, Image) as stream:
         for image, _ in stream:
             if image is not None and views.add(_grey(image)) == "taken":
                 missing = views.missing()
                 console.print(
-                    f"view {len(views.views)} of {VIEWS}{f'; not yet: {missing}' if missing else ''}"
+                    f"view {len(views.views)} of {VIEWS}{f'; missing: {missing}' if missing else ''}"
                 )
             if len(views.views) >= VIEWS or time.monotonic() > deadline:
                 return views
@@ -274,38 +287,46 @@ def _wait_for_enter(text: str) -> None:
     typer.prompt(f"{text}. Enter", default="", show_default=False)
 
 
-def _against_camera(
-    camera: Found, lidar: dict[str, Any], lens: CameraSection, board: Board, T_body_lidar: np.ndarray
+def _calibrate_lidar_extrinsics(
+    camera: FoundSensor,
+    lidar: dict[str, Any],
+    lens: CameraSection,
+    board: Chessboard,
+    T_body_lidar: np.ndarray,
 ) -> np.ndarray:
-    """`T_body_lidar` as beams on the board tell it, or as it was measured."""
-    from beamsplat.tools.setup.board_calibration import N_BOARDS, Boards
+    """Return `T_body_lidar` calibrated with boards, or as measured if the user declines."""
+    from beamsplat.tools.setup.board_calibration import N_BOARDS, LidarBoardCalibration
 
     console.rule("Lidar against camera", align="left")
     console.print(
-        "The beams must cross the chessboard: at 0.5 to 1.5 m, turned to the left and to the right."
+        "The lidar's beams must cross the chessboard: at 0.5 to 1.5 m, turned to the left and to the right."
     )
-    while typer.confirm(f"Do that now, {N_BOARDS} times? (else: as measured)", default=True):
-        boards = Boards(lens.model(), board)
+    while typer.confirm(f"Do that now, {N_BOARDS} times? (otherwise: as measured)", default=True):
+        boards = LidarBoardCalibration(lens.model(), board)
         _take_pairs(camera.options, lidar, boards, N_BOARDS)
         try:
             found = boards.solve(T_body_lidar)
         except ValueError as error:
             console.print(f"[yellow]{error}[/]")
             continue
-        console.print(found.sentence)
-        if found.good:
+        console.print(found.summary)
+        if found.is_good:
             return found.T_body_lidar
-        console.print("[yellow]That is not good enough.[/]")
-    console.print("The lidar stays as measured; `beamsplat calibrate extrinsics` finds it from a drive, too.")
+        console.print("[yellow]The result is not accurate enough.[/]")
+    console.print(
+        "The lidar's mount stays as measured; `beamsplat calibrate extrinsics` can estimate it from a recording."
+    )
     return T_body_lidar
 
 
-def _take_pairs(camera: dict[str, Any], lidar: dict[str, Any], boards: Boards, wanted: int) -> None:
+def _take_pairs(
+    camera: dict[str, Any], lidar: dict[str, Any], boards: LidarBoardCalibration, wanted: int
+) -> None:
     from beamsplat.common.messages import Image, Scan
-    from beamsplat.tools.setup.discovery import Watched
+    from beamsplat.tools.setup.discovery import SensorStream
 
-    with Watched("camera", camera, Image) as pictures, Watched("lidar", lidar, Scan) as scans:
+    with SensorStream("camera", camera, Image) as images, SensorStream("lidar", lidar, Scan) as scans:
         while boards.count < wanted:
             _wait_for_enter(f"board {boards.count + 1} of {wanted}: hold it still")
-            before, scan, after = _grey(pictures.next()), scans.next(), _grey(pictures.next())
+            before, scan, after = _grey(images.next()), scans.next(), _grey(images.next())
             console.print(boards.add(before, scan, after))

@@ -21,6 +21,8 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+from beamsplat.tools.cli.options import writable
+
 console = Console(stderr=True)
 
 
@@ -47,7 +49,7 @@ def _size(text: str) -> tuple[int, int]:
 
 
 def simulate(
-    out: Annotated[Path, typer.Option(help="Folder to write; it must not exist yet.")],
+    out: Annotated[Path, typer.Option(callback=writable, help="Folder to write; it must not exist yet.")],
     seconds: Annotated[
         float | None, typer.Option(min=1.0, help="Length of the recording; default: one lap, about 80 s.")
     ] = None,
@@ -70,14 +72,22 @@ def simulate(
     lidar_only: Annotated[
         bool, typer.Option("--lidar-only", help="No camera: fast, for long drives.")
     ] = False,
-    clock_offset_ms: Annotated[float, typer.Option(help="Fault: added to the stamps of the images.")] = 0.0,
+    clock_offset_ms: Annotated[
+        float, typer.Option(min=-10_000.0, max=10_000.0, help="Fault: added to the stamps of the images.")
+    ] = 0.0,
     extrinsic_yaw_deg: Annotated[
-        float, typer.Option(help="Fault: the camera in tf is rotated to the left of the true one.")
+        float,
+        typer.Option(
+            min=-180.0, max=180.0, help="Fault: the camera in tf is rotated to the left of the true one."
+        ),
     ] = 0.0,
     extrinsic_pitch_deg: Annotated[
-        float, typer.Option(help="Fault: the camera in tf points lower than the true one.")
+        float,
+        typer.Option(min=-90.0, max=90.0, help="Fault: the camera in tf points lower than the true one."),
     ] = 0.0,
-    extrinsic_roll_deg: Annotated[float, typer.Option(help="Fault: the camera in tf is rolled.")] = 0.0,
+    extrinsic_roll_deg: Annotated[
+        float, typer.Option(min=-180.0, max=180.0, help="Fault: the camera in tf is rolled.")
+    ] = 0.0,
     extrinsic_xyz_m: Annotated[
         str, typer.Option(help="Fault: the camera in tf is displaced by x,y,z.")
     ] = "0,0,0",

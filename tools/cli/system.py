@@ -18,6 +18,7 @@ from rich.live import Live as Screen
 from beamsplat.common.config.deployment import Deployment, load_deployment
 from beamsplat.common.errors import UserError
 from beamsplat.tools.cli.memory_option import MemoryOption, memory_overrides
+from beamsplat.tools.cli.options import writable
 
 if TYPE_CHECKING:
     from beamsplat.tools.system.health_table import HealthBoard
@@ -203,7 +204,7 @@ def router_config(file: FileArgument, set_: SetOption = None) -> None:
 
 def offline(
     file: FileArgument,
-    out: Annotated[Path, typer.Option(help="Folder for messages.mcap and summary.json")],
+    out: Annotated[Path, typer.Option(callback=writable, help="Folder for messages.mcap and summary.json")],
     data: Annotated[Path | None, typer.Option(help="Bag, recording or folder for the replay node")] = None,
     set_: SetOption = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the summary as one JSON object")] = False,
@@ -231,7 +232,7 @@ def offline(
 
 def record(
     file: FileArgument,
-    out: Annotated[Path, typer.Option(help="Folder of the recording to write")],
+    out: Annotated[Path, typer.Option(callback=writable, help="Folder of the recording to write")],
     set_: SetOption = None,
 ) -> None:
     """Records the topics of a running deployment to MCAP, until Ctrl-C or the end of the data.
@@ -273,7 +274,7 @@ def _watch(
                 screen.update(draw())
 
 
-SecondsOption = Annotated[float | None, typer.Option(help="Stop after this long; default: Ctrl-C")]
+SecondsOption = Annotated[float | None, typer.Option(min=0.0, help="Stop after this long; default: Ctrl-C")]
 
 
 def top(
