@@ -1,4 +1,4 @@
-"""The fusion service: beams, floor, past pictures and a guess become metric depth with an error bar."""
+"""The fusion service: metric depth with its standard deviation, from beams, floor, images and an estimate."""
 
 from __future__ import annotations
 
@@ -36,32 +36,32 @@ from beamsplat.services.fusion.single_image import SingleImageFusion
 
 log = logging.getLogger("beamsplat.fusion")
 
-_PICTURES = 8  # kept until their estimate comes
-_CHECK_AFTER_SCANS = 100  # the calibration check has ten seconds for a second or two of work
+_IMAGES = 8  # kept until their depth estimate arrives
+_CHECK_AFTER_SCANS = 100  # result of the calibration check after 10 s at 10 Hz; it takes 1 to 2 s
 
 
 class FusionConfig(NodeConfig):
-    """What is true of this robot, and how often a picture is a keyframe (swept against past ones)."""
+    """Options of fusion: method, properties of the robot, and the distance of keyframes (plane sweeps)."""
 
-    # field: all that is known; ratio: the paper's one factor a picture; affine: scale and shift of inverse
-    # depth; given: the estimate as it is (robots without a lidar).
+    # field: plane sweep with all priors; ratio: the paper's one factor per image; affine: scale and shift of
+    # inverse depth; given: the estimate unchanged (robots without a lidar).
     method: Literal["field", "ratio", "affine", "given"] = "field"
-    floor_known: bool = True  # the camera's height in the calibration can be relied on
+    floor_known: bool = True  # the camera height in the calibration is reliable
     planar: bool = True  # the body stays level on a floor
     keyframe_m: float = 0.3
     keyframe_rad: float = 0.26
-    cloud_every_px: int = 4  # a point of the cloud per so many pixels in each direction
-    check_pairs: int = Field(60, ge=0)  # pairs of pictures for the calibration check at the start; 0 = none
+    cloud_every_px: int = 4  # pixels per point of the cloud, in each direction
+    check_pairs: int = Field(60, ge=0)  # image pairs for the calibration check at the start; 0 = no check
 
 
 class FusionNode(Node):
-    """Waits for picture, estimate and pose of one moment; works in the odom frame, which never jumps."""
+    """Publishes fused depth per image and a point cloud per keyframe; works in the smooth odom frame."""
 
     name = "fusion"
     Config = FusionConfig
     inputs = (
         Input("rig", "every"),
-        Input("camera/image", "every"),  # kept, not worked on: an estimate must find its picture
+        Input("camera/image", "every"),  # every image, so that each estimate finds its image
         "depth/estimate",
         "lidar/scan",
         "localization/odometry",
@@ -72,20 +72,20 @@ class FusionNode(Node):
     def configure(self) -> None:
         self._fusion: Fusion | SingleImageFusion | None = None
         self._check: StartupCheck | None = None  # of the calibration; only `field` has one
-        self._pictures: deque[Image] = deque(maxlen=_PICTURES)
-        self._estimates: deque[DepthEstimate] = deque(maxlen=_PICTURES)
+        self._images: deque[Image] = deque(maxlen=_IMAGES)
+        self._estimates: deque[DepthEstimate] = deque(maxlen=_IMAGES)
         self._T_odom_keyframe: np.ndarray | None = None
         self._rig: Rig | None = None
-        self._localizer = ""  # the process that localizes
+        self._localizer = ""  # instance of the localization process
         self.calibration: CalibrationHealth | None = None
         self.overtaken = 0
 
     def on_header(self, header: Header) -> None:
-        """Another process localizes: what is known hangs on an odom frame that is gone."""
+        """Reset if localization runs in another process, because its odom frame is a new one."""
         if header.producer != "localization" or header.instance == self._localizer:
             return
         if self._localizer and self._rig is not None:
-            log.info("localization has started anew: so does fusion")
+            log.info("localization was restarted: fusion is reset")
             checked = self._check is not None and self._check.done
             self._T_odom_keyframe = None
             self.on_rig(self._rig)
@@ -94,10 +94,10 @@ class FusionNode(Node):
         self._localizer = header.instance
 
     def on_rig(self, rig: Rig) -> Outputs:
-        """Camera and lidar of this robot; both are needed, unless the estimate is taken as given."""
+        """Set up camera and lidar; both are required, except for the method `given`."""
         method = self.config.method
         if rig.camera is None or (rig.lidar is None and method != "given"):
-            log.error("the calibration lacks the camera or the lidar: nothing can be fused")
+            log.error("the calibration has no camera or no lidar: depth is not fused; complete the rig file")
             return iter(())
         self._rig, camera = rig, rig.camera
         self._undistort = Undistorter(Pinhole.of(camera))
@@ -128,21 +128,21 @@ class FusionNode(Node):
         return iter(())
 
     def on_localization_odometry(self, odometry: Odometry) -> Outputs:
-        """A pose: scans that end before it can be placed, and a picture may have waited for it."""
+        """Add a pose, the scans that are complete with it, and process the image that has waited for it."""
         if self._fusion is None or odometry.status != "ok":
             return
         for scan in self._history.add_pose(odometry.stamp_ns, odometry.T_odom_body):
             self._fusion.add_scan(self._history.scan_points_a(scan))
-            self._keep_for_check(scan)
+            self._add_to_check(scan)
         if self._check is not None and not self._check.done:
             self._check.add_pose(odometry.stamp_ns, odometry.T_odom_body)
             job = self._check.job()
             if job is not None:
                 yield Job("check_calibration", job, after=_CHECK_AFTER_SCANS, of="lidar/scan")
-            self._say()
+            self._update_detail()
         yield from self._fuse_if_ready()
 
-    def _keep_for_check(self, scan: TimedScan) -> None:
+    def _add_to_check(self, scan: TimedScan) -> None:
         T_odom_body = self._history.pose(scan.middle_ns)
         if self._check is not None and not self._check.done and T_odom_body is not None:
             points, _ = scan_points(
@@ -155,14 +155,14 @@ class FusionNode(Node):
             self._check.add_scan(points, T_odom_body)
 
     def on_job_check_calibration(self, health: CalibrationHealth) -> Outputs:
-        """What the check at the start found: beside the health from now on, and in the log if it is bad."""
+        """Log the result of the calibration check, and add it to the health from now on."""
         self.calibration = health
         (log.info if health.status == "ok" else log.error)("%s", health.line)
-        self._say()
+        self._update_detail()
         return iter(())
 
-    def _say(self) -> None:
-        """The line beside the health: frames overtaken, and the calibration."""
+    def _update_detail(self) -> None:
+        """Update the health detail: number of overtaken estimates, and the calibration."""
         overtaken = f"{self.overtaken} estimates overtaken" if self.overtaken else ""
         if self.calibration is not None:
             calibration = self.calibration.line
@@ -172,16 +172,16 @@ class FusionNode(Node):
         self.detail = "; ".join(text for text in (overtaken, calibration) if text)
 
     def on_camera_image(self, image: Image) -> Outputs:
-        self._pictures.append(image)
+        self._images.append(image)
         yield from self._fuse_if_ready()
 
     def on_depth_estimate(self, estimate: DepthEstimate) -> Outputs:
-        """An estimate; it may have to wait for the pose of its picture."""
+        """Queue an estimate until the pose at its time is known."""
         self._estimates.append(estimate)
         yield from self._fuse_if_ready()
 
     def _fuse_if_ready(self) -> Outputs:
-        """The newest picture that has its estimate and its pose; older ones are overtaken, and counted."""
+        """Process the newest image with estimate and pose; older ones are counted as overtaken."""
         ready = None
         while self._fusion is not None and self._estimates:
             if self._estimates[0].stamp_ns > self._history.newest_pose_ns:
@@ -190,25 +190,25 @@ class FusionNode(Node):
             ready = self._estimates.popleft()
         if ready is None:
             return
-        self._say()
-        image = next((p for p in self._pictures if p.stamp_ns == ready.stamp_ns), None)
-        if image is None:  # its picture was lost on the way, or is older than those kept
+        self._update_detail()
+        image = next((p for p in self._images if p.stamp_ns == ready.stamp_ns), None)
+        if image is None:  # its image was lost, or is no longer kept
             self.overtaken += 1
             return
         yield from self._fuse(image, ready)
 
     def _fuse(self, image: Image, estimate: DepthEstimate) -> Outputs:
-        """One picture: keyframes are swept and give a cloud, the others live on the keyframes' depth."""
+        """Publish the depth of one image, and the cloud if it is a keyframe."""
         T_odom_body = self._history.pose(image.stamp_ns)
         try:
             rgb = self._undistort(
                 decode_rgb(image.data, image.encoding, image.width_px, image.height_px, image.step_bytes)
             )
         except (UserError, ValueError) as error:
-            yield "fusion/depth", _refused(image.stamp_ns, str(error))
+            yield "fusion/depth", _rejected(image.stamp_ns, str(error))
             return
         if T_odom_body is None:
-            yield "fusion/depth", _refused(image.stamp_ns, "no pose at the time of the picture")
+            yield "fusion/depth", _rejected(image.stamp_ns, "no pose at the time of the image")
             return
         if self._check is not None:
             self._check.add_image(image.stamp_ns, rgb, T_odom_body)
@@ -221,7 +221,7 @@ class FusionNode(Node):
         keyframe = self._moved(T_odom_body)
         fused = self._fusion.fuse(frame, keyframe=keyframe)
         if not fused.ok:
-            yield "fusion/depth", _refused(image.stamp_ns, fused.status)
+            yield "fusion/depth", _rejected(image.stamp_ns, fused.status)
             return
         if keyframe:
             self._T_odom_keyframe = T_odom_body
@@ -266,6 +266,6 @@ def _message(
     )
 
 
-def _refused(stamp_ns: int, status: str) -> FusedDepth:
+def _rejected(stamp_ns: int, status: str) -> FusedDepth:
     empty = np.zeros((0, 0), np.float32)
     return FusedDepth(stamp_ns=stamp_ns, depth_m=empty, sigma_m=empty, status=status)
