@@ -5,8 +5,13 @@ from __future__ import annotations
 from typing import Any
 
 from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic_core import ErrorDetails
 
 from beamsplat.common.errors import UserError
+
+# Error types of pydantic (its documentation, "Validation Errors").
+_TEXT_EXPECTED = ("string_type", "path_type")
+_LIST_EXPECTED = ("tuple_type", "list_type", "set_type", "frozen_set_type")
 
 
 class Config(BaseModel):
@@ -15,8 +20,11 @@ class Config(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
-def parse(cls: type[Config], table: dict[str, Any], where: str) -> Any:
+def parse(cls: type[Config], table: dict[str, Any], where: str, prefix: str | None = None) -> Any:
     """Return a `cls` instance made from a raw table; `where` names the table's source in errors.
+
+    Args:
+        prefix: what precedes a field in `--set`, for example "camera."; None where no `--set` can set it.
 
     Raises:
         UserError: the table is invalid; one clause per fault with field, value and expected value.
@@ -33,8 +41,20 @@ def parse(cls: type[Config], table: dict[str, Any], where: str) -> Any:
             elif fault["type"] == "missing":
                 faults.append(f"option {field!r} is required: set it in the file, or with --set")
             else:
-                faults.append(f"{field} = {fault['input']!r}: {fault['msg']}")
+                hint = "" if prefix is None else _quoting_hint(f"{prefix}{field}", fault)
+                faults.append(f"{field} = {fault['input']!r}: {fault['msg']}{hint}")
         raise UserError(f"{where}: " + "; ".join(faults)) from error
+
+
+def _quoting_hint(option: str, fault: ErrorDetails) -> str:
+    """Return how to write a text or a list on the command line, where the wrong type was parsed as TOML."""
+    value = fault["input"]
+    if fault["type"] in _TEXT_EXPECTED and isinstance(value, (bool, int, float)):
+        text = str(value).lower() if isinstance(value, bool) else str(value)
+        return f"; a text needs quotes: --set '{option}=\"{text}\"'"
+    if fault["type"] in _LIST_EXPECTED and isinstance(value, str):
+        return f"; a list needs brackets: --set '{option}=[\"{value}\"]'"
+    return ""
 
 
 def _model_at(cls: type[BaseModel], path: tuple[str | int, ...]) -> type[BaseModel]:

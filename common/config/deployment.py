@@ -90,7 +90,7 @@ def load_deployment(path: Path, overrides: tuple[str, ...] = ()) -> Deployment:
         raise UserError(f"{path}: not a TOML file: {reason(error)}") from error
     for override in overrides:
         _apply(table, override)
-    return parse(Deployment, table, str(path))
+    return parse(Deployment, table, str(path), "")
 
 
 def with_overrides(deployment: Deployment, overrides: tuple[str, ...]) -> Deployment:

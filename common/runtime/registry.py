@@ -71,5 +71,7 @@ def make_node(service: Service, options: dict[str, object], where: str) -> Node:
         UserError: unknown kind or option, or an invalid value; `where` names the source.
     """
     node_class = node_class_of(service, options)
-    config: NodeConfig = parse(node_class.Config, options, f"{where}: node {service.name!r}")
+    config: NodeConfig = parse(
+        node_class.Config, options, f"{where}: node {service.name!r}", f"{service.name}."
+    )
     return node_class(config)

@@ -9,6 +9,8 @@ from hypothesis import strategies as st
 from beamsplat.common.config.base import parse
 from beamsplat.common.config.deployment import NodeConfig, load_deployment
 from beamsplat.common.errors import UserError
+from beamsplat.common.runtime.registry import make_node
+from beamsplat.services.nodes import NODES
 
 
 def _file(tmp_path, text):
@@ -69,3 +71,29 @@ def test_node_options_are_strict():
         parse(NodeConfig, {"stepcost": 1}, "node 'x'")
     with pytest.raises(UserError, match="threads = 0"):
         parse(NodeConfig, {"threads": 0}, "node 'x'")
+
+
+@pytest.mark.parametrize(
+    ("override", "hint"),
+    [
+        ("camera.source=9", """--set 'camera.source="9"'"""),
+        ("camera.source=true", """--set 'camera.source="true"'"""),
+        ("camera.rig=7", """--set 'camera.rig="7"'"""),
+        ("recorder.without=tick", """--set 'recorder.without=["tick"]'"""),
+    ],
+)
+def test_a_value_of_another_type_is_told_how_to_be_quoted(tmp_path, override, hint):
+    (tmp_path / "d.toml").write_text("[nodes.camera]\n[nodes.recorder]\n")
+    deployment = load_deployment(tmp_path / "d.toml", (override,))
+    node = override.partition(".")[0]
+    with pytest.raises(UserError) as refused:
+        make_node(NODES[node], deployment.nodes[node], "d.toml")
+    assert hint in str(refused.value)
+    repaired = load_deployment(tmp_path / "d.toml", (hint.removeprefix("--set ").strip("'"),))
+    make_node(NODES[node], repaired.nodes[node], "d.toml")
+
+
+def test_the_hint_also_names_options_of_the_deployment_itself(tmp_path):
+    (tmp_path / "d.toml").write_text("")
+    with pytest.raises(UserError, match="""--set 'robot="9"'"""):
+        load_deployment(tmp_path / "d.toml", ("robot=9",))
