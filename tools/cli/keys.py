@@ -77,9 +77,7 @@ def remove(name: NameArgument, authority: FolderOption = DEFAULT) -> None:
     found = CertificateAuthority(authority)
     found.remove(name)
     edges = ", ".join(str(folder / "hosts.toml") for folder in found.edges()) or "no edge yet"
-    print(
-        f"{name} was removed. The policy of the edges was written ({edges}): copy it to edges on other machines"
-    )
+    print(f"{name} was removed. The edges' policy was written ({edges}): copy it to edges on other machines")
 
 
 @app.command(name="list")

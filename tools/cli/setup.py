@@ -219,12 +219,12 @@ def _intrinsics_from_field_of_view(
 ) -> tuple[CameraSection, str]:
     """Return the section [camera] of the rig, and one sentence on where it comes from."""
     from beamsplat.common.geometry.rig import CameraSection, Mount
-    from beamsplat.services.replay.rig_draft import pinhole
+    from beamsplat.services.replay.rig_draft import pinhole_from_fov
 
     fov_deg = typer.prompt("Horizontal field of view (degrees)", default=65.0, type=typer.FloatRange(10, 170))
     size_px = camera.first.width_px, camera.first.height_px
     note = f"fx, fy from a horizontal field of view of {fov_deg:g} degrees as stated, no distortion"
-    return CameraSection(**pinhole(*size_px, fov_deg), mount=Mount.of(T_body_camera)), note
+    return CameraSection(**pinhole_from_fov(*size_px, fov_deg), mount=Mount.of(T_body_camera)), note
 
 
 def _calibrate_with_chessboard(
@@ -263,6 +263,7 @@ def _take_views(camera: dict[str, Any], board: Chessboard) -> IntrinsicsCalibrat
     import time
 
     from beamsplat.common.messages import Image
+    from beamsplat.tools.setup.discovery import sensor_messages
     from beamsplat.tools.setup.intrinsics import VIEWS, IntrinsicsCalibration
 
     views = IntrinsicsCalibration(board)
@@ -314,7 +315,7 @@ def _calibrate_lidar_extrinsics(
             return found.T_body_lidar
         console.print("[yellow]The result is not accurate enough.[/]")
     console.print(
-        "The lidar's mount stays as measured; `beamsplat calibrate extrinsics` can estimate it from a recording."
+        "The lidar's mount stays as measured; `beamsplat calibrate extrinsics` estimates it from a recording."
     )
     return T_body_lidar
 

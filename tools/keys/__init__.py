@@ -1,1 +1,1 @@
-"""Key management: the certificate authority of a fleet, and the diagnosis of protected links."""
+"""Key management: the certificate authority of a fleet, and the diagnosis of TLS links."""

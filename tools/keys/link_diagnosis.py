@@ -1,4 +1,4 @@
-"""What stands in the way of a protected link, said aloud: Zenoh passes over every refusal in silence."""
+"""Diagnose why a TLS link is not opened: Zenoh does not report the reason of a refusal."""
 
 from __future__ import annotations
 
@@ -24,53 +24,65 @@ from beamsplat.common.security.keys import (
 )
 from beamsplat.tools.keys.pki import expiry, openssl
 
-SOON_DAYS = 14
-_PATIENCE_S = 3.0
-Remark = tuple[str, Literal["ok", "note", "fault"], str, str]  # subject, verdict, what was found, remedy
-_RENEW = "renew it: beamsplat keys issue NAME, where the authority is, and copy the folder here"
+EXPIRES_SOON_DAYS = 14  # before the expiry of a certificate, a note is given
+_TIMEOUT_S = 3.0  # to connect to the edge
+LinkFinding = tuple[str, Literal["ok", "note", "fault"], str, str]  # subject, verdict, finding, remedy
+_RENEW = "renew it: run `beamsplat keys issue NAME` on the authority's host, and copy the folder here"
 
 
-def examine_security(deployment: Deployment) -> Iterator[Remark]:
-    """Endpoints, keys, policy, and for a robot the way to its edge, step by step."""
+def diagnose_security(deployment: Deployment) -> Iterator[LinkFinding]:
+    """Yield findings on endpoints, keys, policy, and for a robot on each step of the connection to its
+    edge.
+    """
     uplink = str(deployment.nodes.get("uplink", {}).get("edge", ""))
     endpoints = [*deployment.router.listen, *deployment.router.connect, *([uplink] if uplink else [])]
     for endpoint in endpoints:
         try:
             check_endpoint(endpoint, deployment.security)
         except UserError as error:
-            yield "link", "fault", str(error), "beamsplat keys init, issue; name the folder in security.keys"
+            yield (
+                "link",
+                "fault",
+                str(error),
+                "run `beamsplat keys init` and `issue`; set security.keys to the folder",
+            )
         else:
-            yield _protection(endpoint)
+            yield _endpoint_finding(endpoint)
     if not any(is_secure(endpoint) for endpoint in endpoints):
         return
     try:
         keys = HostKeys.of(deployment.security)
     except UserError as error:
-        yield "keys", "fault", str(error), "beamsplat keys issue NAME, then copy the folder it names"
+        yield (
+            "keys",
+            "fault",
+            str(error),
+            "run `beamsplat keys issue NAME`, then copy the folder that it prints",
+        )
         return
-    yield from _certificate(keys.folder)
+    yield from _check_certificate(keys.folder)
     if any(is_secure(endpoint) for endpoint in deployment.router.listen):
-        yield from _policy(keys.folder)
+        yield from _check_policy(keys.folder)
     if is_secure(uplink):
-        yield from _way_to(uplink, keys.folder)
+        yield from _check_tls_connection(uplink, keys.folder)
 
 
-def _protection(endpoint: str) -> Remark:
+def _endpoint_finding(endpoint: str) -> LinkFinding:
     if is_secure(endpoint):
-        return "link", "ok", f"{endpoint}: both sides show certificates", ""
+        return "link", "ok", f"{endpoint}: TLS, both sides present certificates", ""
     if is_loopback(endpoint):
         return "link", "ok", f"{endpoint}: processes of this host only", ""
     return (
         "link",
         "note",
-        f"{endpoint}: open to everybody who reaches it (security.plain)",
+        f"{endpoint}: not protected, anyone who can reach it may connect (security.plain)",
         "use tls/ instead",
     )
 
 
-def _certificate(folder: Path) -> Iterator[Remark]:
+def _check_certificate(folder: Path) -> Iterator[LinkFinding]:
     if shutil.which("openssl") is None:
-        yield "certificate", "note", "not examined: `openssl` is not installed", "apt install openssl"
+        yield "certificate", "note", "not checked: `openssl` is not installed", "apt install openssl"
         return
     file = folder / CERTIFICATE
     try:
@@ -82,8 +94,13 @@ def _certificate(folder: Path) -> Iterator[Remark]:
     name = next((line.rpartition("= ")[2] for line in text.splitlines() if "commonName" in line), "nobody")
     days = (until - datetime.now(UTC)).total_seconds() / 86400
     if days < 0:
-        yield "certificate", "fault", f"{name}: expired on {until:%Y-%m-%d}; is the clock right?", _RENEW
-    elif days < SOON_DAYS:
+        yield (
+            "certificate",
+            "fault",
+            f"{name}: expired on {until:%Y-%m-%d}; check the clock of this host",
+            _RENEW,
+        )
+    elif days < EXPIRES_SOON_DAYS:
         yield "certificate", "note", f"{name}: expires in {days:.0f} days", _RENEW
     else:
         yield "certificate", "ok", f"{name}: valid for {days:.0f} days", ""
@@ -93,7 +110,7 @@ def _certificate(folder: Path) -> Iterator[Remark]:
         yield "certificate", "fault", f"{file} was not issued by {folder / CA}", _RENEW
 
 
-def _policy(folder: Path) -> Iterator[Remark]:
+def _check_policy(folder: Path) -> Iterator[LinkFinding]:
     try:
         hosts = read_hosts(folder)
     except UserError as error:
@@ -111,53 +128,58 @@ def _policy(folder: Path) -> Iterator[Remark]:
         yield "policy", "note", "no robot may connect", "beamsplat keys issue robot1"
 
 
-def _way_to(endpoint: str, folder: Path) -> Iterator[Remark]:
-    """Name, TCP, TLS: the first that fails is the reason."""
+def _check_tls_connection(endpoint: str, folder: Path) -> Iterator[LinkFinding]:
+    """Check name resolution, TCP and TLS; the first step that fails is the reason."""
     host, _, port = endpoint.partition("/")[2].rpartition(":")
     host = host.strip("[]")
     context = ssl.create_default_context(ssl.Purpose.SERVER_AUTH, cafile=str(folder / CA))
     try:
         context.load_cert_chain(folder / CERTIFICATE, folder / KEY)
         with (
-            socket.create_connection((host, int(port)), _PATIENCE_S) as raw,
+            socket.create_connection((host, int(port)), _TIMEOUT_S) as raw,
             context.wrap_socket(raw, server_hostname=host) as link,
         ):
             link.settimeout(1.0)
-            # Whether the other side takes our certificate shows only when it would speak: silence is assent.
+            # TLS 1.3 reports a rejected client certificate only at the first read: a timeout means accepted.
             if link.recv(1) == b"":
-                raise ssl.SSLError("the edge closes the link: it does not take this host's certificate")
+                raise ssl.SSLError("the edge closes the link: it does not accept this host's certificate")
     except TimeoutError as error:
         if "handshake" in str(error) or not str(error).startswith("The read"):
-            yield "edge", "fault", f"{endpoint} does not answer", "is the edge running and reachable? ping it"
+            yield (
+                "edge",
+                "fault",
+                f"{endpoint} does not answer",
+                "check that the edge is running and reachable (ping)",
+            )
         else:
-            yield "edge", "ok", f"{endpoint} takes this host's certificate, and shows a good one", ""
+            yield "edge", "ok", f"{endpoint} accepts this host's certificate, and its own is valid", ""
     except socket.gaierror as error:
         yield (
             "edge",
             "fault",
-            f"{host} is no known name ({error.strerror})",
-            "name its address in uplink.edge",
+            f"{host} cannot be resolved ({error.strerror})",
+            "set uplink.edge to its IP address",
         )
     except ssl.SSLCertVerificationError as error:
         yield (
             "edge",
             "fault",
-            f"the edge's certificate is not good: {error.verify_message}",
-            ("issue the edge's anew: beamsplat keys issue edge --role edge --address " + host),
+            f"the edge's certificate is not valid: {error.verify_message}",
+            ("issue a new one: beamsplat keys issue edge --role edge --address " + host),
         )
     except ssl.SSLError as error:
         reason = (error.reason or str(error)).replace("_", " ").lower()
-        yield "edge", "fault", f"the edge refuses this host's certificate: {reason}", _RENEW
+        yield "edge", "fault", f"the edge rejects this host's certificate: {reason}", _RENEW
     except OSError as error:
         yield (
             "edge",
             "fault",
             f"{endpoint} cannot be reached: {error.strerror or error}",
-            "is the edge running?",
+            "check that the edge is running",
         )
     yield (
         "edge",
         "note",
-        "whether this host is in the edge's policy, only the edge can tell",
-        ("there: beamsplat doctor deploy/edge.toml --security"),
+        "whether the edge's policy contains this host can be checked only on the edge",
+        ("run there: beamsplat doctor deploy/edge.toml --security"),
     )

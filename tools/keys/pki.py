@@ -1,11 +1,12 @@
-"""The authority of a fleet: a folder with its own key, a certificate for each host, and who may do what.
+"""The certificate authority of a fleet: its key, a certificate for each host, and the policy of access
+rights.
 
-    ca.key      never leaves this folder
-    ca.pem      what all hosts trust
-    hosts.toml  every host that was issued and not removed; each edge has a copy
+    ca.key      private key of the authority; stays in this folder
+    ca.pem      root certificate that all hosts trust
+    hosts.toml  the policy: every host that was issued and not removed; each edge has a copy
     hosts/NAME  to be copied to that host: ca.pem, host.pem, host.key (and hosts.toml for an edge)
 
-OpenSSL's command line makes keys and certificates: it is needed where the authority is, and nowhere else.
+Keys and certificates are made with OpenSSL's command line, which only the authority's host needs.
 """
 
 from __future__ import annotations
@@ -23,43 +24,50 @@ from beamsplat.common.security.access_control import HostRole, read_hosts
 from beamsplat.common.security.keys import CA, CERTIFICATE, HOSTS, KEY
 
 CA_KEY = "ca.key"
-CA_DAYS = 3650
+CA_DAYS = 3650  # validity of the root certificate
 
 
 def openssl(*arguments: str) -> str:
-    """Output of an OpenSSL command.
+    """Run an OpenSSL command and return its output.
 
     Raises:
-        UserError: it is not installed, or refuses.
+        UserError: OpenSSL is not installed, or the command fails.
     """
     if shutil.which("openssl") is None:
         raise UserError("the command `openssl` is not installed: apt install openssl")
     done = subprocess.run(["openssl", *arguments], capture_output=True, text=True, check=False)
     if done.returncode != 0:
         lines = [line for line in done.stderr.strip().splitlines() if line] or ["no reason given"]
-        raise UserError(f"openssl {arguments[0]} refuses: {lines[-1]}")
+        raise UserError(f"openssl {arguments[0]} failed: {lines[-1]}")
     return done.stdout
 
 
-class Authority:
-    """A folder made by `Authority.create`."""
+class CertificateAuthority:
+    """An authority's folder, created by `CertificateAuthority.create`."""
 
     def __init__(self, folder: Path) -> None:
-        """Raises UserError where there is no authority."""
-        self.folder = folder.expanduser()
-        if not (self.folder / CA_KEY).is_file():
-            raise UserError(f"{self.folder} holds no authority: `beamsplat keys init` makes one")
-
-    @staticmethod
-    def create(folder: Path, days: int = CA_DAYS) -> Authority:
-        """A new authority.
+        """Open an existing authority.
 
         Raises:
-            UserError: there is one already (its certificates would become worthless), or OpenSSL refuses.
+            UserError: the folder contains no authority.
+        """
+        self.folder = folder.expanduser()
+        if not (self.folder / CA_KEY).is_file():
+            raise UserError(f"{self.folder} contains no authority: create one with `beamsplat keys init`")
+
+    @staticmethod
+    def create(folder: Path, days: int = CA_DAYS) -> CertificateAuthority:
+        """Create an authority in a folder.
+
+        Raises:
+            UserError: the folder contains one already (its certificates would become invalid), or OpenSSL
+            fails.
         """
         folder = make_folder(folder.expanduser())
         if (folder / CA_KEY).exists():
-            raise UserError(f"{folder} holds an authority already, which is never replaced: choose another")
+            raise UserError(
+                f"{folder} contains an authority already, which is never replaced: choose another folder"
+            )
         folder.chmod(0o700)
         _new_key(folder / CA_KEY)
         openssl("req", "-x509", "-new", "-key", str(folder / CA_KEY), "-sha256", "-days", str(days),
@@ -67,16 +75,19 @@ class Authority:
                 "-addext", "basicConstraints=critical,CA:TRUE,pathlen:0",
                 "-addext", "keyUsage=critical,keyCertSign,cRLSign")  # fmt: skip
         write_atomically(folder / HOSTS, b"")
-        return Authority(folder)
+        return CertificateAuthority(folder)
 
     def issue(self, name: str, host: HostRole, addresses: tuple[str, ...] = (), days: int = 90) -> Path:
-        """A new key and certificate for a host, which replace those it had; the folder to copy to it.
+        """Create a key and a certificate for a host, replacing earlier ones; return the folder to copy to the
+        host.
 
         Raises:
-            UserError: an edge without addresses, or OpenSSL refuses.
+            UserError: an edge without addresses, or OpenSSL fails.
         """
         if host.role == "edge" and not addresses:
-            raise UserError(f"{name}: robots check the address they connect to; name one with --address")
+            raise UserError(
+                f"{name}: robots check the edge's address against its certificate; set it with --address"
+            )
         out = make_folder(self.folder / "hosts" / name)
         out.chmod(0o700)
         with tempfile.TemporaryDirectory(dir=self.folder) as scratch:
@@ -95,25 +106,23 @@ class Authority:
         return out
 
     def remove(self, name: str) -> None:
-        """Takes a host out of the policy; its certificate opens nothing any more.
+        """Remove a host from the policy; its certificate then gives no access.
 
         Raises:
             UserError: no such host.
         """
         hosts = self.hosts()
         if hosts.pop(name, None) is None:
-            raise UserError(
-                f"no host {name!r} in {self.folder / HOSTS}; there are {', '.join(hosts) or 'none'}"
-            )
+            raise UserError(f"no host {name!r} in {self.folder / HOSTS}; hosts: {', '.join(hosts) or 'none'}")
         shutil.rmtree(self.folder / "hosts" / name, ignore_errors=True)
         self._write(hosts)
 
     def hosts(self) -> dict[str, HostRole]:
-        """Every host there is."""
+        """Return the role of every host by name."""
         return read_hosts(self.folder)
 
     def edges(self) -> list[Path]:
-        """Folders of the edge servers, which hold copies of the policy."""
+        """Return the folders of the edge servers, which hold copies of the policy."""
         return [self.folder / "hosts" / name for name, host in self.hosts().items() if host.role == "edge"]
 
     def _write(self, hosts: dict[str, HostRole]) -> None:
@@ -126,7 +135,7 @@ class Authority:
 
 
 def expiry(certificate: Path) -> str:
-    """When a certificate ends, as OpenSSL prints it."""
+    """Return the expiry of a certificate as OpenSSL prints it."""
     return openssl("x509", "-in", str(certificate), "-noout", "-enddate").strip().partition("=")[2]
 
 
@@ -141,11 +150,11 @@ def _extensions(addresses: tuple[str, ...]) -> str:
         "basicConstraints=critical,CA:FALSE\n"
         "keyUsage=critical,digitalSignature\n"
         "extendedKeyUsage=serverAuth,clientAuth\n"
-        "subjectAltName=" + ",".join(_alternative(a) for a in dict.fromkeys(addresses)) + "\n"
+        "subjectAltName=" + ",".join(_subject_alternative_name(a) for a in dict.fromkeys(addresses)) + "\n"
     )
 
 
-def _alternative(address: str) -> str:
+def _subject_alternative_name(address: str) -> str:
     try:
         return f"IP:{ipaddress.ip_address(address)}"
     except ValueError:

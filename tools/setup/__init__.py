@@ -1,1 +1,1 @@
-"""From what is plugged in to a deployment that runs, step by step in a terminal."""
+"""Interactive setup of a robot in a terminal: find sensors, calibrate, write deployment and rig file."""

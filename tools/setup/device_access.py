@@ -1,4 +1,4 @@
-"""Cameras and serial ports of this machine: are they there, who may open them, does somebody hold them?"""
+"""Check the cameras and serial ports of this machine: existence, permissions, use by other programs."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from typing import Any, NamedTuple
 
 import psutil
 
-_CONNECT_S = 0.5
-# Programs that open every new serial port to see whether a modem or a Braille display is there.
-_PROBERS = {
+_CONNECT_S = 0.5  # timeout for network lidars
+# Programs that open every new serial port to search for modems or Braille displays -> how to disable them.
+_INTERFERING = {
     "ModemManager": "sudo systemctl disable --now ModemManager",
     "brltty": "sudo systemctl mask brltty-udev.service; sudo apt remove brltty",
 }
 
 
-class Remark(NamedTuple):
-    """One line about a device: verdict is ok, note or fault."""
+class DeviceFinding(NamedTuple):
+    """One finding on a device; `verdict` is ok, note or fault."""
 
     subject: str
     verdict: str
@@ -30,23 +30,25 @@ class Remark(NamedTuple):
     remedy: str = ""
 
 
-class User(NamedTuple):
-    """Who wants to open devices."""
+class UserAccount(NamedTuple):
+    """A user and the groups that give access to devices."""
 
     name: str
     groups: frozenset[str]  # of this session
-    enrolled: frozenset[str]  # by /etc/group: in force at the next login
+    enrolled: frozenset[str]  # by /etc/group: effective after the next login
 
     @staticmethod
-    def now() -> User:
-        """Whoever runs this."""
+    def current() -> UserAccount:
+        """Return the user who runs this process."""
         name = getpass.getuser()
         groups = {_group_name(gid) for gid in os.getgroups()}
-        return User(name, frozenset(groups), frozenset(g.gr_name for g in grp.getgrall() if name in g.gr_mem))
+        return UserAccount(
+            name, frozenset(groups), frozenset(g.gr_name for g in grp.getgrall() if name in g.gr_mem)
+        )
 
 
 def wanted_devices(nodes: dict[str, dict[str, Any]]) -> list[tuple[str, str]]:
-    """(option, device) of the cameras and lidars in a deployment's raw tables."""
+    """Return (option, device) of the cameras and lidars in a deployment's node tables."""
     found = []
     lidar, camera = nodes.get("lidar"), nodes.get("camera")
     if lidar is not None:
@@ -58,83 +60,94 @@ def wanted_devices(nodes: dict[str, dict[str, Any]]) -> list[tuple[str, str]]:
     return found
 
 
-def examine_devices(
+def diagnose_devices(
     wanted: Iterable[tuple[str, str]],
     dev: Path = Path("/dev"),
-    user: User | None = None,
+    user: UserAccount | None = None,
     may_open: Callable[[Path], bool] = lambda path: os.access(path, os.R_OK | os.W_OK),
-) -> Iterator[Remark]:
-    """What is to say of the devices a deployment wants, and of the others that are plugged in."""
-    user = user or User.now()
+) -> Iterator[DeviceFinding]:
+    """Yield findings on the devices that a deployment uses, and on other connected ones.
+
+    Args:
+        wanted: (option, device) pairs.
+        dev: folder of device files.
+        user: whose permissions are checked; default: the current user.
+        may_open: access test, replaceable for tests.
+    """
+    user = user or UserAccount.current()
     serial = sorted([*dev.glob("ttyUSB*"), *dev.glob("ttyACM*")])
     video = sorted(dev.glob("video[0-9]*"))
-    said: set[Path] = set()
+    reported: set[Path] = set()
     for option, device in wanted:
         if device.startswith("tcp/"):
-            yield _network(option, device)
+            yield _check_network(option, device)
         elif not device.startswith(str(dev)):
-            continue  # a stream or a file: the camera itself says what is wrong with it
+            continue  # a stream or a file: its errors are in the camera node's status
         elif not (path := Path(device)).exists():
             others = video if option.startswith("camera") else serial
-            yield Remark(device, "fault", f"{option}: no such device", _missing(others, dev))
+            yield DeviceFinding(device, "fault", f"{option}: no such device", _what_is_there(others, dev))
         else:
-            said.add(path.resolve())
-            yield _openable(path, user, may_open, needed=True)
+            reported.add(path.resolve())
+            yield _check_access(path, user, may_open, needed=True)
     for path in [*serial, *video]:
-        if path.resolve() not in said:
-            yield _openable(path, user, may_open, needed=False)
+        if path.resolve() not in reported:
+            yield _check_access(path, user, may_open, needed=False)
     if serial or any(option == "lidar.device" for option, _ in wanted):
-        yield from _probers()
+        yield from _interfering_programs()
 
 
-def _openable(path: Path, user: User, may_open: Callable[[Path], bool], *, needed: bool) -> Remark:
-    """May this user open it, and is it free?"""
+def _check_access(
+    path: Path, user: UserAccount, may_open: Callable[[Path], bool], *, needed: bool
+) -> DeviceFinding:
+    """Return the finding on one device: permissions of the user, use by other programs."""
     bad = "fault" if needed else "note"
     if may_open(path):
-        holder = _holder(path)
+        holder = _locked_by(path)
         if holder:
-            return Remark(str(path), bad, f"is held by {holder}", f"stop it: `fuser -v {path}` shows it")
-        return Remark(str(path), "ok", f"may be opened{_by_id(path)}")
+            return DeviceFinding(
+                str(path), bad, f"is in use by {holder}", f"stop it: `fuser -v {path}` shows it"
+            )
+        return DeviceFinding(str(path), "ok", f"accessible{_by_id(path)}")
     group = _group_name(path.stat().st_gid)
     if group in user.enrolled and group not in user.groups:
-        return Remark(
-            str(path), bad, f"{user.name} is in the group {group}, but not yet in this session",
+        return DeviceFinding(
+            str(path), bad, f"{user.name} is in the group {group}, but not yet in this login session",
             f"log out and in again, or `newgrp {group}` in this terminal",
         )  # fmt: skip
     if group in user.groups:
-        return Remark(
-            str(path), bad, f"the group {group} has no right to it",
-            f"sudo chmod g+rw {path}; for good, a udev rule with MODE=\"0660\"",
+        return DeviceFinding(
+            str(path), bad, f"the group {group} has no permission to open it",
+            f"sudo chmod g+rw {path}; permanently: a udev rule with MODE=\"0660\"",
         )  # fmt: skip
-    return Remark(
+    return DeviceFinding(
         str(path), bad, f"belongs to the group {group}, in which {user.name} is not",
         f"sudo usermod -aG {group} {user.name}, then log out and in again",
     )  # fmt: skip
 
 
-def _missing(others: list[Path], dev: Path) -> str:
-    there = f"there are: {', '.join(map(str, others))}" if others else "nothing of that kind is plugged in"
+def _what_is_there(others: list[Path], dev: Path) -> str:
+    there = f"connected: {', '.join(map(str, others))}" if others else "no device of this kind is connected"
     if Path("/.dockerenv").exists() or Path("/run/.containerenv").exists():
-        return f"{there}; this is a container: give it the device with --device={dev}/..."
-    return f"{there}; `sudo dmesg | tail` tells what happened when it was plugged in"
+        return f"{there}; this is a container: pass the device to it with --device={dev}/..."
+    return f"{there}; `sudo dmesg | tail` shows what happened when it was connected"
 
 
-def _network(option: str, device: str) -> Remark:
+def _check_network(option: str, device: str) -> DeviceFinding:
     host, _, port = device.removeprefix("tcp/").rpartition(":")
     if not host or not port.isdigit():
-        return Remark(device, "fault", f"{option}: no address", "write tcp/HOST:PORT")
+        return DeviceFinding(device, "fault", f"{option}: invalid address", "write tcp/HOST:PORT")
     try:
         socket.create_connection((host.strip("[]"), int(port)), timeout=_CONNECT_S).close()
     except OSError as error:
-        return Remark(
+        return DeviceFinding(
             device, "fault", f"{option}: does not answer ({error})",
-            "give this host an address in the same network (Hokuyo: 192.168.0.x), and check cable and power",
+            "set an address of this host in the same network (Hokuyo: 192.168.0.x); check cable and power",
         )  # fmt: skip
-    return Remark(device, "ok", "answers")
+    return DeviceFinding(device, "ok", "answers")
 
 
-def _holder(path: Path) -> str:
-    """Who has locked a serial port; "" if nobody."""
+def _locked_by(path: Path) -> str:
+    """Return the program that has locked a serial port; "" if it is not locked."""
     if "tty" not in path.name:
         return ""
     try:
@@ -151,18 +164,20 @@ def _holder(path: Path) -> str:
 
 
 def _by_id(path: Path) -> str:
-    """The name that survives replugging."""
+    """Return a text with the device's stable name, which does not change when it is reconnected."""
     names = [
         link for link in (path.parent / "serial" / "by-id").glob("*") if link.resolve() == path.resolve()
     ]
-    return f"; its lasting name is {names[0]}" if names else ""
+    return f"; its stable name is {names[0]}" if names else ""
 
 
-def _probers() -> Iterator[Remark]:
+def _interfering_programs() -> Iterator[DeviceFinding]:
     running = {process.info["name"] for process in psutil.process_iter(["name"])}
-    for name, remedy in _PROBERS.items():
+    for name, remedy in _INTERFERING.items():
         if name in running:
-            yield Remark(name, "note", "runs, and may talk to a lidar when it is plugged in", remedy)
+            yield DeviceFinding(
+                name, "note", "is running, and may send data to a lidar when it is connected", remedy
+            )
 
 
 def _group_name(gid: int) -> str:

@@ -1,4 +1,4 @@
-"""Which cameras and lidars answer: the very nodes that will run are asked for their first message."""
+"""Find cameras and lidars by running their nodes until the first message."""
 
 from __future__ import annotations
 
@@ -14,95 +14,101 @@ from beamsplat.common.messages import Image, Message, Scan
 from beamsplat.common.runtime.registry import make_node
 from beamsplat.services.nodes import NODES
 
-CAMERA_S = 6.0  # a network camera takes its time for the first picture
-LIDAR_S = {"ldrobot": 3.0, "rplidar": 8.0, "hokuyo": 5.0}  # all baud rates of a kind, and a turn
+CAMERA_TIMEOUT_S = 6.0  # network cameras need seconds for the first image
+LIDAR_TIMEOUT_S = {
+    "ldrobot": 3.0,
+    "rplidar": 8.0,
+    "hokuyo": 5.0,
+}  # for all baud rates of the kind and one revolution
 
 
-class Found(NamedTuple):
+class FoundSensor(NamedTuple):
     """A sensor that answered."""
 
     options: dict[str, Any]  # of its node
-    says: str  # its status: model, rates, losses
+    status: str  # of its node: model, rates, losses
     first: Message
 
 
-class Silent(NamedTuple):
-    """A place where nothing answered, and what was heard instead."""
+class NoAnswer(NamedTuple):
+    """A device where no sensor answered, and the status of the attempt."""
 
     where: str
-    says: str
+    status: str
 
 
-def camera_places(dev: Path = Path("/dev")) -> list[str]:
-    """V4L2 devices of this machine, by their lasting names where they have one."""
-    return _lasting(sorted(dev.glob("video[0-9]*")), dev / "v4l" / "by-id")
+def camera_devices(dev: Path = Path("/dev")) -> list[str]:
+    """Return the V4L2 devices of this machine, by their stable names where available."""
+    return _stable_names(sorted(dev.glob("video[0-9]*")), dev / "v4l" / "by-id")
 
 
-def lidar_places(dev: Path = Path("/dev")) -> list[str]:
-    """Serial ports at which a lidar could be, by their lasting names where they have one."""
-    return _lasting(sorted([*dev.glob("ttyUSB*"), *dev.glob("ttyACM*")]), dev / "serial" / "by-id")
+def lidar_devices(dev: Path = Path("/dev")) -> list[str]:
+    """Return the serial ports where a lidar may be, by their stable names where available."""
+    return _stable_names(sorted([*dev.glob("ttyUSB*"), *dev.glob("ttyACM*")]), dev / "serial" / "by-id")
 
 
-def _lasting(devices: list[Path], names: Path) -> list[str]:
+def _stable_names(devices: list[Path], names: Path) -> list[str]:
     by_device = {link.resolve(): link for link in sorted(names.glob("*"), reverse=True)}
     return [str(by_device.get(device.resolve(), device)) for device in devices]
 
 
-def find_camera(source: str) -> Found | Silent:
-    """The camera at an index, path or address."""
-    return _first("camera", {"kind": "opencv", "source": source}, source, Image, CAMERA_S)
+def find_camera(source: str) -> FoundSensor | NoAnswer:
+    """Probe the camera at an index, path or address."""
+    return _first_message("camera", {"kind": "opencv", "source": source}, source, Image, CAMERA_TIMEOUT_S)
 
 
-def find_lidar(device: str, kinds: tuple[str, ...] = tuple(LIDAR_S)) -> Found | Silent:
-    """The lidar at a serial port or tcp/HOST:PORT, whichever kind answers."""
+def find_lidar(device: str, kinds: tuple[str, ...] = tuple(LIDAR_TIMEOUT_S)) -> FoundSensor | NoAnswer:
+    """Probe the lidar at a serial port or tcp/HOST:PORT with all kinds of drivers."""
     if device.startswith("tcp/"):
         kinds = ("hokuyo",)
     heard = []
     for kind in kinds:
-        answer = _first("lidar", {"kind": kind, "device": device}, device, Scan, LIDAR_S[kind])
-        if isinstance(answer, Found):
+        answer = _first_message(
+            "lidar", {"kind": kind, "device": device}, device, Scan, LIDAR_TIMEOUT_S[kind]
+        )
+        if isinstance(answer, FoundSensor):
             return answer
-        heard.append(f"{kind}: {answer.says}")
-        if "cannot be opened" in answer.says or "permission" in answer.says:
-            break  # it is the same for all kinds
-    return Silent(device, "; ".join(heard))
+        heard.append(f"{kind}: {answer.status}")
+        if "cannot be opened" in answer.status or "permission" in answer.status:
+            break  # independent of the kind
+    return NoAnswer(device, "; ".join(heard))
 
 
-def answers_of(
-    places: Iterable[str], find: Callable[[str], Found | Silent], say: Callable[[str], None]
-) -> list[Found]:
-    """What answers at any of the places; `say` hears of each what it is."""
+def probe_all(
+    devices: Iterable[str], find: Callable[[str], FoundSensor | NoAnswer], say: Callable[[str], None]
+) -> list[FoundSensor]:
+    """Return the sensors that answer; `say` is called with a line of progress for each device."""
     found = []
-    for place in places:
-        say(f"trying {place} ...")
-        answer = find(place)
-        say(f"  {answer.says}")
-        if isinstance(answer, Found):
+    for device in devices:
+        say(f"trying {device} ...")
+        answer = find(device)
+        say(f"  {answer.status}")
+        if isinstance(answer, FoundSensor):
             found.append(answer)
     return found
 
 
-def _first(
-    service: str, options: dict[str, Any], where: str, wanted: type[Message], patience_s: float
-) -> Found | Silent:
-    with messages(service, options, wanted) as stream:
-        deadline = time.monotonic() + patience_s
-        for message, says in stream:
+def _first_message(
+    service: str, options: dict[str, Any], where: str, wanted: type[Message], timeout_s: float
+) -> FoundSensor | NoAnswer:
+    with sensor_messages(service, options, wanted) as stream:
+        deadline = time.monotonic() + timeout_s
+        for message, status in stream:
             if message is not None:
-                return Found(options, says, message)
+                return FoundSensor(options, status, message)
             if time.monotonic() > deadline:
-                return Silent(where, says)
-    return Silent(where, "it has ended")
+                return NoAnswer(where, status)
+    return NoAnswer(where, "the stream has ended")
 
 
 @contextmanager
-def messages(
+def sensor_messages(
     service: str, options: dict[str, Any], wanted: type[Message]
 ) -> Iterator[Iterator[tuple[Message | None, str]]]:
-    """What a sensor's node says, (message or None, its status), as long as it is looked at.
+    """Run a sensor's node and iterate over (message or None, status).
 
     Raises:
-        UserError: options that do not fit.
+        UserError: invalid options.
     """
     node = make_node(NODES[service], options, "setup")
     try:
@@ -116,18 +122,18 @@ def messages(
         node.close()
 
 
-class Watched:
-    """A sensor that is read in a thread of its own, so that the next message is one of now."""
+class SensorStream:
+    """Reads a sensor in a thread, so that `next` returns a current message."""
 
     def __init__(self, service: str, options: dict[str, Any], wanted: type[Message]) -> None:
         self._service = service
         self._changed = threading.Condition()
         self._message: Message | None = None
-        self._says = ""
+        self._status = ""
         self._ended = False
         self._thread = threading.Thread(target=self._read, args=(options, wanted), daemon=True)
 
-    def __enter__(self) -> Watched:
+    def __enter__(self) -> SensorStream:
         self._thread.start()
         return self
 
@@ -136,24 +142,24 @@ class Watched:
         self._thread.join(10.0)
 
     def _read(self, options: dict[str, Any], wanted: type[Message]) -> None:
-        with messages(self._service, options, wanted) as stream:
-            for message, says in stream:
+        with sensor_messages(self._service, options, wanted) as stream:
+            for message, status in stream:
                 if self._ended:
                     return
-                self._says = says
+                self._status = status
                 if message is not None:
                     with self._changed:
                         self._message = message
                         self._changed.notify_all()
 
-    def next(self, patience_s: float = 20.0) -> Any:
-        """The first message that comes from now on.
+    def next(self, timeout_s: float = 20.0) -> Any:
+        """Wait for the first message from now on, and return it.
 
         Raises:
-            UserError: none comes.
+            UserError: none arrives within `timeout_s`.
         """
         with self._changed:
             self._message = None
-            if not self._changed.wait_for(lambda: self._message is not None, patience_s):
-                raise UserError(f"{self._service}: says nothing any more: {self._says}")
+            if not self._changed.wait_for(lambda: self._message is not None, timeout_s):
+                raise UserError(f"{self._service}: no message for {timeout_s:g} s: {self._status}")
             return self._message

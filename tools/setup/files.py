@@ -1,4 +1,4 @@
-"""The two files that setup writes: robot.toml, the deployment, and rig.toml, the calibration."""
+"""Texts of the two files that setup writes: robot.toml (deployment) and rig.toml (calibration)."""
 
 from __future__ import annotations
 
@@ -10,35 +10,35 @@ import numpy as np
 
 from beamsplat.common.geometry.frames import camera_mount, lidar_mount
 from beamsplat.common.geometry.rig import CameraSection, LidarSection, Mount, RigFile, format_rig
-from beamsplat.tools.setup.lens import Lens
+from beamsplat.tools.setup.intrinsics import CameraIntrinsics
 
-_HEADER = """Calibration of one robot, by `beamsplat setup`: where camera and lidar sit, how the camera sees.
-The body frame lies on the floor between the wheels: x forward, y left, z up. Metres and degrees.
+_HEADER = """Calibration of one robot, by `beamsplat setup`: mounts of the sensors, camera intrinsics.
+The body frame is on the floor between the wheels: x forward, y left, z up. Metres and degrees.
 rpy_deg = [roll, pitch, yaw]: zero is level and straight ahead; positive pitch looks down,
-positive yaw to the left."""
+positive yaw turns to the left."""
 
 
 @dataclass(frozen=True)
-class Place:
-    """Where a sensor sits, as one measures it with a tape."""
+class MeasuredMount:
+    """The mount of a sensor as measured with a tape."""
 
     forward_m: float
     left_m: float
     up_m: float
-    down_deg: float = 0.0  # how far it looks down
-    left_deg: float = 0.0  # how far it is turned to the left
+    down_deg: float = 0.0  # pitch, positive down
+    left_deg: float = 0.0  # yaw, positive left
 
-    def camera(self) -> np.ndarray:
-        """`T_body_camera` [4, 4]."""
+    def T_body_camera(self) -> np.ndarray:
+        """Return the mount of a camera, float64 [4, 4]."""
         return camera_mount(self.forward_m, self.left_m, self.up_m, pitch_down_rad=np.radians(self.down_deg))
 
-    def lidar(self) -> np.ndarray:
-        """`T_body_lidar` [4, 4]."""
+    def T_body_lidar(self) -> np.ndarray:
+        """Return the mount of a lidar, float64 [4, 4]."""
         return lidar_mount(self.forward_m, self.left_m, self.up_m, yaw_left_rad=np.radians(self.left_deg))
 
 
-def camera_file(lens: Lens, T_body_camera: np.ndarray) -> CameraSection:
-    """[camera] of a calibrated lens."""
+def camera_section(lens: CameraIntrinsics, T_body_camera: np.ndarray) -> CameraSection:
+    """Return the section [camera] of a rig file."""
     K = np.round(lens.K, 4)
     return CameraSection(
         width_px=lens.size_px[0], height_px=lens.size_px[1], fx_px=float(K[0, 0]), fy_px=float(K[1, 1]),
@@ -47,8 +47,10 @@ def camera_file(lens: Lens, T_body_camera: np.ndarray) -> CameraSection:
     )  # fmt: skip
 
 
-def rig_text(camera: CameraSection | None, T_body_lidar: np.ndarray, assumed: tuple[str, ...], note: str) -> str:
-    """Text of rig.toml; `note` says how the camera was calibrated."""
+def rig_text(
+    camera: CameraSection | None, T_body_lidar: np.ndarray, assumed: tuple[str, ...], note: str
+) -> str:
+    """Return the text of rig.toml; `note` is a comment on how the camera was calibrated."""
     rig = RigFile(
         camera=camera,
         lidar=LidarSection(mount=Mount.of(T_body_lidar)),
@@ -59,7 +61,7 @@ def rig_text(camera: CameraSection | None, T_body_lidar: np.ndarray, assumed: tu
 
 
 def robot_text(robot: str, rig: str, camera: dict[str, Any] | None, lidar: dict[str, Any]) -> str:
-    """Text of robot.toml: the sensors' nodes with these options, and what makes a map of them."""
+    """Return the text of robot.toml: the sensors with these options, and the nodes that make a map."""
     sections: list[tuple[str, dict[str, Any]]] = [
         ("camera", {"kind": "none", "rig": rig} if camera is None else {**camera, "rig": rig}),
         ("lidar", lidar),

@@ -1,4 +1,4 @@
-"""Pictures and scans as text, for terminals without a screen behind them."""
+"""Show images and scans as text, for machines without a display."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ from rich.color import Color
 from rich.style import Style
 from rich.text import Text
 
-_HALF = "▀"  # upper half in the foreground's colour, lower half in the background's
+_HALF = "▀"  # upper half in the foreground colour, lower half in the background colour
 _CHARACTER = 2.0  # height of a character over its width
-_RANGES_M = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
+_RANGES_M = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)  # half widths of the scan view
 
 
-def picture_text(
+def image_text(
     bgr: np.ndarray,  # uint8 [H, W, 3]
     columns: int,
 ) -> Text:
-    """A picture, two pixels a character."""
+    """Return an image as coloured text, two pixels per character."""
     rows = max(round(bgr.shape[0] / bgr.shape[1] * columns / _CHARACTER), 1)
     small = cv2.resize(bgr, (columns, 2 * rows), interpolation=cv2.INTER_AREA)[..., ::-1]
     text = Text(no_wrap=True)
@@ -30,11 +30,13 @@ def picture_text(
 
 
 def scan_text(
-    points_m: np.ndarray,  # float [N, 2]: ahead, left
+    points_m: np.ndarray,  # float [N, 2]: x forward, y left
     columns: int,
 ) -> Text:
-    """A scan from above: ahead is up, the lidar is ^. The scale is the least of 1, 2, 4 ... m that shows nine
-    points of ten."""
+    """Return a scan seen from above: forward is up, the lidar is ^.
+
+    The scale is the smallest of 1, 2, 4 ... m that shows 90 % of the points.
+    """
     half = columns // 2
     rows = round(half / _CHARACTER)
     far_m = float(np.quantile(np.abs(points_m), 0.9)) if len(points_m) else 1.0
@@ -46,4 +48,4 @@ def scan_text(
     cells[row[seen], column[seen]] = "·"
     cells[rows, half] = "^"
     lines = ["".join(line).rstrip() for line in cells]
-    return Text("\n".join([*lines, f"(from the middle to the edge: {reach_m:g} m)"]), no_wrap=True)
+    return Text("\n".join([*lines, f"(from the centre to the edge: {reach_m:g} m)"]), no_wrap=True)

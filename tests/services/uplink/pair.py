@@ -17,7 +17,7 @@ from beamsplat.common.config.deployment import Deployment, RouterConfig
 from beamsplat.common.mapfiles.session import SessionFolder
 from beamsplat.common.security.access_control import HostRole
 from beamsplat.common.security.keys import SecurityConfig
-from beamsplat.tools.keys.pki import Authority
+from beamsplat.tools.keys.pki import CertificateAuthority
 from tests.services.uplink.radio import FAR_ADDRESS, ROOT
 
 PORT = 7448
@@ -92,7 +92,7 @@ class BadLinkPair:
 
     def __init__(self, radio, folder, data, *, duration_s=None, mapping=LIGHT, rate=RATE):
         self._radio, self._folder = radio, folder
-        authority = Authority.create(folder / "authority")
+        authority = CertificateAuthority.create(folder / "authority")
         edge_keys = authority.issue("edge", HostRole(role="edge"), (FAR_ADDRESS,))
         robot_keys = authority.issue("r1", HostRole(role="robot", robot="r1"))
         self.session = folder / "session"

@@ -17,7 +17,7 @@ from beamsplat.common.topics import TOPICS
 from beamsplat.common.zenoh.bus import open_session
 from beamsplat.services.nodes import NODES
 from beamsplat.services.uplink.node import UplinkConfig, UplinkNode
-from beamsplat.tools.keys.pki import Authority
+from beamsplat.tools.keys.pki import CertificateAuthority
 from beamsplat.tools.system.assembly import faults, surroundings
 from beamsplat.tools.system.health_table import HealthBoard
 from beamsplat.tools.system.supervisor import Supervisor
@@ -159,7 +159,7 @@ def test_the_robot_starts_without_an_edge_and_an_edge_that_is_killed_goes_on_fro
 
 @pytest.mark.slow
 def test_behind_locked_doors_everything_flows_until_the_robot_is_removed(tmp_path):
-    authority = Authority.create(tmp_path / "authority")
+    authority = CertificateAuthority.create(tmp_path / "authority")
     keys = {"edge": authority.issue("edge", HostRole(role="edge"), ("127.0.0.1",))}
     robot = HostRole(role="robot", robot="r1")
     keys["robot"] = shutil.copytree(authority.issue("r1", robot), tmp_path / "keys")

@@ -1,4 +1,4 @@
-"""`doctor --security`: every refusal that Zenoh keeps to itself has its sentence here."""
+"""`doctor --security` reports the reason of every refused link, which Zenoh does not."""
 
 import pytest
 
@@ -6,14 +6,14 @@ from beamsplat.common.config.deployment import Deployment, RouterConfig
 from beamsplat.common.security.access_control import HostRole
 from beamsplat.common.security.keys import KEY, SecurityConfig
 from beamsplat.common.zenoh.bus import open_router
-from beamsplat.tools.keys.link_diagnosis import examine_security
-from beamsplat.tools.keys.pki import Authority
+from beamsplat.tools.keys.link_diagnosis import diagnose_security
+from beamsplat.tools.keys.pki import CertificateAuthority
 from tests.conftest import free_port
 
 
 @pytest.fixture(scope="module")
 def authority(tmp_path_factory):
-    made = Authority.create(tmp_path_factory.mktemp("authority"))
+    made = CertificateAuthority.create(tmp_path_factory.mktemp("authority"))
     made.issue("edge", HostRole(role="edge"), ("127.0.0.1",))
     made.issue("r1", HostRole(role="robot", robot="r1"))
     return made
@@ -32,25 +32,25 @@ def robot(endpoint, keys):
 
 def faults(deployment):
     return [
-        text for _, verdict, text, remedy in examine_security(deployment) if verdict == "fault" and remedy
+        text for _, verdict, text, remedy in diagnose_security(deployment) if verdict == "fault" and remedy
     ]
 
 
 def test_a_good_link_is_said_to_be_good(authority, door):
-    remarks = list(examine_security(robot(door, authority.folder / "hosts" / "r1")))
-    assert any(v == "ok" and "takes this host's certificate" in text for _, v, text, _ in remarks)
+    remarks = list(diagnose_security(robot(door, authority.folder / "hosts" / "r1")))
+    assert any(v == "ok" and "accepts this host's certificate" in text for _, v, text, _ in remarks)
     assert any("r1: valid for" in text for _, _, text, _ in remarks)
     assert not faults(robot(door, authority.folder / "hosts" / "r1"))
 
 
 def test_another_authority_on_either_side(authority, door, tmp_path):
-    other = Authority.create(tmp_path)
+    other = CertificateAuthority.create(tmp_path)
     folder = other.issue("r1", HostRole(role="robot", robot="r1"))
-    assert any("the edge's certificate is not good" in text for text in faults(robot(door, folder)))
+    assert any("the edge's certificate is not valid" in text for text in faults(robot(door, folder)))
     (folder / "ca.pem").write_bytes((authority.folder / "ca.pem").read_bytes())
     found = faults(robot(door, folder))
     assert any("was not issued by" in text for text in found)
-    assert any("refuses this host's certificate" in text for text in found)
+    assert any("rejects this host's certificate" in text for text in found)
 
 
 def test_another_address_than_the_certificate_names(authority, door):
@@ -62,7 +62,7 @@ def test_another_address_than_the_certificate_names(authority, door):
 def test_nobody_there_and_no_such_name(authority):
     keys = authority.folder / "hosts" / "r1"
     assert any("cannot be reached" in text for text in faults(robot(f"tls/127.0.0.1:{free_port()}", keys)))
-    assert any("no known name" in text for text in faults(robot("tls/nowhere.invalid:7448", keys)))
+    assert any("cannot be resolved" in text for text in faults(robot("tls/nowhere.invalid:7448", keys)))
 
 
 def test_missing_readable_and_unprotected(authority, tmp_path):
@@ -72,7 +72,7 @@ def test_missing_readable_and_unprotected(authority, tmp_path):
     assert any("is missing" in t for t in faults(robot("tls/127.0.0.1:1", tmp_path)))
     open_door = Deployment(router=RouterConfig(listen=("tcp/0.0.0.0:7447",)))
     assert any("unprotected" in t for t in faults(open_door))
-    remarks = list(examine_security(open_door.model_copy(update={"security": SecurityConfig(plain=True)})))
+    remarks = list(diagnose_security(open_door.model_copy(update={"security": SecurityConfig(plain=True)})))
     assert [verdict for _, verdict, _, _ in remarks] == ["note"]
     folder = authority.issue("loose", HostRole(role="robot", robot="loose"))
     (folder / KEY).chmod(0o644)
@@ -84,12 +84,12 @@ def test_the_edge_lists_what_each_host_may(authority):
         router=RouterConfig(listen=("tcp/127.0.0.1:1", "tls/0.0.0.0:2")),
         security=SecurityConfig(keys=authority.folder / "hosts" / "edge"),
     )
-    texts = [text for _, _, text, _ in examine_security(edge)]
+    texts = [text for _, _, text, _ in diagnose_security(edge)]
     assert any(text == "r1: robot of r1" for text in texts)
     assert any("edge: edge of all robots" in text for text in texts)
 
 
 def test_a_certificate_about_to_expire_is_noted(authority, door):
     folder = authority.issue("brief", HostRole(role="robot", robot="brief"), days=3)
-    remarks = list(examine_security(robot(door, folder)))
+    remarks = list(diagnose_security(robot(door, folder)))
     assert any(v == "note" and "expires in 3 days" in text for _, v, text, _ in remarks)

@@ -1,4 +1,4 @@
-"""Locked doors: who may open a link to an edge's router, and what each may then do. Real certificates."""
+"""Access control of an edge's router with real certificates: which hosts may connect, and what each may do."""
 
 import contextlib
 import subprocess
@@ -24,7 +24,7 @@ from beamsplat.common.topics import TOPICS, topic
 from beamsplat.common.zenoh.bridge import Bridge, BridgeSessions
 from beamsplat.common.zenoh.bus import Bus, open_link, open_router, open_session
 from beamsplat.common.zenoh.streams import declare_subscription, decode_sample
-from beamsplat.tools.keys.pki import Authority, expiry, openssl
+from beamsplat.tools.keys.pki import CertificateAuthority, expiry, openssl
 from tests.common.polling import publish_until_received
 from tests.common.samples import sample_messages
 from tests.conftest import free_port
@@ -34,7 +34,7 @@ NAMES = {"edge": "edge", "r1": "robot", "r2": "robot", "watcher": "monitor", "ch
 
 @pytest.fixture(scope="module")
 def authority(tmp_path_factory):
-    made = Authority.create(tmp_path_factory.mktemp("authority"))
+    made = CertificateAuthority.create(tmp_path_factory.mktemp("authority"))
     for name, role in NAMES.items():
         host = HostRole(role=role, robot=name if role == "robot" else "*")
         made.issue(name, host, ("127.0.0.1", "localhost") if role == "edge" else ())
@@ -43,7 +43,7 @@ def authority(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def edge(authority):
-    """(endpoint for this host's processes, endpoint for others) of a router that guards its door."""
+    """(endpoint for this host's processes, endpoint for others) of a router with access control."""
     near, far = f"tcp/127.0.0.1:{free_port()}", f"tls/127.0.0.1:{free_port()}"
     with open_router((near, far), security=SecurityConfig(keys=authority.folder / "hosts" / "edge")):
         yield near, far
@@ -68,7 +68,7 @@ def hear(session, pattern):
     return heard, kept
 
 
-# --- the door ---
+# --- authentication ---
 
 
 def test_a_host_with_a_certificate_comes_in(authority, edge):
@@ -106,7 +106,7 @@ def test_without_a_certificate_nobody_comes_in(authority, edge, tmp_path):
 
 
 def test_a_certificate_of_another_authority_opens_nothing(authority, edge, tmp_path):
-    other = Authority.create(tmp_path / "other")
+    other = CertificateAuthority.create(tmp_path / "other")
     other.issue("r1", HostRole(role="robot", robot="r1"))
     folder = copy(other, "r1", tmp_path / "r1")
     refused(edge, folder)  # neither side knows the other's authority
@@ -256,8 +256,8 @@ def test_every_topic_crosses_a_guarded_door_with_what_was_said_before(authority,
 
 
 def test_a_robot_without_a_rule_is_let_in_but_can_do_nothing(authority, tmp_path):
-    """Removed from the policy: its certificate is still good, but says nothing any more."""
-    made = Authority.create(tmp_path / "authority")
+    """Removed from the policy: its certificate is still valid, but gives no access."""
+    made = CertificateAuthority.create(tmp_path / "authority")
     made.issue("edge", HostRole(role="edge"), ("127.0.0.1",))
     made.issue("r1", HostRole(role="robot", robot="r1"))
     folder = copy(made, "r1", tmp_path / "r1")
@@ -283,7 +283,7 @@ def test_a_robot_without_a_rule_is_let_in_but_can_do_nothing(authority, tmp_path
 
 
 def test_renewed_keys_replace_the_old_and_the_policy_stays(authority, tmp_path):
-    made = Authority.create(tmp_path)
+    made = CertificateAuthority.create(tmp_path)
     folder = made.issue("r1", HostRole(role="robot", robot="r1"), days=1)
     before = {name: (folder / name).read_bytes() for name in (KEY, CERTIFICATE)}
     made.issue("r1", HostRole(role="robot", robot="r1"), days=30)
@@ -292,13 +292,13 @@ def test_renewed_keys_replace_the_old_and_the_policy_stays(authority, tmp_path):
     assert list(made.hosts()) == ["r1"]
     assert "OK" in openssl("verify", "-CAfile", str(made.folder / CA), str(folder / CERTIFICATE))
     with pytest.raises(UserError, match="never replaced"):
-        Authority.create(tmp_path)
+        CertificateAuthority.create(tmp_path)
     with pytest.raises(UserError, match="no host 'r2'"):
         made.remove("r2")
     with pytest.raises(UserError, match="--address"):
         made.issue("edge", HostRole(role="edge"))
-    with pytest.raises(UserError, match="holds no authority"):
-        Authority(tmp_path / "hosts")
+    with pytest.raises(UserError, match="contains no authority"):
+        CertificateAuthority(tmp_path / "hosts")
 
 
 def test_a_policy_that_makes_no_sense_is_refused(tmp_path):
@@ -320,7 +320,7 @@ def test_everything_in_the_policy_comes_from_the_topic_table():
 
 
 def test_openssl_says_why_it_refuses(tmp_path):
-    with pytest.raises(UserError, match="openssl x509 refuses"):
+    with pytest.raises(UserError, match="openssl x509 failed"):
         openssl("x509", "-in", str(tmp_path / "nothing"))
     assert subprocess.run(["openssl", "version"], capture_output=True, check=True).stdout
     assert Path(tmp_path).exists()

@@ -8,7 +8,7 @@ import socket
 import pytest
 import serial
 
-from beamsplat.tools.setup.device_access import User, examine_devices, wanted_devices
+from beamsplat.tools.setup.device_access import UserAccount, diagnose_devices, wanted_devices
 
 GROUP = grp.getgrgid(os.getgid()).gr_name
 
@@ -21,7 +21,7 @@ def dev(tmp_path):
 
 
 def _say(dev, wanted, user, right=False):
-    return {r.subject: r for r in examine_devices(wanted, dev, user, lambda path: right)}
+    return {r.subject: r for r in diagnose_devices(wanted, dev, user, lambda path: right)}
 
 
 def test_the_devices_a_deployment_names():
@@ -33,40 +33,52 @@ def test_the_devices_a_deployment_names():
 
 
 def test_a_user_outside_the_group_is_told_how_to_get_in(dev):
-    said = _say(dev, [("lidar.device", str(dev / "ttyUSB0"))], User("ann", frozenset(), frozenset()))
-    lidar = said[str(dev / "ttyUSB0")]
+    reported = _say(
+        dev, [("lidar.device", str(dev / "ttyUSB0"))], UserAccount("ann", frozenset(), frozenset())
+    )
+    lidar = reported[str(dev / "ttyUSB0")]
     assert lidar.verdict == "fault"
     assert f"belongs to the group {GROUP}, in which ann is not" in lidar.text
     assert lidar.remedy.startswith(f"sudo usermod -aG {GROUP} ann")
-    assert said[str(dev / "video0")].verdict == "note"  # nobody asked for it
+    assert reported[str(dev / "video0")].verdict == "note"  # nobody asked for it
 
 
 def test_a_user_who_must_log_in_again_is_told_so(dev):
-    said = _say(dev, [("camera.source", str(dev / "video0"))], User("ann", frozenset(), frozenset({GROUP})))
-    assert "not yet in this session" in said[str(dev / "video0")].text
-    assert "log out and in again" in said[str(dev / "video0")].remedy
+    reported = _say(
+        dev, [("camera.source", str(dev / "video0"))], UserAccount("ann", frozenset(), frozenset({GROUP}))
+    )
+    assert "not yet in this session" in reported[str(dev / "video0")].text
+    assert "log out and in again" in reported[str(dev / "video0")].remedy
 
 
 def test_a_group_without_the_right(dev):
-    said = _say(dev, [("camera.source", str(dev / "video0"))], User("ann", frozenset({GROUP}), frozenset()))
-    assert "udev rule" in said[str(dev / "video0")].remedy
+    reported = _say(
+        dev, [("camera.source", str(dev / "video0"))], UserAccount("ann", frozenset({GROUP}), frozenset())
+    )
+    assert "udev rule" in reported[str(dev / "video0")].remedy
 
 
 def test_all_well_and_its_lasting_name(dev):
     (dev / "serial" / "by-id").mkdir(parents=True)
     (dev / "serial" / "by-id" / "usb-Silicon_Labs_CP2102").symlink_to(dev / "ttyUSB0")
-    said = _say(
-        dev, [("lidar.device", str(dev / "ttyUSB0"))], User("ann", frozenset(), frozenset()), right=True
+    reported = _say(
+        dev,
+        [("lidar.device", str(dev / "ttyUSB0"))],
+        UserAccount("ann", frozenset(), frozenset()),
+        right=True,
     )
-    assert said[str(dev / "ttyUSB0")].verdict == "ok"
-    assert "usb-Silicon_Labs_CP2102" in said[str(dev / "ttyUSB0")].text
+    assert reported[str(dev / "ttyUSB0")].verdict == "ok"
+    assert "usb-Silicon_Labs_CP2102" in reported[str(dev / "ttyUSB0")].text
 
 
 def test_a_missing_device_names_those_there_are(dev):
-    said = _say(
-        dev, [("lidar.device", str(dev / "ttyUSB7"))], User("ann", frozenset(), frozenset()), right=True
+    reported = _say(
+        dev,
+        [("lidar.device", str(dev / "ttyUSB7"))],
+        UserAccount("ann", frozenset(), frozenset()),
+        right=True,
     )
-    missing = said[str(dev / "ttyUSB7")]
+    missing = reported[str(dev / "ttyUSB7")]
     assert missing.verdict == "fault"
     assert str(dev / "ttyUSB0") in missing.remedy
 
@@ -76,11 +88,11 @@ def test_a_port_that_another_program_holds(tmp_path):
     try:
         (tmp_path / "ttyUSB0").symlink_to(os.ttyname(slave))
         wanted = [("lidar.device", str(tmp_path / "ttyUSB0"))]
-        free = {r.subject: r for r in examine_devices(wanted, tmp_path)}[str(tmp_path / "ttyUSB0")]
+        free = {r.subject: r for r in diagnose_devices(wanted, tmp_path)}[str(tmp_path / "ttyUSB0")]
         assert free.verdict == "ok"
         with serial.Serial(str(tmp_path / "ttyUSB0"), exclusive=True):
-            held = {r.subject: r for r in examine_devices(wanted, tmp_path)}[str(tmp_path / "ttyUSB0")]
-        assert (held.verdict, held.text) == ("fault", "is held by another program")
+            held = {r.subject: r for r in diagnose_devices(wanted, tmp_path)}[str(tmp_path / "ttyUSB0")]
+        assert (held.verdict, held.text) == ("fault", "is in use by another program")
     finally:
         os.close(master)
         os.close(slave)
@@ -89,10 +101,10 @@ def test_a_port_that_another_program_holds(tmp_path):
 def test_network_lidars(tmp_path):
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
-        (answers,) = examine_devices([("camera.source", f"tcp/127.0.0.1:{port}")], tmp_path)
+        (answers,) = diagnose_devices([("camera.source", f"tcp/127.0.0.1:{port}")], tmp_path)
     assert answers.verdict == "ok"
-    (silent,) = examine_devices([("camera.source", f"tcp/127.0.0.1:{port}")], tmp_path)
+    (silent,) = diagnose_devices([("camera.source", f"tcp/127.0.0.1:{port}")], tmp_path)
     assert silent.verdict == "fault"
     assert "cable and power" in silent.remedy
-    (wrong,) = examine_devices([("camera.source", "tcp/lidar")], tmp_path)
+    (wrong,) = diagnose_devices([("camera.source", "tcp/lidar")], tmp_path)
     assert "tcp/HOST:PORT" in wrong.remedy

@@ -15,8 +15,8 @@ from beamsplat.common.geometry.rig import load_rig
 from beamsplat.common.geometry.transforms import se3_to_se2
 from beamsplat.common.zenoh.bus import open_session
 from beamsplat.tools.system.health_table import HealthBoard
-from tests.services.lidar.devices import Plugged
-from tests.tools.setup.bench import (
+from tests.services.lidar.devices import EmulatedPort
+from tests.tools.setup.emulated_desk import (
     T_BODY_CAMERA,
     T_BODY_LIDAR,
     Desk,
@@ -27,7 +27,7 @@ from tests.tools.setup.bench import (
 )
 
 pexpect = pytest.importorskip("pexpect", reason="needs pexpect: pip install -e '.[dev]'")
-COMMAND = [sys.executable, "-m", "services"]
+COMMAND = [sys.executable, "-m", "beamsplat"]
 BOARDS = 6
 
 
@@ -40,7 +40,7 @@ def environment(tmp_path):
 def test_from_what_is_plugged_in_to_a_system_that_runs(tmp_path, environment, free_endpoint):
     robot, rig, lidar = (tmp_path / name for name in ("robot.toml", "rig.toml", "ttyUSB0"))
     desk = Desk(24, boards_before_the_lidar(BOARDS))
-    with DeskCamera(desk) as camera, Plugged(DeskLidar(desk), str(lidar)):
+    with DeskCamera(desk) as camera, EmulatedPort(DeskLidar(desk), str(lidar)):
         arguments = ["setup", "--out", str(robot), "--rig", str(rig), "--camera", camera.url,
                      "--device", str(tmp_path / "nothing"), "--device", str(lidar)]  # fmt: skip
         child = pexpect.spawn(
@@ -55,15 +55,15 @@ def test_from_what_is_plugged_in_to_a_system_that_runs(tmp_path, environment, fr
         child.expect("480x360 pixels")
         child.expect("nothing.*No such file")
         child.expect("LDROBOT")
-        child.expect("from the middle to the edge: 4 m")
-        _answer(child, "head down", "n")
+        child.expect("from the centre to the edge: 4 m")
+        _answer(child, "upside down", "n")
         for question, answer in (("forward", ""), ("left", ""), ("up", ""), ("looks down", "5")):
             _answer(child, f"camera: {question}", answer)
         for question, answer in (("forward", "0.03"), ("left", ""), ("up", ""), ("turned to the left", "")):
             _answer(child, f"lidar: {question}", answer)
         _answer(child, "printed chessboard", "y")
         _answer(child, "Side of a square", "")
-        _answer(child, "Hold it before the camera", "")
+        _answer(child, "Hold it in front of the camera", "")
         child.expect("view 12 of 12", timeout=200)
         child.expect(r"reprojection error (\d\.\d+) px over 12 views")
         assert float(child.match[1]) < 0.3
@@ -73,7 +73,7 @@ def test_from_what_is_plugged_in_to_a_system_that_runs(tmp_path, environment, fr
             desk.hold(number)
             time.sleep(0.5)  # what both see then is this board
             child.sendline("")
-            child.expect("taken, 0.[67]")
+            child.expect("accepted, distance 0.[67]")
         child.expect(r"turned by (\d\.\d+) degrees, \+- (\d\.\d+)")
         child.expect("fits together")
         child.expect(pexpect.EOF)

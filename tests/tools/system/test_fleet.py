@@ -15,7 +15,7 @@ from beamsplat.common.messages.header import Header
 from beamsplat.common.security.access_control import HostRole
 from beamsplat.common.security.keys import SecurityConfig
 from beamsplat.common.zenoh.bus import open_session
-from beamsplat.tools.keys.pki import Authority
+from beamsplat.tools.keys.pki import CertificateAuthority
 from beamsplat.tools.system.health_table import ALL, HealthBoard
 from beamsplat.tools.system.supervisor import Supervisor
 from tests.conftest import free_port
@@ -45,7 +45,7 @@ def robot_side(name, tmp_path, keys, door, pictures):
 
 @pytest.mark.slow
 def test_five_robots_on_one_edge_hear_nothing_of_each_other(tmp_path):
-    authority = Authority.create(tmp_path / "authority")
+    authority = CertificateAuthority.create(tmp_path / "authority")
     edge_keys = authority.issue("edge", HostRole(role="edge"), ("127.0.0.1",))
     inner, door = f"tcp/127.0.0.1:{free_port()}", f"tls/127.0.0.1:{free_port()}"
     keys = {

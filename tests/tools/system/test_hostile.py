@@ -19,7 +19,7 @@ from beamsplat.common.topics import topic
 from beamsplat.common.zenoh.bus import open_session
 from beamsplat.common.zenoh.streams import decode_sample
 from beamsplat.services.nodes import NODES
-from beamsplat.tools.keys.pki import Authority
+from beamsplat.tools.keys.pki import CertificateAuthority
 from beamsplat.tools.system.health_table import HealthBoard
 from beamsplat.tools.system.supervisor import Supervisor
 from tests.conftest import free_port
@@ -58,7 +58,7 @@ class Latency:
 @pytest.fixture
 def attacked(tmp_path, shared_dir):
     """Robot and edge behind mutual TLS; the robot localizes a recorded drive, round and round."""
-    authority = Authority.create(tmp_path / "authority")
+    authority = CertificateAuthority.create(tmp_path / "authority")
     edge_keys = authority.issue("edge", HostRole(role="edge"), ("127.0.0.1",))
     robot_keys = shutil.copytree(authority.issue("r1", HostRole(role="robot", robot="r1")), tmp_path / "keys")
     near, inner, far = (free_port() for _ in range(3))
@@ -128,4 +128,4 @@ def test_a_flood_of_garbage_by_a_robots_own_certificate_is_counted_and_contained
     assert bad(board, "mapping") > 0.1 * sent / 4
     assert all(c.restarts == 0 for s in supervisors for c in s.children.values())
     assert board.states()["mapping"] == "active"
-    assert "health reports too many" in board.records["uplink"].health.detail
+    assert "health reports rejected" in board.records["uplink"].health.detail

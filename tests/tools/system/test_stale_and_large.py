@@ -21,7 +21,7 @@ from beamsplat.common.security.keys import SecurityConfig
 from beamsplat.common.topics import LIMIT_KB, TOPICS, topic
 from beamsplat.common.zenoh.bus import Bus, open_link, open_router, open_session
 from beamsplat.common.zenoh.streams import decode_sample
-from beamsplat.tools.keys.pki import Authority
+from beamsplat.tools.keys.pki import CertificateAuthority
 from tests.common.nodes import Sink
 from tests.conftest import free_port
 from tests.tools.keys.test_security import wait
@@ -32,7 +32,7 @@ POSE = "localization/odometry"
 
 @pytest.fixture(scope="module")
 def keys(tmp_path_factory):
-    made = Authority.create(tmp_path_factory.mktemp("authority"))
+    made = CertificateAuthority.create(tmp_path_factory.mktemp("authority"))
     made.issue("edge", HostRole(role="edge"), ("127.0.0.1",))
     made.issue("r1", HostRole(role="robot", robot="r1"))
     return made.folder / "hosts"
@@ -185,9 +185,7 @@ def test_what_is_too_large_for_its_topic_is_refused_before_it_is_decoded(keys, e
         large = bytes(TOPICS[POSE].limit_kb * 1000 + 1)
         hostile.put(sample.key_expr, large, encoding=sample.encoding, attachment=sample.attachment)
         wait(lambda: listener.why)
-        assert listener.why == [
-            "0.1 MB on localization/odometry, the limit is 0.064 MB (common/topics.py)"
-        ]
+        assert listener.why == ["0.1 MB on localization/odometry, the limit is 0.064 MB (common/topics.py)"]
         assert listener.taken() == 1
 
 

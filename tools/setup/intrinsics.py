@@ -1,4 +1,4 @@
-"""How a camera sees, from pictures of a chessboard: focal lengths, centre, distortion, with their errors."""
+"""Calibrate a camera's intrinsics and distortion, with standard errors, from images of a chessboard."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ from typing import Any
 import cv2
 import numpy as np
 
-from beamsplat.tools.setup.pattern import Board
+from beamsplat.tools.setup.chessboard import Chessboard
 
-VIEWS = 12
-_FIND_WIDTH_PX = 960  # corners are looked for in a picture so wide, and refined in the whole one
-_NEW = 0.05  # of the picture's width: corners must lie so far from all earlier ones on the average
-_GOOD_RMS_PX = 1.0
-_GROUPS = 3
-_FEWEST = 6
+VIEWS = 12  # wanted
+_FIND_WIDTH_PX = 960  # corners are searched at this width, and refined in the full image
+_MIN_CORNER_SHIFT = 0.05  # mean distance from the corners of earlier views, as a ratio of the image width
+_GOOD_RMS_PX = 1.0  # largest acceptable reprojection error
+_JACKKNIFE_GROUPS = 3
+_MIN_VIEWS = 6  # for a solution
 
 
 @dataclass(frozen=True)
-class Lens:
-    """K and distortion (plumb bob) with standard errors, and how well the corners fit."""
+class CameraIntrinsics:
+    """K and distortion (plumb bob) with the standard error of the focal length and the reprojection error."""
 
     size_px: tuple[int, int]  # width, height
     K: np.ndarray  # float64 [3, 3]
@@ -30,15 +30,15 @@ class Lens:
     views: int
 
     @property
-    def good(self) -> bool:
-        """Whether it may be used."""
+    def is_good(self) -> bool:
+        """Whether reprojection error and relative standard error (2 %) are within the limits."""
         return self.rms_px < _GOOD_RMS_PX and self.focal_sigma_px < 0.02 * self.K[0, 0]
 
 
-class LensCalibration:
-    """Takes pictures; keeps those that show the board where it has not been yet."""
+class IntrinsicsCalibration:
+    """Collects views of the board at different places in the image and solves for the intrinsics."""
 
-    def __init__(self, board: Board) -> None:
+    def __init__(self, board: Chessboard) -> None:
         self._board = board
         self._grid = np.zeros((board.corners[0] * board.corners[1], 3), np.float32)
         self._grid[:, :2] = np.mgrid[: board.corners[0], : board.corners[1]].T.reshape(-1, 2) * board.square_m
@@ -46,13 +46,13 @@ class LensCalibration:
         self._size_px: tuple[int, int] | None = None
 
     def add(self, grey: np.ndarray) -> str:
-        """Looks at a picture, uint8 [H, W]: "taken", "no board", or "too alike"; all must be of one size."""
+        """Add an image, uint8 [H, W], all of one size; return "taken", "no board", or "too alike"."""
         self._size_px = grey.shape[1], grey.shape[0]
         uv = self._corners(grey)
         if uv is None:
             return "no board"
-        # A board turned by half is the same board: its corners come in the other order.
-        far = _NEW * grey.shape[1]
+        # A board turned by 180 degrees looks the same: its corners are found in reverse order.
+        far = _MIN_CORNER_SHIFT * grey.shape[1]
         for other in self.views:
             if min(np.abs(uv - other).mean(), np.abs(uv[::-1] - other).mean()) < far:
                 return "too alike"
@@ -60,23 +60,21 @@ class LensCalibration:
         return "taken"
 
     def _corners(self, grey: np.ndarray) -> np.ndarray | None:
-        shrink = min(_FIND_WIDTH_PX / grey.shape[1], 1.0)
+        scale = min(_FIND_WIDTH_PX / grey.shape[1], 1.0)
         small = (
-            grey
-            if shrink == 1.0
-            else cv2.resize(grey, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
+            grey if scale == 1.0 else cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
         )
         found, uv = cv2.findChessboardCornersSB(small, self._board.corners, flags=cv2.CALIB_CB_ACCURACY)
         if not found:
             return None
-        uv = (uv.reshape(-1, 2).astype(np.float32) + 0.5) / shrink - 0.5
-        if shrink < 1.0:
+        uv = (uv.reshape(-1, 2).astype(np.float32) + 0.5) / scale - 0.5
+        if scale < 1.0:
             criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 30, 0.01)
             uv = cv2.cornerSubPix(grey, np.ascontiguousarray(uv), (5, 5), (-1, -1), criteria)
         return uv.reshape(-1, 2)
 
     def missing(self) -> str:
-        """Where in the picture the board has not been yet; "" if everywhere."""
+        """Return the corners of the image where the board was not seen yet, as text; "" if none."""
         if self._size_px is None:
             return ""
         names = ("top left", "top right", "bottom left", "bottom right")
@@ -85,26 +83,31 @@ class LensCalibration:
         outer = np.abs(seen - 0.5).max(axis=1) > 0.3
         return ", ".join(name for i, name in enumerate(names) if not np.any((quarter == i) & outer))
 
-    def solve(self) -> Lens:
-        """The lens that explains the views best.
+    def solve(self) -> CameraIntrinsics:
+        """Return the intrinsics that fit the views best.
 
         Raises:
             ValueError: too few views.
         """
-        if len(self.views) < _FEWEST:
+        if len(self.views) < _MIN_VIEWS:
             raise ValueError(
-                f"{len(self.views)} views of the board are too few: at least {_FEWEST}, better {VIEWS}"
+                f"{len(self.views)} views of the board are too few: at least {_MIN_VIEWS}, better {VIEWS}"
             )
         rms, K, distortion, _, _, sigma, _, _ = self._fit(self.views)
-        # Corners of one view are wrong together, which a fit's own errors know nothing of: the focal lengths
-        # without each third of the views tell (delete-a-group jackknife).
+        # Errors of the corners of one view are correlated, which the fit's covariance ignores. The focal
+        # lengths without each third of the views show it (delete-a-group jackknife).
         without = [
-            [uv for i, uv in enumerate(self.views) if i % _GROUPS != group] for group in range(_GROUPS)
+            [uv for i, uv in enumerate(self.views) if i % _JACKKNIFE_GROUPS != group]
+            for group in range(_JACKKNIFE_GROUPS)
         ]
         focals = np.array([self._fit(views)[1][[0, 1], [0, 1]] for views in without])
-        spread_px = np.sqrt((_GROUPS - 1) / _GROUPS * np.sum((focals - focals.mean(axis=0)) ** 2, axis=0))
+        spread_px = np.sqrt(
+            (_JACKKNIFE_GROUPS - 1) / _JACKKNIFE_GROUPS * np.sum((focals - focals.mean(axis=0)) ** 2, axis=0)
+        )
         focal_sigma_px = float(max(np.max(sigma.ravel()[:2]), np.max(spread_px)))
-        return Lens(self._size_px, K, distortion.ravel()[:5], focal_sigma_px, float(rms), len(self.views))
+        return CameraIntrinsics(
+            self._size_px, K, distortion.ravel()[:5], focal_sigma_px, float(rms), len(self.views)
+        )
 
     def _fit(self, views: list[np.ndarray]) -> tuple[Any, ...]:
         corners = [uv.reshape(-1, 1, 2) for uv in views]

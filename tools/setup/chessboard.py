@@ -1,4 +1,4 @@
-"""A chessboard to print: a PDF page of squares whose sides are true to the millimetre at 100 %."""
+"""A chessboard to print, as a PDF page at true scale."""
 
 from __future__ import annotations
 
@@ -8,19 +8,23 @@ _POINTS_PER_MM = 72.0 / 25.4
 _A4_MM = (297.0, 210.0)  # landscape
 
 
-class Board(NamedTuple):
-    """A chessboard by its inner corners."""
+class Chessboard(NamedTuple):
+    """A chessboard by its number of inner corners."""
 
-    corners: tuple[int, int]  # along, across
-    square_m: float
-
-
-# What `calibrate extrinsics --target board` looks for, too; fits A4 with margins that every printer has.
-BOARD = Board((11, 8), 0.020)
+    corners: tuple[int, int]  # along the long side, along the short side
+    square_m: float  # side of a square
 
 
-def board_pdf(board: Board = BOARD) -> bytes:
-    """One A4 page, landscape, with the board in the middle and its size in words."""
+# Also the board of `calibrate extrinsics --target board`; fits A4 with the margins of usual printers.
+DEFAULT_CHESSBOARD = Chessboard((11, 8), 0.020)
+
+
+def chessboard_pdf(board: Chessboard = DEFAULT_CHESSBOARD) -> bytes:
+    """Return a PDF with one A4 page, landscape: the board and its size in words.
+
+    Raises:
+        ValueError: the board does not fit on A4.
+    """
     columns, rows = board.corners[0] + 1, board.corners[1] + 1
     side_mm = board.square_m * 1e3
     left, bottom = (_A4_MM[0] - columns * side_mm) / 2.0, (_A4_MM[1] - rows * side_mm) / 2.0 + 2.0
@@ -33,7 +37,7 @@ def board_pdf(board: Board = BOARD) -> bytes:
                 drawing.append(
                     f"{left + column * side_mm:.4f} {bottom + row * side_mm:.4f} {side_mm:g} {side_mm:g} re f"
                 )
-    words = f"Print at 100 %. Squares of {side_mm:g} mm: measure ten of them. Glue it on something flat."
+    words = f"Print at 100 %. Squares of {side_mm:g} mm: measure ten of them. Glue it on a flat plate."
     drawing.append(f"BT /F1 3.5 Tf {left:.2f} {bottom - 7.0:.2f} Td ({words}) Tj ET")
     content = "\n".join(drawing).encode()
     size = " ".join(f"{mm * _POINTS_PER_MM:.3f}" for mm in _A4_MM)
@@ -47,7 +51,7 @@ def board_pdf(board: Board = BOARD) -> bytes:
 
 
 def _pdf(objects: list[bytes]) -> bytes:
-    """A PDF file of numbered objects, the first being its catalogue (ISO 32000-1, 7.5)."""
+    """Return a PDF file of numbered objects, the first being its catalogue (ISO 32000-1, 7.5)."""
     out, places = b"%PDF-1.4\n", []
     for number, body in enumerate(objects, start=1):
         places.append(len(out))

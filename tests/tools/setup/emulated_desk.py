@@ -7,7 +7,7 @@ import numpy as np
 
 from beamsplat.common.geometry.frames import R_body_camera_level, camera_mount, lidar_mount
 from beamsplat.common.geometry.transforms import inverse, make_transform, so3_exp, transform_points
-from tests.services.camera.test_camera import Camera
+from tests.services.camera.test_camera import EmulatedCamera
 from tests.services.lidar.devices import Ld19, room_range_m
 
 SIZE = (480, 360)
@@ -133,7 +133,7 @@ class DeskLidar(Ld19):
         return self._desk.range_m(angle_rad)
 
 
-class DeskCamera(Camera):
+class DeskCamera(EmulatedCamera):
     def __init__(self, desk):
         super().__init__()
         self.rate_hz = 5.0
