@@ -1,4 +1,4 @@
-"""Typed messages and their encoding on the bus and in recordings."""
+"""Typed messages and their encoding, on the bus and in recordings."""
 
 from beamsplat.common.messages.map import (
     Keyframe,
@@ -30,7 +30,7 @@ from beamsplat.common.messages.robot import (
     Tick,
     WheelOdometry,
 )
-from beamsplat.common.messages.schema import Array, Message, Part
+from beamsplat.common.messages.schema import Array, Message, MessagePart
 from beamsplat.common.messages.sensor_models import CameraModel, LidarModel
 
 __all__ = [
@@ -57,10 +57,10 @@ __all__ = [
     "MapState",
     "MapStatus",
     "Message",
+    "MessagePart",
     "MovingBeams",
     "Odometry",
     "OutputHealth",
-    "Part",
     "Rig",
     "Scan",
     "Tick",

@@ -1,10 +1,10 @@
-"""Messages to bytes and back: a msgpack head, then the arrays raw and 64-byte aligned.
+"""Encoding of messages as bytes: a msgpack head, followed by raw arrays aligned to 64 bytes.
 
     uint32 head length | head (msgpack map) | padding | array 0 | padding | array 1 ...
 
-In the head an array is msgpack extension type 1 holding [dtype, shape, offset]; offsets count from
-the end of the padded head. Nothing is pickled, and decoding gives read-only views into the payload.
-The schema, "Scan/1.0", travels beside the payload (in Zenoh's encoding).
+In the head, an array is msgpack extension type 1 with [dtype, shape, offset]; offsets count from the end of
+the padded head. pickle is not used, and decoded arrays are read-only views into the payload. The schema, for
+example "Scan/1.0", is transmitted beside the payload, as Zenoh's encoding.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ _LENGTH = struct.Struct("<I")
 
 
 def schema_of(message: Message | type[Message]) -> str:
-    """ "Scan/1.0": name and version of a message or its class."""
+    """Return name and version of a message or message class, for example "Scan/1.0"."""
     return f"{message.schema_name()}/{message.version}"
 
 
 def encode(message: Message) -> bytes:
-    """The payload of a message (its schema travels beside it: `schema_of`)."""
+    """Return the payload of a message; its schema (`schema_of`) must be transmitted beside it."""
     arrays: list[np.ndarray] = []
     position = 0
 
@@ -49,7 +49,7 @@ def encode(message: Message) -> bytes:
             return msgpack.ExtType(_ARRAY, description)
         if isinstance(value, BaseModel):
             return value.__dict__
-        raise TypeError(f"{type(value).__name__} has no place in a message")
+        raise TypeError(f"{type(value).__name__} cannot be encoded in a message")
 
     head = msgpack.packb(message.__dict__, default=pack)
     start = _padded(_LENGTH.size + len(head))
@@ -61,13 +61,13 @@ def encode(message: Message) -> bytes:
 
 
 def decode(schema: str, payload: bytes) -> Message:
-    """The message in `payload`; arrays are read-only views into it.
+    """Decode and validate the message in `payload`; its arrays are read-only views into the payload.
 
-    A newer minor version decodes, without the fields this program does not know.
+    Of a newer minor version, fields unknown to this program are ignored.
 
     Raises:
-        DecodeError: unknown schema, another major version, truncated or inconsistent bytes, or values
-            that the message class refuses. No other exception leaves.
+        DecodeError: the schema is unknown or has another major version, the bytes are truncated or
+            inconsistent, or a value is invalid. No other exception is raised, whatever the bytes.
     """
     cls, minor = _class_of(schema)
     try:
@@ -76,7 +76,7 @@ def decode(schema: str, payload: bytes) -> Message:
         return cls.model_validate(fields, extra="ignore" if newer else None)
     except DecodeError:
         raise
-    # msgpack and pydantic raise ValueErrors; hostile bytes also provoke the other three in them.
+    # msgpack and pydantic raise ValueError; on malicious bytes they also raise the others.
     except (ValueError, TypeError, OverflowError, RecursionError, msgpack.UnpackException) as error:
         raise DecodeError(f"{schema}: {_first_line(error)}") from error
 
@@ -88,11 +88,11 @@ def _class_of(schema: str) -> tuple[type[Message], int]:
         raise DecodeError(f"unknown message {schema[:80]!r}")
     major, _, minor = version.partition(".")
     if not (major.isascii() and major.isdecimal() and minor.isascii() and minor.isdecimal()):
-        raise DecodeError(f"{schema[:80]!r} carries no version")
+        raise DecodeError(f"{schema[:80]!r} has no version")
     if len(version) > 12 or int(major) != _version(MESSAGES[name])[0]:
         raise DecodeError(
-            f"{name} is version {version[:12]}, this program speaks {MESSAGES[name].version}: "
-            "update the older of the two sides"
+            f"{name} has version {version[:12]}, this program supports {MESSAGES[name].version}: "
+            "update the older of the two programs"
         )
     return MESSAGES[name], int(minor)
 
@@ -138,7 +138,7 @@ def _padded(size: int) -> int:
 
 
 def _first_line(error: Exception) -> str:
-    """Pydantic's field and reason on one line; its own text spans several and quotes the input."""
+    """Return field and reason of a pydantic error; its own text has several lines and quotes the input."""
     if hasattr(error, "errors"):
         first = error.errors(include_url=False, include_input=False)[0]
         return f"{'.'.join(str(part) for part in first['loc'])}: {first['msg']}"

@@ -1,17 +1,20 @@
-"""Depth, its error bar and masks as PNGs: how a keyframe carries them."""
+"""PNG encoding of depth maps, their standard deviations, and masks, as used in keyframes."""
 
 from __future__ import annotations
 
 import cv2
 import numpy as np
 
-_SIGMA_M = 1e-3  # of code 1
-_PER_OCTAVE = 16  # codes for each doubling of sigma: 2.2 % at most are lost
-_FAST = (cv2.IMWRITE_PNG_COMPRESSION, 1)
+_SIGMA_M = 1e-3  # sigma of code 1
+_PER_OCTAVE = 16  # codes per doubling of sigma: the quantisation error is at most 2.2 %
+_FAST = (cv2.IMWRITE_PNG_COMPRESSION, 1)  # zlib level
 
 
 def depth_to_png(depth_m: np.ndarray) -> np.ndarray:
-    """uint8 [B]: PNG of uint16 millimetres of float32 [H, W]; NaN and what does not fit become 0, unknown."""
+    """Encode depth float32 [H, W] (m) as a PNG of uint16 millimetres, returned as uint8 [B].
+
+    NaN and values outside (0, 65) m are encoded as 0 = unknown.
+    """
     with np.errstate(invalid="ignore"):
         fits = (depth_m > 0.0) & (depth_m < 65.0)
     mm = np.where(fits, np.nan_to_num(depth_m) * 1e3 + 0.5, 0.0).astype(np.uint16)
@@ -19,17 +22,20 @@ def depth_to_png(depth_m: np.ndarray) -> np.ndarray:
 
 
 def depth_from_png(png: np.ndarray) -> np.ndarray:
-    """float32 [H, W] metres, NaN = unknown.
+    """Decode depth float32 [H, W] (m) from a PNG uint8 [B]; NaN = unknown.
 
     Raises:
-        ValueError: no PNG of 16 bits and one channel.
+        ValueError: the bytes are not a PNG of 16 bits and one channel.
     """
     mm = _decode(png, np.uint16, "depth")
     return np.where(mm > 0, mm * np.float32(1e-3), np.float32(np.nan)).astype(np.float32)
 
 
 def sigma_to_png(sigma_m: np.ndarray) -> np.ndarray:
-    """uint8 [B]: PNG of logarithmic codes of float32 [H, W], from 1 mm to 62 m; NaN becomes 0."""
+    """Encode standard deviations float32 [H, W] (m) as a PNG of logarithmic codes, returned as uint8 [B].
+
+    Codes 1 to 255 range from 1 mm to about 60 m; 0 = unknown (NaN).
+    """
     with np.errstate(invalid="ignore"):
         known = sigma_m > 0.0
     octaves = np.log2(np.where(known, sigma_m, _SIGMA_M) / _SIGMA_M)
@@ -38,10 +44,10 @@ def sigma_to_png(sigma_m: np.ndarray) -> np.ndarray:
 
 
 def sigma_from_png(png: np.ndarray) -> np.ndarray:
-    """float32 [H, W] metres, NaN = unknown.
+    """Decode standard deviations float32 [H, W] (m) from a PNG uint8 [B]; NaN = unknown.
 
     Raises:
-        ValueError: no PNG of 8 bits and one channel.
+        ValueError: the bytes are not a PNG of 8 bits and one channel.
     """
     code = _decode(png, np.uint8, "sigma")
     sigma = _SIGMA_M * np.exp2((code.astype(np.float32) - 1.0) / _PER_OCTAVE)
@@ -49,15 +55,15 @@ def sigma_from_png(png: np.ndarray) -> np.ndarray:
 
 
 def mask_to_png(mask: np.ndarray) -> np.ndarray:
-    """uint8 [B]: PNG of bool [H, W]."""
+    """Encode a mask bool [H, W] as a PNG of 0 and 255, returned as uint8 [B]."""
     return cv2.imencode(".png", mask.astype(np.uint8) * 255, _FAST)[1].ravel()
 
 
 def mask_from_png(png: np.ndarray) -> np.ndarray:
-    """bool [H, W].
+    """Decode a mask bool [H, W] from a PNG uint8 [B].
 
     Raises:
-        ValueError: no PNG of 8 bits and one channel.
+        ValueError: the bytes are not a PNG of 8 bits and one channel.
     """
     return _decode(png, np.uint8, "mask") > 127
 

@@ -1,7 +1,7 @@
-"""What rides beside every message as Zenoh's attachment: readable without decoding the payload.
+"""The header of a message, sent as Zenoh's attachment: readable without decoding the payload.
 
-Clocks of two hosts are never compared: `publish_ns` is the publisher's monotonic clock, and
-`clock_id` tells whose. Only where it equals one's own is `age_ns` known.
+`publish_ns` is a time of the publisher's monotonic clock, which `clock_id` identifies. Times of different
+hosts' clocks are never compared: `age_ns` is known only if publisher and receiver run on one host.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ _INSTANCE_BYTES = 8
 
 
 class DecodeError(ValueError):
-    """Bytes that are not the message they claim to be."""
+    """The bytes are not a valid message of the stated schema, or not a valid header."""
 
 
 def local_clock_id() -> int:
-    """uint64 naming this host's monotonic clock: a hash of the boot id, which containers share."""
+    """Return the uint64 id of this host's monotonic clock: a hash of the boot id, equal in all containers."""
     boot_id = Path("/proc/sys/kernel/random/boot_id")
     text = boot_id.read_text() if boot_id.exists() else f"{time.time() - time.monotonic():.0f}"
     return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "little")
@@ -31,18 +31,18 @@ def local_clock_id() -> int:
 
 @dataclass(frozen=True, slots=True)
 class Header:
-    """Who sent what when."""
+    """Publisher, time and sequence number of one message."""
 
     stamp_ns: int  # measurement time of the message
-    publish_ns: int  # publisher's monotonic clock
-    clock_id: int  # uint64: whose monotonic clock
-    sequence: int  # counts up by one per topic, instance and epoch
-    epoch: int  # uint32: takeover count; consumers ignore lower ones
+    publish_ns: int  # time of publication, publisher's monotonic clock
+    clock_id: int  # uint64 id of that clock (`local_clock_id`)
+    sequence: int  # counts up by one per message of one topic, instance and epoch
+    epoch: int  # uint32: counts the hand-overs of the node; subscribers ignore lower epochs
     producer: str  # node name
     instance: str  # 16 hex digits, random per process start
 
     def pack(self) -> bytes:
-        """The attachment's bytes."""
+        """Return the header as bytes."""
         producer = self.producer.encode()
         return (
             _LAYOUT.pack(
@@ -55,10 +55,10 @@ class Header:
 
     @staticmethod
     def unpack(data: bytes) -> Header:
-        """Header of attachment bytes.
+        """Return the header in the bytes of an attachment.
 
         Raises:
-            DecodeError: too short, not ours, or of another layout version.
+            DecodeError: the bytes are too short or too long, have another magic or another layout version.
         """
         if len(data) < _LAYOUT.size + _INSTANCE_BYTES:
             raise DecodeError(f"header of {len(data)} bytes is too short")
@@ -76,5 +76,5 @@ class Header:
         return Header(stamp_ns, publish_ns, clock_id, sequence, epoch, producer, instance)
 
     def age_ns(self, now_ns: int, clock_id: int) -> int | None:
-        """Time since publication, or None where the clock is another host's."""
+        """Return the time since publication in ns; None if the publisher's clock differs from `clock_id`."""
         return now_ns - self.publish_ns if clock_id == self.clock_id else None

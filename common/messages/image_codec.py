@@ -1,4 +1,4 @@
-"""Camera pictures as arrays: RGB inside the house; BGR stops at OpenCV."""
+"""Decoding of camera images. Image arrays are RGB everywhere in this project; only OpenCV calls use BGR."""
 
 from __future__ import annotations
 
@@ -19,23 +19,23 @@ def decode_rgb(
     encoding: str,
     width_px: int,
     height_px: int,
-    step_bytes: int = 0,  # bytes of a row of a raw encoding; 0 = no padding
+    step_bytes: int = 0,  # row length of a raw encoding, padding included; 0 = no padding
 ) -> np.ndarray:
-    """uint8 [H, W, 3] of a picture's bytes.
+    """Decode the bytes of an image to RGB uint8 [H, W, 3].
 
     Raises:
-        UserError: the bytes are no such picture, or of another size than they claim.
+        UserError: the bytes are not an image of this encoding, or the image has another size.
     """
     if encoding in ("jpeg", "png"):
         bgr = cv2.imdecode(data, cv2.IMREAD_COLOR) if len(data) else None
         if bgr is None:
-            raise UserError(f"the picture's {len(data)} bytes do not decode as {encoding}")
+            raise UserError(f"the image's {len(data)} bytes do not decode as {encoding}")
         if bgr.shape[:2] != (height_px, width_px):
-            raise UserError(f"the picture is {bgr.shape[1]}x{bgr.shape[0]}, not {width_px}x{height_px}")
+            raise UserError(f"the image is {bgr.shape[1]}x{bgr.shape[0]}, not {width_px}x{height_px}")
         return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
     row = width_px * _CHANNELS[encoding]
     step = step_bytes or row
     if step < row or len(data) < step * height_px:
-        raise UserError(f"the picture is cut off: {len(data)} bytes for {width_px}x{height_px} {encoding}")
+        raise UserError(f"the image is truncated: {len(data)} bytes for {width_px}x{height_px} {encoding}")
     raw = data[: step * height_px].reshape(height_px, step)[:, :row].reshape(height_px, width_px, -1)
     return np.ascontiguousarray(raw) if encoding == "rgb8" else cv2.cvtColor(raw, _TO_RGB[encoding])

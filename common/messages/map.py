@@ -1,4 +1,4 @@
-"""Messages between keyframes, mapper and viewers; `beamsplat.common.messages` has all of them."""
+"""Messages between keyframe selection, mapper and viewers. Import them from `beamsplat.common.messages`."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ ODOM_ORIGIN = -1  # `anchor_id` of keyframes sent before localization has publis
 
 
 class Keyframe(Message):
-    """A picture that is to become part of the map, with all that the map needs of it: nothing else of this
-    moment has to survive an outage. The same `id` always means the same content.
+    """An image to be added to the map, with all data that the mapper needs: it is self-contained, so that no
+    other message of this time must be kept during a network outage. An `id` always has the same content.
 
-    T_map_body = T_map_anchor @ T_anchor_body; both of this `optimisation`. A later one moves the anchor only.
-    Depth and mask belong to the undistorted picture (a pinhole with the camera's K). Depths are PNGs of
-    uint16 millimetres, 0 = unknown (`depth_png`); the mask is a PNG, 0 = on something that moves.
+    T_map_body = T_map_anchor @ T_anchor_body; both are results of pose-graph optimisation number
+    `optimisation`. A later optimisation changes T_map_anchor only. Depth and mask refer to the undistorted
+    image (a pinhole with the camera's K) and are encoded by `depth_png`; mask 0 = on a dynamic object.
     """
 
     version = "1.2"
@@ -28,35 +28,41 @@ class Keyframe(Message):
     encoding: Literal["jpeg", "png"]
     picture: Annotated[np.ndarray, Array("uint8", "P")]
     camera: CameraModel
-    anchor_id: Annotated[int, Field(ge=-1, lt=2**63)]  # a lidar submap; -1 = the odom frame's origin
+    anchor_id: Annotated[int, Field(ge=-1, lt=2**63)]  # id of a lidar submap; -1 = origin of the odom frame
     T_anchor_body: Transform
     T_map_anchor: Transform
     optimisation: Count = 0
     depth_png: Annotated[np.ndarray, Array("uint8", "D")]  # optical z
-    sigma_png: Annotated[np.ndarray, Array("uint8", "S")]  # standard deviation
+    sigma_png: Annotated[np.ndarray, Array("uint8", "S")]  # standard deviation of the depth
     mask_png: Annotated[np.ndarray, Array("uint8", "M")] = Field(
         default_factory=lambda: np.zeros(0, np.uint8)
     )
-    # Returns of the moment, brought to the picture's time: u, v (px, undistorted), z, sigma (m).
+    # Lidar returns deskewed to the image's time and projected: u, v (px, undistorted), optical z, sigma (m).
     beams: Annotated[np.ndarray, Array("float32", "N", 4, finite=True)] = Field(
         default_factory=lambda: np.zeros((0, 4), np.float32)
     )
-    why: Text = ""  # it was chosen
-    backlog: Count = 0  # keyframes not acknowledged when this one went out; since 1.1
-    map_uuid: Text = ""  # of the map that the anchor belongs to (`Anchors`); since 1.2
+    why: Text = ""  # why this image was selected as a keyframe
+    backlog: Count = 0  # number of unacknowledged keyframes when this one was sent; since 1.1
+    map_uuid: Text = ""  # UUID of the map that the anchor belongs to (see `Anchors`); since 1.2
 
 
 class KeyframeAck(Message):
-    """The mapper has a keyframe, which need not be sent again: "ok", or why it was refused. One that was "ok"
-    when it came can be refused later, when it is looked at."""
+    """Acknowledgement that the mapper received a keyframe; it need not be sent again.
+
+    `status` is "ok", or why the keyframe was rejected. The mapper can reject a keyframe that it acknowledged
+    with "ok" before, when it processes it.
+    """
 
     id: Count
     status: Text = "ok"
 
 
 class MapChunk(Message):
-    """The Gaussians bound to one anchor, in the anchor's frame, packed by `splat_codec`. A newer `revision`
-    replaces all of the older one, as does the same one in finer cells; `count` 0 takes it away."""
+    """The Gaussians of one anchor, in the anchor's frame, encoded by `splat_codec`.
+
+    A chunk with a higher `revision`, or with the same `revision` and smaller `cell_m`, replaces the previous
+    chunk of this anchor; `count` 0 removes it.
+    """
 
     version = "1.1"
 
@@ -65,20 +71,20 @@ class MapChunk(Message):
     T_map_anchor: Transform
     count: Count
     packed: Annotated[np.ndarray, Array("uint8", "B")]
-    cell_m: NonNegative = 0.0  # Gaussians within such a cell are merged into one; 0 = none are; since 1.1
+    cell_m: NonNegative = 0.0  # level of detail: Gaussians within a cell are merged; 0 = all; since 1.1
 
 
 class MapState(Message):
-    """A piece of a mapper's whole state, as its checkpoint holds it (an .npz), for who asks."""
+    """A part of a mapper's complete state in the checkpoint format (.npz), as the answer to a query."""
 
-    first: Count  # byte of the state with which `data` begins
-    total: Count  # bytes of the state
+    first: Count  # offset of `data` in the state, bytes
+    total: Count  # size of the state, bytes
     data: Annotated[np.ndarray, Array("uint8", "B")]
 
 
 class MapPoses(Message):
-    """Where the map's keyframes are, refined: T_map_body = T_map_anchor @ T_anchor_body @ (what the mapper
-    found, brought to the body)."""
+    """Refined poses of the map's keyframes: T_map_body = T_map_anchor @ T_anchor_body @ delta, where delta is
+    the mapper's pose correction, transformed from the camera to the body frame."""
 
     keyframe_ids: Annotated[np.ndarray, Array("int64", "N")]
     stamps_ns: Annotated[np.ndarray, Array("int64", "N")]
@@ -86,7 +92,7 @@ class MapPoses(Message):
 
 
 class MapPreview(Message):
-    """The map as seen from its newest keyframe, as a JPEG of the picture's own shape."""
+    """The map rendered from its newest keyframe, as a JPEG with the aspect ratio of the image."""
 
     keyframe_id: Count
     render: Annotated[np.ndarray, Array("uint8", "B")]
@@ -94,19 +100,22 @@ class MapPreview(Message):
 
 
 class MapStatus(Message):
-    """How the map is doing after a keyframe. Errors are of the newest keyframe's own view: of what the map
-    foretold before it took the picture in, where it knew anything there, and after."""
+    """State of the map after a keyframe, with rendering errors at the newest keyframe's view.
+
+    The `foretold_` values are predictions: they compare the keyframe's image with the map before the keyframe
+    was added, where the map already covered the view.
+    """
 
     version = "1.1"
 
-    status: Text = "ok"  # or why the newest keyframe was refused
+    status: Text = "ok"  # or why the newest keyframe was rejected
     keyframes: Count = 0
-    refused: Count = 0
+    refused: Count = 0  # rejected keyframes
     gaussians: Count = 0
-    steps: Count = 0
+    steps: Count = 0  # optimisation steps so far
     loss: NonNegative = 0.0
-    foretold_share: NonNegative = 0.0  # of the pixels, that the map covered before
-    foretold_psnr_db: float = float("nan")
-    psnr_db: float = float("nan")
-    depth_error_m: float = float("nan")  # median |rendered - fused|
-    session: Text = ""  # since 1.1: how far the map is on disk, or "NOT SAVED: " and why; "" = not asked for
+    foretold_share: NonNegative = 0.0  # fraction of the pixels that the map covered before this keyframe
+    foretold_psnr_db: float = float("nan")  # PSNR over these pixels, before this keyframe
+    psnr_db: float = float("nan")  # PSNR after the keyframe was added
+    depth_error_m: float = float("nan")  # median |rendered - fused depth|
+    session: Text = ""  # since 1.1: saving progress, or "NOT SAVED: " and the reason; "" = no session

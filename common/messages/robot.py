@@ -1,8 +1,8 @@
-"""What travels between services: frozen, typed, checked on the way in and on the way out.
+"""Messages between services, except those of the map (map.py): immutable, typed, validated at both ends.
 
-Versions: a class carries `version = "major.minor"`. Within a major, fields are only ever added, and
-each added field has a default, so that old recordings open for ever (tests/common/golden holds one
-file of every released version).
+Versions: each class has `version = "major.minor"`. Within a major version fields are only added, each with a
+default value, so that all old recordings can be read (tests/common/messages/golden has a file of every
+released version).
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from beamsplat.common.messages.schema import (
     Count,
     Finite,
     Message,
+    MessagePart,
     Name,
     NonNegative,
-    Part,
     Positive,
     Text,
     Transform,
@@ -40,30 +40,30 @@ from beamsplat.common.messages.sensor_models import CameraModel, LidarModel
 
 
 class Rig(Message):
-    """Calibration in use: what was found, and in `assumed`, one sentence for each value that was not."""
+    """Calibration of the robot's camera and lidar."""
 
     camera: CameraModel | None = None
     lidar: LidarModel | None = None
-    assumed: Annotated[tuple[Text, ...], Field(max_length=64)] = ()
-    source: Text = ""
+    assumed: Annotated[tuple[Text, ...], Field(max_length=64)] = ()  # one sentence per assumed value
+    source: Text = ""  # file or topic that the calibration comes from
 
 
 class Image(Message):
-    """One camera picture, in the bytes the sensor gave: compressed ones are never decoded on the way."""
+    """One camera image with the bytes of the sensor: compressed images are transmitted as they are."""
 
     width_px: Annotated[int, Field(gt=0, le=16384)]
     height_px: Annotated[int, Field(gt=0, le=16384)]
     encoding: Literal["jpeg", "png", "rgb8", "bgr8", "rgba8", "bgra8", "mono8", "yuv422_yuy2"]
-    step_bytes: Count = 0  # bytes of a row of a raw encoding; 0 for compressed
+    step_bytes: Count = 0  # row length of a raw encoding; 0 for compressed images
     data: Annotated[np.ndarray, Array("uint8", "B")]
 
 
 class Scan(Message):
-    """One revolution of a planar lidar, as measured; `stamp_ns` is the time of the first beam.
+    """One revolution of a planar lidar; `stamp_ns` is the time of the first beam.
 
-    Beam i points at angle_min_rad + i * angle_increment_rad in the lidar frame and was taken
-    i * time_increment_s after the stamp. No return is +inf; rubbish (NaN, negative) passes unchanged,
-    consumers decide.
+    Beam i has the direction angle_min_rad + i * angle_increment_rad in the lidar frame and was measured
+    i * time_increment_s after the stamp. A beam without return is +inf. Invalid values of the sensor (NaN,
+    negative) are kept; subscribers must handle them.
     """
 
     angle_min_rad: Finite
@@ -78,14 +78,14 @@ class Scan(Message):
     )
 
     @model_validator(mode="after")
-    def _intensities_are_none_or_one_a_beam(self) -> Scan:
+    def _intensities_match_beams(self) -> Scan:
         if len(self.intensities) not in (0, len(self.ranges_m)):
             raise ValueError(f"{len(self.intensities)} intensities for {len(self.ranges_m)} beams")
         return self
 
 
 class WheelOdometry(Message):
-    """Pose by wheel counting in its own drifting frame, and the body's velocity."""
+    """Pose from wheel encoders in the wheels' own drifting odom frame, and the velocity in the body frame."""
 
     T_odom_body: Transform
     velocity_m_s: Annotated[np.ndarray, Array("float64", 3, finite=True)]
@@ -93,7 +93,7 @@ class WheelOdometry(Message):
 
 
 class ExternalPose(Message):
-    """`T_map_body` from somebody else's localization (motion capture, another SLAM, recorded truth)."""
+    """Pose `T_map_body` from an external source: motion capture, another SLAM system, ground truth."""
 
     T_map_body: Transform
 
@@ -102,9 +102,10 @@ class ExternalPose(Message):
 
 
 class Odometry(Message):
-    """Smooth pose `T_odom_body` at the stamp, with the covariance of (x, y, yaw).
+    """Smooth pose `T_odom_body` at the stamp, with the covariance of (x, y, yaw) in m and rad.
 
-    Where `metric` is False its unit of length is nobody's: a camera alone, without anything of known size.
+    If `metric` is False the scale of the translation is unknown: monocular odometry without a metric
+    reference.
     """
 
     version = "1.1"
@@ -117,34 +118,39 @@ class Odometry(Message):
 
 
 class Correction(Message):
-    """`T_map_odom`: takes the smooth pose to the map; may jump when a loop closes."""
+    """Global correction `T_map_odom` of the smooth pose: T_map_body = T_map_odom @ T_odom_body.
+
+    It jumps at a loop closure.
+    """
 
     T_map_odom: Transform
     optimisation: Count = 0
 
 
 class Anchors(Message):
-    """`T_map_anchor` of all anchors (lidar submaps) after an optimisation."""
+    """Poses `T_map_anchor` of all anchors (lidar submaps) after a pose-graph optimisation."""
 
     version = "1.1"
 
     anchor_ids: Annotated[np.ndarray, Array("int64", "N")]
     T_map_anchor: Transforms
     optimisation: Count = 0
-    map_uuid: Text = ""  # since 1.1: of the map that they belong to; "" = its maker gives none
+    map_uuid: Text = ""  # since 1.1: UUID of the map that they belong to; "" = the source has none
 
 
 class MovingBeams(Message):
-    """Which beams of the scan with this stamp ended in space known to be free: people, carts, doors."""
+    """Dynamic-beam mask of the scan with this stamp: beams that hit dynamic objects (people, carts, doors),
+    because they end in space that the map knows to be free."""
 
     moving: Annotated[np.ndarray, Array("bool", "N")]
 
 
 class Grid(Message):
-    """Occupancy grid: cell [row, column] covers origin + (column, row) * resolution, y up.
+    """Occupancy grid in the map frame. The corner of cell [row, column] with the smallest x and y is at
+    origin_m + (column, row) * resolution_m.
 
-    Values as nav2: -1 unknown, 0 free .. 100 occupied. `changed` is the region touched since the grid
-    before: row0, column0, row1, column1 (half open).
+    Values are those of ROS: -1 unknown, 0 free .. 100 occupied. `changed` is the region that differs from the
+    previous grid: row0, column0, row1, column1 (half open).
     """
 
     resolution_m: Positive
@@ -157,67 +163,67 @@ class Grid(Message):
 
 
 class DepthEstimate(Message):
-    """What a depth source says of the picture with this stamp, undistorted; what it means, `kind` says.
+    """Output of a depth source for the undistorted image with this stamp; `kind` defines the values:
 
-    metric: metres of optical z; relative: up to a factor; disparity: a / z + b; none: no values (0 x 0).
-    With a status other than "ok" the values must not be used.
+    metric: optical z in metres; relative: optical z up to a factor; disparity: a / z + b with unknown a and
+    b; none: no values (0 x 0). If the status is not "ok" the values must not be used.
     """
 
     source: Name
     kind: Literal["metric", "relative", "disparity", "none"]
-    values: Annotated[np.ndarray, Array("float32", "H", "W")]  # NaN = no answer
+    values: Annotated[np.ndarray, Array("float32", "H", "W")]  # NaN = unknown
     status: Text = "ok"
 
 
 class FusedDepth(Message):
-    """Metric depth of the picture with this stamp, undistorted, with its error bar and how it came about.
+    """Metric depth of the undistorted image with this stamp, its standard deviation, and figures of the fit.
 
-    With a status other than "ok" there is no depth (0 x 0): a bad frame is refused, not used.
+    If the status is not "ok" there is no depth (0 x 0): a depth map with a bad fit is rejected.
     """
 
     depth_m: Annotated[np.ndarray, Array("float32", "H", "W")]  # optical z, NaN = unknown
-    sigma_m: Annotated[np.ndarray, Array("float32", "H", "W")]  # standard deviation
-    status: Text = "ok"
-    keyframe: bool = False
+    sigma_m: Annotated[np.ndarray, Array("float32", "H", "W")]  # standard deviation of depth_m
+    status: Text = "ok"  # or why there is no depth
+    keyframe: bool = False  # whether the image is a keyframe
     scale: float = float("nan")  # metres per unit of the estimate (the paper's alpha)
-    scale_sigma: float = float("nan")
-    inlier_share: NonNegative = 0.0
-    residual_m: float = float("nan")
-    pairs: Count = 0
-    beams_age_ns: Annotated[int, Field(ge=-(2**63), lt=2**63)] = 0  # picture minus the beams used
+    scale_sigma: float = float("nan")  # standard error of the scale
+    inlier_share: NonNegative = 0.0  # fraction of the pairs that support the fit
+    residual_m: float = float("nan")  # of the inliers
+    pairs: Count = 0  # pairs of a beam and a depth pixel
+    beams_age_ns: Annotated[int, Field(ge=-(2**63), lt=2**63)] = 0  # image stamp minus stamp of the beams
     T_odom_body: Transform = Field(default_factory=lambda: np.eye(4))
 
 
 class Cloud(Message):
-    """Coloured points of a picture in the odom frame."""
+    """Coloured point cloud of one image in the odom frame."""
 
     points_odom_m: Annotated[np.ndarray, Array("float32", "N", 3, finite=True)]
     colours: Annotated[np.ndarray, Array("uint8", "N", 3)]
 
 
-# --- the system itself -------------------------------------------------------------------------
+# --- system ------------------------------------------------------------------------------------
 
 
 class Tick(Message):
-    """A timer's beat: time passes as a message, so that a replay repeats it."""
+    """A timer event. Timers are messages, so that a replay repeats them."""
 
     count: Count
 
 
-class InputHealth(Part):
-    """One subscription of one node, since it started."""
+class InputHealth(MessagePart):
+    """Counts of one subscription of a node since it started."""
 
     topic: Name
-    received: Count  # handed to the node
-    dropped: Count  # overtaken in the ring or overflowed: by design, but counted
-    lost: Count  # gaps in the sequence of an `every` stream: a fault
+    received: Count  # messages passed to the node's handler
+    dropped: Count  # replaced by a newer message (`latest`) or removed from a full queue: expected under load
+    lost: Count  # gaps in the sequence of an `every` topic: a fault
     undecodable: Count
-    stale: Count  # from an epoch that has been taken over
-    age_ms: NonNegative  # publish to handler, of the newest, on clocks of one host; 0 if unknown
+    stale: Count  # from an earlier epoch: the publisher has been replaced
+    age_ms: NonNegative  # publication to handler, newest message; 0 = unknown (publisher on another host)
 
 
-class OutputHealth(Part):
-    """One publication of one node."""
+class OutputHealth(MessagePart):
+    """Counts of one published topic of a node since it started."""
 
     topic: Name
     sent: Count
@@ -225,7 +231,7 @@ class OutputHealth(Part):
 
 
 class Health(Message):
-    """Once a second from every node."""
+    """State and counts of a node, published by each node at 1 Hz."""
 
     node: Name
     instance: Name
@@ -241,7 +247,7 @@ class Health(Message):
 
 
 class Answer(Message):
-    """What was done about a request, in one sentence."""
+    """Result of a command as one sentence."""
 
     text: Text
 

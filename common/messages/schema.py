@@ -1,8 +1,8 @@
-"""What messages are made of: checked arrays, transforms, and the frozen base classes.
+"""Base classes and field types of messages: validated arrays and transforms, immutable models.
 
 A message is a frozen pydantic model. Arrays are declared with dtype and shape,
-`Annotated[np.ndarray, Array("float32", "N")]`; a letter binds a dimension across the fields of one
-message. Arrays are made read-only: every consumer in a process sees the same memory.
+`Annotated[np.ndarray, Array("float32", "N")]`; a dimension with the same letter must have the same size in
+all fields of a message. Arrays are read-only because all subscribers in a process share the memory.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ MAX_ARRAY_BYTES = 256 * 1024 * 1024
 
 
 class Array:
-    """Annotation for a numpy field: dtype, shape, and whether NaN and inf are refused.
+    """Annotation of a NumPy field: dtype, shape, and whether NaN and infinity are rejected.
 
-    Shape entries are ints (exact) or letters (any size, equal within one message).
+    Shape entries are ints (exact size) or letters (any size, the same within one message).
     """
 
     def __init__(self, dtype: str, *shape: int | str, finite: bool = False) -> None:
@@ -33,10 +33,11 @@ class Array:
         return core_schema.no_info_plain_validator_function(self.check)
 
     def check(self, value: Any) -> np.ndarray:
-        """The array as a read-only, C-contiguous view (a copy only if it was strided).
+        """Validate an array and return a read-only, C-contiguous view (a copy if it is not contiguous).
 
         Raises:
-            ValueError: not an array, or another dtype, rank, fixed size, or non-finite where forbidden.
+            ValueError: the value is not an array, too large, not finite where required, or its dtype or shape
+                differs.
         """
         if not isinstance(value, np.ndarray):
             raise ValueError(f"expected a numpy array, got {type(value).__name__}")
@@ -74,16 +75,16 @@ NonNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 
 
-class Part(BaseModel):
-    """A frozen piece of a message (or of a configuration)."""
+class MessagePart(BaseModel):
+    """Base class of structures within messages: immutable, strictly typed, no unknown fields."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, arbitrary_types_allowed=True)
 
-    _lettered: ClassVar[tuple[tuple[str, int, str], ...]] = ()  # (field, axis, letter) of letters used twice
+    _lettered: ClassVar[tuple[tuple[str, int, str], ...]] = ()  # (field, axis, letter) of repeated letters
 
     @classmethod
     def __pydantic_init_subclass__(cls, **kwargs: Any) -> None:
-        """Looks up once which dimensions must agree: this is checked for every message."""
+        """Collect the dimensions that must agree once per class; they are checked for every message."""
         found = [
             (name, axis, letter)
             for name, field in cls.model_fields.items()
@@ -96,7 +97,7 @@ class Part(BaseModel):
         cls._lettered = tuple(entry for entry in found if letters.count(entry[2]) > 1)
 
     @model_validator(mode="after")
-    def _dimensions_agree(self) -> Part:
+    def _dimensions_agree(self) -> MessagePart:
         sizes: dict[str, tuple[int, str]] = {}
         for name, axis, letter in self._lettered:
             size = getattr(self, name).shape[axis]
@@ -106,8 +107,8 @@ class Part(BaseModel):
         return self
 
 
-class Message(Part):
-    """Base of everything on the bus. `stamp_ns` is the time of measurement, int64 nanoseconds."""
+class Message(MessagePart):
+    """Base class of all messages. `stamp_ns` is the measurement time, int64 nanoseconds."""
 
     version: ClassVar[str] = "1.0"
     stamp_ns: StampNs

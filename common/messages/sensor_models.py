@@ -1,4 +1,4 @@
-"""How a camera and a lidar see, and where they sit: parts of messages."""
+"""Camera and lidar models (intrinsics and mounts), parts of the `Rig` and `Keyframe` messages."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from beamsplat.common.messages.schema import Finite, Part, Positive, Transform
+from beamsplat.common.messages.schema import Finite, MessagePart, Positive, Transform
 
 
-class CameraModel(Part):
-    """A pinhole camera with the distortion of OpenCV; K belongs to this image size.
+class CameraModel(MessagePart):
+    """Pinhole camera with lens distortion, and its mount. K is valid for this image size only.
 
-    `distortion_model` follows ROS: plumb_bob (k1 k2 p1 p2 k3), rational_polynomial (8),
-    equidistant (4, fisheye), none.
+    `distortion_model` and the order of `distortion` follow ROS and OpenCV: plumb_bob (k1 k2 p1 p2 k3),
+    rational_polynomial (8 coefficients), equidistant (fisheye, 4 coefficients), none.
     """
 
     width_px: Annotated[int, Field(gt=0, le=16384)]
@@ -28,7 +28,7 @@ class CameraModel(Part):
     T_body_camera: Transform
 
     @model_validator(mode="after")
-    def _k_fits_the_image(self) -> CameraModel:
+    def _k_fits_image(self) -> CameraModel:
         for axis, centre, size in (("cx", self.cx_px, self.width_px), ("cy", self.cy_px, self.height_px)):
             if not 0.0 < centre < size:
                 raise ValueError(
@@ -45,11 +45,11 @@ class CameraModel(Part):
 
     @property
     def K(self) -> np.ndarray:
-        """float64 [3, 3]."""
+        """Camera matrix, float64 [3, 3]."""
         return np.array([[self.fx_px, 0.0, self.cx_px], [0.0, self.fy_px, self.cy_px], [0.0, 0.0, 1.0]])
 
 
-class LidarModel(Part):
-    """Where the planar lidar sits."""
+class LidarModel(MessagePart):
+    """Mount of the planar lidar."""
 
     T_body_lidar: Transform

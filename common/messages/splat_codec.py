@@ -1,7 +1,8 @@
-"""Gaussians as few bytes: what viewers and remote copies of the map receive.
+"""Compact encoding of Gaussians for viewers and remote copies of the map.
 
-17 bytes each before compression: means to 1/65535 of the chunk's extent, scales to 2.4 %, directions to
-half a degree, opacity and colour to 1/255. Rows are those of beamsplat.common.raster.layout.
+17 bytes per Gaussian before zlib compression: means are quantised to 1/65535 of the chunk's extent, scales to
+2.4 %, rotations to half a degree, opacity and colour to 1/255. Parameter rows are those of
+beamsplat.common.raster.layout.
 """
 
 from __future__ import annotations
@@ -13,21 +14,21 @@ import numpy as np
 
 from beamsplat.common.raster.layout import COLOUR, MEAN, OPACITY, PARAMS, QUAT, SCALE
 
-MAX_GAUSSIANS = 8_000_000
-_HEAD = struct.Struct("<4sI6f")  # magic, count, low and high corner of the means
+MAX_GAUSSIANS = 8_000_000  # per chunk: limits the memory that a received message can allocate
+_HEAD = struct.Struct("<4sI6f")  # magic, count, minimum and maximum corner of the means
 _MAGIC = b"SPL1"
-_BYTES = 17
-_LOG_SCALE = (-9.2, 2.9)  # 0.1 mm to 18 m
-_LOGIT = 8.0  # opacity 0.0003 to 0.9997
+_BYTES = 17  # per Gaussian
+_LOG_SCALE = (-9.2, 2.9)  # range of ln(scale in m): 0.1 mm to 18 m
+_LOGIT = 8.0  # range of the opacity logit: opacity 0.0003 to 0.9997
 
 
 def pack(params: np.ndarray) -> np.ndarray:
-    """uint8 [B] of Gaussians float32 [14, N]."""
+    """Encode Gaussians float32 [14, N] as bytes uint8 [B]."""
     count = params.shape[1]
     mean = params[MEAN:SCALE].astype(np.float64)
     low = mean.min(axis=1) if count else np.zeros(3)
     high = mean.max(axis=1) if count else np.zeros(3)
-    # What the reader divides by must be what is written here.
+    # Quantise with the float32 corners that are written, because the decoder uses those.
     low, high = low.astype(np.float32), high.astype(np.float32)
     extent = np.maximum(high.astype(np.float64) - low, 1e-9)
     grid = np.clip((mean - low[:, None]) / extent[:, None] * 65535.0 + 0.5, 0.0, 65535.0).astype("<u2")
@@ -38,7 +39,7 @@ def pack(params: np.ndarray) -> np.ndarray:
     turned = np.clip(np.round(quat * 127.0), -127, 127).astype(np.int8)
     opacity = _to_byte(1.0 / (1.0 + np.exp(-np.clip(params[OPACITY], -_LOGIT, _LOGIT))))
     colour = _to_byte(params[COLOUR:])
-    # Bytes of one kind side by side, high ones apart from low ones: they repeat, and compress.
+    # Group bytes of one kind, high and low bytes apart: similar neighbouring bytes compress better.
     high_byte, low_byte = (grid >> 8).astype(np.uint8), (grid & 255).astype(np.uint8)
     planes = [high_byte, low_byte, scale, turned.view(np.uint8), opacity[None], colour]
     body = zlib.compress(np.concatenate(planes).tobytes(), 1)
@@ -46,17 +47,17 @@ def pack(params: np.ndarray) -> np.ndarray:
 
 
 def unpack(packed: np.ndarray) -> np.ndarray:
-    """float32 [14, N] of `pack`.
+    """Decode the bytes of `pack` to Gaussians float32 [14, N].
 
     Raises:
-        ValueError: not such bytes, cut off, or of more than 8 million Gaussians.
+        ValueError: the bytes are invalid, truncated, or have more than `MAX_GAUSSIANS` Gaussians.
     """
     blob = packed.tobytes()
     if len(blob) < _HEAD.size:
         raise ValueError(f"{len(blob)} bytes are too few for packed Gaussians")
     magic, count, *corners = _HEAD.unpack_from(blob)
     if magic != _MAGIC or count > MAX_GAUSSIANS or not np.all(np.isfinite(corners)):
-        raise ValueError(f"no packed Gaussians: they start with {magic!r} and claim {count}")
+        raise ValueError(f"not packed Gaussians: the data starts with {magic!r} and a count of {count}")
     try:
         body = zlib.decompressobj().decompress(blob[_HEAD.size :], _BYTES * count + 1)
     except zlib.error as error:

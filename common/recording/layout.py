@@ -16,7 +16,7 @@ import numpy as np
 from pydantic import BaseModel
 from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
 
-from beamsplat.common.messages import MESSAGES, Array, Message, Part
+from beamsplat.common.messages import MESSAGES, Array, Message, MessagePart
 from beamsplat.common.messages.codec import schema_of
 from beamsplat.common.messages.header import DecodeError, Header
 
@@ -158,10 +158,10 @@ def _describe_arrays(cls: type[BaseModel], schema: dict[str, Any]) -> None:
             }
 
 
-def _parts(cls: type[BaseModel]) -> dict[str, type[Part]]:
-    """Every Part class by name, to resolve the schema's $defs."""
-    found: dict[str, type[Part]] = {}
-    pending = [Part]
+def _parts(cls: type[BaseModel]) -> dict[str, type[MessagePart]]:
+    """Every MessagePart class by name, to resolve the schema's $defs."""
+    found: dict[str, type[MessagePart]] = {}
+    pending = [MessagePart]
     while pending:
         for child in pending.pop().__subclasses__():
             found[child.__name__] = child

@@ -79,7 +79,7 @@ def test_a_newer_minor_version_decodes_without_the_fields_we_do_not_know():
     assert_equal(decode("Correction/1.9", newer), SAMPLES[6])
     with pytest.raises(DecodeError, match="future"):
         decode("Correction/1.0", newer)
-    with pytest.raises(DecodeError, match=r"version 2\.0.*speaks 1\.0"):
+    with pytest.raises(DecodeError, match=r"version 2\.0.*supports 1\.0"):
         decode("Correction/2.0", newer)
 
 

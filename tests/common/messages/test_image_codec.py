@@ -36,7 +36,7 @@ def test_grey_and_png():
         (np.zeros(0, np.uint8), "jpeg", "0 bytes do not decode"),
         (np.arange(200, dtype=np.uint8), "jpeg", "do not decode as jpeg"),
         (cv2.imencode(".jpg", RGB)[1].reshape(-1), "jpeg", "is 8x6, not 9x6"),
-        (np.zeros(100, np.uint8), "rgb8", "cut off: 100 bytes for 9x6 rgb8"),
+        (np.zeros(100, np.uint8), "rgb8", "truncated: 100 bytes for 9x6 rgb8"),
     ],
 )
 def test_broken_bytes(data, encoding, complaint):
