@@ -1,7 +1,7 @@
-"""How fast messages cross the local router, and what a slow subscriber does to the others.
+"""`bench bus`: latency of messages through the local router, and the effect of a slow subscriber on others.
 
-The publisher is a process of its own, the subscriber is this one. Ours and plain Zenoh puts of the same
-bytes alternate within one run, so that their ratio holds on a busy machine.
+The publisher is a separate process; this process subscribes. Messages of our bus and plain Zenoh puts of the
+same bytes alternate within one run, so that their ratio is meaningful on a busy machine.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ from beamsplat.tools.system.supervisor import Supervisor
 
 ROBOT = "bench"
 PLAIN_KEY = f"beamsplat/{ROBOT}/plain"
-_WARM_UP = 20  # samples, not counted: connections, shared memory and caches settle
+_WARM_UP = 20  # first samples, not counted: connections, shared memory and caches are being set up
 
 
-class _Taker(Node):
-    """Declares the inputs whose mailbox the slow-subscriber run uses."""
+class _SlowSubscriber(Node):
+    """Declares the input of the mailbox that the run with a slow subscriber uses."""
 
     name = "monitor"
     inputs = ("camera/image",)
@@ -44,7 +44,7 @@ class _Taker(Node):
 
 
 @dataclass
-class _Ages:
+class _Latencies:
     """Latencies in ms, filled by a receiving thread."""
 
     values: list[float] = field(default_factory=list)
@@ -53,10 +53,10 @@ class _Ages:
         self.values.append((time.monotonic_ns() - then_ns) / 1e6)
 
     def percentiles(self) -> tuple[float, float]:
-        """(p50, p99) in ms without the warm-up.
+        """Return (p50, p99) in ms without the warm-up.
 
         Raises:
-            RuntimeError: too little arrived to say anything.
+            RuntimeError: too few messages arrived.
         """
         counted = self.values[_WARM_UP:]
         if len(counted) < 10:
@@ -65,28 +65,32 @@ class _Ages:
 
 
 def _publish(endpoint: str, go: Event, stop: Event, image_bytes: int, hz: float, plain: bool) -> None:
-    """The publishing process: pictures (and, in turn, plain puts) at `hz`, odometry at 100 Hz."""
+    """Publish images at `hz`, with `plain` every second one as a plain put, and odometry at 100 Hz.
+
+    This is the main function of the publishing process.
+    """
     data = np.random.default_rng(0).integers(0, 255, image_bytes).astype(np.uint8)
     body = data.tobytes()
     with Bus(open_session((endpoint,)), ROBOT, "replay", "ab" * 8, 1) as bus:
-        pictures = bus.publish("camera/image")
-        bare = bus.session.declare_publisher(PLAIN_KEY, congestion_control=zenoh.CongestionControl.DROP)
-        beside = threading.Thread(target=_publish_odometry, args=(bus, stop), daemon=True)
+        images = bus.publish("camera/image")
+        drop = zenoh.CongestionControl.DROP
+        plain_publisher = bus.session.declare_publisher(PLAIN_KEY, congestion_control=drop)
+        odometry_thread = threading.Thread(target=_publish_odometry, args=(bus, stop), daemon=True)
         go.wait()
-        beside.start()
+        odometry_thread.start()
         turn = 0
         due = time.monotonic()
         while not stop.is_set():
             now_ns = time.monotonic_ns()
             if plain and turn % 2:
-                bare.put(body, attachment=struct.pack("<q", now_ns))
+                plain_publisher.put(body, attachment=struct.pack("<q", now_ns))
             else:
-                picture = Image(stamp_ns=now_ns, width_px=640, height_px=480, encoding="jpeg", data=data)
-                pictures.put(picture)
+                image = Image(stamp_ns=now_ns, width_px=640, height_px=480, encoding="jpeg", data=data)
+                images.put(image)
             turn += 1
             due += 1.0 / hz
             time.sleep(max(0.0, due - time.monotonic()))
-        beside.join()
+        odometry_thread.join()
 
 
 def _publish_odometry(bus: Bus, stop: Event) -> None:
@@ -108,15 +112,15 @@ def _publish_odometry(bus: Bus, stop: Event) -> None:
 def bench_bus(
     seconds: float, image_bytes: int, endpoint: str, report: Callable[[str], None]
 ) -> dict[str, Any]:
-    """Runs both parts; figures by name, units in the names."""
+    """Run both parts, `seconds` each; return the figures by name, with units in the names."""
     with tempfile.TemporaryDirectory() as folder:
         deployment = Deployment(
             robot=ROBOT, router=RouterConfig(listen=(endpoint,)), state_dir=Path(folder), nodes={}
         )
         with Supervisor(deployment, ("router",)):
-            report(f"{image_bytes / 1e6:g} MB pictures through the local router, ours and plain in turn")
+            report(f"{image_bytes / 1e6:g} MB images through the router: our bus and plain Zenoh alternate")
             result = _latency(endpoint, seconds, image_bytes)
-            report("a subscriber that needs 200 ms a picture, beside a 100 Hz topic")
+            report("a subscriber that needs 200 ms per image, and a 100 Hz topic")
             result |= _slow_subscriber(endpoint, seconds, image_bytes)
     return result
 
@@ -124,7 +128,8 @@ def bench_bus(
 def _with_publisher(
     endpoint: str, image_bytes: int, plain: bool, hz: float, body: Callable[[Bus], Callable[[], None]]
 ) -> None:
-    """Declares subscriptions with `body`, then lets a publisher run while what it returned works."""
+    """Declare subscriptions with `body`, then run the function that
+    it returns while a publisher is running."""
     context = multiprocessing.get_context("spawn")
     go, stop = context.Event(), context.Event()
     process = context.Process(target=_publish, args=(endpoint, go, stop, image_bytes, hz, plain))
@@ -132,7 +137,7 @@ def _with_publisher(
     try:
         with Bus(open_session((endpoint,)), ROBOT, "monitor", "cd" * 8, 1) as bus:
             work = body(bus)
-            time.sleep(1.0)  # declarations travel through the router
+            time.sleep(1.0)  # until the declarations have passed the router
             go.set()
             work()
             stop.set()
@@ -144,10 +149,10 @@ def _with_publisher(
 
 
 def _latency(endpoint: str, seconds: float, image_bytes: int) -> dict[str, float]:
-    ours, plain = _Ages(), _Ages()
+    ours, plain = _Latencies(), _Latencies()
 
     def body(bus: Bus) -> Callable[[], None]:
-        bus.subscribe(_Taker.inputs[0], lambda e: ours.add_since(e.message.stamp_ns), _broken, _end)
+        bus.subscribe(_SlowSubscriber.inputs[0], lambda e: ours.add_since(e.message.stamp_ns), _broken, _end)
         subscriber = bus.session.declare_subscriber(PLAIN_KEY, zenoh.handlers.RingChannel(1))
 
         def receive() -> None:
@@ -176,8 +181,8 @@ def _latency(endpoint: str, seconds: float, image_bytes: int) -> dict[str, float
 
 def _slow_subscriber(endpoint: str, seconds: float, image_bytes: int) -> dict[str, float]:
     hz = 30.0
-    beside, ages_frames = _Ages(), []
-    mailbox, lock = Mailbox(_Taker), threading.Lock()
+    beside, ages_frames = _Latencies(), []
+    mailbox, lock = Mailbox(_SlowSubscriber), threading.Lock()
     memory = []
 
     def on_image(envelope: Envelope) -> None:
@@ -187,7 +192,7 @@ def _slow_subscriber(endpoint: str, seconds: float, image_bytes: int) -> dict[st
     def body(bus: Bus) -> Callable[[], None]:
         from beamsplat.common.runtime.node import Input
 
-        bus.subscribe(_Taker.inputs[0], on_image, _broken, _end)
+        bus.subscribe(_SlowSubscriber.inputs[0], on_image, _broken, _end)
         bus.subscribe(Input("wheel/odometry"), lambda e: beside.add_since(e.message.stamp_ns), _broken, _end)
         return work
 

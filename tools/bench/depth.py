@@ -1,4 +1,4 @@
-"""CPU time of depth and fusion on a textured room that moves by: no recording needed."""
+"""`bench depth`: CPU time of depth and fusion on synthetic views of a textured wall."""
 
 from __future__ import annotations
 
@@ -16,11 +16,12 @@ from beamsplat.services.depth.source import IGNORES_IMAGE, DepthInput, make_sour
 from beamsplat.services.fusion.fuse import Fusion
 from beamsplat.services.fusion.inputs import FusionInput
 
-_WALL_M = 4.0
+_WALL_M = 4.0  # distance of the wall
 
 
 def bench(source_name: str, frames: int) -> dict[str, float | int | str]:
-    """Median CPU milliseconds of one thread at 640x480: source, fusion of a picture and of a keyframe."""
+    """Return median CPU milliseconds of one thread at 640x480: depth
+    source, fusion of an image and of a keyframe."""
     cv2.setNumThreads(1)
     camera = Pinhole(530.0, 530.0, 319.5, 239.5, 640, 480)
     T_body_camera = camera_mount(0.1, 0.0, 0.45, pitch_down_rad=0.035)
@@ -50,23 +51,23 @@ def bench(source_name: str, frames: int) -> dict[str, float | int | str]:
             started = time.process_time()
             fusion.fuse(frame, keyframe=keyframe)
             times[name].append(1e3 * (time.process_time() - started))
-    # The first runs compile, or load from the cache, what later ones use.
+    # The first run compiles kernels or loads them from the cache: it is not counted.
     median = {name: float(np.median(values[1:])) for name, values in times.items()}
-    # Both nodes decode the picture for themselves, unless the source does not look at it.
+    # Both nodes decode the image, unless the source does not use it.
     decodes = 1 if source_name in IGNORES_IMAGE else 2
-    per_picture = median["source_ms"] + median["fusion_ms"] + decodes * median["decode_ms"]
+    per_image_ms = median["source_ms"] + median["fusion_ms"] + decodes * median["decode_ms"]
     return {
         "source": source_name, "width": 640, "height": 480, "threads": 1, "frames": frames,
         "cpu_ms_decode": median["decode_ms"], "decodes": decodes,
         "cpu_ms_source": median["source_ms"], "cpu_ms_fusion": median["fusion_ms"],
-        "cpu_ms_keyframe": median["keyframe_ms"], "fps_one_core": 1e3 / per_picture,
+        "cpu_ms_keyframe": median["keyframe_ms"], "fps_one_core": 1e3 / per_image_ms,
         "fps_source_alone": 1e3 / median["source_ms"],
-        "fps_one_core_with_a_keyframe_a_second": max(1e3 - median["keyframe_ms"], 0.0) / per_picture,
+        "fps_one_core_with_a_keyframe_a_second": max(1e3 - median["keyframe_ms"], 0.0) / per_image_ms,
     }  # fmt: skip
 
 
 def _view(wall: np.ndarray, camera: Pinhole, distance_m: float, shift_m: float) -> np.ndarray:
-    """The wall, 300 px a metre, as the camera sees it."""
+    """Return the camera's view of the wall, whose texture has 300 px per metre."""
     scale = 300.0 * distance_m / camera.fx_px
     A = np.array([[scale, 0.0, 320.0 + 30.0 * shift_m], [0.0, scale, 100.0]])
     return cv2.warpAffine(

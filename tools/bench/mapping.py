@@ -1,4 +1,4 @@
-"""`bench map`: how good a map the mapper makes of a recording in real time with true poses, and refined."""
+"""`bench map`: quality of the map of a recording with true poses, built in real time and after refinement."""
 
 from __future__ import annotations
 
@@ -18,43 +18,41 @@ from beamsplat.common.geometry.transforms import make_transform, so3_exp
 from beamsplat.common.mapfiles.ply import read_ply_points, write_gaussian_ply
 from beamsplat.common.mapfiles.scores import ViewScore, f_score, fused_surface, render_rgb_depth, score_view
 from beamsplat.common.raster.camera import RasterCamera
-from beamsplat.services.mapping.keyframe import Keyframe
+from beamsplat.services.mapping.keyframe import RgbdKeyframe
 from beamsplat.services.mapping.mapper import HALF, Mapper
 from beamsplat.services.mapping.settings import MapperSettings
 from beamsplat.services.mapping.warm import warm
 from beamsplat.tools.bench.depth_priors import Prior, find_prior
-from beamsplat.tools.evaluation.dataset import Recording, load, read_depth_png
+from beamsplat.tools.evaluation.dataset import TruthDataset, load_dataset, read_depth_png
 
-HELD_OUT_EVERY, HELD_OUT_AT = 8, 2  # pictures i with i % 8 == 2 are scored and never shown
-Say = Callable[[str], None]
+HELD_OUT_EVERY, HELD_OUT_AT = 8, 2  # images i with i % 8 == 2 are scored and never mapped
+Log = Callable[[str], None]
 
 
 @dataclass(frozen=True)
-class MapBench:
-    """What to run."""
+class MapBenchSettings:
+    """Settings of one run of `bench map`."""
 
     prior: str = "stixel"
     distance_m: float = 0.25
     angle_rad: float = 0.22
     settings: MapperSettings = field(default_factory=MapperSettings)
     refine_s: float = 60.0
-    count_cpu: bool = (
-        False  # refinement is measured in CPU seconds a thread instead of wall: on a machine that is shared
-    )
+    count_cpu: bool = False  # refine_s are CPU seconds per thread instead of wall time: for shared machines
     threads: int = 1
     seed: int = 0
-    jump: bool = False  # the second half of the keyframes is misplaced until the drive has ended
-    settle_steps: int = 0  # at the end of the drive, at half size, before the first scoring
+    jump: bool = False  # misplace the second half of the keyframes until the end of the drive
+    settle_steps: int = 0  # steps at half image size at the end of the drive, before the first scoring
 
 
-JUMP = make_transform(so3_exp([0.0, 0.0, np.radians(10.0)]), np.array([1.0, 0.0, 0.0]))
-# (recording, number of the picture, its depth_m) -> bool [H, W], False on what moves; None: nothing does
-Mask = Callable[[Recording, int, np.ndarray], np.ndarray | None]
+T_MAP_ANCHOR_JUMP = make_transform(so3_exp([0.0, 0.0, np.radians(10.0)]), np.array([1.0, 0.0, 0.0]))
+# (recording, index of the image, its depth_m) -> bool [H, W], False on dynamic objects; None without any
+Mask = Callable[[TruthDataset, int, np.ndarray], np.ndarray | None]
 
 
 @dataclass
-class _Clock:
-    """Wall and CPU seconds of the mapper alone: without decoding, scoring and compiling."""
+class _MapperTimer:
+    """Wall and CPU seconds of the mapper and the prior, without decoding, scoring and compilation."""
 
     wall_s: float = 0.0
     cpu_s: float = 0.0
@@ -68,7 +66,7 @@ class _Clock:
 
 
 def raster_camera(camera: Pinhole) -> RasterCamera:
-    """The rasterizer's camera of a pinhole."""
+    """Return the rasterizer's camera of a pinhole camera."""
     return RasterCamera(
         camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px, camera.width_px, camera.height_px
     )
@@ -76,85 +74,93 @@ def raster_camera(camera: Pinhole) -> RasterCamera:
 
 def run_bench(
     path: Path,
-    bench: MapBench,
-    say: Say = lambda text: None,
+    bench: MapBenchSettings,
+    log: Log = lambda text: None,
     out: Path | None = None,
     prior: Prior | None = None,
     mask: Mask | None = None,
 ) -> dict[str, Any]:
-    """Runs the mapper over a recording and gives the figures of the design's section 12.
+    """Run the mapper over a recording; return the figures of `beamsplat bench map`.
 
-    `wall_s` and `cpu_s` are the mapper's and the prior's: pictures are decoded, views scored and kernels
-    compiled outside. With `out`, pictures of held-out views beside the truth and the map are written there.
-    `prior` is used in place of the one that `bench.prior` names; `mask` says what moves.
+    `wall_s` and `cpu_s` are of the mapper and the prior only, without decoding, scoring and compilation.
 
-    With `bench.jump` the pose graph holds the second half of the drive 1 m and 10 degrees off, and finds the
-    truth at its end: compare with a run without the jump, both with the same `settle_steps`.
+    With `bench.jump`, the anchor of the second half of the drive is 1 m and 10 degrees wrong until the end of
+    the
+    drive, as before a loop closure: compare with a run without it and with the same `settle_steps`.
+
+    Args:
+        log: receives progress messages.
+        out: folder for images of held-out views beside the truth, and the map; None writes nothing.
+        prior: depth of the keyframes, instead of the one that `bench.prior` names.
+        mask: masks of dynamic objects.
     """
     warm()
-    recording = load(path)
+    recording = load_dataset(path)
     mapper = Mapper(bench.settings, seed=bench.seed, threads=bench.threads)
-    clock = _Clock()
-    keyframes, refused = _drive(recording, mapper, bench, prior or find_prior(bench.prior), mask, clock, say)
+    timer = _MapperTimer()
+    keyframes, refused = _map_drive(
+        recording, mapper, bench, prior or find_prior(bench.prior), mask, timer, log
+    )
     if bench.jump:
-        clock.run(lambda: mapper.move_anchors({1: np.eye(4)}))
-    clock.run(lambda: mapper.refine(bench.settle_steps, HALF))
-    online_clock, online_steps = replace(clock), mapper.steps
-    online = score_map(recording, mapper, say)
-    _refine(mapper, bench, clock)
-    refined = score_map(recording, mapper, say)
+        timer.run(lambda: mapper.move_anchors({1: np.eye(4)}))
+    timer.run(lambda: mapper.refine(bench.settle_steps, HALF))
+    online_timer, online_steps = replace(timer), mapper.steps
+    online = score_map(recording, mapper, log)
+    _refine(mapper, bench, timer)
+    refined = score_map(recording, mapper, log)
     if out is not None:
-        write_pictures(recording, mapper, out)
+        write_comparison_images(recording, mapper, out)
         write_gaussian_ply(out / "splats.ply", mapper.store.params[:, : mapper.store.count])
     return {
         "data": str(path), "prior": bench.prior, "threads": bench.threads, "seed": bench.seed,
         "keyframes": keyframes, "refused": refused, "data_s": recording.seconds,
-        "wall_s": online_clock.wall_s, "cpu_s": online_clock.cpu_s, "steps": online_steps,
-        "refine_wall_s": clock.wall_s - online_clock.wall_s, "refine_cpu_s": clock.cpu_s - online_clock.cpu_s,
+        "wall_s": online_timer.wall_s, "cpu_s": online_timer.cpu_s, "steps": online_steps,
+        "refine_wall_s": timer.wall_s - online_timer.wall_s, "refine_cpu_s": timer.cpu_s - online_timer.cpu_s,
         "refine_steps": mapper.steps - online_steps, "online": online, "refined": refined,
         "peak_rss_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0,
     }  # fmt: skip
 
 
-def _drive(
-    recording: Recording, mapper: Mapper, bench: MapBench, prior: Prior, mask: Mask | None, clock: _Clock,
-    say: Say,
+def _map_drive(
+    recording: TruthDataset, mapper: Mapper, bench: MapBenchSettings, prior: Prior, mask: Mask | None,
+    timer: _MapperTimer, log: Log,
 ) -> tuple[int, int]:  # fmt: skip
-    """Every keyframe with its fixed work, as they come; gives how many were used and refused."""
+    """Map the keyframes in order, with a fixed number of steps each;
+    return the numbers of used and rejected ones."""
     used, refused, last = 0, 0, None
-    for index, shot in enumerate(recording.shots):
-        if index % HELD_OUT_EVERY == HELD_OUT_AT or not _moved(last, shot.T_map_camera, bench):
+    for index, posed_image in enumerate(recording.posed_images):
+        if index % HELD_OUT_EVERY == HELD_OUT_AT or not _moved(last, posed_image.T_map_camera, bench):
             continue
-        guess = clock.run(lambda i=index: prior(recording, i))
-        if guess is None:
+        prior_depth = timer.run(lambda i=index: prior(recording, i))
+        if prior_depth is None:
             continue
-        last = shot.T_map_camera
-        late = 2 * index >= len(recording.shots)
+        last = posed_image.T_map_camera
+        late = 2 * index >= len(recording.posed_images)
         frame = replace(
-            make_keyframe(recording, index, guess), anchor=int(late),
-            mask=None if mask is None else clock.run(lambda i=index, d=guess[0]: mask(recording, i, d)),
+            make_keyframe(recording, index, prior_depth), anchor=int(late),
+            mask=None if mask is None else timer.run(lambda i=index, d=prior_depth[0]: mask(recording, i, d)),
         )  # fmt: skip
-        place = JUMP if late and bench.jump else np.eye(4)
-        outcome = clock.run(lambda f=frame, T=place: mapper.add(f, T))
-        clock.run(mapper.optimise)
+        T_map_anchor = T_MAP_ANCHOR_JUMP if late and bench.jump else np.eye(4)
+        outcome = timer.run(lambda f=frame, T=T_map_anchor: mapper.add(f, T))
+        timer.run(mapper.optimise)
         used, refused = used + outcome.ok, refused + (not outcome.ok)
         if used % 10 == 0:
-            say(f"{used} keyframes, {mapper.store.count} Gaussians, {clock.cpu_s:.0f} CPU s")
+            log(f"{used} keyframes, {mapper.store.count} Gaussians, {timer.cpu_s:.0f} CPU s")
     return used, refused
 
 
-def _refine(mapper: Mapper, bench: MapBench, clock: _Clock) -> None:
-    start = replace(clock)
+def _refine(mapper: Mapper, bench: MapBenchSettings, timer: _MapperTimer) -> None:
+    start = replace(timer)
     while True:
-        cpu_s = (clock.cpu_s - start.cpu_s) / bench.threads
-        spent = cpu_s if bench.count_cpu else clock.wall_s - start.wall_s
+        cpu_s = (timer.cpu_s - start.cpu_s) / bench.threads
+        spent = cpu_s if bench.count_cpu else timer.wall_s - start.wall_s
         if spent >= bench.refine_s or not mapper.keyframes:
             return
-        clock.run(lambda: mapper.refine(20))
+        timer.run(lambda: mapper.refine(20))
 
 
-def write_pictures(recording: Recording, mapper: Mapper, out: Path) -> None:
-    """Truth beside render of every eighth held-out view: `offpath_NNN.png`, `heldout_NNN.png`."""
+def write_comparison_images(recording: TruthDataset, mapper: Mapper, out: Path) -> None:
+    """Write true image beside render for some held-out views: `offpath_NNN.png`, `heldout_NNN.png`."""
     out.mkdir(parents=True, exist_ok=True)
     camera = raster_camera(recording.camera)
 
@@ -163,14 +169,14 @@ def write_pictures(recording: Recording, mapper: Mapper, out: Path) -> None:
         both = np.hstack([truth, (rgb * 255.0 + 0.5).astype(np.uint8)])
         cv2.imwrite(str(out / name), cv2.cvtColor(both, cv2.COLOR_RGB2BGR))
 
-    for i, view in enumerate(recording.extra_views[::8]):
+    for i, view in enumerate(recording.offpath_views[::8]):
         truth = cv2.cvtColor(cv2.imread(str(view.image_file)), cv2.COLOR_BGR2RGB)
         write(f"offpath_{8 * i:03d}.png", view.T_map_camera, truth)
-    for index in range(HELD_OUT_AT, len(recording.shots), 16 * HELD_OUT_EVERY):
-        write(f"heldout_{index:03d}.png", recording.shots[index].T_map_camera, recording.image(index))
+    for index in range(HELD_OUT_AT, len(recording.posed_images), 16 * HELD_OUT_EVERY):
+        write(f"heldout_{index:03d}.png", recording.posed_images[index].T_map_camera, recording.image(index))
 
 
-def _moved(last: np.ndarray | None, T_map_camera: np.ndarray, bench: MapBench) -> bool:
+def _moved(last: np.ndarray | None, T_map_camera: np.ndarray, bench: MapBenchSettings) -> bool:
     if last is None:
         return True
     cos = (np.trace(last[:3, :3].T @ T_map_camera[:3, :3]) - 1.0) / 2.0
@@ -178,29 +184,31 @@ def _moved(last: np.ndarray | None, T_map_camera: np.ndarray, bench: MapBench) -
     return bool(far or np.arccos(np.clip(cos, -1.0, 1.0)) >= bench.angle_rad)
 
 
-def make_keyframe(recording: Recording, index: int, guess: tuple[np.ndarray, np.ndarray]) -> Keyframe:
-    """A keyframe bound to one anchor at the map's origin, with the beams of the moment."""
-    shot = recording.shots[index]
-    uv, z, _ = project_beams(shot.beams, recording.camera, recording.T_body_camera)
-    return Keyframe(
+def make_keyframe(
+    recording: TruthDataset, index: int, prior_depth: tuple[np.ndarray, np.ndarray]
+) -> RgbdKeyframe:
+    """Return a keyframe in the frame of an anchor at the map's origin, with the beams at its time."""
+    posed_image = recording.posed_images[index]
+    uv, z, _ = project_beams(posed_image.beams, recording.camera, recording.T_body_camera)
+    return RgbdKeyframe(
         id=index, rgb=recording.image(index), camera=raster_camera(recording.camera),
-        T_anchor_camera=shot.T_map_camera, depth_m=guess[0], sigma_m=guess[1],
+        T_anchor_camera=posed_image.T_map_camera, depth_m=prior_depth[0], sigma_m=prior_depth[1],
         beams_uvz=np.column_stack([uv, z]) if len(z) else np.zeros((0, 3)),
     )  # fmt: skip
 
 
-def score_map(recording: Recording, mapper: Mapper, say: Say) -> dict[str, float | None]:
-    """Figures at the views that the mapper has not seen; None where the recording has no such views."""
-    say("scoring")
+def score_map(recording: TruthDataset, mapper: Mapper, log: Log) -> dict[str, float | None]:
+    """Return the figures at views that were not mapped; None where the recording has no such views."""
+    log("scoring")
     camera = raster_camera(recording.camera)
     off, held = [], []
-    for view in recording.extra_views:
+    for view in recording.offpath_views:
         true_rgb = cv2.cvtColor(cv2.imread(str(view.image_file)), cv2.COLOR_BGR2RGB)
         rgb, depth, _ = render_rgb_depth(mapper.rasterizer, mapper.store, camera, view.T_map_camera)
         off.append(score_view(rgb, depth, true_rgb, read_depth_png(view.depth_file)))
-    for index in range(HELD_OUT_AT, len(recording.shots), HELD_OUT_EVERY):
+    for index in range(HELD_OUT_AT, len(recording.posed_images), HELD_OUT_EVERY):
         rgb, depth, _ = render_rgb_depth(
-            mapper.rasterizer, mapper.store, camera, recording.shots[index].T_map_camera
+            mapper.rasterizer, mapper.store, camera, recording.posed_images[index].T_map_camera
         )
         held.append(score_view(rgb, depth, recording.image(index), None))
     figures = {

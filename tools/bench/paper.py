@@ -1,4 +1,4 @@
-"""`bench paper`: the paper's six configurations and the default one, live, each in its own run."""
+"""`bench paper`: the paper's six configurations and our default one, each in a live run."""
 
 from __future__ import annotations
 
@@ -20,40 +20,40 @@ from beamsplat.common.files.resources import shipped_file
 from beamsplat.common.geometry.transforms import inverse
 from beamsplat.services.depth.model_files import find_model
 from beamsplat.tools.evaluation.drive import open_drive
-from beamsplat.tools.evaluation.evaluate import read_truth
+from beamsplat.tools.evaluation.evaluate import truth_depth_files
 from beamsplat.tools.report.html import write_report
-from beamsplat.tools.report.map_scores import map_figures, map_from_above, previews, truth_folder
-from beamsplat.tools.report.observer import Costs, Seen, run_live
+from beamsplat.tools.report.map_scores import map_figures, previews, top_view_of_map, truth_folder
+from beamsplat.tools.report.observer import RunCosts, RunRecord, run_live
 from beamsplat.tools.report.scores import (
-    Truth,
-    compared_poses,
+    GroundTruth,
+    aligned_poses,
     depth_errors,
     pose_errors,
     rigid_offset,
-    speed,
+    speed_and_load,
 )
 
 DEFAULT = "default"
-STAND_IN = "fastdepth_nyu_fp32"
+SUBSTITUTE_MODEL = "fastdepth_nyu_fp32"  # replaces networks whose weights are missing
 
 
 @dataclass(frozen=True)
 class Configuration:
-    """One row of the tables; `paper` holds the paper's own figures for it."""
+    """One row of the tables; `paper` holds the figures of the paper."""
 
     name: str
     title: str
     file: str
-    model: str | None = None  # weights it needs
+    model: str | None = None  # required weights
     paper: dict[str, float] = field(default_factory=dict)
-    partner: str | None = None  # the same with the other localization
+    partner: str | None = None  # the configuration with the same depth and camera localization
 
     @property
     def lidar(self) -> bool:
         return not self.name.endswith("-camera")
 
 
-def _paper(position: float, yaw: float, fps: float, load: float, *depth: float) -> dict[str, float]:
+def _paper_figures(position: float, yaw: float, fps: float, load: float, *depth: float) -> dict[str, float]:
     row = {"position_rmse_m": position, "yaw_rmse_rad": yaw, "fps": fps, "cpu_load_percent": load}
     return row | dict(zip(("depth_rmse_scaled_m", "depth_rmse_unscaled_m"), depth))
 
@@ -61,52 +61,61 @@ def _paper(position: float, yaw: float, fps: float, load: float, *depth: float) 
 _UNIDEPTH, _ANYTHING = "unidepth_v2_vits", "depth_anything_v2_small"
 CONFIGURATIONS = (
     Configuration("unidepth-lidar", "UniDepth + lidar", "paper/unidepth-lidar.toml", _UNIDEPTH,
-                  _paper(0.0784, 0.4195, 2.176, 1024, 0.3980, 1.4600), "unidepth-camera"),
+                  _paper_figures(0.0784, 0.4195, 2.176, 1024, 0.3980, 1.4600), "unidepth-camera"),
     Configuration("unidepth-camera", "UniDepth, no lidar", "paper/unidepth-camera.toml", _UNIDEPTH,
-                  _paper(2.0507, 0.4142, 1.201, 1243)),
+                  _paper_figures(2.0507, 0.4142, 1.201, 1243)),
     Configuration("depth_anything-lidar", "Depth Anything + lidar", "paper/depth_anything-lidar.toml",
-                  _ANYTHING, _paper(0.1753, 0.7058, 2.566, 1305, 0.5404, 1.4588), "depth_anything-camera"),
+                  _ANYTHING, _paper_figures(0.1753, 0.7058, 2.566, 1305, 0.5404, 1.4588),
+                  "depth_anything-camera"),
     Configuration("depth_anything-camera", "Depth Anything, no lidar", "paper/depth_anything-camera.toml",
-                  _ANYTHING, _paper(3.2359, 0.7337, 1.564, 1445)),
+                  _ANYTHING, _paper_figures(3.2359, 0.7337, 1.564, 1445)),
     Configuration("monogs-lidar", "MonoGS + lidar", "paper/monogs-lidar.toml", None,
-                  _paper(0.0701, 0.4514, 1.593, 1343), "monogs-camera"),
+                  _paper_figures(0.0701, 0.4514, 1.593, 1343), "monogs-camera"),
     Configuration("monogs-camera", "MonoGS, no lidar", "paper/monogs-camera.toml", None,
-                  _paper(2.4102, 0.4231, 1.418, 1549)),
+                  _paper_figures(2.4102, 0.4231, 1.418, 1549)),
     Configuration(DEFAULT, "default: lidar + fused depth", "demo.toml"),
 )  # fmt: skip
 
 
-def chosen_configurations(names: list[str] | None) -> list[Configuration]:
-    """All, or those named.
+def select_configurations(names: list[str] | None) -> list[Configuration]:
+    """Return the configurations with these names, or all.
 
     Raises:
-        UserError: there is none of that name.
+        UserError: a name is unknown.
     """
     known = {c.name: c for c in CONFIGURATIONS}
     for name in names or ():
         if name not in known:
-            raise UserError(f"there is no configuration {name!r}; there are {', '.join(known)}")
+            raise UserError(f"unknown configuration {name!r}; known are {', '.join(known)}")
     return [known[name] for name in names] if names else list(CONFIGURATIONS)
 
 
-def prepared(
+def prepare_deployment(
     configuration: Configuration, data: Path, out: Path, recorded: Path | None, seed: int
 ) -> tuple[Deployment | None, str, str]:
-    """(deployment, what its depth really is, advice): None where the weights are missing and nothing can
-    stand in. Another network is never shown under this one's name."""
+    """Return the deployment of a configuration, the name of the depth source that really runs, and advice.
+
+    If the weights of the network are missing, recorded depth or FastDepth replaces it and is named as such;
+    without
+    a replacement the deployment is None.
+    """
     overrides = [f"replay.data={json.dumps(str(data))}", f"state_dir={json.dumps(str(out / 'state'))}"]
     overrides.append(f'router.listen=["tcp/127.0.0.1:{_free_port()}"]')
     depth, advice = configuration.title, ""
     if configuration.model is not None and not _installed(configuration.model):
         advice = f"weights missing: beamsplat models pull {configuration.model}"
         if recorded is not None:
-            depth = f"recorded depth of {recorded.name} in the network's place"
+            depth = f"recorded depth of {recorded.name} instead of the network"
             overrides += ['depth.source="recorded"', f"depth.options.folder={json.dumps(str(recorded))}"]
-        elif _installed(STAND_IN):
-            depth = "FastDepth in the network's place"
+        elif _installed(SUBSTITUTE_MODEL):
+            depth = "FastDepth instead of the network"
             overrides.append('depth.source="fastdepth"')
         else:
-            return None, "not run", f"{advice}; FastDepth, which could stand in, is missing too ({STAND_IN})"
+            return (
+                None,
+                "not run",
+                f"{advice}; the substitute {SUBSTITUTE_MODEL} is missing too",
+            )
     deployment = load_deployment(shipped_file(configuration.file), tuple(overrides))
     nodes = {name: dict(t) for name, t in deployment.nodes.items() if name not in ("recorder", "monitor")}
     if "mapping" in nodes:
@@ -133,41 +142,50 @@ def _free_port() -> int:
         return int(probe.getsockname()[1])
 
 
-def open_truth(data: Path, groundtruth: Path | None = None) -> Truth:
-    """The recording with its truth, where there is one: groundtruth.txt beside the bag, or its own poses.
+def open_truth(data: Path, groundtruth: Path | None = None) -> GroundTruth:
+    """Open a recording with its ground truth: a TUM file,
+    groundtruth.txt beside the bag, or poses in the bag.
 
     Raises:
-        UserError: no poses at all to compare with.
+        UserError: there are no poses to compare with.
     """
     folder = truth_folder(data)
     file = groundtruth or (folder / "groundtruth.txt" if (folder / "groundtruth.txt").is_file() else None)
     bag = folder / "bag" if (folder / "bag").exists() else data
     drive = open_drive(bag, file)
     try:
-        depth_files = read_truth(folder)
+        depth_files = truth_depth_files(folder)
     except UserError:
         depth_files = {}
-    return Truth(folder, drive, depth_files)
+    return GroundTruth(folder, drive, depth_files)
 
 
 def bench_paper(
     data: Path, out: Path, *, names: list[str] | None = None, seeds: int = 1, recorded: Path | None = None,
     groundtruth: Path | None = None, seconds: float | None = None, refine_steps: int = 0,
-    say: Callable[[str], None] = print,
+    log: Callable[[str], None] = print,
 ) -> dict[str, Any]:  # fmt: skip
-    """Runs everything, writes report.json and report.html into `out`, gives the report.
+    """Run the configurations, write report.json and report.html into `out`, return the report.
+
+    Args:
+        names: configurations to run; None runs all.
+        seeds: runs of each configuration.
+        recorded: folder of depth maps by stamp that replaces networks with missing weights.
+        seconds: length of the recording that is used; None uses all.
+        refine_steps: refinement steps of the default configuration after the drive.
+        log: receives progress messages.
 
     Raises:
-        UserError: data, names or weights that do not fit.
+        UserError: data or names are invalid.
     """
-    configurations = chosen_configurations(names)
+    configurations = select_configurations(names)
     truth = open_truth(data, groundtruth)
     make_folder(out)
     bag = truth.path / "bag" if (truth.path / "bag").exists() else data
     rows: list[dict[str, Any]] = []
     for configuration in configurations:
         for seed in range(seeds):
-            rows.append(_one_run(configuration, bag, out, truth, recorded, seed, seconds, refine_steps, say))
+            rows.append(_one_run(configuration, bag, out, truth, recorded, seed, seconds, refine_steps, log))
             report = _report(rows, data, truth)
             write_atomically(out / "report.json", json.dumps(_figures_only(report), indent=1).encode())
             write_report(out / "report.html", report, truth)
@@ -175,8 +193,8 @@ def bench_paper(
 
 
 def _one_run(
-    configuration: Configuration, bag: Path, out: Path, truth: Truth, recorded: Path | None, seed: int,
-    seconds: float | None, refine_steps: int, say: Callable[[str], None],
+    configuration: Configuration, bag: Path, out: Path, truth: GroundTruth, recorded: Path | None, seed: int,
+    seconds: float | None, refine_steps: int, log: Callable[[str], None],
 ) -> dict[str, Any]:  # fmt: skip
     row: dict[str, Any] = {
         "name": configuration.name, "title": configuration.title, "seed": seed, "paper": configuration.paper,
@@ -184,60 +202,66 @@ def _one_run(
     }  # fmt: skip
     run_dir = out / f"{configuration.name}-{seed}"
     make_folder(run_dir)
-    deployment, depth, advice = prepared(configuration, bag, run_dir, recorded, seed)
+    deployment, depth, advice = prepare_deployment(configuration, bag, run_dir, recorded, seed)
     row |= {"depth_source": depth, "advice": advice}
     if deployment is None:
-        say(f"{configuration.name}: {advice}")
+        log(f"{configuration.name}: {advice}")
         return row | {"status": advice}
     if seconds is not None:
         deployment = _with(deployment, "replay", duration_s=seconds)
     if configuration.name == DEFAULT:
         deployment = _with(deployment, "mapping", final_steps=refine_steps)
-    say(f"{configuration.name}: running ({depth})")
+    log(f"{configuration.name}: running ({depth})")
     duration_s = seconds or (truth.drive.images[-1].stamp_ns - truth.drive.images[0].stamp_ns) * 1e-9
     began = time.monotonic()
     try:
-        seen, costs = run_live(
-            deployment, frozenset(truth.depth_files), 4.0 * duration_s + 120.0 + 0.5 * refine_steps, say
+        record, costs = run_live(
+            deployment, frozenset(truth.depth_files), 4.0 * duration_s + 120.0 + 0.5 * refine_steps, log
         )
     except UserError as error:
-        say(f"{configuration.name}: {error}")
+        log(f"{configuration.name}: {error}")
         return row | {"status": str(error)}
-    row |= {"status": "ok", **score(seen, costs, truth)}
-    say(
-        f"{row['name']}: {time.monotonic() - began:.0f} s, position {_show(row, 'position_rmse_m')} m, "
-        f"fps {_show(row, 'fps')}, CPU {_show(row, 'cpu_load_percent')} %"
+    row |= {"status": "ok", **score_run(record, costs, truth)}
+    log(
+        f"{row['name']}: {time.monotonic() - began:.0f} s, position {_format(row, 'position_rmse_m')} m, "
+        f"fps {_format(row, 'fps')}, CPU {_format(row, 'cpu_load_percent')} %"
     )
     return row
 
 
-def _show(row: dict[str, Any], name: str) -> str:
+def _format(row: dict[str, Any], name: str) -> str:
     value = row.get(name)
     return "-" if value is None else f"{value:.3g}"
 
 
-def score(seen: Seen, costs: Costs, truth: Truth) -> dict[str, Any]:
-    """All figures of one run, and under `pictures` what the report draws."""
-    stamps, T_found, T_true = compared_poses(seen, truth)
-    row = speed(seen, costs, os.cpu_count() or 1) | pose_errors(T_found, T_true) | depth_errors(seen, truth)
+def score_run(record: RunRecord, costs: RunCosts, truth: GroundTruth) -> dict[str, Any]:
+    """Return all figures of one run, and under `plots` the data that the report draws."""
+    stamps, T_found, T_true = aligned_poses(record, truth)
+    row = (
+        speed_and_load(record, costs, os.cpu_count() or 1)
+        | pose_errors(T_found, T_true)
+        | depth_errors(record, truth)
+    )
     T_world_map = None
     if len(T_found):
-        first = next(T for _, T, status, _ in seen.poses if status == "ok")
+        first = next(T for _, T, status, _ in record.poses if status == "ok")
         T_world_map = rigid_offset(T_found, T_true) @ T_found[0] @ inverse(first)
-    figures, offpath = ({}, []) if T_world_map is None else map_figures(seen, truth, T_world_map)
-    ends = [s.psnr_db for s in seen.statuses if np.isfinite(s.psnr_db)]
+    figures, offpath = ({}, []) if T_world_map is None else map_figures(record, truth, T_world_map)
+    ends = [s.psnr_db for s in record.statuses if np.isfinite(s.psnr_db)]
     row |= figures | {"psnr_keyframes_db": float(np.mean(ends)) if ends else None}
-    row["pictures"] = {
+    row["plots"] = {
         "stamps_ns": stamps, "found": T_found, "true": T_true, "offpath": offpath,
-        "previews": previews(seen, 4),
-        "estimates": seen.kept_estimates, "fused": seen.kept_fused,
-        "above": None if T_world_map is None else map_from_above(seen, T_world_map, T_found[:, :2, 3]),
+        "previews": previews(record, 4),
+        "estimates": record.kept_estimates, "fused": record.kept_fused,
+        "above": None if T_world_map is None else top_view_of_map(record, T_world_map, T_found[:, :2, 3]),
     }  # fmt: skip
     return row
 
 
-def one_row_report(name: str, title: str, data: Path, truth: Truth, row: dict[str, Any]) -> dict[str, Any]:
-    """The report of a single run that is none of the paper's."""
+def single_run_report(
+    name: str, title: str, data: Path, truth: GroundTruth, row: dict[str, Any]
+) -> dict[str, Any]:
+    """Return the report of a single run that is not one of the paper's configurations."""
     whole = {
         "name": name, "title": title, "seed": 0, "paper": {}, "partner": None, "lidar": True,
         "depth_source": title, "advice": "", "status": "ok", **row,
@@ -245,15 +269,16 @@ def one_row_report(name: str, title: str, data: Path, truth: Truth, row: dict[st
     return _report([whole], data.parent if data.name == "bag" else data, truth)
 
 
-def _report(rows: list[dict[str, Any]], data: Path, truth: Truth) -> dict[str, Any]:
+def _report(rows: list[dict[str, Any]], data: Path, truth: GroundTruth) -> dict[str, Any]:
     return {
         "data": data.name, "cores": os.cpu_count(), "truth": truth.drive.poses_name.rsplit("/", 1)[-1],
-        "configurations": rows, "pairs": pairs(rows),
+        "configurations": rows, "pairs": compare_pairs(rows),
     }  # fmt: skip
 
 
-def pairs(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Lidar beside camera of each kind: the ratios of CPU load and of speed (the paper's 34 %)."""
+def compare_pairs(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return the ratios of lidar to camera localization for each depth
+    source: CPU load, speed, position error."""
     means = {name: _means([r for r in rows if r["name"] == name]) for name in {r["name"] for r in rows}}
     out = []
     for row in {r["name"]: r for r in rows}.values():
@@ -280,5 +305,5 @@ def _ratio(a: dict[str, float], b: dict[str, float], name: str) -> float | None:
 
 
 def _figures_only(report: dict[str, Any]) -> dict[str, Any]:
-    rows = [{k: v for k, v in row.items() if k != "pictures"} for row in report["configurations"]]
+    rows = [{k: v for k, v in row.items() if k != "plots"} for row in report["configurations"]]
     return {**report, "configurations": rows}

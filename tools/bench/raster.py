@@ -1,4 +1,5 @@
-"""`bench raster`: forward + L1 (colour and depth) + backward on a synthetic room, beside plain torch."""
+"""`bench raster`: time of forward, L1 loss (colour and depth) and
+backward on a synthetic room, and of plain torch."""
 
 from __future__ import annotations
 
@@ -17,14 +18,17 @@ from beamsplat.services.mapping.kernels import photometric_and_depth
 from beamsplat.services.mapping.warm import warm
 
 SIZES = ((320, 240), (640, 480))
-Say = Callable[[str], None]
+Log = Callable[[str], None]
 
 
 def synthetic_room(gaussians: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """(params float32 [14, capacity], T_camera_map): a furnished room of 6 x 5 x 2.5 m seen from a corner.
+    """Return the Gaussians of a furnished room of 6 x 5 x 2.5 m and a view from its corner.
 
-    Discs of 1-4 cm on walls, floor, ceiling and the sides of boxes. Neighbours in memory are neighbours on
-    a surface, as a mapper makes them.
+    Gaussians are discs of 1-4 cm on walls, floor, ceiling and boxes. Neighbours in memory are neighbours on a
+    surface, as in maps that the mapper builds.
+
+    Returns:
+        params float32 [14, capacity], T_camera_map float64 [4, 4].
     """
     rng = np.random.default_rng(seed)
     faces = _faces(rng)
@@ -56,7 +60,7 @@ def synthetic_room(gaussians: int, seed: int = 0) -> tuple[np.ndarray, np.ndarra
 
 
 def _faces(rng: np.random.Generator) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """(origin, side, side) of the rectangles of the room and of eight boxes in it."""
+    """Return (origin, side, side) of the rectangles of the room and of eight boxes in it."""
 
     def box(low: np.ndarray, high: np.ndarray) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
         x, y, z = np.diag(high - low)
@@ -70,21 +74,21 @@ def _faces(rng: np.random.Generator) -> list[tuple[np.ndarray, np.ndarray, np.nd
 
 
 def _turn_z_to(normal: np.ndarray) -> np.ndarray:
-    """Quaternion (w, x, y, z) that takes z to the normal's direction."""
+    """Return the quaternion (w, x, y, z) that rotates z to the direction of the normal."""
     n = normal / np.linalg.norm(normal)
     quat = np.array([1.0 + n[2], -n[1], n[0], 0.0]) if n[2] > -0.999 else np.array([0.0, 1.0, 0.0, 0.0])
     return quat / np.linalg.norm(quat)
 
 
-def bench_raster(gaussians: int = 50_000, repeats: int = 15, say: Say = lambda text: None) -> dict[str, Any]:
-    """Medians over `repeats`, contenders in turn; wall time, and CPU time of the process beside it."""
+def bench_raster(gaussians: int = 50_000, repeats: int = 15, log: Log = lambda text: None) -> dict[str, Any]:
+    """Return median wall and CPU times over `repeats` runs in which one and two threads alternate."""
     warm()
     params, T_camera_map = synthetic_room(gaussians)
     cases = []
     for width, height in SIZES:
         camera = RasterCamera(0.9 * width, 0.9 * width, 0.5 * width - 0.5, 0.5 * height - 0.5, width, height)
         cases += _cpu_cases(params, gaussians, camera, T_camera_map, repeats)
-        say(f"{width}x{height}: {cases[-1]['total_ms']:.1f} ms with two threads; now the reference")
+        log(f"{width}x{height}: {cases[-1]['total_ms']:.1f} ms with two threads; running the reference")
         cases.append(_reference_case(params, gaussians, camera, T_camera_map))
         fastest = min(case["cpu_ms"] for case in cases if case["width"] == width and case["backend"] == "cpu")
         cases[-1]["times_slower"] = cases[-1]["cpu_ms"] / fastest
@@ -122,7 +126,7 @@ def _cpu_cases(
             rasterizer.backward(render, gradient)
             end, pairs = time.perf_counter(), render.pairs
             rasterizer.release(render)
-            if repeat >= 2:  # the first ones make room
+            if repeat >= 2:  # the first two allocate memory
                 times[threads].append((middle - start, end - start, time.process_time() - cpu))
     for rasterizer in teams.values():
         rasterizer.close()
@@ -149,7 +153,7 @@ def _case(
 def _reference_case(
     params: np.ndarray, count: int, camera: RasterCamera, T_camera_map: np.ndarray
 ) -> dict[str, Any]:
-    """One run of plain torch in float32 on one thread."""
+    """Time one run of plain torch in float32 on one thread."""
     import torch
 
     from beamsplat.services.mapping.renderers.protocol import make_renderer
@@ -166,7 +170,7 @@ def _reference_case(
 def _torch_step(
     renderer: Any, params: np.ndarray, count: int, camera: RasterCamera, T_camera_map: np.ndarray, device: str
 ) -> tuple[float, float, float]:
-    """(forward, total, CPU) seconds of forward + L1 + backward through a renderer of torch tensors."""
+    """Return (forward, total, CPU) seconds of forward, L1 loss and backward of a torch renderer."""
     import torch
 
     from beamsplat.common.raster.layout import GROUPS
@@ -179,17 +183,17 @@ def _torch_step(
     wait = torch.cuda.synchronize if device == "cuda" else lambda: None
     wait()
     cpu, start = time.process_time(), time.perf_counter()
-    picture = renderer.render(gaussians, camera, T_camera_map)
+    view = renderer.render(gaussians, camera, T_camera_map)
     wait()
     middle = time.perf_counter()
-    image = torch.cat([picture.colour.permute(2, 0, 1), picture.depth_m[None], picture.alpha[None]])
+    image = torch.cat([view.colour.permute(2, 0, 1), view.depth_m[None], view.alpha[None]])
     (image - target).abs().mean().backward()
     wait()
     return middle - start, time.perf_counter() - start, time.process_time() - cpu
 
 
 def _gsplat_cases(repeats: int) -> list[dict[str, Any]]:
-    """640x480 with a million Gaussians, where there is a GPU."""
+    """Time gsplat at 640x480 with a million Gaussians; no cases without a GPU."""
     from beamsplat.services.mapping.renderers.gsplat import fault
     from beamsplat.services.mapping.renderers.protocol import make_renderer
 

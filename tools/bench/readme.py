@@ -1,4 +1,4 @@
-"""Tables of figures that stand in the README between two marks, put there by the bench that measures them."""
+"""Writes tables of benchmark results into the README, between two marks."""
 
 from __future__ import annotations
 
@@ -7,26 +7,28 @@ from typing import Any
 
 from beamsplat.common.errors import UserError
 
-_PAPER_COLUMNS = ("configuration", "position RMSE, m", "pictures/s", "CPU s a picture", "depth RMSE, m",
+_PAPER_COLUMNS = ("configuration", "position RMSE, m", "images/s", "CPU s per image", "depth RMSE, m",
                   "map off the path, dB", "p95 to the map, s", "memory, MB")  # fmt: skip
 
 
-def into_readme(readme: Path, bench: str, table: str) -> None:
-    """Replaces what stands between <!-- bench NAME --> and <!-- /bench NAME -->.
+def replace_readme_table(readme: Path, bench: str, table: str) -> None:
+    """Replace the text between <!-- bench NAME --> and <!-- /bench NAME --> with a table.
 
     Raises:
-        UserError: they are not there.
+        UserError: the marks are missing.
     """
     begin, end = f"<!-- bench {bench} -->", f"<!-- /bench {bench} -->"
     text = readme.read_text()
     if begin not in text or end not in text:
-        raise UserError(f"{readme}: no lines {begin} and {end} between which the table could go")
+        raise UserError(
+            f"{readme}: the lines {begin} and {end}, between which the table is written, are missing"
+        )
     head, tail = text.split(begin)[0], text.split(end)[1]
     readme.write_text(f"{head}{begin}\n{table}\n{end}{tail}")
 
 
 def paper_table(rows: list[dict[str, Any]]) -> str:
-    """The table of `bench paper`; what the paper has for the same stands in brackets."""
+    """Return the table of `bench paper` in Markdown, with the paper's figures in brackets."""
     lines = ["| " + " | ".join(_PAPER_COLUMNS) + " |", "|---" * len(_PAPER_COLUMNS) + "|"]
     for row in rows:
         paper = row["paper"]
@@ -38,10 +40,10 @@ def paper_table(rows: list[dict[str, Any]]) -> str:
         name = row["title"] + (f" [{row['depth_source']}]" if row["advice"] else "")
         cells = [
             name,
-            _beside(row.get("position_rmse_m"), 4, paper.get("position_rmse_m")),
-            _beside(row.get("fps"), 1, paper.get("fps")),
-            _beside(row.get("cpu_s_per_image"), 2, cpu_s),
-            _beside(row.get("depth_rmse_scaled_m"), 2, paper.get("depth_rmse_scaled_m")),
+            _with_reference(row.get("position_rmse_m"), 4, paper.get("position_rmse_m")),
+            _with_reference(row.get("fps"), 1, paper.get("fps")),
+            _with_reference(row.get("cpu_s_per_image"), 2, cpu_s),
+            _with_reference(row.get("depth_rmse_scaled_m"), 2, paper.get("depth_rmse_scaled_m")),
             map_db,
             _number(None if latency_ms is None else latency_ms * 1e-3, 1),
             _number(memory, 0),
@@ -54,5 +56,5 @@ def _number(value: float | None, digits: int) -> str:
     return "–" if value is None else f"{value:.{digits}f}"
 
 
-def _beside(value: float | None, digits: int, theirs: float | None) -> str:
+def _with_reference(value: float | None, digits: int, theirs: float | None) -> str:
     return _number(value, digits) + ("" if theirs is None else f" ({theirs:.{digits}f})")

@@ -1,4 +1,4 @@
-"""The lidar SLAM on recordings with truth: accuracy and cost, each recording in a process of its own."""
+"""`bench slam`: accuracy and cost of the lidar SLAM on recordings with ground truth, one process each."""
 
 from __future__ import annotations
 
@@ -17,17 +17,23 @@ from beamsplat.common.geometry.trajectory import read_tum
 # Mean absolute errors of Cartographer over the same relations as published (Hess et al. 2016, table II).
 CARTOGRAPHER = {"aces": (0.0375, 0.373), "intel": (0.0229, 0.453), "fr079": (0.0452, 0.538)}
 COLUMNS = (
-    "recording", "error, m", "error, deg", "Cartographer as published", "CPU ms a scan", "p95 of a step, ms",
-    "memory, MB",
+    "recording", "error, m", "error, deg", "Cartographer as published", "CPU ms per scan",
+    "p95 of a step, ms", "memory, MB",
 )  # fmt: skip
 COSTS = (("cpu_ms_per_scan", 1), ("step_p95_ms", 1), ("peak_rss_mb", 0))
-MOST_RISE_M, MOST_TILT_DEG = 0.2, 5.0
-MAP_PX = 480  # side of one picture in the deck
+MAX_RISE_M, MAX_TILT_DEG = 0.2, 5.0  # of recordings that count as planar
+TILE_PX = 480  # side of one map in the overview image
 
 
 def recordings_in(folder: Path) -> list[tuple[str, Path, list[str]]]:
-    """(name, recording, arguments of `eval slam`) of what has a truth: X.bag beside X.relations, and folders
-    with bag/ and groundtruth.txt that have a lidar. Raises UserError where there is none."""
+    """Find recordings with ground truth: X.bag beside X.relations, and folders with bag/ and groundtruth.txt.
+
+    Returns:
+        (name, recording, arguments of `eval slam`) of each.
+
+    Raises:
+        UserError: there is no such recording.
+    """
     found = [
         (path.stem, path.with_suffix(".bag"), ["--relations", str(path)])
         for path in sorted(folder.rglob("*.relations"))
@@ -39,22 +45,22 @@ def recordings_in(folder: Path) -> list[tuple[str, Path, list[str]]]:
         if (path.parent / "bag").exists()
     ]
     if not found:
-        raise UserError(f"{folder}: neither X.bag with X.relations nor bag/ with groundtruth.txt in it")
+        raise UserError(f"{folder} contains neither X.bag with X.relations nor bag/ with groundtruth.txt")
     return found
 
 
-def bench_slam(folder: Path, out: Path, odometry: bool, say: Callable[[str], None]) -> list[dict[str, Any]]:
-    """One row for each recording; those without a lidar are said and left out."""
+def bench_slam(folder: Path, out: Path, odometry: bool, log: Callable[[str], None]) -> list[dict[str, Any]]:
+    """Return one row of figures per recording; unsuitable recordings are logged and left out."""
     rows = []
     for name, bag, truth in recordings_in(folder):
         if truth[0] == "--groundtruth" and (why := _not_planar(Path(truth[1]))):
-            say(f"{name}: left out, {why}")
+            log(f"{name}: left out, {why}")
             continue
-        say(f"{name} ...")
+        log(f"{name} ...")
         command = ["slam", str(bag), "--out", str(out / name), "--json"]
         mapped = _beamsplat([*command, *([] if odometry else ["--no-odometry"])])
         if mapped.returncode:
-            say(f"{name}: left out, {mapped.stderr.strip().splitlines()[-1]}")
+            log(f"{name}: left out, {mapped.stderr.strip().splitlines()[-1]}")
             continue
         scored = _beamsplat(["eval", "slam", str(out / name), *truth, "--json"])
         if scored.returncode:
@@ -64,11 +70,11 @@ def bench_slam(folder: Path, out: Path, odometry: bool, say: Callable[[str], Non
 
 
 def _not_planar(groundtruth: Path) -> str:
-    """Why a drive is none on a floor; a planar SLAM says nothing about a camera carried by hand."""
+    """Return why a recording is not planar, or "": a planar SLAM cannot map a hand-held sensor."""
     T_world_body = read_tum(groundtruth).T_a_b
     rise_m = float(np.ptp(T_world_body[:, 2, 3]))
     tilt_deg = float(np.degrees(np.arccos(np.clip(T_world_body[:, 2, 2].min(), -1.0, 1.0))))
-    if rise_m < MOST_RISE_M and tilt_deg < MOST_TILT_DEG:
+    if rise_m < MAX_RISE_M and tilt_deg < MAX_TILT_DEG:
         return ""
     return f"its body rises by {rise_m:.2f} m and tilts by {tilt_deg:.0f} degrees"
 
@@ -79,7 +85,7 @@ def _beamsplat(arguments: list[str]) -> subprocess.CompletedProcess[str]:
 
 
 def markdown(rows: list[dict[str, Any]]) -> str:
-    """The table of the README."""
+    """Return the rows as the table of the README in Markdown."""
     lines = [
         "| " + " | ".join(COLUMNS) + " |",
         "|---" * len(COLUMNS) + "|",
@@ -98,17 +104,17 @@ def markdown(rows: list[dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
-def deck(out: Path, names: list[str], path: Path) -> None:
-    """The maps side by side, each with its name, as one JPEG."""
+def write_map_overview(out: Path, names: list[str], path: Path) -> None:
+    """Write the maps side by side, each with its name, as one JPEG."""
     import cv2
 
     tiles = []
     for name in names:
-        picture = cv2.imread(str(out / name / "map.png"))
-        scale = (MAP_PX - 30) / max(picture.shape[:2])
-        small = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-        tile = np.full((MAP_PX, MAP_PX, 3), 205, dtype=np.uint8)
-        top, left = 30 + (MAP_PX - 30 - small.shape[0]) // 2, (MAP_PX - small.shape[1]) // 2
+        image = cv2.imread(str(out / name / "map.png"))
+        scale = (TILE_PX - 30) / max(image.shape[:2])
+        small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        tile = np.full((TILE_PX, TILE_PX, 3), 205, dtype=np.uint8)
+        top, left = 30 + (TILE_PX - 30 - small.shape[0]) // 2, (TILE_PX - small.shape[1]) // 2
         tile[top : top + small.shape[0], left : left + small.shape[1]] = small
         cv2.putText(tile, name, (12, 22), cv2.FONT_HERSHEY_SIMPLEX, 0.6, (40, 40, 40), 1, cv2.LINE_AA)
         tiles.append(tile)

@@ -1,1 +1,1 @@
-"""Commands that look at depth, measure it and calibrate: they play recordings through several services."""
+"""Evaluation of depth and calibration: plays recordings through the libraries of several services."""

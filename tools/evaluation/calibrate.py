@@ -1,4 +1,5 @@
-"""Calibration of a recorded drive, and of still pairs with a board: reading the data, asking the library."""
+"""Calibrates a recorded drive, or still pairs of images and scans with a
+board: reads the data, calls the library."""
 
 from __future__ import annotations
 
@@ -23,30 +24,31 @@ from beamsplat.services.fusion.calibration.motion import (
 )
 from beamsplat.services.fusion.calibration.startup_check import describe_calibration
 from beamsplat.services.fusion.relative_pose import detect_corners, track_corners
-from beamsplat.tools.evaluation.drive import Drive
+from beamsplat.tools.evaluation.drive import RecordedDrive
 
-_WIDTH_PX = 320
-_APART_NS = 1_000_000_000  # the longer, the more of the turn's change is seen against the poses' noise
-_EVERY_NS = 250_000_000
-_HALF_BOARD_M = 0.26
+_WIDTH_PX = 320  # images are tracked at this width
+_PAIR_BASELINE_NS = 1_000_000_000  # longer pairs have more rotation relative to the noise of the poses
+_PAIR_PERIOD_NS = 250_000_000
+_HALF_BOARD_M = 0.26  # beams this close to the board's centre can hit it
 
 
-def tracked_pairs(drive: Drive, clock_offset_ns: int = 0) -> list[TrackedPair]:
-    """Corners tracked over about 0.6 s, all along the drive; `clock_offset_ns` is added to the stamps."""
+def tracked_pairs(drive: RecordedDrive, clock_offset_ns: int = 0) -> list[TrackedPair]:
+    """Track corners over 1 s, every 0.25 s of the drive;
+    `clock_offset_ns` is added to the stamps of the images."""
     cv2.setNumThreads(1)
     height = round(drive.camera.height_px * _WIDTH_PX / drive.camera.width_px)
     camera = drive.undistort.pinhole.resized(_WIDTH_PX, height)
     stamps = np.array([image.stamp_ns for image in drive.images], dtype=np.int64)
     pairs = []
     begin = int(stamps[0])
-    while begin + _APART_NS < stamps[-1]:
+    while begin + _PAIR_BASELINE_NS < stamps[-1]:
         i = int(np.searchsorted(stamps, begin))
-        j = int(np.searchsorted(stamps, stamps[i] + _APART_NS))
-        begin += _EVERY_NS
+        j = int(np.searchsorted(stamps, stamps[i] + _PAIR_BASELINE_NS))
+        begin += _PAIR_PERIOD_NS
         if j >= len(stamps):
             break
         grey = [
-            cv2.resize(cv2.cvtColor(drive.picture(k), cv2.COLOR_RGB2GRAY), (_WIDTH_PX, height),
+            cv2.resize(cv2.cvtColor(drive.rgb(k), cv2.COLOR_RGB2GRAY), (_WIDTH_PX, height),
                        interpolation=cv2.INTER_AREA)
             for k in (i, j)
         ]  # fmt: skip
@@ -60,11 +62,11 @@ def tracked_pairs(drive: Drive, clock_offset_ns: int = 0) -> list[TrackedPair]:
     return pairs
 
 
-def calibrate_motion(drive: Drive, free: tuple[str, ...] = PARAMETERS) -> MotionCalibration:
-    """Clock and mount of a drive's camera.
+def calibrate_motion(drive: RecordedDrive, free: tuple[str, ...] = PARAMETERS) -> MotionCalibration:
+    """Estimate the clock offset and the mount of a drive's camera; only the parameters `free` are estimated.
 
     Raises:
-        UserError: too little to see, or no poses.
+        UserError: too few tracked corners, or no poses.
     """
     focal = drive.camera.fx_px * _WIDTH_PX / drive.camera.width_px
     try:
@@ -76,29 +78,38 @@ def calibrate_motion(drive: Drive, free: tuple[str, ...] = PARAMETERS) -> Motion
 def calibrate_board(
     folder: Path, rig_file: Path, corner_counts: tuple[int, int], square_m: float
 ) -> dict[str, Any]:
-    """Yaw and offsets from `images/<stamp_ns>.png` and `lasers/<stamp_ns>.pcd`, nearest stamps paired.
+    """Estimate yaw and offsets of the lidar in the camera from
+    `images/<stamp_ns>.png` and `lasers/<stamp_ns>.pcd`.
+
+    Args:
+        corner_counts: inner corners of the chessboard, (columns, rows).
+        square_m: side of a square.
+
+    Returns:
+        The figures of the JSON report of `calibrate extrinsics --target board`.
 
     Raises:
-        UserError: no such files, no camera in the rig, or no board in the pictures.
+        UserError: no such files, no camera in the rig, or no board in the images.
     """
     loaded = load_rig(rig_file)
     if loaded.camera is None:
-        raise UserError(f"{rig_file}: has no [camera]; the board needs K and distortion")
+        raise UserError(f"{rig_file} has no [camera]; calibration with a board needs K and distortion")
     camera = Pinhole.of(loaded.camera.model())
-    pairs, pictures, missing = [], [], []
+    pairs, images, missing = [], [], []
     for image_file, cloud_file in pair_files(folder):
         grey = cv2.imread(str(image_file), cv2.IMREAD_GRAYSCALE)
         if grey is None or grey.shape != camera.shape:
-            raise UserError(f"{image_file}: is no picture of {camera.width_px}x{camera.height_px}")
+            raise UserError(f"{image_file} is not an image of {camera.width_px}x{camera.height_px} pixels")
         plane = chessboard_plane(grey, camera, corner_counts, square_m)
         if plane is None:
             missing.append(image_file.name)
             continue
-        pictures.append(grey)
+        images.append(grey)
         pairs.append(BoardPair(plane[0], plane[1], plane[2], _HALF_BOARD_M, read_pcd(cloud_file)))
     if len(pairs) < 2:
         raise UserError(
-            f"{folder}: a board of {corner_counts} corners is seen in {len(pairs)} pictures; 2 are needed"
+            f"{folder}: a board of {corner_counts} corners was found in {len(pairs)} images; at "
+            f"least 2 are needed"
         )
     start, y_m = (0.0, 0.0, 0.0), 0.0
     if loaded.lidar is not None:
@@ -114,7 +125,7 @@ def calibrate_board(
         image_edges(
             grey, camera, pinhole.project(transform_points(found.T_camera_lidar, pair.points_lidar[beams]))[0]
         )
-        for grey, pair, beams in zip(pictures, pairs, found.on_board)
+        for grey, pair, beams in zip(images, pairs, found.on_board)
     ]  # fmt: skip
     before = edge_errors(
         pairs, found.on_board, edges, level_mount(start[0], start[1], y_m, start[2]), pinhole
@@ -133,10 +144,10 @@ def calibrate_board(
 
 
 def pair_files(folder: Path, tolerance_ns: int = 100_000_000) -> list[tuple[Path, Path]]:
-    """Pictures and clouds of the same moment.
+    """Return pairs of an image file and the point cloud file nearest in time.
 
     Raises:
-        UserError: there are none.
+        UserError: there is no pair.
     """
     images = {int(p.stem): p for p in sorted((folder / "images").glob("*.png")) if p.stem.isdigit()}
     clouds = {int(p.stem): p for p in sorted((folder / "lasers").glob("*.pcd")) if p.stem.isdigit()}
@@ -147,16 +158,17 @@ def pair_files(folder: Path, tolerance_ns: int = 100_000_000) -> list[tuple[Path
             pairs.append((image, clouds[near]))
     if not pairs:
         raise UserError(
-            f"{folder}: expected images/<stamp_ns>.png and lasers/<stamp_ns>.pcd of the same moments"
+            f"{folder}: expected images/<stamp_ns>.png and lasers/<stamp_ns>.pcd with stamps at most"
+            f" 0.1 s apart"
         )
     return pairs
 
 
 def read_pcd(path: Path) -> np.ndarray:
-    """Points float64 [N, 3] of an ASCII PCD file with fields x y z first.
+    """Read points float64 [N, 3] of an ASCII PCD file whose first fields are x, y, z.
 
     Raises:
-        UserError: another kind of file.
+        UserError: the file has another format.
     """
     try:
         head, _, body = path.read_text().partition("DATA ascii\n")
@@ -170,8 +182,11 @@ def read_pcd(path: Path) -> np.ndarray:
     return values[np.all(np.isfinite(values), axis=1)]
 
 
-def motion_report(drive: Drive, found: MotionCalibration) -> dict[str, Any]:
-    """The figures of a motion calibration, and a sentence on its health."""
+def motion_report(drive: RecordedDrive, found: MotionCalibration) -> dict[str, Any]:
+    """Return the figures of a motion calibration and a sentence on its quality.
+
+    Values that were not estimated are None.
+    """
     report: dict[str, Any] = {
         "corners": found.corners, "residual_px": found.residual_px,
         "residual_before_px": found.residual_before_px,
@@ -184,13 +199,14 @@ def motion_report(drive: Drive, found: MotionCalibration) -> dict[str, Any]:
         report[f"{shown}_sigma"] = float(sigma * unit) if np.isfinite(sigma) else None
         if np.isfinite(sigma) and not sure:
             unknown.append(name.rsplit("_", 1)[0])
-    report["not_observable"] = [*unknown, "z: a body on a floor never moves along it"]
+    report["not_observable"] = [*unknown, "z: a body on a floor never moves along z"]
     report["status"] = describe_calibration(found)
     report["T_body_camera"] = found.mount(drive.T_body_camera).tolist()
     return report
 
 
-def with_clock(drive: Drive, offset_ns: int) -> Drive:
-    """The drive with its pictures stamped later by `offset_ns`: to see whether it is found."""
+def with_clock_offset(drive: RecordedDrive, offset_ns: int) -> RecordedDrive:
+    """Return the drive with `offset_ns` added to the stamps of its
+    images, to test whether it is estimated."""
     images = [image.model_copy(update={"stamp_ns": image.stamp_ns + offset_ns}) for image in drive.images]
     return replace(drive, images=images)

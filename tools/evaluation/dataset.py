@@ -1,6 +1,6 @@
-"""Recordings with truth as arrays, for measuring the mapper: pictures, true poses, beams, true depth.
+"""Recordings with ground truth, for evaluating the mapper: images, true poses, beams, true depth.
 
-Reads a folder laid out as `bag/` plus `groundtruth.txt` (T_map_body), `depth_gt/` and `extra_views/`.
+Reads a folder with `bag/`, `groundtruth.txt` (T_map_body), `depth_gt/` and `extra_views/`.
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ from beamsplat.common.geometry.transforms import make_transform, matrix_from_qua
 
 
 @dataclass(frozen=True)
-class Shot:
-    """A picture with its true pose."""
+class PosedImage:
+    """A compressed image with its true pose."""
 
     stamp_ns: int
     T_map_camera: np.ndarray
     jpeg: bytes
-    beams: Beams = NO_BEAMS  # in the body frame at the picture's time
+    beams: Beams = NO_BEAMS  # in the body frame at the time of the image
 
 
 @dataclass(frozen=True)
-class ExtraView:
-    """A held-out view off the path."""
+class OffPathView:
+    """A held-out view off the path, with its true pose and files of its image and depth."""
 
     T_map_camera: np.ndarray
     image_file: Path
@@ -40,38 +40,39 @@ class ExtraView:
 
 
 @dataclass
-class Recording:
-    """See `load`."""
+class TruthDataset:
+    """A recording with ground truth; see `load_dataset`."""
 
     path: Path
-    camera: Pinhole  # of the pictures as `image` gives them
+    camera: Pinhole  # of the undistorted images that `image` returns
     T_body_camera: np.ndarray
-    shots: list[Shot]
-    extra_views: list[ExtraView] = field(default_factory=list)
+    posed_images: list[PosedImage]
+    offpath_views: list[OffPathView] = field(default_factory=list)
     undistort: Undistorter | None = None
 
     @property
     def seconds(self) -> float:
-        """From the first picture to the last."""
-        return (self.shots[-1].stamp_ns - self.shots[0].stamp_ns) * 1e-9
+        """Time from the first to the last image."""
+        return (self.posed_images[-1].stamp_ns - self.posed_images[0].stamp_ns) * 1e-9
 
     def image(self, index: int) -> np.ndarray:
-        """uint8 [H, W, 3] RGB, undistorted."""
-        bgr = cv2.imdecode(np.frombuffer(self.shots[index].jpeg, np.uint8), cv2.IMREAD_COLOR)
+        """Return image `index`, undistorted, RGB uint8 [H, W, 3]."""
+        bgr = cv2.imdecode(np.frombuffer(self.posed_images[index].jpeg, np.uint8), cv2.IMREAD_COLOR)
         rgb = cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
         return rgb if self.undistort is None else self.undistort(rgb)
 
     def true_depth(self, index: int) -> np.ndarray | None:
-        """float32 [H, W] metres, NaN where unknown; None where the recording has none for this picture."""
-        file = self.path / "depth_gt" / f"{self.shots[index].stamp_ns}.png"
+        """Return the true depth of image `index`, float32 [H, W] in metres,
+        NaN where unknown; None without a file."""
+        file = self.path / "depth_gt" / f"{self.posed_images[index].stamp_ns}.png"
         return read_depth_png(file) if file.is_file() else None
 
 
 def read_depth_png(file: Path) -> np.ndarray:
-    """float32 [H, W] metres of a uint16 millimetre PNG, 0 = NaN.
+    """Read depth float32 [H, W] in metres from a 16 bit PNG in millimetres; 0 becomes NaN.
 
     Raises:
-        UserError: unreadable or of another type.
+        UserError: the file is unreadable or has another type.
     """
     raw = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
     if raw is None or raw.dtype != np.uint16:
@@ -79,33 +80,40 @@ def read_depth_png(file: Path) -> np.ndarray:
     return np.where(raw > 0, raw * np.float32(1e-3), np.float32(np.nan)).astype(np.float32)
 
 
-def load(path: Path) -> Recording:
-    """The recording in a folder; pictures without a pose are left out.
+def load_dataset(path: Path) -> TruthDataset:
+    """Load the dataset in a folder; images without a true pose are left out.
 
     Raises:
-        UserError: a file is missing, or the bag lacks pictures, camera_info or transforms.
+        UserError: a file is missing, or the bag has no images, camera_info or static transforms.
     """
     path = Path(path)
     truth_file = path / "groundtruth.txt"
     if not truth_file.is_file():
-        raise UserError(f"{truth_file}: missing; `bench map` needs true poses (TUM, T_map_body)")
+        raise UserError(f"{truth_file} is missing; `bench map` needs true poses (TUM, T_map_body)")
     truth = read_tum(truth_file)
     raw = _read_bag(path / "bag")
     camera, static = raw.camera, raw.static
     if camera is None or "camera" not in static:
-        raise UserError(f"{path / 'bag'}: has no camera_info, or no static transform to the camera")
+        raise UserError(f"{path / 'bag'} has no camera_info, or no static transform to the camera")
     T_body_camera = static["camera"]
-    beams = _BeamTrack(raw.scans, static.get("lidar"), truth)
-    shots = []
+    beams = _BeamsAtImages(raw.scans, static.get("lidar"), truth)
+    posed_images = []
     for stamp_ns, jpeg in raw.images:
         T_map_body = truth.at(stamp_ns, max_extrapolation_ns=50_000_000)
         if T_map_body is not None:
-            shots.append(Shot(stamp_ns, T_map_body @ T_body_camera, jpeg, beams.at(stamp_ns, T_map_body)))
-    if not shots:
-        raise UserError(f"{path}: no picture has a true pose")
+            posed_images.append(
+                PosedImage(stamp_ns, T_map_body @ T_body_camera, jpeg, beams.at(stamp_ns, T_map_body))
+            )
+    if not posed_images:
+        raise UserError(f"{path}: no image has a true pose")
     undistort = Undistorter(camera) if camera.is_distorted else None
-    return Recording(
-        path, camera.undistorted(), T_body_camera, shots, extra_views(path / "extra_views"), undistort
+    return TruthDataset(
+        path,
+        camera.undistorted(),
+        T_body_camera,
+        posed_images,
+        read_offpath_views(path / "extra_views"),
+        undistort,
     )
 
 
@@ -161,8 +169,8 @@ def _take_static(static: dict[str, np.ndarray], message: Any) -> None:
             static["lidar"] = T
 
 
-class _BeamTrack:
-    """The scan nearest to a picture, each beam brought to the picture's time."""
+class _BeamsAtImages:
+    """Provides the scan nearest to an image, with each beam moved to the time of the image."""
 
     def __init__(
         self, scans: list[tuple[int, Any]], T_body_lidar: np.ndarray | None, truth: Trajectory
@@ -171,7 +179,7 @@ class _BeamTrack:
         self._stamps = np.array([stamp for stamp, _ in scans], dtype=np.int64)
 
     def at(self, stamp_ns: int, T_map_body: np.ndarray) -> Beams:
-        """Beams in the body frame at the stamp; none if there is no scan within 0.2 s."""
+        """Return beams in the body frame at the stamp; none if there is no scan within 0.2 s."""
         if len(self._scans) == 0 or self._T_body_lidar is None:
             return NO_BEAMS
         i = int(np.argmin(np.abs(self._stamps - stamp_ns)))
@@ -193,8 +201,8 @@ class _BeamTrack:
         return self._truth.T_a_b[-1] if T is None else T
 
 
-def extra_views(folder: Path) -> list[ExtraView]:
-    """Held-out views of a folder with poses.json; none where there is no such file."""
+def read_offpath_views(folder: Path) -> list[OffPathView]:
+    """Read the held-out views of a folder with poses.json; an empty list if that file is missing."""
     file = folder / "poses.json"
     if not file.is_file():
         return []
@@ -207,5 +215,5 @@ def extra_views(folder: Path) -> list[ExtraView]:
         )
         named = folder / entry["file"]
         image = named if named.is_file() else named.with_suffix(".jpg")
-        views.append(ExtraView(T, image, folder / entry["depth"]))
+        views.append(OffPathView(T, image, folder / entry["depth"]))
     return views

@@ -67,12 +67,14 @@ class RecordedDrive:
         return self.scans[i] if abs(int(self._middles[i]) - stamp_ns) < 150_000_000 else None
 
     def beams_at(self, stamp_ns: int, excluded: np.ndarray | None = None) -> Beams:
-        """Return the beams of the nearest scan, moved to a stamp; beams in the mask `excluded` are left out."""
+        """Return the beams of the nearest scan, moved to a stamp; beams
+        in the mask `excluded` are left out."""
         scan = self.scan_near(stamp_ns)
         return NO_BEAMS if scan is None else self.beams_of(scan, stamp_ns, excluded)
 
     def beams_of(self, scan: TimedScan, stamp_ns: int, excluded: np.ndarray | None = None) -> Beams:
-        """Return the beams of one scan, moved to a stamp; beams in the mask `excluded` bool [beams] are left out."""
+        """Return the beams of one scan, moved to a stamp; beams in the
+        mask `excluded` bool [beams] are left out."""
         points, index = scan_points(
             scan.ranges_m, scan.angle_min_rad, scan.angle_increment_rad, scan.range_min_m, scan.range_max_m
         )
@@ -123,7 +125,8 @@ def decode_rgb(image: Any, where: str) -> np.ndarray:
 def open_drive(path: Path, poses: Path | None = None, rig: Path | None = None) -> RecordedDrive:
     """Open a recording: a bag, or a folder that contains bag/.
 
-    Poses are taken from the TUM file `poses` (T_map_body), else from the pose topic of the recording, else from
+    Poses are taken from the TUM file `poses` (T_map_body), else from the pose topic of the recording, else
+    from
     the lidar SLAM, which is run on it.
 
     Raises:
@@ -148,7 +151,9 @@ def open_drive(path: Path, poses: Path | None = None, rig: Path | None = None) -
         source.close()
     calibration = found if hasattr(found.camera, "T_body_camera") else found.message(0, str(path))
     if calibration.camera is None or calibration.lidar is None:
-        raise UserError(f"{path}: the calibration of the camera or of the lidar is missing; add --rig rig.toml")
+        raise UserError(
+            f"{path}: the calibration of the camera or of the lidar is missing; add --rig rig.toml"
+        )
     if poses is not None:
         trajectory, name = read_tum(poses), str(poses)
     elif stamps:

@@ -1,4 +1,4 @@
-"""Depth of a drive against dense truth and against beams that nobody was shown."""
+"""Evaluates depth along a drive against dense true depth and against held-out beams."""
 
 from __future__ import annotations
 
@@ -18,53 +18,63 @@ from beamsplat.services.fusion.fuse import Fusion
 from beamsplat.services.fusion.inputs import FusionInput, PlaneSweepConfig
 from beamsplat.services.fusion.result import FusionResult, rejected
 from beamsplat.services.fusion.scaling import affine, ratio
-from beamsplat.tools.evaluation.drive import Drive
-from beamsplat.tools.evaluation.metrics import MethodErrors, blocks, confirmed, every_third
+from beamsplat.tools.evaluation.drive import RecordedDrive
+from beamsplat.tools.evaluation.metrics import (
+    MethodErrors,
+    confirmed_by_truth,
+    every_third,
+    every_third_block,
+)
 
 DEFAULT = "field"
-KEYFRAME_M, KEYFRAME_RAD = 0.3, np.radians(15.0)
+KEYFRAME_M, KEYFRAME_RAD = 0.3, np.radians(15.0)  # motion between keyframes
 
 
 @dataclass(frozen=True)
-class Outcome:
-    """Everything said about one picture."""
+class DepthComparison:
+    """All depth maps of one image, by method, and its true depth."""
 
     stamp_ns: int
     image_rgb: np.ndarray
     estimate: Estimate
     methods: dict[str, FusionResult]
     truth: np.ndarray  # float32 [H, W], NaN = none
-    seconds: dict[str, float]  # CPU time by step
+    seconds: dict[str, float]  # CPU time by method, and of the source
 
 
-def read_truth(folder: Path) -> dict[int, Path]:
-    """Truth files `<stamp_ns>.png` of a folder (or of its depth_gt/) by stamp.
+def truth_depth_files(folder: Path) -> dict[int, Path]:
+    """Return the true depth files `<stamp_ns>.png` of a folder, or of its depth_gt/, by stamp.
 
     Raises:
-        UserError: there are none.
+        UserError: there are no such files.
     """
     folder = Path(folder)
     if (folder / "depth_gt").is_dir():
         folder = folder / "depth_gt"
     files = {int(p.stem): p for p in sorted(folder.glob("*.png")) if p.stem.isdigit()}
     if not files:
-        raise UserError(f"{folder}: holds no truth: expected <stamp_ns>.png, 16 bit millimetres of optical z")
+        raise UserError(f"{folder} holds no truth: expected <stamp_ns>.png, 16 bit millimetres of optical z")
     return files
 
 
-def walk(
-    drive: Drive,
+def replay_depth(
+    drive: RecordedDrive,
     source: DepthSource,
     wanted: dict[int, Path | None],
-    hide: Callable[[int], np.ndarray] | None = None,
+    heldout_mask: Callable[[int], np.ndarray] | None = None,
     config: PlaneSweepConfig | None = None,
     floor: bool | None = None,
-) -> Iterator[Outcome]:
-    """Plays a drive through depth and fusion in order of time; yields the wanted pictures (stamp -> truth).
+) -> Iterator[DepthComparison]:
+    """Run depth estimation and fusion over a drive in order of time; yield the results of the wanted images.
 
-    `hide(beams)` gives the beams of a scan that nobody may see. Wanted pictures are treated as keyframes
-    (`field`); `field_carried` is what they would have got from the keyframes before. Nothing that comes
-    after a picture is used for it, the scan that was running when it was taken excepted.
+    An image is processed without later data, except the scan during which it was taken. Wanted images are
+    processed as keyframes (method `field`); method `field_carried` is the depth that they would have got from
+    earlier keyframes.
+
+    Args:
+        wanted: file of the true depth, or None, by stamp of the image.
+        heldout_mask: maps the number of beams of a scan to bool [beams]; True beams are excluded.
+        floor: whether the camera's height above the floor is known; None: if the poses are planar.
     """
     planar = drive.planar
     known = planar if floor is None else floor
@@ -80,12 +90,14 @@ def walk(
             continue
         while next_scan < len(drive.scans) and drive.scans[next_scan].last_ns <= stamp:
             scan = drive.scans[next_scan]
-            fusion.add_scan(drive.scan_in_map(scan, None if hide is None else hide(len(scan.ranges_m))))
+            fusion.add_scan(
+                drive.scan_in_map(scan, None if heldout_mask is None else heldout_mask(len(scan.ranges_m)))
+            )
             next_scan += 1
-        rgb = drive.picture(number)
+        rgb = drive.rgb(number)
         scan = drive.scan_near(stamp)
-        hidden = None if hide is None or scan is None else hide(len(scan.ranges_m))
-        beams = drive.beams(stamp, hidden)
+        excluded_beams = None if heldout_mask is None or scan is None else heldout_mask(len(scan.ranges_m))
+        beams = drive.beams_at(stamp, excluded_beams)
         is_keyframe = last_keyframe is None or _moved(last_keyframe, T_map_body)
         if stamp not in wanted and not is_keyframe:
             fusion.look(rgb, T_map_body)
@@ -114,7 +126,7 @@ def walk(
             done = correct(guess, estimate.kind, uv, z) if guess is not None else None
             methods[name] = done or rejected(rgb.shape[:2], estimate.status)
             seconds[name] = time.process_time() - started
-        yield Outcome(stamp, rgb, estimate, methods, truth, seconds)
+        yield DepthComparison(stamp, rgb, estimate, methods, truth, seconds)
 
 
 def _moved(T_before: np.ndarray, T_now: np.ndarray) -> bool:
@@ -124,7 +136,7 @@ def _moved(T_before: np.ndarray, T_now: np.ndarray) -> bool:
 
 
 def evaluate(
-    drive: Drive,
+    drive: RecordedDrive,
     source: DepthSource,
     truth: dict[int, Path],
     *,
@@ -133,22 +145,26 @@ def evaluate(
     floor: bool | None = None,
     progress: Callable[[str, int, int], None] = lambda run, done, total: None,
 ) -> dict[str, object]:
-    """The figures of `beamsplat eval depth`: one object per method, and `default`.
+    """Return the figures of `beamsplat eval depth`: one object per method, and `default`.
+
+    With `heldout`, the drive is processed twice more: with every third beam, then with every third block of
+    beams
+    held out.
 
     Raises:
-        UserError: no picture of the drive has a truth and a pose.
+        UserError: no image of the drive has a true depth.
     """
     stamps = {image.stamp_ns for image in drive.images}
     wanted: dict[int, Path | None] = {s: p for s, p in truth.items() if s in stamps}
     if not wanted:
-        raise UserError(f"{drive.path}: no picture has the stamp of a truth file")
+        raise UserError(f"{drive.path}: no image has the stamp of a truth file")
     errors: dict[str, MethodErrors] = {}
     excluded: dict[str, float] = {}
     seconds: dict[str, list[float]] = {}
     for run in ("dense", "third", "blocks") if heldout else ("dense",):
-        hide = _hider(run, drive)
-        seen, dropped = 0, 0
-        for count, outcome in enumerate(walk(drive, source, wanted, hide, config, floor)):
+        heldout_mask = _heldout_selector(run, drive)
+        total, unconfirmed = 0, 0
+        for count, outcome in enumerate(replay_depth(drive, source, wanted, heldout_mask, config, floor)):
             progress(run, count + 1, len(wanted))
             results = dict(outcome.methods)
             if outcome.estimate.kind == "metric":
@@ -157,14 +173,14 @@ def evaluate(
             if run == "dense":
                 _add_dense(errors, results, outcome, drive, seconds)
                 continue
-            uv, z = _hidden_beams(drive, outcome.stamp_ns, hide)
-            good = confirmed(outcome.truth, uv, z)
-            seen, dropped = seen + len(z), dropped + int((~good).sum())
+            uv, z = _heldout_beams(drive, outcome.stamp_ns, heldout_mask)
+            good = confirmed_by_truth(outcome.truth, uv, z)
+            total, unconfirmed = total + len(z), unconfirmed + int((~good).sum())
             for name, result in results.items():
                 sigma = None if name == "raw" else result.sigma_m
                 errors[name].add_held(run, result.depth_m, sigma, uv[good], z[good])
         if run != "dense":
-            excluded[run] = dropped / max(seen, 1)
+            excluded[run] = unconfirmed / max(total, 1)
     report: dict[str, object] = {name: e.summary(excluded) for name, e in errors.items()}
     report["default"] = DEFAULT
     report["cpu_ms"] = {name: 1e3 * float(np.median(values)) for name, values in seconds.items()}
@@ -174,10 +190,10 @@ def evaluate(
 
 
 def _add_dense(
-    errors: dict[str, MethodErrors], results: dict[str, FusionResult], outcome: Outcome, drive: Drive,
-    seconds: dict[str, list[float]],
+    errors: dict[str, MethodErrors], results: dict[str, FusionResult], outcome: DepthComparison,
+    drive: RecordedDrive, seconds: dict[str, list[float]],
 ) -> None:  # fmt: skip
-    uv, z, _ = project_beams(drive.beams(outcome.stamp_ns), drive.undistort.pinhole, drive.T_body_camera)
+    uv, z, _ = project_beams(drive.beams_at(outcome.stamp_ns), drive.undistort.pinhole, drive.T_body_camera)
     for name, result in results.items():
         e = errors.setdefault(name, MethodErrors())
         e.add_dense(result.depth_m, None if name == "raw" else result.sigma_m, outcome.truth)
@@ -186,22 +202,22 @@ def _add_dense(
         seconds.setdefault(name, []).append(value)
 
 
-def _hider(run: str, drive: Drive) -> Callable[[int], np.ndarray] | None:
+def _heldout_selector(run: str, drive: RecordedDrive) -> Callable[[int], np.ndarray] | None:
     if run == "dense":
         return None
     if run == "third":
         return every_third
     increment = drive.scans[0].angle_increment_rad if drive.scans else np.radians(0.5)
-    return lambda count: blocks(count, increment)
+    return lambda count: every_third_block(count, increment)
 
 
-def _hidden_beams(
-    drive: Drive, stamp_ns: int, hide: Callable[[int], np.ndarray] | None
+def _heldout_beams(
+    drive: RecordedDrive, stamp_ns: int, heldout_mask: Callable[[int], np.ndarray] | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(uv [N, 2], z [N]) of the beams nobody saw."""
+    """Return pixels uv [N, 2] and optical z [N] of the held-out beams."""
     scan = drive.scan_near(stamp_ns)
-    if scan is None or hide is None:
+    if scan is None or heldout_mask is None:
         return np.zeros((0, 2)), np.zeros(0)
-    beams = drive.beams(stamp_ns, ~hide(len(scan.ranges_m)))
+    beams = drive.beams_at(stamp_ns, ~heldout_mask(len(scan.ranges_m)))
     uv, z, _ = project_beams(beams, drive.undistort.pinhole, drive.T_body_camera)
     return uv, z

@@ -1,4 +1,4 @@
-"""Errors of depth against truth: dense over every truth pixel, and at beams that were held out."""
+"""Errors of depth: dense over all pixels with true depth, and at beams that were held out."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ import numpy as np
 
 
 def every_third(count: int) -> np.ndarray:
-    """bool [count]: every third beam."""
+    """Return bool [count], True for every third beam."""
     return np.arange(count) % 3 == 0
 
 
-def blocks(count: int, increment_rad: float, width_rad: float = np.radians(7.5)) -> np.ndarray:
-    """bool [count]: every third of contiguous blocks of `width_rad`."""
+def every_third_block(count: int, increment_rad: float, width_rad: float = np.radians(7.5)) -> np.ndarray:
+    """Return bool [count], True for the beams in every third of contiguous blocks of `width_rad`."""
     return np.floor(np.arange(count) * abs(increment_rad) / width_rad).astype(int) % 3 == 0
 
 
 @dataclass
 class MethodErrors:
-    """Sums of one method over the frames of an evaluation."""
+    """Errors of one method, collected over the frames of an evaluation."""
 
     frames: int = 0
     refused: int = 0
@@ -35,7 +35,10 @@ class MethodErrors:
     held_sigma: dict[str, list[np.ndarray]] = field(default_factory=dict)
 
     def add_dense(self, depth: np.ndarray, sigma: np.ndarray | None, truth: np.ndarray) -> None:
-        """One frame, float32 [H, W] each, truth NaN = none. What is not answered lowers the coverage."""
+        """Add one frame; all arrays are float32 [H, W] in metres, truth is NaN where unknown.
+
+        Pixels without depth lower the coverage and enter no other figure.
+        """
         self.frames += 1
         there = np.isfinite(truth)
         ok = there & np.isfinite(depth)
@@ -54,7 +57,7 @@ class MethodErrors:
             self.sigma_m.append(float(np.median(s)))
 
     def add_beams(self, depth: np.ndarray, uv: np.ndarray, z: np.ndarray) -> None:
-        """Errors at beams (the paper's Table IV)."""
+        """Add the errors at beams with pixels uv [N, 2] and optical z [N] (the paper's Table IV)."""
         error = at_pixels(depth, uv) - z
         error = error[np.isfinite(error)]
         self.beam_square += float(error @ error)
@@ -63,7 +66,8 @@ class MethodErrors:
     def add_held(
         self, run: str, depth: np.ndarray, sigma: np.ndarray | None, uv: np.ndarray, z: np.ndarray
     ) -> None:
-        """Errors at held-out, confirmed beams of one frame."""
+        """Add the errors at held-out beams of one frame that the truth
+        confirms; `run` is "third" or "blocks"."""
         error = np.abs(at_pixels(depth, uv) - z)
         ok = np.isfinite(error)
         self.held.setdefault(run, []).append(error[ok])
@@ -71,7 +75,10 @@ class MethodErrors:
             self.held_sigma.setdefault(run, []).append(at_pixels(sigma, uv)[ok])
 
     def summary(self, excluded: dict[str, float]) -> dict[str, float | int | None]:
-        """The figures of the contract (design section 12), and more; None where there is nothing to say."""
+        """Return the figures by name, with their unit in the name; None if no data contributed.
+
+        `excluded` is the ratio of held-out beams, by run, that the truth does not confirm.
+        """
         out: dict[str, float | int | None] = {
             "frames": self.frames,
             "frames_refused": self.refused,
@@ -101,15 +108,16 @@ class MethodErrors:
 
 
 def at_pixels(values: np.ndarray, uv: np.ndarray) -> np.ndarray:
-    """float64 [N]: values [H, W] at the nearest pixels."""
+    """Return float64 [N]: values [H, W] at the pixels nearest to uv [N, 2]."""
     h, w = values.shape
     v = np.clip(np.rint(uv[:, 1]).astype(int), 0, h - 1)
     u = np.clip(np.rint(uv[:, 0]).astype(int), 0, w - 1)
     return values[v, u].astype(np.float64)
 
 
-def confirmed(truth: np.ndarray, uv: np.ndarray, z: np.ndarray) -> np.ndarray:
-    """bool [N]: beams that the truth at their pixel confirms within 5 cm + 2 %."""
+def confirmed_by_truth(truth: np.ndarray, uv: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """Return bool [N]: whether the true depth at a beam's pixel
+    agrees with its optical z within 5 cm + 2 %."""
     t = at_pixels(truth, uv)
     with np.errstate(invalid="ignore"):
         return np.abs(t - z) <= 0.05 + 0.02 * t

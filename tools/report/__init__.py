@@ -1,1 +1,1 @@
-"""What a live run cost and produced: an observer on the bus, scores against truth, the HTML report."""
+"""Results and costs of a live run: an observer on the bus, scores against ground truth, the HTML report."""

@@ -1,4 +1,4 @@
-"""report.html of `bench paper`: one file with the paper's tables and figures, and ours beside them."""
+"""report.html of `bench paper`: tables and figures of the paper with our results, in one file."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ import numpy as np
 
 from beamsplat.common.files.persist import write_atomically
 from beamsplat.common.geometry.beams import project_beams
-from beamsplat.tools.evaluation.pictures import colour, label
-from beamsplat.tools.report.scores import Truth
+from beamsplat.tools.evaluation.depth_panels import colourize, label
+from beamsplat.tools.report.scores import GroundTruth
 from beamsplat.tools.report.svg import COLOURS, Curve, chart
 
 _STYLE = """body{font:14px/1.4 sans-serif;max-width:1200px;margin:2em auto;padding:0 1em;color:#222}
@@ -27,17 +27,17 @@ _TABLES: tuple[tuple[str, tuple[tuple[str, str, str], ...]], ...] = (
     ("Table I. Position RMSE (m), first poses aligned", (
         ("x", "position_rmse_xyz_m.0", ""), ("y", "position_rmse_xyz_m.1", ""),
         ("z", "position_rmse_xyz_m.2", ""),
-        ("together", "position_rmse_m", "position_rmse_m"), ("ATE", "ate_first_pose_rmse_m", ""),
+        ("combined", "position_rmse_m", "position_rmse_m"), ("ATE", "ate_first_pose_rmse_m", ""),
         ("SE(3)-aligned", "ate_se3_rmse_m", ""), ("Sim(3)-aligned", "ate_sim3_rmse_m", ""),
-        ("its scale", "sim3_scale", ""), ("unit is the metre", "metric", ""),
+        ("Sim(3) scale", "sim3_scale", ""), ("metric scale", "metric", ""),
         ("poses", "poses", ""),
     )),
     ("Table II. Orientation RMSE (rad)", (
         ("roll", "orientation_rmse_rpy_rad.0", ""), ("pitch", "orientation_rmse_rpy_rad.1", ""),
-        ("yaw", "orientation_rmse_rpy_rad.2", "yaw_rmse_rad"), ("together", "orientation_rmse_rad", ""),
+        ("yaw", "orientation_rmse_rpy_rad.2", "yaw_rmse_rad"), ("combined", "orientation_rmse_rad", ""),
     )),
     ("Table III. Speed and load", (
-        ("FPS through the whole system", "fps", "fps"), ("poses per s", "poses_per_s", ""),
+        ("FPS of the whole system", "fps", "fps"), ("poses per s", "poses_per_s", ""),
         ("CPU load %", "cpu_load_percent", "cpu_load_percent"), ("CPU s per image", "cpu_s_per_image", ""),
         ("keyframes per s", "keyframes_per_s", ""), ("latency p50 ms", "keyframe_latency_p50_ms", ""),
         ("p95 ms", "keyframe_latency_p95_ms", ""), ("memory MB", "peak_rss_mb", ""),
@@ -48,9 +48,9 @@ _TABLES: tuple[tuple[str, tuple[tuple[str, str, str], ...]], ...] = (
         ("unscaled", "depth_rmse_unscaled_m", "depth_rmse_unscaled_m"),
         ("dense, scaled", "depth_dense_rmse_scaled_m", ""),
         ("dense, unscaled", "depth_dense_rmse_unscaled_m", ""),
-        ("pictures", "depth_frames", ""),
+        ("images", "depth_frames", ""),
     )),
-    ("What the paper lacks: the map", (
+    ("The map (not in the paper)", (
         ("PSNR off the path dB", "psnr_offpath_db", ""), ("SSIM", "ssim_offpath", ""),
         ("depth L1 m", "depth_l1_offpath_m", ""), ("F-score 5 cm", "fscore_5cm", ""),
         ("refined: PSNR dB", "refined_psnr_offpath_db", ""), ("SSIM", "refined_ssim_offpath", ""),
@@ -61,18 +61,21 @@ _TABLES: tuple[tuple[str, tuple[tuple[str, str, str], ...]], ...] = (
 )  # fmt: skip
 
 
-def write_report(path: Path, report: dict[str, Any], truth: Truth, *, paper: bool = True) -> None:
-    """Writes the report; rows without `pictures` (not run) appear in the tables only. Not `paper`: of a
-    drive by itself, without the comparisons."""
+def write_report(path: Path, report: dict[str, Any], truth: GroundTruth, *, paper: bool = True) -> None:
+    """Write the report as one HTML file.
+
+    Rows without `plots` were not run and appear only in the tables. `paper=False` leaves out the comparison
+    with the paper, for a report on a single drive.
+    """
     rows: list[Row] = report["configurations"]
-    drawn = [row for row in rows if "pictures" in row]
+    drawn = [row for row in rows if "plots" in row]
     title = "The paper's configurations on" if paper else "A drive mapped:"
     body = [f"<h1>{title} {escape(report['data'])}</h1>", _preface(report, paper)]
     body += [_table(title, columns, rows) for title, columns in _TABLES]
     body += [_pairs(report["pairs"])] if paper else []
     body += ["<h2>Maps and trajectories</h2>", *_trajectories(drawn)]
     body += ["<h2>Errors over time</h2>", *_errors(drawn), "<h2>Depth</h2>", *_depth(drawn, truth)]
-    body += ["<h2>Render beside camera</h2>", *_renders(drawn, truth)]
+    body += ["<h2>Camera image and render</h2>", *_renders(drawn, truth)]
     page = (
         f"<!doctype html><html><head><meta charset='utf-8'><title>bench paper</title><style>{_STYLE}</style>"
     )
@@ -80,9 +83,9 @@ def write_report(path: Path, report: dict[str, Any], truth: Truth, *, paper: boo
 
 
 def _preface(report: dict[str, Any], paper: bool) -> str:
-    lines = [f"Live, as processes, on {report['cores']} CPU cores."]
+    lines = [f"Run live, as processes, on {report['cores']} CPU cores."]
     if paper:
-        lines.append("Small grey figures are the paper's (Gazebo house, i9-12 and RTX 4090).")
+        lines.append("Grey figures are from the paper (Gazebo house, i9-12 and RTX 4090).")
     for row in report["configurations"]:
         if row["status"] != "ok":
             lines.append(f"<span class=w>{escape(row['name'])} did not run: {escape(row['status'])}</span>")
@@ -101,7 +104,7 @@ def _table(title: str, columns: tuple[tuple[str, str, str], ...], rows: list[Row
 
 
 def _name(row: Row) -> str:
-    """What really ran: a stand-in never goes under the network's name."""
+    """Return the name of a row; a substitute for a missing network is named as such."""
     stand_in = " [" + row["depth_source"] + "]" if row["advice"] else ""
     return f"{row['title']}{stand_in} #{row['seed']}"
 
@@ -133,28 +136,28 @@ def _pairs(pairs: list[Row]) -> str:
         + "</tr>"
         for p in pairs
     )
-    note = "<p>The paper: 1024 / 1549 = 0.66 of the CPU load, its saving of 34 %.</p>"
+    note = "<p>The paper: 1024 / 1549 = 0.66 of the CPU load, a saving of 34 %.</p>"
     return f"<h2>Lidar against camera</h2><table><tr><th></th>{head}</tr>{lines}</table>{note}"
 
 
 def _trajectories(rows: list[Row]) -> list[str]:
     out = []
     for row in rows:
-        p = row["pictures"]
+        p = row["plots"]
         curves = [
             Curve("truth", p["true"][:, :2, 3], "#222", dashed=True),
             Curve(row["name"], p["found"][:, :2, 3], COLOURS[1]),
         ]
         out.append(chart(_name(row), "x m", "y m", curves, equal=True))
         if p["above"] is not None:
-            out.append(_figure(p["above"], f"{_name(row)}: the map from above, without its ceiling"))
+            out.append(_figure(p["above"], f"{_name(row)}: top view of the map without its ceiling"))
     return out
 
 
 def _errors(rows: list[Row]) -> list[str]:
     position, depth = [], []
     for number, row in enumerate(rows):
-        p, tint = row["pictures"], COLOURS[number % len(COLOURS)]
+        p, tint = row["plots"], COLOURS[number % len(COLOURS)]
         if len(p["stamps_ns"]):
             error = np.linalg.norm(p["found"][:, :3, 3] - p["true"][:, :3, 3], axis=1)
             seconds = (p["stamps_ns"] - p["stamps_ns"][0]) * 1e-9
@@ -168,60 +171,62 @@ def _errors(rows: list[Row]) -> list[str]:
                 depth.append(Curve(f"{row['name']} {name[:-2]}", points, tint, dashed))
     with_lidar = [c for c in position if not c.name.endswith("-camera")]
     charts = [chart("Position error", "s", "m", position), chart("Depth RMSE at the beams", "s", "m", depth)]
-    if 0 < len(with_lidar) < len(position):  # beside the others they would be flat
+    if 0 < len(with_lidar) < len(position):  # in one chart with the others they would be flat
         charts.insert(1, chart("Position error, with lidar", "s", "m", with_lidar))
     return charts
 
 
-def _depth(rows: list[Row], truth: Truth) -> list[str]:
-    """Beams on the picture; the guess; what became of it."""
+def _depth(rows: list[Row], truth: GroundTruth) -> list[str]:
+    """Return figures of the image with beams, the estimated depth, and the corrected depth."""
     out = []
     for row in rows:
-        fused, guesses = row["pictures"]["fused"], row["pictures"]["estimates"]
+        fused, guesses = row["plots"]["fused"], row["plots"]["estimates"]
         stamps = sorted(fused)
         for stamp_ns in stamps[len(stamps) // 3 :: max(len(stamps) // 2, 1)][:2]:
-            rgb = _picture(truth, stamp_ns)
+            rgb = _rgb(truth, stamp_ns)
             if rgb is None:
                 continue
             h, w = fused[stamp_ns].shape
             shown = cv2.resize(cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), (w, h), interpolation=cv2.INTER_AREA)
             uv, z, _ = project_beams(
-                truth.drive.beams(stamp_ns), truth.drive.undistort.pinhole, truth.drive.T_body_camera
+                truth.drive.beams_at(stamp_ns), truth.drive.undistort.pinhole, truth.drive.T_body_camera
             )
-            tints = colour(z[:, None].astype(np.float32), 0.5, 8.0)[:, 0] if len(z) else []
+            tints = colourize(z[:, None].astype(np.float32), 0.5, 8.0)[:, 0] if len(z) else []
             for (u, v), tint in zip(uv * (h / rgb.shape[0]), tints):
                 cv2.circle(shown, (round(u), round(v)), 1, tuple(int(k) for k in tint), -1)
             guess = guesses.get(stamp_ns)
             before = np.full((h, w), np.nan, np.float32) if guess is None else guess.astype(np.float32)
             after = fused[stamp_ns].astype(np.float32)
-            tiles = [label(shown, f"{len(z)} beams"), label(colour(before, 0.5, 8.0), "before"),
-                     label(colour(after, 0.5, 8.0), "after")]  # fmt: skip
+            tiles = [label(shown, f"{len(z)} beams"), label(colourize(before, 0.5, 8.0), "before"),
+                     label(colourize(after, 0.5, 8.0), "after")]  # fmt: skip
             out.append(_figure(np.hstack(tiles), _name(row)))
     return out
 
 
-def _renders(rows: list[Row], truth: Truth) -> list[str]:
+def _renders(rows: list[Row], truth: GroundTruth) -> list[str]:
     out = []
     for row in rows:
-        for stamp_ns, jpeg in row["pictures"]["previews"]:
+        for stamp_ns, jpeg in row["plots"]["previews"]:
             render = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
-            rgb = _picture(truth, stamp_ns)
+            rgb = _rgb(truth, stamp_ns)
             if render is None or rgb is None:
                 continue
             size = (render.shape[1], render.shape[0])
             camera = cv2.resize(cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), size, interpolation=cv2.INTER_AREA)
             both = np.hstack([label(camera, "camera"), label(render, "map, a keyframe")])
             out.append(_figure(both, _name(row)))
-        for pair in row["pictures"]["offpath"]:
+        for pair in row["plots"]["offpath"]:
             out.append(
-                _figure(cv2.cvtColor(pair, cv2.COLOR_RGB2BGR), f"{_name(row)}: off the path; truth, map")
+                _figure(
+                    cv2.cvtColor(pair, cv2.COLOR_RGB2BGR), f"{_name(row)}: off the path: true image, render"
+                )
             )
     return out
 
 
-def _picture(truth: Truth, stamp_ns: int) -> np.ndarray | None:
+def _rgb(truth: GroundTruth, stamp_ns: int) -> np.ndarray | None:
     numbers = {image.stamp_ns: i for i, image in enumerate(truth.drive.images)}
-    return truth.drive.picture(numbers[stamp_ns]) if stamp_ns in numbers else None
+    return truth.drive.rgb(numbers[stamp_ns]) if stamp_ns in numbers else None
 
 
 def _figure(bgr: np.ndarray, caption: str) -> str:

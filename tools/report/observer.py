@@ -1,4 +1,4 @@
-"""One deployment run live, as processes at the data's own speed, with a witness on the bus and on the CPU."""
+"""Runs a deployment live, as processes in real time, and records its messages and its costs."""
 
 from __future__ import annotations
 
@@ -26,173 +26,183 @@ TOPICS = (
     "camera/image", "localization/odometry", "localization/correction", "depth/estimate", "fusion/depth",
     "keyframes/frame", "keyframes/ack", "mapping/chunk", "mapping/poses", "mapping/preview", "mapping/status",
 )  # fmt: skip
-DEPTH_STEP = 2  # kept depth is sampled so much
+DEPTH_STRIDE = 2  # recorded depth maps keep every second row and column
 
 
 @dataclass
-class Seen:
-    """What went over the bus; times are the senders' monotonic clocks of one host."""
+class RunRecord:
+    """Messages of one run; times are monotonic clocks of the publishers, all on one host."""
 
-    images: dict[int, int] = field(default_factory=dict)  # stamp -> published
+    images: dict[int, int] = field(default_factory=dict)  # stamp -> time of publication
     poses: list[tuple[int, np.ndarray, str, bool]] = field(default_factory=list)  # T_map_body, status, metric
-    pose_at_ns: dict[int, int] = field(default_factory=dict)  # stamp -> published
+    pose_at_ns: dict[int, int] = field(default_factory=dict)  # stamp -> time of publication
     estimates: dict[int, str] = field(default_factory=dict)  # stamp -> status
-    fused: dict[int, tuple[int, str, bool]] = field(default_factory=dict)  # published, status, keyframe
-    kept_estimates: dict[int, np.ndarray] = field(default_factory=dict)  # float16, every DEPTH_STEP-th pixel
+    fused: dict[int, tuple[int, str, bool]] = field(
+        default_factory=dict
+    )  # stamp -> publication, status, keyframe
+    kept_estimates: dict[int, np.ndarray] = field(
+        default_factory=dict
+    )  # float16, every DEPTH_STRIDE-th pixel
     kept_fused: dict[int, np.ndarray] = field(default_factory=dict)
     kinds: set[str] = field(default_factory=set)
-    keyframes: dict[int, int] = field(default_factory=dict)  # stamp -> published, the first time
-    acks: dict[int, tuple[int, str]] = field(default_factory=dict)  # id -> published, status
+    keyframes: dict[int, int] = field(default_factory=dict)  # stamp -> time of first publication
+    acks: dict[int, tuple[int, str]] = field(default_factory=dict)  # id -> publication, status
     link_bytes: int = 0
-    chunks: dict[int, Any] = field(default_factory=dict)  # the newest of each anchor
-    online_chunks: dict[int, Any] | None = None  # when the data ended, before any refinement
+    chunks: dict[int, Any] = field(default_factory=dict)  # newest chunk of each anchor
+    online_chunks: dict[int, Any] | None = None  # `chunks` at the end of the data
     keyframe_poses: np.ndarray | None = None  # float64 [K, 4, 4] T_map_body, refined
     previews: list[tuple[int, np.ndarray, bytes]] = field(default_factory=list)  # stamp, T_map_camera, JPEG
     statuses: list[Any] = field(default_factory=list)
-    refusals: dict[str, int] = field(default_factory=dict)  # why there was no pose or depth -> how often
+    refusals: dict[str, int] = field(default_factory=dict)  # reason for a missing pose or depth -> count
     undecodable: int = 0
 
 
-class Witness:
-    """Takes every message of one run; depth is kept whole only at the stamps that have a truth."""
+class BusObserver:
+    """Subscribes to all messages of one run; depth maps are kept only at the stamps with a true depth."""
 
     def __init__(self, keep_depth_at: frozenset[int]) -> None:
-        self.seen = Seen()
+        self.record = RunRecord()
         self._keep_at = keep_depth_at
         self._T_map_odom = np.eye(4)
         self._ended_ns = 0
         self._lock = threading.Lock()
 
-    def listen(self, bus: Bus) -> None:
-        """Subscribes; callbacks come from threads of the bus."""
+    def subscribe(self, bus: Bus) -> None:
+        """Subscribe to all TOPICS; callbacks run in threads of the bus."""
         for name in TOPICS:
             delivery = None if topic(name).delivery == "latched" else "every"
-            bus.subscribe(Input(name, delivery), self._take, self._broken, lambda *_: None)
+            bus.subscribe(Input(name, delivery), self._receive, self._count_undecodable, lambda *_: None)
 
-    def _broken(self, topic_name: str, why: str) -> None:
-        self.seen.undecodable += 1
+    def _count_undecodable(self, topic_name: str, why: str) -> None:
+        self.record.undecodable += 1
 
-    def _take(self, envelope: Envelope) -> None:
+    def _receive(self, envelope: Envelope) -> None:
         with self._lock:
             getattr(self, "_" + envelope.topic.replace("/", "_"))(envelope, envelope.message)
             if topic(envelope.topic).uplink in ("up", "bulk"):
-                self.seen.link_bytes += envelope.size_bytes
+                self.record.link_bytes += envelope.size_bytes
 
     def _camera_image(self, envelope: Envelope, m: Any) -> None:
-        self.seen.images[m.stamp_ns] = envelope.header.publish_ns
+        self.record.images[m.stamp_ns] = envelope.header.publish_ns
 
     def _localization_correction(self, envelope: Envelope, m: Any) -> None:
         self._T_map_odom = m.T_map_odom.copy()
 
     def _localization_odometry(self, envelope: Envelope, m: Any) -> None:
-        self.seen.poses.append((m.stamp_ns, self._T_map_odom @ m.T_odom_body, m.status, m.metric))
+        self.record.poses.append((m.stamp_ns, self._T_map_odom @ m.T_odom_body, m.status, m.metric))
         if m.status == "ok":
-            self.seen.pose_at_ns[m.stamp_ns] = envelope.header.publish_ns
+            self.record.pose_at_ns[m.stamp_ns] = envelope.header.publish_ns
         else:
             self._count_refusal(f"pose, {m.status}: {m.detail}")
 
     def _count_refusal(self, why: str) -> None:
-        """Numbers in the sentence do not make another reason."""
+        """Count a reason; numbers in it are replaced, so that they do not make different reasons."""
         reason = re.sub(r"-?\d+(\.\d+)?", "#", why)
-        self.seen.refusals[reason] = self.seen.refusals.get(reason, 0) + 1
+        self.record.refusals[reason] = self.record.refusals.get(reason, 0) + 1
 
     def _depth_estimate(self, envelope: Envelope, m: Any) -> None:
-        self.seen.estimates[m.stamp_ns] = m.status
-        self.seen.kinds.add(m.kind)
+        self.record.estimates[m.stamp_ns] = m.status
+        self.record.kinds.add(m.kind)
         if m.stamp_ns in self._keep_at and m.status == "ok" and m.values.size:
-            self.seen.kept_estimates[m.stamp_ns] = m.values[::DEPTH_STEP, ::DEPTH_STEP].astype(np.float16)
+            self.record.kept_estimates[m.stamp_ns] = m.values[::DEPTH_STRIDE, ::DEPTH_STRIDE].astype(
+                np.float16
+            )
 
     def _fusion_depth(self, envelope: Envelope, m: Any) -> None:
-        self.seen.fused[m.stamp_ns] = (envelope.header.publish_ns, m.status, m.keyframe)
+        self.record.fused[m.stamp_ns] = (envelope.header.publish_ns, m.status, m.keyframe)
         if m.status != "ok":
             self._count_refusal(f"depth: {m.status}")
         if m.stamp_ns in self._keep_at and m.status == "ok":
-            self.seen.kept_fused[m.stamp_ns] = m.depth_m[::DEPTH_STEP, ::DEPTH_STEP].astype(np.float16)
+            self.record.kept_fused[m.stamp_ns] = m.depth_m[::DEPTH_STRIDE, ::DEPTH_STRIDE].astype(np.float16)
 
     def _keyframes_frame(self, envelope: Envelope, m: Any) -> None:
-        self.seen.keyframes.setdefault(m.stamp_ns, envelope.header.publish_ns)
+        self.record.keyframes.setdefault(m.stamp_ns, envelope.header.publish_ns)
 
     def _keyframes_ack(self, envelope: Envelope, m: Any) -> None:
-        self.seen.acks.setdefault(m.id, (envelope.header.publish_ns, m.status))
+        self.record.acks.setdefault(m.id, (envelope.header.publish_ns, m.status))
 
     def _mapping_chunk(self, envelope: Envelope, m: Any) -> None:
-        self.seen.chunks[m.anchor_id] = m
-        if self.seen.online_chunks is not None and envelope.header.publish_ns <= self._ended_ns:
-            self.seen.online_chunks[m.anchor_id] = m  # overtaken by the poses that ended the drive
+        self.record.chunks[m.anchor_id] = m
+        if self.record.online_chunks is not None and envelope.header.publish_ns <= self._ended_ns:
+            self.record.online_chunks[m.anchor_id] = m  # sent before the final poses, received after them
 
     def _mapping_poses(self, envelope: Envelope, m: Any) -> None:
-        if self.seen.online_chunks is None:
-            self.seen.online_chunks, self._ended_ns = dict(self.seen.chunks), envelope.header.publish_ns
-        self.seen.keyframe_poses = m.T_map_body.copy()
+        if self.record.online_chunks is None:
+            self.record.online_chunks, self._ended_ns = dict(self.record.chunks), envelope.header.publish_ns
+        self.record.keyframe_poses = m.T_map_body.copy()
 
     def _mapping_preview(self, envelope: Envelope, m: Any) -> None:
-        self.seen.previews.append((m.stamp_ns, m.T_map_camera.copy(), m.render.tobytes()))
+        self.record.previews.append((m.stamp_ns, m.T_map_camera.copy(), m.render.tobytes()))
 
     def _mapping_status(self, envelope: Envelope, m: Any) -> None:
-        self.seen.statuses.append(m)
+        self.record.statuses.append(m)
 
 
 @dataclass
-class Costs:
-    """What the processes of a run used while data played, by node; start-up apart."""
+class RunCosts:
+    """CPU time and memory of the processes of a run while data was played, without start-up."""
 
     wall_s: float = 0.0
     cpu_s: dict[str, float] = field(default_factory=dict)
     startup_cpu_s: float = 0.0
     peak_rss_mb: float = 0.0
-    drained: bool = True  # all nodes had come to their end by themselves
+    drained: bool = True  # whether all nodes finished by themselves
     dropped: dict[str, int] = field(default_factory=dict)
     lost: dict[str, int] = field(default_factory=dict)
 
 
-class Observer:
-    """A witness on the bus of a supervised system, and its costs while the data play."""
+class RunObserver:
+    """Records the messages and the costs of a supervised system while data is played."""
 
     def __init__(self, supervisor: Supervisor, deployment: Deployment, keep_depth_at: frozenset[int]) -> None:
         endpoints = deployment.router.listen
-        self._witness, self.costs = Witness(keep_depth_at), Costs()
-        self._bus = Bus(open_session(endpoints), deployment.robot, "witness", secrets.token_hex(8), 1)
-        self._witness.listen(self._bus)
-        self._meter = _Meter(supervisor)
+        self._bus_observer, self.costs = BusObserver(keep_depth_at), RunCosts()
+        self._bus = Bus(open_session(endpoints), deployment.robot, "observer", secrets.token_hex(8), 1)
+        self._bus_observer.subscribe(self._bus)
+        self._meter = _ProcessMeter(supervisor)
         self._began = self._started = time.monotonic()
         self._state = "starting"
 
     @property
-    def seen(self) -> Seen:
-        """What went over the bus so far."""
-        return self._witness.seen
+    def record(self) -> RunRecord:
+        """Messages received so far."""
+        return self._bus_observer.record
 
     def poll(self) -> None:
-        """Looks at the processes; to be called a few times a second."""
+        """Measure the processes; call this several times per second."""
         if self._state == "over":
             return
         self._meter.read()
-        if self._state == "starting" and self.seen.images:
+        if self._state == "starting" and self.record.images:
             self._state, self._started = "driving", time.monotonic()
             self.costs.startup_cpu_s = self._meter.mark()
-        self._count()
-        if self.seen.online_chunks is not None:  # what comes now is refinement of a map that is whole
+        self._update_costs()
+        if self.record.online_chunks is not None:  # the drive has ended; from now on the map is only refined
             self._state = "over"
 
-    def _count(self) -> None:
+    def _update_costs(self) -> None:
         self.costs.wall_s = time.monotonic() - self._started
         self.costs.cpu_s, self.costs.peak_rss_mb = self._meter.since_mark(), self._meter.peak_rss_mb
 
-    def finish(self, board: HealthBoard, drained: bool) -> tuple[Seen, Costs]:
-        """Takes what is still on its way and what the nodes counted, and leaves the bus."""
+    def finish(self, board: HealthBoard, drained: bool) -> tuple[RunRecord, RunCosts]:
+        """Receive outstanding messages, take over the nodes' counters, and disconnect from the bus."""
         self.costs.drained = drained
         for name, record in board.records.items():
             self.costs.dropped[name] = sum(i.dropped for i in record.health.inputs)
             self.costs.lost[name] = sum(i.lost for i in record.health.inputs)
         time.sleep(0.5)
         self._bus.session.close()
-        return self.seen, self.costs
+        return self.record, self.costs
 
 
 def run_live(
-    deployment: Deployment, keep_depth_at: frozenset[int], longest_s: float, say: Callable[[str], None]
-) -> tuple[Seen, Costs]:
-    """Runs until all nodes have drained.
+    deployment: Deployment, keep_depth_at: frozenset[int], longest_s: float, log: Callable[[str], None]
+) -> tuple[RunRecord, RunCosts]:
+    """Run a deployment until all nodes have drained, at most for `longest_s`.
+
+    Args:
+        keep_depth_at: stamps whose depth maps are kept.
+        log: receives the events of the supervisor.
 
     Raises:
         UserError: a node cannot run.
@@ -202,7 +212,7 @@ def run_live(
         Supervisor(deployment, on_event=events.append) as supervisor,
         open_session(deployment.router.listen) as board_session,
     ):
-        observer = Observer(supervisor, deployment, keep_depth_at)
+        observer = RunObserver(supervisor, deployment, keep_depth_at)
         board = HealthBoard(board_session, deployment.robot)
         deadline = time.monotonic() + longest_s
         drained = False
@@ -217,30 +227,30 @@ def run_live(
             drained = all(states.get(name) == "drained" for name in deployment.nodes)
         result = observer.finish(board, drained)
     for event in events:
-        say(event)
+        log(event)
     return result
 
 
-class _Meter:
-    """CPU seconds and memory (proportional set size) of the supervisor's children."""
+class _ProcessMeter:
+    """Measures CPU seconds and memory (proportional set size) of the supervisor's child processes."""
 
     def __init__(self, supervisor: Supervisor) -> None:
         self._supervisor = supervisor
         self._last: dict[tuple[str, int], float] = {}
         self._marked: dict[tuple[str, int], float] = {}
         self.peak_rss_mb = 0.0
-        self._weighed = 0.0
+        self._memory_read_s = 0.0
 
     def read(self) -> None:
-        """Looks at all children; a process that has gone keeps what it was last seen with."""
+        """Read all child processes; a process that has exited keeps its last values."""
         memory, now = 0.0, time.monotonic()
-        weigh = now - self._weighed > 1.0  # reading it costs milliseconds a process
-        self._weighed = now if weigh else self._weighed
+        read_memory = now - self._memory_read_s > 1.0  # it costs milliseconds per process
+        self._memory_read_s = now if read_memory else self._memory_read_s
         for child in self._supervisor.children.values():
             try:
                 process = psutil.Process(child.process.pid)
                 times = process.cpu_times()
-                if weigh:  # shared pages count once: the processes come from one fork server
+                if read_memory:  # PSS counts shared pages once: all processes are forked from one server
                     memory += process.memory_full_info().pss / 1e6
             except psutil.Error:
                 continue
@@ -248,12 +258,12 @@ class _Meter:
         self.peak_rss_mb = max(self.peak_rss_mb, memory)
 
     def mark(self) -> float:
-        """Counts from here; gives the CPU seconds before."""
+        """Start counting from now; return the CPU seconds used before."""
         self._marked = dict(self._last)
         return sum(self._marked.values())
 
     def since_mark(self) -> dict[str, float]:
-        """CPU seconds by node since `mark`."""
+        """Return the CPU seconds by node since `mark`."""
         out: dict[str, float] = {}
         for (name, pid), seconds in self._last.items():
             out[name] = out.get(name, 0.0) + seconds - self._marked.get((name, pid), 0.0)

@@ -1,4 +1,4 @@
-"""Curves as SVG text: no plotting library, and sharp at any size."""
+"""Line charts as SVG text, without a plotting library."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _WIDTH, _HEIGHT, _EDGE = 560, 340, 46
 
 @dataclass(frozen=True)
 class Curve:
-    """A named line through points float64 [N, 2]; NaN breaks it."""
+    """A named line through points float64 [N, 2]; NaN interrupts it."""
 
     name: str
     points: np.ndarray
@@ -22,11 +22,11 @@ class Curve:
 
 
 def chart(title: str, x_label: str, y_label: str, curves: list[Curve], *, equal: bool = False) -> str:
-    """An SVG element; `equal` gives both axes one scale, as maps need."""
+    """Return a chart as an SVG element; `equal` uses one scale for both axes, as for maps."""
     parts = [c.points[np.all(np.isfinite(c.points), axis=1)] for c in curves]
     everything = np.concatenate(parts) if parts else np.zeros((0, 2))
     if not len(everything):
-        return f"<p>{escape(title)}: nothing to show</p>"
+        return f"<p>{escape(title)}: no data</p>"
     low, high = np.percentile(everything, 0.5, axis=0), np.percentile(everything, 99.5, axis=0)
     if not equal:
         low, high = everything.min(axis=0), everything.max(axis=0)
@@ -55,7 +55,7 @@ def chart(title: str, x_label: str, y_label: str, curves: list[Curve], *, equal:
 
 
 def _line(curve: Curve, xy: np.ndarray) -> list[str]:
-    """Polylines between gaps, of at most about a thousand points."""
+    """Return the polylines between gaps, each thinned to about 1000 points."""
     good = np.all(np.isfinite(xy), axis=1)
     pieces = np.split(np.arange(len(xy)), np.flatnonzero(np.diff(good.astype(int)) != 0) + 1)
     dash = ' stroke-dasharray="5 3"' if curve.dashed else ""

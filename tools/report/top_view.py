@@ -1,4 +1,4 @@
-"""A Gaussian map seen from above, without its ceiling, at a known scale: the picture of a floor plan."""
+"""Renders a Gaussian map from above, without its ceiling, at a known scale, like a floor plan."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from beamsplat.common.raster.layout import MEAN, OPACITY
 from beamsplat.common.raster.optimiser import GaussianArrays
 from beamsplat.common.raster.rasterizer import Rasterizer
 
-_HEIGHT_M = 60.0  # of the eye: so far away that walls do not lean
-_EDGE_M = 0.4
-_MOST_PX = 2000
-_FAINT = -2.0  # logit of the opacity
+_HEIGHT_M = 60.0  # height of the camera: far enough that walls appear almost vertical
+_EDGE_M = 0.4  # margin around the map
+_MAX_SIDE_PX = 2000
+_MIN_OPACITY_LOGIT = -2.0  # fainter Gaussians do not extend the image
 _WHITE = np.ones(3, np.float32)
 
 
@@ -21,21 +21,23 @@ def top_view(
     params: np.ndarray,  # float32 [14, N] in a frame whose z points up
     path_m: np.ndarray | None = None,  # [K, >= 2] drawn on it
     *,
-    ceiling_m: float = 1.8,  # what lies higher is left out
+    ceiling_m: float = 1.8,  # Gaussians above this height are left out
     metres_per_px: float = 0.015,
 ) -> np.ndarray | None:
-    """uint8 [H, W, 3] BGR, x to the right and y up; None where there is nothing to see."""
-    solid = (params[MEAN + 2] < ceiling_m) & (params[MEAN + 2] > -0.5) & (params[OPACITY] > _FAINT)
+    """Return the view as BGR uint8 [H, W, 3], x to the right and y up; None if no Gaussian is visible."""
+    solid = (
+        (params[MEAN + 2] < ceiling_m) & (params[MEAN + 2] > -0.5) & (params[OPACITY] > _MIN_OPACITY_LOGIT)
+    )
     if not solid.any():
         return None
     store = GaussianArrays(int(solid.sum()))
     store.append(params[:, solid])
     low, high = _extent(params[MEAN : MEAN + 2, solid])
-    scale = max(metres_per_px, float((high - low).max()) / _MOST_PX)
+    scale = max(metres_per_px, float((high - low).max()) / _MAX_SIDE_PX)
     width, height = (int(np.ceil(v / scale)) for v in high - low)
     centre = (low + high) / 2
     T_camera_map = np.eye(4)
-    T_camera_map[:3, :3] = np.diag([1.0, -1.0, -1.0])  # looks down, map's y is up in the picture
+    T_camera_map[:3, :3] = np.diag([1.0, -1.0, -1.0])  # looks down; y of the map is up in the image
     T_camera_map[:3, 3] = [-centre[0], centre[1], _HEIGHT_M]
     focal_px = _HEIGHT_M / scale
     camera = RasterCamera(focal_px, focal_px, (width - 1) / 2, (height - 1) / 2, width, height)
@@ -55,7 +57,11 @@ def top_view(
 
 
 def _extent(xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(low, high) [2] that hold all but the outermost: a few strays must not shrink the rest."""
+    """Return corners (low, high) float64 [2] that contain 99 % of the
+    points xy [2, N] per axis, plus a margin.
+
+    A few outliers must not shrink the rest of the map.
+    """
     return np.percentile(xy, 0.5, axis=1) - _EDGE_M, np.percentile(xy, 99.5, axis=1) + _EDGE_M
 
 

@@ -99,8 +99,8 @@ class SimulatedLidar:
         distance: np.ndarray,
         moving: np.ndarray,
     ) -> None:
-        """Shorten, in place, the `distance` of those `beams` (indices) that hit an object, and mark them
-        `moving`.
+        """Shorten, in place, the `distance` of those `beams` (indices)
+        that hit an object, and mark them `moving`.
 
         Only beams that pass through the bounding circle of an object are cast.
         """

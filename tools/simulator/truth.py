@@ -34,8 +34,8 @@ class DepthViews:
     distortion: tuple[float, ...]
 
     def count(self, points_m: np.ndarray, normals: np.ndarray) -> np.ndarray:
-        """Return int32 [P]: in how many views each point [P, 3] is visible from the side of its normal [P,
-        3]."""
+        """Return int32 [P]: in how many views each point [P, 3] is
+        visible from the side of its normal [P, 3]."""
         return _count_views(
             np.ascontiguousarray(points_m, dtype=np.float64),
             np.ascontiguousarray(normals, dtype=np.float64),

@@ -1,11 +1,11 @@
-"""What the bench of the lidar SLAM takes, and what it leaves behind."""
+"""`bench slam`: recordings that it finds, tables that it writes."""
 
 import json
 
 import pytest
 
 from beamsplat.common.errors import UserError
-from beamsplat.tools.bench.readme import into_readme, paper_table
+from beamsplat.tools.bench.readme import paper_table, replace_readme_table
 from beamsplat.tools.bench.slam import markdown, recordings_in
 from tests.tools.cli.test_cli import beamsplat
 
@@ -15,7 +15,7 @@ ROW = {
 }  # fmt: skip
 
 
-def test_recordings_are_found_by_their_truth(tmp_path):
+def test_recordings_are_found_by_their_ground_truth(tmp_path):
     with pytest.raises(UserError, match="neither"):
         recordings_in(tmp_path)
     for name in (
@@ -31,10 +31,10 @@ def test_recordings_are_found_by_their_truth(tmp_path):
     assert names == [("a", "--relations"), ("home", "--groundtruth")]
 
 
-def test_the_table_goes_between_its_marks(tmp_path):
+def test_the_table_is_written_between_its_marks(tmp_path):
     readme = tmp_path / "README.md"
     readme.write_text("before\n<!-- bench slam -->\nold\n<!-- /bench slam -->\nafter\n")
-    into_readme(readme, "slam", markdown([ROW]))
+    replace_readme_table(readme, "slam", markdown([ROW]))
     text = readme.read_text()
     assert text.startswith("before\n")
     assert text.endswith("\nafter\n")
@@ -42,12 +42,12 @@ def test_the_table_goes_between_its_marks(tmp_path):
     assert "| aces | 0.0348 ± 0.0310 | 0.360 | 0.0375 m, 0.373° | 5.4 | 8.2 | 456 |" in text
     readme.write_text("nothing")
     with pytest.raises(UserError, match="between"):
-        into_readme(readme, "paper", "table")
+        replace_readme_table(readme, "paper", "table")
 
 
 def test_the_papers_table_has_its_figures_in_brackets():
     rows = [
-        {"title": "UniDepth + lidar", "advice": "weights missing", "depth_source": "FastDepth in the network's place",
+        {"title": "UniDepth + lidar", "advice": "weights missing", "depth_source": "FastDepth instead of the network",
          "position_rmse_m": 0.00725, "fps": 9.91, "cpu_s_per_image": 0.15, "depth_rmse_scaled_m": 0.4012,
          "psnr_offpath_db": 18.04, "keyframe_latency_p95_ms": 812.0, "peak_rss_mb": 1024.4,
          "paper": {"position_rmse_m": 0.0784, "fps": 2.176, "cpu_load_percent": 1024, "depth_rmse_scaled_m": 0.398}},
@@ -56,7 +56,7 @@ def test_the_papers_table_has_its_figures_in_brackets():
     ]  # fmt: skip
     first, second = paper_table(rows).split("\n")[2:]
     assert first == (
-        "| UniDepth + lidar [FastDepth in the network's place] | 0.0073 (0.0784) | 9.9 (2.2) | 0.15 (4.71) "
+        "| UniDepth + lidar [FastDepth instead of the network] | 0.0073 (0.0784) | 9.9 (2.2) | 0.15 (4.71) "
         "| 0.40 (0.40) | 18.0 | 0.8 | 1024 |"
     )
     assert second == "| default | – | – | – | – | 23.2, refined 24.5 | – | – |"

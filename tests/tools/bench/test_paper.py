@@ -1,4 +1,4 @@
-"""bench paper: its figures against made-up runs whose figures are known, its deployments, its report."""
+"""`bench paper`: figures of synthetic runs with known results, deployments, report."""
 
 import xml.etree.ElementTree as ET
 from pathlib import Path
@@ -12,17 +12,17 @@ from beamsplat.common.geometry.frames import camera_mount
 from beamsplat.common.geometry.trajectory import Trajectory
 from beamsplat.common.geometry.transforms import make_transform, so3_exp
 from beamsplat.tools.bench import paper
-from beamsplat.tools.evaluation.drive import Drive
+from beamsplat.tools.evaluation.drive import RecordedDrive
 from beamsplat.tools.report.html import write_report
-from beamsplat.tools.report.observer import Costs, Seen
+from beamsplat.tools.report.observer import RunCosts, RunRecord
 from beamsplat.tools.report.scores import (
-    Truth,
+    GroundTruth,
+    aligned_poses,
     aligned_rmse,
-    compared_poses,
     depth_errors,
     pose_errors,
     rigid_offset,
-    speed,
+    speed_and_load,
 )
 from beamsplat.tools.report.svg import Curve, chart
 from beamsplat.tools.system.assembly import faults
@@ -36,11 +36,11 @@ def pose(x, y=0.0, yaw=0.0):
 
 def truth(tmp_path, stamps):
     T = np.array([pose(1.0 + i, 2.0, 0.5) for i in range(len(stamps))])
-    drive = Drive(
+    drive = RecordedDrive(
         tmp_path, Pinhole(100.0, 100.0, 31.5, 23.5, 64, 48), camera_mount(0.0, 0.0, 0.4), np.eye(4), [], [],
         Trajectory(np.array(stamps), T), "made up",
     )  # fmt: skip
-    return Truth(tmp_path, drive, {})
+    return GroundTruth(tmp_path, drive, {})
 
 
 def test_errors_are_per_axis_after_aligning_the_first_pose_only(tmp_path):
@@ -50,10 +50,10 @@ def test_errors_are_per_axis_after_aligning_the_first_pose_only(tmp_path):
     T_map_world = pose(5.0, -1.0, 1.2)
     poses = [T_map_world @ T for T in known.drive.poses.T_a_b]
     poses[1] = poses[1] @ pose(0.3, 0.0, 0.1)
-    seen = Seen(
+    record = RunRecord(
         poses=[(s, T, "ok", True) for s, T in zip(stamps, poses)] + [(4 * S, np.eye(4), "lost", True)]
     )
-    _, found, true = compared_poses(seen, known)
+    _, found, true = aligned_poses(record, known)
     figures = pose_errors(found, true)
     xyz = 0.3 * np.array([np.cos(0.5), np.sin(0.5), 0.0]) / np.sqrt(3)
     np.testing.assert_allclose(figures["position_rmse_xyz_m"], xyz, atol=1e-9)
@@ -64,7 +64,7 @@ def test_errors_are_per_axis_after_aligning_the_first_pose_only(tmp_path):
     assert pose_errors(found[:1], true[:1]) == {"poses": 1}  # its error is zero by alignment
 
 
-def test_a_map_is_placed_by_all_poses():
+def test_a_map_is_aligned_by_all_poses():
     random = np.random.default_rng(1)
     true = np.array([pose(*random.normal(size=2), random.normal()) for _ in range(40)])
     T = pose(0.03, -0.02, 0.004)
@@ -90,42 +90,42 @@ def test_an_image_counts_with_pose_depth_and_decision():
         1 * S: (1 * S, "ok", True), 2 * S: (2 * S, "ok", False), 3 * S: (3 * S, "bad beams", False),
         4 * S: (4 * S, "ok", True), 9 * S: (9 * S, "ok", True), 20 * S: (20 * S, "ok", False),
     }  # fmt: skip
-    seen = Seen(
+    record = RunRecord(
         images=images, fused=fused, acks={S: (S + S // 2, "ok"), 6 * S: (7 * S, "refused")},
         pose_at_ns={i * S: i * S for i in range(1, 11)}, keyframes={S: S}, poses=[(S, np.eye(4), "ok", True)],
     )  # fmt: skip
-    costs = Costs(wall_s=10.0, cpu_s={"mapping": 4.0, "keyframes": 1.0}, drained=True)
-    figures = speed(seen, costs, 2)
-    # Used; passed over; (bad); passed over, since a later one was decided. 9 s is undecided, 20 s has no pose.
+    costs = RunCosts(wall_s=10.0, cpu_s={"mapping": 4.0, "keyframes": 1.0}, drained=True)
+    figures = speed_and_load(record, costs, 2)
+    # 1 s is used, 2 s is no keyframe, 3 s is bad, 4 s precedes a decided one, 9 s is undecided, 20 s has no pose.
     assert figures["images_through"] == 3
     assert figures["fps"] == pytest.approx(3 / 9)
     assert figures["cpu_load_percent"] == pytest.approx(50.0)
     assert figures["cpu_s_per_image"] == pytest.approx(5 / 3)
     assert figures["keyframes_refused"] == 1
     assert figures["keyframe_latency_p50_ms"] == pytest.approx(750.0)
-    assert speed(seen, Costs(wall_s=10.0, cpu_s={"localization": 1.0}), 2)["fps"] is None
+    assert speed_and_load(record, RunCosts(wall_s=10.0, cpu_s={"localization": 1.0}), 2)["fps"] is None
 
 
-def test_depth_is_compared_scaled_and_unscaled_and_numbers_without_unit_have_no_error(tmp_path):
+def test_depth_is_compared_scaled_and_unscaled_and_disparity_has_no_error_in_metres(tmp_path):
     import cv2
 
     true = np.full((48, 64), 2.0, np.float32)
     cv2.imwrite(str(tmp_path / f"{S}.png"), (true * 1e3).astype(np.uint16))
-    known = Truth(tmp_path, truth(tmp_path, [S]).drive, {S: tmp_path / f"{S}.png"})
-    seen = Seen(kinds={"metric"})
-    seen.kept_fused[S], seen.kept_estimates[S] = true[::2, ::2] + 0.1, true[::2, ::2] * 1.5
-    figures = depth_errors(seen, known)
+    known = GroundTruth(tmp_path, truth(tmp_path, [S]).drive, {S: tmp_path / f"{S}.png"})
+    record = RunRecord(kinds={"metric"})
+    record.kept_fused[S], record.kept_estimates[S] = true[::2, ::2] + 0.1, true[::2, ::2] * 1.5
+    figures = depth_errors(record, known)
     assert figures["depth_dense_rmse_scaled_m"] == pytest.approx(0.1, abs=1e-3)
     assert figures["depth_dense_rmse_unscaled_m"] == pytest.approx(1.0, abs=1e-3)
     assert figures["depth_rmse_scaled_m"] is None  # no beams in this drive
-    seen.kinds = {"disparity"}
-    assert depth_errors(seen, known)["depth_dense_rmse_unscaled_m"] is None
+    record.kinds = {"disparity"}
+    assert depth_errors(record, known)["depth_dense_rmse_unscaled_m"] is None
 
 
 @pytest.mark.parametrize("configuration", paper.CONFIGURATIONS, ids=lambda c: c.name)
 def test_every_configuration_fits_together(configuration, tmp_path, monkeypatch):
     monkeypatch.setattr(paper, "_installed", lambda model: True)
-    deployment, _, advice = paper.prepared(configuration, tmp_path / "bag", tmp_path, None, 3)
+    deployment, _, advice = paper.prepare_deployment(configuration, tmp_path / "bag", tmp_path, None, 3)
     assert advice == ""
     assert [f.text for f in faults(deployment) if f.fatal] == []
     assert "recorder" not in deployment.nodes
@@ -137,41 +137,41 @@ def test_every_configuration_fits_together(configuration, tmp_path, monkeypatch)
         assert "scan" in deployment.nodes["replay"]["without"]
 
 
-def test_missing_weights_are_replaced_by_name_or_not_run(tmp_path, monkeypatch):
+def test_missing_weights_are_replaced_under_another_name_or_not_run(tmp_path, monkeypatch):
     unidepth = paper.CONFIGURATIONS[0]
-    monkeypatch.setattr(paper, "_installed", lambda model: model == paper.STAND_IN)
-    deployment, depth, advice = paper.prepared(unidepth, tmp_path, tmp_path, None, 0)
+    monkeypatch.setattr(paper, "_installed", lambda model: model == paper.SUBSTITUTE_MODEL)
+    deployment, depth, advice = paper.prepare_deployment(unidepth, tmp_path, tmp_path, None, 0)
     assert deployment.nodes["depth"]["source"] == "fastdepth"
     assert "FastDepth" in depth
     assert "beamsplat models pull unidepth_v2_vits" in advice
-    deployment, depth, _ = paper.prepared(unidepth, tmp_path, tmp_path, tmp_path / "depths", 0)
+    deployment, depth, _ = paper.prepare_deployment(unidepth, tmp_path, tmp_path, tmp_path / "depths", 0)
     assert deployment.nodes["depth"]["source"] == "recorded"
     assert "recorded" in depth
     monkeypatch.setattr(paper, "_installed", lambda model: False)
-    deployment, _, advice = paper.prepared(unidepth, tmp_path, tmp_path, None, 0)
+    deployment, _, advice = paper.prepare_deployment(unidepth, tmp_path, tmp_path, None, 0)
     assert deployment is None
     assert "models pull" in advice
 
 
 def test_names_are_checked():
     with pytest.raises(UserError, match="monogs-lidar"):
-        paper.chosen_configurations(["nope"])
-    assert len(paper.chosen_configurations(None)) == 7
+        paper.select_configurations(["nope"])
+    assert len(paper.select_configurations(None)) == 7
 
 
-def test_pairs_give_the_papers_saving():
+def test_pairs_have_the_papers_saving():
     rows = [{**c.paper, "name": c.name, "partner": c.partner} for c in paper.CONFIGURATIONS]
-    found = {p["lidar"]: p for p in paper.pairs(rows)}
+    found = {p["lidar"]: p for p in paper.compare_pairs(rows)}
     assert set(found) == {"unidepth-lidar", "depth_anything-lidar", "monogs-lidar"}
     assert found["unidepth-lidar"]["cpu_load_ratio"] == pytest.approx(1024 / 1243)
     assert found["unidepth-lidar"]["fps_ratio"] == pytest.approx(2.176 / 1.201)
 
 
-def test_charts_are_well_formed_and_bridge_no_gaps():
+def test_charts_are_well_formed_and_interrupt_lines_at_gaps():
     line = np.array([[0.0, 0.0], [1.0, 1.0], [2.0, np.nan], [3.0, 1.0], [4.0, 2.0]])
     svg = ET.fromstring(chart("a < b & c", "s", "m", [Curve("x<y", line, "#123456")], equal=True))
     assert len(svg.findall("polyline")) == 2
-    assert "nothing to show" in chart("t", "s", "m", [])
+    assert "no data" in chart("t", "s", "m", [])
 
 
 def test_the_report_is_one_file_and_names_what_did_not_run(tmp_path):
@@ -180,7 +180,7 @@ def test_the_report_is_one_file_and_names_what_did_not_run(tmp_path):
         "name": "default", "title": "default <1>", "seed": 0, "paper": {"fps": 2.0}, "advice": "", "status": "ok",
         "depth_source": "x", "fps": 3.25, "position_rmse_xyz_m": [0.1, 0.2, 0.3], "metric": True,
         "depth_series": {"stamps_ns": [S], "scaled_m": [0.1], "unscaled_m": [None]},
-        "pictures": {
+        "plots": {
             "stamps_ns": np.array([S, 2 * S]), "found": known.drive.poses.T_a_b, "true": known.drive.poses.T_a_b,
             "offpath": [np.zeros((8, 8, 3), np.uint8)], "previews": [], "estimates": {}, "fused": {},
             "above": np.zeros((8, 8, 3), np.uint8),
@@ -223,7 +223,7 @@ def test_single_corrections_of_fusion_are_the_papers_ratio_or_the_guess_itself()
 @pytest.mark.slow
 def test_a_few_seconds_live(shared_dir, tmp_path):
     data = shared_dir / "data" / "house_a"
-    report = paper.bench_paper(data, tmp_path, names=["monogs-lidar"], seconds=8.0, say=lambda text: None)
+    report = paper.bench_paper(data, tmp_path, names=["monogs-lidar"], seconds=8.0, log=lambda text: None)
     row = report["configurations"][0]
     assert row["status"] == "ok"
     assert row["drained"]
@@ -234,21 +234,21 @@ def test_a_few_seconds_live(shared_dir, tmp_path):
     assert (Path(tmp_path) / "report.html").stat().st_size > 20_000
 
 
-def test_the_map_that_the_drive_left_is_told_from_the_refined_one():
-    """Topics have no common order: a chunk said before the drive's end may come after it."""
+def test_the_map_at_the_end_of_the_drive_is_kept_apart_from_the_refined_one():
+    """Topics have no common order: a chunk published before the end of the drive may be received after it."""
     from beamsplat.common.messages import MapChunk, MapPoses
     from beamsplat.common.messages.header import Header
     from beamsplat.common.runtime.mailbox import Envelope
-    from beamsplat.tools.report.observer import Witness
+    from beamsplat.tools.report.observer import BusObserver
 
-    witness = Witness(frozenset())
+    observer = BusObserver(frozenset())
 
-    def say(topic, message, at_ns):
+    def receive(topic, message, at_ns):
         header = Header(
             stamp_ns=message.stamp_ns, publish_ns=at_ns, clock_id=1, sequence=0, producer="mapping",
             instance="ab" * 8, epoch=1,
         )  # fmt: skip
-        witness._take(Envelope(topic, header, message, 100))
+        observer._receive(Envelope(topic, header, message, 100))
 
     def chunk(anchor, revision):
         return MapChunk(
@@ -259,10 +259,10 @@ def test_the_map_that_the_drive_left_is_told_from_the_refined_one():
     poses = MapPoses(
         stamp_ns=S, keyframe_ids=np.zeros(1, np.int64), stamps_ns=np.full(1, S), T_map_body=np.eye(4)[None]
     )
-    say("mapping/chunk", chunk(0, 1), 10)
-    say("mapping/poses", poses, 30)
-    say("mapping/chunk", chunk(0, 2), 20)  # overtaken
-    say("mapping/chunk", chunk(0, 3), 40)  # refined
-    say("mapping/poses", poses, 50)
-    assert witness.seen.online_chunks[0].revision == 2
-    assert witness.seen.chunks[0].revision == 3
+    receive("mapping/chunk", chunk(0, 1), 10)
+    receive("mapping/poses", poses, 30)
+    receive("mapping/chunk", chunk(0, 2), 20)  # published before the end, received after it
+    receive("mapping/chunk", chunk(0, 3), 40)  # refined
+    receive("mapping/poses", poses, 50)
+    assert observer.record.online_chunks[0].revision == 2
+    assert observer.record.chunks[0].revision == 3

@@ -1,4 +1,4 @@
-"""The picture from above: things lie where they are, at the scale it says, and the ceiling is gone."""
+"""The top view of a map: objects at their position and scale, without the ceiling."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from beamsplat.tools.report.top_view import top_view
 
 
 def tiles(low, high, z, colour, step=0.05):
-    """Gaussians float32 [PARAMS, N] that pave a rectangle (x, y) at a height."""
+    """Return Gaussians float32 [PARAMS, N] that cover a rectangle (x, y) at a height."""
     x, y = (
         a.ravel() for a in np.meshgrid(np.arange(low[0], high[0], step), np.arange(low[1], high[1], step))
     )
@@ -29,14 +29,14 @@ def room():
     ], axis=1)  # fmt: skip
 
 
-def test_things_lie_where_they_are(room):
-    picture = top_view(room, metres_per_px=0.02)
-    h, w = picture.shape[:2]
-    assert w * 0.02 == pytest.approx(4.0 + 0.8, abs=0.1)  # an edge around
+def test_objects_appear_at_their_position(room):
+    image = top_view(room, metres_per_px=0.02)
+    h, w = image.shape[:2]
+    assert w * 0.02 == pytest.approx(4.0 + 0.8, abs=0.1)  # a margin around
     assert h * 0.02 == pytest.approx(2.0 + 0.8, abs=0.1)
 
     def at(x, y):
-        return picture[round((h - 1) / 2 - y / 0.02), round((w - 1) / 2 + x / 0.02)].astype(int)
+        return image[round((h - 1) / 2 - y / 0.02), round((w - 1) / 2 + x / 0.02)].astype(int)
 
     assert np.abs(at(1.5, 0.5) - [0, 0, 255]).max() < 30  # BGR
     assert np.abs(at(-1.5, 0.5) - 128).max() < 30
@@ -56,5 +56,5 @@ def test_a_path_is_drawn_on_it(room):
     assert np.abs(y + 0.5).max() < 0.06
 
 
-def test_a_map_of_nothing_but_ceiling_has_no_picture(room):
+def test_a_map_of_only_a_ceiling_has_no_top_view(room):
     assert top_view(room[:, room[2] > 2.0]) is None

@@ -1,4 +1,4 @@
-"""A short drive through the textured room, recorded: pictures, scans, wheels, and dense truth beside it."""
+"""A recorded short drive through the textured room: images, scans, wheel odometry, and dense true depth."""
 
 import cv2
 import numpy as np
@@ -33,7 +33,7 @@ def _scan(stamp_ns, rng):
 
 @pytest.fixture(scope="session")
 def drive(tmp_path_factory):
-    """Folder with rec/ (30 pictures, 60 scans, no poses) and depth_gt/ of every sixth picture."""
+    """Folder with rec/ (30 images, 60 scans, no poses) and depth_gt/ of every sixth image."""
     folder = tmp_path_factory.mktemp("drive")
     (folder / "depth_gt").mkdir()
     rng = np.random.default_rng(5)
@@ -55,11 +55,11 @@ def drive(tmp_path_factory):
             writer.write("wheel/odometry", wheels, stamp)
             writer.write("lidar/scan", _scan(stamp, rng), stamp)
             if tick % 2 == 0:
-                _picture(writer, folder, stamp, T, truth=tick % 12 == 0)
+                _write_image(writer, folder, stamp, T, truth=tick % 12 == 0)
     return folder
 
 
-def _picture(writer, folder, stamp, T, truth):
+def _write_image(writer, folder, stamp, T, truth):
     rgb, depth = render(T)
     data = rgb.reshape(-1)
     image = Image(

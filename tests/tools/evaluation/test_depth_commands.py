@@ -1,4 +1,4 @@
-"""`eval depth`, `depth`, `bench depth` and `calibrate` on a short drive, as people type them."""
+"""The commands `eval depth`, `depth`, `bench depth` and `calibrate` on a short drive."""
 
 import json
 
@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 
 from beamsplat.common.geometry.trajectory import Trajectory, write_tum
 from beamsplat.tools.cli.main import app
-from beamsplat.tools.evaluation.metrics import MethodErrors, blocks, every_third
+from beamsplat.tools.evaluation.metrics import MethodErrors, every_third, every_third_block
 from tests.tools.evaluation.conftest import pose
 
 runner = CliRunner()
@@ -35,7 +35,7 @@ def poses(drive):
 
 
 @pytest.mark.slow
-def test_eval_depth_finds_its_own_poses_and_keeps_the_contract(drive):
+def test_eval_depth_estimates_poses_and_has_all_figures(drive):
     report = figures("eval", "depth", drive / "rec", "--truth", drive, "--source", "stixel")
     assert report["poses"] == "our SLAM"
     assert report["default"] == "field"
@@ -51,7 +51,7 @@ def test_eval_depth_finds_its_own_poses_and_keeps_the_contract(drive):
     assert report["ratio"]["frames"] == 5
 
 
-def test_depth_draws_pictures_side_by_side(drive, poses, tmp_path):
+def test_depth_writes_panels(drive, poses, tmp_path):
     result = run(
         "depth", drive / "rec", "--out", tmp_path, "--poses", poses, "--source", "stixel", "--truth", drive,
         "--every", 3,
@@ -62,7 +62,7 @@ def test_depth_draws_pictures_side_by_side(drive, poses, tmp_path):
     assert cv2.imread(str(files[0])).shape == (240, 5 * 320, 3)
 
 
-def test_a_planted_clock_offset_is_found_and_named(drive, poses):
+def test_a_clock_offset_is_estimated_and_reported(drive, poses):
     right = figures("calibrate", "time", drive / "rec", "--poses", poses)
     assert abs(right["clock_ms"]) < 5.0
     wrong = figures("calibrate", "time", drive / "rec", "--poses", poses, "--shift-ms", 80)
@@ -70,13 +70,13 @@ def test_a_planted_clock_offset_is_found_and_named(drive, poses):
     assert "clock is wrong" in wrong["status"]
 
 
-def test_extrinsics_say_what_cannot_be_known(drive, poses):
+def test_extrinsics_report_unobservable_parameters(drive, poses):
     report = figures("calibrate", "extrinsics", drive / "rec", "--poses", poses)
     assert abs(report["yaw_deg"]) < 0.3
     assert any("z:" in reason for reason in report["not_observable"])
 
 
-def test_bench_depth_prints_the_network_alone_beside_the_whole():
+def test_bench_depth_reports_the_source_alone_and_the_whole():
     report = figures("bench", "depth", "--source", "stixel", "--frames", 6)
     assert report["fps_source_alone"] > report["fps_one_core"] > 0.0
     assert report["cpu_ms_keyframe"] > 0.0
@@ -91,13 +91,13 @@ def test_bench_depth_prints_the_network_alone_beside_the_whole():
         (("eval", "depth", "{drive}/rec", "--truth", "{drive}", "--source", "nonsense"), "stixel"),
     ],
 )
-def test_what_is_wrong_is_said_in_one_sentence(drive, arguments, words):
+def test_errors_name_the_cause(drive, arguments, words):
     result = run(*(a.format(drive=drive) for a in arguments))
     assert result.exit_code != 0
     assert words in result.output + str(result.exception)
 
 
-def test_boards_real_beams_end_at_their_edges(shared_dir, tmp_path):
+def test_calibration_with_real_boards_aligns_beams_with_the_boards_edges(shared_dir, tmp_path):
     folder = shared_dir / "data/acfr_2dlidar"
     if not folder.exists():
         pytest.skip("needs the recorded boards")
@@ -117,12 +117,12 @@ def test_boards_real_beams_end_at_their_edges(shared_dir, tmp_path):
     assert report["edge_error_px"] < 3.0 < report["edge_error_before_px"]
 
 
-def test_held_out_beams_are_a_third_either_way():
+def test_a_third_of_the_beams_is_held_out_either_way():
     assert every_third(720).mean() == pytest.approx(1 / 3)
-    assert blocks(720, np.radians(0.5)).mean() == pytest.approx(1 / 3, abs=0.02)
+    assert every_third_block(720, np.radians(0.5)).mean() == pytest.approx(1 / 3, abs=0.02)
 
 
-def test_what_is_not_answered_lowers_the_coverage_and_nothing_else():
+def test_pixels_without_depth_lower_only_the_coverage():
     truth = np.full((4, 4), 2.0, np.float32)
     depth = truth + 0.1
     depth[:2] = np.nan

@@ -1,4 +1,6 @@
-"""A drive that is stopped in the middle and goes on from a start that nobody told: the same map as without the stop."""
+"""A drive that is stopped in the middle and goes on from a start that nobody told: the same map as without
+the stop.
+"""
 
 import cv2
 import numpy as np
@@ -13,7 +15,7 @@ from beamsplat.common.mapfiles.state import store_of
 from beamsplat.common.raster.camera import RasterCamera
 from beamsplat.common.raster.rasterizer import Rasterizer
 from beamsplat.common.runtime.lockstep import Lockstep
-from beamsplat.tools.evaluation.dataset import extra_views, read_depth_png
+from beamsplat.tools.evaluation.dataset import read_depth_png, read_offpath_views
 from beamsplat.tools.report.scores import pose_errors, rigid_offset
 from beamsplat.tools.system.assembly import build_node
 
@@ -22,8 +24,9 @@ CAMERA = RasterCamera(530.0, 530.0, 319.5, 239.5, 640, 480)
 
 
 def drive(shared_dir, folder, start_s, duration_s, resume=None, final_steps=150):
-    """One run of all nodes: the session in `folder`/map, the robot's state in `folder`/robot. Gives the keyframes'
-    (stamps, T_map_body) at its end, and the statuses of localization."""
+    """One run of all nodes: the session in `folder`/map, the robot's state in `folder`/robot. Gives the
+    keyframes' (stamps, T_map_body) at its end, and the statuses of localization.
+    """
     nodes = {
         "replay": {"data": str(shared_dir / "data/house_a/bag"), "start_s": start_s, "duration_s": duration_s},
         "localization": {"kind": "lidar", "save": str(folder / "robot")},
@@ -56,7 +59,7 @@ def scores(shared_dir, session, poses):
     found = T_map_body[answered]
     T_world_map = rigid_offset(found, T_world_body)
     store, rasterizer, at_views = store_of(SessionFolder(session).read_state()), Rasterizer(), {}
-    for number, view in enumerate(extra_views(shared_dir / "data/house_a/extra_views")):
+    for number, view in enumerate(read_offpath_views(shared_dir / "data/house_a/extra_views")):
         T_map_camera = inverse(T_world_map) @ view.T_map_camera
         rgb, depth, alpha = render_rgb_depth(rasterizer, store, CAMERA, T_map_camera)
         if alpha.mean() > 0.95:
@@ -67,8 +70,9 @@ def scores(shared_dir, session, poses):
 
 @pytest.mark.slow
 def test_a_stopped_drive_ends_where_an_uninterrupted_one_does(shared_dir, tmp_path):
-    """Stopped after half a minute; the robot is carried back four seconds' way and told nothing. Within 0.3 dB at
-    views that neither has seen, and within 1 cm of the poses' error."""
+    """Stopped after half a minute; the robot is carried back four seconds' way and told nothing. Within 0.3
+    dB at views that neither has seen, and within 1 cm of the poses' error.
+    """
     whole, _ = drive(shared_dir, tmp_path / "whole", 0.0, SECONDS)
     psnr_whole, ate_whole = scores(shared_dir, tmp_path / "whole" / "map", whole)
     go = tmp_path / "stopped"

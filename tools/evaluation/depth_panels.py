@@ -1,4 +1,4 @@
-"""Pictures side by side: image with its beams, raw depth, corrected depth, sigma, truth."""
+"""Panels for visual inspection: image with beams, raw depth, corrected depth, sigma, true depth."""
 
 from __future__ import annotations
 
@@ -13,69 +13,75 @@ from beamsplat.common.geometry.beams import project_beams
 from beamsplat.common.geometry.camera import Pinhole, Undistorter
 from beamsplat.common.geometry.rig import load_rig
 from beamsplat.services.depth.source import DepthInput, DepthSource
-from beamsplat.tools.evaluation.drive import Drive
-from beamsplat.tools.evaluation.evaluate import Outcome, read_truth, walk
+from beamsplat.tools.evaluation.drive import RecordedDrive
+from beamsplat.tools.evaluation.evaluate import DepthComparison, replay_depth, truth_depth_files
 
-_Z_RANGE_M = (0.4, 10.0)
-_SIGMA_RANGE_M = (0.005, 2.0)
+_Z_RANGE_M = (0.4, 10.0)  # colour range of depth
+_SIGMA_RANGE_M = (0.005, 2.0)  # colour range of sigma
 
 
-def draw_drive(
-    drive: Drive, source: DepthSource, truth: Path | None, every: int, out: Path, floor: bool | None
+def draw_depth_panels(
+    drive: RecordedDrive, source: DepthSource, truth: Path | None, every: int, out: Path, floor: bool | None
 ) -> Iterator[tuple[Path, int]]:
-    """Writes a PNG of every n-th picture (of those with truth, if there is any); yields (path, total)."""
-    files = read_truth(truth) if truth is not None else {}
+    """Write a panel as PNG for every n-th image; yield (path, number of panels).
+
+    With `truth`, only images with a true depth are used.
+    """
+    files = truth_depth_files(truth) if truth is not None else {}
     chosen = [image.stamp_ns for image in drive.images if not files or image.stamp_ns in files][::every]
     wanted: dict[int, Path | None] = {stamp: files.get(stamp) for stamp in chosen}
-    for outcome in walk(drive, source, wanted, floor=floor):
+    for outcome in replay_depth(drive, source, wanted, floor=floor):
         path = out / f"{outcome.stamp_ns}.png"
-        cv2.imwrite(str(path), panel(outcome, drive))
+        cv2.imwrite(str(path), depth_panel(outcome, drive))
         yield path, len(wanted)
 
 
-def panel(outcome: Outcome, drive: Drive) -> np.ndarray:
-    """uint8 BGR [H, 4W or 5W, 3]."""
+def depth_panel(outcome: DepthComparison, drive: RecordedDrive) -> np.ndarray:
+    """Return the panel of one image, BGR uint8 [H, 4W or 5W, 3]: with true depth it has five tiles."""
     field = outcome.methods["field"]
-    beams = drive.beams(outcome.stamp_ns)
+    beams = drive.beams_at(outcome.stamp_ns)
     uv, z, _ = project_beams(beams, drive.undistort.pinhole, drive.T_body_camera)
     image = cv2.cvtColor(outcome.image_rgb, cv2.COLOR_RGB2BGR)
-    colours = colour(z[:, None].astype(np.float32), *_Z_RANGE_M)[:, 0]
+    colours = colourize(z[:, None].astype(np.float32), *_Z_RANGE_M)[:, 0]
     for (u, v), c in zip(np.rint(uv).astype(int), colours):
         cv2.circle(image, (int(u), int(v)), 3, tuple(int(k) for k in c), -1)
     tiles = [
         label(image, f"{len(z)} beams"),
         label(
-            colour(outcome.estimate.values, *_Z_RANGE_M), f"{outcome.estimate.kind}, as the source gives it"
+            colourize(outcome.estimate.values, *_Z_RANGE_M),
+            f"{outcome.estimate.kind}, as estimated by the source",
         ),
-        label(colour(field.depth_m, *_Z_RANGE_M), f"field: {field.status}, scale {field.scale:.2f}"),
-        label(colour(field.sigma_m, *_SIGMA_RANGE_M), "sigma, 5 mm to 2 m"),
+        label(colourize(field.depth_m, *_Z_RANGE_M), f"field: {field.status}, scale {field.scale:.2f}"),
+        label(colourize(field.sigma_m, *_SIGMA_RANGE_M), "sigma, 5 mm to 2 m"),
     ]
     if np.isfinite(outcome.truth).any():
-        tiles.append(label(colour(outcome.truth, *_Z_RANGE_M), "truth"))
+        tiles.append(label(colourize(outcome.truth, *_Z_RANGE_M), "truth"))
     return np.hstack(tiles)
 
 
-def draw_image(path: Path, source: DepthSource, rig: Path | None, out: Path) -> Path:
-    """One picture without beams: what the source gives. Returns the file written.
+def draw_depth_of_image(path: Path, source: DepthSource, rig: Path | None, out: Path) -> Path:
+    """Write a panel of the estimate for a single image file without beams; return the file written.
 
     Raises:
-        UserError: it is no picture, or the rig belongs to another size.
+        UserError: the file is not an image, or the rig is for another image size.
     """
     bgr = cv2.imread(str(path), cv2.IMREAD_COLOR)
     if bgr is None:
-        raise UserError(f"{path}: is no picture that OpenCV can read")
+        raise UserError(f"{path} is not an image that OpenCV can read")
     h, w = bgr.shape[:2]
     if rig is None:
-        # A 60 degree lens: without K a network's metric depth is off by the ratio of the focals.
+        # Assume a field of view of 60 degrees: metric depth is then wrong by the ratio of the focal lengths.
         focal = w / 2.0 / np.tan(np.radians(30.0))
         camera = Pinhole(focal, focal, (w - 1) / 2.0, (h - 1) / 2.0, w, h)
     else:
         loaded = load_rig(rig)
         if loaded.camera is None:
-            raise UserError(f"{rig}: has no [camera]")
+            raise UserError(f"{rig} has no [camera]")
         camera = Pinhole.of(loaded.camera.model())
     if camera.shape != (h, w):
-        raise UserError(f"{rig}: is for {camera.width_px}x{camera.height_px}, {path} is {w}x{h}")
+        raise UserError(
+            f"{rig} is for images of {camera.width_px}x{camera.height_px}, but {path} has {w}x{h}"
+        )
     undistort = Undistorter(camera)
     image = undistort(bgr)
     view = DepthInput(0, cv2.cvtColor(image, cv2.COLOR_BGR2RGB), undistort.pinhole)
@@ -84,15 +90,15 @@ def draw_image(path: Path, source: DepthSource, rig: Path | None, out: Path) -> 
     if estimate.kind == "disparity" and np.isfinite(estimate.values).any():
         near, far = (float(v) for v in np.nanpercentile(estimate.values, (2, 98)))
     tile = label(
-        colour(estimate.values, max(near, 1e-6), max(far, 2e-6)), f"{estimate.kind}: {estimate.status}"
+        colourize(estimate.values, max(near, 1e-6), max(far, 2e-6)), f"{estimate.kind}: {estimate.status}"
     )
     target = out / f"{path.stem}_depth.png"
     cv2.imwrite(str(target), np.hstack([image, tile]))
     return target
 
 
-def colour(values: np.ndarray, low: float, high: float) -> np.ndarray:
-    """uint8 BGR [H, W, 3]: logarithmic between `low` and `high`; NaN is black."""
+def colourize(values: np.ndarray, low: float, high: float) -> np.ndarray:
+    """Return values [H, W] as colours BGR uint8 [H, W, 3], logarithmic from `low` to `high`; NaN is black."""
     with np.errstate(invalid="ignore", divide="ignore"):
         place = np.log(values / low) / np.log(high / low)
     grey = (np.clip(np.nan_to_num(place), 0.0, 1.0) * 255).astype(np.uint8)
@@ -101,9 +107,9 @@ def colour(values: np.ndarray, low: float, high: float) -> np.ndarray:
     return painted
 
 
-def label(picture: np.ndarray, text: str) -> np.ndarray:
-    """The picture with a line of text at its top."""
-    out = picture.copy()
+def label(image: np.ndarray, text: str) -> np.ndarray:
+    """Return a copy of the image with a line of text at its top."""
+    out = image.copy()
     cv2.rectangle(out, (0, 0), (out.shape[1], 20), (0, 0, 0), -1)
     cv2.putText(out, text, (5, 15), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (255, 255, 255), 1, cv2.LINE_AA)
     return out
