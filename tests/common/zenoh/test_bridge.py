@@ -1,0 +1,124 @@
+"""The bridge between a robot's router and an edge server's: what the topic table marks crosses, the rest does not."""
+
+import contextlib
+
+import pytest
+
+from beamsplat.common.messages import Health
+from beamsplat.common.messages.header import Header
+from beamsplat.common.topics import TOPICS
+from beamsplat.common.zenoh.bridge import Bridge, BridgeSessions
+from beamsplat.common.zenoh.bus import Bus, open_router, open_session
+from tests.common.polling import wait_until
+from tests.common.samples import sample_messages
+from tests.conftest import free_port
+
+SAMPLES = {type(m): m for m in sample_messages()}
+UP = {name for name, row in TOPICS.items() if row.uplink in ("up", "bulk")}
+DOWN = {name for name, row in TOPICS.items() if row.uplink == "down"}
+AT_ROBOT, AT_EDGE = "aa" * 8, "bb" * 8  # instances of the producers of the two sides
+
+
+class Side:
+    """A router with one producer of all topics, and everything that is heard there from the other side."""
+
+    def __init__(self, stack, instance):
+        self.endpoint = f"tcp/127.0.0.1:{free_port()}"
+        stack.enter_context(open_router((self.endpoint,)))
+        self.instance, self._stack = instance, stack
+        self.bus = Bus(self.open(), "r1", "producer", instance, 1)
+        self.publications = {name: self.bus.publish(name) for name in TOPICS}
+        self.crossed = set()
+        self._kept = self.open().declare_subscriber("beamsplat/**", self._hear)
+
+    def open(self):
+        return self._stack.enter_context(open_session((self.endpoint,)))
+
+    def _hear(self, sample):
+        if Header.unpack(sample.attachment.to_bytes()).instance != self.instance:
+            self.crossed.add(str(sample.key_expr).removeprefix("beamsplat/r1/"))
+
+    def publish(self, names):
+        for name in names:
+            self.publications[name].put(SAMPLES[TOPICS[name].message])
+
+
+@pytest.fixture
+def sides():
+    with contextlib.ExitStack() as stack:
+        robot, edge = Side(stack, AT_ROBOT), Side(stack, AT_EDGE)
+        sessions = BridgeSessions(robot=robot.open(), edge=edge.open(), edge_bulk=edge.open())
+        yield robot, edge, Bridge("r1", sessions), sessions
+
+
+def test_marked_topics_cross_in_their_direction_and_no_others(sides):
+    robot, edge, bridge, _ = sides
+
+    def all_crossed():
+        robot.publish(TOPICS)  # the unmarked ones too, and each before the last marked one
+        edge.publish(TOPICS)
+        return edge.crossed >= UP and robot.crossed >= DOWN
+
+    wait_until(all_crossed, 10.0)
+    assert edge.crossed == UP
+    assert robot.crossed == DOWN
+    assert set(bridge.forwarded_up()) == UP
+    for name in UP | DOWN:
+        assert bridge.forwarded[name].messages > 0
+        assert bridge.forwarded[name].bytes > 0
+    assert bridge.ended == set()
+    assert bridge.interrupted == 0
+
+
+def test_ends_and_health_cross(sides):
+    robot, edge, bridge, _ = sides
+    for name in ("tick", "wheel/odometry"):
+        robot.bus.end(robot.publications[name])
+    edge.bus.end(edge.publications["keyframes/ack"])
+
+    def crossed():
+        robot.bus.publish_health(SAMPLES[Health])
+        edge.bus.publish_health(SAMPLES[Health])
+        return {"end/tick", "health/producer"} <= edge.crossed and "health/producer" in robot.crossed
+
+    wait_until(crossed)
+    wait_until(lambda: bridge.ended == {"tick", "keyframes/ack"})
+    assert edge.crossed == {"end/tick", "health/producer"}
+    wait_until(lambda: robot.crossed == {"end/keyframes/ack", "health/producer"})
+
+
+def test_a_latched_message_of_before_the_bridge_crosses():
+    with contextlib.ExitStack() as stack:
+        robot, edge = Side(stack, AT_ROBOT), Side(stack, AT_EDGE)
+        robot.publish(["rig"])
+        sessions = BridgeSessions(robot=robot.open(), edge=edge.open(), edge_bulk=edge.open())
+        bridge = Bridge("r1", sessions)
+        wait_until(lambda: "rig" in edge.crossed)
+        assert bridge.forwarded["rig"].messages == 1
+
+
+def test_a_new_session_forwards_the_large_messages_alone(sides):
+    robot, edge, bridge, sessions = sides
+    wait_until(lambda: robot.publish(["keyframes/frame"]) or "keyframes/frame" in edge.crossed)
+    replacement = BridgeSessions(robot=sessions.robot, edge=sessions.edge, edge_bulk=edge.open())
+    bridge.replace_bulk_session(replacement)
+    sessions.edge_bulk.close()
+    edge.crossed.clear()
+    wait_until(lambda: robot.publish(["keyframes/frame"]) or "keyframes/frame" in edge.crossed)
+    assert bridge.interrupted == 0
+
+
+def test_another_robots_topics_do_not_cross(sides):
+    robot, edge, _, _ = sides
+    other = Bus(robot.open(), "r2", "clock", "cc" * 8, 1).publish("tick")
+    heard = []
+    kept = edge.open().declare_subscriber("beamsplat/r2/**", lambda s: heard.append(s))
+
+    def own_crossed():
+        other.put(SAMPLES[TOPICS["tick"].message])
+        robot.publish(["tick"])
+        return "tick" in edge.crossed
+
+    wait_until(own_crossed)
+    assert heard == []
+    kept.undeclare()
