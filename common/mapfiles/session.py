@@ -1,11 +1,13 @@
-"""The files of a session: manifests replaced atomically, states as arrays, keyframes as the bytes that came.
+"""The files of a session: manifests (JSON), states (arrays, npz), keyframes (the message bytes as received).
 
-Whatever is killed or runs full in the middle leaves the state before: a manifest is replaced only after all
-that it names is on the disk. One process at a time may write to a session; it holds a lock that ends with it.
+A crash or a full disk at any moment leaves the previous state valid: a manifest is replaced atomically, and
+only after all files that it lists are on the disk. One process at a time may write to a session; it holds a
+file lock, which the kernel releases when the process ends.
 """
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import io
 import json
@@ -26,70 +28,78 @@ from beamsplat.common.files.persist import make_folder, write_atomically
 from beamsplat.common.mapfiles.blocks import Arrays, block_file, with_blocks
 
 FORMAT, VERSION = "beamsplat-session", 1
-EDGE_VERSION = 2  # 2: Gaussians may lie in blocks beside the state; without any, 1 is written
+EDGE_VERSION = 2  # 2: some Gaussians are in block files; 1 is written when there are none
 MANIFEST, EDGE_MANIFEST = "session.json", "edge.json"
-_TRIES = 5  # to read a state while a mapper replaces it
-_BODY_MAGIC = b"BSKF"
-_BODY_HEAD = struct.Struct("<4sIH")  # magic, CRC-32 of what follows the head, length of the schema
+_MAX_READS = 5  # attempts to read a state while a mapper replaces it
+_KEYFRAME_MAGIC = b"BSKF"
+_KEYFRAME_HEAD = struct.Struct("<4sIH")  # magic, CRC-32 of what follows the header, length of the schema name
 
 
 class SessionFolder:
-    """One session on disk. Reading needs no lock; `lock` before writing."""
+    """The folder of one session. Reading needs no lock; call `lock` before writing."""
 
     def __init__(self, path: Path) -> None:
         self.path = Path(path)
         self._lock: TextIO | None = None
+        self._created = False  # by this object
 
     @property
     def edge(self) -> Path:
+        """Return the folder of the mapper's half."""
         return self.path / "edge"
 
     @property
     def robot(self) -> Path:
+        """Return the folder of the robot's half: lidar map, grid and trajectory."""
         return self.path / "robot"
 
     @property
-    def bodies(self) -> Path:
+    def keyframes(self) -> Path:
+        """Return the folder of the keyframe files."""
         return self.edge / "keyframes"
 
     @property
     def blocks(self) -> Path:
+        """Return the folder of the block files (Gaussians)."""
         return self.edge / "gaussians"
 
     def exists(self) -> bool:
-        """Whether this folder holds a session."""
+        """Return whether the folder contains a session."""
         return (self.path / MANIFEST).is_file()
 
     # --- identity and lock ---
 
     def create(self) -> None:
-        """Makes the folder a session, unless it is one.
+        """Create the session with a new UUID, unless the folder contains one already.
 
         Raises:
-            UserError: the folder cannot be made, or holds a session that cannot be read.
+            UserError: the folder cannot be created, or contains a session that cannot be read.
         """
-        make_folder(self.bodies)
+        make_folder(self.keyframes)
         make_folder(self.blocks)
         if self.exists():
-            self.head()
+            self.header()
             return
+        self._created = True
         head = {"format": FORMAT, "version": VERSION, "uuid": str(uuid.uuid4())}
         try:
             write_json(self.path / MANIFEST, head)
         except OSError as error:
-            raise UserError(f"{self.path}: no session can be made here ({error.strerror})") from error
+            raise UserError(f"{self.path}: cannot create a session here ({error.strerror})") from error
 
-    def head(self) -> dict[str, Any]:
-        """`session.json`.
+    def header(self) -> dict[str, Any]:
+        """Return the contents of `session.json`: format, version and UUID.
 
         Raises:
-            UserError: no session, not readable, or of a version that this program does not know.
+            UserError: there is no session, it cannot be read, or a newer program wrote it.
         """
         if not self.path.is_dir():
             raise UserError(f"{self.path}: no such folder; a session is what `mapping.session = DIR` writes")
         head = read_json(self.path / MANIFEST, "a session is a folder written by `mapping.session = DIR`")
         if head.get("format") != FORMAT:
-            raise UserError(f"{self.path / MANIFEST}: field 'format' is not {FORMAT!r}: this is no session")
+            raise UserError(
+                f"{self.path / MANIFEST}: field 'format' is not {FORMAT!r}: this is not a session"
+            )
         check_version(head, self.path / MANIFEST)
         if not isinstance(head.get("uuid"), str):
             raise UserError(
@@ -98,43 +108,64 @@ class SessionFolder:
         return head
 
     def lock(self) -> None:
-        """Keeps other writers out until `unlock` or the process's end, and clears what a killed writer left.
+        """Take the write lock until `unlock` or the end of the process; remove temporary files of a killed
+        writer.
 
         Raises:
-            UserError: another process writes to this session; the text names it and its host.
+            UserError: another process holds the lock; the text contains its id and host.
         """
         file = (self.edge / "lock").open("a+")
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
             file.seek(0)
-            holder = file.readline().strip() or "it does not say which"
+            holder = file.readline().strip() or "unknown process"
             file.close()
             raise UserError(
-                f"{self.path}: another process writes to this session ({holder}): end it, or use another "
+                f"{self.path}: another process writes to this session ({holder}): stop it, or use another "
                 "folder"
             ) from error
         file.truncate(0)
         file.write(f"process {os.getpid()} on {socket.gethostname()}\n")
         file.flush()
         self._lock = file
-        for folder in (self.edge, self.bodies):
+        for folder in (self.edge, self.keyframes):
             for leftover in folder.glob(".*"):
                 leftover.unlink()
 
     def unlock(self) -> None:
-        """Lets others write."""
-        if self._lock is not None:
-            self._lock.close()
-            self._lock = None
+        """Release the write lock; remove a session that was created here and has remained empty."""
+        if self._lock is None:
+            return
+        if self._created and not self.robot.exists() and not self._has_map():
+            self._remove_empty()
+        self._lock.close()
+        self._lock = None
+
+    def _has_map(self) -> bool:
+        empty = {"lock", self.keyframes.name, self.blocks.name}
+        if {path.name for path in self.edge.iterdir()} - empty:
+            return True
+        return any(any(folder.iterdir()) for folder in (self.keyframes, self.blocks))
+
+    def _remove_empty(self) -> None:
+        """Remove the files that `create` and `lock` write, and the folders; anything else stays."""
+        (self.edge / "lock").unlink(missing_ok=True)
+        (self.path / MANIFEST).unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            for folder in (self.keyframes, self.blocks, self.edge, self.path):
+                folder.rmdir()
 
     # --- states ---
 
     def write_state(self, arrays: Arrays, summary: dict[str, Any]) -> None:
-        """A new state beside the old one, then the manifest that names it; the old one goes last.
+        """Write a new state, then the manifest that refers to it, then remove the old state.
+
+        Args:
+            summary: numbers for the manifest, such as the counts of keyframes and Gaussians.
 
         Raises:
-            OSError: the disk is full or broken; the old state is still the valid one.
+            OSError: the disk is full or broken; the old state is still valid.
         """
         numbers = [int(p.stem.rpartition("-")[2]) for p in self.edge.glob("state-*.npz")]
         name = f"state-{1 + max(numbers, default=0)}.npz"
@@ -155,12 +186,12 @@ class SessionFolder:
                 old.unlink(missing_ok=True)
 
     def manifest(self) -> dict[str, Any] | None:
-        """`edge.json`; None while nothing has been saved.
+        """Return the contents of `edge.json`; None before the first checkpoint.
 
         Raises:
-            UserError: not readable, or of a version that this program does not know.
+            UserError: it cannot be read, or a newer program wrote it.
         """
-        self.head()
+        self.header()
         path = self.edge / EDGE_MANIFEST
         if not path.is_file():
             return None
@@ -172,20 +203,22 @@ class SessionFolder:
         return manifest
 
     def read_state(self, whole: bool = True) -> Arrays | None:
-        """The arrays that the manifest names; None while nothing has been saved. Without `whole`, blocks of
-        Gaussians stay in their files.
+        """Return the arrays of the last checkpoint; None before the first one.
+
+        Args:
+            whole: also read the Gaussians in block files; otherwise only their descriptions are returned.
 
         Raises:
-            UserError: they are missing, truncated or altered.
+            UserError: the state is missing, truncated or altered.
         """
-        for _ in range(_TRIES):
+        for _ in range(_MAX_READS):
             manifest = self.manifest()
             try:
                 return None if manifest is None else self._read(manifest, whole)
             except UserError:
                 if self.manifest() == manifest:
                     raise
-        raise UserError(f"{self.path}: is saved faster than it can be read; try again")
+        raise UserError(f"{self.path}: the session changes faster than it can be read; try again")
 
     def _read(self, manifest: dict[str, Any], whole: bool) -> Arrays:
         path = self.edge / Path(manifest["state"]).name
@@ -204,79 +237,80 @@ class SessionFolder:
 
     # --- keyframes ---
 
-    def write_body(self, id: int, schema: str, payload: bytes) -> None:
-        """A keyframe as it came. It is on the disk when this returns.
+    def write_keyframe(self, id: int, schema: str, payload: bytes) -> None:
+        """Write a keyframe message as received: its schema and payload. It is on the disk when this returns.
 
         Raises:
             OSError: the disk is full or broken.
         """
         name = schema.encode()
         checksum = zlib.crc32(payload, zlib.crc32(name))
-        write_durably(self._body(id), _BODY_HEAD.pack(_BODY_MAGIC, checksum, len(name)) + name + payload)
+        head = _KEYFRAME_HEAD.pack(_KEYFRAME_MAGIC, checksum, len(name))
+        write_durably(self._keyframe_file(id), head + name + payload)
 
-    def body_ids(self) -> list[int]:
-        """Ids of the keyframes on disk, rising."""
-        return sorted(int(p.stem) for p in self.bodies.glob("*.kf") if p.stem.isdecimal())
+    def keyframe_ids(self) -> list[int]:
+        """Return the ids of the keyframes on disk, ascending."""
+        return sorted(int(p.stem) for p in self.keyframes.glob("*.kf") if p.stem.isdecimal())
 
-    def read_body(self, id: int) -> tuple[str, bytes]:
-        """(schema, payload) of a keyframe.
+    def read_keyframe(self, id: int) -> tuple[str, bytes]:
+        """Return (schema, payload) of a keyframe.
 
         Raises:
-            UserError: it is missing or altered.
+            UserError: the file is missing or altered.
         """
-        path = self._body(id)
+        path = self._keyframe_file(id)
         try:
             blob = path.read_bytes()
         except OSError as error:
             raise UserError(f"{path}: cannot be read ({error.strerror})") from error
-        if len(blob) >= _BODY_HEAD.size:
-            magic, checksum, length = _BODY_HEAD.unpack_from(blob)
-            if magic == _BODY_MAGIC and zlib.crc32(blob[_BODY_HEAD.size :]) == checksum:
-                schema = blob[_BODY_HEAD.size : _BODY_HEAD.size + length].decode()
-                return schema, blob[_BODY_HEAD.size + length :]
+        if len(blob) >= _KEYFRAME_HEAD.size:
+            magic, checksum, length = _KEYFRAME_HEAD.unpack_from(blob)
+            body = blob[_KEYFRAME_HEAD.size :]
+            if magic == _KEYFRAME_MAGIC and zlib.crc32(body) == checksum:
+                return body[:length].decode(), body[length:]
         raise UserError(f"{path}: truncated or altered; restore it from a copy, or remove it")
 
-    def remove_bodies(self, ids: Iterator[int] | list[int]) -> int:
-        """Takes keyframes off the disk; gives how many there were."""
-        there = [path for path in map(self._body, ids) if path.exists()]
-        for path in there:
+    def remove_keyframes(self, ids: Iterator[int] | list[int]) -> int:
+        """Delete keyframe files; return how many existed."""
+        existing = [path for path in map(self._keyframe_file, ids) if path.exists()]
+        for path in existing:
             path.unlink(missing_ok=True)
-        return len(there)
+        return len(existing)
 
-    def _body(self, id: int) -> Path:
-        return self.bodies / f"{id}.kf"
+    def _keyframe_file(self, id: int) -> Path:
+        return self.keyframes / f"{id}.kf"
 
     # --- blocks of Gaussians ---
 
     def block_numbers(self) -> list[int]:
-        """Numbers of the blocks on disk, rising."""
+        """Return the numbers of the blocks on disk, ascending."""
         return sorted(int(p.stem) for p in self.blocks.glob("*.block") if p.stem.isdecimal())
 
     def remove_blocks(self, numbers: Iterable[int]) -> None:
-        """Takes blocks off the disk."""
+        """Delete block files."""
         for number in numbers:
             block_file(self.blocks, number).unlink(missing_ok=True)
 
 
 def packed_arrays(arrays: Arrays) -> bytes:
-    """The bytes of a state, as they stand in its file."""
+    """Return a state as the bytes of its npz file."""
     buffer = io.BytesIO()
     np.savez(buffer, **arrays)
     return buffer.getvalue()
 
 
 def unpacked_arrays(source: Path | bytes) -> Arrays:
-    """The state in a file, or in its bytes.
+    """Return the state in an npz file, or in the bytes of one.
 
     Raises:
-        OSError, ValueError, zipfile.BadZipFile, zlib.error: it is not whole.
+        OSError, ValueError, zipfile.BadZipFile, zlib.error: the file is incomplete or damaged.
     """
     with np.load(io.BytesIO(source) if isinstance(source, bytes) else source, allow_pickle=False) as stored:
         return {key: stored[key] for key in stored.files}
 
 
 def write_durably(path: Path, data: bytes | memoryview) -> None:
-    """Replaces a file whole, and the entry in its folder survives a power cut too."""
+    """Replace a file atomically and flush its folder entry, so that the file survives a power failure."""
     write_atomically(path, data)
     folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
     try:
@@ -286,15 +320,15 @@ def write_durably(path: Path, data: bytes | memoryview) -> None:
 
 
 def write_json(path: Path, table: dict[str, Any]) -> None:
-    """Replaces a JSON file whole."""
+    """Replace a JSON file atomically and durably."""
     write_durably(path, (json.dumps(table, indent=1) + "\n").encode())
 
 
 def read_json(path: Path, advice: str) -> dict[str, Any]:
-    """The object in a JSON file.
+    """Return the object in a JSON file.
 
     Raises:
-        UserError: there is none; the text ends with `advice`.
+        UserError: the file is missing or not a JSON object; the text ends with `advice`.
     """
     try:
         table = json.loads(path.read_text())
@@ -306,10 +340,10 @@ def read_json(path: Path, advice: str) -> dict[str, Any]:
 
 
 def check_version(table: dict[str, Any], path: Path, newest: int = VERSION) -> None:
-    """Refuses what a newer program wrote.
+    """Raise an error if a newer program wrote the file.
 
     Raises:
-        UserError: names the file, its version and the one that this program reads.
+        UserError: the version is above `newest` or invalid; the text contains the file and both versions.
     """
     version = table.get("version")
     if not isinstance(version, int) or not 1 <= version <= newest:

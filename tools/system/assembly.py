@@ -10,12 +10,12 @@ from beamsplat.common.errors import UserError
 from beamsplat.common.plugins import is_class_path
 from beamsplat.common.runtime.node import Node
 from beamsplat.common.runtime.registry import Service, make_node, node_class_of
-from beamsplat.common.security.access_control import MASTERS
+from beamsplat.common.security.access_control import ADMIN_USERS
 from beamsplat.common.security.keys import Keys, check_endpoint, is_secure
 from beamsplat.common.topics import TOPICS
 from beamsplat.services.nodes import NODES
 
-RESERVED = ("router", *MASTERS)  # users and processes of a running system that are not nodes
+RESERVED = ("router", *ADMIN_USERS)  # users and processes of a running system that are not nodes
 
 
 @dataclass(frozen=True)

@@ -90,6 +90,7 @@ class Supervisor:
         self._context.set_forkserver_preload(list(PRELOADED))
 
     def __enter__(self) -> Supervisor:
+        self._refuse_second_router()  # before anything is created
         make_folder(self.log_dir)
         try:
             self._start_all()
@@ -106,11 +107,7 @@ class Supervisor:
         if ROUTER in self._names:
             if (folder := self.deployment.security.local) is not None:
                 make_logins(folder, (*self.table, *self.deployment.nodes, SUPERVISOR, OPERATOR))
-            if self._router_answers():
-                raise UserError(
-                    f"a router already runs at {', '.join(self.deployment.router.listen)}: stop it, name the "
-                    "nodes to run beside it (beamsplat run FILE NODE...), or choose another router.listen"
-                )
+                self._refuse_second_router()  # now with a login
             self._start(ROUTER)
             self._wait_for_router()
         classes = node_classes(self.deployment, self.table)
@@ -118,6 +115,13 @@ class Supervisor:
         self._around = {name: surroundings(classes, name, self.deployment.role) for name in nodes}
         for name in sorted(nodes, key=lambda n: classes[n].is_source()):
             self._start(name)
+
+    def _refuse_second_router(self) -> None:
+        if ROUTER in self._names and self._router_answers():
+            raise UserError(
+                f"a router already runs at {', '.join(self.deployment.router.listen)}: stop it, name the "
+                "nodes to run beside it (beamsplat run FILE NODE...), or choose another router.listen"
+            )
 
     def _router_answers(self) -> bool:
         with contextlib.suppress(UserError):

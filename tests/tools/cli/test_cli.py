@@ -44,7 +44,10 @@ def test_help_names_every_command_and_each_has_an_example():
             "unknown option 'router.port' (options are: connect,",
         ),
         (("check", "deploy/demo.toml", "--set", "replay.[/x]=1"), "unknown option '[/x]'"),
-        (("serve", "deploy/demo.toml", "router", "--set", 'router.listen=["no"]'), "no is not a Zenoh endpoint"),
+        (
+            ("serve", "deploy/demo.toml", "router", "--set", 'router.listen=["no"]'),
+            "no is not a Zenoh endpoint",
+        ),
         (
             ("run", "deploy/poses.toml", *POSES, "router", "--set", "state_dir=/dev/null/x"),
             "cannot create this folder",
@@ -88,6 +91,7 @@ def test_run_without_a_router_port_says_what_to_do(tmp_path, free_endpoint):
     assert done.returncode == 2
     assert "router" in done.stderr
     assert "Traceback" not in done.stderr
+    assert not list(tmp_path.iterdir()), "a refused run created something"
 
 
 def test_doctor_says_what_tcp_makes_of_a_bad_link():
