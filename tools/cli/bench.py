@@ -1,4 +1,4 @@
-"""`beamsplat bench ...`: the figures of this machine, each beside a baseline of the same run."""
+"""Commands `beamsplat bench ...`: measure this machine, each figure with a baseline of the same run."""
 
 from __future__ import annotations
 
@@ -12,19 +12,23 @@ from rich.table import Table
 
 from beamsplat.tools.cli.options import writable
 
-app = typer.Typer(no_args_is_help=True, help="Measure this machine; every figure has a baseline beside it.")
+app = typer.Typer(
+    no_args_is_help=True, help="Measure this machine; every figure has a baseline of the same run."
+)
 console = Console(stderr=True)
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object")]
 
 
 @app.command()
 def bus(
-    seconds: Annotated[float, typer.Option(min=1.0, max=3600.0, help="Length of each part")] = 10.0,
-    megabytes: Annotated[float, typer.Option(min=0.001, max=30.0, help="Size of a picture")] = 1.0,
-    port: Annotated[int, typer.Option(min=1, max=65535, help="Port of the router this starts")] = 17447,
+    seconds: Annotated[
+        float, typer.Option(min=1.0, max=3600.0, help="Length of each part in seconds")
+    ] = 10.0,
+    megabytes: Annotated[float, typer.Option(min=0.001, max=30.0, help="Size of an image")] = 1.0,
+    port: Annotated[int, typer.Option(min=1, max=65535, help="Port of the router that is started")] = 17447,
     as_json: JsonOption = False,
 ) -> None:
-    """Latency of pictures through the local router beside plain Zenoh; what a slow subscriber costs.
+    """Measure the latency of images through the local router, beside plain Zenoh and with a slow subscriber.
 
     Example: beamsplat bench bus --seconds 20 --json
     """
@@ -43,17 +47,18 @@ def bus(
 @app.command()
 def slam(
     data: Annotated[
-        Path, typer.Option(help="Folder with X.bag beside X.relations, bag/ beside groundtruth.txt")
+        Path, typer.Option(help="Folder with X.bag beside X.relations, or bag/ beside groundtruth.txt")
     ],
     out: Annotated[
-        Path, typer.Option(callback=writable, help="Folder for maps, trajectories and the deck of pictures")
+        Path,
+        typer.Option(callback=writable, help="Folder for maps, trajectories and an overview of the maps"),
     ],
-    no_odometry: Annotated[bool, typer.Option("--no-odometry", help="Use the scans alone")] = False,
+    no_odometry: Annotated[bool, typer.Option("--no-odometry", help="Use only the scans")] = False,
     readme: Annotated[Path | None, typer.Option(help="Put the table between its marks in this file")] = None,
-    pictures: Annotated[Path | None, typer.Option(help="Where the deck of maps goes")] = None,
+    pictures: Annotated[Path | None, typer.Option(help="File of the overview of the maps")] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Accuracy and cost of the lidar SLAM on recordings with truth, beside Cartographer's published figures.
+    """Measure accuracy and cost of the lidar SLAM on recordings with ground truth, beside Cartographer.
 
     Examples:
 
@@ -74,24 +79,29 @@ def slam(
 
 @app.command()
 def paper(
-    data: Annotated[Path, typer.Option(help="Folder with bag/ and its truth, or a bag with poses in it")],
+    data: Annotated[
+        Path, typer.Option(help="Folder with bag/ and its ground truth, or a bag that contains poses")
+    ],
     out: Annotated[Path, typer.Option(callback=writable, help="Folder for report.json and report.html")],
     seeds: Annotated[int, typer.Option(min=1, help="Runs of each configuration")] = 1,
     only: Annotated[list[str] | None, typer.Option(help="Only this configuration; repeatable")] = None,
     recorded: Annotated[
-        Path | None, typer.Option(help="Depth maps by stamp, in the place of weights that are missing")
+        Path | None,
+        typer.Option(help="Folder of depth maps by stamp, used for networks whose weights are missing"),
     ] = None,
     groundtruth: Annotated[Path | None, typer.Option(help="TUM file of the true body poses")] = None,
-    seconds: Annotated[float | None, typer.Option(min=0.1, help="Only so much of the recording")] = None,
+    seconds: Annotated[
+        float | None, typer.Option(min=0.1, help="Use only the first seconds of the recording")
+    ] = None,
     refine_steps: Annotated[
         int, typer.Option(min=0, help="Steps on the default configuration's map after the drive, 0.1 s each")
     ] = 500,
     readme: Annotated[Path | None, typer.Option(help="Put the table between its marks in this file")] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """The paper's six configurations and the default one, live at the recording's speed: its Tables I-IV.
+    """Run the paper's six configurations and the default one live in real time; print its Tables I-IV.
 
-    A network whose weights are missing is replaced by FastDepth (or by --recorded), and named as what it is.
+    A network whose weights are missing is replaced by FastDepth (or by --recorded) and named as such.
 
     Examples:
 

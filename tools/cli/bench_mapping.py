@@ -1,4 +1,4 @@
-"""`beamsplat bench raster` and `bench map`: the rasterizer's speed, what the mapper makes of a recording."""
+"""Commands `beamsplat bench raster` and `bench map`: speed of the rasterizer, quality of the maps."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object"
 
 def bench_raster(
     gaussians: Annotated[int, typer.Option(min=1000, help="Gaussians in the synthetic room")] = 50_000,
-    repeats: Annotated[int, typer.Option(min=3, help="Timed runs; the median counts")] = 15,
+    repeats: Annotated[int, typer.Option(min=3, help="Timed runs; the median is reported")] = 15,
     as_json: JsonOption = False,
 ) -> None:
-    """Forward + L1 + backward of the rasterizers, one and two threads, beside plain torch.
+    """Measure forward, L1 loss and backward of the rasterizers with one and two threads, and of plain torch.
 
     Example: beamsplat bench raster --json
     """
@@ -42,40 +42,41 @@ def bench_raster(
 
 
 def bench_map(
-    data: Annotated[Path, typer.Argument(help="Folder with bag/, groundtruth.txt and the held-out truth")],
+    data: Annotated[Path, typer.Argument(help="Folder with bag/, groundtruth.txt and held-out views")],
     prior: Annotated[
         str,
-        typer.Option(help="Depth of the keyframes: field (the fusion's), stixel (beams and floor) or truth"),
+        typer.Option(help="Depth of the keyframes: field (fused), stixel (beams and floor) or truth"),
     ] = "field",
-    source: Annotated[str, typer.Option(help="Depth source that the fusion starts from (field)")] = "stixel",
+    source: Annotated[str, typer.Option(help="Depth source that fusion uses (with field)")] = "stixel",
     refine_s: Annotated[float, typer.Option(min=0.0, help="Refinement after the drive, in seconds")] = 60.0,
     count_cpu: Annotated[
-        bool, typer.Option("--count-cpu", help="Count those in CPU seconds a thread: on a busy machine")
+        bool, typer.Option("--count-cpu", help="Count these as CPU seconds per thread: for busy machines")
     ] = False,
     threads: Annotated[int, typer.Option(min=1, help="Threads of the rasterizer")] = 2,
-    distance_m: Annotated[float, typer.Option(min=0.01, help="Motion between keyframes")] = 0.25,
-    angle_rad: Annotated[float, typer.Option(min=0.01, help="Turn between keyframes")] = 0.22,
-    refine_pose: Annotated[bool, typer.Option("--refine-pose", help="The mapper refines poses")] = False,
+    distance_m: Annotated[float, typer.Option(min=0.01, help="Distance between keyframes")] = 0.25,
+    angle_rad: Annotated[float, typer.Option(min=0.01, help="Rotation between keyframes")] = 0.22,
+    refine_pose: Annotated[bool, typer.Option("--refine-pose", help="Let the mapper refine poses")] = False,
     refine_exposure: Annotated[
-        bool, typer.Option("--refine-exposure", help="The mapper refines each picture's brightness")
+        bool, typer.Option("--refine-exposure", help="Let the mapper refine the exposure of each image")
     ] = False,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the mapper")] = 0,
     jump: Annotated[
-        bool, typer.Option("--jump", help="Misplace half of the keyframes by 1 m and 10 deg until the end")
+        bool,
+        typer.Option("--jump", help="Misplace half of the keyframes by 1 m and 10 degrees until the end"),
     ] = False,
     settle_steps: Annotated[
-        int, typer.Option(min=0, help="Steps at the end of the drive, before the first scoring")
+        int, typer.Option(min=0, help="Steps at the end of the drive, before the first evaluation")
     ] = 0,
     movers: Annotated[
-        bool, typer.Option("--movers", help="Mask people and carts that the beams show")
+        bool, typer.Option("--movers", help="Mask dynamic objects that the beams detect")
     ] = False,
     out: Annotated[
         Path | None,
-        typer.Option(callback=writable, help="Write pictures and the map (.ply) into this folder"),
+        typer.Option(callback=writable, help="Write images and the map (.ply) into this folder"),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """A map from true poses: PSNR, SSIM and depth at views that it never saw, online and refined.
+    """Build a map from true poses; evaluate PSNR, SSIM and depth at held-out views, online and refined.
 
     Examples:
 

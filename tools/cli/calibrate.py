@@ -11,24 +11,26 @@ import typer
 from beamsplat.common.errors import UserError
 from beamsplat.tools.cli.depth import JsonOption, PosesOption, RigOption
 
-app = typer.Typer(no_args_is_help=True, help="Camera, lidar and their clocks against each other.")
+app = typer.Typer(no_args_is_help=True, help="Calibrate camera, lidar and their clocks.")
 
 
 @app.command("extrinsics")
 def extrinsics(
     data: Annotated[
-        Path, typer.Argument(help="A drive; with --target board a folder of images/ and lasers/.")
+        Path, typer.Argument(help="A recorded drive; with --target board: a folder with images/ and lasers/.")
     ],
     poses: PosesOption = None,
     rig: RigOption = None,
-    target: Annotated[str, typer.Option(help="`motion` (a drive), or `board` (still pairs).")] = "motion",
+    target: Annotated[
+        str, typer.Option(help="`motion` (a recorded drive), or `board` (still pairs).")
+    ] = "motion",
     corners: Annotated[str, typer.Option(help="Inner corners of the chessboard.")] = "11x8",
     square_m: Annotated[float, typer.Option(min=0.001, help="Side of a square.")] = 0.019,
     as_json: JsonOption = False,
 ) -> None:
-    """Where the camera looks, against the lidar's poses or against beams on a board.
+    """Estimate the mount of the camera from the motion of a drive, or from beams on a board.
 
-    Says what a planar lidar cannot tell, and the standard error of what it can.
+    Prints standard errors, and the parameters that a planar lidar cannot observe.
 
     Examples:
 
@@ -56,15 +58,15 @@ def extrinsics(
 
 @app.command("time")
 def clock(
-    data: Annotated[Path, typer.Argument(help="A drive.")],
+    data: Annotated[Path, typer.Argument(help="A recorded drive.")],
     poses: PosesOption = None,
     rig: RigOption = None,
     shift_ms: Annotated[
-        float, typer.Option(min=-1000.0, max=1000.0, help="Plant this offset first: does it find it?")
+        float, typer.Option(min=-1000.0, max=1000.0, help="Add this offset first, to test the estimate.")
     ] = 0.0,
     as_json: JsonOption = False,
 ) -> None:
-    """What to add to the camera's stamps so that they fit the lidar's clock.
+    """Estimate the offset to add to the camera's stamps so that they match the lidar's clock.
 
     Example: beamsplat calibrate time drive --poses out/trajectory.tum
     """
@@ -82,7 +84,7 @@ def _show(report: dict[str, Any], as_json: bool) -> None:
         print(json.dumps(report))
         return
     for name, value in report.items():
-        if name.endswith("_sigma") or value is None:  # beside its value; not asked for
+        if name.endswith("_sigma") or value is None:  # printed with its value; not estimated
             continue
         sigma = report.get(f"{name}_sigma")
         print(f"{name}:{_text(value)}" + (f" ± {sigma:.4f}" if sigma is not None else ""))

@@ -1,4 +1,4 @@
-"""Commands `beamsplat depth`, `eval depth`, `bench depth`, and `models list | pull | check`."""
+"""Commands `beamsplat depth`, `eval depth` and `bench depth`."""
 
 from __future__ import annotations
 
@@ -18,37 +18,46 @@ from beamsplat.tools.cli.options import writable
 if TYPE_CHECKING:
     from beamsplat.tools.evaluation.drive import RecordedDrive
 
-# OpenCV, Numba and onnxruntime are imported where they are used: every other command starts without them.
+# OpenCV, Numba and onnxruntime are imported inside the commands, so that other commands start fast.
 
-BagArgument = Annotated[Path, typer.Argument(help="A bag or recording, or a folder with bag/ in it.")]
+BagArgument = Annotated[Path, typer.Argument(help="A bag, a recording, or a folder that contains bag/.")]
 PosesOption = Annotated[
     Path | None,
-    typer.Option(help="TUM file of T_map_body; default: poses in the recording, else our lidar SLAM's."),
+    typer.Option(
+        help="TUM file of T_map_body; default: poses in the recording, else poses of the lidar SLAM."
+    ),
 ]
-SourceOption = Annotated[str, typer.Option(help="Depth source, by name.")]
+SourceOption = Annotated[str, typer.Option(help="Name of the depth source.")]
 SetOption = Annotated[
-    list[str] | None, typer.Option("--set", metavar="OPTION=VALUE", help="Option of the source; repeatable")
+    list[str] | None,
+    typer.Option("--set", metavar="OPTION=VALUE", help="Option of the depth source; repeatable"),
 ]
-RigOption = Annotated[Path | None, typer.Option(help="A rig file that wins over the calibration inside.")]
+RigOption = Annotated[
+    Path | None, typer.Option(help="Rig file that replaces the calibration in the recording.")
+]
 FloorOption = Annotated[
     bool | None,
-    typer.Option("--floor/--no-floor", help="The camera's height is known; default: if the poses are level."),
+    typer.Option(
+        "--floor/--no-floor", help="Whether the camera's height is known; default: if the poses are planar."
+    ),
 ]
-JsonOption = Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output.")]
 
 
 def eval_depth(
     bag: BagArgument,
-    truth: Annotated[Path, typer.Option(help="Folder of <stamp_ns>.png, or with depth_gt/ in it.")],
+    truth: Annotated[
+        Path, typer.Option(help="Folder of true depth <stamp_ns>.png, or one that contains depth_gt/.")
+    ],
     poses: PosesOption = None,
     source: SourceOption = "stixel",
     set_: SetOption = None,
     rig: RigOption = None,
     floor: FloorOption = None,
-    heldout: Annotated[bool, typer.Option(help="Also play twice more with beams held out.")] = True,
+    heldout: Annotated[bool, typer.Option(help="Also evaluate twice with beams held out.")] = True,
     as_json: JsonOption = False,
 ) -> None:
-    """Errors of depth against dense truth and against held-out beams, for every method.
+    """Evaluate depth against dense true depth and against held-out beams, for every method.
 
     Examples:
 
@@ -61,7 +70,7 @@ def eval_depth(
     from beamsplat.services.depth.source import make_source
     from beamsplat.tools.evaluation.evaluate import evaluate, truth_depth_files
 
-    cv2.setNumThreads(1)  # CPU times are those of one core
+    cv2.setNumThreads(1)  # CPU times are measured on one core
     drive = _open(bag, poses, rig)
     with _progress() as bar:
         task = bar.add_task("", total=None)
@@ -80,23 +89,23 @@ def eval_depth(
 
 
 def depth(
-    data: Annotated[Path, typer.Argument(help="A bag, recording or folder; or one picture (.jpg, .png).")],
-    out: Annotated[Path, typer.Option(callback=writable, help="Folder for the pictures.")],
+    data: Annotated[Path, typer.Argument(help="A bag, recording or folder; or one image (.jpg, .png).")],
+    out: Annotated[Path, typer.Option(callback=writable, help="Folder for the images.")],
     poses: PosesOption = None,
     source: SourceOption = "stixel",
     set_: SetOption = None,
     rig: RigOption = None,
     floor: FloorOption = None,
-    truth: Annotated[Path | None, typer.Option(help="Folder of truth, shown beside.")] = None,
-    every: Annotated[int, typer.Option(min=1, help="Each n-th picture.")] = 8,
+    truth: Annotated[Path | None, typer.Option(help="Folder of true depth, shown as well.")] = None,
+    every: Annotated[int, typer.Option(min=1, help="Use every n-th image.")] = 8,
 ) -> None:
-    """Pictures side by side: image with beams, raw depth, corrected depth, sigma, and truth if there is any.
+    """Draw panels: image with beams, raw depth, corrected depth, sigma, and true depth if given.
 
     Examples:
 
-        beamsplat depth drive --out pictures --poses out/trajectory.tum
+        beamsplat depth drive --out images --poses out/trajectory.tum
 
-        beamsplat depth photo.jpg --out pictures --rig rig.toml
+        beamsplat depth photo.jpg --out images --rig rig.toml
     """
     from beamsplat.services.depth.source import make_source
     from beamsplat.tools.evaluation.depth_panels import draw_depth_of_image, draw_depth_panels
@@ -108,13 +117,13 @@ def depth(
         return
     drive = _open(data, poses, rig)
     with _progress() as bar:
-        task = bar.add_task("pictures", total=None)
+        task = bar.add_task("images", total=None)
         count = 0
         for count, (_, total) in enumerate(
             draw_depth_panels(drive, chosen, truth, every, out, floor), start=1
         ):
             bar.update(task, completed=count, total=total)
-    print(f"{count} pictures in {out}")
+    print(f"{count} images in {out}")
 
 
 def bench_depth(
@@ -122,7 +131,7 @@ def bench_depth(
     frames: Annotated[int, typer.Option(min=5, help="Frames timed.")] = 60,
     as_json: JsonOption = False,
 ) -> None:
-    """CPU milliseconds per 640x480 picture: the bare source, fusion of a picture, fusion of a keyframe.
+    """Measure CPU milliseconds per 640x480 image: depth source, fusion of an image, fusion of a keyframe.
 
     Example: beamsplat bench depth --source stixel
     """
@@ -137,10 +146,10 @@ def bench_depth(
 
 
 def options_of(pairs: list[str] | None) -> dict[str, Any]:
-    """Options `name=value` of a depth source; values are TOML where they parse as such.
+    """Return options `name=value` of a depth source; values are parsed as TOML if possible, else are strings.
 
     Raises:
-        UserError: not of that form.
+        UserError: an option has another form.
     """
     import tomllib
 
@@ -186,4 +195,4 @@ def _print_report(report: dict[str, Any]) -> None:
             key, *("-" if v is None else f"{v:.3f}" if isinstance(v, float) else str(v) for v in values)
         )
     Console().print(table)
-    print("CPU ms per picture: " + ", ".join(f"{k} {v:.1f}" for k, v in report["cpu_ms"].items()))
+    print("CPU ms per image: " + ", ".join(f"{k} {v:.1f}" for k, v in report["cpu_ms"].items()))

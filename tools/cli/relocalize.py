@@ -1,4 +1,4 @@
-"""`beamsplat eval relocalize`: how often single scans find their place in a saved map, and how fast."""
+"""Command `beamsplat eval relocalize`: success rate and time of relocalizing single scans in a saved map."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from rich.progress import track
 from beamsplat.common.errors import UserError
 from beamsplat.tools.cli.slam import JsonOption, console, poses_of, print_figures
 
-NEAR_M, NEAR_DEG = 0.10, 2.0  # an answer this good is right
-SURE = 0.5  # confidence from which an answer is used
+MAX_ERROR_M, MAX_ERROR_DEG = 0.10, 2.0  # a pose within these errors is right
+MIN_CONFIDENCE = 0.5  # an answer with at least this confidence is used
 
 
 def eval_relocalize(
     folder: Annotated[Path, typer.Argument(help="Folder written by `beamsplat slam`")],
-    bag: Annotated[Path, typer.Argument(help="Bag or recording the scans are taken from")],
-    scans: Annotated[int, typer.Option(min=1, help="Scans drawn at random")] = 100,
-    seed: Annotated[int, typer.Option(min=0, help="Of the draw")] = 0,
+    bag: Annotated[Path, typer.Argument(help="Bag or recording with the scans")],
+    scans: Annotated[int, typer.Option(min=1, help="Number of random scans")] = 100,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the random choice")] = 0,
     as_json: JsonOption = False,
 ) -> None:
-    """Single scans against a saved map, without any guess; right is within 0.10 m and 2 degrees.
+    """Relocalize single scans in a saved map without a prior; right is within 0.10 m and 2 degrees.
 
-    The truth is the mapped trajectory of the same drive, so this measures finding the place, not the map.
+    The true poses are the mapped trajectory of the same drive: errors of the map itself are not measured.
 
     Examples:
 
@@ -50,7 +50,7 @@ def eval_relocalize(
     for i in track(chosen, "relocalizing", console=console, transient=True):
         m = drawn.get(int(stamps_ns[i]))
         if m is None:
-            raise UserError(f"{bag} has no scan at {stamps_ns[i]} ns: is {folder} a map of another drive?")
+            raise UserError(f"{bag} has no scan at {stamps_ns[i]} ns: is {folder} the map of another drive?")
         started = time.perf_counter()
         answer = slam.relocalize(
             m.ranges_m, m.angle_min_rad, m.angle_increment_rad, m.range_min_m, m.range_max_m
@@ -67,15 +67,15 @@ def eval_relocalize(
 
 
 def _error(pose_map_body: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
-    """Distance in metres and angle in degrees."""
+    """Return the distance in metres and the angle in degrees between two planar poses."""
     away = float(np.hypot(*(pose_map_body - truth)[:2]))
     return away, math.degrees(abs(math.remainder(pose_map_body[2] - truth[2], 2.0 * math.pi)))
 
 
 def _summary(rows: np.ndarray) -> dict[str, Any]:
-    """Rows float64 [N, 4]: metres, degrees, confidence, seconds."""
-    right = (rows[:, 0] <= NEAR_M) & (rows[:, 1] <= NEAR_DEG)
-    sure = rows[:, 2] >= SURE
+    """Return the figures of rows float64 [N, 4]: metres, degrees, confidence, seconds."""
+    right = (rows[:, 0] <= MAX_ERROR_M) & (rows[:, 1] <= MAX_ERROR_DEG)
+    sure = rows[:, 2] >= MIN_CONFIDENCE
     return {
         "scans": len(rows),
         "right_share": float(right.mean()),
@@ -89,7 +89,7 @@ def _summary(rows: np.ndarray) -> dict[str, Any]:
 
 
 def _scans_at(bag: Path, stamps_ns: set[int]) -> tuple[dict[int, Any], np.ndarray]:
-    """Scan messages by stamp, and the lidar's T_body_lidar."""
+    """Return the scan messages with these stamps by stamp, and T_body_lidar."""
     from beamsplat.services.replay.options import SourceOptions
     from beamsplat.services.replay.source import open_source
 
