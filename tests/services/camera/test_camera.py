@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from beamsplat.common.errors import UserError
-from beamsplat.common.recording.picture import is_whole
+from beamsplat.common.recording.image_header import is_complete_image
 from beamsplat.services.camera.config import CameraConfig, NoCameraConfig
 from beamsplat.services.camera.jpeg import is_intact
 from beamsplat.services.camera.node import CameraNode, NoCamera
@@ -108,7 +108,7 @@ def _images(running):
     return [(at, m) for at, m in running.messages if type(m).__name__ == "Image"]
 
 
-def test_jpegs_go_through_byte_for_byte_behind_the_calibration(rig):
+def test_jpegs_are_published_unchanged_after_the_calibration(rig):
     with (
         EmulatedCamera() as camera,
         RunningSource(CameraNode(CameraConfig(source=camera.url, rig=rig))) as running,
@@ -126,7 +126,7 @@ def test_jpegs_go_through_byte_for_byte_behind_the_calibration(rig):
     assert "Hz" in running.node.detail
 
 
-def test_another_size_than_the_calibrations_is_refused_and_said(rig):
+def test_images_of_another_size_than_the_calibration_are_rejected(rig):
     with (
         EmulatedCamera() as camera,
         RunningSource(CameraNode(CameraConfig(source=camera.url, rig=rig))) as running,
@@ -140,7 +140,7 @@ def test_another_size_than_the_calibrations_is_refused_and_said(rig):
     assert {(m.width_px, m.height_px) for _, m in _images(running)} == {(64, 48)}
 
 
-def test_a_slow_camera_is_said_to_be_slow(rig):
+def test_the_status_reports_a_slow_camera(rig):
     config = CameraConfig(source="", rig=rig, rate_hz=25.0)
     with EmulatedCamera() as camera:
         camera.rate_hz = 2.0
@@ -152,7 +152,7 @@ def test_a_slow_camera_is_said_to_be_slow(rig):
     assert "reopened" not in node.detail  # 2 Hz is slow, not gone
 
 
-def test_broken_pictures_are_not_passed_on(rig):
+def test_damaged_images_are_rejected(rig):
     rng = np.random.default_rng(0)
 
     def cut(data):
@@ -165,11 +165,11 @@ def test_broken_pictures_are_not_passed_on(rig):
             running.wait(lambda: len(_images(running)) >= 10 and "rejected (damaged)" in node.detail)
     for _, image in _images(running):
         assert cv2.imdecode(np.asarray(image.data), cv2.IMREAD_COLOR).shape == (48, 64, 3)
-        assert is_whole(bytes(image.data))
+        assert is_complete_image(bytes(image.data))
         assert is_intact(bytes(image.data))
 
 
-def test_a_camera_that_vanishes_is_opened_again(rig):
+def test_a_disconnected_camera_is_reopened(rig):
     with EmulatedCamera() as camera:
         node = CameraNode(CameraConfig(source=camera.url, rig=rig))
         with RunningSource(node) as running:
@@ -185,7 +185,7 @@ def test_a_camera_that_vanishes_is_opened_again(rig):
     assert sorted(set(stamps)) == stamps
 
 
-def test_a_camera_that_hangs_is_given_up(rig):
+def test_a_camera_without_images_is_disconnected(rig):
     with EmulatedCamera() as camera:
         node = CameraNode(CameraConfig(source=camera.url, rig=rig, silence_s=0.5))
         with RunningSource(node) as running:
@@ -194,7 +194,7 @@ def test_a_camera_that_hangs_is_given_up(rig):
             running.wait(lambda: "DISCONNECTED: no image for 0.5 s" in node.detail)
 
 
-def test_the_hosts_time_of_day_moves_no_stamp(rig, monkeypatch):
+def test_stamps_do_not_depend_on_the_wall_clock(rig, monkeypatch):
     wall = {"offset": 0}
     real = time.time_ns
     monkeypatch.setattr("time.time_ns", lambda: real() + wall["offset"])
@@ -211,7 +211,7 @@ def test_the_hosts_time_of_day_moves_no_stamp(rig, monkeypatch):
 
 
 @pytest.mark.parametrize("codec", ["MJPG", "mp4v"])
-def test_a_video_file_plays_to_its_end(tmp_path, codec):
+def test_a_video_file_is_read_to_its_end(tmp_path, codec):
     path = tmp_path / ("video.avi" if codec == "MJPG" else "video.mp4")
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*codec), 20.0, (64, 48))
     for i in range(12):
@@ -230,7 +230,7 @@ def test_a_video_file_plays_to_its_end(tmp_path, codec):
     node.close()
 
 
-def test_what_is_not_there_is_said(tmp_path, rig):
+def test_the_status_reports_missing_cameras(tmp_path, rig):
     for source, said in (
         (str(tmp_path / "no.avi"), "no such file"), ("/dev/video77", "no such camera"), ("77", "no such camera"),
         ("http://127.0.0.1:9/video", "does not answer"),
@@ -245,7 +245,7 @@ def test_what_is_not_there_is_said(tmp_path, rig):
         CameraNode(CameraConfig(rig=rig)).configure()
 
 
-def test_a_robot_without_a_camera_still_says_where_its_lidar_sits(rig):
+def test_without_a_camera_the_rig_is_published(rig):
     rig.write_text(RIG[RIG.index("[lidar") :])
     node = NoCamera(NoCameraConfig(rig=rig))
     node.configure()
@@ -265,7 +265,7 @@ def test_a_robot_without_a_camera_still_says_where_its_lidar_sits(rig):
         [cv2.IMWRITE_JPEG_PROGRESSIVE, 1],
     ],
 )
-def test_every_whole_jpeg_is_taken(options):
+def test_every_complete_jpeg_is_accepted(options):
     for shape in ((48, 64, 3), (47, 61, 3), (33, 8), (480, 640, 3)):
         noise = np.random.default_rng(1).integers(0, 255, shape, dtype=np.uint8)
         for image in (noise, cv2.GaussianBlur(noise, (0, 0), 3.0)):
@@ -273,7 +273,7 @@ def test_every_whole_jpeg_is_taken(options):
     assert is_intact(jpeg(0) + b"\0" * 100)  # padded as cameras do
 
 
-def test_how_much_damage_is_noticed():
+def test_detection_rates_of_damaged_jpegs():
     """Measured shares, so that nobody takes the check for more than it is."""
     rng = np.random.default_rng(0)
     data = jpeg(3, 320, 240)

@@ -21,7 +21,7 @@ def ticks(node, count):
             return found
 
 
-def test_a_tick_a_second_on_the_sensors_clock():
+def test_one_tick_per_second_on_the_sensors_clock():
     node = ClockNode(NodeConfig())
     node.configure()
     said = ticks(node, 3)
@@ -32,7 +32,7 @@ def test_a_tick_a_second_on_the_sensors_clock():
     assert all(at_ns >= message.stamp_ns for message, at_ns in said)  # never ahead of the time
 
 
-def test_what_is_late_is_not_made_up_for():
+def test_missed_ticks_are_left_out():
     node = ClockNode(NodeConfig())
     node.configure()
     source = node.source()

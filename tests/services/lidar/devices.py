@@ -268,7 +268,7 @@ class Hokuyo:
         return self.scans * 60.0 / self.rpm
 
 
-def corrupt(data, rng, share):
+def corrupt_bytes(data, rng, share):
     """`data` with that share of its bytes replaced by random other ones."""
     array = np.frombuffer(data, np.uint8).copy()
     hit = rng.random(len(array)) < share
@@ -342,10 +342,10 @@ class EmulatedPort:
                     return
                 answer = self.device.answer(data)
                 if answer:
-                    write(corrupt(answer, self._rng, self.corruption))
+                    write(corrupt_bytes(answer, self._rng, self.corruption))
                     began, at_start = time.monotonic(), self.device.seconds
             if getattr(self.device, "scanning", True) is None:
                 began, at_start = time.monotonic(), self.device.seconds
                 continue
             while self.device.seconds - at_start < time.monotonic() - began and not self._stop.is_set():
-                write(corrupt(self.device.packet(), self._rng, self.corruption))
+                write(corrupt_bytes(self.device.packet(), self._rng, self.corruption))

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from tests.services.lidar.devices import corrupt, room_range_m
+from tests.services.lidar.devices import corrupt_bytes, room_range_m
 
 
 class DirectLink:
@@ -32,7 +32,7 @@ def run_device(driver, device, seconds, corruption=0.0, seed=0, chunk=None):
     driver.start(DirectLink(device))
     begin, scans = device.seconds, []
     while device.seconds - begin < seconds:
-        data = corrupt(device.packet(), rng, corruption)
+        data = corrupt_bytes(device.packet(), rng, corruption)
         at_ns = int((1000.0 + device.seconds + rng.exponential(0.003)) * 1e9)
         size = chunk or len(data)
         for i in range(0, len(data), size):

@@ -77,7 +77,7 @@ def test_scans_over_a_link_with_wrong_bytes(tmp_path, kind):
 
 
 @pytest.mark.parametrize("kind", ["ldrobot", "rplidar"])
-def test_unplugged_and_plugged_in_again(tmp_path, kind):
+def test_a_reconnected_lidar_is_reopened(tmp_path, kind):
     path = str(tmp_path / "lidar")
     device = {"ldrobot": Ld19, "rplidar": Rplidar}[kind]()
     node = {
@@ -104,7 +104,7 @@ def test_unplugged_and_plugged_in_again(tmp_path, kind):
         _right(scan)
 
 
-def test_a_lidar_that_falls_silent_is_opened_again(tmp_path):
+def test_a_lidar_without_data_is_reopened(tmp_path):
     class Mute(Ld19):
         silent = False
 
@@ -142,7 +142,7 @@ def test_the_baud_rate_is_found(tmp_path):
     assert "RPLIDAR C1" in node.detail
 
 
-def test_the_hosts_time_of_day_moves_no_stamp(tmp_path, monkeypatch):
+def test_stamps_do_not_depend_on_the_wall_clock(tmp_path, monkeypatch):
     wall = {"offset": 0}
     real = time.time_ns
     monkeypatch.setattr("time.time_ns", lambda: real() + wall["offset"])

@@ -33,7 +33,7 @@ def test_ldrobot_example_of_the_manual():
 
 
 @pytest.mark.parametrize("at", range(ldrobot.PACKET_BYTES))
-def test_ldrobot_any_one_wrong_byte_is_noticed(at):
+def test_ldrobot_checksum_detects_any_wrong_byte(at):
     for flip in (0x01, 0x80, 0xFF):
         wrong = bytearray(LD06_EXAMPLE)
         wrong[at] ^= flip
@@ -52,7 +52,7 @@ def test_rplidar_requests_and_descriptors_of_the_protocol_document():
     assert rp.find_descriptor(bytes.fromhex("00A5A55A5400004082"), kinds) == ((84, True, 0x82), 9)
 
 
-def test_rplidar_exchange_as_somebody_recorded_it():
+def test_rplidar_recorded_exchange():
     """An A2M8's exchange, printed in zerowincoding.tistory.com, "RPLIDAR SDK" (2020)."""
     assert rp.request(0xFF, bytes(2)) == bytes.fromhex("A5FF02000058")
     assert rp.request(rp.SET_MOTOR_PWM, bytes(2)) == bytes.fromhex("A5F002000057")
@@ -77,7 +77,7 @@ def _sdk_capsule(previous, current):
 
 
 @given(st.binary(min_size=80, max_size=80), st.integers(0, 23039), st.integers(500, 1500))
-def test_rplidar_capsules_as_slamtecs_own_decoder(cabins, start_q6, span_q6):
+def test_rplidar_capsules_match_slamtecs_decoder(cabins, start_q6, span_q6):
     first = b"\xa0\x50" + struct.pack("<H", start_q6) + cabins
     second = b"\xa0\x50" + struct.pack("<H", (start_q6 + span_q6) % 23040) + cabins
     expected = _sdk_capsule(first, second)
@@ -122,7 +122,7 @@ def _sdk_ultra(previous, current):
 
 
 @given(st.binary(min_size=128, max_size=128), st.binary(min_size=4, max_size=4))
-def test_rplidar_ultra_capsules_as_slamtecs_own_decoder(cabins, after):
+def test_rplidar_ultra_capsules_match_slamtecs_decoder(cabins, after):
     first, second = b"\xa0\x50\0\0" + cabins, b"\xa0\x50\0\0" + after + bytes(124)
     expected = _sdk_ultra(first, second)
     measured = rp.parse_ultra(first, second)
@@ -161,7 +161,7 @@ def test_scip_request_for_scans():
 
 
 @given(st.binary(max_size=2000), st.integers(0, 4))
-def test_rubbish_is_no_packet_and_no_error(data, kind):
+def test_random_bytes_give_no_packet_and_no_error(data, kind):
     from beamsplat.services.lidar.framing import Framer, StreamCounters
     from beamsplat.services.lidar.rplidar_stream import RplidarStream
 
@@ -174,7 +174,7 @@ def test_rubbish_is_no_packet_and_no_error(data, kind):
 
 
 @given(st.binary(max_size=200), st.integers(1, 100), st.integers(3, 12))
-def test_packets_are_found_behind_any_rubbish_in_any_pieces(garbage, piece, count):
+def test_packets_are_found_after_any_bytes_and_in_any_chunks(garbage, piece, count):
     from beamsplat.services.lidar.framing import Framer, StreamCounters
 
     counters = StreamCounters()

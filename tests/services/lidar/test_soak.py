@@ -47,7 +47,7 @@ def test_a_minute_of_wrong_bytes(tmp_path, kind):
 
 @pytest.mark.soak
 @pytest.mark.parametrize("kind", ["ld19", "c1 dense"])
-def test_five_seconds_without_a_plug(tmp_path, kind):
+def test_reconnect_after_five_seconds(tmp_path, kind):
     device, node_class, config = KINDS[kind]
     path = str(tmp_path / "lidar")
     with EmulatedPort(device(), path) as plugged, RunningSource(node_class(config(device=path))) as running:

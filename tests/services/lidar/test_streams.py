@@ -49,7 +49,7 @@ def test_clean_stream(kind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_stamps_are_when_it_was_measured(kind):
+def test_stamps_are_measurement_times(kind):
     """Arrivals are late by 3 ms on average; the stamps must not wander with them."""
     make, device, _, turn_hz, _ = KINDS[kind]
     scans = run_device(make(), device(), 6.0, seed=3)
@@ -126,7 +126,7 @@ def test_lost_bytes_cost_a_few_packets(kind):
     assert driver.counters.skipped_bytes > 0
 
 
-def test_pieces_do_not_matter():
+def test_chunk_size_does_not_change_the_result():
     whole = run_device(LdrobotDriver(), Ld19(), 1.0)
     pieces = run_device(LdrobotDriver(), Ld19(), 1.0, chunk=7)
     assert len(whole) == len(pieces) > 5
@@ -134,13 +134,13 @@ def test_pieces_do_not_matter():
         assert np.array_equal(a.revolution.range_m, b.revolution.range_m, equal_nan=True)
 
 
-def test_a_device_that_knows_no_modes_is_asked_for_none():
+def test_a_device_without_modes_gets_no_mode_request():
     device = Rplidar()
     run_device(RplidarDriver(), device, 0.5)
     assert device.requests == [bytes.fromhex(x) for x in ("A525", "A550", "A552", "A58205000000000022")]
 
 
-def test_device_clock_takes_the_fastest_packets_and_no_wrong_times():
+def test_device_clock_uses_the_least_delayed_packets_and_rejects_wrong_times():
     rng = np.random.default_rng(0)
     clock = DeviceClock()
     for i in range(2000):
@@ -158,7 +158,7 @@ def test_device_clock_takes_the_fastest_packets_and_no_wrong_times():
     assert clock.stamp_ns(1008.0) / 1e9 == pytest.approx(68.0, abs=0.001)
 
 
-def test_counters_that_start_over():
+def test_counters_are_unwrapped():
     unwrap = CounterUnwrapper(30000, 1e3)
     times = [unwrap(t % 30000, t * 1_000_000) for t in range(29000, 200_000, 500)]
     assert np.diff(times).tolist() == [500] * (len(times) - 1)
@@ -166,7 +166,7 @@ def test_counters_that_start_over():
     assert unwrap(200_500 % 30000, 200_500_000_000) == times[0] + 200_500 - 29000
 
 
-def test_doubtful_ranges_need_a_witness():
+def test_unconfirmed_ranges_are_rejected():
     noise = LinkNoise()
     for i in range(100):
         noise.update(i % 20 != 0)

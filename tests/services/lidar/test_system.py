@@ -14,7 +14,7 @@ from tests.services.lidar.devices import EmulatedPort, Ld19
 RIG = "[lidar.mount]\nxyz_m = [0.0, 0.0, 0.2]\nrpy_deg = [0.0, 0.0, 0.0]\n"
 
 
-def test_a_lidar_on_a_noisy_wire_is_enough_to_know_where_the_robot_stands(tmp_path, free_endpoint):
+def test_localization_with_a_lidar_on_a_noisy_link(tmp_path, free_endpoint):
     path = str(tmp_path / "lidar")
     (tmp_path / "rig.toml").write_text(RIG)
     nodes = {

@@ -137,7 +137,7 @@ def saved(tmp_path_factory):
     return RrdFile(path)
 
 
-def test_every_entity_is_there_and_a_layout_with_it(saved):
+def test_the_file_has_all_entities_and_a_layout(saved):
     body = "map/odom/body"
     expected = {
         "map", "map/grid", "map/anchors", "map/scan", "map/odom", body, f"{body}/shape", f"{body}/heading",
@@ -158,14 +158,14 @@ def test_rates_are_limited_and_time_is_that_of_measurement(saved):
     assert len(saved.stamps("map/anchors")) == 3
 
 
-def test_pictures_are_the_bytes_of_the_camera(saved):
+def test_images_are_stored_unchanged(saved):
     blobs = saved.column("map/odom/body/camera/image", "EncodedImage:blob")
     assert len(blobs) == 30
     for blob in blobs:
         assert blob.astype(np.uint8).tobytes() == JPEG.tobytes()
 
 
-def test_scan_points_lie_on_the_walls_although_the_robot_moves(saved):
+def test_scan_points_are_on_the_walls_while_the_robot_moves(saved):
     """5 cm driven and 2.9 degrees turned within each sweep: undistorted, within a centimetre."""
     scans = saved.column("map/scan", "Points3D:positions")
     assert len(scans) == 30
@@ -177,7 +177,7 @@ def test_scan_points_lie_on_the_walls_although_the_robot_moves(saved):
         assert np.max(off_wall) < 0.01
 
 
-def test_the_robot_stands_where_localization_says(saved):
+def test_the_robot_is_drawn_at_the_localized_pose(saved):
     positions = saved.column("map/odom/body", "Transform3D:translation")
     quaternions = saved.column("map/odom/body", "Transform3D:quaternion")
     for i, (position, quat_xyzw) in enumerate(zip(positions[-30:], quaternions[-30:])):
@@ -189,7 +189,7 @@ def test_the_robot_stands_where_localization_says(saved):
     np.testing.assert_allclose(correction.ravel(), T_MAP_ODOM[:3, 3], atol=1e-6)
 
 
-def test_paths_lie_in_the_map(saved):
+def test_paths_are_in_the_map_frame(saved):
     """The wheels' drifting frame is laid on the map where the robot was first known to be."""
     for source in ("localization", "external", "wheel"):
         points = saved.column(f"map/path/{source}", "LineStrips3D:strips")[-1].reshape(-1, 3)
@@ -209,7 +209,7 @@ def test_the_camera_is_a_pinhole_on_the_body(saved):
     np.testing.assert_allclose(position.ravel(), [0.1, 0.02, 0.45], atol=1e-6)
 
 
-def test_the_grid_is_cut_to_what_is_known_with_its_first_row_at_the_bottom(saved):
+def test_the_grid_is_cropped_to_known_cells_with_row_0_at_the_bottom(saved):
     data = saved.column("map/grid", "GridMap:data")[0].astype(np.uint8).reshape(10, 30)
     assert np.all(data[-1] == 100)
     assert np.all(data[:-1] == 0)
@@ -217,7 +217,7 @@ def test_the_grid_is_cut_to_what_is_known_with_its_first_row_at_the_bottom(saved
     np.testing.assert_allclose(corner[:2], [-3.0 + 1.5, -2.0 + 1.0], atol=1e-6)
 
 
-def test_what_was_assumed_and_what_went_wrong_stands_in_the_log(saved):
+def test_assumptions_and_faults_are_logged(saved):
     lines = [str(text.ravel()[0]) for text in saved.column("log", "TextLog:text")]
     assert lines == ["rig: camera height: assumed 0.45 m", "localization: ok", "localization: lost (dark)"]
 
@@ -237,7 +237,7 @@ def _tell(monitor, topic, message):
     [("rgb8", 12), ("bgr8", 12), ("rgba8", 16), ("bgra8", 16), ("mono8", 4), ("yuv422_yuy2", 8)],
 )
 @pytest.mark.parametrize("padding", [0, 5])
-def test_raw_pictures_lose_their_padding_and_nothing_else(tmp_path, read_rrd, encoding, row_bytes, padding):
+def test_padding_of_raw_images_is_removed(tmp_path, read_rrd, encoding, row_bytes, padding):
     rows = np.random.default_rng(5).integers(0, 255, (3, row_bytes + padding)).astype(np.uint8)
     monitor = _monitor(tmp_path)
     step = row_bytes + padding if padding else 0
@@ -249,7 +249,7 @@ def test_raw_pictures_lose_their_padding_and_nothing_else(tmp_path, read_rrd, en
     np.testing.assert_array_equal(buffer.ravel().astype(np.uint8), rows[:, :row_bytes].ravel())
 
 
-def test_a_raw_picture_with_too_few_bytes_is_left_out(tmp_path, read_rrd):
+def test_a_raw_image_with_too_few_bytes_is_rejected(tmp_path, read_rrd):
     monitor = _monitor(tmp_path)
     short = Image(stamp_ns=T0, width_px=4, height_px=3, encoding="rgb8", data=np.zeros(35, np.uint8))
     _tell(monitor, "camera/image", short)
@@ -259,7 +259,7 @@ def test_a_raw_picture_with_too_few_bytes_is_left_out(tmp_path, read_rrd):
     assert "too few for 3 rows of 12" in str(saved.column("log", "TextLog:text")[0])
 
 
-def test_without_localization_the_best_other_pose_leads(tmp_path, read_rrd):
+def test_without_localization_the_best_other_source_is_used(tmp_path, read_rrd):
     monitor = _monitor(tmp_path)
     still = {"velocity_m_s": np.zeros(3), "angular_velocity_rad_s": np.zeros(3)}
     wheel_at = se2_to_se3(np.array([0.2, 0.0, 0.0]))
@@ -304,12 +304,12 @@ def test_health_becomes_curves_states_a_table_and_a_log(tmp_path, read_rrd):
     assert "| **depth** | active |" in str(saved.column("health/table", "TextDocument:text")[-1])
 
 
-def test_a_monitor_that_would_show_nothing_is_refused():
+def test_a_monitor_without_output_is_rejected():
     with pytest.raises(UserError, match="choose a view"):
         MonitorNode(MonitorConfig(view="none")).configure()
 
 
-def test_every_row_is_a_topic_and_none_holds_a_publisher_up():
+def test_every_row_is_a_topic_and_none_blocks_a_publisher():
     for entry in (*SCENE, *DEPTH):
         assert entry.topic in TOPICS
         assert entry.effective_delivery in ("latest", "latched"), entry.topic

@@ -52,7 +52,7 @@ def _flows(board):
         return False
 
 
-def test_a_stopped_monitor_slows_nobody_and_what_it_saved_opens(system, read_rrd):
+def test_a_stopped_monitor_blocks_no_node_and_its_file_is_valid(system, read_rrd):
     supervisor, board, path = system
     page = re.search(r"http://127\.0\.0\.1:\d+/\?url=\S+", board.records["monitor"].health.detail)
     with urllib.request.urlopen(page.group().split("?")[0], timeout=10) as reply:
@@ -87,7 +87,7 @@ def test_a_stopped_monitor_slows_nobody_and_what_it_saved_opens(system, read_rrd
     assert all(b - a >= 90_000_000 for a, b in itertools.pairwise(stamps)), "10 Hz of 30"
 
 
-def test_a_taken_port_is_said_in_one_sentence(free_endpoint):
+def test_a_port_in_use_is_reported(free_endpoint):
     import socket
 
     port = int(free_endpoint.rpartition(":")[2])
@@ -99,7 +99,7 @@ def test_a_taken_port_is_said_in_one_sentence(free_endpoint):
             monitor.configure()
 
 
-def test_a_window_that_cannot_open_is_said_and_the_node_goes_on(monkeypatch, tmp_path, read_rrd):
+def test_a_closed_viewer_window_is_reported_and_the_node_continues(monkeypatch, tmp_path, read_rrd):
     """Without a display the viewer ends at once; the file is written all the same."""
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)

@@ -41,7 +41,7 @@ def tell(monitor, topic, message):
     assert list(monitor.handle(topic, message)) == []
 
 
-def test_gaussians_lie_in_their_submap_as_they_are(monitor, tmp_path, read_rrd):
+def test_gaussians_are_drawn_in_their_submap(monitor, tmp_path, read_rrd):
     tell(monitor, "mapping/chunk", chunk(0.0, 1))
     monitor.close()
     saved = read_rrd(tmp_path / "m.rrd")
@@ -58,7 +58,7 @@ def test_gaussians_lie_in_their_submap_as_they_are(monitor, tmp_path, read_rrd):
     assert int(colours.ravel()[0]) & 0xFF == pytest.approx(128, abs=1)
 
 
-def test_the_rate_holds_back_and_the_end_shows_the_last(monitor, tmp_path, read_rrd):
+def test_the_rate_limit_defers_chunks_until_the_end(monitor, tmp_path, read_rrd):
     for i in range(5):
         tell(monitor, "mapping/chunk", chunk(0.5 * i, i + 1, count=i + 1))
     list(monitor.drain())
@@ -68,7 +68,7 @@ def test_the_rate_holds_back_and_the_end_shows_the_last(monitor, tmp_path, read_
     assert counts == [1, 5]
 
 
-def test_an_older_version_does_not_replace_a_newer_one(monitor, tmp_path, read_rrd):
+def test_an_older_revision_does_not_replace_a_newer_one(monitor, tmp_path, read_rrd):
     tell(monitor, "mapping/chunk", chunk(0.0, 5, count=2))
     tell(monitor, "mapping/chunk", chunk(9.0, 4, count=1))
     monitor.close()
@@ -84,7 +84,7 @@ def test_a_loop_closure_moves_the_chunk(monitor, tmp_path, read_rrd):
     np.testing.assert_allclose([p.ravel()[0] for p in places], [2.0, 3.0], atol=1e-6)
 
 
-def test_rubbish_is_said_and_does_not_harm(monitor, tmp_path, read_rrd):
+def test_invalid_chunks_are_logged_and_ignored(monitor, tmp_path, read_rrd):
     broken = chunk(0.0, 1).model_copy(update={"packed": np.zeros(5, np.uint8)})
     tell(monitor, "mapping/chunk", broken)
     tell(monitor, "mapping/chunk", chunk(9.0, 2))
@@ -94,7 +94,7 @@ def test_rubbish_is_said_and_does_not_harm(monitor, tmp_path, read_rrd):
     assert len(saved.stamps("map/splats/7")) == 1
 
 
-def test_figures_and_the_render_over_time(monitor, tmp_path, read_rrd):
+def test_metrics_and_render_over_time(monitor, tmp_path, read_rrd):
     jpeg = cv2.imencode(".jpg", np.full((12, 16, 3), 90, np.uint8))[1].ravel()
     tell(
         monitor,

@@ -41,7 +41,7 @@ class StuckStream:
         self.logged.append((path, *parts))
 
 
-def test_a_stalled_viewer_holds_nobody_up_and_then_gets_the_newest():
+def test_a_stalled_viewer_blocks_nothing_and_gets_the_newest_entries():
     stream = StuckStream()
     thread = SinkThread("viewer", stream, None, None)
     thread.put(_LogEntry("rig", ("rig",), None, True))
@@ -59,7 +59,7 @@ def test_a_stalled_viewer_holds_nobody_up_and_then_gets_the_newest():
     assert {newest[f"entity{i}"] for i in range(3)} == {10 * _QUEUE - i for i in (1, 2, 3)}
 
 
-def test_large_drawings_that_wait_are_bounded_by_their_bytes():
+def test_queued_entries_are_bounded_by_bytes():
     stream = StuckStream()
     thread = SinkThread("viewer", stream, None, None)
     for i in range(200):
@@ -73,7 +73,7 @@ def test_large_drawings_that_wait_are_bounded_by_their_bytes():
     assert thread._bytes == 0
 
 
-def test_closing_does_not_wait_for_ever():
+def test_closing_has_a_timeout():
     stream = StuckStream()
     thread = SinkThread("viewer", stream, None, None)
     thread.put(_LogEntry("a", (1,), None, False))
@@ -89,7 +89,7 @@ def _draw_until_fault(writer, path="a"):
     return writer.status
 
 
-def test_a_file_ends_whole_at_its_limit(tmp_path, read_rrd):
+def test_a_file_is_closed_at_its_size_limit(tmp_path, read_rrd):
     writer = RerunWriter()
     path = writer.save(tmp_path / "sub" / "drive.rrd", layout(), limit_mb=0, keep_free_mb=0)
     assert "closed at" in _draw_until_fault(writer)
@@ -98,7 +98,7 @@ def test_a_file_ends_whole_at_its_limit(tmp_path, read_rrd):
     assert read_rrd(path).entities == {"a"}
 
 
-def test_a_disk_that_runs_full_ends_the_file(tmp_path, read_rrd):
+def test_a_file_is_closed_when_the_disk_is_nearly_full(tmp_path, read_rrd):
     writer = RerunWriter()
     path = writer.save(tmp_path / "drive.rrd", layout(), limit_mb=100, keep_free_mb=10**9)
     assert "left on the disk" in _draw_until_fault(writer)
@@ -106,7 +106,7 @@ def test_a_disk_that_runs_full_ends_the_file(tmp_path, read_rrd):
     assert read_rrd(path).entities == {"a"}
 
 
-def test_a_file_that_vanishes_is_noticed(tmp_path):
+def test_a_removed_file_is_reported(tmp_path):
     writer = RerunWriter()
     path = writer.save(tmp_path / "drive.rrd", layout(), limit_mb=100, keep_free_mb=0)
     path.unlink()
@@ -114,7 +114,7 @@ def test_a_file_that_vanishes_is_noticed(tmp_path):
     writer.close()
 
 
-def test_a_disk_that_refuses_is_noticed(tmp_path):
+def test_a_write_error_is_reported(tmp_path):
     """The kernel refuses to write beyond a size, as a full disk would."""
     script = """
         import os, resource, sys, time
@@ -148,7 +148,7 @@ def test_a_file_is_never_overwritten(tmp_path):
     assert (tmp_path / "drive.rrd").read_bytes() == b"precious"
 
 
-def test_a_folder_that_cannot_be_made_is_named(tmp_path):
+def test_a_folder_that_cannot_be_created_is_reported(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(RuntimeError, match="cannot create the folder"):
         RerunWriter().save(tmp_path / "file" / "drive.rrd", layout(), limit_mb=1, keep_free_mb=0)

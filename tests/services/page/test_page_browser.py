@@ -100,7 +100,7 @@ def _number(page, name):
 
 
 @pytest.mark.parametrize("size", [DESK, PHONE], ids=["desk", "phone"])
-def test_what_runs_is_seen(chromium, start, size):
+def test_the_page_shows_the_running_system(chromium, start, size):
     system = start()
     with opened(chromium, system.address, size) as page:
         poll(system, lambda: _state(page, "fusion") == "active", 20)
@@ -146,7 +146,7 @@ _COLOURS = """() => {
 }"""
 
 
-def test_a_killed_node_shows_and_a_killed_page_comes_back(chromium, start):
+def test_a_killed_node_is_shown_and_a_killed_page_reconnects(chromium, start):
     system = start()
     with opened(chromium, system.address, DESK) as page:
         poll(system, lambda: _state(page, "localization") == "active", 20)
@@ -165,7 +165,7 @@ def test_a_killed_node_shows_and_a_killed_page_comes_back(chromium, start):
         poll(system, lambda: _state(page, "fusion") == "active", 10)
 
 
-def test_who_has_the_token_commands_and_nobody_else(chromium, start):
+def test_commands_need_the_token_in_the_browser(chromium, start):
     system = start(token=TOKEN)
     with opened(chromium, system.address, PHONE) as page:
         poll(system, lambda: page.is_visible("#login"), 20)

@@ -60,7 +60,7 @@ def _cpu_percent(process, supervisor):
 
 
 @pytest.mark.slow
-def test_nine_more_viewers_cost_little(tmp_path, free_endpoint):
+def test_nine_more_pages_cost_little_cpu(tmp_path, free_endpoint):
     nodes = {"replay": {}, "localization": {}, "fusion": {}, "page": {"port": 0}}
     deployment = Deployment(
         robot="test", router=RouterConfig(listen=(free_endpoint,)), state_dir=tmp_path, nodes=nodes

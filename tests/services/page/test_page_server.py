@@ -65,7 +65,7 @@ class Serving:
     def get(self, path, host="127.0.0.1"):
         return self.ask(f"GET {path} HTTP/1.1\r\nHost: {host}\r\n\r\n".encode())
 
-    def viewer(self):
+    def open_event_stream(self):
         s = socket.socket()
         s.settimeout(20)
         s.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 16 * 1024)
@@ -96,10 +96,10 @@ class EventReader(threading.Thread):
                     self.events.append(json.loads(line[5:]))
 
 
-def test_who_does_not_read_holds_nobody_up():
+def test_a_page_that_does_not_read_blocks_no_other():
     with Serving() as serving:
-        asleep = serving.stateer()
-        awake = EventReader(serving.stateer())
+        asleep = serving.open_event_stream()
+        awake = EventReader(serving.open_event_stream())
         _wait(lambda: len(serving.server.events) == 2)
         rng = np.random.default_rng(0)
         for i in range(600):  # 3 KB each: a megabyte and more that nobody takes
@@ -116,7 +116,7 @@ def test_who_does_not_read_holds_nobody_up():
         assert serving.server.events.dropped >= slow.dropped
 
 
-def test_a_picture_is_encoded_once_for_all_and_never_for_nobody():
+def test_an_image_is_encoded_once_for_all_pages_and_only_if_one_is_open():
     encoded = []
 
     def encode():
@@ -128,7 +128,7 @@ def test_a_picture_is_encoded_once_for_all_and_never_for_nobody():
             serving.state.images["camera"].update(encode)
             time.sleep(0.01)
         assert encoded == [], "nobody looks"
-        readers = [EventReader(serving.stateer()) for _ in range(10)]
+        readers = [EventReader(serving.open_event_stream()) for _ in range(10)]
         _wait(lambda: all(any("name" in e for e in r.events if isinstance(e, dict)) for r in readers))
         assert len(encoded) == 1
         for _ in range(10):
@@ -143,7 +143,7 @@ def test_a_picture_is_encoded_once_for_all_and_never_for_nobody():
         assert gaps.min() >= 0.1
 
 
-def test_what_is_damaged_is_said_and_the_last_good_one_stays():
+def test_a_damaged_image_is_reported_and_the_last_valid_one_stays():
     picture = LatestImage(1000.0)
     assert picture.metadata() is None
     good = cv2.imencode(".jpg", np.zeros((8, 8, 3), np.uint8))[1].ravel()
@@ -177,13 +177,13 @@ def test_what_is_damaged_is_said_and_the_last_good_one_stays():
         (b"GET camera HTTP/1.1\r\nHost: localhost\r\n\r\n", 404),
     ],
 )
-def test_rude_requests_get_a_reply_and_end_nothing(raw, status):
+def test_invalid_requests_get_an_error_response(raw, status):
     with Serving() as serving:
         assert serving.ask(raw)[0] == status
         assert serving.get("/")[0] == 200
 
 
-def test_commands_need_the_token_and_make_sense():
+def test_commands_need_the_token_and_valid_json():
     with Serving() as serving:
 
         def post(body, token=TOKEN):
@@ -212,7 +212,7 @@ def test_names_of_this_machine():
         assert not is_own_host(host, own), host
 
 
-def test_depth_is_a_colour_and_unknown_is_black():
+def test_depth_is_coloured_and_unknown_is_black():
     depth = np.full((60, 1280), 1.0, np.float32)
     depth[:, 640:] = np.nan
     rgb = cv2.imdecode(np.frombuffer(encode_depth(depth, 640).data, np.uint8), cv2.IMREAD_COLOR)
@@ -222,7 +222,7 @@ def test_depth_is_a_colour_and_unknown_is_black():
     assert near[2] > near[0] + 80, "near is red (BGR)"
 
 
-def test_the_map_is_cut_to_what_is_known():
+def test_the_map_is_cropped_to_known_cells():
     occupancy = np.full((40, 60), -1, np.int8)
     occupancy[10:20, 15:45] = 0
     occupancy[10, 15:45] = 100
@@ -237,7 +237,7 @@ def test_the_map_is_cut_to_what_is_known():
         encode_grid(np.full((3, 3), -1, np.int8), 0.1, np.zeros(2))
 
 
-def test_what_is_not_a_number_is_null_for_the_browser():
+def test_nan_and_infinity_become_null():
     state = PageState(2.0, 2.0)
     state.service_status("fusion", "ok", scale=math.nan, scale_sigma=math.inf, detail="")
     state.scale(math.nan, 1.0)
@@ -247,7 +247,7 @@ def test_what_is_not_a_number_is_null_for_the_browser():
     json.dumps([state.status(), state.scales(), state.robot(), state.path()], allow_nan=False)
 
 
-def test_the_best_pose_leads_and_the_scan_lies_where_the_robot_was():
+def test_the_best_source_is_used_and_the_scan_is_drawn_at_its_pose():
     state = PageState(2.0, 2.0)
     ns = 1_000_000_000
     state.pose("wheel", ns, se2_to_se3(np.array([9.0, 9.0, 0.0])))
@@ -267,7 +267,7 @@ def test_the_best_pose_leads_and_the_scan_lies_where_the_robot_was():
     assert robot["scan_cm"] == [100, 300, 300, 200]
 
 
-def test_options_that_do_not_fit_are_said():
+def test_invalid_options_are_reported():
     with pytest.raises(UserError, match="at least 12 characters"):
         make_node(NODES["page"], {"token": "short"}, "x")
     with socket.socket() as taken:
@@ -304,7 +304,7 @@ def test_a_page_with_a_certificate_is_https(tmp_path):
         node.close()
 
 
-def test_a_refused_depth_is_said_and_shows_no_picture():
+def test_a_refused_depth_is_reported_and_shows_no_image():
     node = PageNode(PageConfig(port=0))
     node.configure()
     try:

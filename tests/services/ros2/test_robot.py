@@ -92,7 +92,7 @@ def _collect(bus, *topics):
     return got
 
 
-def test_a_robot_that_speaks_ros2_is_taken_as_it_is(tmp_path, free_endpoint):
+def test_a_ros2_robot_needs_no_options(tmp_path, free_endpoint):
     """No option but the domain: calibration, scans, pictures and odometry arrive, stamps and bytes unchanged."""
     bag = write_bag(tmp_path, "mcap", Drive(seconds=6.0))
     node = Ros2Node(Ros2Config(domain=3, router=free_endpoint))
@@ -130,7 +130,7 @@ def test_a_robot_that_speaks_ros2_is_taken_as_it_is(tmp_path, free_endpoint):
         (Drive(seconds=60.0, info_px=(32, 24)), "K is for 32x24 px"),
     ],
 )  # fmt: skip
-def test_what_is_missing_or_contradicts_itself_is_said(tmp_path, free_endpoint, drive, said):
+def test_missing_or_contradicting_topics_are_reported(tmp_path, free_endpoint, drive, said):
     bag = write_bag(tmp_path, "mcap", drive)
     node = Ros2Node(Ros2Config(domain=0, router=free_endpoint, settle_s=0.5))
     with open_router((free_endpoint,)), Bus(open_session((free_endpoint,)), "test", "x", "cd" * 8, 1) as bus:
@@ -142,7 +142,7 @@ def test_what_is_missing_or_contradicts_itself_is_said(tmp_path, free_endpoint, 
     assert got == {"lidar/scan": [], "camera/image": []}
 
 
-def test_pictures_of_another_size_and_broken_ones_are_not_passed_on():
+def test_images_of_another_size_and_damaged_ones_are_rejected():
     import cv2
     from rosbags.typesys import Stores, get_typestore
 
@@ -177,7 +177,7 @@ def test_pictures_of_another_size_and_broken_ones_are_not_passed_on():
     assert robot.rejected[name[0]] == 3
 
 
-def test_answers_come_back_with_attachments_and_tokens(tmp_path, free_endpoint):
+def test_results_are_published_with_attachments_and_tokens(tmp_path, free_endpoint):
     bag = write_bag(tmp_path, "mcap", Drive(seconds=0.1, odometry=False))
     node = Ros2OutNode(Ros2OutConfig(domain=5, router=free_endpoint))
     rng = np.random.default_rng(0)
@@ -261,7 +261,7 @@ def test_a_recorded_drive_runs_the_whole_system_over_ros2(tmp_path, free_endpoin
     assert {edge[0] + ">" + edge[1] for line in robot.on("/tf") for edge in line["edges"]} == {"map>odom"}
 
 
-def test_wheels_that_only_tf_tells_of_are_taken_from_there(tmp_path, free_endpoint):
+def test_wheel_odometry_is_taken_from_tf(tmp_path, free_endpoint):
     """No Odometry topic: odom -> base_link on /tf is the wheels', and our own /tf beside it is not."""
     bag = write_bag(tmp_path, "mcap", Drive(seconds=8.0, odometry=False, tf="repeated"))
     node = Ros2Node(Ros2Config(domain=5, router=free_endpoint))

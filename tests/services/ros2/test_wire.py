@@ -36,7 +36,7 @@ def test_tokens_of_the_design_document(token):
     assert entity.gid() == xxhash.xxh3_128(token.encode()).intdigest().to_bytes(16, "little")
 
 
-def test_what_a_talkers_token_says():
+def test_parts_of_a_publishers_token():
     talker = RmwEntity.parse(PUBLISHER)
     assert (talker.kind, talker.node_name, talker.topic, talker.type_name) == (
         "MP", "talker", "/chatter", "std_msgs/msg/String",
@@ -49,21 +49,21 @@ def test_what_a_talkers_token_says():
     )
 
 
-def test_what_is_no_token_of_ours():
+def test_unsupported_tokens_are_ignored():
     service = "@ros2_lv/2/f9/0/10/SS/%/%/add_server/%add/example_interfaces::srv::dds_::AddTwoInts_/RIHS01_e1/::,10:,:,:,,"
     for text in (service, "@ros2_lv/2/x", "chatter", NODE + "/more", PUBLISHER.replace("::,7", "7")):
         assert RmwEntity.parse(text) is None
 
 
 @given(st.text(max_size=200))
-def test_any_text_is_taken_without_an_error(text):
+def test_any_text_is_parsed_without_an_error(text):
     RmwEntity.parse(text)
     RmwKey.parse(text)
     RmwQos.parse(text)
 
 
 @given(st.integers(-(2**63), 2**63 - 1), st.integers(0, 2**63 - 1), st.binary(min_size=16, max_size=16))
-def test_attachments_as_zenohs_own_serializer_writes_them(sequence, source_ns, gid):
+def test_attachments_match_zenohs_serializer(sequence, source_ns, gid):
     ours = RmwAttachment(sequence, source_ns, gid)
     theirs = ze.z_serialize((ze.Int64(sequence), ze.Int64(source_ns), gid)).to_bytes()
     assert ours.pack() == theirs
@@ -96,7 +96,7 @@ def _independent(message):
 
 
 @pytest.mark.parametrize("word", SENSORS)
-def test_sensor_messages_go_through_byte_for_byte(word):
+def test_sensor_messages_are_converted_without_loss(word):
     """ROS bytes -> our message -> ROS bytes: the same, but for what our frames are called."""
     sensor = SENSORS[word]
     rng = np.random.default_rng(0)
@@ -119,7 +119,7 @@ def test_sensor_messages_go_through_byte_for_byte(word):
     assert ros.serialize(records_of(sensor.topic, back)[0].message) == data
 
 
-def test_the_answers_are_what_ros_reads():
+def test_published_messages_are_valid_ros_messages():
     rng = np.random.default_rng(0)
     points = rng.uniform(-5, 5, (7, 3)).astype(np.float32)
     colours = rng.integers(0, 255, (7, 3)).astype(np.uint8)
@@ -143,7 +143,7 @@ def test_the_answers_are_what_ros_reads():
     assert (grid.info.origin.position.x, grid.info.origin.position.y) == (-1.0, 2.0)
 
 
-def test_transforms_leave_the_robots_own_odometry_to_it():
+def test_the_robots_odometry_publishes_odom_to_body():
     from beamsplat.common.geometry.transforms import se2_to_se3
 
     tree = TfTree("map", "odom", "base_link")

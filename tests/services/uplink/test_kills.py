@@ -9,7 +9,7 @@ import pytest
 
 from tests.services.uplink.pair import RATE, BadLinkPair
 from tests.services.uplink.radio import Radio
-from tests.services.uplink.test_bad_link import BAD, LAP_S, print_details, say
+from tests.services.uplink.test_bad_link import BAD, LAP_S, print_details, print_line
 
 VICTIMS = [
     *(("near", name) for name in ("router", "uplink", "keyframes", "fusion", "depth", "localization", "replay")),
@@ -66,9 +66,9 @@ def test_any_process_may_be_killed_at_any_time(tmp_path, drive):
         print(*done, sep="\n")
         states = pair.wait(all_active, 300)
         print()
-        say("killed", f"{sum(k for *_, k in done)} of {len(done)} in {MINUTES:g} min, seed {SEED}")
+        print_line("killed", f"{sum(k for *_, k in done)} of {len(done)} in {MINUTES:g} min, seed {SEED}")
         for side in ("near", "far"):
-            say(f"restarts, {side}", getattr(pair, side).state()["restarts"])
+            print_line(f"restarts, {side}", getattr(pair, side).state()["restarts"])
         print_details(states)
         before = set(pair.durable())
         pair.wait(
@@ -78,7 +78,7 @@ def test_any_process_may_be_killed_at_any_time(tmp_path, drive):
         print_details(states)
         made = set(pair.near.log.first("keyframes/frame", "sent_ns"))
         earlier = pair.queued
-        say("keyframes made, on the edge, of earlier drives on the robot",
+        print_line("keyframes made, on the edge, of earlier drives on the robot",
             f"{len(made)}, {len(pair.durable())}, {len(earlier)}")  # fmt: skip
         assert not any(state["gave_up"] for state in states)
         assert len(made) > 20

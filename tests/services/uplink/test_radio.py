@@ -50,7 +50,7 @@ def heard_over(radio, cut=False):
     return {int(k): v for k, v in json.loads(ear.communicate(timeout=20)[0]).items()}
 
 
-def test_packets_take_their_time_and_the_seed_decides_which_are_lost():
+def test_delay_and_reproducible_loss():
     needs_namespaces()
     heard = []
     for seed in (3, 3, 4):
@@ -62,7 +62,7 @@ def test_packets_take_their_time_and_the_seed_decides_which_are_lost():
     assert all(10 <= len(numbers) <= 60 for numbers in lost)  # of 30 expected; three sigma are 16
 
 
-def test_nothing_crosses_while_it_is_cut():
+def test_no_packet_crosses_during_a_cut():
     needs_namespaces()
     with Radio() as radio:
         heard = heard_over(radio, cut=True)

@@ -84,7 +84,7 @@ def detail(board, node):
 
 
 @pytest.mark.slow
-def test_a_cut_link_loses_no_keyframe_and_does_not_reach_the_robot(tmp_path):
+def test_a_cut_link_loses_no_keyframe_and_does_not_affect_the_robot(tmp_path):
     pair = Pair(tmp_path, pictures=80)
     with running(pair) as ((robot, near, near_board), (edge, far, far_board)):
         both = (robot, edge)
@@ -124,7 +124,7 @@ def test_a_cut_link_loses_no_keyframe_and_does_not_reach_the_robot(tmp_path):
 
 
 @pytest.mark.slow
-def test_the_robot_starts_without_an_edge_and_an_edge_that_is_killed_goes_on_from_its_session(tmp_path):
+def test_the_robot_starts_without_an_edge_and_a_killed_edge_continues_its_session(tmp_path):
     pair = Pair(tmp_path, pictures=60)
     pair.edge.nodes["mapping"] |= {"session": str(tmp_path / "session"), "session_every_s": 1.0}
     pair.link.cut = True
@@ -158,7 +158,7 @@ def test_the_robot_starts_without_an_edge_and_an_edge_that_is_killed_goes_on_fro
 
 
 @pytest.mark.slow
-def test_behind_locked_doors_everything_flows_until_the_robot_is_removed(tmp_path):
+def test_a_tls_link_works_until_the_robot_is_removed_from_the_policy(tmp_path):
     authority = CertificateAuthority.create(tmp_path / "authority")
     keys = {"edge": authority.issue("edge", HostRole(role="edge"), ("127.0.0.1",))}
     robot = HostRole(role="robot", robot="r1")
@@ -181,7 +181,7 @@ def test_behind_locked_doors_everything_flows_until_the_robot_is_removed(tmp_pat
         assert robot_side.children["uplink"].restarts == edge.children["router"].restarts == 0
 
 
-def test_only_what_the_table_marks_crosses(tmp_path):
+def test_only_topics_marked_in_the_table_cross(tmp_path):
     """Raw pictures, scans and depth stay on the robot, whoever asks for them on the edge."""
     pair = Pair(tmp_path, pictures=12)
     with running(pair) as ((robot, near, near_board), (edge, far, _)):
@@ -196,7 +196,7 @@ def test_only_what_the_table_marks_crosses(tmp_path):
     assert all(TOPICS[name].uplink or name.startswith("mapping/") for name in topics)
 
 
-def test_a_deployment_is_told_what_comes_from_the_other_side(tmp_path):
+def test_the_check_knows_topics_from_the_other_side(tmp_path):
     pair = Pair(tmp_path, pictures=1)
     assert faults(pair.robot, TABLE) == faults(pair.edge, TABLE) == []
     classes = {name: TABLE[name].load("default") for name in ("mapping", "keyframes")}

@@ -20,7 +20,7 @@ def authority(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def door(authority):
+def router_endpoint(authority):
     endpoint = f"tls/127.0.0.1:{free_port()}"
     with open_router((endpoint,), security=SecurityConfig(keys=authority.folder / "hosts" / "edge")):
         yield endpoint
@@ -36,30 +36,32 @@ def faults(deployment):
     ]
 
 
-def test_a_good_link_is_said_to_be_good(authority, door):
-    remarks = list(diagnose_security(robot(door, authority.folder / "hosts" / "r1")))
+def test_a_valid_link_is_reported_as_ok(authority, router_endpoint):
+    remarks = list(diagnose_security(robot(router_endpoint, authority.folder / "hosts" / "r1")))
     assert any(v == "ok" and "accepts this host's certificate" in text for _, v, text, _ in remarks)
     assert any("r1: valid for" in text for _, _, text, _ in remarks)
-    assert not faults(robot(door, authority.folder / "hosts" / "r1"))
+    assert not faults(robot(router_endpoint, authority.folder / "hosts" / "r1"))
 
 
-def test_another_authority_on_either_side(authority, door, tmp_path):
+def test_certificates_of_another_authority(authority, router_endpoint, tmp_path):
     other = CertificateAuthority.create(tmp_path)
     folder = other.issue("r1", HostRole(role="robot", robot="r1"))
-    assert any("the edge's certificate is not valid" in text for text in faults(robot(door, folder)))
+    assert any(
+        "the edge's certificate is not valid" in text for text in faults(robot(router_endpoint, folder))
+    )
     (folder / "ca.pem").write_bytes((authority.folder / "ca.pem").read_bytes())
-    found = faults(robot(door, folder))
+    found = faults(robot(router_endpoint, folder))
     assert any("was not issued by" in text for text in found)
     assert any("rejects this host's certificate" in text for text in found)
 
 
-def test_another_address_than_the_certificate_names(authority, door):
-    endpoint = door.replace("127.0.0.1", "localhost")
+def test_an_address_that_is_not_in_the_certificate(authority, router_endpoint):
+    endpoint = router_endpoint.replace("127.0.0.1", "localhost")
     found = faults(robot(endpoint, authority.folder / "hosts" / "r1"))
     assert any("ostname mismatch" in text for text in found)
 
 
-def test_nobody_there_and_no_such_name(authority):
+def test_no_answer_and_unknown_host_name(authority):
     keys = authority.folder / "hosts" / "r1"
     assert any("cannot be reached" in text for text in faults(robot(f"tls/127.0.0.1:{free_port()}", keys)))
     assert any("cannot be resolved" in text for text in faults(robot("tls/nowhere.invalid:7448", keys)))
@@ -70,16 +72,16 @@ def test_missing_readable_and_unprotected(authority, tmp_path):
         "needs the host's keys" in t for t in faults(Deployment(nodes={"uplink": {"edge": "tls/x:1"}}))
     )
     assert any("is missing" in t for t in faults(robot("tls/127.0.0.1:1", tmp_path)))
-    open_door = Deployment(router=RouterConfig(listen=("tcp/0.0.0.0:7447",)))
-    assert any("unprotected" in t for t in faults(open_door))
-    remarks = list(diagnose_security(open_door.model_copy(update={"security": SecurityConfig(plain=True)})))
+    unprotected = Deployment(router=RouterConfig(listen=("tcp/0.0.0.0:7447",)))
+    assert any("unprotected" in t for t in faults(unprotected))
+    remarks = list(diagnose_security(unprotected.model_copy(update={"security": SecurityConfig(plain=True)})))
     assert [verdict for _, verdict, _, _ in remarks] == ["note"]
     folder = authority.issue("loose", HostRole(role="robot", robot="loose"))
     (folder / KEY).chmod(0o644)
     assert any("can be read by others" in t for t in faults(robot("tls/127.0.0.1:1", folder)))
 
 
-def test_the_edge_lists_what_each_host_may(authority):
+def test_the_edge_lists_the_roles_of_all_hosts(authority):
     edge = Deployment(
         router=RouterConfig(listen=("tcp/127.0.0.1:1", "tls/0.0.0.0:2")),
         security=SecurityConfig(keys=authority.folder / "hosts" / "edge"),
@@ -89,7 +91,7 @@ def test_the_edge_lists_what_each_host_may(authority):
     assert any("edge: edge of all robots" in text for text in texts)
 
 
-def test_a_certificate_about_to_expire_is_noted(authority, door):
+def test_a_certificate_that_expires_soon_is_noted(authority, router_endpoint):
     folder = authority.issue("brief", HostRole(role="robot", robot="brief"), days=3)
-    remarks = list(diagnose_security(robot(door, folder)))
+    remarks = list(diagnose_security(robot(router_endpoint, folder)))
     assert any(v == "note" and "expires in 3 days" in text for _, v, text, _ in remarks)

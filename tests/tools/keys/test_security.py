@@ -62,16 +62,16 @@ def wait(until, timeout_s=5.0):
     raise AssertionError(f"not within {timeout_s} s")
 
 
-def hear(session, pattern):
-    heard = []
-    kept = session.declare_subscriber(pattern, lambda s: heard.append(str(s.key_expr)))
-    return heard, kept
+def subscribe_keys(session, pattern):
+    received_keys = []
+    subscriber = session.declare_subscriber(pattern, lambda s: received_keys.append(str(s.key_expr)))
+    return received_keys, subscriber
 
 
 # --- authentication ---
 
 
-def test_a_host_with_a_certificate_comes_in(authority, edge):
+def test_a_host_with_a_certificate_connects(authority, edge):
     with link(authority, edge, "r1") as session:
         assert list(session.info.routers_zid())
 
@@ -85,12 +85,12 @@ def copy(authority, name, folder):
     return folder
 
 
-def refused(edge, folder):
+def assert_rejected(edge, folder):
     with pytest.raises(UserError, match="no router answers"):
         open_link(edge[1], 2.0, SecurityConfig(keys=folder)).close()
 
 
-def test_without_a_certificate_nobody_comes_in(authority, edge, tmp_path):
+def test_a_host_without_a_certificate_is_rejected(authority, edge, tmp_path):
     config = zenoh.Config()
     config.insert_json5("mode", '"client"')
     config.insert_json5("connect", f'{{endpoints: ["{edge[1]}"], timeout_ms: 2000, exit_on_failure: true}}')
@@ -105,16 +105,16 @@ def test_without_a_certificate_nobody_comes_in(authority, edge, tmp_path):
         open_link(edge[1].replace("tls/", "tcp/"), 1.0, plain).close()
 
 
-def test_a_certificate_of_another_authority_opens_nothing(authority, edge, tmp_path):
+def test_a_certificate_of_another_authority_is_rejected(authority, edge, tmp_path):
     other = CertificateAuthority.create(tmp_path / "other")
     other.issue("r1", HostRole(role="robot", robot="r1"))
     folder = copy(other, "r1", tmp_path / "r1")
-    refused(edge, folder)  # neither side knows the other's authority
+    assert_rejected(edge, folder)  # neither side knows the other's authority
     (folder / CA).write_bytes((authority.folder / CA).read_bytes())
-    refused(edge, folder)  # the host would trust the edge; the edge does not trust the host
+    assert_rejected(edge, folder)  # the host would trust the edge; the edge does not trust the host
 
 
-def test_an_expired_certificate_opens_nothing(authority, edge, tmp_path):
+def test_an_expired_certificate_is_rejected(authority, edge, tmp_path):
     folder = copy(authority, "r1", tmp_path / "r1")
     request = tmp_path / "request"
     openssl("req", "-new", "-key", str(folder / KEY), "-subj", "/O=BeamSplat/CN=r1", "-out", str(request))
@@ -129,18 +129,18 @@ def test_an_expired_certificate_opens_nothing(authority, edge, tmp_path):
             str(authority.folder / "ca.key"), "-in", str(request), "-out", str(folder / CERTIFICATE),
             "-startdate", "20200101000000Z", "-enddate", "20200201000000Z", "-notext")  # fmt: skip
     assert "2020" in expiry(folder / CERTIFICATE)
-    refused(edge, folder)
+    assert_rejected(edge, folder)
 
 
-def test_a_robot_does_not_talk_to_an_edge_of_another_name(authority, tmp_path):
+def test_a_robot_rejects_an_edge_of_another_name(authority, tmp_path):
     authority.issue("elsewhere", HostRole(role="edge"), ("edge.example",))
     near, far = f"tcp/127.0.0.1:{free_port()}", f"tls/127.0.0.1:{free_port()}"
     with open_router((near, far), security=SecurityConfig(keys=authority.folder / "hosts" / "elsewhere")):
-        refused((near, far), authority.folder / "hosts" / "r1")
+        assert_rejected((near, far), authority.folder / "hosts" / "r1")
     authority.remove("elsewhere")
 
 
-def test_links_off_this_host_are_protected_or_not_opened(tmp_path):
+def test_unprotected_links_to_other_hosts_are_rejected(tmp_path):
     for endpoint in ("tcp/0.0.0.0:7447", "tcp/192.168.1.5:7447", "udp/[::]:7447"):
         with pytest.raises(UserError, match="unprotected"):
             open_router((endpoint,))
@@ -153,7 +153,7 @@ def test_links_off_this_host_are_protected_or_not_opened(tmp_path):
         open_link("tls/127.0.0.1:7448", 1.0, SecurityConfig(keys=tmp_path))
 
 
-def test_a_key_that_others_can_read_is_refused(authority, tmp_path):
+def test_a_key_that_others_can_read_is_rejected(authority, tmp_path):
     folder = copy(authority, "r1", tmp_path / "r1")
     (folder / KEY).chmod(0o644)
     with pytest.raises(UserError, match="can be read by others"):
@@ -163,7 +163,7 @@ def test_a_key_that_others_can_read_is_refused(authority, tmp_path):
 # --- what each may do ---
 
 
-def test_a_robot_writes_what_crosses_under_its_own_name_and_nothing_else(authority, edge):
+def test_a_robot_may_publish_only_its_own_uplink_topics(authority, edge):
     allowed = [f"beamsplat/r1/{name}" for name, row in TOPICS.items() if row.uplink in ("up", "bulk")]
     allowed += ["beamsplat/r1/health/uplink", "beamsplat/r1/end/keyframes/frame"]
     forbidden = [
@@ -171,21 +171,22 @@ def test_a_robot_writes_what_crosses_under_its_own_name_and_nothing_else(authori
         "beamsplat/r1/mapping/chunk", "beamsplat/other", "anything", "beamsplat/r2/health/uplink",
     ]  # fmt: skip
     with open_session((edge[0],)) as local, link(authority, edge, "r1") as robot:
-        heard, kept = hear(local, "**")
+        received_keys, subscriber = subscribe_keys(local, "**")
         time.sleep(0.5)
         for key in forbidden + allowed:
             robot.put(key, b"x")
-        wait(lambda: set(heard) >= set(allowed))
+        wait(lambda: set(received_keys) >= set(allowed))
         time.sleep(0.3)
-        assert set(heard) == set(allowed)
-        kept.undeclare()
+        assert set(received_keys) == set(allowed)
+        subscriber.undeclare()
 
 
-def test_a_robot_hears_what_is_meant_for_it_and_no_other(authority, edge):
+def test_a_robot_receives_only_its_own_downlink_topics(authority, edge):
     with open_session((edge[0],)) as local, link(authority, edge, "r1") as robot:
-        heard, kept = hear(robot, "beamsplat/r1/keyframes/ack")
+        received_keys, subscriber = subscribe_keys(robot, "beamsplat/r1/keyframes/ack")
         others = [
-            hear(robot, p) for p in ("beamsplat/r2/keyframes/ack", "beamsplat/r2/**", "beamsplat/r1/camera/*")
+            subscribe_keys(robot, p)
+            for p in ("beamsplat/r2/keyframes/ack", "beamsplat/r2/**", "beamsplat/r1/camera/*")
         ]
         queryable = local.declare_queryable(
             "beamsplat/r1/query/mapping/set_params", lambda q: q.reply(q.key_expr, b"1")
@@ -193,24 +194,24 @@ def test_a_robot_hears_what_is_meant_for_it_and_no_other(authority, edge):
         time.sleep(0.5)
         for name in ("r1/keyframes/ack", "r2/keyframes/ack", "r1/camera/image", "r1/localization/odometry"):
             local.put(f"beamsplat/{name}", b"x")
-        wait(lambda: heard)
+        wait(lambda: received_keys)
         time.sleep(0.3)
-        assert set(heard) == {"beamsplat/r1/keyframes/ack"}
+        assert set(received_keys) == {"beamsplat/r1/keyframes/ack"}
         assert [h for h, _ in others] == [[], [], []]
         assert list(robot.get("beamsplat/r1/query/mapping/set_params", timeout=2.0)) == []
-        for thing in (kept, queryable, *(k for _, k in others)):
+        for thing in (subscriber, queryable, *(k for _, k in others)):
             thing.undeclare()
 
 
 @pytest.mark.parametrize(("name", "may_change"), [("watcher", False), ("chief", True)])
-def test_a_monitor_reads_everything_and_changes_nothing(authority, edge, name, may_change):
+def test_a_monitor_may_read_everything_and_change_nothing(authority, edge, name, may_change):
     def answer(query):
         with query:
             query.reply(query.key_expr, b"1")
 
     with open_session((edge[0],)) as local, link(authority, edge, name) as monitor:
-        heard, kept = hear(local, "**")
-        seen, watching = hear(monitor, "beamsplat/*/**")
+        received_keys, subscriber = subscribe_keys(local, "**")
+        seen, watching = subscribe_keys(monitor, "beamsplat/*/**")
         answers = [
             local.declare_queryable(f"beamsplat/r1/query/mapping/{q}", answer)
             for q in ("snapshot", "set_params")
@@ -221,16 +222,16 @@ def test_a_monitor_reads_everything_and_changes_nothing(authority, edge, name, m
         local.put("beamsplat/r1/mapping/chunk", b"x")
         local.put("beamsplat/r2/health/mapping", b"x")
         wait(lambda: len(seen) >= 2)
-        assert "beamsplat/r1/keyframes/ack" not in heard
+        assert "beamsplat/r1/keyframes/ack" not in received_keys
         assert len(list(monitor.get("beamsplat/r1/query/mapping/snapshot", timeout=2.0))) == 1
         assert len(list(monitor.get("beamsplat/r1/query/mapping/set_params", timeout=2.0))) == may_change
         assert len(list(monitor.liveliness().get("beamsplat/*/alive/**", timeout=2.0))) == 1
-        for thing in (kept, watching, token, *answers):
+        for thing in (subscriber, watching, token, *answers):
             thing.undeclare()
 
 
 @pytest.mark.parametrize("name", [n for n, row in TOPICS.items() if row.uplink])
-def test_every_topic_crosses_a_guarded_door_with_what_was_said_before(authority, edge, name, free_endpoint):
+def test_every_uplink_topic_passes_access_control_with_its_history(authority, edge, name, free_endpoint):
     """Latched values and caches too: their `@adv` keys need rules of their own."""
     row = topic(name)
     message = next(m for m in sample_messages() if type(m) is row.message)
@@ -245,17 +246,17 @@ def test_every_topic_crosses_a_guarded_door_with_what_was_said_before(authority,
         stack.enter_context(sessions.edge)
         stack.enter_context(sessions.edge_bulk)
         bridge = Bridge("r1", sessions)
-        heard = []
-        take = lambda s: heard.append(decode_sample(s, row).message)  # noqa: E731
-        kept = [declare_subscription(there, f"beamsplat/r1/{name}", row, "every", take)]
+        received_keys = []
+        take = lambda s: received_keys.append(decode_sample(s, row).message)  # noqa: E731
+        subscriber = [declare_subscription(there, f"beamsplat/r1/{name}", row, "every", take)]
         if row.delivery == "latched":
-            wait(lambda: len(heard) == 1)  # said before anybody listened
-        publish_until_received(publication, message, heard)
-        assert bridge.forwarded[name].messages >= len(heard)
-        assert kept
+            wait(lambda: len(received_keys) == 1)  # published before anybody listened
+        publish_until_received(publication, message, received_keys)
+        assert bridge.forwarded[name].messages >= len(received_keys)
+        assert subscriber
 
 
-def test_a_robot_without_a_rule_is_let_in_but_can_do_nothing(authority, tmp_path):
+def test_a_removed_robot_connects_but_has_no_rights(authority, tmp_path):
     """Removed from the policy: its certificate is still valid, but gives no access."""
     made = CertificateAuthority.create(tmp_path / "authority")
     made.issue("edge", HostRole(role="edge"), ("127.0.0.1",))
@@ -269,14 +270,14 @@ def test_a_robot_without_a_rule_is_let_in_but_can_do_nothing(authority, tmp_path
         open_session((near,)) as local,
         open_link(far, 2.0, SecurityConfig(keys=folder)) as robot,
     ):
-        heard, kept = hear(local, "**")
+        received_keys, subscriber = subscribe_keys(local, "**")
         time.sleep(0.3)
         robot.put("beamsplat/r1/localization/odometry", b"x")
         local.put("beamsplat/r1/tick", b"x")
-        wait(lambda: heard)
+        wait(lambda: received_keys)
         time.sleep(0.3)
-        assert heard == ["beamsplat/r1/tick"]
-        kept.undeclare()
+        assert received_keys == ["beamsplat/r1/tick"]
+        subscriber.undeclare()
 
 
 # --- the authority ---
@@ -301,7 +302,7 @@ def test_renewed_keys_replace_the_old_and_the_policy_stays(authority, tmp_path):
         CertificateAuthority(tmp_path / "hosts")
 
 
-def test_a_policy_that_makes_no_sense_is_refused(tmp_path):
+def test_an_invalid_policy_is_rejected(tmp_path):
     with pytest.raises(UserError, match="is missing"):
         read_hosts(tmp_path)
     for text in ('[r1]\nrole = "king"', "[r1", '[r1]\nrole = "robot"\nrobot = "r1/**"', "r1 = 3"):
@@ -310,7 +311,7 @@ def test_a_policy_that_makes_no_sense_is_refused(tmp_path):
             read_hosts(tmp_path)
 
 
-def test_everything_in_the_policy_comes_from_the_topic_table():
+def test_the_policy_follows_the_topic_table():
     policy = access_control({"r1": HostRole(role="robot", robot="r1")})
     assert policy["default_permission"] == "deny"
     writes = next(r for r in policy["rules"] if r["id"] == "r1 publish")
@@ -319,7 +320,7 @@ def test_everything_in_the_policy_comes_from_the_topic_table():
     } == {f"beamsplat/r1/{name}" for name, row in TOPICS.items() if row.uplink in ("up", "bulk")}
 
 
-def test_openssl_says_why_it_refuses(tmp_path):
+def test_errors_of_openssl_are_reported(tmp_path):
     with pytest.raises(UserError, match="openssl x509 failed"):
         openssl("x509", "-in", str(tmp_path / "nothing"))
     assert subprocess.run(["openssl", "version"], capture_output=True, check=True).stdout

@@ -32,7 +32,7 @@ def test_the_devices_a_deployment_names():
     assert wanted_devices({"replay": {"data": "x"}}) == []
 
 
-def test_a_user_outside_the_group_is_told_how_to_get_in(dev):
+def test_a_user_outside_the_group(dev):
     reported = _say(
         dev, [("lidar.device", str(dev / "ttyUSB0"))], UserAccount("ann", frozenset(), frozenset())
     )
@@ -43,22 +43,22 @@ def test_a_user_outside_the_group_is_told_how_to_get_in(dev):
     assert reported[str(dev / "video0")].verdict == "note"  # nobody asked for it
 
 
-def test_a_user_who_must_log_in_again_is_told_so(dev):
+def test_a_user_who_must_log_in_again(dev):
     reported = _say(
         dev, [("camera.source", str(dev / "video0"))], UserAccount("ann", frozenset(), frozenset({GROUP}))
     )
-    assert "not yet in this session" in reported[str(dev / "video0")].text
+    assert "not yet in this login session" in reported[str(dev / "video0")].text
     assert "log out and in again" in reported[str(dev / "video0")].remedy
 
 
-def test_a_group_without_the_right(dev):
+def test_a_group_without_permission(dev):
     reported = _say(
         dev, [("camera.source", str(dev / "video0"))], UserAccount("ann", frozenset({GROUP}), frozenset())
     )
     assert "udev rule" in reported[str(dev / "video0")].remedy
 
 
-def test_all_well_and_its_lasting_name(dev):
+def test_an_accessible_device_and_its_stable_name(dev):
     (dev / "serial" / "by-id").mkdir(parents=True)
     (dev / "serial" / "by-id" / "usb-Silicon_Labs_CP2102").symlink_to(dev / "ttyUSB0")
     reported = _say(
@@ -71,7 +71,7 @@ def test_all_well_and_its_lasting_name(dev):
     assert "usb-Silicon_Labs_CP2102" in reported[str(dev / "ttyUSB0")].text
 
 
-def test_a_missing_device_names_those_there_are(dev):
+def test_a_missing_device_lists_the_connected_ones(dev):
     reported = _say(
         dev,
         [("lidar.device", str(dev / "ttyUSB7"))],
@@ -83,7 +83,7 @@ def test_a_missing_device_names_those_there_are(dev):
     assert str(dev / "ttyUSB0") in missing.remedy
 
 
-def test_a_port_that_another_program_holds(tmp_path):
+def test_a_port_in_use_by_another_program(tmp_path):
     master, slave = pty.openpty()
     try:
         (tmp_path / "ttyUSB0").symlink_to(os.ttyname(slave))

@@ -40,7 +40,7 @@ def lens():
     return calibration.solve()
 
 
-def test_the_lens_is_found_with_its_error(lens):
+def test_the_intrinsics_are_estimated_with_their_errors(lens):
     assert lens.views >= 10
     assert lens.rms_px < 0.15
     assert lens.is_good
@@ -56,7 +56,7 @@ def test_the_lens_is_found_with_its_error(lens):
     assert np.abs(off.mean(axis=0)).max() < 2.0
 
 
-def test_views_that_are_alike_or_without_a_board_are_not_taken():
+def test_similar_views_and_views_without_a_board_are_rejected():
     calibration = IntrinsicsCalibration(DEFAULT_CHESSBOARD)
     first = picture(views(1)[0])
     assert calibration.add(np.full_like(first, 120)) == "no board"
@@ -67,7 +67,7 @@ def test_views_that_are_alike_or_without_a_board_are_not_taken():
         calibration.solve()
 
 
-def test_a_wrong_board_is_not_good():
+def test_a_board_that_is_not_flat_is_rejected():
     """A board that is not flat: its corners lie where no pinhole sees a plane's."""
     calibration = IntrinsicsCalibration(DEFAULT_CHESSBOARD)
     calibration.add(picture(views(1)[0]))
@@ -101,7 +101,7 @@ def test_the_printed_board_is_true_to_the_millimetre(tmp_path):
     np.testing.assert_allclose(np.linalg.norm(sides, axis=1), 200.0, atol=1.5)
 
 
-def test_the_pdf_says_where_its_parts_are():
+def test_the_pdf_has_a_valid_object_table():
     data = chessboard_pdf()
     table = int(re.search(rb"startxref\n(\d+)", data)[1])
     assert data[table:].startswith(b"xref\n0 5")
@@ -111,7 +111,7 @@ def test_the_pdf_says_where_its_parts_are():
         chessboard_pdf(Chessboard((11, 8), 0.03))
 
 
-def test_the_lidar_is_found_by_the_boards(lens):
+def test_the_lidar_mount_is_estimated_from_boards(lens):
     """Two centimetres and three degrees off, and a camera that looks down: found within its own errors."""
     desk = Desk(1)
     boards = LidarBoardCalibration(camera_section(lens, T_BODY_CAMERA).model(), DEFAULT_CHESSBOARD)
@@ -137,7 +137,7 @@ def test_the_lidar_is_found_by_the_boards(lens):
     assert "not completely in the image" in boards.add(np.full_like(grey, 9), scan, grey)
 
 
-def test_what_the_terminal_shows():
+def test_images_and_scans_as_text():
     bgr = np.zeros((40, 80, 3), np.uint8)
     bgr[:, 40:] = (0, 0, 255)
     text = image_text(bgr, 20)
@@ -154,7 +154,7 @@ def test_what_the_terminal_shows():
     assert drawn[here].index("·") < drawn[here].index("^"), "left is left"
 
 
-def test_the_files_are_what_the_nodes_read(lens):
+def test_the_files_can_be_read_by_the_nodes(lens):
     text = rig_text(camera_section(lens, T_BODY_CAMERA), T_BODY_LIDAR, (), "note")
     rig = parse_rig(text, "rig.toml")
     np.testing.assert_allclose(rig.camera.model().T_body_camera, T_BODY_CAMERA, atol=1e-6)
@@ -167,7 +167,7 @@ def test_the_files_are_what_the_nodes_read(lens):
     assert "[nodes.fusion]" not in text
 
 
-def test_sensors_are_looked_for_by_their_lasting_names(tmp_path):
+def test_devices_are_listed_by_their_stable_names(tmp_path):
     for name in ("video0", "video1", "ttyUSB0", "ttyACM1", "ttyS0"):
         (tmp_path / name).touch()
     (tmp_path / "serial/by-id").mkdir(parents=True)

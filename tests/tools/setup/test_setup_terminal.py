@@ -37,7 +37,7 @@ def environment(tmp_path):
 
 
 @pytest.mark.slow
-def test_from_what_is_plugged_in_to_a_system_that_runs(tmp_path, environment, free_endpoint):
+def test_setup_ends_with_a_running_system(tmp_path, environment, free_endpoint):
     robot, rig, lidar = (tmp_path / name for name in ("robot.toml", "rig.toml", "ttyUSB0"))
     desk = Desk(24, boards_before_the_lidar(BOARDS))
     with DeskCamera(desk) as camera, EmulatedPort(DeskLidar(desk), str(lidar)):

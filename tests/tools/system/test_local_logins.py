@@ -25,7 +25,7 @@ from tests.common.samples import sample_messages
 from tests.common.topic_listener import TopicListener
 from tests.conftest import free_port
 from tests.services.mapping.room_drive import TABLE
-from tests.tools.keys.test_security import hear, wait
+from tests.tools.keys.test_security import subscribe_keys, wait
 
 POSE = "localization/odometry"
 
@@ -57,7 +57,7 @@ def test_a_camera_writes_its_own_topics_and_no_pose(guarded):
     others = {f"beamsplat/r1/{n}" for n, row in TOPICS.items() if "camera" not in row.producers}
     others |= {"beamsplat/r1/health/localization", "beamsplat/other", "x", f"beamsplat/r1/end/{POSE}"}
     with enter(guarded, OPERATOR) as ears, enter(guarded, "camera") as camera:
-        heard, kept = hear(ears, "**")
+        heard, kept = subscribe_keys(ears, "**")
         time.sleep(0.5)
         for key in others | own:
             camera.put(key, b"x")
