@@ -14,7 +14,7 @@ MODULES = {
 MAX_LINES = 500
 
 # Files of a service that may know messages, the bus and configuration. All others are libraries.
-SHELLS = {"node.py", "config.py", "messages.py", "intake.py", "live_session.py"}
+SHELLS = {"node.py", "config.py", "messages.py", "intake.py", "live_session.py", "open.py"}
 SHELL_ONLY = (
     "zenoh", "beamsplat.common.zenoh", "beamsplat.common.runtime", "beamsplat.common.messages",
     "beamsplat.common.topics", "beamsplat.common.config.deployment",
@@ -54,7 +54,11 @@ def _within(name: str, packages: tuple[str, ...]) -> bool:
 
 def test_imports_run_one_way(imports):
     """`common` <- `services` <- `tools`; no service imports another one; nothing imports the tests."""
-    above = {"common": ("beamsplat.services", "beamsplat.tools"), "services": ("beamsplat.tools",), "tools": ()}
+    above = {
+        "common": ("beamsplat.services", "beamsplat.tools"),
+        "services": ("beamsplat.tools",),
+        "tools": (),
+    }
     wrong = []
     for path, names in imports.items():
         folder, service = path.split("/")[:2]
@@ -64,6 +68,19 @@ def test_imports_run_one_way(imports):
             parts = name.split(".")
             if folder == "services" and name.startswith("beamsplat.services.") and parts[2] != service:
                 wrong.append(f"{path} imports another service: {name}")
+    assert not wrong
+
+
+def test_only_bench_commands_use_the_benchmarks(imports):
+    """What a user's command and a benchmark share is in `tools/report` or `tools/evaluation`."""
+    allowed = ("tools/bench/", "tools/cli/bench.py", "tools/cli/bench_mapping.py", "tools/cli/depth.py")
+    wrong = [
+        f"{path} imports {name}"
+        for path, names in imports.items()
+        if not path.startswith(allowed)
+        for name in names
+        if _within(name, ("beamsplat.tools.bench",))
+    ]
     assert not wrong
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import socket
 import time
 from collections.abc import Callable
@@ -11,27 +10,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from beamsplat.common.config.deployment import Deployment, load_deployment
 from beamsplat.common.errors import UserError
 from beamsplat.common.files.persist import make_folder, write_atomically
 from beamsplat.common.files.resources import shipped_file
-from beamsplat.common.geometry.transforms import inverse
 from beamsplat.services.depth.model_files import find_model
-from beamsplat.tools.evaluation.drive import open_drive
-from beamsplat.tools.evaluation.evaluate import truth_depth_files
 from beamsplat.tools.report.html import write_report
-from beamsplat.tools.report.map_scores import map_figures, previews, top_view_of_map, truth_folder
-from beamsplat.tools.report.observer import RunCosts, RunRecord, run_live
-from beamsplat.tools.report.scores import (
-    GroundTruth,
-    aligned_poses,
-    depth_errors,
-    pose_errors,
-    rigid_offset,
-    speed_and_load,
-)
+from beamsplat.tools.report.observer import run_live
+from beamsplat.tools.report.run_report import open_truth, report_of_runs, score_run
+from beamsplat.tools.report.scores import GroundTruth
 
 DEFAULT = "default"
 SUBSTITUTE_MODEL = "fastdepth_nyu_fp32"  # replaces networks whose weights are missing
@@ -142,24 +129,6 @@ def _free_port() -> int:
         return int(probe.getsockname()[1])
 
 
-def open_truth(data: Path, groundtruth: Path | None = None) -> GroundTruth:
-    """Open a recording with its ground truth: a TUM file,
-    groundtruth.txt beside the bag, or poses in the bag.
-
-    Raises:
-        UserError: there are no poses to compare with.
-    """
-    folder = truth_folder(data)
-    file = groundtruth or (folder / "groundtruth.txt" if (folder / "groundtruth.txt").is_file() else None)
-    bag = folder / "bag" if (folder / "bag").exists() else data
-    drive = open_drive(bag, file)
-    try:
-        depth_files = truth_depth_files(folder)
-    except UserError:
-        depth_files = {}
-    return GroundTruth(folder, drive, depth_files)
-
-
 def bench_paper(
     data: Path, out: Path, *, names: list[str] | None = None, seeds: int = 1, recorded: Path | None = None,
     groundtruth: Path | None = None, seconds: float | None = None, refine_steps: int = 0,
@@ -186,7 +155,7 @@ def bench_paper(
     for configuration in configurations:
         for seed in range(seeds):
             rows.append(_one_run(configuration, bag, out, truth, recorded, seed, seconds, refine_steps, log))
-            report = _report(rows, data, truth)
+            report = report_of_runs(rows, data, truth)
             write_atomically(out / "report.json", json.dumps(_figures_only(report), indent=1).encode())
             write_report(out / "report.html", report, truth)
     return _figures_only(report)
@@ -232,76 +201,6 @@ def _one_run(
 def _format(row: dict[str, Any], name: str) -> str:
     value = row.get(name)
     return "-" if value is None else f"{value:.3g}"
-
-
-def score_run(record: RunRecord, costs: RunCosts, truth: GroundTruth) -> dict[str, Any]:
-    """Return all figures of one run, and under `plots` the data that the report draws."""
-    stamps, T_found, T_true = aligned_poses(record, truth)
-    row = (
-        speed_and_load(record, costs, os.cpu_count() or 1)
-        | pose_errors(T_found, T_true)
-        | depth_errors(record, truth)
-    )
-    T_world_map = None
-    if len(T_found):
-        first = next(T for _, T, status, _ in record.poses if status == "ok")
-        T_world_map = rigid_offset(T_found, T_true) @ T_found[0] @ inverse(first)
-    figures, offpath = ({}, []) if T_world_map is None else map_figures(record, truth, T_world_map)
-    ends = [s.psnr_db for s in record.statuses if np.isfinite(s.psnr_db)]
-    row |= figures | {"psnr_keyframes_db": float(np.mean(ends)) if ends else None}
-    row["plots"] = {
-        "stamps_ns": stamps, "found": T_found, "true": T_true, "offpath": offpath,
-        "previews": previews(record, 4),
-        "estimates": record.kept_estimates, "fused": record.kept_fused,
-        "above": None if T_world_map is None else top_view_of_map(record, T_world_map, T_found[:, :2, 3]),
-    }  # fmt: skip
-    return row
-
-
-def single_run_report(
-    name: str, title: str, data: Path, truth: GroundTruth, row: dict[str, Any]
-) -> dict[str, Any]:
-    """Return the report of a single run that is not one of the paper's configurations."""
-    whole = {
-        "name": name, "title": title, "seed": 0, "paper": {}, "partner": None, "lidar": True,
-        "depth_source": title, "advice": "", "status": "ok", **row,
-    }  # fmt: skip
-    return _report([whole], data.parent if data.name == "bag" else data, truth)
-
-
-def _report(rows: list[dict[str, Any]], data: Path, truth: GroundTruth) -> dict[str, Any]:
-    return {
-        "data": data.name, "cores": os.cpu_count(), "truth": truth.drive.poses_name.rsplit("/", 1)[-1],
-        "configurations": rows, "pairs": compare_pairs(rows),
-    }  # fmt: skip
-
-
-def compare_pairs(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return the ratios of lidar to camera localization for each depth
-    source: CPU load, speed, position error."""
-    means = {name: _means([r for r in rows if r["name"] == name]) for name in {r["name"] for r in rows}}
-    out = []
-    for row in {r["name"]: r for r in rows}.values():
-        a, b = means.get(row["name"]), means.get(row.get("partner") or "")
-        if not a or not b:
-            continue
-        out.append({
-            "lidar": row["name"], "camera": row["partner"],
-            "cpu_load_ratio": _ratio(a, b, "cpu_load_percent"),
-            "cpu_s_per_located_image_ratio": _ratio(a, b, "cpu_s_per_located_image"),
-            "fps_ratio": _ratio(a, b, "fps"), "position_ratio": _ratio(a, b, "position_rmse_m"),
-        })  # fmt: skip
-    return out
-
-
-def _means(rows: list[dict[str, Any]]) -> dict[str, float]:
-    names = ("cpu_load_percent", "fps", "position_rmse_m", "cpu_s_per_located_image")
-    values = {name: [r[name] for r in rows if r.get(name) is not None] for name in names}
-    return {name: float(np.mean(v)) for name, v in values.items() if v}
-
-
-def _ratio(a: dict[str, float], b: dict[str, float], name: str) -> float | None:
-    return a[name] / b[name] if name in a and b.get(name) else None
 
 
 def _figures_only(report: dict[str, Any]) -> dict[str, Any]:

@@ -151,9 +151,9 @@ def write_results(out: Path, source: Path, record: RunRecord, costs: RunCosts) -
     write_tum(out / "trajectory.tum", trajectory, "T_map_body as it was said live")
     if not record.images:
         return {}
-    from beamsplat.tools.bench.paper import open_truth, score_run, single_run_report
     from beamsplat.tools.evaluation.drive import has_poses
     from beamsplat.tools.report.html import write_report
+    from beamsplat.tools.report.run_report import open_truth, score_run, single_run_report
 
     known = has_poses(source)
     truth = open_truth(source, None if known else out / "trajectory.tum")

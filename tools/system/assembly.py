@@ -11,7 +11,7 @@ from beamsplat.common.plugins import is_class_path
 from beamsplat.common.runtime.node import Node
 from beamsplat.common.runtime.registry import Service, make_node, node_class_of
 from beamsplat.common.security.access_control import ADMIN_USERS
-from beamsplat.common.security.keys import Keys, check_endpoint, is_secure
+from beamsplat.common.security.keys import HostKeys, check_endpoint, is_secure
 from beamsplat.common.topics import TOPICS
 from beamsplat.services.nodes import NODES
 
@@ -116,7 +116,7 @@ def _link_faults(deployment: Deployment, names: tuple[str, ...] | None) -> list[
         for endpoint in filter(None, endpoints):
             check_endpoint(endpoint, deployment.security)
         if any(map(is_secure, endpoints)):
-            Keys.of(deployment.security)
+            HostKeys.of(deployment.security)
     except UserError as error:
         found.append(str(error))
     return found

@@ -15,6 +15,7 @@ from beamsplat.tools.bench import paper
 from beamsplat.tools.evaluation.drive import RecordedDrive
 from beamsplat.tools.report.html import write_report
 from beamsplat.tools.report.observer import RunCosts, RunRecord
+from beamsplat.tools.report.run_report import compare_pairs
 from beamsplat.tools.report.scores import (
     GroundTruth,
     aligned_poses,
@@ -161,7 +162,7 @@ def test_names_are_checked():
 
 def test_pairs_have_the_papers_saving():
     rows = [{**c.paper, "name": c.name, "partner": c.partner} for c in paper.CONFIGURATIONS]
-    found = {p["lidar"]: p for p in paper.compare_pairs(rows)}
+    found = {p["lidar"]: p for p in compare_pairs(rows)}
     assert set(found) == {"unidepth-lidar", "depth_anything-lidar", "monogs-lidar"}
     assert found["unidepth-lidar"]["cpu_load_ratio"] == pytest.approx(1024 / 1243)
     assert found["unidepth-lidar"]["fps_ratio"] == pytest.approx(2.176 / 1.201)
