@@ -1,4 +1,4 @@
-"""A camera that changes size, slows down, delivers broken pictures, vanishes: nothing false goes out."""
+"""Camera node with faults: changed image size, low rate, damaged images, disconnection."""
 
 import http.server
 import threading
@@ -33,13 +33,13 @@ rpy_deg = [0.0, 0.0, 0.0]
 
 
 def jpeg(number, width=64, height=48):
-    """Smooth noise, another for each number."""
+    """Return a JPEG of smooth noise that depends on `number`."""
     noise = np.random.default_rng(number).integers(0, 255, (height, width, 3), dtype=np.uint8)
     return cv2.imencode(".jpg", cv2.GaussianBlur(noise, (0, 0), 2.0))[1].tobytes()
 
 
 class EmulatedCamera:
-    """A network camera: MJPEG over HTTP, with faults to switch on."""
+    """An emulated network camera: MJPEG over HTTP, with faults to switch on."""
 
     def __init__(self):
         self.rate_hz, self.size, self.damage = 25.0, (64, 48), None
@@ -274,7 +274,7 @@ def test_every_complete_jpeg_is_accepted(options):
 
 
 def test_detection_rates_of_damaged_jpegs():
-    """Measured shares, so that nobody takes the check for more than it is."""
+    """The detection rates that docs/sensors.md states."""
     rng = np.random.default_rng(0)
     data = jpeg(3, 320, 240)
     noticed = dict.fromkeys(("cut off", "512 bytes lost", "1 % wrong", "one byte wrong"), 0)

@@ -1,4 +1,4 @@
-"""Ticks of a live robot: one a second on the sensors' clock, and what they are good for over the bus."""
+"""The clock node: one tick per second on the sensors' clock."""
 
 import time
 from itertools import pairwise
@@ -29,7 +29,7 @@ def test_one_tick_per_second_on_the_sensors_clock():
     assert [message.count for message, _ in said] == [0, 1, 2]
     assert all(stamp % TICK_NS == 0 for stamp in stamps)
     assert all(b - a == TICK_NS for a, b in pairwise(stamps))
-    assert all(at_ns >= message.stamp_ns for message, at_ns in said)  # never ahead of the time
+    assert all(at_ns >= message.stamp_ns for message, at_ns in said)  # never before its stamp
 
 
 def test_missed_ticks_are_left_out():
@@ -40,7 +40,7 @@ def test_missed_ticks_are_left_out():
     time.sleep(2.3)
     later = [next(item for item in source if item is not None).message for _ in range(2)]
     assert [message.count for message in later] == [1, 2]
-    assert later[0].stamp_ns - first.stamp_ns >= 3 * TICK_NS  # those between were never said
+    assert later[0].stamp_ns - first.stamp_ns >= 3 * TICK_NS  # the missed ticks are left out
     assert later[1].stamp_ns - later[0].stamp_ns == TICK_NS
 
 

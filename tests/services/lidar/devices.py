@@ -1,6 +1,6 @@
-"""Emulators of lidars, byte for byte as their protocol documents say, on a pseudo-terminal or a socket.
+"""Emulated lidars that follow their protocol documents, on a pseudo-terminal or a socket.
 
-They are written from the documents, apart from our parsers, and stand in a known room.
+They are written from the documents, independently of our parsers, and measure a known room.
 """
 
 import contextlib
@@ -20,7 +20,7 @@ ROOM = (-2.0, 3.0, -1.5, 2.5)  # x from, x to, y from, y to (m), the lidar at th
 
 
 def room_range_m(angle_rad):
-    """Range of the walls in directions counter-clockwise from the front."""
+    """Return the range to the walls in directions counter-clockwise from the front."""
     x0, x1, y0, y1 = ROOM
     c, s = np.cos(angle_rad), np.sin(angle_rad)
     with np.errstate(divide="ignore"):
@@ -28,7 +28,7 @@ def room_range_m(angle_rad):
 
 
 class Ld19:
-    """4500 points/s at 10 turns/s: 375 packets/s."""
+    """An LD19: 4500 points/s at 10 revolutions/s, 375 packets/s."""
 
     point_hz, speed_deg_s = 4500.0, 3600.0
 
@@ -67,7 +67,7 @@ class Ld19:
 
 
 class Rplidar:
-    """Answers requests; streams standard nodes, capsules, dense capsules or HQ packets."""
+    """An RPLIDAR that answers requests and streams standard nodes, capsules, dense capsules or HQ packets."""
 
     def __init__(self, kind=0x82, model=0x18, sample_hz=4000.0, turn_hz=5.5):
         self.kind, self.model, self.sample_hz, self.turn_hz = kind, model, sample_hz, turn_hz
@@ -159,12 +159,16 @@ class Rplidar:
         return self._head(angles[0] % 360.0, body)
 
     def _offsets_q3(self, angles):
-        """A triangulating lidar looks aside, the more the farther it sees: up to 8 degrees, in 1/8."""
+        """Return the angle offsets of a triangulation lidar: larger at larger range, up to 8 degrees,
+        in 1/8 degree.
+        """
         near = 98361.0 / (self._mm(angles) * 4.0) * 64.0 / 65536.0
         return np.clip(np.round((8.0 - np.degrees(near)) * 8.0), 0, 63).astype(int)
 
     def _ultra(self):
-        """Cabins of three samples; the third counts from the next cabin's, hence one more than is sent."""
+        """Encode cabins of three samples; the third is relative to the next cabin, so one more sample
+        is needed.
+        """
         angles = self._angles(96)
         ahead = angles[-1] + (np.arange(3) + 1) * 360.0 * self.turn_hz / self.sample_hz
         angles = np.concatenate([angles, ahead])
@@ -187,10 +191,10 @@ class Rplidar:
     @staticmethod
     def _difference(mm, shift):
         scaled = int(mm) >> shift
-        return scaled & 0x3FF if -512 < scaled < 511 else 0x1FF  # what does not fit is invalid
+        return scaled & 0x3FF if -512 < scaled < 511 else 0x1FF  # out of range: invalid
 
     def _aside(self, angles):
-        """The angle (rad) that a ULTRA host takes off, by the distance at which the beam ends."""
+        """Return the angle (rad) that the host subtracts in ULTRA mode, by the range of the beam's end."""
         aside = np.full(len(angles), np.radians(6.5))
         for _ in range(6):
             q2 = self._mm(angles - np.degrees(aside)) * 4.0
@@ -216,7 +220,7 @@ class Rplidar:
 
 
 class Hokuyo:
-    """A UST-10LX as SCIP 2.2 describes it: 1081 steps over 270 degrees, 40 scans/s."""
+    """A UST-10LX according to SCIP 2.2: 1081 steps over 270 degrees, 40 scans/s."""
 
     steps, first, last, front, rpm = 1440, 0, 1080, 540, 2400
 
@@ -269,7 +273,7 @@ class Hokuyo:
 
 
 def corrupt_bytes(data, rng, share):
-    """`data` with that share of its bytes replaced by random other ones."""
+    """Return `data` with a ratio of its bytes replaced by random other ones."""
     array = np.frombuffer(data, np.uint8).copy()
     hit = rng.random(len(array)) < share
     array[hit] ^= rng.integers(1, 256, hit.sum()).astype(np.uint8)
@@ -277,7 +281,7 @@ def corrupt_bytes(data, rng, share):
 
 
 class EmulatedPort:
-    """A device in real time behind a pseudo-terminal that comes and goes, or behind a TCP port."""
+    """Runs a device in real time behind a pseudo-terminal that can be removed, or behind a TCP port."""
 
     def __init__(self, device, path=None, corruption=0.0, seed=0):
         self.device, self.path, self.corruption = device, path, corruption
@@ -329,7 +333,7 @@ class EmulatedPort:
                 self._serve(connection, connection.recv, connection.sendall)
 
     def _write_master(self, data):
-        with contextlib.suppress(BlockingIOError):  # nobody reads: a UART loses it
+        with contextlib.suppress(BlockingIOError):  # no reader: a UART loses the bytes
             os.set_blocking(self._master, False)
             os.write(self._master, data)
 

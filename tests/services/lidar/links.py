@@ -1,4 +1,4 @@
-"""A link straight into an emulated device, without time passing."""
+"""A link to an emulated device without real time."""
 
 import numpy as np
 
@@ -27,7 +27,7 @@ class DirectLink:
 
 
 def run_device(driver, device, seconds, corruption=0.0, seed=0, chunk=None):
-    """Scans of so many seconds of the device; arrivals are late by a few random milliseconds."""
+    """Return the scans of `seconds` of the device; packets are delayed by random milliseconds."""
     rng = np.random.default_rng(seed)
     driver.start(DirectLink(device))
     begin, scans = device.seconds, []
@@ -41,7 +41,7 @@ def run_device(driver, device, seconds, corruption=0.0, seed=0, chunk=None):
 
 
 def range_errors_m(scans):
-    """Differences of all measured ranges from the room's walls."""
+    """Return the differences of all measured ranges from the room's walls."""
     found = [np.zeros(0)]
     for scan in scans:
         turn = scan.revolution

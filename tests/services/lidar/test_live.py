@@ -1,4 +1,4 @@
-"""Nodes that read emulated lidars over pseudo-terminals and sockets in real time."""
+"""Lidar nodes with emulated devices on pseudo-terminals and sockets in real time."""
 
 import threading
 import time
@@ -18,7 +18,7 @@ from tests.services.lidar.devices import EmulatedPort, Hokuyo, Ld19, Rplidar, ro
 
 
 class RunningSource:
-    """A source in a thread, without a bus; what it says with the time it said it."""
+    """Runs a node's source in a thread without a bus; keeps its messages with their times."""
 
     def __init__(self, node):
         self.node, self.messages = node, []
@@ -96,7 +96,7 @@ def test_a_reconnected_lidar_is_reopened(tmp_path, kind):
             plugged.plug()
             again = time.monotonic()
             running.wait(lambda: len(running.messages) >= before + 2)
-            # Whoever plugs it in sees data again within 2 s; twice that on a machine busy with other tests.
+            # Required: data again within 2 s; allow twice that on a machine busy with other tests.
             assert running.messages[before][0] - again < 4.0
     stamps = [scan.stamp_ns for _, scan in running.messages]
     assert sorted(set(stamps)) == stamps
@@ -122,7 +122,7 @@ def test_a_lidar_without_data_is_reopened(tmp_path):
 
 
 def test_the_baud_rate_is_found(tmp_path):
-    """An RPLIDAR at 460800: at other rates only rubbish comes and goes, as with a wrong rate on a wire."""
+    """An RPLIDAR at 460800: at other rates, as on a real line, only invalid bytes are transmitted."""
     path = str(tmp_path / "lidar")
     tried = []
 

@@ -1,4 +1,4 @@
-"""Bytes as the vendors' documents print them, to the numbers the same documents give."""
+"""Packets printed in the vendors' documents are decoded to the values printed there."""
 
 import itertools
 import struct
@@ -63,7 +63,9 @@ def test_rplidar_recorded_exchange():
 
 
 def _sdk_capsule(previous, current):
-    """sl_lidar_driver.cpp, _capsuleToNormal, in its integers: (angle q6, distance q2) of 32 samples."""
+    """Decode as _capsuleToNormal of sl_lidar_driver.cpp, in integers: (angle q6, distance q2) of 32
+    samples.
+    """
     start = [(struct.unpack_from("<H", p, 2)[0] & 0x7FFF) << 2 for p in (previous, current)]
     difference = start[1] - start[0] + (360 << 8 if start[0] > start[1] else 0)
     increment, angle, found = difference << 3, start[0] << 8, []
@@ -100,7 +102,9 @@ def _sdk_scale(code):
 
 
 def _sdk_ultra(previous, current):
-    """_ultraCapsuleToNormal in its integers: (angle q6 relative to an even one, distance q2) of 96 samples."""
+    """Decode as _ultraCapsuleToNormal, in integers: (angle q6 relative to an even one, distance q2), 96
+    samples.
+    """
     found = []
     words = [*struct.unpack("<32I", previous[4:]), struct.unpack_from("<I", current, 4)[0]]
     for word, after in itertools.pairwise(words):
@@ -130,7 +134,7 @@ def test_rplidar_ultra_capsules_match_slamtecs_decoder(cabins, after):
     assert np.array_equal(np.isfinite(measured.range_m), positive)
     assert measured.range_m[positive] * 4000 == pytest.approx(expected[positive, 1], abs=1e-6)
     assert measured.offset_deg[positive] == pytest.approx(expected[positive, 0], abs=1e-3)
-    alone = rp.parse_ultra(first, None)  # the packet behind is lost: all but the last samples are there
+    alone = rp.parse_ultra(first, None)  # the next packet is lost: only the last samples are missing
     assert np.array_equal(alone.range_m[:93], measured.range_m[:93], equal_nan=True)
     assert np.isnan(alone.range_m[95])
 

@@ -1,4 +1,4 @@
-"""Each lidar's stream at full rate, clean and with one byte in a hundred wrong, against the room's walls."""
+"""Each lidar's stream at full rate, undamaged and with 1 % wrong bytes, compared with the room's walls."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from beamsplat.services.lidar.rplidar import RplidarDriver
 from tests.services.lidar.devices import Hokuyo, Ld19, Rplidar
 from tests.services.lidar.links import range_errors_m, run_device
 
-# name: driver, device, beams of a turn, turns/s, error allowed (m): half a step of direction on these walls
+# name: driver, device, beams per revolution, revolutions/s, allowed error (m): half an angle step on these walls
 KINDS = {
     "ld19": (LdrobotDriver, Ld19, 450, 10.0, 0.01),
     "rplidar a1 express": (RplidarDriver, Rplidar, 727, 5.5, 0.04),
@@ -50,7 +50,7 @@ def test_clean_stream(kind):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_stamps_are_measurement_times(kind):
-    """Arrivals are late by 3 ms on average; the stamps must not wander with them."""
+    """Packets are delayed by 3 ms on average; the stamps must not vary with the delay."""
     make, device, _, turn_hz, _ = KINDS[kind]
     scans = run_device(make(), device(), 6.0, seed=3)
     stamps = np.array([s.stamp_ns for s in scans[5:]])
@@ -62,7 +62,9 @@ def test_stamps_are_measurement_times(kind):
 
 
 def front_times(scans):
-    """When the device looked to its front (s); the emulated clock starts at 1000 s, looking there."""
+    """Return when the device measured its front direction (s); the emulated clock starts at 1000 s, at
+    the front.
+    """
     found = []
     for scan in scans:
         turn = scan.revolution
@@ -80,7 +82,7 @@ def test_one_byte_in_a_hundred_wrong(kind):
     assert len(scans) > (0.25 if "ultra" in kind else 0.8) * 6.0 * turn_hz
     assert driver.noise.noisy
     errors = range_errors_m(scans)
-    # What the guard lets pass of a doubly wrong packet agrees with its neighbours to 2 cm + 0.5 %.
+    # Undetected wrong ranges agree with their neighbours to 2 cm + 0.5 %.
     assert errors.max() < (0.10 if "standard" in kind else 0.06)
     assert len(errors) > (0.1 if "ultra" in kind else 0.2) * beams * len(scans)
     measured_or_lost = len(errors) + driver.counters.lost_samples
@@ -93,7 +95,7 @@ def test_one_byte_in_a_hundred_wrong(kind):
 
 
 def test_hq_at_a_wrong_byte_in_a_thousand():
-    """Packets of 781 bytes: at one in a hundred none would be whole."""
+    """Packets have 781 bytes: with 1 % wrong bytes none would be undamaged."""
     make, device, beams, *_ = KINDS["rplidar s1 hq"]
     driver = make()
     scans = run_device(driver, device(), 6.0, corruption=0.001, seed=1)
@@ -153,7 +155,7 @@ def test_device_clock_uses_the_least_delayed_packets_and_rejects_wrong_times():
     stamp = clock.stamp_ns(2000 * 0.00267)
     assert stamp / 1e9 == pytest.approx(50.0 + 2000 * 0.00267 * (1.0 + 5e-5), abs=0.001)
     assert clock.stamp_ns(0.0) == stamp + 1  # never backwards
-    for i in range(8):  # another device, whose clock says something else
+    for i in range(8):  # a device with another clock
         clock.update(1000.0 + i, int((60.0 + i) * 1e9))
     assert clock.stamp_ns(1008.0) / 1e9 == pytest.approx(68.0, abs=0.001)
 
@@ -174,7 +176,7 @@ def test_unconfirmed_ranges_are_rejected():
     angle = np.radians(np.arange(-40, 41))
     wall = 2.0 / np.cos(angle)
     nothing = np.full(81, np.nan)
-    assert confirmed_ranges(wall, nothing).all()  # at the ends by what lies on one side
+    assert confirmed_ranges(wall, nothing).all()  # at the ends by neighbours on one side
     twisted = wall.copy()
     twisted[50], twisted[52] = wall[50] - 0.4, wall[52] + 0.4  # one bit of two bytes, up and down
     assert not confirmed_ranges(twisted, nothing)[[50, 52]].any()
@@ -183,6 +185,6 @@ def test_unconfirmed_ranges_are_rejected():
     assert not confirmed_ranges(wrong, nothing)[[30, 31]].any()
     assert not confirmed_ranges(wrong, wall)[[30, 31]].any()
     post = wall.copy()
-    post[40] = 1.0  # a chair leg that was there a turn ago as well
+    post[40] = 1.0  # a chair leg, also seen one revolution before
     assert not confirmed_ranges(post, nothing)[40]
     assert confirmed_ranges(post, post)[40]

@@ -1,4 +1,4 @@
-"""An emulated lidar on a wire, and the SLAM behind it: separate processes, as on a robot."""
+"""An emulated lidar on a serial line and SLAM, in separate processes as on a robot."""
 
 import time
 
@@ -40,7 +40,7 @@ def test_localization_with_a_lidar_on_a_noisy_link(tmp_path, free_endpoint):
             time.sleep(0.05)
         detail = board.records["lidar"].health.detail
         stopped = time.monotonic()
-    assert time.monotonic() - stopped < 6.0, "somebody had to be killed"
+    assert time.monotonic() - stopped < 6.0, "a process had to be killed"
     good = [p for p in poses if p.status == "ok"]
     assert len(good) >= 30
     wandered_m = max(float(np.linalg.norm(p.T_odom_body[:3, 3])) for p in good)

@@ -1,4 +1,4 @@
-"""Reading .rrd files back, and rerun in strict mode: a drawing it does not like must fail here."""
+"""Fixtures to read .rrd files, and rerun in strict mode, so that invalid entries raise."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ from rerun.chunk import RrdReader
 
 
 class RrdFile:
-    """What a .rrd file holds."""
+    """The content of a .rrd file."""
 
     def __init__(self, path):
         reader = RrdReader(path)
@@ -23,7 +23,7 @@ class RrdFile:
         return {path for path in self._chunks if not path.startswith("__")}
 
     def rows(self, entity):
-        """(column names -> values) of each row of an entity, in order of its time."""
+        """Return the rows (column name -> value) of an entity in order of time."""
         found = []
         for chunk in self._chunks.get(entity, []):
             batch = chunk.to_record_batch()
@@ -35,7 +35,7 @@ class RrdFile:
         return [row["time"].value for row in self.rows(entity) if "time" in row]
 
     def column(self, entity, part):
-        """The values of the one component whose name contains `part`, one array a row that has it."""
+        """Return the values of the component whose name contains `part`, one array per row that has it."""
         values = []
         for row in self.rows(entity):
             for name, value in row.items():

@@ -1,5 +1,6 @@
-"""A small system with something to see for the page: a camera, a lidar, a robot that drives a circle in a
-room, its map, depth with a scale."""
+"""A small system for tests of the page: camera, lidar, a robot that drives a circle in a room, map and
+depth.
+"""
 
 import time
 
@@ -16,11 +17,11 @@ from beamsplat.common.runtime.registry import Service
 NASTY = "<img src=x onerror=\"document.title='taken over'\"> & <b>bold</b>"
 SCALE, SCALE_SIGMA = 1.25, 0.05
 RADIUS_M = 1.0
-WALL_M = 2.0  # the room's walls, from its middle
+WALL_M = 2.0  # distance of the room's walls from its centre
 
 
 class RoomSensors(Node):
-    """Pictures at 10 Hz, grey by grey, and scans of a square room, as if it happened now."""
+    """Publishes images at 10 Hz with changing grey, and scans of a square room, in real time."""
 
     name = "replay"
     outputs = ("rig", "camera/image", "lidar/scan")
@@ -50,7 +51,7 @@ class RoomSensors(Node):
 
 
 class CirclingLocalization(Node):
-    """Where the robot is, and the map of the room."""
+    """Publishes poses on a circle, and the map of the room."""
 
     name = "localization"
     inputs = ("lidar/scan",)
@@ -83,7 +84,7 @@ class FloorDepthConfig(NodeConfig):
 
 
 class FloorDepth(Node):
-    """Depth of a floor, with its scale."""
+    """Publishes depth of a floor with its scale."""
 
     name = "fusion"
     Config = FloorDepthConfig

@@ -1,4 +1,4 @@
-"""Real messages in, an .rrd out: what is drawn, where, when, and how often."""
+"""Messages in, a .rrd file out: entities, frames, times and rates."""
 
 import cv2
 import numpy as np
@@ -36,12 +36,12 @@ T_BODY_CAMERA = camera_mount(0.1, 0.02, 0.45, pitch_down_rad=0.1)
 
 
 def _T_map_body(t_s):
-    """A robot that drives a circle at 0.5 m/s and turns at 0.5 rad/s."""
+    """Return the pose of a robot that drives a circle at 0.5 m/s and turns at 0.5 rad/s."""
     return se2_to_se3(np.array([np.sin(0.5 * t_s), -np.cos(0.5 * t_s), 0.5 * t_s]))
 
 
 def _scan(t_s):
-    """Each beam from where the lidar is at the beam's own time, to the walls of the room."""
+    """Return a scan with motion distortion: each beam starts at the lidar's pose at the beam's time."""
     beams, sweep_s = 360, 0.1
     ranges = np.zeros(beams, np.float32)
     increment = 2.0 * np.pi / beams
@@ -70,7 +70,7 @@ JPEG = _jpeg()
 
 
 class RoomRecording(Node):
-    """Three seconds of a drive in the room."""
+    """Publishes three seconds of a drive in the room."""
 
     name = "replay"
     outputs = ("rig", "camera/image", "lidar/scan", "wheel/odometry", "external/pose")
@@ -96,7 +96,7 @@ class RoomRecording(Node):
 
 
 class TrueLocalization(Node):
-    """Knows where it is."""
+    """Publishes the true pose."""
 
     name = "localization"
     inputs = ("lidar/scan",)
@@ -166,7 +166,9 @@ def test_images_are_stored_unchanged(saved):
 
 
 def test_scan_points_are_on_the_walls_while_the_robot_moves(saved):
-    """5 cm driven and 2.9 degrees turned within each sweep: undistorted, within a centimetre."""
+    """The robot moves 5 cm and turns 2.9 degrees within each scan; deskewed points are within a
+    centimetre.
+    """
     scans = saved.column("map/scan", "Points3D:positions")
     assert len(scans) == 30
     for points in scans[:-1]:  # the last sweep has no pose at its end
@@ -190,7 +192,7 @@ def test_the_robot_is_drawn_at_the_localized_pose(saved):
 
 
 def test_paths_are_in_the_map_frame(saved):
-    """The wheels' drifting frame is laid on the map where the robot was first known to be."""
+    """The wheels' frame is aligned to the map at the first known pose."""
     for source in ("localization", "external", "wheel"):
         points = saved.column(f"map/path/{source}", "LineStrips3D:strips")[-1].reshape(-1, 3)
         assert len(points) > 10, source
@@ -263,7 +265,7 @@ def test_without_localization_the_best_other_source_is_used(tmp_path, read_rrd):
     monitor = _monitor(tmp_path)
     still = {"velocity_m_s": np.zeros(3), "angular_velocity_rad_s": np.zeros(3)}
     wheel_at = se2_to_se3(np.array([0.2, 0.0, 0.0]))
-    _tell(monitor, "lidar/scan", _scan(0.0))  # nothing known yet: drawn around the origin
+    _tell(monitor, "lidar/scan", _scan(0.0))  # no pose yet: drawn at the origin
     _tell(monitor, "wheel/odometry", WheelOdometry(stamp_ns=_ns(0.1), T_odom_body=wheel_at, **still))
     map_at = se2_to_se3(np.array([3.0, 1.0, 0.5]))
     _tell(monitor, "external/pose", ExternalPose(stamp_ns=_ns(0.2), T_map_body=map_at))

@@ -1,4 +1,4 @@
-"""The monitor as a process among others: it shows, it saves, and nobody waits for it."""
+"""The monitor as a process of a system: it draws, it saves, and no node waits for it."""
 
 import itertools
 import os
@@ -62,7 +62,7 @@ def test_a_stopped_monitor_blocks_no_node_and_its_file_is_valid(system, read_rrd
     scans, pictures = (_sent(board, "replay", t) for t in ("lidar/scan", "camera/image"))
     os.kill(monitor, signal.SIGSTOP)
     try:
-        # 5 s of data at its own speed, while 3 MB of pictures a second pile up for somebody who sleeps.
+        # 5 s of data in real time, while the stopped monitor receives 3 MB of images per second.
         poll(supervisor, lambda: _sent(board, "replay", "lidar/scan") >= scans + 50, 15)
         assert _sent(board, "replay", "camera/image") >= pictures + 130
         slam = _received(board, "localization", "lidar/scan")
@@ -100,7 +100,7 @@ def test_a_port_in_use_is_reported(free_endpoint):
 
 
 def test_a_closed_viewer_window_is_reported_and_the_node_continues(monkeypatch, tmp_path, read_rrd):
-    """Without a display the viewer ends at once; the file is written all the same."""
+    """Without a display the viewer ends at once; the file is written nevertheless."""
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
     monitor = MonitorNode(MonitorConfig(view="spawn", grpc_port=0, save=tmp_path / "a.rrd"))

@@ -1,4 +1,4 @@
-"""The Gaussian map in the viewer: where its chunks lie, which version is shown, figures, the render."""
+"""The Gaussian map in the viewer: frames of chunks, revisions, metrics, render."""
 
 import cv2
 import numpy as np

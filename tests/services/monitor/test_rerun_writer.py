@@ -1,4 +1,4 @@
-"""Sinks that stall, fill up, vanish or cannot be opened: the node goes on and says so."""
+"""Sinks that stall, fill up, disappear or cannot be opened: the node continues and reports it."""
 
 import subprocess
 import sys
@@ -14,7 +14,7 @@ from beamsplat.services.monitor.rerun_writer import _QUEUE, _QUEUE_BYTES, RerunW
 
 
 class StuckStream:
-    """A recording stream whose sink stops reading until the test lets it go on."""
+    """A recording stream whose sink blocks until the test opens the gate."""
 
     def __init__(self):
         self.gate = threading.Event()
@@ -115,7 +115,7 @@ def test_a_removed_file_is_reported(tmp_path):
 
 
 def test_a_write_error_is_reported(tmp_path):
-    """The kernel refuses to write beyond a size, as a full disk would."""
+    """The kernel refuses to write beyond a file size, as a full disk would."""
     script = """
         import os, resource, sys, time
         from pathlib import Path

@@ -1,5 +1,7 @@
-"""A real headless browser. `python -m tests.services.page.browser ADDRESS OUT.png` makes the page's
-picture in docs/: run a system with a page, and call it when there is something to see."""
+"""A headless browser for tests.
+
+`python -m tests.services.page.browser ADDRESS OUT.png` makes the screenshot in docs/ from a running page.
+"""
 
 import contextlib
 import os
@@ -15,11 +17,11 @@ DESK = {"width": 1280, "height": 1150}
 
 @contextlib.contextmanager
 def browser():
-    """Chromium as this machine has it; skips the test where there is none."""
+    """Start the machine's Chromium; skip the test if there is none."""
     api = pytest.importorskip("playwright.sync_api", reason="needs playwright: pip install -e '.[dev]'")
     if CHROMIUM is None:
         pytest.skip("needs a browser: apt-get install chromium")
-    sandbox = ["--no-sandbox"] if os.getuid() == 0 else []  # root cannot have one
+    sandbox = ["--no-sandbox"] if os.getuid() == 0 else []  # Chromium has no sandbox for root
     with api.sync_playwright() as playwright:
         chromium = playwright.chromium.launch(executable_path=CHROMIUM, args=sandbox)
         try:
@@ -29,7 +31,7 @@ def browser():
 
 
 def main(address, out):
-    """The page as it is a few seconds after it was opened."""
+    """Save a screenshot of the page a few seconds after it was opened."""
     with browser() as chromium:
         page = chromium.new_page(viewport=DESK, device_scale_factor=1)
         page.goto(address)

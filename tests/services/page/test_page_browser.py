@@ -1,5 +1,4 @@
-"""The page of a running system in a real browser: what is there shows, what dies shows, and nobody
-commands without the right."""
+"""The page of a running system in a real browser: content, faults, and commands with and without token."""
 
 import contextlib
 import json
@@ -113,14 +112,14 @@ def test_the_page_shows_the_running_system(chromium, start, size):
         poll(system, lambda: page.inner_text("#scale-text") == "1.250 ± 0.050", 10)
         assert "90 % of the lidar-depth pairs are inliers" in page.inner_text("#words")
         poll(system, lambda: "by localization" in page.inner_text("#pose"), 10)
-        # The robot, its path and the map: their own colours are on the canvas.
+        # Robot, path and map have different colours on the canvas.
         poll(system, lambda: page.evaluate(_COLOURS)["map"] > 1000, 10)
         colours = page.evaluate(_COLOURS)
         assert colours["robot"] > 20
         assert colours["path"] > 20
         poll(system, lambda: "10.0" in page.inner_text('tr[data-topic="camera/image"]'), 15)
         assert "page" in page.inner_text('tr[data-topic="camera/image"]')
-        # What a node says is text, whatever it says.
+        # Status texts of nodes are shown as text, not as HTML.
         assert NASTY in page.inner_text("#nodes")
         assert page.title() == "BeamSplat"
         assert page.evaluate("document.documentElement.scrollWidth <= window.innerWidth"), "scrolls sideways"
@@ -230,7 +229,7 @@ def test_a_swap_from_the_page_works(chromium, start):
 
 
 def _command(address, order, token, method="POST"):
-    """(status, text) of a command given by a script."""
+    """Send a command as a script; return (status, text)."""
     headers = {} if token is None else {"Authorization": f"Bearer {token}"}
     body = json.dumps(order).encode() if method == "POST" else None
     request = urllib.request.Request(address + "command", body, headers, method=method)

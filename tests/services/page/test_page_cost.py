@@ -1,4 +1,4 @@
-"""What ten viewers cost: everything is encoded once, and sent ten times."""
+"""CPU cost of ten open pages: everything is encoded once and sent ten times."""
 
 import json
 import re
@@ -21,7 +21,7 @@ SECONDS = 20.0
 
 
 class BrowserClient(threading.Thread):
-    """Does what a browser with the page does: takes the events, and gets each picture that they name."""
+    """Acts as a browser with the page: receives the events and fetches each announced image."""
 
     def __init__(self, port):
         super().__init__(daemon=True)
@@ -50,7 +50,7 @@ class BrowserClient(threading.Thread):
 
 
 def _cpu_percent(process, supervisor):
-    """Of a core, over some seconds."""
+    """Return the CPU load of a process in percent of a core, over some seconds."""
     began, before = time.monotonic(), process.cpu_times()
     while time.monotonic() < began + SECONDS:
         supervisor.poll()

@@ -1,4 +1,4 @@
-"""The page's server by itself: who looks costs once, who is slow holds nobody up, who is rude gets a reply."""
+"""The page's server alone: encoding cost, slow clients, invalid requests."""
 
 import json
 import math
@@ -35,7 +35,7 @@ TOKEN = "correct horse battery"
 
 
 class Serving:
-    """A server with a view that a test fills."""
+    """A running server whose state a test sets."""
 
     def __init__(self, picture_hz=20.0, robot_hz=20.0):
         self.state = PageState(picture_hz, picture_hz)
@@ -54,7 +54,7 @@ class Serving:
         self.server.close()
 
     def ask(self, raw):
-        """The reply to some bytes, as (status, body)."""
+        """Send raw bytes; return (status, body) of the response."""
         with socket.create_connection(("127.0.0.1", self.port), timeout=10) as s:
             s.sendall(raw)
             s.shutdown(socket.SHUT_WR)
@@ -82,7 +82,7 @@ def _wait(until, timeout_s=20.0):
 
 
 class EventReader(threading.Thread):
-    """Counts the events of one viewer."""
+    """Collects the events of one stream."""
 
     def __init__(self, viewer):
         super().__init__(daemon=True)

@@ -1,9 +1,9 @@
-"""A robot as rmw_zenoh_cpp would have it, in a process of its own: replays a ROS 2 bag onto the bus.
+"""A robot that publishes as rmw_zenoh_cpp does, in its own process: replays a ROS 2 bag.
 
-Written from rmw_zenoh's documents with Zenoh's own serializer and rosbags; it uses nothing of ours.
+Written from rmw_zenoh's documents with Zenoh's serializer and rosbags, independently of our code.
 Usage: python -m tests.services.ros2.robot_process ENDPOINT DOMAIN BAG RATE SECONDS NOW TF
-Prints a line of JSON for each message that comes back on /map, /tf, /beamsplat/pose and /beamsplat/cloud.
-NOW = 1 puts the bag's stamps in the present, TF = 1 replays its /tf, too.
+Prints a line of JSON for each message received on /map, /tf, /beamsplat/pose and /beamsplat/cloud.
+NOW = 1 shifts the bag's stamps to the present, TF = 1 also replays its /tf.
 """
 
 import json

@@ -1,4 +1,4 @@
-"""A recorded ROS 2 drive, replayed onto rmw_zenoh's keys by another process, through a router."""
+"""A ROS 2 recording, replayed with rmw_zenoh's keys by another process, through a router."""
 
 import json
 import subprocess
@@ -49,7 +49,7 @@ class RobotProcess:
 
 
 class RunningNodes:
-    """Nodes on the bus, each in a thread."""
+    """Runs nodes on the bus, each in a thread."""
 
     def __init__(self, endpoint, folder, *nodes):
         settings = LiveSettings("test", (endpoint,), folder)
@@ -93,7 +93,9 @@ def _collect(bus, *topics):
 
 
 def test_a_ros2_robot_needs_no_options(tmp_path, free_endpoint):
-    """No option but the domain: calibration, scans, pictures and odometry arrive, stamps and bytes unchanged."""
+    """With only the domain set, calibration, scans, images and odometry arrive with unchanged stamps
+    and bytes.
+    """
     bag = write_bag(tmp_path, "mcap", Drive(seconds=6.0))
     node = Ros2Node(Ros2Config(domain=3, router=free_endpoint))
     topics = ("rig", "lidar/scan", "camera/image", "wheel/odometry")
@@ -237,7 +239,9 @@ def test_results_are_published_with_attachments_and_tokens(tmp_path, free_endpoi
 
 @pytest.mark.slow
 def test_a_recorded_drive_runs_the_whole_system_over_ros2(tmp_path, free_endpoint, shared_dir):
-    """house_a's bag, replayed onto ROS 2's keys: SLAM, depth and fusion run, and ROS gets map and poses."""
+    """house_a's bag, replayed with ROS 2's keys: SLAM, depth and fusion run, and ROS receives map and
+    poses.
+    """
     nodes = {
         "ros2": {"domain": 9, "router": free_endpoint}, "localization": {"kind": "lidar", "grid_every_scans": 20},
         "depth": {"source": "stixel"}, "fusion": {}, "ros2_out": {"domain": 9, "router": free_endpoint},
@@ -262,7 +266,7 @@ def test_a_recorded_drive_runs_the_whole_system_over_ros2(tmp_path, free_endpoin
 
 
 def test_wheel_odometry_is_taken_from_tf(tmp_path, free_endpoint):
-    """No Odometry topic: odom -> base_link on /tf is the wheels', and our own /tf beside it is not."""
+    """Without an Odometry topic, odom -> base_link on /tf is the odometry; our own /tf is ignored."""
     bag = write_bag(tmp_path, "mcap", Drive(seconds=8.0, odometry=False, tf="repeated"))
     node = Ros2Node(Ros2Config(domain=5, router=free_endpoint))
     out = Ros2OutNode(Ros2OutConfig(domain=5, router=free_endpoint))
@@ -275,7 +279,7 @@ def test_wheel_odometry_is_taken_from_tf(tmp_path, free_endpoint):
         ):
             elsewhere = np.eye(4)
             elsewhere[0, 3] = 50.0
-            for i in range(10_000):  # what ros2_out says of it on /tf must not come back as the robot's
+            for i in range(10_000):  # what ros2_out publishes on /tf must not be taken for the robot's
                 if len(got["wheel/odometry"]) >= 20 or i == 600:
                     break
                 said.put(Odometry(stamp_ns=START_NS + i * 10**8, T_odom_body=elsewhere, covariance=np.eye(3)))

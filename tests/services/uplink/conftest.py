@@ -1,4 +1,4 @@
-"""Drives for tests on two hosts."""
+"""Recordings for tests on two hosts."""
 
 import subprocess
 import sys
@@ -10,7 +10,7 @@ from tests.services.uplink.radio import ROOT, needs_namespaces
 
 @pytest.fixture(scope="session")
 def drive(tmp_path_factory):
-    """(laps) -> a simulated drive that ends where it began, 70 s a lap."""
+    """(laps) -> a simulated drive that ends where it started, 70 s per lap."""
     needs_namespaces()
     made = {}
 

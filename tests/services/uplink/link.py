@@ -1,4 +1,4 @@
-"""A link between two hosts that a test can cut: a TCP relay on loopback."""
+"""A TCP relay on loopback as a link between two hosts that a test can cut."""
 
 import contextlib
 import selectors
@@ -10,8 +10,10 @@ from tests.conftest import free_port
 
 
 class CuttableLink:
-    """Connect to `port`, and what is said arrives at `target_port`, unless the link is cut: then it is silent,
-    as a radio out of reach is, and nothing tells either side."""
+    """Forwards connections to `port` to `target_port`.
+
+    While it is cut nothing is forwarded and connections stay open, as with a radio out of range.
+    """
 
     def __init__(self, target_port, rate_bytes_s=None):
         self._target, self._rate = target_port, rate_bytes_s

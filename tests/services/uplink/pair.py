@@ -1,7 +1,8 @@
-"""The real system on two hosts with a radio between them: a recorded drive on one, the map on the other.
+"""The real system on two hosts with a radio between them: one replays a drive, the other maps.
 
-All times are of one machine's clock, which both hosts share: `sent_ns` is in a message's header (its producer's
-monotonic clock as it was handed to the bus), `heard_ns` is taken by a subscriber beside the consumers.
+All times are of one machine's clock, which both hosts share: `sent_ns` is in a message's header (monotonic
+time
+of publishing), `heard_ns` is the time of reception by a subscriber next to the consumers.
 """
 
 import contextlib
@@ -31,7 +32,7 @@ LIGHT = {
 
 
 class ReceivedMessages:
-    """What one side has heard so far."""
+    """The messages that one host has received so far."""
 
     def __init__(self, path):
         lines = path.read_text().splitlines() if path.exists() else []
@@ -41,7 +42,7 @@ class ReceivedMessages:
         return [line for line in self.lines if line["topic"] == topic]
 
     def first(self, topic, what):
-        """stamp_ns -> the earliest `what` ("heard_ns", "sent_ns")."""
+        """Return stamp_ns -> the earliest `what` ("heard_ns", "sent_ns")."""
         out = {}
         for line in self.of(topic):
             out[line["stamp_ns"]] = min(line[what], out.get(line["stamp_ns"], line[what]))
@@ -49,7 +50,7 @@ class ReceivedMessages:
 
 
 class HostProcess:
-    """A side (see tests.services.uplink.side) that runs on one of the hosts."""
+    """A host's process (tests.services.uplink.side)."""
 
     def __init__(self, radio, namespace, deployment, folder):
         folder.mkdir(parents=True)
@@ -88,7 +89,7 @@ class HostProcess:
 
 
 class BadLinkPair:
-    """`near` drives, `far` maps into `session`; use with `with`."""
+    """Two hosts: `near` drives, `far` maps into `session`; use with `with`."""
 
     def __init__(self, radio, folder, data, *, duration_s=None, mapping=LIGHT, rate=RATE):
         self._radio, self._folder = radio, folder
@@ -125,7 +126,7 @@ class BadLinkPair:
         self._stack.close()
 
     def wait(self, until, timeout_s):
-        """Until `until(near, far)`, given the states of both."""
+        """Wait until `until(near, far)` is true for the states of both hosts; return the states."""
         deadline = time.monotonic() + timeout_s
         while time.monotonic() < deadline:
             near, far = self.near.state(), self.far.state()
@@ -137,7 +138,7 @@ class BadLinkPair:
         )
 
     def drained(self, timeout_s):
-        """All that was driven is mapped."""
+        """Wait until everything that was driven is mapped."""
         return self.wait(
             lambda near, far: (
                 near["states"].get("keyframes") == "drained" and far["states"].get("mapping") == "drained"
@@ -147,11 +148,11 @@ class BadLinkPair:
 
     @property
     def queued(self):
-        """Ids of keyframes on the robot's disk."""
+        """Ids of the keyframes on the robot's disk."""
         return {int(p.stem) for p in (self._robot.run_dir / "keyframes").glob("*.keyframe")}
 
     def durable(self):
-        """id -> when it was on the edge's disk (monotonic ns; from the file's time of writing)."""
+        """Return id -> when the keyframe was on the edge's disk (monotonic ns, from the file's time)."""
         shift_ns = time.monotonic_ns() - time.time_ns()
         folder = SessionFolder(self.session)
         return {
@@ -160,14 +161,14 @@ class BadLinkPair:
 
 
 def quantiles(values_ns):
-    """(p50, p95, p99, largest) in ms."""
+    """Return (p50, p95, p99, maximum) in ms."""
     if not len(values_ns):
         return (float("nan"),) * 4
     return tuple(np.percentile(np.asarray(values_ns) / 1e6, (50, 95, 99, 100)))
 
 
 def onboard(log, since_ns, until_ns):
-    """(share of scans that got a pose, poses/s, latencies in ns) of the robot's localization."""
+    """Return (ratio of scans with a pose, poses/s, latencies in ns) of the robot's localization."""
     scans = {s: t for s, t in log.first("lidar/scan", "sent_ns").items() if since_ns <= t < until_ns}
     poses = log.first("localization/odometry", "sent_ns")
     late = [poses[s] - t for s, t in scans.items() if s in poses]
@@ -176,7 +177,9 @@ def onboard(log, since_ns, until_ns):
 
 
 def transit(near, far, topic, since_ns, until_ns):
-    """Latencies in ns, from sent first on the robot to heard first on the edge; and how many never came."""
+    """Return latencies in ns from first sent on the robot to first received on the edge, and the number
+    missing.
+    """
     sent, heard = near.first(topic, "sent_ns"), far.first(topic, "heard_ns")
     mine = {s: t for s, t in sent.items() if since_ns <= t < until_ns}
     return [heard[s] - t for s, t in mine.items() if s in heard], sum(s not in heard for s in mine)

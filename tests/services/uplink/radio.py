@@ -1,6 +1,6 @@
-"""Two hosts on one machine, as network namespaces with a radio between them; needs root and TUN devices.
+"""Two hosts on one machine: network namespaces with an emulated radio; needs root and TUN devices.
 
-Both see the same clocks, so that times taken on one side can be subtracted from times taken on the other.
+Both share the same clocks, so that times of both sides can be compared.
 """
 
 import contextlib
@@ -20,7 +20,7 @@ NEAR_ADDRESS, FAR_ADDRESS = "10.77.0.1", "10.77.0.2"
 
 
 def needs_namespaces():
-    """Skips where two hosts cannot be made."""
+    """Skip the test if namespaces cannot be made."""
     if os.geteuid() != 0 or not Path("/dev/net/tun").exists() or shutil.which("ip") is None:
         pytest.skip("needs root, /dev/net/tun and the command `ip`, to make two hosts of one machine")
     probe = subprocess.run(["ip", "netns", "add", f"probe{os.getpid()}"], capture_output=True, text=True)
@@ -30,7 +30,10 @@ def needs_namespaces():
 
 
 class Radio:
-    """`near` and `far` are namespaces; `rate` bounds each direction in front of a queue of `queue_ms`."""
+    """An emulated radio between the namespaces `near` and `far`.
+
+    `rate_mbit` limits each direction, behind a queue of `queue_ms`.
+    """
 
     def __init__(self, rate_mbit=None, delay_ms=0.0, loss=0.0, seed=0, congestion="bbr", queue_ms=100):
         self._rate, self._queue_ms, self._congestion = rate_mbit, queue_ms, congestion
@@ -73,15 +76,15 @@ class Radio:
                      "burst", "8kb", "latency", f"{self._queue_ms}ms")  # fmt: skip
 
     def run(self, name, *command):
-        """A command on one of the hosts, which must succeed."""
+        """Run a command on one of the hosts; it must succeed."""
         subprocess.run(self.on(name, *command), check=True, capture_output=True, text=True)
 
     def on(self, name, *command):
-        """The command line that runs a command on one of the hosts."""
+        """Return the command line that runs a command on one of the hosts."""
         return ["ip", "netns", "exec", name, *command]
 
     def tell(self, text):
-        """cut, mend, loss SHARE, count: (what went from near to far, what came back) so far."""
+        """Send a command (cut, mend, loss RATIO, count); return the counts (near to far, far to near)."""
         self._relay.stdin.write(text + "\n")
         self._relay.stdin.flush()
         return tuple(json.loads(self._relay.stdout.readline()))

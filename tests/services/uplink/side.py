@@ -33,13 +33,13 @@ _POLL_S = 0.1
 
 
 class MessageLog:
-    """A line for each message heard: topic, when (monotonic ns), and what its header says."""
+    """Writes a line for each received message: topic, time (monotonic ns), and fields of its header."""
 
     def __init__(self, path: Path) -> None:
         self._file = path.open("w", buffering=1 << 16)
 
     def listen(self, session, robot: str, name: str):
-        """Writes from now on what comes on a topic; keep what this returns."""
+        """Log the messages of a topic from now on; keep the returned subscriber."""
         row = topic(name)
 
         def take(sample) -> None:
@@ -63,7 +63,7 @@ class MessageLog:
 
 
 class Side:
-    """Answers commands about one supervisor."""
+    """Executes commands on one supervisor."""
 
     def __init__(self, supervisor: Supervisor, board: HealthBoard) -> None:
         self._supervisor, self._board = supervisor, board

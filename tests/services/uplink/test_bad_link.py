@@ -38,7 +38,7 @@ def print_transit(near, far, since_ns, until_ns):
 
 
 def run_with_cut(pair, radio, cut_s):
-    """(when cut, when mended), monotonic ns."""
+    """Run and cut the link; return (begin, cut, mended), monotonic ns."""
     pair.wait(lambda near, far: len(pair.far.log.of("keyframes/frame")) >= 2, 120)
     begin_ns = time.monotonic_ns()
     time.sleep(SETTLED_S)
@@ -66,7 +66,9 @@ def print_recovery(pair, cut_ns, mended_ns):
 
 
 def check_complete(pair):
-    """Every keyframe that the robot made is on the edge's disk and in its map, or was refused and said."""
+    """Check that every keyframe of the robot is on the edge's disk and in its map, or was refused with
+    a message.
+    """
     made = set(pair.near.log.first("keyframes/frame", "sent_ns"))
     refused = {line["stamp_ns"] for line in pair.far.log.of("keyframes/ack") if line["status"] != "ok"}
     print_line("keyframes made, refused", f"{len(made)}, {len(refused)}")

@@ -1,4 +1,4 @@
-"""Processes of robot and edge that die at random over a bad link: nothing wedges, no keyframe is lost."""
+"""Processes of robot and edge are killed at random over a bad link: nothing blocks, no keyframe is lost."""
 
 import math
 import os
@@ -22,7 +22,7 @@ SEED = int(os.environ.get("BEAMSPLAT_KILL_SEED", "0"))
 
 
 def kill_at_random(pair, kills, minutes, seed):
-    """Seconds and victims, drawn from the seed; as they came about."""
+    """Kill random processes at random times of a seed; return (time, side, name, killed) of each."""
     chance = random.Random(seed)
     times_s = sorted(chance.uniform(0.0, 60.0 * minutes) for _ in range(kills))
     begin, done = time.monotonic(), []
@@ -35,7 +35,7 @@ def kill_at_random(pair, kills, minutes, seed):
 
 
 def all_active(near, far):
-    """Every process runs, and has said so since."""
+    """Return whether every process runs and has published its health since."""
     now_ns = time.time_ns()
     for state in (near, far):
         if state["down"] or any(now_ns - t > 3_000_000_000 for n, t in state["seen_ns"].items()):
@@ -44,12 +44,12 @@ def all_active(near, far):
 
 
 def drained(near):
-    """The recording has ended, and everything of it is dealt with."""
+    """Return whether the recording has ended and all keyframes are done."""
     return near["states"].get("keyframes") == "drained"
 
 
 def losses(pair, data_ids):
-    """Keyframes made that are neither on the edge's disk, nor refused, nor still on the robot's."""
+    """Return keyframes that are neither on the edge's disk, nor refused, nor on the robot's disk."""
     acks = pair.far.log.of("keyframes/ack")
     refused = {line["stamp_ns"] for line in acks if line["status"] != "ok"}
     return data_ids - set(pair.durable()) - refused - pair.queued
@@ -57,7 +57,9 @@ def losses(pair, data_ids):
 
 @pytest.mark.soak
 def test_any_process_may_be_killed_at_any_time(tmp_path, drive):
-    """A killed localization begins a new map: what waits of the one before stays on the robot, counted."""
+    """A killed localization starts a new map: queued keyframes of the old one stay on the robot and are
+    counted.
+    """
     seconds = RATE * (60.0 * MINUTES + 30.0)
     laps = drive(math.ceil(seconds / LAP_S))
     with Radio(**BAD) as radio, BadLinkPair(radio, tmp_path, laps, duration_s=seconds, mapping=QUICK) as pair:

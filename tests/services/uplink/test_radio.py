@@ -1,4 +1,4 @@
-"""The radio that other tests rely on: its delay, its loss, its cut."""
+"""The emulated radio: delay, loss, cut."""
 
 import json
 import subprocess
@@ -32,7 +32,7 @@ with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as mouth:
 
 
 def heard_over(radio, cut=False):
-    """Number of a datagram -> ms that it took; with `cut`, the later half is sent while the radio is cut."""
+    """Return datagram number -> delay in ms; with `cut` the second half is sent during a cut."""
 
     def send(*numbers):
         subprocess.run(radio.on(radio.near, sys.executable, "-c", _SEND, *map(str, numbers)), check=True)

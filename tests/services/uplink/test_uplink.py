@@ -1,4 +1,4 @@
-"""A robot and its edge server, each with a router and processes of its own, and a link that breaks."""
+"""A robot and its edge server, each with router and processes, over a link that breaks."""
 
 import contextlib
 import os
@@ -30,7 +30,7 @@ TABLE = {**TABLE, "uplink": NODES["uplink"]}
 
 
 class Pair:
-    """Two supervisors; the link between them goes through a relay that the test can cut."""
+    """Deployments of robot and edge; the link between them goes through a relay that a test can cut."""
 
     def __init__(
         self, tmp_path, pictures, rate_bytes_s=None, edge_security=None, robot_security=None, scheme="tcp"
@@ -57,7 +57,7 @@ class Pair:
 
 @contextlib.contextmanager
 def running(pair):
-    """(supervisor, session, board) of robot and edge; the edge is there first, as it is at home."""
+    """Start edge, then robot; yield (supervisor, session, board) of robot and edge."""
     with contextlib.ExitStack() as stack:
         stack.enter_context(pair.link)
         made = []
@@ -182,7 +182,7 @@ def test_a_tls_link_works_until_the_robot_is_removed_from_the_policy(tmp_path):
 
 
 def test_only_topics_marked_in_the_table_cross(tmp_path):
-    """Raw pictures, scans and depth stay on the robot, whoever asks for them on the edge."""
+    """Raw images, scans and depth stay on the robot, even if the edge subscribes to everything."""
     pair = Pair(tmp_path, pictures=12)
     with running(pair) as ((robot, near, near_board), (edge, far, _)):
         everything = set()

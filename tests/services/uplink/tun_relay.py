@@ -1,10 +1,12 @@
-"""A radio between two network namespaces, in a process of its own: delay, loss, and it can be cut.
+"""An emulated radio between two network namespaces, in its own process: delay, loss and cuts.
 
     python -m tests.services.uplink.tun_relay NEAR FAR DELAY_S LOSS SEED
 
-makes a TUN device in each namespace and carries packets between them. Each line on standard input is answered by
-one on standard output: "cut" (packets vanish, nobody is told), "mend", "loss SHARE", "count". Ends with its input.
-Which packets are lost depends on the seed and their number alone.
+creates a TUN device in each namespace and forwards packets between them. Each line on standard input is
+answered
+by one on standard output: "cut" (packets are dropped silently), "mend", "loss RATIO", "count". It ends
+with its
+input. The seed and a packet's number determine whether it is lost.
 """
 
 from __future__ import annotations
@@ -30,7 +32,7 @@ _BURST = 64  # packets read at once
 
 
 def open_tun(namespace: str) -> int:
-    """A file of packets: what the namespace sends over the device is read, what is written it receives."""
+    """Open a TUN device in a namespace: reads return packets it sends, writes are packets it receives."""
     with open(f"/run/netns/{namespace}") as file:
         libc = ctypes.CDLL(None, use_errno=True)
         if libc.setns(file.fileno(), _CLONE_NEWNET) != 0:
@@ -41,7 +43,7 @@ def open_tun(namespace: str) -> int:
 
 
 class Direction:
-    """One direction."""
+    """One direction of the radio."""
 
     def __init__(self, source: int, target: int, delay_ns: int, loss: float, seed: int) -> None:
         self.source, self._target = source, target
@@ -51,7 +53,7 @@ class Direction:
         self.carried = self.bytes = self.lost = self.cut = 0
 
     def take(self, cut: bool) -> None:
-        """Packets that wait to be sent."""
+        """Read the packets that wait to be sent."""
         for _ in range(_BURST):
             try:
                 packet = os.read(self.source, _MTU + 64)
@@ -65,7 +67,7 @@ class Direction:
                 self._flying.append((time.monotonic_ns() + self._delay_ns, packet))
 
     def deliver(self, cut: bool) -> int | None:
-        """Packets whose time has come; when the next is due."""
+        """Deliver due packets; return when the next one is due (monotonic ns)."""
         now = time.monotonic_ns()
         while self._flying and self._flying[0][0] <= now:
             packet = self._flying.popleft()[1]

@@ -1,4 +1,6 @@
-"""Access control of an edge's router with real certificates: which hosts may connect, and what each may do."""
+"""Access control of an edge's router with real certificates: which hosts may connect, and what each may
+do.
+"""
 
 import contextlib
 import subprocess

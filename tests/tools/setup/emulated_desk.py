@@ -1,4 +1,4 @@
-"""A desk with a chessboard on it, as an emulated camera and an emulated lidar see it."""
+"""A desk with a chessboard as an emulated camera and an emulated lidar see it."""
 
 import functools
 
@@ -21,14 +21,14 @@ _CENTRE_M = 0.5 * SQUARE_M * np.array([CORNERS[0] - 1, CORNERS[1] - 1, 0.0])
 
 
 def board_at(position, right_rad=0.0, up_rad=0.0, roll_rad=0.0, base=None):
-    """`T_x_board` of a board whose middle is at `position`, turned from facing the viewer."""
+    """Return `T_x_board` of a board with its centre at `position`, rotated relative to facing the viewer."""
     R = (np.eye(3) if base is None else base) @ so3_exp(np.array([up_rad, right_rad, roll_rad]))
     return make_transform(R, np.asarray(position) - R @ _CENTRE_M)
 
 
 @functools.cache
 def _rays():
-    """float64 [4 H W, 3]: four a pixel, in rows."""
+    """Return float64 [4 H W, 3]: four rays per pixel, row by row."""
     step = (np.arange(2) - 0.5) / 2.0
     u, v = ((np.arange(n)[:, None] + step).ravel() for n in SIZE)
     uv = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 1, 2)
@@ -38,7 +38,7 @@ def _rays():
 
 
 def picture(T_camera_board):
-    """Grey picture of the board: each pixel's rays to where they meet the paper."""
+    """Render the board as a grey image by intersecting each pixel's rays with the paper."""
     T = inverse(T_camera_board)
     origin, directions = T[:3, 3], _rays() @ T[:3, :3].T
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -52,7 +52,7 @@ def picture(T_camera_board):
 
 
 def views(count, seed=1):
-    """`T_camera_board` of boards all over the picture, tilted, each wholly in it."""
+    """Return `T_camera_board` of tilted boards all over the image, each completely visible."""
     rng, found = np.random.default_rng(seed), []
     ends = np.array([[x, y, 0.0] for x in (-1, CORNERS[0]) for y in (-1, CORNERS[1])]) * SQUARE_M
     while len(found) < count:
@@ -68,7 +68,7 @@ def views(count, seed=1):
 
 
 def boards_before_the_lidar(count):
-    """`T_body_board` of boards that the beams cross, turned to the left and to the right."""
+    """Return `T_body_board` of boards that the beams cross, turned to the left and to the right."""
     turns = np.radians(np.linspace(-30.0, 30.0, count))
     sides = np.linspace(-0.12, 0.12, count)[::-1]
     return [
@@ -78,10 +78,10 @@ def boards_before_the_lidar(count):
 
 
 class Desk:
-    """What camera and lidar look at: the views one after the other, or one board for both."""
+    """What camera and lidar see: the views in turn, or one board for both."""
 
     def __init__(self, count, boards=()):
-        """Everything is drawn beforehand: emulators have no time for it."""
+        """Render all images beforehand, since emulators run in real time."""
         self._views = [_jpeg(picture(T)) for T in views(count)]
         self._boards = [(T, _jpeg(picture(inverse(T_BODY_CAMERA) @ T))) for T in boards]
         self._shown = 0
@@ -89,7 +89,7 @@ class Desk:
         self._still = b""
 
     def hold(self, number):
-        """One of the boards, held still before both."""
+        """Show one of the boards to both sensors."""
         self.T_body_board, self._still = self._boards[number]
 
     def jpeg(self):
@@ -99,7 +99,7 @@ class Desk:
         return self._views[self._shown % len(self._views)]
 
     def range_m(self, angle_rad):
-        """The walls, or the board before them."""
+        """Return ranges to the walls, or to the board in front of them."""
         walls = room_range_m(angle_rad)
         if self.T_body_board is None:
             return walls
@@ -121,7 +121,7 @@ def _jpeg(grey):
 
 
 class DeskLidar(Ld19):
-    """At five turns a second, which an LD19 does, too: half the work for a busy machine."""
+    """An LD19 at five revolutions per second, which it supports: half the load of ten."""
 
     point_hz, speed_deg_s = 2250.0, 1800.0
 

@@ -1,4 +1,4 @@
-"""What `doctor` says of serial ports and cameras, each with its remedy."""
+"""Findings of `doctor` on serial ports and cameras, each with its remedy."""
 
 import grp
 import os
@@ -40,7 +40,7 @@ def test_a_user_outside_the_group(dev):
     assert lidar.verdict == "fault"
     assert f"belongs to the group {GROUP}, in which ann is not" in lidar.text
     assert lidar.remedy.startswith(f"sudo usermod -aG {GROUP} ann")
-    assert reported[str(dev / "video0")].verdict == "note"  # nobody asked for it
+    assert reported[str(dev / "video0")].verdict == "note"  # not used by the deployment
 
 
 def test_a_user_who_must_log_in_again(dev):

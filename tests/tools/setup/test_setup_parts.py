@@ -47,7 +47,7 @@ def test_the_intrinsics_are_estimated_with_their_errors(lens):
     found = lens.K[[0, 1, 0, 1], [0, 1, 2, 2]]
     np.testing.assert_allclose(found, [K[0, 0], K[1, 1], K[0, 2], K[1, 2]], atol=3.0)
     assert np.abs(found[:2] - K[[0, 1], [0, 1]]).max() < 4.0 * lens.focal_sigma_px
-    # What counts is where points land, in the outer parts, too, but for a turn of the whole camera.
+    # Compare projections over the whole image, except for a rotation of the camera.
     rays = np.array([[x, y, 1.0] for x in (-0.45, 0.0, 0.45) for y in (-0.35, 0.0, 0.35)])
     lenses = ((K, DISTORTION), (lens.K, lens.distortion))
     uv = [cv2.projectPoints(rays, np.zeros(3), np.zeros(3), *pair)[0] for pair in lenses]
@@ -68,7 +68,7 @@ def test_similar_views_and_views_without_a_board_are_rejected():
 
 
 def test_a_board_that_is_not_flat_is_rejected():
-    """A board that is not flat: its corners lie where no pinhole sees a plane's."""
+    """The corners of a bent board do not fit any pinhole camera."""
     calibration = IntrinsicsCalibration(DEFAULT_CHESSBOARD)
     calibration.add(picture(views(1)[0]))
     grid = np.zeros((88, 3))
@@ -112,7 +112,7 @@ def test_the_pdf_has_a_valid_object_table():
 
 
 def test_the_lidar_mount_is_estimated_from_boards(lens):
-    """Two centimetres and three degrees off, and a camera that looks down: found within its own errors."""
+    """Start 2 cm and 3 degrees off, with a camera that looks down: the result is within its own errors."""
     desk = Desk(1)
     boards = LidarBoardCalibration(camera_section(lens, T_BODY_CAMERA).model(), DEFAULT_CHESSBOARD)
     angle = np.radians(np.arange(-180.0, 180.0, 0.8))

@@ -1,4 +1,4 @@
-"""`beamsplat setup` in a terminal, before emulated devices: it ends with a deployment that checks and runs."""
+"""`beamsplat setup` in a terminal with emulated devices: it ends with a deployment that runs."""
 
 import json
 import os
@@ -71,7 +71,7 @@ def test_setup_ends_with_a_running_system(tmp_path, environment, free_endpoint):
         for number in range(BOARDS):
             child.expect(f"board {number + 1} of {BOARDS}")
             desk.hold(number)
-            time.sleep(0.5)  # what both see then is this board
+            time.sleep(0.5)  # both sensors see this board now
             child.sendline("")
             child.expect("accepted, distance 0.[67]")
         child.expect(r"turned by (\d\.\d+) degrees, \+- (\d\.\d+)")
@@ -103,7 +103,7 @@ def _is_right(rig):
 
 
 def _runs(robot, environment, endpoint):
-    """`beamsplat run` with it: every node is active, and the robot knows where it stands."""
+    """Run `beamsplat run`: every node becomes active, and the robot localizes."""
     overrides = [f"--set=router.listen={json.dumps([endpoint])}", "--set=page.port=0"]
     running = subprocess.Popen(
         [*COMMAND, "run", str(robot), *overrides], env=environment, stderr=subprocess.PIPE
