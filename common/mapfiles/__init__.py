@@ -1,1 +1,1 @@
-"""Maps as files of others: splats, point clouds, meshes, nav2 maps, pictures."""
+"""Map files: saved sessions, and exports as splats, point clouds, meshes, nav2 maps, images and videos."""

@@ -1,7 +1,7 @@
-"""Blocks of Gaussians as files beside a session's state.
+"""Files with blocks of Gaussians, stored beside the state of a session.
 
-A block's file is written once and never changed: a checkpoint names the blocks that belong to it, and a file
-goes only after a later checkpoint does without it.
+A block file is written once and never changed. A checkpoint lists the blocks that belong to it; a file is
+removed only after a later checkpoint that does not list it.
 """
 
 from __future__ import annotations
@@ -18,25 +18,25 @@ import numpy as np
 
 from beamsplat.common.errors import UserError
 from beamsplat.common.geometry.transforms import inverse
-from beamsplat.common.mapfiles.store import carried
+from beamsplat.common.mapfiles.store import transform_with_momentum
 
 _MAGIC = b"BSGB"
-_HEAD = struct.Struct("<4sII")  # magic, CRC-32 of what follows the head, length of the table of arrays
+_HEAD = struct.Struct("<4sII")  # magic, CRC-32 of all bytes after the header, length of the table of arrays
 
 Arrays = dict[str, np.ndarray]
 
 
 @dataclass(frozen=True)
 class Block:
-    """What is known of a block without reading it."""
+    """The description of a block in a checkpoint: all that is known without reading its file."""
 
-    number: int  # names the file
+    number: int  # of the file
     anchor: int
-    count: int
-    steps: int  # of the optimiser, summed
+    count: int  # of Gaussians
+    steps: int  # of the optimiser, summed over the Gaussians
     centre_anchor_m: np.ndarray  # [3], in the anchor's frame
-    radius_m: float  # of a sphere round all that its Gaussians colour
-    T_map_anchor: np.ndarray  # when it was written
+    radius_m: float  # of the sphere around the centre that contains all rendered extents
+    T_map_anchor: np.ndarray  # at the time of writing
 
 
 def block_file(folder: Path, number: int) -> Path:
@@ -44,14 +44,14 @@ def block_file(folder: Path, number: int) -> Path:
 
 
 def arrays_of_blocks(blocks: list[Block]) -> Arrays:
-    """What a checkpoint says of blocks; empty without any."""
+    """Return the checkpoint arrays `block_*` that describe blocks; an empty dict without any block."""
     if not blocks:
         return {}
     return {f"block_{name}": np.array([getattr(b, name) for b in blocks]) for name in Block.__annotations__}
 
 
 def blocks_of(arrays: Arrays) -> list[Block]:
-    """The blocks that a checkpoint names.
+    """Return the blocks that a checkpoint lists.
 
     Raises:
         KeyError: an array is missing.
@@ -66,7 +66,7 @@ def blocks_of(arrays: Arrays) -> list[Block]:
 
 
 def write_block(folder: Path, number: int, arrays: Arrays) -> None:
-    """The arrays (4 bytes an element, [.., N] each) as one table with its checksum; `sync` comes later.
+    """Write arrays [..., N] with 4 bytes per element as one table with a checksum. `sync` must follow.
 
     Raises:
         OSError: the disk is full or broken.
@@ -84,7 +84,9 @@ def write_block(folder: Path, number: int, arrays: Arrays) -> None:
 
 
 def read_block(folder: Path, block: Block, T_map_anchor: np.ndarray) -> Arrays:
-    """A block's arrays, where its anchor is now: bit for bit as they were if it has not moved.
+    """Return the arrays of a block, transformed to the current pose of its anchor.
+
+    They are bit-identical to the written ones if the anchor has not moved.
 
     Raises:
         UserError: the file is missing or altered.
@@ -98,7 +100,7 @@ def read_block(folder: Path, block: Block, T_map_anchor: np.ndarray) -> Arrays:
         raise UserError(f"{path}: {error}; restore it from a copy") from error
     if not np.array_equal(T_map_anchor, block.T_map_anchor):
         move = T_map_anchor @ inverse(block.T_map_anchor)
-        arrays["params"], arrays["first"] = carried(arrays["params"], arrays["first"], move)
+        arrays["params"], arrays["first"] = transform_with_momentum(arrays["params"], arrays["first"], move)
     return arrays
 
 
@@ -118,7 +120,7 @@ def _unpacked(blob: bytes) -> Arrays:
 
 
 def with_blocks(folder: Path, arrays: Arrays) -> Arrays:
-    """A checkpoint as if all its Gaussians had been in memory.
+    """Return a checkpoint with all Gaussians in its `store_*` arrays; blocks are read and merged into them.
 
     Raises:
         UserError: a block cannot be read.
@@ -126,8 +128,8 @@ def with_blocks(folder: Path, arrays: Arrays) -> Arrays:
     blocks = blocks_of(arrays)
     if not blocks:
         return arrays
-    places = dict(zip(arrays["anchor_id"].tolist(), arrays["anchor_T_map"]))
-    read = [read_block(folder, block, places[block.anchor]) for block in blocks]
+    T_map_anchor = dict(zip(arrays["anchor_id"].tolist(), arrays["anchor_T_map"]))
+    read = [read_block(folder, block, T_map_anchor[block.anchor]) for block in blocks]
     for block, part in zip(blocks, read):
         part["anchor"] = np.full(block.count, block.anchor, np.int64)
     out = {key: array for key, array in arrays.items() if not key.startswith("block_")}
@@ -137,7 +139,7 @@ def with_blocks(folder: Path, arrays: Arrays) -> Arrays:
 
 
 def sync(folder: Path, numbers: Iterable[int]) -> None:
-    """Brings blocks' files to the disk.
+    """Flush block files, and their folder, to the disk (fsync).
 
     Raises:
         OSError: the disk is full or broken.

@@ -19,7 +19,7 @@ _THINNEST_M = 1e-4
 _GROWTH = 1.6  # of a merged Gaussian's area; best of 1 to 2.5 on a mapped home
 
 
-def cell_for(distance_m: float, focal_px: float, error_px: float) -> float:
+def detail_cell_m(distance_m: float, focal_px: float, error_px: float) -> float:
     """Edge (m) of cells that a pinhole of that focal length sees as `error_px` from that far: a power of two
     times `FINEST_CELL_M`; 0.0 where all detail is due."""
     cell_m = error_px * distance_m / focal_px
@@ -28,7 +28,7 @@ def cell_for(distance_m: float, focal_px: float, error_px: float) -> float:
     return FINEST_CELL_M * 2.0 ** math.floor(math.log2(cell_m / FINEST_CELL_M))
 
 
-def coarser(params: np.ndarray, cell_m: float) -> np.ndarray:
+def merge_by_cell(params: np.ndarray, cell_m: float) -> np.ndarray:
     """Gaussians float32 [14, M], M <= N, for those of `params` float32 [14, N]: one a cell of edge `cell_m`,
     beside those that are larger than a cell. `cell_m` 0 leaves all as they are."""
     scale = np.exp(params[SCALE:QUAT].astype(np.float64))

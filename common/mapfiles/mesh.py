@@ -13,7 +13,7 @@ from itertools import combinations, product
 import numpy as np
 
 from beamsplat.common.compiled import kernel
-from beamsplat.common.mapfiles.surface import DepthView
+from beamsplat.common.mapfiles.surface import RenderedDepth
 from beamsplat.common.raster.camera import RasterCamera
 
 MAX_VOXELS = 40_000_000  # 24 bytes each
@@ -21,7 +21,7 @@ TRUNCATION = 4.0  # voxels
 
 
 @dataclass
-class DistanceField:
+class TsdfVolume:
     """Distances to the surface along rays, positive before it, in truncations; `weight` 0 = not seen."""
 
     origin_m: np.ndarray  # float64 [3]: centre of voxel (0, 0, 0)
@@ -32,7 +32,7 @@ class DistanceField:
     near: np.ndarray  # float32 [X, Y, Z]: how many those were
 
     @staticmethod
-    def around(low_m: np.ndarray, high_m: np.ndarray, voxel_m: float) -> DistanceField:
+    def around(low_m: np.ndarray, high_m: np.ndarray, voxel_m: float) -> TsdfVolume:
         """An empty field over a box and a margin.
 
         Raises:
@@ -47,12 +47,12 @@ class DistanceField:
                 f"{count / 1e6:.0f} million voxels of {voxel_m:g} m are too many; {enough:.3f} m would do"
             )
         x, y, z = shape
-        return DistanceField(
+        return TsdfVolume(
             low_m - margin, voxel_m, np.zeros((x, y, z), np.float32), np.zeros((x, y, z), np.float32),
             np.zeros((x, y, z, 3), np.float32), np.zeros((x, y, z), np.float32),
         )  # fmt: skip
 
-    def add(self, views: Iterable[DepthView]) -> None:
+    def add(self, views: Iterable[RenderedDepth]) -> None:
         """Fuses rendered views."""
         for view in views:
             c, R, t = view.camera, view.T_map_camera[:3, :3], view.T_map_camera[:3, 3]
@@ -68,7 +68,7 @@ def _fuse(
     distance: np.ndarray, weight: np.ndarray, colour: np.ndarray, near: np.ndarray, numbers: np.ndarray,
     R_camera_map: np.ndarray, first_camera: np.ndarray, depth: np.ndarray, rgb: np.ndarray,
 ) -> None:  # fmt: skip
-    """One view into the field; arrays as in DistanceField, `first_camera` is voxel (0, 0, 0)."""
+    """One view into the field; arrays as in TsdfVolume, `first_camera` is voxel (0, 0, 0)."""
     fx, fy, cx, cy, voxel = numbers
     reach = TRUNCATION * voxel
     height, width = depth.shape
@@ -103,7 +103,7 @@ def _fuse(
 
 
 @dataclass(frozen=True)
-class Mesh:
+class TriangleMesh:
     """Triangles that face the free side."""
 
     vertices_m: np.ndarray  # float64 [N, 3]
@@ -111,7 +111,7 @@ class Mesh:
     faces: np.ndarray  # int32 [M, 3]
 
 
-def surface_nets(field: DistanceField) -> Mesh:
+def surface_nets(field: TsdfVolume) -> TriangleMesh:
     """The surface where the distance changes its sign: a vertex a cell, a quad an edge (Gibson 1998)."""
     corners = list(product((0, 1), repeat=3))
     shape = tuple(n - 1 for n in field.distance.shape)
@@ -133,7 +133,7 @@ def surface_nets(field: DistanceField) -> Mesh:
     colour = sum(field.colour[tuple((cells + c).T)] for c in corners)
     rgb = colour / np.maximum(near, 1.0)[:, None]
     faces = _used_faces(field, number)
-    return Mesh(vertices, np.clip(rgb * 255.0 + 0.5, 0, 255).astype(np.uint8), faces)
+    return TriangleMesh(vertices, np.clip(rgb * 255.0 + 0.5, 0, 255).astype(np.uint8), faces)
 
 
 def _crossings(values: np.ndarray, corners: list[tuple[int, ...]]) -> np.ndarray:
@@ -151,7 +151,7 @@ def _crossings(values: np.ndarray, corners: list[tuple[int, ...]]) -> np.ndarray
     return total / np.maximum(count, 1)[:, None]
 
 
-def _used_faces(field: DistanceField, number: np.ndarray) -> np.ndarray:
+def _used_faces(field: TsdfVolume, number: np.ndarray) -> np.ndarray:
     """int32 [M, 3]: two triangles for each voxel edge through the surface that has a vertex all round."""
     out = []
     for axis in range(3):
@@ -176,7 +176,7 @@ def _used_faces(field: DistanceField, number: np.ndarray) -> np.ndarray:
     return np.concatenate(out).astype(np.int32)
 
 
-def without_crumbs(mesh: Mesh, least_faces: int) -> Mesh:
+def remove_small_pieces(mesh: TriangleMesh, least_faces: int) -> TriangleMesh:
     """The mesh without connected pieces of fewer triangles, and without unused vertices."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
@@ -188,11 +188,11 @@ def without_crumbs(mesh: Mesh, least_faces: int) -> Mesh:
     size = np.bincount(piece[faces[:, 0]], minlength=piece.max(initial=0) + 1)
     faces = faces[size[piece[faces[:, 0]]] >= least_faces]
     used, faces = np.unique(faces, return_inverse=True)
-    return Mesh(mesh.vertices_m[used], mesh.colours[used], faces.reshape(-1, 3).astype(np.int32))
+    return TriangleMesh(mesh.vertices_m[used], mesh.colours[used], faces.reshape(-1, 3).astype(np.int32))
 
 
 def warm() -> None:
     """Compiles the kernel, with the types used in production."""
     camera = RasterCamera(10.0, 10.0, 3.5, 3.5, 8, 8)
-    view = DepthView(camera, np.eye(4), np.zeros((8, 8, 3), np.float32), np.ones((8, 8), np.float32))
-    DistanceField.around(np.zeros(3), np.ones(3), 0.5).add([view])
+    view = RenderedDepth(camera, np.eye(4), np.zeros((8, 8, 3), np.float32), np.ones((8, 8), np.float32))
+    TsdfVolume.around(np.zeros(3), np.ones(3), 0.5).add([view])

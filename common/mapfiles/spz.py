@@ -14,7 +14,7 @@ import numpy as np
 from beamsplat.common.files.persist import write_atomically
 from beamsplat.common.geometry.transforms import make_transform
 from beamsplat.common.mapfiles.ply import SH_C0
-from beamsplat.common.mapfiles.store import moved
+from beamsplat.common.mapfiles.store import transform_gaussians
 from beamsplat.common.mapfiles.y_up import R_yup_map
 from beamsplat.common.raster.layout import COLOUR, MEAN, OPACITY, QUAT, SCALE
 
@@ -30,7 +30,7 @@ def write_spz(path: Path, params: np.ndarray) -> None:
         ValueError: a Gaussian lies more than 2 km from the origin.
         OSError: not writable.
     """
-    params = moved(params, make_transform(R_yup_map, np.zeros(3)))
+    params = transform_gaussians(params, make_transform(R_yup_map, np.zeros(3)))
     fixed = np.round(params[MEAN : MEAN + 3].T.astype(np.float64) * (1 << _FRACTION_BITS))
     if fixed.size and np.abs(fixed).max() >= 1 << 23:
         raise ValueError(

@@ -1,4 +1,4 @@
-"""Reading a saved state without a mapper: its Gaussians, counters and views."""
+"""Read parts of a saved state without a mapper: Gaussians, counters and keyframe views."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ CAMERA_FIELDS = ("fx_px", "fy_px", "cx_px", "cy_px", "width_px", "height_px")
 
 
 def store_of(arrays: Arrays) -> GaussianStore:
-    """The Gaussians of a state.
+    """Return the Gaussians of a state.
 
     Raises:
         KeyError: an array is missing.
@@ -27,30 +27,31 @@ def store_of(arrays: Arrays) -> GaussianStore:
 
 
 def progress_of(arrays: Arrays) -> dict[str, Any]:
-    """The mapper's counters (`Mapper.progress`) in a state."""
+    """Return the mapper's counters (see `Mapper.progress`) in a state."""
     return json.loads(arrays["progress"].tobytes())
 
 
 @dataclass(frozen=True)
-class View:
-    """A keyframe of a saved map: where it looks from."""
+class KeyframeView:
+    """The camera and the refined pose of a keyframe in a saved map."""
 
     id: int
     camera: RasterCamera
     T_map_camera: np.ndarray
 
 
-def views_of(arrays: Arrays) -> list[View]:
-    """The keyframes of a state, refined, in order of id (which is time)."""
+def keyframe_views(arrays: Arrays) -> list[KeyframeView]:
+    """Return the views of all keyframes, with refined poses, by ascending id, which is the order of time."""
     T_map_anchor = dict(zip(arrays["anchor_id"].tolist(), arrays["anchor_T_map"]))
     out = []
     for row, id in enumerate(arrays["keyframe_id"].tolist()):
         T_anchor_camera = arrays["keyframe_T_anchor_camera"][row] @ arrays["keyframe_delta"][row]
         T_map_camera = T_map_anchor[int(arrays["keyframe_anchor"][row])] @ T_anchor_camera
-        out.append(View(id, camera_of(arrays, row), T_map_camera))
+        out.append(KeyframeView(id, camera_of(arrays, row), T_map_camera))
     return sorted(out, key=lambda view: view.id)
 
 
 def camera_of(arrays: Arrays, row: int) -> RasterCamera:
+    """Return the camera of the keyframe in row `row` of the `keyframe_*` arrays."""
     numbers = dict(zip(CAMERA_FIELDS, arrays["keyframe_camera"][row].tolist()))
     return RasterCamera(**numbers | {name: int(numbers[name]) for name in ("width_px", "height_px")})

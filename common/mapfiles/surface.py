@@ -18,7 +18,7 @@ _EDGE = 0.05  # neighbours whose depth differs by more than this share of it: on
 
 
 @dataclass(frozen=True)
-class DepthView:
+class RenderedDepth:
     """A rendered picture with depth."""
 
     camera: RasterCamera
@@ -29,20 +29,20 @@ class DepthView:
 
 def rendered_views(
     store: GaussianStore, views: Iterable[tuple[RasterCamera, np.ndarray]], threads: int = 1
-) -> Iterator[DepthView]:
+) -> Iterator[RenderedDepth]:
     """Each view at half size; pixels seen through, and those between two surfaces, have no depth."""
     rasterizer = Rasterizer(threads)
     try:
         for camera, T_map_camera in views:
             half = camera.resized(camera.width_px // 2, camera.height_px // 2)
             rgb, depth, alpha = render_rgb_depth(rasterizer, store, half, T_map_camera)
-            sure = (alpha > 0.8) & np.isfinite(depth) & ~flying(depth)
-            yield DepthView(half, T_map_camera, rgb, np.where(sure, depth, np.float32(np.nan)))
+            sure = (alpha > 0.8) & np.isfinite(depth) & ~flying_pixels(depth)
+            yield RenderedDepth(half, T_map_camera, rgb, np.where(sure, depth, np.float32(np.nan)))
     finally:
         rasterizer.close()
 
 
-def flying(depth: np.ndarray) -> np.ndarray:
+def flying_pixels(depth: np.ndarray) -> np.ndarray:
     """bool [H, W]: pixels beside a jump of depth."""
     out = np.zeros(depth.shape, bool)
     for axis in (0, 1):
@@ -57,7 +57,7 @@ def flying(depth: np.ndarray) -> np.ndarray:
     return out
 
 
-def points_of(view: DepthView) -> tuple[np.ndarray, np.ndarray]:
+def points_of(view: RenderedDepth) -> tuple[np.ndarray, np.ndarray]:
     """Points float64 [N, 3] in the map and their colours float32 [N, 3]."""
     v, u = np.nonzero(np.isfinite(view.depth_m))
     z, c = view.depth_m[v, u].astype(np.float64), view.camera
@@ -65,7 +65,7 @@ def points_of(view: DepthView) -> tuple[np.ndarray, np.ndarray]:
     return points @ view.T_map_camera[:3, :3].T + view.T_map_camera[:3, 3], view.rgb[v, u]
 
 
-def surface_points(views: Iterable[DepthView], cell_m: float) -> tuple[np.ndarray, np.ndarray]:
+def surface_points(views: Iterable[RenderedDepth], cell_m: float) -> tuple[np.ndarray, np.ndarray]:
     """One point float64 [N, 3] and colour uint8 [N, 3] for each cell that holds any: the means."""
     cells, sums, waiting = np.zeros(0, np.int64), np.zeros((0, 7)), []
     for view in views:

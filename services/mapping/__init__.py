@@ -1,1 +1,1 @@
-"""The mapper: Gaussians from keyframes with depth, optimised by differentiable rendering."""
+"""The mapper: 3D Gaussians from keyframes with depth, optimised by differentiable rendering."""

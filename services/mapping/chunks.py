@@ -1,4 +1,4 @@
-"""What viewers have of the map: the version and detail of each chunk that was sent, and what is due next."""
+"""Publication of chunks: which version and level of detail viewers have, and which chunk to publish next."""
 
 from __future__ import annotations
 
@@ -8,97 +8,106 @@ from dataclasses import dataclass
 import numpy as np
 
 from beamsplat.common.geometry.transforms import inverse
-from beamsplat.common.mapfiles.detail import cell_for, coarser
-from beamsplat.common.mapfiles.store import moved
+from beamsplat.common.mapfiles.detail import detail_cell_m, merge_by_cell
+from beamsplat.common.mapfiles.store import transform_gaussians
 from beamsplat.common.raster.layout import MEAN
 from beamsplat.services.mapping.mapper import Mapper
 
-_NEVER = (-1, 0.0, -1)
+_NEVER = (-1, 0.0, -1)  # version, cell and time of a chunk that has not been published
 
 
 @dataclass(frozen=True)
-class Part:
-    """A chunk as it is sent: Gaussians float32 [14, N] in the anchor's frame, merged in cells of `cell_m`."""
+class ChunkUpdate:
+    """A chunk to publish: Gaussians in the anchor's frame, merged in cells of `cell_m`; 0 = full detail."""
 
     version: int
     cell_m: float
-    params: np.ndarray
+    params: np.ndarray  # float32 [14, N]
 
 
 @dataclass(frozen=True)
-class Eye:
-    """From where detail is judged, in the map."""
+class Viewpoint:
+    """The viewpoint from which the level of detail is chosen."""
 
-    at_m: np.ndarray  # [3]
+    at_map_m: np.ndarray  # [3]
     focal_px: float
-    error_px: float
+    error_px: float  # detail below this size in the image may be merged
 
 
 class ChunkFeed:
-    """Each chunk goes out when it has changed, or when its viewer has come so near that more detail shows.
+    """The chunks published so far, and which are due.
 
-    Who moves away keeps the detail: sending less again would cost what it saves.
+    A chunk is due when it has changed, or when a nearer viewpoint shows more detail.
+    Detail that has been published is kept when the viewpoint moves away: publishing less detail again would
+    cost bandwidth.
     """
 
     def __init__(self) -> None:
-        self._sent: dict[int, tuple[int, float, int]] = {}  # anchor -> version, cell, when (counted)
+        self._sent: dict[int, tuple[int, float, int]] = {}  # anchor -> version, cell, time (count of updates)
         self._clock = 0
 
-    def take(self, mapper: Mapper, anchor: int, eye: Eye | None) -> Part | None:
-        """An anchor's Gaussians as they are due, and marked as sent; None if there is nothing new to see."""
+    def take_update(self, mapper: Mapper, anchor: int, viewpoint: Viewpoint | None) -> ChunkUpdate | None:
+        """Return the chunk of an anchor and mark it as published; None if viewers have all visible detail.
+
+        Args:
+            viewpoint: chooses the level of detail; None for full detail.
+        """
         version = mapper.store.versions().get(anchor)
         sent, cell_m, _ = self._sent.get(anchor, _NEVER)
         if version is None:
             return None
-        due_m = _cell(mapper, anchor, eye)
+        due_m = _cell_m(mapper, anchor, viewpoint)
         if sent == version and cell_m <= due_m:
             return None
         self._clock += 1
         self._sent[anchor] = (version, due_m, self._clock)
-        return Part(version, due_m, _in_anchor(mapper, anchor, due_m))
+        return ChunkUpdate(version, due_m, _params_anchor(mapper, anchor, due_m))
 
-    def longest_due(self, mapper: Mapper, eye: Eye | None) -> int | None:
-        """Of the chunks that have changed or lack detail, the one sent longest ago."""
+    def oldest_due(self, mapper: Mapper, viewpoint: Viewpoint | None) -> int | None:
+        """Return the anchor of the due chunk that was published longest ago; None if no chunk is due."""
         due = [
             anchor
             for anchor, version in mapper.store.versions().items()
-            if self._sent.get(anchor, _NEVER)[0] != version or self._lacks(mapper, anchor, eye)
+            if self._sent.get(anchor, _NEVER)[0] != version or self._lacks_detail(mapper, anchor, viewpoint)
         ]
         return min(due, key=lambda a: (self._sent.get(a, _NEVER)[2], a)) if due else None
 
-    def _lacks(self, mapper: Mapper, anchor: int, eye: Eye | None) -> bool:
+    def _lacks_detail(self, mapper: Mapper, anchor: int, viewpoint: Viewpoint | None) -> bool:
         cell_m = self._sent.get(anchor, _NEVER)[1]
-        return cell_m > 0.0 and cell_m > _cell(mapper, anchor, eye)
+        return cell_m > 0.0 and cell_m > _cell_m(mapper, anchor, viewpoint)
 
 
-def parts(mapper: Mapper, eye: Eye | None) -> dict[int, Part]:
-    """The whole map by anchor, for one who asks."""
+def chunk_snapshot(mapper: Mapper, viewpoint: Viewpoint | None) -> dict[int, ChunkUpdate]:
+    """Return the chunks of the whole map by anchor, at the detail for a viewpoint; None for full detail."""
     out = {}
     for anchor, version in mapper.store.versions().items():
-        cell_m = _cell(mapper, anchor, eye)
-        out[anchor] = Part(version, cell_m, _in_anchor(mapper, anchor, cell_m))
+        cell_m = _cell_m(mapper, anchor, viewpoint)
+        out[anchor] = ChunkUpdate(version, cell_m, _params_anchor(mapper, anchor, cell_m))
     return out
 
 
-def on_disk(mapper: Mapper, anchor: int) -> Iterator[np.ndarray]:
-    """float32 [14, N] of an anchor's Gaussians that are not in memory, in parts, in the map frame."""
-    if mapper.elsewhere is not None:
-        yield from mapper.elsewhere.read(anchor, mapper.T_map_anchor[anchor])
+def disk_params(mapper: Mapper, anchor: int) -> Iterator[np.ndarray]:
+    """Yield an anchor's Gaussians that are on disk only, float32 [14, N] each, in the map frame."""
+    if mapper.disk_gaussians is not None:
+        yield from mapper.disk_gaussians.read(anchor, mapper.T_map_anchor[anchor])
 
 
-def _cell(mapper: Mapper, anchor: int, eye: Eye | None) -> float:
-    """By the nearest Gaussian; without an eye all detail is due."""
-    if eye is None:
+def _cell_m(mapper: Mapper, anchor: int, viewpoint: Viewpoint | None) -> float:
+    """Return the cell edge (m) for the distance to the nearest Gaussian; 0 without a viewpoint."""
+    if viewpoint is None:
         return 0.0
-    store = mapper.store
+    store, at_m = mapper.store, viewpoint.at_map_m
     means = store.params[MEAN : MEAN + 3, : store.count][:, store.anchor[: store.count] == anchor].T
-    nearest_m = np.sqrt(np.min(np.sum((means - eye.at_m) ** 2, axis=1), initial=np.inf))
-    if mapper.elsewhere is not None:
-        nearest_m = min(nearest_m, mapper.elsewhere.nearest_m(anchor, mapper.T_map_anchor[anchor], eye.at_m))
-    return cell_for(float(nearest_m), eye.focal_px, eye.error_px) if np.isfinite(nearest_m) else 0.0
+    nearest_m = np.sqrt(np.min(np.sum((means - at_m) ** 2, axis=1), initial=np.inf))
+    if mapper.disk_gaussians is not None:
+        disk_m = mapper.disk_gaussians.nearest_m(anchor, mapper.T_map_anchor[anchor], at_m)
+        nearest_m = min(nearest_m, disk_m)
+    if not np.isfinite(nearest_m):
+        return 0.0
+    return detail_cell_m(float(nearest_m), viewpoint.focal_px, viewpoint.error_px)
 
 
-def _in_anchor(mapper: Mapper, anchor: int, cell_m: float) -> np.ndarray:
-    """All of an anchor's Gaussians in its own frame, those on disk too."""
-    params = np.concatenate([mapper.store.chunk(anchor), *on_disk(mapper, anchor)], axis=1)
-    return coarser(moved(params, inverse(mapper.T_map_anchor[anchor])), cell_m)
+def _params_anchor(mapper: Mapper, anchor: int, cell_m: float) -> np.ndarray:
+    """Return all Gaussians of an anchor, in memory and on disk, in the anchor's frame, merged by cell."""
+    params = np.concatenate([mapper.store.chunk(anchor), *disk_params(mapper, anchor)], axis=1)
+    return merge_by_cell(transform_gaussians(params, inverse(mapper.T_map_anchor[anchor])), cell_m)

@@ -1,4 +1,4 @@
-"""New Gaussians where the map does not explain a picture: discs on the surface that the depth shows."""
+"""Insertion of Gaussians at pixels that the map does not explain: flat discs at the measured depth."""
 
 from __future__ import annotations
 
@@ -6,38 +6,41 @@ import cv2
 import numpy as np
 
 from beamsplat.common.raster.discs import choose_pixels, make_discs
-from beamsplat.services.mapping.keyframe import Level
+from beamsplat.services.mapping.keyframe import PyramidLevel
 from beamsplat.services.mapping.settings import MapperSettings
 
+_TRUSTED_WEIGHT = 128  # of 255: depth that can show an error of the map (weight 1/2)
+_COVERED_ALPHA = 0.9  # from which the map counts as covering a pixel
 
-def unexplained(
-    image: np.ndarray,  # float32 [5, H, W] as rendered
-    level: Level,
+
+def unexplained_pixels(
+    image: np.ndarray,  # float32 [5, H, W] as rendered: r, g, b, accumulated depth, alpha
+    level: PyramidLevel,
     settings: MapperSettings,
 ) -> np.ndarray:
-    """bool [H, W]: seen through, of another colour, or at another depth than a trusted measurement."""
+    """Return bool [H, W]: low alpha, wrong colour, or a depth that differs from a trusted measurement."""
     alpha = image[4]
     rgb = level.rgb.astype(np.float32) * np.float32(1 / 255)
-    # Over a few pixels: thin edges that lie half a pixel off are for the optimiser, not for new Gaussians.
-    colour_off = cv2.blur(np.abs(image[:3] - rgb).mean(axis=0), (5, 5)) > settings.colour_off
+    # Averaged over 5 px: edges displaced by half a pixel are left to the optimiser.
+    colour_off = cv2.blur(np.abs(image[:3] - rgb).mean(axis=0), (5, 5)) > settings.max_colour_error
     depth = level.depth_mm.astype(np.float32) * np.float32(1e-3)
     expected = image[3] / np.maximum(alpha, 1e-3)
-    trusted = level.depth_weight >= 128
-    depth_off = (trusted & (np.abs(expected - depth) > settings.depth_off * depth)).astype(np.uint8)
+    trusted = level.depth_weight >= _TRUSTED_WEIGHT
+    depth_off = (trusted & (np.abs(expected - depth) > settings.max_depth_error * depth)).astype(np.uint8)
     depth_off = cv2.erode(depth_off, np.ones((5, 5), np.uint8)) > 0
-    return (alpha < settings.alpha_low) | colour_off | depth_off
+    return (alpha < settings.min_alpha) | colour_off | depth_off
 
 
 def new_gaussians(
     missing: np.ndarray,  # bool [H, W]
-    level: Level,
+    level: PyramidLevel,
     T_map_camera: np.ndarray,
     settings: MapperSettings,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(u int [N], v int [N], float32 [14, N]): Gaussians for missing pixels that have a depth."""
+    """Return (u int [N], v int [N], Gaussians float32 [14, N]) for missing pixels with a known depth."""
     s = settings
     grey = level.rgb.astype(np.float32).mean(axis=0) * np.float32(1 / 255)
-    texture = s.texture * 8.0 / s.stride_px  # Sobel's sums are eight times the step to the next pixel
+    texture = s.texture * 8.0 / s.stride_px  # the Sobel response is 8 times the step to the next pixel
     wanted = missing & (level.depth_mm > 0)
     u, v, spacing = choose_pixels(wanted, grey, s.stride_px, s.fine_stride_px, texture)
     z_m = level.depth_mm.astype(np.float32) * np.float32(1e-3)
@@ -49,13 +52,20 @@ def new_gaussians(
     return u, v, discs
 
 
-def foretold(image: np.ndarray, level: Level) -> tuple[float, float]:
-    """Share of the pixels that the render float32 [5, H, W] covers, and its PSNR (dB) there."""
-    covered = image[4] > 0.9
+def prediction_quality(image: np.ndarray, level: PyramidLevel) -> tuple[float, float]:
+    """Return how well the map predicts a new image, before it is inserted.
+
+    Args:
+        image: float32 [5, H, W], the render of the map from the new viewpoint.
+
+    Returns:
+        The covered fraction of the pixels, and the PSNR (dB) there; NaN if less than 1 % is covered.
+    """
+    covered = image[4] > _COVERED_ALPHA
     if level.hidden is not None:
         covered &= ~level.hidden
-    share = float(covered.mean())
-    if share < 0.01:
-        return share, float("nan")
+    fraction = float(covered.mean())
+    if fraction < 0.01:
+        return fraction, float("nan")
     error = np.clip(image[:3, covered], 0.0, 1.0) - level.rgb[:, covered] * np.float32(1 / 255)
-    return share, float(-10.0 * np.log10(max(float(np.mean(error**2)), 1e-12)))
+    return fraction, float(-10.0 * np.log10(max(float(np.mean(error**2)), 1e-12)))

@@ -1,4 +1,4 @@
-"""Losses of the mapper, and what contradicts a Gaussian, as compiled loops on arrays."""
+"""Losses and free-space carving of the mapper as compiled loops on arrays."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ from beamsplat.common.raster.simd_memory import atomic_next
 def photometric_and_depth(  # noqa: ANN201
     counter, image, rgb, depth_mm, depth_weight, exposure, colour_scale, depth_scale, gradient, sums,  # noqa: ANN001
 ):  # fmt: skip
-    """L1 of colour (after exposure) and of depth, and their gradient, by image rows handed out to threads.
+    """Compute the L1 losses of colour (after exposure) and depth with their gradients; threads take image
+    rows.
 
     Args:
         image: float32 [5, H, W] as rendered. rgb: uint8 [3, H, W]. depth_mm: uint16 [H, W], 0 unknown.
@@ -22,7 +23,8 @@ def photometric_and_depth(  # noqa: ANN201
         gradient: float32 [5, H, W], overwritten. sums: float64 [H, 8]: per row |colour error|, weighted
             |depth error| (m), weights, and dL/dgain, dL/doffset of the three channels summed (last 4 unused).
 
-    The depth term is w |sum w_i z_i - d alpha| (m): zero where the surface is right, whatever its opacity.
+    The depth term is w |sum w_i z_i - d alpha| (m): zero where the surface
+    is at the right depth, independent of its opacity.
     """
     height, width = image.shape[1], image.shape[2]
     to_unit = np.float32(1.0 / 255.0)
@@ -61,7 +63,11 @@ def photometric_and_depth(  # noqa: ANN201
 
 @kernel
 def add_lidar(image, pixels, z_m, scale, gradient):  # noqa: ANN001, ANN201
-    """Adds the gradient of scale * |rendered - measured depth| at the beams' pixels int32 [N] (flat)."""
+    """Add the gradient of scale * |rendered - measured depth| at the flat pixel indices int32 [N] of lidar
+    beams.
+
+    Returns the loss.
+    """
     flat, g = image.reshape(5, -1), gradient.reshape(5, -1)
     total = 0.0
     for i in range(len(pixels)):
@@ -75,16 +81,16 @@ def add_lidar(image, pixels, z_m, scale, gradient):  # noqa: ANN001, ANN201
 
 
 @kernel
-def contradicted(  # noqa: ANN201
-    params, count, camera, depth_mm, depth_weight, least_weight, margin, strikes,  # noqa: ANN001
+def count_carving_votes(  # noqa: ANN201
+    params, count, camera, depth_mm, depth_weight, least_weight, margin, votes,  # noqa: ANN001
 ):  # fmt: skip
-    """strikes[i] += 1 for Gaussians whose centre floats before a surface that is known well.
+    """Add 1 to votes[i] for each Gaussian whose centre floats in front of a trusted surface; return how many.
 
-    A Gaussian at z counts as floating if its pixel's depth d is trusted (weight >= least_weight) and
-    z + 3 sigma < d (1 - margin). Gives how many were struck. `camera` as packed for the rasterizer.
+    A Gaussian at optical z is floating if the depth d of its pixel is trusted (weight >= least_weight) and
+    z + 3 sigma < d (1 - margin). `camera` is packed as for the rasterizer.
     """
     height, width = depth_mm.shape
-    c, struck = camera, 0
+    c, voted = camera, 0
     for i in range(count):
         x, y, z = params[MEAN, i], params[MEAN + 1, i], params[MEAN + 2, i]
         zc = c[6] * x + c[7] * y + c[8] * z + c[11]
@@ -97,6 +103,6 @@ def contradicted(  # noqa: ANN201
         d = depth_mm[v, u] * np.float32(1e-3)
         size = np.exp(max(params[SCALE, i], max(params[SCALE + 1, i], params[SCALE + 2, i])))
         if d > 0.0 and zc + 3.0 * size < d * (1.0 - margin):
-            strikes[i] += 1
-            struck += 1
-    return struck
+            votes[i] += 1
+            voted += 1
+    return voted

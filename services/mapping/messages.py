@@ -1,4 +1,4 @@
-"""What the mapping service hears and says, as the values that its libraries take and give."""
+"""Conversion between the messages of the mapping service and the types of its libraries."""
 
 from __future__ import annotations
 
@@ -16,28 +16,31 @@ from beamsplat.common.messages.depth_png import depth_from_png, mask_from_png, s
 from beamsplat.common.messages.image_codec import decode_rgb
 from beamsplat.common.messages.splat_codec import pack
 from beamsplat.common.raster.camera import RasterCamera
-from beamsplat.services.mapping.chunks import Eye, Part
-from beamsplat.services.mapping.keyframe import Keyframe as MapKeyframe
-from beamsplat.services.mapping.preview import Look
+from beamsplat.services.mapping.chunks import ChunkUpdate, Viewpoint
+from beamsplat.services.mapping.keyframe import RgbdKeyframe
+from beamsplat.services.mapping.preview import KeyframeRender
 
-_PIECE_BYTES = 4 << 20
+_PIECE_BYTES = 4 << 20  # of a state in one message
 
 
 def ack(message: Keyframe, status: str) -> tuple[str, KeyframeAck]:
-    """The answer to a keyframe, as a node sends it."""
+    """Return (topic, message) that acknowledges a keyframe; `status` is "ok" or why it was refused."""
     return "keyframes/ack", KeyframeAck(stamp_ns=message.stamp_ns, id=message.id, status=status)
 
 
-def body_of(message: Keyframe) -> tuple[str, bytes]:
-    """A keyframe as a session keeps it: schema and payload."""
+def encode_keyframe(message: Keyframe) -> tuple[str, bytes]:
+    """Return (schema, payload) of a keyframe, as a session stores it."""
     return schema_of(message), encode(message)
 
 
-def open_keyframe(message: Keyframe, lens: Callable[[Pinhole], Undistorter]) -> MapKeyframe:
-    """Decoded and undistorted: everything behind sees a pinhole.
+def decode_keyframe(message: Keyframe, lens: Callable[[Pinhole], Undistorter]) -> RgbdKeyframe:
+    """Decode and undistort a keyframe message: all later stages use a pinhole camera.
+
+    Args:
+        lens: makes the undistorter of a camera model; may cache it.
 
     Raises:
-        UserError, ValueError: picture, depth, sigma or mask do not decode, or are of another size.
+        UserError, ValueError: image, depth, sigma or mask cannot be decoded or have the wrong size.
     """
     camera = message.camera
     undistort = lens(
@@ -46,7 +49,7 @@ def open_keyframe(message: Keyframe, lens: Callable[[Pinhole], Undistorter]) -> 
     p = undistort.pinhole
     rgb = decode_rgb(message.picture, message.encoding, p.width_px, p.height_px)
     mask = mask_from_png(message.mask_png) if len(message.mask_png) else None
-    return MapKeyframe(
+    return RgbdKeyframe(
         id=message.id, rgb=undistort(rgb),
         camera=RasterCamera(p.fx_px, p.fy_px, p.cx_px, p.cy_px, p.width_px, p.height_px),
         T_anchor_camera=message.T_anchor_body @ camera.T_body_camera,
@@ -55,8 +58,8 @@ def open_keyframe(message: Keyframe, lens: Callable[[Pinhole], Undistorter]) -> 
     )  # fmt: skip
 
 
-def preview_message(keyframe: Keyframe, view: Look) -> MapPreview:
-    """The map from that keyframe, as a JPEG."""
+def preview_message(keyframe: Keyframe, view: KeyframeRender) -> MapPreview:
+    """Return the preview of a keyframe with its render as JPEG."""
     bgr = cv2.cvtColor(view.rgb, cv2.COLOR_RGB2BGR)
     render = cv2.imencode(".jpg", bgr, (cv2.IMWRITE_JPEG_QUALITY, 85))[1].ravel()
     return MapPreview(
@@ -64,16 +67,16 @@ def preview_message(keyframe: Keyframe, view: Look) -> MapPreview:
     )  # fmt: skip
 
 
-def chunk_message(T_map_anchor: np.ndarray, anchor: int, part: Part, stamp_ns: int) -> MapChunk:
-    """A chunk, packed."""
+def chunk_message(T_map_anchor: np.ndarray, anchor: int, update: ChunkUpdate, stamp_ns: int) -> MapChunk:
+    """Return the message of a chunk, with packed Gaussians."""
     return MapChunk(
-        stamp_ns=stamp_ns, anchor_id=anchor, revision=part.version, cell_m=part.cell_m,
-        T_map_anchor=T_map_anchor, count=part.params.shape[1], packed=pack(part.params),
+        stamp_ns=stamp_ns, anchor_id=anchor, revision=update.version, cell_m=update.cell_m,
+        T_map_anchor=T_map_anchor, count=update.params.shape[1], packed=pack(update.params),
     )  # fmt: skip
 
 
 def state_messages(arrays: Arrays) -> Iterator[MapState]:
-    """A state in pieces that a link carries."""
+    """Yield a state in pieces of at most 4 MiB."""
     blob = packed_arrays(arrays)
     for first in range(0, len(blob), _PIECE_BYTES):
         piece = np.frombuffer(blob[first : first + _PIECE_BYTES], np.uint8)
@@ -81,28 +84,32 @@ def state_messages(arrays: Arrays) -> Iterator[MapState]:
 
 
 def joined_state(pieces: list[MapState]) -> Arrays:
-    """The state that came in pieces, in any order.
+    """Return the state from its pieces, received in any order.
 
     Raises:
-        UserError: some of it did not come.
+        UserError: some bytes are missing.
     """
     pieces = sorted(pieces, key=lambda piece: piece.first)
     blob = b"".join(piece.data.tobytes() for piece in pieces)
     if not pieces or len(blob) != pieces[0].total:
-        raise UserError(f"{len(blob)} of {pieces[0].total if pieces else 0} bytes of the map came: ask again")
+        raise UserError(
+            f"received {len(blob)} of {pieces[0].total if pieces else 0} bytes of the map: try again"
+        )
     return unpacked_arrays(blob)
 
 
-def eye_of(parameters: dict[str, str]) -> Eye | None:
-    """The eye that a query names, if it names one.
+def viewpoint_of(parameters: dict[str, str]) -> Viewpoint | None:
+    """Return the viewpoint in the parameters of a query; None without one.
 
     Raises:
-        UserError: it names half of one, or no numbers.
+        UserError: a parameter is missing or not a number.
     """
     if "from" not in parameters:
         return None
     try:
         x, y, z = (float(word) for word in parameters["from"].split(","))
-        return Eye(np.array([x, y, z]), float(parameters["focal_px"]), float(parameters.get("error_px", "1")))
+        return Viewpoint(
+            np.array([x, y, z]), float(parameters["focal_px"]), float(parameters.get("error_px", "1"))
+        )
     except (KeyError, ValueError) as error:
-        raise UserError("snapshot: expected from=X,Y,Z and focal_px=F, numbers") from error
+        raise UserError("snapshot: expected numbers from=X,Y,Z (m, map frame) and focal_px=F") from error

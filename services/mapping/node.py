@@ -211,8 +211,8 @@ class MappingNode(Node):
         self.detail += f"; {session}" if session else ""
         return MapStatus(
             stamp_ns=stamp_ns, status=outcome.status, keyframes=keyframes, refused=rejected,
-            gaussians=gaussians, steps=m.steps, loss=loss, foretold_share=outcome.foretold_share,
-            foretold_psnr_db=outcome.foretold_psnr_db, psnr_db=psnr_db, depth_error_m=depth_error_m,
+            gaussians=gaussians, steps=m.steps, loss=loss, foretold_share=outcome.predicted_coverage,
+            foretold_psnr_db=outcome.predicted_psnr_db, psnr_db=psnr_db, depth_error_m=depth_error_m,
             session=session,
         )  # fmt: skip
 

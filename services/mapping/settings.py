@@ -1,4 +1,7 @@
-"""What can be chosen about the mapper. All work is fixed per keyframe: nothing depends on the time of day."""
+"""Settings of the mapper. The work per keyframe is fixed: nothing depends on the wall clock.
+
+Values without another source were tuned with `beamsplat bench map`.
+"""
 
 from __future__ import annotations
 
@@ -7,10 +10,10 @@ from dataclasses import dataclass, field
 
 @dataclass(frozen=True)
 class LearningRates:
-    """Adam's step per parameter, in the parameter's own unit."""
+    """Step sizes of Adam, in the unit of each parameter."""
 
-    mean_m: float = 2e-3  # of keyframes just taken in: Gaussians have to find their places
-    refined_mean_m: float = 6e-4  # of refinement: places are known, and jitter shows
+    mean_m: float = 2e-3  # for keyframes just inserted: new Gaussians are still displaced
+    refined_mean_m: float = 6e-4  # for refinement: larger steps make converged Gaussians jitter
     log_scale: float = 6e-3
     quat: float = 2e-3
     opacity_logit: float = 3e-2
@@ -22,42 +25,41 @@ class LearningRates:
 
 @dataclass(frozen=True)
 class MapperSettings:
-    """See module. Lengths in metres, sizes in pixels of the full picture."""
+    """Settings of insertion, losses and pruning. Lengths in metres, pixels of the full-size image."""
 
-    # Work per keyframe; sizes are halved once for `half` iterations.
+    # Work per keyframe; `half` iterations use the half-size image.
     half_iterations: int = 18
     full_iterations: int = 5
-    recent: int = 8  # keyframes of the window that are newest; each second draw is one of them
+    recent: int = 8  # newest keyframes in the optimisation window; every second draw is one of them
     # Insertion
-    stride_px: int = 5
-    fine_stride_px: int = 3  # where the picture has texture
+    stride_px: int = 5  # between new Gaussians
+    fine_stride_px: int = 3  # the same, where the image has texture
     texture: float = 0.15  # mean absolute colour step over `stride_px` that counts as texture
-    sure_weight: float = 0.25  # depth of less weight is not put where other keyframes see through
-    alpha_low: float = 0.7  # less than this is not explained
-    colour_off: float = 0.15  # mean absolute colour error that is not explained
-    depth_off: float = 0.10  # relative depth error that is not explained
-    opacity: float = 0.6
-    size: float = 0.65  # standard deviation over spacing
-    flatness: float = 0.2
-    least_slant: float = 0.12  # cosine to the normal that bounds how long a disc gets down a slope
+    sure_weight: float = 0.25  # depth of lower weight is not inserted in observed free space
+    min_alpha: float = 0.7  # a pixel with less is unexplained
+    max_colour_error: float = 0.15  # mean absolute error in [0, 1]; a pixel with more is unexplained
+    max_depth_error: float = 0.10  # relative; a pixel with more is unexplained
+    opacity: float = 0.6  # of a new Gaussian
+    size: float = 0.65  # standard deviation of a new Gaussian over the spacing
+    flatness: float = 0.2  # thickness of a new Gaussian over its size
+    least_slant: float = 0.12  # lower bound of cos(angle to the normal): limits the length of discs on slopes
     max_gaussians: int = 300_000
-    max_keyframes: int = 800  # 2.2 MB each at 640x480; beyond it old ones are forgotten, drawn by chance
+    max_keyframes: int = 800  # 2.2 MB each at 640x480; beyond it, keyframes of crowded places are dropped
     # Losses
     ssim_weight: float = 0.2
-    ssim_every: int = 3
+    ssim_every: int = 3  # steps between two with the SSIM term
     depth_weight: float = 0.15
     lidar_weight: float = 1e-3
     isotropy_weight: float = 0.05
-    isotropy_ratio: float = 12.0
-    sigma_unit: float = 0.03  # a depth whose sigma is this share of it has weight 1/2
-    # Upkeep
-    prune_opacity: float = 0.03
-    carve_sigma: float = 3.0
-    carve_weight: float = 0.5  # of depth that can carve
-    carve_margin: float = 0.08  # relative, beyond which a Gaussian floats before a trusted surface
-    carve_strikes: int = 2
+    isotropy_ratio: float = 12.0  # longest over second axis, above which the isotropy term acts
+    sigma_unit: float = 0.03  # relative depth sigma that gets weight 1/2
+    # Pruning
+    prune_opacity: float = 0.03  # below it a Gaussian is removed
+    carve_weight: float = 0.5  # least weight of a depth that can vote for carving
+    carve_margin: float = 0.08  # relative distance to a surface from which a Gaussian is floating
+    carve_votes: int = 2  # votes at which a floating Gaussian is removed
     refine_pose: bool = False
     refine_exposure: bool = False
-    max_pose_m: float = 0.10
+    max_pose_m: float = 0.10  # largest correction of a keyframe's pose
     max_pose_rad: float = 0.05
     rates: LearningRates = field(default_factory=LearningRates)

@@ -1,4 +1,4 @@
-"""Compiles the mapper's kernels, and those of the rasterizer, into their caches."""
+"""Compile the kernels of the mapper and of the rasterizer into their on-disk caches."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ import numpy as np
 
 from beamsplat.common.raster.camera import RasterCamera
 from beamsplat.common.raster.warm import warm as warm_rasterizer
-from beamsplat.services.mapping.keyframe import Keyframe
+from beamsplat.services.mapping.keyframe import RgbdKeyframe
 from beamsplat.services.mapping.mapper import FULL, HALF, Mapper
 from beamsplat.services.mapping.settings import MapperSettings
 
 
 def warm() -> None:
-    """Maps two tiny keyframes, with everything switched on, with the types used in production."""
+    """Map two tiny keyframes with all options on, with the array types used in production."""
     warm_rasterizer()
-    settings = MapperSettings(ssim_every=1, refine_pose=True, refine_exposure=True, carve_strikes=1)
+    settings = MapperSettings(ssim_every=1, refine_pose=True, refine_exposure=True, carve_votes=1)
     mapper = Mapper(settings)
-    wall = Keyframe(
+    wall = RgbdKeyframe(
         id=0, rgb=np.full((48, 64, 3), 128, np.uint8), camera=RasterCamera(50.0, 50.0, 31.5, 23.5, 64, 48),
         T_anchor_camera=np.eye(4), depth_m=np.full((48, 64), 2.0, np.float32),
         sigma_m=np.full((48, 64), 0.01, np.float32), beams_uvz=np.array([[30.0, 20.0, 2.0]]),

@@ -15,12 +15,12 @@ import numpy as np
 from beamsplat.common.geometry.transforms import inverse
 from beamsplat.common.mapfiles.blocks import Arrays
 from beamsplat.common.mapfiles.scores import render_rgb_depth
-from beamsplat.common.mapfiles.state import View, store_of, views_of
+from beamsplat.common.mapfiles.state import KeyframeView, keyframe_views, store_of
 from beamsplat.common.mapfiles.store import GaussianStore
 from beamsplat.common.raster.camera import RasterCamera
 from beamsplat.common.raster.layout import MEAN, SCALE
 from beamsplat.common.raster.rasterizer import Rasterizer
-from beamsplat.services.mapping.keyframe import Keyframe, hold
+from beamsplat.services.mapping.keyframe import RgbdKeyframe, compress
 from beamsplat.services.mapping.mapper import HALF
 
 _COVERED = 0.5  # alpha from which a map shows a surface
@@ -28,20 +28,20 @@ _SAME_M, _SAME_SHARE = 0.15, 0.10  # two depths within both are one surface
 _BLUR_PX = 11  # neighbours go together: a mosaic of both maps has seams everywhere
 
 
-def without_doubles(
+def without_duplicates(
     arrays: Arrays,  # of two maps, as `merged` gives them
     second: np.ndarray,  # bool [N]: Gaussians of the second map
-    opened: Callable[[int], Keyframe],  # a keyframe by its id; raises ValueError
-    watched: Callable[[list[View]], Iterable[View]] = iter,
+    opened: Callable[[int], RgbdKeyframe],  # a keyframe by its id; raises ValueError
+    watched: Callable[[list[KeyframeView]], Iterable[KeyframeView]] = iter,
 ) -> np.ndarray:
     """bool [N]: the Gaussians that stay. Keyframes that cannot be opened have no say."""
     stores = [_part(arrays, ~second), _part(arrays, second)]
     votes = [np.zeros(store.count, np.int32) for store in stores]
     exposure = dict(zip(arrays["keyframe_id"].tolist(), arrays["keyframe_exposure"]))
     rasterizer = Rasterizer()
-    for view in watched(views_of(arrays)):
+    for view in watched(keyframe_views(arrays)):
         try:
-            level = hold(opened(view.id), 1.0).levels[HALF]
+            level = compress(opened(view.id), 1.0).levels[HALF]
         except ValueError:
             continue
         picture, e = level.rgb.transpose(1, 2, 0) * np.float32(1 / 255), exposure[view.id]

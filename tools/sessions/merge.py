@@ -8,10 +8,10 @@ from functools import lru_cache
 from beamsplat.common.geometry.camera import Undistorter
 from beamsplat.common.mapfiles.blocks import Arrays
 from beamsplat.common.mapfiles.session import SessionFolder
-from beamsplat.common.mapfiles.state import View
+from beamsplat.common.mapfiles.state import KeyframeView
 from beamsplat.common.messages.codec import decode
-from beamsplat.services.mapping.messages import open_keyframe
-from beamsplat.tools.sessions.deduplicate import without_doubles
+from beamsplat.services.mapping.messages import decode_keyframe
+from beamsplat.tools.sessions.deduplicate import without_duplicates
 from beamsplat.tools.sessions.edit import with_gaussians
 
 
@@ -19,12 +19,12 @@ def once(
     folder: SessionFolder,  # with the keyframes of both
     arrays: Arrays,  # as `merged` gives them
     offset: int,  # of the second map's anchors
-    watched: Callable[[list[View]], Iterable[View]] = iter,
+    watched: Callable[[list[KeyframeView]], Iterable[KeyframeView]] = iter,
 ) -> Arrays:
     """The merged map without doubled surfaces."""
     lens = lru_cache(maxsize=4)(Undistorter)
-    stay = without_doubles(
+    stay = without_duplicates(
         arrays, arrays["store_anchor"] >= offset - 1,
-        lambda id: open_keyframe(decode(*folder.read_body(id)), lens), watched,
+        lambda id: decode_keyframe(decode(*folder.read_keyframe(id)), lens), watched,
     )  # fmt: skip
     return with_gaussians(arrays, stay)

@@ -10,10 +10,10 @@ import torch
 from beamsplat.common.raster.camera import RasterCamera
 from beamsplat.common.raster.layout import GROUPS, PARAMS
 from beamsplat.common.raster.rasterizer import Rasterizer, Render
-from beamsplat.services.mapping.renderers.protocol import Gaussians, Picture
+from beamsplat.services.mapping.renderers.protocol import Gaussians, RenderedImage
 
 
-class Cpu:
+class CpuRenderer:
     """See module. `threads` are shared by all pictures of this renderer."""
 
     def __init__(self, threads: int = 1) -> None:
@@ -26,12 +26,12 @@ class Cpu:
         T_camera_map: np.ndarray,
         background: torch.Tensor | None = None,
         pose_tangent: torch.Tensor | None = None,
-    ) -> Picture:
+    ) -> RenderedImage:
         """The picture; differentiable once."""
         tangent = torch.zeros(6) if pose_tangent is None else pose_tangent
         black = torch.zeros(3) if background is None else background
         image = _Rasterize.apply(self._rasterizer, camera, T_camera_map, black, tangent, *gaussians.tensors())
-        return Picture(image[:3].permute(1, 2, 0), image[3], image[4])
+        return RenderedImage(image[:3].permute(1, 2, 0), image[3], image[4])
 
 
 def pack(gaussians: tuple[torch.Tensor, ...]) -> tuple[np.ndarray, int]:

@@ -8,7 +8,7 @@ import torch
 from beamsplat.common.errors import UserError
 from beamsplat.common.raster.camera import RasterCamera
 from beamsplat.common.raster.layout import BLUR_PX2, NEAR_M
-from beamsplat.services.mapping.renderers.protocol import Gaussians, Picture
+from beamsplat.services.mapping.renderers.protocol import Gaussians, RenderedImage
 
 
 def fault() -> str | None:
@@ -26,7 +26,7 @@ def fault() -> str | None:
     return None
 
 
-class Gsplat:
+class GsplatRenderer:
     """See module.
 
     Raises:
@@ -49,7 +49,7 @@ class Gsplat:
         T_camera_map: np.ndarray,
         background: torch.Tensor | None = None,
         pose_tangent: torch.Tensor | None = None,
-    ) -> Picture:
+    ) -> RenderedImage:
         """The picture, on the device of this renderer; differentiable once."""
         to = {"device": self._device, "dtype": torch.float32}
         viewmat = torch.as_tensor(T_camera_map, **to)
@@ -73,7 +73,7 @@ class Gsplat:
         rgb = image[0, ..., :3]
         if background is not None:
             rgb = rgb + (1.0 - alpha[..., None]) * background.to(**to)
-        return Picture(rgb, image[0, ..., 3], alpha)
+        return RenderedImage(rgb, image[0, ..., 3], alpha)
 
 
 def _left_perturbed(viewmat: torch.Tensor, tangent: torch.Tensor) -> torch.Tensor:

@@ -35,7 +35,7 @@ class Gaussians:
 
 
 @dataclass(frozen=True)
-class Picture:
+class RenderedImage:
     """A rendered image."""
 
     colour: torch.Tensor  # [H, W, 3]
@@ -48,7 +48,7 @@ class Picture:
         return torch.where(known, self.depth_m / torch.where(known, self.alpha, 1.0), torch.nan)
 
 
-class Renderer(Protocol):
+class DifferentiableRenderer(Protocol):
     """A differentiable rasterizer."""
 
     def render(
@@ -59,19 +59,19 @@ class Renderer(Protocol):
         background: torch.Tensor | None = None,  # [3], default black
         pose_tangent: torch.Tensor
         | None = None,  # [6], zero, with requires_grad where its gradient is wanted
-    ) -> Picture:
+    ) -> RenderedImage:
         """The picture from there."""
         ...
 
 
 RENDERERS: dict[str, str] = {
-    "reference": "beamsplat.services.mapping.renderers.reference:Reference",
-    "cpu": "beamsplat.services.mapping.renderers.cpu:Cpu",
-    "gsplat": "beamsplat.services.mapping.renderers.gsplat:Gsplat",
+    "reference": "beamsplat.services.mapping.renderers.reference:ReferenceRenderer",
+    "cpu": "beamsplat.services.mapping.renderers.cpu:CpuRenderer",
+    "gsplat": "beamsplat.services.mapping.renderers.gsplat:GsplatRenderer",
 }
 
 
-def make_renderer(name: str) -> Renderer:
+def make_renderer(name: str) -> DifferentiableRenderer:
     """The renderer called `name`; its module is imported only now.
 
     Raises:

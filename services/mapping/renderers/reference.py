@@ -10,12 +10,12 @@ import torch
 
 from beamsplat.common.raster.camera import RasterCamera
 from beamsplat.common.raster.layout import ALPHA_MAX, ALPHA_MIN, BLUR_PX2, NEAR_M, STOP
-from beamsplat.services.mapping.renderers.protocol import Gaussians, Picture
+from beamsplat.services.mapping.renderers.protocol import Gaussians, RenderedImage
 
 _BLOCK = 16
 
 
-class Reference:
+class ReferenceRenderer:
     """See module."""
 
     def render(
@@ -25,7 +25,7 @@ class Reference:
         T_camera_map: np.ndarray,
         background: torch.Tensor | None = None,
         pose_tangent: torch.Tensor | None = None,
-    ) -> Picture:
+    ) -> RenderedImage:
         """The picture; differentiable in everything, twice if need be."""
         mean = gaussians.mean_map_m
         T = torch.as_tensor(T_camera_map, dtype=mean.dtype)
@@ -47,7 +47,7 @@ class Reference:
         colour, depth, alpha = image[..., :3], image[..., 3], image[..., 4]
         if background is not None:
             colour = colour + (1.0 - alpha[..., None]) * background.to(mean.dtype)
-        return Picture(colour, depth, alpha)
+        return RenderedImage(colour, depth, alpha)
 
 
 def _so3_exp(phi: torch.Tensor) -> torch.Tensor:

@@ -1,8 +1,9 @@
-"""Maps that live on: folders that a mapper is saved to and resumes from, and what can be done with them.
+"""Sessions: folders that a mapper is saved to while it runs, and resumed from.
 
-session.json            one UUID and the format's version; written once
-edge/edge.json          the edge half's manifest: which state is the valid one; replaced last, atomically
-edge/state-N.npz        Gaussians with optimiser state, anchors, keyframes' poses and exposures
-edge/keyframes/ID.kf    one self-sufficient keyframe each, as it came
+session.json            UUID and format version; written once
+edge/edge.json          manifest of the edge half: names the valid state; replaced last, atomically
+edge/state-N.npz        Gaussians with optimiser state, anchors, poses and exposures of keyframes
+edge/gaussians/N.block  Gaussians that are paged out
+edge/keyframes/ID.kf    one keyframe message each, as received
 robot/                  the robot half: lidar map, grid and trajectory, as localization saves them
 """

@@ -1,4 +1,4 @@
-"""Keeps a mapper on disk: when it is saved, what has become of that, and how it resumes."""
+"""Checkpoints of a mapper in a session folder: when to write them, their results, and resuming from them."""
 
 from __future__ import annotations
 
@@ -11,201 +11,214 @@ from beamsplat.common.errors import UserError
 from beamsplat.common.mapfiles.blocks import Arrays, sync, with_blocks
 from beamsplat.common.mapfiles.session import SessionFolder
 from beamsplat.common.mapfiles.state import progress_of
-from beamsplat.services.mapping.keyframe import Held, Keyframe
+from beamsplat.services.mapping.keyframe import RgbdKeyframe, StoredKeyframe
 from beamsplat.services.mapping.mapper import Mapper
-from beamsplat.services.mapping.session.disk_tier import Shelf
+from beamsplat.services.mapping.session.disk_tier import DiskTier
 from beamsplat.services.mapping.session.paging import Pager
 from beamsplat.services.mapping.session.state import arrays_of, extras_of, restore
 
 log = logging.getLogger("beamsplat.mapping")
 
-Opener = Callable[[str, bytes], Keyframe]  # (schema, payload) -> keyframe; raises ValueError
+KeyframeDecoder = Callable[[str, bytes], RgbdKeyframe]  # (schema, payload) -> keyframe; raises ValueError
 
 
 @dataclass(frozen=True)
-class Saved:
-    """What became of a checkpoint. `fault` is "" or why there is none."""
+class CheckpointResult:
+    """The result of writing a checkpoint. `fault` is "", or why it was not written."""
 
     steps: int
     keyframes: int
     fault: str = ""
-    synced: tuple[int, ...] = ()  # blocks of Gaussians that are on the disk for good,
-    removed: tuple[int, ...] = ()  # and those that are not needed any more
+    synced: tuple[int, ...] = ()  # blocks that were flushed to the disk
+    removed: tuple[int, ...] = ()  # blocks whose files were removed
 
 
-class Keeper:
-    """A mapper's session. Times are those of measurements, so that a replay saves at the same moments."""
+class Checkpointer:
+    """The session of a mapper, locked for writing. Periods count measurement time, so that a replay is
+    reproducible.
+    """
 
     def __init__(self, path: Path, period_ns: int, budget_bytes: float | None = None, seed: int = 0) -> None:
         self.folder = SessionFolder(path)
         self.folder.create()
         self.folder.lock()
-        self.shelf = Shelf(self.folder)
-        self._pager = None if budget_bytes is None else Pager(budget_bytes, seed, self.shelf)
+        self.disk_tier = DiskTier(self.folder)
+        self._pager = None if budget_bytes is None else Pager(budget_bytes, seed, self.disk_tier)
         self._period_ns = period_ns
-        self._since_ns: int | None = None  # stamp at the last checkpoint, or the first stamp there was
+        self._since_ns: int | None = None  # stamp of the last checkpoint, or of the first keyframe
         self._running = False
-        self._last: Saved | None = None
-        self._unsaved: set[int] = set()
-        self._body_fault = ""
+        self._last: CheckpointResult | None = None
+        self._unwritten: set[int] = set()  # keyframes that the mapper has and the disk has not
+        self._write_fault = ""
 
     # --- resuming ---
 
-    def resume(self, mapper: Mapper, opener: Opener) -> tuple[Arrays, list[int]]:
-        """Makes a fresh mapper the saved one. Gives what rode along with the state, and the ids of
-        keyframes on disk that came after it: the caller takes them in.
+    def resume(self, mapper: Mapper, decoder: KeyframeDecoder) -> tuple[Arrays, list[int]]:
+        """Restore the last checkpoint into a new mapper.
+
+        Returns:
+            The extra arrays that `checkpoint` was given, and the ids of keyframes on disk that are newer than
+            the checkpoint: the caller inserts them.
 
         Raises:
-            UserError: there is a saved state, but it cannot be read.
+            UserError: there is a checkpoint, but it cannot be read.
         """
         paged = self._pager is not None
-        mapper.elsewhere = self.shelf
+        mapper.disk_gaussians = self.disk_tier
         arrays = self.folder.read_state(whole=not paged)
-        self._opener = opener
+        self._decoder = decoder
         if arrays is None:
-            self.shelf.tidy()
-            return {}, self.folder.body_ids()
-        lost = restore(mapper, arrays, self._body, rest=paged)
-        self.shelf.restore(arrays, mapper.store)
+            self.disk_tier.find_stale_files()
+            return {}, self.folder.keyframe_ids()
+        lost = restore(mapper, arrays, self._decode, keep_paged_out=paged)
+        self.disk_tier.restore(arrays, mapper.store)
         for text in lost:
-            log.warning("not looked at any more: %s", text)
+            log.warning("the mapper no longer optimises on this keyframe: %s", text)
         progress = progress_of(arrays)
-        # After a crash too, none grows older than a period.
+        # Counted from the stored checkpoint: a mapper that crashes repeatedly still writes one per period.
         self._since_ns = self.folder.manifest().get("stamp_ns")
-        self._last = Saved(int(progress["steps"]), len(mapper.keyframes) + len(mapper.resting))
+        keyframes = len(mapper.keyframes) + len(mapper.paged_out)
+        self._last = CheckpointResult(int(progress["steps"]), keyframes)
         extra = extras_of(arrays)
         known = set(extra["taken_id"].tolist()) | set(progress["forgotten"])
-        return extra, [id for id in self.folder.body_ids() if id not in known]
+        return extra, [id for id in self.folder.keyframe_ids() if id not in known]
 
-    def _body(self, id: int) -> Keyframe:
-        return self._opener(*self.folder.read_body(id))
+    def _decode(self, id: int) -> RgbdKeyframe:
+        return self._decoder(*self.folder.read_keyframe(id))
+
+    # --- paging ---
 
     def page(self, mapper: Mapper) -> None:
-        """Keeps the budget, if there is one."""
+        """Page keyframes and Gaussians to keep the memory budget; no effect without a budget."""
         if self._pager is not None:
-            self._pager.page(mapper, self._body, lambda id: id not in self._unsaved)
+            self._pager.page(mapper, self._decode, lambda id: id not in self._unwritten)
 
-    def bring(self, mapper: Mapper, held: Held) -> None:
-        """Has all in memory that a keyframe sees."""
+    def load_visible(self, mapper: Mapper, keyframe: StoredKeyframe) -> None:
+        """Page in all Gaussians that a keyframe observes."""
         if self._pager is not None:
-            self._pager.bring(mapper, held)
+            self._pager.load_visible(mapper, keyframe)
 
-    def moved(self, mapper: Mapper) -> None:
-        """Anchors have moved."""
+    def anchors_moved(self, mapper: Mapper) -> None:
+        """Update paging after anchors have moved."""
         if self._pager is not None:
-            self._pager.moved(mapper)
-
-    def body(self, id: int) -> tuple[str, bytes] | None:
-        """A keyframe on disk; None if it is broken, which is said."""
-        try:
-            return self.folder.read_body(id)
-        except UserError as error:
-            log.warning("left out: %s", error)
-            return None
+            self._pager.anchors_moved(mapper)
 
     # --- keyframes ---
 
-    def drop(self, id: int) -> None:
-        """The mapper refuses a keyframe that is on disk."""
-        self.folder.remove_bodies([id])
-
-    def keep(self, id: int, schema: str, payload: bytes) -> bool:
-        """Writes a keyframe that the mapper has taken. False where it could not be: who sent it keeps it."""
+    def read_keyframe(self, id: int) -> tuple[str, bytes] | None:
+        """Return (schema, payload) of a keyframe on disk; None, with a warning, if it cannot be read."""
         try:
-            self.folder.write_body(id, schema, payload)
+            return self.folder.read_keyframe(id)
+        except UserError as error:
+            log.warning("keyframe skipped: %s", error)
+            return None
+
+    def remove_keyframe(self, id: int) -> None:
+        """Remove a keyframe that the mapper refused from the disk."""
+        self.folder.remove_keyframes([id])
+
+    def write_keyframe(self, id: int, schema: str, payload: bytes) -> bool:
+        """Write a keyframe to disk; return False if that failed: then it must not be acknowledged."""
+        try:
+            self.folder.write_keyframe(id, schema, payload)
         except OSError as error:
-            self._unsaved.add(id)
-            self._body_fault = f"keyframe {id} not saved: {error.strerror}"
-            log.warning("%s: %s", self.folder.path, self._body_fault)
+            self._unwritten.add(id)
+            self._write_fault = f"keyframe {id} not saved: {error.strerror}"
+            log.warning("%s: %s", self.folder.path, self._write_fault)
             return False
-        self._unsaved.discard(id)
-        if not self._unsaved:
-            self._body_fault = ""
+        self._unwritten.discard(id)
+        if not self._unwritten:
+            self._write_fault = ""
         return True
 
-    def lacks(self, id: int) -> bool:
-        """Whether a keyframe that the mapper has could not be written."""
-        return id in self._unsaved
+    def is_unwritten(self, id: int) -> bool:
+        """Return whether writing a keyframe to disk has failed so far."""
+        return id in self._unwritten
 
     # --- checkpoints ---
 
-    def whole(self, arrays: Arrays) -> Arrays:
-        """A state as if all Gaussians had been in memory.
+    def with_disk_gaussians(self, arrays: Arrays) -> Arrays:
+        """Return a state of the mapper with all Gaussians, those on disk included.
 
         Raises:
-            UserError: some on the disk cannot be read.
+            UserError: a block cannot be read.
         """
-        return with_blocks(self.folder.blocks, arrays | self.shelf.arrays())
+        return with_blocks(self.folder.blocks, arrays | self.disk_tier.arrays())
 
-    def count_from(self, stamp_ns: int) -> None:
-        """The first keyframe that no checkpoint holds is from then."""
+    def start_period(self, stamp_ns: int) -> None:
+        """Start the first checkpoint period at the stamp of a keyframe, unless one is running."""
         if self._since_ns is None:
             self._since_ns = stamp_ns
 
     def due(self, stamp_ns: int) -> bool:
-        """Whether it is time for a checkpoint. A clock that leaps back counts too."""
-        self.count_from(stamp_ns)
+        """Return whether a checkpoint is due. A jump of the clock back by a period counts too."""
+        self.start_period(stamp_ns)
         return not self._running and abs(stamp_ns - self._since_ns) >= self._period_ns
 
-    def checkpoint(self, mapper: Mapper, extra: Arrays, stamp_ns: int) -> Callable[[], Saved]:
-        """Work for the background, on copies made now; its result belongs into `done`."""
+    def checkpoint(self, mapper: Mapper, extra: Arrays, stamp_ns: int) -> Callable[[], CheckpointResult]:
+        """Copy the mapper's state now and return the job that writes it, for a background thread.
+
+        The result of the job must be passed to `finish_checkpoint`.
+        """
         self._running, self._since_ns = True, stamp_ns
-        arrays, folder = arrays_of(mapper, extra) | self.shelf.arrays(), self.folder
-        keyframes, steps = len(mapper.keyframes) + len(mapper.resting), mapper.steps
-        synced, removed = self.shelf.settled()
+        arrays, folder = arrays_of(mapper, extra) | self.disk_tier.arrays(), self.folder
+        keyframes, steps = len(mapper.keyframes) + len(mapper.paged_out), mapper.steps
+        synced, removed = self.disk_tier.pending_files()
         summary = {
-            "keyframes": keyframes, "gaussians": mapper.store.count + self.shelf.count, "steps": steps,
+            "keyframes": keyframes, "gaussians": mapper.store.count + self.disk_tier.count, "steps": steps,
             "anchors": len(mapper.T_map_anchor), "stamp_ns": stamp_ns,
         }  # fmt: skip
-        forgotten = mapper.progress()["forgotten"]
+        dropped = mapper.progress()["forgotten"]
 
-        def run() -> Saved:
+        def run() -> CheckpointResult:
             try:
                 sync(folder.blocks, synced)
                 folder.write_state(arrays, summary)
             except OSError as error:
-                return Saved(steps, keyframes, error.strerror or str(error))
-            folder.remove_bodies(forgotten)
+                return CheckpointResult(steps, keyframes, error.strerror or str(error))
+            folder.remove_keyframes(dropped)
             folder.remove_blocks(removed)
-            return Saved(steps, keyframes, "", tuple(synced), tuple(removed))
+            return CheckpointResult(steps, keyframes, "", tuple(synced), tuple(removed))
 
         return run
 
-    def done(self, saved: Saved) -> None:
-        """Takes in what became of a checkpoint."""
+    def finish_checkpoint(self, result: CheckpointResult) -> None:
+        """Record the result of a checkpoint job."""
         self._running = False
-        if saved.fault:
-            log.warning("%s: no checkpoint: %s; the one before stays valid", self.folder.path, saved.fault)
-        self.shelf.saved(saved.synced, saved.removed)
-        self._last = saved
+        if result.fault:
+            log.warning(
+                "%s: checkpoint not written: %s; the previous one stays valid", self.folder.path, result.fault
+            )
+        self.disk_tier.mark_saved(result.synced, result.removed)
+        self._last = result
 
     def save(self, mapper: Mapper, extra: Arrays) -> None:
-        """A checkpoint now; none must be under way.
+        """Write a checkpoint now; no other may be running.
 
         Raises:
-            UserError: the disk does not take it, or keyframes are in memory only.
+            UserError: it could not be written, or some keyframes are not on disk.
         """
         stamp_ns = self._since_ns or 0
-        self.done(self.checkpoint(mapper, extra, stamp_ns)())
-        if self._unsaved or self._last.fault:
-            raise UserError(f"{self.folder.path}: {self.text(mapper)}")
+        self.finish_checkpoint(self.checkpoint(mapper, extra, stamp_ns)())
+        if self._unwritten or self._last.fault:
+            raise UserError(f"{self.folder.path}: {self.status_text(mapper)}")
 
-    def text(self, mapper: Mapper) -> str:
-        """For the status: how far the session is on disk, or what keeps it from being; and the memory."""
+    def status_text(self, mapper: Mapper) -> str:
+        """Return a status for people: the last checkpoint, or why there is none, and the memory use."""
         last = self._last
         if last is not None and last.fault:
-            return f"NOT SAVED: {last.fault}; the checkpoint before stays valid"
-        if self._body_fault:
-            return f"NOT SAVED: {self._body_fault}"
+            return f"NOT SAVED: {last.fault}; the previous checkpoint stays valid"
+        if self._write_fault:
+            return f"NOT SAVED: {self._write_fault}"
         parts = [] if last is None else [f"saved at {last.keyframes} keyframes, step {last.steps}"]
         if self._pager is not None:
             if self._pager.fault:
-                parts.insert(0, f"BUDGET NOT KEPT: {self._pager.fault}")
-            parts.append(self._pager.text(mapper))
-        if mapper.given_up:
-            parts.append(f"{mapper.given_up} keyframes given up for others of the same place")
+                parts.insert(0, f"MEMORY BUDGET EXCEEDED: {self._pager.fault}")
+            parts.append(self._pager.status_text(mapper))
+        if mapper.dropped_count:
+            parts.append(f"{mapper.dropped_count} keyframes dropped in favour of others with the same pose")
         return "; ".join(parts)
 
     def close(self) -> None:
-        """Lets others write to the session."""
+        """Release the write lock of the session."""
         self.folder.unlock()

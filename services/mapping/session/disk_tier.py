@@ -1,5 +1,8 @@
-"""Gaussians on disk instead of in memory, in blocks: those of one anchor in one cube of its frame. What is on
-the shelf is not trained; it moves with its anchor."""
+"""The disk tier of the Gaussians: blocks that are on disk and not in memory.
+
+A block contains the Gaussians of one anchor in one cubic cell of the anchor's frame. Gaussians on disk are
+not optimised; they move with their anchor.
+"""
 
 from __future__ import annotations
 
@@ -26,45 +29,45 @@ from beamsplat.common.raster.layout import MEAN, QUAT, SCALE
 
 log = logging.getLogger("beamsplat.mapping")
 
-CELL_M = 2.0
-_REACH = 3.4  # standard deviations that the rasterizer draws
+CELL_M = 2.0  # edge of a block's cell
+_EXTENT_SIGMA = 3.4  # standard deviations up to which the rasterizer draws a Gaussian
 
 
 @dataclass(frozen=True)
-class Group:
-    """Gaussians in memory that would be a block."""
+class GaussianGroup:
+    """Gaussians in memory that would form one block."""
 
     anchor: int
-    members: np.ndarray  # int64 [N] columns of the store, rising
-    centre_anchor_m: np.ndarray
-    radius_m: float
+    members: np.ndarray  # int64 [N] columns of the store, ascending
+    centre_anchor_m: np.ndarray  # [3]
+    radius_m: float  # of the sphere that contains their rendered extents
 
 
-class Shelf:
-    """The blocks of one session. Only `put`, `take` and `settled` touch the disk."""
+class DiskTier:
+    """The blocks of one session; implements `DiskGaussians`. Files are written by `page_out` only."""
 
     def __init__(self, folder: SessionFolder) -> None:
         self._folder = folder
         self.blocks: dict[int, Block] = {}
         self._unsynced: set[int] = set()
-        self._stale: set[int] = set()  # files that the next checkpoint does without
+        self._stale: set[int] = set()  # files that the next checkpoint does not need
         self._next = 1
-        self.lost = 0  # Gaussians in files that could not be read again
+        self.lost_count = 0  # Gaussians in files that could not be read again
 
     @property
     def count(self) -> int:
-        """Gaussians on disk only."""
+        """Return the number of Gaussians that are on disk only."""
         return sum(block.count for block in self.blocks.values())
 
-    # --- in and out ---
+    # --- paging ---
 
-    def put(
-        self, store: GaussianStore, groups: list[Group], T_map_anchor: dict[int, np.ndarray]
+    def page_out(
+        self, store: GaussianStore, groups: list[GaussianGroup], T_map_anchor: dict[int, np.ndarray]
     ) -> list[Block]:
-        """Groups go from memory to the disk; gives their blocks.
+        """Write groups to disk and free their memory; return their blocks.
 
         Raises:
-            OSError: the disk is full or broken; all that had not been written yet stays in memory.
+            OSError: the disk is full or broken; groups that were not written stay in memory.
         """
         out, gone = [], []
         try:
@@ -72,9 +75,9 @@ class Shelf:
                 arrays, number = store.columns(group.members), self._next
                 write_block(self._folder.blocks, number, arrays)
                 steps = int(arrays["steps"].sum(dtype=np.float64))
-                place = T_map_anchor[group.anchor].copy()
+                T = T_map_anchor[group.anchor].copy()
                 out.append(Block(number, group.anchor, len(group.members), steps, group.centre_anchor_m,
-                                 group.radius_m, place))  # fmt: skip
+                                 group.radius_m, T))  # fmt: skip
                 gone.append(group.members)
                 self._next += 1
         except OSError:
@@ -84,12 +87,17 @@ class Shelf:
             self.blocks |= {block.number: block for block in out}
             self._unsynced |= {block.number for block in out}
             if gone:
-                store.take_out(gone)
+                store.page_out(gone)
         return out
 
-    def take(self, store: GaussianStore, numbers: Iterable[int], T_map_anchor: dict[int, np.ndarray]) -> int:
-        """Blocks come back into memory, where their anchors are now; gives how many Gaussians."""
-        came = 0
+    def page_in(
+        self, store: GaussianStore, numbers: Iterable[int], T_map_anchor: dict[int, np.ndarray]
+    ) -> int:
+        """Read blocks into memory, at the current poses of their anchors; return the number of Gaussians.
+
+        Gaussians of a file that cannot be read are lost; this is logged and counted in `lost_count`.
+        """
+        loaded = 0
         for number in numbers:
             block = self.blocks.pop(number)
             self._unsynced.discard(number)
@@ -97,71 +105,77 @@ class Shelf:
                 arrays = read_block(self._folder.blocks, block, T_map_anchor[block.anchor])
             except UserError as error:
                 log.warning("%d Gaussians are lost: %s", block.count, error)
-                self.lost += block.count
-                store.lose(block.anchor, block.count, block.steps)
+                self.lost_count += block.count
+                store.discard_paged_out(block.anchor, block.count, block.steps)
             else:
-                store.put_back(arrays, block.anchor)
-                came += block.count
+                store.page_in(arrays, block.anchor)
+                loaded += block.count
             self._stale.add(number)
-        return came
+        return loaded
 
     def read(self, anchor: int, T_map_anchor: np.ndarray) -> Iterator[np.ndarray]:
-        """float32 [14, N] of each block of an anchor, in the map frame. What cannot be read is left out."""
+        """Yield the Gaussians of an anchor block by block, float32 [14, N], in the map frame.
+
+        A block that cannot be read is logged and left out.
+        """
         for block in [b for b in self.blocks.values() if b.anchor == anchor]:
             try:
                 yield read_block(self._folder.blocks, block, T_map_anchor)["params"]
             except UserError as error:
                 log.warning("%d Gaussians are not shown: %s", block.count, error)
 
-    # --- where they are ---
+    # --- geometry ---
 
-    def nearest_m(self, anchor: int, T_map_anchor: np.ndarray, at_m: np.ndarray) -> float:
-        """See `Elsewhere`: by the blocks' spheres."""
+    def nearest_m(self, anchor: int, T_map_anchor: np.ndarray, at_map_m: np.ndarray) -> float:
+        """Return a lower bound on the distance from a map point [3] to an anchor's Gaussians; inf without
+        any.
+        """
         blocks = [b for b in self.blocks.values() if b.anchor == anchor]
-        at_anchor_m = inverse(T_map_anchor)[:3] @ [*at_m, 1.0]
-        away = [float(np.linalg.norm(b.centre_anchor_m - at_anchor_m)) - b.radius_m for b in blocks]
-        return max(min(away, default=np.inf), 0.0)
+        at_anchor_m = inverse(T_map_anchor)[:3] @ [*at_map_m, 1.0]
+        bounds = [float(np.linalg.norm(b.centre_anchor_m - at_anchor_m)) - b.radius_m for b in blocks]
+        return max(min(bounds, default=np.inf), 0.0)
 
     def spheres(self, T_map_anchor: dict[int, np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(numbers int64 [B], centres float64 [B, 3] in the map frame, radii float64 [B])."""
+        """Return (block numbers int64 [B], centres float64 [B, 3] in the map frame, radii float64 [B])."""
         return _spheres([(b.number, b) for b in self.blocks.values()], T_map_anchor)
 
     # --- checkpoints ---
 
     def arrays(self) -> Arrays:
-        """What a checkpoint says of the blocks; empty without any."""
+        """Return the checkpoint arrays that describe the blocks; an empty dict without any block."""
         return arrays_of_blocks(list(self.blocks.values()))
 
     def restore(self, arrays: Arrays, store: GaussianStore) -> None:
-        """Becomes what a checkpoint says. Files that it does not name, and those whose Gaussians have been
-        read into it, are not needed after the next one."""
+        """Set the blocks to those that a checkpoint lists; all other block files become stale."""
         for block in blocks_of(arrays):
             self.blocks[block.number] = block
-            store.note_away(block.anchor, block.count, block.steps)
-        self.tidy()
+            store.count_paged_out(block.anchor, block.count, block.steps)
+        self.find_stale_files()
 
-    def tidy(self) -> None:
-        """Notes which files on the disk nothing needs: a killed writer's, or those of a whole state."""
+    def find_stale_files(self) -> None:
+        """Mark block files on disk that are not in `blocks`: left by a killed writer, or read into memory."""
         numbers = self._folder.block_numbers()
         self._stale = set(numbers) - self.blocks.keys()
         self._next = 1 + max(numbers, default=0)
 
-    def settled(self) -> tuple[list[int], list[int]]:
-        """(files to bring to the disk before a checkpoint that is made now, files to remove after it)."""
+    def pending_files(self) -> tuple[list[int], list[int]]:
+        """Return (blocks to flush before a checkpoint made now, blocks to remove after it)."""
         return sorted(self._unsynced), sorted(self._stale)
 
-    def saved(self, synced: Iterable[int], removed: Iterable[int]) -> None:
-        """A checkpoint with what `settled` gave is on the disk."""
+    def mark_saved(self, synced: Iterable[int], removed: Iterable[int]) -> None:
+        """Record that a checkpoint with the results of `pending_files` is on disk."""
         self._unsynced.difference_update(synced)
         self._stale.difference_update(removed)
 
 
-def groups_of(store: GaussianStore, T_map_anchor: dict[int, np.ndarray]) -> list[Group]:
-    """All Gaussians in memory by anchor and cube, but for those too large for a cube: they are few, and
-    seen from afar."""
-    out, large = [], np.exp(store.params[SCALE:QUAT, : store.count].max(axis=0)) * _REACH
+def groups_of(store: GaussianStore, T_map_anchor: dict[int, np.ndarray]) -> list[GaussianGroup]:
+    """Group the Gaussians in memory by anchor and cell.
+
+    Gaussians larger than a cell are in no group and stay in memory: they are few and visible from far away.
+    """
+    out, extent = [], np.exp(store.params[SCALE:QUAT, : store.count].max(axis=0)) * _EXTENT_SIGMA
     for anchor in np.unique(store.anchor[: store.count]).tolist():
-        members = np.flatnonzero((store.anchor[: store.count] == anchor) & (large < CELL_M))
+        members = np.flatnonzero((store.anchor[: store.count] == anchor) & (extent < CELL_M))
         if len(members) == 0:
             continue
         points = transform_points(
@@ -173,20 +187,20 @@ def groups_of(store: GaussianStore, T_map_anchor: dict[int, np.ndarray]) -> list
         for part in np.split(order, np.flatnonzero(np.diff(keys[order])) + 1):
             low, high = points[part].min(axis=0), points[part].max(axis=0)
             centre = 0.5 * (low + high)
-            reach = np.linalg.norm(points[part] - centre, axis=1) + large[members[part]]
-            out.append(Group(anchor, members[part], centre, float(reach.max())))
+            reach = np.linalg.norm(points[part] - centre, axis=1) + extent[members[part]]
+            out.append(GaussianGroup(anchor, members[part], centre, float(reach.max())))
     return out
 
 
 def spheres_of(
-    groups: list[Group], T_map_anchor: dict[int, np.ndarray]
+    groups: list[GaussianGroup], T_map_anchor: dict[int, np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(places in the list int64 [B], centres float64 [B, 3] in the map frame, radii float64 [B])."""
+    """Return (indices int64 [B], centres float64 [B, 3] in the map frame, radii float64 [B]) of groups."""
     return _spheres(list(enumerate(groups)), T_map_anchor)
 
 
 def _spheres(
-    items: list[tuple[int, Block]] | list[tuple[int, Group]], T_map_anchor: dict[int, np.ndarray]
+    items: list[tuple[int, Block]] | list[tuple[int, GaussianGroup]], T_map_anchor: dict[int, np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     centres = [
         T_map_anchor[x.anchor][:3, :3] @ x.centre_anchor_m + T_map_anchor[x.anchor][:3, 3] for _, x in items

@@ -1,4 +1,4 @@
-"""What a keyframe can see: spheres against the pyramid of its view, which ends where its depth does."""
+"""Visibility test: spheres against the view frustum of a keyframe, which ends at its largest depth."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ from beamsplat.common.geometry.transforms import inverse, transform_points
 from beamsplat.common.raster.camera import RasterCamera
 from beamsplat.common.raster.layout import NEAR_M
 
-_PAD_PX = 4.0  # small splats are drawn larger than they are
+_PAD_PX = 4.0  # margin: the rasterizer's low-pass filter enlarges small Gaussians
 
 
-def sees(
+def frustum_intersects(
     camera: RasterCamera,
     T_map_camera: np.ndarray,
-    reach_m: float,  # optical z
+    reach_m: float,  # far plane, optical z
     centres_map_m: np.ndarray,  # float64 [B, 3]
     radii_m: np.ndarray,  # float64 [B]
 ) -> np.ndarray:
-    """bool [B]: the sphere may touch the picture. Errs to the side of yes."""
+    """Return bool [B]: whether each sphere may intersect the frustum; no false negatives."""
     x, y, z = transform_points(inverse(T_map_camera), centres_map_m.reshape(-1, 3)).T
     seen = (z + radii_m > NEAR_M) & (z - radii_m < reach_m)
     sides = (

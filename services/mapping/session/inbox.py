@@ -1,7 +1,8 @@
-"""Keyframes between their arrival and their turn: on the disk at once, so that their sender may forget them.
+"""The inbox of a mapper: keyframes are written to disk on reception, before they are processed.
 
-A mapper may be a minute behind a robot that comes back from an outage. What has arrived is safe meanwhile: a
-mapper that is killed finds it in its session.
+A mapper may be minutes behind a robot that reconnects after an outage. Keyframes in the inbox are
+acknowledged at once, so the robot may delete them; if the mapper is killed, the next one finds them in the
+session.
 """
 
 from __future__ import annotations
@@ -9,60 +10,71 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 
-from beamsplat.services.mapping.session.checkpointer import Keeper
+from beamsplat.services.mapping.session.checkpointer import Checkpointer
 
 
-class Arrivals:
-    """`take` is called by the thread that receives, everything else by the one that maps."""
+class Inbox:
+    """Keyframes that were received and not yet processed.
 
-    def __init__(self, keeper: Keeper) -> None:
-        self._keeper = keeper
+    `accept` runs on the receiving thread, all other methods on the mapping thread. The mailbox of the node is
+    smaller than the inbox and drops its oldest messages. Keyframes dropped there are *skipped*: they are read
+    back from the disk later.
+    """
+
+    def __init__(self, checkpointer: Checkpointer) -> None:
+        self._checkpointer = checkpointer
         self._waiting: dict[int, None] = {}  # in order of arrival
-        self._overtaken: deque[int] = deque()
-        self._read: int | None = None  # came from the disk, and has its turn now
+        self._skipped: deque[int] = deque()
+        self._read: int | None = None  # read from the disk, and being processed now
 
-    def take(self, id: int, known: bool, body: Callable[[], tuple[str, bytes]]) -> bool:
-        """Whether a keyframe that has just come is on the disk. `known`: the mapper has it already; `body`
-        gives its schema and payload."""
+    def accept(self, id: int, known: bool, body: Callable[[], tuple[str, bytes]]) -> bool:
+        """Write a received keyframe to disk, unless it is there; return whether it is on disk now.
+
+        Args:
+            known: the mapper has the keyframe already.
+            body: returns its schema and payload.
+        """
         if known:
-            return not self._keeper.lacks(id)
-        if id not in self._waiting and id not in self._overtaken:
-            if not self._keeper.keep(id, *body()):
+            return not self._checkpointer.is_unwritten(id)
+        if id not in self._waiting and id not in self._skipped:
+            if not self._checkpointer.write_keyframe(id, *body()):
                 return False
             self._waiting[id] = None
         return True
 
-    def begin(self, id: int) -> bool:
-        """A keyframe's turn has come; whether it was on the disk already. Those that came before it and had
-        no turn never will: more were waiting than a mailbox holds."""
+    def start(self, id: int) -> bool:
+        """Take a keyframe out of the inbox for processing; return whether it is on disk.
+
+        Keyframes that arrived before it and still wait were dropped by the mailbox: they become skipped.
+        """
         if id not in self._waiting:
             return id == self._read
         for other in list(self._waiting):
             del self._waiting[other]
             if other == id:
                 return True
-            self._overtaken.append(other)
+            self._skipped.append(other)
         return True
 
     def __len__(self) -> int:
-        """How many wait."""
-        return len(self._waiting) + len(self._overtaken)
+        """Return how many keyframes wait, skipped ones included."""
+        return len(self._waiting) + len(self._skipped)
 
     @property
-    def behind(self) -> bool:
-        """Some will have no turn."""
-        return bool(self._overtaken)
+    def has_skipped(self) -> bool:
+        """Return whether there are skipped keyframes."""
+        return bool(self._skipped)
 
-    def overtaken(self) -> tuple[str, bytes] | None:
-        """(schema, payload) of the oldest that will have no turn; None if there is none that can be read."""
-        while self._overtaken:
-            self._read = self._overtaken.popleft()
-            body = self._keeper.body(self._read)
+    def pop_skipped(self) -> tuple[str, bytes] | None:
+        """Return (schema, payload) of the oldest skipped keyframe that can be read; None without any."""
+        while self._skipped:
+            self._read = self._skipped.popleft()
+            body = self._checkpointer.read_keyframe(self._read)
             if body is not None:
                 return body
         return None
 
-    def rest(self) -> None:
-        """Nothing more comes: what waits still will have no turn."""
-        self._overtaken.extend(self._waiting)
+    def skip_waiting(self) -> None:
+        """Mark all waiting keyframes as skipped: at the end of the stream nothing else delivers them."""
+        self._skipped.extend(self._waiting)
         self._waiting.clear()

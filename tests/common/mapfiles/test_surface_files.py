@@ -8,9 +8,15 @@ import trimesh
 from plyfile import PlyData
 
 from beamsplat.common.geometry.transforms import make_transform, so3_exp
-from beamsplat.common.mapfiles.mesh import DistanceField, Mesh, surface_nets, without_crumbs
+from beamsplat.common.mapfiles.mesh import TriangleMesh, TsdfVolume, remove_small_pieces, surface_nets
 from beamsplat.common.mapfiles.nav2 import FREE, OCCUPIED, UNKNOWN, camera_layer, combined, grid_around
-from beamsplat.common.mapfiles.surface import DepthView, flying, points_of, surface_points, write_ply
+from beamsplat.common.mapfiles.surface import (
+    RenderedDepth,
+    flying_pixels,
+    points_of,
+    surface_points,
+    write_ply,
+)
 from beamsplat.common.raster.camera import RasterCamera
 
 CAMERA = RasterCamera(120.0, 120.0, 79.5, 59.5, 160, 120)
@@ -28,9 +34,9 @@ def sphere_view(T_map_camera, behind_m=np.nan, radius_m=1.0):
     a, b, c = (rays**2).sum(-1), rays @ eye, eye @ eye - radius_m**2
     root = b**2 - a * c
     depth = np.where(root > 0, (-b - np.sqrt(np.maximum(root, 0))) / a, behind_m).astype(np.float32)
-    depth[flying(depth)] = np.nan
+    depth[flying_pixels(depth)] = np.nan
     height = eye[2] + depth * rays[..., 2]
-    return DepthView(CAMERA, T_map_camera, np.where((height > 0)[..., None], RED, BLUE), depth)
+    return RenderedDepth(CAMERA, T_map_camera, np.where((height > 0)[..., None], RED, BLUE), depth)
 
 
 def around(behind_m=np.nan, distance_m=3.0):
@@ -44,7 +50,7 @@ def around(behind_m=np.nan, distance_m=3.0):
 
 
 def fused(views, voxel_m=0.08):
-    field = DistanceField.around(np.full(3, -1.0), np.full(3, 1.0), voxel_m)
+    field = TsdfVolume.around(np.full(3, -1.0), np.full(3, 1.0), voxel_m)
     field.add(views)
     return field
 
@@ -64,7 +70,7 @@ def test_points_lie_on_the_surface_one_a_cell(tmp_path):
 
 
 def test_a_sphere_seen_from_all_sides_is_watertight(tmp_path):
-    mesh = without_crumbs(surface_nets(fused(around(behind_m=9.0))), 60)
+    mesh = remove_small_pieces(surface_nets(fused(around(behind_m=9.0))), 60)
     write_ply(tmp_path / "mesh.ply", mesh.vertices_m, mesh.colours, mesh.faces)
     read = trimesh.load(tmp_path / "mesh.ply", process=False)
     assert read.is_watertight
@@ -92,16 +98,16 @@ def test_a_sphere_seen_from_one_side_is_open_only_where_it_was_not_seen():
 
 def test_crumbs_go_and_large_fields_are_refused():
     whole = surface_nets(fused(around()))
-    far = Mesh(whole.vertices_m[:3] + 9.0, whole.colours[:3], np.array([[0, 1, 2]], np.int32))
-    both = Mesh(
+    far = TriangleMesh(whole.vertices_m[:3] + 9.0, whole.colours[:3], np.array([[0, 1, 2]], np.int32))
+    both = TriangleMesh(
         np.concatenate([whole.vertices_m, far.vertices_m]), np.concatenate([whole.colours, far.colours]),
         np.concatenate([whole.faces, far.faces + len(whole.vertices_m)]),
     )  # fmt: skip
-    clean = without_crumbs(both, 10)
+    clean = remove_small_pieces(both, 10)
     assert len(clean.faces) == len(whole.faces)
     assert np.abs(clean.vertices_m).max() < 2.0
     with pytest.raises(ValueError, match=r"million voxels of 0\.01 m are too many; 0\.\d+ m would do"):
-        DistanceField.around(np.zeros(3), np.full(3, 30.0), 0.01)
+        TsdfVolume.around(np.zeros(3), np.full(3, 30.0), 0.01)
 
 
 def test_unknown_depth_gives_no_points():

@@ -1,4 +1,6 @@
-"""Keyframes of a drive through the simulator's home with true depth and true poses, as messages: laps as long as wanted."""
+"""Keyframes of a drive through the simulator's home with true depth and true poses, as messages: laps as long
+as wanted.
+"""
 
 from functools import lru_cache
 

@@ -1,4 +1,6 @@
-"""A mapper in a process of its own that is driven round and round through the home; what it takes is measured there."""
+"""A mapper in a process of its own that is driven round and round through the home; what it takes is measured
+there.
+"""
 
 import gc
 import multiprocessing
@@ -72,12 +74,12 @@ def drive(lap, folder, options, keyframes, sample_every, period_s, views, camera
         if (number + 1) % sample_every == 0:
             renders = [render(node, lap.message(view, period_s), camera) for view in views]
             gc.collect()
-            store, pager = node._mapper.store, node._keeper._pager
+            store, pager = node._mapper.store, node._session._checkpointer._pager
             disk = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
             memory = process.memory_full_info()
             said.send(Sample(
                 number + 1, memory.pss / 1e6, memory.uss / 1e6, pager._used(node._mapper) / 1e6,
-                1e3 * spent / sample_every, store.count + store.away_count, store.away_count, node.detail, renders,
+                1e3 * spent / sample_every, store.count + store.paged_out_count, store.paged_out_count, node.detail, renders,
                 disk / 1e6,
             ))  # fmt: skip
             spent = 0.0
@@ -87,13 +89,13 @@ def drive(lap, folder, options, keyframes, sample_every, period_s, views, camera
 
 def render(node, message, camera):
     """float32 [3, H, W]: what the mapper shows from a keyframe's place, all that it sees brought back first."""
-    from beamsplat.services.mapping.keyframe import hold
-    from beamsplat.services.mapping.messages import open_keyframe
+    from beamsplat.services.mapping.keyframe import compress
+    from beamsplat.services.mapping.messages import decode_keyframe
     from tests.services.mapping.home_drive import rendered
 
-    frame = open_keyframe(message, node._lens)
-    held = hold(frame, 0.03)
-    node._keeper.bring(node._mapper, held)
+    frame = decode_keyframe(message, node._lens)
+    held = compress(frame, 0.03)
+    node._session._checkpointer.load_visible(node._mapper, held)
     return rendered(node._mapper, camera, node._mapper.T_map_camera(held)).astype(np.float16)
 
 

@@ -7,15 +7,15 @@ from hypothesis import strategies as st
 
 from beamsplat.common.errors import UserError
 from beamsplat.common.geometry.transforms import inverse, make_transform
-from beamsplat.common.mapfiles.detail import FINEST_CELL_M, cell_for, coarser
+from beamsplat.common.mapfiles.detail import FINEST_CELL_M, detail_cell_m, merge_by_cell
 from beamsplat.common.mapfiles.scores import psnr_db
 from beamsplat.common.mapfiles.store import GaussianStore
 from beamsplat.common.raster.camera import RasterCamera
 from beamsplat.common.raster.layout import COLOUR, MEAN, OPACITY, QUAT, SCALE
 from beamsplat.common.raster.rasterizer import Rasterizer
-from beamsplat.services.mapping.chunks import ChunkFeed, Eye, parts
+from beamsplat.services.mapping.chunks import ChunkFeed, Viewpoint, chunk_snapshot
 from beamsplat.services.mapping.mapper import Mapper
-from beamsplat.services.mapping.messages import eye_of, joined_state, state_messages
+from beamsplat.services.mapping.messages import joined_state, state_messages, viewpoint_of
 from beamsplat.services.mapping.settings import MapperSettings
 
 
@@ -40,22 +40,22 @@ CAMERA = RasterCamera(280.0, 280.0, 159.5, 119.5, 320, 240)
 def seen(params, distance_m):
     rasterizer, store = Rasterizer(1), GaussianStore()
     store.add(params, 0)
-    back = make_transform(np.eye(3), np.array([0.0, 0.0, 1.0 - distance_m]))
+    back = make_transform(np.viewpoint(3), np.array([0.0, 0.0, 1.0 - distance_m]))
     image = rasterizer.render(store.params, store.count, CAMERA, inverse(back)).image
     return np.clip(image[:3], 0.0, 1.0).copy()
 
 
 def test_no_cell_no_change():
     params = wall(100)
-    assert coarser(params, 0.0) is params
-    assert coarser(params, 0.001) is params  # all are larger than that
+    assert merge_by_cell(params, 0.0) is params
+    assert merge_by_cell(params, 0.001) is params  # all are larger than that
 
 
 @given(st.integers(0, 50), st.sampled_from([0.05, 0.1, 0.4]))
 @settings(max_examples=20, deadline=None)
 def test_merged_gaussians_keep_place_colour_and_plane(seed, cell_m):
     params = wall(3000, seed)
-    merged = coarser(params, cell_m)
+    merged = merge_by_cell(params, cell_m)
     assert merged.shape[1] < params.shape[1]
     assert np.all(np.isfinite(merged))
     cells = {tuple(c) for c in np.floor(params[MEAN:SCALE].T.astype(float) / cell_m).astype(int)}
@@ -71,64 +71,64 @@ def test_merged_gaussians_keep_place_colour_and_plane(seed, cell_m):
 def test_larger_ones_stay_themselves():
     params = wall(500)
     params[SCALE:QUAT, :3] = np.log(0.5)
-    np.testing.assert_array_equal(coarser(params, 0.1)[:, :3], params[:, :3])
+    np.testing.assert_array_equal(merge_by_cell(params, 0.1)[:, :3], params[:, :3])
 
 
 @pytest.mark.parametrize("distance_m", [12.0, 24.0])
 def test_a_pixels_worth_of_detail_costs_little_where_it_cannot_be_seen(distance_m):
     params = wall()
-    cell_m = cell_for(distance_m, 280.0, 1.0)
-    merged = coarser(params, cell_m)
+    cell_m = detail_cell_m(distance_m, 280.0, 1.0)
+    merged = merge_by_cell(params, cell_m)
     assert merged.shape[1] < 0.3 * params.shape[1]
     assert psnr_db(seen(params, distance_m), seen(merged, distance_m)) > 30.0
 
 
 def test_cells_grow_by_twos_with_the_distance():
-    assert cell_for(5.0, 280.0, 1.0) == 0.0  # 18 mm
-    assert cell_for(5.7, 280.0, 1.0) == FINEST_CELL_M
-    assert cell_for(11.3, 280.0, 1.0) == 2 * FINEST_CELL_M
-    assert cell_for(11.3, 280.0, 2.0) == 4 * FINEST_CELL_M
+    assert detail_cell_m(5.0, 280.0, 1.0) == 0.0  # 18 mm
+    assert detail_cell_m(5.7, 280.0, 1.0) == FINEST_CELL_M
+    assert detail_cell_m(11.3, 280.0, 1.0) == 2 * FINEST_CELL_M
+    assert detail_cell_m(11.3, 280.0, 2.0) == 4 * FINEST_CELL_M
 
 
 def test_a_far_chunk_comes_coarse_and_whole_once_somebody_is_near():
     mapper, feed = Mapper(MapperSettings(), seed=0, threads=1), ChunkFeed()
-    mapper.T_map_anchor[3] = make_transform(np.eye(3), np.array([2.0, 0.0, 0.0]))
+    mapper.T_map_anchor[3] = make_transform(np.viewpoint(3), np.array([2.0, 0.0, 0.0]))
     mapper.store.add(wall(20_000), 3)
-    far, near = (Eye(np.array([0.0, 0.0, z]), 280.0, 1.0) for z in (-30.0, 0.0))
-    first = feed.take(mapper, 3, far)
+    far, near = (Viewpoint(np.array([0.0, 0.0, z]), 280.0, 1.0) for z in (-30.0, 0.0))
+    first = feed.take_update(mapper, 3, far)
     assert first.cell_m == 0.08
     assert first.params.shape[1] < 0.2 * 20_000
     assert first.params[MEAN].mean() == pytest.approx(-2.0, abs=0.1)  # in the anchor's frame
-    assert feed.take(mapper, 3, far) is None  # nothing new
-    assert feed.longest_due(mapper, far) is None
-    assert feed.longest_due(mapper, near) == 3
-    assert feed.take(mapper, 3, near).params.shape[1] == 20_000
-    assert feed.take(mapper, 3, far) is None  # who goes away keeps it
-    assert feed.longest_due(mapper, far) is None
+    assert feed.take_update(mapper, 3, far) is None  # nothing new
+    assert feed.oldest_due(mapper, far) is None
+    assert feed.oldest_due(mapper, near) == 3
+    assert feed.take_update(mapper, 3, near).params.shape[1] == 20_000
+    assert feed.take_update(mapper, 3, far) is None  # who goes away keeps it
+    assert feed.oldest_due(mapper, far) is None
     mapper.store.move(3, mapper.T_map_anchor[3])
-    assert feed.longest_due(mapper, far) == 3  # but a new version comes as it is seen from there
-    assert feed.take(mapper, 3, far).cell_m == 0.08
-    assert feed.take(mapper, 3, None).cell_m == 0.0
-    assert parts(mapper, far)[3].cell_m == 0.08
-    assert feed.take(mapper, 99, None) is None
+    assert feed.oldest_due(mapper, far) == 3  # but a new version comes as it is seen from there
+    assert feed.take_update(mapper, 3, far).cell_m == 0.08
+    assert feed.take_update(mapper, 3, None).cell_m == 0.0
+    assert chunk_snapshot(mapper, far)[3].cell_m == 0.08
+    assert feed.take_update(mapper, 99, None) is None
 
 
 def test_who_asks_says_from_where():
-    assert eye_of({}) is None
-    eye = eye_of({"from": "1,2,3", "focal_px": "300"})
-    assert eye.at_m.tolist() == [1.0, 2.0, 3.0]
-    assert (eye.focal_px, eye.error_px) == (300.0, 1.0)
+    assert viewpoint_of({}) is None
+    viewpoint = viewpoint_of({"from": "1,2,3", "focal_px": "300"})
+    assert viewpoint.at_map_m.tolist() == [1.0, 2.0, 3.0]
+    assert (viewpoint.focal_px, viewpoint.error_px) == (300.0, 1.0)
     for wrong in ({"from": "1,2"}, {"from": "1,2,3"}, {"from": "a,b,c", "focal_px": "3"}):
         with pytest.raises(UserError, match="from=X,Y,Z"):
-            eye_of(wrong)
+            viewpoint_of(wrong)
 
 
 def test_a_state_in_pieces_is_whole_or_refused():
-    arrays = {"a": np.arange(3_000_000), "b": np.eye(3)}
+    arrays = {"a": np.arange(3_000_000), "b": np.viewpoint(3)}
     pieces = list(state_messages(arrays))
     assert len(pieces) > 4
     again = joined_state(pieces[::-1])
     for name in arrays:
         np.testing.assert_array_equal(again[name], arrays[name])
-    with pytest.raises(UserError, match="ask again"):
+    with pytest.raises(UserError, match="try again"):
         joined_state(pieces[1:])

@@ -12,7 +12,7 @@ from beamsplat.common.mapfiles.store import GaussianStore
 from beamsplat.common.raster.camera import RasterCamera
 from beamsplat.common.raster.layout import MEAN
 from beamsplat.common.raster.rasterizer import Rasterizer
-from beamsplat.services.mapping.keyframe import Keyframe
+from beamsplat.services.mapping.keyframe import RgbdKeyframe
 from beamsplat.services.mapping.mapper import FULL, HALF, Mapper
 from beamsplat.services.mapping.settings import MapperSettings
 from beamsplat.services.mapping.warm import warm
@@ -47,7 +47,9 @@ def view(room, number):
 def keyframe(room, number, **change):
     T = view(room, number)
     rgb, depth = shot(room, T)
-    return replace(Keyframe(number, rgb, CAMERA, T, depth, np.full(depth.shape, 0.01, np.float32)), **change)
+    return replace(
+        RgbdKeyframe(number, rgb, CAMERA, T, depth, np.full(depth.shape, 0.01, np.float32)), **change
+    )
 
 
 def quality(mapper, room, T_map_camera):
@@ -103,9 +105,9 @@ def test_the_same_keyframes_give_the_same_bits(room, mapped):
         ({"mask": np.zeros((120, 160), bool)}, "mask leaves no pixel"),
         ({"T_anchor_camera": make_transform(np.eye(3), np.array([1e6, 0.0, 0.0]))}, "from its anchor"),
         ({"T_anchor_camera": np.full((4, 4), np.nan)}, "rigid"),
-        ({"rgb": np.zeros((120, 160, 3), np.float32)}, "picture must be uint8"),
+        ({"rgb": np.zeros((120, 160, 3), np.float32)}, "image must be uint8"),
         ({"depth_m": np.ones((10, 10), np.float32)}, "depth and sigma"),
-        ({"anchor": 7}, "anchor 7 has no place"),
+        ({"anchor": 7}, "the pose of anchor 7 is unknown"),
     ],
 )
 def test_what_cannot_be_used_is_refused_and_harms_nothing(room, mapped, change, words):
@@ -137,8 +139,9 @@ def test_the_map_moves_with_its_anchor(room, mapped):
 
 
 def test_a_loop_closure_mends_the_map(room):
-    """Half of the keyframes are a metre and ten degrees off until the pose graph knows better: after some steps
-    the views between them are as good as in a map that never jumped."""
+    """Half of the keyframes are a metre and ten degrees off until the pose graph knows better: after some
+    steps the views between them are as good as in a map that never jumped.
+    """
     jump = make_transform(so3_exp([0.0, 0.0, np.deg2rad(10.0)]), np.array([1.0, 0.0, 0.0]))
     scores = []
     for misplaced in (np.eye(4), jump):
@@ -257,11 +260,11 @@ def test_what_floats_before_a_trusted_surface_is_carved(room, mapped):
     floater[3:6] = np.log(0.01)
     before = mapper.store.count
     mapper.store.add(floater, 0)
-    mapper.settings = replace(SETTINGS, carve_strikes=2)
+    mapper.settings = replace(SETTINGS, carve_votes=2)
     for _ in range(2):
         mapper._clean(mapper.keyframes[2])
     # Gaps are closed when they are many; until then floaters are marked.
-    left = mapper.store.strikes[before : mapper.store.count] < 2
+    left = mapper.store.carving_votes[before : mapper.store.count] < 2
     assert mapper.store.count < before or left.mean() < 0.2
     assert mapper.store.count >= before - 200
 

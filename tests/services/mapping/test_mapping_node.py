@@ -9,7 +9,7 @@ from plyfile import PlyData
 
 from beamsplat.common.geometry.trajectory import read_tum
 from beamsplat.common.geometry.transforms import inverse, make_transform
-from beamsplat.common.mapfiles.store import moved
+from beamsplat.common.mapfiles.store import transform_gaussians
 from beamsplat.common.messages import Anchors, Keyframe, Tick
 from beamsplat.common.messages.codec import encode
 from beamsplat.common.messages.depth_png import depth_to_png, mask_to_png, sigma_to_png
@@ -75,7 +75,7 @@ def test_chunks_make_up_the_map(drive):
     assert set(newest) == {-1, 0, 1}
     store = node._mapper.store
     for anchor, chunk in newest.items():
-        params = moved(unpack(chunk.packed), chunk.T_map_anchor)
+        params = transform_gaussians(unpack(chunk.packed), chunk.T_map_anchor)
         assert params.shape[1] == chunk.count
         np.testing.assert_allclose(params[:3], store.chunk(anchor)[:3], atol=3e-4)
     assert sum(c.count for c in newest.values()) == store.count
@@ -178,7 +178,11 @@ NAN = np.full((r.HEIGHT, r.WIDTH), np.nan, np.float32)
 )
 def test_what_cannot_be_mapped_is_refused_with_a_reason_and_harms_nothing(node, change, words):
     store = node._mapper.store
-    before, steps, refused = store.params[:, : store.count].copy(), node._mapper.steps, len(node._refusals)
+    before, steps, refused = (
+        store.params[:, : store.count].copy(),
+        node._mapper.steps,
+        len(node._intake.rejections),
+    )
     out = dict(node.handle("keyframes/frame", keyframe(7, **change)))
     assert set(out) == {"keyframes/ack", "mapping/status"}
     assert out["keyframes/ack"].id == 7

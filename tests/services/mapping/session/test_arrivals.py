@@ -12,8 +12,8 @@ from beamsplat.services.keyframes.node import KeyframesConfig, KeyframesNode
 from beamsplat.services.mapping.config import MappingConfig
 from beamsplat.services.mapping.mapper import Mapper
 from beamsplat.services.mapping.node import MappingNode
-from beamsplat.services.mapping.session.checkpointer import Keeper
-from beamsplat.services.mapping.session.inbox import Arrivals
+from beamsplat.services.mapping.session.checkpointer import Checkpointer
+from beamsplat.services.mapping.session.inbox import Inbox
 from tests.services.mapping import room_drive as r
 from tests.services.mapping.session.maps import SECOND, handle, make_node, message
 
@@ -47,7 +47,7 @@ def test_one_that_is_refused_at_its_turn_is_answered_again_and_leaves_the_disk(t
     assert arrive(node, empty) == ["ok"]
     (answer,) = handle(node, "keyframes/frame", empty)["keyframes/ack"]
     assert "mask leaves no pixel" in answer.status
-    assert SessionFolder(tmp_path / "s").body_ids() == []
+    assert SessionFolder(tmp_path / "s").keyframe_ids() == []
     assert arrive(node, empty) == [answer.status]
     node.close()
 
@@ -66,14 +66,14 @@ def test_what_the_mailbox_had_no_room_for_is_taken_in_from_the_disk(tmp_path):
 
 
 def test_a_keyframe_that_the_disk_does_not_take_waits_for_its_turn(tmp_path):
-    keeper = Keeper(tmp_path / "s", 10**9)
-    arrivals = Arrivals(keeper)
-    keeper.folder.bodies.rmdir()
-    keeper.folder.bodies.write_text("no folder any more")
-    assert not arrivals.take(1, False, lambda: ("s", b"x"))
+    keeper = Checkpointer(tmp_path / "s", 10**9)
+    arrivals = Inbox(keeper)
+    keeper.folder.keyframes.rmdir()
+    keeper.folder.keyframes.write_text("no folder any more")
+    assert not arrivals.accept(1, False, lambda: ("s", b"x"))
     assert len(arrivals) == 0
-    assert not arrivals.begin(1)
-    assert keeper.text(Mapper()).startswith("NOT SAVED")
+    assert not arrivals.start(1)
+    assert keeper.status_text(Mapper()).startswith("NOT SAVED")
     keeper.close()
 
 

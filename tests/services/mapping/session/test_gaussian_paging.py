@@ -1,4 +1,6 @@
-"""Gaussians beyond the budget lie on the disk: what was seen looks the same when it comes back, and nothing is lost."""
+"""Gaussians beyond the budget lie on the disk: what was seen looks the same when it comes back, and nothing
+is lost.
+"""
 
 import shutil
 
@@ -11,14 +13,14 @@ from beamsplat.common.mapfiles.blocks import arrays_of_blocks, block_file, block
 from beamsplat.common.mapfiles.ply import read_ply_points
 from beamsplat.common.mapfiles.session import EDGE_MANIFEST, SessionFolder
 from beamsplat.common.mapfiles.state import store_of
-from beamsplat.common.mapfiles.store import moved
+from beamsplat.common.mapfiles.store import transform_gaussians
 from beamsplat.common.messages import Anchors
 from beamsplat.common.messages.splat_codec import unpack
 from beamsplat.common.raster.layout import MEAN, SCALE
-from beamsplat.services.mapping.chunks import on_disk
+from beamsplat.services.mapping.chunks import disk_params
 from beamsplat.services.mapping.keyframe import MAX_DEPTH_M
 from beamsplat.services.mapping.session.disk_tier import CELL_M, groups_of, spheres_of
-from beamsplat.services.mapping.session.frustum import sees
+from beamsplat.services.mapping.session.frustum import frustum_intersects
 from beamsplat.services.mapping.session.paging import PROCESS_MB
 from tests.services.mapping.session import gallery
 from tests.services.mapping.session.maps import SECOND, handle, make_node
@@ -80,32 +82,40 @@ def walked(once, tmp_path):
 def test_the_budget_holds_and_the_status_says_what_is_where(tmp_path):
     """Twice along the gallery: never over the budget, and what a keyframe in memory sees is in memory."""
     node = make(tmp_path / "s")
-    pager, shelf, mapper, sent = node._keeper._pager, node._keeper.shelf, node._mapper, {}
+    pager, disk_tier, mapper, sent = (
+        node._session._checkpointer._pager,
+        node._session._checkpointer.disk_tier,
+        node._mapper,
+        {},
+    )
     for number in range(2 * PLACES):
         walk(node, [number], sent)
         assert pager._used(mapper) <= BUDGET_MB * 1e6
         assert not pager.fault
         for held in mapper.keyframes.values():
-            assert len(pager._on_shelf(mapper, held)) == 0
-        assert mapper.store.away_count == shelf.count
-        assert len(mapper.keyframes) + len(mapper.resting) == number + 1
+            assert len(pager._visible_blocks(mapper, held)) == 0
+        assert mapper.store.paged_out_count == disk_tier.count
+        assert len(mapper.keyframes) + len(mapper.paged_out) == number + 1
     status = sent["mapping/status"][-1]
-    assert shelf.count > 0.3 * status.gaussians
-    assert status.gaussians == mapper.store.count + shelf.count
+    assert disk_tier.count > 0.3 * status.gaussians
+    assert status.gaussians == mapper.store.count + disk_tier.count
     assert (
-        f"{mapper.store.count} of {status.gaussians} Gaussians; {len(shelf.blocks)} chunks" in status.session
+        f"{mapper.store.count} of {status.gaussians} Gaussians; {len(disk_tier.blocks)} blocks"
+        in status.session
     )
     assert f"of {BUDGET_MB:.0f} MB" in node.detail
     node.close()
 
 
 def test_all_places_are_visited_again_while_time_passes(walked):
-    """Keyframes have their turns, those whose surroundings were on the disk too: each visit brings another place."""
+    """Keyframes have their turns, those whose surroundings were on the disk too: each visit brings another
+    place.
+    """
     _, node = walked
-    ever, pager = set(node._mapper.keyframes), node._keeper._pager
+    ever, pager = set(node._mapper.keyframes), node._session._checkpointer._pager
     before = len(ever)
     for _ in range(320):
-        node._keeper.page(node._mapper)
+        node._session._checkpointer.page(node._mapper)
         ever |= set(node._mapper.keyframes)
         assert pager._used(node._mapper) <= BUDGET_MB * 1e6
     assert len(ever) > before + 8
@@ -113,33 +123,35 @@ def test_all_places_are_visited_again_while_time_passes(walked):
 
 
 def test_old_places_look_the_same_after_they_were_on_the_disk(walked):
-    """The first places have left; a view brings them back as they were when they left: 60 dB, in fact the same bits."""
+    """The first places have left; a view brings them back as they were when they left: 60 dB, in fact the
+    same bits.
+    """
     _, node = walked
-    mapper, keeper = node._mapper, node._keeper
-    assert mapper.store.count < 0.8 * (mapper.store.count + keeper.shelf.count)
-    before, away = {}, [place for place in range(12) if gallery.T0 + place * SECOND in mapper.resting]
+    mapper, keeper = node._mapper, node._session._checkpointer
+    assert mapper.store.count < 0.8 * (mapper.store.count + keeper.disk_tier.count)
+    before, away = {}, [place for place in range(12) if gallery.T0 + place * SECOND in mapper.paged_out]
     away = [
         place
         for place in away
-        if len(keeper._pager._on_shelf(mapper, mapper.resting[gallery.T0 + place * SECOND]))
+        if len(keeper._pager._visible_blocks(mapper, mapper.paged_out[gallery.T0 + place * SECOND]))
     ]
     assert len(away) > 3
     for place in away[:3]:  # they do not see each other
-        held = mapper.resting[gallery.T0 + place * SECOND]
+        held = mapper.paged_out[gallery.T0 + place * SECOND]
         seen = gallery.painting(place).transpose(2, 0, 1) / 255.0
         gone_db = psnr_db(picture(mapper, place), seen)
-        keeper.bring(mapper, held)
+        keeper.load_visible(mapper, held)
         before[place] = picture(mapper, place)
         assert psnr_db(before[place], seen) > gone_db + 8.0
     whole = rows(mapper.store)
     groups = groups_of(mapper.store, mapper.T_map_anchor)
-    keeper.shelf.put(mapper.store, groups, mapper.T_map_anchor)
+    keeper.disk_tier.page_out(mapper.store, groups, mapper.T_map_anchor)
     assert mapper.store.count < 0.05 * len(whole)
     keeper._pager._where = None
     for place, image in before.items():
-        keeper.bring(mapper, mapper.resting[gallery.T0 + place * SECOND])
+        keeper.load_visible(mapper, mapper.paged_out[gallery.T0 + place * SECOND])
         assert psnr_db(image, picture(mapper, place)) >= 60.0
-    keeper.shelf.take(mapper.store, list(keeper.shelf.blocks), mapper.T_map_anchor)
+    keeper.disk_tier.page_in(mapper.store, list(keeper.disk_tier.blocks), mapper.T_map_anchor)
     stored = {tuple(row) for row in rows(mapper.store)}
     assert {tuple(row) for row in whole} <= stored
 
@@ -147,9 +159,9 @@ def test_old_places_look_the_same_after_they_were_on_the_disk(walked):
 def test_anchors_take_what_is_on_the_disk_along(walked):
     """The first submap moves by half a metre and ten degrees while its Gaussians lie on the disk."""
     _, node = walked
-    mapper, shelf = node._mapper, node._keeper.shelf
-    assert mapper.store.away[0][0] > 0.8 * sum(mapper.store.anchor[: mapper.store.count] == 0)
-    whole = [mapper.store.chunk(0), *on_disk(mapper, 0)]
+    mapper, disk_tier = node._mapper, node._session._checkpointer.disk_tier
+    assert mapper.store.paged_out[0][0] > 0.8 * sum(mapper.store.anchor[: mapper.store.count] == 0)
+    whole = [mapper.store.chunk(0), *disk_params(mapper, 0)]
     before = np.concatenate(whole, axis=1)
     move = se2_to_se3(np.array([0.5, 0.2, np.deg2rad(10.0)]))
     version = mapper.store.versions()[0]
@@ -161,8 +173,10 @@ def test_anchors_take_what_is_on_the_disk_along(walked):
         {},
     )
     assert mapper.store.versions()[0] > version
-    shelf.take(mapper.store, [n for n, b in shelf.blocks.items() if b.anchor == 0], mapper.T_map_anchor)
-    after, expected = mapper.store.chunk(0), moved(before, move)
+    disk_tier.page_in(
+        mapper.store, [n for n, b in disk_tier.blocks.items() if b.anchor == 0], mapper.T_map_anchor
+    )
+    after, expected = mapper.store.chunk(0), transform_gaussians(before, move)
     order, expected_order = np.lexsort(after[11:14]), np.lexsort(expected[11:14])
     np.testing.assert_allclose(after[MEAN:SCALE, order], expected[MEAN:SCALE, expected_order], atol=1e-5)
 
@@ -172,10 +186,10 @@ def test_chunks_and_the_file_at_the_end_hold_what_is_on_the_disk(tmp_path):
     walk(node, range(PLACES), sent)
     chunks = {c.anchor_id: c for c in node.on_query_snapshot({})}
     store = node._mapper.store
-    total = store.count + store.away_count
+    total = store.count + store.paged_out_count
     assert sum(c.count for c in chunks.values()) == total > store.count
-    points = moved(unpack(chunks[0].packed), chunks[0].T_map_anchor)[MEAN:SCALE]
-    assert len(points[0]) == sum(store.anchor[: store.count] == 0) + store.away[0][0]
+    points = transform_gaussians(unpack(chunks[0].packed), chunks[0].T_map_anchor)[MEAN:SCALE]
+    assert len(points[0]) == sum(store.anchor[: store.count] == 0) + store.paged_out[0][0]
     assert points[1].min() < 0.5 < 8.5 < points[1].max() < 11.0  # four pictures, three metres apart
     assert chunks == chunks | {
         c.anchor_id: c for c in sent["mapping/chunk"] if c.revision == chunks[c.anchor_id].revision
@@ -188,11 +202,11 @@ def test_chunks_and_the_file_at_the_end_hold_what_is_on_the_disk(tmp_path):
 
 def test_leaving_and_coming_back_changes_no_version(walked):
     _, node = walked
-    mapper, shelf = node._mapper, node._keeper.shelf
+    mapper, disk_tier = node._mapper, node._session._checkpointer.disk_tier
     versions = mapper.store.versions()
-    shelf.take(mapper.store, list(shelf.blocks), mapper.T_map_anchor)
+    disk_tier.page_in(mapper.store, list(disk_tier.blocks), mapper.T_map_anchor)
     assert mapper.store.versions() == versions
-    shelf.put(mapper.store, groups_of(mapper.store, mapper.T_map_anchor), mapper.T_map_anchor)
+    disk_tier.page_out(mapper.store, groups_of(mapper.store, mapper.T_map_anchor), mapper.T_map_anchor)
     assert mapper.store.versions() == versions
 
 
@@ -205,13 +219,16 @@ def test_a_checkpoint_holds_all_and_resumes_with_or_without_a_budget(walked):
     node.close()
     session = SessionFolder(folder)
     assert session.manifest()["version"] == 2
-    assert session.manifest()["gaussians"] == node._mapper.store.count + node._keeper.shelf.count
+    assert (
+        session.manifest()["gaussians"]
+        == node._mapper.store.count + node._session._checkpointer.disk_tier.count
+    )
     again = make(folder)
     assert again._mapper.store.count == node._mapper.store.count
-    assert again._mapper.store.away == node._mapper.store.away
+    assert again._mapper.store.paged_out == node._mapper.store.paged_out
     again.close()
-    shelf, mapper = node._keeper.shelf, node._mapper
-    shelf.take(mapper.store, list(shelf.blocks), mapper.T_map_anchor)
+    disk_tier, mapper = node._session._checkpointer.disk_tier, node._mapper
+    disk_tier.page_in(mapper.store, list(disk_tier.blocks), mapper.T_map_anchor)
     expected = rows(mapper.store)
     np.testing.assert_array_equal(rows(store_of(session.read_state())), expected)
     free = make(folder, memory_mb=None, session_every_s=1.0)
@@ -233,17 +250,17 @@ def test_a_mapper_that_is_killed_finds_what_its_checkpoint_names(tmp_path):
     assert named <= set(session.block_numbers())
     assert store_of(session.read_state()).count == session.manifest()["gaussians"]
     again = make(tmp_path / "s", session_every_s=2.0)
-    assert len(again._mapper.keyframes) + len(again._mapper.resting) == PLACES
+    assert len(again._mapper.keyframes) + len(again._mapper.paged_out) == PLACES
     walk(again, range(PLACES, PLACES + 6))
     list(again.drain())
-    assert set(session.block_numbers()) == set(again._keeper.shelf.blocks)
+    assert set(session.block_numbers()) == set(again._session._checkpointer.disk_tier.blocks)
     again.close()
 
 
 def test_the_same_walk_gives_the_same_bytes(tmp_path):
     nodes = [walk(make(tmp_path / name), range(PLACES + 10)) for name in "ab"]
     a, b = (node._mapper for node in nodes)
-    assert a.store.away == b.store.away != {}
+    assert a.store.paged_out == b.store.paged_out != {}
     for name in a.store._arrays():
         x, y = (getattr(m.store, name)[..., : m.store.count] for m in (a, b))
         np.testing.assert_array_equal(x, y)
@@ -263,10 +280,10 @@ def test_a_budget_that_the_view_itself_breaks_is_said(tmp_path, caplog):
     walk(node, range(1, 12), sent)
     assert node._mapper.store.count <= first  # what there is no room for is not begun
     assert sent["mapping/status"][-1].session.startswith(
-        "BUDGET NOT KEPT: what the newest keyframes see takes "
+        "MEMORY BUDGET EXCEEDED: what the newest keyframes observe takes "
     )
-    assert "BUDGET NOT KEPT" in node.detail
-    assert "the memory's budget is not kept" in caplog.text
+    assert "MEMORY BUDGET EXCEEDED" in node.detail
+    assert "the memory budget is exceeded" in caplog.text
     node.close()
 
 
@@ -275,36 +292,36 @@ def test_a_disk_that_takes_no_gaussians_keeps_them_in_memory_and_says_so(tmp_pat
     (tmp_path / "s" / "edge" / "gaussians").rmdir()
     sent = {}
     walk(node, range(8, PLACES), sent)
-    assert node._mapper.store.away_count == 0
+    assert node._mapper.store.paged_out_count == 0
     assert "Gaussians do not go to the disk: No such file" in sent["mapping/status"][-1].session
     (tmp_path / "s" / "edge" / "gaussians").mkdir()
     walk(node, range(PLACES, PLACES + 3), sent)
-    assert node._mapper.store.away_count > 0
-    assert "BUDGET NOT KEPT" not in sent["mapping/status"][-1].session
+    assert node._mapper.store.paged_out_count > 0
+    assert "MEMORY BUDGET EXCEEDED" not in sent["mapping/status"][-1].session
     node.close()
 
 
 @pytest.mark.parametrize("harm", ["cut", "gone", "altered", "empty"])
 def test_a_broken_block_costs_only_its_gaussians_and_is_said(walked, harm, caplog):
     _, node = walked
-    mapper, shelf = node._mapper, node._keeper.shelf
-    block = next(b for b in shelf.blocks.values() if b.anchor == 0)
-    path = block_file(shelf._folder.blocks, block.number)
+    mapper, disk_tier = node._mapper, node._session._checkpointer.disk_tier
+    block = next(b for b in disk_tier.blocks.values() if b.anchor == 0)
+    path = block_file(disk_tier._folder.blocks, block.number)
     blob = bytearray(path.read_bytes())
     blob[len(blob) // 2] ^= 0xFF
     {"cut": lambda: path.write_bytes(path.read_bytes()[:-40]), "gone": path.unlink,
      "altered": lambda: path.write_bytes(blob), "empty": lambda: path.write_bytes(b"")}[harm]()  # fmt: skip
-    total, version = mapper.store.count + shelf.count, mapper.store.versions()[0]
-    shelf.take(mapper.store, list(shelf.blocks), mapper.T_map_anchor)
-    assert shelf.lost == block.count
+    total, version = mapper.store.count + disk_tier.count, mapper.store.versions()[0]
+    disk_tier.page_in(mapper.store, list(disk_tier.blocks), mapper.T_map_anchor)
+    assert disk_tier.lost_count == block.count
     assert mapper.store.count == total - block.count
     assert mapper.store.versions()[0] > version
-    assert mapper.store.away == {}
+    assert mapper.store.paged_out == {}
     assert path.name in caplog.text
-    assert f"{block.count} Gaussians lost" in node._keeper.text(mapper)
+    assert f"{block.count} Gaussians lost" in node._session._checkpointer.status_text(mapper)
     arrays = {"anchor_id": np.array([0]), "anchor_T_map": np.eye(4)[None], **arrays_of_blocks([block])}
     with pytest.raises(UserError, match=path.name):
-        with_blocks(shelf._folder.blocks, arrays)
+        with_blocks(disk_tier._folder.blocks, arrays)
 
 
 def test_a_manifest_of_a_newer_program_is_refused(walked):
@@ -320,7 +337,9 @@ def test_a_manifest_of_a_newer_program_is_refused(walked):
 
 
 def test_whatever_a_picture_shows_is_seen_and_what_is_far_from_it_is_not():
-    """Points of a sphere that fall into the picture make the sphere seen; ten radii off its pyramid it is not."""
+    """Points of a sphere that fall into the picture make the sphere seen; ten radii off its pyramid it is
+    not.
+    """
     chance = np.random.default_rng(4)
     T_map_camera = gallery.T_map_camera(3)
     centres, radii = chance.uniform(-12, 12, (4000, 3)), chance.uniform(0.05, 1.5, 4000)
@@ -333,12 +352,12 @@ def test_whatever_a_picture_shows_is_seen_and_what_is_far_from_it_is_not():
     inside = (
         (z > 0.1) & (z < 6.0) & (u > -0.5) & (v > -0.5) & (u < c.width_px - 0.5) & (v < c.height_px - 0.5)
     )
-    seen = sees(c, T_map_camera, 6.0, centres, radii)
+    seen = frustum_intersects(c, T_map_camera, 6.0, centres, radii)
     assert seen[inside.any(axis=1)].all()
     assert 60 < seen.sum() < 400
     behind = (centres - T_map_camera[:3, 3]) @ T_map_camera[:3, 2] < -radii
     assert not seen[behind].any()
-    assert sees(c, T_map_camera, MAX_DEPTH_M, centres, radii).sum() > seen.sum()
+    assert frustum_intersects(c, T_map_camera, MAX_DEPTH_M, centres, radii).sum() > seen.sum()
 
 
 def test_groups_hold_every_gaussian_of_a_cube_and_their_spheres_all_they_colour(walked):

@@ -1,4 +1,6 @@
-"""The robot's half and the map's half of a session know that they belong together, and those of two drives that not."""
+"""The robot's half and the map's half of a session know that they belong together, and those of two drives
+that not.
+"""
 
 import json
 

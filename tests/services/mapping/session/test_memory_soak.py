@@ -13,7 +13,9 @@ HALF_HOUR = 3000  # keyframes
 
 @pytest.mark.soak
 def test_four_hours_at_a_hundred_keyframes_a_minute(tmp_path):
-    """24 000 keyframes of a small camera: the same memory from the first half-hour on; the time for each is printed."""
+    """24 000 keyframes of a small camera: the same memory from the first half-hour on; the time for each is
+    printed.
+    """
     seen, budget_mb = home(64, 100), PROCESS_MB + 10.0
     options = {
         "memory_mb": budget_mb, "max_keyframes": 400, "half_steps": 1, "full_steps": 1, "session_every_s": 60.0,
@@ -44,8 +46,9 @@ def test_four_hours_at_a_hundred_keyframes_a_minute(tmp_path):
 @pytest.mark.soak
 @pytest.mark.parametrize("budget_mb", [1000.0, PROCESS_MB + 35.0], ids=["1GB", "tight"])
 def test_ten_laps_under_a_budget(tmp_path, budget_mb):
-    """The process stays within its budget lap after lap, and the rooms of the first lap look as good after the last:
-    where everything fits, and where most keyframes and Gaussians lie on the disk."""
+    """The process stays within its budget lap after lap, and the rooms of the first lap look as good after
+    the last: where everything fits, and where most keyframes and Gaussians lie on the disk.
+    """
     seen, a_lap = home(240, 40), 40
     views = list(range(3, a_lap, 6))
     options = {"memory_mb": budget_mb, "session_every_s": 30.0, "half_steps": 8, "full_steps": 3}

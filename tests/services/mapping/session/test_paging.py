@@ -5,10 +5,16 @@ import pytest
 
 from beamsplat.common.errors import UserError
 from beamsplat.common.mapfiles.session import SessionFolder
-from beamsplat.common.mapfiles.state import views_of
+from beamsplat.common.mapfiles.state import keyframe_views
 from beamsplat.common.messages import Tick
-from beamsplat.services.mapping.session.disk_tier import Shelf
-from beamsplat.services.mapping.session.paging import PROCESS_MB, Pager, bytes_of, check_budget, resting
+from beamsplat.services.mapping.session.disk_tier import DiskTier
+from beamsplat.services.mapping.session.paging import (
+    PROCESS_MB,
+    Pager,
+    check_budget,
+    image_bytes,
+    without_images,
+)
 from tests.services.mapping import room_drive as r
 from tests.services.mapping.session.maps import SECOND, feed, handle, make_node, message
 
@@ -21,7 +27,7 @@ def used(node):
     mapper = node._mapper
     store = mapper.store
     gaussians = 2 * sum(getattr(store, n)[..., : store.count].nbytes for n in store._arrays())
-    pictures = sum(map(bytes_of, mapper.keyframes.values()))
+    pictures = sum(map(image_bytes, mapper.keyframes.values()))
     return PROCESS_MB * 1e6 + gaussians + pictures + mapper.workspace_bytes
 
 
@@ -35,20 +41,20 @@ def paged(tmp_path_factory):
             stamp_ns = r.T0 + (lap * 12 + number) * SECOND
             handle(node, "keyframes/frame", message(number, stamp_ns), sent)
             assert used(node) <= BUDGET_MB * 1e6
-            assert len(node._mapper.keyframes) + len(node._mapper.resting) == lap * 12 + number + 1
+            assert len(node._mapper.keyframes) + len(node._mapper.paged_out) == lap * 12 + number + 1
     return folder, node, sent
 
 
 def test_the_budget_holds_lap_after_lap_and_top_says_what_rests(paged):
     _, node, sent = paged
-    assert len(node._mapper.resting) > 5
+    assert len(node._mapper.paged_out) > 5
     assert f"in memory {len(node._mapper.keyframes)} of 24 keyframes" in node.detail
     statuses = sent["mapping/status"]
     assert [s.keyframes for s in statuses] == list(range(1, 25))
     assert statuses[-1].gaussians == node._mapper.store.count
 
 
-def test_resting_keyframes_take_turns(paged):
+def test_paged_out_keyframes_are_paged_in_by_turns(paged):
     _, node, _ = paged
     ever = set(node._mapper.keyframes)
     for count in range(48):
@@ -56,7 +62,7 @@ def test_resting_keyframes_take_turns(paged):
         assert used(node) <= BUDGET_MB * 1e6
         ever |= set(node._mapper.keyframes)
     assert len(ever) == 24
-    assert len(node._mapper.keyframes) + len(node._mapper.resting) == 24
+    assert len(node._mapper.keyframes) + len(node._mapper.paged_out) == 24
 
 
 def test_a_checkpoint_holds_those_on_disk_and_resumes_with_or_without_a_budget(paged, tmp_path):
@@ -65,14 +71,14 @@ def test_a_checkpoint_holds_those_on_disk_and_resumes_with_or_without_a_budget(p
     for output in node.drain():
         sent.setdefault(output[0], []).append(output[1])
     assert len(sent["mapping/poses"][-1].keyframe_ids) == 24
-    parked = {id: held.delta for id, held in node._mapper.resting.items()}
+    parked = {id: held.delta for id, held in node._mapper.paged_out.items()}
     node.close()
     arrays = SessionFolder(folder).read_state()
-    assert len(views_of(arrays)) == 24
+    assert len(keyframe_views(arrays)) == 24
     again = make_node(folder, memory_mb=BUDGET_MB)
-    assert set(again._mapper.resting) == set(parked)
+    assert set(again._mapper.paged_out) == set(parked)
     for id, delta in parked.items():
-        np.testing.assert_array_equal(again._mapper.resting[id].delta, delta)
+        np.testing.assert_array_equal(again._mapper.paged_out[id].delta, delta)
     assert list(again._mapper.keyframes) == list(node._mapper.keyframes)
     again.close()
     free = make_node(folder)
@@ -89,8 +95,8 @@ def test_the_same_drive_pages_the_same_keyframes(tmp_path):
         feed(node, range(12))
         node.close()
     a, b = nodes
-    assert list(a._mapper.resting) == list(b._mapper.resting)
-    assert a._mapper.resting
+    assert list(a._mapper.paged_out) == list(b._mapper.paged_out)
+    assert a._mapper.paged_out
     count = a._mapper.store.count
     np.testing.assert_array_equal(a._mapper.store.params[:, :count], b._mapper.store.params[:, :count])
 
@@ -98,7 +104,7 @@ def test_the_same_drive_pages_the_same_keyframes(tmp_path):
 def test_what_cannot_be_read_again_stays_in_memory_or_is_said(tmp_path, caplog):
     node = make_node(tmp_path / "s", half_steps=0, full_steps=0)
     feed(node, range(12))
-    mapper, pager = node._mapper, Pager(0.0, 0, Shelf(SessionFolder(tmp_path / "s")))
+    mapper, pager = node._mapper, Pager(0.0, 0, DiskTier(SessionFolder(tmp_path / "s")))
     pager.page(mapper, lambda id: None, lambda id: False)
     assert len(mapper.keyframes) == 12
     pager.page(mapper, lambda id: None, lambda id: True)
@@ -108,11 +114,11 @@ def test_what_cannot_be_read_again_stays_in_memory_or_is_said(tmp_path, caplog):
         raise UserError("the disk is gone")
 
     pager.page(mapper, broken, lambda id: True)
-    assert pager.lost == 1
+    assert pager.lost_count == 1
     assert "the disk is gone" in caplog.text
     held = next(iter(mapper.keyframes.values()))
-    assert bytes_of(resting(held)) == 0 < bytes_of(held)
-    assert resting(held).levels[0].camera == held.levels[0].camera
+    assert image_bytes(without_images(held)) == 0 < image_bytes(held)
+    assert without_images(held).levels[0].camera == held.levels[0].camera
     node.close()
 
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from beamsplat.common.mapfiles.session import SessionFolder
-from beamsplat.services.mapping.messages import open_keyframe
-from beamsplat.tools.sessions.deduplicate import without_doubles
+from beamsplat.services.mapping.messages import decode_keyframe
+from beamsplat.tools.sessions.deduplicate import without_duplicates
 from beamsplat.tools.sessions.edit import with_gaussians
 from tests.services.mapping.session import gallery
 from tests.services.mapping.session.maps import handle, make_node
@@ -23,7 +23,7 @@ def galleries(tmp_path_factory):
         node.close()
         out.append(SessionFolder(root / name).read_state())
     opener = make_node()
-    return *out, lambda id: open_keyframe(gallery.message((id - gallery.T0) // 10**9), opener._lens)
+    return *out, lambda id: decode_keyframe(gallery.message((id - gallery.T0) // 10**9), opener._lens)
 
 
 def joined(a, b):
@@ -44,7 +44,7 @@ def place_of(arrays):
 def test_the_worse_of_two_surfaces_goes_and_what_only_one_map_has_stays(galleries):
     good, bad, opened = galleries
     both, second = joined(good, bad)
-    stay = without_doubles(both, second, opened)
+    stay = without_duplicates(both, second, opened)
     places = place_of(both)
     alone_good, alone_bad = ~second & (places < 2), second & (places > 3)
     assert stay[alone_good].all()
@@ -57,7 +57,7 @@ def test_the_worse_of_two_surfaces_goes_and_what_only_one_map_has_stays(gallerie
 def test_which_map_comes_first_does_not_matter(galleries):
     good, bad, opened = galleries
     both, second = joined(good, bad)
-    flipped, first = without_doubles(both, second, opened), without_doubles(both, ~second, opened)
+    flipped, first = without_duplicates(both, second, opened), without_duplicates(both, ~second, opened)
     np.testing.assert_array_equal(flipped, first)
 
 
@@ -68,4 +68,4 @@ def test_keyframes_that_cannot_be_opened_have_no_say(galleries):
     def broken(id):
         raise ValueError("gone")
 
-    assert without_doubles(both, second, broken).all()
+    assert without_duplicates(both, second, broken).all()

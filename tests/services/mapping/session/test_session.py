@@ -16,16 +16,16 @@ import pytest
 from beamsplat.common.errors import UserError
 from beamsplat.common.geometry.transforms import inverse
 from beamsplat.common.mapfiles.session import EDGE_MANIFEST, MANIFEST, SessionFolder
-from beamsplat.common.mapfiles.state import progress_of, views_of
+from beamsplat.common.mapfiles.state import keyframe_views, progress_of
 from beamsplat.common.messages import Tick
 from beamsplat.common.runtime.lockstep import Lockstep
 from beamsplat.services.keyframes.node import KeyframesConfig, KeyframesNode
 from beamsplat.services.mapping.config import MappingConfig
-from beamsplat.services.mapping.keyframe import Held
+from beamsplat.services.mapping.keyframe import StoredKeyframe
 from beamsplat.services.mapping.mapper import FULL, HALF, Mapper
-from beamsplat.services.mapping.messages import open_keyframe
+from beamsplat.services.mapping.messages import decode_keyframe
 from beamsplat.services.mapping.node import MappingNode
-from beamsplat.services.mapping.session.checkpointer import Keeper
+from beamsplat.services.mapping.session.checkpointer import Checkpointer
 from beamsplat.services.mapping.session.state import arrays_of, extras_of, restore
 from tests.services.mapping import room_drive as r
 from tests.services.mapping.session.maps import SECOND, feed, handle, make_node, message
@@ -73,14 +73,16 @@ def test_training_goes_on_as_if_nothing_had_happened(saved, copy):
     ours = Mapper(saved[1]._mapper.settings)  # a second mapper from memory: the saved node stays as it is
     bodies = SessionFolder(copy)
     arrays = arrays_of(saved[1]._mapper)
-    assert restore(ours, arrays, lambda id: open_keyframe(message((id - r.T0) // SECOND), loaded._lens)) == []
+    assert (
+        restore(ours, arrays, lambda id: decode_keyframe(message((id - r.T0) // SECOND), loaded._lens)) == []
+    )
     losses = [[m.step(m._draw(), HALF), m.refine(3), m.step(m._draw(), FULL)] for m in (ours, loaded._mapper)]
     assert losses[0] == losses[1]
     a, b = arrays_of(ours), arrays_of(loaded._mapper)
     for name in a:
         if name != "store_events":
             np.testing.assert_array_equal(a[name], b[name], name)
-    assert len(bodies.body_ids()) == 6
+    assert len(bodies.keyframe_ids()) == 6
     loaded.close()
 
 
@@ -163,7 +165,7 @@ def test_lockstep_gives_the_same_map_with_a_session_as_without(tmp_path):
     arrays = SessionFolder(tmp_path / "s").read_state()
     np.testing.assert_array_equal(arrays["store_params"], without.params[:, : without.count])
     assert {"taken_id", "taken_stamp_ns"} <= set(extras_of(arrays))
-    assert [view.id for view in views_of(arrays)] == sorted(arrays["keyframe_id"].tolist())
+    assert [view.id for view in keyframe_views(arrays)] == sorted(arrays["keyframe_id"].tolist())
 
 
 def test_forgotten_keyframes_leave_the_disk_once_a_checkpoint_is_without_them(tmp_path):
@@ -171,7 +173,7 @@ def test_forgotten_keyframes_leave_the_disk_once_a_checkpoint_is_without_them(tm
     feed(node, range(9))
     list(node.drain())
     folder = SessionFolder(tmp_path / "s")
-    assert set(folder.body_ids()) == set(node._mapper.keyframes)
+    assert set(folder.keyframe_ids()) == set(node._mapper.keyframes)
     assert len(progress_of(folder.read_state())["forgotten"]) == 5
     node.close()
 
@@ -221,9 +223,9 @@ def test_twenty_kills_lose_no_acknowledged_keyframe_and_break_no_file(tmp_path):
             continue
         manifest = folder.manifest()
         arrays = folder.read_state()
-        assert known <= set(folder.body_ids())
+        assert known <= set(folder.keyframe_ids())
         for id in known:
-            folder.read_body(id)
+            folder.read_keyframe(id)
         if manifest is not None:
             # Every 2 s; one that is killed while it is written is tried again a keyframe later.
             assert manifest["stamp_ns"] >= max(known) - 6 * SECOND
@@ -258,7 +260,7 @@ def test_a_full_disk_leaves_the_checkpoint_valid_and_says_so(tmp_path):
     assert [ack.status for ack in again["keyframes/ack"]] == ["ok"] * 4
     status = feed(node, range(8, 10))["mapping/status"][-1]
     assert status.session.startswith("saved at ")
-    assert folder.body_ids() == sorted(node._mapper.keyframes)
+    assert folder.keyframe_ids() == sorted(node._mapper.keyframes)
     node.close()
 
 
@@ -267,9 +269,9 @@ def test_two_mappers_cannot_write_to_one_session(copy):
     with pytest.raises(
         UserError, match=rf"another process writes to this session \(process {os.getpid()} on .+\)"
     ):
-        Keeper(copy, SECOND)
+        Checkpointer(copy, SECOND)
     node.close()
-    Keeper(copy, SECOND).close()
+    Checkpointer(copy, SECOND).close()
 
 
 @pytest.mark.parametrize(
@@ -307,13 +309,13 @@ def test_a_broken_keyframe_costs_only_itself(saved, copy, caplog):
     assert len(node._mapper.keyframes) == 5
     assert "truncated or altered" in caplog.text
     np.testing.assert_array_equal(picture(saved[1]._mapper), picture(node._mapper))
-    assert isinstance(next(iter(node._mapper.keyframes.values())), Held)
+    assert isinstance(next(iter(node._mapper.keyframes.values())), StoredKeyframe)
     node.close()
 
 
 def test_a_folder_that_is_no_session_is_refused(tmp_path):
     with pytest.raises(UserError, match="a folder written by"):
-        SessionFolder(tmp_path).head()
+        SessionFolder(tmp_path).header()
 
 
 @pytest.mark.parametrize("version", [1, 2])

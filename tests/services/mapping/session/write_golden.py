@@ -37,7 +37,7 @@ def write(version, paged):
     mapper = node._mapper
     first, count = mapper.store.params[:, 0].tolist(), mapper.store.count
     if paged:
-        node._keeper.shelf.put(
+        node._session._checkpointer.disk_tier.page_out(
             mapper.store, groups_of(mapper.store, mapper.T_map_anchor), mapper.T_map_anchor
         )
     list(node.drain())

@@ -71,7 +71,7 @@ def pictures(
         rasterizer.close()
 
 
-def write_film(path: Path, frames: Iterable[np.ndarray], fps: float, count: int) -> list[Path]:
+def write_video(path: Path, frames: Iterable[np.ndarray], fps: float, count: int) -> list[Path]:
     """`.mp4` as one video, `.png` as one file a picture (NAME-0001.png ..., NAME.png if there is only one).
 
     Raises:
