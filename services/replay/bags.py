@@ -1,7 +1,7 @@
-"""Any ROS bag as one thing: topics with types and counts, raw messages in order of arrival.
+"""Reader of ROS bags of any kind: topics with types and counts, raw messages by receive time.
 
 ROS 1 (.bag, or a folder of splits), ROS 2 sqlite (.db3), MCAP (.mcap), and ROS 2 folders with or
-without metadata.yaml. What goes wrong is said in one sentence that names the file.
+without metadata.yaml. Errors are one sentence that names the file.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from beamsplat.common.errors import UserError
 from beamsplat.common.recording.mcap_file import McapFile
 from beamsplat.services.replay.decode import RawMessage
 
-# What the readers raise on damaged files, beyond their own errors.
-_DAMAGE = (
+# Exceptions of the readers on damaged files, besides their own errors.
+_READ_ERRORS = (
     ReaderError1, ReaderError2, apsw.Error, sqlite3.Error, OSError, AssertionError, KeyError, IndexError,
     ValueError, struct.error, EOFError, RuntimeError, TypeError, MemoryError, OverflowError,
 )  # fmt: skip
@@ -35,16 +35,16 @@ _COPY_AGAIN = "copy it again from where it was recorded"
 
 
 class BagTopic(NamedTuple):
-    """One topic of a bag; `type_name` in the form pkg/msg/Type for ROS 1 too."""
+    """One topic of a bag; `type_name` has the form pkg/msg/Type, also for ROS 1."""
 
     name: str
     type_name: str
     count: int
-    encoding: str  # "cdr", "ros1", or something nobody here decodes
+    encoding: str  # "cdr", "ros1", or an unsupported encoding
 
 
 class Bag:
-    """An open bag. `problems` holds sentences about what is missing.
+    """An open bag. `problems` are sentences about missing parts.
 
     Raises:
         UserError: no such file, not a bag, truncated (unless `allow_truncated`), or without messages.
@@ -54,21 +54,21 @@ class Bag:
         self.path = Path(path)
         self.problems: list[str] = []
         self._stack = ExitStack()
-        self._parts: list[_Part] = []
+        self._bag_files: list[_BagFile] = []
         try:
             for file in _files(self.path):
-                self._parts.append(self._open(file, allow_truncated))
-            if not any(topic.count for part in self._parts for topic in part.topics):
-                raise UserError(f"{self.path}: the bag holds no messages; record again")
+                self._bag_files.append(self._open(file, allow_truncated))
+            if not any(topic.count for part in self._bag_files for topic in part.topics):
+                raise UserError(f"{self.path}: the bag has no messages; record again")
         except UserError:
             self.close()
             raise
 
     @property
     def topics(self) -> list[BagTopic]:
-        """Topics by name, counts summed over the files of the bag."""
+        """Return the topics by name, with counts summed over the files of the bag."""
         found: dict[tuple[str, str, str], int] = {}
-        for part in self._parts:
+        for part in self._bag_files:
             for topic in part.topics:
                 key = (topic.name, topic.type_name, topic.encoding)
                 found[key] = found.get(key, 0) + topic.count
@@ -76,29 +76,29 @@ class Bag:
 
     @property
     def start_ns(self) -> int:
-        return min(part.span_ns[0] for part in self._parts if part.span_ns)
+        return min(part.span_ns[0] for part in self._bag_files if part.span_ns)
 
     @property
     def end_ns(self) -> int:
-        """Receive time of the last message."""
-        return max(part.span_ns[1] for part in self._parts if part.span_ns)
+        """Return the receive time of the last message."""
+        return max(part.span_ns[1] for part in self._bag_files if part.span_ns)
 
     def messages(
         self, topics: Collection[str] | None = None, start_ns: int = 0, stop_ns: int | None = None
     ) -> Iterator[RawMessage]:
-        """Raw messages with start_ns <= at_ns < stop_ns by receive time.
+        """Yield raw messages with start_ns <= at_ns < stop_ns, by receive time.
 
         Raises:
-            UserError: the file turns out to be damaged here.
+            UserError: the file is damaged.
         """
         stop_ns = 2**63 - 1 if stop_ns is None else stop_ns
-        streams = [part.messages(topics, start_ns, stop_ns) for part in self._parts]
+        streams = [part.messages(topics, start_ns, stop_ns) for part in self._bag_files]
         last_ns = start_ns
         try:
             for message in heapq.merge(*streams, key=lambda raw: raw.at_ns):
                 last_ns = message.at_ns
                 yield message
-        except _DAMAGE as error:
+        except _READ_ERRORS as error:
             if isinstance(error, UserError):
                 raise
             after_s = (last_ns - self.start_ns) / 1e9
@@ -115,36 +115,38 @@ class Bag:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _open(self, file: Path, allow_truncated: bool) -> _Part:
+    def _open(self, file: Path, allow_truncated: bool) -> _BagFile:
         if file.suffix == ".mcap":
-            part = _McapPart(self._stack.enter_context(McapFile(file)))
+            part = _McapFile(self._stack.enter_context(McapFile(file)))
             if part.file.truncated:
                 sentence = f"{file}: truncated: {part.file.truncated}"
                 if not allow_truncated:
-                    raise UserError(f"{sentence}; {_COPY_AGAIN}, or set allow_truncated to use what is there")
+                    raise UserError(
+                        f"{sentence}; {_COPY_AGAIN}, or set allow_truncated to use the readable part"
+                    )
                 self.problems.append(sentence)
             return part
         try:
             reader = Reader1(file) if file.suffix == ".bag" else Reader2(file)
             reader.open()
-        except _DAMAGE as error:
+        except _READ_ERRORS as error:
             raise UserError(_explain(file, error)) from error
         self._stack.callback(_close, reader)
-        return _RosbagsPart(reader)
+        return _RosbagsFile(reader)
 
 
-class _Part(ABC):
-    """One storage of a bag."""
+class _BagFile(ABC):
+    """One file (storage) of a bag."""
 
     topics: list[BagTopic]
     span_ns: tuple[int, int] | None
 
     @abstractmethod
     def messages(self, topics: Collection[str] | None, start_ns: int, stop_ns: int) -> Iterator[RawMessage]:
-        """Messages of the topics (None: all) with start_ns <= at_ns < stop_ns by receive time, in order."""
+        """Yield messages of the topics (None: all) with start_ns <= at_ns < stop_ns, by receive time."""
 
 
-class _McapPart(_Part):
+class _McapFile(_BagFile):
     def __init__(self, file: McapFile) -> None:
         self.file = file
         self.span_ns = (file.start_ns, file.end_ns) if file.counts.total() else None
@@ -169,7 +171,7 @@ class _McapPart(_Part):
             )
 
 
-class _RosbagsPart(_Part):
+class _RosbagsFile(_BagFile):
     def __init__(self, reader: Reader1 | Reader2) -> None:
         self._reader = reader
         ros1 = isinstance(reader, Reader1)
@@ -193,7 +195,7 @@ class _RosbagsPart(_Part):
 
 
 def looks_like_bag(path: Path) -> bool:
-    """Whether `path` is, by its name or the files in it, a bag of some kind."""
+    """Return whether `path` is a bag, judged by its name or by the names of the files in it."""
     if path.is_dir():
         names = {file.suffix for file in path.iterdir()}
         return bool(names & {".mcap", ".db3", ".bag", ".zstd"}) or (path / "metadata.yaml").exists()
@@ -201,7 +203,7 @@ def looks_like_bag(path: Path) -> bool:
 
 
 def _files(path: Path) -> list[Path]:
-    """The storages to open, by what lies at `path`; a folder that rosbags must open is its own storage."""
+    """Return the files to open for `path`; a folder that rosbags opens as a whole is returned itself."""
     if not path.exists():
         raise UserError(f"{path}: no such file or folder; check the path")
     if path.is_file():
@@ -221,7 +223,7 @@ def _files(path: Path) -> list[Path]:
 
 
 def _compressed_by_message(metadata: Path) -> bool:
-    """Whether each message is compressed by itself: rosbags undoes that, our MCAP reader does not."""
+    """Return whether messages are compressed singly, which rosbags supports and our MCAP reader does not."""
     return (
         re.search(r"compression_mode:\s*['\"]?message", metadata.read_text(errors="replace"), re.I)
         is not None
@@ -229,12 +231,12 @@ def _compressed_by_message(metadata: Path) -> bool:
 
 
 def _explain(file: Path, error: Exception) -> str:
-    """One sentence for what a reader said when a bag did not open."""
+    """Return one sentence about a bag that could not be opened."""
     if file.is_file() and file.stat().st_size == 0:
         return f"{file}: the file is empty; {_COPY_AGAIN}"
     reason = _reason(error)
     if "magic" in reason or "file is not a database" in reason or "missing tables" in reason:
-        return f"{file}: not a bag, whatever its name says ({reason})"
+        return f"{file}: not a bag, in spite of its name ({reason})"
     if "not indexed" in reason:
         return f"{file}: the recording was not closed; repair it with `rosbag reindex {file.name}`"
     if isinstance(error, (ReaderError1, apsw.Error, AssertionError, struct.error, IndexError, ValueError)):
@@ -248,5 +250,5 @@ def _reason(error: Exception) -> str:
 
 
 def _close(reader: Reader1 | Reader2) -> None:
-    with suppress(*_DAMAGE):  # closing a damaged file may complain again
+    with suppress(*_READ_ERRORS):  # closing a damaged file may raise again
         reader.close()

@@ -1,4 +1,4 @@
-"""Serialised ROS messages, 1 and 2, to objects; and their stamps without decoding the rest."""
+"""Decoding of serialised ROS 1 and ROS 2 messages, and of their stamps alone."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-# What rosbags' generated deserialisers raise on rubbish, besides its own error.
-_RUBBISH = (
+# Exceptions of the generated deserialisers of rosbags on invalid data, besides its own error.
+_DECODE_ERRORS = (
     SerdeError, ValueError, struct.error, IndexError, AssertionError, OverflowError, MemoryError, TypeError,
 )  # fmt: skip
 
@@ -21,58 +21,58 @@ class RawMessage(NamedTuple):
 
     at_ns: int
     topic: str
-    type_name: str  # pkg/msg/Type, for ROS 1 too
+    type_name: str  # pkg/msg/Type, also for ROS 1
     data: bytes
-    encoding: str  # "cdr", "ros1", or something nobody here decodes
+    encoding: str  # "cdr", "ros1", or an unsupported encoding
 
 
 @cache
 def _store(encoding: str) -> Typestore:
     if encoding != "ros1":
         return get_typestore(Stores.ROS2_JAZZY)
-    store = get_typestore(Stores.ROS1_NOETIC)  # comes without tf
+    store = get_typestore(Stores.ROS1_NOETIC)  # has no tf messages
     for name in ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage"):
         if name not in store.types:
             store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", name))
     return store
 
 
-def knows(type_name: str, encoding: str) -> bool:
-    """Whether messages of this type can be deserialised."""
+def can_decode(type_name: str, encoding: str) -> bool:
+    """Return whether messages of this type and encoding can be decoded."""
     return encoding in ("cdr", "ros1") and type_name in _store(encoding).types
 
 
 def deserialize(message: RawMessage) -> Any:
-    """The ROS message as an object with the fields of its definition.
+    """Return the ROS message as an object with the fields of its definition.
 
     Raises:
-        ValueError: unknown type, or the bytes are not that message.
+        ValueError: unknown type, or invalid data.
     """
-    if not knows(message.type_name, message.encoding):
-        raise ValueError(f"messages of type {message.type_name} in {message.encoding} are not known here")
+    if not can_decode(message.type_name, message.encoding):
+        raise ValueError(f"type {message.type_name} with encoding {message.encoding} is not supported")
     store = _store(message.encoding)
     read = store.deserialize_ros1 if message.encoding == "ros1" else store.deserialize_cdr
     try:
         return read(message.data, message.type_name)
-    except _RUBBISH as error:
+    except _DECODE_ERRORS as error:
         raise ValueError(f"not a {message.type_name}: {error}") from error
 
 
 @cache
 def begins_with_header(type_name: str, encoding: str) -> bool:
-    """Whether messages of this type start with a std_msgs/Header."""
-    if not knows(type_name, encoding):
+    """Return whether messages of this type start with a std_msgs/Header."""
+    if not can_decode(type_name, encoding):
         return False
     fields = _store(encoding).fielddefs[type_name][1]
     return bool(fields) and fields[0][1][1] == "std_msgs/msg/Header"
 
 
 def header_stamp_ns(message: RawMessage) -> int | None:
-    """Stamp of a message that begins with a header; None if it is too short to have one."""
+    """Return the stamp of a message that begins with a header; None if the data are too short."""
     try:
         if message.encoding == "ros1":
-            sec, nanosec = struct.unpack_from("<II", message.data, 4)  # behind the sequence number
-        else:  # behind the CDR head, whose second byte tells the byte order
+            sec, nanosec = struct.unpack_from("<II", message.data, 4)  # after the sequence number
+        else:  # after the CDR header, whose second byte is the byte order
             sec, nanosec = struct.unpack_from("<iI" if message.data[1] & 1 else ">iI", message.data, 4)
     except (struct.error, IndexError):
         return None

@@ -1,4 +1,4 @@
-"""A plain folder as a source: pictures, scans and poses named or stamped in nanoseconds.
+"""Source of sensor messages from a plain folder: images, scans and poses with stamps in nanoseconds.
 
     images/<stamp_ns>.jpg | .png
     lasers/<stamp_ns>.pcd      or   scans.csv
@@ -7,7 +7,7 @@
     rig.toml                   calibration (common/rig.py)
     folder.toml                optional: range_min_m, range_max_m, scan_time_s of the PCD scans
 
-docs/recordings.md describes them. There are no receive times: what was measured at t arrives at t.
+docs/recordings.md describes the layout. There are no receive times: the stamp is used instead.
 """
 
 from __future__ import annotations
@@ -28,18 +28,18 @@ from beamsplat.common.errors import UserError
 from beamsplat.common.geometry.rig import load_rig
 from beamsplat.common.geometry.trajectory import Trajectory, read_tum
 from beamsplat.common.geometry.transforms import so3_log
-from beamsplat.common.recording.picture import picture_head
-from beamsplat.common.recording.sensors import SENSORS, build
+from beamsplat.common.recording.image_header import read_image_header
+from beamsplat.common.recording.sensors import SENSORS, build_message
 from beamsplat.services.replay.folder_scans import CsvScans, scan_from_points, xy_from_pcd
 from beamsplat.services.replay.options import SourceOptions
 
-_PICTURES = (".jpg", ".jpeg", ".png")
+_IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
 Stamped = tuple[int, str, Any]
 
 
 @dataclass(frozen=True)
-class Lidar:
-    """folder.toml: what PCD files do not say about the lidar."""
+class FolderLidar:
+    """Properties of the lidar from folder.toml, which PCD files do not contain."""
 
     range_min_m: float = 0.02
     range_max_m: float = 30.0
@@ -47,16 +47,16 @@ class Lidar:
 
 
 def looks_like_folder(path: Path) -> bool:
-    """Whether `path` holds any of the files of this layout."""
+    """Return whether `path` has any of the files of this layout."""
     names = ("images", "lasers", "scans.csv", "odometry.txt", "poses.txt")
     return path.is_dir() and any((path / name).exists() for name in names)
 
 
 class FolderSource:
-    """Messages of a plain folder by stamp.
+    """Source of the messages of a plain folder, by stamp.
 
     Raises:
-        UserError: a file that does not fit the layout, or something required is missing.
+        UserError: a file does not fit the layout, or a required sensor is missing.
     """
 
     def __init__(self, path: Path, options: SourceOptions) -> None:
@@ -67,39 +67,45 @@ class FolderSource:
         self.first_fault: dict[str, str] = {}
         self._settings = self._read_settings()
         self._streams = {
-            word: stream for word, stream in self._find_streams().items() if word not in options.without
+            sensor_name: stream
+            for sensor_name, stream in self._find_streams().items()
+            if sensor_name not in options.without
         }
-        for word in sorted(options.require - options.without):
-            if not self._streams.get(word):
-                there = ", ".join(word for word, stream in self._streams.items() if stream) or "nothing"
+        for sensor_name in sorted(options.require - options.without):
+            if not self._streams.get(sensor_name):
+                there = (
+                    ", ".join(sensor_name for sensor_name, stream in self._streams.items() if stream)
+                    or "nothing"
+                )
                 raise UserError(
-                    f"{path}: has no {word}; it holds {there}. Use another recording, or set "
-                    f'without = ["{word}"] if the deployment does not need one'
+                    f"{path}: has no {sensor_name}; it holds {there}. Use another recording, or set "
+                    f'without = ["{sensor_name}"] if the deployment does not need one'
                 )
         stamps = [stamp for stream in self._streams.values() for stamp, _ in stream]
         if not stamps:
-            raise UserError(f"{path}: the folder holds no pictures, scans or poses")
+            raise UserError(f"{path}: the folder has no images, scans or poses")
         self.start_ns, self.end_ns = min(stamps), max(stamps)
 
     @property
     def problems(self) -> list[str]:
         return [
-            f"{self.where}: {word}: {count} passed over, the first because: {self.first_fault[word]}"
-            for word, count in sorted(self.skipped.items())
+            f"{self.where}: {sensor_name}: {count} skipped, "
+            f"the first because: {self.first_fault[sensor_name]}"
+            for sensor_name, count in sorted(self.skipped.items())
         ]
 
     def counts(self) -> dict[str, int]:
-        """Files or rows by word ("image", "scan", ...)."""
-        return {word: len(stream) for word, stream in self._streams.items() if stream}
+        """Return the number of files or rows of each sensor ("image", "scan", ...)."""
+        return {sensor_name: len(stream) for sensor_name, stream in self._streams.items() if stream}
 
-    def expected(self) -> int:
+    def message_count(self) -> int:
         return sum(self.counts().values())
 
     def rig(self) -> Any:
-        """The calibration as the message `Rig`, from the option or from rig.toml in the folder.
+        """Return the calibration as the message `Rig`, from the option or from rig.toml in the folder.
 
         Raises:
-            UserError: neither is there, or K is of another picture size.
+            UserError: both are missing, or K is for another image size.
         """
         file = self.options.rig or self.path / "rig.toml"
         if self.options.rig is None and not file.exists():
@@ -110,9 +116,9 @@ class FolderSource:
         rig = load_rig(file)
         images = self._streams.get("image")
         if images and rig.camera is None:
-            raise UserError(f'{file}: has no [camera] for the pictures; add it, or set without = ["image"]')
+            raise UserError(f'{file}: has no [camera] for the images; add it, or set without = ["image"]')
         if images:
-            head = picture_head(images[0][1].read_bytes())
+            head = read_image_header(images[0][1].read_bytes())
             size = (rig.camera.width_px, rig.camera.height_px)
             if head is not None and head[1:] != size:
                 raise UserError(
@@ -122,39 +128,47 @@ class FolderSource:
         return rig.message(self.start_ns, rig.source or str(file))
 
     def messages(self, start_ns: int = 0, stop_ns: int | None = None) -> Iterator[Stamped]:
-        """(stamp, our topic, message) with start_ns <= stamp < stop_ns, by stamp."""
+        """Yield (stamp, topic, message) with start_ns <= stamp < stop_ns, by stamp."""
         stop_ns = 2**63 if stop_ns is None else stop_ns
         makers = {
             "image": self._image, "scan": self._scan, "odometry": self._odometry, "pose": self._pose,
         }  # fmt: skip
         streams = [
-            self._stream(word, [entry for entry in stream if start_ns <= entry[0] < stop_ns], makers[word])
-            for word, stream in self._streams.items()
+            self._stream(
+                sensor_name,
+                [entry for entry in stream if start_ns <= entry[0] < stop_ns],
+                makers[sensor_name],
+            )
+            for sensor_name, stream in self._streams.items()
         ]
         yield from heapq.merge(*streams, key=itemgetter(0))
 
     def stamps(self) -> dict[str, list[int]]:
-        """Stamps by word."""
-        return {word: [stamp for stamp, _ in stream] for word, stream in self._streams.items() if stream}
+        """Return the stamps of each sensor."""
+        return {
+            sensor_name: [stamp for stamp, _ in stream]
+            for sensor_name, stream in self._streams.items()
+            if stream
+        }
 
-    def sample(self, word: str, count: int) -> list[dict[str, Any]]:
-        """Fields of up to `count` messages of a sensor, spread evenly."""
-        topic = SENSORS[word].topic
-        step = max(1, len(self._streams.get(word, ())) // count)
+    def sample(self, sensor_name: str, count: int) -> list[dict[str, Any]]:
+        """Return the fields of up to `count` messages of a sensor, evenly spread."""
+        topic = SENSORS[sensor_name].topic
+        step = max(1, len(self._streams.get(sensor_name, ())) // count)
         found = (message for _, name, message in self.messages() if name == topic)
         return [vars(message) for i, message in enumerate(found) if i % step == 0][:count]
 
     def close(self) -> None:
-        """Nothing stays open."""
+        """Do nothing: no file stays open."""
 
-    def _stream(self, word: str, entries: list[tuple[int, Any]], make: Any) -> Iterator[Stamped]:
-        topic = SENSORS[word].topic
+    def _stream(self, sensor_name: str, entries: list[tuple[int, Any]], make: Any) -> Iterator[Stamped]:
+        topic = SENSORS[sensor_name].topic
         for stamp_ns, entry in entries:
             try:
-                message = build(topic, {"stamp_ns": stamp_ns, **make(entry)})
+                message = build_message(topic, {"stamp_ns": stamp_ns, **make(entry)})
             except (ValueError, OSError) as error:
-                self.skipped[word] += 1
-                self.first_fault.setdefault(word, str(error).split("\n")[0][:200])
+                self.skipped[sensor_name] += 1
+                self.first_fault.setdefault(sensor_name, str(error).split("\n")[0][:200])
                 continue
             yield stamp_ns, topic, message
 
@@ -165,35 +179,35 @@ class FolderSource:
             raise UserError(f"{self.path}: has both lasers/ and scans.csv; keep one of them")
         self._csv = CsvScans(csv) if csv.exists() else None
         streams: dict[str, list[tuple[int, Any]]] = {
-            "image": _stamped_files(self.path / "images", _PICTURES),
+            "image": _stamped_files(self.path / "images", _IMAGE_SUFFIXES),
             "scan": self._csv.rows if self._csv else pcds,
         }
-        for word, name in (("odometry", "odometry.txt"), ("pose", "poses.txt")):
+        for sensor_name, name in (("odometry", "odometry.txt"), ("pose", "poses.txt")):
             if (self.path / name).exists():
                 poses = read_tum(self.path / name)
-                made = _with_velocity(poses) if word == "odometry" else poses.T_a_b
-                streams[word] = list(zip(poses.stamps_ns.tolist(), made))
+                made = _with_velocity(poses) if sensor_name == "odometry" else poses.T_a_b
+                streams[sensor_name] = list(zip(poses.stamps_ns.tolist(), made))
         return streams
 
-    def _read_settings(self) -> Lidar:
+    def _read_settings(self) -> FolderLidar:
         file = self.path / "folder.toml"
         if not file.exists():
-            return Lidar()
+            return FolderLidar()
         try:
             table = tomllib.loads(file.read_text())
         except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
             raise UserError(f"{file}: not a TOML file: {error}") from error
-        known = [field.name for field in fields(Lidar)]
+        known = [field.name for field in fields(FolderLidar)]
         for name, value in table.items():
             if name not in known:
                 raise UserError(f"{file}: unknown option {name!r} (there are: {', '.join(known)})")
             if type(value) not in (int, float) or not 0.0 <= value < math.inf:
                 raise UserError(f"{file}: {name} = {value!r} is not a number of at least 0")
-        return Lidar(**table)
+        return FolderLidar(**table)
 
     def _image(self, file: Path) -> dict[str, Any]:
         data = np.fromfile(file, np.uint8)
-        head = picture_head(data.data)
+        head = read_image_header(data.data)
         if head is None:
             raise ValueError(f"{file.name} is neither JPEG nor PNG")
         return {**head._asdict(), "data": data}
@@ -215,7 +229,7 @@ class FolderSource:
 
 
 def _stamped_files(folder: Path, endings: tuple[str, ...]) -> list[tuple[int, Path]]:
-    """(stamp, file) by stamp; a name that is not a stamp is an error, not a guess."""
+    """Return (stamp, file) by stamp. Raises UserError for a name that is not a stamp."""
     found = []
     for file in folder.glob("*") if folder.is_dir() else ():
         if file.suffix.lower() not in endings or file.name.startswith("."):
@@ -229,7 +243,7 @@ def _stamped_files(folder: Path, endings: tuple[str, ...]) -> list[tuple[int, Pa
 
 
 def _with_velocity(poses: Trajectory) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Pose, velocity and turn rate in the body, by the difference to the pose before (zero at the first)."""
+    """Return pose, velocity and angular velocity in the body frame, by difference to the previous pose."""
     made = [(T, np.zeros(3), np.zeros(3)) for T in poses.T_a_b[:1]]
     for i in range(1, len(poses)):
         T_0, T_1 = poses.T_a_b[i - 1], poses.T_a_b[i]

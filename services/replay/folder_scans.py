@@ -1,4 +1,4 @@
-"""Scans in plain files: rows of a CSV, or PCD point clouds of one revolution each."""
+"""Scans in plain files: rows of a CSV file, or PCD point clouds of one revolution each."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from beamsplat.common.errors import UserError, reason
 
 _REQUIRED = ("angle_min_rad", "angle_increment_rad", "range_min_m", "range_max_m")
 _OPTIONAL = ("time_increment_s", "scan_time_s")
-# Points this far from their beam's direction are still taken as that beam.
+# Largest angle between a point and the direction of its beam in a regular scan.
 _REGULAR_RAD = np.radians(0.1)
 
 
 class CsvScans:
-    """scans.csv: `# name = value` lines for the lidar, then rows `stamp_ns, range_0, range_1, ...`.
+    """File scans.csv: `# name = value` lines for the lidar, then rows `stamp_ns, range_0, range_1, ...`.
 
     Raises:
-        UserError: names file and line of what does not fit.
+        UserError: invalid content; names file and line.
     """
 
     def __init__(self, path: Path) -> None:
@@ -60,10 +60,10 @@ class CsvScans:
             raise UserError(f"{where}: {name} = {value!r} is not a number") from error
 
     def fields(self, ranges: str) -> dict[str, Any]:
-        """Fields of a scan, from the text of a row.
+        """Return the fields of a scan from the text of a row.
 
         Raises:
-            ValueError: a range that is not a number.
+            ValueError: a range is not a number.
         """
         values = [float(word) for word in ranges.split(",")] if ranges.strip() else []
         defaults = dict.fromkeys(_OPTIONAL, 0.0)
@@ -71,10 +71,10 @@ class CsvScans:
 
 
 def xy_from_pcd(data: bytes, name: str) -> np.ndarray:
-    """x and y float64 [N, 2] of a PCD file (ASCII or binary, uncompressed).
+    """Return x and y float64 [N, 2] of a PCD file (ASCII or binary, uncompressed).
 
     Raises:
-        ValueError: not such a file; says what is wrong.
+        ValueError: not such a file; the message names the reason.
     """
     header: dict[str, list[str]] = {}
     position = 0
@@ -116,20 +116,20 @@ def _binary_xy(header: dict[str, list[str]], data: bytes, name: str) -> np.ndarr
 def scan_from_points(
     points_m: np.ndarray, range_min_m: float, range_max_m: float, scan_time_s: float
 ) -> dict[str, Any]:
-    """Fields of a scan from the points [N, 2] of one revolution, in the order they were measured.
+    """Return the fields of a scan from the points [N, 2] of one revolution, in the order of measurement.
 
-    A point at the origin is a beam without return. Where the directions follow a constant step (they do
-    for most drivers), beam i keeps its place in time; otherwise points go to the nearest beam of a grid
-    four times as fine as their median step, and beams without a point are NaN (not measured).
+    A point at the origin is a beam without return. If the directions have a constant step, as with most
+    drivers, the order of the beams in time is kept. Otherwise each point is assigned to the nearest beam of
+    a grid four times finer than the median step, and beams without a point are NaN (not measured).
     """
     ranges = np.hypot(points_m[:, 0], points_m[:, 1])
     valid = np.isfinite(ranges) & (ranges > 0.0)
     if valid.sum() < 2:
-        raise ValueError(f"{int(valid.sum())} points are no scan")
+        raise ValueError(f"{int(valid.sum())} valid points are not a scan; at least 2 are needed")
     index = np.flatnonzero(valid)
     angles = np.unwrap(np.arctan2(points_m[index, 1], points_m[index, 0]))
     step = float(np.median(np.diff(angles) / np.diff(index)))
-    # Through the first direction with that step, then least squares on what remains.
+    # A line through the first direction with that step, then least squares on the residuals.
     remainder = np.angle(np.exp(1j * (angles - angles[0] - step * (index - index[0]))))
     slope, offset = np.polyfit(index - index[0], remainder, 1)
     error = np.abs(remainder - offset - slope * (index - index[0]))
@@ -140,7 +140,7 @@ def scan_from_points(
         time_increment_s = scan_time_s / len(filled)
     else:
         start, increment, filled = _on_grid(angles, ranges[index])
-        time_increment_s = 0.0  # the order in time is not known
+        time_increment_s = 0.0  # the order in time is unknown
     return {
         "angle_min_rad": float(np.angle(np.exp(1j * start))),
         "angle_increment_rad": increment,
@@ -153,7 +153,7 @@ def scan_from_points(
 
 
 def _on_grid(angles: np.ndarray, ranges: np.ndarray) -> tuple[float, float, np.ndarray]:
-    """Start, increment and ranges of unordered directions; of two points on one beam the nearer stays."""
+    """Return start, increment and ranges of unordered directions; the nearest point of each beam is used."""
     around = np.sort(np.mod(angles, 2.0 * np.pi))
     steps = np.diff(around)
     typical = float(np.median(steps[steps > 1e-6])) if np.any(steps > 1e-6) else 2.0 * np.pi

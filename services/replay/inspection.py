@@ -1,4 +1,4 @@
-"""What is in a bag, a recording or a folder: the report behind `beamsplat info`."""
+"""Inspection of a bag, a recording or a folder: the report of `beamsplat info`."""
 
 from __future__ import annotations
 
@@ -20,29 +20,29 @@ from beamsplat.services.replay.options import SourceOptions
 from beamsplat.services.replay.recording_source import RecordingSource
 from beamsplat.services.replay.source import data_path
 from beamsplat.services.replay.statistics import (
-    LidarFacts,
-    StreamFacts,
-    lidar_facts,
+    LidarStatistics,
+    TopicStatistics,
     lidar_problems,
-    stream_facts,
-    stream_problems,
+    lidar_statistics,
+    topic_problems,
+    topic_statistics,
 )
 
-_SCANS_LOOKED_AT = 300
+_SCANS_SAMPLED = 300  # scans sampled for the statistics
 
 
 @dataclass
-class Report:
-    """Everything `info` prints. `error` says why it cannot be played as it is, or is empty."""
+class InspectionReport:
+    """All that `info` prints. `error` is the reason why the data cannot be played, or empty."""
 
     path: str
     kind: str
     bytes: int = 0
     start_ns: int = 0
     end_ns: int = 0
-    topics: list[StreamFacts] = field(default_factory=list)
-    sensors: dict[str, str] = field(default_factory=dict)  # word -> topic or file
-    lidar: LidarFacts | None = None
+    topics: list[TopicStatistics] = field(default_factory=list)
+    sensors: dict[str, str] = field(default_factory=dict)  # sensor name -> topic or file
+    lidar: LidarStatistics | None = None
     camera: dict[str, Any] | None = None
     calibration_found: list[str] = field(default_factory=list)
     calibration_assumed: list[str] = field(default_factory=list)
@@ -55,15 +55,15 @@ class Report:
         return (self.end_ns - self.start_ns) / 1e9
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return the report as a dictionary for JSON."""
         return {**asdict(self), "duration_s": self.duration_s}
 
 
-def inspect(path: Path, options: SourceOptions) -> Report:
-    """The report on what lies at `path`.
+def inspect(path: Path, options: SourceOptions) -> InspectionReport:
+    """Return the report on the data at `path`.
 
     Raises:
-        UserError: nothing that can be read at all.
+        UserError: there are no readable data.
     """
     path = data_path(path)
     if not path.exists():
@@ -73,10 +73,12 @@ def inspect(path: Path, options: SourceOptions) -> Report:
     return _inspect_bag(path, options, own=is_recording(path))
 
 
-def _inspect_bag(path: Path, options: SourceOptions, *, own: bool) -> Report:
+def _inspect_bag(path: Path, options: SourceOptions, *, own: bool) -> InspectionReport:
     with Bag(path, allow_truncated=own or options.allow_truncated) as bag:
-        report = Report(str(path), "recording" if own else _kind(bag), _size(path), bag.start_ns, bag.end_ns)
-        report.topics = _topic_facts(bag)
+        report = InspectionReport(
+            str(path), "recording" if own else _kind(bag), _size(path), bag.start_ns, bag.end_ns
+        )
+        report.topics = _statistics_of_topics(bag)
         source: Any = None
         try:
             source = RecordingSource(path, options) if own else BagSource(bag, options)
@@ -90,37 +92,39 @@ def _inspect_bag(path: Path, options: SourceOptions, *, own: bool) -> Report:
         names = set(report.sensors.values())
         for facts in report.topics:
             if facts.name in names:
-                report.problems += stream_problems(facts)
+                report.problems += topic_problems(facts)
         if report.lidar is not None:
             report.problems += lidar_problems(report.lidar)
-        before = [] if source is not None else bag.problems  # a source repeats them
+        before = [] if source is not None else bag.problems  # contained in the problems of the source
         report.problems = list(dict.fromkeys([*before, *report.problems]))
         return report
 
 
-def _describe_recording(report: Report, source: RecordingSource | None) -> list[str]:
-    """Sensors and lidar of one of our recordings; problems found on the way."""
+def _describe_recording(report: InspectionReport, source: RecordingSource | None) -> list[str]:
+    """Add sensors and lidar of a recording to the report; return the problems found."""
     if source is None:
         return []
-    report.sensors = {word: f"/{SENSORS[word].topic}" for word in source.words}
-    if "image" in report.sensors:  # the ROS topic that carries it
+    report.sensors = {sensor_name: f"/{SENSORS[sensor_name].topic}" for sensor_name in source.sensor_names}
+    if "image" in report.sensors:  # the ROS topic of the images
         names = [facts.name for facts in report.topics if facts.name.startswith("/camera/image")]
         report.sensors["image"] = names[0] if names else report.sensors["image"]
-    if "scan" in source.words:
-        report.lidar = lidar_facts(source.sample("scan", _SCANS_LOOKED_AT))
+    if "scan" in source.sensor_names:
+        report.lidar = lidar_statistics(source.sample("scan", _SCANS_SAMPLED))
     problems = source.problems
     source.close()
     return problems
 
 
-def _describe_bag(report: Report, bag: Bag, source: BagSource | None, options: SourceOptions) -> None:
-    """Sensors, lidar and calibration of a foreign bag, also where it cannot be played."""
+def _describe_bag(
+    report: InspectionReport, bag: Bag, source: BagSource | None, options: SourceOptions
+) -> None:
+    """Add sensors, lidar and calibration of a ROS bag to the report, even if it cannot be played."""
     if source is None:
         try:
             source = BagSource(bag, SourceOptions(**{**vars(options), "require": frozenset()}))
-        except UserError:  # said already in report.error
+        except UserError:  # already in report.error
             return
-    report.sensors = {word: topic.name for word, topic in source.chosen.items()}
+    report.sensors = {sensor_name: topic.name for sensor_name, topic in source.chosen.items()}
     try:
         found = source.calibrate()
         if options.rig is None:
@@ -130,8 +134,8 @@ def _describe_bag(report: Report, bag: Bag, source: BagSource | None, options: S
     except UserError as error:
         report.calibration_missing = [str(error)]
     if "scan" in source.chosen:
-        scans = source.sample("scan", _SCANS_LOOKED_AT)
-        report.lidar = lidar_facts(scans) if scans else None
+        scans = source.sample("scan", _SCANS_SAMPLED)
+        report.lidar = lidar_statistics(scans) if scans else None
     if "image" in source.chosen:
         first = source.sample("image", 1)
         report.camera = {
@@ -141,8 +145,8 @@ def _describe_bag(report: Report, bag: Bag, source: BagSource | None, options: S
     report.problems += source.problems
 
 
-def _describe(report: Report, rig: Any) -> None:
-    """Camera and calibration as the message `Rig` has them."""
+def _describe(report: InspectionReport, rig: Any) -> None:
+    """Add camera and calibration of the message `Rig` to the report."""
     report.calibration_assumed = list(rig.assumed)
     if rig.camera is not None:
         fields = {k: v for k, v in vars(rig.camera).items() if k != "T_body_camera"}
@@ -155,8 +159,8 @@ def _describe(report: Report, rig: Any) -> None:
         report.calibration_found.append(f"lidar mount ({rig.source})")
 
 
-def _topic_facts(bag: Bag) -> list[StreamFacts]:
-    """One pass over the bag: receive times and, where a message begins with a header, its stamp."""
+def _statistics_of_topics(bag: Bag) -> list[TopicStatistics]:
+    """Return the statistics of all topics from one pass over the bag."""
     arrivals: dict[str, list[int]] = defaultdict(list)
     stamps: dict[str, list[int]] = defaultdict(list)
     topics: dict[str, BagTopic] = {topic.name: topic for topic in bag.topics}
@@ -167,7 +171,7 @@ def _topic_facts(bag: Bag) -> list[StreamFacts]:
             stamp_ns = header_stamp_ns(raw)
             stamps[raw.topic].append(stamp_ns or raw.at_ns)
     return [
-        stream_facts(
+        topic_statistics(
             name, topic.type_name, np.array(arrivals[name], np.int64),
             np.array(stamps[name], np.int64) if stamps.get(name) else None,
         )
@@ -176,21 +180,21 @@ def _topic_facts(bag: Bag) -> list[StreamFacts]:
     ]  # fmt: skip
 
 
-def _inspect_folder(path: Path, options: SourceOptions) -> Report:
+def _inspect_folder(path: Path, options: SourceOptions) -> InspectionReport:
     source = FolderSource(path, SourceOptions(**{**vars(options), "require": frozenset()}))
-    report = Report(str(path), "folder", _size(path), source.start_ns, source.end_ns)
-    for word, stamps in source.stamps().items():
-        facts = stream_facts(word, SENSORS[word].topic, np.array(stamps, np.int64), None)
+    report = InspectionReport(str(path), "folder", _size(path), source.start_ns, source.end_ns)
+    for sensor_name, stamps in source.stamps().items():
+        facts = topic_statistics(sensor_name, SENSORS[sensor_name].topic, np.array(stamps, np.int64), None)
         report.topics.append(facts)
-        report.sensors[word] = word
-        report.problems += stream_problems(facts)
+        report.sensors[sensor_name] = sensor_name
+        report.problems += topic_problems(facts)
     try:
         _describe(report, FolderSource(path, options).rig())
     except UserError as error:
         report.error = str(error)
-    scans = source.sample("scan", _SCANS_LOOKED_AT)
+    scans = source.sample("scan", _SCANS_SAMPLED)
     if scans:
-        report.lidar = lidar_facts(scans)
+        report.lidar = lidar_statistics(scans)
         report.problems += lidar_problems(report.lidar, sparse=not (path / "scans.csv").exists())
     report.problems += source.problems
     return report

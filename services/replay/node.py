@@ -1,4 +1,4 @@
-"""Plays recorded data as if the robot were driving."""
+"""The replay service: publishes recorded sensor data."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from beamsplat.common.geometry.rig import check_rig_option
 from beamsplat.common.runtime.node import Node, SourceItem
 from beamsplat.services.replay.config import ReplayConfig
 from beamsplat.services.replay.options import SourceOptions
-from beamsplat.services.replay.source import Source, open_source, play
+from beamsplat.services.replay.source import ReplaySource, open_source, play
 
 log = logging.getLogger("beamsplat.replay")
 
 
 class ReplayNode(Node):
-    """Sensor topics of a bag, a recording or a folder, paced by the runner."""
+    """Publishes the sensor topics of a bag, a recording or a folder, paced by the runner."""
 
     name = "replay"
     Config = ReplayConfig
@@ -23,10 +23,10 @@ class ReplayNode(Node):
 
     def __init__(self, config: ReplayConfig) -> None:
         super().__init__(config)
-        self._source: Source | None = None
+        self._source: ReplaySource | None = None
 
     def configure(self) -> None:
-        """Opens the data, so that what is wrong with it is said before anything runs."""
+        """Open the data, so that errors are reported before the system starts."""
         if self._source is not None:
             return
         source = open_source(self.config.data, source_options(self.config))
@@ -43,15 +43,15 @@ class ReplayNode(Node):
         self.close()
 
     def expected_messages(self) -> int | None:
-        """How many messages the sensors have; None if there is no end, or only a part is played."""
+        """Return the number of sensor messages; None if playback is endless or limited to a part."""
         config = self.config
         if config.loop or config.start_s or config.duration_s is not None:
             return None
         self.configure()
-        return self._source.expected()
+        return self._source.message_count()
 
     def source(self) -> Iterator[SourceItem]:
-        """The calibration, then everything by arrival."""
+        """Yield the calibration, then all messages by arrival time."""
         self.configure()
         config = self.config
         played = play(self._source, start_s=config.start_s, duration_s=config.duration_s, loop=config.loop)
@@ -67,7 +67,7 @@ class ReplayNode(Node):
 
 
 def source_options(config: ReplayConfig) -> SourceOptions:
-    """The options of the libraries, from those of the node."""
+    """Return the source options that the node options contain."""
     names = (
         "image_topic", "scan_topic", "odometry_topic", "pose_topic", "camera_info_topic", "body_frame", "rig",
         "assume_mounts", "allow_truncated",

@@ -1,4 +1,4 @@
-"""What a user may choose about a source."""
+"""Options of data sources."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 @dataclass(frozen=True)
 class SourceOptions:
-    """Choices that the data do not make by themselves."""
+    """Selection of topics, calibration and tolerance for damaged data."""
 
     image_topic: str = ""
     scan_topic: str = ""
@@ -16,12 +16,12 @@ class SourceOptions:
     pose_topic: str = ""
     camera_info_topic: str = ""
     body_frame: str = ""
-    rig: Path | None = None  # a rig TOML; wins over what the data say
+    rig: Path | None = None  # a rig file; overrides the calibration of the data
     without: frozenset[str] = field(default_factory=frozenset)  # image, scan, odometry, pose
     require: frozenset[str] = frozenset({"scan"})
-    assume_mounts: bool = False  # missing mounting positions: customary ones, said in Rig.assumed
+    assume_mounts: bool = False  # assume usual mounts where there are none; listed in Rig.assumed
     allow_truncated: bool = False
 
-    def topic_for(self, word: str) -> str:
-        """The topic chosen for "image", "scan", "odometry" or "pose"; "" leaves it to its type."""
-        return getattr(self, f"{word}_topic")
+    def topic_for(self, sensor_name: str) -> str:
+        """Return the topic chosen for "image", "scan", "odometry" or "pose"; "" = select by type."""
+        return getattr(self, f"{sensor_name}_topic")

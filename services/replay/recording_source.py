@@ -1,4 +1,4 @@
-"""One of our own recordings as a source: what its sensors said, bit for bit."""
+"""Source of sensor messages from one of our own recordings, bit for bit."""
 
 from __future__ import annotations
 
@@ -14,31 +14,31 @@ from beamsplat.services.replay.options import SourceOptions
 
 
 class RecordingSource:
-    """Sensor messages of a recording by arrival.
+    """Source of the sensor messages of a recording, by arrival time.
 
     Raises:
-        UserError: nothing recorded, or a required sensor or the calibration is not in it.
+        UserError: the recording is empty, or a required sensor is missing.
     """
 
     def __init__(self, path: Path, options: SourceOptions) -> None:
         self.where = str(path)
         self.options = options
         self._reader = RecordingReader(path)
-        self.words = [
-            word
-            for word, sensor in SENSORS.items()
-            if self._reader.counts[sensor.topic] and word not in options.without
+        self.sensor_names = [
+            sensor_name
+            for sensor_name, sensor in SENSORS.items()
+            if self._reader.counts[sensor.topic] and sensor_name not in options.without
         ]
         if not self._reader.counts:
             self.close()
-            raise UserError(f"{path}: the recording holds no messages; record again")
-        for word in sorted(options.require - options.without):
-            if word not in self.words:
+            raise UserError(f"{path}: the recording has no messages; record again")
+        for sensor_name in sorted(options.require - options.without):
+            if sensor_name not in self.sensor_names:
                 self.close()
                 there = ", ".join(sorted(self._reader.counts))
                 raise UserError(
-                    f"{path}: has no {word}: nothing on {SENSORS[word].topic}; it holds {there}. Use another "
-                    f'recording, or set without = ["{word}"] if the deployment does not need one'
+                    f"{path}: has no {sensor_name}: nothing on {SENSORS[sensor_name].topic}; it has {there}. "
+                    f'Use another recording, or set without = ["{sensor_name}"] if it is not needed'
                 )
 
     @property
@@ -53,24 +53,24 @@ class RecordingSource:
     def problems(self) -> list[str]:
         return self._reader.problems
 
-    def expected(self) -> int:
-        """How many messages the chosen topics hold."""
-        return sum(self._reader.counts[SENSORS[word].topic] for word in self.words)
+    def message_count(self) -> int:
+        """Return the number of messages of the sensors."""
+        return sum(self._reader.counts[SENSORS[sensor_name].topic] for sensor_name in self.sensor_names)
 
     def rig(self) -> Any:
-        """The calibration as the message `Rig`: the rig file given by option, else the first recorded one.
+        """Return the calibration as the message `Rig`: that of the option, else the first recorded one.
 
         Raises:
-            UserError: neither is there.
+            UserError: both are missing.
         """
         if self.options.rig is not None:
             rig = load_rig(self.options.rig)
             return rig.message(self.start_ns, rig.source or str(self.options.rig))
         recorded = next(self._reader.messages(["rig"]), None)
-        if recorded is None and ({"image", "scan"} & set(self.words)) == {"scan"}:
+        if recorded is None and ({"image", "scan"} & set(self.sensor_names)) == {"scan"}:
             origin = LidarSection(mount=Mount(xyz_m=(0.0, 0.0, 0.0), rpy_deg=(0.0, 0.0, 0.0)))
-            said = ("the lidar sits at the body's origin, facing forward (no rig was recorded)",)
-            return RigFile(lidar=origin, assumed=said).message(self.start_ns, self.where)
+            assumed = ("the lidar is at the origin of the body frame, facing forward (no rig was recorded)",)
+            return RigFile(lidar=origin, assumed=assumed).message(self.start_ns, self.where)
         if recorded is None:
             raise UserError(
                 f"{self.where}: calibration is missing: nothing was recorded on rig; give a rig file "
@@ -79,16 +79,16 @@ class RecordingSource:
         return recorded.message
 
     def messages(self, start_ns: int = 0, stop_ns: int | None = None) -> Iterator[tuple[int, str, Any]]:
-        """(arrival, our topic, message) with start_ns <= arrival < stop_ns, in that order."""
-        topics = [SENSORS[word].topic for word in self.words]
+        """Yield (arrival, topic, message) with start_ns <= arrival < stop_ns, by arrival."""
+        topics = [SENSORS[sensor_name].topic for sensor_name in self.sensor_names]
         for recorded in self._reader.messages(topics, start_ns, stop_ns):
             yield recorded.log_time_ns, recorded.topic, recorded.message
 
-    def sample(self, word: str, count: int) -> list[dict[str, Any]]:
-        """Fields of up to `count` messages of a sensor, spread evenly over the recording."""
-        topic = SENSORS[word].topic
+    def sample(self, sensor_name: str, count: int) -> list[dict[str, Any]]:
+        """Return the fields of up to `count` messages of a sensor, evenly spread over the recording."""
+        topic = SENSORS[sensor_name].topic
         step = max(1, self._reader.counts[topic] // count)
-        recorded = self._reader.messages([topic]) if word in self.words else ()
+        recorded = self._reader.messages([topic]) if sensor_name in self.sensor_names else ()
         return [vars(r.message) for i, r in enumerate(recorded) if i % step == 0][:count]
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""A first rig file: what was found, what was assumed, and what somebody must measure with a tape."""
+"""Draft of a rig file: values found, values assumed, and values to measure with a tape measure."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from beamsplat.services.replay.bag_source import BagSource
 from beamsplat.services.replay.options import SourceOptions
 from beamsplat.services.replay.source import data_path, open_source
 
-_HEADER = """Calibration of one robot: where camera and lidar sit, and how the camera sees.
+_HEADER = """Calibration of one robot: mounts of camera and lidar, and intrinsics of the camera.
 The body frame lies on the floor between the wheels: x forward, y left, z up. Metres and degrees.
-rpy_deg = [roll, pitch, yaw]: zero is level and straight ahead; positive pitch looks down,
-positive yaw to the left. Lines marked MEASURE were assumed: a tape measure beats every guess."""
-_ASSUMED_FOV_DEG = 65.0
-_ORDINARY = """MEASURE from the floor point between the wheels to the {what} (forward, left, up); a centimetre
-matters, and so does a degree of pitch."""
+rpy_deg = [roll, pitch, yaw]: zero is level and straight ahead; positive pitch is down,
+positive yaw is to the left. Lines marked MEASURE were assumed: replace them by measured values."""
+_ASSUMED_FOV_DEG = 65.0  # of common webcams
+_MEASURE = """MEASURE from the floor point between the wheels to the {what} (forward, left, up). The
+accuracy must be 1 cm, and 1 degree of pitch."""
 
 
 def draft_from_data(path: Path) -> tuple[str, list[str]]:
-    """Text of a rig file for a bag, recording or folder, and the sentences to show.
+    """Return the text of a rig file for a bag, recording or folder, and sentences for the user.
 
     Raises:
-        UserError: nothing readable there, or neither camera nor lidar in it.
+        UserError: the data are unreadable, or have neither camera nor lidar.
     """
     relaxed = SourceOptions(
         require=frozenset(), without=frozenset({"odometry", "pose"}), allow_truncated=True
@@ -52,78 +52,80 @@ def _from_bag(source: BagSource, where: str) -> tuple[str, list[str]]:
     notes = []
     try:
         source.calibrate()
-    except UserError as error:  # what is there is not usable: a draft is all the more needed
+    except UserError as error:  # an unusable calibration is the reason for a draft
         notes.append(str(error))
     found = source.calibration
     notes += [f"found: {text}" for text in found.found] + [f"assumed: {text}" for text in found.assumed]
     assumed = list(found.assumed)
     comments: dict[str, str] = {"camera": f"Found in {where}."}
     if "image" in source.chosen and found.camera is None:
-        width, height = source.picture_px()
-        found.camera = pinhole(width, height, _ASSUMED_FOV_DEG)
+        width, height = source.image_size_px()
+        found.camera = pinhole_from_fov(width, height, _ASSUMED_FOV_DEG)
         text = (
             f"fx, fy from an assumed horizontal field of view of {_ASSUMED_FOV_DEG:g} degrees, no distortion"
         )
         comments["camera"] = f"MEASURE with a chessboard: {text}."
         assumed.append(text)
-    for sensor, word in (("camera", "image"), ("lidar", "scan")):
-        if word not in source.chosen:
+    for sensor, sensor_name in (("camera", "image"), ("lidar", "scan")):
+        if sensor_name not in source.chosen:
             continue
         if sensor in found.mounts and not _is_assumed(sensor, assumed):
             comments[f"{sensor}.mount"] = f"From the fixed transforms in {where}; check it with a tape."
             continue
         found.mounts.setdefault(sensor, ASSUMED_MOUNTS[sensor])
-        comments[f"{sensor}.mount"] = _ORDINARY.format(what=f"{sensor}'s centre")
+        comments[f"{sensor}.mount"] = _MEASURE.format(what=f"{sensor}'s centre")
         if not _is_assumed(sensor, assumed):
-            assumed.append(f"where the {sensor} sits: not in the data, a customary place was put here")
+            assumed.append(f"mount of the {sensor}: not in the data, a usual one was assumed")
     notes += [f"assumed, to be measured: {text}" for text in assumed[len(found.assumed) :]]
     found.assumed = assumed
     return format_rig(found.rig(where), _HEADER, comments), notes
 
 
 def _is_assumed(sensor: str, assumed: list[str]) -> bool:
-    return any(text.startswith(f"the {sensor} sits") for text in assumed)
+    """Return whether `calibration.py` has assumed the mount of a sensor, judged by its sentence."""
+    return any(text.startswith(f"the {sensor} is at") for text in assumed)
 
 
 def is_device(source: str) -> bool:
-    """Whether `source` names a camera (an index, /dev/videoN, a stream's URL) and not data."""
+    """Return whether `source` is a camera (index, /dev/videoN, URL of a stream) and not data."""
     return source.isdecimal() or source.startswith("/dev/") or "://" in source
 
 
 def draft_from_device(source: str, fov_deg: float) -> tuple[str, list[str]]:
-    """Text of a rig file for a camera that OpenCV can open, and the sentences to show.
+    """Return the text of a rig file for a camera that OpenCV can open, and sentences for the user.
 
     Raises:
-        UserError: the camera does not open or gives no picture.
+        UserError: the camera cannot be opened, or returns no image.
     """
     capture = cv2.VideoCapture(int(source) if source.isdecimal() else source)
     try:
-        ok, picture = capture.read() if capture.isOpened() else (False, None)
+        ok, image = capture.read() if capture.isOpened() else (False, None)
     finally:
         capture.release()
     if not ok:
         raise UserError(
-            f"{source}: no picture from this camera; check the cable, the index and who else uses it"
+            f"{source}: no image from this camera; check the cable, the index, and other programs that use it"
         )
-    height, width = picture.shape[:2]
+    height, width = image.shape[:2]
     text = f"fx, fy from a horizontal field of view of {fov_deg:g} degrees as stated, no distortion"
-    camera = CameraSection(**pinhole(width, height, fov_deg), mount=Mount.of(camera_mount(0.1, 0.0, 0.3)))
+    camera = CameraSection(
+        **pinhole_from_fov(width, height, fov_deg), mount=Mount.of(camera_mount(0.1, 0.0, 0.3))
+    )
     lidar = LidarSection(mount=Mount.of(ASSUMED_MOUNTS["lidar"]))
-    assumed = (text, "where camera and lidar sit: customary places were put here")
+    assumed = (text, "mounts of camera and lidar: usual ones were assumed")
     comments = {
         "camera": f"MEASURE with a chessboard: {text}.",
-        "camera.mount": _ORDINARY.format(what="camera's centre"),
-        "lidar.mount": _ORDINARY.format(what="lidar's centre")
-        + "\nRemove this section if there is no lidar.",
+        "camera.mount": _MEASURE.format(what="camera's centre"),
+        "lidar.mount": _MEASURE.format(what="lidar's centre") + "\nRemove this section if there is no lidar.",
     }
     rig = RigFile(camera=camera, lidar=lidar, assumed=assumed, source=source)
-    return format_rig(rig, _HEADER, comments), [f"found: pictures of {width}x{height} px", *assumed]
+    return format_rig(rig, _HEADER, comments), [f"found: images of {width}x{height} px", *assumed]
 
 
-def pinhole(width_px: int, height_px: int, fov_deg: float) -> dict[str, object]:
-    """Fields of CameraSection for a lens without distortion and square pixels.
+def pinhole_from_fov(width_px: int, height_px: int, fov_deg: float) -> dict[str, object]:
+    """Return the camera fields of a rig file for a lens without distortion and square pixels.
 
-    Pixel centres lie at integers, so the picture reaches from -0.5 to width - 0.5.
+    Pixel centres are integers, so the image extends from -0.5 to width - 0.5.
     """
     focal_px = 0.5 * width_px / math.tan(math.radians(fov_deg) / 2.0)
     return {

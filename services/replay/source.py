@@ -1,4 +1,4 @@
-"""Opens whatever a user calls data, and plays it: seek, loop, ticks, in order of arrival."""
+"""Opening of data of any kind, and playback: seek, loop, ticks, by arrival time."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any, Protocol
 
 from beamsplat.common.errors import UserError
 from beamsplat.common.recording import is_recording
-from beamsplat.common.recording.sensors import build
+from beamsplat.common.recording.sensors import build_message
 from beamsplat.services.replay.bag_source import BagSource
 from beamsplat.services.replay.bags import Bag, looks_like_bag
 from beamsplat.services.replay.folder import FolderSource, looks_like_folder
@@ -16,43 +16,43 @@ from beamsplat.services.replay.options import SourceOptions
 from beamsplat.services.replay.recording_source import RecordingSource
 
 TICK_NS = 10**9
-# Between the last message of one round and the first of the next.
+# Between the last message of one loop and the first of the next.
 _LOOP_PAUSE_NS = 100_000_000
 
 
-class Source(Protocol):
-    """Something to play: a bag, a recording, a folder."""
+class ReplaySource(Protocol):
+    """Interface of playable data: a bag, a recording or a folder."""
 
     start_ns: int
     end_ns: int
     problems: list[str]
 
-    def expected(self) -> int:
-        """How many sensor messages it holds."""
+    def message_count(self) -> int:
+        """Return the number of sensor messages."""
 
     def rig(self) -> Any:
-        """The calibration, as the message `Rig`."""
+        """Return the calibration as the message `Rig`."""
 
     def messages(self, start_ns: int = 0, stop_ns: int | None = None) -> Iterator[tuple[int, str, Any]]:
-        """(arrival, topic, message) by arrival."""
+        """Yield (arrival, topic, message) with start_ns <= arrival < stop_ns, by arrival."""
 
     def close(self) -> None:
-        """Releases files."""
+        """Close all files."""
 
 
 def data_path(path: Path) -> Path:
-    """Where the data lie: `path` itself, or its bag/ where truth lies beside a bag (as in house_a)."""
+    """Return `path`, or its subfolder bag/ if the folder has ground truth beside a bag (as house_a)."""
     path = Path(path)
     if path.is_dir() and not looks_like_bag(path) and looks_like_bag(path / "bag"):
         return path / "bag"
     return path
 
 
-def open_source(path: Path, options: SourceOptions) -> Source:
-    """The source at `path`, whatever its kind.
+def open_source(path: Path, options: SourceOptions) -> ReplaySource:
+    """Open the data at `path`, of any kind.
 
     Raises:
-        UserError: nothing there that can be played, or options that do not fit; one sentence.
+        UserError: there are no playable data, or the options do not fit.
     """
     path = data_path(path)
     if not path.exists():
@@ -75,15 +75,15 @@ def open_source(path: Path, options: SourceOptions) -> Source:
 
 
 def play(
-    source: Source, *, start_s: float = 0.0, duration_s: float | None = None, loop: bool = False
+    source: ReplaySource, *, start_s: float = 0.0, duration_s: float | None = None, loop: bool = False
 ) -> Iterator[tuple[int, str, Any]]:
-    """(arrival, topic, message) with the calibration first and a tick each second of arrival time.
+    """Yield (arrival, topic, message): the calibration, then the data, with a tick each second.
 
-    `start_s` counts from the first message. With `loop` it starts over for ever, stamps and arrivals
-    moved on by the length of a round, so that time never runs backwards.
+    `start_s` is relative to the first message. With `loop` playback is endless; stamps and arrivals are
+    shifted by the length of a loop, so that time never goes back.
 
     Raises:
-        UserError: nothing lies between start and end.
+        UserError: there are no data between start and end.
     """
     begin_ns = source.start_ns + round(start_s * 1e9)
     stop_ns = source.end_ns + 1
@@ -92,7 +92,7 @@ def play(
     if begin_ns >= stop_ns:
         length_s = (source.end_ns - source.start_ns) / 1e9
         raise UserError(
-            f"start_s = {start_s:g} lies beyond the end of the data, which are {length_s:.1f} s long"
+            f"start_s = {start_s:g} is beyond the end of the data, which are {length_s:.1f} s long"
         )
     rig = source.rig()
     yield begin_ns, "rig", rig.model_copy(update={"stamp_ns": max(begin_ns, 0)})
@@ -104,7 +104,7 @@ def play(
             played = True
             at_ns += offset_ns
             while next_tick_ns <= at_ns:
-                yield next_tick_ns, "tick", build("tick", {"stamp_ns": next_tick_ns, "count": count})
+                yield next_tick_ns, "tick", build_message("tick", {"stamp_ns": next_tick_ns, "count": count})
                 next_tick_ns, count = next_tick_ns + TICK_NS, count + 1
             if offset_ns:
                 message = message.model_copy(update={"stamp_ns": message.stamp_ns + offset_ns})

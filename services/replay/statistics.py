@@ -1,4 +1,4 @@
-"""Facts about streams of data: rates, gaps, lags, what a lidar's scans are like. Arrays in, facts out."""
+"""Statistics of topics (rates, gaps, delays) and of lidar scans, from arrays."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-_GAP_PERIODS = 3.0
+_GAP_PERIODS = 3.0  # a longer pause is a gap
 
 
 @dataclass(frozen=True)
-class StreamFacts:
-    """One topic. Times in its own stamps where it has them, else in receive times; None: not known."""
+class TopicStatistics:
+    """Statistics of one topic, from stamps if it has them, else from receive times; None = unknown."""
 
     name: str
     type: str
@@ -27,8 +27,8 @@ class StreamFacts:
 
 
 @dataclass(frozen=True)
-class LidarFacts:
-    """What the scans of a lidar have in common, from a sample of them."""
+class LidarStatistics:
+    """Statistics of a sample of lidar scans."""
 
     beams_min: int
     beams_max: int
@@ -40,20 +40,22 @@ class LidarFacts:
     no_return_share: float  # +inf
     invalid_share: float  # NaN, negative, or below range_min_m
     beyond_share: float  # finite, but beyond range_max_m
-    most_common_far_m: float | None  # a far reading that many beams share exactly: a mark, not a distance
+    most_common_far_m: float | None  # a large range that many beams have exactly: a code for "no return"
     most_common_far_share: float
 
 
-def stream_facts(name: str, type_name: str, at_ns: np.ndarray, stamp_ns: np.ndarray | None) -> StreamFacts:
-    """Facts of a topic from receive times and stamps, int64 [N] each, in order of arrival."""
+def topic_statistics(
+    name: str, type_name: str, at_ns: np.ndarray, stamp_ns: np.ndarray | None
+) -> TopicStatistics:
+    """Return statistics from receive times and stamps, int64 [N] each, in order of arrival."""
     times = at_ns if stamp_ns is None else stamp_ns
     steps = np.diff(times)
     forward = np.diff(np.sort(times))
-    # Bursts make the median small, gaps make the mean large: a period must be both to be missed thrice.
+    # Bursts lower the median and gaps raise the mean; a gap is long compared to both.
     period = float(max(np.median(forward), forward.mean())) if len(forward) else 0.0
     span = float(forward.sum())
     lag_ms = None if stamp_ns is None or not len(stamp_ns) else (at_ns - stamp_ns) / 1e6
-    return StreamFacts(
+    return TopicStatistics(
         name=name,
         type=type_name,
         count=len(times),
@@ -67,8 +69,8 @@ def stream_facts(name: str, type_name: str, at_ns: np.ndarray, stamp_ns: np.ndar
     )
 
 
-def lidar_facts(scans: list[dict[str, Any]]) -> LidarFacts:
-    """Facts of a lidar from the fields of some of its scans (at least one)."""
+def lidar_statistics(scans: list[dict[str, Any]]) -> LidarStatistics:
+    """Return statistics from the fields of at least one scan."""
     first = scans[0]
     beams = [len(scan["ranges_m"]) for scan in scans]
     ranges = np.concatenate([scan["ranges_m"] for scan in scans]).astype(np.float64)
@@ -84,7 +86,7 @@ def lidar_facts(scans: list[dict[str, Any]]) -> LidarFacts:
         share = float(counts.max()) / total
         if share > 0.005 and counts.max() > 20:
             far, far_share = float(values[counts.argmax()]), share
-    return LidarFacts(
+    return LidarStatistics(
         beams_min=min(beams),
         beams_max=max(beams),
         field_of_view_deg=float(np.degrees(abs(first["angle_increment_rad"]) * max(max(beams) - 1, 0))),
@@ -100,8 +102,8 @@ def lidar_facts(scans: list[dict[str, Any]]) -> LidarFacts:
     )
 
 
-def stream_problems(facts: StreamFacts) -> list[str]:
-    """Plain sentences about what may trouble a consumer of this stream."""
+def topic_problems(facts: TopicStatistics) -> list[str]:
+    """Return sentences about properties of a topic that may disturb its consumers."""
     found = []
     if facts.gaps:
         found.append(
@@ -112,7 +114,7 @@ def stream_problems(facts: StreamFacts) -> list[str]:
         found.append(f"{facts.name}: {facts.backwards} stamps are earlier than the one before")
     if facts.lag_median_ms is not None and facts.lag_min_ms < -1.0:
         found.append(
-            f"{facts.name}: stamps lie up to {-facts.lag_min_ms:.0f} ms after their receipt: "
+            f"{facts.name}: stamps are up to {-facts.lag_min_ms:.0f} ms later than the receive time: "
             "sensor and recorder have different clocks"
         )
     if facts.lag_median_ms is not None and facts.lag_median_ms > 1000.0:
@@ -120,8 +122,8 @@ def stream_problems(facts: StreamFacts) -> list[str]:
     return found
 
 
-def lidar_problems(facts: LidarFacts, *, sparse: bool = False) -> list[str]:
-    """Plain sentences about the scans; in `sparse` ones beams that were not measured are normal."""
+def lidar_problems(facts: LidarStatistics, *, sparse: bool = False) -> list[str]:
+    """Return sentences about problems of the scans; `sparse`: beams that were not measured are normal."""
     found = []
     if facts.beams_min != facts.beams_max:
         found.append(f"the scans have between {facts.beams_min} and {facts.beams_max} beams")
@@ -130,8 +132,8 @@ def lidar_problems(facts: LidarFacts, *, sparse: bool = False) -> list[str]:
     if facts.most_common_far_m is not None:
         found.append(
             f"{facts.most_common_far_share:.1%} of the beams read exactly {facts.most_common_far_m:.2f} m: "
-            "that stands for no return, drop them"
+            "the driver's code for no return; drop these beams"
         )
     if facts.time_increment_s == 0.0:
-        found.append("the scans do not say when each beam was taken (time_increment is 0): no deskewing")
+        found.append("the scans have no time per beam (time_increment is 0): they are not deskewed")
     return found

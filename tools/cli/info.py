@@ -15,7 +15,7 @@ from beamsplat.common.errors import UserError
 from beamsplat.tools.cli.options import writable
 
 if TYPE_CHECKING:
-    from beamsplat.services.replay.inspection import Report
+    from beamsplat.services.replay.inspection import InspectionReport
 
 # Readers of bags and OpenCV are imported where they are used: every other command starts without them.
 
@@ -81,7 +81,7 @@ def rig(
     console.print(f"[green]written:[/] {escape(str(out))}")
 
 
-def _print(report: Report, console: Console) -> None:
+def _print(report: InspectionReport, console: Console) -> None:
     size_mb = report.bytes / 1e6
     console.print(
         f"[bold]{escape(report.path)}[/]: {report.kind}, {report.duration_s:.1f} s, {size_mb:.1f} MB"

@@ -1,4 +1,4 @@
-"""`beamsplat slam` and `beamsplat eval slam`: a map from a bag, and how good it is."""
+"""`beamsplat slam` and `beamsplat eval slam`: map a recording with the lidar SLAM, measure the accuracy."""
 
 from __future__ import annotations
 
@@ -28,16 +28,16 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Print the figures as o
 def slam(
     bag: Annotated[Path, typer.Argument(help="Bag, recording or folder with a 2D lidar")],
     out: Annotated[Path, typer.Option(callback=writable, help="Folder for trajectory, map and state")],
-    no_odometry: Annotated[bool, typer.Option("--no-odometry", help="Use the scans alone")] = False,
-    rig: Annotated[Path | None, typer.Option(help="Calibration file, where the bag has none")] = None,
-    scan_topic: Annotated[str, typer.Option(help="Where the bag has several")] = "",
-    odometry_topic: Annotated[str, typer.Option(help="Where the bag has several")] = "",
+    no_odometry: Annotated[bool, typer.Option("--no-odometry", help="Use the scans only")] = False,
+    rig: Annotated[Path | None, typer.Option(help="Calibration file, if the bag has none")] = None,
+    scan_topic: Annotated[str, typer.Option(help="Needed if the bag has several")] = "",
+    odometry_topic: Annotated[str, typer.Option(help="Needed if the bag has several")] = "",
     as_json: JsonOption = False,
 ) -> None:
-    """Maps a bag with the lidar SLAM, as fast as the machine allows.
+    """Map a recording with the lidar SLAM, as fast as the machine allows.
 
-    Writes trajectory.tum (after the last optimisation), online.tum (as it would have been published),
-    map.pgm and map.yaml (nav2), map.png, state/ (to continue or localize in), figures.json.
+    Writes trajectory.tum (after the last optimisation), online.tum (as it would have been published), map.pgm
+    and map.yaml (nav2), map.png, state/ (to continue or localize in), figures.json.
 
     Examples:
 
@@ -59,16 +59,16 @@ def slam(
         lidar = source.rig().lidar
         if lidar is None:
             raise UserError(
-                f"{bag}: no lidar in its calibration; give one with --rig (`beamsplat rig` drafts it)"
+                f"{bag}: the calibration has no lidar; give a calibration with --rig (`beamsplat rig` drafts one)"
             )
         bar = Progress(
             TextColumn("mapping"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
             TimeRemainingColumn(), console=console, transient=True,
         )  # fmt: skip
         with bar:
-            task = bar.add_task("mapping", total=source.expected())
-            drive = MeasurementLog(lidar.T_body_lidar, _measurements(source), lambda: bar.advance(task))
-            figures = map_measurements(drive, out)
+            task = bar.add_task("mapping", total=source.message_count())
+            log = MeasurementLog(lidar.T_body_lidar, _measurements(source), lambda: bar.advance(task))
+            figures = map_measurements(log, out)
         for problem in source.problems:
             console.print(f"[yellow]{problem}[/]", highlight=False)
     finally:
@@ -77,11 +77,11 @@ def slam(
         print(json.dumps(figures))
     else:
         print_figures(figures)
-        console.print(f"trajectory.tum, online.tum, map.pgm, map.yaml, map.png and state/ lie in {out}")
+        console.print(f"wrote trajectory.tum, online.tum, map.pgm, map.yaml, map.png and state/ to {out}")
 
 
 def _measurements(source: Any) -> Any:
-    """Plain tuples for the library, in order of the bag: ("scan", ...) and ("odometry", ...)."""
+    """Yield plain tuples ("scan", ...) and ("odometry", ...) in the order of the recording."""
     from beamsplat.common.geometry.transforms import se3_to_se2
 
     for _, topic, m in source.messages():
@@ -101,7 +101,7 @@ def eval_slam(
     groundtruth: Annotated[Path | None, typer.Option(help="TUM file of the true body poses")] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Errors of a mapped trajectory against relations or a true trajectory; no scale is ever fitted.
+    """Compute the errors of a trajectory against relations or a true trajectory; the scale is never fitted.
 
     Examples:
 
@@ -110,7 +110,7 @@ def eval_slam(
         beamsplat eval slam map --groundtruth groundtruth.txt --json
     """
     if (relations is None) == (groundtruth is None):
-        raise UserError("eval slam takes one of --relations FILE and --groundtruth FILE")
+        raise UserError("eval slam needs either --relations FILE or --groundtruth FILE")
     figures = _against_relations(folder, relations) if relations else _against_truth(folder, groundtruth)
     if as_json:
         print(json.dumps(figures))
@@ -119,7 +119,7 @@ def eval_slam(
 
 
 def poses_of(folder: Path, name: str) -> tuple[Any, Any]:
-    """Stamps int64 [N] and planar poses float64 [N, 3] of a TUM file."""
+    """Return stamps int64 [N] and planar poses float64 [N, 3] of a TUM file."""
     from beamsplat.common.geometry.trajectory import read_tum
     from beamsplat.common.geometry.transforms import se3_to_se2
 
@@ -128,7 +128,7 @@ def poses_of(folder: Path, name: str) -> tuple[Any, Any]:
 
 
 def _against_relations(folder: Path, path: Path) -> dict[str, Any]:
-    """Relations speak of the laser: the body poses are taken there first."""
+    """Return the errors against relations, which are poses of the lidar."""
     from dataclasses import asdict
 
     import numpy as np
@@ -142,6 +142,7 @@ def _against_relations(folder: Path, path: Path) -> dict[str, Any]:
 
 
 def _against_truth(folder: Path, path: Path) -> dict[str, Any]:
+    """Return the errors of the optimised and the online trajectory against the truth."""
     from beamsplat.services.localization.lidar2d.metrics import interpolate_poses, trajectory_errors
 
     figures: dict[str, Any] = {}
@@ -150,7 +151,7 @@ def _against_truth(folder: Path, path: Path) -> dict[str, Any]:
         stamps_ns, pose_map_body = poses_of(folder, name)
         inside = (stamps_ns >= true_stamps_ns[0]) & (stamps_ns <= true_stamps_ns[-1])
         if not inside.any():
-            raise UserError(f"{path}: no true pose within the time of {folder / name}")
+            raise UserError(f"{path}: has no pose in the time range of {folder / name}")
         truth = interpolate_poses(true_stamps_ns, pose_world_body, stamps_ns[inside])
         errors = trajectory_errors(pose_map_body[inside], truth)
         figures |= {
@@ -163,7 +164,7 @@ def _against_truth(folder: Path, path: Path) -> dict[str, Any]:
 
 
 def print_figures(figures: dict[str, Any]) -> None:
-    """A table of the scalars."""
+    """Print a table of the scalar figures."""
     table = Table("figure", "value")
     for name, value in figures.items():
         if isinstance(value, (int, float, str)):

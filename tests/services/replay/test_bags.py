@@ -13,7 +13,7 @@ from rosbags.rosbag2 import CompressionMode
 from beamsplat.common.errors import UserError
 from beamsplat.common.geometry.frames import R_body_camera_level, camera_mount
 from beamsplat.common.geometry.transforms import make_transform
-from beamsplat.common.recording.sensors import SENSORS, build, ros_fields
+from beamsplat.common.recording.sensors import SENSORS, build_message, ros_fields
 from beamsplat.services.replay.bag_source import TF_TYPES, _transforms
 from beamsplat.services.replay.bags import Bag
 from beamsplat.services.replay.config import ReplayConfig
@@ -164,7 +164,7 @@ def test_a_rig_file_of_another_size_or_without_a_sensor_is_refused(tmp_path):
     path = write_bag(tmp_path, "mcap", Drive())
     rig = tmp_path / "rig.toml"
     rig.write_text(RIG.replace("64", "128").replace("31.5", "63.5"))
-    assert "K is for 128x48 px but the pictures" in refusal(path, rig=rig)
+    assert "K is for 128x48 px but the images" in refusal(path, rig=rig)
     rig.write_text(RIG[RIG.index("[lidar") :])
     assert "has no [camera]" in refusal(path, rig=rig)
 
@@ -177,7 +177,7 @@ def test_what_is_missing_is_said_in_one_sentence(tmp_path, kind):
             (Drive(info_px=None), ["calibration is missing", "CameraInfo", "beamsplat rig"]),
             (Drive(info_px=(32, 24)), ["K is for 32x24 px", "64x48 px"]),
             (Drive(fx_px=0.0), ["calibration is missing", "all zero"]),
-            (Drive(tf=""), ["where the camera sits", "where the lidar sits"]),
+            (Drive(tf=""), ["position of the camera", "position of the lidar"]),
             (Drive(distortion=("strange", [0.1])), ["distortion model 'strange'"]),
             (Drive(extra_scan="/rear/scan"), ["several topics for scan", "/rear/scan", "scan_topic"]),
         ]
@@ -193,7 +193,7 @@ def test_choices_by_option(tmp_path):
     sourced, _ = play(path, scan_topic="/rear/scan", without=("odometry", "pose", "image"))
     assert {item.topic for item in sourced} == {"rig", "tick", "lidar/scan"}
     assert sourced[0].message.camera is None
-    assert "scan_topic = '/front' is not there; topics that would do: /rear/scan, /scan" in refusal(
+    assert "scan_topic = '/front' is not there; possible topics: /rear/scan, /scan" in refusal(
         path, scan_topic="/front"
     )
     assert "is a nav_msgs/msg/Odometry" in refusal(path, scan_topic="/odom")
@@ -205,7 +205,7 @@ def test_mounts_may_be_assumed_and_a_lidar_alone_needs_none(tmp_path):
     assert len(sourced[0].message.assumed) == 2
     sourced, _ = play(path, without=("image",))
     assert np.array_equal(sourced[0].message.lidar.T_body_lidar, np.eye(4))
-    assert "the lidar sits at the body's origin" in sourced[0].message.assumed[0]
+    assert "the lidar is at the body's origin" in sourced[0].message.assumed[0]
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -213,7 +213,7 @@ def test_broken_messages_are_counted_not_fatal(tmp_path, kind):
     sourced, problems = play(write_bag(tmp_path, kind, Drive(corrupt_scans=3)))
     assert len(of(sourced, "lidar/scan")) == 17
     assert len(problems) == 1
-    assert "/scan: 3 messages passed over" in problems[0]
+    assert "/scan: 3 messages skipped" in problems[0]
 
 
 def test_without_stamps_the_receive_time_stands_in(tmp_path):
@@ -311,7 +311,7 @@ def test_what_is_no_bag_is_refused(tmp_path):
 @pytest.mark.parametrize("kind", KINDS)
 def test_zero_messages(tmp_path, kind):
     drive = Drive(seconds=0.0, tf="")
-    assert "holds no messages" in refusal(write_bag(tmp_path, kind, drive))
+    assert "has no messages" in refusal(write_bag(tmp_path, kind, drive))
 
 
 def test_a_folder_with_truth_beside_its_bag_is_its_bag(tmp_path):
@@ -371,7 +371,7 @@ def test_mutated_messages_raise_value_errors_only(tmp_path, kind):
             try:
                 message = deserialize(raw._replace(data=data))
                 if raw.type_name in topics:
-                    build(topics[raw.type_name], ros_fields(topics[raw.type_name], message))
+                    build_message(topics[raw.type_name], ros_fields(topics[raw.type_name], message))
             except ValueError:
                 pass
             header_stamp_ns(raw._replace(data=data))

@@ -19,7 +19,7 @@ from beamsplat.services.replay.config import ReplayConfig
 from beamsplat.services.replay.inspection import inspect
 from beamsplat.services.replay.node import ReplayNode
 from beamsplat.services.replay.options import SourceOptions
-from beamsplat.services.replay.statistics import lidar_facts, stream_facts
+from beamsplat.services.replay.statistics import lidar_statistics, topic_statistics
 from beamsplat.tools.cli import info as cli
 from tests.services.replay.make_bags import KINDS, T_BASE_CAMERA, T_BASE_LIDAR, Drive, write_bag
 
@@ -95,7 +95,7 @@ def test_info_of_our_own_recordings(tmp_path):
     report = inspect(tmp_path / "rec", SourceOptions())
     assert report.error == ""
     assert len(report.problems) == 1
-    assert "breaks off" in report.problems[0]
+    assert "truncated: readable" in report.problems[0]
 
 
 def test_a_recording_replayed_is_the_recording(tmp_path):
@@ -178,22 +178,22 @@ def test_rig_of_a_camera_states_the_field_of_view_it_was_told(tmp_path):
 def test_rig_of_what_is_no_robot(tmp_path):
     path = write_bag(tmp_path, "mcap", Drive(scan=False, images=""))
     assert "neither camera nor lidar" in run("rig", path, "--out", tmp_path / "r.toml")[1]
-    assert "no picture from this camera" in run("rig", "/dev/video99", "--out", tmp_path / "r.toml")[1]
+    assert "no image from this camera" in run("rig", "/dev/video99", "--out", tmp_path / "r.toml")[1]
     assert not (tmp_path / "r.toml").exists()
 
 
 def test_gaps_and_backward_stamps_are_counted():
     at_ns = np.arange(100) * 10**8
-    facts = stream_facts("/t", "T", at_ns, at_ns - 5_000_000)
+    facts = topic_statistics("/t", "T", at_ns, at_ns - 5_000_000)
     assert (facts.gaps, facts.backwards, facts.lag_median_ms) == (0, 0, 5.0)
     gap = at_ns + np.where(np.arange(100) >= 50, 2 * 10**9, 0)
-    facts = stream_facts("/t", "T", gap, gap)
+    facts = topic_statistics("/t", "T", gap, gap)
     assert facts.gaps == 1
     assert facts.largest_gap_s == pytest.approx(2.1)
     swapped = at_ns.copy()
     swapped[[10, 11]] = swapped[[11, 10]]
-    assert stream_facts("/t", "T", at_ns, swapped).backwards == 1
-    assert stream_facts("/t", "T", at_ns[:1], None).rate_hz is None
+    assert topic_statistics("/t", "T", at_ns, swapped).backwards == 1
+    assert topic_statistics("/t", "T", at_ns[:1], None).rate_hz is None
 
 
 def test_a_mark_for_no_return_is_found_and_a_wall_is_not():
@@ -203,9 +203,9 @@ def test_a_mark_for_no_return_is_found_and_a_wall_is_not():
     }  # fmt: skip
     rng = np.random.default_rng(0)
     real = rng.uniform(1, 60, 1000).astype(np.float32)
-    assert lidar_facts([{**fields, "ranges_m": real}]).most_common_far_m is None
+    assert lidar_statistics([{**fields, "ranges_m": real}]).most_common_far_m is None
     real[:50] = 81.83
-    facts = lidar_facts([{**fields, "ranges_m": real}])
+    facts = lidar_statistics([{**fields, "ranges_m": real}])
     assert facts.most_common_far_m == pytest.approx(81.83)
     assert facts.most_common_far_share == pytest.approx(0.05)
     assert facts.beyond_share == pytest.approx(0.05)
