@@ -233,6 +233,8 @@ class OutputHealth(MessagePart):
 class Health(Message):
     """State and counts of a node, published by each node at 1 Hz."""
 
+    version = "1.1"  # 1.1: pid
+
     node: Name
     instance: Name
     epoch: Count
@@ -244,6 +246,7 @@ class Health(Message):
     rss_mb: NonNegative = 0.0
     cpu_percent: NonNegative = 0.0
     detail: Text = ""
+    pid: Count = 0  # process id on its host; 0 = not reported
 
 
 class Answer(Message):

@@ -180,9 +180,11 @@ def serve(
     """
     from beamsplat.tools.system.node_process import route, start_logging
     from beamsplat.tools.system.node_process import serve as serve_node
+    from beamsplat.tools.system.process_title import set_process_title
 
     deployment = _load(file, set_)
     start_logging()
+    set_process_title(f"beamsplat:{node}", arguments=False)
     if node == "router":
         route(deployment)
     else:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Callable
 
 import zenoh
 from rich import box
@@ -25,7 +26,10 @@ class HealthBoard:
     """Listens to health/* in a thread of its own until the session is closed: of one robot, or with `ALL` of
     every robot, whose nodes then go by robot/node."""
 
-    def __init__(self, session: zenoh.Session, robot: str) -> None:
+    def __init__(
+        self, session: zenoh.Session, robot: str, clock_s: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._clock_s = clock_s
         self._all = robot == ALL
         self._book = HealthRecords()
         self.records: dict[str, NodeRecord] = self._book.records
@@ -50,25 +54,43 @@ class HealthBoard:
                 whose = str(sample.key_expr).split("/")[1]
                 health = health.model_copy(update={"node": f"{whose}/{health.node}"})
             with self._lock:
-                self._book.add(health)
+                self._book.add(health, self._clock_s())
 
     def states(self) -> dict[str, str]:
         """Node -> state, "silent" where nothing was heard lately."""
         with self._lock:
-            return self._book.states()
+            return self._book.states(self._clock_s())
 
     def nodes_table(self) -> RenderableType:
-        """One row a node: state, rates, step time, age, losses, memory, CPU; below, what they say."""
+        """Return one row per node: process, state, rates, step time, age, losses, memory, CPU; details below.
+
+        Of several robots no process ids are shown: their names need the room, and the ids are of other hosts.
+        """
         table = _narrow_table()
-        for heading in ("node", "state"):
-            table.add_column(heading, no_wrap=True)
-        for heading in ("in Hz", "out Hz", "step ms", "p95", "age ms", "drop", "lost", "bad", "MB", "CPU%"):
+        table.add_column("node", no_wrap=True)
+        if not self._all:
+            table.add_column("pid", justify="right", no_wrap=True)
+        table.add_column("state", no_wrap=True)
+        for heading in (
+            "in\nHz",
+            "out\nHz",
+            "step\nms",
+            "p95\nms",
+            "age\nms",
+            "drop",
+            "lost",
+            "bad",
+            "MB",
+            "CPU%",
+        ):
             table.add_column(heading, justify="right", no_wrap=True)
-        now = time.monotonic()
+        now = self._clock_s()
         said = []
         with self._lock:
             for name, record in sorted(self.records.items()):
-                table.add_row(*_node_row(name, record, now))
+                name_cell, *cells = _node_row(name, record, now)
+                pid = () if self._all else (str(record.health.pid or ""),)
+                table.add_row(name_cell, *pid, *cells)
                 if record.health.detail:
                     said.append(Text(f"{name}: {record.health.detail}", style="dim"))
         return Group(table, *said)
@@ -99,17 +121,22 @@ def _node_row(name: str, record: NodeRecord, now: float) -> tuple[str, ...]:
     return (
         name,
         f"[{colour}]{state}[/]",
-        f"{totals.in_hz:.1f}" if health.inputs else "",
-        f"{totals.out_hz:.1f}" if health.outputs else "",
-        f"{health.step_p50_ms:.1f}",
-        f"{health.step_p95_ms:.1f}",
-        f"{totals.age_ms:.1f}" if health.inputs else "",
+        _short(totals.in_hz) if health.inputs else "",
+        _short(totals.out_hz) if health.outputs else "",
+        _short(health.step_p50_ms),
+        _short(health.step_p95_ms),
+        _short(totals.age_ms) if health.inputs else "",
         _count(totals.dropped, "yellow"),
         _count(totals.lost, "red"),
         _count(totals.bad, "red"),
         f"{health.rss_mb:.0f}",
         f"{health.cpu_percent:.0f}",
     )
+
+
+def _short(number: float) -> str:
+    """Return a number in four characters or, from 10 000 on, more."""
+    return f"{number:.1f}" if number < 99.95 else f"{number:.0f}"
 
 
 def _flow_row(flow: TopicTraffic) -> tuple[str, ...]:

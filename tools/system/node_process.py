@@ -21,6 +21,7 @@ from beamsplat.common.security.keys import CERTIFICATE, HOSTS
 from beamsplat.common.zenoh.bus import open_router
 from beamsplat.services.nodes import NODES
 from beamsplat.tools.system.assembly import Surroundings, build_node, node_classes, surroundings
+from beamsplat.tools.system.process_title import set_process_title
 
 log = logging.getLogger("beamsplat")
 
@@ -116,6 +117,7 @@ def child(
     """Entry of a supervised process: its output goes to a log file, its end shows in the exit code."""
     # Ctrl-C in a terminal reaches the whole group; the supervisor decides who stops when.
     os.setpgrp()
+    set_process_title(f"beamsplat:{name}")
     with log_file.open("ab", buffering=0) as file:
         os.dup2(file.fileno(), 1)
         os.dup2(file.fileno(), 2)

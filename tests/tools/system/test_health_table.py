@@ -1,12 +1,11 @@
 """What `top` and `topics` show is what the nodes report."""
 
-import time
-
 from rich.console import Console
 
 from beamsplat.common.messages import Health, InputHealth, OutputHealth
 from beamsplat.common.zenoh.bus import Bus, open_router, open_session
 from beamsplat.tools.system.health_table import ALL, HealthBoard
+from tests.common.polling import wait_until
 
 
 def _text(table, width=80):
@@ -23,33 +22,40 @@ def _health(node, sent, lost=0, state="active", **inputs):
         stamp_ns=1, node=node, instance="ab" * 8, epoch=1, state=state, detail="warm and well",
         inputs=(takes,) if node == "localization" else (),
         outputs=(OutputHealth(topic="lidar/scan", sent=sent, bytes=1000 * sent),) if node == "replay" else (),
-        step_p50_ms=1.0, step_p95_ms=2.0, rss_mb=100.0, cpu_percent=5.0,
+        step_p50_ms=1000.0, step_p95_ms=2000.0, rss_mb=1000.0, cpu_percent=100.0, pid=4194304,
     )  # fmt: skip
 
 
 def test_rates_losses_and_silence_are_shown(free_endpoint):
     with open_router((free_endpoint,)), open_session((free_endpoint,)) as watcher:
-        board = HealthBoard(watcher, "r")
+        now_s = 0.0
+        board = HealthBoard(watcher, "r", lambda: now_s)
         sender = Bus(open_session((free_endpoint,)), "r", "replay", "ab" * 8, 1)
         taker = Bus(open_session((free_endpoint,)), "r", "localization", "cd" * 8, 1)
         with sender, taker:
-            time.sleep(0.5)
-            for sent in (0, 10):
-                sender.publish_health(_health("replay", sent))
-                taker.publish_health(_health("localization", sent, lost=2))
-                time.sleep(1.0)
+            for now_s, sent in ((0.0, 0), (1.0, 10)):
+
+                def received(sent=sent):
+                    sender.publish_health(_health("replay", sent))
+                    taker.publish_health(_health("localization", sent, lost=2))
+                    records = [board.records.get(node) for node in ("replay", "localization")]
+                    return all(records) and (
+                        records[0].health.outputs[0].sent == records[1].health.inputs[0].received == sent
+                    )
+
+                wait_until(received)
             assert board.states() == {"replay": "active", "localization": "active"}
             nodes = _text(board.nodes_table())
             row = next(line for line in nodes.splitlines() if line.strip().startswith("localization"))
-            assert row.split()[1] == "active"
-            assert 8.0 < float(row.split()[2]) < 12.0  # 10 in about a second
+            assert row.split()[1:3] == ["4194304", "active"]
+            assert 8.0 < float(row.split()[3]) < 12.0  # 10 in about a second
             assert row.split()[-4:-2] == ["2", "0"]  # lost, broken
             assert "localization: warm and well" in nodes
             topics = _text(board.topics_table())
             assert "localization 1.5, 3" in topics
             assert "2 lost" in topics
             assert "…" not in nodes + topics  # nothing is cut off in 80 columns
-            time.sleep(3.2)
+            now_s = 4.2  # no report for 3.2 s
             assert board.states() == {"replay": "silent", "localization": "silent"}
             assert "silent" in _text(board.nodes_table())
 
@@ -61,12 +67,13 @@ def test_a_fleet_is_shown_by_robot_and_kept_apart(free_endpoint):
             name: Bus(open_session((free_endpoint,)), name, "replay", "ab" * 8, 1)
             for name in ("r1", "r2", "r3")
         }
-        time.sleep(0.5)
-        for number, bus in enumerate(buses.values()):
-            bus.publish_health(_health("replay", number))
-        deadline = time.monotonic() + 5.0
-        while len(fleet.states()) < 3 and time.monotonic() < deadline:
-            time.sleep(0.05)
+
+        def received():
+            for number, bus in enumerate(buses.values()):
+                bus.publish_health(_health("replay", number))
+            return len(fleet.states()) == 3 and len(one.states()) == 1
+
+        wait_until(received)
         assert fleet.states() == dict.fromkeys(("r1/replay", "r2/replay", "r3/replay"), "active")
         assert one.states() == {"replay": "active"}
         assert [o.sent for o in one.records["replay"].health.outputs] == [1]
