@@ -1,18 +1,18 @@
-"""When a message arrived, on the clock that its recording should have."""
+"""Arrival times of messages for a recording, by the wall clock or by the clock of replayed data."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from typing import Literal
 
-_NOW_S = 300.0  # a first stamp nearer to now than this comes from a running robot
+_NOW_S = 300.0  # a first stamp within this time of now is from a running robot
 
 
 class ArrivalClock:
-    """Arrival times in nanoseconds, never running backwards on the data's clock.
+    """Clock of arrival times in nanoseconds; monotonic for replayed data.
 
-    On a running robot arrival is the time of publication by this host's clock: what lay in a queue since
-    did not arrive later for that. Replayed data have a clock of their own, which only their stamps tell.
+    On a running robot the arrival is the time of publication by this host's clock, so that waiting in a
+    queue does not count. For replayed data the clock is the newest stamp.
     """
 
     def __init__(
@@ -27,8 +27,10 @@ class ArrivalClock:
         self._newest_ns = 0
 
     def arrival_ns(self, stamp_ns: int, published_ns: int | None) -> int:
-        """Arrival of a message; `published_ns` is its publication on this host's monotonic clock, None
-        where another host published it."""
+        """Return the arrival time of a message.
+
+        `published_ns` is its publication by this host's monotonic clock, None if another host published it.
+        """
         if self._wall is None:
             self._wall = abs(self._wall_ns() - stamp_ns) < _NOW_S * 1e9
         if self._wall:
@@ -38,7 +40,7 @@ class ArrivalClock:
         return self._newest_ns
 
     def now_ns(self) -> int | None:
-        """Now, for what has no stamp of the data's clock; None before the first message of the data."""
+        """Return the present time, for messages without a data stamp; None before the first data message."""
         if self._wall:
             return self._wall_ns()
         return self._newest_ns or None

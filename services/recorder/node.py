@@ -1,4 +1,4 @@
-"""Writes what goes over the bus to MCAP."""
+"""The recorder service: writes all topics to an MCAP recording."""
 
 from __future__ import annotations
 
@@ -24,20 +24,20 @@ from beamsplat.services.recorder.config import RecorderConfig
 log = logging.getLogger("beamsplat.recorder")
 
 
-def _keeper(topic: str) -> Callable[[Any, Message], Iterable[Output]]:
-    def keep(self: RecorderNode, message: Message) -> Iterable[Output]:
-        self.keep(topic, message)
+def _record_handler(topic: str) -> Callable[[Any, Message], Iterable[Output]]:
+    def record(self: RecorderNode, message: Message) -> Iterable[Output]:
+        self.record(topic, message)
         return ()
 
-    return keep
+    return record
 
 
-# A handler for each row of the topic table, so that a new topic is recorded the day it appears.
-_Handlers = type("_Handlers", (), {row.handler: _keeper(row.name) for row in TOPICS.values()})
+# A handler for each row of the topic table, so that new topics are recorded without a change here.
+_Handlers = type("_Handlers", (), {row.handler: _record_handler(row.name) for row in TOPICS.values()})
 
 
 class RecorderNode(_Handlers, Node):
-    """All topics, every message of them, and the health of all nodes."""
+    """Records every message of all topics, and the health of all nodes."""
 
     name = "recorder"
     Config = RecorderConfig
@@ -55,9 +55,9 @@ class RecorderNode(_Handlers, Node):
         self.writer: RecordingWriter | None = None
 
     def configure(self) -> None:
-        """Makes the recording, so that a wrong path is said before anything runs."""
+        """Create the recording, so that a wrong path is reported before the system starts."""
         self.writer = RecordingWriter(
-            _free(self.config.out),
+            _unused_path(self.config.out),
             compression=CompressionType[self.config.compression.upper()],
             chunk_s=self.config.chunk_s,
             sync=self.config.sync,
@@ -77,8 +77,8 @@ class RecorderNode(_Handlers, Node):
         lost = self.writer.lost.total()
         self.detail = f"writing {self.writer.path}" + (f", {lost} messages LOST" if lost else "")
 
-    def keep(self, topic: str, message: Message) -> None:
-        """Writes one message with the header that came with it."""
+    def record(self, topic: str, message: Message) -> None:
+        """Write one message with its header."""
         header, self._header = self._header, None
         if topic in self._chosen:
             own_clock = header is not None and header.clock_id == self._clock_id
@@ -100,12 +100,12 @@ class RecorderNode(_Handlers, Node):
         try:
             self.writer.write(topic, message, arrival_ns, header)
         except RecordingError as error:
-            if not failed_before:  # once is enough; the count is in `lost` and in the last log line
+            if not failed_before:  # logged once; the count is in `lost` and in the last log line
                 log.error("%s", error)
 
 
-def _free(path: Path) -> Path:
-    """`path`, or with a number behind it the first that is free."""
+def _unused_path(path: Path) -> Path:
+    """Return `path` if it does not exist, else the first free path with a number appended."""
     if not path.exists():
         return path
     names = (path.with_name(f"{path.stem}_{number}{path.suffix}") for number in count(2))

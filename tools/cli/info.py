@@ -17,20 +17,24 @@ from beamsplat.tools.cli.options import writable
 if TYPE_CHECKING:
     from beamsplat.services.replay.inspection import InspectionReport
 
-# Readers of bags and OpenCV are imported where they are used: every other command starts without them.
+# Bag readers and OpenCV are imported where they are used, so that other commands start fast.
 
 
 def info(
-    path: Annotated[Path, typer.Argument(help="A bag (.bag, .mcap, .db3, folder), a recording, a folder.")],
+    path: Annotated[
+        Path, typer.Argument(help="A bag (.bag, .mcap, .db3, folder), a recording or a plain folder.")
+    ],
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")] = False,
     rig: Annotated[
-        Path | None, typer.Option(help="A rig file that wins over the calibration inside.")
+        Path | None, typer.Option(help="A rig file that overrides the calibration in the data.")
     ] = None,
-    allow_truncated: Annotated[bool, typer.Option(help="Look into a bag that was cut off.")] = False,
+    allow_truncated: Annotated[
+        bool, typer.Option(help="Inspect the readable part of a truncated bag.")
+    ] = False,
 ) -> None:
-    """What is in a bag or recording: topics, rates, gaps, sensors, calibration, problems.
+    """Show the content of a bag or recording: topics, rates, gaps, sensors, calibration, problems.
 
-    Exit code 2, and the reason in one sentence, if it cannot be played as it is.
+    If the data cannot be played, the exit code is 2, and one sentence states the reason.
 
     Example: beamsplat info drive/bag
     """
@@ -51,16 +55,16 @@ def info(
 
 def rig(
     source: Annotated[
-        str, typer.Argument(help="A bag, recording or folder; or a camera: index, /dev/videoN, URL.")
+        str, typer.Argument(help="A bag, recording or folder, or a camera: index, /dev/videoN, URL.")
     ],
-    out: Annotated[Path, typer.Option(callback=writable, help="Where to write.")] = Path("rig.toml"),
+    out: Annotated[Path, typer.Option(callback=writable, help="File to write.")] = Path("rig.toml"),
     fov_deg: Annotated[
         float,
         typer.Option(help="Camera only: horizontal field of view from its data sheet.", min=10, max=170),
     ] = 65.0,
     overwrite: Annotated[bool, typer.Option(help="Replace an existing file.")] = False,
 ) -> None:
-    """A first calibration file: what was found, what was assumed, what must be measured with a tape.
+    """Write a draft of the rig file: values found, values assumed, and values to measure.
 
     Examples:
 
@@ -72,7 +76,7 @@ def rig(
     from beamsplat.services.replay.rig_draft import draft_from_data, draft_from_device, is_device
 
     if out.exists() and not overwrite:
-        raise UserError(f"{out}: exists already; choose another name with --out, or say --overwrite")
+        raise UserError(f"{out}: exists already; choose another name with --out, or use --overwrite")
     text, notes = draft_from_device(source, fov_deg) if is_device(source) else draft_from_data(Path(source))
     write_rig(out, text)
     console = Console(soft_wrap=True, highlight=False)
