@@ -1,6 +1,6 @@
-"""Recordings in MCAP: standard ROS 2 messages wherever they exist, our own beside them."""
+"""Recordings as MCAP files: standard ROS 2 messages where they exist, BeamSplat messages for the rest."""
 
-from beamsplat.common.recording.reader import Recorded, RecordingReader, is_recording
+from beamsplat.common.recording.reader import RecordedMessage, RecordingReader, is_recording
 from beamsplat.common.recording.writer import RecordingError, RecordingWriter
 
-__all__ = ["Recorded", "RecordingError", "RecordingReader", "RecordingWriter", "is_recording"]
+__all__ = ["RecordedMessage", "RecordingError", "RecordingReader", "RecordingWriter", "is_recording"]

@@ -1,7 +1,7 @@
-"""ROS messages (1 and 2 alike) as ours, field by field.
+"""Conversion of ROS 1 and ROS 2 messages to the fields of BeamSplat messages.
 
-`fields_of(cls, ros_message)` gives the fields that the ROS message carries, without checking them: the
-reader of our own recordings adds those ROS has no room for; a foreign bag must do with what is there.
+The fields are not validated: the reader of our own recordings adds the fields that ROS messages cannot hold,
+and other bags have only the fields of the ROS message.
 """
 
 from __future__ import annotations
@@ -11,15 +11,15 @@ from typing import Any
 import numpy as np
 
 from beamsplat.common import messages as m
-from beamsplat.common.recording.picture import picture_head
+from beamsplat.common.recording.image_header import read_image_header
 from beamsplat.common.recording.ros_types import stamp_ns_of, transform_of
 
-# OpenCV's names for what ROS also calls by its colours.
+# Encodings with several names in ROS: OpenCV's type names and others.
 _ENCODINGS = {"8UC3": "bgr8", "8UC1": "mono8", "8UC4": "bgra8", "yuyv": "yuv422_yuy2"}
 
 
 def fields_of(cls: type[m.Message], ros_message: Any) -> dict[str, Any]:
-    """Fields of `cls` as found in a ROS message."""
+    """Return the fields of `cls` that a ROS message holds, not validated."""
     return _CONVERTERS[cls](ros_message)
 
 
@@ -29,7 +29,7 @@ def _image(ros_image: Any) -> dict[str, Any]:
         "data": np.asarray(ros_image.data).view(np.uint8),
     }
     if hasattr(ros_image, "format"):
-        head = picture_head(fields["data"].data)
+        head = read_image_header(fields["data"].data)
         if head is not None:
             fields |= head._asdict()
         else:

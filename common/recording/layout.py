@@ -1,8 +1,8 @@
-"""How a recording names and describes what it holds; docs/recordings.md is the long form.
+"""Layout of a recording: names, encodings and metadata of its MCAP channels. See docs/recordings.md.
 
-Each of our messages becomes at most one ROS message (role "message"), one map of the fields ROS has no
-room for (role "fields"), or, where ROS has no counterpart, its own bytes (role "own"). Channel
-metadata ties them together and carries what the header says about the sender.
+A BeamSplat message is stored as one ROS message (role "message") and, where necessary, a map of the fields
+that the ROS message cannot hold (role "fields"); or, if ROS has no such message type, as its own encoding
+(role "own"). Channel metadata connects the records and holds the publisher's part of the header.
 """
 
 from __future__ import annotations
@@ -22,21 +22,21 @@ from beamsplat.common.messages.header import DecodeError, Header
 
 LIBRARY = "beamsplat 1"
 PROFILE = "ros2"
-OWN_ENCODING = "x-beamsplat"  # head and arrays of common/codec.py
+OWN_ENCODING = "x-beamsplat"  # the encoding of common/messages/codec.py
 FIELDS_ENCODING = "msgpack"
 OWN_PREFIX = "/beamsplat/"
 
 ROLE, TOPIC, SCHEMA = "beamsplat.role", "beamsplat.topic", "beamsplat.schema"
-# The JSON schema of our own channels rides in their metadata: an MCAP schema record of an encoding
-# other than ROS's keeps rosbags, and tools built on it, from opening the whole file.
+# The JSON schema of our own channels is stored in their metadata: rosbags, and tools that use it, cannot
+# open a file that has an MCAP schema record with an encoding other than those of ROS.
 JSON_SCHEMA = "beamsplat.jsonschema"
 NO_SCHEMA = 0
 _SENDER = ("clock_id", "epoch", "producer", "instance")
-_SEQUENCE_BITS = 32  # MCAP counts in a uint32; the rest rides in the channel's metadata
+_SEQUENCE_BITS = 32  # MCAP's sequence is a uint32; the high bits are in the channel's metadata
 
 
 def sender_metadata(header: Header | None) -> dict[str, str]:
-    """What all messages of one sender share; {} where there was no header."""
+    """Return the channel metadata: the header fields that all messages of a publisher share; {} for None."""
     if header is None:
         return {}
     metadata = {f"beamsplat.{name}": str(getattr(header, name)) for name in _SENDER}
@@ -44,7 +44,7 @@ def sender_metadata(header: Header | None) -> dict[str, str]:
 
 
 def header_of(metadata: dict[str, str], stamp_ns: int, publish_ns: int, sequence: int) -> Header | None:
-    """The header that `sender_metadata` was made from; None where there was none."""
+    """Return the header of a record; None if the message was recorded without one."""
     if "beamsplat.producer" not in metadata:
         return None
     high = int(metadata["beamsplat.sequence_high"])
@@ -60,20 +60,20 @@ def header_of(metadata: dict[str, str], stamp_ns: int, publish_ns: int, sequence
 
 
 def class_of(schema: str) -> type[Message]:
-    """The message class of "Scan/1.0".
+    """Return the message class of a schema, for example "Scan/1.0".
 
     Raises:
-        DecodeError: unknown name or another major version.
+        DecodeError: the name is unknown or the major version differs.
     """
     name, _, version = schema.partition("/")
     cls = MESSAGES.get(name)
     if cls is None or version.split(".")[0] != cls.version.split(".")[0]:
-        raise DecodeError(f"this program does not read {schema[:80]!r}")
+        raise DecodeError(f"this program does not support {schema[:80]!r}")
     return cls
 
 
 def missing_fields(message: Message, carried: dict[str, Any]) -> dict[str, Any]:
-    """Fields of `message` which `carried` lacks or holds with another value."""
+    """Return the fields of `message` that `carried` lacks or holds with another value."""
     return {
         name: value
         for name, value in message.__dict__.items()
@@ -83,7 +83,7 @@ def missing_fields(message: Message, carried: dict[str, Any]) -> dict[str, Any]:
 
 def _same(a: Any, b: Any) -> bool:
     if isinstance(a, np.ndarray):
-        # Bytes, not values: NaN equals NaN, and -0.0 is not 0.0.
+        # Compare bytes: NaN must equal NaN, and -0.0 must differ from 0.0.
         return (
             isinstance(b, np.ndarray)
             and (a.dtype, a.shape) == (b.dtype, b.shape)
@@ -93,21 +93,21 @@ def _same(a: Any, b: Any) -> bool:
 
 
 def pack_fields(fields: dict[str, Any]) -> bytes:
-    """msgpack of some fields; an array is {"dtype", "shape", "data"}."""
+    """Encode fields as msgpack; an array becomes {"dtype", "shape", "data"}."""
     return msgpack.packb(fields, default=_pack_array)
 
 
 def _pack_array(value: Any) -> Any:
     if isinstance(value, np.ndarray):
         return {"dtype": value.dtype.name, "shape": list(value.shape), "data": value.tobytes()}
-    raise TypeError(f"{type(value).__name__} has no place in a recording")
+    raise TypeError(f"{type(value).__name__} cannot be encoded in a recording")
 
 
 def unpack_fields(data: bytes, cls: type[Message]) -> dict[str, Any]:
-    """Fields packed by `pack_fields`, without those of a newer minor version.
+    """Decode fields encoded by `pack_fields`; fields unknown to `cls` (of a newer version) are ignored.
 
     Raises:
-        DecodeError: not such a map.
+        DecodeError: the bytes are not such a map.
     """
     try:
         fields = msgpack.unpackb(data, use_list=False)
@@ -125,7 +125,7 @@ def _unpack_array(value: dict[str, Any]) -> np.ndarray:
 
 
 class _Schema(GenerateJsonSchema):
-    """JSON schema in which an array is described by words: JSON has no bytes."""
+    """JSON schema generator that describes NumPy arrays in words, because JSON has no binary type."""
 
     def handle_invalid_for_json_schema(self, schema: Any, error_info: str) -> JsonSchemaValue:
         return {"type": "object", "description": "numpy array"}
@@ -133,7 +133,7 @@ class _Schema(GenerateJsonSchema):
 
 @cache
 def json_schema(cls: type[Message]) -> str:
-    """JSON schema that a recording embeds, with dtype and shape of each array."""
+    """Return the JSON schema of a message class that recordings embed, with dtype and shape of each array."""
     schema = cls.model_json_schema(schema_generator=_Schema)
     _describe_arrays(cls, schema)
     for name, part in schema.get("$defs", {}).items():
@@ -159,7 +159,7 @@ def _describe_arrays(cls: type[BaseModel], schema: dict[str, Any]) -> None:
 
 
 def _parts(cls: type[BaseModel]) -> dict[str, type[MessagePart]]:
-    """Every MessagePart class by name, to resolve the schema's $defs."""
+    """Return all MessagePart classes by name, to resolve the schema's $defs."""
     found: dict[str, type[MessagePart]] = {}
     pending = [MessagePart]
     while pending:

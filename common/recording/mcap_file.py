@@ -1,7 +1,7 @@
-"""Reads MCAP files: indexed and seekable where they are whole, chunk by chunk where they were cut off.
+"""Reader of MCAP files: uses the index of complete files and scans truncated files chunk by chunk.
 
-The `mcap` package gives up on a file without a footer. A robot whose battery died leaves exactly such
-files, so this reader indexes what is there and says what is not.
+The reader of the `mcap` package rejects files without a footer, such as those of a robot that lost power.
+This reader indexes the complete chunks of such a file and reports what is missing.
 """
 
 from __future__ import annotations
@@ -29,48 +29,49 @@ _FOOTER_BYTES = 9 + 20 + len(MAGIC)
 _PREFIX = struct.Struct("<BQ")
 _CHUNK_HEAD = struct.Struct("<QQQI")
 _MESSAGE_HEAD = struct.Struct("<HIQQ")
+# Maximum size of a block of messages outside chunks: limits the memory of one read.
 _REGION_BYTES = 4 * 1024 * 1024
-# What damaged bytes provoke in the record parsers and the decompressors.
+# Exceptions that record parsers and decompressors raise on damaged bytes.
 _DAMAGE = (McapError, ValueError, struct.error, RuntimeError, EOFError, OverflowError, MemoryError)
 
 try:
     from zstandard import ZstdError
 
     _DAMAGE = (*_DAMAGE, ZstdError)
-except ImportError:  # files without zstd still open
+except ImportError:  # optional: files with other compression can be read without it
     pass
 
 
 @dataclass
 class _Block:
-    """A chunk, or a run of top-level messages in a file written without chunks."""
+    """A chunk, or consecutive messages outside chunks in a file written without chunks."""
 
     offset: int
     length: int
     start_ns: int
     end_ns: int
-    channel_ids: set[int] | None  # None: not known without reading it
+    channel_ids: set[int] | None  # None = unknown until the block is read
     chunked: bool = True
 
 
 @dataclass
 class McapFile:
-    """An open MCAP file. `truncated` says in one sentence what is missing, or is empty.
+    """An open MCAP file with its index.
 
     Raises:
-        UserError: not an MCAP file, or nothing in it can be read.
+        UserError: the file is not an MCAP file, or nothing in it can be read.
     """
 
     path: Path
     profile: str = ""
     library: str = ""
-    truncated: str = ""
+    truncated: str = ""  # what is missing of a truncated file, as a sentence; "" = the file is complete
     damaged_chunks: int = 0
     schemas: dict[int, Schema] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
-    counts: Counter[int] = field(default_factory=Counter)
-    start_ns: int = 0
-    end_ns: int = 0
+    counts: Counter[int] = field(default_factory=Counter)  # messages by channel id
+    start_ns: int = 0  # first log time
+    end_ns: int = 0  # last log time
 
     def __post_init__(self) -> None:
         self.path = Path(self.path)
@@ -100,10 +101,10 @@ class McapFile:
     def messages(
         self, channel_ids: Collection[int] | None = None, start_ns: int = 0, stop_ns: int | None = None
     ) -> Iterator[tuple[Channel, Message]]:
-        """Messages with start_ns <= log_time < stop_ns by log time; equal times in file order.
+        """Yield messages with start_ns <= log_time < stop_ns in order of log time, equal times in file order.
 
-        Chunks that hold none of the channels are not read. A chunk that does not decode is counted in
-        `damaged_chunks` and passed over.
+        Chunks without any of the channels are not read. A chunk that cannot be decoded is skipped and counted
+        in `damaged_chunks`.
         """
         wanted = None if channel_ids is None else set(channel_ids)
         stop_ns = 2**64 if stop_ns is None else stop_ns
@@ -135,7 +136,7 @@ class McapFile:
         self.end_ns = max((block.end_ns for block in self._blocks), default=0)
 
     def _read_summary(self) -> bool:
-        """Index from the end of the file; False if there is none to trust."""
+        """Read the index at the end of the file; return False if it is missing, damaged or incomplete."""
         self._file.seek(len(MAGIC))
         self._take_header(self._file.read(min(self._size, 4096)))
         if self._size < len(MAGIC) + _FOOTER_BYTES:
@@ -149,14 +150,14 @@ class McapFile:
             return False
         self._file.seek(footer.summary_start)
         summary = self._file.read(self._size - _FOOTER_BYTES - footer.summary_start)
-        # The checksum covers the summary and the footer up to itself.
+        # The checksum covers the summary section and the footer up to the checksum field.
         if footer.summary_crc and zlib.crc32(tail[:25], zlib.crc32(summary)) != footer.summary_crc:
             return False
         counted = False
         for opcode, body in _records(summary):
             if opcode == Opcode.CHUNK_INDEX:
                 index = ChunkIndex.read(_stream(body))
-                # Without message indexes the chunk's channels are not known; empty would mean none.
+                # A chunk without message indexes can hold any channel: None, because {} means no channel.
                 ids = set(index.message_index_offsets) or None
                 self._blocks.append(
                     _Block(
@@ -191,7 +192,7 @@ class McapFile:
             self.channels[channel.id] = channel
 
     def _scan(self) -> None:
-        """Index by walking the records; notes in `truncated` where the file breaks off."""
+        """Build the index by reading all records; set `truncated` if the file is incomplete."""
         position = len(MAGIC)
         while True:
             self._file.seek(position)
@@ -205,11 +206,11 @@ class McapFile:
             if opcode in (Opcode.DATA_END, Opcode.FOOTER):
                 self._file.seek(self._size - len(MAGIC))
                 if self._file.read() != MAGIC:
-                    self.truncated = "its last bytes (the index) are missing, though all messages are there"
+                    self.truncated = "its last bytes (the index) are missing, but it has all messages"
                 return
             self._scan_record(opcode, position, length)
             position = end
-        self.truncated = self._loss(position)
+        self.truncated = self._describe_loss(position)
 
     def _scan_record(self, opcode: int, position: int, length: int) -> None:
         whole = _PREFIX.size + length
@@ -239,24 +240,24 @@ class McapFile:
         elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
             self._take_definition(opcode, self._file.read(length))
 
-    def _loss(self, position: int) -> str:
+    def _describe_loss(self, position: int) -> str:
         lost = self._size - position
-        text = f"breaks off after byte {position} of {self._size}: "
+        text = f"truncated: readable up to byte {position} of {self._size}: "
         if lost == 0:
-            return text + "the end of the file with its index is missing, all whole chunks are there"
+            return text + "the end of the file with its index is missing, all complete chunks are readable"
         self._file.seek(position)
         head = self._file.read(_PREFIX.size + _CHUNK_HEAD.size)
         if len(head) == _PREFIX.size + _CHUNK_HEAD.size and head[0] == Opcode.CHUNK:
             start_ns, end_ns, size, _ = _CHUNK_HEAD.unpack(head[_PREFIX.size :])
             if start_ns <= end_ns < 2**63 and size < 2**40:
                 return text + (
-                    f"the last chunk ({(end_ns - start_ns) / 1e9:.2f} s, {size} bytes of messages) is lost, "
-                    "and whatever came after it"
+                    f"the last chunk ({(end_ns - start_ns) / 1e9:.2f} s, {size} bytes of messages) and all "
+                    "messages after it are lost"
                 )
-        return text + f"{lost} bytes are lost, and whatever came after them"
+        return text + f"the last {lost} bytes of the file and all messages after them are lost"
 
     def _read_block(self, block: _Block) -> list[Message]:
-        """Messages of a block in file order; [] and counted if its bytes do not decode."""
+        """Return the messages of a block in file order; if it cannot be decoded, count it and return []."""
         try:
             if block.offset + block.length > self._size:
                 raise McapError("chunk beyond the end of the file")
@@ -292,7 +293,7 @@ def _stream(data: bytes | memoryview) -> ReadDataStream:
 
 
 def _records(data: bytes) -> Iterator[tuple[int, memoryview]]:
-    """(opcode, body) of each record in `data`; a last one that is cut short ends it."""
+    """Yield (opcode, body) of each record in `data`; an incomplete last record is ignored."""
     view = memoryview(data)
     position = 0
     while position + _PREFIX.size <= len(view):

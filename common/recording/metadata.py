@@ -1,4 +1,4 @@
-"""metadata.yaml: what makes a folder with an MCAP file a ROS 2 bag (format 5: Humble and later)."""
+"""The file metadata.yaml, with which ROS 2 reads a folder as a bag (format version 5: Humble and later)."""
 
 from __future__ import annotations
 
@@ -25,8 +25,14 @@ _QOS = """- history: 1
 
 
 def metadata_yaml(file_name: str, topics: dict[str, tuple[str, int]], first_ns: int, last_ns: int) -> str:
-    """Text for one MCAP file; `topics` gives ROS type and message count. Only ROS topics are listed:
-    `ros2 bag play` makes a publisher for each of them."""
+    """Return the text of metadata.yaml for a bag with one MCAP file.
+
+    Args:
+        file_name: name of the MCAP file in the folder.
+        topics: ROS topic -> (ROS type, message count). List ROS topics only: `ros2 bag play` creates a
+            publisher for each topic.
+        first_ns, last_ns: first and last log time.
+    """
     span = {
         "starting_time": {"nanoseconds_since_epoch": first_ns},
         "duration": {"nanoseconds": last_ns - first_ns},
@@ -56,8 +62,8 @@ def metadata_yaml(file_name: str, topics: dict[str, tuple[str, int]], first_ns: 
 
 
 def qos_profiles(topic: str) -> str:
-    """Offered QoS of a ROS topic; channel metadata and metadata.yaml must agree on it."""
-    latched = topic == "/tf_static"  # transient local: late joiners get the last one
+    """Return the offered QoS of a ROS topic as YAML; channel metadata and metadata.yaml must be identical."""
+    latched = topic == "/tf_static"  # durability transient local: late subscribers receive the last message
     return _QOS.format(depth=1 if latched else 10, durability=1 if latched else 2)
 
 

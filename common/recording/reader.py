@@ -1,4 +1,4 @@
-"""Reads our recordings back: the same messages, headers and arrival times that were written."""
+"""Reader of BeamSplat recordings: returns the messages, headers and arrival times that were recorded."""
 
 from __future__ import annotations
 
@@ -21,23 +21,23 @@ from beamsplat.common.recording.mcap_file import Message as McapMessage
 _READ_ROLES = ("message", "fields", "own")
 
 
-class Recorded(NamedTuple):
-    """One message as it was recorded."""
+class RecordedMessage(NamedTuple):
+    """A message in a recording."""
 
-    log_time_ns: int
+    log_time_ns: int  # arrival time at the recorder
     topic: str
     message: Message
-    header: Header | None
+    header: Header | None  # None if it was recorded without one
 
 
 def mcap_files(path: Path) -> list[Path]:
-    """The MCAP files of a recording: a file itself, or those in a folder, by name."""
+    """Return the MCAP files of a recording: `path` itself, or the files in this folder sorted by name."""
     path = Path(path)
     return sorted(path.glob("*.mcap")) if path.is_dir() else [path]
 
 
 def is_recording(path: Path) -> bool:
-    """Whether a file or folder holds MCAP that we wrote (judged by its first bytes)."""
+    """Return whether a file or folder is a BeamSplat recording, by the first bytes of its MCAP file."""
     for file in mcap_files(path):
         if file.is_file():
             with file.open("rb") as stream:
@@ -47,41 +47,41 @@ def is_recording(path: Path) -> bool:
 
 
 class RecordingReader:
-    """An open recording. `problems` says what is missing from a file that was cut off.
+    """An open recording; truncated and damaged files are read as far as possible (see `problems`).
 
     Raises:
-        UserError: no such recording, not MCAP, or not written by us.
+        UserError: there is no MCAP file, or it is not a BeamSplat recording.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = Path(path)
-        self.undecodable: Counter[str] = Counter()  # messages passed over, by our topic
+        self.undecodable: Counter[str] = Counter()  # skipped messages by topic
         paths = [file for file in mcap_files(self.path) if file.is_file()]
         if not paths:
-            raise UserError(f"{self.path}: no such recording (no MCAP file there)")
+            raise UserError(f"{self.path}: no such recording (no MCAP file found)")
         self.files: list[McapFile] = []
         try:
             for file in paths:
                 self.files.append(McapFile(file))
                 if not self.files[-1].library.startswith(layout.LIBRARY.split()[0]):
-                    raise UserError(f"{file}: an MCAP file, but not one of our recordings")
+                    raise UserError(f"{file}: an MCAP file, but not a BeamSplat recording")
         except UserError:
             self.close()
             raise
 
     @property
     def problems(self) -> list[str]:
-        """Plain sentences about what is missing or damaged."""
+        """Sentences about missing and damaged data, known so far."""
         found = [f"{file.path}: {file.truncated}" for file in self.files if file.truncated]
         damaged = sum(file.damaged_chunks for file in self.files)
         if damaged:
-            found.append(f"{self.path}: {damaged} damaged chunks were passed over")
+            found.append(f"{self.path}: {damaged} damaged chunks were skipped")
         found += [f"{topic}: {count} messages do not decode" for topic, count in self.undecodable.items()]
         return found
 
     @property
     def counts(self) -> Counter[str]:
-        """Messages by our topic name."""
+        """Number of messages by topic."""
         counts: Counter[str] = Counter()
         for file in self.files:
             for channel_id, count in file.counts.items():
@@ -92,46 +92,49 @@ class RecordingReader:
 
     @property
     def start_ns(self) -> int:
-        """Arrival of the first message."""
+        """Arrival time of the first message."""
         return min((file.start_ns for file in self.files if file.counts), default=0)
 
     @property
     def end_ns(self) -> int:
-        """Arrival of the last message."""
+        """Arrival time of the last message."""
         return max((file.end_ns for file in self.files), default=0)
 
     def messages(
         self, topics: Collection[str] | None = None, start_ns: int = 0, stop_ns: int | None = None
-    ) -> Iterator[Recorded]:
-        """Messages with start_ns <= arrival < stop_ns in order of arrival; broken ones are counted."""
+    ) -> Iterator[RecordedMessage]:
+        """Yield messages with start_ns <= arrival time < stop_ns in order of arrival.
+
+        Messages that do not decode are skipped and counted in `undecodable`. `topics` None = all.
+        """
         streams = [self._file_messages(file, topics, start_ns, stop_ns) for file in self.files]
         yield from heapq.merge(*streams, key=lambda recorded: recorded.log_time_ns)
 
     def _file_messages(
         self, file: McapFile, topics: Collection[str] | None, start_ns: int, stop_ns: int | None
-    ) -> Iterator[Recorded]:
+    ) -> Iterator[RecordedMessage]:
         ids = {
             channel_id
             for channel_id, channel in file.channels.items()
             if channel.metadata.get(layout.ROLE) in _READ_ROLES
             and (topics is None or channel.metadata.get(layout.TOPIC) in topics)
         }
-        beside: dict[tuple[Any, ...], bytes] = {}  # fields waiting for their ROS message
+        extra_fields: dict[tuple[Any, ...], bytes] = {}  # "fields" records; their ROS message follows
         for channel, message in file.messages(ids, start_ns, stop_ns):
             role, topic = channel.metadata[layout.ROLE], channel.metadata[layout.TOPIC]
             key = (topic, message.log_time, message.sequence, channel.metadata.get("beamsplat.instance"))
             if role == "fields":
-                beside[key] = message.data
+                extra_fields[key] = message.data
                 continue
             try:
-                decoded = _decode(file, channel, message, beside.pop(key, None))
+                decoded = _decode(file, channel, message, extra_fields.pop(key, None))
                 header = layout.header_of(
                     channel.metadata, decoded.stamp_ns, message.publish_time, message.sequence
                 )
             except DecodeError:
                 self.undecodable[topic] += 1
                 continue
-            yield Recorded(message.log_time, topic, decoded, header)
+            yield RecordedMessage(message.log_time, topic, decoded, header)
 
     def close(self) -> None:
         for file in self.files:
@@ -146,12 +149,12 @@ class RecordingReader:
         self.close()
 
 
-def _decode(file: McapFile, channel: Channel, message: McapMessage, beside: bytes | None) -> Message:
+def _decode(file: McapFile, channel: Channel, message: McapMessage, extra_fields: bytes | None) -> Message:
     schema = channel.metadata.get(layout.SCHEMA, "")
     if channel.metadata[layout.ROLE] == "own":
         return decode(schema, message.data)
     cls = layout.class_of(schema)
-    rest = layout.unpack_fields(beside, cls) if beside is not None else {}
+    rest = layout.unpack_fields(extra_fields, cls) if extra_fields is not None else {}
     try:
         ros_message = ros_types.deserialize(message.data, file.schemas[channel.schema_id].name)
         return cls.model_validate(_carried(cls, ros_message) | rest)
@@ -162,5 +165,5 @@ def _decode(file: McapFile, channel: Channel, message: McapMessage, beside: byte
 def _carried(cls: type[Message], ros_message: Any) -> dict[str, Any]:
     try:
         return fields_of(cls, ros_message)
-    except ValueError:  # a ROS message of which nothing can be used has all its fields beside it
+    except ValueError:  # nothing in the ROS message can be used: all fields are in the "fields" record
         return {}

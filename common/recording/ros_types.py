@@ -1,4 +1,4 @@
-"""ROS 2 types as our recordings use them: definitions, frame names, stamps."""
+"""ROS 2 message types: definitions, construction, serialisation, frame names, time stamps."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from rosbags.typesys.store import Typestore
 
 from beamsplat.common.geometry.transforms import make_transform, matrix_from_quat_wxyz, quat_xyzw_from_matrix
 
-# The names of REP 103 and REP 105, so that RViz, nav2 and Foxglove find what they expect.
+# Frame names of REP 103 and REP 105, which RViz, nav2 and Foxglove expect.
 FRAME_MAP = "map"
 FRAME_ODOM = "odom"
 FRAME_BODY = "base_link"
@@ -25,63 +25,66 @@ _SEC_LIMIT = 2**31  # builtin_interfaces/Time counts seconds in an int32
 
 @cache
 def typestore() -> Typestore:
-    """The message definitions of ROS 2 Jazzy; those we use are the same in Humble."""
+    """Return the message definitions of ROS 2 Jazzy; those used here are the same in Humble."""
     return get_typestore(Stores.ROS2_JAZZY)
 
 
 @cache
 def definition(type_name: str) -> bytes:
-    """Full text definition with all dependencies: the `ros2msg` schema of MCAP."""
+    """Return the text definition of a type with its dependencies, the `ros2msg` schema of MCAP."""
     return typestore().generate_msgdef(type_name, ros_version=2)[0].encode()
 
 
 def new(type_name: str, **fields: Any) -> Any:
-    """An instance of a ROS type: new("std_msgs/msg/Header", stamp=..., frame_id=...)."""
+    """Create an instance of a ROS type: new("std_msgs/msg/Header", stamp=..., frame_id=...)."""
     return typestore().types[type_name](**fields)
 
 
 def serialize(message: Any) -> bytes:
-    """CDR, little endian."""
+    """Return a ROS message as CDR bytes, little endian."""
     return bytes(typestore().serialize_cdr(message, message.__msgtype__))
 
 
 def time_of(stamp_ns: int) -> Any:
-    """builtin_interfaces/Time; beyond 2038 the seconds are clipped (the writer notices)."""
+    """Return a stamp as builtin_interfaces/Time; seconds after 2038 are clipped.
+
+    The writer of recordings detects a clipped stamp and stores the exact one in a "fields" record.
+    """
     sec, nanosec = divmod(stamp_ns, 10**9)
     return new("builtin_interfaces/msg/Time", sec=min(sec, _SEC_LIMIT - 1), nanosec=nanosec)
 
 
 def header(stamp_ns: int, frame_id: str) -> Any:
-    """std_msgs/Header."""
+    """Return a std_msgs/Header."""
     return new("std_msgs/msg/Header", stamp=time_of(stamp_ns), frame_id=frame_id)
 
 
 def stamp_ns_of(time: Any) -> int:
-    """int64 ns of a ROS 1 or ROS 2 time."""
+    """Return the int64 nanoseconds of a ROS 1 or ROS 2 time."""
     return int(time.sec) * 10**9 + int(time.nanosec)
 
 
 def vector(values: np.ndarray) -> Any:
-    """geometry_msgs/Vector3 of [3]."""
+    """Return a vector [3] as geometry_msgs/Vector3."""
     x, y, z = (float(v) for v in values)
     return new("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
 
 
 def quaternion(R: np.ndarray) -> Any:
-    """geometry_msgs/Quaternion of a rotation [3, 3]."""
+    """Return a rotation [3, 3] as geometry_msgs/Quaternion."""
     x, y, z, w = (float(v) for v in quat_xyzw_from_matrix(R))
     return new("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
 
 
 def pose(T: np.ndarray) -> Any:
-    """geometry_msgs/Pose of a transform [4, 4]."""
+    """Return a transform [4, 4] as geometry_msgs/Pose."""
     x, y, z = (float(v) for v in T[:3, 3])
     position = new("geometry_msgs/msg/Point", x=x, y=y, z=z)
     return new("geometry_msgs/msg/Pose", position=position, orientation=quaternion(T[:3, :3]))
 
 
 def tf(stamp_ns: int, parent: str, child: str, T_parent_child: np.ndarray) -> Any:
-    """geometry_msgs/TransformStamped."""
+    """Return a transform [4, 4] as geometry_msgs/TransformStamped."""
     transform = new(
         "geometry_msgs/msg/Transform",
         translation=vector(T_parent_child[:3, 3]),
@@ -94,22 +97,22 @@ def tf(stamp_ns: int, parent: str, child: str, T_parent_child: np.ndarray) -> An
 
 
 def tf_message(transforms: list[Any]) -> Any:
-    """tf2_msgs/TFMessage."""
+    """Return a list of TransformStamped as tf2_msgs/TFMessage."""
     return new("tf2_msgs/msg/TFMessage", transforms=transforms)
 
 
 def transform_of(position: Any, orientation: Any) -> np.ndarray:
-    """[4, 4] of a ROS position (or translation) and orientation.
+    """Return the transform [4, 4] of a ROS position (or translation) and orientation.
 
     Raises:
-        ValueError: the quaternion has no direction.
+        ValueError: the quaternion is zero or not finite.
     """
     quat_wxyz = np.array([orientation.w, orientation.x, orientation.y, orientation.z])
     return make_transform(matrix_from_quat_wxyz(quat_wxyz), np.array([position.x, position.y, position.z]))
 
 
-# What rosbags' generated deserialisers raise on rubbish, besides its own error.
-_RUBBISH = (
+# Exceptions that rosbags' generated deserialisers raise on invalid bytes.
+_DESERIALISE_ERRORS = (
     SerdeError,
     ValueError,
     struct.error,
@@ -122,12 +125,12 @@ _RUBBISH = (
 
 
 def deserialize(data: bytes, type_name: str) -> Any:
-    """ROS message of CDR bytes.
+    """Return the ROS message in CDR bytes.
 
     Raises:
-        ValueError: not that message.
+        ValueError: the bytes are not a message of this type.
     """
     try:
         return typestore().deserialize_cdr(data, type_name)
-    except _RUBBISH as error:
+    except _DESERIALISE_ERRORS as error:
         raise ValueError(f"not a {type_name}: {error}") from error

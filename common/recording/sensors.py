@@ -1,4 +1,4 @@
-"""What a robot's sensors publish: our topic, the word people use for it, and the ROS types that carry it."""
+"""Kinds of sensor data of a robot: their names in options, topics, message classes and ROS message types."""
 
 from __future__ import annotations
 
@@ -8,24 +8,24 @@ from beamsplat.common import messages as m
 from beamsplat.common.recording.from_ros import fields_of
 
 
-class Sensor(NamedTuple):
+class SensorType(NamedTuple):
     """One kind of sensor data."""
 
-    word: str
+    name: str  # in options and texts, for example "image" in `image_topic`
     topic: str
     cls: type[m.Message]
-    ros_types: tuple[str, ...]  # best first
+    ros_types: tuple[str, ...]  # in order of preference
 
 
-SENSORS: dict[str, Sensor] = {
-    sensor.word: sensor
+SENSORS: dict[str, SensorType] = {
+    sensor.name: sensor
     for sensor in (
-        Sensor(
+        SensorType(
             "image", "camera/image", m.Image, ("sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/Image")
         ),
-        Sensor("scan", "lidar/scan", m.Scan, ("sensor_msgs/msg/LaserScan",)),
-        Sensor("odometry", "wheel/odometry", m.WheelOdometry, ("nav_msgs/msg/Odometry",)),
-        Sensor(
+        SensorType("scan", "lidar/scan", m.Scan, ("sensor_msgs/msg/LaserScan",)),
+        SensorType("odometry", "wheel/odometry", m.WheelOdometry, ("nav_msgs/msg/Odometry",)),
+        SensorType(
             "pose", "external/pose", m.ExternalPose,
             ("geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped"),
         ),
@@ -35,15 +35,15 @@ SENSORS: dict[str, Sensor] = {
 _CLASSES = {sensor.topic: sensor.cls for sensor in SENSORS.values()} | {"tick": m.Tick, "rig": m.Rig}
 
 
-def build(topic: str, fields: dict[str, Any]) -> m.Message:
-    """The message of one of the topics above, "rig" or "tick".
+def build_message(topic: str, fields: dict[str, Any]) -> m.Message:
+    """Create and validate the message of a sensor topic, "rig" or "tick".
 
     Raises:
-        ValueError: a field that the message refuses; says which and why.
+        ValueError: a field is invalid; the text names the field and the reason.
     """
     return _CLASSES[topic].model_validate(fields)
 
 
 def ros_fields(topic: str, ros_message: Any) -> dict[str, Any]:
-    """What a ROS message of one of these sensors holds, as the fields of our message, unchecked."""
+    """Return the fields of a sensor topic's message that a ROS message holds, not validated."""
     return fields_of(_CLASSES[topic], ros_message)

@@ -1,4 +1,4 @@
-"""The tree of fixed transforms of a robot: what is bolted to what, from /tf_static or constant /tf."""
+"""The tree of static transforms between a robot's frames, from /tf_static or constant transforms on /tf."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 
 from beamsplat.common.geometry.transforms import inverse
 
-# Best first. base_footprint lies on the floor by REP 120, as our body does.
+# In order of preference. base_footprint is on the floor by REP 120, like our body frame.
 BODY_NAMES = (
     "base_footprint",
     "body",
@@ -17,37 +17,40 @@ BODY_NAMES = (
     "robot_base",
     "chassis_link",
 )
-_SAME = 1e-6  # metres and rotation-matrix entries: below that a repeated transform has not moved
+_TOLERANCE = 1e-6  # metres and rotation matrix entries: a repeated transform within this has not changed
 
 
 class StaticFrames:
-    """Fixed transforms between named frames; a transform seen with two values is not fixed."""
+    """Static transforms between named frames; a transform received with two values is not static."""
 
     def __init__(self) -> None:
         self._parent: dict[str, tuple[str, np.ndarray]] = {}  # child -> (parent, T_parent_child)
-        self.moving: set[tuple[str, str]] = set()  # (parent, child) that changed
+        self.moving: set[tuple[str, str]] = set()  # (parent, child) whose transform changed
 
     def add(self, parent: str, child: str, T_parent_child: np.ndarray, *, replace: bool = False) -> None:
-        """Takes one transform [4, 4]. With `replace` a newer value wins (a latched publisher corrected
-        itself); without, a change marks the pair as moving."""
-        parent, child = clean(parent), clean(child)
+        """Add one transform [4, 4].
+
+        With `replace`, a new value replaces the old one: a latched publisher has corrected itself. Otherwise
+        a new value marks the pair of frames as moving and removes its transform.
+        """
+        parent, child = normalize_frame(parent), normalize_frame(child)
         if not child or parent == child or (parent, child) in self.moving:
             return
         known = self._parent.get(child)
         if known is None or replace:
             self._parent[child] = (parent, T_parent_child)
-        elif known[0] == parent and not np.allclose(known[1], T_parent_child, atol=_SAME, rtol=0.0):
+        elif known[0] == parent and not np.allclose(known[1], T_parent_child, atol=_TOLERANCE, rtol=0.0):
             self.moving.add((parent, child))
             del self._parent[child]
 
     @property
     def names(self) -> set[str]:
-        """All frames with a fixed place relative to another."""
+        """All frames that have a static transform to another frame."""
         return set(self._parent) | {parent for parent, _ in self._parent.values()}
 
     def find(self, a: str, b: str) -> np.ndarray | None:
-        """`T_a_b` [4, 4] along the tree, or None if no chain of fixed transforms joins them."""
-        a, b = clean(a), clean(b)
+        """Return `T_a_b` [4, 4], or None if no chain of static transforms connects the frames a and b."""
+        a, b = normalize_frame(a), normalize_frame(b)
         up_a, up_b = self._chain(a), self._chain(b)
         for ancestor, T_ancestor_a in up_a.items():
             if ancestor in up_b:
@@ -55,36 +58,41 @@ class StaticFrames:
         return None
 
     def path(self, a: str, b: str) -> list[str]:
-        """Frames on the way from a to b, for telling people; [] if there is none."""
-        up_a, up_b = list(self._chain(clean(a))), list(self._chain(clean(b)))
+        """Return the names of the frames on the path from a to b, for texts; [] if there is no path."""
+        up_a, up_b = list(self._chain(normalize_frame(a))), list(self._chain(normalize_frame(b)))
         common = next((frame for frame in up_a if frame in up_b), None)
         if common is None:
             return []
         return up_a[: up_a.index(common) + 1] + up_b[: up_b.index(common)][::-1]
 
     def body_frame(self, sensors: list[str], odometry_child: str) -> str | None:
-        """The robot's own frame: a customary name joined to a sensor; else the child of the odometry."""
-        known = self.names | {clean(odometry_child)} - {""}
+        """Return the frame to use as body: the first of `BODY_NAMES` connected to a sensor, else odometry's.
+
+        Args:
+            sensors: frames of the sensors.
+            odometry_child: child frame of the wheel odometry, "" = unknown.
+        """
+        known = self.names | {normalize_frame(odometry_child)} - {""}
         for name in BODY_NAMES:
             for frame in sorted(known):
                 joined = any(self.find(frame, sensor) is not None for sensor in sensors)
                 if frame.split("/")[-1] == name and (joined or not sensors):
                     return frame
-        return clean(odometry_child) or None
+        return normalize_frame(odometry_child) or None
 
     def _chain(self, frame: str) -> dict[str, np.ndarray]:
-        """Frame and its ancestors, each with `T_ancestor_frame`."""
+        """Return the frame and its ancestors, each with `T_ancestor_frame`."""
         chain = {frame: np.eye(4)}
         T = np.eye(4)
         while frame in self._parent:
             frame, T_parent_child = self._parent[frame]
-            if frame in chain:  # a loop in a broken tree
+            if frame in chain:  # a cycle in an invalid tree
                 break
             T = T_parent_child @ T
             chain[frame] = T
         return chain
 
 
-def clean(frame: str) -> str:
-    """Frame name without the leading slash of old ROS 1 drivers."""
+def normalize_frame(frame: str) -> str:
+    """Return a frame name without spaces at its ends and without the leading slash of old ROS 1 drivers."""
     return frame.strip().lstrip("/")

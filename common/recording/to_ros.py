@@ -1,8 +1,7 @@
-"""Our messages as the standard ROS 2 messages that Foxglove, RViz and `ros2 bag` know.
+"""Conversion of BeamSplat messages to standard ROS 2 messages, which Foxglove, RViz and `ros2 bag` can use.
 
-`records_of(topic, message)` lists what a recording holds for one message. At most one of them, the
-first with `role = "message"`, is what the reader reads back; those with `role = "display"` are there
-for other tools (transforms, CameraInfo) and say nothing that is not elsewhere.
+A recording holds at most one ROS message with `role = "message"` per BeamSplat message, from which the reader
+restores it. ROS messages with `role = "display"` (transforms, CameraInfo) are for other tools and redundant.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ class RosRecord(NamedTuple):
 
 
 def records_of(topic: str, message: m.Message) -> list[RosRecord]:
-    """The ROS side of a message on our `topic`; [] if ROS has no counterpart (Anchors, Tick, Health)."""
+    """Return the ROS messages of a message on `topic`; [] if ROS has no such type (Anchors, Tick, Health)."""
     convert = _CONVERTERS.get(type(message))
     return convert("/" + topic, message) if convert else []
 
@@ -35,18 +34,18 @@ def records_of(topic: str, message: m.Message) -> list[RosRecord]:
 def _image(topic: str, image: m.Image) -> list[RosRecord]:
     header = ros.header(image.stamp_ns, ros.FRAME_CAMERA)
     if image.encoding in ("jpeg", "png"):
-        name = topic + "/compressed"  # where image_transport looks for it
-        picture = ros.new(
+        name = topic + "/compressed"  # naming convention of image_transport
+        ros_image = ros.new(
             "sensor_msgs/msg/CompressedImage", header=header, format=image.encoding, data=image.data
         )
     else:
         name = topic
-        picture = ros.new(
+        ros_image = ros.new(
             "sensor_msgs/msg/Image",
             header=header, height=image.height_px, width=image.width_px, encoding=image.encoding,
             is_bigendian=0, step=image.step_bytes % 2**32, data=image.data,
         )  # fmt: skip
-    return [RosRecord(name, picture, "message")]
+    return [RosRecord(name, ros_image, "message")]
 
 
 def _scan(topic: str, scan: m.Scan) -> list[RosRecord]:
@@ -129,7 +128,7 @@ def _rig(topic: str, rig: m.Rig) -> list[RosRecord]:
 
 
 def camera_info(stamp_ns: int, camera: m.CameraModel) -> Any:
-    """sensor_msgs/CameraInfo of a camera."""
+    """Return the sensor_msgs/CameraInfo of a camera."""
     projection = np.hstack([camera.K, np.zeros((3, 1))])
     whole = ros.new(
         "sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
@@ -153,7 +152,7 @@ def _nav_odometry(stamp_ns: int, T_odom_body: np.ndarray, covariance: np.ndarray
 
 
 def _float32(value: float) -> float:
-    """Clipped to what a float32 holds; packing a larger number would raise."""
+    """Clip a value to the range of float32, because serialisation raises on larger values."""
     limit = float(np.finfo(np.float32).max)
     return float(np.clip(value, -limit, limit))
 

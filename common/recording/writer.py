@@ -1,4 +1,4 @@
-"""Writes our recordings: MCAP that Foxglove and `ros2 bag` open, and that a crash cannot spoil."""
+"""Writer of recordings: MCAP files for Foxglove and `ros2 bag`. A crash loses at most the last chunk."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ from beamsplat.common.recording.to_ros import RosRecord, records_of
 
 
 class RecordingError(OSError):
-    """A recording cannot go on, most often because the disk is full. What was written stays readable."""
+    """The recording has stopped, usually because the disk is full. The written part stays readable."""
 
 
 class _File:
-    """Unbuffered output whose `whole` is the end of the last complete chunk.
+    """Unbuffered output file; `chunk_end` is the end of the last complete chunk.
 
-    `mcap.Writer` writes each record in one call, so bytes reach the system as soon as a chunk ends, and
-    a kill -9 costs the chunk in memory and no more.
+    `mcap.Writer` writes each record with one call, so a chunk is passed to the operating system when it ends,
+    and kill -9 loses only the chunk in memory.
     """
 
     def __init__(self, path: Path) -> None:
         self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
         self.position = 0
-        self.whole = 0
+        self.chunk_end = 0
 
     def write(self, data: bytes) -> int:
         view = memoryview(data)
@@ -49,27 +49,30 @@ class _File:
         return self.position
 
     def flush(self) -> None:
-        self.whole = self.position
+        self.chunk_end = self.position
 
     def sync(self) -> None:
         os.fdatasync(self._fd)
 
-    def cut_to_whole(self) -> None:
-        os.ftruncate(self._fd, self.whole)
+    def truncate_to_chunk_end(self) -> None:
+        os.ftruncate(self._fd, self.chunk_end)
 
     def close(self) -> None:
         os.close(self._fd)
 
 
 class RecordingWriter:
-    """Context manager; `write` appends messages in any order of topics.
+    """Writer of one recording, usable as a context manager; messages may be of any topics in any order.
 
-    `path` is a folder to make (a ROS 2 bag: NAME_0.mcap and metadata.yaml) or a file ending in .mcap.
-    A chunk is closed after `chunk_bytes` or `chunk_s` of log time, whichever comes first: that much a
-    crash can cost.
+    Args:
+        path: folder to create (a ROS 2 bag with NAME_0.mcap and metadata.yaml), or a file ending in .mcap.
+        chunk_bytes, chunk_s: a chunk ends at this size or duration of log time; a crash loses one chunk.
+        compression: of the chunks.
+        sync: call fdatasync after each chunk, against power loss.
+        overwrite: replace an existing recording.
 
     Raises:
-        UserError: the path exists already (unless `overwrite`), or cannot be made.
+        UserError: the path exists (without `overwrite`) or cannot be created.
     """
 
     def __init__(
@@ -83,8 +86,8 @@ class RecordingWriter:
         overwrite: bool = False,
     ) -> None:
         self.path = Path(path)
-        self.counts: Counter[str] = Counter()  # messages written, by our topic
-        self.lost: Counter[str] = Counter()  # messages that did not reach the disk, by our topic
+        self.counts: Counter[str] = Counter()  # written messages by topic
+        self.lost: Counter[str] = Counter()  # messages that were not written to disk, by topic
         self._sync = sync
         self._chunk_ns = round(chunk_s * 1e9)
         self._chunk_bytes = chunk_bytes
@@ -94,21 +97,21 @@ class RecordingWriter:
         self._channels: dict[tuple[Any, ...], int] = {}
         self._schemas: dict[str, int] = {}
         self._sequences: Counter[str] = Counter()
-        self._ros_topics: dict[str, tuple[str, int]] = {}  # for metadata.yaml: type and count
+        self._ros_topics: dict[str, tuple[str, int]] = {}  # ROS topic -> (type, count), for metadata.yaml
         self._times_ns: list[int] = []  # first and last log time
         self._failure = ""
         self._closed = False
         self.file_path = self._make_path(overwrite)
         self._file = _File(self.file_path)
-        # Chunks end in `flush` only, between two messages: a message and its fields stay together.
+        # Chunks end in `flush` only, between two messages, so that a message and its fields are in one chunk.
         self._writer = Writer(self._file, chunk_size=2**62, compression=compression)
         self._writer.start(layout.PROFILE, layout.LIBRARY)
 
     def write(self, topic: str, message: Message, log_time_ns: int, header: Header | None = None) -> None:
-        """Appends one message; `log_time_ns` is its arrival.
+        """Append one message; `log_time_ns` is its arrival time.
 
         Raises:
-            RecordingError: the disk is full or gone; this message and all later ones are counted in `lost`.
+            RecordingError: writing failed; this message and all later ones are counted in `lost`.
         """
         if self._failure or self._closed:
             self.lost[topic] += 1
@@ -127,7 +130,7 @@ class RecordingWriter:
             raise self._fail(error) from error
 
     def flush(self) -> None:
-        """Ends the chunk in progress: what was written so far survives a crash of this process."""
+        """End the current chunk: all messages so far are kept if this process crashes."""
         try:
             self._writer.flush()
             if self._sync:
@@ -139,7 +142,7 @@ class RecordingWriter:
         self._in_chunk.clear()
 
     def close(self) -> None:
-        """Writes index and metadata.yaml; the recording is whole then. Harmless when repeated."""
+        """Complete the recording: write the index and metadata.yaml. Further calls do nothing."""
         if self._closed:
             return
         self._closed = True
@@ -170,21 +173,21 @@ class RecordingWriter:
         single = self.path.suffix == ".mcap"
         file = self.path if single else self.path / f"{self.path.name}_0.mcap"
         if self.path.exists() and not overwrite:
-            raise UserError(f"{self.path}: exists already and is not overwritten; choose another name")
+            raise UserError(f"{self.path}: exists already and is not overwritten: choose another name")
         try:
             file.parent.mkdir(parents=True, exist_ok=True)
-            if overwrite:  # takes away what a recording of this name consists of, nothing else
+            if overwrite:  # remove the files of a recording of this name only
                 file.unlink(missing_ok=True)
                 if not single:
                     (self.path / "metadata.yaml").unlink(missing_ok=True)
         except OSError as error:
-            raise UserError(f"{self.path}: cannot be made: {error.strerror}") from error
+            raise UserError(f"{self.path}: cannot be created: {error.strerror}") from error
         return file
 
     def _write_records(
         self, topic: str, message: Message, log_time_ns: int, header: Header | None, sequence: int
     ) -> None:
-        # The fields come first, so that a reader has them when the ROS message arrives.
+        # The fields are written first, so that a reader has them when it reads the ROS message.
         records = records_of(topic, message)
         carried = next((record for record in records if record.role == "message"), None)
         when = (log_time_ns, log_time_ns if header is None else header.publish_ns, sequence % 2**32)
@@ -252,7 +255,7 @@ class RecordingWriter:
         return self._schemas[name]
 
     def _fail(self, error: OSError) -> RecordingError:
-        """Cuts the file back to its last whole chunk and remembers why."""
+        """Stop the recording: truncate the file to its last complete chunk, and return the error to raise."""
         if isinstance(error, RecordingError):
             return error
         reason = (
@@ -264,9 +267,9 @@ class RecordingWriter:
         self._in_chunk.clear()
         self._failure = (
             f"{self.file_path}: recording stopped because {reason}; "
-            f"{self.counts.total()} messages are safe, {self.lost.total()} were lost"
+            f"{self.counts.total()} messages are saved, {self.lost.total()} were lost"
         )
-        self._file.cut_to_whole()
+        self._file.truncate_to_chunk_end()
         return RecordingError(self._failure)
 
     def _write_metadata(self) -> None:
@@ -277,8 +280,8 @@ class RecordingWriter:
 
 
 def _carried_fields(message: Message, cdr: bytes, type_name: str) -> dict[str, Any]:
-    """What a reader will get back from the ROS message alone, found out by reading it."""
+    """Return the fields that a reader restores from the ROS message alone, by deserialising it."""
     try:
         return fields_of(type(message), ros_types.deserialize(cdr, type_name))
-    except ValueError:  # nothing that can be read back: all fields go beside it
+    except ValueError:  # the ROS message cannot be read back: all fields are stored in the "fields" record
         return {}

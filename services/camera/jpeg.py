@@ -14,7 +14,7 @@ from functools import lru_cache
 import numpy as np
 
 from beamsplat.common.compiled import kernel
-from beamsplat.common.recording.picture import is_whole
+from beamsplat.common.recording.image_header import is_complete_image
 
 _BASELINE = (0xC0, 0xC1)
 _STAND_ALONE = frozenset([0x01, *range(0xD0, 0xD8)])
@@ -22,7 +22,7 @@ _STAND_ALONE = frozenset([0x01, *range(0xD0, 0xD8)])
 
 def is_intact(data: bytes) -> bool:
     """Return whether no damage is found in a JPEG."""
-    if not data.startswith(b"\xff\xd8") or not is_whole(data):
+    if not data.startswith(b"\xff\xd8") or not is_complete_image(data):
         return False
     try:
         scan = _parse_segments(data)

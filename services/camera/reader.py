@@ -13,7 +13,7 @@ from typing import NamedTuple, Protocol
 
 import cv2
 
-from beamsplat.common.recording.picture import picture_head
+from beamsplat.common.recording.image_header import read_image_header
 from beamsplat.services.camera.frame import CameraEnded, CameraError, CapturedFrame
 from beamsplat.services.camera.jpeg import is_intact
 
@@ -133,7 +133,7 @@ class CameraReader:
             jpeg = data.tobytes()
         elif not is_intact(jpeg):
             return self._reject("damaged")
-        head = picture_head(jpeg)
+        head = read_image_header(jpeg)
         if head is None or head.encoding != "jpeg":
             return self._reject("not a JPEG")
         if self._size_px is not None and (head.width_px, head.height_px) != self._size_px:

@@ -16,10 +16,10 @@ import numpy as np
 from beamsplat.common.errors import UserError
 from beamsplat.common.geometry.rig import RigFile, load_rig
 from beamsplat.common.recording import calibration as cal
-from beamsplat.common.recording.picture import is_whole
+from beamsplat.common.recording.image_header import is_complete_image
 from beamsplat.common.recording.ros_types import deserialize, transform_of
-from beamsplat.common.recording.sensors import SENSORS, build, ros_fields
-from beamsplat.common.recording.static_frames import StaticFrames, clean
+from beamsplat.common.recording.sensors import SENSORS, build_message, ros_fields
+from beamsplat.common.recording.static_frames import StaticFrames, normalize_frame
 from beamsplat.services.ros2.tf_odometry import TfOdometry
 from beamsplat.services.ros2.topics import (
     CAMERA_INFO,
@@ -171,13 +171,13 @@ class RosRobot:
     def _rig_from_robot(self, chosen: dict[str, str]) -> RigFile | None:
         found = cal.Calibration()
         frames = {
-            sensor: clean(self._first_messages[chosen[kind]][1].header.frame_id)
+            sensor: normalize_frame(self._first_messages[chosen[kind]][1].header.frame_id)
             for sensor, kind in (("camera", "image"), ("lidar", "scan"))
             if kind in chosen
         }
         child = ""
         if "odometry" in chosen:
-            child = clean(self._first_messages[chosen["odometry"]][1].child_frame_id)
+            child = normalize_frame(self._first_messages[chosen["odometry"]][1].child_frame_id)
         elif (edge := self._tf_odometry.odometry_edge()) is not None:
             child = edge[1]
         tree = self._static_tree
@@ -218,10 +218,10 @@ class RosRobot:
             if fields["stamp_ns"] == 0:
                 fields["stamp_ns"] = received_ns
             if kind == "odometry":
-                cal.to_body(fields, self._T_child_body)
+                cal.move_odometry_to_body(fields, self._T_child_body)
             if kind == "image":
                 self._check_image(fields)
-            built = build(sensor.topic, fields)
+            built = build_message(sensor.topic, fields)
         except ValueError as error:
             self._reject(topic, _first_line(error))
             return []
@@ -232,7 +232,9 @@ class RosRobot:
     def _check_image(self, fields: dict[str, Any]) -> None:
         camera = self.rig.camera
         size = fields.get("width_px"), fields.get("height_px")
-        if None in size or (fields["encoding"] in ("jpeg", "png") and not is_whole(fields["data"].data)):
+        if None in size or (
+            fields["encoding"] in ("jpeg", "png") and not is_complete_image(fields["data"].data)
+        ):
             raise ValueError("the image is damaged")
         if camera is not None and size != (camera.width_px, camera.height_px):
             raise ValueError(
@@ -251,16 +253,16 @@ class RosRobot:
         """Return wheel odometry from a message of /tf, if there is no Odometry topic."""
         found = []
         for stamped, T in _transforms(message):
-            edge = clean(stamped.header.frame_id), clean(stamped.child_frame_id)
+            edge = normalize_frame(stamped.header.frame_id), normalize_frame(stamped.child_frame_id)
             if edge != self._odometry_edge or topic.endswith("tf_static"):
                 continue
             stamp = stamped.header.stamp
             fields = self._tf_odometry.odometry_fields(int(stamp.sec) * 10**9 + int(stamp.nanosec), T)
             if fields is None:
                 continue
-            cal.to_body(fields, self._T_child_body)
+            cal.move_odometry_to_body(fields, self._T_child_body)
             try:
-                found.append((SENSORS["odometry"].topic, build(SENSORS["odometry"].topic, fields)))
+                found.append((SENSORS["odometry"].topic, build_message(SENSORS["odometry"].topic, fields)))
             except ValueError as error:
                 self._reject(topic, _first_line(error))
                 continue

@@ -19,8 +19,8 @@ from beamsplat.common.messages import MESSAGES, Anchors, Image, Odometry, Scan, 
 from beamsplat.common.messages.codec import decode, schema_of
 from beamsplat.common.messages.header import Header
 from beamsplat.common.recording import RecordingError, RecordingReader, RecordingWriter, is_recording
+from beamsplat.common.recording.image_header import read_image_header
 from beamsplat.common.recording.mcap_file import McapFile
-from beamsplat.common.recording.picture import picture_head
 from beamsplat.common.topics import TOPICS
 from tests.common.messages.random_messages import assert_same, random_message
 from tests.common.samples import sample_messages
@@ -240,7 +240,7 @@ def test_what_is_no_recording_is_named(tmp_path):
     for name, what in [
         ("empty", "no MCAP"),
         ("text.mcap", "not an MCAP"),
-        ("foreign.mcap", "not one of our"),
+        ("foreign.mcap", "not a BeamSplat recording"),
     ]:
         assert not is_recording(tmp_path / name)
         with pytest.raises(UserError, match=what):
@@ -329,13 +329,13 @@ def test_pictures_tell_their_size(extension, encoding):
     import cv2
 
     data = cv2.imencode(extension, np.zeros((37, 53, 3), np.uint8))[1].tobytes()
-    assert picture_head(data) == (encoding, 53, 37)
+    assert read_image_header(data) == (encoding, 53, 37)
     for cut in range(0, 30):
-        assert picture_head(data[:cut]) in (None, (encoding, 53, 37))
+        assert read_image_header(data[:cut]) in (None, (encoding, 53, 37))
 
 
 def test_rubbish_is_no_picture():
     rng = np.random.default_rng(2)
     for _ in range(500):
-        assert picture_head(rng.bytes(rng.integers(0, 40))) is None
-        picture_head(b"\xff\xd8" + rng.bytes(rng.integers(0, 60)))
+        assert read_image_header(rng.bytes(rng.integers(0, 40))) is None
+        read_image_header(b"\xff\xd8" + rng.bytes(rng.integers(0, 60)))

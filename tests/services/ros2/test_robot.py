@@ -126,7 +126,7 @@ def test_a_ros2_robot_needs_no_options(tmp_path, free_endpoint):
 @pytest.mark.parametrize(
     ("drive", "said"),
     [
-        (Drive(seconds=60.0, tf=""), "calibration is missing: where the"),
+        (Drive(seconds=60.0, tf=""), "calibration is missing: the position of the"),
         (Drive(seconds=60.0, info_px=None), "no sensor_msgs/CameraInfo was received"),
         (Drive(seconds=60.0, odometry=False, extra_scan="/scan_back"), "several topics for scan: /scan, /scan_back"),
         (Drive(seconds=60.0, info_px=(32, 24)), "K is for 32x24 px"),

@@ -1,4 +1,4 @@
-"""Size and kind of a compressed picture from its first bytes; pixels are never decoded."""
+"""Encoding and size of a compressed image from its first bytes, without decoding its pixels."""
 
 from __future__ import annotations
 
@@ -10,27 +10,27 @@ _PNG = b"\x89PNG\r\n\x1a\n"
 _START_OF_FRAME = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 
 
-class Picture(NamedTuple):
-    """What the head of a compressed picture says."""
+class ImageHeader(NamedTuple):
+    """Encoding and size of a compressed image."""
 
     encoding: Literal["jpeg", "png"]
     width_px: int
     height_px: int
 
 
-def picture_head(data: bytes | memoryview) -> Picture | None:
-    """Kind and size of a JPEG or PNG; None for anything else or a head that is cut short."""
+def read_image_header(data: bytes | memoryview) -> ImageHeader | None:
+    """Return encoding and size of a JPEG or PNG; None for other formats and truncated headers."""
     head = memoryview(data)
     if bytes(head[:8]) == _PNG and len(head) >= 24:
         width, height = struct.unpack_from(">II", head, 16)
-        return Picture("png", width, height)
+        return ImageHeader("png", width, height)
     if bytes(head[:2]) == b"\xff\xd8":
         return _jpeg(head)
     return None
 
 
-def _jpeg(data: memoryview) -> Picture | None:
-    """Walks the segments to the frame header (ITU-T T.81, B.1 and B.2.2)."""
+def _jpeg(data: memoryview) -> ImageHeader | None:
+    """Search the segments of a JPEG for its frame header (ITU-T T.81, B.1 and B.2.2)."""
     position = 2
     while position + 9 <= len(data):
         if data[position] != 0xFF:
@@ -42,19 +42,19 @@ def _jpeg(data: memoryview) -> Picture | None:
             position += 2
         elif marker in _START_OF_FRAME:
             height, width = struct.unpack_from(">HH", data, position + 5)
-            return Picture("jpeg", width, height)
+            return ImageHeader("jpeg", width, height)
         else:
             position += 2 + struct.unpack_from(">H", data, position + 2)[0]
     return None
 
 
-def is_whole(data: bytes | memoryview) -> bool:
-    """Whether a JPEG or PNG has its beginning and its end, so that nothing was cut off.
+def is_complete_image(data: bytes | memoryview) -> bool:
+    """Return whether a JPEG or PNG has a header and an end marker, so that it is not truncated.
 
-    Cameras pad their buffers: zeros may follow the end mark. Wrong bytes between are not looked for.
+    Zeros after the end marker are allowed, because cameras pad their buffers. Bytes between are not checked.
     """
     view = memoryview(data)
-    head = picture_head(view)
+    head = read_image_header(view)
     if head is None:
         return False
     tail = bytes(view[-4096:]).rstrip(b"\0")
