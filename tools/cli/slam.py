@@ -59,7 +59,7 @@ def slam(
         lidar = source.rig().lidar
         if lidar is None:
             raise UserError(
-                f"{bag}: the calibration has no lidar; give a calibration with --rig (`beamsplat rig` drafts one)"
+                f"{bag}: the calibration has no lidar; give one with --rig (`beamsplat rig` drafts it)"
             )
         bar = Progress(
             TextColumn("mapping"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),

@@ -1,4 +1,4 @@
-"""The two submaps being filled: which scans enter them, and what moves in them."""
+"""The two submaps that new scans are inserted into, and the detection of dynamic objects in them."""
 
 from __future__ import annotations
 
@@ -33,12 +33,17 @@ Result = TypeVar("Result")
 
 @dataclass
 class _Active:
+    """An active submap: its entry in the pose graph and its growing local map."""
+
     submap: Submap
     local: LocalMap
 
 
 class ActiveSubmaps:
-    """Every keynode goes into two submaps; the older of them is what scans are matching_target to."""
+    """The one or two submaps that are being filled, as in Cartographer.
+
+    Every trajectory node is inserted into both; scans are matched to the older one.
+    """
 
     def __init__(self, settings: LidarSlamSettings, pose_graph: PoseGraph) -> None:
         self.settings = settings
@@ -50,16 +55,16 @@ class ActiveSubmaps:
 
     @property
     def matching_target(self) -> LocalMap:
-        """The map the next scan is matching_target to."""
+        """Return the local map that the next scan is matched to: the older active submap."""
         return self._active[0].local
 
     @property
     def active_ids(self) -> set[int]:
-        """Submaps still being filled."""
+        """Return the ids of the active submaps."""
         return {a.submap.id for a in self._active}
 
     def dynamic_returns(self, scan: PreparedScan, pose_odom_body: np.ndarray) -> np.ndarray:
-        """Returns on things that were not there before, bool [M]."""
+        """Return a mask bool [M] of the returns on dynamic objects, i.e. in space that was observed free."""
         dynamic = np.zeros(len(scan), dtype=bool)
         if not self._active:
             return dynamic
@@ -89,10 +94,11 @@ class ActiveSubmaps:
         match: Match,
         force_new_submap: bool = False,
     ) -> bool:
-        """Put the scan into the active submaps if it adds anything (motion filter).
+        """Insert the scan into the active submaps if it passes the motion filter; return whether it did.
 
-        A `force_new_submap` ends the older submap early: what comes after a blind stretch hangs together, but only loosely
-        on what was before, and within one submap nothing could bend.
+        With `force_new_submap` the older submap is finished early. It is set after a stretch with an
+        unobservable direction: the poses after it are consistent among themselves, but only loosely tied to
+        the poses before, and the pose graph can correct this only between submaps, not within one.
         """
         self._force_new_submap = self._force_new_submap or force_new_submap
         if self._active and not self._passes_motion_filter(stamp_ns, pose_odom_body):
@@ -115,12 +121,13 @@ class ActiveSubmaps:
         node = TrajectoryNode(
             self.pose_graph.next_node_id, stamp_ns, pose_odom_body, NodeScan.of(scan, dynamic)
         )
-        # Scans in a row slip together if they slip: in their own submap they stay together.
+        # Consecutive scans share errors along an unobservable direction, so within their own submap the
+        # relative poses keep the full information.
         rigid = match.information if match.full_information is None else match.full_information
         matched = edge_information(rigid, s.edge_sigma_m, s.edge_sigma_rad)
         edges = []
         for active in self._active:
-            active.submap.frozen = None  # what was frozen for a last optimisation goes on growing
+            active.submap.frozen = None  # discard a temporary freeze: the submap grows again
             pose = se2.between(active.local.pose_odom_submap, pose_odom_body)
             active.local.surfels.insert(
                 se2.transform(pose, scan.points_body),
@@ -139,6 +146,7 @@ class ActiveSubmaps:
         return True
 
     def _passes_motion_filter(self, stamp_ns: int, pose_odom_body: np.ndarray) -> bool:
+        """Return whether the motion or the time since the last node is large enough for a new one."""
         s = self.settings
         moved = se2.between(self.last_node.pose_odom_body, pose_odom_body)
         return (
@@ -148,18 +156,18 @@ class ActiveSubmaps:
         )
 
     def close(self) -> None:
-        """Finish the active submaps; the next keynode starts new ones."""
+        """Finish the active submaps; the next node starts new ones."""
         for active in self._active:
             active.submap.frozen = freeze(active.local.surfels)
         self._active = []
 
     def freeze_active(self) -> None:
-        """Let the active submaps take part in loop closure as they are; they go on being filled."""
+        """Freeze the current state of the active submaps for loop closure; they continue to grow."""
         for active in self._active:
             active.submap.frozen = freeze(active.local.surfels)
 
     def with_frozen(self, work: Callable[[], Result]) -> Result:
-        """What `work` gives while the active submaps look finished (saving)."""
+        """Return `work()`, called while the active submaps are temporarily frozen (for saving)."""
         growing = [active for active in self._active if active.submap.frozen is None]
         for active in growing:
             active.submap.frozen = freeze(active.local.surfels)
@@ -170,7 +178,7 @@ class ActiveSubmaps:
                 active.submap.frozen = None
 
     def count_grids(self) -> list[CountGrid]:
-        """Hits and misses of the submaps that are not frozen."""
+        """Return the hit and miss grids of the active submaps that are not frozen."""
         return [
             CountGrid(
                 a.local.surfels.hits,

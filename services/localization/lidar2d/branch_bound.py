@@ -1,4 +1,4 @@
-"""Branch and bound over poses (Hess et al. 2016, section V-B): the best match in a large window, exactly."""
+"""Branch-and-bound scan matching (Hess et al. 2016, section V-B): the exact best pose in a large window."""
 
 from __future__ import annotations
 
@@ -9,13 +9,17 @@ import numpy as np
 
 from beamsplat.common.compiled import kernel
 
-SAME_POSE_CELLS = 3  # leaves this close are the same place
-LEVELS = 6  # the coarsest level looks at 2^5 search cells at once
+SAME_POSE_CELLS = 3  # leaves within this distance count as the same pose
+LEVELS = 6  # a cell of the coarsest level covers 2^5 x 2^5 search cells
 
 
 @dataclass(frozen=True)
 class SearchPyramid:
-    """Level h holds the maximum of the field over 2^h x 2^h search cells starting at each cell."""
+    """Precomputed grids for branch and bound.
+
+    Level h holds at each cell the maximum of the likelihood field over the 2^h x 2^h search cells that start
+    there.
+    """
 
     levels: np.ndarray  # uint8 [LEVELS, H, W], padded by 2^(LEVELS - 1) on all sides
     row0: int  # search cell of the first row of the padded arrays
@@ -25,6 +29,7 @@ class SearchPyramid:
 
 @kernel
 def _fill(field: np.ndarray, shift_r: int, shift_c: int, levels: np.ndarray) -> None:
+    """Fill all levels from the likelihood field."""
     for r in range(field.shape[0]):
         for c in range(field.shape[1]):
             rr, cc = (r + shift_r) >> 1, (c + shift_c) >> 1
@@ -44,8 +49,10 @@ def _fill(field: np.ndarray, shift_r: int, shift_c: int, levels: np.ndarray) -> 
 
 
 def build_pyramid(field: np.ndarray, row0: int, col0: int, cell_m: float) -> SearchPyramid:
-    """SearchPyramid of a likelihood field uint8 [H, W] whose first cell is (row0, col0); search cells are twice
-    as large."""
+    """Return the search pyramid of a likelihood field uint8 [H, W] whose first cell is (row0, col0).
+
+    Search cells are twice as large as the cells of the field.
+    """
     pad = 1 << (LEVELS - 1)
     r0, c0 = row0 >> 1, col0 >> 1
     rows = ((row0 + field.shape[0]) >> 1) - r0 + 1
@@ -57,6 +64,7 @@ def build_pyramid(field: np.ndarray, row0: int, col0: int, cell_m: float) -> Sea
 
 @kernel
 def _score(level: np.ndarray, rows: np.ndarray, cols: np.ndarray, dr: int, dc: int) -> float:
+    """Return the mean likelihood of the returns at the offset (dr, dc)."""
     total = 0
     for i in range(rows.shape[0]):
         r, c = rows[i] + dr, cols[i] + dc
@@ -67,8 +75,10 @@ def _score(level: np.ndarray, rows: np.ndarray, cols: np.ndarray, dr: int, dc: i
 
 @kernel
 def _row_for(found: np.ndarray, count: int, score: float, yaw: int, dr: int, dc: int, near_yaw: int) -> int:
-    """Where a leaf goes: the row of a weaker neighbour, a new row, or -1 if a neighbour is better. Without
-    this the hundred poses around the best would crowd out all other places."""
+    """Return the row of the result table for a leaf, or -1 if a better leaf is nearby.
+
+    A weaker leaf nearby is replaced. Otherwise the many poses around the best one would fill the table.
+    """
     for i in range(count):
         if (
             abs(found[i, 2] - dr) <= SAME_POSE_CELLS
@@ -81,7 +91,10 @@ def _row_for(found: np.ndarray, count: int, score: float, yaw: int, dr: int, dc:
 
 @kernel
 def _make_room(found: np.ndarray, best: float, keep: float) -> tuple[float, int]:
-    """Be pickier until at least a quarter of the table is free; the best never goes."""
+    """Raise `keep` until at least a quarter of the table is free; return the new `keep` and the row count.
+
+    The best leaf is never removed.
+    """
     count = found.shape[0]
     while 4 * count > 3 * found.shape[0]:
         keep += 0.2 * (1.0 - keep)
@@ -91,7 +104,7 @@ def _make_room(found: np.ndarray, best: float, keep: float) -> tuple[float, int]
                 found[kept] = found[i]
                 kept += 1
         if keep > 0.9999:
-            kept = min(kept, found.shape[0] // 2)  # half a table of equals: any of them will do
+            kept = min(kept, found.shape[0] // 2)  # all scores are equal: keep an arbitrary half
         count = kept
     return keep, count
 
@@ -103,11 +116,11 @@ def _search(
     cols: np.ndarray,
     steps: int,  # window of +-steps cells
     min_score: float,
-    keep: float,  # leaves better than keep * best are reported
-    near_yaw: int,  # leaves within so many yaw steps are the same place
+    keep: float,  # leaves with a score above keep * best are reported
+    near_yaw: int,  # leaves within this many yaw steps count as the same pose
     found: np.ndarray,  # out float64 [M, 4] score, yaw index, dr, dc
 ) -> tuple[int, int]:
-    """Depth first, best child first. Returns (number of leaves reported, nodes visited)."""
+    """Search depth first, best child first; return (number of leaves reported, nodes visited)."""
     top = levels.shape[0] - 1
     width = 1 << top
     n_angles = rows.shape[0]
@@ -178,7 +191,11 @@ def branch_and_bound(
     max_found: int = 512,
     min_step_rad: float = math.radians(0.8),
 ) -> list[tuple[float, np.ndarray]]:
-    """Distinct poses (score, pose_map_body), best first; empty if none reaches `min_score`."""
+    """Return distinct poses (score, pose [3] of the body in the pyramid's frame), best first.
+
+    The list is empty if no pose reaches `min_score`. Poses with a score below `keep` times the best are
+    dropped.
+    """
     if len(points) == 0:
         return []
     reach = np.percentile(np.hypot(points[:, 0], points[:, 1]), 80)

@@ -24,7 +24,7 @@ def correlate(
     step_yaw_rad: float,
     scores: np.ndarray,  # out float32 [2 steps_yaw + 1, 2 steps_xy + 1, 2 steps_xy + 1], mean likelihood
 ) -> None:
-    """Real-time correlative scan matching (Olson 2009): the score of every pose in a window."""
+    """Compute the mean likelihood of every pose in a window (Olson 2009)."""
     n = points.shape[0]
     rows, cols = np.empty(n, dtype=np.int32), np.empty(n, dtype=np.int32)
     for a in range(2 * steps_yaw + 1):
@@ -55,8 +55,11 @@ def search(
     candidates: int = 3,
     step_yaw_rad: float = math.radians(1.5),
 ) -> list[tuple[float, np.ndarray]]:
-    """The best distinct poses (score, pose_map_body) of a window; the score falls with the squared distance
-    from the centre by `prior_weight` at its border."""
+    """Return the best distinct poses (score, pose [3] of the body in the map's frame) of a window.
+
+    For the ranking, the score is reduced with the squared distance from the window's centre, by
+    `prior_weight` at its border.
+    """
     stride = 2
     steps_xy = max(1, math.ceil(window_m / (stride * tables.cell_m)))
     steps_yaw = max(1, math.ceil(window_rad / step_yaw_rad))

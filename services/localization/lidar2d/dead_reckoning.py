@@ -1,4 +1,4 @@
-"""Along a corridor the scans say nothing; there the wheels count the way, from the last scan that knew."""
+"""Dead reckoning along the direction that scan matching cannot observe, for example along a corridor."""
 
 from __future__ import annotations
 
@@ -7,24 +7,25 @@ import numpy as np
 from beamsplat.services.localization.lidar2d import se2
 from beamsplat.services.localization.lidar2d.odometry import OdometryBuffer
 
-MIN_TRUST = 0.7  # trust along the weak direction above which a scan knows where it is
-CORRECTION_GAIN = 0.5  # stamps of wheels and scans jitter: the pose follows the count, it does not copy it
-CHECK_DISTANCE_M = 1.0  # the wheels are checked against the scans over stretches of this length
-MAX_ERROR_RATIO = 0.15  # and are used while they are wrong by less than this share of the way
-DEGENERATE_DISTANCE_M = (
-    1.0  # after such a way the scans are no longer held to what they were before, see take_recovery()
-)
-WHEEL_SIGMA_M = 0.15  # what the count is worth in an edge of the pose graph
+MIN_TRUST = 0.7  # observability of the weak direction, below which a match is degenerate
+# fraction of the difference applied per scan; below 1, because the stamps of wheels and scans jitter
+CORRECTION_GAIN = 0.5
+CHECK_DISTANCE_M = 1.0  # distance over which the odometry is compared with the scans
+MAX_ERROR_RATIO = 0.15  # relative distance error, above which the odometry is not used
+DEGENERATE_DISTANCE_M = 1.0  # after a longer degenerate stretch, a new submap is started; see take_recovery()
+WHEEL_SIGMA_M = 0.15  # standard deviation of the reckoned position in a pose graph constraint
 
 
 class DeadReckoning:
-    """Counts increments between scans, so that jitter of single stamps does not add up."""
+    """Integrates wheel odometry between scans while the scan matching is degenerate.
+
+    It starts at the last scan with an observable pose. Increments are summed over the whole stretch, so that
+    stamp jitter does not accumulate.
+    """
 
     def __init__(self, odometry: OdometryBuffer) -> None:
         self._odometry = odometry
-        self._reckoned_pose: np.ndarray | None = (
-            None  # pose_odom_body whose part along the corridor is the wheels'
-        )
+        self._reckoned_pose: np.ndarray | None = None  # pose_odom_body; wheels along the weak direction
         self._stamp_ns = 0
         self._check: tuple[int, np.ndarray] | None = None
         self.error_ratio = 0.0
@@ -33,19 +34,26 @@ class DeadReckoning:
         self._last_pose: np.ndarray | None = None
 
     def take_recovery(self) -> bool:
-        """True once, when the scans know again where they are after a long way of counting."""
+        """Return True once when the pose becomes observable again after a long degenerate stretch.
+
+        The caller then starts a new submap.
+        """
         if self.degenerate or self._degenerate_m < DEGENERATE_DISTANCE_M:
             return False
         self._degenerate_m = 0.0
         return True
 
     def predict(self, stamp_ns: int) -> np.ndarray | None:
-        """T_odom_body by count, while the scans do not know; None if they do or the wheels are no good."""
+        """Return pose_odom_body [3] by dead reckoning while the matching is degenerate.
+
+        Returns None if the pose is observable, or if the odometry is missing or inaccurate.
+        """
         if not self.degenerate:
             return None
         return self._extrapolated(stamp_ns)
 
     def _extrapolated(self, stamp_ns: int) -> np.ndarray | None:
+        """Return the reckoned pose at a stamp, None if the odometry is missing or inaccurate."""
         if self._reckoned_pose is None or self.error_ratio > MAX_ERROR_RATIO:
             return None
         moved = self._odometry.increment(self._stamp_ns, stamp_ns)
@@ -54,7 +62,11 @@ class DeadReckoning:
     def correct(
         self, stamp_ns: int, pose_odom_body: np.ndarray, trust: float, direction_odom: np.ndarray
     ) -> tuple[np.ndarray, bool]:
-        """The pose with its part along the weak direction drawn to the count; whether that was done."""
+        """Return the matched pose, corrected along the weak direction, and whether it was corrected.
+
+        Args:     trust: observability along the weak direction, 0 .. 1, see observability.ObservedMatch.
+        direction_odom: float64 [2], unit vector of the weak direction in the odom frame.
+        """
         extrapolated = self._extrapolated(stamp_ns)
         was_lost, self.degenerate = self.degenerate, trust < MIN_TRUST
         if was_lost and self._last_pose is not None:
@@ -78,7 +90,7 @@ class DeadReckoning:
         return corrected, True
 
     def restart(self, stamp_ns: int, pose_odom_body: np.ndarray) -> None:
-        """Begin again from a pose (first scan, loss of track)."""
+        """Restart from a pose after the first scan or a loss of tracking."""
         self._reckoned_pose, self._stamp_ns, self._check, self.degenerate = (
             pose_odom_body,
             stamp_ns,
@@ -87,16 +99,17 @@ class DeadReckoning:
         )
 
     def _update_error_ratio(self, stamp_ns: int, pose_odom_body: np.ndarray) -> None:
+        """Compare the distances by wheels and by scans over CHECK_DISTANCE_M while the pose is observable."""
         if self._check is None:
             self._check = (stamp_ns, pose_odom_body)
             return
         matched = se2.between(self._check[1], pose_odom_body)
-        way = float(np.hypot(matched[0], matched[1]))
-        if way < CHECK_DISTANCE_M:
+        distance = float(np.hypot(matched[0], matched[1]))
+        if distance < CHECK_DISTANCE_M:
             return
         wheels = self._odometry.increment(self._check[0], stamp_ns)
         self._check = (stamp_ns, pose_odom_body)
         if wheels is not None:
-            # Lengths only: the heading comes from the scans.
-            share = abs(float(np.hypot(wheels[0], wheels[1])) - way) / way
-            self.error_ratio += 0.2 * (min(share, 1.0) - self.error_ratio)
+            # Compare distances only, because the heading comes from the scans.
+            ratio = abs(float(np.hypot(wheels[0], wheels[1])) - distance) / distance
+            self.error_ratio += 0.2 * (min(ratio, 1.0) - self.error_ratio)

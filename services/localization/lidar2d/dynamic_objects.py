@@ -1,4 +1,4 @@
-"""Beams that end where the map knows free space: people, carts, doors. They stay out of the map."""
+"""Detection of returns on dynamic objects: returns in space that the submap has observed free."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ import numpy as np
 
 from beamsplat.common.compiled import kernel
 
-MIN_FREE_SCANS = 5  # so many keynodes must have looked through a cell
-CLEARANCE_M = 0.12  # a return this close to a known surface belongs to it
-MAX_MISSES_PER_HIT = 4  # a surface is one while it is hit at least once for so many beams that went through
-MAX_OBJECT_WIDTH_M = 1.2  # what is no wider than this moves as a whole,
-MIN_DYNAMIC_RATIO = 0.25  # if so many of its returns do
+MIN_FREE_SCANS = 5  # number of nodes that must have observed a cell as free
+CLEARANCE_M = 0.12  # a return closer than this to a surface belongs to it
+MAX_MISSES_PER_HIT = 4  # a cell with more beams passing through per hit is not a surface any more
+MAX_OBJECT_WIDTH_M = 1.2  # objects up to this width are static or dynamic as a whole
+MIN_DYNAMIC_RATIO = 0.25  # fraction of an object's returns that must be dynamic to mark all of it
 
 
 @kernel
@@ -28,8 +28,12 @@ def contradicts_free_space(
     cell_m: float,
     out: np.ndarray,  # out bool [M]
 ) -> None:
-    """A return is on something that was not there: its cell and all around it were seen free often, hit
-    hardly ever, and no surface is near."""
+    """Mark returns that contradict observed free space.
+
+    A return is marked if its cell and all neighbours were observed free by at least MIN_FREE_SCANS nodes and
+    were rarely hit, and if no surface is within CLEARANCE_M. A surface that beams have passed since does not
+    count.
+    """
     c, s = math.cos(pose[2]), math.sin(pose[2])
     for i in range(points.shape[0]):
         out[i] = False
@@ -39,7 +43,8 @@ def contradicts_free_space(
             continue
         k = nearest[r, q]
         if k >= 0 and math.hypot(x - means[k, 0], y - means[k, 1]) < CLEARANCE_M:
-            # What a mover left behind before it was found out has been looked through since.
+            # A dynamic object may have been inserted before it was detected. It is not a
+            # surface if beams have passed through it since.
             kr, kq = math.floor(means[k, 1] / cell_m) - row0, math.floor(means[k, 0] / cell_m) - col0
             known = 0 <= kr < hits.shape[0] and 0 <= kq < hits.shape[1]
             if known and MAX_MISSES_PER_HIT * int(hits[kr, kq]) >= int(misses[kr, kq]):
@@ -60,8 +65,12 @@ def grow_along_beams(
     gap_m: float,
     out: np.ndarray,  # out bool [M]
 ) -> None:
-    """The edge of a dynamic thing touches cells that are not surely free: neighbours of a dynamic return on the
-    same object (next beam, close by) move with it if at least two returns on it were found to move."""
+    """Extend the dynamic-beam mask along the beams to the edges of objects.
+
+    Returns at an object's edge are in cells that are not certainly free. A neighbouring return (next beam,
+    closer than `gap_m`) is marked too if it follows at least two marked returns; at most three returns are
+    added per side.
+    """
     m = dynamic.shape[0]
     for i in range(m):
         out[i] = dynamic[i]
@@ -90,7 +99,7 @@ def grow_along_beams(
 
 @kernel
 def _mark_whole_objects(points: np.ndarray, beams: np.ndarray, gap_m: float, out: np.ndarray) -> None:
-    """Small connected things of which a good part moves do so altogether."""
+    """Mark all returns of a small connected object if a sufficient part of them is marked."""
     m = out.shape[0]
     first = 0
     for i in range(1, m + 1):

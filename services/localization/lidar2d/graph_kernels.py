@@ -1,4 +1,4 @@
-"""Kernels of the pose graph: normal equations with the nodes eliminated, and their solution."""
+"""Kernels of the pose graph optimisation: normal equations with eliminated nodes, and back substitution."""
 
 from __future__ import annotations
 
@@ -12,13 +12,16 @@ from beamsplat.services.localization.lidar2d import se2
 
 @kernel
 def linearise(
-    submap_poses: np.ndarray, node_poses: np.ndarray, z: np.ndarray, e: np.ndarray, Js: np.ndarray
+    pose_map_submap: np.ndarray, pose_map_node: np.ndarray, z: np.ndarray, e: np.ndarray, Js: np.ndarray
 ) -> None:
-    """Residual [3] and its Jacobian by the submap [3, 3]; that by the node is the rotation R_s'."""
-    c, s = math.cos(submap_poses[2]), math.sin(submap_poses[2])
-    dx, dy = node_poses[0] - submap_poses[0], node_poses[1] - submap_poses[1]
+    """Compute the residual e [3] and its Jacobian Js [3, 3] with respect to the submap pose.
+
+    `z` is the measured pose_submap_node. The Jacobian with respect to the node is the rotation R_s^T.
+    """
+    c, s = math.cos(pose_map_submap[2]), math.sin(pose_map_submap[2])
+    dx, dy = pose_map_node[0] - pose_map_submap[0], pose_map_node[1] - pose_map_submap[1]
     lx, ly = c * dx + s * dy, -s * dx + c * dy
-    e[0], e[1], e[2] = lx - z[0], ly - z[1], se2.wrap(node_poses[2] - submap_poses[2] - z[2])
+    e[0], e[1], e[2] = lx - z[0], ly - z[1], se2.wrap(pose_map_node[2] - pose_map_submap[2] - z[2])
     Js[0, 0], Js[0, 1], Js[0, 2] = -c, -s, ly
     Js[1, 0], Js[1, 1], Js[1, 2] = s, -c, -lx
     Js[2, 0], Js[2, 1], Js[2, 2] = 0.0, 0.0, -1.0
@@ -36,7 +39,7 @@ def _mul(A: np.ndarray, B: np.ndarray, out: np.ndarray, transpose_a: bool) -> No
 
 @kernel
 def invert3(A: np.ndarray, out: np.ndarray) -> None:
-    """out <- A^-1 for [3, 3] matrices, by cofactors."""
+    """Write the inverse of a matrix [3, 3] to `out`, by cofactors."""
     c00 = A[1, 1] * A[2, 2] - A[1, 2] * A[2, 1]
     c01 = A[1, 2] * A[2, 0] - A[1, 0] * A[2, 2]
     c02 = A[1, 0] * A[2, 1] - A[1, 1] * A[2, 0]
@@ -69,7 +72,11 @@ def reduce_nodes(
     bn: np.ndarray,  # out float64 [N, 3]
     chi2: np.ndarray,  # out float64 [E]
 ) -> float:
-    """Normal equations with every node eliminated. Returns the robust cost."""
+    """Compute the normal equations of the submaps with every node eliminated (Schur complement).
+
+    Loop closure constraints (`robust`) have a Geman-McClure loss with the squared scale `scale2`, the others
+    with `limit2`. Returns the robust cost.
+    """
     blocks[:] = 0.0
     rhs[:] = 0.0
     e, Js, Jn, Om = np.empty(3), np.empty((3, 3)), np.zeros((3, 3)), np.empty((3, 3))
@@ -147,6 +154,7 @@ def substitute(
     submap_poses: np.ndarray,
     node_poses: np.ndarray,
 ) -> None:
+    """Update all poses in place: submaps by `dx`, nodes by back substitution."""
     b = np.empty(3)
     for n in range(node_poses.shape[0]):
         if first[n] == first[n + 1]:
@@ -168,6 +176,7 @@ def substitute(
 
 @kernel
 def edge_pairs(submap: np.ndarray, first: np.ndarray, n_submaps: int, keys: np.ndarray) -> None:
+    """Write the block key submap_i * n_submaps + submap_j of every ordered pair of edges of each node."""
     p = 0
     for n in range(first.shape[0] - 1):
         for k in range(first[n], first[n + 1]):

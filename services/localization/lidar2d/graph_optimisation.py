@@ -1,9 +1,10 @@
-"""Sparse robust pose graph: submaps and nodes, edges from submap to node, nodes eliminated first.
+"""Sparse robust pose graph optimisation over submap and node poses.
 
-The structure of sparse pose adjustment (Konolige et al. 2010) as Cartographer uses it, solved like bundle
-adjustment: a node only touches a handful of submaps, so its 3x3 block is eliminated exactly (Schur
-complement) and only the submap poses are left to solve for. Loop edges have a Geman-McClure loss whose
-scale shrinks during the iterations (graduated non-convexity, Yang et al. 2020).
+The structure is that of sparse pose adjustment (Konolige et al. 2010) as Cartographer uses it: constraints
+from submaps to nodes. It is solved like bundle adjustment: a node has constraints to a few submaps only, so
+its 3x3 block is eliminated exactly (Schur complement) and only the submap poses are solved for. Loop closure
+constraints have a Geman-McClure loss whose scale shrinks during the iterations (graduated non-convexity, Yang
+et al. 2020).
 """
 
 from __future__ import annotations
@@ -19,29 +20,29 @@ import scipy.sparse.linalg
 
 from beamsplat.services.localization.lidar2d.graph_kernels import edge_pairs, reduce_nodes, substitute
 
-DENSE_SUBMAPS = 250  # beyond this the reduced system is solved as a sparse one
-INNER_SCALE2 = 1e4  # poses in their own submap are hardly doubted
-SHRINK = 5.0  # the squared scale of the loop edges falls by this factor per iteration until the final one
+DENSE_SUBMAPS = 250  # above this number of submaps the reduced system is solved with sparse matrices
+INNER_SCALE2 = 1e4  # squared loss scale of constraints within a submap, which are rarely outliers
+SHRINK = 5.0  # factor per iteration by which the squared loss scale of loop closures falls to its final value
 
 
 @dataclass(frozen=True)
 class ConstraintArrays:
-    """Measured poses of nodes in submaps; rows ordered by node."""
+    """Constraints as arrays: measured poses of nodes in submaps; rows are ordered by node."""
 
     submap: np.ndarray  # int32 [E]
     node: np.ndarray  # int32 [E], non-decreasing
     pose_submap_node: np.ndarray  # float64 [E, 3]
     information: np.ndarray  # float64 [E, 3, 3]
-    robust: np.ndarray  # bool [E], loop edges
+    robust: np.ndarray  # bool [E], True for loop closures
 
 
 @dataclass(frozen=True)
 class GraphSolution:
-    """Optimised poses and what each edge says about them."""
+    """Optimised poses and the residual of each constraint."""
 
     pose_map_submap: np.ndarray  # float64 [S, 3]
     pose_map_node: np.ndarray  # float64 [N, 3]
-    chi2: np.ndarray  # float64 [E] squared, information weighted residuals
+    chi2: np.ndarray  # float64 [E], squared residuals weighted with the information
     iterations: int
 
 
@@ -49,11 +50,14 @@ def optimise(
     pose_map_submap: np.ndarray,  # float64 [S, 3] start
     pose_map_node: np.ndarray,  # float64 [N, 3] start
     edges: ConstraintArrays,
-    fixed: Sequence[int] = (0,),  # rows of the submaps that do not move
+    fixed: Sequence[int] = (0,),  # rows of the submaps that are held constant
     final_scale2: float = 9.0,
     iterations: int = 16,
 ) -> GraphSolution:
-    """Minimise sum rho(e' Omega e), e = pose_submap_node (-) inverse(pose_map_submap) pose_map_node."""
+    """Minimise sum rho(e^T Omega e) with e = pose_submap_node (-) inverse(pose_map_submap) * pose_map_node.
+
+    Args:     final_scale2: squared scale of the robust loss in the last iterations, in units of chi^2.
+    """
     submap_poses, node_poses = (
         pose_map_submap.astype(np.float64).copy(),
         pose_map_node.astype(np.float64).copy(),
@@ -70,7 +74,8 @@ def optimise(
     done, scale2 = 0, math.inf
     while done < iterations:
         done += 1
-        # The first pass with a large scale trusts every loop; only then is told who disagrees with the rest.
+        # The first iteration has a very large scale and so accepts every loop closure; outliers are visible
+        # only after it.
         reduce_nodes(
             edges.submap,
             edges.pose_submap_node,
@@ -121,6 +126,7 @@ def optimise(
 def _solve(
     blocks: np.ndarray, row: np.ndarray, col: np.ndarray, rhs: np.ndarray, fixed: Sequence[int]
 ) -> np.ndarray:
+    """Return the submap updates float64 [S, 3]; a dense Cholesky or a sparse LU factorisation is used."""
     n = len(rhs)
     diagonal = 1e-6 * np.ones(3 * n)
     for row_fixed in fixed:

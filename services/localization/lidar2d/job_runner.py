@@ -1,4 +1,4 @@
-"""Running the background jobs: at once or in a thread of their own; the results are the same."""
+"""Execution of the background jobs, inline or in a thread; the results are identical."""
 
 from __future__ import annotations
 
@@ -10,10 +10,11 @@ from beamsplat.services.localization.lidar2d.slam import LidarSlam, ScanResult
 
 
 class JobRunner:
-    """Call `before_scan()` before and `after_scan()` after each `slam.add_scan()`.
+    """Runs the background jobs of a LidarSlam.
 
-    A job's result is taken in at the scan its job names, never earlier, so that a thread and no thread give
-    the same map; a thread that is not done by then is waited for (and counted in `waits`).
+    Call `before_scan()` before and `after_scan()` after each `slam.add_scan()`. A result is applied exactly
+    at the scan that its job names, so that the map does not depend on threading. If the thread is not
+    finished by then, the runner blocks (counted in `waits`).
     """
 
     def __init__(self, slam: LidarSlam, threaded: bool = False) -> None:
@@ -24,7 +25,7 @@ class JobRunner:
         self._job: BackgroundJob | None = None
 
     def before_scan(self) -> None:
-        """Take in what is due before the next scan."""
+        """Apply the result that is due before the next scan."""
         if self._job is None or self.slam.scans < self._job.apply_at_scan:
             return
         if self._future is not None:
@@ -36,13 +37,13 @@ class JobRunner:
         self.slam.apply(result)
 
     def after_scan(self, result: ScanResult) -> None:
-        """Start the job a scan handed out."""
+        """Start the job of a scan result, if it has one."""
         if result.job is not None:
             self._job = result.job
             self._future = self._pool.submit(result.job.run) if self._pool is not None else None
 
     def finish(self) -> None:
-        """Take in what is still running, then the final optimisation."""
+        """Apply the running job, then do the final optimisation."""
         if self._job is not None:
             result = self._future.result() if self._future is not None else self._job.run()
             self._job, self._future = None, None

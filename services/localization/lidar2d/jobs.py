@@ -1,4 +1,4 @@
-"""Background work as pure functions of a snapshot: loop closure, linking, refinement, optimisation."""
+"""Background jobs as pure functions of a snapshot: loop closure, linking, refinement, optimisation."""
 
 from __future__ import annotations
 
@@ -24,37 +24,42 @@ from beamsplat.services.localization.lidar2d.snapshot import Snapshot
 from beamsplat.services.localization.lidar2d.surfel_map import FrozenMap
 
 ITERATIONS, LAST_ITERATIONS = 10, 16
-REJECT_CHI2 = 1e5  # a loop this far off after optimisation is forgotten; less, and it may be right later
+REJECT_CHI2 = 1e5  # loop closures above it after optimisation are deleted; others are only down-weighted
 
 
 @dataclass(frozen=True)
 class JobResult:
-    """What a background job found; `LidarSlam.apply` takes it in."""
+    """Result of a background job, to be passed to `LidarSlam.apply`."""
 
     number: int
-    constraints: list[Constraint] | None  # None: as they were; else the whole new list up to the snapshot
-    snapshot_constraints: int  # how many the snapshot had
+    # All constraints up to the snapshot, or None if they have not changed.
+    constraints: list[Constraint] | None
+    snapshot_constraints: int  # number of constraints in the snapshot
     pose_map_submap: dict[int, np.ndarray]
     pose_map_node: dict[int, np.ndarray]
-    frozen: dict[int, FrozenMap]  # submaps that were rebuilt anew
-    still_pending: list[int]
-    searched: list[int]  # submaps that were searched widely
+    frozen: dict[int, FrozenMap]  # rebuilt submaps
+    still_pending: list[int]  # nodes whose loop closure search must be repeated
+    searched: list[int]  # submaps that were searched globally
     loops_found: int
-    linked: bool  # the newest segment now hangs on the map
-    candidate: tuple[int, np.ndarray] | None  # keynode and pose_map_node of an answer that waits for another
+    linked: bool  # the newest segment is connected to the map
+    candidate: tuple[int, np.ndarray] | None  # node id and pose_map_node of an unconfirmed relocalization
 
 
 @dataclass(frozen=True)
 class BackgroundJob:
-    """Pure work on a snapshot: call `run` in any thread, hand the result to `LidarSlam.apply`."""
+    """Work on a snapshot: call `run` in any thread and pass the result to `LidarSlam.apply`."""
 
     number: int
-    apply_at_scan: int  # before the scan of this number is added
+    apply_at_scan: int  # number of the scan before which the result must be applied
     run: Callable[[], JobResult]
 
 
 def run_job(snapshot: Snapshot, refine_rounds: int = 0) -> JobResult:
-    """Close loops, optimise; with `refine_rounds` also draw the submaps anew and measure every edge again."""
+    """Search loop closures (or link a new segment), then optimise the pose graph.
+
+    With `refine_rounds` > 0, the submaps are also rebuilt from the optimised poses and all constraints are
+    measured again, that many times.
+    """
     submap_row = {s: i for i, s in enumerate(snapshot.submap_ids)}
     node_row = {n: i for i, n in enumerate(snapshot.node_ids)}
     constraints, searched, frozen = list(snapshot.constraints), [], dict(snapshot.frozen)
@@ -69,7 +74,7 @@ def run_job(snapshot: Snapshot, refine_rounds: int = 0) -> JobResult:
     fixed = [submap_row[i] for i in sorted(snapshot.fixed) if i in submap_row] or [0]
     if found:
         edges = constraint_arrays(constraints, submap_row, node_row)
-    # While driving the next job goes on where this one ends; the last one has to get there by itself.
+    # During mapping the next job continues from this solution; the final one must converge by itself.
     iterations = LAST_ITERATIONS if refine_rounds else ITERATIONS
     solution = optimise(submap_poses, node_poses, edges, fixed, iterations=iterations)
     rebuilt: dict[int, FrozenMap] = {}
@@ -107,6 +112,7 @@ def run_job(snapshot: Snapshot, refine_rounds: int = 0) -> JobResult:
 def _without_outliers(
     constraints: list[Constraint], chi2: np.ndarray, node_row: dict[int, int]
 ) -> list[Constraint]:
+    """Return the constraints without loop closures whose chi^2 is above REJECT_CHI2."""
     order = np.argsort([node_row[c.node] for c in constraints], kind="stable")
     keep = np.ones(len(constraints), dtype=bool)
     keep[order] = chi2 < REJECT_CHI2
@@ -116,7 +122,7 @@ def _without_outliers(
 def _find_constraints(
     snapshot: Snapshot, edges: ConstraintArrays, submap_row: dict[int, int], node_row: dict[int, int]
 ) -> tuple[list[Constraint], list[int], list[int]]:
-    """New loop constraints, the submaps searched widely, and the nodes whose turn has not come."""
+    """Return new loop closures, the submaps that were searched globally, and the node ids still pending."""
     s = snapshot.settings
     if not snapshot.frozen or not snapshot.pending:
         return [], [], list(snapshot.pending)
@@ -133,7 +139,7 @@ def _find_constraints(
         tasks += [(candidate.submap, node_id, candidate) for candidate in candidates]
         if uncertain and not candidates:
             still.append(node_id)
-    # One submap after the other: their tables are large.
+    # Sorted by submap, because the cache holds few of the large match tables.
     closed = [
         match_locally(snapshot.nodes[node_id], candidate, snapshot.cache, s)
         for _, node_id, candidate in sorted(tasks, key=lambda task: task[:2])
@@ -147,12 +153,13 @@ def _find_constraints(
 
 
 def _submaps_of(edges: ConstraintArrays, row: int) -> np.ndarray:
+    """Return the rows of the submaps that contain a node."""
     lo, hi = np.searchsorted(edges.node, [row, row + 1])
     return edges.submap[lo:hi][~edges.robust[lo:hi]]
 
 
 def _nearest_member(snapshot: Snapshot, edges: ConstraintArrays, row: int) -> np.ndarray:
-    """Distance (m) from a node to the nearest member of each submap, float64 [S]."""
+    """Return the distance (m) from a node to the nearest member of each submap, float64 [S]."""
     away = np.hypot(*(snapshot.pose_map_node[:, :2] - snapshot.pose_map_node[row, :2]).T)
     distance = np.full(len(snapshot.submap_ids), np.inf)
     inner = ~edges.robust
@@ -167,7 +174,10 @@ def _loop_candidates(
     own: list[int],
     windows: tuple[np.ndarray, np.ndarray],
 ) -> tuple[list[LoopCandidate], bool]:
-    """Submaps of other passes right here, nearest first; the flag: some are too uncertain for that."""
+    """Return the nearest submaps from other passes as local loop candidates.
+
+    The flag tells whether a near submap was skipped because its relative pose is too uncertain.
+    """
     s = snapshot.settings
     distance = _nearest_member(snapshot, edges, row)
     distance[[k for o in own for k in range(o - 2, o + 3) if 0 <= k < len(distance)]] = np.inf
@@ -199,6 +209,7 @@ def _find_global_constraints(
     windows: dict[int, tuple[np.ndarray, np.ndarray]],
     drift: DriftModel,
 ) -> tuple[list[Constraint], list[int]]:
+    """Search one node in submaps of uncertain relative pose; return constraints and submap ids."""
     s = snapshot.settings
     row = node_row[centre]
     own = sorted(set(_submaps_of(edges, row).tolist()))

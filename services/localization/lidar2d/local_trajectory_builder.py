@@ -1,4 +1,4 @@
-"""The front end: one scan in, one smooth pose out. Never waits for loop closure."""
+"""The front end: estimates a smooth pose in the odom frame per scan; it never waits for loop closure."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ NS = 1e-9
 
 @dataclass(frozen=True)
 class RawScan:
-    """One revolution or sweep as the sensor gives it; the stamp is that of the first beam."""
+    """One revolution or sweep as the sensor delivers it; the stamp is that of the first beam."""
 
     stamp_ns: int
     ranges_m: np.ndarray  # float32 [N], +inf or >= range_max_m: no return
@@ -36,7 +36,7 @@ class RawScan:
 
 @dataclass
 class LocalMap:
-    """A submap that is still being filled."""
+    """A submap that is being filled: its pose in the odom frame and its surfel map."""
 
     pose_odom_submap: np.ndarray  # float64 [3]
     surfels: SurfelMap
@@ -44,17 +44,20 @@ class LocalMap:
 
 @dataclass(frozen=True)
 class Prediction:
-    """Motion since the last scan and how far it may be off."""
+    """Predicted motion since the last scan and its uncertainty."""
 
-    motion: np.ndarray  # float64 [3] pose_last_now
+    motion: np.ndarray  # float64 [3], pose_last_now
     sigma_m: float
     sigma_rad: float
     source: str
-    blind: bool  # over a gap without wheels: anything may have happened
+    long_gap: bool  # gap of over 1 s without wheel odometry: the motion is unknown
 
 
 class LocalTrajectoryBuilder:
-    """Prediction, deskew, matching; the caller decides what enters which map."""
+    """Motion prediction, deskewing and scan-to-submap matching, as in Cartographer.
+
+    The caller decides which scans are inserted into which submap.
+    """
 
     def __init__(
         self, settings: LidarSlamSettings, pose_body_lidar: np.ndarray, upside_down: bool = False
@@ -71,7 +74,7 @@ class LocalTrajectoryBuilder:
         self.poses: list[np.ndarray] = []
 
     def restart_clock(self, stamp_ns: int) -> None:
-        """Go on from the last pose under a clock that was set."""
+        """Continue from the last pose after the clock was set to another time."""
         if self.poses:
             self.stamps, self.poses = [stamp_ns - round(0.1 / NS)], [self.poses[-1]]
             self.reckoning.restart(stamp_ns, self.poses[-1])
@@ -79,7 +82,7 @@ class LocalTrajectoryBuilder:
     # ---- motion -----------------------------------------------------------------------------------
 
     def velocity(self) -> np.ndarray:
-        """Body twist (m/s, m/s, rad/s) over the last fifth of a second or the last step."""
+        """Return the body twist (m/s, m/s, rad/s) over the last 0.15 s or the last scan interval."""
         if len(self.poses) < 2:
             return np.zeros(3)
         i = len(self.stamps) - 2
@@ -91,13 +94,17 @@ class LocalTrajectoryBuilder:
         return twist(se2.between(self.poses[i], self.poses[-1]), dt)
 
     def predict(self, stamp_ns: int) -> tuple[Prediction, list[tuple[MotionErrorModel, np.ndarray]]]:
-        """The better of wheels and inertia, judged by how they did lately."""
+        """Return the motion prediction with the lowest recent error, and all candidates for the error models.
+
+        Candidates are constant velocity, standstill and wheel odometry; dead reckoning has priority while it
+        is active.
+        """
         dt = (stamp_ns - self.stamps[-1]) * NS
         steady = exp_twist(self.velocity(), min(dt, self.settings.extrapolate_s))
-        # Stamps of real logs come in bursts and out of order; then "as before" is worse than "not at all".
+        # Stamps of real logs are irregular; then standstill predicts better than constant velocity.
         predictions = [
-            (self._velocity_error, steady, "inertia"),
-            (self._standstill_error, np.zeros(3), "still"),
+            (self._velocity_error, steady, "constant velocity"),
+            (self._standstill_error, np.zeros(3), "standstill"),
         ]
         wheels = self.odometry.increment(self.stamps[-1], stamp_ns)
         if wheels is not None and self._is_plausible(wheels, dt):
@@ -107,8 +114,8 @@ class LocalTrajectoryBuilder:
             motion = se2.between(self.poses[-1], reckoned)
             if self._is_plausible(motion, dt):
                 sigma_rad = self._wheel_error.sigmas(motion, dt)[1]
-                known = Prediction(motion, WHEEL_SIGMA_M, sigma_rad, "wheels", False)
-                return known, [(predictor, motion) for predictor, motion, _ in predictions]
+                reckoned_motion = Prediction(motion, WHEEL_SIGMA_M, sigma_rad, "wheels", False)
+                return reckoned_motion, [(predictor, motion) for predictor, motion, _ in predictions]
         rated = []
         for predictor, motion, name in predictions:
             sigma_m, sigma_rad = predictor.sigmas(motion, dt)
@@ -122,14 +129,18 @@ class LocalTrajectoryBuilder:
         return best, [(predictor, motion) for predictor, motion, _ in predictions]
 
     def _is_plausible(self, motion: np.ndarray, dt_s: float) -> bool:
+        """Return whether a motion is within the speed limits of the settings."""
         s = self.settings
-        margin = dt_s + 0.2  # stamps of real robots jitter
+        margin = dt_s + 0.2  # tolerance for stamp jitter
         return math.hypot(motion[0], motion[1]) < s.max_speed_m_s * margin and abs(motion[2]) < (
             s.max_yaw_rate_rad_s * margin
         )
 
     def scan_velocity(self, raw: RawScan, motion: np.ndarray | None) -> np.ndarray:
-        """Body twist while the beams were taken: the wheels if they know, else the matched motion."""
+        """Return the body twist during the scan: from wheel odometry if it is accurate, else from `motion`.
+
+        `motion` is the motion [3] since the last scan, predicted or matched.
+        """
         duration = raw.time_increment_s * len(raw.ranges_m)
         if duration <= 0.0:
             return np.zeros(3)
@@ -145,6 +156,7 @@ class LocalTrajectoryBuilder:
         return self.velocity()
 
     def prepare(self, raw: RawScan, velocity: np.ndarray) -> PreparedScan:
+        """Return the filtered and deskewed scan for the given body twist."""
         s = self.settings
         return prepare_scan(
             raw.ranges_m,
@@ -164,7 +176,11 @@ class LocalTrajectoryBuilder:
     def match(
         self, raw: RawScan, scan: PreparedScan, prediction: Prediction, local: LocalMap
     ) -> tuple[PreparedScan, Match, bool]:
-        """Pose of the scan in the local map; the flag says whether the match can be trusted."""
+        """Match the scan to the local map; return the deskewed scan, the match and whether it is trusted.
+
+        Gauss-Newton starts at the prediction. Correlative search is added if the prediction is uncertain or
+        the match is poor. The scan is then deskewed again with the matched motion and matched once more.
+        """
         s = self.settings
         pose_submap_last = se2.between(local.pose_odom_submap, self.poses[-1])
         guess_pose = se2.compose(pose_submap_last, prediction.motion)
@@ -172,16 +188,18 @@ class LocalTrajectoryBuilder:
         tables = local.surfels.tables()
         points = scan.features()
         match = refine(points, scan.origin_body, guess_pose, tables, s, guess_pose, information)
-        blind = (raw.stamp_ns - self.stamps[-1]) * NS > 1.0
-        window_m = min(max(3.0 * prediction.sigma_m, s.search_min_m), 2.0 if blind else s.search_max_m)
+        long_gap = (raw.stamp_ns - self.stamps[-1]) * NS > 1.0
+        window_m = min(max(3.0 * prediction.sigma_m, s.search_min_m), 2.0 if long_gap else s.search_max_m)
         window_rad = min(
-            max(3.0 * prediction.sigma_rad, s.search_min_rad), math.pi if blind else s.search_max_rad
+            max(3.0 * prediction.sigma_rad, s.search_min_rad), math.pi if long_gap else s.search_max_rad
         )
         if window_m > s.search_min_m or window_rad > s.search_min_rad:
             match = self._search(
                 scan, match, guess_pose, guess_pose, information, local, window_m, window_rad
             )
-        if match.inlier_ratio < s.good_inlier_ratio:  # a prediction this wrong may be worse than none
+        if (
+            match.inlier_ratio < s.good_inlier_ratio
+        ):  # the prediction may be wrong: search around the last pose
             wide_m, wide_rad = max(window_m, 0.4), max(window_rad, math.radians(20.0))
             match = self._search(
                 scan, match, guess_pose, pose_submap_last, information, local, wide_m, wide_rad
@@ -224,7 +242,7 @@ class LocalTrajectoryBuilder:
         )
 
     def _apply_dead_reckoning(self, stamp_ns: int, local: LocalMap, seen: ObservedMatch) -> Match:
-        """Where the scan slides freely, let the wheels say how far it is."""
+        """Correct the match along its weak direction by dead reckoning, where it is degenerate."""
         pose_odom_submap = local.pose_odom_submap
         turn = np.array([0.0, 0.0, pose_odom_submap[2]])
         direction_odom = se2.transform(turn, seen.direction[None])[0]
@@ -238,13 +256,16 @@ class LocalTrajectoryBuilder:
         return dataclasses.replace(seen.match, pose_target_body=pose_map_body, information=information)
 
     def _is_trusted(self, prediction: Prediction, guess_pose: np.ndarray, match: Match) -> bool:
-        """Enough agrees; more has to agree where the prediction says something else or nothing."""
+        """Return whether the inlier ratio is high enough.
+
+        The limit is higher if the match is far from the prediction or if there is no prediction.
+        """
         s = self.settings
         off = se2.between(guess_pose, match.pose_target_body)
         far = math.hypot(off[0], off[1]) > 0.2 + 3.0 * prediction.sigma_m or abs(off[2]) > (
             0.15 + 3.0 * prediction.sigma_rad
         )
-        if prediction.blind:
+        if prediction.long_gap:
             return match.inlier_ratio >= s.good_inlier_ratio
         return match.inlier_ratio >= (s.sure_inlier_ratio if far else s.lost_inlier_ratio)
 
@@ -259,7 +280,7 @@ class LocalTrajectoryBuilder:
         window_m: float,
         window_rad: float,
     ) -> Match:
-        """The best of the given match and of those found in a window."""
+        """Return the better of the match `best` and the matches found by correlative search in a window."""
         tables, s = local.surfels.tables(), self.settings
         points = scan.features()
         for _, start_pose in search(points, centre_pose, tables, window_m, window_rad, prior_weight=0.02):
@@ -274,7 +295,7 @@ class LocalTrajectoryBuilder:
         pose_odom_body: np.ndarray,
         predictions: list[tuple[MotionErrorModel, np.ndarray]],
     ) -> None:
-        """Take in the pose of the newest scan; predictors and the delay update from it."""
+        """Append the pose of the newest scan; update the error models and the odometry delay."""
         if self.poses:
             moved = se2.between(self.poses[-1], pose_odom_body)
             for predictor, motion in predictions:
@@ -287,7 +308,7 @@ class LocalTrajectoryBuilder:
 
 
 def twist(motion: np.ndarray, dt_s: float) -> np.ndarray:
-    """Constant body twist that moves by `motion` in `dt_s` (logarithm of SE(2))."""
+    """Return the constant body twist that moves by `motion` in `dt_s` (logarithm of SE(2))."""
     half = 0.5 * motion[2]
     ratio = 1.0 - half * half / 3.0 if abs(half) < 1e-3 else half / math.tan(half)
     vx = ratio * motion[0] + half * motion[1]
@@ -296,7 +317,7 @@ def twist(motion: np.ndarray, dt_s: float) -> np.ndarray:
 
 
 def exp_twist(velocity: np.ndarray, dt_s: float) -> np.ndarray:
-    """Motion after `dt_s` at a constant body twist (exponential of SE(2))."""
+    """Return the motion after `dt_s` at a constant body twist (exponential of SE(2))."""
     yaw = velocity[2] * dt_s
     half = 0.5 * yaw
     sinc = 1.0 - half * half / 6.0 if abs(half) < 1e-3 else math.sin(half) / half

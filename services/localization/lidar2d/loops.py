@@ -1,4 +1,4 @@
-"""Loop closure: which submaps a keynode may lie in, how uncertain that is, and where exactly it lies."""
+"""Loop closure: search windows from the drift model, local and global matching, verification."""
 
 from __future__ import annotations
 
@@ -28,10 +28,11 @@ from beamsplat.services.localization.lidar2d.scan_matching import Match, refine
 from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
 from beamsplat.services.localization.lidar2d.surfel_map import FrozenMap
 
-MERGED_MIN_INLIER_RATIO = (
-    0.80  # a merged chunk must agree better than a single scan: it is what tells node_positions apart
-)
-AMBIGUITY_MARGIN = 0.06  # a second candidate whose share is this close to the best makes the answer worthless
+# Higher than for a single scan, because merged scans must discriminate between places.
+MERGED_MIN_INLIER_RATIO = 0.80
+# A second pose whose inlier ratio is this close to the best makes the result ambiguous.
+AMBIGUITY_MARGIN = 0.06
+# Offsets in nodes along the trajectory at which a global loop closure is verified.
 VERIFICATION_OFFSETS = (
     -60,
     -48,
@@ -40,17 +41,17 @@ VERIFICATION_OFFSETS = (
     -12,
     12,
     24,
-)  # keynodes around a wide loop that must agree with it
-VERIFICATION_MIN_INLIER_RATIO = 0.75
+)
+VERIFICATION_MIN_INLIER_RATIO = 0.75  # mean over the verified nodes
 
 
 @dataclass(frozen=True)
 class LoopCandidate:
-    """A submap a keynode may lie in."""
+    """A submap that may contain a node, with the predicted relative pose and its search window."""
 
     submap: int
     frozen: FrozenMap
-    pose_submap_node: np.ndarray  # float64 [3] guess
+    pose_submap_node: np.ndarray  # float64 [3], predicted
     window_m: float
     window_rad: float
 
@@ -59,7 +60,10 @@ class LoopCandidate:
 def _submap_pair_variances(
     submap: np.ndarray, first: np.ndarray, var_m: np.ndarray, var_rad: np.ndarray, links: np.ndarray
 ) -> None:
-    """Smallest variance from submap to submap over a shared node, float64 [3, S, S] (m2, rad2, hops)."""
+    """Compute the smallest variance between two submaps that share a node.
+
+    `links` is float64 [3, S, S]: variance in m^2, variance in rad^2, and 1 where there is a link.
+    """
     for n in range(first.shape[0] - 1):
         for i in range(first[n], first[n + 1]):
             for j in range(first[n], i):
@@ -73,14 +77,15 @@ def _submap_pair_variances(
 
 
 class DriftModel:
-    """How far two submaps may be off: the shortest path of uncertainties between them."""
+    """Uncertainty of the relative pose of two submaps: the shortest path of variances between them."""
 
     def __init__(
         self, edges: ConstraintArrays, n_submaps: int, n_nodes: int, settings: LidarSlamSettings
     ) -> None:
         s = settings
         covariance = np.linalg.inv(edges.information)
-        # The edges into younger submaps carry the drift of a whole link each, see second_submap_information().
+        # Constraints into the second submap include the drift between submaps, see
+        # second_submap_information(): subtract it, then add it once.
         per_edge = s.submap_nodes
         var_m = 0.5 * (covariance[:, 0, 0] + covariance[:, 1, 1]) - per_edge * s.submap_drift_sigma_m**2
         var_rad = covariance[:, 2, 2] - per_edge * s.submap_drift_sigma_rad**2
@@ -92,7 +97,7 @@ class DriftModel:
         self._length_m = s.submap_nodes * s.motion_filter_distance_m
 
     def windows(self, source: int) -> tuple[np.ndarray, np.ndarray]:
-        """Search windows (m, rad) of each submap, float64 [S] each, three sigma seen from one submap."""
+        """Return the search windows (m, rad) of all submaps as seen from one, float64 [S], three sigma."""
         var_m, var_rad, hops = (
             dijkstra(np.where(np.isfinite(links), links, 0.0), directed=False, indices=source)
             for links in self._links
@@ -105,7 +110,10 @@ class DriftModel:
 def match_locally(
     node: TrajectoryNode, candidate: LoopCandidate, cache: TableCache, settings: LidarSlamSettings
 ) -> Constraint | None:
-    """One scan against one submap, the guess is good to some decimetres."""
+    """Match one scan to one submap near the predicted pose; return a constraint if it is accepted.
+
+    The correlative search is used if the window is large or the first match is poor.
+    """
     tables = cache.tables(candidate.submap, candidate.frozen)
     features = node.scan.features.astype(np.float64)
     if len(features) < settings.min_points:
@@ -131,7 +139,10 @@ def match_globally(
     cache: TableCache,
     settings: LidarSlamSettings,
 ) -> Constraint | None:
-    """A chunk of scans against one submap by branch and bound, then the scan of its centre alone."""
+    """Match merged scans to one submap by branch and bound; return a constraint if it is unambiguous.
+
+    The constraint is measured with the scan of the centre node alone.
+    """
     features = merged_features(neighbours, node)
     if len(features) < settings.min_points:
         return None
@@ -156,8 +167,8 @@ def match_globally(
     matches.sort(key=lambda m: -m.inlier_ratio)
     if not matches or matches[0].inlier_ratio < MERGED_MIN_INLIER_RATIO:
         return None
-    # A candidate only half known is as good an answer as one fully known: the share alone decides, and if it
-    # cannot (corridors), there is no answer.
+    # Compare inlier ratios only: a pose with a smaller overlap may be the right one. If the result is
+    # ambiguous, as in corridors, there is no constraint.
     best = matches[0]
     for other in matches[1:]:
         apart = np.hypot(*(other.pose_target_body[:2] - best.pose_target_body[:2])) > 0.3 or (
@@ -183,10 +194,10 @@ def verify_constraint(
     cache: TableCache,
     settings: LidarSlamSettings,
 ) -> bool:
-    """Whether keynodes metres before and after a wide loop see what its candidate says they should see.
+    """Return whether nodes metres before and after a global loop closure agree with it.
 
-    The neighbourhood of the node is laid rigidly over the neighbourhood of the submap; each check matches one
-    scan against the submap of the other pass it then lies in.
+    The neighbourhood of the node is moved rigidly according to the constraint. Each check matches one scan to
+    the submap of the other pass at its moved position.
     """
     shift = se2.compose(
         se2.compose(pose_map_submap[link.submap], link.pose_submap_node),
@@ -196,7 +207,7 @@ def verify_constraint(
     near = [s for s in frozen if abs(s - link.submap) <= 6]
     node_positions = [(pose_map_node[m][:2], s) for s in near for m in members[s] if m in pose_map_node]
     where = np.array([p for p, _ in node_positions])
-    shares = []
+    ratios = []
     for step in VERIFICATION_OFFSETS:
         k = position[link.node] + step
         if not 0 <= k < len(node_ids):
@@ -217,20 +228,23 @@ def verify_constraint(
             settings,
         )
         if match.overlap >= settings.loop_min_overlap:
-            shares.append(match.inlier_ratio)
-    return len(shares) >= 2 and float(np.mean(shares)) >= VERIFICATION_MIN_INLIER_RATIO and min(shares) >= 0.5
+            ratios.append(match.inlier_ratio)
+    return len(ratios) >= 2 and float(np.mean(ratios)) >= VERIFICATION_MIN_INLIER_RATIO and min(ratios) >= 0.5
 
 
 def match_score(match: Match) -> float:
-    """How much speaks for a match: returns on surfaces for it, returns in known free space against it,
-    returns in unknown space neither."""
+    """Return overlap * (inlier_ratio - 0.5).
+
+    Returns on surfaces count for the match, returns in free space against it, returns in unknown space not at
+    all.
+    """
     return match.overlap * (match.inlier_ratio - 0.5)
 
 
 def _constraint_if_accepted(
     node: TrajectoryNode, candidate: LoopCandidate, match: Match, settings: LidarSlamSettings
 ) -> Constraint | None:
-    """A constraint if enough of what the scan sees is known there and agrees."""
+    """Return a constraint if overlap and inlier ratio suffice and the pose is within the window."""
     if match.inlier_ratio < settings.loop_min_inlier_ratio or match.overlap < settings.loop_min_overlap:
         return None
     guess = candidate.pose_submap_node

@@ -1,4 +1,4 @@
-"""Two lidar maps made one: where one lies in the other, and the loops between them."""
+"""Merging of two lidar maps: relative pose of the maps, then loop closures between them."""
 
 from __future__ import annotations
 
@@ -13,51 +13,52 @@ from beamsplat.services.localization.lidar2d.relocalization import relocalize_in
 from beamsplat.services.localization.lidar2d.slam import LidarSlam
 from beamsplat.services.localization.lidar2d.trajectory_record import TrajectoryRecord
 
-QUERY_SCANS = 24  # scans of the second map that are looked for in the first
+QUERY_SCANS = 24  # number of scans of map b that are relocalized in map a
 MIN_AGREEING_SCANS = 3
-SAME_POSE_M, SAME_POSE_RAD = 0.4, math.radians(4.0)  # votes_cast that mean the same place
+SAME_POSE_M, SAME_POSE_RAD = 0.4, math.radians(4.0)  # tolerance for equal poses
 
 
 @dataclass(frozen=True)
 class MapAlignment:
-    """Where map b lies in map a, and how sure that is."""
+    """Pose of map b in map a, with the number of scans that support it."""
 
     pose_a_b: np.ndarray  # float64 [3]
-    agreeing: int  # scans that say so
-    queried: int
+    agreeing: int  # number of scans that support this pose
+    queried: int  # number of scans that were relocalized
 
 
 def find_alignment(a: LidarSlam, b: LidarSlam) -> MapAlignment | None:
-    """Looks for scans of b all over a. None where too few of the votes_cast agree, or others agree as much."""
+    """Relocalize scans of map b in map a; return None if too few results agree or the result is ambiguous."""
     global_map, nodes = a.global_map(), list(b.pose_graph.nodes.values())
     chosen = [nodes[i] for i in np.unique(np.linspace(0, len(nodes) - 1, QUERY_SCANS).round().astype(int))]
-    votes_cast = []
+    poses_a_b = []
     for node in chosen:
         found = relocalize_in(global_map, node.scan.features.astype(np.float64), node.scan.origin, a.settings)
         if found.confidence >= 0.5:
-            votes_cast.append(
+            poses_a_b.append(
                 se2.compose(found.pose_map_body, se2.inverse(b.pose_graph.pose_map_node[node.id]))
             )
-    if not votes_cast:
+    if not poses_a_b:
         return None
-    same = np.array([[_same(p, q) for q in votes_cast] for p in votes_cast])
+    same = np.array([[_same(p, q) for q in poses_a_b] for p in poses_a_b])
     votes = same.sum(axis=1)
     best = int(np.argmax(votes))
     rival = int(votes[~same[best]].max(initial=0))
     if votes[best] < MIN_AGREEING_SCANS or rival * 2 > votes[best]:
         return None
-    return MapAlignment(votes_cast[best], int(votes[best]), len(chosen))
+    return MapAlignment(poses_a_b[best], int(votes[best]), len(chosen))
 
 
 def _same(p: np.ndarray, q: np.ndarray) -> bool:
+    """Return whether two poses [3] are equal within SAME_POSE_M and SAME_POSE_RAD."""
     turned = abs(math.remainder(p[2] - q[2], 2.0 * math.pi))
     return bool(np.hypot(*(p[:2] - q[:2])) < SAME_POSE_M and turned < SAME_POSE_RAD)
 
 
 def merge_into(a: LidarSlam, b: LidarSlam, pose_a_b: np.ndarray, offset: int) -> int:
-    """Puts map b into a at `pose_a_b` [3], finds the loops between them and optimises both as one.
+    """Insert map b into map a at `pose_a_b` [3], search loop closures and optimise; return their number.
 
-    Submaps of b get `offset` added to their ids. Gives the number of loop closures found. b is used up.
+    `offset` is added to the submap ids of b. Map b must not be used afterwards.
     """
     graph, other, first = a.pose_graph, b.pose_graph, a.pose_graph.next_node_id
     for id, node in other.nodes.items():
@@ -71,7 +72,7 @@ def merge_into(a: LidarSlam, b: LidarSlam, pose_a_b: np.ndarray, offset: int) ->
     ]
     a.record = _merged_records(a.record, b.record, pose_a_b, first)
     graph.pending = [first + id for id in other.nodes]
-    graph.unlinked_from = None  # the whole map hangs together from now on
+    graph.unlinked_from = None  # both maps are one connected map now
     graph.resume_numbering()
     before = graph.loop_closures
     a.finish()
@@ -81,7 +82,7 @@ def merge_into(a: LidarSlam, b: LidarSlam, pose_a_b: np.ndarray, offset: int) ->
 def _merged_records(
     a: TrajectoryRecord, b: TrajectoryRecord, pose_a_b: np.ndarray, first: int
 ) -> TrajectoryRecord:
-    """The scans of both, in order of time."""
+    """Return the trajectory records of both maps, sorted by stamp."""
     of_a, of_b = a.arrays(), b.arrays()
     poses = of_b["extra_poses"].copy()
     poses[:, 3:] = se2.compose_many(np.tile(pose_a_b, (len(poses), 1)), poses[:, 3:])

@@ -1,4 +1,4 @@
-"""Figures of merit for planar trajectories: relations (Kuemmerle et al. 2009), ATE and yaw RMSE."""
+"""Accuracy metrics of planar trajectories: relations (Kuemmerle et al. 2009), ATE and yaw RMSE."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class RelationErrors:
 
 @dataclass(frozen=True)
 class TrajectoryErrors:
-    """Absolute trajectory errors, never with a scale."""
+    """Absolute trajectory errors; the scale is never fitted."""
 
     poses: int
     ate_first_pose_rmse_m: float
@@ -35,9 +35,10 @@ class TrajectoryErrors:
 
 
 def read_relations(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Stamps int64 [R, 2] in ns and relative poses float64 [R, 3] of a Kuemmerle `.relations` file.
+    """Return stamps int64 [R, 2] (ns) and relative poses float64 [R, 3] of a `.relations` file.
 
-    Columns: t1 t2 x y z roll pitch yaw, the pose of t2 in the frame of t1. Raises ValueError naming the line.
+    Format of Kuemmerle et al. 2009: t1 t2 x y z roll pitch yaw, the pose of t2 in the frame of t1. Raises
+    ValueError with the line number.
     """
     stamps, relative = [], []
     for number, line in enumerate(Path(path).read_text().splitlines(), start=1):
@@ -57,7 +58,10 @@ def read_relations(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def stamp_ns_of(seconds: str) -> int:
-    """Decimal seconds as text to int64 ns without going through a float (which keeps only ~100 ns)."""
+    """Convert decimal seconds as text to int64 ns; a float would keep only about 100 ns.
+
+    Raises ValueError if the text is not a decimal number.
+    """
     whole, _, fraction = seconds.partition(".")
     if not (whole.lstrip("-").isdigit() and (fraction == "" or fraction.isdigit())):
         raise ValueError(f"stamp {seconds!r} is not decimal seconds")
@@ -70,17 +74,22 @@ def relation_errors(
     pose_map_body: np.ndarray,  # float64 [N, 3]
     relation_stamps_ns: np.ndarray,  # int64 [R, 2]
     relations: np.ndarray,  # float64 [R, 3]
-    pose_body_reference: np.ndarray | None = None,  # float64 [3], the frame the relations speak of
+    pose_body_reference: np.ndarray | None = None,  # float64 [3], the frame of the relations
     tolerance_ns: int = 1_000_000,
 ) -> RelationErrors:
-    """Difference between estimated and given relative poses: length of its translation and absolute yaw."""
+    """Return the errors of estimated relative poses: length of the translation error and absolute yaw error.
+
+    Raises ValueError if no relation has both stamps in the trajectory.
+    """
     poses = (
         pose_map_body if pose_body_reference is None else se2.compose_many(pose_map_body, pose_body_reference)
     )
     index, ok = nearest_stamps(stamps_ns, relation_stamps_ns.ravel(), tolerance_ns)
     index, ok = index.reshape(-1, 2), ok.reshape(-1, 2).all(axis=1)
     if not ok.any():
-        raise ValueError("no relation has both its stamps in the trajectory; are they of the same log?")
+        raise ValueError(
+            "no relation has both its stamps in the trajectory; check that both are of the same log"
+        )
     estimated = se2.between_many(poses[index[ok, 0]], poses[index[ok, 1]])
     difference = se2.between_many(relations[ok], estimated)
     translation = np.hypot(difference[:, 0], difference[:, 1])
@@ -99,7 +108,10 @@ def trajectory_errors(
     pose_map_body: np.ndarray,  # float64 [N, 3], estimated
     pose_world_body: np.ndarray,  # float64 [N, 3], truth at the same stamps
 ) -> TrajectoryErrors:
-    """ATE aligned by the first pose only, ATE after the best rigid alignment, yaw RMSE."""
+    """Return the ATE aligned by the first pose, the ATE after the best rigid alignment, and the yaw RMSE.
+
+    The yaw errors use the alignment by the first pose. Raises ValueError for unequal or empty inputs.
+    """
     if pose_map_body.shape != pose_world_body.shape or len(pose_map_body) == 0:
         raise ValueError(
             f"estimate {pose_map_body.shape} and truth {pose_world_body.shape} must be equal [N > 0, 3]"
@@ -114,7 +126,7 @@ def trajectory_errors(
 
 
 def rigid_alignment(points_a: np.ndarray, points_b: np.ndarray) -> np.ndarray:
-    """T_b_a minimising the squared distances of [N, 2] point pairs (closed form, Umeyama without scale)."""
+    """Return pose_b_a that minimises the squared distances of point pairs [N, 2] (Umeyama without scale)."""
     a, b = points_a - points_a.mean(axis=0), points_b - points_b.mean(axis=0)
     yaw = np.arctan2((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum(), (a * b).sum())
     shift = points_b.mean(axis=0) - se2.transform(np.array([0.0, 0.0, yaw]), points_a.mean(axis=0)[None])[0]
@@ -126,7 +138,7 @@ def interpolate_poses(
     poses: np.ndarray,  # float64 [N, 3]
     at_ns: np.ndarray,  # int64 [M]
 ) -> np.ndarray:
-    """Poses float64 [M, 3] at other stamps, linear in position and yaw; clamped at both ends."""
+    """Return poses float64 [M, 3] at other stamps, linear in position and yaw, clamped at both ends."""
     base = int(stamps_ns[0])
     t, q = (stamps_ns - base) * 1e-9, (at_ns - base) * 1e-9
     yaw = np.unwrap(poses[:, 2])
@@ -141,7 +153,7 @@ def interpolate_poses(
 def nearest_stamps(
     stamps_ns: np.ndarray, wanted_ns: np.ndarray, tolerance_ns: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Index of the nearest stamp for each wanted one and whether it lies within the tolerance."""
+    """Return the index of the nearest stamp for each wanted one, and whether it is within the tolerance."""
     if len(stamps_ns) == 0:
         return np.zeros(len(wanted_ns), dtype=np.int64), np.zeros(len(wanted_ns), dtype=bool)
     right = np.clip(np.searchsorted(stamps_ns, wanted_ns), 0, len(stamps_ns) - 1)

@@ -1,4 +1,4 @@
-"""Lidar SLAM as a node: scans and wheels in; smooth pose, correction, anchors, movers and grid out."""
+"""Lidar SLAM node: scans and wheel odometry in; pose, correction, anchors, dynamic-beam mask and grid out."""
 
 from __future__ import annotations
 
@@ -32,28 +32,29 @@ from beamsplat.services.localization.lidar2d.state import MANIFEST, MapStateErro
 
 log = logging.getLogger("beamsplat.localization")
 
-_LOST_SUBMAPS = 1000  # more than can have been begun since the state that a restart goes on from
+_RESERVED_SUBMAP_IDS = 1000  # upper bound of the submaps started between the last checkpoint and a crash
 
 
 class LidarLocalizationConfig(NodeConfig):
-    """The SLAM itself needs no tuning: what differs between lidars comes with the scans."""
+    """Configuration; the SLAM needs no tuning, because the properties of the lidar come with the scans."""
 
     grid_every_scans: Annotated[int, Field(ge=1)] = 50
     grid_resolution_m: Annotated[float, Field(gt=0.0, le=1.0)] = 0.05
     save: Path | None = None  # folder for map, trajectory and state, written at the end of the data
-    resume: Path | None = None  # folder of a saved state: the robot finds its place in it and maps on
-    keep_every_s: Annotated[float, Field(gt=0.0)] = 10.0  # live: a copy, for a restart after a crash
+    resume: Path | None = None  # folder of a saved state to continue; the robot relocalizes in it
+    keep_every_s: Annotated[float, Field(gt=0.0)] = 10.0  # live: interval of the checkpoints
 
 
 class LidarLocalization(Node):
-    """The robot's pose from its lidar, with wheel odometry if there is any.
+    """Localization service by 2D lidar SLAM, with wheel odometry where it is available.
 
-    A process that dies costs the seconds until its successor has found its place in the map that it kept.
+    In live operation it writes checkpoints. After a crash, the restarted process loads the last one and
+    relocalizes in it, which takes a few seconds.
     """
 
     name = "localization"
     Config = LidarLocalizationConfig
-    # The calibration is merged by stamp with the scans: whether it is there must not depend on luck.
+    # "every": the calibration is merged with the scans by stamp, so that runs are reproducible.
     inputs = (Input("rig", "every"), "lidar/scan", "wheel/odometry")
     outputs = (
         "localization/odometry", "localization/correction", "localization/anchors", "localization/movers",
@@ -72,16 +73,18 @@ class LidarLocalization(Node):
 
     def configure(self) -> None:
         self._slam: LidarSlam | None = None
-        self._said: np.ndarray | None = None  # T_map_odom as last published
+        self._published_correction: np.ndarray | None = None  # pose_map_odom
         self._optimisations = 0
         self._stamp_ns = 0
-        self._drawn: OccupancyGrid | None = None
-        self._named = ""  # the map whose name was said
-        self._kept_ns: int | None = None  # when the last state was kept for a restart
-        self._keeping = False
-        self._spare = None if self.live_settings is None else self.live_settings.run_dir / "localization"
-        if self._spare is not None and not self.live_settings.resume:  # of another drive
-            shutil.rmtree(self._spare, ignore_errors=True)
+        self._published_grid: OccupancyGrid | None = None
+        self._published_uuid = ""
+        self._checkpoint_ns: int | None = None
+        self._checkpoint_running = False
+        self._checkpoint_dir = (
+            None if self.live_settings is None else self.live_settings.run_dir / "localization"
+        )
+        if self._checkpoint_dir is not None and not self.live_settings.resume:  # checkpoint of an earlier run
+            shutil.rmtree(self._checkpoint_dir, ignore_errors=True)
         if self.config.resume is not None:
             try:
                 read_manifest(self.config.resume / MANIFEST)
@@ -89,19 +92,20 @@ class LidarLocalization(Node):
                 raise UserError(f"localization.resume: {error}") from error
 
     def on_rig(self, rig: Rig) -> Outputs:
-        """Where the lidar sits. A second calibration would bend the map: it is rejected, and said."""
+        """Create the SLAM from the first calibration; ignore later ones, which would distort the map."""
         if rig.lidar is None:
             log.error("the calibration has no lidar: scans cannot be used")
         elif self._slam is None:
             self._stamp_ns = rig.stamp_ns
-            self._slam = self._begin(rig.lidar.T_body_lidar)
-            yield from self._name_map()
+            self._slam = self._create_slam(rig.lidar.T_body_lidar)
+            yield from self._publish_new_map()
         else:
             log.warning("a new calibration is ignored: restart the node to use it")
 
-    def _begin(self, T_body_lidar: np.ndarray) -> LidarSlam:
-        crashed = self._spare is not None and (self._spare / MANIFEST).is_file()
-        folder = self._spare if crashed else self.config.resume
+    def _create_slam(self, T_body_lidar: np.ndarray) -> LidarSlam:
+        """Return the SLAM from a checkpoint, from the `resume` folder, or with an empty map."""
+        crashed = self._checkpoint_dir is not None and (self._checkpoint_dir / MANIFEST).is_file()
+        folder = self._checkpoint_dir if crashed else self.config.resume
         if folder is None:
             return LidarSlam(LidarSlamSettings(), T_body_lidar)
         try:
@@ -109,11 +113,11 @@ class LidarLocalization(Node):
         except MapStateError as error:
             if not crashed:
                 raise UserError(f"localization.resume: {error}") from error
-            log.error("begins a new map: %s", error)
+            log.error("cannot load the checkpoint, starting a new map: %s", error)
             return LidarSlam(LidarSlamSettings(), T_body_lidar)
         if crashed:
-            slam.pose_graph.reserve_submap_ids(_LOST_SUBMAPS)
-        log.info("goes on from %s: %d submaps", folder, len(slam.anchors()))
+            slam.pose_graph.reserve_submap_ids(_RESERVED_SUBMAP_IDS)
+        log.info("continuing the map in %s: %d submaps", folder, len(slam.anchors()))
         return slam
 
     def on_wheel_odometry(self, odometry: WheelOdometry) -> Outputs:
@@ -122,79 +126,85 @@ class LidarLocalization(Node):
         return iter(())
 
     def on_lidar_scan(self, scan: Scan) -> Outputs:
-        """One pose a scan; background work and a new grid now and then."""
+        """Publish one pose per scan; start background jobs and publish the grid at fixed intervals."""
         if self._slam is None:
-            yield "localization/odometry", _unusable(scan.stamp_ns, "no calibration yet")
+            yield "localization/odometry", _rejected(scan.stamp_ns, "no calibration yet")
             return
         result = self._slam.add_scan(
             scan.stamp_ns, scan.ranges_m, scan.angle_min_rad, scan.angle_increment_rad,
             scan.time_increment_s, scan.range_min_m, scan.range_max_m,
         )  # fmt: skip
         self._stamp_ns = scan.stamp_ns
-        yield from self._name_map()
+        yield from self._publish_new_map()
         yield "localization/odometry", _odometry(result)
         yield "localization/movers", MovingBeams(stamp_ns=scan.stamp_ns, moving=result.dynamic)
         yield from self._correction(scan.stamp_ns, result.pose_map_odom)
         if result.job is not None:
-            # Its result is due before the scan with number `apply_at_scan`; the next one is `scans`.
+            # The result is due before the scan with number `apply_at_scan`; the next scan has number `scans`.
             after = result.job.apply_at_scan - self._slam.scans + 1
             yield Job("optimise", result.job.run, after=after, of="lidar/scan")
-        yield from self._keep_state(scan.stamp_ns, result.status == "ok")
+        yield from self._start_checkpoint(scan.stamp_ns, result.status == "ok")
         if self._slam.scans % self.config.grid_every_scans == 0:
-            yield from self._draw_grid()
+            yield from self._publish_grid()
 
     def on_job_optimise(self, result: object) -> Outputs:
-        """A background optimisation is taken in: the map moves, the smooth pose does not."""
+        """Apply an optimisation: the map changes, the pose in the odom frame does not."""
         self._slam.apply(result)
         self._optimisations += 1
-        yield from self._map_moved()
+        yield from self._publish_map_poses()
 
-    def _keep_state(self, stamp_ns: int, placed: bool) -> Outputs:
-        """Now and then a copy goes to the disk, in the background, for whoever is started after a crash."""
-        if self._spare is None or self._keeping or not placed:
+    def _start_checkpoint(self, stamp_ns: int, localized: bool) -> Outputs:
+        """Write a checkpoint in the background every `keep_every_s`, while the pose is known."""
+        if self._checkpoint_dir is None or self._checkpoint_running or not localized:
             return
-        if self._kept_ns is None or abs(stamp_ns - self._kept_ns) >= self.config.keep_every_s * 1e9:
-            self._kept_ns, self._keeping = stamp_ns, True
-            folder, state = self._spare, self._slam.packed()
+        if (
+            self._checkpoint_ns is None
+            or abs(stamp_ns - self._checkpoint_ns) >= self.config.keep_every_s * 1e9
+        ):
+            self._checkpoint_ns, self._checkpoint_running = stamp_ns, True
+            folder, state = self._checkpoint_dir, self._slam.packed()
 
-            def keep() -> str:
+            def write() -> str:
                 try:
                     write_state(folder, state)
                 except OSError as error:
                     return f"{folder}: {reason(error)}"
                 return ""
 
-            yield Job("keep", keep)
+            yield Job("checkpoint", write)
 
-    def on_job_keep(self, fault: str) -> Outputs:
-        """The copy is on the disk, or could not be written."""
-        self._keeping = False
-        self.detail = f"no copy of the map for a restart: {fault}" if fault else ""
+    def on_job_checkpoint(self, fault: str) -> Outputs:
+        """Report whether the checkpoint was written."""
+        self._checkpoint_running = False
+        self.detail = f"the checkpoint of the map was not written: {fault}" if fault else ""
         return iter(())
 
     def drain(self) -> Outputs:
-        """Last loop closures and optimisation, the final grid, and the files asked for."""
+        """Do the final loop closure and optimisation, publish the result and write the requested files."""
         if self._slam is None or not self._slam.anchors():
-            return  # nothing usable came: there is no map
+            return  # there was no usable scan
         self._slam.finish()
         self._optimisations += 1
-        yield from self._map_moved()
-        yield from self._draw_grid()
+        yield from self._publish_map_poses()
+        yield from self._publish_grid()
         if self.config.save is not None:
             self._slam.save(self.config.save)
             log.info("map and state saved to %s", self.config.save)
 
-    def _map_moved(self) -> Outputs:
+    def _publish_map_poses(self) -> Outputs:
         yield from self._correction(self._stamp_ns, self._slam.pose_graph.pose_map_odom)
         yield from self._anchors()
 
-    def _name_map(self) -> Outputs:
-        """Which map it is, before the first pose in it: what hangs on anchors of two must not mix."""
-        if self._slam.pose_graph.uuid != self._named:
+    def _publish_new_map(self) -> Outputs:
+        """Publish the anchors with the map's UUID before the first pose in a new map.
+
+        Subscribers must not mix anchors of two maps.
+        """
+        if self._slam.pose_graph.uuid != self._published_uuid:
             yield from self._anchors()
 
     def _anchors(self) -> Outputs:
-        self._named = self._slam.pose_graph.uuid
+        self._published_uuid = self._slam.pose_graph.uuid
         anchors = self._slam.anchors()
         T_map_anchor = se2_to_se3(np.array(list(anchors.values())).reshape(-1, 3))
         yield (
@@ -207,9 +217,11 @@ class LidarLocalization(Node):
         )  # fmt: skip
 
     def _correction(self, stamp_ns: int, pose_map_odom: np.ndarray) -> Outputs:
-        """Says `T_map_odom` when it has changed: it is latched."""
-        if self._said is None or not np.array_equal(self._said, pose_map_odom):
-            self._said = pose_map_odom.copy()
+        """Publish T_map_odom if it has changed; the topic is latched."""
+        if self._published_correction is None or not np.array_equal(
+            self._published_correction, pose_map_odom
+        ):
+            self._published_correction = pose_map_odom.copy()
             yield (
                 "localization/correction",
                 Correction(
@@ -217,11 +229,11 @@ class LidarLocalization(Node):
                 ),
             )
 
-    def _draw_grid(self) -> Outputs:
-        """The occupancy grid as it is now, and the region in which it differs from the one before."""
+    def _publish_grid(self) -> Outputs:
+        """Publish the occupancy grid with the region that differs from the last one."""
         grid = self._slam.grid(self.config.grid_resolution_m)
-        changed = _changed(self._drawn, grid)
-        self._drawn = grid
+        changed = _changed(self._published_grid, grid)
+        self._published_grid = grid
         yield (
             "localization/grid",
             Grid(
@@ -232,7 +244,10 @@ class LidarLocalization(Node):
 
 
 def _changed(before: OccupancyGrid | None, grid: OccupancyGrid) -> tuple[int, int, int, int]:
-    """Bounding box (row0, column0, row1, column1) of the cells that differ; all, if the grid has moved."""
+    """Return the bounding box (row0, column0, row1, column1) of the cells that differ.
+
+    It covers the whole grid if the grid's origin or size has changed.
+    """
     rows, columns = grid.values.shape
     same_place = before is not None and before.values.shape == grid.values.shape and (
         before.origin_x_m == grid.origin_x_m and before.origin_y_m == grid.origin_y_m
@@ -254,7 +269,7 @@ def _odometry(result: ScanResult) -> Odometry:
     )  # fmt: skip
 
 
-def _unusable(stamp_ns: int, why: str) -> Odometry:
+def _rejected(stamp_ns: int, why: str) -> Odometry:
     return Odometry(
         stamp_ns=stamp_ns,
         T_odom_body=np.eye(4),

@@ -1,4 +1,4 @@
-"""What a match really knows: a corridor looks the same a little further on."""
+"""Observability of a match: detects directions along which the scan can be shifted, as in a corridor."""
 
 from __future__ import annotations
 
@@ -12,10 +12,9 @@ from beamsplat.services.localization.lidar2d.scan_matching import Match, accumul
 from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
 from beamsplat.services.localization.lidar2d.surfel_map import MatchTables
 
+# Shifts of the scan that are tested along the weak direction.
 SHIFTS_M = np.array([-0.45, -0.3, -0.15, 0.15, 0.3, 0.45])
-MIN_DISAGREEMENT_RATIO = (
-    0.10  # share of the returns that must disagree with a shift for its direction to be trusted
-)
+MIN_DISAGREEMENT_RATIO = 0.10  # fraction of the returns that must disagree with every shift for full trust
 
 
 @kernel
@@ -35,7 +34,7 @@ def weights_when_shifted(
     scale2: float,
     out: np.ndarray,
 ) -> float:
-    """Sum of weights at the match (returned) and at each shift along a direction (out float64 [K])."""
+    """Return the sum of weights at the match; write the sum at each shift to `out` float64 [K]."""
     H, g, moved = np.empty((3, 3)), np.empty(3), np.empty(3)
     here, _, _ = accumulate(
         points, origin, pose, nearest, means, omegas, views, row0, col0, cell_m, scale2, H, g
@@ -52,22 +51,22 @@ def weights_when_shifted(
 
 @kernel
 def weak_direction(information: np.ndarray) -> np.ndarray:
-    """Unit vector of the translation a match knows least about (yaw marginalised)."""
+    """Return the unit vector [2] of the least certain translation (yaw marginalised)."""
     yaw = max(information[2, 2], 1e-9)
     xx = information[0, 0] - information[0, 2] * information[2, 0] / yaw
     xy = information[0, 1] - information[0, 2] * information[2, 1] / yaw
     yy = information[1, 1] - information[1, 2] * information[2, 1] / yaw
-    angle = 0.5 * math.atan2(2.0 * xy, xx - yy)  # of the strong axis
+    angle = 0.5 * math.atan2(2.0 * xy, xx - yy)  # of the most certain axis
     return np.array([-math.sin(angle), math.cos(angle)])
 
 
 @dataclasses.dataclass(frozen=True)
 class ObservedMatch:
-    """A match and how far it can be trusted along its weak direction."""
+    """A match with the observability of its weak direction."""
 
-    match: Match  # with the information that is left
-    trust: float  # 0 (slides freely) .. 1
-    direction: np.ndarray  # float64 [2] unit vector, axes of the map
+    match: Match  # with reduced information
+    trust: float  # 0 (unobservable) .. 1 (fully observable)
+    direction: np.ndarray  # float64 [2], unit vector in the axes of the map
 
 
 def reduce_unobservable(
@@ -77,7 +76,10 @@ def reduce_unobservable(
     tables: MatchTables,
     settings: LidarSlamSettings,
 ) -> ObservedMatch:
-    """Reduce the information along the weak direction to what shifting the scan tells."""
+    """Return the match with less information along its weak direction if shifting the scan changes little.
+
+    The information along the direction is multiplied by trust^2. `full_information` keeps the original.
+    """
     direction = weak_direction(match.information)
     if len(points) == 0:
         return ObservedMatch(match, 0.0, direction)
@@ -99,8 +101,8 @@ def reduce_unobservable(
         (settings.outlier_m / sigma_m) ** 2,
         shifted,
     )
-    known = max(match.overlap * len(points), 1.0)
-    trust = min(max((here - float(shifted.max())) / (MIN_DISAGREEMENT_RATIO * known), 0.0), 1.0)
+    overlapping = max(match.overlap * len(points), 1.0)
+    trust = min(max((here - float(shifted.max())) / (MIN_DISAGREEMENT_RATIO * overlapping), 0.0), 1.0)
     if trust >= 1.0:
         return ObservedMatch(match, 1.0, direction)
     v = np.array([direction[0], direction[1], 0.0])
@@ -112,11 +114,11 @@ def reduce_unobservable(
 
 
 def keep_guess_if_unobservable(observed: ObservedMatch, guess_pose: np.ndarray) -> Match:
-    """The match, except that it stays at the guess along a direction it knows nothing about."""
+    """Return the match with its pose moved back to the guess along the unobservable direction."""
     match, v = observed.match, observed.direction
     if observed.trust >= 1.0:
         return match
-    back = (1.0 - observed.trust**2) * float((guess_pose - match.pose_target_body)[:2] @ v)
+    correction = (1.0 - observed.trust**2) * float((guess_pose - match.pose_target_body)[:2] @ v)
     pose = match.pose_target_body.copy()
-    pose[:2] += back * v
+    pose[:2] += correction * v
     return dataclasses.replace(match, pose_target_body=pose)

@@ -1,4 +1,4 @@
-"""Occupancy grids from hits and misses of all submaps, and their nav2 files."""
+"""Occupancy grids from the hits and misses of all submaps, and their files for nav2."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ import numpy as np
 from beamsplat.common.compiled import kernel
 from beamsplat.services.localization.lidar2d import se2
 
-HIT_LOG_ODDS = 1.5  # one return outweighs three beams that pass: walls are often seen at a grazing angle
+HIT_LOG_ODDS = 1.5  # one hit outweighs three misses, because beams pass walls at grazing angles
 MISS_LOG_ODDS = -0.5
-OCCUPIED, FREE, UNKNOWN = 65, 25, -1  # nav2: percent above which a cell is a wall, below which it is free
+OCCUPIED, FREE, UNKNOWN = 65, 25, -1  # percent; limits of nav2 for occupied and free
 
 
 @dataclass(frozen=True)
 class OccupancyGrid:
-    """Row 0 is the lowest y; `values` are percent, -1 = unknown, as in nav_msgs/OccupancyGrid."""
+    """Occupancy in percent, -1 = unknown, as in nav_msgs/OccupancyGrid; row 0 has the lowest y."""
 
     values: np.ndarray  # int8 [H, W]
     origin_x_m: float  # lower left corner of cell (0, 0) in the map frame
@@ -45,7 +45,7 @@ def add_counts(
     sum_hits: np.ndarray,
     sum_misses: np.ndarray,  # in out float32 [H, W]
 ) -> None:
-    """Each map cell asks the submap's cell at its centre (so that turning leaves no holes)."""
+    """Add the counts of a submap to the map grid: each map cell reads the submap cell at its centre."""
     c, s = math.cos(pose_submap_map[2]), math.sin(pose_submap_map[2])
     for r in range(low_row, high_row):
         y = origin_y + (r + 0.5) * resolution
@@ -60,7 +60,7 @@ def add_counts(
 
 @dataclass(frozen=True)
 class CountGrid:
-    """Hits and misses of one submap and where it lies."""
+    """Hits and misses of one submap, with its pose."""
 
     hits: np.ndarray  # uint8 [h, w]
     misses: np.ndarray  # uint8 [h, w]
@@ -70,7 +70,7 @@ class CountGrid:
     pose_map_submap: np.ndarray  # float64 [3]
 
     def corners(self) -> np.ndarray:
-        """Corners of what was seen in the map frame, float64 [4, 2]."""
+        """Return the corners of the observed rectangle in the map frame, float64 [4, 2]."""
         seen = (self.hits > 0) | (self.misses > 0)
         rows, cols = np.flatnonzero(seen.any(axis=1)), np.flatnonzero(seen.any(axis=0))
         if len(rows) == 0:
@@ -80,8 +80,11 @@ class CountGrid:
         return se2.transform(self.pose_map_submap, np.column_stack([x, y]) * self.cell_m)
 
 
-def render(grids: list[CountGrid], resolution_m: float) -> OccupancyGrid:
-    """One grid from all submaps; its origin is a multiple of 64 cells, so that it grows in whole tiles."""
+def render_occupancy(grids: list[CountGrid], resolution_m: float) -> OccupancyGrid:
+    """Return one occupancy grid of all submaps.
+
+    Its origin is a multiple of 64 cells, so that a growing grid keeps its cell boundaries.
+    """
     if not grids:
         return OccupancyGrid(np.full((64, 64), UNKNOWN, dtype=np.int8), 0.0, 0.0, resolution_m)
     boxes = [grid.corners() for grid in grids]
@@ -116,30 +119,8 @@ def render(grids: list[CountGrid], resolution_m: float) -> OccupancyGrid:
     return OccupancyGrid(values, float(low[0]), float(low[1]), resolution_m)
 
 
-def changed_regions(
-    old: OccupancyGrid | None, new: OccupancyGrid, tile: int = 64
-) -> list[tuple[int, int, int, int]]:
-    """Tiles of the new grid (row, column, height, width in cells) that differ from the old one."""
-    rows, cols = new.values.shape
-    reference = np.full((rows, cols), UNKNOWN, dtype=np.int8)
-    if old is not None and old.resolution_m == new.resolution_m:
-        dr = round((old.origin_y_m - new.origin_y_m) / new.resolution_m)
-        dc = round((old.origin_x_m - new.origin_x_m) / new.resolution_m)
-        r0, c0 = max(dr, 0), max(dc, 0)
-        r1, c1 = min(dr + old.values.shape[0], rows), min(dc + old.values.shape[1], cols)
-        if r1 > r0 and c1 > c0:
-            reference[r0:r1, c0:c1] = old.values[r0 - dr : r1 - dr, c0 - dc : c1 - dc]
-    regions = []
-    for r in range(0, rows, tile):
-        for c in range(0, cols, tile):
-            window = np.s_[r : r + tile, c : c + tile]
-            if not np.array_equal(reference[window], new.values[window]):
-                regions.append((r, c, *new.values[window].shape))
-    return regions
-
-
 def save_nav2(grid: OccupancyGrid, folder: Path, name: str = "map") -> None:
-    """`map.pgm` + `map.yaml` for nav2's map server and `map.png` to look at."""
+    """Write `NAME.pgm` and `NAME.yaml` for the map server of nav2, and `NAME.png` as a preview."""
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     flipped = grid.values[::-1]
@@ -151,7 +132,7 @@ def save_nav2(grid: OccupancyGrid, folder: Path, name: str = "map") -> None:
     (folder / f"{name}.yaml").write_text(
         f"image: {name}.pgm\nmode: trinary\nresolution: {grid.resolution_m}\n"
         f"origin: [{grid.origin_x_m:.6f}, {grid.origin_y_m:.6f}, 0.0]\nnegate: 0\n"
-        # Between the three pixel values: 205 is (255 - 205) / 255 = 0.1961, and must not read as free.
+        # Pixel 205 (unknown) is (255 - 205) / 255 = 0.1961 and must not be read as free.
         "occupied_thresh: 0.65\nfree_thresh: 0.196\n"
     )
     known = np.argwhere(flipped >= 0)
@@ -160,4 +141,4 @@ def save_nav2(grid: OccupancyGrid, folder: Path, name: str = "map") -> None:
         (r0, c0), (r1, c1) = known.min(axis=0), known.max(axis=0) + 1
         shown = shown[r0:r1, c0:c1]
     if not cv2.imwrite(str(folder / f"{name}.png"), shown):
-        raise ValueError(f"{folder / name}.png could not be written")
+        raise ValueError(f"{folder / name}.png cannot be written")

@@ -1,4 +1,4 @@
-"""Wheel odometry that is trusted as far as the scans confirm it: delay, gaps, noise, lies."""
+"""Wheel odometry with estimated delay, tolerance to gaps, and error models learnt from matched scans."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from beamsplat.services.localization.lidar2d import se2
 
 NS = 1e-9
 BASELINE_NS = 80_000_000
-DELAY_CANDIDATES_S = np.arange(-30, 31) * 0.01  # candidates for the delay of the odometry clock
+DELAY_CANDIDATES_S = np.arange(-30, 31) * 0.01  # candidates for the delay of the odometry stamps
 
 
 @kernel
@@ -19,17 +19,17 @@ def interpolate(
     stamps_ns: np.ndarray,  # int64 [N], increasing
     poses: np.ndarray,  # float64 [N, 3]
     at_ns: int,
-    ahead_ns: int,  # how far beyond the newest pose its last velocity may be followed
-    gap_ns: int,  # an interval longer than this is no information
+    ahead_ns: int,  # extrapolate up to this time beyond the newest pose
+    gap_ns: int,  # no interpolation over longer intervals
     out: np.ndarray,  # out float64 [3]
 ) -> bool:
-    """Pose at a stamp; False if the buffer cannot tell."""
+    """Write the pose at a stamp to `out`; return False if it is outside of the buffer or in a gap."""
     n = stamps_ns.shape[0]
     if n < 2 or at_ns < stamps_ns[0] or at_ns > stamps_ns[n - 1] + ahead_ns:
         return False
     i = min(max(np.searchsorted(stamps_ns, at_ns), 1), n - 1)
     k = i - 1
-    if at_ns > stamps_ns[n - 1]:  # a velocity needs a baseline: messages come in bursts
+    if at_ns > stamps_ns[n - 1]:  # stamps are irregular: use a longer baseline for the velocity
         while k > 0 and stamps_ns[n - 1] - stamps_ns[k] < BASELINE_NS:
             k -= 1
     span = stamps_ns[i] - stamps_ns[k]
@@ -53,7 +53,7 @@ def delay_costs(
     gap_ns: int,
     costs: np.ndarray,
 ) -> bool:
-    """Squared difference between the turn of the odometry, read `delay` later, and the matched turn."""
+    """Write the squared error of the odometry's rotation at each delay to `costs`; False if unknown."""
     a, b = np.empty(3), np.empty(3)
     for k in range(delays_ns.shape[0]):
         d = delays_ns[k]
@@ -67,14 +67,14 @@ def delay_costs(
 
 
 class OdometryBuffer:
-    """The last minute of wheel poses, and the delay that fits the scans best."""
+    """Recent wheel odometry poses and the estimated delay of their clock."""
 
     def __init__(self, capacity: int = 4096, gap_s: float = 0.6, bridge_s: float = 10.0) -> None:
         self._stamps = np.zeros(2 * capacity, dtype=np.int64)
         self._poses = np.zeros((2 * capacity, 3))
         self._capacity, self._count = capacity, 0
-        self._gap_ns = round(gap_s / NS)  # no learning over longer gaps
-        self._bridge_ns = round(bridge_s / NS)  # wheels keep counting while messages are missing
+        self._gap_ns = round(gap_s / NS)  # no delay estimation over longer gaps
+        self._bridge_ns = round(bridge_s / NS)  # interpolate over gaps up to this long
         self.delay_ns = 0
         self.rejected = 0
         self._delays_ns = np.round(DELAY_CANDIDATES_S / NS).astype(np.int64)
@@ -93,10 +93,10 @@ class OdometryBuffer:
         return self._poses[: self._count]
 
     def add(self, stamp_ns: int, x_m: float, y_m: float, yaw_rad: float) -> bool:
-        """False (and counted) for poses that are not finite or not newer than the last one."""
+        """Add a pose; return False (and count it) if it is not finite or not newer than the last one."""
         values = (x_m, y_m, yaw_rad)
         if not all(math.isfinite(v) for v in values) or (self._count and stamp_ns <= self.stamps_ns[-1]):
-            # A clock that was set back by more than the buffer's reach starts afresh.
+            # Restart if the clock was set back by more than the length of the buffer.
             if self._count and stamp_ns < self.stamps_ns[0] and all(math.isfinite(v) for v in values):
                 self._count = 0
             else:
@@ -112,7 +112,7 @@ class OdometryBuffer:
         return True
 
     def increment(self, t0_ns: int, t1_ns: int, ahead_s: float = 0.25) -> np.ndarray | None:
-        """Motion of the body between two scan stamps, read at the estimated delay; None if unknown."""
+        """Return the motion [3] of the body between two scan stamps, None if it is unknown."""
         a, b = np.empty(3), np.empty(3)
         ahead = round(ahead_s / NS)
         for stamp, out in ((t0_ns, a), (t1_ns, b)):
@@ -123,7 +123,11 @@ class OdometryBuffer:
         return se2.between(a, b)
 
     def observe_rotation(self, t0_ns: int, t1_ns: int, yaw_rad: float) -> None:
-        """Learn the delay from a matched turn: the candidate whose turns differ least, robustly averaged."""
+        """Update the delay estimate from a matched rotation between two scans.
+
+        The delay is the candidate with the lowest sum of robust, exponentially forgotten squared rotation
+        errors.
+        """
         if abs(yaw_rad) > 0.01 and t1_ns - t0_ns < self._gap_ns:
             self._pending_rotations.append((t0_ns, t1_ns, yaw_rad))
         horizon = int(self._delays_ns[-1])
@@ -157,23 +161,23 @@ class OdometryBuffer:
             return
         best = int(np.argmin(self._cost))
         now = int(np.argmin(np.abs(self._delays_ns - self.delay_ns)))
-        # Change only for a gain that is clear beyond the noise of the sum.
+        # Change only if the improvement exceeds the noise of the sum.
         if self._cost[best] < self._cost[now] - 0.02 * self._weight**0.5 - 0.02 * self._cost[now]:
             self.delay_ns = int(self._delays_ns[best])
 
 
 class MotionErrorModel:
-    """How wrong a source of motion has been lately; its prediction is weighted by that."""
+    """Standard deviation of a source of motion, scaled by its recent errors."""
 
     def __init__(
         self, base_m: float, per_m: float, per_s: float, base_rad: float, per_rad: float, rad_per_s: float
     ) -> None:
         self._base = (base_m, per_m, base_rad, per_rad)
-        self._gap_growth = (per_s, rad_per_s)  # growth over a gap in the scans, not scaled by what was learnt
+        self._gap_growth = (per_s, rad_per_s)  # growth over a gap in the scans; not scaled
         self.scale2_m = self.scale2_rad = 1.0
 
     def sigmas(self, motion: np.ndarray, dt_s: float) -> tuple[float, float]:
-        """Standard deviations (m, rad) of a predicted motion float64 [3]."""
+        """Return the standard deviations (m, rad) of a predicted motion float64 [3]."""
         base_m, base_rad = self._unit(motion)
         gap_s = max(0.0, dt_s - 0.5)
         sigma_m = base_m * math.sqrt(self.scale2_m) + self._gap_growth[0] * gap_s
@@ -185,7 +189,7 @@ class MotionErrorModel:
         return base_m + per_m * distance, base_rad + per_rad * turn + 0.1 * per_rad * distance
 
     def update(self, motion: np.ndarray, truth: np.ndarray) -> None:
-        """Compare with the matched motion; the scale follows quickly upwards and slowly down."""
+        """Compare a prediction with the matched motion; the scale rises quickly and falls slowly."""
         error = se2.between(motion, truth)
         unit_m, unit_rad = self._unit(motion)
         ratio_m = min((error[0] ** 2 + error[1] ** 2) / (2.0 * unit_m**2), 400.0)

@@ -1,4 +1,4 @@
-"""Maps a whole recorded drive as fast as the machine allows, and counts what it costs."""
+"""Mapping of a whole recording as fast as the machine allows, with run-time figures."""
 
 from __future__ import annotations
 
@@ -28,29 +28,33 @@ STREAMS = ("odometry", "scan")
 
 @dataclass(frozen=True)
 class MeasurementLog:
-    """Measurements in order of arrival: ("scan", stamp_ns, ranges_m, angle_min_rad, angle_increment_rad,
-    time_increment_s, range_min_m, range_max_m) and ("odometry", stamp_ns, x_m, y_m, yaw_rad)."""
+    """Measurements of a recording in order of arrival.
+
+    ("scan", stamp_ns, ranges_m, angle_min_rad, angle_increment_rad, time_increment_s, range_min_m,
+        range_max_m)
+    ("odometry", stamp_ns, x_m, y_m, yaw_rad)
+    """
 
     T_body_lidar: np.ndarray  # float64 [4, 4]
     measurements: Iterable[tuple]
-    advance: Callable[[], None]  # called once a measurement, for a progress bar
+    advance: Callable[[], None]  # called once per measurement, for a progress bar
 
 
-def map_measurements(drive: MeasurementLog, out: Path, resolution_m: float = 0.05) -> dict[str, Any]:
-    """Runs the SLAM over a drive and writes poses, map, state and figures into `out`.
+def map_measurements(log: MeasurementLog, out: Path, resolution_m: float = 0.05) -> dict[str, Any]:
+    """Run the SLAM over a recording, write poses, map, state and figures into `out`, and return the figures.
 
-    Background jobs run in a second thread and are taken in at the scans where they are due, exactly as in
-    the live node.
+    Background jobs run in a second thread. Their results are applied at the scans where they are due, exactly
+    as in the live node.
 
     Raises:
         UserError: there was no usable scan.
     """
-    slam = LidarSlam(LidarSlamSettings(), drive.T_body_lidar)
+    slam = LidarSlam(LidarSlamSettings(), log.T_body_lidar)
     wall, cpu = time.perf_counter(), time.process_time()
     steps_ms: list[float] = []
     statuses: dict[str, int] = {}
     with JobRunner(slam, threaded=True) as jobs:
-        for kind, *values in _merged(drive):
+        for kind, *values in _merged(log):
             if kind == "odometry":
                 slam.add_odometry(*values)
                 continue
@@ -64,7 +68,7 @@ def map_measurements(drive: MeasurementLog, out: Path, resolution_m: float = 0.0
         jobs.finish()
     cpu_s, wall_s = time.process_time() - cpu, time.perf_counter() - wall
     if slam.record.count == 0:
-        raise UserError(f"no scan could be used: {statuses or 'there was none'}")
+        raise UserError(f"no scan could be used: {statuses or 'the recording has none'}")
     _write(slam, out, resolution_m)
     figures = {
         "scans": len(steps_ms),
@@ -77,17 +81,17 @@ def map_measurements(drive: MeasurementLog, out: Path, resolution_m: float = 0.0
         "loop_closures": slam.pose_graph.loop_closures,
         "odometry_refused": slam.local_builder.odometry.rejected,
         **{f"scans_{status}": count for status, count in statuses.items()},
-        "T_body_lidar": se2.from_matrix(drive.T_body_lidar).tolist(),
+        "T_body_lidar": se2.from_matrix(log.T_body_lidar).tolist(),
     }
     (out / "figures.json").write_text(json.dumps(figures, indent=1))
     return figures
 
 
-def _merged(drive: MeasurementLog) -> Iterable[tuple]:
-    """Measurements by stamp, with the merger that the live runner uses."""
+def _merged(log: MeasurementLog) -> Iterable[tuple]:
+    """Yield the measurements by stamp, with the same merger as the live runner."""
     merger = StampMerger(STREAMS)
-    for measurement in drive.measurements:
-        drive.advance()
+    for measurement in log.measurements:
+        log.advance()
         merger.put(measurement[0], measurement[1], measurement)
         while (item := merger.pop()) is not None:
             yield item[1]

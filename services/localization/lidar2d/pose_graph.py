@@ -1,4 +1,4 @@
-"""The back end owns the map: keynodes, submaps, edges; it hands out snapshots and takes in results."""
+"""The back end: owns nodes, submaps and constraints; creates snapshots and applies job results."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from beamsplat.services.localization.lidar2d.submap_trimming import redundant_su
 
 
 class PoseGraph:
-    """State of the map between jobs."""
+    """State of the pose graph between background jobs."""
 
     def __init__(self, settings: LidarSlamSettings) -> None:
         self.settings = settings
-        self.uuid = ""  # of the map, from its first scan on; whatever goes on in it keeps it
+        self.uuid = ""  # of the map; derived from its first scan and kept over restarts
         self.nodes: dict[int, TrajectoryNode] = {}
         self.submaps: dict[int, Submap] = {}
         self.constraints: list[Constraint] = []
@@ -36,12 +36,13 @@ class PoseGraph:
         self.unlinked_from: int | None = None
         self._candidate: tuple[int, np.ndarray] | None = None
         self.fixed: frozenset[int] = frozenset()
-        # Keynodes that were taken out: the one they hang on now, and where (x, y, yaw).
+        # Trimmed nodes: the remaining node they are attached to, and the pose (x, y, yaw) relative to it.
         self.trimmed_nodes: dict[int, tuple[int, float, float, float]] = {}
         self._jobs = 0
         self._next_node = self._next_submap = 0
 
     def start_submap(self, pose_odom_submap: np.ndarray) -> Submap:
+        """Add an empty submap at a pose in the odom frame and return it."""
         submap = Submap(
             self._next_submap, pose_odom_submap, se2.compose(self.pose_map_odom, pose_odom_submap)
         )
@@ -50,22 +51,22 @@ class PoseGraph:
         return submap
 
     def resume_numbering(self) -> None:
-        """Continue the ids of a loaded map."""
+        """Continue the ids after those of a loaded map."""
         self._next_node = 1 + max([*self.nodes, *self.trimmed_nodes], default=-1)
         self._next_submap = 1 + max(self.submaps, default=-1)
 
     def reserve_submap_ids(self, count: int) -> None:
-        """Leaves ids free: others may know submaps by them that this map has lost."""
+        """Skip submap ids that a crashed predecessor may have published and that the loaded map lacks."""
         self._next_submap += count
 
     def start_segment(self) -> None:
-        """What comes next hangs on nothing until its place in the map is found."""
+        """Start a trajectory segment that is not connected to the map until its pose in it is found."""
         if self.nodes and self.unlinked_from is None:
             self.unlinked_from = self._next_node
             self._candidate = None
 
     def add_node(self, node: TrajectoryNode, edges: list[Constraint]) -> None:
-        """A new keynode and its poses in the submaps it was put into."""
+        """Add a node with its constraints to the submaps that it was inserted into."""
         self.nodes[node.id] = node
         self._next_node = node.id + 1
         self.pose_map_node[node.id] = se2.compose(self.pose_map_odom, node.pose_odom_body)
@@ -79,7 +80,7 @@ class PoseGraph:
         return self._next_node
 
     def snapshot(self) -> Snapshot:
-        """What a job may read while the map goes on growing."""
+        """Return an immutable copy for a background job."""
         self._jobs += 1
         return Snapshot(
             self._jobs,
@@ -102,7 +103,10 @@ class PoseGraph:
         )
 
     def apply(self, result: JobResult) -> None:
-        """Take in a job's result; what was added since the snapshot moves with the last optimised node."""
+        """Apply the result of a job.
+
+        Nodes and submaps that were added since the snapshot move with the last optimised node.
+        """
         if not result.pose_map_node:
             return
         if result.constraints is not None:
@@ -134,11 +138,11 @@ class PoseGraph:
         self.optimisations += 1
 
     def trim(self, active: set[int]) -> list[int]:
-        """Take out submaps nobody needs; returns their ids."""
+        """Remove redundant submaps and return their ids."""
         s = self.settings
         if self.unlinked_from is not None:
             return []
-        if self.fixed:  # localization only: of the own submaps keep the last few
+        if self.fixed:  # pure localization: keep only the last two of the new submaps
             own = [i for i in self.submaps if i not in self.fixed and i not in active]
             gone = own[: max(0, len(own) - 2)]
         else:
@@ -170,7 +174,7 @@ class PoseGraph:
         self.pending = [n for n in self.pending if n not in gone]
 
     def all_node_poses(self) -> dict[int, np.ndarray]:
-        """T_map_node of every keynode there ever was."""
+        """Return pose_map_node of all nodes, including the trimmed ones."""
         poses = dict(self.pose_map_node)
         for n in self.trimmed_nodes:
             chain, k = [], n

@@ -1,4 +1,4 @@
-"""What the back end remembers: keynodes with their scans, submaps, and the edges between them."""
+"""Elements of the pose graph: trajectory nodes with their scans, submaps, and their constraints."""
 
 from __future__ import annotations
 
@@ -21,17 +21,18 @@ from beamsplat.services.localization.lidar2d.surfel_map import FrozenMap, MatchT
 
 @dataclass(frozen=True)
 class NodeScan:
-    """The returns of one keynode, body frame, small types."""
+    """Range data of one node in the body frame, in compact types."""
 
     points: np.ndarray  # float32 [M, 2]
     tangents: np.ndarray  # float32 [M, 2]
     spacing_m: np.ndarray  # float32 [M]
-    dynamic: np.ndarray  # bool [M]
-    features: np.ndarray  # float32 [K, 5], see PreparedScan.features
-    origin: np.ndarray  # float64 [2]
+    dynamic: np.ndarray  # bool [M], returns on dynamic objects
+    features: np.ndarray  # float32 [K, 5] of static returns, see PreparedScan.features
+    origin: np.ndarray  # float64 [2], the lidar in the body frame
 
     @staticmethod
     def of(scan: PreparedScan, dynamic: np.ndarray) -> NodeScan:
+        """Create from a prepared scan and its dynamic mask bool [M]."""
         static = ~dynamic[scan.match_index]
         return NodeScan(
             scan.points_body.astype(np.float32),
@@ -45,7 +46,7 @@ class NodeScan:
 
 @dataclass(frozen=True)
 class TrajectoryNode:
-    """A scan that entered the map."""
+    """A scan that was inserted into the submaps, with its pose in the odom frame."""
 
     id: int
     stamp_ns: int
@@ -55,47 +56,47 @@ class TrajectoryNode:
 
 @dataclass
 class Submap:
-    """A local map with a pose of its own; the anchor that everything built on it hangs on."""
+    """A local map with its own pose; keyframes are anchored to submaps."""
 
     id: int
-    pose_odom_submap: np.ndarray  # float64 [3], where it was started
+    pose_odom_submap: np.ndarray  # float64 [3], at its start
     pose_map_submap: np.ndarray  # float64 [3], optimised
-    members: list[int] = field(default_factory=list)  # keynode ids
+    members: list[int] = field(default_factory=list)  # node ids
     frozen: FrozenMap | None = None
 
 
 @dataclass(frozen=True)
 class Constraint:
-    """A measured pose of a keynode in a submap."""
+    """A measured pose of a node in a submap."""
 
     submap: int  # submap id
-    node: int  # keynode id
+    node: int  # node id
     pose_submap_node: np.ndarray  # float64 [3]
     information: np.ndarray  # float64 [3, 3]
     loop: bool
 
 
 class TableCache:
-    """Match tables and pyramids of finished submaps, the most recently used ones."""
+    """Cache of the match tables and search pyramids of the most recently used finished submaps."""
 
     def __init__(self, reach_cells: int, capacity: int = 12) -> None:
         self._reach, self._capacity = reach_cells, capacity
-        # Each entry keeps the map it was made from: a submap that was drawn anew has another one.
+        # Each entry keeps the map that it was made from, to detect rebuilt submaps.
         self._tables: OrderedDict[int, tuple[FrozenMap, MatchTables]] = OrderedDict()
         self._pyramids: OrderedDict[int, tuple[FrozenMap, SearchPyramid]] = OrderedDict()
         self._global_map: tuple[object, object] | None = None
         self._lock = threading.Lock()
 
     def tables(self, submap: int, frozen: FrozenMap) -> MatchTables:
-        """Tables of a submap's frozen map (recomputed if the map was replaced)."""
+        """Return the match tables of a submap; they are recomputed if its map was replaced."""
         return self._get(self._tables, submap, frozen, lambda: frozen.tables(self._reach))
 
     def pyramid(self, submap: int, frozen: FrozenMap) -> SearchPyramid:
-        """Search pyramid of a submap's frozen map."""
+        """Return the search pyramid of a submap; it is recomputed if its map was replaced."""
         return self._get(self._pyramids, submap, frozen, lambda: _pyramid_of(self.tables(submap, frozen)))
 
     def global_map(self, key: object, make: Callable[[], object]) -> object:
-        """The map of everything; only the latest is kept."""
+        """Return the global map for a key; only the latest one is kept."""
         with self._lock:
             if self._global_map is not None and self._global_map[0] == key:
                 return self._global_map[1]
@@ -125,7 +126,7 @@ def _pyramid_of(tables: MatchTables) -> SearchPyramid:
 def constraint_arrays(
     constraints: list[Constraint], submap_row: dict[int, int], node_row: dict[int, int]
 ) -> ConstraintArrays:
-    """Edge arrays in the order the solver wants."""
+    """Return the constraints as arrays in the order that the solver needs."""
     node = np.array([node_row[c.node] for c in constraints], dtype=np.int32)
     order = np.argsort(node, kind="stable")
     chosen = [constraints[i] for i in order]
@@ -140,8 +141,11 @@ def constraint_arrays(
 
 @kernel
 def edge_information(match_information: np.ndarray, sigma_m: float, sigma_rad: float) -> np.ndarray:
-    """Information of an edge: that of the match, limited by what a match cannot know about itself."""
-    # (3 m)^-2 and (0.5 rad)^-2 keep the inverse finite where the scan says nothing.
+    """Return the information [3, 3] of a constraint: that of the match, limited by unmodelled errors.
+
+    `sigma_m` and `sigma_rad` are the standard deviations of errors that the match cannot observe.
+    """
+    # (3 m)^-2 and (0.5 rad)^-2 keep the inverse finite in unobservable directions.
     regular, covariance, information = match_information.copy(), np.empty((3, 3)), np.empty((3, 3))
     regular[0, 0] += 0.1
     regular[1, 1] += 0.1
@@ -155,10 +159,11 @@ def edge_information(match_information: np.ndarray, sigma_m: float, sigma_rad: f
 
 
 def second_submap_information(match_information: np.ndarray, settings: LidarSlamSettings) -> np.ndarray:
-    """Information of a keynode's edge into the younger submap, which it was not matched to.
+    """Return the information [3, 3] of a node's constraint in the younger submap.
 
-    All those edges together tie two neighbouring submaps, by no more than the drift from one to the next; if
-    they were as stiff as matches, a loop would have to bend steel and be taken for an outlier.
+    The scan was not matched to that submap. All these constraints together connect two consecutive submaps,
+    with an uncertainty of the drift between them. If they were as stiff as matches, true loop closures would
+    be rejected as outliers.
     """
     s = settings
     inner = np.linalg.inv(edge_information(match_information, s.edge_sigma_m, s.edge_sigma_rad))
@@ -169,7 +174,7 @@ def second_submap_information(match_information: np.ndarray, settings: LidarSlam
 
 
 def merged_features(nodes: list[TrajectoryNode], centre: TrajectoryNode, limit: int = 360) -> np.ndarray:
-    """Features float64 [K, 5] of several keynodes in the body frame of one of them."""
+    """Return the features float64 [K, 5] of several nodes in the body frame of the node `centre`."""
     parts = []
     for node in nodes:
         pose_centre_node = se2.between(centre.pose_odom_body, node.pose_odom_body)
@@ -181,7 +186,7 @@ def merged_features(nodes: list[TrajectoryNode], centre: TrajectoryNode, limit: 
             )
         )
     merged = np.concatenate(parts)
-    # One return per 10 cm cell: near walls would outvote far ones.
+    # One return per 10 cm cell, because near walls have more returns than far ones.
     cells = np.floor(merged[:, :2] / 0.1).astype(np.int64)
     _, index = np.unique(cells[:, 0] * 1_000_003 + cells[:, 1], return_index=True)
     merged = merged[np.sort(index)]

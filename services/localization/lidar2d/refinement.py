@@ -1,4 +1,4 @@
-"""Draw submaps anew from optimised poses and measure every edge again: what makes relations accurate."""
+"""Refinement: rebuild the submaps from optimised poses and measure every constraint again."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from beamsplat.services.localization.lidar2d.scan_matching import refine
 from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
 from beamsplat.services.localization.lidar2d.surfel_map import FrozenMap, MatchTables, SurfelMap, freeze
 
-UNMOVED_M, UNMOVED_RAD = 0.02, 0.005  # keynodes that moved less leave the free space of a submap as it was
+UNMOVED_M, UNMOVED_RAD = 0.02, 0.005  # limits of _has_moved()
 
 
 def rebuild_submap(
@@ -27,7 +27,10 @@ def rebuild_submap(
     pose_submap_node: list[np.ndarray],
     before: FrozenMap | None = None,
 ) -> FrozenMap:
-    """A frozen map of keynodes at given poses; the free space is taken over where `before` is given."""
+    """Return a frozen map of nodes at the given poses.
+
+    With `before`, the hit and miss counts of that map are kept instead of being recomputed.
+    """
     surfels = SurfelMap(settings)
     points = [
         se2.transform(pose, n.scan.points.astype(np.float64)) for n, pose in zip(nodes, pose_submap_node)
@@ -51,7 +54,7 @@ def rebuild_submap(
 def _has_moved(
     rebuilt: dict[int, np.ndarray], members: list[int], pose_submap_node: list[np.ndarray]
 ) -> bool:
-    """Whether any keynode left the place it was rebuilt at."""
+    """Return whether any node has moved relative to the submap since it was inserted."""
     for node, pose in zip(members, pose_submap_node):
         if node not in rebuilt:
             return True
@@ -70,7 +73,7 @@ def refine_submaps(
     pose_map_submap: dict[int, np.ndarray],
     pose_map_node: dict[int, np.ndarray],
 ) -> tuple[dict[int, FrozenMap], list[Constraint]]:
-    """New maps of the finished submaps and all constraints remeasured in them."""
+    """Return the rebuilt maps of the finished submaps, and all constraints measured in them."""
     rebuilt: dict[int, FrozenMap] = {}
     by_submap: dict[int, list[int]] = {}
     for k, c in enumerate(constraints):
@@ -105,7 +108,7 @@ def _remeasure(
     pose_map_submap: np.ndarray,
     pose_map_node: np.ndarray,
 ) -> Constraint:
-    """The same constraint from a fresh match that starts at the optimised pose."""
+    """Return the constraint from a new match that starts at the optimised pose; unchanged if that fails."""
     features = node.scan.features.astype(np.float64)
     guess = se2.between(pose_map_submap, pose_map_node)
     match = refine(features, node.scan.origin, guess, tables, settings, anneal=(1.5,))
@@ -119,8 +122,9 @@ def _remeasure(
     match = keep_guess_if_unobservable(
         reduce_unobservable(features, node.scan.origin, match, tables, settings), guess
     )
-    known = match.information if constraint.loop or match.full_information is None else match.full_information
-    information = edge_information(known, settings.edge_sigma_m, settings.edge_sigma_rad)
+    keep_reduced = constraint.loop or match.full_information is None
+    chosen = match.information if keep_reduced else match.full_information
+    information = edge_information(chosen, settings.edge_sigma_m, settings.edge_sigma_rad)
     if not constraint.loop:
         information /= settings.nodes_per_measurement
     return Constraint(

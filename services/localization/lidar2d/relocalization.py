@@ -1,4 +1,4 @@
-"""Where am I in a known map, without any guess: branch and bound over the whole map, then match_score."""
+"""Global relocalization in a map: branch and bound over the whole map, then scoring of the matches."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from beamsplat.services.localization.lidar2d.scan_matching import Match, refine
 from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
 from beamsplat.services.localization.lidar2d.surfel_map import MatchTables, SurfelMap, freeze
 
-SEARCH_RETURNS = 120
-CANDIDATES = 40
-REFINE_FIRST = 6  # Gauss-Newton steps every candidate gets before the best few get all of them
+SEARCH_RETURNS = 120  # returns used by branch and bound
+CANDIDATES = 40  # poses that are refined
+REFINE_FIRST = 6  # Gauss-Newton iterations for every candidate; only the best get all iterations
 
 
 @dataclass(frozen=True)
 class GlobalMap:
-    """All keynodes of a map in one grid in the map frame."""
+    """All nodes of a map in one grid in the map frame."""
 
     tables: MatchTables
     pyramid: SearchPyramid
@@ -36,22 +36,22 @@ class GlobalMap:
 
 @dataclass(frozen=True)
 class Relocalization:
-    """The best place for a scan. Below a confidence of 0.5 it should not be used."""
+    """The best pose for a scan; it should not be used with a confidence below 0.5."""
 
     pose_map_body: np.ndarray  # float64 [3]
-    confidence: float  # 0..1: how well the scan fits, times how much better than anywhere else
+    confidence: float  # 0..1, from the fit of the scan and the lead over the best other pose
     covariance: np.ndarray  # float64 [3, 3]
-    inlier_ratio: float  # returns on known surfaces / returns in known space
-    overlap: float
-    runner_up_ratio: float  # match_score of the best other place / match_score of the best
+    inlier_ratio: float  # returns on surfaces / returns in observed space
+    overlap: float  # returns in observed space / all returns
+    runner_up_ratio: float  # match_score of the best other pose / match_score of the best
 
 
 def build_global_map(
     settings: LidarSlamSettings, nodes: list[TrajectoryNode], pose_map_node: list[np.ndarray]
 ) -> GlobalMap:
-    """Draw every keynode into one map. Raises ValueError if there is none."""
+    """Return one map of all nodes. Raises ValueError if there is none."""
     if not nodes:
-        raise ValueError("the map is empty: drive and map first, or load a saved map")
+        raise ValueError("the map is empty: map an area first, or load a saved map")
     surfels = SurfelMap(settings)
     for node, pose in zip(nodes, pose_map_node):
         static = ~node.scan.dynamic
@@ -67,7 +67,7 @@ def build_global_map(
     tables = freeze(surfels).tables(settings.reach_cells)
     positions = np.array([pose[:2] for pose in pose_map_node])
     low, high = positions.min(axis=0), positions.max(axis=0)
-    # A body can only be where it has been, give or take a few metres.
+    # The search is limited to 3 m around the driven trajectory.
     half = 0.5 * float((high - low).max()) + 3.0
     pyramid = build_pyramid(tables.field, tables.row0, tables.col0, tables.cell_m)
     return GlobalMap(tables, pyramid, 0.5 * (low + high), half)
@@ -79,7 +79,7 @@ def relocalize_in(
     origin: np.ndarray,  # float64 [2]
     settings: LidarSlamSettings,
 ) -> Relocalization:
-    """Global search for one scan (or a merged chunk)."""
+    """Return the best pose in the whole map for one scan or for merged scans."""
     if len(features) < settings.min_points:
         return _no_match(global_map)
     centre = np.array([global_map.centre_m[0], global_map.centre_m[1], 0.0])
@@ -111,6 +111,7 @@ def relocalize_in(
 
 
 def _differ(a: Match, b: Match) -> bool:
+    """Return whether two matches are more than 0.3 m or 10 degrees apart."""
     turned = abs(math.remainder(a.pose_target_body[2] - b.pose_target_body[2], 2.0 * math.pi))
     return bool(
         np.hypot(*(a.pose_target_body[:2] - b.pose_target_body[:2])) > 0.3 or turned > math.radians(10.0)
@@ -118,5 +119,6 @@ def _differ(a: Match, b: Match) -> bool:
 
 
 def _no_match(global_map: GlobalMap) -> Relocalization:
+    """Return a result with confidence 0."""
     pose = np.array([global_map.centre_m[0], global_map.centre_m[1], 0.0])
     return Relocalization(pose, 0.0, np.diag([1e4, 1e4, 10.0]), 0.0, 0.0, 1.0)

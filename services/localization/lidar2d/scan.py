@@ -1,4 +1,4 @@
-"""From raw ranges to deskewed points with tangents: everything that needs only one scan."""
+"""Range data processing of a single scan: filtering, deskewing, surface tangents."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from beamsplat.common.compiled import kernel
 
 @dataclass(frozen=True)
 class PreparedScan:
-    """Valid returns of one scan, moved to the scan's stamp and expressed in the body frame."""
+    """Valid returns of one scan, deskewed to the stamp of its first beam, in the body frame."""
 
     points_body: np.ndarray  # float64 [M, 2], metres, deskewed
     tangents: np.ndarray  # float64 [M, 2], unit direction of the surface, (0, 0) where unknown
@@ -22,7 +22,7 @@ class PreparedScan:
     origin_body: np.ndarray  # float64 [2], the lidar in the body frame
 
     def features(self) -> np.ndarray:
-        """What the matcher takes, float64 [K, 5]: x, y, tangent x, tangent y, half spacing (m)."""
+        """Return the input of scan matching, float64 [K, 5]: x, y, tangent x, tangent y, half spacing (m)."""
         i = self.match_index
         half = np.minimum(0.5 * self.spacing_m[i], 0.10)
         return np.column_stack([self.points_body[i], self.tangents[i], half])
@@ -44,6 +44,7 @@ def _valid_points(
     points: np.ndarray,  # out float64 [N, 2]
     beams: np.ndarray,  # out int32 [N]
 ) -> int:
+    """Write the deskewed valid returns and their beam indices; return their number."""
     count = 0
     cl, sl = math.cos(pose_body_lidar[2]), math.sin(pose_body_lidar[2])
     for i in range(ranges_m.shape[0]):
@@ -54,7 +55,7 @@ def _valid_points(
         lx, ly = r * math.cos(a), r * math.sin(a)
         bx = pose_body_lidar[0] + cl * lx - sl * ly
         by = pose_body_lidar[1] + sl * lx + cl * ly
-        # Constant body twist: the exact motion after t seconds (the half-angle form of exp).
+        # Exact motion after t seconds at a constant body twist (half-angle form of the exponential).
         t = i * time_increment_s
         yaw = velocity_body[2] * t
         half = 0.5 * yaw
@@ -80,7 +81,7 @@ def _tangents(
     tangents: np.ndarray,  # out float64 [M, 2]
     spacing: np.ndarray,  # out float64 [M]
 ) -> None:
-    """Surface direction by PCA over the connected neighbours within `window_m` (at least two a side)."""
+    """Compute surface directions by PCA over connected neighbours in `window_m`, at least two per side."""
     m = points.shape[0]
     for i in range(m):
         px, py = points[i, 0], points[i, 1]
@@ -128,8 +129,11 @@ def _tangents(
 
 @kernel
 def _spread(points: np.ndarray, step_m: float, limit: int, keep: np.ndarray) -> int:
-    """Indices of returns at least `step_m` from the last kept one (voxel filter along the beam order);
-    the step grows until at most `limit` are left (the adaptive part)."""
+    """Write the indices of returns at least `step_m` from the last one kept; return their number.
+
+    This is an adaptive voxel filter along the beam order: the step grows until at most `limit` returns are
+    left.
+    """
     step = step_m
     while True:
         count = 0
@@ -161,7 +165,7 @@ def prepare_scan(
     match_limit: int,
     tangent_window_m: float = 0.10,
 ) -> PreparedScan:
-    """Drop what is no return, deskew by per-beam time to the stamp of the first beam, find tangents."""
+    """Return the valid returns, deskewed by per-beam time to the stamp of the first beam, with tangents."""
     n = len(ranges_m)
     points = np.empty((n, 2))
     beams = np.empty(n, dtype=np.int32)

@@ -1,4 +1,4 @@
-"""Scan to map: robust Gauss-Newton on surface elements, from wherever a search or a prediction starts it."""
+"""Scan-to-map matching: robust Gauss-Newton on surface elements from a given start pose."""
 
 from __future__ import annotations
 
@@ -12,30 +12,33 @@ from beamsplat.services.localization.lidar2d import se2
 from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
 from beamsplat.services.localization.lidar2d.surfel_map import MatchTables
 
-TANGENT_VARIANCE_M2 = 0.3**2  # m^2, along its tangent a return may belong to any part of the surface near it
-MIN_VIEW_COSINE = -0.3  # cosine times how much of one mind the views of a surface are
-ANNEAL_SCALES = (3.0, 2.0, 1.4)  # the outlier scale starts wide and ends at 1
+# Variance of a return along its tangent: it may belong to any nearby part of the surface.
+TANGENT_VARIANCE_M2 = 0.3**2
+# Cosine between the viewing directions of return and surface, times the consistency of the latter.
+MIN_VIEW_COSINE = -0.3
+ANNEAL_SCALES = (3.0, 2.0, 1.4)  # factors on the outlier scale in the first iterations; then 1
 
 
 @dataclass(frozen=True)
 class Match:
-    """Where a scan lies in a map."""
+    """Pose of a scan in a map, with its information and quality.
+
+    The target frame is that of the map: a submap or the global map.
+    """
 
     pose_target_body: np.ndarray  # float64 [3]
-    information: np.ndarray  # float64 [3, 3], of the scan alone, axes of the map, yaw about the body
-    inlier_ratio: float  # returns on known surfaces / returns in known space
-    overlap: float  # returns in known space / all returns
+    information: np.ndarray  # float64 [3, 3] of the scan alone; axes of the target frame, yaw about the body
+    inlier_ratio: float  # returns on surfaces / returns in observed space
+    overlap: float  # returns in observed space / all returns
     residual_m: float  # robust RMS distance to the surfaces
-    full_information: np.ndarray | None = (
-        None  # the information before anything was taken from it, see observability
-    )
+    full_information: np.ndarray | None = None  # before a reduction by observability.reduce_unobservable()
 
 
 @kernel
 def accumulate(
     points: np.ndarray,  # float64 [K, 5] body frame: x, y, tangent x, tangent y, half spacing
     origin: np.ndarray,  # float64 [2] lidar in the body frame
-    pose: np.ndarray,  # float64 [3] pose_map_body
+    pose: np.ndarray,  # float64 [3] pose_target_body
     nearest: np.ndarray,
     means: np.ndarray,
     omegas: np.ndarray,
@@ -47,14 +50,14 @@ def accumulate(
     H: np.ndarray,  # out float64 [3, 3]
     g: np.ndarray,  # out float64 [3]
 ) -> tuple[float, float, float]:
-    """Normal equations of sum rho(d' Omega d), d = pose p - mean, Geman-McClure weights.
+    """Compute the normal equations of sum rho(d^T Omega d), d = pose * p - mean, with Geman-McClure weights.
 
-    A return is known across its own surface only: along its tangent (or, where that is unknown, within its
-    spacing) it may be anywhere, S = s^2 t t' or s^2 I, and Omega' = (Omega^-1 + S)^-1. Without this a
-    corridor would hold on to a robot that drives along it.
+    A return constrains the pose only across its own surface. Along its tangent (or, if that is unknown,
+    within its spacing) its position is uncertain: S = s^2 t t^T or s^2 I, and Omega' = (Omega^-1 + S)^-1.
+    Without S, a corridor would seem to constrain the motion along it. A surface that was observed from its
+    other side is ignored, because walls are thin.
 
-    Returns (sum of weights, number of associated returns, weighted sum of d' Omega d).
-    A surface seen from its other side does not count: walls are thin.
+    Returns (sum of weights, number of associated returns, weighted sum of d^T Omega d).
     """
     c, s = math.cos(pose[2]), math.sin(pose[2])
     ox, oy = pose[0] + c * origin[0] - s * origin[1], pose[1] + s * origin[0] + c * origin[1]
@@ -95,7 +98,7 @@ def accumulate(
         w = root * root
         weights += w
         cost += w * e2
-        # Jacobian of pose p: [I, (-ry, rx)]
+        # Jacobian of pose * p: [I, (-ry, rx)]
         jx, jy = a * -ry + b * rx, b * -ry + d * rx
         H[0, 0] += w * a
         H[0, 1] += w * b
@@ -112,7 +115,7 @@ def accumulate(
 
 @kernel
 def solve3(A: np.ndarray, b: np.ndarray, x: np.ndarray) -> bool:
-    """x = A^-1 b for symmetric positive definite A [3, 3] by Cholesky; False if it is not."""
+    """Write x = A^-1 b for symmetric positive definite A [3, 3] by Cholesky; return False if A is not."""
     l00 = A[0, 0]
     if not l00 > 0.0:
         return False
@@ -151,13 +154,16 @@ def gauss_newton(
     prior_pose: np.ndarray,  # float64 [3]
     prior_information: np.ndarray,  # float64 [3, 3], zeros = no prior
     outlier: float,  # units of the surface's standard deviation
-    returns_per_measurement: float,  # so many returns count as one independent measurement
+    returns_per_measurement: float,  # number of returns per independent measurement
     anneal: np.ndarray,  # float64 [A]
     iterations: int,
     pose: np.ndarray,  # out float64 [3]
     H: np.ndarray,  # out float64 [3, 3] information of the scan alone
 ) -> tuple[float, float, float]:
-    """Iteratively reweighted Gauss-Newton with a robust prior; damped where the scan says nothing."""
+    """Minimise by iteratively reweighted Gauss-Newton with a robust prior, damped in unobservable directions.
+
+    Returns (sum of weights, number of associated returns, weighted cost) at the final pose.
+    """
     g, A, b, step, e = np.empty(3), np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(3)
     pose[:] = start_pose
     weights = found = cost = 0.0
@@ -171,13 +177,13 @@ def gauss_newton(
         for i in range(3):
             for j in range(3):
                 m2 += e[i] * prior_information[i, j] * e[j]
-        w = 1.0 / (1.0 + m2 / 9.0)  # Cauchy: a prediction three sigma off has half its say
+        w = 1.0 / (1.0 + m2 / 9.0)  # Cauchy weight: 0.5 at three sigma
         for i in range(3):
             b[i] = -g[i] / returns_per_measurement
             for j in range(3):
                 A[i, j] = H[i, j] / returns_per_measurement + w * prior_information[i, j]
                 b[i] -= w * prior_information[i, j] * e[j]
-        # Damping of (1 m)^-2 and (0.3 rad)^-2: only felt in directions without any information.
+        # Damping of (1 m)^-2 and (0.3 rad)^-2; it matters only in unobservable directions.
         A[0, 0] += 1.0
         A[1, 1] += 1.0
         A[2, 2] += 10.0
@@ -205,7 +211,7 @@ def count_overlapping_returns(
     col0: int,
     cell_m: float,
 ) -> int:
-    """Return the number of returns in observed space: a surface within reach, or a cell that a beam crossed."""
+    """Return the number of returns in observed space: near a surface or where a beam passed."""
     c, s = math.cos(pose[2]), math.sin(pose[2])
     n = 0
     for i in range(points.shape[0]):
@@ -228,7 +234,7 @@ def refine(
     iterations: int = 15,
     anneal: tuple[float, ...] = ANNEAL_SCALES,
 ) -> Match:
-    """Gauss-Newton from one start."""
+    """Return the match of a scan, refined by Gauss-Newton from `start_pose` [3]."""
     pose, H = np.empty(3), np.empty((3, 3))
     sigma_m = math.hypot(settings.range_sigma_m, settings.map_sigma_m)
     if prior_pose is None or prior_information is None:

@@ -91,9 +91,3 @@ def from_matrix(T_a_b: np.ndarray) -> np.ndarray:
         raise ValueError(f"a pose has shape {T_a_b.shape}; expected (4, 4), (3, 3) or (3,)")
     last = T_a_b.shape[0] - 1
     return np.array([T_a_b[0, last], T_a_b[1, last], math.atan2(T_a_b[1, 0], T_a_b[0, 0])])
-
-
-def to_matrix(pose_a_b: np.ndarray) -> np.ndarray:
-    """Return T_a_b float64 [4, 4] with z = 0."""
-    x, y, c, s = pose_a_b[0], pose_a_b[1], math.cos(pose_a_b[2]), math.sin(pose_a_b[2])
-    return np.array([[c, -s, 0, x], [s, c, 0, y], [0, 0, 1, 0], [0, 0, 0, 1]], dtype=np.float64)

@@ -1,4 +1,7 @@
-"""Segments: after a restart, a kidnapping or a loss the new map hangs on nothing until its place is found."""
+"""Trajectory segments: after a restart or a loss of tracking, the new part of the map is disconnected.
+
+A segment is connected as soon as relocalization finds its pose in the existing map.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +15,7 @@ from beamsplat.services.localization.lidar2d.pose_graph_data import Constraint, 
 from beamsplat.services.localization.lidar2d.relocalization import GlobalMap, build_global_map, relocalize_in
 from beamsplat.services.localization.lidar2d.snapshot import Snapshot
 
-MAX_LINK_DISTANCE_M = 4.0  # the submap a new segment is tied to has a keynode within this distance
+MAX_LINK_DISTANCE_M = 4.0  # a segment is linked to a submap that has a node within this distance
 
 
 Candidate = tuple[int, np.ndarray]
@@ -21,34 +24,35 @@ Candidate = tuple[int, np.ndarray]
 def link_segment(
     snapshot: Snapshot,
 ) -> tuple[Constraint | None, np.ndarray, np.ndarray, Candidate | None]:
-    """An edge from the newest keynode to the map and the poses with the segment moved there.
+    """Return a constraint from the newest node to the map, and all poses with the segment moved.
 
-    Returns (None, poses as they were, the answer that waits for a second one) while the place is not certain.
+    The second and third values are the submap and node poses, the fourth is a relocalization result that
+    waits for confirmation. While the pose is uncertain, the constraint is None and the poses are unchanged.
     """
     submap_poses, node_poses = snapshot.pose_map_submap.copy(), snapshot.pose_map_node.copy()
     first = snapshot.unlinked_from
     row = {n: i for i, n in enumerate(snapshot.node_ids)}
     segment = [n for n in snapshot.node_ids if n >= first]
-    known = [n for n in snapshot.node_ids if n < first]
-    if not segment or not known:
+    map_nodes = [n for n in snapshot.node_ids if n < first]
+    if not segment or not map_nodes:
         return None, submap_poses, node_poses, None
     newest = snapshot.nodes[segment[-1]]
     chunk = [snapshot.nodes[n] for n in segment[-snapshot.settings.merged_scans :]]
     global_map: GlobalMap = snapshot.cache.global_map(
-        (snapshot.version, len(known)),
+        (snapshot.version, len(map_nodes)),
         lambda: build_global_map(
-            snapshot.settings, [snapshot.nodes[n] for n in known], [node_poses[row[n]] for n in known]
+            snapshot.settings, [snapshot.nodes[n] for n in map_nodes], [node_poses[row[n]] for n in map_nodes]
         ),
     )
-    answer = relocalize_in(global_map, merged_features(chunk, newest), newest.scan.origin, snapshot.settings)
-    if answer.confidence < snapshot.settings.link_min_confidence:
+    found = relocalize_in(global_map, merged_features(chunk, newest), newest.scan.origin, snapshot.settings)
+    if found.confidence < snapshot.settings.link_min_confidence:
         return None, submap_poses, node_poses, snapshot.candidate
-    candidate = (newest.id, answer.pose_map_body)
-    if answer.runner_up_ratio > snapshot.settings.link_max_runner_up_ratio and not _agrees(
+    candidate = (newest.id, found.pose_map_body)
+    if found.runner_up_ratio > snapshot.settings.link_max_runner_up_ratio and not _agrees(
         snapshot, candidate
     ):
         return None, submap_poses, node_poses, _next_candidate(snapshot, candidate)
-    link = _link_to_submap(snapshot, newest.id, answer.pose_map_body, known, row, submap_poses, node_poses)
+    link = _link_to_submap(snapshot, newest.id, found.pose_map_body, map_nodes, row, submap_poses, node_poses)
     if link is None:
         return None, submap_poses, node_poses, candidate
     submap_row = {s: i for i, s in enumerate(snapshot.submap_ids)}
@@ -63,13 +67,13 @@ def link_segment(
 
 
 def _moved(snapshot: Snapshot, candidate: Candidate) -> np.ndarray:
-    """Motion from the earlier answer's keynode to this one's, by the smooth poses."""
+    """Return the motion from the candidate's node to this one, by the odom poses."""
     earlier, _ = snapshot.candidate
     return se2.between(snapshot.nodes[earlier].pose_odom_body, snapshot.nodes[candidate[0]].pose_odom_body)
 
 
 def _agrees(snapshot: Snapshot, candidate: Candidate) -> bool:
-    """Whether an earlier answer, carried along, says the same from somewhere else."""
+    """Return whether the earlier candidate, moved along the trajectory, confirms this one from a distance."""
     if snapshot.candidate is None or snapshot.candidate[0] not in snapshot.nodes:
         return False
     moved = _moved(snapshot, candidate)
@@ -79,7 +83,7 @@ def _agrees(snapshot: Snapshot, candidate: Candidate) -> bool:
 
 
 def _next_candidate(snapshot: Snapshot, candidate: Candidate) -> Candidate:
-    """Keep the earlier answer while the new one agrees but is too near to count; else start over."""
+    """Return the earlier candidate if the new one agrees but is too near to confirm it; else the new one."""
     if snapshot.candidate is None or snapshot.candidate[0] not in snapshot.nodes:
         return candidate
     off = se2.between(se2.compose(snapshot.candidate[1], _moved(snapshot, candidate)), candidate[1])
@@ -91,14 +95,14 @@ def _link_to_submap(
     snapshot: Snapshot,
     node_id: int,
     pose_map_body: np.ndarray,
-    known: list[int],
+    map_nodes: list[int],
     row: dict[int, int],
     submap_poses: np.ndarray,
     node_poses: np.ndarray,
 ) -> Constraint | None:
-    """The edge to the nearest finished submap that confirms the place."""
-    positions = np.array([node_poses[row[n], :2] for n in known])
-    away = dict(zip(known, np.hypot(*(positions - pose_map_body[:2]).T)))
+    """Return a constraint to the nearest finished submap that confirms the pose, None if there is none."""
+    positions = np.array([node_poses[row[n], :2] for n in map_nodes])
+    away = dict(zip(map_nodes, np.hypot(*(positions - pose_map_body[:2]).T)))
     near = sorted(
         (min(away[m] for m in snapshot.members[s] if m in away), k, s)
         for k, s in enumerate(snapshot.submap_ids)
@@ -107,10 +111,10 @@ def _link_to_submap(
     for distance, k, s in near[:4]:
         if distance > MAX_LINK_DISTANCE_M:
             break
-        place = LoopCandidate(
+        target = LoopCandidate(
             s, snapshot.frozen[s], se2.between(submap_poses[k], pose_map_body), 0.3, math.radians(5.0)
         )
-        link = match_locally(snapshot.nodes[node_id], place, snapshot.cache, snapshot.settings)
+        link = match_locally(snapshot.nodes[node_id], target, snapshot.cache, snapshot.settings)
         if link is not None:
             return link
     return None

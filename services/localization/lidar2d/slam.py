@@ -1,4 +1,4 @@
-"""2D lidar SLAM: scans and odometry in; poses, maps and background jobs out."""
+"""2D lidar SLAM: scans and odometry in; poses, map and background jobs out."""
 
 from __future__ import annotations
 
@@ -13,9 +13,8 @@ from beamsplat.services.localization.lidar2d.jobs import BackgroundJob, JobResul
 from beamsplat.services.localization.lidar2d.local_trajectory_builder import (
     LocalTrajectoryBuilder,
     RawScan,
-    exp_twist,
 )
-from beamsplat.services.localization.lidar2d.occupancy import CountGrid, OccupancyGrid, render
+from beamsplat.services.localization.lidar2d.occupancy import CountGrid, OccupancyGrid, render_occupancy
 from beamsplat.services.localization.lidar2d.pose_graph import PoseGraph
 from beamsplat.services.localization.lidar2d.pose_graph_data import edge_information
 from beamsplat.services.localization.lidar2d.relocalization import (
@@ -37,39 +36,32 @@ from beamsplat.services.localization.lidar2d.state import (
 from beamsplat.services.localization.lidar2d.trajectory_record import TrajectoryRecord
 from beamsplat.services.localization.lidar2d.validate import StampGuard, reason_to_reject
 
-NS = 1e-9
-
 
 @dataclass(frozen=True)
 class ScanResult:
-    """What one scan gave."""
+    """Result of one scan."""
 
     stamp_ns: int
     status: str  # "ok", "lost", "relocalizing" or "rejected: reason"
-    pose_odom_body: np.ndarray  # float64 [3], smooth
+    pose_odom_body: np.ndarray  # float64 [3], continuous
     pose_map_odom: np.ndarray  # float64 [3], may jump
     covariance: np.ndarray  # float64 [3, 3] of x, y (odom axes), yaw
-    dynamic: np.ndarray  # bool [N] per beam
+    dynamic: np.ndarray  # bool [N], dynamic-beam mask
     points_body: np.ndarray  # float64 [M, 2] deskewed returns
     beams: np.ndarray  # int32 [M] beam of each return
-    inserted: bool
-    inlier_ratio: float  # share of returns in known space that lie on known surfaces
-    job: BackgroundJob | None  # work to run; its result is due before scan number `job.apply_at_scan`
-
-
-@dataclass(frozen=True)
-class PoseAt:
-    """Pose at any stamp; both factors as of now."""
-
-    pose_map_odom: np.ndarray  # float64 [3]
-    pose_odom_body: np.ndarray  # float64 [3]
-    extrapolated_s: float  # 0 between scans
+    inserted: bool  # the scan became a node
+    inlier_ratio: float  # returns on surfaces / returns in observed space
+    job: BackgroundJob | None  # work to be run; its result is due before scan `job.apply_at_scan`
 
 
 class LidarSlam:
-    """One robot, one lidar. `add_scan` never waits for background work; `offline.JobRunner` runs the jobs."""
+    """2D lidar SLAM of one robot with one lidar.
+
+    `add_scan` never waits for background jobs; `job_runner.JobRunner` runs them.
+    """
 
     def __init__(self, settings: LidarSlamSettings, T_body_lidar: np.ndarray) -> None:
+        """Create an empty map; `T_body_lidar` is float64 [4, 4], or a planar pose [3]."""
         matrix = np.asarray(T_body_lidar, dtype=np.float64)
         self.settings = settings
         self.local_builder = LocalTrajectoryBuilder(
@@ -85,7 +77,10 @@ class LidarSlam:
         self._pending_job: BackgroundJob | None = None
 
     def add_odometry(self, stamp_ns: int, x_m: float, y_m: float, yaw_rad: float) -> None:
-        """A pose of the wheels in their own frame; rejected ones are counted in `front.odometry.rejected`."""
+        """Add a wheel odometry pose in its own frame.
+
+        Rejected ones are counted in `local_builder.odometry.rejected`.
+        """
         self.local_builder.odometry.add(stamp_ns, x_m, y_m, yaw_rad)
 
     def add_scan(
@@ -98,7 +93,10 @@ class LidarSlam:
         range_min_m: float,
         range_max_m: float,
     ) -> ScanResult:
-        """Match one scan; keynodes enter the map. Raises RuntimeError if a job's result is overdue."""
+        """Match one scan and insert it if it passes the motion filter.
+
+        Malformed scans are reported in the status. Raises RuntimeError if the result of a job is overdue.
+        """
         if self._pending_job is not None and self.scans >= self._pending_job.apply_at_scan:
             raise RuntimeError(
                 f"the result of job {self._pending_job.number} is due: call apply() before scan {self.scans}"
@@ -118,14 +116,14 @@ class LidarSlam:
         if not self.local_builder.poses:
             return self._add_first_scan(raw)
         # 1. predict, 2. deskew, 3. match
-        prediction, options = self.local_builder.predict(stamp_ns)
+        prediction, candidates = self.local_builder.predict(stamp_ns)
         scan = self.local_builder.prepare(raw, self.local_builder.scan_velocity(raw, prediction.motion))
         if len(scan) < self.settings.min_points:
-            return self._rejected(raw, f"{len(scan)} returns, {self.settings.min_points} are needed")
+            return self._rejected(raw, f"{len(scan)} returns; at least {self.settings.min_points} are needed")
         scan, match, good = self.local_builder.match(
             raw, scan, prediction, self.active_submaps.matching_target
         )
-        # 4. take the pose, or hold on to what the wheels say
+        # 4. take the matched pose, or else the wheel odometry
         if good:
             pose_odom_body = se2.compose(
                 self.active_submaps.matching_target.pose_odom_submap, match.pose_target_body
@@ -133,20 +131,20 @@ class LidarSlam:
         else:
             last = self.local_builder.poses[-1]
             pose_odom_body = se2.compose(last, prediction.motion) if prediction.source == "wheels" else last
-        self.local_builder.accept(stamp_ns, pose_odom_body, options if good else [])
+        self.local_builder.accept(stamp_ns, pose_odom_body, candidates if good else [])
         self._consecutive_lost = 0 if good else self._consecutive_lost + 1
         if self._consecutive_lost >= self.settings.lost_scans or (
-            self._consecutive_lost and prediction.blind
+            self._consecutive_lost and prediction.long_gap
         ):
             self._start_segment(raw.stamp_ns, scan, pose_odom_body)
             good = True
-        # 5. movers, 6. map, 7. background work
+        # 5. dynamic objects, 6. insertion, 7. background job
         return self._insert_scan(raw, scan, pose_odom_body, match, good)
 
     def _add_first_scan(self, raw: RawScan) -> ScanResult:
         scan = self.local_builder.prepare(raw, self.local_builder.scan_velocity(raw, None))
         if len(scan) < self.settings.min_points:
-            return self._rejected(raw, f"{len(scan)} returns, {self.settings.min_points} are needed")
+            return self._rejected(raw, f"{len(scan)} returns; at least {self.settings.min_points} are needed")
         self.local_builder.accept(raw.stamp_ns, np.zeros(3), [])
         self.pose_graph.uuid = self.pose_graph.uuid or map_uuid(raw.stamp_ns, raw.ranges_m)
         return self._insert_scan(
@@ -154,6 +152,7 @@ class LidarSlam:
         )
 
     def _start_segment(self, stamp_ns: int, scan: PreparedScan, pose_odom_body: np.ndarray) -> None:
+        """Finish the submaps and start a segment that is disconnected from the map."""
         self._consecutive_lost = 0
         self.active_submaps.close()
         self.pose_graph.start_segment()
@@ -162,6 +161,7 @@ class LidarSlam:
     def _insert_scan(
         self, raw: RawScan, scan: PreparedScan, pose_odom_body: np.ndarray, match: Match, good: bool
     ) -> ScanResult:
+        """Detect dynamic objects, insert the scan, start a background job if one is due."""
         dynamic = (
             self.active_submaps.dynamic_returns(scan, pose_odom_body)
             if good
@@ -214,9 +214,10 @@ class LidarSlam:
             self._next_job(),
         )
 
-    # ---- background work --------------------------------------------------------------------------
+    # ---- background jobs --------------------------------------------------------------------------
 
     def _next_job(self) -> BackgroundJob | None:
+        """Return a background job if one is due, else None."""
         s = self.settings
         searching = self.pose_graph.unlinked_from is not None and self.scans >= self._next_link_scan
         if self._pending_job is not None or not self.pose_graph.nodes:
@@ -231,13 +232,8 @@ class LidarSlam:
         )
         return self._pending_job
 
-    @property
-    def pending_job(self) -> BackgroundJob | None:
-        """The job that was handed out and not yet applied."""
-        return self._pending_job
-
     def apply(self, result: JobResult) -> None:
-        """Take in the result of the job that is due."""
+        """Apply the result of the job that is due, and trim redundant submaps."""
         self.pose_graph.apply(result)
         if self._pending_job is not None and self._pending_job.number == result.number:
             self._pending_job = None
@@ -245,7 +241,7 @@ class LidarSlam:
             self.pose_graph.trim(self.active_submaps.active_ids)
 
     def finish(self, refine_rounds: int = 4) -> None:
-        """Final loop closure, refinement and optimisation, inline; mapping may go on afterwards."""
+        """Do the final loop closure, refinement and optimisation inline; mapping may continue afterwards."""
         if self._pending_job is not None:
             self.apply(self._pending_job.run())
         if not self.pose_graph.nodes:
@@ -263,26 +259,13 @@ class LidarSlam:
             run_job(self.pose_graph.snapshot(), 0 if self.pose_graph.fixed else refine_rounds)
         )
 
-    # ---- answers ----------------------------------------------------------------------------------
-
-    def pose_at(self, stamp_ns: int) -> PoseAt | None:
-        """Between scans interpolated; up to `extrapolate_s` beyond the newest by its velocity; else None."""
-        stamps, poses = self.local_builder.stamps, self.local_builder.poses
-        if not stamps or stamp_ns < stamps[0]:
-            return None
-        ahead_s = (stamp_ns - stamps[-1]) * NS
-        if ahead_s > self.settings.extrapolate_s:
-            return None
-        if ahead_s >= 0.0:
-            pose = se2.compose(poses[-1], exp_twist(self.local_builder.velocity(), ahead_s))
-            return PoseAt(self.pose_graph.pose_map_odom.copy(), pose, ahead_s)
-        i = int(np.searchsorted(np.array(stamps), stamp_ns, side="right"))
-        f = (stamp_ns - stamps[i - 1]) / (stamps[i] - stamps[i - 1])
-        pose = se2.compose(poses[i - 1], f * se2.between(poses[i - 1], poses[i]))
-        return PoseAt(self.pose_graph.pose_map_odom.copy(), pose, 0.0)
+    # ---- results ----------------------------------------------------------------------------------
 
     def trajectory(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Stamps int64 [N], pose_map_body [N, 3] as now known, and as published online [N, 3], of every scan."""
+        """Return for all N scans the stamps int64 [N], optimised poses and published poses, float64 [N, 3].
+
+        The poses are pose_map_body.
+        """
         return (
             self.record.stamps_ns,
             self.record.optimised(self.pose_graph.all_node_poses()),
@@ -290,16 +273,16 @@ class LidarSlam:
         )
 
     def anchors(self) -> dict[int, np.ndarray]:
-        """T_map_anchor float64 [3] by id: the submaps."""
+        """Return pose_map_anchor float64 [3] by anchor id; the anchors are the submaps."""
         return {i: s.pose_map_submap.copy() for i, s in self.pose_graph.submaps.items()}
 
     def grid(self, resolution_m: float = 0.05) -> OccupancyGrid:
-        """Occupancy of everything seen so far."""
+        """Return the occupancy grid of the whole map."""
         frozen = [
             (s.frozen, s.pose_map_submap) for s in self.pose_graph.submaps.values() if s.frozen is not None
         ]
         grids = [CountGrid(*f.counts(), f.row0, f.col0, f.cell_m, pose) for f, pose in frozen]
-        return render(grids + self.active_submaps.count_grids(), resolution_m)
+        return render_occupancy(grids + self.active_submaps.count_grids(), resolution_m)
 
     def relocalize(
         self,
@@ -309,7 +292,10 @@ class LidarSlam:
         range_min_m: float,
         range_max_m: float,
     ) -> Relocalization:
-        """Where one scan was taken, without any guess. Raises ValueError for an empty map or a bad scan."""
+        """Return the pose of one scan in the map, without a prediction.
+
+        Raises ValueError for an empty map or a malformed scan.
+        """
         raw = RawScan(0, ranges_m, angle_min_rad, angle_increment_rad, 0.0, range_min_m, range_max_m)
         reason = reason_to_reject(raw)
         if reason:
@@ -318,7 +304,7 @@ class LidarSlam:
         return relocalize_in(self.global_map(), scan.features(), scan.origin_body, self.settings)
 
     def global_map(self) -> GlobalMap:
-        """The map relocalization searches; drawn once per state of the map (about a second)."""
+        """Return the map for relocalization; it is built once per map version and takes about a second."""
         graph = self.pose_graph
         known = [n for n in graph.nodes if graph.unlinked_from is None or n < graph.unlinked_from]
 
@@ -329,20 +315,20 @@ class LidarSlam:
         return graph.cache.global_map((graph.optimisations, len(known)), build)
 
     def save(self, folder: Path) -> None:
-        """Write the state; mapping may go on."""
+        """Write the state; mapping may continue afterwards."""
         write_state(folder, self.pack())
 
     def pack(self) -> PackedMap:
-        """Copies of the state as it is now."""
+        """Return copies of the current state."""
         return self.active_submaps.with_frozen(lambda: pack_state(self.pose_graph, self.record.arrays()))
 
     @staticmethod
     def load(
         folder: Path, settings: LidarSlamSettings, T_body_lidar: np.ndarray, localize_only: bool = False
     ) -> LidarSlam:
-        """A saved map to go on with; the first scans find their place in it ("relocalizing").
+        """Load a saved map to continue it; the status is "relocalizing" until the pose in it is found.
 
-        With `localize_only` the saved map stays as it is. Raises MapStateError.
+        With `localize_only` the saved map is not changed. Raises MapStateError.
         """
         slam = LidarSlam(settings, T_body_lidar)
         slam.pose_graph, extra = load_state(folder, settings)

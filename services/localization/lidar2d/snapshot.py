@@ -28,7 +28,7 @@ class Snapshot:
     pending: list[int]
     search_counts: dict[int, int]
     cache: TableCache
-    version: int  # of the map's poses
-    unlinked_from: int | None  # first keynode of a segment whose place in the map is unknown
-    fixed: frozenset[int]  # submaps that must not move
-    candidate: tuple[int, np.ndarray] | None  # an earlier answer to where the segment is
+    version: int  # counter of the map's optimisations
+    unlinked_from: int | None  # first node of a segment that is not connected to the map
+    fixed: frozenset[int]  # submaps that are held constant
+    candidate: tuple[int, np.ndarray] | None  # node id and pose_map_node of an unconfirmed relocalization

@@ -1,4 +1,4 @@
-"""A map on disk: one manifest (JSON) and one array file (npz), both replaced atomically."""
+"""Saved maps: one manifest (JSON) and one array file (npz), both replaced atomically."""
 
 from __future__ import annotations
 
@@ -28,39 +28,57 @@ VERSION = 1
 MANIFEST = "lidar_map.json"
 
 
+# Version 1 of the format stores these settings under other names.
+_SETTING_KEYS = {
+    "min_spacing_m": "spread_m", "max_match_points": "match_points", "submap_nodes": "submap_keynodes",
+    "min_submap_nodes": "least_keynodes", "motion_filter_distance_m": "keynode_distance_m",
+    "motion_filter_angle_rad": "keynode_angle_rad", "motion_filter_time_s": "keynode_time_s",
+    "returns_per_measurement": "beams_per_fact", "good_inlier_ratio": "good_share",
+    "lost_inlier_ratio": "lost_share", "sure_inlier_ratio": "sure_share",
+    "submap_drift_sigma_m": "link_sigma_m", "submap_drift_sigma_rad": "link_sigma_rad",
+    "nodes_per_measurement": "inner_facts", "job_nodes": "job_keynodes", "max_loops_per_node": "loop_submaps",
+    "loop_distance_m": "loop_near_m", "local_window_m": "narrow_m", "local_window_rad": "narrow_rad",
+    "global_searches_per_job": "wide_searches", "max_global_window_m": "wide_limit_m",
+    "merged_scans": "chunk_keynodes", "min_global_score": "wide_score",
+    "loop_min_inlier_ratio": "loop_share", "loop_min_overlap": "loop_known",
+    "min_covering_submaps": "copies_of_a_place", "link_min_confidence": "link_confidence",
+    "link_max_runner_up_ratio": "link_alone_rival", "link_min_distance_m": "link_apart_m",
+}  # fmt: skip
+
+
 class MapStateError(ValueError):
-    """A saved map that cannot be read; the text names the file and what to do."""
+    """A saved map cannot be read; the text contains the file and what to do."""
 
 
 def map_uuid(stamp_ns: int, ranges_m: np.ndarray) -> str:
-    """The name of a map that begins with this scan: the same scans give the same map, its name included."""
+    """Return the UUID of a map that begins with this scan; the same scan yields the same UUID."""
     first = f"{FORMAT} {stamp_ns} {np.asarray(ranges_m, np.float32).tobytes().hex()}"
     return str(uuid.uuid5(uuid.NAMESPACE_OID, first))
 
 
 @dataclasses.dataclass(frozen=True)
 class PackedMap:
-    """Copies of all that a map is: writing them may take its time while mapping goes on."""
+    """Copies of a map's state; they can be written in another thread while mapping continues."""
 
     arrays: dict[str, np.ndarray]
     head: dict[str, object]
 
 
 def pack_state(graph: PoseGraph, extra: dict[str, np.ndarray]) -> PackedMap:
-    """The map as it is now."""
+    """Return copies of the map, with the arrays `extra` added."""
     arrays = {**_pack_nodes(graph), **_pack_submaps(graph), **_pack_edges(graph.constraints), **extra}
     head = {
         "uuid": graph.uuid,
         "keynodes": len(graph.nodes),
         "submaps": len(graph.submaps),
         "constraints": len(graph.constraints),
-        "settings": dataclasses.asdict(graph.settings),
+        "settings": {_SETTING_KEYS.get(k, k): v for k, v in dataclasses.asdict(graph.settings).items()},
     }
     return PackedMap(arrays, head)
 
 
 def write_state(folder: Path, state: PackedMap) -> None:
-    """Write the map; the manifest is replaced last, so a crash leaves the previous map whole."""
+    """Write the map; the manifest is replaced last, so that a crash leaves the previous map intact."""
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     generation = 1 + max((int(p.stem.rpartition("-")[2]) for p in folder.glob("lidar_map-*.npz")), default=0)
@@ -89,7 +107,7 @@ def write_state(folder: Path, state: PackedMap) -> None:
 
 
 def load_state(folder: Path, settings: LidarSlamSettings) -> tuple[PoseGraph, dict[str, np.ndarray]]:
-    """The saved graph end and the extra arrays. Raises MapStateError naming the file and the reason."""
+    """Return the saved pose graph and the extra arrays. Raises MapStateError."""
     path = Path(folder) / MANIFEST
     manifest = read_manifest(path)
     arrays_path = Path(folder) / str(manifest["arrays"])
@@ -97,7 +115,7 @@ def load_state(folder: Path, settings: LidarSlamSettings) -> tuple[PoseGraph, di
         raw = arrays_path.read_bytes()
     except OSError as error:
         raise MapStateError(
-            f"{arrays_path}: named by {path} but cannot be read ({reason(error)}); restore it"
+            f"{arrays_path}: cannot be read, but {path} needs it ({reason(error)}); restore it"
         ) from error
     if len(raw) != manifest["bytes"] or zlib.crc32(raw) != manifest["crc32"]:
         raise MapStateError(
@@ -107,25 +125,25 @@ def load_state(folder: Path, settings: LidarSlamSettings) -> tuple[PoseGraph, di
     cell_m = manifest["settings"].get("cell_m")
     if cell_m != settings.cell_m:
         raise MapStateError(
-            f"{path}: settings.cell_m is {cell_m}, the running SLAM has {settings.cell_m}; use that"
+            f"{path}: settings.cell_m is {cell_m}, the running SLAM has {settings.cell_m}; use the same value"
         )
     try:
         with np.load(arrays_path, allow_pickle=False) as stored:
             arrays = {key: stored[key] for key in stored.files}
         graph = _unpack(arrays, settings)
-        graph.uuid = str(manifest.get("uuid", ""))  # none in states from before it
+        graph.uuid = str(manifest.get("uuid", ""))  # missing in old states
     except (KeyError, ValueError, zipfile.BadZipFile) as error:
         raise MapStateError(f"{arrays_path}: not a complete map of version {VERSION} ({error})") from error
     return graph, {key: value for key, value in arrays.items() if key.startswith("extra_")}
 
 
 def read_manifest(path: Path) -> dict:
-    """What a saved map says of itself. Raises MapStateError naming the file and the reason."""
+    """Return the manifest of a saved map. Raises MapStateError."""
     try:
         manifest = json.loads(path.read_text())
     except OSError as error:
         raise MapStateError(
-            f"{path}: no saved map here ({reason(error)}); give the folder that was saved to"
+            f"{path}: no saved map here ({reason(error)}); give the folder of a saved map"
         ) from error
     except json.JSONDecodeError as error:
         raise MapStateError(f"{path}: not valid JSON ({error}); restore the folder from a copy") from error

@@ -1,7 +1,7 @@
-"""Keeping the map bounded: submaps of places that are covered many times over are taken out.
+"""Trimming of redundant submaps, so that the map stays bounded in lifelong operation.
 
-The two oldest submaps of a place stay (what hangs on them stays put) and so do the newest (the world
-changes); those in between go.
+Of the submaps that cover the same place, the two oldest (which carry the anchors of early keyframes) and the
+two newest (the current state of the environment) are kept.
 """
 
 from __future__ import annotations
@@ -13,39 +13,46 @@ import numpy as np
 
 from beamsplat.services.localization.lidar2d.pose_graph_data import Submap
 
-CELL_M = 1.5
-HEADINGS = 4
-MIN_COVERED_RATIO = 0.9  # share of a submap's keynodes whose place others cover
+CELL_M = 1.5  # edge of the square cells
+HEADINGS = 4  # number of heading sectors
+MIN_COVERED_RATIO = 0.9  # fraction of a submap's nodes that other submaps must cover
 
 
 def redundant_submaps(
-    submaps: dict[int, Submap], pose_map_node: dict[int, np.ndarray], protected: set[int], copies: int
+    submaps: dict[int, Submap],
+    pose_map_node: dict[int, np.ndarray],
+    protected: set[int],
+    min_covering: int,
 ) -> list[int]:
-    """Ids of submaps that may go: nearly everywhere they were, at least `copies` other submaps have been too,
-    looking the same way, two of them older and two of them newer."""
-    place_of = {n: _pose_cell(pose) for n, pose in pose_map_node.items()}
+    """Return the ids of submaps that can be removed.
+
+    Nearly all of their nodes must be covered by at least `min_covering` other submaps with the same heading,
+    two of them older and two newer.
+    """
+    cell_of = {n: _pose_cell(pose) for n, pose in pose_map_node.items()}
     seen_by: dict[tuple[int, int, int], set[int]] = defaultdict(set)
     for submap in submaps.values():
         if submap.frozen is not None:
             for n in submap.members:
-                seen_by[place_of[n]].add(submap.id)
-    gone: set[int] = set()
+                seen_by[cell_of[n]].add(submap.id)
+    redundant: set[int] = set()
     for submap_id in sorted(submaps):
         submap = submaps[submap_id]
         if submap.frozen is None or submap_id in protected or not submap.members:
             continue
         covered = 0
         for n in submap.members:
-            others = seen_by[place_of[n]] - gone - {submap_id}
-            # Neighbours share half their scans: they are no second look.
+            others = seen_by[cell_of[n]] - redundant - {submap_id}
+            # Consecutive submaps share half of their scans: they are not independent.
             others = {o for o in others if abs(o - submap_id) > 1}
             older = sum(o < submap_id for o in others)
-            covered += len(others) >= copies and older >= 2 and len(others) - older >= 2
+            covered += len(others) >= min_covering and older >= 2 and len(others) - older >= 2
         if covered >= MIN_COVERED_RATIO * len(submap.members):
-            gone.add(submap_id)
-    return sorted(gone)
+            redundant.add(submap_id)
+    return sorted(redundant)
 
 
 def _pose_cell(pose_map_body: np.ndarray) -> tuple[int, int, int]:
+    """Return the cell (x, y, heading) of a pose."""
     heading = math.floor((pose_map_body[2] + math.pi / HEADINGS) / (2 * math.pi / HEADINGS)) % HEADINGS
     return math.floor(pose_map_body[0] / CELL_M), math.floor(pose_map_body[1] / CELL_M), heading

@@ -1,4 +1,4 @@
-"""Kernels of the local map: moments per cell and the surface element they describe."""
+"""Kernels of the surfel map: moments per cell and the surface elements (surfels) computed from them."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import numpy as np
 from beamsplat.common.compiled import kernel
 from beamsplat.services.localization.lidar2d.table_kernels import splat
 
-MAX_WEIGHT = 60.0  # moments forget beyond this many returns: slow change is followed, memory of drift fades
-RESPLAT_M = 0.006  # a surface element that moved less than this is where its neighbourhood thinks it is
+MAX_WEIGHT = 60.0  # number of returns after which old ones are forgotten: follows slow changes and drift
+RESPLAT_M = 0.006  # the tables are updated when a surface element has moved by this distance
 
 
 @kernel
@@ -24,8 +24,10 @@ def merged_surfel(
     mean: np.ndarray,  # out float64 [2]
     omega: np.ndarray,  # out float64 [3] information xx, xy, yy
 ) -> None:
-    """Mean and information matrix of the 3x3 neighbourhood (binomial weights): a wall gives a line (no
-    information along it), anything else a blob."""
+    """Compute mean and information matrix of the 3x3 neighbourhood (binomial weights).
+
+    A wall has no information along its direction; other shapes have some in both directions.
+    """
     w = sx = sy = sxx = sxy = syy = 0.0
     ref = cell_id[row, col]
     ox = moments[ref, 1] / moments[ref, 0]
@@ -40,7 +42,7 @@ def merged_surfel(
                 continue
             f = (1.0 if dr == 0 else 0.5) * (1.0 if dc == 0 else 0.5)
             m = moments[k]
-            # Shift to a local origin first: sums of squares far from zero lose digits.
+            # Shift to a local origin first, against cancellation in the sums of squares.
             w += f * m[0]
             sx += f * (m[1] - m[0] * ox)
             sy += f * (m[2] - m[0] * oy)
@@ -57,7 +59,7 @@ def merged_surfel(
     angle = 0.5 * math.atan2(2.0 * cxy, cxx - cyy)
     nx, ny = -math.sin(angle), math.cos(angle)
     a = 1.0 / (low + noise)
-    # Along the surface: none for a line, 1/variance for a blob, smoothly in between.
+    # Along the surface: 0 for a line, 1 / variance for a round shape, interpolated in between.
     roundness = low / max(high, 1e-9)
     b = max(0.0, min(1.0, (roundness - 0.1) / 0.3)) / (high + noise)
     omega[0] = a * nx * nx + b * ny * ny
@@ -77,7 +79,7 @@ def compute_surfels(
     means: np.ndarray,  # out float64 [>= S, 2]
     omegas: np.ndarray,  # out float64 [>= S, 3]
 ) -> None:
-    """The surface element of every cell."""
+    """Compute the surface element of every cell."""
     for k in range(cells.shape[0]):
         row, col = cells[k, 0] - row0, cells[k, 1] - col0
         merged_surfel(cell_id, moments, row, col, range_sigma_m, map_sigma_m, means[k], omegas[k])
@@ -85,7 +87,8 @@ def compute_surfels(
 
 @kernel
 def _increment(counter: np.ndarray, other: np.ndarray, r: int, c: int) -> None:
-    if counter[r, c] == 255:  # halve both: the ratio stays, old match_score fades
+    """Increment `counter`; at 255 halve both counters first, which keeps their ratio."""
+    if counter[r, c] == 255:
         counter[r, c] = 128
         other[r, c] >>= 1
     counter[r, c] += 1
@@ -102,7 +105,7 @@ def add_returns(
     cell_id: np.ndarray,
     hits: np.ndarray,  # uint8 [H, W]
     misses: np.ndarray,  # uint8 [H, W]
-    touched: np.ndarray,  # int32 [H, W] last scan that counted here
+    touched: np.ndarray,  # int32 [H, W], number of the last scan that changed the cell
     moments: np.ndarray,
     views: np.ndarray,  # float64 [S, 2] mean of the unit directions towards the lidar
     cells: np.ndarray,  # int32 [S, 2] row, col (absolute)
@@ -111,9 +114,9 @@ def add_returns(
     row0: int,
     col0: int,
     cell_m: float,
-    changed: np.ndarray,  # out int32 [>= M], surfels that got a return
+    changed: np.ndarray,  # out int32 [>= M], surfels with a new return
 ) -> tuple[int, int]:
-    """Add the moments of every return; returns (number of surfels, number changed)."""
+    """Add the moments of every return; return (number of surfels, number of changed surfels)."""
     n_changed = 0
     for i in range(points.shape[0]):
         if not use[i]:
@@ -140,8 +143,8 @@ def add_returns(
             f = MAX_WEIGHT / m[0]
             for j in range(6):
                 m[j] *= f
-        # A return stands for a short piece of the surface: its own spacing, along the tangent; where the
-        # tangent is unknown it may lie anywhere within it.
+        # A return represents a piece of the surface of the length of its spacing, along the tangent; if
+        # the tangent is unknown, in all directions.
         s = min(0.5 * spacing_m[i], 0.10)
         s2 = s * s
         tx, ty = tangents[i, 0], tangents[i, 1]
@@ -173,8 +176,11 @@ def cast_rays(
     col0: int,
     cell_m: float,
 ) -> None:
-    """Count one miss per scan in every cell that a beam crossed before its return (grid walk of
-    Amanatides and Woo 1987); cells with a return of the same scan are left alone."""
+    """Count one miss per scan in every cell that a beam crossed before its return.
+
+    The grid traversal is that of Amanatides and Woo 1987. Cells with a return of the same scan are not
+    changed.
+    """
     for i in range(points.shape[0]):
         if not use[i]:
             continue
@@ -219,7 +225,7 @@ def refresh(
     cells: np.ndarray,
     means: np.ndarray,
     omegas: np.ndarray,
-    table_means: np.ndarray,  # in out float64 [S, 2] the mean that the cells around know
+    table_means: np.ndarray,  # in out float64 [S, 2], the means in the match tables
     row0: int,
     col0: int,
     cell_m: float,
@@ -227,7 +233,7 @@ def refresh(
     range_sigma_m: float,
     map_sigma_m: float,
 ) -> None:
-    """Recompute the surface elements of changed cells and of their neighbours, then the nearest table."""
+    """Recompute the surface elements of changed cells and their neighbours, then update the match tables."""
     for i in range(changed.shape[0]):
         row, col = cells[changed[i], 0] - row0, cells[changed[i], 1] - col0
         for r in range(max(row - 1, 0), min(row + 2, cell_id.shape[0])):

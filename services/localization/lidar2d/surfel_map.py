@@ -1,4 +1,4 @@
-"""The local map scans are matched to: surface elements, free space and a likelihood field on one grid."""
+"""The local map for scan matching: surface elements, free space and a likelihood field on one grid."""
 
 from __future__ import annotations
 
@@ -18,27 +18,27 @@ from beamsplat.services.localization.lidar2d.surfel_kernels import (
 )
 from beamsplat.services.localization.lidar2d.table_kernels import nearest_all, splat_all
 
-BLOCK = 64  # grids grow in blocks of so many cells
-MARGIN = 8
+BLOCK = 64  # grids grow in multiples of this many cells
+MARGIN = 8  # cells kept around observed space
 
 
 @dataclass(frozen=True)
 class MatchTables:
-    """What a matcher reads; arrays are shared with the map that made them."""
+    """Lookup tables of scan matching; the arrays are shared with the map that made them."""
 
-    nearest: np.ndarray  # int32 [H, W] index of the nearest surface element, -1 = none in reach
-    field: np.ndarray  # uint8 [H, W] likelihood of a return, for searches
+    nearest: np.ndarray  # int32 [H, W], index of the nearest surface element within reach, -1 = none
+    field: np.ndarray  # uint8 [H, W], likelihood of a return, for searches
     means: np.ndarray  # float64 [S, 2]
-    omegas: np.ndarray  # float64 [S, 3]
-    views: np.ndarray  # float64 [S, 2]
-    misses: np.ndarray  # uint8 [H, W] beams that crossed a cell
+    omegas: np.ndarray  # float64 [S, 3], information xx, xy, yy
+    views: np.ndarray  # float64 [S, 2], mean unit direction towards the lidar
+    misses: np.ndarray  # uint8 [H, W], beams that crossed a cell
     row0: int
     col0: int
     cell_m: float
 
 
 class SurfelMap:
-    """A growing grid in its own frame; row is y, column is x, cell (0, 0) starts at the frame's origin."""
+    """A growing grid map in its own frame; rows are y, columns are x, cell (0, 0) starts at the origin."""
 
     def __init__(self, settings: LidarSlamSettings) -> None:
         self.settings = settings
@@ -70,7 +70,7 @@ class SurfelMap:
             setattr(self, name, grown)
 
     def cover(self, points: np.ndarray) -> None:
-        """Grow the grids until the points (float64 [N, 2], N > 0) lie inside, with a margin."""
+        """Grow the grids until the points (float64 [N, 2], N > 0) are inside, with a margin."""
         top, bottom, left, right = _growth(points, self.cell_m, self.row0, self.col0, *self.cell_id.shape)
         if top or bottom or left or right:
             pad = ((top, bottom), (left, right))
@@ -91,12 +91,12 @@ class SurfelMap:
         points: np.ndarray,  # float64 [M, 2] in this map's frame
         tangents: np.ndarray,  # float64 [M, 2]
         spacing_m: np.ndarray,  # float64 [M]
-        origin: np.ndarray,  # float64 [2] where the lidar was
-        surface: np.ndarray,  # bool [M] returns that become surface
-        free: np.ndarray,  # bool [M] returns whose beam clears the cells before it
-        matchable: bool = True,  # False: put off what only a matcher reads, see make_matchable()
+        origin: np.ndarray,  # float64 [2], position of the lidar
+        surface: np.ndarray,  # bool [M], returns inserted as surface
+        free: np.ndarray,  # bool [M], returns whose beams clear cells
+        matchable: bool = True,  # False: postpone the match tables, see make_matchable()
     ) -> None:
-        """Add one scan."""
+        """Insert one scan."""
         if len(points) == 0:
             return
         self.cover(points)
@@ -142,7 +142,7 @@ class SurfelMap:
         self.scans += 1
 
     def make_matchable(self) -> None:
-        """Bring surface elements and tables up to date after scans that were added without."""
+        """Update surface elements and tables after scans inserted with `matchable=False`."""
         self._refresh(np.arange(self.count, dtype=np.int32))
 
     def _refresh(self, changed: np.ndarray) -> None:
@@ -166,7 +166,7 @@ class SurfelMap:
         )
 
     def surface_elements(self) -> tuple[np.ndarray, np.ndarray]:
-        """Means float64 [S, 2] and information float64 [S, 3] of every cell with a return, now."""
+        """Return means float64 [S, 2] and information float64 [S, 3] of all cells with returns."""
         s, n = self.settings, self.count
         compute_surfels(
             self.cell_id, self.moments, self.cells[:n], self.row0, self.col0, s.range_sigma_m, s.map_sigma_m,
@@ -175,7 +175,7 @@ class SurfelMap:
         return self.means[:n], self.omegas[:n]
 
     def tables(self) -> MatchTables:
-        """The live tables of this map (not a copy)."""
+        """Return the live tables of this map, not a copy."""
         return MatchTables(
             self.nearest,
             self.field,
@@ -193,7 +193,7 @@ class SurfelMap:
 def _growth(
     points: np.ndarray, cell_m: float, row0: int, col0: int, rows: int, cols: int
 ) -> tuple[int, int, int, int]:
-    """Cells to add at the top, bottom, left and right, in whole blocks."""
+    """Return the number of cells to add at the top, bottom, left and right, in whole blocks."""
     x_low = x_high = points[0, 0]
     y_low = y_high = points[0, 1]
     for i in range(1, points.shape[0]):
@@ -213,24 +213,27 @@ def _growth(
 
 @dataclass(frozen=True)
 class FrozenMap:
-    """A finished local map in little memory: what is needed to match to it, to search it and to draw it."""
+    """A finished local map in compact form, for scan matching, search and rendering."""
 
     means: np.ndarray  # float32 [S, 2]
     omegas: np.ndarray  # float32 [S, 3]
     views: np.ndarray  # float32 [S, 2]
-    packed: bytes  # hits and misses, uint8 [2, H, W], deflated: most of a grid is empty
+    packed: bytes  # hits and misses uint8 [2, H, W], compressed with zlib, because most cells are empty
     shape: tuple[int, int]
     row0: int
     col0: int
     cell_m: float
 
     def counts(self) -> tuple[np.ndarray, np.ndarray]:
-        """Hits and misses, uint8 [H, W] each."""
+        """Return hits and misses, uint8 [H, W] each."""
         hits, misses = np.frombuffer(zlib.decompress(self.packed), dtype=np.uint8).reshape(2, *self.shape)
         return hits, misses
 
     def tables(self, reach_cells: int, for_search: bool = True) -> MatchTables:
-        """Match tables, computed from the surface elements; without the likelihood field if none searches."""
+        """Return match tables computed from the surface elements.
+
+        The likelihood field is computed only with `for_search`.
+        """
         means, omegas = self.means.astype(np.float64), self.omegas.astype(np.float64)
         nearest = np.full(self.shape, -1, dtype=np.int32)
         field = np.zeros(self.shape, dtype=np.uint8)
@@ -253,9 +256,9 @@ class FrozenMap:
 
 
 def freeze(surfels: SurfelMap, counts_of: FrozenMap | None = None, min_hit_ratio: float = 0.2) -> FrozenMap:
-    """Keep the surface elements that later beams did not contradict, crop the grids to what was seen.
+    """Return the compact form: grids cropped to observed space, without surfels that later beams contradict.
 
-    With `counts_of` the counts of an older drawing of the same scans are kept.
+    With `counts_of`, the hit and miss counts of an older map of the same scans are kept.
     """
     n = surfels.count
     means, omegas = surfels.surface_elements()
@@ -285,7 +288,7 @@ def freeze(surfels: SurfelMap, counts_of: FrozenMap | None = None, min_hit_ratio
 
 @dataclass(frozen=True)
 class _Counts:
-    """Hits and misses as a frozen map keeps them."""
+    """Hits and misses in the form that a frozen map stores."""
 
     packed: bytes
     shape: tuple[int, int]
@@ -294,6 +297,7 @@ class _Counts:
 
     @staticmethod
     def of(surfels: SurfelMap) -> _Counts:
+        """Crop and compress the counts of a map. Raises ValueError if the map has no return."""
         seen = (surfels.hits > 0) | (surfels.misses > 0)
         used_rows, used_cols = np.flatnonzero(seen.any(axis=1)), np.flatnonzero(seen.any(axis=0))
         if len(used_rows) == 0:

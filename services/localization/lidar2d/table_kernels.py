@@ -1,4 +1,4 @@
-"""Kernels of what a matcher reads: the nearest surface element of every cell, and the likelihood field."""
+"""Kernels of the match tables: nearest surface element of every cell, and the likelihood field."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from beamsplat.common.compiled import kernel
 
-FIELD_SIGMA_M = 0.06  # width of the likelihood field used by searches
+FIELD_SIGMA_M = 0.06  # standard deviation of the likelihood field
 
 
 @kernel
@@ -25,7 +25,7 @@ def splat(
     cell_m: float,
     reach: int,
 ) -> None:
-    """Tell the cells around a surface element that it may be their nearest, and raise the likelihood."""
+    """Enter a surface element into the nearest table of the cells around it, and raise their likelihood."""
     mx, my = means[index, 0], means[index, 1]
     trace = omegas[index, 0] + omegas[index, 2]
     for r in range(max(row - reach, 0), min(row + reach + 1, nearest.shape[0])):
@@ -40,7 +40,7 @@ def splat(
                     nearest[r, c] = index
             else:
                 nearest[r, c] = index
-            # Distance across the surface counts fully, along it a quarter.
+            # Squared distance: across the surface with weight 1, along it with weight 1/4.
             across = (
                 omegas[index, 0] * cx * cx + 2.0 * omegas[index, 1] * cx * cy + omegas[index, 2] * cy * cy
             ) / trace
@@ -63,7 +63,7 @@ def splat_all(
     cell_m: float,
     reach: int,
 ) -> None:
-    """Nearest table and likelihood field of all surface elements, from empty ones."""
+    """Fill empty nearest table and likelihood field from all surface elements."""
     for i in range(len(means)):
         splat(
             nearest,
@@ -90,7 +90,7 @@ def nearest_all(
     cell_m: float,
     reach: int,
 ) -> None:
-    """What splat_all writes into `nearest`, without the field."""
+    """Fill the nearest table as splat_all does, without the likelihood field."""
     best = np.full(nearest.shape, np.inf, dtype=np.float32)
     for i in range(len(means)):
         row, col = cells[i, 0] - row0, cells[i, 1] - col0

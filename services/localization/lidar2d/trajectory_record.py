@@ -1,4 +1,4 @@
-"""What is kept of every scan: its stamp, the keynode it hangs on, and the pose as it was published."""
+"""Record of every scan: its stamp, the node that it is attached to, and its pose as published."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from beamsplat.services.localization.lidar2d import se2
 
 
 class TrajectoryRecord:
-    """Arrays that grow by doubling: 64 bytes a scan, 18 MB for eight hours at 10 Hz."""
+    """Arrays that grow by doubling: 64 bytes per scan, 18 MB for eight hours at 10 Hz."""
 
     def __init__(self) -> None:
         self.count = 0
@@ -17,7 +17,7 @@ class TrajectoryRecord:
         self._poses = np.zeros((1024, 6))
 
     def add(self, stamp_ns: int, node: int, pose_node_body: np.ndarray, pose_map_body: np.ndarray) -> None:
-        """One more scan: pose relative to a keynode and pose in the map as published."""
+        """Append a scan: its pose relative to a node, and its pose in the map as published."""
         if self.count == len(self._stamps):
             for name in ("_stamps", "_nodes", "_poses"):
                 old = getattr(self, name)
@@ -28,27 +28,27 @@ class TrajectoryRecord:
 
     @property
     def stamps_ns(self) -> np.ndarray:
-        """Stamps int64 [N]."""
+        """Return the stamps int64 [N]."""
         return self._stamps[: self.count].copy()
 
     @property
     def nodes(self) -> np.ndarray:
-        """TrajectoryNode ids int64 [N]."""
+        """Return the node ids int64 [N]."""
         return self._nodes[: self.count].copy()
 
     @property
     def online(self) -> np.ndarray:
-        """T_map_body as published, float64 [N, 3]."""
+        """Return pose_map_body as published, float64 [N, 3]."""
         return self._poses[: self.count, 3:].copy()
 
     def optimised(self, pose_map_node: dict[int, np.ndarray]) -> np.ndarray:
-        """T_map_body float64 [N, 3] for the present poses of the keynodes."""
+        """Return pose_map_body float64 [N, 3] for the current poses of the nodes."""
         unique, inverse = np.unique(self.nodes, return_inverse=True)
         base = np.array([pose_map_node[int(n)] for n in unique]).reshape(-1, 3)
         return se2.compose_many(base[inverse], self._poses[: self.count, :3])
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """Copies for saving."""
+        """Return copies of the arrays for saving."""
         return {
             "extra_stamps": self.stamps_ns,
             "extra_nodes": self.nodes,
@@ -57,7 +57,7 @@ class TrajectoryRecord:
 
     @staticmethod
     def of(arrays: dict[str, np.ndarray]) -> TrajectoryRecord:
-        """From `arrays()`."""
+        """Create from the result of `arrays()`."""
         record = TrajectoryRecord()
         if len(arrays["extra_stamps"]):
             record._stamps, record._nodes = arrays["extra_stamps"].copy(), arrays["extra_nodes"].copy()

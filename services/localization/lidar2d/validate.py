@@ -1,4 +1,4 @@
-"""Is this a scan at all? Rubbish is rejected with a reason and never reaches the map."""
+"""Validation of scans: malformed ones are rejected with a reason and do not affect the map."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ import numpy as np
 
 from beamsplat.services.localization.lidar2d.local_trajectory_builder import RawScan
 
-RESTART_SCANS = 5  # so many rejected scans in a row whose own stamps rise: the clock was set, follow it
+RESTART_SCANS = 5  # rejected scans in a row with increasing stamps, after which the clock is followed
 
 
 class StampGuard:
-    """Stamps must rise; a clock that was set (back, or forward by mistake) is followed after a few scans."""
+    """Checks that stamps increase; follows a clock that was set to another time after a few scans."""
 
     def __init__(self) -> None:
         self.last_ns: int | None = None
         self._refused_ns: list[int] = []
 
     def check(self, stamp_ns: int) -> tuple[str, bool]:
-        """Reason for refusing (empty: none) and whether the clock was restarted with this scan."""
+        """Return the reason for a rejection (empty: none), and whether the clock was restarted."""
         if self.last_ns is None or stamp_ns > self.last_ns:
             self.last_ns = stamp_ns
             self._refused_ns.clear()
@@ -35,7 +35,7 @@ class StampGuard:
 
 
 def reason_to_reject(raw: RawScan) -> str:
-    """Empty if the scan has the shape of a scan."""
+    """Return why a scan is malformed; empty if it is valid."""
     ranges = raw.ranges_m
     if not isinstance(ranges, np.ndarray) or ranges.ndim != 1 or ranges.dtype.kind != "f":
         return "ranges_m is not a one-dimensional float array"

@@ -1,4 +1,4 @@
-"""Runs every kernel of the lidar SLAM once, so that a service finds them compiled."""
+"""Compilation of all kernels of the lidar SLAM, so that the service does not compile them at run time."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ _HALF_M = (3.0, 2.0)  # half sides of the room
 
 
 def warm() -> None:
-    """A lap in a small rectangular room: front end, map, loop closure, optimisation, grid, relocalization."""
+    """Run every kernel once: map a small rectangular room, optimise, render the grid, relocalize."""
     slam = LidarSlam(LidarSlamSettings(), np.eye(4))
     angles = -np.pi + np.arange(_BEAMS) * (2.0 * np.pi / _BEAMS)
     with JobRunner(slam) as jobs:
         for i in range(_SCANS):
-            jump = 0.35 if i >= _SCANS - 5 else 0.0  # off the prediction: the correlative search must run
+            jump = 0.35 if i >= _SCANS - 5 else 0.0  # away from the prediction, to run the correlative search
             turn = 2.0 * np.pi * i / _SCANS + jump
             x, y, yaw = np.cos(turn), 0.7 * np.sin(turn), turn + np.pi / 2.0
             stamp_ns = 10**9 + i * 10**8
@@ -34,7 +34,7 @@ def warm() -> None:
 
 
 def _room_ranges(x_m: float, y_m: float, directions_rad: np.ndarray) -> np.ndarray:
-    """float32 [N]: distance to the nearest wall in each direction."""
+    """Return the distance to the nearest wall in each direction, float32 [N]."""
     dx, dy = np.cos(directions_rad), np.sin(directions_rad)
     with np.errstate(divide="ignore"):
         to_x = np.where(dx > 0.0, (_HALF_M[0] - x_m) / dx, (-_HALF_M[0] - x_m) / dx)

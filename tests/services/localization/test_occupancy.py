@@ -6,8 +6,7 @@ from beamsplat.services.localization.lidar2d.dynamic_objects import contradicts_
 from beamsplat.services.localization.lidar2d.occupancy import (
     CountGrid,
     OccupancyGrid,
-    changed_regions,
-    render,
+    render_occupancy,
     save_nav2,
 )
 from beamsplat.services.localization.lidar2d.surfel_kernels import cast_rays
@@ -20,10 +19,10 @@ def counts(shape=(20, 30)):
     return hits, misses
 
 
-def test_walls_and_floor_land_where_they_are():
+def test_walls_and_floor_are_at_the_right_place():
     hits, misses = counts()
     pose = np.array([2.0, 1.0, np.pi / 2])
-    grid = render([CountGrid(hits, misses, 0, 0, 0.05, pose)], 0.05)
+    grid = render_occupancy([CountGrid(hits, misses, 0, 0, 0.05, pose)], 0.05)
     wall = se2.transform(pose, np.array([[0.5, 5.5 * 0.05]]))[0]
     floor = se2.transform(pose, np.array([[0.5, 10.5 * 0.05]]))[0]
 
@@ -33,14 +32,14 @@ def test_walls_and_floor_land_where_they_are():
     assert at(wall) > 90
     assert 0 <= at(floor) < 10
     assert grid.values[0, 0] == -1
-    assert (grid.values >= 0).sum() == ((hits > 0) | (misses > 0)).sum()  # turning leaves no holes
+    assert (grid.values >= 0).sum() == ((hits > 0) | (misses > 0)).sum()  # rotation leaves no holes
 
 
-def test_rendering_against_a_slow_twin(rng):
+def test_rendering_against_reference_code(rng):
     hits = rng.integers(0, 3, (12, 9)).astype(np.uint8)
     misses = rng.integers(0, 3, (12, 9)).astype(np.uint8)
     pose = np.array([0.3, -0.2, 0.7])
-    grid = render([CountGrid(hits, misses, -4, -3, 0.1, pose)], 0.05)
+    grid = render_occupancy([CountGrid(hits, misses, -4, -3, 0.1, pose)], 0.05)
     for r in range(0, grid.values.shape[0], 3):
         for c in range(0, grid.values.shape[1], 3):
             p = np.array([[grid.origin_x_m + (c + 0.5) * 0.05, grid.origin_y_m + (r + 0.5) * 0.05]])
@@ -49,18 +48,6 @@ def test_rendering_against_a_slow_twin(rng):
             inside = 0 <= i < 12 and 0 <= j < 9 and (hits[i, j] or misses[i, j])
             expected = 1 / (1 + np.exp(-(1.5 * hits[i, j] - 0.5 * misses[i, j]))) if inside else None
             assert grid.values[r, c] == (-1 if expected is None else round(100 * expected))
-
-
-def test_changed_regions_cover_every_difference(rng):
-    old = OccupancyGrid(np.zeros((128, 192), np.int8), 0.0, 0.0, 0.05)
-    values = old.values.copy()
-    values[70, 130] = 100
-    assert changed_regions(old, OccupancyGrid(values, 0.0, 0.0, 0.05)) == [(64, 128, 64, 64)]
-    assert changed_regions(old, old) == []
-    grown = np.full((192, 192), -1, np.int8)
-    grown[64:] = old.values  # the map grew downwards by one tile, where nothing is known yet
-    assert changed_regions(old, OccupancyGrid(grown, 0.0, -3.2, 0.05)) == []
-    assert len(changed_regions(None, old)) == 6
 
 
 def test_nav2_files(tmp_path):
@@ -76,14 +63,14 @@ def test_nav2_files(tmp_path):
     assert "image: map.pgm" in text
     assert "origin: [-1.000000, 2.000000, 0.0]" in text
     assert (tmp_path / "map.png").stat().st_size > 0
-    # As map_server reads them (trinary): what is unknown must stay so.
+    # Interpret the image as map_server does (trinary): unknown cells must stay unknown.
     limits = dict(line.split(": ") for line in text.splitlines() if "thresh" in line)
     occupancy = (255.0 - image.astype(float)) / 255.0
     occupied, free = occupancy > float(limits["occupied_thresh"]), occupancy < float(limits["free_thresh"])
     np.testing.assert_array_equal(np.where(occupied, 100, np.where(free, 0, -1))[::-1], values)
 
 
-def test_rays_clear_what_they_cross_and_stop_before_the_wall():
+def test_rays_count_misses_up_to_the_wall():
     hits, misses = np.zeros((40, 40), np.uint8), np.zeros((40, 40), np.uint8)
     touched = np.full((40, 40), -1, np.int32)
     origin, end = np.array([0.12, 0.13]), np.array([[1.51, 0.92]])
@@ -95,7 +82,7 @@ def test_rays_clear_what_they_cross_and_stop_before_the_wall():
     assert misses.max() == 1
 
 
-def test_movers_stand_in_free_space():
+def test_returns_in_free_space_are_dynamic():
     hits, misses = np.zeros((40, 40), np.uint8), np.full((40, 40), 20, np.uint8)
     nearest = np.full((40, 40), -1, np.int32)
     hits[:, 30] = 20
@@ -108,7 +95,7 @@ def test_movers_stand_in_free_space():
     assert out.tolist() == [True, False, False, False]  # free, wall, unknown, next to the wall
 
 
-def test_movers_grow_to_their_edge_only():
+def test_the_dynamic_mask_grows_to_the_edge_of_the_object_only():
     points = np.column_stack([np.arange(10) * 0.05, np.ones(10)])
     points[6:] += [2.0, 0.0]  # another object behind a gap
     moving = np.zeros(10, dtype=bool)
