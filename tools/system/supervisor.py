@@ -22,6 +22,7 @@ from beamsplat.common.security.logins import OPERATOR, SUPERVISOR, login_of, mak
 from beamsplat.common.zenoh.bus import open_session
 from beamsplat.services.nodes import NODES
 from beamsplat.tools.system.assembly import Surroundings, build_node, node_classes, surroundings
+from beamsplat.tools.system.log_tail import last_error
 from beamsplat.tools.system.node_process import ONE_THREAD, STOP_S, child
 
 log = logging.getLogger("beamsplat")
@@ -81,6 +82,7 @@ class Supervisor:
         self.log_dir = deployment.run_dir / "logs"
         self.children: dict[str, Child] = {}
         self._around: dict[str, Surroundings] = {}
+        self._log_start: dict[str, int] = {}  # where the log of the newest process begins, bytes
         self._retired: list[BaseProcess] = []  # ends by itself
         self.table = table
         self._names = names if names is not None else (ROUTER, *deployment.nodes)
@@ -137,12 +139,16 @@ class Supervisor:
             if self._router_answers():
                 return
             if not router.process.is_alive():
-                raise UserError(f"the router did not start: {last_line(self.log_file(ROUTER))}")
+                raise UserError(f"the router did not start: {self.last_error(ROUTER)}")
         raise UserError(f"no router at {', '.join(self.deployment.router.listen)} after 20 s")
 
     def log_file(self, name: str) -> Path:
         """Where a process writes what it has to say."""
         return self.log_dir / f"{name}.log"
+
+    def last_error(self, name: str) -> str:
+        """Return what the log says about the end of the newest process of a node, in one line."""
+        return last_error(self.log_file(name), self._log_start.get(name, 0))
 
     def _start(self, name: str, resume: bool = False) -> None:
         self._seat(name, *self._spawn(self.deployment, name, resume))
@@ -152,10 +158,12 @@ class Supervisor:
     ) -> tuple[BaseProcess, str]:
         """A process and the instance it goes by."""
         instance = secrets.token_hex(8)
+        log_file = self.log_file(name)
+        self._log_start[name] = log_file.stat().st_size if log_file.exists() else 0
         around = self._around.get(name)
         process = self._context.Process(
             target=child,
-            args=(deployment, name, self.log_file(name), resume, around, self.table, instance, standby),
+            args=(deployment, name, log_file, resume, around, self.table, instance, standby),
             name=name,
             daemon=False,
         )
@@ -232,7 +240,7 @@ class Supervisor:
         code = entry.process.exitcode or 0
         if code == 2:
             entry.gave_up = True
-            self._on_event(f"{entry.name} cannot run: {last_line(self.log_file(entry.name))}")
+            self._on_event(f"{entry.name} cannot run: {self.last_error(entry.name)}")
             return
         if now - entry.started > HEALTHY_S:
             entry.attempts = 0
@@ -242,7 +250,7 @@ class Supervisor:
         # A drained node stays until it is told to go, so exit code 0 means that somebody else told it.
         how = f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
         self._on_event(
-            f"{entry.name} died ({how}: {last_line(self.log_file(entry.name))}); starts again in {delay:g} s"
+            f"{entry.name} died ({how}: {self.last_error(entry.name)}); starts again in {delay:g} s"
         )
 
     def stop(self) -> None:
@@ -266,12 +274,3 @@ def _end(children: list[Child]) -> None:
             log.warning("%s does not stop: killed", entry.name)
             entry.process.kill()
             entry.process.join()
-
-
-def last_line(path: Path) -> str:
-    """The end of a log, without time and origin."""
-    try:
-        lines = path.read_text(errors="replace").strip().splitlines()
-    except OSError:
-        return f"no log at {path}"
-    return lines[-1].split(": ", 1)[-1] if lines else f"nothing in {path}"

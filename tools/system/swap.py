@@ -11,7 +11,7 @@ import zenoh
 
 from beamsplat.common.errors import UserError
 from beamsplat.common.zenoh.queries import command
-from beamsplat.tools.system.supervisor import Successor, Supervisor, last_line
+from beamsplat.tools.system.supervisor import Successor, Supervisor
 
 READY_S = 120.0  # to load a model, and say something
 _WARM_S = 10.0  # to catch up with its predecessor, which may be the faster
@@ -45,8 +45,8 @@ class Swap:
             return f"{successor.name} was told to end, and starts again with the new options"
         try:
             if not successor.process.is_alive():
-                log = self._supervisor.log_file(successor.name)
-                raise UserError(f"{successor.name} goes on as it was: its successor ended: {last_line(log)}")
+                why = self._supervisor.last_error(successor.name)
+                raise UserError(f"{successor.name} goes on as it was: its successor ended: {why}")
             if now - self._started > READY_S:
                 raise UserError(f"{successor.name} goes on as it was: no successor after {READY_S:g} s")
             reached = self._reached(successor.instance)
