@@ -33,7 +33,7 @@ PLAIN_KEY = f"beamsplat/{ROBOT}/plain"
 _WARM_UP = 20  # first samples, not counted: connections, shared memory and caches are being set up
 
 
-class _SlowSubscriber(Node):
+class _ImageSubscriber(Node):
     """Declares the input of the mailbox that the run with a slow subscriber uses."""
 
     name = "monitor"
@@ -149,10 +149,12 @@ def _with_publisher(
 
 
 def _latency(endpoint: str, seconds: float, image_bytes: int) -> dict[str, float]:
-    ours, plain = _Latencies(), _Latencies()
+    our_latency, plain = _Latencies(), _Latencies()
 
     def body(bus: Bus) -> Callable[[], None]:
-        bus.subscribe(_SlowSubscriber.inputs[0], lambda e: ours.add_since(e.message.stamp_ns), _broken, _end)
+        bus.subscribe(
+            _ImageSubscriber.inputs[0], lambda e: our_latency.add_since(e.message.stamp_ns), _broken, _end
+        )
         subscriber = bus.session.declare_subscriber(PLAIN_KEY, zenoh.handlers.RingChannel(1))
 
         def receive() -> None:
@@ -168,21 +170,21 @@ def _latency(endpoint: str, seconds: float, image_bytes: int) -> dict[str, float
         return lambda: time.sleep(seconds)
 
     _with_publisher(endpoint, image_bytes, True, 60.0, body)
-    (p50, p99), (plain_p50, plain_p99) = ours.percentiles(), plain.percentiles()
+    (p50, p99), (plain_p50, plain_p99) = our_latency.percentiles(), plain.percentiles()
     return {
         "image_p50_ms": p50,
         "image_p99_ms": p99,
         "plain_p50_ms": plain_p50,
         "plain_p99_ms": plain_p99,
         "overhead_p50": p50 / plain_p50,
-        "images": len(ours.values),
+        "images": len(our_latency.values),
     }
 
 
 def _slow_subscriber(endpoint: str, seconds: float, image_bytes: int) -> dict[str, float]:
     hz = 30.0
-    beside, ages_frames = _Latencies(), []
-    mailbox, lock = Mailbox(_SlowSubscriber), threading.Lock()
+    odometry_latency, ages_in_frames = _Latencies(), []
+    mailbox, lock = Mailbox(_ImageSubscriber), threading.Lock()
     memory = []
 
     def on_image(envelope: Envelope) -> None:
@@ -192,8 +194,10 @@ def _slow_subscriber(endpoint: str, seconds: float, image_bytes: int) -> dict[st
     def body(bus: Bus) -> Callable[[], None]:
         from beamsplat.common.runtime.node import Input
 
-        bus.subscribe(_SlowSubscriber.inputs[0], on_image, _broken, _end)
-        bus.subscribe(Input("wheel/odometry"), lambda e: beside.add_since(e.message.stamp_ns), _broken, _end)
+        bus.subscribe(_ImageSubscriber.inputs[0], on_image, _broken, _end)
+        bus.subscribe(
+            Input("wheel/odometry"), lambda e: odometry_latency.add_since(e.message.stamp_ns), _broken, _end
+        )
         return work
 
     def work() -> None:
@@ -205,23 +209,23 @@ def _slow_subscriber(endpoint: str, seconds: float, image_bytes: int) -> dict[st
             if envelope is None:
                 time.sleep(0.001)
                 continue
-            ages_frames.append((time.monotonic_ns() - envelope.message.stamp_ns) / 1e9 * hz)
+            ages_in_frames.append((time.monotonic_ns() - envelope.message.stamp_ns) / 1e9 * hz)
             time.sleep(0.2)
             memory.append(process.memory_info().rss / 1e6)
 
     _with_publisher(endpoint, image_bytes, False, hz, body)
-    p50, p99 = beside.percentiles()
+    p50, p99 = odometry_latency.percentiles()
     count = mailbox.counts["camera/image"]
     settled = memory[len(memory) // 3 :]
     return {
-        "slow_age_median_frames": float(np.median(ages_frames)),
-        "slow_age_max_frames": float(np.max(ages_frames[2:])),
+        "slow_age_median_frames": float(np.median(ages_in_frames)),
+        "slow_age_max_frames": float(np.max(ages_in_frames[2:])),
         "slow_received": count.received,
         "slow_dropped": count.dropped,
         "slow_memory_growth_mb": float(settled[-1] - settled[0]),
         "beside_p50_ms": p50,
         "beside_p99_ms": p99,
-        "beside_messages": len(beside.values),
+        "beside_messages": len(odometry_latency.values),
     }
 
 

@@ -24,8 +24,7 @@ def stixel(recording: TruthDataset, index: int) -> tuple[np.ndarray, np.ndarray]
     """Return depth of vertical walls at the beams, cut off by the floor plane.
 
     The floor is certain where it is nearer than the wall. A wall is certain at the height of the beams; its
-    sigma
-    grows with the vertical distance from there.
+    sigma grows with the vertical distance from there.
     """
     beams, T_body_camera = recording.posed_images[index].beams, recording.T_body_camera
     if len(beams) == 0:

@@ -85,8 +85,7 @@ def run_bench(
     `wall_s` and `cpu_s` are of the mapper and the prior only, without decoding, scoring and compilation.
 
     With `bench.jump`, the anchor of the second half of the drive is 1 m and 10 degrees wrong until the end of
-    the
-    drive, as before a loop closure: compare with a run without it and with the same `settle_steps`.
+    the drive, as before a loop closure: compare with a run without it and with the same `settle_steps`.
 
     Args:
         log: receives progress messages.

@@ -83,8 +83,7 @@ def prepare_deployment(
     """Return the deployment of a configuration, the name of the depth source that really runs, and advice.
 
     If the weights of the network are missing, recorded depth or FastDepth replaces it and is named as such;
-    without
-    a replacement the deployment is None.
+    without a replacement the deployment is None.
     """
     overrides = [f"replay.data={json.dumps(str(data))}", f"state_dir={json.dumps(str(out / 'state'))}"]
     overrides.append(f'router.listen=["tcp/127.0.0.1:{_free_port()}"]')

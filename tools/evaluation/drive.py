@@ -126,8 +126,7 @@ def open_drive(path: Path, poses: Path | None = None, rig: Path | None = None) -
     """Open a recording: a bag, or a folder that contains bag/.
 
     Poses are taken from the TUM file `poses` (T_map_body), else from the pose topic of the recording, else
-    from
-    the lidar SLAM, which is run on it.
+    from the lidar SLAM, which is run on it.
 
     Raises:
         UserError: images, scans, calibration or poses are missing.

@@ -106,8 +106,8 @@ def replay_depth(
         view = DepthInput(stamp, rgb, drive.undistort.pinhole, drive.T_body_camera, beams, known)
         estimate = source.estimate(view)
         seconds = {"source": time.process_time() - started}
-        guess = estimate.values if estimate.ok and estimate.kind != "none" else None
-        frame = FusionInput(stamp, rgb, T_map_body, beams, guess, estimate.kind)
+        prediction = estimate.values if estimate.ok and estimate.kind != "none" else None
+        frame = FusionInput(stamp, rgb, T_map_body, beams, prediction, estimate.kind)
         methods: dict[str, FusionResult] = {}
         for name in ("field_carried", "field"):
             if name == "field_carried" and stamp not in wanted:
@@ -123,7 +123,7 @@ def replay_depth(
         uv, z, _ = project_beams(beams, drive.undistort.pinhole, drive.T_body_camera)
         for name, correct in (("ratio", ratio), ("affine", affine)):
             started = time.process_time()
-            done = correct(guess, estimate.kind, uv, z) if guess is not None else None
+            done = correct(prediction, estimate.kind, uv, z) if prediction is not None else None
             methods[name] = done or rejected(rgb.shape[:2], estimate.status)
             seconds[name] = time.process_time() - started
         yield DepthComparison(stamp, rgb, estimate, methods, truth, seconds)
@@ -148,8 +148,7 @@ def evaluate(
     """Return the figures of `beamsplat eval depth`: one object per method, and `default`.
 
     With `heldout`, the drive is processed twice more: with every third beam, then with every third block of
-    beams
-    held out.
+    beams held out.
 
     Raises:
         UserError: no image of the drive has a true depth.

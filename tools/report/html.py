@@ -115,8 +115,8 @@ def _cell(row: Row, key: str, paper_key: str) -> str:
     if index and value is not None:
         value = value[int(index)]
     paper = row["paper"].get(paper_key)
-    beside = f" <span class=p>{paper:g}</span>" if paper is not None else ""
-    return f"<td>{_text(value)}{beside}</td>"
+    reference = f" <span class=p>{paper:g}</span>" if paper is not None else ""
+    return f"<td>{_text(value)}{reference}</td>"
 
 
 def _text(value: Any) -> str:
@@ -180,7 +180,7 @@ def _depth(rows: list[Row], truth: GroundTruth) -> list[str]:
     """Return figures of the image with beams, the estimated depth, and the corrected depth."""
     out = []
     for row in rows:
-        fused, guesses = row["plots"]["fused"], row["plots"]["estimates"]
+        fused, estimates = row["plots"]["fused"], row["plots"]["estimates"]
         stamps = sorted(fused)
         for stamp_ns in stamps[len(stamps) // 3 :: max(len(stamps) // 2, 1)][:2]:
             rgb = _rgb(truth, stamp_ns)
@@ -194,8 +194,8 @@ def _depth(rows: list[Row], truth: GroundTruth) -> list[str]:
             tints = colourize(z[:, None].astype(np.float32), 0.5, 8.0)[:, 0] if len(z) else []
             for (u, v), tint in zip(uv * (h / rgb.shape[0]), tints):
                 cv2.circle(shown, (round(u), round(v)), 1, tuple(int(k) for k in tint), -1)
-            guess = guesses.get(stamp_ns)
-            before = np.full((h, w), np.nan, np.float32) if guess is None else guess.astype(np.float32)
+            estimate = estimates.get(stamp_ns)
+            before = np.full((h, w), np.nan, np.float32) if estimate is None else estimate.astype(np.float32)
             after = fused[stamp_ns].astype(np.float32)
             tiles = [label(shown, f"{len(z)} beams"), label(colourize(before, 0.5, 8.0), "before"),
                      label(colourize(after, 0.5, 8.0), "after")]  # fmt: skip

@@ -33,25 +33,25 @@ class ActorPath:
     lap_s: float
 
     @property
-    def lap_length_m(self) -> float:
+    def round_length_m(self) -> float:
         """Length of one round."""
         return 2.0 * float(np.hypot(*np.subtract(self.end_m, self.start_m))) + 2.0 * np.pi * TURN_RADIUS_M
 
     def at(self, time_s: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return positions [N, 2] in metres, headings [N] in radians
         and travelled distances [N] in metres."""
-        walked = (self.rounds * np.asarray(time_s) / self.lap_s + self.phase) * self.lap_length_m
+        travelled_m = (self.rounds * np.asarray(time_s) / self.lap_s + self.phase) * self.round_length_m
         a, b = np.array(self.start_m), np.array(self.end_m)
         length = float(np.linalg.norm(b - a))
         ahead = (b - a) / length
         left = np.array([-ahead[1], ahead[0]])
-        s = np.mod(walked, self.lap_length_m)[..., None]
+        s = np.mod(travelled_m, self.round_length_m)[..., None]
         half = np.pi * TURN_RADIUS_M
         bend = np.where(s < length + half, s - length, s - 2 * length - half) / TURN_RADIUS_M
         turn_b = b + TURN_RADIUS_M * (left + np.sin(bend) * ahead - np.cos(bend) * left)
         turn_a = a + TURN_RADIUS_M * (left - np.sin(bend) * ahead + np.cos(bend) * left)
         back = b + 2 * TURN_RADIUS_M * left - (s - length - half) * ahead
-        place = np.where(
+        position = np.where(
             s < length,
             a + s * ahead,
             np.where(s < length + half, turn_b, np.where(s < 2 * length + half, back, turn_a)),
@@ -65,7 +65,7 @@ class ActorPath:
                 s < length + half, bend[..., 0], np.where(s < 2 * length + half, np.pi, np.pi + bend[..., 0])
             ),
         )
-        return place, base + turned, walked
+        return position, base + turned, travelled_m
 
 
 def choose_actor_paths(
@@ -99,13 +99,13 @@ def choose_actor_paths(
             path = _random_path(space, places, drive.lap_s, rng)
             if path is None:
                 continue
-            spots, _, _ = path.at(times)
-            distance = np.linalg.norm(spots - robot[:, :2], axis=1)
+            positions, _, _ = path.at(times)
+            distance = np.linalg.norm(positions - robot[:, :2], axis=1)
             if distance.min() < MIN_ROBOT_DISTANCE_M:
                 continue
-            if any(np.linalg.norm(spots - other.at(times)[0], axis=1).min() < 0.8 for other in chosen):
+            if any(np.linalg.norm(positions - other.at(times)[0], axis=1).min() < 0.8 for other in chosen):
                 continue
-            score = _visibility_score(caster, robot, spots, distance)
+            score = _visibility_score(caster, robot, positions, distance)
             if score > best_score:
                 best, best_score = path, score
         if best is None:
@@ -124,14 +124,16 @@ def _random_path(
     a = places[int(rng.integers(len(places)))]
     b = a + rng.uniform(0.9, 4.0) * np.array([np.cos(t := rng.uniform(0, 2 * np.pi)), np.sin(t)])
     path = ActorPath(tuple(a.tolist()), tuple(b.tolist()), 1, float(rng.random()), lap_s)
-    rounds = max(1, round(rng.uniform(0.45, 0.85) * lap_s / path.lap_length_m))
+    rounds = max(1, round(rng.uniform(0.45, 0.85) * lap_s / path.round_length_m))
     path = ActorPath(path.start_m, path.end_m, rounds, path.phase, lap_s)
     corners = path.at(np.linspace(0.0, lap_s / rounds, 24))[0]
     return path if space.clearance(corners).min() > 0.32 else None
 
 
-def _visibility_score(caster: RayCaster, robot: np.ndarray, spots: np.ndarray, distance: np.ndarray) -> float:
-    to = spots - robot[:, :2]
+def _visibility_score(
+    caster: RayCaster, robot: np.ndarray, positions: np.ndarray, distance: np.ndarray
+) -> float:
+    to = positions - robot[:, :2]
     bearing = np.abs(np.angle(np.exp(1j * (np.arctan2(to[:, 1], to[:, 0]) - robot[:, 2]))))
     at = np.flatnonzero((bearing < 0.5) & (distance < 6.0))
     if len(at) == 0:
@@ -166,12 +168,14 @@ class ActorSet:
     def bounding_circles(self, time_s: float) -> np.ndarray:
         """Return float64 [A, 3]: x, y and radius in metres of a circle that contains each body."""
         places = [path.at(np.array(time_s))[0] for path in self.paths]
-        return np.array([[*place, ACTOR_RADIUS_M] for place in places])
+        return np.array([[*position, ACTOR_RADIUS_M] for position in places])
 
     def ray_caster_of(self, index: int, time_s: float) -> RayCaster:
         """Return a ray caster of one body, posed at a time of the lap."""
-        place, yaw, walked = self.paths[index].at(np.array(time_s))
-        mesh = self.bodies[index].posed(float(place[0]), float(place[1]), float(yaw), float(walked))
+        position, yaw, travelled_m = self.paths[index].at(np.array(time_s))
+        mesh = self.bodies[index].posed(
+            float(position[0]), float(position[1]), float(yaw), float(travelled_m)
+        )
         return RayCaster.of(mesh)
 
 
@@ -199,8 +203,8 @@ class ActorLighting:
         """Return all actors, posed at a time of the lap and lit."""
         meshes, lights, bounds, occluder_spheres = [], [], [], []
         for body, path in zip(self._actors.bodies, self._actors.paths):
-            place, yaw, walked = path.at(np.array(time_s))
-            mesh = body.posed(float(place[0]), float(place[1]), float(yaw), float(walked))
+            position, yaw, travelled_m = path.at(np.array(time_s))
+            mesh = body.posed(float(position[0]), float(position[1]), float(yaw), float(travelled_m))
             meshes.append(mesh)
             lights.append(self._light(mesh))
             low, high = mesh.vertices_m.min(axis=0), mesh.vertices_m.max(axis=0)

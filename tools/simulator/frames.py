@@ -72,6 +72,7 @@ class FrameRenderer:
         return self.drive.transform_at(time_s) @ self.spec.camera.T_body_camera
 
     def render(self, time_s: float) -> RenderedView:
+        """Render the view at a time of the lap, with dynamic objects, before the image sensor."""
         actors = None if self.actor_lighting is None else self.actor_lighting.snapshot(time_s)
         return self.renderer.render(self.camera_pose(time_s), self.table, actors)
 

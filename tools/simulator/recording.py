@@ -182,7 +182,7 @@ def _lidar_records(
     waiting: list[tuple[int, int, w.BagRecord]] = []
     last, number = {"/scan": 0, "/odom": 0}, 0
 
-    def put(topic: str, received: int, data: bytes) -> int:
+    def push(topic: str, received: int, data: bytes) -> int:
         nonlocal number
         received = max(received, last.get(topic, 0) + 1000)
         last[topic] = received
@@ -200,10 +200,10 @@ def _lidar_records(
         lags = 2e6 + rng.exponential(3e5, len(odometry.pose) + 1)
         for k, (stamp, T) in enumerate(zip(step.odometry_stamps_ns.tolist(), se2_to_se3(odometry.pose))):
             data = w.odometry_bytes(stamp, T, float(odometry.speed_m_s[k]), float(odometry.turn_rad_s[k]))
-            received = put("/odom", stamp + int(lags[k]), data)
-            put("/tf", received + 100, w.tf_bytes(stamp, [(w.ODOM, w.BASE, T)]))
+            received = push("/odom", stamp + int(lags[k]), data)
+            push("/tf", received + 100, w.tf_bytes(stamp, [(w.ODOM, w.BASE, T)]))
         scan_lag = period_ns + int(5e6 + 4 * (lags[-1] - 2e6))
-        put("/scan", step.stamp_ns + scan_lag, w.scan_bytes(step.stamp_ns, step.ranges_m, settings.lidar))
+        push("/scan", step.stamp_ns + scan_lag, w.scan_bytes(step.stamp_ns, step.ranges_m, settings.lidar))
         # Odometry of later steps is measured after the end of this one: earlier records are complete.
         while waiting and waiting[0][0] <= step.stamp_ns + period_ns:
             yield heapq.heappop(waiting)[2]
@@ -216,14 +216,14 @@ def _write_image_truth(
     folder: Path, settings: SimulationSettings, times_s: list[float], paths: list[Path]
 ) -> None:
     (folder / "depth_gt").mkdir()
-    movers = settings.people + settings.carts > 0
-    if movers:
+    has_dynamic_objects = settings.people + settings.carts > 0
+    if has_dynamic_objects:
         (folder / "moving_masks").mkdir()
     for k, (time_s, path) in enumerate(zip(times_s, paths)):
         name = f"{_stamp(settings, time_s)}.png"
         if k % settings.truth_every == 0:
             (folder / "depth_gt" / name).write_bytes(load_frame(path).depth_png.tobytes())
-        if movers:
+        if has_dynamic_objects:
             mask = load_frame(path).mask_png
             if len(mask):
                 (folder / "moving_masks" / name).write_bytes(mask.tobytes())

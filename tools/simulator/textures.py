@@ -29,8 +29,7 @@ def fractal(
     variance; `stretch` (x, y) elongates its grain.
 
     There is one noise field per set of arguments, which the generator shifts and mirrors: one Fourier
-    transform
-    per texture would take longer than everything else in a home.
+    transform per texture would take longer than everything else in a home.
     """
     noise = _noise(height, width, beta, stretch)
     rolled = np.roll(noise, tuple(rng.integers(0, (height, width)).tolist()), axis=(0, 1))

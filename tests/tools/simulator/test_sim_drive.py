@@ -93,14 +93,14 @@ def test_odometry_reports_the_speed_of_its_own_poses(drive):
 def test_a_path_is_closed_smooth_and_of_constant_speed():
     path = ActorPath((0.0, 0.0), (2.0, 1.0), 3, 0.2, 30.0)
     times = np.linspace(0.0, 30.0, 3001)
-    place, yaw, walked = path.at(times)
-    np.testing.assert_allclose(place[0], place[-1], atol=1e-9)
-    step = np.diff(place, axis=0)
-    np.testing.assert_allclose(np.linalg.norm(step, axis=1), 3 * path.lap_length_m / 3000, rtol=1e-2)
+    position, yaw, travelled_m = path.at(times)
+    np.testing.assert_allclose(position[0], position[-1], atol=1e-9)
+    step = np.diff(position, axis=0)
+    np.testing.assert_allclose(np.linalg.norm(step, axis=1), 3 * path.round_length_m / 3000, rtol=1e-2)
     heading = np.arctan2(step[:, 1], step[:, 0])
     assert np.abs(wrap_angle(heading - yaw[:-1])).max() < 0.1
-    assert np.abs(wrap_angle(np.diff(yaw))).max() < 1.1 * (path.lap_length_m * 3 / 3000) / TURN_RADIUS_M
-    assert walked[-1] - walked[0] == pytest.approx(3 * path.lap_length_m)
+    assert np.abs(wrap_angle(np.diff(yaw))).max() < 1.1 * (path.round_length_m * 3 / 3000) / TURN_RADIUS_M
+    assert travelled_m[-1] - travelled_m[0] == pytest.approx(3 * path.round_length_m)
 
 
 @pytest.fixture(scope="module")
