@@ -55,7 +55,7 @@ class DepthSource(Protocol):
     """Estimator of dense depth from one image."""
 
     def estimate(self, view: DepthInput) -> Estimate:
-        """Return the estimate for one image; a bad image gives a `status`, not an exception."""
+        """Return the estimate for one image; for a bad image it has a `status`, no exception is raised."""
         ...
 
 
