@@ -1,8 +1,8 @@
 """The clock node: one tick per second on the sensors' clock."""
 
-import time
-from itertools import pairwise
 from pathlib import Path
+
+import pytest
 
 from beamsplat.common.config.deployment import NodeConfig, load_deployment
 from beamsplat.common.runtime.clock import StampClock
@@ -12,36 +12,53 @@ from beamsplat.tools.system.assembly import faults
 ROOT = Path(__file__).resolve().parents[3]
 
 
-def ticks(node, count):
-    found = []
-    for item in node.source():
-        if item is not None:
-            found.append((item.message, StampClock().now_ns()))
-        if len(found) == count:
-            return found
+class SimulatedClock:
+    """A stamp clock that advances only while the node sleeps."""
+
+    def __init__(self, start_ns):
+        self.time_ns = start_ns
+
+    def now_ns(self):
+        return self.time_ns
+
+    def sleep(self, seconds):
+        self.time_ns += round(seconds * 1e9)
 
 
-def test_one_tick_per_second_on_the_sensors_clock():
+@pytest.fixture
+def simulated(monkeypatch):
+    clock = SimulatedClock(7_400_000_000)
+    monkeypatch.setattr("beamsplat.services.clock.node.StampClock", lambda: clock)
+    monkeypatch.setattr("beamsplat.services.clock.node.time.sleep", clock.sleep)
     node = ClockNode(NodeConfig())
     node.configure()
-    said = ticks(node, 3)
-    stamps = [message.stamp_ns for message, _ in said]
-    assert [message.count for message, _ in said] == [0, 1, 2]
-    assert all(stamp % TICK_NS == 0 for stamp in stamps)
-    assert all(b - a == TICK_NS for a, b in pairwise(stamps))
-    assert all(at_ns >= message.stamp_ns for message, at_ns in said)  # never before its stamp
+    return clock, (item.message for item in node.source() if item is not None)
 
 
-def test_missed_ticks_are_left_out():
+def test_one_tick_per_second_on_the_sensors_clock(simulated):
+    clock, ticks = simulated
+    for count, stamp_ns in enumerate((8 * TICK_NS, 9 * TICK_NS, 10 * TICK_NS)):
+        tick = next(ticks)
+        assert (tick.count, tick.stamp_ns) == (count, stamp_ns)
+        assert (
+            stamp_ns <= clock.time_ns < stamp_ns + TICK_NS // 5
+        )  # never early, and soon after the full second
+
+
+def test_missed_ticks_are_left_out(simulated):
+    clock, ticks = simulated
+    assert next(ticks).stamp_ns == 8 * TICK_NS
+    clock.time_ns = 10 * TICK_NS + TICK_NS // 2  # the process was stopped for 2.5 s
+    later = [next(ticks) for _ in range(3)]
+    assert [tick.count for tick in later] == [1, 2, 3]
+    assert [tick.stamp_ns for tick in later] == [11 * TICK_NS, 12 * TICK_NS, 13 * TICK_NS]
+
+
+def test_the_node_uses_the_clock_of_the_sensors():
     node = ClockNode(NodeConfig())
     node.configure()
-    source = node.source()
-    first = next(item for item in source if item is not None).message
-    time.sleep(2.3)
-    later = [next(item for item in source if item is not None).message for _ in range(2)]
-    assert [message.count for message in later] == [1, 2]
-    assert later[0].stamp_ns - first.stamp_ns >= 3 * TICK_NS  # the missed ticks are left out
-    assert later[1].stamp_ns - later[0].stamp_ns == TICK_NS
+    tick = next(item for item in node.source() if item is not None).message
+    assert 0 <= StampClock().now_ns() - tick.stamp_ns < 60 * TICK_NS
 
 
 def test_deployments_of_robots_have_a_clock():

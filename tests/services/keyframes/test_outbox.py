@@ -89,7 +89,7 @@ def test_beyond_the_bound_the_least_useful_goes_and_is_counted(folder):
     put(box, 6, x=5.0)
     assert (box.dropped, len(box)) == (1, 6)
     left = [key for key in range(7) if box.acknowledge(key, 0)]
-    assert left in ([0, 1, 3, 4, 5, 6], [0, 1, 2, 4, 5, 6])  # one of the two views that are alike
+    assert left == [0, 1, 2, 4, 5, 6]  # 2 and 3 are alike; the next neighbour of 3 is nearer (0.9 m, not 1 m)
 
 
 def test_the_newest_is_never_thrown_away():

@@ -90,14 +90,12 @@ def test_a_reconnected_lidar_is_reopened(tmp_path, kind):
         with EmulatedPort(device, path) as plugged:
             running.wait(lambda: len(running.messages) >= 3)
             plugged.unplug()
-            running.wait(lambda: "DISCONNECTED" in node.detail or "NOT CONNECTED" in node.detail)
-            time.sleep(0.7)
+            running.wait(lambda: "NOT CONNECTED" in node.detail)  # after an attempt to open it again
             before = len(running.messages)
             plugged.plug()
-            again = time.monotonic()
-            running.wait(lambda: len(running.messages) >= before + 2)
             # Required: data again within 2 s; allow twice that on a machine busy with other tests.
-            assert running.messages[before][0] - again < 4.0
+            running.wait(lambda: len(running.messages) > before, timeout=4.0)
+            running.wait(lambda: len(running.messages) >= before + 2)
     stamps = [scan.stamp_ns for _, scan in running.messages]
     assert sorted(set(stamps)) == stamps
     for _, scan in running.messages:
@@ -119,6 +117,12 @@ def test_a_lidar_without_data_is_reopened(tmp_path):
         running.wait(lambda: len(running.messages) >= 2)
         device.silent = True
         running.wait(lambda: "no data for 1 s" in node.detail)
+        before = len(running.messages)
+        device.silent = False
+        running.wait(lambda: len(running.messages) >= before + 2)
+        assert "reopened" in node.detail
+    for _, scan in running.messages:
+        _right(scan)
 
 
 def test_the_baud_rate_is_found(tmp_path):

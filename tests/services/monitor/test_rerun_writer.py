@@ -73,12 +73,17 @@ def test_queued_entries_are_bounded_by_bytes():
     assert thread._bytes == 0
 
 
-def test_closing_has_a_timeout():
+def test_closing_has_a_timeout(caplog):
     stream = StuckStream()
     thread = SinkThread("viewer", stream, None, None)
     thread.put(_LogEntry("a", (1,), None, False))
-    thread.close(0.1)  # returns
+    thread.close(0.1)
+    assert "viewer was not closed within 0.1 s" in caplog.text
+    assert stream.logged == []
     stream.gate.set()
+    thread.close(10.0)
+    assert not thread._thread.is_alive()
+    assert stream.logged == [("a", 1)]
 
 
 def _draw_until_fault(writer, path="a"):
