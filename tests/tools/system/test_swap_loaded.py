@@ -64,7 +64,7 @@ class Healths:
 
     def overtaken(self):
         """Pictures, on the way or while they waited for their pose; of an instance's last second not all."""
-        waiting = [re.match(r"(\d+) pictures overtaken", h.detail) for h in self._latest.values()]
+        waiting = [re.match(r"(\d+) images overtaken", h.detail) for h in self._latest.values()]
         dropped = [i.dropped for h in self._latest.values() for i in h.inputs if i.topic == "camera/image"]
         return sum(int(found[1]) for found in waiting if found) + sum(dropped)
 
