@@ -86,12 +86,12 @@ def demo(
     deployment = load_deployment(DEPLOYMENT, overrides)
     seen_by: list[RunObserver] = []
 
-    def beside(supervisor: Supervisor) -> RunObserver:
+    def monitor(supervisor: Supervisor) -> RunObserver:
         seen_by.append(RunObserver(supervisor, deployment, _truth_stamps(source)))
         return seen_by[0]
 
     busy_s, began = _busy_s(), time.monotonic()
-    run_checked(deployment, beside=beside)
+    run_checked(deployment, monitor=monitor)
     costs = seen_by[0].costs
     others_s = _busy_s() - busy_s - costs.startup_cpu_s - sum(costs.cpu_s.values())
     console.print("the drive has ended; writing the report")

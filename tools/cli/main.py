@@ -28,6 +28,7 @@ from beamsplat.tools.cli import simulate as simulator_cli
 from beamsplat.tools.cli import slam as localization_cli
 from beamsplat.tools.cli import swap as swap_cli
 from beamsplat.tools.cli import system as system_cli
+from beamsplat.tools.cli import watch as watch_cli
 from beamsplat.tools.cli.relocalize import eval_relocalize
 
 app = typer.Typer(
@@ -42,7 +43,7 @@ _RESULTS = "Maps and figures"
 _MACHINE = "This machine"
 for command in (
     demo.demo, system_cli.run, system_cli.check, system_cli.serve, system_cli.offline, system_cli.record,
-    system_cli.top, system_cli.topics, system_cli.graph, system_cli.router_config,
+    watch_cli.top, watch_cli.topics, watch_cli.graph, system_cli.router_config,
 ):  # fmt: skip
     app.command(rich_help_panel=_SYSTEM)(command)
 app.command(rich_help_panel=_SYSTEM)(swap_cli.swap)

@@ -1,4 +1,4 @@
-"""Commands that run a system: check, run, serve, offline, record, top, topics, graph."""
+"""Commands that run a system: check, run, serve, offline, record, router-config."""
 
 from __future__ import annotations
 
@@ -29,6 +29,7 @@ SetOption = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="NODE.OPTION=VALUE", help="Override an option of the file; repeatable"),
 ]
+STATUS_S = 5.0  # between two lines of a run whose output is a file
 console = Console(stderr=True, width=None if sys.stderr.isatty() else 120)
 
 
@@ -96,25 +97,59 @@ def run(
     run_checked(deployment, tuple(nodes) if nodes else None)
 
 
-class Beside(Protocol):
-    """Somebody who looks on while a deployment runs."""
+class RunMonitor(Protocol):
+    """Observes a deployment while it runs."""
 
     def poll(self) -> None:
-        """Called a few times a second."""
+        """Called several times per second."""
 
     def finish(self, board: HealthBoard, drained: bool) -> Any:
-        """Called once, before the processes are ended."""
+        """Called once, before the processes are stopped."""
+
+
+class _Display:
+    """The state of a run on standard error: a live table in a terminal, else a line every few seconds."""
+
+    def __init__(self, board: HealthBoard) -> None:
+        self._board = board
+        self._screen = Screen(console=console, refresh_per_second=2) if sys.stderr.isatty() else None
+        self._began = self._written = time.monotonic()
+
+    def __enter__(self) -> _Display:
+        if self._screen is not None:
+            self._screen.__enter__()
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        if self._screen is not None:
+            self._screen.__exit__(*exception)
+        elif exception[0] is None:
+            console.print(self._board.nodes_table())
+
+    def update(self) -> None:
+        """Show the newest state; called several times per second."""
+        now = time.monotonic()
+        if self._screen is not None:
+            self._screen.update(self._board.nodes_table())
+        elif now - self._written >= STATUS_S:
+            self._written = now
+            _say(f"{now - self._began:.0f} s: {self._board.status_line()}")
+            sys.stderr.flush()
 
 
 def run_checked(
     deployment: Deployment,
     names: tuple[str, ...] | None = None,
-    beside: Callable[[Supervisor], Beside] | None = None,
+    monitor: Callable[[Supervisor], RunMonitor] | None = None,
 ) -> None:
-    """Runs processes until all have drained, one cannot run, or Ctrl-C; `beside` makes an onlooker.
+    """Run processes until all have drained, one cannot run, or Ctrl-C.
+
+    Args:
+        names: nodes to run, and `router`; None runs all.
+        monitor: creates an observer of the run from its supervisor.
 
     Raises:
-        UserError: the deployment does not fit together, or a node cannot run with what it was given.
+        UserError: the deployment is invalid, or a node cannot run with its options.
     """
     for name in names or ():
         if name != "router" and name not in deployment.nodes:
@@ -127,14 +162,13 @@ def run_checked(
     from beamsplat.tools.system.health_table import HealthBoard
     from beamsplat.tools.system.supervisor import Supervisor
 
-    for number in (signal.SIGTERM, signal.SIGHUP):  # ends the children in order, as Ctrl-C does
+    for number in (signal.SIGTERM, signal.SIGHUP):  # stop the children in order, as Ctrl-C does
         signal.signal(number, signal.default_int_handler)
     events: list[str] = []
-    show = sys.stderr.isatty()
 
     def on_event(text: str) -> None:
         events.append(text)
-        if " cannot run: " not in text:  # that is the error with which this ends
+        if " cannot run: " not in text:  # the run ends with that error
             _say(text, "yellow")
 
     with Supervisor(deployment, names, on_event=on_event) as supervisor:
@@ -142,19 +176,17 @@ def run_checked(
         login = login_of(deployment.security, SUPERVISOR)
         with open_session(deployment.router.listen, login=login) as session:
             board = HealthBoard(session, deployment.robot)
-            onlooker = beside(supervisor) if beside is not None else None
+            observer = monitor(supervisor) if monitor is not None else None
             commands = Commands(session, deployment.robot, supervisor)
-            screen = Screen(console=console, refresh_per_second=2) if show else contextlib.nullcontext()
             drained = False
-            with screen, contextlib.suppress(KeyboardInterrupt):
+            with _Display(board) as display, contextlib.suppress(KeyboardInterrupt):
                 while not drained:
                     time.sleep(0.2)
                     supervisor.poll()
-                    if onlooker is not None:
-                        onlooker.poll()
+                    if observer is not None:
+                        observer.poll()
                     commands.attend()
-                    if show:
-                        screen.update(board.nodes_table())
+                    display.update()
                     nodes = [c for c in supervisor.children.values() if c.name != "router"]
                     for entry in supervisor.children.values():
                         if entry.gave_up:
@@ -163,10 +195,8 @@ def run_checked(
                             )
                     states = board.states()
                     drained = bool(nodes) and all(states.get(c.name) == "drained" for c in nodes)
-            if not show:
-                console.print(board.nodes_table())
-            if onlooker is not None:
-                onlooker.finish(board, drained)
+            if observer is not None:
+                observer.finish(board, drained)
 
 
 def serve(
@@ -252,70 +282,3 @@ def record(
     start_logging()
     serve_node(deployment, "recorder", exit_when_drained=True)
     print(f"recorded to {out}")
-
-
-def _watch(
-    file: Path, overrides: list[str] | None, table: str, seconds: float | None, every_robot: bool = False
-) -> None:
-    from beamsplat.common.security.logins import OPERATOR, login_of
-    from beamsplat.common.zenoh.bus import open_session
-    from beamsplat.tools.system.health_table import ALL, HealthBoard
-
-    deployment = _load(file, overrides)
-    login = login_of(deployment.security, OPERATOR)
-    with open_session(deployment.router.listen, 2.0, login=login) as session:
-        board = HealthBoard(session, ALL if every_robot else deployment.robot)
-        draw = getattr(board, table)
-        deadline = time.monotonic() + (seconds if seconds is not None else 1e12)
-        with (
-            Screen(console=Console(), refresh_per_second=2) as screen,
-            contextlib.suppress(KeyboardInterrupt),
-        ):
-            while time.monotonic() < deadline:
-                time.sleep(0.25)
-                screen.update(draw())
-
-
-SecondsOption = Annotated[float | None, typer.Option(min=0.0, help="Stop after this long; default: Ctrl-C")]
-
-
-def top(
-    file: FileArgument,
-    seconds: SecondsOption = None,
-    set_: SetOption = None,
-    every_robot: Annotated[
-        bool, typer.Option("--all", help="Of every robot that this router hears of")
-    ] = False,
-) -> None:
-    """Live table of the nodes: state, rates, step time, age, drops, memory, CPU.
-
-    Examples:
-
-        beamsplat top deploy/robot.toml
-
-        beamsplat top deploy/edge.toml --all
-    """
-    _watch(file, set_, "nodes_table", seconds, every_robot)
-
-
-def topics(file: FileArgument, seconds: SecondsOption = None, set_: SetOption = None) -> None:
-    """Live table of the topics: who sends how often, who takes it and how late.
-
-    Example: beamsplat topics deploy/robot.toml
-    """
-    _watch(file, set_, "topics_table", seconds)
-
-
-def graph(
-    file: FileArgument,
-    mermaid: Annotated[bool, typer.Option(help="As a Mermaid flowchart")] = False,
-) -> None:
-    """The dataflow of a deployment.
-
-    Example: beamsplat graph deploy/demo.toml --mermaid
-    """
-    from beamsplat.tools.system.assembly import node_classes
-    from beamsplat.tools.system.graph import as_mermaid, as_text
-
-    classes = node_classes(_load(file, None))
-    print(as_mermaid(classes) if mermaid else as_text(classes))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
+from typing import Any
 
 import zenoh
 from rich import box
@@ -61,6 +62,27 @@ class HealthBoard:
         with self._lock:
             return self._book.states(self._clock_s())
 
+    def snapshot(self) -> dict[str, Any]:
+        """Return the health of all nodes and the traffic of all topics as a JSON table, units in the keys."""
+        now = self._clock_s()
+        with self._lock:
+            nodes = {name: _node_figures(record, now) for name, record in sorted(self.records.items())}
+            topics = {flow.topic: _topic_figures(flow) for flow in self._book.traffic()}
+        return {"nodes": nodes, "topics": topics}
+
+    def status_line(self) -> str:
+        """Return the states and rates of all nodes in one line, with what was lost."""
+        now = self._clock_s()
+        parts = []
+        with self._lock:
+            for name, record in sorted(self.records.items()):
+                totals, silent_s = record.totals(), record.silent_s(now)
+                state = f"silent {silent_s:.0f} s" if silent_s else record.health.state
+                rate = totals.out_hz if record.health.outputs else totals.in_hz
+                lost = f", {totals.lost} lost" if totals.lost else ""
+                parts.append(f"{name} {state} {rate:.1f} Hz{lost}")
+        return "; ".join(parts) or "no node reports yet"
+
     def nodes_table(self) -> RenderableType:
         """Return one row per node: process, state, rates, step time, age, losses, memory, CPU; details below.
 
@@ -107,6 +129,28 @@ class HealthBoard:
             for flow in self._book.traffic():
                 table.add_row(*_flow_row(flow))
         return table
+
+
+def _node_figures(record: NodeRecord, now: float) -> dict[str, Any]:
+    health, totals, silent_s = record.health, record.totals(), record.silent_s(now)
+    return {
+        "state": "silent" if silent_s else health.state, "silent_s": silent_s, "pid": health.pid,
+        "starts": record.starts, "epoch": health.epoch, "in_hz": totals.in_hz, "out_hz": totals.out_hz,
+        "step_p50_ms": health.step_p50_ms, "step_p95_ms": health.step_p95_ms, "age_ms": totals.age_ms,
+        "dropped": totals.dropped, "lost": totals.lost, "bad": totals.bad, "rss_mb": health.rss_mb,
+        "cpu_percent": health.cpu_percent, "detail": health.detail,
+    }  # fmt: skip
+
+
+def _topic_figures(flow: TopicTraffic) -> dict[str, Any]:
+    return {
+        "producer": flow.producer, "rate_hz": flow.hz, "nominal_hz": flow.nominal_hz,
+        "bytes_per_s": flow.bytes_s, "sent": flow.sent,
+        "consumers": {
+            consumer.node: {"age_ms": consumer.age_ms, "dropped": consumer.dropped, "lost": consumer.lost}
+            for consumer in flow.consumers
+        },
+    }  # fmt: skip
 
 
 def _narrow_table() -> Table:
