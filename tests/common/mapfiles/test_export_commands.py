@@ -15,12 +15,18 @@ from beamsplat.common.geometry.trajectory import Trajectory, write_tum
 from beamsplat.common.geometry.transforms import inverse, make_transform
 from beamsplat.common.mapfiles.session import SessionFolder
 from beamsplat.common.mapfiles.state import keyframe_views, store_of
-from beamsplat.common.mapfiles.video import along, drive, looking, orbit, write_video
+from beamsplat.common.mapfiles.video import (
+    interpolate_path,
+    look_at,
+    orbit_poses,
+    trajectory_poses,
+    write_video,
+)
 from beamsplat.common.raster.rasterizer import Rasterizer
 from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
 from beamsplat.services.localization.lidar2d.slam import LidarSlam
 from beamsplat.tools.cli.main import app
-from tests.services.localization.world import SimulatedDrive, SimulatedLidar
+from tests.services.localization.world import RayCastLidar, SimulatedDrive
 from tests.services.mapping import room_drive as r
 from tests.services.mapping.session.maps import feed, make_node
 
@@ -111,7 +117,7 @@ def test_nav2_without_a_robots_half_is_what_the_camera_saw(session, tmp_path):
 def test_nav2_layers_lie_on_each_other(session, tmp_path):
     """A lidar map of a flat and, wherever the room's keyframes put it, the camera's layer on the same cells."""
     shutil.copytree(session, tmp_path / "s")
-    lidar, path, slam = SimulatedLidar(), SimulatedDrive(), LidarSlam(LidarSlamSettings(), np.eye(4))
+    lidar, path, slam = RayCastLidar(), SimulatedDrive(), LidarSlam(LidarSlamSettings(), np.eye(4))
     angle_min, increment, dt, least, most = lidar.arguments()
     for number in range(60):
         slam.add_scan(number * 10**8, lidar.scan(path, number * 0.1), angle_min, increment, dt, least, most)
@@ -193,28 +199,28 @@ def test_a_path_of_body_poses_is_followed_with_the_robots_camera(session, tmp_pa
 
 def test_cameras_look_where_they_should(session):
     """Upright: x right, y down, z forward; an orbit looks at the map from outside and above."""
-    T = looking(np.array([0.0, -2.0, 1.0]), np.array([0.0, 0.0, 1.0]))
+    T = look_at(np.array([0.0, -2.0, 1.0]), np.array([0.0, 0.0, 1.0]))
     np.testing.assert_allclose(T[:3, :3] @ [0.0, 0.0, 1.0], [0.0, 1.0, 0.0], atol=1e-12)
     np.testing.assert_allclose(T[:3, :3] @ [1.0, 0.0, 0.0], [1.0, 0.0, 0.0], atol=1e-12)
     np.testing.assert_allclose(T[:3, :3] @ [0.0, 1.0, 0.0], [0.0, 0.0, -1.0], atol=1e-12)
-    assert np.isfinite(looking(np.array([0.0, 0.0, 5.0]), np.zeros(3))).all()
+    assert np.isfinite(look_at(np.array([0.0, 0.0, 5.0]), np.zeros(3))).all()
     arrays = SessionFolder(session).read_state()
     store, views = store_of(arrays), keyframe_views(arrays)
-    poses = orbit(store, 0.4, 6)
+    poses = orbit_poses(store, 0.4, 6)
     middle = np.median(store.params[:3, : store.count], axis=1)
     for T in poses:
         p = inverse(T)[:3, :3] @ middle + inverse(T)[:3, 3]
         assert p[2] > 0.0
         assert abs(p[0] / p[2]) < 0.5
         assert T[2, 3] > middle[2]
-    path = drive([view.T_map_camera for view in views], 15)
+    path = interpolate_path([view.T_map_camera for view in views], 15)
     np.testing.assert_allclose(path[0], views[0].T_map_camera, atol=1e-9)
     np.testing.assert_allclose(path[-1], views[-1].T_map_camera, atol=1e-9)
-    assert len(drive([np.eye(4)], 3)) == 3
+    assert len(interpolate_path([np.eye(4)], 3)) == 3
     track = Trajectory(
         np.array([0, 10]), np.stack([np.eye(4), make_transform(np.eye(3), np.array([1.0, 0, 0]))])
     )
-    assert [T[0, 3] for T in along(track, np.eye(4), 3)] == pytest.approx([0.0, 0.5, 1.0])
+    assert [T[0, 3] for T in trajectory_poses(track, np.eye(4), 3)] == pytest.approx([0.0, 0.5, 1.0])
 
 
 def test_one_picture_is_one_file(tmp_path):

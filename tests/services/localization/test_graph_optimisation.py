@@ -7,7 +7,7 @@ from beamsplat.services.localization.lidar2d.pose_graph_data import edge_informa
 
 
 def problem(rng, n_submaps=6, n_nodes=40, noise=0.01):
-    """Submaps along a ring, nodes near them, each node in two submaps; the last closes the ring."""
+    """Return submaps along a ring and nodes near them; each node is in two submaps, the last closes the ring."""
     angle = np.linspace(0, 1.8 * np.pi, n_submaps)
     submaps = np.column_stack([5 * np.cos(angle), 5 * np.sin(angle), se2.wrap_many(angle)])
     nodes, submap, node, z, info = [], [], [], [], []
@@ -70,19 +70,19 @@ def test_sparse_and_dense_agree(rng, monkeypatch):
     assert np.allclose(dense.pose_map_submap, sparse.pose_map_submap, atol=1e-7)
 
 
-def test_a_wrong_loop_is_overruled_and_a_true_one_bends_the_chain(rng):
+def test_a_wrong_loop_closure_is_rejected_and_true_ones_correct_the_drift(rng):
     submaps, nodes, edges = problem(rng, noise=0.0)
     n = len(edges.node)
-    # The chain drifts; three edges at the end know better, a fourth lies by two metres.
+    # Three loop closures at the end are right, a fourth is wrong by two metres.
     robust = np.zeros(n, dtype=bool)
     robust[edges.submap == 0] = edges.node[edges.submap == 0] >= 37
     z = edges.pose_submap_node.copy()
-    liar = np.flatnonzero(robust)[0]
+    wrong_edge = np.flatnonzero(robust)[0]
     extra = ConstraintArrays(
         np.append(edges.submap, 0).astype(np.int32),
-        np.append(edges.node, edges.node[liar]).astype(np.int32),
-        np.vstack([z, z[liar] + [2.0, 0, 0]]),
-        np.concatenate([edges.information, edges.information[liar][None]]),
+        np.append(edges.node, edges.node[wrong_edge]).astype(np.int32),
+        np.vstack([z, z[wrong_edge] + [2.0, 0, 0]]),
+        np.concatenate([edges.information, edges.information[wrong_edge][None]]),
         np.append(robust, True),
     )
     order = np.argsort(extra.node, kind="stable")
@@ -107,7 +107,7 @@ def test_fixed_submaps_stay(rng):
     assert not np.allclose(solution.pose_map_submap[1], submaps[1], atol=1e-4)
 
 
-def test_edge_information_knows_its_limits():
+def test_edge_information_is_limited():
     certain = np.linalg.inv(edge_information(np.diag([1e9, 1e9, 1e9]), 0.01, 0.002))
     assert np.allclose(np.sqrt(np.diag(certain)), [0.01, 0.01, 0.002], rtol=1e-3)
     blind = np.linalg.inv(edge_information(np.zeros((3, 3)), 0.01, 0.002))

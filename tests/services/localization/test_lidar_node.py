@@ -1,4 +1,4 @@
-"""The lidar localization as a node, on a real recording with truth: accurate, reproducible, unhurried."""
+"""The lidar localization node on a real recording with ground truth: accuracy, reproducibility, robustness."""
 
 import hashlib
 
@@ -29,31 +29,31 @@ def _house(shared_dir, **replay):
 
 
 def _lockstep(deployment):
-    letters, digest = [], hashlib.sha256()
+    envelopes, digest = [], hashlib.sha256()
 
-    def on_message(letter):
-        if letter.header.producer == "localization":
-            letters.append(letter)
-            digest.update(encode(letter.message))
+    def on_message(envelope):
+        if envelope.header.producer == "localization":
+            envelopes.append(envelope)
+            digest.update(encode(envelope.message))
 
     Lockstep([build_node(deployment, name) for name in deployment.nodes], on_message).run()
-    return letters, digest.hexdigest()
+    return envelopes, digest.hexdigest()
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("without", [("image",), ("image", "odometry")], ids=["wheels", "scans alone"])
 def test_published_poses_of_the_house_are_true(shared_dir, without):
-    """Online: T_map_odom as last published, times T_odom_body, aligned by the first pose only."""
-    letters, _ = _lockstep(_house(shared_dir, without=without))
+    """Check the online poses, T_map_odom * T_odom_body as published, aligned by the first pose only."""
+    envelopes, _ = _lockstep(_house(shared_dir, without=without))
     truth = read_tum(shared_dir / "data/house_a/groundtruth.txt")
     T_map_odom, stamps, online = np.eye(4), [], []
-    for letter in letters:
-        if letter.topic == "localization/correction":
-            T_map_odom = letter.message.T_map_odom
-        elif letter.topic == "localization/odometry":
-            assert letter.message.status == "ok"
-            stamps.append(letter.message.stamp_ns)
-            online.append(T_map_odom @ letter.message.T_odom_body)
+    for envelope in envelopes:
+        if envelope.topic == "localization/correction":
+            T_map_odom = envelope.message.T_map_odom
+        elif envelope.topic == "localization/odometry":
+            assert envelope.message.status == "ok"
+            stamps.append(envelope.message.stamp_ns)
+            online.append(T_map_odom @ envelope.message.T_odom_body)
     answered, T_world_body = truth.resampled(stamps)
     online = np.array(online)[answered]
     T_world_map = T_world_body[0] @ inverse(online[0])
@@ -64,18 +64,18 @@ def test_published_poses_of_the_house_are_true(shared_dir, without):
 
 
 @pytest.mark.slow
-def test_the_same_drive_gives_the_same_bytes(shared_dir):
+def test_the_output_is_reproducible_byte_for_byte(shared_dir):
     deployment = _house(shared_dir, duration_s=25.0)
-    letters, first = _lockstep(deployment)
-    assert {letter.topic for letter in letters} == set(LidarLocalization.outputs)
+    envelopes, first = _lockstep(deployment)
+    assert {envelope.topic for envelope in envelopes} == set(LidarLocalization.outputs)
     assert _lockstep(deployment)[1] == first
 
 
 @pytest.mark.slow
-def test_live_through_zenoh_gives_the_same_messages(shared_dir, tmp_path, free_endpoint):
-    """Background optimisation included: its results are taken in at fixed scans."""
+def test_live_operation_publishes_the_same_messages_as_lockstep(shared_dir, tmp_path, free_endpoint):
+    """Includes background optimisation: its results are applied at fixed scans."""
     offline = _house(shared_dir, duration_s=12.0)
-    letters, _ = _lockstep(offline)
+    envelopes, _ = _lockstep(offline)
     live = Deployment(
         robot="t",
         router=RouterConfig(listen=(free_endpoint,)),
@@ -88,7 +88,7 @@ def test_live_through_zenoh_gives_the_same_messages(shared_dir, tmp_path, free_e
     with RecordingReader(tmp_path / "rec") as reader:
         recorded = [r for r in reader.messages() if r.topic.startswith("localization/")]
     for topic in ("localization/odometry", "localization/movers"):
-        expected = [encode(x.message) for x in letters if x.topic == topic]
+        expected = [encode(x.message) for x in envelopes if x.topic == topic]
         assert [encode(r.message) for r in recorded if r.topic == topic] == expected, topic
 
 
@@ -112,7 +112,7 @@ def _feed(node: Node, topic, message):
     return [output for output in node.handle(topic, message) if isinstance(output, tuple)]
 
 
-def test_scans_before_the_calibration_are_refused_and_said():
+def test_scans_before_the_calibration_are_rejected():
     node = LidarLocalization(LidarLocalization.Config())
     node.configure()
     scan = next(m for m in sample_messages() if type(m) is Scan)
@@ -122,7 +122,7 @@ def test_scans_before_the_calibration_are_refused_and_said():
     assert np.isnan(odometry.covariance).all()
 
 
-def test_rubbish_scans_give_a_status_and_no_map():
+def test_malformed_scans_are_rejected_and_create_no_map():
     node = LidarLocalization(LidarLocalization.Config())
     node.configure()
     assert _feed(node, "rig", next(m for m in sample_messages() if type(m) is Rig)) == []
@@ -139,5 +139,5 @@ def test_rubbish_scans_give_a_status_and_no_map():
     assert list(node.drain()) == []
 
 
-def test_the_process_list_knows_it():
+def test_the_node_is_in_the_node_table():
     assert NODES["localization"].load("lidar") is LidarLocalization

@@ -69,7 +69,7 @@ def test_trajectory_errors():
     exact = trajectory_errors(moved, truth)
     assert exact.ate_first_pose_rmse_m < 1e-12
     assert exact.yaw_rmse_rad < 1e-12
-    # One degree off at the first pose only: the first-pose alignment pays for it, the rigid one does not.
+    # An error of one degree at the first pose affects the first-pose alignment, but not the rigid one.
     tilted = moved.copy()
     tilted[0, 2] += np.radians(1.0)
     errors = trajectory_errors(tilted, truth)
@@ -87,7 +87,7 @@ def test_rigid_alignment_recovers_any_motion(rng):
     assert np.allclose(rigid_alignment(points, se2.transform(pose, points)), pose)
 
 
-def test_interpolation_goes_the_short_way_round():
+def test_yaw_interpolation_takes_the_shorter_direction():
     poses = np.array([[0, 0, np.pi - 0.1], [1, 2, -np.pi + 0.1]])
     middle = interpolate_poses(np.array([0, 10]), poses, np.array([5]))[0]
     assert np.allclose(middle[:2], [0.5, 1.0])

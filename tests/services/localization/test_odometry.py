@@ -10,13 +10,13 @@ NS = 1_000_000_000
 
 
 def turning(times):
-    """A robot that sways while it drives."""
+    """Return poses [N, 3] of a robot that drives with an oscillating heading."""
     return np.column_stack(
         [0.3 * times, 0.1 * np.sin(times), 0.8 * np.sin(1.3 * times) + 0.3 * np.sin(3.1 * times)]
     )
 
 
-def test_interpolation_against_a_slow_twin(rng):
+def test_interpolation_against_reference_code(rng):
     stamps = np.cumsum(rng.integers(10_000_000, 60_000_000, 50)).astype(np.int64)
     poses = np.column_stack([rng.normal(size=(50, 2)), se2.wrap_many(np.cumsum(rng.normal(size=50)))])
     out = np.empty(3)
@@ -30,9 +30,9 @@ def test_interpolation_against_a_slow_twin(rng):
 
 
 @pytest.mark.parametrize("delay_s", [-0.12, 0.0, 0.15])
-def test_the_delay_is_found(delay_s, rng):
+def test_the_delay_is_estimated(delay_s, rng):
     buffer, last = OdometryBuffer(), None
-    for k in range(3000):  # odometry at 50 Hz whose clock is off
+    for k in range(3000):  # odometry at 50 Hz with a delayed clock
         t = k * 0.02
         buffer.add(round(t * NS), *turning(np.array([t - delay_s]))[0])
         if k % 10 == 0 and t > 1.0:
@@ -48,15 +48,13 @@ def test_increments_across_gaps_and_beyond_the_end():
     for k in range(10):
         buffer.add(k * NS // 10, 0.1 * k, 0.0, 0.0)
     assert np.allclose(buffer.increment(NS // 4, NS * 3 // 4), [0.5, 0, 0])
-    assert np.allclose(
-        buffer.increment(NS // 2, NS), [0.5, 0, 0]
-    )  # the last velocity, a tenth of a second on
+    assert np.allclose(buffer.increment(NS // 2, NS), [0.5, 0, 0])  # extrapolated by 0.1 s
     assert buffer.increment(NS // 2, 2 * NS) is None
-    buffer.add(4 * NS, 2.0, 0.0, 0.0)  # the wheels kept counting during three silent seconds
+    buffer.add(4 * NS, 2.0, 0.0, 0.0)  # messages were missing for 3 s
     assert np.allclose(buffer.increment(NS // 2, 4 * NS), [1.5, 0, 0])
 
 
-def test_bad_odometry_is_refused_and_counted():
+def test_invalid_odometry_is_rejected_and_counted():
     buffer = OdometryBuffer()
     assert buffer.add(NS, 0, 0, 0)
     assert not buffer.add(NS, 1, 0, 0)
@@ -64,18 +62,18 @@ def test_bad_odometry_is_refused_and_counted():
     assert buffer.rejected == 2
 
 
-def test_a_lying_predictor_loses_its_say():
-    honest, liar = (
+def test_the_error_model_follows_the_recent_errors():
+    accurate, wrong = (
         MotionErrorModel(0.01, 0.05, 0.02, 0.004, 0.05, 0.03),
         MotionErrorModel(0.01, 0.05, 0.02, 0.004, 0.05, 0.03),
     )
     truth = np.array([0.1, 0.0, 0.02])
     for _ in range(30):
-        honest.update(truth + np.array([0.002, 0, 0.001]), truth)
-        liar.update(-truth, truth)
-    assert liar.sigmas(truth, 0.1)[0] > 0.1  # it says so itself: decimetres
-    assert honest.sigmas(truth, 0.1)[0] < 0.01
-    assert honest.sigmas(truth, 3.0)[0] > honest.sigmas(truth, 0.1)[0]  # nothing is certain after a gap
+        accurate.update(truth + np.array([0.002, 0, 0.001]), truth)
+        wrong.update(-truth, truth)
+    assert wrong.sigmas(truth, 0.1)[0] > 0.1  # decimetres
+    assert accurate.sigmas(truth, 0.1)[0] < 0.01
+    assert accurate.sigmas(truth, 3.0)[0] > accurate.sigmas(truth, 0.1)[0]  # less certain after a gap
 
 
 def test_twist_and_its_exponential():

@@ -1,4 +1,4 @@
-"""A second drive goes on in the first one's map: from a wrong start, with the same submaps, into one state."""
+"""A second drive continues the map of the first: relocalization, same submaps, one saved state."""
 
 import json
 from dataclasses import replace
@@ -11,15 +11,18 @@ from beamsplat.common.geometry.transforms import inverse, se2_to_se3
 from beamsplat.common.messages import LidarModel, Rig, Scan
 from beamsplat.common.runtime.live_settings import LiveSettings
 from beamsplat.services.localization.lidar2d.node import LidarLocalization
-from tests.services.localization.world import SimulatedDrive, SimulatedLidar
+from tests.services.localization.world import RayCastLidar, SimulatedDrive
 
 T0 = 1_000_000_000_000
 PATH = SimulatedDrive()
 
 
 def drive(node, start_s, end_s, seed, day):
-    """Messages of a drive through the flat, by topic, and the pose (true, published) of each scan that was ok."""
-    lidar, sent, poses, T_map_odom = SimulatedLidar(seed=seed), {}, [], np.eye(4)
+    """Drive through the flat.
+
+    Return the messages by topic, and the poses (true, published) of the scans with status "ok".
+    """
+    lidar, sent, poses, T_map_odom = RayCastLidar(seed=seed), {}, [], np.eye(4)
     angle_min, increment, dt, least, most = lidar.arguments()
 
     def take(outputs):
@@ -55,7 +58,7 @@ def drive(node, start_s, end_s, seed, day):
 
 
 def fitted(world, mapped):
-    """The rigid motion [3] that takes poses [N, 3] of the map to those of the world, in least squares."""
+    """Return the rigid motion [3] that maps map poses [N, 3] to world poses, in least squares."""
     a, b = world[:, :2] - world[:, :2].mean(0), mapped[:, :2] - mapped[:, :2].mean(0)
     yaw = np.arctan2((b[:, 0] * a[:, 1] - b[:, 1] * a[:, 0]).sum(), (a * b).sum())
     c, s = np.cos(yaw), np.sin(yaw)
@@ -70,7 +73,7 @@ def make(home=None, **options):
 
 
 @pytest.mark.slow
-def test_a_drive_goes_on_in_the_map_of_another(tmp_path):
+def test_a_second_drive_continues_the_map_of_the_first(tmp_path):
     node = make(save=tmp_path / "map")
     first, _ = drive(node, 0.0, 36.0, 1, 0)
     old = set(first["localization/anchors"][-1].anchor_ids.tolist())
@@ -85,13 +88,13 @@ def test_a_drive_goes_on_in_the_map_of_another(tmp_path):
     off_m = [np.hypot(*e[:2, 3]) for e in errors]
     assert np.percentile(off_m, 95) < 0.05
     anchors = second["localization/anchors"][-1].anchor_ids.tolist()
-    assert old < set(anchors)  # keyframes of the first drive still hang on theirs
+    assert old < set(anchors)  # the anchors of the first drive still exist
     table = json.loads((tmp_path / "map" / "lidar_map.json").read_text())
     assert table["submaps"] == len(anchors)
 
 
 @pytest.mark.slow
-def test_a_process_that_dies_goes_on_in_the_map_that_it_kept(tmp_path):
+def test_a_crashed_process_continues_its_checkpoint(tmp_path):
     home = LiveSettings("r1", (), tmp_path)
     node = make(home, keep_every_s=5.0)
     first, _ = drive(node, 0.0, 36.0, 1, 0)
@@ -104,16 +107,16 @@ def test_a_process_that_dies_goes_on_in_the_map_that_it_kept(tmp_path):
     assert np.percentile([np.hypot(*e[:2, 3]) for e in errors], 95) < 0.05
     names = {a.map_uuid for sent in (first, second) for a in sent["localization/anchors"]}
     assert len(names) == 1
-    assert second["localization/anchors"][0].map_uuid  # before the first pose: who has keyframes knows
+    assert second["localization/anchors"][0].map_uuid  # published before the first pose
     kept = set(second["localization/anchors"][0].anchor_ids.tolist())
     begun = set(second["localization/anchors"][-1].anchor_ids.tolist()) - kept
     lost = set(first["localization/anchors"][-1].anchor_ids.tolist()) - kept
     assert begun
-    assert not begun & lost  # a submap that was begun after the copy is nobody else's name
-    third, _ = drive(make(home), 0.0, 5.0, 3, 0)  # another run of the system is another drive
+    assert not begun & lost  # ids of submaps after the checkpoint are not used again
+    third, _ = drive(make(home), 0.0, 5.0, 3, 0)  # another run starts a new map
     assert {a.map_uuid for a in third["localization/anchors"]}.isdisjoint(names)
 
 
-def test_a_state_that_cannot_be_read_is_said_before_anything_starts(tmp_path):
+def test_an_unreadable_state_is_reported_before_the_start(tmp_path):
     with pytest.raises(UserError, match=r"localization\.resume: .*no saved map here"):
         make(resume=tmp_path)

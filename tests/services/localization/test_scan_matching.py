@@ -1,4 +1,4 @@
-"""Kernels against slow twins, and what they are for: poses in metres and radians."""
+"""Scan matching kernels against reference code, and their accuracy in metres and radians."""
 
 import math
 
@@ -21,7 +21,7 @@ from beamsplat.services.localization.lidar2d.scan_matching import (
 from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
 from beamsplat.services.localization.lidar2d.surfel_kernels import merged_surfel
 from beamsplat.services.localization.lidar2d.surfel_map import SurfelMap, freeze
-from tests.services.localization.world import SimulatedLidar
+from tests.services.localization.world import RayCastLidar
 
 SETTINGS = LidarSlamSettings()
 poses = st.tuples(st.floats(-5, 5), st.floats(-5, 5), st.floats(-3.1, 3.1)).map(np.array)
@@ -32,7 +32,7 @@ def still(pose):
 
 
 def prepared(pose, lidar=None, velocity=(0.0, 0.0, 0.0), pose_at=None):
-    lidar = lidar or SimulatedLidar()
+    lidar = lidar or RayCastLidar()
     ranges = lidar.scan(pose_at or still(pose), 0.0)
     a, inc, dt, low, high = lidar.arguments()
     return prepare_scan(ranges, a, inc, dt, low, high, np.zeros(3), np.array(velocity), 0.03, 360)
@@ -79,15 +79,15 @@ def test_se2_is_a_group(a, b, c):
     assert np.allclose(se2.compose_many(a, b)[0], se2.compose(a, b))
 
 
-def test_rubbish_ranges_are_no_returns():
+def test_invalid_ranges_are_no_returns():
     ranges = np.array([1, np.nan, np.inf, -np.inf, -2, 0, 0.05, 11.99, 12, 50, 2], dtype=np.float32)
     scan = prepare_scan(ranges, 0.0, 0.1, 0.0, 0.1, 12.0, np.zeros(3), np.zeros(3), 0.03, 360)
     assert scan.beams.tolist() == [0, 7, 10]
     assert np.allclose(np.hypot(*scan.points_body.T), [1, 11.99, 2], atol=1e-6)
 
 
-def test_deskew_against_a_slow_twin_and_against_the_world(rng):
-    lidar = SimulatedLidar(beams=180, sigma_m=0.0)
+def test_deskewing_against_integration_and_against_the_true_walls(rng):
+    lidar = RayCastLidar(beams=180, sigma_m=0.0)
     start, velocity = np.array([2.0, 2.0, 0.4]), np.array([0.6, 0.1, 1.2])
 
     def pose_at(t):
@@ -102,7 +102,7 @@ def test_deskew_against_a_slow_twin_and_against_the_world(rng):
     scan = prepared(start, lidar, velocity, pose_at)
     seen = se2.transform(start, scan.points_body)
     stretched = se2.transform(start, prepared(start, lidar, (0, 0, 0), pose_at).points_body)
-    truth = se2.transform(start, prepared(start, SimulatedLidar(beams=3600, sigma_m=0.0)).points_body)
+    truth = se2.transform(start, prepared(start, RayCastLidar(beams=3600, sigma_m=0.0)).points_body)
 
     def distance(points):
         return np.min(np.hypot(*(points[:, None] - truth[None]).transpose(2, 0, 1)), axis=1)
@@ -112,7 +112,7 @@ def test_deskew_against_a_slow_twin_and_against_the_world(rng):
 
 
 def test_tangents_lie_along_walls():
-    scan = prepared(np.array([2.0, 2.0, 0.0]), SimulatedLidar(sigma_m=0.005))
+    scan = prepared(np.array([2.0, 2.0, 0.0]), RayCastLidar(sigma_m=0.005))
     on_floor_wall = np.abs(scan.points_body[:, 1] + 2.0) < 0.03
     known = np.hypot(*scan.tangents.T) > 0
     tangents = scan.tangents[on_floor_wall & known]
@@ -226,9 +226,9 @@ def test_search_against_brute_force_and_from_far(room):
     assert min(np.hypot(*(pose[:2] - truth[:2])) for _, pose in best) < 0.12
 
 
-def test_a_corridor_gives_no_information_along_it():
+def test_a_corridor_has_no_information_along_its_direction():
     walls = np.array([[-40, 0, 40, 0], [-40, 2, 40, 2.0]])
-    surfels, lidar = SurfelMap(SETTINGS), SimulatedLidar(range_max=8.0)
+    surfels, lidar = SurfelMap(SETTINGS), RayCastLidar(range_max=8.0)
     for x in np.linspace(0, 2, 15):
         pose = np.array([x, 1.0, 0.0])
         a, inc, _, low, high = lidar.arguments()
@@ -275,7 +275,7 @@ def test_branch_and_bound_is_exact(room):
     assert branch_and_bound(features, centre, pyramid, 1.5, 0.4, 1.1) == []
 
 
-def test_a_map_survives_freezing_and_growing(room):
+def test_a_frozen_map_yields_the_same_match(room):
     frozen = freeze(room)
     live, cold = room.tables(), frozen.tables(SETTINGS.reach_cells)
     scan = prepared(np.array([2.5, 2.2, 0.5]))
@@ -287,7 +287,7 @@ def test_a_map_survives_freezing_and_growing(room):
     assert misses.sum() == room.misses.sum()
 
 
-def test_tables_with_and_without_the_field_agree(room):
+def test_match_tables_with_and_without_the_likelihood_field_agree(room):
     frozen = freeze(room)
     searched, matched = frozen.tables(SETTINGS.reach_cells), frozen.tables(SETTINGS.reach_cells, False)
     assert np.mean(searched.nearest != matched.nearest) < 1e-3  # equally near, within float32
@@ -295,19 +295,19 @@ def test_tables_with_and_without_the_field_agree(room):
     assert searched.field.any()
 
 
-def test_what_was_put_off_is_made_up_for(room):
-    late = mapped(VIEWS, matchable=False)
-    assert not late.field.any()
-    late.make_matchable()
-    assert np.allclose(late.means[: late.count], room.means[: room.count])
-    # The live map moves its tables only once an element has moved by millimetres.
-    rows, cols = np.nonzero((late.nearest >= 0) & (room.nearest >= 0))
-    centre = (np.column_stack([cols + late.col0, rows + late.row0]) + 0.5) * late.cell_m
-    away = [np.linalg.norm(m.means[m.nearest[rows, cols]] - centre, axis=1) for m in (late, room)]
+def test_make_matchable_updates_postponed_tables(room):
+    postponed = mapped(VIEWS, matchable=False)
+    assert not postponed.field.any()
+    postponed.make_matchable()
+    assert np.allclose(postponed.means[: postponed.count], room.means[: room.count])
+    # The live map updates its tables only when an element has moved by millimetres.
+    rows, cols = np.nonzero((postponed.nearest >= 0) & (room.nearest >= 0))
+    centre = (np.column_stack([cols + postponed.col0, rows + postponed.row0]) + 0.5) * postponed.cell_m
+    away = [np.linalg.norm(m.means[m.nearest[rows, cols]] - centre, axis=1) for m in (postponed, room)]
     assert np.max(np.abs(away[0] - away[1])) < 0.02  # m
 
 
-def test_a_redrawn_submap_keeps_its_free_space(room):
+def test_a_rebuilt_submap_keeps_its_counts(room):
     frozen = freeze(room)
     again = freeze(mapped(VIEWS, matchable=False, rays=False), frozen)
     assert again.packed == frozen.packed

@@ -11,7 +11,7 @@ from beamsplat.services.localization.lidar2d.metrics import trajectory_errors
 from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
 from beamsplat.services.localization.lidar2d.slam import LidarSlam
 from beamsplat.services.localization.lidar2d.state import MANIFEST, MapStateError
-from tests.services.localization.world import WALLS, SimulatedDrive, SimulatedLidar, box, wheels
+from tests.services.localization.world import WALLS, RayCastLidar, SimulatedDrive, box, wheels
 
 NS = 1_000_000_000
 SETTINGS = LidarSlamSettings()
@@ -46,7 +46,7 @@ def run(
 
 @pytest.fixture(scope="module")
 def mapped():
-    drive, lidar = SimulatedDrive(laps=1), SimulatedLidar(seed=1)
+    drive, lidar = SimulatedDrive(laps=1), RayCastLidar(seed=1)
     slam = LidarSlam(SETTINGS, np.eye(4))
     results, truth = run(slam, drive, lidar, odometry=wheels(drive, np.arange(0, drive.duration_s, 0.02)))
     return slam, results, truth
@@ -84,8 +84,8 @@ def test_grid_shows_the_walls(mapped):
 @pytest.mark.parametrize(
     "lidar",
     [
-        SimulatedLidar(beams=180, fov=np.pi, rate_hz=5.0, sweep=False, seed=2),
-        SimulatedLidar(beams=1440, rate_hz=10, seed=3, sigma_m=0.02),
+        RayCastLidar(beams=180, fov=np.pi, rate_hz=5.0, sweep=False, seed=2),
+        RayCastLidar(beams=1440, rate_hz=10, seed=3, sigma_m=0.02),
     ],
     ids=["180 beams of a half turn at 5 Hz", "1440 beams"],
 )
@@ -97,8 +97,8 @@ def test_without_odometry(lidar):
     assert trajectory_errors(slam.trajectory()[1], truth).ate_first_pose_rmse_m < 0.025
 
 
-def test_odometry_that_lies_does_no_harm():
-    drive, lidar = SimulatedDrive(), SimulatedLidar(beams=240, seed=4)
+def test_wrong_odometry_does_not_degrade_the_pose():
+    drive, lidar = SimulatedDrive(), RayCastLidar(beams=240, seed=4)
     ticks = np.arange(0, drive.duration_s, 0.02)
     odometry = wheels(drive, ticks)
     odometry[500:700] = odometry[500]  # frozen for four seconds, then it jumps
@@ -109,14 +109,14 @@ def test_odometry_that_lies_does_no_harm():
     assert trajectory_errors(slam.trajectory()[1], truth).ate_first_pose_rmse_m < 0.02
 
 
-def test_threads_and_no_threads_give_the_same_bytes():
+def test_threading_does_not_change_the_result():
     outcomes = []
     for threaded in (False, True):
         slam = LidarSlam(SETTINGS, np.eye(4))
         run(
             slam,
             SimulatedDrive(speed_m_s=1.0),
-            SimulatedLidar(beams=180, seed=5),
+            RayCastLidar(beams=180, seed=5),
             threaded=threaded,
             end_s=25.0,
         )
@@ -125,11 +125,11 @@ def test_threads_and_no_threads_give_the_same_bytes():
     assert outcomes[0] == outcomes[1]
 
 
-def test_a_result_that_is_overdue_is_an_error_not_a_different_map():
+def test_an_overdue_job_result_raises():
     slam, drive, lidar = (
         LidarSlam(SETTINGS, np.eye(4)),
         SimulatedDrive(speed_m_s=1.0),
-        SimulatedLidar(beams=120),
+        RayCastLidar(beams=120),
     )
 
     def drive_on():
@@ -140,8 +140,8 @@ def test_a_result_that_is_overdue_is_an_error_not_a_different_map():
         drive_on()
 
 
-def test_rubbish_is_refused_and_changes_nothing(mapped):
-    drive, lidar = SimulatedDrive(), SimulatedLidar(beams=180, seed=6)
+def test_malformed_scans_are_rejected_and_change_nothing(mapped):
+    drive, lidar = SimulatedDrive(), RayCastLidar(beams=180, seed=6)
     slam = LidarSlam(SETTINGS, np.eye(4))
     args = lidar.arguments()
 
@@ -172,8 +172,8 @@ def test_rubbish_is_refused_and_changes_nothing(mapped):
         assert good(k).status == "ok"
 
 
-def test_the_lidar_stops_and_the_clock_is_set_back():
-    drive, lidar = SimulatedDrive(), SimulatedLidar(beams=240, seed=7)
+def test_a_gap_in_the_scans_and_a_clock_set_back():
+    drive, lidar = SimulatedDrive(), RayCastLidar(beams=240, seed=7)
     slam, odometry = LidarSlam(SETTINGS, np.eye(4)), wheels(drive, np.arange(0, drive.duration_s, 0.02))
     results, truth = run(slam, drive, lidar, end_s=10.0, odometry=odometry)
     later, more = run(slam, drive, lidar, start_s=15.0, end_s=25.0, odometry=odometry)  # 5 s without a scan
@@ -185,8 +185,8 @@ def test_the_lidar_stops_and_the_clock_is_set_back():
     assert back[-1].status == "ok"
 
 
-def test_people_are_marked_and_stay_out_of_the_map():
-    drive, lidar = SimulatedDrive(speed_m_s=0.3), SimulatedLidar(beams=360, seed=8)
+def test_dynamic_objects_are_marked_and_not_mapped():
+    drive, lidar = SimulatedDrive(speed_m_s=0.3), RayCastLidar(beams=360, seed=8)
 
     def person(t):
         return box(2.4 + 0.9 * np.sin(0.7 * t), 2.6 + 0.4 * np.cos(0.5 * t), 0.35)
@@ -195,7 +195,7 @@ def test_people_are_marked_and_stay_out_of_the_map():
     run(slam, drive, lidar, end_s=8.0)
     results, truth = run(slam, drive, lidar, start_s=8.1, end_s=16.0, walls_at=person)
     marked = on_person = false = others = 0
-    clean = SimulatedLidar(beams=360, sigma_m=0.0)
+    clean = RayCastLidar(beams=360, sigma_m=0.0)
     for k, result in enumerate(results):
         t = 8.1 + k * 0.1
         without, with_ = clean.scan(drive, t), clean.scan(drive, t, np.vstack([WALLS, person(t)]))
@@ -208,9 +208,9 @@ def test_people_are_marked_and_stay_out_of_the_map():
     assert trajectory_errors(slam.trajectory()[1][-len(truth) :], truth).ate_se3_rmse_m < 0.02
 
 
-def test_relocalization_without_a_guess(mapped, rng):
+def test_global_relocalization(mapped, rng):
     slam, _, truth = mapped
-    drive, lidar = SimulatedDrive(), SimulatedLidar(beams=360, seed=9, sweep=False)
+    drive, lidar = SimulatedDrive(), RayCastLidar(beams=360, seed=9, sweep=False)
     pose_world_map = se2.compose(truth[0], se2.inverse(slam.trajectory()[1][0]))
     args, sure = lidar.arguments(), 0
     for t in rng.uniform(1, drive.duration_s - 1, 12):
@@ -222,7 +222,7 @@ def test_relocalization_without_a_guess(mapped, rng):
         assert np.hypot(error[0], error[1]) < 0.10
         assert abs(error[2]) < np.radians(2.0)
         sure += answer.confidence > 0.5
-    assert sure >= 8  # the two rooms look alike from some places, and it says so
+    assert sure >= 8  # the two rooms are ambiguous from some poses
     elsewhere = np.vstack([box(0, 0, 5.0), box(1.5, 0.2, 0.8)])
     strange = slam.relocalize(
         lidar.scan(lambda _: np.zeros((360, 3)), 0.0, elsewhere), args[0], args[1], *args[3:]
@@ -230,14 +230,14 @@ def test_relocalization_without_a_guess(mapped, rng):
     assert strange.confidence < 0.5
 
 
-def test_save_load_and_go_on(mapped, tmp_path):
+def test_save_load_and_continue(mapped, tmp_path):
     slam, _, truth = mapped
     slam.save(tmp_path)
     again = LidarSlam.load(tmp_path, SETTINGS, np.eye(4))
     assert again.anchors().keys() == slam.anchors().keys()
     assert np.allclose(again.trajectory()[1], slam.trajectory()[1])
     assert np.array_equal(again.grid().values, slam.grid().values)
-    drive, lidar = SimulatedDrive(), SimulatedLidar(beams=360, seed=10)
+    drive, lidar = SimulatedDrive(), RayCastLidar(beams=360, seed=10)
     results, more = run(again, drive, lidar, start_s=6.0, end_s=14.0, offset_s=1000.0)
     assert results[0].status == "relocalizing"
     assert results[-1].status == "ok"
@@ -246,12 +246,12 @@ def test_save_load_and_go_on(mapped, tmp_path):
     assert np.hypot(*(placed - more)[:, :2].T).max() < 0.08
 
 
-def test_localization_only_leaves_the_map_alone(mapped, tmp_path):
+def test_pure_localization_does_not_change_the_map(mapped, tmp_path):
     slam, _, truth = mapped
     slam.save(tmp_path)
     again = LidarSlam.load(tmp_path, SETTINGS, np.eye(4), localize_only=True)
     results, more = run(
-        again, SimulatedDrive(), SimulatedLidar(beams=360, seed=11), start_s=20.0, end_s=40.0, offset_s=1000.0
+        again, SimulatedDrive(), RayCastLidar(beams=360, seed=11), start_s=20.0, end_s=40.0, offset_s=1000.0
     )
     assert results[-1].status == "ok"
     for i, pose in slam.anchors().items():
@@ -264,13 +264,13 @@ def test_localization_only_leaves_the_map_alone(mapped, tmp_path):
     assert np.sqrt(np.mean(np.hypot(*(placed - more[ok])[:, :2].T) ** 2)) < 0.03
 
 
-def test_a_kidnapped_robot_finds_itself_again():
-    drive, lidar = SimulatedDrive(), SimulatedLidar(beams=360, seed=12)
+def test_a_kidnapped_robot_is_relocalized():
+    drive, lidar = SimulatedDrive(), RayCastLidar(beams=360, seed=12)
     slam = LidarSlam(SETTINGS, np.eye(4))
     _, truth = run(slam, drive, lidar, end_s=drive.duration_s - 1.0)
     results, more = run(
         slam, drive, lidar, start_s=8.0, end_s=16.0, offset_s=drive.duration_s
-    )  # carried away
+    )  # the robot was moved
     statuses = [r.status for r in results]
     assert "relocalizing" in statuses
     assert statuses[-1] == "ok"
@@ -280,7 +280,7 @@ def test_a_kidnapped_robot_finds_itself_again():
     assert np.hypot(*(placed - more[-50:])[:, :2].T).max() < 0.1
 
 
-def test_bad_states_are_named(mapped, tmp_path):
+def test_errors_of_invalid_states(mapped, tmp_path):
     with pytest.raises(MapStateError, match="no saved map here"):
         LidarSlam.load(tmp_path, SETTINGS, np.eye(4))
     mapped[0].save(tmp_path)

@@ -1,4 +1,4 @@
-"""A robot that never stops: hours in the same rooms cost no more memory and no more time; `make soak`."""
+"""Eight hours of operation in the same rooms: constant memory and time per scan; run by `make soak`."""
 
 import gc
 import time
@@ -10,28 +10,28 @@ import pytest
 from beamsplat.services.localization.lidar2d.job_runner import JobRunner
 from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
 from beamsplat.services.localization.lidar2d.slam import LidarSlam
-from tests.services.localization.world import SimulatedDrive, SimulatedLidar
+from tests.services.localization.world import RayCastLidar, SimulatedDrive
 
 RATE_HZ = 10.0
 
 
 def resident_mb() -> float:
-    """Of this process, now."""
+    """Return the resident memory of this process."""
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     return pages * 4096 / 1e6
 
 
-def lap_of_ranges(lidar: SimulatedLidar) -> np.ndarray:
-    """Noise-free ranges float32 [pose, N] of one lap; the middle one of three, so that its ends meet."""
-    drive, quiet = SimulatedDrive(laps=3), SimulatedLidar(beams=lidar.beams, sigma_m=0.0)
+def lap_of_ranges(lidar: RayCastLidar) -> np.ndarray:
+    """Return noise-free ranges float32 [T, N] of the middle one of three laps, so that its ends meet."""
+    drive, quiet = SimulatedDrive(laps=3), RayCastLidar(beams=lidar.beams, sigma_m=0.0)
     lap_s = drive.duration_s / 3.0
     times = lap_s + np.arange(round(lap_s * RATE_HZ)) / RATE_HZ
     return np.array([quiet.scan(drive, t) for t in times])
 
 
 def drive_for(scans: int, parts: int = 20) -> tuple[np.ndarray, np.ndarray, LidarSlam]:
-    """CPU milliseconds a scan and resident MB at the end of each part."""
-    lidar, rng = SimulatedLidar(), np.random.default_rng(0)
+    """Return CPU milliseconds per scan and resident MB at the end of each part, and the SLAM."""
+    lidar, rng = RayCastLidar(), np.random.default_rng(0)
     lap = lap_of_ranges(lidar)
     slam = LidarSlam(LidarSlamSettings(), np.eye(4))
     cost_ms, memory_mb, began = [], [], time.process_time()

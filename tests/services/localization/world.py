@@ -1,4 +1,4 @@
-"""A small flat with known walls, and a lidar in it: truth for the SLAM tests."""
+"""A simulated flat with known walls and a lidar: ground truth for the SLAM tests."""
 
 import numpy as np
 
@@ -30,7 +30,7 @@ WALLS = np.array(
 
 
 def cast(origins: np.ndarray, angles: np.ndarray, walls: np.ndarray) -> np.ndarray:
-    """Range of each ray (origin [N, 2], angle [N]) to the nearest wall [S, 4]; inf if there is none."""
+    """Return the range of each ray (origin [N, 2], angle [N]) to the nearest wall [S, 4], else inf."""
     d = np.stack([np.cos(angles), np.sin(angles)], axis=1)[:, None]
     a, e = walls[None, :, :2], walls[None, :, 2:] - walls[None, :, :2]
     cross = d[..., 0] * e[..., 1] - d[..., 1] * e[..., 0]
@@ -43,13 +43,13 @@ def cast(origins: np.ndarray, angles: np.ndarray, walls: np.ndarray) -> np.ndarr
 
 
 def box(x: float, y: float, size: float) -> np.ndarray:
-    """Four walls of a square thing."""
+    """Return the four walls of a square object."""
     a, b, c, d = x - size / 2, y - size / 2, x + size / 2, y + size / 2
     return np.array([[a, b, c, b], [c, b, c, d], [c, d, a, d], [a, d, a, b]])
 
 
-class SimulatedLidar:
-    """A full turn (or less) of beams, each at its own time."""
+class RayCastLidar:
+    """A lidar with up to a full turn of beams, each at its own time."""
 
     def __init__(
         self, beams=360, fov=2 * np.pi, rate_hz=10.0, sigma_m=0.01, seed=0, sweep=True, range_max=12.0
@@ -59,14 +59,17 @@ class SimulatedLidar:
         self.sigma_m, self.range_max, self.rng = sigma_m, range_max, np.random.default_rng(seed)
 
     def scan(self, pose_at, t: float, walls: np.ndarray = WALLS) -> np.ndarray:
-        """Ranges float32 [N] of a scan whose first beam is at time t; pose_at(times [N]) gives [N, 3]."""
+        """Return ranges float32 [N] of a scan with its first beam at time t.
+
+        `pose_at` maps times [N] to poses [N, 3].
+        """
         poses = pose_at(t + np.arange(self.beams) * self.dt)
         angles = poses[:, 2] + self.angle_min + np.arange(self.beams) * self.increment
         ranges = cast(poses[:, :2], angles, walls) + self.sigma_m * self.rng.standard_normal(self.beams)
         return np.where(ranges < self.range_max, ranges, np.inf).astype(np.float32)
 
     def arguments(self) -> tuple[float, float, float, float, float]:
-        """angle_min, angle_increment, time_increment, range_min, range_max."""
+        """Return angle_min, angle_increment, time_increment, range_min, range_max."""
         return self.angle_min, self.increment, self.dt, 0.1, self.range_max
 
 
@@ -92,7 +95,7 @@ LOOP = np.array(
 
 
 class SimulatedDrive:
-    """A smooth path through the flat at constant speed; `laps` times round."""
+    """A smooth path of `laps` rounds through the flat at constant speed."""
 
     def __init__(self, speed_m_s=0.5, laps=1):
         points = np.concatenate([LOOP] + [LOOP[1:]] * (laps - 1))
@@ -108,7 +111,7 @@ class SimulatedDrive:
         self.duration_s = float(s[-1] / speed_m_s)
 
     def __call__(self, t: np.ndarray) -> np.ndarray:
-        """Poses float64 [N, 3] in the world."""
+        """Return poses float64 [N, 3] in the world frame."""
         s = np.clip(np.asarray(t) * self._speed, 0, self._s[-1])
         pose = np.stack([np.interp(s, self._s, self._table[:, i]) for i in range(3)], axis=1)
         pose[:, 2] = se2.wrap_many(pose[:, 2])
@@ -116,7 +119,7 @@ class SimulatedDrive:
 
 
 def wheels(drive, times: np.ndarray, scale=1.02, drift_rad_s=0.002) -> np.ndarray:
-    """Odometry poses [N, 3]: too long by `scale`, turning by `drift_rad_s`."""
+    """Return odometry poses [N, 3] with a scale error `scale` and a yaw drift `drift_rad_s`."""
     truth = drive(times)
     steps = se2.between_many(truth[:-1], truth[1:])
     steps[:, :2] *= scale

@@ -15,7 +15,7 @@ from beamsplat.services.localization.lidar2d.node import LidarLocalization
 from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
 from beamsplat.services.localization.lidar2d.slam import LidarSlam
 from beamsplat.services.localization.lidar2d.state import MANIFEST, map_uuid
-from tests.services.localization.world import SimulatedDrive, SimulatedLidar
+from tests.services.localization.world import RayCastLidar, SimulatedDrive
 from tests.services.mapping import room_drive as r
 from tests.services.mapping.session.maps import SECOND, handle, make_node, message
 from tests.services.mapping.session.test_session_cli import run
@@ -25,7 +25,7 @@ def localized(folder, seed, resume=None, scans=40):
     """The last anchors of a few seconds' drive, whose state is saved in `folder`."""
     node = LidarLocalization(LidarLocalization.Config(kind="lidar", save=folder, resume=resume))
     node.configure()
-    lidar, path, sent = SimulatedLidar(seed=seed), SimulatedDrive(), []
+    lidar, path, sent = RayCastLidar(seed=seed), SimulatedDrive(), []
     angle_min, increment, dt, least, most = lidar.arguments()
     list(node.handle("rig", Rig(stamp_ns=r.T0, lidar=LidarModel(T_body_lidar=np.eye(4)))))
     for number in range(scans):
@@ -106,7 +106,7 @@ def test_a_mapper_whose_robot_starts_another_map_keeps_its_own_as_it_is(tmp_path
             map_uuid=name,
         )  # fmt: skip
         handle(node, "localization/anchors", anchors, {})
-        assert ("anchors are left out: of the robot's map second" in caplog.text) == (name == "second")
+        assert ("anchors are ignored: it belongs to the robot's map second" in caplog.text) == (name == "second")
     assert node._mapper.T_map_anchor[0][0, 3] == 0.5
     handle(node, "keyframes/frame", message(1, map_uuid="second"), sent)
     handle(node, "keyframes/frame", message(2, map_uuid="first"), sent)

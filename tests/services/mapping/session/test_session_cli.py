@@ -18,7 +18,7 @@ from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
 from beamsplat.services.localization.lidar2d.slam import LidarSlam
 from beamsplat.tools.cli.main import app
 from beamsplat.tools.sessions.edit import merged, pruned, summary_of, with_anchors
-from tests.services.localization.world import WALLS, SimulatedDrive, SimulatedLidar
+from tests.services.localization.world import WALLS, RayCastLidar, SimulatedDrive
 from tests.services.mapping import room_drive as r
 from tests.services.mapping.session.maps import SECOND, feed, make_node, message
 
@@ -143,7 +143,7 @@ def lidar_maps():
     """Two drives through the same flat, the second starting elsewhere: (SLAM, true pose_world_map) of each."""
     drive, out = SimulatedDrive(), []
     for start_s, end_s, seed in ((0.0, 36.0, 1), (14.0, 40.0, 2)):
-        lidar = SimulatedLidar(seed=seed)
+        lidar = RayCastLidar(seed=seed)
         slam = LidarSlam(LidarSlamSettings(), np.eye(4))
         for number in range(int((end_s - start_s) * 10)):
             t = start_s + number * 0.1
@@ -194,7 +194,7 @@ def test_a_second_drive_finds_its_place_in_the_first_and_closes_loops_with_it(li
 @pytest.mark.slow
 def test_a_map_of_somewhere_else_is_not_placed(lidar_maps, tmp_path):
     a, _ = copies(lidar_maps, tmp_path)
-    lidar, slam = SimulatedLidar(seed=9), LidarSlam(LidarSlamSettings(), np.eye(4))
+    lidar, slam = RayCastLidar(seed=9), LidarSlam(LidarSlamSettings(), np.eye(4))
     walls = np.array([[0, 0, 14, 0], [14, 0, 14, 1.7], [14, 1.7, 0, 1.7], [0, 1.7, 0, 0]], float)
     angle_min, increment, dt, least, most = lidar.arguments()
     for number in range(80):
