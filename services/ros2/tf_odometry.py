@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from beamsplat.common.geometry.transforms import inverse, se3_log
-from beamsplat.common.recording.static_frames import BODY_NAMES, clean
+from beamsplat.common.recording.static_frames import BODY_NAMES, normalize_frame
 
 _ODOM = "odom"
 _MAX_STEP_NS = 1_000_000_000  # over a longer interval the velocity is unknown
@@ -22,7 +22,7 @@ class TfOdometry:
 
     def add_edge(self, parent: str, child: str) -> None:
         """Register a transform of /tf."""
-        self._edges.add((clean(parent), clean(child)))
+        self._edges.add((normalize_frame(parent), normalize_frame(child)))
 
     def odometry_edge(self) -> tuple[str, str] | None:
         """Return the frames (odom, child) by their usual names; None if there is no or more than one

@@ -10,7 +10,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from beamsplat.common import messages as m
 from beamsplat.common.recording import ros_types as ros
-from beamsplat.common.recording.sensors import SENSORS, build, ros_fields
+from beamsplat.common.recording.sensors import SENSORS, build_message, ros_fields
 from beamsplat.common.recording.to_ros import records_of
 from beamsplat.common.zenoh.rmw import RmwAttachment, RmwEntity, RmwKey, RmwQos, data_key
 from beamsplat.services.ros2_out.conversions import TfTree, occupancy_grid, point_cloud
@@ -115,7 +115,7 @@ def test_sensor_messages_are_converted_without_loss(word):
     }[word]  # fmt: skip
     first = records_of(sensor.topic, made)[0].message
     data = ros.serialize(first)
-    back = build(sensor.topic, ros_fields(sensor.topic, _independent(first)))
+    back = build_message(sensor.topic, ros_fields(sensor.topic, _independent(first)))
     assert ros.serialize(records_of(sensor.topic, back)[0].message) == data
 
 
