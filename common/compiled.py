@@ -1,7 +1,7 @@
-"""The decorator of every compiled function, and a cache that notices when one of its helpers changes.
+"""The decorator of all Numba kernels, with an on-disk cache that is invalidated when a helper changes.
 
-Numba's cache looks only at the file of the compiled function, but constants and inlined functions come from
-other files: after an update of one of them, old machine code would run with the new rest.
+Numba's cache checks only the file of the compiled function. Constants and inlined functions come from other
+files too, so after a change of such a file Numba alone would load outdated machine code.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ from typing import Any
 
 from numba import njit
 
-_SHARED = Path(__file__).parent / "raster"  # whose helpers are inlined elsewhere too
+_SHARED = Path(__file__).parent / "raster"  # its helpers are inlined into kernels of other folders too
 
 
 @cache
 def _digest(folder: Path) -> str:
-    """Return the SHA-256 of the sources in a folder and of the shared helpers."""
+    """Return the SHA-256 digest of the sources in a folder and of the shared helpers."""
     sources = sorted({*folder.glob("*.py"), *_SHARED.glob("*.py"), Path(__file__)})
     return hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()
 
@@ -27,10 +27,15 @@ def _digest(folder: Path) -> str:
 def kernel(
     function: Callable[..., Any] | None = None, *, fastmath: bool | set[str] = False, sources: str = ""
 ) -> Any:
-    """Compile a function without the GIL and with a cache on disk; use as `@kernel` or `@kernel(...)`.
+    """Compile a function to run without the GIL, with an on-disk cache; use as `@kernel` or `@kernel(...)`.
 
-    Division follows NumPy (Python's check for zero prevents vectorisation). `sources` is a digest of all that
-    the machine code is made from; by default of the function's folder and of `common/raster`.
+    Division by zero follows NumPy, because Python's check for zero prevents vectorisation.
+
+    Args:
+        function: the function to compile.
+        fastmath: as in numba.njit.
+        sources: digest of all sources that the machine code depends on; by default those in the function's
+            folder and in `common/raster`.
     """
     if function is None:
         return lambda f: kernel(f, fastmath=fastmath, sources=sources)
@@ -42,5 +47,5 @@ def kernel(
     return compiled
 
 
-inner = njit(error_model="numpy")  # inlined into kernels by LLVM
-inlined = njit(inline="always", error_model="numpy")
+inner = njit(error_model="numpy")  # helper functions; LLVM may inline them into kernels
+inlined = njit(inline="always", error_model="numpy")  # helper functions that Numba inlines always

@@ -1,1 +1,1 @@
-"""Differentiable rasterization of 3D Gaussians on CPUs: Numba kernels on explicit SIMD vectors, no torch."""
+"""Differentiable rasterizer of 3D Gaussians for CPUs: Numba kernels with explicit SIMD vectors, no torch."""

@@ -1,37 +1,45 @@
-"""Lists of splats per tile, nearest first: a stable counting sort of the pairs, in parallel parts."""
+"""Binning: lists of splats per tile, nearest first, by a parallel stable counting sort of the pairs.
+
+Arrays, with V visible splats: `order` int32 [V] holds the splats in order of depth, cut into `BATCHES`
+batches; `first_pair` and `pair_count` int32 [V] give the pairs of each splat; `tiles` and `rows` int32 hold
+the tile and the range of rows of each pair.
+"""
 
 from __future__ import annotations
 
 from beamsplat.common.compiled import kernel
-from beamsplat.common.raster.layout import CHUNKS
-from beamsplat.common.raster.project import chunk_size
+from beamsplat.common.raster.layout import BATCHES
+from beamsplat.common.raster.project import batch_size
 from beamsplat.common.raster.simd_memory import atomic_next
 
 
 @kernel
-def count(counter, visible, order, first_pair, pair_count, tiles, per_tile):  # noqa: ANN001, ANN201
-    """per_tile [CHUNKS, tiles]: pairs of each part of the depth order in each tile."""
-    size = chunk_size(visible)
+def count_pairs(counter, visible, order, first_pair, pair_count, tiles, per_tile):  # noqa: ANN001, ANN201
+    """Count the pairs of each batch in each tile, into `per_tile` int32 [BATCHES, tiles]."""
+    size = batch_size(visible)
     while True:
-        chunk = atomic_next(counter, 0)
-        if chunk >= CHUNKS:
+        batch = atomic_next(counter, 0)
+        if batch >= BATCHES:
             return
-        per_tile[chunk, :] = 0
-        for rank in range(chunk * size, min(visible, (chunk + 1) * size)):
+        per_tile[batch, :] = 0
+        for rank in range(batch * size, min(visible, (batch + 1) * size)):
             first = first_pair[order[rank]]
             for pair in range(first, first + pair_count[order[rank]]):
-                per_tile[chunk, tiles[pair]] += 1
+                per_tile[batch, tiles[pair]] += 1
 
 
 @kernel
-def place(per_tile, tile_start):  # noqa: ANN001, ANN201
-    """Turns counts into places where the parts begin to write; fills `tile_start`; gives the sum."""
+def prefix_sum(per_tile, tile_start):  # noqa: ANN001, ANN201
+    """Replace the counts by start rows in the lists, fill `tile_start`, and return the number of pairs.
+
+    The start rows are an exclusive prefix sum over tiles and, within a tile, over batches.
+    """
     total = 0
     for tile in range(per_tile.shape[1]):
         tile_start[tile] = total
-        for chunk in range(CHUNKS):
-            here = per_tile[chunk, tile]
-            per_tile[chunk, tile] = total
+        for batch in range(BATCHES):
+            here = per_tile[batch, tile]
+            per_tile[batch, tile] = total
             total += here
     tile_start[per_tile.shape[1]] = total
     return total
@@ -41,18 +49,18 @@ def place(per_tile, tile_start):  # noqa: ANN001, ANN201
 def scatter(  # noqa: ANN201
     counter, visible, order, first_pair, pair_count, tiles, rows, per_tile, lists,  # noqa: ANN001
 ):  # fmt: skip
-    """Fills lists [pairs, 2] of (splat, rows), tile after tile; tiles[pair] becomes the pair's place."""
-    size = chunk_size(visible)
+    """Write (splat, rows) of each pair to `lists` int32 [pairs, 2]; set tiles[pair] to the pair's row."""
+    size = batch_size(visible)
     while True:
-        chunk = atomic_next(counter, 0)
-        if chunk >= CHUNKS:
+        batch = atomic_next(counter, 0)
+        if batch >= BATCHES:
             return
-        for rank in range(chunk * size, min(visible, (chunk + 1) * size)):
+        for rank in range(batch * size, min(visible, (batch + 1) * size)):
             splat = order[rank]
             first = first_pair[splat]
             for pair in range(first, first + pair_count[splat]):
                 tile = tiles[pair]
-                at = per_tile[chunk, tile]
-                per_tile[chunk, tile] = at + 1
+                at = per_tile[batch, tile]
+                per_tile[batch, tile] = at + 1
                 lists[at, 0], lists[at, 1] = splat, rows[pair]
                 tiles[pair] = at

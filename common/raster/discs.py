@@ -1,4 +1,4 @@
-"""Discs on the surface that a depth map shows: how both mappers begin their Gaussians."""
+"""Initial Gaussians from a depth map: flat discs (surfels) on the surface, for mapper and camera tracker."""
 
 from __future__ import annotations
 
@@ -8,18 +8,22 @@ import numpy as np
 from beamsplat.common.raster.camera import RasterCamera
 from beamsplat.common.raster.layout import COLOUR, MEAN, OPACITY, PARAMS, QUAT, SCALE
 
-_REACH_PX = 2  # of the differences that give a normal
-_SMOOTH = 0.05  # relative step of depth beyond which two pixels are not on one surface
+_REACH_PX = 2  # distance of the neighbours whose differences give the normal
+_SMOOTH = 0.05  # relative depth difference above which two pixels are not on the same surface
 
 
 def choose_pixels(
-    wanted: np.ndarray,  # bool [H, W]: where a Gaussian may begin
+    wanted: np.ndarray,  # bool [H, W]: pixels where a Gaussian may be created
     grey: np.ndarray,  # float32 [H, W] in [0, 1]
     stride_px: int,
     fine_stride_px: int,
-    texture: float,  # mean absolute colour step (Sobel sums) that counts as texture
+    texture: float,  # threshold of the mean absolute image gradient (Sobel sums) of a textured cell
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(u, v, spacing in px): a coarse lattice, and a fine one in cells where the colour changes."""
+    """Choose the pixels of new Gaussians: a coarse grid, and a fine grid in textured cells.
+
+    Returns:
+        u int [N], v int [N], and the spacing (px) float64 [N] of each pixel's grid.
+    """
     h, w = wanted.shape
     change = np.abs(cv2.Sobel(grey, cv2.CV_32F, 1, 0)) + np.abs(cv2.Sobel(grey, cv2.CV_32F, 0, 1))
     rough = cv2.blur(change, (stride_px + 1, stride_px + 1)) > np.float32(texture)
@@ -31,7 +35,8 @@ def choose_pixels(
         chosen = wanted[v, u] & here[cell_v, cell_u]
         out.append(np.stack([u[chosen], v[chosen], np.full(chosen.sum(), step)]))
     u, v, spacing = np.concatenate(out, axis=1)
-    # Neighbours in the picture become neighbours in memory: the kernels read visible Gaussians in order.
+    # Sort by blocks of 32 x 32 pixels: neighbours in the image become neighbours in memory, which the kernels
+    # read in order.
     order = np.lexsort((u // 32, v // 32))
     return u[order], v[order], spacing[order].astype(np.float64)
 
@@ -39,18 +44,22 @@ def choose_pixels(
 def make_discs(
     u: np.ndarray,  # int [N]
     v: np.ndarray,
-    spacing_px: np.ndarray,  # [N] to their neighbours
-    z_m: np.ndarray,  # float32 [H, W], 0 unknown; known at (u, v)
+    spacing_px: np.ndarray,  # [N] distance to the neighbouring pixels of the grid
+    z_m: np.ndarray,  # float32 [H, W] optical z, 0 = unknown; must be known at (u, v)
     rgb: np.ndarray,  # float32 [3, N] in [0, 1]
     camera: RasterCamera,
     T_map_camera: np.ndarray,
     *,
-    size: float,  # standard deviation over spacing
-    flatness: float,  # thickness over size
+    size: float,  # standard deviation / spacing
+    flatness: float,  # thickness / size
     opacity: float,
-    least_slant: float,  # of the cosine to the normal: bounds how long a disc gets along a slope
+    least_slant: float,  # lower limit of the cosine between ray and normal: bounds the length of a disc
 ) -> np.ndarray:
-    """float32 [PARAMS, N]: as wide as the spacing, flat along the depth's normal, long down the slope."""
+    """Return disc-shaped Gaussians float32 [PARAMS, N] on the surface, one per pixel.
+
+    A disc is flat along the surface normal, as wide as the spacing of the pixels, and elongated along the
+    slope, so that discs cover a slanted surface without gaps.
+    """
     z = z_m[v, u].astype(np.float64)
     points = _points(z_m, u, v, camera)
     normals = _normals(z_m, points, u, v, camera)
@@ -60,7 +69,7 @@ def make_discs(
     R = T_map_camera[:3, :3]
     out = np.empty((PARAMS, len(u)), np.float32)
     out[MEAN:SCALE] = (points @ R.T + T_map_camera[:3, 3]).T
-    out[SCALE] = np.log(across / slant)  # along the slope a pixel covers more surface
+    out[SCALE] = np.log(across / slant)  # along the slope, a pixel covers more of the surface
     out[SCALE + 1] = np.log(across)
     out[SCALE + 2] = np.log(across * flatness)
     out[QUAT:OPACITY] = disc_quats(normals @ R.T, rays @ R.T).T
@@ -70,7 +79,7 @@ def make_discs(
 
 
 def _points(z_m: np.ndarray, u: np.ndarray, v: np.ndarray, camera: RasterCamera) -> np.ndarray:
-    """float64 [N, 3] in the camera's frame."""
+    """Return the points float64 [N, 3] at pixels (u, v) in the camera frame."""
     z = z_m[v, u].astype(np.float64)
     return np.stack([(u - camera.cx_px) / camera.fx_px * z, (v - camera.cy_px) / camera.fy_px * z, z], axis=1)
 
@@ -78,7 +87,10 @@ def _points(z_m: np.ndarray, u: np.ndarray, v: np.ndarray, camera: RasterCamera)
 def _normals(
     z_m: np.ndarray, points: np.ndarray, u: np.ndarray, v: np.ndarray, camera: RasterCamera
 ) -> np.ndarray:
-    """Unit normals [N, 3] towards the camera by differences; the line of sight where the depth jumps."""
+    """Return unit normals [N, 3] towards the camera, from differences of neighbouring points.
+
+    At a depth discontinuity the normal is the direction to the camera.
+    """
     h, w = z_m.shape
     here = z_m[v, u]
 
@@ -98,15 +110,17 @@ def _normals(
 
 
 def disc_quats(normals: np.ndarray, rays: np.ndarray) -> np.ndarray:
-    """Quaternions (w, x, y, z) [N, 4] of discs: z along unit normals [N, 3], x down the slope seen by rays.
+    """Return the orientations of discs as quaternions (w, x, y, z) [N, 4].
 
-    The shortest turn that takes the z axis to the normal, after a turn about z that takes x to the slope.
+    The z axis is along the unit normal [N, 3], the x axis along the projection of the ray [N, 3] to the
+    disc's plane (the slope). The quaternion is a rotation about z, followed by the shortest rotation from z
+    to the normal.
     """
-    n = np.where(normals[:, 2:] < -0.999, -normals, normals)  # a disc has two sides
+    n = np.where(normals[:, 2:] < -0.999, -normals, normals)  # a disc has two equivalent normals
     tilt = np.stack([1.0 + n[:, 2], -n[:, 1], n[:, 0]], axis=1)
     tilt /= np.linalg.norm(tilt, axis=1, keepdims=True)
     w, x, y = tilt.T
-    # The ray in the tilted frame: its part in the disc's plane is the slope.
+    # Components of the ray in the disc's plane, in the tilted frame.
     along_x = (1 - 2 * y * y) * rays[:, 0] + 2 * x * y * rays[:, 1] - 2 * w * y * rays[:, 2]
     along_y = 2 * x * y * rays[:, 0] + (1 - 2 * x * x) * rays[:, 1] + 2 * w * x * rays[:, 2]
     half = 0.5 * np.arctan2(along_y, along_x)

@@ -1,8 +1,9 @@
-"""What the arrays of the rasterizer hold, and the constants all backends agree on.
+"""Layout of the rasterizer's arrays, and the rendering constants that all backends share.
 
-Parameters are stored by component, float32 [PARAMS, capacity], so that vectors of lanes run over Gaussians.
-Semantics are those of 3DGS (Kerbl et al. 2023) with gsplat's constants: the screen covariance gets 0.3 px^2,
-alpha is at most 0.999, alpha below 1/255 is skipped, and a pixel stops before transmittance falls to 1e-4.
+Parameters are stored by component, float32 [PARAMS, capacity], so that a SIMD vector holds one component of
+consecutive Gaussians. The semantics are those of 3DGS (Kerbl et al. 2023) with gsplat's constants: 0.3 px^2
+is added to the image covariance, alpha is at most 0.999, alpha below 1/255 is skipped, and a pixel ends
+before its transmittance would fall to 1e-4.
 """
 
 from __future__ import annotations
@@ -21,23 +22,24 @@ GROUPS = {
     "colour": (11, 14),
 }
 
-# Rows of the gradient beside those of the parameters.
-SCREEN_GRADIENT, WEIGHT = 14, 15  # |dL/d(centre in px)|, and the sum of blending weights over all pixels
+# Additional rows of the gradient: |dL/d(centre in px)|, and the sum of the blending weights over all pixels.
+SCREEN_GRADIENT, WEIGHT = 14, 15
 GRADIENTS = 16
 
 CHANNELS = 5  # planes of a rendered image: red, green, blue, accumulated depth (m), alpha
 
+# Constants of gsplat, see above; the near plane NEAR_M (m) is our own choice.
 BLUR_PX2 = 0.3
 ALPHA_MAX = 0.999
 ALPHA_MIN = 1.0 / 255.0
-STOP = 1e-4
+MIN_TRANSMITTANCE = 1e-4
 NEAR_M = 0.05
 LOG2_ALPHA_MIN = math.log2(ALPHA_MIN)
 LOG2_ALPHA_MAX = math.log2(ALPHA_MAX)
 
-TILE_W, TILE_H = 8, 32
+TILE_W, TILE_H = 8, 32  # pixels
 TILE_PIXELS = TILE_W * TILE_H
 ROWS = LANES // TILE_W  # image rows in one vector
-RECORD = 16  # floats of a projected splat: x y A B C log2(opacity) r g b z, and what binning needs
-SLOT = 16  # a cache line: sums of one (splat, tile) pair: v vx vy vxx | vxy vyy wr wg | wb wz w | -
-CHUNKS = 16  # parts of the depth order that are projected and binned on their own, whatever the threads
+RECORD = 16  # floats per projected splat: x y A B C log2(opacity) r g b z, and six values for binning
+SLOT = 16  # floats, a cache line: sums of one (splat, tile) pair: v vx vy vxx | vxy vyy wr wg | wb wz w | -
+BATCHES = 16  # splats are processed in so many batches, independent of the number of threads: same results

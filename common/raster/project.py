@@ -1,6 +1,8 @@
-"""Gaussians on the screen: projection of `LANES` at a time, and the tiles that each one touches.
+"""Projection of Gaussians to splats on the image, and the list of tiles that each splat overlaps.
 
-EWA splatting (Zwicker et al. 2001) as in 3DGS: V = J R_camera_map R_q diag(s), covariance V V^T + blur.
+EWA splatting (Zwicker et al. 2001) as in 3DGS: V = J R_camera_map R_q diag(s), covariance V V^T + blur. The
+kernels process `LANES` Gaussians at a time; `c` is the camera of `RasterCamera.packed`, matrices are tuples
+of vectors by rows.
 """
 
 from __future__ import annotations
@@ -8,10 +10,10 @@ from __future__ import annotations
 import numpy as np
 
 from beamsplat.common.compiled import inner, kernel
-from beamsplat.common.raster.lanes import LOG2_E, exp_lanes, log2_lanes, sigmoid_lanes
+from beamsplat.common.raster.culling import sort_by_depth
 from beamsplat.common.raster.layout import (
+    BATCHES,
     BLUR_PX2,
-    CHUNKS,
     COLOUR,
     OPACITY,
     QUAT,
@@ -21,9 +23,9 @@ from beamsplat.common.raster.layout import (
     TILE_H,
     TILE_W,
 )
-from beamsplat.common.raster.simd import LANES, fma, larger, root, smaller
+from beamsplat.common.raster.simd import LANES, fma, maximum, minimum, sqrt
+from beamsplat.common.raster.simd_math import LOG2_E, exp_lanes, log2_lanes, sigmoid_lanes
 from beamsplat.common.raster.simd_memory import aligned_floats, atomic_next, gather, store
-from beamsplat.common.raster.visible import sort_by_depth
 
 _LN_255 = float(np.log(255.0))
 _SHIFT_W, _SHIFT_H = TILE_W.bit_length() - 1, TILE_H.bit_length() - 1
@@ -31,7 +33,7 @@ _SHIFT_W, _SHIFT_H = TILE_W.bit_length() - 1, TILE_H.bit_length() - 1
 
 @inner
 def camera_point(params, stride, index, at, c):  # noqa: ANN001, ANN201
-    """Centres of Gaussians index[at...] in the camera frame: three vectors."""
+    """Return the centres of Gaussians index[at...] in the camera frame (m): three vectors x, y, z."""
     x, y, z = (
         gather(params, 0, index, at),
         gather(params, stride, index, at),
@@ -45,10 +47,10 @@ def camera_point(params, stride, index, at, c):  # noqa: ANN001, ANN201
 
 @inner
 def rotation(params, stride, index, at):  # noqa: ANN001, ANN201
-    """Unit quaternion (w x y z) of Gaussians index[at...], 1/length of the raw one, and R by rows."""
+    """Return (unit quaternion w x y z, 1 / stored norm) and R by rows, of Gaussians index[at...]."""
     w, x = gather(params, QUAT * stride, index, at), gather(params, (QUAT + 1) * stride, index, at)
     y, z = gather(params, (QUAT + 2) * stride, index, at), gather(params, (QUAT + 3) * stride, index, at)
-    n = 1.0 / root(larger(w * w + x * x + y * y + z * z, 1e-24))
+    n = 1.0 / sqrt(maximum(w * w + x * x + y * y + z * z, 1e-24))
     w, x, y, z = w * n, x * n, y * n, z * n
     q = (w, x, y, z, n)
     R = (
@@ -61,7 +63,7 @@ def rotation(params, stride, index, at):  # noqa: ANN001, ANN201
 
 @inner
 def axes(params, stride, index, at, c, R):  # noqa: ANN001, ANN201
-    """M = R_camera_map R_q diag(s), nine vectors by rows, and the three scales (metres)."""
+    """Return M = R_camera_map R_q diag(s), nine vectors by rows, and the three scales s (m)."""
     s0 = exp_lanes(gather(params, SCALE * stride, index, at))
     s1 = exp_lanes(gather(params, (SCALE + 1) * stride, index, at))
     s2 = exp_lanes(gather(params, (SCALE + 2) * stride, index, at))
@@ -81,10 +83,13 @@ def axes(params, stride, index, at, c, R):  # noqa: ANN001, ANN201
 
 @inner
 def screen_covariance(M, xc, yc, zc, c):  # noqa: ANN001, ANN201
-    """V = J M (rows V0, V1), the covariance (a, b, d) in px^2 with blur, and what J was made of."""
+    """Return the rows V0, V1 of V = J M, the covariance (a, b, d) in px^2 with blur, and the terms of J.
+
+    The terms of J are (1/z, x/z and y/z clamped to the slope limits, J00, J02, J11, J12).
+    """
     inverse = 1.0 / zc
-    ux = smaller(larger(xc * inverse, c[16]), c[17])
-    uy = smaller(larger(yc * inverse, c[18]), c[19])
+    ux = minimum(maximum(xc * inverse, c[16]), c[17])
+    uy = minimum(maximum(yc * inverse, c[18]), c[19])
     j00, j02 = inverse * c[12], -(ux * inverse) * c[12]
     j11, j12 = inverse * c[13], -(uy * inverse) * c[13]
     V0 = (fma(j00, M[0], j02 * M[6]), fma(j00, M[1], j02 * M[7]), fma(j00, M[2], j02 * M[8]))
@@ -97,14 +102,14 @@ def screen_covariance(M, xc, yc, zc, c):  # noqa: ANN001, ANN201
 
 @kernel
 def _write_records(params, stride, index, first, c, records, lanes):  # noqa: ANN001, ANN202
-    """Projects Gaussians index[first ... first + LANES) into records[first * RECORD ...]."""
+    """Project Gaussians index[first ... first + LANES) to their records at records[first * RECORD ...]."""
     xc, yc, zc = camera_point(params, stride, index, first, c)
     _, R = rotation(params, stride, index, first)
     M, _ = axes(params, stride, index, first, c, R)
     _, _, cov, _ = screen_covariance(M, xc, yc, zc, c)
     inverse = 1.0 / zc
-    k = 1.0 / larger(cov[0] * cov[2] - cov[1] * cov[1], 1e-12)
-    log_opacity = log2_lanes(larger(sigmoid_lanes(gather(params, OPACITY * stride, index, first)), 1e-30))
+    k = 1.0 / maximum(cov[0] * cov[2] - cov[1] * cov[1], 1e-12)
+    log_opacity = log2_lanes(maximum(sigmoid_lanes(gather(params, OPACITY * stride, index, first)), 1e-30))
     reach = 2.0 * fma(log_opacity, 1.0 / LOG2_E, _LN_255)  # d^T cov^-1 d of the ellipse where alpha is 1/255
     store(lanes, 0, fma(xc * inverse, c[12], c[14]))
     store(lanes, LANES, fma(yc * inverse, c[13], c[15]))
@@ -117,10 +122,10 @@ def _write_records(params, stride, index, first, c, records, lanes):  # noqa: AN
     store(lanes, 8 * LANES, gather(params, (COLOUR + 2) * stride, index, first))
     store(lanes, 9 * LANES, zc)
     store(lanes, 10 * LANES, reach)
-    store(lanes, 11 * LANES, root(larger(reach * cov[0], 0.0)))  # half width of the ellipse
-    store(lanes, 12 * LANES, root(larger(reach * cov[2], 0.0)))  # half height
-    store(lanes, 13 * LANES, root(larger(reach / cov[2], 0.0)) * cov[1])  # x of its top point
-    # B^2 - 4 A C, and 4 C level with level = -log2(e) reach / 2: what the ellipse's arcs need.
+    store(lanes, 11 * LANES, sqrt(maximum(reach * cov[0], 0.0)))  # half width of the ellipse
+    store(lanes, 12 * LANES, sqrt(maximum(reach * cov[2], 0.0)))  # half height
+    store(lanes, 13 * LANES, sqrt(maximum(reach / cov[2], 0.0)) * cov[1])  # x of its top point
+    # B^2 - 4 A C, and 4 C level with level = -log2(e) reach / 2: terms of the ellipse equation in `_emit`.
     store(lanes, 14 * LANES, -(k * (LOG2_E * LOG2_E)))
     store(lanes, 15 * LANES, cov[0] * k * reach * (LOG2_E * LOG2_E))
     for lane in range(LANES):
@@ -133,18 +138,19 @@ def _write_records(params, stride, index, first, c, records, lanes):  # noqa: AN
 def _emit(  # noqa: ANN202
     begin, stop, records, width, height, tiles_x, first_pair, pair_count, tiles, rows, at, limit,  # noqa: ANN001
 ):  # fmt: skip
-    """Writes (tile, first and last vector of rows) of splats begin ... stop behind `at`; gives the new end.
+    """Write the (tile, rows) pairs of splats begin ... stop from index `at` on, and return the end index.
 
-    The coverage is exact per column of tiles: the ellipse's largest and smallest y over its eight pixels,
-    y = (-B x -+ sqrt(B^2 x^2 - 4 C (A x^2 - level))) / 2 C. Beyond `limit` pairs are counted only.
-    A loop over splats, not a function of one: each call counts references to its arrays, atomically.
+    `rows` holds the first and the last vector of rows that the splat overlaps in the tile. The overlap is
+    exact per column of tiles: the minimum and maximum y of the ellipse over the column's eight pixels,
+    y = (-B x -+ sqrt(B^2 x^2 - 4 C (A x^2 - level))) / 2 C. From index `limit` on, pairs are only counted.
+    The loop over splats is in here because each call costs atomic reference counting of the arrays.
     """
     zero, right_edge, bottom = np.float32(0.0), np.float32(width - 1), np.float32(height - 1)
     slack = np.float32(1e-3)
     for splat in range(begin, stop):
         first_pair[splat] = at
         record = splat * RECORD
-        if not records[record + 10] > 0.0:  # fainter than 1/255 at its centre, or not a number
+        if not records[record + 10] > 0.0:  # alpha below 1/255 at the centre, or NaN
             pair_count[splat] = 0
             continue
         x, y, half_w, half_h = (
@@ -195,33 +201,34 @@ def project_and_emit(  # noqa: ANN201
     records, first_pair, pair_count, tiles, rows, emitted,  # noqa: ANN001
     depth, order, keys, keys_other, order_other,  # noqa: ANN001
 ):  # fmt: skip
-    """Projects the visible Gaussians and lists their pairs with tiles, in parts; one thread sorts by depth.
+    """Project the visible Gaussians in batches and list their (splat, tile) pairs; one thread sorts by depth.
 
-    `tiles` and `rows` are int32 [CHUNKS * capacity]; `emitted` [CHUNKS] tells how many pairs a part wanted to
-    write: more than the capacity means that the caller must make room and call again. The pairs of splat i
-    are first_pair[i] ... + pair_count[i]. The other arguments are those of `sort_by_depth`.
+    `tiles` and `rows` are int32 [BATCHES * capacity]; `emitted` [BATCHES] is the number of pairs of each
+    batch. If it exceeds the capacity, the caller must enlarge the arrays and call again. The pairs of splat
+    i are first_pair[i] ... first_pair[i] + pair_count[i]. The last five arguments are those of
+    `sort_by_depth`.
     """
     lanes = aligned_floats(RECORD * LANES)
-    size, capacity = chunk_size(visible), len(rows) // CHUNKS
+    size, capacity = batch_size(visible), len(rows) // BATCHES
     while True:
-        chunk = atomic_next(counter, 0) - 1
-        if chunk >= CHUNKS:
+        batch = atomic_next(counter, 0) - 1
+        if batch >= BATCHES:
             return
-        if chunk < 0:
+        if batch < 0:
             sort_by_depth(depth, visible, order, keys, keys_other, order_other)
             continue
-        at, limit = chunk * capacity, (chunk + 1) * capacity
-        start, stop = chunk * size, min(visible, (chunk + 1) * size)
+        at, limit = batch * capacity, (batch + 1) * capacity
+        start, stop = batch * size, min(visible, (batch + 1) * size)
         for group in range(start, stop, LANES):
             _write_records(params, stride, index, group, camera, records, lanes)
             at = _emit(
                 group, min(group + LANES, stop), records, width, height, tiles_x, first_pair, pair_count,
                 tiles, rows, at, limit,
             )  # fmt: skip
-        emitted[chunk] = at - chunk * capacity
+        emitted[batch] = at - batch * capacity
 
 
 @inner
-def chunk_size(visible):  # noqa: ANN001, ANN201
-    """Splats in one part: a multiple of LANES, so that parts do not write into each other's records."""
-    return ((visible + CHUNKS - 1) // CHUNKS + LANES - 1) // LANES * LANES
+def batch_size(visible):  # noqa: ANN001, ANN201
+    """Return the number of splats per batch: a multiple of LANES, so that batches write separate records."""
+    return ((visible + BATCHES - 1) // BATCHES + LANES - 1) // LANES * LANES

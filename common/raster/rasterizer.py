@@ -1,11 +1,11 @@
-"""The CPU rasterizer on arrays: `render` a picture, then `backward` from the gradient of a loss.
+"""The CPU rasterizer on arrays: `render` an image, then `backward` from the gradient of a loss.
 
-    pictures = Rasterizer(threads=2)
-    render = pictures.render(params, count, camera, T_camera_map)     # params float32 [14, capacity]
-    gradients = pictures.backward(render, dL_dimage)                  # dL_dimage float32 [5, H, W]
-    pictures.release(render)
+    rasterizer = Rasterizer(threads=2)
+    render = rasterizer.render(params, count, camera, T_camera_map)     # params float32 [14, capacity]
+    gradients = rasterizer.backward(render, dL_dimage)                  # dL_dimage float32 [5, H, W]
+    rasterizer.release(render)
 
-Memory comes from a pool and belongs to a render until it is released: several may be alive at once.
+Each render uses a workspace from a pool until it is released, so several renders can exist at the same time.
 """
 
 from __future__ import annotations
@@ -14,26 +14,26 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from beamsplat.common.raster.bins import count as count_pairs
-from beamsplat.common.raster.bins import place, scatter
+from beamsplat.common.raster.bins import count_pairs, prefix_sum, scatter
 from beamsplat.common.raster.camera import RasterCamera
-from beamsplat.common.raster.chain import chain
-from beamsplat.common.raster.layout import CHANNELS, CHUNKS, GRADIENTS, PARAMS, RECORD, SLOT, TILE_H, TILE_W
+from beamsplat.common.raster.culling import BLOCK, compact, cull
+from beamsplat.common.raster.layout import BATCHES, CHANNELS, GRADIENTS, PARAMS, RECORD, SLOT, TILE_H, TILE_W
 from beamsplat.common.raster.project import project_and_emit
+from beamsplat.common.raster.project_backward import project_backward
 from beamsplat.common.raster.simd import LANES
-from beamsplat.common.raster.threads import Team
+from beamsplat.common.raster.threads import ThreadTeam
 from beamsplat.common.raster.tiles import backward_tiles, forward_tiles
-from beamsplat.common.raster.visible import BLOCK, compact, cull
 
 
 class Workspace:
-    """Arrays of one render by name; grown when needed, never shrunk. Fresh pages cost more than the work."""
+    """Reusable arrays of one render, by name. They grow when needed and never shrink: page faults of newly
+    allocated memory take longer than the rendering itself."""
 
     def __init__(self) -> None:
         self._arrays: dict[str, np.ndarray] = {}
 
     def take(self, name: str, shape: tuple[int, ...], dtype: type = np.float32) -> np.ndarray:
-        """A C-contiguous array of this shape, with whatever it held before."""
+        """Return a C-contiguous array of this shape; its content is undefined."""
         size = int(np.prod(shape))
         held = self._arrays.get(name)
         if held is None or held.size < size or held.dtype != dtype:
@@ -42,12 +42,12 @@ class Workspace:
         return held[:size].reshape(shape)
 
     @property
-    def held_bytes(self) -> int:
+    def allocated_bytes(self) -> int:
         return sum(array.nbytes for array in self._arrays.values())
 
 
 def _aligned(size: int, dtype: type) -> np.ndarray:
-    """Uninitialised [size] on a cache line's boundary."""
+    """Return an uninitialised array [size] that is aligned to a cache line (64 bytes)."""
     item = np.dtype(dtype).itemsize
     raw = np.empty(size * item + 64, np.uint8)
     skip = -raw.ctypes.data % 64
@@ -55,37 +55,37 @@ def _aligned(size: int, dtype: type) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class Tables:
-    """What binning made of a scene: memory of one workspace."""
+class TileLists:
+    """Projected splats and their lists per tile; V = visible Gaussians. The memory belongs to a workspace."""
 
     index: np.ndarray  # int32 [>= V]: Gaussian of each visible splat, ascending
-    records: np.ndarray  # float32 [V * RECORD]: splats on the screen
-    first_pair: np.ndarray  # int32 [V]
-    pair_count: np.ndarray  # int32 [V]
-    places: np.ndarray  # int32: row in `lists` of each pair
-    lists: np.ndarray  # int32 [pairs, 2]: (splat, rows) tile by tile, nearest first
-    tile_start: np.ndarray  # int64 [tiles + 1]
+    records: np.ndarray  # float32 [V * RECORD]: splats projected to the image
+    first_pair: np.ndarray  # int32 [V]: first (splat, tile) pair of each splat
+    pair_count: np.ndarray  # int32 [V]: number of its pairs
+    list_row: np.ndarray  # int32: row in `lists` of each pair
+    lists: np.ndarray  # int32 [pairs + 1, 2]: (splat, rows) tile by tile, nearest first in each tile
+    tile_start: np.ndarray  # int64 [tiles + 1]: first row in `lists` of each tile
 
 
 @dataclass
 class Render:
-    """A picture and all that its gradient needs. Valid until released."""
+    """A rendered image, with the data for its gradient. The arrays are valid until the render is released."""
 
     image: np.ndarray  # float32 [5, H, W]: red, green, blue, accumulated depth (m), alpha
-    index: np.ndarray  # int32 [V]: Gaussians that may be seen, ascending
+    index: np.ndarray  # int32 [V]: Gaussians in the view frustum, ascending
     params: np.ndarray
     camera: np.ndarray
     background: np.ndarray
     workspace: Workspace
-    tables: Tables
+    tables: TileLists
 
     @property
     def pairs(self) -> int:
-        """(splat, tile) pairs blended."""
+        """Number of (splat, tile) pairs."""
         return len(self.tables.lists) - 1
 
     def expected_depth(self) -> np.ndarray:
-        """float32 [H, W] metres: accumulated depth over alpha, NaN where alpha is below 1e-3."""
+        """Return the expected depth float32 [H, W] (m): accumulated depth / alpha, NaN for alpha <= 1e-3."""
         alpha = self.image[4]
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.where(alpha > 1e-3, self.image[3] / alpha, np.float32(np.nan))
@@ -93,26 +93,26 @@ class Render:
 
 @dataclass
 class Gradients:
-    """dL/d(parameters) of visible Gaussians. `by_splat` is the render's memory: copy what must outlive it."""
+    """dL/d(parameters) of the visible Gaussians. `by_splat` is memory of the render, valid until release."""
 
-    by_splat: np.ndarray  # float32 [GRADIENTS, >= V]: rows as in layout, one column a visible Gaussian
-    index: np.ndarray  # int32 [V]: which Gaussian a column belongs to, ascending
+    by_splat: np.ndarray  # float32 [GRADIENTS, >= V]: rows as in layout, one column per visible Gaussian
+    index: np.ndarray  # int32 [V]: Gaussian of each column, ascending
     pose: np.ndarray  # float64 [6]: (rho, phi), left perturbation of T_camera_map
 
     def dense(self, count: int) -> np.ndarray:
-        """float32 [GRADIENTS, count], zero where nothing was seen."""
+        """Return the gradients of all Gaussians, float32 [GRADIENTS, count]; zero for invisible ones."""
         out = np.zeros((GRADIENTS, count), np.float32)
         out[:, self.index] = self.by_splat[:, : len(self.index)]
         return out
 
 
 class Rasterizer:
-    """Kernels, threads and the pool of workspaces."""
+    """Differentiable CPU rasterizer with its threads and its pool of workspaces."""
 
     def __init__(self, threads: int = 1) -> None:
-        self.team = Team(threads)
+        self.team = ThreadTeam(threads)
         self._pool: list[Workspace] = []
-        self._capacity = 4096  # pairs of one part of the depth order; grows with the scenes seen
+        self._capacity = 4096  # (splat, tile) pairs per batch of splats; grows as scenes need it
 
     def render(
         self,
@@ -122,10 +122,10 @@ class Rasterizer:
         T_camera_map: np.ndarray,
         background: np.ndarray | None = None,  # float32 [3], default black
     ) -> Render:
-        """Renders the first `count` Gaussians.
+        """Render the first `count` Gaussians of `params`.
 
         Raises:
-            ValueError: the arrays are not as stated.
+            ValueError: an array has another shape or dtype, or the pose is not finite.
         """
         stride = _check_params(params, count)
         packed = camera.packed(T_camera_map)
@@ -144,7 +144,10 @@ class Rasterizer:
         return Render(image, seen[0][: seen[2]], params, packed, background, work, tables)
 
     def backward(self, render: Render, gradient: np.ndarray) -> Gradients:
-        """Gradients of a loss, given dL/d(image) float32 [5, H, W]. May be called again for another loss."""
+        """Return the gradients of a loss from dL/d(image) float32 [5, H, W].
+
+        It can be called several times on one render; each call overwrites `by_splat` of the previous one.
+        """
         if gradient.shape != render.image.shape or gradient.dtype != np.float32:
             raise ValueError(
                 f"the gradient must be float32 {list(render.image.shape)}, "
@@ -158,24 +161,24 @@ class Rasterizer:
             render.image, gradient, slots,
         )  # fmt: skip
         out = work.take("gradients", (GRADIENTS, -(-max(visible, 1) // LANES) * LANES))
-        pose_sums = np.zeros((CHUNKS, 6))
+        pose_sums = np.zeros((BATCHES, 6))
         self.team.run(
-            chain, render.params.reshape(-1), render.params.shape[1], tables.index, visible, render.camera,
-            slots, tables.places, tables.first_pair, tables.pair_count, out, pose_sums,
+            project_backward, render.params.reshape(-1), render.params.shape[1], tables.index, visible,
+            render.camera, slots, tables.list_row, tables.first_pair, tables.pair_count, out, pose_sums,
         )  # fmt: skip
         return Gradients(out, render.index, pose_sums.sum(axis=0))
 
     def release(self, render: Render) -> None:
-        """Gives the render's memory back; its arrays may change from now on."""
+        """Return the workspace of a render to the pool; its arrays must not be used any more."""
         self._pool.append(render.workspace)
 
     @property
-    def held_bytes(self) -> int:
-        """What the pool holds on to; renders that are not released do not count."""
-        return sum(work.held_bytes for work in self._pool)
+    def allocated_bytes(self) -> int:
+        """Memory of the workspaces in the pool, without those of renders that are not released."""
+        return sum(work.allocated_bytes for work in self._pool)
 
     def close(self) -> None:
-        """Ends the threads."""
+        """Stop the threads."""
         self.team.close()
 
     def _visible(
@@ -190,7 +193,7 @@ class Rasterizer:
     def _bin(
         self, work: Workspace, flat: np.ndarray, stride: int, seen: tuple[np.ndarray, np.ndarray, int],
         packed: np.ndarray, camera: RasterCamera,
-    ) -> Tables:  # fmt: skip
+    ) -> TileLists:  # fmt: skip
         index, depth, visible = seen
         width, height = camera.width_px, camera.height_px
         tiles_x, tiles_y = -(-width // TILE_W), -(-height // TILE_H)
@@ -199,10 +202,10 @@ class Rasterizer:
         pair_count = work.take("pair_count", (visible,), np.int32)
         order, order_other = (work.take(name, (visible,), np.int32) for name in ("order", "order_other"))
         keys, keys_other = (work.take(name, (visible,), np.uint32) for name in ("keys", "keys_other"))
-        emitted = np.zeros(CHUNKS, np.int64)
+        emitted = np.zeros(BATCHES, np.int64)
         while True:
-            tiles = work.take("tiles", (CHUNKS * self._capacity + 64,), np.int32)
-            rows = work.take("rows", (CHUNKS * self._capacity,), np.int32)
+            tiles = work.take("tiles", (BATCHES * self._capacity + 64,), np.int32)
+            rows = work.take("rows", (BATCHES * self._capacity,), np.int32)
             self.team.run(
                 project_and_emit, flat, stride, index, visible, packed, width, height, tiles_x,
                 records, first_pair, pair_count, tiles, rows, emitted,
@@ -212,12 +215,12 @@ class Rasterizer:
             if most <= self._capacity:
                 break
             self._capacity = most + most // 2
-        per_tile = work.take("per_tile", (CHUNKS, tiles_x * tiles_y), np.int32)
+        per_tile = work.take("per_tile", (BATCHES, tiles_x * tiles_y), np.int32)
         tile_start = work.take("tile_start", (tiles_x * tiles_y + 1,), np.int64)
         self.team.run(count_pairs, visible, order, first_pair, pair_count, tiles, per_tile)
-        lists = work.take("lists", (int(place(per_tile, tile_start)) + 1, 2), np.int32)
+        lists = work.take("lists", (int(prefix_sum(per_tile, tile_start)) + 1, 2), np.int32)
         self.team.run(scatter, visible, order, first_pair, pair_count, tiles, rows, per_tile, lists)
-        return Tables(index, records, first_pair, pair_count, tiles, lists, tile_start)
+        return TileLists(index, records, first_pair, pair_count, tiles, lists, tile_start)
 
 
 def _check_params(params: np.ndarray, count: int) -> int:

@@ -1,9 +1,9 @@
-"""Vectors of float32 lanes as a Numba type, so that kernels say what LLVM's vectoriser would have to guess.
+"""SIMD vectors of float32 as a Numba type: kernels are vectorised explicitly, without LLVM's auto-vectoriser.
 
-`F32` is `LANES` floats in one register (16 with AVX-512, else 8: two SSE or NEON registers), `Mask` one bit
-a lane. Both live in local variables only; arrays hold plain float32. Operators work lane by lane; a scalar
-beside a vector is repeated. LLVM lowers the vectors to whatever the host has, so one source serves all.
-Only `contract` (fused multiply-add) is allowed of the fast-math liberties: results repeat bit for bit.
+`F32` is a vector of `LANES` floats (16 with AVX-512, else 8: two SSE or NEON registers), `Mask` has one bit
+per lane. Both are types of local variables only; arrays hold plain float32. Operators work lane by lane,
+scalar operands are broadcast. LLVM maps the vectors to the instructions of the host, so one source runs on
+all CPUs. The only fast-math flag is `contract` (fused multiply-add): results are reproducible bit by bit.
 """
 
 from __future__ import annotations
@@ -134,21 +134,21 @@ def _and(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
 
 
 @intrinsic
-def repeat(typingctx: Any, value: types.Float) -> Any:
-    """The scalar in all lanes."""
+def broadcast(typingctx: Any, value: types.Float) -> Any:
+    """Return a vector with the scalar in all lanes."""
     return F32(types.float32), lambda context, builder, sig, args: _repeat(builder, args[0])
 
 
 @intrinsic
 def iota(typingctx: Any) -> Any:
-    """0, 1, 2, ..."""
+    """Return the vector (0, 1, 2, ...)."""
     lanes = ir.Constant(VEC, [float(i) for i in range(LANES)])
     return F32(), lambda context, builder, sig, args: lanes
 
 
 @intrinsic
 def where(typingctx: Any, mask: _MaskType, yes: types.Type, no: types.Type) -> Any:
-    """yes where the mask is set, no elsewhere."""
+    """Return `yes` where the mask is set, `no` elsewhere."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
         return builder.select(args[0], _as_vector(builder, args[1]), _as_vector(builder, args[2]))
@@ -196,20 +196,20 @@ def _reciprocal(builder: ir.IRBuilder, v: ir.Value) -> ir.Value:
 
 
 fma = _lane_function(lambda builder, a, b, c: _call(builder, "fmuladd", a, b, c), 3)
-smaller = _lane_function(lambda builder, a, b: builder.select(builder.fcmp_ordered("<", a, b), a, b), 2)
-larger = _lane_function(lambda builder, a, b: builder.select(builder.fcmp_ordered(">", a, b), a, b), 2)
-root = _lane_function(lambda builder, a: _call(builder, "sqrt", a), 1)
+minimum = _lane_function(lambda builder, a, b: builder.select(builder.fcmp_ordered("<", a, b), a, b), 2)
+maximum = _lane_function(lambda builder, a, b: builder.select(builder.fcmp_ordered(">", a, b), a, b), 2)
+sqrt = _lane_function(lambda builder, a: _call(builder, "sqrt", a), 1)
 floor = _lane_function(lambda builder, a: _call(builder, "floor", a), 1)
-magnitude = _lane_function(lambda builder, a: _call(builder, "fabs", a), 1)
+absolute = _lane_function(lambda builder, a: _call(builder, "fabs", a), 1)
 exp2_scale = _lane_function(_exp2_scale, 2)  # value * 2**n, n in the low bits of shifted = n + 1.5 * 2**23
-reciprocal = _lane_function(_reciprocal, 1)  # 1/v to 1e-7; not for zero or infinity
+reciprocal = _lane_function(_reciprocal, 1)  # 1/v with error 1e-7; undefined for zero and infinity
 mantissa = _lane_function(_mantissa, 1)  # in [1, 2), of positive normal numbers
-exponent = _lane_function(_exponent, 1)  # floor(log2), of positive normal numbers
+exponent = _lane_function(_exponent, 1)  # floor(log2(v)) of positive normal numbers
 
 
 @intrinsic
 def any_lane(typingctx: Any, mask: _MaskType) -> Any:
-    """Whether any lane of the mask is set."""
+    """Return whether any lane of the mask is set."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
         bits = builder.bitcast(args[0], ir.IntType(LANES))

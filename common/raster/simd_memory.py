@@ -1,4 +1,4 @@
-"""Vectors of lanes and memory: load, store, gather, scatter, prefetch, atomic counters, sums over lanes."""
+"""Memory operations on SIMD vectors (load, store, gather, scatter, sums, prefetch) and an atomic counter."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from beamsplat.common.raster.simd import F32, FLOAT, INT, IVEC, LANES, MASK, VEC
 
 @njit(nogil=True, error_model="numpy")
 def aligned_floats(count: int) -> np.ndarray:
-    """Uninitialised float32 [count] on a 64 byte boundary: vectors that straddle cache lines cost double."""
+    """Return an uninitialised float32 [count] aligned to 64 bytes: no vector access crosses a cache line."""
     raw = np.empty(count + 16, np.float32)
     skip = (64 - raw.ctypes.data % 64) % 64 // 4
     return raw[skip : skip + count]
@@ -36,7 +36,7 @@ def _aligned_load(builder: ir.IRBuilder, pointer: ir.Value, kind: ir.Type) -> ir
 
 @intrinsic
 def load(typingctx: Any, array: types.Array, at: types.Integer) -> Any:
-    """Lanes array[at], array[at + 1], ... of a contiguous float32 array; no bounds are checked."""
+    """Return the vector (array[at], array[at + 1], ...) of a contiguous float32 array, unchecked."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
         return _aligned_load(builder, _address(context, builder, sig.args[0], args[0], args[1]), VEC)
@@ -46,7 +46,7 @@ def load(typingctx: Any, array: types.Array, at: types.Integer) -> Any:
 
 @intrinsic
 def store(typingctx: Any, array: types.Array, at: types.Integer, value: F32Type) -> Any:
-    """Writes the lanes to array[at], array[at + 1], ...; no bounds are checked."""
+    """Write a vector to array[at], array[at + 1], ..., without bounds check."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
         pointer = _address(context, builder, sig.args[0], args[0], args[1])
@@ -57,7 +57,7 @@ def store(typingctx: Any, array: types.Array, at: types.Integer, value: F32Type)
 
 
 def _scattered(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
-    """Pointers to array[base + index[at + lane]], from the arguments (array, base, index, at, ...)."""
+    """Return pointers to array[base + index[at + lane]], from the arguments (array, base, index, at, ...)."""
     lanes = _aligned_load(builder, _address(context, builder, sig.args[2], args[2], args[3]), IVEC)
     start = _address(context, builder, sig.args[0], args[0], args[1])
     pointers = builder.gep(start, [lanes], inbounds=False, source_etype=FLOAT)
@@ -70,7 +70,7 @@ def _scattered(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.V
 def gather(
     typingctx: Any, array: types.Array, base: types.Integer, index: types.Array, at: types.Integer
 ) -> Any:
-    """Lanes array[base + index[at]], array[base + index[at + 1]], ...; `index` is contiguous int32."""
+    """Return the vector of array[base + index[at + lane]]; `index` is contiguous int32."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
         pointers = _scattered(context, builder, sig, args)
@@ -89,7 +89,7 @@ def scatter_some(
     typingctx: Any, array: types.Array, base: types.Integer, index: types.Array, at: types.Integer,
     value: F32Type, count: types.Integer,
 ) -> Any:  # fmt: skip
-    """array[base + index[at + lane]] = value for the first `count` lanes; `index` is contiguous int32."""
+    """Write the first `count` lanes of a vector to array[base + index[at + lane]]; `index` is int32."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
         pointers = _scattered(context, builder, sig, args)
@@ -110,7 +110,7 @@ def scatter_some(
 
 @intrinsic
 def prefetch(typingctx: Any, array: types.Array, at: types.Integer) -> Any:
-    """Asks for the cache line of array[at] ahead of time."""
+    """Prefetch the cache line of array[at]."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
         pointer = _address(context, builder, sig.args[0], args[0], args[1])
@@ -124,7 +124,7 @@ def prefetch(typingctx: Any, array: types.Array, at: types.Integer) -> Any:
 
 @intrinsic
 def atomic_next(typingctx: Any, counter: types.Array, at: types.Integer) -> Any:
-    """counter[at] += 1 for all threads at once; gives the value before. int64 array."""
+    """Atomically increment counter[at] of an int64 array, and return the value before."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
         pointer = _address(context, builder, sig.args[0], args[0], args[1])
@@ -135,7 +135,7 @@ def atomic_next(typingctx: Any, counter: types.Array, at: types.Integer) -> Any:
 
 @intrinsic
 def store_sums4(typingctx: Any, array: types.Array, at: types.Integer, a: Any, b: Any, c: Any, d: Any) -> Any:
-    """array[at : at + 4] = the sums over all lanes of a, b, c and d: four horizontal sums by one tree."""
+    """Write the sums over all lanes of a, b, c and d to array[at : at + 4], by one tree of additions."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
         quads = range(0, LANES, 4)

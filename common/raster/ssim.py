@@ -1,6 +1,6 @@
-"""SSIM (Wang et al. 2004): as a loss on luma with its gradient, and as a figure on RGB.
+"""SSIM (Wang et al. 2004): a loss on luma with its gradient, and a metric on RGB.
 
-Window: 11 x 11 Gaussian of sigma 1.5, zero outside the picture, as 3DGS uses it.
+The window is an 11 x 11 Gaussian with sigma 1.5 px, the image is zero-padded, as in 3DGS.
 """
 
 from __future__ import annotations
@@ -10,20 +10,20 @@ import numpy as np
 
 from beamsplat.common.compiled import inner, kernel
 from beamsplat.common.raster.simd_memory import atomic_next
-from beamsplat.common.raster.threads import Team
+from beamsplat.common.raster.threads import ThreadTeam
 
-C1, C2 = 0.01**2, 0.03**2
-_RADIUS = 5
+C1, C2 = 0.01**2, 0.03**2  # Wang et al. 2004, for values in [0, 1]
+_RADIUS = 5  # px
 _TAPS = np.exp(-0.5 * (np.arange(-_RADIUS, _RADIUS + 1) / 1.5) ** 2)
 TAPS = (_TAPS / _TAPS.sum()).astype(np.float32)
-LUMA = (np.float32(0.299), np.float32(0.587), np.float32(0.114))
-_BAND = 16  # rows that one thread takes at a time
-_PAD = 8
+LUMA = (np.float32(0.299), np.float32(0.587), np.float32(0.114))  # weights of R, G, B: ITU-R BT.601
+_BAND = 16  # rows per unit of work of a thread
+_PAD = 8  # zeros at both ends of a row, at least _RADIUS
 
 
 @inner
-def _blur_row(source, y, out, taps):  # noqa: ANN001, ANN202
-    """out[pad + x] = source blurred down the columns at row y (zero outside)."""
+def _blur_columns(source, y, out, taps):  # noqa: ANN001, ANN202
+    """Blur `source` along its columns at row y (zero outside), into out[_PAD + x]."""
     height, width = source.shape
     for x in range(width):
         out[_PAD + x] = np.float32(0.0)
@@ -34,8 +34,8 @@ def _blur_row(source, y, out, taps):  # noqa: ANN001, ANN202
 
 
 @inner
-def _across(padded, out, taps):  # noqa: ANN001, ANN202
-    """out[x] = blurred along the row; `padded` has zeros at both ends."""
+def _blur_along_row(padded, out, taps):  # noqa: ANN001, ANN202
+    """Blur `padded`, a row with `_PAD` zeros at both ends, into out[x]."""
     for x in range(len(out)):
         out[x] = np.float32(0.0)
     for k in range(2 * _RADIUS + 1):
@@ -46,7 +46,7 @@ def _across(padded, out, taps):  # noqa: ANN001, ANN202
 
 @kernel
 def _prepare(counter, image, rgb, planes):  # noqa: ANN001, ANN202
-    """planes: x, y, xx, yy, xy of the luma of the rendered and the true picture."""
+    """Fill the planes x, y, xx, yy, xy; x, y = luma of the rendered and the true image (`rgb`, 0 to 255)."""
     height = image.shape[1]
     unit = np.float32(1.0 / 255.0)
     while True:
@@ -62,7 +62,7 @@ def _prepare(counter, image, rgb, planes):  # noqa: ANN001, ANN202
 
 @kernel
 def _partials(counter, planes, taps, partials, sums):  # noqa: ANN001, ANN202
-    """dSSIM/d(mean x, mean xx, mean xy) at every pixel, and the rows' sums of SSIM."""
+    """Compute dSSIM/d(mean x, mean xx, mean xy) at each pixel, and the sum of SSIM over each row."""
     height, width = planes.shape[1], planes.shape[2]
     padded = np.zeros(width + 2 * _PAD, np.float32)
     m = np.empty((5, width), np.float32)
@@ -72,8 +72,8 @@ def _partials(counter, planes, taps, partials, sums):  # noqa: ANN001, ANN202
             return
         for y in range(band, min(height, band + _BAND)):
             for p in range(5):
-                _blur_row(planes[p], y, padded, taps)
-                _across(padded, m[p], taps)
+                _blur_columns(planes[p], y, padded, taps)
+                _blur_along_row(padded, m[p], taps)
             total = np.float32(0.0)
             for x in range(width):
                 mx, my = m[0, x], m[1, x]
@@ -98,8 +98,8 @@ def _partials(counter, planes, taps, partials, sums):  # noqa: ANN001, ANN202
 
 
 @kernel
-def _add(counter, planes, partials, taps, scale, gradient):  # noqa: ANN001, ANN202
-    """gradient[rgb] += scale * dSSIM/d(pixel)."""
+def _accumulate_gradient(counter, planes, partials, taps, scale, gradient):  # noqa: ANN001, ANN202
+    """Add scale * dSSIM/d(pixel) to the rows R, G, B of `gradient`."""
     height, width = planes.shape[1], planes.shape[2]
     padded = np.zeros(width + 2 * _PAD, np.float32)
     m = np.empty((3, width), np.float32)
@@ -109,8 +109,8 @@ def _add(counter, planes, partials, taps, scale, gradient):  # noqa: ANN001, ANN
             return
         for y in range(band, min(height, band + _BAND)):
             for p in range(3):
-                _blur_row(partials[p], y, padded, taps)
-                _across(padded, m[p], taps)
+                _blur_columns(partials[p], y, padded, taps)
+                _blur_along_row(padded, m[p], taps)
             for x in range(width):
                 g = m[0, x] + np.float32(2.0) * planes[0, y, x] * m[1, x] + planes[1, y, x] * m[2, x]
                 g *= scale
@@ -120,31 +120,39 @@ def _add(counter, planes, partials, taps, scale, gradient):  # noqa: ANN001, ANN
 
 
 class SsimLoss:
-    """weight * (1 - SSIM of luma) / 2, with memory that is reused."""
+    """The loss weight * (1 - SSIM of luma) / 2; its buffers are reused per image size."""
 
     def __init__(self) -> None:
         self._memory: dict[tuple[int, int], tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
 
     @property
-    def held_bytes(self) -> int:
+    def allocated_bytes(self) -> int:
         return sum(array.nbytes for arrays in self._memory.values() for array in arrays)
 
     def add(
-        self, image: np.ndarray, rgb: np.ndarray, weight: float, gradient: np.ndarray, team: Team
+        self, image: np.ndarray, rgb: np.ndarray, weight: float, gradient: np.ndarray, team: ThreadTeam
     ) -> float:
-        """Adds the gradient to `gradient` float32 [5, H, W] and gives the loss."""
+        """Add the gradient of the loss to `gradient`, and return the loss.
+
+        Args:
+            image: rendered image, float32 [5, H, W]; the first three planes are RGB in [0, 1].
+            rgb: true image, [3, H, W], 0 to 255.
+            weight: weight of the loss.
+            gradient: float32 [5, H, W], changed in place.
+            team: threads that run the kernels.
+        """
         h, w = image.shape[1:]
         if (h, w) not in self._memory:
             self._memory[h, w] = np.empty((5, h, w), np.float32), np.empty((3, h, w), np.float32), np.empty(h)
         planes, partials, sums = self._memory[h, w]
         team.run(_prepare, image, rgb, planes)
         team.run(_partials, planes, TAPS, partials, sums)
-        team.run(_add, planes, partials, TAPS, np.float32(-0.5 * weight / (h * w)), gradient)
+        team.run(_accumulate_gradient, planes, partials, TAPS, np.float32(-0.5 * weight / (h * w)), gradient)
         return 0.5 * weight * (1.0 - float(sums.sum()) / (h * w))
 
 
 def ssim(a: np.ndarray, b: np.ndarray) -> float:
-    """Mean SSIM over pixels and channels of two pictures float32 [H, W, C] in [0, 1]."""
+    """Return the mean SSIM over pixels and channels of two images float32 [H, W, C] in [0, 1]."""
 
     def blur(x: np.ndarray) -> np.ndarray:
         taps = TAPS.astype(np.float64)

@@ -1,7 +1,7 @@
-"""A few threads that run GIL-free kernels together. Kernels share their work by an atomic counter.
+"""A thread team for kernels without GIL; the threads divide the work by an atomic counter.
 
-Numba's own `parallel=True` is not used: its fall-back threading layer aborts the process when two Python
-threads enter it at once, and its static split waits for whichever core was taken away.
+Numba's `parallel=True` is not used: its fallback threading layer aborts the process if two Python threads use
+it at the same time, and with its static work distribution all threads wait for the slowest core.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 
-class Team:
-    """`count` threads, this one included; `Team(1)` starts none."""
+class ThreadTeam:
+    """A team of `count` threads, including the calling one; `ThreadTeam(1)` starts no thread."""
 
     def __init__(self, count: int = 1) -> None:
         if count < 1:
@@ -23,7 +23,10 @@ class Team:
         self._pool = ThreadPoolExecutor(count - 1, thread_name_prefix="raster") if count > 1 else None
 
     def run(self, kernel: Callable[..., Any], *args: Any) -> None:
-        """kernel(counter, *args) on every thread; returns when all are done, raises what one raised."""
+        """Call kernel(counter, *args) in each thread, wait for all, and raise a thread's exception here.
+
+        `counter` is a new int64 [1], zero, from which the threads take work with `atomic_next`.
+        """
         counter = np.zeros(1, np.int64)
         if self._pool is None:
             kernel(counter, *args)
@@ -36,6 +39,6 @@ class Team:
                 other.result()
 
     def close(self) -> None:
-        """Ends the threads."""
+        """Stop the threads."""
         if self._pool is not None:
             self._pool.shutdown()

@@ -1,9 +1,10 @@
-"""Blending of a tile's splats, front to back, and its gradient.
+"""Alpha blending of the splats of a tile, front to back, and its gradient.
 
-A tile's pixels lie flat in scratch memory, `ROWS` image rows to a vector. A pixel that is done has its
-transmittance T stored negative. The gradient runs front to back as well: with q = <dL/dout, splat> and
-Q = what the splats behind add to <dL/dout, out>, dL/dalpha = T q - Q / (1 - alpha): no other state.
-With v = alpha dL/dalpha every gradient of a splat on screen is a moment of v over dx, dy (ten sums).
+The pixels of a tile are in a scratch array, `ROWS` image rows per vector. A pixel whose transmittance T would
+fall below the minimum ends: its T is stored with negative sign. The gradient is computed front to back, too:
+with q = <dL/dout, splat> and Q = contribution of the splats behind to <dL/dout, out>,
+dL/dalpha = T q - Q / (1 - alpha), without other state. With v = alpha dL/dalpha, all gradients of a projected
+splat are moments of v over dx, dy and weighted sums (eleven sums per slot).
 """
 
 from __future__ import annotations
@@ -11,31 +12,31 @@ from __future__ import annotations
 import numpy as np
 
 from beamsplat.common.compiled import inner, kernel
-from beamsplat.common.raster.lanes import exp2_lanes
 from beamsplat.common.raster.layout import (
     ALPHA_MAX,
     LOG2_ALPHA_MIN,
+    MIN_TRANSMITTANCE,
     RECORD,
     ROWS,
     SLOT,
-    STOP,
     TILE_H,
     TILE_PIXELS,
     TILE_W,
 )  # fmt: skip
 from beamsplat.common.raster.simd import (
     LANES,
+    absolute,
     any_lane,
+    broadcast,
     floor,
     fma,
     iota,
-    larger,
-    magnitude,
+    maximum,
+    minimum,
     reciprocal,
-    repeat,
-    smaller,
     where,
 )
+from beamsplat.common.raster.simd_math import exp2_lanes
 from beamsplat.common.raster.simd_memory import (
     aligned_floats,
     atomic_next,
@@ -45,38 +46,39 @@ from beamsplat.common.raster.simd_memory import (
     store_sums4,
 )
 
-_AHEAD = 8  # splats whose records are fetched in advance: they lie anywhere in the depth order
-_CHECK = 8  # splats between two looks whether all pixels of the tile are done
-# Scratch memory: per vector of pixels one line for each quantity, side by side (planes far apart would alias
-# at 4096 bytes). Forward: T, R, G, B, D; backward: T, Q and the gradient's five channels.
+_PREFETCH = 8  # records are prefetched this many splats ahead, because they are not contiguous in depth order
+_CHECK_INTERVAL = 8  # after this many splats, check whether all pixels of the tile have ended
+# Scratch array: for each vector of pixels one vector per quantity, interleaved, because separate planes would
+# alias in the cache at 4096 bytes. Forward: transmittance T, R, G, B, depth D; backward: T, Q, and the
+# gradient's five channels.
 T, R, G, B, D = (i * LANES for i in range(5))
 Q, GR, GG, GB, GD, GA = (i * LANES for i in range(1, 7))
-_FORWARD, _BACKWARD = 5 * LANES, 7 * LANES
+_FORWARD_STRIDE, _BACKWARD_STRIDE = 5 * LANES, 7 * LANES
 _VECTORS = TILE_PIXELS // LANES
 
 
 @inner
-def _alive(scratch, step):  # noqa: ANN001, ANN202
+def _any_pixel_open(scratch, step):  # noqa: ANN001, ANN202
     best = load(scratch, T)
     for vector in range(1, _VECTORS):
-        best = larger(best, load(scratch, T + vector * step))
+        best = maximum(best, load(scratch, T + vector * step))
     return any_lane(best > 0.0)
 
 
 @inner
-def _place(x, y, step):  # noqa: ANN001, ANN202
-    """Where the pixel (x, y) of a tile begins in the scratch memory."""
+def _pixel_offset(x, y, step):  # noqa: ANN001, ANN202
+    """Return the offset of the pixel (x, y) of a tile in the scratch array."""
     return y // ROWS * step + y % ROWS * TILE_W + x
 
 
 @inner
-def _open_pixels(scratch, step, left, top, width, height):  # noqa: ANN001, ANN202
-    """All zero, but T = 1 inside the image and -1 outside."""
+def _init_scratch(scratch, step, left, top, width, height):  # noqa: ANN001, ANN202
+    """Set the scratch array to zero, and T to 1 for pixels inside the image, -1 outside."""
     scratch[:] = 0.0
     for row in range(TILE_H):
         for column in range(TILE_W):
             inside = left + column < width and top + row < height
-            scratch[T + _place(column, row, step)] = 1.0 if inside else -1.0
+            scratch[T + _pixel_offset(column, row, step)] = 1.0 if inside else -1.0
 
 
 @kernel
@@ -85,34 +87,34 @@ def _forward_tile(lists, first, last, records, left, top, scratch, alphas):  # n
     column = iota() - row_of_lane * np.float32(TILE_W) + np.float32(left)
     row_of_lane = row_of_lane + np.float32(top)
     for i in range(first, last):
-        if (i - first) % _CHECK == 0 and not _alive(scratch, _FORWARD):
+        if (i - first) % _CHECK_INTERVAL == 0 and not _any_pixel_open(scratch, _FORWARD_STRIDE):
             return
-        prefetch(records, lists[min(i + _AHEAD, last - 1), 0] * RECORD)
+        prefetch(records, lists[min(i + _PREFETCH, last - 1), 0] * RECORD)
         record = lists[i, 0] * RECORD
         begin, end = lists[i, 1] & 255, lists[i, 1] >> 8
         dx = column - records[record]
         constant = fma(dx * dx, records[record + 2], records[record + 5])
         linear = dx * records[record + 3]
-        C = repeat(records[record + 4])
+        C = broadcast(records[record + 4])
         red, green, blue = (
-            repeat(records[record + 6]),
-            repeat(records[record + 7]),
-            repeat(records[record + 8]),
+            broadcast(records[record + 6]),
+            broadcast(records[record + 7]),
+            broadcast(records[record + 8]),
         )
-        z = repeat(records[record + 9])
+        z = broadcast(records[record + 9])
         dy = row_of_lane + (np.float32(begin * ROWS) - records[record + 1])
         for at in range(begin * LANES, (end + 1) * LANES, LANES):
             power = fma(dy, fma(dy, C, linear), constant)
             dy = dy + np.float32(ROWS)
-            store(alphas, at, where(power >= LOG2_ALPHA_MIN, smaller(exp2_lanes(power), ALPHA_MAX), 0.0))
+            store(alphas, at, where(power >= LOG2_ALPHA_MIN, minimum(exp2_lanes(power), ALPHA_MAX), 0.0))
         for vector in range(begin, end + 1):
-            at, alpha = vector * _FORWARD, load(alphas, vector * LANES)
+            at, alpha = vector * _FORWARD_STRIDE, load(alphas, vector * LANES)
             before = load(scratch, T + at)
             weight = before * alpha
             after = before - weight
-            goes_on = after > STOP
-            weight = where(goes_on, weight, 0.0)
-            store(scratch, T + at, where(goes_on, after, -magnitude(before)))
+            still_open = after > MIN_TRANSMITTANCE
+            weight = where(still_open, weight, 0.0)
+            store(scratch, T + at, where(still_open, after, -absolute(before)))
             store(scratch, R + at, fma(weight, red, load(scratch, R + at)))
             store(scratch, G + at, fma(weight, green, load(scratch, G + at)))
             store(scratch, B + at, fma(weight, blue, load(scratch, B + at)))
@@ -121,19 +123,19 @@ def _forward_tile(lists, first, last, records, left, top, scratch, alphas):  # n
 
 @kernel
 def forward_tiles(counter, tiles_x, background, lists, tile_start, records, image):  # noqa: ANN001, ANN201
-    """Renders tiles as they are handed out into `image` float32 [5, H, W]."""
+    """Render the tiles that `counter` assigns to this thread into `image` float32 [5, H, W]."""
     height, width = image.shape[1], image.shape[2]
-    scratch, alphas = aligned_floats(_VECTORS * _FORWARD), aligned_floats(TILE_PIXELS)
+    scratch, alphas = aligned_floats(_VECTORS * _FORWARD_STRIDE), aligned_floats(TILE_PIXELS)
     while True:
         tile = atomic_next(counter, 0)
         if tile >= len(tile_start) - 1:
             return
         left, top = tile % tiles_x * TILE_W, tile // tiles_x * TILE_H
-        _open_pixels(scratch, _FORWARD, left, top, width, height)
+        _init_scratch(scratch, _FORWARD_STRIDE, left, top, width, height)
         _forward_tile(lists, tile_start[tile], tile_start[tile + 1], records, left, top, scratch, alphas)
         for y in range(top, min(top + TILE_H, height)):
             for x in range(left, min(left + TILE_W, width)):
-                at = _place(x - left, y - top, _FORWARD)
+                at = _pixel_offset(x - left, y - top, _FORWARD_STRIDE)
                 through = abs(scratch[T + at])
                 image[0, y, x] = scratch[R + at] + through * background[0]
                 image[1, y, x] = scratch[G + at] + through * background[1]
@@ -147,24 +149,24 @@ def _backward_tile(lists, first, last, records, left, top, scratch, alphas, slot
     row_of_lane = floor(iota() * np.float32(1.0 / TILE_W))
     column = iota() - row_of_lane * np.float32(TILE_W) + np.float32(left)
     row_of_lane = row_of_lane + np.float32(top)
-    nothing = repeat(np.float32(0.0))
+    nothing = broadcast(np.float32(0.0))
     for i in range(first, last):
-        if (i - first) % _CHECK == 0 and not _alive(scratch, _BACKWARD):
-            slots[i * SLOT : last * SLOT] = 0.0  # hidden; the memory holds an older picture's sums
+        if (i - first) % _CHECK_INTERVAL == 0 and not _any_pixel_open(scratch, _BACKWARD_STRIDE):
+            slots[i * SLOT : last * SLOT] = 0.0  # occluded; the memory holds sums of an earlier image
             return
-        prefetch(records, lists[min(i + _AHEAD, last - 1), 0] * RECORD)
+        prefetch(records, lists[min(i + _PREFETCH, last - 1), 0] * RECORD)
         record = lists[i, 0] * RECORD
         begin, end = lists[i, 1] & 255, lists[i, 1] >> 8
         dx = column - records[record]
         constant = fma(dx * dx, records[record + 2], records[record + 5])
         linear = dx * records[record + 3]
-        C = repeat(records[record + 4])
+        C = broadcast(records[record + 4])
         red, green, blue = (
-            repeat(records[record + 6]),
-            repeat(records[record + 7]),
-            repeat(records[record + 8]),
+            broadcast(records[record + 6]),
+            broadcast(records[record + 7]),
+            broadcast(records[record + 8]),
         )
-        z = repeat(records[record + 9])
+        z = broadcast(records[record + 9])
         dy = row_of_lane + (np.float32(begin * ROWS) - records[record + 1])
         dy_first = dy
         v_0, v_y, v_yy = nothing, nothing, nothing
@@ -172,22 +174,24 @@ def _backward_tile(lists, first, last, records, left, top, scratch, alphas, slot
         for at in range(begin * LANES, (end + 1) * LANES, LANES):
             power = fma(dy_first, fma(dy_first, C, linear), constant)
             dy_first = dy_first + np.float32(ROWS)
-            store(alphas, at, where(power >= LOG2_ALPHA_MIN, smaller(exp2_lanes(power), ALPHA_MAX), 0.0))
+            store(alphas, at, where(power >= LOG2_ALPHA_MIN, minimum(exp2_lanes(power), ALPHA_MAX), 0.0))
         for vector in range(begin, end + 1):
-            at, alpha = vector * _BACKWARD, load(alphas, vector * LANES)
+            at, alpha = vector * _BACKWARD_STRIDE, load(alphas, vector * LANES)
             before = load(scratch, T + at)
             weight = before * alpha
             after = before - weight
-            goes_on = after > STOP
-            weight = where(goes_on, weight, 0.0)
+            still_open = after > MIN_TRANSMITTANCE
+            weight = where(still_open, weight, 0.0)
             g_red, g_green, g_blue = load(scratch, GR + at), load(scratch, GG + at), load(scratch, GB + at)
             g_z = load(scratch, GD + at)
             q = fma(g_red, red, fma(g_green, green, fma(g_blue, blue, fma(g_z, z, load(scratch, GA + at)))))
             gain = weight * q
             behind = load(scratch, Q + at) - gain
-            store(scratch, T + at, where(goes_on, after, -magnitude(before)))
+            store(scratch, T + at, where(still_open, after, -absolute(before)))
             store(scratch, Q + at, behind)
-            v = where(goes_on & (alpha < ALPHA_MAX), gain - behind * (alpha * reciprocal(1.0 - alpha)), 0.0)
+            v = where(
+                still_open & (alpha < ALPHA_MAX), gain - behind * (alpha * reciprocal(1.0 - alpha)), 0.0
+            )
             v_0 = v_0 + v
             vy = v * dy
             v_y = v_y + vy
@@ -207,20 +211,20 @@ def _backward_tile(lists, first, last, records, left, top, scratch, alphas, slot
 
 @kernel
 def backward_tiles(counter, tiles_x, background, lists, tile_start, records, image, gradient, slots):  # noqa: ANN001, ANN201
-    """Sums dL/d(splat) of each (splat, tile) pair into its slot, given dL/d(image) float32 [5, H, W]."""
+    """Write the sums of dL/d(splat) of each (splat, tile) pair to its slot, from dL/d(image) [5, H, W]."""
     height, width = image.shape[1], image.shape[2]
-    scratch, alphas = aligned_floats(_VECTORS * _BACKWARD), aligned_floats(TILE_PIXELS)
+    scratch, alphas = aligned_floats(_VECTORS * _BACKWARD_STRIDE), aligned_floats(TILE_PIXELS)
     while True:
         tile = atomic_next(counter, 0)
         if tile >= len(tile_start) - 1:
             return
         left, top = tile % tiles_x * TILE_W, tile // tiles_x * TILE_H
-        _open_pixels(scratch, _BACKWARD, left, top, width, height)
+        _init_scratch(scratch, _BACKWARD_STRIDE, left, top, width, height)
         for y in range(top, min(top + TILE_H, height)):
             for x in range(left, min(left + TILE_W, width)):
-                at = _place(x - left, y - top, _BACKWARD)
+                at = _pixel_offset(x - left, y - top, _BACKWARD_STRIDE)
                 g0, g1, g2, g3 = gradient[0, y, x], gradient[1, y, x], gradient[2, y, x], gradient[3, y, x]
-                # out = sum w c + (1 - A) background: the background's share belongs to alpha.
+                # out = sum w c + (1 - A) background: the background term contributes to dL/dA.
                 g4 = gradient[4, y, x] - (g0 * background[0] + g1 * background[1] + g2 * background[2])
                 alpha = image[4, y, x]
                 through = np.float32(1.0) - alpha

@@ -16,7 +16,7 @@ import numpy as np
 from beamsplat.common.geometry.transforms import inverse, is_rigid
 from beamsplat.common.mapfiles.store import DiskGaussians, GaussianStore
 from beamsplat.common.raster.layout import OPACITY
-from beamsplat.common.raster.optimiser import rate_rows
+from beamsplat.common.raster.optimiser import learning_rates
 from beamsplat.common.raster.rasterizer import Rasterizer, Render
 from beamsplat.common.raster.ssim import SsimLoss
 from beamsplat.services.mapping.insertion import new_gaussians, prediction_quality, unexplained_pixels
@@ -74,8 +74,8 @@ class Mapper:
         self._buffers: dict[tuple[int, int], tuple[np.ndarray, np.ndarray]] = {}
         r = self.settings.rates
         rest = (r.log_scale, r.quat, r.opacity_logit, r.colour)
-        self._rates = rate_rows(r.mean_m, *rest)
-        self._refining_rates = rate_rows(r.refined_mean_m, *rest)
+        self._rates = learning_rates(r.mean_m, *rest)
+        self._refining_rates = learning_rates(r.refined_mean_m, *rest)
 
     # --- keyframes and anchors ---------------------------------------------------------------------
 
@@ -134,7 +134,7 @@ class Mapper:
     def workspace_bytes(self) -> int:
         """Return the bytes of the buffers for rendering and losses."""
         losses = sum(array.nbytes for pair in self._buffers.values() for array in pair)
-        return self.rasterizer.held_bytes + self._ssim.held_bytes + losses
+        return self.rasterizer.allocated_bytes + self._ssim.allocated_bytes + losses
 
     def _drop_redundant(self) -> None:
         """Drop keyframes until one more fits: random ones of the fullest pose bin. Their Gaussians stay."""

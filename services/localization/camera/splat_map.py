@@ -14,7 +14,7 @@ from beamsplat.common.geometry.transforms import inverse
 from beamsplat.common.raster.camera import RasterCamera
 from beamsplat.common.raster.discs import choose_pixels, make_discs
 from beamsplat.common.raster.layout import MEAN, OPACITY, SCALE
-from beamsplat.common.raster.optimiser import GaussianArrays, rate_rows
+from beamsplat.common.raster.optimiser import GaussianArrays, learning_rates
 from beamsplat.common.raster.rasterizer import Rasterizer, Render
 from beamsplat.services.localization.camera.kernels import map_loss
 from beamsplat.services.localization.camera.settings import CameraTrackerSettings
@@ -42,7 +42,9 @@ class SplatMap:
         self.keyframes: list[MapKeyframe] = []
         self.store = GaussianArrays(1 << 14)
         s = settings
-        self._rates = rate_rows(s.mean_rate_m, s.log_scale_rate, s.quat_rate, s.opacity_rate, s.colour_rate)
+        self._rates = learning_rates(
+            s.mean_rate_m, s.log_scale_rate, s.quat_rate, s.opacity_rate, s.colour_rate
+        )
         self._gradient = np.empty((5, camera.height_px, camera.width_px), np.float32)
 
     def render(self, camera: RasterCamera, T_camera_map: np.ndarray) -> Render:
@@ -115,9 +117,9 @@ class SplatMap:
         keep = np.ones(self.store.count, bool)
         keep[index] = False
         self.store.keep(keep)
-        place = np.cumsum(keep, dtype=np.int32) - 1
+        new_index = np.cumsum(keep, dtype=np.int32) - 1
         for frame in self.keyframes[-1:]:  # the lists of older keyframes are not used any more
-            frame.in_view = place[frame.in_view[keep[frame.in_view]]]
+            frame.in_view = new_index[frame.in_view[keep[frame.in_view]]]
 
     # --- optimising --------------------------------------------------------------------------------
 

@@ -1,6 +1,6 @@
-"""`reference`: the rasterizer in plain torch, for any dtype. Slow; the others' truth in tests.
+"""`reference`: the rasterizer in plain torch, for any dtype. Slow; tests compare the other renderers with it.
 
-Dense over pixels within blocks of 16 x 16, gradients by autograd. Constants are in `raster.layout`.
+Dense over the pixels in blocks of 16 x 16, gradients by autograd. Constants are in `raster.layout`.
 """
 
 from __future__ import annotations
@@ -9,14 +9,14 @@ import numpy as np
 import torch
 
 from beamsplat.common.raster.camera import RasterCamera
-from beamsplat.common.raster.layout import ALPHA_MAX, ALPHA_MIN, BLUR_PX2, NEAR_M, STOP
+from beamsplat.common.raster.layout import ALPHA_MAX, ALPHA_MIN, BLUR_PX2, MIN_TRANSMITTANCE, NEAR_M
 from beamsplat.services.mapping.renderers.protocol import Gaussians, RenderedImage
 
-_BLOCK = 16
+_BLOCK = 16  # px
 
 
 class ReferenceRenderer:
-    """See module."""
+    """The reference renderer."""
 
     def render(
         self,
@@ -26,7 +26,7 @@ class ReferenceRenderer:
         background: torch.Tensor | None = None,
         pose_tangent: torch.Tensor | None = None,
     ) -> RenderedImage:
-        """The picture; differentiable in everything, twice if need be."""
+        """Render the Gaussians; differentiable in all inputs, also twice."""
         mean = gaussians.mean_map_m
         T = torch.as_tensor(T_camera_map, dtype=mean.dtype)
         R, t = T[:3, :3], T[:3, 3]
@@ -51,7 +51,7 @@ class ReferenceRenderer:
 
 
 def _so3_exp(phi: torch.Tensor) -> torch.Tensor:
-    """exp of a rotation vector at zero, to second order: enough for gradients there."""
+    """Return exp of a rotation vector to second order: value and first two derivatives are exact at zero."""
     zero = torch.zeros_like(phi[0])
     W = torch.stack([
         torch.stack([zero, -phi[2], phi[1]]), torch.stack([phi[2], zero, -phi[0]]),
@@ -72,7 +72,7 @@ def _rotations(quat_wxyz: torch.Tensor) -> torch.Tensor:
 def _project(
     gaussians: Gaussians, camera: RasterCamera, R: torch.Tensor, t: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Centres [V, 2] px, covariances [V, 2, 2] px^2, z [V], and which Gaussians they are [V]."""
+    """Return centres [V, 2] px, covariances [V, 2, 2] px^2, optical z [V] and indices [V] of Gaussians."""
     points = gaussians.mean_map_m @ R.T + t
     keep = torch.nonzero(points[:, 2] > NEAR_M)[:, 0]
     points = points[keep]
@@ -93,7 +93,7 @@ def _project(
 def _block(
     splats: tuple[torch.Tensor, ...], reach: torch.Tensor, camera: RasterCamera, left: int, top: int
 ) -> torch.Tensor:
-    """[h, w, 5] of one block of pixels."""
+    """Return [h, w, 5] (colour, accumulated depth, alpha) of one block of pixels."""
     centre, conic, opacity, values = splats
     w, h = min(_BLOCK, camera.width_px - left), min(_BLOCK, camera.height_px - top)
     u, v = centre.detach().unbind(1)
@@ -111,6 +111,6 @@ def _block(
     alpha = torch.where(alpha >= ALPHA_MIN, alpha, 0.0)
     through = torch.cumprod(1.0 - alpha, dim=1)
     before = torch.cat([torch.ones_like(through[:, :1]), through[:, :-1]], dim=1)
-    weight = torch.where(through > STOP, before * alpha, 0.0)
+    weight = torch.where(through > MIN_TRANSMITTANCE, before * alpha, 0.0)
     out = torch.cat([weight @ values[near], weight.sum(dim=1, keepdim=True)], dim=1)
     return out.reshape(h, w, 5)

@@ -10,8 +10,8 @@ from beamsplat.common.geometry.transforms import make_transform, matrix_from_qua
 from beamsplat.common.raster.camera import RasterCamera
 from beamsplat.common.raster.discs import choose_pixels, disc_quats, make_discs
 from beamsplat.common.raster.layout import GRADIENTS, MEAN, OPACITY, QUAT, SCALE, WEIGHT
-from beamsplat.common.raster.optimiser import GaussianArrays, adam, rate_rows
-from beamsplat.common.raster.threads import Team
+from beamsplat.common.raster.optimiser import GaussianArrays, adam, learning_rates
+from beamsplat.common.raster.threads import ThreadTeam
 
 
 def test_adam_is_that_of_torch_for_what_is_seen():
@@ -29,8 +29,8 @@ def test_adam_is_that_of_torch_for_what_is_seen():
         gradients = np.zeros((GRADIENTS, 64), np.float32)
         gradients[:14, :61] = rng.normal(size=(14, 61))
         gradients[WEIGHT] = 1.0
-        Team(1).run(adam, gradients, padded[:61], params, first, second, steps,
-                    rate_rows(0.01, 0.01, 0.01, 0.01, 0.01), np.float32(0.0), np.float32(9.0))  # fmt: skip
+        ThreadTeam(1).run(adam, gradients, padded[:61], params, first, second, steps,
+                    learning_rates(0.01, 0.01, 0.01, 0.01, 0.01), np.float32(0.0), np.float32(9.0))  # fmt: skip
         theirs.grad = torch.tensor(gradients[:14, :61])
         optimiser.step()
     assert np.allclose(params[:, index], theirs.detach().numpy(), atol=2e-5)
@@ -46,8 +46,8 @@ def test_needles_are_pulled_towards_discs():
     gradients = np.zeros((GRADIENTS, 16), np.float32)
     gradients[WEIGHT] = 1.0
     index = np.zeros(16, np.int32)
-    Team(1).run(adam, gradients, index[:1], params, moments[0], moments[1], np.zeros(16, np.float32),
-                rate_rows(0.0, 0.01, 0.0, 0.0, 0.0), np.float32(1.0), np.float32(np.log(4.0)))  # fmt: skip
+    ThreadTeam(1).run(adam, gradients, index[:1], params, moments[0], moments[1], np.zeros(16, np.float32),
+                learning_rates(0.0, 0.01, 0.0, 0.0, 0.0), np.float32(1.0), np.float32(np.log(4.0)))  # fmt: skip
     assert params[3, 0] == pytest.approx(-0.01, abs=1e-6)
     assert np.allclose(params[4:6, 0], np.log([0.1, 0.01]), atol=1e-6)
 

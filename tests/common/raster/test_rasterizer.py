@@ -7,13 +7,13 @@ from hypothesis import strategies as st
 from numba import njit
 
 from beamsplat.common.raster.camera import RasterCamera
-from beamsplat.common.raster.lanes import exp2_lanes, exp_lanes, log2_lanes, sigmoid_lanes
+from beamsplat.common.raster.culling import sort_by_depth
 from beamsplat.common.raster.layout import GRADIENTS, WEIGHT
 from beamsplat.common.raster.rasterizer import Rasterizer
 from beamsplat.common.raster.simd import LANES, iota
+from beamsplat.common.raster.simd_math import exp2_lanes, exp_lanes, log2_lanes, sigmoid_lanes
 from beamsplat.common.raster.simd_memory import gather, load, scatter_some, store, store_sums4
-from beamsplat.common.raster.visible import sort_by_depth
-from beamsplat.common.raster.warm import warm
+from tests.common.kernels import kernels_of
 from tests.common.raster.scenes import random_camera, random_gaussians, random_pose
 
 
@@ -126,8 +126,26 @@ def test_bad_input_is_named():
         Rasterizer(0)
 
 
-def test_warm_compiles_what_is_used():
-    warm()
+def test_warm_compiles_all_kernels_of_a_training_step():
+    warmed, missing = kernels_of(
+        warm="from beamsplat.common.raster.warm import warm; warm()",
+        use="""
+            import numpy as np
+            from beamsplat.common.raster.optimiser import GaussianArrays, rate_rows
+            from beamsplat.common.raster.rasterizer import Rasterizer
+            from tests.common.raster.test_rasterizer import scene
+
+            params, count, camera, T, weights = scene(1)
+            arrays, rasterizer = GaussianArrays(4096), Rasterizer(2)
+            arrays.append(params[:, :count])
+            render = rasterizer.render(arrays.params, arrays.count, camera, T, np.ones(3))
+            gradients = rasterizer.backward(render, weights)
+            arrays.step(rasterizer.team, gradients, rate_rows(1e-3, 1e-3, 1e-3, 1e-3, 1e-3))
+            assert len(gradients.index) > 0
+        """,
+    )
+    assert len(warmed) >= 5
+    assert missing == []
 
 
 @settings(max_examples=40, deadline=None)

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from beamsplat.common.raster.ssim import TAPS, SsimLoss, ssim
-from beamsplat.common.raster.threads import Team
+from beamsplat.common.raster.threads import ThreadTeam
 from beamsplat.services.mapping.kernels import add_lidar, photometric_and_depth
 
 H, W = 37, 53
@@ -23,7 +23,7 @@ def test_photometric_and_depth_loss_is_that_of_torch():
     image, rgb, depth_mm, weight = pictures()
     exposure = np.array([0.1, -0.2, 0.05, 0.01, -0.02, 0.03], np.float32)
     gradient, sums = np.full((5, H, W), np.nan, np.float32), np.zeros((H, 8))
-    Team(2).run(
+    ThreadTeam(2).run(
         photometric_and_depth,
         image,
         rgb,
@@ -65,7 +65,7 @@ def test_lidar_loss_pulls_at_the_beams_only():
 def test_ssim_gradient_is_that_of_torch():
     image, rgb, *_ = pictures(1)
     gradient = np.zeros((5, H, W), np.float32)
-    loss = SsimLoss().add(image, rgb, 0.2, gradient, Team(2))
+    loss = SsimLoss().add(image, rgb, 0.2, gradient, ThreadTeam(2))
     taps = torch.tensor(TAPS, dtype=torch.float64)
     kernel = (taps[:, None] * taps[None])[None, None]
     luma = torch.tensor([0.299, 0.587, 0.114], dtype=torch.float64)

@@ -6,7 +6,7 @@ import torch
 
 from beamsplat.common.errors import UserError
 from beamsplat.common.geometry.transforms import se3_exp
-from beamsplat.common.raster.camera import RasterCamera, right_gradient
+from beamsplat.common.raster.camera import RasterCamera
 from beamsplat.services.mapping.renderers.protocol import Gaussians, make_renderer
 from tests.common.raster.scenes import random_camera, random_gaussians, random_pose
 
@@ -114,7 +114,7 @@ def test_two_live_graphs_do_not_disturb_each_other():
 
 
 def test_pose_gradient_is_that_of_the_left_perturbation():
-    """Central differences of the picture when the camera really moves, on both sides.
+    """Central differences of the image when the camera moves.
 
     A few large Gaussians under smooth weights: the cut at alpha 1/255 moves too, and no gradient knows it.
     """
@@ -136,13 +136,11 @@ def test_pose_gradient_is_that_of_the_left_perturbation():
                 )
             )
 
-    left, right = np.zeros(6), np.zeros(6)
+    left = np.zeros(6)
     for k in range(6):
         move = np.eye(6)[k] * step
         left[k] = (loss(se3_exp(move) @ T) - loss(se3_exp(-move) @ T)) / (2 * step)
-        right[k] = (loss(T @ se3_exp(move)) - loss(T @ se3_exp(-move))) / (2 * step)
     assert relative(gradients["pose"], left) < 0.03
-    assert relative(right_gradient(gradients["pose"], T), right) < 0.03
 
 
 def test_a_single_gaussian_lands_where_the_pinhole_says():

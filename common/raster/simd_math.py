@@ -1,23 +1,23 @@
-"""Functions on vectors of lanes, built from the operations of `simd`: exp2, log2, exp, sigmoid."""
+"""Mathematical functions on SIMD vectors: exp2, log2, exp, sigmoid."""
 
 from __future__ import annotations
 
 from beamsplat.common.compiled import inlined
-from beamsplat.common.raster.simd import exp2_scale, exponent, fma, larger, mantissa, smaller, where
+from beamsplat.common.raster.simd import exp2_scale, exponent, fma, mantissa, maximum, minimum, where
 
 LOG2_E = 1.4426950408889634
 LN_2 = 0.6931471805599453
 
 
-_ROUND = 12582912.0  # 1.5 * 2**23: adding it leaves the nearest whole number in the low bits
+_ROUND = 12582912.0  # 1.5 * 2**23: adding it rounds to the nearest integer, which is then in the low bits
 
 
 @inlined
 def exp2_lanes(x):  # noqa: ANN001, ANN201
-    """2**x to 2e-7 relative for x in [-126, 126]; garbage outside.
+    """Return 2**x with a relative error of 2e-7 for x in [-126, 126]; undefined outside.
 
-    Minimax polynomial (Lawson's iteration) on [-1/2, 1/2], in Estrin's order: short chains of dependent
-    operations matter more than their number, because the scheduler holds only a few vectors in flight.
+    Minimax polynomial (Lawson's iteration) on [-1/2, 1/2] in Estrin's scheme: its dependency chain is short,
+    which matters more than the number of operations.
     """
     shifted = x + _ROUND
     f = x - (shifted - _ROUND)
@@ -30,19 +30,19 @@ def exp2_lanes(x):  # noqa: ANN001, ANN201
 
 @inlined
 def exp_lanes(x):  # noqa: ANN001, ANN201
-    """e**x, held within what float32 can say."""
-    return exp2_lanes(smaller(larger(x * LOG2_E, -120.0), 120.0))
+    """Return e**x, with the result clamped to 2**-120 .. 2**120."""
+    return exp2_lanes(minimum(maximum(x * LOG2_E, -120.0), 120.0))
 
 
 @inlined
 def sigmoid_lanes(x):  # noqa: ANN001, ANN201
-    """1 / (1 + e**-x)."""
+    """Return 1 / (1 + e**-x)."""
     return 1.0 / (1.0 + exp_lanes(-x))
 
 
 @inlined
 def log2_lanes(x):  # noqa: ANN001, ANN201
-    """log2(x) to 2e-7 absolute (near 1) for positive normal x, by the series of atanh around 1."""
+    """Return log2(x) of positive normal x with an absolute error of 2e-7 near 1 (series of atanh)."""
     m, e = mantissa(x), exponent(x)
     high = m > 1.4142135
     m = where(high, m * 0.5, m)

@@ -1,24 +1,25 @@
-"""Which Gaussians can touch the image, and which is nearer: culling, and one radix sort by depth."""
+"""View-frustum culling of Gaussians, and a radix sort of the visible ones by depth."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from beamsplat.common.compiled import kernel
-from beamsplat.common.raster.lanes import exp_lanes
 from beamsplat.common.raster.layout import BLUR_PX2, SCALE
-from beamsplat.common.raster.simd import LANES, any_lane, larger, where
+from beamsplat.common.raster.simd import LANES, any_lane, maximum, where
+from beamsplat.common.raster.simd_math import exp_lanes
 from beamsplat.common.raster.simd_memory import aligned_floats, atomic_next, load, store
 
-BLOCK = 4096  # Gaussians culled in one piece
+BLOCK = 4096  # Gaussians per unit of work of a thread
 
 
 @kernel
 def cull(counter, params, stride, count, camera, index, depth, kept):  # noqa: ANN001, ANN201
-    """Writes index and depth z of the Gaussians of each block that may be seen; blocks are handed out.
+    """Write index and depth z of the possibly visible Gaussians of the blocks that `counter` assigns.
 
-    The bound is conservative: 3.4 times the largest scale, projected where the view is steepest. `params`
-    is [14 * stride], `index` and `depth` hold a block at its own place, `kept` [blocks] counts.
+    The bound is conservative: 3.4 times the largest scale, projected at the steepest viewing ray. `params` is
+    [14 * stride]; the results of a block start at index block * BLOCK of `index` and `depth`; `kept`
+    [blocks] is their number.
     """
     r = camera
     steep = max(max(-camera[16], camera[17]), max(-camera[18], camera[19]))
@@ -40,8 +41,8 @@ def cull(counter, params, stride, count, camera, index, depth, kept):  # noqa: A
                 continue
             xc = x * r[0] + y * r[1] + z * r[2] + r[9]
             yc = x * r[3] + y * r[4] + z * r[5] + r[10]
-            s = larger(load(params, SCALE * stride + i), load(params, (SCALE + 1) * stride + i))
-            s = exp_lanes(larger(s, load(params, (SCALE + 2) * stride + i)))
+            s = maximum(load(params, SCALE * stride + i), load(params, (SCALE + 1) * stride + i))
+            s = exp_lanes(maximum(s, load(params, (SCALE + 2) * stride + i)))
             inverse = 1.0 / zc
             reach = s * inverse * (focal * np.float32(3.4)) + pad
             u, v = xc * inverse * camera[12] + camera[14], yc * inverse * camera[13] + camera[15]
@@ -60,9 +61,9 @@ def cull(counter, params, stride, count, camera, index, depth, kept):  # noqa: A
 
 @kernel
 def compact(index, depth, kept):  # noqa: ANN001, ANN201
-    """Closes the gaps between blocks in place; gives the number of visible Gaussians.
+    """Remove the gaps between blocks in place, and return the number of visible Gaussians.
 
-    `index` is filled behind the end with the last one, so that whole vectors may be read.
+    `index` is padded with its last entry, so that a whole vector can be read at the end.
     """
     n = 0
     for block in range(len(kept)):
@@ -77,10 +78,10 @@ def compact(index, depth, kept):  # noqa: ANN001, ANN201
 
 @kernel
 def sort_by_depth(depth, n, order, keys, keys_other, order_other):  # noqa: ANN001, ANN201
-    """order[rank] = which of depth[0 : n] is the rank-th nearest; equal depths keep their order.
+    """Write the indices of depth[0 : n], nearest first, to `order`; the sort is stable.
 
-    Least significant digit radix sort on the bits of positive floats, 11 bits a pass and only as many passes
-    as the spread needs.
+    Radix sort (least significant digit first) on the bits of positive floats, 11 bits per pass, with only as
+    many passes as the range of depths needs. The other arrays [n] are buffers.
     """
     bits = depth.view(np.uint32)
     low, high = np.uint32(0xFFFFFFFF), np.uint32(0)
@@ -93,9 +94,9 @@ def sort_by_depth(depth, n, order, keys, keys_other, order_other):  # noqa: ANN0
     spread, shift, flipped = high - low, 0, False
     while shift < 32 and (spread >> np.uint32(shift)) > 0:
         if flipped:
-            _pass(keys_other, order_other, keys, order, histogram, n, low, shift)
+            _radix_pass(keys_other, order_other, keys, order, histogram, n, low, shift)
         else:
-            _pass(keys, order, keys_other, order_other, histogram, n, low, shift)
+            _radix_pass(keys, order, keys_other, order_other, histogram, n, low, shift)
         flipped = not flipped
         shift += 11
     if flipped:
@@ -103,7 +104,7 @@ def sort_by_depth(depth, n, order, keys, keys_other, order_other):  # noqa: ANN0
 
 
 @kernel
-def _pass(keys, order, keys_out, order_out, histogram, n, low, shift):  # noqa: ANN001, ANN202
+def _radix_pass(keys, order, keys_out, order_out, histogram, n, low, shift):  # noqa: ANN001, ANN202
     s = np.uint32(shift)
     histogram[:] = 0
     for i in range(n):

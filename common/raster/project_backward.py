@@ -1,13 +1,16 @@
-"""From sums on screen to gradients of the Gaussians' parameters and of the camera pose (chain rule)."""
+"""Backward pass of `project`: from sums per splat on the image to gradients of parameters and camera pose.
+
+The kernels work on `LANES` splats at a time. `c` is the camera of `RasterCamera.packed`; matrices are tuples
+of vectors by rows; J is the tuple that `screen_covariance` returns last.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 
 from beamsplat.common.compiled import inner, kernel
-from beamsplat.common.raster.lanes import sigmoid_lanes
 from beamsplat.common.raster.layout import (
-    CHUNKS,
+    BATCHES,
     COLOUR,
     GRADIENTS,
     OPACITY,
@@ -17,8 +20,9 @@ from beamsplat.common.raster.layout import (
     SLOT,
     WEIGHT,
 )  # fmt: skip
-from beamsplat.common.raster.project import axes, camera_point, chunk_size, rotation, screen_covariance
-from beamsplat.common.raster.simd import LANES, any_lane, repeat, root, where
+from beamsplat.common.raster.project import axes, batch_size, camera_point, rotation, screen_covariance
+from beamsplat.common.raster.simd import LANES, any_lane, broadcast, sqrt, where
+from beamsplat.common.raster.simd_math import sigmoid_lanes
 from beamsplat.common.raster.simd_memory import (
     aligned_floats,
     atomic_next,
@@ -29,28 +33,28 @@ from beamsplat.common.raster.simd_memory import (
     store_sums4,
 )
 
-_AHEAD = 24  # pairs whose slots are fetched in advance
+_PREFETCH = 24  # slots are prefetched this many pairs ahead
 
 
 @kernel
-def _gather_sums(slots, places, first_pair, pair_count, splat, stop, sums):  # noqa: ANN001, ANN202
-    """sums[lane * SLOT ...]: the slots of each splat of the group, added up. A slot is a cache line."""
+def _gather_sums(slots, list_row, first_pair, pair_count, splat, stop, sums):  # noqa: ANN001, ANN202
+    """Add up the slots of each splat of a group into sums[lane * SLOT ...]. A slot is a cache line."""
     for lane in range(LANES):
         at = lane * SLOT
         for k in range(0, SLOT, LANES):
-            store(sums, at + k, repeat(np.float32(0.0)))
+            store(sums, at + k, broadcast(np.float32(0.0)))
         if splat + lane < stop:
             first = first_pair[splat + lane]
             for pair in range(first, first + pair_count[splat + lane]):
-                slot = places[pair] * SLOT
-                prefetch(slots, places[pair + _AHEAD] * SLOT)
+                slot = list_row[pair] * SLOT
+                prefetch(slots, list_row[pair + _PREFETCH] * SLOT)
                 for k in range(0, SLOT, LANES):
                     store(sums, at + k, load(sums, at + k) + load(slots, slot + k))
 
 
 @inner
 def _screen_to_axes(sums, lane_at, cov, V0, V1):  # noqa: ANN001, ANN202
-    """Gradients of the centre (px) and of V = J M, from the moments of v."""
+    """Return the gradients of the centre (px) and of the rows of V = J M from the moments of v."""
     v_x, v_y = gather(sums, 1, lane_at, 0), gather(sums, 2, lane_at, 0)
     v_xx, v_xy, v_yy = gather(sums, 3, lane_at, 0), gather(sums, 4, lane_at, 0), gather(sums, 5, lane_at, 0)
     k = 1.0 / (cov[0] * cov[2] - cov[1] * cov[1])
@@ -67,7 +71,7 @@ def _screen_to_axes(sums, lane_at, cov, V0, V1):  # noqa: ANN001, ANN202
 
 @inner
 def _point_gradient(g_u, g_v, g_depth, dV0, dV1, M, xc, yc, J, c):  # noqa: ANN001, ANN202
-    """dL/d(centre in the camera): through its pixel, its depth, and the Jacobian J."""
+    """Return dL/d(centre in the camera frame), through the pixel, the depth and the Jacobian J."""
     inverse, ux, uy = J[0], J[1], J[2]
     d_j00 = dV0[0] * M[0] + dV0[1] * M[1] + dV0[2] * M[2]
     d_j02 = dV0[0] * M[6] + dV0[1] * M[7] + dV0[2] * M[8]
@@ -86,7 +90,7 @@ def _point_gradient(g_u, g_v, g_depth, dV0, dV1, M, xc, yc, J, c):  # noqa: ANN0
 
 @inner
 def _quat_gradient(q, N):  # noqa: ANN001, ANN202
-    """dL/d(raw quaternion) from N = dL/dR_q (nine vectors by rows), through the normalisation."""
+    """Return dL/d(unnormalised quaternion) from N = dL/dR_q (nine vectors by rows)."""
     w, x, y, z = q[0], q[1], q[2], q[3]
     gw = 2.0 * (x * (N[7] - N[5]) + y * (N[2] - N[6]) + z * (N[3] - N[1]))
     gx = 2.0 * (w * (N[7] - N[5]) + y * (N[1] + N[3]) + z * (N[2] + N[6]) - 2.0 * (x * (N[4] + N[8])))
@@ -98,7 +102,7 @@ def _quat_gradient(q, N):  # noqa: ANN001, ANN202
 
 @inner
 def _write_shape(out, at, wide, c, q, M, dM, s):  # noqa: ANN001, ANN202
-    """Gradients of log scales and quaternion: the columns of dL/dM belong to the ellipsoid's axes."""
+    """Write the gradients of log scales and quaternion; columns of dL/dM belong to the ellipsoid's axes."""
     store(out, SCALE * wide + at, M[0] * dM[0] + M[3] * dM[3] + M[6] * dM[6])
     store(out, (SCALE + 1) * wide + at, M[1] * dM[1] + M[4] * dM[4] + M[7] * dM[7])
     store(out, (SCALE + 2) * wide + at, M[2] * dM[2] + M[5] * dM[5] + M[8] * dM[8])
@@ -121,8 +125,8 @@ def _write_shape(out, at, wide, c, q, M, dM, s):  # noqa: ANN001, ANN202
 
 
 @kernel
-def _chain_group(params, stride, index, first, c, sums, lane_at, out, wide, pose):  # noqa: ANN001, ANN202
-    """Gradients of a group of splats into out[row * wide + first], their pose sums into pose[8]."""
+def _project_backward_group(params, stride, index, first, c, sums, lane_at, out, wide, pose):  # noqa: ANN001, ANN202
+    """Write the gradients of a group of splats to out[row * wide + first], their pose sums to pose[8]."""
     xc, yc, zc = camera_point(params, stride, index, first, c)
     q, Rq = rotation(params, stride, index, first)
     M, s = axes(params, stride, index, first, c, Rq)
@@ -142,9 +146,9 @@ def _chain_group(params, stride, index, first, c, sums, lane_at, out, wide, pose
     store(out, COLOUR * wide + first, gather(sums, 6, lane_at, 0))
     store(out, (COLOUR + 1) * wide + first, gather(sums, 7, lane_at, 0))
     store(out, (COLOUR + 2) * wide + first, gather(sums, 8, lane_at, 0))
-    store(out, SCREEN_GRADIENT * wide + first, root(g_u * g_u + g_v * g_v))
+    store(out, SCREEN_GRADIENT * wide + first, sqrt(g_u * g_u + g_v * g_v))
     store(out, WEIGHT * wide + first, gather(sums, 10, lane_at, 0))
-    # exp(phi) turns the centre and the axes alike: dL/dphi = p x dL/dp + sum over axes M_k x dL/dM_k.
+    # exp(phi) rotates the centre p and the axes M_k: dL/dphi = p x dL/dp + sum over axes M_k x dL/dM_k.
     turn_x, turn_y, turn_z = yc * gz - zc * gy, zc * gx - xc * gz, xc * gy - yc * gx
     turn_x = (
         turn_x + (M[3] * dM[6] - M[6] * dM[3]) + (M[4] * dM[7] - M[7] * dM[4]) + (M[5] * dM[8] - M[8] * dM[5])
@@ -160,30 +164,31 @@ def _chain_group(params, stride, index, first, c, sums, lane_at, out, wide, pose
 
 
 @kernel
-def chain(  # noqa: ANN201
-    counter, params, stride, index, visible, camera, slots, places, first_pair, pair_count, out, pose_sums,  # noqa: ANN001
+def project_backward(  # noqa: ANN201
+    counter, params, stride, index, visible, camera, slots, list_row, first_pair, pair_count, out, pose_sums,  # noqa: ANN001
 ):  # fmt: skip
-    """Gradients float32 [GRADIENTS, wide] by visible splat into `out` (flat), and of the pose: [CHUNKS, 6].
+    """Write the gradients of visible splats to `out` float32 [GRADIENTS, wide], of the pose to `pose_sums`.
 
-    The pose is summed in float64 over fixed parts, so that the number of threads changes nothing.
+    The pose gradient is summed in float64 per batch, `pose_sums` [BATCHES, 6], so that the result does not
+    depend on the number of threads.
     """
     wide = out.shape[1]
     flat = out.reshape(-1)
     sums, pose = aligned_floats(SLOT * LANES), aligned_floats(8)
     lane_at = np.arange(LANES, dtype=np.int32) * np.int32(SLOT)
-    size = chunk_size(visible)
+    size = batch_size(visible)
     while True:
-        chunk = atomic_next(counter, 0)
-        if chunk >= CHUNKS:
+        batch = atomic_next(counter, 0)
+        if batch >= BATCHES:
             return
-        pose_sums[chunk, :] = 0.0
-        stop = min(visible, (chunk + 1) * size)
-        for first in range(chunk * size, stop, LANES):
-            _gather_sums(slots, places, first_pair, pair_count, first, stop, sums)
-            if not any_lane(gather(sums, 10, lane_at, 0) > 0.0):  # hidden behind others: no gradient at all
+        pose_sums[batch, :] = 0.0
+        stop = min(visible, (batch + 1) * size)
+        for first in range(batch * size, stop, LANES):
+            _gather_sums(slots, list_row, first_pair, pair_count, first, stop, sums)
+            if not any_lane(gather(sums, 10, lane_at, 0) > 0.0):  # all occluded: the gradients are zero
                 for row in range(GRADIENTS):
-                    store(flat, row * wide + first, repeat(np.float32(0.0)))
+                    store(flat, row * wide + first, broadcast(np.float32(0.0)))
                 continue
-            _chain_group(params, stride, index, first, camera, sums, lane_at, flat, wide, pose)
+            _project_backward_group(params, stride, index, first, camera, sums, lane_at, flat, wide, pose)
             for k in range(6):
-                pose_sums[chunk, k] += pose[k]
+                pose_sums[batch, k] += pose[k]
