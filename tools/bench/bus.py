@@ -128,8 +128,7 @@ def bench_bus(
 def _with_publisher(
     endpoint: str, image_bytes: int, plain: bool, hz: float, body: Callable[[Bus], Callable[[], None]]
 ) -> None:
-    """Declare subscriptions with `body`, then run the function that
-    it returns while a publisher is running."""
+    """Declare subscriptions with `body`, then run the function it returns while a publisher runs."""
     context = multiprocessing.get_context("spawn")
     go, stop = context.Event(), context.Event()
     process = context.Process(target=_publish, args=(endpoint, go, stop, image_bytes, hz, plain))

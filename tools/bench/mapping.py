@@ -124,8 +124,11 @@ def _map_drive(
     recording: TruthDataset, mapper: Mapper, bench: MapBenchSettings, prior: Prior, mask: Mask | None,
     timer: _MapperTimer, log: Log,
 ) -> tuple[int, int]:  # fmt: skip
-    """Map the keyframes in order, with a fixed number of steps each;
-    return the numbers of used and rejected ones."""
+    """Map the keyframes in order, with a fixed number of steps each.
+
+    Returns:
+        The numbers of used and of rejected keyframes.
+    """
     used, refused, last = 0, 0, None
     for index, posed_image in enumerate(recording.posed_images):
         if index % HELD_OUT_EVERY == HELD_OUT_AT or not _moved(last, posed_image.T_map_camera, bench):

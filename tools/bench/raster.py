@@ -1,5 +1,7 @@
-"""`bench raster`: time of forward, L1 loss (colour and depth) and
-backward on a synthetic room, and of plain torch."""
+"""`bench raster`: time of rendering with L1 loss and backward pass on a synthetic room.
+
+Plain torch is the reference.
+"""
 
 from __future__ import annotations
 
@@ -49,14 +51,14 @@ def synthetic_room(gaussians: int, seed: int = 0) -> tuple[np.ndarray, np.ndarra
     params[SCALE : SCALE + 2, :gaussians] = np.log(rng.uniform(0.01, 0.04, (2, gaussians)))
     params[SCALE + 2, :gaussians] = np.log(0.004)
     params[OPACITY, :gaussians] = rng.normal(1.0, 1.0, gaussians)
-    eye, target = np.array([0.5, 0.5, 1.3]), np.array([6.0, 4.4, 0.9])
-    forward = (target - eye) / np.linalg.norm(target - eye)
+    viewpoint, target = np.array([0.5, 0.5, 1.3]), np.array([6.0, 4.4, 0.9])
+    forward = (target - viewpoint) / np.linalg.norm(target - viewpoint)
     right = np.cross(forward, [0.0, 0.0, 1.0])
     right /= np.linalg.norm(right)
-    T = np.eye(4)
-    T[:3, :3] = np.stack([right, np.cross(forward, right), forward])
-    T[:3, 3] = -T[:3, :3] @ eye
-    return params, T
+    T_camera_map = np.eye(4)
+    T_camera_map[:3, :3] = np.stack([right, np.cross(forward, right), forward])
+    T_camera_map[:3, 3] = -T_camera_map[:3, :3] @ viewpoint
+    return params, T_camera_map
 
 
 def _faces(rng: np.random.Generator) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:

@@ -1,5 +1,4 @@
-"""Calibrates a recorded drive, or still pairs of images and scans with a
-board: reads the data, calls the library."""
+"""Calibrates camera and lidar from a recorded drive, or from still images and scans of a board."""
 
 from __future__ import annotations
 
@@ -33,8 +32,10 @@ _HALF_BOARD_M = 0.26  # beams this close to the board's centre can hit it
 
 
 def tracked_pairs(drive: RecordedDrive, clock_offset_ns: int = 0) -> list[TrackedPair]:
-    """Track corners over 1 s, every 0.25 s of the drive;
-    `clock_offset_ns` is added to the stamps of the images."""
+    """Track corners over 1 s, every 0.25 s of the drive.
+
+    `clock_offset_ns` is added to the stamps of the images.
+    """
     cv2.setNumThreads(1)
     height = round(drive.camera.height_px * _WIDTH_PX / drive.camera.width_px)
     camera = drive.undistort.pinhole.resized(_WIDTH_PX, height)
@@ -78,8 +79,9 @@ def calibrate_motion(drive: RecordedDrive, free: tuple[str, ...] = PARAMETERS) -
 def calibrate_board(
     folder: Path, rig_file: Path, corner_counts: tuple[int, int], square_m: float
 ) -> dict[str, Any]:
-    """Estimate yaw and offsets of the lidar in the camera from
-    `images/<stamp_ns>.png` and `lasers/<stamp_ns>.pcd`.
+    """Estimate yaw and offsets of the lidar in the camera from images and scans of a board.
+
+    Reads `images/<stamp_ns>.png` and `lasers/<stamp_ns>.pcd`.
 
     Args:
         corner_counts: inner corners of the chessboard, (columns, rows).
@@ -206,7 +208,9 @@ def motion_report(drive: RecordedDrive, found: MotionCalibration) -> dict[str, A
 
 
 def with_clock_offset(drive: RecordedDrive, offset_ns: int) -> RecordedDrive:
-    """Return the drive with `offset_ns` added to the stamps of its
-    images, to test whether it is estimated."""
+    """Return the drive with `offset_ns` added to the stamps of its images.
+
+    This tests whether calibration estimates the offset.
+    """
     images = [image.model_copy(update={"stamp_ns": image.stamp_ns + offset_ns}) for image in drive.images]
     return replace(drive, images=images)

@@ -62,8 +62,10 @@ class TruthDataset:
         return rgb if self.undistort is None else self.undistort(rgb)
 
     def true_depth(self, index: int) -> np.ndarray | None:
-        """Return the true depth of image `index`, float32 [H, W] in metres,
-        NaN where unknown; None without a file."""
+        """Return the true depth of image `index`, float32 [H, W] in metres, NaN where unknown.
+
+        None if the image has no depth file.
+        """
         file = self.path / "depth_gt" / f"{self.posed_images[index].stamp_ns}.png"
         return read_depth_png(file) if file.is_file() else None
 

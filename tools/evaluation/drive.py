@@ -67,14 +67,18 @@ class RecordedDrive:
         return self.scans[i] if abs(int(self._middles[i]) - stamp_ns) < 150_000_000 else None
 
     def beams_at(self, stamp_ns: int, excluded: np.ndarray | None = None) -> Beams:
-        """Return the beams of the nearest scan, moved to a stamp; beams
-        in the mask `excluded` are left out."""
+        """Return the beams of the nearest scan, moved to a stamp.
+
+        Beams in the mask `excluded` bool [beams] are left out.
+        """
         scan = self.scan_near(stamp_ns)
         return NO_BEAMS if scan is None else self.beams_of(scan, stamp_ns, excluded)
 
     def beams_of(self, scan: TimedScan, stamp_ns: int, excluded: np.ndarray | None = None) -> Beams:
-        """Return the beams of one scan, moved to a stamp; beams in the
-        mask `excluded` bool [beams] are left out."""
+        """Return the beams of one scan, moved to a stamp.
+
+        Beams in the mask `excluded` bool [beams] are left out.
+        """
         points, index = scan_points(
             scan.ranges_m, scan.angle_min_rad, scan.angle_increment_rad, scan.range_min_m, scan.range_max_m
         )

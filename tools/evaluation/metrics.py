@@ -66,8 +66,10 @@ class MethodErrors:
     def add_held(
         self, run: str, depth: np.ndarray, sigma: np.ndarray | None, uv: np.ndarray, z: np.ndarray
     ) -> None:
-        """Add the errors at held-out beams of one frame that the truth
-        confirms; `run` is "third" or "blocks"."""
+        """Add the errors at held-out beams of one frame that the truth confirms.
+
+        `run` is "third" or "blocks".
+        """
         error = np.abs(at_pixels(depth, uv) - z)
         ok = np.isfinite(error)
         self.held.setdefault(run, []).append(error[ok])
@@ -116,8 +118,10 @@ def at_pixels(values: np.ndarray, uv: np.ndarray) -> np.ndarray:
 
 
 def confirmed_by_truth(truth: np.ndarray, uv: np.ndarray, z: np.ndarray) -> np.ndarray:
-    """Return bool [N]: whether the true depth at a beam's pixel
-    agrees with its optical z within 5 cm + 2 %."""
+    """Return bool [N]: whether the true depth confirms a beam.
+
+    A beam is confirmed if the true depth at its pixel agrees with its optical z within 5 cm + 2 %.
+    """
     t = at_pixels(truth, uv)
     with np.errstate(invalid="ignore"):
         return np.abs(t - z) <= 0.05 + 0.02 * t

@@ -93,8 +93,10 @@ def _score(
 
 
 def top_view_of_map(record: RunRecord, T_world_map: np.ndarray, path_m: np.ndarray) -> np.ndarray | None:
-    """Return a BGR image of the map without its ceiling and with a path
-    [K, >= 2] in the world frame; None if empty."""
+    """Return a BGR image of the map without its ceiling, with a path on it; None if empty.
+
+    `path_m` is [K, >= 2] in the world frame.
+    """
     store = assemble_map(record.chunks)
     if not store.count:
         return None

@@ -25,8 +25,9 @@ from beamsplat.tools.report.scores import (
 
 
 def open_truth(data: Path, groundtruth: Path | None = None) -> GroundTruth:
-    """Open a recording with its ground truth: a TUM file,
-    groundtruth.txt beside the bag, or poses in the bag.
+    """Open a recording with its ground truth.
+
+    True poses are taken from a TUM file, groundtruth.txt beside the bag, or the bag.
 
     Raises:
         UserError: there are no poses to compare with.
@@ -86,8 +87,10 @@ def report_of_runs(rows: list[dict[str, Any]], data: Path, truth: GroundTruth) -
 
 
 def compare_pairs(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return the ratios of lidar to camera localization for each depth
-    source: CPU load, speed, position error."""
+    """Return the ratios of lidar to camera localization for each depth source.
+
+    Ratios are of CPU load, speed and position error.
+    """
     means = {name: _means([r for r in rows if r["name"] == name]) for name in {r["name"] for r in rows}}
     out = []
     for row in {r["name"]: r for r in rows}.values():

@@ -50,10 +50,10 @@ def aligned_poses(record: RunRecord, truth: GroundTruth) -> tuple[np.ndarray, np
 
 
 def rigid_offset(T_found: np.ndarray, T_true: np.ndarray) -> np.ndarray:
-    """Return the rigid transform [4, 4] that best maps poses [N, 4, 4]
-    to the true ones: mean rotation, mean shift.
+    """Return the rigid transform [4, 4] that best maps poses [N, 4, 4] to the true ones.
 
-    Maps are aligned by all poses, because an error of the first pose alone would move the whole map.
+    It is the mean rotation and the mean shift. Maps are aligned by all poses, because an error of the first
+    pose alone would move the whole map.
     """
     U, _, Vt = np.linalg.svd(np.sum(T_true[:, :3, :3] @ np.swapaxes(T_found[:, :3, :3], 1, 2), axis=0))
     R = U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt
@@ -62,8 +62,7 @@ def rigid_offset(T_found: np.ndarray, T_true: np.ndarray) -> np.ndarray:
 
 
 def pose_errors(T_found: np.ndarray, T_true: np.ndarray) -> dict[str, Any]:
-    """Return the RMSE per axis and combined as in the paper, and the
-    ATE after rigid and similarity alignment.
+    """Return the RMSE per axis and combined, and the ATE after rigid and similarity alignment.
 
     The combined RMSE is the quadratic mean over the three axes. Both arguments are float64 [N, 4, 4].
     """
@@ -148,8 +147,10 @@ def speed_and_load(record: RunRecord, costs: RunCosts, cores: int) -> dict[str, 
 
 
 def depth_errors(record: RunRecord, truth: GroundTruth) -> dict[str, Any]:
-    """Return the depth RMSE, scaled and unscaled: at the beams as in the
-    paper's Table IV, and over all true pixels."""
+    """Return the depth RMSE, scaled and unscaled.
+
+    It is computed at the beams as in the paper's Table IV, and over all pixels with true depth.
+    """
     series: dict[str, list[Any]] = {"stamps_ns": [], "scaled_m": [], "unscaled_m": []}
     square = {"scaled": [], "unscaled": [], "dense_scaled": [], "dense_unscaled": []}
     for stamp_ns, path in sorted(truth.depth_files.items()):

@@ -57,10 +57,9 @@ def top_view(
 
 
 def _extent(xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return corners (low, high) float64 [2] that contain 99 % of the
-    points xy [2, N] per axis, plus a margin.
+    """Return corners (low, high) float64 [2] of the points xy [2, N] with a margin.
 
-    A few outliers must not shrink the rest of the map.
+    They contain 99 % of the points per axis. A few outliers must not shrink the rest of the map.
     """
     return np.percentile(xy, 0.5, axis=1) - _EDGE_M, np.percentile(xy, 99.5, axis=1) + _EDGE_M
 

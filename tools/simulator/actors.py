@@ -23,8 +23,10 @@ PROBE_RAYS = 192  # rays of the light probe at the middle of an actor
 
 @dataclass(frozen=True)
 class ActorPath:
-    """A closed stadium-shaped path between two points, followed a whole
-    number of rounds per lap of the robot."""
+    """A closed stadium-shaped path between two points.
+
+    An actor follows it for a whole number of rounds per lap of the robot.
+    """
 
     start_m: tuple[float, float]
     end_m: tuple[float, float]
@@ -38,8 +40,7 @@ class ActorPath:
         return 2.0 * float(np.hypot(*np.subtract(self.end_m, self.start_m))) + 2.0 * np.pi * TURN_RADIUS_M
 
     def at(self, time_s: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return positions [N, 2] in metres, headings [N] in radians
-        and travelled distances [N] in metres."""
+        """Return positions [N, 2], headings [N] in radians and travelled distances [N] in metres."""
         travelled_m = (self.rounds * np.asarray(time_s) / self.lap_s + self.phase) * self.round_length_m
         a, b = np.array(self.start_m), np.array(self.end_m)
         length = float(np.linalg.norm(b - a))
@@ -78,8 +79,9 @@ def choose_actor_paths(
     *,
     tries: int = 500,
 ) -> list[ActorPath]:
-    """Choose the random paths that the robot sees most, among those
-    that keep away from it and from each other.
+    """Choose those random paths that the robot sees most.
+
+    Paths keep away from the robot and from each other.
 
     Args:
         count: number of actors.
@@ -219,8 +221,10 @@ class ActorLighting:
         )
 
     def _light(self, mesh: SceneMesh) -> np.ndarray:
-        """Return irradiance / pi float32 [V, 3]: a light probe at the body's
-        middle, plus the lamps visible from there."""
+        """Return irradiance / pi float32 [V, 3] of a body.
+
+        It is the sum of a light probe at the middle of the body and of the lamps visible from there.
+        """
         middle = ((mesh.vertices_m.min(axis=0) + mesh.vertices_m.max(axis=0)) / 2).astype(np.float64)
         hit = self._caster.first_hit_from(middle, self._rays)
         sent = np.where((hit >= 0)[:, None], self._leaving[hit], 0.0)
@@ -242,8 +246,10 @@ class ActorLighting:
 
     @staticmethod
     def _occluder_spheres(mesh: SceneMesh, kind: str) -> list[list[float]]:
-        """Return spheres (x, y, z, radius) that cast contact shadows:
-        feet and body, or the decks of a cart."""
+        """Return spheres (x, y, z, radius) that cast contact shadows.
+
+        They are at the feet and the body of a person, or at the decks of a cart.
+        """
         low, high = mesh.vertices_m.min(axis=0), mesh.vertices_m.max(axis=0)
         x, y = ((low + high) / 2)[:2]
         if kind == "cart":

@@ -43,8 +43,10 @@ def linear_to_srgb(linear: np.ndarray) -> np.ndarray:
 
 
 def build_atlas(textures: dict[str, tuple[np.ndarray, tuple[float, float]]]) -> Atlas:
-    """Build the atlas of textures by name: sRGB float32 [H, W, 3], row 0
-    on top, and the size of a repeat in metres."""
+    """Build the atlas of textures by name.
+
+    Textures are sRGB float32 [H, W, 3], row 0 on top, each with the size of one repeat in metres.
+    """
     names = tuple(textures)
     shape = (len(names), MAX_LEVELS)
     offset, widths, heights = (np.zeros(shape, np.int32) for _ in range(3))

@@ -14,8 +14,10 @@ READ_NOISE = 4e-6  # read noise variance, in squared units of exposed light
 
 
 def distort(points: np.ndarray, distortion: tuple[float, ...]) -> np.ndarray:
-    """Return the distorted normalised coordinates [N, 2] of ideal ones;
-    plumb_bob (k1, k2, p1, p2, k3) as in OpenCV."""
+    """Return the distorted normalised coordinates [N, 2] of ideal ones.
+
+    The model is plumb_bob (k1, k2, p1, p2, k3) as in OpenCV.
+    """
     k1, k2, p1, p2, k3 = distortion
     x, y = points[:, 0], points[:, 1]
     r2 = x * x + y * y
@@ -60,8 +62,10 @@ def undistort(points: np.ndarray, distortion: tuple[float, ...], iterations: int
 def pixel_rays(
     width: int, height: int, K: np.ndarray, distortion: tuple[float, ...] = (0.0,) * 5
 ) -> np.ndarray:
-    """Return the ray of each pixel in the camera frame, float64 [H, W, 3]
-    with z = 1; pixel centres are integers."""
+    """Return the ray of each pixel in the camera frame, float64 [H, W, 3] with z = 1.
+
+    Pixel centres are at integer coordinates.
+    """
     u, v = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
     points = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1]], axis=-1).reshape(-1, 2)
     if any(distortion):
@@ -70,8 +74,10 @@ def pixel_rays(
 
 
 def _tone_table() -> np.ndarray:
-    """Return sRGB values 0..255, float32 [4 * WHITE + 1], of exposed light
-    0..4: linear to 0.7, then a soft shoulder."""
+    """Return sRGB values 0..255, float32 [4 * WHITE + 1], of exposed light 0..4.
+
+    The tone curve is linear up to 0.7 and has a soft shoulder above.
+    """
     x = np.arange(4 * WHITE + 1) / WHITE
     knee = 0.7
     soft = knee + (1 - knee) * (1 - np.exp(-(x - knee) / (1 - knee)))

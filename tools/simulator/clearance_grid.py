@@ -43,8 +43,10 @@ class ClearanceGrid:
         return ndimage.map_coordinates(self.clearance_m, [at[..., 1], at[..., 0]], order=1, mode="nearest")
 
     def relax(self, route_m: np.ndarray, wanted_m: float = 0.5, *, iterations: int = 160) -> np.ndarray:
-        """Return a closed route [N, 2] smoothed and pushed away from obstacles
-        (elastic band, Quinlan and Khatib 1993)."""
+        """Return a closed route [N, 2] smoothed and pushed away from obstacles.
+
+        This is an elastic band (Quinlan and Khatib 1993).
+        """
         gradient = np.stack(np.gradient(self.clearance_m, RESOLUTION_M)[::-1], axis=0)
         points = route_m.copy()
         for _ in range(iterations):

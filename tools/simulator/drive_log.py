@@ -27,7 +27,7 @@ class SimulationStep:
     T_world_body: np.ndarray  # float64 [4, 4], true pose at the first beam
     odometry_stamps_ns: np.ndarray  # int64 [M], up to the end of this revolution
     odometry: WheelReadings
-    truth_poses: np.ndarray  # float64 [M, 3], true pose_world_body at the odometry stamps
+    true_pose_world_body: np.ndarray  # float64 [M, 3], true pose_world_body at the odometry stamps
 
 
 def simulate_lidar(

@@ -160,8 +160,10 @@ def _render_task(task: tuple[float, str]) -> None:
 def render_frames(
     spec: FrameSpec, times_s: list[float], jobs: int, progress: Callable[[int, int], None]
 ) -> list[Path]:
-    """Return the files of the frames at all times of the lap; missing
-    ones are rendered by `jobs` processes."""
+    """Return the files of the frames at all times of the lap.
+
+    Frames that are not cached are rendered by `jobs` processes.
+    """
     paths = [frame_path(spec, t) for t in times_s]
     missing = [(t, str(p)) for t, p in zip(times_s, paths) if not p.exists()]
     done = len(paths) - len(missing)

@@ -88,8 +88,10 @@ def _part(
 
 
 def _refine(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Bisect triangles at their longest edge until none is longer
-    than EDGE_M; columns 3.. are interpolated."""
+    """Bisect triangles at their longest edge until no edge is longer than EDGE_M.
+
+    Columns 3.. of the vertices are interpolated.
+    """
     done_v, done_f, offset = [], [], 0
     for _ in range(14):
         corners = vertices[faces]

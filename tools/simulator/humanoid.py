@@ -35,8 +35,10 @@ def clothes(rng: np.random.Generator) -> Textures:
 
 @dataclass(frozen=True)
 class BodyLink:
-    """A rigid link whose origin is its joint; the joint is at `joint_m`
-    in the frame of link `parent` (-1: root)."""
+    """A rigid link; its origin is its joint.
+
+    The joint is at `joint_m` in the frame of the link `parent`; -1 is the root.
+    """
 
     mesh: SceneMesh
     parent: int

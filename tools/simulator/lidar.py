@@ -99,10 +99,10 @@ class SimulatedLidar:
         distance: np.ndarray,
         moving: np.ndarray,
     ) -> None:
-        """Shorten, in place, the `distance` of those `beams` (indices)
-        that hit an object, and mark them `moving`.
+        """Shorten the `distance` of those beams that hit a dynamic object, in place.
 
-        Only beams that pass through the bounding circle of an object are cast.
+        `beams` are the indices of the beams to test; hits are marked in `moving`. Only beams that pass
+        through the bounding circle of an object are cast.
         """
         for index, (x, y, radius) in enumerate(dynamic_scene.bounding_circles(time_s)):
             to = np.array([x, y]) - origins[beams, :2]

@@ -24,8 +24,10 @@ BLOCK = 1 << 16  # vertices processed at once, bounds memory
 def bake(
     mesh: SceneMesh, atlas: Atlas, lights: tuple[Light, ...], caster: RayCaster, *, rays: int = GATHER_RAYS
 ) -> np.ndarray:
-    """Return irradiance / pi of every vertex, linear RGB float32 [V,
-    3]: the radiance of a white surface there."""
+    """Return irradiance / pi of every vertex, linear RGB float32 [V, 3].
+
+    It is the radiance that a white surface would have there.
+    """
     direct = np.zeros((len(mesh.vertices_m), 3), np.float32)
     for number, light in enumerate(lights):
         direct += _direct(mesh, light, caster, number)
@@ -72,8 +74,10 @@ def _arriving(
     sample_normals: np.ndarray,
     caster: RayCaster,
 ) -> np.ndarray:
-    """Return the relative irradiance float32 [N] of points [N, 3] from
-    one sample of the light each; 0 in shadow."""
+    """Return the relative irradiance float32 [N] of points [N, 3]; 0 in shadow.
+
+    Each point receives light from one sample of the area light.
+    """
     to = samples - points
     squared = np.maximum(np.einsum("ij,ij->i", to, to), 1e-3)
     cos_here = np.einsum("ij,ij->i", to, normals)
@@ -89,8 +93,10 @@ def _arriving(
 def _light_points(
     light: Light, rng: np.random.Generator, points: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return stratified points on the light for receivers [N, 3], and the
-    normals there; [N, LIGHT_SAMPLES, 3] each."""
+    """Return stratified points on the light for receivers [N, 3], and the normals there.
+
+    Both are [N, LIGHT_SAMPLES, 3].
+    """
     count = len(points)
     centre = np.array(light.centre_m, np.float32)
     if light.radius_m > 0:
@@ -126,8 +132,10 @@ def _light_points(
 
 
 def _gather(mesh: SceneMesh, caster: RayCaster, rays: int) -> np.ndarray:
-    """Return int32 [V, rays]: the triangle that each cosine-weighted
-    ray hits; -1 = none, -2 = a back face."""
+    """Return int32 [V, rays]: the triangle that each cosine-weighted ray hits.
+
+    -1 is no hit, -2 a hit on a back face.
+    """
     count = len(mesh.vertices_m)
     hits = np.empty((count, rays), np.int32)
     k = np.arange(rays, dtype=np.float32)
@@ -183,8 +191,10 @@ def _bounce(mesh: SceneMesh, atlas: Atlas, direct: np.ndarray, hits: np.ndarray)
 
 
 def _smoothing_matrix(mesh: SceneMesh) -> sparse.csr_matrix:
-    """Return a row-stochastic matrix [V, V] that averages each vertex with
-    its neighbours, to remove sampling noise."""
+    """Return a row-stochastic matrix [V, V] that averages each vertex with its neighbours.
+
+    It removes sampling noise.
+    """
     i = mesh.triangles[:, [0, 1, 2, 1, 2, 0]].ravel()
     j = mesh.triangles[:, [1, 2, 0, 0, 1, 2]].ravel()
     n = len(mesh.vertices_m)

@@ -242,8 +242,10 @@ class MeshBuilder:
 
 
 def grid_triangles(rows: int, columns: int) -> np.ndarray:
-    """Return triangles int [2 (rows-1) (columns-1), 3] of a row-major
-    vertex grid: rows go up, columns right."""
+    """Return the triangles int [2 (rows-1) (columns-1), 3] of a row-major vertex grid.
+
+    Rows go up, columns to the right.
+    """
     index = np.arange(rows * columns).reshape(rows, columns)
     a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]
     return np.stack([a, b, c, a, c, d], axis=-1).reshape(-1, 3)

@@ -42,8 +42,10 @@ class RayCaster:
         return self.first_hit(np.broadcast_to(origin_m.astype(np.float32), directions.shape), directions)
 
     def occluded(self, origins: np.ndarray, directions: np.ndarray, reach: np.ndarray) -> np.ndarray:
-        """Return bool [N]: whether a ray hits a triangle within `reach`
-        [N], in units of its direction's length."""
+        """Return bool [N]: whether each ray hits a triangle within `reach` [N].
+
+        `reach` is in units of the length of the direction.
+        """
         hit = self._scene.run(
             np.ascontiguousarray(origins, dtype=np.float32),
             np.ascontiguousarray(directions, dtype=np.float32),

@@ -195,10 +195,12 @@ def _lidar_records(
         log.moving.append(np.packbits(step.moving))
         log.through_glass.append(np.packbits(step.through_glass))
         log.stamps_ns.append(step.odometry_stamps_ns)
-        log.truth.append(step.truth_poses)
+        log.truth.append(step.true_pose_world_body)
         odometry = step.odometry
-        lags = 2e6 + rng.exponential(3e5, len(odometry.pose) + 1)
-        for k, (stamp, T) in enumerate(zip(step.odometry_stamps_ns.tolist(), se2_to_se3(odometry.pose))):
+        lags = 2e6 + rng.exponential(3e5, len(odometry.pose_odom_body) + 1)
+        for k, (stamp, T) in enumerate(
+            zip(step.odometry_stamps_ns.tolist(), se2_to_se3(odometry.pose_odom_body))
+        ):
             data = w.odometry_bytes(stamp, T, float(odometry.speed_m_s[k]), float(odometry.turn_rad_s[k]))
             received = push("/odom", stamp + int(lags[k]), data)
             push("/tf", received + 100, w.tf_bytes(stamp, [(w.ODOM, w.BASE, T)]))

@@ -105,10 +105,10 @@ def sample(
     vy: float,
     out: np.ndarray,
 ) -> None:
-    """Write the texture at (u, v) to out [3], averaged over the
-    pixel's footprint with edges (ux, vx), (uy, vy).
+    """Write the texture at (u, v), averaged over the footprint of a pixel, to out [3].
 
-    Anisotropic filtering: several trilinear lookups along the longer edge.
+    The footprint is a parallelogram with edges (ux, vx) and (uy, vy). Anisotropic filtering: several
+    trilinear lookups along the longer edge.
     """
     width, height = s.width_px[texture, 0], s.height_px[texture, 0]
     long, short = np.hypot(ux * width, vx * height), np.hypot(uy * width, vy * height)
@@ -146,8 +146,10 @@ def sample(
 
 @kernel
 def rotate_rays(table: np.ndarray, R: np.ndarray, out: np.ndarray) -> None:
-    """Write table [N, 3] rotated by R [3, 3] to out [N, 3]; not by
-    matmul, because BLAS would start threads."""
+    """Write the rays of table [N, 3], rotated by R [3, 3], to out [N, 3].
+
+    A kernel instead of matmul, because BLAS would start threads.
+    """
     for i in range(len(table)):
         x, y, z = table[i, 0], table[i, 1], table[i, 2]
         for c in range(3):
@@ -246,8 +248,10 @@ def _sphere_occlusion(
 
 @kernel
 def mark_cones(rays: np.ndarray, axis: np.ndarray, cosine: np.ndarray, inside: np.ndarray) -> None:
-    """Set inside [N] for the rays [N, 3] within one of the cones with
-    unit axes [A, 3] and half-angle cosines [A]."""
+    """Set inside [N] for the rays [N, 3] within one of the cones.
+
+    Cones have unit axes [A, 3] and cosines of the half-angle [A].
+    """
     for i in range(len(rays)):
         x, y, z = rays[i, 0], rays[i, 1], rays[i, 2]
         squared = x * x + y * y + z * z
@@ -259,8 +263,7 @@ def mark_cones(rays: np.ndarray, axis: np.ndarray, cosine: np.ndarray, inside: n
 
 @kernel
 def find_edges(surface: np.ndarray, depth: np.ndarray, edge: np.ndarray) -> None:
-    """Set edge [H, W] at pixels whose right or lower neighbour shows
-    another surface or a depth jump, and there."""
+    """Set edge [H, W] at both pixels where neighbours show different surfaces or a depth jump."""
     height, width = surface.shape
     for y in range(height):
         for x in range(width):

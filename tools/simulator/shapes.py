@@ -57,8 +57,10 @@ def lathe(
     smooth: bool = True,
     fit: bool = False,
 ) -> None:
-    """Draw a surface of revolution about z; `smooth` shades the bands
-    between profile points as one surface."""
+    """Draw a surface of revolution about z.
+
+    `smooth` shades the bands between profile points as one surface.
+    """
     points = np.array(profile, dtype=np.float64)
     angle = np.linspace(0.0, 2.0 * np.pi, sides + 1)
     ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -219,8 +221,10 @@ def curtain(
     wave_m: float = 0.03,
     folds: float = 7.0,
 ) -> None:
-    """Draw hanging cloth in the local xz plane with folds in y,
-    facing -y; `left` is its lower left corner."""
+    """Draw hanging cloth in the local xz plane, facing -y, with folds in y.
+
+    `left` is its lower left corner.
+    """
     columns, rows = int(folds * 8) + 1, max(2, int(height_m / 0.15))
     s, t = np.meshgrid(np.linspace(0.0, 1.0, columns), np.linspace(0.0, 1.0, rows))
     phase = 2 * np.pi * folds * s + 0.8 * np.sin(3.0 * s + 2.0 * t)

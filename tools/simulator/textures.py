@@ -25,11 +25,10 @@ def fractal(
     beta: float = 1.6,
     stretch: tuple[float, float] = (1.0, 1.0),
 ) -> np.ndarray:
-    """Return periodic 1/f^beta noise [H, W] of zero mean and unit
-    variance; `stretch` (x, y) elongates its grain.
+    """Return periodic 1/f^beta noise [H, W] of zero mean and unit variance.
 
-    There is one noise field per set of arguments, which the generator shifts and mirrors: one Fourier
-    transform per texture would take longer than everything else in a home.
+    `stretch` (x, y) elongates its grain. There is one noise field per set of arguments, which the generator
+    shifts and mirrors: one Fourier transform per texture would take longer than everything else in a home.
     """
     noise = _noise(height, width, beta, stretch)
     rolled = np.roll(noise, tuple(rng.integers(0, (height, width)).tolist()), axis=(0, 1))

@@ -15,7 +15,7 @@ from beamsplat.common.geometry.transforms import so3_exp
 from beamsplat.tools.simulator.camera import TONE, WHITE, ImageSensor, pixel_rays
 from beamsplat.tools.simulator.clearance_grid import ClearanceGrid
 from beamsplat.tools.simulator.frames import FrameRenderer, depth_mm
-from beamsplat.tools.simulator.render import ray_table
+from beamsplat.tools.simulator.render import RenderedView, ray_table
 from beamsplat.tools.simulator.settings import CameraSettings
 from beamsplat.tools.simulator.shade import ShadingTables, sample
 from beamsplat.tools.simulator.writer import transform_json, write_png
@@ -34,8 +34,10 @@ class DepthViews:
     distortion: tuple[float, ...]
 
     def count(self, points_m: np.ndarray, normals: np.ndarray) -> np.ndarray:
-        """Return int32 [P]: in how many views each point [P, 3] is
-        visible from the side of its normal [P, 3]."""
+        """Return int32 [P]: in how many views each point [P, 3] is visible.
+
+        A point is visible only from the side of its normal [P, 3].
+        """
         return _count_views(
             np.ascontiguousarray(points_m, dtype=np.float64),
             np.ascontiguousarray(normals, dtype=np.float64),
@@ -177,20 +179,24 @@ def write_extra_views(
     for _ in range(count * 40):
         if len(views) == count:
             break
-        T, offset = _random_view(frame_renderer, space, path, times_s, rng)
-        if T is None:
+        T_world_camera, offset = _random_view(frame_renderer, space, path, times_s, rng)
+        if T_world_camera is None:
             continue
         seen_ratio = _seen_ratio(
-            frame_renderer, depth_views, T, frame_renderer.render_static(T, small), small.rays
+            frame_renderer,
+            depth_views,
+            T_world_camera,
+            frame_renderer.render_static(T_world_camera, small),
+            small.rays,
         )
         if seen_ratio < MIN_SEEN_RATIO:
             continue
-        view = frame_renderer.render_static(T, table)
+        view = frame_renderer.render_static(T_world_camera, table)
         name = f"{len(views):03d}"
         bgr = sensor.develop(view.radiance, frame_renderer.gain, np.random.default_rng(0))
         (folder / f"{name}.jpg").write_bytes(sensor.jpeg(bgr))
         write_png(folder / f"{name}_depth.png", depth_mm(view.depth_z_m))
-        pose = transform_json(T)
+        pose = transform_json(T_world_camera)
         views.append(
             {
                 "file": f"{name}.jpg",
@@ -233,28 +239,36 @@ def _random_view(
     times_s: np.ndarray,
     rng: np.random.Generator,
 ) -> tuple[np.ndarray | None, float]:
-    T = frame_renderer.camera_pose(float(rng.choice(times_s)))
+    T_world_camera = frame_renderer.camera_pose(float(rng.choice(times_s)))
     sideways = rng.uniform(*OFF_PATH_M) * rng.choice([-1.0, 1.0])
-    place = T[:3, 3] + T[:3, 0] * sideways + T[:3, 2] * rng.uniform(-0.2, 0.2)
-    offset = float(np.linalg.norm(path - place[:2], axis=1).min())
-    if not OFF_PATH_M[0] <= offset <= OFF_PATH_M[1] or space.clearance(place[None, :2])[0] < 0.18:
+    position = (
+        T_world_camera[:3, 3]
+        + T_world_camera[:3, 0] * sideways
+        + T_world_camera[:3, 2] * rng.uniform(-0.2, 0.2)
+    )
+    offset = float(np.linalg.norm(path - position[:2], axis=1).min())
+    if not OFF_PATH_M[0] <= offset <= OFF_PATH_M[1] or space.clearance(position[None, :2])[0] < 0.18:
         return None, offset
     turn = so3_exp([0.0, 0.0, rng.normal(0.0, 0.25)])
     tilt = so3_exp([rng.normal(0.0, 0.05), 0.0, rng.normal(0.0, 0.02)])
     out = np.eye(4)
-    out[:3, :3] = turn @ T[:3, :3] @ tilt
-    out[:3, 3] = [place[0], place[1], rng.uniform(0.38, 0.62)]
+    out[:3, :3] = turn @ T_world_camera[:3, :3] @ tilt
+    out[:3, 3] = [position[0], position[1], rng.uniform(0.38, 0.62)]
     return out, offset
 
 
 def _seen_ratio(
-    frame_renderer: FrameRenderer, depth_views: DepthViews, T: np.ndarray, view: object, rays: np.ndarray
+    frame_renderer: FrameRenderer,
+    depth_views: DepthViews,
+    T_world_camera: np.ndarray,
+    view: RenderedView,
+    rays: np.ndarray,
 ) -> float:
-    depth, triangle = view.depth_z_m.ravel(), view.triangle.ravel()  # type: ignore[attr-defined]
+    depth, triangle = view.depth_z_m.ravel(), view.triangle.ravel()
     valid = triangle >= 0
-    points = (rays.reshape(-1, 3) * depth[:, None])[valid] @ T[:3, :3].T + T[:3, 3]
+    points = (rays.reshape(-1, 3) * depth[:, None])[valid] @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
     n = frame_renderer.renderer.scene.normal[triangle[valid]]
-    flip = np.sign(np.einsum("ij,ij->i", n, T[:3, 3] - points))[:, None]
+    flip = np.sign(np.einsum("ij,ij->i", n, T_world_camera[:3, 3] - points))[:, None]
     return float(np.sum(depth_views.count(points, n * flip) > 0) / len(depth))
 
 

@@ -14,7 +14,7 @@ from beamsplat.tools.simulator.settings import WheelSettings
 class WheelReadings:
     """M odometry readings; the very first one defines the odom frame."""
 
-    pose: np.ndarray  # float64 [M, 3], pose_odom_body (x, y, yaw)
+    pose_odom_body: np.ndarray  # float64 [M, 3], (x, y, yaw)
     speed_m_s: np.ndarray  # float64 [M]
     turn_rad_s: np.ndarray  # float64 [M]
 
@@ -26,36 +26,38 @@ class WheelOdometrySimulator:
         self._noise, self._rng = settings.noise, rng
         self.scale = 1.0 + _signed(rng, settings.scale_error)
         self.turn = 1.0 + _signed(rng, settings.turn_error)
-        self._pose = np.zeros(3)
-        self._last_pose: np.ndarray | None = None
+        self._pose_odom_body = np.zeros(3)
+        self._last_pose_world_body: np.ndarray | None = None
 
-    def measure(self, pose: np.ndarray, period_s: float) -> WheelReadings:
+    def measure(self, pose_world_body: np.ndarray, period_s: float) -> WheelReadings:
         """Return the readings at the next true poses.
 
         Args:
-            pose: float64 [M, 3], pose_world_body; continues from the last pose of the previous call.
+            pose_world_body: float64 [M, 3]; continues from the last pose of the previous call.
             period_s: time between two poses.
         """
-        first = pose[:1] if self._last_pose is None else self._last_pose[None]
-        chain = np.concatenate([first, pose])
-        self._last_pose = pose[-1].copy()
+        first = (
+            pose_world_body[:1] if self._last_pose_world_body is None else self._last_pose_world_body[None]
+        )
+        chain = np.concatenate([first, pose_world_body])
+        self._last_pose_world_body = pose_world_body[-1].copy()
         move = np.diff(chain[:, :2], axis=0)
         turn = np.asarray(wrap_angle(np.diff(chain[:, 2])))
         middle = chain[:-1, 2] + turn / 2
         forward = move[:, 0] * np.cos(middle) + move[:, 1] * np.sin(middle)
         # Slip grows with the motion: while the robot stands still, its odometry does not drift.
-        noise = self._rng.standard_normal((2, len(pose)))
+        noise = self._rng.standard_normal((2, len(pose_world_body)))
         forward = forward * self.scale + self._noise * np.sqrt(np.abs(forward) * 0.01) * noise[0]
         turn = (
             turn * self.turn
             + self._noise * np.sqrt(np.abs(turn) * 0.02 + np.abs(forward) * 0.0005) * noise[1]
         )
-        yaw = self._pose[2] + np.cumsum(turn)
+        yaw = self._pose_odom_body[2] + np.cumsum(turn)
         along = yaw - turn / 2
-        x = self._pose[0] + np.cumsum(forward * np.cos(along))
-        y = self._pose[1] + np.cumsum(forward * np.sin(along))
+        x = self._pose_odom_body[0] + np.cumsum(forward * np.cos(along))
+        y = self._pose_odom_body[1] + np.cumsum(forward * np.sin(along))
         out = np.stack([x, y, yaw], axis=1)
-        self._pose = out[-1].copy()
+        self._pose_odom_body = out[-1].copy()
         out[:, 2] = wrap_angle(out[:, 2])
         return WheelReadings(out, forward / period_s, turn / period_s)
 

@@ -103,8 +103,10 @@ def tf_bytes(stamp_ns: int, links: list[tuple[str, str, np.ndarray]]) -> bytes:
 
 
 def odometry_bytes(stamp_ns: int, T_odom_body: np.ndarray, speed_m_s: float, turn_rad_s: float) -> bytes:
-    """Return the CDR bytes of a nav_msgs/Odometry with covariances as
-    drivers of planar robots report them."""
+    """Return the CDR bytes of a nav_msgs/Odometry.
+
+    The covariances are typical of drivers of planar robots.
+    """
     point = _make("geometry_msgs/msg/Point", *(float(v) for v in T_odom_body[:3, 3]))
     pose = _make("geometry_msgs/msg/Pose", point, _quaternion(T_odom_body[:3, :3]))
     covariances = [np.diag([v, v, 1e6, 1e6, 1e6, w]).ravel() for v, w in ((1e-2, 2e-2), (1e-3, 2e-3))]
@@ -189,8 +191,10 @@ def transform_json(T: np.ndarray) -> dict[str, Any]:
 
 
 def write_camera_json(path: Path, camera: CameraSettings, lidar: LidarSettings, faults: Faults) -> None:
-    """Write the true calibration, and in `published_T_base_camera` the
-    one in the bag's tf (differs if faulty)."""
+    """Write the true calibration.
+
+    `published_T_base_camera` is the mount in the bag's tf, which differs if it has a fault.
+    """
     K = camera.K
     text: dict[str, Any] = {
         "width": camera.width_px,

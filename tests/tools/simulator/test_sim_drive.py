@@ -61,7 +61,7 @@ def test_odometry_drifts_two_to_three_percent_of_the_way(drive):
     truth = drive.pose_at(times)
     for seed in range(6):
         odometry = WheelOdometrySimulator(WheelSettings(), np.random.default_rng(seed)).measure(truth, 0.02)
-        T_true, T_odom = se2_to_se3(truth), se2_to_se3(odometry.pose)
+        T_true, T_odom = se2_to_se3(truth), se2_to_se3(odometry.pose_odom_body)
         shares = []
         for start in range(0, len(times) - 250, 250):
             stop = start + 250
@@ -76,16 +76,16 @@ def test_odometry_without_errors_is_the_truth_however_the_calls_are_split(drive)
     truth = drive.pose_at(np.arange(0.0, 20.0, 0.02))
     whole = WheelOdometrySimulator(perfect, np.random.default_rng(0)).measure(truth, 0.02)
     expected = inverse(se2_to_se3(truth[0])) @ se2_to_se3(truth)
-    np.testing.assert_allclose(se2_to_se3(whole.pose)[:, :2, 3], expected[:, :2, 3], atol=2e-3)
+    np.testing.assert_allclose(se2_to_se3(whole.pose_odom_body)[:, :2, 3], expected[:, :2, 3], atol=2e-3)
     wheels = WheelOdometrySimulator(perfect, np.random.default_rng(0))
-    parts = [wheels.measure(part, 0.02).pose for part in np.array_split(truth, 7)]
-    np.testing.assert_allclose(np.concatenate(parts), whole.pose, atol=1e-9)
+    parts = [wheels.measure(part, 0.02).pose_odom_body for part in np.array_split(truth, 7)]
+    np.testing.assert_allclose(np.concatenate(parts), whole.pose_odom_body, atol=1e-9)
 
 
 def test_odometry_reports_the_speed_of_its_own_poses(drive):
     truth = drive.pose_at(np.arange(0.0, 20.0, 0.02))
     odometry = WheelOdometrySimulator(WheelSettings(noise=0.0), np.random.default_rng(3)).measure(truth, 0.02)
-    moved = np.linalg.norm(np.diff(odometry.pose[:, :2], axis=0), axis=1) / 0.02
+    moved = np.linalg.norm(np.diff(odometry.pose_odom_body[:, :2], axis=0), axis=1) / 0.02
     np.testing.assert_allclose(odometry.speed_m_s[1:], moved, atol=2e-3)
     assert odometry.speed_m_s[0] == 0.0
 
