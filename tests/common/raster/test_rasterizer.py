@@ -131,7 +131,7 @@ def test_warm_compiles_all_kernels_of_a_training_step():
         warm="from beamsplat.common.raster.warm import warm; warm()",
         use="""
             import numpy as np
-            from beamsplat.common.raster.optimiser import GaussianArrays, rate_rows
+            from beamsplat.common.raster.optimiser import GaussianArrays, learning_rates
             from beamsplat.common.raster.rasterizer import Rasterizer
             from tests.common.raster.test_rasterizer import scene
 
@@ -140,7 +140,7 @@ def test_warm_compiles_all_kernels_of_a_training_step():
             arrays.append(params[:, :count])
             render = rasterizer.render(arrays.params, arrays.count, camera, T, np.ones(3))
             gradients = rasterizer.backward(render, weights)
-            arrays.step(rasterizer.team, gradients, rate_rows(1e-3, 1e-3, 1e-3, 1e-3, 1e-3))
+            arrays.step(rasterizer.team, gradients, learning_rates(1e-3, 1e-3, 1e-3, 1e-3, 1e-3))
             assert len(gradients.index) > 0
         """,
     )
