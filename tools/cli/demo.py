@@ -84,6 +84,10 @@ def demo(
         *(set_ or ()),
     )
     deployment = load_deployment(DEPLOYMENT, overrides)
+    if deployment.nodes["localization"].get("kind") == "lidar":  # the robot's half of the session
+        options = {"save": str(out / "session" / "robot"), **deployment.nodes["localization"]}
+        nodes = {**deployment.nodes, "localization": options}
+        deployment = deployment.model_copy(update={"nodes": nodes})
     seen_by: list[RunObserver] = []
 
     def monitor(supervisor: Supervisor) -> RunObserver:

@@ -1,4 +1,4 @@
-"""`beamsplat export` and `beamsplat render`: saved maps as files that others open, and as pictures."""
+"""`beamsplat export` and `beamsplat render`: write saved maps as files, images and videos."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from rich.console import Console
 
 from beamsplat.common.errors import UserError, reason
 from beamsplat.common.files.persist import make_folder
-from beamsplat.tools.cli.options import writable
+from beamsplat.tools.cli.options import session_folder, writable
 
 console = Console(stderr=True)
 FORMATS = {
@@ -21,8 +21,9 @@ FORMATS = {
 SessionArgument = Annotated[
     Path,
     typer.Argument(
+        callback=session_folder,
         help="Folder written by `mapping.session = DIR`; or the deployment file (.toml) of a running system, "
-        "whose mapper is asked"
+        "whose mapper is asked",
     ),
 ]
 ThreadsOption = Annotated[int, typer.Option(min=1, help="Threads of the rasterizer")]
@@ -170,7 +171,7 @@ def _cost_db(store: Any, params: Any, arrays: dict[str, Any], threads: int) -> f
     from beamsplat.common.mapfiles.scores import psnr_db
     from beamsplat.common.mapfiles.state import keyframe_views
     from beamsplat.common.mapfiles.store import GaussianStore
-    from beamsplat.common.mapfiles.video import pictures
+    from beamsplat.common.mapfiles.video import render_path
 
     views = keyframe_views(arrays)
     views = views[:: -(-len(views) // _VIEWS) or 1]
@@ -178,7 +179,7 @@ def _cost_db(store: Any, params: Any, arrays: dict[str, Any], threads: int) -> f
         return float("nan")
     coarse, poses = GaussianStore(), [view.T_map_camera for view in views]
     coarse.add(params, 0)
-    pairs = zip(*(pictures(s, views[0].camera, poses, threads) for s in (store, coarse)))
+    pairs = zip(*(render_path(s, views[0].camera, poses, threads) for s in (store, coarse)))
     return float(np.mean([psnr_db(a / 255.0, b / 255.0) for a, b in pairs]))
 
 
@@ -197,12 +198,12 @@ def _views(store: Any, arrays: dict[str, Any], threads: int) -> Any:
     from rich.progress import track
 
     from beamsplat.common.mapfiles.state import keyframe_views
-    from beamsplat.common.mapfiles.surface import rendered_views
+    from beamsplat.common.mapfiles.surface import render_depth_views
 
     views = [(view.camera, view.T_map_camera) for view in keyframe_views(arrays)]
     if not views:
         raise UserError("the session has no keyframes to look from")
-    rendered = rendered_views(store, views, threads)
+    rendered = render_depth_views(store, views, threads)
     return track(rendered, "looking", len(views), console=console, transient=True)
 
 
@@ -217,7 +218,7 @@ def _points(path: Path, store: Any, arrays: dict[str, Any], cell_m: float, threa
 def _mesh(path: Path, store: Any, arrays: dict[str, Any], voxel_m: float, threads: int) -> str:
     import numpy as np
 
-    from beamsplat.common.mapfiles.mesh import TsdfVolume, remove_small_pieces, surface_nets
+    from beamsplat.common.mapfiles.mesh import TsdfVolume, remove_small_components, surface_nets
     from beamsplat.common.mapfiles.surface import points_of, write_ply
 
     views = list(_views(store, arrays, threads))
@@ -232,7 +233,7 @@ def _mesh(path: Path, store: Any, arrays: dict[str, Any], voxel_m: float, thread
     low, high = np.percentile(corners, 5.0, axis=0), np.percentile(corners, 95.0, axis=0)
     field = TsdfVolume.around(low, high, voxel_m)
     field.add(views)
-    mesh = remove_small_pieces(surface_nets(field), _LEAST_FACES)
+    mesh = remove_small_components(surface_nets(field), _LEAST_FACES)
     write_ply(path, mesh.vertices_m, mesh.colours, mesh.faces)
     return f"{len(mesh.faces)} triangles"
 
@@ -287,7 +288,7 @@ def render(
     from rich.progress import track
 
     from beamsplat.common.mapfiles.state import keyframe_views, store_of
-    from beamsplat.common.mapfiles.video import pictures, write_video
+    from beamsplat.common.mapfiles.video import render_path, write_video
 
     arrays, _ = _open(session)
     views, store = keyframe_views(arrays), store_of(arrays)
@@ -299,7 +300,7 @@ def render(
         camera = camera.resized(width, round(width * camera.height_px / camera.width_px))
     poses = _poses(path, store, arrays, views, frames)
     bar = track(
-        pictures(store, camera, poses, threads), "rendering", len(poses), console=console, transient=True
+        render_path(store, camera, poses, threads), "rendering", len(poses), console=console, transient=True
     )
     written = write_video(out, bar, fps, len(poses))
     print(f"{written[0]}: {len(poses)} pictures of {camera.width_px}x{camera.height_px}")
@@ -310,13 +311,13 @@ def _poses(path: str, store: Any, arrays: dict[str, Any], views: list[Any], fram
 
     from beamsplat.common.geometry.trajectory import read_tum
     from beamsplat.common.geometry.transforms import inverse
-    from beamsplat.common.mapfiles.video import along, drive, orbit
+    from beamsplat.common.mapfiles.video import interpolate_path, orbit_poses, trajectory_poses
 
     if path == "orbit":
-        return orbit(store, float(np.median([view.T_map_camera[2, 3] for view in views])), frames)
+        return orbit_poses(store, float(np.median([view.T_map_camera[2, 3] for view in views])), frames)
     if path == "drive":
-        return drive([view.T_map_camera for view in views], frames)
+        return interpolate_path([view.T_map_camera for view in views], frames)
     trajectory = read_tum(Path(path))
     if len(trajectory) == 0:
         raise UserError(f"{path}: has no poses")
-    return along(trajectory, inverse(arrays["extra_taken_T_camera_body"][0]), frames)
+    return trajectory_poses(trajectory, inverse(arrays["extra_taken_T_camera_body"][0]), frames)

@@ -1,4 +1,7 @@
-"""`beamsplat session`: what a saved map holds, halves joined, drives merged, the superfluous pruned."""
+"""`beamsplat session`: inspect saved maps, add the robot half, merge two maps, prune.
+
+A session has two halves: the edge half (Gaussians and keyframes) and the robot half (the lidar map).
+"""
 
 from __future__ import annotations
 
@@ -10,19 +13,21 @@ import typer
 from rich.console import Console
 
 from beamsplat.common.errors import UserError
-from beamsplat.tools.cli.options import writable
+from beamsplat.tools.cli.options import session_folder, writable
 
 console = Console(stderr=True)
-app = typer.Typer(no_args_is_help=True, help="Saved maps: look into them, join, merge, prune.")
-SessionArgument = Annotated[Path, typer.Argument(help="Folder written by `mapping.session = DIR`")]
+app = typer.Typer(no_args_is_help=True, help="Saved maps: inspect, join, merge, prune.")
+SessionArgument = Annotated[
+    Path, typer.Argument(callback=session_folder, help="Folder written by `mapping.session = DIR`")
+]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object")]
 ROBOT_MANIFEST = "lidar_map.json"
-_AROUND_NS = 60_000_000_000  # a keyframe lies that close to the scans of its own drive
+_AROUND_NS = 60_000_000_000  # largest time between a keyframe and the scans of the same drive
 
 
 @app.command()
 def info(session: SessionArgument, as_json: JsonOption = False) -> None:
-    """Says what a session holds, and whether its two halves are there.
+    """Print what a session contains, and which of its two halves exist.
 
     Example: beamsplat session info map
     """
@@ -49,18 +54,18 @@ def info(session: SessionArgument, as_json: JsonOption = False) -> None:
         print(
             f"edge half: {edge['keyframes']} keyframes, {edge['gaussians']} Gaussians on {edge['anchors']} "
             f"anchors, {edge['steps']} steps, {edge['bytes'] / 1e6:.1f} MB; {edge['keyframes_on_disk']} "
-            f"keyframes on disk, {edge['keyframes_newer']} of them newer than the checkpoint; on the robot's "
-            f"map {edge['map_uuid'] or 'without a UUID'}"
+            f"keyframes on disk, {edge['keyframes_newer']} of them newer than the checkpoint; robot map "
+            f"{edge['map_uuid'] or 'without a UUID'}"
         )
     if robot is None:
-        print("robot half: none (`beamsplat session join` puts one in)")
+        print("robot half: none (`beamsplat session join` adds it)")
     else:
-        print(f"robot half: {robot['submaps']} submaps, {robot['keynodes']} keynodes, "
+        print(f"robot half: {robot['submaps']} submaps, {robot['keynodes']} nodes, "
               f"{robot['constraints']} constraints, map {robot['uuid'] or 'without a UUID'}")  # fmt: skip
 
 
 def _map_uuid(arrays: dict[str, Any]) -> str:
-    """Of the robot's map that a session hangs on; "" where nobody said."""
+    """Return the UUID of the robot map that the anchors of a session belong to; "" if it is unknown."""
     return str(next(iter(arrays.get("extra_map_uuid", [])), ""))
 
 
@@ -77,7 +82,7 @@ def join(
         Path, typer.Argument(help="State of the lidar SLAM: `localization.save`, or `state/` of `slam`")
     ],
 ) -> None:
-    """Puts the robot's half into a session, and the map where the robot's last optimisation says.
+    """Add the robot half to a session, and move the map to the anchor poses of the robot's last optimisation.
 
     Example: beamsplat session join map robot_state
     """
@@ -90,32 +95,35 @@ def join(
     folder.lock()
     try:
         slam.save(folder.robot)
-        places = {id: se2_to_se3(pose) for id, pose in slam.anchors().items()}
-        _write(folder, with_anchors(arrays, places))
+        T_map_anchor = {id: se2_to_se3(pose) for id, pose in slam.anchors().items()}
+        _write(folder, with_anchors(arrays, T_map_anchor))
     finally:
         folder.unlock()
-    missing = [a for a in arrays["anchor_id"].tolist() if a >= 0 and a not in places]
-    more = f"; {len(missing)} anchors that the robot has given up stay where they were" if missing else ""
-    print(f"{session}: {len(places)} submaps joined{more}")
+    missing = [a for a in arrays["anchor_id"].tolist() if a >= 0 and a not in T_map_anchor]
+    more = f"; {len(missing)} anchors that the robot has removed keep their pose" if missing else ""
+    print(f"{session}: {len(T_map_anchor)} submaps joined{more}")
 
 
 @app.command()
 def merge(
-    first: Annotated[Path, typer.Argument(help="Session whose map frame stays")],
-    second: Annotated[Path, typer.Argument(help="Session of another drive through the same place")],
+    first: Annotated[Path, typer.Argument(callback=session_folder, help="Session whose map frame is kept")],
+    second: Annotated[
+        Path, typer.Argument(callback=session_folder, help="Session of another drive through the same place")
+    ],
     out: Annotated[
-        Path, typer.Option(callback=writable, help="Folder for the merged session; must not hold one")
+        Path, typer.Option(callback=writable, help="Folder for the merged session; must not contain one")
     ],
     place: Annotated[
         str,
         typer.Option(
-            metavar="X,Y,DEG", help="Where the second map's origin lies in the first; default: found by lidar"
+            metavar="X,Y,DEG",
+            help="Pose of the second map's origin in the first map; default: found by lidar",
         ),
     ] = "",
 ) -> None:
-    """Makes one map of two drives. Where the second lies, its scans tell, if both have a robot half.
+    """Merge the maps of two drives. If both have a robot half, lidar scans align them.
 
-    Seams mend as a mapper resumes on the merged session and ticks or keyframes come.
+    A mapper that resumes on the merged session optimises the borders between the two maps.
 
     Examples:
 
@@ -128,20 +136,22 @@ def merge(
     from beamsplat.common.geometry.transforms import se2_to_se3
     from beamsplat.common.mapfiles.session import SessionFolder
     from beamsplat.tools.sessions.edit import merged, with_anchors
-    from beamsplat.tools.sessions.merge import once
+    from beamsplat.tools.sessions.merge import deduplicated, merge_doubt
 
     (folder_a, a), (folder_b, b) = _open(first), _open(second)
     target = SessionFolder(out)
     if target.exists():
-        raise UserError(f"{out}: holds a session already; choose another folder")
+        raise UserError(f"{out}: contains a session already; choose another folder")
     both = all((folder.robot / ROBOT_MANIFEST).is_file() for folder in (folder_a, folder_b))
     slams = [load_slam(folder.robot) for folder in (folder_a, folder_b)] if both else []
-    pose_a_b = _placed(place) if place else _found(first, second, slams)
+    alignment = None if place else _aligned(first, second, slams)
+    pose_a_b = _parsed_pose(place) if alignment is None else alignment.pose_a_b
     known = [*a["anchor_id"].tolist(), *(slams[0].pose_graph.submaps if slams else [])]
-    offset = max([*known, -1]) + 2  # -1 is the second's odom origin
+    offset = max([*known, -1]) + 2  # -1 is the odom origin of the second map
     arrays = merged(a, b, se2_to_se3(pose_a_b), offset)
     target.create()
     target.lock()
+    doubt = ""
     try:
         if slams:
             from beamsplat.services.localization.lidar2d.merge import merge_into
@@ -150,34 +160,41 @@ def merge(
             slams[0].save(target.robot)
             arrays = with_anchors(arrays, {id: se2_to_se3(pose) for id, pose in slams[0].anchors().items()})
             console.print(f"{loops} loop closures between the drives")
-        held = set(arrays["keyframe_id"].tolist())
+            if alignment is not None:
+                doubt = merge_doubt(alignment.agreeing, alignment.queried, loops)
+        ids = set(arrays["keyframe_id"].tolist())
         for folder in (folder_a, folder_b):
-            for id in held.intersection(folder.keyframe_ids()):
+            for id in ids.intersection(folder.keyframe_ids()):
                 target.write_keyframe(id, *folder.read_keyframe(id))
         before = arrays["store_params"].shape[1]
-        arrays = once(
-            target, arrays, offset, lambda views: track(views, "looking", console=console, transient=True)
+        arrays = deduplicated(
+            target, arrays, offset, lambda views: track(views, "comparing", console=console, transient=True)
         )
         _write(target, arrays)
     finally:
         target.unlock()
     left = arrays["store_params"].shape[1]
-    print(
-        f"{out}: {len(held)} keyframes, {left} Gaussians; {before - left} that both maps had are there once"
-    )
+    print(f"{out}: {len(ids)} keyframes, {left} Gaussians; {before - left} duplicates removed")
+    if doubt:
+        console.print(
+            f"{out} was written, but do not trust it: {doubt}. Look at it (beamsplat export {out} --to ply), "
+            "or remove it and merge again with --place X,Y,DEG", style="red", markup=False, soft_wrap=True,
+        )  # fmt: skip
+        raise typer.Exit(3)
 
 
 @app.command()
 def prune(
     session: SessionArgument,
     opacity: Annotated[
-        float, typer.Option(min=0.0, max=1.0, help="Leave out Gaussians fainter than this")
+        float, typer.Option(min=0.0, max=1.0, help="Remove Gaussians with a lower opacity")
     ] = 0.05,
     keyframes: Annotated[
-        int | None, typer.Option(min=1, help="Keep so many keyframes, spread over the drive")
+        int | None,
+        typer.Option(min=1, help="How many keyframes to keep, evenly spaced in time; default: all"),
     ] = None,
 ) -> None:
-    """Makes a session smaller: faint Gaussians, keyframes beyond a number, and their pictures on disk.
+    """Make a session smaller: remove faint Gaussians and surplus keyframes, also from the disk.
 
     Example: beamsplat session prune map --keyframes 400
     """
@@ -205,10 +222,10 @@ def _bytes(path: Path) -> int:
 
 
 def _open(session: Path) -> tuple[Any, dict[str, Any]]:
-    """(folder, arrays of its valid state).
+    """Return (folder, arrays of its last checkpoint).
 
     Raises:
-        UserError: no session, or nothing saved in it.
+        UserError: there is no session, or no checkpoint in it.
     """
     from beamsplat.common.mapfiles.session import SessionFolder
 
@@ -218,8 +235,8 @@ def _open(session: Path) -> tuple[Any, dict[str, Any]]:
         raise UserError(f"{session}: nothing has been saved in this session yet")
     newer = _newer(folder, arrays)
     if newer:
-        console.print(f"[yellow]{session}: {newer} keyframes came after the checkpoint and are left out; "
-                      "a mapper that resumes takes them in[/]")  # fmt: skip
+        console.print(f"[yellow]{session}: {newer} keyframes are newer than the checkpoint and not included; "
+                      "a mapper that resumes inserts them[/]")  # fmt: skip
     return folder, arrays
 
 
@@ -238,15 +255,15 @@ def _write(folder: Any, arrays: dict[str, Any]) -> None:
         folder.remove_blocks(folder.block_numbers())  # all Gaussians are in the state now
     except OSError as error:
         raise UserError(
-            f"{folder.path}: not written ({error.strerror}); the state before is whole"
+            f"{folder.path}: not written ({error.strerror}); the previous state is still valid"
         ) from error
 
 
 def load_slam(path: Path) -> Any:
-    """The lidar SLAM of a robot half.
+    """Load the lidar SLAM of a robot half.
 
     Raises:
-        UserError: no state there, or not readable.
+        UserError: there is no saved state, or it cannot be read.
     """
     import numpy as np
 
@@ -256,22 +273,27 @@ def load_slam(path: Path) -> Any:
 
     folder = path if (path / ROBOT_MANIFEST).is_file() else path / "state"
     try:
-        # Where the lidar sits matters for new scans only.
+        # T_body_lidar is needed for new scans only.
         return LidarSlam.load(folder, LidarSlamSettings(), np.eye(4))
     except MapStateError as error:
         raise UserError(str(error)) from error
 
 
 def _same_drive(session: Path, robot: Path, arrays: dict[str, Any], slam: Any) -> None:
-    """Raises UserError where the map does not hang on that SLAM's: by their UUIDs, or where a state is from
-    before it had one, because the keyframes were not taken while those scans were."""
+    """Check that a session and a lidar map are of the same drive.
+
+    Their UUIDs are compared; for older states without a UUID, the stamps of keyframes and scans.
+
+    Raises:
+        UserError: they are of different drives, or one of them is empty.
+    """
     import numpy as np
 
     mine, its = _map_uuid(arrays), slam.pose_graph.uuid
     if mine and its and mine != its:
         raise UserError(
-            f"{robot}: is the robot's half of map {its}, but {session} hangs on map {mine}: it is of another "
-            "drive. Give the state that localization.save wrote in the session's own drive, or use `merge`"
+            f"{robot}: is the robot half of map {its}, but {session} belongs to map {mine}: it is of another "
+            "drive. Give the state that localization.save wrote in the drive of the session, or use `merge`"
         )
 
     scans_ns = np.array([node.stamp_ns for node in slam.pose_graph.nodes.values()])
@@ -282,11 +304,12 @@ def _same_drive(session: Path, robot: Path, arrays: dict[str, Any], slam: Any) -
     if inside.mean() < 0.9:
         raise UserError(
             f"{robot}: only {inside.mean():.0%} of the keyframes of {session} were taken during its scans: "
-            "it is the half of another drive"
+            "it is the robot half of another drive"
         )
 
 
-def _placed(text: str) -> Any:
+def _parsed_pose(text: str) -> Any:
+    """Return the planar pose float64 [3] (x m, y m, yaw rad) in X,Y,DEG."""
     import numpy as np
 
     try:
@@ -296,19 +319,24 @@ def _placed(text: str) -> Any:
     return np.array([x_m, y_m, np.radians(yaw_deg)])
 
 
-def _found(first: Path, second: Path, slams: list[Any]) -> Any:
+def _aligned(first: Path, second: Path, slams: list[Any]) -> Any:
+    """Return the alignment of the second map to the first from lidar scans; its pose_a_b is float64 [3].
+
+    Raises:
+        UserError: a robot half is missing, or the scans do not agree on a pose.
+    """
     if not slams:
         raise UserError(
-            f"{first} or {second} has no robot half to find the place with: join them first "
-            "(`beamsplat session join`), or say where the second lies with --place X,Y,DEG"
+            f"{first} or {second} has no robot half, which the alignment needs: add it first "
+            "(`beamsplat session join`), or give the pose of the second map with --place X,Y,DEG"
         )
     from beamsplat.services.localization.lidar2d.merge import find_alignment
 
     alignment = find_alignment(*slams)
     if alignment is None:
         raise UserError(
-            f"the scans of {second} find no place in {first} that enough of them agree on: "
-            "say where it lies with --place X,Y,DEG"
+            f"the scans of {second} do not agree on one pose in {first}: "
+            "give the pose of the second map with --place X,Y,DEG"
         )
-    console.print(f"{alignment.agreeing} of {alignment.queried} scans agree on where the second drive lies")
-    return alignment.pose_a_b
+    console.print(f"{alignment.agreeing} of {alignment.queried} scans agree on the pose of the second map")
+    return alignment

@@ -96,7 +96,10 @@ def _measurements(source: Any) -> Any:
 
 
 def eval_slam(
-    folder: Annotated[Path, typer.Argument(help="Folder written by `beamsplat slam`")],
+    folder: Annotated[
+        Path,
+        typer.Argument(help="Folder written by `beamsplat slam`, or a trajectory (TUM file of body poses)"),
+    ],
     relations: Annotated[Path | None, typer.Option(help="Relations file (Kuemmerle et al. 2009)")] = None,
     groundtruth: Annotated[Path | None, typer.Option(help="TUM file of the true body poses")] = None,
     as_json: JsonOption = False,
@@ -108,6 +111,8 @@ def eval_slam(
         beamsplat eval slam map --relations intel.relations
 
         beamsplat eval slam map --groundtruth groundtruth.txt --json
+
+        beamsplat eval slam out/demo/trajectory.tum --groundtruth groundtruth.txt
     """
     if (relations is None) == (groundtruth is None):
         raise UserError("eval slam needs either --relations FILE or --groundtruth FILE")
@@ -135,7 +140,13 @@ def _against_relations(folder: Path, path: Path) -> dict[str, Any]:
 
     from beamsplat.services.localization.lidar2d.metrics import read_relations, relation_errors
 
-    stamps_ns, pose_map_body = poses_of(folder, "trajectory.tum")
+    folder, name = (folder.parent, folder.name) if folder.is_file() else (folder, "trajectory.tum")
+    if not (folder / "figures.json").is_file():
+        raise UserError(
+            f"{folder}: no figures.json, which says where the lidar is mounted; relations need a folder that "
+            "`beamsplat slam` wrote"
+        )
+    stamps_ns, pose_map_body = poses_of(folder, name)
     relation_stamps_ns, relative = read_relations(path)
     pose_body_lidar = np.array(json.loads((folder / "figures.json").read_text())["T_body_lidar"])
     return asdict(relation_errors(stamps_ns, pose_map_body, relation_stamps_ns, relative, pose_body_lidar))
@@ -147,7 +158,12 @@ def _against_truth(folder: Path, path: Path) -> dict[str, Any]:
 
     figures: dict[str, Any] = {}
     true_stamps_ns, pose_world_body = poses_of(path.parent, path.name)
-    for prefix, name in (("", "trajectory.tum"), ("online_", "online.tum")):
+    names = {"": "trajectory.tum", "online_": "online.tum"}
+    if folder.is_file():
+        folder, names = folder.parent, {"": folder.name}
+    elif not (folder / names["online_"]).is_file():
+        del names["online_"]
+    for prefix, name in names.items():
         stamps_ns, pose_map_body = poses_of(folder, name)
         inside = (stamps_ns >= true_stamps_ns[0]) & (stamps_ns <= true_stamps_ns[-1])
         if not inside.any():

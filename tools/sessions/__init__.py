@@ -1,1 +1,1 @@
-"""Editing saved maps: merge, prune, move to new anchors."""
+"""Editing of saved maps: merging, pruning, moving anchors."""

@@ -1,8 +1,8 @@
-"""Where two maps made one show the same surface, one of them goes: doubled walls stand in each other's way.
+"""Removal of duplicate surfaces after merging two maps.
 
-At every keyframe both maps are rendered alone. Where both cover a pixel at the same depth, the one that is
-nearer to the picture wins it; each Gaussian at such pixels gathers wins and losses, and goes with more losses
-than wins.
+Both maps are rendered separately from every keyframe. Where both cover a pixel at the same depth, the render
+with the smaller colour error wins the pixel. Each Gaussian there counts wins and losses of its pixels;
+Gaussians with more losses than wins are removed.
 """
 
 from __future__ import annotations
@@ -23,44 +23,44 @@ from beamsplat.common.raster.rasterizer import Rasterizer
 from beamsplat.services.mapping.keyframe import RgbdKeyframe, compress
 from beamsplat.services.mapping.mapper import HALF
 
-_COVERED = 0.5  # alpha from which a map shows a surface
-_SAME_M, _SAME_SHARE = 0.15, 0.10  # two depths within both are one surface
-_BLUR_PX = 11  # neighbours go together: a mosaic of both maps has seams everywhere
+_COVERED = 0.5  # alpha above which a map shows a surface
+_SAME_M, _SAME_RATIO = 0.15, 0.10  # largest depth difference of one surface: absolute plus relative
+_BLUR_PX = 11  # colour errors are averaged: neighbouring pixels should choose the same map
 
 
 def without_duplicates(
-    arrays: Arrays,  # of two maps, as `merged` gives them
+    arrays: Arrays,  # of two maps, from `merged`
     second: np.ndarray,  # bool [N]: Gaussians of the second map
-    opened: Callable[[int], RgbdKeyframe],  # a keyframe by its id; raises ValueError
-    watched: Callable[[list[KeyframeView]], Iterable[KeyframeView]] = iter,
+    decode: Callable[[int], RgbdKeyframe],  # reads a keyframe by its id; raises ValueError
+    progress: Callable[[list[KeyframeView]], Iterable[KeyframeView]] = iter,  # may show a progress bar
 ) -> np.ndarray:
-    """bool [N]: the Gaussians that stay. Keyframes that cannot be opened have no say."""
-    stores = [_part(arrays, ~second), _part(arrays, second)]
+    """Return bool [N]: the Gaussians to keep. Keyframes that cannot be decoded are skipped."""
+    stores = [_selected(arrays, ~second), _selected(arrays, second)]
     votes = [np.zeros(store.count, np.int32) for store in stores]
     exposure = dict(zip(arrays["keyframe_id"].tolist(), arrays["keyframe_exposure"]))
     rasterizer = Rasterizer()
-    for view in watched(keyframe_views(arrays)):
+    for view in progress(keyframe_views(arrays)):
         try:
-            level = compress(opened(view.id), 1.0).levels[HALF]
+            level = compress(decode(view.id), 1.0).levels[HALF]
         except ValueError:
             continue
-        picture, e = level.rgb.transpose(1, 2, 0) * np.float32(1 / 255), exposure[view.id]
+        image, e = level.rgb.transpose(1, 2, 0) * np.float32(1 / 255), exposure[view.id]
         seen = [render_rgb_depth(rasterizer, store, level.camera, view.T_map_camera) for store in stores]
         both = _same_surface(seen)
         if level.hidden is not None:
             both &= ~level.hidden
         shown = [rgb * np.exp(e[:3]) + e[3:] for rgb, _, _ in seen]
-        off = [cv2.blur(np.abs(rgb - picture).mean(axis=2), (_BLUR_PX, _BLUR_PX)) for rgb in shown]
+        off = [cv2.blur(np.abs(rgb - image).mean(axis=2), (_BLUR_PX, _BLUR_PX)) for rgb in shown]
         for which, store in enumerate(stores):
             won = np.where(both, np.sign(off[1 - which] - off[which]), 0.0).astype(np.int32)
-            _gather(votes[which], won, store, level.camera, view.T_map_camera, seen[which][1])
+            _add_votes(votes[which], won, store, level.camera, view.T_map_camera, seen[which][1])
     rasterizer.close()
     stay = np.ones(len(second), bool)
     stay[~second], stay[second] = votes[0] >= 0, votes[1] >= 0
     return stay
 
 
-def _part(arrays: Arrays, chosen: np.ndarray) -> GaussianStore:
+def _selected(arrays: Arrays, chosen: np.ndarray) -> GaussianStore:
     store = store_of(arrays)
     store.keep(chosen)
     return store
@@ -69,19 +69,19 @@ def _part(arrays: Arrays, chosen: np.ndarray) -> GaussianStore:
 def _same_surface(seen: list[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> np.ndarray:
     (_, depth_a, alpha_a), (_, depth_b, alpha_b) = seen
     with np.errstate(invalid="ignore"):
-        near = np.abs(depth_a - depth_b) < _SAME_M + _SAME_SHARE * np.minimum(depth_a, depth_b)
+        near = np.abs(depth_a - depth_b) < _SAME_M + _SAME_RATIO * np.minimum(depth_a, depth_b)
     return near & (alpha_a > _COVERED) & (alpha_b > _COVERED)
 
 
-def _gather(
+def _add_votes(
     votes: np.ndarray,  # int32 [N], added to
-    won: np.ndarray,  # int32 [H, W]: 1, -1, or 0 where there was no contest
+    won: np.ndarray,  # int32 [H, W]: 1 won, -1 lost, 0 not compared
     store: GaussianStore,
     camera: RasterCamera,
     T_map_camera: np.ndarray,
-    depth_m: np.ndarray,  # float32 [H, W] of this map alone
+    depth_m: np.ndarray,  # float32 [H, W] of this map, rendered alone
 ) -> None:
-    """Each Gaussian on the surface that the map shows gets what its own pixel won or lost."""
+    """Add `won` of its pixel to the votes of each Gaussian on the visible surface."""
     T = inverse(T_map_camera)
     x, y, z = T[:3, :3] @ store.params[MEAN:SCALE, : store.count] + T[:3, 3:4]
     ahead = np.maximum(z, 1e-3)
@@ -91,5 +91,5 @@ def _gather(
     row, column = v[inside].astype(int), u[inside].astype(int)
     shown = depth_m[row, column]
     with np.errstate(invalid="ignore"):
-        on = np.abs(z[inside] - shown) < _SAME_M + _SAME_SHARE * shown
+        on = np.abs(z[inside] - shown) < _SAME_M + _SAME_RATIO * shown
     votes[inside[on]] += won[row[on], column[on]]

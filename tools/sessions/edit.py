@@ -1,4 +1,4 @@
-"""Saved maps changed as arrays: anchors moved, two maps made one, parts left out."""
+"""Editing of saved maps as arrays: move anchors, merge two maps, remove Gaussians and keyframes."""
 
 from __future__ import annotations
 
@@ -17,39 +17,39 @@ _KEYFRAMES, _STORE, _TAKEN = "keyframe_", "store_", "extra_taken_"
 
 
 def with_anchors(arrays: Arrays, T_map_anchor: dict[int, np.ndarray]) -> Arrays:
-    """The map with anchors at new places [4, 4]: Gaussians and keyframes move along. Others stay."""
-    ids, places = arrays["anchor_id"], arrays["anchor_T_map"].copy()
+    """Return the map with new anchor poses [4, 4]; Gaussians and keyframes move with them."""
+    ids, poses = arrays["anchor_id"], arrays["anchor_T_map"].copy()
     store = store_of(arrays)
     for row, anchor in enumerate(ids.tolist()):
         if anchor in T_map_anchor:
-            store.move(anchor, T_map_anchor[anchor] @ inverse(places[row]))
-            places[row] = T_map_anchor[anchor]
-    return arrays | _prefixed(store) | {"anchor_T_map": places}
+            store.move(anchor, T_map_anchor[anchor] @ inverse(poses[row]))
+            poses[row] = T_map_anchor[anchor]
+    return arrays | _prefixed(store) | {"anchor_T_map": poses}
 
 
 def merged(a: Arrays, b: Arrays, T_a_b: np.ndarray, offset: int) -> Arrays:
-    """Map b put into map a at `T_a_b` [4, 4]. Anchors of b get `offset` added to their ids.
+    """Return map a with map b inserted at `T_a_b` [4, 4]; `offset` is added to the anchor ids of b.
 
     Raises:
-        UserError: they share keyframes, or the offset leads to an anchor of a.
+        UserError: the maps share keyframes, or ids with the offset exist in a.
     """
     shared = set(a["extra_taken_id"].tolist()) & set(b["extra_taken_id"].tolist())
     if shared:
         raise UserError(
-            f"the two sessions share {len(shared)} keyframes (such as {min(shared)}): they are one drive"
+            f"the sessions share {len(shared)} keyframes (such as {min(shared)}): they are of the same run"
         )
     ids_b = b["anchor_id"] + offset
     if set(ids_b.tolist()) & set(a["anchor_id"].tolist()):
-        raise UserError(f"anchors of the second session lead to those of the first with offset {offset}")
-    places_b = {anchor: T_a_b @ T for anchor, T in zip(b["anchor_id"].tolist(), b["anchor_T_map"])}
-    b = with_anchors(b, places_b)
+        raise UserError(f"with offset {offset}, anchor ids of the second map exist in the first")
+    T_a_anchor = {anchor: T_a_b @ T for anchor, T in zip(b["anchor_id"].tolist(), b["anchor_T_map"])}
+    b = with_anchors(b, T_a_anchor)
     b = b | {
         "anchor_id": ids_b, "keyframe_anchor": b["keyframe_anchor"] + offset,
         "store_anchor": b["store_anchor"] + offset, "store_events": b["store_events"] + [[offset, 0]],
     }  # fmt: skip
     out = dict(a)
     for key in a:
-        if key not in b:  # a newer program's: what it stands for has a default
+        if key not in b:  # written by a newer program only: the mapper has a default for it
             out.pop(key)
         elif key.startswith(_STORE) and key != "store_events":
             out[key] = np.concatenate([a[key], b[key]], axis=-1)
@@ -63,15 +63,19 @@ def merged(a: Arrays, b: Arrays, T_a_b: np.ndarray, offset: int) -> Arrays:
 
 
 def with_gaussians(arrays: Arrays, stay: np.ndarray) -> Arrays:
-    """The map with those Gaussians only whose flag in bool [N] is set."""
+    """Return the map with only the Gaussians whose flag in bool [N] is True."""
     store = store_of(arrays)
     store.keep(stay)
     return arrays | _prefixed(store)
 
 
 def pruned(arrays: Arrays, least_opacity: float, keyframes: int | None) -> Arrays:
-    """The map without Gaussians fainter than `least_opacity`, and with at most so many keyframes, spread over
-    time; what they made stays."""
+    """Return the map without faint Gaussians, and with fewer keyframes.
+
+    Args:
+        least_opacity: in [0, 1]; Gaussians below it are removed.
+        keyframes: how many to keep, evenly spaced in time; None for all. Gaussians of the others stay.
+    """
     opacity = 1.0 / (1.0 + np.exp(-arrays["store_params"][OPACITY].astype(np.float64)))
     out = with_gaussians(arrays, opacity >= least_opacity)
     ids = arrays["keyframe_id"]
@@ -89,7 +93,7 @@ def pruned(arrays: Arrays, least_opacity: float, keyframes: int | None) -> Array
 
 
 def summary_of(arrays: Arrays) -> dict[str, int]:
-    """What a manifest says of a state."""
+    """Return the summary of a state for the manifest."""
     stamps_ns = arrays["extra_taken_stamp_ns"]
     return {
         "keyframes": len(arrays["keyframe_id"]), "gaussians": arrays["store_params"].shape[1],

@@ -1,4 +1,4 @@
-"""The last step of a merge: what both maps show is there once, as the pictures in the session decide."""
+"""The last step of a merge: remove surfaces that both maps contain."""
 
 from __future__ import annotations
 
@@ -15,16 +15,32 @@ from beamsplat.tools.sessions.deduplicate import without_duplicates
 from beamsplat.tools.sessions.edit import with_gaussians
 
 
-def once(
-    folder: SessionFolder,  # with the keyframes of both
-    arrays: Arrays,  # as `merged` gives them
-    offset: int,  # of the second map's anchors
-    watched: Callable[[list[KeyframeView]], Iterable[KeyframeView]] = iter,
+def deduplicated(
+    folder: SessionFolder,  # contains the keyframes of both maps
+    arrays: Arrays,  # from `merged`
+    offset: int,  # added to the anchor ids of the second map
+    progress: Callable[[list[KeyframeView]], Iterable[KeyframeView]] = iter,
 ) -> Arrays:
-    """The merged map without doubled surfaces."""
+    """Return the merged map without duplicate surfaces, compared with the images of the keyframes."""
     lens = lru_cache(maxsize=4)(Undistorter)
     stay = without_duplicates(
         arrays, arrays["store_anchor"] >= offset - 1,
-        lambda id: decode_keyframe(decode(*folder.read_keyframe(id)), lens), watched,
+        lambda id: decode_keyframe(decode(*folder.read_keyframe(id)), lens), progress,
     )  # fmt: skip
     return with_gaussians(arrays, stay)
+
+
+def merge_doubt(agreeing: int, queried: int, loop_closures: int) -> str:
+    """Return why the place found for a second map should not be trusted; "" where it is confirmed.
+
+    Args:
+        agreeing: scans of the second map whose place in the first agrees with the one found.
+        queried: scans that were searched for.
+        loop_closures: constraints between the two maps that were found at that place.
+    """
+    if loop_closures > 0 or 2 * agreeing > queried:
+        return ""
+    return (
+        f"only {agreeing} of {queried} scans agree on the place of the second drive, and no loop closure "
+        "between the drives confirms it"
+    )
