@@ -1,4 +1,4 @@
-"""The array interface: conventions, threads, several renders at once, errors, and the SIMD lanes beneath."""
+"""The rasterizer's array interface: threads, several renders at once, errors; and the SIMD functions."""
 
 import numpy as np
 import pytest
@@ -38,7 +38,7 @@ def scene(seed, count=400):
     )
 
 
-def test_threads_change_no_bit():
+def test_results_do_not_depend_on_the_number_of_threads():
     params, count, camera, T, weights = scene(1, 3000)
     results = []
     for threads in (1, 2, 3):
@@ -52,7 +52,7 @@ def test_threads_change_no_bit():
             assert np.array_equal(a, b)
 
 
-def test_order_of_the_gaussians_does_not_matter():
+def test_results_do_not_depend_on_the_order_of_gaussians():
     params, count, camera, T, weights = scene(2)
     shuffled = np.random.default_rng(0).permutation(count)
     other = params.copy()
@@ -64,7 +64,7 @@ def test_order_of_the_gaussians_does_not_matter():
     assert np.allclose(a[:, shuffled], b, rtol=1e-5, atol=1e-6 * np.abs(a).max())
 
 
-def test_several_renders_live_at_once_and_memory_is_reused():
+def test_several_renders_at_once_and_workspace_reuse():
     params, count, camera, T, weights = scene(3)
     rasterizer = Rasterizer()
     first = rasterizer.render(params, count, camera, T)
@@ -78,8 +78,8 @@ def test_several_renders_live_at_once_and_memory_is_reused():
     assert rasterizer.render(params, count, camera, T).workspace is memory
 
 
-def test_more_pairs_than_expected_make_room():
-    """Large splats cover every tile: the lists grow, the picture stays that of a rasterizer that knew before."""
+def test_pair_capacity_grows():
+    """Large splats overlap all tiles: the lists grow, and the image equals that of sufficient capacity."""
     params, count, camera, T, _ = scene(4, 3000)
     params[3:6] += 2.0
     rasterizer = Rasterizer()
@@ -89,7 +89,7 @@ def test_more_pairs_than_expected_make_room():
     assert np.array_equal(grown.image, Rasterizer().render(params, count, camera, T).image)
 
 
-def test_weights_of_all_splats_add_up_to_alpha():
+def test_blending_weights_sum_to_alpha():
     params, count, camera, T, _ = scene(5)
     rasterizer = Rasterizer()
     render = rasterizer.render(params, count, camera, T)
@@ -99,7 +99,7 @@ def test_weights_of_all_splats_add_up_to_alpha():
     assert np.all(dense[:14] == 0.0)
 
 
-def test_not_a_number_in_one_gaussian_hurts_no_other():
+def test_nan_gaussians_do_not_affect_others():
     params, count, camera, T, _ = scene(6)
     rasterizer = Rasterizer()
     without = rasterizer.render(np.ascontiguousarray(params[:, 16:]), count - 16, camera, T).image.copy()
@@ -107,7 +107,7 @@ def test_not_a_number_in_one_gaussian_hurts_no_other():
     assert np.array_equal(rasterizer.render(params, count, camera, T).image, without)
 
 
-def test_bad_input_is_named():
+def test_invalid_input_raises():
     params, count, camera, T, _ = scene(7)
     rasterizer = Rasterizer()
     with pytest.raises(ValueError, match="float32"):
@@ -168,7 +168,7 @@ def _functions(x, positive, out):
         store(out[3], at, sigmoid_lanes(load(x, at)))
 
 
-def test_lane_functions_are_as_good_as_float32():
+def test_simd_functions_have_float32_accuracy():
     rng = np.random.default_rng(0)
     x = rng.uniform(-40, 40, 64 * LANES).astype(np.float32)
     positive = np.exp(rng.uniform(-60, 60, 64 * LANES)).astype(np.float32)
@@ -188,7 +188,7 @@ def _memory(a, index, out, sums):
     store_sums4(sums, 1, v, v * 2.0, -v, iota())
 
 
-def test_lane_memory_operations():
+def test_simd_memory_operations():
     a, index = np.arange(100, dtype=np.float32), (np.arange(LANES, dtype=np.int32) * 5)[::-1].copy()
     out, sums = np.zeros(120, np.float32), np.zeros(6, np.float32)
     _memory(a, index, out, sums)

@@ -15,8 +15,8 @@ from beamsplat.common.raster.rasterizer import Rasterizer
 from beamsplat.services.mapping.keyframe import RgbdKeyframe
 from beamsplat.services.mapping.mapper import FULL, HALF, Mapper
 from beamsplat.services.mapping.settings import MapperSettings
-from beamsplat.services.mapping.warm import warm
 from beamsplat.tools.bench.raster import synthetic_room
+from tests.common.kernels import kernels_of
 
 CAMERA = RasterCamera(110.0, 110.0, 79.5, 59.5, 160, 120)
 SETTINGS = MapperSettings(half_iterations=10, full_iterations=5, stride_px=3)
@@ -262,7 +262,7 @@ def test_what_floats_before_a_trusted_surface_is_carved(room, mapped):
     mapper.store.add(floater, 0)
     mapper.settings = replace(SETTINGS, carve_votes=2)
     for _ in range(2):
-        mapper._clean(mapper.keyframes[2])
+        mapper._prune(mapper.keyframes[2])
     # Gaps are closed when they are many; until then floaters are marked.
     left = mapper.store.carving_votes[before : mapper.store.count] < 2
     assert mapper.store.count < before or left.mean() < 0.2
@@ -311,8 +311,10 @@ def test_chunks_say_what_has_changed(room, mapped):
     known = mapper.store.versions()
     assert mapper.store.chunks(known) == []
     assert mapper.store.chunks()[0].params.shape == (14, mapper.store.count)
+    before = mapper.store.params[:, : mapper.store.count].copy()
     mapper.add(keyframe(room, 6, anchor=5), make_transform(so3_exp([0, 0, 0.3]), np.array([0.4, 0.0, 0.0])))
-    assert [chunk.anchor for chunk in mapper.store.chunks(known)] in ([5], [0, 5])
+    assert [chunk.anchor for chunk in mapper.store.chunks(known)] == [5]
+    assert np.array_equal(mapper.store.params[:, : before.shape[1]], before)  # all of anchor 0
     known = mapper.store.versions()
     mapper.step(mapper.keyframes[2], HALF)
     assert 0 in [chunk.anchor for chunk in mapper.store.chunks(known)]
@@ -321,5 +323,30 @@ def test_chunks_say_what_has_changed(room, mapped):
     assert [chunk.anchor for chunk in mapper.store.chunks(known)] == [5]
 
 
-def test_warm_compiles_what_is_used():
-    warm()
+def test_warm_compiles_all_kernels_of_mapping():
+    warmed, missing = kernels_of(
+        warm="from beamsplat.services.mapping.warm import warm; warm()",
+        use="""
+            import numpy as np
+            from beamsplat.common.raster.camera import RasterCamera
+            from beamsplat.services.mapping.keyframe import RgbdKeyframe
+            from beamsplat.services.mapping.mapper import Mapper
+            from beamsplat.services.mapping.settings import MapperSettings
+
+            rng, mapper = np.random.default_rng(0), Mapper(MapperSettings(ssim_every=1), seed=1, threads=2)
+            for number in range(3):
+                depth_m = rng.uniform(1.9, 2.1, (120, 160)).astype(np.float32)
+                T = np.eye(4)
+                T[0, 3] = 0.1 * number
+                keyframe = RgbdKeyframe(
+                    number, rng.integers(0, 255, (120, 160, 3)).astype(np.uint8),
+                    RasterCamera(110.0, 110.0, 79.5, 59.5, 160, 120), T, depth_m,
+                    np.full((120, 160), 0.01, np.float32), mask=depth_m > 1.95,
+                )
+                assert mapper.add(keyframe, np.eye(4)).ok
+                mapper.optimise()
+            mapper.store.chunks()
+        """,
+    )
+    assert len(warmed) >= 5
+    assert missing == []
