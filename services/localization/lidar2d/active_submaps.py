@@ -123,8 +123,8 @@ class ActiveSubmaps:
         )
         # Consecutive scans share errors along an unobservable direction, so within their own submap the
         # relative poses keep the full information.
-        rigid = match.information if match.full_information is None else match.full_information
-        matched = edge_information(rigid, s.edge_sigma_m, s.edge_sigma_rad)
+        full = match.information if match.full_information is None else match.full_information
+        matched = edge_information(full, s.edge_sigma_m, s.edge_sigma_rad)
         edges = []
         for active in self._active:
             active.submap.frozen = None  # discard a temporary freeze: the submap grows again

@@ -8,7 +8,7 @@ from beamsplat.services.localization.lidar2d import se2
 from beamsplat.services.localization.lidar2d.odometry import OdometryBuffer
 
 MIN_TRUST = 0.7  # observability of the weak direction, below which a match is degenerate
-# fraction of the difference applied per scan; below 1, because the stamps of wheels and scans jitter
+# Fraction of the difference applied per scan; below 1, because the stamps of wheels and scans jitter.
 CORRECTION_GAIN = 0.5
 CHECK_DISTANCE_M = 1.0  # distance over which the odometry is compared with the scans
 MAX_ERROR_RATIO = 0.15  # relative distance error, above which the odometry is not used

@@ -66,10 +66,10 @@ def run_job(snapshot: Snapshot, refine_rounds: int = 0) -> JobResult:
     edges = constraint_arrays(constraints, submap_row, node_row)
     submap_poses, node_poses, link, candidate = snapshot.pose_map_submap, snapshot.pose_map_node, None, None
     if snapshot.unlinked_from is None:
-        found, searched, still = _find_constraints(snapshot, edges, submap_row, node_row)
+        found, searched, still_pending = _find_constraints(snapshot, edges, submap_row, node_row)
     else:
         link, submap_poses, node_poses, candidate = link_segment(snapshot)
-        found, searched, still = [] if link is None else [link], [], list(snapshot.pending)
+        found, searched, still_pending = [] if link is None else [link], [], list(snapshot.pending)
     constraints += found
     fixed = [submap_row[i] for i in sorted(snapshot.fixed) if i in submap_row] or [0]
     if found:
@@ -101,7 +101,7 @@ def run_job(snapshot: Snapshot, refine_rounds: int = 0) -> JobResult:
         dict(zip(snapshot.submap_ids, solution.pose_map_submap)),
         dict(zip(snapshot.node_ids, solution.pose_map_node)),
         rebuilt,
-        still,
+        still_pending,
         searched,
         len(found),
         snapshot.unlinked_from is None or link is not None,
@@ -128,28 +128,28 @@ def _find_constraints(
         return [], [], list(snapshot.pending)
     drift = DriftModel(edges, len(snapshot.submap_ids), len(snapshot.node_ids), s)
     windows: dict[int, tuple[np.ndarray, np.ndarray]] = {}
-    turn = snapshot.pending[-3 * s.job_nodes :]
-    still = snapshot.pending[: -3 * s.job_nodes]
+    selected = snapshot.pending[-3 * s.job_nodes :]
+    still_pending = snapshot.pending[: -3 * s.job_nodes]
     tasks = []
-    for node_id in turn:
+    for node_id in selected:
         own = sorted(set(_submaps_of(edges, node_row[node_id]).tolist()))
         if own[0] not in windows:
             windows[own[0]] = drift.windows(own[0])
         candidates, uncertain = _loop_candidates(snapshot, edges, node_row[node_id], own, windows[own[0]])
         tasks += [(candidate.submap, node_id, candidate) for candidate in candidates]
         if uncertain and not candidates:
-            still.append(node_id)
+            still_pending.append(node_id)
     # Sorted by submap, because the cache holds few of the large match tables.
     closed = [
         match_locally(snapshot.nodes[node_id], candidate, snapshot.cache, s)
         for _, node_id, candidate in sorted(tasks, key=lambda task: task[:2])
     ]
     found = [c for c in closed if c is not None]
-    fresh = turn[-s.job_nodes :]
-    wide, searched = _find_global_constraints(
-        snapshot, edges, node_row, fresh[len(fresh) // 2], windows, drift
+    newest = selected[-s.job_nodes :]
+    global_found, searched = _find_global_constraints(
+        snapshot, edges, node_row, newest[len(newest) // 2], windows, drift
     )
-    return found + wide, searched, sorted(still)[-2000:]
+    return found + global_found, searched, sorted(still_pending)[-2000:]
 
 
 def _submaps_of(edges: ConstraintArrays, row: int) -> np.ndarray:
@@ -217,25 +217,22 @@ def _find_global_constraints(
     distance = _nearest_member(snapshot, edges, row)
     distance[own] = np.inf
     half = s.merged_scans // 2
-    chunk = [snapshot.nodes[n] for n in snapshot.node_ids[max(0, row - half) : row + half + 1]]
+    neighbours = [snapshot.nodes[n] for n in snapshot.node_ids[max(0, row - half) : row + half + 1]]
     candidates = []
     for k in np.flatnonzero(np.isfinite(distance)):
         submap_id = snapshot.submap_ids[k]
-        narrow = window_m[k] <= s.local_window_m and window_rad[k] <= s.local_window_rad
-        if submap_id in snapshot.frozen and not narrow and distance[k] < s.loop_distance_m + window_m[k]:
+        local = window_m[k] <= s.local_window_m and window_rad[k] <= s.local_window_rad
+        if submap_id in snapshot.frozen and not local and distance[k] < s.loop_distance_m + window_m[k]:
             candidates.append((snapshot.search_counts.get(submap_id, 0), float(distance[k]), int(k)))
     found, searched = [], []
     for _, _, k in sorted(candidates)[: s.global_searches_per_job]:
         submap_id = snapshot.submap_ids[k]
         pose = se2.between(snapshot.pose_map_submap[k], snapshot.pose_map_node[row])
-        window = (
-            min(float(window_m[k]), s.max_global_window_m)
-            if math.isfinite(window_m[k])
-            else s.max_global_window_m
-        )
+        limit_m = s.max_global_window_m
+        window = min(float(window_m[k]), limit_m) if math.isfinite(window_m[k]) else limit_m
         turn = min(float(window_rad[k]), math.pi) if math.isfinite(window_rad[k]) else math.pi
         candidate = LoopCandidate(submap_id, snapshot.frozen[submap_id], pose, window, turn)
-        constraint = match_globally(snapshot.nodes[centre], chunk, candidate, snapshot.cache, s)
+        constraint = match_globally(snapshot.nodes[centre], neighbours, candidate, snapshot.cache, s)
         searched.append(submap_id)
         if constraint is not None and verify_constraint(
             constraint,

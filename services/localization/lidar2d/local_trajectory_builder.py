@@ -115,10 +115,10 @@ class LocalTrajectoryBuilder:
             if self._is_plausible(motion, dt):
                 sigma_rad = self._wheel_error.sigmas(motion, dt)[1]
                 reckoned_motion = Prediction(motion, WHEEL_SIGMA_M, sigma_rad, "wheels", False)
-                return reckoned_motion, [(predictor, motion) for predictor, motion, _ in predictions]
+                return reckoned_motion, [(model, motion) for model, motion, _ in predictions]
         rated = []
-        for predictor, motion, name in predictions:
-            sigma_m, sigma_rad = predictor.sigmas(motion, dt)
+        for model, motion, name in predictions:
+            sigma_m, sigma_rad = model.sigmas(motion, dt)
             rated.append(
                 (
                     sigma_m / 0.05 + sigma_rad / 0.03,
@@ -126,7 +126,7 @@ class LocalTrajectoryBuilder:
                 )
             )
         best = min(rated, key=lambda item: item[0])[1]
-        return best, [(predictor, motion) for predictor, motion, _ in predictions]
+        return best, [(model, motion) for model, motion, _ in predictions]
 
     def _is_plausible(self, motion: np.ndarray, dt_s: float) -> bool:
         """Return whether a motion is within the speed limits of the settings."""
@@ -200,9 +200,9 @@ class LocalTrajectoryBuilder:
         if (
             match.inlier_ratio < s.good_inlier_ratio
         ):  # the prediction may be wrong: search around the last pose
-            wide_m, wide_rad = max(window_m, 0.4), max(window_rad, math.radians(20.0))
+            wider_m, wider_rad = max(window_m, 0.4), max(window_rad, math.radians(20.0))
             match = self._search(
-                scan, match, guess_pose, pose_submap_last, information, local, wide_m, wide_rad
+                scan, match, guess_pose, pose_submap_last, information, local, wider_m, wider_rad
             )
         if match.inlier_ratio < s.lost_inlier_ratio:
             match = self._search(
@@ -298,8 +298,8 @@ class LocalTrajectoryBuilder:
         """Append the pose of the newest scan; update the error models and the odometry delay."""
         if self.poses:
             moved = se2.between(self.poses[-1], pose_odom_body)
-            for predictor, motion in predictions:
-                predictor.update(motion, moved)
+            for model, motion in predictions:
+                model.update(motion, moved)
             self.odometry.observe_rotation(self.stamps[-1], stamp_ns, float(moved[2]))
         self.stamps.append(stamp_ns)
         self.poses.append(pose_odom_body)

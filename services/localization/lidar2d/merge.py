@@ -65,8 +65,8 @@ def merge_into(a: LidarSlam, b: LidarSlam, pose_a_b: np.ndarray, offset: int) ->
         graph.nodes[first + id] = replace(node, id=first + id)
         graph.pose_map_node[first + id] = se2.compose(pose_a_b, other.pose_map_node[id])
     for id, s in other.submaps.items():
-        place, members = se2.compose(pose_a_b, s.pose_map_submap), [first + m for m in s.members]
-        graph.submaps[offset + id] = Submap(offset + id, s.pose_odom_submap, place, members, s.frozen)
+        pose, members = se2.compose(pose_a_b, s.pose_map_submap), [first + m for m in s.members]
+        graph.submaps[offset + id] = Submap(offset + id, s.pose_odom_submap, pose, members, s.frozen)
     graph.constraints += [
         replace(c, submap=offset + c.submap, node=first + c.node) for c in other.constraints
     ]

@@ -36,11 +36,11 @@ def rebuild_submap(
         se2.transform(pose, n.scan.points.astype(np.float64)) for n, pose in zip(nodes, pose_submap_node)
     ]
     surfels.cover(np.concatenate(points))
-    for node, pose, there in zip(nodes, pose_submap_node, points):
+    for node, pose, points_submap in zip(nodes, pose_submap_node, points):
         scan = node.scan
         static = ~scan.dynamic
         surfels.insert(
-            there,
+            points_submap,
             se2.transform(np.array([0.0, 0.0, pose[2]]), scan.tangents.astype(np.float64)),
             scan.spacing_m.astype(np.float64),
             se2.transform(pose, scan.origin[None])[0],

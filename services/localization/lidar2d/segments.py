@@ -37,14 +37,16 @@ def link_segment(
     if not segment or not map_nodes:
         return None, submap_poses, node_poses, None
     newest = snapshot.nodes[segment[-1]]
-    chunk = [snapshot.nodes[n] for n in segment[-snapshot.settings.merged_scans :]]
+    newest_nodes = [snapshot.nodes[n] for n in segment[-snapshot.settings.merged_scans :]]
     global_map: GlobalMap = snapshot.cache.global_map(
         (snapshot.version, len(map_nodes)),
         lambda: build_global_map(
             snapshot.settings, [snapshot.nodes[n] for n in map_nodes], [node_poses[row[n]] for n in map_nodes]
         ),
     )
-    found = relocalize_in(global_map, merged_features(chunk, newest), newest.scan.origin, snapshot.settings)
+    found = relocalize_in(
+        global_map, merged_features(newest_nodes, newest), newest.scan.origin, snapshot.settings
+    )
     if found.confidence < snapshot.settings.link_min_confidence:
         return None, submap_poses, node_poses, snapshot.candidate
     candidate = (newest.id, found.pose_map_body)

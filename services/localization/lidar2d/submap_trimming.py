@@ -30,11 +30,11 @@ def redundant_submaps(
     two of them older and two newer.
     """
     cell_of = {n: _pose_cell(pose) for n, pose in pose_map_node.items()}
-    seen_by: dict[tuple[int, int, int], set[int]] = defaultdict(set)
+    covered_by: dict[tuple[int, int, int], set[int]] = defaultdict(set)
     for submap in submaps.values():
         if submap.frozen is not None:
             for n in submap.members:
-                seen_by[cell_of[n]].add(submap.id)
+                covered_by[cell_of[n]].add(submap.id)
     redundant: set[int] = set()
     for submap_id in sorted(submaps):
         submap = submaps[submap_id]
@@ -42,7 +42,7 @@ def redundant_submaps(
             continue
         covered = 0
         for n in submap.members:
-            others = seen_by[cell_of[n]] - redundant - {submap_id}
+            others = covered_by[cell_of[n]] - redundant - {submap_id}
             # Consecutive submaps share half of their scans: they are not independent.
             others = {o for o in others if abs(o - submap_id) > 1}
             older = sum(o < submap_id for o in others)
