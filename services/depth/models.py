@@ -7,6 +7,7 @@ import tomllib
 import urllib.error
 import urllib.request
 from collections.abc import Callable
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated
 
@@ -46,15 +47,32 @@ def read_model_table(path: Path = TABLE) -> dict[str, ModelEntry]:
     return {name: parse(ModelEntry, row, f"{path}: [{name}]") for name, row in table.items()}
 
 
+def model_name(name: str, table: dict[str, ModelEntry]) -> str:
+    """Return the name of a model in the table; the name of a depth source means its first model there.
+
+    Raises:
+        UserError: there is neither; the message lists all names.
+    """
+    if name in table:
+        return name
+    if (default := next((key for key, row in table.items() if row.source == name), None)) is not None:
+        return default
+    sources = dict.fromkeys(row.source for row in table.values())
+    near = get_close_matches(name, (*table, *sources), 1)
+    meant = f"did you mean {near[0]!r}? " if near else ""
+    raise UserError(
+        f"there is no model {name!r}; {meant}there are {', '.join(table)}, and by depth source "
+        f"{', '.join(sources)}"
+    )
+
+
 def find_entry(name: str, table: dict[str, ModelEntry]) -> ModelEntry:
-    """Return the row called `name`.
+    """Return the row called `name`, see `model_name`.
 
     Raises:
         UserError: there is none; the message lists all names.
     """
-    if name not in table:
-        raise UserError(f"there is no model {name!r}; there are {', '.join(table)}")
-    return table[name]
+    return table[model_name(name, table)]
 
 
 def pull(

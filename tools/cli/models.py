@@ -43,7 +43,7 @@ def list_models(
 
 @app.command("pull")
 def pull_model(
-    name: Annotated[str, typer.Argument(help="A name from `beamsplat models list`.")],
+    name: Annotated[str, typer.Argument(help="A name or a source from `beamsplat models list`.")],
     yes: Annotated[
         bool, typer.Option("--yes", help="Accept the licence and an unverified file without asking.")
     ] = False,
@@ -52,11 +52,17 @@ def pull_model(
 
     An interrupted download is resumed; the digest is checked before the file is installed.
 
-    Example: beamsplat models pull depth_anything_v2_small
-    """
-    from beamsplat.services.depth.models import find_entry, pull, read_model_table
+    Examples:
 
-    row = find_entry(name, read_model_table())
+        beamsplat models pull depth_anything_v2_small
+
+        beamsplat models pull depth_anything
+    """
+    from beamsplat.services.depth.models import model_name, pull, read_model_table
+
+    table = read_model_table()
+    name = model_name(name, table)
+    row = table[name]
     bar = Progress(
         TextColumn(name), BarColumn(), DownloadColumn(), TransferSpeedColumn(), console=Console(stderr=True)
     )
@@ -84,6 +90,10 @@ def check_model(
 
     Example: beamsplat models check my.onnx
     """
-    from beamsplat.services.depth.models import describe_model_file, read_model_table
+    from beamsplat.services.depth.models import describe_model_file, model_name, read_model_table
 
-    print(json.dumps(describe_model_file(file, read_model_table()), indent=2))
+    table = read_model_table()
+    sources = {row.source for row in table.values()}
+    if str(file) in sources and not file.exists():
+        file = Path(model_name(str(file), table))
+    print(json.dumps(describe_model_file(file, table), indent=2))

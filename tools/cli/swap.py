@@ -70,7 +70,7 @@ def swap(
 
     Examples:
 
-        beamsplat swap deploy/robot.toml depth --set source=fastdepth
+        beamsplat swap deploy/robot.toml depth --set source=depth_anything
 
         beamsplat swap deploy/edge.toml mapping --set half_steps=30
     """

@@ -1,14 +1,17 @@
 """The models store: table, digest, resume, licence."""
 
+import inspect
+import re
 import threading
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
 
 import pytest
 
 from beamsplat.common.errors import UserError
 from beamsplat.services.depth.model_files import find_model, sha256_of
-from beamsplat.services.depth.models import ModelEntry, find_entry, pull, read_model_table
-from beamsplat.services.depth.source import SOURCES
+from beamsplat.services.depth.models import ModelEntry, find_entry, model_name, pull, read_model_table
+from beamsplat.services.depth.source import SOURCES, source_class
 
 DATA = bytes(range(256)) * 4000
 
@@ -114,3 +117,38 @@ def test_no_address_and_no_connection_are_said(folder):
         pull("net", _row(how="export it yourself."), lambda _: True)
     with pytest.raises(UserError, match="download failed"):
         pull("net", _row(url="http://127.0.0.1:9/net.onnx"), lambda _: True)
+
+
+@pytest.mark.parametrize("source", sorted({row.source for row in read_model_table().values()}))
+def test_the_name_of_a_source_means_the_model_that_it_uses_by_default(source):
+    default = inspect.signature(source_class(source)).parameters["model"].default
+    assert model_name(source, read_model_table()) == default
+    assert find_entry(source, read_model_table()).source == source
+
+
+def test_a_misspelt_model_is_answered_with_the_nearest_name():
+    with pytest.raises(UserError, match="did you mean 'unidepth'"):
+        model_name("unidpeth", read_model_table())
+
+
+def test_the_commands_take_the_name_of_a_source(folder):
+    from typer.testing import CliRunner
+
+    from beamsplat.tools.cli.main import app
+
+    with pytest.raises(
+        UserError, match=r"unidepth_v2_vits: there is no file to download.*unidepth_v2_vits.onnx"
+    ):
+        CliRunner().invoke(app, ["models", "pull", "unidepth"], catch_exceptions=False)
+    with pytest.raises(UserError, match="model 'unidepth_v2_vits' is not in"):
+        CliRunner().invoke(app, ["models", "check", "unidepth"], catch_exceptions=False)
+
+
+def test_the_models_that_the_documents_pull_can_be_pulled():
+    root = Path(__file__).resolve().parents[3]
+    table, named = read_model_table(), set()
+    for page in (root / "README.md", *(root / "docs").glob("*.md")):
+        named |= set(re.findall(r"models pull (?:--yes )?([a-z0-9_]+)", page.read_text()))
+    assert named
+    for name in named:
+        assert find_entry(name, table).url, f"{name}: there is no file to download"
