@@ -50,6 +50,7 @@ class _Latencies:
     values: list[float] = field(default_factory=list)
 
     def add_since(self, then_ns: int) -> None:
+        """Add the time since a monotonic time of this host."""
         self.values.append((time.monotonic_ns() - then_ns) / 1e6)
 
     def percentiles(self) -> tuple[float, float]:

@@ -58,6 +58,7 @@ class _MapperTimer:
     cpu_s: float = 0.0
 
     def run(self, work: Callable[[], Any]) -> Any:
+        """Call `work`, add its wall and CPU time, return its result."""
         wall, cpu = time.perf_counter(), time.process_time()
         result = work()
         self.wall_s += time.perf_counter() - wall

@@ -37,6 +37,7 @@ class Configuration:
 
     @property
     def lidar(self) -> bool:
+        """Whether localization uses the lidar."""
         return not self.name.endswith("-camera")
 
 

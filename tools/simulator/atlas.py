@@ -28,6 +28,7 @@ class Atlas:
     mean: np.ndarray  # float32 [T, 3] average linear colour
 
     def index(self, name: str) -> int:
+        """Return the number of the texture called `name`."""
         return self.names.index(name)
 
 

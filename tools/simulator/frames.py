@@ -140,6 +140,7 @@ class RenderedFrame:
 
 
 def load_frame(path: Path) -> RenderedFrame:
+    """Read a frame that `save_frame` wrote."""
     with np.load(path) as data:
         return RenderedFrame(data["jpeg"], data["depth_png"], data["mask_png"])
 

@@ -50,7 +50,10 @@ def legs(
 
 
 def sofa(width: float) -> FurniturePiece:
-    """Upholstered, on short feet, with seat and back cushions and two pillows."""
+    """Return a piece of furniture: upholstered, on short feet, with seat and back cushions and two pillows.
+
+    Upholstered, on short feet, with seat and back cushions and two pillows.
+    """
 
     def draw(b: MeshBuilder, rng: np.random.Generator) -> None:
         cloth = Material("sofa")
@@ -76,7 +79,7 @@ def sofa(width: float) -> FurniturePiece:
 
 
 def armchair() -> FurniturePiece:
-    """A round-backed easy chair."""
+    """Return a piece of furniture: a round-backed easy chair."""
 
     def draw(b: MeshBuilder, rng: np.random.Generator) -> None:
         cloth = Material("armchair")
@@ -99,7 +102,7 @@ def armchair() -> FurniturePiece:
 
 
 def coffee_table() -> FurniturePiece:
-    """Low table with a shelf, magazines, a bowl."""
+    """Return a piece of furniture: low table with a shelf, magazines, a bowl."""
 
     def draw(b: MeshBuilder, rng: np.random.Generator) -> None:
         top = wood(rng)
@@ -170,7 +173,7 @@ def spine(
 
 
 def bookshelf(width: float, height: float) -> FurniturePiece:
-    """Boards, a back, and rows of standing books with gaps and ornaments."""
+    """Return a piece of furniture: boards, a back, and rows of standing books with gaps and ornaments."""
 
     def draw(b: MeshBuilder, rng: np.random.Generator) -> None:
         timber, depth, board = wood(rng), 0.30, 0.022
@@ -222,7 +225,7 @@ def vase(b: MeshBuilder, rng: np.random.Generator, height: float) -> None:
 
 
 def sideboard(width: float, *, television: bool = False) -> FurniturePiece:
-    """A low cabinet with doors and drawers; a television or ornaments on it."""
+    """Return a piece of furniture: a low cabinet with doors and drawers; a television or ornaments on it."""
 
     def draw(b: MeshBuilder, rng: np.random.Generator) -> None:
         timber, height, depth = wood(rng), 0.52, 0.40

@@ -223,6 +223,7 @@ class MeshBuilder:
 
     @property
     def lights(self) -> tuple[Light, ...]:
+        """All lights added so far, in the frame of the mesh."""
         return tuple(self._buffers.lights)
 
     def build(self) -> SceneMesh:

@@ -37,6 +37,7 @@ class Room:
     spans: dict[str, list[tuple[float, float, float]]] = field(default_factory=lambda: {s: [] for s in SIDES})
 
     def length(self, side: str) -> float:
+        """Return the length of a wall in metres."""
         return self.x1 - self.x0 if side in ("south", "north") else self.y1 - self.y0
 
     def corner(self, side: str) -> tuple[float, float]:

@@ -27,6 +27,7 @@ class RayCaster:
 
     @classmethod
     def of(cls, mesh: SceneMesh) -> RayCaster:
+        """Return a ray caster of all triangles of a mesh."""
         return cls(mesh.vertices_m, mesh.triangles)
 
     def first_hit(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:

@@ -122,6 +122,7 @@ def _duration(settings: SimulationSettings, drive: DrivePath) -> float:
 
 
 def frame_spec(settings: SimulationSettings, actor_paths: list[ActorPath]) -> FrameSpec:
+    """Return the inputs of the frames of a recording; its world must be in the cache."""
     name = f"{world_key(settings.seed, settings.scene)}.npz"
     return FrameSpec(
         str(store.cache_root() / "worlds" / name),

@@ -39,6 +39,7 @@ class CameraSettings:
 
     @property
     def T_body_camera(self) -> np.ndarray:
+        """True mount of the camera, float64 [4, 4]."""
         return camera_mount(self.x_m, self.y_m, self.z_m, pitch_down_rad=self.pitch_down_rad)
 
 
@@ -69,6 +70,7 @@ class LidarSettings:
 
     @property
     def scan_time_s(self) -> float:
+        """Duration of a revolution."""
         return 1.0 / self.rate_hz
 
     @property
@@ -77,6 +79,7 @@ class LidarSettings:
 
     @property
     def T_body_lidar(self) -> np.ndarray:
+        """True mount of the lidar, float64 [4, 4]."""
         return lidar_mount(self.x_m, self.y_m, self.z_m)
 
 

@@ -38,6 +38,7 @@ class World:
 
     @property
     def texture_size_m(self) -> dict[str, tuple[float, float]]:
+        """Width and height of one repeat of each texture, by name."""
         return {name: (float(w), float(h)) for name, (w, h) in zip(self.atlas.names, self.atlas.size_m)}
 
 
