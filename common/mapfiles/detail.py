@@ -1,8 +1,9 @@
-"""Level of detail: Gaussians of one cell as one, for who looks from so far that a cell is a pixel.
+"""Level of detail: the Gaussians of one grid cell are merged into one, for viewpoints that see a cell as a
+pixel.
 
-A merged Gaussian has the mean, covariance and colour of those it stands for, weighted by opacity times area,
-and the opacity that covers as much (the moments and the opacity rule of Kerbl et al. 2024, "A Hierarchical 3D
-Gaussian Representation", eqs. 2-5, over cells of a grid in place of a tree).
+A merged Gaussian has the mean, covariance and colour of its members, weighted by opacity times area, and the
+opacity that covers the same area: the moments and the opacity rule of Kerbl et al. 2024, "A Hierarchical 3D
+Gaussian Representation", eqs. 2-5, over the cells of a grid instead of the nodes of a tree.
 """
 
 from __future__ import annotations
@@ -14,14 +15,16 @@ from scipy.spatial.transform import Rotation
 
 from beamsplat.common.raster.layout import ALPHA_MAX, COLOUR, MEAN, OPACITY, QUAT, SCALE
 
-FINEST_CELL_M = 0.02  # below, merging saves little: Gaussians are as large
-_THINNEST_M = 1e-4
-_GROWTH = 1.6  # of a merged Gaussian's area; best of 1 to 2.5 on a mapped home
+FINEST_CELL_M = 0.02  # smallest cell; most Gaussians are as large, so smaller cells save little
+_MIN_SIGMA_M = 1e-4  # of a merged Gaussian: keeps its covariance invertible
+_MAX_GROWTH = 1.6  # of a merged Gaussian's area; best of 1 to 2.5 on a mapped home
 
 
 def detail_cell_m(distance_m: float, focal_px: float, error_px: float) -> float:
-    """Edge (m) of cells that a pinhole of that focal length sees as `error_px` from that far: a power of two
-    times `FINEST_CELL_M`; 0.0 where all detail is due."""
+    """Return the edge (m) of the largest cell that is at most `error_px` large in the image.
+
+    Edges are `FINEST_CELL_M` times a power of two; 0.0 (full detail) if the finest cell is larger.
+    """
     cell_m = error_px * distance_m / focal_px
     if cell_m < FINEST_CELL_M:
         return 0.0
@@ -29,8 +32,15 @@ def detail_cell_m(distance_m: float, focal_px: float, error_px: float) -> float:
 
 
 def merge_by_cell(params: np.ndarray, cell_m: float) -> np.ndarray:
-    """Gaussians float32 [14, M], M <= N, for those of `params` float32 [14, N]: one a cell of edge `cell_m`,
-    beside those that are larger than a cell. `cell_m` 0 leaves all as they are."""
+    """Return Gaussians with one per cell of edge `cell_m`; those larger than a cell are not merged.
+
+    Args:
+        params: float32 [14, N], in any frame.
+        cell_m: 0 returns `params` unchanged.
+
+    Returns:
+        float32 [14, M], M <= N.
+    """
     scale = np.exp(params[SCALE:QUAT].astype(np.float64))
     small = scale.max(axis=0) < cell_m
     if cell_m <= 0.0 or not small.any():
@@ -47,7 +57,7 @@ def merge_by_cell(params: np.ndarray, cell_m: float) -> np.ndarray:
 
 
 def _merged(params: np.ndarray, starts: np.ndarray) -> np.ndarray:
-    """One Gaussian for each run of columns that begins at `starts`."""
+    """Return one Gaussian for each run of columns that begins at `starts` int [M]."""
     if params.shape[1] == 0:
         return params
 
@@ -65,10 +75,10 @@ def _merged(params: np.ndarray, starts: np.ndarray) -> np.ndarray:
     spread = np.einsum("nij,jn,nkj->ikn", R, scale**2, R) + off[:, None] * off[None]
     covariance = (total(weight * spread) / mass).transpose(2, 0, 1)
     variance, axes = np.linalg.eigh(covariance)
-    axes[np.linalg.det(axes) < 0.0, :, 0] *= -1.0  # a rotation, no mirror
-    deviation = np.sqrt(np.maximum(variance, _THINNEST_M**2)).T
-    # What opacity alone cannot cover, size does, within bounds.
-    deviation[1:] *= np.sqrt(np.clip(mass / _area(deviation), 1.0, _GROWTH))
+    axes[np.linalg.det(axes) < 0.0, :, 0] *= -1.0  # det = +1: a rotation
+    deviation = np.sqrt(np.maximum(variance, _MIN_SIGMA_M**2)).T
+    # Opacity is at most 1: the rest of the area is covered by a larger Gaussian, within bounds.
+    deviation[1:] *= np.sqrt(np.clip(mass / _area(deviation), 1.0, _MAX_GROWTH))
     covering = np.clip(mass / _area(deviation), 1e-4, ALPHA_MAX)
     out = np.empty((params.shape[0], len(starts)), np.float32)
     out[MEAN:SCALE], out[SCALE:QUAT] = centre, np.log(deviation)
@@ -79,11 +89,11 @@ def _merged(params: np.ndarray, starts: np.ndarray) -> np.ndarray:
 
 
 def _area(scale_m: np.ndarray) -> np.ndarray:
-    """Of the largest face of ellipsoids [3, N], but for a factor."""
+    """Return the area of the largest cross-section of ellipsoids [3, N], without the factor pi."""
     ordered = np.sort(scale_m, axis=0)
     return ordered[1] * ordered[2]
 
 
 def _rotation(quat_wxyz: np.ndarray) -> Rotation:
-    """N rotations of quaternions [4, N] of any length."""
+    """Return N rotations from quaternions [4, N] of any norm."""
     return Rotation.from_quat(np.roll(quat_wxyz.astype(np.float64), -1, axis=0).T)

@@ -1,7 +1,8 @@
-"""Gaussians as binary glTF with `KHR_gaussian_splatting` (ratified): viewers without it show coloured points.
+"""Gaussians as binary glTF with the extension `KHR_gaussian_splatting` (ratified).
 
-Values are activated, as the extension wants them: linear scales (standard deviations, metres), opacity 0..1,
-unit quaternions xyzw, colour as the spherical harmonic of degree 0. A node turns z up into glTF's y up.
+Viewers without the extension show coloured points. Values are activated, as the extension requires: linear
+scales (standard deviations, metres), opacity 0..1, unit quaternions xyzw, colour as the spherical harmonic of
+degree 0. The rotation of the node converts z up to y up.
 """
 
 from __future__ import annotations
@@ -24,14 +25,14 @@ _WIDTH = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 
 
 def write_gltf(path: Path, params: np.ndarray) -> None:
-    """Writes Gaussians float32 [14, N] as `.glb`, whole or not at all.
+    """Write Gaussians float32 [14, N], in the map frame, as `.glb`, atomically.
 
     Raises:
-        ValueError: there are none; glTF knows no empty arrays.
-        OSError: not writable.
+        ValueError: there are no Gaussians; glTF has no empty arrays.
+        OSError: the file cannot be written.
     """
     if params.shape[1] == 0:
-        raise ValueError("the map has no Gaussians: glTF cannot hold an empty one")
+        raise ValueError("the map has no Gaussians: a glTF file cannot be empty")
     colour = params[COLOUR : COLOUR + 3].T
     opacity = 1.0 / (1.0 + np.exp(-params[OPACITY].astype(np.float64)))
     w, x, y, z = params[QUAT : QUAT + 4] / np.linalg.norm(params[QUAT : QUAT + 4].astype(np.float64), axis=0)
@@ -48,7 +49,7 @@ def write_gltf(path: Path, params: np.ndarray) -> None:
 
 
 def _linear(srgb: np.ndarray) -> np.ndarray:
-    """sRGB in [0, 1] decoded: glTF's own vertex colours are linear."""
+    """Decode sRGB in [0, 1] to linear: the vertex colours of glTF are linear."""
     return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
 
 

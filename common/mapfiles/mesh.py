@@ -1,7 +1,7 @@
-"""A triangle mesh of what a map shows: rendered depth fused into a signed distance field, then surface nets.
+"""Triangle mesh of a map: rendered depth fused into a TSDF volume (Curless & Levoy 1996), then surface nets.
 
-Every cell whose eight corners were seen gets its piece of surface, and neighbours share vertices: the mesh is
-closed where everything was seen, and open only at the border of the unseen.
+Each cell with eight observed corners gets its part of the surface, and neighbours share vertices: the mesh is
+closed in observed space and open only at its border.
 """
 
 from __future__ import annotations
@@ -16,27 +16,30 @@ from beamsplat.common.compiled import kernel
 from beamsplat.common.mapfiles.surface import RenderedDepth
 from beamsplat.common.raster.camera import RasterCamera
 
-MAX_VOXELS = 40_000_000  # 24 bytes each
-TRUNCATION = 4.0  # voxels
+MAX_VOXELS = 40_000_000  # 24 bytes each, 1 GB in all
+TRUNCATION = 4.0  # truncation distance in voxels
+_MIN_DEPTH_M = 0.1  # voxels nearer to the camera are not updated
 
 
 @dataclass
 class TsdfVolume:
-    """Distances to the surface along rays, positive before it, in truncations; `weight` 0 = not seen."""
+    """A truncated signed distance field (TSDF) with colour; distances along rays, positive in front of the
+    surface.
+    """
 
     origin_m: np.ndarray  # float64 [3]: centre of voxel (0, 0, 0)
     voxel_m: float
-    distance: np.ndarray  # float32 [X, Y, Z] in [-1, 1]
-    weight: np.ndarray  # float32 [X, Y, Z]: views
+    distance: np.ndarray  # float32 [X, Y, Z] in [-1, 1], in units of the truncation distance
+    weight: np.ndarray  # float32 [X, Y, Z]: number of views; 0 = not observed
     colour: np.ndarray  # float32 [X, Y, Z, 3]: sum over views near the surface
-    near: np.ndarray  # float32 [X, Y, Z]: how many those were
+    near: np.ndarray  # float32 [X, Y, Z]: number of views near the surface
 
     @staticmethod
     def around(low_m: np.ndarray, high_m: np.ndarray, voxel_m: float) -> TsdfVolume:
-        """An empty field over a box and a margin.
+        """Return an empty volume over a box [3] to [3] in the map frame, plus a margin.
 
         Raises:
-            ValueError: too many voxels; says which size would do.
+            ValueError: too many voxels; the text contains a size that is possible.
         """
         margin = (TRUNCATION + 1.0) * voxel_m
         shape = np.ceil((high_m - low_m + 2.0 * margin) / voxel_m).astype(int) + 1
@@ -44,7 +47,7 @@ class TsdfVolume:
         if count > MAX_VOXELS:
             enough = voxel_m * (count / MAX_VOXELS) ** (1 / 3) * 1.02
             raise ValueError(
-                f"{count / 1e6:.0f} million voxels of {voxel_m:g} m are too many; {enough:.3f} m would do"
+                f"{count / 1e6:.0f} million voxels of {voxel_m:g} m are too many; use {enough:.3f} m or more"
             )
         x, y, z = shape
         return TsdfVolume(
@@ -53,7 +56,7 @@ class TsdfVolume:
         )  # fmt: skip
 
     def add(self, views: Iterable[RenderedDepth]) -> None:
-        """Fuses rendered views."""
+        """Fuse rendered views."""
         for view in views:
             c, R, t = view.camera, view.T_map_camera[:3, :3], view.T_map_camera[:3, 3]
             numbers = np.array([c.fx_px, c.fy_px, c.cx_px, c.cy_px, self.voxel_m])
@@ -68,7 +71,9 @@ def _fuse(
     distance: np.ndarray, weight: np.ndarray, colour: np.ndarray, near: np.ndarray, numbers: np.ndarray,
     R_camera_map: np.ndarray, first_camera: np.ndarray, depth: np.ndarray, rgb: np.ndarray,
 ) -> None:  # fmt: skip
-    """One view into the field; arrays as in TsdfVolume, `first_camera` is voxel (0, 0, 0)."""
+    """Fuse one view into the arrays of a TsdfVolume; `first_camera` [3] is voxel (0, 0, 0) in the camera
+    frame.
+    """
     fx, fy, cx, cy, voxel = numbers
     reach = TRUNCATION * voxel
     height, width = depth.shape
@@ -78,7 +83,7 @@ def _fuse(
                 z = first_camera[2] + voxel * (
                     R_camera_map[2, 0] * i + R_camera_map[2, 1] * j + R_camera_map[2, 2] * k
                 )
-                if z < 0.1:
+                if z < _MIN_DEPTH_M:
                     continue
                 x = first_camera[0] + voxel * (
                     R_camera_map[0, 0] * i + R_camera_map[0, 1] * j + R_camera_map[0, 2] * k
@@ -104,7 +109,7 @@ def _fuse(
 
 @dataclass(frozen=True)
 class TriangleMesh:
-    """Triangles that face the free side."""
+    """A coloured mesh; the normals of its triangles point to free space."""
 
     vertices_m: np.ndarray  # float64 [N, 3]
     colours: np.ndarray  # uint8 [N, 3]
@@ -112,7 +117,7 @@ class TriangleMesh:
 
 
 def surface_nets(field: TsdfVolume) -> TriangleMesh:
-    """The surface where the distance changes its sign: a vertex a cell, a quad an edge (Gibson 1998)."""
+    """Extract the zero level set by surface nets (Gibson 1998): a vertex per cell, a quad per voxel edge."""
     corners = list(product((0, 1), repeat=3))
     shape = tuple(n - 1 for n in field.distance.shape)
 
@@ -132,12 +137,14 @@ def surface_nets(field: TsdfVolume) -> TriangleMesh:
     near = sum(field.near[tuple((cells + c).T)] for c in corners)
     colour = sum(field.colour[tuple((cells + c).T)] for c in corners)
     rgb = colour / np.maximum(near, 1.0)[:, None]
-    faces = _used_faces(field, number)
+    faces = _quads_as_triangles(field, number)
     return TriangleMesh(vertices, np.clip(rgb * 255.0 + 0.5, 0, 255).astype(np.uint8), faces)
 
 
 def _crossings(values: np.ndarray, corners: list[tuple[int, ...]]) -> np.ndarray:
-    """float64 [N, 3] in [0, 1]: mean of the points where the cell's edges cross zero; values [N, 8]."""
+    """Return float64 [N, 3] in [0, 1]: the mean zero crossing of the 12 cell edges, from corner values [N,
+    8].
+    """
     total, count = np.zeros((len(values), 3)), np.zeros(len(values))
     for a, b in combinations(range(8), 2):
         p, q = np.array(corners[a]), np.array(corners[b])
@@ -151,8 +158,8 @@ def _crossings(values: np.ndarray, corners: list[tuple[int, ...]]) -> np.ndarray
     return total / np.maximum(count, 1)[:, None]
 
 
-def _used_faces(field: TsdfVolume, number: np.ndarray) -> np.ndarray:
-    """int32 [M, 3]: two triangles for each voxel edge through the surface that has a vertex all round."""
+def _quads_as_triangles(field: TsdfVolume, number: np.ndarray) -> np.ndarray:
+    """Return int32 [M, 3]: two triangles for each zero-crossing voxel edge with vertices in all cells."""
     out = []
     for axis in range(3):
         low = [slice(None)] * 3
@@ -169,15 +176,17 @@ def _used_faces(field: TsdfVolume, number: np.ndarray) -> np.ndarray:
         step_b, step_c = np.eye(3, dtype=int)[b], np.eye(3, dtype=int)[c]
         around = (edges - step_b - step_c, edges - step_c, edges, edges - step_b)
         quad = np.stack([number[tuple(cell.T)] for cell in around], axis=1)
-        turned = after[tuple(edges.T)]  # free before it, solid behind: the quad looks back along the axis
+        turned = after[
+            tuple(edges.T)
+        ]  # free in front of it, solid behind: the normal points against the axis
         whole = np.all(quad >= 0, axis=1)
         quad = np.where(turned[:, None], quad[:, ::-1], quad)[whole]
         out += [quad[:, [0, 1, 2]], quad[:, [0, 2, 3]]]
     return np.concatenate(out).astype(np.int32)
 
 
-def remove_small_pieces(mesh: TriangleMesh, least_faces: int) -> TriangleMesh:
-    """The mesh without connected pieces of fewer triangles, and without unused vertices."""
+def remove_small_components(mesh: TriangleMesh, min_faces: int) -> TriangleMesh:
+    """Return the mesh without connected components of fewer than `min_faces` triangles."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
@@ -186,13 +195,13 @@ def remove_small_pieces(mesh: TriangleMesh, least_faces: int) -> TriangleMesh:
     links = coo_array((np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), (count, count))
     _, piece = connected_components(links, directed=False)
     size = np.bincount(piece[faces[:, 0]], minlength=piece.max(initial=0) + 1)
-    faces = faces[size[piece[faces[:, 0]]] >= least_faces]
+    faces = faces[size[piece[faces[:, 0]]] >= min_faces]
     used, faces = np.unique(faces, return_inverse=True)
     return TriangleMesh(mesh.vertices_m[used], mesh.colours[used], faces.reshape(-1, 3).astype(np.int32))
 
 
 def warm() -> None:
-    """Compiles the kernel, with the types used in production."""
+    """Compile the fusion kernel with the array types used in production."""
     camera = RasterCamera(10.0, 10.0, 3.5, 3.5, 8, 8)
     view = RenderedDepth(camera, np.eye(4), np.zeros((8, 8, 3), np.float32), np.ones((8, 8), np.float32))
     TsdfVolume.around(np.zeros(3), np.ones(3), 0.5).add([view])

@@ -1,25 +1,26 @@
-"""What the camera saw as an occupancy layer beside the lidar's: tables, chairs' seats, shelves, low boxes."""
+"""Occupancy layer from the map surface: tables, seats and low boxes outside the lidar plane."""
 
 from __future__ import annotations
 
 import numpy as np
 
 OCCUPIED, FREE, UNKNOWN = 100, 0, -1
-_FLOOR_M = 0.06  # around z = 0
-_LEAST_POINTS = 3  # in a cell, of those the surface is sampled with: one is a stray
-_LEAST_HEIGHT_M = 0.04  # between the lowest and the highest of them
+_FLOOR_M = 0.06  # points with |z| up to this are floor
+_MIN_POINTS = 3  # surface samples in an occupied cell: fewer are outliers
+_MIN_HEIGHT_M = 0.04  # between the lowest and the highest sample of an occupied cell
 
 
 def camera_layer(
-    points_map_m: np.ndarray,  # float64 [N, 3] of the surface
+    points_map_m: np.ndarray,  # float64 [N, 3], samples of the surface
     origin_m: tuple[float, float],  # lower left corner of cell (0, 0)
     shape: tuple[int, int],  # rows, columns
     resolution_m: float,
     low_m: float,
     high_m: float,
 ) -> np.ndarray:
-    """int8 [rows, columns]: 100 where something stands between `low_m` and `high_m` above the floor, 0 where
-    floor is seen and nothing stands, -1 elsewhere."""
+    """Return int8 [rows, columns]: 100 occupied between `low_m` and `high_m` above the floor, 0 free floor,
+    -1 unknown.
+    """
     column, row = (
         np.floor((points_map_m[:, axis] - origin_m[axis]) / resolution_m).astype(int) for axis in (0, 1)
     )
@@ -36,12 +37,17 @@ def camera_layer(
     out = np.full(size, UNKNOWN, np.int8)
     out[floor > 0] = FREE
     with np.errstate(invalid="ignore"):
-        out[(count >= _LEAST_POINTS) & ((top - bottom >= _LEAST_HEIGHT_M) | (floor == 0))] = OCCUPIED
+        out[(count >= _MIN_POINTS) & ((top - bottom >= _MIN_HEIGHT_M) | (floor == 0))] = OCCUPIED
     return out.reshape(shape)
 
 
 def combined(lidar: np.ndarray, camera: np.ndarray, occupied: int, free: int) -> np.ndarray:
-    """int8: the lidar's cells (percent, -1 unknown) and, where it has no wall, what the camera saw there."""
+    """Return the lidar grid int8 (percent, -1 unknown) with the camera layer in cells not occupied.
+
+    Args:
+        occupied: percent from which a lidar cell is occupied and is kept.
+        free: percent up to which a lidar cell is free; cells in between become free if the camera saw floor.
+    """
     out = lidar.copy()
     open_to_camera = lidar < occupied
     out[open_to_camera & (camera == OCCUPIED)] = OCCUPIED
@@ -52,7 +58,7 @@ def combined(lidar: np.ndarray, camera: np.ndarray, occupied: int, free: int) ->
 
 
 def grid_around(points_map_m: np.ndarray, resolution_m: float) -> tuple[tuple[float, float], tuple[int, int]]:
-    """(origin, shape) of a grid that covers points [N, 3] and a rim, for a map without a lidar's."""
+    """Return (origin x, y in m; rows, columns) of a grid around points [N, 3], with a margin of one cell."""
     low = (np.floor(points_map_m[:, :2].min(axis=0) / resolution_m) - 1.0) * resolution_m
     cells = np.floor((points_map_m[:, :2].max(axis=0) - low) / resolution_m).astype(int) + 2
     return (float(low[0]), float(low[1])), (int(cells[1]), int(cells[0]))

@@ -1,4 +1,4 @@
-"""The map as files others read: 3DGS `.ply` (INRIA layout)."""
+"""Gaussians as 3DGS `.ply` files (INRIA layout), and reading the points of PLY files."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from beamsplat.common.files.persist import make_folder
 from beamsplat.common.geometry.trajectory import Trajectory, write_tum
 from beamsplat.common.raster.layout import COLOUR, MEAN, OPACITY, QUAT, SCALE
 
-SH_C0 = 0.28209479177387814  # the constant spherical harmonic
-_ROWS = 65_536  # written at a time
+SH_C0 = 0.28209479177387814  # value of the spherical harmonic of degree 0
+_ROWS = 65_536  # Gaussians per write: bounds the memory
 _PLY_TYPES = {"float": "<f4", "float32": "<f4", "double": "<f8", "uchar": "u1", "uint8": "u1", "char": "i1",
               "short": "<i2", "ushort": "<u2", "int": "<i4", "uint": "<u4"}  # fmt: skip
 FIELDS = ("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity",
@@ -22,29 +22,29 @@ FIELDS = ("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacit
 
 
 def write_gaussian_ply(path: Path, params: np.ndarray) -> None:
-    """Writes Gaussians float32 [14, N] as INRIA's 3DGS does (SH degree 0), all at once or not at all."""
+    """Write Gaussians float32 [14, N] in the INRIA 3DGS layout (SH degree 0), atomically."""
     write_gaussian_parts(path, params.shape[1], [params])
 
 
 def write_gaussian_parts(path: Path, count: int, parts: Iterable[np.ndarray]) -> None:
-    """The same of `count` Gaussians that come in parts float32 [14, N], one after the other.
+    """Write `count` Gaussians that are given in parts float32 [14, N], atomically.
 
     Raises:
-        ValueError: there were more or fewer; then nothing is written.
+        ValueError: the parts have more or fewer Gaussians; then nothing is written.
     """
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
     header += [f"property float {name}" for name in FIELDS] + ["end_header", ""]
-    path, came = Path(path), 0
+    path, received = Path(path), 0
     partial = path.with_name(path.name + ".partial")
     with partial.open("wb") as file:
         file.write("\n".join(header).encode())
         for params in parts:
             for first in range(0, params.shape[1], _ROWS):
                 file.write(_rows(params[:, first : first + _ROWS]).tobytes())
-            came += params.shape[1]
-    if came != count:
+            received += params.shape[1]
+    if received != count:
         partial.unlink()
-        raise ValueError(f"{path}: {came} Gaussians came, {count} were to come")
+        raise ValueError(f"{path}: received {received} Gaussians, expected {count}")
     os.replace(partial, path)
 
 
@@ -66,10 +66,10 @@ def write_map(
     stamps_ns: np.ndarray,  # int64 [K], rising
     T_map_body: np.ndarray,  # float64 [K, 4, 4] of the keyframes
 ) -> None:
-    """`splats.ply` and `keyframes.tum` in a folder, which is made.
+    """Write `splats.ply` and `keyframes.tum` into a folder, which is created.
 
     Raises:
-        UserError: the folder cannot be made or written.
+        UserError: the folder cannot be created or written.
     """
     make_folder(folder)
     write_gaussian_parts(folder / "splats.ply", count, parts)
@@ -77,10 +77,10 @@ def write_map(
 
 
 def read_ply_points(path: Path) -> np.ndarray:
-    """float64 [N, 3] of the vertices of a binary little-endian PLY.
+    """Return the vertices float64 [N, 3] of a binary little-endian PLY file.
 
     Raises:
-        UserError: not such a file.
+        UserError: the file has another format.
     """
     blob = Path(path).read_bytes()
     end = blob.find(b"end_header\n")

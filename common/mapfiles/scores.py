@@ -1,4 +1,4 @@
-"""How good a map is: PSNR, SSIM and depth at views, and the surface against points of the truth."""
+"""Quality of a map: PSNR, SSIM and depth error of views, F-score of the surface against ground truth."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ from beamsplat.common.raster.camera import RasterCamera
 from beamsplat.common.raster.rasterizer import Rasterizer
 from beamsplat.common.raster.ssim import ssim
 
-GRID_M = 0.02  # of the fused surface
-NEAR_ENOUGH_M = 0.05
+GRID_M = 0.02  # cell of the fused surface; fixed by the evaluation protocol
+FSCORE_DISTANCE_M = 0.05  # largest distance of a matching point; fixed by the evaluation protocol
 
 
 @dataclass(frozen=True)
 class ViewScore:
-    """One view at full size."""
+    """Scores of one rendered view at full size."""
 
     psnr_db: float
     ssim: float
-    depth_l1_m: float  # per pixel capped at the true depth; NaN without truth
+    depth_l1_m: float  # mean; per pixel at most the true depth; NaN without ground truth
 
 
 def render_rgb_depth(
     rasterizer: Rasterizer, store: GaussianStore, camera: RasterCamera, T_map_camera: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(rgb float32 [H, W, 3] in [0, 1], expected depth float32 [H, W] m, alpha float32 [H, W])."""
+    """Return (rgb float32 [H, W, 3] in [0, 1], expected optical z float32 [H, W] m, alpha float32 [H, W])."""
     render = rasterizer.render(store.params, store.count, camera, inverse(T_map_camera))
     rgb = np.clip(render.image[:3].transpose(1, 2, 0), 0.0, 1.0).copy()
     depth, alpha = render.expected_depth(), render.image[4].copy()
@@ -39,14 +39,19 @@ def render_rgb_depth(
 
 
 def psnr_db(a: np.ndarray, b: np.ndarray) -> float:
-    """Of two pictures in [0, 1]; 120 dB where they are the same."""
+    """Return the PSNR of two images in [0, 1]; 120 dB if they are equal."""
     return float(-10.0 * np.log10(max(float(np.mean((a - b) ** 2)), 1e-12)))
 
 
 def score_view(
     rgb: np.ndarray, depth: np.ndarray, true_rgb: np.ndarray, true_depth: np.ndarray | None
 ) -> ViewScore:
-    """Rendered against true: rgb float32 in [0, 1], true_rgb uint8, depths in metres, NaN unknown."""
+    """Return the scores of a render against the truth.
+
+    Args:
+        rgb: float32 [H, W, 3] in [0, 1]. true_rgb: uint8 [H, W, 3].
+        depth, true_depth: float32 [H, W] in metres, NaN unknown.
+    """
     truth = true_rgb.astype(np.float32) / 255.0
     l1 = float("nan")
     if true_depth is not None:
@@ -59,7 +64,9 @@ def score_view(
 def fused_surface(
     rasterizer: Rasterizer, store: GaussianStore, views: Iterable[tuple[RasterCamera, np.ndarray]]
 ) -> np.ndarray:
-    """Points float64 [N, 3] of the rendered depth with alpha above one half, one a cell of 2 cm."""
+    """Return the points float64 [N, 3] of rendered depth with alpha > 0.5, one per 2 cm cell, in the map
+    frame.
+    """
     parts = []
     for camera, T_map_camera in views:
         _, depth, alpha = render_rgb_depth(rasterizer, store, camera, T_map_camera)
@@ -76,12 +83,17 @@ def fused_surface(
 
 
 def f_score(points: np.ndarray, truth: np.ndarray) -> dict[str, float]:
-    """Accuracy, completion (mean metres) and F-score at 5 cm of points [N, 3] against points [M, 3]."""
+    """Return accuracy and completion (mean, m, at most 1 m) and F-score at 5 cm of points [N, 3] against [M,
+    3].
+    """
     if len(points) == 0 or len(truth) == 0:
         return {"fscore_5cm": 0.0, "accuracy_m": float("nan"), "completion_m": float("nan")}
     to_truth, _ = cKDTree(truth).query(points, distance_upper_bound=1.0)
     to_map, _ = cKDTree(points).query(truth, distance_upper_bound=1.0)
     to_truth, to_map = np.minimum(to_truth, 1.0), np.minimum(to_map, 1.0)
-    precision, recall = float(np.mean(to_truth < NEAR_ENOUGH_M)), float(np.mean(to_map < NEAR_ENOUGH_M))
+    precision, recall = (
+        float(np.mean(to_truth < FSCORE_DISTANCE_M)),
+        float(np.mean(to_map < FSCORE_DISTANCE_M)),
+    )
     score = 2.0 * precision * recall / max(precision + recall, 1e-12)
     return {"fscore_5cm": score, "accuracy_m": float(to_truth.mean()), "completion_m": float(to_map.mean())}

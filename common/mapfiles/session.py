@@ -108,8 +108,9 @@ class SessionFolder:
         return head
 
     def lock(self) -> None:
-        """Take the write lock until `unlock` or the end of the process; remove temporary files of a killed
-        writer.
+        """Take the write lock until `unlock` or the end of the process.
+
+        Temporary files of a killed writer are removed.
 
         Raises:
             UserError: another process holds the lock; the text contains its id and host.
@@ -146,7 +147,8 @@ class SessionFolder:
         empty = {"lock", self.keyframes.name, self.blocks.name}
         if {path.name for path in self.edge.iterdir()} - empty:
             return True
-        return any(any(folder.iterdir()) for folder in (self.keyframes, self.blocks))
+        folders = (self.keyframes, self.blocks)
+        return any(not folder.is_dir() or any(folder.iterdir()) for folder in folders)
 
     def _remove_empty(self) -> None:
         """Remove the files that `create` and `lock` write, and the folders; anything else stays."""

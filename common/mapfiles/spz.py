@@ -1,6 +1,6 @@
-"""Gaussians as `.spz` (Niantic), version 3: 20 bytes each before gzip, y up.
+"""Gaussians as `.spz` files (Niantic), version 3: 20 bytes each before gzip, y up.
 
-Positions to 1/4096 m within 2 km, scales to 6 %, colours and opacity to 1/255.
+Resolution: positions 1/4096 m within 2 km of the origin, scales 6 %, colours and opacity 1/255.
 """
 
 from __future__ import annotations
@@ -20,21 +20,21 @@ from beamsplat.common.raster.layout import COLOUR, MEAN, OPACITY, QUAT, SCALE
 
 _HEAD = struct.Struct("<4sIIBBBB")  # magic, version, count, degree, fraction bits, flags, reserved
 _FRACTION_BITS = 12
-_COLOUR_SCALE = 0.15  # of the harmonic of degree 0, so that colours beyond 0..1 fit
+_COLOUR_SCALE = 0.15  # of the harmonic of degree 0 (format): leaves room for colours outside 0..1
 
 
 def write_spz(path: Path, params: np.ndarray) -> None:
-    """Writes Gaussians float32 [14, N], whole or not at all.
+    """Write Gaussians float32 [14, N], in the map frame, atomically.
 
     Raises:
-        ValueError: a Gaussian lies more than 2 km from the origin.
-        OSError: not writable.
+        ValueError: a Gaussian is more than 2047 m from the origin.
+        OSError: the file cannot be written.
     """
     params = transform_gaussians(params, make_transform(R_yup_map, np.zeros(3)))
     fixed = np.round(params[MEAN : MEAN + 3].T.astype(np.float64) * (1 << _FRACTION_BITS))
     if fixed.size and np.abs(fixed).max() >= 1 << 23:
         raise ValueError(
-            f"a Gaussian lies {np.abs(params[:3]).max():.0f} m off: SPZ holds 2047 m; use ply or gltf"
+            f"a Gaussian is {np.abs(params[:3]).max():.0f} m from the origin, SPZ allows 2047; use ply"
         )
     words = np.ascontiguousarray(fixed.astype("<i4"))
     positions = words.view("u1").reshape(*words.shape, 4)[..., :3]  # little endian: the low 24 bits
@@ -54,7 +54,9 @@ def _byte(values: np.ndarray) -> np.ndarray:
 
 
 def _smallest_three(params: np.ndarray) -> np.ndarray:
-    """uint32 [N]: which of x, y, z, w is largest, and sign and nine bits of each other, in that order."""
+    """Return the quaternions packed as uint32 [N]: index of the largest of x, y, z, w; sign and 9 bits of the
+    others.
+    """
     w, x, y, z = params[QUAT : QUAT + 4].astype(np.float64)
     quat = np.stack([x, y, z, w], axis=1)
     quat /= np.linalg.norm(quat, axis=1, keepdims=True)

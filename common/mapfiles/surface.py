@@ -1,4 +1,4 @@
-"""The surface that a map shows: its rendered depth from all keyframes, as coloured points."""
+"""The surface of a map as coloured points: depth rendered from all keyframes."""
 
 from __future__ import annotations
 
@@ -14,39 +14,43 @@ from beamsplat.common.mapfiles.store import GaussianStore
 from beamsplat.common.raster.camera import RasterCamera
 from beamsplat.common.raster.rasterizer import Rasterizer
 
-_EDGE = 0.05  # neighbours whose depth differs by more than this share of it: one flies between two surfaces
+_MAX_DEPTH_STEP = 0.05  # relative step between neighbours, above which a pixel may be between two surfaces
+_MIN_ALPHA = 0.8  # pixels with less are seen through
+_MAX_WAITING_ROWS = 1_000_000  # points kept before they are merged: bounds the memory
 
 
 @dataclass(frozen=True)
 class RenderedDepth:
-    """A rendered picture with depth."""
+    """A rendered image with depth."""
 
     camera: RasterCamera
     T_map_camera: np.ndarray
     rgb: np.ndarray  # float32 [H, W, 3] in [0, 1]
-    depth_m: np.ndarray  # float32 [H, W] optical z, NaN where nothing sure is seen
+    depth_m: np.ndarray  # float32 [H, W] optical z, NaN where it is uncertain
 
 
-def rendered_views(
+def render_depth_views(
     store: GaussianStore, views: Iterable[tuple[RasterCamera, np.ndarray]], threads: int = 1
 ) -> Iterator[RenderedDepth]:
-    """Each view at half size; pixels seen through, and those between two surfaces, have no depth."""
+    """Render the map from each (camera, T_map_camera) at half size; transparent and flying pixels have no
+    depth.
+    """
     rasterizer = Rasterizer(threads)
     try:
         for camera, T_map_camera in views:
             half = camera.resized(camera.width_px // 2, camera.height_px // 2)
             rgb, depth, alpha = render_rgb_depth(rasterizer, store, half, T_map_camera)
-            sure = (alpha > 0.8) & np.isfinite(depth) & ~flying_pixels(depth)
+            sure = (alpha > _MIN_ALPHA) & np.isfinite(depth) & ~flying_pixels(depth)
             yield RenderedDepth(half, T_map_camera, rgb, np.where(sure, depth, np.float32(np.nan)))
     finally:
         rasterizer.close()
 
 
 def flying_pixels(depth: np.ndarray) -> np.ndarray:
-    """bool [H, W]: pixels beside a jump of depth."""
+    """Return bool [H, W]: pixels next to a step of depth, which may be averages of two surfaces."""
     out = np.zeros(depth.shape, bool)
     for axis in (0, 1):
-        jump = np.abs(np.diff(depth, axis=axis)) > _EDGE * np.minimum(
+        jump = np.abs(np.diff(depth, axis=axis)) > _MAX_DEPTH_STEP * np.minimum(
             *(np.take(depth, range(i, depth.shape[axis] - 1 + i), axis=axis) for i in (0, 1))
         )
         before = [slice(None)] * 2
@@ -58,7 +62,7 @@ def flying_pixels(depth: np.ndarray) -> np.ndarray:
 
 
 def points_of(view: RenderedDepth) -> tuple[np.ndarray, np.ndarray]:
-    """Points float64 [N, 3] in the map and their colours float32 [N, 3]."""
+    """Return the points float64 [N, 3] in the map frame and their colours float32 [N, 3] of a view."""
     v, u = np.nonzero(np.isfinite(view.depth_m))
     z, c = view.depth_m[v, u].astype(np.float64), view.camera
     points = np.stack([(u - c.cx_px) / c.fx_px * z, (v - c.cy_px) / c.fy_px * z, z], axis=1)
@@ -66,13 +70,13 @@ def points_of(view: RenderedDepth) -> tuple[np.ndarray, np.ndarray]:
 
 
 def surface_points(views: Iterable[RenderedDepth], cell_m: float) -> tuple[np.ndarray, np.ndarray]:
-    """One point float64 [N, 3] and colour uint8 [N, 3] for each cell that holds any: the means."""
+    """Return the mean point float64 [N, 3] and the mean colour uint8 [N, 3] of each occupied cell."""
     cells, sums, waiting = np.zeros(0, np.int64), np.zeros((0, 7)), []
     for view in views:
         points, colours = points_of(view)
         rows = np.column_stack([points, colours, np.ones(len(points))])
         waiting.append(_summed(_cell_numbers(points, cell_m), rows))
-        if sum(len(part[0]) for part in waiting) > 1_000_000:
+        if sum(len(part[0]) for part in waiting) > _MAX_WAITING_ROWS:
             cells, sums = _joined([(cells, sums), *waiting])
             waiting = []
     cells, sums = _joined([(cells, sums), *waiting])
@@ -81,7 +85,7 @@ def surface_points(views: Iterable[RenderedDepth], cell_m: float) -> tuple[np.nd
 
 
 def _cell_numbers(points: np.ndarray, cell_m: float) -> np.ndarray:
-    """int64 [N]: one number a cell, within 2**20 cells of the origin."""
+    """Return int64 [N], unique per cell within 2**20 cells of the origin."""
     x, y, z = (np.floor(points / cell_m).astype(np.int64) + (1 << 20)).T
     return (x << 42) | (y << 21) | z
 
@@ -92,14 +96,14 @@ def _joined(parts: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.
 
 
 def _summed(cells: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Different cells int64 [M], rising, and the sums of their rows."""
+    """Return the unique cells int64 [M], ascending, and the sums of their rows."""
     unique, which = np.unique(cells, return_inverse=True)
     sums = np.stack([np.bincount(which, column, len(unique)) for column in rows.T], axis=1)
     return unique, sums
 
 
 def write_ply(path: Path, points: np.ndarray, colours: np.ndarray, faces: np.ndarray | None = None) -> None:
-    """Coloured points [N, 3] (uint8 colours), or with int32 faces [M, 3] a mesh, as binary PLY."""
+    """Write points [N, 3] with uint8 colours [N, 3], or a mesh with int32 faces [M, 3], as binary PLY."""
     vertex = np.zeros(len(points), [("xyz", "<f4", 3), ("rgb", "u1", 3)])
     vertex["xyz"], vertex["rgb"] = points, colours
     head = ["ply", "format binary_little_endian 1.0", "comment metres, z up", f"element vertex {len(points)}"]

@@ -1,4 +1,4 @@
-"""Pictures of a map along a path: a video, or numbered PNGs."""
+"""Renders of a map along a camera path, as a video or as numbered PNG files."""
 
 from __future__ import annotations
 
@@ -18,33 +18,41 @@ from beamsplat.common.raster.layout import MEAN, OPACITY
 from beamsplat.common.raster.rasterizer import Rasterizer
 
 
-def orbit(store: GaussianStore, eye_height_m: float, frames: int) -> list[np.ndarray]:
-    """T_map_camera of a circle around what is solid, seen from above at 35 degrees; the map fits in."""
+def orbit_poses(store: GaussianStore, target_height_m: float, frames: int) -> list[np.ndarray]:
+    """Return T_map_camera of a circle around the map, looking down at 35 degrees; the whole map is in the
+    image.
+
+    Args:
+        target_height_m: upper limit on the height of the point at the image centre.
+
+    Raises:
+        UserError: no Gaussian has an opacity above 0.5.
+    """
     solid = store.params[MEAN : MEAN + 3, : store.count][:, store.params[OPACITY, : store.count] > 0.0]
     if solid.shape[1] == 0:
-        raise UserError("the map has nothing solid to circle around")
+        raise UserError("the map has no opaque Gaussians: there is nothing to render")
     low, high = np.percentile(solid, [2.0, 98.0], axis=1)
     centre, reach = 0.5 * (low + high), 0.55 * float(np.linalg.norm(high - low))
-    centre[2] = min(centre[2], eye_height_m)
+    centre[2] = min(centre[2], target_height_m)
     angles = np.linspace(0.0, 2.0 * np.pi, frames, endpoint=False)
     down = np.radians(35.0)
     offsets = np.stack([np.cos(angles) * np.cos(down), np.sin(angles) * np.cos(down),
                         np.full(frames, np.sin(down))], axis=1)  # fmt: skip
-    return [looking(centre + 1.6 * reach * offset, centre) for offset in offsets]
+    return [look_at(centre + 1.6 * reach * offset, centre) for offset in offsets]
 
 
-def looking(eye_m: np.ndarray, target_m: np.ndarray) -> np.ndarray:
-    """T_map_camera at `eye_m`, upright, with the target in the middle."""
-    forward = (target_m - eye_m) / np.linalg.norm(target_m - eye_m)
+def look_at(camera_m: np.ndarray, target_m: np.ndarray) -> np.ndarray:
+    """Return T_map_camera of an upright camera at `camera_m` [3] with `target_m` [3] at the image centre."""
+    forward = (target_m - camera_m) / np.linalg.norm(target_m - camera_m)
     right = np.cross(forward, [0.0, 0.0, 1.0])
-    if np.linalg.norm(right) < 1e-6:  # straight down: any side will do
+    if np.linalg.norm(right) < 1e-6:  # straight up or down: the direction to the right is arbitrary
         right = np.array([0.0, -1.0, 0.0])
     right /= np.linalg.norm(right)
-    return make_transform(np.stack([right, np.cross(forward, right), forward], axis=1), eye_m)
+    return make_transform(np.stack([right, np.cross(forward, right), forward], axis=1), camera_m)
 
 
-def drive(poses: list[np.ndarray], frames: int) -> list[np.ndarray]:
-    """Poses [4, 4] spread evenly over a path through others, in their order."""
+def interpolate_path(poses: list[np.ndarray], frames: int) -> list[np.ndarray]:
+    """Return `frames` poses [4, 4], interpolated at equal steps along a list of poses."""
     if len(poses) == 1:
         return [poses[0]] * frames
     at = np.linspace(0.0, len(poses) - 1.0, frames)
@@ -52,16 +60,16 @@ def drive(poses: list[np.ndarray], frames: int) -> list[np.ndarray]:
     return [interpolate(poses[i], poses[i + 1], float(s - i)) for i, s in zip(before, at)]
 
 
-def along(trajectory: Trajectory, T_body_camera: np.ndarray, frames: int) -> list[np.ndarray]:
-    """T_map_camera at stamps spread evenly over a trajectory of body poses."""
+def trajectory_poses(trajectory: Trajectory, T_body_camera: np.ndarray, frames: int) -> list[np.ndarray]:
+    """Return T_map_camera at `frames` equally spaced stamps of a trajectory of body poses."""
     stamps = np.linspace(trajectory.stamps_ns[0], trajectory.stamps_ns[-1], frames).astype(np.int64)
     return [T @ T_body_camera for T in trajectory.resampled(stamps)[1]]
 
 
-def pictures(
+def render_path(
     store: GaussianStore, camera: RasterCamera, poses: Iterable[np.ndarray], threads: int
 ) -> Iterator[np.ndarray]:
-    """uint8 [H, W, 3] RGB of each pose."""
+    """Yield the RGB image uint8 [H, W, 3] of the map from each T_map_camera."""
     rasterizer = Rasterizer(threads)
     try:
         for T_map_camera in poses:
@@ -72,10 +80,14 @@ def pictures(
 
 
 def write_video(path: Path, frames: Iterable[np.ndarray], fps: float, count: int) -> list[Path]:
-    """`.mp4` as one video, `.png` as one file a picture (NAME-0001.png ..., NAME.png if there is only one).
+    """Write images as one video (`.mp4`) or as one file each (`.png`); return the files.
+
+    Args:
+        frames: uint8 [H, W, 3] RGB each.
+        count: how many there are; one `.png` is NAME.png, several are NAME-0001.png and so on.
 
     Raises:
-        UserError: another ending, or the file cannot be written.
+        UserError: the name has another suffix, or a file cannot be written.
     """
     if path.suffix not in (".mp4", ".png"):
         raise UserError(f"--out {path}: expected a name that ends in .mp4 or .png")
@@ -90,7 +102,7 @@ def write_video(path: Path, frames: Iterable[np.ndarray], fps: float, count: int
             written.append(file)
             continue
         if writer is None:
-            size = (rgb.shape[1] // 2 * 2, rgb.shape[0] // 2 * 2)  # the codec wants even sizes
+            size = (rgb.shape[1] // 2 * 2, rgb.shape[0] // 2 * 2)  # the codec requires even sizes
             writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), fps, size)
             if not writer.isOpened():
                 raise UserError(f"{path}: cannot be written as a video; choose another folder, or .png")

@@ -1,1 +1,3 @@
-"""Rasterizers behind one protocol, chosen by name. Torch lives here and nowhere else in the mapper."""
+"""Differentiable renderers behind one protocol, chosen by name. Only this package of the mapper imports
+torch.
+"""

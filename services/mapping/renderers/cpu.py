@@ -1,4 +1,6 @@
-"""`cpu`: the Numba rasterizer as a torch function. Float32; each graph holds its own workspace."""
+"""`cpu`: the Numba rasterizer as a torch autograd function, float32. Each autograd graph has its own
+workspace.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,7 @@ from beamsplat.services.mapping.renderers.protocol import Gaussians, RenderedIma
 
 
 class CpuRenderer:
-    """See module. `threads` are shared by all pictures of this renderer."""
+    """The Numba rasterizer for torch. `threads` are shared by all renders of this object."""
 
     def __init__(self, threads: int = 1) -> None:
         self._rasterizer = Rasterizer(threads)
@@ -27,7 +29,7 @@ class CpuRenderer:
         background: torch.Tensor | None = None,
         pose_tangent: torch.Tensor | None = None,
     ) -> RenderedImage:
-        """The picture; differentiable once."""
+        """Render the Gaussians; differentiable once."""
         tangent = torch.zeros(6) if pose_tangent is None else pose_tangent
         black = torch.zeros(3) if background is None else background
         image = _Rasterize.apply(self._rasterizer, camera, T_camera_map, black, tangent, *gaussians.tensors())
@@ -35,7 +37,7 @@ class CpuRenderer:
 
 
 def pack(gaussians: tuple[torch.Tensor, ...]) -> tuple[np.ndarray, int]:
-    """Parameters as the kernels want them: float32 [14, capacity], and the count."""
+    """Return the parameters in the layout of the kernels, float32 [14, capacity], and the count."""
     count = len(gaussians[0])
     params = np.zeros((PARAMS, -(-max(count, 1) // 16) * 16), np.float32)
     for tensor, (first, last) in zip(gaussians, GROUPS.values()):
@@ -43,8 +45,8 @@ def pack(gaussians: tuple[torch.Tensor, ...]) -> tuple[np.ndarray, int]:
     return params, count
 
 
-class _Lease:
-    """Gives a render's memory back when the graph that needs it is gone, whether or not it ran backward."""
+class _RenderLease:
+    """Releases the workspace of a render when its autograd graph is freed, with or without backward pass."""
 
     def __init__(self, rasterizer: Rasterizer, render: Render) -> None:
         self.rasterizer, self.render = rasterizer, render
@@ -66,7 +68,11 @@ class _Rasterize(torch.autograd.Function):
     ) -> torch.Tensor:
         params, count = pack(gaussians)
         render = rasterizer.render(params, count, camera, T_camera_map, background.detach().numpy())
-        ctx.lease, ctx.count, ctx.dtypes = _Lease(rasterizer, render), count, [g.dtype for g in gaussians]
+        ctx.lease, ctx.count, ctx.dtypes = (
+            _RenderLease(rasterizer, render),
+            count,
+            [g.dtype for g in gaussians],
+        )
         ctx.tangent_dtype = tangent.dtype
         return torch.from_numpy(render.image.copy())
 
@@ -76,7 +82,7 @@ class _Rasterize(torch.autograd.Function):
         rasterizer, render = ctx.lease.rasterizer, ctx.lease.render
         gradients = rasterizer.backward(render, np.ascontiguousarray(d_image.numpy()))
         dense = torch.from_numpy(gradients.dense(ctx.count))
-        # Light that no splat stopped shows the background: its gradient needs no kernel.
+        # The background has the remaining transmittance 1 - alpha as weight: its gradient needs no kernel.
         through = 1.0 - torch.from_numpy(render.image[4])
         d_background = (d_image[:3] * through).sum(dim=(1, 2))
         out = [dense[first:last].T.to(dtype) for dtype, (first, last) in zip(ctx.dtypes, GROUPS.values())]

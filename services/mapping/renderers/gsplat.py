@@ -1,4 +1,4 @@
-"""`gsplat`: CUDA. The one place that knows gsplat's conventions (pixel centres at halves, viewmats, ED)."""
+"""`gsplat`: the CUDA rasterizer. Converts to the conventions of gsplat: pixel centres at halves, viewmats."""
 
 from __future__ import annotations
 
@@ -12,25 +12,25 @@ from beamsplat.services.mapping.renderers.protocol import Gaussians, RenderedIma
 
 
 def fault() -> str | None:
-    """Why gsplat cannot run here, in one sentence; None if it can."""
+    """Return why gsplat cannot run on this machine, as one sentence; None if it can."""
     if not torch.cuda.is_available():
-        return "torch sees no CUDA device; use renderer = 'cpu'"
+        return "torch finds no CUDA device; use renderer = 'cpu'"
     try:
-        # Without nvcc this fails in several ways (ImportError, OSError, AttributeError): all mean the same.
+        # Without nvcc the import fails with ImportError, OSError or AttributeError: all mean the same.
         from gsplat import rasterization
         from gsplat.cuda._backend import _C
     except Exception as error:
-        return f"gsplat does not load: {error}; `pip install 'beamsplat[gpu]'`, or use renderer = 'cpu'"
+        return f"gsplat cannot be imported: {error}; `pip install 'beamsplat[gpu]'`, or use renderer = 'cpu'"
     if _C is None or rasterization is None:
         return "gsplat has no compiled kernels and found no CUDA toolkit to build them; use renderer = 'cpu'"
     return None
 
 
 class GsplatRenderer:
-    """See module.
+    """The gsplat rasterizer.
 
     Raises:
-        UserError: no CUDA device, or gsplat or its kernels are missing.
+        UserError: there is no CUDA device, or gsplat or its kernels are missing.
     """
 
     def __init__(self, device: str = "cuda") -> None:
@@ -50,7 +50,7 @@ class GsplatRenderer:
         background: torch.Tensor | None = None,
         pose_tangent: torch.Tensor | None = None,
     ) -> RenderedImage:
-        """The picture, on the device of this renderer; differentiable once."""
+        """Render the Gaussians on the device of this renderer; differentiable once."""
         to = {"device": self._device, "dtype": torch.float32}
         viewmat = torch.as_tensor(T_camera_map, **to)
         if pose_tangent is not None:
@@ -64,7 +64,7 @@ class GsplatRenderer:
             **to,
         )
         mean, log_scale, quat, logit, colour = (tensor.to(**to) for tensor in gaussians.tensors())
-        # The background is added here: gsplat's would tint the depth channel too.
+        # The background is added here: gsplat would add it to the depth channel too.
         image, alpha, _ = self._rasterization(
             mean, quat, log_scale.exp(), torch.sigmoid(logit), colour, viewmat[None], K[None],
             camera.width_px, camera.height_px, near_plane=NEAR_M, eps2d=BLUR_PX2, render_mode="RGB+D",
@@ -77,7 +77,7 @@ class GsplatRenderer:
 
 
 def _left_perturbed(viewmat: torch.Tensor, tangent: torch.Tensor) -> torch.Tensor:
-    """se3_exp(tangent) @ viewmat to first order: exact in value and gradient at zero."""
+    """Return se3_exp(tangent) @ viewmat to first order; value and gradient are exact at zero."""
     zero = torch.zeros_like(tangent[0])
     x, y, z = tangent[3:]
     rows = [(zero, -z, y, tangent[0]), (z, zero, -x, tangent[1]), (-y, x, zero, tangent[2]), (zero,) * 4]

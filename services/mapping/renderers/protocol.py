@@ -1,8 +1,8 @@
-"""What every renderer takes and gives, on torch tensors with autograd.
+"""The interface of the differentiable renderers, on torch tensors with autograd.
 
 Gaussians are five tensors of one dtype: mean_map_m [N, 3], log_scale [N, 3] (ln metres), quat_wxyz
-[N, 4] (any length but zero), opacity_logit [N], colour [N, 3]. The pose enters as `T_camera_map` and, for its
-gradient, as a tangent xi [6] = (rho, phi): the camera stands at se3_exp(xi) @ T_camera_map.
+[N, 4] (any norm but zero), opacity_logit [N], colour [N, 3]. The pose enters as `T_camera_map` and, for its
+gradient, as a tangent xi [6] = (rho, phi): the camera pose is se3_exp(xi) @ T_camera_map.
 `xi` must be zero: renderers may linearise there.
 """
 
@@ -21,7 +21,7 @@ from beamsplat.common.raster.camera import RasterCamera
 
 @dataclass(frozen=True)
 class Gaussians:
-    """Parameters as tensors; `requires_grad` as the caller wants."""
+    """The parameters of Gaussians as tensors."""
 
     mean_map_m: torch.Tensor  # [N, 3]
     log_scale: torch.Tensor  # [N, 3]
@@ -30,7 +30,7 @@ class Gaussians:
     colour: torch.Tensor  # [N, 3]
 
     def tensors(self) -> tuple[torch.Tensor, ...]:
-        """In the order of the rows of the rasterizer's parameter array."""
+        """Return the tensors in the row order of the rasterizer's parameter array."""
         return self.mean_map_m, self.log_scale, self.quat_wxyz, self.opacity_logit, self.colour
 
 
@@ -39,11 +39,11 @@ class RenderedImage:
     """A rendered image."""
 
     colour: torch.Tensor  # [H, W, 3]
-    depth_m: torch.Tensor  # [H, W]: accumulated, sum of weight times optical z
+    depth_m: torch.Tensor  # [H, W]: accumulated depth, sum of weight times optical z
     alpha: torch.Tensor  # [H, W]
 
     def expected_depth_m(self) -> torch.Tensor:
-        """Accumulated depth over alpha; NaN where alpha is below 1e-3."""
+        """Return accumulated depth over alpha; NaN where alpha is below 1e-3."""
         known = self.alpha > 1e-3
         return torch.where(known, self.depth_m / torch.where(known, self.alpha, 1.0), torch.nan)
 
@@ -60,7 +60,7 @@ class DifferentiableRenderer(Protocol):
         pose_tangent: torch.Tensor
         | None = None,  # [6], zero, with requires_grad where its gradient is wanted
     ) -> RenderedImage:
-        """The picture from there."""
+        """Return the render from T_camera_map."""
         ...
 
 
@@ -72,12 +72,12 @@ RENDERERS: dict[str, str] = {
 
 
 def make_renderer(name: str) -> DifferentiableRenderer:
-    """The renderer called `name`; its module is imported only now.
+    """Create a renderer of `RENDERERS`; its module is imported only now.
 
     Raises:
-        UserError: no such renderer, or this machine cannot run it.
+        UserError: the name is unknown, or this machine cannot run the renderer.
     """
     if name not in RENDERERS:
-        raise UserError(f"there is no renderer {name!r}; there are {', '.join(RENDERERS)}")
+        raise UserError(f"unknown renderer {name!r}; choose one of {', '.join(RENDERERS)}")
     module, _, cls = RENDERERS[name].partition(":")
     return getattr(importlib.import_module(module), cls)()

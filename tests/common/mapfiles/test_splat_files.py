@@ -84,7 +84,7 @@ def test_spz_as_gsply_reads_it(params, tmp_path):
 def test_spz_says_what_it_cannot_hold(params, tmp_path):
     far = params.copy()
     far[0, 3] = 3000.0
-    with pytest.raises(ValueError, match="3000 m off: SPZ holds 2047 m"):
+    with pytest.raises(ValueError, match="3000 m from the origin, SPZ allows 2047"):
         write_spz(tmp_path / "map.spz", far)
     assert not list(tmp_path.iterdir())
 

@@ -8,7 +8,7 @@ import trimesh
 from plyfile import PlyData
 
 from beamsplat.common.geometry.transforms import make_transform, so3_exp
-from beamsplat.common.mapfiles.mesh import TriangleMesh, TsdfVolume, remove_small_pieces, surface_nets
+from beamsplat.common.mapfiles.mesh import TriangleMesh, TsdfVolume, remove_small_components, surface_nets
 from beamsplat.common.mapfiles.nav2 import FREE, OCCUPIED, UNKNOWN, camera_layer, combined, grid_around
 from beamsplat.common.mapfiles.surface import (
     RenderedDepth,
@@ -70,7 +70,7 @@ def test_points_lie_on_the_surface_one_a_cell(tmp_path):
 
 
 def test_a_sphere_seen_from_all_sides_is_watertight(tmp_path):
-    mesh = remove_small_pieces(surface_nets(fused(around(behind_m=9.0))), 60)
+    mesh = remove_small_components(surface_nets(fused(around(behind_m=9.0))), 60)
     write_ply(tmp_path / "mesh.ply", mesh.vertices_m, mesh.colours, mesh.faces)
     read = trimesh.load(tmp_path / "mesh.ply", process=False)
     assert read.is_watertight
@@ -103,10 +103,10 @@ def test_crumbs_go_and_large_fields_are_refused():
         np.concatenate([whole.vertices_m, far.vertices_m]), np.concatenate([whole.colours, far.colours]),
         np.concatenate([whole.faces, far.faces + len(whole.vertices_m)]),
     )  # fmt: skip
-    clean = remove_small_pieces(both, 10)
+    clean = remove_small_components(both, 10)
     assert len(clean.faces) == len(whole.faces)
     assert np.abs(clean.vertices_m).max() < 2.0
-    with pytest.raises(ValueError, match=r"million voxels of 0\.01 m are too many; 0\.\d+ m would do"):
+    with pytest.raises(ValueError, match=r"million voxels of 0\.01 m are too many; use 0\.\d+ m or more"):
         TsdfVolume.around(np.zeros(3), np.full(3, 30.0), 0.01)
 
 

@@ -93,7 +93,7 @@ def render(node, message, camera):
     from beamsplat.services.mapping.messages import decode_keyframe
     from tests.services.mapping.home_drive import rendered
 
-    frame = decode_keyframe(message, node._lens)
+    frame = decode_keyframe(message, node._intake.undistorter)
     held = compress(frame, 0.03)
     node._session._checkpointer.load_visible(node._mapper, held)
     return rendered(node._mapper, camera, node._mapper.T_map_camera(held)).astype(np.float16)

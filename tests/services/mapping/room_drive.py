@@ -13,6 +13,7 @@ from beamsplat.common.messages import (
     Correction,
     FusedDepth,
     Image,
+    KeyframeCandidate,
     LidarModel,
     Odometry,
     Rig,
@@ -135,22 +136,29 @@ JUMP = se2_to_se3(np.array([1.0, 0.0, np.deg2rad(10.0)]))
 
 
 class Fusion(Node):
-    """True depth, every picture a keyframe."""
+    """True depth; asks for every image whether it becomes a keyframe."""
 
     name = "fusion"
-    inputs = (Input("camera/image", "every"),)
-    outputs = ("fusion/depth",)
+    inputs = (Input("camera/image", "every"), Input("keyframes/decision", feedback=True))
+    outputs = ("keyframes/candidate", "fusion/depth")
 
     def configure(self):
         shot(0)
 
     def on_camera_image(self, image):
-        number = (image.stamp_ns - T0) // STEP
+        T_odom_body = inverse(T_MAP_ODOM) @ T_map_body((image.stamp_ns - T0) // STEP)
+        yield (
+            "keyframes/candidate",
+            KeyframeCandidate(stamp_ns=image.stamp_ns, T_odom_body=T_odom_body, sharpness=1.0),
+        )
+
+    def on_keyframes_decision(self, decision):
+        number = (decision.stamp_ns - T0) // STEP
         depth = shot(number)[1]
         yield (
             "fusion/depth",
-            FusedDepth(stamp_ns=image.stamp_ns, depth_m=depth, sigma_m=np.full_like(depth, 0.01), keyframe=True,
-                       T_odom_body=inverse(T_MAP_ODOM) @ T_map_body(number)),
+            FusedDepth(stamp_ns=decision.stamp_ns, depth_m=depth, sigma_m=np.full_like(depth, 0.01),
+                       keyframe=decision.keyframe, T_odom_body=inverse(T_MAP_ODOM) @ T_map_body(number)),
         )  # fmt: skip
 
 

@@ -42,7 +42,7 @@ def make(folder, **options):
 def rows(store):
     """All that is known of the Gaussians, one row each, in an order of its own."""
     state = store.state()
-    parts = [state[n].reshape(-1, store.count).astype(np.float64) for n in store._arrays()]
+    parts = [state[n].reshape(-1, store.count).astype(np.float64) for n in state if n != "events"]
     table = np.concatenate(parts).T
     return table[np.lexsort(table.T)]
 
@@ -293,7 +293,7 @@ def test_a_disk_that_takes_no_gaussians_keeps_them_in_memory_and_says_so(tmp_pat
     sent = {}
     walk(node, range(8, PLACES), sent)
     assert node._mapper.store.paged_out_count == 0
-    assert "Gaussians do not go to the disk: No such file" in sent["mapping/status"][-1].session
+    assert "Gaussians cannot be written to disk: No such file" in sent["mapping/status"][-1].session
     (tmp_path / "s" / "edge" / "gaussians").mkdir()
     walk(node, range(PLACES, PLACES + 3), sent)
     assert node._mapper.store.paged_out_count > 0

@@ -73,7 +73,7 @@ def test_the_half_of_another_drive_is_refused_though_it_was_at_the_same_time(hal
     session, _, other = halves
     before = SessionFolder(session).manifest()
     with pytest.raises(
-        UserError, match=r"other: is the robot's half of map .*hangs on map .*of another drive"
+        UserError, match=r"other: is the robot half of map .*belongs to map .*of another drive"
     ):
         run("join", session, other)
     assert SessionFolder(session).manifest() == before
@@ -106,7 +106,9 @@ def test_a_mapper_whose_robot_starts_another_map_keeps_its_own_as_it_is(tmp_path
             map_uuid=name,
         )  # fmt: skip
         handle(node, "localization/anchors", anchors, {})
-        assert ("anchors are ignored: it belongs to the robot's map second" in caplog.text) == (name == "second")
+        assert ("anchors are ignored: it belongs to the robot's map second" in caplog.text) == (
+            name == "second"
+        )
     assert node._mapper.T_map_anchor[0][0, 3] == 0.5
     handle(node, "keyframes/frame", message(1, map_uuid="second"), sent)
     handle(node, "keyframes/frame", message(2, map_uuid="first"), sent)

@@ -23,7 +23,9 @@ def galleries(tmp_path_factory):
         node.close()
         out.append(SessionFolder(root / name).read_state())
     opener = make_node()
-    return *out, lambda id: decode_keyframe(gallery.message((id - gallery.T0) // 10**9), opener._lens)
+    return *out, lambda id: decode_keyframe(
+        gallery.message((id - gallery.T0) // 10**9), opener._intake.undistorter
+    )
 
 
 def joined(a, b):

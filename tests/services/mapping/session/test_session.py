@@ -74,7 +74,12 @@ def test_training_goes_on_as_if_nothing_had_happened(saved, copy):
     bodies = SessionFolder(copy)
     arrays = arrays_of(saved[1]._mapper)
     assert (
-        restore(ours, arrays, lambda id: decode_keyframe(message((id - r.T0) // SECOND), loaded._lens)) == []
+        restore(
+            ours,
+            arrays,
+            lambda id: decode_keyframe(message((id - r.T0) // SECOND), loaded._intake.undistorter),
+        )
+        == []
     )
     losses = [[m.step(m._draw(), HALF), m.refine(3), m.step(m._draw(), FULL)] for m in (ours, loaded._mapper)]
     assert losses[0] == losses[1]

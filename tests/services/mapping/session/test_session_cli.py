@@ -81,7 +81,7 @@ def test_two_drives_become_one_map_that_goes_on(drives, tmp_path):
     both = a["store_params"].shape[1] + b["store_params"].shape[1]
     left = c["store_params"].shape[1]
     assert 0.5 * both < left < 0.8 * both
-    assert f"{both - left} that both maps had are there once" in out
+    assert f"{both - left} duplicates removed" in out
     alone = psnr(a, 1), psnr(b, 7, inverse(T_A_B))
     assert psnr(c, 1) > alone[0] - 1.3  # 3.3 dB less with all of both: walls in front of walls
     assert psnr(c, 7) > alone[1] - 0.8
@@ -103,16 +103,16 @@ def test_two_drives_become_one_map_that_goes_on(drives, tmp_path):
 
 def test_merging_refuses_what_cannot_be_merged(drives, tmp_path):
     a, b = drives / "a", drives / "b"
-    with pytest.raises(UserError, match="they are one drive"):
+    with pytest.raises(UserError, match="they are of the same run"):
         run("merge", a, a, "--out", tmp_path / "c", "--place", "0,0,0")
     with pytest.raises(UserError, match="has no robot half"):
         run("merge", a, b, "--out", tmp_path / "c")
     with pytest.raises(UserError, match="expected X,Y,DEG"):
         run("merge", a, b, "--out", tmp_path / "c", "--place", "0,0")
-    with pytest.raises(UserError, match="holds a session already"):
+    with pytest.raises(UserError, match="contains a session already"):
         run("merge", a, b, "--out", b, "--place", "0,0,0")
     arrays = [SessionFolder(p).read_state() for p in (a, b)]
-    with pytest.raises(UserError, match="lead to those of the first"):
+    with pytest.raises(UserError, match="exist in the first"):
         merged(*arrays, np.eye(4), 0)
     assert not (tmp_path / "c" / "session.json").exists()
 
