@@ -1,4 +1,4 @@
-"""Small real nodes for the tests of the runners; they use rows of the real topic table."""
+"""Small nodes for tests of the runners; they use topics of the real topic table."""
 
 import hashlib
 import time
@@ -22,7 +22,7 @@ class SensorSourceConfig(NodeConfig):
 
 
 class SensorSource(Node):
-    """Scans at 10 Hz, wheel odometry at 50 Hz, pictures at 30 Hz; each arrives late by its own jitter."""
+    """Publishes scans at 10 Hz, wheel odometry at 50 Hz and images at 30 Hz, each with its own latency and jitter."""
 
     name = "replay"
     Config = SensorSourceConfig
@@ -67,7 +67,7 @@ class SensorSource(Node):
 
 
 class Chain(Node):
-    """Sends, per scan, a digest of everything seen so far: any other order gives other messages."""
+    """Publishes, per scan, a digest of all messages so far, which depends on their order."""
 
     name = "localization"
     inputs = ("lidar/scan", "wheel/odometry")
@@ -109,7 +109,7 @@ class SlowConfig(NodeConfig):
 
 
 class Slow(Node):
-    """Takes the newest picture and needs its time for it; takes every scan as well."""
+    """Handles the newest image slowly (`sleep_s`), and every scan."""
 
     name = "localization"
     Config = SlowConfig
@@ -129,7 +129,7 @@ class Slow(Node):
 
 
 class Sink(Node):
-    """Takes every result in and keeps it for the test to look at."""
+    """Stores all received messages in `seen`."""
 
     name = "recorder"
     inputs = (
@@ -156,7 +156,7 @@ class Sink(Node):
 
 
 class PoseSource(Node):
-    """A source that says what it says at once, as a device would."""
+    """Publishes five poses at once, without an arrival time, like a device."""
 
     name = "ros2"
     outputs = ("external/pose",)

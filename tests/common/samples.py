@@ -1,4 +1,4 @@
-"""One filled-in message of every type, and the strategies that make random ones."""
+"""Sample messages: one of each type."""
 
 import numpy as np
 
@@ -19,6 +19,8 @@ from beamsplat.common.messages import (
     InputHealth,
     Keyframe,
     KeyframeAck,
+    KeyframeCandidate,
+    KeyframeDecision,
     LidarModel,
     MapChunk,
     MapPoses,
@@ -37,7 +39,7 @@ from beamsplat.common.messages import (
 
 
 def sample_messages() -> list[Message]:
-    """Every message type once, no field left at its default."""
+    """Return one message of each type, with no field at its default value."""
     rng = np.random.default_rng(7)
     T = se2_to_se3(np.array([[1.0, -2.0, 0.3], [0.5, 4.0, -3.0]]))
     camera = CameraModel(
@@ -93,6 +95,8 @@ def sample_messages() -> list[Message]:
             sigma_png=np.arange(4, dtype=np.uint8), mask_png=np.arange(2, dtype=np.uint8),
             beams=np.array([[320.0, 240.0, 2.0, 0.01]], np.float32), why="moved",
         ),
+        KeyframeCandidate(stamp_ns=26, T_odom_body=T[1], sharpness=0.7),
+        KeyframeDecision(stamp_ns=26, keyframe=True, reason="moved"),
         KeyframeAck(stamp_ns=26, id=26, status="no pixel has a depth"),
         MapChunk(
             stamp_ns=27, anchor_id=7, revision=4, T_map_anchor=T[1], count=2, packed=np.arange(9, dtype=np.uint8),
@@ -118,7 +122,7 @@ def sample_messages() -> list[Message]:
 
 
 def assert_equal(a: object, b: object) -> None:
-    """Deep equality with NaN equal to NaN, arrays by value, shape and dtype."""
+    """Assert deep equality, with NaN equal to NaN; arrays by value, shape and dtype."""
     assert type(a) is type(b)
     if isinstance(a, np.ndarray):
         assert a.dtype == b.dtype

@@ -15,7 +15,7 @@ from mcap.writer import CompressionType, Writer
 from rosbags.highlevel import AnyReader
 
 from beamsplat.common.errors import UserError
-from beamsplat.common.messages import MESSAGES, Anchors, Image, Odometry, Scan, Tick
+from beamsplat.common.messages import MESSAGES, Anchors, Health, Image, Odometry, Scan, Tick
 from beamsplat.common.messages.codec import decode, schema_of
 from beamsplat.common.messages.header import Header
 from beamsplat.common.recording import RecordingError, RecordingReader, RecordingWriter, is_recording
@@ -44,7 +44,7 @@ def scan(stamp_ns, beams=5):
 
 
 @pytest.mark.parametrize("compression", list(CompressionType))
-def test_every_message_comes_back_bit_for_bit(tmp_path, compression):
+def test_all_messages_round_trip_bit_for_bit(tmp_path, compression):
     rng = np.random.default_rng(3)
     messages = [random_message(cls, rng) for _ in range(20) for cls in MESSAGES.values()] + sample_messages()
     with RecordingWriter(tmp_path / "rec", compression=compression, chunk_bytes=20_000) as writer:
@@ -61,7 +61,7 @@ def test_every_message_comes_back_bit_for_bit(tmp_path, compression):
         assert_same(back.message, message)
 
 
-def test_headers_come_back_also_beyond_32_bits(tmp_path):
+def test_headers_round_trip_with_64_bit_sequence(tmp_path):
     headers = [
         Header(5, 77, 2**64 - 1, 0, 1, "camera", "00112233445566ff"),
         Header(6, 78, 2**64 - 1, 1, 1, "camera", "00112233445566ff"),
@@ -75,7 +75,7 @@ def test_headers_come_back_also_beyond_32_bits(tmp_path):
         assert [recorded.header for recorded in reader.messages()] == headers
 
 
-def test_other_tools_open_it(tmp_path):
+def test_rosbags_and_mcap_read_the_recording(tmp_path):
     messages = sample_messages()
     with RecordingWriter(tmp_path / "rec") as writer:
         for i, message in enumerate(messages):
@@ -99,7 +99,7 @@ def test_other_tools_open_it(tmp_path):
     assert decoded["/wheel/odometry"].twist.twist.linear.x == 0.3
     frames = {(t.header.frame_id, t.child_frame_id) for t in decoded["/tf_static"].transforms}
     assert frames == {("base_link", "camera_optical_frame"), ("base_link", "laser")}
-    # The reader of the mcap package agrees, and our own types carry schema and payload.
+    # The mcap package reads it too; channels of our own types have schema and payload.
     with (tmp_path / "rec" / "rec_0.mcap").open("rb") as stream:
         own = {
             channel.metadata["beamsplat.schema"]: (
@@ -109,14 +109,14 @@ def test_other_tools_open_it(tmp_path):
             for _, channel, message in make_reader(stream).iter_messages()
             if channel.message_encoding == "x-beamsplat"
         }
-    assert set(own) >= {schema_of(Anchors), "Tick/1.0", "Health/1.0", "Rig/1.0"}
+    assert set(own) >= {schema_of(Anchors), "Tick/1.0", schema_of(Health), "Rig/1.0"}
     schema, message = own[schema_of(Anchors)]
     assert schema["properties"]["T_map_anchor"]["description"] == "array float64 ['N', 4, 4]"
     anchors = next(m for m in messages if schema_of(m) == schema_of(Anchors))
     assert_same(decode(schema_of(Anchors), message.data), anchors)
 
 
-def test_topics_and_times_are_chosen(tmp_path):
+def test_messages_are_filtered_by_topic_and_time(tmp_path):
     with RecordingWriter(tmp_path / "rec.mcap", chunk_s=0.0) as writer:
         for i in range(10):
             writer.write("tick", tick(i), i * 100)
@@ -127,7 +127,7 @@ def test_topics_and_times_are_chosen(tmp_path):
         assert [r.log_time_ns for r in reader.messages(start_ns=900)] == [900, 950]
 
 
-def test_messages_come_by_arrival_even_if_written_otherwise(tmp_path):
+def test_messages_are_read_in_order_of_arrival(tmp_path):
     rng = np.random.default_rng(0)
     times = rng.permutation(500)
     with RecordingWriter(tmp_path / "rec.mcap", chunk_bytes=500) as writer:
@@ -137,7 +137,7 @@ def test_messages_come_by_arrival_even_if_written_otherwise(tmp_path):
         assert [r.message.count for r in reader.messages()] == list(range(500))
 
 
-def test_a_recording_cut_anywhere_opens_to_its_last_whole_chunk(tmp_path):
+def test_truncated_recording_is_read_to_its_last_complete_chunk(tmp_path):
     whole = tmp_path / "whole.mcap"
     with RecordingWriter(whole, chunk_bytes=4000) as writer:
         for i in range(200):
@@ -165,7 +165,7 @@ def test_a_recording_cut_anywhere_opens_to_its_last_whole_chunk(tmp_path):
         assert found == list(range(kept[-1] // 10**8 + 1 if kept else 0))
 
 
-def test_the_sentence_about_a_lost_chunk_says_how_much(tmp_path):
+def test_problem_text_states_the_duration_of_a_lost_chunk(tmp_path):
     whole = tmp_path / "whole.mcap"
     with RecordingWriter(whole, chunk_s=2.0) as writer:
         for i in range(100):
@@ -178,7 +178,7 @@ def test_the_sentence_about_a_lost_chunk_says_how_much(tmp_path):
         assert "2.00 s" in reader.problems[0]
 
 
-def test_a_damaged_chunk_costs_itself_only(tmp_path):
+def test_only_the_damaged_chunk_is_skipped(tmp_path):
     path = tmp_path / "rec.mcap"
     with RecordingWriter(path, chunk_s=1.0, compression=CompressionType.NONE) as writer:
         for i in range(100):
@@ -193,7 +193,7 @@ def test_a_damaged_chunk_costs_itself_only(tmp_path):
         assert "1 damaged chunks" in reader.problems[0]
 
 
-def test_random_bytes_are_refused_in_one_sentence(tmp_path):
+def test_random_damage_raises_user_errors_only(tmp_path):
     rng = np.random.default_rng(5)
     file = tmp_path / "rec.mcap"
     with RecordingWriter(file, chunk_bytes=300) as writer:
@@ -212,7 +212,7 @@ def test_random_bytes_are_refused_in_one_sentence(tmp_path):
             assert "rec.mcap" in str(error)  # noqa: PT017
 
 
-def test_broken_messages_are_counted(tmp_path):
+def test_undecodable_messages_are_counted(tmp_path):
     path = tmp_path / "rec.mcap"
     with path.open("wb") as stream:
         writer = Writer(stream)
@@ -220,7 +220,7 @@ def test_broken_messages_are_counted(tmp_path):
         meta = {"beamsplat.role": "own", "beamsplat.topic": "tick", "beamsplat.schema": "Tick/1.0"}
         channel = writer.register_channel("/beamsplat/tick", "x-beamsplat", 0, meta)
         future = writer.register_channel("/x", "x-beamsplat", 0, meta | {"beamsplat.schema": "Tick/99.0"})
-        writer.add_message(channel, 1, b"rubbish", 1)
+        writer.add_message(channel, 1, b"invalid", 1)
         writer.add_message(future, 2, b"", 2)
         writer.finish()
     with RecordingReader(path) as reader:
@@ -229,7 +229,7 @@ def test_broken_messages_are_counted(tmp_path):
         assert "do not decode" in reader.problems[0]
 
 
-def test_what_is_no_recording_is_named(tmp_path):
+def test_other_files_raise_user_error(tmp_path):
     (tmp_path / "empty").mkdir()
     (tmp_path / "text.mcap").write_text("hello")
     foreign = tmp_path / "foreign.mcap"
@@ -247,20 +247,20 @@ def test_what_is_no_recording_is_named(tmp_path):
             RecordingReader(tmp_path / name)
 
 
-def test_nothing_is_overwritten(tmp_path):
+def test_existing_recording_is_not_overwritten(tmp_path):
     (tmp_path / "rec").mkdir()
     with pytest.raises(UserError, match="exists already"):
         RecordingWriter(tmp_path / "rec")
 
 
-def test_a_full_disk_is_said_once_and_what_is_safe_stays_readable(tmp_path, monkeypatch):
+def test_full_disk_raises_and_written_messages_stay_readable(tmp_path, monkeypatch):
     real_write = os.write
     room = 30_000
 
     def write(fd, data):
         nonlocal room
         if len(data) > room:
-            real_write(fd, data[:room])  # a full disk takes a part
+            real_write(fd, data[:room])  # a full disk writes a part
             room = 0
             raise OSError(errno.ENOSPC, "No space left on device")
         room -= len(data)
@@ -295,7 +295,7 @@ time.sleep(60)
 """
 
 
-def test_a_killed_recorder_loses_its_open_chunk_only(tmp_path):
+def test_killed_recorder_loses_its_open_chunk_only(tmp_path):
     child = subprocess.Popen(
         [sys.executable, "-c", CRASHING, str(tmp_path / "rec")],
         stdout=subprocess.PIPE, cwd=Path(__file__).parents[2],
@@ -305,12 +305,12 @@ def test_a_killed_recorder_loses_its_open_chunk_only(tmp_path):
     child.wait()
     child.stdout.close()
     with RecordingReader(tmp_path / "rec") as reader:
-        # Chunks end with the message that makes them one second old: 11 ticks each.
+        # A chunk ends with the message that makes it one second long: 11 ticks each.
         assert [r.message.count for r in reader.messages()] == list(range(88))
         assert len(reader.problems) == 1
 
 
-def test_float32_and_2038_do_not_spoil_a_message(tmp_path):
+def test_values_beyond_float32_and_2038_round_trip(tmp_path):
     late = Odometry(stamp_ns=2**62, T_odom_body=np.eye(4), covariance=np.full((3, 3), np.nan), status="lost")
     wide = scan(3).model_copy(update={"range_max_m": 1e300, "angle_min_rad": 0.1})
     picture = Image(
@@ -325,7 +325,7 @@ def test_float32_and_2038_do_not_spoil_a_message(tmp_path):
 
 
 @pytest.mark.parametrize(("extension", "encoding"), [(".jpg", "jpeg"), (".png", "png")])
-def test_pictures_tell_their_size(extension, encoding):
+def test_image_header_of_complete_and_truncated_images(extension, encoding):
     import cv2
 
     data = cv2.imencode(extension, np.zeros((37, 53, 3), np.uint8))[1].tobytes()
@@ -334,7 +334,7 @@ def test_pictures_tell_their_size(extension, encoding):
         assert read_image_header(data[:cut]) in (None, (encoding, 53, 37))
 
 
-def test_rubbish_is_no_picture():
+def test_random_bytes_have_no_image_header():
     rng = np.random.default_rng(2)
     for _ in range(500):
         assert read_image_header(rng.bytes(rng.integers(0, 40))) is None

@@ -1,4 +1,4 @@
-"""Deployment files are strict: a wrong one is one sentence naming file, field and value."""
+"""Deployment files: overrides, and rejection of invalid files with file, field and value in the error."""
 
 import contextlib
 
@@ -19,7 +19,7 @@ def _file(tmp_path, text):
     return path
 
 
-def test_a_deployment_with_overrides(tmp_path):
+def test_load_deployment_applies_overrides(tmp_path):
     path = _file(
         tmp_path, 'robot = "r2"\n[nodes.replay]\ndata = "bag"\n[router]\nlisten = ["tcp/127.0.0.1:1"]\n'
     )
@@ -33,7 +33,7 @@ def test_a_deployment_with_overrides(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("text", "complaint"),
+    ("text", "message"),
     [
         ("robot = ", "not a TOML file"),
         ('robott = "x"', r"unknown option 'robott' \(options are: .*robot"),
@@ -42,31 +42,31 @@ def test_a_deployment_with_overrides(tmp_path):
         ("[nodes]\nreplay = 3", r"nodes.replay = 3"),
     ],
 )
-def test_wrong_files_are_refused_with_field_and_value(tmp_path, text, complaint):
-    with pytest.raises(UserError, match=complaint) as caught:
+def test_invalid_files_raise_errors_with_field_and_value(tmp_path, text, message):
+    with pytest.raises(UserError, match=message) as caught:
         load_deployment(_file(tmp_path, text))
     assert "robot.toml" in str(caught.value)
 
 
-def test_no_file(tmp_path):
+def test_missing_file_raises_user_error(tmp_path):
     with pytest.raises(UserError, match=r"none\.toml: no such deployment file"):
         load_deployment(tmp_path / "none.toml")
 
 
 @pytest.mark.parametrize("override", ["replay.data", "=3", "a..b=1", "robot.x=1"])
-def test_wrong_overrides_are_refused(tmp_path, override):
+def test_invalid_overrides_raise_user_error(tmp_path, override):
     with pytest.raises(UserError, match="--set"):
         load_deployment(_file(tmp_path, 'robot = "r"'), (override,))
 
 
 @given(st.text(max_size=40))
-def test_any_override_text_is_taken_or_refused_cleanly(tmp_path_factory, text):
+def test_any_override_text_is_accepted_or_raises_user_error(tmp_path_factory, text):
     path = _file(tmp_path_factory.mktemp("c"), "")
     with contextlib.suppress(UserError):
         load_deployment(path, (text,))
 
 
-def test_node_options_are_strict():
+def test_unknown_and_invalid_node_options_raise_user_error():
     with pytest.raises(UserError, match="node 'x': unknown option 'stepcost'"):
         parse(NodeConfig, {"stepcost": 1}, "node 'x'")
     with pytest.raises(UserError, match="threads = 0"):

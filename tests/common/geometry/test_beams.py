@@ -1,4 +1,4 @@
-"""Beams at the image's time, hidden beams, and the surfaces they predict."""
+"""Deskewing and projection of beams, occlusion, and the depth of walls and floor."""
 
 import numpy as np
 from hypothesis import given
@@ -22,7 +22,7 @@ from beamsplat.common.geometry.transforms import interpolate, inverse, se2_to_se
 CAMERA = Pinhole(530.0, 530.0, 319.5, 239.5, 640, 480)
 
 
-def test_rubbish_and_missing_returns_are_left_out():
+def test_scan_points_omits_invalid_and_missing_returns():
     ranges = np.array([np.inf, np.nan, -1.0, 0.05, 2.0, 20.0], np.float32)
     points, index = scan_points(ranges, 0.0, 0.1, 0.1, 12.0)
     assert index.tolist() == [4]
@@ -35,7 +35,7 @@ def test_rubbish_and_missing_returns_are_left_out():
     st.floats(-0.6, 0.6),
     st.floats(-3, 3),
 )
-def test_beams_of_a_moving_robot_hit_the_same_points_of_the_world(dx, dy, turn, heading):
+def test_deskewed_beams_hit_the_same_world_points(dx, dy, turn, heading):
     T0 = se2_to_se3(np.array([1.0, 2.0, heading]))
     T1 = T0 @ se2_to_se3(np.array([dx, dy, turn]))
     T_image = interpolate(T0, T1, 0.37)
@@ -53,7 +53,7 @@ def test_beams_of_a_moving_robot_hit_the_same_points_of_the_world(dx, dy, turn, 
     assert np.allclose(transform_points(T_image, moved), world, atol=1e-9)
 
 
-def test_a_beam_behind_a_nearer_edge_is_hidden_from_the_camera_only_there():
+def test_only_beams_behind_a_nearer_edge_are_occluded():
     T = camera_mount(0.0, 0.3, 0.45)  # left of the lidar
     near = np.column_stack([np.full(60, 1.0), np.linspace(-0.05, 0.2, 60), np.full(60, 0.18)])
     far = np.column_stack([np.full(60, 3.0), np.linspace(-0.9, -0.1, 60), np.full(60, 0.18)])
@@ -66,14 +66,14 @@ def test_a_beam_behind_a_nearer_edge_is_hidden_from_the_camera_only_there():
     assert np.mean(hidden[60:] == covered) > 0.95
 
 
-def test_optical_z_of_a_beam_is_not_its_range():
+def test_projected_depth_is_optical_z_not_range():
     T = camera_mount(0.1, 0.0, 0.45, pitch_down_rad=0.03)
     point = np.array([[3.1, 1.0, 0.18]])
     _, z, _ = project_beams(Beams(point, np.zeros(1, int), np.full(1, 0.01)), CAMERA, T)
     assert np.allclose(z, 3.0 * np.cos(0.03) + 0.27 * np.sin(0.03), atol=1e-6)
 
 
-def test_a_straight_wall_between_two_beams_is_straight():
+def test_wall_ranges_interpolates_a_straight_wall():
     angle = np.linspace(-0.5, 0.5, 101)
     r = 3.0 / np.cos(angle)
     between = angle[:-1] + 0.0031
@@ -81,7 +81,7 @@ def test_a_straight_wall_between_two_beams_is_straight():
     assert np.isnan(wall_ranges(np.array([0.8]), angle, r)).all()
 
 
-def test_walls_and_floor_are_found_at_their_depth():
+def test_wall_and_floor_depth_match_geometry():
     T = camera_mount(0.1, 0.0, 0.45, pitch_down_rad=0.035)
     rays = CAMERA.resized(64, 48).ray_grid() @ T[:3, :3].T
     angle = np.linspace(-0.7, 0.7, 301)

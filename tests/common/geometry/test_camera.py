@@ -1,4 +1,4 @@
-"""Pinhole cameras: projection and rays undo each other, K follows the image size, undistortion is exact."""
+"""Pinhole cameras: projection is the inverse of rays, scaling of K, undistortion."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ FISHEYE = Pinhole(300.0, 300.0, 320.0, 240.0, 640, 480, "equidistant", (0.02, -0
 
 @pytest.mark.parametrize("camera", [PLAIN, PLUMB, FISHEYE])
 @given(u=st.floats(100, 560), v=st.floats(80, 400), z=st.floats(0.2, 30))
-def test_projecting_a_ray_gives_its_pixel_back(camera, u, v, z):
+def test_projecting_a_ray_returns_its_pixel(camera, u, v, z):
     ray = camera.rays(np.array([[u, v]]))
     assert ray[0, 2] == 1.0
     uv, inside = camera.project(z * ray)
@@ -31,20 +31,20 @@ def test_points_behind_the_camera_or_outside_the_image_are_flagged():
     assert np.allclose(uv[2], [319.5, 239.5])
 
 
-def test_a_polynomial_that_folds_back_does_not_show_what_lies_far_outside():
+def test_points_far_outside_are_flagged_with_a_non_monotonic_polynomial():
     folding = Pinhole(500.0, 500.0, 320.0, 240.0, 640, 480, "plumb_bob", (-0.4, 0.0, 0.0, 0.0, 0.0))
     far = np.array([[2.5, 0.0, 1.0]])
     assert not folding.project(far)[1][0]
 
 
-def test_resizing_keeps_the_edges_of_the_view():
+def test_resizing_keeps_the_edges_of_the_field_of_view():
     small = PLAIN.resized(160, 120)
     corner = PLAIN.rays(np.array([[-0.5, -0.5], [639.5, 479.5]]))
     assert np.allclose(small.project(corner)[0], [[-0.5, -0.5], [159.5, 119.5]])
 
 
 @pytest.mark.parametrize("camera", [PLUMB, FISHEYE])
-def test_an_undistorted_picture_shows_points_where_the_pinhole_projects_them(camera):
+def test_undistorted_image_matches_pinhole_projection(camera):
     rng = np.random.default_rng(3)
     for point in rng.uniform([-0.3, -0.2, 1.0], [0.3, 0.2, 2.0], (10, 3)):
         (u, v), (inside,) = camera.project(point[None])[0][0], camera.project(point[None])[1]
@@ -59,6 +59,6 @@ def test_an_undistorted_picture_shows_points_where_the_pinhole_projects_them(cam
         assert np.allclose(centre, camera.undistorted().project(point[None])[0][0], atol=0.3)
 
 
-def test_an_image_of_another_size_is_refused():
+def test_image_of_another_size_raises():
     with pytest.raises(ValueError, match="640x480"):
         Undistorter(PLUMB)(np.zeros((240, 320), np.uint8))

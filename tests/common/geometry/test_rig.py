@@ -42,7 +42,7 @@ quat_xyzw = [0.0, 0.0, 0.0, 1.0]
 """
 
 
-def test_a_camera_looking_two_degrees_down():
+def test_rpy_of_a_camera_pitched_down_two_degrees():
     rig = parse_rig(RIG, "rig.toml").message(7, "rig.toml")
     expected = camera_mount(0.1, 0.0, 0.45, pitch_down_rad=np.radians(2.0))
     assert np.allclose(rig.camera.T_body_camera, expected, atol=1e-12)
@@ -54,7 +54,7 @@ def test_a_camera_looking_two_degrees_down():
     assert rig.stamp_ns == 7
 
 
-def test_the_optical_quaternion_of_ros_gives_the_same_camera():
+def test_optical_quaternion_is_equivalent_to_rpy():
     quat = "quat_xyzw = [-0.5086500507968373, 0.5086500507968373, -0.4911976443595539, 0.4911976443595539]"
     rig = parse_rig(RIG.replace("rpy_deg = [0.0, 2.0, 0.0]", quat), "rig.toml")
     expected = camera_mount(0.1, 0.0, 0.45, pitch_down_rad=np.radians(2.0))
@@ -63,14 +63,14 @@ def test_the_optical_quaternion_of_ros_gives_the_same_camera():
 
 @settings(max_examples=100, deadline=None)
 @given(st.tuples(*[st.floats(-179, 179)] * 3))
-def test_rpy_is_that_of_urdf(degrees):
+def test_rpy_matches_urdf(degrees):
     R = rotation_from_rpy(*np.radians(degrees))
     assert np.allclose(R, Rotation.from_euler("xyz", degrees, degrees=True).as_matrix(), atol=1e-12)
     assert np.allclose(rotation_from_rpy(*rpy_from_rotation(R)), R, atol=1e-6)
 
 
 @pytest.mark.parametrize("pitch", [90.0, -90.0])
-def test_rpy_at_the_poles(pitch):
+def test_rpy_at_gimbal_lock(pitch):
     R = rotation_from_rpy(*np.radians([30.0, pitch, 50.0]))
     assert np.allclose(rotation_from_rpy(*rpy_from_rotation(R)), R, atol=1e-9)
 
@@ -82,7 +82,7 @@ def test_rpy_at_the_poles(pitch):
     st.booleans(),
     st.booleans(),
 )
-def test_what_is_written_reads_back(seed, source, with_camera, with_lidar):
+def test_format_and_parse_round_trip(seed, source, with_camera, with_lidar):
     if not with_camera and not with_lidar:
         return
     rng = np.random.default_rng(seed)
@@ -116,7 +116,7 @@ def test_what_is_written_reads_back(seed, source, with_camera, with_lidar):
         ("[camera]", "[camera", ["not a TOML file"]),
     ],
 )
-def test_faults_name_file_field_and_value(tmp_path, old, new, words):
+def test_errors_name_file_field_and_value(tmp_path, old, new, words):
     file = tmp_path / "rig.toml"
     assert old in RIG
     file.write_text(RIG.replace(old, new, 1))
@@ -136,11 +136,11 @@ def test_an_empty_rig_and_a_missing_file(tmp_path):
 
 @settings(max_examples=200, deadline=None)
 @given(st.text(max_size=60))
-def test_rubbish_raises_user_errors_only(text):
+def test_arbitrary_text_raises_user_errors_only(text):
     with pytest.raises(UserError):
-        parse_rig(text, "rubbish")
+        parse_rig(text, "text")
 
 
-def test_mounts_from_transforms_are_exact():
+def test_mount_of_transform_round_trip():
     T = make_transform(Rotation.random(rng=np.random.default_rng(1)).as_matrix(), [0.1, -0.2, 0.3])
     assert np.allclose(Mount.of(T).transform(np.eye(3)), T, atol=1e-12)

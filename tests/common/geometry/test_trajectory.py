@@ -47,21 +47,21 @@ def test_tum_round_trip_is_exact_in_time_and_a_micrometre_in_space(stamps, seed)
 
 @settings(max_examples=200, deadline=None)
 @given(st.text(alphabet="0123456789.eE+-# \nnaifx,", max_size=200))
-def test_rubbish_raises_user_errors_only(text):
+def test_arbitrary_text_raises_user_errors_only(text):
     try:
-        parse_tum(text, "rubbish")
+        parse_tum(text, "a file")
     except UserError as error:
-        assert "rubbish" in str(error)  # noqa: PT017
+        assert "a file" in str(error)  # noqa: PT017
 
 
-def test_stamps_of_today_keep_their_nanoseconds():
+def test_stamps_are_exact_to_the_nanosecond():
     assert parse_stamp_s("1767225600.123456789", "here") == 1767225600123456789
     assert parse_stamp_s("1.7672256e9", "here") == 1767225600 * 10**9
     assert parse_stamp_s("0", "here") == 0
 
 
 @pytest.mark.parametrize("word", ["-1", "nan", "inf", "1e40", "seven", ""])
-def test_no_stamp(word):
+def test_invalid_stamps_raise_user_error(word):
     with pytest.raises(UserError, match="here"):
         parse_stamp_s(word, "here")
 
@@ -76,7 +76,7 @@ def test_no_stamp(word):
         ("2 0 0 0 0 0 0 1\n2 1 0 0 0 0 0 1", "same stamp"),
     ],
 )
-def test_faulty_lines_are_named(tmp_path, line, what):
+def test_errors_name_file_and_line(tmp_path, line, what):
     file = tmp_path / "poses.txt"
     file.write_text(f"# comment\n{line}\n")
     with pytest.raises(UserError, match=what) as caught:
@@ -85,12 +85,12 @@ def test_faulty_lines_are_named(tmp_path, line, what):
     assert "2" in str(caught.value)
 
 
-def test_a_missing_file_is_named(tmp_path):
+def test_missing_file_raises_user_error(tmp_path):
     with pytest.raises(UserError, match=r"nowhere\.txt"):
         read_tum(tmp_path / "nowhere.txt")
 
 
-def test_between_two_poses_translation_is_linear_and_rotation_geodesic():
+def test_interpolation_is_linear_in_translation_and_geodesic_in_rotation():
     turn = Rotation.from_euler("z", 90, degrees=True).as_matrix()
     trajectory = Trajectory(
         np.array([10**9, 2 * 10**9]),
@@ -102,7 +102,7 @@ def test_between_two_poses_translation_is_linear_and_rotation_geodesic():
     assert np.array_equal(trajectory.at(2 * 10**9), trajectory.T_a_b[1])
 
 
-def test_outside_and_in_gaps_there_is_no_answer():
+def test_no_pose_outside_the_covered_time_or_in_gaps():
     trajectory = Trajectory(np.array([0, 100, 1000]), np.array([np.eye(4)] * 3))
     assert trajectory.at(1001) is None
     assert trajectory.at(1001, max_extrapolation_ns=1) is not None
@@ -122,7 +122,7 @@ def test_extrapolation_continues_the_last_step():
     assert trajectory.at(150, max_extrapolation_ns=50)[0, 3] == pytest.approx(1.5)
 
 
-def test_a_trajectory_refuses_what_it_is_not():
+def test_invalid_trajectories_raise():
     with pytest.raises(ValueError, match="increase"):
         Trajectory(np.array([2, 1]), np.array([np.eye(4)] * 2))
     with pytest.raises(ValueError, match="rigid"):
@@ -131,7 +131,7 @@ def test_a_trajectory_refuses_what_it_is_not():
         Trajectory(np.array([2]), np.zeros((0, 4, 4)))
 
 
-def test_the_vectorised_rigidity_check_agrees_with_the_plain_one():
+def test_vectorised_rigidity_check_matches_is_rigid():
     T = random_poses(20, 3)
     T[1, 0, 0] += 1e-3
     T[2, 3, 0] = 1e-9
@@ -154,7 +154,7 @@ def test_association_is_symmetric_and_within_the_limit(a, b, limit):
     for i, j in pairs:
         assert abs(a[i] - b[j]) <= limit
         assert abs(a[i] - b[j]) == np.abs(b - a[i]).min() == np.abs(a - b[j]).min()
-    # Whoever is each other's only nearest within the limit must be paired.
+    # Two stamps that are each other's unique nearest within the limit must be paired.
     for i, stamp in enumerate(a):
         distance = np.abs(b - stamp)
         if len(b) and distance.min() <= limit and (distance == distance.min()).sum() == 1:
@@ -164,14 +164,14 @@ def test_association_is_symmetric_and_within_the_limit(a, b, limit):
                 assert [i, j] in pairs.tolist()
 
 
-def test_the_truth_of_the_house_reads(shared_dir):
+def test_ground_truth_of_the_house_dataset_can_be_read(shared_dir):
     trajectory = read_tum(shared_dir / "data/house_a/groundtruth.txt")
     length_m = np.linalg.norm(np.diff(trajectory.T_a_b[:, :3, 3], axis=0), axis=1).sum()
     assert length_m == pytest.approx(30.7, abs=0.1)
     assert (trajectory.stamps_ns[-1] - trajectory.stamps_ns[0]) / 1e9 == pytest.approx(88, abs=0.5)
 
 
-def test_files_appear_whole(tmp_path):
+def test_write_tum_leaves_no_partial_file(tmp_path):
     trajectory = Trajectory(np.array([5, 6]), random_poses(2))
     write_tum(tmp_path / "out.txt", trajectory)
     assert [path.name for path in tmp_path.iterdir()] == ["out.txt"]

@@ -1,4 +1,4 @@
-"""Random valid messages of any class, made from its fields: new classes are covered the day they appear."""
+"""Random valid messages of any class, generated from its fields, so that new classes are covered."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from beamsplat.common.messages import Array
 
 
 def random_message(cls: type[BaseModel], rng: np.random.Generator) -> Any:
-    """A valid instance of `cls`; draws again where fields that hang together do not fit."""
+    """Return a random valid instance of `cls`; draws again if dependent fields are inconsistent."""
     for _ in range(2000):
         sizes = {letter: int(rng.integers(0, 9)) for letter in "ABCDEFGHIJKLMNOPQRSTUVWXYZ"}
         if rng.random() < 0.5:
@@ -95,7 +95,7 @@ def _scalar(hint: type, metadata: list[Any], rng: np.random.Generator) -> Any:
 
 
 def _limits(metadata: list[Any]) -> tuple[float | None, float | None]:
-    """Bounds among annotations, also inside pydantic's Field(...)."""
+    """Return the lower and upper bound in annotations, also inside pydantic's Field(...)."""
     low = high = None
     for entry in metadata:
         for bound in getattr(entry, "metadata", [entry]):
@@ -111,7 +111,7 @@ def _limits(metadata: list[Any]) -> tuple[float | None, float | None]:
 
 
 def assert_same(a: Any, b: Any) -> None:
-    """Bit for bit: arrays by bytes, everything else by type and value."""
+    """Assert bitwise equality: arrays by bytes, everything else by type and value."""
     assert type(a) is type(b), (type(a), type(b))
     if isinstance(a, BaseModel):
         for name in type(a).model_fields:

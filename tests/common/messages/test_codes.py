@@ -1,4 +1,4 @@
-"""Gaussians, depth and masks survive their packing within what the formats promise; rubbish is named."""
+"""Precision of the encodings of Gaussians, depth and masks; errors for invalid bytes."""
 
 import numpy as np
 import pytest
@@ -29,7 +29,7 @@ def gaussians(count, seed=0):
 
 @settings(max_examples=30, deadline=None)
 @given(st.integers(0, 400), st.integers(0, 2**31))
-def test_gaussians_come_back_within_a_quarter_of_a_millimetre(count, seed):
+def test_packed_gaussians_round_trip_within_tolerance(count, seed):
     params = gaussians(count, seed)
     back = unpack(pack(params))
     assert back.shape == params.shape
@@ -42,27 +42,27 @@ def test_gaussians_come_back_within_a_quarter_of_a_millimetre(count, seed):
     assert np.all(np.abs(back[11:14] - params[11:14]) < 0.003)
 
 
-def test_packed_gaussians_are_small():
+def test_packed_gaussians_take_17_bytes_each():
     assert len(pack(gaussians(10_000))) < 17 * 10_000 + 1000
 
 
 @pytest.mark.parametrize(
-    "harm", [lambda b: b[:10], lambda b: b[:-30], lambda b: b"X" + b[1:], lambda b: b[:40] + b"\0" * 40]
+    "damage", [lambda b: b[:10], lambda b: b[:-30], lambda b: b"X" + b[1:], lambda b: b[:40] + b"\0" * 40]
 )
-def test_broken_packages_are_refused(harm):
-    blob = harm(pack(gaussians(100)).tobytes())
+def test_damaged_packed_gaussians_raise(damage):
+    blob = damage(pack(gaussians(100)).tobytes())
     with pytest.raises(ValueError, match="Gaussians"):
         unpack(np.frombuffer(blob, np.uint8))
 
 
-def test_a_package_cannot_claim_more_than_it_holds():
+def test_packed_gaussians_with_a_wrong_count_raise():
     blob = bytearray(pack(gaussians(100)).tobytes())
     blob[4:8] = (7_000_000).to_bytes(4, "little")
     with pytest.raises(ValueError, match="bytes for 7000000"):
         unpack(np.frombuffer(bytes(blob), np.uint8))
 
 
-def test_depth_keeps_half_a_millimetre_and_its_holes():
+def test_depth_round_trip_within_half_a_millimetre():
     rng = np.random.default_rng(1)
     depth = rng.uniform(0.2, 60.0, (30, 40)).astype(np.float32)
     depth[3, 4], depth[5, 6], depth[7, 8] = np.nan, 90.0, -1.0
@@ -73,7 +73,7 @@ def test_depth_keeps_half_a_millimetre_and_its_holes():
     assert np.abs(back[known] - depth[known]).max() <= 0.00051
 
 
-def test_sigma_keeps_two_percent():
+def test_sigma_round_trip_within_two_percent():
     sigma = np.geomspace(0.001, 60.0, 500).reshape(20, 25).astype(np.float32)
     sigma[0, 3] = np.nan
     back = sigma_from_png(sigma_to_png(sigma))
@@ -82,7 +82,7 @@ def test_sigma_keeps_two_percent():
     assert np.abs(back[known] / sigma[known] - 1.0).max() < 0.023
 
 
-def test_masks_come_back_and_rubbish_is_named():
+def test_mask_round_trip_and_invalid_bytes_raise():
     mask = np.random.default_rng(2).random((12, 17)) > 0.5
     assert np.array_equal(mask_from_png(mask_to_png(mask)), mask)
     for read in (depth_from_png, sigma_from_png, mask_from_png):

@@ -1,4 +1,4 @@
-"""Every encoding of the same picture gives the same RGB; broken bytes give one sentence."""
+"""All encodings of an image decode to the same RGB; invalid bytes raise UserError."""
 
 import cv2
 import numpy as np
@@ -31,7 +31,7 @@ def test_grey_and_png():
 
 
 @pytest.mark.parametrize(
-    ("data", "encoding", "complaint"),
+    ("data", "encoding", "message"),
     [
         (np.zeros(0, np.uint8), "jpeg", "0 bytes do not decode"),
         (np.arange(200, dtype=np.uint8), "jpeg", "do not decode as jpeg"),
@@ -39,6 +39,6 @@ def test_grey_and_png():
         (np.zeros(100, np.uint8), "rgb8", "truncated: 100 bytes for 9x6 rgb8"),
     ],
 )
-def test_broken_bytes(data, encoding, complaint):
-    with pytest.raises(UserError, match=complaint):
+def test_invalid_bytes_raise_user_error(data, encoding, message):
+    with pytest.raises(UserError, match=message):
         decode_rgb(data, encoding, 9, 6)

@@ -1,4 +1,4 @@
-"""Writes the golden file of each message's present version, once, when it is released."""
+"""Writes the golden file of each message's current version if it does not exist; run it at a release."""
 
 from beamsplat.common.messages.codec import encode
 from tests.common.messages.test_codec import GOLDEN

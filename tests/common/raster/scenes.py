@@ -1,4 +1,4 @@
-"""Random scenes for the tests of the rasterizers."""
+"""Random scenes for tests of the rasterizers."""
 
 import numpy as np
 
@@ -19,7 +19,7 @@ def random_camera(rng, width_px=61, height_px=47):
 
 
 def random_gaussians(rng, T_camera_map, count=400, spread=1.4):
-    """Five float64 arrays: some across the borders, some outside, some behind the camera, some huge."""
+    """Return five float64 arrays of Gaussians: some at the border, outside, behind the camera, or very large."""
     z = rng.uniform(-1.0, 6.0, count)
     slope = rng.uniform(-spread, spread, (count, 2)) * 0.6
     points = np.column_stack([slope * np.abs(z)[:, None], z])

@@ -1,4 +1,4 @@
-"""Adam against torch, arrays that grow, and discs that lie on the surface they were made from."""
+"""Adam compared with torch, growable arrays, and initial discs on surfaces."""
 
 import numpy as np
 import pytest
@@ -14,11 +14,11 @@ from beamsplat.common.raster.optimiser import GaussianArrays, adam, learning_rat
 from beamsplat.common.raster.threads import ThreadTeam
 
 
-def test_adam_is_that_of_torch_for_what_is_seen():
+def test_adam_matches_torch_for_visible_gaussians():
     rng = np.random.default_rng(2)
     count, capacity = 100, 112
     params = rng.normal(size=(14, capacity)).astype(np.float32)
-    params[3:6] = 0.0  # equal axes: no pull towards roundness
+    params[3:6] = 0.0  # equal axes: no isotropic regularisation
     index = np.sort(rng.choice(count, 61, replace=False)).astype(np.int32)
     padded = np.concatenate([index, np.full(32, index[-1], np.int32)])
     first, second, steps = np.zeros_like(params), np.zeros_like(params), np.zeros(capacity, np.float32)
@@ -39,7 +39,7 @@ def test_adam_is_that_of_torch_for_what_is_seen():
     assert np.all(steps[index] == 20.0)
 
 
-def test_needles_are_pulled_towards_discs():
+def test_isotropic_regularisation_shortens_needles():
     params = np.zeros((14, 16), np.float32)
     params[3:6, 0] = np.log([1.0, 0.1, 0.01])
     moments = np.zeros((2, 14, 16), np.float32)
@@ -52,7 +52,7 @@ def test_needles_are_pulled_towards_discs():
     assert np.allclose(params[4:6, 0], np.log([0.1, 0.01]), atol=1e-6)
 
 
-def test_arrays_grow_and_shrink_with_what_the_optimiser_knows():
+def test_arrays_grow_and_shrink_with_their_optimiser_state():
     arrays = GaussianArrays(16)
     first, second = (np.full((14, n), float(n), np.float32) for n in (10, 30))
     assert arrays.append(first) == slice(0, 10)
@@ -64,15 +64,15 @@ def test_arrays_grow_and_shrink_with_what_the_optimiser_knows():
     assert arrays.count == 20
     assert np.array_equal(arrays.params[0, :20], np.repeat([10.0, 30.0], [5, 15]).astype(np.float32))
     assert np.array_equal(arrays.first[0, :20], np.repeat([7.0, 0.0], [5, 15]).astype(np.float32))
-    arrays.append(first)  # over what was dropped: nothing of it is left
+    arrays.append(first)  # reuses columns of removed Gaussians, whose state must be zero
     assert not arrays.first[:, 20:30].any()
 
 
 CAMERA = RasterCamera(200.0, 200.0, 79.5, 59.5, 160, 120)
 
 
-def test_discs_cover_a_slanted_wall():
-    """z = 2 + x / 2 seen from another place: centres on the plane, flat along its normal, side by side."""
+def test_discs_on_a_slanted_wall():
+    """Plane z = 2 + x / 2: disc centres on the plane, discs flat along its normal."""
     rays = (np.arange(160) - CAMERA.cx_px) / CAMERA.fx_px
     z = np.tile((2.0 / (1.0 - 0.5 * rays)).astype(np.float32), (120, 1))
     grey = np.full((120, 160), 0.5, np.float32)
@@ -94,7 +94,7 @@ def test_discs_cover_a_slanted_wall():
     assert np.all(discs[SCALE, inside] > discs[SCALE + 1, inside])  # longer down the slope
 
 
-def test_texture_and_missing_depth_decide_where_discs_begin():
+def test_choose_pixels_follows_texture_and_mask():
     grey = np.full((40, 80), 0.5, np.float32)
     grey[:, 40:] = np.where(np.arange(40) % 4 < 2, 0.9, 0.5)
     wanted = np.ones((40, 80), bool)
@@ -110,7 +110,7 @@ _UNIT = st.tuples(*[st.floats(-1, 1) for _ in range(3)]).filter(lambda v: np.lin
 
 @settings(max_examples=60, deadline=None)
 @given(_UNIT, _UNIT)
-def test_discs_lie_on_their_surface_and_point_down_the_slope(normal, ray):
+def test_disc_orientation_follows_normal_and_slope(normal, ray):
     n, r = (np.array(v) / np.linalg.norm(v) for v in (normal, ray))
     slope = r - n * (n @ r)
     R = matrix_from_quat_wxyz(disc_quats(n[None], r[None])[0])

@@ -1,4 +1,4 @@
-"""Logins of the processes of one host: made once, readable by their owner only, asked for on loopback only."""
+"""Logins of local processes: created once, readable by their owner only, required on loopback routers only."""
 
 import pytest
 import zenoh
@@ -14,7 +14,7 @@ def security(tmp_path):
     return SecurityConfig(local=tmp_path / "logins")
 
 
-def test_a_login_is_its_owners_only_and_stays_when_others_are_made(security):
+def test_logins_have_mode_600_and_existing_ones_are_kept(security):
     camera = login_of(security, "camera")
     assert len(camera.password) >= 32
     assert camera.password != login_of(security, OPERATOR).password
@@ -25,7 +25,7 @@ def test_a_login_is_its_owners_only_and_stays_when_others_are_made(security):
     assert names == ["camera", OPERATOR, "depth"]
 
 
-def test_what_is_missing_open_to_others_or_broken_is_refused(security):
+def test_missing_readable_or_invalid_login_files_raise(security):
     with pytest.raises(UserError, match=r"lidar.login is missing"):
         login_of(security, "lidar")
     (security.local / "camera.login").chmod(0o644)
@@ -36,9 +36,9 @@ def test_what_is_missing_open_to_others_or_broken_is_refused(security):
         make_logins(security.local, ("depth",))
 
 
-def test_only_a_router_without_doors_to_other_hosts_asks_for_logins(security):
+def test_only_a_loopback_router_requires_logins(security):
     config = zenoh.Config()
-    require_logins(config, SecurityConfig(), ("tls/0.0.0.0:7448",))  # asks for none
+    require_logins(config, SecurityConfig(), ("tls/0.0.0.0:7448",))  # requires none
     with pytest.raises(UserError, match="can be reached from other hosts"):
         require_logins(config, security, ("tcp/127.0.0.1:7447", "tls/0.0.0.0:7448"))
     require_logins(config, security, ("tcp/127.0.0.1:7447",))
