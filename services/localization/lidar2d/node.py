@@ -162,7 +162,7 @@ class LidarLocalization(Node):
             or abs(stamp_ns - self._checkpoint_ns) >= self.config.keep_every_s * 1e9
         ):
             self._checkpoint_ns, self._checkpoint_running = stamp_ns, True
-            folder, state = self._checkpoint_dir, self._slam.packed()
+            folder, state = self._checkpoint_dir, self._slam.pack()
 
             def write() -> str:
                 try:
