@@ -15,8 +15,8 @@ from beamsplat.common.errors import UserError
 from beamsplat.common.optional_packages import missing_packages_explained
 from beamsplat.tools.cli import bench as bench_cli
 from beamsplat.tools.cli import bench_mapping as mapping_cli
+from beamsplat.tools.cli import bug_report, demo, doctor, warm
 from beamsplat.tools.cli import calibrate as calibrate_cli
-from beamsplat.tools.cli import demo, doctor, warm
 from beamsplat.tools.cli import depth as depth_cli
 from beamsplat.tools.cli import export as formats_cli
 from beamsplat.tools.cli import info as replay_cli
@@ -62,7 +62,7 @@ evaluate.command("relocalize")(eval_relocalize)
 evaluate.command("depth")(depth_cli.eval_depth)
 app.add_typer(evaluate, name="eval", rich_help_panel=_RESULTS)
 
-for command in (setup_cli.setup, doctor.doctor, warm.warm):
+for command in (setup_cli.setup, doctor.doctor, bug_report.bug_report, warm.warm):
     app.command(rich_help_panel=_MACHINE)(command)
 app.add_typer(models_cli.app, name="models", rich_help_panel=_MACHINE)
 app.add_typer(keys_cli.app, name="keys", rich_help_panel=_MACHINE)

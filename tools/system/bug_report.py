@@ -1,0 +1,137 @@
+"""What a bug report needs: versions, deployment, logs, findings and health, without secrets."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import io
+import json
+import os
+import platform
+import re
+import shutil
+import subprocess
+import zipfile
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import psutil
+
+from beamsplat.common.config.deployment import Deployment
+from beamsplat.common.errors import UserError, reason
+from beamsplat.common.optional_packages import requirements
+
+REMOVED = "REMOVED"
+LOG_BYTES = 200_000  # of the end of each log
+_MIN_SECRET_CHARS = 5  # of what is removed from texts: shorter ones are parts of other words
+HEALTH_S = 2.5  # nodes report once per second, and a rate needs two reports
+_SECRET_NAMES = re.compile(r"passw|token|secret|credential|login|api_?key|(^|_)keys?$", re.IGNORECASE)
+_URL_USER = re.compile(r"(://)[^/@\s\"']+@")
+_URL_PARAMETER = re.compile(
+    r"([?&;][^=&\s]*(?:passw|token|secret|key|auth|pwd)[^=&\s]*=)[^&\s\"']+", re.IGNORECASE
+)
+_ASSIGNMENT = re.compile(
+    r"((?:passw(?:or)?d|token|secret|authorization|bearer)[\"']?\s*[:=]\s*(?:bearer\s+)?)[^\s,;\"']+",
+    re.IGNORECASE,
+)
+_PRIVATE_KEY = re.compile(
+    r"-----BEGIN [A-Z ]*PRIVATE KEY-----.*?(-----END [A-Z ]*PRIVATE KEY-----|\Z)", re.DOTALL
+)
+
+
+@dataclass
+class Redactor:
+    """Removes secrets: values of options named like one, wherever they occur, and users in addresses."""
+
+    _values: set[str] = field(default_factory=set)
+
+    def table(self, value: Any, name: str = "") -> Any:
+        """Return a copy of a raw TOML table without secrets; remember what was removed for `text`."""
+        if isinstance(value, dict):
+            return {key: self.table(item, str(key)) for key, item in value.items()}
+        if _SECRET_NAMES.search(name) and value not in ("", None):
+            self._values |= {str(v) for v in (value if isinstance(value, (list, tuple)) else [value])}
+            return REMOVED
+        if isinstance(value, (list, tuple)):
+            return [self.table(item, name) for item in value]
+        return self.text(value) if isinstance(value, str) else value
+
+    def text(self, text: str) -> str:
+        """Return a text without secrets."""
+        for value in sorted(self._values, key=len, reverse=True):
+            if len(value) >= _MIN_SECRET_CHARS:
+                text = text.replace(value, REMOVED)
+        text = _PRIVATE_KEY.sub(REMOVED, text)
+        text = _URL_USER.sub(rf"\1{REMOVED}@", text)
+        text = _URL_PARAMETER.sub(rf"\1{REMOVED}", text)
+        return _ASSIGNMENT.sub(rf"\1{REMOVED}", text)
+
+
+def versions() -> dict[str, Any]:
+    """Return the versions of this package, Python and the required packages, and what the machine is."""
+    packages: dict[str, str | None] = {}
+    for requirement, _ in requirements():
+        try:
+            packages[requirement.name] = importlib.metadata.version(requirement.name)
+        except importlib.metadata.PackageNotFoundError:
+            packages[requirement.name] = None
+    return {
+        "beamsplat": importlib.metadata.version("beamsplat"), "python": platform.python_version(),
+        "platform": platform.platform(), "machine": platform.machine(), "cpu_cores": os.cpu_count(),
+        "memory_mb": round(psutil.virtual_memory().total / 1e6), "gpu": _gpus(), "packages": packages,
+    }  # fmt: skip
+
+
+def _gpus() -> list[str]:
+    if shutil.which("nvidia-smi") is None:
+        return []
+    command = ["nvidia-smi", "--query-gpu=name,driver_version,memory.total", "--format=csv,noheader"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=20, check=False)
+    return done.stdout.strip().splitlines()
+
+
+def bundle(
+    deployment: Deployment,
+    findings: Callable[[], Iterable[Any]],
+    health: Callable[[], dict[str, Any]],
+) -> bytes:
+    """Return a ZIP file with versions, deployment, findings, health and the ends of the logs.
+
+    What cannot be collected is replaced by the reason.
+
+    Args:
+        findings: returns the doctor's findings, dataclasses.
+        health: returns `HealthBoard.snapshot()` of the running system; raises UserError if none runs.
+    """
+    redactor = Redactor()
+    options = redactor.table(deployment.model_dump(mode="json"))
+    parts: dict[str, str] = {
+        "versions.json": _json(versions),
+        "deployment.json": json.dumps(options, indent=1),
+        "doctor.json": _json(lambda: [asdict(finding) for finding in findings()]),
+        "health.json": _json(health),
+    }
+    for log in sorted((deployment.run_dir / "logs").glob("*.log")):
+        parts[f"logs/{log.name}"] = _tail(log)
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as file:
+        for name, text in parts.items():
+            file.writestr(name, redactor.text(text))
+    return out.getvalue()
+
+
+def _json(collect: Callable[[], Any]) -> str:
+    try:
+        return json.dumps(collect(), indent=1, default=str)
+    except (UserError, OSError, subprocess.SubprocessError) as error:
+        return json.dumps({"error": reason(error)})
+
+
+def _tail(path: Path) -> str:
+    try:
+        with path.open("rb") as file:
+            file.seek(max(0, file.seek(0, 2) - LOG_BYTES))
+            return file.read().decode(errors="replace")
+    except OSError as error:
+        return f"not readable: {reason(error)}"
