@@ -32,7 +32,7 @@ class CameraModel(MessagePart):
         for axis, centre, size in (("cx", self.cx_px, self.width_px), ("cy", self.cy_px, self.height_px)):
             if not 0.0 < centre < size:
                 raise ValueError(
-                    f"{axis} = {centre:g} px lies outside the {self.width_px}x{self.height_px} image: "
+                    f"{axis} = {centre:g} px is outside the {self.width_px}x{self.height_px} image: "
                     "K belongs to another image size"
                 )
         counts = {"none": (0,), "plumb_bob": (0, 4, 5), "rational_polynomial": (8,), "equidistant": (4,)}
