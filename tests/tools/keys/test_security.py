@@ -64,6 +64,17 @@ def wait(until, timeout_s=5.0):
     raise AssertionError(f"not within {timeout_s} s")
 
 
+def publish_until(condition, session, keys):
+    """Publish to all `keys`, in this order, until `condition()`: what comes first was denied before the rest arrived."""
+
+    def done():
+        for key in keys:
+            session.put(key, b"x")
+        return condition()
+
+    wait(done)
+
+
 def subscribe_keys(session, pattern):
     received_keys = []
     subscriber = session.declare_subscriber(pattern, lambda s: received_keys.append(str(s.key_expr)))
@@ -174,11 +185,7 @@ def test_a_robot_may_publish_only_its_own_uplink_topics(authority, edge):
     ]  # fmt: skip
     with open_session((edge[0],)) as local, link(authority, edge, "r1") as robot:
         received_keys, subscriber = subscribe_keys(local, "**")
-        time.sleep(0.5)
-        for key in forbidden + allowed:
-            robot.put(key, b"x")
-        wait(lambda: set(received_keys) >= set(allowed))
-        time.sleep(0.3)
+        publish_until(lambda: set(received_keys) >= set(allowed), robot, forbidden + allowed)
         assert set(received_keys) == set(allowed)
         subscriber.undeclare()
 
@@ -193,11 +200,8 @@ def test_a_robot_receives_only_its_own_downlink_topics(authority, edge):
         queryable = local.declare_queryable(
             "beamsplat/r1/query/mapping/set_params", lambda q: q.reply(q.key_expr, b"1")
         )
-        time.sleep(0.5)
-        for name in ("r1/keyframes/ack", "r2/keyframes/ack", "r1/camera/image", "r1/localization/odometry"):
-            local.put(f"beamsplat/{name}", b"x")
-        wait(lambda: received_keys)
-        time.sleep(0.3)
+        names = ("r2/keyframes/ack", "r1/camera/image", "r1/localization/odometry", "r1/keyframes/ack")
+        publish_until(lambda: len(received_keys) >= 3, local, [f"beamsplat/{name}" for name in names])
         assert set(received_keys) == {"beamsplat/r1/keyframes/ack"}
         assert [h for h, _ in others] == [[], [], []]
         assert list(robot.get("beamsplat/r1/query/mapping/set_params", timeout=2.0)) == []
@@ -219,13 +223,12 @@ def test_a_monitor_may_read_everything_and_change_nothing(authority, edge, name,
             for q in ("snapshot", "set_params")
         ]
         token = local.liveliness().declare_token("beamsplat/r1/alive/mapping/x")
-        time.sleep(0.5)
-        monitor.put("beamsplat/r1/keyframes/ack", b"x")
-        local.put("beamsplat/r1/mapping/chunk", b"x")
-        local.put("beamsplat/r2/health/mapping", b"x")
-        wait(lambda: len(seen) >= 2)
+        publish_until(
+            lambda: received_keys, local, ["beamsplat/r1/mapping/chunk", "beamsplat/r2/health/mapping"]
+        )
+        publish_until(lambda: len(set(seen)) == 2, monitor, ["beamsplat/r1/keyframes/ack"])
+        wait(lambda: len(list(monitor.get("beamsplat/r1/query/mapping/snapshot", timeout=2.0))) == 1)
         assert "beamsplat/r1/keyframes/ack" not in received_keys
-        assert len(list(monitor.get("beamsplat/r1/query/mapping/snapshot", timeout=2.0))) == 1
         assert len(list(monitor.get("beamsplat/r1/query/mapping/set_params", timeout=2.0))) == may_change
         assert len(list(monitor.liveliness().get("beamsplat/*/alive/**", timeout=2.0))) == 1
         for thing in (subscriber, watching, token, *answers):
@@ -273,12 +276,14 @@ def test_a_removed_robot_connects_but_has_no_rights(authority, tmp_path):
         open_link(far, 2.0, SecurityConfig(keys=folder)) as robot,
     ):
         received_keys, subscriber = subscribe_keys(local, "**")
-        time.sleep(0.3)
-        robot.put("beamsplat/r1/localization/odometry", b"x")
-        local.put("beamsplat/r1/tick", b"x")
-        wait(lambda: received_keys)
-        time.sleep(0.3)
-        assert received_keys == ["beamsplat/r1/tick"]
+
+        def received_often():
+            robot.put("beamsplat/r1/localization/odometry", b"x")
+            local.put("beamsplat/r1/tick", b"x")
+            return len(received_keys) >= 10
+
+        wait(received_often)
+        assert set(received_keys) == {"beamsplat/r1/tick"}
         subscriber.undeclare()
 
 

@@ -1,4 +1,6 @@
-"""Logins of a host's own processes: what each may say on its router, and the whole system under that policy."""
+"""Logins of a host's own processes: what each may say on its router, and the whole system under that
+policy.
+"""
 
 import os
 import subprocess
@@ -25,7 +27,7 @@ from tests.common.samples import sample_messages
 from tests.common.topic_listener import TopicListener
 from tests.conftest import free_port
 from tests.services.mapping.room_drive import TABLE
-from tests.tools.keys.test_security import subscribe_keys, wait
+from tests.tools.keys.test_security import publish_until, subscribe_keys, wait
 
 POSE = "localization/odometry"
 
@@ -58,11 +60,7 @@ def test_a_camera_writes_its_own_topics_and_no_pose(guarded):
     others |= {"beamsplat/r1/health/localization", "beamsplat/other", "x", f"beamsplat/r1/end/{POSE}"}
     with enter(guarded, OPERATOR) as ears, enter(guarded, "camera") as camera:
         heard, kept = subscribe_keys(ears, "**")
-        time.sleep(0.5)
-        for key in others | own:
-            camera.put(key, b"x")
-        wait(lambda: set(heard) >= own)
-        time.sleep(0.3)
+        publish_until(lambda: set(heard) >= own, camera, [*others, *own])
         assert set(heard) == own
         kept.undeclare()
 
