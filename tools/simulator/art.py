@@ -54,7 +54,7 @@ def text_mask(
 
 
 def landscape(rng: np.random.Generator, height: int, width: int, *, night: bool = False) -> np.ndarray:
-    """Return a texture: sky, sun, ridges in aerial perspective, a lake or meadow."""
+    """Return a painting of sky, sun, ridges in aerial perspective, and a lake or meadow."""
     top, low = (rgb("1d2b52"), rgb("c26a4a")) if night else (rgb("6fa3d0"), rgb("f2dcc0"))
     t = np.linspace(0.0, 1.0, height, dtype=np.float32)[:, None, None]
     out = np.broadcast_to(top * (1 - t) + low * t, (height, width, 3)).copy()
@@ -77,7 +77,7 @@ def landscape(rng: np.random.Generator, height: int, width: int, *, night: bool 
 
 
 def mondrian(rng: np.random.Generator, height: int, width: int) -> np.ndarray:
-    """Return a texture: fields of primary colours between black bars."""
+    """Return a painting of fields in primary colours between black bars."""
     out = np.full((height, width, 3), 0.93, np.float32)
     xs = np.sort(rng.uniform(0.1, 0.9, 4) * width).astype(int)
     ys = np.sort(rng.uniform(0.1, 0.9, 5) * height).astype(int)
@@ -96,7 +96,7 @@ def mondrian(rng: np.random.Generator, height: int, width: int) -> np.ndarray:
 
 
 def abstract(rng: np.random.Generator, height: int, width: int) -> np.ndarray:
-    """Return a texture: warped colour fields with rings and strokes."""
+    """Return a painting of warped colour fields with rings and strokes."""
     palette = rng.uniform(0.08, 0.95, size=(5, 3)).astype(np.float32)
     field = fractal(rng, height, width, 2.0)
     index = np.clip((field + 1.6) / 3.2 * 5, 0, 4.99)
@@ -114,7 +114,7 @@ def abstract(rng: np.random.Generator, height: int, width: int) -> np.ndarray:
 
 
 def skyline(rng: np.random.Generator, height: int, width: int) -> np.ndarray:
-    """Return a texture: a city at dusk with lit windows."""
+    """Return a painting of a city at dusk with lit windows."""
     t = np.linspace(0, 1, height, dtype=np.float32)[:, None, None]
     out = np.broadcast_to(rgb("27345e") * (1 - t) + rgb("e89a5b") * t, (height, width, 3)).copy()
     for layer in range(3):
@@ -134,7 +134,7 @@ def skyline(rng: np.random.Generator, height: int, width: int) -> np.ndarray:
 
 
 def portrait(rng: np.random.Generator, height: int, width: int) -> np.ndarray:
-    """Return a texture: head and shoulders in broad strokes."""
+    """Return a painting of head and shoulders in broad strokes."""
     ground = rng.uniform(0.15, 0.6, 3).astype(np.float32)
     out = (ground * (1 + 0.2 * fractal(rng, height, width, 1.6)[..., None])).astype(np.float32)
     cx, unit = width // 2, min(width, height)
@@ -161,7 +161,7 @@ def portrait(rng: np.random.Generator, height: int, width: int) -> np.ndarray:
 
 
 def lettering(rng: np.random.Generator, height: int, width: int) -> np.ndarray:
-    """Return a texture: a poster: a figure above, large words below."""
+    """Return a poster with a figure above and large words below."""
     paper, ink = rgb("ece5d3"), rng.uniform(0.05, 0.5, 3)
     out = np.broadcast_to(paper, (height, width, 3)).astype(np.float32).copy()
     accent = rng.uniform(0.2, 0.9, 3)
@@ -185,7 +185,7 @@ PAINTINGS = (landscape, mondrian, abstract, skyline, portrait, lettering)
 def book_spines(
     rng: np.random.Generator, height: int = 256, width: int = 1024, count: int = 32
 ) -> np.ndarray:
-    """Return a texture: `count` spines of equal width side by side: cell k is u in [k, k + 1] / count."""
+    """Return `count` book spines of equal width side by side; spine k is u in [k, k + 1] / count."""
     out = np.empty((height, width, 3), np.float32)
     cell = width // count
     dyes = "7b2d26,1f3a5f,2f4b3c,e0d6c2,3b3b3d,b5762b,8c8f91,5a2a4a,d8d2c4,20504f,c7a24b"
@@ -210,7 +210,7 @@ def book_spines(
 
 
 def persian_rug(rng: np.random.Generator, height: int = 512, width: int = 768) -> np.ndarray:
-    """Return a texture: stepped borders, a medallion, and motifs mirrored about both axes."""
+    """Return a rug with stepped borders, a medallion, and motifs mirrored about both axes."""
     palettes = ("7c1f23 20345c d9c39a 3b5a4a", "23395b c8b48a 8a2c2c e6dcc3", "5b4636 c9b79c 8f6f4e 2e3a3f")
     colours = [rgb(c) for c in str(rng.choice(palettes)).split()]
     quarter_h, quarter_w = height // 2, width // 2
@@ -238,7 +238,7 @@ def persian_rug(rng: np.random.Generator, height: int = 512, width: int = 768) -
 
 
 def garden_view(rng: np.random.Generator, height: int = 512, width: int = 512) -> np.ndarray:
-    """Return a texture: view through a window: bright sky, far trees, lawn; blurred as if out of focus."""
+    """Return a view through a window: bright sky, far trees, lawn, blurred as if out of focus."""
     t = np.linspace(0, 1, height, dtype=np.float32)[:, None, None]
     out = np.broadcast_to(rgb("b9d6f2") * (1 - t) + rgb("f4f6f2") * t, (height, width, 3)).copy()
     out += 0.12 * np.clip(fractal(rng, height, width, 1.8), 0, 2)[..., None] * (1 - t)
@@ -253,7 +253,7 @@ def garden_view(rng: np.random.Generator, height: int = 512, width: int = 512) -
 
 
 def foliage(rng: np.random.Generator, size_px: int = 256) -> np.ndarray:
-    """Return a texture: surface of a leaf: midrib along u, side veins, uneven green."""
+    """Return the surface of a leaf: midrib along u, side veins, uneven green."""
     y, x = np.mgrid[:size_px, :size_px].astype(np.float32) / size_px
     rib = np.exp(-np.abs(y - 0.5) * 70)
     veins = 0.5 + 0.5 * np.cos((x * 14 + np.abs(y - 0.5) * 10) * 2 * np.pi)
@@ -262,7 +262,7 @@ def foliage(rng: np.random.Generator, size_px: int = 256) -> np.ndarray:
 
 
 def screen(rng: np.random.Generator, height: int = 256, width: int = 448) -> np.ndarray:
-    """Return a texture: a monitor: windows with lines of text on a wallpaper."""
+    """Return a computer screen: windows with lines of text on a wallpaper."""
     out = landscape(rng, height, width, night=True) * 0.8
     for _ in range(3):
         x, y = int(rng.uniform(0.03, 0.5) * width), int(rng.uniform(0.05, 0.4) * height)
@@ -276,7 +276,7 @@ def screen(rng: np.random.Generator, height: int = 256, width: int = 448) -> np.
 
 
 def clock_face(size_px: int = 256) -> np.ndarray:
-    """Return a texture: dial of a clock that shows ten past ten."""
+    """Return the dial of a clock that shows ten past ten."""
     out = np.full((size_px, size_px, 3), 0.95, np.float32)
     centre = (size_px // 2, size_px // 2)
     for hour in range(12):

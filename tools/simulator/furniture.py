@@ -50,10 +50,7 @@ def legs(
 
 
 def sofa(width: float) -> FurniturePiece:
-    """Return a piece of furniture: upholstered, on short feet, with seat and back cushions and two pillows.
-
-    Upholstered, on short feet, with seat and back cushions and two pillows.
-    """
+    """Return an upholstered sofa on short feet with seat and back cushions and two pillows."""
 
     def draw(b: MeshBuilder, rng: np.random.Generator) -> None:
         cloth = Material("sofa")
@@ -79,7 +76,7 @@ def sofa(width: float) -> FurniturePiece:
 
 
 def armchair() -> FurniturePiece:
-    """Return a piece of furniture: a round-backed easy chair."""
+    """Return a round-backed armchair."""
 
     def draw(b: MeshBuilder, rng: np.random.Generator) -> None:
         cloth = Material("armchair")
@@ -102,7 +99,7 @@ def armchair() -> FurniturePiece:
 
 
 def coffee_table() -> FurniturePiece:
-    """Return a piece of furniture: low table with a shelf, magazines, a bowl."""
+    """Return a low table with a shelf, magazines and a bowl."""
 
     def draw(b: MeshBuilder, rng: np.random.Generator) -> None:
         top = wood(rng)
@@ -173,7 +170,7 @@ def spine(
 
 
 def bookshelf(width: float, height: float) -> FurniturePiece:
-    """Return a piece of furniture: boards, a back, and rows of standing books with gaps and ornaments."""
+    """Return a bookshelf with rows of standing books, gaps and ornaments."""
 
     def draw(b: MeshBuilder, rng: np.random.Generator) -> None:
         timber, depth, board = wood(rng), 0.30, 0.022
@@ -225,7 +222,7 @@ def vase(b: MeshBuilder, rng: np.random.Generator, height: float) -> None:
 
 
 def sideboard(width: float, *, television: bool = False) -> FurniturePiece:
-    """Return a piece of furniture: a low cabinet with doors and drawers; a television or ornaments on it."""
+    """Return a low cabinet with doors; a television or ornaments stand on it."""
 
     def draw(b: MeshBuilder, rng: np.random.Generator) -> None:
         timber, height, depth = wood(rng), 0.52, 0.40

@@ -10,10 +10,7 @@ from beamsplat.tools.simulator.shapes import box, cylinder, lathe, rod
 
 
 def kitchen_run(width: float) -> FurniturePiece:
-    """Return a piece of furniture: base cabinets with worktop, sink, hob and oven.
-
-    Base cabinets with worktop, sink, hob and oven; hanging cupboards, hood, tiles between.
-    """
+    """Return base cabinets with worktop, sink, hob and oven, hanging cupboards, hood and tiles."""
 
     def draw(b: MeshBuilder, rng: np.random.Generator) -> None:
         top = Material("granite") if rng.random() < 0.5 else OAK
@@ -77,7 +74,7 @@ def _clutter(b: MeshBuilder, rng: np.random.Generator) -> None:
 
 
 def fridge() -> FurniturePiece:
-    """Return a piece of furniture: two doors, handles, notes on the front."""
+    """Return a fridge with two doors, handles and notes on the front."""
 
     def draw(b: MeshBuilder, rng: np.random.Generator) -> None:
         box(b, (0, 0.02, 0.04), (0.66, 0.62, 1.82), STEEL, turn=True)

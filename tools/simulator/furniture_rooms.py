@@ -37,7 +37,7 @@ def chair(b: MeshBuilder, rng: np.random.Generator, material: Material) -> None:
 
 
 def dining_set(width: float) -> FurniturePiece:
-    """Return a piece of furniture: a laid table with chairs around it; the footprint includes the chairs."""
+    """Return a laid table with chairs around it; the footprint includes the chairs."""
 
     def draw(b: MeshBuilder, rng: np.random.Generator) -> None:
         timber, seat = wood(rng), wood(rng)
@@ -68,7 +68,7 @@ def dining_set(width: float) -> FurniturePiece:
 
 
 def bed(width: float) -> FurniturePiece:
-    """Return a piece of furniture: head board at the wall, mattress, quilt with overhang, pillows."""
+    """Return a bed with head board, mattress, quilt and pillows."""
 
     def draw(b: MeshBuilder, rng: np.random.Generator) -> None:
         timber, length = wood(rng), 2.05
@@ -116,7 +116,7 @@ def bed(width: float) -> FurniturePiece:
 
 
 def nightstand() -> FurniturePiece:
-    """Return a piece of furniture: drawers and a lamp."""
+    """Return a nightstand with drawers and a lamp."""
 
     def draw(b: MeshBuilder, rng: np.random.Generator) -> None:
         timber = wood(rng)
@@ -142,7 +142,7 @@ def table_lamp(b: MeshBuilder) -> None:
 
 
 def wardrobe(width: float) -> FurniturePiece:
-    """Return a piece of furniture: tall, with panelled doors."""
+    """Return a tall wardrobe with panelled doors."""
 
     def draw(b: MeshBuilder, rng: np.random.Generator) -> None:
         timber = wood(rng)
@@ -154,7 +154,7 @@ def wardrobe(width: float) -> FurniturePiece:
 
 
 def chest(width: float) -> FurniturePiece:
-    """Return a piece of furniture: chest of drawers with a vase and a lamp on it."""
+    """Return a chest of drawers with a vase and a lamp on it."""
 
     def draw(b: MeshBuilder, rng: np.random.Generator) -> None:
         timber = wood(rng)
@@ -168,10 +168,7 @@ def chest(width: float) -> FurniturePiece:
 
 
 def desk(width: float) -> FurniturePiece:
-    """Return a piece of furniture: desk with monitor, keyboard, books, lamp, and a swivel chair in front of it.
-
-    Desk with monitor, keyboard, books, lamp, and a swivel chair in front of it.
-    """
+    """Return a desk with monitor, keyboard, books and lamp, and a swivel chair in front of it."""
 
     def draw(b: MeshBuilder, rng: np.random.Generator) -> None:
         timber = wood(rng)
@@ -217,7 +214,7 @@ def swivel_chair(b: MeshBuilder) -> None:
 
 
 def bench(width: float) -> FurniturePiece:
-    """Return a piece of furniture: a bench with a blanket and a basket under it."""
+    """Return a bench with a blanket on it and a basket under it."""
 
     def draw(b: MeshBuilder, rng: np.random.Generator) -> None:
         timber = wood(rng)
@@ -236,7 +233,7 @@ def bench(width: float) -> FurniturePiece:
 
 
 def stool() -> FurniturePiece:
-    """Return a piece of furniture: round seat, three legs."""
+    """Return a stool with a round seat and three legs."""
 
     def draw(b: MeshBuilder, rng: np.random.Generator) -> None:
         timber = wood(rng)
@@ -255,7 +252,7 @@ def stool() -> FurniturePiece:
 
 
 def toy_box() -> FurniturePiece:
-    """Return a piece of furniture: a crate with balls and blocks around it."""
+    """Return a crate with balls and blocks in it."""
 
     def draw(b: MeshBuilder, rng: np.random.Generator) -> None:
         for y in (-0.19, 0.19):
@@ -288,7 +285,7 @@ def ceiling_lamp(b: MeshBuilder, drop: float) -> None:
 
 
 def fireplace() -> FurniturePiece:
-    """Return a piece of furniture: brick chimney breast with a mantel and an opening."""
+    """Return a brick chimney breast with a mantel and an opening."""
 
     def draw(b: MeshBuilder, rng: np.random.Generator) -> None:
         stones = Material("brick") if rng.random() < 0.6 else Material("stonebrick")

@@ -10,7 +10,7 @@ from beamsplat.tools.simulator.shapes import cylinder, lathe, rod
 
 
 def floor_lamp() -> FurniturePiece:
-    """Return a piece of furniture: a lit lampshade on a pole."""
+    """Return a lit lampshade on a pole."""
 
     def draw(b: MeshBuilder, rng: np.random.Generator) -> None:
         cylinder(b, (0, 0, 0), 0.15, 0.025, BLACK, sides=20)
@@ -22,7 +22,7 @@ def floor_lamp() -> FurniturePiece:
 
 
 def plant(height: float) -> FurniturePiece:
-    """Return a piece of furniture: leaves on stems in a pot."""
+    """Return a potted plant with leaves on stems."""
 
     def draw(b: MeshBuilder, rng: np.random.Generator) -> None:
         pot = Material("terracotta") if rng.random() < 0.5 else Material("ceramic")

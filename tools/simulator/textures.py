@@ -62,10 +62,7 @@ def planks(
     contrast: float = 1.0,
     gap: float = 0.5,
 ) -> np.ndarray:
-    """Return a texture: floor boards along x.
-
-    Floor boards along x; each has its own tone and part of the grain, with knots and joints.
-    """
+    """Return floor boards along x, each with its own tone and part of the grain, knots and joints."""
     grain = fractal(rng, size_px, size_px, 1.1, (14.0, 1.0))
     fine = fractal(rng, size_px, size_px, 0.6, (24.0, 1.0))
     wave = fractal(rng, size_px, size_px, 2.2, (5.0, 1.0))
@@ -110,10 +107,7 @@ def _knot(rng: np.random.Generator, board: np.ndarray, base: np.ndarray) -> np.n
 def herringbone(
     rng: np.random.Generator, base: np.ndarray, size_px: int = 1024, blocks: int = 8
 ) -> np.ndarray:
-    """Return a texture: parquet.
-
-    Parquet: pairs of staves in alternating directions (basket weave, which tiles on a square).
-    """
+    """Return parquet: pairs of staves in alternating directions, a weave that tiles on a square."""
     cell = size_px // blocks
     staves = 4
     strip = planks(rng, base, size_px=size_px, boards=blocks * staves, contrast=1.1, gap=0.35)
@@ -141,10 +135,7 @@ def tiles(
     mottle: float = 0.03,
     rows: int | None = None,
 ) -> np.ndarray:
-    """Return a texture: glazed tiles.
-
-    Glazed tiles: `grid`, `checker` or `brick` (half offset); `rows` x `count` of them.
-    """
+    """Return `rows` x `count` glazed tiles; the pattern is `grid`, `checker` or `brick` (half offset)."""
     rows = count if rows is None else rows
     clouds = fractal(rng, size_px, size_px, 1.4)
     speck = fractal(rng, size_px, size_px, 0.3)
@@ -169,7 +160,7 @@ def tiles(
 
 
 def brick(rng: np.random.Generator, base: np.ndarray, mortar: np.ndarray, size_px: int = 1024) -> np.ndarray:
-    """Return a texture: running bond, 16 courses of 5 bricks (1.2 m square), rough and of uneven firing."""
+    """Return rough bricks of uneven firing in running bond, 16 courses of 5 bricks (1.2 m square)."""
     rows, count = 16, 5
     warp_x, warp_y = 2.2 * fractal(rng, size_px, size_px, 1.5), 1.8 * fractal(rng, size_px, size_px, 1.5)
     y, x = np.mgrid[:size_px, :size_px].astype(np.float32)
@@ -189,7 +180,7 @@ def brick(rng: np.random.Generator, base: np.ndarray, mortar: np.ndarray, size_p
 
 
 def plaster(rng: np.random.Generator, base: np.ndarray, size_px: int = 512, depth: float = 1.0) -> np.ndarray:
-    """Return a texture: rolled paint on plaster: fine relief lit from above, broad uneven patches."""
+    """Return rolled paint on plaster: fine relief lit from above, broad uneven patches."""
     relief = fractal(rng, size_px, size_px, 0.9)
     slope = np.roll(relief, 1, axis=0) - relief
     clouds = fractal(rng, size_px, size_px, 1.9)
@@ -199,7 +190,7 @@ def plaster(rng: np.random.Generator, base: np.ndarray, size_px: int = 512, dept
 def stripes(
     rng: np.random.Generator, first: np.ndarray, second: np.ndarray, size_px: int = 512
 ) -> np.ndarray:
-    """Return a texture: wallpaper in stripes of four widths with a woven ground."""
+    """Return wallpaper with stripes of random widths and a woven ground."""
     x = np.arange(size_px)
     widths = rng.integers(14, 46, size=6)
     edges = np.concatenate([[0], np.cumsum(widths)]) * size_px / widths.sum()
@@ -211,7 +202,7 @@ def stripes(
 
 
 def damask(rng: np.random.Generator, ground: np.ndarray, motif: np.ndarray, size_px: int = 512) -> np.ndarray:
-    """Return a texture: wallpaper with a mirrored leaf ornament in half-drop repeat."""
+    """Return wallpaper with a mirrored leaf ornament in half-drop repeat."""
     cell = np.zeros((size_px // 2, size_px // 2), np.float32)
     half = size_px // 4
     for _ in range(7):
@@ -234,7 +225,7 @@ def weave(
     strength: float = 0.16,
     melange: float = 0.05,
 ) -> np.ndarray:
-    """Return a texture: plain woven cloth: over-and-under threads, uneven yarn."""
+    """Return plain woven cloth: over-and-under threads, uneven yarn."""
     y, x = np.mgrid[:size_px, :size_px].astype(np.float32)
     period = 8.0
     over = ((x // period + y // period) % 2).astype(np.float32)
@@ -244,7 +235,7 @@ def weave(
 
 
 def plaid(rng: np.random.Generator, colours: list[np.ndarray], size_px: int = 256) -> np.ndarray:
-    """Return a texture: tartan: the same sequence of bands as warp and weft."""
+    """Return tartan: the same sequence of bands as warp and weft."""
     edges = np.sort(rng.integers(0, size_px, size=9))
     band = np.searchsorted(edges, np.arange(size_px)) % len(colours)
     line = np.stack(colours)[band]
@@ -255,7 +246,7 @@ def plaid(rng: np.random.Generator, colours: list[np.ndarray], size_px: int = 25
 
 
 def shag(rng: np.random.Generator, base: np.ndarray, size_px: int = 512) -> np.ndarray:
-    """Return a texture: deep pile carpet."""
+    """Return a deep pile carpet."""
     pile = 0.16 * fractal(rng, size_px, size_px, 0.5) + 0.08 * fractal(rng, size_px, size_px, 1.3)
     return finish(base * (1.0 + pile)[..., None])
 
@@ -263,7 +254,7 @@ def shag(rng: np.random.Generator, base: np.ndarray, size_px: int = 512) -> np.n
 def veneer(
     rng: np.random.Generator, base: np.ndarray, size_px: int = 512, contrast: float = 1.0
 ) -> np.ndarray:
-    """Return a texture: furniture wood, grain along u: cathedral rings, pores, slow change of tone."""
+    """Return furniture wood with the grain along u: cathedral rings, pores, slow change of tone."""
     wave = fractal(rng, size_px, size_px, 2.3, (4.0, 1.0))
     rings = np.sin(9.0 * wave) * 0.5 + np.sin(23.0 * wave) * 0.2
     pores = fractal(rng, size_px, size_px, 0.5, (30.0, 1.0))
@@ -273,7 +264,7 @@ def veneer(
 
 
 def stone(rng: np.random.Generator, base: np.ndarray, vein: np.ndarray, size_px: int = 512) -> np.ndarray:
-    """Return a texture: marble: veins along the zero lines of warped noise."""
+    """Return marble: veins along the zero lines of warped noise."""
     first, second = fractal(rng, size_px, size_px, 1.7), fractal(rng, size_px, size_px, 1.6)
     fine = fractal(rng, size_px, size_px, 0.8)
     veins = np.exp(-np.abs(first) * 9.0) * 0.7 + np.exp(-np.abs(second + 0.6) * 16.0) * 0.4
@@ -285,7 +276,7 @@ def stone(rng: np.random.Generator, base: np.ndarray, vein: np.ndarray, size_px:
 def terrazzo(
     rng: np.random.Generator, base: np.ndarray, chips: list[np.ndarray], size_px: int = 512
 ) -> np.ndarray:
-    """Return a texture: stone chips in cement, also good as granite."""
+    """Return stone chips in cement, which also serves as granite."""
     out = np.broadcast_to(base, (size_px, size_px, 3)).astype(np.float32).copy()
     for _ in range(2200):
         centre = rng.integers(0, size_px, size=2)
@@ -301,18 +292,18 @@ def terrazzo(
 
 
 def flat(rng: np.random.Generator, base: np.ndarray, size_px: int = 128, depth: float = 0.015) -> np.ndarray:
-    """Return a texture: paint, plastic or metal: nearly even."""
+    """Return an almost uniform surface: paint, plastic or metal."""
     return finish(base * (1.0 + depth * fractal(rng, size_px, size_px, 1.0))[..., None])
 
 
 def brushed(rng: np.random.Generator, base: np.ndarray, size_px: int = 256) -> np.ndarray:
-    """Return a texture: brushed steel, lines along u."""
+    """Return brushed steel with lines along u."""
     lines = fractal(rng, size_px, size_px, 0.5, (40.0, 1.0))
     return finish(base * (1.0 + 0.05 * lines + 0.03 * fractal(rng, size_px, size_px, 2.0))[..., None])
 
 
 def dots(rng: np.random.Generator, ground: np.ndarray, spot: np.ndarray, size_px: int = 256) -> np.ndarray:
-    """Return a texture: cloth or paper with spots in half drop."""
+    """Return cloth or paper with spots in half-drop repeat."""
     y, x = np.mgrid[:size_px, :size_px].astype(np.float32)
     pitch = size_px / 4
     column = (x // pitch) % 2
