@@ -22,16 +22,16 @@ SessionArgument = Annotated[
     Path,
     typer.Argument(
         callback=session_folder,
-        help="Folder written by `mapping.session = DIR`; or the deployment file (.toml) of a running system, "
-        "whose mapper is asked",
+        help="Folder written by `mapping.session = DIR`; or the deployment file (.toml) of a running system: "
+        "its mapper then sends the map",
     ),
 ]
 ThreadsOption = Annotated[int, typer.Option(min=1, help="Threads of the rasterizer")]
-_RESOLUTION_M = 0.05
-_LEAST_FACES = 60  # of a piece of mesh: less is a crumb
-_PATIENCE_S = 120.0  # of a mapper that has a keyframe in hand, over a slow link
-_LATCHED_S = 2.0
-_VIEWS = 12  # from which the cost of leaving detail out is measured
+_RESOLUTION_M = 0.05  # of nav2 grids
+_MIN_FACES = 60  # of a connected component of the mesh; smaller ones are removed
+_STATE_TIMEOUT_S = 120.0  # a mapper answers after its current keyframe, perhaps over a slow link
+_GRID_TIMEOUT_S = 2.0  # for the latched lidar grid
+_VIEWS = 12  # viewpoints to measure the loss of merged detail
 
 
 def export(
@@ -45,23 +45,23 @@ def export(
         ),
     ] = None,
     detail_m: Annotated[
-        float, typer.Option(min=0.0, help="ply, gltf, spz: Gaussians in a cell of that edge become one")
+        float, typer.Option(min=0.0, help="ply, gltf, spz: merge the Gaussians in each cell of this edge")
     ] = 0.0,
-    cell_m: Annotated[float, typer.Option(min=0.002, help="points: between points")] = 0.02,
-    voxel_m: Annotated[float, typer.Option(min=0.005, help="mesh: finest detail")] = 0.04,
+    cell_m: Annotated[float, typer.Option(min=0.002, help="points: distance between points")] = 0.02,
+    voxel_m: Annotated[float, typer.Option(min=0.005, help="mesh: edge of a voxel")] = 0.04,
     low_m: Annotated[
-        float, typer.Option(min=-10.0, max=10.0, help="nav2: what stands higher than this is in the way")
+        float, typer.Option(min=-10.0, max=10.0, help="nav2: lower end of the obstacle band above the floor")
     ] = 0.10,
     high_m: Annotated[
-        float, typer.Option(min=-10.0, max=100.0, help="nav2: what hangs higher than this is not")
+        float, typer.Option(min=-10.0, max=100.0, help="nav2: upper end of the obstacle band above the floor")
     ] = 1.50,
     threads: ThreadsOption = 2,
 ) -> None:
-    """Writes a map for other programs; at any time, also while it is being made.
+    """Write a map for other programs, also while the map is being built.
 
-    ply: 3DGS layout. gltf: .glb with KHR_gaussian_splatting. spz: Niantic's, small. points: coloured points.
-    mesh: coloured triangles. nav2: map.yaml (both), lidar.yaml, camera.yaml (what the lidar's plane misses).
-    ply, points, mesh and nav2 have z up, gltf and spz y up; all are in metres.
+    ply: 3DGS layout. gltf: .glb with KHR_gaussian_splatting. spz: Niantic, small files. points: coloured
+    points. mesh: coloured triangles. nav2: map.yaml (both layers), lidar.yaml, camera.yaml (obstacles outside
+    the lidar plane). ply, points, mesh and nav2 have z up, gltf and spz y up; all are in metres.
 
     Examples:
 
@@ -74,11 +74,11 @@ def export(
     from beamsplat.common.mapfiles.state import store_of
 
     if to not in FORMATS:
-        raise UserError(f"--to {to!r}: there are {', '.join(FORMATS)}")
+        raise UserError(f"--to {to!r}: choose one of {', '.join(FORMATS)}")
     path = out or (Path() if _running(session) else session) / FORMATS[to]
     ending = Path(FORMATS[to]).suffix
     if path.suffix != ending:
-        expected = f"a name ending in {ending}" if ending else "a folder, which has no ending"
+        expected = f"a name ending in {ending}" if ending else "a folder name without an ending"
         raise UserError(f"--out {path}: expected {expected} for --to {to}")
     arrays, lidar = _open(session)
     store = store_of(arrays)
@@ -104,9 +104,9 @@ def _running(session: Path) -> bool:
 
 
 def _open(session: Path) -> tuple[dict[str, Any], Callable[[], Any]]:
-    """(arrays of the map's state, what gives the lidar's OccupancyGrid or None), from disk or a mapper."""
+    """Return (state arrays, function that returns the lidar OccupancyGrid or None), from disk or a mapper."""
     if _running(session):
-        return _asked(session)
+        return _from_mapper(session)
     from beamsplat.common.mapfiles.session import SessionFolder
     from beamsplat.tools.cli.session import ROBOT_MANIFEST, load_slam
 
@@ -118,7 +118,8 @@ def _open(session: Path) -> tuple[dict[str, Any], Callable[[], Any]]:
     return arrays, lambda: load_slam(folder.robot).grid(_RESOLUTION_M) if there else None
 
 
-def _asked(file: Path) -> tuple[dict[str, Any], Callable[[], Any]]:
+def _from_mapper(file: Path) -> tuple[dict[str, Any], Callable[[], Any]]:
+    """Query the state of a running mapper and the lidar grid; see `_open`."""
     from beamsplat.common.config.deployment import load_deployment
     from beamsplat.common.security.logins import OPERATOR, login_of
     from beamsplat.common.zenoh.bus import open_session
@@ -128,13 +129,13 @@ def _asked(file: Path) -> tuple[dict[str, Any], Callable[[], Any]]:
     deployment = load_deployment(file)
     login = login_of(deployment.security, OPERATOR)
     with open_session(deployment.router.listen, 2.0, login=login) as session:
-        arrays = joined_state(list(ask(session, deployment.robot, "mapping", "state", {}, _PATIENCE_S)))
+        arrays = joined_state(list(ask(session, deployment.robot, "mapping", "state", {}, _STATE_TIMEOUT_S)))
         grid = _latched_grid(session, deployment.robot)
     return arrays, lambda: grid
 
 
 def _latched_grid(session: Any, robot: str) -> Any:
-    """The lidar's OccupancyGrid as localization said it last; None where none comes."""
+    """Return the last lidar OccupancyGrid that localization published; None if there is none."""
     import queue
 
     from beamsplat.common.topics import topic
@@ -142,10 +143,10 @@ def _latched_grid(session: Any, robot: str) -> Any:
     from beamsplat.common.zenoh.streams import declare_subscription, decode_sample
     from beamsplat.services.localization.lidar2d.occupancy import OccupancyGrid
 
-    row, said = topic("localization/grid"), queue.SimpleQueue()
-    _kept = declare_subscription(session, key(robot, row.name), row, "latched", said.put)
+    row, received = topic("localization/grid"), queue.SimpleQueue()
+    _kept = declare_subscription(session, key(robot, row.name), row, "latched", received.put)
     try:
-        grid = decode_sample(said.get(timeout=_LATCHED_S), row).message
+        grid = decode_sample(received.get(timeout=_GRID_TIMEOUT_S), row).message
     except queue.Empty:
         return None
     return OccupancyGrid(grid.occupancy, *map(float, grid.origin_m), grid.resolution_m)
@@ -161,11 +162,11 @@ def _gaussians(path: Path, to: str, store: Any, arrays: dict[str, Any], detail_m
     if params is whole:
         return text
     psnr_db = _cost_db(store, params, arrays, threads)
-    return f"{text} for {store.count}; {psnr_db:.1f} dB to the whole map, from the drive's own views"
+    return f"{text} for {store.count}; {psnr_db:.1f} dB PSNR against the whole map from the keyframes"
 
 
 def _cost_db(store: Any, params: Any, arrays: dict[str, Any], threads: int) -> float:
-    """Mean PSNR of coarse Gaussians against all of them."""
+    """Return the mean PSNR (dB) of merged Gaussians against all Gaussians, from the keyframes' viewpoints."""
     import numpy as np
 
     from beamsplat.common.mapfiles.scores import psnr_db
@@ -194,7 +195,7 @@ def _writer(to: str) -> Any:
 
 
 def _views(store: Any, arrays: dict[str, Any], threads: int) -> Any:
-    """The map's rendered depth from all keyframes, with a bar."""
+    """Yield the rendered depth of the map from all keyframes, with a progress bar."""
     from rich.progress import track
 
     from beamsplat.common.mapfiles.state import keyframe_views
@@ -202,9 +203,9 @@ def _views(store: Any, arrays: dict[str, Any], threads: int) -> Any:
 
     views = [(view.camera, view.T_map_camera) for view in keyframe_views(arrays)]
     if not views:
-        raise UserError("the session has no keyframes to look from")
+        raise UserError("the session has no keyframes: there is no viewpoint")
     rendered = render_depth_views(store, views, threads)
-    return track(rendered, "looking", len(views), console=console, transient=True)
+    return track(rendered, "rendering", len(views), console=console, transient=True)
 
 
 def _points(path: Path, store: Any, arrays: dict[str, Any], cell_m: float, threads: int) -> str:
@@ -229,11 +230,11 @@ def _mesh(path: Path, store: Any, arrays: dict[str, Any], voxel_m: float, thread
             corners += [points.min(axis=0), points.max(axis=0)]
     if not corners:
         raise UserError("the map shows no surface from its keyframes")
-    # The rare pixel that looks out of a window must not make the field large.
+    # A few pixels that look out of a window must not enlarge the volume.
     low, high = np.percentile(corners, 5.0, axis=0), np.percentile(corners, 95.0, axis=0)
     field = TsdfVolume.around(low, high, voxel_m)
     field.add(views)
-    mesh = remove_small_components(surface_nets(field), _LEAST_FACES)
+    mesh = remove_small_components(surface_nets(field), _MIN_FACES)
     write_ply(path, mesh.vertices_m, mesh.colours, mesh.faces)
     return f"{len(mesh.faces)} triangles"
 
@@ -259,7 +260,7 @@ def _nav2(
         camera = camera_layer(points, origin, shape, _RESOLUTION_M, *band_m)
         save_nav2(OccupancyGrid(camera, *origin, _RESOLUTION_M), path, "camera")
         save_nav2(OccupancyGrid(camera, *origin, _RESOLUTION_M), path)
-        return "map.yaml, camera.yaml (no lidar layer: `beamsplat session join` puts the robot's half in)"
+        return "map.yaml, camera.yaml (no lidar layer: `beamsplat session join` adds the robot half)"
     origin, cell_m = (lidar.origin_x_m, lidar.origin_y_m), lidar.resolution_m
     camera = camera_layer(points, origin, lidar.values.shape, cell_m, *band_m)
     both = combined(lidar.values, camera, OCCUPIED, FREE)
@@ -271,13 +272,13 @@ def _nav2(
 def render(
     session: SessionArgument,
     path: Annotated[str, typer.Option(help="orbit, drive, or a TUM file of body poses in the map")],
-    out: Annotated[Path, typer.Option(callback=writable, help="NAME.mp4, or NAME.png for pictures")],
-    seconds: Annotated[float, typer.Option(min=0.1, help="How long the video is")] = 10.0,
-    fps: Annotated[float, typer.Option(min=1.0, help="Pictures a second")] = 30.0,
-    width: Annotated[int, typer.Option(min=0, help="Pixels; 0: as the keyframes")] = 0,
+    out: Annotated[Path, typer.Option(callback=writable, help="NAME.mp4, or NAME.png for images")],
+    seconds: Annotated[float, typer.Option(min=0.1, help="Length of the video")] = 10.0,
+    fps: Annotated[float, typer.Option(min=1.0, help="Images per second")] = 30.0,
+    width: Annotated[int, typer.Option(min=0, help="Image width in pixels; 0: that of the keyframes")] = 0,
     threads: ThreadsOption = 2,
 ) -> None:
-    """Films a map: round it, along its own drive, or along a path of yours.
+    """Render a map along a camera path: around the map, along its own drive, or along a given path.
 
     Examples:
 
@@ -293,7 +294,7 @@ def render(
     arrays, _ = _open(session)
     views, store = keyframe_views(arrays), store_of(arrays)
     if not views:
-        raise UserError(f"{session}: has no keyframes, so no camera to film with")
+        raise UserError(f"{session}: has no keyframes, so the camera is unknown")
     frames = max(round(seconds * fps), 1)
     camera = views[0].camera
     if width:
@@ -303,7 +304,7 @@ def render(
         render_path(store, camera, poses, threads), "rendering", len(poses), console=console, transient=True
     )
     written = write_video(out, bar, fps, len(poses))
-    print(f"{written[0]}: {len(poses)} pictures of {camera.width_px}x{camera.height_px}")
+    print(f"{written[0]}: {len(poses)} images of {camera.width_px}x{camera.height_px}")
 
 
 def _poses(path: str, store: Any, arrays: dict[str, Any], views: list[Any], frames: int) -> Any:

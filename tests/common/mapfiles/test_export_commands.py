@@ -62,7 +62,7 @@ def test_every_format_is_written_where_it_is_asked_for(session, tmp_path):
     assert points.count > 1000
 
 
-def test_points_and_mesh_lie_on_the_room(session, tmp_path):
+def test_points_and_mesh_match_the_surface_of_the_room(session, tmp_path):
     """Against the exact depth of a keyframe's view."""
     run("export", session, "--to", "points", "--out", tmp_path / "points.ply")
     run("export", session, "--to", "mesh", "--voxel-m", "0.06", "--out", tmp_path / "mesh.ply")
@@ -80,7 +80,7 @@ def test_points_and_mesh_lie_on_the_room(session, tmp_path):
     assert len(read.faces) > 1000
 
 
-def test_an_export_while_a_mapper_saves_is_of_a_whole_state(session, tmp_path):
+def test_an_export_while_a_mapper_saves_is_of_one_checkpoint(session, tmp_path):
     shutil.copytree(session, tmp_path / "s")
     node = make_node(tmp_path / "s", session_every_s=1.0)
     for number in (8, 9):
@@ -105,7 +105,7 @@ def served(folder, name):
     return np.where(occupied, 100, np.where(free, 0, -1)), table
 
 
-def test_nav2_without_a_robots_half_is_what_the_camera_saw(session, tmp_path):
+def test_nav2_without_a_robot_half_is_the_camera_layer(session, tmp_path):
     assert "no lidar layer" in run("export", session, "--to", "nav2", "--out", tmp_path / "nav2")
     values, table = served(tmp_path / "nav2", "map")
     assert table["resolution"] == 0.05
@@ -114,8 +114,8 @@ def test_nav2_without_a_robots_half_is_what_the_camera_saw(session, tmp_path):
 
 
 @pytest.mark.slow
-def test_nav2_layers_lie_on_each_other(session, tmp_path):
-    """A lidar map of a flat and, wherever the room's keyframes put it, the camera's layer on the same cells."""
+def test_nav2_layers_are_aligned(session, tmp_path):
+    """The lidar map of a flat and the camera layer of the room, on the same cells."""
     shutil.copytree(session, tmp_path / "s")
     lidar, path, slam = RayCastLidar(), SimulatedDrive(), LidarSlam(LidarSlamSettings(), np.eye(4))
     angle_min, increment, dt, least, most = lidar.arguments()
@@ -134,8 +134,8 @@ def test_nav2_layers_lie_on_each_other(session, tmp_path):
     assert (seen == 100).sum() > 20
 
 
-def test_wrong_words_are_answered_with_the_right_ones(session, tmp_path):
-    with pytest.raises(UserError, match="there are ply, gltf, spz"):
+def test_wrong_arguments_are_answered_with_valid_ones(session, tmp_path):
+    with pytest.raises(UserError, match="choose one of ply, gltf, spz"):
         run("export", session, "--to", "obj")
     with pytest.raises(UserError, match=r"ending in \.glb"):
         run("export", session, "--to", "gltf", "--out", tmp_path / "map.gltf")
@@ -149,19 +149,19 @@ def test_wrong_words_are_answered_with_the_right_ones(session, tmp_path):
         run("export", tmp_path, "--to", "ply")
 
 
-# --- pictures ---
+# --- images and videos ---
 
 
-def test_a_drive_shows_what_the_keyframes_saw(session, tmp_path):
+def test_renders_along_the_drive_match_the_keyframes(session, tmp_path):
     out = tmp_path / "frames" / "drive.png"
-    assert "3 pictures of 160x120" in run(
+    assert "3 images of 160x120" in run(
         "render", session, "--path", "drive", "--seconds", "1", "--fps", "3", "--out", out
     )
     first = cv2.imread(str(out.with_name("drive-0001.png")))[..., ::-1].astype(float)
     assert np.corrcoef(first.ravel(), r.shot(0)[0].astype(float).ravel())[0, 1] > 0.8
 
 
-def test_a_video_has_its_pictures(session, tmp_path):
+def test_a_video_has_the_requested_images(session, tmp_path):
     run("render", session, "--path", "orbit", "--seconds", "0.5", "--fps", "10", "--width", "96",
         "--out", tmp_path / "orbit.mp4")  # fmt: skip
     video = cv2.VideoCapture(str(tmp_path / "orbit.mp4"))
@@ -197,7 +197,7 @@ def test_a_path_of_body_poses_is_followed_with_the_robots_camera(session, tmp_pa
     np.testing.assert_allclose(shown, np.clip(image, 0, 1), atol=2 / 255)
 
 
-def test_cameras_look_where_they_should(session):
+def test_camera_paths_look_at_their_target(session):
     """Upright: x right, y down, z forward; an orbit looks at the map from outside and above."""
     T = look_at(np.array([0.0, -2.0, 1.0]), np.array([0.0, 0.0, 1.0]))
     np.testing.assert_allclose(T[:3, :3] @ [0.0, 0.0, 1.0], [0.0, 1.0, 0.0], atol=1e-12)
@@ -223,7 +223,7 @@ def test_cameras_look_where_they_should(session):
     assert [T[0, 3] for T in trajectory_poses(track, np.eye(4), 3)] == pytest.approx([0.0, 0.5, 1.0])
 
 
-def test_one_picture_is_one_file(tmp_path):
+def test_one_image_is_one_file(tmp_path):
     written = write_video(tmp_path / "one.png", [np.zeros((8, 8, 3), np.uint8)], 1.0, 1)
     assert written == [tmp_path / "one.png"]
     assert cv2.imread(str(written[0])).shape == (8, 8, 3)

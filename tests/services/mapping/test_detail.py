@@ -1,4 +1,4 @@
-"""Level of detail: what merging keeps, what it costs from afar, and when viewers get more of it."""
+"""Level of detail: what merging preserves, its error from a distance, and when viewers get more detail."""
 
 import numpy as np
 import pytest
@@ -68,7 +68,7 @@ def test_merged_gaussians_keep_place_colour_and_plane(seed, cell_m):
     assert np.all(merged[COLOUR:] <= high[:, None] + 1e-5)
 
 
-def test_larger_ones_stay_themselves():
+def test_gaussians_larger_than_a_cell_are_not_merged():
     params = wall(500)
     params[SCALE:QUAT, :3] = np.log(0.5)
     np.testing.assert_array_equal(merge_by_cell(params, 0.1)[:, :3], params[:, :3])
@@ -90,7 +90,7 @@ def test_cells_grow_by_twos_with_the_distance():
     assert detail_cell_m(11.3, 280.0, 2.0) == 4 * FINEST_CELL_M
 
 
-def test_a_far_chunk_comes_coarse_and_whole_once_somebody_is_near():
+def test_a_distant_chunk_is_coarse_and_complete_for_a_near_viewpoint():
     mapper, feed = Mapper(MapperSettings(), seed=0, threads=1), ChunkFeed()
     mapper.T_map_anchor[3] = make_transform(np.eye(3), np.array([2.0, 0.0, 0.0]))
     mapper.store.add(wall(20_000), 3)
@@ -103,7 +103,7 @@ def test_a_far_chunk_comes_coarse_and_whole_once_somebody_is_near():
     assert feed.oldest_due(mapper, far) is None
     assert feed.oldest_due(mapper, near) == 3
     assert feed.take_update(mapper, 3, near).params.shape[1] == 20_000
-    assert feed.take_update(mapper, 3, far) is None  # who goes away keeps it
+    assert feed.take_update(mapper, 3, far) is None  # detail is kept when the viewpoint moves away
     assert feed.oldest_due(mapper, far) is None
     mapper.store.move(3, mapper.T_map_anchor[3])
     assert feed.oldest_due(mapper, far) == 3  # but a new version comes as it is seen from there
@@ -113,7 +113,7 @@ def test_a_far_chunk_comes_coarse_and_whole_once_somebody_is_near():
     assert feed.take_update(mapper, 99, None) is None
 
 
-def test_who_asks_says_from_where():
+def test_a_query_may_contain_a_viewpoint():
     assert viewpoint_of({}) is None
     viewpoint = viewpoint_of({"from": "1,2,3", "focal_px": "300"})
     assert viewpoint.at_map_m.tolist() == [1.0, 2.0, 3.0]
@@ -123,7 +123,7 @@ def test_who_asks_says_from_where():
             viewpoint_of(wrong)
 
 
-def test_a_state_in_pieces_is_whole_or_refused():
+def test_a_state_in_pieces_is_complete_or_refused():
     arrays = {"a": np.arange(3_000_000), "b": np.eye(3)}
     pieces = list(state_messages(arrays))
     assert len(pieces) > 4

@@ -1,4 +1,4 @@
-"""The mapper's loops against torch: the losses, SSIM."""
+"""The losses and SSIM of the mapper against torch."""
 
 import numpy as np
 import pytest
@@ -50,7 +50,7 @@ def test_photometric_and_depth_loss_is_that_of_torch():
     assert np.allclose(sums[:, 2:8].sum(axis=0), e.grad.numpy(), rtol=1e-3, atol=1e-2)
 
 
-def test_lidar_loss_pulls_at_the_beams_only():
+def test_lidar_loss_has_gradients_at_the_beams_only():
     image, *_ = pictures()
     gradient = np.zeros((5, H, W), np.float32)
     pixels, z = np.array([5, 5 * W + 7], np.int32), np.array([1.0, 2.0], np.float32)
@@ -87,7 +87,7 @@ def test_ssim_gradient_is_that_of_torch():
     assert np.linalg.norm(gradient[:3] - x.grad.numpy()) < 1e-3 * np.linalg.norm(x.grad.numpy())
 
 
-def test_ssim_of_equal_pictures_is_one():
+def test_ssim_of_equal_images_is_one():
     picture = np.random.default_rng(0).random((H, W, 3))
     assert ssim(picture, picture) == pytest.approx(1.0)
     assert ssim(picture, np.roll(picture, 3, axis=0)) < 0.3

@@ -80,7 +80,7 @@ def copy_of(mapper):
     return other
 
 
-def test_views_never_seen_are_close_to_the_truth(room, mapped):
+def test_held_out_views_are_close_to_the_truth(room, mapped):
     score = quality(mapped, room, view(room, 2.5))
     assert score.psnr_db > 23.0
     assert score.depth_l1_m < 0.10
@@ -110,7 +110,7 @@ def test_the_same_keyframes_give_the_same_bits(room, mapped):
         ({"anchor": 7}, "the pose of anchor 7 is unknown"),
     ],
 )
-def test_what_cannot_be_used_is_refused_and_harms_nothing(room, mapped, change, words):
+def test_invalid_keyframes_are_refused_without_effect(room, mapped, change, words):
     mapper = copy_of(mapped)
     before = mapper.store.params[:, : mapper.store.count].copy()
     outcome = mapper.add(keyframe(room, 4, id=99, **change), None)
@@ -126,7 +126,7 @@ def test_a_keyframe_is_taken_once(room, mapped):
 
 
 def test_the_map_moves_with_its_anchor(room, mapped):
-    """The camera and the Gaussians move together: the picture stays the same, elsewhere in the map."""
+    """The camera and the Gaussians move together: the image does not change."""
     mapper = copy_of(mapped)
     jump = make_transform(so3_exp([0.0, 0.0, np.deg2rad(10.0)]), np.array([1.0, 0.0, 0.0]))
     before = render_rgb_depth(mapper.rasterizer, mapper.store, CAMERA, view(room, 2))[0]
@@ -138,8 +138,8 @@ def test_the_map_moves_with_its_anchor(room, mapped):
         mapper.move_anchors({0: np.zeros((4, 4))})
 
 
-def test_a_loop_closure_mends_the_map(room):
-    """Half of the keyframes are a metre and ten degrees off until the pose graph knows better: after some
+def test_a_loop_closure_corrects_the_map(room):
+    """Half of the keyframes are a metre and ten degrees off until the pose graph corrects them: after some
     steps the views between them are as good as in a map that never jumped.
     """
     jump = make_transform(so3_exp([0.0, 0.0, np.deg2rad(10.0)]), np.array([1.0, 0.0, 0.0]))
@@ -161,8 +161,8 @@ def test_a_loop_closure_mends_the_map(room):
     assert scores[1] > scores[0] - 0.5
 
 
-def test_what_others_look_through_is_not_filled_with_doubtful_depth(room):
-    """Doubtful depth half way to a wall that another keyframe sees well: nothing is put into the air."""
+def test_uncertain_depth_is_not_inserted_in_observed_free_space(room):
+    """Doubtful depth half way to a wall that another keyframe sees well: nothing is inserted in free space."""
     mapper = Mapper(SETTINGS, seed=1)
     good = keyframe(room, 0)
     doubtful = replace(
@@ -177,10 +177,10 @@ def test_what_others_look_through_is_not_filled_with_doubtful_depth(room):
     v = np.round((camera[1, :3] @ points + camera[1, 3]) / z * 110.0 + 59.5).astype(int)
     inside = (u >= 0) & (u < 160) & (v >= 0) & (v < 120)
     depth = good.depth_m[v[inside], u[inside]]
-    assert np.nanmean(z[inside] < 0.7 * depth) < 0.15  # half of them, if nobody objected
+    assert np.nanmean(z[inside] < 0.7 * depth) < 0.15  # half of them without the check
 
 
-def test_masked_pixels_teach_nothing(room):
+def test_masked_pixels_have_no_effect(room):
     """A grey sheet hangs before half of the picture; with a mask the map does not learn its colour."""
     results = []
     for masked in (False, True):
@@ -200,7 +200,7 @@ def test_masked_pixels_teach_nothing(room):
     assert results[1] > 22.0
 
 
-def test_old_keyframes_are_forgotten_within_the_bound(room):
+def test_old_keyframes_are_dropped_within_the_limit(room):
     mapper = Mapper(replace(SETTINGS, max_keyframes=4, half_iterations=1, full_iterations=0), seed=1)
     for number in range(8):
         assert mapper.add(keyframe(room, number), np.eye(4)).ok
@@ -231,7 +231,7 @@ def test_pose_refinement_undoes_a_planted_error(room, mapped):
     assert np.linalg.norm(se3_log(held.delta)[:3]) <= mapper.settings.max_pose_m * np.sqrt(3)
 
 
-def test_exposure_takes_up_a_brighter_picture(room, mapped):
+def test_exposure_compensates_a_brighter_image(room, mapped):
     mapper = copy_of(mapped)
     mapper.settings = replace(
         SETTINGS, refine_exposure=True, ssim_weight=0.0, rates=replace(SETTINGS.rates, exposure=5e-3)
@@ -252,7 +252,7 @@ def test_exposure_takes_up_a_brighter_picture(room, mapped):
     assert np.all(held.exposure[:3] < -0.05)
 
 
-def test_what_floats_before_a_trusted_surface_is_carved(room, mapped):
+def test_gaussians_in_front_of_a_trusted_surface_are_carved(room, mapped):
     mapper = copy_of(mapped)
     ahead = view(room, 2) @ np.array([0.0, 0.0, 0.6, 1.0])
     floater = mapper.store.params[:, :16].copy()
@@ -269,7 +269,7 @@ def test_what_floats_before_a_trusted_surface_is_carved(room, mapped):
     assert mapper.store.count >= before - 200
 
 
-def test_gaussians_hang_on_their_anchor_whatever_room_they_need():
+def test_gaussians_keep_their_anchor_when_arrays_grow():
     """More than fit: all arrays are replaced by larger ones while they are added."""
     store = GaussianStore(capacity=16)
     for anchor, count in ((7, 10), (8, 30), (9, 500), (7, 3000)):
@@ -305,7 +305,7 @@ def test_ply_is_what_inria_writes(tmp_path, mapped):
     assert np.array_equal(read_ply_points(tmp_path / "map.ply"), params[:3].T.astype(float))
 
 
-def test_chunks_say_what_has_changed(room, mapped):
+def test_chunk_versions_show_what_has_changed(room, mapped):
     mapper = copy_of(mapped)
     mapper.store._events = {0: 1}
     known = mapper.store.versions()

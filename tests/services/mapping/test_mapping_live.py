@@ -13,7 +13,7 @@ from beamsplat.common.topics import topic
 from beamsplat.common.zenoh.bus import open_session
 from beamsplat.common.zenoh.streams import decode_sample
 from beamsplat.tools.cli.main import app
-from beamsplat.tools.system.health_table import HealthBoard
+from beamsplat.tools.system.health_table import HealthTable
 from beamsplat.tools.system.supervisor import Supervisor
 from tests.common.polling import poll
 from tests.services.mapping.room_drive import TABLE
@@ -51,7 +51,7 @@ def state(board, node):
 def test_the_live_system_maps_and_ends(deployment, tmp_path):
     live = deployment(14)
     with Supervisor(live, table=TABLE) as supervisor, open_session(live.router.listen) as session:
-        board = HealthBoard(session, "test")
+        board = HealthTable(session, "test")
         poll(supervisor, lambda: state(board, "mapping") == "drained", 90)
         poll(supervisor, lambda: " 0 not acknowledged" in detail(board, "keyframes"), 5)
         received = {i.topic: i for i in board.records["mapping"].health.inputs}["keyframes/frame"]
@@ -61,11 +61,11 @@ def test_the_live_system_maps_and_ends(deployment, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_killed_mapper_gets_again_what_it_had_not_acknowledged(deployment):
+def test_unacknowledged_keyframes_are_sent_again_after_a_kill(deployment):
     """The successor starts with an empty map: later keyframes reach it, unanswered ones come again."""
     live = deployment(60, retry_s=1.0)
     with Supervisor(live, table=TABLE) as supervisor, open_session(live.router.listen) as session:
-        board = HealthBoard(session, "test")
+        board = HealthTable(session, "test")
         poll(supervisor, lambda: "3 keyframes" in detail(board, "mapping"), 90)
         first = supervisor.children["mapping"].process.pid
         os.kill(first, signal.SIGKILL)
@@ -75,7 +75,7 @@ def test_a_killed_mapper_gets_again_what_it_had_not_acknowledged(deployment):
 
 
 @pytest.mark.slow
-def test_a_running_mapper_gives_its_map_away(deployment, tmp_path):
+def test_export_from_a_running_mapper(deployment, tmp_path):
     """Without a session on disk: `export` asks, while keyframes go on coming."""
     live = deployment(60)
     file = tmp_path / "robot.toml"
@@ -89,7 +89,7 @@ def test_a_running_mapper_gives_its_map_away(deployment, tmp_path):
         return out, result.stdout
 
     with Supervisor(live, table=TABLE) as supervisor, open_session(live.router.listen) as session:
-        board = HealthBoard(session, "test")
+        board = HealthTable(session, "test")
         poll(supervisor, lambda: "4 keyframes" in detail(board, "mapping"), 90)
         whole, _ = export("ply")
         coarse, said = export("spz", "--detail-m", "0.2")
@@ -97,7 +97,7 @@ def test_a_running_mapper_gives_its_map_away(deployment, tmp_path):
     made = PlyData.read(whole)["vertex"].count
     assert 1000 < made < PlyData.read(tmp_path / "map" / "splats.ply")["vertex"].count
     assert coarse.stat().st_size < 0.5 * whole.stat().st_size
-    assert "dB to the whole map" in said
+    assert "dB PSNR against the whole map" in said
 
 
 def heard(session, name):
@@ -111,12 +111,12 @@ def heard(session, name):
 
 
 @pytest.mark.slow
-def test_keyframes_outlive_their_own_process_and_reach_a_mapper_that_comes_later(deployment):
+def test_queued_keyframes_survive_a_restart_and_reach_a_mapper_started_later(deployment):
     live = deployment(70, durable=True, retry_s=0.5, window=2)
     others = tuple(name for name in live.nodes if name != "mapping")
     with Supervisor(live, ("router",), table=TABLE), open_session(live.router.listen) as session:
         sent, answered = heard(session, "keyframes/frame"), heard(session, "keyframes/ack")
-        board = HealthBoard(session, "test")
+        board = HealthTable(session, "test")
         with Supervisor(live, ("mapping",), table=TABLE) as edge:
             robot = Supervisor(live, others, table=TABLE)
             with robot:
@@ -146,7 +146,7 @@ def test_a_killed_mapper_with_a_session_loses_no_keyframe(deployment, tmp_path):
     live = deployment(60, {"session": str(tmp_path / "session"), "session_every_s": 2.0}, retry_s=1.0)
     live = live.model_copy(update={"rate": 0.5})  # the successor must be there before the drive ends
     with Supervisor(live, table=TABLE) as supervisor, open_session(live.router.listen) as session:
-        board = HealthBoard(session, "test")
+        board = HealthTable(session, "test")
         poll(supervisor, lambda: "saved at " in detail(board, "mapping"), 90)
         first = supervisor.children["mapping"].process.pid
         os.kill(first, signal.SIGKILL)

@@ -93,7 +93,7 @@ def test_the_preview_shows_what_the_camera_saw(drive):
     np.testing.assert_allclose(last.T_map_camera, r.T_map_body(number) @ r.T_BODY_CAMERA, atol=0.02)
 
 
-def test_an_independent_reader_finds_the_map_in_the_file(drive):
+def test_an_independent_reader_opens_the_ply_file(drive):
     node, letters, _, folder = drive
     vertices = PlyData.read(folder / "splats.ply")["vertex"]
     store = node._mapper.store
@@ -114,7 +114,7 @@ def test_an_independent_reader_finds_the_map_in_the_file(drive):
         assert np.linalg.norm(T[:3, 3] - truth[:3, 3]) < 0.02
 
 
-def test_submaps_take_their_gaussians_along():
+def test_submaps_move_their_gaussians():
     """The pose graph moves submap 1 by a metre and ten degrees; -1 and 0 stay."""
     still, jumped = run(None)[1], run(None, jump_at=11)[1]
     where = {c.anchor_id: c.T_map_anchor for c in jumped["mapping/chunk"]}
@@ -124,7 +124,7 @@ def test_submaps_take_their_gaussians_along():
     assert final.keyframes == still["mapping/status"][-1].keyframes
 
 
-def test_what_hangs_on_the_odom_origin_goes_with_the_oldest_submap():
+def test_keyframes_at_the_odom_origin_move_with_the_oldest_submap():
     node = MappingNode(MappingConfig(half_steps=0, full_steps=0, mend_steps=0))
     node.configure()
     list(node.handle("keyframes/frame", keyframe(0, anchor_id=-1, T_map_anchor=np.eye(4))))
@@ -176,7 +176,7 @@ NAN = np.full((r.HEIGHT, r.WIDTH), np.nan, np.float32)
         ({"mask_png": mask_to_png(np.ones((7, 7), bool))}, "the mask leaves no pixel"),
     ],
 )
-def test_what_cannot_be_mapped_is_refused_with_a_reason_and_harms_nothing(node, change, words):
+def test_invalid_keyframes_are_refused_with_a_reason_and_without_effect(node, change, words):
     store = node._mapper.store
     before, steps, refused = (
         store.params[:, : store.count].copy(),
@@ -194,7 +194,7 @@ def test_what_cannot_be_mapped_is_refused_with_a_reason_and_harms_nothing(node, 
     np.testing.assert_array_equal(store.params[:, : store.count], before)
 
 
-def test_a_keyframe_that_comes_twice_is_answered_twice_and_taken_once(node):
+def test_a_keyframe_sent_twice_is_acknowledged_twice_and_inserted_once(node):
     steps = node._mapper.steps
     out = list(node.handle("keyframes/frame", keyframe(1)))
     assert [topic for topic, _ in out] == ["keyframes/ack"]
@@ -202,7 +202,7 @@ def test_a_keyframe_that_comes_twice_is_answered_twice_and_taken_once(node):
     assert node._mapper.steps == steps
 
 
-def test_keyframes_may_come_in_any_order(node):
+def test_keyframes_may_arrive_in_any_order(node):
     fresh = MappingNode(MappingConfig(half_steps=4, full_steps=2))
     fresh.configure()
     for number in (5, 0, 3):
@@ -218,7 +218,7 @@ def test_ticks_go_on_improving(node):
     assert set(out) <= {"mapping/chunk"}
 
 
-def test_without_keyframes_nothing_is_said():
+def test_without_keyframes_nothing_is_published():
     empty = MappingNode(MappingConfig())
     empty.configure()
     assert list(empty.handle("tick", Tick(stamp_ns=0, count=0))) == []

@@ -1,4 +1,4 @@
-"""The fast renderers against plain torch in float64: pictures and every gradient."""
+"""The fast renderers against the reference in float64: images and all gradients."""
 
 import numpy as np
 import pytest
@@ -55,7 +55,7 @@ def backends():
 
 
 @pytest.mark.parametrize("backend", backends())
-def test_pictures_and_gradients_agree_with_float64(backend):
+def test_images_and_gradients_agree_with_float64(backend):
     errors = {name: [] for name in NAMES}
     quality = []
     for seed in range(12):
@@ -143,7 +143,7 @@ def test_pose_gradient_is_that_of_the_left_perturbation():
     assert relative(gradients["pose"], left) < 0.03
 
 
-def test_a_single_gaussian_lands_where_the_pinhole_says():
+def test_a_single_gaussian_is_rendered_at_its_pinhole_projection():
     """Pixel centres at integers: a small splat on the ray through (20, 10) peaks there, at its depth."""
     camera = RasterCamera(50.0, 50.0, 31.0, 23.0, 64, 48)
     point = np.array([[(20 - 31.0) / 50.0 * 2.0, (10 - 23.0) / 50.0 * 2.0, 2.0]])

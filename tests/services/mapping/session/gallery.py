@@ -1,4 +1,4 @@
-"""A long gallery: a picture every three metres, each seen from two metres by one keyframe and by no other."""
+"""A long gallery: a painting every three metres, each observed from two metres by exactly one keyframe."""
 
 from functools import lru_cache
 
@@ -37,7 +37,7 @@ def painting(place):
 
 
 def message(number, places=40):
-    """Keyframe `number`, before picture `number % places`."""
+    """Return keyframe `number`, in front of painting `number % places`."""
     place = number % places
     depth = np.full((HEIGHT, WIDTH), 2.0, np.float32)
     anchor = place // PLACES_AN_ANCHOR

@@ -1,4 +1,4 @@
-"""Maps of the synthetic room for the tests of sessions: keyframes as messages, and a mapper that takes them."""
+"""Keyframe messages of the synthetic room, and a mapper for them, for the session tests."""
 
 import numpy as np
 
@@ -13,7 +13,7 @@ SECOND = 1_000_000_000
 
 
 def message(number, stamp_ns=None, **change):
-    """A keyframe a second; the second half hangs on anchor 1."""
+    """Return one keyframe per second; the second half is anchored to anchor 1."""
     rgb, depth = r.shot(number)
     anchor = int(number >= 4)
     T_map_anchor = r.T_map_body(4 * anchor)
@@ -29,7 +29,7 @@ def message(number, stamp_ns=None, **change):
 
 
 def make_node(session=None, **options):
-    """A configured mapper that works quickly."""
+    """Return a configured mapper with few steps."""
     options = {"half_steps": 4, "full_steps": 3, "tick_steps": 2, **options}
     node = MappingNode(MappingConfig(session=session, **options))
     node.configure()
@@ -37,7 +37,7 @@ def make_node(session=None, **options):
 
 
 def feed(node, numbers):
-    """Gives it keyframes; background work is done at once. Gives what it sent, by topic."""
+    """Pass keyframes to a node, run background jobs at once; return its outputs by topic."""
     sent = {}
     for number in numbers:
         handle(node, "keyframes/frame", message(number), sent)
@@ -45,7 +45,7 @@ def feed(node, numbers):
 
 
 def handle(node, topic, content, sent=None):
-    """One message in; outputs are added to `sent`, which is given back."""
+    """Pass one message to a node; return `sent` with its outputs added."""
     sent = {} if sent is None else sent
     for output in node.handle(topic, content):
         if isinstance(output, tuple):

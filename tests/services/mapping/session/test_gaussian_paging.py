@@ -40,7 +40,7 @@ def make(folder, **options):
 
 
 def rows(store):
-    """All that is known of the Gaussians, one row each, in an order of its own."""
+    """Return all arrays of the Gaussians, one row each, sorted."""
     state = store.state()
     parts = [state[n].reshape(-1, store.count).astype(np.float64) for n in state if n != "events"]
     table = np.concatenate(parts).T
@@ -79,7 +79,7 @@ def walked(once, tmp_path):
     node.close()
 
 
-def test_the_budget_holds_and_the_status_says_what_is_where(tmp_path):
+def test_the_budget_holds_and_the_status_counts_memory_and_disk(tmp_path):
     """Twice along the gallery: never over the budget, and what a keyframe in memory sees is in memory."""
     node = make(tmp_path / "s")
     pager, disk_tier, mapper, sent = (
@@ -107,7 +107,7 @@ def test_the_budget_holds_and_the_status_says_what_is_where(tmp_path):
     node.close()
 
 
-def test_all_places_are_visited_again_while_time_passes(walked):
+def test_all_keyframes_are_paged_in_again_over_time(walked):
     """Keyframes have their turns, those whose surroundings were on the disk too: each visit brings another
     place.
     """
@@ -122,42 +122,42 @@ def test_all_places_are_visited_again_while_time_passes(walked):
     assert min(ever) < gallery.T0 + 15 * SECOND
 
 
-def test_old_places_look_the_same_after_they_were_on_the_disk(walked):
+def test_paged_out_gaussians_render_the_same_after_page_in(walked):
     """The first places have left; a view brings them back as they were when they left: 60 dB, in fact the
     same bits.
     """
     _, node = walked
-    mapper, keeper = node._mapper, node._session._checkpointer
-    assert mapper.store.count < 0.8 * (mapper.store.count + keeper.disk_tier.count)
+    mapper, checkpointer = node._mapper, node._session._checkpointer
+    assert mapper.store.count < 0.8 * (mapper.store.count + checkpointer.disk_tier.count)
     before, away = {}, [place for place in range(12) if gallery.T0 + place * SECOND in mapper.paged_out]
     away = [
         place
         for place in away
-        if len(keeper._pager._visible_blocks(mapper, mapper.paged_out[gallery.T0 + place * SECOND]))
+        if len(checkpointer._pager._visible_blocks(mapper, mapper.paged_out[gallery.T0 + place * SECOND]))
     ]
     assert len(away) > 3
     for place in away[:3]:  # they do not see each other
         held = mapper.paged_out[gallery.T0 + place * SECOND]
         seen = gallery.painting(place).transpose(2, 0, 1) / 255.0
         gone_db = psnr_db(picture(mapper, place), seen)
-        keeper.load_visible(mapper, held)
+        checkpointer.load_visible(mapper, held)
         before[place] = picture(mapper, place)
         assert psnr_db(before[place], seen) > gone_db + 8.0
     whole = rows(mapper.store)
     groups = groups_of(mapper.store, mapper.T_map_anchor)
-    keeper.disk_tier.page_out(mapper.store, groups, mapper.T_map_anchor)
+    checkpointer.disk_tier.page_out(mapper.store, groups, mapper.T_map_anchor)
     assert mapper.store.count < 0.05 * len(whole)
-    keeper._pager._where = None
+    checkpointer._pager._where = None
     for place, image in before.items():
-        keeper.load_visible(mapper, mapper.paged_out[gallery.T0 + place * SECOND])
+        checkpointer.load_visible(mapper, mapper.paged_out[gallery.T0 + place * SECOND])
         assert psnr_db(image, picture(mapper, place)) >= 60.0
-    keeper.disk_tier.page_in(mapper.store, list(keeper.disk_tier.blocks), mapper.T_map_anchor)
+    checkpointer.disk_tier.page_in(mapper.store, list(checkpointer.disk_tier.blocks), mapper.T_map_anchor)
     stored = {tuple(row) for row in rows(mapper.store)}
     assert {tuple(row) for row in whole} <= stored
 
 
-def test_anchors_take_what_is_on_the_disk_along(walked):
-    """The first submap moves by half a metre and ten degrees while its Gaussians lie on the disk."""
+def test_anchors_move_gaussians_on_disk(walked):
+    """The first submap moves by half a metre and ten degrees while its Gaussians are on disk."""
     _, node = walked
     mapper, disk_tier = node._mapper, node._session._checkpointer.disk_tier
     assert mapper.store.paged_out[0][0] > 0.8 * sum(mapper.store.anchor[: mapper.store.count] == 0)
@@ -181,7 +181,7 @@ def test_anchors_take_what_is_on_the_disk_along(walked):
     np.testing.assert_allclose(after[MEAN:SCALE, order], expected[MEAN:SCALE, expected_order], atol=1e-5)
 
 
-def test_chunks_and_the_file_at_the_end_hold_what_is_on_the_disk(tmp_path):
+def test_chunks_and_the_final_file_include_gaussians_on_disk(tmp_path):
     node, sent = make(tmp_path / "s", save=tmp_path / "out"), {}
     walk(node, range(PLACES), sent)
     chunks = {c.anchor_id: c for c in node.on_query_snapshot({})}
@@ -200,7 +200,7 @@ def test_chunks_and_the_file_at_the_end_hold_what_is_on_the_disk(tmp_path):
     node.close()
 
 
-def test_leaving_and_coming_back_changes_no_version(walked):
+def test_paging_changes_no_version(walked):
     _, node = walked
     mapper, disk_tier = node._mapper, node._session._checkpointer.disk_tier
     versions = mapper.store.versions()
@@ -213,7 +213,7 @@ def test_leaving_and_coming_back_changes_no_version(walked):
 # --- sessions ---
 
 
-def test_a_checkpoint_holds_all_and_resumes_with_or_without_a_budget(walked):
+def test_a_checkpoint_includes_gaussians_on_disk_and_resumes_with_or_without_a_budget(walked):
     folder, node = walked
     list(node.drain())
     node.close()
@@ -240,8 +240,8 @@ def test_a_checkpoint_holds_all_and_resumes_with_or_without_a_budget(walked):
     np.testing.assert_array_equal(rows(store_of(session.read_state())), expected)
 
 
-def test_a_mapper_that_is_killed_finds_what_its_checkpoint_names(tmp_path):
-    """Blocks come and go after the checkpoint; those that it names are still there."""
+def test_a_killed_mapper_finds_all_blocks_of_its_checkpoint(tmp_path):
+    """Blocks are written and read after the checkpoint; the files of those that it lists still exist."""
     node = walk(make(tmp_path / "s", session_every_s=25.0), range(PLACES))
     node.close()  # no drain: as if killed
     session = SessionFolder(tmp_path / "s")
@@ -270,15 +270,15 @@ def test_the_same_walk_gives_the_same_bytes(tmp_path):
         node.close()
 
 
-# --- what goes wrong ---
+# --- faults ---
 
 
-def test_a_budget_that_the_view_itself_breaks_is_said(tmp_path, caplog):
+def test_a_budget_that_the_current_view_exceeds_is_reported(tmp_path, caplog):
     node, sent = make(tmp_path / "s", memory_mb=PROCESS_MB + 1.0), {}
     walk(node, range(1), sent)
     first = node._mapper.store.count
     walk(node, range(1, 12), sent)
-    assert node._mapper.store.count <= first  # what there is no room for is not begun
+    assert node._mapper.store.count <= first  # no insertion without room
     assert sent["mapping/status"][-1].session.startswith(
         "MEMORY BUDGET EXCEEDED: what the newest keyframes observe takes "
     )
@@ -287,7 +287,7 @@ def test_a_budget_that_the_view_itself_breaks_is_said(tmp_path, caplog):
     node.close()
 
 
-def test_a_disk_that_takes_no_gaussians_keeps_them_in_memory_and_says_so(tmp_path, monkeypatch):
+def test_gaussians_that_cannot_be_written_stay_in_memory_and_this_is_reported(tmp_path, monkeypatch):
     node = walk(make(tmp_path / "s", session_every_s=1e6), range(8))
     (tmp_path / "s" / "edge" / "gaussians").rmdir()
     sent = {}
@@ -302,7 +302,7 @@ def test_a_disk_that_takes_no_gaussians_keeps_them_in_memory_and_says_so(tmp_pat
 
 
 @pytest.mark.parametrize("harm", ["cut", "gone", "altered", "empty"])
-def test_a_broken_block_costs_only_its_gaussians_and_is_said(walked, harm, caplog):
+def test_a_broken_block_loses_only_its_gaussians_and_is_reported(walked, harm, caplog):
     _, node = walked
     mapper, disk_tier = node._mapper, node._session._checkpointer.disk_tier
     block = next(b for b in disk_tier.blocks.values() if b.anchor == 0)
@@ -333,10 +333,10 @@ def test_a_manifest_of_a_newer_program_is_refused(walked):
         SessionFolder(folder).read_state()
 
 
-# --- what is seen ---
+# --- visibility ---
 
 
-def test_whatever_a_picture_shows_is_seen_and_what_is_far_from_it_is_not():
+def test_spheres_in_the_image_intersect_the_frustum_and_distant_ones_do_not():
     """Points of a sphere that fall into the picture make the sphere seen; ten radii off its pyramid it is
     not.
     """
@@ -360,7 +360,7 @@ def test_whatever_a_picture_shows_is_seen_and_what_is_far_from_it_is_not():
     assert frustum_intersects(c, T_map_camera, MAX_DEPTH_M, centres, radii).sum() > seen.sum()
 
 
-def test_groups_hold_every_gaussian_of_a_cube_and_their_spheres_all_they_colour(walked):
+def test_groups_contain_all_gaussians_of_a_cell_and_their_spheres_the_rendered_extents(walked):
     _, node = walked
     store, places = node._mapper.store, node._mapper.T_map_anchor
     groups = groups_of(store, places)

@@ -58,7 +58,7 @@ def halves(tmp_path_factory):
     return root / "map", root / "robot", root / "other"
 
 
-def test_both_halves_name_the_same_map(halves):
+def test_both_halves_have_the_uuid_of_the_same_map(halves):
     session, robot, other = halves
     uuid = json.loads((robot / MANIFEST).read_text())["uuid"]
     assert len(uuid) == 36
@@ -69,7 +69,7 @@ def test_both_halves_name_the_same_map(halves):
     assert uuid in run("info", session)
 
 
-def test_the_half_of_another_drive_is_refused_though_it_was_at_the_same_time(halves):
+def test_the_half_of_another_drive_at_the_same_time_is_refused(halves):
     session, _, other = halves
     before = SessionFolder(session).manifest()
     with pytest.raises(
@@ -79,7 +79,7 @@ def test_the_half_of_another_drive_is_refused_though_it_was_at_the_same_time(hal
     assert SessionFolder(session).manifest() == before
 
 
-def test_a_state_from_before_maps_had_names_joins_by_its_time(halves, tmp_path):
+def test_a_state_without_a_uuid_joins_by_its_stamps(halves, tmp_path):
     session, robot, _ = halves
     slam = LidarSlam.load(robot, LidarSlamSettings(), np.eye(4))
     slam.save(tmp_path / "old")
@@ -89,15 +89,15 @@ def test_a_state_from_before_maps_had_names_joins_by_its_time(halves, tmp_path):
     assert "joined" in run("join", session, tmp_path / "old")
 
 
-def test_who_goes_on_in_a_map_keeps_its_name(halves, tmp_path):
+def test_a_resumed_map_keeps_its_uuid(halves, tmp_path):
     _, robot, _ = halves
     localized(tmp_path / "more", 3, resume=robot, scans=15)
     names = [json.loads((folder / MANIFEST).read_text())["uuid"] for folder in (robot, tmp_path / "more")]
     assert names[0] == names[1]
 
 
-def test_a_mapper_whose_robot_starts_another_map_keeps_its_own_as_it_is(tmp_path, caplog):
-    """Submaps of both have the same numbers: places and keyframes of the second are left out, and said."""
+def test_a_mapper_rejects_data_of_another_robot_map(tmp_path, caplog):
+    """Submaps of both maps have the same ids: anchors and keyframes of the second are rejected and reported."""
     node, sent = make_node(tmp_path / "s"), {}
     handle(node, "keyframes/frame", message(0, map_uuid="first"), sent)
     for name, x_m in (("first", 0.5), ("second", 7.0)):
@@ -118,7 +118,7 @@ def test_a_mapper_whose_robot_starts_another_map_keeps_its_own_as_it_is(tmp_path
     node.close()
 
 
-def test_the_same_scans_give_the_same_name():
+def test_the_same_scans_give_the_same_uuid():
     ranges = np.arange(5, dtype=np.float32)
     assert map_uuid(1, ranges) == map_uuid(1, ranges.copy())
     assert len({map_uuid(1, ranges), map_uuid(2, ranges), map_uuid(1, ranges + 1)}) == 3

@@ -1,4 +1,4 @@
-"""A budget for the mapper's memory: keyframes rest on disk and come back, and nothing is lost by it."""
+"""The memory budget of the mapper: keyframes are paged out and in without loss."""
 
 import numpy as np
 import pytest
@@ -18,12 +18,12 @@ from beamsplat.services.mapping.session.paging import (
 from tests.services.mapping import room_drive as r
 from tests.services.mapping.session.maps import SECOND, feed, handle, make_node, message
 
-# A keyframe of 160x120 takes 140 kB with both its sizes; rendering holds on to 4 MB.
+# A keyframe of 160x120 takes 140 kB with both its sizes; rendering keeps 4 MB.
 BUDGET_MB = PROCESS_MB + 10.0
 
 
 def used(node):
-    """Bytes in the mapper's memory, counted apart from the pager: pictures, Gaussians twice, workspaces."""
+    """Bytes in the mapper's memory, counted independently of the pager: images, Gaussians twice, workspaces."""
     mapper = node._mapper
     store = mapper.store
     gaussians = 2 * sum(getattr(store, n)[..., : store.count].nbytes for n in store._arrays())
@@ -45,7 +45,7 @@ def paged(tmp_path_factory):
     return folder, node, sent
 
 
-def test_the_budget_holds_lap_after_lap_and_top_says_what_rests(paged):
+def test_the_budget_holds_lap_after_lap_and_the_status_counts_paged_out_keyframes(paged):
     _, node, sent = paged
     assert len(node._mapper.paged_out) > 5
     assert f"in memory {len(node._mapper.keyframes)} of 24 keyframes" in node.detail
@@ -65,7 +65,7 @@ def test_paged_out_keyframes_are_paged_in_by_turns(paged):
     assert len(node._mapper.keyframes) + len(node._mapper.paged_out) == 24
 
 
-def test_a_checkpoint_holds_those_on_disk_and_resumes_with_or_without_a_budget(paged, tmp_path):
+def test_a_checkpoint_includes_paged_out_keyframes_and_resumes_with_or_without_a_budget(paged, tmp_path):
     folder, node, _ = paged
     sent = {}
     for output in node.drain():
@@ -101,7 +101,7 @@ def test_the_same_drive_pages_the_same_keyframes(tmp_path):
     np.testing.assert_array_equal(a._mapper.store.params[:, :count], b._mapper.store.params[:, :count])
 
 
-def test_what_cannot_be_read_again_stays_in_memory_or_is_said(tmp_path, caplog):
+def test_keyframes_that_cannot_be_read_again_stay_in_memory_or_are_reported(tmp_path, caplog):
     node = make_node(tmp_path / "s", half_steps=0, full_steps=0)
     feed(node, range(12))
     mapper, pager = node._mapper, Pager(0.0, 0, DiskTier(SessionFolder(tmp_path / "s")))

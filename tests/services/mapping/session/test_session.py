@@ -1,4 +1,4 @@
-"""A mapper on disk: the same map and the same training after loading, whatever is killed, full or broken."""
+"""Save and resume of a mapper: identical map and optimisation, also after kills, full disks and broken files."""
 
 import json
 import multiprocessing
@@ -58,7 +58,7 @@ def copy(saved, tmp_path):
     return tmp_path / "copy"
 
 
-def test_what_is_loaded_renders_the_same_picture(saved, copy):
+def test_a_loaded_map_renders_the_same_image(saved, copy):
     node = make_node(copy)
     before, after = picture(saved[1]._mapper), picture(node._mapper)
     mse = float(np.mean((before - after) ** 2))
@@ -67,7 +67,7 @@ def test_what_is_loaded_renders_the_same_picture(saved, copy):
     node.close()
 
 
-def test_training_goes_on_as_if_nothing_had_happened(saved, copy):
+def test_optimisation_continues_identically(saved, copy):
     """Every loss of the next steps is the same number; so are the keyframes drawn, the poses and exposures."""
     loaded = make_node(copy)
     ours = Mapper(saved[1]._mapper.settings)  # a second mapper from memory: the saved node stays as it is
@@ -91,7 +91,7 @@ def test_training_goes_on_as_if_nothing_had_happened(saved, copy):
     loaded.close()
 
 
-def test_going_on_is_the_same_as_never_having_stopped(saved, tmp_path):
+def test_a_resumed_run_equals_an_uninterrupted_one(saved, tmp_path):
     """Six keyframes, a stop, three more: the map of nine in a row, to the bit."""
     shutil.copytree(saved[0], tmp_path / "stopped")
     stopped = make_node(tmp_path / "stopped")
@@ -117,7 +117,7 @@ def test_a_known_keyframe_is_acknowledged_and_not_taken_again(copy):
     node.close()
 
 
-def test_keyframes_after_the_checkpoint_come_from_their_files(copy):
+def test_keyframes_newer_than_the_checkpoint_are_read_from_their_files(copy):
     node = make_node(copy, session_every_s=1e6)
     feed(node, range(6, 9))
     node.close()  # no drain: as if killed
@@ -127,7 +127,7 @@ def test_keyframes_after_the_checkpoint_come_from_their_files(copy):
     again.close()
 
 
-def test_checkpoints_come_by_the_datas_clock(tmp_path):
+def test_checkpoint_periods_count_measurement_time(tmp_path):
     """Every three seconds of stamps, ticks count too; two runs save at the same moments."""
     summaries = []
     for name in "ab":
@@ -173,7 +173,7 @@ def test_lockstep_gives_the_same_map_with_a_session_as_without(tmp_path):
     assert [view.id for view in keyframe_views(arrays)] == sorted(arrays["keyframe_id"].tolist())
 
 
-def test_forgotten_keyframes_leave_the_disk_once_a_checkpoint_is_without_them(tmp_path):
+def test_dropped_keyframes_are_removed_from_disk_after_the_next_checkpoint(tmp_path):
     node = make_node(tmp_path / "s", max_keyframes=4, session_every_s=1.0)
     feed(node, range(9))
     list(node.drain())
@@ -183,7 +183,7 @@ def test_forgotten_keyframes_leave_the_disk_once_a_checkpoint_is_without_them(tm
     node.close()
 
 
-# --- what goes wrong ---
+# --- faults ---
 
 
 def work(folder, acknowledged):
@@ -242,7 +242,7 @@ def test_twenty_kills_lose_no_acknowledged_keyframe_and_break_no_file(tmp_path):
     node.close()
 
 
-def test_a_full_disk_leaves_the_checkpoint_valid_and_says_so(tmp_path):
+def test_a_full_disk_leaves_the_checkpoint_valid_and_is_reported(tmp_path):
     """No file may grow any more: the map grows on, nothing is acknowledged; with room again all is caught up."""
     node = make_node(tmp_path / "s", session_every_s=2.0)
     feed(node, range(4))
@@ -307,7 +307,7 @@ def test_a_broken_state_is_named_and_not_overwritten(copy):
     assert state.read_bytes() == bytes(blob)
 
 
-def test_a_broken_keyframe_costs_only_itself(saved, copy, caplog):
+def test_a_broken_keyframe_loses_only_itself(saved, copy, caplog):
     body = sorted((copy / "edge" / "keyframes").glob("*.kf"))[1]
     body.write_bytes(body.read_bytes()[:-9])
     node = make_node(copy)

@@ -1,4 +1,4 @@
-"""`beamsplat session`: halves joined, drives merged into one map and one grid, parts pruned."""
+"""`beamsplat session`: join the robot half, merge two drives into one map and one grid, prune."""
 
 import json
 import shutil
@@ -23,7 +23,7 @@ from tests.services.mapping import room_drive as r
 from tests.services.mapping.session.maps import SECOND, feed, make_node, message
 
 ORIGIN = np.eye(4)
-T_A_B = se2_to_se3(np.array([0.4, -0.3, 0.5]))  # where the second drive's map lies in the first
+T_A_B = se2_to_se3(np.array([0.4, -0.3, 0.5]))  # pose of the second map in the first
 
 
 def psnr(arrays, number, T=ORIGIN):
@@ -38,7 +38,7 @@ def psnr(arrays, number, T=ORIGIN):
 
 
 def run(*words):
-    """The command's output; its UserError is raised here."""
+    """Return the output of a command; raise its UserError."""
     result = CliRunner().invoke(app, ["session", *map(str, words)])
     if result.exception is not None and not isinstance(result.exception, SystemExit):
         raise result.exception
@@ -62,7 +62,7 @@ def drives(tmp_path_factory):
     return root
 
 
-def test_anchors_take_their_part_of_the_map_along(drives):
+def test_anchors_move_their_part_of_the_map(drives):
     arrays = SessionFolder(drives / "a").read_state()
     T = se2_to_se3(np.array([3.0, -2.0, 1.2]))
     places = {a: T @ place for a, place in zip(arrays["anchor_id"].tolist(), arrays["anchor_T_map"])}
@@ -72,8 +72,8 @@ def test_anchors_take_their_part_of_the_map_along(drives):
     assert summary_of(moved) == summary_of(arrays)
 
 
-def test_two_drives_become_one_map_that_goes_on(drives, tmp_path):
-    """Both halves of the path render; a mapper resumes with all keyframes, mends the seam and learns on."""
+def test_two_drives_become_one_map_that_can_be_resumed(drives, tmp_path):
+    """Both halves of the path render; a mapper resumes with all keyframes, closes the gap between the maps and continues."""
     x, y, yaw = 0.4, -0.3, np.degrees(0.5)
     out = run("merge", drives / "a", drives / "b", "--out", tmp_path / "c", "--place", f"{x},{y},{yaw}")
     assert "10 keyframes" in out
@@ -117,7 +117,7 @@ def test_merging_refuses_what_cannot_be_merged(drives, tmp_path):
     assert not (tmp_path / "c" / "session.json").exists()
 
 
-def test_pruning_leaves_what_is_seen(drives, tmp_path):
+def test_pruning_keeps_the_visible_map(drives, tmp_path):
     arrays = SessionFolder(drives / "a").read_state()
     out = pruned(arrays, 0.3, 3)
     assert len(out["keyframe_id"]) == 3
@@ -135,7 +135,7 @@ def test_pruning_leaves_what_is_seen(drives, tmp_path):
     node.close()
 
 
-# --- the robot's half ---
+# --- the robot half ---
 
 
 @pytest.fixture(scope="module")
@@ -167,7 +167,7 @@ def copies(lidar_maps, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_second_drive_finds_its_place_in_the_first_and_closes_loops_with_it(lidar_maps, tmp_path):
+def test_a_second_drive_is_aligned_to_the_first_and_closes_loops_with_it(lidar_maps, tmp_path):
     a, b = copies(lidar_maps, tmp_path)
     true = se2.between(lidar_maps[0][1], lidar_maps[1][1])
     found = find_alignment(a, b)
@@ -192,7 +192,7 @@ def test_a_second_drive_finds_its_place_in_the_first_and_closes_loops_with_it(li
 
 
 @pytest.mark.slow
-def test_a_map_of_somewhere_else_is_not_placed(lidar_maps, tmp_path):
+def test_a_map_of_another_place_is_not_aligned(lidar_maps, tmp_path):
     a, _ = copies(lidar_maps, tmp_path)
     lidar, slam = RayCastLidar(seed=9), LidarSlam(LidarSlamSettings(), np.eye(4))
     walls = np.array([[0, 0, 14, 0], [14, 0, 14, 1.7], [14, 1.7, 0, 1.7], [0, 1.7, 0, 0]], float)
@@ -206,8 +206,8 @@ def test_a_map_of_somewhere_else_is_not_placed(lidar_maps, tmp_path):
 
 
 @pytest.mark.slow
-def test_halves_join_where_the_robot_says_and_merge_by_their_scans(lidar_maps, tmp_path):
-    """Keyframes of the room hang on submaps of the flat: what is looked at is where they end up."""
+def test_halves_join_at_the_robots_anchors_and_merge_by_their_scans(lidar_maps, tmp_path):
+    """Keyframes of the room are anchored to submaps of the flat; the test checks their final poses."""
     for seed, (name, (slam, _)) in enumerate(zip("ab", lidar_maps), start=1):
         slam.save(tmp_path / f"robot_{name}")
         node = make_node(tmp_path / name)

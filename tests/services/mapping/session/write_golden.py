@@ -1,4 +1,4 @@
-"""Writes a small session of the present format, once, when its version is released."""
+"""Write a small session of the current format; run once when a version is released."""
 
 import json
 
@@ -27,7 +27,7 @@ def small(number):
 
 
 def write(version, paged):
-    """Two keyframes; `paged`: all Gaussians that fit into a cube lie on the disk."""
+    """Two keyframes; `paged`: all Gaussians smaller than a cell are on disk."""
     folder = GOLDEN / f"session-{version}"
     if folder.exists():
         return

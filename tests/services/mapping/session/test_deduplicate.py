@@ -1,4 +1,4 @@
-"""Two maps of one room merged: doubled surfaces go where they are worse, what only one map has stays."""
+"""Merge of two maps of one room: the worse of two duplicate surfaces is removed, all other surfaces are kept."""
 
 import numpy as np
 import pytest
@@ -43,7 +43,7 @@ def place_of(arrays):
     return np.round(arrays["store_params"][1] / 3.0).astype(int)
 
 
-def test_the_worse_of_two_surfaces_goes_and_what_only_one_map_has_stays(galleries):
+def test_the_worse_of_two_duplicates_is_removed_and_other_surfaces_are_kept(galleries):
     good, bad, opened = galleries
     both, second = joined(good, bad)
     stay = without_duplicates(both, second, opened)
@@ -56,14 +56,14 @@ def test_the_worse_of_two_surfaces_goes_and_what_only_one_map_has_stays(gallerie
     assert with_gaussians(both, stay)["store_params"].shape[1] == stay.sum()
 
 
-def test_which_map_comes_first_does_not_matter(galleries):
+def test_the_order_of_the_maps_does_not_matter(galleries):
     good, bad, opened = galleries
     both, second = joined(good, bad)
     flipped, first = without_duplicates(both, second, opened), without_duplicates(both, ~second, opened)
     np.testing.assert_array_equal(flipped, first)
 
 
-def test_keyframes_that_cannot_be_opened_have_no_say(galleries):
+def test_keyframes_that_cannot_be_decoded_are_skipped(galleries):
     good, bad, _ = galleries
     both, second = joined(good, bad)
 

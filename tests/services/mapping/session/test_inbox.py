@@ -1,4 +1,4 @@
-"""What has arrived at a mapper is on its disk, whatever becomes of the mapper before its turn."""
+"""Received keyframes are on the mapper's disk before they are processed, also if the mapper is killed."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ from tests.services.mapping.session.maps import SECOND, handle, make_node, messa
 
 
 def arrive(node, keyframe):
-    """The statuses that are answered at once."""
+    """Return the acknowledgements that are sent on arrival."""
     return [m.status for _, m in node.handle_arrival("keyframes/frame", keyframe)]
 
 
@@ -27,7 +27,7 @@ def ids(node):
     return sorted(node._mapper.keyframes)
 
 
-def test_an_arrived_keyframe_is_answered_once_and_survives_a_mapper_that_never_came_to_it(tmp_path):
+def test_a_received_keyframe_is_acknowledged_once_and_survives_a_killed_mapper(tmp_path):
     node = make_node(tmp_path / "s")
     assert arrive(node, message(0)) == arrive(node, message(1)) == ["ok"]
     assert arrive(node, message(1)) == ["ok"]  # sent again before its turn
@@ -40,7 +40,7 @@ def test_an_arrived_keyframe_is_answered_once_and_survives_a_mapper_that_never_c
     again.close()
 
 
-def test_one_that_is_refused_at_its_turn_is_answered_again_and_leaves_the_disk(tmp_path):
+def test_a_keyframe_refused_later_is_answered_again_and_removed_from_disk(tmp_path):
     node = make_node(tmp_path / "s")
     everything_moves = mask_to_png(np.zeros((r.HEIGHT, r.WIDTH), bool))
     empty = message(0).model_copy(update={"mask_png": everything_moves})
@@ -52,11 +52,11 @@ def test_one_that_is_refused_at_its_turn_is_answered_again_and_leaves_the_disk(t
     node.close()
 
 
-def test_what_the_mailbox_had_no_room_for_is_taken_in_from_the_disk(tmp_path):
+def test_keyframes_dropped_by_the_mailbox_are_read_from_disk(tmp_path):
     node = make_node(tmp_path / "s")
     for number in range(5):
         arrive(node, message(number))
-    handle(node, "keyframes/frame", message(3))  # 0 to 2 had no turn
+    handle(node, "keyframes/frame", message(3))  # 0 to 2 were dropped by the mailbox
     assert ids(node) == [message(3).id]
     sent = handle(node, "tick", Tick(stamp_ns=r.T0 + 9 * SECOND, count=1))
     assert ids(node) == [message(0).id, message(3).id]
@@ -65,19 +65,19 @@ def test_what_the_mailbox_had_no_room_for_is_taken_in_from_the_disk(tmp_path):
     node.close()
 
 
-def test_a_keyframe_that_the_disk_does_not_take_waits_for_its_turn(tmp_path):
-    keeper = Checkpointer(tmp_path / "s", 10**9)
-    arrivals = Inbox(keeper)
-    keeper.folder.keyframes.rmdir()
-    keeper.folder.keyframes.write_text("no folder any more")
-    assert not arrivals.accept(1, False, lambda: ("s", b"x"))
-    assert len(arrivals) == 0
-    assert not arrivals.start(1)
-    assert keeper.status_text(Mapper()).startswith("NOT SAVED")
-    keeper.close()
+def test_a_keyframe_that_cannot_be_written_is_not_acknowledged(tmp_path):
+    checkpointer = Checkpointer(tmp_path / "s", 10**9)
+    inbox = Inbox(checkpointer)
+    checkpointer.folder.keyframes.rmdir()
+    checkpointer.folder.keyframes.write_text("no folder any more")
+    assert not inbox.accept(1, False, lambda: ("s", b"x"))
+    assert len(inbox) == 0
+    assert not inbox.start(1)
+    assert checkpointer.status_text(Mapper()).startswith("NOT SAVED")
+    checkpointer.close()
 
 
-def test_a_mapper_that_is_killed_before_every_checkpoint_still_comes_to_one(tmp_path):
+def test_a_mapper_that_crashes_repeatedly_still_writes_a_checkpoint(tmp_path):
     folder = SessionFolder(tmp_path / "s")
     for number in range(4):
         node = make_node(tmp_path / "s", session_every_s=2.5)
@@ -88,7 +88,7 @@ def test_a_mapper_that_is_killed_before_every_checkpoint_still_comes_to_one(tmp_
     assert folder.manifest()["keyframes"] == 4
 
 
-def test_a_hand_over_that_the_disk_refuses_leaves_the_map_with_its_mapper(tmp_path):
+def test_a_hand_over_that_cannot_be_written_leaves_the_map_with_its_mapper(tmp_path):
     """What common/control.py does next: the mapper goes on as it was, and may hand over later."""
     node, edge = make_node(tmp_path / "s"), tmp_path / "s" / "edge"
     handle(node, "keyframes/frame", message(0))
@@ -108,7 +108,7 @@ def test_a_hand_over_that_the_disk_refuses_leaves_the_map_with_its_mapper(tmp_pa
     again.close()
 
 
-def test_answers_do_not_wait_for_a_slow_mapper(tmp_path):
+def test_acknowledgements_do_not_wait_for_a_slow_mapper(tmp_path):
     """Three seconds a keyframe, one every quarter of a second: all are answered before the second is mapped."""
     heard = []
     mapper = MappingNode(
