@@ -1,4 +1,4 @@
-"""A node that hears of its own output: it ends all the same, in both runners, and hears every answer."""
+"""A node with feedback of its own output ends in both runners, and handles all feedback."""
 
 import threading
 import time
@@ -14,6 +14,7 @@ from beamsplat.common.runtime.mailbox import NO_PRODUCER, Envelope, Mailbox
 from beamsplat.common.runtime.node import Input, Node, merged_topics
 from beamsplat.common.zenoh.bus import open_router
 from tests.common.nodes import SensorSource, SensorSourceConfig
+from tests.common.polling import wait_until
 
 CAMERA = CameraModel(
     width_px=4, height_px=4, fx_px=4.0, fy_px=4.0, cx_px=2.0, cy_px=2.0, T_body_camera=np.eye(4)
@@ -21,15 +22,15 @@ CAMERA = CameraModel(
 BYTES = np.zeros(1, np.uint8)
 
 
-class Asks(Node):
-    """A keyframe for every scan; counts the answers."""
+class Requester(Node):
+    """Publishes a keyframe for every scan; collects the acknowledgements."""
 
     name = "keyframes"
     inputs = ("lidar/scan", Input("keyframes/ack", feedback=True))
     outputs = ("keyframes/frame",)
 
     def configure(self):
-        self.heard, self.order = [], []
+        self.acknowledged, self.order = [], []
 
     def on_lidar_scan(self, scan):
         self.order.append("scan")
@@ -42,11 +43,11 @@ class Asks(Node):
 
     def on_keyframes_ack(self, ack):
         self.order.append("ack")
-        self.heard.append(ack.id)
+        self.acknowledged.append(ack.id)
         return iter(())
 
 
-class Answers(Node):
+class Responder(Node):
     name = "mapping"
     inputs = ("keyframes/frame",)
     outputs = ("keyframes/ack",)
@@ -62,29 +63,29 @@ class Answers(Node):
         return ()
 
 
-def _drive(**change):
+def _sensors(**change):
     return SensorSource(SensorSourceConfig(seconds=2.0, images=False, **change))
 
 
 def test_in_lockstep_a_loop_of_two_nodes_ends():
-    asks, answers = Asks(Asks.Config()), Answers(Answers.Config())
-    Lockstep([_drive(), asks, answers]).run()
-    assert answers.ended
-    assert len(asks.heard) == 20
-    assert asks.order[:4] == ["scan", "ack", "scan", "ack"]
+    requester, responder = Requester(Requester.Config()), Responder(Responder.Config())
+    Lockstep([_sensors(), requester, responder]).run()
+    assert responder.ended
+    assert len(requester.acknowledged) == 20
+    assert requester.order[:4] == ["scan", "ack", "scan", "ack"]
 
 
-def test_an_answer_after_the_end_is_still_heard():
-    """The slow mapper answers when the keyframes' own input has ended long ago."""
-    asks, answers = Asks(Asks.Config()), Answers(Answers.Config(step_cost_s=5.0))
-    Lockstep([_drive(), asks, answers]).run()
-    assert answers.ended
-    assert len(asks.heard) == 20
-    assert asks.order[-15:] == ["ack"] * 15
+def test_feedback_after_the_end_is_still_handled():
+    """The slow mapper acknowledges long after the inputs of the keyframes node have ended."""
+    requester, responder = Requester(Requester.Config()), Responder(Responder.Config(step_cost_s=5.0))
+    Lockstep([_sensors(), requester, responder]).run()
+    assert responder.ended
+    assert len(requester.acknowledged) == 20
+    assert requester.order[-15:] == ["ack"] * 15
 
 
 def test_live_a_loop_of_two_nodes_ends(tmp_path, free_endpoint):
-    nodes = [Asks(Asks.Config()), Answers(Answers.Config())]
+    nodes = [Requester(Requester.Config()), Responder(Responder.Config())]
     settings = {
         "robot": "test",
         "endpoints": (free_endpoint,),
@@ -92,31 +93,30 @@ def test_live_a_loop_of_two_nodes_ends(tmp_path, free_endpoint):
         "exit_when_drained": True,
     }
     with open_router((free_endpoint,)):
-        # Who asks stays when it has ended, as processes do: the last answers come after.
-        asking = Live(nodes[0], LiveSettings(**{**settings, "exit_when_drained": False}))
+        # The requester's process stays after its inputs have ended: the last acknowledgements arrive later.
+        requesting = Live(nodes[0], LiveSettings(**{**settings, "exit_when_drained": False}))
         lives = [Live(nodes[1], LiveSettings(**settings))]
         everyone = frozenset({"keyframes", "mapping"})
-        lives.append(Live(_drive(), LiveSettings(**settings, rate=4.0, wait_for=everyone)))
-        threads = [threading.Thread(target=live.run, daemon=True) for live in (*lives, asking)]
+        lives.append(Live(_sensors(), LiveSettings(**settings, rate=4.0, wait_for=everyone)))
+        threads = [threading.Thread(target=live.run, daemon=True) for live in (*lives, requesting)]
         for thread in threads:
             thread.start()
         deadline = time.monotonic() + 30.0
         for thread in threads[:-1]:
             thread.join(max(deadline - time.monotonic(), 0.0))
-        assert not any(thread.is_alive() for thread in threads[:-1]), "the loop waits for itself"
-        while len(nodes[0].heard) < 20 and time.monotonic() < deadline:
-            time.sleep(0.05)
-        asking.stop()
+        assert not any(thread.is_alive() for thread in threads[:-1]), "the nodes wait for each other"
+        wait_until(lambda: len(nodes[0].acknowledged) == 20, 30.0)
+        requesting.stop()
         threads[-1].join(10.0)
     assert nodes[1].ended
-    assert len(nodes[0].heard) == 20
+    assert len(nodes[0].acknowledged) == 20
 
 
 @pytest.mark.parametrize("delivery", [None, "latest"])
 def test_feedback_is_neither_merged_nor_waited_for(delivery):
     node = type(
         "Hears",
-        (Asks,),
+        (Requester,),
         {"name": "keyframes", "inputs": ("lidar/scan", Input("keyframes/ack", delivery, feedback=True))},
     )
     assert merged_topics(node) == ("lidar/scan",)
@@ -136,8 +136,8 @@ def test_feedback_is_neither_merged_nor_waited_for(delivery):
 
 
 def test_a_node_without_other_inputs_than_feedback_does_not_end_by_itself():
-    mailbox = Mailbox(Asks)
+    mailbox = Mailbox(Requester)
     mailbox.end("keyframes/ack", "cd" * 8, 0)
     assert not mailbox.ended
     mailbox.end("lidar/scan", NO_PRODUCER, 0)
-    assert not mailbox.ended  # nobody feeds it at all: it waits, as every node does
+    assert not mailbox.ended  # no producer at all: it waits, as every node does

@@ -1,4 +1,4 @@
-"""What `top` and the page show of nodes: rates between reports, silence, restarts, and who takes what."""
+"""Health records: rates between reports, silent nodes, restarts, and consumers of a topic."""
 
 import pytest
 
@@ -20,39 +20,39 @@ def report(node, instance, *, received=0, sent=0, state="active"):
 
 
 def test_rates_are_changes_of_counters_over_the_last_seconds():
-    book = HealthRecords()
+    records = HealthRecords()
     for second in range(10):  # 10 Hz at first, 20 Hz for the last five seconds
         received = 10 * second if second < 5 else 50 + 20 * (second - 5)
-        book.add(report("localization", "a", received=received, sent=received // 2), float(second))
-    totals = book.records["localization"].totals()
+        records.add(report("localization", "a", received=received, sent=received // 2), float(second))
+    totals = records.records["localization"].totals()
     assert totals.in_hz == pytest.approx(18.0)  # from 4 s to 9 s
     assert totals.out_hz == pytest.approx(9.0)
     assert (totals.dropped, totals.lost, totals.bad, totals.age_ms) == (2, 3, 9, 80.0)
-    (flow,) = [f for f in book.traffic() if f.topic == "localization/odometry"]
-    assert flow.producer == "localization"
-    assert flow.hz == pytest.approx(9.0)
-    assert flow.bytes_s == pytest.approx(900.0)
-    assert flow.consumers == ()
+    (traffic,) = [t for t in records.traffic() if t.topic == "localization/odometry"]
+    assert traffic.producer == "localization"
+    assert traffic.hz == pytest.approx(9.0)
+    assert traffic.bytes_s == pytest.approx(900.0)
+    assert traffic.consumers == ()
 
 
-def test_a_restart_is_counted_and_begins_new_rates():
-    book = HealthRecords()
-    book.add(report("localization", "a", received=1000), 0.0)
-    book.add(report("localization", "b", received=0), 1.0)
-    book.add(report("localization", "b", received=10), 2.0)
-    assert book.records["localization"].starts == 2
-    assert book.records["localization"].totals().in_hz == pytest.approx(10.0)  # not minus 495
+def test_a_restart_is_counted_and_starts_new_rates():
+    records = HealthRecords()
+    records.add(report("localization", "a", received=1000), 0.0)
+    records.add(report("localization", "b", received=0), 1.0)
+    records.add(report("localization", "b", received=10), 2.0)
+    assert records.records["localization"].starts == 2
+    assert records.records["localization"].totals().in_hz == pytest.approx(10.0)  # not minus 495
 
 
-def test_who_says_nothing_is_silent_and_said_what_it_was_before():
-    book = HealthRecords()
-    book.add(report("localization", "a", state="drained"), 10.0)
-    assert book.states(10.0 + STALE_S - 0.1) == {"localization": "drained"}
-    assert book.states(10.0 + STALE_S + 0.1) == {"localization": "silent"}
-    assert book.records["localization"].silent_s(20.0) == pytest.approx(10.0)
+def test_a_node_without_reports_becomes_silent():
+    records = HealthRecords()
+    records.add(report("localization", "a", state="drained"), 10.0)
+    assert records.states(10.0 + STALE_S - 0.1) == {"localization": "drained"}
+    assert records.states(10.0 + STALE_S + 0.1) == {"localization": "silent"}
+    assert records.records["localization"].silent_s(20.0) == pytest.approx(10.0)
 
 
 def test_one_report_has_no_rate():
-    book = HealthRecords()
-    book.add(report("localization", "a", received=500), 0.0)
-    assert book.records["localization"].totals().in_hz == 0.0
+    records = HealthRecords()
+    records.add(report("localization", "a", received=500), 0.0)
+    assert records.records["localization"].totals().in_hz == 0.0

@@ -1,4 +1,4 @@
-"""Lockstep: the same bytes every time, drops included."""
+"""The lockstep runner: the same messages every time, including the dropped ones."""
 
 import hashlib
 
@@ -10,14 +10,14 @@ from tests.common.nodes import Chain, SensorSource, SensorSourceConfig, Sink, Sl
 
 
 def _run(*nodes):
-    digest, letters = hashlib.sha256(), []
+    digest, envelopes = hashlib.sha256(), []
 
-    def on_message(letter):
-        digest.update(letter.topic.encode() + encode(letter.message))
-        letters.append(letter)
+    def on_message(envelope):
+        digest.update(envelope.topic.encode() + encode(envelope.message))
+        envelopes.append(envelope)
 
     mailboxes = Lockstep(list(nodes), on_message).run()
-    return digest.hexdigest(), letters, mailboxes
+    return digest.hexdigest(), envelopes, mailboxes
 
 
 def test_the_same_input_gives_the_same_bytes():
@@ -27,12 +27,12 @@ def test_the_same_input_gives_the_same_bytes():
     assert runs[0][0] == runs[1][0]
     other = _run(SensorSource(SensorSourceConfig(seed=1)), Chain(Chain.Config()), Sink(Sink.Config()))
     assert other[0] != runs[0][0]
-    topics = [letter.topic for letter in runs[0][1]]
+    topics = [envelope.topic for envelope in runs[0][1]]
     assert topics.count("localization/odometry") == 30
-    assert topics.count("localization/correction") > 2  # the background jobs came back, all of them
+    assert topics.count("localization/correction") > 2  # results of the background jobs
 
 
-def test_modelled_cost_drops_what_is_latest_and_always_the_same():
+def test_modelled_cost_drops_latest_messages_reproducibly():
     runs = []
     for _ in range(2):
         slow, sink = Slow(SlowConfig(step_cost_s=0.2)), Sink(Sink.Config())
@@ -40,15 +40,15 @@ def test_modelled_cost_drops_what_is_latest_and_always_the_same():
     assert runs[0][0] == runs[1][0]
     count = runs[0][2]["localization"].counts["camera/image"]
     assert count.received + count.dropped == 90
-    assert count.dropped > 60  # 30 Hz of pictures, at most 5 of them a second, beside the scans
+    assert count.dropped > 60  # 30 Hz of images, of which at most 5 per second are handled
     assert runs[0][2]["localization"].counts["lidar/scan"].dropped == 0
 
 
 def test_no_cost_drops_nothing():
     slow = Slow(SlowConfig())
-    _, letters, mailboxes = _run(SensorSource(SensorSourceConfig()), slow, Sink(Sink.Config()))
+    _, envelopes, mailboxes = _run(SensorSource(SensorSourceConfig()), slow, Sink(Sink.Config()))
     assert mailboxes["localization"].counts["camera/image"].dropped == 0
-    assert sum(letter.topic == "localization/grid" for letter in letters) == 90
+    assert sum(envelope.topic == "localization/grid" for envelope in envelopes) == 90
 
 
 def test_messages_reach_a_node_in_order_of_their_stamps():
@@ -84,6 +84,6 @@ def test_all_nodes_are_closed_when_one_cannot_be_configured():
     assert closed == ["sink"]
 
 
-def test_a_topic_nobody_produces_is_not_waited_for():
-    letters = _run(SensorSource(SensorSourceConfig(scans=False)), Chain(Chain.Config()))[1]
-    assert sum(letter.topic == "wheel/odometry" for letter in letters) == 150
+def test_a_topic_without_a_producer_is_not_waited_for():
+    envelopes = _run(SensorSource(SensorSourceConfig(scans=False)), Chain(Chain.Config()))[1]
+    assert sum(envelope.topic == "wheel/odometry" for envelope in envelopes) == 150

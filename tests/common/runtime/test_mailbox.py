@@ -1,4 +1,4 @@
-"""What waits for a node: ends, gaps and bounds."""
+"""The mailbox: end of stream, gaps in the sequence, limits of the queues."""
 
 import numpy as np
 
@@ -31,8 +31,8 @@ def _ended_mailbox():
     return mailbox
 
 
-def test_a_straggler_is_handed_out_and_the_end_stands():
-    """Recovery may bring a message after its producer's end was believed: the stream must still end."""
+def test_a_message_after_the_end_of_its_stream_is_delivered_and_the_stream_stays_ended():
+    """Recovery can deliver a message after the end-of-stream time-out: the stream must still end."""
     mailbox = _ended_mailbox()
     mailbox.put(_scan(1))
     assert not mailbox.ended
@@ -40,15 +40,15 @@ def test_a_straggler_is_handed_out_and_the_end_stands():
     assert mailbox.ended
 
 
-def test_a_successor_reopens_what_had_ended():
+def test_a_successor_reopens_an_ended_stream():
     mailbox = _ended_mailbox()
     mailbox.put(_scan(0, instance=SECOND, epoch=2))
-    mailbox.end("lidar/scan", FIRST, 1)  # the predecessor's word counts no longer
+    mailbox.end("lidar/scan", FIRST, 1)  # an end marker of the predecessor is ignored
     assert mailbox.pop() is not None
     assert not mailbox.ended
 
 
-def test_an_absurd_sequence_number_can_still_be_reported():
+def test_a_count_beyond_int64_is_reported_as_the_largest_int64():
     mailbox = Mailbox(Chain)
     for sequence in (0, 2**64 - 1):
         mailbox.put(_scan(sequence))
@@ -57,13 +57,13 @@ def test_an_absurd_sequence_number_can_still_be_reported():
 
 
 class Small(Slow):
-    """Lets little wait."""
+    """A node with a small queue."""
 
     name = "localization"
     inputs = (Input("lidar/scan", "every", queued_bytes=10_000),)
 
 
-def test_what_waits_is_bounded_in_bytes():
+def test_a_queue_is_limited_in_bytes():
     mailbox = Mailbox(Small)
     for sequence in range(100):
         mailbox.put(_scan(sequence, size_bytes=1000))
@@ -75,7 +75,7 @@ def test_what_waits_is_bounded_in_bytes():
     assert mailbox.counts["lidar/scan"].dropped == 90
 
 
-def test_what_never_came_before_the_end_counts_as_lost():
+def test_messages_missing_at_the_end_of_a_stream_are_lost():
     mailbox = Mailbox(Chain)
     mailbox.end("lidar/scan", "ab" * 8, 1, sent=3)
     assert mailbox.counts["lidar/scan"].lost == 3

@@ -1,4 +1,4 @@
-"""A node that is misspelt fails when it is defined; one that writes what it must not, when it does."""
+"""Errors in a node class are raised at its definition, undeclared outputs when they are published."""
 
 import numpy as np
 import pytest
@@ -12,17 +12,17 @@ from tests.common.nodes import Chain, Slow
 
 def test_a_missing_handler_fails_at_definition():
     with pytest.raises(TypeError, match="on_lidar_scan"):
-        type("Deaf", (Node,), {"name": "localization", "inputs": ("lidar/scan",)})
+        type("WithoutHandler", (Node,), {"name": "localization", "inputs": ("lidar/scan",)})
 
 
 def test_an_unknown_topic_fails_at_definition():
     with pytest.raises(KeyError, match="there is no topic 'lidar/scans'"):
-        type("Typo", (Node,), {"name": "localization", "outputs": ("lidar/scans",)})
+        type("Misspelt", (Node,), {"name": "localization", "outputs": ("lidar/scans",)})
 
 
 def test_a_foreign_topic_fails_at_definition():
     with pytest.raises(TypeError, match="whose producers are"):
-        type("Thief", (Node,), {"name": "localization", "outputs": ("camera/image",)})
+        type("ForeignOutput", (Node,), {"name": "localization", "outputs": ("camera/image",)})
 
 
 def _node(handler):
@@ -43,20 +43,23 @@ def _node(handler):
 
 
 @pytest.mark.parametrize(
-    ("output", "complaint"),
+    ("output", "error"),
     [
         (("localization/correction", Correction(stamp_ns=0, T_map_odom=np.eye(4))), "not among its outputs"),
-        (("localization/odometry", Correction(stamp_ns=0, T_map_odom=np.eye(4))), "published a Correction on"),
+        (
+            ("localization/odometry", Correction(stamp_ns=0, T_map_odom=np.eye(4))),
+            "published a Correction on",
+        ),
         (Job("dig", lambda: None), "no method on_job_dig"),
     ],
 )
-def test_undeclared_outputs_raise(output, complaint):
+def test_undeclared_outputs_raise(output, error):
     pose = ExternalPose(stamp_ns=0, T_map_body=np.eye(4))
-    with pytest.raises(UndeclaredOutput, match=complaint):
+    with pytest.raises(UndeclaredOutput, match=error):
         list(_node(output).handle("external/pose", pose))
 
 
-def test_merged_inputs_are_the_ones_that_must_not_be_lost():
+def test_merged_inputs_are_those_of_delivery_every():
     assert merged_topics(Chain) == ("wheel/odometry", "lidar/scan")
     assert merged_topics(Slow) == ("lidar/scan",)
     assert Chain.queries() == ("count",)
@@ -71,7 +74,7 @@ def test_topic_rows_are_consistent():
         )
 
 
-def test_only_who_asks_for_it_is_told_the_health_of_others():
+def test_only_nodes_with_on_health_receive_health_reports():
     assert not Chain.watches_health()
     watcher = type("Watcher", (Node,), {"name": "monitor", "on_health": lambda self, health: None})
     assert watcher.watches_health()

@@ -1,4 +1,4 @@
-"""A restarted replay goes on where its predecessor died: neither earlier, nor later, nor after a pause."""
+"""A restarted replay continues at the stored position, without a pause; the token bucket."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ SECOND_NS = 1_000_000_000
 
 
 class Player(Node):
-    """The calibration first, then 100 poses at 10 Hz."""
+    """Publishes the calibration, then 100 poses at 10 Hz."""
 
     name = "replay"
     outputs = ("rig", "external/pose")
@@ -27,7 +27,7 @@ class Player(Node):
 
 
 class FakePublication:
-    """Keeps what is put; the node is stopped at `last`."""
+    """Collects the messages; stops the node at `last`."""
 
     def __init__(self, topic, live, sent, last):
         self.row = TOPICS[topic]
@@ -52,9 +52,9 @@ def play(tmp_path):
     return run
 
 
-def test_it_goes_on_where_it_was_without_a_pause(play):
+def test_a_restarted_replay_continues_without_a_pause(play):
     assert len(play(resume=False, last=49)[0]) == 51
-    # At the speed of the drive, 5 s lie between the calibration, said once more, and the next pose.
+    # In real time, 5 s pass between the calibration, which is published again, and the next pose.
     slept = []
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("beamsplat.common.runtime.live.time.sleep", slept.append)
@@ -62,31 +62,34 @@ def test_it_goes_on_where_it_was_without_a_pause(play):
     assert [stamp for topic, stamp in sent if topic == "external/pose"] == [50]
     assert sent[0][0] == "rig"
     assert slept == []
-    assert play(resume=True, last=51)[0][-1] == ("external/pose", 51)  # the calibration moved no bookmark
+    assert play(resume=True, last=51)[0][-1] == (
+        "external/pose",
+        51,
+    )  # the repeated calibration did not move the position
 
 
-def test_a_new_run_forgets_the_place_of_an_earlier_one(play, monkeypatch):
+def test_a_new_run_starts_at_the_beginning(play, monkeypatch):
     live = play(resume=False, last=49)[1]
 
-    def dies(endpoints, *rest, **options):
+    def fails(endpoints, *rest, **options):
         raise UserError("no router")
 
-    monkeypatch.setattr("beamsplat.common.runtime.live.open_session", dies)
-    with pytest.raises(UserError):  # the new run: killed before its first message
+    monkeypatch.setattr("beamsplat.common.runtime.live.open_session", fails)
+    with pytest.raises(UserError):  # the new run ends before its first message
         Live(live.running.node, live.running.settings).run()
     assert ("external/pose", 1) in play(resume=True)[0]
 
 
-def test_what_has_ended_is_not_played_again(play):
+def test_a_finished_replay_is_not_repeated(play):
     play(resume=False)[1]._bookmark.finish()
     assert play(resume=True)[0] == [("rig", SECOND_NS)]
 
 
-def test_an_allowance_lets_a_burst_through_and_then_its_rate():
+def test_a_token_bucket_allows_a_burst_and_then_its_rate():
     now = [0.0]
-    allowance = TokenBucket(10.0, lambda: now[0])
-    assert [allowance.take() for _ in range(25)].count(True) == 20
+    bucket = TokenBucket(10.0, lambda: now[0])
+    assert [bucket.take() for _ in range(25)].count(True) == 20
     now[0] = 1.05
-    assert [allowance.take() for _ in range(25)].count(True) == 10
+    assert [bucket.take() for _ in range(25)].count(True) == 10
     now[0] = 100.0
-    assert [allowance.take() for _ in range(25)].count(True) == 20
+    assert [bucket.take() for _ in range(25)].count(True) == 20

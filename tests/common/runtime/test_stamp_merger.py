@@ -1,4 +1,4 @@
-"""Streams merge by stamp whatever the order of arrival."""
+"""Merging by stamp does not depend on the order of arrival."""
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -19,7 +19,7 @@ stamps = st.lists(st.integers(0, 400_000_000), unique=True, max_size=20).map(sor
 @given(a=stamps, b=stamps, arrivals=st.randoms(use_true_random=False))
 @settings(max_examples=200, deadline=None)
 def test_any_interleaving_of_arrivals_gives_the_same_order(a, b, arrivals):
-    """Both streams keep their own order; how they interleave on the way must not matter."""
+    """Each stream keeps its own order; how their arrivals interleave must not matter."""
     queues = {"a": list(a), "b": list(b)}
     merger, out = StampMerger(("a", "b")), []
     while any(queues.values()):
@@ -42,12 +42,12 @@ def test_nothing_is_released_before_it_is_certain():
     merger.put("b", 100, "b100")
     assert merger.pop() is None
     merger.put("a", 90, "a90")
-    assert _drain(merger) == [("a", "a90")]  # b100 waits: an a95 could come
+    assert _drain(merger) == [("a", "a90")]  # b100 is held: a message a95 could still arrive
     merger.put("a", 110, "a110")
     assert _drain(merger) == [("b", "b100")]
 
 
-def test_a_silent_stream_is_given_up_and_taken_back():
+def test_a_silent_stream_times_out_until_its_next_message():
     merger = StampMerger(("a", "b"))
     merger.put("a", 0, "a0")
     merger.put("b", 0, "b0")
@@ -55,22 +55,22 @@ def test_a_silent_stream_is_given_up_and_taken_back():
     merger.put("b", TIMEOUT_NS, "b1")
     assert merger.pop() is None
     merger.put("b", TIMEOUT_NS + 1, "b2")
-    assert _drain(merger) == [("b", "b1"), ("b", "b2")]  # a has been silent for too long
+    assert _drain(merger) == [("b", "b1"), ("b", "b2")]  # a has timed out
     merger.put("a", TIMEOUT_NS - 5, "late")
     assert _drain(merger) == [("a", "late")]
     assert merger.late == 1
     merger.put("b", TIMEOUT_NS + 3, "b3")
-    assert merger.pop() is None  # a speaks again, and is waited for again
+    assert merger.pop() is None  # a is waited for again
 
 
-def test_a_stream_that_never_spoke_is_given_up_as_well():
+def test_a_stream_without_any_message_times_out():
     merger = StampMerger(("a", "b"))
     for i in range(8):
         merger.put("b", i * 100_000_000, i)
     assert [item for _, item in _drain(merger)] == list(range(8))
 
 
-def test_equal_stamps_go_by_row():
+def test_equal_stamps_are_ordered_by_stream():
     merger = StampMerger(("a", "b"))
     merger.put("b", 5, "b")
     merger.put("a", 5, "a")
@@ -81,9 +81,9 @@ def test_equal_stamps_go_by_row():
 
 @given(a=stamps, b=stamps, arrivals=st.randoms(use_true_random=False))
 @settings(max_examples=100, deadline=None)
-def test_a_stream_late_on_its_way_is_waited_for_by_the_clock(a, b, arrivals):
-    """However far one stream runs ahead of the other in a burst, live gives the order of the stamps."""
-    queues = {"a": [10 * s for s in a], "b": [10 * s for s in b]}  # gaps far beyond the patience
+def test_with_a_clock_delayed_messages_are_waited_for(a, b, arrivals):
+    """With a clock, the order is that of the stamps, however far one stream is ahead in a burst."""
+    queues = {"a": [10 * s for s in a], "b": [10 * s for s in b]}  # gaps far beyond the time-out
     expected = sorted((s, n) for n, queue in queues.items() for s in queue)
     merger, out = StampMerger(("a", "b"), clock_ns=lambda: 0), []
     while any(queues.values()):
@@ -100,7 +100,7 @@ def test_a_stream_late_on_its_way_is_waited_for_by_the_clock(a, b, arrivals):
     assert merger.late == 0
 
 
-def test_by_the_clock_a_silent_stream_is_given_up_as_well():
+def test_with_a_clock_a_silent_stream_times_out():
     now_ns = 0
     merger = StampMerger(("a", "b"), clock_ns=lambda: now_ns)
     for i in range(8):
@@ -113,7 +113,7 @@ def test_by_the_clock_a_silent_stream_is_given_up_as_well():
 
 
 def _both(merger, start_ns, count=10):
-    """Two streams 10 Hz apart by 1 ns, the younger one arriving first; what comes out."""
+    """Return the merged order of two 10 Hz streams 1 ns apart, of which the newer arrives first."""
     out = []
     for i in range(count):
         for name, stamp_ns in (("b", start_ns + i * 100_000_000 + 1), ("a", start_ns + i * 100_000_000)):
@@ -122,7 +122,7 @@ def _both(merger, start_ns, count=10):
     return out
 
 
-def test_after_a_clock_was_set_back_streams_merge_as_before():
+def test_streams_merge_in_order_after_their_clock_was_set_back():
     merger = StampMerger(("a", "b"))
     _both(merger, 1_000_000_000_000)
     after = _both(merger, 10_000_000_000)
@@ -131,7 +131,7 @@ def test_after_a_clock_was_set_back_streams_merge_as_before():
     assert settled == sorted(settled)
 
 
-def test_one_absurd_stamp_does_not_end_the_merging():
+def test_merging_continues_after_one_wrong_stamp():
     merger = StampMerger(("a", "b"))
     _both(merger, 0)
     merger.put("a", 2**62, (2**62, "a"))
