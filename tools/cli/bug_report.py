@@ -51,10 +51,10 @@ def _health(deployment: Deployment) -> dict[str, Any]:
     from beamsplat.common.security.logins import OPERATOR, login_of
     from beamsplat.common.zenoh.bus import open_session
     from beamsplat.tools.system.bug_report import HEALTH_S
-    from beamsplat.tools.system.health_table import HealthBoard
+    from beamsplat.tools.system.health_table import HealthTable
 
     login = login_of(deployment.security, OPERATOR)
     with open_session(deployment.router.listen, 0.5, login=login) as session:
-        board = HealthBoard(session, deployment.robot)
+        board = HealthTable(session, deployment.robot)
         time.sleep(HEALTH_S)
         return board.snapshot()

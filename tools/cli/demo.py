@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 DEPLOYMENT = shipped_file("demo.toml")
 console = Console(stderr=True)
-_CORES_OF_OTHERS = 0.4  # taken by other programs: figures suffer, which is said
+_CORES_OF_OTHERS = 0.4  # used by other programs: beyond that a note says that the figures suffer
 SHOWN = (
     ("keyframes", "keyframes", 0, ""), ("gaussians", "Gaussians", 0, ""),
     ("psnr_keyframes_db", "PSNR at keyframes", 1, " dB"), ("psnr_offpath_db", "off the path", 1, " dB"),
@@ -55,7 +55,7 @@ def demo(
     ] = None,
     memory: MemoryOption = None,
 ) -> None:
-    """Simulates a drive through a furnished home, runs the system on it live, watches and records it.
+    """Simulate a drive through a furnished home, run the system on it live, and record it.
 
     Examples:
 
@@ -98,29 +98,29 @@ def demo(
     run_checked(deployment, monitor=monitor)
     costs = seen_by[0].costs
     others_s = _busy_s() - busy_s - costs.startup_cpu_s - sum(costs.cpu_s.values())
-    console.print("the drive has ended; writing the report")
+    console.print("the recording has ended; writing the report")
     figures = write_results(out, source, seen_by[0].record, costs)
     _say_where(out, source, figures)
     cores = others_s / (time.monotonic() - began)
     if cores > _CORES_OF_OTHERS:
         console.print(
             f"Other programs took {cores:.1f} of {os.cpu_count()} CPU cores meanwhile: on an idle machine "
-            "more pictures get through, sooner, and the map is better."
+            "more images are processed, with less delay, and the map is better."
         )
 
 
 def _busy_s() -> float:
-    """CPU seconds that this machine has spent on anything."""
+    """Return the CPU time that this machine has used since it started, s."""
     times = psutil.cpu_times()
     return sum(times) - times.idle - getattr(times, "iowait", 0.0) - getattr(times, "guest", 0.0)
 
 
 def _simulated(out: Path, seconds: float) -> Path:
-    """The bag of a drive simulated into `out`, made anew only if its length differs."""
+    """Return the bag of a simulated drive in `out`; it is simulated once per length."""
     from beamsplat.tools.cli.simulate import simulate
 
     folder = out / f"simulated-{seconds:g}s"
-    if not folder.exists():  # the simulator leaves a whole folder or none
+    if not folder.exists():  # the simulator writes a complete folder or none
         simulate(folder, seconds=seconds)
     return folder / "bag"
 
@@ -136,10 +136,10 @@ def _truth_stamps(source: Path) -> frozenset[int]:
 
 
 def write_results(out: Path, source: Path, record: RunRecord, costs: RunCosts) -> dict[str, Any]:
-    """trajectory.tum, and where there were pictures: map.png, report.html, report.json. Gives the figures.
+    """Write trajectory.tum and, if there were images, map.png, report.html, report.json; return the figures.
 
-    Errors are against the recording's own truth (groundtruth.txt beside the bag, or poses in it); without
-    one they are left out.
+    Errors are computed against the recording's own ground truth (groundtruth.txt beside the bag, or poses in
+    it); without one they are left out.
     """
     import cv2
     import numpy as np
@@ -176,13 +176,16 @@ def write_results(out: Path, source: Path, record: RunRecord, costs: RunCosts) -
 def _say_where(out: Path, source: Path, figures: dict[str, Any]) -> None:
     rows = [
         (source, "the drive: camera, lidar, wheels"),
-        (out / "report.html", "what came of it: open it in a browser"),
+        (out / "report.html", "the results: open it in a browser"),
         (out / "map" / "splats.ply", "the map: opens in viewers of 3D Gaussian splats"),
         (out / "map.png", "the map from above"),
-        (out / "trajectory.tum", "where the robot was"),
-        (out / "session", "the map to go on with, export, render: beamsplat session info, export, render"),
-        (out / "demo.rrd", "what the monitor saw: rerun FILE"),
-        (out / "recording", "what went over the bus: Foxglove, `ros2 bag`, beamsplat info"),
+        (out / "trajectory.tum", "the trajectory of the robot"),
+        (
+            out / "session",
+            "the saved map, to continue, export or render: beamsplat session info, export, render",
+        ),
+        (out / "demo.rrd", "the view of the monitor: rerun FILE"),
+        (out / "recording", "all messages: Foxglove, `ros2 bag`, beamsplat info"),
     ]
     there = [(str(path), what) for path, what in rows if path.exists()]  # no camera, no map
     wide = max(len(path) for path, _ in there)

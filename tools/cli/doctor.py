@@ -1,4 +1,4 @@
-"""`beamsplat doctor`: what this machine lacks, and the remedy for each fault."""
+"""The command `beamsplat doctor`: what this machine lacks, and how to correct it."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ def _gpu() -> Iterator[Finding]:
 
 def _deployment(deployment: Deployment) -> Iterator[Finding]:
     """Report what the deployment names and this machine lacks: rig, keys, models, data, own classes."""
-    from beamsplat.tools.system.assembly import faults, unusable
+    from beamsplat.tools.system.assembly import faults, missing_resources
 
     found = faults(deployment)
     required = [fault for fault in found if "is required" in fault.text]  # to be given with --set
@@ -115,7 +115,7 @@ def _deployment(deployment: Deployment) -> Iterator[Finding]:
     named = tuple(n for n in deployment.nodes if not any(f"node {n!r}" in f.text for f in required))
     if wrong:
         return
-    missing = unusable(deployment, ("router", *named))
+    missing = missing_resources(deployment, ("router", *named))
     for fault in missing:
         yield Finding("deployment", "fault", fault.text, "correct it in the file, or with --set")
     if deployment.nodes and not found and not missing:
@@ -130,7 +130,7 @@ def _router(deployment: Deployment) -> Iterator[Finding]:
 
     running = False
     for endpoint in sorted(deployment.router.listen, key=lambda e: not is_loopback(e)):
-        if running:  # whose other doors are open, too
+        if running:  # it listens at the other endpoints too
             continue
         try:
             login = login_of(deployment.security, OPERATOR)
@@ -158,7 +158,7 @@ def _router(deployment: Deployment) -> Iterator[Finding]:
 def _shared_memory() -> Iterator[Finding]:
     shm = Path("/dev/shm")
     if not shm.is_dir() or not os.access(shm, os.W_OK):
-        yield Finding("shared memory", "fault", "/dev/shm is not writable: pictures go the slow way",
+        yield Finding("shared memory", "fault", "/dev/shm is not writable: images are sent more slowly",
                       "mount -t tmpfs tmpfs /dev/shm, or give the container --shm-size=512m")  # fmt: skip
         return
     free_mb = shutil.disk_usage(shm).free / 1e6
@@ -203,9 +203,9 @@ def _models() -> Iterator[Finding]:
 
 
 def congestion(algorithm: str) -> Finding:
-    """What this host's TCP does on a radio that loses packets; `algorithm` as the kernel names it."""
+    """Return a finding about TCP on lossy radio links; `algorithm` is the kernel's congestion control."""
     if algorithm == "bbr":
-        return Finding("uplink", "ok", "TCP takes lost packets for what they are (bbr)")
+        return Finding("uplink", "ok", "TCP keeps its rate when packets are lost (bbr)")
     return Finding("uplink", "note", f"TCP is {algorithm}: where 1 % is lost, it uses a sixth of 20 Mbit/s",
                    "sysctl -w net.ipv4.tcp_congestion_control=bbr, see docs/deploy.md")  # fmt: skip
 
@@ -257,7 +257,7 @@ def doctor(
         findings = examine(deployment)
     table = Table(pad_edge=False)
     for heading in ("", "what", "found", "remedy"):
-        table.add_column(heading, overflow="fold")  # a path that is cut helps nobody
+        table.add_column(heading, overflow="fold")  # paths must not be truncated
     mark = {"ok": "[green]ok[/]", "note": "[yellow]note[/]", "fault": "[red]FAULT[/]"}
     for finding in findings:
         if not (brief and finding.verdict == "ok"):

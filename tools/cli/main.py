@@ -99,7 +99,7 @@ def _root(
 
 
 def main() -> None:
-    """Entry point: bad input is one sentence and exit code 2, not a traceback."""
+    """Run the command line; a UserError is printed as one sentence, exit code 2."""
     try:
         with missing_packages_explained(f"beamsplat {' '.join(sys.argv[1:2])}".strip()):
             app()

@@ -1,4 +1,4 @@
-"""`--memory 1GB`: the mapper's budget as people say it."""
+"""The option `--memory 1GB`: the mapper's memory budget."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ _MB = {"MB": 1.0, "GB": 1e3, "MIB": 2**20 / 1e6, "GIB": 2**30 / 1e6}
 
 MemoryOption = Annotated[
     str | None,
-    typer.Option("--memory", metavar="1GB", help="What the mapper may take; more of its map rests on disk"),
+    typer.Option("--memory", metavar="1GB", help="Memory of the mapper; the rest of its map is kept on disk"),
 ]
 
 
 def memory_overrides(text: str | None) -> tuple[str, ...]:
-    """The override of a deployment that `--memory TEXT` stands for; none without.
+    """Return the overrides of a deployment that `--memory TEXT` stands for; none for None.
 
     Raises:
-        UserError: it is no size.
+        UserError: the text is not a size.
     """
     if text is None:
         return ()

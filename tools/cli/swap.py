@@ -17,15 +17,15 @@ app = typer.Typer(no_args_is_help=True, help="Options of the nodes of a running 
 FileArgument = Annotated[Path, typer.Argument(help="Deployment file of the running system")]
 NodeArgument = Annotated[str, typer.Argument(help="Name of the node")]
 ColdOption = Annotated[
-    bool, typer.Option("--cold", help="End the node first: for those whose knowledge lives in their process")
+    bool, typer.Option("--cold", help="Stop the node first: for nodes that cannot hand over their state")
 ]
 FileSetOption = Annotated[
     list[str] | None,
     typer.Option(
-        "--set", metavar="OPTION=VALUE", help="Override of the file that `run` was given, as router.listen"
+        "--set", metavar="OPTION=VALUE", help="Override that `run` was given, such as router.listen"
     ),
 ]
-_PATIENCE_S = 150.0  # loading a model takes its time
+_PATIENCE_S = 150.0  # loading a model can take minutes
 
 
 def _ask(
@@ -63,10 +63,10 @@ def swap(
     ] = None,
     cold: ColdOption = False,
 ) -> None:
-    """Puts another process, with other options, in a node's place while the system runs.
+    """Replace a node by a process with other options while the system runs.
 
-    The successor loads and warms up beside it, then takes over between two messages: nothing is said twice,
-    and nothing is lost. What has changed lasts until the system is stopped.
+    The successor loads beside the node, then takes over between two messages: no message is published twice,
+    and none is lost. The changes last until the system is stopped.
 
     Examples:
 
@@ -79,7 +79,7 @@ def swap(
 
 @app.command()
 def get(file: FileArgument, node: NodeArgument, overrides: FileSetOption = None) -> None:
-    """The options of a running node, defaults included, as JSON.
+    """Print the options of a running node, defaults included, as JSON.
 
     Example: beamsplat params get deploy/robot.toml depth
     """
@@ -94,7 +94,7 @@ def set_params(
     cold: ColdOption = False,
     overrides: FileSetOption = None,
 ) -> None:
-    """Changes options of a running node, by a successor that takes over: `beamsplat swap` in other words.
+    """Change options of a running node by a successor that takes over, as `beamsplat swap` does.
 
     Example: beamsplat params set deploy/robot.toml depth floor_known=false
     """

@@ -21,7 +21,7 @@ from beamsplat.tools.cli.memory_option import MemoryOption, memory_overrides
 from beamsplat.tools.cli.options import writable
 
 if TYPE_CHECKING:
-    from beamsplat.tools.system.health_table import HealthBoard
+    from beamsplat.tools.system.health_table import HealthTable
     from beamsplat.tools.system.supervisor import Supervisor
 
 FileArgument = Annotated[Path, typer.Argument(help="Deployment file (TOML), for example deploy/demo.toml")]
@@ -38,21 +38,21 @@ def _load(file: Path, overrides: list[str] | None) -> Deployment:
 
 
 def _say(text: str, style: str | None = None) -> None:
-    """Prints text as it is: what stands in brackets is no markup."""
+    """Print text without interpreting brackets as markup."""
     console.print(text, style=style, markup=False, highlight=False, soft_wrap=True)
 
 
 def check(file: FileArgument, set_: SetOption = None) -> None:
-    """Says whether a deployment would run, and what is wrong if not.
+    """Check whether a deployment can run here, and report every error.
 
     Example: beamsplat check deploy/demo.toml
     """
-    from beamsplat.tools.system.assembly import faults, unusable
+    from beamsplat.tools.system.assembly import faults, missing_resources
 
     deployment = _load(file, set_)
     found = faults(deployment)
     if not any(fault.fatal for fault in found):
-        found += unusable(deployment)
+        found += missing_resources(deployment)
     for fault in found:
         _say(f"{file}: {fault.text}", "red" if fault.fatal else "yellow")
     if any(fault.fatal for fault in found):
@@ -61,10 +61,10 @@ def check(file: FileArgument, set_: SetOption = None) -> None:
 
 
 def _checked(deployment: Deployment, names: tuple[str, ...] | None = None) -> Deployment:
-    from beamsplat.tools.system.assembly import faults, unusable
+    from beamsplat.tools.system.assembly import faults, missing_resources
 
     fatal = [fault.text for fault in faults(deployment) if fault.fatal]
-    fatal = fatal or [fault.text for fault in unusable(deployment, names)]
+    fatal = fatal or [fault.text for fault in missing_resources(deployment, names)]
     if fatal:
         raise UserError("; ".join(fatal))
     return deployment
@@ -79,9 +79,9 @@ def run(
     ] = None,
     memory: MemoryOption = None,
 ) -> None:
-    """Runs a deployment: a router and one supervised process per node.
+    """Run a deployment: a router and one supervised process per node.
 
-    Ends when recorded data ends, or with Ctrl-C. Logs lie under the robot's state folder.
+    Ends at the end of recorded data, or with Ctrl-C. Logs are written to the robot's state folder.
 
     Examples:
 
@@ -103,14 +103,14 @@ class RunMonitor(Protocol):
     def poll(self) -> None:
         """Called several times per second."""
 
-    def finish(self, board: HealthBoard, drained: bool) -> Any:
+    def finish(self, board: HealthTable, drained: bool) -> Any:
         """Called once, before the processes are stopped."""
 
 
 class _Display:
     """The state of a run on standard error: a live table in a terminal, else a line every few seconds."""
 
-    def __init__(self, board: HealthBoard) -> None:
+    def __init__(self, board: HealthTable) -> None:
         self._board = board
         self._screen = Screen(console=console, refresh_per_second=2) if sys.stderr.isatty() else None
         self._began = self._written = time.monotonic()
@@ -159,7 +159,7 @@ def run_checked(
     from beamsplat.common.security.logins import SUPERVISOR, login_of
     from beamsplat.common.zenoh.bus import open_session
     from beamsplat.tools.system.commands import Commands
-    from beamsplat.tools.system.health_table import HealthBoard
+    from beamsplat.tools.system.health_table import HealthTable
     from beamsplat.tools.system.supervisor import Supervisor
 
     for number in (signal.SIGTERM, signal.SIGHUP):  # stop the children in order, as Ctrl-C does
@@ -175,7 +175,7 @@ def run_checked(
         _say(f"robot {deployment.robot}: logs in {supervisor.log_dir}")
         login = login_of(deployment.security, SUPERVISOR)
         with open_session(deployment.router.listen, login=login) as session:
-            board = HealthBoard(session, deployment.robot)
+            board = HealthTable(session, deployment.robot)
             observer = monitor(supervisor) if monitor is not None else None
             commands = Commands(session, deployment.robot, supervisor)
             drained = False
@@ -185,7 +185,7 @@ def run_checked(
                     supervisor.poll()
                     if observer is not None:
                         observer.poll()
-                    commands.attend()
+                    commands.answer_pending()
                     display.update()
                     nodes = [c for c in supervisor.children.values() if c.name != "router"]
                     for entry in supervisor.children.values():
@@ -204,7 +204,7 @@ def serve(
     node: Annotated[str, typer.Argument(help="Name of the node, or `router`")],
     set_: SetOption = None,
 ) -> None:
-    """Runs one node in this process, without supervision (for debuggers, systemd, containers).
+    """Run one node in this process, without supervision (for debuggers, systemd, containers).
 
     Example: beamsplat serve deploy/robot.toml localization
     """
@@ -222,9 +222,9 @@ def serve(
 
 
 def router_config(file: FileArgument, set_: SetOption = None) -> None:
-    """Prints the configuration of a deployment's router for `zenohd -c`, to run that in its place.
+    """Print the configuration of a deployment's router for `zenohd -c`, to run that instead.
 
-    The policy is as it is now: after `beamsplat keys issue` or `remove`, print it again.
+    It contains the present policy: print it again after `beamsplat keys issue` or `remove`.
 
     Example: beamsplat router-config deploy/edge.toml > router.json5
     """
@@ -241,7 +241,7 @@ def offline(
     set_: SetOption = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the summary as one JSON object")] = False,
 ) -> None:
-    """Runs a deployment in lockstep: one thread, no bus, as fast as possible, reproducible.
+    """Run a deployment in lockstep: one thread, no bus, as fast as possible, reproducible.
 
     The same input gives the same bytes: summary.json holds a SHA-256 over all messages.
 
@@ -267,7 +267,7 @@ def record(
     out: Annotated[Path, typer.Option(callback=writable, help="Folder of the recording to write")],
     set_: SetOption = None,
 ) -> None:
-    """Records the topics of a running deployment to MCAP, until Ctrl-C or the end of the data.
+    """Record the topics of a running deployment to MCAP, until Ctrl-C or the end of the data.
 
     Example: beamsplat record deploy/robot.toml --out drive1
     """

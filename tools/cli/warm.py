@@ -1,4 +1,4 @@
-"""Compiles the numeric kernels once, into the cache beside their sources: no service does it later."""
+"""Compilation of the numeric kernels into the cache beside their sources, before services need them."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ WARMERS = (
 
 
 def warm() -> None:
-    """Compiles all kernels into their cache, so that no service starts cold (about a minute, once).
+    """Compile all numeric kernels into their cache, so that services start fast (about a minute, once).
 
     Example: beamsplat warm
     """

@@ -17,14 +17,14 @@ from beamsplat.common.config.deployment import load_deployment
 from beamsplat.tools.cli.system import FileArgument, SetOption
 
 if TYPE_CHECKING:
-    from beamsplat.tools.system.health_table import HealthBoard
+    from beamsplat.tools.system.health_table import HealthTable
 
 SecondsOption = Annotated[float | None, typer.Option(min=0.0, help="Stop after this long; default: Ctrl-C")]
 SNAPSHOT_S = 3.0  # nodes report once per second, and a rate needs two reports
 
 
 @contextlib.contextmanager
-def _board(file: Path, overrides: list[str] | None, every_robot: bool) -> Iterator[HealthBoard]:
+def _board(file: Path, overrides: list[str] | None, every_robot: bool) -> Iterator[HealthTable]:
     """Open the health of a running system.
 
     Raises:
@@ -32,15 +32,15 @@ def _board(file: Path, overrides: list[str] | None, every_robot: bool) -> Iterat
     """
     from beamsplat.common.security.logins import OPERATOR, login_of
     from beamsplat.common.zenoh.bus import open_session
-    from beamsplat.tools.system.health_table import ALL, HealthBoard
+    from beamsplat.tools.system.health_table import ALL, HealthTable
 
     deployment = load_deployment(file, tuple(overrides or ()))
     login = login_of(deployment.security, OPERATOR)
     with open_session(deployment.router.listen, 2.0, login=login) as session:
-        yield HealthBoard(session, ALL if every_robot else deployment.robot)
+        yield HealthTable(session, ALL if every_robot else deployment.robot)
 
 
-def _watch(board: HealthBoard, table: str, seconds: float | None) -> None:
+def _watch(board: HealthTable, table: str, seconds: float | None) -> None:
     draw = getattr(board, table)
     deadline = time.monotonic() + (seconds if seconds is not None else 1e12)
     with Screen(console=Console(), refresh_per_second=2) as screen, contextlib.suppress(KeyboardInterrupt):
@@ -54,7 +54,7 @@ def top(
     seconds: SecondsOption = None,
     set_: SetOption = None,
     every_robot: Annotated[
-        bool, typer.Option("--all", help="Of every robot that this router hears of")
+        bool, typer.Option("--all", help="Nodes of all robots that this router reaches")
     ] = False,
     as_json: Annotated[
         bool,

@@ -19,7 +19,7 @@ from beamsplat.common.runtime.mailbox import Envelope
 from beamsplat.common.runtime.node import Input
 from beamsplat.common.topics import topic
 from beamsplat.common.zenoh.bus import Bus, open_session
-from beamsplat.tools.system.health_table import HealthBoard
+from beamsplat.tools.system.health_table import HealthTable
 from beamsplat.tools.system.supervisor import Supervisor
 
 TOPICS = (
@@ -184,7 +184,7 @@ class RunObserver:
         self.costs.wall_s = time.monotonic() - self._started
         self.costs.cpu_s, self.costs.peak_rss_mb = self._meter.since_mark(), self._meter.peak_rss_mb
 
-    def finish(self, board: HealthBoard, drained: bool) -> tuple[RunRecord, RunCosts]:
+    def finish(self, board: HealthTable, drained: bool) -> tuple[RunRecord, RunCosts]:
         """Receive outstanding messages, take over the nodes' counters, and disconnect from the bus."""
         self.costs.drained = drained
         for name, record in board.records.items():
@@ -213,7 +213,7 @@ def run_live(
         open_session(deployment.router.listen) as board_session,
     ):
         observer = RunObserver(supervisor, deployment, keep_depth_at)
-        board = HealthBoard(board_session, deployment.robot)
+        board = HealthTable(board_session, deployment.robot)
         deadline = time.monotonic() + longest_s
         drained = False
         while not drained and time.monotonic() < deadline:

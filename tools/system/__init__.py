@@ -1,1 +1,1 @@
-"""The run-time system: deployments checked and assembled, processes supervised, handed over, watched."""
+"""The run-time system: checking of deployments, supervision of processes, hand-over, health."""

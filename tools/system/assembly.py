@@ -1,4 +1,4 @@
-"""From a deployment file to nodes: what would run, and whether it fits together."""
+"""Nodes of a deployment: their classes and options, and whether they fit together."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ RESERVED = ("router", *ADMIN_USERS)  # users and processes of a running system t
 
 @dataclass(frozen=True)
 class Fault:
-    """Something wrong in a deployment. Fatal ones keep it from running."""
+    """An error in a deployment; it cannot run if `fatal`."""
 
     text: str
     fatal: bool = True
 
 
 def build_node(deployment: Deployment, name: str, table: dict[str, Service] = NODES) -> Node:
-    """The node called `name` as this deployment configures it.
+    """Return the node called `name` with the options of the deployment.
 
     Raises:
         UserError: not in the deployment, or not in the process list, or wrong options.
@@ -55,7 +55,7 @@ def _service(deployment: Deployment, name: str, table: dict[str, Service]) -> Se
 
 
 def node_classes(deployment: Deployment, table: dict[str, Service] = NODES) -> dict[str, type[Node]]:
-    """The class of each node of a deployment, by name; options other than `kind` are not looked at."""
+    """Return the class of each node of a deployment by name; options other than `kind` are not checked."""
     return {
         name: node_class_of(_service(deployment, name, table), options)
         for name, options in deployment.nodes.items()
@@ -63,7 +63,7 @@ def node_classes(deployment: Deployment, table: dict[str, Service] = NODES) -> d
 
 
 def faults(deployment: Deployment, table: dict[str, Service] = NODES) -> list[Fault]:
-    """What is wrong with a deployment; empty if it would run."""
+    """Return the errors of a deployment: unknown nodes, invalid options, topics without one producer."""
     found: list[Fault] = []
     classes: dict[str, type[Node]] = {}
     for name in deployment.nodes:
@@ -75,14 +75,16 @@ def faults(deployment: Deployment, table: dict[str, Service] = NODES) -> list[Fa
     for name, node_class in classes.items():
         for topic in node_class.outputs:
             producers[topic].append(name)
-    for topic in _from_afar(deployment.role):
+    for topic in _uplink_topics(deployment.role):
         producers[topic].append("the uplink")
     for topic, names in producers.items():
         if len(names) > 1:
-            found.append(Fault(f"{topic} would be written by {' and '.join(names)}: keep one of them"))
+            found.append(
+                Fault(f"{topic} would be published by {' and '.join(names)}: only one may publish it")
+            )
     for name, node_class in classes.items():
         missing = [i.topic for i in node_class.inputs if not producers[i.topic]]
-        whole = len(classes) == len(deployment.nodes)  # else what does not fit may have fed it
+        whole = len(classes) == len(deployment.nodes)  # else the missing producer may be a node with errors
         if whole and missing and len(missing) == len(node_class.inputs):
             found.append(Fault(f"nothing in this deployment feeds {name}: {', '.join(missing)}", fatal=False))
     if deployment.role == "robot" and "uplink" not in deployment.nodes:
@@ -90,10 +92,14 @@ def faults(deployment: Deployment, table: dict[str, Service] = NODES) -> list[Fa
     return found
 
 
-def unusable(
+def missing_resources(
     deployment: Deployment, names: tuple[str, ...] | None = None, table: dict[str, Service] = NODES
 ) -> list[Fault]:
-    """What options of a deployment without faults name and cannot be used, such as missing data."""
+    """Return what a deployment without errors names and this machine lacks, such as files and keys.
+
+    Args:
+        names: nodes, and `router`, that are to run; None checks all.
+    """
     found = []
     for name in names or tuple(deployment.nodes):
         if name in deployment.nodes:
@@ -124,15 +130,15 @@ def _link_faults(deployment: Deployment, names: tuple[str, ...] | None) -> list[
 
 @dataclass(frozen=True)
 class Surroundings:
-    """What a node must know of the others of its deployment."""
+    """What a node needs to know about the other nodes of its deployment."""
 
-    wait_for: frozenset[str]  # a source starts when these are active, so that they miss nothing
-    without_producer: frozenset[str]  # inputs that nobody here produces: they are not waited for
+    wait_for: frozenset[str]  # a source starts when these are active, so that they receive every message
+    without_producer: frozenset[str]  # inputs that no node here produces: the node does not wait for them
 
 
 def surroundings(classes: dict[str, type[Node]], name: str, role: Role = "whole") -> Surroundings:
-    """The surroundings of a node among the classes of its deployment."""
-    fed = {topic for node in classes.values() for topic in node.outputs} | _from_afar(role)
+    """Return the surroundings of the node `name` among the node classes of its deployment."""
+    fed = {topic for node in classes.values() for topic in node.outputs} | _uplink_topics(role)
     listeners = frozenset(other for other, node in classes.items() if node.inputs and other != name)
     return Surroundings(
         wait_for=listeners if classes[name].is_source() and classes[name].outputs else frozenset(),
@@ -140,7 +146,7 @@ def surroundings(classes: dict[str, type[Node]], name: str, role: Role = "whole"
     )
 
 
-def _from_afar(role: Role) -> set[str]:
-    """Topics that come over the uplink: to the edge what goes up, to a robot what comes down."""
+def _uplink_topics(role: Role) -> set[str]:
+    """Return the topics that the uplink delivers: on the edge those sent up, on a robot those sent down."""
     ways = {"whole": (), "robot": ("down",), "edge": ("up", "bulk")}[role]
     return {name for name, row in TOPICS.items() if row.uplink in ways}

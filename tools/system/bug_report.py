@@ -102,7 +102,7 @@ def bundle(
 
     Args:
         findings: returns the doctor's findings, dataclasses.
-        health: returns `HealthBoard.snapshot()` of the running system; raises UserError if none runs.
+        health: returns `HealthTable.snapshot()` of the running system; raises UserError if none runs.
     """
     redactor = Redactor()
     options = redactor.table(deployment.model_dump(mode="json"))

@@ -1,8 +1,8 @@
-"""Requests to a supervisor from the bus, for the nodes that are its own:
+"""Queries that a supervisor answers on the bus, for the nodes that it runs:
 
-query/<node>/restart               ends it, and starts it again
-query/<node>/swap?set=...&cold=    changes options: see `beamsplat.tools.system.swap`
-query/<node>/params                its options as they are, defaults included
+query/<node>/restart               stops it and starts it again
+query/<node>/swap?set=...&cold=    changes its options: see `beamsplat.tools.system.swap`
+query/<node>/params                returns its options, defaults included
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ VERBS = ("restart", "swap", "params")
 
 
 class Commands:
-    """The requests that have come; `attend()` a few times a second, beside `Supervisor.poll()`."""
+    """Answers the queries; call `answer_pending` several times per second, as `Supervisor.poll`."""
 
     def __init__(self, session: zenoh.Session, robot: str, supervisor: Supervisor) -> None:
         self._session, self._supervisor = session, supervisor
@@ -34,14 +34,14 @@ class Commands:
             verb: session.declare_queryable(key(robot, "query", "*", verb), zenoh.handlers.FifoChannel(16))
             for verb in VERBS
         }
-        self._swaps: dict[str, tuple[Swap, zenoh.Query]] = {}  # by node, under way
+        self._swaps: dict[str, tuple[Swap, zenoh.Query]] = {}  # by node, unfinished
 
-    def attend(self) -> None:
-        """Does what was asked for since the last time."""
+    def answer_pending(self) -> None:
+        """Answer the queries received since the last call, and continue swaps."""
         for verb, queryable in self._queryables.items():
             while (query := queryable.try_recv()) is not None:
                 node = str(query.key_expr).split("/")[-2]
-                if node not in self._supervisor.children:  # another host's: its supervisor answers
+                if node not in self._supervisor.children:  # on another host: the supervisor there answers
                     query.drop()
                 elif verb == "swap":
                     self._begin_swap(node, query)
@@ -60,7 +60,7 @@ class Commands:
 
     def _restart(self, node: str) -> Iterator[Answer]:
         self._supervisor.restart(node)
-        yield Answer(stamp_ns=time.time_ns(), text=f"{node} was told to end, and starts again")
+        yield Answer(stamp_ns=time.time_ns(), text=f"{node} is stopped and starts again")
 
     def _params(self, node: str) -> Iterator[Answer]:
         if node == ROUTER:
@@ -77,7 +77,7 @@ class Commands:
             if not (isinstance(overrides, list) and all(isinstance(o, str) for o in overrides)):
                 raise UserError("swap: `set` is a JSON list of OPTION=VALUE")
             successor = self._supervisor.successor(node, tuple(overrides), "cold" not in parameters)
-        except ValueError as error:  # a UserError, or no JSON
+        except ValueError as error:  # a UserError, or invalid JSON
             reply(query, _refuse(error))
             return
         self._swaps[node] = (Swap(self._session, self._supervisor, successor), query)
@@ -85,4 +85,4 @@ class Commands:
 
 def _refuse(error: ValueError) -> Iterator[Answer]:
     raise error
-    yield  # a generator, so that `reply` makes an error reply of it
+    yield  # a generator: `reply` sends the exception as an error reply

@@ -1,4 +1,4 @@
-"""The dataflow as text and as Mermaid, drawn from the topic table and the process list."""
+"""The dataflow of a deployment as text and as a Mermaid flowchart."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ _MARK = {"latest": "newest only", "every": "every one", "latched": "last value"}
 
 
 def edges(classes: dict[str, type[Node]]) -> list[tuple[str, str, str, str]]:
-    """(producer, topic, consumer, delivery) of every connection, in table order."""
+    """Return (producer, topic, consumer, delivery) of every connection, in the order of the topic table."""
     found = []
     for topic in TOPICS:
         for producer, node in classes.items():
@@ -23,7 +23,7 @@ def edges(classes: dict[str, type[Node]]) -> list[tuple[str, str, str, str]]:
 
 
 def as_text(classes: dict[str, type[Node]]) -> str:
-    """One line a topic: producer -> topic -> consumers."""
+    """Return one line per topic: producer -> topic -> consumers."""
     lines = []
     for topic, row in TOPICS.items():
         producers = [name for name, node in classes.items() if topic in node.outputs]
@@ -43,7 +43,7 @@ def as_text(classes: dict[str, type[Node]]) -> str:
 
 
 def as_mermaid(classes: dict[str, type[Node]]) -> str:
-    """A Mermaid flowchart: boxes are processes, arrows are topics, dotted ones carry the newest only."""
+    """Return a Mermaid flowchart: boxes are processes, arrows are topics; dotted arrows drop old messages."""
     lines = ["flowchart LR"]
     lines += [f"    {name}([{name}])" for name in classes]
     joined: dict[tuple[str, str, bool], list[str]] = {}

@@ -1,4 +1,4 @@
-"""The health of all nodes of a robot, collected from the bus and drawn as a table."""
+"""The health of all nodes of a robot, received from the bus and shown as tables."""
 
 from __future__ import annotations
 
@@ -23,9 +23,11 @@ from beamsplat.common.zenoh.streams import decode_sample
 ALL = "*"
 
 
-class HealthBoard:
-    """Listens to health/* in a thread of its own until the session is closed: of one robot, or with `ALL` of
-    every robot, whose nodes then go by robot/node."""
+class HealthTable:
+    """Receives health/* in a thread until the session is closed.
+
+    Of one robot, or of all robots with `ALL`; nodes are then named robot/node.
+    """
 
     def __init__(
         self, session: zenoh.Session, robot: str, clock_s: Callable[[], float] = time.monotonic
@@ -49,7 +51,7 @@ class HealthBoard:
                 return
             try:
                 health = decode_sample(sample, self._row).message
-            except DecodeError:  # another version's health cannot be shown; its node still runs
+            except DecodeError:  # a health message of an incompatible version
                 continue
             if self._all:
                 whose = str(sample.key_expr).split("/")[1]
@@ -58,7 +60,7 @@ class HealthBoard:
                 self._book.add(health, self._clock_s())
 
     def states(self) -> dict[str, str]:
-        """Node -> state, "silent" where nothing was heard lately."""
+        """Return the state of each node by name; "silent" where no report arrived lately."""
         with self._lock:
             return self._book.states(self._clock_s())
 
@@ -118,7 +120,7 @@ class HealthBoard:
         return Group(table, *said)
 
     def topics_table(self) -> Table:
-        """One row a topic that flows: producer, rate, bytes, and who takes it."""
+        """Return one row per published topic: producer, rate, bytes, consumers."""
         table = _narrow_table()
         for heading in ("topic", "from"):
             table.add_column(heading, no_wrap=True)
@@ -154,7 +156,7 @@ def _topic_figures(flow: TopicTraffic) -> dict[str, Any]:
 
 
 def _narrow_table() -> Table:
-    """Both tables fit into 80 columns."""
+    """Return a table without borders: both tables must fit into 80 columns."""
     return Table(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False, padding=0)
 
 

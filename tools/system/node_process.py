@@ -1,4 +1,4 @@
-"""What runs inside a service's process: one node on the bus, or the router."""
+"""The main functions of the processes of a running system: one node on the bus, or the router."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ log = logging.getLogger("beamsplat")
 
 STOP_S = 5.0  # from SIGTERM to SIGKILL
 
-# Two cores are shared by all services: nobody starts a thread per core. Read by OpenMP, BLAS and
+# Two cores are shared by all services: no library may start a thread per core. Read by OpenMP, BLAS and
 # numba when they are first imported, hence set before the fork server starts.
 ONE_THREAD = dict.fromkeys(
     ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1"
@@ -45,9 +45,9 @@ def serve(
     standby: bool = False,
     table: dict[str, Service] = NODES,
 ) -> None:
-    """Runs one node until its inputs end or SIGINT or SIGTERM comes.
+    """Run one node until its inputs end, or SIGINT or SIGTERM arrives.
 
-    A supervisor says what is `around` it; without one, the classes of all nodes are imported to see.
+    Without `around`, the classes of all nodes are imported to determine it.
 
     Raises:
         UserError: wrong options, bad input data, or no router.
@@ -76,8 +76,10 @@ def serve(
 
 
 def route(deployment: Deployment) -> None:
-    """Runs this host's router until SIGINT or SIGTERM comes. A new policy is taken up at once: clients of a
-    router that opens anew are back within a second."""
+    """Run this host's router until SIGINT or SIGTERM arrives.
+
+    When the policy or the certificate changes, the router restarts; clients reconnect within a second.
+    """
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
@@ -91,13 +93,13 @@ def route(deployment: Deployment) -> None:
                 try:
                     read_hosts(security.keys)
                     break
-                except UserError as error:  # being copied, or edited: the old policy stays
+                except UserError as error:  # being copied or edited: keep the old policy
                     policy = _changed_at(security.keys)
                     log.error("the new policy is not taken up: %s", error)
 
 
 def _changed_at(keys: Path | None) -> int:
-    """When the policy in a folder of keys, or the certificate, was last written; 0 where there is none."""
+    """Return the time of the last change of the policy or the certificate in ns; 0 if there is none."""
     if keys is None:
         return 0
     files = [keys.expanduser() / name for name in (HOSTS, CERTIFICATE)]
@@ -114,8 +116,8 @@ def child(
     instance: str = "",
     standby: bool = False,
 ) -> None:
-    """Entry of a supervised process: its output goes to a log file, its end shows in the exit code."""
-    # Ctrl-C in a terminal reaches the whole group; the supervisor decides who stops when.
+    """Main function of a supervised process: writes to a log file; exit code 2 after a UserError."""
+    # Ctrl-C in a terminal is sent to the whole process group; the supervisor stops processes in order.
     os.setpgrp()
     set_process_title(f"beamsplat:{name}")
     with log_file.open("ab", buffering=0) as file:
@@ -143,14 +145,14 @@ def child(
 
 
 def start_logging(level: int = logging.INFO) -> None:
-    """Log lines with time, level and origin on standard error."""
+    """Configure logging: lines with time, level and logger name on standard error."""
     logging.basicConfig(
         level=level, format="%(asctime)s %(levelname)-7s %(name)s: %(message)s", stream=sys.stderr, force=True
     )
 
 
 def _die_with_parent() -> None:
-    """A killed supervisor must not leave a robot's services running unwatched, busy or not."""
+    """Stop this process when its supervisor ends: services must not run unsupervised."""
     parent = parent_process()
     if parent is not None:
         connection.wait([parent.sentinel])
@@ -160,7 +162,7 @@ def _die_with_parent() -> None:
 
 
 def _limit_threads(threads: int) -> None:
-    """Fixed thread counts in what is already imported here."""
+    """Set the thread counts of the libraries that are already imported."""
     if "cv2" in sys.modules:
         sys.modules["cv2"].setNumThreads(threads)
     if "torch" in sys.modules:

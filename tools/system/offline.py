@@ -1,4 +1,4 @@
-"""A whole deployment in lockstep, recorded and hashed."""
+"""Lockstep run of a whole deployment, recorded and hashed."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from beamsplat.common.runtime.registry import Service
 from beamsplat.services.nodes import NODES
 from beamsplat.tools.system.assembly import build_node
 
-# Watching and recording happen around a lockstep run, not inside it.
+# Not part of a lockstep run: it records by itself and has no viewers.
 OUTSIDE = ("monitor", "page", "recorder")
 
 
@@ -33,22 +33,22 @@ class MessageHash:
         self.counts: dict[str, int] = {}
 
     def add(self, envelope: Envelope, payload: bytes) -> None:
-        """Takes one message."""
+        """Add one message."""
         head = f"{envelope.topic} {schema_of(envelope.message)} {envelope.header.sequence} {len(payload)}\n"
         self._all.update(head.encode())
         self._all.update(payload)
         self.counts[envelope.topic] = self.counts.get(envelope.topic, 0) + 1
 
     def hexdigest(self) -> str:
-        """64 hex digits."""
+        """Return the SHA-256 over all messages as 64 hex digits."""
         return self._all.hexdigest()
 
 
 def run_offline(
     deployment: Deployment, out: Path, console: Console, table: dict[str, Service] = NODES
 ) -> dict[str, Any]:
-    """Runs all nodes of a deployment (leave the watching ones out of it); writes `messages` (a recording) and
-    summary.json into `out`, and returns the summary.
+    """Run all nodes of a deployment (without recorder, monitor and page); write `messages` (a recording) and
+    summary.json into `out`, and return the summary.
 
     Raises:
         UserError: options or data that do not fit.

@@ -1,4 +1,4 @@
-"""Starts the router and the nodes of a deployment, restarts what dies, and ends them in order."""
+"""Starts the router and the nodes of a deployment, restarts crashed processes, and stops all in order."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ log = logging.getLogger("beamsplat")
 
 ROUTER = "router"
 BACK_OFF_S = (0.1, 0.5, 1.0, 2.0, 5.0)
-HEALTHY_S = 30.0  # alive for so long, a process earns a fresh back-off
+HEALTHY_S = 30.0  # a process that ran this long starts with the shortest back-off again
 PRELOADED = (
     "numpy",
     "cv2",
@@ -51,24 +51,24 @@ class Child:
     instance: str = ""
     restarts: int = 0
     attempts: int = 0  # within the current back-off
-    due: float | None = None  # dead, to be started again then
-    gave_up: bool = False  # ended with a user error: restarting would not help
-    kill_at: float | None = None  # told to end, to be started again; killed if it has not ended by then
+    due: float | None = None  # time of the next start of a process that has ended
+    gave_up: bool = False  # ended with a UserError: restarting would not help
+    kill_at: float | None = None  # SIGTERM was sent for a restart; SIGKILL follows at this time
 
 
 @dataclass
 class Successor:
-    """What is to take a node's place. Without a process the node ends first."""
+    """The process and options that replace a node. Without a process the node is stopped first."""
 
     name: str
     deployment: Deployment
     process: BaseProcess | None = None
     instance: str = ""
-    hands_over: bool = False  # starts with what its predecessor leaves, and says nothing before
+    hands_over: bool = False  # loads the state that its predecessor saves, and publishes nothing before
 
 
 class Supervisor:
-    """The processes of one deployment. `poll()` a few times a second; use with `with`."""
+    """The processes of one deployment, as a context manager; call `poll` several times per second."""
 
     def __init__(
         self,
@@ -83,7 +83,7 @@ class Supervisor:
         self.children: dict[str, Child] = {}
         self._around: dict[str, Surroundings] = {}
         self._log_start: dict[str, int] = {}  # where the log of the newest process begins, bytes
-        self._retired: list[BaseProcess] = []  # ends by itself
+        self._retired: list[BaseProcess] = []  # replaced processes, which end by themselves
         self.table = table
         self._names = names if names is not None else (ROUTER, *deployment.nodes)
         self._on_event = on_event or (lambda text: log.info("%s", text))
@@ -105,7 +105,7 @@ class Supervisor:
         self.stop()
 
     def _start_all(self) -> None:
-        """The router, then who listens, then who speaks."""
+        """Start the router, then consumers, then sources."""
         if ROUTER in self._names:
             if (folder := self.deployment.security.local) is not None:
                 make_logins(folder, (*self.table, *self.deployment.nodes, SUPERVISOR, OPERATOR))
@@ -143,7 +143,7 @@ class Supervisor:
         raise UserError(f"no router at {', '.join(self.deployment.router.listen)} after 20 s")
 
     def log_file(self, name: str) -> Path:
-        """Where a process writes what it has to say."""
+        """Return the log file of a process."""
         return self.log_dir / f"{name}.log"
 
     def last_error(self, name: str) -> str:
@@ -151,12 +151,12 @@ class Supervisor:
         return last_error(self.log_file(name), self._log_start.get(name, 0))
 
     def _start(self, name: str, resume: bool = False) -> None:
-        self._seat(name, *self._spawn(self.deployment, name, resume))
+        self._set_process(name, *self._spawn(self.deployment, name, resume))
 
     def _spawn(
         self, deployment: Deployment, name: str, resume: bool = False, standby: bool = False
     ) -> tuple[BaseProcess, str]:
-        """A process and the instance it goes by."""
+        """Start a process; return it and its instance id."""
         instance = secrets.token_hex(8)
         log_file = self.log_file(name)
         self._log_start[name] = log_file.stat().st_size if log_file.exists() else 0
@@ -170,7 +170,7 @@ class Supervisor:
         process.start()
         return process, instance
 
-    def _seat(self, name: str, process: BaseProcess, instance: str) -> None:
+    def _set_process(self, name: str, process: BaseProcess, instance: str) -> None:
         known = self.children.get(name)
         if known is None:
             self.children[name] = Child(name, process, time.monotonic(), instance)
@@ -179,15 +179,15 @@ class Supervisor:
             known.due, known.kill_at = None, None
 
     def successor(self, name: str, overrides: tuple[str, ...], warm: bool) -> Successor:
-        """A second process of a node, with other options, in standby: see `beamsplat.tools.system.swap`.
+        """Start a second process of a node with other options, in standby: see `beamsplat.tools.system.swap`.
 
-        Another kind starts from that kind's defaults.
+        Another kind starts with its own default options.
 
         Raises:
             UserError: no such node here, options that do not fit, or a node that cannot run twice.
         """
         before = self.deployment
-        if any(o.partition("=")[0].strip() == "kind" for o in overrides):  # whose options are others
+        if any(o.partition("=")[0].strip() == "kind" for o in overrides):  # its options differ
             before = before.model_copy(update={"nodes": {**before.nodes, name: {}}})
         deployment = with_overrides(before, tuple(f"{name}.{o}" for o in overrides))
         node = build_node(deployment, name, self.table)
@@ -201,26 +201,26 @@ class Supervisor:
         return Successor(name, deployment, *self._spawn(deployment, name, standby=True), node.hands_over)
 
     def replace(self, successor: Successor) -> None:
-        """The successor, which has been activated, is the node now; also when it must be started again."""
+        """Make an activated successor the node; later restarts use its options."""
         self.deployment = successor.deployment
         self._retired.append(self.children[successor.name].process)
-        self._seat(successor.name, successor.process, successor.instance)
+        self._set_process(successor.name, successor.process, successor.instance)
         self._on_event(f"{successor.name} was taken over by its successor")
 
     def restart_with(self, successor: Successor) -> None:
-        """The node ends and starts with the successor's options."""
+        """Restart a node with the successor's options."""
         self.deployment = successor.deployment
         self.restart(successor.name)
 
     def restart(self, name: str) -> None:
-        """Tells a process to end; the next polls see to it that it does, and start it again at once."""
+        """Send SIGTERM to a process; `poll` starts it again when it has ended."""
         entry = self.children[name]
         if entry.process.is_alive() and entry.kill_at is None:
             entry.kill_at = time.monotonic() + STOP_S
             entry.process.terminate()
 
     def poll(self) -> None:
-        """Notices what has died and starts what is due."""
+        """Detect ended processes, and start those whose back-off has passed."""
         now = time.monotonic()
         for entry in self.children.values():
             if entry.due is not None:
@@ -234,9 +234,9 @@ class Supervisor:
                 entry.due = now
                 self._on_event(f"{entry.name} was ended by request; starts again")
             elif not entry.gave_up:
-                self._bury(entry, now)
+                self._handle_exit(entry, now)
 
-    def _bury(self, entry: Child, now: float) -> None:
+    def _handle_exit(self, entry: Child, now: float) -> None:
         code = entry.process.exitcode or 0
         if code == 2:
             entry.gave_up = True
@@ -247,14 +247,14 @@ class Supervisor:
         delay = BACK_OFF_S[min(entry.attempts, len(BACK_OFF_S) - 1)]
         entry.attempts += 1
         entry.due = now + delay
-        # A drained node stays until it is told to go, so exit code 0 means that somebody else told it.
+        # A drained node runs until it is stopped, so with exit code 0 another program has stopped it.
         how = f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
         self._on_event(
             f"{entry.name} died ({how}: {self.last_error(entry.name)}); starts again in {delay:g} s"
         )
 
     def stop(self) -> None:
-        """SIGTERM to the nodes, sources first; then the router; SIGKILL to who does not listen."""
+        """Stop the nodes with SIGTERM, sources first, then the router; SIGKILL after `STOP_S`."""
         nodes = [c for c in self.children.values() if c.name != ROUTER]
         _end(list(reversed(nodes)))
         for process in self._retired:
@@ -271,6 +271,6 @@ def _end(children: list[Child]) -> None:
     for entry in children:
         entry.process.join(max(deadline - time.monotonic(), 0.0))
         if entry.process.is_alive():
-            log.warning("%s does not stop: killed", entry.name)
+            log.warning("%s did not stop within the time limit: killed", entry.name)
             entry.process.kill()
             entry.process.join()

@@ -1,4 +1,4 @@
-"""Swapping a node while the system runs: a successor in standby, then one moment in which it takes over."""
+"""Replacement of a node while the system runs: a successor starts in standby, then takes over."""
 
 from __future__ import annotations
 
@@ -13,42 +13,42 @@ from beamsplat.common.errors import UserError
 from beamsplat.common.zenoh.queries import command
 from beamsplat.tools.system.supervisor import Successor, Supervisor
 
-READY_S = 120.0  # to load a model, and say something
-_WARM_S = 10.0  # to catch up with its predecessor, which may be the faster
+READY_S = 120.0  # limit for loading a model until the first message
+_WARM_S = 10.0  # limit for catching up with the predecessor, which may be faster
 _BEHIND_NS = 100_000_000
-_STEP_S = 20.0  # of the predecessor, between two messages
-_RESUME_S = 120.0  # of the successor, to take up what was left to it
+_STEP_S = 20.0  # limit for the current step of the predecessor
+_RESUME_S = 120.0  # limit for loading the saved state in the successor
 
 
 class Swap:
-    """One swap under way; `poll()` until it gives a sentence. If it fails, the node goes on as it was."""
+    """One swap; call `poll` until it returns a text. If it fails, the node continues unchanged."""
 
     def __init__(self, session: zenoh.Session, supervisor: Supervisor, successor: Successor) -> None:
         self._session, self._supervisor, self.successor = session, supervisor, successor
         self._robot = supervisor.deployment.robot
         self._started = time.monotonic()
         self._configured: float | None = None
-        self._retired = (0.0, 0.0)  # when it was asked to, when it had
+        self._retired = (0.0, 0.0)  # (retirement requested, retired), monotonic clock, s
         self._activation: Future[str] | None = None
 
     def poll(self) -> str | None:
-        """What has come of it, once something has.
+        """Continue the swap; return the result as one sentence when it is done, else None.
 
         Raises:
-            UserError: nothing was changed, and why.
+            UserError: the swap failed; nothing was changed.
         """
         successor, now = self.successor, time.monotonic()
         if self._activation is not None:
             return self._taken_over()
         if successor.process is None:
             self._supervisor.restart_with(successor)
-            return f"{successor.name} was told to end, and starts again with the new options"
+            return f"{successor.name} is stopped, and starts again with the new options"
         try:
             if not successor.process.is_alive():
                 why = self._supervisor.last_error(successor.name)
-                raise UserError(f"{successor.name} goes on as it was: its successor ended: {why}")
+                raise UserError(f"{successor.name} continues unchanged: its successor ended: {why}")
             if now - self._started > READY_S:
-                raise UserError(f"{successor.name} goes on as it was: no successor after {READY_S:g} s")
+                raise UserError(f"{successor.name} continues unchanged: no successor after {READY_S:g} s")
             reached = self._reached(successor.instance)
             if reached is None:
                 return None
@@ -67,7 +67,7 @@ class Swap:
             raise
 
     def _reached(self, instance: str) -> dict[str, int] | None:
-        """How far a process is, by topic; None if it does not answer."""
+        """Return the stamp that a process has reached on each topic, ns; None if it does not answer."""
         try:
             return json.loads(command(self._session, self._robot, instance, "reached", {}, 0.5))
         except UserError:
@@ -79,10 +79,10 @@ class Swap:
         before = self._supervisor.children[name]
         said = command(self._session, self._robot, before.instance, "retire", {}, _STEP_S)
         self._retired = (asked, time.monotonic())
-        # From here on there is no way back: a successor that fails now is started again, as after a crash.
+        # The swap cannot be undone from here: a successor that fails now is restarted, as after a crash.
         self._supervisor.replace(self.successor)
         self._activation = Future()
-        # What was left may take long to take up, and others are to be looked after meanwhile.
+        # In a thread: loading the saved state may take long, and the supervisor must not wait.
         threading.Thread(target=self._activate, args=(said, self._activation), daemon=True).start()
         if not self.successor.hands_over:
             wait([self._activation])
@@ -92,7 +92,7 @@ class Swap:
         who = (self._session, self._robot, self.successor.instance)
         try:
             activation.set_result(command(*who, "activate", {"after": said}, _RESUME_S))
-        except Exception as error:  # raised where the result is asked for
+        except Exception as error:  # raised again by result()
             activation.set_exception(error)
 
     def _taken_over(self) -> str | None:

@@ -7,7 +7,7 @@ import numpy as np
 from beamsplat.common.config.deployment import Deployment, RouterConfig
 from beamsplat.common.runtime.node import Input
 from beamsplat.common.zenoh.bus import Bus, open_session
-from beamsplat.tools.system.health_table import HealthBoard
+from beamsplat.tools.system.health_table import HealthTable
 from beamsplat.tools.system.supervisor import Supervisor
 from tests.services.lidar.devices import EmulatedPort, Ld19
 
@@ -31,7 +31,7 @@ def test_localization_with_a_lidar_on_a_noisy_link(tmp_path, free_endpoint):
         Supervisor(deployment) as supervisor,
         Bus(open_session((free_endpoint,)), "test", "x", "cd" * 8, 1) as bus,
     ):
-        board = HealthBoard(bus.session, "test")
+        board = HealthTable(bus.session, "test")
         bus.subscribe(Input("localization/odometry"), lambda x: poses.append(x.message), lambda *a: None,
                       lambda *a: None)  # fmt: skip
         deadline = time.monotonic() + 60

@@ -96,10 +96,10 @@ def _until_recorded(supervisor, folder):
     import time
 
     from beamsplat.common.zenoh.bus import open_session
-    from beamsplat.tools.system.health_table import HealthBoard
+    from beamsplat.tools.system.health_table import HealthTable
 
     with open_session(supervisor.deployment.router.listen) as session:
-        board = HealthBoard(session, "t")
+        board = HealthTable(session, "t")
         deadline = time.monotonic() + 90
         while board.states().get("recorder") != "drained":
             supervisor.poll()

@@ -14,7 +14,7 @@ from beamsplat.common.errors import UserError
 from beamsplat.common.zenoh.bus import open_session
 from beamsplat.services.monitor.node import MonitorConfig, MonitorNode
 from beamsplat.services.nodes import NODES
-from beamsplat.tools.system.health_table import HealthBoard
+from beamsplat.tools.system.health_table import HealthTable
 from beamsplat.tools.system.supervisor import Supervisor
 from tests.common.nodes import TABLE
 from tests.common.polling import poll
@@ -40,7 +40,7 @@ def system(tmp_path, free_endpoint):
     )
     table = {**TABLE, "monitor": NODES["monitor"]}
     with Supervisor(deployment, table=table) as supervisor, open_session((free_endpoint,)) as session:
-        board = HealthBoard(session, "test")
+        board = HealthTable(session, "test")
         poll(supervisor, lambda: _flows(board), 60)
         yield supervisor, board, tmp_path / "drive.rrd"
 

@@ -14,7 +14,7 @@ from beamsplat.common.config.deployment import Deployment, RouterConfig
 from beamsplat.common.zenoh.bus import open_session
 from beamsplat.services.nodes import NODES
 from beamsplat.tools.system.commands import Commands
-from beamsplat.tools.system.health_table import HealthBoard
+from beamsplat.tools.system.health_table import HealthTable
 from beamsplat.tools.system.supervisor import Supervisor
 from tests.common.polling import poll
 from tests.services.monitor.demo_system import NASTY, TABLE
@@ -35,14 +35,14 @@ class PageSystem:
 
     def __init__(self, supervisor, session, address):
         self.supervisor, self.address = supervisor, address
-        self.board = HealthBoard(session, "test")
+        self.board = HealthTable(session, "test")
         self._commands = Commands(session, "test", supervisor)
         self.supervising = True
 
     def poll(self):
         if self.supervising:
             self.supervisor.poll()
-        self._commands.attend()
+        self._commands.answer_pending()
 
     def pids(self):
         return {name: child.process.pid for name, child in self.supervisor.children.items()}
@@ -185,7 +185,7 @@ def test_commands_need_the_token_in_the_browser(chromium, start):
         page.on("dialog", lambda dialog: dialog.accept())
         page.select_option("#node", "fusion")
         page.click("#restart")
-        poll(system, lambda: "fusion was told to end" in page.inner_text("#answer"), 20)
+        poll(system, lambda: "fusion is stopped" in page.inner_text("#answer"), 20)
         poll(system, lambda: _state(page, "fusion") == "active (start 2)", 30)
         after = system.pids()
         assert {n for n in before if before[n] != after[n]} == {"fusion"}

@@ -12,7 +12,7 @@ import pytest
 from beamsplat.common.config.deployment import Deployment, RouterConfig
 from beamsplat.common.zenoh.bus import open_session
 from beamsplat.services.nodes import NODES
-from beamsplat.tools.system.health_table import HealthBoard
+from beamsplat.tools.system.health_table import HealthTable
 from beamsplat.tools.system.supervisor import Supervisor
 from tests.common.polling import poll
 from tests.services.monitor.demo_system import TABLE
@@ -67,7 +67,7 @@ def test_nine_more_pages_cost_little_cpu(tmp_path, free_endpoint):
     )
     table = {**TABLE, "page": NODES["page"]}
     with Supervisor(deployment, table=table) as supervisor, open_session((free_endpoint,)) as session:
-        board = HealthBoard(session, "test")
+        board = HealthTable(session, "test")
         poll(supervisor, lambda: board.states() == dict.fromkeys(nodes, "active"), 60)
         port = int(re.search(r":(\d+)/", board.records["page"].health.detail)[1])
         process = psutil.Process(supervisor.children["page"].process.pid)

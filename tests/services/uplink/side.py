@@ -22,7 +22,7 @@ from beamsplat.common.messages.header import DecodeError, Header
 from beamsplat.common.topics import topic
 from beamsplat.common.zenoh.bus import key, open_session
 from beamsplat.common.zenoh.streams import declare_subscription, decode_sample
-from beamsplat.tools.system.health_table import HealthBoard
+from beamsplat.tools.system.health_table import HealthTable
 from beamsplat.tools.system.supervisor import Supervisor
 
 HEARD = {
@@ -62,10 +62,10 @@ class MessageLog:
         self._file.flush()
 
 
-class Side:
+class HostCommands:
     """Executes commands on one supervisor."""
 
-    def __init__(self, supervisor: Supervisor, board: HealthBoard) -> None:
+    def __init__(self, supervisor: Supervisor, board: HealthTable) -> None:
         self._supervisor, self._board = supervisor, board
 
     def answer(self, verb: str, name: str) -> dict:
@@ -95,8 +95,8 @@ def main() -> None:
     deployment = Deployment.model_validate_json(Path(sys.argv[1]).read_text())
     log = MessageLog(Path(sys.argv[2]))
     with Supervisor(deployment) as supervisor, open_session(deployment.router.listen[:1]) as session:
-        board = HealthBoard(session, deployment.robot)
-        side = Side(supervisor, board)
+        board = HealthTable(session, deployment.robot)
+        side = HostCommands(supervisor, board)
         kept = [log.listen(session, deployment.robot, name) for name in HEARD[deployment.role]]
         print(json.dumps({"listens": len(kept)}), flush=True)
         while True:

@@ -19,7 +19,7 @@ from beamsplat.services.nodes import NODES
 from beamsplat.services.uplink.node import UplinkConfig, UplinkNode
 from beamsplat.tools.keys.pki import CertificateAuthority
 from beamsplat.tools.system.assembly import faults, surroundings
-from beamsplat.tools.system.health_table import HealthBoard
+from beamsplat.tools.system.health_table import HealthTable
 from beamsplat.tools.system.supervisor import Supervisor
 from tests.common.topic_listener import TopicListener
 from tests.conftest import free_port
@@ -64,7 +64,7 @@ def running(pair):
         for deployment in (pair.edge, pair.robot):
             supervisor = stack.enter_context(Supervisor(deployment, table=TABLE))
             session = stack.enter_context(open_session(deployment.router.listen))
-            made.append((supervisor, session, HealthBoard(session, "r1")))
+            made.append((supervisor, session, HealthTable(session, "r1")))
         yield made[1], made[0]
 
 
@@ -133,7 +133,7 @@ def test_the_robot_starts_without_an_edge_and_a_killed_edge_continues_its_sessio
         Supervisor(pair.robot, table=TABLE) as robot,
         open_session(pair.robot.router.listen) as near,
     ):
-        board = HealthBoard(near, "r1")
+        board = HealthTable(near, "r1")
         sent, answered = TopicListener(near, "keyframes/frame"), TopicListener(near, "keyframes/ack")
         poll((robot,), lambda: len(set(sent.ids())) >= 4, 60)
         assert "no link" in detail(board, "uplink")

@@ -14,7 +14,7 @@ import pytest
 from beamsplat.common.geometry.rig import load_rig
 from beamsplat.common.geometry.transforms import se3_to_se2
 from beamsplat.common.zenoh.bus import open_session
-from beamsplat.tools.system.health_table import HealthBoard
+from beamsplat.tools.system.health_table import HealthTable
 from tests.services.lidar.devices import EmulatedPort
 from tests.tools.setup.emulated_desk import (
     T_BODY_CAMERA,
@@ -110,7 +110,7 @@ def _runs(robot, environment, endpoint):
     )
     try:
         with open_session((endpoint,), wait_s=60.0) as session:
-            board = HealthBoard(session, "robot1")
+            board = HealthTable(session, "robot1")
             wanted = dict.fromkeys(("camera", "lidar", "localization", "depth", "fusion", "page"), "active")
             deadline = time.monotonic() + 90.0
             while not (board.states() == wanted and _sent(board, "localization/odometry") > 10):

@@ -5,13 +5,13 @@ from typer.testing import CliRunner
 
 from beamsplat.common.config.deployment import Deployment
 from beamsplat.tools.cli.main import app
-from beamsplat.tools.system.assembly import faults, unusable
+from beamsplat.tools.system.assembly import faults, missing_resources
 
 
 def fatal(**nodes):
     deployment = Deployment(nodes=nodes)
     assert [fault.text for fault in faults(deployment) if fault.fatal] == []
-    return [fault.text for fault in unusable(deployment)]
+    return [fault.text for fault in missing_resources(deployment)]
 
 
 @pytest.mark.parametrize(
@@ -56,11 +56,11 @@ def test_devices_and_streams_may_be_connected_later():
 def test_missing_keys_of_a_link_to_another_host_are_named(tmp_path):
     uplink = {"uplink": {"edge": "tls/edge.local:7448"}}
     deployment = Deployment(role="robot", nodes=uplink, security={"keys": tmp_path / "keys"})
-    (fault,) = unusable(deployment)
+    (fault,) = missing_resources(deployment)
     assert f"security.keys = {tmp_path / 'keys'}: ca.pem is missing" in fault.text
-    (fault,) = unusable(Deployment(nodes={}, router={"listen": ("tcp/0.0.0.0:7447",)}))
+    (fault,) = missing_resources(Deployment(nodes={}, router={"listen": ("tcp/0.0.0.0:7447",)}))
     assert "leaves this host unprotected" in fault.text
-    assert unusable(deployment, ("localization",)) == []
+    assert missing_resources(deployment, ("localization",)) == []
 
 
 def test_the_command_names_the_file_the_field_and_the_value(tmp_path):

@@ -16,7 +16,7 @@ from beamsplat.common.security.access_control import HostRole
 from beamsplat.common.security.keys import SecurityConfig
 from beamsplat.common.zenoh.bus import open_session
 from beamsplat.tools.keys.pki import CertificateAuthority
-from beamsplat.tools.system.health_table import ALL, HealthBoard
+from beamsplat.tools.system.health_table import ALL, HealthTable
 from beamsplat.tools.system.supervisor import Supervisor
 from tests.conftest import free_port
 from tests.services.uplink.test_uplink import TABLE, poll
@@ -68,7 +68,7 @@ def test_five_robots_on_one_edge_hear_nothing_of_each_other(tmp_path):
             for d in edge
         ]
         session = stack.enter_context(open_session((inner,)))
-        board = HealthBoard(session, ALL)
+        board = HealthTable(session, ALL)
         voices = {name: set() for name in NAMES}  # whose keyframes were heard under a robot's name
 
         def hear(sample):

@@ -4,7 +4,7 @@ from rich.console import Console
 
 from beamsplat.common.messages import Health, InputHealth, OutputHealth
 from beamsplat.common.zenoh.bus import Bus, open_router, open_session
-from beamsplat.tools.system.health_table import ALL, HealthBoard
+from beamsplat.tools.system.health_table import ALL, HealthTable
 from tests.common.polling import wait_until
 
 
@@ -29,7 +29,7 @@ def _health(node, sent, lost=0, state="active", **inputs):
 def test_rates_losses_and_silence_are_shown(free_endpoint):
     with open_router((free_endpoint,)), open_session((free_endpoint,)) as watcher:
         clock_s = [0.0]
-        board = HealthBoard(watcher, "r", lambda: clock_s[0])
+        board = HealthTable(watcher, "r", lambda: clock_s[0])
         sender = Bus(open_session((free_endpoint,)), "r", "replay", "ab" * 8, 1)
         taker = Bus(open_session((free_endpoint,)), "r", "localization", "cd" * 8, 1)
         with sender, taker:
@@ -66,7 +66,7 @@ def test_rates_losses_and_silence_are_shown(free_endpoint):
 
 def test_a_fleet_is_shown_by_robot_and_kept_apart(free_endpoint):
     with open_router((free_endpoint,)), open_session((free_endpoint,)) as watcher:
-        fleet, one = HealthBoard(watcher, ALL), HealthBoard(watcher, "r2")
+        fleet, one = HealthTable(watcher, ALL), HealthTable(watcher, "r2")
         buses = {
             name: Bus(open_session((free_endpoint,)), name, "replay", "ab" * 8, 1)
             for name in ("r1", "r2", "r3")

@@ -20,7 +20,7 @@ from beamsplat.common.zenoh.bus import open_session
 from beamsplat.common.zenoh.streams import decode_sample
 from beamsplat.services.nodes import NODES
 from beamsplat.tools.keys.pki import CertificateAuthority
-from beamsplat.tools.system.health_table import HealthBoard
+from beamsplat.tools.system.health_table import HealthTable
 from beamsplat.tools.system.supervisor import Supervisor
 from tests.conftest import free_port
 from tests.services.uplink.test_uplink import poll
@@ -80,7 +80,7 @@ def attacked(tmp_path, shared_dir):
         made = [stack.enter_context(Supervisor(d, table=NODES)) for d in (edge, robot)]
         near_session = stack.enter_context(open_session(robot.router.listen))
         edge_session = stack.enter_context(open_session(edge.router.listen[:1]))
-        board = HealthBoard(edge_session, "r1")
+        board = HealthTable(edge_session, "r1")
         latency = Latency(near_session)
         poll(
             made,

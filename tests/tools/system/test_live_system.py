@@ -15,7 +15,7 @@ from beamsplat.common.runtime.lockstep import Lockstep
 from beamsplat.common.zenoh.bus import Bus, open_session
 from beamsplat.common.zenoh.queries import ask
 from beamsplat.tools.system.assembly import node_classes, surroundings
-from beamsplat.tools.system.health_table import HealthBoard
+from beamsplat.tools.system.health_table import HealthTable
 from beamsplat.tools.system.supervisor import Supervisor
 from tests.common.nodes import TABLE, Chain, SensorSource, SensorSourceConfig, Sink
 from tests.common.polling import poll
@@ -99,7 +99,7 @@ def test_a_killed_node_comes_back_and_its_peers_go_on(deployment):
         open_session(live.router.listen) as session,
         SinkThread(live) as thread,
     ):
-        board = HealthBoard(session, "test")
+        board = HealthTable(session, "test")
         poll(supervisor, lambda: len(thread.stamps("localization/odometry")) > 5, 30)
         peers = {n: c.process.pid for n, c in supervisor.children.items() if n != "localization"}
         first = supervisor.children["localization"].process.pid
@@ -175,7 +175,7 @@ def test_a_slow_node_gets_the_newest_picture_and_every_scan(deployment):
     }
     live = deployment(nodes, rate=1.0)
     with Supervisor(live, table=TABLE) as supervisor, open_session(live.router.listen) as session:
-        board = HealthBoard(session, "test")
+        board = HealthTable(session, "test")
         poll(supervisor, lambda: board.states().get("localization") == "drained", 40)
         health = {i.topic: i for i in board.records["localization"].health.inputs}
     assert 20 <= health["camera/image"].received <= 40  # 6 s at 5 Hz
@@ -186,7 +186,7 @@ def test_a_slow_node_gets_the_newest_picture_and_every_scan(deployment):
 def test_broken_messages_are_counted_and_harm_nothing(deployment):
     live = deployment({"localization": {"kind": "chain"}})
     with Supervisor(live, table=TABLE) as supervisor, open_session(live.router.listen) as session:
-        board = HealthBoard(session, "test")
+        board = HealthTable(session, "test")
         poll(supervisor, lambda: board.states().get("localization") == "active", 30)
         for payload, attachment in ((b"rubbish", None), (b"rubbish", b"short"), (b"", b"x" * 80)):
             session.put("beamsplat/test/lidar/scan", payload, attachment=attachment)
@@ -205,7 +205,7 @@ def test_broken_messages_are_counted_and_harm_nothing(deployment):
 def test_queries_are_answered_by_the_node(deployment):
     live = deployment({"localization": {"kind": "chain"}})
     with Supervisor(live, table=TABLE) as supervisor, open_session(live.router.listen) as session:
-        board = HealthBoard(session, "test")
+        board = HealthTable(session, "test")
         poll(supervisor, lambda: board.states().get("localization") == "active", 30)
         replies = list(ask(session, "test", "localization", "count", {"add": "41"}, 5.0))
         assert [r.optimisation for r in replies] == [41]

@@ -20,7 +20,7 @@ from beamsplat.common.zenoh.bus import Bus, open_router, open_session
 from beamsplat.common.zenoh.queries import ask
 from beamsplat.common.zenoh.streams import declare_subscription, decode_sample
 from beamsplat.services.nodes import NODES
-from beamsplat.tools.system.health_table import HealthBoard
+from beamsplat.tools.system.health_table import HealthTable
 from beamsplat.tools.system.supervisor import Supervisor
 from tests.common.polling import poll, publish_until_received
 from tests.common.samples import sample_messages
@@ -120,7 +120,7 @@ def test_the_whole_system_runs_under_the_policy_and_top_shows_it(tmp_path, free_
     )
     with Supervisor(live, table=TABLE) as supervisor:
         with open_session((free_endpoint,), login=login_of(security, SUPERVISOR)) as session:
-            board = HealthBoard(session, "r1")
+            board = HealthTable(session, "r1")
             poses = TopicListener(session, POSE)
             wait_for = lambda: board.states().get("mapping") == "drained"  # noqa: E731
             poll(supervisor, wait_for, 120)

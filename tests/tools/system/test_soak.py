@@ -15,7 +15,7 @@ import pytest
 from beamsplat.common.config.deployment import load_deployment
 from beamsplat.common.zenoh.bus import open_session
 from beamsplat.tools.cli.simulate import simulate
-from beamsplat.tools.system.health_table import HealthBoard
+from beamsplat.tools.system.health_table import HealthTable
 from beamsplat.tools.system.supervisor import Supervisor
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -41,7 +41,7 @@ def test_laps_on_end_cost_no_more_memory_and_no_more_files(tmp_path, free_endpoi
     ))  # fmt: skip
     memory_mb, files, threads = (defaultdict(list) for _ in range(3))
     with Supervisor(deployment) as supervisor, open_session(deployment.router.listen) as session:
-        board, end = HealthBoard(session, deployment.robot), time.monotonic() + MINUTES * 60.0
+        board, end = HealthTable(session, deployment.robot), time.monotonic() + MINUTES * 60.0
         while time.monotonic() < end:
             next_look = time.monotonic() + EVERY_S
             for name, child in supervisor.children.items():

@@ -15,7 +15,7 @@ import pytest
 from beamsplat.common.config.deployment import Deployment, RouterConfig
 from beamsplat.common.messages import ExternalPose
 from beamsplat.common.zenoh.bus import Bus, open_router, open_session
-from beamsplat.tools.system.health_table import HealthBoard
+from beamsplat.tools.system.health_table import HealthTable
 from beamsplat.tools.system.supervisor import Supervisor
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -149,7 +149,7 @@ def test_a_whole_system_whose_supervisor_is_ended(tmp_path, free_endpoint, numbe
     process = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
     try:
         with open_session((free_endpoint,), wait_s=30.0) as session:
-            board = HealthBoard(session, "test")
+            board = HealthTable(session, "test")
             _until(lambda: any(i.received for r in board.records.values() for i in r.health.inputs), 30)
         family = [psutil.Process(process.pid), *psutil.Process(process.pid).children(recursive=True)]
     finally:

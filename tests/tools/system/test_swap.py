@@ -19,7 +19,7 @@ from beamsplat.common.runtime.registry import Service
 from beamsplat.common.zenoh.bus import open_session
 from beamsplat.common.zenoh.queries import ask, command
 from beamsplat.tools.system.commands import Commands
-from beamsplat.tools.system.health_table import HealthBoard
+from beamsplat.tools.system.health_table import HealthTable
 from beamsplat.tools.system.supervisor import Supervisor
 from tests.common.nodes import TABLE, SlowConfig
 from tests.common.topic_listener import TopicListener
@@ -65,7 +65,7 @@ class System:
     def __enter__(self):
         self.supervisor = Supervisor(self.deployment, table=self._table).__enter__()
         self.session = open_session(self.deployment.router.listen)
-        self.board = HealthBoard(self.session, "r1")
+        self.board = HealthTable(self.session, "r1")
         self._commands = Commands(self.session, "r1", self.supervisor)
         self._thread = threading.Thread(target=self._attend)
         self._thread.start()
@@ -74,7 +74,7 @@ class System:
 
     def _attend(self):
         while not self._stop.wait(0.05):
-            self._commands.attend()
+            self._commands.answer_pending()
             self.supervisor.poll()
 
     def __exit__(self, *exception):
