@@ -44,7 +44,7 @@ class _LogEntry:
     bytes: int = 0
 
 
-class SinkThread:
+class RerunSinkThread:
     """One sink of a recording and the thread that feeds it."""
 
     def __init__(
@@ -184,7 +184,7 @@ class RerunWriter:
     """Writes entries to all sinks. Logging never blocks and never raises."""
 
     def __init__(self) -> None:
-        self.sinks: list[SinkThread] = []
+        self.sinks: list[RerunSinkThread] = []
         self.notes: list[str] = []  # addresses and files, for the status
         self._recording_id = np.random.default_rng().bytes(16).hex()
         self._viewer: subprocess.Popen[bytes] | None = None
@@ -211,7 +211,7 @@ class RerunWriter:
         # Few, large chunks: rerun keeps their index in memory until the file is closed.
         stream = self._stream(flush_tick_s=2.0)
         watch = _disk_watch(path, limit_mb, keep_free_mb)
-        self.sinks.append(SinkThread(str(path), stream, rr.FileSink(path), blueprint, watch))
+        self.sinks.append(RerunSinkThread(str(path), stream, rr.FileSink(path), blueprint, watch))
         self.notes.append(f"writing {path}")
         return path
 
@@ -228,7 +228,9 @@ class RerunWriter:
         sink = rr.GrpcServerSink(
             bind, port, server_memory_limit=f"{memory_mb}MB", cors_allow_origin=origins or None
         )
-        thread = SinkThread(f"viewer at port {port}", self._stream(0.1), sink, blueprint, self._watch_viewer)
+        thread = RerunSinkThread(
+            f"viewer at port {port}", self._stream(0.1), sink, blueprint, self._watch_viewer
+        )
         self.sinks.append(thread)
         return f"rerun+http://127.0.0.1:{port}/proxy"
 

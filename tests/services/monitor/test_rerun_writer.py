@@ -10,7 +10,13 @@ import pytest
 import rerun as rr
 
 from beamsplat.services.monitor.layout import layout
-from beamsplat.services.monitor.rerun_writer import _QUEUE, _QUEUE_BYTES, RerunWriter, SinkThread, _LogEntry
+from beamsplat.services.monitor.rerun_writer import (
+    _QUEUE,
+    _QUEUE_BYTES,
+    RerunSinkThread,
+    RerunWriter,
+    _LogEntry,
+)
 
 
 class StuckStream:
@@ -43,7 +49,7 @@ class StuckStream:
 
 def test_a_stalled_viewer_blocks_nothing_and_gets_the_newest_entries():
     stream = StuckStream()
-    thread = SinkThread("viewer", stream, None, None)
+    thread = RerunSinkThread("viewer", stream, None, None)
     thread.put(_LogEntry("rig", ("rig",), None, True))
     for i in range(10 * _QUEUE):
         thread.put(_LogEntry(f"entity{i % 3}", (i,), i, False))
@@ -61,7 +67,7 @@ def test_a_stalled_viewer_blocks_nothing_and_gets_the_newest_entries():
 
 def test_queued_entries_are_bounded_by_bytes():
     stream = StuckStream()
-    thread = SinkThread("viewer", stream, None, None)
+    thread = RerunSinkThread("viewer", stream, None, None)
     for i in range(200):
         thread.put(_LogEntry(f"splats{i % 4}", (i,), i, False, bytes=10_000_000))
     assert len(thread._queue) <= _QUEUE_BYTES // 10_000_000 + 4
@@ -75,7 +81,7 @@ def test_queued_entries_are_bounded_by_bytes():
 
 def test_closing_has_a_timeout(caplog):
     stream = StuckStream()
-    thread = SinkThread("viewer", stream, None, None)
+    thread = RerunSinkThread("viewer", stream, None, None)
     thread.put(_LogEntry("a", (1,), None, False))
     thread.close(0.1)
     assert "viewer was not closed within 0.1 s" in caplog.text
