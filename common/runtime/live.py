@@ -34,8 +34,8 @@ from beamsplat.common.zenoh.queries import ask, reply
 
 log = logging.getLogger(__name__)
 
-_STOP_PATIENCE_S = 2.0  # after a signal, background jobs have this long to finish
-_SILENCE_S = 1.0  # without feedback, after which `on_feedback_timeout` is called
+_STOP_TIMEOUT_S = 2.0  # after a signal, background jobs have this long to finish
+_FEEDBACK_TIMEOUT_S = 1.0  # without feedback, after which `on_feedback_timeout` is called
 
 
 class Live:
@@ -47,18 +47,16 @@ class Live:
         self._stop_by = math.inf
         self._queries: deque[tuple[str, zenoh.Query]] = deque()
         self._healths: deque[Health] = deque(maxlen=256)
-        self._undecodable_log = RateLimitedLog()
-        self._bookmark = ReplayPosition(settings.run_dir, node.name)
+        self._undecodable_limit = RateLimitedLog()
+        self._position = ReplayPosition(settings.run_dir, node.name)
 
     def run(self) -> None:
         """Go through the life cycle: configure, standby, active, drain, drained, closed."""
         r = self.running
         settings, node = r.settings, r.node
         epoch = claim_epoch(settings.run_dir, node.name)
-        if (
-            not settings.resume
-        ):  # position of an earlier run: a crash before the first message must not resume there
-            self._bookmark.clear()
+        if not settings.resume:  # else a crash before the first message would resume an earlier run
+            self._position.clear()
         try:
             login = login_of(settings.security, node.name)
             session = open_session(settings.endpoints, should_stop=lambda: self._stopping, login=login)
@@ -86,7 +84,7 @@ class Live:
     def stop(self, *_: object) -> None:
         """Ask the node to end; safe in a signal handler."""
         self._stopping = True
-        self._stop_by = min(self._stop_by, time.monotonic() + _STOP_PATIENCE_S)
+        self._stop_by = min(self._stop_by, time.monotonic() + _STOP_TIMEOUT_S)
 
     def _must_abandon(self) -> bool:
         return time.monotonic() > self._stop_by
@@ -128,11 +126,11 @@ class Live:
         r.emit(r.node.handle_drain())
         r.state = "drained"
         if finished:  # stopped by a signal, it leaves the stream open for a successor
-            self._bookmark.finish()
+            self._position.finish()
             for publication in r.publications.values():
                 bus.end(publication)
             while not (self._stopping or r.settings.exit_when_drained or r.handover.retired):
-                self._attend()
+                self._process_requests()
                 self._handle_late_feedback()
                 with r.changed:
                     r.changed.wait(POLL_S)
@@ -151,7 +149,7 @@ class Live:
         r = self.running
         last_received = time.monotonic()
         while not self._stopping:
-            self._attend()
+            self._process_requests()
             if r.handover.retired:
                 return
             if r.handover.standby and r.node.hands_over:
@@ -164,7 +162,7 @@ class Live:
                 if r.mailbox.ended:
                     if not (r.mailbox.feedback_may_arrive and r.node.awaits_feedback()):
                         return
-                    last_received = self._report_silence(last_received)
+                    last_received = self._check_feedback_timeout(last_received)
                 continue
             last_received = time.monotonic()
             if r.handover.was_handled(envelope):
@@ -175,29 +173,30 @@ class Live:
             r.emit(r.node.handle(envelope.topic, envelope.message))
             r.steps_ms.append((time.perf_counter() - started) * 1e3)
 
-    def _report_silence(self, last_received: float) -> float:
-        silence_s = time.monotonic() - last_received
-        if silence_s < _SILENCE_S:
+    def _check_feedback_timeout(self, last_received: float) -> float:
+        """Call `on_feedback_timeout` when feedback is missing; return the start of the next time-out."""
+        waited_s = time.monotonic() - last_received
+        if waited_s < _FEEDBACK_TIMEOUT_S:
             time.sleep(0.02)  # `next_envelope` does not wait once the inputs have ended
             return last_received
-        self.running.emit(self.running.node.handle_feedback_timeout(silence_s))
-        return last_received + silence_s
+        self.running.emit(self.running.node.handle_feedback_timeout(waited_s))
+        return last_received + waited_s
 
     def _run_source(self) -> None:
         r = self.running
-        playback = Playback(r.settings.rate, self._bookmark, r.settings.resume)
+        playback = Playback(r.settings.rate, self._position, r.settings.resume)
         for item in r.node.source():
             if item is None:  # a device without a new measurement
-                self._attend()
+                self._process_requests()
                 if self._stopping:
                     return
                 continue
             while not self._stopping and (wait_s := playback.wait_s(item)) > 0.0:
-                self._attend()
+                self._process_requests()
                 time.sleep(min(wait_s, POLL_S))
             if self._stopping:
                 return
-            self._attend()
+            self._process_requests()
             started = time.perf_counter()
             r.node.check_output(item.topic, item.message)
             publication = r.publications[item.topic]
@@ -210,13 +209,13 @@ class Live:
     def _wait_for_consumers(self, bus: Bus) -> None:
         r = self.running
 
-        def show(missing: list[str]) -> None:
+        def on_waiting(missing: list[str]) -> None:
             r.detail = f"waiting for {', '.join(missing)}"
 
-        wait_for_nodes(bus.alive_nodes, r.settings, lambda: self._stopping, show)
+        wait_for_nodes(bus.alive_nodes, r.settings, lambda: self._stopping, on_waiting)
         r.detail = ""
 
-    def _attend(self) -> None:
+    def _process_requests(self) -> None:
         """Process the health reports and queries received since the last call."""
         node = self.running.node
         while self._healths:
@@ -235,7 +234,7 @@ class Live:
         r = self.running
         with r.changed:
             r.mailbox.counts[topic].undecodable += 1
-            count = self._undecodable_log.due(topic)
+            count = self._undecodable_limit.due(topic)
         if count is not None:
             log.warning("dropped a message on %s (%d more since the last report): %s", topic, count, reason)
 

@@ -274,21 +274,21 @@ class Bus:
         `on_query(name, query)` runs in a thread of the bus.
         """
         self._on_query = on_query
-        place = key(self.robot, CONTROL, self.producer.instance, "*")
-        self._answer(place, lambda query: on_query(f"{CONTROL}/{_verb_of(query)}", query))
+        key_expr = key(self.robot, CONTROL, self.producer.instance, "*")
+        self._answer(key_expr, lambda query: on_query(f"{CONTROL}/{_verb_of(query)}", query))
 
     def announce(self, queries: tuple[str, ...]) -> None:
         """Show this process as the active node: declare its queries and its liveliness token."""
         for name in queries:
-            place = key(self.robot, "query", self.producer.node, name)
-            self._answer(place, partial(self._on_query, name))
+            key_expr = key(self.robot, "query", self.producer.node, name)
+            self._answer(key_expr, partial(self._on_query, name))
         node, instance = self.producer.node, self.producer.instance
         self._declared.append(
             self.session.liveliness().declare_token(key(self.robot, "alive", node, instance))
         )
 
-    def _answer(self, place: str, on_query: Callable[[zenoh.Query], None]) -> None:
-        queryable = self.session.declare_queryable(place, zenoh.handlers.FifoChannel(16))
+    def _answer(self, key_expr: str, on_query: Callable[[zenoh.Query], None]) -> None:
+        queryable = self.session.declare_queryable(key_expr, zenoh.handlers.FifoChannel(16))
         self._declared.append(queryable)
 
         def receive() -> None:
@@ -299,7 +299,7 @@ class Bus:
                     return
                 on_query(query)
 
-        threading.Thread(target=receive, name=f"query-{place}", daemon=True).start()
+        threading.Thread(target=receive, name=f"query-{key_expr}", daemon=True).start()
 
     def watch_health(self, on_health: Callable[[Health], None]) -> None:
         """Call `on_health` for the health of every node of this robot, from a thread of the bus."""

@@ -36,19 +36,19 @@ def command(
     Raises:
         UserError: the process did not answer in time, or rejected the request.
     """
-    place = key(robot, CONTROL, instance, verb)
-    return next(_ask(session, place, (instance, verb), parameters, timeout_s)).text
+    key_expr = key(robot, CONTROL, instance, verb)
+    return next(_ask(session, key_expr, (instance, verb), parameters, timeout_s)).text
 
 
 def _ask(
     session: zenoh.Session,
-    place: str,
+    key_expr: str,
     target: tuple[str, str],  # node or instance, and query name; for error texts
     parameters: dict[str, str],
     timeout_s: float,
 ) -> Iterator[Message]:
     who, name = target
-    selector = zenoh.Selector(place, zenoh.Parameters(parameters))
+    selector = zenoh.Selector(key_expr, zenoh.Parameters(parameters))
     deadline = time.monotonic() + min(timeout_s, _DISCOVERY_S)
     while True:
         answered = False

@@ -44,7 +44,7 @@ def play(tmp_path):
     def run(*, resume, last=99, rate=0.0):
         sent = []
         live = Live(Player(Player.Config()), LiveSettings("r", (), tmp_path, rate=rate, resume=resume))
-        live._bookmark._PERIOD_S = 0.0
+        live._position._PERIOD_S = 0.0
         live.running.publications = {name: FakePublication(name, live, sent, last) for name in Player.outputs}
         live._run_source()
         return sent, live
@@ -81,7 +81,7 @@ def test_a_new_run_starts_at_the_beginning(play, monkeypatch):
 
 
 def test_a_finished_replay_is_not_repeated(play):
-    play(resume=False)[1]._bookmark.finish()
+    play(resume=False)[1]._position.finish()
     assert play(resume=True)[0] == [("rig", SECOND_NS)]
 
 

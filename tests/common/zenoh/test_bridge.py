@@ -20,7 +20,7 @@ AT_ROBOT, AT_EDGE = "aa" * 8, "bb" * 8  # instances of the producers of the two 
 
 
 class Side:
-    """A router with one producer of all topics, and everything that is heard there from the other side."""
+    """A router with one producer of all topics, and the keys that are received there from the other side."""
 
     def __init__(self, stack, instance):
         self.endpoint = f"tcp/127.0.0.1:{free_port()}"
@@ -111,8 +111,8 @@ def test_a_new_session_forwards_the_large_messages_alone(sides):
 def test_another_robots_topics_do_not_cross(sides):
     robot, edge, _, _ = sides
     other = Bus(robot.open(), "r2", "clock", "cc" * 8, 1).publish("tick")
-    heard = []
-    kept = edge.open().declare_subscriber("beamsplat/r2/**", lambda s: heard.append(s))
+    received = []
+    kept = edge.open().declare_subscriber("beamsplat/r2/**", lambda s: received.append(s))
 
     def own_crossed():
         other.put(SAMPLES[TOPICS["tick"].message])
@@ -120,5 +120,5 @@ def test_another_robots_topics_do_not_cross(sides):
         return "tick" in edge.crossed
 
     wait_until(own_crossed)
-    assert heard == []
+    assert received == []
     kept.undeclare()

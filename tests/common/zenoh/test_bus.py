@@ -160,14 +160,14 @@ def test_a_process_answers_control_requests_at_once_and_queries_once_announced(m
 
 def test_health_of_every_node_arrives_and_an_undecodable_one_is_ignored(make_bus, robot):
     one, two, watcher = make_bus("depth"), make_bus("fusion"), make_bus("page")
-    heard = []
-    watcher.watch_health(lambda health: heard.append((health.node, health.state)))
+    received = []
+    watcher.watch_health(lambda health: received.append((health.node, health.state)))
     for bus, node in ((one, "depth"), (two, "fusion")):
         health = SAMPLES[Health].model_copy(update={"node": node, "state": "active"})
         wait_until(
-            lambda bus=bus, health=health: bus.publish_health(health) or (health.node, "active") in heard
+            lambda bus=bus, health=health: bus.publish_health(health) or (health.node, "active") in received
         )
         bus.session.put(key(robot, "health", node), b"garbage", attachment=_header())
-    count = len(heard)
-    wait_until(lambda: one.publish_health(SAMPLES[Health]) or len(heard) > count)
-    assert set(heard) <= {("depth", "active"), ("fusion", "active")}
+    count = len(received)
+    wait_until(lambda: one.publish_health(SAMPLES[Health]) or len(received) > count)
+    assert set(received) <= {("depth", "active"), ("fusion", "active")}
