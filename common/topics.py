@@ -71,6 +71,8 @@ _ROWS = (
     Topic("localization/movers",     m.MovingBeams,   ("localization",),        10, "every", 400),
     Topic("localization/grid",       m.Grid,          ("localization",),         0, "latched", 1, "bulk"),
     Topic("depth/estimate",          m.DepthEstimate, ("depth",),                5, "latest"),
+    Topic("keyframes/candidate",     m.KeyframeCandidate, ("fusion",),          10, "every"),
+    Topic("keyframes/decision",      m.KeyframeDecision, ("keyframes",),        10, "every"),
     Topic("fusion/depth",            m.FusedDepth,    ("fusion",),               5, "latest"),
     Topic("fusion/cloud",            m.Cloud,         ("fusion",),               1, "latest"),
     Topic("keyframes/frame",         m.Keyframe,      ("keyframes",),           2, "every", 60, "bulk", True),

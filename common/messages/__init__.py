@@ -3,6 +3,8 @@
 from beamsplat.common.messages.map import (
     Keyframe,
     KeyframeAck,
+    KeyframeCandidate,
+    KeyframeDecision,
     MapChunk,
     MapPoses,
     MapPreview,
@@ -50,6 +52,8 @@ __all__ = [
     "InputHealth",
     "Keyframe",
     "KeyframeAck",
+    "KeyframeCandidate",
+    "KeyframeDecision",
     "LidarModel",
     "MapChunk",
     "MapPoses",

@@ -13,6 +13,20 @@ from beamsplat.common.messages.sensor_models import CameraModel
 ODOM_ORIGIN = -1  # `anchor_id` of keyframes sent before localization has published an anchor
 
 
+class KeyframeCandidate(Message):
+    """An image for which fusion can compute depth; fusion asks whether it is to become a keyframe."""
+
+    T_odom_body: Transform
+    sharpness: NonNegative  # of the undistorted image, `geometry.keyframe_selection.sharpness`
+
+
+class KeyframeDecision(Message):
+    """The answer to the candidate with the same stamp."""
+
+    keyframe: bool
+    reason: Text = ""
+
+
 class Keyframe(Message):
     """An image to be added to the map, with all data that the mapper needs: it is self-contained, so that no
     other message of this time must be kept during a network outage. An `id` always has the same content.

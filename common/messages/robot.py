@@ -15,6 +15,8 @@ from pydantic import Field, model_validator
 from beamsplat.common.messages.map import (
     Keyframe,
     KeyframeAck,
+    KeyframeCandidate,
+    KeyframeDecision,
     MapChunk,
     MapPoses,
     MapPreview,
@@ -259,7 +261,7 @@ MESSAGES: dict[str, type[Message]] = {
     cls.schema_name(): cls
     for cls in (
         Rig, Image, Scan, WheelOdometry, ExternalPose, Odometry, Correction, Anchors, MovingBeams, Grid,
-        DepthEstimate, FusedDepth, Cloud, Keyframe, KeyframeAck, MapChunk, MapPoses, MapPreview, MapState,
-        MapStatus, Tick, Health, Answer,
+        DepthEstimate, FusedDepth, Cloud, KeyframeCandidate, KeyframeDecision, Keyframe, KeyframeAck,
+        MapChunk, MapPoses, MapPreview, MapState, MapStatus, Tick, Health, Answer,
     )
 }  # fmt: skip

@@ -52,18 +52,22 @@ class Lockstep:
     def run(self) -> dict[str, Mailbox]:
         """Run until all sources are exhausted and all nodes drained; return each node's mailbox by name."""
         try:
-            for state in self._states:
-                state.node.configure()
             produced = {name for state in self._states for name in state.node.outputs}
+            for state in self._states:
+                state.node.without_producer = frozenset(state.mailbox.counts) - produced
+                state.node.configure()
             for name in TOPICS:
                 if name not in produced:
                     self._end_topic(name, NO_PRODUCER, 0)
             for state in self._states:
                 if state.source is not None:
                     self._pull(state, 0)
+            time_ns = 0
             while self._events:
                 time_ns, _, _, act = heapq.heappop(self._events)
                 act(time_ns)
+                if not self._events:
+                    self._end_one_that_waits(time_ns)
         finally:
             for state in self._states:
                 state.node.close()
@@ -112,8 +116,16 @@ class Lockstep:
             self._emit(state, state.node.handle(envelope.topic, envelope.message), state.busy_until_ns)
             if state.busy_until_ns > now_ns:
                 self._at(state.busy_until_ns, _LAST_ROW, lambda t: self._step(state, t))
-        if state.mailbox.ended and not state.ended and now_ns >= state.busy_until_ns:
+        waits = state.mailbox.feedback_may_arrive and state.node.awaits_feedback()
+        if state.mailbox.ended and not state.ended and not waits and now_ns >= state.busy_until_ns:
             self._end_node(state, now_ns)
+
+    def _end_one_that_waits(self, now_ns: int) -> None:
+        """End a node whose inputs have ended and whose feedback does not arrive any more."""
+        for state in self._states:
+            if state.mailbox.ended and not state.ended:
+                self._end_node(state, now_ns)
+                return
 
     def _handle_late_feedback(self, state: _NodeState) -> None:
         """Handle feedback for a node that has ended; its outputs are discarded."""

@@ -18,7 +18,7 @@ from beamsplat.common.runtime.node import Job, Node, Output
 from beamsplat.common.zenoh.streams import Publication
 
 POLL_S = 0.2  # longest wait for a message before signals are checked
-_END_PATIENCE_S = 5.0  # an end-of-stream marker waits this long for messages still in transit
+_END_TIMEOUT_S = 5.0  # an end-of-stream marker waits this long for messages still in transit
 
 
 class RunningNode:
@@ -31,6 +31,7 @@ class RunningNode:
     def __init__(self, node: Node, settings: LiveSettings) -> None:
         self.node = node
         self.settings = node.live_settings = settings
+        node.without_producer = settings.without_producer
         self.instance = settings.instance or secrets.token_hex(8)
         self.handover = Handover(settings.standby)
         self.accepts_arrivals = True  # whether `on_arrival` is called as soon as a message is received
@@ -62,7 +63,7 @@ class RunningNode:
     def receive_end(self, topic: str, instance: str, epoch: int, sent: int) -> None:
         """Note that a producer has ended after `sent` messages."""
         with self.changed:
-            self._ends.append((topic, instance, epoch, sent, time.monotonic() + _END_PATIENCE_S))
+            self._ends.append((topic, instance, epoch, sent, time.monotonic() + _END_TIMEOUT_S))
             self.changed.notify()
 
     def wake(self) -> None:

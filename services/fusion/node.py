@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import logging
 from collections import deque
+from dataclasses import dataclass
 from typing import Literal
 
+import cv2
 import numpy as np
 from pydantic import Field
 
@@ -13,13 +15,16 @@ from beamsplat.common.config.deployment import NodeConfig
 from beamsplat.common.errors import UserError
 from beamsplat.common.geometry.beams import scan_points
 from beamsplat.common.geometry.camera import Pinhole, Undistorter
+from beamsplat.common.geometry.keyframe_selection import KeyframeSelector, field_of_view, sharpness
 from beamsplat.common.geometry.sensor_history import SensorHistory, TimedScan
-from beamsplat.common.geometry.transforms import inverse, transform_points
+from beamsplat.common.geometry.transforms import transform_points
 from beamsplat.common.messages import (
     Cloud,
     DepthEstimate,
     FusedDepth,
     Image,
+    KeyframeCandidate,
+    KeyframeDecision,
     MovingBeams,
     Odometry,
     Rig,
@@ -37,25 +42,37 @@ from beamsplat.services.fusion.single_image import SingleImageFusion
 log = logging.getLogger("beamsplat.fusion")
 
 _IMAGES = 8  # kept until their depth estimate arrives
+_DECISION_PATIENCE_NS = 1_000_000_000  # a candidate without a decision is dropped after this data time
 _CHECK_AFTER_SCANS = 100  # result of the calibration check after 10 s at 10 Hz; it takes 1 to 2 s
 
 
 class FusionConfig(NodeConfig):
-    """Options of fusion: method, properties of the robot, and the distance of keyframes (plane sweeps)."""
+    """Options of fusion: method and properties of the robot."""
 
     # field: plane sweep with all priors; ratio: the paper's one factor per image; affine: scale and shift of
     # inverse depth; given: the estimate unchanged (robots without a lidar).
     method: Literal["field", "ratio", "affine", "given"] = "field"
     floor_known: bool = True  # the camera height in the calibration is reliable
     planar: bool = True  # the body stays level on a floor
-    keyframe_m: float = 0.3
-    keyframe_rad: float = 0.26
     cloud_every_px: int = 4  # pixels per point of the cloud, in each direction
     check_pairs: int = Field(60, ge=0)  # image pairs for the calibration check at the start; 0 = no check
 
 
+@dataclass(frozen=True)
+class _Candidate:
+    """An image that fusion can process, with the age of its beams."""
+
+    frame: FusionInput
+    age_ns: int
+
+
 class FusionNode(Node):
-    """Publishes fused depth per image and a point cloud per keyframe; works in the smooth odom frame."""
+    """Publishes fused depth per image and a point cloud per keyframe; works in the smooth odom frame.
+
+    A plane sweep costs several times more than depth between keyframes, so each image is a candidate first:
+    the keyframes service decides whether it is swept. In a deployment without that service, fusion decides
+    by the same rule.
+    """
 
     name = "fusion"
     Config = FusionConfig
@@ -66,15 +83,16 @@ class FusionNode(Node):
         "lidar/scan",
         "localization/odometry",
         "localization/movers",
+        Input("keyframes/decision", feedback=True),
     )
-    outputs = ("fusion/depth", "fusion/cloud")
+    outputs = ("keyframes/candidate", "fusion/depth", "fusion/cloud")
 
     def configure(self) -> None:
         self._fusion: Fusion | SingleImageFusion | None = None
         self._check: StartupCheck | None = None  # of the calibration; only `field` has one
         self._images: deque[Image] = deque(maxlen=_IMAGES)
         self._estimates: deque[DepthEstimate] = deque(maxlen=_IMAGES)
-        self._T_odom_keyframe: np.ndarray | None = None
+        self._candidate: _Candidate | None = None  # waits for the decision of the keyframes service
         self._rig: Rig | None = None
         self._localizer = ""  # instance of the localization process
         self.calibration: CalibrationHealth | None = None
@@ -87,7 +105,6 @@ class FusionNode(Node):
         if self._localizer and self._rig is not None:
             log.info("localization was restarted: fusion is reset")
             checked = self._check is not None and self._check.done
-            self._T_odom_keyframe = None
             self.on_rig(self._rig)
             if self._check is not None and checked:
                 self._check.done = True
@@ -99,7 +116,8 @@ class FusionNode(Node):
         if rig.camera is None or (rig.lidar is None and method != "given"):
             log.error("the calibration has no camera or no lidar: depth is not fused; complete the rig file")
             return iter(())
-        self._rig, camera = rig, rig.camera
+        self._rig, camera, self._candidate = rig, rig.camera, None
+        self._selector = KeyframeSelector(field_of_view(Pinhole.of(camera)))
         self._undistort = Undistorter(Pinhole.of(camera))
         self._T_body_camera = camera.T_body_camera
         self._history = SensorHistory(np.eye(4) if rig.lidar is None else rig.lidar.T_body_lidar)
@@ -182,6 +200,12 @@ class FusionNode(Node):
 
     def _fuse_if_ready(self) -> Outputs:
         """Process the newest image with estimate and pose; older ones are counted as overtaken."""
+        if self._candidate is not None:
+            newest_ns = self._estimates[-1].stamp_ns if self._estimates else 0
+            if newest_ns < self._candidate.frame.stamp_ns + _DECISION_PATIENCE_NS:
+                return
+            self._candidate = None  # the keyframes service does not answer
+            self.overtaken += 1
         ready = None
         while self._fusion is not None and self._estimates:
             if self._estimates[0].stamp_ns > self._history.newest_pose_ns:
@@ -195,10 +219,10 @@ class FusionNode(Node):
         if image is None:  # its image was lost, or is no longer kept
             self.overtaken += 1
             return
-        yield from self._fuse(image, ready)
+        yield from self._propose(image, ready)
 
-    def _fuse(self, image: Image, estimate: DepthEstimate) -> Outputs:
-        """Publish the depth of one image, and the cloud if it is a keyframe."""
+    def _propose(self, image: Image, estimate: DepthEstimate) -> Outputs:
+        """Ask whether an image is to become a keyframe; it is fused when the answer arrives."""
         T_odom_body = self._history.pose(image.stamp_ns)
         try:
             rgb = self._undistort(
@@ -218,23 +242,50 @@ class FusionNode(Node):
             image.stamp_ns, rgb, T_odom_body, beams, estimate.values if usable else None,
             estimate.kind if usable else "none",
         )  # fmt: skip
-        keyframe = self._moved(T_odom_body)
+        candidate, sharp = _Candidate(frame, age_ns), sharpness(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY))
+        if "keyframes/decision" in self.without_producer:
+            selection = self._selector.decide(T_odom_body @ self._T_body_camera, sharp)
+            yield from self._fuse(candidate, selection.selected)
+            return
+        self._candidate = candidate
+        yield (
+            "keyframes/candidate",
+            KeyframeCandidate(stamp_ns=image.stamp_ns, T_odom_body=T_odom_body, sharpness=sharp),
+        )
+
+    def on_keyframes_decision(self, decision: KeyframeDecision) -> Outputs:
+        """Fuse the candidate that was decided on, then continue with the newest image."""
+        candidate = self._candidate
+        if candidate is None or candidate.frame.stamp_ns != decision.stamp_ns:
+            return
+        self._candidate = None
+        yield from self._fuse(candidate, decision.keyframe)
+        yield from self._fuse_if_ready()
+
+    def awaits_feedback(self) -> bool:
+        """Return whether a candidate waits for its decision."""
+        return self._candidate is not None
+
+    def on_feedback_timeout(self, seconds: float) -> Outputs:
+        """Drop the candidate: the keyframes service does not answer any more."""
+        if self._candidate is not None:
+            self._candidate = None
+            self.overtaken += 1
+        return iter(())
+
+    def _fuse(self, candidate: _Candidate, keyframe: bool) -> Outputs:
+        """Publish the depth of one image, and the cloud if it is a keyframe."""
+        frame = candidate.frame
         fused = self._fusion.fuse(frame, keyframe=keyframe)
         if not fused.ok:
-            yield "fusion/depth", _rejected(image.stamp_ns, fused.status)
+            if keyframe:
+                self._selector.withdraw()
+            yield "fusion/depth", _rejected(frame.stamp_ns, fused.status, keyframe)
             return
+        T_odom_body = frame.T_map_body
+        yield "fusion/depth", _message(frame.stamp_ns, fused, keyframe, candidate.age_ns, T_odom_body)
         if keyframe:
-            self._T_odom_keyframe = T_odom_body
-        yield "fusion/depth", _message(image.stamp_ns, fused, keyframe, age_ns, T_odom_body)
-        if keyframe:
-            yield "fusion/cloud", self._cloud(image.stamp_ns, fused, rgb, T_odom_body)
-
-    def _moved(self, T_odom_body: np.ndarray) -> bool:
-        if self._T_odom_keyframe is None:
-            return True
-        T = inverse(self._T_odom_keyframe) @ T_odom_body
-        turn = np.arccos(np.clip((np.trace(T[:3, :3]) - 1.0) / 2.0, -1.0, 1.0))
-        return bool(np.linalg.norm(T[:3, 3]) > self.config.keyframe_m or turn > self.config.keyframe_rad)
+            yield "fusion/cloud", self._cloud(frame.stamp_ns, fused, frame.image_rgb, T_odom_body)
 
     def _cloud(self, stamp_ns: int, fused: FusionResult, rgb: np.ndarray, T_odom_body: np.ndarray) -> Cloud:
         every = self.config.cloud_every_px
@@ -266,6 +317,6 @@ def _message(
     )
 
 
-def _rejected(stamp_ns: int, status: str) -> FusedDepth:
+def _rejected(stamp_ns: int, status: str, keyframe: bool = False) -> FusedDepth:
     empty = np.zeros((0, 0), np.float32)
-    return FusedDepth(stamp_ns=stamp_ns, depth_m=empty, sigma_m=empty, status=status)
+    return FusedDepth(stamp_ns=stamp_ns, depth_m=empty, sigma_m=empty, status=status, keyframe=keyframe)

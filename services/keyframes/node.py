@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from collections import deque
-from dataclasses import dataclass
 from typing import Annotated
 
 import cv2
@@ -12,9 +11,9 @@ import numpy as np
 from pydantic import Field
 
 from beamsplat.common.config.deployment import NodeConfig
-from beamsplat.common.errors import UserError
 from beamsplat.common.geometry.beams import project_beams
 from beamsplat.common.geometry.camera import Pinhole, Undistorter
+from beamsplat.common.geometry.keyframe_selection import KeyframeSelector, SelectionSettings, field_of_view
 from beamsplat.common.geometry.sensor_history import SensorHistory, TimedScan
 from beamsplat.common.geometry.transforms import inverse
 from beamsplat.common.messages import (
@@ -24,6 +23,8 @@ from beamsplat.common.messages import (
     Image,
     Keyframe,
     KeyframeAck,
+    KeyframeCandidate,
+    KeyframeDecision,
     MovingBeams,
     Odometry,
     Rig,
@@ -37,7 +38,6 @@ from beamsplat.common.messages.map import ODOM_ORIGIN
 from beamsplat.common.runtime.node import Input, Node, Outputs
 from beamsplat.services.keyframes.dynamic_mask import dynamic_object_mask
 from beamsplat.services.keyframes.outbox import Outbox
-from beamsplat.services.keyframes.selection import KeyframeSelector, SelectionSettings
 
 log = logging.getLogger("beamsplat.keyframes")
 
@@ -50,11 +50,10 @@ _BEAMS_PATIENCE_NS = 400_000_000  # the scan of a 5 Hz lidar is complete by then
 class KeyframesConfig(NodeConfig):
     """Options of the keyframes service: selection, and the outbox of unacknowledged keyframes."""
 
-    distance_m: Annotated[float, Field(gt=0.0)] = 0.25
-    angle_rad: Annotated[float, Field(gt=0.0)] = 0.22
+    distance_m: Annotated[float, Field(gt=0.0)] = 0.3
+    angle_rad: Annotated[float, Field(gt=0.0)] = 0.26
     least_overlap: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.6
-    patience: Annotated[int, Field(ge=1)] = 2  # images considered when one is blurred
-    swept_only: bool = True  # only images with a plane sweep in fusion; False: any with depth
+    patience: Annotated[int, Field(ge=1)] = 2  # the image of this number is taken even if it is blurred
     durable: bool = False  # live: unacknowledged keyframes are kept on disk, in the state folder
     queue_mb: Annotated[float, Field(gt=0.0)] = (
         64.0  # largest size of the outbox: about four keyframes per megabyte
@@ -66,14 +65,13 @@ class KeyframesConfig(NodeConfig):
     jpeg_quality: Annotated[int, Field(ge=50, le=100)] = 95  # of images that arrive uncompressed
 
 
-@dataclass(frozen=True)
-class _Candidate:
-    image: Image
-    depth: FusedDepth
-
-
 class KeyframesNode(Node):
-    """Publishes keyframes: image, fused depth, beams and pose at one time, relative to the newest anchor."""
+    """Decides which images become keyframes, and publishes these: image, fused depth, beams and pose at one
+    time, relative to the newest anchor.
+
+    Fusion asks before it computes the depth of an image (`keyframes/candidate`). A keyframe whose depth is
+    rejected is withdrawn; a later image takes its place.
+    """
 
     name = "keyframes"
     Config = KeyframesConfig
@@ -85,17 +83,20 @@ class KeyframesNode(Node):
         Input("localization/correction", "every"),
         Input("localization/anchors", "every"),
         "localization/movers",
+        Input("keyframes/candidate", feedback=True),
         Input("fusion/depth", "every"),
         Input("keyframes/ack", feedback=True),
     )
-    outputs = ("keyframes/frame",)
+    outputs = ("keyframes/decision", "keyframes/frame")
 
     def configure(self) -> None:
         self._history: SensorHistory | None = None
         self._rig: Rig | None = None
         self._images: deque[Image] = deque(maxlen=_IMAGES)
         self._depths: deque[FusedDepth] = deque(maxlen=_IMAGES)
-        self._candidates: deque[tuple[int, _Candidate]] = deque(maxlen=8)
+        self._selector: KeyframeSelector | None = None
+        self._undecided: deque[KeyframeCandidate] = deque(maxlen=_IMAGES)  # until the calibration is known
+        self._reasons: dict[int, str] = {}  # stamp of a selected image -> why; until its depth arrives
         self._T_map_odom = np.eye(4)
         self._localizer, self._map_uuid = "", ""  # the localization process, and its map
         self._reset_frame()
@@ -105,7 +106,7 @@ class KeyframesNode(Node):
         )
         self._outbox = Outbox(round(c.queue_mb * 1e6), round(c.retry_s * 1e9), c.window, folder)
         self._now_ns = 0  # image time
-        self._seen = self._sent = self._sent_again = 0
+        self._sent = self._sent_again = 0
         self._rejected: set[int] = set()
         if self._outbox.of_earlier_drives:
             log.info(
@@ -123,34 +124,37 @@ class KeyframesNode(Node):
             if self._localizer:
                 self._reset_frame()
                 if self._rig is not None:
-                    self.on_rig(self._rig)
+                    self._set_up(self._rig)
             self._localizer = self._outbox.drive = header.instance
 
     def _reset_frame(self) -> None:
         self._anchor_id, self._T_map_anchor, self._optimisation = ODOM_ORIGIN, np.eye(4), 0
         self._depths.clear()
-        self._candidates.clear()
+        self._reasons.clear()
 
     def on_rig(self, rig: Rig) -> Outputs:
-        """Set up camera and lidar; the camera is required. A second calibration restarts the selection."""
+        """Set up camera and lidar; a second calibration restarts the selection."""
+        self._set_up(rig)
+        yield from self._decide()
+
+    def _set_up(self, rig: Rig) -> None:
+        """Set up camera and lidar; the camera is required."""
         if rig.camera is None:
             log.error("the calibration has no camera: there are no keyframes; add [camera] to the rig file")
-            return iter(())
+            return
         c = rig.camera
         self._camera, self._rig = c, rig
         lens = Pinhole.of(c)
         self._undistort = Undistorter(lens)
         self._history = SensorHistory(np.eye(4) if rig.lidar is None else rig.lidar.T_body_lidar)
         s = self.config
-        fov = 2.0 * np.arctan([0.5 * c.width_px / c.fx_px, 0.5 * c.height_px / c.fy_px])
         self._selector = KeyframeSelector(
-            (float(fov[0]), float(fov[1])),
+            field_of_view(lens),
             SelectionSettings(
                 distance_m=s.distance_m, angle_rad=s.angle_rad, least_overlap=s.least_overlap,
                 patience=s.patience,
             ),
         )  # fmt: skip
-        return iter(())
 
     def on_lidar_scan(self, scan: Scan) -> Outputs:
         if self._history is not None:
@@ -195,18 +199,41 @@ class KeyframesNode(Node):
             self._sent_again += 1
             yield "keyframes/frame", frame.model_copy(update={"backlog": len(self._outbox)})
 
+    def on_keyframes_candidate(self, candidate: KeyframeCandidate) -> Outputs:
+        """Decide whether an image becomes a keyframe; before the calibration is known, fusion waits."""
+        self._undecided.append(candidate)
+        yield from self._decide()
+
+    def _decide(self) -> Outputs:
+        while self._selector is not None and self._undecided:
+            candidate = self._undecided.popleft()
+            T_odom_camera = candidate.T_odom_body @ self._camera.T_body_camera
+            selection = self._selector.decide(T_odom_camera, candidate.sharpness)
+            if selection.selected:
+                self._reasons[candidate.stamp_ns] = selection.reason
+                if len(self._reasons) > _IMAGES:  # depth that never arrived
+                    del self._reasons[next(iter(self._reasons))]
+            decision = KeyframeDecision(
+                stamp_ns=candidate.stamp_ns, keyframe=selection.selected, reason=selection.reason
+            )
+            yield "keyframes/decision", decision
+
     def on_fusion_depth(self, depth: FusedDepth) -> Outputs:
-        if depth.status == "ok" and (depth.keyframe or not self.config.swept_only):
+        """Keep the depth of a selected image; one without depth is withdrawn."""
+        if depth.keyframe and depth.status == "ok":
             self._depths.append(depth)
+        elif depth.keyframe and self._selector is not None:
+            self._selector.withdraw()
+            self._reasons.pop(depth.stamp_ns, None)
         return iter(())
 
     def on_localization_odometry(self, odometry: Odometry) -> Outputs:
-        """Add a pose, and consider the images whose beams can be deskewed now."""
+        """Add a pose, and publish the keyframes whose beams can be deskewed now."""
         if self._history is None or odometry.status != "ok":
             return
         self._history.add_pose(odometry.stamp_ns, odometry.T_odom_body)
         while self._depths and self._beams_are_known(self._depths[0].stamp_ns, odometry.stamp_ns):
-            yield from self._consider(self._depths.popleft())
+            yield from self._publish(self._depths.popleft())
 
     def _beams_are_known(self, image_ns: int, pose_ns: int) -> bool:
         """Return whether the scan around an image is complete, or the waiting time is over."""
@@ -233,27 +260,17 @@ class KeyframesNode(Node):
         self._update_detail()
 
     def drain(self) -> Outputs:
-        """Consider the remaining images without waiting for further poses."""
+        """Publish the remaining keyframes without waiting for further poses."""
         while self._history is not None and self._depths:
-            yield from self._consider(self._depths.popleft())
+            yield from self._publish(self._depths.popleft())
 
-    def _consider(self, depth: FusedDepth) -> Outputs:
+    def _publish(self, depth: FusedDepth) -> Outputs:
+        """Publish the keyframe of a selected image with depth, and keep it until it is acknowledged."""
         image = next((p for p in self._images if p.stamp_ns == depth.stamp_ns), None)
         if image is None:
+            log.warning("a keyframe is lost: its image arrived more than %d images ago", _IMAGES)
             return
-        try:
-            rgb = decode_rgb(image.data, image.encoding, image.width_px, image.height_px, image.step_bytes)
-        except UserError as error:
-            log.warning("an image is skipped: %s", error)
-            return
-        self._seen += 1
-        self._candidates.append((self._seen, _Candidate(image, depth)))
-        grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
-        decision = self._selector.consider(self._seen, grey, depth.T_odom_body @ self._camera.T_body_camera)
-        chosen = next((c for number, c in self._candidates if number == decision.key), None)
-        if chosen is None:
-            return
-        frame = self._keyframe(chosen, decision.reason)
+        frame = self._keyframe(image, depth, self._reasons.pop(depth.stamp_ns, ""))
         T_map_camera = frame.T_map_anchor @ frame.T_anchor_body @ frame.camera.T_body_camera
         units = (self.config.distance_m, self.config.angle_rad)
         view = np.concatenate([T_map_camera[:3, 3] / units[0], T_map_camera[:3, 2] / units[1]])
@@ -262,9 +279,8 @@ class KeyframesNode(Node):
         self._update_detail()
         yield "keyframes/frame", frame.model_copy(update={"backlog": len(self._outbox)})
 
-    def _keyframe(self, chosen: _Candidate, why: str) -> Keyframe:
+    def _keyframe(self, image: Image, depth: FusedDepth, why: str) -> Keyframe:
         """Return the keyframe message, with the poses of the latest optimisation."""
-        image, depth = chosen.image, chosen.depth
         stamp_ns, T_body_camera = image.stamp_ns, self._camera.T_body_camera
         encoding, picture = self._compress(image)
         beams, _ = self._history.beams(stamp_ns)

@@ -56,6 +56,38 @@ def test_the_house_comes_out_metric(shared_dir):
         assert message.residual_m < 0.03
 
 
+def test_images_are_swept_as_the_keyframes_service_decides(shared_dir):
+    """Every candidate gets one decision, and the fused depth carries it; published keyframes are those."""
+    nodes = {
+        "replay": {"data": str(shared_dir / "data/house_a/bag"), "duration_s": 4.0},
+        "localization": {"kind": "lidar"}, "depth": {"source": "stixel"}, "fusion": {},
+        "keyframes": {"distance_m": 0.4},
+    }  # fmt: skip
+    deployment, by_topic = Deployment(nodes=nodes), {}
+
+    def on_message(envelope):
+        by_topic.setdefault(envelope.topic, {})[envelope.message.stamp_ns] = envelope.message
+
+    Lockstep([build_node(deployment, name) for name in nodes], on_message).run()
+    candidates, decisions = by_topic["keyframes/candidate"], by_topic["keyframes/decision"]
+    assert set(candidates) == set(decisions) == set(by_topic["fusion/depth"])
+    selected = {stamp for stamp, decision in decisions.items() if decision.keyframe}
+    assert selected == {stamp for stamp, fused in by_topic["fusion/depth"].items() if fused.keyframe}
+    assert selected == set(by_topic["keyframes/frame"])
+    assert 2 <= len(selected) < 0.5 * len(decisions)
+
+
+def test_a_candidate_without_an_answer_is_dropped_and_counted():
+    node = FusionNode(FusionNode.Config())
+    node.configure()
+    out = _feed(node, RIG, _scan(7 * S), _odometry(7 * S))
+    for k in range(15):
+        out += _feed(node, *_moment(k, _live_image(k)))
+    assert [topic for topic, _ in out] == ["keyframes/candidate"] * 2
+    assert node.overtaken > 0
+    assert node.awaits_feedback()
+
+
 def _scan(stamp_ns):
     return Scan(
         stamp_ns=stamp_ns, angle_min_rad=-1.5, angle_increment_rad=0.01, time_increment_s=1e-4, scan_time_s=0.1,
@@ -119,8 +151,7 @@ def test_an_image_of_another_size_is_refused_with_both_sizes():
     [(_image(S // 2, 0), "black|dark"), (_image(S // 2, 255), "overexposed|bright|white")],
 )
 def test_an_image_that_shows_nothing_gives_no_depth(image, reason):
-    node = FusionNode(FusionNode.Config())
-    node.configure()
+    node = _node()
     empty = DepthEstimate(stamp_ns=S // 2, source="none", kind="none", values=np.zeros((0, 0), np.float32))
     scans = [m for i in range(-3, 1) for m in (_scan(10 * S + i * S), _odometry(10 * S + i * S))]
     shifted = image.model_copy(update={"stamp_ns": 10 * S - S // 2})
@@ -134,7 +165,9 @@ def test_an_image_that_shows_nothing_gives_no_depth(image, reason):
 
 
 def _node(**config):
+    """A fusion node in a system without a keyframes service."""
     node = FusionNode(FusionNode.Config(**config))
+    node.without_producer = frozenset({"keyframes/decision"})
     node.configure()
     return node
 

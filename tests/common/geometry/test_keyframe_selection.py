@@ -5,8 +5,13 @@ import numpy as np
 import pytest
 
 from beamsplat.common.geometry.frames import camera_mount
+from beamsplat.common.geometry.keyframe_selection import (
+    KeyframeSelector,
+    SelectionSettings,
+    overlap,
+    sharpness,
+)
 from beamsplat.common.geometry.transforms import make_transform, se2_to_se3, so3_exp
-from beamsplat.services.keyframes.selection import KeyframeSelector, SelectionSettings, overlap, sharpness
 
 FOV_RAD = (1.09, 0.85)
 HALF = np.tan(0.5 * np.array(FOV_RAD))
@@ -25,8 +30,9 @@ def pose(x_m=0.0, yaw_rad=0.0):
 
 def keys(poses, pictures=None, **settings):
     selector = KeyframeSelector(FOV_RAD, SelectionSettings(**settings))
-    found = [selector.consider(i, SHARP if pictures is None else pictures[i], T) for i, T in enumerate(poses)]
-    return [d.key for d in found if d.key is not None], [d.reason for d in found]
+    images = [SHARP] * len(poses) if pictures is None else pictures
+    found = [selector.decide(T, sharpness(image)) for T, image in zip(poses, images)]
+    return [i for i, d in enumerate(found) if d.selected], [d.reason for d in found]
 
 
 def test_motion_decides_on_both_sides_of_the_threshold():
@@ -53,7 +59,16 @@ def test_waits_for_a_sharp_picture_but_not_for_ever():
     assert taken[:2] == [0, 8]
     assert "blurred" in reasons[6]
     taken, _ = keys(poses, [SHARP] * 3 + [BLURRED] * 17, distance_m=0.3, patience=3)
-    assert taken[1] in (6, 7, 8)
+    assert taken[1] == 8  # due at 6, the third image is taken
+
+
+def test_a_selection_that_is_withdrawn_is_made_up_for_by_the_next_image():
+    selector = KeyframeSelector(FOV_RAD, SelectionSettings(distance_m=0.3))
+    assert selector.decide(pose(0.0), 1.0).selected
+    assert selector.decide(pose(0.4), 1.0).selected
+    selector.withdraw()
+    assert selector.decide(pose(0.42), 1.0).selected
+    assert not selector.decide(pose(0.45), 1.0).selected
 
 
 def test_a_broken_pose_is_refused():

@@ -1,7 +1,8 @@
 """Selection of keyframes by motion, overlap and sharpness, from pose and image alone.
 
 An image becomes a keyframe if the camera has moved or turned far enough since the last keyframe, or if too
-little of the last keyframe's view is still visible. Of the next `patience` images the sharpest is taken.
+little of the last keyframe's view is still visible. A blurred image is passed over, but at most `patience`
+images in a row.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from beamsplat.common.geometry.camera import Pinhole
 from beamsplat.common.geometry.transforms import inverse, is_rigid, so3_log
 
 
@@ -22,8 +24,8 @@ class SelectionSettings:
     angle_rad: float = 0.26
     least_overlap: float = 0.6  # share of the last keyframe's view that is still visible
     typical_depth_m: float = 2.5  # at which the overlap is computed
-    patience: int = 3  # images considered once a keyframe is due
-    blur_ratio: float = 0.5  # an image above this share of the mean sharpness is taken at once
+    patience: int = 2  # the image of this number after a keyframe is due is taken even if it is blurred
+    blur_ratio: float = 0.5  # an image below this share of the mean sharpness is blurred
 
     def __post_init__(self) -> None:
         if self.distance_m <= 0.0 or self.angle_rad <= 0.0 or not 0.0 <= self.least_overlap < 1.0:
@@ -33,58 +35,45 @@ class SelectionSettings:
 
 
 @dataclass(frozen=True)
-class KeyframeDecision:
-    """`key` is the number of the image to use, as counted by the caller, or None; `reason` states why."""
+class Selection:
+    """Whether an image becomes a keyframe, and why."""
 
-    key: int | None
+    selected: bool
     reason: str
 
 
-@dataclass
-class _Candidate:
-    number: int
-    sharpness: float
-    T_map_camera: np.ndarray
-    left: int
-    why: str
-
-
 class KeyframeSelector:
-    """Selector of keyframes in a stream of images; a decision may name the present or a recent image."""
+    """Decides for each candidate image in turn whether it becomes a keyframe."""
 
     def __init__(self, fov_rad: tuple[float, float], settings: SelectionSettings | None = None) -> None:
+        """`fov_rad`: horizontal and vertical field of view."""
         self.settings = settings or SelectionSettings()
         self._half = np.tan(0.5 * np.asarray(fov_rad, dtype=np.float64))
-        self._last: np.ndarray | None = None
+        self._last: np.ndarray | None = None  # T_map_camera of the last keyframe
+        self._before_last: np.ndarray | None = None
         self._mean_sharpness: float | None = None
-        self._candidate: _Candidate | None = None
+        self._blurred = 0  # candidates passed over since a keyframe was due
 
-    def consider(self, number: int, grey: np.ndarray, T_map_camera: np.ndarray) -> KeyframeDecision:
-        """Return the decision after one image uint8 [H, W]; call it for all images in order."""
+    def decide(self, T_map_camera: np.ndarray, sharpness: float) -> Selection:
+        """Return the decision on one candidate, given its camera pose and its `sharpness`."""
         if not is_rigid(T_map_camera):
-            return KeyframeDecision(None, "its pose is not a rigid transform")
-        sharp = sharpness(grey)
-        mean_sharpness = sharp if self._mean_sharpness is None else self._mean_sharpness
-        self._mean_sharpness = 0.95 * mean_sharpness + 0.05 * sharp
-        why = self._trigger(T_map_camera)
-        if why is None and self._candidate is None:
-            return KeyframeDecision(None, "too close to the last keyframe")
-        if self._candidate is None or sharp > self._candidate.sharpness:
-            left = self.settings.patience if self._candidate is None else self._candidate.left
-            self._candidate = _Candidate(number, sharp, T_map_camera, left, why or self._candidate.why)
-        self._candidate.left -= 1
-        if (
-            self._candidate.sharpness >= self.settings.blur_ratio * mean_sharpness
-            or self._candidate.left <= 0
-        ):
-            return self._take()
-        return KeyframeDecision(None, "blurred: waiting for a sharper image")
+            return Selection(False, "its pose is not a rigid transform")
+        mean = sharpness if self._mean_sharpness is None else self._mean_sharpness
+        self._mean_sharpness = 0.95 * mean + 0.05 * sharpness
+        reason = self._trigger(T_map_camera)
+        if reason is None:
+            self._blurred = 0
+            return Selection(False, "too close to the last keyframe")
+        if sharpness < self.settings.blur_ratio * mean and self._blurred + 1 < self.settings.patience:
+            self._blurred += 1
+            return Selection(False, "blurred: waiting for a sharper image")
+        self._blurred = 0
+        self._before_last, self._last = self._last, T_map_camera
+        return Selection(True, reason)
 
-    def _take(self) -> KeyframeDecision:
-        candidate = self._candidate
-        assert candidate is not None
-        self._last, self._candidate = candidate.T_map_camera, None
-        return KeyframeDecision(candidate.number, candidate.why)
+    def withdraw(self) -> None:
+        """Undo the last selection: that image got no depth, so a later one has to take its place."""
+        self._last = self._before_last
 
     def _trigger(self, T_map_camera: np.ndarray) -> str | None:
         if self._last is None:
@@ -99,7 +88,15 @@ class KeyframeSelector:
         return None
 
 
-def sharpness(grey: np.ndarray) -> float:
+def field_of_view(camera: Pinhole) -> tuple[float, float]:
+    """Return the horizontal and vertical field of view in rad, without distortion."""
+    half = np.arctan([0.5 * camera.width_px / camera.fx_px, 0.5 * camera.height_px / camera.fy_px])
+    return 2.0 * float(half[0]), 2.0 * float(half[1])
+
+
+def sharpness(
+    grey: np.ndarray,  # uint8 [H, W]
+) -> float:
     """Return the variance of the Laplacian over that of the image, which is independent of contrast."""
     small = cv2.resize(grey, (320, 240), interpolation=cv2.INTER_AREA).astype(np.float32)
     return float(cv2.Laplacian(small, cv2.CV_32F).var() / (small.var() + 25.0))
