@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 OUT ?= out/demo
 STAMP := $(VENV)/.installed
 
-.PHONY: setup demo test slow soak bench bench-slam lint clean
+.PHONY: setup demo test slow soak bench bench-slam lint docs clean
 
 setup: $(STAMP)
 
@@ -53,5 +53,17 @@ lint: setup
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 
+# The package as one folder of links: tools that read sources cannot follow an editable install.
+TYPED := build/typed
+
+$(TYPED):
+	mkdir -p $@/beamsplat
+	ln -sfn ../../../tools/api/__init__.py ../../../tools/api/py.typed $@/beamsplat
+	ln -sfn ../../../common ../../../services ../../../tools ../../../deploy $@/beamsplat
+
+# The documentation site in build/site; its reference pages are generated from the code by docs/hooks.py.
+docs: setup $(TYPED)
+	NO_MKDOCS_2_WARNING=true $(BIN)/mkdocs build --strict
+
 clean:
-	rm -rf $(VENV) out .numba_cache
+	rm -rf $(VENV) out build .numba_cache

@@ -24,7 +24,9 @@ def camera_mount(
     """Return `T_body_camera` [4, 4] from the camera's measured position and viewing direction.
 
     Args:
-        x_m, y_m, z_m: position of the camera centre in the body frame.
+        x_m: position of the camera centre in the body frame, forward.
+        y_m: to the left.
+        z_m: above the floor.
         pitch_down_rad: rotates the view towards the floor.
         yaw_left_rad: rotates the view to the left.
     """

@@ -66,7 +66,8 @@ class RecordingWriter:
 
     Args:
         path: folder to create (a ROS 2 bag with NAME_0.mcap and metadata.yaml), or a file ending in .mcap.
-        chunk_bytes, chunk_s: a chunk ends at this size or duration of log time; a crash loses one chunk.
+        chunk_bytes: a chunk ends at this size; a crash loses at most one chunk.
+        chunk_s: a chunk ends after this duration of log time.
         compression: of the chunks.
         sync: call fdatasync after each chunk, against power loss.
         overwrite: replace an existing recording.
