@@ -27,8 +27,8 @@ def used(node):
     mapper = node._mapper
     store = mapper.store
     gaussians = 2 * sum(getattr(store, n)[..., : store.count].nbytes for n in store._arrays())
-    pictures = sum(map(image_bytes, mapper.keyframes.values()))
-    return PROCESS_MB * 1e6 + gaussians + pictures + mapper.workspace_bytes
+    images = sum(map(image_bytes, mapper.keyframes.values()))
+    return PROCESS_MB * 1e6 + gaussians + images + mapper.workspace_bytes
 
 
 @pytest.fixture(scope="module")
@@ -71,13 +71,13 @@ def test_a_checkpoint_includes_paged_out_keyframes_and_resumes_with_or_without_a
     for output in node.drain():
         sent.setdefault(output[0], []).append(output[1])
     assert len(sent["mapping/poses"][-1].keyframe_ids) == 24
-    parked = {id: held.delta for id, held in node._mapper.paged_out.items()}
+    paged_out = {id: held.delta for id, held in node._mapper.paged_out.items()}
     node.close()
     arrays = SessionFolder(folder).read_state()
     assert len(keyframe_views(arrays)) == 24
     again = make_node(folder, memory_mb=BUDGET_MB)
-    assert set(again._mapper.paged_out) == set(parked)
-    for id, delta in parked.items():
+    assert set(again._mapper.paged_out) == set(paged_out)
+    for id, delta in paged_out.items():
         np.testing.assert_array_equal(again._mapper.paged_out[id].delta, delta)
     assert list(again._mapper.keyframes) == list(node._mapper.keyframes)
     again.close()
