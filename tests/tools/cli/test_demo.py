@@ -7,9 +7,11 @@ import cv2
 import numpy as np
 import pytest
 from plyfile import PlyData
+from typer.testing import CliRunner
 
 from beamsplat.common.geometry.trajectory import read_tum
 from beamsplat.tools.cli.demo import demo
+from beamsplat.tools.cli.main import app
 
 
 @pytest.fixture(scope="module")
@@ -43,6 +45,10 @@ def test_the_demo_leaves_what_it_names(drive, tmp_path, free_endpoint, capsys):
         "recording",
     ):
         assert name in said
+    shown = CliRunner().invoke(app, ["session", "info", str(tmp_path / "out"), "--json"])
+    assert json.loads(shown.stdout)["robot"]["submaps"] >= 1, "the session lacks the robot's half"
+    exported = CliRunner().invoke(app, ["export", str(tmp_path / "out"), "--to", "nav2"])
+    assert exported.exit_code == 0, exported.output
     assert figures["ate_first_pose_rmse_m"] < 0.05
     assert figures["keyframes"] >= 3
     assert PlyData.read(tmp_path / "out" / "map" / "splats.ply")["vertex"].count == figures["gaussians"]

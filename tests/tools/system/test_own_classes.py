@@ -88,7 +88,7 @@ def test_a_node_that_no_service_has_the_name_of_runs_if_its_class_declares_it(mo
         ("depth", "{}_absent:X", "there is no module"),
         ("depth", "{}_broken:X", "ZeroDivisionError: division by zero"),
         ("depth", "{}_broken:X", "_broken.py, line 2"),
-        ("ghost", "{}_wrong:Wrong", "writes lidar/scan, whose producers are"),
+        ("ghost", "{}_wrong:Wrong", "publishes lidar/scan, whose producers are"),
         ("depth", "not a module:X", "expected 'module:Class'"),
         ("operator", "{}:Wheels", "reserved"),
     ],
