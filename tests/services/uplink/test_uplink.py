@@ -215,7 +215,7 @@ def test_the_check_knows_topics_from_the_other_side(tmp_path):
     lonely = pair.robot.model_copy(update={"nodes": {"localization": {"kind": "known"}}})
     assert any("without node uplink" in f.text for f in faults(lonely, TABLE))
     both = pair.edge.model_copy(update={"nodes": {"localization": {"kind": "known"}}})
-    assert any("written by localization and the uplink" in f.text for f in faults(both, TABLE))
+    assert any("published by localization and the uplink" in f.text for f in faults(both, TABLE))
 
 
 def test_the_uplink_needs_a_bus():
