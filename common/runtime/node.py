@@ -109,7 +109,7 @@ class Node:
     def __init__(self, config: NodeConfig) -> None:
         self.config = config
         self.live_settings: LiveSettings | None = None  # None in lockstep
-        self.without_producer: frozenset[str] = frozenset()  # inputs without a producer in the system; set by the runner
+        self.without_producer: frozenset[str] = frozenset()  # of the inputs, in this system; set by the runner
         self.detail = ""  # one line that is shown with the node's health
 
     def __init_subclass__(cls, **kwargs: Any) -> None:

@@ -72,7 +72,7 @@ def test_chunks_make_up_the_map(drive):
     for chunk in letters["mapping/chunk"]:
         assert chunk.revision > newest[chunk.anchor_id].revision if chunk.anchor_id in newest else True
         newest[chunk.anchor_id] = chunk
-    assert set(newest) == {-1, 0, 1}
+    assert set(newest) == {0, 1}
     store = node._mapper.store
     for anchor, chunk in newest.items():
         params = transform_gaussians(unpack(chunk.packed), chunk.T_map_anchor)
