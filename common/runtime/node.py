@@ -109,7 +109,7 @@ class Node:
     def __init__(self, config: NodeConfig) -> None:
         self.config = config
         self.live_settings: LiveSettings | None = None  # None in lockstep
-        self.without_producer: frozenset[str] = frozenset()  # of the inputs, in this system; set by the runner
+        self.without_producer: frozenset[str] = frozenset()  # inputs that nothing publishes; set by runners
         self.detail = ""  # one line that is shown with the node's health
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
