@@ -33,7 +33,8 @@ demo: setup
 	$(BIN)/beamsplat demo --out $(OUT)
 
 test: setup
-	$(BIN)/python -m pytest -m "not soak and not slow" --durations=12
+	$(BIN)/python -m pytest -m "not live and not soak and not slow" -n auto --maxprocesses 4 --dist loadfile
+	$(BIN)/python -m pytest -m "live and not soak and not slow" --durations=12
 
 # Whole drives and whole systems, minutes in all; most of them need recordings with truth.
 slow: setup
@@ -49,17 +50,18 @@ bench: setup
 bench-slam: setup
 	$(BIN)/beamsplat bench slam --data $(DATA) --out out/slam --readme README.md --pictures docs/slam_maps.jpg
 
-lint: setup
-	$(BIN)/ruff check .
-	$(BIN)/ruff format --check .
-
 # The package as one folder of links: tools that read sources cannot follow an editable install.
 TYPED := build/typed
 
+lint: setup $(TYPED)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
 $(TYPED):
 	mkdir -p $@/beamsplat
-	ln -sfn ../../../tools/api/__init__.py ../../../tools/api/py.typed $@/beamsplat
-	ln -sfn ../../../common ../../../services ../../../tools ../../../deploy $@/beamsplat
+	ln -sfn ../../../tools/api/__init__.py ../../../tools/api/__main__.py $@/beamsplat
+	ln -sfn ../../../tools/api/py.typed ../../../common ../../../services ../../../tools ../../../deploy $@/beamsplat
 
 # The documentation site in build/site; its reference pages are generated from the code by docs/hooks.py.
 docs: setup $(TYPED)

@@ -10,6 +10,21 @@ from hypothesis import settings
 settings.register_profile("beamsplat", deadline=None)
 settings.load_profile("beamsplat")
 
+
+# Tests of whole systems, drivers and servers: they run alone, so that no process starves another.
+LIVE = ("common/zenoh", "services/camera", "services/lidar", "services/monitor", "services/page", "services/ros2",
+        "services/uplink", "tools/cli", "tools/keys", "tools/setup", "tools/system")  # fmt: skip
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark the tests that must not run in parallel with others."""
+    here = Path(__file__).parent
+    for item in items:
+        folder = item.path.relative_to(here).parent.as_posix()
+        if folder.startswith(LIVE) or "free_endpoint" in getattr(item, "fixturenames", ()):
+            item.add_marker(pytest.mark.live)
+
+
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 
 

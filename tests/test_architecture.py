@@ -141,3 +141,19 @@ def test_heavy_imports_stay_out_of_the_command_line():
             else:
                 continue
             assert not names & heavy, f"{path.name} imports {names & heavy} at the top"
+
+
+def test_no_two_public_classes_share_a_name():
+    found: dict[str, list[str]] = {}
+    for path in SOURCES:
+        for node in ast.parse(path.read_text()).body:
+            if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+                found.setdefault(node.name, []).append(path.relative_to(ROOT).as_posix())
+    assert not {name: paths for name, paths in found.items() if len(paths) > 1}
+
+
+def test_every_compiled_function_uses_the_kernel_decorator():
+    """Its cache notices changed helpers; `numba.njit` alone would run old machine code."""
+    allowed = {"common/compiled.py", "common/raster/simd_memory.py"}
+    users = {p.relative_to(ROOT).as_posix() for p in SOURCES if "njit" in p.read_text()}
+    assert users <= allowed
