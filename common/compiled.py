@@ -10,10 +10,11 @@ import hashlib
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar, overload
 
 from numba import njit
 
+_F = TypeVar("_F", bound=Callable[..., Any])
 _SHARED = Path(__file__).parent / "raster"  # its helpers are inlined into kernels of other folders too
 
 
@@ -22,6 +23,14 @@ def _digest(folder: Path) -> str:
     """Return the SHA-256 digest of the sources in a folder and of the shared helpers."""
     sources = sorted({*folder.glob("*.py"), *_SHARED.glob("*.py"), Path(__file__)})
     return hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()
+
+
+@overload
+def kernel(function: _F, *, fastmath: bool | set[str] = False, sources: str = "") -> _F: ...
+
+
+@overload
+def kernel(*, fastmath: bool | set[str] = False, sources: str = "") -> Callable[[_F], _F]: ...
 
 
 def kernel(
@@ -47,5 +56,11 @@ def kernel(
     return compiled
 
 
-inner = njit(error_model="numpy")  # helper functions; LLVM may inline them into kernels
-inlined = njit(inline="always", error_model="numpy")  # helper functions that Numba inlines always
+def inner(function: _F) -> _F:
+    """Compile a helper function of kernels; LLVM may inline it into them."""
+    return njit(error_model="numpy")(function)
+
+
+def inlined(function: _F) -> _F:
+    """Compile a helper function of kernels that Numba always inlines."""
+    return njit(inline="always", error_model="numpy")(function)

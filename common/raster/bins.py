@@ -7,6 +7,8 @@ the tile and the range of rows of each pair.
 
 from __future__ import annotations
 
+import numpy as np
+
 from beamsplat.common.compiled import kernel
 from beamsplat.common.raster.layout import BATCHES
 from beamsplat.common.raster.project import batch_size
@@ -14,7 +16,15 @@ from beamsplat.common.raster.simd_memory import atomic_next
 
 
 @kernel
-def count_pairs(counter, visible, order, first_pair, pair_count, tiles, per_tile):  # noqa: ANN001, ANN201
+def count_pairs(
+    counter: np.ndarray,
+    visible: int,
+    order: np.ndarray,
+    first_pair: np.ndarray,
+    pair_count: np.ndarray,
+    tiles: np.ndarray,
+    per_tile: np.ndarray,
+) -> None:
     """Count the pairs of each batch in each tile, into `per_tile` int32 [BATCHES, tiles]."""
     size = batch_size(visible)
     while True:
@@ -29,7 +39,7 @@ def count_pairs(counter, visible, order, first_pair, pair_count, tiles, per_tile
 
 
 @kernel
-def prefix_sum(per_tile, tile_start):  # noqa: ANN001, ANN201
+def prefix_sum(per_tile: np.ndarray, tile_start: np.ndarray) -> int:
     """Replace the counts by start rows in the lists, fill `tile_start`, and return the number of pairs.
 
     The start rows are an exclusive prefix sum over tiles and, within a tile, over batches.
@@ -46,9 +56,17 @@ def prefix_sum(per_tile, tile_start):  # noqa: ANN001, ANN201
 
 
 @kernel
-def scatter(  # noqa: ANN201
-    counter, visible, order, first_pair, pair_count, tiles, rows, per_tile, lists,  # noqa: ANN001
-):  # fmt: skip
+def scatter(
+    counter: np.ndarray,
+    visible: int,
+    order: np.ndarray,
+    first_pair: np.ndarray,
+    pair_count: np.ndarray,
+    tiles: np.ndarray,
+    rows: np.ndarray,
+    per_tile: np.ndarray,
+    lists: np.ndarray,
+) -> None:
     """Write (splat, rows) of each pair to `lists` int32 [pairs, 2]; set tiles[pair] to the pair's row."""
     size = batch_size(visible)
     while True:

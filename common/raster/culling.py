@@ -14,7 +14,16 @@ BLOCK = 4096  # Gaussians per unit of work of a thread
 
 
 @kernel
-def cull(counter, params, stride, count, camera, index, depth, kept):  # noqa: ANN001, ANN201
+def cull(
+    counter: np.ndarray,
+    params: np.ndarray,
+    stride: int,
+    count: int,
+    camera: np.ndarray,
+    index: np.ndarray,
+    depth: np.ndarray,
+    kept: np.ndarray,
+) -> None:
     """Write index and depth z of the possibly visible Gaussians of the blocks that `counter` assigns.
 
     The bound is conservative: 3.4 times the largest scale, projected at the steepest viewing ray. `params` is
@@ -60,7 +69,7 @@ def cull(counter, params, stride, count, camera, index, depth, kept):  # noqa: A
 
 
 @kernel
-def compact(index, depth, kept):  # noqa: ANN001, ANN201
+def compact(index: np.ndarray, depth: np.ndarray, kept: np.ndarray) -> int:
     """Remove the gaps between blocks in place, and return the number of visible Gaussians.
 
     `index` is padded with its last entry, so that a whole vector can be read at the end.
@@ -77,7 +86,14 @@ def compact(index, depth, kept):  # noqa: ANN001, ANN201
 
 
 @kernel
-def sort_by_depth(depth, n, order, keys, keys_other, order_other):  # noqa: ANN001, ANN201
+def sort_by_depth(
+    depth: np.ndarray,
+    n: int,
+    order: np.ndarray,
+    keys: np.ndarray,
+    keys_other: np.ndarray,
+    order_other: np.ndarray,
+) -> None:
     """Write the indices of depth[0 : n], nearest first, to `order`; the sort is stable.
 
     Radix sort (least significant digit first) on the bits of positive floats, 11 bits per pass, with only as
@@ -104,7 +120,16 @@ def sort_by_depth(depth, n, order, keys, keys_other, order_other):  # noqa: ANN0
 
 
 @kernel
-def _radix_pass(keys, order, keys_out, order_out, histogram, n, low, shift):  # noqa: ANN001, ANN202
+def _radix_pass(
+    keys: np.ndarray,
+    order: np.ndarray,
+    keys_out: np.ndarray,
+    order_out: np.ndarray,
+    histogram: np.ndarray,
+    n: int,
+    low: np.uint32,
+    shift: int,
+) -> None:
     s = np.uint32(shift)
     histogram[:] = 0
     for i in range(n):

@@ -92,9 +92,18 @@ class GaussianArrays:
 
 
 @kernel
-def adam(  # noqa: ANN201
-    counter, gradients, index, params, first, second, steps, rates, isotropy, ratio_log,  # noqa: ANN001
-):  # fmt: skip
+def adam(
+    counter: np.ndarray,
+    gradients: np.ndarray,
+    index: np.ndarray,
+    params: np.ndarray,
+    first: np.ndarray,
+    second: np.ndarray,
+    steps: np.ndarray,
+    rates: np.ndarray,
+    isotropy: np.float32,
+    ratio_log: np.float32,
+) -> None:
     """Take one Adam step (Kingma & Ba 2015) on the visible Gaussians; each one has its own step count.
 
     Args:

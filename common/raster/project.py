@@ -26,13 +26,16 @@ from beamsplat.common.raster.layout import (
 from beamsplat.common.raster.simd import LANES, fma, maximum, minimum, sqrt
 from beamsplat.common.raster.simd_math import LOG2_E, exp_lanes, log2_lanes, sigmoid_lanes
 from beamsplat.common.raster.simd_memory import aligned_floats, atomic_next, gather, store
+from beamsplat.common.raster.simd_types import Vector, Vectors
 
 _LN_255 = float(np.log(255.0))
 _SHIFT_W, _SHIFT_H = TILE_W.bit_length() - 1, TILE_H.bit_length() - 1
 
 
 @inner
-def camera_point(params, stride, index, at, c):  # noqa: ANN001, ANN201
+def camera_point(
+    params: np.ndarray, stride: int, index: np.ndarray, at: int, c: np.ndarray
+) -> tuple[Vector, Vector, Vector]:
     """Return the centres of Gaussians index[at...] in the camera frame (m): three vectors x, y, z."""
     x, y, z = (
         gather(params, 0, index, at),
@@ -46,7 +49,7 @@ def camera_point(params, stride, index, at, c):  # noqa: ANN001, ANN201
 
 
 @inner
-def rotation(params, stride, index, at):  # noqa: ANN001, ANN201
+def rotation(params: np.ndarray, stride: int, index: np.ndarray, at: int) -> tuple[Vectors, Vectors]:
     """Return (unit quaternion w x y z, 1 / stored norm) and R by rows, of Gaussians index[at...]."""
     w, x = gather(params, QUAT * stride, index, at), gather(params, (QUAT + 1) * stride, index, at)
     y, z = gather(params, (QUAT + 2) * stride, index, at), gather(params, (QUAT + 3) * stride, index, at)
@@ -62,7 +65,9 @@ def rotation(params, stride, index, at):  # noqa: ANN001, ANN201
 
 
 @inner
-def axes(params, stride, index, at, c, R):  # noqa: ANN001, ANN201
+def axes(
+    params: np.ndarray, stride: int, index: np.ndarray, at: int, c: np.ndarray, R: Vectors
+) -> tuple[Vectors, Vectors]:
     """Return M = R_camera_map R_q diag(s), nine vectors by rows, and the three scales s (m)."""
     s0 = exp_lanes(gather(params, SCALE * stride, index, at))
     s1 = exp_lanes(gather(params, (SCALE + 1) * stride, index, at))
@@ -82,7 +87,9 @@ def axes(params, stride, index, at, c, R):  # noqa: ANN001, ANN201
 
 
 @inner
-def screen_covariance(M, xc, yc, zc, c):  # noqa: ANN001, ANN201
+def screen_covariance(
+    M: Vectors, xc: Vector, yc: Vector, zc: Vector, c: np.ndarray
+) -> tuple[Vectors, Vectors, Vectors, Vectors]:
     """Return the rows V0, V1 of V = J M, the covariance (a, b, d) in px^2 with blur, and the terms of J.
 
     The terms of J are (1/z, x/z and y/z clamped to the slope limits, J00, J02, J11, J12).
@@ -101,7 +108,15 @@ def screen_covariance(M, xc, yc, zc, c):  # noqa: ANN001, ANN201
 
 
 @kernel
-def _write_records(params, stride, index, first, c, records, lanes):  # noqa: ANN001, ANN202
+def _write_records(
+    params: np.ndarray,
+    stride: int,
+    index: np.ndarray,
+    first: int,
+    c: np.ndarray,
+    records: np.ndarray,
+    lanes: np.ndarray,
+) -> None:
     """Project Gaussians index[first ... first + LANES) to their records at records[first * RECORD ...]."""
     xc, yc, zc = camera_point(params, stride, index, first, c)
     _, R = rotation(params, stride, index, first)
@@ -135,9 +150,20 @@ def _write_records(params, stride, index, first, c, records, lanes):  # noqa: AN
 
 
 @kernel
-def _emit(  # noqa: ANN202
-    begin, stop, records, width, height, tiles_x, first_pair, pair_count, tiles, rows, at, limit,  # noqa: ANN001
-):  # fmt: skip
+def _emit(
+    begin: int,
+    stop: int,
+    records: np.ndarray,
+    width: int,
+    height: int,
+    tiles_x: int,
+    first_pair: np.ndarray,
+    pair_count: np.ndarray,
+    tiles: np.ndarray,
+    rows: np.ndarray,
+    at: int,
+    limit: int,
+) -> int:
     """Write the (tile, rows) pairs of splats begin ... stop from index `at` on, and return the end index.
 
     `rows` holds the first and the last vector of rows that the splat overlaps in the tile. The overlap is
@@ -196,11 +222,28 @@ def _emit(  # noqa: ANN202
 
 
 @kernel
-def project_and_emit(  # noqa: ANN201
-    counter, params, stride, index, visible, camera, width, height, tiles_x,  # noqa: ANN001
-    records, first_pair, pair_count, tiles, rows, emitted,  # noqa: ANN001
-    depth, order, keys, keys_other, order_other,  # noqa: ANN001
-):  # fmt: skip
+def project_and_emit(
+    counter: np.ndarray,
+    params: np.ndarray,
+    stride: int,
+    index: np.ndarray,
+    visible: int,
+    camera: np.ndarray,
+    width: int,
+    height: int,
+    tiles_x: int,
+    records: np.ndarray,
+    first_pair: np.ndarray,
+    pair_count: np.ndarray,
+    tiles: np.ndarray,
+    rows: np.ndarray,
+    emitted: np.ndarray,
+    depth: np.ndarray,
+    order: np.ndarray,
+    keys: np.ndarray,
+    keys_other: np.ndarray,
+    order_other: np.ndarray,
+) -> None:
     """Project the visible Gaussians in batches and list their (splat, tile) pairs; one thread sorts by depth.
 
     `tiles` and `rows` are int32 [BATCHES * capacity]; `emitted` [BATCHES] is the number of pairs of each
@@ -229,6 +272,6 @@ def project_and_emit(  # noqa: ANN201
 
 
 @inner
-def batch_size(visible):  # noqa: ANN001, ANN201
+def batch_size(visible: int) -> int:
     """Return the number of splats per batch: a multiple of LANES, so that batches write separate records."""
     return ((visible + BATCHES - 1) // BATCHES + LANES - 1) // LANES * LANES

@@ -32,12 +32,21 @@ from beamsplat.common.raster.simd_memory import (
     store,
     store_sums4,
 )
+from beamsplat.common.raster.simd_types import Vector, Vectors
 
 _PREFETCH = 24  # slots are prefetched this many pairs ahead
 
 
 @kernel
-def _gather_sums(slots, list_row, first_pair, pair_count, splat, stop, sums):  # noqa: ANN001, ANN202
+def _gather_sums(
+    slots: np.ndarray,
+    list_row: np.ndarray,
+    first_pair: np.ndarray,
+    pair_count: np.ndarray,
+    splat: int,
+    stop: int,
+    sums: np.ndarray,
+) -> None:
     """Add up the slots of each splat of a group into sums[lane * SLOT ...]. A slot is a cache line."""
     for lane in range(LANES):
         at = lane * SLOT
@@ -53,7 +62,9 @@ def _gather_sums(slots, list_row, first_pair, pair_count, splat, stop, sums):  #
 
 
 @inner
-def _screen_to_axes(sums, lane_at, cov, V0, V1):  # noqa: ANN001, ANN202
+def _screen_to_axes(
+    sums: np.ndarray, lane_at: np.ndarray, cov: Vectors, V0: Vectors, V1: Vectors
+) -> tuple[Vector, Vector, Vectors, Vectors]:
     """Return the gradients of the centre (px) and of the rows of V = J M from the moments of v."""
     v_x, v_y = gather(sums, 1, lane_at, 0), gather(sums, 2, lane_at, 0)
     v_xx, v_xy, v_yy = gather(sums, 3, lane_at, 0), gather(sums, 4, lane_at, 0), gather(sums, 5, lane_at, 0)
@@ -70,7 +81,18 @@ def _screen_to_axes(sums, lane_at, cov, V0, V1):  # noqa: ANN001, ANN202
 
 
 @inner
-def _point_gradient(g_u, g_v, g_depth, dV0, dV1, M, xc, yc, J, c):  # noqa: ANN001, ANN202
+def _point_gradient(
+    g_u: Vector,
+    g_v: Vector,
+    g_depth: Vector,
+    dV0: Vectors,
+    dV1: Vectors,
+    M: Vectors,
+    xc: Vector,
+    yc: Vector,
+    J: Vectors,
+    c: np.ndarray,
+) -> tuple[Vector, Vector, Vector]:
     """Return dL/d(centre in the camera frame), through the pixel, the depth and the Jacobian J."""
     inverse, ux, uy = J[0], J[1], J[2]
     d_j00 = dV0[0] * M[0] + dV0[1] * M[1] + dV0[2] * M[2]
@@ -89,7 +111,7 @@ def _point_gradient(g_u, g_v, g_depth, dV0, dV1, M, xc, yc, J, c):  # noqa: ANN0
 
 
 @inner
-def _quat_gradient(q, N):  # noqa: ANN001, ANN202
+def _quat_gradient(q: Vectors, N: Vectors) -> Vectors:
     """Return dL/d(unnormalised quaternion) from N = dL/dR_q (nine vectors by rows)."""
     w, x, y, z = q[0], q[1], q[2], q[3]
     gw = 2.0 * (x * (N[7] - N[5]) + y * (N[2] - N[6]) + z * (N[3] - N[1]))
@@ -101,7 +123,9 @@ def _quat_gradient(q, N):  # noqa: ANN001, ANN202
 
 
 @inner
-def _write_shape(out, at, wide, c, q, M, dM, s):  # noqa: ANN001, ANN202
+def _write_shape(
+    out: np.ndarray, at: int, wide: int, c: np.ndarray, q: Vectors, M: Vectors, dM: Vectors, s: Vectors
+) -> None:
     """Write the gradients of log scales and quaternion; columns of dL/dM belong to the ellipsoid's axes."""
     store(out, SCALE * wide + at, M[0] * dM[0] + M[3] * dM[3] + M[6] * dM[6])
     store(out, (SCALE + 1) * wide + at, M[1] * dM[1] + M[4] * dM[4] + M[7] * dM[7])
@@ -125,7 +149,18 @@ def _write_shape(out, at, wide, c, q, M, dM, s):  # noqa: ANN001, ANN202
 
 
 @kernel
-def _project_backward_group(params, stride, index, first, c, sums, lane_at, out, wide, pose):  # noqa: ANN001, ANN202
+def _project_backward_group(
+    params: np.ndarray,
+    stride: int,
+    index: np.ndarray,
+    first: int,
+    c: np.ndarray,
+    sums: np.ndarray,
+    lane_at: np.ndarray,
+    out: np.ndarray,
+    wide: int,
+    pose: np.ndarray,
+) -> None:
     """Write the gradients of a group of splats to out[row * wide + first], their pose sums to pose[8]."""
     xc, yc, zc = camera_point(params, stride, index, first, c)
     q, Rq = rotation(params, stride, index, first)
@@ -164,9 +199,20 @@ def _project_backward_group(params, stride, index, first, c, sums, lane_at, out,
 
 
 @kernel
-def project_backward(  # noqa: ANN201
-    counter, params, stride, index, visible, camera, slots, list_row, first_pair, pair_count, out, pose_sums,  # noqa: ANN001
-):  # fmt: skip
+def project_backward(
+    counter: np.ndarray,
+    params: np.ndarray,
+    stride: int,
+    index: np.ndarray,
+    visible: int,
+    camera: np.ndarray,
+    slots: np.ndarray,
+    list_row: np.ndarray,
+    first_pair: np.ndarray,
+    pair_count: np.ndarray,
+    out: np.ndarray,
+    pose_sums: np.ndarray,
+) -> None:
     """Write the gradients of visible splats to `out` float32 [GRADIENTS, wide], of the pose to `pose_sums`.
 
     The pose gradient is summed in float64 per batch, `pose_sums` [BATCHES, 6], so that the result does not

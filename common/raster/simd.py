@@ -13,11 +13,14 @@ from collections.abc import Callable
 from typing import Any
 
 import llvmlite.binding as llvm
+import numpy as np
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
 from numba.core.typing.templates import ConcreteTemplate, infer_global, signature
-from numba.extending import intrinsic, lower_builtin, models, register_model
+from numba.extending import lower_builtin, models, register_model
+
+from beamsplat.common.raster.simd_types import Intrinsic, LaneMask, Vector, VectorLike, typed_intrinsic
 
 LANES = 16 if llvm.get_host_cpu_features().get("avx512f", False) else 8
 FLOAT, INT, _BIT = ir.FloatType(), ir.IntType(32), ir.IntType(1)
@@ -133,41 +136,56 @@ def _and(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
 # --- lane functions --------------------------------------------------------------------------------
 
 
-@intrinsic
-def broadcast(typingctx: Any, value: types.Float) -> Any:
+@typed_intrinsic
+def broadcast(typingctx: Any, value: float | np.floating) -> Intrinsic[Vector]:
     """Return a vector with the scalar in all lanes."""
-    return F32(types.float32), lambda context, builder, sig, args: _repeat(builder, args[0])
+    return Intrinsic(F32(types.float32), lambda context, builder, sig, args: _repeat(builder, args[0]))
 
 
-@intrinsic
-def iota(typingctx: Any) -> Any:
+@typed_intrinsic
+def iota(typingctx: Any) -> Intrinsic[Vector]:
     """Return the vector (0, 1, 2, ...)."""
     lanes = ir.Constant(VEC, [float(i) for i in range(LANES)])
-    return F32(), lambda context, builder, sig, args: lanes
+    return Intrinsic(F32(), lambda context, builder, sig, args: lanes)
 
 
-@intrinsic
-def where(typingctx: Any, mask: _MaskType, yes: types.Type, no: types.Type) -> Any:
+@typed_intrinsic
+def where(typingctx: Any, mask: LaneMask, yes: VectorLike, no: VectorLike) -> Intrinsic[Vector]:
     """Return `yes` where the mask is set, `no` elsewhere."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
         return builder.select(args[0], _as_vector(builder, args[1]), _as_vector(builder, args[2]))
 
-    return F32(Mask, F32 if yes == F32 else types.float32, F32 if no == F32 else types.float32), emit
+    return Intrinsic(F32(Mask, *_kinds(yes, no)), emit)
 
 
-def _lane_function(emit: Callable[..., ir.Value], arity: int, result: types.Type = F32) -> Any:
-    def lower(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
-        return emit(builder, *(_as_vector(builder, a) for a in args))
+def _kinds(*given: Any) -> list[types.Type]:
+    return [F32 if g == F32 else types.float32 for g in given]
 
-    def kinds(*given: types.Type) -> Any:
-        return result(*(F32 if g == F32 else types.float32 for g in given)), lower
 
-    if arity == 1:
-        return intrinsic(lambda typingctx, a: kinds(a))
-    if arity == 2:
-        return intrinsic(lambda typingctx, a, b: kinds(a, b))
-    return intrinsic(lambda typingctx, a, b, c: kinds(a, b, c))
+def _lower(emit: Callable[..., ir.Value]) -> Callable[..., ir.Value]:
+    return lambda context, builder, sig, args: emit(builder, *(_as_vector(builder, a) for a in args))
+
+
+def _unary(emit: Callable[..., ir.Value]) -> Callable[[VectorLike], Vector]:
+    def declare(typingctx: Any, a: VectorLike) -> Intrinsic[Vector]:
+        return Intrinsic(F32(*_kinds(a)), _lower(emit))
+
+    return typed_intrinsic(declare)
+
+
+def _binary(emit: Callable[..., ir.Value]) -> Callable[[VectorLike, VectorLike], Vector]:
+    def declare(typingctx: Any, a: VectorLike, b: VectorLike) -> Intrinsic[Vector]:
+        return Intrinsic(F32(*_kinds(a, b)), _lower(emit))
+
+    return typed_intrinsic(declare)
+
+
+def _ternary(emit: Callable[..., ir.Value]) -> Callable[[VectorLike, VectorLike, VectorLike], Vector]:
+    def declare(typingctx: Any, a: VectorLike, b: VectorLike, c: VectorLike) -> Intrinsic[Vector]:
+        return Intrinsic(F32(*_kinds(a, b, c)), _lower(emit))
+
+    return typed_intrinsic(declare)
 
 
 def _mantissa(builder: ir.IRBuilder, v: ir.Value) -> ir.Value:
@@ -195,24 +213,24 @@ def _reciprocal(builder: ir.IRBuilder, v: ir.Value) -> ir.Value:
     return builder.fmul(r, two_minus)
 
 
-fma = _lane_function(lambda builder, a, b, c: _call(builder, "fmuladd", a, b, c), 3)
-minimum = _lane_function(lambda builder, a, b: builder.select(builder.fcmp_ordered("<", a, b), a, b), 2)
-maximum = _lane_function(lambda builder, a, b: builder.select(builder.fcmp_ordered(">", a, b), a, b), 2)
-sqrt = _lane_function(lambda builder, a: _call(builder, "sqrt", a), 1)
-floor = _lane_function(lambda builder, a: _call(builder, "floor", a), 1)
-absolute = _lane_function(lambda builder, a: _call(builder, "fabs", a), 1)
-exp2_scale = _lane_function(_exp2_scale, 2)  # value * 2**n, n in the low bits of shifted = n + 1.5 * 2**23
-reciprocal = _lane_function(_reciprocal, 1)  # 1/v with error 1e-7; undefined for zero and infinity
-mantissa = _lane_function(_mantissa, 1)  # in [1, 2), of positive normal numbers
-exponent = _lane_function(_exponent, 1)  # floor(log2(v)) of positive normal numbers
+fma = _ternary(lambda builder, a, b, c: _call(builder, "fmuladd", a, b, c))
+minimum = _binary(lambda builder, a, b: builder.select(builder.fcmp_ordered("<", a, b), a, b))
+maximum = _binary(lambda builder, a, b: builder.select(builder.fcmp_ordered(">", a, b), a, b))
+sqrt = _unary(lambda builder, a: _call(builder, "sqrt", a))
+floor = _unary(lambda builder, a: _call(builder, "floor", a))
+absolute = _unary(lambda builder, a: _call(builder, "fabs", a))
+exp2_scale = _binary(_exp2_scale)  # value * 2**n, n in the low bits of shifted = n + 1.5 * 2**23
+reciprocal = _unary(_reciprocal)  # 1/v with error 1e-7; undefined for zero and infinity
+mantissa = _unary(_mantissa)  # in [1, 2), of positive normal numbers
+exponent = _unary(_exponent)  # floor(log2(v)) of positive normal numbers
 
 
-@intrinsic
-def any_lane(typingctx: Any, mask: _MaskType) -> Any:
+@typed_intrinsic
+def any_lane(typingctx: Any, mask: LaneMask) -> Intrinsic[bool]:
     """Return whether any lane of the mask is set."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
         bits = builder.bitcast(args[0], ir.IntType(LANES))
         return builder.icmp_unsigned("!=", bits, ir.Constant(ir.IntType(LANES), 0))
 
-    return types.boolean(Mask), emit
+    return Intrinsic(types.boolean(Mask), emit)

@@ -8,9 +8,9 @@ import numpy as np
 from llvmlite import ir
 from numba import njit, types
 from numba.core import cgutils
-from numba.extending import intrinsic
 
-from beamsplat.common.raster.simd import F32, FLOAT, INT, IVEC, LANES, MASK, VEC, F32Type, constant, shuffle
+from beamsplat.common.raster.simd import F32, FLOAT, INT, IVEC, LANES, MASK, VEC, constant, shuffle
+from beamsplat.common.raster.simd_types import Intrinsic, Vector, numba_signature, typed_intrinsic
 
 
 @njit(nogil=True, error_model="numpy")
@@ -34,18 +34,18 @@ def _aligned_load(builder: ir.IRBuilder, pointer: ir.Value, kind: ir.Type) -> ir
     return value
 
 
-@intrinsic
-def load(typingctx: Any, array: types.Array, at: types.Integer) -> Any:
+@typed_intrinsic
+def load(typingctx: Any, array: np.ndarray, at: int) -> Intrinsic[Vector]:
     """Return the vector (array[at], array[at + 1], ...) of a contiguous float32 array, unchecked."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
         return _aligned_load(builder, _address(context, builder, sig.args[0], args[0], args[1]), VEC)
 
-    return F32(array, types.int64), emit
+    return Intrinsic(numba_signature(F32, array, types.int64), emit)
 
 
-@intrinsic
-def store(typingctx: Any, array: types.Array, at: types.Integer, value: F32Type) -> Any:
+@typed_intrinsic
+def store(typingctx: Any, array: np.ndarray, at: int, value: Vector) -> Intrinsic[None]:
     """Write a vector to array[at], array[at + 1], ..., without bounds check."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
@@ -53,7 +53,7 @@ def store(typingctx: Any, array: types.Array, at: types.Integer, value: F32Type)
         builder.store(args[2], builder.bitcast(pointer, VEC.as_pointer()), align=4)
         return context.get_dummy_value()
 
-    return types.void(array, types.int64, F32), emit
+    return Intrinsic(numba_signature(types.void, array, types.int64, F32), emit)
 
 
 def _scattered(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
@@ -66,10 +66,8 @@ def _scattered(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.V
     return pointers
 
 
-@intrinsic
-def gather(
-    typingctx: Any, array: types.Array, base: types.Integer, index: types.Array, at: types.Integer
-) -> Any:
+@typed_intrinsic
+def gather(typingctx: Any, array: np.ndarray, base: int, index: np.ndarray, at: int) -> Intrinsic[Vector]:
     """Return the vector of array[base + index[at + lane]]; `index` is contiguous int32."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
@@ -81,14 +79,14 @@ def gather(
         every = ir.Constant(MASK, [1] * LANES)
         return builder.call(gathered, [pointers, ir.Constant(INT, 4), every, constant(0.0)])
 
-    return F32(array, types.int64, index, types.int64), emit
+    return Intrinsic(numba_signature(F32, array, types.int64, index, types.int64), emit)
 
 
-@intrinsic
+@typed_intrinsic
 def scatter_some(
-    typingctx: Any, array: types.Array, base: types.Integer, index: types.Array, at: types.Integer,
-    value: F32Type, count: types.Integer,
-) -> Any:  # fmt: skip
+    typingctx: Any, array: np.ndarray, base: int, index: np.ndarray, at: int,
+    value: Vector, count: int,
+) -> Intrinsic[None]:  # fmt: skip
     """Write the first `count` lanes of a vector to array[base + index[at + lane]]; `index` is int32."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
@@ -105,11 +103,13 @@ def scatter_some(
         builder.call(scattered, [args[4], pointers, ir.Constant(INT, 4), used])
         return context.get_dummy_value()
 
-    return types.void(array, types.int64, index, types.int64, F32, types.int64), emit
+    return Intrinsic(
+        numba_signature(types.void, array, types.int64, index, types.int64, F32, types.int64), emit
+    )
 
 
-@intrinsic
-def prefetch(typingctx: Any, array: types.Array, at: types.Integer) -> Any:
+@typed_intrinsic
+def prefetch(typingctx: Any, array: np.ndarray, at: int) -> Intrinsic[None]:
     """Prefetch the cache line of array[at]."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
@@ -119,22 +119,24 @@ def prefetch(typingctx: Any, array: types.Array, at: types.Integer) -> Any:
         builder.call(function, [pointer, *(ir.Constant(INT, value) for value in (0, 3, 1))])
         return context.get_dummy_value()
 
-    return types.void(array, types.int64), emit
+    return Intrinsic(numba_signature(types.void, array, types.int64), emit)
 
 
-@intrinsic
-def atomic_next(typingctx: Any, counter: types.Array, at: types.Integer) -> Any:
+@typed_intrinsic
+def atomic_next(typingctx: Any, counter: np.ndarray, at: int) -> Intrinsic[int]:
     """Atomically increment counter[at] of an int64 array, and return the value before."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
         pointer = _address(context, builder, sig.args[0], args[0], args[1])
         return builder.atomic_rmw("add", pointer, ir.Constant(ir.IntType(64), 1), "monotonic")
 
-    return types.int64(counter, types.int64), emit
+    return Intrinsic(numba_signature(types.int64, counter, types.int64), emit)
 
 
-@intrinsic
-def store_sums4(typingctx: Any, array: types.Array, at: types.Integer, a: Any, b: Any, c: Any, d: Any) -> Any:
+@typed_intrinsic
+def store_sums4(
+    typingctx: Any, array: np.ndarray, at: int, a: Vector, b: Vector, c: Vector, d: Vector
+) -> Intrinsic[None]:
     """Write the sums over all lanes of a, b, c and d to array[at : at + 4], by one tree of additions."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
@@ -156,4 +158,4 @@ def store_sums4(typingctx: Any, array: types.Array, at: types.Integer, a: Any, b
         builder.store(sums, builder.bitcast(pointer, kind.as_pointer()), align=4)
         return context.get_dummy_value()
 
-    return types.void(array, types.int64, F32, F32, F32, F32), emit
+    return Intrinsic(numba_signature(types.void, array, types.int64, F32, F32, F32, F32), emit)

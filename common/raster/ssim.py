@@ -22,7 +22,7 @@ _PAD = 8  # zeros at both ends of a row, at least _RADIUS
 
 
 @inner
-def _blur_columns(source, y, out, taps):  # noqa: ANN001, ANN202
+def _blur_columns(source: np.ndarray, y: int, out: np.ndarray, taps: np.ndarray) -> None:
     """Blur `source` along its columns at row y (zero outside), into out[_PAD + x]."""
     height, width = source.shape
     for x in range(width):
@@ -34,7 +34,7 @@ def _blur_columns(source, y, out, taps):  # noqa: ANN001, ANN202
 
 
 @inner
-def _blur_along_row(padded, out, taps):  # noqa: ANN001, ANN202
+def _blur_along_row(padded: np.ndarray, out: np.ndarray, taps: np.ndarray) -> None:
     """Blur `padded`, a row with `_PAD` zeros at both ends, into out[x]."""
     for x in range(len(out)):
         out[x] = np.float32(0.0)
@@ -45,7 +45,7 @@ def _blur_along_row(padded, out, taps):  # noqa: ANN001, ANN202
 
 
 @kernel
-def _prepare(counter, image, rgb, planes):  # noqa: ANN001, ANN202
+def _prepare(counter: np.ndarray, image: np.ndarray, rgb: np.ndarray, planes: np.ndarray) -> None:
     """Fill the planes x, y, xx, yy, xy; x, y = luma of the rendered and the true image (`rgb`, 0 to 255)."""
     height = image.shape[1]
     unit = np.float32(1.0 / 255.0)
@@ -61,7 +61,9 @@ def _prepare(counter, image, rgb, planes):  # noqa: ANN001, ANN202
 
 
 @kernel
-def _partials(counter, planes, taps, partials, sums):  # noqa: ANN001, ANN202
+def _partials(
+    counter: np.ndarray, planes: np.ndarray, taps: np.ndarray, partials: np.ndarray, sums: np.ndarray
+) -> None:
     """Compute dSSIM/d(mean x, mean xx, mean xy) at each pixel, and the sum of SSIM over each row."""
     height, width = planes.shape[1], planes.shape[2]
     padded = np.zeros(width + 2 * _PAD, np.float32)
@@ -98,7 +100,14 @@ def _partials(counter, planes, taps, partials, sums):  # noqa: ANN001, ANN202
 
 
 @kernel
-def _accumulate_gradient(counter, planes, partials, taps, scale, gradient):  # noqa: ANN001, ANN202
+def _accumulate_gradient(
+    counter: np.ndarray,
+    planes: np.ndarray,
+    partials: np.ndarray,
+    taps: np.ndarray,
+    scale: np.float32,
+    gradient: np.ndarray,
+) -> None:
     """Add scale * dSSIM/d(pixel) to the rows R, G, B of `gradient`."""
     height, width = planes.shape[1], planes.shape[2]
     padded = np.zeros(width + 2 * _PAD, np.float32)

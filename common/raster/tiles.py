@@ -58,7 +58,7 @@ _VECTORS = TILE_PIXELS // LANES
 
 
 @inner
-def _any_pixel_open(scratch, step):  # noqa: ANN001, ANN202
+def _any_pixel_open(scratch: np.ndarray, step: int) -> bool:
     best = load(scratch, T)
     for vector in range(1, _VECTORS):
         best = maximum(best, load(scratch, T + vector * step))
@@ -66,13 +66,13 @@ def _any_pixel_open(scratch, step):  # noqa: ANN001, ANN202
 
 
 @inner
-def _pixel_offset(x, y, step):  # noqa: ANN001, ANN202
+def _pixel_offset(x: int, y: int, step: int) -> int:
     """Return the offset of the pixel (x, y) of a tile in the scratch array."""
     return y // ROWS * step + y % ROWS * TILE_W + x
 
 
 @inner
-def _init_scratch(scratch, step, left, top, width, height):  # noqa: ANN001, ANN202
+def _init_scratch(scratch: np.ndarray, step: int, left: int, top: int, width: int, height: int) -> None:
     """Set the scratch array to zero, and T to 1 for pixels inside the image, -1 outside."""
     scratch[:] = 0.0
     for row in range(TILE_H):
@@ -82,7 +82,16 @@ def _init_scratch(scratch, step, left, top, width, height):  # noqa: ANN001, ANN
 
 
 @kernel
-def _forward_tile(lists, first, last, records, left, top, scratch, alphas):  # noqa: ANN001, ANN202
+def _forward_tile(
+    lists: np.ndarray,
+    first: int,
+    last: int,
+    records: np.ndarray,
+    left: int,
+    top: int,
+    scratch: np.ndarray,
+    alphas: np.ndarray,
+) -> None:
     row_of_lane = floor(iota() * np.float32(1.0 / TILE_W))
     column = iota() - row_of_lane * np.float32(TILE_W) + np.float32(left)
     row_of_lane = row_of_lane + np.float32(top)
@@ -122,7 +131,15 @@ def _forward_tile(lists, first, last, records, left, top, scratch, alphas):  # n
 
 
 @kernel
-def forward_tiles(counter, tiles_x, background, lists, tile_start, records, image):  # noqa: ANN001, ANN201
+def forward_tiles(
+    counter: np.ndarray,
+    tiles_x: int,
+    background: np.ndarray,
+    lists: np.ndarray,
+    tile_start: np.ndarray,
+    records: np.ndarray,
+    image: np.ndarray,
+) -> None:
     """Render the tiles that `counter` assigns to this thread into `image` float32 [5, H, W]."""
     height, width = image.shape[1], image.shape[2]
     scratch, alphas = aligned_floats(_VECTORS * _FORWARD_STRIDE), aligned_floats(TILE_PIXELS)
@@ -145,7 +162,17 @@ def forward_tiles(counter, tiles_x, background, lists, tile_start, records, imag
 
 
 @kernel
-def _backward_tile(lists, first, last, records, left, top, scratch, alphas, slots):  # noqa: ANN001, ANN202
+def _backward_tile(
+    lists: np.ndarray,
+    first: int,
+    last: int,
+    records: np.ndarray,
+    left: int,
+    top: int,
+    scratch: np.ndarray,
+    alphas: np.ndarray,
+    slots: np.ndarray,
+) -> None:
     row_of_lane = floor(iota() * np.float32(1.0 / TILE_W))
     column = iota() - row_of_lane * np.float32(TILE_W) + np.float32(left)
     row_of_lane = row_of_lane + np.float32(top)
@@ -210,7 +237,17 @@ def _backward_tile(lists, first, last, records, left, top, scratch, alphas, slot
 
 
 @kernel
-def backward_tiles(counter, tiles_x, background, lists, tile_start, records, image, gradient, slots):  # noqa: ANN001, ANN201
+def backward_tiles(
+    counter: np.ndarray,
+    tiles_x: int,
+    background: np.ndarray,
+    lists: np.ndarray,
+    tile_start: np.ndarray,
+    records: np.ndarray,
+    image: np.ndarray,
+    gradient: np.ndarray,
+    slots: np.ndarray,
+) -> None:
     """Write the sums of dL/d(splat) of each (splat, tile) pair to its slot, from dL/d(image) [5, H, W]."""
     height, width = image.shape[1], image.shape[2]
     scratch, alphas = aligned_floats(_VECTORS * _BACKWARD_STRIDE), aligned_floats(TILE_PIXELS)

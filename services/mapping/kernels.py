@@ -10,9 +10,18 @@ from beamsplat.common.raster.simd_memory import atomic_next
 
 
 @kernel
-def photometric_and_depth(  # noqa: ANN201
-    counter, image, rgb, depth_mm, depth_weight, exposure, colour_scale, depth_scale, gradient, sums,  # noqa: ANN001
-):  # fmt: skip
+def photometric_and_depth(
+    counter: np.ndarray,
+    image: np.ndarray,
+    rgb: np.ndarray,
+    depth_mm: np.ndarray,
+    depth_weight: np.ndarray,
+    exposure: np.ndarray,
+    colour_scale: np.float32,
+    depth_scale: np.float32,
+    gradient: np.ndarray,
+    sums: np.ndarray,
+) -> None:
     """Compute the L1 losses of colour (after exposure) and depth with their gradients; threads take image
     rows.
 
@@ -62,7 +71,9 @@ def photometric_and_depth(  # noqa: ANN201
 
 
 @kernel
-def add_lidar(image, pixels, z_m, scale, gradient):  # noqa: ANN001, ANN201
+def add_lidar(
+    image: np.ndarray, pixels: np.ndarray, z_m: np.ndarray, scale: np.float32, gradient: np.ndarray
+) -> float:
     """Add the gradient of scale * |rendered - measured depth| at the flat pixel indices int32 [N] of lidar
     beams.
 
@@ -81,9 +92,16 @@ def add_lidar(image, pixels, z_m, scale, gradient):  # noqa: ANN001, ANN201
 
 
 @kernel
-def count_carving_votes(  # noqa: ANN201
-    params, count, camera, depth_mm, depth_weight, least_weight, margin, votes,  # noqa: ANN001
-):  # fmt: skip
+def count_carving_votes(
+    params: np.ndarray,
+    count: int,
+    camera: np.ndarray,
+    depth_mm: np.ndarray,
+    depth_weight: np.ndarray,
+    least_weight: np.uint8,
+    margin: float,
+    votes: np.ndarray,
+) -> int:
     """Add 1 to votes[i] for each Gaussian whose centre floats in front of a trusted surface; return how many.
 
     A Gaussian at optical z is floating if the depth d of its pixel is trusted (weight >= least_weight) and

@@ -15,7 +15,15 @@ UNKNOWN_COUNT = 8  # (rho, phi) of the left perturbation of T_now_render, log ga
 
 
 @kernel
-def select_points(grey, z_m, alpha, min_gradient, min_alpha, stride, out):  # noqa: ANN001, ANN201
+def select_points(
+    grey: np.ndarray,
+    z_m: np.ndarray,
+    alpha: np.ndarray,
+    min_gradient: np.float32,
+    min_alpha: np.float32,
+    stride: int,
+    out: np.ndarray,
+) -> tuple[int, int]:
     """Write (u, v, z, grey) of pixels with contrast and an opaque map (and neighbours) into out [N, 4].
 
     Every `stride`-th such pixel is taken. Returns (number written, number before the stride); if they do not
@@ -42,9 +50,22 @@ def select_points(grey, z_m, alpha, min_gradient, min_alpha, stride, out):  # no
 
 
 @kernel
-def normal_equations(  # noqa: ANN201
-    points, count, camera, R, t, image, gradient_x, gradient_y, gain, offset, delta, H, g, residuals,  # noqa: ANN001
-):  # fmt: skip
+def normal_equations(
+    points: np.ndarray,
+    count: int,
+    camera: np.ndarray,
+    R: np.ndarray,
+    t: np.ndarray,
+    image: np.ndarray,
+    gradient_x: np.ndarray,
+    gradient_y: np.ndarray,
+    gain: float,
+    offset: float,
+    delta: float,
+    H: np.ndarray,
+    g: np.ndarray,
+    residuals: np.ndarray,
+) -> tuple[int, float]:
     """Sum J^T w J into H [8, 8] and J^T w r into g [8] with Huber weights; return (points used, cost).
 
     Args:
@@ -114,7 +135,15 @@ def normal_equations(  # noqa: ANN201
 
 
 @kernel
-def map_loss(image, rgb, z_m, weight, colour_scale, depth_scale, gradient):  # noqa: ANN001, ANN201
+def map_loss(
+    image: np.ndarray,
+    rgb: np.ndarray,
+    z_m: np.ndarray,
+    weight: np.ndarray,
+    colour_scale: np.float32,
+    depth_scale: np.float32,
+    gradient: np.ndarray,
+) -> float:
     """Return the L1 loss of a render against a keyframe and write its gradient float32 [5, H, W].
 
     `image` float32 [5, H, W] is the render (colour, depth, alpha), `rgb` float32 [3, H, W], `z_m` float32
