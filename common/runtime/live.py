@@ -34,6 +34,7 @@ from beamsplat.common.zenoh.queries import ask, reply
 
 log = logging.getLogger(__name__)
 
+_MATCHING_S = 0.5  # a topic without subscribers delays the start of a source by this
 _STOP_TIMEOUT_S = 2.0  # after a signal, background jobs have this long to finish
 _FEEDBACK_TIMEOUT_S = 1.0  # without feedback, after which `on_feedback_timeout` is called
 
@@ -213,6 +214,8 @@ class Live:
             r.detail = f"waiting for {', '.join(missing)}"
 
         wait_for_nodes(bus.alive_nodes, r.settings, lambda: self._stopping, on_waiting)
+        if r.settings.wait_for:
+            bus.wait_for_subscribers(tuple(r.publications), _MATCHING_S)
         r.detail = ""
 
     def _process_requests(self) -> None:

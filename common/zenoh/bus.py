@@ -327,6 +327,19 @@ class Bus:
         """Publish this node's health."""
         self._health.put(health)
 
+    def wait_for_subscribers(self, topic_names: tuple[str, ...], timeout_s: float) -> None:
+        """Block until this session knows a subscriber of each topic, at most for `timeout_s`.
+
+        A session drops what it publishes before the declaration of the first subscriber has arrived, although
+        the subscribing node is already alive.
+        """
+        probes = [self.session.declare_publisher(key(self.robot, name)) for name in topic_names]
+        deadline = time.monotonic() + timeout_s
+        while time.monotonic() < deadline and not all(p.matching_status.matching for p in probes):
+            time.sleep(0.01)
+        for probe in probes:
+            probe.undeclare()
+
     def alive_nodes(self) -> set[str]:
         """Return the names of the active nodes of this robot."""
         replies = self.session.liveliness().get(key(self.robot, "alive", "*", "*"), timeout=2.0)

@@ -171,3 +171,14 @@ def test_health_of_every_node_arrives_and_an_undecodable_one_is_ignored(make_bus
     count = len(received)
     wait_until(lambda: one.publish_health(SAMPLES[Health]) or len(received) > count)
     assert set(received) <= {("depth", "active"), ("fusion", "active")}
+
+
+def test_a_source_waits_until_its_topics_have_subscribers(make_bus):
+    producer, consumer = make_bus("clock"), make_bus("monitor")
+    started = time.monotonic()
+    producer.wait_for_subscribers(("tick",), 0.3)
+    assert time.monotonic() - started >= 0.3  # nobody subscribes
+    received = Received(consumer, "tick")
+    producer.wait_for_subscribers(("tick",), 10.0)
+    producer.publish("tick").put(SAMPLES[Tick])
+    wait_until(lambda: received.sequences() == [0])
