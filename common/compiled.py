@@ -58,9 +58,11 @@ def kernel(
 
 def inner(function: _F) -> _F:
     """Compile a helper function of kernels; LLVM may inline it into them."""
-    return njit(error_model="numpy")(function)
+    compiled: Any = njit(error_model="numpy")(function)
+    return compiled
 
 
 def inlined(function: _F) -> _F:
     """Compile a helper function of kernels that Numba always inlines."""
-    return njit(inline="always", error_model="numpy")(function)
+    compiled: Any = njit(inline="always", error_model="numpy")(function)
+    return compiled

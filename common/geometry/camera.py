@@ -159,7 +159,8 @@ class Undistorter:
         if camera.is_distorted:
             rays = self.pinhole.ray_grid().reshape(-1, 3)
             uv = camera._distort(rays[:, :2]).astype(np.float32).reshape(*camera.shape, 2)
-            self._maps = cv2.convertMaps(uv, None, cv2.CV_16SC2)
+            # The stubs do not know that map2 may be None.
+            self._maps = cv2.convertMaps(uv, None, cv2.CV_16SC2)  # type: ignore[call-overload]
 
     def __call__(self, image: np.ndarray) -> np.ndarray:
         """Return the undistorted image, uint8 [H, W] or [H, W, 3]; pixels outside the original are black.

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import numpy.typing as npt
 
 
 def wrap_angle(angle_rad: np.ndarray | float) -> np.ndarray | float:
@@ -85,7 +86,7 @@ def skew(v: np.ndarray) -> np.ndarray:
     return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
 
 
-def so3_exp(rotation_vector_rad: np.ndarray) -> np.ndarray:
+def so3_exp(rotation_vector_rad: npt.ArrayLike) -> np.ndarray:
     """Return the rotation [3, 3] of a rotation vector [3] (Rodrigues' formula)."""
     w = np.asarray(rotation_vector_rad, dtype=np.float64)
     angle = float(np.linalg.norm(w))

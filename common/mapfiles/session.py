@@ -173,7 +173,7 @@ class SessionFolder:
         name = f"state-{1 + max(numbers, default=0)}.npz"
         try:
             with (self.edge / name).open("xb") as file:
-                np.savez(file, **arrays)
+                np.savez(file, **arrays)  # type: ignore[arg-type]  # the stubs pass ** to allow_pickle
                 file.flush()
                 os.fsync(file.fileno())
             size = (self.edge / name).stat().st_size
@@ -297,7 +297,7 @@ class SessionFolder:
 def packed_arrays(arrays: Arrays) -> bytes:
     """Return a state as the bytes of its npz file."""
     buffer = io.BytesIO()
-    np.savez(buffer, **arrays)
+    np.savez(buffer, **arrays)  # type: ignore[arg-type]  # the stubs pass ** to allow_pickle
     return buffer.getvalue()
 
 

@@ -232,6 +232,9 @@ class OutputHealth(MessagePart):
     bytes: Count
 
 
+NodeState = Literal["configure", "standby", "active", "drain", "drained", "closed"]
+
+
 class Health(Message):
     """State and counts of a node, published by each node at 1 Hz."""
 
@@ -240,7 +243,7 @@ class Health(Message):
     node: Name
     instance: Name
     epoch: Count
-    state: Literal["configure", "standby", "active", "drain", "drained", "closed"]
+    state: NodeState
     inputs: Annotated[tuple[InputHealth, ...], Field(max_length=64)] = ()
     outputs: Annotated[tuple[OutputHealth, ...], Field(max_length=64)] = ()
     step_p50_ms: NonNegative = 0.0

@@ -138,7 +138,7 @@ def find_mounts(
     calibration.body_frame = body or ""
     for sensor, frame in sensor_frames.items():
         T = frames.find(body, frame) if body and frame else None
-        if T is None:
+        if T is None or body is None:
             _handle_missing_mount(calibration, sensor, frame, body, list(sensor_frames), assume)
             continue
         if sensor == "camera":
@@ -166,11 +166,11 @@ def _to_optical_frame(
     below = [
         name for name in sorted(frames.names) if "optical" in name and name.startswith(normalize_frame(frame))
     ]
-    if len(below) == 1:
+    if len(below) == 1 and (T_body_camera := frames.find(body, below[0])) is not None:
         calibration.assumed.append(
             f"images stamped {frame!r} are in its child, the optical frame {below[0]!r}"
         )
-        return frames.find(body, below[0])
+        return T_body_camera
     calibration.assumed.append(
         f"frame {frame!r} has its z axis up, so it is the camera's housing: the optical rotation was added"
     )

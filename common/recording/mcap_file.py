@@ -32,7 +32,9 @@ _MESSAGE_HEAD = struct.Struct("<HIQQ")
 # Maximum size of a block of messages outside chunks: limits the memory of one read.
 _REGION_BYTES = 4 * 1024 * 1024
 # Exceptions that record parsers and decompressors raise on damaged bytes.
-_DAMAGE = (McapError, ValueError, struct.error, RuntimeError, EOFError, OverflowError, MemoryError)
+_DAMAGE: tuple[type[Exception], ...] = (
+    McapError, ValueError, struct.error, RuntimeError, EOFError, OverflowError, MemoryError,
+)  # fmt: skip
 
 try:
     from zstandard import ZstdError
@@ -183,7 +185,7 @@ class McapFile:
                 self.profile, self.library = header.profile, header.library
             return
 
-    def _take_definition(self, opcode: int, body: bytes) -> None:
+    def _take_definition(self, opcode: int, body: bytes | memoryview) -> None:
         if opcode == Opcode.SCHEMA:
             schema = Schema.read(_stream(body))
             self.schemas[schema.id] = schema
@@ -216,10 +218,10 @@ class McapFile:
         whole = _PREFIX.size + length
         if opcode == Opcode.CHUNK:
             start_ns, end_ns = _CHUNK_HEAD.unpack(self._file.read(_CHUNK_HEAD.size))[:2]
-            block = _Block(position, whole, start_ns, end_ns, None)
-            block.channel_ids = set()
+            channel_ids: set[int] = set()
+            block = _Block(position, whole, start_ns, end_ns, channel_ids)
             for message in self._read_block(block):
-                block.channel_ids.add(message.channel_id)
+                channel_ids.add(message.channel_id)
                 self.counts[message.channel_id] += 1
             self._blocks.append(block)
         elif opcode == Opcode.MESSAGE:
@@ -234,6 +236,7 @@ class McapFile:
             ):
                 last.length += whole
                 last.start_ns, last.end_ns = min(last.start_ns, log_time), max(last.end_ns, log_time)
+                assert last.channel_ids is not None  # known for messages outside chunks
                 last.channel_ids.add(channel_id)
             else:
                 self._blocks.append(_Block(position, whole, log_time, log_time, {channel_id}, chunked=False))

@@ -6,6 +6,7 @@ restores it. ROS messages with `role = "display"` (transforms, CameraInfo) are f
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -157,7 +158,7 @@ def _float32(value: float) -> float:
     return float(np.clip(value, -limit, limit))
 
 
-_CONVERTERS = {
+_CONVERTERS: dict[type[m.Message], Callable[[str, Any], list[RosRecord]]] = {
     m.Image: _image,
     m.Scan: _scan,
     m.WheelOdometry: _wheel_odometry,

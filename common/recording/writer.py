@@ -105,7 +105,11 @@ class RecordingWriter:
         self.file_path = self._make_path(overwrite)
         self._file = _File(self.file_path)
         # Chunks end in `flush` only, between two messages, so that a message and its fields are in one chunk.
-        self._writer = Writer(self._file, chunk_size=2**62, compression=compression)
+        self._writer = Writer(
+            self._file,  # type: ignore[arg-type]  # of IO, the writer calls these three methods only
+            chunk_size=2**62,
+            compression=compression,
+        )
         self._writer.start(layout.PROFILE, layout.LIBRARY)
 
     def write(self, topic: str, message: Message, log_time_ns: int, header: Header | None = None) -> None:

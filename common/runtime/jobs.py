@@ -7,7 +7,7 @@ import queue
 import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Generic, Protocol, TypeVar
 
 from beamsplat.common.runtime.node import Job
 
@@ -18,6 +18,9 @@ class JobFuture(Protocol):
     def result(self) -> Any: ...
 
     def done(self) -> bool: ...
+
+
+_FutureT = TypeVar("_FutureT", bound=JobFuture)
 
 
 class LazyFuture:
@@ -58,7 +61,7 @@ class JobThread:
         self._waiting: queue.SimpleQueue[tuple[_WorkerFuture, Callable[[], Any]]] = queue.SimpleQueue()
         threading.Thread(target=self._work, name="job", daemon=True).start()
 
-    def submit(self, run: Callable[[], Any]) -> JobFuture:
+    def submit(self, run: Callable[[], Any]) -> concurrent.futures.Future:
         """Queue a job; it runs after all jobs submitted before it."""
         future = _WorkerFuture(self._must_stop)
         self._waiting.put((future, run))
@@ -74,20 +77,20 @@ class JobThread:
 
 
 @dataclass
-class _Pending:
+class _Pending(Generic[_FutureT]):
     job: Job
-    future: JobFuture
+    future: _FutureT
     remaining: int | None  # messages until the result is due; None = when the job is finished
 
 
-class JobQueue:
+class JobQueue(Generic[_FutureT]):
     """Jobs that one node has started and whose results it has not received yet."""
 
-    def __init__(self, submit: Callable[[Callable[[], Any]], JobFuture]) -> None:
+    def __init__(self, submit: Callable[[Callable[[], Any]], _FutureT]) -> None:
         self._submit = submit
-        self._pending: list[_Pending] = []
+        self._pending: list[_Pending[_FutureT]] = []
 
-    def start(self, job: Job) -> JobFuture:
+    def start(self, job: Job) -> _FutureT:
         """Submit a job and return its future."""
         future = self._submit(job.run)
         self._pending.append(_Pending(job, future, job.after))
@@ -105,7 +108,7 @@ class JobQueue:
         """Yield (name, result) of the finished jobs that have no fixed delivery point (`after` is None)."""
         yield from self._take([p for p in self._pending if p.remaining is None and p.future.done()])
 
-    def result_of(self, future: JobFuture) -> Iterator[tuple[str, Any]]:
+    def result_of(self, future: _FutureT) -> Iterator[tuple[str, Any]]:
         """Yield (name, result) of the job of `future`, unless its result was delivered already."""
         yield from self._take([p for p in self._pending if p.future is future])
 
@@ -114,7 +117,7 @@ class JobQueue:
         while self._pending:
             yield from self._take(self._pending[:1])
 
-    def _take(self, due: list[_Pending]) -> Iterator[tuple[str, Any]]:
+    def _take(self, due: list[_Pending[_FutureT]]) -> Iterator[tuple[str, Any]]:
         for pending in due:
             self._pending.remove(pending)
             yield pending.job.name, pending.future.result()

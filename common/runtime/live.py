@@ -24,7 +24,7 @@ from beamsplat.common.runtime.health_reporter import HealthReporter
 from beamsplat.common.runtime.jobs import JobAbandoned, JobQueue, JobThread
 from beamsplat.common.runtime.live_settings import LiveSettings
 from beamsplat.common.runtime.mailbox import NO_PRODUCER
-from beamsplat.common.runtime.node import Node
+from beamsplat.common.runtime.node import Node, subscriptions
 from beamsplat.common.runtime.pacing import Playback, wait_for_nodes
 from beamsplat.common.runtime.rate_limited_log import RateLimitedLog
 from beamsplat.common.runtime.running_node import POLL_S, RunningNode
@@ -99,7 +99,7 @@ class Live:
         r = self.running
         # Assigned as a whole: the health thread iterates over it meanwhile.
         r.publications = {name: bus.publish(name) for name in r.node.outputs}
-        for entry in r.node.inputs:
+        for entry in subscriptions(type(r.node)):
             if entry.topic in r.settings.without_producer:
                 r.mailbox.end(entry.topic, NO_PRODUCER, 0)
             bus.subscribe(entry, r.receive, self._on_undecodable, r.receive_end)
@@ -225,7 +225,8 @@ class Live:
             node.on_health(self._healths.popleft())
         while self._queries:
             name, query = self._queries.popleft()
-            parameters = dict(query.parameters)
+            # The stubs miss that Parameters iterates over (key, value).
+            parameters: dict[str, str] = dict(query.parameters)  # type: ignore[call-overload]
             if name.startswith(CONTROL):
                 reply(query, self._control.answer(name.removeprefix(CONTROL + "/"), parameters))
                 continue

@@ -11,6 +11,7 @@ import hashlib
 import heapq
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from beamsplat.common.messages import Message
@@ -29,7 +30,7 @@ class _NodeState:
 
     node: Node
     mailbox: Mailbox
-    jobs: JobQueue
+    jobs: JobQueue[LazyFuture]
     instance: str
     sequences: dict[str, int]
     source: Iterator[Any] | None
@@ -79,6 +80,7 @@ class Lockstep:
 
     def _pull(self, state: _NodeState, now_ns: int) -> None:
         """Schedule the next message of a source, or its end."""
+        assert state.source is not None  # called for sources only
         item = next(state.source, None)
         if item is None:
             self._at(now_ns, _LAST_ROW, lambda t: self._end_node(state, t))
@@ -140,11 +142,7 @@ class Lockstep:
                 self._start(state, output, time_ns)
             else:
                 name, message = output
-                self._at(
-                    time_ns,
-                    ROW_NUMBER[name],
-                    lambda t, name=name, message=message: self._send(state, name, message, t),
-                )
+                self._at(time_ns, ROW_NUMBER[name], partial(self._send, state, name, message))
 
     def _start(self, state: _NodeState, job: Job, time_ns: int) -> None:
         future = state.jobs.start(job)
@@ -163,7 +161,7 @@ class Lockstep:
             self._emit(state, state.node.handle_job(name, result), now_ns)
         self._emit(state, state.node.handle_drain(), now_ns)
         for name in state.node.outputs:
-            self._at(now_ns, _LAST_ROW, lambda t, name=name: self._end_topic(name, state.instance, t))
+            self._at(now_ns, _LAST_ROW, partial(self._end_topic, name, state.instance))
 
     def _end_topic(self, name: str, instance: str, now_ns: int) -> None:
         for consumer in self._consumers[name]:

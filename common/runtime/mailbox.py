@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 from beamsplat.common.messages import InputHealth, Message
 from beamsplat.common.messages.header import Header
-from beamsplat.common.runtime.node import Input, Node, merged_topics
+from beamsplat.common.runtime.node import Node, merged_topics, subscriptions
 from beamsplat.common.runtime.stamp_merger import StampMerger
 from beamsplat.common.topics import ROW_NUMBER, TOPICS
 
@@ -56,12 +56,12 @@ class Mailbox:
 
     def __init__(self, node: type[Node], clock_ns: Callable[[], int] | None = None) -> None:
         """`clock_ns`: clock for time-outs in the live runner, None in lockstep; see `StampMerger`."""
-        self._deliveries = {i.topic: i.effective_delivery for i in _inputs(node)}
+        self._deliveries = {i.topic: i.effective_delivery for i in subscriptions(node)}
         self._merger = StampMerger(merged_topics(node), clock_ns=clock_ns)
         self._slots: dict[str, Envelope] = {}
-        self._feedback_topics = frozenset(i.topic for i in _inputs(node) if i.feedback)
+        self._feedback_topics = frozenset(i.topic for i in subscriptions(node) if i.feedback)
         self._feedback_queue: deque[Envelope] = deque()  # of `every` inputs that are feedback
-        self._most_bytes = {i.topic: i.queued_bytes for i in _inputs(node)}
+        self._most_bytes = {i.topic: i.queued_bytes for i in subscriptions(node)}
         self.counts = {name: InputCount() for name in self._deliveries}
 
     def __len__(self) -> int:
@@ -210,7 +210,3 @@ class Mailbox:
             )
             for name, c in self.counts.items()
         )  # fmt: skip
-
-
-def _inputs(node: type[Node]) -> tuple[Input, ...]:
-    return tuple(i for i in node.inputs if isinstance(i, Input))

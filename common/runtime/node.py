@@ -117,7 +117,7 @@ class Node:
         if not cls.name:  # an abstract base class
             return
         cls.inputs = tuple(Input(i) if isinstance(i, str) else i for i in cls.inputs)
-        for entry in cls.inputs:
+        for entry in subscriptions(cls):
             if not callable(getattr(cls, entry.row.handler, None)):
                 raise TypeError(f"{cls.__name__} subscribes to {entry.topic}, but has no {entry.row.handler}")
         for name in cls.outputs:
@@ -254,7 +254,12 @@ class Node:
             raise UndeclaredOutput(f"{self.name} published a {type(message).__name__} on {topic_name}")
 
 
+def subscriptions(node: type[Node]) -> tuple[Input, ...]:
+    """Return the inputs of a node class; `Node` converts topic names when the class is defined."""
+    return tuple(i for i in node.inputs if isinstance(i, Input))
+
+
 def merged_topics(node: type[Node]) -> tuple[str, ...]:
     """Return the inputs that are merged by stamp: the `every` inputs except feedback, in table order."""
-    names = [i.topic for i in node.inputs if i.effective_delivery == "every" and not i.feedback]
+    names = [i.topic for i in subscriptions(node) if i.effective_delivery == "every" and not i.feedback]
     return tuple(sorted(names, key=ROW_NUMBER.__getitem__))

@@ -7,9 +7,11 @@ import threading
 import time
 from collections import deque
 from collections.abc import Iterator
+from concurrent.futures import Future
 from typing import Any
 
 from beamsplat.common.messages.header import local_clock_id
+from beamsplat.common.messages.robot import NodeState
 from beamsplat.common.runtime.handover import Handover
 from beamsplat.common.runtime.jobs import JobQueue
 from beamsplat.common.runtime.live_settings import LiveSettings
@@ -38,11 +40,11 @@ class RunningNode:
         self.arrival_lock = threading.Lock()  # held during `on_arrival`: retiring waits for it
         self.mailbox = Mailbox(type(node), time.monotonic_ns)
         self.changed = threading.Condition()
-        self.state = "configure"
+        self.state: NodeState = "configure"
         self.detail = ""
         self.steps_ms: deque[float] = deque(maxlen=512)
         self.publications: dict[str, Publication] = {}
-        self.jobs: JobQueue  # set by the runner, before the node is configured
+        self.jobs: JobQueue[Future]  # set by the runner, before the node is configured
         self._ends: list[tuple[str, str, int, int, float]] = []
         self._clock_id = local_clock_id()
 

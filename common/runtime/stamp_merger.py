@@ -87,7 +87,9 @@ class StampMerger:
         return stream, self._queues[stream].popleft()[1]
 
     def _timed_out(self, name: str, front_ns: int) -> bool:
-        if front_ns - self._newest_ns.get(name, self._first_ns) <= self._timeout_ns:
+        newest_ns = self._newest_ns.get(name, self._first_ns)
+        assert newest_ns is not None  # set by the first `put`
+        if front_ns - newest_ns <= self._timeout_ns:
             return False
         if self._clock_ns is None:
             return True

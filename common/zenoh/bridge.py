@@ -126,6 +126,7 @@ class Bridge:
         send: Callable[[zenoh.Sample], None],
         count_as: str | None,
     ) -> None:
+        channel: zenoh.handlers.FifoChannel[zenoh.Sample] | zenoh.handlers.RingChannel[zenoh.Sample]
         if row.resent_until_ack and row.delivery != "latched":
             channel = zenoh.handlers.RingChannel(_RESENT_QUEUE_MESSAGES)
         elif row.delivery == "latched":

@@ -233,7 +233,7 @@ class Bus:
             key(self.robot, "end", entry.topic),
             zenoh.handlers.FifoChannel(16),
             history=zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=1),
-            recovery=zenoh.ext.RecoveryConfig(heartbeat=True),
+            recovery=zenoh.ext.RecoveryConfig(periodic_queries=None, heartbeat=True),
         )
         self._declared.append(subscriber)
 
@@ -260,7 +260,7 @@ class Bus:
             self.session,
             key(self.robot, "end", publication.row.name),
             cache=zenoh.ext.CacheConfig(1),
-            sample_miss_detection=zenoh.ext.MissDetectionConfig(sporadic_heartbeat=0.5),
+            sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=0.5),
             publisher_detection=True,
         )
         p = self.producer
@@ -319,6 +319,7 @@ class Bus:
                     health = decode_sample(sample, row).message
                 except DecodeError:  # a node of another software version
                     continue
+                assert isinstance(health, Health)  # the row's message type
                 on_health(health)
 
         threading.Thread(target=receive, name="watch-health", daemon=True).start()
@@ -335,7 +336,11 @@ class Bus:
         """
         probes = [self.session.declare_publisher(key(self.robot, name)) for name in topic_names]
         deadline = time.monotonic() + timeout_s
-        while time.monotonic() < deadline and not all(p.matching_status.matching for p in probes):
+
+        def all_matched() -> bool:  # the stubs declare the status as bool
+            return all(p.matching_status.matching for p in probes)  # type: ignore[attr-defined]
+
+        while time.monotonic() < deadline and not all_matched():
             time.sleep(0.01)
         for probe in probes:
             probe.undeclare()

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import zenoh
 
 from beamsplat.common.errors import UserError
-from beamsplat.common.messages import Message
+from beamsplat.common.messages import Answer, Message
 from beamsplat.common.messages.codec import decode, encode, schema_of
 from beamsplat.common.runtime.handover import CONTROL
 from beamsplat.common.zenoh.bus import key
@@ -37,7 +37,9 @@ def command(
         UserError: the process did not answer in time, or rejected the request.
     """
     key_expr = key(robot, CONTROL, instance, verb)
-    return next(_ask(session, key_expr, (instance, verb), parameters, timeout_s)).text
+    answer = next(_ask(session, key_expr, (instance, verb), parameters, timeout_s))
+    assert isinstance(answer, Answer)  # the message type of all hand-over requests
+    return answer.text
 
 
 def _ask(
@@ -59,6 +61,7 @@ def _ask(
             consolidation=zenoh.ConsolidationMode.NONE,
         ):
             if reply.ok is None:
+                assert reply.err is not None  # a reply is one or the other
                 raise UserError(f"{who} rejected {name}: {reply.err.payload.to_string()}")
             answered = True
             yield decode(str(reply.ok.encoding).partition(";")[2], reply.ok.payload.to_bytes())

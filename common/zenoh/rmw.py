@@ -169,6 +169,8 @@ class RmwEntity:
         if len(parts) < 9 or parts[0] != LIVELINESS_PREFIX or not (parts[1] + parts[3] + parts[4]).isdigit():
             return None
         kind = parts[5]
+        type_name: str | None
+        qos: RmwQos | None
         if kind == "NN" and len(parts) == 9:
             topic, type_name, type_hash, qos = "", "", "", RmwQos()
         elif kind in ("MP", "MS") and len(parts) == 13:

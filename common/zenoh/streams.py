@@ -40,7 +40,7 @@ def declare_publication(
         congestion_control=congestion,
         priority=priority,
         cache=zenoh.ext.CacheConfig(row.cache),
-        sample_miss_detection=zenoh.ext.MissDetectionConfig(sporadic_heartbeat=0.5),
+        sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=0.5),
         publisher_detection=True,
     )
 
@@ -66,7 +66,7 @@ def declare_subscription(
         key_expr,
         channel,
         allowed_origin=origin,
-        recovery=zenoh.ext.RecoveryConfig(heartbeat=True),
+        recovery=zenoh.ext.RecoveryConfig(periodic_queries=None, heartbeat=True),
         history=latched if row.delivery == "latched" else None,
     )
 
@@ -126,6 +126,7 @@ class Subscription:
         self.row = row
         self._on_envelope = on_envelope
         self._on_undecodable = on_undecodable
+        channel: zenoh.handlers.FifoChannel[zenoh.Sample] | zenoh.handlers.RingChannel[zenoh.Sample]
         if delivery == "every":
             channel = zenoh.handlers.FifoChannel(max(row.cache, FIFO_MESSAGES))
         else:

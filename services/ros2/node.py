@@ -157,7 +157,7 @@ class Ros2Node(Node):
             subscriber = zenoh.ext.declare_advanced_subscriber(
                 self._session, key, channel,
                 history=zenoh.ext.HistoryConfig(detect_late_publishers=True),
-                recovery=zenoh.ext.RecoveryConfig(heartbeat=True),
+                recovery=zenoh.ext.RecoveryConfig(periodic_queries=None, heartbeat=True),
             )  # fmt: skip
         else:
             subscriber = self._session.declare_subscriber(key, channel)

@@ -39,7 +39,7 @@ class RosPublisher:
                 session, key,
                 congestion_control=zenoh.CongestionControl.DROP,
                 cache=zenoh.ext.CacheConfig(qos.depth),
-                sample_miss_detection=zenoh.ext.MissDetectionConfig(sporadic_heartbeat=0.5),
+                sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=0.5),
                 publisher_detection=True,
             )  # fmt: skip
         else:
