@@ -51,7 +51,7 @@ Mask = Callable[[TruthDataset, int, np.ndarray], np.ndarray | None]
 
 
 @dataclass
-class _MapperTimer:
+class MapperTimer:
     """Wall and CPU seconds of the mapper and the prior, without decoding, scoring and compilation."""
 
     wall_s: float = 0.0
@@ -97,7 +97,7 @@ def run_bench(
     warm()
     recording = load_dataset(path)
     mapper = Mapper(bench.settings, seed=bench.seed, threads=bench.threads)
-    timer = _MapperTimer()
+    timer = MapperTimer()
     keyframes, refused = _map_drive(
         recording, mapper, bench, prior or find_prior(bench.prior), mask, timer, log
     )
@@ -121,9 +121,22 @@ def run_bench(
     }  # fmt: skip
 
 
+def map_and_score(
+    recording: TruthDataset, bench: MapBenchSettings, prior: Prior, true_surface_m: np.ndarray | None = None
+) -> tuple[dict[str, float | None], MapperTimer]:
+    """Run the mapper over a recording without refinement; return the figures of the map and the time.
+
+    Args:
+        true_surface_m: float64 [N, 3]; None: gt_surface.ply of the recording.
+    """
+    mapper, timer = Mapper(bench.settings, seed=bench.seed, threads=bench.threads), MapperTimer()
+    _map_drive(recording, mapper, bench, prior, None, timer, lambda text: None)
+    return score_map(recording, mapper, lambda text: None, true_surface_m), timer
+
+
 def _map_drive(
     recording: TruthDataset, mapper: Mapper, bench: MapBenchSettings, prior: Prior, mask: Mask | None,
-    timer: _MapperTimer, log: Log,
+    timer: MapperTimer, log: Log,
 ) -> tuple[int, int]:  # fmt: skip
     """Map the keyframes in order, with a fixed number of steps each.
 
@@ -152,7 +165,7 @@ def _map_drive(
     return used, refused
 
 
-def _refine(mapper: Mapper, bench: MapBenchSettings, timer: _MapperTimer) -> None:
+def _refine(mapper: Mapper, bench: MapBenchSettings, timer: MapperTimer) -> None:
     start = replace(timer)
     while True:
         cpu_s = (timer.cpu_s - start.cpu_s) / bench.threads
@@ -200,8 +213,13 @@ def make_keyframe(
     )  # fmt: skip
 
 
-def score_map(recording: TruthDataset, mapper: Mapper, log: Log) -> dict[str, float | None]:
-    """Return the figures at views that were not mapped; None where the recording has no such views."""
+def score_map(
+    recording: TruthDataset, mapper: Mapper, log: Log, true_surface_m: np.ndarray | None = None
+) -> dict[str, float | None]:
+    """Return the figures at views that were not mapped; None where the recording has no such views.
+
+    The true surface is `true_surface_m` float64 [N, 3], or else gt_surface.ply of the recording.
+    """
     log("scoring")
     camera = raster_camera(recording.camera)
     off, held = [], []
@@ -220,10 +238,12 @@ def score_map(recording: TruthDataset, mapper: Mapper, log: Log) -> dict[str, fl
         "ssim_heldout": _mean(held, "ssim"), "gaussians": mapper.store.count,
     }  # fmt: skip
     surface = recording.path / "gt_surface.ply"
-    if surface.is_file():
+    if true_surface_m is None and surface.is_file():
+        true_surface_m = read_ply_points(surface)
+    if true_surface_m is not None:
         half = camera.resized(camera.width_px // 2, camera.height_px // 2)
         views = [(half, mapper.T_map_camera(held)) for held in mapper.keyframes.values()]
-        figures |= f_score(fused_surface(mapper.rasterizer, mapper.store, views), read_ply_points(surface))
+        figures |= f_score(fused_surface(mapper.rasterizer, mapper.store, views), true_surface_m)
     return figures
 
 

@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from beamsplat.tools.cli.options import writable
@@ -132,3 +133,63 @@ def paper(
         table.add_row(f"{row['name']} #{row['seed']}", *("-" if v is None else f"{v:.4g}" for v in values))
     Console().print(table)
     print(f"{out / 'report.html'}\n{out / 'report.json'}")
+
+
+@app.command()
+def sensitivity(
+    part: Annotated[str, typer.Option(help="slam, fusion or map")],
+    data: Annotated[
+        Path, typer.Option(exists=True, file_okay=False, help="Folder with bag/ beside its ground truth")
+    ],
+    only: Annotated[list[str] | None, typer.Option(help="Only this parameter; repeatable")] = None,
+    seconds: Annotated[
+        float | None, typer.Option(min=1.0, help="Use only the first seconds of the recording")
+    ] = None,
+    minutes: Annotated[float | None, typer.Option(min=0.0, help="Start no run later than this")] = None,
+    out: Annotated[
+        Path,
+        typer.Option(callback=writable, help="Append each run to this file; runs in it are not repeated"),
+    ] = Path("out/sensitivity.jsonl"),
+    markdown: Annotated[Path | None, typer.Option(help="Write the table into this page")] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Change each setting of SLAM, fusion or mapper by -30 and +30 %; print the effect on the figures.
+
+    Start with a new --out file after a change of the code.
+
+    Examples:
+
+        beamsplat bench sensitivity --part slam --data drive
+
+        beamsplat bench sensitivity --part map --data drive --only stride_px --only opacity --json
+    """
+    import time
+
+    from beamsplat.common.errors import UserError
+    from beamsplat.tools.bench.sensitivity import chosen, measure
+    from beamsplat.tools.bench.sensitivity_parts import PARTS
+    from beamsplat.tools.bench.sensitivity_table import as_json as result_json
+    from beamsplat.tools.bench.sensitivity_table import markdown as table_of
+    from beamsplat.tools.bench.sensitivity_table import write_page
+
+    if part not in PARTS:
+        raise UserError(f"--part {part}: unknown; known are {', '.join(PARTS)}")
+    measured, length_s = PARTS[part], seconds or PARTS[part].seconds
+    setup = {"part": part, "data": data.resolve().name, "seconds": length_s}
+    bar = Progress(
+        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
+        console=console, transient=True,
+    )  # fmt: skip
+    with bar:
+        task = bar.add_task("loading", total=None)
+        rows = measure(
+            measured, lambda: measured.open(data, length_s), chosen(measured, only), out, setup,
+            float("inf") if minutes is None else minutes,
+            lambda name, done, total: bar.update(task, description=name, completed=done, total=total),
+        )  # fmt: skip
+    everything = chosen(measured, None)
+    command = f"beamsplat bench sensitivity --part {part} --data {setup['data']} --seconds {length_s:g}"
+    table = table_of(measured, everything, rows, command, time.strftime("%Y-%m-%d"))
+    if markdown is not None:
+        write_page(markdown, part, table)
+    print(json.dumps(result_json(measured, everything, rows, setup)) if as_json else table)

@@ -13,7 +13,8 @@ import typer
 from rich.progress import track
 
 from beamsplat.common.errors import UserError
-from beamsplat.tools.cli.slam import JsonOption, console, poses_of, print_figures
+from beamsplat.tools.cli.slam import JsonOption, console, print_figures
+from beamsplat.tools.evaluation.slam import planar_poses
 
 MAX_ERROR_M, MAX_ERROR_DEG = 0.10, 2.0  # a pose within these errors is right
 MIN_CONFIDENCE = 0.5  # an answer with at least this confidence is used
@@ -39,7 +40,7 @@ def eval_relocalize(
     from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
     from beamsplat.services.localization.lidar2d.slam import LidarSlam
 
-    stamps_ns, pose_map_body = poses_of(folder, "trajectory.tum")
+    stamps_ns, pose_map_body = planar_poses(folder / "trajectory.tum")
     chosen = np.sort(np.random.default_rng(seed).choice(len(stamps_ns), min(scans, len(stamps_ns)), False))
     drawn, T_body_lidar = _scans_at(bag, {int(stamps_ns[i]) for i in chosen})
     slam = LidarSlam.load(folder / "state", LidarSlamSettings(), T_body_lidar, localize_only=True)

@@ -48,6 +48,7 @@ def slam(
     from beamsplat.services.localization.lidar2d.offline_mapping import MeasurementLog, map_measurements
     from beamsplat.services.replay.options import SourceOptions
     from beamsplat.services.replay.source import open_source
+    from beamsplat.tools.evaluation.slam import measurements
 
     without = {"image", "pose"} | ({"odometry"} if no_odometry else set())
     options = SourceOptions(
@@ -67,7 +68,7 @@ def slam(
         )  # fmt: skip
         with bar:
             task = bar.add_task("mapping", total=source.message_count())
-            log = MeasurementLog(lidar.T_body_lidar, _measurements(source), lambda: bar.advance(task))
+            log = MeasurementLog(lidar.T_body_lidar, measurements(source), lambda: bar.advance(task))
             figures = map_measurements(log, out)
         for problem in source.problems:
             console.print(f"[yellow]{problem}[/]", highlight=False)
@@ -78,21 +79,6 @@ def slam(
     else:
         print_figures(figures)
         console.print(f"wrote trajectory.tum, online.tum, map.pgm, map.yaml, map.png and state/ to {out}")
-
-
-def _measurements(source: Any) -> Any:
-    """Yield plain tuples ("scan", ...) and ("odometry", ...) in the order of the recording."""
-    from beamsplat.common.geometry.transforms import se3_to_se2
-
-    for _, topic, m in source.messages():
-        if topic == "lidar/scan":
-            yield (
-                "scan", m.stamp_ns, m.ranges_m, m.angle_min_rad, m.angle_increment_rad, m.time_increment_s,
-                m.range_min_m, m.range_max_m,
-            )  # fmt: skip
-        elif topic == "wheel/odometry":
-            x_m, y_m, yaw_rad = se3_to_se2(m.T_odom_body)
-            yield "odometry", m.stamp_ns, float(x_m), float(y_m), float(yaw_rad)
 
 
 def eval_slam(
@@ -116,20 +102,15 @@ def eval_slam(
     """
     if (relations is None) == (groundtruth is None):
         raise UserError("eval slam needs either --relations FILE or --groundtruth FILE")
-    figures = _against_relations(folder, relations) if relations else _against_truth(folder, groundtruth)
+    from beamsplat.tools.evaluation.slam import errors_against_truth
+
+    figures = (
+        _against_relations(folder, relations) if relations else errors_against_truth(folder, groundtruth)
+    )
     if as_json:
         print(json.dumps(figures))
     else:
         print_figures(figures)
-
-
-def poses_of(folder: Path, name: str) -> tuple[Any, Any]:
-    """Return stamps int64 [N] and planar poses float64 [N, 3] of a TUM file."""
-    from beamsplat.common.geometry.trajectory import read_tum
-    from beamsplat.common.geometry.transforms import se3_to_se2
-
-    trajectory = read_tum(folder / name)
-    return trajectory.stamps_ns, se3_to_se2(trajectory.T_a_b)
 
 
 def _against_relations(folder: Path, path: Path) -> dict[str, Any]:
@@ -139,6 +120,7 @@ def _against_relations(folder: Path, path: Path) -> dict[str, Any]:
     import numpy as np
 
     from beamsplat.services.localization.lidar2d.metrics import read_relations, relation_errors
+    from beamsplat.tools.evaluation.slam import planar_poses
 
     folder, name = (folder.parent, folder.name) if folder.is_file() else (folder, "trajectory.tum")
     if not (folder / "figures.json").is_file():
@@ -146,37 +128,10 @@ def _against_relations(folder: Path, path: Path) -> dict[str, Any]:
             f"{folder}: no figures.json, which says where the lidar is mounted; relations need a folder that "
             "`beamsplat slam` wrote"
         )
-    stamps_ns, pose_map_body = poses_of(folder, name)
+    stamps_ns, pose_map_body = planar_poses(folder / name)
     relation_stamps_ns, relative = read_relations(path)
     pose_body_lidar = np.array(json.loads((folder / "figures.json").read_text())["T_body_lidar"])
     return asdict(relation_errors(stamps_ns, pose_map_body, relation_stamps_ns, relative, pose_body_lidar))
-
-
-def _against_truth(folder: Path, path: Path) -> dict[str, Any]:
-    """Return the errors of the optimised and the online trajectory against the truth."""
-    from beamsplat.services.localization.lidar2d.metrics import interpolate_poses, trajectory_errors
-
-    figures: dict[str, Any] = {}
-    true_stamps_ns, pose_world_body = poses_of(path.parent, path.name)
-    names = {"": "trajectory.tum", "online_": "online.tum"}
-    if folder.is_file():
-        folder, names = folder.parent, {"": folder.name}
-    elif not (folder / names["online_"]).is_file():
-        del names["online_"]
-    for prefix, name in names.items():
-        stamps_ns, pose_map_body = poses_of(folder, name)
-        inside = (stamps_ns >= true_stamps_ns[0]) & (stamps_ns <= true_stamps_ns[-1])
-        if not inside.any():
-            raise UserError(f"{path}: has no pose in the time range of {folder / name}")
-        truth = interpolate_poses(true_stamps_ns, pose_world_body, stamps_ns[inside])
-        errors = trajectory_errors(pose_map_body[inside], truth)
-        figures |= {
-            f"{prefix}poses": errors.poses,
-            f"{prefix}ate_first_pose_rmse_m": errors.ate_first_pose_rmse_m,
-            f"{prefix}ate_se3_rmse_m": errors.ate_se3_rmse_m,
-            f"{prefix}yaw_rmse_rad": errors.yaw_rmse_rad,
-        }
-    return figures
 
 
 def print_figures(figures: dict[str, Any]) -> None:

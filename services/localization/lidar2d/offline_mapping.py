@@ -40,7 +40,9 @@ class MeasurementLog:
     advance: Callable[[], None]  # called once per measurement, for a progress bar
 
 
-def map_measurements(log: MeasurementLog, out: Path, resolution_m: float = 0.05) -> dict[str, Any]:
+def map_measurements(
+    log: MeasurementLog, out: Path, resolution_m: float = 0.05, settings: LidarSlamSettings | None = None
+) -> dict[str, Any]:
     """Run the SLAM over a recording, write poses, map, state and figures into `out`, and return the figures.
 
     Background jobs run in a second thread. Their results are applied at the scans where they are due, exactly
@@ -49,7 +51,7 @@ def map_measurements(log: MeasurementLog, out: Path, resolution_m: float = 0.05)
     Raises:
         UserError: there was no usable scan.
     """
-    slam = LidarSlam(LidarSlamSettings(), log.T_body_lidar)
+    slam = LidarSlam(settings or LidarSlamSettings(), log.T_body_lidar)
     wall, cpu = time.perf_counter(), time.process_time()
     steps_ms: list[float] = []
     statuses: dict[str, int] = {}

@@ -21,57 +21,57 @@ class LidarSlamSettings:
     min_points: int = 20  # scans with fewer returns are rejected
 
     # Local map
-    cell_m: float = 0.05
+    cell_m: float = 0.05  # cell size of the local map
     reach_cells: int = 6  # a return is associated with a surface within this many cells
     range_sigma_m: float = 0.015  # noise of one return along the surface normal
     map_sigma_m: float = 0.02  # error that averaging does not remove (beam footprint, sensor bias)
     submap_nodes: int = 40  # a new submap starts after this many nodes; each submap holds twice as many
     min_submap_nodes: int = 10  # minimum before a degenerate stretch ends a submap early
-    motion_filter_distance_m: float = 0.15  # a scan becomes a node after this motion,
-    motion_filter_angle_rad: float = math.radians(8.0)  # or this rotation,
-    motion_filter_time_s: float = 4.0  # or this time
+    motion_filter_distance_m: float = 0.15  # a scan becomes a node after this motion
+    motion_filter_angle_rad: float = math.radians(8.0)  # a scan becomes a node after this rotation
+    motion_filter_time_s: float = 4.0  # a scan becomes a node after this time
 
     # Matching
     outlier_m: float = 0.08  # Geman-McClure scale: the weight is 1/4 at this distance from the surface
     returns_per_measurement: float = 6.0  # neighbouring returns have correlated errors: so many count as one
-    search_min_m: float = 0.10  # limits of the correlative search window
-    search_max_m: float = 0.80
-    search_min_rad: float = math.radians(4.0)
-    search_max_rad: float = math.radians(35.0)
+    search_min_m: float = 0.10  # lower limit of the correlative search window
+    search_max_m: float = 0.80  # upper limit of the correlative search window
+    search_min_rad: float = math.radians(4.0)  # lower limit of this window in rotation
+    search_max_rad: float = math.radians(35.0)  # upper limit of this window in rotation
     good_inlier_ratio: float = 0.70  # below it, the search is repeated in a larger window
     lost_inlier_ratio: float = 0.50  # below it, the match is rejected
     sure_inlier_ratio: float = 0.80  # minimum for a match far from its prediction
 
     # Motion
-    max_speed_m_s: float = 3.0
-    max_yaw_rate_rad_s: float = 6.0
+    max_speed_m_s: float = 3.0  # a match that implies faster motion is rejected
+    max_yaw_rate_rad_s: float = 6.0  # a match that implies faster rotation is rejected
     extrapolate_s: float = 0.5  # the last velocity is extrapolated for at most this time
 
     # Pose graph
     edge_sigma_m: float = 0.01  # error of a match that is not in its information matrix
-    edge_sigma_rad: float = math.radians(0.15)
-    # Drift between consecutive submaps, as measured on real logs; errors of consecutive matches correlate.
-    submap_drift_sigma_m: float = 0.03
-    submap_drift_sigma_rad: float = math.radians(0.5)
+    edge_sigma_rad: float = math.radians(0.15)  # rotation error of a match, likewise
+    # As measured on real logs; errors of consecutive matches correlate.
+    submap_drift_sigma_m: float = 0.03  # drift between consecutive submaps
+    submap_drift_sigma_rad: float = math.radians(0.5)  # drift in rotation between consecutive submaps
     nodes_per_measurement: float = 4.0  # after refinement, this many constraints within a submap count as one
     job_nodes: int = 20  # a background job starts after this many new nodes
-    apply_after_scans: int = 20  # its result is applied exactly this many scans later
+    apply_after_scans: int = 20  # the result of a job is applied exactly this many scans later
     max_loops_per_node: int = 3  # maximum number of loop closures per node
     loop_distance_m: float = 3.0  # a submap is near if one of its nodes is within this distance
     local_window_m: float = 0.8  # largest window of the local loop search, done for every node
-    local_window_rad: float = math.radians(12.0)
+    local_window_rad: float = math.radians(12.0)  # largest rotation in the local loop search
     global_searches_per_job: int = 4  # number of submaps per job that are searched in larger windows
-    max_global_window_m: float = 40.0
+    max_global_window_m: float = 40.0  # largest window of a global search
     merged_scans: int = 17  # number of scans merged for a global search
-    min_global_score: float = 0.30  # mean likelihood
-    loop_min_inlier_ratio: float = 0.60
-    loop_min_overlap: float = 0.40
+    min_global_score: float = 0.30  # minimum mean likelihood of a global match
+    loop_min_inlier_ratio: float = 0.60  # a loop closure with less is rejected
+    loop_min_overlap: float = 0.40  # a loop closure with less of its scan in mapped area is rejected
 
     # Lifelong operation
     min_covering_submaps: int = 6  # a submap is trimmed if this many others cover its nodes
-    trim_every_jobs: int = 5
+    trim_every_jobs: int = 5  # jobs from one search for such submaps to the next
     lost_scans: int = 5  # scans in a row without a match, after which a new segment starts
     link_every_scans: int = 10  # interval between relocalization attempts of a segment
-    link_min_confidence: float = 0.5
+    link_min_confidence: float = 0.5  # minimum of a relocalization that links two segments
     link_max_runner_up_ratio: float = 0.7  # above it, two relocalizations must agree
-    link_min_distance_m: float = 1.0  # minimum distance between these two
+    link_min_distance_m: float = 1.0  # minimum distance between two relocalizations that must agree

@@ -1,0 +1,196 @@
+"""Table of `bench sensitivity` in Markdown: one row per parameter, those with the largest effect first."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from beamsplat.common.errors import UserError
+from beamsplat.tools.bench.parameters import Parameter
+from beamsplat.tools.bench.readme import replace_readme_table
+from beamsplat.tools.bench.sensitivity import DEFAULTS, SCALES, Row
+from beamsplat.tools.bench.sensitivity_parts import PARTS, Figure, Part
+
+# A change counts as real if it exceeds this many times the spread of the runs with default settings: 3 runs
+# of a normal distribution spread over 1.7 sigma in the mean.
+NOISE_FACTOR = 2.0
+_INTRODUCTION = """# Parameters and their effect
+
+Each numeric setting of SLAM, fusion and mapper was changed by -30 % and by +30 % while all others kept their
+defaults. The tables show the change of the figures, in percent of their values with default settings. This
+page is generated:
+
+    beamsplat bench sensitivity --part slam --data DIR --markdown docs/parameters.md
+
+* A cell `-1.2 / +3.4` shows the change with the smaller and with the larger value. **Bold** changes exceed
+  twice the spread (largest minus smallest) of the runs with default settings; all others may be noise.
+* Rows are in the order of the largest bold change of a quality figure, then of a cost.
+* Integers are rounded and change by at least 1. Flags and tuples are left out. Values that cannot be used are
+  marked as invalid.
+* No effect means that the figures of this recording do not depend on the setting. Other recordings can:
+  settings for long drives, lost localization or large maps never act in a short drive through a house.
+"""
+
+
+@dataclass(frozen=True)
+class Effect:
+    """Relative changes of the figures by one parameter; a figure that a run lacks has no entry."""
+
+    parameter: Parameter
+    values: tuple[float | int | None, ...]  # by SCALES; None: not measured
+    errors: tuple[str, ...]  # by SCALES; "" if the run has figures
+    changes: tuple[dict[str, float], ...]  # by SCALES; 0.01 is one percent
+
+    @property
+    def measured(self) -> bool:
+        """Whether both values were run or found invalid."""
+        return None not in self.values
+
+
+def noise(part: Part, rows: list[Row]) -> dict[str, float]:
+    """Return the relative spread (largest minus smallest) of each figure with default settings."""
+    runs, base = [row["figures"] for row in rows if row["parameter"] == DEFAULTS], _base(rows)
+    spread = {}
+    for figure in part.figures:
+        values = [run[figure.key] for run in runs if run.get(figure.key) is not None]
+        spread[figure.key] = _relative(max(values) - min(values), base[figure.key]) if values else 0.0
+    return spread
+
+
+def effects(part: Part, parameters: list[Parameter], rows: list[Row]) -> list[Effect]:
+    """Return the effect of each parameter, in the order of the table.
+
+    Raises:
+        UserError: no run with default settings is finished.
+    """
+    base, spread, found = _base(rows), noise(part, rows), []
+    for parameter in parameters:
+        own = {row["scale"]: row for row in rows if row["parameter"] == parameter.name}
+        runs = [own.get(scale) for scale in SCALES]
+        changes = tuple(
+            {
+                figure.key: _relative(row["figures"][figure.key] - base[figure.key], base[figure.key])
+                for figure in part.figures
+                if row and row.get("figures", {}).get(figure.key) is not None
+            }
+            for row in runs
+        )
+        values = tuple(row["value"] if row else None for row in runs)
+        found.append(Effect(parameter, values, tuple((row or {}).get("error", "") for row in runs), changes))
+    return sorted(found, key=lambda effect: _order(part, effect, spread), reverse=True)
+
+
+def as_json(
+    part: Part, parameters: list[Parameter], rows: list[Row], setup: dict[str, Any]
+) -> dict[str, Any]:
+    """Return the result as JSON values: default figures, their relative spread, relative changes."""
+    return {
+        **setup,
+        "default": _base(rows),
+        "spread": noise(part, rows),
+        "parameters": [
+            {
+                "name": effect.parameter.name, "default": effect.parameter.default,
+                "unit": effect.parameter.unit, "meaning": effect.parameter.meaning,
+                "runs": [
+                    {"scale": scale, "value": value, "change": change, **({"error": error} if error else {})}
+                    for scale, value, change, error in zip(
+                        SCALES, effect.values, effect.changes, effect.errors
+                    )
+                    if value is not None
+                ],
+            }
+            for effect in effects(part, parameters, rows)
+        ],
+    }  # fmt: skip
+
+
+def markdown(part: Part, parameters: list[Parameter], rows: list[Row], command: str, date: str) -> str:
+    """Return the text of one part: how it was measured, its noise, the table, parameters without runs."""
+    spread, base = noise(part, rows), _base(rows)
+    defaults = [
+        f"{figure.title} {base[figure.key]:.4g} (spread {100.0 * spread[figure.key]:.1f} %)"
+        for figure in part.figures
+    ]
+    found = effects(part, parameters, rows)
+    head = ["parameter", "default", "unit", "meaning", "-30 %", "+30 %", *(f.title for f in part.figures)]
+    lines = [
+        f"Measured with `{command}` on {date}.",
+        "",
+        f"Default settings ({part.noise}): {', '.join(defaults)}. Changes below are in percent.",
+        "",
+        "| " + " | ".join(head) + " |",
+        "|---" * len(head) + "|",
+    ]
+    for effect in found:
+        if effect.measured:
+            cells = [_cell(figure, effect, spread[figure.key]) for figure in part.figures]
+            lines.append("| " + " | ".join([*_head_cells(effect), *cells]) + " |")
+    if rest := [f"`{effect.parameter.name}`" for effect in found if not effect.measured]:
+        lines += ["", f"Not measured: {', '.join(rest)}."]
+    return "\n".join(lines)
+
+
+def write_page(file: Path, name: str, text: str) -> None:
+    """Replace the text of one part in a page, which is created if it is missing."""
+    if not file.is_file():
+        file.parent.mkdir(parents=True, exist_ok=True)
+        titles = {"slam": "Lidar SLAM", "fusion": "Depth fusion", "map": "Mapper"}
+        marks = [
+            f"\n## {titles[part]}\n\n<!-- bench sensitivity {part} -->\n<!-- /bench sensitivity {part} -->\n"
+            for part in PARTS
+        ]
+        file.write_text(_INTRODUCTION + "".join(marks))
+    replace_readme_table(file, f"sensitivity {name}", f"\n{text}\n")
+
+
+def _base(rows: list[Row]) -> dict[str, float]:
+    """Return the figures of the run with default settings and seed 0, like all other runs."""
+    for row in rows:
+        if row["parameter"] == DEFAULTS and row["seed"] == 0:
+            return row["figures"]
+    raise UserError("no run with default settings is finished; run the command again, or raise --minutes")
+
+
+def _relative(difference: float, base: float) -> float:
+    return difference / (abs(base) or 1.0)
+
+
+def _order(part: Part, effect: Effect, spread: dict[str, float]) -> tuple[float, float, float]:
+    """Return the largest change beyond the noise of a quality figure, that of a cost, the largest change."""
+
+    def largest(quality: bool, factor: float) -> float:
+        keys = [figure.key for figure in part.figures if figure.quality == quality]
+        sizes = [abs(change.get(key, 0.0)) for change in effect.changes for key in keys
+                 if abs(change.get(key, 0.0)) > factor * spread[key]]  # fmt: skip
+        return max(sizes, default=0.0)
+
+    return largest(True, NOISE_FACTOR), largest(False, NOISE_FACTOR), largest(True, 0.0)
+
+
+def _head_cells(effect: Effect) -> list[str]:
+    parameter = effect.parameter
+    values = [
+        _number(value) + (f" (invalid: {error})" if error else "")
+        for value, error in zip(effect.values, effect.errors)
+    ]
+    words = [parameter.unit, parameter.meaning, *values]
+    return [f"`{parameter.name}`", _number(parameter.default), *(word.replace("|", "\\|") for word in words)]
+
+
+def _number(value: float | int | None) -> str:
+    return "–" if value is None else str(value) if isinstance(value, int) else f"{value:.4g}"
+
+
+def _cell(figure: Figure, effect: Effect, spread: float) -> str:
+    shown = []
+    for change in effect.changes:
+        if figure.key not in change:
+            shown.append("–")
+            continue
+        text = f"{100.0 * change[figure.key]:+.1f}"
+        text = "0" if text in ("+0.0", "-0.0") else text
+        real = abs(change[figure.key]) > NOISE_FACTOR * spread and text != "0"
+        shown.append(f"**{text}**" if real else text)
+    return " / ".join(shown)
