@@ -20,18 +20,18 @@ class PlaneSweepConfig:
 
     width_px: int = 160  # working size; the height follows from the aspect ratio
     labels: int = 64  # depth hypotheses, evenly spaced in log depth
-    z_near_m: float = 0.4
-    z_far_m: float = 14.0
+    z_near_m: float = 0.4  # depth of the nearest hypothesis
+    z_far_m: float = 14.0  # depth of the farthest hypothesis
     baselines_m: tuple[float, ...] = (0.2, 0.4, 0.8)  # preferred distances to the source images
-    max_turn_rad: float = 0.6  # between the viewing directions of two images
-    cost_scale: float = 12.0
+    max_turn_rad: float = 0.6  # largest angle between the viewing directions of two images
+    cost_scale: float = 12.0  # of the matching cost per unit of feature difference
     cost_cap: float = 5.0  # truncation: one very bad match must not outweigh the smoothness terms
     p1: float = 0.7  # penalty for a change of one label (Hirschmueller 2008)
-    p2: float = 20.0  # penalty for a larger change
+    p2: float = 20.0  # penalty for a change of several labels
     edge_grey: float = 30.0  # grey step at which p2 is halved
     temperature: float = 4.0  # of the label distribution exp(-cost / temperature)
     wall_near: float = 4.0  # prior weight of the extruded beams at the height of the lidar
-    wall_far: float = 0.15  # the same far above and below, for a body that stays level
+    wall_far: float = 0.15  # weight of these beams far above and below, for a body that stays level
     wall_reach_m: float = 0.15  # e-folding height of `wall_near`
     floor: float = 4.0  # prior weight of the floor plane
     occluded_walls: float = 0.5  # prior weight of each wall behind the nearest one
@@ -46,11 +46,11 @@ class PlaneSweepConfig:
     max_sigma_log: float = 0.3  # pixels with a larger sigma of log depth are unknown
     max_sigma_m: float = 0.95  # pixels whose neighbourhood has a larger mean sigma are unknown
     estimate: float = 1.6  # prior weight of the depth source's estimate
-    estimate_spread: float = 0.12  # spread of log depth at which that weight falls to 1/e
+    estimate_spread: float = 0.12  # spread of log depth at which the weight `estimate` falls to 1/e
     near_m: float = 0.7  # depth below this is penalised
     near: float = 1.0  # penalty per unit of log depth below `near_m`
-    rotation_sigma_rad: float = 0.007  # of a relative pose from localization
-    translation_sigma_m: float = 0.015
+    rotation_sigma_rad: float = 0.007  # rotation error of a relative pose from localization
+    translation_sigma_m: float = 0.015  # translation error of a relative pose from localization
 
     @staticmethod
     def in_hand() -> PlaneSweepConfig:
