@@ -103,6 +103,9 @@ class ExternalPose(Message):
 # --- localization ------------------------------------------------------------------------------
 
 
+TrackingStatus = Literal["ok", "lost", "relocalizing", "rejected"]
+
+
 class Odometry(Message):
     """Smooth pose `T_odom_body` at the stamp, with the covariance of (x, y, yaw) in m and rad.
 
@@ -114,7 +117,7 @@ class Odometry(Message):
 
     T_odom_body: Transform
     covariance: Annotated[np.ndarray, Array("float64", 3, 3)]
-    status: Literal["ok", "lost", "relocalizing", "rejected"] = "ok"
+    status: TrackingStatus = "ok"
     detail: Text = ""
     metric: bool = True  # since 1.1
 

@@ -95,7 +95,7 @@ class CaptureSource:
         JPEG is requested first because raw images at full rate exceed the bandwidth of USB. A setting
         that the device rejects keeps its previous value.
         """
-        self._capture.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter_fourcc(*"MJPG"))
+        self._capture.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*"MJPG"))
         if size_px is not None:
             self._capture.set(cv2.CAP_PROP_FRAME_WIDTH, size_px[0])
             self._capture.set(cv2.CAP_PROP_FRAME_HEIGHT, size_px[1])

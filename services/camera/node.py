@@ -88,7 +88,7 @@ class CameraNode(Node):
         With `strict` False (the size to request from the camera) the options are the second choice.
         """
         c = self.config
-        if self._rig is not None:
+        if self._rig is not None and self._rig.camera is not None:
             return self._rig.camera.width_px, self._rig.camera.height_px
         return (c.width_px, c.height_px) if c.width_px and c.height_px and not strict else None
 

@@ -127,18 +127,23 @@ class CameraReader:
         """Return the image if it passes all checks; otherwise count the reason and return None."""
         jpeg = frame.jpeg
         if jpeg is None:
+            assert frame.bgr is not None  # a frame has one of both
             good, data = cv2.imencode(".jpg", frame.bgr, [cv2.IMWRITE_JPEG_QUALITY, self._quality])
             if not good:
-                return self._reject("cannot be written as JPEG")
+                self._reject("cannot be written as JPEG")
+                return None
             jpeg = data.tobytes()
         elif not is_intact(jpeg):
-            return self._reject("damaged")
+            self._reject("damaged")
+            return None
         head = read_image_header(jpeg)
         if head is None or head.encoding != "jpeg":
-            return self._reject("not a JPEG")
+            self._reject("not a JPEG")
+            return None
         if self._size_px is not None and (head.width_px, head.height_px) != self._size_px:
             wanted = f"{self._size_px[0]}x{self._size_px[1]}"
-            return self._reject(f"{head.width_px}x{head.height_px} px, the calibration is for {wanted}")
+            self._reject(f"{head.width_px}x{head.height_px} px, the calibration is for {wanted}")
+            return None
         self._newest_ns = max(frame.stamp_ns - self._delay_ns, self._newest_ns + 1)
         self.sent += 1
         return CheckedImage(self._newest_ns, head.width_px, head.height_px, jpeg)

@@ -15,7 +15,7 @@ import numpy as np
 from beamsplat.common.errors import UserError
 from beamsplat.services.depth.model_files import find_model
 from beamsplat.services.depth.onnx_model import OnnxModel, to_hw
-from beamsplat.services.depth.source import DepthInput, Estimate, check_depth_map
+from beamsplat.services.depth.source import DepthInput, Estimate, Kind, check_depth_map
 
 PATCH = 14  # px, side of a vision transformer patch
 _MEAN = np.array([0.485, 0.456, 0.406], dtype=np.float32)
@@ -29,7 +29,7 @@ class DepthAnything:
         UserError: the model is missing or has other inputs, or `input_px` is below one patch.
     """
 
-    kind = "disparity"
+    kind: Kind = "disparity"
 
     def __init__(
         self, model: str | Path = "depth_anything_v2_small", input_px: int = 252, threads: int = 1
@@ -66,7 +66,7 @@ class DepthAnythingMetric(DepthAnything):
     The network does not know the focal length. Its scale is wrong by 10 to 20 %, which fusion corrects.
     """
 
-    kind = "metric"
+    kind: Kind = "metric"
 
     def __init__(
         self, model: str | Path = "depth_anything_v2_metric_hypersim_small", input_px: int = 252,

@@ -20,6 +20,7 @@ from beamsplat.services.depth.source import (
     IGNORES_IMAGE,
     DepthInput,
     DepthSource,
+    Kind,
     check_source,
     make_source,
     uses_beams,
@@ -43,6 +44,7 @@ class DepthNode(Node):
 
     name = "depth"
     Config = DepthConfig
+    config: DepthConfig
     replaceable = True
     inputs = (Input("rig", "every"), "camera/image", "lidar/scan", "localization/odometry")
     outputs = ("depth/estimate",)
@@ -97,6 +99,8 @@ class DepthNode(Node):
     def _estimate_waiting(self) -> Outputs:
         """Process the newest image that is ready; older ones are dropped and counted as overtaken."""
         image = None
+        assert self._history is not None  # images are queued after the calibration only
+        assert self._undistort is not None
         while self._waiting:
             if self._needs_beams and self._waiting[0].stamp_ns > self._history.newest_pose_ns:
                 break
@@ -106,7 +110,7 @@ class DepthNode(Node):
         if image is None:
             return
         try:
-            rgb = self._decode_image(image)
+            rgb = self._decode_image(image, self._undistort)
         except (UserError, ValueError) as error:
             yield self._rejection(image.stamp_ns, str(error))
             return
@@ -125,20 +129,20 @@ class DepthNode(Node):
             ),
         )
 
-    def _decode_image(self, image: Image) -> np.ndarray:
+    def _decode_image(self, image: Image, undistort: Undistorter) -> np.ndarray:
         """Return the undistorted image uint8 [H, W, 3]; black for a source that does not use it.
 
         Raises:
             UserError, ValueError: it cannot be decoded, or its size differs from the calibration.
         """
-        shape = self._undistort.pinhole.shape
+        shape = undistort.pinhole.shape
         if self.config.source in IGNORES_IMAGE and (image.height_px, image.width_px) == shape:
             return np.broadcast_to(np.uint8(0), (*shape, 3))
-        return self._undistort(
+        return undistort(
             decode_rgb(image.data, image.encoding, image.width_px, image.height_px, image.step_bytes)
         )
 
-    def _rejection(self, stamp_ns: int, status: str, kind: str = "none") -> tuple[str, DepthEstimate]:
+    def _rejection(self, stamp_ns: int, status: str, kind: Kind = "none") -> tuple[str, DepthEstimate]:
         empty = np.zeros((0, 0), np.float32)
         message = DepthEstimate(
             stamp_ns=stamp_ns, source=self.config.source, kind=kind, values=empty, status=status

@@ -76,6 +76,7 @@ class FusionNode(Node):
 
     name = "fusion"
     Config = FusionConfig
+    config: FusionConfig
     inputs = (
         Input("rig", "every"),
         Input("camera/image", "every"),  # every image, so that each estimate finds its image
@@ -128,6 +129,7 @@ class FusionNode(Node):
             self._undistort.pinhole, camera.T_body_camera, floor_known=self.config.floor_known,
             planar=self.config.planar,
         )  # fmt: skip
+        assert rig.lidar is not None  # checked above
         self._check = StartupCheck(
             self._undistort.pinhole, camera.T_body_camera, rig.lidar.T_body_lidar, self.config.check_pairs
         )
@@ -185,8 +187,8 @@ class FusionNode(Node):
         if self.calibration is not None:
             calibration = self.calibration.line
         else:
-            running = self._check is not None and not self._check.done
-            calibration = self._check.progress if running else ""
+            check = self._check
+            calibration = check.progress if check is not None and not check.done else ""
         self.detail = "; ".join(text for text in (overtaken, calibration) if text)
 
     def on_camera_image(self, image: Image) -> Outputs:
@@ -276,6 +278,7 @@ class FusionNode(Node):
     def _fuse(self, candidate: _Candidate, keyframe: bool) -> Outputs:
         """Publish the depth of one image, and the cloud if it is a keyframe."""
         frame = candidate.frame
+        assert self._fusion is not None  # candidates exist after the calibration only
         fused = self._fusion.fuse(frame, keyframe=keyframe)
         if not fused.ok:
             if keyframe:

@@ -7,6 +7,8 @@ metric prior.
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 
@@ -14,7 +16,7 @@ from beamsplat.common.geometry.camera import Pinhole
 from beamsplat.common.geometry.transforms import skew, so3_exp
 
 # Parameters of pyramidal Lucas-Kanade tracking.
-_LK = {"winSize": (13, 13), "maxLevel": 3, "flags": cv2.OPTFLOW_USE_INITIAL_FLOW}
+_LK: dict[str, Any] = {"winSize": (13, 13), "maxLevel": 3, "flags": cv2.OPTFLOW_USE_INITIAL_FLOW}
 MIN_TRACKS = 12  # fewer tracks do not refine a pose
 
 

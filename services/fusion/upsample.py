@@ -64,7 +64,7 @@ def upsample_depth(
 
 
 @kernel
-def _one_surface(depth: np.ndarray, i0: int, j0: int, most: float) -> bool:
+def _one_surface(depth: np.ndarray, i0: int, j0: int, most: np.float32) -> bool:
     """Return whether the 2x2 pixels from [i0, j0] are known and within a factor `most` of each other."""
     low, high = np.inf, 0.0
     for i in range(i0, i0 + 2):
@@ -72,12 +72,19 @@ def _one_surface(depth: np.ndarray, i0: int, j0: int, most: float) -> bool:
             if not depth[i, j] > 0.0:
                 return False
             low, high = min(low, depth[i, j]), max(high, depth[i, j])
-    return high < low * most
+    return bool(high < low * most)
 
 
 @kernel
 def _most_similar_pixel(
-    colour: np.ndarray, full_colour: np.ndarray, V: int, U: int, i0: int, j0: int, a: float, b: float
+    colour: np.ndarray,
+    full_colour: np.ndarray,
+    V: int,
+    U: int,
+    i0: int,
+    j0: int,
+    a: np.float32,
+    b: np.float32,
 ) -> tuple[int, int]:
     """Return the pixel of the 2x2 block at [i0, j0] whose colour and position are most similar to [V, U]."""
     best, best_i, best_j = np.float32(1e9), i0, j0

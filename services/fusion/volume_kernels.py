@@ -86,7 +86,7 @@ def cost_volume(
 
 
 @kernel
-def _combine_views(best: np.ndarray, count: np.ndarray, last: int, cut: float, out: np.ndarray) -> None:
+def _combine_views(best: np.ndarray, count: np.ndarray, last: int, cut: np.float32, out: np.ndarray) -> None:
     D = out.shape[0]
     lowest, total, seen = cut, np.float32(0.0), 0
     for d in range(last):

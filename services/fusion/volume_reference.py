@@ -51,7 +51,11 @@ def box3(volume: np.ndarray, scale: float) -> np.ndarray:
     """Return the mean over 3 x 3 pixels with edges repeated, times `scale`."""
     padded = np.pad(volume, ((1, 1), (1, 1), (0, 0)), mode="edge")
     h, w, _ = volume.shape
-    return scale * sum(padded[i : i + h, j : j + w] for i in range(3) for j in range(3)) / 9.0
+    total = np.zeros_like(padded[:h, :w])
+    for i in range(3):
+        for j in range(3):
+            total = total + padded[i : i + h, j : j + w]
+    return scale * total / 9.0
 
 
 def aggregate(

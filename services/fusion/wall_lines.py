@@ -47,7 +47,7 @@ def find_lines(points_m: np.ndarray, cell_m: float, least_m: float = 1.2, most: 
         hough_vote(left, cell_m, reach_m, votes)
         angle, row = np.unravel_index(int(np.argmax(votes)), votes.shape)
         theta = angle * np.pi / _ANGLES
-        normal, offset = np.array([np.cos(theta), np.sin(theta)]), (row + 0.5) * cell_m - reach_m
+        normal, offset = np.array([np.cos(theta), np.sin(theta)]), float((row + 0.5) * cell_m - reach_m)
         for _ in range(2):
             near = np.abs(left @ normal - offset) < _NEAR_M
             if np.count_nonzero(near) < least:

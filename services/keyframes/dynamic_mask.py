@@ -29,7 +29,7 @@ def dynamic_object_mask(
     and its depth is unknown or within a stride of it; or if it is within 9 cm and no surface is known in
     front of it. `step`: the mask is computed at every `step`-th pixel.
     """
-    mask = np.zeros(depth_m.shape, dtype=bool)
+    mask: np.ndarray = np.zeros(depth_m.shape, dtype=bool)
     if len(dynamic_body_m) == 0:
         return mask
     rays = camera.ray_grid()[::step, ::step] @ T_body_camera[:3, :3].T

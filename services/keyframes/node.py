@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections import deque
-from typing import Annotated
+from typing import Annotated, Literal
 
 import cv2
 import numpy as np
@@ -75,6 +75,7 @@ class KeyframesNode(Node):
 
     name = "keyframes"
     Config = KeyframesConfig
+    config: KeyframesConfig
     inputs = (
         Input("rig", "every"),
         "lidar/scan",
@@ -239,6 +240,7 @@ class KeyframesNode(Node):
         """Return whether the scan around an image is complete, or the waiting time is over."""
         if pose_ns < image_ns + _BEAMS_NS:
             return False
+        assert self._history is not None  # depths are queued after the calibration only
         return self._history.decided_scan_near(image_ns) or pose_ns >= image_ns + _BEAMS_PATIENCE_NS
 
     def on_keyframes_ack(self, ack: KeyframeAck) -> Outputs:
@@ -282,6 +284,7 @@ class KeyframesNode(Node):
     def _keyframe(self, image: Image, depth: FusedDepth, why: str) -> Keyframe:
         """Return the keyframe message, with the poses of the latest optimisation."""
         stamp_ns, T_body_camera = image.stamp_ns, self._camera.T_body_camera
+        assert self._history is not None  # depths are queued after the calibration only
         encoding, picture = self._compress(image)
         beams, _ = self._history.beams(stamp_ns)
         uv, z, index = project_beams(beams, self._undistort.pinhole, T_body_camera)
@@ -297,8 +300,8 @@ class KeyframesNode(Node):
             map_uuid=self._map_uuid,
         )  # fmt: skip
 
-    def _compress(self, image: Image) -> tuple[str, np.ndarray]:
-        if image.encoding in ("jpeg", "png"):
+    def _compress(self, image: Image) -> tuple[Literal["jpeg", "png"], np.ndarray]:
+        if image.encoding == "jpeg" or image.encoding == "png":
             return image.encoding, image.data
         rgb = decode_rgb(image.data, image.encoding, image.width_px, image.height_px, image.step_bytes)
         quality = (cv2.IMWRITE_JPEG_QUALITY, self.config.jpeg_quality)

@@ -230,7 +230,8 @@ def most_redundant(
         raise ValueError("no view may be dropped")
     if count == 1:
         return 0
-    distance, _ = cKDTree(views).query(views, k=min(3, count))  # the first is itself
+    found = cKDTree(views).query(views, k=min(3, count))
+    distance = np.asarray(found[0])  # the first is itself
     # Both views of a pair have the same distance, except for rounding: the third neighbour decides.
     for index in np.lexsort((distance[:, -1], np.round(distance[:, 1], 9))):
         if index != keep:

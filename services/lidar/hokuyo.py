@@ -29,7 +29,7 @@ class HokuyoDriver(LidarDriver):
         super().__init__()
         self._intensity = intensity
         self._byte_time_s = 0.0
-        self._reply: ScipScanReply | None = None
+        self._reply: ScipScanReply  # set by `start`
         self._leftover = b""
 
     def start(self, link: DeviceLink) -> None:

@@ -73,8 +73,10 @@ class LidarReader:
 
     def _read(self) -> Iterator[StampedScan | None]:
         last_data_s = last_scan_s = time.monotonic()
+        link = self._link
+        assert link is not None  # opened by `scans`
         while True:
-            data = self._link.read(_POLL_S)
+            data = link.read(_POLL_S)
             at_ns, now = self._now_ns(), time.monotonic()
             if data:
                 last_data_s = now

@@ -37,7 +37,7 @@ class RplidarDriver(LidarDriver):
     def __init__(self, mode: str = "auto") -> None:
         super().__init__(no_checksum=mode == "standard")
         self.mode = mode
-        self._stream: RplidarStream | None = None
+        self._stream: RplidarStream  # set by `start`
         self._byte_time_s = 0.0
         self._leftover = b""
 

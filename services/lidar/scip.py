@@ -76,7 +76,7 @@ class ScipGeometry(NamedTuple):
         )  # fmt: skip
 
     @property
-    def count(self) -> int:
+    def count(self) -> int:  # type: ignore[override]  # hides tuple.count, which nothing needs
         """Number of measurements of a scan."""
         return self.last_step - self.first_step + 1
 

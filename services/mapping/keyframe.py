@@ -110,7 +110,8 @@ def compress(frame: RgbdKeyframe, sigma_unit: float) -> StoredKeyframe:
         weight = np.where(known, 1.0 / (1.0 + (relative / sigma_unit) ** 2), 0.0)
     depth_mm = np.where(known, frame.depth_m * 1e3, 0.0).astype(np.uint16)
     weight_8 = np.clip(np.nan_to_num(weight) * 255.0 + 0.5, 0.0, 255.0).astype(np.uint8)
-    levels, camera, rgb = [], frame.camera, frame.rgb
+    levels: list[PyramidLevel] = []
+    camera, rgb = frame.camera, frame.rgb
     for halvings in range(2):
         step = 1 << halvings
         w, h = frame.camera.width_px // step, frame.camera.height_px // step
@@ -122,9 +123,9 @@ def compress(frame: RgbdKeyframe, sigma_unit: float) -> StoredKeyframe:
         pixels, z = _beams_at(frame.beams_uvz, frame.camera, camera)
         sampled = np.s_[: h * step : step, : w * step : step]
         planes, d, wt = rgb.transpose(2, 0, 1), depth_mm[sampled], weight_8[sampled]
-        arrays = (np.ascontiguousarray(array) for array in (planes, d, wt))
         hidden = None if frame.mask is None or frame.mask.all() else ~frame.mask[sampled]
-        levels.append(PyramidLevel(camera, *arrays, pixels, z, hidden))
+        rgb_planes, d, wt = (np.ascontiguousarray(array) for array in (planes, d, wt))
+        levels.append(PyramidLevel(camera, rgb_planes, d, wt, pixels, z, hidden))
     T_anchor_camera = np.array(frame.T_anchor_camera, dtype=np.float64)
     return StoredKeyframe(frame.id, frame.anchor, T_anchor_camera, levels, reach_m=visible_range_m(frame))
 
@@ -151,6 +152,8 @@ def with_hidden(level: PyramidLevel, image: np.ndarray, exposure: np.ndarray) ->
         image: float32 [5, H, W] as rendered.
         exposure: float32 [6], log gains and offsets.
     """
+    if level.hidden is None:
+        return level
     gain, offset = np.exp(exposure[:3])[:, None, None], exposure[3:, None, None]
     shown = np.clip((image[:3] * gain + offset) * 255.0 + 0.5, 0.0, 255.0).astype(np.uint8)
     return replace(level, rgb=np.where(level.hidden, shown, level.rgb))

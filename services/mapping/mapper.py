@@ -274,7 +274,8 @@ class Mapper:
 
     def refine(self, iterations: int, size: int = FULL) -> float:
         """Run steps on all keyframes in random order, each equally often; return the mean loss."""
-        ids, losses = [], []
+        ids: list[int] = []
+        losses: list[float] = []
         for _ in range(iterations):
             if not ids:
                 ids = list(self._random.permutation(sorted(self.keyframes)))

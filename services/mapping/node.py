@@ -94,6 +94,7 @@ class MappingNode(Node):
 
     def handover_obstacle(self, before: Node) -> str:
         """The map is handed over in the session: both processes need the same one."""
+        assert isinstance(before.config, MappingConfig)  # `before` is a node of this class
         own, other = self.config.session, before.config.session
         if other is None:
             return "the map is handed over in mapping.session, and the running mapper has none"

@@ -134,7 +134,7 @@ def _handler(view: str, draw: Draw) -> Callable[[MonitorNode, Any], tuple[Output
     return handle
 
 
-_Handlers = type(
+_Handlers: Any = type(
     "_Handlers",
     (),
     {
@@ -150,8 +150,8 @@ class MonitorNode(_Handlers, Node):
 
     name = "monitor"
     Config = MonitorConfig
-    inputs = (*SCENE, *DEPTH, *MAP)
     config: MonitorConfig
+    inputs = (*SCENE, *DEPTH, *MAP)
 
     def check_resources(self) -> None:
         if self.config.save is not None:

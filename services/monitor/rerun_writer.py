@@ -19,7 +19,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import rerun as rr
@@ -141,7 +141,7 @@ class RerunSinkThread:
         except RuntimeError as error:
             self._give_up(str(error))
 
-    def _take(self) -> _LogEntry | threading.Event | str | None:
+    def _take(self) -> _LogEntry | threading.Event | Literal["closing"] | None:
         with self._changed:
             if not self._queue and not self._closing:
                 self._changed.wait(_CHECK_S)

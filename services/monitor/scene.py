@@ -130,6 +130,7 @@ class Scene:
         if not self._limits.due("image", stamp_ns):
             return
         width, height = size_px
+        drawing: rr.EncodedImage | rr.Image
         if encoding in ("jpeg", "png"):
             drawing = rr.EncodedImage(contents=data.tobytes(), media_type=f"image/{encoding}")
         elif encoding == "yuv422_yuy2":
@@ -286,10 +287,10 @@ class Scene:
         best_source = self._best_source()
         ends = [np.eye(4), np.eye(4)]
         if best_source is not None:
-            ends = [self._poses[best_source].at(t) for t in (sweep.stamp_ns, sweep.end_ns)]
-            if ends[0] is None or ends[1] is None:
+            first, last = (self._poses[best_source].at(t) for t in (sweep.stamp_ns, sweep.end_ns))
+            if first is None or last is None:
                 return  # no pose of that time: nowhere to draw it
-            ends = [self._T_map_source(best_source) @ T for T in ends]
+            ends = [self._T_map_source(best_source) @ T for T in (first, last)]
         points_map = sweep_to_world(sweep.points_body, sweep.share, *ends)
         points = rr.Points3D(points_map.astype(np.float32), colors=_SCAN, radii=rr.Radius.ui_points(2.0))
         self._writer.log(SCAN, points, stamp_ns=sweep.stamp_ns)

@@ -120,13 +120,13 @@ def encode_grid(
     rows, columns = np.flatnonzero(known.any(axis=1)), np.flatnonzero(known.any(axis=0))
     if not len(rows):
         raise ValueError("no cell of the map is known yet")
-    rows, columns = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
-    part = occupancy[rows, columns][::-1].astype(np.float32)
+    row0, column0 = rows[0], columns[0]
+    part = occupancy[row0 : rows[-1] + 1, column0 : columns[-1] + 1][::-1].astype(np.float32)
     grey = np.clip(_FREE + (_OCCUPIED - _FREE) * part / 100.0, 0, 255).astype(np.uint8)
     alpha = np.where(part >= 0, 255, 0).astype(np.uint8)
     pixels = np.stack([grey, grey, grey, alpha], axis=-1)
     png = cv2.imencode(".png", pixels, (cv2.IMWRITE_PNG_COMPRESSION, 2))[1].tobytes()
-    corner_m = np.asarray(origin_m) + resolution_m * np.array([columns.start, rows.start])
+    corner_m = np.asarray(origin_m) + resolution_m * np.array([column0, row0])
     metadata = {
         "x_m": round(float(corner_m[0]), 4), "y_m": round(float(corner_m[1]), 4), "cell_m": resolution_m,
         "width": part.shape[1], "height": part.shape[0],

@@ -18,6 +18,7 @@ from pydantic import Field, SecretStr, field_validator
 from beamsplat.common.config.deployment import NodeConfig
 from beamsplat.common.errors import UserError
 from beamsplat.common.messages import (
+    Answer,
     Correction,
     ExternalPose,
     FusedDepth,
@@ -147,7 +148,8 @@ class PageNode(Node):
             }
         if verb != "params":
             log.info("%s %s, commanded by the page", action, node)
-        return " ".join(answer.text for answer in self._ask(node, verb, parameters_sent, timeout_s))
+        answers = self._ask(node, verb, parameters_sent, timeout_s)
+        return " ".join(answer.text for answer in answers if isinstance(answer, Answer))
 
     # --- inputs ---
 

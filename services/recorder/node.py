@@ -33,7 +33,7 @@ def _record_handler(topic: str) -> Callable[[Any, Message], Iterable[Output]]:
 
 
 # A handler for each row of the topic table, so that new topics are recorded without a change here.
-_Handlers = type("_Handlers", (), {row.handler: _record_handler(row.name) for row in TOPICS.values()})
+_Handlers: Any = type("_Handlers", (), {row.handler: _record_handler(row.name) for row in TOPICS.values()})
 
 
 class RecorderNode(_Handlers, Node):
@@ -41,6 +41,7 @@ class RecorderNode(_Handlers, Node):
 
     name = "recorder"
     Config = RecorderConfig
+    config: RecorderConfig
     inputs = tuple(Input(row.name, None if row.delivery == "latched" else "every") for row in TOPICS.values())
 
     def __init__(self, config: RecorderConfig) -> None:
@@ -64,6 +65,11 @@ class RecorderNode(_Handlers, Node):
         )
         log.info("recording to %s", self.writer.path)
 
+    @property
+    def _open_writer(self) -> RecordingWriter:
+        assert self.writer is not None  # opened by `configure`
+        return self.writer
+
     def check_resources(self) -> None:
         check_can_write(self.config.out, "out")
 
@@ -74,15 +80,18 @@ class RecorderNode(_Handlers, Node):
         arrival_ns = self._clock.now_ns()
         if self.config.health and arrival_ns is not None:
             self._write(f"{HEALTH}/{health.node}", health, arrival_ns, None)
-        lost = self.writer.lost.total()
-        self.detail = f"writing {self.writer.path}" + (f", {lost} messages LOST" if lost else "")
+        writer = self._open_writer
+        lost = writer.lost.total()
+        self.detail = f"writing {writer.path}" + (f", {lost} messages LOST" if lost else "")
 
     def record(self, topic: str, message: Message) -> None:
         """Write one message with its header."""
         header, self._header = self._header, None
         if topic in self._chosen:
-            own_clock = header is not None and header.clock_id == self._clock_id
-            arrival_ns = self._clock.arrival_ns(message.stamp_ns, header.publish_ns if own_clock else None)
+            publish_ns = None
+            if header is not None and header.clock_id == self._clock_id:
+                publish_ns = header.publish_ns
+            arrival_ns = self._clock.arrival_ns(message.stamp_ns, publish_ns)
             self._write(topic, message, arrival_ns, header)
 
     def close(self) -> None:
@@ -96,9 +105,10 @@ class RecorderNode(_Handlers, Node):
         log.info("%d messages in %s, %d lost", self.writer.counts.total(), self.writer.path, lost)
 
     def _write(self, topic: str, message: Message, arrival_ns: int, header: Header | None) -> None:
-        failed_before = self.writer.lost.total() > 0
+        writer = self._open_writer
+        failed_before = writer.lost.total() > 0
         try:
-            self.writer.write(topic, message, arrival_ns, header)
+            writer.write(topic, message, arrival_ns, header)
         except RecordingError as error:
             if not failed_before:  # logged once; the count is in `lost` and in the last log line
                 log.error("%s", error)

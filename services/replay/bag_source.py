@@ -150,7 +150,7 @@ class BagSource:
     def sample(self, sensor_name: str, count: int) -> list[dict[str, Any]]:
         """Return the fields of up to `count` messages of a sensor, evenly spread and not validated."""
         topic = self.chosen.get(sensor_name)
-        found = []
+        found: list[dict[str, Any]] = []
         step = max(1, topic.count // count) if topic else 1
         for i, raw in enumerate(self.bag.messages([topic.name]) if topic else ()):
             if i % step == 0 and len(found) < count:
@@ -201,9 +201,9 @@ class BagSource:
                 f"there are images on {image.name} but no sensor_msgs/CameraInfo with the camera's K"
             )
             return
-        self.calibration.camera = cal.intrinsics(
-            self._peek(info), self.image_size_px(), image.name, self.where
-        )
+        size_px = self.image_size_px()
+        assert size_px is not None  # there are images
+        self.calibration.camera = cal.intrinsics(self._peek(info), size_px, image.name, self.where)
         if self.calibration.camera is None:
             self.calibration.missing.append(f"K on {info.name} is all zero: this camera was never calibrated")
         else:

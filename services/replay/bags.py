@@ -39,7 +39,7 @@ class BagTopic(NamedTuple):
 
     name: str
     type_name: str
-    count: int
+    count: int  # type: ignore[assignment]  # hides tuple.count, which nothing needs
     encoding: str  # "cdr", "ros1", or an unsupported encoding
 
 

@@ -115,9 +115,9 @@ class FolderSource:
             )
         rig = load_rig(file)
         images = self._streams.get("image")
-        if images and rig.camera is None:
-            raise UserError(f'{file}: has no [camera] for the images; add it, or set without = ["image"]')
         if images:
+            if rig.camera is None:
+                raise UserError(f'{file}: has no [camera] for the images; add it, or set without = ["image"]')
             head = read_image_header(images[0][1].read_bytes())
             size = (rig.camera.width_px, rig.camera.height_px)
             if head is not None and head[1:] != size:

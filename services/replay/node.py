@@ -19,6 +19,7 @@ class ReplayNode(Node):
 
     name = "replay"
     Config = ReplayConfig
+    config: ReplayConfig
     outputs = ("rig", "wheel/odometry", "lidar/scan", "camera/image", "external/pose", "tick")
 
     def __init__(self, config: ReplayConfig) -> None:
@@ -27,8 +28,11 @@ class ReplayNode(Node):
 
     def configure(self) -> None:
         """Open the data, so that errors are reported before the system starts."""
+        self._open()
+
+    def _open(self) -> ReplaySource:
         if self._source is not None:
-            return
+            return self._source
         source = open_source(self.config.data, source_options(self.config))
         try:
             source.rig()
@@ -36,6 +40,7 @@ class ReplayNode(Node):
             source.close()
             raise
         self._source = source
+        return source
 
     def check_resources(self) -> None:
         check_rig_option(self.config.rig)
@@ -47,17 +52,16 @@ class ReplayNode(Node):
         config = self.config
         if config.loop or config.start_s or config.duration_s is not None:
             return None
-        self.configure()
-        return self._source.message_count()
+        return self._open().message_count()
 
     def source(self) -> Iterator[SourceItem]:
         """Yield the calibration, then all messages by arrival time."""
-        self.configure()
+        source = self._open()
         config = self.config
-        played = play(self._source, start_s=config.start_s, duration_s=config.duration_s, loop=config.loop)
+        played = play(source, start_s=config.start_s, duration_s=config.duration_s, loop=config.loop)
         for at_ns, topic, message in played:
             yield SourceItem(at_ns, topic, message)
-        for problem in self._source.problems:
+        for problem in source.problems:
             log.warning("%s", problem)
 
     def close(self) -> None:

@@ -59,7 +59,9 @@ def _from_bag(source: BagSource, where: str) -> tuple[str, list[str]]:
     assumed = list(found.assumed)
     comments: dict[str, str] = {"camera": f"Found in {where}."}
     if "image" in source.chosen and found.camera is None:
-        width, height = source.image_size_px()
+        size_px = source.image_size_px()
+        assert size_px is not None  # there are images
+        width, height = size_px
         found.camera = pinhole_from_fov(width, height, _ASSUMED_FOV_DEG)
         text = (
             f"fx, fy from an assumed horizontal field of view of {_ASSUMED_FOV_DEG:g} degrees, no distortion"
@@ -102,7 +104,7 @@ def draft_from_device(source: str, fov_deg: float) -> tuple[str, list[str]]:
         ok, image = capture.read() if capture.isOpened() else (False, None)
     finally:
         capture.release()
-    if not ok:
+    if not ok or image is None:
         raise UserError(
             f"{source}: no image from this camera; check the cable, the index, and other programs that use it"
         )

@@ -23,15 +23,22 @@ _LOOP_PAUSE_NS = 100_000_000
 class ReplaySource(Protocol):
     """Interface of playable data: a bag, a recording or a folder."""
 
-    start_ns: int
-    end_ns: int
-    problems: list[str]
+    @property
+    def start_ns(self) -> int: ...
+
+    @property
+    def end_ns(self) -> int: ...
+
+    @property
+    def problems(self) -> list[str]: ...
 
     def message_count(self) -> int:
         """Return the number of sensor messages."""
+        ...
 
     def rig(self) -> Any:
         """Return the calibration as the message `Rig`."""
+        ...
 
     def messages(self, start_ns: int = 0, stop_ns: int | None = None) -> Iterator[tuple[int, str, Any]]:
         """Yield (arrival, topic, message) with start_ns <= arrival < stop_ns, by arrival."""

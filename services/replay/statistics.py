@@ -112,7 +112,7 @@ def topic_problems(facts: TopicStatistics) -> list[str]:
         )
     if facts.backwards:
         found.append(f"{facts.name}: {facts.backwards} stamps are earlier than the one before")
-    if facts.lag_median_ms is not None and facts.lag_min_ms < -1.0:
+    if facts.lag_min_ms is not None and facts.lag_min_ms < -1.0:
         found.append(
             f"{facts.name}: stamps are up to {-facts.lag_min_ms:.0f} ms later than the receive time: "
             "sensor and recorder have different clocks"

@@ -152,7 +152,8 @@ class Ros2Node(Node):
     def _subscribe(self, key: str, type_name: str) -> None:
         if key in self._type_by_key or self._topics_selected:
             return
-        channel = zenoh.handlers.FifoChannel(_FIFO)
+        channel: zenoh.handlers.FifoChannel[zenoh.Sample] = zenoh.handlers.FifoChannel(_FIFO)
+        subscriber: zenoh.Subscriber | zenoh.ext.AdvancedSubscriber
         if type_name == TF:  # /tf_static is published once and fetched from the publisher's cache
             subscriber = zenoh.ext.declare_advanced_subscriber(
                 self._session, key, channel,
@@ -172,7 +173,7 @@ class Ros2Node(Node):
             )  # fmt: skip
             self._declarations.append(self._session.liveliness().declare_token(entity.token()))
 
-    def _start_receiver(self, subscriber: object, key: str) -> None:
+    def _start_receiver(self, subscriber: zenoh.Subscriber | zenoh.ext.AdvancedSubscriber, key: str) -> None:
         """Empty a subscriber's channel in a thread, so that it never blocks the transport.
 
         The thread itself undeclares the subscriber when it is unused: others cannot while it waits in `recv`.

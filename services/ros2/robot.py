@@ -119,15 +119,19 @@ class RosRobot:
             self._first_messages.setdefault(topic, (type_name, message))
             self._first_message_s = now_s if self._first_message_s is None else self._first_message_s
         if self.rig is None:
-            if self._first_message_s is None or not self._all_topics_seen(now_s) or not self._calibrate():
+            if (
+                self._first_message_s is None
+                or not self._all_topics_seen(now_s - self._first_message_s)
+                or not self._calibrate()
+            ):
                 return []
             stamp_ns = min(self._stamp_ns(m, received_ns) for _, m in self._first_messages.values())
+            assert self.rig is not None  # set by `_calibrate`
             return [("rig", self.rig.message(max(stamp_ns, 0), self.rig.source))]
         kind = self._kind_by_topic.get(topic)
         return self._convert(topic, kind, message, received_ns) if kind else []
 
-    def _all_topics_seen(self, now_s: float) -> bool:
-        waited_s = now_s - self._first_message_s
+    def _all_topics_seen(self, waited_s: float) -> bool:
         silent = [
             topic for topic, type_name in self._publisher_types.items()
             if type_name not in (CAMERA_INFO, TF) and topic not in self._first_messages
@@ -148,7 +152,8 @@ class RosRobot:
         if "scan" not in chosen and "image" not in chosen:
             self.status = f"no scan or image among the topics: {', '.join(sorted(seen)) or 'none received'}"
             return False
-        rig = self._rig_from_file(chosen) if self._options.rig is not None else self._rig_from_robot(chosen)
+        path = self._options.rig
+        rig = self._rig_from_file(path, chosen) if path is not None else self._rig_from_robot(chosen)
         if rig is None:
             return False
         self._kind_by_topic = {topic: kind for kind, topic in chosen.items()}
@@ -158,8 +163,8 @@ class RosRobot:
         self._update_status()
         return True
 
-    def _rig_from_file(self, chosen: dict[str, str]) -> RigFile:
-        rig = load_rig(self._options.rig)
+    def _rig_from_file(self, path: Path, chosen: dict[str, str]) -> RigFile:
+        rig = load_rig(path)
         for kind, sensor in (("image", "camera"), ("scan", "lidar")):
             if kind in chosen and getattr(rig, sensor) is None:
                 raise UserError(
@@ -230,7 +235,7 @@ class RosRobot:
         return [(sensor.topic, built)]
 
     def _check_image(self, fields: dict[str, Any]) -> None:
-        camera = self.rig.camera
+        camera = None if self.rig is None else self.rig.camera
         size = fields.get("width_px"), fields.get("height_px")
         if None in size or (
             fields["encoding"] in ("jpeg", "png") and not is_complete_image(fields["data"].data)

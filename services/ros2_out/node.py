@@ -34,6 +34,7 @@ class RosPublisher:
             type_name=type_name, type_hash=type_hash, qos=qos,
         )  # fmt: skip
         key = data_key(domain, topic, type_name, type_hash)
+        self._publisher: zenoh.Publisher | zenoh.ext.AdvancedPublisher
         if qos.transient_local:
             self._publisher = zenoh.ext.declare_advanced_publisher(
                 session, key,

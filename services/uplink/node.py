@@ -17,6 +17,7 @@ from pydantic import Field
 
 from beamsplat.common.config.deployment import NodeConfig
 from beamsplat.common.errors import UserError
+from beamsplat.common.runtime.live_settings import LiveSettings
 from beamsplat.common.runtime.node import Node, SourceItem
 from beamsplat.common.security.logins import login_of
 from beamsplat.common.zenoh.bridge import Bridge, BridgeSessions
@@ -83,24 +84,32 @@ class UplinkNode(Node):
         Raises:
             UserError: no router answers on one of the two sides.
         """
+        live = self._live_settings()
         opened: list[zenoh.Session] = []
         try:
             for buffer_bytes in (URGENT_BUFFER_BYTES, BULK_BUFFER_BYTES):
                 opened.append(self._open_edge_session(buffer_bytes))
-            login = login_of(self.live_settings.security, self.name)
-            opened.append(open_session(self.live_settings.endpoints, _ATTEMPT_S, login=login))
+            login = login_of(live.security, self.name)
+            opened.append(open_session(live.endpoints, _ATTEMPT_S, login=login))
         except UserError:
             for session in opened:
                 session.close()
             raise
         self._sessions = opened
         small, large, robot = opened
-        self._bridge = Bridge(
-            self.live_settings.robot, BridgeSessions(robot=robot, edge=small, edge_bulk=large)
-        )
+        self._bridge = Bridge(live.robot, BridgeSessions(robot=robot, edge=small, edge_bulk=large))
+
+    @property
+    def _connected(self) -> Bridge:
+        assert self._bridge is not None  # set by `_connect`
+        return self._bridge
+
+    def _live_settings(self) -> LiveSettings:
+        assert self.live_settings is not None  # the uplink runs live only
+        return self.live_settings
 
     def _open_edge_session(self, buffer_bytes: int) -> zenoh.Session:
-        return open_link(self.config.edge, _ATTEMPT_S, self.live_settings.security, buffer_bytes)
+        return open_link(self.config.edge, _ATTEMPT_S, self._live_settings().security, buffer_bytes)
 
     def _replace_bulk_session(self) -> None:
         """After an interruption, replace the session for large messages when the small one is connected
@@ -115,13 +124,13 @@ class UplinkNode(Node):
         small, old, robot = self._sessions
         self._sessions = [small, large, robot]
         self._bulk_session_cut = False
-        self._bridge.replace_bulk_session(BridgeSessions(robot=robot, edge=small, edge_bulk=large))
+        self._connected.replace_bulk_session(BridgeSessions(robot=robot, edge=small, edge_bulk=large))
         threading.Thread(target=old.close, daemon=True).start()
 
     def _all_topics_ended(self) -> bool:
         """Return whether all topics on which the robot published have ended."""
-        spoke = {name for name, traffic in self._bridge.forwarded_up().items() if traffic.messages}
-        return bool(spoke) and spoke <= self._bridge.ended
+        spoke = {name for name, traffic in self._connected.forwarded_up().items() if traffic.messages}
+        return bool(spoke) and spoke <= self._connected.ended
 
     def _update_detail(self) -> None:
         now = time.monotonic()
@@ -133,10 +142,12 @@ class UplinkNode(Node):
                 self._cut_since_s, self._cuts = now, self._cuts + 1
             self._bulk_session_cut = True
             state = f"no link for {now - self._cut_since_s:.0f} s"
-        up = self._bridge.forwarded_up().values()
-        cuts = f", {self._cuts} cuts, {self._bridge.interrupted} messages cut off" if self._cuts else ""
+        up = self._connected.forwarded_up().values()
+        cuts = f", {self._cuts} cuts, {self._connected.interrupted} messages cut off" if self._cuts else ""
         cuts += (
-            f", {self._bridge.health_dropped} health reports rejected" if self._bridge.health_dropped else ""
+            f", {self._connected.health_dropped} health reports rejected"
+            if self._connected.health_dropped
+            else ""
         )
         self.detail = (
             f"{state} ({self.config.edge}){cuts}: {sum(c.messages for c in up)} messages, "

@@ -79,9 +79,8 @@ class Aligner:
         views = [rendered]
         for _ in range(1, len(s.coarse_steps)):
             last = views[-1]
-            views.append(
-                _Rendered(*(downsample_2x(a) for a in (last.grey, last.z_m, last.alpha)), last.index)
-            )
+            grey, z_m, alpha = (downsample_2x(a) for a in (last.grey, last.z_m, last.alpha))
+            views.append(_Rendered(grey, z_m, alpha, last.index))
         T_start = found.T_camera_map
         for back, steps in enumerate(s.coarse_steps):
             level = len(s.coarse_steps) - back

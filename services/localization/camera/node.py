@@ -43,6 +43,7 @@ class CameraLocalization(Node):
 
     name = "localization"
     Config = CameraLocalizationConfig
+    config: CameraLocalizationConfig
     # The depth service may itself use the poses of this node: do not wait for its end of stream.
     inputs = (Input("rig", "every"), Input("camera/image", "latest"), Input("depth/estimate", feedback=True))
     outputs = ("localization/odometry", "localization/correction")
@@ -82,8 +83,8 @@ class CameraLocalization(Node):
         result = self._tracker.track(image.stamp_ns, rgb)
         if self.config.depth == "none" and result.status in ("ok", "relocalizing"):
             self._tracker.add_without_depth(image.stamp_ns)
-        self._set_detail(result)
-        yield "localization/odometry", self._odometry(result)
+        self._set_detail(self._tracker, result)
+        yield "localization/odometry", _odometry(self._tracker, result)
 
     def on_depth_estimate(self, estimate: DepthEstimate) -> Outputs:
         """Add a keyframe from the depth of a tracked image, where one is due."""
@@ -101,26 +102,27 @@ class CameraLocalization(Node):
         return iter(())
 
     def close(self) -> None:
-        if getattr(self, "_tracker", None) is not None:
-            self._tracker.close()
+        tracker: CameraTracker | None = getattr(self, "_tracker", None)
+        if tracker is not None:
+            tracker.close()
 
-    def _odometry(self, result: TrackingResult) -> Odometry:
-        metric = bool(self._tracker.metric)
-        scale = "" if metric or self._tracker.metric is None else ARBITRARY_SCALE
-        return Odometry(
-            stamp_ns=result.stamp_ns, T_odom_body=result.T_map_body, covariance=result.covariance,
-            status=result.status, detail="; ".join(t for t in (result.detail, scale) if t), metric=metric,
-        )  # fmt: skip
-
-    def _set_detail(self, result: TrackingResult) -> None:
+    def _set_detail(self, t: CameraTracker, result: TrackingResult) -> None:
         """Set the text that the health message shows."""
-        t = self._tracker
         parts = [f"{len(t.splats.keyframes)} keyframes, {t.splats.store.count} Gaussians", result.detail]
         if t.metric is False:
             parts.append(ARBITRARY_SCALE)
         if np.isfinite(t.scale_disagreement) and abs(t.scale_disagreement) > 0.05:
             parts.append(f"new depth is {np.exp(t.scale_disagreement):.2f} times the map's")
         self.detail = "; ".join(text for text in parts if text)
+
+
+def _odometry(tracker: CameraTracker, result: TrackingResult) -> Odometry:
+    metric = bool(tracker.metric)
+    scale = "" if metric or tracker.metric is None else ARBITRARY_SCALE
+    return Odometry(
+        stamp_ns=result.stamp_ns, T_odom_body=result.T_map_body, covariance=result.covariance,
+        status=result.status, detail="; ".join(t for t in (result.detail, scale) if t), metric=metric,
+    )  # fmt: skip
 
 
 def _rejected(stamp_ns: int, why: str) -> Odometry:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from beamsplat.common.messages.robot import TrackingStatus
 from beamsplat.services.localization.camera.align import Alignment
 from beamsplat.services.localization.camera.image_pyramid import ImagePyramid
 
@@ -16,7 +17,7 @@ class TrackingResult:
 
     stamp_ns: int
     T_map_body: np.ndarray  # float64 [4, 4]
-    status: str  # "ok", "lost", "relocalizing", "rejected"
+    status: TrackingStatus
     detail: str
     covariance: np.ndarray  # float64 [3, 3] of (x, y, yaw) in the map frame, NaN unless the status is "ok"
     wants_keyframe: bool = False

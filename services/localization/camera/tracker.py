@@ -16,6 +16,7 @@ import numpy as np
 
 from beamsplat.common.geometry.camera import Pinhole
 from beamsplat.common.geometry.transforms import inverse, se3_exp, se3_log, yaw_of
+from beamsplat.common.messages.robot import TrackingStatus
 from beamsplat.services.localization.camera.align import Aligner, Alignment
 from beamsplat.services.localization.camera.depth import DepthPrior, align_scale_to_map, resize_depth
 from beamsplat.services.localization.camera.image_pyramid import (
@@ -174,13 +175,14 @@ class CameraTracker:
 
     def _covariance(self, found: Alignment) -> np.ndarray:
         """Return the covariance float64 [3, 3] of (x, y, yaw) in the map frame, of this alignment alone."""
+        assert found.hessian is not None  # of a finished alignment
         free = np.linalg.pinv(found.hessian) * _RESIDUAL_CORRELATION
         full = self._aligner.to_body(free)
         yaw = float(yaw_of(self._T_map_body(found)))
         turn = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1.0]])
         return turn @ full @ turn.T
 
-    def _result(self, stamp_ns: int, status: str, detail: str) -> TrackingResult:
+    def _result(self, stamp_ns: int, status: TrackingStatus, detail: str) -> TrackingResult:
         T_map_body = self._last_poses[-1][1] if self._last_poses else np.eye(4)
         return TrackingResult(stamp_ns, T_map_body, status, detail, np.full((3, 3), np.nan))
 

@@ -148,11 +148,13 @@ class ActiveSubmaps:
     def _passes_motion_filter(self, stamp_ns: int, pose_odom_body: np.ndarray) -> bool:
         """Return whether the motion or the time since the last node is large enough for a new one."""
         s = self.settings
-        moved = se2.between(self.last_node.pose_odom_body, pose_odom_body)
+        last = self.last_node
+        assert last is not None  # there are active submaps
+        moved = se2.between(last.pose_odom_body, pose_odom_body)
         return (
             math.hypot(moved[0], moved[1]) > s.motion_filter_distance_m
             or abs(moved[2]) > s.motion_filter_angle_rad
-            or not 0.0 <= (stamp_ns - self.last_node.stamp_ns) * NS <= s.motion_filter_time_s
+            or not 0.0 <= (stamp_ns - last.stamp_ns) * NS <= s.motion_filter_time_s
         )
 
     def close(self) -> None:

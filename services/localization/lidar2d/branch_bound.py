@@ -218,7 +218,7 @@ def branch_and_bound(
         pyramid.levels, rows, cols, steps, min_score, keep, max(1, round(0.1 / step_rad)), found
     )
     found = found[:count]
-    best = []
+    best: list[tuple[float, np.ndarray]] = []
     for score, a, dr, dc in found[np.argsort(-found[:, 0], kind="stable")]:
         pose = np.array(
             [centre_pose[0] + dc * pyramid.cell_m, centre_pose[1] + dr * pyramid.cell_m, yaws[int(a)]]

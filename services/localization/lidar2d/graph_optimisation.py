@@ -134,13 +134,13 @@ def _solve(
     if n <= DENSE_SUBMAPS:
         A = np.zeros((n, 3, n, 3))
         A[row, :, col, :] = blocks
-        A = A.reshape(3 * n, 3 * n)
-        A[np.arange(3 * n), np.arange(3 * n)] += diagonal
-        factor = scipy.linalg.cho_factor(A, lower=True, overwrite_a=True, check_finite=False)
+        dense = A.reshape(3 * n, 3 * n)
+        dense[np.arange(3 * n), np.arange(3 * n)] += diagonal
+        factor = scipy.linalg.cho_factor(dense, lower=True, overwrite_a=True, check_finite=False)
         return scipy.linalg.cho_solve(factor, rhs.ravel(), check_finite=False).reshape(n, 3)
     rows = np.repeat(3 * row[:, None] + np.arange(3), 3, axis=1).ravel()
     cols = np.tile(3 * col[:, None] + np.arange(3), (1, 3)).ravel()
-    A = scipy.sparse.coo_matrix((blocks.ravel(), (rows, cols)), shape=(3 * n, 3 * n)).tocsc()
-    A = A + scipy.sparse.diags(diagonal, format="csc")
-    factor = scipy.sparse.linalg.splu(A, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
-    return factor.solve(rhs.ravel()).reshape(n, 3)
+    sparse = scipy.sparse.coo_matrix((blocks.ravel(), (rows, cols)), shape=(3 * n, 3 * n)).tocsc()
+    sparse = sparse + scipy.sparse.diags(diagonal, format="csc")
+    lu = scipy.sparse.linalg.splu(sparse, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
+    return lu.solve(rhs.ravel()).reshape(n, 3)

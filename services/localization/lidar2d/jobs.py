@@ -62,7 +62,8 @@ def run_job(snapshot: Snapshot, refine_rounds: int = 0) -> JobResult:
     """
     submap_row = {s: i for i, s in enumerate(snapshot.submap_ids)}
     node_row = {n: i for i, n in enumerate(snapshot.node_ids)}
-    constraints, searched, frozen = list(snapshot.constraints), [], dict(snapshot.frozen)
+    constraints, frozen = list(snapshot.constraints), dict(snapshot.frozen)
+    searched: list[int] = []
     edges = constraint_arrays(constraints, submap_row, node_row)
     submap_poses, node_poses, link, candidate = snapshot.pose_map_submap, snapshot.pose_map_node, None, None
     if snapshot.unlinked_from is None:
@@ -181,7 +182,9 @@ def _loop_candidates(
     s = snapshot.settings
     distance = _nearest_member(snapshot, edges, row)
     distance[[k for o in own for k in range(o - 2, o + 3) if 0 <= k < len(distance)]] = np.inf
-    candidates, taken, uncertain = [], [], False
+    candidates: list[LoopCandidate] = []
+    taken: list[int] = []
+    uncertain = False
     for k in np.argsort(distance, kind="stable"):
         if distance[k] > s.loop_distance_m or len(candidates) == s.max_loops_per_node:
             break
@@ -219,11 +222,11 @@ def _find_global_constraints(
     half = s.merged_scans // 2
     neighbours = [snapshot.nodes[n] for n in snapshot.node_ids[max(0, row - half) : row + half + 1]]
     candidates = []
-    for k in np.flatnonzero(np.isfinite(distance)):
+    for k in np.flatnonzero(np.isfinite(distance)).tolist():
         submap_id = snapshot.submap_ids[k]
         local = window_m[k] <= s.local_window_m and window_rad[k] <= s.local_window_rad
         if submap_id in snapshot.frozen and not local and distance[k] < s.loop_distance_m + window_m[k]:
-            candidates.append((snapshot.search_counts.get(submap_id, 0), float(distance[k]), int(k)))
+            candidates.append((snapshot.search_counts.get(submap_id, 0), float(distance[k]), k))
     found, searched = [], []
     for _, _, k in sorted(candidates)[: s.global_searches_per_job]:
         submap_id = snapshot.submap_ids[k]

@@ -85,7 +85,8 @@ def relation_errors(
         pose_map_body if pose_body_reference is None else se2.compose_many(pose_map_body, pose_body_reference)
     )
     index, ok = nearest_stamps(stamps_ns, relation_stamps_ns.ravel(), tolerance_ns)
-    index, ok = index.reshape(-1, 2), ok.reshape(-1, 2).all(axis=1)
+    index, both = index.reshape(-1, 2), ok.reshape(-1, 2)
+    ok = both[:, 0] & both[:, 1]
     if not ok.any():
         raise ValueError(
             "no relation has both its stamps in the trajectory; check that both are of the same log"

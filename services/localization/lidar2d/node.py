@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import shutil
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, cast
 
 import numpy as np
 from pydantic import Field
@@ -24,7 +24,9 @@ from beamsplat.common.messages import (
     Scan,
     WheelOdometry,
 )
+from beamsplat.common.messages.robot import TrackingStatus
 from beamsplat.common.runtime.node import Input, Job, Node, Outputs
+from beamsplat.services.localization.lidar2d.jobs import JobResult
 from beamsplat.services.localization.lidar2d.occupancy import OccupancyGrid
 from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
 from beamsplat.services.localization.lidar2d.slam import LidarSlam, ScanResult
@@ -54,6 +56,7 @@ class LidarLocalization(Node):
 
     name = "localization"
     Config = LidarLocalizationConfig
+    config: LidarLocalizationConfig
     # "every": the calibration is merged with the scans by stamp, so that runs are reproducible.
     inputs = (Input("rig", "every"), "lidar/scan", "wheel/odometry")
     outputs = (
@@ -80,10 +83,9 @@ class LidarLocalization(Node):
         self._published_uuid = ""
         self._checkpoint_ns: int | None = None
         self._checkpoint_running = False
-        self._checkpoint_dir = (
-            None if self.live_settings is None else self.live_settings.run_dir / "localization"
-        )
-        if self._checkpoint_dir is not None and not self.live_settings.resume:  # checkpoint of an earlier run
+        live = self.live_settings
+        self._checkpoint_dir = None if live is None else live.run_dir / "localization"
+        if self._checkpoint_dir is not None and live is not None and not live.resume:  # of an earlier run
             shutil.rmtree(self._checkpoint_dir, ignore_errors=True)
         if self.config.resume is not None:
             try:
@@ -98,7 +100,7 @@ class LidarLocalization(Node):
         elif self._slam is None:
             self._stamp_ns = rig.stamp_ns
             self._slam = self._create_slam(rig.lidar.T_body_lidar)
-            yield from self._publish_new_map()
+            yield from self._publish_new_map(self._slam)
         else:
             log.warning("a new calibration is ignored: restart the node to use it")
 
@@ -135,7 +137,7 @@ class LidarLocalization(Node):
             scan.time_increment_s, scan.range_min_m, scan.range_max_m,
         )  # fmt: skip
         self._stamp_ns = scan.stamp_ns
-        yield from self._publish_new_map()
+        yield from self._publish_new_map(self._slam)
         yield "localization/odometry", _odometry(result)
         yield "localization/movers", MovingBeams(stamp_ns=scan.stamp_ns, moving=result.dynamic)
         yield from self._correction(scan.stamp_ns, result.pose_map_odom)
@@ -143,17 +145,18 @@ class LidarLocalization(Node):
             # The result is due before the scan with number `apply_at_scan`; the next scan has number `scans`.
             after = result.job.apply_at_scan - self._slam.scans + 1
             yield Job("optimise", result.job.run, after=after, of="lidar/scan")
-        yield from self._start_checkpoint(scan.stamp_ns, result.status == "ok")
+        yield from self._start_checkpoint(self._slam, scan.stamp_ns, result.status == "ok")
         if self._slam.scans % self.config.grid_every_scans == 0:
-            yield from self._publish_grid()
+            yield from self._publish_grid(self._slam)
 
-    def on_job_optimise(self, result: object) -> Outputs:
+    def on_job_optimise(self, result: JobResult) -> Outputs:
         """Apply an optimisation: the map changes, the pose in the odom frame does not."""
+        assert self._slam is not None  # it started the job
         self._slam.apply(result)
         self._optimisations += 1
-        yield from self._publish_map_poses()
+        yield from self._publish_map_poses(self._slam)
 
-    def _start_checkpoint(self, stamp_ns: int, localized: bool) -> Outputs:
+    def _start_checkpoint(self, slam: LidarSlam, stamp_ns: int, localized: bool) -> Outputs:
         """Write a checkpoint in the background every `keep_every_s`, while the pose is known."""
         if self._checkpoint_dir is None or self._checkpoint_running or not localized:
             return
@@ -162,7 +165,7 @@ class LidarLocalization(Node):
             or abs(stamp_ns - self._checkpoint_ns) >= self.config.keep_every_s * 1e9
         ):
             self._checkpoint_ns, self._checkpoint_running = stamp_ns, True
-            folder, state = self._checkpoint_dir, self._slam.pack()
+            folder, state = self._checkpoint_dir, slam.pack()
 
             def write() -> str:
                 try:
@@ -185,34 +188,34 @@ class LidarLocalization(Node):
             return  # there was no usable scan
         self._slam.finish()
         self._optimisations += 1
-        yield from self._publish_map_poses()
-        yield from self._publish_grid()
+        yield from self._publish_map_poses(self._slam)
+        yield from self._publish_grid(self._slam)
         if self.config.save is not None:
             self._slam.save(self.config.save)
             log.info("map and state saved to %s", self.config.save)
 
-    def _publish_map_poses(self) -> Outputs:
-        yield from self._correction(self._stamp_ns, self._slam.pose_graph.pose_map_odom)
-        yield from self._anchors()
+    def _publish_map_poses(self, slam: LidarSlam) -> Outputs:
+        yield from self._correction(self._stamp_ns, slam.pose_graph.pose_map_odom)
+        yield from self._anchors(slam)
 
-    def _publish_new_map(self) -> Outputs:
+    def _publish_new_map(self, slam: LidarSlam) -> Outputs:
         """Publish the anchors with the map's UUID before the first pose in a new map.
 
         Subscribers must not mix anchors of two maps.
         """
-        if self._slam.pose_graph.uuid != self._published_uuid:
-            yield from self._anchors()
+        if slam.pose_graph.uuid != self._published_uuid:
+            yield from self._anchors(slam)
 
-    def _anchors(self) -> Outputs:
-        self._published_uuid = self._slam.pose_graph.uuid
-        anchors = self._slam.anchors()
+    def _anchors(self, slam: LidarSlam) -> Outputs:
+        self._published_uuid = slam.pose_graph.uuid
+        anchors = slam.anchors()
         T_map_anchor = se2_to_se3(np.array(list(anchors.values())).reshape(-1, 3))
         yield (
             "localization/anchors",
             Anchors(
                 stamp_ns=self._stamp_ns, anchor_ids=np.array(list(anchors), dtype=np.int64),
                 T_map_anchor=T_map_anchor, optimisation=self._optimisations,
-                map_uuid=self._slam.pose_graph.uuid,
+                map_uuid=slam.pose_graph.uuid,
             ),
         )  # fmt: skip
 
@@ -229,9 +232,9 @@ class LidarLocalization(Node):
                 ),
             )
 
-    def _publish_grid(self) -> Outputs:
+    def _publish_grid(self, slam: LidarSlam) -> Outputs:
         """Publish the occupancy grid with the region that differs from the last one."""
-        grid = self._slam.grid(self.config.grid_resolution_m)
+        grid = slam.grid(self.config.grid_resolution_m)
         changed = _changed(self._published_grid, grid)
         self._published_grid = grid
         yield (
@@ -249,10 +252,12 @@ def _changed(before: OccupancyGrid | None, grid: OccupancyGrid) -> tuple[int, in
     It covers the whole grid if the grid's origin or size has changed.
     """
     rows, columns = grid.values.shape
-    same_place = before is not None and before.values.shape == grid.values.shape and (
-        before.origin_x_m == grid.origin_x_m and before.origin_y_m == grid.origin_y_m
-    )  # fmt: skip
-    if not same_place:
+    if (
+        before is None
+        or before.values.shape != grid.values.shape
+        or before.origin_x_m != grid.origin_x_m
+        or before.origin_y_m != grid.origin_y_m
+    ):
         return 0, 0, rows, columns
     differs = np.argwhere(before.values != grid.values)
     if not len(differs):
@@ -265,7 +270,7 @@ def _odometry(result: ScanResult) -> Odometry:
     status, _, detail = result.status.partition(": ")
     return Odometry(
         stamp_ns=result.stamp_ns, T_odom_body=se2_to_se3(result.pose_odom_body), covariance=result.covariance,
-        status=status, detail=detail,
+        status=cast(TrackingStatus, status), detail=detail,
     )  # fmt: skip
 
 

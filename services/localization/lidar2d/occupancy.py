@@ -124,10 +124,11 @@ def save_nav2(grid: OccupancyGrid, folder: Path, name: str = "map") -> None:
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     flipped = grid.values[::-1]
-    image = np.full(flipped.shape, 205, dtype=np.uint8)
+    height, width = flipped.shape
+    image = np.full((height, width), 205, dtype=np.uint8)
     image[(flipped >= 0) & (flipped <= FREE)] = 254
     image[flipped >= OCCUPIED] = 0
-    header = f"P5\n{image.shape[1]} {image.shape[0]}\n255\n".encode()
+    header = f"P5\n{width} {height}\n255\n".encode()
     (folder / f"{name}.pgm").write_bytes(header + image.tobytes())
     (folder / f"{name}.yaml").write_text(
         f"image: {name}.pgm\nmode: trinary\nresolution: {grid.resolution_m}\n"

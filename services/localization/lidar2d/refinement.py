@@ -122,8 +122,8 @@ def _remeasure(
     match = keep_guess_if_unobservable(
         reduce_unobservable(features, node.scan.origin, match, tables, settings), guess
     )
-    keep_reduced = constraint.loop or match.full_information is None
-    chosen = match.information if keep_reduced else match.full_information
+    full = None if constraint.loop else match.full_information
+    chosen = match.information if full is None else full
     information = edge_information(chosen, settings.edge_sigma_m, settings.edge_sigma_rad)
     if not constraint.loop:
         information /= settings.nodes_per_measurement

@@ -12,7 +12,7 @@ import numpy as np
 from beamsplat.services.localization.lidar2d import se2
 from beamsplat.services.localization.lidar2d.loops import LoopCandidate, match_locally
 from beamsplat.services.localization.lidar2d.pose_graph_data import Constraint, merged_features
-from beamsplat.services.localization.lidar2d.relocalization import GlobalMap, build_global_map, relocalize_in
+from beamsplat.services.localization.lidar2d.relocalization import build_global_map, relocalize_in
 from beamsplat.services.localization.lidar2d.snapshot import Snapshot
 
 MAX_LINK_DISTANCE_M = 4.0  # a segment is linked to a submap that has a node within this distance
@@ -31,6 +31,7 @@ def link_segment(
     """
     submap_poses, node_poses = snapshot.pose_map_submap.copy(), snapshot.pose_map_node.copy()
     first = snapshot.unlinked_from
+    assert first is not None  # called for a segment that is not linked only
     row = {n: i for i, n in enumerate(snapshot.node_ids)}
     segment = [n for n in snapshot.node_ids if n >= first]
     map_nodes = [n for n in snapshot.node_ids if n < first]
@@ -38,7 +39,7 @@ def link_segment(
         return None, submap_poses, node_poses, None
     newest = snapshot.nodes[segment[-1]]
     newest_nodes = [snapshot.nodes[n] for n in segment[-snapshot.settings.merged_scans :]]
-    global_map: GlobalMap = snapshot.cache.global_map(
+    global_map = snapshot.cache.global_map(
         (snapshot.version, len(map_nodes)),
         lambda: build_global_map(
             snapshot.settings, [snapshot.nodes[n] for n in map_nodes], [node_poses[row[n]] for n in map_nodes]
@@ -68,9 +69,8 @@ def link_segment(
     return link, submap_poses, node_poses, None
 
 
-def _moved(snapshot: Snapshot, candidate: Candidate) -> np.ndarray:
-    """Return the motion from the candidate's node to this one, by the odom poses."""
-    earlier, _ = snapshot.candidate
+def _moved(snapshot: Snapshot, earlier: int, candidate: Candidate) -> np.ndarray:
+    """Return the motion from the node `earlier` to the candidate's node, by the odom poses."""
     return se2.between(snapshot.nodes[earlier].pose_odom_body, snapshot.nodes[candidate[0]].pose_odom_body)
 
 
@@ -78,7 +78,7 @@ def _agrees(snapshot: Snapshot, candidate: Candidate) -> bool:
     """Return whether the earlier candidate, moved along the trajectory, confirms this one from a distance."""
     if snapshot.candidate is None or snapshot.candidate[0] not in snapshot.nodes:
         return False
-    moved = _moved(snapshot, candidate)
+    moved = _moved(snapshot, snapshot.candidate[0], candidate)
     off = se2.between(se2.compose(snapshot.candidate[1], moved), candidate[1])
     far = float(np.hypot(moved[0], moved[1])) >= snapshot.settings.link_min_distance_m
     return far and float(np.hypot(off[0], off[1])) < 0.3 and abs(float(off[2])) < math.radians(5.0)
@@ -88,7 +88,8 @@ def _next_candidate(snapshot: Snapshot, candidate: Candidate) -> Candidate:
     """Return the earlier candidate if the new one agrees but is too near to confirm it; else the new one."""
     if snapshot.candidate is None or snapshot.candidate[0] not in snapshot.nodes:
         return candidate
-    off = se2.between(se2.compose(snapshot.candidate[1], _moved(snapshot, candidate)), candidate[1])
+    moved = _moved(snapshot, snapshot.candidate[0], candidate)
+    off = se2.between(se2.compose(snapshot.candidate[1], moved), candidate[1])
     same = float(np.hypot(off[0], off[1])) < 0.3 and abs(float(off[2])) < math.radians(5.0)
     return snapshot.candidate if same else candidate
 

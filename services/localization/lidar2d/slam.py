@@ -175,6 +175,7 @@ class LidarSlam:
         per_beam[scan.beams[dynamic]] = True
         pose_map_odom = self.pose_graph.pose_map_odom.copy()
         last = self.active_submaps.last_node
+        assert last is not None  # the first accepted scan is a node
         self.record.add(
             raw.stamp_ns,
             last.id,

@@ -84,7 +84,7 @@ def write_state(folder: Path, state: PackedMap) -> None:
     generation = 1 + max((int(p.stem.rpartition("-")[2]) for p in folder.glob("lidar_map-*.npz")), default=0)
     name = f"lidar_map-{generation}.npz"
     with open(folder / f"{name}.tmp", "wb") as file:
-        np.savez(file, **state.arrays)
+        np.savez(file, **state.arrays)  # type: ignore[arg-type]  # the stubs pass ** to allow_pickle
         file.flush()
         os.fsync(file.fileno())
     os.replace(folder / f"{name}.tmp", folder / name)
@@ -184,8 +184,8 @@ def _concat(parts: list[np.ndarray], width: int) -> np.ndarray:
 
 
 def _pack_submaps(graph: PoseGraph) -> dict[str, np.ndarray]:
-    submaps = [s for s in graph.submaps.values() if s.frozen is not None]
-    frozen = [s.frozen for s in submaps]
+    finished = [(s, s.frozen) for s in graph.submaps.values() if s.frozen is not None]
+    submaps, frozen = [s for s, _ in finished], [f for _, f in finished]
     return {
         "submap_id": np.array([s.id for s in submaps], dtype=np.int64),
         "submap_odom": np.array([s.pose_odom_submap for s in submaps]).reshape(-1, 3),

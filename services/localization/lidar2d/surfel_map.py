@@ -40,6 +40,14 @@ class MatchTables:
 class SurfelMap:
     """A growing grid map in its own frame; rows are y, columns are x, cell (0, 0) starts at the origin."""
 
+    # Arrays with a row for each surface element; set by `_reserve_surfels`.
+    moments: np.ndarray  # float64 [N, 6]
+    views: np.ndarray  # float64 [N, 2]
+    cells: np.ndarray  # int32 [N, 2]
+    means: np.ndarray  # float64 [N, 2]
+    omegas: np.ndarray  # float64 [N, 3]
+    table_means: np.ndarray  # float64 [N, 2]
+
     def __init__(self, settings: LidarSlamSettings) -> None:
         self.settings = settings
         self.cell_m = settings.cell_m

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
 
@@ -51,7 +53,7 @@ class GsplatRenderer:
         pose_tangent: torch.Tensor | None = None,
     ) -> RenderedImage:
         """Render the Gaussians on the device of this renderer; differentiable once."""
-        to = {"device": self._device, "dtype": torch.float32}
+        to: dict[str, Any] = {"device": self._device, "dtype": torch.float32}
         viewmat = torch.as_tensor(T_camera_map, **to)
         if pose_tangent is not None:
             viewmat = _left_perturbed(viewmat, pose_tangent.to(**to))

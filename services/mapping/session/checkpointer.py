@@ -76,7 +76,9 @@ class Checkpointer:
             log.warning("the mapper no longer optimises on this keyframe: %s", text)
         progress = progress_of(arrays)
         # Counted from the stored checkpoint: a mapper that crashes repeatedly still writes one per period.
-        self._since_ns = self.folder.manifest().get("stamp_ns")
+        manifest = self.folder.manifest()
+        assert manifest is not None  # there is a state
+        self._since_ns = manifest.get("stamp_ns")
         keyframes = len(mapper.keyframes) + len(mapper.paged_out)
         self._last = CheckpointResult(int(progress["steps"]), keyframes)
         extra = extras_of(arrays)
@@ -145,15 +147,19 @@ class Checkpointer:
         """
         return with_blocks(self.folder.blocks, arrays | self.disk_tier.arrays())
 
-    def start_period(self, stamp_ns: int) -> None:
-        """Start the first checkpoint period at the stamp of a keyframe, unless one is running."""
+    def start_period(self, stamp_ns: int) -> int:
+        """Start the first checkpoint period at the stamp of a keyframe, unless one is running.
+
+        Returns the start of the period (ns).
+        """
         if self._since_ns is None:
             self._since_ns = stamp_ns
+        return self._since_ns
 
     def due(self, stamp_ns: int) -> bool:
         """Return whether a checkpoint is due. A jump of the clock back by a period counts too."""
-        self.start_period(stamp_ns)
-        return not self._running and abs(stamp_ns - self._since_ns) >= self._period_ns
+        since_ns = self.start_period(stamp_ns)
+        return not self._running and abs(stamp_ns - since_ns) >= self._period_ns
 
     def checkpoint(self, mapper: Mapper, extra: Arrays, stamp_ns: int) -> Callable[[], CheckpointResult]:
         """Copy the mapper's state now and return the job that writes it, for a background thread.
@@ -200,7 +206,7 @@ class Checkpointer:
         """
         stamp_ns = self._since_ns or 0
         self.finish_checkpoint(self.checkpoint(mapper, extra, stamp_ns)())
-        if self._unwritten or self._last.fault:
+        if self._unwritten or (self._last is not None and self._last.fault):
             raise UserError(f"{self.folder.path}: {self.status_text(mapper)}")
 
     def status_text(self, mapper: Mapper) -> str:

@@ -145,7 +145,9 @@ class LiveSession:
         period_ns = round(config.session_every_s * 1e9)
         self._intake, self._mapper = intake, intake.mapper
         self._checkpointer = Checkpointer(config.session, period_ns, budget_bytes, config.seed)
-        self.load_visible = lambda keyframe: self._checkpointer.load_visible(self._mapper, keyframe)
+        self.load_visible: LoadVisible | None = lambda keyframe: self._checkpointer.load_visible(
+            self._mapper, keyframe
+        )
         self._resumed: set[int] = set()
         self._resume(resume_known)
         self._inbox = Inbox(self._checkpointer)
@@ -154,7 +156,9 @@ class LiveSession:
         """Restore the checkpoint, then insert the keyframes that arrived after it."""
         c, m = self._checkpointer, self._mapper
         undistorter = self._intake.undistorter
-        extra, newer = c.resume(m, lambda schema, body: decode_keyframe(decode(schema, body), undistorter))
+        extra, newer = c.resume(
+            m, lambda schema, body: decode_keyframe(_decode_message(schema, body), undistorter)
+        )
         self._intake.restore(extra)
         if resume_known:
             self._resumed = set(newer)
@@ -162,7 +166,7 @@ class LiveSession:
             body = c.read_keyframe(id)
             if body is None:
                 continue
-            message = decode(*body)
+            message = _decode_message(*body)
             c.start_period(message.stamp_ns)  # a process that is killed repeatedly still reaches a checkpoint
             outcome = self._intake.insert(message, self.load_visible)
             if outcome.ok:
@@ -199,7 +203,7 @@ class LiveSession:
 
     def skipped(self) -> Iterator[Keyframe]:
         if (body := self._inbox.pop_skipped()) is not None:
-            yield decode(*body)
+            yield _decode_message(*body)
 
     def end_of_input(self) -> None:
         self._inbox.skip_waiting()
@@ -243,3 +247,9 @@ class LiveSession:
 
     def close(self) -> None:
         self._checkpointer.close()
+
+
+def _decode_message(schema: str, body: bytes) -> Keyframe:
+    message = decode(schema, body)
+    assert isinstance(message, Keyframe)  # sessions store keyframes only
+    return message

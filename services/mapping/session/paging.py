@@ -184,8 +184,9 @@ class Pager:
         groups = groups_of(store, mapper.T_map_anchor)
         _, centres, radii = spheres_of(groups, mapper.T_map_anchor)
         needed = np.zeros(len(groups), bool)
-        for id in pinned & mapper.keyframes.keys():
-            needed |= _visible(mapper, mapper.keyframes[id], centres, radii)
+        for id, keyframe in mapper.keyframes.items():
+            if id in pinned:
+                needed |= _visible(mapper, keyframe, centres, radii)
         self._needed_bytes = each * sum(len(group.members) for group, n in zip(groups, needed) if n)
         robot = mapper.T_map_camera(mapper.keyframes[newest[-1]])[:3, 3]
         distance_m = np.where(needed, -1.0, np.linalg.norm(centres - robot, axis=1))
