@@ -48,7 +48,25 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     pages = {"commands": commands(), "options": options(), "topics": topics(), "api": api()}
     for name, text in pages.items():
         files.append(File.generated(config, f"reference/{name}.md", content=text))
+    for name in ("ARCHITECTURE", "CONTRIBUTING", "CHANGELOG"):
+        files.append(File.generated(config, f"{name.lower()}.md", content=_from_root(f"{name}.md")))
     return files
+
+
+def _from_root(name: str) -> str:
+    """Return a page of the repository's root with links as from docs/."""
+
+    def replace(match: re.Match[str]) -> str:
+        target = match["target"]
+        if re.match(r"[a-z]+:|#", target):
+            return match[0]
+        inside = re.sub(r"^(ARCHITECTURE|CONTRIBUTING|CHANGELOG)\.md", lambda page: page[0].lower(), target)
+        inside = (
+            inside.removeprefix("docs/") if inside != target or target.startswith("docs/") else f"../{target}"
+        )
+        return f"[{match['text']}]({inside})"
+
+    return _LINK.sub(replace, (ROOT / name).read_text())
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
