@@ -50,7 +50,7 @@ def declare_subscription(
     key_expr: str,
     row: Topic,
     delivery: str,
-    channel: zenoh.handlers.FifoChannel | zenoh.handlers.RingChannel,
+    channel: zenoh.handlers.FifoChannel | zenoh.handlers.RingChannel | Callable[[zenoh.Sample], None],
     origin: zenoh.Locality = zenoh.Locality.ANY,
 ) -> zenoh.Subscriber | zenoh.ext.AdvancedSubscriber:
     """Declare a subscriber for a row of the topic table.

@@ -24,7 +24,7 @@ import zenoh
 from beamsplat.common.config.deployment import Deployment, RouterConfig
 from beamsplat.common.messages import Image, WheelOdometry
 from beamsplat.common.runtime.mailbox import Envelope, Mailbox
-from beamsplat.common.runtime.node import Node, Outputs
+from beamsplat.common.runtime.node import Node, Outputs, subscriptions
 from beamsplat.common.zenoh.bus import Bus, open_session
 from beamsplat.tools.system.supervisor import Supervisor
 
@@ -153,7 +153,10 @@ def _latency(endpoint: str, seconds: float, image_bytes: int) -> dict[str, float
 
     def body(bus: Bus) -> Callable[[], None]:
         bus.subscribe(
-            _ImageSubscriber.inputs[0], lambda e: our_latency.add_since(e.message.stamp_ns), _broken, _end
+            subscriptions(_ImageSubscriber)[0],
+            lambda e: our_latency.add_since(e.message.stamp_ns),
+            _broken,
+            _end,
         )
         subscriber = bus.session.declare_subscriber(PLAIN_KEY, zenoh.handlers.RingChannel(1))
 
@@ -164,6 +167,7 @@ def _latency(endpoint: str, seconds: float, image_bytes: int) -> dict[str, float
                 except zenoh.ZError:
                     return
                 sample.payload.to_bytes()
+                assert sample.attachment is not None  # sent with each sample
                 plain.add_since(struct.unpack("<q", sample.attachment.to_bytes())[0])
 
         threading.Thread(target=receive, daemon=True).start()
@@ -194,7 +198,7 @@ def _slow_subscriber(endpoint: str, seconds: float, image_bytes: int) -> dict[st
     def body(bus: Bus) -> Callable[[], None]:
         from beamsplat.common.runtime.node import Input
 
-        bus.subscribe(_ImageSubscriber.inputs[0], on_image, _broken, _end)
+        bus.subscribe(subscriptions(_ImageSubscriber)[0], on_image, _broken, _end)
         bus.subscribe(
             Input("wheel/odometry"), lambda e: odometry_latency.add_since(e.message.stamp_ns), _broken, _end
         )

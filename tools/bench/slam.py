@@ -111,6 +111,7 @@ def write_map_overview(out: Path, names: list[str], path: Path) -> None:
     tiles = []
     for name in names:
         image = cv2.imread(str(out / name / "map.png"))
+        assert image is not None  # written by the run before
         scale = (TILE_PX - 30) / max(image.shape[:2])
         small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
         tile = np.full((TILE_PX, TILE_PX, 3), 205, dtype=np.uint8)

@@ -26,13 +26,15 @@ MIN_PYTHON = (3, 11)
 MIN_SHM_MB = 256
 MIN_DISK_MB = 2000
 
+Verdict = Literal["ok", "note", "fault"]
+
 
 @dataclass(frozen=True)
 class Finding:
     """One line of the report."""
 
     subject: str
-    verdict: Literal["ok", "note", "fault"]
+    verdict: Verdict
     text: str
     remedy: str = ""
 
@@ -55,7 +57,7 @@ def _packages() -> Iterator[Finding]:
         try:
             version = importlib.metadata.version(requirement.name)
         except importlib.metadata.PackageNotFoundError:
-            verdict = "note" if extra else "fault"
+            verdict: Verdict = "note" if extra else "fault"
             remedy = str(remedy_for(requirement.name))
             yield Finding(requirement.name, verdict, f"not installed ({need})", remedy)
             continue
@@ -109,7 +111,7 @@ def _deployment(deployment: Deployment) -> Iterator[Finding]:
     found = faults(deployment)
     required = [fault for fault in found if "is required" in fault.text]  # to be given with --set
     for fault in found:
-        verdict = "fault" if fault.fatal and fault not in required else "note"
+        verdict: Verdict = "fault" if fault.fatal and fault not in required else "note"
         yield Finding("deployment", verdict, fault.text, "correct it in the file, or with --set")
     wrong = any(fault.fatal and fault not in required for fault in found)
     named = tuple(n for n in deployment.nodes if not any(f"node {n!r}" in f.text for f in required))
@@ -220,7 +222,7 @@ def _devices(deployment: Deployment) -> Iterator[Finding]:
     from beamsplat.tools.setup.device_access import diagnose_devices, wanted_devices
 
     for remark in diagnose_devices(wanted_devices(deployment.nodes)):
-        yield Finding(*remark)
+        yield Finding(remark.subject, remark.verdict, remark.text, remark.remedy)
 
 
 def examine(deployment: Deployment) -> list[Finding]:

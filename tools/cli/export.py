@@ -121,6 +121,7 @@ def _open(session: Path) -> tuple[dict[str, Any], Callable[[], Any]]:
 def _from_mapper(file: Path) -> tuple[dict[str, Any], Callable[[], Any]]:
     """Query the state of a running mapper and the lidar grid; see `_open`."""
     from beamsplat.common.config.deployment import load_deployment
+    from beamsplat.common.messages import MapState
     from beamsplat.common.security.logins import OPERATOR, login_of
     from beamsplat.common.zenoh.bus import open_session
     from beamsplat.common.zenoh.queries import ask
@@ -129,7 +130,8 @@ def _from_mapper(file: Path) -> tuple[dict[str, Any], Callable[[], Any]]:
     deployment = load_deployment(file)
     login = login_of(deployment.security, OPERATOR)
     with open_session(deployment.router.listen, 2.0, login=login) as session:
-        arrays = joined_state(list(ask(session, deployment.robot, "mapping", "state", {}, _STATE_TIMEOUT_S)))
+        answers = ask(session, deployment.robot, "mapping", "state", {}, _STATE_TIMEOUT_S)
+        arrays = joined_state([answer for answer in answers if isinstance(answer, MapState)])
         grid = _latched_grid(session, deployment.robot)
     return arrays, lambda: grid
 
@@ -138,18 +140,24 @@ def _latched_grid(session: Any, robot: str) -> Any:
     """Return the last lidar OccupancyGrid that localization published; None if there is none."""
     import queue
 
+    import zenoh
+
+    from beamsplat.common.messages import Grid
     from beamsplat.common.topics import topic
     from beamsplat.common.zenoh.bus import key
     from beamsplat.common.zenoh.streams import declare_subscription, decode_sample
     from beamsplat.services.localization.lidar2d.occupancy import OccupancyGrid
 
-    row, received = topic("localization/grid"), queue.SimpleQueue()
+    row = topic("localization/grid")
+    received: queue.SimpleQueue[zenoh.Sample] = queue.SimpleQueue()
     _kept = declare_subscription(session, key(robot, row.name), row, "latched", received.put)
     try:
         grid = decode_sample(received.get(timeout=_GRID_TIMEOUT_S), row).message
     except queue.Empty:
         return None
-    return OccupancyGrid(grid.occupancy, *map(float, grid.origin_m), grid.resolution_m)
+    assert isinstance(grid, Grid)  # the row's message type
+    x_m, y_m = (float(v) for v in grid.origin_m)
+    return OccupancyGrid(grid.occupancy, x_m, y_m, grid.resolution_m)
 
 
 def _gaussians(path: Path, to: str, store: Any, arrays: dict[str, Any], detail_m: float, threads: int) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.metadata
 import platform
 import sys
+from collections.abc import Callable
 from typing import Annotated
 
 import typer
@@ -41,6 +42,7 @@ _SYSTEM = "Run a system"
 _DATA = "Recordings and calibration"
 _RESULTS = "Maps and figures"
 _MACHINE = "This machine"
+command: Callable[..., None]
 for command in (
     demo.demo, system_cli.run, system_cli.check, system_cli.serve, system_cli.offline, system_cli.record,
     watch_cli.top, watch_cli.topics, watch_cli.graph, system_cli.router_config,

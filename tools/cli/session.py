@@ -40,6 +40,7 @@ def info(session: SessionArgument, as_json: JsonOption = False) -> None:
         edge = {k: manifest[k] for k in ("keyframes", "gaussians", "anchors", "steps", "stamp_ns", "bytes")}
         edge["keyframes_on_disk"] = len(folder.keyframe_ids())
         state = folder.read_state()
+        assert state is not None  # there is a manifest
         edge["keyframes_newer"] = _newer(folder, state)
         edge["map_uuid"] = _map_uuid(state)
     robot = _robot_summary(folder.robot) if (folder.robot / ROBOT_MANIFEST).is_file() else None
@@ -156,7 +157,8 @@ def merge(
         if slams:
             from beamsplat.services.localization.lidar2d.merge import merge_into
 
-            loops = merge_into(*slams, pose_a_b, offset)
+            slam_a, slam_b = slams
+            loops = merge_into(slam_a, slam_b, pose_a_b, offset)
             slams[0].save(target.robot)
             arrays = with_anchors(arrays, {id: se2_to_se3(pose) for id, pose in slams[0].anchors().items()})
             console.print(f"{loops} loop closures between the drives")

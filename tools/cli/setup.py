@@ -99,7 +99,7 @@ def _find_camera(more: list[str]) -> FoundSensor | None:
     if chosen is None:
         console.print("No camera: the robot localizes with its lidar only, and no 3D map is made.")
         return None
-    _show_image(chosen.first)
+    _show_image(_first_image(chosen))
     return chosen
 
 
@@ -119,8 +119,30 @@ def _choose(what: str, answers: list[FoundSensor], names: list[str]) -> FoundSen
         return answers[0] if answers else None
     for number, name in enumerate(names, start=1):
         console.print(f"  {number}) {name}", markup=False)
-    number = typer.prompt(f"Which {what}?", default=1, type=typer.IntRange(1, len(answers)))
-    return answers[number - 1]
+    chosen = _prompt_number(f"Which {what}?", 1, 1, len(answers), int)
+    return answers[int(chosen) - 1]
+
+
+def _prompt_number(text: str, default: float, low: float, high: float, kind: type[float] = float) -> float:
+    """Ask for a number from `low` to `high`; ask again after any other answer."""
+
+    def parse(answer: str) -> float:
+        try:
+            value = kind(answer)
+        except ValueError as error:
+            raise typer.BadParameter(f"{answer!r} is not a number") from error
+        if not low <= value <= high:
+            raise typer.BadParameter(f"{value:g} is not in the range {low:g} to {high:g}")
+        return value
+
+    return typer.prompt(text, default=default, value_proc=parse)
+
+
+def _first_image(camera: FoundSensor) -> Image:
+    from beamsplat.common.messages import Image
+
+    assert isinstance(camera.first, Image)  # as `find_camera` asks for
+    return camera.first
 
 
 def _show_image(image: Image) -> None:
@@ -168,7 +190,8 @@ def _check_existing_rig(rig: Path, camera: FoundSensor | None) -> None:
     loaded = load_rig(rig)
     if camera is None:
         return
-    size_px = camera.first.width_px, camera.first.height_px
+    image = _first_image(camera)
+    size_px = image.width_px, image.height_px
     if loaded.camera is None:
         raise UserError(f"{rig}: [camera] is missing, but a camera was found: do not keep the file")
     if (loaded.camera.width_px, loaded.camera.height_px) != size_px:
@@ -221,8 +244,9 @@ def _intrinsics_from_field_of_view(
     from beamsplat.common.geometry.rig import CameraSection, Mount
     from beamsplat.services.replay.rig_draft import pinhole_from_fov
 
-    fov_deg = typer.prompt("Horizontal field of view (degrees)", default=65.0, type=typer.FloatRange(10, 170))
-    size_px = camera.first.width_px, camera.first.height_px
+    fov_deg = _prompt_number("Horizontal field of view (degrees)", 65.0, 10.0, 170.0)
+    image = _first_image(camera)
+    size_px = image.width_px, image.height_px
     note = f"fx, fy from a horizontal field of view of {fov_deg:g} degrees as stated, no distortion"
     return CameraSection(**pinhole_from_fov(*size_px, fov_deg), mount=Mount.of(T_body_camera)), note
 
@@ -270,7 +294,7 @@ def _take_views(camera: dict[str, Any], board: Chessboard) -> IntrinsicsCalibrat
     deadline = time.monotonic() + _VIEWS_TIMEOUT_S
     with sensor_messages("camera", camera, Image) as stream:
         for image, _ in stream:
-            if image is not None and views.add(_grey(image)) == "taken":
+            if isinstance(image, Image) and views.add(_grey(image)) == "taken":
                 missing = views.missing()
                 console.print(
                     f"view {len(views.views)} of {VIEWS}{f'; missing: {missing}' if missing else ''}"

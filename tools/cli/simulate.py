@@ -16,6 +16,7 @@ from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
     Progress,
+    TaskID,
     TextColumn,
     TimeElapsedColumn,
     TimeRemainingColumn,
@@ -123,8 +124,8 @@ def simulate(
     from beamsplat.tools.simulator.settings import CameraSettings, Faults, LidarSettings, SimulationSettings
 
     width, height = _size(size)
-    lens = _numbers(distortion, 5, "--distortion")
-    shift = _numbers(extrinsic_xyz_m, 3, "--extrinsic-xyz-m")
+    k1, k2, p1, p2, k3 = _numbers(distortion, 5, "--distortion")
+    x_m, y_m, z_m = _numbers(extrinsic_xyz_m, 3, "--extrinsic-xyz-m")
     settings = SimulationSettings(
         seed=seed,
         seconds=seconds,
@@ -133,11 +134,13 @@ def simulate(
         carts=carts,
         scene=None if scene is None else str(scene),
         lidar_only=lidar_only,
-        camera=CameraSettings(width_px=width, height_px=height, rate_hz=rate_hz, distortion=lens),
+        camera=CameraSettings(
+            width_px=width, height_px=height, rate_hz=rate_hz, distortion=(k1, k2, p1, p2, k3)
+        ),
         lidar=LidarSettings(glass=glass),
         faults=Faults(
             clock_offset_ms=clock_offset_ms,
-            extrinsic_xyz_m=shift,
+            extrinsic_xyz_m=(x_m, y_m, z_m),
             extrinsic_yaw_deg=extrinsic_yaw_deg,
             extrinsic_pitch_deg=extrinsic_pitch_deg,
             extrinsic_roll_deg=extrinsic_roll_deg,
@@ -180,7 +183,7 @@ class _Bar:
             console=console,
         )
         self._stage = ""
-        self._task = None
+        self._task: TaskID | None = None
 
     def __enter__(self) -> _Bar:
         self._progress.start()

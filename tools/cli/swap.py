@@ -12,6 +12,7 @@ import typer
 
 from beamsplat.common.config.deployment import load_deployment
 from beamsplat.common.errors import UserError
+from beamsplat.common.messages import Answer
 
 app = typer.Typer(no_args_is_help=True, help="Options of the nodes of a running system.")
 FileArgument = Annotated[Path, typer.Argument(help="Deployment file of the running system")]
@@ -43,6 +44,7 @@ def _ask(
     login = login_of(deployment.security, OPERATOR)
     with open_session(deployment.router.listen, 2.0, login=login) as session:
         (answer,) = ask(session, deployment.robot, node, verb, parameters, _PATIENCE_S)
+    assert isinstance(answer, Answer)  # the type of all answers to commands
     return answer.text
 
 

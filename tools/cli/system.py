@@ -9,6 +9,7 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from types import TracebackType
 from typing import TYPE_CHECKING, Annotated, Any, Protocol
 
 import typer
@@ -120,10 +121,15 @@ class _Display:
             self._screen.__enter__()
         return self
 
-    def __exit__(self, *exception: object) -> None:
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
         if self._screen is not None:
-            self._screen.__exit__(*exception)
-        elif exception[0] is None:
+            self._screen.__exit__(kind, error, traceback)
+        elif kind is None:
             console.print(self._board.nodes_table())
 
     def update(self) -> None:

@@ -58,6 +58,8 @@ class TruthDataset:
     def image(self, index: int) -> np.ndarray:
         """Return image `index`, undistorted, RGB uint8 [H, W, 3]."""
         bgr = cv2.imdecode(np.frombuffer(self.posed_images[index].jpeg, np.uint8), cv2.IMREAD_COLOR)
+        if bgr is None:
+            raise ValueError(f"image {index} cannot be decoded")
         rgb = cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
         return rgb if self.undistort is None else self.undistort(rgb)
 
@@ -140,7 +142,7 @@ def _read_bag(path: Path) -> _Raw:
                 continue
             if kind == "CameraInfo" and raw.camera is not None:
                 continue
-            message = reader.deserialize(data, connection.msgtype)
+            message: Any = reader.deserialize(data, connection.msgtype)
             if kind == "CompressedImage":
                 raw.images.append((_stamp_ns(message.header), message.data.tobytes()))
             elif kind == "LaserScan":

@@ -89,9 +89,9 @@ def replay_depth(
         if T_map_body is None:
             continue
         while next_scan < len(drive.scans) and drive.scans[next_scan].last_ns <= stamp:
-            scan = drive.scans[next_scan]
+            due = drive.scans[next_scan]
             fusion.add_scan(
-                drive.scan_in_map(scan, None if heldout_mask is None else heldout_mask(len(scan.ranges_m)))
+                drive.scan_in_map(due, None if heldout_mask is None else heldout_mask(len(due.ranges_m)))
             )
             next_scan += 1
         rgb = drive.rgb(number)

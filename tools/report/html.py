@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+from collections.abc import Iterable
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -191,7 +192,9 @@ def _depth(rows: list[Row], truth: GroundTruth) -> list[str]:
             uv, z, _ = project_beams(
                 truth.drive.beams_at(stamp_ns), truth.drive.undistort.pinhole, truth.drive.T_body_camera
             )
-            tints = colourize(z[:, None].astype(np.float32), 0.5, 8.0)[:, 0] if len(z) else []
+            tints: Iterable[np.ndarray] = ()
+            if len(z):
+                tints = colourize(z[:, None].astype(np.float32), 0.5, 8.0)[:, 0]
             for (u, v), tint in zip(uv * (h / rgb.shape[0]), tints):
                 cv2.circle(shown, (round(u), round(v)), 1, tuple(int(k) for k in tint), -1)
             estimate = estimates.get(stamp_ns)
@@ -233,6 +236,6 @@ def _figure(bgr: np.ndarray, caption: str) -> str:
     if bgr.shape[1] > 1000:
         size = (1000, round(bgr.shape[0] * 1000 / bgr.shape[1]))
         bgr = cv2.resize(bgr, size, interpolation=cv2.INTER_AREA)
-    data = base64.b64encode(cv2.imencode(".jpg", bgr, (cv2.IMWRITE_JPEG_QUALITY, 80))[1]).decode()
+    data = base64.b64encode(cv2.imencode(".jpg", bgr, (cv2.IMWRITE_JPEG_QUALITY, 80))[1].tobytes()).decode()
     image = f"<img src='data:image/jpeg;base64,{data}'>"
     return f"<figure>{image}<figcaption>{escape(caption)}</figcaption></figure>"

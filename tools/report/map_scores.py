@@ -10,7 +10,7 @@ import numpy as np
 
 from beamsplat.common.geometry.transforms import inverse, transform_points
 from beamsplat.common.mapfiles.ply import read_ply_points
-from beamsplat.common.mapfiles.scores import f_score, fused_surface, render_rgb_depth, score_view
+from beamsplat.common.mapfiles.scores import ViewScore, f_score, fused_surface, render_rgb_depth, score_view
 from beamsplat.common.mapfiles.store import GaussianStore, transform_gaussians
 from beamsplat.common.messages.splat_codec import unpack
 from beamsplat.common.raster.camera import RasterCamera
@@ -72,9 +72,12 @@ def _score(
     camera = RasterCamera(p.fx_px, p.fy_px, p.cx_px, p.cy_px, p.width_px, p.height_px)
     rasterizer = Rasterizer()
     views: list[OffPathView] = read_offpath_views(truth.path / "extra_views")
-    scores, images = [], []
+    scores: list[ViewScore] = []
+    images: list[np.ndarray] = []
     for number, view in enumerate(views):
-        true_rgb = cv2.cvtColor(cv2.imread(str(view.image_file)), cv2.COLOR_BGR2RGB)
+        true_bgr = cv2.imread(str(view.image_file))
+        assert true_bgr is not None  # written by the simulator
+        true_rgb = cv2.cvtColor(true_bgr, cv2.COLOR_BGR2RGB)
         T_map_camera = inverse(T_world_map) @ view.T_map_camera
         rgb, depth, _ = render_rgb_depth(rasterizer, store, camera, T_map_camera)
         scores.append(score_view(rgb, depth, true_rgb, read_depth_png(view.depth_file)))

@@ -17,7 +17,7 @@ from beamsplat.common.config.deployment import Deployment
 from beamsplat.common.errors import UserError
 from beamsplat.common.runtime.mailbox import Envelope
 from beamsplat.common.runtime.node import Input
-from beamsplat.common.topics import topic
+from beamsplat.common.topics import Delivery, topic
 from beamsplat.common.zenoh.bus import Bus, open_session
 from beamsplat.tools.system.health_table import HealthTable
 from beamsplat.tools.system.supervisor import Supervisor
@@ -70,7 +70,7 @@ class BusObserver:
     def subscribe(self, bus: Bus) -> None:
         """Subscribe to all TOPICS; callbacks run in threads of the bus."""
         for name in TOPICS:
-            delivery = None if topic(name).delivery == "latched" else "every"
+            delivery: Delivery | None = None if topic(name).delivery == "latched" else "every"
             bus.subscribe(Input(name, delivery), self._receive, self._count_undecodable, lambda *_: None)
 
     def _count_undecodable(self, topic_name: str, why: str) -> None:
@@ -248,13 +248,16 @@ class _ProcessMeter:
         self._memory_read_s = now if read_memory else self._memory_read_s
         for child in self._supervisor.children.values():
             try:
-                process = psutil.Process(child.process.pid)
+                pid = child.process.pid
+                if pid is None:  # not started
+                    continue
+                process = psutil.Process(pid)
                 times = process.cpu_times()
                 if read_memory:  # PSS counts shared pages once: all processes are forked from one server
                     memory += process.memory_full_info().pss / 1e6
             except psutil.Error:
                 continue
-            self._last[child.name, child.process.pid] = times.user + times.system
+            self._last[child.name, pid] = times.user + times.system
         self.peak_rss_mb = max(self.peak_rss_mb, memory)
 
     def mark(self) -> float:

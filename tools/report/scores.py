@@ -152,7 +152,7 @@ def depth_errors(record: RunRecord, truth: GroundTruth) -> dict[str, Any]:
     It is computed at the beams as in the paper's Table IV, and over all pixels with true depth.
     """
     series: dict[str, list[Any]] = {"stamps_ns": [], "scaled_m": [], "unscaled_m": []}
-    square = {"scaled": [], "unscaled": [], "dense_scaled": [], "dense_unscaled": []}
+    square: dict[str, list[Any]] = {"scaled": [], "unscaled": [], "dense_scaled": [], "dense_unscaled": []}
     for stamp_ns, path in sorted(truth.depth_files.items()):
         shown = {"scaled": record.kept_fused.get(stamp_ns), "unscaled": record.kept_estimates.get(stamp_ns)}
         if shown["scaled"] is None:

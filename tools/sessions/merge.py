@@ -9,7 +9,9 @@ from beamsplat.common.geometry.camera import Undistorter
 from beamsplat.common.mapfiles.blocks import Arrays
 from beamsplat.common.mapfiles.session import SessionFolder
 from beamsplat.common.mapfiles.state import KeyframeView
+from beamsplat.common.messages import Keyframe
 from beamsplat.common.messages.codec import decode
+from beamsplat.services.mapping.keyframe import RgbdKeyframe
 from beamsplat.services.mapping.messages import decode_keyframe
 from beamsplat.tools.sessions.deduplicate import without_duplicates
 from beamsplat.tools.sessions.edit import with_gaussians
@@ -23,9 +25,15 @@ def deduplicated(
 ) -> Arrays:
     """Return the merged map without duplicate surfaces, compared with the images of the keyframes."""
     lens = lru_cache(maxsize=4)(Undistorter)
+
+    def load(id: int) -> RgbdKeyframe:
+        message = decode(*folder.read_keyframe(id))
+        assert isinstance(message, Keyframe)  # sessions store keyframes only
+        return decode_keyframe(message, lens)
+
     stay = without_duplicates(
         arrays, arrays["store_anchor"] >= offset - 1,
-        lambda id: decode_keyframe(decode(*folder.read_keyframe(id)), lens), progress,
+        load, progress,
     )  # fmt: skip
     return with_gaussians(arrays, stay)
 

@@ -9,7 +9,7 @@ import os
 import socket
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import psutil
 
@@ -22,10 +22,10 @@ _INTERFERING = {
 
 
 class DeviceFinding(NamedTuple):
-    """One finding on a device; `verdict` is ok, note or fault."""
+    """One finding on a device."""
 
     subject: str
-    verdict: str
+    verdict: Literal["ok", "note", "fault"]
     text: str
     remedy: str = ""
 
@@ -100,7 +100,7 @@ def _check_access(
     path: Path, user: UserAccount, may_open: Callable[[Path], bool], *, needed: bool
 ) -> DeviceFinding:
     """Return the finding on one device: permissions of the user, use by other programs."""
-    bad = "fault" if needed else "note"
+    bad: Literal["fault", "note"] = "fault" if needed else "note"
     if may_open(path):
         holder = _locked_by(path)
         if holder:

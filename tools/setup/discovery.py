@@ -113,7 +113,7 @@ def sensor_messages(
     node = make_node(NODES[service], options, "setup")
     try:
         node.configure()
-        with closing(node.source()) as source:
+        with closing(node.source()) as source:  # type: ignore[type-var]  # all sources are generators
             yield (
                 (item.message if item is not None and isinstance(item.message, wanted) else None, node.detail)
                 for item in source

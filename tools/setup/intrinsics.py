@@ -104,6 +104,7 @@ class IntrinsicsCalibration:
         spread_px = np.sqrt(
             (_JACKKNIFE_GROUPS - 1) / _JACKKNIFE_GROUPS * np.sum((focals - focals.mean(axis=0)) ** 2, axis=0)
         )
+        assert self._size_px is not None  # set by the first view
         focal_sigma_px = float(max(np.max(sigma.ravel()[:2]), np.max(spread_px)))
         return CameraIntrinsics(
             self._size_px, K, distortion.ravel()[:5], focal_sigma_px, float(rms), len(self.views)
@@ -111,4 +112,7 @@ class IntrinsicsCalibration:
 
     def _fit(self, views: list[np.ndarray]) -> tuple[Any, ...]:
         corners = [uv.reshape(-1, 1, 2) for uv in views]
-        return cv2.calibrateCameraExtended([self._grid] * len(views), corners, self._size_px, None, None)
+        # The stubs do not allow None for the matrices that are estimated.
+        return cv2.calibrateCameraExtended(  # type: ignore[call-overload]
+            [self._grid] * len(views), corners, self._size_px, None, None
+        )

@@ -54,7 +54,7 @@ def build_atlas(textures: dict[str, tuple[np.ndarray, tuple[float, float]]]) -> 
     levels, mean = np.zeros(len(names), np.int32), np.zeros((len(names), 3), np.float32)
     chunks, start = [], 0
     for k, name in enumerate(names):
-        level = srgb_to_linear(textures[name][0].astype(np.float32)).astype(np.float32)
+        level: np.ndarray = srgb_to_linear(textures[name][0].astype(np.float32)).astype(np.float32)
         mean[k] = level.mean(axis=(0, 1))
         for j in range(MAX_LEVELS):
             height, width = level.shape[:2]

@@ -34,7 +34,7 @@ class ClearanceGrid:
         row, column = np.mgrid[: shape[0], : shape[1]]
         xy = np.stack([column, row], axis=-1).reshape(-1, 2) * RESOLUTION_M + RESOLUTION_M / 2 + self.origin_m
         origins = np.column_stack([xy, np.full(len(xy), BODY_M[0] + 0.02)]).astype(np.float32)
-        down = np.broadcast_to(np.float32([0.0, 0.0, -1.0]), origins.shape)
+        down = np.broadcast_to(np.array([0.0, 0.0, -1.0], np.float32), origins.shape)
         return caster.occluded(origins, down, np.full(len(xy), 0.12)).astype(np.uint8).reshape(shape)
 
     def clearance(self, points_m: np.ndarray) -> np.ndarray:
@@ -78,7 +78,7 @@ class ClearanceGrid:
         chosen = [int(rng.integers(len(cells)))]
         distance, paths = [], []
         for _ in range(stops):
-            d, before = dijkstra(graph, indices=chosen[-1], return_predecessors=True)
+            d, before = dijkstra(graph, indices=chosen[-1], return_predecessors=True)  # type: ignore[call-overload]  # the stubs miss single indices
             distance.append(d)
             paths.append(before)
             chosen.append(int(np.argmax(np.where(np.isfinite(d), np.min(distance, axis=0), -1))))

@@ -180,7 +180,8 @@ def _render_missing(spec: FrameSpec, tasks: list[tuple[float, str]], jobs: int) 
         if tasks:
             frame_renderer = FrameRenderer(spec)
             for time_s, path in tasks:
-                yield save_frame(Path(path), *frame_renderer.render_frame(time_s))
+                save_frame(Path(path), *frame_renderer.render_frame(time_s))
+                yield
         return
     context = multiprocessing.get_context("spawn")
     with context.Pool(min(jobs, len(tasks)), _start_worker, (spec,)) as pool:

@@ -27,7 +27,7 @@ def load_glb(path: Path) -> tuple[SceneMesh, Textures]:
         raise ValueError(f"{path} is not a 3D scene that can be read: {error}") from error
     to_z_up = trimesh.transformations.rotation_matrix(np.pi / 2, [1, 0, 0])
     textures: Textures = {"plain": (WHITE, (1.0, 1.0))}
-    parts = []
+    parts: list[SceneMesh] = []
     for name in scene.graph.nodes_geometry:
         transform, geometry_name = scene.graph[name]
         geometry = scene.geometry[geometry_name]

@@ -201,4 +201,5 @@ def _smoothing_matrix(mesh: SceneMesh) -> sparse.csr_matrix:
     graph = sparse.coo_matrix((np.ones(len(i), np.float32), (i, j)), shape=(n, n)).tocsr()
     graph.data[:] = 1.0
     graph = graph + 2.0 * sparse.identity(n, dtype=np.float32, format="csr")
-    return sparse.diags(1.0 / np.asarray(graph.sum(axis=1)).ravel()).astype(np.float32) @ graph
+    scale = sparse.diags(1.0 / np.asarray(graph.sum(axis=1)).ravel()).astype(np.float32)
+    return sparse.csr_matrix(scale @ graph)

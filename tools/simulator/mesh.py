@@ -10,6 +10,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+import numpy.typing as npt
 
 BAKE_OFFSET_M = 0.004  # irradiance is computed this far in front of the surface
 BAKE_INSET_M = 0.012  # and this far inside the rim of a flat piece, because its rim may be inside a neighbour
@@ -154,9 +155,9 @@ class MeshBuilder:
 
     def quad(
         self,
-        origin: np.ndarray,
-        right: np.ndarray,
-        up: np.ndarray,
+        origin: npt.ArrayLike,
+        right: npt.ArrayLike,
+        up: npt.ArrayLike,
         material: Material,
         *,
         fit: bool = False,

@@ -64,7 +64,7 @@ def shading_tables(mesh: SceneMesh, atlas: Atlas, light: np.ndarray) -> ShadingT
 @kernel(fastmath=True)
 def _bilinear(
     s: ShadingTables, texture: int, level: int, u: float, v: float, weight: float
-) -> tuple[float, float, float]:
+) -> tuple[np.float32, np.float32, np.float32]:
     width, height = s.width_px[texture, level], s.height_px[texture, level]
     x = np.float32((u - np.floor(u)) * width - 0.5)
     y = np.float32((1.0 - (v - np.floor(v))) * height - 0.5)

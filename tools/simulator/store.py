@@ -60,7 +60,9 @@ def key(kind: str, *parts: Any) -> str:
     """
 
     def plain(value: Any) -> Any:
-        return {type(value).__name__: asdict(value)} if is_dataclass(value) else value
+        if is_dataclass(value) and not isinstance(value, type):
+            return {type(value).__name__: asdict(value)}
+        return value
 
     text = json.dumps([kind, *(plain(p) for p in parts)], sort_keys=True, default=repr)
     code = code_version(NOT_IN_WORLD_HASH if kind == "world" else NOT_IN_FRAME_HASH)

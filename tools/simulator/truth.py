@@ -274,4 +274,6 @@ def _seen_ratio(
 
 def decode_depth(png: np.ndarray) -> np.ndarray:
     """Return the depth uint16 [H, W] in millimetres of PNG bytes uint8 [B]."""
-    return cv2.imdecode(png, cv2.IMREAD_UNCHANGED)
+    depth = cv2.imdecode(png, cv2.IMREAD_UNCHANGED)
+    assert depth is not None  # written by the simulator
+    return depth

@@ -67,8 +67,8 @@ def _wall(
 ) -> None:
     split = 0.92 if dado and finish.dado is not None else 0.0
     cuts = [0.0]
-    for hole in sorted(openings, key=lambda o: o.s0):
-        cuts += [hole.s0, hole.s1]
+    for opening in sorted(openings, key=lambda o: o.s0):
+        cuts += [opening.s0, opening.s1]
     cuts.append(length)
     for k in range(len(cuts) - 1):
         s0, s1 = cuts[k], cuts[k + 1]

@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -99,7 +100,7 @@ def _lamps(route_m: np.ndarray) -> tuple[Light, ...]:
     return tuple(Light((float(x), float(y), 2.2), radius_m=0.2, intensity=(3.0, 2.9, 2.7)) for x, y in chosen)
 
 
-def _save(world: World, out: object) -> None:
+def _save(world: World, out: BinaryIO) -> None:
     mesh, atlas = world.mesh, world.atlas
     head = {
         "materials": [asdict(m) for m in mesh.materials],
@@ -121,15 +122,16 @@ _MESH = ("vertices_m", "normals", "bake_points_m", "uvs", "triangles", "material
 _ATLAS = ("size_m", "texels", "offset", "width_px", "height_px", "levels", "mean")
 
 
+def _with_tuples(fields: dict[str, Any]) -> dict[str, Any]:
+    return {k: tuple(v) if isinstance(v, list) else v for k, v in fields.items()}
+
+
 def load_world(path: Path) -> World:
     """Load a world from a file that `get_world` wrote."""
     with np.load(path) as data:
         head = json.loads(data["head"].tobytes())
         materials = tuple(Material(**{**m, "tint": tuple(m["tint"])}) for m in head["materials"])
-        lights = tuple(
-            Light(**{k: tuple(v) if isinstance(v, list) else v for k, v in light.items()})
-            for light in head["lights"]
-        )
+        lights = tuple(Light(**_with_tuples(light)) for light in head["lights"])
         mesh = SceneMesh(**{k: data[f"mesh_{k}"] for k in _MESH}, materials=materials)
         atlas = Atlas(tuple(head["names"]), **{k: data[f"atlas_{k}"] for k in _ATLAS})
         return World(mesh, atlas, data["light"], lights, data["route_m"])

@@ -8,7 +8,7 @@ from difflib import get_close_matches
 from beamsplat.common.config.deployment import Deployment, Role
 from beamsplat.common.errors import UserError
 from beamsplat.common.plugins import is_class_path
-from beamsplat.common.runtime.node import Node
+from beamsplat.common.runtime.node import Node, subscriptions
 from beamsplat.common.runtime.registry import Service, make_node, node_class_of
 from beamsplat.common.security.access_control import ADMIN_USERS
 from beamsplat.common.security.keys import HostKeys, check_endpoint, is_secure
@@ -83,7 +83,7 @@ def faults(deployment: Deployment, table: dict[str, Service] = NODES) -> list[Fa
                 Fault(f"{topic} would be published by {' and '.join(names)}: only one may publish it")
             )
     for name, node_class in classes.items():
-        missing = [i.topic for i in node_class.inputs if not producers[i.topic]]
+        missing = [i.topic for i in subscriptions(node_class) if not producers[i.topic]]
         whole = len(classes) == len(deployment.nodes)  # else the missing producer may be a node with errors
         if whole and missing and len(missing) == len(node_class.inputs):
             found.append(Fault(f"nothing in this deployment feeds {name}: {', '.join(missing)}", fatal=False))
@@ -142,7 +142,9 @@ def surroundings(classes: dict[str, type[Node]], name: str, role: Role = "whole"
     listeners = frozenset(other for other, node in classes.items() if node.inputs and other != name)
     return Surroundings(
         wait_for=listeners if classes[name].is_source() and classes[name].outputs else frozenset(),
-        without_producer=frozenset(entry.topic for entry in classes[name].inputs if entry.topic not in fed),
+        without_producer=frozenset(
+            entry.topic for entry in subscriptions(classes[name]) if entry.topic not in fed
+        ),
     )
 
 

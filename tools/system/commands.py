@@ -72,7 +72,8 @@ class Commands:
         try:
             if node in self._swaps:
                 raise UserError(f"{node} is being swapped already: wait until that is done")
-            parameters = dict(query.parameters)
+            # The stubs miss that Parameters iterates over (key, value).
+            parameters: dict[str, str] = dict(query.parameters)  # type: ignore[call-overload]
             overrides = json.loads(unquote(parameters.get("set", "[]")))
             if not (isinstance(overrides, list) and all(isinstance(o, str) for o in overrides)):
                 raise UserError("swap: `set` is a JSON list of OPTION=VALUE")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from beamsplat.common.runtime.node import Node
+from beamsplat.common.runtime.node import Node, subscriptions
 from beamsplat.common.topics import TOPICS
 
 _MARK = {"latest": "newest only", "every": "every one", "latched": "last value"}
@@ -10,13 +10,13 @@ _MARK = {"latest": "newest only", "every": "every one", "latched": "last value"}
 
 def edges(classes: dict[str, type[Node]]) -> list[tuple[str, str, str, str]]:
     """Return (producer, topic, consumer, delivery) of every connection, in the order of the topic table."""
-    found = []
+    found: list[tuple[str, str, str, str]] = []
     for topic in TOPICS:
         for producer, node in classes.items():
             if topic not in node.outputs:
                 continue
             for consumer, other in classes.items():
-                for entry in other.inputs:
+                for entry in subscriptions(other):
                     if entry.topic == topic:
                         found.append((producer, topic, consumer, entry.effective_delivery))
     return found
@@ -30,7 +30,7 @@ def as_text(classes: dict[str, type[Node]]) -> str:
         consumers = [
             f"{name} ({_MARK[entry.effective_delivery]})"
             for name, node in classes.items()
-            for entry in node.inputs
+            for entry in subscriptions(node)
             if entry.topic == topic
         ]
         if producers:

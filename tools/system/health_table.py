@@ -53,6 +53,7 @@ class HealthTable:
                 health = decode_sample(sample, self._row).message
             except DecodeError:  # a health message of an incompatible version
                 continue
+            assert isinstance(health, Health)  # the row's message type
             if self._all:
                 whose = str(sample.key_expr).split("/")[1]
                 health = health.model_copy(update={"node": f"{whose}/{health.node}"})

@@ -84,17 +84,18 @@ def route(deployment: Deployment) -> None:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
     router, security = deployment.router, deployment.security
+    keys = security.keys
     while not stop.is_set():
-        policy = _changed_at(security.keys)
+        policy = _changed_at(keys)
         with open_router(router.listen, router.connect, security):
             while not stop.wait(0.5):
-                if _changed_at(security.keys) == policy:
+                if keys is None or _changed_at(keys) == policy:
                     continue
                 try:
-                    read_hosts(security.keys)
+                    read_hosts(keys)
                     break
                 except UserError as error:  # being copied or edited: keep the old policy
-                    policy = _changed_at(security.keys)
+                    policy = _changed_at(keys)
                     log.error("the new policy is not taken up: %s", error)
 
 

@@ -204,6 +204,7 @@ class Supervisor:
         """Make an activated successor the node; later restarts use its options."""
         self.deployment = successor.deployment
         self._retired.append(self.children[successor.name].process)
+        assert successor.process is not None  # only a running successor takes over
         self._set_process(successor.name, successor.process, successor.instance)
         self._on_event(f"{successor.name} was taken over by its successor")
 

@@ -96,12 +96,14 @@ class Swap:
             activation.set_exception(error)
 
     def _taken_over(self) -> str | None:
+        assert self._activation is not None  # set before the first call
         if not self._activation.done():
             return None
         try:
             came = json.loads(self._activation.result())
         except UserError:
-            self.successor.process.kill()
+            if self.successor.process is not None:
+                self.successor.process.kill()
             raise
         asked, retired = self._retired
         lost = f", {came['lost']} more are lost" if came["lost"] else ""
