@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from beamsplat.common.geometry.beams import Beams
+from beamsplat.services.depth.source import Kind
 
 
 @dataclass(frozen=True)
@@ -72,7 +73,7 @@ class FusionInput:
     T_map_body: np.ndarray
     beams: Beams
     estimate: np.ndarray | None = None  # float32 [H, W]; unit by `estimate_kind`
-    estimate_kind: str = "none"  # a `Kind` of scaling.py
+    estimate_kind: Kind = "none"
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -100,9 +101,9 @@ def person(rng: np.random.Generator, sizes: dict[str, tuple[float, float]]) -> A
         Material("hair", tint=(1, 1, float(rng.uniform(0.7, 1.2)))),
     )
 
-    def part(draw: object, parent: int, joint: tuple[float, float, float]) -> BodyLink:
+    def part(draw: Callable[[MeshBuilder], None], parent: int, joint: tuple[float, float, float]) -> BodyLink:
         b = MeshBuilder(sizes, edge_m=0.12)
-        draw(b)  # type: ignore[operator]
+        draw(b)
         mesh = b.build()
         scaled = mesh.posed(mesh.vertices_m * scale, mesh.normals)
         return BodyLink(scaled, parent, (joint[0] * scale, joint[1] * scale, joint[2] * scale))
