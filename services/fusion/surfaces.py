@@ -1,4 +1,4 @@
-"""CandidateSurfaces an image may show, as the lidar and the floor predict them: candidates, not answers."""
+"""Surfaces that an image may show, as the lidar and the floor predict them: candidates, not answers."""
 
 from __future__ import annotations
 
