@@ -1,5 +1,6 @@
 """The wheel: one package, typed, with its data; a base install that works from an empty directory."""
 
+import os
 import subprocess
 import sys
 import zipfile
@@ -24,9 +25,11 @@ def wheel(tmp_path_factory):
 
 
 def _run(*command, cwd=None, ok=(0,), **environment):
+    """Run a command in which nothing of the checkout can be imported."""
+    clean = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
     done = subprocess.run(
-        [str(word) for word in command], cwd=cwd, capture_output=True, text=True, timeout=900, check=False,
-        env={"PATH": "/usr/bin:/bin", "HOME": str(cwd or "/tmp"), **environment} if environment else None,
+        [str(word) for word in command], cwd=cwd or "/", capture_output=True, text=True, timeout=1800, check=False,
+        env=clean | environment,
     )  # fmt: skip
     assert done.returncode in ok, f"{command}: {done.stdout[-2000:]}{done.stderr[-2000:]}"
     return done
