@@ -12,15 +12,15 @@ from dataclasses import dataclass, field
 class LearningRates:
     """Step sizes of Adam, in the unit of each parameter."""
 
-    mean_m: float = 2e-3  # for keyframes just inserted: new Gaussians are still displaced
-    refined_mean_m: float = 6e-4  # for refinement: larger steps make converged Gaussians jitter
-    log_scale: float = 6e-3  # logarithm of the three standard deviations
-    quat: float = 2e-3  # rotation as a unit quaternion
-    opacity_logit: float = 3e-2  # logit of the opacity
-    colour: float = 5e-3  # of RGB in [0, 1]
-    pose_rad: float = 2e-4  # with `refine_pose`
-    pose_m: float = 2e-4  # with `refine_pose`
-    exposure: float = 1e-3  # with `refine_exposure`
+    mean_m: float = 2e-3  # of the centre, for keyframes just inserted: new Gaussians are still displaced
+    refined_mean_m: float = 6e-4  # of the centre, for refinement: larger steps make it jitter
+    log_scale: float = 6e-3  # of the logarithm of the three standard deviations
+    quat: float = 2e-3  # of the rotation as a unit quaternion
+    opacity_logit: float = 3e-2  # of the logit of the opacity
+    colour: float = 5e-3  # of the RGB colour in [0, 1]
+    pose_rad: float = 2e-4  # of a keyframe's rotation, with `refine_pose`
+    pose_m: float = 2e-4  # of a keyframe's position, with `refine_pose`
+    exposure: float = 1e-3  # of a keyframe's exposure, with `refine_exposure`
 
 
 @dataclass(frozen=True)

@@ -31,6 +31,7 @@ class Figure:
     key: str
     title: str
     quality: bool = True  # False: a cost, which does not count in the order of the table
+    timed: bool = False  # varies with the load of the machine
 
 
 @dataclass(frozen=True)
@@ -79,6 +80,7 @@ def open_slam(data: Path, seconds: float) -> Run:
             "cpu_s": done["cpu_s"],
         }
 
+    run(LidarSlamSettings(), 0)  # the first run is slower
     return run
 
 
@@ -108,6 +110,7 @@ def open_fusion(data: Path, seconds: float) -> Run:
         figures = {key: errors[key] for key in ("absrel", "delta1", "coverage", "dense_within_1sigma")}
         return {**figures, "frames": errors["frames"], "cpu_ms": cpu_ms[DEFAULT]}
 
+    run(PlaneSweepConfig(), 0)  # the first run is slower
     return run
 
 
@@ -187,21 +190,21 @@ PARTS: dict[str, Part] = {
         LidarSlamSettings(),
         (Figure("ate_first_pose_rmse_m", "ATE optimised (m)"),
          Figure("online_ate_first_pose_rmse_m", "ATE online (m)"),
-         Figure("cpu_s", "CPU (s)", quality=False)),
+         Figure("cpu_s", "CPU (s)", quality=False, timed=True)),
         90.0, open_slam, _RANGE_NOISE,
     ),
     "fusion": Part(
         PlaneSweepConfig(),
         (Figure("absrel", "AbsRel"), Figure("delta1", "delta1"), Figure("coverage", "coverage"),
          Figure("dense_within_1sigma", "within 1 sigma"),
-         Figure("cpu_ms", "CPU per keyframe (ms)", quality=False)),
+         Figure("cpu_ms", "CPU per keyframe (ms)", quality=False, timed=True)),
         16.0, open_fusion, _RANGE_NOISE,
     ),
     "map": Part(
         MapperSettings(),
         (Figure("psnr_offpath_db", "PSNR off the path (dB)"), Figure("depth_l1_offpath_m", "depth L1 (m)"),
          Figure("fscore_5cm", "F-score at 5 cm"), Figure("gaussians", "Gaussians", quality=False),
-         Figure("wall_s", "wall (s)", quality=False)),
+         Figure("wall_s", "wall (s)", quality=False, timed=True)),
         12.0, open_map, "3 runs with different seeds of the mapper",
     ),
 }  # fmt: skip

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from beamsplat.common.errors import UserError
 from beamsplat.tools.bench.parameters import Parameter
 from beamsplat.tools.bench.readme import replace_readme_table
@@ -50,7 +52,7 @@ class Effect:
 
 def noise(part: Part, rows: list[Row]) -> dict[str, float]:
     """Return the relative spread (largest minus smallest) of each figure with default settings."""
-    runs, base = [row["figures"] for row in rows if row["parameter"] == DEFAULTS], _base(rows)
+    runs, base = [row["figures"] for row in rows if row["parameter"] == DEFAULTS], _base(part, rows)
     spread = {}
     for figure in part.figures:
         values = [run[figure.key] for run in runs if run.get(figure.key) is not None]
@@ -64,7 +66,7 @@ def effects(part: Part, parameters: list[Parameter], rows: list[Row]) -> list[Ef
     Raises:
         UserError: no run with default settings is finished.
     """
-    base, spread, found = _base(rows), noise(part, rows), []
+    base, spread, found = _base(part, rows), noise(part, rows), []
     for parameter in parameters:
         own = {row["scale"]: row for row in rows if row["parameter"] == parameter.name}
         runs = [own.get(scale) for scale in SCALES]
@@ -87,7 +89,7 @@ def as_json(
     """Return the result as JSON values: default figures, their relative spread, relative changes."""
     return {
         **setup,
-        "default": _base(rows),
+        "default": _base(part, rows),
         "spread": noise(part, rows),
         "parameters": [
             {
@@ -108,7 +110,7 @@ def as_json(
 
 def markdown(part: Part, parameters: list[Parameter], rows: list[Row], command: str, date: str) -> str:
     """Return the text of one part: how it was measured, its noise, the table, parameters without runs."""
-    spread, base = noise(part, rows), _base(rows)
+    spread, base = noise(part, rows), _base(part, rows)
     defaults = [
         f"{figure.title} {base[figure.key]:.4g} (spread {100.0 * spread[figure.key]:.1f} %)"
         for figure in part.figures
@@ -145,12 +147,13 @@ def write_page(file: Path, name: str, text: str) -> None:
     replace_readme_table(file, f"sensitivity {name}", f"\n{text}\n")
 
 
-def _base(rows: list[Row]) -> dict[str, float]:
-    """Return the figures of the run with default settings and seed 0, like all other runs."""
-    for row in rows:
-        if row["parameter"] == DEFAULTS and row["seed"] == 0:
-            return row["figures"]
-    raise UserError("no run with default settings is finished; run the command again, or raise --minutes")
+def _base(part: Part, rows: list[Row]) -> dict[str, float]:
+    """Return the figures with default settings: of seed 0, as in all other runs; medians of timed figures."""
+    runs = {row["seed"]: row["figures"] for row in rows if row["parameter"] == DEFAULTS}
+    if 0 not in runs:
+        raise UserError("no run with default settings is finished; run the command again, or raise --minutes")
+    timed = [figure.key for figure in part.figures if figure.timed]
+    return {**runs[0], **{key: float(np.median([run[key] for run in runs.values()])) for key in timed}}
 
 
 def _relative(difference: float, base: float) -> float:

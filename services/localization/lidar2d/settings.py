@@ -36,8 +36,8 @@ class LidarSlamSettings:
     returns_per_measurement: float = 6.0  # neighbouring returns have correlated errors: so many count as one
     search_min_m: float = 0.10  # lower limit of the correlative search window
     search_max_m: float = 0.80  # upper limit of the correlative search window
-    search_min_rad: float = math.radians(4.0)  # lower limit of this window in rotation
-    search_max_rad: float = math.radians(35.0)  # upper limit of this window in rotation
+    search_min_rad: float = math.radians(4.0)  # lower limit of the search window in rotation
+    search_max_rad: float = math.radians(35.0)  # upper limit of the search window in rotation
     good_inlier_ratio: float = 0.70  # below it, the search is repeated in a larger window
     lost_inlier_ratio: float = 0.50  # below it, the match is rejected
     sure_inlier_ratio: float = 0.80  # minimum for a match far from its prediction
@@ -49,7 +49,7 @@ class LidarSlamSettings:
 
     # Pose graph
     edge_sigma_m: float = 0.01  # error of a match that is not in its information matrix
-    edge_sigma_rad: float = math.radians(0.15)  # rotation error of a match, likewise
+    edge_sigma_rad: float = math.radians(0.15)  # error in rotation of a match, likewise not in that matrix
     # As measured on real logs; errors of consecutive matches correlate.
     submap_drift_sigma_m: float = 0.03  # drift between consecutive submaps
     submap_drift_sigma_rad: float = math.radians(0.5)  # drift in rotation between consecutive submaps
@@ -69,7 +69,7 @@ class LidarSlamSettings:
 
     # Lifelong operation
     min_covering_submaps: int = 6  # a submap is trimmed if this many others cover its nodes
-    trim_every_jobs: int = 5  # jobs from one search for such submaps to the next
+    trim_every_jobs: int = 5  # jobs between two searches for submaps to trim
     lost_scans: int = 5  # scans in a row without a match, after which a new segment starts
     link_every_scans: int = 10  # interval between relocalization attempts of a segment
     link_min_confidence: float = 0.5  # minimum of a relocalization that links two segments

@@ -144,6 +144,16 @@ def test_the_table_has_a_row_for_each_parameter_largest_effect_first(tmp_path):
     assert json.loads(json.dumps(result, allow_nan=False)) == result
 
 
+def test_timed_figures_are_compared_with_the_median(tmp_path):
+    rows = [
+        {"parameter": DEFAULTS, "seed": seed, "figures": {"error_m": error_m, "cpu_s": cpu_s}}
+        for seed, error_m, cpu_s in ((0, 1.0, 4.0), (1, 1.1, 2.0), (2, 1.2, 2.1))
+    ]
+    figures = (Figure("error_m", "error"), Figure("cpu_s", "CPU", quality=False, timed=True))
+    part = Part(ToySettings(), figures, 1.0, TOY.open, "3 seeds")
+    assert as_json(part, [], rows, SETUP)["default"] == {"error_m": 1.0, "cpu_s": 2.1}
+
+
 def test_parts_are_written_between_their_marks(tmp_path):
     page = tmp_path / "docs" / "parameters.md"
     write_page(page, "map", "table of the mapper")
