@@ -37,6 +37,7 @@ from beamsplat.common.messages.schema import (
     Transforms,
 )  # fmt: skip
 from beamsplat.common.messages.sensor_models import CameraModel, LidarModel
+from beamsplat.common.status import TrackingStatus
 
 # --- sensors -----------------------------------------------------------------------------------
 
@@ -101,9 +102,6 @@ class ExternalPose(Message):
 
 
 # --- localization ------------------------------------------------------------------------------
-
-
-TrackingStatus = Literal["ok", "lost", "relocalizing", "rejected"]
 
 
 class Odometry(Message):

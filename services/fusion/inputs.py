@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from beamsplat.common.geometry.beams import Beams
-from beamsplat.services.depth.source import Kind
+from beamsplat.services.fusion.scaling import Kind
 
 
 @dataclass(frozen=True)

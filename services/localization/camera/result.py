@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from beamsplat.common.messages.robot import TrackingStatus
+from beamsplat.common.status import TrackingStatus
 from beamsplat.services.localization.camera.align import Alignment
 from beamsplat.services.localization.camera.image_pyramid import ImagePyramid
 

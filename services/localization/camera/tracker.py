@@ -16,7 +16,7 @@ import numpy as np
 
 from beamsplat.common.geometry.camera import Pinhole
 from beamsplat.common.geometry.transforms import inverse, se3_exp, se3_log, yaw_of
-from beamsplat.common.messages.robot import TrackingStatus
+from beamsplat.common.status import TrackingStatus
 from beamsplat.services.localization.camera.align import Aligner, Alignment
 from beamsplat.services.localization.camera.depth import DepthPrior, align_scale_to_map, resize_depth
 from beamsplat.services.localization.camera.image_pyramid import (

@@ -24,8 +24,8 @@ from beamsplat.common.messages import (
     Scan,
     WheelOdometry,
 )
-from beamsplat.common.messages.robot import TrackingStatus
 from beamsplat.common.runtime.node import Input, Job, Node, Outputs
+from beamsplat.common.status import TrackingStatus
 from beamsplat.services.localization.lidar2d.jobs import JobResult
 from beamsplat.services.localization.lidar2d.occupancy import OccupancyGrid
 from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings

@@ -6,7 +6,7 @@ import threading
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, TypeVar
+from typing import Any, TypeVar, cast
 
 import numpy as np
 
@@ -18,9 +18,6 @@ from beamsplat.services.localization.lidar2d.graph_optimisation import Constrain
 from beamsplat.services.localization.lidar2d.scan import PreparedScan
 from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
 from beamsplat.services.localization.lidar2d.surfel_map import FrozenMap, MatchTables
-
-if TYPE_CHECKING:
-    from beamsplat.services.localization.lidar2d.relocalization import GlobalMap
 
 _T = TypeVar("_T")
 
@@ -90,7 +87,7 @@ class TableCache:
         # Each entry keeps the map that it was made from, to detect rebuilt submaps.
         self._tables: OrderedDict[int, tuple[FrozenMap, MatchTables]] = OrderedDict()
         self._pyramids: OrderedDict[int, tuple[FrozenMap, SearchPyramid]] = OrderedDict()
-        self._global_map: tuple[object, GlobalMap] | None = None
+        self._global_map: tuple[object, Any] | None = None
         self._lock = threading.Lock()
 
     def tables(self, submap: int, frozen: FrozenMap) -> MatchTables:
@@ -101,11 +98,11 @@ class TableCache:
         """Return the search pyramid of a submap; it is recomputed if its map was replaced."""
         return self._get(self._pyramids, submap, frozen, lambda: _pyramid_of(self.tables(submap, frozen)))
 
-    def global_map(self, key: object, make: Callable[[], GlobalMap]) -> GlobalMap:
+    def global_map(self, key: object, make: Callable[[], _T]) -> _T:
         """Return the global map for a key; only the latest one is kept."""
         with self._lock:
             if self._global_map is not None and self._global_map[0] == key:
-                return self._global_map[1]
+                return cast(_T, self._global_map[1])
         value = make()
         with self._lock:
             self._global_map = (key, value)
