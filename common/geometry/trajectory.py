@@ -106,28 +106,6 @@ def _rigid(T: np.ndarray, tolerance: float = 1e-6) -> np.ndarray:
     return finite & orthonormal & last_row & (np.linalg.det(np.where(np.isfinite(R), R, 0.0)) > 0.0)
 
 
-def associate(stamps_a_ns: np.ndarray, stamps_b_ns: np.ndarray, max_difference_ns: int) -> np.ndarray:
-    """Return pairs of indices (i, j) int64 [M, 2] of mutually nearest stamps of two sorted lists.
-
-    The stamps of a pair are at most `max_difference_ns` apart. Each stamp is used at most once. Because a
-    pair must be mutually nearest, swapping the two lists only swaps i and j.
-    """
-    a, b = np.asarray(stamps_a_ns, dtype=np.int64), np.asarray(stamps_b_ns, dtype=np.int64)
-    if len(a) == 0 or len(b) == 0:
-        return np.zeros((0, 2), dtype=np.int64)
-    b_of_a, a_of_b = _nearest(a, b), _nearest(b, a)
-    i = np.arange(len(a))
-    mutual = (a_of_b[b_of_a] == i) & (np.abs(b[b_of_a] - a) <= max_difference_ns)
-    return np.stack([i[mutual], b_of_a[mutual]], axis=1)
-
-
-def _nearest(queries: np.ndarray, sorted_stamps: np.ndarray) -> np.ndarray:
-    right = np.clip(np.searchsorted(sorted_stamps, queries), 0, len(sorted_stamps) - 1)
-    left = np.maximum(right - 1, 0)
-    take_left = np.abs(queries - sorted_stamps[left]) <= np.abs(sorted_stamps[right] - queries)
-    return np.where(take_left, left, right)
-
-
 def read_tum(path: Path) -> Trajectory:
     """Read the trajectory in a TUM file; its lines may be in any order.
 

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from beamsplat.common.geometry.transforms import inverse, se2_to_se3, transform_points
 from beamsplat.common.geometry.tracks import BoundedPath, PoseBuffer, RateLimit, scan_points, sweep_to_world
+from beamsplat.common.geometry.transforms import inverse, se2_to_se3, transform_points
 
 NS = 1_000_000_000
 

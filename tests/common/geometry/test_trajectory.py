@@ -10,7 +10,6 @@ from beamsplat.common.errors import UserError
 from beamsplat.common.geometry.trajectory import (
     Trajectory,
     _rigid,
-    associate,
     format_tum,
     parse_stamp_s,
     parse_tum,
@@ -139,29 +138,6 @@ def test_vectorised_rigidity_check_matches_is_rigid():
     T[4, 0, 3] = np.nan
     T[5, 0, 0] = np.inf
     assert _rigid(T).tolist() == [is_rigid(matrix) for matrix in T]
-
-
-@settings(max_examples=100, deadline=None)
-@given(
-    st.lists(st.integers(0, 300), unique=True, max_size=25),
-    st.lists(st.integers(0, 300), unique=True, max_size=25),
-    st.integers(0, 50),
-)
-def test_association_is_symmetric_and_within_the_limit(a, b, limit):
-    a, b = np.array(sorted(a), dtype=np.int64), np.array(sorted(b), dtype=np.int64)
-    pairs = associate(a, b, limit)
-    assert len(set(pairs[:, 0].tolist())) == len(pairs) == len(set(pairs[:, 1].tolist()))
-    for i, j in pairs:
-        assert abs(a[i] - b[j]) <= limit
-        assert abs(a[i] - b[j]) == np.abs(b - a[i]).min() == np.abs(a - b[j]).min()
-    # Two stamps that are each other's unique nearest within the limit must be paired.
-    for i, stamp in enumerate(a):
-        distance = np.abs(b - stamp)
-        if len(b) and distance.min() <= limit and (distance == distance.min()).sum() == 1:
-            j = int(distance.argmin())
-            back = np.abs(a - b[j])
-            if back.argmin() == i and (back == back.min()).sum() == 1:
-                assert [i, j] in pairs.tolist()
 
 
 def test_ground_truth_of_the_house_dataset_can_be_read(shared_dir):
