@@ -1,4 +1,4 @@
-"""Dynamic objects: persons and carts on closed paths that the robot sees and never touches."""
+"""Dynamic objects: persons and carts on closed paths, in view of the robot but clear of its path."""
 
 from __future__ import annotations
 
@@ -25,7 +25,8 @@ PROBE_RAYS = 192  # rays of the light probe at the middle of an actor
 class ActorPath:
     """A closed stadium-shaped path between two points.
 
-    An actor follows it for a whole number of rounds per lap of the robot.
+    An actor completes `rounds` rounds of this path while the robot completes one lap of `lap_s` seconds.
+    Points are (x, y) in the world frame.
     """
 
     start_m: tuple[float, float]
@@ -36,11 +37,16 @@ class ActorPath:
 
     @property
     def round_length_m(self) -> float:
-        """Length of one round."""
+        """Length of one round in metres."""
         return 2.0 * float(np.hypot(*np.subtract(self.end_m, self.start_m))) + 2.0 * np.pi * TURN_RADIUS_M
 
     def at(self, time_s: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return positions [N, 2], headings [N] in radians and travelled distances [N] in metres."""
+        """Return poses and travelled distances of the actor at times in seconds since the start of the lap.
+
+        Returns:
+            Positions (x, y) [N, 2] in metres and headings [N] in radians, both in the world frame, and
+            distances [N] in metres travelled since the start point of the path.
+        """
         travelled_m = (self.rounds * np.asarray(time_s) / self.lap_s + self.phase) * self.round_length_m
         a, b = np.array(self.start_m), np.array(self.end_m)
         length = float(np.linalg.norm(b - a))
@@ -79,13 +85,16 @@ def choose_actor_paths(
     *,
     tries: int = 500,
 ) -> list[ActorPath]:
-    """Choose those random paths that the robot sees most.
+    """Return `count` paths: for each actor, the random candidate that the robot's camera sees best.
 
-    Paths keep away from the robot and from each other.
+    An actor is never nearer than MIN_ROBOT_DISTANCE_M to the robot, nor nearer than 0.8 m to another actor.
 
     Args:
+        space: free floor of the scene.
+        drive: path of the robot.
+        caster: ray caster of the static scene, for visibility.
         count: number of actors.
-        duration_s: length of the recording.
+        duration_s: duration of the recording.
         tries: random candidates per actor.
 
     Raises:
@@ -160,20 +169,20 @@ class ActorSet:
         sizes: dict[str, tuple[float, float]],
         rng: np.random.Generator,
     ) -> ActorSet:
-        """Create a person for each of the first `people` paths and a cart for each other path.
+        """Return a set with a person on each of the first `people` paths and a cart on each other path.
 
-        `sizes` are the sizes of the textures in metres, by name.
+        `sizes` maps the name of a texture to the width and height in metres of one repeat.
         """
         makers = [person] * people + [cart] * (len(paths) - people)
         return cls([make(rng, sizes) for make in makers], paths)
 
     def bounding_circles(self, time_s: float) -> np.ndarray:
-        """Return float64 [A, 3]: x, y and radius in metres of a circle that contains each body."""
+        """Return float64 [A, 3]: x, y and radius in metres of a circle around each of A bodies."""
         places = [path.at(np.array(time_s))[0] for path in self.paths]
         return np.array([[*position, ACTOR_RADIUS_M] for position in places])
 
     def ray_caster_of(self, index: int, time_s: float) -> RayCaster:
-        """Return a ray caster of one body, posed at a time of the lap."""
+        """Return a ray caster of body number `index`, posed at `time_s` seconds after the lap start."""
         position, yaw, travelled_m = self.paths[index].at(np.array(time_s))
         mesh = self.bodies[index].posed(
             float(position[0]), float(position[1]), float(yaw), float(travelled_m)
@@ -182,7 +191,7 @@ class ActorSet:
 
 
 class ActorLighting:
-    """Lights the actors with the radiance of the static scene around each of them."""
+    """Computes the light on the actors from the surfaces and lamps of the static scene."""
 
     def __init__(
         self,
@@ -202,7 +211,7 @@ class ActorLighting:
         self._rays = np.stack([r * np.cos(angle), r * np.sin(angle), z], axis=1).astype(np.float32)
 
     def snapshot(self, time_s: float) -> ActorSnapshot:
-        """Return all actors, posed at a time of the lap and lit."""
+        """Return all actors, posed and lit, at `time_s` seconds after the start of the lap."""
         meshes, lights, bounds, occluder_spheres = [], [], [], []
         for body, path in zip(self._actors.bodies, self._actors.paths):
             position, yaw, travelled_m = path.at(np.array(time_s))
@@ -221,9 +230,9 @@ class ActorLighting:
         )
 
     def _light(self, mesh: SceneMesh) -> np.ndarray:
-        """Return irradiance / pi float32 [V, 3] of a body.
+        """Return irradiance / pi at the V vertices of a body, linear RGB float32 [V, 3].
 
-        It is the sum of a light probe at the middle of the body and of the lamps visible from there.
+        This is the sum of the light from a probe at the middle of the body and from the lamps visible there.
         """
         middle = ((mesh.vertices_m.min(axis=0) + mesh.vertices_m.max(axis=0)) / 2).astype(np.float64)
         hit = self._caster.first_hit_from(middle, self._rays)
@@ -248,7 +257,7 @@ class ActorLighting:
     def _occluder_spheres(mesh: SceneMesh, kind: str) -> list[list[float]]:
         """Return spheres (x, y, z, radius) that cast contact shadows.
 
-        They are at the feet and the body of a person, or at the decks of a cart.
+        The spheres are at the feet and the body of a person, or at the decks of a cart.
         """
         low, high = mesh.vertices_m.min(axis=0), mesh.vertices_m.max(axis=0)
         x, y = ((low + high) / 2)[:2]

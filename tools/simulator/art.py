@@ -1,6 +1,6 @@
 """Image-like textures: paintings and posters, book spines, rugs, window views, screens, clock faces.
 
-All are float32 [H, W, 3] sRGB, row 0 on top, from a seeded generator.
+Textures are sRGB float32 [H, W, 3], 0..1, row 0 on top; `rng` is a seeded generator.
 """
 
 from __future__ import annotations
@@ -47,7 +47,11 @@ WORDS = (
 def text_mask(
     height: int, width: int, at: tuple[int, int], text: str, scale: float, thick: int
 ) -> np.ndarray:
-    """Return a mask float32 [H, W, 1] of printed text, drawn in uint8 because OpenCV's putText needs it."""
+    """Return a mask float32 [H, W, 1] of printed text: 1 on the letters, 0 elsewhere.
+
+    `at` is the lower left corner of the text in pixels. The mask is drawn in uint8, as OpenCV's putText
+    requires.
+    """
     mask = np.zeros((height, width), np.uint8)
     cv2.putText(mask, text, at, cv2.FONT_HERSHEY_DUPLEX, scale, 255, thick, cv2.LINE_AA)
     return (mask / np.float32(255.0))[..., None]
@@ -161,7 +165,7 @@ def portrait(rng: np.random.Generator, height: int, width: int) -> np.ndarray:
 
 
 def lettering(rng: np.random.Generator, height: int, width: int) -> np.ndarray:
-    """Return a poster with a figure above and large words below."""
+    """Return a poster with concentric discs above and two large words below."""
     paper, ink = rgb("ece5d3"), rng.uniform(0.05, 0.5, 3)
     out = np.broadcast_to(paper, (height, width, 3)).astype(np.float32).copy()
     accent = rng.uniform(0.2, 0.9, 3)
@@ -185,7 +189,7 @@ PAINTINGS = (landscape, mondrian, abstract, skyline, portrait, lettering)
 def book_spines(
     rng: np.random.Generator, height: int = 256, width: int = 1024, count: int = 32
 ) -> np.ndarray:
-    """Return `count` book spines of equal width side by side; spine k is u in [k, k + 1] / count."""
+    """Return `count` book spines of equal width side by side; spine k is at u in [k, k + 1] / count."""
     out = np.empty((height, width, 3), np.float32)
     cell = width // count
     dyes = "7b2d26,1f3a5f,2f4b3c,e0d6c2,3b3b3d,b5762b,8c8f91,5a2a4a,d8d2c4,20504f,c7a24b"

@@ -16,37 +16,37 @@ MAX_LEVELS = 12
 
 @dataclass(frozen=True)
 class Atlas:
-    """T textures with their mip levels."""
+    """T textures, each with its mip levels; all levels together have N texels."""
 
     names: tuple[str, ...]
-    size_m: np.ndarray  # float64 [T, 2] width and height of one repeat
+    size_m: np.ndarray  # float64 [T, 2] width and height in metres of one repeat
     texels: np.ndarray  # uint8 [N, 3], sqrt-encoded linear RGB
-    offset: np.ndarray  # int32 [T, MAX_LEVELS] first texel of each level
+    offset: np.ndarray  # int32 [T, MAX_LEVELS], index in `texels` of the first texel of each level
     width_px: np.ndarray  # int32 [T, MAX_LEVELS]
     height_px: np.ndarray  # int32 [T, MAX_LEVELS]
-    levels: np.ndarray  # int32 [T]
+    levels: np.ndarray  # int32 [T], number of mip levels
     mean: np.ndarray  # float32 [T, 3] average linear colour
 
     def index(self, name: str) -> int:
-        """Return the number of the texture called `name`."""
+        """Return the index 0..T-1 of the texture called `name`."""
         return self.names.index(name)
 
 
 def srgb_to_linear(srgb: np.ndarray) -> np.ndarray:
-    """Return linear values 0..1 of sRGB values 0..1 (IEC 61966-2-1)."""
+    """Convert sRGB values 0..1 to linear values 0..1 (IEC 61966-2-1)."""
     return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
 
 
 def linear_to_srgb(linear: np.ndarray) -> np.ndarray:
-    """Return sRGB values 0..1 of linear values 0..1 (IEC 61966-2-1)."""
+    """Convert linear values 0..1 to sRGB values 0..1 (IEC 61966-2-1)."""
     linear = np.maximum(linear, 0.0)
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
 
 
 def build_atlas(textures: dict[str, tuple[np.ndarray, tuple[float, float]]]) -> Atlas:
-    """Build the atlas of textures by name.
+    """Return the atlas of `textures`, a dictionary from the name to the pixels and the size of a texture.
 
-    Textures are sRGB float32 [H, W, 3], row 0 on top, each with the size of one repeat in metres.
+    Pixels are sRGB float32 [H, W, 3], row 0 on top; the size is the width and height in metres of one repeat.
     """
     names = tuple(textures)
     shape = (len(names), MAX_LEVELS)

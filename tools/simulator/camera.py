@@ -1,4 +1,8 @@
-"""The camera: rays of its pixels, with plumb_bob distortion, and the image formation of its sensor."""
+"""The camera: rays of its pixels, with plumb_bob distortion, and the image formation of its sensor.
+
+Normalised image coordinates are (x / z, y / z) in the camera frame. Exposed light is radiance times the
+exposure gain; 1 is a fully exposed pixel.
+"""
 
 from __future__ import annotations
 
@@ -14,9 +18,9 @@ READ_NOISE = 4e-6  # read noise variance, in squared units of exposed light
 
 
 def distort(points: np.ndarray, distortion: tuple[float, ...]) -> np.ndarray:
-    """Return the distorted normalised coordinates [N, 2] of ideal ones.
+    """Return the distorted normalised image coordinates [N, 2] of undistorted ones, `points` [N, 2].
 
-    The model is plumb_bob (k1, k2, p1, p2, k3) as in OpenCV.
+    The distortion model is plumb_bob with the coefficients (k1, k2, p1, p2, k3), as in OpenCV.
     """
     k1, k2, p1, p2, k3 = distortion
     x, y = points[:, 0], points[:, 1]
@@ -32,7 +36,9 @@ def distort(points: np.ndarray, distortion: tuple[float, ...]) -> np.ndarray:
 
 
 def undistort(points: np.ndarray, distortion: tuple[float, ...], iterations: int = 30) -> np.ndarray:
-    """Return the ideal normalised coordinates [N, 2] of distorted ones: Newton's method, numeric Jacobian.
+    """Return the undistorted normalised image coordinates [N, 2] of distorted ones, `points` [N, 2].
+
+    This is the inverse of `distort`, computed by Newton's method with a numeric Jacobian.
 
     Raises:
         ValueError: the distortion folds over inside the image, so some pixels have no ray.
@@ -64,7 +70,7 @@ def pixel_rays(
 ) -> np.ndarray:
     """Return the ray of each pixel in the camera frame, float64 [H, W, 3] with z = 1.
 
-    Pixel centres are at integer coordinates.
+    Pixel centres are at integer coordinates; `K` is the intrinsic matrix [3, 3] in pixels.
     """
     u, v = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
     points = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1]], axis=-1).reshape(-1, 2)
@@ -74,7 +80,7 @@ def pixel_rays(
 
 
 def _tone_table() -> np.ndarray:
-    """Return sRGB values 0..255, float32 [4 * WHITE + 1], of exposed light 0..4.
+    """Return the sRGB values 0..255 of exposed light 0..4, float32 [4 * WHITE + 1].
 
     The tone curve is linear up to 0.7 and has a soft shoulder above.
     """
@@ -110,7 +116,14 @@ def _develop(
 
 
 class ImageSensor:
-    """An image sensor: vignetting, exposure, shot and read noise, tone curve, JPEG compression."""
+    """An image sensor: vignetting, exposure, shot and read noise, tone curve, JPEG compression.
+
+    Args:
+        table_rays: float32 [H, W, 3], rays of the pixels in the camera frame with z = 1.
+        noise: factor on the standard deviation of shot and read noise; 0 = none.
+        vignetting: v in the falloff 1 / (1 + v r^2), r in normalised image coordinates.
+        quality: JPEG quality, 0..100.
+    """
 
     def __init__(self, table_rays: np.ndarray, *, noise: float, vignetting: float, quality: int) -> None:
         squared = (table_rays[..., :2] ** 2).sum(axis=-1)
@@ -118,7 +131,7 @@ class ImageSensor:
         self._noise, self._quality = noise, quality
 
     def develop(self, radiance: np.ndarray, gain: float, rng: np.random.Generator) -> np.ndarray:
-        """Return the BGR image uint8 [H, W, 3] of linear radiance float32 [H, W, 3]."""
+        """Return the BGR image uint8 [H, W, 3] of RGB radiance float32 [H, W, 3] times exposure `gain`."""
         out = np.empty(radiance.shape, np.uint8)
         grain = rng.standard_normal(radiance.shape, dtype=np.float32)
         shot, read = SHOT_NOISE * self._noise**2, READ_NOISE * self._noise**2

@@ -1,4 +1,4 @@
-"""Free space of a scene for a robot or a person: obstacle clearance on a grid, and routes through it."""
+"""Free floor of a scene for a robot or a person: a grid of obstacle clearances, and routes on free floor."""
 
 from __future__ import annotations
 
@@ -15,7 +15,11 @@ BODY_M = (0.03, 1.25)  # surfaces between these heights are obstacles
 
 
 class ClearanceGrid:
-    """A grid of clearances: metres to the nearest obstacle; 0 where there is no floor."""
+    """A grid in the world xy plane that stores the clearance of each cell.
+
+    The clearance is the distance in metres to the nearest obstacle or missing floor; 0 inside an obstacle or
+    where there is no floor.
+    """
 
     def __init__(self, mesh: SceneMesh, caster: RayCaster) -> None:
         points = _surface_points(mesh)
@@ -38,14 +42,15 @@ class ClearanceGrid:
         return caster.occluded(origins, down, np.full(len(xy), 0.12)).astype(np.uint8).reshape(shape)
 
     def clearance(self, points_m: np.ndarray) -> np.ndarray:
-        """Return the metres to the nearest obstacle at points [..., 2], by bilinear interpolation."""
+        """Return the clearance in metres at points (x, y) [..., 2], by bilinear interpolation."""
         at = (np.asarray(points_m) - self.origin_m) / RESOLUTION_M - 0.5
         return ndimage.map_coordinates(self.clearance_m, [at[..., 1], at[..., 0]], order=1, mode="nearest")
 
     def relax(self, route_m: np.ndarray, wanted_m: float = 0.5, *, iterations: int = 160) -> np.ndarray:
         """Return a closed route [N, 2] smoothed and pushed away from obstacles.
 
-        This is an elastic band (Quinlan and Khatib 1993).
+        This is an elastic band (Quinlan and Khatib 1993): points (x, y) in metres whose clearance is less
+        than `wanted_m` are pushed towards larger clearance.
         """
         gradient = np.stack(np.gradient(self.clearance_m, RESOLUTION_M)[::-1], axis=0)
         points = route_m.copy()
@@ -61,10 +66,10 @@ class ClearanceGrid:
         return points
 
     def tour(self, rng: np.random.Generator, *, stops: int = 7, margin_m: float = 0.38) -> np.ndarray:
-        """Return a closed route [N, 2] through `stops` cells far apart in the largest connected free space.
+        """Return a closed route [N, 2] in metres through `stops` distant cells of the largest free area.
 
         Args:
-            margin_m: smallest clearance on the route.
+            margin_m: smallest clearance on the route, in metres.
 
         Raises:
             ValueError: there is too little connected floor for a robot.
@@ -95,7 +100,7 @@ class ClearanceGrid:
         return (cells[:, ::-1] + 0.5) * RESOLUTION_M + self.origin_m
 
     def places(self, margin_m: float) -> np.ndarray:
-        """Return the centres [N, 2] of all cells with more than this clearance."""
+        """Return the centres (x, y) [N, 2] in metres of all cells with more clearance than `margin_m`."""
         return self._centres(np.argwhere(self.clearance_m > margin_m))
 
     def _graph(self, margin_m: float) -> tuple[np.ndarray, sparse.csr_matrix]:
@@ -123,7 +128,7 @@ class ClearanceGrid:
 
 
 def _surface_points(mesh: SceneMesh, spacing_m: float = 0.025) -> np.ndarray:
-    """Return points [N, 3] on all triangles at obstacle height, no farther apart than the spacing."""
+    """Return points [N, 3] in metres on all triangles at obstacle height, at most `spacing_m` apart."""
     v = mesh.vertices_m[mesh.triangles].astype(np.float64)
     tall = (v[:, :, 2].max(axis=1) > BODY_M[0]) & (v[:, :, 2].min(axis=1) < BODY_M[1])
     v = v[tall]
@@ -139,7 +144,7 @@ def _surface_points(mesh: SceneMesh, spacing_m: float = 0.025) -> np.ndarray:
 
 
 def _round_trip(distance: np.ndarray) -> list[int]:
-    """Return an order of all stops that makes a short closed tour, by 2-opt."""
+    """Return the stop indices in the order of a short closed tour, by 2-opt; `distance` is [S, S]."""
     order = list(range(len(distance)))
 
     def length(o: list[int]) -> float:

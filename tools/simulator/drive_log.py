@@ -1,4 +1,4 @@
-"""Lidar scans, wheel odometry and true poses over any number of laps, as a stream without images or files."""
+"""Simulates lidar scans, wheel odometry and true poses of any number of laps; renders and writes nothing."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from beamsplat.tools.simulator.wheels import WheelOdometrySimulator, WheelReadin
 
 @dataclass(frozen=True)
 class SimulationStep:
-    """One lidar revolution, and the odometry readings since the previous one."""
+    """One lidar revolution of B beams, and the M odometry readings after those of the previous step."""
 
-    stamp_ns: int  # time of the first beam
+    stamp_ns: int  # time of the first beam, nanoseconds since 1970
     ranges_m: np.ndarray  # float32 [B], +inf = no return
     moving: np.ndarray  # bool [B], the beam hit a dynamic object
     through_glass: np.ndarray  # bool [B], the beam passed through glass
     T_world_body: np.ndarray  # float64 [4, 4], true pose at the first beam
     odometry_stamps_ns: np.ndarray  # int64 [M], up to the end of this revolution
-    odometry: WheelReadings
-    true_pose_world_body: np.ndarray  # float64 [M, 3], true pose_world_body at the odometry stamps
+    odometry: WheelReadings  # at the odometry stamps
+    true_pose_world_body: np.ndarray  # float64 [M, 3], true (x, y, yaw) at the odometry stamps
 
 
 def simulate_lidar(
@@ -41,10 +41,18 @@ def simulate_lidar(
     duration_s: float,
     actors: ActorSet | None = None,
 ) -> Iterator[SimulationStep]:
-    """Yield every revolution that is complete within `duration_s`.
+    """Yield one step for each lidar revolution that ends within `duration_s` seconds.
 
-    Ranges without noise are computed for one lap and reused; noise, dropouts and odometry are new on every
-    lap.
+    Noise-free ranges are computed in the first lap and reused in all other laps; noise, dropouts and odometry
+    are computed anew in each lap.
+
+    Args:
+        mesh: the static scene.
+        caster: ray caster of `mesh`.
+        drive: path of the robot.
+        seed: seed of all random noise.
+        duration_s: duration of the recording.
+        actors: dynamic objects; None = a static scene.
     """
     simulated_lidar = SimulatedLidar(mesh, caster, lidar)
     wheel_simulator = WheelOdometrySimulator(wheels, np.random.default_rng([seed, 0x57]))

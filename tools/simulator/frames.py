@@ -1,4 +1,7 @@
-"""Renders all images of a lap in worker processes; every frame is cached under a hash of its inputs."""
+"""Renders all images of a lap in worker processes; every frame is cached under a hash of its inputs.
+
+`time_s` is always the time in seconds since the start of the lap.
+"""
 
 from __future__ import annotations
 
@@ -20,13 +23,13 @@ from beamsplat.tools.simulator.settings import CameraSettings, Faults
 from beamsplat.tools.simulator.shade import shading_tables
 from beamsplat.tools.simulator.world import World, load_world
 
-METERING_VIEWS = 12  # views along the lap that set the exposure
-METERED_LEVEL = 0.40  # exposed value of the 70th percentile of their radiance
+METERING_VIEWS = 12  # number of views along the lap that set the exposure
+METERED_LEVEL = 0.40  # exposure gain times the 70th percentile of the radiance in these views
 
 
 @dataclass(frozen=True)
 class FrameSpec:
-    """Inputs of the rendered frames of a lap, besides the world."""
+    """All inputs that determine the frames of a lap; `world_file` is the cached world."""
 
     world_file: str
     seed: int
@@ -37,7 +40,7 @@ class FrameSpec:
 
 
 class FrameRenderer:
-    """Renders frames of one world as its camera sees them; built once in each process."""
+    """Renders camera frames of one world; each worker process creates one renderer."""
 
     def __init__(self, spec: FrameSpec) -> None:
         self.spec = spec
@@ -60,7 +63,7 @@ class FrameRenderer:
         self.gain = self._meter()
 
     def _meter(self) -> float:
-        """Return one exposure gain for the whole drive, measured in small views along it."""
+        """Return the exposure gain of the whole drive, measured in small rendered views along the path."""
         K = np.array([[60.0, 0, 35.5], [0, 60.0, 26.5], [0, 0, 1]])
         table = ray_table(pixel_rays(72, 54, K))
         times = np.linspace(0.0, self.drive.lap_s, METERING_VIEWS, endpoint=False)
@@ -68,23 +71,24 @@ class FrameRenderer:
         return METERED_LEVEL / float(np.percentile(np.stack(views).mean(axis=-1), 70))
 
     def camera_pose(self, time_s: float) -> np.ndarray:
-        """Return `T_world_camera` float64 [4, 4] at a time of the lap."""
+        """Return the true `T_world_camera` float64 [4, 4] at `time_s`."""
         return self.drive.transform_at(time_s) @ self.spec.camera.T_body_camera
 
     def render(self, time_s: float) -> RenderedView:
-        """Render the view at a time of the lap, with dynamic objects, before the image sensor."""
+        """Render the view at `time_s`, with dynamic objects, before the image sensor."""
         actors = None if self.actor_lighting is None else self.actor_lighting.snapshot(time_s)
         return self.renderer.render(self.camera_pose(time_s), self.table, actors)
 
     def render_static(self, T_world_camera: np.ndarray, table: RayTable) -> RenderedView:
-        """Render the scene without dynamic objects."""
+        """Render the view from `T_world_camera` [4, 4] through the rays of `table`, no dynamic objects."""
         return self.renderer.render(T_world_camera, table)
 
     def render_frame(self, time_s: float) -> tuple[bytes, np.ndarray, np.ndarray]:
-        """Render a frame at a time of the lap.
+        """Render the camera image at `time_s` and its ground truth.
 
         Returns:
-            JPEG bytes, depth uint16 [H, W] in millimetres, mask of dynamic objects bool [H, W].
+            The image as JPEG bytes, the depth uint16 [H, W] along optical z in millimetres (0 = no surface),
+            and the mask of dynamic objects bool [H, W].
         """
         view = self.render(time_s)
         rng = np.random.default_rng([self.spec.seed, 0x4E, round(time_s * 1e6)])
@@ -94,23 +98,23 @@ class FrameRenderer:
 
 
 def depth_mm(depth_z_m: np.ndarray) -> np.ndarray:
-    """Return depth in millimetres, uint16; 0 = no surface, or farther than 65 m."""
+    """Convert depth in metres (NaN = no surface) to uint16 millimetres; 0 = none, or beyond 65 m."""
     mm = np.nan_to_num(np.rint(depth_z_m * 1000.0), nan=0.0)
     return np.where(mm < 65535, mm, 0).astype(np.uint16)
 
 
 def lap_start(seed: int) -> float:
-    """Return where on the closed route a lap begins, 0..1."""
+    """Return the start of a lap as a fraction 0..1 of the closed route, drawn from the seed."""
     return float(np.random.default_rng([seed, 0x53]).random())
 
 
 def build_actors(world: World, actor_paths: tuple[ActorPath, ...], people: int, seed: int) -> ActorSet:
-    """Return the dynamic objects of a recording: `people` persons, then carts, one on each path."""
+    """Return the dynamic objects of a recording: persons on the first `people` paths, carts on the others."""
     return ActorSet.of(list(actor_paths), people, world.texture_size_m, np.random.default_rng([seed, 0x50]))
 
 
 def frame_path(spec: FrameSpec, time_s: float) -> Path:
-    """Return the file of one frame in the cache."""
+    """Return the path of the cache file of the frame at `time_s`; the file may not exist."""
     settings = [
         Path(spec.world_file).name,  # a hash of the world
         spec.seed,
@@ -123,7 +127,7 @@ def frame_path(spec: FrameSpec, time_s: float) -> Path:
 
 
 def save_frame(path: Path, jpeg: bytes, depth: np.ndarray, moving: np.ndarray) -> None:
-    """Write one frame with its ground truth."""
+    """Write image, depth uint16 [H, W] in mm and mask bool [H, W] of dynamic objects to one file."""
     png = cv2.imencode(".png", depth, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1]
     mask = cv2.imencode(".png", moving.astype(np.uint8) * 255)[1] if moving.any() else np.zeros(0, np.uint8)
     with store.atomic_file(path) as part, open(part, "wb") as out:
@@ -132,7 +136,7 @@ def save_frame(path: Path, jpeg: bytes, depth: np.ndarray, moving: np.ndarray) -
 
 @dataclass(frozen=True)
 class RenderedFrame:
-    """One rendered frame, encoded as uint8 [B] each; the mask is empty if nothing moves."""
+    """One frame: contents of a JPEG and two PNG files, uint8 [B] each; no mask bytes if nothing moves."""
 
     jpeg: np.ndarray
     depth_png: np.ndarray
@@ -140,7 +144,7 @@ class RenderedFrame:
 
 
 def load_frame(path: Path) -> RenderedFrame:
-    """Read a frame that `save_frame` wrote."""
+    """Return a frame, read from a file that `save_frame` wrote."""
     with np.load(path) as data:
         return RenderedFrame(data["jpeg"], data["depth_png"], data["mask_png"])
 
@@ -161,9 +165,12 @@ def _render_task(task: tuple[float, str]) -> None:
 def render_frames(
     spec: FrameSpec, times_s: list[float], jobs: int, progress: Callable[[int, int], None]
 ) -> list[Path]:
-    """Return the files of the frames at all times of the lap.
+    """Render the frames at `times_s` that are not in the cache, with `jobs` processes.
 
-    Frames that are not cached are rendered by `jobs` processes.
+    `progress` is called with the number of finished frames and the number of all frames.
+
+    Returns:
+        The cache files of all frames, in the order of `times_s`.
     """
     paths = [frame_path(spec, t) for t in times_s]
     missing = [(t, str(p)) for t, p in zip(times_s, paths) if not p.exists()]

@@ -1,7 +1,8 @@
 """Living room furniture and shared parts.
 
-A piece is drawn around the centre of its footprint with its front to -y. Each is a function of a seeded
-generator, so that pieces differ between homes.
+Conventions: lengths are metres, angles radians. A piece stands on z = 0, with the centre of its footprint at
+the origin and its front towards -y. Functions draw into the mesh builder `b`, in its local frame. Random
+details are drawn from the seeded generator `rng`, so that pieces differ between homes.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ BULB = Material("plain", tint=(1.0, 0.93, 0.8), emission=6.0)
 
 @dataclass(frozen=True)
 class FurniturePiece:
-    """A piece of furniture: its extent in metres and the function that draws it."""
+    """A piece of furniture: width along x, depth along y, height, and the function that draws the piece."""
 
     name: str
     width_m: float
@@ -42,7 +43,7 @@ def wood(rng: np.random.Generator) -> Material:
 def legs(
     b: MeshBuilder, width: float, depth: float, height: float, material: Material, thick: float = 0.045
 ) -> None:
-    """Draw four square legs under the corners of a width x depth top."""
+    """Draw four square legs from z = 0 to `height` under the corners of a table top of `width` x `depth`."""
     for x in (-1, 1):
         for y in (-1, 1):
             at = (x * (width - thick) / 2, y * (depth - thick) / 2, 0.0)
@@ -128,7 +129,7 @@ def coffee_table() -> FurniturePiece:
 
 
 def stack(b: MeshBuilder, rng: np.random.Generator, count: int) -> None:
-    """Draw a stack of lying books."""
+    """Draw a stack of `count` lying books."""
     z = 0.0
     for _ in range(count):
         thick, k = float(rng.uniform(0.015, 0.035)), int(rng.integers(64))
@@ -141,7 +142,7 @@ def stack(b: MeshBuilder, rng: np.random.Generator, count: int) -> None:
 def book(
     b: MeshBuilder, k: int, width: float, depth: float, height: float, colour: tuple[float, ...]
 ) -> None:
-    """Draw a book: a box whose front shows spine k of the texture `books`."""
+    """Draw a book: a box in the linear RGB `colour` whose front shows spine `k` of the texture `books`."""
     cover = Material("plain", tint=(colour[0], colour[1], colour[2]))
     box(b, (0, 0, 0), (width, depth, height), cover, skip=("front",))
     spine(b, k, (-width / 2, -depth / 2, 0), (width, 0, 0), (0, 0, height))
@@ -150,7 +151,10 @@ def book(
 def spine(
     b: MeshBuilder, k: int, origin: tuple[float, ...], right: tuple[float, ...], up: tuple[float, ...]
 ) -> None:
-    """Draw one quad with spine k of the 64 in the texture `books`."""
+    """Draw the rectangle of one book spine, with number `k` modulo 64 of the spines in the texture `books`.
+
+    `origin` is the lower left corner, `right` and `up` are the edges from this corner.
+    """
     vertices = np.array(
         [origin, np.add(origin, right), np.add(np.add(origin, right), up), np.add(origin, up)]
     )
@@ -214,7 +218,7 @@ def _books(b: MeshBuilder, rng: np.random.Generator, width: float, height: float
 
 
 def vase(b: MeshBuilder, rng: np.random.Generator, height: float) -> None:
-    """Draw a vase, a body of revolution."""
+    """Draw a vase of random shape and colour, `height` metres tall."""
     r = height * rng.uniform(0.16, 0.26)
     profile = [(0.55, 0.0), (0.9, 0.2), (1.0, 0.42), (0.75, 0.68), (0.38, 0.85), (0.45, 1.0)]
     tint = tuple(rng.uniform(0.15, 0.9, 3).tolist())
@@ -253,7 +257,10 @@ def fronts(
     rows: int,
     material: Material,
 ) -> None:
-    """Draw doors or drawers as raised panels with handles on the plane y = const."""
+    """Draw a grid of `columns` x `rows` cabinet doors or drawers: raised panels with handles.
+
+    The grid is `width` x `height`, centred at x = 0, in the vertical plane at `y`; its lower edge is at `z`.
+    """
     gap, w, h = 0.006, width / columns, height / rows
     for i in range(columns):
         for j in range(rows):

@@ -130,7 +130,7 @@ def nightstand() -> FurniturePiece:
 
 
 def table_lamp(b: MeshBuilder) -> None:
-    """Draw a small lit lampshade on a foot."""
+    """Draw a small lit lampshade on a foot, and add its light."""
     lathe(
         b,
         (0, 0, 0),
@@ -276,7 +276,7 @@ def toy_box() -> FurniturePiece:
 
 
 def ceiling_lamp(b: MeshBuilder, drop: float) -> None:
-    """Draw a lit pendant lamp that hangs down from z = 0."""
+    """Draw a lit pendant lamp that hangs from z = 0 on a cord of length `drop`, and add its light."""
     rod(b, (0, 0, 0), (0, 0, -drop), 0.006, BLACK, sides=5)
     lathe(b, (0, 0, -drop - 0.2), [(0.2, 0.0), (0.14, 0.14), (0.04, 0.2)], LACQUER, sides=24)
     lathe(b, (0, 0, -drop - 0.2), [(0.185, 0.005), (0.13, 0.135), (0.04, 0.19)][::-1], SHADE, sides=24)

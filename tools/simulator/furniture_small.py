@@ -41,7 +41,10 @@ def plant(height: float) -> FurniturePiece:
 
 
 def leaf(b: MeshBuilder, tip: np.ndarray, yaw: float, length: float, pitch: float) -> None:
-    """Draw a pointed, drooping, two-sided leaf that starts at `tip`."""
+    """Draw a pointed, drooping, two-sided leaf.
+
+    The leaf starts at `tip` [3], the tip of its stem, and leaves it in direction `yaw`, raised by `pitch`.
+    """
     s = np.linspace(0.0, 1.0, 7)
     half = 0.30 * length * np.sin(np.pi * np.clip(s, 0.03, 1.0) ** 0.8)
     along = length * s

@@ -1,4 +1,7 @@
-"""Loads a scene from glTF/GLB, or any format of trimesh: y-up metres to z-up, textures, refined mesh."""
+"""Loads a scene from a glTF/GLB file, or from another 3D format that trimesh reads.
+
+The file is y-up and in metres; the mesh is z-up, with triangles refined to edges of at most EDGE_M.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +19,7 @@ WHITE = np.ones((4, 4, 3), np.float32)
 
 
 def load_glb(path: Path) -> tuple[SceneMesh, Textures]:
-    """Return the mesh and the textures of a scene file.
+    """Return the refined mesh (z up, metres) and the textures by name of a scene file.
 
     Raises:
         ValueError: the file is unreadable, has no triangles, or is too large to bake.
@@ -90,7 +93,10 @@ def _part(
 def _refine(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Bisect triangles at their longest edge until no edge is longer than EDGE_M.
 
-    Columns 3.. of the vertices are interpolated.
+    `vertices` is [V, 3 + K]: position in metres and K more values, which are interpolated at new vertices.
+
+    Returns:
+        Vertices and faces int [F, 3]; no vertex is shared by two faces.
     """
     done_v, done_f, offset = [], [], 0
     for _ in range(14):
@@ -122,7 +128,7 @@ def _refine(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.nda
 def _material(
     geometry: trimesh.Trimesh, name: str, textures: Textures
 ) -> tuple[str, tuple[float, float, float]]:
-    """Return the texture name and the linear tint of a geometry; its image is added to `textures`."""
+    """Return the texture name and the linear RGB tint of a geometry; add its image, if any, to `textures`."""
     material = getattr(geometry.visual, "material", None)
     image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
     factor = getattr(material, "baseColorFactor", None)

@@ -18,7 +18,7 @@ ROUTE_CLEARANCE_M = 0.42  # distance of furniture from the route
 
 @dataclass(frozen=True)
 class Home:
-    """Geometry, textures, lights, and a closed route [N, 2] in metres that a robot can follow."""
+    """Geometry, textures, lights, and a closed route of points (x, y) [N, 2] in metres for a robot."""
 
     mesh: SceneMesh
     textures: Textures
@@ -27,7 +27,7 @@ class Home:
 
 
 def build_home(seed: int) -> Home:
-    """Return the home of this seed; the same seed yields the same bytes."""
+    """Return the home generated from `seed`; the same seed yields bit-identical arrays."""
     rng = np.random.default_rng([seed, 0x48])
     textures = home_textures(np.random.default_rng([seed, 0x54]))
     builder = MeshBuilder({name: size for name, (_, size) in textures.items()})
@@ -42,7 +42,11 @@ def build_home(seed: int) -> Home:
 
 
 def floor_plan(rng: np.random.Generator) -> tuple[list[Room], np.ndarray]:
-    """Return the rooms, counter-clockwise from the south-west, and the route [N, 2] at 5 cm steps."""
+    """Return the four rooms with their doorways and windows, and a closed route through all of them.
+
+    Rooms are in counter-clockwise order, from the south-west. The route is float64 [N, 2], points (x, y) in
+    metres at steps of 5 cm. The origin is the centre of the house.
+    """
     width, depth = rng.uniform(11.4, 12.6), rng.uniform(8.8, 9.8)
     low_x, high_x = rng.uniform(0.45, 0.58, 2) * width
     mid_y = rng.uniform(0.47, 0.56) * depth
@@ -105,7 +109,7 @@ def _windows(rng: np.random.Generator, room: Room, outer: tuple[str, str]) -> No
 
 
 def _route(rng: np.random.Generator, rooms: list[Room], doors: list[tuple[str, float, float]]) -> np.ndarray:
-    """Return a route straight through each doorway, and in each room towards its outer corner and back."""
+    """Return a closed route [N, 2]: straight through the doorways, in each room towards its outer corner."""
     corners = [
         (rooms[0].x0, rooms[0].y0),
         (rooms[1].x1, rooms[1].y0),
@@ -162,7 +166,7 @@ def _finishes(rng: np.random.Generator, rooms: list[Room]) -> dict[str, RoomFini
 
 
 def _terrace(b: MeshBuilder, rooms: list[Room]) -> None:
-    """Draw a garden wall around the home: beams that pass through a glazed door end there."""
+    """Draw a garden wall around the home, where lidar beams that pass through a glazed door end."""
     x0, y0 = min(r.x0 for r in rooms) - 2.6, min(r.y0 for r in rooms) - 2.6
     x1, y1 = max(r.x1 for r in rooms) + 2.6, max(r.y1 for r in rooms) + 2.6
     wall = Material("stonebrick")

@@ -17,7 +17,7 @@ STRIDE_M = 1.25  # length of a gait cycle (two steps)
 
 
 def clothes(rng: np.random.Generator) -> Textures:
-    """Return the textures of people and carts, by name."""
+    """Return the textures of persons (shirts, trousers, skin, hair, shoes) by name, also for carts."""
     shirts = [
         tx.plaid(rng, [rgb("8c2f39"), rgb("e0d5c1"), rgb("2c3e50")]),
         tx.stripes(rng, rgb("e9e4d8"), rgb("31506e"), 256),
@@ -36,9 +36,10 @@ def clothes(rng: np.random.Generator) -> Textures:
 
 @dataclass(frozen=True)
 class BodyLink:
-    """A rigid link; its origin is its joint.
+    """A rigid link of an articulated body; the origin of its frame is its joint.
 
-    The joint is at `joint_m` in the frame of the link `parent`; -1 is the root.
+    `parent` is the index of the parent link, -1 for the root. `joint_m` is the position of the joint in the
+    frame of the parent link; for the root, in the frame of the body on the floor.
     """
 
     mesh: SceneMesh
@@ -48,14 +49,14 @@ class BodyLink:
 
 @dataclass(frozen=True)
 class ArticulatedBody:
-    """An articulated body: links in an order in which every parent precedes its children."""
+    """An articulated body; in `parts`, every parent link precedes its children."""
 
     parts: tuple[BodyLink, ...]
     kind: str  # person or cart
     whole: SceneMesh  # all links merged, in the same order
 
     def posed(self, x_m: float, y_m: float, yaw_rad: float, travelled_m: float) -> SceneMesh:
-        """Return the mesh of the body at (x, y), facing yaw, at the gait phase of a travelled distance."""
+        """Return the body's mesh in the world frame, with its limbs at the gait phase of `travelled_m`."""
         angles, lift = _gait(travelled_m) if self.kind == "person" else ([0.0] * len(self.parts), 0.0)
         frames: list[tuple[np.ndarray, np.ndarray]] = []
         vertices, normals = [], []
@@ -78,7 +79,7 @@ class ArticulatedBody:
 def _gait(travelled_m: float) -> tuple[list[float], float]:
     """Return the joint angles in link order and the vertical motion of the pelvis in metres.
 
-    Angles are about the y axis (left): a positive one swings a hanging limb backwards.
+    Angles are radians about the y axis (left): a positive angle swings a hanging limb backwards.
     """
     phase = 2 * np.pi * travelled_m / STRIDE_M
     angles = [0.0, 0.0]  # pelvis, head
@@ -91,7 +92,10 @@ def _gait(travelled_m: float) -> tuple[list[float], float]:
 
 
 def person(rng: np.random.Generator, sizes: dict[str, tuple[float, float]]) -> ArticulatedBody:
-    """Return a random person, 1.6 to 1.85 m tall, facing +x; `sizes` are texture sizes in metres by name."""
+    """Return a random person, 1.6 to 1.85 m tall, facing +x.
+
+    `sizes` maps the name of a texture to the width and height in metres of one repeat.
+    """
     scale = float(rng.uniform(0.93, 1.06))
     shirt = Material(f"shirt_{int(rng.integers(4))}")
     trousers = Material(str(rng.choice(["denim", "chino"])))
@@ -166,7 +170,7 @@ def person(rng: np.random.Generator, sizes: dict[str, tuple[float, float]]) -> A
 
 
 def _oval(b: MeshBuilder, profile: list[tuple[float, float]], flat: float, material: Material) -> None:
-    """Draw a body of revolution, scaled by `flat` from front to back."""
+    """Draw a body of revolution about z, scaled by the factor `flat` along x (front to back)."""
     inner = MeshBuilder(b.texture_size_m, b.edge_m)
     lathe(inner, (0, 0, 0), profile, material, sides=20)
     mesh = inner.build()
@@ -177,7 +181,7 @@ def _oval(b: MeshBuilder, profile: list[tuple[float, float]], flat: float, mater
 
 
 def cart(rng: np.random.Generator, sizes: dict[str, tuple[float, float]]) -> ArticulatedBody:
-    """Return a serving trolley 0.75 m high with boxes on it, facing +x."""
+    """Return a serving trolley 0.75 m high with boxes on it, facing +x; `sizes` as for `person`."""
     b = MeshBuilder(sizes, edge_m=0.12)
     for z in (0.14, 0.44, 0.72):
         box(b, (0, 0, z), (0.62, 0.42, 0.025), Material("oak"))

@@ -1,4 +1,7 @@
-"""A spinning 2D lidar: each beam starts from the robot's pose at the time of that beam."""
+"""A spinning 2D lidar: each beam starts from the robot's pose at the time of that beam.
+
+`time_s` is always the time in seconds since the start of the lap.
+"""
 
 from __future__ import annotations
 
@@ -15,31 +18,31 @@ from beamsplat.tools.simulator.settings import LidarSettings
 TIME_SLICES = 10  # parts of a revolution; within each, dynamic objects are treated as static
 GRAZING_COSINE = 0.08  # cosine of incidence below which half of the beams have no return
 
-PoseAt = Callable[[np.ndarray], np.ndarray]  # seconds [N] -> pose_world_body [N, 3]
+PoseAt = Callable[[np.ndarray], np.ndarray]  # times [N] in seconds -> pose_world_body (x, y, yaw) [N, 3]
 
 
 class DynamicScene(Protocol):
     """The objects that move while the lidar turns."""
 
     def bounding_circles(self, time_s: float) -> np.ndarray:
-        """Return float64 [A, 3]: x, y and radius in metres of a circle that contains each object."""
+        """Return float64 [A, 3]: x, y and radius in metres of a circle around each of A objects."""
 
     def ray_caster_of(self, index: int, time_s: float) -> RayCaster:
-        """Return a ray caster of one object, posed at a time."""
+        """Return a ray caster of object number `index`, posed at `time_s`."""
 
 
 @dataclass(frozen=True)
 class SimulatedRevolution:
-    """Noise-free ranges of the B beams of one revolution."""
+    """Noise-free ranges of the B beams of one revolution, in the order in which they are measured."""
 
     range_m: np.ndarray  # float64 [B], +inf = no surface
     moving: np.ndarray  # bool [B], the beam hits a dynamic object
-    behind_m: np.ndarray  # float64 [B], range behind glass if the beam passes it; NaN = no glass
+    behind_m: np.ndarray  # float64 [B], range of the surface behind the glass that was hit; NaN = no glass
     cosine: np.ndarray  # float32 [B], cosine of the angle of incidence
 
 
 class SimulatedLidar:
-    """A lidar that casts the beams of its revolutions into one scene."""
+    """A lidar in one static scene; computes the ranges of its revolutions by ray casting."""
 
     def __init__(self, mesh: SceneMesh, caster: RayCaster, settings: LidarSettings) -> None:
         self.settings = settings
@@ -57,7 +60,10 @@ class SimulatedLidar:
     def revolution(
         self, time_s: float, pose_at: PoseAt, dynamic_scene: DynamicScene | None = None
     ) -> SimulatedRevolution:
-        """Cast the beams of the revolution that starts at a time."""
+        """Return the noise-free ranges of the revolution whose first beam is at `time_s`.
+
+        `pose_at` returns the true pose of the robot at the time of each beam.
+        """
         s = self.settings
         times = time_s + s.time_increment_s * np.arange(s.beams)
         pose = pose_at(times)
@@ -99,10 +105,10 @@ class SimulatedLidar:
         distance: np.ndarray,
         moving: np.ndarray,
     ) -> None:
-        """Shorten the `distance` of those beams that hit a dynamic object, in place.
+        """Reduce `distance` of each beam that hits a dynamic object, and set its `moving`, both in place.
 
-        `beams` are the indices of the beams to test; hits are marked in `moving`. Only beams that pass
-        through the bounding circle of an object are cast.
+        `beams` contains the indices of the beams to test. A ray is cast only for beams that pass through the
+        bounding circle of an object.
         """
         for index, (x, y, radius) in enumerate(dynamic_scene.bounding_circles(time_s)):
             to = np.array([x, y]) - origins[beams, :2]
@@ -119,13 +125,14 @@ class SimulatedLidar:
     def measure(
         self, revolution: SimulatedRevolution, rng: np.random.Generator
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the ranges that the device reports, and which beams passed through glass.
-
-        Returns:
-            Ranges float32 [B] in metres with noise and dropouts (+inf = no return), and bool [B].
+        """Add noise, dropouts and random passage through glass to the ranges of a revolution.
 
         The number of random draws does not depend on the ranges, so one scan never changes the noise of the
-        next one.
+        next scan.
+
+        Returns:
+            The measured ranges float32 [B] in metres (+inf = no return), and bool [B]: whether each beam
+            passed through glass.
         """
         s = self.settings
         noise, lost, grazed, passed = rng.standard_normal(s.beams), *rng.random((3, s.beams))

@@ -1,8 +1,9 @@
 """Light baking: direct light of windows and lamps with soft shadows, and indirect light between surfaces.
 
-Per vertex, Lambertian. Direct light samples each area light at several points. Indirect light is radiosity by
-gathering: E = E_direct + mean of albedo * E at the hits of cosine-weighted rays, iterated over the same hits,
-so that further bounces need no further rays.
+Light is computed per vertex; all surfaces are Lambertian. Direct light is computed from several sample points
+on each area light. Indirect light is radiosity by gathering: the irradiance E = E_direct + mean of albedo * E
+at the hits of cosine-weighted rays. Each bounce is one iteration over the same hits, so that no further rays
+are cast.
 """
 
 from __future__ import annotations
@@ -24,9 +25,10 @@ BLOCK = 1 << 16  # vertices processed at once, bounds memory
 def bake(
     mesh: SceneMesh, atlas: Atlas, lights: tuple[Light, ...], caster: RayCaster, *, rays: int = GATHER_RAYS
 ) -> np.ndarray:
-    """Return irradiance / pi of every vertex, linear RGB float32 [V, 3].
+    """Return irradiance / pi at every vertex, linear RGB float32 [V, 3].
 
-    It is the radiance that a white surface would have there.
+    This is the radiance of a white surface at the vertex. `rays` is the number of rays per vertex for
+    indirect light.
     """
     direct = np.zeros((len(mesh.vertices_m), 3), np.float32)
     for number, light in enumerate(lights):
@@ -74,9 +76,9 @@ def _arriving(
     sample_normals: np.ndarray,
     caster: RayCaster,
 ) -> np.ndarray:
-    """Return the relative irradiance float32 [N] of points [N, 3]; 0 in shadow.
+    """Return the irradiance float32 [N] at points [N, 3], for a light of intensity 1; 0 in shadow.
 
-    Each point receives light from one sample of the area light.
+    Point i receives light only from sample i of the area light.
     """
     to = samples - points
     squared = np.maximum(np.einsum("ij,ij->i", to, to), 1e-3)
@@ -93,9 +95,9 @@ def _arriving(
 def _light_points(
     light: Light, rng: np.random.Generator, points: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return stratified points on the light for receivers [N, 3], and the normals there.
+    """Return stratified sample points on the light for each receiver in `points` [N, 3], and their normals.
 
-    Both are [N, LIGHT_SAMPLES, 3].
+    Both arrays are float32 [N, LIGHT_SAMPLES, 3].
     """
     count = len(points)
     centre = np.array(light.centre_m, np.float32)
@@ -132,9 +134,9 @@ def _light_points(
 
 
 def _gather(mesh: SceneMesh, caster: RayCaster, rays: int) -> np.ndarray:
-    """Return int32 [V, rays]: the triangle that each cosine-weighted ray hits.
+    """Return int32 [V, rays]: the index of the triangle that each cosine-weighted ray from a vertex hits.
 
-    -1 is no hit, -2 a hit on a back face.
+    -1 = no hit, -2 = a hit on a back face.
     """
     count = len(mesh.vertices_m)
     hits = np.empty((count, rays), np.int32)
@@ -193,7 +195,7 @@ def _bounce(mesh: SceneMesh, atlas: Atlas, direct: np.ndarray, hits: np.ndarray)
 def _smoothing_matrix(mesh: SceneMesh) -> sparse.csr_matrix:
     """Return a row-stochastic matrix [V, V] that averages each vertex with its neighbours.
 
-    It removes sampling noise.
+    Multiplication by this matrix removes sampling noise.
     """
     i = mesh.triangles[:, [0, 1, 2, 1, 2, 0]].ravel()
     j = mesh.triangles[:, [1, 2, 0, 0, 1, 2]].ravel()

@@ -1,7 +1,7 @@
-"""Triangle meshes with materials, and the builder that all pieces of furniture are drawn with.
+"""Triangle meshes with materials, and the builder into which all furniture is drawn.
 
-Surfaces are finely tessellated because light is baked per vertex: the builder's `edge_m` sets the
-resolution of shadows, not of shape.
+Surfaces are finely tessellated because light is computed per vertex: the builder's `edge_m`, the longest edge
+of a triangle, is the resolution of shadows.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ BAKE_INSET_M = 0.012  # and this far inside the rim of a flat piece, because its
 
 @dataclass(frozen=True)
 class Material:
-    """Appearance of a triangle: a texture by name, multiplied by a linear RGB tint."""
+    """Appearance of a triangle: the texture called `texture`, multiplied by a linear RGB tint."""
 
     texture: str = "plain"
     tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
@@ -40,7 +40,7 @@ class SceneMesh:
     materials: tuple[Material, ...]
 
     def posed(self, vertices_m: np.ndarray, normals: np.ndarray) -> SceneMesh:
-        """Return the mesh with other vertices and normals [V, 3] and the same topology."""
+        """Return a copy of the mesh with these vertices and normals [V, 3]; the triangles are the same."""
         return replace(
             self,
             vertices_m=vertices_m.astype(np.float32),
@@ -50,7 +50,7 @@ class SceneMesh:
 
 
 def merge(meshes: Iterable[SceneMesh]) -> SceneMesh:
-    """Merge meshes into one; material and surface numbers are shifted so that they stay distinct."""
+    """Return one mesh of all meshes; materials and surfaces get new numbers, so that they stay distinct."""
     parts = list(meshes)
     vertices = np.cumsum([0, *(len(p.vertices_m) for p in parts)])
     materials = np.cumsum([0, *(len(p.materials) for p in parts)])
@@ -72,15 +72,15 @@ class Light:
     """An area light: a parallelogram (a window), or a sphere if `right_m` and `up_m` are zero."""
 
     centre_m: tuple[float, float, float]
-    right_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # half the extent
-    up_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    right_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # from the centre to the middle of the right side
+    up_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # from the centre to the middle of the upper side
     radius_m: float = 0.0
-    intensity: tuple[float, float, float] = (1.0, 1.0, 1.0)  # irradiance of a surface that faces it at 1 m
+    intensity: tuple[float, float, float] = (1.0, 1.0, 1.0)  # irradiance at 1 m, facing the light
 
 
 @dataclass
 class _MeshBuffers:
-    """Data that a builder shares with the builders that `placed` and `tilted` return."""
+    """Surfaces and lights of one mesh, shared by all builders that `placed` and `tilted` derive."""
 
     lights: list[Light] = field(default_factory=list)
     pieces: list[tuple[np.ndarray, ...]] = field(default_factory=list)
@@ -90,9 +90,10 @@ class _MeshBuffers:
 
 
 class MeshBuilder:
-    """Collects surfaces given in a local frame (x right, y away, z up).
+    """Collects the surfaces and lights of a mesh; coordinates are in the builder's local frame, in metres.
 
-    `placed` and `tilted` return a builder that draws into the same mesh from another frame.
+    The local frame is x right, y away from the viewer, z up. `placed` and `tilted` return a builder with
+    another local frame that adds to the same mesh.
     """
 
     def __init__(self, texture_size_m: dict[str, tuple[float, float]], edge_m: float = 0.11) -> None:
@@ -105,7 +106,10 @@ class MeshBuilder:
     def placed(
         self, x_m: float, y_m: float, z_m: float = 0.0, yaw_rad: float = 0.0, edge_m: float | None = None
     ) -> MeshBuilder:
-        """Return a builder of the same mesh whose frame is at (x, y, z) and rotated by yaw about z."""
+        """Return a builder of the same mesh with the frame moved to (x, y, z), then rotated by yaw about z.
+
+        Position and yaw are in the frame of this builder. `edge_m` None = the same as of this builder.
+        """
         child = MeshBuilder.__new__(MeshBuilder)
         child.texture_size_m, child._buffers = self.texture_size_m, self._buffers
         child.edge_m = self.edge_m if edge_m is None else edge_m
@@ -115,7 +119,7 @@ class MeshBuilder:
         return child
 
     def tilted(self, axis: str, angle_rad: float) -> MeshBuilder:
-        """Return a builder of the same mesh whose frame is rotated about this frame's x, y or z axis."""
+        """Return a builder of the same mesh with the frame rotated about its x, y or z axis."""
         child = self.placed(0.0, 0.0)
         cos, sin = np.cos(angle_rad), np.sin(angle_rad)
         i, j = {"x": (1, 2), "y": (2, 0), "z": (0, 1)}[axis]
@@ -134,7 +138,11 @@ class MeshBuilder:
         material: Material,
         bake_points: np.ndarray | None = None,
     ) -> None:
-        """Add one smooth surface."""
+        """Add one smooth surface.
+
+        `bake_points` [V, 3] are the points at which the light of each vertex is computed; None = the
+        vertices.
+        """
         store = self._buffers
         number = store.materials.setdefault(material, len(store.materials))
         bake = vertices if bake_points is None else bake_points
@@ -165,14 +173,14 @@ class MeshBuilder:
         turn: bool = False,
         edge_m: float | None = None,
     ) -> None:
-        """Add a parallelogram; seen from its front, `origin` is its lower left corner.
+        """Add a parallelogram; `origin` is its lower left corner, seen from its front.
 
         Args:
-            origin, right, up: float [3], local metres.
-            fit: stretch the texture over the parallelogram once, instead of repeating it in its own size.
-            offset: start of the repeated texture, in repeats; None chooses another one for each surface.
+            origin, right, up: float [3], the corner and the two edges from this corner, in local metres.
+            fit: stretch one repeat of the texture over the parallelogram, instead of its real size.
+            offset: start of the repeated texture, in repeats; None = a different start for each surface.
             turn: map the u axis of the texture to `up`.
-            edge_m: longest edge of the tessellation; None takes the builder's.
+            edge_m: longest edge of the tessellation; None = `edge_m` of the builder.
         """
         origin, right, up = (np.asarray(v, dtype=np.float64) for v in (origin, right, up))
         width, height = float(np.linalg.norm(right)), float(np.linalg.norm(up))
@@ -203,13 +211,16 @@ class MeshBuilder:
         )
 
     def lamp(self, at: tuple[float, float, float], radius_m: float, power: float, tint: np.ndarray) -> None:
-        """Add a spherical light; the geometry of its fixture must be inside the radius."""
+        """Add a spherical light at `at` (local metres) with intensity `power` * `tint` (linear RGB [3]).
+
+        The geometry of the lamp must be inside the sphere, because surfaces inside it do not block the light.
+        """
         centre = tuple((self._R @ np.asarray(at, dtype=np.float64) + self._t).tolist())
         intensity = tuple((power * np.asarray(tint, dtype=np.float64)).tolist())
         self._buffers.lights.append(Light(centre, radius_m=radius_m, intensity=intensity))
 
     def window(self, origin: np.ndarray, right: np.ndarray, up: np.ndarray, radiance: np.ndarray) -> None:
-        """Add an area light for a window pane; origin, right and up as for `quad`."""
+        """Add an area light of RGB `radiance` [3] for a window pane; origin, right and up as for `quad`."""
         origin, right, up = (np.asarray(v, dtype=np.float64) for v in (origin, right, up))
         centre = self._R @ (origin + right / 2 + up / 2) + self._t
         area = float(np.linalg.norm(np.cross(right, up)))
@@ -224,11 +235,11 @@ class MeshBuilder:
 
     @property
     def lights(self) -> tuple[Light, ...]:
-        """All lights added so far, in the frame of the mesh."""
+        """All lights added until now, in the frame of the mesh."""
         return tuple(self._buffers.lights)
 
     def build(self) -> SceneMesh:
-        """Return the mesh of all surfaces added so far."""
+        """Return the mesh of all surfaces added until now."""
         columns = [np.concatenate(column) for column in zip(*self._buffers.pieces)]
         vertices, normals, bake, uvs, triangles, material, surface = columns
         return SceneMesh(
@@ -244,9 +255,9 @@ class MeshBuilder:
 
 
 def grid_triangles(rows: int, columns: int) -> np.ndarray:
-    """Return the triangles int [2 (rows-1) (columns-1), 3] of a row-major vertex grid.
+    """Return the triangles, int [2 (rows-1) (columns-1), 3], of a row-major grid of vertices.
 
-    Rows go up, columns to the right.
+    Row 0 is at the bottom, column 0 on the left.
     """
     index = np.arange(rows * columns).reshape(rows, columns)
     a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]

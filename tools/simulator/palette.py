@@ -8,7 +8,7 @@ from beamsplat.tools.simulator import art
 from beamsplat.tools.simulator import textures as tx
 from beamsplat.tools.simulator.textures import rgb
 
-Textures = dict[str, tuple[np.ndarray, tuple[float, float]]]  # sRGB [H, W, 3], size of a repeat in metres
+Textures = dict[str, tuple[np.ndarray, tuple[float, float]]]  # name: sRGB [H, W, 3], metres (w, h)
 
 PAINTINGS = 14
 WALLS = ("wall_a", "wall_b", "wall_c", "wall_d")
@@ -16,7 +16,7 @@ FLOORS = ("floor_a", "floor_b", "floor_c", "floor_d")
 
 
 def home_textures(rng: np.random.Generator) -> Textures:
-    """Return the textures of a home, by the names that furniture and rooms use."""
+    """Return all textures of a home, by the names that the materials of furniture and rooms refer to."""
     return {**_surfaces(rng), **_floors_and_walls(rng), **_cloths(rng), **_artworks(rng)}
 
 

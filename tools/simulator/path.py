@@ -11,7 +11,10 @@ from beamsplat.common.geometry.transforms import se2_to_se3
 
 
 def resample_closed(points_m: np.ndarray, step_m: float) -> np.ndarray:
-    """Return a closed polyline [N, 2] resampled at even steps; the first point is not repeated at the end."""
+    """Return a closed polyline [N, 2] resampled at equal steps of at most `step_m` along its length.
+
+    There are at least 8 points. The first point is not repeated at the end.
+    """
     closed = np.vstack([points_m, points_m[:1]])
     s = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1))])
     count = max(8, int(np.ceil(s[-1] / step_m)))
@@ -21,7 +24,7 @@ def resample_closed(points_m: np.ndarray, step_m: float) -> np.ndarray:
 
 @dataclass(frozen=True)
 class MotionLimits:
-    """Limits of the robot's motion."""
+    """Upper limits of the robot's speed, turn rate, and acceleration along and across its path."""
 
     speed_m_s: float = 0.45
     turn_rad_s: float = 0.7
@@ -30,13 +33,16 @@ class MotionLimits:
 
 
 class DrivePath:
-    """A closed lap as a function of time that starts and ends at rest in the same place.
+    """The robot's pose as a function of time, on closed laps that start and end at rest in one place.
 
     The heading is the tangent of the curve, because a differential-drive robot cannot slide sideways.
     """
 
     def __init__(self, points_m: np.ndarray, limits: MotionLimits, *, start: float = 0.0) -> None:
-        """Fit a closed curve through control points [N, 2]; `start` in 0..1 is where on it the lap begins."""
+        """Fit a closed curve through control points (x, y) [N, 2] and compute its speed profile.
+
+        `start` is the control point where a lap begins, as a fraction 0..1 of all points.
+        """
         count = len(points_m)
         points_m = np.roll(points_m, -int(start * count) % count, axis=0)
         closed = np.vstack([points_m, points_m[:1]])
@@ -61,7 +67,7 @@ class DrivePath:
         self.lap_s = float(np.ceil(time[-1] + 0.5))
 
     def pose_at(self, time_s: np.ndarray | float) -> np.ndarray:
-        """Return planar poses pose_world_body float64 [..., 3] at times in seconds since the start.
+        """Return pose_world_body (x, y, yaw) float64 [..., 3] at times in seconds since the drive start.
 
         Times beyond the first lap are allowed.
         """
@@ -71,7 +77,7 @@ class DrivePath:
         return np.concatenate([xy, np.arctan2(tangent[..., 1], tangent[..., 0])[..., None]], axis=-1)
 
     def transform_at(self, time_s: np.ndarray | float) -> np.ndarray:
-        """Return `T_world_body` float64 [..., 4, 4] at times in seconds since the start."""
+        """Return `T_world_body` float64 [..., 4, 4] at times in seconds since the start of the drive."""
         return se2_to_se3(self.pose_at(time_s))
 
     def _position(self, time: np.ndarray) -> np.ndarray:
@@ -79,12 +85,12 @@ class DrivePath:
 
 
 def _limit_acceleration(speed: np.ndarray, along: np.ndarray, limit: float) -> np.ndarray:
-    """Return a speed profile lowered until its acceleration and deceleration stay within the limit.
+    """Return the speed [N] in m/s, reduced so that acceleration and deceleration are within the limit.
 
     Args:
         speed: m/s at each sample; its array is not modified.
         along: arc length in metres at each sample.
-        limit: m/s^2. The speed at both ends is (almost) zero.
+        limit: largest acceleration in m/s^2. The returned speed at both ends is almost zero.
     """
     v2 = speed**2
     v2[0] = v2[-1] = 1e-5

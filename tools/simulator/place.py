@@ -1,4 +1,8 @@
-"""Furniture placement: at walls or free-standing, clear of doors, windows, the route and other pieces."""
+"""Furniture placement: at walls or free-standing, clear of doors, windows, the route and other pieces.
+
+House coordinates are the x and y of the world frame. The frame of a wall has its origin at the lower left
+corner of the wall, seen from inside the room; s is the distance in metres along the wall from there.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +18,7 @@ YAW = {"south": np.pi, "east": -np.pi / 2, "north": 0.0, "west": np.pi / 2}
 
 @dataclass(frozen=True)
 class WallOpening:
-    """An opening in a wall, from s0 to s1 along it and from z0 to z1 in height, in metres."""
+    """An opening in a wall, from s0 to s1 along the wall and from z0 to z1 in height, in metres."""
 
     s0: float
     s1: float
@@ -25,7 +29,11 @@ class WallOpening:
 
 @dataclass
 class Room:
-    """Inner rectangle of a room in house coordinates, its openings and the furniture placed in it."""
+    """Inner rectangle of a room in house coordinates, its openings and the furniture placed in it.
+
+    `taken` contains the footprint and height of each piece; `spans` contains (s0, s1, height) of each piece
+    at a wall.
+    """
 
     name: str
     x0: float
@@ -41,7 +49,7 @@ class Room:
         return self.x1 - self.x0 if side in ("south", "north") else self.y1 - self.y0
 
     def corner(self, side: str) -> tuple[float, float]:
-        """Return the lower left corner of a wall as seen from inside: the origin of the wall's frame."""
+        """Return the origin (x, y) of the frame of a wall, in house coordinates."""
         return {
             "south": (self.x1, self.y0),
             "east": (self.x1, self.y1),
@@ -50,7 +58,7 @@ class Room:
         }[side]
 
     def to_house(self, side: str, s: float, out_m: float) -> tuple[float, float]:
-        """Return the point s metres along a wall and `out_m` metres from it into the room."""
+        """Return the house coordinates of the point `s` along a wall and `out_m` metres into the room."""
         x, y = self.corner(side)
         cos, sin = np.cos(YAW[side]), np.sin(YAW[side])
         return float(x + cos * s + sin * out_m), float(y + sin * s - cos * out_m)
@@ -66,7 +74,10 @@ class Placement:
 
 
 class FurniturePlacer:
-    """Places furniture in one room by rejection sampling: random placements until one is free."""
+    """Places furniture in one room by rejection sampling: tries random placements until one is free.
+
+    Pieces are at least `clearance_m` from the route, points (x, y) [N, 2] in house coordinates.
+    """
 
     def __init__(self, room: Room, route_m: np.ndarray, clearance_m: float, rng: np.random.Generator) -> None:
         self.room = room
@@ -83,7 +94,7 @@ class FurniturePlacer:
     def at_wall(
         self, piece: FurniturePiece, *, tries: int = 60, sides: tuple[str, ...] = SIDES
     ) -> Placement | None:
-        """Place a piece with its back to a wall; return None if no try is free."""
+        """Place a piece with its back to a random wall; return None if no tried placement is free."""
         for _ in range(tries):
             side = str(self.rng.choice(sides))
             length = self.room.length(side)
@@ -102,7 +113,10 @@ class FurniturePlacer:
         return None
 
     def inside(self, piece: FurniturePiece, *, tries: int = 80, margin_m: float = 0.25) -> Placement | None:
-        """Place a piece inside the room at a multiple of 90 degrees; return None if no try is free."""
+        """Place a piece at least `margin_m` from all walls, at a yaw that is a multiple of 90 degrees.
+
+        Return None if none of the tried placements is free.
+        """
         room = self.room
         for _ in range(tries):
             yaw = float(self.rng.integers(4)) * np.pi / 2
@@ -121,7 +135,7 @@ class FurniturePlacer:
         return None
 
     def at(self, spot: Placement, piece: FurniturePiece) -> bool:
-        """Place a piece at a given placement; return whether that was free."""
+        """Place a piece at the placement `spot` if its floor is free; return whether the piece was placed."""
         if not self._floor_is_free(spot, piece):
             return False
         self._take(spot, piece)

@@ -1,7 +1,9 @@
 """Ray casting with Embree: first hits and occlusion, for batches of rays.
 
-Embree works in float32 and only its triangle index is used; `hit_distance` computes the intersection with
-the plane of the triangle in float64.
+Embree computes in float32, so only the triangle index of its hits is used; `hit_distance` computes the
+intersection with the plane of the triangle in float64.
+
+Rays have origins [N, 3] in metres and directions [N, 3] of any length.
 """
 
 from __future__ import annotations
@@ -14,7 +16,7 @@ from beamsplat.tools.simulator.mesh import SceneMesh
 
 
 class RayCaster:
-    """An immutable set of triangles to cast rays into."""
+    """An immutable set of triangles that is tested for hits of rays."""
 
     def __init__(self, vertices_m: np.ndarray, triangles: np.ndarray) -> None:
         self._vertices = np.ascontiguousarray(vertices_m, dtype=np.float32)
@@ -31,7 +33,7 @@ class RayCaster:
         return cls(mesh.vertices_m, mesh.triangles)
 
     def first_hit(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """Return int32 [N]: the index of the first triangle that each ray [N, 3] hits, or -1."""
+        """Return int32 [N]: the index of the first triangle that each ray hits; -1 = no hit."""
         return self._scene.run(
             np.ascontiguousarray(origins, dtype=np.float32),
             np.ascontiguousarray(directions, dtype=np.float32),
@@ -39,13 +41,13 @@ class RayCaster:
         )
 
     def first_hit_from(self, origin_m: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """Return int32 [N]: as `first_hit`, with all rays starting at one point [3]."""
+        """Return int32 [N]: as `first_hit`, for rays that all start at the point `origin_m` [3]."""
         return self.first_hit(np.broadcast_to(origin_m.astype(np.float32), directions.shape), directions)
 
     def occluded(self, origins: np.ndarray, directions: np.ndarray, reach: np.ndarray) -> np.ndarray:
         """Return bool [N]: whether each ray hits a triangle within `reach` [N].
 
-        `reach` is in units of the length of the direction.
+        `reach` is a multiple of the length of the ray's direction.
         """
         hit = self._scene.run(
             np.ascontiguousarray(origins, dtype=np.float32),
@@ -56,9 +58,9 @@ class RayCaster:
         return hit >= 0
 
     def hit_distance(self, origins: np.ndarray, directions: np.ndarray, triangle: np.ndarray) -> np.ndarray:
-        """Return float64 [N]: the distance along each ray to the plane of its triangle, +inf for triangle -1.
+        """Return float64 [N]: the distance along each ray to the plane of `triangle` [N], +inf for -1.
 
-        Distances are in units of the length of the direction.
+        Distances are multiples of the length of the ray's direction.
         """
         n, corner = self._normal[triangle], self._corner[triangle]
         along = np.einsum("ij,ij->i", n, directions)

@@ -30,12 +30,12 @@ from beamsplat.tools.simulator.truth import DepthViews, decode_depth, surface_po
 from beamsplat.tools.simulator.world import get_world, world_key
 
 Progress = Callable[[str, int, int], None]  # stage, done, total
-SURFACE_VIEWS = 160  # depth maps, evenly over the drive, that decide which surface was seen
+SURFACE_VIEWS = 160  # maximum number of depth maps, evenly over the lap, that define the seen surface
 
 
 @dataclass(frozen=True)
 class RecordingSummary:
-    """Extent of a written recording."""
+    """Duration, driven distance in metres and number of images, scans, messages and views of a recording."""
 
     seconds: float
     laps: float
@@ -48,7 +48,7 @@ class RecordingSummary:
 
 @dataclass
 class _TruthLog:
-    """Ground truth collected while the lidar stream is written; masks are packed bits."""
+    """Ground truth collected while the lidar stream is written; beam masks are packed, 8 beams per byte."""
 
     scan_stamps_ns: list[int] = field(default_factory=list)
     moving: list[np.ndarray] = field(default_factory=list)
@@ -60,7 +60,14 @@ class _TruthLog:
 def simulate(
     settings: SimulationSettings, out: Path, *, jobs: int, replace: bool, progress: Progress
 ) -> RecordingSummary:
-    """Write a recording into the folder `out`, which appears only when it is complete.
+    """Simulate a recording and write the folder `out`, which appears only when all files are complete.
+
+    Args:
+        settings: all settings of the recording.
+        out: the folder.
+        jobs: number of processes that render images.
+        replace: whether an existing folder is replaced.
+        progress: called with the name of the stage and the numbers of finished and of all parts.
 
     Raises:
         ValueError: a setting or the scene cannot be used.
@@ -122,7 +129,7 @@ def _duration(settings: SimulationSettings, drive: DrivePath) -> float:
 
 
 def frame_spec(settings: SimulationSettings, actor_paths: list[ActorPath]) -> FrameSpec:
-    """Return the inputs of the frames of a recording; its world must be in the cache."""
+    """Return the inputs that determine the frames of a recording; its world must already be in the cache."""
     name = f"{world_key(settings.seed, settings.scene)}.npz"
     return FrameSpec(
         str(store.cache_root() / "worlds" / name),
@@ -135,7 +142,7 @@ def frame_spec(settings: SimulationSettings, actor_paths: list[ActorPath]) -> Fr
 
 
 def _image_times(settings: SimulationSettings, drive: DrivePath, duration_s: float) -> list[float]:
-    """Return the times of all images; every lap has images at the same times of the lap."""
+    """Return the times of all images in seconds; times since the lap start are equal in all laps."""
     camera = settings.camera
     per_lap = int(np.floor((drive.lap_s - camera.phase_s) * camera.rate_hz)) + 1
     offsets = [round(camera.phase_s + k / camera.rate_hz, 6) for k in range(per_lap)]
@@ -146,7 +153,7 @@ def _image_times(settings: SimulationSettings, drive: DrivePath, duration_s: flo
 
 
 def _stamp(settings: SimulationSettings, time_s: float) -> int:
-    """Return the stamp of an image, with the fault of the camera's clock."""
+    """Return the stamp in nanoseconds of the image at `time_s`, with the camera's clock offset."""
     return START_NS + round(time_s * 1e6) * 1000 + round(settings.faults.clock_offset_ms * 1e6)
 
 
@@ -241,7 +248,7 @@ def _write_views(
     paths: list[Path],
     progress: Progress,
 ) -> int:
-    """Write held-out views and the ground-truth surface; return the number of views."""
+    """Write the held-out views and the points of the ground-truth surface; return the number of views."""
     if not times_s:
         return 0
     frame_renderer = FrameRenderer(spec)
@@ -285,7 +292,7 @@ def _write_lidar_truth(folder: Path, settings: SimulationSettings, log: _TruthLo
 
 
 def _unpack(rows: list[np.ndarray], beams: int) -> np.ndarray:
-    """Return bool [S, B] of S rows of packed bits."""
+    """Return the beam masks bool [S, B] of S rows of packed bits."""
     if not rows:
         return np.zeros((0, beams), np.bool_)
     return np.unpackbits(np.stack(rows), axis=1)[:, :beams].astype(np.bool_)

@@ -1,4 +1,4 @@
-"""Ray-traced views of a lit scene: primary rays, shading, and four more rays per pixel at edges."""
+"""Ray-traced views of a lit scene: one ray per pixel, shading, and four rays per pixel at edges."""
 
 from __future__ import annotations
 
@@ -17,35 +17,35 @@ FAR_M = np.float32(1e6)  # depth of pixels without a surface, while rendering
 
 @dataclass(frozen=True)
 class ActorSnapshot:
-    """Dynamic objects at one instant, lit, with spheres that approximate their contact shadows."""
+    """Geometry, light and bounding spheres of A dynamic objects at one instant, in the world frame."""
 
     caster: RayCaster
     surfaces: ShadingTables
-    bounding_spheres: np.ndarray  # float64 [A, 4], centre and radius of a sphere around each object
-    occluder_spheres: np.ndarray  # float64 [K, 4], centre and radius of spheres that cast contact shadows
+    bounding_spheres: np.ndarray  # float64 [A, 4], centre and radius in metres of a sphere around each object
+    occluder_spheres: np.ndarray  # float64 [K, 4], centre and radius in m of spheres with contact shadows
 
 
 @dataclass(frozen=True)
 class RenderedView:
-    """A rendered view, before the image sensor."""
+    """A rendered view, before the image sensor: radiance, depth, and the object in each pixel."""
 
     radiance: np.ndarray  # float32 [H, W, 3], linear RGB
-    depth_z_m: np.ndarray  # float32 [H, W], NaN = no surface
+    depth_z_m: np.ndarray  # float32 [H, W], depth along the optical axis, NaN = no surface
     moving: np.ndarray  # bool [H, W], the pixel's centre shows a dynamic object
-    triangle: np.ndarray  # int32 [H, W], index in the static scene, -1 = none
+    triangle: np.ndarray  # int32 [H, W], index of the triangle of the static scene, -1 = none
 
 
 @dataclass(frozen=True)
 class RayTable:
-    """Rays of all pixels in the camera frame with z = 1, and their derivatives along x and y of the image."""
+    """Rays of all pixels in the camera frame with z = 1, and their change per pixel in image x and y."""
 
     rays: np.ndarray  # float32 [H, W, 3]
-    rays_x: np.ndarray
-    rays_y: np.ndarray
+    rays_x: np.ndarray  # float32 [H, W, 3]
+    rays_y: np.ndarray  # float32 [H, W, 3]
 
 
 def ray_table(rays: np.ndarray) -> RayTable:
-    """Return the table of rays float64 [H, W, 3]."""
+    """Return the ray table of the pixel rays float64 [H, W, 3], in the camera frame with z = 1."""
     dx, dy = np.gradient(rays, axis=1), np.gradient(rays, axis=0)
     return RayTable(rays.astype(np.float32), dx.astype(np.float32), dy.astype(np.float32))
 
@@ -61,7 +61,7 @@ class SceneRenderer:
     def render(
         self, T_world_camera: np.ndarray, table: RayTable, actors: ActorSnapshot | None = None
     ) -> RenderedView:
-        """Render the view from T_world_camera float64 [4, 4]."""
+        """Return the view from the pose T_world_camera float64 [4, 4] through the rays of `table`."""
         height, width = table.rays.shape[:2]
         R = np.ascontiguousarray(T_world_camera[:3, :3], dtype=np.float32)
         origin = T_world_camera[:3, 3].astype(np.float64)
@@ -136,7 +136,7 @@ def _rotated(table: np.ndarray, R: np.ndarray) -> np.ndarray:
 
 
 def _rays_near_actors(origin: np.ndarray, rays: np.ndarray, bounding_spheres: np.ndarray) -> np.ndarray:
-    """Return the indices of the rays that may hit one of the bounding spheres [A, 4]."""
+    """Return the indices of the rays from `origin` that may hit one of the bounding spheres [A, 4]."""
     to = bounding_spheres[:, :3] - origin
     distance = np.linalg.norm(to, axis=1)
     if np.any(distance <= bounding_spheres[:, 3]):

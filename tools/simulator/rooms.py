@@ -18,7 +18,11 @@ from beamsplat.tools.simulator.walls import CEILING_M
 def furnish(
     b: MeshBuilder, room: Room, route_m: np.ndarray, clearance_m: float, rng: np.random.Generator
 ) -> None:
-    """Furnish one room; pieces without a free placement are left out."""
+    """Draw the furniture, lamps, radiators and wall decoration of one room into `b`.
+
+    A piece for which no free placement is found is not drawn. Furniture is at least `clearance_m` from the
+    route [N, 2].
+    """
     placer = FurniturePlacer(room, route_m, clearance_m, rng)
     {"living": _living, "kitchen": _kitchen, "bedroom": _bedroom, "study": _study}[room.name](b, placer, rng)
     for piece in (
@@ -52,7 +56,7 @@ def _inside_piece(
 
 
 def rug(b: MeshBuilder, name: str, x: float, y: float, yaw: float, width: float, depth: float) -> None:
-    """Draw a carpet 8 mm thick with a bound rim."""
+    """Draw a carpet 8 mm thick with a bound rim, with the texture `name` and its centre at (x, y)."""
     at = b.placed(x, y, 0.0, yaw, edge_m=0.07)
     h = 0.008
     at.quad(

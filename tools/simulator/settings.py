@@ -14,7 +14,7 @@ START_NS = 1_767_225_600_000_000_000  # stamp at time 0: 2026-01-01 00:00 UTC, a
 
 @dataclass(frozen=True)
 class CameraSettings:
-    """Settings of the camera, rigidly mounted on the body: fx = fy = focal_widths * width_px."""
+    """Settings of the camera, fixed at (x, y, z) in the body frame; fx = fy = focal_widths * width_px."""
 
     width_px: int = 640
     height_px: int = 480
@@ -24,28 +24,31 @@ class CameraSettings:
     y_m: float = 0.0
     z_m: float = 0.45
     pitch_down_rad: float = float(np.radians(2.0))
-    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)  # plumb_bob
-    noise: float = 1.0  # factor on the noise of the simulated sensor; 0 = none
+    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)  # k1, k2, p1, p2, k3
+    noise: float = 1.0  # factor on the standard deviation of the sensor noise; 0 = none
     vignetting: float = 0.12  # v in the falloff 1 / (1 + v r^2), r in normalised image coordinates
     jpeg_quality: int = 92
     phase_s: float = 0.035  # time of the first image after the start
 
     @property
     def K(self) -> np.ndarray:
-        """Intrinsics, float64 [3, 3]; the principal point is the image centre."""
+        """Intrinsic matrix in pixels, float64 [3, 3]; the principal point is the image centre."""
         f = self.focal_widths * self.width_px
         cx, cy = (self.width_px - 1) / 2.0, (self.height_px - 1) / 2.0
         return np.array([[f, 0.0, cx], [0.0, f, cy], [0.0, 0.0, 1.0]])
 
     @property
     def T_body_camera(self) -> np.ndarray:
-        """True mount of the camera, float64 [4, 4]."""
+        """True pose of the camera in the body frame, float64 [4, 4]."""
         return camera_mount(self.x_m, self.y_m, self.z_m, pitch_down_rad=self.pitch_down_rad)
 
 
 @dataclass(frozen=True)
 class LidarSettings:
-    """Settings of a spinning 2D lidar: beam i is measured i * time_increment_s after the scan's stamp."""
+    """Settings of a spinning 2D lidar, rigidly mounted at (x, y, z) in the body frame.
+
+    Beam i is measured i * time_increment_s after the scan's stamp.
+    """
 
     beams: int = 720
     rate_hz: float = 10.0
@@ -62,24 +65,27 @@ class LidarSettings:
 
     @property
     def angle_min_rad(self) -> float:
+        """Angle of the first beam in the lidar frame."""
         return -np.pi
 
     @property
     def angle_increment_rad(self) -> float:
+        """Angle between two successive beams."""
         return 2.0 * np.pi / self.beams
 
     @property
     def scan_time_s(self) -> float:
-        """Duration of a revolution."""
+        """Duration of a revolution in seconds."""
         return 1.0 / self.rate_hz
 
     @property
     def time_increment_s(self) -> float:
+        """Time between two successive beams in seconds."""
         return self.scan_time_s / self.beams
 
     @property
     def T_body_lidar(self) -> np.ndarray:
-        """True mount of the lidar, float64 [4, 4]."""
+        """True pose of the lidar in the body frame, float64 [4, 4]."""
         return lidar_mount(self.x_m, self.y_m, self.z_m)
 
 
@@ -88,15 +94,15 @@ class WheelSettings:
     """Settings of wheel odometry with systematic errors of wheel radius and track width."""
 
     rate_hz: float = 50.0
-    # Relative errors of distance and of turn: the magnitude is drawn from the range, the sign at random.
+    # Relative errors of distance and of turn: (min, max) of the magnitude; magnitude and sign are random.
     scale_error: tuple[float, float] = (0.018, 0.026)
     turn_error: tuple[float, float] = (0.003, 0.008)
-    noise: float = 0.01  # relative standard deviation of each increment
+    noise: float = 0.01  # standard deviation of the random error of a 1 cm step, relative to the step
 
 
 @dataclass(frozen=True)
 class Faults:
-    """Faults that are added to the recording on purpose."""
+    """Faults added to the recording on purpose; extrinsic faults change only the published mount."""
 
     clock_offset_ms: float = 0.0  # added to the stamps of the images
     extrinsic_xyz_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # published minus true camera mount
@@ -106,9 +112,10 @@ class Faults:
     exposure_changes: bool = False
 
     def published_mount(self, T_body_camera: np.ndarray) -> np.ndarray:
-        """Return the T_body_camera that tf publishes: the true one with the extrinsic fault applied.
+        """Return the T_body_camera that is published in tf: the true pose with the extrinsic fault added.
 
-        The fault translates and rotates the camera in the body frame.
+        The fault moves the camera by `extrinsic_xyz_m`, and rotates it about its own centre by roll, pitch
+        and yaw (in this order) about the axes of the body frame.
         """
         yaw, pitch, roll = np.radians(
             [self.extrinsic_yaw_deg, self.extrinsic_pitch_deg, self.extrinsic_roll_deg]
@@ -119,7 +126,7 @@ class Faults:
         )
 
     def exposure_gain_at(self, time_s: float) -> float:
-        """Return the factor on the exposure at a time of the lap: slow sine waves and one sudden step."""
+        """Return the exposure factor `time_s` seconds after the lap start: sine waves and a repeated step."""
         if not self.exposure_changes:
             return 1.0
         wave = 0.35 * np.sin(2 * np.pi * time_s / 11.0) + 0.2 * np.sin(2 * np.pi * time_s / 3.7)
@@ -131,8 +138,8 @@ class SimulationSettings:
     """Settings of one recording."""
 
     seed: int = 0
-    seconds: float | None = None  # None: as long as the laps take
-    laps: int | None = None  # None: as many as `seconds` needs, at least one
+    seconds: float | None = None  # duration; None: all `laps`; with `laps`: the shorter of both
+    laps: int | None = None  # number of laps; None: until `seconds`, or one lap if both are None
     people: int = 0
     carts: int = 0
     scene: str | None = None  # a glTF/GLB file instead of the generated home

@@ -16,16 +16,16 @@ MAX_ANISOTROPY = 6
 class ShadingTables(NamedTuple):
     """Data of F triangles and all textures, laid out for the compiled shading kernels."""
 
-    corner: np.ndarray  # float64 [F, 3]
+    corner: np.ndarray  # float64 [F, 3], position of corner 0 in metres
     normal: np.ndarray  # float64 [F, 3], not normalised
-    dual: np.ndarray  # float32 [F, 2, 3]: barycentrics 1 and 2 = dual @ (P - corner)
-    uv: np.ndarray  # float32 [F, 3, 2]: at the corner, and the two edge differences
-    light: np.ndarray  # float32 [F, 3, 3]: at the three corners
-    tint: np.ndarray  # float32 [F, 3]
+    dual: np.ndarray  # float32 [F, 2, 3]: barycentric coordinates 1 and 2 of point P = dual @ (P - corner)
+    uv: np.ndarray  # float32 [F, 3, 2]: (u, v) at corner 0, and the differences to corners 1 and 2
+    light: np.ndarray  # float32 [F, 3, 3]: irradiance / pi at the three corners, linear RGB
+    tint: np.ndarray  # float32 [F, 3], linear RGB
     emission: np.ndarray  # float32 [F]
-    texture: np.ndarray  # int32 [F]
-    surface: np.ndarray  # int32 [F]
-    texels: np.ndarray
+    texture: np.ndarray  # int32 [F], index in the atlas
+    surface: np.ndarray  # int32 [F], as in `SceneMesh`
+    texels: np.ndarray  # this field and all below are as in `Atlas`
     offset: np.ndarray
     width_px: np.ndarray
     height_px: np.ndarray
@@ -33,7 +33,7 @@ class ShadingTables(NamedTuple):
 
 
 def shading_tables(mesh: SceneMesh, atlas: Atlas, light: np.ndarray) -> ShadingTables:
-    """Return the tables of a mesh; `light` is float32 [V, 3] as `light.bake` returns it."""
+    """Return the shading tables of a mesh; `light` is irradiance / pi [V, 3], as `light.bake` returns."""
     v = mesh.vertices_m.astype(np.float64)[mesh.triangles]
     e1, e2 = v[:, 1] - v[:, 0], v[:, 2] - v[:, 0]
     normal = np.cross(e1, e2)
@@ -105,10 +105,10 @@ def sample(
     vy: float,
     out: np.ndarray,
 ) -> None:
-    """Write the texture at (u, v), averaged over the footprint of a pixel, to out [3].
+    """Write the linear RGB colour of a texture at (u, v), averaged over the footprint of a pixel, to out [3].
 
-    The footprint is a parallelogram with edges (ux, vx) and (uy, vy). Anisotropic filtering: several
-    trilinear lookups along the longer edge.
+    The footprint is a parallelogram with edges (ux, vx) and (uy, vy), in texture repeats. The average is
+    anisotropic filtering: several trilinear lookups along the longer edge.
     """
     width, height = s.width_px[texture, 0], s.height_px[texture, 0]
     long, short = np.hypot(ux * width, vx * height), np.hypot(uy * width, vy * height)
@@ -148,7 +148,7 @@ def sample(
 def rotate_rays(table: np.ndarray, R: np.ndarray, out: np.ndarray) -> None:
     """Write the rays of table [N, 3], rotated by R [3, 3], to out [N, 3].
 
-    A kernel instead of matmul, because BLAS would start threads.
+    This is a kernel and not a matrix product, because BLAS would start threads.
     """
     for i in range(len(table)):
         x, y, z = table[i, 0], table[i, 1], table[i, 2]
@@ -163,13 +163,13 @@ def shade(
     origin: np.ndarray,  # float64 [3]
     rays: np.ndarray,  # float32 [N, 3], world frame, scaled to z = 1 in the camera frame
     rays_x: np.ndarray,  # float32 [N, 3], difference to the next pixel's ray in x
-    rays_y: np.ndarray,  # float32 [N, 3]
+    rays_y: np.ndarray,  # float32 [N, 3], difference to the next pixel's ray in y
     scale: float,  # width of a ray's footprint in pixels
     spheres: np.ndarray,  # float64 [K, 4], centre and radius of spheres that cast contact shadows
     colour: np.ndarray,  # float32 [N, 3] out: linear radiance
-    depth: np.ndarray,  # float32 [N] in and out: optical z; only nearer hits are written
+    depth: np.ndarray,  # float32 [N] in and out: metres along optical z; only nearer hits are written
 ) -> None:
-    """Write colour and depth of the rays whose triangle is nearer than `depth`."""
+    """Write `colour` and `depth` of each ray whose triangle is nearer than the present `depth` of the ray."""
     texel = np.zeros(3)
     for i in range(len(triangle)):
         f = triangle[i]
@@ -229,7 +229,7 @@ def shade(
 def _sphere_occlusion(
     spheres: np.ndarray, x: float, y: float, z: float, nx: float, ny: float, nz: float
 ) -> float:
-    """Return the factor on ambient light next to spheres [K, 4]: product of 1 - 0.8 cos r^2 / d^2.
+    """Return the factor on the light at (x, y, z) near spheres [K, 4]: product of 1 - 0.8 cos r^2 / d^2.
 
     Sphere ambient occlusion after Inigo Quilez; 0.8 keeps contact shadows from becoming black.
     """
@@ -248,9 +248,9 @@ def _sphere_occlusion(
 
 @kernel
 def mark_cones(rays: np.ndarray, axis: np.ndarray, cosine: np.ndarray, inside: np.ndarray) -> None:
-    """Set inside [N] for the rays [N, 3] within one of the cones.
+    """Set `inside` [N] to True for each of the rays [N, 3] that is within at least one of A cones.
 
-    Cones have unit axes [A, 3] and cosines of the half-angle [A].
+    `axis` [A, 3] contains the unit axes of the cones, `cosine` [A] the cosines of their half-angles.
     """
     for i in range(len(rays)):
         x, y, z = rays[i, 0], rays[i, 1], rays[i, 2]
@@ -263,7 +263,7 @@ def mark_cones(rays: np.ndarray, axis: np.ndarray, cosine: np.ndarray, inside: n
 
 @kernel
 def find_edges(surface: np.ndarray, depth: np.ndarray, edge: np.ndarray) -> None:
-    """Set edge [H, W] at both pixels where neighbours show different surfaces or a depth jump."""
+    """Set `edge` [H, W] to True at adjacent pixels with different surfaces or over 4 % depth difference."""
     height, width = surface.shape
     for y in range(height):
         for x in range(width):

@@ -1,4 +1,4 @@
-"""Solid shapes for furniture, drawn in the frame of a `MeshBuilder`."""
+"""Solid shapes for furniture, drawn in the local frame of the `MeshBuilder` `b`; lengths are metres."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ def box(
     skip: tuple[str, ...] = (),
     turn: bool = False,
 ) -> None:
-    """Draw a box whose base is centred at `centre` and whose front faces -y.
+    """Draw a box of `size` (x, y, z) whose base has its centre at `centre` and whose front faces -y.
 
     Args:
-        faces: materials of single faces, instead of `material`.
-        fit: faces whose texture is stretched over them once.
-        skip: faces that are left out.
-        turn: whether the grain of the texture is upright on the sides.
+        faces: materials of single faces by the names in FACES, instead of `material`.
+        fit: faces over which one repeat of the texture is stretched.
+        skip: faces that are not drawn.
+        turn: whether the u axis (grain) of the texture is vertical on the four vertical faces.
     """
     x, y, z = centre
     w, d, h = (max(v, 1e-4) for v in size)
@@ -57,9 +57,10 @@ def lathe(
     smooth: bool = True,
     fit: bool = False,
 ) -> None:
-    """Draw a surface of revolution about z.
+    """Draw a surface of revolution about the vertical axis through `centre`, where the profile has height 0.
 
-    `smooth` shades the bands between profile points as one surface.
+    If `smooth`, the bands between profile points have common normals, so that edges between them are
+    invisible.
     """
     points = np.array(profile, dtype=np.float64)
     angle = np.linspace(0.0, 2.0 * np.pi, sides + 1)
@@ -110,7 +111,7 @@ def cylinder(
     sides: int = 16,
     caps: bool = True,
 ) -> None:
-    """Draw an upright cylinder or cone frustum whose base is centred at `centre`."""
+    """Draw an upright cylinder, or a frustum of a cone, whose base has its centre at `centre`."""
     top = radius_m if top_radius_m is None else top_radius_m
     rings = max(2, int(np.ceil(height_m / b.edge_m)) + 1)
     side = list(zip(np.linspace(radius_m, top, rings), np.linspace(0.0, height_m, rings)))
@@ -165,9 +166,9 @@ def cushion(
     detail: int = 18,
     squash: float = 0.55,
 ) -> None:
-    """Draw a superellipsoid with its base at `centre`: a pillow (`power` 0.5) or an upholstered block (0.2).
+    """Draw a superellipsoid with its base at `centre`: a pillow (`power` 0.5) or a padded block (0.2).
 
-    `squash` is the exponent of the vertical profile; small values make the rim boxy.
+    `power` and `squash` are the exponents of the horizontal and the vertical outline; small = like a box.
     """
     rows = max(7, detail // 2 + 1)
     latitude = np.linspace(-np.pi / 2, np.pi / 2, rows)
@@ -223,7 +224,7 @@ def curtain(
 ) -> None:
     """Draw hanging cloth in the local xz plane, facing -y, with folds in y.
 
-    `left` is its lower left corner.
+    `left` is the lower left corner of the cloth; the folds have the amplitude `wave_m`.
     """
     columns, rows = int(folds * 8) + 1, max(2, int(height_m / 0.15))
     s, t = np.meshgrid(np.linspace(0.0, 1.0, columns), np.linspace(0.0, 1.0, rows))

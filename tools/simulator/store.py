@@ -1,4 +1,4 @@
-"""The cache on disk: entries are named by a hash of all their inputs and of the source code."""
+"""The cache on disk: the name of an entry is a hash of all its inputs and of the source code."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def cache_root() -> Path:
 
 @cache
 def code_version(leave_out: frozenset[str]) -> str:
-    """Return a hash of the source files of this folder, except those named in `leave_out`."""
+    """Return a hash of the source files in this module's folder, without the file names in `leave_out`."""
     digest = hashlib.sha256()
     for path in sorted(Path(__file__).parent.glob("*.py")):
         if path.name not in leave_out:
@@ -54,7 +54,7 @@ def code_version(leave_out: frozenset[str]) -> str:
 
 
 def key(kind: str, *parts: Any) -> str:
-    """Return the cache key of a `world` or a `shot` (a rendered frame) that is made from `parts`.
+    """Return the cache key of an entry of kind `world` or `shot` (a rendered frame) with the inputs `parts`.
 
     `parts` are dataclasses of settings, numbers, strings, and lists of them.
     """
@@ -76,7 +76,7 @@ def file_hash(path: Path) -> str:
 
 @contextmanager
 def atomic_file(path: Path) -> Iterator[Path]:
-    """Yield a temporary path that is renamed to `path` on success: `path` never holds an incomplete file."""
+    """Yield a temporary path that is renamed to `path` on success; `path` is never an incomplete file."""
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
@@ -90,7 +90,7 @@ def atomic_file(path: Path) -> Iterator[Path]:
 def atomic_folder(path: Path, *, replace: bool) -> Iterator[Path]:
     """Yield a temporary folder that is renamed to `path` on success.
 
-    With `replace`, an existing folder `path` is deleted just before.
+    With `replace`, an existing folder `path` is deleted immediately before the renaming.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f".{path.name}.{os.getpid()}.part")

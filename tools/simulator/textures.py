@@ -1,6 +1,7 @@
 """Procedural textures: wood, tiles, brick, plaster, wallpaper, cloth, stone. All of them tile seamlessly.
 
-Textures are float32 [H, W, 3] in sRGB, 0..1, row 0 on top. Every function takes a seeded generator.
+Textures and colour arguments are sRGB float32 [H, W, 3] and [3], 0..1, row 0 on top; `rng` is a seeded
+generator.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from scipy import fft
 
 
 def rgb(hex_colour: str) -> np.ndarray:
-    """Return float32 [3], 0..1, of a colour such as 'a0b1c2'."""
+    """Return the sRGB colour float32 [3], 0..1, of a hexadecimal code such as 'a0b1c2'."""
     return np.array([int(hex_colour[i : i + 2], 16) for i in (0, 2, 4)], dtype=np.float32) / 255.0
 
 
@@ -25,10 +26,11 @@ def fractal(
     beta: float = 1.6,
     stretch: tuple[float, float] = (1.0, 1.0),
 ) -> np.ndarray:
-    """Return periodic 1/f^beta noise [H, W] of zero mean and unit variance.
+    """Return periodic noise [H, W] of zero mean and unit variance, with an amplitude of frequency^-beta.
 
-    `stretch` (x, y) elongates its grain. There is one noise field per set of arguments, which the generator
-    shifts and mirrors: one Fourier transform per texture would take longer than everything else in a home.
+    `stretch` contains the factors in x and y by which the grain of the noise is elongated. One noise field
+    per set of arguments is computed and cached, then shifted and mirrored at random: one Fourier transform
+    per texture would take longer than all other parts of a home.
     """
     noise = _noise(height, width, beta, stretch)
     rolled = np.roll(noise, tuple(rng.integers(0, (height, width)).tolist()), axis=(0, 1))
@@ -49,7 +51,7 @@ def _noise(height: int, width: int, beta: float, stretch: tuple[float, float]) -
 
 
 def finish(texture: np.ndarray) -> np.ndarray:
-    """Return the texture clipped to 0..1, float32."""
+    """Return the texture as float32, clipped to 0..1."""
     return np.clip(texture, 0.0, 1.0).astype(np.float32)
 
 
@@ -107,7 +109,7 @@ def _knot(rng: np.random.Generator, board: np.ndarray, base: np.ndarray) -> np.n
 def herringbone(
     rng: np.random.Generator, base: np.ndarray, size_px: int = 1024, blocks: int = 8
 ) -> np.ndarray:
-    """Return parquet: pairs of staves in alternating directions, a weave that tiles on a square."""
+    """Return parquet: square blocks of four parallel boards, in alternating directions."""
     cell = size_px // blocks
     staves = 4
     strip = planks(rng, base, size_px=size_px, boards=blocks * staves, contrast=1.1, gap=0.35)
@@ -235,7 +237,7 @@ def weave(
 
 
 def plaid(rng: np.random.Generator, colours: list[np.ndarray], size_px: int = 256) -> np.ndarray:
-    """Return tartan: the same sequence of bands as warp and weft."""
+    """Return tartan cloth: the same sequence of coloured bands in both directions of the threads."""
     edges = np.sort(rng.integers(0, size_px, size=9))
     band = np.searchsorted(edges, np.arange(size_px)) % len(colours)
     line = np.stack(colours)[band]
@@ -276,7 +278,7 @@ def stone(rng: np.random.Generator, base: np.ndarray, vein: np.ndarray, size_px:
 def terrazzo(
     rng: np.random.Generator, base: np.ndarray, chips: list[np.ndarray], size_px: int = 512
 ) -> np.ndarray:
-    """Return stone chips in cement, which also serves as granite."""
+    """Return terrazzo (stone chips in cement); other colours make it look like granite."""
     out = np.broadcast_to(base, (size_px, size_px, 3)).astype(np.float32).copy()
     for _ in range(2200):
         centre = rng.integers(0, size_px, size=2)

@@ -1,4 +1,4 @@
-"""Ground truth beside the bag: held-out views off the path, and points of the surface that the camera saw."""
+"""Ground-truth files beside the bag: held-out views off the path, and points of the seen surface."""
 
 from __future__ import annotations
 
@@ -20,23 +20,23 @@ from beamsplat.tools.simulator.settings import CameraSettings
 from beamsplat.tools.simulator.shade import ShadingTables, sample
 from beamsplat.tools.simulator.writer import transform_json, write_png
 
-OFF_PATH_M = (0.15, 0.60)  # least and largest distance of a held-out view from the path
-MIN_SEEN_RATIO = 0.85  # ratio of a held-out view's pixels that the drive has seen
+OFF_PATH_M = (0.15, 0.60)  # smallest and largest distance of a held-out view from the path
+MIN_SEEN_RATIO = 0.85  # smallest ratio of a held-out view's pixels that depth maps of the drive also show
 
 
 @dataclass(frozen=True)
 class DepthViews:
-    """Depth maps of the drive with their camera poses, to test whether the drive has seen a point."""
+    """Depth maps of N images of the drive with camera poses, to test whether a point is visible."""
 
     T_world_camera: np.ndarray  # float64 [N, 4, 4]
-    depth_mm: np.ndarray  # uint16 [N, H, W], in the pixels of the (distorted) images
-    K: np.ndarray
-    distortion: tuple[float, ...]
+    depth_mm: np.ndarray  # uint16 [N, H, W], in the pixels of the (distorted) images, 0 = no surface
+    K: np.ndarray  # float64 [3, 3], intrinsic matrix in pixels
+    distortion: tuple[float, ...]  # plumb_bob: k1, k2, p1, p2, k3
 
     def count(self, points_m: np.ndarray, normals: np.ndarray) -> np.ndarray:
-        """Return int32 [P]: in how many views each point [P, 3] is visible.
+        """Return int32 [P]: the number of views in which each world point [P, 3] is visible.
 
-        A point is visible only from the side of its normal [P, 3].
+        A point is visible only from the side towards which its normal [P, 3] points.
         """
         return _count_views(
             np.ascontiguousarray(points_m, dtype=np.float64),
@@ -81,15 +81,18 @@ def _count_views(
 def surface_points(
     scene: ShadingTables, depth_views: DepthViews, wanted: int, gain: float, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Sample the surface that the drive has seen, uniformly by area.
+    """Sample points uniformly by area on the surface that is visible in at least one of the depth views.
+
+    `gain` is the exposure gain for the colours.
 
     Returns:
-        Points float32 [N, 3] and their RGB uint8 [N, 3]; N < `wanted` only if the camera saw almost nothing.
+        Points float32 [N, 3] in metres in the world frame, and their RGB colours uint8 [N, 3]. N = `wanted`,
+        or less if almost no surface is visible.
     """
     area = np.linalg.norm(scene.normal, axis=1) / 2
     unit = scene.normal / np.maximum(2 * area[:, None], 1e-30)
     e1, e2 = _edges(scene)
-    # Triangles are small: if neither a corner nor the middle is visible, the triangle is left out.
+    # Triangles are small: a triangle is not sampled if neither a corner nor its middle is visible.
     probes = np.stack(
         [
             scene.corner + 0.02 * (e1 + e2),
@@ -162,12 +165,21 @@ def write_extra_views(
     rng: np.random.Generator,
     progress: Callable[[int, int], None],
 ) -> int:
-    """Write held-out pinhole views off the path, with depth and without dynamic objects.
+    """Write random held-out views off the path: pinhole images, depth and poses, no dynamic objects.
 
-    Only views of which the drive has seen at least MIN_SEEN_RATIO are used.
+    The surface in at least MIN_SEEN_RATIO of the pixels of a view is visible in the depth views of the drive.
+
+    Args:
+        folder: new folder for the files.
+        frame_renderer: renderer of the frames of the drive.
+        space: free floor of the scene.
+        depth_views: depth maps of the drive.
+        times_s: float64 [N], times of the images in seconds since the start of the lap.
+        count: wanted number of views.
+        progress: called with the number of finished views and `count`.
 
     Returns:
-        The number of views: `count`, or fewer if too few random candidates qualify.
+        The number of written views: `count`, or fewer if too few random candidates qualify.
     """
     folder.mkdir()
     camera = frame_renderer.spec.camera
@@ -273,7 +285,7 @@ def _seen_ratio(
 
 
 def decode_depth(png: np.ndarray) -> np.ndarray:
-    """Return the depth uint16 [H, W] in millimetres of PNG bytes uint8 [B]."""
+    """Return the depth map uint16 [H, W] in millimetres that is encoded in the PNG bytes uint8 [B]."""
     depth = cv2.imdecode(png, cv2.IMREAD_UNCHANGED)
     assert depth is not None  # written by the simulator
     return depth

@@ -18,7 +18,7 @@ DAYLIGHT = np.array([1.0, 1.04, 1.10])
 
 @dataclass(frozen=True)
 class RoomFinish:
-    """Materials of a room's surfaces; `accent` covers one wall."""
+    """Materials of a room's surfaces; `accent` is the material of the whole wall `accent_side`."""
 
     floor: Material
     wall: Material
@@ -26,8 +26,8 @@ class RoomFinish:
     accent: Material | None = None
     accent_side: str = "north"
     dado: Material | None = None  # lower part of all other walls
-    beams: bool = False
-    trim: Material = LACQUER
+    beams: bool = False  # whether the ceiling has wooden beams
+    trim: Material = LACQUER  # skirting boards and frames of doors and windows
 
 
 def draw_shell(b: MeshBuilder, room: Room, finish: RoomFinish, rng: np.random.Generator) -> None:

@@ -12,15 +12,15 @@ from beamsplat.tools.simulator.settings import WheelSettings
 
 @dataclass(frozen=True)
 class WheelReadings:
-    """M odometry readings; the very first one defines the odom frame."""
+    """M odometry readings; the pose of the first reading of a recording is the origin of the odom frame."""
 
     pose_odom_body: np.ndarray  # float64 [M, 3], (x, y, yaw)
-    speed_m_s: np.ndarray  # float64 [M]
-    turn_rad_s: np.ndarray  # float64 [M]
+    speed_m_s: np.ndarray  # float64 [M], forward speed
+    turn_rad_s: np.ndarray  # float64 [M], yaw rate
 
 
 class WheelOdometrySimulator:
-    """Wheel odometry of one robot: its systematic errors are drawn once, its pose is kept between calls."""
+    """Wheel odometry of one robot; systematic errors are drawn once, and the pose is stored between calls."""
 
     def __init__(self, settings: WheelSettings, rng: np.random.Generator) -> None:
         self._noise, self._rng = settings.noise, rng
@@ -30,11 +30,11 @@ class WheelOdometrySimulator:
         self._last_pose_world_body: np.ndarray | None = None
 
     def measure(self, pose_world_body: np.ndarray, period_s: float) -> WheelReadings:
-        """Return the readings at the next true poses.
+        """Return the odometry readings at M true poses of the robot.
 
         Args:
-            pose_world_body: float64 [M, 3]; continues from the last pose of the previous call.
-            period_s: time between two poses.
+            pose_world_body: float64 [M, 3], (x, y, yaw); follows the last pose of the previous call.
+            period_s: time between two poses in seconds.
         """
         first = (
             pose_world_body[:1] if self._last_pose_world_body is None else self._last_pose_world_body[None]

@@ -1,4 +1,4 @@
-"""A scene ready for a drive: geometry with baked light, textures, a route. Built once, then cached."""
+"""Builds, caches and loads worlds: scenes with precomputed light, textures and a route for the robot."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ Report = Callable[[str], None]
 
 @dataclass(frozen=True)
 class World:
-    """A scene with baked light, and the control points [N, 2] of a closed route through it."""
+    """A scene with precomputed light, and control points (x, y) [N, 2] in metres of a closed route."""
 
     mesh: SceneMesh
     atlas: Atlas
-    light: np.ndarray  # float32 [V, 3], as `light.bake` returns it
+    light: np.ndarray  # float32 [V, 3], irradiance / pi as `light.bake` returns
     lights: tuple[Light, ...]
     route_m: np.ndarray
 
@@ -44,15 +44,20 @@ class World:
 
 
 def world_key(seed: int, scene: str | None) -> str:
-    """Return the name of this world in the cache."""
+    """Return the cache key of the world of a seed, and of a scene file if there is one."""
     return store.key("world", seed, store.file_hash(Path(scene)) if scene else None)
 
 
 def get_world(seed: int, scene: str | None, report: Report = lambda _: None) -> World:
-    """Load a world from the cache; build and cache it first if needed (tens of seconds).
+    """Return a world from the cache; if it is not there, build and store it first (tens of seconds).
+
+    Args:
+        seed: seed of the generated home, or of the route through the scene file.
+        scene: path of a 3D scene file; None = a generated home.
+        report: called with the name of each stage of the build.
 
     Raises:
-        ValueError: the scene file cannot be used.
+        ValueError: the scene file cannot be used, or no route is clear of obstacles.
     """
     path = store.cache_root() / "worlds" / f"{world_key(seed, scene)}.npz"
     if not path.exists():
@@ -63,7 +68,13 @@ def get_world(seed: int, scene: str | None, report: Report = lambda _: None) -> 
 
 
 def build_world(seed: int, scene: str | None, report: Report = lambda _: None) -> World:
-    """Generate or load the geometry, find a route, bake the light."""
+    """Return a new world: generate or load the geometry, find a route, compute the light.
+
+    The arguments are the same as of `get_world`; the cache is not used.
+
+    Raises:
+        ValueError: the scene file cannot be used, or there is no route clear of obstacles.
+    """
     rng = np.random.default_rng([seed, 0x57])
     if scene is None:
         report("furnishing the home")
@@ -92,7 +103,7 @@ def build_world(seed: int, scene: str | None, report: Report = lambda _: None) -
 
 
 def _lamps(route_m: np.ndarray) -> tuple[Light, ...]:
-    """Return lamps 2.2 m above the route, 2.5 m apart: lights in scene files are not read."""
+    """Return lamps 2.2 m above the route, 2.5 m apart, because lights in scene files are not read."""
     chosen: list[np.ndarray] = []
     for point in route_m:
         if all(np.linalg.norm(point - other) > 2.5 for other in chosen):
@@ -127,7 +138,7 @@ def _with_tuples(fields: dict[str, Any]) -> dict[str, Any]:
 
 
 def load_world(path: Path) -> World:
-    """Load a world from a file that `get_world` wrote."""
+    """Return a world, read from a file that `get_world` wrote."""
     with np.load(path) as data:
         head = json.loads(data["head"].tobytes())
         materials = tuple(Material(**{**m, "tint": tuple(m["tint"])}) for m in head["materials"])

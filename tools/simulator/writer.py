@@ -34,7 +34,7 @@ BASE, CAMERA, LASER, ODOM = "base_link", "camera_optical_frame", "laser", "odom"
 
 @dataclass(frozen=True)
 class BagRecord:
-    """One message of the bag: time of receipt, topic, and CDR bytes."""
+    """One message of the bag: time of receipt, topic, and the message serialised as CDR bytes."""
 
     received_ns: int
     topic: str
@@ -42,7 +42,13 @@ class BagRecord:
 
 
 def write_bag(path: Path, streams: Iterable[Iterator[BagRecord]], topics: Iterable[str]) -> int:
-    """Merge streams, each in order of receipt, into a new bag folder; return the number of messages."""
+    """Write a new bag folder with the messages of all streams, merged by time of receipt.
+
+    Each stream must be in order of receipt. `topics` are all topics of the messages.
+
+    Returns:
+        The number of written messages.
+    """
     count = 0
     with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as bag:
         connections = {
@@ -98,14 +104,14 @@ def _stamped(stamp_ns: int, parent: str, child: str, T: np.ndarray) -> Any:
 
 
 def tf_bytes(stamp_ns: int, links: list[tuple[str, str, np.ndarray]]) -> bytes:
-    """Return the CDR bytes of a tf2_msgs/TFMessage of links (parent, child, T_parent_child)."""
+    """Return the CDR bytes of a tf2_msgs/TFMessage; links are (parent frame, child frame, T_parent_child)."""
     return _cdr(_make("tf2_msgs/msg/TFMessage", [_stamped(stamp_ns, *link) for link in links]))
 
 
 def odometry_bytes(stamp_ns: int, T_odom_body: np.ndarray, speed_m_s: float, turn_rad_s: float) -> bytes:
-    """Return the CDR bytes of a nav_msgs/Odometry.
+    """Return the CDR bytes of a nav_msgs/Odometry with the pose `T_odom_body` [4, 4], speed and yaw rate.
 
-    The covariances are typical of drivers of planar robots.
+    The covariances are constant, with values that are typical of drivers of planar robots.
     """
     point = _make("geometry_msgs/msg/Point", *(float(v) for v in T_odom_body[:3, 3]))
     pose = _make("geometry_msgs/msg/Pose", point, _quaternion(T_odom_body[:3, :3]))
@@ -125,7 +131,7 @@ def odometry_bytes(stamp_ns: int, T_odom_body: np.ndarray, speed_m_s: float, tur
 
 
 def scan_bytes(stamp_ns: int, ranges_m: np.ndarray, lidar: LidarSettings) -> bytes:
-    """Return the CDR bytes of a sensor_msgs/LaserScan."""
+    """Return the CDR bytes of a sensor_msgs/LaserScan with ranges float32 [B] in metres, +inf = no return."""
     step = lidar.angle_increment_rad
     return _cdr(
         _make(
@@ -150,7 +156,7 @@ def image_bytes(stamp_ns: int, jpeg: np.ndarray) -> bytes:
 
 
 def camera_info_bytes(stamp_ns: int, camera: CameraSettings) -> bytes:
-    """Return the CDR bytes of a sensor_msgs/CameraInfo."""
+    """Return the CDR bytes of a sensor_msgs/CameraInfo with the camera's intrinsics and distortion."""
     K = camera.K
     P = np.hstack([K, np.zeros((3, 1))])
     region = _make("sensor_msgs/msg/RegionOfInterest", 0, 0, 0, 0, False)
@@ -173,7 +179,7 @@ def camera_info_bytes(stamp_ns: int, camera: CameraSettings) -> bytes:
 
 
 def write_tum(path: Path, stamps_ns: np.ndarray, T_world_body: np.ndarray) -> None:
-    """Write a TUM trajectory of poses [N, 4, 4]; stamps keep nanoseconds."""
+    """Write poses [N, 4, 4] as a TUM trajectory, with stamps in seconds that have nine decimals."""
     lines = ["# timestamp_s tx ty tz qx qy qz qw  (T_world_base)"]
     for stamp, T in zip(stamps_ns.tolist(), T_world_body):
         numbers = " ".join(f"{v:.9f}" for v in (*T[:3, 3], *quat_xyzw_from_matrix(T[:3, :3])))
@@ -182,7 +188,7 @@ def write_tum(path: Path, stamps_ns: np.ndarray, T_world_body: np.ndarray) -> No
 
 
 def transform_json(T: np.ndarray) -> dict[str, Any]:
-    """Return a transform both as matrix and as translation and quaternion."""
+    """Return a transform [4, 4] for a JSON file, as a matrix and also as a translation and a quaternion."""
     return {
         "matrix": T.tolist(),
         "translation_xyz": T[:3, 3].tolist(),
@@ -191,9 +197,10 @@ def transform_json(T: np.ndarray) -> dict[str, Any]:
 
 
 def write_camera_json(path: Path, camera: CameraSettings, lidar: LidarSettings, faults: Faults) -> None:
-    """Write the true calibration.
+    """Write the true calibration of camera and lidar, and the faults, as a JSON file.
 
-    `published_T_base_camera` is the mount in the bag's tf, which differs if it has a fault.
+    Its key `published_T_base_camera` is the pose of the camera in the bag's tf; with an extrinsic fault, this
+    pose differs from the true `T_base_camera`.
     """
     K = camera.K
     text: dict[str, Any] = {
@@ -239,7 +246,7 @@ def write_camera_json(path: Path, camera: CameraSettings, lidar: LidarSettings, 
 
 
 def write_ply(path: Path, points_m: np.ndarray, colours: np.ndarray) -> None:
-    """Write a binary PLY of points [N, 3] with RGB uint8 [N, 3]."""
+    """Write a binary PLY file of points [N, 3] in metres with RGB colours uint8 [N, 3]."""
     head = (
         f"ply\nformat binary_little_endian 1.0\nelement vertex {len(points_m)}\n"
         "property float x\nproperty float y\nproperty float z\n"
@@ -251,5 +258,5 @@ def write_ply(path: Path, points_m: np.ndarray, colours: np.ndarray) -> None:
 
 
 def write_png(path: Path, image: np.ndarray) -> None:
-    """Write an image [H, W] or [H, W, 3] of uint8 or uint16."""
+    """Write an image [H, W] or BGR [H, W, 3], uint8 or uint16, as a PNG file."""
     path.write_bytes(cv2.imencode(".png", image)[1].tobytes())
