@@ -2,7 +2,7 @@
 
 
 class UserError(ValueError):
-    """Invalid input from a user, file or device. The text says what is wrong, where, and what to do."""
+    """Invalid input from a user, file or device. The text names the fault, its place and the remedy."""
 
 
 def reason(error: BaseException) -> str:

@@ -1,4 +1,4 @@
-"""Python packages that only some commands and nodes need, and what to say where one is not installed."""
+"""Python packages that only some commands and nodes need, and the error texts if one is not installed."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def missing_packages_explained(who: str = "this") -> Iterator[None]:
     """Turn the ModuleNotFoundError of a package in this package's requirements into a UserError.
 
     Args:
-        who: what needs the package, the subject of the error text.
+        who: name of the command or node that needs the package; the subject of the error text.
 
     Raises:
         UserError: one sentence with the package and the command that installs it.

@@ -22,7 +22,7 @@ def load_class(path: str, option: str) -> type:
 
     Args:
         path: for example "my_package.my_node:MyNode".
-        option: the option that holds the path, for error texts, for example "nodes.depth.kind".
+        option: name of the option that contains the path, for error texts, for example "nodes.depth.kind".
 
     Raises:
         UserError: `path` has another form, there is no such module or class, or the module fails on import.

@@ -24,7 +24,8 @@ def parse(cls: type[Config], table: dict[str, Any], where: str, prefix: str | No
     """Return a `cls` instance made from a raw table; `where` names the table's source in errors.
 
     Args:
-        prefix: what precedes a field in `--set`, for example "camera."; None where no `--set` can set it.
+        prefix: text before a field's name in `--set`, for example "camera."; None for tables whose fields
+            `--set` cannot change.
 
     Raises:
         UserError: the table is invalid; one clause per fault with field, value and expected value.

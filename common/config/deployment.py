@@ -75,7 +75,7 @@ class Deployment(Config):
 def load_deployment(path: Path, overrides: tuple[str, ...] = ()) -> Deployment:
     """Read a deployment from a TOML file and apply `node.key=value` (or `key=value`) overrides.
 
-    If the working directory has no such file, the deployment of that name shipped with the package is read.
+    If the file does not exist, the deployment of that name shipped with the package is read.
     Relative paths inside the file are relative to the working directory, as on a command line.
 
     Raises:

@@ -28,8 +28,8 @@ def check_can_write(path: Path, option: str) -> None:
     """Check that a file or folder can be written, without creating anything.
 
     Args:
-        path: may exist; else its nearest existing parent counts.
-        option: the option that names it, for the error text.
+        path: need not exist; in that case, its nearest existing parent folder is checked.
+        option: name of the option that contains the path, for the error text.
 
     Raises:
         UserError: no permission, or a parent is a file.
@@ -73,7 +73,7 @@ def _read_int(path: Path) -> int | None:
 
 
 def claim_epoch(run_dir: Path, node: str) -> int:
-    """Return the node's next epoch, one above the highest claimed so far; it is stored on disk first."""
+    """Return the node's next epoch, one above the highest epoch claimed so far, after storing it on disk."""
     path = make_folder(run_dir / "epochs") / node
     epoch = (_read_int(path) or 0) + 1
     write_atomically(path, str(epoch).encode())

@@ -16,8 +16,8 @@ def shipped_file(name: str) -> Path:
 def deployment_file(path: Path) -> Path:
     """Return `path` if that file exists, else the shipped deployment of that name, else `path`.
 
-    `deploy/demo.toml`, `demo.toml` and `demo` all name the shipped demo where the working directory has no
-    such file.
+    `deploy/demo.toml`, `demo.toml` and `demo` all name the shipped demo if the working directory does not
+    contain this file.
     """
     if path.exists() or path.is_absolute():
         return path

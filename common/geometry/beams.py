@@ -41,10 +41,10 @@ def scan_points(
     range_min_m: float,
     range_max_m: float,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Convert the valid ranges of a scan to points.
+    """Convert the valid ranges of a planar scan to points in the lidar frame.
 
     Returns:
-        Points float64 [M, 3] in the lidar frame, and the beam numbers int64 [M] of these returns.
+        Points float64 [M, 3] (m) in the lidar frame, and int64 [M]: the number of the beam of each point.
     """
     ranges = np.asarray(ranges_m, dtype=np.float64)
     with np.errstate(invalid="ignore"):
@@ -62,7 +62,7 @@ def deskew_beams(
     T_map_body_image: np.ndarray,
     T_body_lidar: np.ndarray,
 ) -> np.ndarray:
-    """Return the points float64 [N, 3] in the body frame at the image's time.
+    """Return lidar points float64 [N, 3] (m) in the body frame of the image's time (motion compensation).
 
     Between the first and the last beam the rotation is interpolated on the geodesic, the translation
     linearly.
@@ -92,10 +92,10 @@ def rotate_by_fraction(
 def project_beams(
     beams: Beams, camera: Pinhole, T_body_camera: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Project beams into the image; omit those outside it and those occluded from the camera.
+    """Project lidar returns into the image; omit returns outside the image or occluded from the camera.
 
     Returns:
-        Pixels (u, v) float64 [M, 2], optical z in metres [M], and indices [M] into `beams`.
+        Pixels (u, v) float64 [M, 2], optical z (m) float64 [M], and indices int64 [M] into `beams`.
     """
     points_camera = transform_points(inverse(T_body_camera), beams.points_body_m)
     uv, inside = camera.project(points_camera)

@@ -45,7 +45,7 @@ class Pinhole:
 
     @classmethod
     def of(cls, camera: CameraModel) -> Pinhole:
-        """Return the intrinsics of the camera in a message."""
+        """Return the intrinsics and distortion in `camera`, which is part of a message."""
         return cls(
             camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px, camera.width_px, camera.height_px,
             camera.distortion_model, tuple(camera.distortion),
@@ -83,7 +83,7 @@ class Pinhole:
         )
 
     def undistorted(self) -> Pinhole:
-        """Return the camera of the images that `Undistorter` makes: the same K without distortion."""
+        """Return the camera of undistorted images (results of `Undistorter`): the same K, no distortion."""
         return replace(self, distortion_model="none", distortion=())
 
     def project(self, points_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

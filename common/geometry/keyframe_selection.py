@@ -18,7 +18,7 @@ from beamsplat.common.geometry.transforms import inverse, is_rigid, so3_log
 
 @dataclass(frozen=True)
 class SelectionSettings:
-    """Thresholds of the selection; see the module."""
+    """Thresholds of the keyframe selection; the module describes the rule."""
 
     distance_m: float = 0.3
     angle_rad: float = 0.26
@@ -36,7 +36,7 @@ class SelectionSettings:
 
 @dataclass(frozen=True)
 class Selection:
-    """Whether an image becomes a keyframe, and why."""
+    """The decision on one image: whether it becomes a keyframe, and the reason in words."""
 
     selected: bool
     reason: str
@@ -46,7 +46,7 @@ class KeyframeSelector:
     """Decides for each candidate image in turn whether it becomes a keyframe."""
 
     def __init__(self, fov_rad: tuple[float, float], settings: SelectionSettings | None = None) -> None:
-        """`fov_rad`: horizontal and vertical field of view."""
+        """`fov_rad`: horizontal and vertical field of view of the camera (see `field_of_view`)."""
         self.settings = settings or SelectionSettings()
         self._half = np.tan(0.5 * np.asarray(fov_rad, dtype=np.float64))
         self._last: np.ndarray | None = None  # T_map_camera of the last keyframe
@@ -55,7 +55,12 @@ class KeyframeSelector:
         self._blurred = 0  # candidates passed over since a keyframe was due
 
     def decide(self, T_map_camera: np.ndarray, sharpness: float) -> Selection:
-        """Return the decision on one candidate, given its camera pose and its `sharpness`."""
+        """Decide whether one candidate image becomes a keyframe, and store its pose if so.
+
+        Args:
+            T_map_camera: pose of the camera, [4, 4].
+            sharpness: result of the function `sharpness` for the image.
+        """
         if not is_rigid(T_map_camera):
             return Selection(False, "its pose is not a rigid transform")
         mean = sharpness if self._mean_sharpness is None else self._mean_sharpness
@@ -72,7 +77,7 @@ class KeyframeSelector:
         return Selection(True, reason)
 
     def withdraw(self) -> None:
-        """Undo the last selection: that image got no depth, so a later one has to take its place."""
+        """Undo the last selection: no depth could be computed for that image, so it is no keyframe."""
         self._last = self._before_last
 
     def _trigger(self, T_map_camera: np.ndarray) -> str | None:
@@ -97,13 +102,25 @@ def field_of_view(camera: Pinhole) -> tuple[float, float]:
 def sharpness(
     grey: np.ndarray,  # uint8 [H, W]
 ) -> float:
-    """Return the variance of the Laplacian over that of the image, which is independent of contrast."""
+    """Return the sharpness of an image: variance of its Laplacian divided by the variance of its brightness.
+
+    The division makes the value independent of the contrast. Without unit; larger is sharper.
+    """
     small = cv2.resize(grey, (320, 240), interpolation=cv2.INTER_AREA).astype(np.float32)
     return float(cv2.Laplacian(small, cv2.CV_32F).var() / (small.var() + 25.0))
 
 
 def overlap(T_last_now: np.ndarray, half_slopes: np.ndarray, depth_m: float, grid: int = 9) -> float:
-    """Return the share of the last view, a plane at `depth_m`, that is inside the present view."""
+    """Return the fraction (0 to 1) of the last keyframe's view that is inside the present view.
+
+    The scene is approximated by a plane at optical z = `depth_m` in front of the last keyframe.
+
+    Args:
+        T_last_now: present camera pose in the camera frame of the last keyframe, [4, 4].
+        half_slopes: tangents of half the horizontal and vertical field of view, [2].
+        depth_m: optical z of the plane.
+        grid: number of sample points along each side of the view.
+    """
     slopes = np.linspace(-1.0, 1.0, grid)
     x, y = np.meshgrid(slopes * half_slopes[0], slopes * half_slopes[1])
     points = np.stack([x.ravel(), y.ravel(), np.ones(grid * grid)], axis=1) * depth_m

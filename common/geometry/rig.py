@@ -66,7 +66,7 @@ def rpy_from_rotation(R: np.ndarray) -> np.ndarray:
 
 
 class Mount(Config):
-    """Position and orientation of a sensor in the body frame."""
+    """Position (m) and orientation of a sensor in the body frame, as written in a rig file."""
 
     xyz_m: tuple[Metres, Metres, Metres]
     rpy_deg: tuple[Degrees, Degrees, Degrees] | None = None
@@ -195,10 +195,10 @@ def load_rig(path: Path) -> RigFile:
 
 
 def check_rig_option(path: Path | None) -> RigFile | None:
-    """Return the rig file that an option `rig` names, None where it names none.
+    """Read the rig file at the path in a node's option `rig`; return None if the option is not set.
 
     Raises:
-        UserError: as `load_rig`, naming the option.
+        UserError: as `load_rig`; the text also contains the name of the option.
     """
     try:
         return None if path is None else load_rig(path)
@@ -207,7 +207,7 @@ def check_rig_option(path: Path | None) -> RigFile | None:
 
 
 def parse_rig(text: str, where: str) -> RigFile:
-    """Parse the text of a rig file (see `load_rig`); `where` names its source in errors."""
+    """Parse and validate the text of a rig file (see `load_rig`); `where` is its source, for error texts."""
     try:
         table = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
@@ -219,7 +219,7 @@ def parse_rig(text: str, where: str) -> RigFile:
 
 
 def write_rig(path: Path, text: str) -> None:
-    """Write the text of `format_rig` and rename the file into place: it is never incomplete."""
+    """Write `text` (result of `format_rig`) to `path` atomically: the file is never incomplete."""
     partial = Path(path).with_name(Path(path).name + ".partial")
     partial.write_text(text)
     os.replace(partial, path)

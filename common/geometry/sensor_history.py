@@ -32,7 +32,7 @@ class TimedScan:
 
     @classmethod
     def of(cls, scan: Any) -> TimedScan:
-        """Return the times and ranges of a Scan message."""
+        """Return the stamp, beam angles, beam times and ranges of a Scan message as a TimedScan."""
         return cls(
             scan.stamp_ns, scan.angle_min_rad, scan.angle_increment_rad, scan.time_increment_s,
             scan.range_min_m, scan.range_max_m, scan.ranges_m,
@@ -40,12 +40,12 @@ class TimedScan:
 
     @property
     def last_ns(self) -> int:
-        """Time of the last beam."""
+        """Measurement time (ns) of the last beam."""
         return self.stamp_ns + round(self.time_increment_s * 1e9 * max(len(self.ranges_m) - 1, 0))
 
     @property
     def middle_ns(self) -> int:
-        """Time halfway through the revolution."""
+        """Time (ns) halfway through the revolution: mean of the times of the first and the last beam."""
         return (self.stamp_ns + self.last_ns) // 2
 
 
@@ -69,11 +69,11 @@ class SensorHistory:
 
     @property
     def newest_pose_ns(self) -> int:
-        """Stamp of the newest pose; -1 before the first."""
+        """Stamp (ns) of the newest pose; -1 if there is no pose."""
         return self._poses[-1][0] if self._poses else -1
 
     def add_scan(self, scan: TimedScan) -> None:
-        """Add a scan; it waits for its mask and for the pose of its last beam."""
+        """Add a scan; with `complete_only`, the scan is not used before a pose at or after its last beam."""
         if not self._complete_only:
             self._insert(scan)
             return
@@ -90,13 +90,16 @@ class SensorHistory:
         stamp_ns: int,
         moving: np.ndarray,  # bool [N]
     ) -> None:
-        """Mark the dynamic beams of the scan with this stamp; a mask for an unknown scan is ignored."""
+        """Mark the beams on dynamic objects in the scan with this stamp (ns).
+
+        `moving` is True for these beams. A mask without a matching incomplete scan is ignored.
+        """
         for i, scan in enumerate(self._incomplete):
             if scan.stamp_ns == stamp_ns and len(scan.ranges_m) == len(moving):
                 self._incomplete[i] = replace(scan, moving=moving)
 
     def add_pose(self, stamp_ns: int, T_a_body: np.ndarray) -> list[TimedScan]:
-        """Add a pose and return the scans that it completes, oldest first.
+        """Add the pose `T_a_body` [4, 4] at a stamp (ns); return the scans that it completes, oldest first.
 
         A pose that is not newer than the last one (the clock was set back) restarts the history. After a gap
         of 2 s older poses are dropped: a restarted process may use another odom frame.
@@ -116,7 +119,7 @@ class SensorHistory:
         return completed
 
     def forget_incomplete(self) -> None:
-        """Drop the scans that wait for a pose: another process localizes, in another odom frame."""
+        """Drop the scans that wait for a pose; call it when a new process localizes, in a new odom frame."""
         self._incomplete.clear()
 
     def _insert(self, scan: TimedScan) -> None:
@@ -125,7 +128,10 @@ class SensorHistory:
             self._scans.popleft()
 
     def pose(self, stamp_ns: int) -> np.ndarray | None:
-        """Return `T_a_body` float64 [4, 4] at a stamp, interpolated, or extrapolated by 0.2 s; else None."""
+        """Return `T_a_body` float64 [4, 4] at a stamp (ns), interpolated, or extrapolated by at most 0.2 s.
+
+        Return None if the stamp is outside this time range.
+        """
         if not self._poses or stamp_ns < self._poses[0][0]:
             return None
         before = self._poses[0]
@@ -144,21 +150,28 @@ class SensorHistory:
         return interpolate(before[1], after[1], (stamp_ns - before[0]) / (after[0] - before[0]))
 
     def scan_near(self, stamp_ns: int) -> TimedScan | None:
-        """Return the scan whose middle is nearest to a stamp, or None if it is further than 0.15 s away."""
+        """Return the scan whose middle time is nearest to a stamp (ns), or None if none is within 0.15 s."""
         if not self._scans:
             return None
         scan = min(self._scans, key=lambda s: abs(s.middle_ns - stamp_ns))
         return scan if abs(scan.middle_ns - stamp_ns) <= BEAMS_WITHIN_NS else None
 
     def beams(self, stamp_ns: int) -> tuple[Beams, int]:
-        """Return the nearest scan's returns, motion-compensated to a stamp, and its age in ns."""
+        """Return the static returns of the scan nearest to a stamp (ns), and its age.
+
+        The returns are in the body frame at the stamp (motion-compensated). The age is the stamp minus the
+        middle time of the scan, in ns; it can be negative.
+        """
         scan = self.scan_near(stamp_ns)
         if scan is None:
             return NO_BEAMS, 0
         return self.beams_of(scan, stamp_ns), stamp_ns - scan.middle_ns
 
     def beams_of(self, scan: TimedScan, stamp_ns: int) -> Beams:
-        """Return the static returns of a scan in the body frame at a stamp; none where a pose is missing."""
+        """Return the static returns of a scan in the body frame at a stamp (ns).
+
+        The result is empty if the pose at the first beam, at the last beam or at the stamp is unknown.
+        """
         points, index = scan_points(
             scan.ranges_m, scan.angle_min_rad, scan.angle_increment_rad, scan.range_min_m, scan.range_max_m
         )
@@ -173,14 +186,17 @@ class SensorHistory:
         return Beams(moved, index, np.full(len(index), _RANGE_SIGMA_M))
 
     def moving_returns(self, stamp_ns: int) -> np.ndarray:
-        """Return the returns of dynamic objects, float64 [N, 3], in the body frame at a stamp."""
+        """Return lidar points on dynamic objects, float64 [N, 3] (m), in the body frame at a stamp (ns)."""
         scan = self.scan_near(stamp_ns)
         if scan is None or scan.moving is None or not scan.moving.any():
             return np.zeros((0, 3))
         return self.beams_of(replace(scan, moving=~scan.moving), stamp_ns).points_body_m
 
     def decided_scan_near(self, stamp_ns: int) -> bool:
-        """Return whether the scan that is nearest to a stamp is complete, or no better one is waiting."""
+        """Return whether the result of `scan_near` for a stamp (ns) is final.
+
+        It is not final while an incomplete scan, which waits for a pose, is nearer to the stamp.
+        """
         if not self._incomplete:
             return True
         known = self.scan_near(stamp_ns)
@@ -188,7 +204,7 @@ class SensorHistory:
         return all(abs(scan.middle_ns - stamp_ns) >= best_ns for scan in self._incomplete)
 
     def scan_points_a(self, scan: TimedScan) -> np.ndarray:
-        """Return the static returns of a scan, float64 [N, 3], in frame a."""
+        """Return the static returns of a scan, float64 [N, 3] (m), in frame a (odom)."""
         T_a_body = self.pose(scan.middle_ns)
         if T_a_body is None:
             return np.zeros((0, 3))

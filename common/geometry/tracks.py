@@ -20,7 +20,9 @@ class RateLimit:
         self._last_ns: dict[str, int] = {}
 
     def due(self, kind: str, stamp_ns: int, key: str = "") -> bool:
-        """Return whether to draw `kind` (of entity `key`) now; True is recorded as drawn.
+        """Return whether to draw data of this kind (and entity `key`) with this stamp (ns).
+
+        A True result is recorded: the caller must draw.
 
         A kind with a limit of 0 Hz is never drawn. A stamp earlier than the last one (a recording that loops)
         resets the limit. A tenth of the period is tolerated as jitter, so that a stream whose rate equals the
@@ -113,7 +115,7 @@ def scan_points(
     angle_increment_rad: float,
     range_limits_m: tuple[float, float],
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the points float64 [M, 3] of valid ranges in the lidar frame, and their beam numbers [M]."""
+    """Return the points of valid ranges, float64 [M, 3] (m, lidar frame), and their beam numbers [M]."""
     nearest, farthest = range_limits_m
     with np.errstate(invalid="ignore"):
         hit = np.isfinite(ranges_m) & (ranges_m > 0.0) & (ranges_m >= nearest) & (ranges_m <= farthest)
@@ -130,10 +132,11 @@ def sweep_to_world(
     T_world_body0: np.ndarray,
     T_world_body1: np.ndarray,
 ) -> np.ndarray:
-    """Deskew a sweep for display: return its points float64 [M, 3] in the world frame.
+    """Deskew one lidar revolution for display: return its points float64 [M, 3] (m) in the world frame.
 
-    Points are interpolated linearly between their positions under the two poses. With a rotation by `a` rad
-    per sweep the error is up to a^2/8 of the range, small enough for drawing.
+    Each point is interpolated linearly between its positions under the two body poses: at `share` 0 (start of
+    the revolution) under `T_world_body0`, at 1 (end) under `T_world_body1`. With a rotation by `a` rad per
+    revolution the error is up to a^2/8 of the range, small enough for drawing.
     """
     start, end = transform_points(T_world_body0, points_body), transform_points(T_world_body1, points_body)
     return start + share[:, None] * (end - start)

@@ -110,8 +110,8 @@ def read_tum(path: Path) -> Trajectory:
     """Read the trajectory in a TUM file; its lines may be in any order.
 
     Raises:
-        UserError: the file cannot be read, a line does not hold eight numbers, or a stamp occurs twice; the
-            text names file and line.
+        UserError: the file cannot be read, a line does not contain eight numbers, or a stamp occurs twice;
+            the text contains file and line number.
     """
     try:
         text = Path(path).read_text()
@@ -121,7 +121,7 @@ def read_tum(path: Path) -> Trajectory:
 
 
 def parse_tum(text: str, where: str) -> Trajectory:
-    """Parse the text of a TUM file (see `read_tum`); `where` names its source in errors."""
+    """Parse the text of a TUM file (see `read_tum`); `where` is the name of its source, for error texts."""
     rows: list[tuple[int, np.ndarray, int]] = []
     for number, line in enumerate(text.splitlines(), start=1):
         content = line.split("#", 1)[0].replace(",", " ").split()

@@ -36,7 +36,10 @@ def se3_to_se2(T: np.ndarray) -> np.ndarray:
 
 
 def yaw_of(T: np.ndarray) -> np.ndarray:
-    """Return the yaw (rad) of the x axis about z, of transforms [..., 4, 4] or rotations [..., 3, 3]."""
+    """Return the yaw (rad) of transforms [..., 4, 4] or rotations [..., 3, 3].
+
+    Yaw is the angle of the rotated x axis in the x-y plane.
+    """
     return np.arctan2(T[..., 1, 0], T[..., 0, 0])
 
 
@@ -114,7 +117,7 @@ def se3_exp(tangent: np.ndarray) -> np.ndarray:
 
 
 def se3_log(T: np.ndarray) -> np.ndarray:
-    """Return the tangent [6] = (rho, phi) with se3_exp(tangent) == T; the rotation must be below pi."""
+    """Return the tangent [6] = (rho, phi) of T [4, 4], with se3_exp(tangent) == T; rotation below pi rad."""
     phi = so3_log(T[:3, :3])
     return np.concatenate([np.linalg.solve(_left_jacobian(phi), T[:3, 3]), phi])
 

@@ -28,7 +28,7 @@ Arrays = dict[str, np.ndarray]
 
 @dataclass(frozen=True)
 class Block:
-    """The description of a block in a checkpoint: all that is known without reading its file."""
+    """The description of a block of Gaussians, stored in the checkpoint: known without reading its file."""
 
     number: int  # of the file
     anchor: int
@@ -44,14 +44,14 @@ def block_file(folder: Path, number: int) -> Path:
 
 
 def arrays_of_blocks(blocks: list[Block]) -> Arrays:
-    """Return the checkpoint arrays `block_*` that describe blocks; an empty dict without any block."""
+    """Return the checkpoint arrays `block_<field>` that describe `blocks`; {} if there are no blocks."""
     if not blocks:
         return {}
     return {f"block_{name}": np.array([getattr(b, name) for b in blocks]) for name in Block.__annotations__}
 
 
 def blocks_of(arrays: Arrays) -> list[Block]:
-    """Return the blocks that a checkpoint lists.
+    """Return the descriptions of the blocks that a checkpoint lists (inverse of `arrays_of_blocks`).
 
     Raises:
         KeyError: an array is missing.
@@ -66,7 +66,9 @@ def blocks_of(arrays: Arrays) -> list[Block]:
 
 
 def write_block(folder: Path, number: int, arrays: Arrays) -> None:
-    """Write arrays [..., N] with 4 bytes per element as one table with a checksum. `sync` must follow.
+    """Write the arrays of N Gaussians to a block file, with a checksum; the caller must call `sync` later.
+
+    The arrays are [..., N] with 4 bytes per element (float32, int32).
 
     Raises:
         OSError: the disk is full or broken.
@@ -86,7 +88,7 @@ def write_block(folder: Path, number: int, arrays: Arrays) -> None:
 def read_block(folder: Path, block: Block, T_map_anchor: np.ndarray) -> Arrays:
     """Return the arrays of a block, transformed to the current pose of its anchor.
 
-    They are bit-identical to the written ones if the anchor has not moved.
+    The arrays are bit-identical to the written arrays if the anchor has not moved.
 
     Raises:
         UserError: the file is missing or altered.

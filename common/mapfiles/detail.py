@@ -21,7 +21,7 @@ _MAX_GROWTH = 1.6  # of a merged Gaussian's area; best of 1 to 2.5 on a mapped h
 
 
 def detail_cell_m(distance_m: float, focal_px: float, error_px: float) -> float:
-    """Return the edge (m) of the largest cell that is at most `error_px` large in the image.
+    """Return the edge (m) of the largest cell that appears at most `error_px` large in the image.
 
     Edges are `FINEST_CELL_M` times a power of two; 0.0 (full detail) if the finest cell is larger.
     """
@@ -32,7 +32,7 @@ def detail_cell_m(distance_m: float, focal_px: float, error_px: float) -> float:
 
 
 def merge_by_cell(params: np.ndarray, cell_m: float) -> np.ndarray:
-    """Return Gaussians with one per cell of edge `cell_m`; those larger than a cell are not merged.
+    """Merge the Gaussians in each grid cell of edge `cell_m` into one, except Gaussians larger than a cell.
 
     Args:
         params: float32 [14, N], in any frame.

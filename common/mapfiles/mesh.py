@@ -1,6 +1,6 @@
 """Triangle mesh of a map: rendered depth fused into a TSDF volume (Curless & Levoy 1996), then surface nets.
 
-Each cell with eight observed corners gets its part of the surface, and neighbours share vertices: the mesh is
+Each cell with eight observed corners has its part of the surface, and neighbours share vertices: the mesh is
 closed in observed space and open only at its border.
 """
 
@@ -23,8 +23,9 @@ _MIN_DEPTH_M = 0.1  # voxels nearer to the camera are not updated
 
 @dataclass
 class TsdfVolume:
-    """A truncated signed distance field (TSDF) with colour; distances along rays, positive in front of the
-    surface.
+    """A truncated signed distance field (TSDF) with colour, on a voxel grid in the map frame.
+
+    Distances to the surface are measured along the camera rays, positive in front of the surface.
     """
 
     origin_m: np.ndarray  # float64 [3]: centre of voxel (0, 0, 0)
@@ -36,10 +37,14 @@ class TsdfVolume:
 
     @staticmethod
     def around(low_m: np.ndarray, high_m: np.ndarray, voxel_m: float) -> TsdfVolume:
-        """Return an empty volume over a box [3] to [3] in the map frame, plus a margin.
+        """Return an empty volume over a box in the map frame, plus a margin.
+
+        Args:
+            low_m, high_m: corners of the box with the smallest and the largest coordinates, [3] each.
+            voxel_m: edge of a voxel.
 
         Raises:
-            ValueError: too many voxels; the text contains a size that is possible.
+            ValueError: too many voxels; the text contains the smallest possible `voxel_m`.
         """
         margin = (TRUNCATION + 1.0) * voxel_m
         shape = np.ceil((high_m - low_m + 2.0 * margin) / voxel_m).astype(int) + 1
@@ -56,7 +61,7 @@ class TsdfVolume:
         )  # fmt: skip
 
     def add(self, views: Iterable[RenderedDepth]) -> None:
-        """Fuse rendered views."""
+        """Fuse the depth and colour of rendered views into the volume."""
         for view in views:
             c, R, t = view.camera, view.T_map_camera[:3, :3], view.T_map_camera[:3, 3]
             numbers = np.array([c.fx_px, c.fy_px, c.cx_px, c.cy_px, self.voxel_m])
@@ -117,7 +122,10 @@ class TriangleMesh:
 
 
 def surface_nets(field: TsdfVolume) -> TriangleMesh:
-    """Extract the zero level set by surface nets (Gibson 1998): a vertex per cell, a quad per voxel edge."""
+    """Return the surface of a volume (distance 0) as a triangle mesh, by surface nets (Gibson 1998).
+
+    Each cell that the surface crosses has one vertex, each crossed voxel edge one quad (two triangles).
+    """
     corners = list(product((0, 1), repeat=3))
     shape = tuple(n - 1 for n in field.distance.shape)
 

@@ -18,8 +18,9 @@ def camera_layer(
     low_m: float,
     high_m: float,
 ) -> np.ndarray:
-    """Return int8 [rows, columns]: 100 occupied between `low_m` and `high_m` above the floor, 0 free floor,
-    -1 unknown.
+    """Return the occupancy grid of the map surface, int8 [rows, columns].
+
+    100 = occupied: surface between `low_m` and `high_m` above the floor; 0 = free: floor seen; -1 = unknown.
     """
     column, row = (
         np.floor((points_map_m[:, axis] - origin_m[axis]) / resolution_m).astype(int) for axis in (0, 1)
@@ -42,11 +43,16 @@ def camera_layer(
 
 
 def combined(lidar: np.ndarray, camera: np.ndarray, occupied: int, free: int) -> np.ndarray:
-    """Return the lidar grid int8 (percent, -1 unknown) with the camera layer in cells not occupied.
+    """Combine a lidar grid and a camera layer to one occupancy grid, int8 [rows, columns].
+
+    Cells that are occupied in either input are occupied in the result.
 
     Args:
-        occupied: percent from which a lidar cell is occupied and is kept.
-        free: percent up to which a lidar cell is free; cells in between become free if the camera saw floor.
+        lidar: occupancy in percent, -1 = unknown.
+        camera: result of `camera_layer`, of the same shape.
+        occupied: a lidar cell with at least this percentage is occupied, and not changed.
+        free: a lidar cell with at most this percentage is free. Cells between `free` and `occupied`, and
+            unknown cells, become free if the camera saw floor.
     """
     out = lidar.copy()
     open_to_camera = lidar < occupied

@@ -27,7 +27,7 @@ def write_gaussian_ply(path: Path, params: np.ndarray) -> None:
 
 
 def write_gaussian_parts(path: Path, count: int, parts: Iterable[np.ndarray]) -> None:
-    """Write `count` Gaussians that are given in parts float32 [14, N], atomically.
+    """Write `count` Gaussians, passed in parts float32 [14, N], in the INRIA 3DGS layout, atomically.
 
     Raises:
         ValueError: the parts have more or fewer Gaussians; then nothing is written.
@@ -66,7 +66,7 @@ def write_map(
     stamps_ns: np.ndarray,  # int64 [K], rising
     T_map_body: np.ndarray,  # float64 [K, 4, 4] of the keyframes
 ) -> None:
-    """Write `splats.ply` and `keyframes.tum` into a folder, which is created.
+    """Create a folder with the Gaussians (`splats.ply`) and the keyframes' body poses (`keyframes.tum`).
 
     Raises:
         UserError: the folder cannot be created or written.

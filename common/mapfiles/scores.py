@@ -20,7 +20,7 @@ FSCORE_DISTANCE_M = 0.05  # largest distance of a matching point; fixed by the e
 
 @dataclass(frozen=True)
 class ViewScore:
-    """Scores of one rendered view at full size."""
+    """Image quality and depth error of one rendered view at full image size."""
 
     psnr_db: float
     ssim: float
@@ -39,18 +39,20 @@ def render_rgb_depth(
 
 
 def psnr_db(a: np.ndarray, b: np.ndarray) -> float:
-    """Return the PSNR of two images in [0, 1]; 120 dB if they are equal."""
+    """Return the PSNR (dB) between two images with values in [0, 1]; 120 dB if they are equal."""
     return float(-10.0 * np.log10(max(float(np.mean((a - b) ** 2)), 1e-12)))
 
 
 def score_view(
     rgb: np.ndarray, depth: np.ndarray, true_rgb: np.ndarray, true_depth: np.ndarray | None
 ) -> ViewScore:
-    """Return the scores of a render against the truth.
+    """Return PSNR, SSIM and depth error of a rendered view, compared with camera image and true depth.
 
     Args:
-        rgb: float32 [H, W, 3] in [0, 1]. true_rgb: uint8 [H, W, 3].
-        depth, true_depth: float32 [H, W] in metres, NaN unknown.
+        rgb: rendered image, float32 [H, W, 3] in [0, 1].
+        depth: rendered optical z, float32 [H, W] in metres, NaN = unknown.
+        true_rgb: camera image, uint8 [H, W, 3].
+        true_depth: true optical z, as `depth`; None = no ground truth.
     """
     truth = true_rgb.astype(np.float32) / 255.0
     l1 = float("nan")
@@ -64,8 +66,9 @@ def score_view(
 def fused_surface(
     rasterizer: Rasterizer, store: GaussianStore, views: Iterable[tuple[RasterCamera, np.ndarray]]
 ) -> np.ndarray:
-    """Return the points float64 [N, 3] of rendered depth with alpha > 0.5, one per 2 cm cell, in the map
-    frame.
+    """Return the surface of the map as points float64 [N, 3] (m) in the map frame, one per 2 cm cell.
+
+    The points are computed from the depth rendered at `views` (camera, T_map_camera) where alpha > 0.5.
     """
     parts = []
     for camera, T_map_camera in views:
@@ -83,8 +86,12 @@ def fused_surface(
 
 
 def f_score(points: np.ndarray, truth: np.ndarray) -> dict[str, float]:
-    """Return accuracy and completion (mean, m, at most 1 m) and F-score at 5 cm of points [N, 3] against [M,
-    3].
+    """Compare the map's surface points [N, 3] with true points [M, 3], both in metres.
+
+    Returns:
+        `accuracy_m`: mean distance from a map point to the nearest true point; `completion_m`: mean distance
+        from a true point to the nearest map point (distances clipped to 1 m); `fscore_5cm`: F-score of the
+        points nearer than 5 cm.
     """
     if len(points) == 0 or len(truth) == 0:
         return {"fscore_5cm": 0.0, "accuracy_m": float("nan"), "completion_m": float("nan")}

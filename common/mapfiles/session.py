@@ -45,12 +45,12 @@ class SessionFolder:
 
     @property
     def edge(self) -> Path:
-        """Return the folder of the mapper's half."""
+        """Return the folder of the mapper's files."""
         return self.path / "edge"
 
     @property
     def robot(self) -> Path:
-        """Return the folder of the robot's half: lidar map, grid and trajectory."""
+        """Return the folder of the robot's files: lidar map, grid and trajectory."""
         return self.path / "robot"
 
     @property
@@ -164,7 +164,8 @@ class SessionFolder:
         """Write a new state, then the manifest that refers to it, then remove the old state.
 
         Args:
-            summary: numbers for the manifest, such as the counts of keyframes and Gaussians.
+            arrays: the state, array by name.
+            summary: entries for the manifest, such as the numbers of keyframes and Gaussians.
 
         Raises:
             OSError: the disk is full or broken; the old state is still valid.
@@ -191,7 +192,7 @@ class SessionFolder:
         """Return the contents of `edge.json`; None before the first checkpoint.
 
         Raises:
-            UserError: it cannot be read, or a newer program wrote it.
+            UserError: the file cannot be read, or a newer program wrote it.
         """
         self.header()
         path = self.edge / EDGE_MANIFEST
@@ -240,7 +241,7 @@ class SessionFolder:
     # --- keyframes ---
 
     def write_keyframe(self, id: int, schema: str, payload: bytes) -> None:
-        """Write a keyframe message as received: its schema and payload. It is on the disk when this returns.
+        """Write the schema and the payload (bytes as received) of a keyframe message, and flush to the disk.
 
         Raises:
             OSError: the disk is full or broken.

@@ -16,7 +16,7 @@ CAMERA_FIELDS = ("fx_px", "fy_px", "cx_px", "cy_px", "width_px", "height_px")
 
 
 def store_of(arrays: Arrays) -> GaussianStore:
-    """Return the Gaussians of a state.
+    """Return the Gaussians of a saved state.
 
     Raises:
         KeyError: an array is missing.
@@ -27,7 +27,7 @@ def store_of(arrays: Arrays) -> GaussianStore:
 
 
 def progress_of(arrays: Arrays) -> dict[str, Any]:
-    """Return the mapper's counters (see `Mapper.progress`) in a state."""
+    """Return the mapper's counters (see `Mapper.progress`) that a saved state contains."""
     return json.loads(arrays["progress"].tobytes())
 
 
@@ -41,7 +41,7 @@ class KeyframeView:
 
 
 def keyframe_views(arrays: Arrays) -> list[KeyframeView]:
-    """Return the views of all keyframes, with refined poses, by ascending id, which is the order of time."""
+    """Return the views of all keyframes in a saved state, by ascending id, which is the order of time."""
     T_map_anchor = dict(zip(arrays["anchor_id"].tolist(), arrays["anchor_T_map"]))
     out = []
     for row, id in enumerate(arrays["keyframe_id"].tolist()):

@@ -25,8 +25,9 @@ class DiskGaussians(Protocol):
         """Yield the Gaussians of an anchor in parts, float32 [14, N] each, in the map frame."""
 
     def nearest_m(self, anchor: int, T_map_anchor: np.ndarray, at_map_m: np.ndarray) -> float:
-        """Return a lower bound on the distance from a map point [3] to an anchor's Gaussians; inf without
-        any.
+        """Return a lower bound on the distance (m) from a point to the Gaussians of an anchor.
+
+        `at_map_m` is the point [3] in the map frame. The result is inf if no Gaussians are on disk.
         """
 
 
@@ -61,13 +62,18 @@ class GaussianStore(GaussianArrays):
         return sum(getattr(self, name).nbytes for name in self._arrays()) // self.capacity
 
     def state(self) -> dict[str, np.ndarray]:
-        """Return copies of all arrays, trimmed to `count`, and the event counters, by their saved names."""
+        """Return copies of all arrays, trimmed to `count` columns, and the event counters.
+
+        The keys are the names in saved files.
+        """
         out = {_saved(name): getattr(self, name)[..., : self.count].copy() for name in self._arrays()}
         out["events"] = np.array(list(self._events.items()), np.int64).reshape(-1, 2)
         return out
 
     def restore(self, state: dict[str, np.ndarray]) -> None:
-        """Replace the contents by those of `state`; the versions become higher than any published since.
+        """Replace the contents by a result of `state`.
+
+        The chunk versions become higher than all versions published since `state` was called.
 
         Raises:
             KeyError: an array is missing.
@@ -85,7 +91,10 @@ class GaussianStore(GaussianArrays):
         self._events[anchor] = self._events.get(anchor, 0) + 1
 
     def keep(self, mask: np.ndarray) -> int:
-        """Remove the Gaussians whose flag in bool [count] is False, in stable order; return how many."""
+        """Remove the Gaussians where `mask` bool [count] is False, and return their number.
+
+        The others stay in the same order.
+        """
         for anchor in np.unique(self.anchor[: self.count][~np.asarray(mask)]):
             self._events[int(anchor)] = self._events.get(int(anchor), 0) + 1
         return super().keep(mask)
@@ -117,17 +126,26 @@ class GaussianStore(GaussianArrays):
         self.count_paged_out(anchor, -count, -_sum(arrays["steps"]))
 
     def columns(self, group: np.ndarray) -> dict[str, np.ndarray]:
-        """Return copies of all arrays but `anchor` for the columns int [N], by their saved names."""
+        """Return copies of all arrays except `anchor`, reduced to the columns `group` int [N].
+
+        The keys are the names in saved files.
+        """
         return {_saved(name): getattr(self, name)[..., group] for name in self._arrays() if name != "anchor"}
 
     def count_paged_out(self, anchor: int, count: int, steps: int) -> None:
-        """Add to the number of an anchor's Gaussians that are on disk only, and to the sum of their steps."""
+        """Record that `count` more Gaussians of an anchor are on disk only.
+
+        `steps` is the sum of their optimiser steps. Negative values record the opposite.
+        """
         before = self.paged_out.pop(anchor, (0, 0))
         if before[0] + count:
             self.paged_out[anchor] = (before[0] + count, before[1] + steps)
 
     def discard_paged_out(self, anchor: int, count: int, steps: int) -> None:
-        """Record that Gaussians on disk cannot be read any more; the version of the chunk changes."""
+        """Record the loss of `count` Gaussians of an anchor on disk; the version of the chunk grows.
+
+        Called when their block file cannot be read any more. `steps` is the sum of their optimiser steps.
+        """
         self.count_paged_out(anchor, -count, -steps)
         self._events[anchor] = self._events.get(anchor, 0) + 1
 
@@ -142,7 +160,10 @@ class GaussianStore(GaussianArrays):
         )
 
     def versions(self) -> dict[int, int]:
-        """Return the version of each anchor's chunk; it grows with each optimiser step and each event."""
+        """Return the version of each chunk, by anchor id.
+
+        A version grows with each optimiser step, insertion, removal and move of Gaussians in the chunk.
+        """
         anchors, which = np.unique(self.anchor[: self.count], return_inverse=True)
         steps = np.bincount(which, weights=self.steps[: self.count], minlength=len(anchors))
         taken = {int(anchor): int(n) for anchor, n in zip(anchors, steps)}
@@ -174,7 +195,7 @@ def _sum(steps: np.ndarray) -> int:
 
 
 def transform_gaussians(params: np.ndarray, T_a_b: np.ndarray) -> np.ndarray:
-    """Return Gaussians float32 [14, N] of frame b in frame a."""
+    """Transform Gaussians float32 [14, N] from frame b to frame a."""
     out = params.copy()
     out[MEAN:SCALE] = T_a_b[:3, :3] @ params[MEAN:SCALE].astype(np.float64) + T_a_b[:3, 3:4]
     out[QUAT:OPACITY] = _left_product(T_a_b[:3, :3]) @ params[QUAT:OPACITY]
@@ -184,7 +205,7 @@ def transform_gaussians(params: np.ndarray, T_a_b: np.ndarray) -> np.ndarray:
 def transform_with_momentum(
     params: np.ndarray, first: np.ndarray, T_a_b: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return Gaussians of frame b and Adam's first moments of them, float32 [14, N] each, in frame a."""
+    """Transform Gaussians and their Adam first moments, float32 [14, N] each, from frame b to frame a."""
     R, turned = T_a_b[:3, :3], first.copy()
     turned[MEAN:SCALE] = R @ first[MEAN:SCALE]
     turned[QUAT:OPACITY] = _left_product(R) @ first[QUAT:OPACITY]

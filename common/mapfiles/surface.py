@@ -21,7 +21,7 @@ _MAX_WAITING_ROWS = 1_000_000  # points kept before they are merged: bounds the 
 
 @dataclass(frozen=True)
 class RenderedDepth:
-    """A rendered image with depth."""
+    """An image and a depth map, rendered from the map at one camera pose."""
 
     camera: RasterCamera
     T_map_camera: np.ndarray
@@ -32,8 +32,9 @@ class RenderedDepth:
 def render_depth_views(
     store: GaussianStore, views: Iterable[tuple[RasterCamera, np.ndarray]], threads: int = 1
 ) -> Iterator[RenderedDepth]:
-    """Render the map from each (camera, T_map_camera) at half size; transparent and flying pixels have no
-    depth.
+    """Render colour and depth of the map from each (camera, T_map_camera), at half the image size.
+
+    Transparent pixels and pixels of `flying_pixels` have no depth (NaN).
     """
     rasterizer = Rasterizer(threads)
     try:
@@ -47,7 +48,7 @@ def render_depth_views(
 
 
 def flying_pixels(depth: np.ndarray) -> np.ndarray:
-    """Return bool [H, W]: pixels next to a step of depth, which may be averages of two surfaces."""
+    """Return a mask bool [H, W] of the pixels next to a depth step: they may be averages of two surfaces."""
     out = np.zeros(depth.shape, bool)
     for axis in (0, 1):
         jump = np.abs(np.diff(depth, axis=axis)) > _MAX_DEPTH_STEP * np.minimum(
@@ -62,7 +63,11 @@ def flying_pixels(depth: np.ndarray) -> np.ndarray:
 
 
 def points_of(view: RenderedDepth) -> tuple[np.ndarray, np.ndarray]:
-    """Return the points float64 [N, 3] in the map frame and their colours float32 [N, 3] of a view."""
+    """Return the pixels of a view with known depth as points.
+
+    Returns:
+        Points float64 [N, 3] (m) in the map frame, and their colours float32 [N, 3], RGB in [0, 1].
+    """
     v, u = np.nonzero(np.isfinite(view.depth_m))
     z, c = view.depth_m[v, u].astype(np.float64), view.camera
     points = np.stack([(u - c.cx_px) / c.fx_px * z, (v - c.cy_px) / c.fy_px * z, z], axis=1)
@@ -70,7 +75,11 @@ def points_of(view: RenderedDepth) -> tuple[np.ndarray, np.ndarray]:
 
 
 def surface_points(views: Iterable[RenderedDepth], cell_m: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the mean point float64 [N, 3] and the mean colour uint8 [N, 3] of each occupied cell."""
+    """Return the surface points of all views, averaged in grid cells of edge `cell_m`.
+
+    Returns:
+        The mean point float64 [N, 3] (m, map frame) and the mean colour uint8 [N, 3] of each occupied cell.
+    """
     cells, sums, waiting = np.zeros(0, np.int64), np.zeros((0, 7)), []
     for view in views:
         points, colours = points_of(view)

@@ -42,7 +42,7 @@ class Header:
     instance: str  # 16 hex digits, random per process start
 
     def pack(self) -> bytes:
-        """Return the header as bytes."""
+        """Return the header as bytes, for Zenoh's attachment."""
         producer = self.producer.encode()
         return (
             _LAYOUT.pack(
@@ -76,5 +76,8 @@ class Header:
         return Header(stamp_ns, publish_ns, clock_id, sequence, epoch, producer, instance)
 
     def age_ns(self, now_ns: int, clock_id: int) -> int | None:
-        """Return the time since publication in ns; None if the publisher's clock differs from `clock_id`."""
+        """Return the time in ns from publication to `now_ns`, a reading of `time.monotonic_ns`.
+
+        Return None if the message was published with another clock than `clock_id`: on another host.
+        """
         return now_ns - self.publish_ns if clock_id == self.clock_id else None

@@ -14,7 +14,10 @@ ODOM_ORIGIN = -1  # `anchor_id` of keyframes sent before localization has publis
 
 
 class KeyframeCandidate(Message):
-    """An image for which fusion can compute depth; fusion asks whether it is to become a keyframe."""
+    """Request of fusion for a decision: must the image with this stamp become a keyframe?
+
+    Fusion can compute depth for this image.
+    """
 
     T_odom_body: Transform
     sharpness: NonNegative  # of the undistorted image, `geometry.keyframe_selection.sharpness`
@@ -29,7 +32,7 @@ class KeyframeDecision(Message):
 
 class Keyframe(Message):
     """An image to be added to the map, with all data that the mapper needs: it is self-contained, so that no
-    other message of this time must be kept during a network outage. An `id` always has the same content.
+    other message of this time must be stored during a network outage. An `id` always has the same content.
 
     T_map_body = T_map_anchor @ T_anchor_body; both are results of pose-graph optimisation number
     `optimisation`. A later optimisation changes T_map_anchor only. Depth and mask refer to the undistorted
@@ -89,7 +92,7 @@ class MapChunk(Message):
 
 
 class MapState(Message):
-    """A part of a mapper's complete state in the checkpoint format (.npz), as the answer to a query."""
+    """A part of a mapper's complete state in the checkpoint format (.npz), sent as answer to a query."""
 
     first: Count  # offset of `data` in the state, bytes
     total: Count  # size of the state, bytes

@@ -66,7 +66,7 @@ class Scan(Message):
 
     Beam i has the direction angle_min_rad + i * angle_increment_rad in the lidar frame and was measured
     i * time_increment_s after the stamp. A beam without return is +inf. Invalid values of the sensor (NaN,
-    negative) are kept; subscribers must handle them.
+    negative) are transmitted unchanged; subscribers must handle them.
     """
 
     angle_min_rad: Finite
@@ -179,7 +179,7 @@ class DepthEstimate(Message):
 
 
 class FusedDepth(Message):
-    """Metric depth of the undistorted image with this stamp, its standard deviation, and figures of the fit.
+    """Metric depth of the undistorted image with this stamp, its standard deviation, and metrics of the fit.
 
     If the status is not "ok" there is no depth (0 x 0): a depth map with a bad fit is rejected.
     """
@@ -208,13 +208,13 @@ class Cloud(Message):
 
 
 class Tick(Message):
-    """A timer event. Timers are messages, so that a replay repeats them."""
+    """A timer event. Timer events are messages, so that a replay repeats them."""
 
     count: Count
 
 
 class InputHealth(MessagePart):
-    """Counts of one subscription of a node since it started."""
+    """Message counts of one subscription of a node since the node's process started."""
 
     topic: Name
     received: Count  # messages passed to the node's handler
@@ -226,7 +226,7 @@ class InputHealth(MessagePart):
 
 
 class OutputHealth(MessagePart):
-    """Counts of one published topic of a node since it started."""
+    """Counts of messages and bytes on one published topic of a node since the node's process started."""
 
     topic: Name
     sent: Count
@@ -237,7 +237,7 @@ NodeState = Literal["configure", "standby", "active", "drain", "drained", "close
 
 
 class Health(Message):
-    """State and counts of a node, published by each node at 1 Hz."""
+    """State, message counts and resource use of one node, published by each node at 1 Hz."""
 
     version = "1.1"  # 1.1: pid
 

@@ -50,6 +50,6 @@ class CameraModel(MessagePart):
 
 
 class LidarModel(MessagePart):
-    """Mount of the planar lidar."""
+    """Mount of the planar lidar on the body."""
 
     T_body_lidar: Transform

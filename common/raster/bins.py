@@ -1,8 +1,9 @@
 """Binning: lists of splats per tile, nearest first, by a parallel stable counting sort of the pairs.
 
-Arrays, with V visible splats: `order` int32 [V] holds the splats in order of depth, cut into `BATCHES`
-batches; `first_pair` and `pair_count` int32 [V] give the pairs of each splat; `tiles` and `rows` int32 hold
-the tile and the range of rows of each pair.
+A pair is a splat and a tile that it overlaps. Arrays, with V visible splats: `order` int32 [V] contains the
+splats in order of depth, cut into `BATCHES` batches; `first_pair` and `pair_count` int32 [V] are the index of
+the first pair and the number of pairs of each splat; `tiles` and `rows` int32 are the tile and the range of
+rows of each pair.
 """
 
 from __future__ import annotations
@@ -25,7 +26,10 @@ def count_pairs(
     tiles: np.ndarray,
     per_tile: np.ndarray,
 ) -> None:
-    """Count the pairs of each batch in each tile, into `per_tile` int32 [BATCHES, tiles]."""
+    """Count the (splat, tile) pairs of each batch in each tile; write to `per_tile` int32 [BATCHES, tiles].
+
+    The other arrays: see the module. `counter` int64 [1] assigns the batches to threads.
+    """
     size = batch_size(visible)
     while True:
         batch = atomic_next(counter, 0)
@@ -40,9 +44,10 @@ def count_pairs(
 
 @kernel
 def prefix_sum(per_tile: np.ndarray, tile_start: np.ndarray) -> int:
-    """Replace the counts by start rows in the lists, fill `tile_start`, and return the number of pairs.
+    """Replace the counts in `per_tile` by start rows in `lists`, and return the total number of pairs.
 
-    The start rows are an exclusive prefix sum over tiles and, within a tile, over batches.
+    The start rows are an exclusive prefix sum over tiles and, within a tile, over batches. `tile_start` int64
+    [tiles + 1] receives the first row of each tile.
     """
     total = 0
     for tile in range(per_tile.shape[1]):
@@ -67,7 +72,10 @@ def scatter(
     per_tile: np.ndarray,
     lists: np.ndarray,
 ) -> None:
-    """Write (splat, rows) of each pair to `lists` int32 [pairs, 2]; set tiles[pair] to the pair's row."""
+    """Sort the pairs by tile: write (splat, rows) of each pair to `lists` int32 [pairs, 2].
+
+    tiles[pair] is overwritten with the row of the pair in `lists`.
+    """
     size = batch_size(visible)
     while True:
         batch = atomic_next(counter, 0)

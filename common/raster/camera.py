@@ -3,7 +3,7 @@
 Kernels take `T_camera_map` (gsplat's viewmat). Pixel centres have integer coordinates, as everywhere in this
 project; gsplat's are at half-integers, so its adapter adds 0.5 to cx and cy.
 
-The pose gradient is that of the left perturbation: with T_camera_map(xi) = se3_exp(xi) @ T_camera_map, it is
+The pose gradient refers to a left perturbation: with T_camera_map(xi) = se3_exp(xi) @ T_camera_map, it is
 dL/dxi at xi = 0, xi = (rho, phi) in the camera frame, translation first (`geometry.transforms.se3_exp`).
 For a right perturbation, T_camera_map @ se3_exp(xi), multiply it by Ad(T_camera_map)^T (Barfoot 2017, eq.
 7.63).
@@ -39,7 +39,7 @@ class RasterCamera:
             raise ValueError(f"focal lengths and image size must be positive and finite: {self}")
 
     def resized(self, width_px: int, height_px: int) -> RasterCamera:
-        """Return the same camera for another image size; the edges of the image area stay fixed."""
+        """Return this camera for another image size, with scaled K; the field of view stays the same."""
         sx, sy = width_px / self.width_px, height_px / self.height_px
         return RasterCamera(
             self.fx_px * sx, self.fy_px * sy, (self.cx_px + 0.5) * sx - 0.5, (self.cy_px + 0.5) * sy - 0.5,
@@ -61,7 +61,7 @@ class RasterCamera:
         )  # fmt: skip
 
     def packed(self, T_camera_map: np.ndarray) -> np.ndarray:
-        """Return camera and pose for the kernels, float32 [24].
+        """Return camera and pose `T_camera_map` [4, 4] as one array for the kernels, float32 [24].
 
         Entries: R by rows (0 to 8), t (9 to 11), fx fy cx cy (12 to 15), slope limits (16 to 19), width,
         height, near plane (20 to 22), 0.

@@ -24,11 +24,11 @@ def cull(
     depth: np.ndarray,
     kept: np.ndarray,
 ) -> None:
-    """Write index and depth z of the possibly visible Gaussians of the blocks that `counter` assigns.
+    """Write index and depth z (m) of the possibly visible Gaussians to `index` and `depth`.
 
-    The bound is conservative: 3.4 times the largest scale, projected at the steepest viewing ray. `params` is
-    [14 * stride]; the results of a block start at index block * BLOCK of `index` and `depth`; `kept`
-    [blocks] is their number.
+    Processes the blocks of Gaussians that `counter` assigns to this thread. The bound is conservative: 3.4
+    times the largest scale, projected at the steepest viewing ray. `params` is float32 [14 * stride]. The
+    results of a block start at block * BLOCK in `index` and `depth`; their number is written to kept[block].
     """
     r = camera
     steep = max(max(-camera[16], camera[17]), max(-camera[18], camera[19]))
@@ -94,7 +94,7 @@ def sort_by_depth(
     keys_other: np.ndarray,
     order_other: np.ndarray,
 ) -> None:
-    """Write the indices of depth[0 : n], nearest first, to `order`; the sort is stable.
+    """Write the indices 0 .. n - 1 to `order`, sorted by `depth`, nearest first; the sort is stable.
 
     Radix sort (least significant digit first) on the bits of positive floats, 11 bits per pass, with only as
     many passes as the range of depths needs. The other arrays [n] are buffers.

@@ -22,7 +22,8 @@ def choose_pixels(
     """Choose the pixels of new Gaussians: a coarse grid, and a fine grid in textured cells.
 
     Returns:
-        u int [N], v int [N], and the spacing (px) float64 [N] of each pixel's grid.
+        u int [N] and v int [N]: columns and rows of the chosen pixels; and float64 [N]: the spacing (px) of
+        the grid from which each pixel was chosen.
     """
     h, w = wanted.shape
     change = np.abs(cv2.Sobel(grey, cv2.CV_32F, 1, 0)) + np.abs(cv2.Sobel(grey, cv2.CV_32F, 0, 1))

@@ -17,9 +17,10 @@ _LOG2_BETA_1, _LOG2_BETA_2 = float(np.log2(BETA_1)), float(np.log2(BETA_2))
 
 
 class GaussianArrays:
-    """Parameters and optimiser state of Gaussians in growable arrays.
+    """Parameters and Adam optimiser state of Gaussians in growable arrays.
 
-    Columns 0 to count - 1 of each array are in use; the rows of `params` are those of `layout`.
+    Columns 0 to count - 1 of each array are in use, one per Gaussian. The rows of `params` are defined in
+    `raster.layout`: mean, log scale, quaternion, opacity logit, colour.
     """
 
     def __init__(self, capacity: int = 4096) -> None:
@@ -42,7 +43,7 @@ class GaussianArrays:
         return self.params.shape[1]
 
     def append(self, params: np.ndarray) -> slice:
-        """Append Gaussians float32 [PARAMS, M] with zero optimiser state, and return their columns."""
+        """Append Gaussians float32 [PARAMS, M] with zero optimiser state; return their columns as a slice."""
         new = params.shape[1]
         if self.count + new > self.capacity:
             self.resize(max(self.count + new, 2 * self.capacity))
@@ -66,7 +67,10 @@ class GaussianArrays:
             setattr(self, name, new)
 
     def keep(self, mask: np.ndarray) -> int:
-        """Remove the Gaussians where `mask` bool [count] is False, and return how many; the order is kept."""
+        """Remove the Gaussians where `mask` bool [count] is False, and return their number.
+
+        The others stay in the same order.
+        """
         chosen = np.flatnonzero(mask)
         dropped = self.count - len(chosen)
         if dropped:
@@ -84,7 +88,14 @@ class GaussianArrays:
         isotropy: float = 0.0,
         ratio_log: float = 0.0,
     ) -> None:
-        """Take one Adam step on the visible Gaussians; `isotropy` and `ratio_log` as in `adam`."""
+        """Take one Adam step on the visible Gaussians.
+
+        Args:
+            team: threads that run the kernel.
+            gradients: result of `Rasterizer.backward`.
+            rates: learning rate of each parameter row, float32 [PARAMS] (see `learning_rates`).
+            isotropy, ratio_log: see `adam`.
+        """
         team.run(
             adam, gradients.by_splat, gradients.index, self.params, self.first, self.second, self.steps,
             rates,  np.float32(isotropy), np.float32(ratio_log),
@@ -157,7 +168,7 @@ def adam(
 
 
 def learning_rates(mean: float, log_scale: float, quat: float, opacity: float, colour: float) -> np.ndarray:
-    """Return the learning rates of all parameter rows, float32 [PARAMS], from one rate per group."""
+    """Return the learning rate of each parameter row, float32 [PARAMS], from one rate per parameter group."""
     rows = np.empty(PARAMS, np.float32)
     rows[MEAN:SCALE], rows[SCALE:QUAT], rows[QUAT:OPACITY] = mean, log_scale, quat
     rows[OPACITY:COLOUR], rows[COLOUR:] = opacity, colour

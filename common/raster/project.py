@@ -36,7 +36,7 @@ _SHIFT_W, _SHIFT_H = TILE_W.bit_length() - 1, TILE_H.bit_length() - 1
 def camera_point(
     params: np.ndarray, stride: int, index: np.ndarray, at: int, c: np.ndarray
 ) -> tuple[Vector, Vector, Vector]:
-    """Return the centres of Gaussians index[at...] in the camera frame (m): three vectors x, y, z."""
+    """Return the centres of Gaussians index[at : at + LANES] in the camera frame: vectors x, y, z (m)."""
     x, y, z = (
         gather(params, 0, index, at),
         gather(params, stride, index, at),
@@ -50,7 +50,11 @@ def camera_point(
 
 @inner
 def rotation(params: np.ndarray, stride: int, index: np.ndarray, at: int) -> tuple[Vectors, Vectors]:
-    """Return (unit quaternion w x y z, 1 / stored norm) and R by rows, of Gaussians index[at...]."""
+    """Return the rotations of Gaussians index[at : at + LANES], as quaternions and as matrices.
+
+    The first result is (w, x, y, z, n): the unit quaternion, and n = 1 / norm of the stored quaternion. The
+    second result is the rotation matrix R by rows (nine vectors).
+    """
     w, x = gather(params, QUAT * stride, index, at), gather(params, (QUAT + 1) * stride, index, at)
     y, z = gather(params, (QUAT + 2) * stride, index, at), gather(params, (QUAT + 3) * stride, index, at)
     n = 1.0 / sqrt(maximum(w * w + x * x + y * y + z * z, 1e-24))
@@ -166,7 +170,7 @@ def _emit(
 ) -> int:
     """Write the (tile, rows) pairs of splats begin ... stop from index `at` on, and return the end index.
 
-    `rows` holds the first and the last vector of rows that the splat overlaps in the tile. The overlap is
+    `rows` contains the first and the last vector of rows that the splat overlaps in the tile. The overlap is
     exact per column of tiles: the minimum and maximum y of the ellipse over the column's eight pixels,
     y = (-B x -+ sqrt(B^2 x^2 - 4 C (A x^2 - level))) / 2 C. From index `limit` on, pairs are only counted.
     The loop over splats is in here because each call costs atomic reference counting of the arrays.
@@ -248,7 +252,7 @@ def project_and_emit(
 
     `tiles` and `rows` are int32 [BATCHES * capacity]; `emitted` [BATCHES] is the number of pairs of each
     batch. If it exceeds the capacity, the caller must enlarge the arrays and call again. The pairs of splat
-    i are first_pair[i] ... first_pair[i] + pair_count[i]. The last five arguments are those of
+    i are first_pair[i] ... first_pair[i] + pair_count[i]. The last five arguments are passed to
     `sort_by_depth`.
     """
     lanes = aligned_floats(RECORD * LANES)

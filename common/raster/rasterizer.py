@@ -26,14 +26,20 @@ from beamsplat.common.raster.tiles import backward_tiles, forward_tiles
 
 
 class Workspace:
-    """Reusable arrays of one render, by name. They grow when needed and never shrink: page faults of newly
-    allocated memory take longer than the rendering itself."""
+    """Memory for the arrays of one render, reused by later renders.
+
+    Arrays grow when needed and never shrink: page faults of newly allocated memory take longer than the
+    rendering itself.
+    """
 
     def __init__(self) -> None:
         self._arrays: dict[str, np.ndarray] = {}
 
     def take(self, name: str, shape: tuple[int, ...], dtype: type = np.float32) -> np.ndarray:
-        """Return a C-contiguous array of this shape; its content is undefined."""
+        """Return the array `name` with this shape and dtype, C-contiguous; its content is undefined.
+
+        It uses the same memory as the array that an earlier call returned for this name.
+        """
         size = int(np.prod(shape))
         held = self._arrays.get(name)
         if held is None or held.size < size or held.dtype != dtype:
@@ -69,7 +75,10 @@ class TileLists:
 
 @dataclass
 class Render:
-    """A rendered image, with the data for its gradient. The arrays are valid until the render is released."""
+    """A rendered image, with the data that `Rasterizer.backward` needs.
+
+    The arrays are valid until `Rasterizer.release`.
+    """
 
     image: np.ndarray  # float32 [5, H, W]: red, green, blue, accumulated depth (m), alpha
     index: np.ndarray  # int32 [V]: Gaussians in the view frustum, ascending
@@ -81,7 +90,7 @@ class Render:
 
     @property
     def pairs(self) -> int:
-        """Number of (splat, tile) pairs."""
+        """Number of (splat, tile) pairs: each splat counts once per tile that it overlaps."""
         return len(self.tables.lists) - 1
 
     def expected_depth(self) -> np.ndarray:
@@ -93,14 +102,17 @@ class Render:
 
 @dataclass
 class Gradients:
-    """dL/d(parameters) of the visible Gaussians. `by_splat` is memory of the render, valid until release."""
+    """Gradients of a loss L with respect to the parameters of the visible Gaussians and the camera pose.
+
+    `by_splat` is memory of the render and valid until `Rasterizer.release`.
+    """
 
     by_splat: np.ndarray  # float32 [GRADIENTS, >= V]: rows as in layout, one column per visible Gaussian
     index: np.ndarray  # int32 [V]: Gaussian of each column, ascending
     pose: np.ndarray  # float64 [6]: (rho, phi), left perturbation of T_camera_map
 
     def dense(self, count: int) -> np.ndarray:
-        """Return the gradients of all Gaussians, float32 [GRADIENTS, count]; zero for invisible ones."""
+        """Return the gradients of all Gaussians, float32 [GRADIENTS, count]: zero for invisible ones."""
         out = np.zeros((GRADIENTS, count), np.float32)
         out[:, self.index] = self.by_splat[:, : len(self.index)]
         return out
@@ -124,6 +136,16 @@ class Rasterizer:
     ) -> Render:
         """Render the first `count` Gaussians of `params`.
 
+        Args:
+            params: float32 [PARAMS, capacity], rows as in `raster.layout`, means in the map frame.
+            count: number of columns in use.
+            camera: intrinsics and image size.
+            T_camera_map: pose, [4, 4].
+            background: RGB in [0, 1], [3]; default black.
+
+        Returns:
+            The render; its `image` is float32 [5, H, W]: red, green, blue, accumulated depth (m), alpha.
+
         Raises:
             ValueError: an array has another shape or dtype, or the pose is not finite.
         """
@@ -144,9 +166,13 @@ class Rasterizer:
         return Render(image, seen[0][: seen[2]], params, packed, background, work, tables)
 
     def backward(self, render: Render, gradient: np.ndarray) -> Gradients:
-        """Return the gradients of a loss from dL/d(image) float32 [5, H, W].
+        """Return the gradients of a loss L with respect to Gaussians and camera pose.
 
-        It can be called several times on one render; each call overwrites `by_splat` of the previous one.
+        Can be called several times on one render; each call overwrites `by_splat` of the previous result.
+
+        Args:
+            render: result of `render`, not released.
+            gradient: dL/d(image), float32 [5, H, W], channels as in `Render.image`.
         """
         if gradient.shape != render.image.shape or gradient.dtype != np.float32:
             raise ValueError(
@@ -169,12 +195,12 @@ class Rasterizer:
         return Gradients(out, render.index, pose_sums.sum(axis=0))
 
     def release(self, render: Render) -> None:
-        """Return the workspace of a render to the pool; its arrays must not be used any more."""
+        """Return the memory of a render to the pool; the arrays of `render` must not be used any more."""
         self._pool.append(render.workspace)
 
     @property
     def allocated_bytes(self) -> int:
-        """Memory of the workspaces in the pool, without those of renders that are not released."""
+        """Memory (bytes) of the workspaces in the pool; workspaces of unreleased renders are not counted."""
         return sum(work.allocated_bytes for work in self._pool)
 
     def close(self) -> None:

@@ -151,7 +151,7 @@ def iota(typingctx: Any) -> Intrinsic[Vector]:
 
 @typed_intrinsic
 def where(typingctx: Any, mask: LaneMask, yes: VectorLike, no: VectorLike) -> Intrinsic[Vector]:
-    """Return `yes` where the mask is set, `no` elsewhere."""
+    """Return a vector with the lanes of `yes` where the mask is set, of `no` elsewhere."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
         return builder.select(args[0], _as_vector(builder, args[1]), _as_vector(builder, args[2]))

@@ -1,7 +1,7 @@
 """Static types of the SIMD values in kernels, for type checkers.
 
-They describe what the functions of `simd` take and return; at run time the values exist in compiled code
-only.
+They describe the arguments and results of the functions of `simd`; at run time the values exist in compiled
+code only.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class Intrinsic(NamedTuple, Generic[_R]):
 
 
 def typed_intrinsic(function: Callable[Concatenate[Any, _P], Intrinsic[_R]]) -> Callable[_P, _R]:
-    """Register a function as `numba.extending.intrinsic` does, and keep its static type.
+    """Register a function like `numba.extending.intrinsic`, but return it with its static type.
 
     The parameters after the typing context are annotated with the types of the values in a call; the function
     itself receives their Numba types.

@@ -129,7 +129,7 @@ def _accumulate_gradient(
 
 
 class SsimLoss:
-    """The loss weight * (1 - SSIM of luma) / 2; its buffers are reused per image size."""
+    """The loss weight * (1 - SSIM) / 2 on luma, with its gradient; buffers are reused per image size."""
 
     def __init__(self) -> None:
         self._memory: dict[tuple[int, int], tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
@@ -141,13 +141,13 @@ class SsimLoss:
     def add(
         self, image: np.ndarray, rgb: np.ndarray, weight: float, gradient: np.ndarray, team: ThreadTeam
     ) -> float:
-        """Add the gradient of the loss to `gradient`, and return the loss.
+        """Add dL/d(image) to `gradient`, and return the loss L.
 
         Args:
-            image: rendered image, float32 [5, H, W]; the first three planes are RGB in [0, 1].
-            rgb: true image, [3, H, W], 0 to 255.
+            image: rendered image, float32 [5, H, W]: red, green, blue in [0, 1], depth, alpha (not used).
+            rgb: camera image to compare with, [3, H, W]: red, green, blue, 0 to 255.
             weight: weight of the loss.
-            gradient: float32 [5, H, W], changed in place.
+            gradient: float32 [5, H, W], channels as in `image`; changed in place.
             team: threads that run the kernels.
         """
         h, w = image.shape[1:]
@@ -161,7 +161,7 @@ class SsimLoss:
 
 
 def ssim(a: np.ndarray, b: np.ndarray) -> float:
-    """Return the mean SSIM over pixels and channels of two images float32 [H, W, C] in [0, 1]."""
+    """Return the SSIM of two images, float32 [H, W, C] in [0, 1]: the mean over pixels and channels."""
 
     def blur(x: np.ndarray) -> np.ndarray:
         taps = TAPS.astype(np.float64)

@@ -140,7 +140,10 @@ def forward_tiles(
     records: np.ndarray,
     image: np.ndarray,
 ) -> None:
-    """Render the tiles that `counter` assigns to this thread into `image` float32 [5, H, W]."""
+    """Render the tiles that `counter` assigns to this thread into `image` float32 [5, H, W].
+
+    Channels: red, green, blue, accumulated depth (m), alpha.
+    """
     height, width = image.shape[1], image.shape[2]
     scratch, alphas = aligned_floats(_VECTORS * _FORWARD_STRIDE), aligned_floats(TILE_PIXELS)
     while True:
@@ -248,7 +251,10 @@ def backward_tiles(
     gradient: np.ndarray,
     slots: np.ndarray,
 ) -> None:
-    """Write the sums of dL/d(splat) of each (splat, tile) pair to its slot, from dL/d(image) [5, H, W]."""
+    """Write the eleven gradient sums of each (splat, tile) pair to its slot in `slots` (see the module).
+
+    `image` and `gradient` = dL/d(image) are float32 [5, H, W]: red, green, blue, accumulated depth, alpha.
+    """
     height, width = image.shape[1], image.shape[2]
     scratch, alphas = aligned_floats(_VECTORS * _BACKWARD_STRIDE), aligned_floats(TILE_PIXELS)
     while True:

@@ -11,7 +11,10 @@ from beamsplat.common.raster.rasterizer import Rasterizer
 
 
 def warm() -> None:
-    """Run forward pass, backward pass and one optimiser step on one Gaussian, with the types in real use."""
+    """Compile all kernels: run forward pass, backward pass and one optimiser step on one Gaussian.
+
+    The arrays have the types used in operation, so that later calls use the compiled code.
+    """
     gaussian = np.zeros((PARAMS, 1), np.float32)
     gaussian[2], gaussian[6] = 2.0, 1.0
     store = GaussianArrays(16)

@@ -42,7 +42,7 @@ class Calibration:
     body_frame: str = ""  # name of the ROS frame used as body
 
     def rig(self, source: str) -> RigFile:
-        """Return the rig file of the sensors whose calibration is known.
+        """Return a rig file with the sensors whose calibration was found; `source` names the bag.
 
         Raises:
             UserError: the values are inconsistent, for example K of another image size.
@@ -64,13 +64,13 @@ def intrinsics(
 ) -> dict[str, Any] | None:
     """Return the fields of CameraSection from a CameraInfo; None if the camera is uncalibrated (K is zero).
 
-    For a rectified image topic the intrinsics are those of the projection matrix P, without distortion.
+    For a rectified image topic the intrinsics are taken from the projection matrix P, without distortion.
 
     Args:
         info: ROS CameraInfo message.
         image_size_px: width and height of the images on the topic.
-        image_topic: a name with "rect" is taken as rectified.
-        where: name of the CameraInfo's source in errors.
+        image_topic: ROS topic of the images; if it contains "rect", the images are taken as rectified.
+        where: name of the CameraInfo's source, for error texts.
 
     Raises:
         UserError: the CameraInfo has another image size or an unsupported distortion model.
@@ -127,7 +127,7 @@ def find_mounts(
     """Find the mounts of sensors in the static transforms, and add them to `calibration`.
 
     Args:
-        calibration: gets `mounts`, `body_frame`, and sentences.
+        calibration: receives `mounts` (`T_body_sensor`), `body_frame`, and sentences for the user.
         frames: static transforms of the robot.
         sensor_frames: "camera", "lidar" -> name of its ROS frame.
         odometry_child: child frame of the wheel odometry, "" = unknown.
@@ -201,8 +201,10 @@ def _handle_missing_mount(
 def move_odometry_to_body(fields: dict[str, Any], T_child_body: np.ndarray) -> None:
     """Transform the fields of a wheel odometry message from its child frame to the body frame, in place.
 
-    The child frame can differ from the body, for example a base_link above the floor. `T_child_body` is [4,
-    4].
+    Args:
+        fields: of a WheelOdometry message: the pose `T_odom_body` [4, 4] and the velocities [3].
+        T_child_body: [4, 4]. The child frame can differ from the body, for example a base_link above the
+            floor.
     """
     if np.array_equal(T_child_body, np.eye(4)):
         return

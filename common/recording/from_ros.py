@@ -1,7 +1,7 @@
 """Conversion of ROS 1 and ROS 2 messages to the fields of BeamSplat messages.
 
-The fields are not validated: the reader of our own recordings adds the fields that ROS messages cannot hold,
-and other bags have only the fields of the ROS message.
+The fields are not validated yet: `recording.reader` adds the fields that ROS messages do not have, and other
+bags contain only the fields of the ROS message.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ _ENCODINGS = {"8UC3": "bgr8", "8UC1": "mono8", "8UC4": "bgra8", "yuyv": "yuv422_
 
 
 def fields_of(cls: type[m.Message], ros_message: Any) -> dict[str, Any]:
-    """Return the fields of `cls` that a ROS message holds, not validated."""
+    """Return the fields of the message class `cls` that a ROS message contains, by name, not validated."""
     return _CONVERTERS[cls](ros_message)
 
 

@@ -11,7 +11,7 @@ _START_OF_FRAME = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 
 
 class ImageHeader(NamedTuple):
-    """Encoding and size of a compressed image."""
+    """Encoding and size in pixels of a compressed image."""
 
     encoding: Literal["jpeg", "png"]
     width_px: int

@@ -1,8 +1,8 @@
 """Layout of a recording: names, encodings and metadata of its MCAP channels. See docs/recordings.md.
 
 A BeamSplat message is stored as one ROS message (role "message") and, where necessary, a map of the fields
-that the ROS message cannot hold (role "fields"); or, if ROS has no such message type, as its own encoding
-(role "own"). Channel metadata connects the records and holds the publisher's part of the header.
+that the ROS message does not have (role "fields"); or, if ROS has no such message type, as its own encoding
+(role "own"). Channel metadata connects the records and contains the publisher's part of the header.
 """
 
 from __future__ import annotations
@@ -36,7 +36,10 @@ _SEQUENCE_BITS = 32  # MCAP's sequence is a uint32; the high bits are in the cha
 
 
 def sender_metadata(header: Header | None) -> dict[str, str]:
-    """Return the channel metadata: the header fields that all messages of a publisher share; {} for None."""
+    """Return the metadata of a publisher's MCAP channel: the header fields that its messages share.
+
+    For a message without header (None) the metadata are empty.
+    """
     if header is None:
         return {}
     metadata = {f"beamsplat.{name}": str(getattr(header, name)) for name in _SENDER}
@@ -44,7 +47,14 @@ def sender_metadata(header: Header | None) -> dict[str, str]:
 
 
 def header_of(metadata: dict[str, str], stamp_ns: int, publish_ns: int, sequence: int) -> Header | None:
-    """Return the header of a record; None if the message was recorded without one."""
+    """Return the header of a recorded message; None if the message was recorded without a header.
+
+    Args:
+        metadata: of the record's MCAP channel, from `sender_metadata`.
+        stamp_ns: measurement time of the message.
+        publish_ns: publish time of the record: publisher's monotonic clock.
+        sequence: low 32 bits of the sequence number, as stored in the record.
+    """
     if "beamsplat.producer" not in metadata:
         return None
     high = int(metadata["beamsplat.sequence_high"])
@@ -60,7 +70,7 @@ def header_of(metadata: dict[str, str], stamp_ns: int, publish_ns: int, sequence
 
 
 def class_of(schema: str) -> type[Message]:
-    """Return the message class of a schema, for example "Scan/1.0".
+    """Return the message class of a schema name, for example `Scan` for "Scan/1.0".
 
     Raises:
         DecodeError: the name is unknown or the major version differs.
@@ -73,7 +83,10 @@ def class_of(schema: str) -> type[Message]:
 
 
 def missing_fields(message: Message, carried: dict[str, Any]) -> dict[str, Any]:
-    """Return the fields of `message` that `carried` lacks or holds with another value."""
+    """Return the fields of `message` that are missing in `carried` or have another value there, by name.
+
+    `carried` contains the fields read back from the ROS message that represents `message`.
+    """
     return {
         name: value
         for name, value in message.__dict__.items()
@@ -93,7 +106,7 @@ def _same(a: Any, b: Any) -> bool:
 
 
 def pack_fields(fields: dict[str, Any]) -> bytes:
-    """Encode fields as msgpack; an array becomes {"dtype", "shape", "data"}."""
+    """Return message fields encoded as msgpack; an array becomes {"dtype", "shape", "data"}."""
     return msgpack.packb(fields, default=_pack_array)
 
 
@@ -107,7 +120,7 @@ def unpack_fields(data: bytes, cls: type[Message]) -> dict[str, Any]:
     """Decode fields encoded by `pack_fields`; fields unknown to `cls` (of a newer version) are ignored.
 
     Raises:
-        DecodeError: the bytes are not such a map.
+        DecodeError: the bytes are not a valid result of `pack_fields`.
     """
     try:
         fields = msgpack.unpackb(data, use_list=False)

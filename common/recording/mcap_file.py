@@ -1,7 +1,7 @@
 """Reader of MCAP files: uses the index of complete files and scans truncated files chunk by chunk.
 
-The reader of the `mcap` package rejects files without a footer, such as those of a robot that lost power.
-This reader indexes the complete chunks of such a file and reports what is missing.
+The reader of the `mcap` package rejects files without a footer, for example from a robot that lost power.
+This reader indexes the complete chunks of a truncated file and reports the missing parts.
 """
 
 from __future__ import annotations

@@ -31,7 +31,7 @@ def metadata_yaml(file_name: str, topics: dict[str, tuple[str, int]], first_ns: 
         file_name: name of the MCAP file in the folder.
         topics: ROS topic -> (ROS type, message count). List ROS topics only: `ros2 bag play` creates a
             publisher for each topic.
-        first_ns, last_ns: first and last log time.
+        first_ns, last_ns: arrival times (ns) of the first and the last message.
     """
     span = {
         "starting_time": {"nanoseconds_since_epoch": first_ns},
@@ -62,7 +62,10 @@ def metadata_yaml(file_name: str, topics: dict[str, tuple[str, int]], first_ns: 
 
 
 def qos_profiles(topic: str) -> str:
-    """Return the offered QoS of a ROS topic as YAML; channel metadata and metadata.yaml must be identical."""
+    """Return the QoS profile that a ROS topic's publisher offers, as YAML text.
+
+    The metadata of the MCAP channel and metadata.yaml must contain the same text.
+    """
     latched = topic == "/tf_static"  # durability transient local: late subscribers receive the last message
     return _QOS.format(depth=1 if latched else 10, durability=1 if latched else 2)
 

@@ -22,7 +22,7 @@ _READ_ROLES = ("message", "fields", "own")
 
 
 class RecordedMessage(NamedTuple):
-    """A message in a recording."""
+    """A message in a recording, with its topic, arrival time and header."""
 
     log_time_ns: int  # arrival time at the recorder
     topic: str
@@ -71,7 +71,7 @@ class RecordingReader:
 
     @property
     def problems(self) -> list[str]:
-        """Sentences about missing and damaged data, known so far."""
+        """Sentences about missing and damaged data that the reader has found so far."""
         found = [f"{file.path}: {file.truncated}" for file in self.files if file.truncated]
         damaged = sum(file.damaged_chunks for file in self.files)
         if damaged:
@@ -81,7 +81,7 @@ class RecordingReader:
 
     @property
     def counts(self) -> Counter[str]:
-        """Number of messages by topic."""
+        """Number of messages in the recording, by topic."""
         counts: Counter[str] = Counter()
         for file in self.files:
             for channel_id, count in file.counts.items():
@@ -92,12 +92,12 @@ class RecordingReader:
 
     @property
     def start_ns(self) -> int:
-        """Arrival time of the first message."""
+        """Arrival time of the first message at the recorder, in nanoseconds."""
         return min((file.start_ns for file in self.files if file.counts), default=0)
 
     @property
     def end_ns(self) -> int:
-        """Arrival time of the last message."""
+        """Arrival time of the last message at the recorder, in nanoseconds."""
         return max((file.end_ns for file in self.files), default=0)
 
     def messages(

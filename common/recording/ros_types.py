@@ -25,13 +25,13 @@ _SEC_LIMIT = 2**31  # builtin_interfaces/Time counts seconds in an int32
 
 @cache
 def typestore() -> Typestore:
-    """Return the message definitions of ROS 2 Jazzy; those used here are the same in Humble."""
+    """Return the message definitions of ROS 2 Jazzy; the types used here are the same in Humble."""
     return get_typestore(Stores.ROS2_JAZZY)
 
 
 @cache
 def definition(type_name: str) -> bytes:
-    """Return the text definition of a type with its dependencies, the `ros2msg` schema of MCAP."""
+    """Return the text definition of a ROS type and the types in it, as in MCAP's `ros2msg` schema."""
     return typestore().generate_msgdef(type_name, ros_version=2)[0].encode()
 
 
@@ -46,7 +46,7 @@ def serialize(message: Any) -> bytes:
 
 
 def time_of(stamp_ns: int) -> Any:
-    """Return a stamp as builtin_interfaces/Time; seconds after 2038 are clipped.
+    """Return a stamp (ns) as builtin_interfaces/Time; stamps after 2038 are clipped to the int32 maximum.
 
     The writer of recordings detects a clipped stamp and stores the exact one in a "fields" record.
     """
@@ -55,12 +55,12 @@ def time_of(stamp_ns: int) -> Any:
 
 
 def header(stamp_ns: int, frame_id: str) -> Any:
-    """Return a std_msgs/Header."""
+    """Return a std_msgs/Header with this stamp (ns) and frame name."""
     return new("std_msgs/msg/Header", stamp=time_of(stamp_ns), frame_id=frame_id)
 
 
 def stamp_ns_of(time: Any) -> int:
-    """Return the int64 nanoseconds of a ROS 1 or ROS 2 time."""
+    """Return a ROS 1 or ROS 2 time in nanoseconds."""
     return int(time.sec) * 10**9 + int(time.nanosec)
 
 
@@ -71,7 +71,7 @@ def vector(values: np.ndarray) -> Any:
 
 
 def quaternion(R: np.ndarray) -> Any:
-    """Return a rotation [3, 3] as geometry_msgs/Quaternion."""
+    """Return a rotation matrix [3, 3] as geometry_msgs/Quaternion."""
     x, y, z, w = (float(v) for v in quat_xyzw_from_matrix(R))
     return new("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
 
@@ -84,7 +84,7 @@ def pose(T: np.ndarray) -> Any:
 
 
 def tf(stamp_ns: int, parent: str, child: str, T_parent_child: np.ndarray) -> Any:
-    """Return a transform [4, 4] as geometry_msgs/TransformStamped."""
+    """Return a transform [4, 4] as geometry_msgs/TransformStamped, with its stamp (ns) and frame names."""
     transform = new(
         "geometry_msgs/msg/Transform",
         translation=vector(T_parent_child[:3, 3]),
@@ -125,7 +125,7 @@ _DESERIALISE_ERRORS = (
 
 
 def deserialize(data: bytes, type_name: str) -> Any:
-    """Return the ROS message in CDR bytes.
+    """Decode CDR bytes to the ROS message of type `type_name`.
 
     Raises:
         ValueError: the bytes are not a message of this type.

@@ -9,7 +9,7 @@ from beamsplat.common.recording.from_ros import fields_of
 
 
 class SensorType(NamedTuple):
-    """One kind of sensor data."""
+    """One kind of sensor data: its name, BeamSplat topic, message class and ROS message types."""
 
     name: str  # in options and texts, for example "image" in `image_topic`
     topic: str
@@ -36,7 +36,7 @@ _CLASSES = {sensor.topic: sensor.cls for sensor in SENSORS.values()} | {"tick": 
 
 
 def build_message(topic: str, fields: dict[str, Any]) -> m.Message:
-    """Create and validate the message of a sensor topic, "rig" or "tick".
+    """Create and validate a message from its fields; `topic` is a sensor topic, "rig" or "tick".
 
     Raises:
         ValueError: a field is invalid; the text names the field and the reason.
@@ -45,5 +45,5 @@ def build_message(topic: str, fields: dict[str, Any]) -> m.Message:
 
 
 def ros_fields(topic: str, ros_message: Any) -> dict[str, Any]:
-    """Return the fields of a sensor topic's message that a ROS message holds, not validated."""
+    """Return the fields that a ROS message contains for the BeamSplat message on `topic`, not validated."""
     return fields_of(_CLASSES[topic], ros_message)

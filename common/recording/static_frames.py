@@ -21,17 +21,17 @@ _TOLERANCE = 1e-6  # metres and rotation matrix entries: a repeated transform wi
 
 
 class StaticFrames:
-    """Static transforms between named frames; a transform received with two values is not static."""
+    """Static transforms between named frames; a transform received with different values is not static."""
 
     def __init__(self) -> None:
         self._parent: dict[str, tuple[str, np.ndarray]] = {}  # child -> (parent, T_parent_child)
         self.moving: set[tuple[str, str]] = set()  # (parent, child) whose transform changed
 
     def add(self, parent: str, child: str, T_parent_child: np.ndarray, *, replace: bool = False) -> None:
-        """Add one transform [4, 4].
+        """Add one received transform [4, 4].
 
-        With `replace`, a new value replaces the old one: a latched publisher has corrected itself. Otherwise
-        a new value marks the pair of frames as moving and removes its transform.
+        If the pair of frames already has a transform with another value: with `replace`, store the new value
+        (a latched publisher has corrected it); otherwise mark the pair as moving and remove its transform.
         """
         parent, child = normalize_frame(parent), normalize_frame(child)
         if not child or parent == child or (parent, child) in self.moving:
@@ -58,7 +58,7 @@ class StaticFrames:
         return None
 
     def path(self, a: str, b: str) -> list[str]:
-        """Return the names of the frames on the path from a to b, for texts; [] if there is no path."""
+        """Return the names of the frames on the path from frame `a` to frame `b`; [] if there is no path."""
         up_a, up_b = list(self._chain(normalize_frame(a))), list(self._chain(normalize_frame(b)))
         common = next((frame for frame in up_a if frame in up_b), None)
         if common is None:
@@ -66,10 +66,13 @@ class StaticFrames:
         return up_a[: up_a.index(common) + 1] + up_b[: up_b.index(common)][::-1]
 
     def body_frame(self, sensors: list[str], odometry_child: str) -> str | None:
-        """Return the frame to use as body: the first of `BODY_NAMES` connected to a sensor, else odometry's.
+        """Return the name of the ROS frame to use as body.
+
+        This is the first of `BODY_NAMES` that is connected to a sensor, else the child frame of the wheel
+        odometry.
 
         Args:
-            sensors: frames of the sensors.
+            sensors: names of the sensors' frames.
             odometry_child: child frame of the wheel odometry, "" = unknown.
         """
         known = self.names | {normalize_frame(odometry_child)} - {""}

@@ -1,7 +1,8 @@
 """Conversion of BeamSplat messages to standard ROS 2 messages, which Foxglove, RViz and `ros2 bag` can use.
 
-A recording holds at most one ROS message with `role = "message"` per BeamSplat message, from which the reader
-restores it. ROS messages with `role = "display"` (transforms, CameraInfo) are for other tools and redundant.
+A recording contains at most one ROS message with `role = "message"` per BeamSplat message; `RecordingReader`
+restores the BeamSplat message from this one. ROS messages with `role = "display"` (transforms, CameraInfo)
+are redundant and serve other tools only.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ TF_STATIC = "/tf_static"
 
 
 class RosRecord(NamedTuple):
-    """One ROS message on one ROS topic."""
+    """One ROS message, its ROS topic, and its role in a recording."""
 
     topic: str
     message: Any
@@ -27,7 +28,10 @@ class RosRecord(NamedTuple):
 
 
 def records_of(topic: str, message: m.Message) -> list[RosRecord]:
-    """Return the ROS messages of a message on `topic`; [] if ROS has no such type (Anchors, Tick, Health)."""
+    """Convert a BeamSplat message on `topic` to ROS messages.
+
+    The result is [] if ROS has no such message type (Anchors, Tick, Health).
+    """
     convert = _CONVERTERS.get(type(message))
     return convert("/" + topic, message) if convert else []
 
@@ -129,7 +133,7 @@ def _rig(topic: str, rig: m.Rig) -> list[RosRecord]:
 
 
 def camera_info(stamp_ns: int, camera: m.CameraModel) -> Any:
-    """Return the sensor_msgs/CameraInfo of a camera."""
+    """Return the intrinsics and distortion of a camera as sensor_msgs/CameraInfo."""
     projection = np.hstack([camera.K, np.zeros((3, 1))])
     whole = ros.new(
         "sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False

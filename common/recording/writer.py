@@ -66,9 +66,9 @@ class RecordingWriter:
 
     Args:
         path: folder to create (a ROS 2 bag with NAME_0.mcap and metadata.yaml), or a file ending in .mcap.
-        chunk_bytes: a chunk ends at this size; a crash loses at most one chunk.
-        chunk_s: a chunk ends after this duration of log time.
-        compression: of the chunks.
+        chunk_bytes: size at which an MCAP chunk ends; a crash loses at most one chunk.
+        chunk_s: duration after which a chunk ends, by arrival time (s).
+        compression: compression method of the chunks.
         sync: call fdatasync after each chunk, against power loss.
         overwrite: replace an existing recording.
 
@@ -113,7 +113,7 @@ class RecordingWriter:
         self._writer.start(layout.PROFILE, layout.LIBRARY)
 
     def write(self, topic: str, message: Message, log_time_ns: int, header: Header | None = None) -> None:
-        """Append one message; `log_time_ns` is its arrival time.
+        """Append one message; `log_time_ns` is its arrival time (ns) at the recorder.
 
         Raises:
             RecordingError: writing failed; this message and all later ones are counted in `lost`.
@@ -135,7 +135,7 @@ class RecordingWriter:
             raise self._fail(error) from error
 
     def flush(self) -> None:
-        """End the current chunk: all messages so far are kept if this process crashes."""
+        """Write the current chunk to the file: a later crash of this process loses no message before it."""
         try:
             self._writer.flush()
             if self._sync:
@@ -285,7 +285,17 @@ class RecordingWriter:
 
 
 def _carried_fields(message: Message, cdr: bytes, type_name: str) -> dict[str, Any]:
-    """Return the fields that a reader restores from the ROS message alone, by deserialising it."""
+    """Return the fields of `message` that `RecordingReader` can restore from its ROS message alone, by name.
+
+    Args:
+        message: the BeamSplat message to be recorded.
+        cdr: the ROS message to which it was converted, as serialised (CDR) bytes.
+        type_name: type of the ROS message, for example "sensor_msgs/msg/LaserScan".
+
+    Returns:
+        The fields after a round trip through `cdr`: values can differ from those of `message`. An empty
+        dict if the ROS message cannot be read back.
+    """
     try:
         return fields_of(type(message), ros_types.deserialize(cdr, type_name))
     except ValueError:  # the ROS message cannot be read back: all fields are stored in the "fields" record

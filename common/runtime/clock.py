@@ -50,9 +50,10 @@ def _runtime_folder() -> Path:
 
 
 def _shared_offset(folder: Path, measured_ns: int) -> int:
-    """Return the offset of this boot, ns: the stored one, or `measured_ns` after storing it.
+    """Return the offset (ns) from the monotonic clock to the stamp clock: the same for all processes.
 
-    The first process creates the file with a hard link, which is atomic: all processes read the same value.
+    If no process has stored an offset since the boot, `measured_ns` is stored and returned. The first process
+    creates the file with a hard link, which is atomic: all processes read the same value.
     """
     place = folder / f"beamsplat-clock-{os.getuid()}-{local_clock_id():016x}"
     own = folder / f".{place.name}-{os.getpid()}"

@@ -16,16 +16,17 @@ log = logging.getLogger(__name__)
 
 
 class HandoverControl:
-    """Answers `reached`, `retire` and `activate` for one process; the protocol: `runtime.handover`."""
+    """Answers the requests `reached`, `retire` and `activate` to one process (see `runtime.handover`)."""
 
     def __init__(self, running: RunningNode, bus: Bus) -> None:
         self._running, self._bus = running, bus
 
     def answer(self, verb: str, parameters: dict[str, str]) -> Iterator[Answer]:
-        """Carry out a request and yield its answer.
+        """Carry out the request `verb` and yield its answer: one message with text.
 
         Raises:
-            ValueError: the request is unknown, not possible now, or it failed; the process keeps its role.
+            ValueError: the request is unknown, not possible now, or failed; the process remains in its
+                state (standby, active or retired).
         """
         handover = self._running.handover
         if verb == "reached":

@@ -3,7 +3,7 @@
 A supervisor starts the successor in standby while the predecessor is still active, and then moves the role of
 the active process from one to the other. It sends three requests, each answered between two messages:
 
-    control/<instance>/reached    -> {topic: newest stamp published or held back}
+    control/<instance>/reached    -> {topic: newest stamp published or stored}
     control/<instance>/retire     -> {"said": {topic: newest stamp}} or {"handled": ...}
     control/<instance>/activate   ?after=<answer of retire> -> {"kept": count, "lost": count}
 
@@ -14,21 +14,22 @@ the active process from one to the other. It sends three requests, each answered
                              +--+ reached                  +--+ reached
 
 1. STANDBY: the successor receives all inputs and computes its outputs, but publishes nothing, not even
-   health. It holds back the newest 16 outputs; when a further one is computed, the oldest is dropped, and
-   only its topic and stamp are kept.
+   health. It stores the newest 16 outputs; when a further one is computed, the oldest is dropped, and only
+   its topic and stamp are stored.
 2. `reached` goes to both processes (a process answers once it is configured). The supervisor continues when
    the successor's newest stamps are close to the predecessor's, or after a time-out.
 3. `retire`: the predecessor answers with the newest stamp that it published on each topic ("said"), publishes
    nothing from here on, and ends without end-of-stream markers.
-4. `activate` passes this answer to the successor. It claims the next epoch, publishes the held messages whose
-   stamp is newer than the predecessor's on the same topic, and becomes ACTIVE. From then on it discards an
-   output that is not newer than the predecessor's last one: no stamp is published twice. Dropped messages
-   newer than the predecessor's last one were published by neither process: they are counted in `lost`.
+4. `activate` passes this answer to the successor. The successor claims the next epoch, publishes the stored
+   outputs whose stamp is newer than the predecessor's on the same topic ("kept" is their number), and becomes
+   ACTIVE. From then on it discards an output that is not newer than the predecessor's last one: no stamp is
+   published twice. Dropped outputs newer than the predecessor's last one were published by neither process:
+   they are counted in "lost".
 5. Messages of the predecessor that are still in transit have the lower epoch; subscribers ignore them.
 
 A node that hands over its state (`Node.hands_over`) does no work in standby: inputs are queued. Its
 predecessor writes its state in `hand_over` and answers `retire` with the sequence numbers that it has
-handled, because its output stamps do not tell which inputs are part of the state. The successor reads the
+handled, because its output stamps do not show which inputs are part of the state. The successor reads the
 state in `take_over` and skips these inputs.
 """
 
@@ -64,11 +65,11 @@ class Handover:
         self._handled: HandledSequences = {}
 
     def holds_back(self, topic: str, message: Message) -> bool:
-        """Return whether a message must not be published now.
+        """Return whether the caller must not publish `message` now; store or discard it in that case.
 
-        In standby it is held back (the oldest held message is dropped when `_MAX_HELD` are held). A retired
-        process discards it. After activation, it is discarded if the predecessor has published this stamp or
-        a newer one on the topic. In all other cases its stamp is recorded as published.
+        In standby the message is stored (the oldest stored one is dropped when `_MAX_HELD` are stored). A
+        retired process discards it. After activation, it is discarded if the predecessor has published this
+        stamp or a newer one on the topic. In all other cases its stamp is recorded as published.
         """
         if self.standby:
             if len(self._held) == _MAX_HELD:
@@ -88,7 +89,7 @@ class Handover:
         return handled is not None and sequence < handled[0] and sequence not in handled[1]
 
     def reached(self) -> str:
-        """Return JSON {topic: newest stamp published or held back}."""
+        """Return the progress of this process as JSON: {topic: newest stamp (ns) published or stored}."""
         newest = dict(self._published)
         for topic, message in self._held:
             newest[topic] = max(newest.get(topic, 0), message.stamp_ns)
@@ -104,10 +105,12 @@ class Handover:
         return json.dumps({"said": self._published} if handled is None else {"handled": handled})
 
     def activate(self, after: str) -> Iterator[tuple[str, Message]]:
-        """Leave standby and yield the held messages that the predecessor has not published, oldest first.
+        """Leave standby and yield (topic, message) of the stored messages to publish now, oldest first.
+
+        These are the messages with a newer stamp than the predecessor has published on their topic.
 
         Args:
-            after: what the predecessor's `retire` returned.
+            after: the JSON text that the predecessor's `retire` returned.
 
         Raises:
             ValueError: `after` is not JSON, or not an answer of `retire`; the state is unchanged.

@@ -19,7 +19,10 @@ _MAX_NODES = 1000  # of all robots; names beyond that are ignored, since anybody
 
 @dataclass
 class NodeRecord:
-    """Newest health of a node; `received_s` is its arrival time on the receiver's monotonic clock."""
+    """Newest health report of a node, and its recent reports.
+
+    `received_s` is the arrival time of the newest report: seconds of the receiver's `time.monotonic`.
+    """
 
     health: Health
     received_s: float
@@ -27,18 +30,24 @@ class NodeRecord:
     history: deque[tuple[float, Health]] = field(default_factory=lambda: deque(maxlen=_MAX_HISTORY))
 
     def silent_s(self, now: float) -> float | None:
-        """Return the time since the last report in s, or None while it is at most `STALE_S`."""
+        """Return the time in s from the last report to `now`, or None if this time is at most `STALE_S`.
+
+        `now` is a reading of `time.monotonic` in seconds.
+        """
         return now - self.received_s if now - self.received_s > STALE_S else None
 
     def rate(self, count: Callable[[Health], int]) -> float:
-        """Return the rate of a counter in 1/s, from the oldest to the newest report of the window."""
+        """Return the mean rate (1/s) of a counter between the oldest and the newest stored report.
+
+        `count` reads the counter from a report. The rate is 0 while the reports span less than 0.5 s.
+        """
         (first, before), (last, after) = self.history[0], self.history[-1]
         if last - first < 0.5:
             return 0.0
         return (count(after) - count(before)) / (last - first)
 
     def totals(self) -> NodeTraffic:
-        """Return the counters and rates of this node, summed over its inputs and outputs."""
+        """Return the message rates and counters of this node, summed over its inputs and outputs."""
         inputs = self.health.inputs
         return NodeTraffic(
             in_hz=self.rate(lambda h: sum(i.received for i in h.inputs)),
@@ -51,7 +60,7 @@ class NodeRecord:
 
 
 class NodeTraffic(NamedTuple):
-    """Traffic of one node; counts since it started."""
+    """Message rates of one node, and its counts of dropped, lost and bad messages since it started."""
 
     in_hz: float
     out_hz: float
@@ -62,7 +71,7 @@ class NodeTraffic(NamedTuple):
 
 
 class TopicConsumer(NamedTuple):
-    """One subscription to a topic."""
+    """Counters of one node's subscription to a topic; `age_ms` is the age of its newest message."""
 
     node: str
     age_ms: float
@@ -71,7 +80,7 @@ class TopicConsumer(NamedTuple):
 
 
 class TopicTraffic(NamedTuple):
-    """Traffic of one topic."""
+    """Message rate, byte rate (bytes per second) and count of one topic, and its subscriptions."""
 
     topic: str
     producer: str
@@ -83,13 +92,13 @@ class TopicTraffic(NamedTuple):
 
 
 class HealthRecords:
-    """The newest health of every node. Not thread-safe: the owner locks it."""
+    """The newest health report of every node. Not thread-safe: its owner must lock it."""
 
     def __init__(self) -> None:
         self.records: dict[str, NodeRecord] = {}
 
     def add(self, health: Health, now: float | None = None) -> None:
-        """Add a health report that arrived at `now` (monotonic clock, s; default: now)."""
+        """Store a health report that arrived at `now`, in seconds of `time.monotonic` (default: now)."""
         now = time.monotonic() if now is None else now
         if health.node not in self.records and len(self.records) >= _MAX_NODES:
             return
@@ -103,7 +112,10 @@ class HealthRecords:
             record.history.popleft()
 
     def states(self, now: float | None = None) -> dict[str, str]:
-        """Return the state of each node by name; "silent" if its last report is older than `STALE_S`."""
+        """Return the state of each node by node name; "silent" if its last report is older than `STALE_S`.
+
+        `now` is in seconds of `time.monotonic` (default: now).
+        """
         now = time.monotonic() if now is None else now
         return {n: "silent" if r.silent_s(now) else r.health.state for n, r in self.records.items()}
 

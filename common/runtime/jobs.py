@@ -13,7 +13,7 @@ from beamsplat.common.runtime.node import Job
 
 
 class JobFuture(Protocol):
-    """The part of `concurrent.futures.Future` that is used here."""
+    """Interface of a job's future: the two methods of `concurrent.futures.Future` that this module uses."""
 
     def result(self) -> Any: ...
 
@@ -37,7 +37,7 @@ class LazyFuture:
 
 
 class JobAbandoned(Exception):
-    """Raised when the process must end before a job that is waited for has finished."""
+    """The process must end before the job, for whose result the node waits, has finished."""
 
 
 class _WorkerFuture(concurrent.futures.Future):
@@ -54,7 +54,10 @@ class _WorkerFuture(concurrent.futures.Future):
 
 
 class JobThread:
-    """One daemon thread that runs jobs in order; unlike an executor's it does not block process exit."""
+    """One daemon thread that runs jobs in order of submission; it does not block the end of the process.
+
+    The threads of `concurrent.futures` executors would block it.
+    """
 
     def __init__(self, must_stop: Callable[[], bool]) -> None:
         self._must_stop = must_stop
@@ -62,7 +65,7 @@ class JobThread:
         threading.Thread(target=self._work, name="job", daemon=True).start()
 
     def submit(self, run: Callable[[], Any]) -> concurrent.futures.Future:
-        """Queue a job; it runs after all jobs submitted before it."""
+        """Queue the job `run` and return its future; the job runs after all jobs submitted before it."""
         future = _WorkerFuture(self._must_stop)
         self._waiting.put((future, run))
         return future
@@ -91,13 +94,16 @@ class JobQueue(Generic[_FutureT]):
         self._pending: list[_Pending[_FutureT]] = []
 
     def start(self, job: Job) -> _FutureT:
-        """Submit a job and return its future."""
+        """Submit `job` for execution in the background and return its future."""
         future = self._submit(job.run)
         self._pending.append(_Pending(job, future, job.after))
         return future
 
     def before_message(self, topic: str) -> Iterator[tuple[str, Any]]:
-        """Yield (name, result) of the jobs due before a message on `topic`; waits for unfinished ones."""
+        """Yield (name, result) of the jobs whose result is due before the next message, which is on `topic`.
+
+        Jobs that have not finished are waited for.
+        """
         for pending in self._pending:
             if pending.remaining is not None and pending.job.of in (None, topic):
                 pending.remaining -= 1

@@ -52,7 +52,7 @@ class Live:
         self._position = ReplayPosition(settings.run_dir, node.name)
 
     def run(self) -> None:
-        """Go through the life cycle: configure, standby, active, drain, drained, closed."""
+        """Run the node through its life cycle: configure, standby, active, drain, drained, closed."""
         r = self.running
         settings, node = r.settings, r.node
         epoch = claim_epoch(settings.run_dir, node.name)
@@ -83,7 +83,7 @@ class Live:
                 node.close()
 
     def stop(self, *_: object) -> None:
-        """Ask the node to end; safe in a signal handler."""
+        """Request the end of the node's main loop, and return at once; safe in a signal handler."""
         self._stopping = True
         self._stop_by = min(self._stop_by, time.monotonic() + _STOP_TIMEOUT_S)
 

@@ -39,7 +39,7 @@ class _NodeState:
 
 
 class Lockstep:
-    """The event loop over all nodes. `on_message` is called for every published message, in order."""
+    """The event loop over all nodes. `on_message` is called with every published message, in event order."""
 
     def __init__(self, nodes: list[Node], on_message: Callable[[Envelope], None] | None = None) -> None:
         self._on_message = on_message or (lambda envelope: None)
@@ -51,7 +51,11 @@ class Lockstep:
         }
 
     def run(self) -> dict[str, Mailbox]:
-        """Run until all sources are exhausted and all nodes drained; return each node's mailbox by name."""
+        """Run until all sources are exhausted and all nodes drained.
+
+        Returns:
+            The mailbox of each node, with its message counters, by node name.
+        """
         try:
             produced = {name for state in self._states for name in state.node.outputs}
             for state in self._states:
@@ -95,7 +99,7 @@ class Lockstep:
         self._at(at_ns, ROW_NUMBER[item.topic], act)
 
     def _send(self, state: _NodeState, name: str, message: Message, time_ns: int) -> None:
-        """Give a message its header, pass it to `on_message` and deliver it to all consumers."""
+        """Create the header of a message, pass both to `on_message`, and deliver them to all subscribers."""
         sequence = state.sequences.get(name, 0)
         state.sequences[name] = sequence + 1
         header = Header(message.stamp_ns, time_ns, 0, sequence, 0, state.node.name, state.instance)

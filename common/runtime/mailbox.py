@@ -37,7 +37,10 @@ class Envelope:
 
 @dataclass
 class InputCount:
-    """Counters of one input, and the sequence state that they are computed from."""
+    """Message counters of one input, and the sequence numbers from which losses are computed.
+
+    The counters have the same meaning as in `messages.robot.InputHealth`.
+    """
 
     received: int = 0
     dropped: int = 0
@@ -68,7 +71,7 @@ class Mailbox:
         return len(self._merger) + len(self._slots) + len(self._feedback_queue)
 
     def put(self, envelope: Envelope) -> bool:
-        """Queue a message; return False for a stale one (repeated, or of a predecessor) instead."""
+        """Queue a message and return True, or return False if it is stale (repeated, or of a predecessor)."""
         count = self.counts[envelope.topic]
         every = self._deliveries[envelope.topic] == "every"
         if not self._admit(count, envelope.header, every and not TOPICS[envelope.topic].resent_until_ack):
@@ -124,9 +127,10 @@ class Mailbox:
         return True
 
     def end(self, topic: str, instance: str, epoch: int, sent: int = 0) -> None:
-        """End an input: its producer `instance` has sent its last message, `sent` messages in all.
+        """Mark an input as ended: its producer `instance` has sent its last message, `sent` messages in all.
 
-        Messages that have not arrived by now are counted as lost (as dropped if the producer resends them).
+        Messages that have not arrived by now are counted as lost, or as dropped on a topic whose producer
+        resends messages until they are acknowledged.
         """
         count = self.counts[topic]
         if epoch < count.epoch:  # of a producer that has handed over
@@ -150,7 +154,12 @@ class Mailbox:
         return [*self._feedback_queue, *self._merger.items()]
 
     def handled(self) -> HandledSequences:
-        """Return which messages of the `every` inputs were received and popped: the progress of this node."""
+        """Return the sequence numbers that this node has handled on its `every` inputs.
+
+        Returns:
+            {topic: {producer instance: (next expected number, numbers that are still queued)}}. All numbers
+            below the first value have been handled, except the queued ones.
+        """
         queued = self.queued()
         return {
             topic: {
@@ -167,7 +176,8 @@ class Mailbox:
     def pop(self) -> Envelope | None:
         """Remove and return the message to handle next, or None if none is ready.
 
-        Feedback first, then the next message of the merged `every` inputs, then the oldest of the slots.
+        Order: feedback, then the next message of the `every` inputs (merged by stamp), then the oldest
+        message of the `latest` and `latched` inputs.
         """
         if self._feedback_queue:
             envelope = self._feedback_queue.popleft()
@@ -201,7 +211,7 @@ class Mailbox:
         return any(self.counts[name].ended_by is None for name in self._feedback_topics)
 
     def health(self) -> tuple[InputHealth, ...]:
-        """Return the counters in the form of a Health message."""
+        """Return the counters of all inputs, for the field `inputs` of a Health message."""
         return tuple(
             InputHealth(
                 topic=name, received=c.received, dropped=min(c.dropped, _MAX_COUNT),

@@ -37,7 +37,8 @@ class Input:
             arrival, not merged by stamp, and the node ends without waiting for its end: otherwise the node
             would wait for itself. Feedback after the node's end is still handled, but the outputs of its
             handler are discarded.
-        queued_bytes: limit of an `every` input; beyond it the oldest messages are dropped and counted.
+        queued_bytes: limit on the payload bytes queued for an `every` input; beyond this limit the oldest
+            messages are dropped and counted.
     """
 
     topic: str
@@ -62,7 +63,7 @@ class Job:
         run: the computation; it must not access state that the node changes meanwhile.
         after: deliver the result just before the n-th next message, and wait for it if necessary:
             reproducible in both runners. None: deliver it when it is finished.
-        of: count only messages on this topic.
+        of: topic whose messages `after` counts; the default counts the messages of all inputs.
     """
 
     name: str
@@ -72,10 +73,10 @@ class Job:
 
 
 class SourceItem(NamedTuple):
-    """A message that `source()` yields.
+    """A message that `source()` yields, with its topic.
 
-    `at_ns` is the arrival time on a recording's clock, by which runners pace and order; None means now (a
-    real device).
+    `at_ns` is the arrival time (ns) on a recording's clock, by which runners pace and order messages; None
+    means now (a real device).
     """
 
     at_ns: int | None
@@ -136,11 +137,11 @@ class Node:
         """Check, before any process starts, that the files and devices named in the options exist.
 
         Raises:
-            UserError: one is missing or unusable.
+            UserError: a file or device is missing or unusable.
         """
 
     def drain(self) -> Iterable[Output]:
-        """Return the last outputs, after all inputs have ended."""
+        """Return the node's last output messages; called once, after all inputs have ended."""
         return ()
 
     def close(self) -> None:
@@ -158,12 +159,17 @@ class Node:
         """Handle a health report of any node; only called live, and only if a subclass overrides it."""
 
     def set_query_function(self, ask: QueryFunction) -> None:
-        """Receive the function that sends queries to other nodes; called before `configure`, live only."""
+        """Receive `ask`, the function that sends queries to other nodes.
+
+        Called by the live runner only, before `configure`. A node that sends queries overrides this method
+        and stores the function.
+        """
 
     def on_arrival(self, topic: str, message: Message) -> Iterable[Output]:
-        """Process a message on arrival, before it is queued: for replies that must not wait for a long step.
+        """Process a message on arrival, before it is queued, and return output messages.
 
-        Live, it is called from the threads of the bus, concurrently with the other methods.
+        For replies that must not wait for a long step of the node. The live runner calls this method from the
+        threads of the bus, concurrently with the other methods.
         """
         return ()
 
@@ -175,7 +181,9 @@ class Node:
         return "" if self.replaceable else "its state exists only in its process"
 
     def hand_over(self) -> None:
-        """Write the node's state where its successor reads it, and release it; called between two messages.
+        """Write the node's state to the files that its successor reads, and release these files.
+
+        Called between two messages, in the process that retires.
 
         Raises:
             UserError: the state could not be written; the node continues as before.
@@ -194,7 +202,10 @@ class Node:
         return False
 
     def on_feedback_timeout(self, seconds: float) -> Iterable[Output]:
-        """Return outputs after `seconds` without the feedback that `awaits_feedback` waits for; live only."""
+        """Return output messages after `seconds` without the awaited feedback (see `awaits_feedback`).
+
+        Called by the live runner only.
+        """
         return ()
 
     # --- used by the runners ---
@@ -211,28 +222,31 @@ class Node:
 
     @classmethod
     def queries(cls) -> tuple[str, ...]:
-        """Return the names of the queries that it answers with `on_query_<name>(parameters)` generators."""
+        """Return the names of the queries that this node answers.
+
+        Each query has a method `on_query_<name>(parameters)`, a generator of the answers.
+        """
         prefix = "on_query_"
         return tuple(sorted(n.removeprefix(prefix) for n in dir(cls) if n.startswith(prefix)))
 
     def handle(self, topic_name: str, message: Message) -> Iterator[Output]:
-        """Yield the outputs of the handler of `topic_name`; raise UndeclaredOutput for an undeclared one."""
+        """Yield the outputs of the handler of `topic_name`; raise UndeclaredOutput if one is not declared."""
         yield from self._declared(getattr(self, topic(topic_name).handler)(message))
 
     def handle_arrival(self, topic_name: str, message: Message) -> Iterator[Output]:
-        """Yield the checked outputs of `on_arrival`."""
+        """Yield the outputs of `on_arrival`; raise UndeclaredOutput for an undeclared output."""
         yield from self._declared(self.on_arrival(topic_name, message))
 
     def handle_job(self, name: str, result: Any) -> Iterator[Output]:
-        """Yield the checked outputs of `on_job_<name>`."""
+        """Yield the outputs of `on_job_<name>(result)`; raise UndeclaredOutput for an undeclared output."""
         yield from self._declared(getattr(self, f"on_job_{name}")(result))
 
     def handle_feedback_timeout(self, seconds: float) -> Iterator[Output]:
-        """Yield the checked outputs of `on_feedback_timeout`."""
+        """Yield the outputs of `on_feedback_timeout`; raise UndeclaredOutput for an undeclared output."""
         yield from self._declared(self.on_feedback_timeout(seconds))
 
     def handle_drain(self) -> Iterator[Output]:
-        """Yield the checked outputs of `drain`."""
+        """Yield the outputs of `drain`; raise UndeclaredOutput for an undeclared output."""
         yield from self._declared(self.drain())
 
     def _declared(self, outputs: Iterable[Output] | None) -> Iterator[Output]:
@@ -255,11 +269,14 @@ class Node:
 
 
 def subscriptions(node: type[Node]) -> tuple[Input, ...]:
-    """Return the inputs of a node class; `Node` converts topic names when the class is defined."""
+    """Return the inputs of a node class as `Input` objects (plain topic names are already converted)."""
     return tuple(i for i in node.inputs if isinstance(i, Input))
 
 
 def merged_topics(node: type[Node]) -> tuple[str, ...]:
-    """Return the inputs that are merged by stamp: the `every` inputs except feedback, in table order."""
+    """Return the topics of the inputs that are merged by stamp, in the order of the topic table.
+
+    These are the `every` inputs except feedback.
+    """
     names = [i.topic for i in subscriptions(node) if i.effective_delivery == "every" and not i.feedback]
     return tuple(sorted(names, key=ROW_NUMBER.__getitem__))

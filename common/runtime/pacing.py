@@ -19,9 +19,13 @@ def wait_for_nodes(
     stopping: Callable[[], bool],
     on_waiting: Callable[[list[str]], None],
 ) -> None:
-    """Block until the nodes in `settings.wait_for` are active, `settings.wait_s` has passed, or `stopping()`.
+    """Block until all nodes in `settings.wait_for` are active.
 
-    `on_waiting` is called with the names of the missing nodes.
+    Return earlier after `settings.wait_s` seconds, or when `stopping()` returns True.
+
+    Args:
+        alive: returns the names of the active nodes.
+        on_waiting: called repeatedly with the names of the nodes that are not active yet.
     """
     deadline = time.monotonic() + settings.wait_s
     missing = settings.wait_for
@@ -40,18 +44,21 @@ class Playback:
     """Maps the clock of a recording to the host's clock, and stores the position in the recording."""
 
     def __init__(self, rate: float, position: ReplayPosition, resume: bool) -> None:
-        """`rate`: times real time, 0 = as fast as possible; `resume`: continue at the stored position."""
+        """`rate`: speed as a multiple of real time, 0 = as fast as possible.
+
+        `resume`: continue after the position stored by the process before the restart.
+        """
         self._rate = rate
         self._position = position
         self._first: tuple[int, float] | None = None
         self._resume_ns = position.read() if resume else None
 
     def is_past(self, item: SourceItem) -> bool:
-        """Return whether the process before the restart has published this item."""
+        """Return whether the process before the restart has already published this item."""
         return self._resume_ns is not None and item.at_ns is not None and item.at_ns <= self._resume_ns
 
     def wait_s(self, item: SourceItem) -> float:
-        """Return the time until an item is due in s; zero or negative if it is due now."""
+        """Return the time in s until an item must be published; zero or negative if that time has come."""
         if item.at_ns is None or self._rate == 0.0 or self.is_past(item):
             return 0.0
         now = time.monotonic()
@@ -61,7 +68,7 @@ class Playback:
         return started + (item.at_ns - first_ns) / 1e9 / self._rate - now
 
     def mark_published(self, item: SourceItem) -> None:
-        """Store the position after a published item."""
+        """Store the arrival time of a published item on disk as the position in the recording."""
         if item.at_ns is not None and not self.is_past(item):
             self._position.write(item.at_ns)
 

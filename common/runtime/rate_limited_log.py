@@ -14,7 +14,10 @@ class RateLimitedLog:
         self._last: dict[str, tuple[float, int]] = {}
 
     def due(self, subject: str) -> int | None:
-        """Return the number of messages suppressed since the last one, or None to suppress this one."""
+        """Return None if a message on `subject` must not be logged now: the last one was too recent.
+
+        Otherwise return the number of messages on `subject` suppressed since the last logged one.
+        """
         now = time.monotonic()
         last, count = self._last.get(subject, (now - _PERIOD_S, 0))
         if now - last < _PERIOD_S:

@@ -28,7 +28,8 @@ class Service:
             kind: a key of `kinds`, "default", or the path of a class elsewhere, "my_package.my_node:MyNode".
 
         Raises:
-            UserError: no such kind or class, its packages are not installed, or the class is not this node.
+            UserError: no such kind or class, its packages are not installed, or the class is no node of this
+                name.
         """
         chosen = next(iter(self.kinds)) if kind == "default" else kind
         if is_class_path(chosen):
@@ -56,7 +57,9 @@ class Service:
 
 
 def node_class_of(service: Service, options: dict[str, object]) -> type[Node]:
-    """Return the node class of a node's table in a deployment; options other than `kind` are not checked.
+    """Return the node class that the option `kind` selects; the other options are not checked.
+
+    `options` is the node's table in a deployment.
 
     Raises:
         UserError: unknown kind.
@@ -65,10 +68,14 @@ def node_class_of(service: Service, options: dict[str, object]) -> type[Node]:
 
 
 def make_node(service: Service, options: dict[str, object], where: str) -> Node:
-    """Return a node made from its table in a deployment; it is not configured yet.
+    """Create a node from its table in a deployment; the caller must still call `configure`.
+
+    Args:
+        options: the node's table.
+        where: name of the deployment file, for error texts.
 
     Raises:
-        UserError: unknown kind or option, or an invalid value; `where` names the source.
+        UserError: unknown kind or option, or an invalid value.
     """
     node_class = node_class_of(service, options)
     config: NodeConfig = parse(

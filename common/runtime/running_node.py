@@ -51,7 +51,7 @@ class RunningNode:
     # --- called from threads of the bus ---
 
     def receive(self, envelope: Envelope) -> None:
-        """Put a message into the mailbox, after the node's `on_arrival` has seen it."""
+        """Pass a received message to the node's `on_arrival`, then put it into the mailbox."""
         with self.arrival_lock:
             # A message that the predecessor has handled may be recovered from the sender's cache later.
             handover = self.handover
@@ -63,7 +63,7 @@ class RunningNode:
                 self.changed.notify()
 
     def receive_end(self, topic: str, instance: str, epoch: int, sent: int) -> None:
-        """Note that a producer has ended after `sent` messages."""
+        """Record that the producer `instance` of `topic` has ended after publishing `sent` messages."""
         with self.changed:
             self._ends.append((topic, instance, epoch, sent, time.monotonic() + _END_TIMEOUT_S))
             self.changed.notify()
@@ -76,7 +76,7 @@ class RunningNode:
     # --- called from the node's thread ---
 
     def next_envelope(self) -> Envelope | None:
-        """Return the next message, or None after `POLL_S` without one."""
+        """Return the next message for the node, or None after waiting `POLL_S` seconds without one."""
         with self.changed:
             self._apply_ends()
             envelope = self.mailbox.pop()
@@ -100,7 +100,7 @@ class RunningNode:
         self._ends = pending
 
     def emit(self, outputs: Iterator[Output]) -> None:
-        """Publish messages and start jobs; in standby, messages are held back."""
+        """Publish the messages and start the jobs in `outputs`; in standby, messages are stored instead."""
         for output in outputs:
             if isinstance(output, Job):
                 self.jobs.start(output).add_done_callback(lambda _: self.wake())
@@ -108,10 +108,10 @@ class RunningNode:
                 self.publications[output[0]].put(output[1])
 
     def emit_results(self, results: Iterator[tuple[str, Any]]) -> None:
-        """Hand the results of background jobs to the node and emit what it returns."""
+        """Pass the results of background jobs, as (name, result), to the node and emit its outputs."""
         for name, result in results:
             self.emit(self.node.handle_job(name, result))
 
     def finish_jobs(self) -> None:
-        """Wait for all background jobs and process their results."""
+        """Wait for all background jobs, pass their results to the node, and emit its outputs."""
         self.emit_results(self.jobs.remaining_results())

@@ -5,7 +5,7 @@ or after the message's stamp, or has ended. A stream whose newest stamp is more 
 newest stamp of all streams is not waited for, until its next message. Without a clock (lockstep) this depends
 on the data alone. With a clock (live), the stream must also have been silent for `timeout_ns` of that clock:
 messages that are only delayed, by a busy machine or by replay faster than real time, are waited for, and the
-order stays that of the stamps.
+order stays the order of the stamps.
 """
 
 from __future__ import annotations
@@ -49,7 +49,10 @@ class StampMerger:
         return (item for queue in self._queues.values() for _, item in queue)
 
     def put(self, stream: str, stamp_ns: int, item: Any) -> None:
-        """Queue an item. If stamps jump back within a stream, its order of arrival is kept."""
+        """Queue an item with its stamp (ns).
+
+        Items of one stream stay in order of arrival, even if their stamps decrease.
+        """
         now_ns = self._clock_ns() if self._clock_ns else 0
         if self._first_ns is None:
             self._first_ns = stamp_ns
@@ -62,7 +65,7 @@ class StampMerger:
         self._arrival_ns[stream] = now_ns
 
     def drop_oldest(self, stream: str) -> Any:
-        """Remove and return the oldest item of `stream`; for callers that limit the queue."""
+        """Remove and return the oldest queued item of `stream`; for callers that limit the queue's size."""
         return self._queues[stream].popleft()[1]
 
     def end(self, stream: str) -> None:

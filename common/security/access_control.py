@@ -64,7 +64,7 @@ def read_hosts(folder: Path) -> dict[str, HostRole]:
 def access_control(hosts: dict[str, HostRole]) -> dict[str, Any]:
     """Return Zenoh's `access_control` configuration for a router that other hosts connect to.
 
-    Processes of this host may do anything; other hosts get the permissions of their role.
+    Processes of this host may do anything; other hosts have the permissions of their role.
     """
     rules = [_rule("local", ["ingress", "egress"], _ANY, ["**", "**/@adv/**", "@/**", "@adv/**"])]
     subjects: list[dict[str, Any]] = [{"id": "local", "interfaces": ["lo"], "link_protocols": ["tcp"]}]
@@ -126,7 +126,10 @@ def _rule(id: str, flows: list[str], messages: list[str], keys: list[str]) -> di
 
 
 def _keys(robot: str, directions: tuple[str, ...]) -> tuple[list[str], list[str]]:
-    """Return the keys of a robot's uplink topics in these directions, and the keys of their recovery."""
+    """Return the key expressions of a robot's topics whose `uplink` is in `directions`.
+
+    They include the `@adv` keys, by which subscribers recover lost messages.
+    """
     names = [name for name, row in TOPICS.items() if row.uplink in directions]
     data = [f"{ROOT}/{robot}/{prefix}{name}" for name in names for prefix in ("", "end/")]
     return [*data, f"{ROOT}/{robot}/{HEALTH}/*"], [f"{key}/@adv/**" for key in data]

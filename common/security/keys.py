@@ -1,6 +1,6 @@
-"""Keys of a host for links to other hosts (mutual TLS), and the check that such links are protected.
+"""Keys of a host for links to other hosts (mutual TLS), and the check that these links are protected.
 
-A host's folder of keys, written by `beamsplat keys`, holds
+A host's folder of keys, written by `beamsplat keys`, contains
 
     ca.pem      certificate of the certificate authority that both sides trust
     host.pem    this host's certificate; its common name (CN) is the host's name

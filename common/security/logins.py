@@ -4,7 +4,7 @@ Logins are used where `security.local` names a folder. The supervisor that start
 once:
 
     users         one line name:password per user, for the router
-    NAME.login    one such line, for one node, the supervisor, or `operator` (the command line)
+    NAME.login    one line name:password, for one node, the supervisor, or `operator` (the command line)
 
 The files are readable by their owner only, and passwords never appear on a command line. The permissions of
 each user follow from the topic table (access_control.py).
@@ -43,7 +43,7 @@ class Login:
 
 
 def make_logins(folder: Path, names: tuple[str, ...]) -> None:
-    """Create logins for those of `names` that have none; existing ones are kept.
+    """Create a login for each of `names` that has no login yet; existing logins stay unchanged.
 
     Raises:
         UserError: the folder cannot be written, or a file in it is invalid.
@@ -117,7 +117,7 @@ def _lines(path: Path) -> dict[str, str]:
 
 
 def _write(path: Path, text: str) -> None:
-    """Replace a file by one that is created with mode 600: others can never read it."""
+    """Replace a file by a new file that is created with mode 600: other users can never read the text."""
     fresh = path.with_name(f".{path.name}")
     fresh.unlink(missing_ok=True)
     with os.fdopen(os.open(fresh, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:

@@ -31,7 +31,7 @@ _HEALTH_ROW = Topic(HEALTH, Health, (), 1, "every")
 
 @dataclass(frozen=True)
 class BridgeSessions:
-    """The Zenoh sessions that a bridge connects."""
+    """The three Zenoh sessions between which a bridge forwards messages."""
 
     robot: zenoh.Session  # client of the robot's own router
     edge: zenoh.Session  # client of the edge server's router, for small messages
@@ -40,14 +40,14 @@ class BridgeSessions:
 
 @dataclass
 class ForwardedTraffic:
-    """Messages and bytes of one topic that the bridge has forwarded."""
+    """Number of messages and of payload bytes that the bridge has forwarded on one topic."""
 
     messages: int = 0
     bytes: int = 0
 
 
 class Bridge:
-    """Forwards until its sessions are closed."""
+    """Forwards the topics with an `uplink` between robot and edge server, until its sessions are closed."""
 
     def __init__(self, robot: str, sessions: BridgeSessions) -> None:
         self._robot = robot
@@ -74,7 +74,7 @@ class Bridge:
                 self._forward_topic(row, sessions)
 
     def forwarded_up(self) -> dict[str, ForwardedTraffic]:
-        """Return what was forwarded from the robot to the edge server, by topic."""
+        """Return the numbers of messages and bytes forwarded from robot to edge server, by topic name."""
         return {
             name: c for name, c in self.forwarded.items() if name in TOPICS and TOPICS[name].uplink != "down"
         }

@@ -100,7 +100,7 @@ def router_config(
     """Return the configuration of a router.
 
     On endpoints for other hosts, hosts authenticate with certificates (mutual TLS); the topic table and
-    hosts.toml define what each of them may read and write.
+    hosts.toml define the keys that each host may read and write.
 
     Raises:
         UserError: an endpoint is malformed, or would be reachable from other hosts without TLS.
@@ -125,10 +125,15 @@ def open_session(
     endpoints: tuple[str, ...], wait_s: float = 15.0, should_stop: Callable[[], bool] = lambda: False,
     login: Login | None = None,
 ) -> zenoh.Session:  # fmt: skip
-    """Open a client session of the router at one of `endpoints`; retry for `wait_s` seconds.
+    """Open a client session to the router at one of `endpoints`; retry for `wait_s` seconds.
+
+    Args:
+        should_stop: called after each failed attempt; a True result ends the attempts early.
+        login: user name and password for a router that requires logins.
 
     Raises:
-        UserError: an endpoint is malformed, or no router answered in time or before `should_stop()` was True.
+        UserError: an endpoint is malformed, or no router answered before the time-out or before
+            `should_stop()` was True.
     """
     zenoh.init_log_from_env_or("error")
     config = _base_config("client")
@@ -153,7 +158,7 @@ def open_session(
 def open_link(
     endpoint: str, wait_s: float, security: SecurityConfig, buffer_bytes: int = URGENT_BUFFER_BYTES
 ) -> zenoh.Session:
-    """Open a client session of a router on another host, over a connection that can be slow and can break.
+    """Open a client session to a router on another host, over a connection that can be slow and can break.
 
     `buffer_bytes` limits the kernel's send buffer, and with it the delay of a message behind queued data.
 
@@ -187,7 +192,10 @@ def _verb_of(query: zenoh.Query) -> str:
 
 
 class Bus:
-    """Publications, subscriptions and queries of one node. A context manager that closes its session."""
+    """Publications, subscriptions and queries of one node; as a context manager, closes the session at exit.
+
+    `instance` identifies the process (16 hex digits); `epoch` increases with each process of the node.
+    """
 
     def __init__(self, session: zenoh.Session, robot: str, node: str, instance: str, epoch: int) -> None:
         self.session = session
@@ -205,7 +213,7 @@ class Bus:
         self.session.close()
 
     def publish(self, topic_name: str) -> Publication:
-        """Declare a publication of a topic."""
+        """Declare a publication of the topic `topic_name` and return it."""
         return Publication(self.session, self.producer, topic(topic_name), key(self.robot, topic_name))
 
     def subscribe(
@@ -215,12 +223,13 @@ class Bus:
         on_undecodable: Callable[[str, str], None],
         on_end: Callable[[str, str, int, int], None],
     ) -> None:
-        """Declare a subscription; the callbacks are called from threads of the bus.
+        """Declare a subscription to the input `entry`; the callbacks are called from threads of the bus.
 
         Args:
-            on_undecodable: called with (topic, reason) for a message that was discarded.
-            on_end: called with (topic, instance, epoch, sent) when a producer has ended after `sent`
-                messages.
+            on_envelope: called with each decoded message.
+            on_undecodable: called with (topic, reason) for each message that could not be decoded.
+            on_end: called with (topic, instance, epoch, sent) when a producer has published its
+                end-of-stream marker; `sent` is the number of messages that it has published.
         """
         delivery = entry.effective_delivery
         self._declared.append(
@@ -255,7 +264,7 @@ class Bus:
         threading.Thread(target=receive, name=f"end-{entry.topic}", daemon=True).start()
 
     def end(self, publication: Publication) -> None:
-        """Publish the end-of-stream marker of a publication."""
+        """Publish the end-of-stream marker of `publication`, with the number of messages published on it."""
         publisher = zenoh.ext.declare_advanced_publisher(
             self.session,
             key(self.robot, "end", publication.row.name),
@@ -269,16 +278,17 @@ class Bus:
         self._declared.append(publisher)
 
     def answer_queries(self, on_query: Callable[[str, zenoh.Query], None]) -> None:
-        """Declare control/<instance>/*, requests to this process; `announce` adds those to the node.
+        """Declare the keys control/<instance>/*, for requests to this process.
 
-        `on_query(name, query)` runs in a thread of the bus.
+        `announce` later declares the queries to the node. For both, `on_query(name, query)` is called from a
+        thread of the bus; `name` is "control/<verb>" for a request, else the name of the query.
         """
         self._on_query = on_query
         key_expr = key(self.robot, CONTROL, self.producer.instance, "*")
         self._answer(key_expr, lambda query: on_query(f"{CONTROL}/{_verb_of(query)}", query))
 
     def announce(self, queries: tuple[str, ...]) -> None:
-        """Show this process as the active node: declare its queries and its liveliness token."""
+        """Announce this process as the active node: declare its queries (names) and its liveliness token."""
         for name in queries:
             key_expr = key(self.robot, "query", self.producer.node, name)
             self._answer(key_expr, partial(self._on_query, name))
@@ -302,7 +312,7 @@ class Bus:
         threading.Thread(target=receive, name=f"query-{key_expr}", daemon=True).start()
 
     def watch_health(self, on_health: Callable[[Health], None]) -> None:
-        """Call `on_health` for the health of every node of this robot, from a thread of the bus."""
+        """Call `on_health` with each health report of any node of this robot, from a thread of the bus."""
         subscriber = self.session.declare_subscriber(
             key(self.robot, HEALTH, "*"), zenoh.handlers.FifoChannel(256)
         )
@@ -325,14 +335,14 @@ class Bus:
         threading.Thread(target=receive, name="watch-health", daemon=True).start()
 
     def publish_health(self, health: Health) -> None:
-        """Publish this node's health."""
+        """Publish a health report of this node."""
         self._health.put(health)
 
     def wait_for_subscribers(self, topic_names: tuple[str, ...], timeout_s: float) -> None:
-        """Block until this session knows a subscriber of each topic, at most for `timeout_s`.
+        """Block until this session knows a subscriber of each topic, at most for `timeout_s` seconds.
 
-        A session drops what it publishes before the declaration of the first subscriber has arrived, although
-        the subscribing node is already alive.
+        A session drops messages that it publishes before the declaration of the first subscriber has
+        arrived, although the subscribing node is already alive.
         """
         probes = [self.session.declare_publisher(key(self.robot, name)) for name in topic_names]
         deadline = time.monotonic() + timeout_s

@@ -20,7 +20,7 @@ _DISCOVERY_S = 2.0  # right after a (re)connection, queries to a running node ge
 def ask(
     session: zenoh.Session, robot: str, node: str, name: str, parameters: dict[str, str], timeout_s: float
 ) -> Iterator[Message]:
-    """Send a query to a node and yield its answers as they arrive.
+    """Send the query `name` with `parameters` to a node, and yield the answer messages as they arrive.
 
     Raises:
         UserError: no node answered this query in time, or the node rejected it.
@@ -76,9 +76,10 @@ def _ask(
 
 
 def reply(query: zenoh.Query, messages: Iterator[Message]) -> None:
-    """Answer a query with messages.
+    """Send `messages` as the answer to a query.
 
-    A ValueError (invalid parameters) is sent as an error reply: a query must not be able to stop a node.
+    A ValueError raised by the iterator (invalid parameters) is sent as an error reply and not raised here:
+    a query must not be able to stop a node.
     """
     with query:
         try:

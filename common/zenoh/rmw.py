@@ -27,12 +27,12 @@ _FIELD_NAMES = (b"sequence_number", b"source_timestamp", b"source_gid")
 
 
 def mangle(name: str) -> str:
-    """Return a name with "/" replaced by "%", as one part of a token."""
+    """Return `name` with "/" replaced by "%", for use as one part of a liveliness token."""
     return name.replace("/", "%")
 
 
 def demangle(part: str) -> str:
-    """Return the name from a part of a token."""
+    """Return the name in a part of a liveliness token, with "%" replaced by "/" (inverse of `mangle`)."""
     return part.replace("%", "/")
 
 
@@ -43,20 +43,21 @@ def dds_type(ros_type: str) -> str:
 
 
 def ros_type(dds: str) -> str | None:
-    """Return the ROS type name: sensor_msgs::msg::dds_::LaserScan_ -> sensor_msgs/msg/LaserScan; else
-    None.
+    """Return the ROS type name: sensor_msgs::msg::dds_::LaserScan_ -> sensor_msgs/msg/LaserScan.
+
+    Return None if `dds` does not have this form.
     """
     package, separator, name = dds.partition("::msg::dds_::")
     return f"{package}/msg/{name[:-1]}" if separator and name.endswith("_") else None
 
 
 def data_key(domain: int, topic: str, type_name: str, type_hash: str) -> str:
-    """Return the key of a topic's messages; `type_hash` may be "*" for a subscription."""
+    """Return the key expression of a ROS topic's messages; `type_hash` may be "*" for a subscription."""
     return f"{domain}/{topic.strip('/')}/{dds_type(type_name)}/{type_hash}"
 
 
 class RmwKey(NamedTuple):
-    """The parts of a message's key."""
+    """The parts of the key on which rmw_zenoh publishes a ROS message."""
 
     domain: str
     topic: str  # with a leading slash
@@ -65,7 +66,7 @@ class RmwKey(NamedTuple):
 
     @staticmethod
     def parse(key: str) -> RmwKey | None:
-        """Return the parts of a key; None if it is no key of a message."""
+        """Return the parts of `key`; None if `key` does not belong to a ROS message."""
         parts = key.split("/")
         type_name = ros_type(parts[-2]) if len(parts) >= 4 else None
         if type_name is None:
@@ -74,20 +75,21 @@ class RmwKey(NamedTuple):
 
 
 class RmwAttachment(NamedTuple):
-    """The metadata sent with a message."""
+    """The metadata that rmw_zenoh sends with each ROS message, as Zenoh's attachment."""
 
     sequence: int
     source_ns: int
     gid: bytes
 
     def pack(self) -> bytes:
-        """Return the 33 bytes that Zenoh's serializer writes for (int64, int64, bytes)."""
+        """Return the attachment: the 33 bytes that Zenoh's serializer writes for (int64, int64, bytes)."""
         return _ATTACHMENT.pack(self.sequence, self.source_ns, GID_BYTES, self.gid)
 
     @staticmethod
     def unpack(data: bytes) -> RmwAttachment | None:
-        """Parse the current format or that of late 2024; return None for others (messages are valid
-        without it).
+        """Parse an attachment in the current format or in the format of late 2024.
+
+        Return None for other formats; the message is valid without its attachment.
         """
         if len(data) == _ATTACHMENT.size:
             sequence, source_ns, length, gid = _ATTACHMENT.unpack(data)
@@ -101,7 +103,10 @@ class RmwAttachment(NamedTuple):
 
 @dataclass(frozen=True)
 class RmwQos:
-    """The quality of service settings in tokens. The defaults are rmw_zenoh's and are left out of tokens."""
+    """The quality of service settings in a liveliness token, which omits settings with default values.
+
+    The default values are rmw_zenoh's.
+    """
 
     best_effort: bool = False
     transient_local: bool = False
@@ -109,8 +114,10 @@ class RmwQos:
     depth: int = 42
 
     def text(self) -> str:
-        """Return reliability:durability:history,depth:deadline:lifespan:liveliness, numbered as in
-        rmw/types.h.
+        """Return the settings as text for a token.
+
+        The form is reliability:durability:history,depth:deadline:lifespan:liveliness, with the numbers of
+        the enumerations in rmw/types.h.
         """
         reliability = "2" if self.best_effort else ""
         durability = "1" if self.transient_local else ""
@@ -120,7 +127,7 @@ class RmwQos:
 
     @staticmethod
     def parse(text: str) -> RmwQos | None:
-        """Return the settings in a token's text; None if the text is invalid."""
+        """Return the settings in the QoS part of a token; None if the text is invalid."""
         parts = text.split(":")
         if len(parts) < 6 or "," not in parts[2]:
             return None
@@ -132,7 +139,7 @@ class RmwQos:
 
 @dataclass(frozen=True)
 class RmwEntity:
-    """A node, publisher or subscription in the ROS graph."""
+    """A node, publisher or subscription in the ROS graph, described by a liveliness token."""
 
     domain: int
     zid: str  # of the Zenoh session
@@ -148,7 +155,7 @@ class RmwEntity:
     qos: RmwQos = RmwQos()
 
     def token(self) -> str:
-        """Return the key of the liveliness token."""
+        """Return the key of this entity's liveliness token."""
         parts = [
             LIVELINESS_PREFIX, str(self.domain), self.zid, str(self.node_id), str(self.entity_id), self.kind,
             mangle(self.enclave), mangle(self.namespace), mangle(self.node_name),
@@ -158,13 +165,13 @@ class RmwEntity:
         return "/".join(parts)
 
     def gid(self) -> bytes:
-        """Return the XXH3 (128 bits) of the token, low half first."""
+        """Return the entity's global id, 16 bytes: the XXH3 hash (128 bits) of the token, low half first."""
         high_low = xxhash.xxh3_128_digest(self.token().encode())
         return high_low[8:][::-1] + high_low[:8][::-1]
 
     @staticmethod
     def parse(token: str) -> RmwEntity | None:
-        """Return the entity of a token; None for unsupported tokens (services, other versions)."""
+        """Return the entity described by `token`; None for unsupported tokens (services, other versions)."""
         parts = token.split("/")
         if len(parts) < 9 or parts[0] != LIVELINESS_PREFIX or not (parts[1] + parts[3] + parts[4]).isdigit():
             return None

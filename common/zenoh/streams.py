@@ -82,7 +82,7 @@ class Producer:
 
 
 class Publication:
-    """Publication of one topic. `put` is thread-safe."""
+    """Publication of one topic, with the counts of sent messages and bytes. `put` is thread-safe."""
 
     def __init__(self, session: zenoh.Session, producer: Producer, row: Topic, key_expr: str) -> None:
         self._producer = producer
@@ -150,7 +150,7 @@ class Subscription:
 
 
 def decode_sample(sample: zenoh.Sample, row: Topic) -> Envelope:
-    """Decode a Zenoh sample of the topic `row`.
+    """Decode a Zenoh sample received on the topic `row`, and return it as an envelope.
 
     Raises:
         DecodeError: no header, too large, the schema of another message, or an undecodable payload.
