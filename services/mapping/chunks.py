@@ -1,4 +1,4 @@
-"""Publication of chunks: which version and level of detail viewers have, and which chunk to publish next."""
+"""Publication of chunks: version and level of detail of published chunks, and which chunk to publish next."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _NEVER = (-1, 0.0, -1)  # version, cell and time of a chunk that has not been pu
 
 @dataclass(frozen=True)
 class ChunkUpdate:
-    """A chunk to publish: Gaussians in the anchor's frame, merged in cells of `cell_m`; 0 = full detail."""
+    """A chunk to publish: Gaussians in the anchor frame, merged in cells of edge `cell_m` (0: no merging)."""
 
     version: int
     cell_m: float
@@ -27,7 +27,7 @@ class ChunkUpdate:
 
 @dataclass(frozen=True)
 class Viewpoint:
-    """The viewpoint from which the level of detail is chosen."""
+    """The viewpoint of a viewer, from which the level of detail is chosen."""
 
     at_map_m: np.ndarray  # [3]
     focal_px: float
@@ -35,11 +35,10 @@ class Viewpoint:
 
 
 class ChunkFeed:
-    """The chunks published so far, and which are due.
+    """Record of the published chunks, which determines the chunks that are due.
 
-    A chunk is due when it has changed, or when a nearer viewpoint shows more detail.
-    Detail that has been published is kept when the viewpoint moves away: publishing less detail again would
-    cost bandwidth.
+    A chunk is due when it has changed, or when a nearer viewpoint shows more detail than was published. When
+    the viewpoint moves away, the chunk is not published again with less detail: this would cost bandwidth.
     """
 
     def __init__(self) -> None:
@@ -47,7 +46,7 @@ class ChunkFeed:
         self._clock = 0
 
     def take_update(self, mapper: Mapper, anchor: int, viewpoint: Viewpoint | None) -> ChunkUpdate | None:
-        """Return the chunk of an anchor and mark it as published; None if viewers have all visible detail.
+        """Return the chunk of an anchor and mark it as published; None if no new detail is visible.
 
         Args:
             viewpoint: chooses the level of detail; None for full detail.
@@ -78,7 +77,7 @@ class ChunkFeed:
 
 
 def chunk_snapshot(mapper: Mapper, viewpoint: Viewpoint | None) -> dict[int, ChunkUpdate]:
-    """Return the chunks of the whole map by anchor, at the detail for a viewpoint; None for full detail."""
+    """Return the chunks of the whole map by anchor, with the detail visible from `viewpoint` (None: all)."""
     out = {}
     for anchor, version in mapper.store.versions().items():
         cell_m = _cell_m(mapper, anchor, viewpoint)
@@ -87,13 +86,16 @@ def chunk_snapshot(mapper: Mapper, viewpoint: Viewpoint | None) -> dict[int, Chu
 
 
 def disk_params(mapper: Mapper, anchor: int) -> Iterator[np.ndarray]:
-    """Yield an anchor's Gaussians that are on disk only, float32 [14, N] each, in the map frame."""
+    """Yield the Gaussians of an anchor that are on disk only: arrays float32 [14, N], map frame."""
     if mapper.disk_gaussians is not None:
         yield from mapper.disk_gaussians.read(anchor, mapper.T_map_anchor[anchor])
 
 
 def _cell_m(mapper: Mapper, anchor: int, viewpoint: Viewpoint | None) -> float:
-    """Return the cell edge (m) for the distance to the nearest Gaussian; 0 without a viewpoint."""
+    """Return the edge (m) of the cells in which Gaussians of an anchor are merged; 0 without a viewpoint.
+
+    It grows with the distance from the viewpoint to the nearest Gaussian of the anchor.
+    """
     if viewpoint is None:
         return 0.0
     store, at_m = mapper.store, viewpoint.at_map_m

@@ -13,8 +13,9 @@ Steps = Annotated[int, Field(ge=0, le=100_000)]
 
 
 class MappingConfig(NodeConfig):
-    """Options of the mapping service. The work per keyframe and per tick is fixed. `threads`: of the
-    rasterizer.
+    """Options of the mapping service. The work per keyframe and per tick is fixed.
+
+    `threads` is the number of threads of the rasterizer.
     """
 
     nice: Annotated[int, Field(ge=0, le=19)] = 5  # lower CPU priority than the services that feed the map
@@ -37,5 +38,5 @@ class MappingConfig(NodeConfig):
     session_every_s: Annotated[float, Field(gt=0.0)] = 30.0  # between checkpoints, in time of the data
 
     def gaussians(self) -> int:
-        """Return the limit on the number of Gaussians: by default 300 000, with `memory_mb` 20 million."""
+        """Return `max_gaussians`, by default 300 000 without `memory_mb`, else 20 million."""
         return self.max_gaussians or (300_000 if self.memory_mb is None else 20_000_000)

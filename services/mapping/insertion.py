@@ -18,7 +18,7 @@ def unexplained_pixels(
     level: PyramidLevel,
     settings: MapperSettings,
 ) -> np.ndarray:
-    """Return bool [H, W]: low alpha, wrong colour, or a depth that differs from a trusted measurement."""
+    """Return bool [H, W]: pixels where the render is transparent, or its colour or trusted depth is wrong."""
     alpha = image[4]
     rgb = level.rgb.astype(np.float32) * np.float32(1 / 255)
     # Averaged over 5 px: edges displaced by half a pixel are left to the optimiser.
@@ -37,7 +37,11 @@ def new_gaussians(
     T_map_camera: np.ndarray,
     settings: MapperSettings,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return (u int [N], v int [N], Gaussians float32 [14, N]) for missing pixels with a known depth."""
+    """Create Gaussians at a subset of the `missing` pixels with a known depth.
+
+    Returns:
+        u and v, int [N] each: the pixels (px). The Gaussians, float32 [14, N], in the map frame.
+    """
     s = settings
     grey = level.rgb.astype(np.float32).mean(axis=0) * np.float32(1 / 255)
     texture = s.texture * 8.0 / s.stride_px  # the Sobel response is 8 times the step to the next pixel
@@ -53,13 +57,15 @@ def new_gaussians(
 
 
 def prediction_quality(image: np.ndarray, level: PyramidLevel) -> tuple[float, float]:
-    """Return how well the map predicts a new image, before it is inserted.
+    """Compare the render of the map with a new image, before the image is inserted.
 
     Args:
-        image: float32 [5, H, W], the render of the map from the new viewpoint.
+        image: float32 [5, H, W], the render at the pose of the image: r, g, b, accumulated depth, alpha.
+        level: the new image.
 
     Returns:
-        The covered fraction of the pixels, and the PSNR (dB) there; NaN if less than 1 % is covered.
+        The fraction of the pixels that the map covers, and the PSNR (dB) of the render at these pixels; NaN
+        if less than 1 % is covered.
     """
     covered = image[4] > _COVERED_ALPHA
     if level.hidden is not None:

@@ -1,4 +1,4 @@
-"""Inserts keyframe messages into the mapper; keeps what was inserted and rejected, and the map's identity."""
+"""Insertion of keyframe messages into the mapper, and records: inserted and rejected ids, map UUID."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from beamsplat.services.mapping.messages import decode_keyframe
 
 log = logging.getLogger("beamsplat.mapping")
 
-_MAX_REJECTIONS = 10_000  # reasons kept; a keyframe that is sent again later is examined again
+_MAX_REJECTIONS = 10_000  # reasons stored; a keyframe that is sent again later is examined again
 
-LoadVisible = Callable[[StoredKeyframe], None]  # brings the Gaussians that a keyframe sees into memory
+LoadVisible = Callable[[StoredKeyframe], None]  # pages in the Gaussians that a keyframe observes
 
 
 class KeyframeIntake:
-    """Inserts keyframe messages into a mapper and remembers what later messages and exports need of them."""
+    """Inserts keyframe messages into a mapper; stores their stamps, camera mountings and rejections."""
 
     def __init__(self, mapper: Mapper) -> None:
         self.mapper = mapper
@@ -40,7 +40,7 @@ class KeyframeIntake:
         return id in self._inserted or self.mapper.was_inserted(id)
 
     def insert(self, message: Keyframe, load_visible: LoadVisible | None = None) -> InsertionResult:
-        """Decode a keyframe and insert it; the result's status says why it was not inserted."""
+        """Decode a keyframe and insert it; `status` of the result is "ok", or why it was not inserted."""
         if reason := self.other_map(message.map_uuid):
             return InsertionResult(reason)
         try:
@@ -56,14 +56,17 @@ class KeyframeIntake:
         return outcome
 
     def reject(self, id: int, reason: str) -> None:
-        """Remember and log why a keyframe was not inserted."""
+        """Store and log the reason why a keyframe was not inserted."""
         self.rejections[id] = reason
         if len(self.rejections) > _MAX_REJECTIONS:
             del self.rejections[next(iter(self.rejections))]
         log.warning("keyframe %d is rejected: %s", id, reason)
 
     def other_map(self, uuid: str) -> str:
-        """Return why data of the robot map `uuid` cannot be used, "" if it can; the first uuid is adopted."""
+        """Return why data of the robot's map `uuid` cannot be used, "" if usable.
+
+        The first non-empty UUID becomes the UUID of this map.
+        """
         if uuid and self.map_uuid and uuid != self.map_uuid:
             return (
                 f"it belongs to the robot's map {uuid[:8]}, this map to {self.map_uuid[:8]}: start "
@@ -73,9 +76,12 @@ class KeyframeIntake:
         return ""
 
     def move_anchors(self, T_map_anchor: dict[int, np.ndarray]) -> list[int]:
-        """Move Gaussians and keyframes with their anchors; return the anchors given, [] where none moved.
+        """Set new poses of anchors; Gaussians and keyframes move with their anchors.
 
         Keyframes anchored to the odom origin move with the oldest submap, which was started there.
+
+        Returns:
+            The ids of all anchors that were passed (and of the odom origin), or [] if no pose has changed.
         """
         poses = dict(T_map_anchor)
         origin = self.mapper.T_map_anchor.get(ODOM_ORIGIN)
@@ -87,7 +93,7 @@ class KeyframeIntake:
         return list(poses) if self.mapper.move_anchors(poses) else []
 
     def stored(self) -> dict[int, StoredKeyframe]:
-        """Return all keyframes of the map by id, those paged out to disk included."""
+        """Return all keyframes of the map by id, including keyframes that are paged out to disk."""
         return self.mapper.keyframes | self.mapper.paged_out
 
     def poses(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -101,7 +107,7 @@ class KeyframeIntake:
     # --- as arrays, beside the mapper's own state ---
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """Return what a later process needs, for a checkpoint."""
+        """Return the records of inserted keyframes and the map UUID as arrays, for a checkpoint."""
         ids = list(self._inserted)
         origin = [] if self._T_oldest_origin is None else [self._T_oldest_origin]
         return {
@@ -113,7 +119,7 @@ class KeyframeIntake:
         }
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        """Take over what `arrays` of an earlier process returned; an empty table changes nothing."""
+        """Restore the records from the result of `arrays` of an earlier process; no effect if empty."""
         if not arrays:
             return
         rows = zip(arrays["taken_stamp_ns"].tolist(), arrays["taken_T_camera_body"])

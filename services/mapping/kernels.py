@@ -22,18 +22,24 @@ def photometric_and_depth(
     gradient: np.ndarray,
     sums: np.ndarray,
 ) -> None:
-    """Compute the L1 losses of colour (after exposure) and depth with their gradients; threads take image
-    rows.
+    """Compute the L1 losses of colour (after exposure) and of depth, and their gradients.
+
+    The depth term is weight * depth_scale * |D - d alpha|, with the accumulated depth D (channel 3 of
+    `image`) and the measured depth d (m). It is zero at the right depth, for any opacity. Every thread runs
+    this function and processes the next image row until no row is left.
 
     Args:
-        image: float32 [5, H, W] as rendered. rgb: uint8 [3, H, W]. depth_mm: uint16 [H, W], 0 unknown.
-        depth_weight: uint8 [H, W], 255 = weight 1. exposure: float32 [6], log gains and offsets.
-        colour_scale, depth_scale: factors of the two terms per pixel.
-        gradient: float32 [5, H, W], overwritten. sums: float64 [H, 8]: per row |colour error|, weighted
-            |depth error| (m), weights, and dL/dgain, dL/doffset of the three channels summed (last 4 unused).
-
-    The depth term is w |sum w_i z_i - d alpha| (m): zero where the surface
-    is at the right depth, independent of its opacity.
+        counter: number of the next row, shared by the threads.
+        image: float32 [5, H, W], the render: red, green, blue in [0, 1], accumulated depth (m), alpha.
+        rgb: uint8 [3, H, W], image of the keyframe.
+        depth_mm: uint16 [H, W], measured optical z, 0 = unknown.
+        depth_weight: uint8 [H, W], 255 = weight 1.
+        exposure: float32 [6], log gains of red, green, blue, then offsets of red, green, blue (not log). The
+            rendered colour is compared after exp(log gain) * colour + offset.
+        colour_scale, depth_scale: factors of the two losses, per pixel.
+        gradient: out float32 [5, H, W], derivative of the loss with respect to `image`.
+        sums: out float64 [H, 8], per row: sum of |colour error| (0), depth loss (1), derivatives of the loss
+            with respect to the log gains (2 to 4) and the offsets (5 to 7).
     """
     height, width = image.shape[1], image.shape[2]
     to_unit = np.float32(1.0 / 255.0)
@@ -74,10 +80,14 @@ def photometric_and_depth(
 def add_lidar(
     image: np.ndarray, pixels: np.ndarray, z_m: np.ndarray, scale: np.float32, gradient: np.ndarray
 ) -> float:
-    """Add the gradient of scale * |rendered - measured depth| at the flat pixel indices int32 [N] of lidar
-    beams.
+    """Add the loss of the lidar beams to the gradient; return the loss.
 
-    Returns the loss.
+    The loss is scale * |D - z alpha|, summed over the beams, with the accumulated depth D of the render.
+
+    Args:
+        image: float32 [5, H, W], the render: red, green, blue, accumulated depth (m), alpha.
+        pixels: int32 [N], flat pixel indices of the beams. z_m: float32 [N], their measured optical z.
+        gradient: in out float32 [5, H, W].
     """
     flat, g = image.reshape(5, -1), gradient.reshape(5, -1)
     total = 0.0
@@ -102,10 +112,11 @@ def count_carving_votes(
     margin: float,
     votes: np.ndarray,
 ) -> int:
-    """Add 1 to votes[i] for each Gaussian whose centre floats in front of a trusted surface; return how many.
+    """Add 1 to votes[i] for each Gaussian i that floats in front of a trusted surface; return their number.
 
     A Gaussian at optical z is floating if the depth d of its pixel is trusted (weight >= least_weight) and
-    z + 3 sigma < d (1 - margin). `camera` is packed as for the rasterizer.
+    z + 3 sigma < d (1 - margin), with its largest standard deviation sigma. Only the first `count` columns of
+    `params` float32 [14, N] are tested. `camera` is the result of RasterCamera.packed().
     """
     height, width = depth_mm.shape
     c, voted = camera, 0

@@ -1,4 +1,4 @@
-"""Keyframes: as decoded for the mapper, and compressed as the mapper stores them."""
+"""Keyframes in two forms: decoded from a message, and compressed in the map of the mapper."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class RgbdKeyframe:
     mask: np.ndarray | None = None  # bool [H, W], False = dynamic object, not used
 
     def fault(self) -> str | None:
-        """Return why the keyframe cannot be mapped, as one sentence; None if it can."""
+        """Return the reason why the keyframe is invalid, as one sentence; None if it is valid."""
         shape = (self.camera.height_px, self.camera.width_px)
         if self.rgb.shape != (*shape, 3) or self.rgb.dtype != np.uint8:
             got = f"{self.rgb.dtype} {list(self.rgb.shape)}"
@@ -72,7 +72,7 @@ class PyramidLevel:
 
 @dataclass
 class StoredKeyframe:
-    """A keyframe in the map. `levels[0]` is full size, `levels[1]` half size.
+    """A keyframe in the map. `levels[0]` has full size, `levels[1]` half size.
 
     Field names other than `levels` are array names in saved sessions (`keyframe_<name>`).
     """
@@ -96,11 +96,10 @@ class StoredKeyframe:
 
 
 def compress(frame: RgbdKeyframe, sigma_unit: float) -> StoredKeyframe:
-    """Return the stored form of a keyframe without fault: two pyramid levels with quantised depth and
-    weights.
+    """Compress a valid keyframe to two pyramid levels with quantised depth and weights.
 
-    The weight of a depth is 1 / (1 + (r / sigma_unit)^2), where r is sigma over depth: relative, so that
-    distant walls count as much as near ones.
+    The weight of a depth is 1 / (1 + (r / sigma_unit)^2), where r is the standard deviation divided by the
+    depth: a relative error, so that distant walls have the same weight as near walls.
     """
     with np.errstate(invalid="ignore"):
         known = np.isfinite(frame.depth_m) & (frame.depth_m > _MIN_DEPTH_M) & (frame.depth_m < MAX_DEPTH_M)
@@ -133,7 +132,8 @@ def compress(frame: RgbdKeyframe, sigma_unit: float) -> StoredKeyframe:
 def visible_range_m(frame: RgbdKeyframe) -> float:
     """Return the optical z (m) beyond which the keyframe observes nothing, from its largest depth.
 
-    At least `_UNKNOWN_REACH_M` if more than 5 % of the image has no depth: it may show a door or a window.
+    It is at least `_UNKNOWN_REACH_M` if more than 5 % of the image has no depth: these pixels may show the
+    space behind a door or a window.
     """
     with np.errstate(invalid="ignore"):
         known = (frame.depth_m > _MIN_DEPTH_M) & (frame.depth_m < MAX_DEPTH_M)
@@ -145,12 +145,11 @@ def visible_range_m(frame: RgbdKeyframe) -> float:
 
 
 def with_hidden(level: PyramidLevel, image: np.ndarray, exposure: np.ndarray) -> PyramidLevel:
-    """Return the level with its hidden pixels replaced by the render, so that they add no error to SSIM
-    windows.
+    """Return the level with the colour of hidden pixels replaced by the render: they add no error to SSIM.
 
     Args:
-        image: float32 [5, H, W] as rendered.
-        exposure: float32 [6], log gains and offsets.
+        image: float32 [5, H, W], the render: red, green, blue, accumulated depth, alpha.
+        exposure: float32 [6], log gains of red, green, blue, then offsets of red, green, blue (not log).
     """
     if level.hidden is None:
         return level
@@ -168,9 +167,10 @@ def refine_pose(
     """Update the pose correction by one step of Adam: T_map_camera <- T_map_camera @ exp(-step).
 
     Args:
-        gradient: float [6], with respect to a left perturbation of T_camera_map (rho, phi).
-        rates: step sizes in m and rad.
-        limits: largest correction per axis in m and rad.
+        gradient: float [6], derivative of the loss with respect to a left perturbation (rho, phi) of
+            T_camera_map.
+        rates: step sizes of position (m) and rotation (rad).
+        limits: largest total correction per axis, in m and rad.
     """
     # T_camera_map <- exp(xi) T_camera_map moves T_map_camera on the right by exp(-xi).
     keyframe.pose_steps += 1
@@ -182,7 +182,7 @@ def refine_pose(
 
 
 def refine_exposure(keyframe: StoredKeyframe, sums: np.ndarray, rate: float) -> None:
-    """Update the exposure's gains and offsets by one step of Adam.
+    """Update the log gains and the offsets of the exposure by one step of Adam.
 
     Args:
         sums: float64 [rows, 8] of `photometric_and_depth`; columns 2 to 7 are the gradient.
@@ -203,7 +203,11 @@ def _adam_step(gradient: np.ndarray, first: np.ndarray, second: np.ndarray, t: i
 
 
 def _beams_at(uvz: np.ndarray, full: RasterCamera, camera: RasterCamera) -> tuple[np.ndarray, np.ndarray]:
-    """Return flat pixel indices int32 and z float32 of the beams that fall into a resized image."""
+    """Project lidar beams float [N, 3] (px, px, m) of the full image into a resized image.
+
+    Returns:
+        Flat pixel indices int32 and optical z float32 (m) of the beams inside the image.
+    """
     if len(uvz) == 0:
         return np.zeros(0, np.int32), np.zeros(0, np.float32)
     u = np.round((uvz[:, 0] + 0.5) * camera.width_px / full.width_px - 0.5).astype(int)

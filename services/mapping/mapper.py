@@ -39,7 +39,10 @@ _MAX_DROPPED_IDS = 4096  # ids of dropped keyframes remembered; a robot's queue 
 
 @dataclass(frozen=True)
 class InsertionResult:
-    """The result of an insertion. `status` is "ok", or why the keyframe was refused (map unchanged)."""
+    """The result of inserting a keyframe: numbers of Gaussians, and the prediction by the map before.
+
+    `status` is "ok", or the reason why the keyframe was rejected and the map did not change.
+    """
 
     status: str
     inserted: int = 0
@@ -85,14 +88,14 @@ class Mapper:
         T_map_anchor: np.ndarray | None = None,
         load_visible: Callable[[StoredKeyframe], None] | None = None,
     ) -> InsertionResult:
-        """Insert a keyframe: carving, pruning and insertion of Gaussians. `optimise` is separate.
+        """Insert a keyframe: remove floating and faint Gaussians, add new ones. Call `optimise` afterwards.
 
         Args:
             T_map_anchor: pose of the keyframe's anchor; used only if the anchor is new.
             load_visible: called before the map changes; pages in the Gaussians that the keyframe observes.
 
         Returns:
-            "ok" without any effect if the id was inserted before.
+            The result; "ok" without any effect if a keyframe with this id was inserted before.
         """
         if self.was_inserted(frame.id):
             return InsertionResult("ok")
@@ -117,11 +120,11 @@ class Mapper:
         return id in self.keyframes or id in self.paged_out
 
     def was_inserted(self, id: int) -> bool:
-        """Return whether a keyframe is in the map, or was in it and has been dropped."""
+        """Return whether a keyframe is in the map, or was in the map and has been dropped."""
         return self.contains(id) or id in self._dropped
 
     def forget(self, id: int) -> None:
-        """Remove a paged-out keyframe for good: its file cannot be read."""
+        """Remove a paged-out keyframe whose file cannot be read."""
         self.paged_out.pop(id, None)
         self._bins.remove(id)
 
@@ -132,12 +135,12 @@ class Mapper:
 
     @property
     def workspace_bytes(self) -> int:
-        """Return the bytes of the buffers for rendering and losses."""
+        """Return the size of the buffers for rendering and losses, in bytes."""
         losses = sum(array.nbytes for pair in self._buffers.values() for array in pair)
         return self.rasterizer.allocated_bytes + self._ssim.allocated_bytes + losses
 
     def _drop_redundant(self) -> None:
-        """Drop keyframes until one more fits: random ones of the fullest pose bin. Their Gaussians stay."""
+        """Drop random keyframes of the fullest pose bin until one more fits; their Gaussians stay."""
         while len(self.keyframes) + len(self.paged_out) >= self.settings.max_keyframes:
             old = self._bins.fullest(set(self._newest)) or sorted(self.keyframes)
             gone = old[int(self._random.integers(len(old)))]
@@ -170,10 +173,10 @@ class Mapper:
         return self.T_map_anchor[keyframe.anchor] @ keyframe.T_anchor_refined()
 
     def move_anchors(self, T_map_anchor: dict[int, np.ndarray]) -> int:
-        """Set new poses of anchors and transform their Gaussians rigidly.
+        """Set new poses of anchors (float64 [4, 4]) and move the Gaussians rigidly with their anchors.
 
         Returns:
-            How many known anchors changed their pose.
+            The number of known anchors whose pose has changed.
 
         Raises:
             ValueError: a pose is not a rigid transform; then nothing has changed.
@@ -230,8 +233,9 @@ class Mapper:
         return InsertionResult("ok", new.shape[1], 0, *known)
 
     def _in_free_space(self, params: np.ndarray) -> np.ndarray:
-        """Return bool [N]: Gaussians float32 [14, N] in front of a trusted surface of one of the newest
-        keyframes.
+        """Return bool [N]: Gaussians that float in front of a trusted surface of one of the newest keyframes.
+
+        `params` are the Gaussians, float32 [14, N] in the map frame.
         """
         votes = np.zeros(params.shape[1], np.int32)
         for id in self._newest:
@@ -241,7 +245,7 @@ class Mapper:
     def _vote_carving(
         self, keyframe: StoredKeyframe, params: np.ndarray, count: int, votes: np.ndarray
     ) -> None:
-        """Add a keyframe's carving votes on the first `count` Gaussians to `votes` int32 [N]."""
+        """Add the carving votes of a keyframe to `votes` int32 [N], for the first `count` Gaussians."""
         level, s = keyframe.levels[HALF], self.settings
         packed = level.camera.packed(inverse(self.T_map_camera(keyframe)))
         least = np.uint8(255.0 * s.carve_weight)
@@ -250,7 +254,7 @@ class Mapper:
         )
 
     def _prune(self, keyframe: StoredKeyframe) -> int:
-        """Remove faint Gaussians, and those with enough carving votes; return how many."""
+        """Remove faint Gaussians and Gaussians with enough carving votes; return the number removed."""
         s, store = self.settings, self.store
         self._vote_carving(keyframe, store.params, store.count, store.carving_votes)
         faint = np.log(s.prune_opacity / (1.0 - s.prune_opacity))
@@ -263,7 +267,10 @@ class Mapper:
     # --- optimisation ------------------------------------------------------------------------------
 
     def optimise(self, half: int | None = None, full: int | None = None) -> float:
-        """Run the fixed steps per keyframe, at half size, then at full size; return the mean loss."""
+        """Do `half` steps at half size, then `full` at full size, on random keyframes; return the mean loss.
+
+        The defaults are the numbers of steps per keyframe in the settings.
+        """
         half = self.settings.half_iterations if half is None else half
         full = self.settings.full_iterations if full is None else full
         if not self.keyframes or self.store.count == 0:
@@ -273,7 +280,7 @@ class Mapper:
         return float(np.mean(losses)) if losses else 0.0
 
     def refine(self, iterations: int, size: int = FULL) -> float:
-        """Run steps on all keyframes in random order, each equally often; return the mean loss."""
+        """Do `iterations` steps on keyframes in random order, each equally often; return the mean loss."""
         ids: list[int] = []
         losses: list[float] = []
         for _ in range(iterations):
@@ -288,7 +295,10 @@ class Mapper:
         return self.keyframes[pool[int(self._random.integers(len(pool)))]]
 
     def step(self, keyframe: StoredKeyframe, size: int, *, refining: bool = False) -> float:
-        """Run one step on a keyframe: render, loss, backward, Adam; return the loss."""
+        """Optimise by one step on a keyframe (render, loss, backward pass, Adam); return the loss.
+
+        `size` is FULL or HALF; `refining` selects the lower step size of the centres.
+        """
         level = keyframe.levels[size]
         T_map_camera = self.T_map_camera(keyframe)
         render = self._render(level, T_map_camera)
@@ -320,7 +330,11 @@ class Mapper:
     def _loss(
         self, render: Render, level: PyramidLevel, keyframe: StoredKeyframe
     ) -> tuple[float, np.ndarray, np.ndarray]:
-        """Return (loss, its gradient float32 [5, H, W], sums per row float64 [H, 8])."""
+        """Compute the loss of a render against a pyramid level of a keyframe.
+
+        Returns:
+            Loss; gradient float32 [5, H, W]; sums float64 [H, 8], see `kernels.photometric_and_depth`.
+        """
         s, (h, w) = self.settings, level.depth_mm.shape
         if (h, w) not in self._buffers:
             self._buffers[h, w] = np.empty((5, h, w), np.float32), np.empty((h, 8))

@@ -24,12 +24,12 @@ _PIECE_BYTES = 4 << 20  # of a state in one message
 
 
 def ack(message: Keyframe, status: str) -> tuple[str, KeyframeAck]:
-    """Return (topic, message) that acknowledges a keyframe; `status` is "ok" or why it was refused."""
+    """Return topic and message that acknowledge a keyframe; `status` is "ok" or why it was rejected."""
     return "keyframes/ack", KeyframeAck(stamp_ns=message.stamp_ns, id=message.id, status=status)
 
 
 def encode_keyframe(message: Keyframe) -> tuple[str, bytes]:
-    """Return (schema, payload) of a keyframe, as a session stores it."""
+    """Encode a keyframe message to (schema, payload), the format of keyframe files in a session."""
     return schema_of(message), encode(message)
 
 
@@ -37,7 +37,7 @@ def decode_keyframe(message: Keyframe, lens: Callable[[Pinhole], Undistorter]) -
     """Decode and undistort a keyframe message: all later stages use a pinhole camera.
 
     Args:
-        lens: makes the undistorter of a camera model; may cache it.
+        lens: returns the undistorter of a camera model, for example from a cache.
 
     Raises:
         UserError, ValueError: image, depth, sigma or mask cannot be decoded or have the wrong size.
@@ -59,7 +59,7 @@ def decode_keyframe(message: Keyframe, lens: Callable[[Pinhole], Undistorter]) -
 
 
 def preview_message(keyframe: Keyframe, view: KeyframeRender) -> MapPreview:
-    """Return the preview of a keyframe with its render as JPEG."""
+    """Return the preview message of a keyframe: the render of the map at its pose, as JPEG."""
     bgr = cv2.cvtColor(view.rgb, cv2.COLOR_RGB2BGR)
     render = cv2.imencode(".jpg", bgr, (cv2.IMWRITE_JPEG_QUALITY, 85))[1].ravel()
     return MapPreview(
@@ -68,7 +68,7 @@ def preview_message(keyframe: Keyframe, view: KeyframeRender) -> MapPreview:
 
 
 def chunk_message(T_map_anchor: np.ndarray, anchor: int, update: ChunkUpdate, stamp_ns: int) -> MapChunk:
-    """Return the message of a chunk, with packed Gaussians."""
+    """Return the message of the chunk of an anchor, with packed Gaussians."""
     return MapChunk(
         stamp_ns=stamp_ns, anchor_id=anchor, revision=update.version, cell_m=update.cell_m,
         T_map_anchor=T_map_anchor, count=update.params.shape[1], packed=pack(update.params),
@@ -76,7 +76,7 @@ def chunk_message(T_map_anchor: np.ndarray, anchor: int, update: ChunkUpdate, st
 
 
 def state_messages(arrays: Arrays) -> Iterator[MapState]:
-    """Yield a state in pieces of at most 4 MiB."""
+    """Yield the arrays of a saved map as messages of at most 4 MiB each."""
     blob = packed_arrays(arrays)
     for first in range(0, len(blob), _PIECE_BYTES):
         piece = np.frombuffer(blob[first : first + _PIECE_BYTES], np.uint8)
@@ -84,7 +84,7 @@ def state_messages(arrays: Arrays) -> Iterator[MapState]:
 
 
 def joined_state(pieces: list[MapState]) -> Arrays:
-    """Return the state from its pieces, received in any order.
+    """Join the messages of `state_messages`, in any order, to the arrays of a saved map.
 
     Raises:
         UserError: some bytes are missing.
@@ -99,7 +99,7 @@ def joined_state(pieces: list[MapState]) -> Arrays:
 
 
 def viewpoint_of(parameters: dict[str, str]) -> Viewpoint | None:
-    """Return the viewpoint in the parameters of a query; None without one.
+    """Return the viewpoint in the parameters of a query; None without the parameter `from`.
 
     Raises:
         UserError: a parameter is missing or not a number.

@@ -46,8 +46,8 @@ log = logging.getLogger("beamsplat.mapping")
 class MappingNode(Node):
     """Inserts keyframes, in any order of arrival, and optimises the map.
 
-    With a session a keyframe is acknowledged as soon as it is on this disk, without one when it is in
-    the map.
+    With a session, a keyframe is acknowledged as soon as it is stored in the session on disk; without a
+    session, as soon as it is in the map.
     """
 
     name = "mapping"
@@ -93,7 +93,7 @@ class MappingNode(Node):
     # --- hand-over ---
 
     def handover_obstacle(self, before: Node) -> str:
-        """The map is handed over in the session: both processes need the same one."""
+        """Return why the map of the node `before` cannot be taken over: both need the same session."""
         assert isinstance(before.config, MappingConfig)  # `before` is a node of this class
         own, other = self.config.session, before.config.session
         if other is None:
@@ -103,19 +103,19 @@ class MappingNode(Node):
         return super().handover_obstacle(before)
 
     def hand_over(self) -> None:
-        """Save the map into the session and release it for the successor."""
+        """Save the map in the session and close the session, so that the successor can open it."""
         self._session.save()
         self._session.close()
 
     def take_over(self) -> None:
-        """Open the session, if one is configured, and resume from it."""
+        """Open the session, if one is configured, and load the map from the session."""
         if self.config.session is not None:
             self._session = LiveSession(self.config, self._intake, resume_known=self.in_standby)
 
     # --- keyframes ---
 
     def on_arrival(self, topic: str, message: Message) -> Outputs:
-        """Acknowledge a keyframe before its turn, once it is on the session's disk."""
+        """Write a received keyframe to the session and acknowledge it, before it is processed."""
         if isinstance(self._session, NoSession) or not isinstance(message, Keyframe):
             return
         reason = self._intake.rejections.get(message.id)
@@ -123,7 +123,7 @@ class MappingNode(Node):
             yield ack(message, reason or "ok")
 
     def on_keyframes_frame(self, message: Keyframe) -> Outputs:
-        """Insert a keyframe, run the fixed number of steps, publish the result."""
+        """Insert a keyframe, optimise a fixed number of steps, publish preview, status and chunk."""
         if self._session.handled_before(message.id):
             return
         acknowledged = self._session.start(message.id)
@@ -149,7 +149,7 @@ class MappingNode(Node):
         yield from self._checkpoint(message.stamp_ns)
 
     def _skipped(self) -> Outputs:
-        """Insert one keyframe from disk for which the mailbox had no room."""
+        """Insert one keyframe from disk that was dropped from the full mailbox."""
         for message in self._session.skipped():
             yield from self.on_keyframes_frame(message)
 
@@ -164,7 +164,7 @@ class MappingNode(Node):
     # --- anchors and time ---
 
     def on_localization_anchors(self, anchors: Anchors) -> Outputs:
-        """Move the Gaussians with the pose graph at once; a few steps then close gaps at submap borders."""
+        """Move the Gaussians to the new anchor poses, then optimise to close gaps at submap borders."""
         if reason := self._intake.other_map(anchors.map_uuid):
             log.warning("anchors are ignored: %s", reason)
             return
@@ -177,7 +177,7 @@ class MappingNode(Node):
                 yield from self._chunk(anchor, anchors.stamp_ns)
 
     def on_tick(self, tick: Tick) -> Outputs:
-        """Refine while no keyframe waits, and publish the chunk that was published longest ago."""
+        """Refine the map (or insert a skipped keyframe), and publish the due chunk that is oldest."""
         if not self._mapper.keyframes:
             return
         if self._session.has_skipped:
@@ -218,7 +218,7 @@ class MappingNode(Node):
         )  # fmt: skip
 
     def _chunk(self, anchor: int, stamp_ns: int, whole: bool = False) -> Outputs:
-        """Publish an anchor's Gaussians unless viewers have the detail that shows; `whole`: all detail."""
+        """Publish the chunk of an anchor, if there is new visible detail; with `whole`, in full detail."""
         part = self._feed.take_update(self._mapper, anchor, None if whole else self._viewpoint)
         if part is not None:
             yield "mapping/chunk", chunk_message(self._mapper.T_map_anchor[anchor], anchor, part, stamp_ns)
@@ -226,13 +226,14 @@ class MappingNode(Node):
     def on_query_snapshot(self, parameters: dict[str, str]) -> Iterator[MapChunk]:
         """Yield the whole map, chunk by chunk, for a viewer that has just joined.
 
-        `from=X,Y,Z` (m, map frame), `focal_px` and `error_px` leave out detail that is invisible from there.
+        With the parameters `from=X,Y,Z` (m, map frame), `focal_px` and `error_px`, detail that is invisible
+        from this viewpoint is omitted.
         """
         for anchor, part in chunk_snapshot(self._mapper, viewpoint_of(parameters)).items():
             yield chunk_message(self._mapper.T_map_anchor[anchor], anchor, part, 0)
 
     def on_query_state(self, parameters: dict[str, str]) -> Iterator[MapState]:
-        """Yield the content of a checkpoint, as it is now, in pieces."""
+        """Yield the current state of the map, with the content of a checkpoint, in several messages."""
         if not self._mapper.keyframes:
             raise UserError("the map is still empty")
         yield from state_messages(self._session.complete(arrays_of(self._mapper, self._intake.arrays())))
@@ -240,7 +241,7 @@ class MappingNode(Node):
     # --- end of the data ---
 
     def drain(self) -> Outputs:
-        """Publish the whole map; refine it if configured, and publish it again; write the files."""
+        """Process all waiting keyframes, publish the map, refine it if configured, and write the files."""
         self._session.end_of_input()
         while self._session.waiting:
             yield from self._skipped()
@@ -253,7 +254,7 @@ class MappingNode(Node):
         self._save()
 
     def _publish_all(self) -> Outputs:
-        """Publish the chunks that changed since they were published, and all keyframe poses."""
+        """Publish all chunks that viewers do not have in full detail, and the poses of all keyframes."""
         stamps_ns, T_map_body, ids = self._intake.poses()
         last_ns = int(stamps_ns[-1])
         for anchor in self._mapper.store.versions():
@@ -262,7 +263,7 @@ class MappingNode(Node):
         yield "mapping/poses", poses
 
     def _save(self) -> None:
-        """Write the last checkpoint, and splats.ply with the keyframes' poses where `save` is given."""
+        """Write the last checkpoint; with the option `save`, also splats.ply and the keyframe poses."""
         m, folder = self._mapper, self.config.save
         stamps_ns, T_map_body, _ = self._intake.poses()
         self._session.save(int(stamps_ns[-1]))

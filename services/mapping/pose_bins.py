@@ -20,7 +20,7 @@ def pose_bin(T_map_camera: np.ndarray) -> PoseBin:
 
 
 class PoseBins:
-    """The ids of keyframes by pose bin."""
+    """The ids of keyframes, grouped by the bin of their camera pose."""
 
     def __init__(self) -> None:
         self._bin: dict[int, PoseBin] = {}
@@ -45,7 +45,7 @@ class PoseBins:
                 del self._ids[bin]
 
     def fullest(self, excluded: set[int]) -> list[int]:
-        """Return the ids of the fullest bin without those `excluded`, ascending; empty if none is left.
+        """Return the ids in the fullest bin, ascending, without the ids `excluded`; empty if none is left.
 
         Bins with excluded ids only are skipped. The result does not depend on the order of insertion.
         """

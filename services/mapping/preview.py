@@ -12,7 +12,7 @@ from beamsplat.services.mapping.mapper import HALF, Mapper
 
 @dataclass(frozen=True)
 class KeyframeRender:
-    """The map rendered at half size from the viewpoint of a keyframe."""
+    """The map rendered at half size at the pose of a keyframe, with the errors against the keyframe."""
 
     rgb: np.ndarray  # uint8 [h, w, 3]
     T_map_camera: np.ndarray

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 @dataclass(frozen=True)
 class LearningRates:
-    """Step sizes of Adam, in the unit of each parameter."""
+    """Step sizes of Adam for each kind of parameter, in the unit of the parameter."""
 
     mean_m: float = 2e-3  # of the centre, for keyframes just inserted: new Gaussians are still displaced
     refined_mean_m: float = 6e-4  # of the centre, for refinement: larger steps make it jitter
@@ -25,7 +25,7 @@ class LearningRates:
 
 @dataclass(frozen=True)
 class MapperSettings:
-    """Settings of insertion, losses and pruning. Lengths in metres, pixels of the full-size image."""
+    """Settings of insertion, losses and pruning; lengths in m, or in px of the full-size image."""
 
     # Work per keyframe; `half` iterations use the half-size image.
     half_iterations: int = 18  # per keyframe, at half size

@@ -14,7 +14,7 @@ from beamsplat.services.mapping.settings import MapperSettings
 
 
 def warm() -> None:
-    """Map two tiny keyframes with all options on, with the array types used in production."""
+    """Run every kernel once: map two small keyframes with all options and the service's array types."""
     warm_rasterizer()
     settings = MapperSettings(ssim_every=1, refine_pose=True, refine_exposure=True, carve_votes=1)
     mapper = Mapper(settings)

@@ -31,7 +31,7 @@ _GAIN_PRIOR, _OFFSET_PRIOR = 5.0, 5.0  # information of the prior: exposure chan
 
 @dataclass
 class Alignment:
-    """Result of aligning one image, with its quality measures."""
+    """Pose and exposure of one image, found by alignment to the map, with measures of their quality."""
 
     T_camera_map: np.ndarray  # float64 [4, 4]
     points: int = 0  # number of points used at the finest level
@@ -47,7 +47,7 @@ class Alignment:
 
 @dataclass
 class _Rendered:
-    """The map rendered at one pose."""
+    """The map rendered at one camera pose: grey values, depth and opacity of every pixel."""
 
     grey: np.ndarray  # float32 [H, W]
     z_m: np.ndarray  # float32 [H, W], 0 = unknown
@@ -56,7 +56,7 @@ class _Rendered:
 
 
 class Aligner:
-    """Aligns images to a splat map; holds the settings, the camera of each level and scratch buffers."""
+    """Aligns images to a splat map. Its buffers are reused: use one object in one thread only."""
 
     def __init__(
         self, camera: RasterCamera, T_body_camera: np.ndarray, settings: CameraTrackerSettings
@@ -97,7 +97,14 @@ class Aligner:
         return found
 
     def to_body(self, covariance: np.ndarray) -> np.ndarray:
-        """Return the covariance float64 [3, 3] of (x, y, yaw) in the body frame from that of the motions."""
+        """Convert a covariance of the camera motion to the covariance of (x, y, yaw) in the body frame.
+
+        Args:
+            covariance: float64 [D, D] of the D free motions, as columns of `motion_basis`.
+
+        Returns:
+            float64 [3, 3], in m^2, m rad and rad^2.
+        """
         R, t = self._T_body_camera[:3, :3], self._T_body_camera[:3, 3]
         adjoint = np.block([[R, skew(t) @ R], [np.zeros((3, 3)), R]])
         to_body = (adjoint @ self._basis)[[0, 1, 5]]
@@ -117,7 +124,11 @@ class Aligner:
         self, rendered: _Rendered, target: GreyLevel, level: int, T_render_map: np.ndarray, steps: int,
         found: Alignment,
     ) -> None:  # fmt: skip
-        """Refine `found` in place at one pyramid level."""
+        """Refine pose, gain and offset of `found` in place by Gauss-Newton at one pyramid level.
+
+        `rendered` is the map at the pose `T_render_map`, `target` the image at this level; at most `steps`
+        steps are done.
+        """
         s, camera = self.settings, self.cameras[level]
         count = self._select_points(rendered)
         T_now_render = found.T_camera_map @ inverse(T_render_map)
@@ -152,7 +163,10 @@ class Aligner:
         found.correlation = self._correlation(count, found)
 
     def _correlation(self, count: int, found: Alignment) -> float:
-        """Return the correlation of rendered and observed grey; it detects a gain near zero."""
+        """Return the Pearson correlation of rendered and observed grey values at the first `count` points.
+
+        A low correlation reveals a solution with a gain near zero, whose residuals are small as well.
+        """
         residuals = self._residuals[:count].astype(np.float64)
         inside = np.isfinite(residuals)
         shown = self._points[:count, 3][inside].astype(np.float64)
@@ -162,7 +176,15 @@ class Aligner:
         return float(np.corrcoef(shown, seen)[0, 1])
 
     def _reduced(self, H: np.ndarray, g: np.ndarray, found: Alignment) -> tuple[np.ndarray, np.ndarray]:
-        """Return the normal equations of the free motions and the exposure, with priors and damping."""
+        """Reduce the normal equations to the D free motions, the log gain and the offset.
+
+        Args:
+            H, g: float64 [8, 8] and [8], see `kernels.normal_equations`.
+            found: its gain and offset are the point of linearisation of the exposure prior.
+
+        Returns:
+            Matrix [D + 2, D + 2] and gradient [D + 2], with exposure prior and damping.
+        """
         B = np.zeros((UNKNOWN_COUNT, self._basis.shape[1] + 2))
         B[:6, :-2] = self._basis
         B[6, -2] = B[7, -1] = 1.0
@@ -176,7 +198,7 @@ class Aligner:
         return A, b
 
     def _rasterizer_step(self, splats: SplatMap, target: GreyLevel, found: Alignment) -> None:
-        """Move `found` one step along the rasterizer's pose gradient of the same robust loss."""
+        """Update the pose of `found` by one Newton step with the gradient from `rasterizer_gradient`."""
         s = self.settings
         gradient, used = rasterizer_gradient(splats, self.cameras[0], target, found, s)
         if used < s.min_points or found.hessian is None:
@@ -189,7 +211,7 @@ class Aligner:
         found.T_camera_map = se3_exp(self._basis @ np.clip(move, -0.02, 0.02)) @ found.T_camera_map
 
     def _select_points(self, rendered: _Rendered) -> int:
-        """Fill `self._points` and return their number; subsample if there are more than the buffer holds."""
+        """Select points of a render into `self._points`, as many as fit; return their number."""
         s, stride = self.settings, 1
         while True:
             count, found = select_points(
@@ -205,10 +227,11 @@ def rasterizer_gradient(
     splats: SplatMap, camera: RasterCamera, target: GreyLevel, found: Alignment,
     settings: CameraTrackerSettings,
 ) -> tuple[np.ndarray, int]:  # fmt: skip
-    """Return dL/dxi [6] of T_camera_map <- se3_exp(xi) T_camera_map, and the number of pixels used.
+    """Return the gradient dL/dxi float [6] of the pose in `found`, and the number of pixels used.
 
-    The gradient passes through the rasterizer. L is the Huber loss of the grey error over pixels that the
-    map covers and that have contrast.
+    xi = (rho, phi) perturbs the pose from the left: T_camera_map <- se3_exp(xi) T_camera_map. L is the Huber
+    loss of the grey error, summed over the pixels of `target` that the map covers and that have contrast. It
+    is differentiated by the backward pass of the rasterizer.
     """
     render = splats.render(camera, found.T_camera_map)
     alpha = np.maximum(render.image[4], 0.3)
@@ -227,7 +250,7 @@ def rasterizer_gradient(
 
 
 def motion_basis(T_body_camera: np.ndarray, planar: bool) -> np.ndarray:
-    """Return a basis [6, D] of the allowed camera motions: all six, or only planar motions of the body.
+    """Return a basis [6, D] of the allowed camera motions: D = 6, or D = 3 for planar motion of the body.
 
     The update is T_camera_map <- exp(xi) T_camera_map. A body that moves on the floor has
     xi = Ad(T_camera_body) (vx, vy, 0, 0, 0, wz).

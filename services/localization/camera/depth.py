@@ -16,7 +16,7 @@ _MAP_SCALE_SIGMA = 0.03  # standard deviation of the map's own log scale
 
 @dataclass(frozen=True)
 class DepthPrior:
-    """Depth map of one image from a depth source."""
+    """Depth map of one image, as measured or estimated by a depth source, with its scale uncertainty."""
 
     z: np.ndarray  # float32 [H, W], optical z, NaN = unknown; any size with the image's aspect ratio
     scale_sigma: float  # standard deviation of the log scale between images
@@ -24,10 +24,10 @@ class DepthPrior:
 
 
 def resize_depth(z: np.ndarray, width_px: int, height_px: int) -> np.ndarray:
-    """Return depth [H, W] (NaN = unknown) resampled to float32 [height_px, width_px].
+    """Resample a depth map [H, W] (NaN = unknown) to float32 [height_px, width_px] (0 = unknown).
 
-    The result is 0 where the depth is unknown and at depth edges, because the mean of two surfaces is
-    neither of them. Inverse depth is averaged, because it is linear in the image for a plane.
+    Pixels at depth edges become unknown, because the mean depth of two surfaces is on neither of them.
+    Inverse depth is averaged, because the inverse depth of a plane is a linear function of the pixel.
     """
     with np.errstate(invalid="ignore"):
         known = np.isfinite(z) & (z > 0.05) & (z < MAX_DEPTH_M)
@@ -46,10 +46,15 @@ def align_scale_to_map(
     rendered_z: np.ndarray,  # float32 [h, w] of the map rendered at the same pose, 0 unknown
     scale_sigma: float,
 ) -> tuple[np.ndarray, float]:
-    """Return the depth rescaled towards the map, and the median log ratio found (NaN if too little overlap).
+    """Scale the depth of an image so that it agrees with the depth of the map.
 
-    The weight of the map grows with `scale_sigma`: a source with an exact scale keeps it. The correction
-    varies smoothly over the image, so that a new keyframe continues the map's surface without a step.
+    The larger `scale_sigma` (standard deviation of the depth's log scale), the closer the result is to the
+    map; depth with an exact scale is not changed. The factor varies smoothly over the image, so that the
+    surface of a new keyframe continues the surface of the map without a step.
+
+    Returns:
+        The scaled depth float32 [h, w], and the median of log(z / rendered_z) before scaling. The median is
+        NaN, and the depth unchanged, where both depths are known in too few pixels.
     """
     both = (z > 0.0) & (rendered_z > 0.0)
     if both.mean() < _MIN_OVERLAP:

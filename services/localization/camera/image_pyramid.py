@@ -15,7 +15,7 @@ GREY = np.array([0.299, 0.587, 0.114], np.float32)  # of red, green, blue
 
 @dataclass(frozen=True)
 class GreyLevel:
-    """One level of an image pyramid."""
+    """Grey values and image gradients of one pyramid level."""
 
     grey: np.ndarray  # float32 [H, W] in [0, 1]
     gradient_x: np.ndarray  # float32 [H, W], central differences per pixel
@@ -24,7 +24,7 @@ class GreyLevel:
 
 @dataclass(frozen=True)
 class ImagePyramid:
-    """An image at the tracker's resolution; levels from fine to coarse, each half the size of the last."""
+    """An image at the tracker's resolution; levels from fine to coarse, each with half the size."""
 
     rgb: np.ndarray  # uint8 [h, w, 3] at the finest level
     levels: tuple[GreyLevel, ...]
@@ -36,7 +36,7 @@ class ImagePyramid:
 
 
 def tracking_camera(camera: Pinhole, width_px: int) -> RasterCamera:
-    """Return the camera of the finest level: at most `width_px` wide, both sides multiples of 8 pixels."""
+    """Scale a camera to the finest level: at most `width_px` wide, both sides multiples of 8 pixels."""
     full = RasterCamera(
         camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px, camera.width_px, camera.height_px
     )
@@ -46,7 +46,7 @@ def tracking_camera(camera: Pinhole, width_px: int) -> RasterCamera:
 
 
 def make_image_pyramid(rgb: np.ndarray, camera: RasterCamera, levels: int) -> ImagePyramid:
-    """Return the pyramid of an image uint8 [H, W, 3].
+    """Return the pyramid of an RGB image uint8 [H, W, 3]; `camera` has the size of the finest level.
 
     Raises:
         ValueError: the array has another shape or type.
@@ -64,7 +64,7 @@ def make_image_pyramid(rgb: np.ndarray, camera: RasterCamera, levels: int) -> Im
 
 
 def downsample_2x(array: np.ndarray) -> np.ndarray:
-    """Return the means of 2 x 2 blocks of float32 [H, W] (even sizes)."""
+    """Return the means of all 2 x 2 blocks: float32 [H / 2, W / 2] from [H, W], both sides even."""
     return cv2.resize(array, (array.shape[1] // 2, array.shape[0] // 2), interpolation=cv2.INTER_AREA)
 
 

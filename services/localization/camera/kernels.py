@@ -1,8 +1,8 @@
 """Compiled kernels of the direct alignment of a rendered view to an image, and of the map loss.
 
 The rendered view is a set of points with grey values: X = z K^-1 (u, v, 1) in the camera frame of the render.
-They are transformed by T_now_render and projected into the image; the residual is the image value minus the
-rendered grey.
+They are transformed by T_now_render and projected into the image; the residual is the grey value of the image
+minus the rendered grey value (after gain and offset).
 """
 
 from __future__ import annotations
@@ -24,10 +24,15 @@ def select_points(
     stride: int,
     out: np.ndarray,
 ) -> tuple[int, int]:
-    """Write (u, v, z, grey) of pixels with contrast and an opaque map (and neighbours) into out [N, 4].
+    """Write the rendered pixels that are used for alignment to `out`, float32 [N, 4]: u, v (px), z, grey.
 
-    Every `stride`-th such pixel is taken. Returns (number written, number before the stride); if they do not
-    fit into `out`, call again with a larger stride.
+    A pixel is suitable if its grey gradient is at least `min_gradient`, its depth is known (`z_m` > 0), and
+    the map is opaque (alpha >= `min_alpha`) at the pixel and its four neighbours. Every `stride`-th suitable
+    pixel is written, until `out` is full.
+
+    Returns:
+        The number of pixels written, and the number of suitable pixels. If the latter over `stride` exceeds
+        N, call again with a larger stride.
     """
     height, width = grey.shape
     found, n = 0, 0
@@ -66,13 +71,16 @@ def normal_equations(
     g: np.ndarray,
     residuals: np.ndarray,
 ) -> tuple[int, float]:
-    """Sum J^T w J into H [8, 8] and J^T w r into g [8] with Huber weights; return (points used, cost).
+    """Compute the normal equations H = sum J^T w J [8, 8] and g = sum J^T w r [8] with Huber weights w.
+
+    The unknowns are rho [3] and phi [3] of a left perturbation of T_now_render, log gain, and offset. Returns
+    the number of points inside the image, and the sum of their Huber losses.
 
     Args:
         points: float32 [N, 4] of select_points. camera: float64 (fx, fy, cx, cy) of this level.
         R, t: rotation and translation of T_now_render.
         image, gradient_x, gradient_y: float32 [H, W], grey and its central differences per pixel.
-        gain, offset: r = image - (gain grey + offset). delta: Huber threshold.
+        gain, offset: exposure, residual r = image - (gain grey + offset). delta: Huber threshold (grey).
         residuals: out float32 [N], NaN where a point falls outside the image.
     """
     height, width = image.shape
@@ -144,12 +152,18 @@ def map_loss(
     depth_scale: np.float32,
     gradient: np.ndarray,
 ) -> float:
-    """Return the L1 loss of a render against a keyframe and write its gradient float32 [5, H, W].
+    """Return the L1 loss of a render against a keyframe; write its gradient with respect to the render.
 
-    `image` float32 [5, H, W] is the render (colour, depth, alpha), `rgb` float32 [3, H, W], `z_m` float32
-    [H, W] (0 = unknown). The colour term uses colour / alpha. The depth term is w |sum w_i z_i - z alpha|,
-    which is zero at the right depth for any opacity. Where the depth is known, alpha is pulled towards one,
-    so that gaps in the surface close.
+    The colour term compares colour / alpha with `rgb`. The depth term is weight |D - z alpha|, where D is the
+    accumulated depth: zero at the right depth for any opacity. Where the depth is known, a third term
+    increases alpha towards one, so that gaps in the surface close.
+
+    Args:
+        image: float32 [5, H, W], the render: red, green, blue, accumulated depth, alpha.
+        rgb: float32 [3, H, W] in [0, 1], image of the keyframe.
+        z_m, weight: float32 [H, W], optical z of the keyframe (0 = unknown) and its weight.
+        colour_scale, depth_scale: factors of the two terms, per pixel.
+        gradient: out float32 [5, H, W].
     """
     height, width = z_m.shape
     total = 0.0

@@ -30,7 +30,12 @@ PosedImage = tuple[np.ndarray, np.ndarray]
 def select_other_images(
     here: PosedImage, candidates: list[PosedImage], usual_depth: float
 ) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return (grey, T_other_here) of up to three images with different baselines, the widest first."""
+    """Select up to three of the candidates for the plane sweep, with different baselines, the widest first.
+
+    Returns:
+        (grey float32 [h, w], T_other_here float64 [4, 4]) of each. Candidates with a baseline that is short
+        compared with `usual_depth`, or with another viewing direction, are not used.
+    """
     found = []
     for grey, T_map_camera in candidates:
         T_other_here = inverse(T_map_camera) @ here[1]
@@ -47,7 +52,11 @@ def select_other_images(
 def depth_from_parallax(
     here: PosedImage, candidates: list[PosedImage], camera: RasterCamera, usual_depth: float
 ) -> np.ndarray:
-    """Return depth float32 [h, w] of the image `here`, 0 where there is no parallax."""
+    """Return the optical z float32 [h, w] of the image `here`, 0 where the parallax does not determine it.
+
+    `usual_depth` is the typical optical z; the plane sweep covers a range around this depth. `camera` has the
+    size of the images.
+    """
     others = select_other_images(here, candidates, usual_depth) if candidates else []
     if not others:
         return np.zeros(here[0].shape, np.float32)
@@ -56,9 +65,10 @@ def depth_from_parallax(
 
 
 def dense(z: np.ndarray, shown: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """Return depth float32 of size `shape` without gaps.
+    """Combine two depth maps (0 = unknown) into one without gaps, float32 with the size `shape` (H, W).
 
-    Sources in order of preference: swept depth `z`, depth `shown` rendered from the map, interpolation.
+    Every pixel has the depth `z` of the plane sweep if known, else the depth `shown` that was rendered from
+    the map, else a depth interpolated from other pixels.
     """
     h, w = z.shape
     known = cv2.resize(shown, (w, h), interpolation=cv2.INTER_NEAREST)
@@ -67,7 +77,7 @@ def dense(z: np.ndarray, shown: np.ndarray, shape: tuple[int, int]) -> np.ndarra
 
 
 def _remove_outliers(z: np.ndarray) -> np.ndarray:
-    """Set pixels to 0 whose inverse depth differs from the mean of their 9 x 9 neighbourhood."""
+    """Return the depth with pixels set to 0 whose inverse depth differs from the mean of 9 x 9 pixels."""
     q = np.where(z > 0.0, 1.0 / np.maximum(z, 1e-6), 0.0).astype(np.float32)
     weight = cv2.blur((z > 0.0).astype(np.float32), (9, 9))
     mean = cv2.blur(q, (9, 9)) / np.maximum(weight, 1e-6)

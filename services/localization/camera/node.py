@@ -28,7 +28,8 @@ ARBITRARY_SCALE = "scale is arbitrary: the depth has no unit, lengths are not me
 class CameraLocalizationConfig(NodeConfig):
     """Properties of the robot and of its depth source.
 
-    `depth = "estimate"` uses the depth service, in the unit that it states; "none" uses the camera alone.
+    `depth = "estimate"` uses the depth maps of the depth service, in metres or in an arbitrary unit, as
+    marked in its messages; "none" uses the camera alone.
     `scale_sigma` is the standard deviation of the log scale of the depth between images.
     """
 
@@ -69,7 +70,7 @@ class CameraLocalization(Node):
             log.warning("a new calibration is ignored: restart the node to use it")
 
     def on_camera_image(self, image: Image) -> Outputs:
-        """Publish one pose per image."""
+        """Publish the pose of the body for an image; without a pose, the status is the reason."""
         if self._tracker is None:
             yield "localization/odometry", _rejected(image.stamp_ns, "no calibration yet")
             return
@@ -87,7 +88,7 @@ class CameraLocalization(Node):
         yield "localization/odometry", _odometry(self._tracker, result)
 
     def on_depth_estimate(self, estimate: DepthEstimate) -> Outputs:
-        """Add a keyframe from the depth of a tracked image, where one is due."""
+        """Add the image of this depth estimate as a keyframe, if the tracker needs a new one."""
         if self._tracker is None or self.config.depth == "none":
             return iter(())
         if estimate.kind == "none" and estimate.status == "ok":
@@ -107,7 +108,7 @@ class CameraLocalization(Node):
             tracker.close()
 
     def _set_detail(self, t: CameraTracker, result: TrackingResult) -> None:
-        """Set the text that the health message shows."""
+        """Set the text of the health message of this node."""
         parts = [f"{len(t.splats.keyframes)} keyframes, {t.splats.store.count} Gaussians", result.detail]
         if t.metric is False:
             parts.append(ARBITRARY_SCALE)

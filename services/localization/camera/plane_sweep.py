@@ -21,10 +21,11 @@ def sweep(
     nearest: float,
     farthest: float,
 ) -> np.ndarray:
-    """Return optical z float32 [h, w] in the unit of the poses, 0 where it is ambiguous.
+    """Return the optical z float32 [h, w] of the image `grey`, 0 where the depth is ambiguous.
 
-    The plane z = d maps a pixel of this image into another one by the homography K (R + t n^T / d) K^-1,
-    with n = (0, 0, 1) and (R, t) = T_other_here.
+    z and its limits `nearest` and `farthest` have the unit of the poses. The plane z = d maps a pixel of this
+    image to a pixel of another image by the homography K (R + t n^T / d) K^-1, with n = (0, 0, 1) and
+    (R, t) = T_other_here.
     """
     h, w = grey.shape
     K = np.array(
@@ -57,7 +58,7 @@ def sweep(
 
 
 def _subplane_inverse_z(inverse_z: np.ndarray, cost: np.ndarray, best: np.ndarray) -> np.ndarray:
-    """Return the inverse depth at the vertex of the parabola through the best plane and its neighbours."""
+    """Return the inverse depth at the minimum of a parabola through the costs of three planes, per pixel."""
     inner = np.clip(best, 1, len(inverse_z) - 2)
     a, b, c = (np.take_along_axis(cost, (inner + k)[None], axis=0)[0] for k in (-1, 0, 1))
     bend = np.maximum(a - 2.0 * b + c, 1e-6)
@@ -66,7 +67,7 @@ def _subplane_inverse_z(inverse_z: np.ndarray, cost: np.ndarray, best: np.ndarra
 
 
 def fill_unknown(z: np.ndarray, sigma_px: float) -> np.ndarray:
-    """Return depth float32 [h, w] with unknown pixels (0) interpolated in inverse depth."""
+    """Fill unknown pixels (0) of a depth map float32 [h, w] with blurred inverse depth (sigma `sigma_px`)."""
     known = (z > 0.0).astype(np.float32)
     if not known.any():
         return z

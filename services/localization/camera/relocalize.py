@@ -19,7 +19,7 @@ def thumbnail(grey: np.ndarray) -> np.ndarray:
 
 
 def similar_keyframes(keyframes: list[MapKeyframe], query: np.ndarray, most: int) -> list[MapKeyframe]:
-    """Return up to `most` keyframes whose thumbnails correlate best with the thumbnail `query`, sorted."""
+    """Return up to `most` keyframes whose thumbnails correlate with the thumbnail `query`, best first."""
     scores = [(float(np.sum(frame.thumbnail * query)), -i) for i, frame in enumerate(keyframes)]
     best = sorted(scores, reverse=True)[:most]
     return [keyframes[-i] for score, i in best if score > _MIN_CORRELATION]

@@ -13,7 +13,7 @@ from beamsplat.services.localization.camera.image_pyramid import ImagePyramid
 
 @dataclass(frozen=True)
 class TrackingResult:
-    """Pose estimate of one image."""
+    """Pose of the body for one image, with status and covariance."""
 
     stamp_ns: int
     T_map_body: np.ndarray  # float64 [4, 4]
@@ -25,7 +25,7 @@ class TrackingResult:
 
 @dataclass
 class TrackedImage:
-    """A tracked image that becomes a keyframe if its depth arrives."""
+    """A tracked image that is stored until its depth is received: it may become a keyframe."""
 
     stamp_ns: int
     view: ImagePyramid
@@ -34,7 +34,7 @@ class TrackedImage:
 
 
 def covisibility(in_view_a: np.ndarray, in_view_b: np.ndarray) -> float:
-    """Return the intersection over union of two ascending index lists of Gaussians."""
+    """Return the intersection over union of the Gaussians in two views (ascending indices int32)."""
     both = len(np.intersect1d(in_view_a, in_view_b, assume_unique=True))
     union = len(in_view_a) + len(in_view_b) - both
     return both / union if union else 0.0

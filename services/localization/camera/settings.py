@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class CameraTrackerSettings:
-    """Lengths are in the map's unit (metres if the depth is metric), colours in [0, 1]."""
+    """Settings of camera tracking: lengths in the unit of the map (metres if metric), colours in [0, 1]."""
 
     planar: bool = True  # the body stays level on a floor: three degrees of freedom instead of six
     width_px: int = 320  # of the finest level; images are only reduced, never enlarged

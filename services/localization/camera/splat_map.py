@@ -34,7 +34,7 @@ class MapKeyframe:
 
 
 class SplatMap:
-    """Gaussians and the keyframes that they were made from."""
+    """The Gaussians, and the keyframes from which they were created."""
 
     def __init__(self, camera: RasterCamera, settings: CameraTrackerSettings) -> None:
         self.camera, self.settings = camera, settings
@@ -48,7 +48,7 @@ class SplatMap:
         self._gradient = np.empty((5, camera.height_px, camera.width_px), np.float32)
 
     def render(self, camera: RasterCamera, T_camera_map: np.ndarray) -> Render:
-        """Return the map rendered at a pose; pass the result to `release` after use."""
+        """Render the map from the camera pose `T_camera_map`; pass the result to `release` after use."""
         return self.rasterizer.render(self.store.params, self.store.count, camera, T_camera_map)
 
     def release(self, render: Render) -> None:
@@ -58,7 +58,7 @@ class SplatMap:
     # --- growing -----------------------------------------------------------------------------------
 
     def add(self, frame: MapKeyframe) -> int:
-        """Add a keyframe and new Gaussians where the map does not match it; return their number."""
+        """Add a keyframe, and Gaussians where the map differs from it; return the number of new Gaussians."""
         s = self.settings
         render = self.render(self.camera, inverse(frame.T_map_camera))
         missing = _unexplained(render.image, frame, s)
@@ -87,10 +87,14 @@ class SplatMap:
         return len(u)
 
     def _contradicted_by(self, index: np.ndarray, missing: np.ndarray, frame: MapKeyframe) -> np.ndarray:
-        """Return the Gaussians, out of those in view (int32 [V]), that contradict the keyframe.
+        """Return the indices int32 [C] of the Gaussians that contradict the keyframe; `add` removes them.
 
-        They are in front of the surface of its depth, transparent, or on the surface but of another colour
-        or too coarse. `add` replaces them by new ones.
+        A Gaussian contradicts the keyframe if it is in front of the measured surface, transparent, or on the
+        surface but too large or of another colour.
+
+        Args:
+            index: int32 [V], the Gaussians in view of the keyframe.
+            missing: bool [H, W], see `_unexplained`.
         """
         s, camera = self.settings, self.camera
         h, w = frame.z_m.shape
@@ -124,7 +128,11 @@ class SplatMap:
     # --- optimising --------------------------------------------------------------------------------
 
     def step(self, frame: MapKeyframe) -> tuple[float, np.ndarray]:
-        """Do one Adam step on one keyframe; return the loss and dL/dxi [6] of its T_camera_map."""
+        """Optimise the Gaussians by one Adam step on one keyframe.
+
+        Returns:
+            The loss, and its gradient dL/dxi [6] with respect to a left perturbation of T_camera_map.
+        """
         s, pixels = self.settings, frame.z_m.size
         render = self.render(self.camera, inverse(frame.T_map_camera))
         loss = map_loss(
@@ -143,7 +151,7 @@ class SplatMap:
 
 
 def _unexplained(image: np.ndarray, frame: MapKeyframe, s: CameraTrackerSettings) -> np.ndarray:
-    """Return a mask bool [H, W] of pixels where the map is transparent or differs in colour or depth."""
+    """Return bool [H, W]: pixels where the map is transparent or has another colour or depth than `frame`."""
     alpha = image[4]
     colour_differs = cv2.blur(np.abs(image[:3] - frame.rgb).mean(axis=0), (5, 5)) > s.max_colour_error
     expected = image[3] / np.maximum(alpha, 1e-3)

@@ -2,7 +2,7 @@
 
     tracker = CameraTracker(pinhole, T_body_camera)
     result = tracker.track(stamp_ns, rgb)         # every image: pose of the body
-    tracker.add_depth(stamp_ns, DepthPrior(...))  # some images: become keyframes where one is due
+    tracker.add_depth(stamp_ns, DepthPrior(...))  # images with depth: they may become keyframes
 
 The first image with depth initialises the map, with the body at the map's origin. Lengths have the unit of
 the depth: metres if it is metric, else arbitrary. The tracker is deterministic.
@@ -37,12 +37,12 @@ from beamsplat.services.localization.camera.result import TrackedImage, Tracking
 from beamsplat.services.localization.camera.settings import CameraTrackerSettings
 from beamsplat.services.localization.camera.splat_map import MapKeyframe, SplatMap
 
-_RECENT_IMAGES = 24  # images that are kept until their depth arrives
+_RECENT_IMAGES = 24  # images that are stored until their depth is received
 _RESIDUAL_CORRELATION = 8.0  # factor on the covariance, because errors of neighbouring pixels are correlated
 
 
 class CameraTracker:
-    """Camera pose tracker with its own splat map; see the module's text for the use."""
+    """Camera pose tracker with its own splat map; the docstring of the module shows its use."""
 
     def __init__(
         self, camera: Pinhole, T_body_camera: np.ndarray, settings: CameraTrackerSettings | None = None
@@ -68,7 +68,7 @@ class CameraTracker:
     # --- tracking ----------------------------------------------------------------------------------
 
     def track(self, stamp_ns: int, rgb: np.ndarray) -> TrackingResult:
-        """Return the pose of the body for an undistorted image uint8 [H, W, 3]."""
+        """Estimate the pose of the body for an undistorted RGB image uint8 [H, W, 3]."""
         error = self._input_error(stamp_ns, rgb)
         if error is not None:
             return self._result(stamp_ns, "rejected", error)
@@ -108,7 +108,7 @@ class CameraTracker:
         return None
 
     def _locate(self, stamp_ns: int, view: ImagePyramid) -> tuple[Alignment | None, str]:
-        """Return the first accepted alignment, or None and the reason why all were rejected."""
+        """Align the image from start poses; return the first accepted, or None and the reason."""
         why = ""
         for T_map_body in self._initial_poses(stamp_ns, view):
             start = Alignment(inverse(T_map_body @ self._T_body_camera))
@@ -120,9 +120,9 @@ class CameraTracker:
         return None, why
 
     def _continue_from_last_pose(self, stamp_ns: int, view: ImagePyramid) -> None:
-        """Allow a keyframe at the last known pose, so that tracking can continue in a new part of the map.
+        """Store the image with the last known pose: as a keyframe, it starts a new part of the map.
 
-        The unknown motion in between is added to the covariance.
+        The covariance is increased, because the motion since that pose is unknown.
         """
         if not self._last_poses:
             return
@@ -131,7 +131,7 @@ class CameraTracker:
         self._recent.append(TrackedImage(stamp_ns, view, alignment, self._keyframe_covariance))
 
     def _initial_poses(self, stamp_ns: int, view: ImagePyramid) -> list[np.ndarray]:
-        """Return start values of T_map_body: prediction and last pose; if lost, also similar keyframes."""
+        """Return start values of T_map_body: predicted and last pose, or if lost also similar keyframes."""
         starts = [self._predicted(stamp_ns)]
         if self._failures == 0:
             if len(self._last_poses) == 2:
@@ -153,7 +153,7 @@ class CameraTracker:
         return T1 @ se3_exp(se3_log(inverse(T0) @ T1) * factor)
 
     def _reason_to_reject(self, found: Alignment, T_start: np.ndarray) -> str:
-        """Return why an alignment is rejected; empty if it is accepted."""
+        """Return why an alignment is rejected, "" if it is accepted; `T_start`: start value of T_map_body."""
         s = self.settings
         if found.points < s.min_points:
             return f"lost: only {found.points} map points are in the image; {s.min_points} are needed"
@@ -174,7 +174,7 @@ class CameraTracker:
         return inverse(found.T_camera_map) @ inverse(self._T_body_camera)
 
     def _covariance(self, found: Alignment) -> np.ndarray:
-        """Return the covariance float64 [3, 3] of (x, y, yaw) in the map frame, of this alignment alone."""
+        """Return the covariance float64 [3, 3] of (x, y, yaw) in the map frame, without errors of the map."""
         assert found.hessian is not None  # of a finished alignment
         free = np.linalg.pinv(found.hessian) * _RESIDUAL_CORRELATION
         full = self._aligner.to_body(free)
@@ -189,7 +189,11 @@ class CameraTracker:
     # --- keyframes ---------------------------------------------------------------------------------
 
     def add_depth(self, stamp_ns: int, prior: DepthPrior) -> str:
-        """Add the image with this stamp as a keyframe if one is due; return "ok" or the reason why not."""
+        """Add the tracked image with this stamp as a keyframe if one is due.
+
+        Returns:
+            "ok", or the reason why the image was not added.
+        """
         tracked = next((t for t in self._recent if t.stamp_ns == stamp_ns), None)
         if tracked is None:
             return "its image was not tracked, or is too old"
@@ -227,7 +231,10 @@ class CameraTracker:
             self._keyframe_covariance = tracked.covariance
 
     def add_without_depth(self, stamp_ns: int) -> str:
-        """Do as `add_depth`, with depth from the parallax of the images; the map's unit is then arbitrary."""
+        """Add a keyframe like `add_depth`, with depth from the parallax of the images.
+
+        The unit of the map is then arbitrary. Returns "ok", or the reason why no keyframe was added.
+        """
         tracked = next((t for t in self._recent if t.stamp_ns == stamp_ns), None)
         if tracked is None:
             return "its image was not tracked, or is too old"
@@ -256,7 +263,10 @@ class CameraTracker:
         return "ok"
 
     def _refine_first_depth(self, tracked: TrackedImage) -> str:
-        """Recompute the first keyframe's depth from the poses so far; rebuild the map, realign the image."""
+        """Recompute the depth of the first keyframe by plane sweep, rebuild the map, realign the image.
+
+        Returns "ok", or the reason why this is not possible yet.
+        """
         first = self.splats.keyframes[0]
         here = (self._first_grey, first.T_map_camera)
         T_first_now = inverse(first.T_map_camera) @ inverse(tracked.alignment.T_camera_map)
@@ -292,7 +302,7 @@ class CameraTracker:
         return shown
 
     def _align_scale(self, z: np.ndarray, alignment: Alignment, scale_sigma: float) -> np.ndarray:
-        """Return the depth at the scale of the map and update `scale_disagreement`."""
+        """Return the depth `z` float32 [H, W] scaled towards the map's depth; update `scale_disagreement`."""
         z, ratio = align_scale_to_map(z, self._rendered_depth(alignment), scale_sigma)
         if np.isfinite(ratio):
             self._log_ratios = [*self._log_ratios, ratio][-20:]
@@ -300,7 +310,7 @@ class CameraTracker:
         return z
 
     def _keyframe_is_due(self, found: Alignment) -> bool:
-        """Return whether coverage by the map, or covisibility with the last keyframe, is too low."""
+        """Return whether the map covers too little of the image, or covisibility is too low."""
         if found.in_view is None:  # not aligned: the first image, or one after a long loss of tracking
             return not self.splats.keyframes or self._failures > self.settings.restart_after
         if found.coverage < self.settings.min_coverage:
@@ -308,7 +318,7 @@ class CameraTracker:
         return covisibility(found.in_view, self.splats.keyframes[-1].in_view) < self.settings.min_covisibility
 
     def _optimise_map(self, steps: int) -> None:
-        """Optimise the map; the steps alternate between one of the newest keyframes and one of all."""
+        """Optimise the map by `steps` steps, alternately on one of the newest keyframes and on one of all."""
         frames = self.splats.keyframes
         for _ in range(steps):
             newest = frames[-self.settings.window :]

@@ -20,7 +20,7 @@ class ExternalLocalization(Node):
         self._correction_published = False
 
     def on_external_pose(self, pose: ExternalPose) -> Outputs:
-        """Publish each pose with an unknown covariance (NaN), and once T_map_odom = identity."""
+        """Publish the pose as T_odom_body with covariance NaN (unknown), and once T_map_odom = identity."""
         if not self._correction_published:
             self._correction_published = True
             yield "localization/correction", Correction(stamp_ns=pose.stamp_ns, T_map_odom=np.eye(4))

@@ -40,7 +40,7 @@ class _Active:
 
 
 class ActiveSubmaps:
-    """The one or two submaps that are being filled, as in Cartographer.
+    """The one or two submaps into which new scans are inserted, as in Cartographer.
 
     Every trajectory node is inserted into both; scans are matched to the older one.
     """
@@ -64,7 +64,7 @@ class ActiveSubmaps:
         return {a.submap.id for a in self._active}
 
     def dynamic_returns(self, scan: PreparedScan, pose_odom_body: np.ndarray) -> np.ndarray:
-        """Return a mask bool [M] of the returns on dynamic objects, i.e. in space that was observed free."""
+        """Return a mask bool [M]: returns on dynamic objects (in space that earlier scans observed free)."""
         dynamic = np.zeros(len(scan), dtype=bool)
         if not self._active:
             return dynamic
@@ -94,11 +94,14 @@ class ActiveSubmaps:
         match: Match,
         force_new_submap: bool = False,
     ) -> bool:
-        """Insert the scan into the active submaps if it passes the motion filter; return whether it did.
+        """Insert the scan into the active submaps if it passes the motion filter; return True if inserted.
 
-        With `force_new_submap` the older submap is finished early. It is set after a stretch with an
-        unobservable direction: the poses after it are consistent among themselves, but only loosely tied to
-        the poses before, and the pose graph can correct this only between submaps, not within one.
+        Args:
+            dynamic: bool [M], returns on dynamic objects; they are not inserted.
+            match: match of the scan, whose information becomes the information of the constraints.
+            force_new_submap: start a new submap early. The caller sets it after a stretch with an
+                unobservable direction (corridor): later poses are consistent with each other, but uncertain
+                relative to earlier ones. The pose graph can move submaps, but not scans within a submap.
         """
         self._force_new_submap = self._force_new_submap or force_new_submap
         if self._active and not self._passes_motion_filter(stamp_ns, pose_odom_body):
@@ -158,7 +161,7 @@ class ActiveSubmaps:
         )
 
     def close(self) -> None:
-        """Finish the active submaps; the next node starts new ones."""
+        """Finish the active submaps; the next trajectory node starts new submaps."""
         for active in self._active:
             active.submap.frozen = freeze(active.local.surfels)
         self._active = []
@@ -169,7 +172,7 @@ class ActiveSubmaps:
             active.submap.frozen = freeze(active.local.surfels)
 
     def with_frozen(self, work: Callable[[], Result]) -> Result:
-        """Return `work()`, called while the active submaps are temporarily frozen (for saving)."""
+        """Freeze the active submaps, call `work()` (for example saving), unfreeze them; return its result."""
         growing = [active for active in self._active if active.submap.frozen is None]
         for active in growing:
             active.submap.frozen = freeze(active.local.surfels)

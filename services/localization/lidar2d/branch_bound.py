@@ -17,8 +17,7 @@ LEVELS = 6  # a cell of the coarsest level covers 2^5 x 2^5 search cells
 class SearchPyramid:
     """Precomputed grids for branch and bound.
 
-    Level h holds at each cell the maximum of the likelihood field over the 2^h x 2^h search cells that start
-    there.
+    A cell of level h contains the maximum likelihood of the 2^h x 2^h search cells that start at this cell.
     """
 
     levels: np.ndarray  # uint8 [LEVELS, H, W], padded by 2^(LEVELS - 1) on all sides
@@ -29,7 +28,7 @@ class SearchPyramid:
 
 @kernel
 def _fill(field: np.ndarray, shift_r: int, shift_c: int, levels: np.ndarray) -> None:
-    """Fill all levels from the likelihood field."""
+    """Compute all levels of the pyramid from the likelihood field, shifted by whole field cells."""
     for r in range(field.shape[0]):
         for c in range(field.shape[1]):
             rr, cc = (r + shift_r) >> 1, (c + shift_c) >> 1
@@ -64,7 +63,7 @@ def build_pyramid(field: np.ndarray, row0: int, col0: int, cell_m: float) -> Sea
 
 @kernel
 def _score(level: np.ndarray, rows: np.ndarray, cols: np.ndarray, dr: int, dc: int) -> float:
-    """Return the mean likelihood of the returns at the offset (dr, dc)."""
+    """Return the mean likelihood (0 .. 1) of the returns in cells (rows + dr, cols + dc) of a level."""
     total = 0
     for i in range(rows.shape[0]):
         r, c = rows[i] + dr, cols[i] + dc
@@ -75,9 +74,10 @@ def _score(level: np.ndarray, rows: np.ndarray, cols: np.ndarray, dr: int, dc: i
 
 @kernel
 def _row_for(found: np.ndarray, count: int, score: float, yaw: int, dr: int, dc: int, near_yaw: int) -> int:
-    """Return the row of the result table for a leaf, or -1 if a better leaf is nearby.
+    """Return the row of the result table to which a leaf is written, -1 if a better leaf is nearby.
 
-    A weaker leaf nearby is replaced. Otherwise the many poses around the best one would fill the table.
+    It is the row of a worse leaf nearby, else the next free row. Without this rule, the many poses around the
+    best pose would fill the table.
     """
     for i in range(count):
         if (
@@ -91,9 +91,9 @@ def _row_for(found: np.ndarray, count: int, score: float, yaw: int, dr: int, dc:
 
 @kernel
 def _make_room(found: np.ndarray, best: float, keep: float) -> tuple[float, int]:
-    """Raise `keep` until at least a quarter of the table is free; return the new `keep` and the row count.
+    """Remove leaves with a score below `keep` * `best`; increase `keep` until a quarter of the table is free.
 
-    The best leaf is never removed.
+    The best leaf is never removed. Returns the new `keep` and the number of leaves left.
     """
     count = found.shape[0]
     while 4 * count > 3 * found.shape[0]:
@@ -120,7 +120,7 @@ def _search(
     near_yaw: int,  # leaves within this many yaw steps count as the same pose
     found: np.ndarray,  # out float64 [M, 4] score, yaw index, dr, dc
 ) -> tuple[int, int]:
-    """Search depth first, best child first; return (number of leaves reported, nodes visited)."""
+    """Search depth first, best child first; return the number of rows of `found` and of scores computed."""
     top = levels.shape[0] - 1
     width = 1 << top
     n_angles = rows.shape[0]
@@ -191,10 +191,10 @@ def branch_and_bound(
     max_found: int = 512,
     min_step_rad: float = math.radians(0.8),
 ) -> list[tuple[float, np.ndarray]]:
-    """Return distinct poses (score, pose [3] of the body in the pyramid's frame), best first.
+    """Search a window around `centre_pose`; return distinct (score, pose [3]), best first.
 
-    The list is empty if no pose reaches `min_score`. Poses with a score below `keep` times the best are
-    dropped.
+    The score is the mean likelihood (0 .. 1); the pose is of the body in the frame of the pyramid. The list
+    contains poses with a score of at least `min_score` and of about `keep` times the best score or more.
     """
     if len(points) == 0:
         return []

@@ -24,7 +24,7 @@ def correlate(
     step_yaw_rad: float,
     scores: np.ndarray,  # out float32 [2 steps_yaw + 1, 2 steps_xy + 1, 2 steps_xy + 1], mean likelihood
 ) -> None:
-    """Compute the mean likelihood of every pose in a window (Olson 2009)."""
+    """Write the mean likelihood (0 .. 1) of every pose in a window around `pose` to `scores` (Olson 2009)."""
     n = points.shape[0]
     rows, cols = np.empty(n, dtype=np.int32), np.empty(n, dtype=np.int32)
     for a in range(2 * steps_yaw + 1):
@@ -55,10 +55,10 @@ def search(
     candidates: int = 3,
     step_yaw_rad: float = math.radians(1.5),
 ) -> list[tuple[float, np.ndarray]]:
-    """Return the best distinct poses (score, pose [3] of the body in the map's frame) of a window.
+    """Return the best distinct poses of a window as (score, pose [3] of the body in the frame of the map).
 
-    For the ranking, the score is reduced with the squared distance from the window's centre, by
-    `prior_weight` at its border.
+    Poses are ranked by mean likelihood minus a penalty that grows with the square of the distance from the
+    centre of the window, to `prior_weight` at the border, in each of x, y and yaw.
     """
     stride = 2
     steps_xy = max(1, math.ceil(window_m / (stride * tables.cell_m)))

@@ -53,7 +53,7 @@ class DeadReckoning:
         return self._extrapolated(stamp_ns)
 
     def _extrapolated(self, stamp_ns: int) -> np.ndarray | None:
-        """Return the reckoned pose at a stamp, None if the odometry is missing or inaccurate."""
+        """Return pose_odom_body [3] by wheel odometry, None if the odometry is missing or inaccurate."""
         if self._reckoned_pose is None or self.error_ratio > MAX_ERROR_RATIO:
             return None
         moved = self._odometry.increment(self._stamp_ns, stamp_ns)
@@ -62,10 +62,15 @@ class DeadReckoning:
     def correct(
         self, stamp_ns: int, pose_odom_body: np.ndarray, trust: float, direction_odom: np.ndarray
     ) -> tuple[np.ndarray, bool]:
-        """Return the matched pose, corrected along the weak direction, and whether it was corrected.
+        """Correct a matched pose along its weak direction by dead reckoning.
 
-        Args:     trust: observability along the weak direction, 0 .. 1, see observability.ObservedMatch.
-        direction_odom: float64 [2], unit vector of the weak direction in the odom frame.
+        Args:
+            pose_odom_body: float64 [3], the matched pose.
+            trust: observability along the weak direction, 0 .. 1, see observability.ObservedMatch.
+            direction_odom: float64 [2], unit vector of the weak direction in the odom frame.
+
+        Returns:
+            pose_odom_body [3], and whether it was corrected.
         """
         extrapolated = self._extrapolated(stamp_ns)
         was_lost, self.degenerate = self.degenerate, trust < MIN_TRUST
@@ -90,7 +95,7 @@ class DeadReckoning:
         return corrected, True
 
     def restart(self, stamp_ns: int, pose_odom_body: np.ndarray) -> None:
-        """Restart from a pose after the first scan or a loss of tracking."""
+        """Start again from a matched pose: after the first scan, or after a loss of tracking."""
         self._reckoned_pose, self._stamp_ns, self._check, self.degenerate = (
             pose_odom_body,
             stamp_ns,
@@ -99,7 +104,7 @@ class DeadReckoning:
         )
 
     def _update_error_ratio(self, stamp_ns: int, pose_odom_body: np.ndarray) -> None:
-        """Compare the distances by wheels and by scans over CHECK_DISTANCE_M while the pose is observable."""
+        """Update `error_ratio`: relative error of the distance by wheels against the distance by scans."""
         if self._check is None:
             self._check = (stamp_ns, pose_odom_body)
             return

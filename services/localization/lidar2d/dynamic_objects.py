@@ -28,11 +28,11 @@ def contradicts_free_space(
     cell_m: float,
     out: np.ndarray,  # out bool [M]
 ) -> None:
-    """Mark returns that contradict observed free space.
+    """Write to `out` which returns contradict observed free space.
 
     A return is marked if its cell and all neighbours were observed free by at least MIN_FREE_SCANS nodes and
-    were rarely hit, and if no surface is within CLEARANCE_M. A surface that beams have passed since does not
-    count.
+    were rarely hit, and if no surface is within CLEARANCE_M. A surface that later beams have passed through
+    is ignored.
     """
     c, s = math.cos(pose[2]), math.sin(pose[2])
     for i in range(points.shape[0]):
@@ -99,7 +99,7 @@ def grow_along_beams(
 
 @kernel
 def _mark_whole_objects(points: np.ndarray, beams: np.ndarray, gap_m: float, out: np.ndarray) -> None:
-    """Mark all returns of a small connected object if a sufficient part of them is marked."""
+    """Mark all returns of a connected object up to MAX_OBJECT_WIDTH_M if enough of them are marked."""
     m = out.shape[0]
     first = 0
     for i in range(1, m + 1):

@@ -14,9 +14,10 @@ from beamsplat.services.localization.lidar2d import se2
 def linearise(
     pose_map_submap: np.ndarray, pose_map_node: np.ndarray, z: np.ndarray, e: np.ndarray, Js: np.ndarray
 ) -> None:
-    """Compute the residual e [3] and its Jacobian Js [3, 3] with respect to the submap pose.
+    """Write the residual e [3] of a constraint and its Jacobian Js [3, 3] with respect to the submap pose.
 
-    `z` is the measured pose_submap_node. The Jacobian with respect to the node is the rotation R_s^T.
+    `z` is the measured pose_submap_node. The Jacobian with respect to the node pose is R^T (not written),
+    where R is the rotation of the submap.
     """
     c, s = math.cos(pose_map_submap[2]), math.sin(pose_map_submap[2])
     dx, dy = pose_map_node[0] - pose_map_submap[0], pose_map_node[1] - pose_map_submap[1]
@@ -154,7 +155,7 @@ def substitute(
     submap_poses: np.ndarray,
     node_poses: np.ndarray,
 ) -> None:
-    """Update all poses in place: submaps by `dx`, nodes by back substitution."""
+    """Update all poses in place: submap poses by `dx` float64 [S, 3], node poses by back substitution."""
     b = np.empty(3)
     for n in range(node_poses.shape[0]):
         if first[n] == first[n + 1]:

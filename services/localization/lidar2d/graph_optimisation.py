@@ -27,7 +27,7 @@ SHRINK = 5.0  # factor per iteration by which the squared loss scale of loop clo
 
 @dataclass(frozen=True)
 class ConstraintArrays:
-    """Constraints as arrays: measured poses of nodes in submaps; rows are ordered by node."""
+    """Constraints as arrays, ordered by node; `submap` and `node` are row numbers of the pose arrays."""
 
     submap: np.ndarray  # int32 [E]
     node: np.ndarray  # int32 [E], non-decreasing
@@ -54,9 +54,14 @@ def optimise(
     final_scale2: float = 9.0,
     iterations: int = 16,
 ) -> GraphSolution:
-    """Minimise sum rho(e^T Omega e) with e = pose_submap_node (-) inverse(pose_map_submap) * pose_map_node.
+    """Optimise all poses: minimise the sum of rho(e^T Omega e) over the constraints.
 
-    Args:     final_scale2: squared scale of the robust loss in the last iterations, in units of chi^2.
+    e is the difference of the measured pose_submap_node and inverse(pose_map_submap) * pose_map_node, Omega
+    the information of the constraint, rho the robust loss.
+
+    Args:
+        final_scale2: squared scale of the robust loss in the last iterations, in units of chi^2.
+        iterations: maximum number of iterations.
     """
     submap_poses, node_poses = (
         pose_map_submap.astype(np.float64).copy(),
@@ -126,7 +131,7 @@ def optimise(
 def _solve(
     blocks: np.ndarray, row: np.ndarray, col: np.ndarray, rhs: np.ndarray, fixed: Sequence[int]
 ) -> np.ndarray:
-    """Return the submap updates float64 [S, 3]; a dense Cholesky or a sparse LU factorisation is used."""
+    """Solve the reduced normal equations for the updates of the submap poses, float64 [S, 3]."""
     n = len(rhs)
     diagonal = 1e-6 * np.ones(3 * n)
     for row_fixed in fixed:

@@ -25,7 +25,7 @@ class JobRunner:
         self._job: BackgroundJob | None = None
 
     def before_scan(self) -> None:
-        """Apply the result that is due before the next scan."""
+        """Apply the result of the running job if it is due before the next scan."""
         if self._job is None or self.slam.scans < self._job.apply_at_scan:
             return
         if self._future is not None:
@@ -37,13 +37,13 @@ class JobRunner:
         self.slam.apply(result)
 
     def after_scan(self, result: ScanResult) -> None:
-        """Start the job of a scan result, if it has one."""
+        """Start the background job in the result of `add_scan`, if the result contains one."""
         if result.job is not None:
             self._job = result.job
             self._future = self._pool.submit(result.job.run) if self._pool is not None else None
 
     def finish(self) -> None:
-        """Apply the running job, then do the final optimisation."""
+        """Wait for the running job and apply its result, then do the final optimisation."""
         if self._job is not None:
             result = self._future.result() if self._future is not None else self._job.run()
             self._job, self._future = None, None

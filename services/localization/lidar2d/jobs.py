@@ -1,4 +1,4 @@
-"""Background jobs as pure functions of a snapshot: loop closure, linking, refinement, optimisation."""
+"""Background jobs as pure functions of a snapshot: loop closure, linking of segments, optimisation."""
 
 from __future__ import annotations
 
@@ -55,10 +55,10 @@ class BackgroundJob:
 
 
 def run_job(snapshot: Snapshot, refine_rounds: int = 0) -> JobResult:
-    """Search loop closures (or link a new segment), then optimise the pose graph.
+    """Search loop closures (or the pose of a new segment in the map), then optimise the pose graph.
 
-    With `refine_rounds` > 0, the submaps are also rebuilt from the optimised poses and all constraints are
-    measured again, that many times.
+    `refine_rounds` times, the submaps are rebuilt from the optimised poses, all constraints are measured
+    again, and the pose graph is optimised again.
     """
     submap_row = {s: i for i, s in enumerate(snapshot.submap_ids)}
     node_row = {n: i for i, n in enumerate(snapshot.node_ids)}
@@ -113,7 +113,7 @@ def run_job(snapshot: Snapshot, refine_rounds: int = 0) -> JobResult:
 def _without_outliers(
     constraints: list[Constraint], chi2: np.ndarray, node_row: dict[int, int]
 ) -> list[Constraint]:
-    """Return the constraints without loop closures whose chi^2 is above REJECT_CHI2."""
+    """Remove loop closures with a chi^2 above REJECT_CHI2; return all other constraints."""
     order = np.argsort([node_row[c.node] for c in constraints], kind="stable")
     keep = np.ones(len(constraints), dtype=bool)
     keep[order] = chi2 < REJECT_CHI2
@@ -154,13 +154,13 @@ def _find_constraints(
 
 
 def _submaps_of(edges: ConstraintArrays, row: int) -> np.ndarray:
-    """Return the rows of the submaps that contain a node."""
+    """Return the row numbers of the submaps that contain the node with row number `row`."""
     lo, hi = np.searchsorted(edges.node, [row, row + 1])
     return edges.submap[lo:hi][~edges.robust[lo:hi]]
 
 
 def _nearest_member(snapshot: Snapshot, edges: ConstraintArrays, row: int) -> np.ndarray:
-    """Return the distance (m) from a node to the nearest member of each submap, float64 [S]."""
+    """Return the distance (m) from the node in `row` to the nearest node of each submap, float64 [S]."""
     away = np.hypot(*(snapshot.pose_map_node[:, :2] - snapshot.pose_map_node[row, :2]).T)
     distance = np.full(len(snapshot.submap_ids), np.inf)
     inner = ~edges.robust
@@ -175,9 +175,9 @@ def _loop_candidates(
     own: list[int],
     windows: tuple[np.ndarray, np.ndarray],
 ) -> tuple[list[LoopCandidate], bool]:
-    """Return the nearest submaps from other passes as local loop candidates.
+    """Return loop candidates for the node in `row`: near submaps of other passes through the same place.
 
-    The flag tells whether a near submap was skipped because its relative pose is too uncertain.
+    The second value is True if a near submap was omitted because its relative pose is too uncertain.
     """
     s = snapshot.settings
     distance = _nearest_member(snapshot, edges, row)
@@ -212,7 +212,7 @@ def _find_global_constraints(
     windows: dict[int, tuple[np.ndarray, np.ndarray]],
     drift: DriftModel,
 ) -> tuple[list[Constraint], list[int]]:
-    """Search one node in submaps of uncertain relative pose; return constraints and submap ids."""
+    """Match the node `centre` globally to submaps of uncertain pose; return constraints and submap ids."""
     s = snapshot.settings
     row = node_row[centre]
     own = sorted(set(_submaps_of(edges, row).tolist()))

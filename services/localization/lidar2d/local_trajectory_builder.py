@@ -23,7 +23,7 @@ NS = 1e-9
 
 @dataclass(frozen=True)
 class RawScan:
-    """One revolution or sweep as the sensor delivers it; the stamp is that of the first beam."""
+    """One scan (revolution or sweep) of the sensor, unprocessed; `stamp_ns` is the time of the first beam."""
 
     stamp_ns: int
     ranges_m: np.ndarray  # float32 [N], +inf or >= range_max_m: no return
@@ -36,7 +36,7 @@ class RawScan:
 
 @dataclass
 class LocalMap:
-    """A submap that is being filled: its pose in the odom frame and its surfel map."""
+    """An unfinished submap: its pose in the odom frame and its surfel map, to which scans are added."""
 
     pose_odom_submap: np.ndarray  # float64 [3]
     surfels: SurfelMap
@@ -44,7 +44,7 @@ class LocalMap:
 
 @dataclass(frozen=True)
 class Prediction:
-    """Predicted motion since the last scan and its uncertainty."""
+    """Predicted motion of the body since the last scan, with standard deviations."""
 
     motion: np.ndarray  # float64 [3], pose_last_now
     sigma_m: float
@@ -74,7 +74,7 @@ class LocalTrajectoryBuilder:
         self.poses: list[np.ndarray] = []
 
     def restart_clock(self, stamp_ns: int) -> None:
-        """Continue from the last pose after the clock was set to another time."""
+        """Continue from the last pose at the stamp `stamp_ns`, after the clock was set to another time."""
         if self.poses:
             self.stamps, self.poses = [stamp_ns - round(0.1 / NS)], [self.poses[-1]]
             self.reckoning.restart(stamp_ns, self.poses[-1])
@@ -94,10 +94,10 @@ class LocalTrajectoryBuilder:
         return twist(se2.between(self.poses[i], self.poses[-1]), dt)
 
     def predict(self, stamp_ns: int) -> tuple[Prediction, list[tuple[MotionErrorModel, np.ndarray]]]:
-        """Return the motion prediction with the lowest recent error, and all candidates for the error models.
+        """Return the motion prediction with the lowest recent error, and all predictions with error models.
 
-        Candidates are constant velocity, standstill and wheel odometry; dead reckoning has priority while it
-        is active.
+        Predictions are by constant velocity, standstill and wheel odometry; while dead reckoning is active,
+        its prediction is returned. Pass the second value to `accept`.
         """
         dt = (stamp_ns - self.stamps[-1]) * NS
         steady = exp_twist(self.velocity(), min(dt, self.settings.extrapolate_s))
@@ -156,7 +156,7 @@ class LocalTrajectoryBuilder:
         return self.velocity()
 
     def prepare(self, raw: RawScan, velocity: np.ndarray) -> PreparedScan:
-        """Return the filtered and deskewed scan for the given body twist."""
+        """Filter and deskew a scan; `velocity` is the body twist [3] (m/s, m/s, rad/s) during the scan."""
         s = self.settings
         return prepare_scan(
             raw.ranges_m,
@@ -176,7 +176,7 @@ class LocalTrajectoryBuilder:
     def match(
         self, raw: RawScan, scan: PreparedScan, prediction: Prediction, local: LocalMap
     ) -> tuple[PreparedScan, Match, bool]:
-        """Match the scan to the local map; return the deskewed scan, the match and whether it is trusted.
+        """Match the scan to the local map; return the scan, the match, and whether the match is accepted.
 
         Gauss-Newton starts at the prediction. Correlative search is added if the prediction is uncertain or
         the match is poor. The scan is then deskewed again with the matched motion and matched once more.
@@ -242,7 +242,7 @@ class LocalTrajectoryBuilder:
         )
 
     def _apply_dead_reckoning(self, stamp_ns: int, local: LocalMap, seen: ObservedMatch) -> Match:
-        """Correct the match along its weak direction by dead reckoning, where it is degenerate."""
+        """Return the match, corrected along its weak direction by dead reckoning if it is degenerate."""
         pose_odom_submap = local.pose_odom_submap
         turn = np.array([0.0, 0.0, pose_odom_submap[2]])
         direction_odom = se2.transform(turn, seen.direction[None])[0]
@@ -256,7 +256,7 @@ class LocalTrajectoryBuilder:
         return dataclasses.replace(seen.match, pose_target_body=pose_map_body, information=information)
 
     def _is_trusted(self, prediction: Prediction, guess_pose: np.ndarray, match: Match) -> bool:
-        """Return whether the inlier ratio is high enough.
+        """Return whether the inlier ratio is high enough to accept the match.
 
         The limit is higher if the match is far from the prediction or if there is no prediction.
         """
@@ -280,7 +280,7 @@ class LocalTrajectoryBuilder:
         window_m: float,
         window_rad: float,
     ) -> Match:
-        """Return the better of the match `best` and the matches found by correlative search in a window."""
+        """Search a window around `centre_pose` by correlative matching; return the best match, or `best`."""
         tables, s = local.surfels.tables(), self.settings
         points = scan.features()
         for _, start_pose in search(points, centre_pose, tables, window_m, window_rad, prior_weight=0.02):

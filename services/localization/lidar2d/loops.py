@@ -47,7 +47,7 @@ VERIFICATION_MIN_INLIER_RATIO = 0.75  # mean over the verified nodes
 
 @dataclass(frozen=True)
 class LoopCandidate:
-    """A submap that may contain a node, with the predicted relative pose and its search window."""
+    """A submap to which a node may be matched, with the predicted relative pose and the search window."""
 
     submap: int
     frozen: FrozenMap
@@ -60,9 +60,9 @@ class LoopCandidate:
 def _submap_pair_variances(
     submap: np.ndarray, first: np.ndarray, var_m: np.ndarray, var_rad: np.ndarray, links: np.ndarray
 ) -> None:
-    """Compute the smallest variance between two submaps that share a node.
+    """Write to `links` the smallest variance of the relative pose of each two submaps that share a node.
 
-    `links` is float64 [3, S, S]: variance in m^2, variance in rad^2, and 1 where there is a link.
+    `links` is float64 [3, S, S]: variance in m^2, variance in rad^2, and 1 where two submaps share a node.
     """
     for n in range(first.shape[0] - 1):
         for i in range(first[n], first[n + 1]):
@@ -77,7 +77,7 @@ def _submap_pair_variances(
 
 
 class DriftModel:
-    """Uncertainty of the relative pose of two submaps: the shortest path of variances between them."""
+    """Uncertainty of the relative pose of two submaps: smallest sum of variances on a path between them."""
 
     def __init__(
         self, edges: ConstraintArrays, n_submaps: int, n_nodes: int, settings: LidarSlamSettings
@@ -97,7 +97,10 @@ class DriftModel:
         self._length_m = s.submap_nodes * s.motion_filter_distance_m
 
     def windows(self, source: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the search windows (m, rad) of all submaps as seen from one, float64 [S], three sigma."""
+        """Return the search windows (m and rad, float64 [S] each) in all submaps, for a node of one submap.
+
+        `source` is the row number of the submap of the node. A window is three sigma plus a constant.
+        """
         var_m, var_rad, hops = (
             # The stubs do not know dense graphs.
             dijkstra(np.where(np.isfinite(links), links, 0.0), directed=False, indices=source)  # type: ignore[call-overload]
@@ -140,9 +143,10 @@ def match_globally(
     cache: TableCache,
     settings: LidarSlamSettings,
 ) -> Constraint | None:
-    """Match merged scans to one submap by branch and bound; return a constraint if it is unambiguous.
+    """Match merged scans to one submap by branch and bound; return a constraint if the pose is unambiguous.
 
-    The constraint is measured with the scan of the centre node alone.
+    `neighbours` are nodes before and after `node`, whose scans are merged. The final match uses the scan of
+    `node` alone.
     """
     features = merged_features(neighbours, node)
     if len(features) < settings.min_points:
@@ -195,10 +199,10 @@ def verify_constraint(
     cache: TableCache,
     settings: LidarSlamSettings,
 ) -> bool:
-    """Return whether nodes metres before and after a global loop closure agree with it.
+    """Return whether nodes some metres before and after a global loop closure confirm it.
 
-    The neighbourhood of the node is moved rigidly according to the constraint. Each check matches one scan to
-    the submap of the other pass at its moved position.
+    The nodes around `link.node` are moved rigidly, so that the constraint `link` is fulfilled. The scan of
+    each such node is then matched to the nearest submap of the other pass, at the moved pose.
     """
     shift = se2.compose(
         se2.compose(pose_map_submap[link.submap], link.pose_submap_node),
@@ -236,8 +240,8 @@ def verify_constraint(
 def match_score(match: Match) -> float:
     """Return overlap * (inlier_ratio - 0.5).
 
-    Returns on surfaces count for the match, returns in free space against it, returns in unknown space not at
-    all.
+    Returns on surfaces increase the score, returns in free space decrease it, returns in unknown space do not
+    change it.
     """
     return match.overlap * (match.inlier_ratio - 0.5)
 

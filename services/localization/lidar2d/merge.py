@@ -20,7 +20,7 @@ SAME_POSE_M, SAME_POSE_RAD = 0.4, math.radians(4.0)  # tolerance for equal poses
 
 @dataclass(frozen=True)
 class MapAlignment:
-    """Pose of map b in map a, with the number of scans that support it."""
+    """Pose of map b in map a, with the number of scans of map b whose relocalization agrees with it."""
 
     pose_a_b: np.ndarray  # float64 [3]
     agreeing: int  # number of scans that support this pose
@@ -28,7 +28,7 @@ class MapAlignment:
 
 
 def find_alignment(a: LidarSlam, b: LidarSlam) -> MapAlignment | None:
-    """Relocalize scans of map b in map a; return None if too few results agree or the result is ambiguous."""
+    """Find the pose of map b in map a by relocalization of scans; None if ambiguous or not confirmed."""
     global_map, nodes = a.global_map(), list(b.pose_graph.nodes.values())
     chosen = [nodes[i] for i in np.unique(np.linspace(0, len(nodes) - 1, QUERY_SCANS).round().astype(int))]
     poses_a_b = []
@@ -56,7 +56,7 @@ def _same(p: np.ndarray, q: np.ndarray) -> bool:
 
 
 def merge_into(a: LidarSlam, b: LidarSlam, pose_a_b: np.ndarray, offset: int) -> int:
-    """Insert map b into map a at `pose_a_b` [3], search loop closures and optimise; return their number.
+    """Insert map b into map a at `pose_a_b` [3], optimise; return the number of new loop closures.
 
     `offset` is added to the submap ids of b. Map b must not be used afterwards.
     """
@@ -82,7 +82,7 @@ def merge_into(a: LidarSlam, b: LidarSlam, pose_a_b: np.ndarray, offset: int) ->
 def _merged_records(
     a: TrajectoryRecord, b: TrajectoryRecord, pose_a_b: np.ndarray, first: int
 ) -> TrajectoryRecord:
-    """Return the trajectory records of both maps, sorted by stamp."""
+    """Join the trajectory records of both maps, sorted by stamp; `first` is added to the node ids of b."""
     of_a, of_b = a.arrays(), b.arrays()
     poses = of_b["extra_poses"].copy()
     poses[:, 3:] = se2.compose_many(np.tile(pose_a_b, (len(poses), 1)), poses[:, 3:])

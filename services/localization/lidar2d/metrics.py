@@ -14,7 +14,7 @@ NS_PER_S = 1_000_000_000
 
 @dataclass(frozen=True)
 class RelationErrors:
-    """Mean absolute errors over given relative poses."""
+    """Mean and standard deviation of the absolute errors of relative poses, over all relations."""
 
     relations: int
     skipped: int  # relations without an estimated pose at one of their stamps
@@ -26,7 +26,7 @@ class RelationErrors:
 
 @dataclass(frozen=True)
 class TrajectoryErrors:
-    """Absolute trajectory errors; the scale is never fitted."""
+    """Absolute trajectory errors (RMSE), after an alignment without scale."""
 
     poses: int
     ate_first_pose_rmse_m: float
@@ -58,7 +58,7 @@ def read_relations(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def stamp_ns_of(seconds: str) -> int:
-    """Convert decimal seconds as text to int64 ns; a float would keep only about 100 ns.
+    """Convert decimal seconds as text to ns, exactly; a float has a resolution of only about 100 ns.
 
     Raises ValueError if the text is not a decimal number.
     """
@@ -77,7 +77,7 @@ def relation_errors(
     pose_body_reference: np.ndarray | None = None,  # float64 [3], the frame of the relations
     tolerance_ns: int = 1_000_000,
 ) -> RelationErrors:
-    """Return the errors of estimated relative poses: length of the translation error and absolute yaw error.
+    """Compare estimated relative poses with the relations: length of translation error, absolute yaw error.
 
     Raises ValueError if no relation has both stamps in the trajectory.
     """
@@ -139,7 +139,7 @@ def interpolate_poses(
     poses: np.ndarray,  # float64 [N, 3]
     at_ns: np.ndarray,  # int64 [M]
 ) -> np.ndarray:
-    """Return poses float64 [M, 3] at other stamps, linear in position and yaw, clamped at both ends."""
+    """Interpolate poses at the stamps `at_ns`, linear in position and yaw; the end poses are used beyond."""
     base = int(stamps_ns[0])
     t, q = (stamps_ns - base) * 1e-9, (at_ns - base) * 1e-9
     yaw = np.unwrap(poses[:, 2])
@@ -154,7 +154,7 @@ def interpolate_poses(
 def nearest_stamps(
     stamps_ns: np.ndarray, wanted_ns: np.ndarray, tolerance_ns: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the index of the nearest stamp for each wanted one, and whether it is within the tolerance."""
+    """Return for each of `wanted_ns` the index of the nearest stamp, and if it is within the tolerance."""
     if len(stamps_ns) == 0:
         return np.zeros(len(wanted_ns), dtype=np.int64), np.zeros(len(wanted_ns), dtype=bool)
     right = np.clip(np.searchsorted(stamps_ns, wanted_ns), 0, len(stamps_ns) - 1)

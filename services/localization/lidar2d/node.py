@@ -38,7 +38,7 @@ _RESERVED_SUBMAP_IDS = 1000  # upper bound of the submaps started between the la
 
 
 class LidarLocalizationConfig(NodeConfig):
-    """Configuration; the SLAM needs no tuning, because the properties of the lidar come with the scans."""
+    """Configuration; the SLAM needs no tuning, because scans contain the properties of the lidar."""
 
     grid_every_scans: Annotated[int, Field(ge=1)] = 50
     grid_resolution_m: Annotated[float, Field(gt=0.0, le=1.0)] = 0.05
@@ -50,8 +50,8 @@ class LidarLocalizationConfig(NodeConfig):
 class LidarLocalization(Node):
     """Localization service by 2D lidar SLAM, with wheel odometry where it is available.
 
-    In live operation it writes checkpoints. After a crash, the restarted process loads the last one and
-    relocalizes in it, which takes a few seconds.
+    In live operation it writes checkpoints of the map. After a crash, the restarted process loads the last
+    checkpoint and relocalizes in this map, which takes a few seconds.
     """
 
     name = "localization"
@@ -65,7 +65,7 @@ class LidarLocalization(Node):
     )  # fmt: skip
 
     def check_resources(self) -> None:
-        """Check that the state to resume can be read, and that the new one can be written."""
+        """Check that the map in the folder `resume` can be read, and the folder `save` can be written."""
         if self.config.resume is not None:
             try:
                 read_manifest(self.config.resume / MANIFEST)
@@ -128,7 +128,7 @@ class LidarLocalization(Node):
         return iter(())
 
     def on_lidar_scan(self, scan: Scan) -> Outputs:
-        """Publish one pose per scan; start background jobs and publish the grid at fixed intervals."""
+        """Publish pose and dynamic beams of a scan; start background jobs; publish the grid at intervals."""
         if self._slam is None:
             yield "localization/odometry", _rejected(scan.stamp_ns, "no calibration yet")
             return
@@ -150,14 +150,14 @@ class LidarLocalization(Node):
             yield from self._publish_grid(self._slam)
 
     def on_job_optimise(self, result: JobResult) -> Outputs:
-        """Apply an optimisation: the map changes, the pose in the odom frame does not."""
+        """Apply the result of a background job and publish the new map poses; T_odom_body does not change."""
         assert self._slam is not None  # it started the job
         self._slam.apply(result)
         self._optimisations += 1
         yield from self._publish_map_poses(self._slam)
 
     def _start_checkpoint(self, slam: LidarSlam, stamp_ns: int, localized: bool) -> Outputs:
-        """Write a checkpoint in the background every `keep_every_s`, while the pose is known."""
+        """Start a job that writes a checkpoint, every `keep_every_s` while the robot is localized."""
         if self._checkpoint_dir is None or self._checkpoint_running or not localized:
             return
         if (
@@ -177,7 +177,7 @@ class LidarLocalization(Node):
             yield Job("checkpoint", write)
 
     def on_job_checkpoint(self, fault: str) -> Outputs:
-        """Report whether the checkpoint was written."""
+        """Set the text of the health message: empty, or why the checkpoint was not written (`fault`)."""
         self._checkpoint_running = False
         self.detail = f"the checkpoint of the map was not written: {fault}" if fault else ""
         return iter(())
@@ -199,7 +199,7 @@ class LidarLocalization(Node):
         yield from self._anchors(slam)
 
     def _publish_new_map(self, slam: LidarSlam) -> Outputs:
-        """Publish the anchors with the map's UUID before the first pose in a new map.
+        """Publish the anchors if the map has a new UUID, before the first pose in this map.
 
         Subscribers must not mix anchors of two maps.
         """
@@ -233,7 +233,7 @@ class LidarLocalization(Node):
             )
 
     def _publish_grid(self, slam: LidarSlam) -> Outputs:
-        """Publish the occupancy grid with the region that differs from the last one."""
+        """Publish the occupancy grid with the bounding box of the cells that changed since the last grid."""
         grid = slam.grid(self.config.grid_resolution_m)
         changed = _changed(self._published_grid, grid)
         self._published_grid = grid

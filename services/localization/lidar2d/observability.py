@@ -34,7 +34,11 @@ def weights_when_shifted(
     scale2: float,
     out: np.ndarray,
 ) -> float:
-    """Return the sum of weights at the match; write the sum at each shift to `out` float64 [K]."""
+    """Return the sum of robust weights of the returns at `pose`; write the sums at shifted poses to `out`.
+
+    `out` is float64 [K]; the shifts are `shifts_m` float64 [K] along `direction`. A sum that is almost as
+    large at a shifted pose shows that the match is not observable in this direction.
+    """
     H, g, moved = np.empty((3, 3)), np.empty(3), np.empty(3)
     here, _, _ = accumulate(
         points, origin, pose, nearest, means, omegas, views, row0, col0, cell_m, scale2, H, g
@@ -62,7 +66,7 @@ def weak_direction(information: np.ndarray) -> np.ndarray:
 
 @dataclasses.dataclass(frozen=True)
 class ObservedMatch:
-    """A match with the observability of its weak direction."""
+    """A match, with its least certain direction and the observability along this direction."""
 
     match: Match  # with reduced information
     trust: float  # 0 (unobservable) .. 1 (fully observable)
@@ -76,9 +80,9 @@ def reduce_unobservable(
     tables: MatchTables,
     settings: LidarSlamSettings,
 ) -> ObservedMatch:
-    """Return the match with less information along its weak direction if shifting the scan changes little.
+    """Reduce the information of a match along its weak direction, if a shifted scan fits almost as well.
 
-    The information along the direction is multiplied by trust^2. `full_information` keeps the original.
+    The information along the direction is multiplied by trust^2. `full_information` is the original.
     """
     direction = weak_direction(match.information)
     if len(points) == 0:
@@ -114,7 +118,7 @@ def reduce_unobservable(
 
 
 def keep_guess_if_unobservable(observed: ObservedMatch, guess_pose: np.ndarray) -> Match:
-    """Return the match with its pose moved back to the guess along the unobservable direction."""
+    """Return the match with its pose moved back to `guess_pose` [3] along the unobservable direction."""
     match, v = observed.match, observed.direction
     if observed.trust >= 1.0:
         return match

@@ -45,7 +45,7 @@ def add_counts(
     sum_hits: np.ndarray,
     sum_misses: np.ndarray,  # in out float32 [H, W]
 ) -> None:
-    """Add the counts of a submap to the map grid: each map cell reads the submap cell at its centre."""
+    """Add hits and misses of a submap to the map grid, from the submap cell at each map cell's centre."""
     c, s = math.cos(pose_submap_map[2]), math.sin(pose_submap_map[2])
     for r in range(low_row, high_row):
         y = origin_y + (r + 0.5) * resolution
@@ -83,7 +83,7 @@ class CountGrid:
 def render_occupancy(grids: list[CountGrid], resolution_m: float) -> OccupancyGrid:
     """Return one occupancy grid of all submaps.
 
-    Its origin is a multiple of 64 cells, so that a growing grid keeps its cell boundaries.
+    The origin is a multiple of 64 cells, so that cell boundaries do not change when the grid grows.
     """
     if not grids:
         return OccupancyGrid(np.full((64, 64), UNKNOWN, dtype=np.int8), 0.0, 0.0, resolution_m)

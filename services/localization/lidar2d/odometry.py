@@ -23,7 +23,7 @@ def interpolate(
     gap_ns: int,  # no interpolation over longer intervals
     out: np.ndarray,  # out float64 [3]
 ) -> bool:
-    """Write the pose at a stamp to `out`; return False if it is outside of the buffer or in a gap."""
+    """Write the pose at the stamp `at_ns` to `out`; return False without odometry around this stamp."""
     n = stamps_ns.shape[0]
     if n < 2 or at_ns < stamps_ns[0] or at_ns > stamps_ns[n - 1] + ahead_ns:
         return False
@@ -53,7 +53,11 @@ def delay_costs(
     gap_ns: int,
     costs: np.ndarray,
 ) -> bool:
-    """Write the squared error of the odometry's rotation at each delay to `costs`; False if unknown."""
+    """Write to `costs` the squared error (rad^2) of the rotation by odometry for each candidate delay.
+
+    The rotation between the stamps `t0_ns` and `t1_ns` is compared with the matched rotation `yaw_rad`.
+    Returns False if there is no odometry at one of the stamps.
+    """
     a, b = np.empty(3), np.empty(3)
     for k in range(delays_ns.shape[0]):
         d = delays_ns[k]
@@ -93,7 +97,7 @@ class OdometryBuffer:
         return self._poses[: self._count]
 
     def add(self, stamp_ns: int, x_m: float, y_m: float, yaw_rad: float) -> bool:
-        """Add a pose; return False (and count it) if it is not finite or not newer than the last one."""
+        """Append a pose; reject it (return False) if it is not finite or not newer than the last pose."""
         values = (x_m, y_m, yaw_rad)
         if not all(math.isfinite(v) for v in values) or (self._count and stamp_ns <= self.stamps_ns[-1]):
             # Restart if the clock was set back by more than the length of the buffer.
@@ -112,7 +116,7 @@ class OdometryBuffer:
         return True
 
     def increment(self, t0_ns: int, t1_ns: int, ahead_s: float = 0.25) -> np.ndarray | None:
-        """Return the motion [3] of the body between two scan stamps, None if it is unknown."""
+        """Return the motion [3] of the body between two scan stamps, None without odometry at them."""
         a, b = np.empty(3), np.empty(3)
         ahead = round(ahead_s / NS)
         for stamp, out in ((t0_ns, a), (t1_ns, b)):
@@ -123,7 +127,7 @@ class OdometryBuffer:
         return se2.between(a, b)
 
     def observe_rotation(self, t0_ns: int, t1_ns: int, yaw_rad: float) -> None:
-        """Update the delay estimate from a matched rotation between two scans.
+        """Update the delay estimate with the rotation `yaw_rad` between two scans, as found by matching.
 
         The delay is the candidate with the lowest sum of robust, exponentially forgotten squared rotation
         errors.
@@ -167,7 +171,7 @@ class OdometryBuffer:
 
 
 class MotionErrorModel:
-    """Standard deviation of a source of motion, scaled by its recent errors."""
+    """Standard deviations of motions from one source, for example wheels, scaled by their recent errors."""
 
     def __init__(
         self, base_m: float, per_m: float, per_s: float, base_rad: float, per_rad: float, rad_per_s: float
@@ -189,7 +193,10 @@ class MotionErrorModel:
         return base_m + per_m * distance, base_rad + per_rad * turn + 0.1 * per_rad * distance
 
     def update(self, motion: np.ndarray, truth: np.ndarray) -> None:
-        """Compare a prediction with the matched motion; the scale rises quickly and falls slowly."""
+        """Update the scale with the error of a predicted motion [3] against the matched motion `truth` [3].
+
+        The scale rises quickly and falls slowly.
+        """
         error = se2.between(motion, truth)
         unit_m, unit_rad = self._unit(motion)
         ratio_m = min((error[0] ** 2 + error[1] ** 2) / (2.0 * unit_m**2), 400.0)

@@ -1,4 +1,4 @@
-"""Mapping of a whole recording as fast as the machine allows, with run-time figures."""
+"""Mapping of a whole recording as fast as the machine allows, with measured run times."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ STREAMS = ("odometry", "scan")
 
 @dataclass(frozen=True)
 class MeasurementLog:
-    """Measurements of a recording in order of arrival.
+    """Measurements of a recording in order of arrival. Each is one of these tuples:
 
     ("scan", stamp_ns, ranges_m, angle_min_rad, angle_increment_rad, time_increment_s, range_min_m,
         range_max_m)
@@ -43,10 +43,10 @@ class MeasurementLog:
 def map_measurements(
     log: MeasurementLog, out: Path, resolution_m: float = 0.05, settings: LidarSlamSettings | None = None
 ) -> dict[str, Any]:
-    """Run the SLAM over a recording, write poses, map, state and figures into `out`, and return the figures.
+    """Run the SLAM over a recording; write poses, map, state and metrics to `out`; return the metrics.
 
-    Background jobs run in a second thread. Their results are applied at the scans where they are due, exactly
-    as in the live node.
+    The metrics (`figures.json`) are run times, memory use and counts. Background jobs run in a second thread.
+    Their results are applied at the scans where they are due, exactly as in the live node.
 
     Raises:
         UserError: there was no usable scan.
@@ -90,7 +90,7 @@ def map_measurements(
 
 
 def _merged(log: MeasurementLog) -> Iterable[tuple]:
-    """Yield the measurements by stamp, with the same merger as the live runner."""
+    """Yield the measurements ordered by stamp, with the same merger as the live runner."""
     merger = StampMerger(STREAMS)
     for measurement in log.measurements:
         log.advance()

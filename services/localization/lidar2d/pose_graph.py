@@ -51,22 +51,22 @@ class PoseGraph:
         return submap
 
     def resume_numbering(self) -> None:
-        """Continue the ids after those of a loaded map."""
+        """Continue the numbering of nodes and submaps after the ids of a loaded map."""
         self._next_node = 1 + max([*self.nodes, *self.trimmed_nodes], default=-1)
         self._next_submap = 1 + max(self.submaps, default=-1)
 
     def reserve_submap_ids(self, count: int) -> None:
-        """Skip submap ids that a crashed predecessor may have published and that the loaded map lacks."""
+        """Skip `count` submap ids: a crashed process may have published ids that the loaded map lacks."""
         self._next_submap += count
 
     def start_segment(self) -> None:
-        """Start a trajectory segment that is not connected to the map until its pose in it is found."""
+        """Start a trajectory segment; it is connected to the map when relocalization finds its pose."""
         if self.nodes and self.unlinked_from is None:
             self.unlinked_from = self._next_node
             self._candidate = None
 
     def add_node(self, node: TrajectoryNode, edges: list[Constraint]) -> None:
-        """Add a node with its constraints to the submaps that it was inserted into."""
+        """Add a node with its constraints (`edges`) to the submaps into which its scan was inserted."""
         self.nodes[node.id] = node
         self._next_node = node.id + 1
         self.pose_map_node[node.id] = se2.compose(self.pose_map_odom, node.pose_odom_body)
@@ -103,7 +103,7 @@ class PoseGraph:
         )
 
     def apply(self, result: JobResult) -> None:
-        """Apply the result of a job.
+        """Apply the result of a background job: poses, constraints and rebuilt submaps.
 
         Nodes and submaps that were added since the snapshot move with the last optimised node.
         """
@@ -138,7 +138,7 @@ class PoseGraph:
         self.optimisations += 1
 
     def trim(self, active: set[int]) -> list[int]:
-        """Remove redundant submaps and return their ids."""
+        """Remove redundant submaps (never the submaps `active`); return the ids of the removed submaps."""
         s = self.settings
         if self.unlinked_from is not None:
             return []

@@ -35,7 +35,7 @@ class NodeScan:
 
     @staticmethod
     def of(scan: PreparedScan, dynamic: np.ndarray) -> NodeScan:
-        """Create from a prepared scan and its dynamic mask bool [M]."""
+        """Create the scan of a node from a prepared scan and the mask bool [M] of dynamic returns."""
         static = ~dynamic[scan.match_index]
         return NodeScan(
             scan.points_body.astype(np.float32),
@@ -91,15 +91,15 @@ class TableCache:
         self._lock = threading.Lock()
 
     def tables(self, submap: int, frozen: FrozenMap) -> MatchTables:
-        """Return the match tables of a submap; they are recomputed if its map was replaced."""
+        """Return the match tables of a submap, recomputed if `frozen` is another object than last time."""
         return self._get(self._tables, submap, frozen, lambda: frozen.tables(self._reach))
 
     def pyramid(self, submap: int, frozen: FrozenMap) -> SearchPyramid:
-        """Return the search pyramid of a submap; it is recomputed if its map was replaced."""
+        """Return the search pyramid of a submap, recomputed if `frozen` is another object than last time."""
         return self._get(self._pyramids, submap, frozen, lambda: _pyramid_of(self.tables(submap, frozen)))
 
     def global_map(self, key: object, make: Callable[[], _T]) -> _T:
-        """Return the global map for a key; only the latest one is kept."""
+        """Return the global map with this key, made by `make()` if needed; only the latest map is cached."""
         with self._lock:
             if self._global_map is not None and self._global_map[0] == key:
                 return cast(_T, self._global_map[1])
@@ -135,7 +135,7 @@ def _pyramid_of(tables: MatchTables) -> SearchPyramid:
 def constraint_arrays(
     constraints: list[Constraint], submap_row: dict[int, int], node_row: dict[int, int]
 ) -> ConstraintArrays:
-    """Return the constraints as arrays in the order that the solver needs."""
+    """Convert constraints to arrays, ordered by node; the dicts map submap and node ids to row numbers."""
     node = np.array([node_row[c.node] for c in constraints], dtype=np.int32)
     order = np.argsort(node, kind="stable")
     chosen = [constraints[i] for i in order]
@@ -150,7 +150,7 @@ def constraint_arrays(
 
 @kernel
 def edge_information(match_information: np.ndarray, sigma_m: float, sigma_rad: float) -> np.ndarray:
-    """Return the information [3, 3] of a constraint: that of the match, limited by unmodelled errors.
+    """Return the information [3, 3] of a constraint: of the match, reduced by unmodelled errors.
 
     `sigma_m` and `sigma_rad` are the standard deviations of errors that the match cannot observe.
     """
@@ -168,11 +168,11 @@ def edge_information(match_information: np.ndarray, sigma_m: float, sigma_rad: f
 
 
 def second_submap_information(match_information: np.ndarray, settings: LidarSlamSettings) -> np.ndarray:
-    """Return the information [3, 3] of a node's constraint in the younger submap.
+    """Return the information [3, 3] of the constraint between a node and the younger active submap.
 
-    The scan was not matched to that submap. All these constraints together connect two consecutive submaps,
-    with an uncertainty of the drift between them. If they were as stiff as matches, true loop closures would
-    be rejected as outliers.
+    The scan was matched to the older submap only. All these constraints together connect two consecutive
+    submaps, with the uncertainty of the drift between them. With the information of a match, true loop
+    closures would be rejected as outliers.
     """
     s = settings
     inner = np.linalg.inv(edge_information(match_information, s.edge_sigma_m, s.edge_sigma_rad))

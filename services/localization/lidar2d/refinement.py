@@ -27,9 +27,9 @@ def rebuild_submap(
     pose_submap_node: list[np.ndarray],
     before: FrozenMap | None = None,
 ) -> FrozenMap:
-    """Return a frozen map of nodes at the given poses.
+    """Build a frozen map from the scans of nodes at the poses `pose_submap_node` (float64 [3] each).
 
-    With `before`, the hit and miss counts of that map are kept instead of being recomputed.
+    With `before`, the hit and miss counts are copied from this older map of the same nodes.
     """
     surfels = SurfelMap(settings)
     points = [
@@ -73,7 +73,7 @@ def refine_submaps(
     pose_map_submap: dict[int, np.ndarray],
     pose_map_node: dict[int, np.ndarray],
 ) -> tuple[dict[int, FrozenMap], list[Constraint]]:
-    """Return the rebuilt maps of the finished submaps, and all constraints measured in them."""
+    """Rebuild the finished submaps from optimised poses; return them by id, and remeasured constraints."""
     rebuilt: dict[int, FrozenMap] = {}
     by_submap: dict[int, list[int]] = {}
     for k, c in enumerate(constraints):
@@ -108,7 +108,7 @@ def _remeasure(
     pose_map_submap: np.ndarray,
     pose_map_node: np.ndarray,
 ) -> Constraint:
-    """Return the constraint from a new match that starts at the optimised pose; unchanged if that fails."""
+    """Match again from the optimised pose; return the new constraint, or the old one if the match fails."""
     features = node.scan.features.astype(np.float64)
     guess = se2.between(pose_map_submap, pose_map_node)
     match = refine(features, node.scan.origin, guess, tables, settings, anneal=(1.5,))

@@ -26,7 +26,7 @@ REFINE_FIRST = 6  # Gauss-Newton iterations for every candidate; only the best g
 
 @dataclass(frozen=True)
 class GlobalMap:
-    """All nodes of a map in one grid in the map frame."""
+    """Match tables and search pyramid of a whole map, on one grid in the map frame."""
 
     tables: MatchTables
     pyramid: SearchPyramid
@@ -36,7 +36,7 @@ class GlobalMap:
 
 @dataclass(frozen=True)
 class Relocalization:
-    """The best pose for a scan; it should not be used with a confidence below 0.5."""
+    """The best pose of a scan in a map; do not use a pose with a confidence below 0.5."""
 
     pose_map_body: np.ndarray  # float64 [3]
     confidence: float  # 0..1, from the fit of the scan and the lead over the best other pose
@@ -49,7 +49,7 @@ class Relocalization:
 def build_global_map(
     settings: LidarSlamSettings, nodes: list[TrajectoryNode], pose_map_node: list[np.ndarray]
 ) -> GlobalMap:
-    """Return one map of all nodes. Raises ValueError if there is none."""
+    """Build the map for relocalization from all nodes. Raises ValueError if there is no node."""
     if not nodes:
         raise ValueError("the map is empty: map an area first, or load a saved map")
     surfels = SurfelMap(settings)
@@ -79,7 +79,7 @@ def relocalize_in(
     origin: np.ndarray,  # float64 [2]
     settings: LidarSlamSettings,
 ) -> Relocalization:
-    """Return the best pose in the whole map for one scan or for merged scans."""
+    """Find the best pose in the whole map for one scan, or for merged scans, without a prediction."""
     if len(features) < settings.min_points:
         return _no_match(global_map)
     centre = np.array([global_map.centre_m[0], global_map.centre_m[1], 0.0])
@@ -119,6 +119,6 @@ def _differ(a: Match, b: Match) -> bool:
 
 
 def _no_match(global_map: GlobalMap) -> Relocalization:
-    """Return a result with confidence 0."""
+    """Return a relocalization result with confidence 0, at the centre of the map."""
     pose = np.array([global_map.centre_m[0], global_map.centre_m[1], 0.0])
     return Relocalization(pose, 0.0, np.diag([1e4, 1e4, 10.0]), 0.0, 0.0, 1.0)

@@ -44,7 +44,7 @@ def _valid_points(
     points: np.ndarray,  # out float64 [N, 2]
     beams: np.ndarray,  # out int32 [N]
 ) -> int:
-    """Write the deskewed valid returns and their beam indices; return their number."""
+    """Write the valid returns, deskewed, in the body frame, and their beam indices; return their number."""
     count = 0
     cl, sl = math.cos(pose_body_lidar[2]), math.sin(pose_body_lidar[2])
     for i in range(ranges_m.shape[0]):
@@ -81,7 +81,7 @@ def _tangents(
     tangents: np.ndarray,  # out float64 [M, 2]
     spacing: np.ndarray,  # out float64 [M]
 ) -> None:
-    """Compute surface directions by PCA over connected neighbours in `window_m`, at least two per side."""
+    """Compute surface direction (PCA over connected neighbours within `window_m`) and spacing of returns."""
     m = points.shape[0]
     for i in range(m):
         px, py = points[i, 0], points[i, 1]
@@ -129,10 +129,10 @@ def _tangents(
 
 @kernel
 def _spread(points: np.ndarray, step_m: float, limit: int, keep: np.ndarray) -> int:
-    """Write the indices of returns at least `step_m` from the last one kept; return their number.
+    """Select returns at least `step_m` from the one selected before; return the number of indices in `keep`.
 
     This is an adaptive voxel filter along the beam order: the step grows until at most `limit` returns are
-    left.
+    selected.
     """
     step = step_m
     while True:
@@ -165,7 +165,11 @@ def prepare_scan(
     match_limit: int,
     tangent_window_m: float = 0.10,
 ) -> PreparedScan:
-    """Return the valid returns, deskewed by per-beam time to the stamp of the first beam, with tangents."""
+    """Filter a scan and deskew it, by the time of each beam, to the stamp of the first beam.
+
+    `velocity_body` is the body twist during the scan (m/s, m/s, rad/s). For matching, at most `match_limit`
+    returns are selected, at least `min_spacing_m` apart.
+    """
     n = len(ranges_m)
     points = np.empty((n, 2))
     beams = np.empty(n, dtype=np.int32)

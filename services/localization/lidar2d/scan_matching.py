@@ -23,7 +23,7 @@ ANNEAL_SCALES = (3.0, 2.0, 1.4)  # factors on the outlier scale in the first ite
 class Match:
     """Pose of a scan in a map, with its information and quality.
 
-    The target frame is that of the map: a submap or the global map.
+    The target frame is the frame of the map: a submap or the global map.
     """
 
     pose_target_body: np.ndarray  # float64 [3]
@@ -115,7 +115,7 @@ def accumulate(
 
 @kernel
 def solve3(A: np.ndarray, b: np.ndarray, x: np.ndarray) -> bool:
-    """Write x = A^-1 b for symmetric positive definite A [3, 3] by Cholesky; return False if A is not."""
+    """Solve A x = b for symmetric A [3, 3] by Cholesky; return False if A is not positive definite."""
     l00 = A[0, 0]
     if not l00 > 0.0:
         return False
@@ -160,7 +160,9 @@ def gauss_newton(
     pose: np.ndarray,  # out float64 [3]
     H: np.ndarray,  # out float64 [3, 3] information of the scan alone
 ) -> tuple[float, float, float]:
-    """Minimise by iteratively reweighted Gauss-Newton with a robust prior, damped in unobservable directions.
+    """Optimise the pose of a scan by iteratively reweighted Gauss-Newton with a robust prior on the pose.
+
+    Damping limits the steps in unobservable directions.
 
     Returns (sum of weights, number of associated returns, weighted cost) at the final pose.
     """
@@ -211,7 +213,7 @@ def count_overlapping_returns(
     col0: int,
     cell_m: float,
 ) -> int:
-    """Return the number of returns in observed space: near a surface or where a beam passed."""
+    """Return the number of returns in observed space: near a surface, or in a cell that a beam crossed."""
     c, s = math.cos(pose[2]), math.sin(pose[2])
     n = 0
     for i in range(points.shape[0]):

@@ -16,7 +16,7 @@ TWO_PI = 2.0 * math.pi
 
 @kernel
 def wrap(angle_rad: float) -> float:
-    """Return the equivalent angle in [-pi, pi)."""
+    """Return the equivalent angle in [-pi, pi) rad."""
     return angle_rad - TWO_PI * math.floor((angle_rad + math.pi) / TWO_PI)
 
 
@@ -49,7 +49,7 @@ def between(pose_a_b: np.ndarray, pose_a_c: np.ndarray) -> np.ndarray:
 
 
 def transform(pose_a_b: np.ndarray, points_b: np.ndarray) -> np.ndarray:
-    """Return points [N, 2] of frame b in frame a."""
+    """Transform points float64 [N, 2] from frame b to frame a."""
     c, s = math.cos(pose_a_b[2]), math.sin(pose_a_b[2])
     out = np.empty(points_b.shape, dtype=np.float64)
     out[:, 0] = pose_a_b[0] + c * points_b[:, 0] - s * points_b[:, 1]
@@ -58,7 +58,7 @@ def transform(pose_a_b: np.ndarray, points_b: np.ndarray) -> np.ndarray:
 
 
 def compose_many(pose_a_b: np.ndarray, pose_b_c: np.ndarray) -> np.ndarray:
-    """Return the row-wise composition float64 [N, 3] of [N, 3] (or [3]) with [N, 3] (or [3])."""
+    """Return pose_a_c float64 [N, 3], row by row; the arguments are [N, 3] or [3]."""
     pose_a_b, pose_b_c = np.broadcast_arrays(np.atleast_2d(pose_a_b), np.atleast_2d(pose_b_c))
     c, s = np.cos(pose_a_b[:, 2]), np.sin(pose_a_b[:, 2])
     x = pose_a_b[:, 0] + c * pose_b_c[:, 0] - s * pose_b_c[:, 1]
@@ -67,7 +67,7 @@ def compose_many(pose_a_b: np.ndarray, pose_b_c: np.ndarray) -> np.ndarray:
 
 
 def between_many(pose_a_b: np.ndarray, pose_a_c: np.ndarray) -> np.ndarray:
-    """Return the row-wise pose_b_c float64 [N, 3] of [N, 3] (or [3]) arrays."""
+    """Return pose_b_c float64 [N, 3], row by row; the arguments are [N, 3] or [3]."""
     pose_a_b, pose_a_c = np.broadcast_arrays(np.atleast_2d(pose_a_b), np.atleast_2d(pose_a_c))
     c, s = np.cos(pose_a_b[:, 2]), np.sin(pose_a_b[:, 2])
     dx, dy = pose_a_c[:, 0] - pose_a_b[:, 0], pose_a_c[:, 1] - pose_a_b[:, 1]
@@ -80,7 +80,7 @@ def wrap_many(angles_rad: np.ndarray) -> np.ndarray:
 
 
 def from_matrix(T_a_b: np.ndarray) -> np.ndarray:
-    """Return the planar pose of a matrix float64 [4, 4] or [3, 3]; a pose [3] is copied.
+    """Convert a transform float64 [4, 4] or [3, 3] to a planar pose [3]; a pose [3] is copied.
 
     Height, roll and pitch are dropped. Raises ValueError for another shape.
     """

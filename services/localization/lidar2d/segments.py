@@ -24,10 +24,13 @@ Candidate = tuple[int, np.ndarray]
 def link_segment(
     snapshot: Snapshot,
 ) -> tuple[Constraint | None, np.ndarray, np.ndarray, Candidate | None]:
-    """Return a constraint from the newest node to the map, and all poses with the segment moved.
+    """Relocalize the newest node of an unconnected segment in the map.
 
-    The second and third values are the submap and node poses, the fourth is a relocalization result that
-    waits for confirmation. While the pose is uncertain, the constraint is None and the poses are unchanged.
+    Returns:
+        1. The constraint between the newest node and a submap of the map; None while the pose is uncertain.
+        2., 3. Submap and node poses in the map frame, float64 [S, 3] and [N, 3]. The segment is moved to its
+        pose in the map; without a constraint, all poses are unchanged.
+        4. A relocalization that must be confirmed by a later one (node id, pose_map_node), or None.
     """
     submap_poses, node_poses = snapshot.pose_map_submap.copy(), snapshot.pose_map_node.copy()
     first = snapshot.unlinked_from
@@ -70,12 +73,12 @@ def link_segment(
 
 
 def _moved(snapshot: Snapshot, earlier: int, candidate: Candidate) -> np.ndarray:
-    """Return the motion from the node `earlier` to the candidate's node, by the odom poses."""
+    """Return the motion [3] from the node `earlier` to the node of the candidate, from their odom poses."""
     return se2.between(snapshot.nodes[earlier].pose_odom_body, snapshot.nodes[candidate[0]].pose_odom_body)
 
 
 def _agrees(snapshot: Snapshot, candidate: Candidate) -> bool:
-    """Return whether the earlier candidate, moved along the trajectory, confirms this one from a distance."""
+    """Return whether the earlier candidate, moved along the trajectory, is far enough away and agrees."""
     if snapshot.candidate is None or snapshot.candidate[0] not in snapshot.nodes:
         return False
     moved = _moved(snapshot, snapshot.candidate[0], candidate)
@@ -103,7 +106,7 @@ def _link_to_submap(
     submap_poses: np.ndarray,
     node_poses: np.ndarray,
 ) -> Constraint | None:
-    """Return a constraint to the nearest finished submap that confirms the pose, None if there is none."""
+    """Match the node to near finished submaps; return the first accepted constraint, None without any."""
     positions = np.array([node_poses[row[n], :2] for n in map_nodes])
     away = dict(zip(map_nodes, np.hypot(*(positions - pose_map_body[:2]).T)))
     near = sorted(

@@ -1,6 +1,6 @@
 """Settings of the lidar SLAM in one frozen object; the defaults serve all lidars and logs.
 
-Properties of the sensor (angles, range limits, rate, number of beams) come with each scan. The values were
+Properties of the sensor (angles, range limits, rate, number of beams) are part of each scan. The values were
 tuned with `beamsplat bench slam`, where no other source is given.
 """
 

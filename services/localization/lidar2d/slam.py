@@ -39,7 +39,7 @@ from beamsplat.services.localization.lidar2d.validate import StampGuard, reason_
 
 @dataclass(frozen=True)
 class ScanResult:
-    """Result of one scan."""
+    """Result of `add_scan` for one scan: status, poses, dynamic beams and the background job to run."""
 
     stamp_ns: int
     status: str  # "ok", "lost", "relocalizing" or "rejected: reason"
@@ -77,9 +77,9 @@ class LidarSlam:
         self._pending_job: BackgroundJob | None = None
 
     def add_odometry(self, stamp_ns: int, x_m: float, y_m: float, yaw_rad: float) -> None:
-        """Add a wheel odometry pose in its own frame.
+        """Add a pose of the body from wheel odometry, in the frame of the odometry.
 
-        Rejected ones are counted in `local_builder.odometry.rejected`.
+        Rejected poses are counted in `local_builder.odometry.rejected`.
         """
         self.local_builder.odometry.add(stamp_ns, x_m, y_m, yaw_rad)
 
@@ -93,7 +93,7 @@ class LidarSlam:
         range_min_m: float,
         range_max_m: float,
     ) -> ScanResult:
-        """Match one scan and insert it if it passes the motion filter.
+        """Match one scan to the map; insert it if it passes the motion filter.
 
         Malformed scans are reported in the status. Raises RuntimeError if the result of a job is overdue.
         """
@@ -152,7 +152,7 @@ class LidarSlam:
         )
 
     def _start_segment(self, stamp_ns: int, scan: PreparedScan, pose_odom_body: np.ndarray) -> None:
-        """Finish the submaps and start a segment that is disconnected from the map."""
+        """Finish the active submaps; start a segment that is not connected to the map, with this scan."""
         self._consecutive_lost = 0
         self.active_submaps.close()
         self.pose_graph.start_segment()
@@ -161,7 +161,7 @@ class LidarSlam:
     def _insert_scan(
         self, raw: RawScan, scan: PreparedScan, pose_odom_body: np.ndarray, match: Match, good: bool
     ) -> ScanResult:
-        """Detect dynamic objects, insert the scan, start a background job if one is due."""
+        """Detect dynamic objects, insert the scan, create a background job if due; return the result."""
         dynamic = (
             self.active_submaps.dynamic_returns(scan, pose_odom_body)
             if good
@@ -234,7 +234,7 @@ class LidarSlam:
         return self._pending_job
 
     def apply(self, result: JobResult) -> None:
-        """Apply the result of the job that is due, and trim redundant submaps."""
+        """Apply the result of the background job, and remove redundant submaps at intervals."""
         self.pose_graph.apply(result)
         if self._pending_job is not None and self._pending_job.number == result.number:
             self._pending_job = None
@@ -263,7 +263,7 @@ class LidarSlam:
     # ---- results ----------------------------------------------------------------------------------
 
     def trajectory(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return for all N scans the stamps int64 [N], optimised poses and published poses, float64 [N, 3].
+        """Return stamps int64 [N], optimised poses and published poses float64 [N, 3] of all N scans.
 
         The poses are pose_map_body.
         """
@@ -305,7 +305,7 @@ class LidarSlam:
         return relocalize_in(self.global_map(), scan.features(), scan.origin_body, self.settings)
 
     def global_map(self) -> GlobalMap:
-        """Return the map for relocalization; it is built once per map version and takes about a second."""
+        """Return the map for relocalization; it is built once per map version, in about a second."""
         graph = self.pose_graph
         known = [n for n in graph.nodes if graph.unlinked_from is None or n < graph.unlinked_from]
 
@@ -316,18 +316,18 @@ class LidarSlam:
         return graph.cache.global_map((graph.optimisations, len(known)), build)
 
     def save(self, folder: Path) -> None:
-        """Write the state; mapping may continue afterwards."""
+        """Write the map and the trajectory to `folder`; mapping may continue afterwards."""
         write_state(folder, self.pack())
 
     def pack(self) -> PackedMap:
-        """Return copies of the current state."""
+        """Return copies of the map and the trajectory, to be written with `state.write_state`."""
         return self.active_submaps.with_frozen(lambda: pack_state(self.pose_graph, self.record.arrays()))
 
     @staticmethod
     def load(
         folder: Path, settings: LidarSlamSettings, T_body_lidar: np.ndarray, localize_only: bool = False
     ) -> LidarSlam:
-        """Load a saved map to continue it; the status is "relocalizing" until the pose in it is found.
+        """Load a saved map to continue it; the status is "relocalizing" until the pose in this map is found.
 
         With `localize_only` the saved map is not changed. Raises MapStateError.
         """

@@ -13,7 +13,7 @@ from beamsplat.services.localization.lidar2d.surfel_map import FrozenMap
 
 @dataclass(frozen=True)
 class Snapshot:
-    """Everything that a background job reads; nothing in it changes afterwards."""
+    """All data that a background job reads; it does not change after creation."""
 
     number: int
     settings: LidarSlamSettings

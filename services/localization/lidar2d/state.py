@@ -47,7 +47,7 @@ _SETTING_KEYS = {
 
 
 class MapStateError(ValueError):
-    """A saved map cannot be read; the text contains the file and what to do."""
+    """A saved map cannot be read; the message names the file and a remedy."""
 
 
 def map_uuid(stamp_ns: int, ranges_m: np.ndarray) -> str:
@@ -65,7 +65,7 @@ class PackedMap:
 
 
 def pack_state(graph: PoseGraph, extra: dict[str, np.ndarray]) -> PackedMap:
-    """Return copies of the map, with the arrays `extra` added."""
+    """Return copies of the pose graph as arrays, and the arrays `extra` of the caller."""
     arrays = {**_pack_nodes(graph), **_pack_submaps(graph), **_pack_edges(graph.constraints), **extra}
     head = {
         "uuid": graph.uuid,
@@ -78,7 +78,7 @@ def pack_state(graph: PoseGraph, extra: dict[str, np.ndarray]) -> PackedMap:
 
 
 def write_state(folder: Path, state: PackedMap) -> None:
-    """Write the map; the manifest is replaced last, so that a crash leaves the previous map intact."""
+    """Write a map; the manifest is replaced last, so that after a crash the previous map is still valid."""
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     generation = 1 + max((int(p.stem.rpartition("-")[2]) for p in folder.glob("lidar_map-*.npz")), default=0)
@@ -107,7 +107,7 @@ def write_state(folder: Path, state: PackedMap) -> None:
 
 
 def load_state(folder: Path, settings: LidarSlamSettings) -> tuple[PoseGraph, dict[str, np.ndarray]]:
-    """Return the saved pose graph and the extra arrays. Raises MapStateError."""
+    """Load a saved pose graph, and the `extra` arrays of `pack_state`. Raises MapStateError."""
     path = Path(folder) / MANIFEST
     manifest = read_manifest(path)
     arrays_path = Path(folder) / str(manifest["arrays"])

@@ -1,7 +1,7 @@
 """Trimming of redundant submaps, so that the map stays bounded in lifelong operation.
 
 Of the submaps that cover the same place, the two oldest (which carry the anchors of early keyframes) and the
-two newest (the current state of the environment) are kept.
+two newest (the current state of the environment) remain.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ def redundant_submaps(
     protected: set[int],
     min_covering: int,
 ) -> list[int]:
-    """Return the ids of submaps that can be removed.
+    """Return the ids of submaps that can be removed, ascending.
 
-    Nearly all of their nodes must be covered by at least `min_covering` other submaps with the same heading,
-    two of them older and two newer.
+    Nearly every node of such a submap must be covered by at least `min_covering` other submaps, with nodes in
+    the same place and heading; at least two of them must be older and two newer.
     """
     cell_of = {n: _pose_cell(pose) for n, pose in pose_map_node.items()}
     covered_by: dict[tuple[int, int, int], set[int]] = defaultdict(set)
@@ -53,6 +53,6 @@ def redundant_submaps(
 
 
 def _pose_cell(pose_map_body: np.ndarray) -> tuple[int, int, int]:
-    """Return the cell (x, y, heading) of a pose."""
+    """Return the indices (x, y, heading sector) of the cell of a pose float64 [3]."""
     heading = math.floor((pose_map_body[2] + math.pi / HEADINGS) / (2 * math.pi / HEADINGS)) % HEADINGS
     return math.floor(pose_map_body[0] / CELL_M), math.floor(pose_map_body[1] / CELL_M), heading

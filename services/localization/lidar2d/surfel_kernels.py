@@ -24,9 +24,9 @@ def merged_surfel(
     mean: np.ndarray,  # out float64 [2]
     omega: np.ndarray,  # out float64 [3] information xx, xy, yy
 ) -> None:
-    """Compute mean and information matrix of the 3x3 neighbourhood (binomial weights).
+    """Compute the surface element of a cell: mean and information matrix of 3x3 cells (binomial weights).
 
-    A wall has no information along its direction; other shapes have some in both directions.
+    A wall has no information along its direction; other shapes have information in both directions.
     """
     w = sx = sy = sxx = sxy = syy = 0.0
     ref = cell_id[row, col]
@@ -79,7 +79,7 @@ def compute_surfels(
     means: np.ndarray,  # out float64 [>= S, 2]
     omegas: np.ndarray,  # out float64 [>= S, 3]
 ) -> None:
-    """Compute the surface element of every cell."""
+    """Compute the surface element (mean, information) of every cell with returns."""
     for k in range(cells.shape[0]):
         row, col = cells[k, 0] - row0, cells[k, 1] - col0
         merged_surfel(cell_id, moments, row, col, range_sigma_m, map_sigma_m, means[k], omegas[k])
@@ -87,7 +87,7 @@ def compute_surfels(
 
 @kernel
 def _increment(counter: np.ndarray, other: np.ndarray, r: int, c: int) -> None:
-    """Increment `counter`; at 255 halve both counters first, which keeps their ratio."""
+    """Increment `counter` at (r, c); at 255, halve both counters first, which preserves their ratio."""
     if counter[r, c] == 255:
         counter[r, c] = 128
         other[r, c] >>= 1
@@ -116,7 +116,10 @@ def add_returns(
     cell_m: float,
     changed: np.ndarray,  # out int32 [>= M], surfels with a new return
 ) -> tuple[int, int]:
-    """Add the moments of every return; return (number of surfels, number of changed surfels)."""
+    """Add the returns of a scan to the moments of their cells and count hits.
+
+    Returns the number of surfels, and the number of surfels with a new return (the length of `changed`).
+    """
     n_changed = 0
     for i in range(points.shape[0]):
         if not use[i]:

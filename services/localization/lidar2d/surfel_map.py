@@ -24,7 +24,7 @@ MARGIN = 8  # cells kept around observed space
 
 @dataclass(frozen=True)
 class MatchTables:
-    """Lookup tables of scan matching; the arrays are shared with the map that made them."""
+    """Lookup tables of scan matching; the arrays may be shared with the map (not copied)."""
 
     nearest: np.ndarray  # int32 [H, W], index of the nearest surface element within reach, -1 = none
     field: np.ndarray  # uint8 [H, W], likelihood of a return, for searches
@@ -38,7 +38,7 @@ class MatchTables:
 
 
 class SurfelMap:
-    """A growing grid map in its own frame; rows are y, columns are x, cell (0, 0) starts at the origin."""
+    """A growing grid map in its own frame: rows along y, columns along x, origin at a corner of (0, 0)."""
 
     # Arrays with a row for each surface element; set by `_reserve_surfels`.
     moments: np.ndarray  # float64 [N, 6]
@@ -104,7 +104,7 @@ class SurfelMap:
         free: np.ndarray,  # bool [M], returns whose beams clear cells
         matchable: bool = True,  # False: postpone the match tables, see make_matchable()
     ) -> None:
-        """Insert one scan."""
+        """Insert one scan: add its returns as surface, and count misses along its beams."""
         if len(points) == 0:
             return
         self.cover(points)
@@ -150,7 +150,7 @@ class SurfelMap:
         self.scans += 1
 
     def make_matchable(self) -> None:
-        """Update surface elements and tables after scans inserted with `matchable=False`."""
+        """Compute surface elements and match tables that were postponed by `insert(..., matchable=False)`."""
         self._refresh(np.arange(self.count, dtype=np.int32))
 
     def _refresh(self, changed: np.ndarray) -> None:
@@ -201,7 +201,7 @@ class SurfelMap:
 def _growth(
     points: np.ndarray, cell_m: float, row0: int, col0: int, rows: int, cols: int
 ) -> tuple[int, int, int, int]:
-    """Return the number of cells to add at the top, bottom, left and right, in whole blocks."""
+    """Return the cells to add at low rows, high rows, low columns and high columns, in whole blocks."""
     x_low = x_high = points[0, 0]
     y_low = y_high = points[0, 1]
     for i in range(1, points.shape[0]):
@@ -264,9 +264,10 @@ class FrozenMap:
 
 
 def freeze(surfels: SurfelMap, counts_of: FrozenMap | None = None, min_hit_ratio: float = 0.2) -> FrozenMap:
-    """Return the compact form: grids cropped to observed space, without surfels that later beams contradict.
+    """Return the compact form of a map: grids cropped to observed space, without refuted surfels.
 
-    With `counts_of`, the hit and miss counts of an older map of the same scans are kept.
+    A surfel is refuted if later beams passed through it: its ratio of hits is below `min_hit_ratio`. With
+    `counts_of`, the hit and miss counts are copied from this older map of the same scans.
     """
     n = surfels.count
     means, omegas = surfels.surface_elements()
@@ -296,7 +297,7 @@ def freeze(surfels: SurfelMap, counts_of: FrozenMap | None = None, min_hit_ratio
 
 @dataclass(frozen=True)
 class _Counts:
-    """Hits and misses in the form that a frozen map stores."""
+    """Hit and miss counts of a map, cropped and compressed, as stored in a frozen map."""
 
     packed: bytes
     shape: tuple[int, int]

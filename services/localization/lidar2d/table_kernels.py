@@ -25,7 +25,7 @@ def splat(
     cell_m: float,
     reach: int,
 ) -> None:
-    """Enter a surface element into the nearest table of the cells around it, and raise their likelihood."""
+    """Write a surface element to `nearest` in the cells closest to it; raise the likelihood around it."""
     mx, my = means[index, 0], means[index, 1]
     trace = omegas[index, 0] + omegas[index, 2]
     for r in range(max(row - reach, 0), min(row + reach + 1, nearest.shape[0])):
@@ -63,7 +63,7 @@ def splat_all(
     cell_m: float,
     reach: int,
 ) -> None:
-    """Fill empty nearest table and likelihood field from all surface elements."""
+    """Fill the table `nearest` and the likelihood `field`, both empty before, from all surface elements."""
     for i in range(len(means)):
         splat(
             nearest,
@@ -90,7 +90,7 @@ def nearest_all(
     cell_m: float,
     reach: int,
 ) -> None:
-    """Fill the nearest table as splat_all does, without the likelihood field."""
+    """Fill the table `nearest` from all surface elements, like `splat_all` without the likelihood field."""
     best = np.full(nearest.shape, np.inf, dtype=np.float32)
     for i in range(len(means)):
         row, col = cells[i, 0] - row0, cells[i, 1] - col0

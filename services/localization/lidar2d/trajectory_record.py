@@ -8,7 +8,7 @@ from beamsplat.services.localization.lidar2d import se2
 
 
 class TrajectoryRecord:
-    """Arrays that grow by doubling: 64 bytes per scan, 18 MB for eight hours at 10 Hz."""
+    """Stamp, node and poses of every scan in growing arrays: 64 bytes per scan, 18 MB in 8 h at 10 Hz."""
 
     def __init__(self) -> None:
         self.count = 0
@@ -17,7 +17,7 @@ class TrajectoryRecord:
         self._poses = np.zeros((1024, 6))
 
     def add(self, stamp_ns: int, node: int, pose_node_body: np.ndarray, pose_map_body: np.ndarray) -> None:
-        """Append a scan: its pose relative to a node, and its pose in the map as published."""
+        """Append a scan: its pose [3] relative to the node `node`, and its published pose [3] in the map."""
         if self.count == len(self._stamps):
             for name in ("_stamps", "_nodes", "_poses"):
                 old = getattr(self, name)
@@ -57,7 +57,7 @@ class TrajectoryRecord:
 
     @staticmethod
     def of(arrays: dict[str, np.ndarray]) -> TrajectoryRecord:
-        """Create from the result of `arrays()`."""
+        """Create a record from the result of `arrays()`."""
         record = TrajectoryRecord()
         if len(arrays["extra_stamps"]):
             record._stamps, record._nodes = arrays["extra_stamps"].copy(), arrays["extra_nodes"].copy()

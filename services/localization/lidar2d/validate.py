@@ -1,4 +1,4 @@
-"""Validation of scans: malformed ones are rejected with a reason and do not affect the map."""
+"""Validation of scans: malformed scans are rejected with a reason and do not affect the map."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ RESTART_SCANS = 5  # rejected scans in a row with increasing stamps, after which
 
 
 class StampGuard:
-    """Checks that stamps increase; follows a clock that was set to another time after a few scans."""
+    """Checks that stamps increase. If the clock was set back, the new time is accepted after a few scans."""
 
     def __init__(self) -> None:
         self.last_ns: int | None = None
         self._refused_ns: list[int] = []
 
     def check(self, stamp_ns: int) -> tuple[str, bool]:
-        """Return the reason for a rejection (empty: none), and whether the clock was restarted."""
+        """Return why the stamp is rejected ("" if accepted), and whether it is accepted as a new time."""
         if self.last_ns is None or stamp_ns > self.last_ns:
             self.last_ns = stamp_ns
             self._refused_ns.clear()
@@ -35,7 +35,7 @@ class StampGuard:
 
 
 def reason_to_reject(raw: RawScan) -> str:
-    """Return why a scan is malformed; empty if it is valid."""
+    """Return the reason why a scan is malformed, "" if it is valid."""
     ranges = raw.ranges_m
     if not isinstance(ranges, np.ndarray) or ranges.ndim != 1 or ranges.dtype.kind != "f":
         return "ranges_m is not a one-dimensional float array"

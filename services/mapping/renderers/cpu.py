@@ -37,7 +37,7 @@ class CpuRenderer:
 
 
 def pack(gaussians: tuple[torch.Tensor, ...]) -> tuple[np.ndarray, int]:
-    """Return the parameters in the layout of the kernels, float32 [14, capacity], and the count."""
+    """Pack Gaussians into the array of the kernels, float32 [14, capacity]; return array and number."""
     count = len(gaussians[0])
     params = np.zeros((PARAMS, -(-max(count, 1) // 16) * 16), np.float32)
     for tensor, (first, last) in zip(gaussians, GROUPS.values()):

@@ -14,7 +14,7 @@ from beamsplat.services.mapping.renderers.protocol import Gaussians, RenderedIma
 
 
 def fault() -> str | None:
-    """Return why gsplat cannot run on this machine, as one sentence; None if it can."""
+    """Return the reason why gsplat cannot run on this machine, as one sentence; None if it can run."""
     if not torch.cuda.is_available():
         return "torch finds no CUDA device; use renderer = 'cpu'"
     try:
@@ -79,7 +79,7 @@ class GsplatRenderer:
 
 
 def _left_perturbed(viewmat: torch.Tensor, tangent: torch.Tensor) -> torch.Tensor:
-    """Return se3_exp(tangent) @ viewmat to first order; value and gradient are exact at zero."""
+    """Return se3_exp(tangent) @ viewmat [4, 4] to first order; exact value and gradient at tangent = 0."""
     zero = torch.zeros_like(tangent[0])
     x, y, z = tangent[3:]
     rows = [(zero, -z, y, tangent[0]), (z, zero, -x, tangent[1]), (-y, x, zero, tangent[2]), (zero,) * 4]

@@ -30,20 +30,20 @@ class Gaussians:
     colour: torch.Tensor  # [N, 3]
 
     def tensors(self) -> tuple[torch.Tensor, ...]:
-        """Return the tensors in the row order of the rasterizer's parameter array."""
+        """Return the five tensors, in the order of the rows of the rasterizer's parameter array."""
         return self.mean_map_m, self.log_scale, self.quat_wxyz, self.opacity_logit, self.colour
 
 
 @dataclass(frozen=True)
 class RenderedImage:
-    """A rendered image."""
+    """A rendered image: colour, accumulated depth and alpha."""
 
     colour: torch.Tensor  # [H, W, 3]
     depth_m: torch.Tensor  # [H, W]: accumulated depth, sum of weight times optical z
     alpha: torch.Tensor  # [H, W]
 
     def expected_depth_m(self) -> torch.Tensor:
-        """Return accumulated depth over alpha; NaN where alpha is below 1e-3."""
+        """Return the expected depth [H, W] (m): accumulated depth / alpha; NaN where alpha is below 1e-3."""
         known = self.alpha > 1e-3
         return torch.where(known, self.depth_m / torch.where(known, self.alpha, 1.0), torch.nan)
 
@@ -60,7 +60,7 @@ class DifferentiableRenderer(Protocol):
         pose_tangent: torch.Tensor
         | None = None,  # [6], zero, with requires_grad where its gradient is wanted
     ) -> RenderedImage:
-        """Return the render from T_camera_map."""
+        """Render the Gaussians at the camera pose `T_camera_map`."""
         ...
 
 
@@ -72,7 +72,7 @@ RENDERERS: dict[str, str] = {
 
 
 def make_renderer(name: str) -> DifferentiableRenderer:
-    """Create a renderer of `RENDERERS`; its module is imported only now.
+    """Create the renderer with a name in `RENDERERS`; its module is imported on the first call.
 
     Raises:
         UserError: the name is unknown, or this machine cannot run the renderer.

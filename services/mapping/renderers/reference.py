@@ -16,7 +16,7 @@ _BLOCK = 16  # px
 
 
 class ReferenceRenderer:
-    """The reference renderer."""
+    """The rasterizer in plain torch, the reference for the other renderers."""
 
     def render(
         self,
@@ -51,7 +51,7 @@ class ReferenceRenderer:
 
 
 def _so3_exp(phi: torch.Tensor) -> torch.Tensor:
-    """Return exp of a rotation vector to second order: value and first two derivatives are exact at zero."""
+    """Return the rotation matrix [3, 3] of a rotation vector [3] (rad) to second order, exact at zero."""
     zero = torch.zeros_like(phi[0])
     W = torch.stack([
         torch.stack([zero, -phi[2], phi[1]]), torch.stack([phi[2], zero, -phi[0]]),
@@ -72,7 +72,12 @@ def _rotations(quat_wxyz: torch.Tensor) -> torch.Tensor:
 def _project(
     gaussians: Gaussians, camera: RasterCamera, R: torch.Tensor, t: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Return centres [V, 2] px, covariances [V, 2, 2] px^2, optical z [V] and indices [V] of Gaussians."""
+    """Project Gaussians into the image, for the camera pose R [3, 3], t [3] of T_camera_map.
+
+    Returns:
+        Centres [V, 2] (px), covariances [V, 2, 2] (px^2), optical z [V] (m) and indices [V] of the V
+        Gaussians in front of the camera.
+    """
     points = gaussians.mean_map_m @ R.T + t
     keep = torch.nonzero(points[:, 2] > NEAR_M)[:, 0]
     points = points[keep]
@@ -93,7 +98,7 @@ def _project(
 def _block(
     splats: tuple[torch.Tensor, ...], reach: torch.Tensor, camera: RasterCamera, left: int, top: int
 ) -> torch.Tensor:
-    """Return [h, w, 5] (colour, accumulated depth, alpha) of one block of pixels."""
+    """Render one block of pixels with its corner at (left, top): [h, w, 5], r, g, b, depth sum, alpha."""
     centre, conic, opacity, values = splats
     w, h = min(_BLOCK, camera.width_px - left), min(_BLOCK, camera.height_px - top)
     u, v = centre.detach().unbind(1)

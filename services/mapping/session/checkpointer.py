@@ -1,4 +1,4 @@
-"""Checkpoints of a mapper in a session folder: when to write them, their results, and resuming from them."""
+"""Checkpoints of a mapper in a session folder: when to write them, how to write and load them."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ KeyframeDecoder = Callable[[str, bytes], RgbdKeyframe]  # (schema, payload) -> k
 
 @dataclass(frozen=True)
 class CheckpointResult:
-    """The result of writing a checkpoint. `fault` is "", or why it was not written."""
+    """The result of writing a checkpoint. `fault` is "", or the reason why it was not written."""
 
     steps: int
     keyframes: int
@@ -34,8 +34,9 @@ class CheckpointResult:
 
 
 class Checkpointer:
-    """The session of a mapper, locked for writing. Periods count measurement time, so that a replay is
-    reproducible.
+    """The session folder of a mapper, locked for writing, with checkpoints at regular periods.
+
+    Periods are measured with the stamps of the keyframes, so that a replay is reproducible.
     """
 
     def __init__(self, path: Path, period_ns: int, budget_bytes: float | None = None, seed: int = 0) -> None:
@@ -57,8 +58,8 @@ class Checkpointer:
         """Restore the last checkpoint into a new mapper.
 
         Returns:
-            The extra arrays that `checkpoint` was given, and the ids of keyframes on disk that are newer than
-            the checkpoint: the caller inserts them.
+            The `extra` arrays that were passed to `checkpoint`, and the ids of keyframes on disk that are
+            newer than the checkpoint: the caller inserts them.
 
         Raises:
             UserError: there is a checkpoint, but it cannot be read.
@@ -91,7 +92,7 @@ class Checkpointer:
     # --- paging ---
 
     def page(self, mapper: Mapper) -> None:
-        """Page keyframes and Gaussians to keep the memory budget; no effect without a budget."""
+        """Page keyframes and Gaussians in and out, within the memory budget; no effect without a budget."""
         if self._pager is not None:
             self._pager.page(mapper, self._decode, lambda id: id not in self._unwritten)
 
@@ -101,7 +102,7 @@ class Checkpointer:
             self._pager.load_visible(mapper, keyframe)
 
     def anchors_moved(self, mapper: Mapper) -> None:
-        """Update paging after anchors have moved."""
+        """Page keyframes and Gaussians after the anchors have moved, see `Pager.anchors_moved`."""
         if self._pager is not None:
             self._pager.anchors_moved(mapper)
 
@@ -116,11 +117,11 @@ class Checkpointer:
             return None
 
     def remove_keyframe(self, id: int) -> None:
-        """Remove a keyframe that the mapper refused from the disk."""
+        """Remove the file of a keyframe that the mapper has rejected."""
         self.folder.remove_keyframes([id])
 
     def write_keyframe(self, id: int, schema: str, payload: bytes) -> bool:
-        """Write a keyframe to disk; return False if that failed: then it must not be acknowledged."""
+        """Write a keyframe to disk; return False on failure: the keyframe must not be acknowledged then."""
         try:
             self.folder.write_keyframe(id, schema, payload)
         except OSError as error:
@@ -134,13 +135,13 @@ class Checkpointer:
         return True
 
     def is_unwritten(self, id: int) -> bool:
-        """Return whether writing a keyframe to disk has failed so far."""
+        """Return whether a keyframe is not on disk because the last attempt to write it failed."""
         return id in self._unwritten
 
     # --- checkpoints ---
 
     def with_disk_gaussians(self, arrays: Arrays) -> Arrays:
-        """Return a state of the mapper with all Gaussians, those on disk included.
+        """Return the arrays of a saved map with all Gaussians, including Gaussians on disk only.
 
         Raises:
             UserError: a block cannot be read.
@@ -157,7 +158,7 @@ class Checkpointer:
         return self._since_ns
 
     def due(self, stamp_ns: int) -> bool:
-        """Return whether a checkpoint is due. A jump of the clock back by a period counts too."""
+        """Return whether a checkpoint is due: one period after the last (or before, if the clock jumped)."""
         since_ns = self.start_period(stamp_ns)
         return not self._running and abs(stamp_ns - since_ns) >= self._period_ns
 
@@ -199,7 +200,7 @@ class Checkpointer:
         self._last = result
 
     def save(self, mapper: Mapper, extra: Arrays) -> None:
-        """Write a checkpoint now; no other may be running.
+        """Write a checkpoint now; no checkpoint job may be running.
 
         Raises:
             UserError: it could not be written, or some keyframes are not on disk.
@@ -210,7 +211,7 @@ class Checkpointer:
             raise UserError(f"{self.folder.path}: {self.status_text(mapper)}")
 
     def status_text(self, mapper: Mapper) -> str:
-        """Return a status for people: the last checkpoint, or why there is none, and the memory use."""
+        """Return a text for the user: the last checkpoint, or why it was not written, and the memory use."""
         last = self._last
         if last is not None and last.fault:
             return f"NOT SAVED: {last.fault}; the previous checkpoint stays valid"

@@ -1,4 +1,4 @@
-"""The disk tier of the Gaussians: blocks that are on disk and not in memory.
+"""The disk tier of the Gaussians: blocks of Gaussians that are on disk and not in memory.
 
 A block contains the Gaussians of one anchor in one cubic cell of the anchor's frame. Gaussians on disk are
 not optimised; they move with their anchor.
@@ -35,7 +35,7 @@ _EXTENT_SIGMA = 3.4  # standard deviations up to which the rasterizer draws a Ga
 
 @dataclass(frozen=True)
 class GaussianGroup:
-    """Gaussians in memory that would form one block."""
+    """Gaussians in memory with the same anchor and cell: they form one block when they are paged out."""
 
     anchor: int
     members: np.ndarray  # int64 [N] columns of the store, ascending
@@ -64,7 +64,7 @@ class DiskTier:
     def page_out(
         self, store: GaussianStore, groups: list[GaussianGroup], T_map_anchor: dict[int, np.ndarray]
     ) -> list[Block]:
-        """Write groups to disk and free their memory; return their blocks.
+        """Write groups of Gaussians to disk and free their memory; return the new blocks.
 
         Raises:
             OSError: the disk is full or broken; groups that were not written stay in memory.
@@ -93,7 +93,7 @@ class DiskTier:
     def page_in(
         self, store: GaussianStore, numbers: Iterable[int], T_map_anchor: dict[int, np.ndarray]
     ) -> int:
-        """Read blocks into memory, at the current poses of their anchors; return the number of Gaussians.
+        """Read blocks into memory, moved to the current anchor poses; return the number of Gaussians.
 
         Gaussians of a file that cannot be read are lost; this is logged and counted in `lost_count`.
         """
@@ -127,8 +127,9 @@ class DiskTier:
     # --- geometry ---
 
     def nearest_m(self, anchor: int, T_map_anchor: np.ndarray, at_map_m: np.ndarray) -> float:
-        """Return a lower bound on the distance from a map point [3] to an anchor's Gaussians; inf without
-        any.
+        """Return a lower bound (m) of the distance from a point to the Gaussians of an anchor on disk.
+
+        `at_map_m` is the point float64 [3]. The result is inf without any Gaussian on disk.
         """
         blocks = [b for b in self.blocks.values() if b.anchor == anchor]
         at_anchor_m = inverse(T_map_anchor)[:3] @ [*at_map_m, 1.0]
@@ -136,7 +137,10 @@ class DiskTier:
         return max(min(bounds, default=np.inf), 0.0)
 
     def spheres(self, T_map_anchor: dict[int, np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return (block numbers int64 [B], centres float64 [B, 3] in the map frame, radii float64 [B])."""
+        """Return bounding spheres of blocks: numbers int64 [B], centres float64 [B, 3], radii float64 [B].
+
+        Centres are in the map frame; all lengths in m.
+        """
         return _spheres([(b.number, b) for b in self.blocks.values()], T_map_anchor)
 
     # --- checkpoints ---
@@ -146,24 +150,24 @@ class DiskTier:
         return arrays_of_blocks(list(self.blocks.values()))
 
     def restore(self, arrays: Arrays, store: GaussianStore) -> None:
-        """Set the blocks to those that a checkpoint lists; all other block files become stale."""
+        """Set the blocks to the blocks listed in a checkpoint; all other block files become stale."""
         for block in blocks_of(arrays):
             self.blocks[block.number] = block
             store.count_paged_out(block.anchor, block.count, block.steps)
         self.find_stale_files()
 
     def find_stale_files(self) -> None:
-        """Mark block files on disk that are not in `blocks`: left by a killed writer, or read into memory."""
+        """Mark as stale all block files that are not in `blocks`: of a killed process, or paged in."""
         numbers = self._folder.block_numbers()
         self._stale = set(numbers) - self.blocks.keys()
         self._next = 1 + max(numbers, default=0)
 
     def pending_files(self) -> tuple[list[int], list[int]]:
-        """Return (blocks to flush before a checkpoint made now, blocks to remove after it)."""
+        """Return the blocks to flush to disk before a checkpoint, and the blocks to remove after it."""
         return sorted(self._unsynced), sorted(self._stale)
 
     def mark_saved(self, synced: Iterable[int], removed: Iterable[int]) -> None:
-        """Record that a checkpoint with the results of `pending_files` is on disk."""
+        """Record that a checkpoint is on disk; the arguments are the results of `pending_files` for it."""
         self._unsynced.difference_update(synced)
         self._stale.difference_update(removed)
 
@@ -171,7 +175,7 @@ class DiskTier:
 def groups_of(store: GaussianStore, T_map_anchor: dict[int, np.ndarray]) -> list[GaussianGroup]:
     """Group the Gaussians in memory by anchor and cell.
 
-    Gaussians larger than a cell are in no group and stay in memory: they are few and visible from far away.
+    Gaussians larger than a cell are in no group and stay in memory: they are few, and visible from far away.
     """
     out, extent = [], np.exp(store.params[SCALE:QUAT, : store.count].max(axis=0)) * _EXTENT_SIGMA
     for anchor in np.unique(store.anchor[: store.count]).tolist():
@@ -195,7 +199,10 @@ def groups_of(store: GaussianStore, T_map_anchor: dict[int, np.ndarray]) -> list
 def spheres_of(
     groups: list[GaussianGroup], T_map_anchor: dict[int, np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return (indices int64 [B], centres float64 [B, 3] in the map frame, radii float64 [B]) of groups."""
+    """Return bounding spheres of groups: indices int64 [B], centres float64 [B, 3], radii float64 [B].
+
+    Centres are in the map frame; all lengths in m.
+    """
     return _spheres(list(enumerate(groups)), T_map_anchor)
 
 

@@ -18,7 +18,7 @@ def frustum_intersects(
     centres_map_m: np.ndarray,  # float64 [B, 3]
     radii_m: np.ndarray,  # float64 [B]
 ) -> np.ndarray:
-    """Return bool [B]: whether each sphere may intersect the frustum; no false negatives."""
+    """Return bool [B]: spheres that may intersect the view frustum; False is always right."""
     x, y, z = transform_points(inverse(T_map_camera), centres_map_m.reshape(-1, 3)).T
     seen = (z + radii_m > NEAR_M) & (z - radii_m < reach_m)
     sides = (

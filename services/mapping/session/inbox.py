@@ -1,8 +1,8 @@
 """The inbox of a mapper: keyframes are written to disk on reception, before they are processed.
 
 A mapper may be minutes behind a robot that reconnects after an outage. Keyframes in the inbox are
-acknowledged at once, so the robot may delete them; if the mapper is killed, the next one finds them in the
-session.
+acknowledged at once, so the robot may delete them; if the mapper is killed, the next process reads them from
+the session.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from beamsplat.services.mapping.session.checkpointer import Checkpointer
 
 
 class Inbox:
-    """Keyframes that were received and not yet processed.
+    """Keyframes that were received but not processed yet; all of them are on disk.
 
     `accept` runs on the receiving thread, all other methods on the mapping thread. The mailbox of the node is
     smaller than the inbox and drops its oldest messages. Keyframes dropped there are *skipped*: they are read
@@ -28,11 +28,11 @@ class Inbox:
         self._read: int | None = None  # read from the disk, and being processed now
 
     def accept(self, id: int, known: bool, body: Callable[[], tuple[str, bytes]]) -> bool:
-        """Write a received keyframe to disk, unless it is there; return whether it is on disk now.
+        """Write a received keyframe to disk, unless it is on disk already; return whether it is on disk now.
 
         Args:
-            known: the mapper has the keyframe already.
-            body: returns its schema and payload.
+            known: True if the keyframe is already in the map.
+            body: returns schema and payload of the keyframe.
         """
         if known:
             return not self._checkpointer.is_unwritten(id)
@@ -57,7 +57,7 @@ class Inbox:
         return True
 
     def __len__(self) -> int:
-        """Return how many keyframes wait, skipped ones included."""
+        """Return the number of waiting keyframes, including skipped keyframes."""
         return len(self._waiting) + len(self._skipped)
 
     @property
@@ -66,7 +66,7 @@ class Inbox:
         return bool(self._skipped)
 
     def pop_skipped(self) -> tuple[str, bytes] | None:
-        """Return (schema, payload) of the oldest skipped keyframe that can be read; None without any."""
+        """Remove and return (schema, payload) of the oldest readable skipped keyframe; None without any."""
         while self._skipped:
             self._read = self._skipped.popleft()
             body = self._checkpointer.read_keyframe(self._read)
@@ -75,6 +75,6 @@ class Inbox:
         return None
 
     def skip_waiting(self) -> None:
-        """Mark all waiting keyframes as skipped: at the end of the stream nothing else delivers them."""
+        """Mark all waiting keyframes as skipped: after the end of the stream, the mailbox is empty."""
         self._skipped.extend(self._waiting)
         self._waiting.clear()

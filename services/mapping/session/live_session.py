@@ -22,24 +22,30 @@ Arrays = dict[str, np.ndarray]
 
 
 class MapSession(Protocol):
-    """What the mapping node asks of its session."""
+    """Interface between the mapping node and its session, with or without a folder on disk.
+
+    A keyframe is *durable* if it is on disk, so that it survives a crash of this process.
+    """
 
     load_visible: LoadVisible | None  # for `KeyframeIntake.insert`
 
     def accept(self, message: Keyframe) -> bool:
-        """Return whether a keyframe that has just arrived is durable, so that it may be acknowledged now.
+        """Write a received keyframe to disk; return whether it is durable and may be acknowledged now.
 
-        Called from another thread than everything else.
+        Called in the receiving thread; all other methods are called in the mapping thread.
         """
 
     def start(self, id: int) -> bool:
-        """Note that a keyframe's turn has come; return whether it was acknowledged on arrival."""
+        """Start processing a keyframe; return whether it was already acknowledged on reception."""
 
     def handled_before(self, id: int) -> bool:
-        """Return whether a keyframe was already inserted when this process resumed; True once per id."""
+        """Return whether a keyframe was inserted from disk when the session was opened; True once per id."""
 
     def store(self, message: Keyframe, known: bool) -> bool:
-        """Return whether an inserted keyframe is durable, as far as that was asked for."""
+        """Write an inserted keyframe to disk, unless `known` and on disk; return False if writing failed.
+
+        Without a session folder, return True.
+        """
 
     def remove(self, id: int) -> None:
         """Remove a rejected keyframe from disk."""
@@ -48,43 +54,43 @@ class MapSession(Protocol):
         """Yield at most one keyframe that is on disk but was dropped from the mailbox."""
 
     def end_of_input(self) -> None:
-        """Count every keyframe that still waits as skipped."""
+        """Mark all waiting keyframes as skipped, at the end of the stream."""
 
     @property
     def waiting(self) -> int:
-        """Number of keyframes on disk that have not had their turn."""
+        """Return the number of keyframes on disk that are not processed yet."""
 
     @property
     def has_skipped(self) -> bool:
-        """Whether `skipped` has something to yield."""
+        """Return whether `skipped` yields a keyframe."""
 
     def keep_budget(self) -> None:
-        """Page Gaussians and keyframes to disk and back so that memory stays within the budget."""
+        """Page Gaussians and keyframes out and in, so that the memory use is within the budget."""
 
     def anchors_moved(self) -> None:
         """Move paged-out Gaussians with their anchors."""
 
     def checkpoint(self, stamp_ns: int) -> Callable[[], CheckpointResult] | None:
-        """Return the work of writing a checkpoint if one is due; its result goes to `finish_checkpoint`."""
+        """Return a job that writes a checkpoint if due, else None. Pass its result to `finish_checkpoint`."""
 
     def finish_checkpoint(self, result: CheckpointResult) -> None:
-        """Process the result of a checkpoint."""
+        """Record the result of a checkpoint job."""
 
     def complete(self, arrays: Arrays) -> Arrays:
-        """Return a state's arrays with the paged-out Gaussians included."""
+        """Return the arrays of a saved map, with the Gaussians that are on disk only added."""
 
     def save(self, stamp_ns: int | None = None) -> None:
-        """Write a checkpoint now and wait for it; `stamp_ns` starts the next period."""
+        """Write a checkpoint now and wait until it is written; the next period starts at `stamp_ns`."""
 
     def status_text(self) -> str:
-        """Return one line for the node's health, "" without a session."""
+        """Return one line for the health message of the node, "" without a session."""
 
     def close(self) -> None:
         """Release the session's lock."""
 
 
 class NoSession:
-    """The session of a mapper that keeps everything in memory."""
+    """A `MapSession` without a folder: keyframes and Gaussians are in memory only."""
 
     load_visible: LoadVisible | None = None
     waiting = 0

@@ -44,10 +44,11 @@ _INSERTION_FACTOR = 8  # memory to insert a keyframe, as a multiple of its image
 
 
 def check_budget(memory_mb: float, session: Path | None) -> None:
-    """Check that a budget can be kept for some map.
+    """Check the configured memory budget, independently of the map.
 
     Raises:
-        UserError: there is no session to page to, or the budget is below the memory of the process itself.
+        UserError: no session folder is configured, to which data can be paged out, or the budget is smaller
+            than the memory of the process without a map.
     """
     if session is None:
         raise UserError(
@@ -61,20 +62,23 @@ def check_budget(memory_mb: float, session: Path | None) -> None:
 
 
 def image_bytes(keyframe: StoredKeyframe) -> int:
-    """Return the bytes of a keyframe's pyramid levels."""
+    """Return the size of the pyramid levels of a keyframe, in bytes."""
     arrays = (getattr(level, field.name) for level in keyframe.levels for field in fields(PyramidLevel))
     return sum(array.nbytes for array in arrays if isinstance(array, np.ndarray))
 
 
 def without_images(keyframe: StoredKeyframe) -> StoredKeyframe:
-    """Return the keyframe with empty arrays in one level, which keeps the camera."""
+    """Return a copy of the keyframe with one level, which contains the camera and empty arrays."""
     empty = np.zeros(0, np.uint8)
     camera = keyframe.levels[FULL].camera
     return replace(keyframe, levels=[PyramidLevel(camera, empty, empty, empty, empty, empty)])
 
 
 class Pager:
-    """Keeps the memory budget of a mapper. Seeded and without measurements: the same input pages the same."""
+    """Pages keyframes and Gaussians of a mapper so that its memory use is within the budget.
+
+    It is deterministic: memory use is calculated, not measured, and random choices depend on `seed`.
+    """
 
     def __init__(self, budget_bytes: float, seed: int, disk_tier: DiskTier) -> None:
         self.lost_count = 0  # keyframes that could not be read again
@@ -101,7 +105,7 @@ class Pager:
             self._block_spheres = None
 
     def anchors_moved(self, mapper: Mapper) -> None:
-        """Restore the invariant after anchors have moved: keyframes may observe other blocks now."""
+        """Restore the invariant (see the module) after anchors moved: keyframes may observe other blocks."""
         self._block_spheres = None
         newest = set(mapper.newest)
         for keyframe in list(mapper.keyframes.values()):
@@ -124,11 +128,11 @@ class Pager:
     def page(
         self, mapper: Mapper, decode: Callable[[int], RgbdKeyframe], on_disk: Callable[[int], bool]
     ) -> None:
-        """Page in one keyframe, if any is paged out; then page out until the budget is kept.
+        """Page in one keyframe, if any is paged out; then page out until memory use is within the budget.
 
         Args:
-            decode: reads a keyframe from disk by its id; raises ValueError.
-            on_disk: whether a keyframe is on disk; only those may be paged out.
+            decode: reads the keyframe with an id from disk; raises ValueError.
+            on_disk: returns whether the keyframe with an id is on disk; others are not paged out.
         """
         self._page_in_one(mapper, decode)
         free = self.budget_bytes - self._fixed(mapper)
@@ -173,7 +177,10 @@ class Pager:
     # --- paging out ---
 
     def _page_out_gaussians(self, mapper: Mapper, free: float, on_disk: Callable[[int], bool]) -> None:
-        """Page out the Gaussians above their share, farthest from the robot first, and their observers."""
+        """Page out Gaussians above their part of the budget, farthest first, and keyframes that observe them.
+
+        `free` is the budget without the memory that paging cannot free, in bytes.
+        """
         store, each = mapper.store, _COPIES * mapper.store.bytes_each
         if store.count * each <= max(
             _PAGE_OUT_ABOVE * free, min(_SPARE * self._needed_bytes, self._max_gaussian_bytes(mapper, free))
@@ -203,7 +210,7 @@ class Pager:
                 self._page_out(mapper, id)
 
     def _max_gaussian_bytes(self, mapper: Mapper, free: float) -> float:
-        """Return the bytes that Gaussians may take when the fewest possible keyframes are in memory."""
+        """Return the largest memory for Gaussians, in bytes: with the fewest possible keyframes in memory."""
         newest = mapper.newest
         return free - (_MIN_KEYFRAMES + 1) * image_bytes(mapper.keyframes[newest[-1]])
 
@@ -215,7 +222,7 @@ class Pager:
             self._disk_fault = f"; Gaussians cannot be written to disk: {error.strerror}"
 
     def _page_out_images(self, mapper: Mapper, free: float, on_disk: Callable[[int], bool]) -> None:
-        """Page out random keyframes until the others fit."""
+        """Page out random keyframes until the images of the others fit into the budget."""
         left = free - _COPIES * mapper.store.bytes_each * mapper.store.count
         used = sum(map(image_bytes, mapper.keyframes.values()))
         pinned = {*mapper.newest, self._guest}
@@ -228,7 +235,7 @@ class Pager:
     # --- accounting ---
 
     def _fixed(self, mapper: Mapper) -> float:
-        """Return the bytes that paging cannot free: process, workspace, one insertion, bookkeeping."""
+        """Return the memory (bytes) that paging cannot free: process, buffers, one insertion, bookkeeping."""
         newest = mapper.newest
         insertion = _INSERTION_FACTOR * image_bytes(mapper.keyframes[newest[-1]]) if newest else 0
         dropped = mapper.progress()["forgotten"]
@@ -243,7 +250,7 @@ class Pager:
         return round(self._fixed(mapper) + gaussians + images)
 
     def _check(self, mapper: Mapper) -> None:
-        """Set `fault`; log a warning when it becomes set."""
+        """Set `fault` if the budget is exceeded, else clear it; log a warning when it changes to a fault."""
         before, self.fault = self.fault, ""
         if self.used_bytes > self.budget_bytes:
             self.fault = (
@@ -254,7 +261,7 @@ class Pager:
             log.warning("the memory budget is exceeded: %s", self.fault)
 
     def status_text(self, mapper: Mapper) -> str:
-        """Return for people how much is in memory, on disk and lost."""
+        """Return a text for the user: numbers of keyframes and Gaussians in memory, on disk and lost."""
         keyframes, blocks = len(mapper.keyframes) + len(mapper.paged_out), len(self._disk_tier.blocks)
         total = mapper.store.count + self._disk_tier.count
         lost = f", {self.lost_count} keyframes lost" if self.lost_count else ""

@@ -22,10 +22,11 @@ _FIELDS = tuple(field.name for field in fields(StoredKeyframe) if field.name not
 
 
 def arrays_of(mapper: Mapper, extra: Arrays | None = None) -> Arrays:
-    """Return copies of the whole state of a mapper, except the images of its keyframes.
+    """Return the state of a mapper as arrays (copies), without the images of its keyframes.
 
-    Gaussians are `store_*`; keyframes `keyframe_*`, in the mapper's order, paged-out ones last
-    (`keyframe_parked`); anchors `anchor_*`; `extra` arrays of the caller `extra_*`.
+    Names of the arrays: `store_*` for Gaussians; `keyframe_*` for keyframes, in the order of the mapper, then
+    the paged-out keyframes (`keyframe_parked` is True); `anchor_*` for anchors; `extra_*` for the arrays
+    `extra` of the caller.
     """
     keyframes = [*mapper.keyframes.values(), *mapper.paged_out.values()]
     out = {f"store_{name}": array for name, array in mapper.store.state().items()}
@@ -41,7 +42,7 @@ def arrays_of(mapper: Mapper, extra: Arrays | None = None) -> Arrays:
 
 
 def extras_of(arrays: Arrays) -> Arrays:
-    """Return the extra arrays that `arrays_of` was given."""
+    """Return the arrays that were passed to `arrays_of` as `extra`."""
     return {key.removeprefix("extra_"): a for key, a in arrays.items() if key.startswith("extra_")}
 
 
@@ -51,8 +52,8 @@ def restore(
     """Restore a saved state into a new mapper.
 
     Args:
-        decode: reads a keyframe by its id; raises ValueError.
-        keep_paged_out: leave keyframes paged out that were so; otherwise all are decoded.
+        decode: reads the keyframe with an id; raises ValueError.
+        keep_paged_out: True: keyframes that were paged out stay paged out; False: decode all keyframes.
 
     Returns:
         One sentence for each keyframe that could not be decoded. Its Gaussians are in the map, but the mapper
@@ -85,7 +86,7 @@ def restore(
 
 
 def _keyframe(arrays: Arrays, row: int) -> StoredKeyframe:
-    """Return a keyframe without images; fields that an older program did not save keep their default."""
+    """Return the keyframe in a row of the arrays, without images; fields not saved have their default."""
     empty, stored = np.zeros(0, np.uint8), [n for n in _FIELDS if f"keyframe_{n}" in arrays]
     level = PyramidLevel(camera_of(arrays, row), empty, empty, empty, empty, empty)
     return StoredKeyframe(levels=[level], **{n: _value(arrays[f"keyframe_{n}"][row]) for n in stored})
