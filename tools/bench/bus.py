@@ -1,7 +1,7 @@
 """`bench bus`: latency of messages through the local router, and the effect of a slow subscriber on others.
 
 The publisher is a separate process; this process subscribes. Messages of our bus and plain Zenoh puts of the
-same bytes alternate within one run, so that their ratio is meaningful on a busy machine.
+same bytes alternate within one run, so that the ratio of their latencies is meaningful on a busy machine.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _WARM_UP = 20  # first samples, not counted: connections, shared memory and cach
 
 
 class _ImageSubscriber(Node):
-    """Declares the input of the mailbox that the run with a slow subscriber uses."""
+    """Node that declares the subscription of the slow subscriber, `camera/image`; it is never run."""
 
     name = "monitor"
     inputs = ("camera/image",)
@@ -45,19 +45,22 @@ class _ImageSubscriber(Node):
 
 @dataclass
 class _Latencies:
-    """Latencies in ms, filled by a receiving thread."""
+    """List of message latencies in ms, to which a receiving thread appends."""
 
     values: list[float] = field(default_factory=list)
 
     def add_since(self, then_ns: int) -> None:
-        """Add the time since a monotonic time of this host."""
+        """Append the latency of one message: the time in ms from `then_ns` until now.
+
+        `then_ns` is the value of `time.monotonic_ns()` when the message was published on this host.
+        """
         self.values.append((time.monotonic_ns() - then_ns) / 1e6)
 
     def percentiles(self) -> tuple[float, float]:
-        """Return (p50, p99) in ms without the warm-up.
+        """Return the 50th and the 99th percentile of the latencies in ms, without the first `_WARM_UP` ones.
 
         Raises:
-            RuntimeError: too few messages arrived.
+            RuntimeError: fewer than 10 latencies remain.
         """
         counted = self.values[_WARM_UP:]
         if len(counted) < 10:
@@ -66,9 +69,10 @@ class _Latencies:
 
 
 def _publish(endpoint: str, go: Event, stop: Event, image_bytes: int, hz: float, plain: bool) -> None:
-    """Publish images at `hz`, with `plain` every second one as a plain put, and odometry at 100 Hz.
+    """Publish images at `hz` per second and odometry at 100 Hz until `stop` is set.
 
-    This is the main function of the publishing process.
+    This is the main function of the publishing process. With `plain`, every second image is published as a
+    plain Zenoh put of the same bytes, without the BeamSplat bus.
     """
     data = np.random.default_rng(0).integers(0, 255, image_bytes).astype(np.uint8)
     body = data.tobytes()
@@ -113,7 +117,17 @@ def _publish_odometry(bus: Bus, stop: Event) -> None:
 def bench_bus(
     seconds: float, image_bytes: int, endpoint: str, report: Callable[[str], None]
 ) -> dict[str, Any]:
-    """Run both parts, `seconds` each; return the figures by name, with units in the names."""
+    """Measure image latency, then the effect of a slow subscriber on another topic, for `seconds` each.
+
+    Args:
+        seconds: duration of each of the two measurements, s.
+        image_bytes: size of one image message.
+        endpoint: address at which a router is started, such as tcp/127.0.0.1:17447.
+        report: receives progress messages.
+
+    Returns:
+        Latencies, message counts and memory growth by name; names of quantities end with the unit.
+    """
     with tempfile.TemporaryDirectory() as folder:
         deployment = Deployment(
             robot=ROBOT, router=RouterConfig(listen=(endpoint,)), state_dir=Path(folder), nodes={}
@@ -129,7 +143,10 @@ def bench_bus(
 def _with_publisher(
     endpoint: str, image_bytes: int, plain: bool, hz: float, body: Callable[[Bus], Callable[[], None]]
 ) -> None:
-    """Declare subscriptions with `body`, then run the function it returns while a publisher runs."""
+    """Run a publisher process and one subscriber on the bus.
+
+    `body` declares the subscriptions and returns a function, which is called while images are published.
+    """
     context = multiprocessing.get_context("spawn")
     go, stop = context.Event(), context.Event()
     process = context.Process(target=_publish, args=(endpoint, go, stop, image_bytes, hz, plain))

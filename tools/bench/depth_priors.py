@@ -15,16 +15,20 @@ Prior = Callable[[TruthDataset, int], tuple[np.ndarray, np.ndarray] | None]
 
 
 def true_depth(recording: TruthDataset, index: int) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return the true depth of an image with a sigma of 1 cm; None if the image has none."""
+    """Return (depth_m, sigma_m) float32 [H, W]: the true optical z of an image, and a sigma of 1 cm.
+
+    None if the recording has no true depth of this image.
+    """
     depth = recording.true_depth(index)
     return None if depth is None else (depth, np.full(depth.shape, 0.01, np.float32))
 
 
 def stixel(recording: TruthDataset, index: int) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return depth of vertical walls at the beams, cut off by the floor plane.
+    """Return (depth_m, sigma_m) float32 [H, W] of vertical walls at the lidar beams and of the floor plane.
 
-    The floor is certain where it is nearer than the wall. A wall is certain at the height of the beams; its
-    sigma grows with the vertical distance from there.
+    Each pixel has the optical z of the nearer surface. The sigma of the floor is 3 cm. The sigma of a wall is
+    2 cm at the height of the beams and grows by 15 cm per metre of vertical distance from the beams. None if
+    there are no beams at the time of the image.
     """
     beams, T_body_camera = recording.posed_images[index].beams, recording.T_body_camera
     if len(beams) == 0:
@@ -46,10 +50,10 @@ PRIORS: dict[str, Prior] = {"truth": true_depth, "stixel": stixel}
 
 
 def find_prior(name: str) -> Prior:
-    """Return the prior called `name`.
+    """Return the depth prior called `name`, a key of `PRIORS`.
 
     Raises:
-        UserError: there is no such prior.
+        UserError: no depth prior has this name.
     """
     if name not in PRIORS:
         raise UserError(f"unknown depth prior {name!r}; known are {', '.join(PRIORS)}")

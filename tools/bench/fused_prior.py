@@ -1,6 +1,7 @@
-"""Inputs that other services provide to the mapper, computed along a drive for `bench map`.
+"""Fused depth and masks of dynamic objects along a drive: the inputs of the mapper in `bench map`.
 
-These are fused depth and masks of dynamic objects. Images that are scored are not used.
+In the running system, the services fusion and keyframes compute them. Held-out images are not passed to
+fusion.
 """
 
 from __future__ import annotations
@@ -19,10 +20,10 @@ from beamsplat.tools.evaluation.dataset import TruthDataset
 
 
 class FusedDepthPrior:
-    """Depth from the fusion service as a prior.
+    """Depth prior of `bench map` that is computed by the algorithm of the fusion service.
 
-    Calls must have increasing image indices; images in between are passed to fusion as they are in the
-    service.
+    Call it with increasing image indices. As in the service, fusion also processes the images between two
+    calls. An index that is not higher than the last one starts fusion anew, from the first image.
     """
 
     def __init__(self, source: str = "stixel") -> None:
@@ -31,7 +32,10 @@ class FusedDepthPrior:
         self._next = 0
 
     def __call__(self, recording: TruthDataset, index: int) -> tuple[np.ndarray, np.ndarray] | None:
-        """Return (depth_m, sigma_m) float32 [H, W] of an image; None if fusion rejects it."""
+        """Return (depth_m, sigma_m) float32 [H, W] of image `index`: optical z and its standard deviation.
+
+        None if fusion rejects the image.
+        """
         T_camera_body = inverse(recording.T_body_camera)
         if self._fusion is None or index < self._next:
             poses = np.array(
@@ -76,16 +80,19 @@ class FusedDepthPrior:
 
 
 class DynamicObjectMasks:
-    """Masks of dynamic objects: they are where beams have passed through free space before.
+    """Detector of dynamic objects: they return beams from space that earlier beams passed through.
 
-    Calls must have increasing image indices.
+    Call it with increasing image indices. An index that is not higher than the last one starts anew.
     """
 
     def __init__(self) -> None:
         self._free, self._next = FreeSpaceGrid(), 0
 
     def __call__(self, recording: TruthDataset, index: int, depth_m: np.ndarray) -> np.ndarray | None:
-        """Return bool [H, W], False on dynamic objects, or None without any; `depth_m` is float32 [H, W]."""
+        """Return the mask bool [H, W] of image `index`, False on dynamic objects; None if no beam hits one.
+
+        `depth_m` is the depth of the image, float32 [H, W].
+        """
         T_camera_body = inverse(recording.T_body_camera)
         if index < self._next:
             self._free, self._next = FreeSpaceGrid(), 0

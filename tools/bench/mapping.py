@@ -52,13 +52,16 @@ Mask = Callable[[TruthDataset, int, np.ndarray], np.ndarray | None]
 
 @dataclass
 class MapperTimer:
-    """Wall and CPU seconds of the mapper and the prior, without decoding, scoring and compilation."""
+    """Accumulated wall and CPU time in s of the calls that are made through `run`.
+
+    These are calls of the mapper, the depth prior and the masks, not decoding, scoring and compilation.
+    """
 
     wall_s: float = 0.0
     cpu_s: float = 0.0
 
     def run(self, work: Callable[[], Any]) -> Any:
-        """Call `work`, add its wall and CPU time, return its result."""
+        """Call `work`, add its wall and CPU time to the sums, and return its result."""
         wall, cpu = time.perf_counter(), time.process_time()
         result = work()
         self.wall_s += time.perf_counter() - wall
@@ -67,7 +70,7 @@ class MapperTimer:
 
 
 def raster_camera(camera: Pinhole) -> RasterCamera:
-    """Return the rasterizer's camera of a pinhole camera."""
+    """Return the rasterizer's camera type with the intrinsics of a pinhole camera, without distortion."""
     return RasterCamera(
         camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px, camera.width_px, camera.height_px
     )
@@ -81,18 +84,21 @@ def run_bench(
     prior: Prior | None = None,
     mask: Mask | None = None,
 ) -> dict[str, Any]:
-    """Run the mapper over a recording; return the figures of `beamsplat bench map`.
+    """Map a recording and score the map before and after refinement; return the results by name.
 
-    `wall_s` and `cpu_s` are of the mapper and the prior only, without decoding, scoring and compilation.
+    `wall_s` and `cpu_s` are the time of the mapper and the depth prior until the end of the drive; decoding,
+    scoring and compilation are not counted.
 
-    With `bench.jump`, the anchor of the second half of the drive is 1 m and 10 degrees wrong until the end of
-    the drive, as before a loop closure: compare with a run without it and with the same `settle_steps`.
+    With `bench.jump`, the anchor of the second half of the drive is misplaced by 1 m and 10 degrees until the
+    end of the drive, as before a loop closure. Compare the result with a run without `jump` that has the same
+    `settle_steps`.
 
     Args:
+        path: folder of the recording, see `load_dataset`.
         log: receives progress messages.
-        out: folder for images of held-out views beside the truth, and the map; None writes nothing.
-        prior: depth of the keyframes, instead of the one that `bench.prior` names.
-        mask: masks of dynamic objects.
+        out: folder for the map and for renders of held-out views beside true images; None writes nothing.
+        prior: depth prior of the keyframes; None uses the one called `bench.prior`.
+        mask: computes the masks of dynamic objects; None maps all pixels.
     """
     warm()
     recording = load_dataset(path)
@@ -124,10 +130,11 @@ def run_bench(
 def map_and_score(
     recording: TruthDataset, bench: MapBenchSettings, prior: Prior, true_surface_m: np.ndarray | None = None
 ) -> tuple[dict[str, float | None], MapperTimer]:
-    """Run the mapper over a recording without refinement; return the figures of the map and the time.
+    """Map a recording without refinement; return the scores of the map by name, and the computing time.
 
     Args:
-        true_surface_m: float64 [N, 3]; None: gt_surface.ply of the recording.
+        true_surface_m: points of the true surface in the map frame, float64 [N, 3]; None reads gt_surface.ply
+            of the recording.
     """
     mapper, timer = Mapper(bench.settings, seed=bench.seed, threads=bench.threads), MapperTimer()
     _map_drive(recording, mapper, bench, prior, None, timer, lambda text: None)
@@ -138,10 +145,10 @@ def _map_drive(
     recording: TruthDataset, mapper: Mapper, bench: MapBenchSettings, prior: Prior, mask: Mask | None,
     timer: MapperTimer, log: Log,
 ) -> tuple[int, int]:  # fmt: skip
-    """Map the keyframes in order, with a fixed number of steps each.
+    """Insert the keyframes in order of time, each followed by a fixed number of optimisation steps.
 
     Returns:
-        The numbers of used and of rejected keyframes.
+        The number of keyframes that the mapper has used, and the number that it has rejected.
     """
     used, refused, last = 0, 0, None
     for index, posed_image in enumerate(recording.posed_images):
@@ -176,7 +183,10 @@ def _refine(mapper: Mapper, bench: MapBenchSettings, timer: MapperTimer) -> None
 
 
 def write_comparison_images(recording: TruthDataset, mapper: Mapper, out: Path) -> None:
-    """Write true image beside render for some held-out views: `offpath_NNN.png`, `heldout_NNN.png`."""
+    """Write some held-out views as PNG files: the true image on the left, the render of the map on the right.
+
+    `offpath_NNN.png` are views off the path, `heldout_NNN.png` are images of the drive that were not mapped.
+    """
     out.mkdir(parents=True, exist_ok=True)
     camera = raster_camera(recording.camera)
 
@@ -203,7 +213,10 @@ def _moved(last: np.ndarray | None, T_map_camera: np.ndarray, bench: MapBenchSet
 def make_keyframe(
     recording: TruthDataset, index: int, prior_depth: tuple[np.ndarray, np.ndarray]
 ) -> RgbdKeyframe:
-    """Return a keyframe in the frame of an anchor at the map's origin, with the beams at its time."""
+    """Return image `index` of a recording as a keyframe, with its depth and the beams at its time.
+
+    The frame of its anchor is the map frame. `prior_depth` is (depth_m, sigma_m), both float32 [H, W].
+    """
     posed_image = recording.posed_images[index]
     uv, z, _ = project_beams(posed_image.beams, recording.camera, recording.T_body_camera)
     return RgbdKeyframe(
@@ -216,9 +229,13 @@ def make_keyframe(
 def score_map(
     recording: TruthDataset, mapper: Mapper, log: Log, true_surface_m: np.ndarray | None = None
 ) -> dict[str, float | None]:
-    """Return the figures at views that were not mapped; None where the recording has no such views.
+    """Return the scores of the map at held-out views by name: PSNR, SSIM, depth error, F-score, map size.
 
-    The true surface is `true_surface_m` float64 [N, 3], or else gt_surface.ply of the recording.
+    A score is None if the recording has no views for it.
+
+    Args:
+        true_surface_m: points of the true surface in the map frame, float64 [N, 3]; None reads gt_surface.ply
+            of the recording. If that file is missing too, there is no F-score.
     """
     log("scoring")
     camera = raster_camera(recording.camera)

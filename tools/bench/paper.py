@@ -26,7 +26,7 @@ SUBSTITUTE_MODEL = "fastdepth_nyu_fp32"  # replaces networks whose weights are m
 
 @dataclass(frozen=True)
 class Configuration:
-    """One row of the tables; `paper` holds the figures of the paper."""
+    """One configuration, a row of the tables; `paper` contains the published results by name."""
 
     name: str
     title: str
@@ -66,10 +66,10 @@ CONFIGURATIONS = (
 
 
 def select_configurations(names: list[str] | None) -> list[Configuration]:
-    """Return the configurations with these names, or all.
+    """Return the configurations called `names`, in this order; all configurations if there are no names.
 
     Raises:
-        UserError: a name is unknown.
+        UserError: no configuration has one of the names.
     """
     known = {c.name: c for c in CONFIGURATIONS}
     for name in names or ():
@@ -81,10 +81,17 @@ def select_configurations(names: list[str] | None) -> list[Configuration]:
 def prepare_deployment(
     configuration: Configuration, data: Path, out: Path, recorded: Path | None, seed: int
 ) -> tuple[Deployment | None, str, str]:
-    """Return the deployment of a configuration, the name of the depth source that really runs, and advice.
+    """Return the deployment of a configuration, a description of its depth source, and advice for the user.
 
-    If the weights of the network are missing, recorded depth or FastDepth replaces it and is named as such;
-    without a replacement the deployment is None.
+    If the weights of the depth network are missing, recorded depth or FastDepth replaces the network. The
+    description then names the replacement, and the advice is the command that installs the weights. If no
+    replacement is installed either, the deployment is None.
+
+    Args:
+        data: the bag to play.
+        out: folder of the run; its folder `state` receives logs and state.
+        recorded: folder of recorded depth maps by stamp; None if there are none.
+        seed: seed of the mapper.
     """
     overrides = [f"replay.data={json.dumps(str(data))}", f"state_dir={json.dumps(str(out / 'state'))}"]
     overrides.append(f'router.listen=["tcp/127.0.0.1:{_free_port()}"]')
@@ -134,13 +141,15 @@ def bench_paper(
     groundtruth: Path | None = None, seconds: float | None = None, refine_steps: int = 0,
     log: Callable[[str], None] = print,
 ) -> dict[str, Any]:  # fmt: skip
-    """Run the configurations, write report.json and report.html into `out`, return the report.
+    """Run configurations live in real time, write report.json and report.html into `out`, return the report.
 
     Args:
+        data: folder with bag/ and its ground truth, or a bag that contains poses.
         names: configurations to run; None runs all.
         seeds: runs of each configuration.
         recorded: folder of depth maps by stamp that replaces networks with missing weights.
-        seconds: length of the recording that is used; None uses all.
+        groundtruth: TUM file of the true body poses; None searches beside the bag and in it.
+        seconds: length in s of the part of the recording that is played, from its start; None plays all.
         refine_steps: refinement steps of the default configuration after the drive.
         log: receives progress messages.
 

@@ -1,6 +1,6 @@
-"""`bench raster`: time of rendering with L1 loss and backward pass on a synthetic room.
+"""`bench raster`: time of rendering with L1 loss and backward pass in a synthetic room.
 
-Plain torch is the reference.
+The reference is a renderer in plain PyTorch.
 """
 
 from __future__ import annotations
@@ -24,13 +24,14 @@ Log = Callable[[str], None]
 
 
 def synthetic_room(gaussians: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Return the Gaussians of a furnished room of 6 x 5 x 2.5 m and a view from its corner.
+    """Return the Gaussians of a furnished room of 6 x 5 x 2.5 m, and a camera pose in one of its corners.
 
     Gaussians are discs of 1-4 cm on walls, floor, ceiling and boxes. Neighbours in memory are neighbours on a
     surface, as in maps that the mapper builds.
 
     Returns:
-        params float32 [14, capacity], T_camera_map float64 [4, 4].
+        Parameters of the Gaussians float32 [14, capacity], of which the first `gaussians` columns are used
+        (rows: `beamsplat.common.raster.layout`), and T_camera_map float64 [4, 4].
     """
     rng = np.random.default_rng(seed)
     faces = _faces(rng)
@@ -62,7 +63,7 @@ def synthetic_room(gaussians: int, seed: int = 0) -> tuple[np.ndarray, np.ndarra
 
 
 def _faces(rng: np.random.Generator) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Return (origin, side, side) of the rectangles of the room and of eight boxes in it."""
+    """Return the faces of the room and of eight boxes in it: (corner, side vector, side vector), metres."""
 
     def box(low: np.ndarray, high: np.ndarray) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
         x, y, z = np.diag(high - low)
@@ -83,7 +84,11 @@ def _turn_z_to(normal: np.ndarray) -> np.ndarray:
 
 
 def bench_raster(gaussians: int = 50_000, repeats: int = 15, log: Log = lambda text: None) -> dict[str, Any]:
-    """Return median wall and CPU times over `repeats` runs in which one and two threads alternate."""
+    """Time the rasterizers on a synthetic room; return one entry of `cases` per renderer and image size.
+
+    Times are wall and CPU time in ms: medians and minima over `repeats` runs, in which one and two threads
+    alternate. The reference is timed once.
+    """
     warm()
     params, T_camera_map = synthetic_room(gaussians)
     cases = []
@@ -155,7 +160,7 @@ def _case(
 def _reference_case(
     params: np.ndarray, count: int, camera: RasterCamera, T_camera_map: np.ndarray
 ) -> dict[str, Any]:
-    """Time one run of plain torch in float32 on one thread."""
+    """Time one run of the reference renderer (plain PyTorch, float32) on one thread; return its case."""
     import torch
 
     from beamsplat.services.mapping.renderers.protocol import make_renderer
@@ -172,7 +177,11 @@ def _reference_case(
 def _torch_step(
     renderer: Any, params: np.ndarray, count: int, camera: RasterCamera, T_camera_map: np.ndarray, device: str
 ) -> tuple[float, float, float]:
-    """Return (forward, total, CPU) seconds of forward, L1 loss and backward of a torch renderer."""
+    """Render, compute the L1 loss and its gradient with a torch renderer, once; return the times in s.
+
+    Returns:
+        Wall time of rendering, wall time of everything, CPU time of everything.
+    """
     import torch
 
     from beamsplat.common.raster.layout import GROUPS
@@ -195,7 +204,7 @@ def _torch_step(
 
 
 def _gsplat_cases(repeats: int) -> list[dict[str, Any]]:
-    """Time gsplat at 640x480 with a million Gaussians; no cases without a GPU."""
+    """Time gsplat at 640x480 with a million Gaussians; return its case, or an empty list without a GPU."""
     from beamsplat.services.mapping.renderers.gsplat import fault
     from beamsplat.services.mapping.renderers.protocol import make_renderer
 

@@ -1,4 +1,4 @@
-"""Writes tables of benchmark results into the README, between two marks."""
+"""Write tables of benchmark results into a Markdown file, between two marks."""
 
 from __future__ import annotations
 
@@ -12,7 +12,12 @@ _PAPER_COLUMNS = ("configuration", "position RMSE, m", "images/s", "CPU s per im
 
 
 def replace_readme_table(readme: Path, bench: str, table: str) -> None:
-    """Replace the text between <!-- bench NAME --> and <!-- /bench NAME --> with a table.
+    """Replace the text between <!-- bench NAME --> and <!-- /bench NAME --> in a file with a table.
+
+    Args:
+        readme: the Markdown file.
+        bench: NAME of the marks.
+        table: the table in Markdown.
 
     Raises:
         UserError: the marks are missing.
@@ -28,7 +33,10 @@ def replace_readme_table(readme: Path, bench: str, table: str) -> None:
 
 
 def paper_table(rows: list[dict[str, Any]]) -> str:
-    """Return the table of `bench paper` in Markdown, with the paper's figures in brackets."""
+    """Return the table of `bench paper` in Markdown, with the results published in the paper in brackets.
+
+    `rows` are the entries of `configurations` in the report.
+    """
     lines = ["| " + " | ".join(_PAPER_COLUMNS) + " |", "|---" * len(_PAPER_COLUMNS) + "|"]
     for row in rows:
         paper = row["paper"]

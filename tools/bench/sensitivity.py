@@ -1,4 +1,7 @@
-"""`bench sensitivity`: effect of each setting, changed one at a time, on the figures of a part."""
+"""`bench sensitivity`: effect of each setting on quality and cost of SLAM, fusion or mapper.
+
+One setting is changed at a time, by the factors `SCALES`.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +25,7 @@ Row = dict[str, Any]  # one run; see `measure`
 
 @dataclass(frozen=True)
 class PlannedRun:
-    """One run: a parameter with a value, or the defaults with a seed."""
+    """One run to make: with one parameter changed to `value`, or with default settings and a seed."""
 
     parameter: str
     value: float | int | None  # None for the defaults
@@ -32,7 +35,7 @@ class PlannedRun:
 
 
 def plan(parameters: list[Parameter]) -> list[PlannedRun]:
-    """Return the runs with default settings, then each parameter with its smaller and its larger value."""
+    """Return all runs: default settings with each of `SEEDS`, then each parameter times each of `SCALES`."""
     runs = [PlannedRun(DEFAULTS, None, 1.0, seed) for seed in SEEDS]
     for parameter in parameters:
         for scale in SCALES:
@@ -42,10 +45,10 @@ def plan(parameters: list[Parameter]) -> list[PlannedRun]:
 
 
 def chosen(part: Part, only: list[str] | None) -> list[Parameter]:
-    """Return the parameters of a part, or those named in `only`, in that order.
+    """Return the parameters of a part that are named in `only`, in this order; all parameters without `only`.
 
     Raises:
-        UserError: a name is unknown.
+        UserError: the part has no parameter of this name.
     """
     parameters = {parameter.name: parameter for parameter in parameters_of(part.settings)}
     for name in only or []:
@@ -55,9 +58,9 @@ def chosen(part: Part, only: list[str] | None) -> list[Parameter]:
 
 
 def read_rows(file: Path, setup: dict[str, Any]) -> list[Row]:
-    """Return the finished rows of a JSON-lines file that have the values of `setup`; none if it is missing.
+    """Return the rows of a JSON-lines file whose entries include all of `setup`; [] if the file is missing.
 
-    An incomplete last line, of a run that was interrupted, is left out.
+    A row is one finished run, see `measure`. An incomplete last line (of an interrupted run) is left out.
     """
     if not file.is_file():
         return []
@@ -81,15 +84,19 @@ def measure(
     minutes: float = float("inf"),
     progress: Callable[[str, int, int], None] = lambda name, done, total: None,
 ) -> list[Row]:
-    """Make the runs that the file lacks, append each as one line of JSON, and return all rows of this setup.
+    """Make the runs that are not in `file` yet, append one row per run to it, and return all rows of `setup`.
 
-    A row has the entries of `setup`, `parameter`, `value`, `scale`, `seed`, `duration_s`, and either
-    `figures` (by name) or `error`: why the value was not run, or how the run failed.
+    A row is a JSON object with the entries of `setup`, `parameter`, `value`, `scale`, `seed`, `duration_s`,
+    and either `figures` (metrics by name) or `error` (why the value was not run, or how the run failed).
 
     Args:
-        run: prepares the runs; not called if all are finished.
-        minutes: no run starts later than this after the first one.
-        progress: receives the name of the parameter, and the numbers of finished and of all runs.
+        part: SLAM, fusion or mapper.
+        run: loads the recording and returns the function that makes one run; not called if no run is left.
+        parameters: the parameters to change.
+        file: JSON-lines file of the rows.
+        setup: entries that identify the measurement, such as the recording; other rows of `file` are ignored.
+        minutes: no run starts later than this time after the first one.
+        progress: receives the name of the parameter, the number of finished runs, the number of all runs.
     """
     rows, runs = read_rows(file, setup), plan(parameters)
     finished = {(row["parameter"], row["value"], row["seed"]) for row in rows}
@@ -114,7 +121,10 @@ def measure(
 
 
 def _outcome(part: Part, run: Run | None, item: PlannedRun) -> dict[str, Any]:
-    """Return the figures of a run, or its error: no setting is checked before it is used."""
+    """Make one run; return {"figures": metrics by name}, or {"error": text} if the changed setting fails.
+
+    Settings are not checked before they are used.
+    """
     assert run is not None
     settings = part.settings
     if item.value is not None:

@@ -1,4 +1,7 @@
-"""`bench slam`: accuracy and cost of the lidar SLAM on recordings with ground truth, one process each."""
+"""`bench slam`: accuracy and cost of the lidar SLAM on recordings with ground truth.
+
+Each recording is processed in a new process, so that its CPU time and memory can be measured.
+"""
 
 from __future__ import annotations
 
@@ -29,10 +32,10 @@ def recordings_in(folder: Path) -> list[tuple[str, Path, list[str]]]:
     """Find recordings with ground truth: X.bag beside X.relations, and folders with bag/ and groundtruth.txt.
 
     Returns:
-        (name, recording, arguments of `eval slam`) of each.
+        For each recording: its name, its path, and the arguments that pass its ground truth to `eval slam`.
 
     Raises:
-        UserError: there is no such recording.
+        UserError: the folder contains no recording with ground truth.
     """
     found = [
         (path.stem, path.with_suffix(".bag"), ["--relations", str(path)])
@@ -50,7 +53,16 @@ def recordings_in(folder: Path) -> list[tuple[str, Path, list[str]]]:
 
 
 def bench_slam(folder: Path, out: Path, odometry: bool, log: Callable[[str], None]) -> list[dict[str, Any]]:
-    """Return one row of figures per recording; unsuitable recordings are logged and left out."""
+    """Map every recording in a folder and return its accuracy and cost by name, one row per recording.
+
+    Recordings that are not planar or cannot be mapped are logged and left out.
+
+    Args:
+        folder: see `recordings_in`.
+        out: folder that receives one folder per recording, with map and trajectories.
+        odometry: whether SLAM uses wheel odometry.
+        log: receives progress messages.
+    """
     rows = []
     for name, bag, truth in recordings_in(folder):
         if truth[0] == "--groundtruth" and (why := _not_planar(Path(truth[1]))):
@@ -70,7 +82,7 @@ def bench_slam(folder: Path, out: Path, odometry: bool, log: Callable[[str], Non
 
 
 def _not_planar(groundtruth: Path) -> str:
-    """Return why a recording is not planar, or "": a planar SLAM cannot map a hand-held sensor."""
+    """Return why a recording is not planar, or "" if it is: a planar SLAM cannot map a hand-held sensor."""
     T_world_body = read_tum(groundtruth).T_a_b
     rise_m = float(np.ptp(T_world_body[:, 2, 3]))
     tilt_deg = float(np.degrees(np.arccos(np.clip(T_world_body[:, 2, 2].min(), -1.0, 1.0))))
@@ -85,7 +97,7 @@ def _beamsplat(arguments: list[str]) -> subprocess.CompletedProcess[str]:
 
 
 def markdown(rows: list[dict[str, Any]]) -> str:
-    """Return the rows as the table of the README in Markdown."""
+    """Return the results of `bench_slam` as a Markdown table, the one in the README."""
     lines = [
         "| " + " | ".join(COLUMNS) + " |",
         "|---" * len(COLUMNS) + "|",
@@ -105,7 +117,10 @@ def markdown(rows: list[dict[str, Any]]) -> str:
 
 
 def write_map_overview(out: Path, names: list[str], path: Path) -> None:
-    """Write the maps side by side, each with its name, as one JPEG."""
+    """Write the maps of several recordings side by side, each with its name, into one JPEG file.
+
+    Reads `map.png` in the folder of each name in `out`.
+    """
     import cv2
 
     tiles = []

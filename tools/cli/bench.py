@@ -1,4 +1,4 @@
-"""Commands `beamsplat bench ...`: measure this machine, each figure with a baseline of the same run."""
+"""Commands `beamsplat bench bus | slam | paper | sensitivity`: benchmarks, each with its reference."""
 
 from __future__ import annotations
 
@@ -153,7 +153,7 @@ def sensitivity(
     markdown: Annotated[Path | None, typer.Option(help="Write the table into this page")] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Change each setting of SLAM, fusion or mapper by -30 and +30 %; print the effect on the figures.
+    """Change each setting of SLAM, fusion or mapper by -30 and +30 %; print the effect on metrics.
 
     Start with a new --out file after a change of the code.
 

@@ -1,4 +1,4 @@
-"""`beamsplat bug-report`: one file for whoever looks into a fault."""
+"""`beamsplat bug-report`: write everything that is needed to diagnose a fault into one file."""
 
 from __future__ import annotations
 

@@ -110,13 +110,13 @@ def demo(
 
 
 def _busy_s() -> float:
-    """Return the CPU time that this machine has used since it started, s."""
+    """Return the CPU time in s that all cores of this computer have been busy since it was started."""
     times = psutil.cpu_times()
     return sum(times) - times.idle - getattr(times, "iowait", 0.0) - getattr(times, "guest", 0.0)
 
 
 def _simulated(out: Path, seconds: float) -> Path:
-    """Return the bag of a simulated drive in `out`; it is simulated once per length."""
+    """Return the bag of a simulated drive of `seconds` in `out`; simulate the drive if it is missing."""
     from beamsplat.tools.cli.simulate import simulate
 
     folder = out / f"simulated-{seconds:g}s"
@@ -136,10 +136,16 @@ def _truth_stamps(source: Path) -> frozenset[int]:
 
 
 def write_results(out: Path, source: Path, record: RunRecord, costs: RunCosts) -> dict[str, Any]:
-    """Write trajectory.tum and, if there were images, map.png, report.html, report.json; return the figures.
+    """Write the results of a live run into `out`; return scores and costs by name, as in report.json.
 
-    Errors are computed against the recording's own ground truth (groundtruth.txt beside the bag, or poses in
-    it); without one they are left out.
+    The files are trajectory.tum and, if there were images, map.png, report.html and report.json. Pose errors
+    are computed against the ground truth of the recording (groundtruth.txt beside the bag, or poses in the
+    bag); they are left out if it has none.
+
+    Args:
+        source: the recording that was played.
+        record: messages of the run.
+        costs: CPU time and memory of the run.
     """
     import cv2
     import numpy as np

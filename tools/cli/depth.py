@@ -146,10 +146,12 @@ def bench_depth(
 
 
 def options_of(pairs: list[str] | None) -> dict[str, Any]:
-    """Return options `name=value` of a depth source; values are parsed as TOML if possible, else are strings.
+    """Return the options of a depth source from texts `name=value`, by name.
+
+    Values are parsed as TOML; a value that is not TOML is a string.
 
     Raises:
-        UserError: an option has another form.
+        UserError: a text does not have the form `name=value`.
     """
     import tomllib
 

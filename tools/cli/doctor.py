@@ -1,4 +1,4 @@
-"""The command `beamsplat doctor`: what this machine lacks, and how to correct it."""
+"""The command `beamsplat doctor`: find what is missing on this computer, and name the remedy."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ Verdict = Literal["ok", "note", "fault"]
 
 @dataclass(frozen=True)
 class Finding:
-    """One line of the report."""
+    """One result of an examination: subject, verdict, text, and the remedy of a fault."""
 
     subject: str
     verdict: Verdict
@@ -48,7 +48,7 @@ def _python() -> Iterator[Finding]:
 
 
 def _packages() -> Iterator[Finding]:
-    """Compare installed versions with the ranges in this package's own metadata."""
+    """Check the versions of installed packages against the ranges in the metadata of this package."""
     unwanted = ("dev", "all") if _has_nvidia() else ("dev", "all", "gpu")
     for requirement, extra in requirements():
         if requirement.name == "beamsplat" or extra in unwanted:
@@ -105,7 +105,7 @@ def _gpu() -> Iterator[Finding]:
 
 
 def _deployment(deployment: Deployment) -> Iterator[Finding]:
-    """Report what the deployment names and this machine lacks: rig, keys, models, data, own classes."""
+    """Report files that the deployment names and this computer lacks: rig, keys, models, data, classes."""
     from beamsplat.tools.system.assembly import faults, missing_resources
 
     found = faults(deployment)
@@ -205,7 +205,10 @@ def _models() -> Iterator[Finding]:
 
 
 def congestion(algorithm: str) -> Finding:
-    """Return a finding about TCP on lossy radio links; `algorithm` is the kernel's congestion control."""
+    """Return a finding on whether TCP suits lossy radio links.
+
+    `algorithm` is the congestion control of the kernel, such as "cubic" or "bbr".
+    """
     if algorithm == "bbr":
         return Finding("uplink", "ok", "TCP keeps its rate when packets are lost (bbr)")
     return Finding("uplink", "note", f"TCP is {algorithm}: where 1 % is lost, it uses a sixth of 20 Mbit/s",

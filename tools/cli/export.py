@@ -119,7 +119,7 @@ def _open(session: Path) -> tuple[dict[str, Any], Callable[[], Any]]:
 
 
 def _from_mapper(file: Path) -> tuple[dict[str, Any], Callable[[], Any]]:
-    """Query the state of a running mapper and the lidar grid; see `_open`."""
+    """Return the same as `_open`, from a running mapper and localization."""
     from beamsplat.common.config.deployment import load_deployment
     from beamsplat.common.messages import MapState
     from beamsplat.common.security.logins import OPERATOR, login_of
@@ -286,7 +286,7 @@ def render(
     width: Annotated[int, typer.Option(min=0, help="Image width in pixels; 0: that of the keyframes")] = 0,
     threads: ThreadsOption = 2,
 ) -> None:
-    """Render a map along a camera path: around the map, along its own drive, or along a given path.
+    """Render a map along a camera path: around the map, along its own drive, or along a path from a file.
 
     Examples:
 

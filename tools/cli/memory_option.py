@@ -18,7 +18,7 @@ MemoryOption = Annotated[
 
 
 def memory_overrides(text: str | None) -> tuple[str, ...]:
-    """Return the overrides of a deployment that `--memory TEXT` stands for; none for None.
+    """Return the overrides NODE.OPTION=VALUE that set the memory budget `text`, such as "1GB"; () for None.
 
     Raises:
         UserError: the text is not a size.

@@ -1,4 +1,4 @@
-"""What several commands require of their options."""
+"""Checks of option values that several commands use."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from beamsplat.common.files.persist import check_can_write
 
 
 def writable(path: Path | None) -> Path | None:
-    """Check, before a command starts its work, that the path of its `--out` can be written; a typer callback.
+    """Check that the path of the option `--out` can be written, and return it; a typer callback.
 
     Raises:
         UserError: no permission, or a parent of the path is a file.
@@ -20,12 +20,13 @@ def writable(path: Path | None) -> Path | None:
 
 
 def session_folder(path: Path) -> Path:
-    """Return `path`, or the folder `session` in it, as `beamsplat demo` leaves it; a typer callback.
+    """Return the session in a folder: its subfolder `session` if there is one, else `path`; a typer callback.
 
-    A deployment file (.toml) and a path that does not exist are returned as they are.
+    `beamsplat demo` writes such a subfolder. A deployment file (.toml) and a path that does not exist are
+    returned unchanged.
 
     Raises:
-        UserError: `path` is another file.
+        UserError: `path` is a file and no deployment.
     """
     from beamsplat.common.mapfiles.session import SessionFolder
 

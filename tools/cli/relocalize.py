@@ -27,7 +27,7 @@ def eval_relocalize(
     seed: Annotated[int, typer.Option(min=0, help="Seed of the random choice")] = 0,
     as_json: JsonOption = False,
 ) -> None:
-    """Relocalize single scans in a saved map without a prior; right is within 0.10 m and 2 degrees.
+    """Relocalize single scans in a saved map without a prior; success is an error below 0.10 m and 2 degrees.
 
     The true poses are the mapped trajectory of the same drive: errors of the map itself are not measured.
 
@@ -68,13 +68,16 @@ def eval_relocalize(
 
 
 def _error(pose_map_body: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
-    """Return the distance in metres and the angle in degrees between two planar poses."""
+    """Return the distance in m and the angle in degrees between two planar poses float64 [3] (x, y, yaw)."""
     away = float(np.hypot(*(pose_map_body - truth)[:2]))
     return away, math.degrees(abs(math.remainder(pose_map_body[2] - truth[2], 2.0 * math.pi)))
 
 
 def _summary(rows: np.ndarray) -> dict[str, Any]:
-    """Return the figures of rows float64 [N, 4]: metres, degrees, confidence, seconds."""
+    """Return success rate, errors and times by name, of N relocalizations.
+
+    `rows` float64 [N, 4]: position error in m, angle error in degrees, confidence, time in s.
+    """
     right = (rows[:, 0] <= MAX_ERROR_M) & (rows[:, 1] <= MAX_ERROR_DEG)
     sure = rows[:, 2] >= MIN_CONFIDENCE
     return {
@@ -90,7 +93,7 @@ def _summary(rows: np.ndarray) -> dict[str, Any]:
 
 
 def _scans_at(bag: Path, stamps_ns: set[int]) -> tuple[dict[int, Any], np.ndarray]:
-    """Return the scan messages with these stamps by stamp, and T_body_lidar."""
+    """Return the scan messages at these stamps, by stamp, and the mount T_body_lidar float64 [4, 4]."""
     from beamsplat.services.replay.options import SourceOptions
     from beamsplat.services.replay.source import open_source
 

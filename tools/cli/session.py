@@ -224,7 +224,7 @@ def _bytes(path: Path) -> int:
 
 
 def _open(session: Path) -> tuple[Any, dict[str, Any]]:
-    """Return (folder, arrays of its last checkpoint).
+    """Return a session as (SessionFolder, arrays of its last checkpoint).
 
     Raises:
         UserError: there is no session, or no checkpoint in it.
@@ -262,7 +262,9 @@ def _write(folder: Any, arrays: dict[str, Any]) -> None:
 
 
 def load_slam(path: Path) -> Any:
-    """Load the lidar SLAM of a robot half.
+    """Return the lidar SLAM that is saved in the robot half of a session.
+
+    `path` is the folder of the saved state, or contains it as `state`.
 
     Raises:
         UserError: there is no saved state, or it cannot be read.
@@ -311,7 +313,7 @@ def _same_drive(session: Path, robot: Path, arrays: dict[str, Any], slam: Any) -
 
 
 def _parsed_pose(text: str) -> Any:
-    """Return the planar pose float64 [3] (x m, y m, yaw rad) in X,Y,DEG."""
+    """Return the planar pose float64 [3] (x m, y m, yaw rad) of a text "X,Y,DEG" (m, m, degrees)."""
     import numpy as np
 
     try:
@@ -322,7 +324,9 @@ def _parsed_pose(text: str) -> Any:
 
 
 def _aligned(first: Path, second: Path, slams: list[Any]) -> Any:
-    """Return the alignment of the second map to the first from lidar scans; its pose_a_b is float64 [3].
+    """Return the alignment of the second map to the first, estimated from lidar scans.
+
+    Its pose_a_b float64 [3] (x m, y m, yaw rad) is the pose of the second map in the first.
 
     Raises:
         UserError: a robot half is missing, or the scans do not agree on a pose.

@@ -180,10 +180,10 @@ def _grey(image: Image) -> np.ndarray:
 
 
 def _check_existing_rig(rig: Path, camera: FoundSensor | None) -> None:
-    """Check that a kept rig file belongs to this camera.
+    """Check that an existing rig file fits the connected camera.
 
     Raises:
-        UserError: it has no camera, or another image size.
+        UserError: the rig file has no camera, or the image size differs.
     """
     from beamsplat.common.geometry.rig import load_rig
 
@@ -202,7 +202,10 @@ def _check_existing_rig(rig: Path, camera: FoundSensor | None) -> None:
 
 
 def _ask_calibration(camera: FoundSensor | None, lidar: dict[str, Any], folder: Path) -> str:
-    """Ask for all parts of the calibration; return the text of rig.toml."""
+    """Ask the user for mounts, calibrate camera and lidar; return the text of rig.toml.
+
+    `folder` receives the chessboard to print.
+    """
     from beamsplat.tools.setup.files import MeasuredMount, camera_section, rig_text
 
     console.rule("Mounts", align="left")
@@ -240,7 +243,7 @@ def _ask_mount(what: str, default: MeasuredMount, *, turns: bool) -> MeasuredMou
 def _intrinsics_from_field_of_view(
     camera: FoundSensor, T_body_camera: np.ndarray
 ) -> tuple[CameraSection, str]:
-    """Return the section [camera] of the rig, and one sentence on where it comes from."""
+    """Ask for the field of view; return section [camera] of rig.toml and a note on how K was determined."""
     from beamsplat.common.geometry.rig import CameraSection, Mount
     from beamsplat.services.replay.rig_draft import pinhole_from_fov
 
@@ -319,7 +322,7 @@ def _calibrate_lidar_extrinsics(
     board: Chessboard,
     T_body_lidar: np.ndarray,
 ) -> np.ndarray:
-    """Return `T_body_lidar` calibrated with boards, or as measured if the user declines."""
+    """Return `T_body_lidar` [4, 4], calibrated with chessboards, or unchanged if the user declines."""
     from beamsplat.tools.setup.board_calibration import N_BOARDS, LidarBoardCalibration
 
     console.rule("Lidar against camera", align="left")

@@ -104,7 +104,7 @@ def simulate(
 ) -> None:
     """Simulate a robot that drives through a generated home, and record it with exact ground truth.
 
-    The folder holds bag/ (ROS 2, MCAP) without ground truth, and beside it groundtruth.txt, camera.json,
+    The folder contains bag/ (ROS 2, MCAP) without ground truth, and beside it groundtruth.txt, camera.json,
     depth_gt/, moving_masks/, beams.npz, extra_views/ and gt_surface.ply. Worlds and images are cached in
     $BEAMSPLAT_CACHE (default ~/.cache/beamsplat) and reused.
 
@@ -171,7 +171,7 @@ def simulate(
 
 
 class _Bar:
-    """Progress on standard error, one line per stage; a stage without a count shows no bar."""
+    """Progress display on standard error, one line per stage; a stage without a count has no bar."""
 
     def __init__(self) -> None:
         self._progress = Progress(

@@ -114,7 +114,10 @@ def eval_slam(
 
 
 def _against_relations(folder: Path, path: Path) -> dict[str, Any]:
-    """Return the errors against relations, which are poses of the lidar."""
+    """Return the errors of a trajectory against relations (relative poses of the lidar), by name.
+
+    `folder` is the output of `beamsplat slam`, or one trajectory file in it; `path` is the relations file.
+    """
     from dataclasses import asdict
 
     import numpy as np
@@ -135,7 +138,10 @@ def _against_relations(folder: Path, path: Path) -> dict[str, Any]:
 
 
 def print_figures(figures: dict[str, Any]) -> None:
-    """Print a table of the scalar figures."""
+    """Print the numbers and texts in `figures` as a table with two columns, name and value.
+
+    Entries of other types, such as lists, are left out.
+    """
     table = Table("figure", "value")
     for name, value in figures.items():
         if isinstance(value, (int, float, str)):

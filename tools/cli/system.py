@@ -99,17 +99,22 @@ def run(
 
 
 class RunMonitor(Protocol):
-    """Observes a deployment while it runs."""
+    """Interface of an observer of a running deployment."""
 
     def poll(self) -> None:
-        """Called several times per second."""
+        """Observe the running system; it is called several times per second."""
 
     def finish(self, board: HealthTable, drained: bool) -> Any:
-        """Called once, before the processes are stopped."""
+        """End the observation; it is called once, before the processes are stopped.
+
+        Args:
+            board: health of all nodes.
+            drained: whether all nodes have finished their work.
+        """
 
 
 class _Display:
-    """The state of a run on standard error: a live table in a terminal, else a line every few seconds."""
+    """Display of the nodes' state on standard error: a table in a terminal, else a line every few seconds."""
 
     def __init__(self, board: HealthTable) -> None:
         self._board = board
@@ -133,7 +138,7 @@ class _Display:
             console.print(self._board.nodes_table())
 
     def update(self) -> None:
-        """Show the newest state; called several times per second."""
+        """Show the newest state of the nodes; call this several times per second."""
         now = time.monotonic()
         if self._screen is not None:
             self._screen.update(self._board.nodes_table())
@@ -249,7 +254,7 @@ def offline(
 ) -> None:
     """Run a deployment in lockstep: one thread, no bus, as fast as possible, reproducible.
 
-    The same input gives the same bytes: summary.json holds a SHA-256 over all messages.
+    The same input produces the same bytes: summary.json contains a SHA-256 over all messages.
 
     Example: beamsplat offline deploy/demo.toml --data drive/bag --out out/
     """

@@ -1,4 +1,4 @@
-"""Compilation of the numeric kernels into the cache beside their sources, before services need them."""
+"""`beamsplat warm`: compile the numeric kernels into the cache beside their sources, before services run."""
 
 from __future__ import annotations
 

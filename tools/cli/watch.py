@@ -1,4 +1,4 @@
-"""Commands that look at a system: top, topics, graph."""
+"""Commands that show the state of a system: top, topics, graph."""
 
 from __future__ import annotations
 
@@ -25,7 +25,9 @@ SNAPSHOT_S = 3.0  # nodes report once per second, and a rate needs two reports
 
 @contextlib.contextmanager
 def _board(file: Path, overrides: list[str] | None, every_robot: bool) -> Iterator[HealthTable]:
-    """Open the health of a running system.
+    """Connect to a running system; yield the health table of its nodes.
+
+    `file` is the deployment, `every_robot` includes the nodes of all robots that its router reaches.
 
     Raises:
         UserError: no router answers.

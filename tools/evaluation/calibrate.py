@@ -1,4 +1,4 @@
-"""Calibrates camera and lidar from a recorded drive, or from still images and scans of a board."""
+"""Calibration of camera and lidar from a recorded drive, or from still images and scans of a chessboard."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _HALF_BOARD_M = 0.26  # beams this close to the board's centre can hit it
 
 
 def tracked_pairs(drive: RecordedDrive, clock_offset_ns: int = 0) -> list[TrackedPair]:
-    """Track corners over 1 s, every 0.25 s of the drive.
+    """Return image corners tracked over 1 s, one set per 0.25 s of the drive, as rays at both times.
 
     `clock_offset_ns` is added to the stamps of the images.
     """
@@ -64,10 +64,12 @@ def tracked_pairs(drive: RecordedDrive, clock_offset_ns: int = 0) -> list[Tracke
 
 
 def calibrate_motion(drive: RecordedDrive, free: tuple[str, ...] = PARAMETERS) -> MotionCalibration:
-    """Estimate the clock offset and the mount of a drive's camera; only the parameters `free` are estimated.
+    """Estimate the clock offset and the mount of the camera from the motion of a drive.
+
+    `free` names the parameters to estimate; the others stay as in the drive's calibration.
 
     Raises:
-        UserError: too few tracked corners, or no poses.
+        UserError: too few corners can be tracked, or the drive has no poses at the images.
     """
     focal = drive.camera.fx_px * _WIDTH_PX / drive.camera.width_px
     try:
@@ -79,19 +81,19 @@ def calibrate_motion(drive: RecordedDrive, free: tuple[str, ...] = PARAMETERS) -
 def calibrate_board(
     folder: Path, rig_file: Path, corner_counts: tuple[int, int], square_m: float
 ) -> dict[str, Any]:
-    """Estimate yaw and offsets of the lidar in the camera from images and scans of a board.
-
-    Reads `images/<stamp_ns>.png` and `lasers/<stamp_ns>.pcd`.
+    """Estimate yaw, x and z of the lidar in the camera frame from images and scans of a chessboard.
 
     Args:
+        folder: contains `images/<stamp_ns>.png` and `lasers/<stamp_ns>.pcd`.
+        rig_file: rig.toml with the camera's intrinsics; mounts in it are the start of the estimation.
         corner_counts: inner corners of the chessboard, (columns, rows).
-        square_m: side of a square.
+        square_m: side of a square of the chessboard.
 
     Returns:
-        The figures of the JSON report of `calibrate extrinsics --target board`.
+        The entries of the JSON report of `calibrate extrinsics --target board`, by name.
 
     Raises:
-        UserError: no such files, no camera in the rig, or no board in the images.
+        UserError: files are missing, the rig has no camera, or fewer than two images show the board.
     """
     loaded = load_rig(rig_file)
     if loaded.camera is None:
@@ -146,10 +148,12 @@ def calibrate_board(
 
 
 def pair_files(folder: Path, tolerance_ns: int = 100_000_000) -> list[tuple[Path, Path]]:
-    """Return pairs of an image file and the point cloud file nearest in time.
+    """Return each image file of a folder with the point cloud file nearest in time.
+
+    Images without a point cloud within `tolerance_ns` are left out.
 
     Raises:
-        UserError: there is no pair.
+        UserError: no image has a point cloud.
     """
     images = {int(p.stem): p for p in sorted((folder / "images").glob("*.png")) if p.stem.isdigit()}
     clouds = {int(p.stem): p for p in sorted((folder / "lasers").glob("*.pcd")) if p.stem.isdigit()}
@@ -167,7 +171,9 @@ def pair_files(folder: Path, tolerance_ns: int = 100_000_000) -> list[tuple[Path
 
 
 def read_pcd(path: Path) -> np.ndarray:
-    """Read points float64 [N, 3] of an ASCII PCD file whose first fields are x, y, z.
+    """Return the points float64 [N, 3] (x, y, z in m) of an ASCII PCD file; its first fields must be x, y, z.
+
+    Points with a coordinate that is not finite are left out.
 
     Raises:
         UserError: the file has another format.
@@ -185,9 +191,9 @@ def read_pcd(path: Path) -> np.ndarray:
 
 
 def motion_report(drive: RecordedDrive, found: MotionCalibration) -> dict[str, Any]:
-    """Return the figures of a motion calibration and a sentence on its quality.
+    """Return the JSON report of a motion calibration: values, standard errors, residuals in px, quality.
 
-    Values that were not estimated are None.
+    Angles are in degrees, the clock offset in ms, and lengths in m. Values that were not estimated are None.
     """
     report: dict[str, Any] = {
         "corners": found.corners, "residual_px": found.residual_px,
@@ -208,9 +214,9 @@ def motion_report(drive: RecordedDrive, found: MotionCalibration) -> dict[str, A
 
 
 def with_clock_offset(drive: RecordedDrive, offset_ns: int) -> RecordedDrive:
-    """Return the drive with `offset_ns` added to the stamps of its images.
+    """Return a copy of the drive with `offset_ns` added to the stamps of its images.
 
-    This tests whether calibration estimates the offset.
+    It is used to test whether the calibration estimates this offset.
     """
     images = [image.model_copy(update={"stamp_ns": image.stamp_ns + offset_ns}) for image in drive.images]
     return replace(drive, images=images)

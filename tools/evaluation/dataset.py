@@ -22,17 +22,17 @@ from beamsplat.common.geometry.transforms import make_transform, matrix_from_qua
 
 @dataclass(frozen=True)
 class PosedImage:
-    """A compressed image with its true pose."""
+    """A compressed image with the true pose of the camera, and the lidar beams at its time."""
 
     stamp_ns: int
-    T_map_camera: np.ndarray
+    T_map_camera: np.ndarray  # float64 [4, 4]
     jpeg: bytes
     beams: Beams = NO_BEAMS  # in the body frame at the time of the image
 
 
 @dataclass(frozen=True)
 class OffPathView:
-    """A held-out view off the path, with its true pose and files of its image and depth."""
+    """A held-out view away from the robot's path: true camera pose float64 [4, 4], image file, depth file."""
 
     T_map_camera: np.ndarray
     image_file: Path
@@ -41,7 +41,10 @@ class OffPathView:
 
 @dataclass
 class TruthDataset:
-    """A recording with ground truth; see `load_dataset`."""
+    """A recording with ground truth: images with true poses, calibration, held-out views.
+
+    `load_dataset` creates it.
+    """
 
     path: Path
     camera: Pinhole  # of the undistorted images that `image` returns
@@ -52,7 +55,7 @@ class TruthDataset:
 
     @property
     def seconds(self) -> float:
-        """Time from the first to the last image."""
+        """Time from the first to the last image, s."""
         return (self.posed_images[-1].stamp_ns - self.posed_images[0].stamp_ns) * 1e-9
 
     def image(self, index: int) -> np.ndarray:
@@ -64,7 +67,7 @@ class TruthDataset:
         return rgb if self.undistort is None else self.undistort(rgb)
 
     def true_depth(self, index: int) -> np.ndarray | None:
-        """Return the true depth of image `index`, float32 [H, W] in metres, NaN where unknown.
+        """Return the true depth (optical z) of image `index`, float32 [H, W] in metres, NaN where unknown.
 
         None if the image has no depth file.
         """
@@ -73,10 +76,10 @@ class TruthDataset:
 
 
 def read_depth_png(file: Path) -> np.ndarray:
-    """Read depth float32 [H, W] in metres from a 16 bit PNG in millimetres; 0 becomes NaN.
+    """Return depth float32 [H, W] in metres from a 16 bit PNG in millimetres; the value 0 becomes NaN.
 
     Raises:
-        UserError: the file is unreadable or has another type.
+        UserError: the file cannot be read, or is not a 16 bit PNG.
     """
     raw = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
     if raw is None or raw.dtype != np.uint16:
@@ -85,7 +88,9 @@ def read_depth_png(file: Path) -> np.ndarray:
 
 
 def load_dataset(path: Path) -> TruthDataset:
-    """Load the dataset in a folder; images without a true pose are left out.
+    """Load a recording with its ground truth from a folder; images without a true pose are left out.
+
+    The folder contains bag/, groundtruth.txt (T_map_body) and, if available, depth_gt/ and extra_views/.
 
     Raises:
         UserError: a file is missing, or the bag has no images, camera_info or static transforms.
@@ -174,7 +179,7 @@ def _take_static(static: dict[str, np.ndarray], message: Any) -> None:
 
 
 class _BeamsAtImages:
-    """Provides the scan nearest to an image, with each beam moved to the time of the image."""
+    """Finder of the scan nearest in time to an image; its beams are transformed to the time of the image."""
 
     def __init__(
         self, scans: list[tuple[int, Any]], T_body_lidar: np.ndarray | None, truth: Trajectory
@@ -183,7 +188,10 @@ class _BeamsAtImages:
         self._stamps = np.array([stamp for stamp, _ in scans], dtype=np.int64)
 
     def at(self, stamp_ns: int, T_map_body: np.ndarray) -> Beams:
-        """Return beams in the body frame at the stamp; none if there is no scan within 0.2 s."""
+        """Return the deskewed beams in the body frame at `stamp_ns`; no beams without a scan within 0.2 s.
+
+        `T_map_body` is the true pose of the body at that time, float64 [4, 4].
+        """
         if len(self._scans) == 0 or self._T_body_lidar is None:
             return NO_BEAMS
         i = int(np.argmin(np.abs(self._stamps - stamp_ns)))
@@ -206,7 +214,7 @@ class _BeamsAtImages:
 
 
 def read_offpath_views(folder: Path) -> list[OffPathView]:
-    """Read the held-out views of a folder with poses.json; an empty list if that file is missing."""
+    """Return the held-out views that poses.json of a folder lists; [] if that file is missing."""
     file = folder / "poses.json"
     if not file.is_file():
         return []

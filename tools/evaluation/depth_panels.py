@@ -23,9 +23,13 @@ _SIGMA_RANGE_M = (0.005, 2.0)  # colour range of sigma
 def draw_depth_panels(
     drive: RecordedDrive, source: DepthSource, truth: Path | None, every: int, out: Path, floor: bool | None
 ) -> Iterator[tuple[Path, int]]:
-    """Write a panel as PNG for every n-th image; yield (path, number of panels).
+    """Write a panel of every n-th image as PNG; yield (path of the panel, total number of panels) for each.
 
-    With `truth`, only images with a true depth are used.
+    Args:
+        truth: folder of true depth; only images with a true depth are then used. None: no true depth.
+        every: n.
+        out: folder of the panels.
+        floor: whether the camera's height above the floor is known; None: if the poses are planar.
     """
     files = truth_depth_files(truth) if truth is not None else {}
     chosen = [image.stamp_ns for image in drive.images if not files or image.stamp_ns in files][::every]
@@ -37,7 +41,10 @@ def draw_depth_panels(
 
 
 def depth_panel(outcome: DepthComparison, drive: RecordedDrive) -> np.ndarray:
-    """Return the panel of one image, BGR uint8 [H, 4W or 5W, 3]: with true depth it has five tiles."""
+    """Return the panel of one image, BGR uint8 [H, 4 W, 3], or [H, 5 W, 3] if true depth is known.
+
+    Tiles from left to right: image with beams, depth estimate, fused depth, sigma, true depth.
+    """
     field = outcome.methods["field"]
     beams = drive.beams_at(outcome.stamp_ns)
     uv, z, _ = project_beams(beams, drive.undistort.pinhole, drive.T_body_camera)
@@ -60,7 +67,9 @@ def depth_panel(outcome: DepthComparison, drive: RecordedDrive) -> np.ndarray:
 
 
 def draw_depth_of_image(path: Path, source: DepthSource, rig: Path | None, out: Path) -> Path:
-    """Write a panel of the estimate for a single image file without beams; return the file written.
+    """Estimate the depth of one image file, write both side by side as PNG, and return the written file.
+
+    Without a rig, a horizontal field of view of 60 degrees is assumed.
 
     Raises:
         UserError: the file is not an image, or the rig is for another image size.
@@ -98,7 +107,10 @@ def draw_depth_of_image(path: Path, source: DepthSource, rig: Path | None, out: 
 
 
 def colourize(values: np.ndarray, low: float, high: float) -> np.ndarray:
-    """Return values [H, W] as colours BGR uint8 [H, W, 3], logarithmic from `low` to `high`; NaN is black."""
+    """Return values [H, W] as an image BGR uint8 [H, W, 3] in pseudo colours; NaN is black.
+
+    The colour scale is logarithmic from `low` to `high`, which are in the unit of the values.
+    """
     with np.errstate(invalid="ignore", divide="ignore"):
         place = np.log(values / low) / np.log(high / low)
     grey = (np.clip(np.nan_to_num(place), 0.0, 1.0) * 255).astype(np.uint8)
@@ -108,7 +120,7 @@ def colourize(values: np.ndarray, low: float, high: float) -> np.ndarray:
 
 
 def label(image: np.ndarray, text: str) -> np.ndarray:
-    """Return a copy of the image with a line of text at its top."""
+    """Return a copy of an image uint8 [H, W, 3] with a line of text at its top."""
     out = image.copy()
     cv2.rectangle(out, (0, 0), (out.shape[1], 20), (0, 0, 0), -1)
     cv2.putText(out, text, (5, 15), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (255, 255, 255), 1, cv2.LINE_AA)

@@ -1,4 +1,4 @@
-"""A recorded drive as evaluation and calibration need it: images, scans, poses, calibration."""
+"""Load a recorded drive for evaluation and calibration: images, scans, poses, calibration."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _MAX_EXTRAPOLATION_NS = 200_000_000  # poses are extrapolated this far beyond th
 
 @dataclass
 class RecordedDrive:
-    """A recording with the data that depth needs; images stay compressed until they are used."""
+    """A recorded drive: images, scans, poses and calibration. Images are decoded only when they are used."""
 
     path: Path
     camera: Pinhole
@@ -42,13 +42,16 @@ class RecordedDrive:
 
     @property
     def planar(self) -> bool:
-        """Whether the body stays on a level floor: all poses within 3 cm of height and 2 degrees of tilt."""
+        """Whether the body stays on a level floor: heights within 3 cm, every tilt below 2 degrees."""
         T = self.poses.T_a_b
         level = bool(np.all(T[:, 2, 2] > np.cos(np.radians(2.0))))
         return level and float(np.ptp(T[:, 2, 3])) < 0.03
 
     def pose(self, stamp_ns: int) -> np.ndarray | None:
-        """Return `T_map_body` at a stamp; None if no pose is near."""
+        """Return `T_map_body` float64 [4, 4] at a time, interpolated.
+
+        None in gaps of more than 1 s between poses, and more than 0.2 s before the first or after the last.
+        """
         return self.poses.at(stamp_ns, max_gap_ns=1_000_000_000, max_extrapolation_ns=_MAX_EXTRAPOLATION_NS)
 
     def rgb(self, index: int) -> np.ndarray:
@@ -60,24 +63,24 @@ class RecordedDrive:
         return self.undistort(decode_rgb(self.images[index], str(self.path)))
 
     def scan_near(self, stamp_ns: int) -> TimedScan | None:
-        """Return the scan whose middle is nearest in time; None if it is 0.15 s or more away."""
+        """Return the scan whose middle is nearest to a time; None if the difference is 0.15 s or more."""
         if len(self.scans) == 0:
             return None
         i = int(np.argmin(np.abs(self._middles - stamp_ns)))
         return self.scans[i] if abs(int(self._middles[i]) - stamp_ns) < 150_000_000 else None
 
     def beams_at(self, stamp_ns: int, excluded: np.ndarray | None = None) -> Beams:
-        """Return the beams of the nearest scan, moved to a stamp.
+        """Return the beams of the nearest scan, deskewed, in the body frame at time `stamp_ns`.
 
-        Beams in the mask `excluded` bool [beams] are left out.
+        Beams whose flag in `excluded` bool [beams] is True are left out. No beams if a pose is unknown.
         """
         scan = self.scan_near(stamp_ns)
         return NO_BEAMS if scan is None else self.beams_of(scan, stamp_ns, excluded)
 
     def beams_of(self, scan: TimedScan, stamp_ns: int, excluded: np.ndarray | None = None) -> Beams:
-        """Return the beams of one scan, moved to a stamp.
+        """Return the beams of a scan, deskewed, in the body frame at time `stamp_ns`.
 
-        Beams in the mask `excluded` bool [beams] are left out.
+        Beams whose flag in `excluded` bool [beams] is True are left out. No beams if a pose is unknown.
         """
         points, index = scan_points(
             scan.ranges_m, scan.angle_min_rad, scan.angle_increment_rad, scan.range_min_m, scan.range_max_m
@@ -93,7 +96,10 @@ class RecordedDrive:
         return Beams(moved, index, np.full(len(index), 0.01))
 
     def scan_in_map(self, scan: TimedScan, excluded: np.ndarray | None = None) -> np.ndarray:
-        """Return the points float64 [N, 3] of a scan in the map frame; none without a pose."""
+        """Return the points float64 [N, 3] of a scan in the map frame; [0, 3] if a pose is unknown.
+
+        Beams whose flag in `excluded` bool [beams] is True are left out.
+        """
         T_map_body = self.pose(scan.middle_ns)
         if T_map_body is None:
             return np.zeros((0, 3))
@@ -101,7 +107,7 @@ class RecordedDrive:
 
 
 def decode_rgb(image: Any, where: str) -> np.ndarray:
-    """Decode an Image message to RGB uint8 [H, W, 3]; `where` names its origin in errors.
+    """Decode an Image message to RGB uint8 [H, W, 3]; `where` names the recording in error texts.
 
     Raises:
         UserError: the bytes do not match the encoding.
@@ -174,7 +180,7 @@ def open_drive(path: Path, poses: Path | None = None, rig: Path | None = None) -
 
 
 def has_poses(path: Path) -> bool:
-    """Return whether poses are known: groundtruth.txt beside the bag, or a pose topic in it."""
+    """Return whether a recording has poses: in groundtruth.txt in or beside the bag, or as a pose topic."""
     if any((folder / "groundtruth.txt").is_file() for folder in (Path(path), Path(path).parent)):
         return True
     source = open_source(path, SourceOptions())
@@ -185,7 +191,7 @@ def has_poses(path: Path) -> bool:
 
 
 def slam_poses(scans: list[TimedScan], wheels: list[tuple], T_body_lidar: np.ndarray) -> Trajectory:
-    """Return `T_map_body` at every scan, estimated by the lidar SLAM after its last optimisation.
+    """Run the lidar SLAM on scans and odometry; return `T_map_body` at the scans after its last optimisation.
 
     Args:
         scans: in the order of the recording.

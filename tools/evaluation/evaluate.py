@@ -32,10 +32,10 @@ KEYFRAME_M, KEYFRAME_RAD = 0.3, np.radians(15.0)  # motion between keyframes
 
 @dataclass(frozen=True)
 class DepthComparison:
-    """All depth maps of one image, by method, and its true depth."""
+    """Depth of one image by every method, its true depth, and the CPU time of each method."""
 
     stamp_ns: int
-    image_rgb: np.ndarray
+    image_rgb: np.ndarray  # uint8 [H, W, 3], undistorted
     estimate: Estimate
     methods: dict[str, FusionResult]
     truth: np.ndarray  # float32 [H, W], NaN = none
@@ -43,10 +43,10 @@ class DepthComparison:
 
 
 def truth_depth_files(folder: Path) -> dict[int, Path]:
-    """Return the true depth files `<stamp_ns>.png` of a folder, or of its depth_gt/, by stamp.
+    """Return the files `<stamp_ns>.png` of true depth in a folder, or in its subfolder depth_gt/, by stamp.
 
     Raises:
-        UserError: there are no such files.
+        UserError: the folder contains no files with such a name.
     """
     folder = Path(folder)
     if (folder / "depth_gt").is_dir():
@@ -68,12 +68,13 @@ def replay_depth(
     """Run depth estimation and fusion over a drive in order of time; yield the results of the wanted images.
 
     An image is processed without later data, except the scan during which it was taken. Wanted images are
-    processed as keyframes (method `field`); method `field_carried` is the depth that they would have got from
-    earlier keyframes.
+    processed as keyframes (method `field`). Method `field_carried` is the depth of the same image if it were
+    not a keyframe: then only earlier keyframes contribute.
 
     Args:
-        wanted: file of the true depth, or None, by stamp of the image.
-        heldout_mask: maps the number of beams of a scan to bool [beams]; True beams are excluded.
+        wanted: stamps of the wanted images, each with the file of its true depth, or None.
+        heldout_mask: returns bool [beams] for a number of beams; True beams are held out. None: no beams are.
+        config: settings of fusion; None uses the defaults.
         floor: whether the camera's height above the floor is known; None: if the poses are planar.
     """
     planar = drive.planar
@@ -145,10 +146,16 @@ def evaluate(
     floor: bool | None = None,
     progress: Callable[[str, int, int], None] = lambda run, done, total: None,
 ) -> dict[str, object]:
-    """Return the figures of `beamsplat eval depth`: one object per method, and `default`.
+    """Evaluate the depth of a drive; return the JSON report of `beamsplat eval depth`.
 
-    With `heldout`, the drive is processed twice more: with every third beam, then with every third block of
-    beams held out.
+    The report contains one object of metrics per method, and the name of the `default` method.
+
+    Args:
+        truth: files of the true depth, by stamp of the image.
+        heldout: also process the drive with every third beam, and with every third block of beams, held out.
+        config: settings of fusion; None uses the defaults.
+        floor: whether the camera's height above the floor is known; None: if the poses are planar.
+        progress: receives the name of the pass over the drive, the number of finished and of all images.
 
     Raises:
         UserError: no image of the drive has a true depth.
@@ -213,7 +220,7 @@ def _heldout_selector(run: str, drive: RecordedDrive) -> Callable[[int], np.ndar
 def _heldout_beams(
     drive: RecordedDrive, stamp_ns: int, heldout_mask: Callable[[int], np.ndarray] | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return pixels uv [N, 2] and optical z [N] of the held-out beams."""
+    """Return pixels uv [N, 2] and optical z [N] in m of the held-out beams at the time of an image."""
     scan = drive.scan_near(stamp_ns)
     if scan is None or heldout_mask is None:
         return np.zeros((0, 2)), np.zeros(0)

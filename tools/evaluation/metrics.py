@@ -1,4 +1,4 @@
-"""Errors of depth: dense over all pixels with true depth, and at beams that were held out."""
+"""Errors of depth maps: over all pixels with true depth, and at held-out beams."""
 
 from __future__ import annotations
 
@@ -8,18 +8,21 @@ import numpy as np
 
 
 def every_third(count: int) -> np.ndarray:
-    """Return bool [count], True for every third beam."""
+    """Return bool [count], True for every third of `count` beams."""
     return np.arange(count) % 3 == 0
 
 
 def every_third_block(count: int, increment_rad: float, width_rad: float = np.radians(7.5)) -> np.ndarray:
-    """Return bool [count], True for the beams in every third of contiguous blocks of `width_rad`."""
+    """Return bool [count]: beams are divided into contiguous blocks, and every third block is True.
+
+    `increment_rad` is the angle between beams, `width_rad` the angle that a block covers.
+    """
     return np.floor(np.arange(count) * abs(increment_rad) / width_rad).astype(int) % 3 == 0
 
 
 @dataclass
 class MethodErrors:
-    """Errors of one method, collected over the frames of an evaluation."""
+    """Errors of one depth method, accumulated over the images of an evaluation."""
 
     frames: int = 0
     refused: int = 0
@@ -35,9 +38,14 @@ class MethodErrors:
     held_sigma: dict[str, list[np.ndarray]] = field(default_factory=dict)
 
     def add_dense(self, depth: np.ndarray, sigma: np.ndarray | None, truth: np.ndarray) -> None:
-        """Add one frame; all arrays are float32 [H, W] in metres, truth is NaN where unknown.
+        """Add the errors of one depth map over all pixels with true depth.
 
-        Pixels without depth lower the coverage and enter no other figure.
+        Pixels without depth lower the coverage and do not change any other metric.
+
+        Args:
+            depth: optical z float32 [H, W] in m, NaN where the method has no depth.
+            sigma: standard deviation of the depth, float32 [H, W] in m; None if the method has none.
+            truth: true optical z float32 [H, W] in m, NaN where unknown.
         """
         self.frames += 1
         there = np.isfinite(truth)
@@ -57,7 +65,13 @@ class MethodErrors:
             self.sigma_m.append(float(np.median(s)))
 
     def add_beams(self, depth: np.ndarray, uv: np.ndarray, z: np.ndarray) -> None:
-        """Add the errors at beams with pixels uv [N, 2] and optical z [N] (the paper's Table IV)."""
+        """Add the errors of one depth map at lidar beams (the paper's Table IV).
+
+        Args:
+            depth: optical z float32 [H, W] in m.
+            uv: pixels of the beams, float [N, 2].
+            z: optical z of the beams, float [N], m.
+        """
         error = at_pixels(depth, uv) - z
         error = error[np.isfinite(error)]
         self.beam_square += float(error @ error)
@@ -66,9 +80,14 @@ class MethodErrors:
     def add_held(
         self, run: str, depth: np.ndarray, sigma: np.ndarray | None, uv: np.ndarray, z: np.ndarray
     ) -> None:
-        """Add the errors at held-out beams of one frame that the truth confirms.
+        """Add the errors of one depth map at held-out beams that the true depth confirms.
 
-        `run` is "third" or "blocks".
+        Args:
+            run: how beams were held out: "third" (every third beam) or "blocks" (every third block).
+            depth: optical z float32 [H, W] in m.
+            sigma: standard deviation of the depth, float32 [H, W] in m; None if the method has none.
+            uv: pixels of the beams, float [N, 2].
+            z: optical z of the beams, float [N], m.
         """
         error = np.abs(at_pixels(depth, uv) - z)
         ok = np.isfinite(error)
@@ -77,9 +96,10 @@ class MethodErrors:
             self.held_sigma.setdefault(run, []).append(at_pixels(sigma, uv)[ok])
 
     def summary(self, excluded: dict[str, float]) -> dict[str, float | int | None]:
-        """Return the figures by name, with their unit in the name; None if no data contributed.
+        """Return the metrics by name (names of lengths end with _m); None where no data contributed.
 
-        `excluded` is the ratio of held-out beams, by run, that the truth does not confirm.
+        `excluded` is the ratio of held-out beams that the true depth does not confirm, by `run` of
+        `add_held`.
         """
         out: dict[str, float | int | None] = {
             "frames": self.frames,
@@ -110,7 +130,7 @@ class MethodErrors:
 
 
 def at_pixels(values: np.ndarray, uv: np.ndarray) -> np.ndarray:
-    """Return float64 [N]: values [H, W] at the pixels nearest to uv [N, 2]."""
+    """Return float64 [N]: the values of an array [H, W] at the pixels nearest to uv [N, 2]."""
     h, w = values.shape
     v = np.clip(np.rint(uv[:, 1]).astype(int), 0, h - 1)
     u = np.clip(np.rint(uv[:, 0]).astype(int), 0, w - 1)
@@ -118,9 +138,14 @@ def at_pixels(values: np.ndarray, uv: np.ndarray) -> np.ndarray:
 
 
 def confirmed_by_truth(truth: np.ndarray, uv: np.ndarray, z: np.ndarray) -> np.ndarray:
-    """Return bool [N]: whether the true depth confirms a beam.
+    """Return bool [N]: for each beam, whether the true depth at its pixel confirms it.
 
-    A beam is confirmed if the true depth at its pixel agrees with its optical z within 5 cm + 2 %.
+    A beam is confirmed if both depths agree within 5 cm plus 2 % of the true depth.
+
+    Args:
+        truth: true optical z float32 [H, W] in m, NaN where unknown.
+        uv: pixels of the beams, float [N, 2].
+        z: optical z of the beams, float [N], m.
     """
     t = at_pixels(truth, uv)
     with np.errstate(invalid="ignore"):

@@ -1,4 +1,4 @@
-"""Measurements of a recording for the lidar SLAM, and errors of its trajectories against the truth."""
+"""Read measurements for the lidar SLAM from a recording; compute errors against a true trajectory."""
 
 from __future__ import annotations
 
@@ -15,7 +15,10 @@ from beamsplat.services.localization.lidar2d.metrics import interpolate_poses, t
 
 
 def measurements(source: Any) -> Iterator[tuple]:
-    """Yield the scans and odometry of a recording in its order, as the tuples of `MeasurementLog`."""
+    """Yield scans and wheel odometry in the order of a recording, as tuples for `MeasurementLog`.
+
+    `source` is the result of `open_source`.
+    """
     for _, topic, m in source.messages():
         if topic == "lidar/scan":
             yield (
@@ -28,20 +31,23 @@ def measurements(source: Any) -> Iterator[tuple]:
 
 
 def planar_poses(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Return stamps int64 [N] and planar poses float64 [N, 3] of a TUM file."""
+    """Return stamps int64 [N] in ns and planar poses float64 [N, 3] (x m, y m, yaw rad) of a TUM file."""
     trajectory = read_tum(path)
     return trajectory.stamps_ns, se3_to_se2(trajectory.T_a_b)
 
 
 def errors_against_truth(folder: Path, truth: Path) -> dict[str, Any]:
-    """Return the errors of the optimised and, with prefix `online_`, of the online trajectory.
+    """Return position errors (m) and yaw errors (rad) of estimated trajectories against the truth, by name.
+
+    Names with the prefix `online_` are of the trajectory as published during the drive, the others of the
+    trajectory after the last optimisation.
 
     Args:
-        folder: as `map_measurements` writes it, or one trajectory (TUM file).
+        folder: output folder of `map_measurements`, or one trajectory (TUM file).
         truth: TUM file of the true body poses.
 
     Raises:
-        UserError: no pose is in the time range of the truth.
+        UserError: no estimated pose is in the time range of the true trajectory.
     """
     figures: dict[str, Any] = {}
     true_stamps_ns, pose_world_body = planar_poses(truth)

@@ -31,8 +31,9 @@ _RENEW = "renew it: run `beamsplat keys issue NAME` on the authority's host, and
 
 
 def diagnose_security(deployment: Deployment) -> Iterator[LinkFinding]:
-    """Yield findings on endpoints, keys, policy, and for a robot on each step of the connection to its
-    edge.
+    """Yield findings on the links of a deployment to other hosts: endpoints, keys, certificate, policy.
+
+    On a robot, the connection to its edge server is tested too: name resolution, TCP, TLS.
     """
     uplink = str(deployment.nodes.get("uplink", {}).get("edge", ""))
     endpoints = [*deployment.router.listen, *deployment.router.connect, *([uplink] if uplink else [])]
@@ -129,7 +130,10 @@ def _check_policy(folder: Path) -> Iterator[LinkFinding]:
 
 
 def _check_tls_connection(endpoint: str, folder: Path) -> Iterator[LinkFinding]:
-    """Check name resolution, TCP and TLS; the first step that fails is the reason."""
+    """Test name resolution, TCP and TLS to an edge server; yield a finding on the first step that fails.
+
+    `folder` contains the keys of this host.
+    """
     host, _, port = endpoint.partition("/")[2].rpartition(":")
     host = host.strip("[]")
     context = ssl.create_default_context(ssl.Purpose.SERVER_AUTH, cafile=str(folder / CA))

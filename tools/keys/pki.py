@@ -1,5 +1,6 @@
-"""The certificate authority of a fleet: its key, a certificate for each host, and the policy of access
-rights.
+"""Manage the certificate authority of a fleet: its key, the certificates of hosts, and their access rights.
+
+Files in the folder of the authority:
 
     ca.key      private key of the authority; stays in this folder
     ca.pem      root certificate that all hosts trust
@@ -28,7 +29,7 @@ CA_DAYS = 3650  # validity of the root certificate
 
 
 def openssl(*arguments: str) -> str:
-    """Run an OpenSSL command and return its output.
+    """Run `openssl` with these arguments and return its standard output.
 
     Raises:
         UserError: OpenSSL is not installed, or the command fails.
@@ -43,10 +44,10 @@ def openssl(*arguments: str) -> str:
 
 
 class CertificateAuthority:
-    """An authority's folder, created by `CertificateAuthority.create`."""
+    """The certificate authority in a folder; `CertificateAuthority.create` makes a new one."""
 
     def __init__(self, folder: Path) -> None:
-        """Open an existing authority.
+        """Open the existing authority in `folder`.
 
         Raises:
             UserError: the folder contains no authority.
@@ -57,7 +58,7 @@ class CertificateAuthority:
 
     @staticmethod
     def create(folder: Path, days: int = CA_DAYS) -> CertificateAuthority:
-        """Create an authority in a folder.
+        """Create an authority in a folder; its root certificate is valid for `days` days.
 
         Raises:
             UserError: the folder contains one already (its certificates would become invalid), or OpenSSL
@@ -78,11 +79,18 @@ class CertificateAuthority:
         return CertificateAuthority(folder)
 
     def issue(self, name: str, host: HostRole, addresses: tuple[str, ...] = (), days: int = 90) -> Path:
-        """Create a key and a certificate for a host, replacing earlier ones; return the folder to copy to the
-        host.
+        """Create key and certificate of a host, and return the folder to copy to this host.
+
+        An earlier key and certificate of the host are replaced, and the host is added to the policy.
+
+        Args:
+            name: name of the host.
+            host: role of the host, and the robot it belongs to.
+            addresses: DNS names and IP addresses of the host, which are part of the certificate.
+            days: validity of the certificate.
 
         Raises:
-            UserError: an edge without addresses, or OpenSSL fails.
+            UserError: the host is an edge server without addresses, or OpenSSL fails.
         """
         if host.role == "edge" and not addresses:
             raise UserError(
@@ -106,10 +114,10 @@ class CertificateAuthority:
         return out
 
     def remove(self, name: str) -> None:
-        """Remove a host from the policy; its certificate then gives no access.
+        """Remove a host from the policy, so that routers refuse its certificate, and delete its folder.
 
         Raises:
-            UserError: no such host.
+            UserError: the policy does not contain the host.
         """
         hosts = self.hosts()
         if hosts.pop(name, None) is None:
@@ -118,11 +126,11 @@ class CertificateAuthority:
         self._write(hosts)
 
     def hosts(self) -> dict[str, HostRole]:
-        """Return the role of every host by name."""
+        """Return the role of every host in the policy, by name of the host."""
         return read_hosts(self.folder)
 
     def edges(self) -> list[Path]:
-        """Return the folders of the edge servers, which hold copies of the policy."""
+        """Return the folders of the edge servers; each contains a copy of the policy."""
         return [self.folder / "hosts" / name for name, host in self.hosts().items() if host.role == "edge"]
 
     def _write(self, hosts: dict[str, HostRole]) -> None:
@@ -135,7 +143,7 @@ class CertificateAuthority:
 
 
 def expiry(certificate: Path) -> str:
-    """Return the expiry of a certificate as OpenSSL prints it."""
+    """Return the expiry date of a certificate file in OpenSSL's format, such as Jan  2 15:04:05 2027 GMT."""
     return openssl("x509", "-in", str(certificate), "-noout", "-enddate").strip().partition("=")[2]
 
 

@@ -1,1 +1,1 @@
-"""Results and costs of a live run: an observer on the bus, scores against ground truth, the HTML report."""
+"""Scores and costs of a live run: observer of the bus, comparison with ground truth, HTML report."""

@@ -1,4 +1,4 @@
-"""report.html of `bench paper`: tables and figures of the paper with our results, in one file."""
+"""Write report.html of `bench paper`: the paper's tables and plots with the results of our runs."""
 
 from __future__ import annotations
 
@@ -63,10 +63,13 @@ _TABLES: tuple[tuple[str, tuple[tuple[str, str, str], ...]], ...] = (
 
 
 def write_report(path: Path, report: dict[str, Any], truth: GroundTruth, *, paper: bool = True) -> None:
-    """Write the report as one HTML file.
+    """Write a report as one HTML file that includes its images.
 
-    Rows without `plots` were not run and appear only in the tables. `paper=False` leaves out the comparison
-    with the paper, for a report on a single drive.
+    Args:
+        path: file to write.
+        report: result of `report_of_runs`; configurations without `plots` appear only in the tables.
+        truth: ground truth of the recording, which also provides the camera images.
+        paper: whether to compare with the paper; False for a report on a single drive.
     """
     rows: list[Row] = report["configurations"]
     drawn = [row for row in rows if "plots" in row]
@@ -105,7 +108,7 @@ def _table(title: str, columns: tuple[tuple[str, str, str], ...], rows: list[Row
 
 
 def _name(row: Row) -> str:
-    """Return the name of a row; a substitute for a missing network is named as such."""
+    """Return title and seed of a row; after the title, the substitute for a missing depth network if any."""
     stand_in = " [" + row["depth_source"] + "]" if row["advice"] else ""
     return f"{row['title']}{stand_in} #{row['seed']}"
 
@@ -178,7 +181,7 @@ def _errors(rows: list[Row]) -> list[str]:
 
 
 def _depth(rows: list[Row], truth: GroundTruth) -> list[str]:
-    """Return figures of the image with beams, the estimated depth, and the corrected depth."""
+    """Return HTML images of up to two times per row: camera image with beams, estimated and fused depth."""
     out = []
     for row in rows:
         fused, estimates = row["plots"]["fused"], row["plots"]["estimates"]

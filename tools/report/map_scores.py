@@ -1,4 +1,4 @@
-"""Scores the map of a live run, as it was sent over the bus, at held-out views off the path."""
+"""Score the map that the mapper published in a live run, at held-out views off the path."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _AT_VIEWS = {
 
 
 def assemble_map(chunks: dict[int, Any]) -> GaussianStore:
-    """Return the chunks by anchor as one map in the map frame."""
+    """Return one map in the map frame, made of map chunks (messages of `mapping/chunk`) by anchor id."""
     store = GaussianStore()
     for chunk in chunks.values():
         if chunk.count:
@@ -40,15 +40,17 @@ def assemble_map(chunks: dict[int, Any]) -> GaussianStore:
 def map_figures(
     record: RunRecord, truth: GroundTruth, T_world_map: np.ndarray
 ) -> tuple[dict[str, Any], list[np.ndarray]]:
-    """Return the figures of the map, and images of held-out views.
+    """Return the scores of the map of a live run at held-out views, and images of some of these views.
 
-    The figures are of the map at the end of the drive and, with prefix `refined_`, of the final map.
+    Names without a prefix are scores of the map at the end of the drive. Names with the prefix `refined_` are
+    scores of the map at the end of the run, if refinement has changed it.
 
     Args:
-        T_world_map: rigid alignment of the map with the ground truth, without scale.
+        T_world_map: rigid alignment of the map with the ground truth, without scale, float64 [4, 4].
 
     Returns:
-        Figures by name, and images uint8 RGB [H, 2 W, 3] of the final map: true image beside render.
+        Scores by name, and RGB images uint8 [H, 2 W, 3]: the true image on the left, the render of the last
+        map on the right.
     """
     figures, images = _score(record.online_chunks or record.chunks, record, truth, T_world_map)
     if record.online_chunks is not None and _revisions(record.online_chunks) != _revisions(record.chunks):
@@ -96,9 +98,11 @@ def _score(
 
 
 def top_view_of_map(record: RunRecord, T_world_map: np.ndarray, path_m: np.ndarray) -> np.ndarray | None:
-    """Return a BGR image of the map without its ceiling, with a path on it; None if empty.
+    """Return an image BGR uint8 [H, W, 3] of the map from above, without ceiling; None if the map is empty.
 
-    `path_m` is [K, >= 2] in the world frame.
+    Args:
+        T_world_map: alignment of the map with the ground truth, float64 [4, 4].
+        path_m: x, y of the path that is drawn on the image, float64 [K, >= 2], world frame.
     """
     store = assemble_map(record.chunks)
     if not store.count:
@@ -109,7 +113,7 @@ def top_view_of_map(record: RunRecord, T_world_map: np.ndarray, path_m: np.ndarr
 
 
 def previews(record: RunRecord, most: int) -> list[tuple[int, bytes]]:
-    """Return (stamp, JPEG of the render) of at most `most` keyframes, evenly over the drive."""
+    """Return (stamp in ns, JPEG of the rendered map) at up to `most` keyframes, evenly over the drive."""
     if not record.previews:
         return []
     picked = np.unique(np.linspace(0, len(record.previews) - 1, most).round().astype(int))

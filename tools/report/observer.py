@@ -1,4 +1,4 @@
-"""Runs a deployment live, as processes in real time, and records its messages and its costs."""
+"""Run a deployment live, as processes in real time, and record its messages, CPU time and memory."""
 
 from __future__ import annotations
 
@@ -31,7 +31,10 @@ DEPTH_STRIDE = 2  # recorded depth maps keep every second row and column
 
 @dataclass
 class RunRecord:
-    """Messages of one run; times are monotonic clocks of the publishers, all on one host."""
+    """Contents of the messages of one run. Stamps are in ns.
+
+    Times of publication are monotonic clock readings in ns; all publishers run on the same host.
+    """
 
     images: dict[int, int] = field(default_factory=dict)  # stamp -> time of publication
     poses: list[tuple[int, np.ndarray, str, bool]] = field(default_factory=list)  # T_map_body, status, metric
@@ -58,7 +61,10 @@ class RunRecord:
 
 
 class BusObserver:
-    """Subscribes to all messages of one run; depth maps are kept only at the stamps with a true depth."""
+    """Subscriber to all `TOPICS` of one run, which stores the messages in `record`.
+
+    Depth maps are stored only for the stamps `keep_depth_at`.
+    """
 
     def __init__(self, keep_depth_at: frozenset[int]) -> None:
         self.record = RunRecord()
@@ -96,7 +102,7 @@ class BusObserver:
             self._count_refusal(f"pose, {m.status}: {m.detail}")
 
     def _count_refusal(self, why: str) -> None:
-        """Count a reason; numbers in it are replaced, so that they do not make different reasons."""
+        """Count a reason for a missing pose or depth; texts that differ only in numbers are one reason."""
         reason = re.sub(r"-?\d+(\.\d+)?", "#", why)
         self.record.refusals[reason] = self.record.refusals.get(reason, 0) + 1
 
@@ -140,7 +146,7 @@ class BusObserver:
 
 @dataclass
 class RunCosts:
-    """CPU time and memory of the processes of a run while data was played, without start-up."""
+    """CPU time and memory of the processes of a run, from the first image to the end of the drive."""
 
     wall_s: float = 0.0
     cpu_s: dict[str, float] = field(default_factory=dict)
@@ -152,7 +158,7 @@ class RunCosts:
 
 
 class RunObserver:
-    """Records the messages and the costs of a supervised system while data is played."""
+    """Recorder of the messages, CPU time and memory of a supervised system while a recording is played."""
 
     def __init__(self, supervisor: Supervisor, deployment: Deployment, keep_depth_at: frozenset[int]) -> None:
         endpoints = deployment.router.listen
@@ -165,11 +171,14 @@ class RunObserver:
 
     @property
     def record(self) -> RunRecord:
-        """Messages received so far."""
+        """Contents of the messages received so far."""
         return self._bus_observer.record
 
     def poll(self) -> None:
-        """Measure the processes; call this several times per second."""
+        """Measure CPU time and memory of the processes; call this several times per second.
+
+        After the end of the drive, nothing is measured any more.
+        """
         if self._state == "over":
             return
         self._meter.read()
@@ -185,7 +194,12 @@ class RunObserver:
         self.costs.cpu_s, self.costs.peak_rss_mb = self._meter.since_mark(), self._meter.peak_rss_mb
 
     def finish(self, board: HealthTable, drained: bool) -> tuple[RunRecord, RunCosts]:
-        """Receive outstanding messages, take over the nodes' counters, and disconnect from the bus."""
+        """Wait 0.5 s for the last messages, disconnect from the bus, and return messages and costs.
+
+        Args:
+            board: health of the nodes, from which counts of dropped and lost messages are copied.
+            drained: whether all nodes have finished their work.
+        """
         self.costs.drained = drained
         for name, record in board.records.items():
             self.costs.dropped[name] = sum(i.dropped for i in record.health.inputs)
@@ -198,10 +212,11 @@ class RunObserver:
 def run_live(
     deployment: Deployment, keep_depth_at: frozenset[int], longest_s: float, log: Callable[[str], None]
 ) -> tuple[RunRecord, RunCosts]:
-    """Run a deployment until all nodes have drained, at most for `longest_s`.
+    """Run a deployment until all nodes have drained; return its messages, CPU time and memory.
 
     Args:
-        keep_depth_at: stamps whose depth maps are kept.
+        keep_depth_at: stamps in ns whose depth maps are stored.
+        longest_s: time limit after which the run is stopped, s.
         log: receives the events of the supervisor.
 
     Raises:
@@ -232,7 +247,7 @@ def run_live(
 
 
 class _ProcessMeter:
-    """Measures CPU seconds and memory (proportional set size) of the supervisor's child processes."""
+    """Meter of CPU time (s) and memory (proportional set size, MB) of the supervisor's child processes."""
 
     def __init__(self, supervisor: Supervisor) -> None:
         self._supervisor = supervisor
@@ -242,7 +257,7 @@ class _ProcessMeter:
         self._memory_read_s = 0.0
 
     def read(self) -> None:
-        """Read all child processes; a process that has exited keeps its last values."""
+        """Read CPU time and memory of all child processes; an exited process keeps its last CPU time."""
         memory, now = 0.0, time.monotonic()
         read_memory = now - self._memory_read_s > 1.0  # it costs milliseconds per process
         self._memory_read_s = now if read_memory else self._memory_read_s
@@ -261,12 +276,12 @@ class _ProcessMeter:
         self.peak_rss_mb = max(self.peak_rss_mb, memory)
 
     def mark(self) -> float:
-        """Start counting from now; return the CPU seconds used before."""
+        """Set the reference of `since_mark` to the last `read`; return the CPU time in s used until then."""
         self._marked = dict(self._last)
         return sum(self._marked.values())
 
     def since_mark(self) -> dict[str, float]:
-        """Return the CPU seconds by node since `mark`."""
+        """Return the CPU time in s since `mark`, by name of the node."""
         out: dict[str, float] = {}
         for (name, pid), seconds in self._last.items():
             out[name] = out.get(name, 0.0) + seconds - self._marked.get((name, pid), 0.0)

@@ -1,4 +1,4 @@
-"""Scores of live runs against ground truth, and the report of one run or of several."""
+"""Compute the scores of live runs against ground truth, and the report on one run or several runs."""
 
 from __future__ import annotations
 
@@ -27,10 +27,11 @@ from beamsplat.tools.report.scores import (
 def open_truth(data: Path, groundtruth: Path | None = None) -> GroundTruth:
     """Open a recording with its ground truth.
 
-    True poses are taken from a TUM file, groundtruth.txt beside the bag, or the bag.
+    True poses are read from `groundtruth` (a TUM file), else from groundtruth.txt beside the bag, else from
+    the bag.
 
     Raises:
-        UserError: there are no poses to compare with.
+        UserError: images, scans or calibration are missing.
     """
     folder = truth_folder(data)
     file = groundtruth or (folder / "groundtruth.txt" if (folder / "groundtruth.txt").is_file() else None)
@@ -44,7 +45,7 @@ def open_truth(data: Path, groundtruth: Path | None = None) -> GroundTruth:
 
 
 def score_run(record: RunRecord, costs: RunCosts, truth: GroundTruth) -> dict[str, Any]:
-    """Return all figures of one run, and under `plots` the data that the report draws."""
+    """Return all scores and costs of one run by name; `plots` contains the data of the report's plots."""
     stamps, T_found, T_true = aligned_poses(record, truth)
     row = (
         speed_and_load(record, costs, os.cpu_count() or 1)
@@ -70,7 +71,10 @@ def score_run(record: RunRecord, costs: RunCosts, truth: GroundTruth) -> dict[st
 def single_run_report(
     name: str, title: str, data: Path, truth: GroundTruth, row: dict[str, Any]
 ) -> dict[str, Any]:
-    """Return the report of a single run that is not one of the paper's configurations."""
+    """Return the report on a single run that is not one of the paper's configurations.
+
+    `row` is the result of `score_run`.
+    """
     whole = {
         "name": name, "title": title, "seed": 0, "paper": {}, "partner": None, "lidar": True,
         "depth_source": title, "advice": "", "status": "ok", **row,
@@ -79,7 +83,10 @@ def single_run_report(
 
 
 def report_of_runs(rows: list[dict[str, Any]], data: Path, truth: GroundTruth) -> dict[str, Any]:
-    """Return the report (see `beamsplat.tools.report.html`) of scored runs, one row each."""
+    """Return the report on scored runs as `beamsplat.tools.report.html.write_report` expects it.
+
+    `rows` are results of `score_run`, each with the entries that describe its configuration.
+    """
     return {
         "data": data.name, "cores": os.cpu_count(), "truth": truth.drive.poses_name.rsplit("/", 1)[-1],
         "configurations": rows, "pairs": compare_pairs(rows),
@@ -87,9 +94,9 @@ def report_of_runs(rows: list[dict[str, Any]], data: Path, truth: GroundTruth) -
 
 
 def compare_pairs(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return the ratios of lidar to camera localization for each depth source.
+    """Return the ratios of CPU load, speed and position error: lidar divided by camera localization.
 
-    Ratios are of CPU load, speed and position error.
+    There is one entry per pair of configurations with the same depth source; values are means over its runs.
     """
     means = {name: _means([r for r in rows if r["name"] == name]) for name in {r["name"] for r in rows}}
     out = []

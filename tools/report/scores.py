@@ -1,4 +1,4 @@
-"""The paper's figures of one run: errors of poses and depth against ground truth, speed and CPU load."""
+"""Compute the paper's metrics of one run: errors of poses and depth, speed, CPU load."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _MAX_EXTRAPOLATION_NS = 20_000_000
 
 @dataclass(frozen=True)
 class GroundTruth:
-    """Ground truth of a recording; `drive.poses` are the true T_world_body."""
+    """Ground truth of a recording: its folder, true poses `drive.poses` (T_world_body), true depth files."""
 
     path: Path
     drive: RecordedDrive
@@ -29,10 +29,12 @@ class GroundTruth:
 
 
 def aligned_poses(record: RunRecord, truth: GroundTruth) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the poses that were published with status ok, aligned by the first of them only.
+    """Return the poses published with status ok, and the true poses at the same stamps.
+
+    The estimated poses are transformed to the world frame so that the first one equals its true pose.
 
     Returns:
-        Stamps int64 [N], estimated T_world_body float64 [N, 4, 4], true T_world_body float64 [N, 4, 4].
+        Stamps int64 [N] in ns, estimated T_world_body float64 [N, 4, 4], true T_world_body float64 [N, 4, 4].
     """
     stamps, found, true = [], [], []
     for stamp_ns, T_map_body, status, _ in record.poses:
@@ -50,10 +52,10 @@ def aligned_poses(record: RunRecord, truth: GroundTruth) -> tuple[np.ndarray, np
 
 
 def rigid_offset(T_found: np.ndarray, T_true: np.ndarray) -> np.ndarray:
-    """Return the rigid transform [4, 4] that best maps poses [N, 4, 4] to the true ones.
+    """Return the rigid transform [4, 4] that maps estimated poses [N, 4, 4] to the true poses [N, 4, 4].
 
-    It is the mean rotation and the mean shift. Maps are aligned by all poses, because an error of the first
-    pose alone would move the whole map.
+    It consists of the mean rotation and the mean translation between both. Maps are aligned by all poses,
+    because an error of the first pose alone would move the whole map.
     """
     U, _, Vt = np.linalg.svd(np.sum(T_true[:, :3, :3] @ np.swapaxes(T_found[:, :3, :3], 1, 2), axis=0))
     R = U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt
@@ -62,9 +64,15 @@ def rigid_offset(T_found: np.ndarray, T_true: np.ndarray) -> np.ndarray:
 
 
 def pose_errors(T_found: np.ndarray, T_true: np.ndarray) -> dict[str, Any]:
-    """Return the RMSE per axis and combined, and the ATE after rigid and similarity alignment.
+    """Return position errors (m) and orientation errors (rad) of estimated poses, by name.
 
-    The combined RMSE is the quadratic mean over the three axes. Both arguments are float64 [N, 4, 4].
+    They are the RMSE per axis and combined (the quadratic mean over the three axes), the ATE without further
+    alignment, and the ATE after rigid and after similarity alignment. With fewer than `MIN_POSES` poses, only
+    the number of poses is returned.
+
+    Args:
+        T_found: estimated T_world_body, float64 [N, 4, 4], from `aligned_poses`.
+        T_true: true T_world_body, float64 [N, 4, 4].
     """
     if len(T_found) < MIN_POSES:
         return {"poses": len(T_found)}
@@ -88,7 +96,12 @@ def pose_errors(T_found: np.ndarray, T_true: np.ndarray) -> dict[str, Any]:
 
 
 def aligned_rmse(found: np.ndarray, true: np.ndarray, *, scaled: bool) -> tuple[float, float]:
-    """Return (RMSE in metres, scale) of positions [N, 3] after the least-squares alignment (Umeyama 1991)."""
+    """Return (RMSE in m, scale) of estimated positions after least-squares alignment (Umeyama 1991).
+
+    Args:
+        found, true: estimated and true positions, float64 [N, 3], m.
+        scaled: whether the alignment includes a scale; else the scale is 1.
+    """
     a, b = found - found.mean(axis=0), true - true.mean(axis=0)
     U, S, Vt = np.linalg.svd(b.T @ a / len(a))
     D = np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))])
@@ -99,10 +112,10 @@ def aligned_rmse(found: np.ndarray, true: np.ndarray, *, scaled: bool) -> tuple[
 
 
 def speed_and_load(record: RunRecord, costs: RunCosts, cores: int) -> dict[str, Any]:
-    """Return the images processed by the whole system per second, and their cost.
+    """Return speed, CPU load, latency and memory of a run by name; speed is in images per second.
 
-    An image counts if it has a pose, a corrected depth, and a decision: it is no keyframe, or the mapper has
-    acknowledged it.
+    For the speed, an image counts if its pose and its fused depth are known, and if it either is no keyframe
+    or was acknowledged by the mapper. `cores` is the number of CPU cores of the host.
     """
     if not record.images:
         return {}
@@ -147,9 +160,10 @@ def speed_and_load(record: RunRecord, costs: RunCosts, cores: int) -> dict[str, 
 
 
 def depth_errors(record: RunRecord, truth: GroundTruth) -> dict[str, Any]:
-    """Return the depth RMSE, scaled and unscaled.
+    """Return the depth RMSE in m after fusion ("scaled") and of the depth estimate ("unscaled"), by name.
 
-    It is computed at the beams as in the paper's Table IV, and over all pixels with true depth.
+    Both are computed at the lidar beams as in the paper's Table IV, and over all pixels with true depth
+    ("dense"). `depth_series` contains the RMSE at the beams of each image.
     """
     series: dict[str, list[Any]] = {"stamps_ns": [], "scaled_m": [], "unscaled_m": []}
     square: dict[str, list[Any]] = {"scaled": [], "unscaled": [], "dense_scaled": [], "dense_unscaled": []}

@@ -1,4 +1,4 @@
-"""Line charts as SVG text, without a plotting library."""
+"""Draw line charts as SVG text, without a plotting library."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _WIDTH, _HEIGHT, _EDGE = 560, 340, 46
 
 @dataclass(frozen=True)
 class Curve:
-    """A named line through points float64 [N, 2]; NaN interrupts it."""
+    """A named line of a chart through points float64 [N, 2] (x, y); a NaN point interrupts the line."""
 
     name: str
     points: np.ndarray
@@ -22,7 +22,10 @@ class Curve:
 
 
 def chart(title: str, x_label: str, y_label: str, curves: list[Curve], *, equal: bool = False) -> str:
-    """Return a chart as an SVG element; `equal` uses one scale for both axes, as for maps."""
+    """Return a line chart as an SVG element, or an HTML paragraph "no data" if no curve has points.
+
+    With `equal`, both axes have the same scale, as in maps.
+    """
     parts = [c.points[np.all(np.isfinite(c.points), axis=1)] for c in curves]
     everything = np.concatenate(parts) if parts else np.zeros((0, 2))
     if not len(everything):
@@ -55,7 +58,7 @@ def chart(title: str, x_label: str, y_label: str, curves: list[Curve], *, equal:
 
 
 def _line(curve: Curve, xy: np.ndarray) -> list[str]:
-    """Return the polylines between gaps, each thinned to about 1000 points."""
+    """Return SVG polylines through points xy [N, 2] in px; each is thinned to about 1000 points."""
     good = np.all(np.isfinite(xy), axis=1)
     pieces = np.split(np.arange(len(xy)), np.flatnonzero(np.diff(good.astype(int)) != 0) + 1)
     dash = ' stroke-dasharray="5 3"' if curve.dashed else ""

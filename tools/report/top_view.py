@@ -1,4 +1,4 @@
-"""Renders a Gaussian map from above, without its ceiling, at a known scale, like a floor plan."""
+"""Render a Gaussian map from above, without its ceiling, at a known scale, like a floor plan."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def top_view(
     ceiling_m: float = 1.8,  # Gaussians above this height are left out
     metres_per_px: float = 0.015,
 ) -> np.ndarray | None:
-    """Return the view as BGR uint8 [H, W, 3], x to the right and y up; None if no Gaussian is visible."""
+    """Return the map from above, BGR uint8 [H, W, 3], x to the right, y up; None if nothing is visible."""
     solid = (
         (params[MEAN + 2] < ceiling_m) & (params[MEAN + 2] > -0.5) & (params[OPACITY] > _MIN_OPACITY_LOGIT)
     )
@@ -57,9 +57,9 @@ def top_view(
 
 
 def _extent(xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return corners (low, high) float64 [2] of the points xy [2, N] with a margin.
+    """Return the lower and the upper corner float64 [2] in m of a rectangle around points xy [2, N].
 
-    They contain 99 % of the points per axis. A few outliers must not shrink the rest of the map.
+    It contains 99 % of the points per axis, plus a margin: a few outliers must not shrink the rest.
     """
     return np.percentile(xy, 0.5, axis=1) - _EDGE_M, np.percentile(xy, 99.5, axis=1) + _EDGE_M
 

@@ -1,1 +1,1 @@
-"""Editing of saved maps: merging, pruning, moving anchors."""
+"""Edit saved maps: merge, prune, move anchors."""

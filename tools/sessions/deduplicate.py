@@ -1,8 +1,8 @@
-"""Removal of duplicate surfaces after merging two maps.
+"""Remove duplicate surfaces after merging two maps.
 
-Both maps are rendered separately from every keyframe. Where both cover a pixel at the same depth, the render
-with the smaller colour error wins the pixel. Each Gaussian there counts wins and losses of its pixels;
-Gaussians with more losses than wins are removed.
+Both maps are rendered separately from every keyframe. Where both maps cover a pixel at the same depth, the
+map whose render has the smaller colour error wins the pixel, and the other map loses it. Gaussians that are
+on lost pixels more often than on won pixels are removed.
 """
 
 from __future__ import annotations
@@ -34,7 +34,10 @@ def without_duplicates(
     decode: Callable[[int], RgbdKeyframe],  # reads a keyframe by its id; raises ValueError
     progress: Callable[[list[KeyframeView]], Iterable[KeyframeView]] = iter,  # may show a progress bar
 ) -> np.ndarray:
-    """Return bool [N]: the Gaussians to keep. Keyframes that cannot be decoded are skipped."""
+    """Return bool [N]: False for the Gaussians of duplicate surfaces, which are to be removed.
+
+    Keyframes that cannot be decoded are skipped.
+    """
     stores = [_selected(arrays, ~second), _selected(arrays, second)]
     votes = [np.zeros(store.count, np.int32) for store in stores]
     exposure = dict(zip(arrays["keyframe_id"].tolist(), arrays["keyframe_exposure"]))
@@ -81,7 +84,7 @@ def _add_votes(
     T_map_camera: np.ndarray,
     depth_m: np.ndarray,  # float32 [H, W] of this map, rendered alone
 ) -> None:
-    """Add `won` of its pixel to the votes of each Gaussian on the visible surface."""
+    """Add to the votes of each Gaussian on the visible surface the value of `won` at its pixel."""
     T = inverse(T_map_camera)
     x, y, z = T[:3, :3] @ store.params[MEAN:SCALE, : store.count] + T[:3, 3:4]
     ahead = np.maximum(z, 1e-3)

@@ -1,4 +1,4 @@
-"""Editing of saved maps as arrays: move anchors, merge two maps, remove Gaussians and keyframes."""
+"""Edit the arrays of saved maps: move anchors, merge two maps, remove Gaussians and keyframes."""
 
 from __future__ import annotations
 
@@ -17,7 +17,10 @@ _KEYFRAMES, _STORE, _TAKEN = "keyframe_", "store_", "extra_taken_"
 
 
 def with_anchors(arrays: Arrays, T_map_anchor: dict[int, np.ndarray]) -> Arrays:
-    """Return the map with new anchor poses [4, 4]; Gaussians and keyframes move with them."""
+    """Return the map with new anchor poses; Gaussians and keyframes move with their anchors.
+
+    `T_map_anchor` contains poses float64 [4, 4] by anchor id; anchors that are not in it do not move.
+    """
     ids, poses = arrays["anchor_id"], arrays["anchor_T_map"].copy()
     store = store_of(arrays)
     for row, anchor in enumerate(ids.tolist()):
@@ -28,10 +31,14 @@ def with_anchors(arrays: Arrays, T_map_anchor: dict[int, np.ndarray]) -> Arrays:
 
 
 def merged(a: Arrays, b: Arrays, T_a_b: np.ndarray, offset: int) -> Arrays:
-    """Return map a with map b inserted at `T_a_b` [4, 4]; `offset` is added to the anchor ids of b.
+    """Return map a with all contents of map b inserted.
+
+    Args:
+        T_a_b: pose of the frame of map b in the frame of map a, float64 [4, 4].
+        offset: number that is added to the anchor ids of map b.
 
     Raises:
-        UserError: the maps share keyframes, or ids with the offset exist in a.
+        UserError: both maps contain the same keyframes, or an anchor id plus the offset exists in map a.
     """
     shared = set(a["extra_taken_id"].tolist()) & set(b["extra_taken_id"].tolist())
     if shared:
@@ -63,18 +70,19 @@ def merged(a: Arrays, b: Arrays, T_a_b: np.ndarray, offset: int) -> Arrays:
 
 
 def with_gaussians(arrays: Arrays, stay: np.ndarray) -> Arrays:
-    """Return the map with only the Gaussians whose flag in bool [N] is True."""
+    """Return the map without the Gaussians whose flag in `stay` bool [N] is False."""
     store = store_of(arrays)
     store.keep(stay)
     return arrays | _prefixed(store)
 
 
 def pruned(arrays: Arrays, least_opacity: float, keyframes: int | None) -> Arrays:
-    """Return the map without faint Gaussians, and with fewer keyframes.
+    """Return the map without Gaussians of low opacity, and with fewer keyframes.
 
     Args:
-        least_opacity: in [0, 1]; Gaussians below it are removed.
-        keyframes: how many to keep, evenly spaced in time; None for all. Gaussians of the others stay.
+        least_opacity: Gaussians whose opacity in [0, 1] is lower are removed.
+        keyframes: number of keyframes that remain, evenly spaced in time; None: all. The Gaussians of removed
+            keyframes remain.
     """
     opacity = 1.0 / (1.0 + np.exp(-arrays["store_params"][OPACITY].astype(np.float64)))
     out = with_gaussians(arrays, opacity >= least_opacity)
@@ -93,7 +101,7 @@ def pruned(arrays: Arrays, least_opacity: float, keyframes: int | None) -> Array
 
 
 def summary_of(arrays: Arrays) -> dict[str, int]:
-    """Return the summary of a state for the manifest."""
+    """Return the summary of a saved map for its manifest: number of keyframes, Gaussians etc., last stamp."""
     stamps_ns = arrays["extra_taken_stamp_ns"]
     return {
         "keyframes": len(arrays["keyframe_id"]), "gaussians": arrays["store_params"].shape[1],

@@ -23,7 +23,10 @@ def deduplicated(
     offset: int,  # added to the anchor ids of the second map
     progress: Callable[[list[KeyframeView]], Iterable[KeyframeView]] = iter,
 ) -> Arrays:
-    """Return the merged map without duplicate surfaces, compared with the images of the keyframes."""
+    """Return the merged map without duplicate surfaces: where both maps agree, the better one remains.
+
+    Better is the map whose render is closer to the images of the keyframes.
+    """
     lens = lru_cache(maxsize=4)(Undistorter)
 
     def load(id: int) -> RgbdKeyframe:
@@ -39,12 +42,12 @@ def deduplicated(
 
 
 def merge_doubt(agreeing: int, queried: int, loop_closures: int) -> str:
-    """Return why the place found for a second map should not be trusted; "" where it is confirmed.
+    """Return why the estimated pose of a second map in the first may be wrong; "" if it is confirmed.
 
     Args:
-        agreeing: scans of the second map whose place in the first agrees with the one found.
-        queried: scans that were searched for.
-        loop_closures: constraints between the two maps that were found at that place.
+        agreeing: number of scans of the second map whose pose in the first map agrees with the estimate.
+        queried: number of scans of the second map that were relocalized in the first map.
+        loop_closures: number of loop closures between the two maps at the estimated pose.
     """
     if loop_closures > 0 or 2 * agreeing > queried:
         return ""

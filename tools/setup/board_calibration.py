@@ -30,12 +30,15 @@ class LidarExtrinsics:
 
     @property
     def is_good(self) -> bool:
-        """Whether residual and standard error are within the limits."""
+        """Whether RMS distance of the beams from the boards and standard error of yaw are small enough.
+
+        The limits are 2 cm and 1 degree.
+        """
         return self.rms_m < _GOOD_RMS_M and self.yaw_sigma_rad < _GOOD_YAW_RAD
 
     @property
     def summary(self) -> str:
-        """The result and its errors in one sentence."""
+        """Position and yaw of the lidar, their standard errors and the residual, in one sentence."""
         x_m, y_m, yaw_rad = se3_to_se2(self.T_body_lidar)
         return (
             f"lidar at {x_m:.3f} m forward, {y_m:.3f} m left, +- {self.shift_sigma_m:.3f}; turned by "
@@ -45,7 +48,10 @@ class LidarExtrinsics:
 
 
 class LidarBoardCalibration:
-    """Collects views of the chessboard with simultaneous scans and solves for the lidar's mount."""
+    """Calibration of the lidar's mount from views of a chessboard with simultaneous scans.
+
+    Call `add` for at least `N_BOARDS` views, then `solve`.
+    """
 
     def __init__(self, model: CameraModel, board: Chessboard) -> None:
         self._model = model
@@ -62,10 +68,11 @@ class LidarBoardCalibration:
         return len(self._pairs)
 
     def add(self, grey_before: np.ndarray, scan: Scan, grey_after: np.ndarray) -> str:
-        """Add a view; return a text that says whether it was accepted.
+        """Add one view of the board; return whether it was accepted or why it was rejected, as text.
 
         Args:
-            grey_before, grey_after: images uint8 [H, W] just before and after the scan.
+            grey_before, grey_after: grey images uint8 [H, W] just before and just after the scan.
+            scan: scan of the board, which must not move between the images.
         """
         size = self._board.corners, self._board.square_m
         planes = [chessboard_plane(grey, self._camera, *size) for grey in (grey_before, grey_after)]
@@ -85,10 +92,12 @@ class LidarBoardCalibration:
         return f"accepted, distance {np.linalg.norm(centre):.2f} m"
 
     def solve(self, T_body_lidar: np.ndarray) -> LidarExtrinsics:
-        """Return the lidar's mount, starting from one that is correct to a few degrees and centimetres.
+        """Estimate the lidar's mount from the accepted views.
+
+        `T_body_lidar` float64 [4, 4] is the start value, correct to a few degrees and centimetres.
 
         Raises:
-            ValueError: no beams on the boards, or all boards face the same way.
+            ValueError: no beams are on the boards, or all boards have the same orientation.
         """
         T = inverse(self._T_body_level) @ T_body_lidar
         start = (float(np.arctan2(-T[0, 0], T[2, 0])), float(T[0, 3]), float(T[2, 3]))

@@ -1,4 +1,4 @@
-"""A chessboard to print, as a PDF page at true scale."""
+"""Draw the calibration chessboard as a PDF page at true scale, for printing."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ _A4_MM = (297.0, 210.0)  # landscape
 
 
 class Chessboard(NamedTuple):
-    """A chessboard by its number of inner corners."""
+    """Size of a chessboard: number of inner corners and side of a square."""
 
     corners: tuple[int, int]  # along the long side, along the short side
     square_m: float  # side of a square
@@ -20,7 +20,7 @@ DEFAULT_CHESSBOARD = Chessboard((11, 8), 0.020)
 
 
 def chessboard_pdf(board: Chessboard = DEFAULT_CHESSBOARD) -> bytes:
-    """Return a PDF with one A4 page, landscape: the board and its size in words.
+    """Return a PDF file of one A4 page (landscape) with the board and a text with its dimensions.
 
     Raises:
         ValueError: the board does not fit on A4.
@@ -51,7 +51,7 @@ def chessboard_pdf(board: Chessboard = DEFAULT_CHESSBOARD) -> bytes:
 
 
 def _pdf(objects: list[bytes]) -> bytes:
-    """Return a PDF file of numbered objects, the first being its catalogue (ISO 32000-1, 7.5)."""
+    """Return a PDF file made of these objects; the first one is the catalogue (ISO 32000-1, 7.5)."""
     out, places = b"%PDF-1.4\n", []
     for number, body in enumerate(objects, start=1):
         places.append(len(out))

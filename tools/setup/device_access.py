@@ -22,7 +22,7 @@ _INTERFERING = {
 
 
 class DeviceFinding(NamedTuple):
-    """One finding on a device."""
+    """One result of the check of a device, with a remedy if there is a fault."""
 
     subject: str
     verdict: Literal["ok", "note", "fault"]
@@ -31,7 +31,7 @@ class DeviceFinding(NamedTuple):
 
 
 class UserAccount(NamedTuple):
-    """A user and the groups that give access to devices."""
+    """A user, and the groups by which the user has access to devices."""
 
     name: str
     groups: frozenset[str]  # of this session
@@ -39,7 +39,7 @@ class UserAccount(NamedTuple):
 
     @staticmethod
     def current() -> UserAccount:
-        """Return the user who runs this process."""
+        """Return the user of this process."""
         name = getpass.getuser()
         groups = {_group_name(gid) for gid in os.getgroups()}
         return UserAccount(
@@ -48,7 +48,10 @@ class UserAccount(NamedTuple):
 
 
 def wanted_devices(nodes: dict[str, dict[str, Any]]) -> list[tuple[str, str]]:
-    """Return (option, device) of the cameras and lidars in a deployment's node tables."""
+    """Return (option, device) of camera and lidar in a deployment, such as ("lidar.device", "/dev/ttyUSB0").
+
+    `nodes` are the option tables of the deployment's nodes, by name.
+    """
     found = []
     lidar, camera = nodes.get("lidar"), nodes.get("camera")
     if lidar is not None:
@@ -66,12 +69,12 @@ def diagnose_devices(
     user: UserAccount | None = None,
     may_open: Callable[[Path], bool] = lambda path: os.access(path, os.R_OK | os.W_OK),
 ) -> Iterator[DeviceFinding]:
-    """Yield findings on the devices that a deployment uses, and on other connected ones.
+    """Check access to the devices of a deployment and to other connected devices; yield the findings.
 
     Args:
-        wanted: (option, device) pairs.
+        wanted: (option, device) pairs from `wanted_devices`.
         dev: folder of device files.
-        user: whose permissions are checked; default: the current user.
+        user: user whose permissions are checked; None: the current user.
         may_open: access test, replaceable for tests.
     """
     user = user or UserAccount.current()
@@ -99,7 +102,10 @@ def diagnose_devices(
 def _check_access(
     path: Path, user: UserAccount, may_open: Callable[[Path], bool], *, needed: bool
 ) -> DeviceFinding:
-    """Return the finding on one device: permissions of the user, use by other programs."""
+    """Return a finding on one device file: permissions of the user, use by other programs.
+
+    A problem is a "fault" if the deployment needs the device (`needed`), else a "note".
+    """
     bad: Literal["fault", "note"] = "fault" if needed else "note"
     if may_open(path):
         holder = _locked_by(path)
@@ -164,7 +170,7 @@ def _locked_by(path: Path) -> str:
 
 
 def _by_id(path: Path) -> str:
-    """Return a text with the device's stable name, which does not change when it is reconnected."""
+    """Return a text with the name of a serial port that stays when it is reconnected; "" without one."""
     names = [
         link for link in (path.parent / "serial" / "by-id").glob("*") if link.resolve() == path.resolve()
     ]

@@ -1,4 +1,4 @@
-"""Find cameras and lidars by running their nodes until the first message."""
+"""Find connected cameras and lidars: run their nodes until the first message arrives."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ LIDAR_TIMEOUT_S = {
 
 
 class FoundSensor(NamedTuple):
-    """A sensor that answered."""
+    """A sensor that sent a message: options and status of its node, and the message."""
 
     options: dict[str, Any]  # of its node
     status: str  # of its node: model, rates, losses
@@ -31,19 +31,19 @@ class FoundSensor(NamedTuple):
 
 
 class NoAnswer(NamedTuple):
-    """A device where no sensor answered, and the status of the attempt."""
+    """A device that sent no message, and the status of the node that tried to read it."""
 
     where: str
     status: str
 
 
 def camera_devices(dev: Path = Path("/dev")) -> list[str]:
-    """Return the V4L2 devices of this machine, by their stable names where available."""
+    """Return the paths of the V4L2 devices (cameras) of this host, from by-id links where available."""
     return _stable_names(sorted(dev.glob("video[0-9]*")), dev / "v4l" / "by-id")
 
 
 def lidar_devices(dev: Path = Path("/dev")) -> list[str]:
-    """Return the serial ports where a lidar may be, by their stable names where available."""
+    """Return the paths of the USB serial ports of this host, from by-id links where available."""
     return _stable_names(sorted([*dev.glob("ttyUSB*"), *dev.glob("ttyACM*")]), dev / "serial" / "by-id")
 
 
@@ -53,12 +53,15 @@ def _stable_names(devices: list[Path], names: Path) -> list[str]:
 
 
 def find_camera(source: str) -> FoundSensor | NoAnswer:
-    """Probe the camera at an index, path or address."""
+    """Run the camera node on `source` (index, device path or stream address) until an image arrives."""
     return _first_message("camera", {"kind": "opencv", "source": source}, source, Image, CAMERA_TIMEOUT_S)
 
 
 def find_lidar(device: str, kinds: tuple[str, ...] = tuple(LIDAR_TIMEOUT_S)) -> FoundSensor | NoAnswer:
-    """Probe the lidar at a serial port or tcp/HOST:PORT with all kinds of drivers."""
+    """Run lidar drivers of all `kinds` on a device, one after the other, until the first scan arrives.
+
+    `device` is a serial port, or tcp/HOST:PORT, where only the driver "hokuyo" is tried.
+    """
     if device.startswith("tcp/"):
         kinds = ("hokuyo",)
     heard = []
@@ -77,7 +80,7 @@ def find_lidar(device: str, kinds: tuple[str, ...] = tuple(LIDAR_TIMEOUT_S)) -> 
 def probe_all(
     devices: Iterable[str], find: Callable[[str], FoundSensor | NoAnswer], say: Callable[[str], None]
 ) -> list[FoundSensor]:
-    """Return the sensors that answer; `say` is called with a line of progress for each device."""
+    """Call `find` for each device, and return the sensors found; `say` receives progress messages."""
     found = []
     for device in devices:
         say(f"trying {device} ...")
@@ -105,10 +108,16 @@ def _first_message(
 def sensor_messages(
     service: str, options: dict[str, Any], wanted: type[Message]
 ) -> Iterator[Iterator[tuple[Message | None, str]]]:
-    """Run a sensor's node and iterate over (message or None, status).
+    """Run the node of a sensor; as a context manager, return an iterator over (message, status of the node).
+
+    The message is None if the node has published nothing or another type than `wanted`.
+
+    Args:
+        service: "camera" or "lidar".
+        options: options of the node.
 
     Raises:
-        UserError: invalid options.
+        UserError: an option is invalid.
     """
     node = make_node(NODES[service], options, "setup")
     try:
@@ -123,7 +132,10 @@ def sensor_messages(
 
 
 class SensorStream:
-    """Reads a sensor in a thread, so that `next` returns a current message."""
+    """Reader of a sensor that runs in a thread, so that `next` returns a message measured after its call.
+
+    Use it as a context manager.
+    """
 
     def __init__(self, service: str, options: dict[str, Any], wanted: type[Message]) -> None:
         self._service = service
@@ -153,10 +165,10 @@ class SensorStream:
                         self._changed.notify_all()
 
     def next(self, timeout_s: float = 20.0) -> Any:
-        """Wait for the first message from now on, and return it.
+        """Wait for the first message of type `wanted` that arrives from now on, and return it.
 
         Raises:
-            UserError: none arrives within `timeout_s`.
+            UserError: no message arrives within `timeout_s`.
         """
         with self._changed:
             self._message = None

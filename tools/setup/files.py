@@ -1,4 +1,4 @@
-"""Texts of the two files that setup writes: robot.toml (deployment) and rig.toml (calibration)."""
+"""Create the two files of `beamsplat setup`: robot.toml (deployment) and rig.toml (calibration)."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ positive yaw turns to the left."""
 
 @dataclass(frozen=True)
 class MeasuredMount:
-    """The mount of a sensor as measured with a tape."""
+    """Position and one angle of a sensor in the body frame, measured by hand with a tape."""
 
     forward_m: float
     left_m: float
@@ -29,16 +29,16 @@ class MeasuredMount:
     left_deg: float = 0.0  # yaw, positive left
 
     def T_body_camera(self) -> np.ndarray:
-        """Return the mount of a camera, float64 [4, 4]."""
+        """Return the pose of a camera with this mount (optical frame) in the body frame, float64 [4, 4]."""
         return camera_mount(self.forward_m, self.left_m, self.up_m, pitch_down_rad=np.radians(self.down_deg))
 
     def T_body_lidar(self) -> np.ndarray:
-        """Return the mount of a lidar, float64 [4, 4]."""
+        """Return the pose of a lidar with this mount in the body frame, float64 [4, 4]."""
         return lidar_mount(self.forward_m, self.left_m, self.up_m, yaw_left_rad=np.radians(self.left_deg))
 
 
 def camera_section(lens: CameraIntrinsics, T_body_camera: np.ndarray) -> CameraSection:
-    """Return the section [camera] of a rig file."""
+    """Return the section [camera] of rig.toml with these intrinsics and the mount `T_body_camera` [4, 4]."""
     K = np.round(lens.K, 4)
     return CameraSection(
         width_px=lens.size_px[0], height_px=lens.size_px[1], fx_px=float(K[0, 0]), fy_px=float(K[1, 1]),
@@ -50,7 +50,14 @@ def camera_section(lens: CameraIntrinsics, T_body_camera: np.ndarray) -> CameraS
 def rig_text(
     camera: CameraSection | None, T_body_lidar: np.ndarray, assumed: tuple[str, ...], note: str
 ) -> str:
-    """Return the text of rig.toml; `note` is a comment on how the camera was calibrated."""
+    """Return the text of rig.toml.
+
+    Args:
+        camera: section [camera]; None without a camera.
+        T_body_lidar: mount of the lidar, float64 [4, 4].
+        assumed: descriptions of values that were not measured.
+        note: comment in the file: how the camera was calibrated.
+    """
     rig = RigFile(
         camera=camera,
         lidar=LidarSection(mount=Mount.of(T_body_lidar)),
@@ -61,7 +68,14 @@ def rig_text(
 
 
 def robot_text(robot: str, rig: str, camera: dict[str, Any] | None, lidar: dict[str, Any]) -> str:
-    """Return the text of robot.toml: the sensors with these options, and the nodes that make a map."""
+    """Return the text of robot.toml: a deployment with the sensors, localization, depth, fusion and page.
+
+    Args:
+        robot: name of the robot.
+        rig: path of rig.toml.
+        camera: options of the camera node; None: a deployment without camera, depth and fusion.
+        lidar: options of the lidar node.
+    """
     sections: list[tuple[str, dict[str, Any]]] = [
         ("camera", {"kind": "none", "rig": rig} if camera is None else {**camera, "rig": rig}),
         ("lidar", lidar),

@@ -20,23 +20,26 @@ _MIN_VIEWS = 6  # for a solution
 
 @dataclass(frozen=True)
 class CameraIntrinsics:
-    """K and distortion (plumb bob) with the standard error of the focal length and the reprojection error."""
+    """Camera matrix K in px, plumb-bob distortion (k1, k2, p1, p2, k3), and their accuracy."""
 
     size_px: tuple[int, int]  # width, height
     K: np.ndarray  # float64 [3, 3]
     distortion: np.ndarray  # float64 [5]
-    focal_sigma_px: float
+    focal_sigma_px: float  # standard error of the focal length, the larger of fx and fy
     rms_px: float  # reprojection error over all corners
     views: int
 
     @property
     def is_good(self) -> bool:
-        """Whether reprojection error and relative standard error (2 %) are within the limits."""
+        """Whether reprojection error (< 1 px) and standard error of the focal length (< 2 %) are small."""
         return self.rms_px < _GOOD_RMS_PX and self.focal_sigma_px < 0.02 * self.K[0, 0]
 
 
 class IntrinsicsCalibration:
-    """Collects views of the board at different places in the image and solves for the intrinsics."""
+    """Calibration of a camera from views of a chessboard at different places in the image.
+
+    Call `add` for images until there are enough `views`, then `solve`.
+    """
 
     def __init__(self, board: Chessboard) -> None:
         self._board = board
@@ -46,7 +49,11 @@ class IntrinsicsCalibration:
         self._size_px: tuple[int, int] | None = None
 
     def add(self, grey: np.ndarray) -> str:
-        """Add an image, uint8 [H, W], all of one size; return "taken", "no board", or "too alike"."""
+        """Search the board in a grey image uint8 [H, W]; add the view if it differs from the earlier views.
+
+        Returns "taken" if the view was added, "no board" if the board was not found, "too alike" if the board
+        is near its place in an earlier view. All images must have the same size.
+        """
         self._size_px = grey.shape[1], grey.shape[0]
         uv = self._corners(grey)
         if uv is None:
@@ -74,7 +81,7 @@ class IntrinsicsCalibration:
         return uv.reshape(-1, 2)
 
     def missing(self) -> str:
-        """Return the corners of the image where the board was not seen yet, as text; "" if none."""
+        """Return the corners of the image that no view of the board covers yet, as text; "" without any."""
         if self._size_px is None:
             return ""
         names = ("top left", "top right", "bottom left", "bottom right")
@@ -84,10 +91,10 @@ class IntrinsicsCalibration:
         return ", ".join(name for i, name in enumerate(names) if not np.any((quarter == i) & outer))
 
     def solve(self) -> CameraIntrinsics:
-        """Return the intrinsics that fit the views best.
+        """Estimate the intrinsics and their standard error from the views (least squares of OpenCV).
 
         Raises:
-            ValueError: too few views.
+            ValueError: there are too few views.
         """
         if len(self.views) < _MIN_VIEWS:
             raise ValueError(

@@ -1,4 +1,4 @@
-"""Show images and scans as text, for machines without a display."""
+"""Draw images and scans as text, for computers without a display."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ def scan_text(
     points_m: np.ndarray,  # float [N, 2]: x forward, y left
     columns: int,
 ) -> Text:
-    """Return a scan seen from above: forward is up, the lidar is ^.
+    """Return a scan seen from above as text: forward is up, the lidar is the character ^.
 
-    The scale is the smallest of 1, 2, 4 ... m that shows 90 % of the points.
+    The half width of the view is the smallest of 1, 2, 4, ... 32 m that contains 90 % of the points.
     """
     half = columns // 2
     rows = round(half / _CHARACTER)

@@ -1,4 +1,4 @@
-"""Nodes of a deployment: their classes and options, and whether they fit together."""
+"""Create the nodes of a deployment, and check that their options and topics are consistent."""
 
 from __future__ import annotations
 
@@ -20,17 +20,19 @@ RESERVED = ("router", *ADMIN_USERS)  # users and processes of a running system t
 
 @dataclass(frozen=True)
 class Fault:
-    """An error in a deployment; it cannot run if `fatal`."""
+    """An error in a deployment; with a `fatal` error the deployment cannot run."""
 
     text: str
     fatal: bool = True
 
 
 def build_node(deployment: Deployment, name: str, table: dict[str, Service] = NODES) -> Node:
-    """Return the node called `name` with the options of the deployment.
+    """Create the node called `name` with its options in the deployment.
+
+    `table` contains the known services by name.
 
     Raises:
-        UserError: not in the deployment, or not in the process list, or wrong options.
+        UserError: the deployment has no such node, `table` has no such service, or an option is invalid.
     """
     return make_node(_service(deployment, name, table), deployment.nodes[name], "deployment")
 
@@ -55,7 +57,7 @@ def _service(deployment: Deployment, name: str, table: dict[str, Service]) -> Se
 
 
 def node_classes(deployment: Deployment, table: dict[str, Service] = NODES) -> dict[str, type[Node]]:
-    """Return the class of each node of a deployment by name; options other than `kind` are not checked."""
+    """Return the class of each node of a deployment by name; only the option `kind` is checked."""
     return {
         name: node_class_of(_service(deployment, name, table), options)
         for name, options in deployment.nodes.items()
@@ -63,7 +65,11 @@ def node_classes(deployment: Deployment, table: dict[str, Service] = NODES) -> d
 
 
 def faults(deployment: Deployment, table: dict[str, Service] = NODES) -> list[Fault]:
-    """Return the errors of a deployment: unknown nodes, invalid options, topics without one producer."""
+    """Return the errors of a deployment.
+
+    They are unknown nodes, invalid options, topics with two producers, nodes without any input, and a robot
+    without uplink.
+    """
     found: list[Fault] = []
     classes: dict[str, type[Node]] = {}
     for name in deployment.nodes:
@@ -95,10 +101,12 @@ def faults(deployment: Deployment, table: dict[str, Service] = NODES) -> list[Fa
 def missing_resources(
     deployment: Deployment, names: tuple[str, ...] | None = None, table: dict[str, Service] = NODES
 ) -> list[Fault]:
-    """Return what a deployment without errors names and this machine lacks, such as files and keys.
+    """Return an error for each resource of a deployment that this host lacks, such as a file or a key.
+
+    Call it only for a deployment without errors.
 
     Args:
-        names: nodes, and `router`, that are to run; None checks all.
+        names: the nodes to run, and `router`; None checks all.
     """
     found = []
     for name in names or tuple(deployment.nodes):
@@ -111,7 +119,7 @@ def missing_resources(
 
 
 def _link_faults(deployment: Deployment, names: tuple[str, ...] | None) -> list[str]:
-    """Return why links to other hosts would be refused: no certificates, or keys that are missing."""
+    """Return why links to other hosts would be refused, as texts: unprotected endpoints, missing keys."""
     endpoints: tuple[str, ...] = ()
     if names is None or "router" in names:
         endpoints = (*deployment.router.listen, *deployment.router.connect)
@@ -130,14 +138,19 @@ def _link_faults(deployment: Deployment, names: tuple[str, ...] | None) -> list[
 
 @dataclass(frozen=True)
 class Surroundings:
-    """What a node needs to know about the other nodes of its deployment."""
+    """Facts about the other nodes of a deployment that one node needs."""
 
     wait_for: frozenset[str]  # a source starts when these are active, so that they receive every message
     without_producer: frozenset[str]  # inputs that no node here produces: the node does not wait for them
 
 
 def surroundings(classes: dict[str, type[Node]], name: str, role: Role = "whole") -> Surroundings:
-    """Return the surroundings of the node `name` among the node classes of its deployment."""
+    """Return for the node called `name` which nodes it waits for, and which of its inputs have no producer.
+
+    Args:
+        classes: the class of every node of the deployment, by name.
+        role: role of the host; the uplink publishes additional topics on a robot and on an edge server.
+    """
     fed = {topic for node in classes.values() for topic in node.outputs} | _uplink_topics(role)
     listeners = frozenset(other for other, node in classes.items() if node.inputs and other != name)
     return Surroundings(
@@ -149,6 +162,9 @@ def surroundings(classes: dict[str, type[Node]], name: str, role: Role = "whole"
 
 
 def _uplink_topics(role: Role) -> set[str]:
-    """Return the topics that the uplink delivers: on the edge those sent up, on a robot those sent down."""
+    """Return the topics that the uplink publishes on this host.
+
+    On an edge server they are the topics sent by robots, on a robot the topics sent by the edge server.
+    """
     ways = {"whole": (), "robot": ("down",), "edge": ("up", "bulk")}[role]
     return {name for name, row in TOPICS.items() if row.uplink in ways}

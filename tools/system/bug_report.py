@@ -1,4 +1,4 @@
-"""What a bug report needs: versions, deployment, logs, findings and health, without secrets."""
+"""Collect the contents of a bug report: versions, deployment, logs, findings, health; without secrets."""
 
 from __future__ import annotations
 
@@ -42,12 +42,19 @@ _PRIVATE_KEY = re.compile(
 
 @dataclass
 class Redactor:
-    """Removes secrets: values of options named like one, wherever they occur, and users in addresses."""
+    """Remover of secrets from tables and texts.
+
+    Secrets are values of options with a name such as password, token or key, wherever the value occurs, user
+    names and passwords in URLs, and private keys.
+    """
 
     _values: set[str] = field(default_factory=set)
 
     def table(self, value: Any, name: str = "") -> Any:
-        """Return a copy of a raw TOML table without secrets; remember what was removed for `text`."""
+        """Return a copy of a parsed TOML value without secrets; `text` removes the same secrets later.
+
+        `name` is the option that the value belongs to.
+        """
         if isinstance(value, dict):
             return {key: self.table(item, str(key)) for key, item in value.items()}
         if _SECRET_NAMES.search(name) and value not in ("", None):
@@ -58,7 +65,7 @@ class Redactor:
         return self.text(value) if isinstance(value, str) else value
 
     def text(self, text: str) -> str:
-        """Return a text without secrets."""
+        """Return a copy of a text in which all secrets are replaced by `REMOVED`."""
         for value in sorted(self._values, key=len, reverse=True):
             if len(value) >= _MIN_SECRET_CHARS:
                 text = text.replace(value, REMOVED)
@@ -69,7 +76,10 @@ class Redactor:
 
 
 def versions() -> dict[str, Any]:
-    """Return the versions of this package, Python and the required packages, and what the machine is."""
+    """Return versions (this package, Python, dependencies) and properties of this host, by name.
+
+    The properties are platform, CPU cores, memory in MB, and GPUs.
+    """
     packages: dict[str, str | None] = {}
     for requirement, _ in requirements():
         try:
@@ -98,10 +108,10 @@ def bundle(
 ) -> bytes:
     """Return a ZIP file with versions, deployment, findings, health and the ends of the logs.
 
-    What cannot be collected is replaced by the reason.
+    Secrets are removed. A part that cannot be collected is replaced by the reason.
 
     Args:
-        findings: returns the doctor's findings, dataclasses.
+        findings: returns the findings of `beamsplat doctor` (dataclasses).
         health: returns `HealthTable.snapshot()` of the running system; raises UserError if none runs.
     """
     redactor = Redactor()

@@ -1,8 +1,8 @@
-"""Queries that a supervisor answers on the bus, for the nodes that it runs:
+"""Answer queries on the bus about the nodes that a supervisor runs.
 
-query/<node>/restart               stops it and starts it again
-query/<node>/swap?set=...&cold=    changes its options: see `beamsplat.tools.system.swap`
-query/<node>/params                returns its options, defaults included
+query/<node>/restart               stops the node and starts it again
+query/<node>/swap?set=...&cold=    changes options of the node: see `beamsplat.tools.system.swap`
+query/<node>/params                returns the options of the node, defaults included
 """
 
 from __future__ import annotations
@@ -26,7 +26,10 @@ VERBS = ("restart", "swap", "params")
 
 
 class Commands:
-    """Answers the queries; call `answer_pending` several times per second, as `Supervisor.poll`."""
+    """Receiver of the queries to a supervisor.
+
+    Call `answer_pending` several times per second, in the thread that calls `Supervisor.poll`.
+    """
 
     def __init__(self, session: zenoh.Session, robot: str, supervisor: Supervisor) -> None:
         self._session, self._supervisor = session, supervisor
@@ -37,7 +40,10 @@ class Commands:
         self._swaps: dict[str, tuple[Swap, zenoh.Query]] = {}  # by node, unfinished
 
     def answer_pending(self) -> None:
-        """Answer the queries received since the last call, and continue swaps."""
+        """Answer the queries received since the last call, and continue unfinished swaps.
+
+        A swap query is answered when its swap has finished or failed.
+        """
         for verb, queryable in self._queryables.items():
             while (query := queryable.try_recv()) is not None:
                 node = str(query.key_expr).split("/")[-2]

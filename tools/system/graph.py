@@ -1,4 +1,4 @@
-"""The dataflow of a deployment as text and as a Mermaid flowchart."""
+"""Draw the dataflow of a deployment as text and as a Mermaid flowchart."""
 
 from __future__ import annotations
 
@@ -9,7 +9,10 @@ _MARK = {"latest": "newest only", "every": "every one", "latched": "last value"}
 
 
 def edges(classes: dict[str, type[Node]]) -> list[tuple[str, str, str, str]]:
-    """Return (producer, topic, consumer, delivery) of every connection, in the order of the topic table."""
+    """Return (producer, topic, consumer, delivery) of every connection, in the order of `TOPICS`.
+
+    `classes` are the node classes of a deployment by name of the node.
+    """
     found: list[tuple[str, str, str, str]] = []
     for topic in TOPICS:
         for producer, node in classes.items():
@@ -23,7 +26,7 @@ def edges(classes: dict[str, type[Node]]) -> list[tuple[str, str, str, str]]:
 
 
 def as_text(classes: dict[str, type[Node]]) -> str:
-    """Return one line per topic: producer -> topic -> consumers."""
+    """Return the dataflow as text, one line per topic: producer -> topic, message, rate -> consumers."""
     lines = []
     for topic, row in TOPICS.items():
         producers = [name for name, node in classes.items() if topic in node.outputs]
@@ -43,7 +46,10 @@ def as_text(classes: dict[str, type[Node]]) -> str:
 
 
 def as_mermaid(classes: dict[str, type[Node]]) -> str:
-    """Return a Mermaid flowchart: boxes are processes, arrows are topics; dotted arrows drop old messages."""
+    """Return the dataflow as a Mermaid flowchart: boxes are nodes, arrows are topics.
+
+    On dotted arrows, the consumer receives only the newest message.
+    """
     lines = ["flowchart LR"]
     lines += [f"    {name}([{name}])" for name in classes]
     joined: dict[tuple[str, str, bool], list[str]] = {}

@@ -1,4 +1,4 @@
-"""The health of all nodes of a robot, received from the bus and shown as tables."""
+"""Receive the health messages of all nodes of a robot from the bus, and show them as tables."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ ALL = "*"
 
 
 class HealthTable:
-    """Receives health/* in a thread until the session is closed.
+    """Table of the newest health message of every node, received in a thread until `session` is closed.
 
-    Of one robot, or of all robots with `ALL`; nodes are then named robot/node.
+    The nodes are of one robot, or of all robots if `robot` is `ALL`; they are then named robot/node.
     """
 
     def __init__(
@@ -61,12 +61,12 @@ class HealthTable:
                 self._book.add(health, self._clock_s())
 
     def states(self) -> dict[str, str]:
-        """Return the state of each node by name; "silent" where no report arrived lately."""
+        """Return the state of each node by name; "silent" if its last health message is too old."""
         with self._lock:
             return self._book.states(self._clock_s())
 
     def snapshot(self) -> dict[str, Any]:
-        """Return the health of all nodes and the traffic of all topics as a JSON table, units in the keys."""
+        """Return the health of all nodes and the traffic of all topics for JSON; keys end with the unit."""
         now = self._clock_s()
         with self._lock:
             nodes = {name: _node_figures(record, now) for name, record in sorted(self.records.items())}
@@ -74,7 +74,7 @@ class HealthTable:
         return {"nodes": nodes, "topics": topics}
 
     def status_line(self) -> str:
-        """Return the states and rates of all nodes in one line, with what was lost."""
+        """Return state, message rate and number of lost messages of every node in one line of text."""
         now = self._clock_s()
         parts = []
         with self._lock:
@@ -87,9 +87,10 @@ class HealthTable:
         return "; ".join(parts) or "no node reports yet"
 
     def nodes_table(self) -> RenderableType:
-        """Return one row per node: process, state, rates, step time, age, losses, memory, CPU; details below.
+        """Return a table with one row per node: process, state, rates, step time, age, losses, memory, CPU.
 
-        Of several robots no process ids are shown: their names need the room, and the ids are of other hosts.
+        Status texts of the nodes are below the table. With several robots, process ids are not shown: the
+        names need the space, and the ids belong to other hosts.
         """
         table = _narrow_table()
         table.add_column("node", no_wrap=True)
@@ -121,7 +122,7 @@ class HealthTable:
         return Group(table, *said)
 
     def topics_table(self) -> Table:
-        """Return one row per published topic: producer, rate, bytes, consumers."""
+        """Return a table with one row per published topic: producer, rate, bytes, consumers."""
         table = _narrow_table()
         for heading in ("topic", "from"):
             table.add_column(heading, no_wrap=True)
@@ -182,7 +183,7 @@ def _node_row(name: str, record: NodeRecord, now: float) -> tuple[str, ...]:
 
 
 def _short(number: float) -> str:
-    """Return a number in four characters or, from 10 000 on, more."""
+    """Return a number as text of at most four characters, from 10 000 on of more."""
     return f"{number:.1f}" if number < 99.95 else f"{number:.0f}"
 
 

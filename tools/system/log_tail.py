@@ -1,4 +1,4 @@
-"""What the log of a process says about its end."""
+"""Find in the log of a process why it ended."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ _TRACEBACK = "Traceback (most recent call last):"
 
 
 def last_error(path: Path, since: int = 0) -> str:
-    """Return the last error in a log in one line, without time and origin.
+    """Return the last error in a log file in one line, without time and logger name.
 
-    That is the exception of the last traceback or the last line of level ERROR, whichever is later; without
-    one, the last line.
+    The last error is the exception of the last traceback, or the last line of level ERROR or CRITICAL,
+    whichever is later. A log without errors: the last line.
 
     Args:
-        since: offset in bytes at which the log of this process begins; what is before is of earlier ones.
+        since: offset in bytes at which the log of this process begins, after those of earlier processes.
     """
     try:
         with path.open("rb") as file:

@@ -1,4 +1,4 @@
-"""The main functions of the processes of a running system: one node on the bus, or the router."""
+"""Main functions of the processes of a running system: one node on the bus, or the router."""
 
 from __future__ import annotations
 
@@ -47,10 +47,16 @@ def serve(
 ) -> None:
     """Run one node until its inputs end, or SIGINT or SIGTERM arrives.
 
-    Without `around`, the classes of all nodes are imported to determine it.
+    Args:
+        resume: start from the last checkpoint, after a crash.
+        exit_when_drained: end the process when the node has processed its last input.
+        around: facts about the other nodes; None: computed here, which imports the classes of all nodes.
+        instance: id of this process on the bus; "": a new one.
+        standby: start as the successor of a running node, see `beamsplat.tools.system.swap`.
+        table: known services by name.
 
     Raises:
-        UserError: wrong options, bad input data, or no router.
+        UserError: an option is invalid, input data is not usable, or no router answers.
     """
     node = build_node(deployment, name, table)
     _limit_threads(node.config.threads)
@@ -100,7 +106,7 @@ def route(deployment: Deployment) -> None:
 
 
 def _changed_at(keys: Path | None) -> int:
-    """Return the time of the last change of the policy or the certificate in ns; 0 if there is none."""
+    """Return the modification time in ns of the newer of policy and certificate; 0 without both files."""
     if keys is None:
         return 0
     files = [keys.expanduser() / name for name in (HOSTS, CERTIFICATE)]
@@ -117,7 +123,10 @@ def child(
     instance: str = "",
     standby: bool = False,
 ) -> None:
-    """Main function of a supervised process: writes to a log file; exit code 2 after a UserError."""
+    """Run a node or the router as a supervised process: output is appended to a log file.
+
+    The exit code is 2 after a UserError. For the arguments see `serve`.
+    """
     # Ctrl-C in a terminal is sent to the whole process group; the supervisor stops processes in order.
     os.setpgrp()
     set_process_title(f"beamsplat:{name}")
@@ -146,7 +155,7 @@ def child(
 
 
 def start_logging(level: int = logging.INFO) -> None:
-    """Configure logging: lines with time, level and logger name on standard error."""
+    """Configure logging to standard error, with time, level and logger name in each line."""
     logging.basicConfig(
         level=level, format="%(asctime)s %(levelname)-7s %(name)s: %(message)s", stream=sys.stderr, force=True
     )
@@ -163,7 +172,7 @@ def _die_with_parent() -> None:
 
 
 def _limit_threads(threads: int) -> None:
-    """Set the thread counts of the libraries that are already imported."""
+    """Set the number of threads of OpenCV and PyTorch, if they are imported already."""
     if "cv2" in sys.modules:
         sys.modules["cv2"].setNumThreads(threads)
     if "torch" in sys.modules:

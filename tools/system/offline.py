@@ -1,4 +1,4 @@
-"""Lockstep run of a whole deployment, recorded and hashed."""
+"""Run a whole deployment in lockstep, and record and hash all its messages."""
 
 from __future__ import annotations
 
@@ -26,32 +26,34 @@ OUTSIDE = ("monitor", "page", "recorder")
 
 
 class MessageHash:
-    """SHA-256 over (topic, schema, sequence, payload) of messages, in order; all, and by topic."""
+    """SHA-256 over topic, schema, sequence number and payload of all messages in order; count by topic."""
 
     def __init__(self) -> None:
         self._all = hashlib.sha256()
         self.counts: dict[str, int] = {}
 
     def add(self, envelope: Envelope, payload: bytes) -> None:
-        """Add one message."""
+        """Add one message to the hash and to the count of its topic; `payload` is the encoded message."""
         head = f"{envelope.topic} {schema_of(envelope.message)} {envelope.header.sequence} {len(payload)}\n"
         self._all.update(head.encode())
         self._all.update(payload)
         self.counts[envelope.topic] = self.counts.get(envelope.topic, 0) + 1
 
     def hexdigest(self) -> str:
-        """Return the SHA-256 over all messages as 64 hex digits."""
+        """Return the SHA-256 over all messages added so far as 64 hex digits."""
         return self._all.hexdigest()
 
 
 def run_offline(
     deployment: Deployment, out: Path, console: Console, table: dict[str, Service] = NODES
 ) -> dict[str, Any]:
-    """Run all nodes of a deployment (without recorder, monitor and page); write `messages` (a recording) and
-    summary.json into `out`, and return the summary.
+    """Run all nodes of a deployment in lockstep, and return the contents of summary.json.
+
+    Writes `messages` (a recording of all messages) and summary.json (hash, counts, wall time) into `out`. The
+    deployment must not contain the nodes named in `OUTSIDE`.
 
     Raises:
-        UserError: options or data that do not fit.
+        UserError: an option is invalid, or the data cannot be played.
     """
     nodes = [build_node(deployment, name, table) for name in deployment.nodes]
     digest = MessageHash()

@@ -1,4 +1,4 @@
-"""The name of a process in `ps`, `top` and `htop`. Children of a fork server would all be called alike."""
+"""Set the name of a process in `ps`, `top` and `htop`: children of a fork server all have the same name."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _ARG_START, _ARG_END = 48, 49  # fields of /proc/PID/stat, counted from 1: proc(
 
 
 def set_process_title(title: str, *, arguments: bool = True) -> None:
-    """Set the name of this process; call it from the main thread. No effect where the system is not Linux.
+    """Set the name of this process; call it from the main thread. Systems other than Linux: no effect.
 
     Args:
         title: the first 15 bytes become the command name (`/proc/self/comm`).

@@ -1,4 +1,4 @@
-"""Starts the router and the nodes of a deployment, restarts crashed processes, and stops all in order."""
+"""Start the router and the nodes of a deployment, restart crashed processes, and stop all in order."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ PRELOADED = (
 
 @dataclass
 class Child:
-    """One supervised process."""
+    """State of one supervised process; times are `time.monotonic()` in s."""
 
     name: str
     process: BaseProcess
@@ -58,7 +58,10 @@ class Child:
 
 @dataclass
 class Successor:
-    """The process and options that replace a node. Without a process the node is stopped first."""
+    """The process and the deployment that replace a running node.
+
+    Without a process, the node is first stopped and then started with the new options.
+    """
 
     name: str
     deployment: Deployment
@@ -68,7 +71,11 @@ class Successor:
 
 
 class Supervisor:
-    """The processes of one deployment, as a context manager; call `poll` several times per second."""
+    """Supervisor of the processes of one deployment.
+
+    As a context manager it starts and stops them. Call `poll` several times per second. `names` are the
+    processes to run (nodes, and `router`); None runs all.
+    """
 
     def __init__(
         self,
@@ -143,11 +150,11 @@ class Supervisor:
         raise UserError(f"no router at {', '.join(self.deployment.router.listen)} after 20 s")
 
     def log_file(self, name: str) -> Path:
-        """Return the log file of a process."""
+        """Return the path of the log file of the process called `name`."""
         return self.log_dir / f"{name}.log"
 
     def last_error(self, name: str) -> str:
-        """Return what the log says about the end of the newest process of a node, in one line."""
+        """Return the last error in the log of the newest process called `name`, in one line."""
         return last_error(self.log_file(name), self._log_start.get(name, 0))
 
     def _start(self, name: str, resume: bool = False) -> None:
@@ -156,7 +163,7 @@ class Supervisor:
     def _spawn(
         self, deployment: Deployment, name: str, resume: bool = False, standby: bool = False
     ) -> tuple[BaseProcess, str]:
-        """Start a process; return it and its instance id."""
+        """Start a process; return the process and its instance id (16 hex digits)."""
         instance = secrets.token_hex(8)
         log_file = self.log_file(name)
         self._log_start[name] = log_file.stat().st_size if log_file.exists() else 0
@@ -179,12 +186,15 @@ class Supervisor:
             known.due, known.kill_at = None, None
 
     def successor(self, name: str, overrides: tuple[str, ...], warm: bool) -> Successor:
-        """Start a second process of a node with other options, in standby: see `beamsplat.tools.system.swap`.
+        """Prepare the replacement of a node by one with other options: see `beamsplat.tools.system.swap`.
 
-        Another kind starts with its own default options.
+        Args:
+            name: name of the node.
+            overrides: options to change, as OPTION=VALUE. If `kind` changes, all others have their defaults.
+            warm: start a second process in standby now; else the node is stopped first, and none starts yet.
 
         Raises:
-            UserError: no such node here, options that do not fit, or a node that cannot run twice.
+            UserError: there is no such node, an option is invalid, or the node cannot run twice.
         """
         before = self.deployment
         if any(o.partition("=")[0].strip() == "kind" for o in overrides):  # its options differ
@@ -201,7 +211,7 @@ class Supervisor:
         return Successor(name, deployment, *self._spawn(deployment, name, standby=True), node.hands_over)
 
     def replace(self, successor: Successor) -> None:
-        """Make an activated successor the node; later restarts use its options."""
+        """Supervise an activated successor in place of its predecessor; later restarts use its options."""
         self.deployment = successor.deployment
         self._retired.append(self.children[successor.name].process)
         assert successor.process is not None  # only a running successor takes over
@@ -221,7 +231,7 @@ class Supervisor:
             entry.process.terminate()
 
     def poll(self) -> None:
-        """Detect ended processes, and start those whose back-off has passed."""
+        """Detect processes that have ended, and restart those whose back-off time has passed."""
         now = time.monotonic()
         for entry in self.children.values():
             if entry.due is not None:

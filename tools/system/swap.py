@@ -21,7 +21,10 @@ _RESUME_S = 120.0  # limit for loading the saved state in the successor
 
 
 class Swap:
-    """One swap; call `poll` until it returns a text. If it fails, the node continues unchanged."""
+    """Replacement of one node by its successor; call `poll` until it returns a text.
+
+    If the replacement fails before the predecessor has retired, the node continues unchanged.
+    """
 
     def __init__(self, session: zenoh.Session, supervisor: Supervisor, successor: Successor) -> None:
         self._session, self._supervisor, self.successor = session, supervisor, successor
@@ -32,10 +35,10 @@ class Swap:
         self._activation: Future[str] | None = None
 
     def poll(self) -> str | None:
-        """Continue the swap; return the result as one sentence when it is done, else None.
+        """Continue the replacement; return its result as one sentence when it is complete, else None.
 
         Raises:
-            UserError: the swap failed; nothing was changed.
+            UserError: the replacement failed.
         """
         successor, now = self.successor, time.monotonic()
         if self._activation is not None:
@@ -67,7 +70,10 @@ class Swap:
             raise
 
     def _reached(self, instance: str) -> dict[str, int] | None:
-        """Return the stamp that a process has reached on each topic, ns; None if it does not answer."""
+        """Return the newest stamp in ns, by topic, that a process has published or held back in standby.
+
+        None if the process does not answer. `instance` is the instance id of the process.
+        """
         try:
             return json.loads(command(self._session, self._robot, instance, "reached", {}, 0.5))
         except UserError:
