@@ -1,4 +1,4 @@
-"""Read cameras, network streams and video files with OpenCV (V4L2 devices, RTSP and other streams, files)."""
+"""Source of frames from cameras, network streams and video files, read with OpenCV (V4L2, RTSP, files)."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _KERNEL_AGE_S = 2.0  # an older (or negative) kernel time stamp is not on the mo
 class CaptureSource:
     """An open `cv2.VideoCapture`.
 
-    JPEG bytes are passed on without decoding where the device or file has them.
+    JPEG bytes of the device or file are returned without decoding, where OpenCV can read them.
     """
 
     def __init__(
@@ -29,12 +29,12 @@ class CaptureSource:
 
         Args:
             source: V4L2 number or path, stream address, or path of a video file.
-            now_ns: the clock of the time stamps, ns.
-            size_px: width and height to request from a V4L2 device; None keeps the device's own.
-            rate_hz: frame rate to request from a V4L2 device; 0 keeps the device's own.
+            now_ns: returns the present time on the clock of the stamps, ns.
+            size_px: (width, height) to request from a V4L2 device; None = the device's default.
+            rate_hz: frame rate to request from a V4L2 device; 0 = the device's default.
 
         Raises:
-            CameraError: the source does not exist, may not be opened, or OpenCV cannot read it.
+            CameraError: the source does not exist, permission is denied, or OpenCV cannot read it.
         """
         self._now_ns = now_ns
         self._device = _device_number(source)
@@ -65,11 +65,11 @@ class CaptureSource:
         self._due = time.monotonic()
 
     def read(self) -> CapturedFrame:
-        """Return the next frame; frames of a file are returned at the file's own frame rate.
+        """Return the next frame; frames of a file are returned at the frame rate of the file.
 
         Raises:
             CameraEnded: the end of a file.
-            CameraError: the device or stream delivers no more frames.
+            CameraError: the device or stream returns no more frames.
         """
         good, data = self._capture.read()
         stamp_ns = self._stamp_ns()
@@ -90,10 +90,10 @@ class CaptureSource:
         self._capture.release()
 
     def _set(self, size_px: tuple[int, int] | None, rate_hz: float) -> None:
-        """Request JPEG, size and rate.
+        """Request JPEG, image size and frame rate from the device.
 
-        JPEG is requested first because raw images at full rate exceed the bandwidth of USB. A setting
-        that the device rejects keeps its previous value.
+        JPEG is requested first, because raw images at full rate exceed the bandwidth of USB. A setting that
+        the device rejects has no effect.
         """
         self._capture.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*"MJPG"))
         if size_px is not None:
@@ -106,9 +106,7 @@ class CaptureSource:
             self._capture.set(cv2.CAP_PROP_CONVERT_RGB, 0)
 
     def _stamp_ns(self) -> int:
-        """Return the capture time, ns: V4L2's time stamp on the kernel's monotonic clock, or else the time
-        now.
-        """
+        """Return the capture time (ns): V4L2's stamp on the kernel's monotonic clock, else the time now."""
         now_ns = self._now_ns()
         if self._device is None:
             return now_ns
@@ -117,9 +115,7 @@ class CaptureSource:
 
 
 def _device_number(source: str) -> int | None:
-    """Return the number of a V4L2 device given as "0", "/dev/video0" or a link to it; None for other
-    sources.
-    """
+    """Return the number of a V4L2 device ("0", "/dev/video0" or a link to it); None for other sources."""
     if source.isdigit():
         return int(source)
     if source.startswith("/dev/"):

@@ -11,13 +11,13 @@ from beamsplat.common.config.deployment import NodeConfig, Seconds
 
 
 class NoCameraConfig(NodeConfig):
-    """Options of a robot without a camera: its rig file still holds the pose of the lidar."""
+    """Options of a robot without a camera; its rig file contains the pose of the lidar."""
 
     rig: Path
 
 
 class CameraConfig(NodeConfig):
-    """Options of one camera that OpenCV or plain HTTP can read."""
+    """Options of one camera that can be read with OpenCV or over HTTP."""
 
     source: str = "0"  # number or path of a V4L2 device, rtsp:// or http:// address, video file
     rig: Path | None = None  # calibration; images of another size than its K are rejected

@@ -1,4 +1,4 @@
-"""A frame as a camera source delivers it, and the errors of sources."""
+"""One frame of a camera source, and the errors of camera sources."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ import numpy as np
 
 
 class CameraError(OSError):
-    """The camera cannot be opened or no longer delivers; the text says why."""
+    """Error: the camera cannot be opened or returns no more images; the text contains the reason."""
 
 
 class CameraEnded(CameraError):
-    """The end of a video file."""
+    """Signal that the end of a video file is reached."""
 
 
 @dataclass(frozen=True)

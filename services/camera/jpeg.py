@@ -1,8 +1,8 @@
 """Check that a JPEG is complete: its segments, and for baseline JPEGs every Huffman code of every block.
 
-A decoder fills damaged areas without an error. Here a scan must hold all its blocks and end at its end
-marker (ITU-T T.81, annexes C and F.2). This detects truncation, longer losses and scattered wrong bytes.
-Of single wrong bytes it detects the smaller part, because Huffman decoding resynchronizes by itself and
+A decoder fills damaged areas without an error. This check requires that a scan contains all its blocks and
+ends at its end marker (ITU-T T.81, annexes C and F.2). It detects truncation, longer losses and several wrong
+bytes. Of single wrong bytes it detects less than half, because Huffman decoding resynchronizes by itself and
 JPEG has no checksum (detection rates in docs/sensors.md, measured by the test).
 """
 
@@ -21,7 +21,7 @@ _STAND_ALONE = frozenset([0x01, *range(0xD0, 0xD8)])
 
 
 def is_intact(data: bytes) -> bool:
-    """Return whether no damage is found in a JPEG."""
+    """Return whether the check finds no damage in a JPEG."""
     if not data.startswith(b"\xff\xd8") or not is_complete_image(data):
         return False
     try:
@@ -38,7 +38,7 @@ def is_intact(data: bytes) -> bool:
 def _parse_segments(
     data: bytes,
 ) -> tuple[int, np.ndarray, np.ndarray, int, int] | None:
-    """Return what is needed to decode the only scan of a baseline JPEG; None if it is not baseline.
+    """Return the data required to decode the only scan of a baseline JPEG; None if it is not baseline.
 
     Returns:
         Offset of the first entropy-coded byte; Huffman tables uint16 [T, 65536]; indices of the (DC, AC)
@@ -93,9 +93,7 @@ def _parse_frame_header(body: bytes) -> tuple[int, int, dict[int, tuple[int, int
 def _parse_scan_header(
     body: bytes, frame: tuple[int, int, dict[int, tuple[int, int]]], codes: dict[int, np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray, int]:
-    """Return the Huffman tables, the indices of the tables of each block of an MCU, and the number of
-    MCUs.
-    """
+    """Return the Huffman tables, the table indices of each block of an MCU, and the number of MCUs."""
     width, height, factors = frame
     order = sorted(codes)
     which: list[tuple[int, int]] = []
@@ -123,7 +121,7 @@ def _parse_huffman_tables(body: bytes, codes: dict[int, np.ndarray]) -> None:
 
 @lru_cache(maxsize=64)
 def _code_table(counts: bytes, symbols: bytes) -> np.ndarray:
-    """Return a lookup table of a Huffman code by the next 16 bits of the stream.
+    """Return a lookup table that maps the next 16 bits of the stream to a Huffman code.
 
     Returns:
         uint16 [65536]: code length << 8 | symbol; 0 where the bits are no code.
@@ -207,6 +205,6 @@ def _decode_scan(
 
 
 def warm() -> None:
-    """Compile the kernel, so that the first image does not wait for it."""
+    """Compile the kernel in advance, so that the first image is not delayed."""
     empty = np.zeros((1, 65536), np.uint16)
     _decode_scan(np.zeros(4, np.uint8), 0, empty, np.zeros((1, 2), np.int64), 1, 0)

@@ -1,4 +1,4 @@
-"""Read JPEG images over HTTP (multipart/x-mixed-replace) and pass them on byte for byte."""
+"""Source of JPEG images over HTTP (multipart/x-mixed-replace); the bytes are returned unchanged."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ _MAX_LINE = 4096  # bytes of one header line
 
 
 def is_multipart(url: str, timeout_s: float) -> bool:
-    """Return whether an address answers with a multipart stream.
+    """Return whether the server at `url` answers with a multipart stream.
 
     Raises:
-        CameraError: the address does not answer.
+        CameraError: the server does not answer.
     """
     source = HttpSource(url, timeout_s, lambda: 0, probe_only=True)
     source.close()
@@ -25,7 +25,7 @@ def is_multipart(url: str, timeout_s: float) -> bool:
 
 
 class HttpSource:
-    """A multipart HTTP response, each part a JPEG. Parts without Content-Length are rejected."""
+    """A multipart HTTP response in which each part is a JPEG. Parts without Content-Length are rejected."""
 
     def __init__(
         self, url: str, timeout_s: float, now_ns: Callable[[], int], *, probe_only: bool = False
@@ -33,10 +33,10 @@ class HttpSource:
         """Connect and send the request.
 
         Args:
-            url: http or https address; user and password in it are sent as basic authentication.
+            url: http or https address; user and password in the address are sent as basic authentication.
             timeout_s: for the connection and for each read.
-            now_ns: the clock of the time stamps, ns.
-            probe_only: accept any answer; only `multipart` is of interest.
+            now_ns: returns the present time on the clock of the stamps, ns.
+            probe_only: accept any answer, to find out only whether it is multipart (`multipart`).
 
         Raises:
             CameraError: no answer, or not a multipart stream (unless `probe_only`).
@@ -64,10 +64,10 @@ class HttpSource:
             )
 
     def read(self) -> CapturedFrame:
-        """Return the next part; its time stamp is when its first header line arrived.
+        """Return the next part; its stamp is the time at which its first header line arrived.
 
         Raises:
-            CameraError: the stream ended, or no data came within the timeout.
+            CameraError: the stream ended, or no data arrived within the timeout.
         """
         try:
             length, stamp_ns = self._read_part_header()

@@ -1,4 +1,4 @@
-"""The camera node: publishes the camera's JPEG images unchanged, and the calibration that belongs to them."""
+"""The camera node: publishes the camera's JPEG images unchanged, and the calibration of the camera."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class CameraNode(Node):
     outputs = ("rig", "camera/image")
 
     def configure(self) -> None:
-        """Read the calibration, so that an error in it is reported before anything runs."""
+        """Read the calibration, so that an error in the rig file is reported before the system starts."""
         c = self.config
         self._rig = load_rig(c.rig) if c.rig is not None else None
         if self._rig is not None and self._rig.camera is None:
@@ -44,7 +44,7 @@ class CameraNode(Node):
         )  # fmt: skip
 
     def check_resources(self) -> None:
-        """Check that the rig file has a camera, and that a source that is a file exists."""
+        """Check that the rig file contains a camera, and that `source`, if it is a file, exists."""
         c = self.config
         rig = check_rig_option(c.rig)
         if rig is not None and rig.camera is None:
@@ -83,9 +83,9 @@ class CameraNode(Node):
         return CaptureSource(source, self._clock.now_ns, self._size_px(strict=False), self.config.rate_hz)
 
     def _size_px(self, *, strict: bool) -> tuple[int, int] | None:
-        """Return the image size (width, height) of the calibration, else None.
+        """Return the image size (width, height), px, of the calibration; None if it is unknown.
 
-        With `strict` False (the size to request from the camera) the options are the second choice.
+        If `strict` is False, the options `width_px` and `height_px` are used where there is no calibration.
         """
         c = self.config
         if self._rig is not None and self._rig.camera is not None:
@@ -94,7 +94,7 @@ class CameraNode(Node):
 
 
 class NoCamera(Node):
-    """Publishes the rig of a robot without a camera."""
+    """Publishes the calibration (`rig`) of a robot without a camera."""
 
     name = "camera"
     Config = NoCameraConfig
@@ -109,7 +109,7 @@ class NoCamera(Node):
         check_rig_option(self.config.rig)
 
     def source(self) -> Iterator[SourceItem | None]:
-        """Yield the calibration once, since the topic is latched; then None, without end."""
+        """Yield the calibration once, because the topic is latched; then None, without end."""
         yield _rig_message(self._rig, self._clock.now_ns(), str(self.config.rig))
         while True:
             time.sleep(0.2)

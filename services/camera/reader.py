@@ -1,6 +1,6 @@
-"""Keep a camera open: read it in a separate thread, reconnect after a failure, check each image.
+"""Reader of a camera: reads in a separate thread, reconnects after a failure, checks each image.
 
-Only images that are complete and have the size of the calibration are passed on.
+Only complete images with the size of the calibration are returned.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _MIN_OPEN_TIMEOUT_S = 5.0  # for the first image: network cameras start slowly
 
 
 class CameraSource(Protocol):
-    """An open camera."""
+    """Interface of an open camera."""
 
     where: str
 
@@ -37,7 +37,7 @@ class CameraSource(Protocol):
 
 
 class CheckedImage(NamedTuple):
-    """An image that is complete and has the size of the calibration."""
+    """A JPEG image that is complete and has the size of the calibration."""
 
     stamp_ns: int
     width_px: int
@@ -46,9 +46,7 @@ class CheckedImage(NamedTuple):
 
 
 class CameraReader:
-    """Delivers checked images of one camera until closed or to the end of a file; `status` is one line of
-    text.
-    """
+    """Yields checked images of one camera until it is closed or a file ends; `status` is one line of text."""
 
     def __init__(
         self,
@@ -77,7 +75,7 @@ class CameraReader:
         self.status = "not opened yet"
 
     def images(self) -> Iterator[CheckedImage | None]:
-        """Yield images as they arrive; None when no image arrived for a moment."""
+        """Yield images as they arrive; None if no image arrived for a short time."""
         while not self._closed:
             thread = self._thread = _CaptureThread(self._open_source)
             try:
@@ -96,7 +94,7 @@ class CameraReader:
                 time.sleep(_POLL_S)
 
     def close(self) -> None:
-        """Stop reading; the camera is released after the read in progress."""
+        """Stop reading; the camera is released after the present read."""
         self._closed = True
         if self._thread is not None:
             self._thread.stop()
@@ -124,7 +122,7 @@ class CameraReader:
             yield image
 
     def _check(self, frame: CapturedFrame) -> CheckedImage | None:
-        """Return the image if it passes all checks; otherwise count the reason and return None."""
+        """Return the image if all checks pass; otherwise count the reason and return None."""
         jpeg = frame.jpeg
         if jpeg is None:
             assert frame.bgr is not None  # a frame has one of both
@@ -175,9 +173,9 @@ class CameraReader:
 
 
 class _CaptureThread:
-    """Reads a source in a thread, because a read of a failed camera may block for long.
+    """Thread that reads a camera source and stores the newest frame.
 
-    Keeps the newest frame.
+    A separate thread is used because reading a failed camera may block for long.
     """
 
     def __init__(self, open_source: Callable[[], CameraSource]) -> None:
@@ -192,7 +190,7 @@ class _CaptureThread:
         threading.Thread(target=self._run, name="camera", daemon=True).start()
 
     def take(self, timeout_s: float) -> CapturedFrame | None:
-        """Return the newest frame not yet taken; None if none arrives within `timeout_s`.
+        """Return the newest frame that was not yet returned; None if no frame arrives within `timeout_s`.
 
         Raises:
             CameraError: the error that ended the source.
@@ -206,13 +204,13 @@ class _CaptureThread:
             return frame
 
     def take_dropped_count(self) -> int:
-        """Return how many frames were replaced by newer ones since the last call."""
+        """Return the number of frames that were replaced by newer ones since the last call."""
         with self._changed:
             count, self._dropped = self._dropped, 0
             return count
 
     def stop(self) -> None:
-        """Let the thread end after its current read, without waiting for it."""
+        """Request the thread to end after its present read, without waiting for it."""
         with self._changed:
             self._stopped = True
 

@@ -1,1 +1,1 @@
-"""The tick of live robots."""
+"""The clock service: ticks for live robots."""

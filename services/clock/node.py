@@ -1,6 +1,7 @@
-"""The clock node: one tick per second on the sensors' clock.
+"""The clock node: publishes one tick per second on the clock of the sensors.
 
-Nodes do their periodic background work on ticks. In a replay the ticks come from the recording's time.
+Nodes do their periodic background work on ticks. In a replay, the replay node publishes the ticks, on the
+time of the recording.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ TICK_NS = 1_000_000_000  # nominal rate of the topic `tick`: 1 Hz
 
 
 class ClockNode(Node):
-    """Publishes `tick` at full seconds."""
+    """Publishes `tick` at each full second."""
 
     name = "clock"
     outputs = ("tick",)
@@ -26,9 +27,9 @@ class ClockNode(Node):
         self._clock = StampClock()
 
     def source(self) -> Iterator[SourceItem | None]:
-        """Yield ticks without end; None in between.
+        """Yield ticks without end; None between ticks.
 
-        Seconds missed by a delay are left out, not published late.
+        Ticks that are missed because of a delay are omitted, not published late.
         """
         count = 0
         due_ns = (self._clock.now_ns() // TICK_NS + 1) * TICK_NS

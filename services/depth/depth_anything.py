@@ -1,8 +1,9 @@
 """Depth Anything V1 and V2: affine-invariant disparity, and the metric variants of V2.
 
-Preprocessing as in the reference (util/transform.py, dpt.py): RGB / 255, short side resized to the input
-size with the aspect ratio kept, both sides multiples of 14, bicubic, ImageNet mean and standard deviation.
-Exports differ in the names of their tensors, so the first input and the first output are used.
+Preprocessing as in the reference implementation (util/transform.py, dpt.py): RGB / 255; short side resized
+(bicubic) to the input size at constant aspect ratio, both sides multiples of 14; normalised by the ImageNet
+mean and standard deviation. Exported models have different tensor names, so the first input and the first
+output are used.
 """
 
 from __future__ import annotations
@@ -81,7 +82,10 @@ class DepthAnythingMetric(DepthAnything):
 
 
 def network_input_size(height: int, width: int, input_px: int) -> tuple[int, int]:
-    """Return (height, width) of the network input: short side >= `input_px`, multiples of 14, aspect kept."""
+    """Return (height, width) of the network input at the image's aspect ratio, in multiples of 14.
+
+    The short side is at least `input_px`.
+    """
     scale = max(input_px / height, input_px / width)
 
     def rounded(side: float) -> int:
@@ -92,7 +96,11 @@ def network_input_size(height: int, width: int, input_px: int) -> tuple[int, int
 
 
 def normalize_image(image_rgb: np.ndarray, side: tuple[int, int]) -> np.ndarray:
-    """Return float32 [1, 3, h, w] of uint8 [H, W, 3]: bicubic, ImageNet mean and standard deviation."""
+    """Return the network input float32 [1, 3, h, w] for an RGB image uint8 [H, W, 3].
+
+    The image is resized (bicubic) to `side` (h, w) and normalised by the ImageNet mean and standard
+    deviation.
+    """
     small = cv2.resize(image_rgb.astype(np.float32) / 255.0, side[::-1], interpolation=cv2.INTER_CUBIC)
     return np.ascontiguousarray(((small - _MEAN) / _STD).transpose(2, 0, 1)[None], dtype=np.float32)
 

@@ -1,7 +1,7 @@
-"""FastDepth (Wofk et al., ICRA 2019), trained on NYU-v2: small, metric with errors of tens of per cent.
+"""FastDepth (Wofk et al., ICRA 2019), trained on NYU-v2: small; metric depth with errors of tens of per cent.
 
 The network was trained on one field of view: 224x224 px with normalised focal lengths fx/w = 0.889,
-fy/h = 1.187. Every image is cropped to that field of view; RGB in [0, 1], no mean subtracted.
+fy/h = 1.187. Every image is cropped to that field of view; RGB in [0, 1], without subtraction of a mean.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class FastDepth:
     """Depth source FastDepth on ONNX Runtime.
 
     Raises:
-        UserError: the model file is missing, or holds another graph.
+        UserError: the model file is missing, or contains another network.
     """
 
     def __init__(self, model: str | Path = "fastdepth_nyu_fp32", threads: int = 1) -> None:
@@ -55,10 +55,11 @@ class FastDepth:
 
 
 def network_crop(camera: Pinhole) -> tuple[int, int, int, int, float]:
-    """Return the crop (u0, v0, u1, v1), half open, with the field of view of NYU-v2, and a depth factor.
+    """Return the crop (u0, v0, u1, v1) with the field of view of NYU-v2 (u1, v1 excluded) and a depth factor.
 
-    A camera with a narrower field of view fills the network input with a smaller part of the scene, so that
-    everything appears nearer. The factor corrects this to first order, by the ratio of the focal lengths.
+    If the camera's field of view is narrower, a smaller part of the scene fills the network input, so that
+    everything appears nearer. Multiplication of the depth by the factor, the ratio of the focal lengths,
+    corrects this to first order.
     """
     wanted_w, wanted_h = camera.fx_px / _FX_PER_WIDTH, camera.fy_px / _FY_PER_HEIGHT
     u0 = max(round(camera.cx_px + 0.5 - wanted_w / 2), 0)

@@ -1,4 +1,4 @@
-"""Search path of model files: BEAMSPLAT_MODELS, else the user's data folder."""
+"""Search for model files: folder BEAMSPLAT_MODELS if set, else the user's data folder."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from beamsplat.common.errors import UserError
 
 
 def models_dirs() -> list[Path]:
-    """Return the folders that are searched for models, in order; `pull` installs into the first."""
+    """Return the folders in which models are searched, in this order; `pull` installs into the first one."""
     given = os.environ.get("BEAMSPLAT_MODELS")
     if given:
         return [Path(part).expanduser() for part in given.split(os.pathsep) if part]
@@ -19,10 +19,12 @@ def models_dirs() -> list[Path]:
 
 
 def find_model(name: str | Path) -> Path:
-    """Return the file of a model: an existing path, or `name` or `name.onnx` in the models folders.
+    """Return the path of a model file.
+
+    `name`: an existing path, or `name` or `name.onnx` in one of the models folders.
 
     Raises:
-        UserError: not found; the message names the folders and how to obtain the file.
+        UserError: not found; the message contains the folders and how to obtain the file.
     """
     path = Path(name).expanduser()
     if path.is_file():

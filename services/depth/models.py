@@ -24,7 +24,7 @@ _TIMEOUT_S = 30.0
 
 
 class ModelEntry(Config):
-    """One row of `models.toml`."""
+    """One row of `models.toml`: a model file that can be downloaded, with its licence and digest."""
 
     source: str  # the depth source that uses it
     licence: str
@@ -48,10 +48,10 @@ def read_model_table(path: Path = TABLE) -> dict[str, ModelEntry]:
 
 
 def model_name(name: str, table: dict[str, ModelEntry]) -> str:
-    """Return the name of a model in the table; the name of a depth source means its first model there.
+    """Return the name of a model in the table; for the name of a depth source, its first model in the table.
 
     Raises:
-        UserError: there is neither; the message lists all names.
+        UserError: no model and no depth source has this name; the message lists all names.
     """
     if name in table:
         return name
@@ -67,10 +67,10 @@ def model_name(name: str, table: dict[str, ModelEntry]) -> str:
 
 
 def find_entry(name: str, table: dict[str, ModelEntry]) -> ModelEntry:
-    """Return the row called `name`, see `model_name`.
+    """Return the row of the table for a model or depth source, see `model_name`.
 
     Raises:
-        UserError: there is none; the message lists all names.
+        UserError: no such row; the message lists all names.
     """
     return table[model_name(name, table)]
 
@@ -83,8 +83,11 @@ def pull(
 ) -> Path:
     """Download a model into the first models folder and return its path; resume an interrupted download.
 
-    `agree(question)` must return True for a non-commercial licence, and for a file without a known digest.
-    `progress(done, total)` gets bytes; `total` is None if the server does not state it.
+    Args:
+        name: file name of the model, without suffix.
+        row: the model's row of the table.
+        agree: called with a question if the licence is non-commercial or the digest unknown; False cancels.
+        progress: called with (bytes received, total bytes or None if the server does not report it).
 
     Raises:
         UserError: no URL, no agreement, no connection, or a wrong digest (the file is then removed).
@@ -146,10 +149,10 @@ def _download(url: str, partial: Path, progress: Callable[[int, int | None], Non
 
 
 def describe_model_file(file: Path, table: dict[str, ModelEntry]) -> dict[str, object]:
-    """Return digest, matching row, inputs, outputs and execution providers of a model file.
+    """Return digest, table row, inputs, outputs and execution providers of a model file, as a dictionary.
 
     Raises:
-        UserError: the file is missing, or holds no graph that can run here.
+        UserError: the file is missing, or ONNX Runtime cannot run its graph here.
     """
     from beamsplat.services.depth.onnx_model import OnnxModel
 

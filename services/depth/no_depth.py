@@ -1,4 +1,4 @@
-"""Source `none`: no depth estimate; depth comes from beams and past images (the MonoGS configuration)."""
+"""Source `none`: no depth estimate; fusion uses beams and past images only (the MonoGS configuration)."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from beamsplat.services.depth.source import DepthInput, Estimate
 
 
 class NoDepth:
-    """Depth source that estimates nothing (null object)."""
+    """Depth source without an estimate (null object)."""
 
     def estimate(self, view: DepthInput) -> Estimate:
-        """Return a depth map of NaN: this source estimates nothing, and fusion uses lidar and past images."""
+        """Return a depth map of NaN [H, W], so that fusion uses lidar and past images only."""
         return Estimate(np.full(view.camera.shape, np.nan, dtype=np.float32), "none")

@@ -1,4 +1,4 @@
-"""The depth service: a dense depth estimate for the newest image, by the configured depth source."""
+"""The depth service: a dense depth estimate for the newest image, computed by the configured depth source."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _IMAGES = 8  # that may wait for their pose
 
 
 class DepthConfig(NodeConfig):
-    """Options of the depth service; `options` are those of `source`, which checks them."""
+    """Options of the depth service. `options` are passed to the depth source `source`, which checks them."""
 
     source: str = "stixel"
     options: dict[str, Any] = Field(default_factory=dict)
@@ -79,13 +79,13 @@ class DepthNode(Node):
         return iter(())
 
     def on_localization_odometry(self, odometry: Odometry) -> Outputs:
-        """Add a pose, and process the images that have waited for it."""
+        """Store a pose, then process the newest image for which a pose was missing until now."""
         if self._history is not None and odometry.status == "ok":
             self._history.add_pose(odometry.stamp_ns, odometry.T_odom_body)
             yield from self._estimate_waiting()
 
     def on_camera_image(self, image: Image) -> Outputs:
-        """Queue an image until the pose at its time is known, which is one scan later."""
+        """Queue an image until the pose at its time is known, which is about one scan later."""
         if self._undistort is not None:
             if len(self._waiting) == _IMAGES:  # poses are late: the oldest image is dropped and counted
                 self._count_overtaken()
@@ -97,7 +97,7 @@ class DepthNode(Node):
         self.detail = f"{self.overtaken} images overtaken"
 
     def _estimate_waiting(self) -> Outputs:
-        """Process the newest image that is ready; older ones are dropped and counted as overtaken."""
+        """Process the newest image whose pose is known; older images are dropped and counted as overtaken."""
         image = None
         assert self._history is not None  # images are queued after the calibration only
         assert self._undistort is not None
@@ -130,10 +130,10 @@ class DepthNode(Node):
         )
 
     def _decode_image(self, image: Image, undistort: Undistorter) -> np.ndarray:
-        """Return the undistorted image uint8 [H, W, 3]; black for a source that does not use it.
+        """Return the undistorted image uint8 [H, W, 3]; a black image if the depth source ignores images.
 
         Raises:
-            UserError, ValueError: it cannot be decoded, or its size differs from the calibration.
+            UserError, ValueError: the image cannot be decoded, or its size differs from the calibration.
         """
         shape = undistort.pinhole.shape
         if self.config.source in IGNORES_IMAGE and (image.height_px, image.width_px) == shape:

@@ -1,7 +1,7 @@
-"""ONNX Runtime session whose inputs and outputs are checked before the first run.
+"""ONNX Runtime session with checks of the network's inputs and outputs before the first run.
 
-On a CPU: one thread and no spinning. On two busy cores a second thread gains nothing, and spinning threads
-doubled the latency of the small network.
+On a CPU, one thread is used, without active waiting (spinning). On two busy cores a second thread is not
+faster, and spinning threads doubled the latency of the small network.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _DTYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16, "tensor(d
 
 @dataclass(frozen=True)
 class TensorSpec:
-    """Name, shape and type of one input or output; None stands for a dynamic size."""
+    """Name, shape and dtype of one input or output of a network; None in the shape = dynamic size."""
 
     name: str
     shape: tuple[int | None, ...]
@@ -32,7 +32,7 @@ class TensorSpec:
 
 
 def available_providers(wanted: tuple[str, ...] = PROVIDERS) -> list[str]:
-    """Return the providers of `wanted` that this onnxruntime has, in that order."""
+    """Return those of the execution providers `wanted` that this onnxruntime has, in the same order."""
     available = set(ort.get_available_providers())
     return [name for name in wanted if name in available]
 
@@ -79,10 +79,10 @@ class OnnxModel:
         return TensorSpec(node.name, shape, np.dtype(_DTYPES[node.type]))
 
     def image_input(self, number: int = 0, name: str | None = None) -> TensorSpec:
-        """Return the input for an RGB image, N x 3 x H x W: the one called `name`, else number `number`.
+        """Return the input for an RGB image, N x 3 x H x W: the input called `name`, else input `number`.
 
         Raises:
-            UserError: there is no such input, or its shape is not N x 3 x H x W.
+            UserError: no such input, or its shape is not N x 3 x H x W.
         """
         spec = next((p for p in self.inputs if p.name == name), None)
         if spec is None:
@@ -98,10 +98,10 @@ class OnnxModel:
         return spec
 
     def output(self, name: str) -> TensorSpec:
-        """Return the output called `name`.
+        """Return the spec of the output called `name`.
 
         Raises:
-            UserError: there is none; the message lists all outputs.
+            UserError: no such output; the message lists all outputs.
         """
         for spec in self.outputs:
             if spec.name == name:
@@ -112,13 +112,13 @@ class OnnxModel:
         )
 
     def check_inputs(self, count: int) -> None:
-        """Raise UserError unless the graph has `count` inputs."""
+        """Raise UserError unless the network has exactly `count` inputs."""
         if len(self.inputs) != count:
             names = ", ".join(spec.name for spec in self.inputs)
             raise UserError(f"{self.path}: takes {len(self.inputs)} inputs ({names}); expected {count}")
 
     def input_size(self, spec: TensorSpec, height: int, width: int, multiple: int) -> tuple[int, int]:
-        """Return (height, width) of the network input: those of the graph if fixed, else the given ones.
+        """Return (height, width) of the network input: fixed sizes of the graph, else `height` and `width`.
 
         Raises:
             UserError: a side is not a multiple of `multiple`.
@@ -132,10 +132,14 @@ class OnnxModel:
         return chosen
 
     def run(self, *arrays: np.ndarray, outputs: tuple[str, ...] | None = None) -> list[np.ndarray]:
-        """Run the graph on inputs in its order and return the outputs as float32 arrays.
+        """Run the network and return its outputs as float32 arrays.
+
+        Args:
+            arrays: the inputs, in the order of the graph.
+            outputs: names of the outputs to return; None = all.
 
         Raises:
-            UserError: the graph rejects the shape of an input.
+            UserError: the network rejects the shape of an input.
         """
         feed = {
             spec.name: np.ascontiguousarray(array, dtype=spec.dtype)
@@ -150,14 +154,14 @@ class OnnxModel:
         return [np.asarray(result, dtype=np.float32) for result in results]
 
     def warm_up(self, *shapes: tuple[int, ...]) -> list[np.ndarray]:
-        """Run twice on grey inputs, which allocates all buffers, and return the outputs."""
+        """Run the network twice on grey inputs of `shapes`, to allocate all buffers; return the outputs."""
         arrays = [np.full(shape, 0.5, dtype=np.float32) for shape in shapes]
         self.run(*arrays)
         return self.run(*arrays)
 
 
 def to_hw(output: np.ndarray, where: str) -> np.ndarray:
-    """Return an output of shape [1, 1, H, W], [1, H, W] or [H, W] as [H, W].
+    """Return a network output of shape [1, 1, H, W], [1, H, W] or [H, W] as [H, W].
 
     Raises:
         UserError: any other shape.

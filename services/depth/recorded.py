@@ -1,4 +1,4 @@
-"""Source `recorded`: depth maps by stamp from a folder, for networks that cannot run here."""
+"""Source `recorded`: reads depth maps from a folder, for networks that cannot run on this machine."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from beamsplat.services.depth.source import DepthInput, Estimate, Kind, check_de
 
 
 class RecordedDepth:
-    """Depth source that reads `<stamp_ns>.png` (uint16 mm, 0 = unknown) or `.npy` (float, by `kind`).
+    """Depth source that reads `<stamp_ns>.png` (uint16 mm, 0 = unknown) or `.npy` (float; option `kind`).
 
     Raises:
-        UserError: the folder is missing, or has no such file.
+        UserError: the folder is missing, or contains no such file.
     """
 
     def __init__(self, folder: str | Path = "", kind: Kind = "metric", tolerance_ns: int = 1_000_000) -> None:
@@ -32,7 +32,10 @@ class RecordedDepth:
         self._tolerance_ns = tolerance_ns
 
     def estimate(self, view: DepthInput) -> Estimate:
-        """Return the depth map nearest in time, resized to the image; a status if it is too far in time."""
+        """Return the depth map nearest in time, resized to the image size.
+
+        If its stamp differs by more than the tolerance, all values are NaN and `status` contains the reason.
+        """
         i = int(np.argmin(np.abs(self._stamps - view.stamp_ns)))
         empty = np.full(view.camera.shape, np.nan, dtype=np.float32)
         if abs(int(self._stamps[i]) - view.stamp_ns) > self._tolerance_ns:
@@ -50,10 +53,10 @@ class RecordedDepth:
 
 
 def read_depth(path: Path) -> np.ndarray:
-    """Return float32 [H, W]: a 16 bit PNG in mm as metres (0 = NaN), a .npy file unchanged.
+    """Return a depth map float32 [H, W]: a 16 bit PNG in mm as metres (0 = NaN), or a .npy file unchanged.
 
     Raises:
-        UserError: unreadable, or of another kind.
+        UserError: the file cannot be read, or is neither of these two.
     """
     if path.suffix == ".npy":
         try:

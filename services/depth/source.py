@@ -1,7 +1,7 @@
 """Interface of depth sources, and the table of their names.
 
-A source takes one undistorted image (geometric sources also the beams at that time) and returns a dense
-estimate of the same size. `Estimate.kind` states the meaning of the values; fusion scales them to metres.
+A source takes one undistorted image (geometric sources also the beams at the image time) and returns a dense
+estimate of the same size. `Estimate.kind` defines the meaning of the values; fusion scales them to metres.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ Kind = Literal["metric", "relative", "disparity", "none"]
 
 @dataclass(frozen=True)
 class DepthInput:
-    """One image with its camera model and the beams at its time."""
+    """Input of a depth source: one image with its camera model and the beams at the image time."""
 
     stamp_ns: int
     image_rgb: np.ndarray  # uint8 [H, W, 3], undistorted
@@ -52,10 +52,10 @@ class Estimate:
 
 
 class DepthSource(Protocol):
-    """Estimator of dense depth from one image."""
+    """Interface of an estimator of dense depth from one image."""
 
     def estimate(self, view: DepthInput) -> Estimate:
-        """Return the estimate for one image; for a bad image it has a `status`, no exception is raised."""
+        """Return the estimate for one image; for an unusable image, set `status` and raise no exception."""
         ...
 
 
@@ -81,7 +81,7 @@ def source_class(name: str) -> type[DepthSource]:
     """Import and return the class of a depth source.
 
     Args:
-        name: a key of `SOURCES`, or the path of a class elsewhere, "my_package.my_module:MySource".
+        name: a key of `SOURCES`, or the path of a class of another package, "my_package.my_module:MySource".
 
     Raises:
         UserError: no such source, or a class that is not a depth source.
@@ -103,20 +103,20 @@ def source_class(name: str) -> type[DepthSource]:
 
 
 def make_source(name: str, options: Mapping[str, Any] | None = None) -> DepthSource:
-    """Create the depth source called `name` (see `source_class`) with its own options.
+    """Create the depth source called `name` (see `source_class`) with the options of this source.
 
     Raises:
-        UserError: no such source, an option it does not take, or a model that is missing or wrong.
+        UserError: no such source, an unknown option, or a model file that is missing or wrong.
     """
     cls = source_class(name)
     return cls(**_checked_options(name, cls, options or {}))
 
 
 def check_source(name: str, options: Mapping[str, Any]) -> None:
-    """Check the name, the options and the files of a depth source, without loading its network.
+    """Check name, options and files of a depth source, without loading its network.
 
     Raises:
-        UserError: as `make_source`; whether a model file holds the right network is not checked.
+        UserError: as `make_source`; whether a model file contains the correct network is not checked.
     """
     cls = source_class(name)
     checked = _checked_options(name, cls, options)
@@ -130,15 +130,15 @@ def check_source(name: str, options: Mapping[str, Any]) -> None:
 
 
 def uses_beams(name: str, source: DepthSource) -> bool:
-    """Return whether a source reads `DepthInput.beams`; a class of your own sets `uses_beams = True`."""
+    """Return whether a depth source reads `DepthInput.beams` (`uses_beams = True` in other packages)."""
     return name in USES_BEAMS or bool(getattr(source, "uses_beams", False))
 
 
 def _checked_options(name: str, cls: type[DepthSource], options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return options whose names and types fit the constructor's parameters and annotations.
+    """Return the options, after a check of their names and types against the signature of the constructor.
 
     Raises:
-        UserError: an option that the source does not take, that it lacks, or of another type.
+        UserError: an unknown or a missing option, or an option of another type.
     """
     signature = inspect.signature(cls)
     try:
@@ -160,7 +160,10 @@ def _checked_options(name: str, cls: type[DepthSource], options: Mapping[str, An
 
 
 def check_depth_map(values: np.ndarray, min_known_share: float = 0.2) -> str:
-    """Return "ok", or the reason why the output [H, W] of a network cannot be depth."""
+    """Return "ok", or the reason why the output [H, W] of a network is not a depth map.
+
+    `min_known_share`: least fraction of pixels that must have a value.
+    """
     finite = np.isfinite(values)
     share = float(finite.mean()) if values.size else 0.0
     if share < min_known_share:

@@ -15,7 +15,7 @@ _FINE = 2  # azimuths per pixel column
 
 @dataclass(frozen=True)
 class _PixelRays:
-    """Rays of one mounted camera, computed once."""
+    """Pixel rays of one camera in the body frame, computed once."""
 
     camera: Pinhole
     T_body_camera: np.ndarray
@@ -26,7 +26,7 @@ class _PixelRays:
 
 
 class Stixel:
-    """Depth source of vertically extruded beams, and of the floor plane if the camera height is known."""
+    """Depth source of vertically extruded beams, cut off by the floor plane if the camera height is known."""
 
     def __init__(self, max_depth_m: float = 30.0) -> None:
         self._max_depth_m = max_depth_m

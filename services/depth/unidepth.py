@@ -1,9 +1,9 @@
 """UniDepth V2, exported by its own export.py: metric points, confidence and estimated intrinsics.
 
-Inputs and outputs: `rgbs` [B, 3, H, W], ImageNet-normalize_image, and with the camera `rays` [B, 3, H, W],
-unit vectors K^-1 [u, v, 1] at network resolution with pixel centres at half integers; out `pts_3d` [B, 3,
-H, W] in metres, `confidence` [B, 1, H, W], `intrinsics` [B, 3, 3]. H and W are fixed multiples of 14. Depth
-is pts_3d's z, not its length.
+Inputs: `rgbs` [B, 3, H, W], an image normalised by the ImageNet mean and standard deviation; in exports with
+a camera also `rays` [B, 3, H, W], unit vectors along K^-1 [u, v, 1] at network resolution, with pixel centres
+at half integers. Outputs: `pts_3d` [B, 3, H, W] in metres, `confidence` [B, 1, H, W], `intrinsics` [B, 3, 3].
+H and W are fixed multiples of 14. Depth is the z coordinate of pts_3d, not its length.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from beamsplat.services.depth.source import DepthInput, Estimate, check_depth_ma
 
 @dataclass(frozen=True)
 class LetterboxLayout:
-    """Position of an image in the network input: scaled by `factor`, then padded."""
+    """Position of an image in the network input: the image is scaled by `factor`, then padded (letterbox)."""
 
     factor: float
     left_px: int
@@ -63,7 +63,7 @@ class UniDepth:
         self._onnx.warm_up(*([shape, shape] if self._takes_rays else [shape]))
 
     def estimate(self, view: DepthInput) -> Estimate:
-        """Return metric depth at the image size, with a confidence that ranks the pixels of this image."""
+        """Return metric depth at the image size, with a confidence comparable within this image only."""
         h, w = view.camera.shape
         fit = letterbox_layout(h, w, self._side)
         inputs = [normalize_image(letterbox(view.image_rgb, fit, self._side), self._side)]
@@ -89,7 +89,10 @@ class UniDepth:
 
 
 def letterbox_layout(height: int, width: int, side: tuple[int, int]) -> LetterboxLayout:
-    """Return the layout of the largest image of the given aspect ratio in the network input, centred."""
+    """Return the layout of an image, scaled as large as fits into the network input and centred.
+
+    `height`, `width`: size of the image; `side`: (height, width) of the network input; all in px.
+    """
     factor = min(side[0] / height, side[1] / width)
     inner_h, inner_w = min(round(height * factor), side[0]), min(round(width * factor), side[1])
     return LetterboxLayout(factor, (side[1] - inner_w) // 2, (side[0] - inner_h) // 2, inner_w, inner_h)

@@ -1,4 +1,4 @@
-"""Dynamic beams by free space: returns in cells that past beams have passed through."""
+"""Detection of beams on dynamic objects: returns in grid cells that earlier beams have passed through."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from beamsplat.common.compiled import kernel
 
 
 class FreeSpaceGrid:
-    """Grid over the floor with the number of passes and hits of beams in each cell."""
+    """Grid over the floor; counts the beams that passed each cell and the beams that ended in it."""
 
     def __init__(self, cell_m: float = 0.1, side_m: float = 60.0) -> None:
         cells = round(side_m / cell_m)
@@ -24,7 +24,7 @@ class FreeSpaceGrid:
         count_ray_cells(start, ends, self._low_m, self.cell_m, self._pass_count, self._hit_count)
 
     def dynamic_returns(self, points_map_m: np.ndarray, least: int = 6, ratio: float = 0.1) -> np.ndarray:
-        """Return bool [N]: returns in cells with `least` passes or more and at most `ratio` hits per pass."""
+        """Return bool [N]: returns in cells with >= `least` passes and <= `ratio` hits per pass."""
         index = np.floor((points_map_m[:, :2] - self._low_m) / self.cell_m).astype(np.int64)
         size = len(self._pass_count)
         inside = np.all((index >= 1) & (index < size - 1), axis=1)

@@ -1,4 +1,4 @@
-"""Fusion by method `field`: image, pose, beams and depth estimate in; metric depth, sigma and status out."""
+"""Fusion by method `field`: metric depth and its standard deviation from image, pose, beams and estimate."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _LEAST_INLIERS = 0.3  # share of the beams that fit the result, below which it i
 
 
 class Fusion:
-    """Dense metric depth of a stream of images: plane sweep at keyframes, warped depth between them."""
+    """Dense metric depth of a sequence of images: plane sweep at keyframes, warped depth in between."""
 
     def __init__(
         self, camera: Pinhole, T_body_camera: np.ndarray, *, floor_known: bool, planar: bool,
@@ -52,9 +52,10 @@ class Fusion:
         self._sweep.add_scan(points_map_m)
 
     def fuse(self, frame: FusionInput, *, keyframe: bool) -> FusionResult:
-        """Return the depth of one image, or a rejected result with the reason.
+        """Return the metric depth of one image, or a result without depth whose status is the reason.
 
-        A keyframe costs several times more than another image; its depth is warped into later images.
+        A keyframe needs several times more computation than another image; its depth is warped into later
+        images.
         """
         shape = self._sweep.camera.shape
         status = self._image_check.check(frame.image_rgb, frame.T_map_body)
@@ -82,7 +83,7 @@ class Fusion:
         return self._to_full_size(frame, swept, sigma_log, uv, z)
 
     def look(self, image_rgb: np.ndarray, T_map_body: np.ndarray) -> None:
-        """Store an image for later sweeps, without estimating its depth."""
+        """Store an image for later plane sweeps, without estimating its depth."""
         frame = FusionInput(0, image_rgb, T_map_body, NO_BEAMS)
         if self._image_check.check(image_rgb, T_map_body) == "ok":
             self._sweep.keep_if_moved(frame)
@@ -90,7 +91,10 @@ class Fusion:
     def _depth_between_keyframes(
         self, frame: FusionInput, warped: WarpedDepth, surfaces: CandidateSurfaces
     ) -> SweepResult:
-        """Return keyframe depth, else the surfaces, else the estimate; `spread` is sigma of log depth."""
+        """Return, per pixel, the warped keyframe depth, else a candidate surface, else the depth estimate.
+
+        `SweepResult.spread` contains the standard deviation of log depth.
+        """
         depth = surfaces.nearest.astype(np.float32)
         upright = _UPRIGHT if self._planar else _TILTING
         spread = np.full(depth.shape, upright, dtype=np.float32)
@@ -114,7 +118,10 @@ class Fusion:
         return SweepResult(depth, spread, at_beam | exact, 0)
 
     def _contradicting_share(self, warped: np.ndarray, uv: np.ndarray, z: np.ndarray) -> float | None:
-        """Return the share of beams that contradict the warped depth; None if too few can be compared."""
+        """Return the fraction of beams that contradict the warped depth; None if too few can be compared.
+
+        `warped` [h, w] m; `uv` [N, 2] pixels of the beams; `z` [N] their optical z, m.
+        """
         if len(z) == 0:
             return None
         h, w = warped.shape
@@ -127,7 +134,7 @@ class Fusion:
         return float(np.mean(np.abs(np.log(z[known] / then[known])) > _CONTRADICTION))
 
     def _sweep_sigma_log(self, swept: SweepResult, surfaces: CandidateSurfaces) -> np.ndarray:
-        """Return sigma of log depth [h, w] from the evidence of each pixel and the spread of its labels."""
+        """Return the standard deviation of log depth [h, w], by kind of surface and label spread."""
         with np.errstate(invalid="ignore"):
             floor = swept.snapped & (np.abs(np.log(surfaces.floor / swept.depth_m)) < 0.01)
             beam = swept.snapped & (surfaces.wall_offset_m < _BEAM_HEIGHT_M)
@@ -138,13 +145,13 @@ class Fusion:
         return np.hypot(base, doubt).astype(np.float32)
 
     def _pin_to_beams(self, swept: SweepResult, sigma_log: np.ndarray, surfaces: CandidateSurfaces) -> None:
-        """Set depth and sigma on the scan line to those of the beams, in place."""
+        """Overwrite depth and standard deviation on the scan line with those of the beams, in place."""
         pinned = (surfaces.wall_offset_m < 0.5 * _BEAM_HEIGHT_M) & ~surfaces.on_floor
         swept.depth_m[pinned] = surfaces.wall[pinned]
         sigma_log[pinned] = _BEAM + _BETWEEN_BEAMS_M / swept.depth_m[pinned]
 
     def _inflate_at_edges(self, depth: np.ndarray, sigma_log: np.ndarray) -> np.ndarray:
-        """Return sigma of log depth, enlarged next to depth jumps."""
+        """Return the standard deviation of log depth [h, w], increased next to depth edges."""
         known = np.isfinite(depth)
         middle = float(np.median(depth[known])) if known.any() else 1.0
         log_z = np.log(np.where(known, depth, middle)).astype(np.float32)
@@ -153,7 +160,7 @@ class Fusion:
         return np.hypot(sigma_log, np.where(jump > _SAME_SURFACE, _EDGE * jump, 0.0)).astype(np.float32)
 
     def _known_mask(self, depth: np.ndarray, sigma_log: np.ndarray) -> np.ndarray:
-        """Return bool [h, w]: pixels whose depth is certain enough to be output."""
+        """Return bool [h, w]: True for pixels whose standard deviation is small enough for output."""
         config = self._sweep.config
         sure = sigma_log <= config.max_sigma_log
         if np.isfinite(config.max_sigma_m):
@@ -165,7 +172,7 @@ class Fusion:
     def _to_full_size(
         self, frame: FusionInput, swept: SweepResult, sigma_log: np.ndarray, uv: np.ndarray, z: np.ndarray
     ) -> FusionResult:
-        """Return the result at the image size, with scale, inlier share and residual at the beams."""
+        """Return the result at the image size, with scale, inlier share and residual (m) at the beams."""
         h, w = self._sweep.working_camera.shape
         depth = np.empty(self._sweep.camera.shape, np.float32)
         sigma = np.empty_like(depth)

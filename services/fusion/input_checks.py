@@ -9,7 +9,7 @@ _SIDE = 64
 
 
 class ImageCheck:
-    """Check of exposure and of a frozen camera over a stream of images."""
+    """Check of each image of a sequence for wrong exposure and for a frozen camera."""
 
     def __init__(self, still_m: float = 0.10, still_rad: float = 0.05) -> None:
         self._still_m, self._still_rad = still_m, still_rad
@@ -17,10 +17,10 @@ class ImageCheck:
         self._T_map_body: np.ndarray | None = None  # where the image last changed
 
     def check(self, image_rgb: np.ndarray, T_map_body: np.ndarray) -> str:
-        """Return "ok", or why this image uint8 [H, W, 3] must not be used.
+        """Return "ok", or the reason why this image uint8 [H, W, 3] must not be used.
 
-        A live camera never repeats an image, because of noise. An image identical to the one before means a
-        frozen camera if the robot has moved by `still_m` or turned by `still_rad` since.
+        Because of noise, a live camera never returns the same image twice. An image identical to the previous
+        one means a frozen camera if the robot has since moved by `still_m` or rotated by `still_rad`.
         """
         grey = cv2.resize(
             cv2.cvtColor(image_rgb, cv2.COLOR_RGB2GRAY), (_SIDE, _SIDE), interpolation=cv2.INTER_AREA
@@ -44,7 +44,7 @@ class ImageCheck:
 
 
 def check_exposure(grey: np.ndarray) -> str:
-    """Return "ok", or what is wrong with the brightness of an image uint8 [h, w]."""
+    """Return "ok", or one sentence if an image uint8 [h, w] is too dark, too bright or without contrast."""
     if float(np.percentile(grey, 95)) < 12.0:
         return "the image is black"
     if float(np.percentile(grey, 15)) > 248.0:
@@ -55,9 +55,12 @@ def check_exposure(grey: np.ndarray) -> str:
 
 
 def check_beams(in_view: int, disagree_share: float | None, least: int = 8) -> str:
-    """Return "ok", or why the beams in view cannot determine the scale.
+    """Return "ok", or the reason why the beams in view cannot determine the scale.
 
-    `disagree_share`: share of the beams in view that contradict the depth of past keyframes; None = unknown.
+    Args:
+        in_view: number of beams in the image.
+        disagree_share: fraction of these beams that contradict the depth of past keyframes; None = unknown.
+        least: smallest sufficient number of beams.
     """
     if in_view < least:
         return f"no beams in view ({in_view} of at least {least}): the scale is unknown"

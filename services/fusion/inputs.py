@@ -15,8 +15,8 @@ from beamsplat.services.fusion.scaling import Kind
 class PlaneSweepConfig:
     """Settings of the plane sweep. Weights are in units of the matching cost (at most `cost_scale`).
 
-    The defaults are for a body that stays level on a floor, `in_hand()` for a hand-held sensor. Both are
-    tuned with `beamsplat eval depth` on one recording each (`house_a`, `redkitchen`).
+    The defaults are for a body that stays level on a floor, `in_hand()` for a hand-held sensor. Each set was
+    tuned with `beamsplat eval depth` on one recording (`house_a`, `redkitchen`).
     """
 
     width_px: int = 160  # working size; the height follows from the aspect ratio
@@ -55,7 +55,7 @@ class PlaneSweepConfig:
 
     @staticmethod
     def in_hand() -> PlaneSweepConfig:
-        """Return settings for hand-held sensors: no floor, tilted walls, keyframe agreement counts."""
+        """Return settings for hand-held sensors: no floor plane, inclined walls, keyframes can outvote."""
         return PlaneSweepConfig(
             labels=88, baselines_m=(0.1, 0.2, 0.4, 0.8),
             cost_cap=np.inf, p2=12.0, edge_grey=12.0, temperature=2.0, keyframe_depth=1.5,
@@ -66,7 +66,7 @@ class PlaneSweepConfig:
 
 @dataclass(frozen=True)
 class FusionInput:
-    """One undistorted image with its pose, its beams and the depth source's estimate."""
+    """One undistorted image with the robot's pose, the beams and the depth estimate at the image time."""
 
     stamp_ns: int
     image_rgb: np.ndarray  # uint8 [H, W, 3]
@@ -78,7 +78,7 @@ class FusionInput:
 
 @dataclass(frozen=True)
 class WorkingImage:
-    """An image at the working size [h, w], with its matching features."""
+    """An image at the working size [h, w], with the features for matching and the camera pose."""
 
     T_map_camera: np.ndarray
     grey: np.ndarray  # float32 [h, w]
@@ -88,7 +88,7 @@ class WorkingImage:
 
 @dataclass(frozen=True)
 class SweepResult:
-    """Depth at the working size."""
+    """Depth map of one image at the working size [h, w], with its uncertainty."""
 
     depth_m: np.ndarray  # float32 [h, w]
     spread: np.ndarray  # float32 [h, w]: standard deviation of log depth over the label distribution

@@ -1,4 +1,4 @@
-"""Depth maps of past keyframes, warped into the view of another image."""
+"""Depth maps of past keyframes, transformed (warped) into the view of another image."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from beamsplat.common.geometry.transforms import inverse
 
 @dataclass(frozen=True)
 class WarpedDepth:
-    """Depth of past keyframes in the pixels of a view."""
+    """Depth of past keyframes, warped into the pixels of another view (optical z of that view)."""
 
     depth_m: np.ndarray  # float32 [h, w], NaN = seen by no keyframe
     votes: np.ndarray  # int64 [h, w]: keyframes that agree on it
 
 
 class KeyframeDepths:
-    """The last `most` keyframe depth maps of one camera, at the working size."""
+    """Buffer of the newest `most` keyframe depth maps of one camera, at the working size."""
 
     def __init__(self, K: np.ndarray, shape: tuple[int, int], most: int) -> None:
         self._K = np.asarray(K, dtype=np.float32)  # [4] fx, fy, cx, cy
@@ -31,11 +31,15 @@ class KeyframeDepths:
         return len(self._ring)
 
     def add(self, T_map_camera: np.ndarray, depth_m: np.ndarray) -> None:
-        """Store a depth map float32 [h, w]; NaN pixels are not warped."""
+        """Store the depth map (optical z, m, float32 [h, w]) of a keyframe; NaN pixels are not warped."""
         self._ring.append((T_map_camera, np.ascontiguousarray(depth_m, dtype=np.float32)))
 
     def warp_into(self, T_map_camera: np.ndarray, agreement: float = 0.06) -> WarpedDepth:
-        """Return the median of the warped depths of each pixel, and how many are within `agreement` (log)."""
+        """Return the depth of all stored keyframes, warped into the camera view at `T_map_camera` [4, 4].
+
+        Per pixel: the median of the warped depths, and the number of keyframes within `agreement` (log depth)
+        of it.
+        """
         warped = np.full((len(self._ring), *self._shape), np.nan, dtype=np.float32)
         T_camera_map = inverse(T_map_camera)
         for k, (T_map_then, depth) in enumerate(self._ring):
@@ -49,9 +53,10 @@ class KeyframeDepths:
 
 @kernel
 def warp_depth(z: np.ndarray, R: np.ndarray, t: np.ndarray, K: np.ndarray, out: np.ndarray) -> None:
-    """Warp depth float32 [h, w] of one view into another (`R, t`: first to second), with a z-buffer.
+    """Warp a depth map float32 [h, w] from one view into another, with a z-buffer; write `out` [h, w].
 
-    A pixel covers an area that grows as it comes nearer, plus 0.3 px on each side to close gaps.
+    `R` [3, 3], `t` [3] transform points of the first camera frame to the second. A pixel covers an area that
+    grows as the surface is nearer in the second view, plus 0.3 px on each side to close gaps.
     """
     h, w = z.shape
     fx, fy, cx, cy = K[0], K[1], K[2], K[3]
@@ -83,7 +88,10 @@ def warp_depth(z: np.ndarray, R: np.ndarray, t: np.ndarray, K: np.ndarray, out: 
 
 @kernel
 def median_vote(warped: np.ndarray, agreement: float, depth: np.ndarray, votes: np.ndarray) -> None:
-    """Write the median over the first axis of float32 [n, h, w] without NaN, and the count near it."""
+    """Write, per pixel, the median of n depths and how many are within `agreement` (log) of the median.
+
+    `warped` float32 [n, h, w]; NaN is ignored. Writes `depth` and `votes` [h, w].
+    """
     n, h, w = warped.shape
     values = np.empty(n, np.float64)
     low, high = np.exp(-agreement), np.exp(agreement)

@@ -1,7 +1,8 @@
-"""Grid map of all beam returns of a drive in the floor plane, for walls that the present scan does not see.
+"""Grid map of all returns of a drive in the floor plane, for walls that the present scan cannot measure.
 
-A column of the image may show a wall above a low cupboard that hides it from the lidar; the lidar may have
-seen that wall from elsewhere. Only for robots that stay on a floor: a tilting lidar measures other heights.
+In one image column, a wall may be visible above a low cupboard that hides the wall from the lidar; an earlier
+scan from another place may contain that wall. Only for robots that stay on a floor: a tilted lidar measures
+at other heights.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from beamsplat.common.compiled import kernel
 
 
 class LidarMap:
-    """Grid with the number and the mean position of the returns in each cell; grows as needed."""
+    """Grid with the number and the mean position of the returns in each cell; grows as required."""
 
     def __init__(self, cell_m: float = 0.04) -> None:
         self.cell_m = cell_m
@@ -49,7 +50,11 @@ class LidarMap:
         self._cells, self._origin = grown, low
 
     def points(self, min_hits: int = 3) -> np.ndarray:
-        """Return the mean return float64 [N, 2] of every cell with `min_hits` returns or more."""
+        """Return the mean position (map frame, m) of the returns in every cell with >= `min_hits` returns.
+
+        Returns:
+            float64 [N, 2].
+        """
         row, column = np.nonzero(self._cells[..., 0] >= min_hits)
         n = self._cells[row, column, 0].astype(np.float64)
         inner = self._cells[row, column, 1:].astype(np.float64) / n[:, None]
@@ -63,7 +68,7 @@ class LidarMap:
         max_range_m: float = 14.0,
         min_hits: int = 2,
     ) -> np.ndarray:
-        """Return ranges float64 [count, M] of the surfaces along each ray, nearest first, NaN = none."""
+        """Return ranges (m) of mapped surfaces on each ray, float64 [count, M], nearest first; NaN: none."""
         out = np.full((count, len(azimuth_map_rad)), np.nan)
         if self._cells.size:
             cast_rays(
@@ -85,7 +90,10 @@ def cast_rays(
     min_hits: int,
     out: np.ndarray,  # float64 [L, M]
 ) -> None:
-    """Write the surface ranges of each ray: steps of half a cell; a run of hit cells is one surface."""
+    """Write the ranges (m) of the surfaces along each ray to `out` [count, M], nearest first.
+
+    The step along the ray is half a cell. Consecutive cells with returns count as one surface.
+    """
     rows, columns = cells.shape[0], cells.shape[1]
     for k in range(azimuth_rad.shape[0]):
         ca, sa = np.cos(azimuth_rad[k]), np.sin(azimuth_rad[k])

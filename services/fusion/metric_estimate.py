@@ -1,4 +1,4 @@
-"""The depth source's estimate scaled to metres along the scan line, and its uncertainty."""
+"""The depth source's estimate, scaled to metres with the beams of the scan line, and its uncertainty."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _BAND = 0.10  # of the image width: standard deviation of the smoothing kernel
 
 @dataclass(frozen=True)
 class MetricEstimate:
-    """An estimated depth map with a scale factor per image column."""
+    """A depth estimate with one scale factor per image column that converts the values to metres."""
 
     estimate: np.ndarray  # float32 [H, W], uncorrected
     log_factor: np.ndarray  # float64 [W]
@@ -25,11 +25,11 @@ class MetricEstimate:
 
     @property
     def depth_m(self) -> np.ndarray:
-        """Return the corrected depth float32 [H, W]."""
+        """Return the scaled depth float32 [H, W], m."""
         return self.estimate * np.exp(self.log_factor).astype(np.float32)
 
     def at_size(self, width: int, height: int) -> np.ndarray:
-        """Return the corrected depth float32 [height, width], sampled at the nearest pixels."""
+        """Return the scaled depth (m), float32 [height, width], sampled at the nearest pixels."""
         small = cv2.resize(self.estimate, (width, height), interpolation=cv2.INTER_NEAREST)
         columns = (np.arange(width) * self.estimate.shape[1]) // width
         return small * np.exp(self.log_factor[columns]).astype(np.float32)
@@ -38,10 +38,10 @@ class MetricEstimate:
 def metric_estimate(
     values: np.ndarray, kind: Kind, uv_px: np.ndarray, z_m: np.ndarray
 ) -> MetricEstimate | None:
-    """Return the estimate with a smooth scale factor per column; None if there are too few pairs.
+    """Return the estimate with a smooth scale factor per column; None for fewer than 12 pairs.
 
-    The spread is measured by leave-neighbours-out at each beam. It stands for the error of the estimate away
-    from the scan line. Arguments as in `scaling.ratio`.
+    `spread` is the error at each beam when the beam and its neighbours are left out of the fit; the same
+    error is assumed for pixels away from the scan line. Arguments as in `scaling.ratio`.
     """
     if kind == "disparity":
         fitted = affine(values, kind, uv_px, z_m)
@@ -63,7 +63,11 @@ def metric_estimate(
 
 
 def _smooth(at: np.ndarray, u: np.ndarray, values: np.ndarray, band: float, exclude: float) -> np.ndarray:
-    """Return kernel means [M], without samples nearer than `exclude`, shrunk to the overall median."""
+    """Return weighted means [M] of `values` at the columns `at`, shrunk towards the median of all values.
+
+    Weights fall with the distance of the sample's column `u` (width `band`, px); samples nearer than
+    `exclude` (px) are not used.
+    """
     distance = np.abs(at[:, None] - u[None])
     weight = np.exp(-0.5 * (distance / band) ** 2) * (distance >= exclude)
     centre = float(np.median(values))

@@ -1,4 +1,4 @@
-"""The fusion service: metric depth with its standard deviation, from beams, floor, images and an estimate."""
+"""The fusion service: metric depth with its standard deviation, from beams, floor, images and estimate."""
 
 from __future__ import annotations
 
@@ -60,18 +60,18 @@ class FusionConfig(NodeConfig):
 
 @dataclass(frozen=True)
 class _Candidate:
-    """An image that fusion can process, with the age of its beams."""
+    """An image that is ready for fusion, with the age of its beams."""
 
     frame: FusionInput
     age_ns: int
 
 
 class FusionNode(Node):
-    """Publishes fused depth per image and a point cloud per keyframe; works in the smooth odom frame.
+    """Publishes metric depth per image and a point cloud per keyframe, in the continuous odom frame.
 
-    A plane sweep costs several times more than depth between keyframes, so each image is a candidate first:
-    the keyframes service decides whether it is swept. In a deployment without that service, fusion decides
-    by the same rule.
+    A plane sweep needs several times more computation than depth between keyframes. Therefore each image is
+    first a candidate, and the keyframes service decides whether the image becomes a keyframe (plane sweep) or
+    not. In a deployment without that service, the fusion service decides by the same rule.
     """
 
     name = "fusion"
@@ -100,7 +100,7 @@ class FusionNode(Node):
         self.overtaken = 0
 
     def on_header(self, header: Header) -> None:
-        """Reset if localization runs in another process, because its odom frame is a new one."""
+        """Reset if the header is from another localization process, which has another odom frame."""
         if header.producer != "localization" or header.instance == self._localizer:
             return
         if self._localizer and self._rig is not None:
@@ -142,13 +142,13 @@ class FusionNode(Node):
         return iter(())
 
     def on_localization_movers(self, movers: MovingBeams) -> Outputs:
-        """Mark the beams on dynamic objects: they must not become part of the walls."""
+        """Mark the beams on dynamic objects, so that they are not used as walls."""
         if self._fusion is not None:
             self._history.add_mask(movers.stamp_ns, movers.moving)
         return iter(())
 
     def on_localization_odometry(self, odometry: Odometry) -> Outputs:
-        """Add a pose, the scans that are complete with it, and process the image that has waited for it."""
+        """Store a pose; then process the scans and the image for which poses were missing until now."""
         if self._fusion is None or odometry.status != "ok":
             return
         for scan in self._history.add_pose(odometry.stamp_ns, odometry.T_odom_body):
@@ -175,14 +175,14 @@ class FusionNode(Node):
             self._check.add_scan(points, T_odom_body)
 
     def on_job_check_calibration(self, health: CalibrationHealth) -> Outputs:
-        """Log the result of the calibration check, and add it to the health from now on."""
+        """Log the result of the calibration check, and show the result in the health detail of this node."""
         self.calibration = health
         (log.info if health.status == "ok" else log.error)("%s", health.line)
         self._update_detail()
         return iter(())
 
     def _update_detail(self) -> None:
-        """Update the health detail: number of overtaken estimates, and the calibration."""
+        """Update the health detail: number of dropped (overtaken) estimates, and the calibration."""
         overtaken = f"{self.overtaken} estimates overtaken" if self.overtaken else ""
         if self.calibration is not None:
             calibration = self.calibration.line
@@ -201,7 +201,7 @@ class FusionNode(Node):
         yield from self._fuse_if_ready()
 
     def _fuse_if_ready(self) -> Outputs:
-        """Process the newest image with estimate and pose; older ones are counted as overtaken."""
+        """Process the newest image that has an estimate and a pose; older images are dropped and counted."""
         if self._candidate is not None:
             newest_ns = self._estimates[-1].stamp_ns if self._estimates else 0
             if newest_ns < self._candidate.frame.stamp_ns + _DECISION_PATIENCE_NS:
@@ -224,7 +224,7 @@ class FusionNode(Node):
         yield from self._propose(image, ready)
 
     def _propose(self, image: Image, estimate: DepthEstimate) -> Outputs:
-        """Ask whether an image is to become a keyframe; it is fused when the answer arrives."""
+        """Publish the image as a keyframe candidate; the image is processed when the decision arrives."""
         T_odom_body = self._history.pose(image.stamp_ns)
         try:
             rgb = self._undistort(
@@ -256,7 +256,7 @@ class FusionNode(Node):
         )
 
     def on_keyframes_decision(self, decision: KeyframeDecision) -> Outputs:
-        """Fuse the candidate that was decided on, then continue with the newest image."""
+        """Process the candidate to which the decision belongs, then continue with the newest image."""
         candidate = self._candidate
         if candidate is None or candidate.frame.stamp_ns != decision.stamp_ns:
             return
@@ -265,18 +265,18 @@ class FusionNode(Node):
         yield from self._fuse_if_ready()
 
     def awaits_feedback(self) -> bool:
-        """Return whether a candidate waits for its decision."""
+        """Return whether a candidate waits for the decision of the keyframes service."""
         return self._candidate is not None
 
     def on_feedback_timeout(self, seconds: float) -> Outputs:
-        """Drop the candidate: the keyframes service does not answer any more."""
+        """Drop the waiting candidate, because the keyframes service no longer answers."""
         if self._candidate is not None:
             self._candidate = None
             self.overtaken += 1
         return iter(())
 
     def _fuse(self, candidate: _Candidate, keyframe: bool) -> Outputs:
-        """Publish the depth of one image, and the cloud if it is a keyframe."""
+        """Publish the depth of one image, and the point cloud if the image is a keyframe."""
         frame = candidate.frame
         assert self._fusion is not None  # candidates exist after the calibration only
         fused = self._fusion.fuse(frame, keyframe=keyframe)

@@ -9,7 +9,7 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Pairs:
-    """Beams on pixels with an estimate."""
+    """Beams with the value of the depth estimate at the pixel of each beam."""
 
     uv_px: np.ndarray  # float64 [N, 2]
     z_m: np.ndarray  # float64 [N]: optical z of the beam, not its range (l_j of the paper)
@@ -28,7 +28,10 @@ def make_pairs(
     z_m: np.ndarray,  # float64 [N]
     max_jump: float = 0.10,
 ) -> Pairs:
-    """Return the pairs, without pixels whose neighbours differ by more than `max_jump` (a ratio)."""
+    """Return the pairs of beam depth and estimate, without pixels at depth edges of the estimate.
+
+    A pixel is at an edge if the neighbours 2 px away differ by more than `max_jump` times its value.
+    """
     h, w = estimate.shape
     u = np.clip(np.rint(uv_px[:, 0]).astype(int), 0, w - 1)
     v = np.clip(np.rint(uv_px[:, 1]).astype(int), 0, h - 1)
@@ -43,11 +46,11 @@ def make_pairs(
 
 
 def largest_cluster(values: np.ndarray, radius: float, least: int = 4) -> np.ndarray:
-    """Return bool [N]: members of the largest density cluster of numbers [N] (DBSCAN in one dimension).
+    """Return bool [N]: members of the largest cluster of the numbers [N] (DBSCAN in one dimension).
 
-    A core value has `least` values (itself included) within `radius`; cores closer than `radius` are one
-    cluster, values within `radius` of a core belong to it. O(N log N). Without a core value
-    there is no member.
+    A core value has at least `least` values (itself included) within `radius`; cores closer than `radius`
+    form one cluster; values within `radius` of a core belong to its cluster. Without a core value, all are
+    False. Complexity O(N log N).
     """
     count = len(values)
     member = np.zeros(count, dtype=bool)
@@ -73,7 +76,8 @@ def largest_cluster(values: np.ndarray, radius: float, least: int = 4) -> np.nda
 def effective_count(residuals: np.ndarray) -> float:
     """Return the effective sample size of residuals [N] in scan order (first-order autocorrelation).
 
-    Neighbouring beams hit the same surface, on which the errors of the network are correlated.
+    Neighbouring beams hit the same surface, where the errors of the network are correlated; hence N beams are
+    less than N independent samples.
     """
     count = len(residuals)
     if count < 4:

@@ -1,9 +1,9 @@
 """Method `field`: dense metric depth by a multi-view plane sweep with priors from lidar, floor and a network.
 
-Candidate surfaces (extruded beams, floor, walls from the lidar map, ceilings), depth warped from past
-keyframes and the depth source's estimate lower the cost of their depth in a cost volume. Matching against
-past images, whose poses lidar localization knows to about 1 cm, decides per pixel (plane sweep: Collins
-1996; aggregation: semi-global matching, Hirschmueller 2008).
+Candidate surfaces (extruded beams, floor, walls from the lidar map, ceilings), the warped depth of past
+keyframes and the depth estimate are priors: each lowers the matching cost at its depth in the cost volume.
+The images themselves decide per pixel, by matching with past images whose poses are accurate to about 1 cm
+from lidar localization (plane sweep: Collins 1996; aggregation: semi-global matching, Hirschmueller 2008).
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _TILTED_WALL_M = 0.05  # snapping distance to extruded beams of a hand-held lida
 
 
 class PlaneSweep:
-    """Plane sweep over the images of a drive; keeps past images, lidar map, keyframe depth and ceilings."""
+    """Plane sweep over the images of a drive; stores past images, lidar map, keyframe depth, ceilings."""
 
     def __init__(
         self, camera: Pinhole, T_body_camera: np.ndarray, *, floor_known: bool, planar: bool,
@@ -47,7 +47,7 @@ class PlaneSweep:
             T_body_camera: float64 [4, 4].
             floor_known: the camera height in `T_body_camera` is reliable.
             planar: the body stays level on a floor.
-            config: default by `planar`.
+            config: None = the defaults if `planar`, else `PlaneSweepConfig.in_hand()`.
 
         Raises:
             ValueError: `camera` has distortion.
@@ -77,7 +77,7 @@ class PlaneSweep:
         self._z_last = np.maximum(limit, 1.1 * self.config.z_near_m).astype(np.float32)
 
     def add_scan(self, points_map_m: np.ndarray) -> None:
-        """Add the returns float64 [N, 3] of a scan, in the map frame, to the lidar map (planar only)."""
+        """Add the returns float64 [N, 3] of a scan, in the map frame, to the lidar map (only if `planar`)."""
         if self._lidar_map is not None:
             self._lidar_map.add(points_map_m)
 
@@ -90,12 +90,12 @@ class PlaneSweep:
         return WorkingImage(frame.T_map_body @ self.T_body_camera, working, features(working), middle)
 
     def keep_if_moved(self, frame: FusionInput) -> None:
-        """Store the image of `frame` for later sweeps if the camera has moved 3 cm or turned 0.05 rad."""
+        """Store the image of `frame` for later sweeps if the camera moved >= 3 cm or rotated >= 0.05 rad."""
         if self._has_moved(frame.T_map_body @ self.T_body_camera):
             self._source_images.append(self.downscale(frame))
 
     def keep(self, working: WorkingImage) -> None:
-        """Store an image that `downscale` has made, under the condition of `keep_if_moved`."""
+        """Store an image made by `downscale` for later sweeps; same condition as in `keep_if_moved`."""
         if self._has_moved(working.T_map_camera):
             self._source_images.append(working)
 
@@ -106,7 +106,7 @@ class PlaneSweep:
         return bool(np.linalg.norm(T[:3, 3]) >= 0.03 or np.trace(T[:3, :3]) <= 1.0 + 2.0 * np.cos(0.05))
 
     def surfaces(self, frame: FusionInput, *, occluded_walls: bool = True) -> CandidateSurfaces:
-        """Return the candidate surfaces of a frame; without `occluded_walls` only the nearest (faster)."""
+        """Return the candidate surfaces of a frame; `occluded_walls=False` omits hidden walls (faster)."""
         heights = self._ceilings.heights(self.config.ceiling_evidence) if self._floor_known else ()
         lidar_map = self._lidar_map if occluded_walls else None
         return self._predictor.find(frame.beams, lidar_map, frame.T_map_body, heights)
@@ -118,9 +118,9 @@ class PlaneSweep:
     def refine(
         self, frame: FusionInput, working: WorkingImage, warped: WarpedDepth | None = None
     ) -> SweepResult:
-        """Return the depth of a keyframe at the working size, and store it for later frames.
+        """Return the depth of a keyframe at the working size, and store this depth for later images.
 
-        `warped` is the result of `warp_into(working)`, if the caller has it already.
+        `warped`: the result of `warp_into(working)` if already computed; None = compute it.
         """
         # Matching cost against past images, float32 [h, w, D].
         cost, views = self._cost_volume(frame, working)
@@ -143,10 +143,10 @@ class PlaneSweep:
         )
 
     def _override_by_votes(self, swept: SweepResult, warped: WarpedDepth) -> SweepResult:
-        """Replace the depth of this sweep where at least `min_override_votes` keyframes agree on another one.
+        """Return the sweep result, with depth replaced where >= `min_override_votes` keyframes disagree.
 
-        Used for hand-held sensors only. On a level body all keyframes take the depth of untextured pixels
-        from the same extruded walls, so that their agreement is no evidence.
+        Used for hand-held sensors only. On a level body, all keyframes take the depth of untextured pixels
+        from the same extruded walls, so the agreement of keyframes is no evidence.
         """
         others = (warped.votes >= self.config.min_override_votes) & ~swept.snapped
         depth, spread = swept.depth_m.copy(), swept.spread.copy()
@@ -174,7 +174,7 @@ class PlaneSweep:
         return chosen
 
     def _cost_volume(self, frame: FusionInput, working: WorkingImage) -> tuple[np.ndarray, int]:
-        """Return the matching cost float32 [h, w, D] and the number of source images."""
+        """Return the matching cost float32 [h, w, D] (D depth labels) and the number of past images used."""
         h, w = self.working_camera.shape
         views = self.choose_views(working.T_map_camera)
         if not views:
@@ -243,7 +243,7 @@ class PlaneSweep:
         cost += unlikely.astype(np.float32)
 
     def metric_estimate_of(self, frame: FusionInput) -> MetricEstimate | None:
-        """Return the depth source's estimate, scaled to metres by the beams; None if there is none."""
+        """Return the depth estimate scaled to metres by the beams; None without estimate or beams."""
         if frame.estimate is None or frame.estimate_kind == "none":
             return None
         uv, z, _ = project_beams(frame.beams, self.camera, self.T_body_camera)
@@ -273,10 +273,10 @@ class PlaneSweep:
 
 
 def snap(depth: np.ndarray, surfaces: CandidateSurfaces, tolerance: float, wall_reach_m: float) -> np.ndarray:
-    """Set depth [h, w], in place, to the nearest candidate surface; return bool [h, w] where it was set.
+    """Set depth [h, w] (m), in place, to the nearest candidate surface; return bool [h, w]: where set.
 
-    A surface is accepted within `tolerance` of log depth, extruded walls up to `wall_reach_m` above and below
-    the lidar plane.
+    A surface is accepted if it differs by less than `tolerance` in log depth; extruded walls only up to
+    `wall_reach_m` above and below the lidar plane.
     """
     wall = np.where(surfaces.on_floor | ~(surfaces.wall_offset_m < wall_reach_m), np.nan, surfaces.wall)
     best = np.full(depth.shape, tolerance)

@@ -1,8 +1,8 @@
 """Relative pose of two images, refined on tracked corners with a prior from localization.
 
-An error of 0.1 degrees of yaw is about one pixel, which at a short baseline is 10 % of depth. The epipolar
-constraint determines the relative rotation and the direction of the translation; the length comes from the
-metric prior.
+An error of 0.1 degrees of yaw is about one pixel; at a short baseline this is a depth error of 10 %. The
+epipolar constraint determines the relative rotation and the direction of the translation; the metric prior
+determines the length of the translation.
 """
 
 from __future__ import annotations
@@ -21,7 +21,11 @@ MIN_TRACKS = 12  # fewer tracks do not refine a pose
 
 
 def detect_corners(grey: np.ndarray, most: int = 150) -> np.ndarray:
-    """Return corners float32 [N, 2] (u, v) of an image uint8 [H, W], best first (Shi-Tomasi)."""
+    """Return up to `most` corners (u, v) of an image uint8 [H, W], strongest first (Shi-Tomasi).
+
+    Returns:
+        float32 [N, 2].
+    """
     found = cv2.goodFeaturesToTrack(grey, most, 0.01, 8)
     return np.zeros((0, 2), np.float32) if found is None else found.reshape(-1, 2)
 
@@ -59,7 +63,16 @@ def refine_relative_pose(
     pixel_sigma: float = 0.4,
     iterations: int = 6,
 ) -> np.ndarray:
-    """Return the most probable T_b_a: Gauss-Newton on epipolar distances (Cauchy weights) and prior."""
+    """Return the maximum a posteriori `T_b_a` [4, 4], by Gauss-Newton on epipolar distances and prior.
+
+    Args:
+        T_b_a: the prior from localization; takes points of camera frame a to camera frame b.
+        rays_a, rays_b: float64 [N, 3] with z = 1, of the same corners in both images.
+        focal_px: converts the distances to pixels.
+        rotation_sigma_rad, translation_sigma_m: standard deviations of the prior, per axis.
+        pixel_sigma: standard deviation of a corner, px.
+        iterations: number of Gauss-Newton steps.
+    """
     prior = np.diag([1.0 / rotation_sigma_rad**2] * 3 + [1.0 / translation_sigma_m**2] * 3)
     x = np.zeros(6)
 
@@ -104,7 +117,11 @@ def refine_from_images(
     rotation_sigma_rad: float,
     translation_sigma_m: float,
 ) -> np.ndarray:
-    """Return `refine_relative_pose` on corners tracked from a to b; `T_b_a` itself if there are too few."""
+    """Track corners from image a to b and return the refined `T_b_a`; unchanged if too few are tracked.
+
+    See `refine_relative_pose`. `initial_depth_m`: depth with which the positions of corners in b are
+    predicted.
+    """
     if len(uv_a) < MIN_TRACKS:
         return T_b_a
     rays_a = camera.rays(uv_a)

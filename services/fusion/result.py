@@ -1,4 +1,4 @@
-"""Result of fusion for one image, the same for every method."""
+"""Result of fusion for one image, the same type for every method."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 @dataclass(frozen=True)
 class FusionResult:
-    """Metric depth with its standard deviation. All depth is NaN unless `status` is "ok"."""
+    """Metric depth of one image with its standard deviation. All depth is NaN unless `status` is "ok"."""
 
     depth_m: np.ndarray  # float32 [H, W] optical z, NaN = unknown
     sigma_m: np.ndarray  # float32 [H, W] standard deviation, NaN where depth is NaN

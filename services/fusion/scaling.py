@@ -1,4 +1,4 @@
-"""One correction for a whole image: the paper's ratio, or scale and shift in inverse depth."""
+"""One correction for a whole image: a scale factor (the paper's ratio), or scale and shift of 1/z."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _MAX_DEPTH_M = 30.0
 
 
 def as_depth(values: np.ndarray, kind: Kind) -> np.ndarray:
-    """Return values proportional to depth, float32 [H, W]; the shift of a disparity is taken as 0."""
+    """Return values proportional to depth, float32 [H, W]; disparity is inverted, its shift taken as 0."""
     if kind != "disparity":
         return values
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -29,11 +29,13 @@ def as_depth(values: np.ndarray, kind: Kind) -> np.ndarray:
 
 
 def ratio(values: np.ndarray, kind: Kind, uv_px: np.ndarray, z_m: np.ndarray) -> FusionResult:
-    """Return alpha D with the paper's alpha = sum(l_j) / sum(d_j) over the largest cluster of ratios.
+    """Return the estimate D times alpha = sum(l_j) / sum(d_j) over the largest cluster of ratios l_j / d_j.
+
+    This is the paper's method. d_j is the value of D at the pixel of beam j.
 
     Args:
         values: float32 [H, W], the dense estimate.
-        kind: what its numbers mean.
+        kind: meaning of the values: metric, relative or disparity.
         uv_px: float64 [N, 2], the beams' pixels.
         z_m: float64 [N], the beams' optical z (l_j).
     """
@@ -51,7 +53,7 @@ def ratio(values: np.ndarray, kind: Kind, uv_px: np.ndarray, z_m: np.ndarray) ->
 
 @dataclass(frozen=True)
 class ScaleFit:
-    """The paper's alpha, its standard error and the agreement of the pairs."""
+    """The scale alpha (metres per unit of the estimate), its standard error, and the agreement of pairs."""
 
     alpha: float
     sigma: float
@@ -62,7 +64,10 @@ class ScaleFit:
 
 
 def fit_scale(estimate: np.ndarray, uv_px: np.ndarray, z_m: np.ndarray) -> ScaleFit | str:
-    """Return alpha of an estimate float32 [H, W] proportional to depth, or the reason why there is none."""
+    """Return the scale fit of an estimate float32 [H, W] proportional to depth; a sentence (str) if it fails.
+
+    `uv_px`, `z_m` as in `ratio`.
+    """
     pairs = make_pairs(estimate, uv_px, z_m)
     if len(pairs) < MIN_PAIRS:
         return _too_few(len(uv_px), len(pairs))
@@ -82,10 +87,11 @@ def fit_scale(estimate: np.ndarray, uv_px: np.ndarray, z_m: np.ndarray) -> Scale
 
 
 def affine(values: np.ndarray, kind: Kind, uv_px: np.ndarray, z_m: np.ndarray) -> FusionResult:
-    """Return depth from 1/z = a q + b, where q is the estimate in inverse depth (affine-invariant disparity).
+    """Return metric depth z from 1/z = a q + b, where q is the estimate as inverse depth.
 
-    Robust: median of slopes (Theil-Sen over fixed partners), then reweighted least squares (Tukey). With
-    too little spread in q the shift b is not observable and stays 0. Arguments as in `ratio`.
+    Robust fit: median of slopes (Theil-Sen over fixed pairs of points), then reweighted least squares
+    (Tukey). If the values q differ too little, the shift b is not observable and stays 0. Arguments as in
+    `ratio`.
     """
     pairs = make_pairs(as_depth(values, kind), uv_px, z_m)
     if len(pairs) < MIN_PAIRS:

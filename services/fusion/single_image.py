@@ -1,4 +1,4 @@
-"""Fusion of one image at a time by one global correction: the paper's ratio, an affine fit, or none."""
+"""Fusion image by image with one correction of the whole image: the paper's ratio, an affine fit, or none."""
 
 from __future__ import annotations
 

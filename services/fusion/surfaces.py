@@ -1,4 +1,4 @@
-"""Surfaces that an image may show, as the lidar and the floor predict them: candidates, not answers."""
+"""Candidate surfaces: surfaces that lidar, lidar map and floor predict in an image, used as priors."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _POST_HEIGHT_M = 0.35  # assumed extent of legs and posts above and below the li
 
 @dataclass(frozen=True)
 class CandidateSurfaces:
-    """Optical z [h, w] of each candidate surface, NaN where the ray does not meet it."""
+    """Optical z (m) [h, w] of each candidate surface; NaN where the pixel's ray does not meet the surface."""
 
     wall: np.ndarray  # nearest beam of the column, extruded vertically
     background_wall: np.ndarray  # the same without narrow objects (legs, posts)
@@ -30,7 +30,7 @@ class CandidateSurfaces:
 
     @property
     def nearest(self) -> np.ndarray:
-        """Return the nearest of wall, floor and ceilings [h, w], as if nothing else existed."""
+        """Return the smallest depth [h, w] of wall, floor and ceilings."""
         with np.errstate(invalid="ignore"):
             high = self.wall_offset_m > _POST_HEIGHT_M
         near = np.fmin(np.where(high, self.background_wall, self.wall), self.floor)
@@ -40,13 +40,13 @@ class CandidateSurfaces:
 
     @property
     def on_floor(self) -> np.ndarray:
-        """Return bool [h, w]: the floor is nearer than the wall."""
+        """Return bool [h, w]: True where the floor is nearer than the wall."""
         with np.errstate(invalid="ignore"):
             return np.isfinite(self.floor) & ~(self.wall < self.floor)
 
 
 class SurfacePredictor:
-    """Intersection of the rays of one camera with the candidate surfaces."""
+    """Predicts candidate surfaces: intersects the rays of one camera with beams, map, floor, ceilings."""
 
     def __init__(self, camera: Pinhole, T_body_camera: np.ndarray, *, floor_known: bool) -> None:
         self._T_body_camera = T_body_camera
@@ -64,18 +64,18 @@ class SurfacePredictor:
         self._fine_azimuths, self._fine_index = self._azimuth_grid(_FINE_AZIMUTHS_PER_PX * camera.width_px)
 
     def _azimuth_grid(self, count: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return `count` azimuths over the view, and int64 [h, w]: the index of each pixel's nearest one."""
+        """Return `count` azimuths (rad) over the view, and int64 [h, w]: index of each pixel's nearest."""
         low, high = float(self._azimuth.min()), float(self._azimuth.max())
         place = (self._azimuth - low) / max(high - low, 1e-9) * (count - 1)
         index = np.clip(np.rint(place).astype(np.int64), 0, count - 1)
         return np.linspace(low, high, count), index
 
     def _extrude(self, azimuth: np.ndarray, reach: np.ndarray) -> np.ndarray:
-        """Return optical z [h, w] of beams extruded vertically, sampled finer than the pixels."""
+        """Return optical z [h, w] (m) of vertically extruded beams, sampled finer than the pixels."""
         return wall_ranges(self._fine_azimuths, azimuth, reach)[self._fine_index] / self._ray_xy
 
     def _occluded(self, ranges: np.ndarray, wall: np.ndarray) -> list[np.ndarray]:
-        """Return optical z [h, w] of the ranges [L, M] that are behind the wall and before the floor."""
+        """Return, per layer of `ranges` [L, M], the optical z [h, w] of walls hidden behind `wall`."""
         layers = []
         for layer in ranges[:, self._coarse_index] / self._ray_xy:
             with np.errstate(invalid="ignore"):
@@ -91,7 +91,7 @@ class SurfacePredictor:
         T_map_body: np.ndarray,
         ceiling_heights_m: tuple[float, ...],
     ) -> CandidateSurfaces:
-        """Return the candidate surfaces of one view; `ceiling_heights_m` are above the floor."""
+        """Return the candidate surfaces of one view; `ceiling_heights_m` are heights above the floor."""
         points = beams.points_body_m
         points = points[~occluded_beams(points, self._T_body_camera)]
         azimuth, reach = azimuth_and_range(points, self._T_body_camera)
@@ -124,10 +124,10 @@ class SurfacePredictor:
 def remove_narrow_objects(
     azimuth_rad: np.ndarray, reach_m: np.ndarray, width_m: float = 0.3, jump: float = 1.15
 ) -> np.ndarray:
-    """Return ranges [N] in which narrow objects are replaced by the surface beside them.
+    """Return ranges [N] (m) in which narrow objects are replaced by the surface beside them.
 
-    A run of beams no wider than `width_m` whose neighbours on both sides are farther by the factor `jump` is
-    a leg or a post. Such objects seldom reach the ceiling.
+    A group of beams not wider than `width_m`, whose neighbours on both sides are farther by the factor
+    `jump`, is taken as a leg or a post. Such objects seldom reach the ceiling.
     """
     order = np.argsort(azimuth_rad, kind="stable")
     a, r = azimuth_rad[order], reach_m[order].copy()
@@ -151,9 +151,9 @@ def remove_narrow_objects(
 
 
 class CeilingDetector:
-    """Detector of horizontal planes overhead, from matching costs of keyframes.
+    """Detector of ceilings (horizontal planes above the camera) from the matching costs of keyframes.
 
-    Evidence decays by 10 % per keyframe, so that the next room may have another ceiling.
+    The evidence decays by 10 % per keyframe, because the next room may have a ceiling at another height.
     """
 
     def __init__(self, low_m: float = 1.6, high_m: float = 4.5, step_m: float = 0.05) -> None:
@@ -162,11 +162,11 @@ class CeilingDetector:
         self._apart = round(0.2 / step_m)
 
     def add(self, gain: np.ndarray) -> None:
-        """Add the evidence [n] of one keyframe, one value per height (`volume_kernels.plane_gain`)."""
+        """Add the evidence [n] of one keyframe (`volume_kernels.plane_gain`), one value per height."""
         self._evidence = 0.9 * self._evidence + gain
 
     def heights(self, least: float, most: int = 2) -> tuple[float, ...]:
-        """Return the heights of up to `most` peaks of the evidence above `least`, strongest first."""
+        """Return the heights (m) of up to `most` peaks of the evidence above `least`, strongest first."""
         e = self._evidence
         peaks = [k for k in range(1, len(e) - 1) if e[k] > least and e[k] > e[k - 1] and e[k] >= e[k + 1]]
         found: list[int] = []

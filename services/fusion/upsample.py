@@ -17,10 +17,10 @@ def upsample_depth(
     depth_out: np.ndarray,  # float32 [H, W]
     sigma_out: np.ndarray,  # float32 [H, W], metres
 ) -> None:
-    """Upsample depth and sigma from [h, w] to [H, W]; writes `depth_out` and `sigma_out`.
+    """Upsample depth and sigma of log depth from [h, w] to [H, W]; write `depth_out` and `sigma_out` (m).
 
-    Within one surface 1/z is interpolated bilinearly, which is exact on planes. At depth edges and holes the
-    output pixel takes the value of the working-size pixel with the most similar colour.
+    Within one surface 1/z is interpolated bilinearly, which is exact on planes. At depth edges and unknown
+    pixels, the output pixel takes the value of the working-size pixel with the most similar colour.
     """
     h, w = depth.shape
     H, W = depth_out.shape
@@ -65,7 +65,7 @@ def upsample_depth(
 
 @kernel
 def _one_surface(depth: np.ndarray, i0: int, j0: int, most: np.float32) -> bool:
-    """Return whether the 2x2 pixels from [i0, j0] are known and within a factor `most` of each other."""
+    """Return whether the 2x2 pixels from [i0, j0] have depths that differ by less than the factor `most`."""
     low, high = np.inf, 0.0
     for i in range(i0, i0 + 2):
         for j in range(j0, j0 + 2):

@@ -25,10 +25,10 @@ def cost_volume(
     truncation: float,
     out: np.ndarray,  # [h, w, D]
 ) -> None:
-    """Write the mean absolute feature difference over the two best views of each pixel and label.
+    """Write, for each pixel and label, the mean absolute feature difference in the two best-matching views.
 
-    A label that no view sees gets the mean of the pixel's lowest and average cost. A pixel of which less
-    than 40 % of the labels are seen gets a constant cost.
+    A label outside all views gets the mean of the pixel's lowest and average cost. A pixel with
+    less than 40 % of its labels inside the views gets a constant cost.
     """
     one = np.float32(1.0)
     cut = np.float32(truncation)
@@ -112,7 +112,7 @@ def _combine_views(best: np.ndarray, count: np.ndarray, last: int, cut: np.float
 
 @kernel
 def box3(volume: np.ndarray, scale: float, out: np.ndarray) -> None:
-    """Write the costs of each label, averaged over 3 x 3 pixels (edges repeated), times `scale`."""
+    """Write the mean cost over 3 x 3 pixels (border repeated) for each label, multiplied by `scale`."""
     h, w, D = volume.shape
     gain = np.float32(scale / 9.0)
     row = np.empty((w, D), np.float32)
@@ -136,7 +136,10 @@ def add_prior(
     log_step: float,
     width: float,  # standard deviation of the well, in labels
 ) -> None:
-    """Subtract a Gaussian around the depth of an expected surface from the cost, in place."""
+    """Lower the cost near the depth of a candidate surface, in place, by a Gaussian of height `weight`.
+
+    The Gaussian has the standard deviation `width`, in labels; NaN depth = no prior at this pixel.
+    """
     h, w, D = volume.shape
     for v in range(h):
         for u in range(w):
@@ -161,7 +164,10 @@ def aggregate(
     edge_grey: float,  # grey step at which p2 is halved
     total: np.ndarray,  # [h, w, D], added to
 ) -> None:
-    """Add the path costs of one direction (Hirschmueller 2008, eq. 13); p2 is lower at grey edges."""
+    """Add the path costs of one image direction to `total` (Hirschmueller 2008, eq. 13).
+
+    The penalty `p2` of a depth jump is lower where the grey value changes.
+    """
     h, w, D = cost.shape
     before, now = np.empty(D, np.float32), np.empty(D, np.float32)
     one_step, jump = np.float32(p1), np.float32(p2)
@@ -200,7 +206,10 @@ def winner_takes_all(
     depth: np.ndarray,  # [h, w] out: depth of the cheapest label, between labels by a parabola
     spread: np.ndarray,  # [h, w] out: standard deviation of log depth about it
 ) -> None:
-    """Write the depth of the cheapest labels, and the spread of the distribution exp(-cost / temperature)."""
+    """Write the depth of the label with the lowest cost, and the spread of the labels about this depth.
+
+    The spread is the standard deviation of log depth under the distribution exp(-cost / temperature).
+    """
     h, w, D = total.shape
     step = log_z[1] - log_z[0]
     for v in range(h):
@@ -237,7 +246,10 @@ def plane_gain(
     heights_m: np.ndarray,  # [n]
     gain: np.ndarray,  # [n] out
 ) -> None:
-    """Write, per height, by how much a horizontal plane costs less than the walls behind it."""
+    """Write, for each height, the summed cost of the walls minus that of a horizontal plane before them.
+
+    A large positive value is evidence for a ceiling at this height.
+    """
     h, w, D = volume.shape
     for k in range(heights_m.shape[0]):
         total = 0.0

@@ -1,7 +1,7 @@
 """Line segments of straight walls in the lidar map, extrapolated behind furniture.
 
-Cupboards, sofas and worktops hide the foot of a wall from a lidar near the floor, while the camera sees the
-wall above them. Walls are straight, so a line that is visible elsewhere predicts the hidden part.
+Cupboards, sofas and worktops hide the lower part of a wall from a lidar near the floor, while the upper part
+is visible in the image. Walls are straight, so a line fitted to the measured part predicts the hidden part.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _GRAZING = 0.12  # sine of the least angle between ray and line
 
 @dataclass(frozen=True)
 class WallLine:
-    """Line normal . p = offset; its inliers lie between `low_m` and `high_m` along (-normal_y, normal_x)."""
+    """A line n . p = offset_m in the floor plane, measured from `low_m` to `high_m` along (-n_y, n_x)."""
 
     normal: np.ndarray  # float64 [2], unit
     offset_m: float
@@ -30,12 +30,12 @@ class WallLine:
 
 
 def find_lines(points_m: np.ndarray, cell_m: float, least_m: float = 1.2, most: int = 24) -> list[WallLine]:
-    """Return lines through points float64 [N, 2], those with most inliers first (Hough, then least squares).
+    """Return lines through points float64 [N, 2], most inliers first (Hough transform, least squares).
 
     Args:
         points_m: one point per occupied cell, in the floor plane.
-        cell_m: cell size, which is the spacing of the points along a wall.
-        least_m: least total length of a line's inliers.
+        cell_m: cell size, equal to the spacing of the points along a wall.
+        least_m: smallest total length of the inliers of a line.
         most: largest number of lines.
     """
     left = points_m
@@ -83,7 +83,10 @@ def ranges_to_lines(
     beyond_m: np.ndarray,  # float64 [M]: least range
     count: int,
 ) -> np.ndarray:
-    """Return ranges float64 [count, M] to the extrapolated lines, nearest first, NaN = no more."""
+    """Return ranges (m) of the extrapolated lines on each ray, float64 [count, M], nearest first, NaN = none.
+
+    Only intersections beyond `beyond_m` are returned.
+    """
     directions = np.stack([np.cos(azimuth_rad), np.sin(azimuth_rad)])
     rows = [np.full((count, len(azimuth_rad)), np.nan)]
     for line in lines:

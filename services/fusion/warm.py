@@ -14,7 +14,7 @@ from beamsplat.services.fusion.inputs import FusionInput
 
 
 def warm() -> None:
-    """Run every kernel once on a few noise images in front of a wall, so that a service finds it compiled."""
+    """Run every kernel once on noise images in front of a wall, so that all are compiled in advance."""
     camera = Pinhole(530.0, 530.0, 319.5, 239.5, 640, 480)
     fusion = Fusion(camera, camera_mount(0.1, 0.0, 0.45), floor_known=True, planar=True)
     rng = np.random.default_rng(0)

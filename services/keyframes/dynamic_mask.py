@@ -1,4 +1,4 @@
-"""Image mask of dynamic objects: the lidar sees the ankles of a person, the image the whole body."""
+"""Image mask of dynamic objects: the lidar measures a person's ankles, the image shows the whole body."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ def dynamic_object_mask(
 ) -> np.ndarray:
     """Return bool [H, W]: True where the image shows a dynamic object, up to 2.1 m above the floor.
 
-    A pixel is masked if it is within 0.3 m to the side of a dynamic return, at the range of that return,
-    and its depth is unknown or within a stride of it; or if it is within 9 cm and no surface is known in
-    front of it. `step`: the mask is computed at every `step`-th pixel.
+    A pixel is masked if a point on its ray, at the range of a dynamic return, is within 0.3 m to the side of
+    this return, and the pixel's depth is unknown or within a stride of this range; or if this point is within
+    9 cm and no surface is known in front of it. The mask is computed at every `step`-th pixel.
     """
     mask: np.ndarray = np.zeros(depth_m.shape, dtype=bool)
     if len(dynamic_body_m) == 0:
@@ -55,7 +55,7 @@ def dynamic_object_mask(
 
 
 def _clustered(points_m: np.ndarray) -> np.ndarray:
-    """Return the points [M, 3] that have enough neighbours in the floor plane, as two ankles have."""
+    """Return the points [M, 3] with enough neighbours in the floor plane, as returns of two ankles have."""
     apart = np.linalg.norm(points_m[:, None, :2] - points_m[None, :, :2], axis=2)
     return points_m[np.count_nonzero(apart < _CLUSTER_M, axis=1) >= _CLUSTER_COUNT]
 

@@ -1,4 +1,4 @@
-"""The keyframes service: selects keyframes on the robot and sends each with all data that mapping needs."""
+"""The keyframes service: selects keyframes on the robot and publishes each with all data for mapping."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ _BEAMS_PATIENCE_NS = 400_000_000  # the scan of a 5 Hz lidar is complete by then
 
 
 class KeyframesConfig(NodeConfig):
-    """Options of the keyframes service: selection, and the outbox of unacknowledged keyframes."""
+    """Options of the keyframes service: selection, and outbox of keyframes not yet acknowledged."""
 
     distance_m: Annotated[float, Field(gt=0.0)] = 0.3
     angle_rad: Annotated[float, Field(gt=0.0)] = 0.26
@@ -66,11 +66,11 @@ class KeyframesConfig(NodeConfig):
 
 
 class KeyframesNode(Node):
-    """Decides which images become keyframes, and publishes these: image, fused depth, beams and pose at one
-    time, relative to the newest anchor.
+    """Decides which images become keyframes, and publishes them with depth, beams and pose.
 
-    Fusion asks before it computes the depth of an image (`keyframes/candidate`). A keyframe whose depth is
-    rejected is withdrawn; a later image takes its place.
+    All data of a keyframe are those of the image time; its pose is relative to the newest anchor. Fusion asks
+    for the decision before it computes the depth of an image (`keyframes/candidate`). A selected image whose
+    depth is rejected does not become a keyframe; a later image takes its place.
     """
 
     name = "keyframes"
@@ -117,9 +117,9 @@ class KeyframesNode(Node):
             )
 
     def on_header(self, header: Header) -> None:
-        """Reset if localization runs in another process, because its odom frame is a new one.
+        """Reset if the header is from another localization process, which has another odom frame.
 
-        A drive is named after its map, or after the localization process while the map is unknown.
+        The drive is named after its map, or after the localization process while the map is unknown.
         """
         if header.producer == "localization" and header.instance != self._localizer:
             if self._localizer:
@@ -139,7 +139,7 @@ class KeyframesNode(Node):
         yield from self._decide()
 
     def _set_up(self, rig: Rig) -> None:
-        """Set up camera and lidar; the camera is required."""
+        """Set up camera and lidar; a calibration without camera is an error."""
         if rig.camera is None:
             log.error("the calibration has no camera: there are no keyframes; add [camera] to the rig file")
             return
@@ -172,7 +172,7 @@ class KeyframesNode(Node):
         return iter(())
 
     def on_localization_anchors(self, anchors: Anchors) -> Outputs:
-        """Bind new keyframes to the newest submap, to which drift is least."""
+        """Attach new keyframes to the newest submap, relative to which the pose has the least drift."""
         self._map_uuid = anchors.map_uuid
         if anchors.map_uuid:
             self._outbox.rename_drive(self._localizer, anchors.map_uuid)
@@ -184,7 +184,7 @@ class KeyframesNode(Node):
         return iter(())
 
     def on_camera_image(self, image: Image) -> Outputs:
-        """Keep the image until its depth arrives; send unacknowledged keyframes again that are due."""
+        """Store the image until its depth is received; publish unacknowledged keyframes again when due."""
         self._images.append(image)
         self._now_ns = max(self._now_ns, image.stamp_ns)
         yield from self._resend_due()
@@ -201,7 +201,7 @@ class KeyframesNode(Node):
             yield "keyframes/frame", frame.model_copy(update={"backlog": len(self._outbox)})
 
     def on_keyframes_candidate(self, candidate: KeyframeCandidate) -> Outputs:
-        """Decide whether an image becomes a keyframe; before the calibration is known, fusion waits."""
+        """Decide whether an image becomes a keyframe; without calibration, candidates are queued."""
         self._undecided.append(candidate)
         yield from self._decide()
 
@@ -220,7 +220,7 @@ class KeyframesNode(Node):
             yield "keyframes/decision", decision
 
     def on_fusion_depth(self, depth: FusedDepth) -> Outputs:
-        """Keep the depth of a selected image; one without depth is withdrawn."""
+        """Store the depth of a selected image; if its depth was rejected, cancel the selection."""
         if depth.keyframe and depth.status == "ok":
             self._depths.append(depth)
         elif depth.keyframe and self._selector is not None:
@@ -229,7 +229,7 @@ class KeyframesNode(Node):
         return iter(())
 
     def on_localization_odometry(self, odometry: Odometry) -> Outputs:
-        """Add a pose, and publish the keyframes whose beams can be deskewed now."""
+        """Store a pose, and publish the keyframes whose beams can be deskewed now."""
         if self._history is None or odometry.status != "ok":
             return
         self._history.add_pose(odometry.stamp_ns, odometry.T_odom_body)
@@ -237,14 +237,14 @@ class KeyframesNode(Node):
             yield from self._publish(self._depths.popleft())
 
     def _beams_are_known(self, image_ns: int, pose_ns: int) -> bool:
-        """Return whether the scan around an image is complete, or the waiting time is over."""
+        """Return whether the scan around the image time is complete, or the time limit for it is over."""
         if pose_ns < image_ns + _BEAMS_NS:
             return False
         assert self._history is not None  # depths are queued after the calibration only
         return self._history.decided_scan_near(image_ns) or pose_ns >= image_ns + _BEAMS_PATIENCE_NS
 
     def on_keyframes_ack(self, ack: KeyframeAck) -> Outputs:
-        """Remove a keyframe that the mapper has accepted or rejected from the outbox."""
+        """Remove an acknowledged keyframe from the outbox, whether the mapper accepted or rejected it."""
         self._outbox.acknowledge(ack.id, self._now_ns)
         if ack.status != "ok":
             self._rejected.add(ack.id)
@@ -252,11 +252,11 @@ class KeyframesNode(Node):
         self._update_detail()
 
     def awaits_feedback(self) -> bool:
-        """Return whether keyframes are not yet acknowledged; recorded data may end before."""
+        """Return whether acknowledgements are missing; recorded data may end before they are received."""
         return len(self._outbox) > 0
 
     def on_feedback_timeout(self, seconds: float) -> Outputs:
-        """Advance the time without images, and send unacknowledged keyframes again that are due."""
+        """Advance the time by `seconds` although no images arrive, and publish due keyframes again."""
         self._now_ns += round(seconds * 1e9)
         yield from self._resend_due()
         self._update_detail()
@@ -267,7 +267,7 @@ class KeyframesNode(Node):
             yield from self._publish(self._depths.popleft())
 
     def _publish(self, depth: FusedDepth) -> Outputs:
-        """Publish the keyframe of a selected image with depth, and keep it until it is acknowledged."""
+        """Publish the keyframe of a selected image with depth, and store it until it is acknowledged."""
         image = next((p for p in self._images if p.stamp_ns == depth.stamp_ns), None)
         if image is None:
             log.warning("a keyframe is lost: its image arrived more than %d images ago", _IMAGES)
@@ -282,7 +282,7 @@ class KeyframesNode(Node):
         yield "keyframes/frame", frame.model_copy(update={"backlog": len(self._outbox)})
 
     def _keyframe(self, image: Image, depth: FusedDepth, why: str) -> Keyframe:
-        """Return the keyframe message, with the poses of the latest optimisation."""
+        """Return the keyframe message with the poses of the newest optimisation; `why`: selection reason."""
         stamp_ns, T_body_camera = image.stamp_ns, self._camera.T_body_camera
         assert self._history is not None  # depths are queued after the calibration only
         encoding, picture = self._compress(image)

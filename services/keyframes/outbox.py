@@ -1,12 +1,13 @@
 """Outbox of keyframes without acknowledgement: bounded in size, optionally on disk, sent again when lost.
 
-Every keyframe is sent once when it is made. Delivery is in order, so that the acknowledgement of one
-keyframe shows that all keyframes sent before it and not acknowledged are lost. These are sent again, oldest
-first, up to `window` at a time; each acknowledgement permits the next one. Live keyframes do not wait for
-them. While there is no acknowledgement at all, only the oldest is sent again, every `retry_ns`.
+Every keyframe is sent once when it is created. Messages are delivered in order; so when a keyframe is
+acknowledged, all keyframes sent before it and not acknowledged are lost. Lost keyframes are sent again,
+oldest first, up to `window` at a time; each acknowledgement permits the next one. New keyframes do not wait
+for lost ones. While no acknowledgement is received at all, only the oldest keyframe is sent again, every
+`retry_ns`.
 
-If the outbox is full, the least useful keyframe is dropped: one of an earlier drive, for which no mapper
-waits, else the one whose view is nearest to another view in the outbox.
+If the outbox is full, the least useful keyframe is dropped: a keyframe of an earlier drive, for which no
+mapper waits, else the one whose view is nearest to another view in the outbox.
 """
 
 from __future__ import annotations
@@ -40,12 +41,12 @@ class Outbox:
     """Queue of keyframes until they are acknowledged; uses measurement times, so that replays are equal."""
 
     def __init__(self, limit_bytes: int, retry_ns: int, window: int, folder: Path | None = None) -> None:
-        """Open the outbox, with the keyframes that are in `folder`; without a folder it is in memory only.
+        """Open the outbox with the keyframes stored in `folder`; without a folder it is in memory only.
 
         Args:
             limit_bytes: largest size of all payloads.
             retry_ns: time without acknowledgement after which the oldest keyframe is sent again.
-            window: largest number of keyframes sent again that are in flight.
+            window: largest number of keyframes that are sent again and not yet acknowledged.
             folder: created if missing.
 
         Raises:
@@ -76,7 +77,7 @@ class Outbox:
         return sum(entry.meta.drive == self.drive for entry in self._entries.values())
 
     def rename_drive(self, before: str, drive: str) -> None:
-        """Rename the current drive from `before`, a name of this process, to the name of its map."""
+        """Rename the current drive from `before` (named after a process) to `drive` (named after its map)."""
         for entry in self._entries.values():
             if entry.meta.drive == before:
                 entry.meta = replace(entry.meta, drive=drive)
@@ -84,7 +85,7 @@ class Outbox:
 
     @property
     def of_earlier_drives(self) -> int:
-        """Return the number of keyframes of earlier drives."""
+        """Return the number of stored keyframes of earlier drives."""
         return len(self._entries) - len(self)
 
     @property
@@ -93,11 +94,14 @@ class Outbox:
         return self._discarded + (self._folder.corrupt if self._folder is not None else 0)
 
     def put(self, key: int, view: np.ndarray, payload: bytes, now_ns: int) -> None:
-        """Store a keyframe that is sent for the first time now.
+        """Store a keyframe that is being sent for the first time.
 
         Args:
-            key: id of the keyframe. view: float64 [6], position and viewing direction in the map, in units
-            of the motion between keyframes. payload: the encoded message. now_ns: measurement time.
+            key: id of the keyframe.
+            view: float64 [6], position and viewing direction in the map, in units of the distance and angle
+                between keyframes.
+            payload: the encoded message.
+            now_ns: measurement time.
         """
         label = QueueEntry(key, self.drive, tuple(float(value) for value in view), len(payload))
         self._forget(key)
@@ -110,7 +114,7 @@ class Outbox:
         self._enforce_limits(keep=key)
 
     def acknowledge(self, key: int, now_ns: int) -> bool:
-        """Remove a keyframe, and mark all sent before it as lost; return False for an unknown key."""
+        """Remove a keyframe and mark all that were sent before as lost; return False for an unknown key."""
         entry = self._entries.get(key)
         self._last_ack_ns = now_ns
         if entry is None:
@@ -126,7 +130,7 @@ class Outbox:
         return True
 
     def due(self, now_ns: int) -> Iterator[tuple[int, bytes]]:
-        """Yield key and payload of the keyframes to send again now."""
+        """Yield key and payload of the keyframes that must be sent again now."""
         current = [entry for entry in self._entries.values() if entry.meta.drive == self.drive]
         if not current:
             return
@@ -184,7 +188,7 @@ class Outbox:
                 self._folder.remove(key)
 
     def _enforce_limits(self, keep: int | None) -> None:
-        """Drop keyframes until the limits hold, but never the one called `keep`."""
+        """Drop keyframes until size and memory are within the limits, but never the keyframe `keep`."""
         while self.bytes > self._limit and (key := self._most_redundant(keep, False)) is not None:
             self._drop(key)
         if self._folder is None:
@@ -220,7 +224,9 @@ def most_redundant(
     views: np.ndarray,  # float64 [N, 6]
     keep: int | None,
 ) -> int:
-    """Return the index of the view nearest to another; of a pair, the one with the nearer third neighbour.
+    """Return the index of the view that is nearest to another view, except `keep`.
+
+    Both views of a pair have the same distance; the view with the nearer third neighbour is returned.
 
     Raises:
         ValueError: there is no view except `keep`.

@@ -1,9 +1,10 @@
-"""Files of the keyframe outbox, one per keyframe; they survive a crash and a power cut.
+"""Files of the keyframe outbox, one per keyframe, which remain complete after a crash or a power failure.
 
     "BSK1" | uint32 head length | head (msgpack map: key, drive, view, size, hash) | payload
 
-The hash (xxh64) is over the payload; a truncated or damaged head cannot be unpacked. Files are written
-atomically, so that only a failing disk produces corrupt ones. These are logged, counted and removed.
+The hash (xxh64) is computed over the payload; a truncated or damaged head cannot be unpacked. Files are
+written atomically, so that only a faulty disk causes corrupt files. Corrupt files are logged, counted and
+removed.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ _SUFFIX = ".keyframe"
 
 
 class CorruptFile(ValueError):
-    """A file with other content than was written."""
+    """A file whose content differs from the content that was written."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +44,7 @@ class QueueEntry:
 
 
 class QueueFolder:
-    """Folder with one file per key. Corrupt files are removed; `corrupt` counts them."""
+    """Folder with one file per keyframe. Corrupt files are removed; `corrupt` counts them."""
 
     def __init__(self, path: Path) -> None:
         """Create the folder if missing. Raises UserError if it cannot be created."""
@@ -89,7 +90,7 @@ class QueueFolder:
         return payload
 
     def remove(self, key: int) -> None:
-        """Remove a file; one that cannot be removed is read again after a restart."""
+        """Remove the file of a keyframe; a file that cannot be removed is loaded again after a restart."""
         try:
             self._file(key).unlink(missing_ok=True)
         except OSError as error:

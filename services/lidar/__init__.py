@@ -1,1 +1,1 @@
-"""Planar lidars: their byte protocols, and revolutions with measured time stamps."""
+"""Planar lidars: byte protocols of the devices, and revolutions with measured time stamps."""

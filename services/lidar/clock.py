@@ -1,4 +1,4 @@
-"""Map the device's clock to the host's, over a link with a varying, never negative delay."""
+"""Conversion of device times to host times, over a link whose delay varies and is never negative."""
 
 from __future__ import annotations
 
@@ -13,11 +13,12 @@ _RESET_AFTER = 8  # rejected packets in a row: the device's clock has changed, e
 
 
 class DeviceClock:
-    """Estimates the clock offset as the minimum of (arrival - device time) over the last packets.
+    """Estimator of the clock offset: the minimum of (arrival time - device time) over the newest packets.
 
-    Buffers, USB frames and a busy host delay packets, so the least delayed packet of a window has the best
-    offset. Drift between the clocks (up to 100 ppm) leaves the estimate with the window. Packets whose time
-    deviates too far have a wrong byte in their time and are rejected.
+    Buffers, USB frames and a busy host delay packets, so the packet with the least delay has the best offset.
+    Old packets leave the window, so the estimate follows the drift between the clocks (up to 100 ppm).
+    Packets whose device time differs too much from the prediction have a wrong byte in their time and are
+    rejected.
     """
 
     def __init__(self) -> None:
@@ -33,7 +34,7 @@ class DeviceClock:
 
         Args:
             device_s: device time of the packet's last measurement.
-            arrival_ns: host time of arrival, less the transmission time.
+            arrival_ns: host time of arrival minus the transmission time.
         """
         offset = arrival_ns - round(device_s * 1e9)
         if self._offsets and not -_EARLY_NS < offset - self._offsets[0][1] < _LATE_NS:
@@ -51,7 +52,7 @@ class DeviceClock:
         return True
 
     def stamp_ns(self, device_s: float) -> int:
-        """Return the host time of a device time, ns; strictly greater than all returned before.
+        """Return the host time (ns) of a device time; strictly greater than all times returned before.
 
         Raises:
             ValueError: no packet was added yet.
@@ -63,13 +64,13 @@ class DeviceClock:
         return self._newest_ns
 
     def reset(self) -> None:
-        """Discard the estimate, after the device has restarted. Stamps stay monotonic."""
+        """Discard the estimate after a restart of the device. Returned times remain increasing."""
         self._offsets.clear()
         self._rejected = 0
 
 
 class CounterUnwrapper:
-    """Extends a counter that wraps at `modulus` to a monotonic total, with the help of the host's clock."""
+    """Converts a counter that wraps at `modulus` to a total that does not wrap, using the host's clock."""
 
     def __init__(self, modulus: int, ticks_per_s: float) -> None:
         self._modulus = modulus
@@ -77,10 +78,10 @@ class CounterUnwrapper:
         self._reference: tuple[int, int] | None = None  # (arrival ns, total)
 
     def __call__(self, value: int, arrival_ns: int) -> int:
-        """Return the total that equals `value` modulo `modulus` and is nearest to the total expected at
-        `arrival_ns`.
+        """Return the total number of ticks for the counter value `value`, received at host time `arrival_ns`.
 
-        One wrong value therefore does not shift later ones.
+        The total equals `value` modulo `modulus` and is the one nearest to the total predicted from the
+        host's clock. Therefore one wrong value does not shift later totals.
         """
         if self._reference is None:
             self._reference = (arrival_ns, value)
@@ -94,5 +95,5 @@ class CounterUnwrapper:
 
 
 def sample_times_s(last_s: float, step_s: float, count: int) -> np.ndarray:
-    """Return times float64 [count], s, of measurements `step_s` apart; the last is at `last_s`."""
+    """Return the times (s), float64 [count], of measurements that are `step_s` apart and end at `last_s`."""
     return last_s - step_s * np.arange(count - 1, -1, -1, dtype=np.float64)

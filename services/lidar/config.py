@@ -12,7 +12,7 @@ Metres = Annotated[float, Field(gt=0.0, le=1000.0, allow_inf_nan=False)]
 
 
 class LidarConfig(NodeConfig):
-    """Options that all lidars have."""
+    """Options common to all lidars."""
 
     device: str = "/dev/ttyUSB0"  # serial port, best by its link in /dev/serial/by-id; or tcp/HOST:PORT
     baud: Annotated[int, Field(ge=0)] = 0  # 0: try the rates that this kind of lidar uses
@@ -22,7 +22,7 @@ class LidarConfig(NodeConfig):
 
 
 class RplidarConfig(LidarConfig):
-    """Options of SLAMTEC RPLIDAR."""
+    """Options of SLAMTEC RPLIDAR devices."""
 
     mode: Literal["auto", "express", "standard"] = "auto"
 

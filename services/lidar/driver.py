@@ -1,6 +1,4 @@
-"""The base class of lidar drivers: turns samples into stamped revolutions, monitors link noise and device
-clock.
-"""
+"""Base class of lidar drivers: converts samples to stamped revolutions; monitors noise and device clock."""
 
 from __future__ import annotations
 
@@ -25,14 +23,14 @@ _RESET_AFTER = 6  # rejected packets in a row: the motor's speed has changed, es
 
 
 class LidarDriver(ABC):
-    """Base class of a lidar's protocol: `start` configures the device, `feed` decodes what it sends."""
+    """Base class of a lidar's protocol: `start` configures the device, `feed` decodes received bytes."""
 
     bauds: tuple[int, ...] = (115200,)
     clockwise = True
     silence_s = 1.0  # without a byte for so long: reconnect
 
     def __init__(self, *, no_checksum: bool = False) -> None:
-        """`no_checksum`: packets carry no checksum, so that each range needs confirmation by others."""
+        """Create the driver. `no_checksum`: packets have no checksum, so ranges must always be confirmed."""
         self.counters = StreamCounters()
         self.noise = LinkNoise(always=no_checksum)
         self.clock = DeviceClock()
@@ -43,7 +41,7 @@ class LidarDriver(ABC):
 
     @abstractmethod
     def start(self, link: DeviceLink) -> None:
-        """Identify the device and start its stream.
+        """Identify the device and start its measurement stream.
 
         Raises:
             LinkError: no device of this kind answers.
@@ -51,18 +49,18 @@ class LidarDriver(ABC):
 
     @abstractmethod
     def feed(self, data: bytes, at_ns: int) -> list[StampedScan]:
-        """Decode `data`, which arrived at host time `at_ns`; return the revolutions that it completes."""
+        """Decode `data`, received at host time `at_ns`; return the revolutions that are now complete."""
 
     def stop(self, link: DeviceLink) -> None:  # noqa: B027 (most devices need nothing)
-        """Stop the stream, for devices that have a command for it."""
+        """Stop the measurement stream, if the device has a command for this."""
 
     def reset(self) -> None:
-        """Discard partial data, after the link was reopened."""
+        """Discard incomplete data after the link was reopened."""
         self.builder.reset()
         self.clock.reset()
 
     def stamp_revolutions(self, samples: Iterable[Samples]) -> list[StampedScan]:
-        """Return the revolutions that the samples complete, with host time stamps."""
+        """Return the revolutions that `samples` complete, with stamps on the host's clock."""
         found = []
         for part in samples:
             for turn in self.builder.add(part, self.noise.noisy):
@@ -72,9 +70,10 @@ class LidarDriver(ABC):
 
 
 class StartAngleGate:
-    """Checks that a packet starts at the angle predicted from the packets before.
+    """Check of a packet's start angle against the angle predicted from earlier packets.
 
-    A wrong byte in a packet's start angle would rotate all its ranges; the motor's steady speed reveals it.
+    A wrong byte in the start angle would rotate all ranges of the packet. The motor's speed is nearly
+    constant, so the start angle can be predicted.
     """
 
     def __init__(self) -> None:
@@ -85,11 +84,11 @@ class StartAngleGate:
 
     @property
     def median_step_deg(self) -> float | None:
-        """The median angle between the starts of consecutive packets; None while there are too few."""
+        """Return the median angle between the starts of consecutive packets; None for too few packets."""
         return float(np.median(self._spans)) if len(self._spans) >= _MIN_SPANS else None
 
     def skip_packets(self, slots: int = 1) -> None:
-        """Count packets that are missing or damaged, so that the next prediction allows for them."""
+        """Add `slots` packets that are missing or damaged, so that the next prediction includes them."""
         self._skipped += slots
 
     def accepts(self, start_deg: float) -> bool:

@@ -1,9 +1,9 @@
-"""Find packets of fixed length in a byte stream that may start anywhere, lose bytes and contain wrong bytes.
+"""Search for packets of fixed length in a byte stream with lost and wrong bytes.
 
-While synchronized, a damaged packet is skipped in place: the next one starts one packet length later. Only
-several packets in a row with a wrong header mean that synchronization is lost. It is found again where
-several packets in a row start with a header and the first one has a correct checksum. A search that accepted
-the first match would accept random bytes: an 8 bit checksum fits one in 256 times.
+While synchronized, a damaged packet is skipped: the next packet starts one packet length later. Only several
+consecutive packets with a wrong header mean that synchronization is lost. Synchronization is restored where
+several consecutive packets start with a header and the first one has a correct checksum. A search that
+accepted the first match would accept random bytes: an 8 bit checksum is correct by chance one time in 256.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ _RESYNC_AFTER = 24  # packets in a row with a wrong checksum: search again
 
 @dataclass
 class StreamCounters:
-    """Statistics of a stream since it was first opened."""
+    """Counters of packets, samples and revolutions of a stream since it was first opened."""
 
     bytes: int = 0
     packets: int = 0  # with correct header and checksum
@@ -36,7 +36,7 @@ class StreamCounters:
 
 
 class Framer:
-    """Splits a stream into packets of `length` bytes.
+    """Splits a byte stream into packets of `length` bytes.
 
     `has_header(packet)` checks the first bytes only, `checksum_ok(packet)` the checksum.
     """
@@ -63,11 +63,11 @@ class Framer:
 
     @property
     def pending(self) -> int:
-        """Number of complete packets in the buffer that wait for the header after them."""
+        """Return the number of complete packets in the buffer that wait for the header after them."""
         return len(self._buffer) // self.length if self._synchronized else 0
 
     def feed(self, data: bytes) -> Iterator[bytes | None]:
-        """Yield the packets that `data` completes, in order; None for each damaged packet."""
+        """Yield the packets that are complete after adding `data`, in order; None for each damaged packet."""
         self._counters.bytes += len(data)
         self._buffer += data
         while True:
@@ -100,10 +100,10 @@ class Framer:
             yield None
 
     def _next_header_follows(self) -> bool | None:
-        """Return whether a header follows this packet directly or one packet later; None: not received yet.
+        """Return whether a header follows this packet directly or one packet later; None if not yet received.
 
-        If bytes are lost within a packet, its start and the next packet's data look like one packet, which an
-        8 bit checksum accepts one time in 256; but then no header follows where it ends.
+        If bytes are lost within a packet, its start and the data of the next packet look like one packet,
+        which an 8 bit checksum accepts one time in 256; but no header follows the end of such a packet.
         """
         for start in (self.length, 2 * self.length):
             head = bytes(self._buffer[start : start + _HEAD])
@@ -114,9 +114,7 @@ class Framer:
         return False
 
     def _search(self) -> bool:
-        """Drop bytes until the buffer starts with consecutive packets; return False if more bytes are
-        needed.
-        """
+        """Drop bytes until consecutive packets start the buffer; return False if more bytes are needed."""
         needed = self.length * self._confirm_packets
         start = 0
         while start + needed <= len(self._buffer):

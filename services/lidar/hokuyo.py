@@ -20,7 +20,7 @@ _MIN_GOOD_RATIO = 0.2  # of a scan's blocks with a correct checksum; scans below
 
 
 class HokuyoDriver(LidarDriver):
-    """Measures distances counter-clockwise; with `intensity` also the echo strength."""
+    """Driver of one Hokuyo lidar; angles are counter-clockwise; `intensity`: also read echo strengths."""
 
     bauds = (115200, 19200, 750000)
     clockwise = False
@@ -104,9 +104,9 @@ class HokuyoDriver(LidarDriver):
         ]
 
     def _device_time_s(self, packet: bytes, at_ns: int) -> float | None:
-        """Return the device time of a reply's first measurement, s.
+        """Return the device time (s) of the first measurement of a reply; None before the first valid time.
 
-        If the checksum of the time is wrong, extrapolate from the scan before; None before the first time.
+        If the checksum of the time is wrong, the time is extrapolated from the previous scan.
         """
         time_ms = self._reply.time_ms(packet)
         missed, self._missed_scans = self._missed_scans + 1, 0
@@ -119,7 +119,7 @@ class HokuyoDriver(LidarDriver):
 
 
 def _query_geometry(link: DeviceLink) -> ScipGeometry:
-    """Return the geometry that the device reports to PP.
+    """Return the scan geometry that the device reports in its reply to the command PP.
 
     Raises:
         LinkError: no Hokuyo answers.
@@ -134,7 +134,7 @@ def _query_geometry(link: DeviceLink) -> ScipGeometry:
 
 
 def _request(link: DeviceLink, command: bytes) -> bytes:
-    """Send a command; return what arrives until an empty line or the timeout."""
+    """Send a command; return the bytes received until an empty line or the timeout."""
     link.write(command)
     data, deadline = b"", time.monotonic() + _ANSWER_S
     while time.monotonic() < deadline and b"\n\n" not in data[data.find(command[:2]) + 1 :]:
@@ -143,7 +143,7 @@ def _request(link: DeviceLink, command: bytes) -> bytes:
 
 
 def _start_scanning(link: DeviceLink, command: bytes) -> bytes:
-    """Start continuous scans; return the first bytes received of them.
+    """Start continuous scans; return the first received bytes of the scans.
 
     Raises:
         LinkError: the device rejects the command.

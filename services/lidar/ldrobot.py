@@ -1,5 +1,4 @@
-"""Driver of LDROBOT LD06, LD19 and compatible lidars: they send packets of 47 bytes as soon as they have
-power.
+"""Driver of LDROBOT LD06, LD19 and compatible lidars, which send packets of 47 bytes when powered.
 
 LDROBOT, "LD06 / LD19 Development Manual", chapter 3 (communication protocol): 0x54, 0x2C (twelve points),
 speed in degrees per second, start angle in 0.01 degrees, twelve times distance in mm and intensity, end
@@ -47,7 +46,7 @@ def crc8(data: bytes) -> int:
 
 
 class LdrobotPacket(NamedTuple):
-    """The values of one packet."""
+    """The decoded values of one packet."""
 
     speed_deg_s: float
     start_deg: float
@@ -58,7 +57,7 @@ class LdrobotPacket(NamedTuple):
 
     @property
     def step_deg(self) -> float:
-        """Angle between two points."""
+        """Return the angle between two consecutive points."""
         return ((self.end_deg - self.start_deg) % 360.0) / (POINTS - 1)
 
 
@@ -73,7 +72,7 @@ def checksum_ok(packet: bytes) -> bool:
 
 
 def parse(packet: bytes) -> LdrobotPacket:
-    """Return the values of one packet of 47 bytes."""
+    """Decode one packet of 47 bytes."""
     _, speed, start, points, end, time_ms, _ = _LAYOUT.unpack(packet)
     data = np.frombuffer(points, dtype=[("mm", "<u2"), ("intensity", "u1")])
     range_m = np.where(data["mm"] > 0, data["mm"] / 1000.0, np.nan)
@@ -83,7 +82,7 @@ def parse(packet: bytes) -> LdrobotPacket:
 
 
 class LdrobotDriver(LidarDriver):
-    """Receives only: the device has no commands. Angles grow clockwise seen from above."""
+    """Driver of one LDROBOT lidar, which has no commands. Angles are clockwise seen from above."""
 
     bauds = (230400,)
 

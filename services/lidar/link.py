@@ -1,6 +1,4 @@
-"""Serial ports and TCP sockets as drivers need them: received bytes, and an error when the connection
-ends.
-"""
+"""Serial ports and TCP sockets for drivers: received bytes, and an error when the connection ends."""
 
 from __future__ import annotations
 
@@ -19,16 +17,16 @@ _BITS_PER_BYTE = 10  # start bit, eight data bits, stop bit
 
 
 class LinkError(OSError):
-    """The device is missing, may not be opened, or does not answer; the text says what to do."""
+    """Error: the device is missing, permission is denied, or it does not answer; the text has the remedy."""
 
 
 class DeviceLink(Protocol):
-    """An open connection to a device."""
+    """Interface of an open connection to a device."""
 
     byte_time_s: float  # transmission time of a byte; 0 if unknown
 
     def read(self, timeout_s: float) -> bytes:
-        """Return received bytes, waiting up to `timeout_s` for the first; b"" if there are none.
+        """Return received bytes; wait up to `timeout_s` for the first byte; b"" if none arrives.
 
         Raises:
             LinkError: the connection has ended.
@@ -38,7 +36,7 @@ class DeviceLink(Protocol):
         """Send all bytes. Raises LinkError."""
 
     def set_motor(self, on: bool) -> None:
-        """Switch the motor by the adapter's DTR line, where there is one."""
+        """Switch the motor on or off by the DTR line of the serial adapter, if the link has one."""
 
     def close(self) -> None:
         """Close the connection."""
@@ -48,7 +46,7 @@ class SerialLink:
     """A serial port (or a pseudo-terminal)."""
 
     def __init__(self, path: str, baud: int) -> None:
-        """Open the port exclusively: a second reader would take bytes away.
+        """Open the port exclusively, because a second reader would receive part of the bytes.
 
         Raises:
             LinkError: no such port, no permission, or in use.
@@ -146,7 +144,7 @@ def open_link(device: str, baud: int) -> DeviceLink:
 
 
 def drain(link: DeviceLink, quiet_s: float = 0.05, at_most_s: float = 0.5) -> None:
-    """Discard received bytes until the device has been quiet for `quiet_s`, at most for `at_most_s`."""
+    """Discard received bytes until the device has been silent for `quiet_s`, at most for `at_most_s`."""
     deadline = time.monotonic() + at_most_s
     while time.monotonic() < deadline and link.read(quiet_s):
         pass

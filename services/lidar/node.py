@@ -1,6 +1,4 @@
-"""The lidar nodes: publish revolutions as scans, with time stamps that do not depend on the host's wall
-clock.
-"""
+"""The lidar nodes: publish revolutions as scans, with stamps independent of the host's wall clock."""
 
 from __future__ import annotations
 
@@ -30,12 +28,12 @@ class _LidarNode(Node, ABC):
 
     @abstractmethod
     def driver(self) -> LidarDriver:
-        """Return a new driver of this kind."""
+        """Return a new driver for the configured device."""
 
     def configure(self) -> None:
-        """Prepare the reader.
+        """Prepare the reader of the device.
 
-        The device is opened later, so that a missing device is a status and not an error.
+        The device is opened later, so that a missing device is reported as a status and not as an error.
         """
         bauds = (self.config.baud,) if self.config.baud else ()
         self._reader = LidarReader(self.driver, self._open, bauds, StampClock().now_ns)
@@ -44,7 +42,7 @@ class _LidarNode(Node, ABC):
         return open_link(self.config.device, baud)
 
     def source(self) -> Iterator[SourceItem | None]:
-        """Yield scans without end; None while there is none."""
+        """Yield scans without end; None while no scan is complete."""
         for scan in self._reader.scans():
             self.detail = self._reader.status
             yield None if scan is None else SourceItem(None, "lidar/scan", self.message(scan))
@@ -52,9 +50,8 @@ class _LidarNode(Node, ABC):
     def message(self, scan: StampedScan) -> Scan:
         """Return the scan message of a revolution.
 
-        Ranges beyond the limit become NaN (not measured): consumers read +inf as free space, and these
-        devices
-        do not distinguish "nothing within range" from "not seen".
+        Ranges beyond the limit become NaN (not measured): subscribers interpret +inf as free space, and these
+        devices do not distinguish "nothing within range" from "not measured".
         """
         turn, sign = scan.revolution, -1.0 if self.config.upside_down else 1.0
         range_max_m = self.config.range_max_m or scan.range_max_m
@@ -78,7 +75,7 @@ class _LidarNode(Node, ABC):
 
 
 class RplidarNode(_LidarNode):
-    """SLAMTEC RPLIDAR A, S and C series."""
+    """Node of SLAMTEC RPLIDAR A, S and C series."""
 
     name = "lidar"
     Config = RplidarConfig
@@ -90,7 +87,7 @@ class RplidarNode(_LidarNode):
 
 
 class LdrobotNode(_LidarNode):
-    """LDROBOT LD06 and LD19."""
+    """Node of LDROBOT LD06 and LD19."""
 
     name = "lidar"
     outputs = ("lidar/scan",)
@@ -100,7 +97,7 @@ class LdrobotNode(_LidarNode):
 
 
 class HokuyoNode(_LidarNode):
-    """Hokuyo over serial or TCP."""
+    """Node of Hokuyo lidars over serial port, USB or TCP."""
 
     name = "lidar"
     Config = HokuyoConfig

@@ -1,9 +1,9 @@
-"""Reject unconfirmed ranges while the link is noisy.
+"""Rejection of unconfirmed ranges while the link is noisy.
 
 A checksum of 8 bits (6 in SCIP) detects one wrong byte, but accepts one in 256 (one in 64) packets with two
-or more. On a clean link that happens once in years; with one byte in a hundred wrong, once in seconds. While
-packets fail, a range must therefore be confirmed: by two neighbours on a straight surface, or by the same
-direction one revolution before.
+or more. On a clean link this happens once in years; with one wrong byte in a hundred, once in seconds. While
+damaged packets are received, a range must therefore be confirmed: by two neighbours on a straight surface, or
+by the same direction one revolution before.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _TOLERANCE_RATIO = 0.005  # of the range
 
 
 class LinkNoise:
-    """Tells whether packets fail so often that the checksum alone is not sufficient."""
+    """Detector of link noise: so many damaged packets that the checksum alone is not sufficient."""
 
     def __init__(self, always: bool = False) -> None:
         self._recent: deque[bool] = deque(maxlen=_WINDOW)
@@ -28,7 +28,7 @@ class LinkNoise:
         self._always = always  # for packets without a checksum
 
     def update(self, good: bool) -> None:
-        """Count one more packet."""
+        """Count one packet; `good`: its checksum was correct."""
         if len(self._recent) == self._recent.maxlen:
             self._bad -= not self._recent[0]
         self._recent.append(good)
@@ -36,7 +36,7 @@ class LinkNoise:
 
     @property
     def noisy(self) -> bool:
-        """Whether more than 2 % of the recent packets failed (at least two)."""
+        """Return whether more than 2 % of the recent packets, and at least two, were damaged."""
         return self._always or self._bad >= max(2, math.ceil(_NOISY_RATIO * len(self._recent)))
 
 
@@ -65,7 +65,7 @@ def _tolerance_m(range_m: np.ndarray) -> np.ndarray:
 
 
 def _matches_inverse(range_m: np.ndarray, inverse: np.ndarray) -> np.ndarray:
-    """Return whether ranges agree with predicted inverse ranges, 1/m."""
+    """Return bool [N]: whether ranges (m) agree with the predicted inverse ranges (1/m)."""
     wanted_m = np.where(inverse > 0.0, 1.0 / inverse, np.nan)
     return np.abs(range_m - wanted_m) <= _tolerance_m(range_m)
 

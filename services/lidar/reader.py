@@ -1,4 +1,4 @@
-"""Keep a lidar open: start it, read it, reconnect after a failure, report its status."""
+"""Reader of a lidar: starts the device, reads it, reconnects after a failure, and reports the status."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _NO_SCAN_S = 5.0  # bytes without a revolution: wrong device, wrong baud rate, o
 
 
 class LidarReader:
-    """Delivers the scans of one device without end; `status` is one line of text."""
+    """Yields the scans of one device without end; `status` is one line of text."""
 
     def __init__(
         self,
@@ -35,7 +35,7 @@ class LidarReader:
         self.reconnects = -1
 
     def scans(self) -> Iterator[StampedScan | None]:
-        """Yield scans as they are complete; None when no data came for a moment."""
+        """Yield each scan when it is complete; None if no data arrived for a short time."""
         while True:
             if self._link is None and not self._open():
                 yield None
@@ -55,7 +55,7 @@ class LidarReader:
             self._close_link()
 
     def _open(self) -> bool:
-        """Try to open the device at one baud rate; a failure selects the next rate for the next call."""
+        """Try to open the device at one baud rate; after a failure, the next call tries the next rate."""
         baud = self._bauds[self._baud]
         link = None
         try:

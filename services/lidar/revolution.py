@@ -1,4 +1,4 @@
-"""Split a stream of measurements into revolutions and resample each to a regular grid of directions."""
+"""Splitting of a stream of measurements into revolutions, resampled to a regular grid of directions."""
 
 from __future__ import annotations
 
@@ -14,8 +14,9 @@ _MAX_STEP_BACK_DEG = 20.0  # RPLIDAR's angle corrections are below 8 degrees
 
 
 class RevolutionBuilder:
-    """Assembles revolutions from samples; drops the first one and those with a gap of most of a
-    revolution.
+    """Assembles revolutions from samples.
+
+    The first, incomplete revolution is dropped, and revolutions with a gap of nearly a revolution or more.
     """
 
     def __init__(self, counters: StreamCounters, *, clockwise: bool) -> None:
@@ -30,14 +31,14 @@ class RevolutionBuilder:
         self._previous: LidarRevolution | None = None
 
     def reset(self) -> None:
-        """Discard the current revolution, after an interruption of the stream."""
+        """Discard the present revolution after an interruption of the stream."""
         if self._parts and self._complete:
             self._counters.dropped_scans += 1
         self._parts, self._complete, self._previous, self._total_deg = [], False, None, None
         self._last_time = -np.inf
 
     def add(self, samples: Samples, noisy: bool = False) -> list[LidarRevolution]:
-        """Return the revolutions that these samples complete. With `noisy`, unconfirmed ranges become NaN."""
+        """Add samples and return the revolutions now complete; `noisy`: unconfirmed ranges become NaN."""
         if not len(samples):
             return []
         if self._period_s is not None and samples.time_s[0] - self._last_time > 0.9 * self._period_s:
@@ -57,10 +58,11 @@ class RevolutionBuilder:
         return turns
 
     def _unwrap_angles(self, angle_deg: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return unwrapped angles and revolution numbers of the samples.
+        """Return the angles of the samples without wrap at 360 degrees, and their revolution numbers.
 
-        A device that corrects its angles by the range may step back a little, but never forward by nearly a
-        revolution; a step back does not reopen the previous revolution.
+        A device that corrects its angles by the range may step back by a small angle, but never forward by
+        nearly a revolution. A step back across the start of a revolution does not return to the previous
+        revolution.
         """
         if self._total_deg is None:
             self._total_deg = float(angle_deg[0] % 360.0)
@@ -85,7 +87,10 @@ class RevolutionBuilder:
         return self.accept(turn, full - sum(len(part) for part in parts), noisy)
 
     def accept(self, turn: LidarRevolution, missing: int, noisy: bool) -> list[LidarRevolution]:
-        """Count a revolution that lacks `missing` measurements; with `noisy`, remove unconfirmed ranges."""
+        """Count a revolution with `missing` lost measurements and return it in a list.
+
+        With `noisy`, unconfirmed ranges become NaN.
+        """
         self._period_s = turn.scan_time_s
         previous, self._previous = self._previous, turn
         self._counters.lost_samples += max(missing, 0)
@@ -107,7 +112,7 @@ class RevolutionBuilder:
 
 
 def ranges_in_directions_of(turn: LidarRevolution, previous: LidarRevolution | None) -> np.ndarray:
-    """Return ranges float64 [N] of `previous` in the directions of `turn`; NaN where it has none."""
+    """Return the ranges (m), float64 [N], of `previous` in the directions of `turn`; NaN = none."""
     found = np.full(len(turn.range_m), np.nan)
     if previous is None or not len(previous.range_m):
         return found
@@ -122,11 +127,11 @@ def ranges_in_directions_of(turn: LidarRevolution, previous: LidarRevolution | N
 
 
 def _resample_to_grid(parts: list[Samples], next_time_s: float, clockwise: bool) -> LidarRevolution | None:
-    """Return the revolution on the regular grid that fits its directions best; None if it has too few
-    samples.
+    """Return the revolution on the regular grid that fits its directions best; None for too few samples.
 
-    The motor turns steadily, so directions are regular to a fraction of a step. Each measurement goes to
-    the nearest grid direction; of two at one direction the nearer one is kept.
+    The motor's speed is nearly constant, so the directions are regular to a fraction of a step. Each
+    measurement is assigned to the nearest grid direction; of two measurements in one direction, the nearer
+    one is used.
     """
     angle = np.concatenate([part.angle_deg for part in parts])
     if len(angle) < _MIN_SAMPLES:
@@ -180,7 +185,7 @@ def _beam_numbers(angle_deg: np.ndarray) -> np.ndarray:
 
 
 def _slice(samples: Samples, piece: slice, angle_deg: np.ndarray) -> Samples:
-    """Return a part of samples with other angles."""
+    """Return the samples of the slice `piece`, with their angles replaced by `angle_deg`."""
     number = None if samples.number is None else samples.number[piece]
     return Samples(
         angle_deg[piece], samples.range_m[piece], samples.intensity[piece], samples.time_s[piece], number

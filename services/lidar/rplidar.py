@@ -1,6 +1,4 @@
-"""Driver of SLAMTEC RPLIDAR (A, S and C series): identifies the model and starts its best supported
-stream.
-"""
+"""Driver of SLAMTEC RPLIDAR (A, S and C series): identifies the model, starts its best supported stream."""
 
 from __future__ import annotations
 
@@ -27,7 +25,7 @@ _MODELS = {
 
 
 class RplidarDriver(LidarDriver):
-    """Reads one RPLIDAR.
+    """Driver of one RPLIDAR.
 
     `mode`: "auto" uses the device's typical mode if its packets are supported, else express, else standard.
     """
@@ -78,7 +76,7 @@ class RplidarDriver(LidarDriver):
         link.set_motor(False)
 
     def _start_best_stream(self, link: DeviceLink, model: int) -> None:
-        """Start the first of the possible streams that the device accepts."""
+        """Start the first stream that the device accepts, in order of preference."""
         attempts: list[tuple[bytes, float | None]] = []
         if self.mode == "auto" and model >> 4 not in (1,):  # the A1 has no modes
             attempts += _typical_mode(link)
@@ -98,9 +96,7 @@ class RplidarDriver(LidarDriver):
 
 
 def _typical_mode(link: DeviceLink) -> list[tuple[bytes, float | None]]:
-    """Return the request for the device's typical mode and its sample period (s); [] if it is not
-    supported.
-    """
+    """Return [(request, sample period s)] for the device's typical mode; [] if it is not supported."""
     mode = _read_configuration(link, rp.CONF_TYPICAL_MODE)
     if mode is None or len(mode) < 2:
         return []
@@ -116,7 +112,7 @@ def _typical_mode(link: DeviceLink) -> list[tuple[bytes, float | None]]:
 
 
 def _read_configuration(link: DeviceLink, entry: int, payload: bytes = b"") -> bytes | None:
-    """Return an entry of the device's configuration; None if old firmware does not answer."""
+    """Return an entry of the device's configuration; None if the device does not answer (old firmware)."""
     try:
         answer = _request(
             link, rp.request(rp.GET_LIDAR_CONF, struct.pack("<I", entry) + payload), rp.CONF, tries=2
@@ -146,7 +142,7 @@ def _request(link: DeviceLink, message: bytes, kind: int, tries: int = _TRIES) -
 
 
 def _start_stream(link: DeviceLink, message: bytes) -> tuple[int | None, bytes]:
-    """Send a request; return the type of the stream that starts and its first bytes; None if none starts."""
+    """Send a request; return the type of the started stream (None: none started) and its first bytes."""
     for _ in range(_TRIES):
         link.write(message)
         data, deadline = b"", time.monotonic() + _ANSWER_S

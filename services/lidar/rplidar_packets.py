@@ -29,7 +29,7 @@ _HQ_NODE = np.dtype([("angle_q14", "<u2"), ("mm_q2", "<u4"), ("quality", "u1"), 
 
 
 def request(command: int, payload: bytes = b"") -> bytes:
-    """Return a request packet (2.2): 0xA5, command; with a payload its size, itself, XOR of all before."""
+    """Return a request packet (2.2): 0xA5, command; with a payload also its size, payload and XOR."""
     head = bytes((0xA5, command))
     if not payload:
         return head
@@ -38,7 +38,7 @@ def request(command: int, payload: bytes = b"") -> bytes:
 
 
 class ResponseDescriptor(NamedTuple):
-    """The header that announces a response (2.3)."""
+    """The header before a response of the device (2.3): data length, one or several packets, type."""
 
     length: int  # of each data packet
     multiple: bool
@@ -57,9 +57,9 @@ def find_descriptor(data: bytes, kinds: tuple[int, ...]) -> tuple[ResponseDescri
 
 
 class PacketSamples(NamedTuple):
-    """The samples of a packet.
+    """The decoded samples of one packet.
 
-    Angles of capsules are relative to the start angles of this and the next capsule.
+    Angles of capsules are relative to the start angles of this capsule and of the next one.
     """
 
     start_deg: float
@@ -71,9 +71,7 @@ class PacketSamples(NamedTuple):
 
 
 def has_capsule_header(packet: bytes) -> bool:
-    """Return whether the upper nibbles of the first two bytes are A and 5; the lower ones are the
-    checksum.
-    """
+    """Return whether the upper four bits of the first two bytes are 0xA and 0x5 (lower bits: checksum)."""
     return packet[0] >> 4 == 0xA and packet[1] >> 4 == 0x5
 
 
@@ -89,7 +87,7 @@ def start_deg(packet: bytes) -> float:
 
 
 def parse_capsule(packet: bytes) -> PacketSamples:
-    """Decode 32 samples in 16 cabins of two distances (q2 without fraction) and two angle offsets (q3)."""
+    """Decode 32 samples in 16 groups ("cabins") of two distances (mm) and two angle offsets (degrees / 8)."""
     word = struct.unpack_from("<H", packet, 2)[0]
     cabins = np.frombuffer(packet, [("d", "<u2", 2), ("angles", "u1")], count=16, offset=4)
     mm = (cabins["d"] >> 2).ravel().astype(np.float64)
@@ -114,12 +112,12 @@ _SCALE_SHIFT = np.array([0, 1, 2, 3, 4])
 
 
 def parse_ultra(packet: bytes, following: bytes | None) -> PacketSamples:
-    """Decode 96 samples in 32 cabins.
+    """Decode 96 samples in 32 groups ("cabins").
 
-    A cabin has one distance of variable scale and two predicted ones: differences from this distance and
-    from the next cabin's. The last cabin therefore needs the following packet (None: its last sample is
-    lost).
-    As _ultraCapsuleToNormal of SLAMTEC's SDK, with the angle offset that the device leaves to the host.
+    A cabin contains one distance of variable scale and two predicted distances: differences from this
+    distance and from the distance of the next cabin. The last cabin therefore needs the following packet
+    (None: its last sample is lost). As _ultraCapsuleToNormal of SLAMTEC's SDK, with the angle offset that the
+    host must compute.
     """
     word = struct.unpack_from("<H", packet, 2)[0]
     cabins = np.frombuffer(packet, "<i4", count=32, offset=4).astype(np.int64)
@@ -148,7 +146,7 @@ def parse_ultra(packet: bytes, following: bytes | None) -> PacketSamples:
 
 
 def _ultra_offset_deg(mm: np.ndarray) -> np.ndarray:
-    """Return the angle offset of a triangulation lidar by distance, in the SDK's fixed-point arithmetic."""
+    """Return the angle offset (degrees) at distances in mm, in the fixed-point arithmetic of the SDK."""
     quarter = np.maximum(mm * 4.0, 200.0).astype(np.int64)
     k = 98361 // quarter
     radians_q16 = int(8 * np.pi * 65536 / 180) - (k << 6) - k * k * k // 98304
@@ -162,8 +160,9 @@ def has_hq_header(packet: bytes) -> bool:
 
 
 def hq_checksum_ok(packet: bytes) -> bool:
-    """Return whether the CRC-32 (IEEE 802.3) of the bytes before it, zero-padded to a multiple of four, is
-    correct.
+    """Return whether the CRC-32 (IEEE 802.3) at the end of the packet is correct.
+
+    The CRC is computed over the preceding bytes, zero-padded to a multiple of four.
     """
     body = packet[:-4]
     return zlib.crc32(body + bytes(-len(body) % 4)) == struct.unpack_from("<I", packet, len(body))[0]
@@ -179,14 +178,12 @@ def parse_hq(packet: bytes) -> PacketSamples:
 
 
 def has_node_header(packet: bytes) -> bool:
-    """Return whether the start bit and its inverse differ and the check bit is set: a node has no
-    checksum.
-    """
+    """Return whether start bit and inverse start bit differ and the check bit is set (no checksum)."""
     return (packet[0] ^ packet[0] >> 1) & 1 == 1 and packet[1] & 1 == 1
 
 
 class MeasurementNode(NamedTuple):
-    """One sample of the standard scan."""
+    """One sample of the standard scan ("node" in SLAMTEC's protocol)."""
 
     first: bool  # start of a revolution
     angle_deg: float
@@ -195,7 +192,7 @@ class MeasurementNode(NamedTuple):
 
 
 def parse_node(packet: bytes) -> MeasurementNode:
-    """Decode one sample: quality, angle in degrees / 64, distance in mm / 4 (4.2)."""
+    """Decode one sample of the standard scan (4.2): quality, angle in degrees / 64, distance in mm / 4."""
     angle, distance = (packet[1] | packet[2] << 8) >> 1, packet[3] | packet[4] << 8
     range_m = distance / 4000.0 if distance else math.nan
     return MeasurementNode(bool(packet[0] & 1), angle / 64.0, range_m, float(packet[0] >> 2))

@@ -1,7 +1,7 @@
-"""Decode RPLIDAR measurement packets to samples with times.
+"""Decoder of RPLIDAR measurement packets to samples with times.
 
-The device sends no time, but measures at a fixed rate: the sample number is the clock. Damaged packets are
-counted with their number of samples.
+The device sends no time, but measures at a constant rate: the time is computed from the sample number. A
+damaged packet is counted with the number of samples that it would contain.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ _CONFIRM_NODES = 16  # consecutive nodes needed to synchronize: a node has only 
 
 
 class RplidarStream:
-    """A stream of measurement packets of one type."""
+    """Decoder of a stream of measurement packets of one type (`kind`)."""
 
     def __init__(self, kind: int, sample_s: float, counters: StreamCounters) -> None:
         self.kind = kind
@@ -47,11 +47,11 @@ class RplidarStream:
 
     @property
     def newest_s(self) -> float:
-        """Device time (s) of the newest received sample, including packets that wait for confirmation."""
+        """Return the device time (s) of the newest received sample, including unconfirmed packets."""
         return (self._sample_count + self._framer.pending * self._samples) * self._sample_s
 
     def feed(self, data: bytes) -> list[Samples | None]:
-        """Return the samples that `data` completes; None for each damaged packet."""
+        """Return the samples that are complete after adding `data`; None for each damaged packet."""
         found: list[Samples | None] = []
         nodes: list[tuple[float, float, float, int]] = []
         for packet in self._framer.feed(data):
@@ -80,7 +80,7 @@ class RplidarStream:
         return packets * self._samples
 
     def _capsule(self, packet: bytes | None) -> list[Samples | None]:
-        """Decode the pending capsule with the start angle of this one, or with the median speed."""
+        """Decode the previous capsule, whose angles need the start angle of this one or the median speed."""
         typical = self._start_gate.median_step_deg
         if packet is None:
             self._start_gate.skip_packets()
@@ -97,7 +97,7 @@ class RplidarStream:
         return found
 
     def _decode_pending(self, span_deg: float | None, following: bytes | None) -> list[Samples | None]:
-        """Return the samples of the pending capsule, which spans `span_deg`."""
+        """Return the samples of the capsule that waits for its angles; it extends over `span_deg`."""
         pending, self._pending_capsule = self._pending_capsule, None
         if pending is None or span_deg is None:
             return []
@@ -116,7 +116,7 @@ class RplidarStream:
         return self._with_sample_numbers(measured.offset_deg, measured, self._sample_count)
 
     def _node(self, packet: bytes | None, nodes: list[tuple[float, float, float, int]]) -> None:
-        """Append a node if its angle agrees with the motor's speed: a node has no checksum."""
+        """Append a sample without checksum to `nodes` if its angle agrees with the motor's speed."""
         self._node_gap += 1
         if packet is None:
             return

@@ -1,4 +1,4 @@
-"""Data types of all lidars."""
+"""Data types common to all lidars."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Samples:
-    """Consecutive measurements. Angles are in the device's direction of rotation, increasing."""
+    """Consecutive measurements. Angles increase in the device's direction of rotation."""
 
     angle_deg: np.ndarray  # float64 [N]
     range_m: np.ndarray  # float64 [N], NaN = no valid measurement
@@ -23,9 +23,9 @@ class Samples:
 
 @dataclass(frozen=True)
 class LidarRevolution:
-    """One revolution on a regular grid.
+    """One revolution of a lidar on a regular grid of directions.
 
-    Beam i is at angle_min_rad + i * angle_increment_rad, measured i * time_increment_s after beam 0.
+    Beam i is at angle_min_rad + i * angle_increment_rad and is measured i * time_increment_s after beam 0.
     """
 
     time_s: float  # of beam 0, on the device's clock
@@ -39,7 +39,7 @@ class LidarRevolution:
 
 @dataclass(frozen=True)
 class StampedScan:
-    """A revolution with its time on the host's clock and the range limits of its device."""
+    """A revolution with its stamp on the host's clock and the range limits of the device."""
 
     stamp_ns: int
     revolution: LidarRevolution

@@ -21,7 +21,7 @@ _MIN_HEADER_MATCH = 0.7  # ratio of a reply's header bytes that must match
 
 
 def checksum(text: bytes) -> int:
-    """Return the checksum character of a line: the lower six bits of its sum, plus 30H (section 7)."""
+    """Return the checksum character of a line: the lower six bits of its byte sum, plus 30H (section 7)."""
     return (sum(text) & 0x3F) + _OFFSET
 
 
@@ -34,7 +34,7 @@ def decode(text: bytes) -> int:
 
 
 def parameters(reply: bytes) -> dict[str, str]:
-    """Return the lines `NAME:value;s` of a PP, VV or II reply with correct checksums, as name -> value."""
+    """Return name -> value of the lines `NAME:value;s` with correct checksum s of a PP, VV or II reply."""
     found = {}
     for line in reply.split(b"\n"):
         body, semicolon, tail = line.rpartition(b";")
@@ -45,7 +45,7 @@ def parameters(reply: bytes) -> dict[str, str]:
 
 
 class ScipGeometry(NamedTuple):
-    """The device's parameters (reply to PP): measured steps, resolution, range limits, period."""
+    """Scan geometry from the device (reply to PP): measured steps, resolution, range limits, period."""
 
     model: str
     range_min_m: float
@@ -77,12 +77,12 @@ class ScipGeometry(NamedTuple):
 
     @property
     def count(self) -> int:  # type: ignore[override]  # hides tuple.count, which nothing needs
-        """Number of measurements of a scan."""
+        """Return the number of measurements of a scan."""
         return self.last_step - self.first_step + 1
 
 
 class ScipScanReply:
-    """Decodes the replies to one continuous MD or ME command."""
+    """Decoder of the replies to one continuous MD or ME command."""
 
     def __init__(self, geometry: ScipGeometry, intensity: bool) -> None:
         self.geometry = geometry
@@ -98,12 +98,12 @@ class ScipScanReply:
         self.length = self._data_at + self._characters + 2 * blocks + 1
 
     def has_header(self, reply: bytes) -> bool:
-        """Return whether a reply starts with the expected header, up to a few wrong bytes."""
+        """Return whether a reply starts with the expected header; a few wrong bytes are tolerated."""
         same = sum(a == b for a, b in zip(self._head, reply))
         return same >= _MIN_HEADER_MATCH * len(self._head)
 
     def time_ms(self, reply: bytes) -> int | None:
-        """Return the device's 24 bit clock, ms; None if its checksum is wrong."""
+        """Return the time (ms) of the device's 24 bit clock; None if the checksum of the time is wrong."""
         line = reply[self._time_at : self._data_at]
         good = _characters(line[:4]) and checksum(line[:4]) == line[4] and line[5] == 0x0A
         return decode(line[:4]) if good else None
@@ -141,7 +141,7 @@ class ScipScanReply:
 
 
 def _characters(text: bytes) -> bool:
-    """Return whether all characters are in 30H to 6FH, those that encode six bits."""
+    """Return whether all characters are in 30H to 6FH, the range that encodes six bits."""
     return not text.translate(None, _SIX_BITS)
 
 

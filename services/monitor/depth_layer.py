@@ -1,4 +1,4 @@
-"""Draw fused depth and coloured point clouds in rerun.
+"""Drawing of fused depth and coloured point clouds in rerun.
 
 Entities:
     depth                       the newest fused depth as an image
@@ -29,7 +29,7 @@ class DepthLayer:
         self._drawn = 0
 
     def depth(self, stamp_ns: int, depth_m: np.ndarray) -> None:
-        """Draw depth float32 [H, W], optical z in m; NaN (unknown) is not drawn."""
+        """Draw a depth map float32 [H, W] (optical z, m); NaN (unknown) is not drawn."""
         if depth_m.size and self._limits.due("depth", stamp_ns):
             small = np.nan_to_num(depth_m[::_SHRINK, ::_SHRINK], nan=0.0)
             drawing = rr.DepthImage(
@@ -38,7 +38,10 @@ class DepthLayer:
             self._writer.log(DEPTH, drawing, stamp_ns=stamp_ns)
 
     def cloud(self, stamp_ns: int, points_odom_m: np.ndarray, colours: np.ndarray) -> None:
-        """Draw points float32 [N, 3] with colours uint8 [N, 3]; they replace those of the oldest keyframe."""
+        """Draw the points float32 [N, 3] (odom frame, m) of a keyframe, with colours uint8 [N, 3] (RGB).
+
+        They replace the points of the oldest keyframe once `clouds` keyframes are drawn.
+        """
         entity = f"{CLOUD}/{self._drawn % self._clouds}"
         self._drawn += 1
         self._writer.log(entity, rr.Points3D(points_odom_m, colors=colours, radii=0.01), stamp_ns=stamp_ns)

@@ -13,7 +13,7 @@ from beamsplat.services.monitor.scene import BODY, CAMERA, SCAN, WORLD
 
 
 def layout() -> rrb.Blueprint:
-    """Return the blueprint of the viewer."""
+    """Return the layout (blueprint) of the viewer."""
     eye = rrb.EyeControls3D(
         kind=rrb.Eye3DKind.Orbital, position=(-5.0, -5.0, 7.0), look_target=(0.0, 0.0, 0.0),
         eye_up=(0.0, 0.0, 1.0), tracking_entity=f"/{BODY}",

@@ -1,10 +1,10 @@
-"""Draw the Gaussian map in rerun.
+"""Drawing of the Gaussian map in rerun.
 
 Entities:
     map/splats/<anchor>         Gaussians of one submap in the submap's frame; a loop closure moves the frame
     map_render                  the newest render, from the pose of the newest keyframe
-    plots/psnr_db/<what>        of the newest keyframe: predicted before it was used for mapping, and after
-    plots/depth_error_m/map     median |rendered - fused|
+    plots/psnr_db/<what>        PSNR of the newest keyframe: predicted before mapping, and after mapping
+    plots/depth_error_m/map     median |rendered - fused depth|
 """
 
 from __future__ import annotations
@@ -33,9 +33,7 @@ class _Chunk:
 
 
 class MapLayer:
-    """Draws the newest revision of every chunk at a bounded rate, and each chunk's last revision at the
-    end.
-    """
+    """Draws the newest revision of every chunk at a limited rate, and the last revisions at the end."""
 
     def __init__(self, writer: RerunWriter, limits: RateLimit) -> None:
         self._writer = writer
@@ -47,8 +45,9 @@ class MapLayer:
     def chunk(
         self, stamp_ns: int, anchor: int, revision: int, T_map_anchor: np.ndarray, packed: np.ndarray
     ) -> None:
-        """Draw the packed Gaussians of an anchor, given in its frame; revisions older than the drawn one are
-        ignored.
+        """Draw the packed Gaussians of one submap, in its anchor's frame; outdated revisions are ignored.
+
+        `packed`: uint8 [B], encoded by `splat_codec`; `T_map_anchor` [4, 4].
 
         Raises:
             ValueError: the bytes are no packed Gaussians.
@@ -84,13 +83,13 @@ class MapLayer:
         )
 
     def render(self, stamp_ns: int, jpeg: np.ndarray) -> None:
-        """Draw the render from the newest keyframe's pose: uint8 [B], JPEG."""
+        """Draw the image rendered from the newest keyframe's pose; `jpeg`: uint8 [B]."""
         if self._limits.due("image", stamp_ns, RENDER):
             drawing = rr.EncodedImage(contents=jpeg.tobytes(), media_type="image/jpeg")
             self._writer.log(RENDER, drawing, stamp_ns=stamp_ns)
 
     def metrics(self, stamp_ns: int, predicted_psnr_db: float, psnr_db: float, depth_error_m: float) -> None:
-        """Append a point to each curve; NaN values are left out."""
+        """Append predicted PSNR, PSNR after mapping (dB) and depth error (m) to the curves; skip NaN."""
         values = (predicted_psnr_db, psnr_db, depth_error_m)
         for name, value in zip(("psnr_db/foretold", "psnr_db/after", "depth_error_m/map"), values):
             if np.isfinite(value):
@@ -101,7 +100,7 @@ class MapLayer:
                 self._writer.log(f"plots/{name}", rr.Scalars(value), stamp_ns=stamp_ns)
 
     def finish(self) -> None:
-        """Draw the chunk revisions that the rate limit has deferred."""
+        """Draw the chunk revisions that were delayed by the rate limit."""
         for anchor, chunk in self._deferred.items():
             self._draw(anchor, chunk)
         self._deferred.clear()

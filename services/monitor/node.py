@@ -1,4 +1,4 @@
-"""The monitor node: shows the running system in rerun. No publisher ever waits for it."""
+"""The monitor node: shows the running system in rerun. Publishers never wait for this node."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ Megabytes = Annotated[int, Field(gt=0)]
 class MonitorConfig(NodeConfig):
     """Options of the monitor.
 
-    `view`: a web viewer ("serve"), a viewer window on this machine ("spawn"), or none; `save` writes a file
-    as well. Rates are upper limits in measurement time; 0 does not draw the kind.
+    `view`: a web viewer ("serve"), a viewer window on this machine ("spawn"), or none; `save`: also write a
+    file. Rates are upper limits in measurement time; a rate of 0 disables the drawing.
     """
 
     view: Literal["none", "spawn", "serve"] = "serve"
@@ -182,7 +182,7 @@ class MonitorNode(_Handlers, Node):
         """Open the file and the viewer.
 
         Raises:
-            RuntimeError, OSError: one of them cannot be opened; the text says what to do.
+            RuntimeError, OSError: one of them cannot be opened; the text contains the remedy.
         """
         c, writer = self.config, self.writer
         if c.save is not None:

@@ -1,4 +1,4 @@
-"""Draw the health of the nodes as plots, states, a table and a log.
+"""Drawing of the health of the nodes in rerun: plots, states, a table and a log.
 
 Entities:
     plots/<quantity>/<node>     one curve per node
@@ -32,7 +32,7 @@ _STATES = {
 
 @dataclass(frozen=True)
 class NodeReport:
-    """The health of one node, received once per second. Counts are since its start."""
+    """The health of one node, received once per second. Counts start at zero when the node starts."""
 
     node: str
     instance: str
@@ -52,7 +52,7 @@ class NodeReport:
 
 
 class HealthPanel:
-    """Draws the newest report of each node; rates use the report before."""
+    """Draws the newest report of each node; rates are computed from the newest two reports."""
 
     def __init__(self, writer: RerunWriter, limits: RateLimit) -> None:
         self._writer = writer
@@ -61,7 +61,7 @@ class HealthPanel:
         self._statuses: dict[str, str] = {}
 
     def report(self, new: NodeReport, stamp_ns: int | None) -> None:
-        """Draw a report. `stamp_ns` is the newest measurement time, None before the first measurement."""
+        """Draw a report; `stamp_ns`: newest measurement time, None before the first measurement."""
         old = self._reports.get(new.node)
         if old is None:
             self._declare_plots(new.node)
@@ -95,7 +95,7 @@ class HealthPanel:
             )
 
     def status(self, path: str, status: str, detail: str, stamp_ns: int) -> None:
-        """Draw the status of a service's results when it changes."""
+        """Draw the status of the results of a service, if the status has changed."""
         if self._statuses.get(path) == status:
             return
         self._statuses[path] = status
@@ -131,6 +131,6 @@ class HealthPanel:
 
 
 def _rate_hz(old: NodeReport, new: NodeReport) -> float:
-    """Return dropped and lost messages per second between two reports."""
+    """Return the number of dropped and lost messages per second between two reports."""
     seconds = max((new.wall_ns - old.wall_ns) / 1e9, 1e-3)
     return (new.dropped + new.lost - old.dropped - old.lost) / seconds

@@ -1,10 +1,9 @@
-"""Write rerun entries to a viewer, a file, or both, each in its own thread.
+"""Writing of rerun entries to a viewer, a file, or both, each in its own thread.
 
-rerun can feed several sinks from one stream (`set_sinks`), but then the slowest sink sets the pace: a browser
-that stops reading blocks `log()` for more than 20 s, and the file with it. Therefore each sink has its own
-stream of the same recording, and a queue that never blocks the caller: when it is full, by number or by
-bytes,
-a new entry replaces the queued entry of the same path.
+rerun can write one stream to several sinks (`set_sinks`), but the slowest sink then delays all others: a
+browser that stops reading blocks `log()`, and thus also the file, for more than 20 s. Therefore each sink has
+its own stream of the same recording, and a queue that never blocks the caller: if the queue is full (number
+of entries or bytes), a new entry replaces the queued entry of the same path.
 """
 
 from __future__ import annotations
@@ -45,7 +44,7 @@ class _LogEntry:
 
 
 class RerunSinkThread:
-    """One sink of a recording and the thread that feeds it."""
+    """One sink of a recording (viewer server or file) and the thread that writes to it."""
 
     def __init__(
         self,
@@ -58,6 +57,10 @@ class RerunSinkThread:
         """Open the sink and start the thread.
 
         Args:
+            name: name of the sink, for status texts.
+            stream: rerun stream that only this sink uses.
+            sink: the rerun sink to open.
+            blueprint: layout of the viewer.
             watch: called about once per second; returns the reason why the sink must be closed, or "".
 
         Raises:
@@ -108,7 +111,7 @@ class RerunSinkThread:
         return bool(self.fault) or done.wait(timeout_s)
 
     def begin_close(self) -> None:
-        """Let the thread write the queued entries and then close the sink."""
+        """Request the thread to write the queued entries and then close the sink; do not wait."""
         with self._changed:
             self._closing = True
             self._changed.notify()
@@ -190,13 +193,13 @@ class RerunWriter:
         self._viewer: subprocess.Popen[bytes] | None = None
 
     def log(self, path: str, *parts: Any, stamp_ns: int | None = None, static: bool = False) -> None:
-        """Write rerun archetypes to an entity, at time `stamp_ns`; without it only log time is set."""
+        """Write rerun archetypes to the entity `path` at the time `stamp_ns`; None: rerun's log time only."""
         entry = _LogEntry(path, parts, stamp_ns, static, sum(map(_size_bytes, parts)))
         for thread in self.sinks:
             thread.put(entry)
 
     def save(self, path: Path, blueprint: rrb.Blueprint, *, limit_mb: int, keep_free_mb: int) -> Path:
-        """Start a file under a name that is not yet used (drive.rrd, drive-2.rrd, ...); return its path.
+        """Start a file under a name that does not exist yet (drive.rrd, drive-2.rrd, ...); return its path.
 
         The file is closed, complete, at `limit_mb`, or when less than `keep_free_mb` are free on the disk.
 
@@ -218,9 +221,9 @@ class RerunWriter:
     def serve(
         self, blueprint: rrb.Blueprint, *, bind: str, port: int, origins: list[str], memory_mb: int
     ) -> str:
-        """Start the server that viewers connect to; return its address.
+        """Start the server to which viewers connect; return its address.
 
-        It keeps `memory_mb` of history for viewers that connect later.
+        The server stores up to `memory_mb` of entries for viewers that connect later.
 
         Raises:
             RuntimeError: the port is in use.
@@ -235,7 +238,7 @@ class RerunWriter:
         return f"rerun+http://127.0.0.1:{port}/proxy"
 
     def spawn(self, address: str, memory_mb: int) -> None:
-        """Open a viewer window on the server at `address`. It stays open when the monitor ends."""
+        """Open a viewer window connected to the server at `address`; it remains when the monitor ends."""
         self._viewer = subprocess.Popen(
             [sys.executable, "-m", "rerun_cli", "--connect", address, "--bind", "127.0.0.1",
              "--memory-limit", f"{memory_mb}MB"],
@@ -244,9 +247,9 @@ class RerunWriter:
         )  # fmt: skip
 
     def _watch_viewer(self) -> str:
-        """Note when the viewer window has ended; the server stays, so that a new one can connect.
+        """Add a note if the viewer window was closed, and return "".
 
-        Return "".
+        The server continues, so that a new viewer can connect.
         """
         if self._viewer is not None and self._viewer.poll() is not None:
             self._viewer = None
@@ -262,7 +265,7 @@ class RerunWriter:
 
     @property
     def status(self) -> str:
-        """One line: addresses, files, and failed sinks."""
+        """Return one line of text: addresses, files, and failed sinks."""
         parts = [*self.notes]
         for thread in self.sinks:
             if thread.fault:
@@ -290,9 +293,7 @@ def _size_bytes(archetype: Any) -> int:
 
 
 def _unused_path(path: Path) -> Path:
-    """Return `path`, or the first of path-2, path-3 ... that does not exist, so that a restart
-    overwrites nothing.
-    """
+    """Return `path`, or the first of path-2, path-3, ... that does not exist; no file is overwritten."""
     candidate, number = path, 1
     while candidate.exists():
         number += 1

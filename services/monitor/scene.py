@@ -1,4 +1,4 @@
-"""Draw the robot and its 2D map in rerun.
+"""Drawing of the robot and its 2D map in rerun.
 
 Entities:
     map                        the map frame, z up
@@ -51,7 +51,7 @@ _RAW_FORMATS = {
 
 @dataclass(frozen=True)
 class SceneStyle:
-    """Sizes and limits of what is drawn."""
+    """Sizes and limits of the drawn entities."""
 
     path_points: int = 2000
     path_step_m: float = 0.05
@@ -60,7 +60,7 @@ class SceneStyle:
 
 @dataclass
 class _Sweep:
-    """A scan that waits for the robot's pose at its end."""
+    """A scan that waits for the robot's pose at the end of the scan."""
 
     stamp_ns: int
     end_ns: int
@@ -69,7 +69,7 @@ class _Sweep:
 
 
 class Scene:
-    """Keeps poses and paths of the robot, and draws robot, sensors and grid."""
+    """Stores poses and paths of the robot, and draws robot, sensors and grid."""
 
     def __init__(self, writer: RerunWriter, limits: RateLimit, style: SceneStyle) -> None:
         self._writer = writer
@@ -100,7 +100,7 @@ class Scene:
         size_px: tuple[int, int],  # width, height
         T_body_camera: np.ndarray,
     ) -> None:
-        """Draw the camera's mount and frustum (without lens distortion)."""
+        """Draw the camera's mount [4, 4] and field of view from K [3, 3] and the size (width, height)."""
         self._writer.log(
             CAMERA,
             _transform(T_body_camera),
@@ -112,7 +112,7 @@ class Scene:
         )  # fmt: skip
 
     def lidar(self, T_body_lidar: np.ndarray) -> None:
-        """Set the lidar's mount."""
+        """Set the lidar's mount `T_body_lidar` [4, 4]."""
         self._T_body_lidar = T_body_lidar
 
     # --- measurements ---
@@ -125,7 +125,7 @@ class Scene:
         size_px: tuple[int, int],  # width, height
         step_bytes: int,  # of a raw row; 0 = no padding
     ) -> None:
-        """Draw a camera image; compressed images stay compressed."""
+        """Draw a camera image; compressed images are passed to rerun without decoding."""
         self._update_newest(stamp_ns)
         if not self._limits.due("image", stamp_ns):
             return
@@ -156,7 +156,7 @@ class Scene:
         time_increment_s: float,
         range_limits_m: tuple[float, float],
     ) -> None:
-        """Draw a scan in the map, as soon as the robot's pose at its end is known."""
+        """Draw a scan in the map frame, as soon as the robot's pose at the end of the scan is known."""
         self._update_newest(stamp_ns)
         if not self._limits.due("scan", stamp_ns):
             return
@@ -174,11 +174,11 @@ class Scene:
             self._draw_sweep(self._sweeps.popleft())
 
     def pose(self, source: str, stamp_ns: int, T_source_body: np.ndarray) -> None:
-        """Draw the robot's pose [4, 4] by one of `SOURCES`.
+        """Draw the robot's pose [4, 4] from `source`, one of `SOURCES`.
 
-        Localization is in odom, external in map, wheel in its own drifting frame, which is aligned to the
-        map at
-        the first pose that a better source knows.
+        Poses of localization are in the odom frame, external poses in the map frame, wheel poses in a
+        drifting frame of their own. The wheel frame is aligned to the map with the first pose of a better
+        source.
         """
         self._update_newest(stamp_ns)
         self._poses[source].add(stamp_ns, T_source_body)
@@ -206,7 +206,7 @@ class Scene:
             self._writer.log(entity, strip, stamp_ns=stamp_ns)
 
     def correction(self, stamp_ns: int, T_map_odom: np.ndarray) -> None:
-        """Draw the odom frame in the map: T_map_odom [4, 4]."""
+        """Draw the odom frame in the map frame: `T_map_odom` [4, 4]."""
         self._T_map_odom = T_map_odom
         self._writer.log(f"{WORLD}/odom", _transform(T_map_odom), stamp_ns=self._not_before(stamp_ns))
 
@@ -262,7 +262,7 @@ class Scene:
     # --- frames and times ---
 
     def _update_newest(self, stamp_ns: int) -> None:
-        """Update the newest measurement time; a looping recording resets it."""
+        """Update the newest measurement time; an earlier stamp by a loop of the playback resets it."""
         if self.newest_ns is None or not self.newest_ns - _LOOP_RESTART_NS < stamp_ns <= self.newest_ns:
             self.newest_ns = stamp_ns
 
@@ -296,8 +296,9 @@ class Scene:
         self._writer.log(SCAN, points, stamp_ns=sweep.stamp_ns)
 
     def _not_before(self, stamp_ns: int) -> int:
-        """Return the time from which a result holds: now, since optimisations carry the stamp of their
-        input.
+        """Return the time (ns) at which to draw a result: `stamp_ns`, but not before the newest measurement.
+
+        An optimisation has the stamp of its input, which is older than the newest measurement.
         """
         return stamp_ns if self.newest_ns is None else max(stamp_ns, self.newest_ns)
 
@@ -309,7 +310,9 @@ def _transform(T: np.ndarray) -> rr.Transform3D:
 
 
 def _rows(data: np.ndarray, height: int, row_bytes: int, step_bytes: int) -> np.ndarray:
-    """Return uint8 [height, row_bytes], a raw image without the padding of its rows.
+    """Return a raw image without the padding of its rows, uint8 [height, row_bytes].
+
+    `step_bytes`: bytes from one row to the next, including padding.
 
     Raises:
         ValueError: fewer bytes than the image needs.

@@ -1,4 +1,4 @@
-"""Serve rerun's web viewer, and choose its ports."""
+"""Server of rerun's web viewer, and choice of its ports."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import rerun as rr
 
 
 def free_port(bind: str, port: int) -> int:
-    """Return `port`, or a free port for 0.
+    """Return `port`; if it is 0, return a free port.
 
     Raises:
         OSError: the port is in use, or `bind` is no address of this machine.
@@ -21,9 +21,9 @@ def free_port(bind: str, port: int) -> int:
 
 
 def serve_page(bind: str, web_port: int, grpc_port: int) -> str:
-    """Serve the web viewer on `web_port` of all interfaces; return the address to open.
+    """Serve the web viewer on `web_port` of all network interfaces; return the address to open in a browser.
 
-    Only the viewer program is served there; it loads the data from `grpc_port` at `bind`.
+    This port serves only the viewer program, which loads the data from `grpc_port` at `bind`.
 
     Raises:
         RuntimeError: the port is in use.
@@ -35,5 +35,5 @@ def serve_page(bind: str, web_port: int, grpc_port: int) -> str:
 
 
 def allowed_origins(bind: str, web_port: int) -> list[str]:
-    """Return the origins (CORS) whose pages may read the data, besides those of this machine."""
+    """Return the origins (CORS) of other machines whose pages may read the data."""
     return [] if bind == "127.0.0.1" else [f"http://*:{web_port}"]

@@ -1,4 +1,4 @@
-"""Distribute server-sent events to all open pages; each page receives only the newest event of each kind."""
+"""Distribution of server-sent events to all open pages; each receives only the newest event of each kind."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 
 @dataclass(eq=False)
 class EventSubscriber:
-    """One open event stream."""
+    """One open event stream: the connection of one page."""
 
     waiting: dict[str, bytes] = field(default_factory=dict)
     dropped: int = 0  # events replaced by newer ones before they were sent
@@ -23,7 +23,7 @@ class EventSubscriber:
         self._wake.set()
 
     async def next_events(self) -> bytes:
-        """Wait for events and return all queued ones."""
+        """Wait until events are queued; remove all queued events and return their bytes."""
         await self._wake.wait()
         self._wake.clear()
         events = b"".join(self.waiting.values())
@@ -32,7 +32,7 @@ class EventSubscriber:
 
 
 class EventHub:
-    """All event streams; each event is encoded once for all."""
+    """All open event streams; each event is encoded once for all streams."""
 
     def __init__(self) -> None:
         self.subscribers: set[EventSubscriber] = set()
@@ -44,7 +44,7 @@ class EventHub:
 
     @property
     def dropped(self) -> int:
-        """Number of events that were replaced before they were sent, since the start."""
+        """Return the number of events, since the start, that were replaced before they were sent."""
         return self._dropped + sum(viewer.dropped for viewer in self.subscribers)
 
     def subscribe(self) -> EventSubscriber:
@@ -63,7 +63,10 @@ class EventHub:
         self._dropped += viewer.dropped
 
     def publish(self, kind: str, data: Any) -> None:
-        """Send data to all streams if it has changed. The part of `kind` before "/" is the event's name."""
+        """Send data to all streams, unless equal to the last data of this kind.
+
+        The part of `kind` before "/" is the name of the event.
+        """
         event = b"event: %s\ndata: %s\n\n" % (kind.partition("/")[0].encode(), as_json(data))
         if self._newest.get(kind) != event:
             self._newest[kind] = event
@@ -72,5 +75,9 @@ class EventHub:
 
 
 def as_json(data: Any) -> bytes:
-    """Return strict JSON: NaN and infinity raise ValueError."""
+    """Return data as JSON.
+
+    Raises:
+        ValueError: the data contain NaN or infinity, which JSON does not have.
+    """
     return json.dumps(data, separators=(",", ":"), allow_nan=False).encode()

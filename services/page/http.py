@@ -1,6 +1,6 @@
-"""A minimal HTTP/1.1 server side: short requests, responses, limits on everything.
+"""A minimal HTTP/1.1 server: short requests and responses, with limits on sizes and times.
 
-The standard library's server needs one thread per connection, too many for a page open on ten phones.
+The standard library's server needs one thread per connection, too many if ten phones show the page.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ SECURITY_HEADERS = (
 
 
 class HttpError(ValueError):
-    """A request that is answered with an error status."""
+    """Error: a request that is answered with an error status."""
 
     def __init__(self, status: HTTPStatus, text: str) -> None:
         super().__init__(text)
@@ -32,7 +32,7 @@ class HttpError(ValueError):
 
 @dataclass(frozen=True)
 class HttpRequest:
-    """One request; header names are in lower case."""
+    """One HTTP request; header names are in lower case."""
 
     method: str
     path: str  # without the query string
@@ -41,7 +41,7 @@ class HttpRequest:
 
 
 async def read_request(reader: asyncio.StreamReader) -> HttpRequest | None:
-    """Return the next request of a connection; None at its end or after `IDLE_S` without a request.
+    """Return the next request of a connection; None if the connection ends or is idle for `IDLE_S`.
 
     Raises:
         HttpError: not an HTTP/1 request, or too long.
@@ -87,7 +87,7 @@ def _body_bytes(headers: dict[str, str]) -> int:
 
 
 def make_response(status: HTTPStatus, content_type: str, body: bytes, extra: bytes = b"") -> bytes:
-    """Return a complete response that caches must not store."""
+    """Return the bytes of a complete response, marked as not to be stored by caches."""
     return (
         f"HTTP/1.1 {status.value} {status.phrase}\r\nContent-Type: {content_type}\r\n"
         f"Content-Length: {len(body)}\r\nCache-Control: no-store\r\n"
@@ -101,12 +101,10 @@ STREAM_HEAD = (
 
 
 def is_own_host(host: str, own: frozenset[str]) -> bool:
-    """Return whether a Host header names this machine: by address, as localhost, or by one of its `own`
-    names.
+    """Return whether a Host header is a name of this machine: an IP address, localhost, or one of `own`.
 
-    A foreign page can point its own host name at this machine (DNS rebinding) to read what is served here.
-    The
-    browser then sends that name in the Host header, which the page cannot change.
+    A foreign page can let its own host name refer to this machine (DNS rebinding) to read the data of this
+    server. The browser then sends that foreign name in the Host header, which the page cannot change.
     """
     name = host.strip().lower()
     if name.startswith("["):
@@ -123,6 +121,6 @@ def is_own_host(host: str, own: frozenset[str]) -> bool:
 
 
 def own_host_names() -> frozenset[str]:
-    """Return the host names of this machine that browsers may use."""
+    """Return the host names by which browsers may address this machine."""
     host = socket.gethostname().lower()
     return frozenset({"localhost", host, f"{host}.local", socket.getfqdn().lower()})

@@ -1,4 +1,4 @@
-"""Encode images for the page: only when a page is open, and once for all open pages."""
+"""Encoding of images for the page: only while a page is open, and once for all open pages."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _FREE, _OCCUPIED = 235, 20  # grey values of map cells
 
 
 class EncodedImage(NamedTuple):
-    """An image in a format for browsers; `metadata` is sent with its event."""
+    """An image in a format that browsers can show; `metadata` is part of the image's event."""
 
     data: bytes
     content_type: str
@@ -25,7 +25,7 @@ class EncodedImage(NamedTuple):
 
 
 class LatestImage:
-    """The newest image of one kind. `update` may be called from another thread than `encode_newest`."""
+    """The newest image of one kind. `update` and `encode_newest` may be called from different threads."""
 
     def __init__(self, max_hz: float) -> None:
         self._period_s = 1.0 / max_hz
@@ -37,14 +37,12 @@ class LatestImage:
         self.fault = ""  # why the newest image could not be encoded
 
     def update(self, encode: Callable[[], EncodedImage]) -> None:
-        """Set a function that encodes the newest image; it is called only when the image is needed."""
+        """Set a function that encodes the newest image; it is called only if a page needs the image."""
         number = self._pending[0] + 1 if self._pending else 1
         self._pending = number, time.monotonic(), encode
 
     def due(self) -> bool:
-        """Return whether there is a newer image than the encoded one and the rate limit allows to
-        encode it.
-        """
+        """Return whether there is a newer image than the encoded one and the rate limit permits it."""
         pending = self._pending
         newer = pending is not None and pending[0] != self.number
         return newer and time.monotonic() - self._encoded_at_s >= self._period_s
@@ -52,7 +50,7 @@ class LatestImage:
     def encode_newest(self) -> None:
         """Encode the newest image.
 
-        If its bytes are damaged, the last valid one stays and `fault` says why.
+        If its bytes are damaged, the last valid image remains and `fault` contains the reason.
         """
         pending = self._pending
         if pending is None:
@@ -78,7 +76,7 @@ def encode_camera_image(
     step_bytes: int,
     widest_px: int,
 ) -> EncodedImage:
-    """Return a camera image as JPEG, at most `widest_px` wide. A JPEG within this width is passed unchanged.
+    """Return a camera image as JPEG, at most `widest_px` wide; a narrower JPEG is returned unchanged.
 
     Raises:
         ValueError: the bytes cannot be decoded.
@@ -92,7 +90,7 @@ def encode_depth(
     depth_m: np.ndarray,  # float32 [H, W], NaN = unknown
     widest_px: int,
 ) -> EncodedImage:
-    """Return depth as a colour image: near is red, unknown is black."""
+    """Return a depth map [H, W] (m) as colour image, <= `widest_px` wide: near is red, unknown is black."""
     stride = -(-depth_m.shape[1] // widest_px)
     small = depth_m[::stride, ::stride]
     near, far = _DEPTH_RANGE_M
@@ -108,8 +106,7 @@ def encode_grid(
     resolution_m: float,
     origin_m: np.ndarray,  # [2], corner of cell (0, 0)
 ) -> EncodedImage:
-    """Return the known part of an occupancy grid as PNG, its largest y at the top; unknown cells are
-    transparent.
+    """Return the known part of an occupancy grid as PNG, largest y at the top; unknown is transparent.
 
     `metadata`: lower left corner (m), cell size (m), width and height in cells.
 

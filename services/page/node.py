@@ -1,6 +1,7 @@
 """The page node: a web page for any browser that shows the running system.
 
-It publishes nothing. Users with the token can restart and swap nodes. No publisher ever waits for it.
+The node publishes nothing. Users with the token can restart and swap nodes. Publishers never wait for this
+node.
 """
 
 from __future__ import annotations
@@ -51,9 +52,8 @@ Hz = Annotated[float, Field(gt=0.0, le=30.0)]
 class PageConfig(NodeConfig):
     """Options of the page.
 
-    With `bind = "0.0.0.0"` anyone who can reach this machine can open the page. Without a certificate,
-    images and
-    token are sent unencrypted.
+    With `bind = "0.0.0.0"` everyone who can reach this machine can open the page. Without a certificate,
+    images and token are sent unencrypted.
     """
 
     bind: str = "127.0.0.1"
@@ -78,7 +78,7 @@ class PageConfig(NodeConfig):
 
 
 class PageNode(Node):
-    """Keeps the newest of all inputs for the page, and forwards commands."""
+    """Stores the newest message of each input for the page, and executes commands of users."""
 
     name = "page"
     Config = PageConfig
@@ -127,7 +127,7 @@ class PageNode(Node):
             self._server.close()
 
     def _command(self, action: str, node: str, parameters: dict[str, str]) -> str:
-        """Carry out a command of an authorized user; called from a thread of the server.
+        """Execute a command of an authorized user, in a thread of the server; return the result text.
 
         Raises:
             ValueError: unknown command or node, or the node rejects it.

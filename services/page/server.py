@@ -60,14 +60,14 @@ Command = Callable[[str, str, dict[str, str]], str]  # (action, node, parameters
 
 @dataclass(frozen=True)
 class PageAccess:
-    """Access control of the page."""
+    """Access control of the page: token for commands, accepted host names."""
 
     token: str = ""  # for commands; "": commands are disabled
     names: frozenset[str] = frozenset()  # accepted host names, besides the machine's own
 
 
 class PageServer:
-    """Serves one `PageState`: `start()`, then `close()`."""
+    """HTTP server of one `PageState`; call `start()`, then `close()`."""
 
     def __init__(self, state: PageState, command: Command, access: PageAccess, robot_hz: float) -> None:
         self._state = state
@@ -87,7 +87,7 @@ class PageServer:
         self.rejected_commands = 0  # commands with a wrong token
 
     def start(self, bind: str, port: int, tls: ssl.SSLContext | None) -> int:
-        """Listen; return the port (a free one for `port` 0).
+        """Start listening; return the port (a free one if `port` is 0).
 
         Raises:
             OSError: the port is in use, or `bind` is no address of this machine.
@@ -102,9 +102,7 @@ class PageServer:
         return self._server.sockets[0].getsockname()[1]
 
     def check(self) -> None:
-        """Raise the exception that ended the event task, if any: the page would show outdated data for
-        ever.
-        """
+        """Raise the exception that ended the event task, if any; without it, the page is outdated."""
         if self._publishing.done() and not self._publishing.cancelled():
             self._publishing.result()
 
@@ -129,7 +127,7 @@ class PageServer:
     # --- events to all pages ---
 
     async def _publish_periodically(self) -> None:
-        """Publish the robot at `robot_hz` and the rest once per second, while a page is open."""
+        """Publish the robot's pose at `robot_hz` and other events once per second, while a page is open."""
         beat = 0
         while True:
             await asyncio.sleep(1.0 / self._robot_hz)
@@ -156,7 +154,7 @@ class PageServer:
         return {**self._state.status(), "page": facts}
 
     async def _encode_if_due(self, name: str) -> None:
-        """Encode an image if it is due; concurrent callers wait for the same encoding."""
+        """Encode the image `name` if it is due; concurrent callers wait for the same encoding."""
         image = self._state.images[name]
         async with self._encode_locks[name]:
             if not image.due():
@@ -242,7 +240,7 @@ class PageServer:
     # --- commands ---
 
     async def _run_command(self, request: HttpRequest) -> dict[str, str]:
-        """Carry out a command of an authorized user."""
+        """Execute the command in a request of an authorized user; return the response as a dictionary."""
         if request.method != "POST":
             raise HttpError(HTTPStatus.METHOD_NOT_ALLOWED, "commands need POST")
         await self._check_token(request)

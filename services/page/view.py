@@ -1,6 +1,6 @@
-"""The state of the running system as the page shows it, as JSON.
+"""State of the running system, as JSON for the page.
 
-The node's thread writes it, the server's thread reads it.
+The node's thread writes the state, the server's thread reads it.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _LOG_LINES = 60
 
 
 class PageState:
-    """The newest of all inputs; every method may be called from any thread."""
+    """The newest message of each input; every method may be called from any thread."""
 
     def __init__(self, picture_hz: float, map_hz: float) -> None:
         self._lock = threading.Lock()
@@ -50,7 +50,7 @@ class PageState:
     # --- written by the node ---
 
     def health(self, health: Any) -> None:
-        """Store the health of a node (a `Health`); log changes of state and restarts."""
+        """Store the health of a node (message `Health`); log changes of its state, and restarts."""
         with self._lock:
             before = self._health.records.get(health.node)
             instance, state = (before.health.instance, before.health.state) if before else ("", "")
@@ -62,7 +62,7 @@ class PageState:
                 self._log_event(f"{health.node} is {health.state}")
 
     def service_status(self, subject: str, status: str, **facts: Any) -> None:
-        """Store the status of a service's newest result; log a change."""
+        """Store the status of a service's newest result; log it if it has changed."""
         with self._lock:
             before = self._services.get(subject, {}).get("status")
             self._services[subject] = {"status": status, "at": time.monotonic(), **facts}
@@ -70,26 +70,25 @@ class PageState:
                 self._log_event(f"{subject}: {status}")
 
     def scale(self, value: float, sigma: float) -> None:
-        """Store the depth scale and its standard error; at most one value per second is kept."""
+        """Store the depth scale and its standard error; at most one value per second is stored."""
         now = time.monotonic()
         with self._lock:
             if math.isfinite(value) and (not self._scales or now - self._scales[-1][0] >= 1.0):
                 self._scales.append((now, value, sigma))
 
     def lidar(self, T_body_lidar: np.ndarray) -> None:
-        """Set the lidar's mount T_body_lidar [4, 4]."""
+        """Store the lidar's mount `T_body_lidar` [4, 4]."""
         self._T_body_lidar = T_body_lidar
 
     def correction(self, T_map_odom: np.ndarray) -> None:
-        """Set T_map_odom [4, 4]."""
+        """Store the pose of the odom frame in the map, `T_map_odom` [4, 4]."""
         self._T_map_odom = T_map_odom
 
     def pose(self, source: str, stamp_ns: int, T_source_body: np.ndarray) -> None:
-        """Store the robot's pose [4, 4] by one of `SOURCES`; poses of a worse source than the best are
-        ignored.
+        """Store the robot's pose [4, 4] from `source`; ignore sources worse than the best one so far.
 
-        Localization is in odom, external in map; the wheels' own frame is taken as map while no better
-        source exists.
+        Poses of localization are in the odom frame, external poses in the map frame. While there are only
+        wheel poses, their own frame is used as the map frame.
         """
         rank = SOURCES.index(source)
         with self._lock:
@@ -110,14 +109,14 @@ class PageState:
         angle_increment_rad: float,
         range_limits_m: tuple[float, float],
     ) -> None:
-        """Store a scan; it is drawn in the map when the pose of its time is known."""
+        """Store a scan, to be drawn in the map when the pose at its stamp is known."""
         points, _ = scan_points(ranges_m, angle_min_rad, angle_increment_rad, range_limits_m)
         points = points[:: max(-(-len(points) // _SCAN_POINTS), 1)]
         with self._lock:
             self._scans.append((stamp_ns, transform_points(self._T_body_lidar, points)))
 
     def _newest_scan_map_m(self) -> np.ndarray:
-        """Return the newest scan whose pose is known, points [N, 3] in the map."""
+        """Return the points [N, 3] (m, map frame) of the newest scan whose pose is known."""
         newest_ns, _ = self._poses.newest
         for stamp_ns, points_body in reversed(self._scans):
             if stamp_ns <= newest_ns and (T_map_body := self._poses.at(stamp_ns)) is not None:
@@ -130,7 +129,7 @@ class PageState:
     # --- read by the server ---
 
     def status(self) -> dict[str, Any]:
-        """Return nodes, links, the services' status, images and log."""
+        """Return nodes, links, the status of the services, images and log, as data for JSON."""
         now = time.monotonic()
         with self._lock:
             for name, record in self._health.records.items():
@@ -153,14 +152,15 @@ class PageState:
             }
 
     def scales(self) -> list[list[float | None]]:
-        """Return [[age s, scale, standard error], ...], oldest first."""
+        """Return [[age s, depth scale, standard error], ...], oldest first."""
         now = time.monotonic()
         with self._lock:
             return [[round(now - at, 1), _json_number(v, 5), _json_number(s, 5)] for at, v, s in self._scales]
 
     def robot(self) -> dict[str, Any] | None:
-        """Return the pose in the map and the last scan as x, y, x, y ... in cm; None before the first
-        pose.
+        """Return the robot's pose in the map frame and the newest scan; None before the first pose.
+
+        `scan_cm` contains the points of the scan as x, y, x, y ... in the map frame, cm.
         """
         with self._lock:
             if not self._poses:
@@ -173,7 +173,7 @@ class PageState:
             }  # fmt: skip
 
     def path(self) -> list[int]:
-        """Return the robot's path as x, y, x, y ... in cm."""
+        """Return the robot's path in the map frame as x, y, x, y ... in cm."""
         with self._lock:
             return _centimetres(self._path.points_m)
 

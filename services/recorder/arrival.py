@@ -1,4 +1,4 @@
-"""Arrival times of messages for a recording, by the wall clock or by the clock of replayed data."""
+"""Arrival times of messages for a recording, from the wall clock or from the stamps of replayed data."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ _NOW_S = 300.0  # a first stamp within this time of now is from a running robot
 
 
 class ArrivalClock:
-    """Clock of arrival times in nanoseconds; monotonic for replayed data.
+    """Clock of arrival times (ns); for replayed data, arrival times never decrease.
 
-    On a running robot the arrival is the time of publication by this host's clock, so that waiting in a
-    queue does not count. For replayed data the clock is the newest stamp.
+    On a running robot, the arrival time is the time of publication on the wall clock of this host, so that
+    the waiting time in a queue is not included. For replayed data, it is the newest stamp so far.
     """
 
     def __init__(
@@ -27,9 +27,10 @@ class ArrivalClock:
         self._newest_ns = 0
 
     def arrival_ns(self, stamp_ns: int, published_ns: int | None) -> int:
-        """Return the arrival time of a message.
+        """Return the arrival time (ns) of a message.
 
-        `published_ns` is its publication by this host's monotonic clock, None if another host published it.
+        `published_ns`: reading of this host's `time.monotonic_ns` at publication; None if another host
+        published the message.
         """
         if self._wall is None:
             self._wall = abs(self._wall_ns() - stamp_ns) < _NOW_S * 1e9
@@ -40,7 +41,7 @@ class ArrivalClock:
         return self._newest_ns
 
     def now_ns(self) -> int | None:
-        """Return the present time, for messages without a data stamp; None before the first data message."""
+        """Return the present time (ns), for messages without stamp; None before the first data message."""
         if self._wall:
             return self._wall_ns()
         return self._newest_ns or None

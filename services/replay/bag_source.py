@@ -56,7 +56,7 @@ class BagSource:
 
     @property
     def problems(self) -> list[str]:
-        """Return sentences about skipped messages and replaced stamps."""
+        """Return sentences about messages that were skipped and stamps that were replaced."""
         found = list(self.bag.problems)
         for name, count in sorted(self.skipped.items()):
             found.append(f"{name}: {count} messages skipped, the first because: {self.first_fault[name]}")
@@ -71,15 +71,15 @@ class BagSource:
         return sum(topic.count for topic in self.chosen.values())
 
     def rig(self) -> Any:
-        """Return the calibration as the message `Rig`; see `rig_file`."""
+        """Return the calibration as the message `Rig`; for its origin see `rig_file`."""
         rig = self.rig_file()
         return rig.message(self.start_ns, rig.source)
 
     def rig_file(self) -> RigFile:
-        """Return the calibration: the rig file of the option, else that of the bag.
+        """Return the calibration from the option `rig` if set, else from the bag.
 
         Raises:
-            UserError: incomplete, or for another image size; the sentence lists all that is missing.
+            UserError: incomplete, or for another image size; the sentence lists all missing values.
         """
         self.calibrate()
         image = self.image_size_px()
@@ -162,7 +162,7 @@ class BagSource:
         self.bag.close()
 
     def _peek(self, topic: BagTopic) -> Any:
-        """Return the first message of a topic that can be decoded."""
+        """Return the first message of a topic that can be decoded. Raises UserError if there is none."""
         for count, raw in enumerate(self.bag.messages([topic.name])):
             try:
                 return deserialize(raw)
@@ -184,7 +184,7 @@ class BagSource:
         return fields["encoding"] in _IMAGE_ENCODINGS
 
     def image_size_px(self) -> tuple[int, int] | None:
-        """Return width and height of the images; None without images."""
+        """Return (width, height) of the images; None if the bag has no images."""
         if "image" not in self._first:
             return None
         fields = ros_fields("camera/image", self._first["image"])
@@ -255,7 +255,7 @@ def _transforms(raw: RawMessage) -> Iterator[tuple[str, str, np.ndarray]]:
 
 
 def _reason_of(error: Exception) -> str:
-    """Return field and reason of an invalid message, in one line."""
+    """Return field and reason of a validation error, in one line."""
     if hasattr(error, "errors"):
         fault = error.errors(include_url=False, include_input=False)[0]
         return f"{'.'.join(str(part) for part in fault['loc'])}: {fault['msg']}"

@@ -35,7 +35,7 @@ _COPY_AGAIN = "copy it again from where it was recorded"
 
 
 class BagTopic(NamedTuple):
-    """One topic of a bag; `type_name` has the form pkg/msg/Type, also for ROS 1."""
+    """One topic of a bag; `type_name` has the form pkg/msg/Type also for ROS 1."""
 
     name: str
     type_name: str
@@ -44,7 +44,7 @@ class BagTopic(NamedTuple):
 
 
 class Bag:
-    """An open bag. `problems` are sentences about missing parts.
+    """An open ROS bag. `problems` are sentences about missing parts of the bag.
 
     Raises:
         UserError: no such file, not a bag, truncated (unless `allow_truncated`), or without messages.
@@ -66,7 +66,7 @@ class Bag:
 
     @property
     def topics(self) -> list[BagTopic]:
-        """Return the topics by name, with counts summed over the files of the bag."""
+        """Return the topics, sorted by name, with counts summed over the files of the bag."""
         found: dict[tuple[str, str, str], int] = {}
         for part in self._bag_files:
             for topic in part.topics:
@@ -86,7 +86,9 @@ class Bag:
     def messages(
         self, topics: Collection[str] | None = None, start_ns: int = 0, stop_ns: int | None = None
     ) -> Iterator[RawMessage]:
-        """Yield raw messages with start_ns <= at_ns < stop_ns, by receive time.
+        """Yield raw messages with start_ns <= at_ns < stop_ns, in order of receive time.
+
+        `topics`: names of the topics to read; None = all.
 
         Raises:
             UserError: the file is damaged.
@@ -136,14 +138,14 @@ class Bag:
 
 
 class _BagFile(ABC):
-    """One file (storage) of a bag."""
+    """One file of a bag (a bag may be split into several)."""
 
     topics: list[BagTopic]
     span_ns: tuple[int, int] | None
 
     @abstractmethod
     def messages(self, topics: Collection[str] | None, start_ns: int, stop_ns: int) -> Iterator[RawMessage]:
-        """Yield messages of the topics (None: all) with start_ns <= at_ns < stop_ns, by receive time."""
+        """Yield messages of the topics (None = all) with start_ns <= at_ns < stop_ns, by receive time."""
 
 
 class _McapFile(_BagFile):
@@ -203,7 +205,7 @@ def looks_like_bag(path: Path) -> bool:
 
 
 def _files(path: Path) -> list[Path]:
-    """Return the files to open for `path`; a folder that rosbags opens as a whole is returned itself."""
+    """Return the files to open for `path`; for a folder that rosbags opens as a whole, the folder."""
     if not path.exists():
         raise UserError(f"{path}: no such file or folder; check the path")
     if path.is_file():
@@ -223,7 +225,7 @@ def _files(path: Path) -> list[Path]:
 
 
 def _compressed_by_message(metadata: Path) -> bool:
-    """Return whether messages are compressed singly, which rosbags supports and our MCAP reader does not."""
+    """Return whether each message is compressed separately (readable by rosbags, not by our MCAP reader)."""
     return (
         re.search(r"compression_mode:\s*['\"]?message", metadata.read_text(errors="replace"), re.I)
         is not None

@@ -1,4 +1,4 @@
-"""Decoding of serialised ROS 1 and ROS 2 messages, and of their stamps alone."""
+"""Decoding of serialised ROS 1 and ROS 2 messages, or of their stamps only."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _DECODE_ERRORS = (
 
 
 class RawMessage(NamedTuple):
-    """One message as stored; `at_ns` is its receive time."""
+    """One serialised message of a bag; `at_ns` is its receive time."""
 
     at_ns: int
     topic: str

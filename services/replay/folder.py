@@ -7,7 +7,7 @@
     rig.toml                   calibration (common/rig.py)
     folder.toml                optional: range_min_m, range_max_m, scan_time_s of the PCD scans
 
-docs/recordings.md describes the layout. There are no receive times: the stamp is used instead.
+docs/recordings.md describes the layout. The data have no receive times: the stamp is used instead.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ Stamped = tuple[int, str, Any]
 
 @dataclass(frozen=True)
 class FolderLidar:
-    """Properties of the lidar from folder.toml, which PCD files do not contain."""
+    """Properties of the lidar that PCD files do not contain; read from folder.toml."""
 
     range_min_m: float = 0.02
     range_max_m: float = 30.0
@@ -47,13 +47,13 @@ class FolderLidar:
 
 
 def looks_like_folder(path: Path) -> bool:
-    """Return whether `path` has any of the files of this layout."""
+    """Return whether `path` is a folder with at least one of the files of this layout."""
     names = ("images", "lasers", "scans.csv", "odometry.txt", "poses.txt")
     return path.is_dir() and any((path / name).exists() for name in names)
 
 
 class FolderSource:
-    """Source of the messages of a plain folder, by stamp.
+    """Source of the messages of a plain folder, in order of their stamps.
 
     Raises:
         UserError: a file does not fit the layout, or a required sensor is missing.
@@ -102,7 +102,7 @@ class FolderSource:
         return sum(self.counts().values())
 
     def rig(self) -> Any:
-        """Return the calibration as the message `Rig`, from the option or from rig.toml in the folder.
+        """Return the calibration as the message `Rig`, from the option `rig` or from rig.toml in the folder.
 
         Raises:
             UserError: both are missing, or K is for another image size.
@@ -128,7 +128,7 @@ class FolderSource:
         return rig.message(self.start_ns, rig.source or str(file))
 
     def messages(self, start_ns: int = 0, stop_ns: int | None = None) -> Iterator[Stamped]:
-        """Yield (stamp, topic, message) with start_ns <= stamp < stop_ns, by stamp."""
+        """Yield (stamp ns, topic, message) with start_ns <= stamp < stop_ns, in order of stamps."""
         stop_ns = 2**63 if stop_ns is None else stop_ns
         makers = {
             "image": self._image, "scan": self._scan, "odometry": self._odometry, "pose": self._pose,
@@ -144,7 +144,7 @@ class FolderSource:
         yield from heapq.merge(*streams, key=itemgetter(0))
 
     def stamps(self) -> dict[str, list[int]]:
-        """Return the stamps of each sensor."""
+        """Return the stamps (ns) of the messages of each sensor ("image", "scan", ...)."""
         return {
             sensor_name: [stamp for stamp, _ in stream]
             for sensor_name, stream in self._streams.items()
@@ -152,14 +152,14 @@ class FolderSource:
         }
 
     def sample(self, sensor_name: str, count: int) -> list[dict[str, Any]]:
-        """Return the fields of up to `count` messages of a sensor, evenly spread."""
+        """Return the fields of up to `count` messages of a sensor, evenly spread over the folder."""
         topic = SENSORS[sensor_name].topic
         step = max(1, len(self._streams.get(sensor_name, ())) // count)
         found = (message for _, name, message in self.messages() if name == topic)
         return [vars(message) for i, message in enumerate(found) if i % step == 0][:count]
 
     def close(self) -> None:
-        """Do nothing: no file stays open."""
+        """Do nothing, because no file remains open."""
 
     def _stream(self, sensor_name: str, entries: list[tuple[int, Any]], make: Any) -> Iterator[Stamped]:
         topic = SENSORS[sensor_name].topic
@@ -229,7 +229,11 @@ class FolderSource:
 
 
 def _stamped_files(folder: Path, endings: tuple[str, ...]) -> list[tuple[int, Path]]:
-    """Return (stamp, file) by stamp. Raises UserError for a name that is not a stamp."""
+    """Return (stamp ns, file) of all files with these endings, in order of stamps.
+
+    Raises:
+        UserError: a file name is not a stamp.
+    """
     found = []
     for file in folder.glob("*") if folder.is_dir() else ():
         if file.suffix.lower() not in endings or file.name.startswith("."):
@@ -243,7 +247,10 @@ def _stamped_files(folder: Path, endings: tuple[str, ...]) -> list[tuple[int, Pa
 
 
 def _with_velocity(poses: Trajectory) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Return pose, velocity and angular velocity in the body frame, by difference to the previous pose."""
+    """Return (T [4, 4], velocity [3] m/s, angular velocity [3] rad/s) of each pose, in the body frame.
+
+    Velocities are differences to the previous pose; 0 for the first pose.
+    """
     made = [(T, np.zeros(3), np.zeros(3)) for T in poses.T_a_b[:1]]
     for i in range(1, len(poses)):
         T_0, T_1 = poses.T_a_b[i - 1], poses.T_a_b[i]

@@ -1,4 +1,4 @@
-"""Scans in plain files: rows of a CSV file, or PCD point clouds of one revolution each."""
+"""Scans in plain files: rows of a CSV file, or one PCD point cloud per revolution."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ _REGULAR_RAD = np.radians(0.1)
 
 
 class CsvScans:
-    """File scans.csv: `# name = value` lines for the lidar, then rows `stamp_ns, range_0, range_1, ...`.
+    """Scans of a file scans.csv: lines `# name = value`, then rows `stamp_ns, range_0, range_1, ...`.
 
     Raises:
-        UserError: invalid content; names file and line.
+        UserError: invalid content; the message contains file and line.
     """
 
     def __init__(self, path: Path) -> None:
@@ -60,7 +60,7 @@ class CsvScans:
             raise UserError(f"{where}: {name} = {value!r} is not a number") from error
 
     def fields(self, ranges: str) -> dict[str, Any]:
-        """Return the fields of a scan from the text of a row.
+        """Return the fields of a scan message from `ranges`, the text of a row after the stamp.
 
         Raises:
             ValueError: a range is not a number.
@@ -71,10 +71,10 @@ class CsvScans:
 
 
 def xy_from_pcd(data: bytes, name: str) -> np.ndarray:
-    """Return x and y float64 [N, 2] of a PCD file (ASCII or binary, uncompressed).
+    """Return the x and y coordinates (m), float64 [N, 2], of a PCD file (ASCII or binary, uncompressed).
 
     Raises:
-        ValueError: not such a file; the message names the reason.
+        ValueError: not such a file; the message contains the reason.
     """
     header: dict[str, list[str]] = {}
     position = 0
@@ -116,11 +116,12 @@ def _binary_xy(header: dict[str, list[str]], data: bytes, name: str) -> np.ndarr
 def scan_from_points(
     points_m: np.ndarray, range_min_m: float, range_max_m: float, scan_time_s: float
 ) -> dict[str, Any]:
-    """Return the fields of a scan from the points [N, 2] of one revolution, in the order of measurement.
+    """Return the fields of a scan message from the points [N, 2] (m, lidar frame) of one revolution.
 
-    A point at the origin is a beam without return. If the directions have a constant step, as with most
-    drivers, the order of the beams in time is kept. Otherwise each point is assigned to the nearest beam of
-    a grid four times finer than the median step, and beams without a point are NaN (not measured).
+    The points are in the order of measurement. A point at the origin is a beam without return. If the
+    directions have a constant step, as with most drivers, the scan has the same beams in the same order.
+    Otherwise each point is assigned to the nearest beam of a grid four times finer than the median step, and
+    beams without a point are NaN (not measured).
     """
     ranges = np.hypot(points_m[:, 0], points_m[:, 1])
     valid = np.isfinite(ranges) & (ranges > 0.0)
@@ -153,7 +154,10 @@ def scan_from_points(
 
 
 def _on_grid(angles: np.ndarray, ranges: np.ndarray) -> tuple[float, float, np.ndarray]:
-    """Return start, increment and ranges of unordered directions; the nearest point of each beam is used."""
+    """Return start angle, angle increment and ranges of unordered directions, on a regular grid.
+
+    If several points are assigned to one beam, the nearest point is used.
+    """
     around = np.sort(np.mod(angles, 2.0 * np.pi))
     steps = np.diff(around)
     typical = float(np.median(steps[steps > 1e-6])) if np.any(steps > 1e-6) else 2.0 * np.pi

@@ -1,4 +1,4 @@
-"""Inspection of a bag, a recording or a folder: the report of `beamsplat info`."""
+"""Inspection of a bag, a recording or a folder for the command `beamsplat info`."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _SCANS_SAMPLED = 300  # scans sampled for the statistics
 
 @dataclass
 class InspectionReport:
-    """All that `info` prints. `error` is the reason why the data cannot be played, or empty."""
+    """Everything that `beamsplat info` prints. `error`: the reason why the data cannot be played, or ""."""
 
     path: str
     kind: str
@@ -63,7 +63,7 @@ def inspect(path: Path, options: SourceOptions) -> InspectionReport:
     """Return the report on the data at `path`.
 
     Raises:
-        UserError: there are no readable data.
+        UserError: there are no readable data at `path`.
     """
     path = data_path(path)
     if not path.exists():

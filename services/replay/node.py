@@ -27,7 +27,7 @@ class ReplayNode(Node):
         self._source: ReplaySource | None = None
 
     def configure(self) -> None:
-        """Open the data, so that errors are reported before the system starts."""
+        """Open the data, so that errors in them are reported before the system starts."""
         self._open()
 
     def _open(self) -> ReplaySource:
@@ -55,7 +55,7 @@ class ReplayNode(Node):
         return self._open().message_count()
 
     def source(self) -> Iterator[SourceItem]:
-        """Yield the calibration, then all messages by arrival time."""
+        """Yield the calibration, then all messages in order of arrival time."""
         source = self._open()
         config = self.config
         played = play(source, start_s=config.start_s, duration_s=config.duration_s, loop=config.loop)
@@ -71,7 +71,7 @@ class ReplayNode(Node):
 
 
 def source_options(config: ReplayConfig) -> SourceOptions:
-    """Return the source options that the node options contain."""
+    """Return the options of the data source that are part of the node's options."""
     names = (
         "image_topic", "scan_topic", "odometry_topic", "pose_topic", "camera_info_topic", "body_frame", "rig",
         "assume_mounts", "allow_truncated",

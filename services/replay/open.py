@@ -1,4 +1,4 @@
-"""Recordings for programs that are no node: `beamsplat.open_recording`."""
+"""Access to recordings for programs that are not nodes: `beamsplat.open_recording`."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from beamsplat.services.replay.source import ReplaySource, open_source, play
 
 
 class OpenRecording:
-    """A bag, a recording or a folder, opened for reading; use it with `with`."""
+    """A bag, a recording or a folder, opened for reading; a context manager that closes the files."""
 
     def __init__(self, source: ReplaySource) -> None:
         self._source = source
 
     @property
     def rig(self) -> Rig:
-        """Calibration of camera and lidar; `rig.assumed` lists the values that the data do not contain."""
+        """Return the calibration; `rig.assumed` lists the values that the data do not contain."""
         return self._source.rig()
 
     @property
     def problems(self) -> list[str]:
-        """What was found wrong in the data, one sentence each."""
+        """Return the faults found in the data, one sentence each."""
         return list(self._source.problems)
 
     def messages(
@@ -65,7 +65,7 @@ def open_recording(path: str | Path, **options: Any) -> OpenRecording:
         options: fields of `SourceOptions`, for example `scan_topic="/scan"` or `rig=Path("rig.toml")`.
 
     Raises:
-        UserError: there is nothing that can be read, or an option does not fit the data.
+        UserError: there are no readable data at `path`, or an option does not fit the data.
 
     Example:
         >>> with beamsplat.open_recording("drive/bag") as recording:  # doctest: +SKIP

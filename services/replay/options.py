@@ -8,7 +8,7 @@ from pathlib import Path
 
 @dataclass(frozen=True)
 class SourceOptions:
-    """Selection of topics, calibration and tolerance for damaged data."""
+    """Options of a data source: topics, calibration, and tolerance for damaged data."""
 
     image_topic: str = ""
     scan_topic: str = ""
@@ -23,5 +23,5 @@ class SourceOptions:
     allow_truncated: bool = False
 
     def topic_for(self, sensor_name: str) -> str:
-        """Return the topic chosen for "image", "scan", "odometry" or "pose"; "" = select by type."""
+        """Return the topic set by option for "image", "scan", "odometry" or "pose"; "" = select by type."""
         return getattr(self, f"{sensor_name}_topic")

@@ -1,4 +1,4 @@
-"""Source of sensor messages from one of our own recordings, bit for bit."""
+"""Source of sensor messages from a recording of BeamSplat; the messages are unchanged, bit for bit."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from beamsplat.services.replay.options import SourceOptions
 
 
 class RecordingSource:
-    """Source of the sensor messages of a recording, by arrival time.
+    """Source of the sensor messages of a recording, in order of arrival time.
 
     Raises:
         UserError: the recording is empty, or a required sensor is missing.
@@ -54,11 +54,11 @@ class RecordingSource:
         return self._reader.problems
 
     def message_count(self) -> int:
-        """Return the number of messages of the sensors."""
+        """Return the number of sensor messages."""
         return sum(self._reader.counts[SENSORS[sensor_name].topic] for sensor_name in self.sensor_names)
 
     def rig(self) -> Any:
-        """Return the calibration as the message `Rig`: that of the option, else the first recorded one.
+        """Return the calibration as the message `Rig`: from the option `rig`, else the first recorded one.
 
         Raises:
             UserError: both are missing.
@@ -79,7 +79,7 @@ class RecordingSource:
         return recorded.message
 
     def messages(self, start_ns: int = 0, stop_ns: int | None = None) -> Iterator[tuple[int, str, Any]]:
-        """Yield (arrival, topic, message) with start_ns <= arrival < stop_ns, by arrival."""
+        """Yield (arrival ns, topic, message) with start_ns <= arrival < stop_ns, in order of arrival."""
         topics = [SENSORS[sensor_name].topic for sensor_name in self.sensor_names]
         for recorded in self._reader.messages(topics, start_ns, stop_ns):
             yield recorded.log_time_ns, recorded.topic, recorded.message

@@ -1,4 +1,4 @@
-"""Draft of a rig file: values found, values assumed, and values to measure with a tape measure."""
+"""Draft of a rig file: values found in the data, values assumed, and values that the user must measure."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def draft_from_data(path: Path) -> tuple[str, list[str]]:
     """Return the text of a rig file for a bag, recording or folder, and sentences for the user.
 
     Raises:
-        UserError: the data are unreadable, or have neither camera nor lidar.
+        UserError: the data cannot be read, or have neither camera nor lidar.
     """
     relaxed = SourceOptions(
         require=frozenset(), without=frozenset({"odometry", "pose"}), allow_truncated=True
@@ -84,7 +84,7 @@ def _from_bag(source: BagSource, where: str) -> tuple[str, list[str]]:
 
 
 def _is_assumed(sensor: str, assumed: list[str]) -> bool:
-    """Return whether `calibration.py` has assumed the mount of a sensor, judged by its sentence."""
+    """Return whether `calibration.py` has assumed the mount of a sensor, judged by its sentences."""
     return any(text.startswith(f"the {sensor} is at") for text in assumed)
 
 
@@ -127,7 +127,8 @@ def draft_from_device(source: str, fov_deg: float) -> tuple[str, list[str]]:
 def pinhole_from_fov(width_px: int, height_px: int, fov_deg: float) -> dict[str, object]:
     """Return the camera fields of a rig file for a lens without distortion and square pixels.
 
-    Pixel centres are integers, so the image extends from -0.5 to width - 0.5.
+    `fov_deg`: horizontal field of view. Pixel centres are integers, so the image extends from -0.5 to width -
+    0.5.
     """
     focal_px = 0.5 * width_px / math.tan(math.radians(fov_deg) / 2.0)
     return {

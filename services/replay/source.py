@@ -1,4 +1,4 @@
-"""Opening of data of any kind, and playback: seek, loop, ticks, by arrival time."""
+"""Opening of data of any kind, and playback in order of arrival, with seek, loop and ticks."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _LOOP_PAUSE_NS = 100_000_000
 
 
 class ReplaySource(Protocol):
-    """Interface of playable data: a bag, a recording or a folder."""
+    """Interface of data that can be played: a bag, a recording or a folder."""
 
     @property
     def start_ns(self) -> int: ...
@@ -41,14 +41,14 @@ class ReplaySource(Protocol):
         ...
 
     def messages(self, start_ns: int = 0, stop_ns: int | None = None) -> Iterator[tuple[int, str, Any]]:
-        """Yield (arrival, topic, message) with start_ns <= arrival < stop_ns, by arrival."""
+        """Yield (arrival ns, topic, message) with start_ns <= arrival < stop_ns, in order of arrival."""
 
     def close(self) -> None:
         """Close all files."""
 
 
 def data_path(path: Path) -> Path:
-    """Return `path`, or its subfolder bag/ if the folder has ground truth beside a bag (as house_a)."""
+    """Return `path`, or its subfolder bag/ if the folder contains ground truth and a bag (as house_a)."""
     path = Path(path)
     if path.is_dir() and not looks_like_bag(path) and looks_like_bag(path / "bag"):
         return path / "bag"
@@ -59,7 +59,7 @@ def open_source(path: Path, options: SourceOptions) -> ReplaySource:
     """Open the data at `path`, of any kind.
 
     Raises:
-        UserError: there are no playable data, or the options do not fit.
+        UserError: there are no playable data at `path`, or the options do not fit the data.
     """
     path = data_path(path)
     if not path.exists():
@@ -84,10 +84,10 @@ def open_source(path: Path, options: SourceOptions) -> ReplaySource:
 def play(
     source: ReplaySource, *, start_s: float = 0.0, duration_s: float | None = None, loop: bool = False
 ) -> Iterator[tuple[int, str, Any]]:
-    """Yield (arrival, topic, message): the calibration, then the data, with a tick each second.
+    """Yield (arrival ns, topic, message): first the calibration, then the data, with one tick per second.
 
-    `start_s` is relative to the first message. With `loop` playback is endless; stamps and arrivals are
-    shifted by the length of a loop, so that time never goes back.
+    `start_s` is relative to the first message. With `loop`, playback is endless: stamps and arrival times are
+    shifted by the length of a loop, so that time never decreases.
 
     Raises:
         UserError: there are no data between start and end.

@@ -1,4 +1,4 @@
-"""Statistics of topics (rates, gaps, delays) and of lidar scans, from arrays."""
+"""Statistics of topics (rates, gaps, delays) and of lidar scans, computed from arrays."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _GAP_PERIODS = 3.0  # a longer pause is a gap
 
 @dataclass(frozen=True)
 class TopicStatistics:
-    """Statistics of one topic, from stamps if it has them, else from receive times; None = unknown."""
+    """Statistics of one topic, from stamps if there are any, else from receive times; None = unknown."""
 
     name: str
     type: str
@@ -47,7 +47,10 @@ class LidarStatistics:
 def topic_statistics(
     name: str, type_name: str, at_ns: np.ndarray, stamp_ns: np.ndarray | None
 ) -> TopicStatistics:
-    """Return statistics from receive times and stamps, int64 [N] each, in order of arrival."""
+    """Return statistics of one topic.
+
+    `at_ns`: receive times int64 [N], in this order; `stamp_ns`: stamps int64 [N], or None.
+    """
     times = at_ns if stamp_ns is None else stamp_ns
     steps = np.diff(times)
     forward = np.diff(np.sort(times))
@@ -70,7 +73,7 @@ def topic_statistics(
 
 
 def lidar_statistics(scans: list[dict[str, Any]]) -> LidarStatistics:
-    """Return statistics from the fields of at least one scan."""
+    """Return statistics of a sample of scans; each scan is a dictionary with the fields of a `Scan`."""
     first = scans[0]
     beams = [len(scan["ranges_m"]) for scan in scans]
     ranges = np.concatenate([scan["ranges_m"] for scan in scans]).astype(np.float64)
@@ -103,7 +106,7 @@ def lidar_statistics(scans: list[dict[str, Any]]) -> LidarStatistics:
 
 
 def topic_problems(facts: TopicStatistics) -> list[str]:
-    """Return sentences about properties of a topic that may disturb its consumers."""
+    """Return sentences about properties of a topic that may disturb its subscribers."""
     found = []
     if facts.gaps:
         found.append(

@@ -1,4 +1,4 @@
-"""Selection of the camera, lidar and odometry topics: by type, or by option if several are possible."""
+"""Selection of the camera, lidar and odometry topics: by type, or by option if several have the type."""
 
 from __future__ import annotations
 
@@ -18,14 +18,17 @@ _NOT_IMAGES = ("depth", "disparity", "mask", "semantic")
 def choose_topics(
     topics: list[BagTopic], options: SourceOptions, where: str, is_image: Callable[[BagTopic], bool]
 ) -> dict[str, BagTopic]:
-    """Return the topic of each sensor ("image", "scan", ...); sensors without a topic are left out.
+    """Return the topic of each sensor ("image", "scan", ...); sensors without a topic are not in the result.
 
-    `is_image` returns whether a raw image topic has camera images (it reads the first one).
+    Args:
+        topics: all topics of the bag.
+        options: contain the topics that the user has set.
+        where: path of the data, for messages.
+        is_image: returns whether a raw image topic has camera images (the first message is read).
 
     Raises:
-        UserError: several topics are possible, a chosen one is missing or has another type, or a required
-        one is
-            missing.
+        UserError: several topics are possible; a topic set by option is missing or has another type; or the
+            topic of a required sensor is missing.
     """
     chosen: dict[str, BagTopic] = {}
     for sensor_name, sensor in SENSORS.items():
@@ -77,7 +80,7 @@ def _by_type(
 
 
 def candidates(topics: list[BagTopic], sensor: SensorType) -> list[BagTopic]:
-    """Return the topics whose type and name fit a sensor."""
+    """Return the topics whose type and name match a sensor."""
     unfit = {"pose": _NOT_POSES, "image": _NOT_IMAGES}.get(sensor.name, ())
     return [
         topic
@@ -89,16 +92,18 @@ def candidates(topics: list[BagTopic], sensor: SensorType) -> list[BagTopic]:
 
 
 def _without_raw_duplicates(images: list[BagTopic]) -> list[BagTopic]:
-    """Return the topics without raw images that exist in compressed form too."""
+    """Return the image topics, without raw image topics that also exist in compressed form."""
     names = {topic.name for topic in images}
     return [topic for topic in images if f"{topic.name}/compressed" not in names]
 
 
 def choose_camera_info(topics: list[BagTopic], image: BagTopic, chosen: str, where: str) -> BagTopic | None:
-    """Return the CameraInfo topic of an image topic; None if there is none.
+    """Return the CameraInfo topic that belongs to an image topic; None if there is none.
+
+    `chosen`: the topic set by option, or "".
 
     Raises:
-        UserError: the chosen one is missing, or several are possible.
+        UserError: the topic set by option is missing, or several topics are possible.
     """
     infos = [topic for topic in topics if topic.type_name == CAMERA_INFO and topic.count]
     names = ", ".join(topic.name for topic in infos) or "none"

@@ -1,4 +1,4 @@
-"""Options of the node that subscribes to a ROS 2 robot."""
+"""Options of the node that receives data from a ROS 2 robot."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ SensorKind = Literal["image", "scan", "odometry", "pose"]
 
 
 class Ros2Config(NodeConfig):
-    """Options of the ROS 2 source. Topics and calibration are found automatically where not set."""
+    """Options of the ROS 2 source. Topics and calibration that are not set are found automatically."""
 
     domain: Domain = domain_field()
     router: str = ROUTER  # the router that the robot's nodes use

@@ -1,4 +1,4 @@
-"""A ROS 2 robot as a sensor source, over rmw_zenoh's keys and without a ROS installation."""
+"""The ros2 node: a ROS 2 robot as sensor source, by rmw_zenoh's keys, without a ROS installation."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class Ros2Node(Node):
         check_rig_option(self.config.rig)
 
     def source(self) -> Iterator[SourceItem | None]:
-        """Yield the messages of the robot's sensors; None while there are none."""
+        """Yield the converted messages of the robot's sensors; None while there are none."""
         while True:
             try:
                 sample = self._samples.get(timeout=_POLL_S)
@@ -105,7 +105,7 @@ class Ros2Node(Node):
         return attachment is not None and attachment.gid in self._own_tf_gids
 
     def _unsubscribe_unused(self) -> None:
-        """After topic selection, unsubscribe from transforms and from raw images of other topics."""
+        """Unsubscribe, after topic selection, from unneeded transforms and from other raw images."""
         self._topics_selected = True
         chosen = {topic.strip("/") for topic in self.robot.selected_topics}
         for key, type_name in self._type_by_key.items():
@@ -114,7 +114,10 @@ class Ros2Node(Node):
                 self._unused_keys.add(key)
 
     def _on_liveliness_token(self, token: str, kind: zenoh.SampleKind) -> None:
-        """Register a publisher of the robot. Raw images are large: only topics that exist are subscribed."""
+        """Register a publisher of the robot, announced by its liveliness token.
+
+        Raw images are large: only image topics that exist are subscribed to.
+        """
         entity = RmwEntity.parse(token)
         if entity is None or entity.kind != "MP" or kind != zenoh.SampleKind.PUT:
             return
@@ -174,9 +177,10 @@ class Ros2Node(Node):
             self._declarations.append(self._session.liveliness().declare_token(entity.token()))
 
     def _start_receiver(self, subscriber: zenoh.Subscriber | zenoh.ext.AdvancedSubscriber, key: str) -> None:
-        """Empty a subscriber's channel in a thread, so that it never blocks the transport.
+        """Start a thread that receives a subscriber's messages, so that it never blocks the transport.
 
-        The thread itself undeclares the subscriber when it is unused: others cannot while it waits in `recv`.
+        The thread itself undeclares the subscriber when it is unused, because no other thread can undeclare
+        it while `recv` waits.
         """
         self._declarations.append(subscriber)
 
@@ -194,7 +198,7 @@ class Ros2Node(Node):
         threading.Thread(target=run, name="ros2-in", daemon=True).start()
 
     def _enqueue(self, sample: zenoh.Sample) -> None:
-        """Queue a message; if the queue is full, drop the oldest and count it."""
+        """Queue a message; if the queue is full, drop the oldest message and count it."""
         while True:
             try:
                 self._samples.put_nowait(sample)

@@ -1,6 +1,6 @@
-"""Convert a ROS 2 robot's messages: select topics, find the calibration, then pass messages on.
+"""Conversion of a ROS 2 robot's messages: select topics, find the calibration, then convert messages.
 
-Nothing is published before the calibration is known, and no image of another size than the calibration.
+Nothing is published before the calibration is known, and no image whose size differs from the calibration.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _MAX_WAIT_S = 10.0  # for the first message of a topic that has a publisher
 
 @dataclass(frozen=True)
 class RosRobotOptions:
-    """Settings that replace automatic choices."""
+    """Options that replace the automatic choice of topics, body frame and calibration."""
 
     topics: dict[str, str] = field(default_factory=dict)  # topic by kind
     camera_info_topic: str = ""
@@ -47,7 +47,7 @@ class RosRobotOptions:
 
 
 class RosRobot:
-    """Converts serialised ROS 2 messages of one robot to messages of this system."""
+    """Converts serialised ROS 2 messages of one robot to messages of BeamSplat."""
 
     def __init__(self, options: RosRobotOptions) -> None:
         self._options = options
@@ -70,34 +70,34 @@ class RosRobot:
 
     @property
     def selected_topics(self) -> dict[str, str]:
-        """Sensor kind by topic, after topic selection."""
+        """Return topic -> sensor kind ("image", "scan", ...); empty before topic selection."""
         return dict(self._kind_by_topic)
 
     @property
     def needs_tf(self) -> bool:
-        """Whether /tf is needed: until the calibration is known, and for odometry from /tf."""
+        """Return whether /tf is needed: until the calibration is known, and for odometry from /tf."""
         return self.rig is None or self._odometry_edge is not None
 
     def add_publisher(self, topic: str, type_name: str) -> None:
-        """Register a topic that has a publisher."""
+        """Register a topic that has a publisher on the robot."""
         if type_name in SUPPORTED_TYPES:
             self._publisher_types[topic] = type_name
 
     def ignore_topic(self, topic: str) -> None:
-        """Ignore a topic that is not the robot's."""
+        """Ignore a topic that is not published by the robot itself."""
         self._ignored.add(topic)
         self._first_messages.pop(topic, None)
 
     def convert(
         self, topic: str, type_name: str, data: bytes, received_ns: int, now_s: float
     ) -> list[tuple[str, Any]]:
-        """Return (topic, message) pairs of this system that result from one ROS message.
+        """Convert one ROS message; return the resulting (topic, message) pairs of BeamSplat, possibly none.
 
         Args:
-            topic, type_name: of the ROS message.
-            data: CDR bytes.
-            received_ns: used as stamp for messages without one.
-            now_s: monotonic time of reception.
+            topic, type_name: topic and type of the ROS message.
+            data: the serialised message (CDR).
+            received_ns: time of reception, used as stamp for messages without a stamp.
+            now_s: reading of `time.monotonic` at reception.
 
         Raises:
             UserError: contradicting topics or calibration; one sentence.
@@ -140,9 +140,7 @@ class RosRobot:
         return waited_s >= self._options.settle_s and (not silent or waited_s >= _MAX_WAIT_S)
 
     def _calibrate(self) -> bool:
-        """Select topics and find the calibration; return False, with the reason in `status`, if it is
-        not available.
-        """
+        """Select topics and find the calibration; return False, with a reason in `status`, if incomplete."""
         seen = {
             t: k
             for t, (k, m) in self._first_messages.items()
@@ -255,7 +253,7 @@ class RosRobot:
                 tree.add(stamped.header.frame_id, stamped.child_frame_id, T, replace=fixed)
 
     def _odometry_from_tf(self, topic: str, message: Any) -> list[tuple[str, Any]]:
-        """Return wheel odometry from a message of /tf, if there is no Odometry topic."""
+        """Return wheel odometry computed from a message of /tf; [] if there is an Odometry topic."""
         found = []
         for stamped, T in _transforms(message):
             edge = normalize_frame(stamped.header.frame_id), normalize_frame(stamped.child_frame_id)
@@ -293,7 +291,7 @@ class RosRobot:
 
 
 def _transforms(message: Any) -> Iterator[tuple[Any, np.ndarray]]:
-    """Yield the transforms of a TFMessage with their matrices; invalid ones are left out."""
+    """Yield each transform of a TFMessage with its matrix [4, 4]; invalid transforms are skipped."""
     for stamped in message.transforms:
         try:
             T = transform_of(stamped.transform.translation, stamped.transform.rotation)
@@ -308,7 +306,7 @@ def _kind_of(type_name: str) -> str:
 
 
 def _is_camera_image(message: Any) -> bool:
-    """Return whether an image message is a camera image: raw image topics also carry depth maps and masks."""
+    """Return whether an image message is a camera image and not a depth map or mask."""
     fields = ros_fields("camera/image", message)
     return "width_px" in fields and fields["encoding"] in IMAGE_ENCODINGS
 

@@ -14,20 +14,18 @@ _MAX_STEP_NS = 1_000_000_000  # over a longer interval the velocity is unknown
 
 
 class TfOdometry:
-    """Finds the transform odom -> base in /tf and computes odometry from its changes."""
+    """Finds the transform odom -> base in /tf and computes velocities from its changes."""
 
     def __init__(self) -> None:
         self._edges: set[tuple[str, str]] = set()  # (parent, child) of the transforms on /tf
         self._previous: tuple[int, np.ndarray] | None = None
 
     def add_edge(self, parent: str, child: str) -> None:
-        """Register a transform of /tf."""
+        """Register the frames (parent, child) of a transform on /tf."""
         self._edges.add((normalize_frame(parent), normalize_frame(child)))
 
     def odometry_edge(self) -> tuple[str, str] | None:
-        """Return the frames (odom, child) by their usual names; None if there is no or more than one
-        such transform.
-        """
+        """Return the frames (odom, child), found by their usual names; None unless exactly one matches."""
         found = [
             (parent, child)
             for parent, child in sorted(self._edges)
@@ -36,9 +34,9 @@ class TfOdometry:
         return found[0] if len(found) == 1 else None
 
     def odometry_fields(self, stamp_ns: int, T_odom_child: np.ndarray) -> dict[str, Any] | None:
-        """Return the fields of a WheelOdometry of the child frame.
+        """Return the fields of a `WheelOdometry` message for the transform `T_odom_child` [4, 4].
 
-        None for the first transform, whose velocity is unknown, and for a stamp that is not newer than the
+        Returns None for the first transform, whose velocity is unknown, and for a stamp not newer than the
         last.
         """
         previous = self._previous

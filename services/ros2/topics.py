@@ -1,4 +1,4 @@
-"""Select a robot's camera, lidar and odometry topics by the same rule as for bags."""
+"""Selection of a robot's camera, lidar and odometry topics, by the same rule as for bags."""
 
 from __future__ import annotations
 
@@ -22,10 +22,12 @@ def select_topics(
     wanted: dict[str, str],  # topic by kind, set by options
     without: frozenset[str],
 ) -> dict[str, str]:
-    """Return the topic by sensor kind ("image", "scan", "odometry", "pose").
+    """Return the topic of each sensor kind ("image", "scan", "odometry", "pose") that has one.
+
+    `without`: sensor kinds that are not used.
 
     Raises:
-        UserError: several topics match, or a named one has another type.
+        UserError: several topics match, or a topic set by option has another type.
     """
     chosen = {}
     for kind, sensor in SENSORS.items():
@@ -62,7 +64,9 @@ def select_topics(
 
 
 def select_camera_info(image: str, infos: list[str], named: str) -> str | None:
-    """Return the CameraInfo topic that belongs to an image topic; None if there is none yet.
+    """Return the CameraInfo topic that belongs to the topic `image`; None if there is none yet.
+
+    `infos`: all CameraInfo topics; `named`: the topic set by option, or "".
 
     Raises:
         UserError: several topics match.

@@ -7,7 +7,7 @@ from beamsplat.common.config.ros import ROUTER, Domain, domain_field
 
 
 class Ros2OutConfig(NodeConfig):
-    """Options of publishing to ROS 2. An empty topic name disables the topic."""
+    """Options of the node that publishes to ROS 2. An empty topic name disables the topic."""
 
     domain: Domain = domain_field()
     router: str = ROUTER

@@ -1,4 +1,4 @@
-"""Convert results to ROS messages: pose, transforms, map, point cloud."""
+"""Conversion of results to ROS messages: pose, transforms, map, point cloud."""
 
 from __future__ import annotations
 
@@ -22,8 +22,9 @@ POSE, TF, MAP, CLOUD = (
 
 
 class TfTree:
-    """Computes the ROS transforms map -> odom -> body; a robot with odometry publishes odom -> body
-    itself.
+    """Computes the transforms map -> odom -> body for ROS.
+
+    If the robot itself publishes odom -> body (wheel odometry), only map -> odom is computed.
     """
 
     def __init__(self, map_frame: str, odom_frame: str, body_frame: str) -> None:
@@ -32,20 +33,19 @@ class TfTree:
         self.T_map_odom = np.eye(4)  # odom: our own smooth frame
 
     def add_wheel_odometry(self, stamp_ns: int, T_odom_body: np.ndarray) -> None:
-        """Store a pose [4, 4] of the robot's own odometry."""
+        """Store a pose `T_odom_body` [4, 4] of the robot's own wheel odometry."""
         self._wheel_odometry.append((stamp_ns, T_odom_body))
 
     def pose(self, stamp_ns: int, T_odom_body: np.ndarray) -> Any:
-        """Return the PoseStamped of the body in the map, for our smooth pose [4, 4]."""
+        """Return the PoseStamped of the body in the map frame for our localization's `T_odom_body` [4, 4]."""
         header = ros.header(stamp_ns, self._frames[0])
         return ros.new(POSE, header=header, pose=ros.pose(self.T_map_odom @ T_odom_body))
 
     def tf(self, stamp_ns: int, T_odom_body: np.ndarray) -> Any | None:
-        """Return the TFMessage for our smooth pose [4, 4]; None if there is no wheel pose of that time.
+        """Return the TFMessage for our localization's `T_odom_body` [4, 4]; None if wheel poses are too old.
 
-        If the robot publishes odom -> body, the published map -> odom is the one that places the body
-        where our
-        localization has it, as nav2 expects (REP 105).
+        If the robot publishes odom -> body, the returned map -> odom is chosen such that map -> odom -> body
+        is the pose of our localization, as nav2 expects (REP 105).
         """
         map_frame, odom_frame, body_frame = self._frames
         if not self._wheel_odometry:
@@ -69,7 +69,10 @@ def occupancy_grid(
     origin_m: np.ndarray,  # float64 [2]
     occupancy: np.ndarray,  # int8 [H, W]
 ) -> Any:
-    """Return a nav_msgs/OccupancyGrid."""
+    """Return a nav_msgs/OccupancyGrid of cells int8 [H, W] (-1 unknown, 0 free to 100 occupied).
+
+    `origin_m`: lower left corner (x, y) of the grid in `frame`.
+    """
     rows, columns = occupancy.shape
     T = np.eye(4)
     T[:2, 3] = origin_m
@@ -88,8 +91,9 @@ def point_cloud(
     colours: np.ndarray,  # uint8 [N, 3], RGB
     T_frame_points: np.ndarray,  # float64 [4, 4]
 ) -> Any:
-    """Return a sensor_msgs/PointCloud2 with x, y, z and rgb packed into a float32, as RViz and PCL read
-    it.
+    """Return a sensor_msgs/PointCloud2 with x, y, z and rgb (packed into a float32, as in RViz and PCL).
+
+    The points are transformed by `T_frame_points` to the frame `frame`.
     """
     packed = np.zeros(len(points_m), [("xyz", "<f4", 3), ("rgb", "<u4")])
     packed["xyz"] = transform_points(T_frame_points, points_m.astype(np.float64))

@@ -1,5 +1,6 @@
-"""Publish pose, transforms, map and point cloud to ROS 2, over rmw_zenoh's keys and without a ROS
-installation.
+"""The ros2_out node: publishes pose, transforms, map and point cloud to ROS 2, without a ROS installation.
+
+It uses the Zenoh keys of rmw_zenoh.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ _LATCHED = RmwQos(transient_local=True, depth=1)
 
 
 class RosPublisher:
-    """A publisher of one ROS topic, declared as rmw_zenoh_cpp does."""
+    """A publisher of one ROS topic, declared in the same way as by rmw_zenoh_cpp."""
 
     def __init__(
         self, session: zenoh.Session, domain: int, number: int, topic: str, type_name: str, qos: RmwQos
@@ -57,7 +58,7 @@ class RosPublisher:
 
 
 class Ros2OutNode(Node):
-    """Publishes the results of this system to a robot's ROS 2 nodes."""
+    """Publishes the results of BeamSplat to a robot's ROS 2 nodes."""
 
     name = "ros2_out"
     Config = Ros2OutConfig
@@ -97,7 +98,7 @@ class Ros2OutNode(Node):
         return iter(())
 
     def on_localization_odometry(self, odometry: Odometry) -> Outputs:
-        """Publish pose and transforms, while the localization has status ok."""
+        """Publish pose and transforms, if the status of localization is ok."""
         if odometry.status == "ok":
             self._publish("pose", self._transforms.pose(odometry.stamp_ns, odometry.T_odom_body))
             self._publish("tf", self._transforms.tf(odometry.stamp_ns, odometry.T_odom_body))

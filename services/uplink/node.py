@@ -1,8 +1,8 @@
-"""The uplink node: on the robot, forwards the topics marked in the topic table to the edge's router, and
-back.
+"""The uplink node: runs on the robot and forwards the topics marked `uplink` to the edge's router, and back.
 
-The robot never waits for it: it runs without a link and connects when there is one. Messages missed during an
-outage are sent again by their producer (keyframes) or recovered from a cache here (poses, anchors).
+The robot never waits for this node: the node also runs without a link, and connects as soon as there is one.
+Messages missed during an outage are sent again by their publisher (keyframes) or recovered from a cache in
+this node (poses, anchors).
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _CLOSE_S = 1.0  # limit for closing all sessions, so that a node stops in time
 
 
 class UplinkConfig(NodeConfig):
-    """Options of the uplink."""
+    """Options of the uplink: the address of the edge's router."""
 
     edge: Annotated[
         str, Field(pattern=r"^[a-z]+/\S+:\d+$")
@@ -37,7 +37,7 @@ class UplinkConfig(NodeConfig):
 
 
 class UplinkNode(Node):
-    """Forwards encoded messages between two Zenoh sessions; it has no inputs and outputs of its own."""
+    """Forwards encoded messages between two Zenoh sessions; the node has no inputs and outputs of its own."""
 
     name = "uplink"
     Config = UplinkConfig
@@ -51,7 +51,7 @@ class UplinkNode(Node):
         self._bulk_session_cut = False
 
     def source(self) -> Iterator[SourceItem | None]:
-        """Run until all topics that the robot published have ended; those of sensors never end."""
+        """Run until all topics that the robot has published on have ended (live sensors never end)."""
         if self.live_settings is None:
             raise UserError("the uplink runs live only: remove it from lockstep runs")
         started = time.monotonic()
@@ -68,9 +68,7 @@ class UplinkNode(Node):
             time.sleep(_POLL_S)
 
     def close(self) -> None:
-        """Close all sessions in threads, at most for `_CLOSE_S`: closing a session without a link
-        blocks for long.
-        """
+        """Close all sessions in threads, waiting at most `_CLOSE_S`: closing may block without a link."""
         threads = [threading.Thread(target=s.close, daemon=True) for s in self._sessions]
         for thread in threads:
             thread.start()
@@ -79,7 +77,7 @@ class UplinkNode(Node):
             thread.join(max(deadline - time.monotonic(), 0.0))
 
     def _connect(self) -> None:
-        """Open all sessions, or none.
+        """Open all sessions; if one cannot be opened, close the others.
 
         Raises:
             UserError: no router answers on one of the two sides.
@@ -112,9 +110,7 @@ class UplinkNode(Node):
         return open_link(self.config.edge, _ATTEMPT_S, self._live_settings().security, buffer_bytes)
 
     def _replace_bulk_session(self) -> None:
-        """After an interruption, replace the session for large messages when the small one is connected
-        again.
-        """
+        """Replace the session for large messages, after an interruption, when the small one is connected."""
         if not self._bulk_session_cut or not self._sessions[0].info.routers_zid():
             return
         try:

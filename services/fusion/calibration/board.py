@@ -1,8 +1,8 @@
 """Extrinsic calibration of camera and planar lidar with a chessboard: yaw and the offsets in the scan plane.
 
-The board is a plane in the camera frame, and beams on it are points of that plane. For a lidar that is level
-with the camera, yaw and the offsets to the side and along the view are observable. Its height and small tilts
-move the points within the board and are not observable.
+The chessboard is a plane in the camera frame; lidar returns from the board are points on this plane. For a
+lidar that is level with the camera, the yaw angle and the offsets to the right and forward are observable.
+The height and small tilts of the lidar move the points within the plane and are not observable.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _SIGMA_M = 0.008  # standard deviation of a lidar range
 
 @dataclass(frozen=True)
 class BoardPair:
-    """A chessboard plane in the camera frame and the scan of the same time."""
+    """One chessboard plane (camera frame) and the lidar scan of the same time (lidar frame)."""
 
     normal_camera: np.ndarray  # float64 [3], unit
     offset_m: float  # normal . point = offset
@@ -33,7 +33,7 @@ class BoardPair:
 
 @dataclass(frozen=True)
 class BoardCalibration:
-    """Result of `solve_board`."""
+    """Pose of the lidar in the camera frame with standard errors and residuals; see `solve_board`."""
 
     T_camera_lidar: np.ndarray
     yaw_rad: float  # of the lidar against the camera's forward direction, to the left
@@ -48,7 +48,18 @@ class BoardCalibration:
 def chessboard_plane(
     grey: np.ndarray, camera: Pinhole, corners: tuple[int, int], square_m: float
 ) -> tuple[np.ndarray, float, np.ndarray, float] | None:
-    """Return (normal, offset, centre, rms px) of a chessboard with inner `corners`; None if not found."""
+    """Return the plane of a chessboard in the camera frame; None if no chessboard is found in the image.
+
+    Args:
+        grey: uint8 [H, W], with lens distortion as described by `camera`.
+        camera: camera model of the image.
+        corners: number of inner corners (columns, rows).
+        square_m: side of one square.
+
+    Returns:
+        Unit normal n float64 [3]; offset (m) with n . p = offset; centre of the inner corners float64 [3], m;
+        RMS reprojection error (px).
+    """
     found, uv = cv2.findChessboardCornersSB(grey, corners, flags=cv2.CALIB_CB_ACCURACY)
     if not found:
         return None
@@ -68,7 +79,10 @@ def chessboard_plane(
 
 
 def level_mount(yaw_rad: float, x_m: float, y_m: float, z_m: float) -> np.ndarray:
-    """Return `T_camera_lidar` of a lidar that is level with the camera, turned by yaw to the left."""
+    """Return `T_camera_lidar` [4, 4] of a lidar level with the camera and rotated by `yaw_rad` to the left.
+
+    `x_m`, `y_m`, `z_m`: position of the lidar in the optical frame (right, down, forward).
+    """
     R_lidar_level = so3_exp([0.0, 0.0, yaw_rad])
     return make_transform(R_body_camera_level.T @ R_lidar_level, np.array([x_m, y_m, z_m]))
 
@@ -76,15 +90,19 @@ def level_mount(yaw_rad: float, x_m: float, y_m: float, z_m: float) -> np.ndarra
 def solve_board(
     pairs: list[BoardPair], start: tuple[float, float, float], y_m: float = 0.0, rounds: int = 14
 ) -> BoardCalibration:
-    """Return yaw, x and z of the lidar from point-to-plane distances; beams are reassigned each round.
+    """Estimate yaw, x and z of the lidar in the camera frame by minimising point-to-plane distances.
+
+    Each of the `rounds` first selects the beams on each board with the present estimate, then runs Gauss-
+    Newton.
 
     Args:
         pairs: at least two boards of different orientation.
-        start: (yaw rad, x m, z m), within a few degrees and centimetres.
-        y_m: height of the lidar below the camera, which is not observable here.
+        start: initial values (yaw rad, x m, z m), correct to a few degrees and centimetres.
+        y_m: position of the lidar below the camera, which is not observable from the boards.
+        rounds: number of rounds.
 
     Raises:
-        ValueError: too few beams on the boards from this start, or boards that do not constrain all values.
+        ValueError: too few beams on the boards with these initial values, or all boards are parallel.
     """
     x = np.array(start, dtype=np.float64)
     on_board: list[np.ndarray] = []
@@ -122,7 +140,7 @@ def solve_board(
 def _linear(
     pairs: list[BoardPair], on_board: list[np.ndarray], x: np.ndarray, y_m: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return point-to-plane distances [M] and their derivatives [M, 3]."""
+    """Return point-to-plane distances [M], m, and their derivatives [M, 3] by (yaw rad, x m, z m)."""
 
     def distances(x: np.ndarray) -> np.ndarray:
         T = level_mount(x[0], x[1], y_m, x[2])

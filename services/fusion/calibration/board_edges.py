@@ -1,8 +1,8 @@
 """Validation of a board calibration by the vertical edges of the board in image and scan.
 
-The calibration uses planes only, so that the edges are independent of it. A beam whose spot half misses the
-board still returns from it: to a lidar, boards appear wider by the same angle at both edges. The median
-over all edges removes this offset. The remaining error is at best half the spacing of the beams.
+The calibration uses only the planes of the boards, so the edges are independent data. A beam whose spot falls
+only partly on the board still returns a range: in a scan, a board appears wider by the same angle at both
+edges. The median over all edges removes this offset. The remaining error is at best half the beam spacing.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _LEAST_STEP = 12.0  # grey values between board and background
 
 @dataclass(frozen=True)
 class EdgeErrors:
-    """Differences of the outermost beams and the board edges in the image."""
+    """Horizontal differences (px) between the outermost beams on a board and its edges in the image."""
 
     errors_px: np.ndarray  # float64 [edges]: beams beyond the edge, minus `spot_px`
     spot_px: float  # apparent widening of boards at each edge
@@ -34,9 +34,14 @@ class EdgeErrors:
 
 
 def image_edges(grey: np.ndarray, camera: Pinhole, uv_px: np.ndarray) -> np.ndarray:
-    """Return the columns float64 [2] of the undistorted image at which the board ends; NaN = not found.
+    """Return the image columns (px) of the left and right board edge, float64 [2]; NaN = edge not found.
 
-    `uv_px` [N, 2] are the beams on the board, projected by the pinhole, in any order.
+    Args:
+        grey: uint8 [H, W], with lens distortion.
+        camera: camera model of the image.
+        uv_px: float64 [N, 2], the beams on the board, projected to the undistorted image, in any order.
+
+    The columns belong to the undistorted image. The board must be brighter than its background.
     """
     flat = Undistorter(camera)(cv2.cvtColor(grey, cv2.COLOR_GRAY2RGB))[..., 0].astype(np.float32)
     uv = uv_px[np.argsort(uv_px[:, 0])]
@@ -64,12 +69,12 @@ def edge_errors(
     pairs: list[BoardPair], on_board: tuple[np.ndarray, ...], edges_px: list[np.ndarray],
     T_camera_lidar: np.ndarray, pinhole: Pinhole,
 ) -> EdgeErrors:  # fmt: skip
-    """Return the differences of the outermost beams on each board and its edges in the image.
+    """Return the differences (px) between the outermost beams on each board and its edges in the image.
 
     Args:
         pairs: boards with their scans.
         on_board: indices of the beams on each board (`BoardCalibration.on_board`).
-        edges_px: of each pair, from `image_edges` (float64 [2], NaN = not found).
+        edges_px: for each pair, the result of `image_edges` (float64 [2], NaN = not found).
         T_camera_lidar: the calibration to validate.
         pinhole: the camera without distortion.
     """

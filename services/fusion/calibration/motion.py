@@ -1,9 +1,10 @@
-"""Time offset and mount of the camera from motion: tracked corners against poses from lidar localization.
+"""Time offset and mount of the camera from motion: tracked corners compared with poses from the lidar.
 
-Two images a fraction of a second apart fulfil the epipolar constraint only if the poses belong to the right
-times and the mount of the camera is right. Rotation makes the time offset (by changes of the yaw rate) and
-the lever arm observable, translation makes yaw and pitch observable, both together roll. A robot on a floor
-does not move vertically, so that the height of the camera is not observable.
+Corners tracked between two images fulfil the epipolar constraint only if the poses of the two image times
+and the mount of the camera are correct. Rotation of the robot makes the time offset (by changes of the yaw
+rate) and the x, y position of the camera observable; translation makes yaw and pitch observable; rotation and
+translation together make roll observable. A robot on a floor does not move vertically, so the height of the
+camera is not observable.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ OBSERVABLE = np.array([0.025, 0.01, 0.01, 0.01, 0.02, 0.02])
 
 @dataclass(frozen=True)
 class TrackedPair:
-    """Rays of corners that were tracked between two images; stamps by the camera's clock."""
+    """Rays of the corners that were tracked from image a to image b; stamps are on the camera's clock."""
 
     stamp_a_ns: int
     stamp_b_ns: int
@@ -39,7 +40,10 @@ class TrackedPair:
 
 @dataclass(frozen=True)
 class MotionCalibration:
-    """Corrections in the order of PARAMETERS with standard errors; `clock_s` is added to image stamps."""
+    """Corrections of time offset and mount with standard errors, in order and units of `PARAMETERS`.
+
+    The correction `clock_s` is added to image stamps.
+    """
 
     values: np.ndarray  # float64 [6]
     sigma: np.ndarray  # float64 [6], inf = not estimated
@@ -49,16 +53,19 @@ class MotionCalibration:
 
     @property
     def observable(self) -> np.ndarray:
-        """Return bool [6]: whether the motion of the drive determines this value."""
+        """Return bool [6], one per parameter: True if the standard error is below the limit `OBSERVABLE`."""
         return self.sigma < OBSERVABLE
 
     def mount(self, T_body_camera: np.ndarray) -> np.ndarray:
-        """Return `T_body_camera` with the observable corrections applied."""
+        """Return `T_body_camera` [4, 4] with the observable corrections of rotation and (x, y) applied."""
         return apply_correction(T_body_camera, np.where(self.observable, self.values, 0.0))
 
 
 def apply_correction(T_body_camera: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Return the mount rotated by (roll, pitch, yaw) about the body axes and translated by (x, y)."""
+    """Return the mount [4, 4], rotated by (roll, pitch, yaw) about the body axes and translated by (x, y).
+
+    `values` float64 [6] in the order of `PARAMETERS`; the time offset `values[0]` is not used.
+    """
     T = T_body_camera.copy()
     T[:3, :3] = so3_exp(values[1:4]) @ T_body_camera[:3, :3]
     T[:2, 3] += values[4:6]
@@ -72,13 +79,20 @@ def solve_motion(
     focal_px: float,
     free: tuple[str, ...] = PARAMETERS,
 ) -> MotionCalibration:
-    """Return the most probable corrections: grid search over the time offset, then Gauss-Newton.
+    """Estimate the corrections of time offset and mount: grid search over the time offset, then Gauss-Newton.
 
-    Standard errors come from a jackknife over blocks of the drive, because errors of one image are
-    correlated.
+    The result is the maximum a posteriori estimate. Standard errors are computed by a jackknife over blocks
+    of the drive, because the errors of the corners of one image are correlated.
+
+    Args:
+        pairs: image pairs with tracked corners, in order of time.
+        pose_at: returns `T_map_body` [4, 4] at a stamp on the lidar's clock; None if there is no pose.
+        T_body_camera: the mount to correct.
+        focal_px: focal length of the images in which the corners were tracked.
+        free: names of the parameters to estimate; the others stay 0.
 
     Raises:
-        ValueError: too few pairs with corners and poses.
+        ValueError: too few pairs with at least 8 corners.
     """
     pairs = [p for p in pairs if len(p.rays_a) >= 8]
     if len(pairs) < 2 * _BLOCKS:
@@ -102,7 +116,7 @@ def solve_motion(
 
 
 def _search_clock(problem: _Problem, mask: np.ndarray) -> float:
-    """Return the time offset, seconds, of least cost on a grid; yaw is estimated along (most correlated)."""
+    """Return the time offset (s) of lowest cost on a grid, optimising yaw too (the most correlated)."""
     clocks = np.arange(-_SEARCH_S, _SEARCH_S + 1e-9, 0.02)
     rest = mask & (np.array(PARAMETERS) == "yaw_rad")
     start = np.zeros(len(PARAMETERS))
@@ -128,7 +142,7 @@ class _Problem:
         self._shift_ns: int | None = None
 
     def residuals(self, x: np.ndarray) -> np.ndarray:
-        """Return `reprojection` of all corners [2M], pixels; 0 where a pose is missing."""
+        """Return the residuals [2M] (px) of all corners, see `reprojection`; 0 where a pose is missing."""
         self._interpolate_motions(round(x[0] * 1e9))
         mount = apply_correction(self._T_body_camera, x)
         T = inverse(mount) @ self._T_bodies @ mount
@@ -136,7 +150,7 @@ class _Problem:
         return np.where(np.tile(self._known[self._of], 2), r, 0.0)
 
     def _interpolate_motions(self, shift_ns: int) -> None:
-        """Set the body motions [P, 4, 4] between the images of each pair, at shifted stamps."""
+        """Compute the body motion `T_b_a` between the images of each pair, with stamps + `shift_ns`."""
         if shift_ns == self._shift_ns:
             return
         self._shift_ns = shift_ns
@@ -148,7 +162,7 @@ class _Problem:
                 self._T_bodies[k], self._known[k] = inverse(T_b) @ T_a, True
 
     def conjugate_motions(self, X: np.ndarray) -> None:
-        """Replace the body motions T by X T X^-1: those measured with another mounting of the lidar."""
+        """Replace the body motions T by X T X^-1, as another mounting of the lidar would measure them."""
         self._T_bodies = X @ self._T_bodies @ np.linalg.inv(X)
 
     def cost(self, x: np.ndarray) -> float:
@@ -157,7 +171,7 @@ class _Problem:
         return float(np.sum(np.log1p(r**2))) / max(2 * int(self._known[self._of].sum()), 1)
 
     def prior_share(self, x: np.ndarray, mask: np.ndarray) -> np.ndarray:
-        """Return the share [6] in [0, 1] of each value that comes from the prior, not from the images."""
+        """Return float64 [6] in [0, 1]: the fraction of each value that the prior determines."""
         columns = np.flatnonzero(mask)
         share = np.ones(len(x))
         if len(columns):
@@ -166,7 +180,7 @@ class _Problem:
         return share
 
     def jackknife(self, x: np.ndarray, mask: np.ndarray) -> np.ndarray:
-        """Return standard errors [6] from one Gauss-Newton step per omitted block of the drive."""
+        """Return the standard errors [6] from Gauss-Newton steps, each without one block of the drive."""
         sigma = np.zeros(len(x))
         columns = np.flatnonzero(mask)
         if len(columns) == 0:
@@ -198,7 +212,7 @@ class _Problem:
         return r, J, weight, scale**2 * len(r) / 2 / len(self._pairs) / _PRIOR[columns] ** 2
 
     def _normal(self, x: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return (H [k, k], gradient [k], weights [k] of the prior) of the robust least squares at x."""
+        """Return (H [k, k], gradient [k], weights [k] of the prior) of the robust normal equations at x."""
         r, J, weight, prior = self._linear(x, columns)
         return J.T @ (J * weight[:, None]) + np.diag(prior), J.T @ (weight * r) + prior * x[columns], prior
 
@@ -224,9 +238,10 @@ def motion_misfit(
     focal_px: float,
     X: np.ndarray | None = None,
 ) -> float:
-    """Return the median distance, pixels, of tracked corners from their prediction by the poses.
+    """Return the median distance (px) between tracked corners and their positions predicted from the poses.
 
-    With `X` [4, 4] the motions are X T X^-1: those measured with another mounting of the lidar.
+    If `X` [4, 4] is passed, each body motion T is replaced by X T X^-1, the motion that another mounting of
+    the lidar would measure.
     """
     problem = _Problem(pairs, pose_at, T_body_camera, focal_px)
     start = np.zeros(len(PARAMETERS))
@@ -243,11 +258,11 @@ def reprojection(
     rays_b: np.ndarray,  # float64 [N, 3]
     sigma: float,  # of a track, normalised pixels
 ) -> np.ndarray:
-    """Return distances [2N], normalised pixels, of tracked rays from their prediction by pose and mean depth.
+    """Return distances [2N] (at z = 1) of tracked rays from their prediction by pose and mean depth.
 
-    The inverse depth of a corner is Gaussian and marginalised: the distance across the epipolar line has full
-    weight, the distance along it less, the more the unknown depth moves the corner. Rotation thus remains
-    observable without translation, where the epipolar constraint is degenerate.
+    The inverse depth of a corner has a Gaussian prior and is marginalised: the distance across the epipolar
+    line has full weight; the distance along the line has less weight, the more the unknown depth moves the
+    corner. Thus rotation remains observable without translation, where the epipolar constraint is degenerate.
     """
     t = T_b_a[:, :3, 3]
     p = np.einsum("nij,nj->ni", T_b_a[:, :3, :3], rays_a) + _INVERSE_DEPTH * t

@@ -1,8 +1,8 @@
 """Check of the lidar mounting: as calibrated, mirrored (upside down), or rotated by 180 degrees.
 
-Scans of a drive, transformed by poses of another source (wheels, camera, motion capture), agree only if the
-direction of rotation and the zero direction of the lidar are right. Poses estimated from the same scans
-would hide the fault, because they are mirrored like the scans.
+Scans of a drive are transformed by poses of another source (wheels, camera, motion capture). The scans agree
+only if the direction of rotation and the zero direction of the lidar are correct. Poses estimated from the
+same scans would hide the fault, because such poses are mirrored together with the scans.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _MOUNTINGS: dict[str, np.ndarray] = {
 
 @dataclass(frozen=True)
 class MountingCheck:
-    """Mean distance between scans under each mounting, and the conclusion."""
+    """Result of `check_mounting`: mean distance (m) between scans for each mounting, and the status."""
 
     misfit_m: dict[str, float]
     status: str  # "ok", or one sentence
@@ -42,7 +42,10 @@ def check_mounting(
     T_map_body: list[np.ndarray],  # of each scan, from a source other than these scans
     T_body_lidar: np.ndarray,
 ) -> MountingCheck:
-    """Compare scans taken 0.25 m or 0.3 rad apart under each possible mounting."""
+    """Return the mean distance between scans for each possible mounting, and which mounting is correct.
+
+    The scans of a pair were taken more than 0.25 m or 0.3 rad apart.
+    """
     chosen = _pairs(T_map_body)
     if len(chosen) < 4:
         return MountingCheck({}, "the robot has hardly moved: the lidar mounting cannot be checked yet", 0)

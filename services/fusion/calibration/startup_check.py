@@ -1,8 +1,8 @@
 """Calibration check at every start: camera clock, camera mount and lidar mounting against the images.
 
-Over the first metres of a drive corners are tracked between images and a few scans are kept. One background
-job then checks whether the lidar is mirrored or rotated, and estimates the clock offset and the orientation
-of the camera.
+During the first metres of a drive, corners are tracked between images and a few scans are stored. One
+background job then checks whether the lidar is mirrored or rotated, and estimates the clock offset and the
+orientation of the camera.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ _CLEARLY = 0.5  # another mounting is accepted if its residual is below this sha
 
 @dataclass(frozen=True)
 class CalibrationHealth:
-    """Result of the check. `status` is "ok" or one sentence: what is wrong and what to do."""
+    """Result of the calibration check. `status` is "ok", or one sentence: the fault and the remedy."""
 
     status: str
     misfit_px: float  # median distance of tracked corners from their prediction by the poses, 320 px wide
@@ -62,7 +62,7 @@ class CalibrationHealth:
 
 
 class StartupCheck:
-    """Collector of image pairs, scans and poses; `job` returns the check once there are enough."""
+    """Collector of image pairs, scans and poses; `job` returns the check once there are enough data."""
 
     def __init__(
         self, camera: Pinhole, T_body_camera: np.ndarray, T_body_lidar: np.ndarray, pairs: int = 60
@@ -83,7 +83,7 @@ class StartupCheck:
         return f"calibration not checked yet: {len(self._pairs)} of {self._wanted} pairs of images"
 
     def add_pose(self, stamp_ns: int, T_map_body: np.ndarray) -> None:
-        """Add a pose of localization. A stamp that goes back restarts the check."""
+        """Add a pose of localization. A stamp earlier than the previous one restarts the check."""
         if self._stamps and stamp_ns <= self._stamps[-1]:
             for kept in (self._pairs, self._images, self._stamps, self._poses, self._scans):
                 kept.clear()
@@ -123,7 +123,10 @@ class StartupCheck:
             self._pairs.append(TrackedPair(a_ns, b_ns, rays(uv[good]), rays(moved[good])))
 
     def job(self) -> Callable[[], CalibrationHealth] | None:
-        """Return the check once, when there is enough data; it shares no data with this object."""
+        """Return the check as a function, once, when there are enough data; None before and after.
+
+        The function uses copies of the data, so it may run in another thread.
+        """
         if self.done or len(self._pairs) < self._wanted:
             return None
         self.done = True
@@ -148,7 +151,10 @@ def check_calibration(
     T_body_lidar: np.ndarray,
     focal_px: float,
 ) -> CalibrationHealth:
-    """Check the lidar first, then clock and mount of the camera, because a lidar fault hides the rest."""
+    """Return the health of the calibration: check the lidar mounting, then clock and mount of the camera.
+
+    The lidar is checked first, because with a wrong lidar mounting the camera cannot be checked.
+    """
     nothing = np.full(3, np.nan)
     misfit = motion_misfit(pairs, pose_at, T_body_camera, focal_px)
     against_poses = check_mounting([p for p, _ in scans], [T for _, T in scans], T_body_lidar)
@@ -172,9 +178,10 @@ def _mounting_fault(
     pairs: list[TrackedPair], pose_at: Callable[[int], np.ndarray | None], T_body_camera: np.ndarray,
     T_body_lidar: np.ndarray, focal_px: float, misfit_px: float,
 ) -> str | None:  # fmt: skip
-    """Return a sentence if the images fit another mounting of the lidar clearly better, else None.
+    """Return one sentence if another mounting of the lidar fits the images clearly better, else None.
 
-    Poses estimated from scans of a wrongly mounted lidar fit those scans; only another sensor reveals it.
+    Poses estimated from scans of a wrongly mounted lidar agree with those scans; only another sensor shows
+    the fault. `misfit_px`: result of `motion_misfit` with the calibrated mounting.
     """
     if not misfit_px > _DOUBT_PX:
         return None
@@ -201,7 +208,10 @@ def _mounting_fault(
 def describe_calibration(
     found: MotionCalibration, clock_ms: float = 10.0, angle_deg: float = 0.5, sigmas: float = 4.0
 ) -> str:
-    """Return "ok", or what is wrong with clock or mount; smaller errors than the given ones are ignored."""
+    """Return "ok", or one sentence about the error of clock or mount.
+
+    Errors below `clock_ms` or `angle_deg`, or below `sigmas` standard errors, are ignored.
+    """
     off_ms, sigma_ms = 1e3 * found.values[0], 1e3 * found.sigma[0]
     if found.observable[0] and abs(off_ms) > max(clock_ms, sigmas * sigma_ms):
         return f"the camera's clock is wrong: add {off_ms:.0f} +- {sigma_ms:.0f} ms to its stamps"
