@@ -114,7 +114,11 @@ class Outbox:
         self._enforce_limits(keep=key)
 
     def acknowledge(self, key: int, now_ns: int) -> bool:
-        """Remove a keyframe and mark all that were sent before as lost; return False for an unknown key."""
+        """Remove an acknowledged keyframe; return False if the key is unknown.
+
+        Keyframes that were sent before it and are still not acknowledged count as lost and become due again.
+        `now_ns` is the time of the acknowledgement, in image time.
+        """
         entry = self._entries.get(key)
         self._last_ack_ns = now_ns
         if entry is None:

@@ -126,7 +126,10 @@ class Faults:
         )
 
     def exposure_gain_at(self, time_s: float) -> float:
-        """Return the exposure factor `time_s` seconds after the lap start: sine waves and a repeated step."""
+        """Return the exposure factor `time_s` seconds after the lap start.
+
+        Its binary logarithm is the sum of two sine waves and of a step of 0.5 that is on for 8 of every 24 s.
+        """
         if not self.exposure_changes:
             return 1.0
         wave = 0.35 * np.sin(2 * np.pi * time_s / 11.0) + 0.2 * np.sin(2 * np.pi * time_s / 3.7)
