@@ -182,8 +182,8 @@ class _Problem:
     def jackknife(self, x: np.ndarray, mask: np.ndarray) -> np.ndarray:
         """Return the standard error float64 [6] of each parameter, in the order and units of `PARAMETERS`.
 
-        The image pairs are divided into consecutive blocks of equal length; a Gauss-Newton step is solved once
-        without each block, and the spread of the steps gives the error (jackknife). Parameters outside `mask`
+        The image pairs are divided into consecutive blocks of equal length. One Gauss-Newton step is solved
+        without each block, and the spread of these steps gives the error (jackknife). Parameters outside `mask`
         (bool [6]) are fixed and get 0.
         """
         sigma = np.zeros(len(x))
