@@ -183,8 +183,8 @@ class _Problem:
         """Return the standard error float64 [6] of each parameter, in the order and units of `PARAMETERS`.
 
         The image pairs are divided into consecutive blocks of equal length. One Gauss-Newton step is solved
-        without each block, and the spread of these steps gives the error (jackknife). Parameters outside `mask`
-        (bool [6]) are fixed and get 0.
+        without each block, and the spread of these steps gives the error (jackknife). Parameters that are
+        False in `mask` (bool [6]) are fixed and get 0.
         """
         sigma = np.zeros(len(x))
         columns = np.flatnonzero(mask)
