@@ -37,21 +37,24 @@ page is generated:
 
 @dataclass(frozen=True)
 class Effect:
-    """Relative changes of the figures by one parameter; a figure that a run lacks has no entry."""
+    """Relative changes of the metrics caused by one parameter; a metric that a run lacks has no entry."""
 
     parameter: Parameter
     values: tuple[float | int | None, ...]  # by SCALES; None: not measured
-    errors: tuple[str, ...]  # by SCALES; "" if the run has figures
+    errors: tuple[str, ...]  # by SCALES; "" if the run has metrics
     changes: tuple[dict[str, float], ...]  # by SCALES; 0.01 is one percent
 
     @property
     def measured(self) -> bool:
-        """Whether both values were run or found invalid."""
+        """Whether both changed values of the parameter were run or are invalid."""
         return None not in self.values
 
 
 def noise(part: Part, rows: list[Row]) -> dict[str, float]:
-    """Return the relative spread (largest minus smallest) of each figure with default settings."""
+    """Return the spread of each metric over the runs with default settings, by the key of the metric.
+
+    The spread is the largest minus the smallest value, divided by the value with default settings.
+    """
     runs, base = [row["figures"] for row in rows if row["parameter"] == DEFAULTS], _base(part, rows)
     spread = {}
     for figure in part.figures:
@@ -61,10 +64,13 @@ def noise(part: Part, rows: list[Row]) -> dict[str, float]:
 
 
 def effects(part: Part, parameters: list[Parameter], rows: list[Row]) -> list[Effect]:
-    """Return the effect of each parameter, in the order of the table.
+    """Return the effect of each parameter on the metrics, the parameter with the largest effect first.
+
+    Args:
+        rows: finished runs, see `beamsplat.tools.bench.sensitivity.measure`.
 
     Raises:
-        UserError: no run with default settings is finished.
+        UserError: the run with default settings and seed 0 is missing.
     """
     base, spread, found = _base(part, rows), noise(part, rows), []
     for parameter in parameters:
@@ -86,7 +92,10 @@ def effects(part: Part, parameters: list[Parameter], rows: list[Row]) -> list[Ef
 def as_json(
     part: Part, parameters: list[Parameter], rows: list[Row], setup: dict[str, Any]
 ) -> dict[str, Any]:
-    """Return the result as JSON values: default figures, their relative spread, relative changes."""
+    """Return the result for JSON: metrics with default settings, their relative spread, relative changes.
+
+    The entries of `setup` are included.
+    """
     return {
         **setup,
         "default": _base(part, rows),
@@ -109,7 +118,7 @@ def as_json(
 
 
 def markdown(part: Part, parameters: list[Parameter], rows: list[Row], command: str, date: str) -> str:
-    """Return the text of one part: how it was measured, its noise, the table, parameters without runs."""
+    """Return the section of one part in Markdown: command and date, noise, table, parameters not measured."""
     spread, base = noise(part, rows), _base(part, rows)
     defaults = [
         f"{figure.title} {base[figure.key]:.4g} (spread {100.0 * spread[figure.key]:.1f} %)"
@@ -120,7 +129,8 @@ def markdown(part: Part, parameters: list[Parameter], rows: list[Row], command: 
     lines = [
         f"Measured with `{command}` on {date}.",
         "",
-        f"Default settings ({part.noise}): {', '.join(defaults)}. Changes below are in percent.",
+        f"Default settings ({part.noise}): {', '.join(defaults)}. Changes below are in percent."
+        + (f" {part.note}" if part.note else ""),
         "",
         "| " + " | ".join(head) + " |",
         "|---" * len(head) + "|",
@@ -135,7 +145,7 @@ def markdown(part: Part, parameters: list[Parameter], rows: list[Row], command: 
 
 
 def write_page(file: Path, name: str, text: str) -> None:
-    """Replace the text of one part in a page, which is created if it is missing."""
+    """Replace the section of the part called `name` in a Markdown page; create the page if it is missing."""
     if not file.is_file():
         file.parent.mkdir(parents=True, exist_ok=True)
         titles = {"slam": "Lidar SLAM", "fusion": "Depth fusion", "map": "Mapper"}
@@ -148,7 +158,10 @@ def write_page(file: Path, name: str, text: str) -> None:
 
 
 def _base(part: Part, rows: list[Row]) -> dict[str, float]:
-    """Return the figures with default settings: of seed 0, as in all other runs; medians of timed figures."""
+    """Return the metrics with default settings by key: of seed 0, which all other runs use too.
+
+    Times are medians over all runs with default settings.
+    """
     runs = {row["seed"]: row["figures"] for row in rows if row["parameter"] == DEFAULTS}
     if 0 not in runs:
         raise UserError("no run with default settings is finished; run the command again, or raise --minutes")
@@ -161,7 +174,11 @@ def _relative(difference: float, base: float) -> float:
 
 
 def _order(part: Part, effect: Effect, spread: dict[str, float]) -> tuple[float, float, float]:
-    """Return the largest change beyond the noise of a quality figure, that of a cost, the largest change."""
+    """Return the sort key of an effect: three largest absolute relative changes, 0.0 where there is none.
+
+    The first is of quality metrics beyond the noise, the second of costs beyond the noise, the third of
+    quality metrics, also within the noise.
+    """
 
     def largest(quality: bool, factor: float) -> float:
         keys = [figure.key for figure in part.figures if figure.quality == quality]
