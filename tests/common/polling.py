@@ -3,7 +3,7 @@
 import time
 
 
-def wait_until(condition, timeout_s=5.0):
+def wait_until(condition, timeout_s=30.0):
     """Poll until `condition()` is true; fail after `timeout_s`."""
     deadline = time.monotonic() + timeout_s
     while not condition():
@@ -22,7 +22,7 @@ def poll(supervisor, until, timeout_s):
     raise AssertionError(f"not within {timeout_s} s")
 
 
-def publish_until_received(publication, message, received, times=3, timeout_s=5.0):
+def publish_until_received(publication, message, received, times=3, timeout_s=30.0):
     """Publish `message` repeatedly until the list `received` has at least `times` entries."""
     deadline = time.monotonic() + timeout_s
     while len(received) < times and time.monotonic() < deadline:
