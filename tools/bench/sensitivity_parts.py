@@ -222,8 +222,8 @@ PARTS: dict[str, Part] = {
          Figure("dense_within_1sigma", "within 1 sigma"),
          Figure("cpu_ms", "CPU per keyframe (ms)", quality=False, timed=True)),
         16.0, open_fusion, _RANGE_NOISE,
-        "AbsRel, delta1 and within 1 sigma are of the pixels that have depth: they improve if fewer difficult "
-        "pixels have one, and the coverage falls.",
+        "AbsRel, delta1 and within 1 sigma are of the pixels that have depth: they improve if fewer "
+        "difficult pixels have one, and the coverage falls.",
     ),
     "map": Part(
         MapperSettings(),
