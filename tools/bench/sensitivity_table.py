@@ -14,9 +14,11 @@ from beamsplat.tools.bench.readme import replace_readme_table
 from beamsplat.tools.bench.sensitivity import DEFAULTS, SCALES, Row
 from beamsplat.tools.bench.sensitivity_parts import PARTS, Figure, Part
 
-# A change counts as real if it exceeds this many times the spread of the runs with default settings: 3 runs
-# of a normal distribution spread over 1.7 sigma in the mean.
+# A change counts as real if it exceeds this many times the spread of the runs with default settings.
 NOISE_FACTOR = 2.0
+TIME_NOISE_FACTOR = 3.0  # the load of the machine stays different over several runs
+# Largest minus smallest of 3 values of a normal distribution, in the mean, over its standard deviation.
+_RANGE_OF_3 = 1.7
 _INTRODUCTION = """# Parameters and their effect
 
 Each numeric setting of SLAM, fusion and mapper was changed by -30 % and by +30 % while all others kept their
@@ -27,6 +29,9 @@ page is generated:
 
 * A cell `-1.2 / +3.4` shows the change with the smaller and with the larger value. **Bold** changes exceed
   twice the spread (largest minus smallest) of the runs with default settings; all others may be noise.
+* CPU times vary with the load of the machine. Their default value is the median, and their spread 1.7
+  standard deviations, of all runs whose other figures are those of the default settings. Their changes are
+  bold if they exceed three times this spread.
 * Rows are in the order of the largest bold change of a quality figure, then of a cost.
 * Integers are rounded and change by at least 1. Flags and tuples are left out. Values that cannot be used are
   marked as invalid.
@@ -53,13 +58,16 @@ class Effect:
 def noise(part: Part, rows: list[Row]) -> dict[str, float]:
     """Return the spread of each metric over the runs with default settings, by the key of the metric.
 
-    The spread is the largest minus the smallest value, divided by the value with default settings.
+    The spread is the largest minus the smallest value, divided by the value with default settings. Times have
+    the equivalent of the standard deviation over all runs that `_unaffected` returns.
     """
-    runs, base = [row["figures"] for row in rows if row["parameter"] == DEFAULTS], _base(part, rows)
+    base = _base(part, rows)
+    defaults, unaffected = _defaults(rows).values(), _unaffected(part, rows)
     spread = {}
     for figure in part.figures:
-        values = [run[figure.key] for run in runs if run.get(figure.key) is not None]
-        spread[figure.key] = _relative(max(values) - min(values), base[figure.key]) if values else 0.0
+        values = [run[figure.key] for run in (unaffected if figure.timed else defaults)]
+        width = _RANGE_OF_3 * float(np.std(values)) if figure.timed else max(values) - min(values)
+        spread[figure.key] = _relative(width, base[figure.key])
     return spread
 
 
@@ -137,7 +145,7 @@ def markdown(part: Part, parameters: list[Parameter], rows: list[Row], command: 
     ]
     for effect in found:
         if effect.measured:
-            cells = [_cell(figure, effect, spread[figure.key]) for figure in part.figures]
+            cells = [_cell(figure, effect, spread) for figure in part.figures]
             lines.append("| " + " | ".join([*_head_cells(effect), *cells]) + " |")
     if rest := [f"`{effect.parameter.name}`" for effect in found if not effect.measured]:
         lines += ["", f"Not measured: {', '.join(rest)}."]
@@ -157,16 +165,36 @@ def write_page(file: Path, name: str, text: str) -> None:
     replace_readme_table(file, f"sensitivity {name}", f"\n{text}\n")
 
 
-def _base(part: Part, rows: list[Row]) -> dict[str, float]:
-    """Return the metrics with default settings by key: of seed 0, which all other runs use too.
+def _defaults(rows: list[Row]) -> dict[int, dict[str, float]]:
+    """Return the metrics of the runs with default settings, by seed.
 
-    Times are medians over all runs with default settings.
+    Raises:
+        UserError: the run with seed 0 is missing.
     """
     runs = {row["seed"]: row["figures"] for row in rows if row["parameter"] == DEFAULTS}
     if 0 not in runs:
         raise UserError("no run with default settings is finished; run the command again, or raise --minutes")
+    return runs
+
+
+def _unaffected(part: Part, rows: list[Row]) -> list[dict[str, float]]:
+    """Return the metrics of the default runs and of all runs that differ from them in times only."""
+    defaults = _defaults(rows)
+    keys = [figure.key for figure in part.figures if not figure.timed]
+    changed = [row["figures"] for row in rows if row["parameter"] != DEFAULTS and "figures" in row]
+    same = [run for run in changed if all(run[key] == defaults[0][key] for key in keys)]
+    return [*defaults.values(), *same]
+
+
+def _base(part: Part, rows: list[Row]) -> dict[str, float]:
+    """Return the metrics with default settings by key: of seed 0, which all other runs use too.
+
+    Times are medians over all runs that `_unaffected` returns.
+    """
+    unaffected = _unaffected(part, rows)
     timed = [figure.key for figure in part.figures if figure.timed]
-    return {**runs[0], **{key: float(np.median([run[key] for run in runs.values()])) for key in timed}}
+    medians = {key: float(np.median([run[key] for run in unaffected])) for key in timed}
+    return {**_defaults(rows)[0], **medians}
 
 
 def _relative(difference: float, base: float) -> float:
@@ -180,13 +208,22 @@ def _order(part: Part, effect: Effect, spread: dict[str, float]) -> tuple[float,
     quality metrics, also within the noise.
     """
 
-    def largest(quality: bool, factor: float) -> float:
-        keys = [figure.key for figure in part.figures if figure.quality == quality]
-        sizes = [abs(change.get(key, 0.0)) for change in effect.changes for key in keys
-                 if abs(change.get(key, 0.0)) > factor * spread[key]]  # fmt: skip
+    def largest(quality: bool, noise_counts: bool) -> float:
+        sizes = [
+            abs(change[figure.key])
+            for change in effect.changes
+            for figure in part.figures
+            if figure.quality == quality and figure.key in change
+            if noise_counts or _is_real(figure, change[figure.key], spread)
+        ]
         return max(sizes, default=0.0)
 
-    return largest(True, NOISE_FACTOR), largest(False, NOISE_FACTOR), largest(True, 0.0)
+    return largest(True, False), largest(False, False), largest(True, True)
+
+
+def _is_real(figure: Figure, change: float, spread: dict[str, float]) -> bool:
+    """Return whether a relative change of a metric exceeds the noise."""
+    return abs(change) > (TIME_NOISE_FACTOR if figure.timed else NOISE_FACTOR) * spread[figure.key]
 
 
 def _head_cells(effect: Effect) -> list[str]:
@@ -203,7 +240,7 @@ def _number(value: float | int | None) -> str:
     return "–" if value is None else str(value) if isinstance(value, int) else f"{value:.4g}"
 
 
-def _cell(figure: Figure, effect: Effect, spread: float) -> str:
+def _cell(figure: Figure, effect: Effect, spread: dict[str, float]) -> str:
     shown = []
     for change in effect.changes:
         if figure.key not in change:
@@ -211,6 +248,6 @@ def _cell(figure: Figure, effect: Effect, spread: float) -> str:
             continue
         text = f"{100.0 * change[figure.key]:+.1f}"
         text = "0" if text in ("+0.0", "-0.0") else text
-        real = abs(change[figure.key]) > NOISE_FACTOR * spread and text != "0"
+        real = text != "0" and _is_real(figure, change[figure.key], spread)
         shown.append(f"**{text}**" if real else text)
     return " / ".join(shown)

@@ -144,14 +144,24 @@ def test_the_table_has_a_row_for_each_parameter_largest_effect_first(tmp_path):
     assert json.loads(json.dumps(result, allow_nan=False)) == result
 
 
-def test_timed_figures_are_compared_with_the_median(tmp_path):
-    rows = [
-        {"parameter": DEFAULTS, "seed": seed, "figures": {"error_m": error_m, "cpu_s": cpu_s}}
-        for seed, error_m, cpu_s in ((0, 1.0, 4.0), (1, 1.1, 2.0), (2, 1.2, 2.1))
-    ]
+def test_times_are_compared_with_all_runs_that_the_parameter_did_not_affect():
     figures = (Figure("error_m", "error"), Figure("cpu_s", "CPU", quality=False, timed=True))
     part = Part(ToySettings(), figures, 1.0, TOY.open, "3 seeds")
-    assert as_json(part, [], rows, SETUP)["default"] == {"error_m": 1.0, "cpu_s": 2.1}
+    parameters = [p for p in parameters_of(part.settings) if p.name in ("cells", "unused_s")]
+    runs = [
+        (DEFAULTS, 1.0, 0, 1.00, 2.0), (DEFAULTS, 1.0, 1, 1.01, 2.2), (DEFAULTS, 1.0, 2, 1.02, 2.1),
+        ("unused_s", 0.7, 0, 1.00, 1.9), ("unused_s", 1.3, 0, 1.00, 1.8),
+        ("cells", 0.7, 0, 1.50, 2.2), ("cells", 1.3, 0, 0.90, 4.0),
+    ]  # fmt: skip
+    rows = [
+        {"parameter": name, "value": 1, "scale": scale, "seed": seed,
+         "figures": {"error_m": error_m, "cpu_s": cpu_s}}
+        for name, scale, seed, error_m, cpu_s in runs
+    ]  # fmt: skip
+    assert as_json(part, parameters, rows, SETUP)["default"] == {"error_m": 1.0, "cpu_s": 2.0}
+    text = markdown(part, parameters, rows, "the command", "today")
+    assert "**+50.0** / **-10.0** | +10.0 / **+100.0** |" in text
+    assert "| 0 / 0 | -5.0 / -10.0 |" in text
 
 
 def test_parts_are_written_between_their_marks(tmp_path):
