@@ -94,7 +94,8 @@ class GaussianArrays:
             team: threads that run the kernel.
             gradients: result of `Rasterizer.backward`.
             rates: learning rate of each parameter row, float32 [PARAMS] (see `learning_rates`).
-            isotropy, ratio_log: see `adam`.
+            isotropy: weight of the isotropic regularisation, see `adam`.
+            ratio_log: logarithm of the axis ratio above which it acts, see `adam`.
         """
         team.run(
             adam, gradients.by_splat, gradients.index, self.params, self.first, self.second, self.steps,
