@@ -132,7 +132,8 @@ class SessionFolder:
         self._lock = file
         for folder in (self.edge, self.keyframes):
             for leftover in folder.glob(".*"):
-                leftover.unlink()
+                if leftover.is_file():
+                    leftover.unlink()
 
     def unlock(self) -> None:
         """Release the write lock; remove a session that was created here and has remained empty."""
@@ -170,8 +171,8 @@ class SessionFolder:
         Raises:
             OSError: the disk is full or broken; the old state is still valid.
         """
-        numbers = [int(p.stem.rpartition("-")[2]) for p in self.edge.glob("state-*.npz")]
-        name = f"state-{1 + max(numbers, default=0)}.npz"
+        before = numbered_files(self.edge, "state-", ".npz")
+        name = f"state-{1 + max(before, default=0)}.npz"
         try:
             with (self.edge / name).open("xb") as file:
                 np.savez(file, **arrays)  # type: ignore[arg-type]  # the stubs pass ** to allow_pickle
@@ -184,9 +185,8 @@ class SessionFolder:
         except OSError:
             (self.edge / name).unlink(missing_ok=True)
             raise
-        for old in self.edge.glob("state-*.npz"):
-            if old.name != name:
-                old.unlink(missing_ok=True)
+        for old in before.values():
+            old.unlink(missing_ok=True)
 
     def manifest(self) -> dict[str, Any] | None:
         """Return the contents of `edge.json`; None before the first checkpoint.
@@ -253,7 +253,7 @@ class SessionFolder:
 
     def keyframe_ids(self) -> list[int]:
         """Return the ids of the keyframes on disk, ascending."""
-        return sorted(int(p.stem) for p in self.keyframes.glob("*.kf") if p.stem.isdecimal())
+        return sorted(numbered_files(self.keyframes, "", ".kf"))
 
     def read_keyframe(self, id: int) -> tuple[str, bytes]:
         """Return (schema, payload) of a keyframe.
@@ -287,12 +287,29 @@ class SessionFolder:
 
     def block_numbers(self) -> list[int]:
         """Return the numbers of the blocks on disk, ascending."""
-        return sorted(int(p.stem) for p in self.blocks.glob("*.block") if p.stem.isdecimal())
+        return sorted(numbered_files(self.blocks, "", ".block"))
 
     def remove_blocks(self, numbers: Iterable[int]) -> None:
         """Delete block files."""
         for number in numbers:
             block_file(self.blocks, number).unlink(missing_ok=True)
+
+
+def numbered_files(folder: Path, prefix: str, suffix: str) -> dict[int, Path]:
+    """Return the files `<prefix><number><suffix>` of a folder by number (an int64 >= 0).
+
+    All other files are left alone: copies made by hand (`state-old.npz`), numbers in another form (`007.kf`),
+    folders.
+    """
+    out = {}
+    for path in folder.glob(f"{prefix}*{suffix}"):
+        digits = path.name.removeprefix(prefix).removesuffix(suffix)
+        if not (digits.isascii() and digits.isdecimal() and path.is_file()):
+            continue
+        number = int(digits)
+        if str(number) == digits and number < 2**63:
+            out[number] = path
+    return out
 
 
 def packed_arrays(arrays: Arrays) -> bytes:

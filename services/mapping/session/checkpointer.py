@@ -19,7 +19,8 @@ from beamsplat.services.mapping.session.state import arrays_of, extras_of, resto
 
 log = logging.getLogger("beamsplat.mapping")
 
-KeyframeDecoder = Callable[[str, bytes], RgbdKeyframe]  # (schema, payload) -> keyframe; raises ValueError
+# (id, schema, payload) -> keyframe; raises ValueError
+KeyframeDecoder = Callable[[int, str, bytes], RgbdKeyframe]
 
 
 @dataclass(frozen=True)
@@ -87,7 +88,7 @@ class Checkpointer:
         return extra, [id for id in self.folder.keyframe_ids() if id not in known]
 
     def _decode(self, id: int) -> RgbdKeyframe:
-        return self._decoder(*self.folder.read_keyframe(id))
+        return self._decoder(id, *self.folder.read_keyframe(id))
 
     # --- paging ---
 

@@ -65,14 +65,12 @@ class Inbox:
         """Return whether there are skipped keyframes."""
         return bool(self._skipped)
 
-    def pop_skipped(self) -> tuple[str, bytes] | None:
-        """Remove and return (schema, payload) of the oldest readable skipped keyframe; None without any."""
-        while self._skipped:
-            self._read = self._skipped.popleft()
-            body = self._checkpointer.read_keyframe(self._read)
-            if body is not None:
-                return body
-        return None
+    def pop_skipped(self) -> int | None:
+        """Remove and return the id of the oldest skipped keyframe; None without any."""
+        if not self._skipped:
+            return None
+        self._read = self._skipped.popleft()
+        return self._read
 
     def skip_waiting(self) -> None:
         """Mark all waiting keyframes as skipped: after the end of the stream, the mailbox is empty."""

@@ -8,6 +8,7 @@ from typing import Protocol
 
 import numpy as np
 
+from beamsplat.common.errors import UserError
 from beamsplat.common.messages import Keyframe
 from beamsplat.common.messages.codec import decode
 from beamsplat.services.mapping.config import MappingConfig
@@ -163,16 +164,15 @@ class LiveSession:
         c, m = self._checkpointer, self._mapper
         undistorter = self._intake.undistorter
         extra, newer = c.resume(
-            m, lambda schema, body: decode_keyframe(_decode_message(schema, body), undistorter)
+            m, lambda id, schema, body: decode_keyframe(_decode_message(id, schema, body), undistorter)
         )
         self._intake.restore(extra)
         if resume_known:
             self._resumed = set(newer)
         for id in newer:
-            body = c.read_keyframe(id)
-            if body is None:
+            message = self._read_message(id)
+            if message is None:
                 continue
-            message = _decode_message(*body)
             c.start_period(message.stamp_ns)  # a process that is killed repeatedly still reaches a checkpoint
             outcome = self._intake.insert(message, self.load_visible)
             if outcome.ok:
@@ -208,8 +208,8 @@ class LiveSession:
         self._checkpointer.remove_keyframe(id)
 
     def skipped(self) -> Iterator[Keyframe]:
-        if (body := self._inbox.pop_skipped()) is not None:
-            yield _decode_message(*body)
+        if (id := self._inbox.pop_skipped()) is not None and (message := self._read_message(id)) is not None:
+            yield message
 
     def end_of_input(self) -> None:
         self._inbox.skip_waiting()
@@ -254,8 +254,28 @@ class LiveSession:
     def close(self) -> None:
         self._checkpointer.close()
 
+    def _read_message(self, id: int) -> Keyframe | None:
+        """Return a keyframe on disk; None, with a warning, if its file does not contain it."""
+        body = self._checkpointer.read_keyframe(id)
+        try:
+            return None if body is None else _decode_message(id, *body)
+        except ValueError as error:
+            log.warning("keyframe skipped: %s", error)
+            return None
 
-def _decode_message(schema: str, body: bytes) -> Keyframe:
-    message = decode(schema, body)
-    assert isinstance(message, Keyframe)  # sessions store keyframes only
+
+def _decode_message(id: int, schema: str, body: bytes) -> Keyframe:
+    """Return the keyframe `id` in the content of its file.
+
+    Raises:
+        UserError: the content is damaged, another message, or another keyframe.
+    """
+    try:
+        message = decode(schema, body)
+    except ValueError as error:
+        raise UserError(f"{id}.kf: {error}") from error
+    if not isinstance(message, Keyframe):
+        raise UserError(f"{id}.kf: contains a {schema}, not a keyframe")
+    if message.id != id:
+        raise UserError(f"{id}.kf: contains keyframe {message.id}")
     return message
