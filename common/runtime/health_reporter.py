@@ -50,6 +50,6 @@ class HealthReporter:
                 epoch=self._bus.producer.epoch, state=r.state, inputs=inputs, outputs=outputs,
                 step_p50_ms=float(np.percentile(steps, 50)), step_p95_ms=float(np.percentile(steps, 95)),
                 rss_mb=self._process.memory_info().rss / 1e6, cpu_percent=self._process.cpu_percent(),
-                detail=(r.detail or r.node.detail)[:_DETAIL_CHARS], pid=self._process.pid,
+                detail=r.detail_text()[:_DETAIL_CHARS], pid=self._process.pid,
             )
         )  # fmt: skip

@@ -11,13 +11,14 @@ import math
 import signal
 import time
 from collections import deque
+from collections.abc import Iterator
 from functools import partial
 
 import zenoh
 
 from beamsplat.common.errors import UserError
 from beamsplat.common.files.persist import ReplayPosition, claim_epoch
-from beamsplat.common.messages import Health
+from beamsplat.common.messages import Health, Message
 from beamsplat.common.runtime.control import HandoverControl
 from beamsplat.common.runtime.handover import CONTROL
 from beamsplat.common.runtime.health_reporter import HealthReporter
@@ -29,6 +30,7 @@ from beamsplat.common.runtime.pacing import Playback, wait_for_nodes
 from beamsplat.common.runtime.rate_limited_log import RateLimitedLog
 from beamsplat.common.runtime.running_node import POLL_S, RunningNode
 from beamsplat.common.security.logins import login_of
+from beamsplat.common.topics import HEALTH
 from beamsplat.common.zenoh.bus import Bus, open_session
 from beamsplat.common.zenoh.queries import ask, reply
 
@@ -104,7 +106,7 @@ class Live:
                 r.mailbox.end(entry.topic, NO_PRODUCER, 0)
             bus.subscribe(entry, r.receive, self._on_undecodable, r.receive_end)
         if r.node.watches_health():
-            bus.watch_health(self._on_health)
+            bus.watch_health(self._on_health, self._on_undecodable)
         bus.answer_queries(self._on_query)
         if not r.handover.standby:
             bus.announce(r.node.queries())
@@ -213,7 +215,10 @@ class Live:
         def on_waiting(missing: list[str]) -> None:
             r.detail = f"waiting for {', '.join(missing)}"
 
-        wait_for_nodes(bus.alive_nodes, r.settings, lambda: self._stopping, on_waiting)
+        def settled() -> set[str]:
+            return bus.alive_nodes() | bus.failed_nodes()
+
+        wait_for_nodes(settled, r.settings, lambda: self._stopping, on_waiting)
         if r.settings.wait_for:
             bus.wait_for_subscribers(tuple(r.publications), _MATCHING_S)
         r.detail = ""
@@ -225,19 +230,27 @@ class Live:
             node.on_health(self._healths.popleft())
         while self._queries:
             name, query = self._queries.popleft()
-            # The stubs miss that Parameters iterates over (key, value).
-            parameters: dict[str, str] = dict(query.parameters)  # type: ignore[call-overload]
-            if name.startswith(CONTROL):
-                reply(query, self._control.answer(name.removeprefix(CONTROL + "/"), parameters))
-                continue
-            reply(query, getattr(node, f"on_query_{name}")(parameters))
+            if fault := reply(query, self._answers(name, query)):
+                self.running.count_query_fault(name, fault)
+
+    def _answers(self, name: str, query: zenoh.Query) -> Iterator[Message]:
+        """Yield the answers to a query; its exceptions are raised while iterating, where `reply` sends them."""
+        # The stubs miss that Parameters iterates over (key, value).
+        parameters: dict[str, str] = dict(query.parameters)  # type: ignore[call-overload]
+        if name.startswith(CONTROL):
+            yield from self._control.answer(name.removeprefix(CONTROL + "/"), parameters)
+        else:
+            yield from getattr(self.running.node, f"on_query_{name}")(parameters)
 
     # --- called from threads of the bus ---
 
     def _on_undecodable(self, topic: str, reason: str) -> None:
         r = self.running
         with r.changed:
-            r.mailbox.counts[topic].undecodable += 1
+            if topic == HEALTH:
+                r.undecodable_reports += 1
+            else:
+                r.mailbox.counts[topic].undecodable += 1
             count = self._undecodable_limit.due(topic)
         if count is not None:
             log.warning("dropped a message on %s (%d more since the last report): %s", topic, count, reason)

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from concurrent.futures import Future
 from typing import Any
 
-from beamsplat.common.messages.header import local_clock_id
+from beamsplat.common.messages.header import Header, local_clock_id
 from beamsplat.common.messages.robot import NodeState
 from beamsplat.common.runtime.handover import Handover
 from beamsplat.common.runtime.jobs import JobQueue
@@ -20,6 +20,7 @@ from beamsplat.common.runtime.node import Job, Node, Output
 from beamsplat.common.zenoh.streams import Publication
 
 POLL_S = 0.2  # longest wait for a message before signals are checked
+_FAULT_CHARS = 200
 _END_TIMEOUT_S = 5.0  # an end-of-stream marker waits this long for messages still in transit
 
 
@@ -42,9 +43,11 @@ class RunningNode:
         self.changed = threading.Condition()
         self.state: NodeState = "configure"
         self.detail = ""
+        self._query_faults, self._last_query_fault = 0, ""
         self.steps_ms: deque[float] = deque(maxlen=512)
         self.publications: dict[str, Publication] = {}
         self.jobs: JobQueue[Future]  # set by the runner, before the node is configured
+        self.undecodable_reports = 0  # health reports of other nodes
         self._ends: list[tuple[str, str, int, int, float]] = []
         self._clock_id = local_clock_id()
 
@@ -62,10 +65,11 @@ class RunningNode:
             if self.mailbox.put(envelope):
                 self.changed.notify()
 
-    def receive_end(self, topic: str, instance: str, epoch: int, sent: int) -> None:
-        """Record that the producer `instance` of `topic` has ended after publishing `sent` messages."""
+    def receive_end(self, topic: str, header: Header, sent: int) -> None:
+        """Record that the producer of `topic` in `header` has ended after publishing `sent` messages."""
         with self.changed:
-            self._ends.append((topic, instance, epoch, sent, time.monotonic() + _END_TIMEOUT_S))
+            deadline = time.monotonic() + _END_TIMEOUT_S
+            self._ends.append((topic, header.instance, header.epoch, sent, deadline))
             self.changed.notify()
 
     def wake(self) -> None:
@@ -74,6 +78,19 @@ class RunningNode:
             self.changed.notify()
 
     # --- called from the node's thread ---
+
+    def count_query_fault(self, query: str, fault: str) -> None:
+        """Count a query that ended with an exception of the node; `fault` names the exception."""
+        self._query_faults, self._last_query_fault = self._query_faults + 1, f"{query}: {fault}"
+
+    def detail_text(self) -> str:
+        """Return the line of detail for the node's health: of the runner, else of the node; failed queries."""
+        detail = self.detail or self.node.detail
+        if not self._query_faults:
+            return detail
+        noun = "query" if self._query_faults == 1 else "queries"
+        failed = f"{self._query_faults} {noun} failed (last: {self._last_query_fault[:_FAULT_CHARS]})"
+        return f"{detail}; {failed}" if detail else failed
 
     def next_envelope(self) -> Envelope | None:
         """Return the next message for the node, or None after waiting `POLL_S` seconds without one."""

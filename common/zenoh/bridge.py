@@ -19,6 +19,7 @@ from beamsplat.common.messages import Health
 from beamsplat.common.runtime.pacing import TokenBucket
 from beamsplat.common.topics import HEALTH, TOPICS, Topic
 from beamsplat.common.zenoh.bus import key
+from beamsplat.common.zenoh.receiving import receive_in_thread
 from beamsplat.common.zenoh.streams import FIFO_MESSAGES, declare_publication, declare_subscription
 
 log = logging.getLogger(__name__)
@@ -140,24 +141,18 @@ class Bridge:
         replaced = self._bulk_replaced if row.uplink == "bulk" else threading.Event()
         count = self.forwarded.setdefault(count_as, ForwardedTraffic()) if count_as else ForwardedTraffic()
 
-        def work() -> None:
-            while True:
-                try:
-                    sample = subscriber.recv()
-                except zenoh.ZError:  # the session was closed
-                    return
-                if replaced.is_set():  # the subscriber is undeclared when this thread returns
-                    return
-                try:
-                    send(sample)
-                except zenoh.ZError as error:  # the connection broke, or the session was closed
-                    self.interrupted += 1
-                    log.info("a message on %s was not forwarded: %s", topic_key, error)
-                    continue
-                count.messages += 1
-                count.bytes += len(sample.payload)
+        def forward(sample: zenoh.Sample) -> None:
+            try:
+                send(sample)
+            except zenoh.ZError as error:  # the connection broke, or the session was closed
+                self.interrupted += 1
+                log.info("a message on %s was not forwarded: %s", topic_key, error)
+                return
+            count.messages += 1
+            count.bytes += len(sample.payload)
 
-        threading.Thread(target=work, name=f"forward-{topic_key}", daemon=True).start()
+        # The subscriber is undeclared when its thread has ended.
+        receive_in_thread(source, f"forward-{topic_key}", subscriber, forward, replaced.is_set)
 
 
 def _put(publisher: zenoh.Publisher | zenoh.ext.AdvancedPublisher, sample: zenoh.Sample) -> None:

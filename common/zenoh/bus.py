@@ -6,6 +6,7 @@ All keys of a robot start with `beamsplat/<robot>/`:
     health/<node>                 health report, once a second
     end/<topic>                   end-of-stream marker of the producer (latched)
     alive/<node>/<instance>       liveliness token of an active node
+    failed/<node>/<instance>      liveliness token of a node that cannot run, declared by its supervisor
     query/<node>/<name>           queries to a node
     control/<instance>/<verb>     hand-over requests to one process (common/runtime/handover.py)
 
@@ -17,7 +18,6 @@ threads of this module, because Zenoh's Python callbacks prevent a process from 
 from __future__ import annotations
 
 import json
-import threading
 import time
 from collections.abc import Callable
 from functools import partial
@@ -36,6 +36,7 @@ from beamsplat.common.security.access_control import access_control, read_hosts
 from beamsplat.common.security.keys import NO_SECURITY, HostKeys, SecurityConfig, check_endpoint, is_secure
 from beamsplat.common.security.logins import Login, require_logins
 from beamsplat.common.topics import HEALTH, LIMIT_KB, Topic, topic
+from beamsplat.common.zenoh.receiving import receive_in_thread
 from beamsplat.common.zenoh.streams import Producer, Publication, Subscription, decode_sample
 
 ROOT = "beamsplat"
@@ -187,6 +188,22 @@ def _short(error: zenoh.ZError) -> str:
     return str(error).split(" at ")[0][:120]
 
 
+def _end_marker(sample: zenoh.Sample) -> tuple[Header, int]:
+    """Return header and content (number of sent messages) of an end-of-stream marker.
+
+    Raises:
+        DecodeError: no valid header, or the content is not a number of messages.
+    """
+    header = Header.unpack(sample.attachment.to_bytes() if sample.attachment else b"")
+    try:
+        sent = msgpack.unpackb(sample.payload.to_bytes(), max_array_len=0, max_map_len=0)
+    except (ValueError, msgpack.UnpackException) as error:
+        raise DecodeError(str(error)) from error
+    if type(sent) is not int or sent < 0:
+        raise DecodeError(f"{str(sent)[:40]!r} is not a number of messages")
+    return header, sent
+
+
 def _verb_of(query: zenoh.Query) -> str:
     return str(query.key_expr).rpartition("/")[2]
 
@@ -221,15 +238,15 @@ class Bus:
         entry: Input,
         on_envelope: Callable[[Envelope], None],
         on_undecodable: Callable[[str, str], None],
-        on_end: Callable[[str, str, int, int], None],
+        on_end: Callable[[str, Header, int], None],
     ) -> None:
         """Declare a subscription to the input `entry`; the callbacks are called from threads of the bus.
 
         Args:
             on_envelope: called with each decoded message.
             on_undecodable: called with (topic, reason) for each message that could not be decoded.
-            on_end: called with (topic, instance, epoch, sent) when a producer has published its
-                end-of-stream marker; `sent` is the number of messages that it has published.
+            on_end: called with (topic, header, sent) when a producer has published its end-of-stream
+                marker; `sent` is the number of messages that it has published.
         """
         delivery = entry.effective_delivery
         self._declared.append(
@@ -246,22 +263,15 @@ class Bus:
         )
         self._declared.append(subscriber)
 
-        def receive() -> None:
-            while True:
-                try:
-                    sample = subscriber.recv()
-                except zenoh.ZError:
-                    return
-                try:
-                    header = Header.unpack(sample.attachment.to_bytes() if sample.attachment else b"")
-                    sent = msgpack.unpackb(sample.payload.to_bytes())
-                except (DecodeError, ValueError, msgpack.UnpackException) as error:
-                    on_undecodable(entry.topic, f"end marker: {error}")
-                    continue
-                if isinstance(sent, int):
-                    on_end(entry.topic, header.instance, header.epoch, sent)
+        def handle(sample: zenoh.Sample) -> None:
+            try:
+                header, sent = _end_marker(sample)
+            except DecodeError as error:
+                on_undecodable(entry.topic, f"end marker: {error}")
+            else:
+                on_end(entry.topic, header, sent)
 
-        threading.Thread(target=receive, name=f"end-{entry.topic}", daemon=True).start()
+        receive_in_thread(self.session, f"end-{entry.topic}", subscriber, handle)
 
     def end(self, publication: Publication) -> None:
         """Publish the end-of-stream marker of `publication`, with the number of messages published on it."""
@@ -300,39 +310,31 @@ class Bus:
     def _answer(self, key_expr: str, on_query: Callable[[zenoh.Query], None]) -> None:
         queryable = self.session.declare_queryable(key_expr, zenoh.handlers.FifoChannel(16))
         self._declared.append(queryable)
+        receive_in_thread(self.session, f"query-{key_expr}", queryable, on_query)
 
-        def receive() -> None:
-            while True:
-                try:
-                    query = queryable.recv()
-                except zenoh.ZError:
-                    return
-                on_query(query)
+    def watch_health(
+        self, on_health: Callable[[Health], None], on_undecodable: Callable[[str, str], None]
+    ) -> None:
+        """Call `on_health` with each health report of any node of this robot, from a thread of the bus.
 
-        threading.Thread(target=receive, name=f"query-{key_expr}", daemon=True).start()
-
-    def watch_health(self, on_health: Callable[[Health], None]) -> None:
-        """Call `on_health` with each health report of any node of this robot, from a thread of the bus."""
+        `on_undecodable` is called with ("health", reason) for each report that could not be decoded.
+        """
         subscriber = self.session.declare_subscriber(
             key(self.robot, HEALTH, "*"), zenoh.handlers.FifoChannel(256)
         )
         self._declared.append(subscriber)
         row = Topic(HEALTH, Health, (), 1, "latest")
 
-        def receive() -> None:
-            while True:
-                try:
-                    sample = subscriber.recv()
-                except zenoh.ZError:
-                    return
-                try:
-                    health = decode_sample(sample, row).message
-                except DecodeError:  # a node of another software version
-                    continue
-                assert isinstance(health, Health)  # the row's message type
-                on_health(health)
+        def handle(sample: zenoh.Sample) -> None:
+            try:
+                health = decode_sample(sample, row).message
+            except DecodeError as error:
+                on_undecodable(HEALTH, f"{sample.key_expr}: {error}")
+                return
+            assert isinstance(health, Health)  # the row's message type
+            on_health(health)
 
-        threading.Thread(target=receive, name="watch-health", daemon=True).start()
+        receive_in_thread(self.session, "watch-health", subscriber, handle)
 
     def publish_health(self, health: Health) -> None:
         """Publish a health report of this node."""
@@ -357,5 +359,12 @@ class Bus:
 
     def alive_nodes(self) -> set[str]:
         """Return the names of the active nodes of this robot."""
-        replies = self.session.liveliness().get(key(self.robot, "alive", "*", "*"), timeout=2.0)
+        return self._nodes_with_token("alive")
+
+    def failed_nodes(self) -> set[str]:
+        """Return the names of the nodes of this robot that cannot run, as their supervisors declare."""
+        return self._nodes_with_token("failed")
+
+    def _nodes_with_token(self, kind: str) -> set[str]:
+        replies = self.session.liveliness().get(key(self.robot, kind, "*", "*"), timeout=2.0)
         return {str(r.ok.key_expr).split("/")[3] for r in replies if r.ok is not None}

@@ -15,6 +15,7 @@ from beamsplat.common.messages.codec import MEDIA_TYPE, decode, encode, schema_o
 from beamsplat.common.messages.header import DecodeError, Header
 from beamsplat.common.runtime.mailbox import Envelope
 from beamsplat.common.topics import Topic
+from beamsplat.common.zenoh.receiving import receive_in_thread
 
 FIFO_MESSAGES = 256  # queue between Zenoh and the receiving thread, for an `every` input without a cache
 ENCODING = zenoh.Encoding(MEDIA_TYPE)
@@ -132,21 +133,15 @@ class Subscription:
         else:
             channel = zenoh.handlers.RingChannel(1)
         self._subscriber = declare_subscription(session, key_expr, row, delivery, channel)
-        self._thread = threading.Thread(target=self._receive, name=f"sub-{row.name}", daemon=True)
-        self._thread.start()
+        receive_in_thread(session, f"sub-{row.name}", self._subscriber, self._handle)
 
-    def _receive(self) -> None:
-        while True:
-            try:
-                sample = self._subscriber.recv()
-            except zenoh.ZError:  # the session was closed
-                return
-            try:
-                envelope = decode_sample(sample, self.row)
-            except DecodeError as error:
-                self._on_undecodable(self.row.name, str(error))
-            else:
-                self._on_envelope(envelope)
+    def _handle(self, sample: zenoh.Sample) -> None:
+        try:
+            envelope = decode_sample(sample, self.row)
+        except DecodeError as error:
+            self._on_undecodable(self.row.name, str(error))
+        else:
+            self._on_envelope(envelope)
 
 
 def decode_sample(sample: zenoh.Sample, row: Topic) -> Envelope:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import queue
-import threading
 import time
 from collections.abc import Iterator
 
@@ -16,6 +15,7 @@ from beamsplat.common.recording.ros_types import typestore
 from beamsplat.common.runtime.clock import StampClock
 from beamsplat.common.runtime.node import Node, SourceItem
 from beamsplat.common.zenoh.bus import open_session
+from beamsplat.common.zenoh.receiving import receive_in_thread
 from beamsplat.common.zenoh.rmw import LIVELINESS_PREFIX, RmwAttachment, RmwEntity, RmwKey, RmwQos, dds_type
 from beamsplat.services.ros2.config import Ros2Config
 from beamsplat.services.ros2.robot import RosRobot, RosRobotOptions
@@ -184,18 +184,13 @@ class Ros2Node(Node):
         """
         self._declarations.append(subscriber)
 
-        def run() -> None:
-            while True:
-                try:
-                    sample = subscriber.recv()
-                except zenoh.ZError:
-                    return
-                if key in self._unused_keys:
-                    subscriber.undeclare()
-                    return
-                self._enqueue(sample)
+        def is_unused() -> bool:
+            if key not in self._unused_keys:
+                return False
+            subscriber.undeclare()
+            return True
 
-        threading.Thread(target=run, name="ros2-in", daemon=True).start()
+        receive_in_thread(self._session, "ros2-in", subscriber, self._enqueue, is_unused)
 
     def _enqueue(self, sample: zenoh.Sample) -> None:
         """Queue a message; if the queue is full, drop the oldest message and count it."""

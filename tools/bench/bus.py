@@ -23,9 +23,11 @@ import zenoh
 
 from beamsplat.common.config.deployment import Deployment, RouterConfig
 from beamsplat.common.messages import Image, WheelOdometry
+from beamsplat.common.messages.header import Header
 from beamsplat.common.runtime.mailbox import Envelope, Mailbox
 from beamsplat.common.runtime.node import Node, Outputs, subscriptions
 from beamsplat.common.zenoh.bus import Bus, open_session
+from beamsplat.common.zenoh.receiving import receive_in_thread
 from beamsplat.tools.system.supervisor import Supervisor
 
 ROBOT = "bench"
@@ -177,17 +179,12 @@ def _latency(endpoint: str, seconds: float, image_bytes: int) -> dict[str, float
         )
         subscriber = bus.session.declare_subscriber(PLAIN_KEY, zenoh.handlers.RingChannel(1))
 
-        def receive() -> None:
-            while True:
-                try:
-                    sample = subscriber.recv()
-                except zenoh.ZError:
-                    return
-                sample.payload.to_bytes()
-                assert sample.attachment is not None  # sent with each sample
-                plain.add_since(struct.unpack("<q", sample.attachment.to_bytes())[0])
+        def handle(sample: zenoh.Sample) -> None:
+            sample.payload.to_bytes()
+            assert sample.attachment is not None  # sent with each sample
+            plain.add_since(struct.unpack("<q", sample.attachment.to_bytes())[0])
 
-        threading.Thread(target=receive, daemon=True).start()
+        receive_in_thread(bus.session, "plain", subscriber, handle)
         return lambda: time.sleep(seconds)
 
     _with_publisher(endpoint, image_bytes, True, 60.0, body)
@@ -254,5 +251,5 @@ def _broken(topic: str, reason: str) -> None:
     raise RuntimeError(f"{topic}: {reason}")
 
 
-def _end(topic: str, instance: str, epoch: int, sent: int) -> None:
+def _end(topic: str, header: Header, sent: int) -> None:
     return

@@ -18,6 +18,7 @@ from beamsplat.common.messages.header import DecodeError
 from beamsplat.common.runtime.health import HealthRecords, NodeRecord, TopicConsumer, TopicTraffic
 from beamsplat.common.topics import HEALTH, Topic
 from beamsplat.common.zenoh.bus import key
+from beamsplat.common.zenoh.receiving import receive_in_thread
 from beamsplat.common.zenoh.streams import decode_sample
 
 ALL = "*"
@@ -37,33 +38,38 @@ class HealthTable:
         self._book = HealthRecords()
         self.records: dict[str, NodeRecord] = self._book.records
         self._lock = threading.Lock()
+        self._undecodable, self._last_fault = 0, ""  # reports that could not be decoded
         self._row = Topic(HEALTH, Health, (), 1, "latest")
         self._subscriber = session.declare_subscriber(
             key(robot, HEALTH, "*"), zenoh.handlers.FifoChannel(256)
         )
-        threading.Thread(target=self._receive, name="health-board", daemon=True).start()
+        receive_in_thread(session, "health-board", self._subscriber, self._receive)
 
-    def _receive(self) -> None:
-        while True:
-            try:
-                sample = self._subscriber.recv()
-            except zenoh.ZError:
-                return
-            try:
-                health = decode_sample(sample, self._row).message
-            except DecodeError:  # a health message of an incompatible version
-                continue
-            assert isinstance(health, Health)  # the row's message type
-            if self._all:
-                whose = str(sample.key_expr).split("/")[1]
-                health = health.model_copy(update={"node": f"{whose}/{health.node}"})
+    def _receive(self, sample: zenoh.Sample) -> None:
+        try:
+            health = decode_sample(sample, self._row).message
+        except DecodeError as error:
             with self._lock:
-                self._book.add(health, self._clock_s())
+                self._undecodable, self._last_fault = self._undecodable + 1, f"{sample.key_expr}: {error}"
+            return
+        assert isinstance(health, Health)  # the row's message type
+        if self._all:
+            whose = str(sample.key_expr).split("/")[1]
+            health = health.model_copy(update={"node": f"{whose}/{health.node}"})
+        with self._lock:
+            self._book.add(health, self._clock_s())
 
     def states(self) -> dict[str, str]:
         """Return the state of each node by name; "silent" if its last health message is too old."""
         with self._lock:
             return self._book.states(self._clock_s())
+
+    def reported(self) -> dict[str, tuple[str, str]]:
+        """Return (instance, state) of each node by name, from its newest health message; silent nodes left out."""
+        now = self._clock_s()
+        with self._lock:
+            records = self.records.items()
+            return {n: (r.health.instance, r.health.state) for n, r in records if not r.silent_s(now)}
 
     def snapshot(self) -> dict[str, Any]:
         """Return the health of all nodes and the traffic of all topics for JSON; keys end with the unit."""
@@ -83,7 +89,8 @@ class HealthTable:
                 state = f"silent {silent_s:.0f} s" if silent_s else record.health.state
                 rate = totals.out_hz if record.health.outputs else totals.in_hz
                 lost = f", {totals.lost} lost" if totals.lost else ""
-                parts.append(f"{name} {state} {rate:.1f} Hz{lost}")
+                why = f": {record.health.detail}" if state == "failed" else f" {rate:.1f} Hz{lost}"
+                parts.append(f"{name} {state}{why}")
         return "; ".join(parts) or "no node reports yet"
 
     def nodes_table(self) -> RenderableType:
@@ -118,7 +125,11 @@ class HealthTable:
                 pid = () if self._all else (str(record.health.pid or ""),)
                 table.add_row(name_cell, *pid, *cells)
                 if record.health.detail:
-                    said.append(Text(f"{name}: {record.health.detail}", style="dim"))
+                    style = "red" if record.health.state == "failed" else "dim"
+                    said.append(Text(f"{name}: {record.health.detail}", style=style))
+            if self._undecodable:
+                text = f"{self._undecodable} health reports could not be decoded: {self._last_fault}"
+                said.append(Text(text, style="red"))
         return Group(table, *said)
 
     def topics_table(self) -> Table:
@@ -164,7 +175,8 @@ def _narrow_table() -> Table:
 
 def _node_row(name: str, record: NodeRecord, now: float) -> tuple[str, ...]:
     health, totals, silent_s = record.health, record.totals(), record.silent_s(now)
-    colour = "red" if silent_s else {"active": "green", "drained": "cyan"}.get(health.state, "yellow")
+    colours = {"active": "green", "drained": "cyan", "failed": "red"}
+    colour = "red" if silent_s else colours.get(health.state, "yellow")
     state = f"silent {silent_s:.0f} s" if silent_s else health.state
     return (
         name,

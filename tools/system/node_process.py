@@ -135,6 +135,7 @@ def child(
         os.dup2(file.fileno(), 2)
     threading.Thread(target=_die_with_parent, name="parent", daemon=True).start()
     start_logging()
+    threading.excepthook = _end_process
     try:
         with missing_packages_explained(name):
             if name == "router":
@@ -152,6 +153,23 @@ def child(
     except UserError as error:
         log.error("%s", error)
         sys.exit(2)
+
+
+def _end_process(failure: threading.ExceptHookArgs) -> None:
+    """Log the exception that has ended a thread, and end this process with exit code 1.
+
+    A process that lacks a thread would stay active and never hear an input again. The node is not closed:
+    its files are as after a crash, and the main thread may hold any lock.
+    """
+    if failure.exc_type is SystemExit or sys.is_finalizing():
+        return
+    name = failure.thread.name if failure.thread else "unknown"
+    log.critical(
+        "an exception has ended the thread %s, and so this process", name,
+        exc_info=(failure.exc_type, failure.exc_value or failure.exc_type(), failure.exc_traceback),
+    )  # fmt: skip
+    logging.shutdown()
+    os._exit(1)
 
 
 def start_logging(level: int = logging.INFO) -> None:

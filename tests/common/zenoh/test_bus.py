@@ -26,7 +26,7 @@ class Received:
             Input(topic_name),
             self.envelopes.append,
             lambda *fault: self.undecodable.append(fault),
-            lambda *end: self.ends.append(end),
+            lambda topic, header, sent: self.ends.append((topic, header.instance, header.epoch, sent)),
         )
 
     def sequences(self):
@@ -158,10 +158,10 @@ def test_a_process_answers_control_requests_at_once_and_queries_once_announced(m
     assert asked[-1] == ("params", {"a": "1"})
 
 
-def test_health_of_every_node_arrives_and_an_undecodable_one_is_ignored(make_bus, robot):
+def test_health_of_every_node_arrives_and_an_undecodable_one_is_reported(make_bus, robot):
     one, two, watcher = make_bus("depth"), make_bus("fusion"), make_bus("page")
-    received = []
-    watcher.watch_health(lambda health: received.append((health.node, health.state)))
+    received, faults = [], []
+    watcher.watch_health(lambda h: received.append((h.node, h.state)), lambda *fault: faults.append(fault))
     for bus, node in ((one, "depth"), (two, "fusion")):
         health = SAMPLES[Health].model_copy(update={"node": node, "state": "active"})
         wait_until(
@@ -171,6 +171,8 @@ def test_health_of_every_node_arrives_and_an_undecodable_one_is_ignored(make_bus
     count = len(received)
     wait_until(lambda: one.publish_health(SAMPLES[Health]) or len(received) > count)
     assert set(received) <= {("depth", "active"), ("fusion", "active")}
+    assert {topic_name for topic_name, _ in faults} == {"health"}
+    assert f"beamsplat/{robot}/health/depth: " in faults[0][1]
 
 
 def test_a_source_waits_until_its_topics_have_subscribers(make_bus):
