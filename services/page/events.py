@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 from dataclasses import dataclass, field
 from typing import Any
@@ -22,9 +23,14 @@ class EventSubscriber:
         self.waiting[kind] = event
         self._wake.set()
 
-    async def next_events(self) -> bytes:
-        """Wait until events are queued; remove all queued events and return their bytes."""
-        await self._wake.wait()
+    async def next_events(self, timeout_s: float) -> bytes:
+        """Wait until events are queued; remove all queued events and return their bytes.
+
+        After the time-out, the result is empty.
+        """
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(timeout_s):
+                await self._wake.wait()
         self._wake.clear()
         events = b"".join(self.waiting.values())
         self.waiting.clear()

@@ -34,8 +34,9 @@ from beamsplat.common.messages import (
     WheelOdometry,
 )
 from beamsplat.common.runtime.node import Input, Node, Outputs, QueryFunction
+from beamsplat.services.page.access import PageAccess, own_host_names
 from beamsplat.services.page.images import EncodedImage, encode_camera_image, encode_depth, encode_grid
-from beamsplat.services.page.server import PageAccess, PageServer
+from beamsplat.services.page.server import PageServer
 from beamsplat.services.page.view import PageState
 
 log = logging.getLogger(__name__)
@@ -107,7 +108,8 @@ class PageNode(Node):
     def configure(self) -> None:
         c = self.config
         self._state = PageState(c.picture_hz, c.map_hz)
-        access = PageAccess(c.token.get_secret_value(), frozenset(name.lower() for name in c.names))
+        names = own_host_names() | {name.lower() for name in c.names}
+        access = PageAccess(c.token.get_secret_value(), names)
         tls = _tls(c.certificate, c.certificate_key)
         self._server = PageServer(self._state, self._command, access, c.robot_hz)
         try:
@@ -157,9 +159,10 @@ class PageNode(Node):
         self._state.health(health)
         if health.node == self.name:
             self._server.check()
-            viewers, rejected = len(self._server.events), self._server.rejected_commands
-            self.detail = f"open {self._address}; {viewers} {'viewer' if viewers == 1 else 'viewers'}" + (
-                f"; {rejected} commands rejected for a wrong token" if rejected else ""
+            viewers = len(self._server.events)
+            refused = "".join(f"; {n} {what}" for what, n in self._server.refused().items() if n)
+            self.detail = (
+                f"open {self._address}; {viewers} {'viewer' if viewers == 1 else 'viewers'}{refused}"
             )
 
     def on_rig(self, rig: Rig) -> Outputs:

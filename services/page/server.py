@@ -9,37 +9,32 @@ POST /command             {"action": "restart", "node": "depth"}, with "Authoriz
                           {"parameters": {OPTION: VALUE}}
 
 Everything is encoded once for all pages. Events that a page has not received yet are replaced by newer ones.
+aiohttp reads the requests; the limits on connections, sizes and times are set here and in `listener`.
 """
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
-import hmac
 import json
-import socket
+import logging
 import ssl
 import threading
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from http import HTTPStatus
 from pathlib import Path
 from typing import Any
 
+from aiohttp import web
+from aiohttp.http_exceptions import HttpProcessingError
+
+from beamsplat.services.page.access import PageAccess
 from beamsplat.services.page.events import EventHub, as_json
-from beamsplat.services.page.http import (
-    MAX_HEAD_BYTES,
-    STREAM_HEAD,
-    HttpError,
-    HttpRequest,
-    is_own_host,
-    make_response,
-    own_host_names,
-    read_request,
-)
+from beamsplat.services.page.listener import MAX_CONNECTIONS, Listener
 from beamsplat.services.page.view import PageState
 
+_http_log = logging.getLogger(f"{__name__}.http")
 _STATIC = Path(__file__).parent / "static"
 _FILES = {
     "/": ("index.html", "text/html; charset=utf-8"),
@@ -48,22 +43,54 @@ _FILES = {
     "/page.css": ("page.css", "text/css; charset=utf-8"),
     "/icon.svg": ("icon.svg", "image/svg+xml"),
 }
-_MAX_CONNECTIONS = 128
-_SEND_BYTES = 64 * 1024
+# No content from other origins, no inline scripts, no embedding in frames, no content sniffing, no caching.
+_HEADERS = {
+    "Content-Security-Policy": "default-src 'self'; frame-ancestors 'none'; base-uri 'none'",
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Cache-Control": "no-store",
+    "Server": "beamsplat",
+}
+_MAX_VIEWERS = MAX_CONNECTIONS // 2  # open event streams: the other connections remain for requests
+_MAX_HEADERS = 64  # of a request, each of at most 8 kB (aiohttp's default)
+_MAX_BODY_BYTES = 16 * 1024
 _MAX_COMMANDS = 4  # at the same time
-_SEND_TIMEOUT_S = 20.0  # a connection that accepts no data for so long is closed
+_IDLE_S = 20.0  # a connection without a complete request is closed
+_TRANSFER_S = 20.0  # a connection whose request body or response takes longer is closed
+_HEARTBEAT_S = (
+    15.0  # after so long without an event, a comment is sent: it shows whether the page still reads
+)
+_HEARTBEAT = b":\n\n"
 _WRONG_TOKEN_DELAY_S = 1.0  # slows down guessing
+_LINGER_S = 2.0  # for the rest of a refused request, so that the client reads the response
+_CLOSE_S = 0.1  # for requests in progress when the server is closed
 _BUSY = (HTTPStatus.SERVICE_UNAVAILABLE, "too many requests at the same time: try again")
 
 Command = Callable[[str, str, dict[str, str]], str]  # (action, node, parameters) -> result text
+Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 
-@dataclass(frozen=True)
-class PageAccess:
-    """Access control of the page: token for commands, accepted host names."""
+class RefusedRequest(Exception):
+    """Error: a request that is answered with an error status and a text."""
 
-    token: str = ""  # for commands; "": commands are disabled
-    names: frozenset[str] = frozenset()  # accepted host names, besides the machine's own
+    def __init__(self, status: HTTPStatus, text: str) -> None:
+        super().__init__(text)
+        self.status = status
+
+
+class _ProtocolErrors(logging.Filter):
+    """Counts requests that are not HTTP, in place of a traceback in the log for each."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.count = 0
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        if record.exc_info and isinstance(record.exc_info[1], HttpProcessingError):
+            self.count += 1
+            return False
+        return True
 
 
 class PageServer:
@@ -73,17 +100,18 @@ class PageServer:
         self._state = state
         self._command = command
         self._access = access
-        self._names = own_host_names() | access.names
         self._robot_hz = robot_hz
         self._files = {path: ((_STATIC / name).read_bytes(), kind) for path, (name, kind) in _FILES.items()}
         self.events = EventHub()
-        self._connections: set[asyncio.Task[None]] = set()
         self._commands = 0
         self._encoder = ThreadPoolExecutor(1, "page-encoder")
         self._command_executor = ThreadPoolExecutor(_MAX_COMMANDS, "page-command")
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._loop.run_forever, name="page", daemon=True)
-        self._server: asyncio.Server | None = None
+        self._runner: web.AppRunner | None = None
+        self._listener: Listener | None = None
+        self._publishing: asyncio.Task[None] | None = None
+        self._protocol_errors = _ProtocolErrors()
         self.rejected_commands = 0  # commands with a wrong token
 
     def start(self, bind: str, port: int, tls: ssl.SSLContext | None) -> int:
@@ -97,14 +125,40 @@ class PageServer:
 
     async def _open(self, bind: str, port: int, tls: ssl.SSLContext | None) -> int:
         self._encode_locks = {name: asyncio.Lock() for name in self._state.images}
-        self._server = await asyncio.start_server(self._serve, bind, port, limit=MAX_HEAD_BYTES, ssl=tls)
+        app = web.Application(middlewares=[self._guard], client_max_size=_MAX_BODY_BYTES)
+        app.router.add_get("/events", self._stream, allow_head=False)
+        app.router.add_get("/status", self._get_status)
+        app.router.add_get("/picture/{name}", self._get_image)
+        app.router.add_post("/command", self._post_command)
+        for path in self._files:
+            app.router.add_get(path, self._get_file)
+        _http_log.setLevel(logging.DEBUG)  # the filter counts what aiohttp logs at this level
+        _http_log.addFilter(self._protocol_errors)
+        runner = web.AppRunner(
+            app, access_log=None, logger=_http_log, keepalive_timeout=_IDLE_S, lingering_time=_LINGER_S,
+            max_headers=_MAX_HEADERS, shutdown_timeout=_CLOSE_S,
+        )  # fmt: skip
+        await runner.setup()
+        assert runner.server is not None  # set by setup()
+        self._runner = runner
+        self._listener = Listener(runner.server, tls)
+        chosen = await self._listener.listen(bind, port)
         self._publishing = asyncio.create_task(self._publish_periodically())
-        return self._server.sockets[0].getsockname()[1]
+        return chosen
 
     def check(self) -> None:
         """Raise the exception that ended the event task, if any; without it, the page is outdated."""
-        if self._publishing.done() and not self._publishing.cancelled():
+        if self._publishing is not None and self._publishing.done() and not self._publishing.cancelled():
             self._publishing.result()
+
+    def refused(self) -> dict[str, int]:
+        """Return how many requests and connections were refused since the start, by reason."""
+        replaced = 0 if self._listener is None else self._listener.replaced
+        return {
+            "commands rejected for a wrong token": self.rejected_commands,
+            "requests were not HTTP": self._protocol_errors.count,
+            "connections closed because too many were open": replaced,
+        }
 
     def close(self) -> None:
         """Close all connections and end the thread."""
@@ -116,13 +170,13 @@ class PageServer:
         self._command_executor.shutdown(wait=False, cancel_futures=True)
 
     async def _close_all(self) -> None:
-        if self._server is None:  # start() failed
-            return
-        self._server.close()
-        ending = {self._publishing, *self._connections}
-        for task in ending:
-            task.cancel()
-        await asyncio.gather(*ending, return_exceptions=True)
+        if self._listener is not None:
+            await self._listener.close()
+        if self._runner is not None:
+            await self._runner.cleanup()
+            _http_log.removeFilter(self._protocol_errors)
+        if self._publishing is not None:
+            self._publishing.cancel()
 
     # --- events to all pages ---
 
@@ -166,124 +220,137 @@ class PageServer:
         if (facts := self._state.images[name].metadata()) is not None:
             self.events.publish(f"picture/{name}", {"name": name, **facts})
 
-    # --- one connection ---
+    # --- requests ---
 
-    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        task = asyncio.current_task()
-        assert task is not None  # asyncio calls this in a task
-        self._connections.add(task)
-        # A small socket buffer keeps events in our queue, where newer ones can replace them.
-        writer.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BYTES)
-        writer.transport.set_write_buffer_limits(high=0)
+    @web.middleware
+    async def _guard(self, request: web.Request, handler: Handler) -> web.StreamResponse:
+        """Check a request, answer it, and send the response within a time limit."""
+        connection = request.protocol
+        assert self._listener is not None  # requests arrive through it
+        self._listener.busy.add(connection)
         try:
-            with contextlib.suppress(ConnectionError, TimeoutError, asyncio.CancelledError):
-                await self._handle_requests(reader, writer)
+            response = await self._answer(request, handler)
+            with _aborting(request):
+                async with asyncio.timeout(_TRANSFER_S):
+                    await response.prepare(request)
+                    await response.write_eof()
+            return response
         finally:
-            self._connections.discard(task)
-            writer.close()
+            self._listener.busy.discard(connection)
 
-    async def _handle_requests(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    async def _answer(self, request: web.Request, handler: Handler) -> web.StreamResponse:
         try:
-            while (request := await read_request(reader)) is not None:
-                if request.path == "/events" and request.method == "GET":
-                    await self._stream(request, writer)
-                    return
-                await _send(writer, await self._answer(request))
-        except HttpError as error:
-            await _send(writer, _error_response(error))
+            self._check_source(request)
+            response = await handler(request)
+        except web.HTTPException as error:  # raised by aiohttp: no such path, method, or a too long body
+            response = _json_response({"error": error.reason}, error.status)
+        except RefusedRequest as error:
+            response = _json_response({"error": str(error)}, error.status)
+        if not response.prepared:
+            response.headers.update(_HEADERS)
+        return response
 
-    def _check_host(self, request: HttpRequest) -> None:
-        if len(self._connections) > _MAX_CONNECTIONS:
-            raise HttpError(*_BUSY)
-        if not is_own_host(request.headers.get("host", ""), self._names):
-            raise HttpError(HTTPStatus.MISDIRECTED_REQUEST, "unknown host name: add it to the option `names`")
+    def _check_source(self, request: web.Request) -> None:
+        """Refuse requests under foreign host names and from pages of other origins, and long bodies."""
+        host = request.headers.get("Host", "")
+        if not self._access.is_own_host(host):
+            raise RefusedRequest(
+                HTTPStatus.MISDIRECTED_REQUEST, "unknown host name: add it to the option `names`"
+            )
+        origin = request.headers.get("Origin")
+        if origin is not None and not self._access.is_own_origin(origin, host):
+            raise RefusedRequest(
+                HTTPStatus.FORBIDDEN, "request of another page: add its host name to the option `names`"
+            )
+        if (request.content_length or 0) > _MAX_BODY_BYTES:
+            raise RefusedRequest(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"more than {_MAX_BODY_BYTES} bytes")
 
-    async def _stream(self, request: HttpRequest, writer: asyncio.StreamWriter) -> None:
-        self._check_host(request)
-        writer.write(STREAM_HEAD)
+    async def _stream(self, request: web.Request) -> web.StreamResponse:
+        if len(self.events) >= _MAX_VIEWERS:
+            raise RefusedRequest(*_BUSY)
+        response = web.StreamResponse(headers={**_HEADERS, "Content-Type": "text/event-stream"})
         viewer = self.events.subscribe()
         try:
-            self._publish_all(slow=True)
-            for name in self._state.images:
-                self._publish_image(name)
-            while True:
-                await _send(writer, await viewer.next_events())
+            with _aborting(request):
+                await response.prepare(request)
+                self._publish_all(slow=True)
+                for name in self._state.images:
+                    self._publish_image(name)
+                while True:
+                    data = await viewer.next_events(_HEARTBEAT_S) or _HEARTBEAT
+                    async with asyncio.timeout(_TRANSFER_S):
+                        await response.write(data)
+                        await request.writer.drain()
         finally:
             self.events.unsubscribe(viewer)
+        return response
 
-    async def _answer(self, request: HttpRequest) -> bytes:
-        try:
-            self._check_host(request)
-            if request.path == "/command":
-                return _json_response(await self._run_command(request))
-            if request.method != "GET":
-                raise HttpError(HTTPStatus.METHOD_NOT_ALLOWED, "only GET is allowed")
-            if request.path == "/status":
-                return _json_response(self._status())
-            if request.path in self._files:
-                body, kind = self._files[request.path]
-                return make_response(HTTPStatus.OK, kind, body)
-            return await self._image_response(request.path)
-        except HttpError as error:
-            return _error_response(error)
+    async def _get_status(self, request: web.Request) -> web.Response:
+        return _json_response(self._status())
 
-    async def _image_response(self, path: str) -> bytes:
-        name = path.removeprefix("/picture/")
-        if name not in self._state.images or not path.startswith("/picture/"):
-            raise HttpError(HTTPStatus.NOT_FOUND, "not found")
+    async def _get_file(self, request: web.Request) -> web.Response:
+        body, kind = self._files[request.path]
+        return web.Response(body=body, headers={"Content-Type": kind})
+
+    async def _get_image(self, request: web.Request) -> web.Response:
+        name = request.match_info["name"]
+        if name not in self._state.images:
+            raise RefusedRequest(HTTPStatus.NOT_FOUND, "not found")
         await self._encode_if_due(name)
         encoded = self._state.images[name].encoded
         if encoded is None:
-            raise HttpError(HTTPStatus.NOT_FOUND, f"no {name} yet")
-        return make_response(HTTPStatus.OK, encoded.content_type, encoded.data)
+            raise RefusedRequest(HTTPStatus.NOT_FOUND, f"no {name} yet")
+        return web.Response(body=encoded.data, content_type=encoded.content_type)
 
     # --- commands ---
 
-    async def _run_command(self, request: HttpRequest) -> dict[str, str]:
-        """Execute the command in a request of an authorized user; return the response as a dictionary."""
-        if request.method != "POST":
-            raise HttpError(HTTPStatus.METHOD_NOT_ALLOWED, "commands need POST")
+    async def _post_command(self, request: web.Request) -> web.Response:
+        """Execute the command in a request of an authorized user."""
         await self._check_token(request)
         try:
-            command = json.loads(request.body)
+            async with asyncio.timeout(_TRANSFER_S):
+                command = json.loads(await request.read())
             action, node = str(command["action"]), str(command.get("node", ""))
             parameters = {str(k): str(v) for k, v in command.get("parameters", {}).items()}
-        except (ValueError, KeyError, TypeError, AttributeError) as error:
-            raise HttpError(
+        except (TimeoutError, ConnectionError, web.RequestPayloadError) as error:
+            raise RefusedRequest(HTTPStatus.REQUEST_TIMEOUT, "the request is not complete") from error
+        except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+            raise RefusedRequest(
                 HTTPStatus.BAD_REQUEST, 'not a command: send {"action": ..., "node": ...}'
             ) from error
         if self._commands >= _MAX_COMMANDS:
-            raise HttpError(*_BUSY)
+            raise RefusedRequest(*_BUSY)
         self._commands += 1
         try:
             done = await self._loop.run_in_executor(
                 self._command_executor, self._command, action, node, parameters
             )
         except ValueError as error:
-            raise HttpError(HTTPStatus.CONFLICT, str(error)) from error
+            raise RefusedRequest(HTTPStatus.CONFLICT, str(error)) from error
         finally:
             self._commands -= 1
-        return {"text": done}
+        return _json_response({"text": done})
 
-    async def _check_token(self, request: HttpRequest) -> None:
+    async def _check_token(self, request: web.Request) -> None:
         if not self._access.token:
-            raise HttpError(HTTPStatus.FORBIDDEN, "commands are disabled: the page's option `token` is empty")
-        given = request.headers.get("authorization", "").removeprefix("Bearer ")
-        if not hmac.compare_digest(given.encode(), self._access.token.encode()):
+            raise RefusedRequest(
+                HTTPStatus.FORBIDDEN, "commands are disabled: the page's option `token` is empty"
+            )
+        if not self._access.is_token(request.headers.get("Authorization", "").removeprefix("Bearer ")):
             self.rejected_commands += 1
             await asyncio.sleep(_WRONG_TOKEN_DELAY_S)
-            raise HttpError(HTTPStatus.UNAUTHORIZED, "wrong token: see the page's option `token`")
+            raise RefusedRequest(HTTPStatus.UNAUTHORIZED, "wrong token: see the page's option `token`")
 
 
-async def _send(writer: asyncio.StreamWriter, data: bytes) -> None:
-    writer.write(data)
-    async with asyncio.timeout(_SEND_TIMEOUT_S):
-        await writer.drain()
+@contextlib.contextmanager
+def _aborting(request: web.Request) -> Iterator[None]:
+    """Close the connection at once if the client does not read in time, or has closed it."""
+    try:
+        yield
+    except (TimeoutError, ConnectionError):
+        if request.transport is not None:
+            request.transport.abort()
 
 
-def _json_response(data: dict[str, Any]) -> bytes:
-    return make_response(HTTPStatus.OK, "application/json", as_json(data))
-
-
-def _error_response(error: HttpError) -> bytes:
-    return make_response(error.status, "application/json", as_json({"error": str(error)}))
+def _json_response(data: dict[str, Any], status: int = HTTPStatus.OK) -> web.Response:
+    return web.Response(body=as_json(data), status=status, content_type="application/json")

@@ -14,7 +14,7 @@ function cell(row, text, className) {
 }
 
 function stateClass(state) {
-  return { active: "good", drained: "good", silent: "bad" }[state] ?? "warn"; // silent: no health message
+  return { active: "good", drained: "good", silent: "bad", failed: "bad" }[state] ?? "warn"; // silent: no health message
 }
 
 function showNodes(nodes) {
@@ -33,7 +33,7 @@ function showNodes(nodes) {
     cell(row, n.cpu_percent);
     if (n.detail) {
       row.className = "has-detail";
-      cell(body.insertRow(), n.detail, "detail").colSpan = 12;
+      cell(body.insertRow(), n.detail, n.state === "failed" ? "detail bad" : "detail").colSpan = 12;
     }
   }
   $("nodes").tBodies[0].replaceWith(body);
@@ -79,9 +79,9 @@ function showWords(words) {
 }
 
 function showSummary(status) {
-  const count = (test) => status.nodes.filter(test).length;
+  const stopped = status.nodes.filter((n) => n.state === "silent" || n.state === "failed").length;
   const parts = [
-    [`${count((n) => n.state !== "silent")} of ${status.nodes.length} nodes running`, count((n) => n.state === "silent") ? "bad" : "good"],
+    [`${status.nodes.length - stopped} of ${status.nodes.length} nodes running`, stopped ? "bad" : "good"],
     [`${status.nodes.reduce((sum, n) => sum + n.lost, 0)} messages lost`, status.nodes.some((n) => n.lost) ? "bad" : "good"],
     [`pages open: ${status.page.viewers}`, ""],
   ];

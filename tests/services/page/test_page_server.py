@@ -1,11 +1,10 @@
 """The page's server alone: encoding cost, slow clients, invalid requests."""
 
+import http.client
 import json
 import math
-import shutil
 import socket
 import ssl
-import subprocess
 import threading
 import time
 import urllib.request
@@ -18,8 +17,10 @@ from beamsplat.common.errors import UserError
 from beamsplat.common.geometry.transforms import se2_to_se3
 from beamsplat.common.messages import FusedDepth, Health
 from beamsplat.common.runtime.registry import make_node
+from beamsplat.common.security.access_control import HostRole
+from beamsplat.common.security.keys import CA, CERTIFICATE, KEY
 from beamsplat.services.nodes import NODES
-from beamsplat.services.page.http import is_own_host
+from beamsplat.services.page.access import PageAccess
 from beamsplat.services.page.images import (
     EncodedImage,
     LatestImage,
@@ -28,8 +29,9 @@ from beamsplat.services.page.images import (
     encode_grid,
 )
 from beamsplat.services.page.node import PageConfig, PageNode
-from beamsplat.services.page.server import PageAccess, PageServer
+from beamsplat.services.page.server import PageServer
 from beamsplat.services.page.view import PageState
+from beamsplat.tools.keys.pki import CertificateAuthority
 
 TOKEN = "correct horse battery"
 
@@ -37,11 +39,11 @@ TOKEN = "correct horse battery"
 class Serving:
     """A running server whose state a test sets."""
 
-    def __init__(self, picture_hz=20.0, robot_hz=20.0):
+    def __init__(self, picture_hz=20.0, robot_hz=20.0, tls=None):
         self.state = PageState(picture_hz, picture_hz)
         self.orders = []
         self.server = PageServer(self.state, self._command, PageAccess(TOKEN), robot_hz)
-        self.port = self.server.start("127.0.0.1", 0, None)
+        self.port = self.server.start("127.0.0.1", 0, tls)
 
     def _command(self, *order):
         self.orders.append(order)
@@ -57,10 +59,9 @@ class Serving:
         """Send raw bytes; return (status, body) of the response."""
         with socket.create_connection(("127.0.0.1", self.port), timeout=10) as s:
             s.sendall(raw)
-            s.shutdown(socket.SHUT_WR)
-            data = b"".join(iter(lambda: s.recv(65536), b""))
-        head, _, body = data.partition(b"\r\n\r\n")
-        return int(head.split()[1]) if head else 0, body
+            reply = http.client.HTTPResponse(s)
+            reply.begin()
+            return reply.status, reply.read()
 
     def get(self, path, host="127.0.0.1"):
         return self.ask(f"GET {path} HTTP/1.1\r\nHost: {host}\r\n\r\n".encode())
@@ -163,18 +164,19 @@ def test_a_damaged_image_is_reported_and_the_last_valid_one_stays():
     [
         (b"rubbish\r\n\r\n", 400),
         (b"GET / SPDY/3\r\n\r\n", 400),
-        (b"GET / HTTP/1.1\r\nHost: localhost\r\nX: " + b"x" * 40_000 + b"\r\n\r\n", 431),
+        (b"GET / HTTP/1.1\r\nHost: localhost\r\nX: " + b"x" * 40_000 + b"\r\n\r\n", 400),
+        (b"GET / HTTP/1.1\r\nHost: localhost\r\n" + b"X: 1\r\n" * 100 + b"\r\n", 400),
         (b"POST /command HTTP/1.1\r\nHost: localhost\r\nContent-Length: 99999\r\n\r\n", 413),
         (b"POST /command HTTP/1.1\r\nHost: localhost\r\nContent-Length: -1\r\n\r\n", 400),
-        (b"POST /command HTTP/1.1\r\nHost: localhost\r\nTransfer-Encoding: chunked\r\n\r\n", 411),
+        (b"POST /command HTTP/1.1\r\nHost: localhost\r\nTransfer-Encoding: x\r\n\r\n", 400),
         (b"GET / HTTP/1.1\r\nHost: evil.example\r\n\r\n", 421),
         (b"GET /events HTTP/1.1\r\nHost: evil.example:80\r\n\r\n", 421),
-        (b"GET / HTTP/1.1\r\n\r\n", 421),
+        (b"GET / HTTP/1.1\r\n\r\n", 400),
         (b"POST / HTTP/1.1\r\nHost: localhost\r\n\r\n", 405),
         (b"GET /../node.py HTTP/1.1\r\nHost: localhost\r\n\r\n", 404),
         (b"GET /picture/../../etc/passwd HTTP/1.1\r\nHost: localhost\r\n\r\n", 404),
         (b"GET /picture/depth HTTP/1.1\r\nHost: localhost\r\n\r\n", 404),
-        (b"GET camera HTTP/1.1\r\nHost: localhost\r\n\r\n", 404),
+        (b"GET camera HTTP/1.1\r\nHost: localhost\r\n\r\n", 400),
     ],
 )
 def test_invalid_requests_get_an_error_response(raw, status):
@@ -205,11 +207,11 @@ def test_commands_need_the_token_and_valid_json():
 
 
 def test_names_of_this_machine():
-    own = frozenset({"localhost", "robot1"})
+    access = PageAccess(names=frozenset({"localhost", "robot1"}))
     for host in ("localhost", "LOCALHOST:8420", "127.0.0.1:8420", "[::1]:8420", "192.168.0.7", "robot1:80"):
-        assert is_own_host(host, own), host
+        assert access.is_own_host(host), host
     for host in ("", "evil.example", "127.0.0.1.evil.example:80", "robot10", "[evil]", "::1]"):
-        assert not is_own_host(host, own), host
+        assert not access.is_own_host(host), host
 
 
 def test_depth_is_coloured_and_unknown_is_black():
@@ -282,20 +284,15 @@ def test_invalid_options_are_reported():
 
 
 def test_a_page_with_a_certificate_is_https(tmp_path):
-    if shutil.which("openssl") is None:
-        pytest.skip("needs openssl to make a certificate")
-    certificate, key = tmp_path / "c.pem", tmp_path / "k.pem"
-    subprocess.run(
-        ["openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "1", "-subj", "/CN=localhost",
-         "-addext", "subjectAltName=IP:127.0.0.1", "-keyout", key, "-out", certificate],
-        check=True, capture_output=True,
-    )  # fmt: skip
+    authority = CertificateAuthority.create(tmp_path)
+    folder = authority.issue("edge", HostRole(role="edge"), ("127.0.0.1",))
+    certificate, key = folder / CERTIFICATE, folder / KEY
     node = PageNode(PageConfig(port=0, certificate=certificate, certificate_key=key))
     node.configure()
     try:
         address = node.detail.removeprefix("open ")
         assert address.startswith("https://127.0.0.1:")
-        context = ssl.create_default_context(cafile=certificate)
+        context = ssl.create_default_context(cafile=folder / CA)
         with urllib.request.urlopen(address + "status", context=context, timeout=10) as reply:
             assert json.load(reply)["nodes"] == []
         with pytest.raises(OSError):
