@@ -46,6 +46,8 @@ class LidarReader:
             except LinkError as error:
                 self.status = f"DISCONNECTED: {error}; {self.driver.counters}"
                 self._close_link()
+                yield None  # before the pause: a device that can be opened may fail again at once
+                time.sleep(_RETRY_S)
 
     def close(self) -> None:
         """Stop the device and close the link."""

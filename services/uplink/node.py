@@ -25,6 +25,8 @@ from beamsplat.common.zenoh.bus import BULK_BUFFER_BYTES, URGENT_BUFFER_BYTES, o
 
 _POLL_S = 0.1
 _ATTEMPT_S = 1.0  # timeout of one attempt to connect
+# Pauses between attempts: an attempt without keys, or to a port that nobody listens on, fails at once.
+_BACK_OFF_S = (0.1, 0.2, 0.5, 1.0, 2.0)
 _CLOSE_S = 1.0  # limit for closing all sessions, so that a node stops in time
 
 
@@ -49,6 +51,8 @@ class UplinkNode(Node):
         self._cut_since_s: float | None = None
         self._cuts = 0
         self._bulk_session_cut = False
+        self._attempts, self._next_attempt_s = 0, 0.0
+        self._fault: UserError | None = None  # of the last attempt
 
     def source(self) -> Iterator[SourceItem | None]:
         """Run until all topics that the robot has published on have ended (live sensors never end)."""
@@ -56,16 +60,30 @@ class UplinkNode(Node):
             raise UserError("the uplink runs live only: remove it from lockstep runs")
         started = time.monotonic()
         while self._bridge is None:
-            try:
-                self._connect()
-            except UserError as error:
-                self.detail = f"no link for {time.monotonic() - started:.0f} s: {error}"
-                yield None
+            if self._may_attempt():
+                try:
+                    self._connect()
+                    self._attempts = 0
+                    break
+                except UserError as error:
+                    self._fault = error
+            self.detail = f"no link for {time.monotonic() - started:.0f} s: {self._fault}"
+            yield None
+            time.sleep(_POLL_S)
         while not self._all_topics_ended():
             self._update_detail()
             self._replace_bulk_session()
             yield None
             time.sleep(_POLL_S)
+
+    def _may_attempt(self) -> bool:
+        """Return whether the pause after the last attempt to connect is over; if so, begin an attempt."""
+        now = time.monotonic()
+        if now < self._next_attempt_s:
+            return False
+        pause_s = _BACK_OFF_S[min(self._attempts, len(_BACK_OFF_S) - 1)]
+        self._attempts, self._next_attempt_s = self._attempts + 1, now + pause_s
+        return True
 
     def close(self) -> None:
         """Close all sessions in threads, waiting at most `_CLOSE_S`: closing may block without a link."""
@@ -111,7 +129,7 @@ class UplinkNode(Node):
 
     def _replace_bulk_session(self) -> None:
         """Replace the session for large messages, after an interruption, when the small one is connected."""
-        if not self._bulk_session_cut or not self._sessions[0].info.routers_zid():
+        if not self._bulk_session_cut or not self._sessions[0].info.routers_zid() or not self._may_attempt():
             return
         try:
             large = self._open_edge_session(BULK_BUFFER_BYTES)
@@ -120,6 +138,7 @@ class UplinkNode(Node):
         small, old, robot = self._sessions
         self._sessions = [small, large, robot]
         self._bulk_session_cut = False
+        self._attempts = 0
         self._connected.replace_bulk_session(BridgeSessions(robot=robot, edge=small, edge_bulk=large))
         threading.Thread(target=old.close, daemon=True).start()
 

@@ -102,6 +102,32 @@ def test_a_reconnected_lidar_is_reopened(tmp_path, kind):
         _right(scan)
 
 
+def test_a_lidar_that_fails_as_soon_as_it_is_opened_does_not_occupy_a_core():
+    reads = []
+
+    class FailingPort:
+        byte_time_s = 1e-5
+
+        def read(self, timeout_s):
+            reads.append(time.monotonic())
+            assert len(reads) < 100, "opened again and again without a pause"
+            raise LinkError("the port is gone")
+
+        def write(self, data):
+            pass
+
+        def close(self):
+            pass
+
+    node = LdrobotNode(LidarConfig(device="/dev/null"))
+    node._open = lambda baud: FailingPort()
+    node.configure()
+    source, until = node.source(), time.monotonic() + 1.0
+    while time.monotonic() < until:
+        assert next(source) is None
+    assert "DISCONNECTED: the port is gone" in node.detail
+
+
 def test_a_lidar_without_data_is_reopened(tmp_path):
     class Mute(Ld19):
         silent = False
