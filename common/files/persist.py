@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import time
 from pathlib import Path
@@ -61,8 +62,33 @@ def write_atomically(path: Path, data: bytes | memoryview) -> None:
             os.fsync(file.fileno())
         temporary.replace(path)
     except OSError:
-        temporary.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
         raise
+
+
+def write_durably(path: Path, data: bytes | memoryview) -> None:
+    """Replace a file atomically and flush its folder, so that the new file survives a power failure.
+
+    Raises:
+        OSError: writing failed: the old file is unchanged; or the folder could not be flushed: the new file
+            is in place, but a power failure may bring the old one back.
+    """
+    write_atomically(path, data)
+    sync_folder(path.parent)
+
+
+def sync_folder(folder: Path) -> None:
+    """Flush a folder to the disk (fsync), so that files created, renamed or removed in it stay so.
+
+    Raises:
+        OSError: the disk is broken.
+    """
+    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
 
 
 def _read_int(path: Path) -> int | None:

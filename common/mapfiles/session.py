@@ -9,28 +9,31 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
-import io
-import json
 import os
 import socket
 import struct
 import uuid
-import zipfile
 import zlib
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, TextIO
 
-import numpy as np
-
-from beamsplat.common.errors import UserError, reason
-from beamsplat.common.files.persist import make_folder, write_atomically
-from beamsplat.common.mapfiles.blocks import Arrays, block_file, with_blocks
+from beamsplat.common.errors import UserError
+from beamsplat.common.files.numbered_state import (
+    Arrays,
+    NumberedState,
+    numbered_files,
+    packed_arrays,  # noqa: F401
+    read_json,
+    unpacked_arrays,  # noqa: F401
+    write_json,
+)
+from beamsplat.common.files.persist import make_folder, write_durably
+from beamsplat.common.mapfiles.blocks import block_file, with_blocks
 
 FORMAT, VERSION = "beamsplat-session", 1
 EDGE_VERSION = 2  # 2: some Gaussians are in block files; 1 is written when there are none
 MANIFEST, EDGE_MANIFEST = "session.json", "edge.json"
-_MAX_READS = 5  # attempts to read a state while a mapper replaces it
 _KEYFRAME_MAGIC = b"BSKF"
 _KEYFRAME_HEAD = struct.Struct("<4sIH")  # magic, CRC-32 of what follows the header, length of the schema name
 
@@ -161,32 +164,22 @@ class SessionFolder:
 
     # --- states ---
 
+    @property
+    def _state(self) -> NumberedState:
+        return NumberedState(self.edge, "state-", EDGE_MANIFEST, "state")
+
     def write_state(self, arrays: Arrays, summary: dict[str, Any]) -> None:
-        """Write a new state, then the manifest that refers to it, then remove the old state.
+        """Write a new state, then the manifest that names it, then remove the old state.
 
         Args:
             arrays: the state, array by name.
             summary: entries for the manifest, such as the numbers of keyframes and Gaussians.
 
         Raises:
-            OSError: the disk is full or broken; the old state is still valid.
+            OSError: the disk is full or broken; the old or the new state is valid.
         """
-        before = numbered_files(self.edge, "state-", ".npz")
-        name = f"state-{1 + max(before, default=0)}.npz"
-        try:
-            with (self.edge / name).open("xb") as file:
-                np.savez(file, **arrays)  # type: ignore[arg-type]  # the stubs pass ** to allow_pickle
-                file.flush()
-                os.fsync(file.fileno())
-            size = (self.edge / name).stat().st_size
-            version = EDGE_VERSION if "block_number" in arrays else VERSION
-            manifest = {"version": version, "state": name, "bytes": size, **summary}
-            write_json(self.edge / EDGE_MANIFEST, manifest)
-        except OSError:
-            (self.edge / name).unlink(missing_ok=True)
-            raise
-        for old in before.values():
-            old.unlink(missing_ok=True)
+        version = EDGE_VERSION if "block_number" in arrays else VERSION
+        self._state.write(arrays, {"version": version, **summary})
 
     def manifest(self) -> dict[str, Any] | None:
         """Return the contents of `edge.json`; None before the first checkpoint.
@@ -195,15 +188,10 @@ class SessionFolder:
             UserError: the file cannot be read, or a newer program wrote it.
         """
         self.header()
-        path = self.edge / EDGE_MANIFEST
-        if not path.is_file():
-            return None
-        manifest = read_json(path, "restore the folder from a copy")
-        check_version(manifest, path, EDGE_VERSION)
-        for field, kind in (("state", str), ("bytes", int)):
-            if not isinstance(manifest.get(field), kind):
-                raise UserError(f"{path}: field {field!r} is missing; restore the folder from a copy")
-        return manifest
+        return self._state.manifest(_check_edge_version) if self._has_state() else None
+
+    def _has_state(self) -> bool:
+        return (self.edge / EDGE_MANIFEST).is_file()
 
     def read_state(self, whole: bool = True) -> Arrays | None:
         """Return the arrays of the last checkpoint; None before the first one.
@@ -214,29 +202,14 @@ class SessionFolder:
         Raises:
             UserError: the state is missing, truncated or altered.
         """
-        for _ in range(_MAX_READS):
-            manifest = self.manifest()
-            try:
-                return None if manifest is None else self._read(manifest, whole)
-            except UserError:
-                if self.manifest() == manifest:
-                    raise
-        raise UserError(f"{self.path}: the session changes faster than it can be read; try again")
+        self.header()
+        if not self._has_state():
+            return None
 
-    def _read(self, manifest: dict[str, Any], whole: bool) -> Arrays:
-        path = self.edge / Path(manifest["state"]).name
-        try:
-            size = path.stat().st_size
-            if size != manifest["bytes"]:
-                raise UserError(
-                    f"{path}: truncated ({size} bytes, {manifest['bytes']} expected); restore it from a copy"
-                )
-            arrays = unpacked_arrays(path)
-        except (OSError, zipfile.BadZipFile, zlib.error, ValueError) as error:
-            if isinstance(error, UserError):
-                raise
-            raise UserError(f"{path}: cannot be read ({reason(error)}); restore it from a copy") from error
-        return with_blocks(self.blocks, arrays) if whole else arrays
+        def unpack(_: dict[str, Any], arrays: Arrays) -> Arrays:
+            return with_blocks(self.blocks, arrays) if whole else arrays
+
+        return self._state.read(_check_edge_version, unpack)
 
     # --- keyframes ---
 
@@ -295,68 +268,8 @@ class SessionFolder:
             block_file(self.blocks, number).unlink(missing_ok=True)
 
 
-def numbered_files(folder: Path, prefix: str, suffix: str) -> dict[int, Path]:
-    """Return the files `<prefix><number><suffix>` of a folder by number (an int64 >= 0).
-
-    All other files are left alone: copies made by hand (`state-old.npz`), numbers in another form (`007.kf`),
-    folders.
-    """
-    out = {}
-    for path in folder.glob(f"{prefix}*{suffix}"):
-        digits = path.name.removeprefix(prefix).removesuffix(suffix)
-        if not (digits.isascii() and digits.isdecimal() and path.is_file()):
-            continue
-        number = int(digits)
-        if str(number) == digits and number < 2**63:
-            out[number] = path
-    return out
-
-
-def packed_arrays(arrays: Arrays) -> bytes:
-    """Return a state as the bytes of its npz file."""
-    buffer = io.BytesIO()
-    np.savez(buffer, **arrays)  # type: ignore[arg-type]  # the stubs pass ** to allow_pickle
-    return buffer.getvalue()
-
-
-def unpacked_arrays(source: Path | bytes) -> Arrays:
-    """Return the state in an npz file, or in the bytes of one.
-
-    Raises:
-        OSError, ValueError, zipfile.BadZipFile, zlib.error: the file is incomplete or damaged.
-    """
-    with np.load(io.BytesIO(source) if isinstance(source, bytes) else source, allow_pickle=False) as stored:
-        return {key: stored[key] for key in stored.files}
-
-
-def write_durably(path: Path, data: bytes | memoryview) -> None:
-    """Replace a file atomically and flush its folder entry, so that the file survives a power failure."""
-    write_atomically(path, data)
-    folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(folder)
-    finally:
-        os.close(folder)
-
-
-def write_json(path: Path, table: dict[str, Any]) -> None:
-    """Replace a JSON file atomically and durably."""
-    write_durably(path, (json.dumps(table, indent=1) + "\n").encode())
-
-
-def read_json(path: Path, advice: str) -> dict[str, Any]:
-    """Return the object in a JSON file.
-
-    Raises:
-        UserError: the file is missing or not a JSON object; the text ends with `advice`.
-    """
-    try:
-        table = json.loads(path.read_text())
-    except (OSError, ValueError) as error:
-        raise UserError(f"{path}: cannot be read ({reason(error)}); {advice}") from error
-    if not isinstance(table, dict):
-        raise UserError(f"{path}: not a JSON object; {advice}")
-    return table
+def _check_edge_version(manifest: dict[str, Any], path: Path) -> None:
+    check_version(manifest, path, EDGE_VERSION)
 
 
 def check_version(table: dict[str, Any], path: Path, newest: int = VERSION) -> None:

@@ -273,14 +273,9 @@ def load_slam(path: Path) -> Any:
 
     from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
     from beamsplat.services.localization.lidar2d.slam import LidarSlam
-    from beamsplat.services.localization.lidar2d.state import MapStateError
 
     folder = path if (path / ROBOT_MANIFEST).is_file() else path / "state"
-    try:
-        # T_body_lidar is needed for new scans only.
-        return LidarSlam.load(folder, LidarSlamSettings(), np.eye(4))
-    except MapStateError as error:
-        raise UserError(str(error)) from error
+    return LidarSlam.load(folder, LidarSlamSettings(), np.eye(4))  # T_body_lidar is needed for scans only
 
 
 def _same_drive(session: Path, robot: Path, arrays: dict[str, Any], slam: Any) -> None:

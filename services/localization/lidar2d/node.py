@@ -30,7 +30,7 @@ from beamsplat.services.localization.lidar2d.jobs import JobResult
 from beamsplat.services.localization.lidar2d.occupancy import OccupancyGrid
 from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
 from beamsplat.services.localization.lidar2d.slam import LidarSlam, ScanResult
-from beamsplat.services.localization.lidar2d.state import MANIFEST, MapStateError, read_manifest, write_state
+from beamsplat.services.localization.lidar2d.state import MANIFEST, read_manifest, write_state
 
 log = logging.getLogger("beamsplat.localization")
 
@@ -68,8 +68,8 @@ class LidarLocalization(Node):
         """Check that the map in the folder `resume` can be read, and the folder `save` can be written."""
         if self.config.resume is not None:
             try:
-                read_manifest(self.config.resume / MANIFEST)
-            except MapStateError as error:
+                read_manifest(self.config.resume)
+            except UserError as error:
                 raise UserError(f"resume = {error}") from error
         if self.config.save is not None:
             check_can_write(self.config.save, "save")
@@ -89,8 +89,8 @@ class LidarLocalization(Node):
             shutil.rmtree(self._checkpoint_dir, ignore_errors=True)
         if self.config.resume is not None:
             try:
-                read_manifest(self.config.resume / MANIFEST)
-            except MapStateError as error:
+                read_manifest(self.config.resume)
+            except UserError as error:
                 raise UserError(f"localization.resume: {error}") from error
 
     def on_rig(self, rig: Rig) -> Outputs:
@@ -112,7 +112,7 @@ class LidarLocalization(Node):
             return LidarSlam(LidarSlamSettings(), T_body_lidar)
         try:
             slam = LidarSlam.load(folder, LidarSlamSettings(), T_body_lidar)
-        except MapStateError as error:
+        except UserError as error:
             if not crashed:
                 raise UserError(f"localization.resume: {error}") from error
             log.error("cannot load the checkpoint, starting a new map: %s", error)

@@ -329,7 +329,7 @@ class LidarSlam:
     ) -> LidarSlam:
         """Load a saved map to continue it; the status is "relocalizing" until the pose in this map is found.
 
-        With `localize_only` the saved map is not changed. Raises MapStateError.
+        With `localize_only` the saved map is not changed. Raises UserError.
         """
         slam = LidarSlam(settings, T_body_lidar)
         slam.pose_graph, extra = load_state(folder, settings)

@@ -1,18 +1,16 @@
-"""Saved maps: one manifest (JSON) and one array file (npz), both replaced atomically."""
+"""Saved maps: one manifest (JSON) and one array file (npz), see `beamsplat.common.files.numbered_state`."""
 
 from __future__ import annotations
 
 import dataclasses
-import json
-import os
 import uuid
-import zipfile
-import zlib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from beamsplat.common.errors import reason
+from beamsplat.common.errors import UserError
+from beamsplat.common.files.numbered_state import Arrays, NumberedState
 from beamsplat.services.localization.lidar2d.pose_graph import PoseGraph
 from beamsplat.services.localization.lidar2d.pose_graph_data import (
     Constraint,
@@ -46,10 +44,6 @@ _SETTING_KEYS = {
 }  # fmt: skip
 
 
-class MapStateError(ValueError):
-    """A saved map cannot be read; the message names the file and a remedy."""
-
-
 def map_uuid(stamp_ns: int, ranges_m: np.ndarray) -> str:
     """Return the UUID of a map that begins with this scan; the same scan yields the same UUID."""
     first = f"{FORMAT} {stamp_ns} {np.asarray(ranges_m, np.float32).tobytes().hex()}"
@@ -77,87 +71,74 @@ def pack_state(graph: PoseGraph, extra: dict[str, np.ndarray]) -> PackedMap:
     return PackedMap(arrays, head)
 
 
+def _files(folder: Path) -> NumberedState:
+    return NumberedState(Path(folder), "lidar_map-", MANIFEST, "arrays")
+
+
+def _existing_files(folder: Path) -> NumberedState:
+    files = _files(folder)
+    if not files.manifest_path.is_file():
+        raise UserError(f"{files.manifest_path}: no saved map here; give the folder of a saved map")
+    return files
+
+
 def write_state(folder: Path, state: PackedMap) -> None:
-    """Write a map; the manifest is replaced last, so that after a crash the previous map is still valid."""
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    generation = 1 + max((int(p.stem.rpartition("-")[2]) for p in folder.glob("lidar_map-*.npz")), default=0)
-    name = f"lidar_map-{generation}.npz"
-    with open(folder / f"{name}.tmp", "wb") as file:
-        np.savez(file, **state.arrays)  # type: ignore[arg-type]  # the stubs pass ** to allow_pickle
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(folder / f"{name}.tmp", folder / name)
-    manifest = {
-        "format": FORMAT,
-        "version": VERSION,
-        "arrays": name,
-        "bytes": (folder / name).stat().st_size,
-        "crc32": zlib.crc32((folder / name).read_bytes()),
-        **state.head,
-    }
-    with open(folder / f"{MANIFEST}.tmp", "w") as file:
-        json.dump(manifest, file, indent=1)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(folder / f"{MANIFEST}.tmp", folder / MANIFEST)
-    for old in folder.glob("lidar_map-*.npz"):
-        if old.name != name:
-            old.unlink()
+    """Write a map in place of the previous one; a crash or an error leaves one of the two valid.
+
+    Raises:
+        OSError: the disk is full or broken.
+    """
+    Path(folder).mkdir(parents=True, exist_ok=True)
+    _files(folder).write(state.arrays, {"format": FORMAT, "version": VERSION, **state.head})
 
 
 def load_state(folder: Path, settings: LidarSlamSettings) -> tuple[PoseGraph, dict[str, np.ndarray]]:
-    """Load a saved pose graph, and the `extra` arrays of `pack_state`. Raises MapStateError."""
-    path = Path(folder) / MANIFEST
-    manifest = read_manifest(path)
-    arrays_path = Path(folder) / str(manifest["arrays"])
-    try:
-        raw = arrays_path.read_bytes()
-    except OSError as error:
-        raise MapStateError(
-            f"{arrays_path}: cannot be read, but {path} needs it ({reason(error)}); restore it"
-        ) from error
-    if len(raw) != manifest["bytes"] or zlib.crc32(raw) != manifest["crc32"]:
-        raise MapStateError(
-            f"{arrays_path}: truncated or altered ({len(raw)} bytes, {manifest['bytes']} expected); "
-            "restore the folder from a copy"
-        )
-    cell_m = manifest["settings"].get("cell_m")
-    if cell_m != settings.cell_m:
-        raise MapStateError(
-            f"{path}: settings.cell_m is {cell_m}, the running SLAM has {settings.cell_m}; use the same value"
-        )
-    try:
-        with np.load(arrays_path, allow_pickle=False) as stored:
-            arrays = {key: stored[key] for key in stored.files}
-        graph = _unpack(arrays, settings)
+    """Load a saved pose graph, and the `extra` arrays of `pack_state`.
+
+    Raises:
+        UserError: there is no saved map, or it cannot be read; the text names the file and a remedy.
+    """
+    files = _existing_files(folder)
+
+    def unpack(manifest: dict[str, Any], arrays: Arrays) -> tuple[PoseGraph, dict[str, np.ndarray]]:
+        cell_m = manifest["settings"].get("cell_m")
+        if cell_m != settings.cell_m:
+            raise UserError(
+                f"{files.manifest_path}: settings.cell_m is {cell_m}, the running SLAM has "
+                f"{settings.cell_m}; use the same value"
+            )
+        try:
+            graph = _unpack(arrays, settings)
+        except (KeyError, ValueError, IndexError, TypeError) as error:
+            raise UserError(
+                f"{files.folder / manifest['arrays']}: not a complete map of version {VERSION} ({error}); "
+                "restore it from a copy"
+            ) from error
         graph.uuid = str(manifest.get("uuid", ""))  # missing in old states
-    except (KeyError, ValueError, zipfile.BadZipFile) as error:
-        raise MapStateError(f"{arrays_path}: not a complete map of version {VERSION} ({error})") from error
-    return graph, {key: value for key, value in arrays.items() if key.startswith("extra_")}
+        return graph, {key: value for key, value in arrays.items() if key.startswith("extra_")}
+
+    return files.read(_check_manifest, unpack)
 
 
-def read_manifest(path: Path) -> dict:
-    """Return the manifest of a saved map. Raises MapStateError."""
-    try:
-        manifest = json.loads(path.read_text())
-    except OSError as error:
-        raise MapStateError(
-            f"{path}: no saved map here ({reason(error)}); give the folder of a saved map"
-        ) from error
-    except json.JSONDecodeError as error:
-        raise MapStateError(f"{path}: not valid JSON ({error}); restore the folder from a copy") from error
-    if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
-        raise MapStateError(f"{path}: field 'format' is not {FORMAT!r}; this is not a lidar map")
+def read_manifest(folder: Path) -> dict[str, Any]:
+    """Return the manifest of the map saved in a folder.
+
+    Raises:
+        UserError: there is none, or this program cannot read it.
+    """
+    return _existing_files(folder).manifest(_check_manifest)
+
+
+def _check_manifest(manifest: dict[str, Any], path: Path) -> None:
+    if manifest.get("format") != FORMAT:
+        raise UserError(f"{path}: field 'format' is not {FORMAT!r}; this is not a lidar map")
     if manifest.get("version") != VERSION:
-        raise MapStateError(
+        raise UserError(
             f"{path}: version {manifest.get('version')!r}, this program reads {VERSION}; "
             "map again or use the program that wrote it"
         )
-    missing = [key for key in ("arrays", "bytes", "crc32", "settings") if key not in manifest]
-    if missing:
-        raise MapStateError(f"{path}: field {missing[0]!r} is missing; restore the folder from a copy")
-    return manifest
+    if not isinstance(manifest.get("settings"), dict):
+        raise UserError(f"{path}: field 'settings' is missing; restore the folder from a copy")
 
 
 def _pack_nodes(graph: PoseGraph) -> dict[str, np.ndarray]:

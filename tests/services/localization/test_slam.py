@@ -5,12 +5,13 @@ import json
 import numpy as np
 import pytest
 
+from beamsplat.common.errors import UserError
 from beamsplat.services.localization.lidar2d import se2
 from beamsplat.services.localization.lidar2d.job_runner import JobRunner
 from beamsplat.services.localization.lidar2d.metrics import trajectory_errors
 from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
 from beamsplat.services.localization.lidar2d.slam import LidarSlam
-from beamsplat.services.localization.lidar2d.state import MANIFEST, MapStateError
+from beamsplat.services.localization.lidar2d.state import MANIFEST
 from tests.services.localization.world import WALLS, RayCastLidar, SimulatedDrive, box, wheels
 
 NS = 1_000_000_000
@@ -281,19 +282,19 @@ def test_a_kidnapped_robot_is_relocalized():
 
 
 def test_errors_of_invalid_states(mapped, tmp_path):
-    with pytest.raises(MapStateError, match="no saved map here"):
+    with pytest.raises(UserError, match="no saved map here"):
         LidarSlam.load(tmp_path, SETTINGS, np.eye(4))
     mapped[0].save(tmp_path)
     manifest = json.loads((tmp_path / MANIFEST).read_text())
     arrays = tmp_path / manifest["arrays"]
     whole = arrays.read_bytes()
     arrays.write_bytes(whole[:-100])
-    with pytest.raises(MapStateError, match="truncated or altered"):
+    with pytest.raises(UserError, match="truncated or altered"):
         LidarSlam.load(tmp_path, SETTINGS, np.eye(4))
     arrays.write_bytes(whole)
     (tmp_path / MANIFEST).write_text(json.dumps(manifest | {"version": 99}))
-    with pytest.raises(MapStateError, match="version 99, this program reads 1"):
+    with pytest.raises(UserError, match="version 99, this program reads 1"):
         LidarSlam.load(tmp_path, SETTINGS, np.eye(4))
     (tmp_path / MANIFEST).write_text("{")
-    with pytest.raises(MapStateError, match="not valid JSON"):
+    with pytest.raises(UserError, match="lidar_map.json: cannot be read"):
         LidarSlam.load(tmp_path, SETTINGS, np.eye(4))
