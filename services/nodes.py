@@ -1,4 +1,9 @@
-"""The process list: all services, by the name that they have in a deployment file."""
+"""The process list: all services, by the name that they have in a deployment file.
+
+Essential are the sources and what turns their data into poses and a map. The mapper is essential too: an
+error at the start is better than a drive of hours without a map. Not essential is what shows, records or
+forwards results. After the start no node ends the run.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +14,7 @@ _ROWS = (
         "replay",
         "replays a bag, a recording or a folder with the timing of the drive",
         {"default": "beamsplat.services.replay.node:ReplayNode"},
+        finite=True,
     ),
     Service(
         "camera",
@@ -36,6 +42,7 @@ _ROWS = (
         "ros2_out",
         "publishes pose, transforms, map and point cloud to ROS 2",
         {"default": "beamsplat.services.ros2_out.node:Ros2OutNode"},
+        essential=False,
     ),
     Service(
         "clock",
@@ -75,21 +82,25 @@ _ROWS = (
         "uplink",
         "on a robot: bridge to the edge server, for the topics that the topic table marks",
         {"default": "beamsplat.services.uplink.node:UplinkNode"},
+        essential=False,
     ),
     Service(
         "recorder",
         "records all topics to an MCAP file",
         {"default": "beamsplat.services.recorder.node:RecorderNode"},
+        essential=False,
     ),
     Service(
         "monitor",
         "shows the running system in rerun",
         {"rerun": "beamsplat.services.monitor.node:MonitorNode"},
+        essential=False,
     ),
     Service(
         "page",
         "shows the running system in a web browser, and accepts commands with its token",
         {"default": "beamsplat.services.page.node:PageNode"},
+        essential=False,
     ),
 )
 

@@ -43,6 +43,7 @@ class NodeConfig(Config):
     job_cost_s: Seconds = 0.0  # lockstep only: modelled duration of a background job
     threads: Annotated[int, Field(ge=1)] = 1  # for cv2, torch and ONNX in this process
     nice: Annotated[int, Field(ge=0, le=19)] = 0  # nice value of the process: higher = lower CPU priority
+    essential: bool | None = None  # whether an error at the start ends the run; None: as in services/nodes.py
 
 
 class RouterConfig(Config):

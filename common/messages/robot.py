@@ -233,13 +233,14 @@ class OutputHealth(MessagePart):
     bytes: Count
 
 
-NodeState = Literal["configure", "standby", "active", "drain", "drained", "closed"]
+# "failed": the node's process cannot run, and its supervisor reports it.
+NodeState = Literal["configure", "standby", "active", "drain", "drained", "closed", "failed"]
 
 
 class Health(Message):
     """State, message counts and resource use of one node, published by each node at 1 Hz."""
 
-    version = "1.1"  # 1.1: pid
+    version = "1.2"  # 1.1: pid; 1.2: state "failed"
 
     node: Name
     instance: Name

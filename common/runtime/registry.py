@@ -20,6 +20,8 @@ class Service:
     name: str
     summary: str
     kinds: dict[str, str]  # kind -> "module:Class"; the first is the default
+    essential: bool = True  # an error at the start ends the run, unless NodeConfig.essential says otherwise
+    finite: bool = False  # its data end: an error ends the run at any time, because nothing follows
 
     def load(self, kind: str) -> type[Node]:
         """Import and return the node class of a kind.

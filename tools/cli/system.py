@@ -153,14 +153,14 @@ def run_checked(
     names: tuple[str, ...] | None = None,
     monitor: Callable[[Supervisor], RunMonitor] | None = None,
 ) -> None:
-    """Run processes until all have drained, one cannot run, or Ctrl-C.
+    """Run processes until all have drained, or Ctrl-C. Nodes that cannot run are tried again, and left out.
 
     Args:
         names: nodes to run, and `router`; None runs all.
         monitor: creates an observer of the run from its supervisor.
 
     Raises:
-        UserError: the deployment is invalid, or a node cannot run with its options.
+        UserError: the deployment is invalid, or an essential node cannot run at the start.
     """
     for name in names or ():
         if name != "router" and name not in deployment.nodes:
@@ -170,40 +170,34 @@ def run_checked(
     from beamsplat.common.security.logins import SUPERVISOR, login_of
     from beamsplat.common.zenoh.bus import open_session
     from beamsplat.tools.system.commands import Commands
+    from beamsplat.tools.system.failure_reports import FailureReports
     from beamsplat.tools.system.health_table import HealthTable
-    from beamsplat.tools.system.supervisor import Supervisor
+    from beamsplat.tools.system.supervisor import ROUTER, Supervisor
 
     for number in (signal.SIGTERM, signal.SIGHUP):  # stop the children in order, as Ctrl-C does
         signal.signal(number, signal.default_int_handler)
-    events: list[str] = []
-
-    def on_event(text: str) -> None:
-        events.append(text)
-        if " cannot run: " not in text:  # the run ends with that error
-            _say(text, "yellow")
-
-    with Supervisor(deployment, names, on_event=on_event) as supervisor:
+    with Supervisor(deployment, names, on_event=lambda text: _say(text, "yellow")) as supervisor:
         _say(f"robot {deployment.robot}: logs in {supervisor.log_dir}")
         login = login_of(deployment.security, SUPERVISOR)
         with open_session(deployment.router.listen, login=login) as session:
             board = HealthTable(session, deployment.robot)
             observer = monitor(supervisor) if monitor is not None else None
             commands = Commands(session, deployment.robot, supervisor)
+            failures = FailureReports(session, deployment.robot, supervisor)
             drained = False
             with _Display(board) as display, contextlib.suppress(KeyboardInterrupt):
                 while not drained:
                     time.sleep(0.2)
                     supervisor.poll()
+                    supervisor.observe(board.reported())
+                    failures.poll()
                     if observer is not None:
                         observer.poll()
                     commands.answer_pending()
                     display.update()
-                    nodes = [c for c in supervisor.children.values() if c.name != "router"]
-                    for entry in supervisor.children.values():
-                        if entry.gave_up:
-                            raise UserError(
-                                next(e for e in events if e.startswith(f"{entry.name} cannot run"))
-                            )
+                    if supervisor.obstacle:
+                        raise UserError(supervisor.obstacle)
+                    nodes = [c for c in supervisor.children.values() if c.name != ROUTER and not c.failed]
                     states = board.states()
                     drained = bool(nodes) and all(states.get(c.name) == "drained" for c in nodes)
             if observer is not None:

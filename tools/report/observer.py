@@ -234,10 +234,10 @@ def run_live(
         while not drained and time.monotonic() < deadline:
             time.sleep(0.2)
             supervisor.poll()
+            supervisor.observe(board.reported())
             observer.poll()
-            failed = next((c.name for c in supervisor.children.values() if c.gave_up), None)
-            if failed:
-                raise UserError(next(e for e in events if e.startswith(f"{failed} cannot run")))
+            if supervisor.obstacle:
+                raise UserError(supervisor.obstacle)
             states = board.states()
             drained = all(states.get(name) == "drained" for name in deployment.nodes)
         result = observer.finish(board, drained)

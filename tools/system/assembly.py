@@ -34,10 +34,15 @@ def build_node(deployment: Deployment, name: str, table: dict[str, Service] = NO
     Raises:
         UserError: the deployment has no such node, `table` has no such service, or an option is invalid.
     """
-    return make_node(_service(deployment, name, table), deployment.nodes[name], "deployment")
+    return make_node(service_of(deployment, name, table), deployment.nodes[name], "deployment")
 
 
-def _service(deployment: Deployment, name: str, table: dict[str, Service]) -> Service:
+def service_of(deployment: Deployment, name: str, table: dict[str, Service]) -> Service:
+    """Return the row of `table` for the node called `name`, or a row for a node defined outside this package.
+
+    Raises:
+        UserError: the deployment has no such node, or `table` has no such service.
+    """
     if name not in deployment.nodes:
         known = ", ".join(deployment.nodes) or "none"
         raise UserError(f"the deployment has no node {name!r}; it has {known}")
@@ -59,7 +64,7 @@ def _service(deployment: Deployment, name: str, table: dict[str, Service]) -> Se
 def node_classes(deployment: Deployment, table: dict[str, Service] = NODES) -> dict[str, type[Node]]:
     """Return the class of each node of a deployment by name; only the option `kind` is checked."""
     return {
-        name: node_class_of(_service(deployment, name, table), options)
+        name: node_class_of(service_of(deployment, name, table), options)
         for name, options in deployment.nodes.items()
     }
 

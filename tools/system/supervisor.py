@@ -1,4 +1,8 @@
-"""Start the router and the nodes of a deployment, restart crashed processes, and stop all in order."""
+"""Start the router and the nodes of a deployment, restart crashed processes, and stop all in order.
+
+A node that cannot run (exit code 2) is started again after `RETRY_S`. During start-up, which lasts until all
+nodes have been active once, it is an obstacle to the run if it is essential.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +25,13 @@ from beamsplat.common.runtime.registry import Service
 from beamsplat.common.security.logins import OPERATOR, SUPERVISOR, login_of, make_logins
 from beamsplat.common.zenoh.bus import open_session
 from beamsplat.services.nodes import NODES
-from beamsplat.tools.system.assembly import Surroundings, build_node, node_classes, surroundings
+from beamsplat.tools.system.assembly import (
+    Surroundings,
+    build_node,
+    node_classes,
+    service_of,
+    surroundings,
+)
 from beamsplat.tools.system.log_tail import last_error
 from beamsplat.tools.system.node_process import ONE_THREAD, STOP_S, child
 
@@ -29,7 +39,9 @@ log = logging.getLogger("beamsplat")
 
 ROUTER = "router"
 BACK_OFF_S = (0.1, 0.5, 1.0, 2.0, 5.0)
+RETRY_S = (5.0, 10.0, 30.0, 60.0)  # before the next start of a node that cannot run
 HEALTHY_S = 30.0  # a process that ran this long starts with the shortest back-off again
+START_UP_S = 300.0  # longest start-up, if a node never becomes active
 PRELOADED = (
     "numpy",
     "cv2",
@@ -52,7 +64,9 @@ class Child:
     restarts: int = 0
     attempts: int = 0  # within the current back-off
     due: float | None = None  # time of the next start of a process that has ended
-    gave_up: bool = False  # ended with a UserError: restarting would not help
+    failed: str = ""  # why the last process could not run (UserError); "" = it runs, or has crashed
+    failures: int = 0  # UserErrors in a row
+    was_active: bool = False
     kill_at: float | None = None  # SIGTERM was sent for a restart; SIGKILL follows at this time
 
 
@@ -94,6 +108,9 @@ class Supervisor:
         self.table = table
         self._names = names if names is not None else (ROUTER, *deployment.nodes)
         self._on_event = on_event or (lambda text: log.info("%s", text))
+        self.starting = True
+        self.obstacle = ""  # why the run cannot go on: text for a UserError
+        self._start_up_until = time.monotonic() + START_UP_S
         os.environ.update({k: os.environ.get(k, v) for k, v in ONE_THREAD.items()})
         self._context = multiprocessing.get_context("forkserver")
         self._context.set_forkserver_preload(list(PRELOADED))
@@ -244,15 +261,61 @@ class Supervisor:
             elif entry.kill_at is not None:
                 entry.due = now
                 self._on_event(f"{entry.name} was ended by request; starts again")
-            elif not entry.gave_up:
+            else:
                 self._handle_exit(entry, now)
+
+    def observe(self, reported: dict[str, tuple[str, str]]) -> None:
+        """Note which nodes run; call it as often as `poll`.
+
+        Args:
+            reported: (instance, state) by node name, from the newest health (`HealthTable.reported`).
+        """
+        nodes = [entry for entry in self.children.values() if entry.name != ROUTER]
+        for entry in nodes:
+            instance, state = reported.get(entry.name, ("", ""))
+            if instance != entry.instance or state not in ("active", "drain", "drained"):
+                continue
+            entry.was_active = True
+            if entry.failed:
+                entry.failed = ""
+                self._on_event(f"{entry.name} runs again")
+        started = all(entry.was_active or entry.failed for entry in nodes)
+        if started or time.monotonic() > self._start_up_until:
+            self.starting = False
+        finite = [entry.name for entry in nodes if self._service(entry.name).finite]
+        if finite and all(reported.get(name, ("", ""))[1] == "drained" for name in finite):
+            # The data have ended, and what follows a failed node waits for it without end.
+            failed = (e for e in nodes if e.failed and self._is_essential(e.name))
+            self.obstacle = self.obstacle or next((f"{e.name} cannot run: {e.failed}" for e in failed), "")
+
+    def _service(self, name: str) -> Service:
+        return service_of(self.deployment, name, self.table)
+
+    def _is_essential(self, name: str) -> bool:
+        option = self.deployment.nodes[name].get("essential")
+        return self._service(name).essential if option is None else bool(option)
+
+    def _handle_failure(self, entry: Child, now: float) -> None:
+        """Schedule the next start of a process that has ended with a UserError, or record an obstacle."""
+        before, entry.failed = entry.failed, self.last_error(entry.name)
+        text = f"{entry.name} cannot run: {entry.failed}"
+        name = entry.name
+        if name != ROUTER and (self._service(name).finite or (self.starting and self._is_essential(name))):
+            self.obstacle = self.obstacle or text
+        if now - entry.started > HEALTHY_S:
+            entry.failures = 0
+        delay = RETRY_S[min(entry.failures, len(RETRY_S) - 1)]
+        entry.failures += 1
+        entry.due = now + delay
+        if entry.failed != before and not self.obstacle:  # an obstacle is the error with which the run ends
+            self._on_event(f"{text}; tried again in {delay:g} s")
 
     def _handle_exit(self, entry: Child, now: float) -> None:
         code = entry.process.exitcode or 0
         if code == 2:
-            entry.gave_up = True
-            self._on_event(f"{entry.name} cannot run: {self.last_error(entry.name)}")
+            self._handle_failure(entry, now)
             return
+        entry.failed = ""
         if now - entry.started > HEALTHY_S:
             entry.attempts = 0
         delay = BACK_OFF_S[min(entry.attempts, len(BACK_OFF_S) - 1)]

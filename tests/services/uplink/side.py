@@ -87,7 +87,7 @@ class HostCommands:
             },
             "restarts": {c.name: c.restarts for c in children},
             "down": [c.name for c in children if not c.process.is_alive()],
-            "gave_up": [c.name for c in children if c.gave_up],
+            "failed": [c.name for c in children if c.failed],
         }
 
 
