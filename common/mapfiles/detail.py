@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from beamsplat.common.raster.layout import ALPHA_MAX, COLOUR, MEAN, OPACITY, QUAT, SCALE
 
 FINEST_CELL_M = 0.02  # smallest cell; most Gaussians are as large, so smaller cells save little
+_COARSEST_CELL_M = FINEST_CELL_M * 2**16  # 1.3 km: larger than any map
 _MIN_SIGMA_M = 1e-4  # of a merged Gaussian: keeps its covariance invertible
 _MAX_GROWTH = 1.6  # of a merged Gaussian's area; best of 1 to 2.5 on a mapped home
 
@@ -23,9 +24,17 @@ _MAX_GROWTH = 1.6  # of a merged Gaussian's area; best of 1 to 2.5 on a mapped h
 def detail_cell_m(distance_m: float, focal_px: float, error_px: float) -> float:
     """Return the edge (m) of the largest cell that appears at most `error_px` large in the image.
 
-    Edges are `FINEST_CELL_M` times a power of two; 0.0 (full detail) if the finest cell is larger.
+    Edges are `FINEST_CELL_M` times a power of two, at most `_COARSEST_CELL_M`; 0.0 (full detail) if the
+    finest cell is larger.
+
+    Raises:
+        ValueError: a length is not finite, negative, or (`focal_px`) zero.
     """
-    cell_m = error_px * distance_m / focal_px
+    if not (0.0 <= distance_m < math.inf and 0.0 < focal_px < math.inf and 0.0 <= error_px < math.inf):
+        raise ValueError(
+            f"distance_m={distance_m}, focal_px={focal_px}, error_px={error_px}: expected finite lengths"
+        )
+    cell_m = min(error_px * distance_m / focal_px, _COARSEST_CELL_M)
     if cell_m < FINEST_CELL_M:
         return 0.0
     return FINEST_CELL_M * 2.0 ** math.floor(math.log2(cell_m / FINEST_CELL_M))

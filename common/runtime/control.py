@@ -9,6 +9,7 @@ from collections.abc import Iterator
 
 from beamsplat.common.files.persist import claim_epoch
 from beamsplat.common.messages import Answer
+from beamsplat.common.runtime.handover import parse_progress
 from beamsplat.common.runtime.running_node import RunningNode
 from beamsplat.common.zenoh.bus import Bus
 
@@ -49,7 +50,7 @@ class HandoverControl:
                 r.handover.retired = True  # messages that arrive from here on belong to the successor
             try:
                 r.node.hand_over()
-            except ValueError:
+            except Exception:
                 r.handover.retired = False
                 raise
         with r.changed:
@@ -69,10 +70,11 @@ class HandoverControl:
 
     def _activate(self, after: str) -> str:
         r = self._running
+        progress = parse_progress(after)
         if r.node.hands_over:
             r.node.take_over()
         r.accepts_arrivals = not r.node.hands_over  # queued messages are passed on first
-        held = list(r.handover.activate(after))
+        held = list(r.handover.activate(progress))
         self._bus.producer.epoch = claim_epoch(r.settings.run_dir, r.node.name)
         self._pass_on_arrivals()
         r.emit(iter(held))

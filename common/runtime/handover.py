@@ -38,6 +38,7 @@ from __future__ import annotations
 import json
 from collections import deque
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from beamsplat.common.messages import Message
@@ -48,6 +49,35 @@ if TYPE_CHECKING:
 CONTROL = "control"
 _MAX_HELD = 16  # messages; one of them can be an image of some MB
 _MAX_DROPPED = 100_000  # remembered (topic, stamp) pairs of dropped messages, only to count `lost`
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far a retired process has come."""
+
+    published: dict[str, int]  # topic -> newest stamp, ns
+    handled: HandledSequences  # of a node that hands over its state
+
+
+def parse_progress(text: str) -> Progress:
+    """Return the progress in an answer to `retire`.
+
+    Raises:
+        ValueError: the text is not JSON, or not an answer of `retire`.
+    """
+    try:
+        progress = json.loads(text)
+        published = {str(topic): int(stamp) for topic, stamp in progress.get("said", {}).items()}
+        handled = {
+            str(topic): {
+                str(instance): (int(sequence), [int(number) for number in queued])
+                for instance, (sequence, queued) in instances.items()
+            }
+            for topic, instances in progress.get("handled", {}).items()
+        }
+    except (ValueError, TypeError, AttributeError, OverflowError, RecursionError) as error:
+        raise ValueError(f"not the answer of a retired process: {text[:40]!r}") from error
+    return Progress(published, handled)
 
 
 class Handover:
@@ -104,25 +134,13 @@ class Handover:
         self.retired = True
         return json.dumps({"said": self._published} if handled is None else {"handled": handled})
 
-    def activate(self, after: str) -> Iterator[tuple[str, Message]]:
+    def activate(self, progress: Progress) -> Iterator[tuple[str, Message]]:
         """Leave standby and yield (topic, message) of the stored messages to publish now, oldest first.
 
         These are the messages with a newer stamp than the predecessor has published on their topic.
-
-        Args:
-            after: the JSON text that the predecessor's `retire` returned.
-
-        Raises:
-            ValueError: `after` is not JSON, or not an answer of `retire`; the state is unchanged.
+        `progress` is the predecessor's.
         """
-        progress = json.loads(after)
-        if not isinstance(progress, dict):
-            raise ValueError(f"not the answer of a retired process: {after[:40]!r}")
-        published, handled = progress.get("said", {}), progress.get("handled", {})
-        if not (isinstance(published, dict) and isinstance(handled, dict)):
-            raise ValueError(f"not the answer of a retired process: {after[:40]!r}")
-        self._by_predecessor = {str(topic): int(stamp) for topic, stamp in published.items()}
-        self._handled = handled
+        self._by_predecessor, self._handled = progress.published, progress.handled
         self._published = dict(self._by_predecessor)
         self.standby = False
         self.lost = sum(stamp > self._by_predecessor.get(topic, -1) for topic, stamp in self._dropped)

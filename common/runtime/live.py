@@ -234,7 +234,7 @@ class Live:
                 self.running.count_query_fault(name, fault)
 
     def _answers(self, name: str, query: zenoh.Query) -> Iterator[Message]:
-        """Yield the answers to a query; its exceptions are raised while iterating, where `reply` sends them."""
+        """Yield the answers to a query; exceptions are raised while iterating, where `reply` sends them."""
         # The stubs miss that Parameters iterates over (key, value).
         parameters: dict[str, str] = dict(query.parameters)  # type: ignore[call-overload]
         if name.startswith(CONTROL):

@@ -84,7 +84,7 @@ class RunningNode:
         self._query_faults, self._last_query_fault = self._query_faults + 1, f"{query}: {fault}"
 
     def detail_text(self) -> str:
-        """Return the line of detail for the node's health: of the runner, else of the node; failed queries."""
+        """Return the detail line of the node's health: of the runner, else of the node; failed queries."""
         detail = self.detail or self.node.detail
         if not self._query_faults:
             return detail

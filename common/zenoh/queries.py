@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import logging
 import time
 from collections.abc import Iterator
 
@@ -11,8 +13,11 @@ from beamsplat.common.errors import UserError
 from beamsplat.common.messages import Answer, Message
 from beamsplat.common.messages.codec import decode, encode, schema_of
 from beamsplat.common.runtime.handover import CONTROL
+from beamsplat.common.runtime.rate_limited_log import RateLimitedLog
 from beamsplat.common.zenoh.bus import key
 from beamsplat.common.zenoh.streams import ENCODING
+
+log = logging.getLogger(__name__)
 
 _DISCOVERY_S = 2.0  # right after a (re)connection, queries to a running node get no answer yet
 
@@ -75,11 +80,17 @@ def _ask(
         time.sleep(0.1)
 
 
-def reply(query: zenoh.Query, messages: Iterator[Message]) -> None:
-    """Send `messages` as the answer to a query.
+_fault_log = RateLimitedLog()
 
-    A ValueError raised by the iterator (invalid parameters) is sent as an error reply and not raised here:
-    a query must not be able to stop a node.
+
+def reply(query: zenoh.Query, messages: Iterator[Message]) -> str:
+    """Send `messages` as the answer to a query; no exception of the iterator is raised here.
+
+    An exception is sent as an error reply: a query must not be able to stop a node. A ValueError says what is
+    wrong with the parameters. Any other exception is a fault of the node itself: it is also logged.
+
+    Returns:
+        The fault of the node, as "ZeroDivisionError: division by zero"; "" without a fault.
     """
     with query:
         try:
@@ -87,4 +98,16 @@ def reply(query: zenoh.Query, messages: Iterator[Message]) -> None:
                 encoding = ENCODING.with_schema(schema_of(message))
                 query.reply(query.key_expr, encode(message), encoding=encoding)
         except ValueError as error:
-            query.reply_err(str(error).encode())
+            _reply_error(query, str(error))
+        except Exception as error:
+            fault = f"{type(error).__name__}: {error}"
+            if (count := _fault_log.due(str(query.key_expr))) is not None:
+                log.exception("%s failed (%d more since the last report)", query.key_expr, count)
+            _reply_error(query, f"fault in this node: {fault}; its log has the details")
+            return fault
+    return ""
+
+
+def _reply_error(query: zenoh.Query, text: str) -> None:
+    with contextlib.suppress(zenoh.ZError):  # the asker has left
+        query.reply_err(text.encode())

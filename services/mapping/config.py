@@ -9,6 +9,7 @@ from pydantic import Field
 
 from beamsplat.common.config.deployment import NodeConfig
 
+PositiveFinite = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 Steps = Annotated[int, Field(ge=0, le=100_000)]
 
 
@@ -30,12 +31,12 @@ class MappingConfig(NodeConfig):
     refine_pose: bool = True
     refine_exposure: bool = True
     chunk_every: Annotated[int, Field(ge=1)] = 2  # keyframes between two updates of the newest chunk
-    chunk_error_px: Annotated[float, Field(gt=0.0)] = 1.0  # smaller detail in the image is not published
+    chunk_error_px: PositiveFinite = 1.0  # smaller detail in the image is not published
     seed: int = 0
     save: Path | None = None  # folder for splats.ply and keyframes.tum, written at the end of the data
     session: Path | None = None  # folder of the saved map: written while mapping, resumed at the start
-    memory_mb: Annotated[float, Field(gt=0.0)] | None = None  # budget of this process; the rest is on disk
-    session_every_s: Annotated[float, Field(gt=0.0)] = 30.0  # between checkpoints, in time of the data
+    memory_mb: PositiveFinite | None = None  # budget of this process; the rest is on disk
+    session_every_s: PositiveFinite = 30.0  # between checkpoints, in time of the data
 
     def gaussians(self) -> int:
         """Return `max_gaussians`, by default 300 000 without `memory_mb`, else 20 million."""

@@ -16,7 +16,7 @@ from beamsplat.common.messages.depth_png import depth_from_png, mask_from_png, s
 from beamsplat.common.messages.image_codec import decode_rgb
 from beamsplat.common.messages.splat_codec import pack
 from beamsplat.common.raster.camera import RasterCamera
-from beamsplat.services.mapping.chunks import ChunkUpdate, Viewpoint
+from beamsplat.services.mapping.chunks import ChunkUpdate
 from beamsplat.services.mapping.keyframe import RgbdKeyframe
 from beamsplat.services.mapping.preview import KeyframeRender
 
@@ -96,20 +96,3 @@ def joined_state(pieces: list[MapState]) -> Arrays:
             f"received {len(blob)} of {pieces[0].total if pieces else 0} bytes of the map: try again"
         )
     return unpacked_arrays(blob)
-
-
-def viewpoint_of(parameters: dict[str, str]) -> Viewpoint | None:
-    """Return the viewpoint in the parameters of a query; None without the parameter `from`.
-
-    Raises:
-        UserError: a parameter is missing or not a number.
-    """
-    if "from" not in parameters:
-        return None
-    try:
-        x, y, z = (float(word) for word in parameters["from"].split(","))
-        return Viewpoint(
-            np.array([x, y, z]), float(parameters["focal_px"]), float(parameters.get("error_px", "1"))
-        )
-    except (KeyError, ValueError) as error:
-        raise UserError("snapshot: expected numbers from=X,Y,Z (m, map frame) and focal_px=F") from error

@@ -30,9 +30,9 @@ from beamsplat.services.mapping.messages import (
     chunk_message,
     preview_message,
     state_messages,
-    viewpoint_of,
 )
 from beamsplat.services.mapping.preview import render_keyframe
+from beamsplat.services.mapping.queries import check_names, viewpoint_of
 from beamsplat.services.mapping.session.checkpointer import CheckpointResult
 from beamsplat.services.mapping.session.live_session import LiveSession, MapSession, NoSession
 from beamsplat.services.mapping.session.paging import check_budget
@@ -229,14 +229,20 @@ class MappingNode(Node):
         With the parameters `from=X,Y,Z` (m, map frame), `focal_px` and `error_px`, detail that is invisible
         from this viewpoint is omitted.
         """
-        for anchor, part in chunk_snapshot(self._mapper, viewpoint_of(parameters)).items():
+        viewpoint = viewpoint_of(parameters)
+        self._check_map("snapshot")
+        for anchor, part in chunk_snapshot(self._mapper, viewpoint).items():
             yield chunk_message(self._mapper.T_map_anchor[anchor], anchor, part, 0)
 
     def on_query_state(self, parameters: dict[str, str]) -> Iterator[MapState]:
         """Yield the current state of the map, with the content of a checkpoint, in several messages."""
-        if not self._mapper.keyframes:
-            raise UserError("the map is still empty")
+        check_names("state", parameters, ())
+        self._check_map("state")
         yield from state_messages(self._session.complete(arrays_of(self._mapper, self._intake.arrays())))
+
+    def _check_map(self, query: str) -> None:
+        if not self._intake.stored():
+            raise UserError(f"{query}: the map is still empty")
 
     # --- end of the data ---
 

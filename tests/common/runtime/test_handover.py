@@ -5,7 +5,7 @@ import pytest
 
 from beamsplat.common.messages import Grid, Odometry
 from beamsplat.common.messages.header import Header
-from beamsplat.common.runtime.handover import Handover
+from beamsplat.common.runtime.handover import Handover, parse_progress
 from beamsplat.common.runtime.mailbox import NO_PRODUCER, Envelope, Mailbox
 from tests.common.nodes import Sink
 
@@ -22,7 +22,7 @@ def published(handover, topic, stamps):
 
 
 def activated(handover, after):
-    return [(topic, message.stamp_ns) for topic, message in handover.activate(after)]
+    return [(topic, message.stamp_ns) for topic, message in handover.activate(parse_progress(after))]
 
 
 def test_a_successor_continues_where_its_predecessor_ended():

@@ -82,15 +82,18 @@ class Query:
         self.errors.append(payload)
 
 
-def test_only_bad_input_becomes_an_error_reply():
-    """A fault of the node itself must stop the node, and be seen in its log."""
+def test_bad_input_and_faults_of_the_node_become_error_replies(caplog):
+    """Neither may stop the node; a fault is returned and logged with its traceback, bad input is not."""
 
     def raises(error):
         raise error
         yield
 
     query = Query()
-    reply(query, raises(ValueError("bad")))
+    assert reply(query, raises(ValueError("bad"))) == ""
     assert query.errors == [b"bad"]
-    with pytest.raises(ZeroDivisionError):
-        reply(Query(), raises(ZeroDivisionError()))
+    assert caplog.text == ""
+    query = Query()
+    assert reply(query, raises(ZeroDivisionError("by zero"))) == "ZeroDivisionError: by zero"
+    assert query.errors == [b"fault in this node: ZeroDivisionError: by zero; its log has the details"]
+    assert "Traceback" in caplog.text

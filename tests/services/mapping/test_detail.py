@@ -15,7 +15,8 @@ from beamsplat.common.raster.layout import COLOUR, MEAN, OPACITY, QUAT, SCALE
 from beamsplat.common.raster.rasterizer import Rasterizer
 from beamsplat.services.mapping.chunks import ChunkFeed, Viewpoint, chunk_snapshot
 from beamsplat.services.mapping.mapper import Mapper
-from beamsplat.services.mapping.messages import joined_state, state_messages, viewpoint_of
+from beamsplat.services.mapping.messages import joined_state, state_messages
+from beamsplat.services.mapping.queries import viewpoint_of
 from beamsplat.services.mapping.settings import MapperSettings
 
 
@@ -119,7 +120,7 @@ def test_a_query_may_contain_a_viewpoint():
     assert viewpoint.at_map_m.tolist() == [1.0, 2.0, 3.0]
     assert (viewpoint.focal_px, viewpoint.error_px) == (300.0, 1.0)
     for wrong in ({"from": "1,2"}, {"from": "1,2,3"}, {"from": "a,b,c", "focal_px": "3"}):
-        with pytest.raises(UserError, match="from=X,Y,Z"):
+        with pytest.raises(UserError, match="snapshot: "):
             viewpoint_of(wrong)
 
 
