@@ -11,6 +11,7 @@ A host's folder of keys, written by `beamsplat keys`, contains
 from __future__ import annotations
 
 import json
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -98,3 +99,18 @@ def check_endpoint(endpoint: str, security: SecurityConfig) -> None:
             f"{endpoint} leaves this host unprotected: use tls/ and `beamsplat keys`, or set "
             "security.plain = true in a network that you trust"
         )
+
+
+def write_private(path: Path, data: bytes) -> None:
+    """Replace a file by a new file that is created with mode 600: other users can never read the data.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    fresh = path.with_name(f".{path.name}")
+    fresh.unlink(missing_ok=True)
+    with os.fdopen(os.open(fresh, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
+    fresh.replace(path)

@@ -13,7 +13,6 @@ each user follow from the topic table (access_control.py).
 from __future__ import annotations
 
 import json
-import os
 import secrets
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,7 +22,7 @@ import zenoh
 from beamsplat.common.errors import UserError, reason
 from beamsplat.common.files.persist import make_folder
 from beamsplat.common.security.access_control import ADMIN_USERS, local_access_control
-from beamsplat.common.security.keys import SecurityConfig, is_loopback
+from beamsplat.common.security.keys import SecurityConfig, is_loopback, write_private
 
 SUPERVISOR, OPERATOR = ADMIN_USERS
 USERS = "users"
@@ -55,8 +54,9 @@ def make_logins(folder: Path, names: tuple[str, ...]) -> None:
     try:
         folder.chmod(0o700)
         for name, password in known.items():
-            _write(folder / f"{name}.login", f"{name}:{password}\n")
-        _write(folder / USERS, "".join(f"{name}:{password}\n" for name, password in known.items()))
+            write_private(folder / f"{name}.login", f"{name}:{password}\n".encode())
+        lines = "".join(f"{name}:{password}\n" for name, password in known.items())
+        write_private(folder / USERS, lines.encode())
     except OSError as error:
         raise UserError(f"security.local = {folder}: cannot be written ({error.strerror})") from error
 
@@ -114,12 +114,3 @@ def _lines(path: Path) -> dict[str, str]:
     if not rows:
         raise UserError(f"{path}: empty; remove its folder to have new logins created")
     return rows
-
-
-def _write(path: Path, text: str) -> None:
-    """Replace a file by a new file that is created with mode 600: other users can never read the text."""
-    fresh = path.with_name(f".{path.name}")
-    fresh.unlink(missing_ok=True)
-    with os.fdopen(os.open(fresh, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
-        file.write(text)
-    fresh.replace(path)

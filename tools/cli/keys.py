@@ -12,6 +12,7 @@ from beamsplat.common.errors import UserError
 
 app = typer.Typer(no_args_is_help=True, help="Certificates for links between hosts.")
 DEFAULT = Path("~/.config/beamsplat/authority")
+_DATE = "%Y-%m-%d %H:%M UTC"
 FolderOption = Annotated[Path, typer.Option("--authority", help="Folder of the authority")]
 NameArgument = Annotated[str, typer.Argument(help="Name of the host: lower case, digits, - and _")]
 
@@ -55,15 +56,17 @@ def issue(
         beamsplat keys issue robot1
     """
     from beamsplat.common.security.access_control import HostRole
-    from beamsplat.tools.keys.pki import CertificateAuthority, expiry
+    from beamsplat.common.security.keys import CERTIFICATE
+    from beamsplat.tools.keys.certificates import read_certificate
+    from beamsplat.tools.keys.pki import CertificateAuthority
 
     if not (name.isascii() and name.replace("-", "a").replace("_", "a").isalnum() and name == name.lower()):
         raise UserError(f"{name!r}: the name of a host may have lower case letters, digits, - and _ only")
     whose = robot or (name if role == "robot" else "*")
     host = parse(HostRole, {"role": role, "robot": whose}, f"host {name!r}")
     folder = CertificateAuthority(authority).issue(name, host, tuple(address or ()), days)
-    print(f"{folder}: copy it to {name}, to the folder in `security.keys`; valid until "
-          f"{expiry(folder / 'host.pem')}")  # fmt: skip
+    until = read_certificate(folder / CERTIFICATE).not_valid_after_utc
+    print(f"{folder}: copy it to {name}, to the folder in `security.keys`; valid until {until:{_DATE}}")
 
 
 @app.command()
@@ -86,10 +89,14 @@ def list_hosts(authority: FolderOption = DEFAULT) -> None:
 
     Example: beamsplat keys list
     """
-    from beamsplat.tools.keys.pki import CertificateAuthority, expiry
+    from beamsplat.common.security.keys import CERTIFICATE
+    from beamsplat.tools.keys.certificates import read_certificate
+    from beamsplat.tools.keys.pki import CertificateAuthority
 
     found = CertificateAuthority(authority)
     for name, host in found.hosts().items():
-        certificate = found.folder / "hosts" / name / "host.pem"
-        until = expiry(certificate) if certificate.exists() else "files are missing"
+        path = found.folder / "hosts" / name / CERTIFICATE
+        until = (
+            f"{read_certificate(path).not_valid_after_utc:{_DATE}}" if path.exists() else "files are missing"
+        )
         print(f"{name:<20} {host.role:<9} robot {host.robot:<12} {until}")

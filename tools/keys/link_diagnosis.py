@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import socket
 import ssl
 from collections.abc import Iterator
@@ -22,7 +21,7 @@ from beamsplat.common.security.keys import (
     is_loopback,
     is_secure,
 )
-from beamsplat.tools.keys.pki import expiry, openssl
+from beamsplat.tools.keys.certificates import common_name, is_issued_by, read_certificate
 
 EXPIRES_SOON_DAYS = 14  # before the expiry of a certificate, a note is given
 _TIMEOUT_S = 3.0  # to connect to the edge
@@ -82,17 +81,13 @@ def _endpoint_finding(endpoint: str) -> LinkFinding:
 
 
 def _check_certificate(folder: Path) -> Iterator[LinkFinding]:
-    if shutil.which("openssl") is None:
-        yield "certificate", "note", "not checked: `openssl` is not installed", "apt install openssl"
-        return
     file = folder / CERTIFICATE
     try:
-        text = openssl("x509", "-in", str(file), "-noout", "-subject", "-nameopt", "multiline")
-        until = datetime.strptime(expiry(file), "%b %d %H:%M:%S %Y %Z").replace(tzinfo=UTC)
-    except (UserError, ValueError) as error:
-        yield "certificate", "fault", f"{file} cannot be read: {error}", _RENEW
+        certificate, authority = read_certificate(file), read_certificate(folder / CA)
+    except UserError as error:
+        yield "certificate", "fault", str(error), _RENEW
         return
-    name = next((line.rpartition("= ")[2] for line in text.splitlines() if "commonName" in line), "nobody")
+    name, until = common_name(certificate), certificate.not_valid_after_utc
     days = (until - datetime.now(UTC)).total_seconds() / 86400
     if days < 0:
         yield (
@@ -105,9 +100,7 @@ def _check_certificate(folder: Path) -> Iterator[LinkFinding]:
         yield "certificate", "note", f"{name}: expires in {days:.0f} days", _RENEW
     else:
         yield "certificate", "ok", f"{name}: valid for {days:.0f} days", ""
-    try:
-        openssl("verify", "-no_check_time", "-CAfile", str(folder / CA), str(file))
-    except UserError:
+    if not is_issued_by(certificate, authority):
         yield "certificate", "fault", f"{file} was not issued by {folder / CA}", _RENEW
 
 
