@@ -15,6 +15,7 @@ from rich.markup import escape
 from beamsplat.common.errors import UserError
 from beamsplat.common.optional_packages import missing_packages_explained
 from beamsplat.tools.cli import bench as bench_cli
+from beamsplat.tools.cli import bench_endurance as endurance_cli
 from beamsplat.tools.cli import bench_mapping as mapping_cli
 from beamsplat.tools.cli import bug_report, demo, doctor, warm
 from beamsplat.tools.cli import calibrate as calibrate_cli
@@ -71,6 +72,7 @@ app.add_typer(keys_cli.app, name="keys", rich_help_panel=_MACHINE)
 bench_cli.app.command("depth")(depth_cli.bench_depth)
 bench_cli.app.command("raster")(mapping_cli.bench_raster)
 bench_cli.app.command("map")(mapping_cli.bench_map)
+bench_cli.app.command("laps")(endurance_cli.bench_laps)
 app.add_typer(bench_cli.app, name="bench", rich_help_panel=_MACHINE)
 
 
