@@ -26,8 +26,8 @@ _FutureT = TypeVar("_FutureT", bound=JobFuture)
 class LazyFuture:
     """Future that runs its job when the result is requested: single-threaded and reproducible (lockstep)."""
 
-    def __init__(self, run: Callable[[], Any]) -> None:
-        self._run = run
+    def __init__(self, job: Job) -> None:
+        self._run = job.run
 
     def result(self) -> Any:
         return self._run()
@@ -53,30 +53,42 @@ class _WorkerFuture(concurrent.futures.Future):
         return super().result(timeout)
 
 
-class JobThread:
-    """One daemon thread that runs jobs in order of submission; it does not block the end of the process.
+class JobThreads:
+    """Two daemon threads that run jobs in order of submission; they do not block the end of the process.
 
-    The threads of `concurrent.futures` executors would block it.
+    Jobs for whose results a step waits (`Job.after`) have a thread of their own: they never wait for the
+    others, which may write to a slow disk. The threads of `concurrent.futures` executors would block the end.
     """
 
     def __init__(self, must_stop: Callable[[], bool]) -> None:
         self._must_stop = must_stop
-        self._waiting: queue.SimpleQueue[tuple[_WorkerFuture, Callable[[], Any]]] = queue.SimpleQueue()
-        threading.Thread(target=self._work, name="job", daemon=True).start()
+        self._awaited, self._others = _queue_of_thread("job"), _queue_of_thread("job-unawaited")
 
-    def submit(self, run: Callable[[], Any]) -> concurrent.futures.Future:
-        """Queue the job `run` and return its future; the job runs after all jobs submitted before it."""
+    def submit(self, job: Job) -> concurrent.futures.Future:
+        """Queue a job and return its future."""
         future = _WorkerFuture(self._must_stop)
-        self._waiting.put((future, run))
+        (self._others if job.after is None else self._awaited).put((future, job.run))
         return future
 
-    def _work(self) -> None:
-        while True:
-            future, run = self._waiting.get()
-            try:
-                future.set_result(run())
-            except BaseException as error:  # re-raised by `result()`
-                future.set_exception(error)
+
+_Queue = queue.SimpleQueue[tuple[_WorkerFuture, Callable[[], Any]]]
+
+
+def _queue_of_thread(name: str) -> _Queue:
+    """Return the queue of a new thread that runs the jobs in it."""
+    waiting: _Queue = queue.SimpleQueue()
+    threading.Thread(target=_work, args=(waiting,), name=name, daemon=True).start()
+    return waiting
+
+
+def _work(waiting: _Queue) -> None:
+    while True:
+        future, run = waiting.get()
+        try:
+            future.set_result(run())
+        except BaseException as error:  # re-raised by `result()`
+            future.set_exception(error)
+        del future, run  # else a result stays in memory until the next job
 
 
 @dataclass
@@ -89,13 +101,13 @@ class _Pending(Generic[_FutureT]):
 class JobQueue(Generic[_FutureT]):
     """Jobs that one node has started and whose results it has not received yet."""
 
-    def __init__(self, submit: Callable[[Callable[[], Any]], _FutureT]) -> None:
+    def __init__(self, submit: Callable[[Job], _FutureT]) -> None:
         self._submit = submit
         self._pending: list[_Pending[_FutureT]] = []
 
     def start(self, job: Job) -> _FutureT:
         """Submit `job` for execution in the background and return its future."""
-        future = self._submit(job.run)
+        future = self._submit(job)
         self._pending.append(_Pending(job, future, job.after))
         return future
 

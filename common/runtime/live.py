@@ -1,6 +1,6 @@
 """Live runner: runs one node as one process on Zenoh.
 
-Threads: the main thread runs the node; one per subscription fills the mailbox; one runs background jobs; one
+Threads: the main thread runs the node; one per subscription fills the mailbox; two run background jobs; one
 publishes health every second. A node's handlers are called from the main thread only, except `on_arrival`.
 """
 
@@ -22,7 +22,7 @@ from beamsplat.common.messages import Health, Message
 from beamsplat.common.runtime.control import HandoverControl
 from beamsplat.common.runtime.handover import CONTROL
 from beamsplat.common.runtime.health_reporter import HealthReporter
-from beamsplat.common.runtime.jobs import JobAbandoned, JobQueue, JobThread
+from beamsplat.common.runtime.jobs import JobAbandoned, JobQueue, JobThreads
 from beamsplat.common.runtime.live_settings import LiveSettings
 from beamsplat.common.runtime.mailbox import NO_PRODUCER
 from beamsplat.common.runtime.node import Node, subscriptions
@@ -69,7 +69,7 @@ class Live:
             raise
         with Bus(session, settings.robot, node.name, r.instance, epoch) as bus:
             reporter = HealthReporter(r, bus)
-            r.jobs = JobQueue(JobThread(self._must_abandon).submit)
+            r.jobs = JobQueue(JobThreads(self._must_abandon).submit)
             node.set_query_function(partial(ask, session, settings.robot))
             try:
                 node.configure()

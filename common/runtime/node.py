@@ -62,7 +62,8 @@ class Job:
     Args:
         run: the computation; it must not access state that the node changes meanwhile.
         after: deliver the result just before the n-th next message, and wait for it if necessary:
-            reproducible in both runners. None: deliver it when it is finished.
+            reproducible in both runners. None: deliver it when it is finished; for work on a disk, which
+            then delays no result that the node waits for.
         of: topic whose messages `after` counts; the default counts the messages of all inputs.
     """
 

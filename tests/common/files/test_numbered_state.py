@@ -85,9 +85,8 @@ def test_an_error_of_any_call_leaves_the_old_or_the_new_state(saved, how):
     assert {"open", "write", "fsync", "replace", "unlink", "close"} <= set(disk.calls)
     for at, call in enumerate(disk.calls):
         state = saved()
-        with FaultyDisk(at, how):
-            with contextlib.suppress(OSError):
-                state.write(2)
+        with FaultyDisk(at, how), contextlib.suppress(OSError):
+            state.write(2)
         check(state, f"{call} (call {at})")
 
 
@@ -106,9 +105,8 @@ def test_an_error_while_the_first_state_is_written_leaves_none(tmp_path):
     def run(at):
         shutil.rmtree(tmp_path / "s", ignore_errors=True)
         session = Session(tmp_path / "s")
-        with FaultyDisk(at) as disk:
-            with contextlib.suppress(OSError):
-                session.write(2)
+        with FaultyDisk(at) as disk, contextlib.suppress(OSError):
+            session.write(2)
         assert session.folder.manifest() is None or session.read() == 2
         return disk.calls
 

@@ -4,14 +4,14 @@ import threading
 
 import pytest
 
-from beamsplat.common.runtime.jobs import JobAbandoned, JobQueue, JobThread, LazyFuture
+from beamsplat.common.runtime.jobs import JobAbandoned, JobQueue, JobThreads, LazyFuture
 from beamsplat.common.runtime.node import Job
 from tests.common.polling import wait_until
 
 
 @pytest.fixture(params=["lazy", "thread"])
 def jobs(request):
-    return JobQueue(LazyFuture if request.param == "lazy" else JobThread(lambda: False).submit)
+    return JobQueue(LazyFuture if request.param == "lazy" else JobThreads(lambda: False).submit)
 
 
 def test_a_result_is_due_before_the_nth_message_in_both_runners(jobs):
@@ -50,9 +50,9 @@ def test_an_error_of_a_job_is_raised_where_its_result_is_delivered(jobs):
         list(jobs.before_message("rig"))
 
 
-def test_jobs_of_a_thread_run_in_order_and_are_delivered_when_finished():
+def test_jobs_without_a_fixed_delivery_run_in_order_and_are_delivered_when_finished():
     go = threading.Event()
-    jobs = JobQueue(JobThread(lambda: False).submit)
+    jobs = JobQueue(JobThreads(lambda: False).submit)
     first = jobs.start(Job("first", lambda: go.wait(10.0)))
     second = jobs.start(Job("second", lambda: 2))
     assert list(jobs.finished()) == []
@@ -62,9 +62,19 @@ def test_jobs_of_a_thread_run_in_order_and_are_delivered_when_finished():
     assert list(jobs.finished()) == [("first", True), ("second", 2)]
 
 
+def test_a_result_that_a_step_waits_for_does_not_wait_for_other_jobs():
+    go = threading.Event()
+    jobs = JobQueue(JobThreads(lambda: False).submit)
+    jobs.start(Job("writes to a slow disk", go.wait))
+    jobs.start(Job("sum", lambda: 42, after=1))
+    assert list(jobs.before_message("rig")) == [("sum", 42)]
+    go.set()
+    assert list(jobs.remaining_results()) == [("writes to a slow disk", True)]
+
+
 def test_a_process_that_must_stop_abandons_a_job_that_does_not_finish():
     never, stop = threading.Event(), []
-    jobs = JobQueue(JobThread(lambda: bool(stop)).submit)
+    jobs = JobQueue(JobThreads(lambda: bool(stop)).submit)
     jobs.start(Job("endless", never.wait, after=1))
     stop.append(True)
     with pytest.raises(JobAbandoned):
