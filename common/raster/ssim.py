@@ -45,8 +45,13 @@ def _blur_along_row(padded: np.ndarray, out: np.ndarray, taps: np.ndarray) -> No
 
 
 @kernel
-def _prepare(counter: np.ndarray, image: np.ndarray, rgb: np.ndarray, planes: np.ndarray) -> None:
-    """Fill the planes x, y, xx, yy, xy; x, y = luma of the rendered and the true image (`rgb`, 0 to 255)."""
+def _prepare(
+    counter: np.ndarray, image: np.ndarray, rgb: np.ndarray, luma: np.ndarray, planes: np.ndarray
+) -> None:
+    """Fill the planes x, y, xx, yy, xy; x, y = luma of the rendered and the true image (`rgb`, 0 to 255).
+
+    `luma` float32 [4]: weights of red, green and blue of the rendered image, and an offset.
+    """
     height = image.shape[1]
     unit = np.float32(1.0 / 255.0)
     while True:
@@ -54,7 +59,7 @@ def _prepare(counter: np.ndarray, image: np.ndarray, rgb: np.ndarray, planes: np
         if y >= height:
             return
         for x in range(image.shape[2]):
-            a = LUMA[0] * image[0, y, x] + LUMA[1] * image[1, y, x] + LUMA[2] * image[2, y, x]
+            a = luma[0] * image[0, y, x] + luma[1] * image[1, y, x] + luma[2] * image[2, y, x] + luma[3]
             b = unit * (LUMA[0] * rgb[0, y, x] + LUMA[1] * rgb[1, y, x] + LUMA[2] * rgb[2, y, x])
             planes[0, y, x], planes[1, y, x] = a, b
             planes[2, y, x], planes[3, y, x], planes[4, y, x] = a * a, b * b, a * b
@@ -106,9 +111,10 @@ def _accumulate_gradient(
     partials: np.ndarray,
     taps: np.ndarray,
     scale: np.float32,
+    luma: np.ndarray,
     gradient: np.ndarray,
 ) -> None:
-    """Add scale * dSSIM/d(pixel) to the rows R, G, B of `gradient`."""
+    """Add scale * dSSIM/d(pixel) to the rows R, G, B of `gradient`; `luma` as in `_prepare`."""
     height, width = planes.shape[1], planes.shape[2]
     padded = np.zeros(width + 2 * _PAD, np.float32)
     m = np.empty((3, width), np.float32)
@@ -123,9 +129,9 @@ def _accumulate_gradient(
             for x in range(width):
                 g = m[0, x] + np.float32(2.0) * planes[0, y, x] * m[1, x] + planes[1, y, x] * m[2, x]
                 g *= scale
-                gradient[0, y, x] += LUMA[0] * g
-                gradient[1, y, x] += LUMA[1] * g
-                gradient[2, y, x] += LUMA[2] * g
+                gradient[0, y, x] += luma[0] * g
+                gradient[1, y, x] += luma[1] * g
+                gradient[2, y, x] += luma[2] * g
 
 
 class SsimLoss:
@@ -139,13 +145,21 @@ class SsimLoss:
         return sum(array.nbytes for arrays in self._memory.values() for array in arrays)
 
     def add(
-        self, image: np.ndarray, rgb: np.ndarray, weight: float, gradient: np.ndarray, team: ThreadTeam
+        self,
+        image: np.ndarray,
+        rgb: np.ndarray,
+        exposure: np.ndarray,
+        weight: float,
+        gradient: np.ndarray,
+        team: ThreadTeam,
     ) -> float:
         """Add dL/d(image) to `gradient`, and return the loss L.
 
         Args:
             image: rendered image, float32 [5, H, W]: red, green, blue in [0, 1], depth, alpha (not used).
             rgb: camera image to compare with, [3, H, W]: red, green, blue, 0 to 255.
+            exposure: float32 [6], log gains of red, green, blue, then their offsets (not log). The rendered
+                colour is compared after exp(log gain) * colour + offset.
             weight: weight of the loss.
             gradient: float32 [5, H, W], channels as in `image`; changed in place.
             team: threads that run the kernels.
@@ -154,9 +168,12 @@ class SsimLoss:
         if (h, w) not in self._memory:
             self._memory[h, w] = np.empty((5, h, w), np.float32), np.empty((3, h, w), np.float32), np.empty(h)
         planes, partials, sums = self._memory[h, w]
-        team.run(_prepare, image, rgb, planes)
+        weights = np.array(LUMA)
+        luma = np.append(weights * np.exp(exposure[:3]), weights @ exposure[3:]).astype(np.float32)
+        team.run(_prepare, image, rgb, luma, planes)
         team.run(_partials, planes, TAPS, partials, sums)
-        team.run(_accumulate_gradient, planes, partials, TAPS, np.float32(-0.5 * weight / (h * w)), gradient)
+        scale = np.float32(-0.5 * weight / (h * w))
+        team.run(_accumulate_gradient, planes, partials, TAPS, scale, luma, gradient)
         return 0.5 * weight * (1.0 - float(sums.sum()) / (h * w))
 
 

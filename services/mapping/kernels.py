@@ -38,8 +38,7 @@ def photometric_and_depth(
             rendered colour is compared after exp(log gain) * colour + offset.
         colour_scale, depth_scale: factors of the two losses, per pixel.
         gradient: out float32 [5, H, W], derivative of the loss with respect to `image`.
-        sums: out float64 [H, 8], per row: sum of |colour error| (0), depth loss (1), derivatives of the loss
-            with respect to the log gains (2 to 4) and the offsets (5 to 7).
+        sums: out float64 [H, 2], per row: sum of |colour error| and depth loss.
     """
     height, width = image.shape[1], image.shape[2]
     to_unit = np.float32(1.0 / 255.0)
@@ -50,18 +49,11 @@ def photometric_and_depth(
         total = np.float32(0.0)
         for channel in range(3):
             gain, offset = np.float32(np.exp(exposure[channel])), exposure[3 + channel]
-            d_gain, d_offset = np.float32(0.0), np.float32(0.0)
             for x in range(width):
-                shown = image[channel, y, x] * gain
-                error = shown + offset - np.float32(rgb[channel, y, x]) * to_unit
+                error = image[channel, y, x] * gain + offset - np.float32(rgb[channel, y, x]) * to_unit
                 slope = np.float32(1.0) if error > 0.0 else np.float32(-1.0)
-                g = slope * colour_scale
-                gradient[channel, y, x] = g * gain
+                gradient[channel, y, x] = slope * colour_scale * gain
                 total += abs(error)
-                d_gain += g * shown
-                d_offset += g
-            sums[y, 2 + channel] = d_gain
-            sums[y, 5 + channel] = d_offset
         sums[y, 0] = total
         depth_total = np.float32(0.0)
         for x in range(width):
@@ -74,6 +66,36 @@ def photometric_and_depth(
             gradient[4, y, x] = -slope * d
             depth_total += w * abs(error)
         sums[y, 1] = depth_total
+
+
+@kernel
+def exposure_gradient(
+    counter: np.ndarray, image: np.ndarray, gradient: np.ndarray, exposure: np.ndarray, sums: np.ndarray
+) -> None:
+    """Compute the derivatives of the loss with respect to the exposure.
+
+    All losses of colour compare s = exp(log gain) * colour + offset. So dL/d(colour) = exp(log gain) * dL/ds
+    contains the derivatives dL/d(offset) = sum of dL/ds and dL/d(log gain) = sum of colour * dL/d(colour).
+
+    Args:
+        counter, image, exposure: as in `photometric_and_depth`.
+        gradient: float32 [5, H, W], complete derivative of the loss with respect to `image`, zero at hidden
+            pixels.
+        sums: out float64 [H, 6], per row: derivatives with respect to the log gains, then to the offsets.
+    """
+    height, width = image.shape[1], image.shape[2]
+    while True:
+        y = atomic_next(counter, 0)
+        if y >= height:
+            return
+        for channel in range(3):
+            d_gain, d_shown = np.float32(0.0), np.float32(0.0)
+            for x in range(width):
+                g = gradient[channel, y, x]
+                d_gain += g * image[channel, y, x]
+                d_shown += g
+            sums[y, channel] = d_gain
+            sums[y, 3 + channel] = d_shown / np.float32(np.exp(exposure[channel]))
 
 
 @kernel

@@ -88,6 +88,7 @@ class StoredKeyframe:
     exposure: np.ndarray = field(default_factory=lambda: np.zeros(6, np.float32))  # log gains, offsets
     exposure_first: np.ndarray = field(default_factory=lambda: np.zeros(6))
     exposure_second: np.ndarray = field(default_factory=lambda: np.zeros(6))
+    exposure_steps: int = 0
     reach_m: float = MAX_DEPTH_M  # visible range (optical z): far plane of the view frustum
 
     def T_anchor_refined(self) -> np.ndarray:
@@ -181,17 +182,16 @@ def refine_pose(
     keyframe.delta = se3_exp(np.clip(tangent, -bounds, bounds))
 
 
-def refine_exposure(keyframe: StoredKeyframe, sums: np.ndarray, rate: float) -> None:
+def refine_exposure(keyframe: StoredKeyframe, gradient: np.ndarray, rate: float) -> None:
     """Update the log gains and the offsets of the exposure by one step of Adam.
 
     Args:
-        sums: float64 [rows, 8] of `photometric_and_depth`; columns 2 to 7 are the gradient.
+        gradient: float64 [6], derivative of the loss with respect to the exposure.
         rate: step size.
     """
-    gradient = sums[:, 2:8].sum(axis=0) + 1e-3 * keyframe.exposure  # weak prior: no change of exposure
-    move = _adam_step(
-        gradient, keyframe.exposure_first, keyframe.exposure_second, max(keyframe.pose_steps, 1)
-    )
+    keyframe.exposure_steps += 1
+    gradient = gradient + 1e-3 * keyframe.exposure  # weak prior: no change of exposure
+    move = _adam_step(gradient, keyframe.exposure_first, keyframe.exposure_second, keyframe.exposure_steps)
     keyframe.exposure = (keyframe.exposure - rate * move).astype(np.float32)
 
 

@@ -20,7 +20,12 @@ from beamsplat.common.raster.optimiser import learning_rates
 from beamsplat.common.raster.rasterizer import Rasterizer, Render
 from beamsplat.common.raster.ssim import SsimLoss
 from beamsplat.services.mapping.insertion import new_gaussians, prediction_quality, unexplained_pixels
-from beamsplat.services.mapping.kernels import add_lidar, count_carving_votes, photometric_and_depth
+from beamsplat.services.mapping.kernels import (
+    add_lidar,
+    count_carving_votes,
+    exposure_gradient,
+    photometric_and_depth,
+)
 from beamsplat.services.mapping.keyframe import (
     PyramidLevel,
     RgbdKeyframe,
@@ -304,7 +309,7 @@ class Mapper:
         render = self._render(level, T_map_camera)
         if level.hidden is not None:
             level = with_hidden(level, render.image, keyframe.exposure)
-        loss, gradient, sums = self._loss(render, level, keyframe)
+        loss, gradient = self._loss(render, level, keyframe)
         gradients = self.rasterizer.backward(render, gradient)
         s = self.settings
         pixels = level.camera.width_px * level.camera.height_px
@@ -317,7 +322,9 @@ class Mapper:
                 keyframe, gradients.pose, (s.rates.pose_m, s.rates.pose_rad), (s.max_pose_m, s.max_pose_rad)
             )
         if s.refine_exposure:
-            refine_exposure(keyframe, sums, s.rates.exposure)
+            rows = np.empty((level.camera.height_px, 6))
+            self.rasterizer.team.run(exposure_gradient, render.image, gradient, keyframe.exposure, rows)
+            refine_exposure(keyframe, rows.sum(axis=0), s.rates.exposure)
         self.rasterizer.release(render)
         self.steps += 1
         return loss
@@ -329,15 +336,11 @@ class Mapper:
 
     def _loss(
         self, render: Render, level: PyramidLevel, keyframe: StoredKeyframe
-    ) -> tuple[float, np.ndarray, np.ndarray]:
-        """Compute the loss of a render against a pyramid level of a keyframe.
-
-        Returns:
-            Loss; gradient float32 [5, H, W]; sums float64 [H, 8], see `kernels.photometric_and_depth`.
-        """
+    ) -> tuple[float, np.ndarray]:
+        """Return the loss of a render against a level of a keyframe, and its gradient, float32 [5, H, W]."""
         s, (h, w) = self.settings, level.depth_mm.shape
         if (h, w) not in self._buffers:
-            self._buffers[h, w] = np.empty((5, h, w), np.float32), np.empty((h, 8))
+            self._buffers[h, w] = np.empty((5, h, w), np.float32), np.empty((h, 2))
         gradient, sums = self._buffers[h, w]
         with_ssim = s.ssim_weight > 0.0 and self.steps % s.ssim_every == 0
         colour_scale = np.float32((1.0 - s.ssim_weight * with_ssim) / (3 * h * w))
@@ -350,7 +353,9 @@ class Mapper:
             scale = np.float32(s.lidar_weight / len(level.beam_pixels))
             loss += add_lidar(render.image, level.beam_pixels, level.beam_z_m, scale, gradient)
         if with_ssim:
-            loss += self._ssim.add(render.image, level.rgb, s.ssim_weight, gradient, self.rasterizer.team)
+            loss += self._ssim.add(
+                render.image, level.rgb, keyframe.exposure, s.ssim_weight, gradient, self.rasterizer.team
+            )
         if level.hidden is not None:
             gradient[:, level.hidden] = 0.0
-        return loss, gradient, sums
+        return loss, gradient

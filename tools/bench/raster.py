@@ -116,7 +116,7 @@ def _cpu_cases(
     shape = (camera.height_px, camera.width_px)
     target = (_target((5, *shape)) * 255.0).astype(np.uint8)
     depth_mm = target[3].astype(np.uint16) * np.uint16(20)
-    gradient, sums = np.empty((5, *shape), np.float32), np.empty((shape[0], 8))
+    gradient, sums = np.empty((5, *shape), np.float32), np.empty((shape[0], 2))
     scale = np.float32(1.0 / gradient.size)
     teams = {threads: Rasterizer(threads) for threads in (1, 2)}
     times: dict[int, list[tuple[float, float, float]]] = {threads: [] for threads in teams}
