@@ -33,34 +33,56 @@ class _Chunk:
 
 
 class MapLayer:
-    """Draws the newest revision of every chunk at a limited rate, and the last revisions at the end."""
+    """Draws the newest revision of every chunk at a limited rate, and the last revisions at the end.
+
+    Revisions of one mapper process are compared only with each other: a mapper that was restarted without a
+    session starts another map, with low revisions and other anchors. What its predecessor sent is removed.
+    """
 
     def __init__(self, writer: RerunWriter, limits: RateLimit) -> None:
         self._writer = writer
         self._limits = limits
+        self._producer = ""  # instance of the mapper process whose chunks are drawn
         self._revisions: dict[int, int] = {}
         self._deferred: dict[int, _Chunk] = {}
         self._declared: set[str] = set()
 
     def chunk(
-        self, stamp_ns: int, anchor: int, revision: int, T_map_anchor: np.ndarray, packed: np.ndarray
+        self,
+        stamp_ns: int,
+        producer: str,
+        anchor: int,
+        revision: int,
+        T_map_anchor: np.ndarray,
+        packed: np.ndarray,
     ) -> None:
         """Draw the packed Gaussians of one submap, in its anchor's frame; outdated revisions are ignored.
 
-        `packed`: uint8 [B], encoded by `splat_codec`; `T_map_anchor` [4, 4].
+        `producer`: instance of the mapper process that sent the chunk; `packed`: uint8 [B], encoded by
+        `splat_codec`; `T_map_anchor` [4, 4].
 
         Raises:
             ValueError: the bytes are no packed Gaussians.
         """
+        if producer != self._producer:
+            self._start_map(producer, stamp_ns)
         if revision < self._revisions.get(anchor, -1):
             return
         self._revisions[anchor] = revision
         chunk = _Chunk(stamp_ns, T_map_anchor, packed)
-        if self._limits.due("splats", stamp_ns, str(anchor)):
+        if self._limits.due("splats", stamp_ns, f"{producer} {anchor}"):
             self._deferred.pop(anchor, None)
             self._draw(anchor, chunk)
         else:
             self._deferred[anchor] = chunk
+
+    def _start_map(self, producer: str, stamp_ns: int) -> None:
+        """Remove the chunks of the process that sent chunks before."""
+        if self._revisions:
+            self._writer.log(SPLATS, rr.Clear(recursive=True), stamp_ns=stamp_ns)
+        self._producer = producer
+        self._revisions.clear()
+        self._deferred.clear()
 
     def _draw(self, anchor: int, chunk: _Chunk) -> None:
         params = unpack(chunk.packed)

@@ -13,7 +13,8 @@ from beamsplat.common.config.deployment import NodeConfig
 from beamsplat.common.errors import UserError
 from beamsplat.common.files.persist import check_can_write
 from beamsplat.common.geometry.tracks import RateLimit
-from beamsplat.common.messages import FusedDepth, Health, MapStatus, Odometry, Rig
+from beamsplat.common.messages import FusedDepth, Health, MapChunk, MapStatus, Odometry, Rig
+from beamsplat.common.messages.header import Header
 from beamsplat.common.runtime.node import Input, Node, Output
 from beamsplat.services.monitor.depth_layer import DepthLayer
 from beamsplat.services.monitor.layout import layout
@@ -113,25 +114,24 @@ DEPTH: dict[Input, Draw] = {
     Input("fusion/depth", "latest"): _draw_depth,
     Input("fusion/cloud", "latest"): lambda view, _, m: view.cloud(m.stamp_ns, m.points_odom_m, m.colours),
 }
+CHUNK = Input("mapping/chunk", "every")
 MAP: dict[Input, Draw] = {
-    Input("mapping/chunk", "every"): lambda view, _, m: view.chunk(
-        m.stamp_ns, m.anchor_id, m.revision, m.T_map_anchor, m.packed
-    ),
     Input("mapping/preview", "latest"): lambda view, _, m: view.render(m.stamp_ns, m.render),
     Input("mapping/status", "latest"): _draw_status,
 }
 
 
 def _handler(view: str, draw: Draw) -> Callable[[MonitorNode, Any], tuple[Output, ...]]:
-    def handle(self: MonitorNode, message: Any) -> tuple[Output, ...]:
-        try:
-            draw(getattr(self, view), self.panel, message)
-        except ValueError as error:  # a valid message that cannot be drawn
-            self.panel.log(str(error), message.stamp_ns, "WARN")
-        self.detail = self.writer.status
-        return ()
+    return lambda self, message: _draw_safely(self, view, draw, message)
 
-    return handle
+
+def _draw_safely(monitor: MonitorNode, view: str, draw: Draw, message: Any) -> tuple[Output, ...]:
+    try:
+        draw(getattr(monitor, view), monitor.panel, message)
+    except ValueError as error:  # a valid message that cannot be drawn
+        monitor.panel.log(str(error), message.stamp_ns, "WARN")
+    monitor.detail = monitor.writer.status
+    return ()
 
 
 _Handlers: Any = type(
@@ -151,7 +151,8 @@ class MonitorNode(_Handlers, Node):
     name = "monitor"
     Config = MonitorConfig
     config: MonitorConfig
-    inputs = (*SCENE, *DEPTH, *MAP)
+    inputs = (*SCENE, *DEPTH, CHUNK, *MAP)
+    _header: Header | None = None
 
     def check_resources(self) -> None:
         if self.config.save is not None:
@@ -202,6 +203,19 @@ class MonitorNode(_Handlers, Node):
         else:
             writer.spawn(address, c.viewer_memory_mb)
             writer.notes.append(f"viewer at {address}")
+
+    def on_header(self, header: Header) -> None:
+        self._header = header
+
+    def on_mapping_chunk(self, message: MapChunk) -> tuple[Output, ...]:
+        """Draw a chunk; the header tells which process of the mapper has sent it."""
+        assert self._header is not None  # runners pass it before each message
+        sent_by = self._header.instance
+
+        def draw(view: MapLayer, _: HealthPanel, m: MapChunk) -> None:
+            view.chunk(m.stamp_ns, sent_by, m.anchor_id, m.revision, m.T_map_anchor, m.packed)
+
+        return _draw_safely(self, "map_layer", draw, message)
 
     def on_health(self, health: Health) -> None:
         """Add the node's health to the table and the curves."""

@@ -71,6 +71,7 @@ class BusObserver:
         self._keep_at = keep_depth_at
         self._T_map_odom = np.eye(4)
         self._ended_ns = 0
+        self._mapper = ""  # instance of the mapper process that has sent `chunks`
         self._lock = threading.Lock()
 
     def subscribe(self, bus: Bus) -> None:
@@ -127,12 +128,21 @@ class BusObserver:
     def _keyframes_ack(self, envelope: Envelope, m: Any) -> None:
         self.record.acks.setdefault(m.id, (envelope.header.publish_ns, m.status))
 
+    def _follow_mapper(self, instance: str) -> None:
+        """Discard the map of a mapper process that was replaced: the new one sends its own map."""
+        if self._mapper not in ("", instance):
+            self.record.chunks.clear()
+            self.record.keyframe_poses = None
+        self._mapper = instance
+
     def _mapping_chunk(self, envelope: Envelope, m: Any) -> None:
+        self._follow_mapper(envelope.header.instance)
         self.record.chunks[m.anchor_id] = m
         if self.record.online_chunks is not None and envelope.header.publish_ns <= self._ended_ns:
             self.record.online_chunks[m.anchor_id] = m  # sent before the final poses, received after them
 
     def _mapping_poses(self, envelope: Envelope, m: Any) -> None:
+        self._follow_mapper(envelope.header.instance)
         if self.record.online_chunks is None:
             self.record.online_chunks, self._ended_ns = dict(self.record.chunks), envelope.header.publish_ns
         self.record.keyframe_poses = m.T_map_body.copy()

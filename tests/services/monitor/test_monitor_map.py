@@ -6,6 +6,7 @@ import pytest
 
 from beamsplat.common.geometry.transforms import se2_to_se3
 from beamsplat.common.messages import MapChunk, MapPreview, MapStatus
+from beamsplat.common.messages.header import Header
 from beamsplat.common.messages.splat_codec import pack
 from beamsplat.common.topics import TOPICS
 from beamsplat.services.monitor.node import MAP, MonitorConfig, MonitorNode
@@ -37,7 +38,8 @@ def monitor(tmp_path):
     return monitor
 
 
-def tell(monitor, topic, message):
+def tell(monitor, topic, message, instance="ab" * 8):
+    monitor.on_header(Header(message.stamp_ns, 0, 0, 0, 1, "mapping", instance))
     assert list(monitor.handle(topic, message)) == []
 
 
@@ -74,6 +76,22 @@ def test_an_older_revision_does_not_replace_a_newer_one(monitor, tmp_path, read_
     monitor.close()
     saved = read_rrd(tmp_path / "m.rrd")
     assert len(saved.stamps("map/splats/7")) == 1
+
+
+def test_the_map_of_a_restarted_mapper_replaces_that_of_its_predecessor(monitor, tmp_path, read_rrd):
+    """Without a session it starts again: low revisions, and anchors that are not in its map any more."""
+    tell(monitor, "mapping/chunk", chunk(0.0, 9, count=2))
+    tell(monitor, "mapping/chunk", chunk(0.0, 9, count=4, anchor=8))
+    tell(monitor, "mapping/chunk", chunk(0.1, 10, count=5))  # deferred by the rate limit
+    tell(monitor, "mapping/chunk", chunk(0.2, 1, count=3), instance="cd" * 8)
+    tell(monitor, "mapping/chunk", chunk(9.0, 2, count=6), instance="cd" * 8)
+    list(monitor.drain())
+    monitor.close()
+    saved = read_rrd(tmp_path / "m.rrd")
+    counts = [len(c.reshape(-1, 3)) for c in saved.column("map/splats/7", "GaussianSplats3D:centers")]
+    assert counts == [2, 3, 6]
+    assert saved.stamps("map/splats") == [T0 + S // 5]  # all below it is cleared
+    assert saved.column("map/splats", "Clear:is_recursive")[0].tolist() == [True]
 
 
 def test_a_loop_closure_moves_the_chunk(monitor, tmp_path, read_rrd):

@@ -267,3 +267,34 @@ def test_the_map_at_the_end_of_the_drive_is_kept_apart_from_the_refined_one():
     receive("mapping/poses", poses, 50)
     assert observer.record.online_chunks[0].revision == 2
     assert observer.record.chunks[0].revision == 3
+
+
+def test_the_map_of_a_restarted_mapper_is_scored_without_chunks_of_its_predecessor():
+    from beamsplat.common.messages import MapChunk, MapPoses
+    from beamsplat.common.messages.header import Header
+    from beamsplat.common.runtime.mailbox import Envelope
+    from beamsplat.tools.report.observer import BusObserver
+
+    observer = BusObserver(frozenset())
+
+    def receive(topic, message, instance):
+        header = Header(S, 10, 1, 0, 1, "mapping", instance)
+        observer._receive(Envelope(topic, header, message, 100))
+
+    def chunk(anchor, revision):
+        return MapChunk(
+            stamp_ns=S, anchor_id=anchor, revision=revision, T_map_anchor=np.eye(4), count=0,
+            packed=np.zeros(0, np.uint8),
+        )  # fmt: skip
+
+    poses = MapPoses(
+        stamp_ns=S, keyframe_ids=np.zeros(1, np.int64), stamps_ns=np.full(1, S), T_map_body=np.eye(4)[None]
+    )
+    for anchor in (0, 1):
+        receive("mapping/chunk", chunk(anchor, 7), "ab" * 8)
+    receive("mapping/poses", poses, "ab" * 8)
+    receive("mapping/chunk", chunk(1, 2), "cd" * 8)
+    assert {anchor: c.revision for anchor, c in observer.record.chunks.items()} == {1: 2}
+    assert observer.record.keyframe_poses is None
+    receive("mapping/poses", poses, "cd" * 8)
+    assert observer.record.keyframe_poses.shape == (1, 4, 4)
