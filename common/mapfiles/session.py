@@ -28,7 +28,7 @@ from beamsplat.common.files.numbered_state import (
     unpacked_arrays,  # noqa: F401
     write_json,
 )
-from beamsplat.common.files.persist import make_folder, write_durably
+from beamsplat.common.files.persist import write_durably
 from beamsplat.common.mapfiles.blocks import block_file, with_blocks
 
 FORMAT, VERSION = "beamsplat-session", 1
@@ -76,19 +76,17 @@ class SessionFolder:
         """Create the session with a new UUID, unless the folder contains one already.
 
         Raises:
-            UserError: the folder cannot be created, or contains a session that cannot be read.
+            UserError: the folder contains a session that cannot be read.
+            OSError: the disk is full or broken, or the folder cannot be written.
         """
-        make_folder(self.keyframes)
-        make_folder(self.blocks)
+        for folder in (self.keyframes, self.blocks):
+            folder.mkdir(parents=True, exist_ok=True)
         if self.exists():
             self.header()
             return
         self._created = True
         head = {"format": FORMAT, "version": VERSION, "uuid": str(uuid.uuid4())}
-        try:
-            write_json(self.path / MANIFEST, head)
-        except OSError as error:
-            raise UserError(f"{self.path}: cannot create a session here ({error.strerror})") from error
+        write_json(self.path / MANIFEST, head)
 
     def header(self) -> dict[str, Any]:
         """Return the contents of `session.json`: format, version and UUID.
@@ -110,40 +108,74 @@ class SessionFolder:
             )
         return head
 
-    def lock(self) -> None:
-        """Take the write lock until `unlock` or the end of the process.
+    def lock(self, shared: bool = False) -> None:
+        """Take the lock until `unlock` or the end of the process: before the state is read, to change it.
 
         Temporary files of a killed writer are removed.
 
+        Args:
+            shared: only exclude writers: for a command that reads state and keyframes.
+
         Raises:
             UserError: another process holds the lock; the text contains its id and host.
+            OSError: the disk is full or broken, or the folder cannot be written.
         """
-        file = (self.edge / "lock").open("a+")
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            file.seek(0)
-            holder = file.readline().strip() or "unknown process"
-            file.close()
-            raise UserError(
-                f"{self.path}: another process writes to this session ({holder}): stop it, or use another "
-                "folder"
-            ) from error
-        file.truncate(0)
-        file.write(f"process {os.getpid()} on {socket.gethostname()}\n")
-        file.flush()
+        file = self._locked_file(shared)
         self._lock = file
+        if not file.writable():
+            return
+        with contextlib.suppress(OSError):  # disk full: the lock is held all the same
+            os.ftruncate(file.fileno(), 0)
+            os.write(file.fileno(), f"process {os.getpid()} on {socket.gethostname()}\n".encode())
+        if not shared:
+            self._remove_temporary_files()
+
+    def _locked_file(self, shared: bool) -> TextIO:
+        path = self.edge / "lock"
+        while True:
+            try:
+                file = path.open("a+")
+            except OSError:
+                if not shared:
+                    raise
+                file = path.open()  # on a disk that is read-only
+            try:
+                fcntl.flock(file, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
+                with contextlib.suppress(FileNotFoundError):
+                    if os.path.samestat(os.fstat(file.fileno()), path.stat()):
+                        return file
+                file.close()  # the previous holder removed the file with its empty session
+            except BlockingIOError as error:
+                file.seek(0)
+                holder = file.readline().strip() or "unknown process"
+                file.close()
+                raise UserError(
+                    f"{self.path}: another process uses this session ({holder}): stop it, or use another "
+                    "folder"
+                ) from error
+            except OSError:
+                file.close()
+                raise
+
+    def _remove_temporary_files(self) -> None:
         for folder in (self.edge, self.keyframes):
-            for leftover in folder.glob(".*"):
-                if leftover.is_file():
-                    leftover.unlink()
+            for leftover in folder.glob(".*.*"):
+                if leftover.suffix[1:].isdecimal() and leftover.is_file():  # see `write_atomically`
+                    with contextlib.suppress(OSError):
+                        leftover.unlink()
+
+    @property
+    def is_locked(self) -> bool:
+        """Return whether this object holds the lock."""
+        return self._lock is not None
 
     def unlock(self) -> None:
-        """Release the write lock; remove a session that was created here and has remained empty."""
+        """Release the lock; remove a session that was created here and has remained empty."""
         if self._lock is None:
             return
-        if self._created and not self.robot.exists() and not self._has_map():
-            self._remove_empty()
+        with contextlib.suppress(OSError):
+            if self._created and not self.robot.exists() and not self._has_map():
+                self._remove_empty()
         self._lock.close()
         self._lock = None
 
@@ -247,11 +279,8 @@ class SessionFolder:
         raise UserError(f"{path}: truncated or altered; restore it from a copy, or remove it")
 
     def remove_keyframes(self, ids: Iterator[int] | list[int]) -> int:
-        """Delete keyframe files; return how many existed."""
-        existing = [path for path in map(self._keyframe_file, ids) if path.exists()]
-        for path in existing:
-            path.unlink(missing_ok=True)
-        return len(existing)
+        """Delete keyframe files; return how many were deleted. Files that cannot be deleted stay."""
+        return sum(_removed(self._keyframe_file(id)) for id in ids)
 
     def _keyframe_file(self, id: int) -> Path:
         return self.keyframes / f"{id}.kf"
@@ -263,9 +292,18 @@ class SessionFolder:
         return sorted(numbered_files(self.blocks, "", ".block"))
 
     def remove_blocks(self, numbers: Iterable[int]) -> None:
-        """Delete block files."""
+        """Delete block files. Files that cannot be deleted stay: the next start finds them."""
         for number in numbers:
-            block_file(self.blocks, number).unlink(missing_ok=True)
+            _removed(block_file(self.blocks, number))
+
+
+def _removed(path: Path) -> bool:
+    """Remove a file; return False if there is none, or the disk is broken or read-only."""
+    try:
+        path.unlink()
+    except OSError:
+        return False
+    return True
 
 
 def _check_edge_version(manifest: dict[str, Any], path: Path) -> None:

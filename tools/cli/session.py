@@ -5,15 +5,21 @@ A session has two halves: the edge half (Gaussians and keyframes) and the robot 
 
 from __future__ import annotations
 
+import contextlib
 import json
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
 
 from beamsplat.common.errors import UserError
 from beamsplat.tools.cli.options import session_folder, writable
+
+if TYPE_CHECKING:
+    from beamsplat.common.files.numbered_state import Arrays
+    from beamsplat.common.mapfiles.session import SessionFolder
 
 console = Console(stderr=True)
 app = typer.Typer(no_args_is_help=True, help="Saved maps: inspect, join, merge, prune.")
@@ -65,7 +71,7 @@ def info(session: SessionArgument, as_json: JsonOption = False) -> None:
               f"{robot['constraints']} constraints, map {robot['uuid'] or 'without a UUID'}")  # fmt: skip
 
 
-def _map_uuid(arrays: dict[str, Any]) -> str:
+def _map_uuid(arrays: Arrays) -> str:
     """Return the UUID of the robot map that the anchors of a session belong to; "" if it is unknown."""
     return str(next(iter(arrays.get("extra_map_uuid", [])), ""))
 
@@ -90,16 +96,12 @@ def join(
     from beamsplat.common.geometry.transforms import se2_to_se3
     from beamsplat.tools.sessions.edit import with_anchors
 
-    folder, arrays = _open(session)
-    slam = load_slam(robot)
-    _same_drive(session, robot, arrays, slam)
-    folder.lock()
-    try:
-        slam.save(folder.robot)
+    with _locked(session) as folder:
+        arrays = _read(folder)
+        slam = load_slam(robot)
+        _same_drive(session, robot, arrays, slam)
         T_map_anchor = {id: se2_to_se3(pose) for id, pose in slam.anchors().items()}
-        _write(folder, with_anchors(arrays, T_map_anchor))
-    finally:
-        folder.unlock()
+        _write(folder, with_anchors(arrays, T_map_anchor), slam)
     missing = [a for a in arrays["anchor_id"].tolist() if a >= 0 and a not in T_map_anchor]
     more = f"; {len(missing)} anchors that the robot has removed keep their pose" if missing else ""
     print(f"{session}: {len(T_map_anchor)} submaps joined{more}")
@@ -132,57 +134,64 @@ def merge(
 
         beamsplat session merge hall annex --out both --place 12.4,-3.1,90
     """
-    from rich.progress import track
-
-    from beamsplat.common.geometry.transforms import se2_to_se3
     from beamsplat.common.mapfiles.session import SessionFolder
-    from beamsplat.tools.sessions.edit import merged, with_anchors
-    from beamsplat.tools.sessions.merge import deduplicated, merge_doubt
 
-    (folder_a, a), (folder_b, b) = _open(first), _open(second)
     target = SessionFolder(out)
     if target.exists():
         raise UserError(f"{out}: contains a session already; choose another folder")
-    both = all((folder.robot / ROBOT_MANIFEST).is_file() for folder in (folder_a, folder_b))
-    slams = [load_slam(folder.robot) for folder in (folder_a, folder_b)] if both else []
-    alignment = None if place else _aligned(first, second, slams)
-    pose_a_b = _parsed_pose(place) if alignment is None else alignment.pose_a_b
-    known = [*a["anchor_id"].tolist(), *(slams[0].pose_graph.submaps if slams else [])]
-    offset = max([*known, -1]) + 2  # -1 is the odom origin of the second map
-    arrays = merged(a, b, se2_to_se3(pose_a_b), offset)
-    target.create()
-    target.lock()
-    doubt = ""
-    try:
-        if slams:
-            from beamsplat.services.localization.lidar2d.merge import merge_into
-
-            slam_a, slam_b = slams
-            loops = merge_into(slam_a, slam_b, pose_a_b, offset)
-            slams[0].save(target.robot)
-            arrays = with_anchors(arrays, {id: se2_to_se3(pose) for id, pose in slams[0].anchors().items()})
-            console.print(f"{loops} loop closures between the drives")
-            if alignment is not None:
-                doubt = merge_doubt(alignment.agreeing, alignment.queried, loops)
-        ids = set(arrays["keyframe_id"].tolist())
-        for folder in (folder_a, folder_b):
-            for id in ids.intersection(folder.keyframe_ids()):
-                target.write_keyframe(id, *folder.read_keyframe(id))
-        before = arrays["store_params"].shape[1]
-        arrays = deduplicated(
-            target, arrays, offset, lambda views: track(views, "comparing", console=console, transient=True)
-        )
-        _write(target, arrays)
-    finally:
-        target.unlock()
-    left = arrays["store_params"].shape[1]
-    print(f"{out}: {len(ids)} keyframes, {left} Gaussians; {before - left} duplicates removed")
+    with _locked(first, shared=True) as folder_a, _locked(second, shared=True) as folder_b, _created(target):
+        arrays, before, doubt = _merged(folder_a, folder_b, target, place)
+    left, count = arrays["store_params"].shape[1], len(arrays["keyframe_id"])
+    print(f"{out}: {count} keyframes, {left} Gaussians; {before - left} duplicates removed")
     if doubt:
         console.print(
             f"{out} was written, but do not trust it: {doubt}. Look at it (beamsplat export {out} --to ply), "
             "or remove it and merge again with --place X,Y,DEG", style="red", markup=False, soft_wrap=True,
         )  # fmt: skip
         raise typer.Exit(3)
+
+
+def _merged(
+    folder_a: SessionFolder, folder_b: SessionFolder, target: SessionFolder, place: str
+) -> tuple[Arrays, int, str]:
+    """Write the merge of two locked sessions to a third.
+
+    Returns:
+        Its arrays, the number of Gaussians before duplicates were removed, and why the pose may be wrong.
+    """
+    from rich.progress import track
+
+    from beamsplat.common.geometry.transforms import se2_to_se3
+    from beamsplat.tools.sessions.edit import merged, with_anchors
+    from beamsplat.tools.sessions.merge import deduplicated, merge_doubt
+
+    a, b = _read(folder_a), _read(folder_b)
+    both = all((folder.robot / ROBOT_MANIFEST).is_file() for folder in (folder_a, folder_b))
+    slams = [load_slam(folder.robot) for folder in (folder_a, folder_b)] if both else []
+    alignment = None if place else _aligned(folder_a.path, folder_b.path, slams)
+    pose_a_b = _parsed_pose(place) if alignment is None else alignment.pose_a_b
+    known = [*a["anchor_id"].tolist(), *(slams[0].pose_graph.submaps if slams else [])]
+    offset = max([*known, -1]) + 2  # -1 is the odom origin of the second map
+    arrays, doubt = merged(a, b, se2_to_se3(pose_a_b), offset), ""
+    if slams:
+        from beamsplat.services.localization.lidar2d.merge import merge_into
+
+        loops = merge_into(slams[0], slams[1], pose_a_b, offset)
+        arrays = with_anchors(arrays, {id: se2_to_se3(pose) for id, pose in slams[0].anchors().items()})
+        console.print(f"{loops} loop closures between the drives")
+        if alignment is not None:
+            doubt = merge_doubt(alignment.agreeing, alignment.queried, loops)
+    ids = set(arrays["keyframe_id"].tolist())
+    with _faults_explained(target):
+        for folder in (folder_a, folder_b):
+            for id in ids.intersection(folder.keyframe_ids()):
+                target.write_keyframe(id, *folder.read_keyframe(id))
+    before = arrays["store_params"].shape[1]
+    arrays = deduplicated(
+        target, arrays, offset, lambda views: track(views, "comparing", console=console, transient=True)
+    )
+    _write(target, arrays, slams[0] if slams else None)
+    return arrays, before, doubt
 
 
 @app.command()
@@ -203,15 +212,12 @@ def prune(
     from beamsplat.common.mapfiles.state import progress_of
     from beamsplat.tools.sessions.edit import pruned
 
-    folder, arrays = _open(session)
-    folder.lock()
-    try:
+    with _locked(session) as folder:
+        arrays = _read(folder)
         before = _bytes(session)
         out = pruned(arrays, opacity, keyframes)
         _write(folder, out)
         folder.remove_keyframes(progress_of(out)["forgotten"])
-    finally:
-        folder.unlock()
     gaussians = [a["store_params"].shape[1] for a in (arrays, out)]
     print(
         f"{session}: {gaussians[0]} -> {gaussians[1]} Gaussians, {len(arrays['keyframe_id'])} -> "
@@ -223,42 +229,95 @@ def _bytes(path: Path) -> int:
     return sum(file.stat().st_size for file in path.rglob("*") if file.is_file())
 
 
-def _open(session: Path) -> tuple[Any, dict[str, Any]]:
-    """Return a session as (SessionFolder, arrays of its last checkpoint).
+@contextlib.contextmanager
+def _locked(session: Path, shared: bool = False) -> Iterator[SessionFolder]:
+    """Hold the lock of a session, from before it is read until its changes are written.
+
+    Args:
+        shared: for a session that is only read.
 
     Raises:
-        UserError: there is no session, or no checkpoint in it.
+        UserError: there is no session, another process uses it, or it cannot be locked.
     """
     from beamsplat.common.mapfiles.session import SessionFolder
 
     folder = SessionFolder(session)
+    folder.header()  # before a lock file is created
+    try:
+        folder.lock(shared)
+    except OSError as error:
+        raise UserError(f"{session}: cannot be locked ({error.strerror})") from error
+    try:
+        yield folder
+    finally:
+        folder.unlock()
+
+
+@contextlib.contextmanager
+def _created(target: SessionFolder) -> Iterator[None]:
+    """Create a session and hold its lock; it is removed again if nothing is written to it.
+
+    Raises:
+        UserError: it cannot be created, or another process has created it meanwhile.
+    """
+    with _faults_explained(target):
+        target.create()
+        target.lock()
+    try:
+        if target.manifest() is not None:
+            raise UserError(f"{target.path}: contains a session already; choose another folder")
+        yield
+    finally:
+        target.unlock()
+
+
+@contextlib.contextmanager
+def _faults_explained(folder: SessionFolder) -> Iterator[None]:
+    """Convert the OSError of writing to a session to a UserError."""
+    try:
+        yield
+    except OSError as error:
+        raise UserError(
+            f"{folder.path}: not written ({error.strerror}); what was saved before is still valid"
+        ) from error
+
+
+def _read(folder: SessionFolder) -> Arrays:
+    """Return the arrays of the last checkpoint of a session.
+
+    Raises:
+        UserError: there is no checkpoint, or it cannot be read.
+    """
     arrays = folder.read_state()
     if arrays is None:
-        raise UserError(f"{session}: nothing has been saved in this session yet")
+        raise UserError(f"{folder.path}: nothing has been saved in this session yet")
     newer = _newer(folder, arrays)
     if newer:
-        console.print(f"[yellow]{session}: {newer} keyframes are newer than the checkpoint and not included; "
-                      "a mapper that resumes inserts them[/]")  # fmt: skip
-    return folder, arrays
+        console.print(f"[yellow]{folder.path}: {newer} keyframes are newer than the checkpoint and not "
+                      "included; a mapper that resumes inserts them[/]")  # fmt: skip
+    return arrays
 
 
-def _newer(folder: Any, arrays: dict[str, Any]) -> int:
+def _newer(folder: SessionFolder, arrays: Arrays) -> int:
     from beamsplat.common.mapfiles.state import progress_of
 
     known = {*arrays["extra_taken_id"].tolist(), *progress_of(arrays)["forgotten"]}
     return len(set(folder.keyframe_ids()) - known)
 
 
-def _write(folder: Any, arrays: dict[str, Any]) -> None:
+def _write(folder: SessionFolder, arrays: Arrays, slam: Any = None) -> None:
+    """Write the state of a locked session, and the robot half `slam`, if one is given.
+
+    Raises:
+        UserError: the disk is full or broken.
+    """
     from beamsplat.tools.sessions.edit import summary_of
 
-    try:
+    with _faults_explained(folder):
+        if slam is not None:
+            slam.save(folder.robot)
         folder.write_state(arrays, summary_of(arrays))
         folder.remove_blocks(folder.block_numbers())  # all Gaussians are in the state now
-    except OSError as error:
-        raise UserError(
-            f"{folder.path}: not written ({error.strerror}); the previous state is still valid"
-        ) from error
 
 
 def load_slam(path: Path) -> Any:
@@ -278,7 +337,7 @@ def load_slam(path: Path) -> Any:
     return LidarSlam.load(folder, LidarSlamSettings(), np.eye(4))  # T_body_lidar is needed for scans only
 
 
-def _same_drive(session: Path, robot: Path, arrays: dict[str, Any], slam: Any) -> None:
+def _same_drive(session: Path, robot: Path, arrays: Arrays, slam: Any) -> None:
     """Check that a session and a lidar map are of the same drive.
 
     Their UUIDs are compared; for older states without a UUID, the stamps of keyframes and scans.

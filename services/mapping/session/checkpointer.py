@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import logging
+import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from beamsplat.common.errors import UserError
+from beamsplat.common.errors import UserError, reason
 from beamsplat.common.mapfiles.blocks import Arrays, sync, with_blocks
 from beamsplat.common.mapfiles.session import SessionFolder
 from beamsplat.common.mapfiles.state import progress_of
@@ -42,8 +43,13 @@ class Checkpointer:
 
     def __init__(self, path: Path, period_ns: int, budget_bytes: float | None = None, seed: int = 0) -> None:
         self.folder = SessionFolder(path)
-        self.folder.create()
-        self.folder.lock()
+        self._opening, self._opened = threading.Lock(), False
+        self._write_fault = ""
+        try:
+            self._open()
+        except OSError as error:
+            self._write_fault = f"the session cannot be opened: {reason(error)}"
+            log.error("%s: %s; this is tried again with each keyframe", path, self._write_fault)
         self.disk_tier = DiskTier(self.folder)
         self._pager = None if budget_bytes is None else Pager(budget_bytes, seed, self.disk_tier)
         self._period_ns = period_ns
@@ -51,7 +57,19 @@ class Checkpointer:
         self._running = False
         self._last: CheckpointResult | None = None
         self._unwritten: set[int] = set()  # keyframes that the mapper has and the disk has not
-        self._write_fault = ""
+
+    def _open(self) -> None:
+        """Create and lock the session, unless that is done; on a disk that is full at first, it is done later.
+
+        Raises:
+            UserError: another process uses the session, or it cannot be read.
+            OSError: the disk is full or broken, or the folder cannot be written.
+        """
+        with self._opening:  # of threads of the bus and of jobs
+            if not self._opened:
+                self.folder.create()
+                self.folder.lock()
+                self._opened = True
 
     # --- resuming ---
 
@@ -67,7 +85,7 @@ class Checkpointer:
         """
         paged = self._pager is not None
         mapper.disk_gaussians = self.disk_tier
-        arrays = self.folder.read_state(whole=not paged)
+        arrays = self.folder.read_state(whole=not paged) if self.folder.exists() else None
         self._decoder = decoder
         if arrays is None:
             self.disk_tier.find_stale_files()
@@ -124,10 +142,11 @@ class Checkpointer:
     def write_keyframe(self, id: int, schema: str, payload: bytes) -> bool:
         """Write a keyframe to disk; return False on failure: the keyframe must not be acknowledged then."""
         try:
+            self._open()
             self.folder.write_keyframe(id, schema, payload)
-        except OSError as error:
+        except (OSError, UserError) as error:
             self._unwritten.add(id)
-            self._write_fault = f"keyframe {id} not saved: {error.strerror}"
+            self._write_fault = f"keyframe {id} not saved: {reason(error)}"
             log.warning("%s: %s", self.folder.path, self._write_fault)
             return False
         self._unwritten.discard(id)
@@ -180,10 +199,11 @@ class Checkpointer:
 
         def run() -> CheckpointResult:
             try:
+                self._open()
                 sync(folder.blocks, synced)
                 folder.write_state(arrays, summary)
-            except OSError as error:
-                return CheckpointResult(steps, keyframes, error.strerror or str(error))
+            except (OSError, UserError) as error:
+                return CheckpointResult(steps, keyframes, reason(error))
             folder.remove_keyframes(dropped)
             folder.remove_blocks(removed)
             return CheckpointResult(steps, keyframes, "", tuple(synced), tuple(removed))

@@ -98,7 +98,7 @@ def test_a_hand_over_that_cannot_be_written_leaves_the_map_with_its_mapper(tmp_p
         node.hand_over()
     edge.unlink()
     (tmp_path / "away").rename(edge)
-    with pytest.raises(UserError, match="writes to this session"):
+    with pytest.raises(UserError, match="uses this session"):
         SessionFolder(tmp_path / "s").lock()
     handle(node, "keyframes/frame", message(1))
     assert ids(node) == [message(0).id, message(1).id]

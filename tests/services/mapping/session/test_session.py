@@ -272,7 +272,7 @@ def test_a_full_disk_leaves_the_checkpoint_valid_and_is_reported(tmp_path):
 def test_two_mappers_cannot_write_to_one_session(copy):
     node = make_node(copy)
     with pytest.raises(
-        UserError, match=rf"another process writes to this session \(process {os.getpid()} on .+\)"
+        UserError, match=rf"another process uses this session \(process {os.getpid()} on .+\)"
     ):
         Checkpointer(copy, SECOND)
     node.close()
