@@ -219,10 +219,12 @@ class InputHealth(MessagePart):
     topic: Name
     received: Count  # messages passed to the node's handler
     dropped: Count  # replaced by a newer message (`latest`) or removed from a full queue: expected under load
-    lost: Count  # gaps in the sequence of an `every` topic: a fault
+    lost: Count  # gaps in the sequence of an `every` topic that were not recovered within 5 s: a fault
     undecodable: Count
-    stale: Count  # from an earlier epoch: the publisher has been replaced
+    stale: Count  # repeated, or of an earlier process of the publisher
     age_ms: NonNegative  # publication to handler, newest message; 0 = unknown (publisher on another host)
+    late: Count = 0  # recovered after newer messages; since Health 1.2
+    refused: Count = 0  # of a process without proof that it succeeds the known publisher; since Health 1.2
 
 
 class OutputHealth(MessagePart):
@@ -231,6 +233,7 @@ class OutputHealth(MessagePart):
     topic: Name
     sent: Count
     bytes: Count
+    refused: Count = 0  # not sent, because larger than the topic's limit; since Health 1.2
 
 
 # "failed": the node's process cannot run, and its supervisor reports it.
@@ -240,7 +243,7 @@ NodeState = Literal["configure", "standby", "active", "drain", "drained", "close
 class Health(Message):
     """State, message counts and resource use of one node, published by each node at 1 Hz."""
 
-    version = "1.2"  # 1.1: pid; 1.2: state "failed"
+    version = "1.2"  # 1.1: pid; 1.2: state "failed", counters `late` and `refused`
 
     node: Name
     instance: Name

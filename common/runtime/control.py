@@ -7,7 +7,6 @@ import logging
 import time
 from collections.abc import Iterator
 
-from beamsplat.common.files.persist import claim_epoch
 from beamsplat.common.messages import Answer
 from beamsplat.common.runtime.handover import parse_progress
 from beamsplat.common.runtime.running_node import RunningNode
@@ -53,14 +52,14 @@ class HandoverControl:
             except Exception:
                 r.handover.retired = False
                 raise
-        with r.changed:
+        with r.arrival_lock, r.changed:
             return r.handover.retire(r.mailbox.handled())
 
     def _pass_on_arrivals(self) -> None:
         """Call `on_arrival` for the messages received in standby, before newer messages are received."""
         r, passed = self._running, set()
         while not r.accepts_arrivals:
-            with r.changed:
+            with r.arrival_lock, r.changed:
                 new = [w for w in r.mailbox.queued() if id(w) not in passed]
                 r.accepts_arrivals = not new
             for envelope in new:
@@ -75,7 +74,6 @@ class HandoverControl:
             r.node.take_over()
         r.accepts_arrivals = not r.node.hands_over  # queued messages are passed on first
         held = list(r.handover.activate(progress))
-        self._bus.producer.epoch = claim_epoch(r.settings.run_dir, r.node.name)
         self._pass_on_arrivals()
         r.emit(iter(held))
         self._bus.announce(r.node.queries())

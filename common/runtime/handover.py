@@ -3,9 +3,9 @@
 A supervisor starts the successor in standby while the predecessor is still active, and then moves the role of
 the active process from one to the other. It sends three requests, each answered between two messages:
 
-    control/<instance>/reached    -> {topic: newest stamp published or stored}
-    control/<instance>/retire     -> {"said": {topic: newest stamp}} or {"handled": ...}
-    control/<instance>/activate   ?after=<answer of retire> -> {"kept": count, "lost": count}
+    control/<id>/reached          -> {topic: newest stamp published or stored}
+    control/<id>/retire           -> {"said": {topic: newest stamp}} or {"handled": ...}
+    control/<id>/activate         ?after=<answer of retire> -> {"kept": count, "lost": count}
 
     successor:                                            predecessor:
 
@@ -20,7 +20,7 @@ the active process from one to the other. It sends three requests, each answered
    the successor's newest stamps are close to the predecessor's, or after a time-out.
 3. `retire`: the predecessor answers with the newest stamp that it published on each topic ("said"), publishes
    nothing from here on, and ends without end-of-stream markers.
-4. `activate` passes this answer to the successor. The successor claims the next epoch, publishes the stored
+4. `activate` passes this answer to the successor. The successor, whose epoch is higher, publishes the stored
    outputs whose stamp is newer than the predecessor's on the same topic ("kept" is their number), and becomes
    ACTIVE. From then on it discards an output that is not newer than the predecessor's last one: no stamp is
    published twice. Dropped outputs newer than the predecessor's last one were published by neither process:

@@ -9,12 +9,15 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from beamsplat.common.messages import Health
+from beamsplat.common.messages.instances import ProcessId
+from beamsplat.common.runtime.accepted_producer import SILENCE_S, AcceptedProducer
 from beamsplat.common.topics import TOPICS
 
 STALE_S = 3.0  # nodes report at 1 Hz: after three missing reports a node is shown as silent
 _WINDOW_S = 5.0  # rates are averages over this time
 _MAX_HISTORY = 50  # reports kept per node, in case it sends more than it should
 _MAX_NODES = 1000  # of all robots; names beyond that are ignored, since anybody can send them
+_FORGET_S = 60.0  # a silent node makes room for another one after this time
 
 
 @dataclass
@@ -27,6 +30,7 @@ class NodeRecord:
     health: Health
     received_s: float
     starts: int = 1  # number of instances (processes) seen so far
+    refused: int = 0  # reports of other processes, which are not accepted as this node
     history: deque[tuple[float, Health]] = field(default_factory=lambda: deque(maxlen=_MAX_HISTORY))
 
     def silent_s(self, now: float) -> float | None:
@@ -55,18 +59,20 @@ class NodeRecord:
             age_ms=max((i.age_ms for i in inputs), default=0.0),
             dropped=sum(i.dropped for i in inputs),
             lost=sum(i.lost for i in inputs),
-            bad=sum(i.undecodable + i.stale for i in inputs),
+            late=sum(i.late for i in inputs),
+            bad=sum(i.undecodable + i.stale + i.refused for i in inputs),
         )
 
 
 class NodeTraffic(NamedTuple):
-    """Message rates of one node, and its counts of dropped, lost and bad messages since it started."""
+    """Message rates of one node, and its counts of dropped, lost, late and bad messages since it started."""
 
     in_hz: float
     out_hz: float
     age_ms: float  # of the newest message on the input with the highest latency
     dropped: int
     lost: int
+    late: int
     bad: int
 
 
@@ -91,17 +97,59 @@ class TopicTraffic(NamedTuple):
     consumers: tuple[TopicConsumer, ...]
 
 
+class HealthFilter:
+    """Which process may report the health of each node (`AcceptedProducer`). Not thread-safe."""
+
+    def __init__(self) -> None:
+        self._producers: dict[str, AcceptedProducer] = {}
+        self._heard_s: dict[str, float] = {}  # time of the last accepted report, by node
+        self.refused: dict[str, int] = {}  # reports of other processes, by node
+        self.ignored = 0  # reports beyond `_MAX_NODES` nodes
+
+    def accepts(self, health: Health, now: float) -> bool:
+        """Return whether a report that arrived at `now` (s) is of the accepted process; else count it."""
+        node = health.node
+        if node not in self._producers:
+            if len(self._producers) >= _MAX_NODES and not self._forget_silent(now):
+                self.ignored += 1
+                return False
+            self._producers[node], self.refused[node] = AcceptedProducer(), 0
+        process = ProcessId(node.rpartition("/")[2], health.epoch, health.instance)
+        silent = now - self._heard_s.get(node, now) > SILENCE_S
+        if self._producers[node].judge(process, silent) in ("stale", "refused"):
+            self.refused[node] += 1
+            return False
+        self._heard_s[node] = now
+        return True
+
+    def _forget_silent(self, now: float) -> bool:
+        """Forget the nodes that have not reported for `_FORGET_S`; return whether there are any."""
+        old = [node for node, heard_s in self._heard_s.items() if now - heard_s > _FORGET_S]
+        for node in old:
+            del self._producers[node], self._heard_s[node], self.refused[node]
+        return bool(old)
+
+
 class HealthRecords:
     """The newest health report of every node. Not thread-safe: its owner must lock it."""
 
     def __init__(self) -> None:
         self.records: dict[str, NodeRecord] = {}
+        self._filter = HealthFilter()
 
-    def add(self, health: Health, now: float | None = None) -> None:
-        """Store a health report that arrived at `now`, in seconds of `time.monotonic` (default: now)."""
+    def add(self, health: Health, now: float | None = None) -> bool:
+        """Store a health report that arrived at `now`, in seconds of `time.monotonic` (default: now).
+
+        Return False, and count the report in the node's record, if it is of another process than the accepted
+        one.
+        """
         now = time.monotonic() if now is None else now
-        if health.node not in self.records and len(self.records) >= _MAX_NODES:
-            return
+        if not self._filter.accepts(health, now):
+            if (known := self.records.get(health.node)) is not None:
+                known.refused = self._filter.refused.get(health.node, 0)
+            return False
+        while len(self.records) >= _MAX_NODES and health.node not in self.records:
+            del self.records[min(self.records, key=lambda name: self.records[name].received_s)]
         record = self.records.setdefault(health.node, NodeRecord(health, now))
         if record.health.instance != health.instance:
             record.history.clear()
@@ -110,6 +158,7 @@ class HealthRecords:
         record.history.append((now, health))
         while now - record.history[0][0] > _WINDOW_S:
             record.history.popleft()
+        return True
 
     def states(self, now: float | None = None) -> dict[str, str]:
         """Return the state of each node by node name; "silent" if its last report is older than `STALE_S`.

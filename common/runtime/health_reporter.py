@@ -46,8 +46,8 @@ class HealthReporter:
         )
         self._bus.publish_health(
             Health(
-                stamp_ns=time.time_ns(), node=r.node.name, instance=r.instance,
-                epoch=self._bus.producer.epoch, state=r.state, inputs=inputs, outputs=outputs,
+                stamp_ns=time.time_ns(), node=r.node.name, instance=r.settings.instance,
+                epoch=r.settings.epoch, state=r.state, inputs=inputs, outputs=outputs,
                 step_p50_ms=float(np.percentile(steps, 50)), step_p95_ms=float(np.percentile(steps, 95)),
                 rss_mb=self._process.memory_info().rss / 1e6, cpu_percent=self._process.cpu_percent(),
                 detail=r.detail_text()[:_DETAIL_CHARS], pid=self._process.pid,

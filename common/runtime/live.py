@@ -17,14 +17,14 @@ from functools import partial
 import zenoh
 
 from beamsplat.common.errors import UserError
-from beamsplat.common.files.persist import ReplayPosition, claim_epoch
+from beamsplat.common.files.persist import ReplayPosition
 from beamsplat.common.messages import Health, Message
 from beamsplat.common.runtime.control import HandoverControl
 from beamsplat.common.runtime.handover import CONTROL
+from beamsplat.common.runtime.health import HealthFilter
 from beamsplat.common.runtime.health_reporter import HealthReporter
 from beamsplat.common.runtime.jobs import JobAbandoned, JobQueue, JobThreads
 from beamsplat.common.runtime.live_settings import LiveSettings
-from beamsplat.common.runtime.mailbox import NO_PRODUCER
 from beamsplat.common.runtime.node import Node, subscriptions
 from beamsplat.common.runtime.pacing import Playback, wait_for_nodes
 from beamsplat.common.runtime.rate_limited_log import RateLimitedLog
@@ -50,6 +50,7 @@ class Live:
         self._stop_by = math.inf
         self._queries: deque[tuple[str, zenoh.Query]] = deque()
         self._healths: deque[Health] = deque(maxlen=256)
+        self._reporters = HealthFilter()
         self._undecodable_limit = RateLimitedLog()
         self._position = ReplayPosition(settings.run_dir, node.name)
 
@@ -57,7 +58,6 @@ class Live:
         """Run the node through its life cycle: configure, standby, active, drain, drained, closed."""
         r = self.running
         settings, node = r.settings, r.node
-        epoch = claim_epoch(settings.run_dir, node.name)
         if not settings.resume:  # else a crash before the first message would resume an earlier run
             self._position.clear()
         try:
@@ -67,7 +67,7 @@ class Live:
             if self._stopping:
                 return
             raise
-        with Bus(session, settings.robot, node.name, r.instance, epoch) as bus:
+        with Bus(session, settings.robot, node.name, settings.instance, settings.epoch) as bus:
             reporter = HealthReporter(r, bus)
             r.jobs = JobQueue(JobThreads(self._must_abandon).submit)
             node.set_query_function(partial(ask, session, settings.robot))
@@ -103,7 +103,7 @@ class Live:
         r.publications = {name: bus.publish(name) for name in r.node.outputs}
         for entry in subscriptions(type(r.node)):
             if entry.topic in r.settings.without_producer:
-                r.mailbox.end(entry.topic, NO_PRODUCER, 0)
+                r.mailbox.end(entry.topic, None)
             bus.subscribe(entry, r.receive, self._on_undecodable, r.receive_end)
         if r.node.watches_health():
             bus.watch_health(self._on_health, self._on_undecodable)
@@ -260,5 +260,6 @@ class Live:
         self.running.wake()
 
     def _on_health(self, health: Health) -> None:
-        self._healths.append(health)
-        self.running.wake()
+        if self._reporters.accepts(health, time.monotonic()):
+            self._healths.append(health)
+            self.running.wake()

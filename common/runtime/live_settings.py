@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import secrets
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from beamsplat.common.security.keys import NO_SECURITY, SecurityConfig
@@ -24,5 +25,7 @@ class LiveSettings:
     )  # inputs that no node of the deployment produces: not waited for
     resume: bool = False  # a restarted source continues where the crashed process stopped
     exit_when_drained: bool = False  # else the process answers queries until it is stopped
-    instance: str = ""  # id of this process, 16 hex digits, chosen by the supervisor; "" = random
+    # Identity of this process, claimed by the supervisor (common/messages/instances.py).
+    epoch: int = 1
+    instance: str = field(default_factory=lambda: secrets.token_hex(8))  # 16 hex digits
     standby: bool = False  # start as the successor in a hand-over: see runtime/handover.py

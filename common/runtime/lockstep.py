@@ -16,8 +16,9 @@ from typing import Any
 
 from beamsplat.common.messages import Message
 from beamsplat.common.messages.header import Header
+from beamsplat.common.messages.instances import ProcessId
 from beamsplat.common.runtime.jobs import JobQueue, LazyFuture
-from beamsplat.common.runtime.mailbox import NO_PRODUCER, Envelope, Mailbox
+from beamsplat.common.runtime.mailbox import Envelope, Mailbox
 from beamsplat.common.runtime.node import Job, Node, Output
 from beamsplat.common.topics import ROW_NUMBER, TOPICS
 
@@ -63,7 +64,7 @@ class Lockstep:
                 state.node.configure()
             for name in TOPICS:
                 if name not in produced:
-                    self._end_topic(name, NO_PRODUCER, 0)
+                    self._end_topic(name, None, 0)
             for state in self._states:
                 if state.source is not None:
                     self._pull(state, 0)
@@ -164,12 +165,13 @@ class Lockstep:
         for name, result in state.jobs.remaining_results():
             self._emit(state, state.node.handle_job(name, result), now_ns)
         self._emit(state, state.node.handle_drain(), now_ns)
+        process = ProcessId(state.node.name, 0, state.instance)
         for name in state.node.outputs:
-            self._at(now_ns, _LAST_ROW, partial(self._end_topic, name, state.instance))
+            self._at(now_ns, _LAST_ROW, partial(self._end_topic, name, process))
 
-    def _end_topic(self, name: str, instance: str, now_ns: int) -> None:
+    def _end_topic(self, name: str, process: ProcessId | None, now_ns: int) -> None:
         for consumer in self._consumers[name]:
-            consumer.mailbox.end(name, instance, 0)
+            consumer.mailbox.end(name, process)
             self._step(consumer, now_ns)
 
 

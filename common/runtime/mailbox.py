@@ -1,18 +1,23 @@
 """Input queues of a node: a slot per `latest` or `latched` input, queues merged by stamp for `every` inputs.
 
 An `every` input that is feedback has a queue of its own. A mailbox belongs to one node and is not
-thread-safe; the live runner locks it. It counts dropped, lost, stale and undecodable messages per input.
+thread-safe; the live runner locks it. It counts dropped, lost, late, stale, refused and undecodable messages
+per input.
 """
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from beamsplat.common.messages import InputHealth, Message
 from beamsplat.common.messages.header import Header
+from beamsplat.common.messages.instances import ProcessId
+from beamsplat.common.runtime.accepted_producer import SILENCE_S, AcceptedProducer
 from beamsplat.common.runtime.node import Node, merged_topics, subscriptions
+from beamsplat.common.runtime.sequence import MAX_JUMP, SequenceTracker
 from beamsplat.common.runtime.stamp_merger import StampMerger
 from beamsplat.common.topics import ROW_NUMBER, TOPICS
 
@@ -21,7 +26,10 @@ MAX_QUEUED = 20_000  # messages per `every` input; beyond that the oldest is dro
 _MAX_COUNT = 2**63 - 1  # largest int64: limit of the counters in a Health message
 
 
-# Topic -> instance of its producer -> (next expected sequence number, earlier ones that are still queued).
+_MAX_OPEN = 10_000  # missing numbers of one gap that a hand-over passes on
+
+
+# Topic -> instance of its producer -> (next expected sequence number, earlier ones queued or missing).
 HandledSequences = dict[str, dict[str, tuple[int, list[int]]]]
 
 
@@ -37,20 +45,24 @@ class Envelope:
 
 @dataclass
 class InputCount:
-    """Message counters of one input, and the sequence numbers from which losses are computed.
+    """Message counters of one input, its producer, and the sequence numbers from which losses are computed.
 
     The counters have the same meaning as in `messages.robot.InputHealth`.
     """
 
     received: int = 0
     dropped: int = 0
-    lost: int = 0
+    lost: int = 0  # of earlier processes, or at the end of the stream; those of `sequence` are not included
+    late: int = 0
     undecodable: int = 0
     stale: int = 0
+    refused: int = 0
     age_ms: float = 0.0
-    epoch: int = -1
-    expected: dict[str, int] = field(default_factory=dict)  # instance -> next sequence number
+    producer: AcceptedProducer = field(default_factory=AcceptedProducer)
+    sequence: SequenceTracker = field(default_factory=lambda: SequenceTracker(None))
+    arrival_ns: int = 0  # of the newest admitted message
     ended_by: str | None = None  # instance that ended the stream, or NO_PRODUCER
+    ended_after: int = 0  # number of messages that this instance has sent in all
     queued_bytes: int = 0
 
 
@@ -65,32 +77,96 @@ class Mailbox:
         self._feedback_topics = frozenset(i.topic for i in subscriptions(node) if i.feedback)
         self._feedback_queue: deque[Envelope] = deque()  # of `every` inputs that are feedback
         self._most_bytes = {i.topic: i.queued_bytes for i in subscriptions(node)}
+        self._clock_ns = clock_ns
+        self._heard_ns: dict[str, int] = {}  # instance of an accepted producer -> last arrival on any input
+        self._refused_latched: dict[str, Envelope] = {}  # topic -> newest message of a process without proof
         self.counts = {name: InputCount() for name in self._deliveries}
 
     def __len__(self) -> int:
         return len(self._merger) + len(self._slots) + len(self._feedback_queue)
 
-    def put(self, envelope: Envelope) -> bool:
-        """Queue a message and return True, or return False if it is stale (repeated, or of a predecessor)."""
-        count = self.counts[envelope.topic]
-        every = self._deliveries[envelope.topic] == "every"
-        if not self._admit(count, envelope.header, every and not TOPICS[envelope.topic].resent_until_ack):
+    def admit(self, envelope: Envelope) -> bool:
+        """Count a received message, and return whether it is to be queued (`queue`).
+
+        Not if it is repeated, of an earlier process of its producer, or of a process that is not accepted as
+        the producer (`beamsplat.common.runtime.accepted_producer`).
+        """
+        count, header, now_ns = self.counts[envelope.topic], envelope.header, self._now_ns()
+        process = ProcessId(header.producer, header.epoch, header.instance)
+        if not self._accepts(count, process, now_ns):
+            if self._deliveries[envelope.topic] == "latched":  # it may be published only once
+                self._refused_latched[envelope.topic] = envelope
             return False
+        newest = count.sequence.next
+        if newest is not None and header.sequence - newest > MAX_JUMP and not self._is_silent(count, now_ns):
+            count.refused += 1  # else the messages that really follow would count as repeated
+            return False
+        if self._deliveries[envelope.topic] == "every":
+            order = count.sequence.add(header.sequence, now_ns)
+        elif newest is not None and header.sequence < newest:
+            order = "repeated"
+        else:  # nothing is recovered: a missing message was replaced by a newer one
+            count.dropped += header.sequence - (header.sequence if newest is None else newest)
+            count.sequence.next = header.sequence + 1
+            order = "next"
+        if order == "repeated":
+            count.stale += 1
+            return False
+        count.late += order == "late"
+        count.arrival_ns = self._heard_ns[header.instance] = now_ns
+        if header.instance != count.ended_by or header.sequence >= count.ended_after:
+            count.ended_by = None
+        return True
+
+    def put(self, envelope: Envelope) -> bool:
+        """Queue a message if it is admitted; return whether it is."""
+        admitted = self.admit(envelope)
+        if admitted:
+            self.queue(envelope)
+        return admitted
+
+    def queue(self, envelope: Envelope) -> None:
+        """Queue an admitted message."""
+        count = self.counts[envelope.topic]
         if envelope.topic in self._slots:
             count.dropped += 1
-        if every and envelope.topic in self._feedback_topics:
+        if self._deliveries[envelope.topic] != "every":
+            self._slots[envelope.topic] = envelope
+        elif envelope.topic in self._feedback_topics:
             if len(self._feedback_queue) >= MAX_QUEUED:
                 self.counts[self._feedback_queue.popleft().topic].dropped += 1
             self._feedback_queue.append(envelope)
-        elif every:
+        else:
             self._make_room(envelope, count)
-            self._merger.put(envelope.topic, envelope.message.stamp_ns, envelope)
+            self._merger.put(envelope.topic, envelope.message.stamp_ns, envelope, _precedes)
             if (
                 count.ended_by is not None
             ):  # recovered after the end-of-stream marker: the stream has ended all the same
                 self._merger.end(envelope.topic)
-        else:
-            self._slots[envelope.topic] = envelope
+
+    def _now_ns(self) -> int:
+        return self._clock_ns() if self._clock_ns else 0
+
+    def _is_silent(self, count: InputCount, now_ns: int) -> bool:
+        """Return whether nothing of the input's accepted producer arrived on any input for `SILENCE_S`."""
+        current = count.producer.current
+        if current is None or self._clock_ns is None:
+            return current is None
+        return now_ns - self._heard_ns.get(current.instance, count.arrival_ns) > SILENCE_S * 1e9
+
+    def _accepts(self, count: InputCount, process: ProcessId, now_ns: int) -> bool:
+        """Return whether `process` is the producer of an input, perhaps from now on; else count why not."""
+        verdict = count.producer.judge(process, self._is_silent(count, now_ns))
+        if verdict in ("stale", "refused"):
+            setattr(count, verdict, getattr(count, verdict) + 1)
+            return False
+        if verdict != "same":
+            count.sequence.give_up(None)
+            count.lost += count.sequence.lost
+            count.sequence = SequenceTracker(0 if verdict == "successor" else None)
+            accepted = {c.producer.current.instance for c in self.counts.values() if c.producer.current}
+            self._heard_ns = {i: heard for i, heard in self._heard_ns.items() if i in accepted}
+            self._heard_ns[process.instance] = count.arrival_ns = now_ns
         return True
 
     def _make_room(self, envelope: Envelope, count: InputCount) -> None:
@@ -102,52 +178,33 @@ class Mailbox:
             count.dropped += 1
         count.queued_bytes += envelope.size_bytes
 
-    def _admit(self, count: InputCount, header: Header, loses: bool) -> bool:
-        """Update epoch and sequence state; return False for a stale or repeated message."""
-        if header.epoch < count.epoch:
-            count.stale += 1
-            return False
-        first = 0 if 0 <= count.epoch < header.epoch else None  # a successor starts at sequence number 0
-        if header.epoch > count.epoch:
-            count.epoch = header.epoch
-            count.expected.clear()
-        expected = count.expected.get(header.instance, first)
-        if expected is not None and header.sequence < expected:
-            count.stale += 1  # recovery can deliver a message a second time
-            return False
-        if expected is not None:
-            gap = header.sequence - expected
-            if loses:
-                count.lost += gap
-            else:
-                count.dropped += gap
-        count.expected[header.instance] = header.sequence + 1
-        if header.instance != count.ended_by:
-            count.ended_by = None
-        return True
+    def end(self, topic: str, process: ProcessId | None, sent: int = 0) -> bool:
+        """Mark an input as ended: `process` has sent its last message, `sent` messages in all.
 
-    def end(self, topic: str, instance: str, epoch: int, sent: int = 0) -> None:
-        """Mark an input as ended: its producer `instance` has sent its last message, `sent` messages in all.
-
-        Messages that have not arrived by now are counted as lost, or as dropped on a topic whose producer
-        resends messages until they are acknowledged.
+        Messages that have not arrived by now are lost. `process` = None: nothing publishes on this topic.
+        Return False, and change nothing, if `process` is not accepted as the producer.
         """
         count = self.counts[topic]
-        if epoch < count.epoch:  # of a producer that has handed over
-            return
-        count.ended_by = instance
+        if process is not None and not self._accepts(count, process, self._now_ns()):
+            return False
+        count.ended_by, count.ended_after = process.instance if process else NO_PRODUCER, sent
         if self._deliveries[topic] == "every":
-            missing = max(sent - self.next_sequence(topic, instance), 0)
-            if TOPICS[topic].resent_until_ack:
-                count.dropped += missing
-            else:
-                count.lost += missing
+            count.lost += max(sent - self.next_sequence(topic, count.ended_by), 0)
+            count.sequence.give_up(None)
             if topic not in self._feedback_topics:
                 self._merger.end(topic)
+        return True
 
     def next_sequence(self, topic: str, instance: str) -> int:
         """Return the next expected sequence number on `topic` from `instance`; 0 before the first message."""
-        return self.counts[topic].expected.get(instance, 0)
+        count = self.counts[topic]
+        is_current = count.producer.current is not None and count.producer.current.instance == instance
+        return (count.sequence.next or 0) if is_current else 0
+
+    def silence_s(self, topic: str) -> float:
+        """Return the time in s since the newest message on `topic`; infinite before the first one."""
+        arrival_ns = self.counts[topic].arrival_ns
+        return (self._now_ns() - arrival_ns) / 1e9 if arrival_ns else math.inf
 
     def queued(self) -> list[Envelope]:
         """Return the queued messages of the `every` inputs, input by input in order of arrival."""
@@ -157,21 +214,22 @@ class Mailbox:
         """Return the sequence numbers that this node has handled on its `every` inputs.
 
         Returns:
-            {topic: {producer instance: (next expected number, numbers that are still queued)}}. All numbers
-            below the first value have been handled, except the queued ones.
+            {topic: {producer instance: (next expected number, numbers that are queued or missing)}}. All
+            numbers below the first value have been handled, except the latter.
         """
-        queued = self.queued()
-        return {
-            topic: {
-                instance: (
-                    next_one,
-                    [q.header.sequence for q in queued if q.topic == topic and q.header.instance == instance],
-                )
-                for instance, next_one in self.counts[topic].expected.items()
-            }
-            for topic, delivery in self._deliveries.items()
-            if delivery == "every"
-        }
+        handled: HandledSequences = {}
+        for topic, delivery in self._deliveries.items():
+            count = self.counts[topic]
+            if delivery != "every" or count.producer.current is None or count.sequence.next is None:
+                continue
+            instance = count.producer.current.instance
+            open_numbers = [
+                q.header.sequence for q in self.queued() if q.topic == topic and q.header.instance == instance
+            ]
+            for start, end in count.sequence.missing():
+                open_numbers += range(start, min(end, start + _MAX_OPEN))
+            handled[topic] = {instance: (count.sequence.next, sorted(open_numbers))}
+        return handled
 
     def pop(self) -> Envelope | None:
         """Remove and return the message to handle next, or None if none is ready.
@@ -179,6 +237,7 @@ class Mailbox:
         Order: feedback, then the next message of the `every` inputs (merged by stamp), then the oldest
         message of the `latest` and `latched` inputs.
         """
+        self._reconsider_refused()
         if self._feedback_queue:
             envelope = self._feedback_queue.popleft()
             self.counts[envelope.topic].received += 1
@@ -196,6 +255,14 @@ class Mailbox:
         self.counts[envelope.topic].received += 1
         return envelope
 
+    def _reconsider_refused(self) -> None:
+        """Queue a latched message of a process without proof once its predecessor counts as silent."""
+        for topic, envelope in list(self._refused_latched.items()):
+            count = self.counts[topic]
+            if self._is_silent(count, self._now_ns()):
+                del self._refused_latched[topic]
+                self.put(envelope)
+
     @property
     def ended(self) -> bool:
         """Whether all inputs have ended, at least one of them had a producer, and the queues are empty.
@@ -212,11 +279,21 @@ class Mailbox:
 
     def health(self) -> tuple[InputHealth, ...]:
         """Return the counters of all inputs, for the field `inputs` of a Health message."""
-        return tuple(
-            InputHealth(
-                topic=name, received=c.received, dropped=min(c.dropped, _MAX_COUNT),
-                lost=min(c.lost, _MAX_COUNT), undecodable=c.undecodable, stale=c.stale,
-                age_ms=max(c.age_ms, 0.0),
-            )
-            for name, c in self.counts.items()
+        return tuple(self._health_of(name, count) for name, count in self.counts.items())
+
+    def _health_of(self, name: str, count: InputCount) -> InputHealth:
+        count.sequence.give_up(self._now_ns())
+        gone, dropped = count.lost + count.sequence.lost, count.dropped
+        if TOPICS[name].resent_until_ack:  # its producer sends these messages again
+            gone, dropped = 0, dropped + gone
+        return InputHealth(
+            topic=name, received=count.received, dropped=min(dropped, _MAX_COUNT), lost=min(gone, _MAX_COUNT),
+            late=count.late, undecodable=count.undecodable, stale=count.stale, refused=count.refused,
+            age_ms=max(count.age_ms, 0.0),
         )  # fmt: skip
+
+
+def _precedes(earlier: Envelope, later: Envelope) -> bool:
+    """Return whether two messages of one process were published in this order."""
+    a, b = earlier.header, later.header
+    return a.instance == b.instance and a.sequence < b.sequence

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import secrets
 import threading
 import time
 from collections import deque
@@ -11,6 +10,7 @@ from concurrent.futures import Future
 from typing import Any
 
 from beamsplat.common.messages.header import Header, local_clock_id
+from beamsplat.common.messages.instances import ProcessId
 from beamsplat.common.messages.robot import NodeState
 from beamsplat.common.runtime.handover import Handover
 from beamsplat.common.runtime.jobs import JobQueue
@@ -22,6 +22,8 @@ from beamsplat.common.zenoh.streams import Publication
 POLL_S = 0.2  # longest wait for a message before signals are checked
 _FAULT_CHARS = 200
 _END_TIMEOUT_S = 5.0  # an end-of-stream marker waits this long for messages still in transit
+_END_SILENCE_S = 0.5  # and so long for a message that shows that the producer has not ended
+_MAX_ENDS = 4  # markers per topic that wait: of one producer, or of few that are not accepted
 
 
 class RunningNode:
@@ -35,7 +37,6 @@ class RunningNode:
         self.node = node
         self.settings = node.live_settings = settings
         node.without_producer = settings.without_producer
-        self.instance = settings.instance or secrets.token_hex(8)
         self.handover = Handover(settings.standby)
         self.accepts_arrivals = True  # whether `on_arrival` is called as soon as a message is received
         self.arrival_lock = threading.Lock()  # held during `on_arrival`: retiring waits for it
@@ -48,28 +49,36 @@ class RunningNode:
         self.publications: dict[str, Publication] = {}
         self.jobs: JobQueue[Future]  # set by the runner, before the node is configured
         self.undecodable_reports = 0  # health reports of other nodes
-        self._ends: list[tuple[str, str, int, int, float]] = []
+        # End-of-stream markers that wait: (topic, producer) -> (messages sent in all, time of arrival).
+        self._ends: dict[tuple[str, ProcessId], tuple[int, float]] = {}
         self._clock_id = local_clock_id()
 
     # --- called from threads of the bus ---
 
     def receive(self, envelope: Envelope) -> None:
-        """Pass a received message to the node's `on_arrival`, then put it into the mailbox."""
+        """Pass an admitted message to the node's `on_arrival`, then put it into the mailbox."""
         with self.arrival_lock:
+            with self.changed:
+                if not self.mailbox.admit(envelope):
+                    return
             # A message that the predecessor has handled may be recovered from the sender's cache later.
             handover = self.handover
             skip = handover.standby or handover.retired or handover.was_handled(envelope)
             if self.accepts_arrivals and not skip:
                 self.emit(self.node.handle_arrival(envelope.topic, envelope.message))
-        with self.changed:
-            if self.mailbox.put(envelope):
+            with self.changed:
+                self.mailbox.queue(envelope)
                 self.changed.notify()
 
     def receive_end(self, topic: str, header: Header, sent: int) -> None:
         """Record that the producer of `topic` in `header` has ended after publishing `sent` messages."""
+        process = ProcessId(header.producer, header.epoch, header.instance)
         with self.changed:
-            deadline = time.monotonic() + _END_TIMEOUT_S
-            self._ends.append((topic, header.instance, header.epoch, sent, deadline))
+            waiting = [producer for ended, producer in self._ends if ended == topic]
+            if len(waiting) >= _MAX_ENDS and process not in waiting:
+                self.mailbox.counts[topic].refused += 1
+                return
+            self._ends[topic, process] = (sent, time.monotonic())
             self.changed.notify()
 
     def wake(self) -> None:
@@ -107,14 +116,20 @@ class RunningNode:
         return envelope
 
     def _apply_ends(self) -> None:
-        """End an input once all messages that its producer sent have arrived, or after a time-out."""
-        pending = []
-        for topic, instance, epoch, sent, deadline in self._ends:
-            if self.mailbox.next_sequence(topic, instance) >= sent or time.monotonic() > deadline:
-                self.mailbox.end(topic, instance, epoch, sent)
-            else:
-                pending.append((topic, instance, epoch, sent, deadline))
-        self._ends = pending
+        """End an input once all messages that its producer sent have arrived, or after a time-out.
+
+        Meanwhile the input must be silent: a marker of somebody else must not end a stream that goes on.
+        """
+        now = time.monotonic()
+        for (topic, process), (sent, arrived) in list(self._ends.items()):
+            complete = self.mailbox.next_sequence(topic, process.instance) >= sent
+            silence_s = min(self.mailbox.silence_s(topic), now - arrived)
+            if silence_s < (_END_SILENCE_S if complete else _END_TIMEOUT_S):
+                continue
+            if self.mailbox.end(topic, process, sent):
+                del self._ends[topic, process]
+            else:  # not accepted as the producer: tried again after a pause
+                self._ends[topic, process] = (sent, now)
 
     def emit(self, outputs: Iterator[Output]) -> None:
         """Publish the messages and start the jobs in `outputs`; in standby, messages are stored instead."""

@@ -48,10 +48,17 @@ class StampMerger:
         """Yield the queued items, stream by stream."""
         return (item for queue in self._queues.values() for _, item in queue)
 
-    def put(self, stream: str, stamp_ns: int, item: Any) -> None:
+    def put(
+        self,
+        stream: str,
+        stamp_ns: int,
+        item: Any,
+        precedes: Callable[[Any, Any], bool] = lambda earlier, later: False,
+    ) -> None:
         """Queue an item with its stamp (ns).
 
-        Items of one stream stay in order of arrival, even if their stamps decrease.
+        Items of one stream stay in order of arrival, even if their stamps decrease. But an item for which
+        `precedes(item, queued)` is True (a message that was recovered late) is queued before `queued`.
         """
         now_ns = self._clock_ns() if self._clock_ns else 0
         if self._first_ns is None:
@@ -60,8 +67,12 @@ class StampMerger:
                 self._queues, now_ns
             )  # start of the time-out for streams without messages
         self._first_ns = min(self._first_ns, stamp_ns)
-        self._queues[stream].append((stamp_ns, item))
-        self._newest_ns[stream] = stamp_ns
+        queue, position = self._queues[stream], len(self._queues[stream])
+        while position and precedes(item, queue[position - 1][1]):
+            position -= 1
+        if position == len(queue):
+            self._newest_ns[stream] = stamp_ns
+        queue.insert(position, (stamp_ns, item))
         self._arrival_ns[stream] = now_ns
 
     def drop_oldest(self, stream: str) -> Any:

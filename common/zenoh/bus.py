@@ -8,7 +8,7 @@ All keys of a robot start with `beamsplat/<robot>/`:
     alive/<node>/<instance>       liveliness token of an active node
     failed/<node>/<instance>      liveliness token of a node that cannot run, declared by its supervisor
     query/<node>/<name>           queries to a node
-    control/<instance>/<verb>     hand-over requests to one process (common/runtime/handover.py)
+    control/<id>/<verb>           hand-over requests to one process (common/runtime/handover.py)
 
 All sessions are clients of a router on this host: two Zenoh peers that are connected only through a router
 do not exchange data, and access control acts between client and router. Samples are read from channels in
@@ -29,6 +29,7 @@ import zenoh.ext
 from beamsplat.common.errors import UserError
 from beamsplat.common.messages import Health
 from beamsplat.common.messages.header import DecodeError, Header, local_clock_id
+from beamsplat.common.messages.instances import control_id
 from beamsplat.common.runtime.handover import CONTROL
 from beamsplat.common.runtime.mailbox import Envelope
 from beamsplat.common.runtime.node import Input
@@ -288,13 +289,13 @@ class Bus:
         self._declared.append(publisher)
 
     def answer_queries(self, on_query: Callable[[str, zenoh.Query], None]) -> None:
-        """Declare the keys control/<instance>/*, for requests to this process.
+        """Declare the keys control/<id>/*, for requests to this process; its instance determines the id.
 
         `announce` later declares the queries to the node. For both, `on_query(name, query)` is called from a
         thread of the bus; `name` is "control/<verb>" for a request, else the name of the query.
         """
         self._on_query = on_query
-        key_expr = key(self.robot, CONTROL, self.producer.instance, "*")
+        key_expr = key(self.robot, CONTROL, control_id(self.producer.instance), "*")
         self._answer(key_expr, lambda query: on_query(f"{CONTROL}/{_verb_of(query)}", query))
 
     def announce(self, queries: tuple[str, ...]) -> None:

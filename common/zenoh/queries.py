@@ -12,12 +12,19 @@ import zenoh
 from beamsplat.common.errors import UserError
 from beamsplat.common.messages import Answer, Message
 from beamsplat.common.messages.codec import decode, encode, schema_of
+from beamsplat.common.messages.header import DecodeError
+from beamsplat.common.messages.instances import control_id
 from beamsplat.common.runtime.handover import CONTROL
 from beamsplat.common.runtime.rate_limited_log import RateLimitedLog
 from beamsplat.common.zenoh.bus import key
 from beamsplat.common.zenoh.streams import ENCODING
 
 log = logging.getLogger(__name__)
+
+
+class NoAnswer(UserError):
+    """No node, or no process, has answered a query."""
+
 
 _DISCOVERY_S = 2.0  # right after a (re)connection, queries to a running node get no answer yet
 
@@ -28,7 +35,8 @@ def ask(
     """Send the query `name` with `parameters` to a node, and yield the answer messages as they arrive.
 
     Raises:
-        UserError: no node answered this query in time, or the node rejected it.
+        NoAnswer: no node answered this query in time.
+        UserError: the node rejected it, or its answer cannot be decoded.
     """
     yield from _ask(session, key(robot, "query", node, name), (node, name), parameters, timeout_s)
 
@@ -39,11 +47,13 @@ def command(
     """Send a hand-over request to one process and return its answer (common/runtime/handover.py).
 
     Raises:
-        UserError: the process did not answer in time, or rejected the request.
+        NoAnswer: the process did not answer in time.
+        UserError: it rejected the request, or answered with something else.
     """
-    key_expr = key(robot, CONTROL, instance, verb)
+    key_expr = key(robot, CONTROL, control_id(instance), verb)
     answer = next(_ask(session, key_expr, (instance, verb), parameters, timeout_s))
-    assert isinstance(answer, Answer)  # the message type of all hand-over requests
+    if not isinstance(answer, Answer):  # the message type of all hand-over requests
+        raise UserError(f"{instance} answered {verb} with a message {schema_of(answer)}, expected an Answer")
     return answer.text
 
 
@@ -67,13 +77,22 @@ def _ask(
         ):
             if reply.ok is None:
                 assert reply.err is not None  # a reply is one or the other
-                raise UserError(f"{who} rejected {name}: {reply.err.payload.to_string()}")
+                text = reply.err.payload.to_string()
+                if text == "Timeout":  # of Zenoh itself: the query was received, and not answered
+                    raise NoAnswer(f"{who} did not answer {name} within {timeout_s:g} s")
+                raise UserError(f"{who} rejected {name}: {text}")
             answered = True
-            yield decode(str(reply.ok.encoding).partition(";")[2], reply.ok.payload.to_bytes())
+            try:
+                answer = decode(str(reply.ok.encoding).partition(";")[2], reply.ok.payload.to_bytes())
+            except DecodeError as error:
+                raise UserError(
+                    f"{who} answered {name} with a message of another version: {error}"
+                ) from error
+            yield answer
         if answered:
             return
         if time.monotonic() > deadline:
-            raise UserError(
+            raise NoAnswer(
                 f"no answer from node {who!r} to the query {name!r}: is the node running? "
                 "(`beamsplat top` shows it)"
             )

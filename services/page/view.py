@@ -54,7 +54,8 @@ class PageState:
         with self._lock:
             before = self._health.records.get(health.node)
             instance, state = (before.health.instance, before.health.state) if before else ("", "")
-            self._health.add(health)
+            if not self._health.add(health):  # of another process than the accepted one
+                return
             self._silent_nodes.discard(health.node)
             if before and instance != health.instance:
                 self._log_event(f"{health.node} was restarted")
@@ -189,7 +190,7 @@ def _node(name: str, record: NodeRecord, now: float) -> dict[str, Any]:
         "silent_s": round(silent_s or 0.0), "detail": health.detail,
         "in_hz": round(totals.in_hz, 1), "out_hz": round(totals.out_hz, 1), "age_ms": round(totals.age_ms, 1),
         "step_ms": round(health.step_p50_ms, 1), "p95_ms": round(health.step_p95_ms, 1),
-        "dropped": totals.dropped, "lost": totals.lost, "bad": totals.bad,
+        "dropped": totals.dropped, "lost": totals.lost, "late": totals.late, "bad": totals.bad + record.refused,
         "rss_mb": round(health.rss_mb), "cpu_percent": round(health.cpu_percent),
     }  # fmt: skip
 

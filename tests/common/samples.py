@@ -113,8 +113,8 @@ def sample_messages() -> list[Message]:
         Tick(stamp_ns=20, count=5),
         Health(
             stamp_ns=21, node="depth", instance="00ff", epoch=2, state="active",
-            inputs=(InputHealth(topic="rig", received=1, dropped=2, lost=3, undecodable=4, stale=5, age_ms=6.0),),
-            outputs=(OutputHealth(topic="rig", sent=1, bytes=2),),
+            inputs=(InputHealth(topic="rig", received=1, dropped=2, lost=3, undecodable=4, stale=5, age_ms=6.0, late=7, refused=8),),
+            outputs=(OutputHealth(topic="rig", sent=1, bytes=2, refused=3),),
             step_p50_ms=1.0, step_p95_ms=2.0, rss_mb=3.0, cpu_percent=4.0, detail="warm",
         ),
         Answer(stamp_ns=31, text="depth was told to end, and starts again"),

@@ -213,8 +213,7 @@ def serve(
 
     Example: beamsplat serve deploy/robot.toml localization
     """
-    from beamsplat.tools.system.node_process import route, start_logging
-    from beamsplat.tools.system.node_process import serve as serve_node
+    from beamsplat.tools.system.node_process import route, serve_alone, start_logging
     from beamsplat.tools.system.process_title import set_process_title
 
     deployment = _load(file, set_)
@@ -223,7 +222,7 @@ def serve(
     if node == "router":
         route(deployment)
     else:
-        serve_node(deployment, node, exit_when_drained=True)
+        serve_alone(deployment, node)
 
 
 def router_config(file: FileArgument, set_: SetOption = None) -> None:
@@ -276,8 +275,7 @@ def record(
 
     Example: beamsplat record deploy/robot.toml --out drive1
     """
-    from beamsplat.tools.system.node_process import serve as serve_node
-    from beamsplat.tools.system.node_process import start_logging
+    from beamsplat.tools.system.node_process import serve_alone, start_logging
 
     if out.exists():
         raise UserError(f"{out} exists: a recording is never overwritten, choose another --out")
@@ -285,5 +283,5 @@ def record(
     options = {**deployment.nodes.get("recorder", {}), "out": str(out)}
     deployment = deployment.model_copy(update={"nodes": {**deployment.nodes, "recorder": options}})
     start_logging()
-    serve_node(deployment, "recorder", exit_when_drained=True)
+    serve_alone(deployment, "recorder")
     print(f"recorded to {out}")

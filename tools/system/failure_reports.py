@@ -8,6 +8,7 @@ import zenoh
 
 from beamsplat.common.messages import Health
 from beamsplat.common.messages.header import local_clock_id
+from beamsplat.common.messages.instances import ProcessId
 from beamsplat.common.security.logins import SUPERVISOR
 from beamsplat.common.topics import HEALTH, Topic
 from beamsplat.common.zenoh.bus import key
@@ -43,17 +44,18 @@ class FailureReports:
             elif not entry.failed and entry.name in self._tokens:
                 self._tokens.pop(entry.name).undeclare()
             if entry.failed and not entry.process.is_alive():
-                self._publish(entry.name, entry.instance, entry.failed)
+                self._publish(entry.identity, entry.failed)
 
-    def _publish(self, name: str, instance: str, why: str) -> None:
+    def _publish(self, identity: ProcessId, why: str) -> None:
+        name, epoch, instance = identity
         if name not in self._publications:
             self._publications[name] = Publication(
-                self._session, Producer(SUPERVISOR, instance, 0, local_clock_id()),
+                self._session, Producer(SUPERVISOR, instance, epoch, local_clock_id()),
                 Topic(HEALTH, Health, (SUPERVISOR,), 1, "latest"), key(self._robot, HEALTH, name),
             )  # fmt: skip
         self._publications[name].put(
             Health(
-                stamp_ns=time.time_ns(), node=name, instance=instance, epoch=0, state="failed",
+                stamp_ns=time.time_ns(), node=name, instance=instance, epoch=epoch, state="failed",
                 detail=why[:_DETAIL_CHARS],
             )
         )  # fmt: skip

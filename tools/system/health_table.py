@@ -65,7 +65,7 @@ class HealthTable:
             return self._book.states(self._clock_s())
 
     def reported(self) -> dict[str, tuple[str, str]]:
-        """Return (instance, state) of each node by name, from its newest health message; silent nodes left out."""
+        """Return (instance, state) of each node by name, without the silent ones."""
         now = self._clock_s()
         with self._lock:
             records = self.records.items()
@@ -127,6 +127,11 @@ class HealthTable:
                 if record.health.detail:
                     style = "red" if record.health.state == "failed" else "dim"
                     said.append(Text(f"{name}: {record.health.detail}", style=style))
+                if late := record.totals().late:
+                    said.append(Text(f"{name}: {late} messages arrived late, and are not lost", style="dim"))
+                if record.refused:
+                    text = f"{name}: {record.refused} reports of another process with this name are refused"
+                    said.append(Text(text, style="red"))
             if self._undecodable:
                 text = f"{self._undecodable} health reports could not be decoded: {self._last_fault}"
                 said.append(Text(text, style="red"))
@@ -152,8 +157,9 @@ def _node_figures(record: NodeRecord, now: float) -> dict[str, Any]:
         "state": "silent" if silent_s else health.state, "silent_s": silent_s, "pid": health.pid,
         "starts": record.starts, "epoch": health.epoch, "in_hz": totals.in_hz, "out_hz": totals.out_hz,
         "step_p50_ms": health.step_p50_ms, "step_p95_ms": health.step_p95_ms, "age_ms": totals.age_ms,
-        "dropped": totals.dropped, "lost": totals.lost, "bad": totals.bad, "rss_mb": health.rss_mb,
-        "cpu_percent": health.cpu_percent, "detail": health.detail,
+        "dropped": totals.dropped, "lost": totals.lost, "late": totals.late,
+        "bad": totals.bad + record.refused, "rss_mb": health.rss_mb, "cpu_percent": health.cpu_percent,
+        "detail": health.detail,
     }  # fmt: skip
 
 
@@ -188,7 +194,7 @@ def _node_row(name: str, record: NodeRecord, now: float) -> tuple[str, ...]:
         _short(totals.age_ms) if health.inputs else "",
         _count(totals.dropped, "yellow"),
         _count(totals.lost, "red"),
-        _count(totals.bad, "red"),
+        _count(totals.bad + record.refused, "red"),
         f"{health.rss_mb:.0f}",
         f"{health.cpu_percent:.0f}",
     )

@@ -12,7 +12,9 @@ from multiprocessing import connection, parent_process
 from pathlib import Path
 
 from beamsplat.common.config.deployment import Deployment
-from beamsplat.common.errors import UserError
+from beamsplat.common.errors import UserError, reason
+from beamsplat.common.files.epochs import EpochClaims
+from beamsplat.common.messages.instances import ProcessId
 from beamsplat.common.optional_packages import missing_packages_explained
 from beamsplat.common.runtime.live import Live, LiveSettings
 from beamsplat.common.runtime.registry import Service
@@ -41,7 +43,7 @@ def serve(
     resume: bool = False,
     exit_when_drained: bool = False,
     around: Surroundings | None = None,
-    instance: str = "",
+    identity: ProcessId,
     standby: bool = False,
     table: dict[str, Service] = NODES,
 ) -> None:
@@ -51,13 +53,14 @@ def serve(
         resume: start from the last checkpoint, after a crash.
         exit_when_drained: end the process when the node has processed its last input.
         around: facts about the other nodes; None: computed here, which imports the classes of all nodes.
-        instance: id of this process on the bus; "": a new one.
+        identity: of this process on the bus, claimed by its supervisor.
         standby: start as the successor of a running node, see `beamsplat.tools.system.swap`.
         table: known services by name.
 
     Raises:
         UserError: an option is invalid, input data is not usable, or no router answers.
     """
+    threading.excepthook = _end_process
     node = build_node(deployment, name, table)
     _limit_threads(node.config.threads)
     os.nice(node.config.nice)
@@ -73,12 +76,23 @@ def serve(
         without_producer=around.without_producer,
         resume=resume,
         exit_when_drained=exit_when_drained,
-        instance=instance,
+        epoch=identity.epoch,
+        instance=identity.instance,
         standby=standby,
     )
     live = Live(node, settings)
     live.install_signal_handlers()
     live.run()
+
+
+def serve_alone(deployment: Deployment, name: str) -> None:
+    """Run one node in this process, without a supervisor, until it has processed its last input.
+
+    Raises:
+        UserError: see `serve`.
+    """
+    identity = EpochClaims(deployment.run_dir, log.warning).claim(name)
+    serve(deployment, name, exit_when_drained=True, identity=identity)
 
 
 def route(deployment: Deployment) -> None:
@@ -120,7 +134,7 @@ def child(
     resume: bool,
     around: Surroundings | None,
     table: dict[str, Service],
-    instance: str = "",
+    identity: ProcessId,
     standby: bool = False,
 ) -> None:
     """Run a node or the router as a supervised process: output is appended to a log file.
@@ -130,12 +144,11 @@ def child(
     # Ctrl-C in a terminal is sent to the whole process group; the supervisor stops processes in order.
     os.setpgrp()
     set_process_title(f"beamsplat:{name}")
-    with log_file.open("ab", buffering=0) as file:
-        os.dup2(file.fileno(), 1)
-        os.dup2(file.fileno(), 2)
+    log_fault = _redirect_output(log_file)
     threading.Thread(target=_die_with_parent, name="parent", daemon=True).start()
     start_logging()
-    threading.excepthook = _end_process
+    if log_fault:
+        log.warning("%s: %s; the log of %s goes to the output of the supervisor", log_file, log_fault, name)
     try:
         with missing_packages_explained(name):
             if name == "router":
@@ -146,7 +159,7 @@ def child(
                     name,
                     resume=resume,
                     around=around,
-                    instance=instance,
+                    identity=identity,
                     standby=standby,
                     table=table,
                 )
@@ -170,6 +183,18 @@ def _end_process(failure: threading.ExceptHookArgs) -> None:
     )  # fmt: skip
     logging.shutdown()
     os._exit(1)
+
+
+def _redirect_output(log_file: Path) -> str:
+    """Append standard output and error to a file; return why not: the disk is full or read-only."""
+    try:
+        log_file.parent.mkdir(parents=True, exist_ok=True)
+        with log_file.open("ab", buffering=0) as file:
+            os.dup2(file.fileno(), 1)
+            os.dup2(file.fileno(), 2)
+    except OSError as error:
+        return reason(error)
+    return ""
 
 
 def start_logging(level: int = logging.INFO) -> None:

@@ -10,7 +10,6 @@ import contextlib
 import logging
 import multiprocessing
 import os
-import secrets
 import signal
 import time
 from collections.abc import Callable
@@ -20,7 +19,9 @@ from pathlib import Path
 
 from beamsplat.common.config.deployment import Deployment, with_overrides
 from beamsplat.common.errors import UserError
-from beamsplat.common.files.persist import make_folder
+from beamsplat.common.files.epochs import EpochClaims
+from beamsplat.common.files.persist import make_folder_if_possible
+from beamsplat.common.messages.instances import ProcessId
 from beamsplat.common.runtime.registry import Service
 from beamsplat.common.security.logins import OPERATOR, SUPERVISOR, login_of, make_logins
 from beamsplat.common.zenoh.bus import open_session
@@ -60,14 +61,19 @@ class Child:
     name: str
     process: BaseProcess
     started: float
-    instance: str = ""
+    identity: ProcessId
     restarts: int = 0
     attempts: int = 0  # within the current back-off
     due: float | None = None  # time of the next start of a process that has ended
     failed: str = ""  # why the last process could not run (UserError); "" = it runs, or has crashed
     failures: int = 0  # UserErrors in a row
     was_active: bool = False
+    retiring: bool = False  # hands over to a successor: its end is no crash
     kill_at: float | None = None  # SIGTERM was sent for a restart; SIGKILL follows at this time
+
+    @property
+    def instance(self) -> str:
+        return self.identity.instance
 
 
 @dataclass
@@ -80,8 +86,12 @@ class Successor:
     name: str
     deployment: Deployment
     process: BaseProcess | None = None
-    instance: str = ""
+    identity: ProcessId | None = None  # with a process
     hands_over: bool = False  # loads the state that its predecessor saves, and publishes nothing before
+
+    @property
+    def instance(self) -> str:
+        return self.identity.instance if self.identity else ""
 
 
 class Supervisor:
@@ -105,9 +115,11 @@ class Supervisor:
         self._around: dict[str, Surroundings] = {}
         self._log_start: dict[str, int] = {}  # where the log of the newest process begins, bytes
         self._retired: list[BaseProcess] = []  # replaced processes, which end by themselves
+        self._successors: list[BaseProcess] = []  # in standby
         self.table = table
         self._names = names if names is not None else (ROUTER, *deployment.nodes)
         self._on_event = on_event or (lambda text: log.info("%s", text))
+        self._claims = EpochClaims(deployment.run_dir, self._on_event)
         self.starting = True
         self.obstacle = ""  # why the run cannot go on: text for a UserError
         self._start_up_until = time.monotonic() + START_UP_S
@@ -117,7 +129,8 @@ class Supervisor:
 
     def __enter__(self) -> Supervisor:
         self._refuse_second_router()  # before anything is created
-        make_folder(self.log_dir)
+        if fault := make_folder_if_possible(self.log_dir):
+            self._on_event(f"{self.log_dir}: {fault}; the logs go to the output of this process")
         try:
             self._start_all()
         except BaseException:
@@ -164,6 +177,7 @@ class Supervisor:
                 return
             if not router.process.is_alive():
                 raise UserError(f"the router did not start: {self.last_error(ROUTER)}")
+            time.sleep(0.05)
         raise UserError(f"no router at {', '.join(self.deployment.router.listen)} after 20 s")
 
     def log_file(self, name: str) -> Path:
@@ -179,28 +193,28 @@ class Supervisor:
 
     def _spawn(
         self, deployment: Deployment, name: str, resume: bool = False, standby: bool = False
-    ) -> tuple[BaseProcess, str]:
-        """Start a process; return the process and its instance id (16 hex digits)."""
-        instance = secrets.token_hex(8)
+    ) -> tuple[BaseProcess, ProcessId]:
+        """Start a process; return the process and its identity on the bus."""
+        identity = self._claims.claim(name)
         log_file = self.log_file(name)
         self._log_start[name] = log_file.stat().st_size if log_file.exists() else 0
         around = self._around.get(name)
         process = self._context.Process(
             target=child,
-            args=(deployment, name, log_file, resume, around, self.table, instance, standby),
+            args=(deployment, name, log_file, resume, around, self.table, identity, standby),
             name=name,
             daemon=False,
         )
         process.start()
-        return process, instance
+        return process, identity
 
-    def _set_process(self, name: str, process: BaseProcess, instance: str) -> None:
+    def _set_process(self, name: str, process: BaseProcess, identity: ProcessId) -> None:
         known = self.children.get(name)
         if known is None:
-            self.children[name] = Child(name, process, time.monotonic(), instance)
+            self.children[name] = Child(name, process, time.monotonic(), identity)
         else:
-            known.process, known.started, known.instance = process, time.monotonic(), instance
-            known.due, known.kill_at = None, None
+            known.process, known.started, known.identity = process, time.monotonic(), identity
+            known.due, known.kill_at, known.retiring = None, None, False
 
     def successor(self, name: str, overrides: tuple[str, ...], warm: bool) -> Successor:
         """Prepare the replacement of a node by one with other options: see `beamsplat.tools.system.swap`.
@@ -225,20 +239,37 @@ class Supervisor:
                 f"{name} cannot be taken over while it runs, {obstacle}: --cold ends it first, and starts it "
                 "anew with the new options"
             )
-        return Successor(name, deployment, *self._spawn(deployment, name, standby=True), node.hands_over)
+        successor = Successor(name, deployment, *self._spawn(deployment, name, standby=True), node.hands_over)
+        assert successor.process is not None  # just started
+        self._successors.append(successor.process)
+        return successor
 
     def replace(self, successor: Successor) -> None:
         """Supervise an activated successor in place of its predecessor; later restarts use its options."""
-        self.deployment = successor.deployment
+        self._use_options_of(successor)
         self._retired.append(self.children[successor.name].process)
-        assert successor.process is not None  # only a running successor takes over
-        self._set_process(successor.name, successor.process, successor.instance)
+        assert successor.process is not None  # it is running
+        self._successors.remove(successor.process)
+        assert successor.identity is not None
+        self._set_process(successor.name, successor.process, successor.identity)
         self._on_event(f"{successor.name} was taken over by its successor")
+
+    def discard(self, successor: Successor) -> None:
+        """Kill the process of a successor that has failed; one that has taken over is restarted by `poll`."""
+        if successor.process is not None:
+            successor.process.kill()
+            self._successors = [p for p in self._successors if p is not successor.process]
 
     def restart_with(self, successor: Successor) -> None:
         """Restart a node with the successor's options."""
-        self.deployment = successor.deployment
+        self._use_options_of(successor)
         self.restart(successor.name)
+
+    def _use_options_of(self, successor: Successor) -> None:
+        """Take over the options of one node; those of others may have changed since it was prepared."""
+        options = successor.deployment.nodes[successor.name]
+        nodes = {**self.deployment.nodes, successor.name: options}
+        self.deployment = self.deployment.model_copy(update={"nodes": nodes})
 
     def restart(self, name: str) -> None:
         """Send SIGTERM to a process; `poll` starts it again when it has ended."""
@@ -261,8 +292,9 @@ class Supervisor:
             elif entry.kill_at is not None:
                 entry.due = now
                 self._on_event(f"{entry.name} was ended by request; starts again")
-            else:
+            elif not entry.retiring:
                 self._handle_exit(entry, now)
+        self._retired = [process for process in self._retired if process.is_alive()]
 
     def observe(self, reported: dict[str, tuple[str, str]]) -> None:
         """Note which nodes run; call it as often as `poll`.
@@ -331,6 +363,8 @@ class Supervisor:
         """Stop the nodes with SIGTERM, sources first, then the router; SIGKILL after `STOP_S`."""
         nodes = [c for c in self.children.values() if c.name != ROUTER]
         _end(list(reversed(nodes)))
+        for process in self._successors:
+            process.kill()
         for process in self._retired:
             process.join(STOP_S)
             process.kill()

@@ -83,6 +83,7 @@ function showSummary(status) {
   const parts = [
     [`${status.nodes.length - stopped} of ${status.nodes.length} nodes running`, stopped ? "bad" : "good"],
     [`${status.nodes.reduce((sum, n) => sum + n.lost, 0)} messages lost`, status.nodes.some((n) => n.lost) ? "bad" : "good"],
+    [`${status.nodes.reduce((sum, n) => sum + n.late, 0)} late`, "good"],
     [`pages open: ${status.page.viewers}`, ""],
   ];
   $("summary").replaceChildren(...parts.map(([text, className]) => {

@@ -8,9 +8,10 @@ import pytest
 
 from beamsplat.common.messages import CameraModel, Keyframe, KeyframeAck
 from beamsplat.common.messages.header import Header
+from beamsplat.common.messages.instances import ProcessId
 from beamsplat.common.runtime.live import Live, LiveSettings
 from beamsplat.common.runtime.lockstep import Lockstep
-from beamsplat.common.runtime.mailbox import NO_PRODUCER, Envelope, Mailbox
+from beamsplat.common.runtime.mailbox import Envelope, Mailbox
 from beamsplat.common.runtime.node import Input, Node, merged_topics
 from beamsplat.common.zenoh.bus import open_router
 from tests.common.nodes import SensorSource, SensorSourceConfig
@@ -121,7 +122,7 @@ def test_feedback_is_neither_merged_nor_waited_for(delivery):
     )
     assert merged_topics(node) == ("lidar/scan",)
     mailbox = Mailbox(node)
-    mailbox.end("lidar/scan", "ab" * 8, 0)
+    mailbox.end("lidar/scan", ProcessId("replay", 0, "ab" * 8))
     assert mailbox.ended
     for i in range(3):
         ack = KeyframeAck(stamp_ns=100 - i, id=i)  # older each time: still in order of arrival
@@ -130,14 +131,14 @@ def test_feedback_is_neither_merged_nor_waited_for(delivery):
     wanted = [0, 1, 2] if delivery is None else [2]
     assert [mailbox.pop().message.id for _ in wanted] == wanted
     assert mailbox.counts["keyframes/ack"].dropped == (0 if delivery is None else 2)
-    mailbox.end("keyframes/ack", "cd" * 8, 0, sent=3)
+    mailbox.end("keyframes/ack", ProcessId("mapping", 0, "cd" * 8), sent=3)
     assert mailbox.ended
     assert mailbox.counts["keyframes/ack"].lost == 0
 
 
 def test_a_node_without_other_inputs_than_feedback_does_not_end_by_itself():
     mailbox = Mailbox(Requester)
-    mailbox.end("keyframes/ack", "cd" * 8, 0)
+    mailbox.end("keyframes/ack", ProcessId("mapping", 0, "cd" * 8))
     assert not mailbox.ended
-    mailbox.end("lidar/scan", NO_PRODUCER, 0)
+    mailbox.end("lidar/scan", None)
     assert not mailbox.ended  # no producer at all: it waits, as every node does

@@ -6,7 +6,7 @@ import pytest
 from beamsplat.common.messages import Grid, Odometry
 from beamsplat.common.messages.header import Header
 from beamsplat.common.runtime.handover import Handover, parse_progress
-from beamsplat.common.runtime.mailbox import NO_PRODUCER, Envelope, Mailbox
+from beamsplat.common.runtime.mailbox import Envelope, Mailbox
 from tests.common.nodes import Sink
 
 
@@ -93,9 +93,10 @@ def test_inputs_that_the_predecessor_handled_are_known_by_sequence_number():
     for sequence in (0, 1, 2, 5):
         mailbox.put(envelope(sequence))
     for name in ("localization/correction", "localization/grid"):
-        mailbox.end(name, NO_PRODUCER, 0)
+        mailbox.end(name, None)
     assert mailbox.pop().header.sequence == 0
     old, new = Handover(standby=False), Handover(standby=True)
     activated(new, old.retire(mailbox.handled()))
-    assert [s for s in range(8) if not new.was_handled(envelope(s))] == [1, 2, 5, 6, 7]
+    # 1, 2 and 5 are queued, 3 and 4 are missing: they may arrive yet.
+    assert [s for s in range(8) if not new.was_handled(envelope(s))] == [1, 2, 3, 4, 5, 6, 7]
     assert not new.was_handled(envelope(0, "b" * 16))

@@ -7,6 +7,7 @@ import pytest
 from beamsplat.common.messages import Health, Tick
 from beamsplat.common.messages.codec import encode, schema_of
 from beamsplat.common.messages.header import Header, local_clock_id
+from beamsplat.common.messages.instances import control_id
 from beamsplat.common.runtime.node import Input
 from beamsplat.common.topics import topic
 from beamsplat.common.zenoh.bus import key
@@ -149,7 +150,7 @@ def test_a_process_answers_control_requests_at_once_and_queries_once_announced(m
 
     node.answer_queries(answer)
     instance = node.producer.instance
-    wait_until(lambda: ask("control", instance, "reached") == [b"yes"])
+    wait_until(lambda: ask("control", control_id(instance), "reached") == [b"yes"])
     assert ask("query", "depth", "params") == []
     node.announce(("params",))
     wait_until(lambda: ask("query", "depth", "params?a=1") == [b"yes"])

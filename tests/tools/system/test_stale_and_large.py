@@ -14,6 +14,7 @@ import pytest
 
 from beamsplat.common.messages import Odometry
 from beamsplat.common.messages.header import DecodeError
+from beamsplat.common.messages.instances import process_of
 from beamsplat.common.runtime.mailbox import Mailbox
 from beamsplat.common.runtime.node import Input
 from beamsplat.common.security.access_control import HostRole
@@ -76,7 +77,8 @@ def test_messages_that_were_heard_and_are_said_again_are_counted_as_stale(keys, 
         ear = local.declare_subscriber(f"beamsplat/r1/{POSE}", captured.append)
         listener = Listener(local)
         time.sleep(0.5)
-        says = [Bus(robot, "r1", "localization", f"{epoch:016x}", epoch).publish(POSE) for epoch in (1, 2)]
+        processes = [process_of(b"seed", "localization", epoch) for epoch in (1, 2)]
+        says = [Bus(robot, "r1", p.node, p.instance, p.epoch).publish(POSE) for p in processes]
         for number in range(20):
             says[number // 10].put(pose(number))
         wait(lambda: listener.taken() == 20 and len(captured) == 20)
