@@ -73,6 +73,7 @@ bench_cli.app.command("depth")(depth_cli.bench_depth)
 bench_cli.app.command("raster")(mapping_cli.bench_raster)
 bench_cli.app.command("map")(mapping_cli.bench_map)
 bench_cli.app.command("laps")(endurance_cli.bench_laps)
+bench_cli.app.command("faults")(endurance_cli.bench_faults)
 app.add_typer(bench_cli.app, name="bench", rich_help_panel=_MACHINE)
 
 
