@@ -122,6 +122,11 @@ class HealthFilter:
         self._heard_s[node] = now
         return True
 
+    @property
+    def total_refused(self) -> int:
+        """Number of reports that were not accepted, of all nodes."""
+        return sum(self.refused.values()) + self.ignored
+
     def _forget_silent(self, now: float) -> bool:
         """Forget the nodes that have not reported for `_FORGET_S`; return whether there are any."""
         old = [node for node, heard_s in self._heard_s.items() if now - heard_s > _FORGET_S]

@@ -10,6 +10,7 @@ import psutil
 import zenoh
 
 from beamsplat.common.messages import Health, OutputHealth
+from beamsplat.common.redaction import without_secrets
 from beamsplat.common.runtime.running_node import RunningNode
 from beamsplat.common.zenoh.bus import Bus
 
@@ -42,7 +43,8 @@ class HealthReporter:
             inputs = r.mailbox.health()
         steps = np.array(r.steps_ms or [0.0])
         outputs = tuple(
-            OutputHealth(topic=name, sent=p.sent, bytes=p.bytes) for name, p in r.publications.items()
+            OutputHealth(topic=name, sent=p.sent, bytes=p.bytes, refused=p.refused)
+            for name, p in r.publications.items()
         )
         self._bus.publish_health(
             Health(
@@ -50,6 +52,6 @@ class HealthReporter:
                 epoch=r.settings.epoch, state=r.state, inputs=inputs, outputs=outputs,
                 step_p50_ms=float(np.percentile(steps, 50)), step_p95_ms=float(np.percentile(steps, 95)),
                 rss_mb=self._process.memory_info().rss / 1e6, cpu_percent=self._process.cpu_percent(),
-                detail=r.detail_text()[:_DETAIL_CHARS], pid=self._process.pid,
+                detail=without_secrets(r.detail_text())[:_DETAIL_CHARS], pid=self._process.pid,
             )
         )  # fmt: skip

@@ -21,7 +21,6 @@ from beamsplat.common.files.persist import ReplayPosition
 from beamsplat.common.messages import Health, Message
 from beamsplat.common.runtime.control import HandoverControl
 from beamsplat.common.runtime.handover import CONTROL
-from beamsplat.common.runtime.health import HealthFilter
 from beamsplat.common.runtime.health_reporter import HealthReporter
 from beamsplat.common.runtime.jobs import JobAbandoned, JobQueue, JobThreads
 from beamsplat.common.runtime.live_settings import LiveSettings
@@ -32,10 +31,11 @@ from beamsplat.common.runtime.running_node import POLL_S, RunningNode
 from beamsplat.common.security.logins import login_of
 from beamsplat.common.topics import HEALTH
 from beamsplat.common.zenoh.bus import Bus, open_session
-from beamsplat.common.zenoh.queries import ask, reply
+from beamsplat.common.zenoh.queries import ask, reject, reply
 
 log = logging.getLogger(__name__)
 
+_MAX_QUERIES = 64  # that wait for the node's thread; a node may be busy with one step for some seconds
 _MATCHING_S = 0.5  # a topic without subscribers delays the start of a source by this
 _STOP_TIMEOUT_S = 2.0  # after a signal, background jobs have this long to finish
 _FEEDBACK_TIMEOUT_S = 1.0  # without feedback, after which `on_feedback_timeout` is called
@@ -50,7 +50,6 @@ class Live:
         self._stop_by = math.inf
         self._queries: deque[tuple[str, zenoh.Query]] = deque()
         self._healths: deque[Health] = deque(maxlen=256)
-        self._reporters = HealthFilter()
         self._undecodable_limit = RateLimitedLog()
         self._position = ReplayPosition(settings.run_dir, node.name)
 
@@ -256,10 +255,14 @@ class Live:
             log.warning("dropped a message on %s (%d more since the last report): %s", topic, count, reason)
 
     def _on_query(self, name: str, query: zenoh.Query) -> None:
+        if len(self._queries) >= _MAX_QUERIES * (2 if name.startswith(CONTROL) else 1):
+            self.running.rejected_queries += 1
+            reject(query, f"{self.running.node.name} has {_MAX_QUERIES} queries to answer: ask again later")
+            return
         self._queries.append((name, query))
         self.running.wake()
 
     def _on_health(self, health: Health) -> None:
-        if self._reporters.accepts(health, time.monotonic()):
+        if self.running.reporters.accepts(health, time.monotonic()):
             self._healths.append(health)
             self.running.wake()

@@ -13,6 +13,7 @@ from beamsplat.common.messages.header import Header, local_clock_id
 from beamsplat.common.messages.instances import ProcessId
 from beamsplat.common.messages.robot import NodeState
 from beamsplat.common.runtime.handover import Handover
+from beamsplat.common.runtime.health import HealthFilter
 from beamsplat.common.runtime.jobs import JobQueue
 from beamsplat.common.runtime.live_settings import LiveSettings
 from beamsplat.common.runtime.mailbox import Envelope, Mailbox
@@ -49,6 +50,8 @@ class RunningNode:
         self.publications: dict[str, Publication] = {}
         self.jobs: JobQueue[Future]  # set by the runner, before the node is configured
         self.undecodable_reports = 0  # health reports of other nodes
+        self.reporters = HealthFilter()
+        self.rejected_queries = 0
         # End-of-stream markers that wait: (topic, producer) -> (messages sent in all, time of arrival).
         self._ends: dict[tuple[str, ProcessId], tuple[int, float]] = {}
         self._clock_id = local_clock_id()
@@ -94,12 +97,27 @@ class RunningNode:
 
     def detail_text(self) -> str:
         """Return the detail line of the node's health: of the runner, else of the node; failed queries."""
-        detail = self.detail or self.node.detail
-        if not self._query_faults:
-            return detail
-        noun = "query" if self._query_faults == 1 else "queries"
-        failed = f"{self._query_faults} {noun} failed (last: {self._last_query_fault[:_FAULT_CHARS]})"
-        return f"{detail}; {failed}" if detail else failed
+        texts = [self.detail or self.node.detail]
+        if self._query_faults:
+            noun = "query" if self._query_faults == 1 else "queries"
+            texts.append(
+                f"{self._query_faults} {noun} failed (last: {self._last_query_fault[:_FAULT_CHARS]})"
+            )
+        for name, publication in self.publications.items():
+            if publication.refused:
+                texts.append(f"{publication.refused} messages on {name} are too large and were not published")
+        for name, count in self.mailbox.counts.items():
+            if count.refused:
+                texts.append(
+                    f"{count.refused} messages on {name} refused: of another process than its producer"
+                )
+        others = (
+            (self.undecodable_reports, "health reports could not be decoded"),
+            (self.reporters.total_refused, "health reports refused: of another process than the node's"),
+            (self.rejected_queries, "queries rejected: too many at once"),
+        )
+        texts += [f"{number} {what}" for number, what in others if number]
+        return "; ".join(text for text in texts if text)
 
     def next_envelope(self) -> Envelope | None:
         """Return the next message for the node, or None after waiting `POLL_S` seconds without one."""

@@ -8,6 +8,7 @@ All keys of a robot start with `beamsplat/<robot>/`:
     alive/<node>/<instance>       liveliness token of an active node
     failed/<node>/<instance>      liveliness token of a node that cannot run, declared by its supervisor
     query/<node>/<name>           queries to a node
+    operator/<node>/<verb>        commands of the operator, from the host of the node only
     control/<id>/<verb>           hand-over requests to one process (common/runtime/handover.py)
 
 All sessions are clients of a router on this host: two Zenoh peers that are connected only through a router
@@ -45,6 +46,7 @@ ROOT = "beamsplat"
 # round trip time (20 Mbit/s x 100 ms), or the rate is not reached.
 URGENT_BUFFER_BYTES = 32 * 1024
 BULK_BUFFER_BYTES = 256 * 1024
+HEADERS_BYTES = 64 * 1024  # of Zenoh and of our own, beside the payload of a message
 SHM_POOL_BYTES = 64 * 1024 * 1024  # Zenoh's shared-memory pool of one process
 
 
@@ -115,7 +117,7 @@ def router_config(
     if any(is_secure(endpoint) for endpoint in (*listen, *connect)):
         keys = HostKeys.of(security)
         keys.identify(config)
-        config.insert_json5("transport/link/rx/max_message_size", str(LIMIT_KB * 1000))
+        config.insert_json5("transport/link/rx/max_message_size", str(LIMIT_KB * 1000 + HEADERS_BYTES))
         config.insert_json5("access_control", json.dumps(access_control(read_hosts(keys.folder))))
     require_logins(config, security, (*listen, *connect))
     config.insert_json5("adminspace/enabled", "true")

@@ -11,15 +11,19 @@ import zenoh
 
 from beamsplat.common.errors import UserError
 from beamsplat.common.messages import Answer, Message
-from beamsplat.common.messages.codec import decode, encode, schema_of
+from beamsplat.common.messages.codec import decode, schema_of
 from beamsplat.common.messages.header import DecodeError
 from beamsplat.common.messages.instances import control_id
+from beamsplat.common.redaction import without_secrets
 from beamsplat.common.runtime.handover import CONTROL
 from beamsplat.common.runtime.rate_limited_log import RateLimitedLog
+from beamsplat.common.topics import LIMIT_KB
 from beamsplat.common.zenoh.bus import key
-from beamsplat.common.zenoh.streams import ENCODING
+from beamsplat.common.zenoh.streams import ENCODING, encode_within
 
 log = logging.getLogger(__name__)
+# First part of the key after the robot: queries, and commands from the host of the node.
+QUERY, OPERATOR_QUERY = "query", "operator"
 
 
 class NoAnswer(UserError):
@@ -30,15 +34,23 @@ _DISCOVERY_S = 2.0  # right after a (re)connection, queries to a running node ge
 
 
 def ask(
-    session: zenoh.Session, robot: str, node: str, name: str, parameters: dict[str, str], timeout_s: float
+    session: zenoh.Session,
+    robot: str,
+    node: str,
+    name: str,
+    parameters: dict[str, str],
+    timeout_s: float,
+    prefix: str = QUERY,
 ) -> Iterator[Message]:
     """Send the query `name` with `parameters` to a node, and yield the answer messages as they arrive.
+
+    With `prefix` = `OPERATOR_QUERY` it is a command of the operator, which may set any option of a node.
 
     Raises:
         NoAnswer: no node answered this query in time.
         UserError: the node rejected it, or its answer cannot be decoded.
     """
-    yield from _ask(session, key(robot, "query", node, name), (node, name), parameters, timeout_s)
+    yield from _ask(session, key(robot, prefix, node, name), (node, name), parameters, timeout_s)
 
 
 def command(
@@ -115,7 +127,8 @@ def reply(query: zenoh.Query, messages: Iterator[Message]) -> str:
         try:
             for message in messages:
                 encoding = ENCODING.with_schema(schema_of(message))
-                query.reply(query.key_expr, encode(message), encoding=encoding)
+                payload = encode_within(message, LIMIT_KB, f"answer to {query.key_expr}")
+                query.reply(query.key_expr, payload, encoding=encoding)
         except ValueError as error:
             _reply_error(query, str(error))
         except Exception as error:
@@ -127,6 +140,12 @@ def reply(query: zenoh.Query, messages: Iterator[Message]) -> str:
     return ""
 
 
+def reject(query: zenoh.Query, text: str) -> None:
+    """Answer a query with the error `text`."""
+    with query:
+        _reply_error(query, text)
+
+
 def _reply_error(query: zenoh.Query, text: str) -> None:
     with contextlib.suppress(zenoh.ZError):  # the asker has left
-        query.reply_err(text.encode())
+        query.reply_err(without_secrets(text).encode())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
 from collections.abc import Callable
@@ -14,8 +15,11 @@ from beamsplat.common.messages import Message
 from beamsplat.common.messages.codec import MEDIA_TYPE, decode, encode, schema_of
 from beamsplat.common.messages.header import DecodeError, Header
 from beamsplat.common.runtime.mailbox import Envelope
+from beamsplat.common.runtime.rate_limited_log import RateLimitedLog
 from beamsplat.common.topics import Topic
 from beamsplat.common.zenoh.receiving import receive_in_thread
+
+log = logging.getLogger(__name__)
 
 FIFO_MESSAGES = 256  # queue between Zenoh and the receiving thread, for an `every` input without a cache
 ENCODING = zenoh.Encoding(MEDIA_TYPE)
@@ -83,7 +87,7 @@ class Producer:
 
 
 class Publication:
-    """Publication of one topic, with the counts of sent messages and bytes. `put` is thread-safe."""
+    """Publication of one topic, with the counts of sent and refused messages. `put` is thread-safe."""
 
     def __init__(self, session: zenoh.Session, producer: Producer, row: Topic, key_expr: str) -> None:
         self._producer = producer
@@ -91,11 +95,24 @@ class Publication:
         self.row = row
         self.sent = 0
         self.bytes = 0
+        self.refused = 0  # messages that are larger than the limit of the topic
+        self._refusal_log = RateLimitedLog()
         self._publisher = declare_publication(session, key_expr, row)
 
-    def put(self, message: Message) -> Header:
-        """Publish one message and return its header; never waits for a subscriber."""
-        payload = encode(message)
+    def put(self, message: Message) -> Header | None:
+        """Publish one message and return its header; never waits for a subscriber.
+
+        Return None, and count and log the message, if it is larger than the limit of its topic: routers and
+        subscribers would drop it.
+        """
+        try:
+            payload = encode_within(message, self.row.limit_kb, self.row.name)
+        except ValueError as error:
+            with self._lock:
+                self.refused += 1
+                if (count := self._refusal_log.due(self.row.name)) is not None:
+                    log.error("not published (%d more since the last report): %s", count, error)
+            return None
         with self._lock:
             header = Header(
                 stamp_ns=message.stamp_ns,
@@ -110,6 +127,21 @@ class Publication:
             self.sent += 1
             self.bytes += len(payload)
         return header
+
+
+def encode_within(message: Message, limit_kb: int, subject: str) -> bytes:
+    """Return the payload of a message of a topic or query, `subject`.
+
+    Raises:
+        ValueError: the payload is larger than `limit_kb`, or its texts and numbers are too long (`encode`).
+    """
+    payload = encode(message)
+    if len(payload) > limit_kb * 1000:
+        raise ValueError(
+            f"{subject}: {len(payload) / 1e6:.2f} MB in a {type(message).__name__} with stamp "
+            f"{message.stamp_ns}, the limit is {limit_kb / 1e3:g} MB"
+        )
+    return payload
 
 
 class Subscription:
