@@ -80,7 +80,8 @@ class Campaign:
         self._pids: dict[Target, int] = {}
         self._samples = ProcessSamples()
         self._recoveries: list[float] = []
-        self._survived = 0
+        self._survived = 0  # faults of rounds without a finding
+        self._found_before = 0  # findings at the end of the previous round
         self._reasons: dict[Target, str] = {}  # why a process ended, from the output of `beamsplat run`
 
     def run(self) -> dict[str, Any]:
@@ -134,6 +135,7 @@ class Campaign:
         kinds: list[Callable[[Surfaces, random.Random], InjectedFault]] = []
         ends = time.monotonic() + self._minutes * 60.0
         while time.monotonic() < ends:
+            first = len(self._faults)
             round_ends = min(time.monotonic() + ROUND_S, ends)
             next_fault = time.monotonic()
             while time.monotonic() < round_ends:
@@ -146,11 +148,15 @@ class Campaign:
                 self._poll()
             while self._active:
                 self._poll()
-            known = len(self.findings)
-            seconds = self._wait_until_healthy(RECOVER_S, "the faults of this round")
-            self._recoveries.append(seconds)
-            self._survived += len(self._faults) - self._survived if len(self.findings) == known else 0
-            self._check_files()
+            self._check_recovery(first)
+
+    def _check_recovery(self, first: int) -> None:
+        """Check that everything works after a round; its faults are those from number `first` on."""
+        self._recoveries.append(self._wait_until_healthy(RECOVER_S, "the faults of this round"))
+        self._check_files()
+        if len(self.findings) == self._found_before:
+            self._survived += len(self._faults) - first
+        self._found_before = len(self.findings)
 
     def _begin(self, fault: InjectedFault) -> None:
         now = self._now()
