@@ -93,6 +93,33 @@ def test_messages_that_were_heard_and_are_said_again_are_counted_as_stale(keys, 
         assert listener.why == []
 
 
+def test_the_highest_epoch_with_the_keys_of_the_robot_does_not_silence_its_stream(keys, edge):
+    with (
+        open_session(edge[:1]) as local,
+        open_link(edge[1], 2.0, SecurityConfig(keys=keys / "r1")) as robot,
+        open_link(edge[1], 2.0, SecurityConfig(keys=keys / "r1")) as hostile,
+    ):
+        listener = Listener(local)
+        time.sleep(0.5)
+        first, second = (process_of(b"seed", "localization", epoch) for epoch in (1, 2))
+        says = Bus(robot, "r1", first.node, first.instance, first.epoch).publish(POSE)
+        for number in range(10):
+            says.put(pose(number))
+        wait(lambda: listener.taken() == 10)
+        claims = Bus(hostile, "r1", "localization", "ab" * 8, 2**32 - 1).publish(POSE)
+        for number in range(10):
+            claims.put(pose(1000 + number))
+        wait(lambda: listener.count.refused == 10)
+        for number in range(10, 20):
+            says.put(pose(number))
+        wait(lambda: listener.taken() == 20)
+        # The robot's own next process takes over at once, as after a restart.
+        restarted = Bus(robot, "r1", second.node, second.instance, second.epoch).publish(POSE)
+        restarted.put(pose(20))
+        wait(lambda: listener.taken() == 21)
+        assert (listener.count.stale, listener.count.refused, listener.why) == (0, 10, [])
+
+
 def record(port, target, tape):
     """Passes one connection on to `target`, and keeps what the one who connects says."""
     listener = socket.create_server(("127.0.0.1", port))
