@@ -52,13 +52,25 @@ def make_logins(folder: Path, names: tuple[str, ...]) -> None:
     for name in names:
         known.setdefault(name, secrets.token_urlsafe(24))
     try:
-        folder.chmod(0o700)
+        if folder.stat().st_mode & 0o777 != 0o700:
+            folder.chmod(0o700)
+        # What is written already is not written again: existing logins are used on a full or read-only disk.
         for name, password in known.items():
-            write_private(folder / f"{name}.login", f"{name}:{password}\n".encode())
+            if not _has(folder / f"{name}.login", f"{name}:{password}\n"):
+                write_private(folder / f"{name}.login", f"{name}:{password}\n".encode())
         lines = "".join(f"{name}:{password}\n" for name, password in known.items())
-        write_private(folder / USERS, lines.encode())
+        if not _has(folder / USERS, lines):
+            write_private(folder / USERS, lines.encode())
     except OSError as error:
         raise UserError(f"security.local = {folder}: cannot be written ({error.strerror})") from error
+
+
+def _has(path: Path, text: str) -> bool:
+    """Return whether a file has this text, and only its owner can read it."""
+    try:
+        return path.stat().st_mode & 0o777 == 0o600 and path.read_text() == text
+    except OSError:
+        return False
 
 
 def login_of(security: SecurityConfig, name: str) -> Login | None:

@@ -69,7 +69,7 @@ class MappingNode(Node):
             check_budget(c.memory_mb, c.session)
         for option, folder in (("save", c.save), ("session", c.session)):
             if folder is not None:
-                check_can_write(folder, option)
+                check_can_write(folder, option, read_only_disk=True)
 
     def configure(self) -> None:
         c = self.config

@@ -156,7 +156,7 @@ class MonitorNode(_Handlers, Node):
 
     def check_resources(self) -> None:
         if self.config.save is not None:
-            check_can_write(self.config.save, "save")
+            check_can_write(self.config.save, "save", read_only_disk=True)
 
     def configure(self) -> None:
         c = self.config

@@ -71,7 +71,7 @@ class RecorderNode(_Handlers, Node):
         return self.writer
 
     def check_resources(self) -> None:
-        check_can_write(self.config.out, "out")
+        check_can_write(self.config.out, "out", read_only_disk=True)
 
     def on_header(self, header: Header) -> None:
         self._header = header

@@ -72,7 +72,7 @@ class LidarLocalization(Node):
             except UserError as error:
                 raise UserError(f"resume = {error}") from error
         if self.config.save is not None:
-            check_can_write(self.config.save, "save")
+            check_can_write(self.config.save, "save", read_only_disk=True)
 
     def configure(self) -> None:
         self._slam: LidarSlam | None = None
@@ -106,7 +106,13 @@ class LidarLocalization(Node):
 
     def _create_slam(self, T_body_lidar: np.ndarray) -> LidarSlam:
         """Return the SLAM from a checkpoint, from the `resume` folder, or with an empty map."""
-        crashed = self._checkpoint_dir is not None and (self._checkpoint_dir / MANIFEST).is_file()
+        # Only after a crash: the checkpoint of an earlier run may be on a disk that is read-only by now.
+        crashed = (
+            self._checkpoint_dir is not None
+            and self.live_settings is not None
+            and self.live_settings.resume
+            and (self._checkpoint_dir / MANIFEST).is_file()
+        )
         folder = self._checkpoint_dir if crashed else self.config.resume
         if folder is None:
             return LidarSlam(LidarSlamSettings(), T_body_lidar)
@@ -191,8 +197,25 @@ class LidarLocalization(Node):
         yield from self._publish_map_poses(self._slam)
         yield from self._publish_grid(self._slam)
         if self.config.save is not None:
-            self._slam.save(self.config.save)
-            log.info("map and state saved to %s", self.config.save)
+            self._save(self._slam, self.config.save)
+
+    def _save(self, slam: LidarSlam, folder: Path) -> None:
+        """Write the files of the option `save`.
+
+        Raises:
+            UserError: they cannot be written, and nothing else continues (lockstep); live, this is logged and
+                shown in the health of the node.
+        """
+        try:
+            slam.save(folder)
+        except OSError as error:
+            fault = f"localization.save = {folder}: not written ({reason(error)})"
+            if self.live_settings is None:
+                raise UserError(fault) from error
+            self.detail = fault
+            log.error("%s", fault)
+            return
+        log.info("map and state saved to %s", folder)
 
     def _publish_map_poses(self, slam: LidarSlam) -> Outputs:
         yield from self._correction(self._stamp_ns, slam.pose_graph.pose_map_odom)
