@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
 from collections import Counter
@@ -74,6 +75,7 @@ class RecordingWriter:
 
     Raises:
         UserError: the path exists (without `overwrite`) or cannot be created.
+        OSError: the disk is full or broken; nothing is left behind.
     """
 
     def __init__(
@@ -110,7 +112,20 @@ class RecordingWriter:
             chunk_size=2**62,
             compression=compression,
         )
-        self._writer.start(layout.PROFILE, layout.LIBRARY)
+        try:
+            self._writer.start(layout.PROFILE, layout.LIBRARY)
+        except OSError:
+            self._file.close()
+            self.remove_files()
+            raise
+
+    def remove_files(self) -> None:
+        """Remove the files of a closed recording, for example of one that has no message."""
+        with contextlib.suppress(OSError):
+            self.file_path.unlink(missing_ok=True)
+            if self.file_path != self.path:
+                (self.path / "metadata.yaml").unlink(missing_ok=True)
+                self.path.rmdir()
 
     def write(self, topic: str, message: Message, log_time_ns: int, header: Header | None = None) -> None:
         """Append one message; `log_time_ns` is its arrival time (ns) at the recorder.
@@ -274,7 +289,8 @@ class RecordingWriter:
             f"{self.file_path}: recording stopped because {reason}; "
             f"{self.counts.total()} messages are saved, {self.lost.total()} were lost"
         )
-        self._file.truncate_to_chunk_end()
+        with contextlib.suppress(OSError):  # a reader finds the end of the last complete chunk itself
+            self._file.truncate_to_chunk_end()
         return RecordingError(self._failure)
 
     def _write_metadata(self) -> None:

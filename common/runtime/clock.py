@@ -43,10 +43,13 @@ class StampClock:
 
 
 def _runtime_folder() -> Path:
-    for folder in (os.environ.get("XDG_RUNTIME_DIR", ""), "/dev/shm", tempfile.gettempdir()):
+    for folder in (os.environ.get("XDG_RUNTIME_DIR", ""), "/dev/shm"):
         if folder and os.access(folder, os.W_OK):
             return Path(folder)
-    return Path(tempfile.gettempdir())
+    try:
+        return Path(tempfile.gettempdir())
+    except FileNotFoundError:  # all disks are full or read-only: `_shared_offset` does without a file
+        return Path("/tmp")
 
 
 def _shared_offset(folder: Path, measured_ns: int) -> int:

@@ -26,6 +26,7 @@ from beamsplat.services.keyframes.queue_folder import QueueEntry, QueueFolder
 log = logging.getLogger("beamsplat.keyframes")
 
 _MEMORY_BYTES = 64_000_000  # largest size of the keyframes that could not be written to disk
+_WRITTEN_LATER = 4  # keyframes from memory that are written with each new one
 _NEWEST_EVERY = 4  # every fourth lost keyframe sent again is the newest
 
 
@@ -65,7 +66,6 @@ class Outbox:
         self.drive = ""  # name of the current drive
         self.bytes = 0
         self.dropped = 0  # never acknowledged, removed because the outbox was full
-        self.not_on_disk = 0  # could not be written to disk, kept in memory
         if self._folder is not None:
             for label in self._folder.entries():
                 self._entries[label.key] = _Pending(label, None)
@@ -84,6 +84,11 @@ class Outbox:
         self.drive = drive
 
     @property
+    def not_on_disk(self) -> int:
+        """Return the number of keyframes that could not be written to the disk yet, and are in memory."""
+        return 0 if self._folder is None else sum(e.payload is not None for e in self._entries.values())
+
+    @property
     def of_earlier_drives(self) -> int:
         """Return the number of stored keyframes of earlier drives."""
         return len(self._entries) - len(self)
@@ -91,7 +96,8 @@ class Outbox:
     @property
     def corrupt(self) -> int:
         """Return the number of keyframes that could not be read."""
-        return self._discarded + (self._folder.corrupt if self._folder is not None else 0)
+        folder = self._folder
+        return self._discarded + (folder.corrupt + folder.unreadable if folder is not None else 0)
 
     def put(self, key: int, view: np.ndarray, payload: bytes, now_ns: int) -> None:
         """Store a keyframe that is being sent for the first time.
@@ -107,11 +113,21 @@ class Outbox:
         self._forget(key)
         if not len(self):
             self._last_ack_ns = now_ns  # the retry time starts here
-        self._entries[key] = _Pending(
-            label, None if self._written(label, payload) else payload, self._next_send_index()
-        )
+        written = self._written(label, payload)
+        self._entries[key] = _Pending(label, None if written else payload, self._next_send_index())
         self.bytes += label.size
+        if written:
+            self._write_waiting()
         self._enforce_limits(keep=key)
+
+    def _write_waiting(self) -> None:
+        """Write the oldest keyframes that wait in memory for a disk that was full; few, to delay no step."""
+        waiting = [entry for entry in self._entries.values() if entry.payload is not None]
+        for entry in waiting[:_WRITTEN_LATER]:
+            assert entry.payload is not None  # see above
+            if not self._written(entry.meta, entry.payload):
+                return
+            entry.payload = None
 
     def acknowledge(self, key: int, now_ns: int) -> bool:
         """Remove an acknowledged keyframe; return False if the key is unknown.
@@ -159,8 +175,9 @@ class Outbox:
         payload = entry.payload
         if payload is None and self._folder is not None:
             payload = self._folder.read(entry.meta.key)
-        if payload is None:  # the folder has logged and counted it
-            self._forget(entry.meta.key)
+        if payload is None:  # the folder has logged and counted it, and removed its file if it is corrupt
+            del self._entries[entry.meta.key]
+            self.bytes -= entry.meta.size
             return
         entry.send_index, entry.resent = self._next_send_index(), True
         yield entry.meta.key, payload
@@ -175,11 +192,11 @@ class Outbox:
         try:
             self._folder.write(label, payload)
         except OSError as error:
-            self.not_on_disk += 1
             if (more := self._rate_limit.due("disk")) is not None:
                 log.error(
                     "keyframes cannot be written to %s (%s; %d more since then): they are kept in memory "
-                    "and will be lost by a restart; free disk space", self._folder.path, error.strerror, more,
+                    "until the disk has room, and will be lost by a restart; free disk space",
+                    self._folder.path, error.strerror, more,
                 )  # fmt: skip
             return False
         return True

@@ -9,6 +9,7 @@ removed.
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import struct
 from collections.abc import Iterator
@@ -19,7 +20,7 @@ import msgpack
 import numpy as np
 import xxhash
 
-from beamsplat.common.files.persist import make_folder, write_atomically
+from beamsplat.common.files.persist import make_folder_if_possible, write_atomically
 
 log = logging.getLogger("beamsplat.keyframes")
 
@@ -44,26 +45,44 @@ class QueueEntry:
 
 
 class QueueFolder:
-    """Folder with one file per keyframe. Corrupt files are removed; `corrupt` counts them."""
+    """Folder with one file per keyframe. Corrupt files are removed; `corrupt` counts them.
+
+    Files that the disk cannot read stay: they are read again after a restart; `unreadable` counts them.
+    """
 
     def __init__(self, path: Path) -> None:
-        """Create the folder if missing. Raises UserError if it cannot be created."""
-        self.path = make_folder(path.expanduser())
-        self.corrupt = 0
+        """Create the folder if missing; on a full or read-only disk, `write` creates it later.
+
+        Raises:
+            UserError: the folder cannot be created for another reason.
+        """
+        self.path = path.expanduser()
+        self.corrupt = self.unreadable = 0
+        if fault := make_folder_if_possible(self.path):
+            log.error("%s cannot be created (%s): keyframes are kept in memory", self.path, fault)
 
     def entries(self) -> Iterator[QueueEntry]:
         """Yield the metadata of all keyframes, oldest first; remove files that a crash left incomplete."""
-        for leftover in self.path.glob(f".*{_SUFFIX}.*"):
-            leftover.unlink(missing_ok=True)
-        for file in sorted(self.path.glob(f"*{_SUFFIX}")):
+        try:
+            leftovers = list(self.path.glob(f".*{_SUFFIX}.*"))
+            files = sorted(self.path.glob(f"*{_SUFFIX}"))
+        except OSError as error:
+            self._count_unreadable(self.path, error)
+            return
+        for leftover in leftovers:
+            with contextlib.suppress(OSError):
+                leftover.unlink()
+        for file in files:
             try:
                 with file.open("rb") as opened:
                     entry, start = _read_head(opened.read(_MAX_HEAD))
                     whole = start + entry.size == file.stat().st_size
                 if not whole or file != self._file(entry.key):
                     raise CorruptFile("is truncated, or has the name of another key")
-            except (OSError, CorruptFile) as error:
+            except CorruptFile as error:
                 self._discard(file, error)
+            except OSError as error:
+                self._count_unreadable(file, error)
             else:
                 yield entry
 
@@ -76,7 +95,7 @@ class QueueFolder:
         write_atomically(self._file(entry.key), _MAGIC + _LENGTH.pack(len(head)) + head + payload)
 
     def read(self, key: int) -> bytes | None:
-        """Return the payload; None if the file is corrupt or missing, which is logged and counted."""
+        """Return the payload; None if the file is corrupt or cannot be read, which is logged and counted."""
         file = self._file(key)
         try:
             data = file.read_bytes()
@@ -84,8 +103,11 @@ class QueueFolder:
             payload = data[start:]
             if len(payload) != entry.size or xxhash.xxh64_digest(payload) != _hash_of(data):
                 raise CorruptFile("does not match its checksum")
-        except (OSError, CorruptFile) as error:
+        except CorruptFile as error:
             self._discard(file, error)
+            return None
+        except OSError as error:
+            self._count_unreadable(file, error)
             return None
         return payload
 
@@ -98,6 +120,10 @@ class QueueFolder:
 
     def _file(self, key: int) -> Path:
         return self.path / f"{key:020d}{_SUFFIX}"
+
+    def _count_unreadable(self, file: Path, error: OSError) -> None:
+        self.unreadable += 1
+        log.warning("%s cannot be read: %s", file, error.strerror)
 
     def _discard(self, file: Path, error: Exception) -> None:
         self.corrupt += 1

@@ -24,6 +24,9 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
+from beamsplat.common.errors import reason
+from beamsplat.common.files.persist import is_disk_fault
+
 log = logging.getLogger(__name__)
 
 APPLICATION = "beamsplat"
@@ -203,14 +206,21 @@ class RerunWriter:
 
         The file is closed, complete, at `limit_mb`, or when less than `keep_free_mb` are free on the disk.
 
+        On a disk that is full, read-only or broken, a note says so, and nothing is saved.
+
         Raises:
-            RuntimeError: the file cannot be written.
+            RuntimeError: the file cannot be written for another reason.
         """
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
+            path = _unused_path(path)
+            _check_room(path)
         except OSError as error:
+            if is_disk_fault(error):
+                self.notes.append(f"NOT SAVED: {path}: {reason(error)}")
+                log.error("%s", self.notes[-1])
+                return path
             raise RuntimeError(f"cannot create the folder of {path}: {error}") from error
-        path = _unused_path(path)
         # Few, large chunks: rerun keeps their index in memory until the file is closed.
         stream = self._stream(flush_tick_s=2.0)
         watch = _disk_watch(path, limit_mb, keep_free_mb)
@@ -290,6 +300,19 @@ class RerunWriter:
 
 def _size_bytes(archetype: Any) -> int:
     return sum(batch.as_arrow_array().nbytes for batch in archetype.as_component_batches())
+
+
+def _check_room(path: Path) -> None:
+    """Check that a new file can be written: rerun does not tell why it cannot.
+
+    Raises:
+        OSError: the disk is full, read-only or broken.
+    """
+    try:
+        with path.open("xb", buffering=0) as file:
+            file.write(bytes(4096))
+    finally:
+        path.unlink(missing_ok=True)
 
 
 def _unused_path(path: Path) -> Path:

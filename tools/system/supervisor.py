@@ -11,6 +11,7 @@ import logging
 import multiprocessing
 import os
 import signal
+import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -124,6 +125,7 @@ class Supervisor:
         self.obstacle = ""  # why the run cannot go on: text for a UserError
         self._start_up_until = time.monotonic() + START_UP_S
         os.environ.update({k: os.environ.get(k, v) for k, v in ONE_THREAD.items()})
+        _use_writable_temporary_folder()
         self._context = multiprocessing.get_context("forkserver")
         self._context.set_forkserver_preload(list(PRELOADED))
 
@@ -369,6 +371,14 @@ class Supervisor:
             process.join(STOP_S)
             process.kill()
         _end([c for c in self.children.values() if c.name == ROUTER])
+
+
+def _use_writable_temporary_folder() -> None:
+    """Let Python create the socket of its fork server in memory, if no disk has room for it."""
+    try:
+        tempfile.gettempdir()
+    except FileNotFoundError:
+        tempfile.tempdir = "/dev/shm"
 
 
 def _end(children: list[Child]) -> None:

@@ -12,8 +12,8 @@ _CALLS = ("open", "fsync", "fdatasync", "replace", "rename", "unlink", "mkdir", 
 class _Raw(io.FileIO):
     """A file whose calls are counted; a call that fails has written the first half of its data."""
 
-    def __init__(self, disk, path, mode):
-        super().__init__(path, mode)
+    def __init__(self, disk, path, mode, opener):
+        super().__init__(path, mode, opener=opener)
         self._disk = disk
 
     def write(self, data):
@@ -47,11 +47,21 @@ class FaultyDisk:
             os._exit(9)
         raise OSError(self.number, os.strerror(self.number), name)
 
-    def _open(self, path, mode="r", buffering=-1, encoding=None, errors=None, newline=None, **other):
+    def _open(
+        self,
+        path,
+        mode="r",
+        buffering=-1,
+        encoding=None,
+        errors=None,
+        newline=None,
+        closefd=True,
+        opener=None,
+    ):
         self.step("open")
         if not set(mode) & set("wxa+") or isinstance(path, int):
-            return self._real_open(path, mode, buffering, encoding, errors, newline, **other)
-        raw = _Raw(self, path, mode.replace("b", "").replace("t", ""))
+            return self._real_open(path, mode, buffering, encoding, errors, newline, closefd, opener)
+        raw = _Raw(self, path, mode.replace("b", "").replace("t", ""), opener)
         file = io.BufferedRandom(raw) if "+" in mode else io.BufferedWriter(raw)
         return file if "b" in mode else io.TextIOWrapper(file, encoding, errors, newline)
 

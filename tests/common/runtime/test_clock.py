@@ -1,11 +1,15 @@
 """The stamp clock does not follow changes of the wall clock, and is common to all processes."""
 
+import errno
 import os
+import tempfile
+import time
 
 from hypothesis import given
 from hypothesis import strategies as st
 
 from beamsplat.common.runtime.clock import StampClock
+from tests.common.files.faulty_disk import FaultyDisk
 
 
 class Host:
@@ -46,3 +50,10 @@ def test_a_damaged_offset_file_is_ignored(tmp_path):
     assert host.clock(tmp_path).now_ns() == host.monotonic_ns + host.set_ns
     assert [file.name for file in tmp_path.iterdir()] == [place.name]
     assert str(os.getuid()) in place.name
+
+
+def test_a_clock_works_where_no_temporary_folder_can_be_written(monkeypatch):
+    monkeypatch.delenv("XDG_RUNTIME_DIR", raising=False)
+    monkeypatch.setattr(tempfile, "tempdir", None)
+    with FaultyDisk(0, "from then on", errno.ENOSPC):
+        assert abs(StampClock().now_ns() - time.time_ns()) < 60 * 10**9

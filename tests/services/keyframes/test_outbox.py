@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from beamsplat.common.errors import UserError
 from beamsplat.services.keyframes.outbox import Outbox, most_redundant
 from beamsplat.services.keyframes.queue_folder import CorruptFile, QueueEntry, QueueFolder, _read_head
+from tests.common.files.faulty_disk import FaultyDisk
 
 S = 1_000_000_000
 
@@ -190,7 +191,23 @@ def test_a_full_disk_is_said_and_counted_and_keyframes_go_on_in_memory(tmp_path,
     put(box, 4)  # there is room again
     box.acknowledge(4, 0)
     assert list(box.due(0)) == [(1, b"frame 1"), (2, b"x" * 5000), (3, b"y" * 5000)]
-    assert len(Outbox(10_000, S, 4, tmp_path)._entries) == 1
+    assert box.not_on_disk == 0
+    assert len(Outbox(10_000_000, S, 4, tmp_path)._entries) == 3  # those from memory are on the disk now
+
+
+def test_a_file_that_the_disk_cannot_read_stays_for_the_next_start(tmp_path):
+    for key in (1, 2):
+        put(Outbox(10_000_000, S, 4, tmp_path), key)
+    first = sorted(tmp_path.iterdir())[0]
+    with FaultyDisk(0, "from then on"):
+        box = Outbox(10_000_000, S, 4, tmp_path)
+    assert len(box._entries) == 0
+    assert box.corrupt
+    box = Outbox(10_000_000, S, 4, tmp_path)
+    with FaultyDisk(0, "from then on"):
+        assert sent(box, 9 * S) == []
+    assert box.corrupt == 1
+    assert first.exists()
 
 
 def test_bounds_and_folders_that_make_no_sense_are_refused(tmp_path):

@@ -95,7 +95,7 @@ def test_a_full_disk_is_logged_once_and_the_node_lives(tmp_path, monkeypatch, ca
         list(node.handle("tick", Tick(stamp_ns=i * SECOND, count=i)))
     node.close()
     assert sum("the disk is full" in record.message for record in caplog.records) == 1
-    assert node.writer.lost.total() == 4
+    assert node.lost.total() == 4
     with RecordingReader(tmp_path / "rec") as reader:
         assert len(list(reader.messages())) == 1
 
