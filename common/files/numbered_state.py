@@ -169,12 +169,22 @@ def packed_arrays(arrays: Arrays) -> bytes:
 def unpacked_arrays(source: bytes | BinaryIO) -> Arrays:
     """Return the arrays in an npz file (inverse of `packed_arrays`).
 
+    Compressed arrays are refused: kilobytes of them can expand to gigabytes, and `packed_arrays` writes none.
+
     Raises:
-        OSError, ValueError, zipfile.BadZipFile, zlib.error: the file is incomplete or damaged.
+        OSError, ValueError, zipfile.BadZipFile, zlib.error: the file is incomplete, damaged or compressed.
     """
     file = io.BytesIO(source) if isinstance(source, bytes) else source
-    with np.load(file, allow_pickle=False) as stored:
-        return {key: stored[key] for key in stored.files}
+    with zipfile.ZipFile(file) as members:
+        for member in members.infolist():
+            if member.compress_type != zipfile.ZIP_STORED:
+                raise ValueError(f"{member.filename} is compressed: its size in memory is not bounded")
+    file.seek(0)
+    try:
+        with np.load(file, allow_pickle=False) as stored:
+            return {key: stored[key] for key in stored.files}
+    except (MemoryError, EOFError, TypeError, AttributeError) as error:  # of a damaged header of an array
+        raise ValueError(f"not an npz file: {reason(error)}") from error
 
 
 def numbered_files(folder: Path, prefix: str, suffix: str) -> dict[int, Path]:

@@ -149,6 +149,9 @@ class Pinhole:
         return cv2.projectPoints(rays, zero, zero, self.K, d)[0].reshape(-1, 2)
 
 
+_BAND_ROWS = 32  # of the image, for which the remap tables are computed at a time
+
+
 class Undistorter:
     """Image undistortion for one camera; the remap tables are computed once, in the constructor."""
 
@@ -157,8 +160,13 @@ class Undistorter:
         self.pinhole = camera.undistorted()
         self._maps: tuple[np.ndarray, np.ndarray] | None = None
         if camera.is_distorted:
-            rays = self.pinhole.ray_grid().reshape(-1, 3)
-            uv = camera._distort(rays[:, :2]).astype(np.float32).reshape(*camera.shape, 2)
+            h, w = camera.shape
+            uv = np.empty((h, w, 2), np.float32)
+            # In bands: OpenCV needs 300 bytes per point, 5 GB for an image of 16 million pixels.
+            for first in range(0, h, _BAND_ROWS):
+                v, u = np.mgrid[first : min(first + _BAND_ROWS, h), :w].astype(np.float64)
+                rays = self.pinhole.rays(np.stack([u.ravel(), v.ravel()], axis=1))
+                uv[first : first + _BAND_ROWS] = camera._distort(rays[:, :2]).reshape(-1, w, 2)
             # The stubs do not know that map2 may be None.
             self._maps = cv2.convertMaps(uv, None, cv2.CV_16SC2)  # type: ignore[call-overload]
 

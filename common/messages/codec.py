@@ -24,10 +24,15 @@ from beamsplat.common.messages.header import DecodeError
 MEDIA_TYPE = "application/x-beamsplat"
 _ALIGN = 64
 _ARRAY = 1
-_DTYPES = frozenset(f"{kind}{bits}" for kind in ("int", "uint") for bits in (8, 16, 32, 64)) | {
+DTYPES = frozenset(f"{kind}{bits}" for kind in ("int", "uint") for bits in (8, 16, 32, 64)) | {
     "bool", "float16", "float32", "float64",
 }  # fmt: skip
 _LENGTH = struct.Struct("<I")
+# Limits of a received head. msgpack allocates a list of the stated length before it reads the entries, and
+# lists can be nested: without limits a head of 1 MB costs gigabytes.
+MAX_HEAD_BYTES = 1024 * 1024
+MAX_ENTRIES = 256  # of a list or map; the longest of a message has 64
+_MAX_DESCRIPTION_BYTES = 128  # of an array: dtype, shape, offset
 
 
 def schema_of(message: Message | type[Message]) -> str:
@@ -36,7 +41,11 @@ def schema_of(message: Message | type[Message]) -> str:
 
 
 def encode(message: Message) -> bytes:
-    """Return the payload of a message; its schema (`schema_of`) must be transmitted beside it."""
+    """Return the payload of a message; its schema (`schema_of`) must be transmitted beside it.
+
+    Raises:
+        ValueError: texts and numbers of the message exceed `MAX_HEAD_BYTES`; arrays do not count.
+    """
     arrays: list[np.ndarray] = []
     position = 0
 
@@ -52,6 +61,10 @@ def encode(message: Message) -> bytes:
         raise TypeError(f"{type(value).__name__} cannot be encoded in a message")
 
     head = msgpack.packb(message.__dict__, default=pack)
+    if len(head) > MAX_HEAD_BYTES:
+        raise ValueError(
+            f"{schema_of(message)}: texts and numbers of {len(head)} bytes, at most {MAX_HEAD_BYTES}"
+        )
     start = _padded(_LENGTH.size + len(head))
     pieces = [_LENGTH.pack(len(head)), head, bytes(start - _LENGTH.size - len(head))]
     for array in arrays:
@@ -109,12 +122,16 @@ def _unpack(payload: bytes) -> dict[str, Any]:
     start = _padded(_LENGTH.size + head_length)
     if _LENGTH.size + head_length > len(payload):
         raise DecodeError(f"head of {head_length} bytes in a payload of {len(payload)}")
+    if head_length > MAX_HEAD_BYTES:
+        raise DecodeError(f"head of {head_length} bytes, at most {MAX_HEAD_BYTES}")
 
     def view(code: int, description: bytes) -> np.ndarray:
         if code != _ARRAY:
             raise DecodeError(f"unknown extension type {code}")
+        if len(description) > _MAX_DESCRIPTION_BYTES:
+            raise DecodeError(f"description of an array has {len(description)} bytes")
         dtype, shape, offset = msgpack.unpackb(description)
-        if dtype not in _DTYPES or not isinstance(offset, int) or offset < 0 or len(shape) > 8:
+        if dtype not in DTYPES or not isinstance(offset, int) or offset < 0 or len(shape) > 8:
             raise DecodeError(f"array of {dtype!r} at {offset!r}")
         if not all(isinstance(size, int) and 0 <= size < 2**40 for size in shape):
             raise DecodeError(f"array of shape {shape!r}")
@@ -127,7 +144,10 @@ def _unpack(payload: bytes) -> dict[str, Any]:
         return np.frombuffer(payload, dtype, count, start + offset).reshape(shape)
 
     head = memoryview(payload)[_LENGTH.size : _LENGTH.size + head_length]
-    fields = msgpack.unpackb(head, ext_hook=view, use_list=False, strict_map_key=True)
+    fields = msgpack.unpackb(
+        head, ext_hook=view, use_list=False, strict_map_key=True,
+        max_array_len=MAX_ENTRIES, max_map_len=MAX_ENTRIES,
+    )  # fmt: skip
     if not isinstance(fields, dict):
         raise DecodeError(f"head is a {type(fields).__name__}, not a map")
     return fields

@@ -5,6 +5,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from beamsplat.common.messages.image_codec import decode_compressed
+
 _SIGMA_M = 1e-3  # sigma of code 1
 _PER_OCTAVE = 16  # codes per doubling of sigma: the quantisation error is at most 2.2 %
 _FAST = (cv2.IMWRITE_PNG_COMPRESSION, 1)  # zlib level
@@ -21,13 +23,13 @@ def depth_to_png(depth_m: np.ndarray) -> np.ndarray:
     return cv2.imencode(".png", mm, _FAST)[1].ravel()
 
 
-def depth_from_png(png: np.ndarray) -> np.ndarray:
-    """Decode depth float32 [H, W] (m) from a PNG uint8 [B]; NaN = unknown.
+def depth_from_png(png: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """Decode depth float32 [H, W] (m), of this shape, from a PNG uint8 [B]; NaN = unknown.
 
     Raises:
-        ValueError: the bytes are not a PNG of 16 bits and one channel.
+        ValueError: the bytes are not a PNG of 16 bits and one channel, or has another shape.
     """
-    mm = _decode(png, np.uint16, "depth")
+    mm = _decode(png, shape, np.uint16, "depth")
     return np.where(mm > 0, mm * np.float32(1e-3), np.float32(np.nan)).astype(np.float32)
 
 
@@ -43,13 +45,13 @@ def sigma_to_png(sigma_m: np.ndarray) -> np.ndarray:
     return cv2.imencode(".png", code.astype(np.uint8), _FAST)[1].ravel()
 
 
-def sigma_from_png(png: np.ndarray) -> np.ndarray:
-    """Decode standard deviations float32 [H, W] (m) from a PNG uint8 [B]; NaN = unknown.
+def sigma_from_png(png: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """Decode standard deviations float32 [H, W] (m), of this shape, from a PNG uint8 [B]; NaN = unknown.
 
     Raises:
-        ValueError: the bytes are not a PNG of 8 bits and one channel.
+        ValueError: the bytes are not a PNG of 8 bits and one channel, or has another shape.
     """
-    code = _decode(png, np.uint8, "sigma")
+    code = _decode(png, shape, np.uint8, "sigma")
     sigma = _SIGMA_M * np.exp2((code.astype(np.float32) - 1.0) / _PER_OCTAVE)
     return np.where(code > 0, sigma, np.float32(np.nan)).astype(np.float32)
 
@@ -59,18 +61,21 @@ def mask_to_png(mask: np.ndarray) -> np.ndarray:
     return cv2.imencode(".png", mask.astype(np.uint8) * 255, _FAST)[1].ravel()
 
 
-def mask_from_png(png: np.ndarray) -> np.ndarray:
-    """Decode a mask bool [H, W] from a PNG uint8 [B].
+def mask_from_png(png: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """Decode a mask bool [H, W], of this shape, from a PNG uint8 [B].
 
     Raises:
-        ValueError: the bytes are not a PNG of 8 bits and one channel.
+        ValueError: the bytes are not a PNG of 8 bits and one channel, or has another shape.
     """
-    return _decode(png, np.uint8, "mask") > 127
+    return _decode(png, shape, np.uint8, "mask") > 127
 
 
-def _decode(png: np.ndarray, dtype: type, what: str) -> np.ndarray:
-    image = cv2.imdecode(png, cv2.IMREAD_UNCHANGED) if len(png) else None
-    if image is None or image.dtype != dtype or image.ndim != 2:
-        found = "nothing" if image is None else f"{image.dtype} {list(image.shape)}"
+def _decode(png: np.ndarray, shape: tuple[int, int], dtype: type, what: str) -> np.ndarray:
+    try:
+        image = decode_compressed(png, "png", shape[1], shape[0], cv2.IMREAD_UNCHANGED)
+    except ValueError as error:
+        raise ValueError(f"{what}: {error}") from error
+    if image.dtype != dtype or image.ndim != 2:
+        found = f"{image.dtype} {list(image.shape)}"
         raise ValueError(f"{what}: expected a PNG of {np.dtype(dtype).name} [H, W], found {found}")
     return image

@@ -26,7 +26,6 @@ from beamsplat.common.messages.map import (
 from beamsplat.common.messages.schema import (
     Array,
     Count,
-    Finite,
     Message,
     MessagePart,
     Name,
@@ -35,9 +34,12 @@ from beamsplat.common.messages.schema import (
     Text,
     Transform,
     Transforms,
+    Velocity,
 )  # fmt: skip
-from beamsplat.common.messages.sensor_models import CameraModel, LidarModel
+from beamsplat.common.messages.sensor_models import MAX_PIXELS, CameraModel, LidarModel
 from beamsplat.common.status import TrackingStatus
+
+MAX_BEAMS = 65536  # of a scan: eight times those of the finest planar lidars
 
 # --- sensors -----------------------------------------------------------------------------------
 
@@ -60,6 +62,12 @@ class Image(Message):
     step_bytes: Count = 0  # row length of a raw encoding; 0 for compressed images
     data: Annotated[np.ndarray, Array("uint8", "B")]
 
+    @model_validator(mode="after")
+    def _size_is_bounded(self) -> Image:
+        if self.width_px * self.height_px > MAX_PIXELS:
+            raise ValueError(f"{self.width_px}x{self.height_px}: more than {MAX_PIXELS} pixels")
+        return self
+
 
 class Scan(Message):
     """One revolution of a planar lidar; `stamp_ns` is the time of the first beam.
@@ -69,12 +77,12 @@ class Scan(Message):
     negative) are transmitted unchanged; subscribers must handle them.
     """
 
-    angle_min_rad: Finite
-    angle_increment_rad: Annotated[float, Field(allow_inf_nan=False)]
-    time_increment_s: NonNegative
-    scan_time_s: NonNegative
-    range_min_m: NonNegative
-    range_max_m: Positive
+    angle_min_rad: Annotated[float, Field(ge=-100.0, le=100.0)]
+    angle_increment_rad: Annotated[float, Field(ge=-7.0, le=7.0)]
+    time_increment_s: Annotated[float, Field(ge=0.0, le=1.0)]
+    scan_time_s: Annotated[float, Field(ge=0.0, le=1000.0)]
+    range_min_m: Annotated[float, Field(ge=0.0, le=1e5)]
+    range_max_m: Annotated[float, Field(gt=0.0, le=1e5)]
     ranges_m: Annotated[np.ndarray, Array("float32", "N")]
     intensities: Annotated[np.ndarray, Array("float32", "M")] = Field(
         default_factory=lambda: np.zeros(0, np.float32)
@@ -82,6 +90,8 @@ class Scan(Message):
 
     @model_validator(mode="after")
     def _intensities_match_beams(self) -> Scan:
+        if len(self.ranges_m) > MAX_BEAMS:
+            raise ValueError(f"{len(self.ranges_m)} beams are more than {MAX_BEAMS}")
         if len(self.intensities) not in (0, len(self.ranges_m)):
             raise ValueError(f"{len(self.intensities)} intensities for {len(self.ranges_m)} beams")
         return self
@@ -91,8 +101,8 @@ class WheelOdometry(Message):
     """Pose from wheel encoders in the wheels' own drifting odom frame, and the velocity in the body frame."""
 
     T_odom_body: Transform
-    velocity_m_s: Annotated[np.ndarray, Array("float64", 3, finite=True)]
-    angular_velocity_rad_s: Annotated[np.ndarray, Array("float64", 3, finite=True)]
+    velocity_m_s: Velocity
+    angular_velocity_rad_s: Velocity
 
 
 class ExternalPose(Message):

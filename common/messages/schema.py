@@ -16,6 +16,8 @@ from pydantic_core import core_schema
 from beamsplat.common.geometry.transforms import is_rigid
 
 MAX_ARRAY_BYTES = 256 * 1024 * 1024
+MAX_VELOCITY = 1e4  # m/s, rad/s: far above that of any robot
+MAX_DISTANCE_M = 1e8  # of a translation: more than any coordinate on Earth, ECEF and UTM included
 
 
 class Array:
@@ -58,15 +60,25 @@ class Array:
 
 
 def _check_rigid(T: np.ndarray) -> np.ndarray:
+    if T.size and np.abs(T[..., :3, 3]).max() > MAX_DISTANCE_M:
+        raise ValueError(f"has a translation of more than {MAX_DISTANCE_M:g} m")
     for matrix in T.reshape(-1, 4, 4):
         if not is_rigid(matrix):
             raise ValueError(f"is not a rigid transform: {matrix.tolist()}")
     return T
 
 
+def _check_velocity(velocity: np.ndarray) -> np.ndarray:
+    if np.abs(velocity).max() > MAX_VELOCITY:
+        raise ValueError(f"a velocity of more than {MAX_VELOCITY:g} m/s or rad/s is impossible")
+    return velocity
+
+
 Transform = Annotated[np.ndarray, Array("float64", 4, 4, finite=True), AfterValidator(_check_rigid)]
 Transforms = Annotated[np.ndarray, Array("float64", "N", 4, 4, finite=True), AfterValidator(_check_rigid)]
-StampNs = Annotated[int, Field(ge=0, lt=2**63)]
+# Until the year 2116. The sum of a stamp and a duration then fits into int64.
+StampNs = Annotated[int, Field(ge=0, lt=2**62)]
+Velocity = Annotated[np.ndarray, Array("float64", 3, finite=True), AfterValidator(_check_velocity)]
 Count = Annotated[int, Field(ge=0, lt=2**63)]
 Name = Annotated[str, Field(max_length=256)]
 Text = Annotated[str, Field(max_length=65536)]

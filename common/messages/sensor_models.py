@@ -9,6 +9,11 @@ from pydantic import Field, model_validator
 
 from beamsplat.common.messages.schema import Finite, MessagePart, Positive, Transform
 
+MAX_PIXELS = 2**24  # of an image (4096 x 4096): bounds the memory of everything that has one value per pixel
+# Limits of a possible focal length, as a multiple of the longer side: less than a tenth of that of a fisheye
+# lens, and 90 times that of a usual camera.
+_FOCAL_RATIO = (0.02, 100.0)
+
 
 class CameraModel(MessagePart):
     """Pinhole camera with lens distortion, and its mount. K is valid for this image size only.
@@ -29,6 +34,14 @@ class CameraModel(MessagePart):
 
     @model_validator(mode="after")
     def _k_fits_image(self) -> CameraModel:
+        if self.width_px * self.height_px > MAX_PIXELS:
+            raise ValueError(f"{self.width_px}x{self.height_px}: more than {MAX_PIXELS} pixels")
+        for axis, focal in (("fx", self.fx_px), ("fy", self.fy_px)):
+            ratio = focal / max(self.width_px, self.height_px)
+            if not _FOCAL_RATIO[0] <= ratio <= _FOCAL_RATIO[1]:
+                raise ValueError(
+                    f"{axis} = {focal:g} px is impossible for a {self.width_px}x{self.height_px} image"
+                )
         for axis, centre, size in (("cx", self.cx_px, self.width_px), ("cy", self.cy_px, self.height_px)):
             if not 0.0 < centre < size:
                 raise ValueError(

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from beamsplat.common import messages as m
-from beamsplat.common.recording.image_header import read_image_header
+from beamsplat.common.messages.image_header import read_image_header
 from beamsplat.common.recording.ros_types import stamp_ns_of, transform_of
 
 # Encodings with several names in ROS: OpenCV's type names and others.

@@ -17,7 +17,7 @@ from pydantic import BaseModel
 from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
 
 from beamsplat.common.messages import MESSAGES, Array, Message, MessagePart
-from beamsplat.common.messages.codec import schema_of
+from beamsplat.common.messages.codec import DTYPES, MAX_ENTRIES, schema_of
 from beamsplat.common.messages.header import DecodeError, Header
 
 LIBRARY = "beamsplat 1"
@@ -123,7 +123,7 @@ def unpack_fields(data: bytes, cls: type[Message]) -> dict[str, Any]:
         DecodeError: the bytes are not a valid result of `pack_fields`.
     """
     try:
-        fields = msgpack.unpackb(data, use_list=False)
+        fields = msgpack.unpackb(data, use_list=False, max_array_len=MAX_ENTRIES, max_map_len=MAX_ENTRIES)
         return {
             name: _unpack_array(value) if isinstance(value, dict) else value
             for name, value in fields.items()
@@ -134,7 +134,9 @@ def unpack_fields(data: bytes, cls: type[Message]) -> dict[str, Any]:
 
 
 def _unpack_array(value: dict[str, Any]) -> np.ndarray:
-    return np.frombuffer(value["data"], np.dtype(value["dtype"])).reshape(value["shape"])
+    if value["dtype"] not in DTYPES:
+        raise ValueError(f"array of {str(value['dtype'])[:80]!r}")
+    return np.frombuffer(value["data"], value["dtype"]).reshape(value["shape"])
 
 
 class _Schema(GenerateJsonSchema):

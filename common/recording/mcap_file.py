@@ -20,9 +20,9 @@ from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, ChunkIndex, Footer, Header, Message, Schema, Statistics
-from mcap.stream_reader import get_chunk_data_stream
 
 from beamsplat.common.errors import UserError
+from beamsplat.common.recording.decompression import MAX_BLOCK_BYTES, decompress
 
 MAGIC = b"\x89MCAP0\r\n"
 _FOOTER_BYTES = 9 + 20 + len(MAGIC)
@@ -31,17 +31,12 @@ _CHUNK_HEAD = struct.Struct("<QQQI")
 _MESSAGE_HEAD = struct.Struct("<HIQQ")
 # Maximum size of a block of messages outside chunks: limits the memory of one read.
 _REGION_BYTES = 4 * 1024 * 1024
+# Maximum size of the messages that are held back because chunks overlap in time.
+_MAX_HELD_BYTES = 8 * MAX_BLOCK_BYTES
 # Exceptions that record parsers and decompressors raise on damaged bytes.
 _DAMAGE: tuple[type[Exception], ...] = (
     McapError, ValueError, struct.error, RuntimeError, EOFError, OverflowError, MemoryError,
 )  # fmt: skip
-
-try:
-    from zstandard import ZstdError
-
-    _DAMAGE = (*_DAMAGE, ZstdError)
-except ImportError:  # optional: files with other compression can be read without it
-    pass
 
 
 @dataclass
@@ -107,13 +102,18 @@ class McapFile:
 
         Chunks without any of the channels are not read. A chunk that cannot be decoded is skipped and counted
         in `damaged_chunks`.
+
+        Raises:
+            UserError: chunks overlap in time so much that more than 1 GiB of messages must be held back.
         """
         wanted = None if channel_ids is None else set(channel_ids)
         stop_ns = 2**64 if stop_ns is None else stop_ns
         heap: list[tuple[int, int, int, Message]] = []
+        held_bytes = 0
         for number, block in enumerate(self._blocks):
             while heap and heap[0][0] < block.start_ns:
                 message = heapq.heappop(heap)[3]
+                held_bytes -= len(message.data)
                 yield self.channels[message.channel_id], message
             if block.end_ns < start_ns or block.start_ns >= stop_ns:
                 continue
@@ -124,6 +124,13 @@ class McapFile:
                     wanted is None or message.channel_id in wanted
                 ) and start_ns <= message.log_time < stop_ns:
                     heapq.heappush(heap, (message.log_time, number, position, message))
+                    held_bytes += len(message.data)
+            if held_bytes > _MAX_HELD_BYTES:
+                raise UserError(
+                    f"{self.path}: its messages are too far out of order: more than "
+                    f"{_MAX_HELD_BYTES >> 20} MiB would have to be held back; sort the file, for example "
+                    "with `mcap sort`"
+                )
         while heap:
             message = heapq.heappop(heap)[3]
             yield self.channels[message.channel_id], message
@@ -149,6 +156,8 @@ class McapFile:
             return False
         footer = Footer.read(_stream(tail[9:-8]))
         if not len(MAGIC) <= footer.summary_start < self._size - _FOOTER_BYTES:
+            return False
+        if self._size - footer.summary_start > MAX_BLOCK_BYTES:
             return False
         self._file.seek(footer.summary_start)
         summary = self._file.read(self._size - _FOOTER_BYTES - footer.summary_start)
@@ -264,12 +273,13 @@ class McapFile:
         try:
             if block.offset + block.length > self._size:
                 raise McapError("chunk beyond the end of the file")
+            if block.length > MAX_BLOCK_BYTES:
+                raise McapError(f"chunk of {block.length} bytes")
             self._file.seek(block.offset)
             data = self._file.read(block.length)
             if block.chunked:
                 chunk = Chunk.read(_stream(data[_PREFIX.size :]))
-                stream, size = get_chunk_data_stream(chunk)
-                data = stream.read(size) if size else b""
+                data = _chunk_data(chunk)
                 if chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
                     raise McapError("checksum")
             return self._parse(data)
@@ -289,6 +299,18 @@ class McapFile:
             elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
                 self._take_definition(opcode, body)
         return messages
+
+
+def _chunk_data(chunk: Chunk) -> bytes:
+    """Return the records of a chunk; raise ValueError if they do not have the stated size."""
+    if not chunk.compression:
+        return chunk.data
+    if not chunk.uncompressed_size:
+        return b""
+    data = decompress(chunk.data, chunk.compression, min(chunk.uncompressed_size, MAX_BLOCK_BYTES))
+    if len(data) != chunk.uncompressed_size:
+        raise ValueError(f"chunk of {len(data)} bytes, stated are {chunk.uncompressed_size}")
+    return data
 
 
 def _stream(data: bytes | memoryview) -> ReadDataStream:

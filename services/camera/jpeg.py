@@ -14,7 +14,7 @@ from functools import lru_cache
 import numpy as np
 
 from beamsplat.common.compiled import kernel
-from beamsplat.common.recording.image_header import is_complete_image
+from beamsplat.common.messages.image_header import is_complete_image
 
 _BASELINE = (0xC0, 0xC1)
 _STAND_ALONE = frozenset([0x01, *range(0xD0, 0xD8)])

@@ -13,7 +13,7 @@ from typing import NamedTuple, Protocol
 
 import cv2
 
-from beamsplat.common.recording.image_header import read_image_header
+from beamsplat.common.messages.image_header import read_image_header
 from beamsplat.services.camera.frame import CameraEnded, CameraError, CapturedFrame
 from beamsplat.services.camera.jpeg import is_intact
 

@@ -8,6 +8,8 @@ import cv2
 import numpy as np
 
 from beamsplat.common.errors import UserError, reason
+from beamsplat.common.messages.image_codec import decode_compressed
+from beamsplat.common.messages.image_header import read_image_header
 from beamsplat.services.depth.source import DepthInput, Estimate, Kind, check_depth_map
 
 
@@ -61,13 +63,24 @@ def read_depth(path: Path) -> np.ndarray:
     if path.suffix == ".npy":
         try:
             values = np.load(path, allow_pickle=False)
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, EOFError, MemoryError, TypeError) as error:
             raise UserError(f"{path}: not a numpy array: {reason(error)}") from error
     else:
-        raw = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-        if raw is None or raw.dtype != np.uint16:
+        raw = _read_png(path)
+        if raw.dtype != np.uint16:
             raise UserError(f"{path}: expected a 16 bit PNG in millimetres")
         values = np.where(raw > 0, raw, np.nan) * 1e-3
-    if values.ndim != 2:
-        raise UserError(f"{path}: has shape {list(values.shape)}; expected H x W")
+    if values.ndim != 2 or values.dtype.kind not in "fiu" or not values.size:
+        raise UserError(f"{path}: {values.dtype} {list(values.shape)}; expected numbers [H, W]")
     return values.astype(np.float32)
+
+
+def _read_png(path: Path) -> np.ndarray:
+    try:
+        data = np.frombuffer(path.read_bytes(), np.uint8)
+        head = read_image_header(data.data)
+        if head is None or head.encoding != "png":
+            raise UserError("not a PNG")
+        return decode_compressed(data, "png", head.width_px, head.height_px, cv2.IMREAD_UNCHANGED)
+    except (OSError, ValueError) as error:
+        raise UserError(f"{path}: cannot be read: {reason(error)}") from error

@@ -48,12 +48,13 @@ def decode_keyframe(message: Keyframe, lens: Callable[[Pinhole], Undistorter]) -
     )  # fmt: skip
     p = undistort.pinhole
     rgb = decode_rgb(message.picture, message.encoding, p.width_px, p.height_px)
-    mask = mask_from_png(message.mask_png) if len(message.mask_png) else None
+    mask = mask_from_png(message.mask_png, p.shape) if len(message.mask_png) else None
     return RgbdKeyframe(
         id=message.id, rgb=undistort(rgb),
         camera=RasterCamera(p.fx_px, p.fy_px, p.cx_px, p.cy_px, p.width_px, p.height_px),
         T_anchor_camera=message.T_anchor_body @ camera.T_body_camera,
-        depth_m=depth_from_png(message.depth_png), sigma_m=sigma_from_png(message.sigma_png),
+        depth_m=depth_from_png(message.depth_png, p.shape),
+        sigma_m=sigma_from_png(message.sigma_png, p.shape),
         anchor=message.anchor_id, beams_uvz=message.beams[:, :3].astype(np.float64), mask=mask,
     )  # fmt: skip
 

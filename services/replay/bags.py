@@ -10,6 +10,7 @@ import heapq
 import re
 import sqlite3
 import struct
+import tempfile
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Iterator
 from contextlib import ExitStack, suppress
@@ -17,13 +18,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import apsw
-from rosbags.rosbag1 import Reader as Reader1
 from rosbags.rosbag1 import ReaderError as ReaderError1
-from rosbags.rosbag2 import Reader as Reader2
 from rosbags.rosbag2 import ReaderError as ReaderError2
 
 from beamsplat.common.errors import UserError
+from beamsplat.common.recording.decompression import decompress
 from beamsplat.common.recording.mcap_file import McapFile
+from beamsplat.services.replay.bounded_readers import BoundedReader1, BoundedReader2, decompress_bag
 from beamsplat.services.replay.decode import RawMessage
 
 # Exceptions of the readers on damaged files, besides their own errors.
@@ -56,7 +57,11 @@ class Bag:
         self._stack = ExitStack()
         self._bag_files: list[_BagFile] = []
         try:
-            for file in _files(self.path):
+            files = _files(self.path)
+            if files[0].suffix == ".zstd":
+                folder = self._stack.enter_context(tempfile.TemporaryDirectory(prefix="beamsplat-bag-"))
+                files = decompress_bag(files, Path(folder))
+            for file in files:
                 self._bag_files.append(self._open(file, allow_truncated))
             if not any(topic.count for part in self._bag_files for topic in part.topics):
                 raise UserError(f"{self.path}: the bag has no messages; record again")
@@ -119,7 +124,8 @@ class Bag:
 
     def _open(self, file: Path, allow_truncated: bool) -> _BagFile:
         if file.suffix == ".mcap":
-            part = _McapFile(self._stack.enter_context(McapFile(file)))
+            by_message = _compression_mode(self.path / "metadata.yaml") == "message"
+            part = _McapFile(self._stack.enter_context(McapFile(file)), by_message)
             if part.file.truncated:
                 sentence = f"{file}: truncated: {part.file.truncated}"
                 if not allow_truncated:
@@ -129,7 +135,7 @@ class Bag:
                 self.problems.append(sentence)
             return part
         try:
-            reader = Reader1(file) if file.suffix == ".bag" else Reader2(file)
+            reader = BoundedReader1(file) if file.suffix == ".bag" else BoundedReader2(file)
             reader.open()
         except _READ_ERRORS as error:
             raise UserError(_explain(file, error)) from error
@@ -149,8 +155,9 @@ class _BagFile(ABC):
 
 
 class _McapFile(_BagFile):
-    def __init__(self, file: McapFile) -> None:
-        self.file = file
+    def __init__(self, file: McapFile, by_message: bool) -> None:
+        """`by_message`: each message is compressed separately."""
+        self.file, self._by_message = file, by_message
         self.span_ns = (file.start_ns, file.end_ns) if file.counts.total() else None
         self.topics = [
             BagTopic(channel.topic, self._type_of(channel), file.counts[i], channel.message_encoding)
@@ -168,15 +175,16 @@ class _McapFile(_BagFile):
         ids = [i for i, channel in self.file.channels.items() if topics is None or channel.topic in topics]
         types = {i: self._type_of(self.file.channels[i]) for i in ids}
         for channel, message in self.file.messages(ids, start_ns, stop_ns):
+            data = decompress(message.data, "zstd") if self._by_message else message.data
             yield RawMessage(
-                message.log_time, channel.topic, types[channel.id], message.data, channel.message_encoding
+                message.log_time, channel.topic, types[channel.id], data, channel.message_encoding
             )
 
 
 class _RosbagsFile(_BagFile):
-    def __init__(self, reader: Reader1 | Reader2) -> None:
+    def __init__(self, reader: BoundedReader1 | BoundedReader2) -> None:
         self._reader = reader
-        ros1 = isinstance(reader, Reader1)
+        ros1 = isinstance(reader, BoundedReader1)
         self._encodings = {
             id(c): "ros1" if ros1 else getattr(c.ext, "serialization_format", "cdr")
             for c in reader.connections
@@ -213,9 +221,10 @@ def _files(path: Path) -> list[Path]:
             raise UserError(f"{path}: not a bag; expected .bag, .mcap, .db3, or a folder with one of them")
         return [path]
     metadata = path / "metadata.yaml"
-    mcaps = sorted(path.glob("*.mcap"))
-    if mcaps and not (metadata.exists() and _compressed_by_message(metadata)):
+    if mcaps := sorted(path.glob("*.mcap")):
         return mcaps
+    if _compression_mode(metadata) == "file" and (compressed := sorted(path.glob("*.zstd"))):
+        return compressed
     if metadata.exists():
         return [path]
     files = sorted(path.glob("*.db3")) or sorted(path.glob("*.bag"))
@@ -224,12 +233,12 @@ def _files(path: Path) -> list[Path]:
     return files
 
 
-def _compressed_by_message(metadata: Path) -> bool:
-    """Return whether each message is compressed separately (readable by rosbags, not by our MCAP reader)."""
-    return (
-        re.search(r"compression_mode:\s*['\"]?message", metadata.read_text(errors="replace"), re.I)
-        is not None
-    )
+def _compression_mode(metadata: Path) -> str:
+    """Return the compression mode in a metadata.yaml, in lower case: "file", "message", or "" for none."""
+    if not metadata.is_file():
+        return ""
+    found = re.search(r"compression_mode:\s*['\"]?(file|message)", metadata.read_text(errors="replace"), re.I)
+    return found[1].lower() if found else ""
 
 
 def _explain(file: Path, error: Exception) -> str:
@@ -251,6 +260,6 @@ def _reason(error: Exception) -> str:
     return text.rstrip(".")[:200] or type(error).__name__
 
 
-def _close(reader: Reader1 | Reader2) -> None:
+def _close(reader: BoundedReader1 | BoundedReader2) -> None:
     with suppress(*_READ_ERRORS):  # closing a damaged file may raise again
         reader.close()

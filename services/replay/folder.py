@@ -28,7 +28,7 @@ from beamsplat.common.errors import UserError
 from beamsplat.common.geometry.rig import load_rig
 from beamsplat.common.geometry.trajectory import Trajectory, read_tum
 from beamsplat.common.geometry.transforms import so3_log
-from beamsplat.common.recording.image_header import read_image_header
+from beamsplat.common.messages.image_header import read_image_header
 from beamsplat.common.recording.sensors import SENSORS, build_message
 from beamsplat.services.replay.folder_scans import CsvScans, scan_from_points, xy_from_pcd
 from beamsplat.services.replay.options import SourceOptions

@@ -15,8 +15,8 @@ import numpy as np
 
 from beamsplat.common.errors import UserError
 from beamsplat.common.geometry.rig import RigFile, load_rig
+from beamsplat.common.messages.image_header import is_complete_image
 from beamsplat.common.recording import calibration as cal
-from beamsplat.common.recording.image_header import is_complete_image
 from beamsplat.common.recording.ros_types import deserialize, transform_of
 from beamsplat.common.recording.sensors import SENSORS, build_message, ros_fields
 from beamsplat.common.recording.static_frames import StaticFrames, normalize_frame

@@ -18,8 +18,8 @@ from beamsplat.common.errors import UserError
 from beamsplat.common.messages import MESSAGES, Anchors, Health, Image, Odometry, Scan, Tick
 from beamsplat.common.messages.codec import decode, schema_of
 from beamsplat.common.messages.header import Header
+from beamsplat.common.messages.image_header import read_image_header
 from beamsplat.common.recording import RecordingError, RecordingReader, RecordingWriter, is_recording
-from beamsplat.common.recording.image_header import read_image_header
 from beamsplat.common.recording.mcap_file import McapFile
 from beamsplat.common.topics import TOPICS
 from tests.common.messages.random_messages import assert_same, random_message
@@ -310,9 +310,11 @@ def test_killed_recorder_loses_its_open_chunk_only(tmp_path):
         assert len(reader.problems) == 1
 
 
-def test_values_beyond_float32_and_2038_round_trip(tmp_path):
-    late = Odometry(stamp_ns=2**62, T_odom_body=np.eye(4), covariance=np.full((3, 3), np.nan), status="lost")
-    wide = scan(3).model_copy(update={"range_max_m": 1e300, "angle_min_rad": 0.1})
+def test_values_finer_than_float32_and_beyond_2038_round_trip(tmp_path):
+    late = Odometry(
+        stamp_ns=2**62 - 1, T_odom_body=np.eye(4), covariance=np.full((3, 3), np.nan), status="lost"
+    )
+    wide = scan(3).model_copy(update={"range_max_m": 99999.123456789, "angle_min_rad": 0.1})
     picture = Image(
         stamp_ns=9, width_px=7, height_px=3, encoding="jpeg", data=np.frombuffer(b"no jpeg", np.uint8)
     )

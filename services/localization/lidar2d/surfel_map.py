@@ -234,7 +234,9 @@ class FrozenMap:
 
     def counts(self) -> tuple[np.ndarray, np.ndarray]:
         """Return hits and misses, uint8 [H, W] each."""
-        hits, misses = np.frombuffer(zlib.decompress(self.packed), dtype=np.uint8).reshape(2, *self.shape)
+        size = 2 * self.shape[0] * self.shape[1]
+        cells = zlib.decompressobj().decompress(self.packed, size + 1)  # bounded: the file may be hostile
+        hits, misses = np.frombuffer(cells, dtype=np.uint8).reshape(2, *self.shape)
         return hits, misses
 
     def tables(self, reach_cells: int, for_search: bool = True) -> MatchTables:

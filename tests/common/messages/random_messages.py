@@ -26,6 +26,8 @@ def random_message(cls: type[BaseModel], rng: np.random.Generator) -> Any:
             name: _value(name, hints[name], field.metadata, sizes, rng)
             for name, field in cls.model_fields.items()
         }
+        for name in {"fx_px", "fy_px"} & fields.keys():
+            fields[name] = float(rng.uniform(0.1, 3.0)) * fields["width_px"]
         try:
             return cls(**fields)
         except ValidationError:
@@ -86,7 +88,8 @@ def _scalar(hint: type, metadata: list[Any], rng: np.random.Generator) -> Any:
         return int(rng.integers(low, min(high, low + int(width))))
     if hint is float:
         value = float(rng.normal(0, 10.0 ** rng.integers(-3, 4)))
-        return abs(value) + 1e-9 if low is not None else value
+        value = abs(value) + 1e-9 if low is not None and low >= 0.0 else value
+        return float(np.clip(value, low, high))
     if hint is str:
         return "".join(
             chr(code) for code in rng.choice([*range(32, 127), 0xE4, 0x2603, 0x1F916], rng.integers(0, 20))

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from beamsplat.common.errors import UserError
-from beamsplat.common.recording.image_header import is_complete_image
+from beamsplat.common.messages.image_header import is_complete_image
 from beamsplat.services.camera.config import CameraConfig, NoCameraConfig
 from beamsplat.services.camera.jpeg import is_intact
 from beamsplat.services.camera.node import CameraNode, NoCamera

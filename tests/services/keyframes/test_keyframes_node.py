@@ -82,10 +82,10 @@ def test_picture_and_depth_arrive_as_they_were(frames):
         rgb, depth = r.shot(number_of(frame))
         got = decode_rgb(frame.picture, frame.encoding, r.WIDTH, r.HEIGHT)
         assert np.array_equal(got, rgb)
-        back = depth_from_png(frame.depth_png)
+        back = depth_from_png(frame.depth_png, depth.shape)
         assert np.array_equal(np.isfinite(back), np.isfinite(depth))
         assert np.nanmax(np.abs(back - depth)) < 0.001
-        assert np.nanmax(np.abs(sigma_from_png(frame.sigma_png) - 0.01)) < 3e-4
+        assert np.nanmax(np.abs(sigma_from_png(frame.sigma_png, depth.shape) - 0.01)) < 3e-4
         assert len(frame.mask_png) == 0
 
 
@@ -173,7 +173,7 @@ def test_movers_are_masked_and_their_beams_left_out():
     moving[350:370] = True
     frame = drive_by_hand(moving)
     assert np.all(frame.beams[:, 2] > 2.0)
-    mask = mask_from_png(frame.mask_png)
+    mask = mask_from_png(frame.mask_png, (r.HEIGHT, r.WIDTH))
     assert not mask[60, 79]  # the walker
     assert mask[:, :20].all()
     assert 0.02 < (~mask).mean() < 0.5
