@@ -1,8 +1,18 @@
 """Errors that a user can correct: the command line prints one sentence without a traceback, exit code 2."""
 
+from __future__ import annotations
+
+from beamsplat.common.redaction import without_secrets
+
 
 class UserError(ValueError):
-    """Invalid input from a user, file or device. The text names the fault, its place and the remedy."""
+    """Invalid input from a user, file or device. The text names the fault, its place and the remedy.
+
+    Passwords in URLs are removed from the text: it is shown on other hosts and written to logs.
+    """
+
+    def __init__(self, text: str = "") -> None:
+        super().__init__(without_secrets(text))
 
 
 def reason(error: BaseException) -> str:

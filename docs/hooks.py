@@ -30,6 +30,7 @@ from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
 import beamsplat
+from beamsplat.common.config.base import remote_options
 from beamsplat.common.config.deployment import Deployment, NodeConfig, RouterConfig
 from beamsplat.common.messages.schema import Array, Message, MessagePart
 from beamsplat.common.security.keys import SecurityConfig
@@ -139,6 +140,9 @@ def options() -> str:
         "A deployment is a TOML file. Unknown options and values of a wrong type are errors; "
         "`beamsplat check FILE` finds them. On the command line, `--set NODE.OPTION=VALUE` overrides one.",
         "",
+        "Options with *remote* = yes can be changed while the system runs from the page and from other hosts "
+        "with the role operator. The others can be changed on the node's own host only (`beamsplat swap`).",
+        "",
         *_section("Top level of the file", Deployment, own=Deployment),
         *_section("Table [router]", RouterConfig, own=RouterConfig),
         *_section("Table [security]", SecurityConfig, own=SecurityConfig),
@@ -172,7 +176,8 @@ def _section(title: str, config: type[BaseModel], own: type) -> list[str]:
 def _options_table(config: type[BaseModel], own: type | None = None) -> list[str]:
     """Return a table of the options; those that all nodes have are left out unless `own` is their class."""
     comments = comments_of(config)
-    rows = ["| option | type | default | |", "|---|---|---|---|"]
+    remote = remote_options(config)
+    rows = ["| option | type | default | remote | |", "|---|---|---|---|---|"]
     for name, field in config.model_fields.items():
         if (
             own is None
@@ -181,7 +186,8 @@ def _options_table(config: type[BaseModel], own: type | None = None) -> list[str
         ):
             continue
         rows.append(
-            f"| `{name}` | {_cell(type_name(field))} | {_default(field)} | {_cell(comments.get(name, ''))} |"
+            f"| `{name}` | {_cell(type_name(field))} | {_default(field)} | {'yes' if name in remote else ''} "
+            f"| {_cell(comments.get(name, ''))} |"
         )
     return [*rows, ""]
 

@@ -2,22 +2,35 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Annotated, Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 from pydantic_core import ErrorDetails
 
 from beamsplat.common.errors import UserError
+from beamsplat.common.redaction import REMOVED, is_secret
 
 # Error types of pydantic (its documentation, "Validation Errors").
 _TEXT_EXPECTED = ("string_type", "path_type")
 _LIST_EXPECTED = ("tuple_type", "list_type", "set_type", "frozen_set_type")
 
 
+_REMOTE = "may be set from another host"
+_T = TypeVar("_T")
+# Type of an option that other hosts may change while the system runs: thresholds, rates and the like. Never
+# files, commands, addresses, secrets, classes, or limits that protect memory and disk.
+Remote = Annotated[_T, _REMOTE]
+
+
 class Config(BaseModel):
     """Base class of all configurations: immutable; an unknown key is an error."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+def remote_options(cls: type[BaseModel]) -> tuple[str, ...]:
+    """Return the names of the options that other hosts may change (type `Remote`)."""
+    return tuple(name for name, field in cls.model_fields.items() if _REMOTE in field.metadata)
 
 
 def parse(cls: type[Config], table: dict[str, Any], where: str, prefix: str | None = None) -> Any:
@@ -43,7 +56,8 @@ def parse(cls: type[Config], table: dict[str, Any], where: str, prefix: str | No
                 faults.append(f"option {field!r} is required: set it in the file, or with --set")
             else:
                 hint = "" if prefix is None else _quoting_hint(f"{prefix}{field}", fault)
-                faults.append(f"{field} = {fault['input']!r}: {fault['msg']}{hint}")
+                value = REMOVED if is_secret(field) else f"{fault['input']!r}"
+                faults.append(f"{field} = {value}: {fault['msg']}{'' if is_secret(field) else hint}")
         raise UserError(f"{where}: " + "; ".join(faults)) from error
 
 

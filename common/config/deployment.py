@@ -113,13 +113,13 @@ def _apply(table: dict[str, Any], override: str) -> None:
     key, equals, text = override.partition("=")
     parts = key.strip().split(".")
     if not equals or not all(parts):
-        raise UserError(f"--set {override!r}: expected NODE.OPTION=VALUE, for example replay.data=drive/bag")
+        raise UserError(f"--set {key!r}: expected NODE.OPTION=VALUE, for example replay.data=drive/bag")
     if len(parts) > 1 and parts[0] not in Deployment.model_fields:
         parts.insert(0, "nodes")
     for part in parts[:-1]:
         table = table.setdefault(part, {})
         if not isinstance(table, dict):
-            raise UserError(f"--set {override!r}: {part!r} is a value, not a table")
+            raise UserError(f"--set {key!r}: {part!r} is a value, not a table")
     table[parts[-1]] = _toml_value(text.strip())
 
 

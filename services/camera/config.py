@@ -7,6 +7,7 @@ from typing import Annotated
 
 from pydantic import Field
 
+from beamsplat.common.config.base import Remote
 from beamsplat.common.config.deployment import NodeConfig, Seconds
 
 
@@ -23,7 +24,7 @@ class CameraConfig(NodeConfig):
     rig: Path | None = None  # calibration; images of another size than its K are rejected
     width_px: Annotated[int, Field(ge=0, le=16384)] = 0  # 0: size of the rig, else the camera's own
     height_px: Annotated[int, Field(ge=0, le=16384)] = 0
-    rate_hz: Annotated[float, Field(ge=0.0, le=1000.0)] = 0.0  # requested; 0: the camera's own
-    jpeg_quality: Annotated[int, Field(ge=1, le=100)] = 92  # used where the source delivers no JPEG
+    rate_hz: Remote[Annotated[float, Field(ge=0.0, le=1000.0)]] = 0.0  # requested; 0: the camera's own
+    jpeg_quality: Remote[Annotated[int, Field(ge=1, le=100)]] = 92  # used where the source delivers no JPEG
     delay_s: Seconds = 0.0  # from exposure to arrival, as measured; subtracted from the time stamps
-    silence_s: Annotated[float, Field(gt=0.0, le=60.0)] = 2.0  # without an image for so long: reconnect
+    silence_s: Remote[Annotated[float, Field(gt=0.0, le=60.0)]] = 2.0  # without an image: reconnect

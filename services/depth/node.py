@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
+from beamsplat.common.config.base import Remote
 from beamsplat.common.config.deployment import NodeConfig
 from beamsplat.common.errors import UserError
 from beamsplat.common.geometry.camera import Pinhole, Undistorter
@@ -34,9 +35,9 @@ _IMAGES = 8  # that may wait for their pose
 class DepthConfig(NodeConfig):
     """Options of the depth service. `options` are passed to the depth source `source`, which checks them."""
 
-    source: str = "stixel"
+    source: Remote[str] = "stixel"
     options: dict[str, Any] = Field(default_factory=dict)
-    floor_known: bool = True  # the camera height in the calibration is reliable
+    floor_known: Remote[bool] = True  # the camera height in the calibration is reliable
 
 
 class DepthNode(Node):

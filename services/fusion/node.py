@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from pydantic import Field
 
+from beamsplat.common.config.base import Remote
 from beamsplat.common.config.deployment import NodeConfig
 from beamsplat.common.errors import UserError
 from beamsplat.common.geometry.beams import scan_points
@@ -51,11 +52,11 @@ class FusionConfig(NodeConfig):
 
     # field: plane sweep with all priors; ratio: the paper's one factor per image; affine: scale and shift of
     # inverse depth; given: the estimate unchanged (robots without a lidar).
-    method: Literal["field", "ratio", "affine", "given"] = "field"
-    floor_known: bool = True  # the camera height in the calibration is reliable
-    planar: bool = True  # the body stays level on a floor
-    cloud_every_px: int = 4  # pixels per point of the cloud, in each direction
-    check_pairs: int = Field(60, ge=0)  # image pairs for the calibration check at the start; 0 = no check
+    method: Remote[Literal["field", "ratio", "affine", "given"]] = "field"
+    floor_known: Remote[bool] = True  # the camera height in the calibration is reliable
+    planar: Remote[bool] = True  # the body stays level on a floor
+    cloud_every_px: Remote[int] = 4  # pixels per point of the cloud, in each direction
+    check_pairs: Remote[int] = Field(60, ge=0)  # image pairs for the check of the calibration; 0 = none
 
 
 @dataclass(frozen=True)

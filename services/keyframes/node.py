@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from pydantic import Field
 
+from beamsplat.common.config.base import Remote
 from beamsplat.common.config.deployment import NodeConfig
 from beamsplat.common.geometry.beams import project_beams
 from beamsplat.common.geometry.camera import Pinhole, Undistorter
@@ -50,19 +51,19 @@ _BEAMS_PATIENCE_NS = 400_000_000  # the scan of a 5 Hz lidar is complete by then
 class KeyframesConfig(NodeConfig):
     """Options of the keyframes service: selection, and outbox of keyframes not yet acknowledged."""
 
-    distance_m: Annotated[float, Field(gt=0.0)] = 0.3
-    angle_rad: Annotated[float, Field(gt=0.0)] = 0.26
-    least_overlap: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.6
-    patience: Annotated[int, Field(ge=1)] = 2  # the image of this number is taken even if it is blurred
+    distance_m: Remote[Annotated[float, Field(gt=0.0)]] = 0.3
+    angle_rad: Remote[Annotated[float, Field(gt=0.0)]] = 0.26
+    least_overlap: Remote[Annotated[float, Field(ge=0.0, lt=1.0)]] = 0.6
+    patience: Remote[Annotated[int, Field(ge=1)]] = 2  # this image is taken even if it is blurred
     durable: bool = False  # live: unacknowledged keyframes are kept on disk, in the state folder
     queue_mb: Annotated[float, Field(gt=0.0)] = (
         64.0  # largest size of the outbox: about four keyframes per megabyte
     )
-    retry_s: Annotated[float, Field(gt=0.0)] = (
+    retry_s: Remote[Annotated[float, Field(gt=0.0)]] = (
         10.0  # without acknowledgement, after which the oldest is sent again
     )
-    window: Annotated[int, Field(ge=1)] = 4  # largest number of keyframes sent again that are in flight
-    jpeg_quality: Annotated[int, Field(ge=50, le=100)] = 95  # of images that arrive uncompressed
+    window: Remote[Annotated[int, Field(ge=1)]] = 4  # most keyframes sent again that are in flight
+    jpeg_quality: Remote[Annotated[int, Field(ge=50, le=100)]] = 95  # of images that arrive uncompressed
 
 
 class KeyframesNode(Node):

@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
+from beamsplat.common.config.base import Remote
 from beamsplat.common.config.deployment import NodeConfig
 
 Metres = Annotated[float, Field(gt=0.0, le=1000.0, allow_inf_nan=False)]
@@ -17,8 +18,8 @@ class LidarConfig(NodeConfig):
     device: str = "/dev/ttyUSB0"  # serial port, best by its link in /dev/serial/by-id; or tcp/HOST:PORT
     baud: Annotated[int, Field(ge=0)] = 0  # 0: try the rates that this kind of lidar uses
     upside_down: bool = False  # mounted upside down: the angles change sign
-    range_min_m: Metres | None = None  # published with each scan; default: the device's own
-    range_max_m: Metres | None = None  # farther readings become NaN; default: the device's own
+    range_min_m: Remote[Metres | None] = None  # published with each scan; default: the device's own
+    range_max_m: Remote[Metres | None] = None  # farther readings become NaN; default: the device's own
 
 
 class RplidarConfig(LidarConfig):
@@ -31,4 +32,4 @@ class HokuyoConfig(LidarConfig):
     """Options of Hokuyo lidars (SCIP 2)."""
 
     device: str = "tcp/192.168.0.10:10940"  # factory setting of network models; USB models: /dev/ttyACM0
-    intensity: bool = False
+    intensity: Remote[bool] = False

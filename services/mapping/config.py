@@ -7,6 +7,7 @@ from typing import Annotated
 
 from pydantic import Field
 
+from beamsplat.common.config.base import Remote
 from beamsplat.common.config.deployment import NodeConfig
 
 PositiveFinite = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
@@ -20,18 +21,18 @@ class MappingConfig(NodeConfig):
     """
 
     nice: Annotated[int, Field(ge=0, le=19)] = 5  # lower CPU priority than the services that feed the map
-    half_steps: Steps = 18  # per keyframe, at half size
-    full_steps: Steps = 5
-    tick_steps: Steps = 6  # per tick without waiting keyframes, at full size
-    mend_steps: Steps = 30  # after anchors have moved, at half size: closes gaps at submap borders
-    final_steps: Steps = 0  # at the end of the data, on all keyframes
-    calm_backlog: Annotated[int, Field(ge=1)] = 5  # with more waiting keyframes, each gets fewer steps
+    half_steps: Remote[Steps] = 18  # per keyframe, at half size
+    full_steps: Remote[Steps] = 5
+    tick_steps: Remote[Steps] = 6  # per tick without waiting keyframes, at full size
+    mend_steps: Remote[Steps] = 30  # after anchors have moved, at half size: closes gaps at submap borders
+    final_steps: Remote[Steps] = 0  # at the end of the data, on all keyframes
+    calm_backlog: Remote[Annotated[int, Field(ge=1)]] = 5  # with more keyframes waiting, fewer steps each
     max_gaussians: Annotated[int, Field(ge=1000)] | None = None  # see `gaussians`
     max_keyframes: Annotated[int, Field(ge=4)] = 800
-    refine_pose: bool = True
-    refine_exposure: bool = True
-    chunk_every: Annotated[int, Field(ge=1)] = 2  # keyframes between two updates of the newest chunk
-    chunk_error_px: PositiveFinite = 1.0  # smaller detail in the image is not published
+    refine_pose: Remote[bool] = True
+    refine_exposure: Remote[bool] = True
+    chunk_every: Remote[Annotated[int, Field(ge=1)]] = 2  # keyframes between two updates of the newest chunk
+    chunk_error_px: Remote[PositiveFinite] = 1.0  # smaller detail in the image is not published
     seed: int = 0
     save: Path | None = None  # folder for splats.ply and keyframes.tum, written at the end of the data
     session: Path | None = None  # folder of the saved map: written while mapping, resumed at the start

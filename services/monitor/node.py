@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
+from beamsplat.common.config.base import Remote
 from beamsplat.common.config.deployment import NodeConfig
 from beamsplat.common.errors import UserError
 from beamsplat.common.files.persist import check_can_write
@@ -46,17 +47,17 @@ class MonitorConfig(NodeConfig):
     viewer_memory_mb: Megabytes = 512  # history for viewers that connect later
     save_limit_mb: Megabytes = 8000  # at this size the file is closed
     keep_free_mb: Megabytes = 500  # on the disk; with less the file is closed
-    image_hz: Hz = 10.0
-    scan_hz: Hz = 10.0
-    pose_hz: Hz = 20.0
-    path_hz: Hz = 1.0
-    grid_hz: Hz = 0.5
-    anchors_hz: Hz = 1.0
-    depth_hz: Hz = 2.0
-    splats_hz: Hz = 0.5  # of each chunk of the map
+    image_hz: Remote[Hz] = 10.0
+    scan_hz: Remote[Hz] = 10.0
+    pose_hz: Remote[Hz] = 20.0
+    path_hz: Remote[Hz] = 1.0
+    grid_hz: Remote[Hz] = 0.5
+    anchors_hz: Remote[Hz] = 1.0
+    depth_hz: Remote[Hz] = 2.0
+    splats_hz: Remote[Hz] = 0.5  # of each chunk of the map
     clouds: Annotated[int, Field(ge=1)] = 40  # keyframes whose points are shown
     path_points: Annotated[int, Field(ge=16)] = 2000
-    path_step_m: Annotated[float, Field(gt=0.0)] = 0.05
+    path_step_m: Remote[Annotated[float, Field(gt=0.0)]] = 0.05
     body_size_m: tuple[float, float, float] = (0.4, 0.3, 0.25)  # length, width, height of the robot
 
 

@@ -16,6 +16,7 @@ from urllib.parse import quote
 
 from pydantic import Field, SecretStr, field_validator
 
+from beamsplat.common.config.base import Remote
 from beamsplat.common.config.deployment import NodeConfig
 from beamsplat.common.errors import UserError
 from beamsplat.common.messages import (
@@ -63,10 +64,10 @@ class PageConfig(NodeConfig):
     token: SecretStr = SecretStr("")  # required for commands; "": commands are disabled
     certificate: Path | None = None  # PEM; with it the page uses https
     certificate_key: Path | None = None
-    picture_hz: Hz = 2.0
-    map_hz: Hz = 0.5
-    robot_hz: Hz = 5.0
-    widest_px: Annotated[int, Field(ge=64, le=4096)] = 640  # wider images are scaled down
+    picture_hz: Remote[Hz] = 2.0
+    map_hz: Remote[Hz] = 0.5
+    robot_hz: Remote[Hz] = 5.0
+    widest_px: Remote[Annotated[int, Field(ge=64, le=4096)]] = 640  # wider images are scaled down
 
     @field_validator("token")
     @classmethod

@@ -34,7 +34,7 @@ def _ask(
 ) -> str:
     from beamsplat.common.security.logins import OPERATOR, login_of
     from beamsplat.common.zenoh.bus import open_session
-    from beamsplat.common.zenoh.queries import ask
+    from beamsplat.common.zenoh.queries import OPERATOR_QUERY, QUERY, NoAnswer, ask
 
     deployment = load_deployment(file, tuple(overrides or ()))
     if node not in (*deployment.nodes, "router"):
@@ -43,7 +43,14 @@ def _ask(
         raise UserError(f"{file} has no node {node!r}; {meant}")
     login = login_of(deployment.security, OPERATOR)
     with open_session(deployment.router.listen, 2.0, login=login) as session:
-        (answer,) = ask(session, deployment.robot, node, verb, parameters, _PATIENCE_S)
+        prefix = OPERATOR_QUERY
+        try:
+            list(ask(session, deployment.robot, node, "params", {}, 2.0, prefix))
+        except NoAnswer:  # the node runs on another host, which decides what may be set from here
+            prefix = QUERY
+        except UserError:  # of the router, which has no options
+            pass
+        (answer,) = ask(session, deployment.robot, node, verb, parameters, _PATIENCE_S, prefix)
     assert isinstance(answer, Answer)  # the type of all answers to commands
     return answer.text
 

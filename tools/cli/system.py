@@ -187,7 +187,7 @@ def run_checked(
             drained = False
             with _Display(board) as display, contextlib.suppress(KeyboardInterrupt):
                 while not drained:
-                    time.sleep(0.2)
+                    time.sleep(0.02 if commands.busy else 0.2)
                     supervisor.poll()
                     supervisor.observe(board.reported())
                     failures.poll()

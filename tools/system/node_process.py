@@ -16,6 +16,7 @@ from beamsplat.common.errors import UserError, reason
 from beamsplat.common.files.epochs import EpochClaims
 from beamsplat.common.messages.instances import ProcessId
 from beamsplat.common.optional_packages import missing_packages_explained
+from beamsplat.common.redaction import without_secrets
 from beamsplat.common.runtime.live import Live, LiveSettings
 from beamsplat.common.runtime.registry import Service
 from beamsplat.common.security.access_control import read_hosts
@@ -34,6 +35,12 @@ STOP_S = 5.0  # from SIGTERM to SIGKILL
 ONE_THREAD = dict.fromkeys(
     ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1"
 )
+# Where Numba looks for compiled kernels, in this order: also on a disk that is full or read-only.
+_KERNEL_CACHES = (
+    "beamsplat.common.kernel_cache.ReadableCacheLocator", "UserWideCacheLocator",
+    "beamsplat.common.kernel_cache.UnwritableCacheLocator",
+)  # fmt: skip
+CHILD_ENVIRONMENT = {**ONE_THREAD, "NUMBA_CACHE_LOCATOR_CLASSES": ",".join(_KERNEL_CACHES)}
 
 
 def serve(
@@ -166,6 +173,9 @@ def child(
     except UserError as error:
         log.error("%s", error)
         sys.exit(2)
+    except Exception:  # logged here, because a log has no secrets
+        log.critical("ended by an exception", exc_info=True)
+        sys.exit(1)
 
 
 def _end_process(failure: threading.ExceptHookArgs) -> None:
@@ -197,11 +207,18 @@ def _redirect_output(log_file: Path) -> str:
     return ""
 
 
+class _Formatter(logging.Formatter):
+    """Formatter that removes passwords in URLs, also from tracebacks."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        return without_secrets(super().format(record))
+
+
 def start_logging(level: int = logging.INFO) -> None:
     """Configure logging to standard error, with time, level and logger name in each line."""
-    logging.basicConfig(
-        level=level, format="%(asctime)s %(levelname)-7s %(name)s: %(message)s", stream=sys.stderr, force=True
-    )
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(_Formatter("%(asctime)s %(levelname)-7s %(name)s: %(message)s"))
+    logging.basicConfig(level=level, handlers=[handler], force=True)
 
 
 def _die_with_parent() -> None:

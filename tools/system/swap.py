@@ -3,26 +3,36 @@
 from __future__ import annotations
 
 import json
+import logging
 import threading
 import time
+from collections.abc import Generator
 from concurrent.futures import Future, wait
+from typing import Any
 
 import zenoh
 
 from beamsplat.common.errors import UserError
-from beamsplat.common.zenoh.queries import command
+from beamsplat.common.zenoh.queries import NoAnswer, command
 from beamsplat.tools.system.supervisor import Successor, Supervisor
+
+log = logging.getLogger("beamsplat")
 
 READY_S = 120.0  # limit for loading a model until the first message
 _WARM_S = 10.0  # limit for catching up with the predecessor, which may be faster
 _BEHIND_NS = 100_000_000
 _STEP_S = 20.0  # limit for the current step of the predecessor
 _RESUME_S = 120.0  # limit for loading the saved state in the successor
+_WAIT_S = 0.05  # longest wait of `poll` for an answer: most come at once
+
+# A request in progress, or None to pause until the next `poll`; receives the answer.
+_Steps = Generator[Future[str] | None, str, Any]
 
 
 class Swap:
     """Replacement of one node by its successor; call `poll` until it returns a text.
 
+    Requests to the two processes are sent in threads, so that `poll` never waits for a long step of a node.
     If the replacement fails before the predecessor has retired, the node continues unchanged.
     """
 
@@ -30,9 +40,8 @@ class Swap:
         self._session, self._supervisor, self.successor = session, supervisor, successor
         self._robot = supervisor.deployment.robot
         self._started = time.monotonic()
-        self._configured: float | None = None
-        self._retired = (0.0, 0.0)  # (retirement requested, retired), monotonic clock, s
-        self._activation: Future[str] | None = None
+        self._steps = self._replace()
+        self._request: Future[str] | None = None
 
     def poll(self) -> str | None:
         """Continue the replacement; return its result as one sentence when it is complete, else None.
@@ -40,82 +49,121 @@ class Swap:
         Raises:
             UserError: the replacement failed.
         """
-        successor, now = self.successor, time.monotonic()
-        if self._activation is not None:
-            return self._taken_over()
-        if successor.process is None:
-            self._supervisor.restart_with(successor)
-            return f"{successor.name} is stopped, and starts again with the new options"
         try:
-            if not successor.process.is_alive():
-                why = self._supervisor.last_error(successor.name)
-                raise UserError(f"{successor.name} continues unchanged: its successor ended: {why}")
-            if now - self._started > READY_S:
-                raise UserError(f"{successor.name} continues unchanged: no successor after {READY_S:g} s")
-            reached = self._reached(successor.instance)
-            if reached is None:
-                return None
-            self._configured = self._configured or now
-            if successor.hands_over:
-                return self._take_over()
-            before = self._reached(self._supervisor.children[successor.name].instance)
-            behind = any(
-                stamp - reached.get(topic, 0) > _BEHIND_NS for topic, stamp in (before or {}).items()
-            )
-            if behind and now - self._configured < _WARM_S:
-                return None
-            return self._take_over()
-        except UserError:
-            successor.process.kill()
-            raise
+            if self._request is None:
+                self._request = next(self._steps)
+            while self._request is not None and wait([self._request], _WAIT_S).done:
+                error = self._request.exception()
+                self._request = (
+                    self._steps.throw(error) if error else self._steps.send(self._request.result())
+                )
+        except StopIteration as end:
+            return end.value
+        except UserError as error:
+            self._supervisor.discard(self.successor)
+            raise UserError(f"{self.successor.name} was not swapped: {error}") from error
+        return None
 
-    def _reached(self, instance: str) -> dict[str, int] | None:
+    def _replace(self) -> _Steps:
+        """Carry out the replacement; return the text that describes it."""
+        successor, supervisor, name = self.successor, self._supervisor, self.successor.name
+        if successor.process is None:
+            supervisor.restart_with(successor)
+            return f"{name} is stopped, and starts again with the new options"
+        yield from self._until_ready()
+        before = supervisor.children[name]
+        assert successor.identity is not None  # it runs
+        if before.identity.epoch > successor.identity.epoch:
+            # Subscribers would take the successor for an earlier process than the running one.
+            raise UserError(f"{name} continues unchanged: it was started again while its successor started")
+        asked = time.monotonic()
+        before.retiring = True
+        try:
+            said = yield self._ask(before.instance, "retire", {}, _STEP_S)
+            _table("retire", said)
+        except UserError:
+            before.retiring = False
+            raise
+        retired = time.monotonic()
+        # The swap cannot be undone from here: a successor that fails now is restarted, as after a crash.
+        supervisor.replace(successor)
+        came = _table(
+            "activate", (yield self._ask(successor.instance, "activate", {"after": said}, _RESUME_S))
+        )
+        lost = f", {came['lost']} more are lost" if came.get("lost") else ""
+        return (
+            f"{name} was taken over {time.monotonic() - self._started:.1f} s after it was "
+            f"asked for: its predecessor ended its last message in {(retired - asked) * 1e3:.0f} ms, its "
+            f"successor began {(time.monotonic() - retired) * 1e3:.0f} ms later with {came.get('kept', 0)} "
+            f"messages kept back{lost}"
+        )
+
+    def _until_ready(self) -> _Steps:
+        """Wait until the successor answers and has caught up with its predecessor, as far as it can."""
+        successor, supervisor = self.successor, self._supervisor
+        assert successor.process is not None  # else there is nothing to wait for
+        configured: float | None = None
+        while True:
+            if not successor.process.is_alive():
+                why = supervisor.last_error(successor.name)
+                raise UserError(f"{successor.name} continues unchanged: its successor ended: {why}")
+            if time.monotonic() - self._started > READY_S:
+                raise UserError(f"{successor.name} continues unchanged: no successor after {READY_S:g} s")
+            reached = yield from self._reached(successor.instance)
+            if reached is not None:
+                configured = configured or time.monotonic()
+                if successor.hands_over or time.monotonic() - configured >= _WARM_S:
+                    return
+                before = yield from self._reached(supervisor.children[successor.name].instance)
+                if all(
+                    stamp - reached.get(topic, 0) <= _BEHIND_NS for topic, stamp in (before or {}).items()
+                ):
+                    return
+            yield None
+
+    def _reached(self, instance: str) -> _Steps:
         """Return the newest stamp in ns, by topic, that a process has published or held back in standby.
 
         None if the process does not answer. `instance` is the instance id of the process.
         """
         try:
-            return json.loads(command(self._session, self._robot, instance, "reached", {}, 0.5))
-        except UserError:
+            said = yield self._ask(instance, "reached", {}, 0.5)
+        except NoAnswer:
             return None
+        stamps = _table("reached", said)
+        if not all(isinstance(stamp_ns, int) for stamp_ns in stamps.values()):
+            raise UserError(f"a process answered reached with {said[:80]!r}, expected stamps in ns")
+        return stamps
 
-    def _take_over(self) -> str | None:
-        name = self.successor.name
-        asked = time.monotonic()
-        before = self._supervisor.children[name]
-        said = command(self._session, self._robot, before.instance, "retire", {}, _STEP_S)
-        self._retired = (asked, time.monotonic())
-        # The swap cannot be undone from here: a successor that fails now is restarted, as after a crash.
-        self._supervisor.replace(self.successor)
-        self._activation = Future()
-        # In a thread: loading the saved state may take long, and the supervisor must not wait.
-        threading.Thread(target=self._activate, args=(said, self._activation), daemon=True).start()
-        if not self.successor.hands_over:
-            wait([self._activation])
-        return self._taken_over()
+    def _ask(self, instance: str, verb: str, parameters: dict[str, str], timeout_s: float) -> Future[str]:
+        """Send a request to one process, in a thread of its own; all faults of the answer are UserErrors."""
+        answer: Future[str] = Future()
 
-    def _activate(self, said: str, activation: Future[str]) -> None:
-        who = (self._session, self._robot, self.successor.instance)
-        try:
-            activation.set_result(command(*who, "activate", {"after": said}, _RESUME_S))
-        except Exception as error:  # raised again by result()
-            activation.set_exception(error)
+        process = self.successor.name, instance
 
-    def _taken_over(self) -> str | None:
-        assert self._activation is not None  # set before the first call
-        if not self._activation.done():
-            return None
-        try:
-            came = json.loads(self._activation.result())
-        except UserError:
-            if self.successor.process is not None:
-                self.successor.process.kill()
-            raise
-        asked, retired = self._retired
-        lost = f", {came['lost']} more are lost" if came["lost"] else ""
-        return (
-            f"{self.successor.name} was taken over {time.monotonic() - self._started:.1f} s after it was "
-            f"asked for: its predecessor ended its last message in {(retired - asked) * 1e3:.0f} ms, its "
-            f"successor began {(time.monotonic() - retired) * 1e3:.0f} ms later with {came['kept']} messages "
-            f"kept back{lost}"
-        )
+        def ask() -> None:
+            try:
+                answer.set_result(command(self._session, self._robot, process[1], verb, parameters, timeout_s))
+            except UserError as error:
+                answer.set_exception(error)
+            except Exception as error:  # whatever a process sends, the supervisor goes on
+                log.exception("%s: the request %s failed", self.successor.name, verb)
+                answer.set_exception(UserError(f"{self.successor.name}: the request {verb} failed: {error}"))
+
+        threading.Thread(target=ask, name=f"swap-{verb}", daemon=True).start()
+        return answer
+
+
+def _table(verb: str, text: str) -> dict[str, Any]:
+    """Return the JSON object that a process has answered.
+
+    Raises:
+        UserError: the text is something else.
+    """
+    try:
+        table = json.loads(text)
+    except (ValueError, RecursionError):
+        table = None
+    if not isinstance(table, dict):
+        raise UserError(f"a process answered {verb} with {text[:80]!r}, expected a JSON object")
+    return table

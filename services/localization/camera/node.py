@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from pydantic import Field
 
+from beamsplat.common.config.base import Remote
 from beamsplat.common.config.deployment import NodeConfig
 from beamsplat.common.errors import UserError
 from beamsplat.common.geometry.camera import Pinhole, Undistorter
@@ -34,8 +35,8 @@ class CameraLocalizationConfig(NodeConfig):
     """
 
     depth: Literal["estimate", "none"] = "estimate"
-    scale_sigma: Annotated[float, Field(ge=0.0, le=2.0)] = 0.15
-    planar: bool = True  # the body stays level on a floor
+    scale_sigma: Remote[Annotated[float, Field(ge=0.0, le=2.0)]] = 0.15
+    planar: Remote[bool] = True  # the body stays level on a floor
     width_px: Annotated[int, Field(ge=64, le=1280)] = 320
 
 

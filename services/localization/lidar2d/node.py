@@ -10,6 +10,7 @@ from typing import Annotated, cast
 import numpy as np
 from pydantic import Field
 
+from beamsplat.common.config.base import Remote
 from beamsplat.common.config.deployment import NodeConfig
 from beamsplat.common.errors import UserError, reason
 from beamsplat.common.files.persist import check_can_write
@@ -40,7 +41,7 @@ _RESERVED_SUBMAP_IDS = 1000  # upper bound of the submaps started between the la
 class LidarLocalizationConfig(NodeConfig):
     """Configuration; the SLAM needs no tuning, because scans contain the properties of the lidar."""
 
-    grid_every_scans: Annotated[int, Field(ge=1)] = 50
+    grid_every_scans: Remote[Annotated[int, Field(ge=1)]] = 50
     grid_resolution_m: Annotated[float, Field(gt=0.0, le=1.0)] = 0.05
     save: Path | None = None  # folder for map, trajectory and state, written at the end of the data
     resume: Path | None = None  # folder of a saved state to continue; the robot relocalizes in it

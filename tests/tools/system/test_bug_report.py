@@ -10,9 +10,10 @@ from typer.testing import CliRunner
 
 from beamsplat.common.errors import UserError
 from beamsplat.common.messages import Health
+from beamsplat.common.redaction import Redactor
 from beamsplat.common.zenoh.bus import Bus, open_router, open_session
 from beamsplat.tools.cli.main import app
-from beamsplat.tools.system.bug_report import LOG_BYTES, Redactor
+from beamsplat.tools.system.bug_report import LOG_BYTES
 
 TOKEN, PASSWORD = "correct-horse-battery", "hunter2hunter2"
 

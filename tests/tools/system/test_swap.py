@@ -17,7 +17,7 @@ from beamsplat.common.messages import Odometry
 from beamsplat.common.runtime.node import Node
 from beamsplat.common.runtime.registry import Service
 from beamsplat.common.zenoh.bus import open_session
-from beamsplat.common.zenoh.queries import ask, command
+from beamsplat.common.zenoh.queries import OPERATOR_QUERY, ask, command
 from beamsplat.tools.system.commands import Commands
 from beamsplat.tools.system.health_table import HealthTable
 from beamsplat.tools.system.supervisor import Supervisor
@@ -48,7 +48,7 @@ class Swift(Node):
 
 _TABLE = {
     **TABLE,
-    "localization": Service("localization", "", {"swift": "tests.tools.system.test_swap:Swift", "chain": "tests.common.nodes:Chain"}),
+    "localization": Service("localization", "", {"swift": "tests.tools.system.test_swap:Swift", "chain": "tests.common.nodes:Chain", "answering": "tests.tools.system.answering:Answering"}),
 }  # fmt: skip
 
 
@@ -85,7 +85,7 @@ class System:
         self.supervisor.__exit__()
 
     def ask(self, node, verb, **parameters):
-        (answer,) = ask(self.asker, "r1", node, verb, parameters, 60.0)
+        (answer,) = ask(self.asker, "r1", node, verb, parameters, 60.0, OPERATOR_QUERY)
         return answer.text
 
     def swap(self, node, *changes, **more):
@@ -149,7 +149,7 @@ def test_a_successor_that_cannot_run_changes_nothing(system):
     assert system.supervisor.children["localization"].instance == before
     for verb in ("activate", "dance"):  # it is not in standby; it knows no such request
         with pytest.raises(UserError, match=f"cannot answer the request '{verb}'"):
-            command(system.asker, "r1", before, verb, {"after": "{}"}, 5.0)
+            command(system.asker, "r1", ("localization", before), verb, {"after": "{}"}, 5.0)
     assert json.loads(system.ask("localization", "params"))["sleep_s"] == 0.01
     count = len(ears.messages)
     system.wait(lambda: len(ears.messages) > count + 5)
@@ -175,3 +175,36 @@ def test_a_restart_by_request_still_works(system):
     system.wait(lambda: len(ears.messages) > 5)
     assert "starts again" in system.ask("localization", "restart")
     system.wait(lambda: system.supervisor.children["localization"].restarts == 1)
+
+
+@pytest.mark.parametrize("answer", ["text", "a list", "another message", "an unknown message"])
+@pytest.mark.parametrize("verb", ["reached", "retire", "activate"])
+def test_an_unexpected_answer_of_a_process_fails_the_swap_and_not_the_supervisor(
+    tmp_path, free_endpoint, verb, answer
+):
+    odd = {"kind": "answering", "verb": verb, "answer": answer}
+    with System(tmp_path, free_endpoint, {**NODES, "localization": odd}) as system:
+        ears = TopicListener(system.session, "localization/odometry")
+        system.wait(lambda: len(ears.messages) > 5)
+        with pytest.raises(UserError, match=f"answered {verb} with") as refused:
+            system.swap("localization", "threads=2")
+        assert "localization" in str(refused.value)
+        count = len(ears.messages)
+        system.wait(lambda: len(ears.messages) > count + 5)
+        assert json.loads(system.ask("localization", "params"))["verb"] == verb, "the supervisor has ended"
+
+
+def test_other_nodes_are_restarted_while_a_predecessor_is_in_a_long_step(tmp_path, free_endpoint):
+    nodes = {**NODES, "localization": {"kind": "answering", "sleep_s": 6.0}, "recorder": {"kind": "sink"}}
+    with System(tmp_path, free_endpoint, nodes) as system:
+        system.wait(lambda: {"recorder", "localization"} <= set(system.board.states()))
+        system.wait(lambda: system.board.records["localization"].health.inputs[0].received > 0)
+        done = threading.Thread(target=system.swap, args=("localization", "sleep_s=0.0"))
+        done.start()
+        predecessor = system.supervisor.children["localization"]
+        system.wait(lambda: getattr(predecessor, "retiring", True))
+        recorder = system.supervisor.children["recorder"]
+        os.kill(recorder.process.pid, signal.SIGKILL)
+        system.wait(lambda: recorder.restarts == 1)
+        assert done.is_alive(), "the supervisor waited for the predecessor"
+        done.join(60)
