@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import deque
 
 import numpy as np
 
@@ -12,7 +11,6 @@ from beamsplat.services.localization.lidar2d import se2
 
 NS = 1e-9
 BASELINE_NS = 80_000_000
-_MAX_PENDING = 512  # turns: some seconds of them, more than the longest delay
 DELAY_CANDIDATES_S = np.arange(-30, 31) * 0.01  # candidates for the delay of the odometry stamps
 
 
@@ -86,8 +84,9 @@ class OdometryBuffer:
         self._delays_ns = np.round(DELAY_CANDIDATES_S / NS).astype(np.int64)
         self._cost = np.zeros(len(DELAY_CANDIDATES_S))
         self._weight = 0.0
-        # Matched turns that wait for odometry after them; the oldest are dropped if there is none.
-        self._pending_rotations: deque[tuple[int, int, float]] = deque(maxlen=_MAX_PENDING)
+        self._pending_rotations: list[
+            tuple[int, int, float]
+        ] = []  # matched turns waiting for odometry after them
 
     @property
     def stamps_ns(self) -> np.ndarray:
@@ -141,7 +140,7 @@ class OdometryBuffer:
             and self._count
             and self.stamps_ns[-1] >= self._pending_rotations[0][1] + horizon
         ):
-            t0, t1, yaw = self._pending_rotations.popleft()
+            t0, t1, yaw = self._pending_rotations.pop(0)
             costs = np.empty(len(self._delays_ns))
             recent = max(0, self._count - 1024)
             if not delay_costs(
