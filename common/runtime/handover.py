@@ -3,9 +3,9 @@
 A supervisor starts the successor in standby while the predecessor is still active, and then moves the role of
 the active process from one to the other. It sends three requests, each answered between two messages:
 
-    control/<id>/reached          -> {topic: newest stamp published or stored}
-    control/<id>/retire           -> {"said": {topic: newest stamp}} or {"handled": ...}
-    control/<id>/activate         ?after=<answer of retire> -> {"kept": count, "lost": count}
+    control/<node>/<id>/reached   -> {topic: newest stamp published or stored}
+    control/<node>/<id>/retire    -> {"said": {topic: newest stamp}} or {"handled": ...}
+    control/<node>/<id>/activate  ?after=<answer of retire> -> {"kept": count, "lost": count}
 
     successor:                                            predecessor:
 

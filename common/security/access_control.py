@@ -1,5 +1,8 @@
 """Zenoh access control rules of a router, generated from the topic table. The default permission is deny.
 
+Commands with the key `operator` may set any option of a node. Other hosts have no rule that allows them; with
+local logins only `ADMIN_USERS` have one.
+
 Other hosts are identified by the common name of their certificate, local processes by their user name. Zenoh
 does not report a denied message to its sender; `beamsplat doctor --security` explains the rules. Two details
 of Zenoh matter here: `**` does not match the `@adv` keys, by which subscribers recover lost messages; and a
@@ -104,15 +107,15 @@ def _node_rules(name: str) -> list[dict[str, Any]]:
     mine = [t for t, row in TOPICS.items() if (row.uplink == "down" if is_bridge else name in row.producers)]
     data = [f"{ROOT}/*/{prefix}{topic}" for topic in mine for prefix in ("", "end/")]
     adv = [f"{key}/@adv/**" for key in data]
-    answers = [f"{ROOT}/*/query/{name}/*", f"{ROOT}/*/control/*/*"]
+    answers = [f"{ROOT}/*/query/{name}/*", f"{ROOT}/*/control/{name}/*/*"]
     everything = [f"{ROOT}/**", f"{ROOT}/**/@adv/**"]
     allowed = ("*",) if name in UNRESTRICTED_CLIENTS else READ_ONLY_QUERIES
     queries = [f"{ROOT}/*/query/*/{query}" for query in allowed]
     health = f"{ROOT}/*/{HEALTH}/{'*' if is_bridge else name}"
     return [
-        _rule(f"{name} publish", ["ingress"], ["put", "delete", "reply"], [*data, *adv, *answers, health]),
-        _rule(f"{name} declare", ["ingress"], ["declare_queryable", "liveliness_token"],
-              [*adv, *answers, f"{ROOT}/*/alive/{name}/*"]),
+        _rule(f"{name} publish", ["ingress"], ["put", "delete", "reply"], [*data, *adv, health]),
+        _rule(f"{name} answer", ["ingress"], ["declare_queryable", "reply"], [*adv, *answers]),
+        _rule(f"{name} announce", ["ingress"], ["liveliness_token"], [*adv, f"{ROOT}/*/alive/{name}/*"]),
         _rule(f"{name} subscribe", ["ingress"],
               ["declare_subscriber", "liveliness_query", "declare_liveliness_subscriber"], everything),
         _rule(f"{name} query", ["ingress"], ["query"], [*queries, everything[1]]),
@@ -143,8 +146,8 @@ def _robot_rules(name: str, robot: str) -> list[dict[str, Any]]:
         _rule(f"{name} publish", ["ingress"], ["put", "delete", "reply"], [*up, *up_adv]),
         _rule(f"{name} declare", ["ingress"], ["declare_queryable", "liveliness_token"], up_adv),
         _rule(f"{name} subscribe", ["ingress"],
-              ["declare_subscriber", "query", "liveliness_query", "declare_liveliness_subscriber"],
-              [*down, *down_adv]),
+              ["declare_subscriber", "liveliness_query", "declare_liveliness_subscriber"], [*down, *down_adv]),
+        _rule(f"{name} query", ["ingress"], ["query"], down_adv),
         _rule(f"{name} receive", ["egress"], ["put", "delete", "reply"], [*down, *down_adv]),
         _rule(f"{name} receive queries", ["egress"], ["query"], up_adv),
         _rule(f"{name} receive declarations", ["egress"], _DECLARE, mine),

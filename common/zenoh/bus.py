@@ -9,7 +9,7 @@ All keys of a robot start with `beamsplat/<robot>/`:
     failed/<node>/<instance>      liveliness token of a node that cannot run, declared by its supervisor
     query/<node>/<name>           queries to a node
     operator/<node>/<verb>        commands of the operator, from the host of the node only
-    control/<id>/<verb>           hand-over requests to one process (common/runtime/handover.py)
+    control/<node>/<id>/<verb>    hand-over requests to one process (common/runtime/handover.py)
 
 All sessions are clients of a router on this host: two Zenoh peers that are connected only through a router
 do not exchange data, and access control acts between client and router. Samples are read from channels in
@@ -291,13 +291,14 @@ class Bus:
         self._declared.append(publisher)
 
     def answer_queries(self, on_query: Callable[[str, zenoh.Query], None]) -> None:
-        """Declare the keys control/<id>/*, for requests to this process; its instance determines the id.
+        """Declare the keys control/<node>/<id>/*, for requests to this process; its instance determines id.
 
         `announce` later declares the queries to the node. For both, `on_query(name, query)` is called from a
         thread of the bus; `name` is "control/<verb>" for a request, else the name of the query.
         """
         self._on_query = on_query
-        key_expr = key(self.robot, CONTROL, control_id(self.producer.instance), "*")
+        p = self.producer
+        key_expr = key(self.robot, CONTROL, p.node, control_id(p.instance), "*")
         self._answer(key_expr, lambda query: on_query(f"{CONTROL}/{_verb_of(query)}", query))
 
     def announce(self, queries: tuple[str, ...]) -> None:

@@ -54,7 +54,12 @@ def ask(
 
 
 def command(
-    session: zenoh.Session, robot: str, instance: str, verb: str, parameters: dict[str, str], timeout_s: float
+    session: zenoh.Session,
+    robot: str,
+    process: tuple[str, str],  # node, instance
+    verb: str,
+    parameters: dict[str, str],
+    timeout_s: float,
 ) -> str:
     """Send a hand-over request to one process and return its answer (common/runtime/handover.py).
 
@@ -62,7 +67,8 @@ def command(
         NoAnswer: the process did not answer in time.
         UserError: it rejected the request, or answered with something else.
     """
-    key_expr = key(robot, CONTROL, control_id(instance), verb)
+    node, instance = process
+    key_expr = key(robot, CONTROL, node, control_id(instance), verb)
     answer = next(_ask(session, key_expr, (instance, verb), parameters, timeout_s))
     if not isinstance(answer, Answer):  # the message type of all hand-over requests
         raise UserError(f"{instance} answered {verb} with a message {schema_of(answer)}, expected an Answer")

@@ -143,7 +143,7 @@ class Swap:
 
         def ask() -> None:
             try:
-                answer.set_result(command(self._session, self._robot, process[1], verb, parameters, timeout_s))
+                answer.set_result(command(self._session, self._robot, process, verb, parameters, timeout_s))
             except UserError as error:
                 answer.set_exception(error)
             except Exception as error:  # whatever a process sends, the supervisor goes on

@@ -81,14 +81,14 @@ def test_a_control_request_with_garbage_is_refused_and_changes_nothing(tmp_path,
         thread = threading.Thread(target=node.run)
         thread.start()
         with open_session((free_endpoint,)) as session:
-            assert command(session, "test", "ef" * 8, "reached", {}, 10.0) == "{}"
+            assert command(session, "test", ("depth", "ef" * 8), "reached", {}, 10.0) == "{}"
             with pytest.raises(UserError, match="rejected activate"):
-                command(session, "test", "ef" * 8, "activate", {"after": after}, 5.0)
+                command(session, "test", ("depth", "ef" * 8), "activate", {"after": after}, 5.0)
             assert node.running.handover.standby
             for verb in ("retired", "*", "activate/x"):
                 with pytest.raises(UserError):
-                    command(session, "test", "ef" * 8, verb, {}, 1.0)
-            assert command(session, "test", "ef" * 8, "reached", {}, 5.0) == "{}"
+                    command(session, "test", ("depth", "ef" * 8), verb, {}, 1.0)
+            assert command(session, "test", ("depth", "ef" * 8), "reached", {}, 5.0) == "{}"
         node.stop()
         thread.join(10.0)
         assert not thread.is_alive()

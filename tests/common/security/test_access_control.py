@@ -87,7 +87,7 @@ def test_a_robot_reports_health_and_receives_the_health_of_the_edge_but_asks_no_
     assert robot.may("ingress", "put", "beamsplat/r1/health/camera")
     assert robot.may("egress", "put", "beamsplat/r1/health/mapping")
     assert robot.queries() == set()
-    assert not robot.may("ingress", "query", "beamsplat/r1/control/0123456789abcdef/retire")
+    assert not robot.may("ingress", "query", "beamsplat/r1/control/mapping/0123456789abcdef/retire")
     assert not robot.may("ingress", "put", "another/key")
 
 
@@ -102,7 +102,9 @@ def test_a_monitor_and_an_operator_read_everything_write_nothing_and_ask(name, q
         assert reader.topics("egress", "put", robot=robot, suffix="/@adv/pub/1/2/_") == ALL
         assert reader.queries(robot) == queries
         assert not reader.may("ingress", "put", f"beamsplat/{robot}/health/camera")
-        assert not reader.may("ingress", "query", f"beamsplat/{robot}/control/0123456789abcdef/retire")
+        assert not reader.may(
+            "ingress", "query", f"beamsplat/{robot}/control/mapping/0123456789abcdef/retire"
+        )
 
 
 def test_a_monitor_of_one_robot_reads_no_other():
@@ -161,8 +163,8 @@ def test_the_uplink_node_publishes_what_comes_down_and_the_health_of_remote_node
 @pytest.mark.parametrize("node", NODES)
 def test_only_the_page_may_send_every_query_and_only_the_supervisor_hand_over_requests(node):
     assert user(node).queries() == (set(QUERIES) if node == "page" else READ_ONLY)
-    assert not user(node).may("ingress", "query", "beamsplat/r1/control/0123456789abcdef/retire")
-    assert user("supervisor").may("ingress", "query", "beamsplat/r1/control/0123456789abcdef/retire")
+    assert not user(node).may("ingress", "query", "beamsplat/r1/control/mapping/0123456789abcdef/retire")
+    assert user("supervisor").may("ingress", "query", "beamsplat/r1/control/mapping/0123456789abcdef/retire")
 
 
 def test_supervisor_and_operator_may_do_everything_on_their_host():

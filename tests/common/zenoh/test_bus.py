@@ -150,7 +150,7 @@ def test_a_process_answers_control_requests_at_once_and_queries_once_announced(m
 
     node.answer_queries(answer)
     instance = node.producer.instance
-    wait_until(lambda: ask("control", control_id(instance), "reached") == [b"yes"])
+    wait_until(lambda: ask("control", "depth", control_id(instance), "reached") == [b"yes"])
     assert ask("query", "depth", "params") == []
     node.announce(("params",))
     wait_until(lambda: ask("query", "depth", "params?a=1") == [b"yes"])

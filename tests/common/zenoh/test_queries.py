@@ -59,9 +59,9 @@ def test_a_query_that_no_node_answers_names_node_and_query(client, robot):
 
 def test_a_control_request_goes_to_one_process(client, robot):
     instance = f"{0:016x}"  # of the first bus that the test made
-    assert command(client, robot, instance, "reached", {"x": "4"}, 5.0) == "4"
+    assert command(client, robot, ("depth", instance), "reached", {"x": "4"}, 5.0) == "4"
     with pytest.raises(UserError, match="no answer"):
-        command(client, robot, "f" * 16, "reached", {"x": "4"}, 0.1)
+        command(client, robot, ("depth", "f" * 16), "reached", {"x": "4"}, 0.1)
 
 
 class Query:

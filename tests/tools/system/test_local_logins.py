@@ -81,7 +81,7 @@ def test_a_camera_takes_over_no_query_and_commands_nobody(guarded):
             with enter(guarded, name) as asker:
                 time.sleep(0.3)
                 assert len(list(asker.get(restart, timeout=2.0))) == allowed, name
-                assert list(asker.get("beamsplat/r1/control/ab/retire", timeout=2.0)) == []
+                assert list(asker.get("beamsplat/r1/control/mapping/ab/retire", timeout=2.0)) == []
         assert kept
 
 

@@ -16,6 +16,7 @@ import zenoh
 
 from beamsplat.common.messages.codec import MEDIA_TYPE, schema_of
 from beamsplat.common.messages.header import DecodeError, Header
+from beamsplat.common.messages.instances import control_id
 from beamsplat.common.runtime.handover import CONTROL
 from beamsplat.common.topics import HEALTH, TOPICS
 from beamsplat.common.zenoh.bus import key
@@ -125,7 +126,7 @@ def forged_copy(header: bytes) -> bytes:
 def hostile_queries(
     session: zenoh.Session,
     queries: list[tuple[str, str]],
-    instances: list[str],
+    instances: dict[str, str],
     rng: random.Random,
     seconds: float,
 ) -> tuple[int, int]:
@@ -134,14 +135,18 @@ def hostile_queries(
     Args:
         session: a session of the operator.
         queries: (node, query name).
-        instances: ids of running processes; `retire` is not sent to them, because it always works.
+        instances: running processes, by node; `retire` is not sent to them, because it always works.
         rng: random numbers.
         seconds: how long.
     """
     keys = [key(ROBOT_NAME, "query", node, name) for node, name in queries]
-    keys += [key(ROBOT_NAME, CONTROL, instance, verb)
-             for instance in instances for verb in ("reached", "activate", "nonsense")]  # fmt: skip
-    keys += [key(ROBOT_NAME, CONTROL, "0" * 16, "retire"), key(ROBOT_NAME, "query", "nobody", "restart")]
+    keys += [key(ROBOT_NAME, CONTROL, node, control_id(instance), verb)
+             for node, instance in instances.items()
+             for verb in ("reached", "activate", "nonsense")]  # fmt: skip
+    keys += [
+        key(ROBOT_NAME, CONTROL, "mapping", "0" * 16, "retire"),
+        key(ROBOT_NAME, "query", "nobody", "restart"),
+    ]
     sent = unanswered = 0
     ends = time.monotonic() + seconds
     while time.monotonic() < ends:

@@ -200,7 +200,7 @@ def hostile_queries_to_nodes(surfaces: Surfaces, rng: random.Random) -> Injected
 
     def work() -> str:
         sent, unanswered = hostile_queries(
-            watch.session, surfaces.queries[host.role], list(watch.instances().values()), own, seconds
+            watch.session, surfaces.queries[host.role], watch.instances(), own, seconds
         )
         return f"{sent} queries, {unanswered} without an answer"
 

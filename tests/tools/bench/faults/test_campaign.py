@@ -121,7 +121,7 @@ def test_hostile_queries_are_sent_to_every_query_and_an_answer_is_counted(sessio
             query.reply_err(b"no")
 
     kept = session.declare_queryable(f"beamsplat/{ROBOT}/**", answer)
-    queries, instances = [("mapping", "snapshot"), ("mapping", "swap")], ["ab" * 8]
+    queries, instances = [("mapping", "snapshot"), ("mapping", "swap")], {"mapping": "ab" * 8}
     wanted = {"snapshot", "swap", "reached", "activate", "nonsense", "retire", "restart"}
     rng = random.Random(2)
 
