@@ -41,6 +41,12 @@ _KERNEL_CACHES = (
     "beamsplat.common.kernel_cache.UnwritableCacheLocator",
 )  # fmt: skip
 CHILD_ENVIRONMENT = {**ONE_THREAD, "NUMBA_CACHE_LOCATOR_CLASSES": ",".join(_KERNEL_CACHES)}
+# Where Numba looks for compiled kernels, in this order: also on a disk that is full or read-only.
+_KERNEL_CACHES = (
+    "beamsplat.common.kernel_cache.ReadableCacheLocator", "UserWideCacheLocator",
+    "beamsplat.common.kernel_cache.UnwritableCacheLocator",
+)  # fmt: skip
+CHILD_ENVIRONMENT = {**ONE_THREAD, "NUMBA_CACHE_LOCATOR_CLASSES": ",".join(_KERNEL_CACHES)}
 
 
 def serve(

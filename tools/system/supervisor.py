@@ -35,7 +35,7 @@ from beamsplat.tools.system.assembly import (
     surroundings,
 )
 from beamsplat.tools.system.log_tail import last_error
-from beamsplat.tools.system.node_process import ONE_THREAD, STOP_S, child
+from beamsplat.tools.system.node_process import CHILD_ENVIRONMENT, STOP_S, child
 
 log = logging.getLogger("beamsplat")
 
@@ -124,7 +124,7 @@ class Supervisor:
         self.starting = True
         self.obstacle = ""  # why the run cannot go on: text for a UserError
         self._start_up_until = time.monotonic() + START_UP_S
-        os.environ.update({k: os.environ.get(k, v) for k, v in ONE_THREAD.items()})
+        os.environ.update({k: os.environ.get(k, v) for k, v in CHILD_ENVIRONMENT.items()})
         _use_writable_temporary_folder()
         self._context = multiprocessing.get_context("forkserver")
         self._context.set_forkserver_preload(list(PRELOADED))
