@@ -13,7 +13,9 @@ from beamsplat.common.recording import RecordingReader
 from beamsplat.common.topics import TOPICS
 from beamsplat.services.recorder.arrival import ArrivalClock
 from beamsplat.services.recorder.config import RecorderConfig
+from beamsplat.services.recorder import node as recorder_node
 from beamsplat.services.recorder.node import RecorderNode
+from tests.common.files.small_disk import SmallDisk
 from tests.common.messages.random_messages import assert_same, random_message
 
 SECOND = 10**9
@@ -98,6 +100,37 @@ def test_a_full_disk_is_logged_once_and_the_node_lives(tmp_path, monkeypatch, ca
     assert node.lost.total() == 4
     with RecordingReader(tmp_path / "rec") as reader:
         assert len(list(reader.messages())) == 1
+
+
+@pytest.mark.parametrize("full_at", ["the start", "a later message"])
+def test_recording_begins_again_when_the_disk_has_room(tmp_path, full_at, monkeypatch):
+    monkeypatch.setattr(recorder_node, "_RETRY_S", 0.0)
+    disk = SmallDisk(tmp_path / "disk", 24)
+    try:
+        if full_at == "the start":
+            disk.fill()
+        node = started(disk.path, clock="data", chunk_s=0.0)
+        if full_at == "a later message":
+            list(node.handle("tick", Tick(stamp_ns=SECOND, count=0)))
+            disk.fill()
+        for i in range(2, 60):
+            list(node.handle("tick", Tick(stamp_ns=i * SECOND, count=i)))
+        lost = node.lost.total()
+        assert lost > 0
+        assert node.detail.startswith("NOT RECORDING")
+        disk.free()
+        for i in range(60, 63):
+            list(node.handle("tick", Tick(stamp_ns=i * SECOND, count=i)))
+        node.close()
+        assert node.lost.total() == lost
+        counts = []
+        for path in sorted(disk.path.iterdir()):
+            with RecordingReader(path) as reader:
+                counts.append(len(list(reader.messages())))
+        assert counts[-1] == 3
+        assert sum(counts) + lost == (61 if full_at == "the start" else 62)
+    finally:
+        disk.close()
 
 
 def test_arrival_on_a_running_robot_is_the_time_of_publication():
