@@ -7,7 +7,7 @@ import math
 from collections.abc import Iterator
 from itertools import chain
 
-from beamsplat.common.errors import UserError
+from beamsplat.common.errors import UserError, reason
 from beamsplat.common.files.persist import check_can_write
 from beamsplat.common.mapfiles.ply import write_map
 from beamsplat.common.messages import (
@@ -277,5 +277,13 @@ class MappingNode(Node):
             on_disk = (part for anchor in list(m.store.paged_out) for part in disk_params(m, anchor))
             params_map = chain([m.store.params[:, : m.store.count]], on_disk)
             count = m.store.count + m.store.paged_out_count
-            write_map(folder, count, params_map, stamps_ns, T_map_body)
+            try:
+                write_map(folder, count, params_map, stamps_ns, T_map_body)
+            except (OSError, UserError) as error:
+                fault = f"mapping.save = {folder}: not written ({reason(error)})"
+                if self.live_settings is None:  # lockstep: nothing else continues
+                    raise UserError(fault) from error
+                self.detail = fault
+                log.error("%s", fault)
+                return
             log.info("map of %d Gaussians saved to %s", count, folder)

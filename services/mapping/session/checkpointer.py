@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from beamsplat.common.errors import UserError, reason
+from beamsplat.common.files.persist import is_disk_fault
 from beamsplat.common.mapfiles.blocks import Arrays, sync, with_blocks
 from beamsplat.common.mapfiles.session import SessionFolder
 from beamsplat.common.mapfiles.state import progress_of
@@ -48,6 +49,8 @@ class Checkpointer:
         try:
             self._open()
         except OSError as error:
+            if not is_disk_fault(error):
+                raise UserError(f"{path}: cannot create a session here ({reason(error)})") from error
             self._write_fault = f"the session cannot be opened: {reason(error)}"
             log.error("%s: %s; this is tried again with each keyframe", path, self._write_fault)
         self.disk_tier = DiskTier(self.folder)
