@@ -21,6 +21,7 @@ from beamsplat.common.config.deployment import Deployment
 from beamsplat.common.errors import UserError, reason
 from beamsplat.common.optional_packages import requirements
 from beamsplat.common.redaction import Redactor
+from beamsplat.tools.system.log_tail import log_tail
 
 LOG_BYTES = 200_000  # of the end of each log
 HEALTH_S = 2.5  # nodes report once per second, and a rate needs two reports
@@ -91,8 +92,6 @@ def _json(collect: Callable[[], Any]) -> str:
 
 def _tail(path: Path) -> str:
     try:
-        with path.open("rb") as file:
-            file.seek(max(0, file.seek(0, 2) - LOG_BYTES))
-            return file.read().decode(errors="replace")
+        return log_tail(path, LOG_BYTES)
     except OSError as error:
         return f"not readable: {reason(error)}"

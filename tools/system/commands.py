@@ -103,9 +103,9 @@ class Commands:
         for option in (override.partition("=")[0].strip() for override in overrides):
             if option not in allowed or is_class_path(str(values[option])):
                 raise UserError(
-                    f"{node}.{option}: this value cannot be set from another host or the page; on the host of "
-                    f"the node, `beamsplat swap FILE {node} --set {option}=VALUE` sets it. Options that can: "
-                    f"{', '.join(allowed) or 'none'}"
+                    f"{node}.{option}: this value cannot be set from another host or the page; on the host "
+                    f"of the node, `beamsplat swap FILE {node} --set {option}=VALUE` sets it. "
+                    f"Options that can: {', '.join(allowed) or 'none'}"
                 )
 
     def _begin_swap(self, node: str, query: zenoh.Query, anything: bool) -> None:

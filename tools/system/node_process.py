@@ -24,23 +24,20 @@ from beamsplat.common.security.keys import CERTIFICATE, HOSTS
 from beamsplat.common.zenoh.bus import open_router
 from beamsplat.services.nodes import NODES
 from beamsplat.tools.system.assembly import Surroundings, build_node, node_classes, surroundings
+from beamsplat.tools.system.log_tail import rotated
 from beamsplat.tools.system.process_title import set_process_title
 
 log = logging.getLogger("beamsplat")
 
 STOP_S = 5.0  # from SIGTERM to SIGKILL
+LOG_BYTES = 10_000_000  # at this size a log becomes the older part, which replaces the one before
+LOG_CHECK_S = 2.0
 
 # Two cores are shared by all services: no library may start a thread per core. Read by OpenMP, BLAS and
 # numba when they are first imported, hence set before the fork server starts.
 ONE_THREAD = dict.fromkeys(
     ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1"
 )
-# Where Numba looks for compiled kernels, in this order: also on a disk that is full or read-only.
-_KERNEL_CACHES = (
-    "beamsplat.common.kernel_cache.ReadableCacheLocator", "UserWideCacheLocator",
-    "beamsplat.common.kernel_cache.UnwritableCacheLocator",
-)  # fmt: skip
-CHILD_ENVIRONMENT = {**ONE_THREAD, "NUMBA_CACHE_LOCATOR_CLASSES": ",".join(_KERNEL_CACHES)}
 # Where Numba looks for compiled kernels, in this order: also on a disk that is full or read-only.
 _KERNEL_CACHES = (
     "beamsplat.common.kernel_cache.ReadableCacheLocator", "UserWideCacheLocator",
@@ -158,7 +155,7 @@ def child(
     os.setpgrp()
     set_process_title(f"beamsplat:{name}")
     log_fault = _redirect_output(log_file)
-    threading.Thread(target=_die_with_parent, name="parent", daemon=True).start()
+    threading.Thread(target=_attend, args=(log_file,), name="parent", daemon=True).start()
     start_logging()
     if log_fault:
         log.warning("%s: %s; the log of %s goes to the output of the supervisor", log_file, log_fault, name)
@@ -227,11 +224,28 @@ def start_logging(level: int = logging.INFO) -> None:
     logging.basicConfig(level=level, handlers=[handler], force=True)
 
 
-def _die_with_parent() -> None:
-    """Stop this process when its supervisor ends: services must not run unsupervised."""
+def _rotate(log_file: Path) -> None:
+    """Begin a new log if this one is full, or if the predecessor of this process has begun one.
+
+    Whatever writes to standard error, C libraries included, writes to the new file from then on.
+    """
+    try:
+        mine = os.fstat(2)
+        if not log_file.exists() or log_file.stat().st_ino != mine.st_ino:
+            _redirect_output(log_file)
+        elif mine.st_size > LOG_BYTES:
+            log_file.replace(rotated(log_file))
+            _redirect_output(log_file)
+    except OSError:  # a disk that cannot be written now; tried again
+        return
+
+
+def _attend(log_file: Path) -> None:
+    """Keep the log bounded, and stop this process when its supervisor ends: it must not run unsupervised."""
     parent = parent_process()
     if parent is not None:
-        connection.wait([parent.sentinel])
+        while not connection.wait([parent.sentinel], LOG_CHECK_S):
+            _rotate(log_file)
         os.kill(os.getpid(), signal.SIGTERM)
         time.sleep(STOP_S)
         os.kill(os.getpid(), signal.SIGKILL)

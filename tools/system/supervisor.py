@@ -34,7 +34,7 @@ from beamsplat.tools.system.assembly import (
     service_of,
     surroundings,
 )
-from beamsplat.tools.system.log_tail import last_error
+from beamsplat.tools.system.log_tail import LogPosition, last_error, log_position
 from beamsplat.tools.system.node_process import CHILD_ENVIRONMENT, STOP_S, child
 
 log = logging.getLogger("beamsplat")
@@ -114,7 +114,7 @@ class Supervisor:
         self.log_dir = deployment.run_dir / "logs"
         self.children: dict[str, Child] = {}
         self._around: dict[str, Surroundings] = {}
-        self._log_start: dict[str, int] = {}  # where the log of the newest process begins, bytes
+        self._log_start: dict[str, LogPosition] = {}  # where the log of the newest process begins
         self._retired: list[BaseProcess] = []  # replaced processes, which end by themselves
         self._successors: list[BaseProcess] = []  # in standby
         self.table = table
@@ -188,7 +188,7 @@ class Supervisor:
 
     def last_error(self, name: str) -> str:
         """Return the last error in the log of the newest process called `name`, in one line."""
-        return last_error(self.log_file(name), self._log_start.get(name, 0))
+        return last_error(self.log_file(name), self._log_start.get(name))
 
     def _start(self, name: str, resume: bool = False) -> None:
         self._set_process(name, *self._spawn(self.deployment, name, resume))
@@ -199,7 +199,7 @@ class Supervisor:
         """Start a process; return the process and its identity on the bus."""
         identity = self._claims.claim(name)
         log_file = self.log_file(name)
-        self._log_start[name] = log_file.stat().st_size if log_file.exists() else 0
+        self._log_start[name] = log_position(log_file)
         around = self._around.get(name)
         process = self._context.Process(
             target=child,

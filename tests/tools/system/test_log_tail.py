@@ -4,7 +4,7 @@ import logging
 import time
 
 from beamsplat.common.config.deployment import Deployment, RouterConfig
-from beamsplat.tools.system.log_tail import last_error
+from beamsplat.tools.system.log_tail import LogPosition, last_error
 from beamsplat.tools.system.node_process import start_logging
 from beamsplat.tools.system.supervisor import Supervisor
 
@@ -27,7 +27,7 @@ more text of the exception"""
 def test_the_last_exception_or_error_line_is_shown(tmp_path):
     log = tmp_path / "x.log"
 
-    def shown(*lines, since=0):
+    def shown(*lines, since=None):
         log.write_text("\n".join(lines) + "\n")
         return last_error(log, since)
 
@@ -40,7 +40,9 @@ def test_the_last_exception_or_error_line_is_shown(tmp_path):
         "Fatal Python error: Segmentation fault"
     )
     assert shown(INFO) == "10 keyframes"
-    assert shown(TRACEBACK, INFO, since=len(TRACEBACK)) == "10 keyframes"  # of an earlier process
+    assert (
+        shown(TRACEBACK, INFO, since=LogPosition(log.stat().st_ino, len(TRACEBACK))) == "10 keyframes"
+    )  # of an earlier process
     assert shown("") == f"nothing in {log}"
     assert "no log" in last_error(tmp_path / "absent.log")
 
