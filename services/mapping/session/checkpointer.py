@@ -139,7 +139,8 @@ class Checkpointer:
             return None
 
     def remove_keyframe(self, id: int) -> None:
-        """Remove the file of a keyframe that the mapper has rejected."""
+        """Remove the file of a keyframe that the mapper has rejected, or forget that it is not written."""
+        self._unwritten.discard(id)
         self.folder.remove_keyframes([id])
 
     def write_keyframe(self, id: int, schema: str, payload: bytes) -> bool:
