@@ -13,6 +13,7 @@ from beamsplat.common.geometry.transforms import interpolate, transform_points
 
 EXTRAPOLATE_NS = 200_000_000  # poses are extrapolated this far along the last motion, no further
 BEAMS_WITHIN_NS = 150_000_000  # a scan whose middle is further from an image than this is not used for it
+_MAX_POSES, _MAX_SCANS = 4096, 256  # that are kept, whatever their stamps: 5 s at 800 Hz and at 50 Hz
 _GAP_NS = 2_000_000_000  # poses from before a gap of this length may refer to another odom frame
 _RANGE_SIGMA_M = 0.01  # standard deviation of a range, of the accuracy that lidar data sheets state
 
@@ -62,9 +63,9 @@ class SensorHistory:
         self._T_body_lidar = T_body_lidar
         self._keep_ns = round(keep_s * 1e9)
         self._complete_only = complete_only
-        self._poses: deque[tuple[int, np.ndarray]] = deque()
+        self._poses: deque[tuple[int, np.ndarray]] = deque(maxlen=_MAX_POSES)
         self._incomplete: deque[TimedScan] = deque()
-        self._scans: deque[TimedScan] = deque()
+        self._scans: deque[TimedScan] = deque(maxlen=_MAX_SCANS)
         self.expired = 0  # scans dropped because no pose came for them within `keep_s`
 
     @property
@@ -81,7 +82,9 @@ class SensorHistory:
             self.expired += len(self._incomplete)
             self._incomplete.clear()
         self._incomplete.append(scan)
-        while scan.stamp_ns - self._incomplete[0].stamp_ns > self._keep_ns:
+        while (
+            scan.stamp_ns - self._incomplete[0].stamp_ns > self._keep_ns or len(self._incomplete) > _MAX_SCANS
+        ):
             self._incomplete.popleft()
             self.expired += 1
 
@@ -123,6 +126,8 @@ class SensorHistory:
         self._incomplete.clear()
 
     def _insert(self, scan: TimedScan) -> None:
+        if self._scans and scan.stamp_ns < self._scans[-1].stamp_ns:  # the clock was set back
+            self._scans.clear()
         self._scans.append(scan)
         while scan.stamp_ns - self._scans[0].stamp_ns > self._keep_ns:
             self._scans.popleft()

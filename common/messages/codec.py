@@ -28,8 +28,8 @@ DTYPES = frozenset(f"{kind}{bits}" for kind in ("int", "uint") for bits in (8, 1
     "bool", "float16", "float32", "float64",
 }  # fmt: skip
 _LENGTH = struct.Struct("<I")
-# Limits of a received head. msgpack allocates a list of the stated length before it reads the entries, and
-# lists can be nested: without limits a head of 1 MB costs gigabytes.
+# Limits of a received head. msgpack reserves a list of the stated length before it reads the entries, and
+# lists can be nested: without limits a head of 1 MB reserves gigabytes of address space.
 MAX_HEAD_BYTES = 1024 * 1024
 MAX_ENTRIES = 256  # of a list or map; the longest of a message has 64
 _MAX_DESCRIPTION_BYTES = 128  # of an array: dtype, shape, offset

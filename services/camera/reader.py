@@ -18,6 +18,7 @@ from beamsplat.services.camera.frame import CameraEnded, CameraError, CapturedFr
 from beamsplat.services.camera.jpeg import is_intact
 
 _POLL_S = 0.1
+_MAX_REASONS = 16  # for which rejected images are counted separately
 _RETRY_S = 0.5  # between attempts to open the camera
 _RATE_S = 4.0  # window over which the frame rate is measured
 _SLOW = 0.6  # ratio to the requested rate below which the status says SLOW
@@ -147,6 +148,8 @@ class CameraReader:
         return CheckedImage(self._newest_ns, head.width_px, head.height_px, jpeg)
 
     def _reject(self, reason: str) -> None:
+        if reason not in self.rejected and len(self.rejected) >= _MAX_REASONS:  # images of ever other sizes
+            reason = "other"
         self.rejected[reason] += 1
 
     def _record_arrival(self, now: float) -> None:

@@ -11,9 +11,15 @@ import numpy as np
 
 from beamsplat.common.compiled import kernel
 
+_MARGIN = 128  # cells by which the grid grows beyond a return
+_MAX_SIDE = 4096  # cells of a side: 164 m, 200 MB. Returns further away move the grid.
+
 
 class LidarMap:
-    """Grid with the number and the mean position of the returns in each cell; grows as required."""
+    """Grid with the number and the mean position of the returns in each cell; grows as required.
+
+    A grid that would become larger than `_MAX_SIDE` is moved to the newest scan; what is outside is dropped.
+    """
 
     def __init__(self, cell_m: float = 0.04) -> None:
         self.cell_m = cell_m
@@ -26,6 +32,11 @@ class LidarMap:
             return
         xy = points_map_m[:, :2]
         cells = np.floor(xy / self.cell_m).astype(np.int64)
+        # Of a scan, only returns within a quarter of the largest grid of its middle one are used.
+        near = np.all(np.abs(cells - np.median(cells, axis=0)) < _MAX_SIDE // 4, axis=1)
+        xy, cells = xy[near], cells[near]
+        if len(xy) == 0:
+            return
         self._cover(cells.min(axis=0), cells.max(axis=0))
         inner = xy - (cells + 0.5) * self.cell_m
         column, row = (cells - self._origin).T
@@ -36,17 +47,20 @@ class LidarMap:
         rows, columns = self._cells.shape[:2]
         if rows and np.all(low >= self._origin) and np.all(high < self._origin + np.array([columns, rows])):
             return
-        margin = 128
+        low, high = low - _MARGIN, high + _MARGIN
+        first, last = self._origin, self._origin + np.array([columns - 1, rows - 1])
         if rows:
-            low = np.minimum(low - margin, self._origin)
-            high = np.maximum(high + margin, self._origin + np.array([columns - 1, rows - 1]))
-        else:
-            low, high = low - margin, high + margin
+            middle, half = (low + high) // 2, _MAX_SIDE // 2
+            low, high = np.minimum(low, first), np.maximum(high, last)
+            large = high - low >= _MAX_SIDE
+            low = np.where(large, np.maximum(low, middle - half), low)
+            high = np.where(large, np.minimum(high, middle + half - 1), high)
         width, height = high - low + 1
         grown = np.zeros((int(height), int(width), 3), dtype=np.float32)
-        if rows:
-            dx, dy = self._origin - low
-            grown[dy : dy + rows, dx : dx + columns] = self._cells
+        a, b = np.maximum(low, first), np.minimum(high, last)  # corners of the part that is in both
+        if rows and np.all(a <= b):
+            (u, v), (du, dv), (m, n) = a - low, a - first, b - a + 1
+            grown[v : v + n, u : u + m] = self._cells[dv : dv + n, du : du + m]
         self._cells, self._origin = grown, low
 
     def points(self, min_hits: int = 3) -> np.ndarray:
