@@ -116,6 +116,8 @@ class KeyframesNode(Node):
                 self._outbox.of_earlier_drives,
                 folder,
             )
+        if self._outbox.disk_fault:
+            self._update_detail()
 
     def on_header(self, header: Header) -> None:
         """Reset if the header is from another localization process, which has another odom frame.
@@ -315,4 +317,5 @@ class KeyframesNode(Node):
             "not on disk": o.not_on_disk, "corrupt": o.corrupt, "of earlier drives": o.of_earlier_drives,
         }  # fmt: skip
         text = "".join(f", {count} {what}" for what, count in counts.items() if count)
+        text += f", NOT DURABLE: {o.disk_fault}" if o.disk_fault else ""
         self.detail = f"{self._sent} keyframes, {len(o)} not acknowledged{text}"

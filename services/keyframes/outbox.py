@@ -89,6 +89,11 @@ class Outbox:
         return 0 if self._folder is None else sum(e.payload is not None for e in self._entries.values())
 
     @property
+    def disk_fault(self) -> str:
+        """Return why keyframes cannot be written to the disk; "" if they can, or if none is configured."""
+        return "" if self._folder is None else self._folder.fault
+
+    @property
     def of_earlier_drives(self) -> int:
         """Return the number of stored keyframes of earlier drives."""
         return len(self._entries) - len(self)

@@ -20,6 +20,7 @@ import msgpack
 import numpy as np
 import xxhash
 
+from beamsplat.common.errors import reason
 from beamsplat.common.files.persist import make_folder_if_possible, write_atomically
 
 log = logging.getLogger("beamsplat.keyframes")
@@ -58,8 +59,9 @@ class QueueFolder:
         """
         self.path = path.expanduser()
         self.corrupt = self.unreadable = 0
-        if fault := make_folder_if_possible(self.path):
-            log.error("%s cannot be created (%s): keyframes are kept in memory", self.path, fault)
+        self.fault = make_folder_if_possible(self.path)  # why keyframes cannot be written; "" = they can
+        if self.fault:
+            log.error("%s cannot be created (%s): keyframes are kept in memory", self.path, self.fault)
 
     def entries(self) -> Iterator[QueueEntry]:
         """Yield the metadata of all keyframes, oldest first; remove files that a crash left incomplete."""
@@ -92,7 +94,12 @@ class QueueFolder:
             "key": entry.key, "drive": entry.drive, "view": list(entry.view), "size": len(payload),
             "hash": xxhash.xxh64_digest(payload),
         })  # fmt: skip
-        write_atomically(self._file(entry.key), _MAGIC + _LENGTH.pack(len(head)) + head + payload)
+        try:
+            write_atomically(self._file(entry.key), _MAGIC + _LENGTH.pack(len(head)) + head + payload)
+        except OSError as error:
+            self.fault = reason(error)
+            raise
+        self.fault = ""
 
     def read(self, key: int) -> bytes | None:
         """Return the payload; None if the file is corrupt or cannot be read, which is logged and counted."""

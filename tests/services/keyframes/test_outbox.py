@@ -186,12 +186,12 @@ def test_a_full_disk_is_said_and_counted_and_keyframes_go_on_in_memory(tmp_path,
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
         signal.signal(signal.SIGXFSZ, ignored)
-    assert (len(box), box.not_on_disk) == (3, 2)
+    assert (len(box), box.not_on_disk, box.disk_fault) == (3, 2, "File too large")
     assert caplog.text.count("keyframes cannot be written") == 1  # said at a bounded rate
     put(box, 4)  # there is room again
     box.acknowledge(4, 0)
     assert list(box.due(0)) == [(1, b"frame 1"), (2, b"x" * 5000), (3, b"y" * 5000)]
-    assert box.not_on_disk == 0
+    assert (box.not_on_disk, box.disk_fault) == (0, "")
     assert len(Outbox(10_000_000, S, 4, tmp_path)._entries) == 3  # those from memory are on the disk now
 
 

@@ -69,6 +69,8 @@ def test_all_nodes_start_and_restart_without_a_disk_and_write_when_it_is_back(di
         wait_until(lambda: all_run(supervisor, table), 120.0)
         wait_until(lambda: "NOT RECORDING" in detail(table, "recorder"), 10.0)
         assert "NOT SAVED" in detail(table, "monitor")
+        if fault == "read-only":  # on the full disk it has written nothing yet
+            assert "NOT DURABLE" in detail(table, "keyframes")
         process = supervisor.children["recorder"].process.pid
         os.kill(process, signal.SIGKILL)
 
