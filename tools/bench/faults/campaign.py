@@ -27,15 +27,14 @@ START_S = 240.0  # limit for the first start: kernels may have to be compiled
 RECOVER_S = 60.0  # after the faults of a round have ended, every process must work again within this time
 ROUND_S = 75.0  # faults, before the system may recover
 BETWEEN_S = (5.0, 10.0)  # between the starts of two faults
-LONGEST_GAP_S = (
-    3.0  # without localization, unless a fault stopped localization, sensors or the robot's router
-)
+LONGEST_GAP_S = 3.0  # without localization, beyond what the faults explain
 ACKNOWLEDGE_S = 120.0  # at the end, all keyframes must be at the edge within this time
 _SAMPLE_S = 5.0
 _POLL_S = 0.2
+_STOPPED, NO_CAUSE = "localization was stopped", "none"
 _FAULTS_BEFORE = 6  # that are listed with a finding
 _DIED = re.compile(r"^(\S+) died \((.*)\)")
-_LATE_S = 15.0  # a process that a fault stopped may end or be replaced this long after the fault
+_LATE_S = 20.0  # a process that a fault stopped may end, be replaced and start up this long after the fault
 _CAMERA = CameraSettings(width_px=320, height_px=240, rate_hz=5.0)  # a small machine keeps up
 Log = Callable[[str], None]
 
@@ -242,7 +241,7 @@ class Campaign:
                 for name, text in watch.unhealthy().items()
             }  # fmt: skip
             if self._poses.last_s == 0.0 or time.monotonic() - self._poses.began - self._poses.last_s > 1.0:
-                wrong["robot", "poses"] = f"no valid pose; rejected so far: {self._poses.rejected}"
+                wrong["robot", "poses"] = f"no valid pose; rejected: {self._poses.rejected}"
             if not wrong:
                 break
             if time.monotonic() - began > limit_s:
@@ -271,27 +270,18 @@ class Campaign:
                 f"robot: {len(waiting)} keyframes are not acknowledged after {ACKNOWLEDGE_S:.0f} s: {detail}"
             )
         self._poses.finish()
-        for gap, cause in self._gaps():
-            if cause == "none" and gap.seconds > LONGEST_GAP_S:
+        for gap, cause, unexplained_s in self._gaps():
+            if unexplained_s > LONGEST_GAP_S:
+                why = "no fault explains" if cause == NO_CAUSE else f"began because {cause}"
                 self._find(
-                    f"robot: no localization for {gap.seconds:.1f} s, which no fault explains", gap.end_s
-                )
+                    f"robot: no localization for {gap.seconds:.1f} s, {unexplained_s:.1f} s more than faults "
+                    f"explain ({why}; statuses meanwhile: {gap.rejected})", gap.end_s,
+                )  # fmt: skip
 
-    def _gaps(self) -> list[tuple[Gap, str]]:
-        """Return the times without localization, each with what explains it."""
-        explained = []
-        for gap in self._poses.gaps:
-            faults = [
-                f for began, end, f in self._faults if began <= gap.end_s and end + _LATE_S >= gap.start_s
-            ]
-            stopped = {name for fault in faults for role, name in fault.stopped if role == "robot"}
-            cause = (
-                "localization was stopped" if "localization" in stopped
-                else "no sensor data" if "replay" in stopped or any(fault.sensors for fault in faults)
-                else "router was stopped" if ROUTER in stopped else "none"
-            )  # fmt: skip
-            explained.append((gap, cause))
-        return explained
+    def _gaps(self) -> list[tuple[Gap, str, float]]:
+        """Return the times without localization, each with its cause and its unexplained seconds."""
+        known = [(began, end, *_explanation(fault)) for began, end, fault in self._faults]
+        return [(gap, *explained(gap, known)) for gap in self._poses.gaps]
 
     def _lost_keyframes(self) -> list[int]:
         """Return the ids of keyframes that the robot made and that are neither at the edge nor refused."""
@@ -310,7 +300,7 @@ class Campaign:
 
     def _report(self) -> dict[str, Any]:
         gaps = self._gaps()
-        others = [gap.seconds for gap, cause in gaps if cause != "localization was stopped"]
+        others = [gap.seconds for gap, cause, _ in gaps if cause != _STOPPED]
         kinds = Counter(fault.kind for _, _, fault in self._faults)
         texts = [finding.text for finding in self.findings]
         memory = {
@@ -319,15 +309,15 @@ class Campaign:
             for name in sorted(self._samples.series)
         }  # fmt: skip
         by_cause: dict[str, float] = {}
-        for gap, cause in gaps:
+        for gap, cause, _ in gaps:
             by_cause[cause] = by_cause.get(cause, 0.0) + gap.seconds
         report = {
             "folder": str(self._out), "minutes": self._minutes, "seed": self._seed,
             "faults": {"injected": len(self._faults), "survived": self._survived,
                        "by_kind": dict(sorted(kinds.items()))},
             "without_localization_s": {
-                "total": sum(gap.seconds for gap, _ in gaps),
-                "longest": max((gap.seconds for gap, _ in gaps), default=0.0),
+                "total": sum(gap.seconds for gap, *_ in gaps),
+                "longest": max((gap.seconds for gap, *_ in gaps), default=0.0),
                 "total_while_localization_ran": sum(others),
                 "longest_while_localization_ran": max(others, default=0.0), "by_cause": by_cause,
             },
@@ -347,13 +337,43 @@ class Campaign:
         ]
         write_atomically(self._out / "faults.json", json.dumps(rows, indent=0).encode())
         picture = timeline(
-            self._now(), rows, [(gap.start_s, gap.end_s, cause) for gap, cause in gaps],
+            self._now(), rows, [(gap.start_s, gap.end_s, cause) for gap, cause, _ in gaps],
             [(r.time_s, f"{r.role}: {r.name}", r.expected) for r in self._restarts],
             [(finding.time_s, finding.text) for finding in self.findings],
         )  # fmt: skip
         write_atomically(self._out / "timeline.svg", picture.encode())
         write_atomically(self._out / "report.json", json.dumps(report, indent=1).encode())
         return report
+
+
+def _explanation(fault: InjectedFault) -> tuple[str, float]:
+    """Return why a fault interrupts localization, or "", and for how many s after its end."""
+    stopped = {name for role, name in fault.stopped if role == "robot"}
+    if "localization" in stopped:
+        return _STOPPED, _LATE_S
+    if "replay" in stopped:
+        return "the sensors were stopped", _LATE_S
+    if ROUTER in stopped:
+        return "the router was stopped", _LATE_S
+    return ("the sensors failed", 0.0) if fault.sensors else ("", 0.0)
+
+
+def explained(gap: Gap, faults: list[tuple[float, float, str, float]]) -> tuple[str, float]:
+    """Return the cause of a time without localization, and how many of its seconds no fault explains.
+
+    Args:
+        gap: the time without localization.
+        faults: (start s, end s, what it does to localization, s after its end that it explains).
+    """
+    spans = sorted((began, end + late_s, why) for began, end, why, late_s in faults if why)
+    cause, at_s, unexplained_s = NO_CAUSE, gap.start_s, 0.0
+    for began, end, why in spans:
+        if end <= at_s or began >= gap.end_s:
+            continue
+        cause = why if cause == NO_CAUSE or why == _STOPPED else cause
+        unexplained_s += max(began - at_s, 0.0)
+        at_s = end
+    return cause, unexplained_s + max(gap.end_s - at_s, 0.0)
 
 
 def _last_line(host: CampaignHost) -> str:

@@ -12,6 +12,8 @@ from dataclasses import dataclass, field
 
 import zenoh
 
+from beamsplat.common.messages.instances import control_id
+from beamsplat.common.runtime.handover import CONTROL
 from beamsplat.common.zenoh.bus import key
 from beamsplat.services.nodes import NODES
 from beamsplat.tools.bench.faults.faulty_replay import SENSOR_FAULTS
@@ -134,7 +136,7 @@ def restart_query(surfaces: Surfaces, rng: random.Random) -> InjectedFault:
     instance = surfaces.watches[host.role].instances().get(node)
     retire = instance is not None and rng.random() < 0.3
     selector = (
-        key(ROBOT_NAME, "control", str(instance), "retire") if retire
+        key(ROBOT_NAME, CONTROL, node, control_id(str(instance)), "retire") if retire
         else key(ROBOT_NAME, "query", node, "restart")
     )  # fmt: skip
     fault = InjectedFault(

@@ -29,6 +29,7 @@ class Gap:
 
     start_s: float
     end_s: float
+    rejected: dict[str, int] = field(default_factory=dict)  # status of the poses in it -> count
 
     @property
     def seconds(self) -> float:
@@ -42,7 +43,8 @@ class PoseWatch:
     began: float = field(default_factory=time.monotonic)
     last_s: float = 0.0
     gaps: list[Gap] = field(default_factory=list)
-    rejected: dict[str, int] = field(default_factory=dict)  # status of a pose that is not valid -> count
+    # Status of the poses since the last valid one -> count.
+    rejected: dict[str, int] = field(default_factory=dict)
 
     def begin(self) -> None:
         """Begin again: now is time 0, and there are no gaps."""
@@ -62,16 +64,14 @@ class PoseWatch:
         if message.status != "ok":
             self.rejected[message.status] = self.rejected.get(message.status, 0) + 1
             return
-        now_s = time.monotonic() - self.began
-        if now_s - self.last_s > GAP_S:
-            self.gaps.append(Gap(self.last_s, now_s))
-        self.last_s = now_s
+        self.finish()
+        self.last_s, self.rejected = time.monotonic() - self.began, {}
 
     def finish(self) -> None:
-        """End the watch: the time since the last pose is a gap too."""
+        """Add the time since the last valid pose, if it is a gap."""
         now_s = time.monotonic() - self.began
         if now_s - self.last_s > GAP_S:
-            self.gaps.append(Gap(self.last_s, now_s))
+            self.gaps.append(Gap(self.last_s, now_s, self.rejected))
 
 
 @dataclass

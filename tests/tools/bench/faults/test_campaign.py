@@ -10,6 +10,7 @@ import pytest
 from beamsplat.common.messages.header import Header
 from beamsplat.common.topics import TOPICS
 from beamsplat.common.zenoh.bus import Bus, open_router, open_session
+from beamsplat.tools.bench.faults.campaign import NO_CAUSE, explained
 from beamsplat.tools.bench.faults.hostile import (
     HalfOpenConnections,
     HeardMessages,
@@ -18,7 +19,7 @@ from beamsplat.tools.bench.faults.hostile import (
 )
 from beamsplat.tools.bench.faults.kinds import DECK, deck
 from beamsplat.tools.bench.faults.timeline import timeline
-from beamsplat.tools.bench.faults.watch import FORGED_INSTANCE, KeyframeWatch, PoseWatch
+from beamsplat.tools.bench.faults.watch import FORGED_INSTANCE, Gap, KeyframeWatch, PoseWatch
 from tests.common.polling import wait_until
 from tests.common.samples import sample_messages
 
@@ -63,6 +64,7 @@ def test_only_valid_poses_of_the_real_process_end_a_gap(session):
     assert watch.gaps[0].seconds == pytest.approx(5.0, abs=2.0)
     watch.finish()
     assert len(watch.gaps) == 1
+    assert watch.gaps[0].rejected == {"lost": 1}
     assert kept
 
 
@@ -156,3 +158,19 @@ def test_a_timeline_shows_faults_gaps_restarts_and_findings():
     )  # fmt: skip
     assert picture.count("<title>") == 6
     assert "SIGKILL of &lt;x&gt;" in picture
+
+
+@pytest.mark.parametrize(
+    ("faults", "cause", "unexplained_s"),
+    [
+        ([], NO_CAUSE, 10.0),
+        ([(99.0, 104.0, "", 0.0)], NO_CAUSE, 10.0),
+        ([(99.0, 104.0, "the sensors failed", 0.0)], "the sensors failed", 6.0),
+        ([(99.0, 99.0, "localization was stopped", 20.0)], "localization was stopped", 0.0),
+        ([(60.0, 70.0, "localization was stopped", 20.0)], NO_CAUSE, 10.0),
+        ([(102.0, 103.0, "a", 0.0), (103.0, 104.0, "localization was stopped", 1.0)], "localization was stopped", 7.0),
+        ([(101.0, 106.0, "a", 0.0), (102.0, 103.0, "b", 0.0)], "a", 5.0),
+    ],
+)  # fmt: skip
+def test_of_a_gap_only_the_time_of_faults_and_their_aftermath_is_explained(faults, cause, unexplained_s):
+    assert explained(Gap(100.0, 110.0), faults) == (cause, unexplained_s)
