@@ -139,7 +139,10 @@ class FusionNode(Node):
 
     def on_lidar_scan(self, scan: Scan) -> Outputs:
         if self._fusion is not None:
+            expired = self._history.expired
             self._history.add_scan(TimedScan.of(scan))
+            if self._history.expired != expired:
+                self._update_detail()
         return iter(())
 
     def on_localization_movers(self, movers: MovingBeams) -> Outputs:
@@ -183,14 +186,16 @@ class FusionNode(Node):
         return iter(())
 
     def _update_detail(self) -> None:
-        """Update the health detail: number of dropped (overtaken) estimates, and the calibration."""
+        """Update the health detail: dropped (overtaken) estimates, scans without a pose, the calibration."""
         overtaken = f"{self.overtaken} estimates overtaken" if self.overtaken else ""
+        expired = self._history.expired if self._fusion is not None else 0
+        without_pose = f"{expired} scans without a pose" if expired else ""
         if self.calibration is not None:
             calibration = self.calibration.line
         else:
             check = self._check
             calibration = check.progress if check is not None and not check.done else ""
-        self.detail = "; ".join(text for text in (overtaken, calibration) if text)
+        self.detail = "; ".join(text for text in (overtaken, without_pose, calibration) if text)
 
     def on_camera_image(self, image: Image) -> Outputs:
         self._images.append(image)
@@ -204,8 +209,9 @@ class FusionNode(Node):
     def _fuse_if_ready(self) -> Outputs:
         """Process the newest image that has an estimate and a pose; older images are dropped and counted."""
         if self._candidate is not None:
-            newest_ns = self._estimates[-1].stamp_ns if self._estimates else 0
-            if newest_ns < self._candidate.frame.stamp_ns + _DECISION_PATIENCE_NS:
+            asked_ns = self._candidate.frame.stamp_ns
+            newest_ns = self._estimates[-1].stamp_ns if self._estimates else asked_ns
+            if abs(newest_ns - asked_ns) < _DECISION_PATIENCE_NS:  # also if the clock was set back
                 return
             self._candidate = None  # the keyframes service does not answer
             self.overtaken += 1

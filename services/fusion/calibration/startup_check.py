@@ -33,6 +33,7 @@ _LEAST_TURN_RAD, _LEAST_WAY_M = 0.02, 0.05  # between the images of a pair
 _LEAST_CORNERS = 12
 _POSE_GAP_NS = 1_000_000_000
 _SCANS = 24
+_MAX_POSES = 12_000  # 20 min at 10 Hz
 _FREE = ("clock_s", "roll_rad", "pitch_rad", "yaw_rad")
 _CLOCK_MS, _ANGLE_DEG, _SIGMAS = 20.0, 0.7, 5.0  # least errors that are reported, and sigmas
 _MISFIT_PX = 1.5  # a larger residual is a fault
@@ -91,6 +92,9 @@ class StartupCheck:
         self._poses.append(T_map_body)
         if not self._pairs and len(self._stamps) > 600:  # robot at rest: keep only the last poses
             del self._stamps[:300], self._poses[:300]
+        elif len(self._stamps) > _MAX_POSES:  # too few pairs for long: the check uses the newest ones
+            del self._stamps[: _MAX_POSES // 2], self._poses[: _MAX_POSES // 2]
+            self._pairs = [pair for pair in self._pairs if pair.stamp_a_ns >= self._stamps[0]]
 
     def add_scan(self, points_lidar_m: np.ndarray, T_map_body: np.ndarray) -> None:
         """Add the returns float64 [N, 3] of a scan, lidar frame; scans nearer than 0.25 m are ignored."""
