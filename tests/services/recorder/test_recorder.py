@@ -67,7 +67,7 @@ def test_topics_are_chosen(tmp_path):
 
 def test_health_is_kept_once_the_clock_of_the_data_is_known(tmp_path):
     node = started(tmp_path, clock="data")
-    health = Health(stamp_ns=5 * 10**18, node="depth", instance="a", epoch=0, state="active")
+    health = Health(stamp_ns=4 * 10**18, node="depth", instance="a", epoch=0, state="active")
     node.on_health(health)
     list(node.handle("tick", Tick(stamp_ns=7 * SECOND, count=0)))
     node.on_health(health)
