@@ -24,7 +24,7 @@ from beamsplat.common.runtime.handover import CONTROL
 from beamsplat.common.runtime.health_reporter import HealthReporter
 from beamsplat.common.runtime.jobs import JobAbandoned, JobQueue, JobThreads
 from beamsplat.common.runtime.live_settings import LiveSettings
-from beamsplat.common.runtime.node import Node, subscriptions
+from beamsplat.common.runtime.node import Node, StopRequested, subscriptions
 from beamsplat.common.runtime.pacing import Playback, wait_for_nodes
 from beamsplat.common.runtime.rate_limited_log import RateLimitedLog
 from beamsplat.common.runtime.running_node import POLL_S, RunningNode
@@ -48,6 +48,7 @@ class Live:
         self.running = RunningNode(node, settings)
         self._stopping = False
         self._stop_by = math.inf
+        node.must_stop = lambda: self._stopping
         self._queries: deque[tuple[str, zenoh.Query]] = deque()
         self._healths: deque[Health] = deque(maxlen=256)
         self._undecodable_limit = RateLimitedLog()
@@ -79,6 +80,8 @@ class Live:
                 reporter.send()
             except JobAbandoned:
                 log.warning("stopped while a background job was running: its result is lost")
+            except StopRequested:
+                log.info("stopped while starting")
             finally:
                 r.state = "closed"
                 node.close()
@@ -126,6 +129,7 @@ class Live:
         r.state = "drain"
         r.finish_jobs()
         r.emit(r.node.handle_drain())
+        r.finish_jobs()
         r.state = "drained"
         if finished:  # stopped by a signal, it leaves the stream open for a successor
             self._position.finish()

@@ -24,6 +24,7 @@ from beamsplat.common.config.deployment import NodeConfig
 from beamsplat.common.messages import Health, Message
 from beamsplat.common.messages.header import Header
 from beamsplat.common.runtime.live_settings import LiveSettings
+from beamsplat.common.runtime.rejections import Rejections
 from beamsplat.common.topics import ROW_NUMBER, Delivery, Topic, topic
 
 
@@ -95,6 +96,10 @@ class UndeclaredOutput(RuntimeError):
     """A node published on a topic, or started a job, that its class does not declare."""
 
 
+class StopRequested(Exception):
+    """The process was asked to end while a node was starting: it ends without `drain`."""
+
+
 class Node:
     """Base class of all nodes. Life cycle: configure() -> messages -> drain() -> close()."""
 
@@ -113,6 +118,10 @@ class Node:
         self.live_settings: LiveSettings | None = None  # None in lockstep
         self.without_producer: frozenset[str] = frozenset()  # inputs that nothing publishes; set by runners
         self.detail = ""  # one line that is shown with the node's health
+        self.rejections = Rejections()  # of inputs and results; those with a status are counted by this class
+        # Whether the process was asked to end, within seconds; set by the live runner. Long work asks between
+        # its steps and ends early, `configure` by raising StopRequested. `drain` then only saves the state.
+        self.must_stop: Callable[[], bool] = lambda: False
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
@@ -259,6 +268,7 @@ class Node:
                     )
             else:
                 self.check_output(*output)
+                self.rejections.add_status(*output)
             yield output
 
     def check_output(self, topic_name: str, message: Message) -> None:

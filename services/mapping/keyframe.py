@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -70,17 +72,43 @@ class PyramidLevel:
     hidden: np.ndarray | None = None  # bool [H, W], True = on a dynamic object: ignored by all losses
 
 
+class DeferredLevels(Sequence[PyramidLevel]):
+    """The pyramid levels of a keyframe that are decoded when one of them is used for the first time."""
+
+    def __init__(self, decode: Callable[[], list[PyramidLevel]]) -> None:
+        self._decode: Callable[[], list[PyramidLevel]] | None = decode
+        self._levels: list[PyramidLevel] = []
+
+    @property
+    def decoded(self) -> bool:
+        """Return whether the levels have been used."""
+        return self._decode is None
+
+    def _all(self) -> list[PyramidLevel]:
+        if self._decode is not None:
+            self._levels = self._decode()
+            self._decode = None
+        return self._levels
+
+    def __len__(self) -> int:
+        return len(self._all())
+
+    def __getitem__(self, index: Any) -> Any:
+        return self._all()[index]
+
+
 @dataclass
 class StoredKeyframe:
     """A keyframe in the map. `levels[0]` has full size, `levels[1]` half size.
 
-    Field names other than `levels` are array names in saved sessions (`keyframe_<name>`).
+    Field names other than `camera` and `levels` are array names in saved sessions (`keyframe_<name>`).
     """
 
     id: int
     anchor: int
     T_anchor_camera: np.ndarray  # as estimated by SLAM
-    levels: list[PyramidLevel]
+    camera: RasterCamera  # of the full size
+    levels: Sequence[PyramidLevel]
     delta: np.ndarray = field(default_factory=lambda: np.eye(4))  # the mapper's correction, right-multiplied
     pose_first: np.ndarray = field(default_factory=lambda: np.zeros(6))  # Adam's moments of the pose
     pose_second: np.ndarray = field(default_factory=lambda: np.zeros(6))
@@ -127,7 +155,22 @@ def compress(frame: RgbdKeyframe, sigma_unit: float) -> StoredKeyframe:
         rgb_planes, d, wt = (np.ascontiguousarray(array) for array in (planes, d, wt))
         levels.append(PyramidLevel(camera, rgb_planes, d, wt, pixels, z, hidden))
     T_anchor_camera = np.array(frame.T_anchor_camera, dtype=np.float64)
-    return StoredKeyframe(frame.id, frame.anchor, T_anchor_camera, levels, reach_m=visible_range_m(frame))
+    return StoredKeyframe(
+        frame.id, frame.anchor, T_anchor_camera, frame.camera, levels, reach_m=visible_range_m(frame)
+    )
+
+
+def unobserved_levels(camera: RasterCamera) -> list[PyramidLevel]:
+    """Return the levels of a keyframe without image and depth: all pixels are hidden."""
+    out = []
+    for halvings in range(2):
+        w, h = camera.width_px >> halvings, camera.height_px >> halvings
+        black, unknown = np.zeros((3, h, w), np.uint8), np.zeros((h, w), np.uint16)
+        no_beams = _beams_at(np.zeros((0, 3)), camera, camera)
+        size = camera.resized(w, h) if halvings else camera
+        weight, hidden = np.zeros((h, w), np.uint8), np.ones((h, w), bool)
+        out.append(PyramidLevel(size, black, unknown, weight, *no_beams, hidden))
+    return out
 
 
 def visible_range_m(frame: RgbdKeyframe) -> float:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import repeat
 from typing import Any
 
 import numpy as np
@@ -72,6 +73,7 @@ class Mapper:
         self.paged_out: dict[int, StoredKeyframe] = {}  # without images; the first is paged in next
         self.T_map_anchor: dict[int, np.ndarray] = {}
         self.steps = 0  # of the optimiser, in all
+        self.must_stop: Callable[[], bool] = lambda: False  # asked between two steps: ends them early
         self._random = np.random.default_rng(seed)
         self._newest: list[int] = []
         self.dropped_count = 0  # keyframes dropped to respect max_keyframes
@@ -280,8 +282,11 @@ class Mapper:
         full = self.settings.full_iterations if full is None else full
         if not self.keyframes or self.store.count == 0:
             return 0.0
-        losses = [self.step(self._draw(), HALF) for _ in range(half)]
-        losses += [self.step(self._draw(), FULL) for _ in range(full)]
+        losses: list[float] = []
+        for size in (*repeat(HALF, half), *repeat(FULL, full)):
+            if self.must_stop():
+                break
+            losses.append(self.step(self._draw(), size))
         return float(np.mean(losses)) if losses else 0.0
 
     def refine(self, iterations: int, size: int = FULL) -> float:
@@ -289,6 +294,8 @@ class Mapper:
         ids: list[int] = []
         losses: list[float] = []
         for _ in range(iterations):
+            if self.must_stop():
+                break
             if not ids:
                 ids = list(self._random.permutation(sorted(self.keyframes)))
             losses.append(self.step(self.keyframes[int(ids.pop())], size, refining=True))

@@ -20,7 +20,7 @@ from beamsplat.common.messages import (
     Message,
     Tick,
 )
-from beamsplat.common.runtime.node import Input, Job, Node, Outputs
+from beamsplat.common.runtime.node import Input, Job, Node, Outputs, StopRequested
 from beamsplat.services.mapping.chunks import ChunkFeed, Viewpoint, chunk_snapshot, disk_params
 from beamsplat.services.mapping.config import MappingConfig
 from beamsplat.services.mapping.intake import KeyframeIntake
@@ -79,6 +79,7 @@ class MappingNode(Node):
             max_keyframes=c.max_keyframes, refine_pose=c.refine_pose, refine_exposure=c.refine_exposure,
         )  # fmt: skip
         self._mapper = Mapper(settings, seed=c.seed, threads=c.threads)
+        self._mapper.must_stop = self.must_stop
         self._intake = KeyframeIntake(self._mapper)
         self._feed = ChunkFeed()
         self._viewpoint: Viewpoint | None = None  # of the newest keyframe
@@ -110,7 +111,15 @@ class MappingNode(Node):
     def take_over(self) -> None:
         """Open the session, if one is configured, and load the map from the session."""
         if self.config.session is not None:
-            self._session = LiveSession(self.config, self._intake, resume_known=self.in_standby)
+            self._session = LiveSession(
+                self.config, self._intake, resume_known=self.in_standby, report=self._report_progress
+            )
+
+    def _report_progress(self, text: str) -> None:
+        """Show the progress of opening the session; end it if the process must stop."""
+        self.detail = text
+        if self.must_stop():
+            raise StopRequested
 
     # --- keyframes ---
 
@@ -247,9 +256,17 @@ class MappingNode(Node):
     # --- end of the data ---
 
     def drain(self) -> Outputs:
-        """Process all waiting keyframes, publish the map, refine it if configured, and write the files."""
+        """Process all waiting keyframes, publish the map, refine it if configured, and write the files.
+
+        If the process must stop, only write the files: waiting keyframes are on disk, or the robot sends them
+        again.
+        """
+        if self.must_stop():
+            if self._mapper.keyframes:
+                yield from self._save()
+            return
         self._session.end_of_input()
-        while self._session.waiting:
+        while self._session.waiting and not self.must_stop():
             yield from self._skipped()
         if not self._mapper.keyframes:
             return
@@ -257,7 +274,7 @@ class MappingNode(Node):
         if self.config.final_steps:
             self._mapper.refine(self.config.final_steps, FULL)
             yield from self._publish_all()
-        self._save()
+        yield from self._save()
 
     def _publish_all(self) -> Outputs:
         """Publish all chunks that viewers do not have in full detail, and the poses of all keyframes."""
@@ -268,11 +285,15 @@ class MappingNode(Node):
         poses = MapPoses(stamp_ns=last_ns, keyframe_ids=ids, stamps_ns=stamps_ns, T_map_body=T_map_body)
         yield "mapping/poses", poses
 
-    def _save(self) -> None:
+    def _save(self) -> Outputs:
         """Write the last checkpoint; with the option `save`, also splats.ply and the keyframe poses."""
         m, folder = self._mapper, self.config.save
         stamps_ns, T_map_body, _ = self._intake.poses()
-        self._session.save(int(stamps_ns[-1]))
+        if (work := self._session.checkpoint(int(stamps_ns[-1]), last=True)) is not None:
+            if self.must_stop():  # the runner waits for a job as long as there is time
+                yield Job("checkpoint", work)
+            else:
+                self._session.finish_checkpoint(work())
         if folder is not None:
             on_disk = (part for anchor in list(m.store.paged_out) for part in disk_params(m, anchor))
             params_map = chain([m.store.params[:, : m.store.count]], on_disk)

@@ -21,8 +21,8 @@ from beamsplat.services.mapping.session.state import arrays_of, extras_of, resto
 
 log = logging.getLogger("beamsplat.mapping")
 
-# (id, schema, payload) -> keyframe; raises ValueError
-KeyframeDecoder = Callable[[int, str, bytes], RgbdKeyframe]
+# (id, schema, payload) -> function that decodes the images of this keyframe; both raise ValueError
+KeyframeDecoder = Callable[[int, str, bytes], Callable[[], RgbdKeyframe]]
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class Checkpointer:
         self._unwritten: set[int] = set()  # keyframes that the mapper has and the disk has not
 
     def _open(self) -> None:
-        """Create and lock the session, unless that is done; on a disk that is full at first, it is done later.
+        """Create and lock the session, unless that is done; on a disk that is full, it is done later.
 
         Raises:
             UserError: another process uses the session, or it cannot be read.
@@ -76,8 +76,10 @@ class Checkpointer:
 
     # --- resuming ---
 
-    def resume(self, mapper: Mapper, decoder: KeyframeDecoder) -> tuple[Arrays, list[int]]:
-        """Restore the last checkpoint into a new mapper.
+    def resume(
+        self, mapper: Mapper, decoder: KeyframeDecoder, report: Callable[[str], None] = lambda _: None
+    ) -> tuple[Arrays, list[int]]:
+        """Restore the last checkpoint into a new mapper; `report` as in `restore`.
 
         Returns:
             The `extra` arrays that were passed to `checkpoint`, and the ids of keyframes on disk that are
@@ -93,7 +95,7 @@ class Checkpointer:
         if arrays is None:
             self.disk_tier.find_stale_files()
             return {}, self.folder.keyframe_ids()
-        lost = restore(mapper, arrays, self._decode, keep_paged_out=paged)
+        lost = restore(mapper, arrays, self._read, keep_paged_out=paged, report=report)
         self.disk_tier.restore(arrays, mapper.store)
         for text in lost:
             log.warning("the mapper no longer optimises on this keyframe: %s", text)
@@ -108,8 +110,11 @@ class Checkpointer:
         known = set(extra["taken_id"].tolist()) | set(progress["forgotten"])
         return extra, [id for id in self.folder.keyframe_ids() if id not in known]
 
-    def _decode(self, id: int) -> RgbdKeyframe:
+    def _read(self, id: int) -> Callable[[], RgbdKeyframe]:
         return self._decoder(id, *self.folder.read_keyframe(id))
+
+    def _decode(self, id: int) -> RgbdKeyframe:
+        return self._read(id)()
 
     # --- paging ---
 

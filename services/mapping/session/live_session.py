@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Protocol
 
 import numpy as np
@@ -71,8 +73,11 @@ class MapSession(Protocol):
     def anchors_moved(self) -> None:
         """Move paged-out Gaussians with their anchors."""
 
-    def checkpoint(self, stamp_ns: int) -> Callable[[], CheckpointResult] | None:
-        """Return a job that writes a checkpoint if due, else None. Pass its result to `finish_checkpoint`."""
+    def checkpoint(self, stamp_ns: int, last: bool = False) -> Callable[[], CheckpointResult] | None:
+        """Return the job that writes a checkpoint, if one is due or this is the last one, else None.
+
+        The next period starts at `stamp_ns`. Pass the result of the job to `finish_checkpoint`.
+        """
 
     def finish_checkpoint(self, result: CheckpointResult) -> None:
         """Record the result of a checkpoint job."""
@@ -80,8 +85,12 @@ class MapSession(Protocol):
     def complete(self, arrays: Arrays) -> Arrays:
         """Return the arrays of a saved map, with the Gaussians that are on disk only added."""
 
-    def save(self, stamp_ns: int | None = None) -> None:
-        """Write a checkpoint now and wait until it is written; the next period starts at `stamp_ns`."""
+    def save(self) -> None:
+        """Write a checkpoint now, for a successor.
+
+        Raises:
+            UserError: it could not be written.
+        """
 
     def status_text(self) -> str:
         """Return one line for the health message of the node, "" without a session."""
@@ -120,14 +129,14 @@ class NoSession:
 
     def anchors_moved(self) -> None: ...
 
-    def checkpoint(self, stamp_ns: int) -> None: ...
+    def checkpoint(self, stamp_ns: int, last: bool = False) -> None: ...
 
     def finish_checkpoint(self, result: CheckpointResult) -> None: ...
 
     def complete(self, arrays: Arrays) -> Arrays:
         return arrays
 
-    def save(self, stamp_ns: int | None = None) -> None: ...
+    def save(self) -> None: ...
 
     def status_text(self) -> str:
         return ""
@@ -138,11 +147,19 @@ class NoSession:
 class LiveSession:
     """A `MapSession` in a folder on disk."""
 
-    def __init__(self, config: MappingConfig, intake: KeyframeIntake, *, resume_known: bool) -> None:
+    def __init__(
+        self,
+        config: MappingConfig,
+        intake: KeyframeIntake,
+        *,
+        resume_known: bool,
+        report: Callable[[str], None],
+    ) -> None:
         """Open the session and resume from its last checkpoint.
 
         With `resume_known`, a predecessor process has acknowledged the keyframes that are newer than the
-        checkpoint; they also wait in this process's mailbox and are skipped there.
+        checkpoint; they also wait in this process's mailbox and are skipped there. `report` is called with
+        the progress as text; what it raises ends the opening.
 
         Raises:
             UserError: the folder cannot be written, is locked by another process, or cannot be read.
@@ -156,27 +173,39 @@ class LiveSession:
             self._mapper, keyframe
         )
         self._resumed: set[int] = set()
-        self._resume(resume_known)
+        try:
+            self._resume(resume_known, config, report)
+        except BaseException:
+            self._checkpointer.close()
+            raise
         self._inbox = Inbox(self._checkpointer)
 
-    def _resume(self, resume_known: bool) -> None:
-        """Restore the checkpoint, then insert the keyframes that arrived after it."""
+    def _resume(self, resume_known: bool, config: MappingConfig, report: Callable[[str], None]) -> None:
+        """Restore the checkpoint, then insert the keyframes that arrived after it.
+
+        All of them together get at most the steps of `calm_backlog` keyframes: until this is done, newer
+        keyframes wait. Later steps make up for it.
+        """
         c, m = self._checkpointer, self._mapper
         undistorter = self._intake.undistorter
         extra, newer = c.resume(
-            m, lambda id, schema, body: decode_keyframe(_decode_message(id, schema, body), undistorter)
+            m,
+            lambda id, schema, body: partial(decode_keyframe, _decode_message(id, schema, body), undistorter),
+            report,
         )
         self._intake.restore(extra)
         if resume_known:
             self._resumed = set(newer)
-        for id in newer:
+        share = min(config.calm_backlog / max(len(newer), 1), 1.0)
+        for number, id in enumerate(newer, 1):
+            report(f"resuming: keyframe {number} of {len(newer)} newer than the checkpoint")
             message = self._read_message(id)
             if message is None:
                 continue
             c.start_period(message.stamp_ns)  # a process that is killed repeatedly still reaches a checkpoint
             outcome = self._intake.insert(message, self.load_visible)
             if outcome.ok:
-                m.optimise()
+                m.optimise(math.ceil(config.half_steps * share), math.ceil(config.full_steps * share))
             else:
                 self._intake.reject(id, outcome.status)
                 self.remove(id)
@@ -228,8 +257,8 @@ class LiveSession:
     def anchors_moved(self) -> None:
         self._checkpointer.anchors_moved(self._mapper)
 
-    def checkpoint(self, stamp_ns: int) -> Callable[[], CheckpointResult] | None:
-        if not self._mapper.keyframes or not self._checkpointer.due(stamp_ns):
+    def checkpoint(self, stamp_ns: int, last: bool = False) -> Callable[[], CheckpointResult] | None:
+        if not self._mapper.keyframes or not (last or self._checkpointer.due(stamp_ns)):
             return None
         return self._checkpointer.checkpoint(self._mapper, self._intake.arrays(), stamp_ns)
 
@@ -239,14 +268,9 @@ class LiveSession:
     def complete(self, arrays: Arrays) -> Arrays:
         return self._checkpointer.with_disk_gaussians(arrays)
 
-    def save(self, stamp_ns: int | None = None) -> None:
-        if not self._mapper.keyframes:
-            return
-        if stamp_ns is None:
+    def save(self) -> None:
+        if self._mapper.keyframes:
             self._checkpointer.save(self._mapper, self._intake.arrays())
-        else:
-            work = self._checkpointer.checkpoint(self._mapper, self._intake.arrays(), stamp_ns)
-            self._checkpointer.finish_checkpoint(work())
 
     def status_text(self) -> str:
         return self._checkpointer.status_text(self._mapper)

@@ -23,7 +23,7 @@ import numpy as np
 
 from beamsplat.common.errors import UserError
 from beamsplat.services.mapping.keyframe import PyramidLevel, RgbdKeyframe, StoredKeyframe, compress
-from beamsplat.services.mapping.mapper import FULL, Mapper
+from beamsplat.services.mapping.mapper import Mapper
 from beamsplat.services.mapping.session.disk_tier import DiskTier, GaussianGroup, groups_of, spheres_of
 from beamsplat.services.mapping.session.frustum import frustum_intersects
 
@@ -68,10 +68,8 @@ def image_bytes(keyframe: StoredKeyframe) -> int:
 
 
 def without_images(keyframe: StoredKeyframe) -> StoredKeyframe:
-    """Return a copy of the keyframe with one level, which contains the camera and empty arrays."""
-    empty = np.zeros(0, np.uint8)
-    camera = keyframe.levels[FULL].camera
-    return replace(keyframe, levels=[PyramidLevel(camera, empty, empty, empty, empty, empty)])
+    """Return a copy of the keyframe without levels."""
+    return replace(keyframe, levels=[])
 
 
 class Pager:
@@ -276,6 +274,5 @@ class Pager:
 def _visible(
     mapper: Mapper, keyframe: StoredKeyframe, centres_map_m: np.ndarray, radii_m: np.ndarray
 ) -> np.ndarray:
-    camera = keyframe.levels[FULL].camera
     T_map_camera = mapper.T_map_camera(keyframe)
-    return frustum_intersects(camera, T_map_camera, keyframe.reach_m, centres_map_m, radii_m)
+    return frustum_intersects(keyframe.camera, T_map_camera, keyframe.reach_m, centres_map_m, radii_m)

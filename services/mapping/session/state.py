@@ -5,6 +5,7 @@ interrupted.
 from __future__ import annotations
 
 import json
+import logging
 from collections.abc import Callable
 from dataclasses import fields
 from typing import Any
@@ -14,10 +15,19 @@ import numpy as np
 from beamsplat.common.errors import UserError
 from beamsplat.common.mapfiles.blocks import Arrays
 from beamsplat.common.mapfiles.state import CAMERA_FIELDS, camera_of, progress_of, store_of
-from beamsplat.services.mapping.keyframe import PyramidLevel, RgbdKeyframe, StoredKeyframe, compress
-from beamsplat.services.mapping.mapper import FULL, Mapper
+from beamsplat.services.mapping.keyframe import (
+    DeferredLevels,
+    PyramidLevel,
+    RgbdKeyframe,
+    StoredKeyframe,
+    compress,
+    unobserved_levels,
+)
+from beamsplat.services.mapping.mapper import Mapper
 
-_NOT_STORED = {"levels"}  # recomputed from the keyframe's file
+log = logging.getLogger("beamsplat.mapping")
+
+_NOT_STORED = {"levels", "camera"}  # recomputed from the keyframe's file; stored as `CAMERA_FIELDS`
 _FIELDS = tuple(field.name for field in fields(StoredKeyframe) if field.name not in _NOT_STORED)
 
 
@@ -32,7 +42,7 @@ def arrays_of(mapper: Mapper, extra: Arrays | None = None) -> Arrays:
     out = {f"store_{name}": array for name, array in mapper.store.state().items()}
     for name in _FIELDS:
         out[f"keyframe_{name}"] = np.array([getattr(k, name) for k in keyframes])
-    cameras = [[getattr(k.levels[FULL].camera, name) for name in CAMERA_FIELDS] for k in keyframes]
+    cameras = [[getattr(k.camera, name) for name in CAMERA_FIELDS] for k in keyframes]
     out["keyframe_parked"] = np.arange(len(keyframes)) >= len(mapper.keyframes)
     out["keyframe_camera"] = np.array(cameras, np.float64).reshape(-1, len(CAMERA_FIELDS))
     out["anchor_id"] = np.array(list(mapper.T_map_anchor), np.int64)
@@ -47,16 +57,24 @@ def extras_of(arrays: Arrays) -> Arrays:
 
 
 def restore(
-    mapper: Mapper, arrays: Arrays, decode: Callable[[int], RgbdKeyframe], keep_paged_out: bool = False
+    mapper: Mapper,
+    arrays: Arrays,
+    read: Callable[[int], Callable[[], RgbdKeyframe]],
+    *,
+    keep_paged_out: bool = False,
+    report: Callable[[str], None] = lambda _: None,
 ) -> list[str]:
     """Restore a saved state into a new mapper.
 
     Args:
-        decode: reads the keyframe with an id; raises ValueError.
-        keep_paged_out: True: keyframes that were paged out stay paged out; False: decode all keyframes.
+        read: reads and checks the file of a keyframe, and returns the function that decodes its images; both
+            raise ValueError.
+        keep_paged_out: True: keyframes that were paged out stay paged out, and all others are decoded now, so
+            that the memory use is known. False: every keyframe is in memory, and decoded when it is used.
+        report: called with the progress as text; what it raises ends the restoring.
 
     Returns:
-        One sentence for each keyframe that could not be decoded. Its Gaussians are in the map, but the mapper
+        One sentence for each keyframe that could not be read. Its Gaussians are in the map, but the mapper
         does not optimise on it any more.
 
     Raises:
@@ -67,14 +85,20 @@ def restore(
         mapper.store = store_of(arrays)
         anchors = zip(arrays["anchor_id"].tolist(), arrays["anchor_T_map"])
         mapper.T_map_anchor = {anchor: T.copy() for anchor, T in anchors}
-        paged_out = arrays.get("keyframe_parked", np.zeros(len(arrays["keyframe_id"]), bool))
-        for row, id in enumerate(arrays["keyframe_id"].tolist()):
+        ids = arrays["keyframe_id"].tolist()
+        paged_out = arrays.get("keyframe_parked", np.zeros(len(ids), bool))
+        for row, id in enumerate(ids):
             keyframe = _keyframe(arrays, row)
             if keep_paged_out and paged_out[row]:
                 mapper.paged_out[id] = keyframe
                 continue
+            report(f"resuming: keyframe {row + 1} of {len(ids)}")
             try:
-                keyframe.levels = compress(decode(id), mapper.settings.sigma_unit).levels
+                decode = read(id)
+                if keep_paged_out:
+                    keyframe.levels = compress(decode(), mapper.settings.sigma_unit).levels
+                else:
+                    keyframe.levels = _deferred(keyframe, decode, mapper.settings.sigma_unit)
             except ValueError as error:
                 lost.append(f"keyframe {id}: {error}")
                 continue
@@ -85,11 +109,24 @@ def restore(
     return lost
 
 
+def _deferred(
+    keyframe: StoredKeyframe, decode: Callable[[], RgbdKeyframe], sigma_unit: float
+) -> DeferredLevels:
+    def levels() -> list[PyramidLevel]:
+        try:
+            return list(compress(decode(), sigma_unit).levels)
+        except ValueError as error:  # of images that an earlier version of this program accepted
+            log.warning("the mapper no longer optimises on keyframe %d: %s", keyframe.id, error)
+            return unobserved_levels(keyframe.camera)
+
+    return DeferredLevels(levels)
+
+
 def _keyframe(arrays: Arrays, row: int) -> StoredKeyframe:
-    """Return the keyframe in a row of the arrays, without images; fields not saved have their default."""
-    empty, stored = np.zeros(0, np.uint8), [n for n in _FIELDS if f"keyframe_{n}" in arrays]
-    level = PyramidLevel(camera_of(arrays, row), empty, empty, empty, empty, empty)
-    return StoredKeyframe(levels=[level], **{n: _value(arrays[f"keyframe_{n}"][row]) for n in stored})
+    """Return the keyframe in a row of the arrays, without levels; fields not saved have their default."""
+    stored = [n for n in _FIELDS if f"keyframe_{n}" in arrays]
+    values = {n: _value(arrays[f"keyframe_{n}"][row]) for n in stored}
+    return StoredKeyframe(camera=camera_of(arrays, row), levels=[], **values)
 
 
 def _value(stored: np.ndarray) -> Any:

@@ -5,12 +5,14 @@ import numpy as np
 import pytest
 import torch
 
+from beamsplat.common.raster.camera import RasterCamera
 from beamsplat.common.raster.ssim import TAPS, SsimLoss, ssim
 from beamsplat.common.raster.threads import ThreadTeam
 from beamsplat.services.mapping.kernels import add_lidar, exposure_gradient, photometric_and_depth
 from beamsplat.services.mapping.keyframe import StoredKeyframe, refine_exposure
 
 H, W = 37, 53
+CAMERA = RasterCamera(50.0, 50.0, 26.0, 18.0, W, H)
 
 
 def pictures(seed=0):
@@ -152,7 +154,7 @@ def test_an_image_that_its_exposure_explains_has_no_ssim_loss():
 def test_adam_of_the_exposure_counts_its_own_steps():
     """With a constant gradient, each step of Adam has the size of the rate, whatever the pose has done."""
     for pose_steps in (0, 1000):
-        keyframe = StoredKeyframe(0, 0, np.eye(4), [], pose_steps=pose_steps)
+        keyframe = StoredKeyframe(0, 0, np.eye(4), CAMERA, [], pose_steps=pose_steps)
         for step in range(1, 11):
             refine_exposure(keyframe, np.full(6, -1.0), 0.01)
             np.testing.assert_allclose(keyframe.exposure, 0.01 * step, rtol=1e-3)

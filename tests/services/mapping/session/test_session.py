@@ -8,6 +8,7 @@ import resource
 import shutil
 import signal
 import time
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -77,7 +78,7 @@ def test_optimisation_continues_identically(saved, copy):
         restore(
             ours,
             arrays,
-            lambda id: decode_keyframe(message((id - r.T0) // SECOND), loaded._intake.undistorter),
+            lambda id: partial(decode_keyframe, message((id - r.T0) // SECOND), loaded._intake.undistorter),
         )
         == []
     )
