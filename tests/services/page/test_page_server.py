@@ -63,6 +63,14 @@ class Serving:
             reply.begin()
             return reply.status, reply.read()
 
+    def status(self, raw):
+        """Send raw bytes; return the status of the response, also of one that does not end."""
+        with socket.create_connection(("127.0.0.1", self.port), timeout=10) as s:
+            s.sendall(raw)
+            reply = http.client.HTTPResponse(s)
+            reply.begin()
+            return reply.status
+
     def get(self, path, host="127.0.0.1"):
         return self.ask(f"GET {path} HTTP/1.1\r\nHost: {host}\r\n\r\n".encode())
 
