@@ -1,4 +1,4 @@
-"""Commands `beamsplat bench bus | slam | paper | sensitivity`: benchmarks, each with its reference."""
+"""Commands `beamsplat bench`: bus, slam, uncertainties, paper, sensitivity; each with its reference."""
 
 from __future__ import annotations
 
@@ -76,6 +76,33 @@ def slam(
     if readme is not None:
         replace_readme_table(readme, "slam", table)
     write_map_overview(out, [row["name"] for row in rows], pictures or out / "maps.jpg")
+
+
+@app.command()
+def uncertainties(
+    data: Annotated[
+        Path,
+        typer.Option(exists=True, file_okay=False, help="Folder with bag/ beside groundtruth.txt"),
+    ],
+    as_json: JsonOption = False,
+) -> None:
+    """Compare stated standard deviations (localization, calibration of the camera) with true errors.
+
+    The normalised error is the RMS of error / stated standard deviation: 1 is honest, more is too optimistic.
+
+    Example: beamsplat bench uncertainties --data recordings
+    """
+    from beamsplat.tools.bench.uncertainties import bench_uncertainties
+
+    rows = bench_uncertainties(data, lambda text: console.print(text, highlight=False))
+    if as_json:
+        print(json.dumps(rows))
+        return
+    table = Table("quantity", "unit", "samples", "RMS error", "mean sigma", "normalised error")
+    for row in rows:
+        figures = (f"{row[key]:.3g}" for key in ("rms_error", "mean_sigma", "normalised_error"))
+        table.add_row(row["quantity"], row["unit"], str(row["samples"]), *figures)
+    Console().print(table)
 
 
 @app.command()

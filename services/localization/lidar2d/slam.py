@@ -14,9 +14,9 @@ from beamsplat.services.localization.lidar2d.local_trajectory_builder import (
     LocalTrajectoryBuilder,
     RawScan,
 )
+from beamsplat.services.localization.lidar2d.motion_covariance import UNKNOWN, motion_covariance
 from beamsplat.services.localization.lidar2d.occupancy import CountGrid, OccupancyGrid, render_occupancy
 from beamsplat.services.localization.lidar2d.pose_graph import PoseGraph
-from beamsplat.services.localization.lidar2d.pose_graph_data import edge_information
 from beamsplat.services.localization.lidar2d.relocalization import (
     GlobalMap,
     Relocalization,
@@ -45,7 +45,7 @@ class ScanResult:
     status: str  # "ok", "lost", "relocalizing" or "rejected: reason"
     pose_odom_body: np.ndarray  # float64 [3], continuous
     pose_map_odom: np.ndarray  # float64 [3], may jump
-    covariance: np.ndarray  # float64 [3, 3] of x, y (odom axes), yaw
+    covariance: np.ndarray  # float64 [3, 3] of the motion over the last second: x, y (odom axes), yaw
     dynamic: np.ndarray  # bool [N], dynamic-beam mask
     points_body: np.ndarray  # float64 [M, 2] deskewed returns
     beams: np.ndarray  # int32 [M] beam of each return
@@ -131,7 +131,9 @@ class LidarSlam:
         else:
             last = self.local_builder.poses[-1]
             pose_odom_body = se2.compose(last, prediction.motion) if prediction.source == "wheels" else last
+        target_yaw_rad = float(self.active_submaps.matching_target.pose_odom_submap[2])
         self.local_builder.accept(stamp_ns, pose_odom_body, candidates if good else [])
+        covariance = self._covariance(match, target_yaw_rad) if good else UNKNOWN
         self._consecutive_lost = 0 if good else self._consecutive_lost + 1
         if self._consecutive_lost >= self.settings.lost_scans or (
             self._consecutive_lost and prediction.long_gap
@@ -139,7 +141,7 @@ class LidarSlam:
             self._start_segment(raw.stamp_ns, scan, pose_odom_body)
             good = True
         # 5. dynamic objects, 6. insertion, 7. background job
-        return self._insert_scan(raw, scan, pose_odom_body, match, good)
+        return self._insert_scan(raw, scan, pose_odom_body, match, covariance, good)
 
     def _add_first_scan(self, raw: RawScan) -> ScanResult:
         scan = self.local_builder.prepare(raw, self.local_builder.scan_velocity(raw, None))
@@ -147,9 +149,12 @@ class LidarSlam:
             return self._rejected(raw, f"{len(scan)} returns; at least {self.settings.min_points} are needed")
         self.local_builder.accept(raw.stamp_ns, np.zeros(3), [])
         self.pose_graph.uuid = self.pose_graph.uuid or map_uuid(raw.stamp_ns, raw.ranges_m)
-        return self._insert_scan(
-            raw, scan, np.zeros(3), Match(np.zeros(3), np.diag([1e6, 1e6, 1e8]), 1.0, 1.0, 0.0), True
-        )
+        match = Match(np.zeros(3), np.diag([1e6, 1e6, 1e8]), 1.0, 1.0, 0.0)
+        return self._insert_scan(raw, scan, np.zeros(3), match, self._covariance(match, 0.0), True)
+
+    def _covariance(self, match: Match, target_yaw_rad: float) -> np.ndarray:
+        builder = self.local_builder
+        return motion_covariance(match, target_yaw_rad, builder.stamps, builder.poses, self.settings)
 
     def _start_segment(self, stamp_ns: int, scan: PreparedScan, pose_odom_body: np.ndarray) -> None:
         """Finish the active submaps; start a segment that is not connected to the map, with this scan."""
@@ -159,8 +164,9 @@ class LidarSlam:
         self._next_link_scan = self.scans
 
     def _insert_scan(
-        self, raw: RawScan, scan: PreparedScan, pose_odom_body: np.ndarray, match: Match, good: bool
-    ) -> ScanResult:
+        self, raw: RawScan, scan: PreparedScan, pose_odom_body: np.ndarray, match: Match,
+        covariance: np.ndarray, good: bool,
+    ) -> ScanResult:  # fmt: skip
         """Detect dynamic objects, insert the scan, create a background job if due; return the result."""
         dynamic = (
             self.active_submaps.dynamic_returns(scan, pose_odom_body)
@@ -182,14 +188,13 @@ class LidarSlam:
             se2.between(last.pose_odom_body, pose_odom_body),
             se2.compose(pose_map_odom, pose_odom_body),
         )
-        covariance = np.linalg.inv(edge_information(match.information, 0.003, 0.001))
         status = "lost" if not good else "ok" if self.pose_graph.unlinked_from is None else "relocalizing"
         return ScanResult(
             raw.stamp_ns,
             status,
             pose_odom_body,
             pose_map_odom,
-            covariance,
+            covariance.copy(),
             per_beam,
             scan.points_body,
             scan.beams,
@@ -206,7 +211,7 @@ class LidarSlam:
             f"rejected: {reason}",
             pose_odom_body,
             self.pose_graph.pose_map_odom.copy(),
-            np.diag([1.0, 1.0, 0.1]),
+            UNKNOWN.copy(),
             np.zeros(count, dtype=bool),
             np.zeros((0, 2)),
             np.zeros(0, dtype=np.int32),
