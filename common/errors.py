@@ -15,6 +15,10 @@ class UserError(ValueError):
         super().__init__(without_secrets(text))
 
 
+class NothingUseful(UserError):
+    """A run ended without any result of a kind that it should have: exit code 3."""
+
+
 def reason(error: BaseException) -> str:
     """Return the text of an exception; for an OSError without its error number and file name."""
     return (error.strerror or str(error)) if isinstance(error, OSError) else str(error)

@@ -246,6 +246,14 @@ class OutputHealth(MessagePart):
     refused: Count = 0  # not sent, because larger than the topic's limit; since Health 1.2
 
 
+class Rejected(MessagePart):
+    """Number of inputs or results that a node has refused for one reason."""
+
+    topic: Name  # of the missing result; "" = an input
+    reason: Name
+    count: Count
+
+
 # "failed": the node's process cannot run, and its supervisor reports it.
 NodeState = Literal["configure", "standby", "active", "drain", "drained", "closed", "failed"]
 
@@ -253,7 +261,7 @@ NodeState = Literal["configure", "standby", "active", "drain", "drained", "close
 class Health(Message):
     """State, message counts and resource use of one node, published by each node at 1 Hz."""
 
-    version = "1.2"  # 1.1: pid; 1.2: state "failed", counters `late` and `refused`
+    version = "1.3"  # 1.1: pid; 1.2: state "failed", counters `late` and `refused`; 1.3: rejected
 
     node: Name
     instance: Name
@@ -267,6 +275,7 @@ class Health(Message):
     cpu_percent: NonNegative = 0.0
     detail: Text = ""
     pid: Count = 0  # process id on its host; 0 = not reported
+    rejected: Annotated[tuple[Rejected, ...], Field(max_length=64)] = ()
 
 
 class Answer(Message):

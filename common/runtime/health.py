@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -30,6 +30,8 @@ class NodeRecord:
     health: Health
     received_s: float
     starts: int = 1  # number of instances (processes) seen so far
+    earlier_losses: Counter[str] = field(default_factory=Counter)  # of processes before this one
+    earlier_results: Counter[str] = field(default_factory=Counter)
     refused: int = 0  # reports of other processes, which are not accepted as this node
     history: deque[tuple[float, Health]] = field(default_factory=lambda: deque(maxlen=_MAX_HISTORY))
 
@@ -50,6 +52,16 @@ class NodeRecord:
             return 0.0
         return (count(after) - count(before)) / (last - first)
 
+    def losses(self) -> Counter[str]:
+        """Return what all processes of this node have refused, dropped and lost: counts by reason."""
+        return self.earlier_losses + losses_of(self.health)
+
+    def results(self) -> dict[str, int]:
+        """Return the number of usable results of all processes of this node by topic."""
+        now = results_of(self.health)
+        topics = dict.fromkeys((*self.earlier_results, *now))
+        return {topic: self.earlier_results[topic] + now.get(topic, 0) for topic in topics}
+
     def totals(self) -> NodeTraffic:
         """Return the message rates and counters of this node, summed over its inputs and outputs."""
         inputs = self.health.inputs
@@ -62,6 +74,30 @@ class NodeRecord:
             late=sum(i.late for i in inputs),
             bad=sum(i.undecodable + i.stale + i.refused for i in inputs),
         )
+
+
+def losses_of(health: Health) -> Counter[str]:
+    """Return what one process has refused, dropped and lost: counts by reason."""
+    found: Counter[str] = Counter()
+    for entry in health.inputs:
+        found[f"{entry.topic}: dropped, a newer message was ready or the queue was full"] = entry.dropped
+        found[f"{entry.topic}: lost"] = entry.lost
+        found[f"{entry.topic}: not decodable"] = entry.undecodable
+        found[f"{entry.topic}: repeated, or of an earlier process"] = entry.stale
+        found[f"{entry.topic}: of another process than the publisher"] = entry.refused
+    for sent in health.outputs:
+        found[f"{sent.topic}: too large to be published"] = sent.refused
+    for rejected in health.rejected:
+        found[f"{rejected.topic}: {rejected.reason}" if rejected.topic else rejected.reason] += rejected.count
+    return +found
+
+
+def results_of(health: Health) -> dict[str, int]:
+    """Return how many messages one process has published by topic, without those whose status is not "ok"."""
+    refused = Counter[str]()
+    for rejected in health.rejected:
+        refused[rejected.topic] += rejected.count
+    return {entry.topic: max(entry.sent - refused[entry.topic], 0) for entry in health.outputs}
 
 
 class NodeTraffic(NamedTuple):
@@ -156,6 +192,10 @@ class HealthRecords:
         while len(self.records) >= _MAX_NODES and health.node not in self.records:
             del self.records[min(self.records, key=lambda name: self.records[name].received_s)]
         record = self.records.setdefault(health.node, NodeRecord(health, now))
+        ended = health.state == "failed" and record.health.state != "failed"  # reported by its supervisor
+        if record.health.instance != health.instance or ended:
+            record.earlier_losses.update(losses_of(record.health))
+            record.earlier_results.update(results_of(record.health))
         if record.health.instance != health.instance:
             record.history.clear()
             record.starts += 1

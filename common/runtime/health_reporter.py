@@ -53,5 +53,6 @@ class HealthReporter:
                 step_p50_ms=float(np.percentile(steps, 50)), step_p95_ms=float(np.percentile(steps, 95)),
                 rss_mb=self._process.memory_info().rss / 1e6, cpu_percent=self._process.cpu_percent(),
                 detail=without_secrets(r.detail_text())[:_DETAIL_CHARS], pid=self._process.pid,
+                rejected=r.node.rejections.report(),
             )
         )  # fmt: skip

@@ -26,7 +26,7 @@ log = logging.getLogger(__name__)
 QUERY, OPERATOR_QUERY = "query", "operator"
 
 
-class NoAnswer(UserError):
+class NoQueryAnswer(UserError):
     """No node, or no process, has answered a query."""
 
 
@@ -47,7 +47,7 @@ def ask(
     With `prefix` = `OPERATOR_QUERY` it is a command of the operator, which may set any option of a node.
 
     Raises:
-        NoAnswer: no node answered this query in time.
+        NoQueryAnswer: no node answered this query in time.
         UserError: the node rejected it, or its answer cannot be decoded.
     """
     yield from _ask(session, key(robot, prefix, node, name), (node, name), parameters, timeout_s)
@@ -64,7 +64,7 @@ def command(
     """Send a hand-over request to one process and return its answer (common/runtime/handover.py).
 
     Raises:
-        NoAnswer: the process did not answer in time.
+        NoQueryAnswer: the process did not answer in time.
         UserError: it rejected the request, or answered with something else.
     """
     node, instance = process
@@ -97,7 +97,7 @@ def _ask(
                 assert reply.err is not None  # a reply is one or the other
                 text = reply.err.payload.to_string()
                 if text == "Timeout":  # of Zenoh itself: the query was received, and not answered
-                    raise NoAnswer(f"{who} did not answer {name} within {timeout_s:g} s")
+                    raise NoQueryAnswer(f"{who} did not answer {name} within {timeout_s:g} s")
                 raise UserError(f"{who} rejected {name}: {text}")
             answered = True
             try:
@@ -110,7 +110,7 @@ def _ask(
         if answered:
             return
         if time.monotonic() > deadline:
-            raise NoAnswer(
+            raise NoQueryAnswer(
                 f"no answer from node {who!r} to the query {name!r}: is the node running? "
                 "(`beamsplat top` shows it)"
             )

@@ -63,6 +63,7 @@ class ReplayNode(Node):
             yield SourceItem(at_ns, topic, message)
         for problem in source.problems:
             log.warning("%s", problem)
+            self.rejections.add(problem)
 
     def close(self) -> None:
         if self._source is not None:

@@ -95,11 +95,11 @@ def demo(
         return seen_by[0]
 
     busy_s, began = _busy_s(), time.monotonic()
-    run_checked(deployment, monitor=monitor)
+    end = run_checked(deployment, monitor=monitor)
     costs = seen_by[0].costs
     others_s = _busy_s() - busy_s - costs.startup_cpu_s - sum(costs.cpu_s.values())
     console.print("the recording has ended; writing the report")
-    figures = write_results(out, source, seen_by[0].record, costs)
+    figures = write_results(out, source, seen_by[0].record, costs, end.losses)
     _say_where(out, source, figures)
     cores = others_s / (time.monotonic() - began)
     if cores > _CORES_OF_OTHERS:
@@ -107,6 +107,7 @@ def demo(
             f"Other programs took {cores:.1f} of {os.cpu_count()} CPU cores meanwhile: on an idle machine "
             "more images are processed, with less delay, and the map is better."
         )
+    end.check_useful()
 
 
 def _busy_s() -> float:
@@ -135,7 +136,9 @@ def _truth_stamps(source: Path) -> frozenset[int]:
         return frozenset()
 
 
-def write_results(out: Path, source: Path, record: RunRecord, costs: RunCosts) -> dict[str, Any]:
+def write_results(
+    out: Path, source: Path, record: RunRecord, costs: RunCosts, losses: dict[str, dict[str, int]]
+) -> dict[str, Any]:
     """Write the results of a live run into `out`; return scores and costs by name, as in report.json.
 
     The files are trajectory.tum and, if there were images, map.png, report.html and report.json. Pose errors
@@ -146,6 +149,7 @@ def write_results(out: Path, source: Path, record: RunRecord, costs: RunCosts) -
         source: the recording that was played.
         record: messages of the run.
         costs: CPU time and memory of the run.
+        losses: what was refused, dropped and lost, by node and reason.
     """
     import cv2
     import numpy as np
@@ -174,7 +178,7 @@ def write_results(out: Path, source: Path, record: RunRecord, costs: RunCosts) -
         cv2.imwrite(str(out / "map.png"), row["plots"]["above"])
     report = single_run_report("demo", "lidar + fused depth", source, truth, row)
     write_report(out / "report.html", report, truth, paper=False)
-    figures = {name: value for name, value in row.items() if name != "plots"}
+    figures = {**{name: value for name, value in row.items() if name != "plots"}, "refused": losses}
     write_atomically(out / "report.json", json.dumps(figures, indent=1).encode())
     return figures
 

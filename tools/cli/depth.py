@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from beamsplat.common.errors import UserError
+from beamsplat.common.errors import NothingUseful, UserError
 from beamsplat.common.files.persist import make_folder
 from beamsplat.tools.cli.options import writable
 
@@ -98,6 +98,7 @@ def depth(
     floor: FloorOption = None,
     truth: Annotated[Path | None, typer.Option(help="Folder of true depth, shown as well.")] = None,
     every: Annotated[int, typer.Option(min=1, help="Use every n-th image.")] = 8,
+    as_json: JsonOption = False,
 ) -> None:
     """Draw panels: image with beams, raw depth, corrected depth, sigma, and true depth if given.
 
@@ -107,6 +108,7 @@ def depth(
 
         beamsplat depth photo.jpg --out images --rig rig.toml
     """
+    from beamsplat.common.runtime.rejections import Rejections
     from beamsplat.services.depth.source import make_source
     from beamsplat.tools.evaluation.depth_panels import draw_depth_of_image, draw_depth_panels
 
@@ -118,12 +120,23 @@ def depth(
     drive = _open(data, poses, rig)
     with _progress() as bar:
         task = bar.add_task("images", total=None)
-        count = 0
-        for count, (_, total) in enumerate(
+        count, refused, useful = 0, Rejections(), 0
+        for count, (status, total) in enumerate(
             draw_depth_panels(drive, chosen, truth, every, out, floor), start=1
         ):
             bar.update(task, completed=count, total=total)
-    print(f"{count} images in {out}")
+            useful += status == "ok"
+            if status != "ok":
+                refused.add(status)
+    reasons = {entry.reason: entry.count for entry in refused.report()}
+    if as_json:
+        print(json.dumps({"images": count, "with_depth": useful, "refused": reasons}))
+    else:
+        print(f"{count} images in {out}, {useful} with depth")
+        for reason, number in reasons.items():
+            print(f"{number} without: {reason}")
+    if not useful:
+        raise NothingUseful(f"{data}: no image has depth ({', '.join(reasons) or 'there are no images'})")
 
 
 def bench_depth(

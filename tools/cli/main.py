@@ -12,7 +12,7 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-from beamsplat.common.errors import UserError
+from beamsplat.common.errors import NothingUseful, UserError
 from beamsplat.common.optional_packages import missing_packages_explained
 from beamsplat.tools.cli import bench as bench_cli
 from beamsplat.tools.cli import bench_endurance as endurance_cli
@@ -104,13 +104,13 @@ def _root(
 
 
 def main() -> None:
-    """Run the command line; a UserError is printed as one sentence, exit code 2."""
+    """Run the command line; a UserError is printed as one sentence, exit code 2 (NothingUseful: 3)."""
     try:
         with missing_packages_explained(f"beamsplat {' '.join(sys.argv[1:2])}".strip()):
             app()
     except UserError as error:
         Console(stderr=True).print(f"[red]error:[/] {escape(str(error))}", soft_wrap=True, highlight=False)
-        sys.exit(2)
+        sys.exit(3 if isinstance(error, NothingUseful) else 2)
 
 
 if __name__ == "__main__":

@@ -78,6 +78,8 @@ def slam(
         print(json.dumps(figures))
     else:
         print_figures(figures)
+        for reason, count in figures["refused"].items():
+            console.print(f"{count} scans: {reason}", markup=False, highlight=False)
         console.print(f"wrote trajectory.tum, online.tum, map.pgm, map.yaml, map.png and state/ to {out}")
 
 

@@ -34,7 +34,7 @@ def _ask(
 ) -> str:
     from beamsplat.common.security.logins import OPERATOR, login_of
     from beamsplat.common.zenoh.bus import open_session
-    from beamsplat.common.zenoh.queries import OPERATOR_QUERY, QUERY, NoAnswer, ask
+    from beamsplat.common.zenoh.queries import OPERATOR_QUERY, QUERY, NoQueryAnswer, ask
 
     deployment = load_deployment(file, tuple(overrides or ()))
     if node not in (*deployment.nodes, "router"):
@@ -46,7 +46,7 @@ def _ask(
         prefix = OPERATOR_QUERY
         try:
             list(ask(session, deployment.robot, node, "params", {}, 2.0, prefix))
-        except NoAnswer:  # the node runs on another host, which decides what may be set from here
+        except NoQueryAnswer:  # the node runs on another host, which decides what may be set from here
             prefix = QUERY
         except UserError:  # of the router, which has no options
             pass

@@ -8,6 +8,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Annotated, Any, Protocol
@@ -23,6 +24,7 @@ from beamsplat.tools.cli.options import writable
 
 if TYPE_CHECKING:
     from beamsplat.tools.system.health_table import HealthTable
+    from beamsplat.tools.system.run_summary import RunSummary
     from beamsplat.tools.system.supervisor import Supervisor
 
 FileArgument = Annotated[Path, typer.Argument(help="Deployment file (TOML), for example deploy/demo.toml")]
@@ -95,7 +97,13 @@ def run(
     deployment = _load(file, [*memory_overrides(memory), *(set_ or ())])
     if rate is not None:
         deployment = deployment.model_copy(update={"rate": rate})
-    run_checked(deployment, tuple(nodes) if nodes else None)
+    run_checked(deployment, tuple(nodes) if nodes else None).check_useful()
+
+
+def show_summary(summary: RunSummary) -> None:
+    """Print what a run has refused, dropped and lost."""
+    for line in summary.lines():
+        _say(line)
 
 
 class RunMonitor(Protocol):
@@ -152,8 +160,10 @@ def run_checked(
     deployment: Deployment,
     names: tuple[str, ...] | None = None,
     monitor: Callable[[Supervisor], RunMonitor] | None = None,
-) -> None:
+) -> RunSummary:
     """Run processes until all have drained, or Ctrl-C. Nodes that cannot run are tried again, and left out.
+
+    At the end it prints, and returns, what was refused, dropped and lost.
 
     Args:
         names: nodes to run, and `router`; None runs all.
@@ -172,6 +182,7 @@ def run_checked(
     from beamsplat.tools.system.commands import Commands
     from beamsplat.tools.system.failure_reports import FailureReports
     from beamsplat.tools.system.health_table import HealthTable
+    from beamsplat.tools.system.run_summary import RunSummary
     from beamsplat.tools.system.supervisor import ROUTER, Supervisor
 
     for number in (signal.SIGTERM, signal.SIGHUP):  # stop the children in order, as Ctrl-C does
@@ -202,6 +213,10 @@ def run_checked(
                     drained = bool(nodes) and all(states.get(c.name) == "drained" for c in nodes)
             if observer is not None:
                 observer.finish(board, drained)
+            failed = {c.name: c.failed for c in supervisor.children.values() if c.failed}
+            summary = RunSummary.of_records(board.records, failed)
+    show_summary(summary)
+    return summary if drained else replace(summary, missing=())  # what was stopped may have begun just now
 
 
 def serve(
@@ -252,6 +267,7 @@ def offline(
     Example: beamsplat offline deploy/demo.toml --data drive/bag --out out/
     """
     from beamsplat.tools.system.offline import OUTSIDE, run_offline
+    from beamsplat.tools.system.run_summary import RunSummary
 
     deployment = _load(file, set_)
     nodes = {name: table for name, table in deployment.nodes.items() if name not in OUTSIDE}
@@ -264,6 +280,9 @@ def offline(
     else:
         console.print(f"{summary['messages']} messages in {summary['wall_s']:.1f} s, SHA-256 "
                       f"{summary['sha256'][:16]}..., in {out}", soft_wrap=True)  # fmt: skip
+    end = RunSummary(summary["refused"], tuple(summary["missing"]))
+    show_summary(end)
+    end.check_useful()
 
 
 def record(

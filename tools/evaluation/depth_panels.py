@@ -22,8 +22,8 @@ _SIGMA_RANGE_M = (0.005, 2.0)  # colour range of sigma
 
 def draw_depth_panels(
     drive: RecordedDrive, source: DepthSource, truth: Path | None, every: int, out: Path, floor: bool | None
-) -> Iterator[tuple[Path, int]]:
-    """Write a panel of every n-th image as PNG; yield (path of the panel, total number of panels) for each.
+) -> Iterator[tuple[str, int]]:
+    """Write a panel of every n-th image as PNG; yield (status of its depth, number of panels) for each.
 
     Args:
         truth: folder of true depth; only images with a true depth are then used. None: no true depth.
@@ -37,7 +37,7 @@ def draw_depth_panels(
     for outcome in replay_depth(drive, source, wanted, floor=floor):
         path = out / f"{outcome.stamp_ns}.png"
         cv2.imwrite(str(path), depth_panel(outcome, drive))
-        yield path, len(wanted)
+        yield outcome.methods["field"].status, len(wanted)
 
 
 def depth_panel(outcome: DepthComparison, drive: RecordedDrive) -> np.ndarray:

@@ -20,6 +20,7 @@ from beamsplat.common.runtime.mailbox import Envelope
 from beamsplat.common.runtime.registry import Service
 from beamsplat.services.nodes import NODES
 from beamsplat.tools.system.assembly import build_node
+from beamsplat.tools.system.run_summary import RunSummary
 
 # Not part of a lockstep run: it records by itself and has no viewers.
 OUTSIDE = ("monitor", "page", "recorder")
@@ -74,6 +75,7 @@ def run_offline(
                 progress.advance(task)
 
         mailboxes = Lockstep(nodes, on_message).run()
+    end = RunSummary.of_lockstep(nodes, mailboxes, digest.counts)
     summary = {
         "sha256": digest.hexdigest(),
         "messages": sum(digest.counts.values()),
@@ -82,6 +84,8 @@ def run_offline(
             node: {name: count.dropped for name, count in mailbox.counts.items() if count.dropped}
             for node, mailbox in mailboxes.items()
         },
+        "refused": end.losses,
+        "missing": list(end.missing),
         "wall_s": time.perf_counter() - started,
     }
     write_atomically(out / "summary.json", json.dumps(summary, indent=1).encode())

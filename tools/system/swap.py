@@ -13,7 +13,7 @@ from typing import Any
 import zenoh
 
 from beamsplat.common.errors import UserError
-from beamsplat.common.zenoh.queries import NoAnswer, command
+from beamsplat.common.zenoh.queries import NoQueryAnswer, command
 from beamsplat.tools.system.supervisor import Successor, Supervisor
 
 log = logging.getLogger("beamsplat")
@@ -128,7 +128,7 @@ class Swap:
         """
         try:
             said = yield self._ask(instance, "reached", {}, 0.5)
-        except NoAnswer:
+        except NoQueryAnswer:
             return None
         stamps = _table("reached", said)
         if not all(isinstance(stamp_ns, int) for stamp_ns in stamps.values()):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import resource
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,11 +13,12 @@ from typing import Any
 
 import numpy as np
 
-from beamsplat.common.errors import UserError
+from beamsplat.common.errors import NothingUseful
 from beamsplat.common.files.persist import make_folder
 from beamsplat.common.geometry.trajectory import Trajectory, write_tum
 from beamsplat.common.geometry.transforms import se2_to_se3
 from beamsplat.common.runtime.stamp_merger import StampMerger
+from beamsplat.common.status import general_reason
 from beamsplat.services.localization.lidar2d import se2
 from beamsplat.services.localization.lidar2d.job_runner import JobRunner
 from beamsplat.services.localization.lidar2d.occupancy import save_nav2
@@ -49,12 +51,13 @@ def map_measurements(
     Their results are applied at the scans where they are due, exactly as in the live node.
 
     Raises:
-        UserError: there was no usable scan.
+        NothingUseful: there was no usable scan.
     """
     slam = LidarSlam(settings or LidarSlamSettings(), log.T_body_lidar)
     wall, cpu = time.perf_counter(), time.process_time()
     steps_ms: list[float] = []
     statuses: dict[str, int] = {}
+    refused: Counter[str] = Counter()
     with JobRunner(slam, threaded=True) as jobs:
         for kind, *values in _merged(log):
             if kind == "odometry":
@@ -67,10 +70,12 @@ def map_measurements(
             jobs.after_scan(result)
             status = result.status.partition(":")[0]
             statuses[status] = statuses.get(status, 0) + 1
+            if status != "ok":
+                refused[general_reason(result.status)] += 1
         jobs.finish()
     cpu_s, wall_s = time.process_time() - cpu, time.perf_counter() - wall
     if slam.record.count == 0:
-        raise UserError(f"no scan could be used: {statuses or 'the recording has none'}")
+        raise NothingUseful(f"no scan could be used: {dict(refused) or 'the recording has none'}")
     _write(slam, out, resolution_m)
     figures = {
         "scans": len(steps_ms),
@@ -83,6 +88,7 @@ def map_measurements(
         "loop_closures": slam.pose_graph.loop_closures,
         "odometry_refused": slam.local_builder.odometry.rejected,
         **{f"scans_{status}": count for status, count in statuses.items()},
+        "refused": dict(refused),
         "T_body_lidar": se2.from_matrix(log.T_body_lidar).tolist(),
     }
     (out / "figures.json").write_text(json.dumps(figures, indent=1))
