@@ -44,6 +44,7 @@ log = logging.getLogger("beamsplat.keyframes")
 
 _SCHEMA = schema_of(Keyframe)
 _IMAGES = 64  # kept until their depth arrives: 6 s at 10 Hz
+_CLOCK_STEP_NS = 600_000_000_000  # a larger step between the stamps of two images is not a duration
 _BEAMS_NS = 120_000_000  # poses up to this long after an image place the scan around it (10 Hz lidars)
 _BEAMS_PATIENCE_NS = 400_000_000  # the scan of a 5 Hz lidar is complete by then
 
@@ -107,9 +108,11 @@ class KeyframesNode(Node):
             self.live_settings.run_dir / "keyframes" if c.durable and self.live_settings is not None else None
         )
         self._outbox = Outbox(round(c.queue_mb * 1e6), round(c.retry_s * 1e9), c.window, folder)
-        self._now_ns = 0  # image time
+        self._now_ns = 0  # time that has passed in image stamps, without steps of the clock
+        self._newest_ns = 0  # stamp of the newest image
         self._sent = self._sent_again = 0
-        self._rejected: set[int] = set()
+        self._rejected = 0
+        self._rejected_ids: deque[int] = deque(maxlen=_IMAGES)  # the mapper may reject a keyframe twice
         if self._outbox.of_earlier_drives:
             log.info(
                 "%d unacknowledged keyframes of earlier drives are in %s",
@@ -189,7 +192,9 @@ class KeyframesNode(Node):
     def on_camera_image(self, image: Image) -> Outputs:
         """Store the image until its depth is received; publish unacknowledged keyframes again when due."""
         self._images.append(image)
-        self._now_ns = max(self._now_ns, image.stamp_ns)
+        step_ns, self._newest_ns = image.stamp_ns - self._newest_ns, image.stamp_ns
+        if 0 <= step_ns < _CLOCK_STEP_NS:
+            self._now_ns += step_ns
         yield from self._resend_due()
 
     def _resend_due(self) -> Outputs:
@@ -249,8 +254,9 @@ class KeyframesNode(Node):
     def on_keyframes_ack(self, ack: KeyframeAck) -> Outputs:
         """Remove an acknowledged keyframe from the outbox, whether the mapper accepted or rejected it."""
         self._outbox.acknowledge(ack.id, self._now_ns)
-        if ack.status != "ok":
-            self._rejected.add(ack.id)
+        if ack.status != "ok" and ack.id not in self._rejected_ids:
+            self._rejected += 1
+            self._rejected_ids.append(ack.id)
         yield from self._resend_due()
         self._update_detail()
 
@@ -313,9 +319,11 @@ class KeyframesNode(Node):
     def _update_detail(self) -> None:
         o = self._outbox
         counts = {
-            "sent again": self._sent_again, "refused": len(self._rejected), "dropped": o.dropped,
+            "sent again": self._sent_again, "refused": self._rejected, "dropped": o.dropped,
             "not on disk": o.not_on_disk, "corrupt": o.corrupt, "of earlier drives": o.of_earlier_drives,
         }  # fmt: skip
+        self.rejections.set("keyframes dropped: the outbox was full", o.dropped)
+        self.rejections.set("keyframes in the outbox are corrupt", o.corrupt)
         text = "".join(f", {count} {what}" for what, count in counts.items() if count)
         text += f", NOT DURABLE: {o.disk_fault}" if o.disk_fault else ""
         self.detail = f"{self._sent} keyframes, {len(o)} not acknowledged{text}"
