@@ -114,6 +114,8 @@ class MappingNode(Node):
             self._session = LiveSession(
                 self.config, self._intake, resume_known=self.in_standby, report=self._report_progress
             )
+            keyframes = len(self._intake.stored())
+            self.detail = f"resumed with {keyframes} keyframes" if keyframes else ""
 
     def _report_progress(self, text: str) -> None:
         """Show the progress of opening the session; end it if the process must stop."""
