@@ -35,6 +35,12 @@ class Rejections:
                 entry = (topic, OTHER)
             self._counts[entry] += 1
 
+    def set(self, reason: str, count: int) -> None:
+        """Set the number of inputs that were refused for a reason without numbers, counted elsewhere."""
+        if count:
+            with self._lock:
+                self._counts["", reason] = count
+
     def add_status(self, topic: str, message: Message) -> None:
         """Count a published message whose status is not "ok"."""
         status = getattr(message, "status", "ok") if topic in WITH_STATUS else "ok"

@@ -95,6 +95,7 @@ class DepthNode(Node):
 
     def _count_overtaken(self) -> None:
         self.overtaken += 1
+        self.rejections.set("images overtaken by newer ones", self.overtaken)
         self.detail = f"{self.overtaken} images overtaken"
 
     def _estimate_waiting(self) -> Outputs:

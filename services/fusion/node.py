@@ -187,6 +187,7 @@ class FusionNode(Node):
 
     def _update_detail(self) -> None:
         """Update the health detail: dropped (overtaken) estimates, scans without a pose, the calibration."""
+        self.rejections.set("estimates overtaken by newer ones", self.overtaken)
         overtaken = f"{self.overtaken} estimates overtaken" if self.overtaken else ""
         expired = self._history.expired if self._fusion is not None else 0
         without_pose = f"{expired} scans without a pose" if expired else ""

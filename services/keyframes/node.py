@@ -324,6 +324,8 @@ class KeyframesNode(Node):
         }  # fmt: skip
         self.rejections.set("keyframes dropped: the outbox was full", o.dropped)
         self.rejections.set("keyframes in the outbox are corrupt", o.corrupt)
+        self.rejections.set("keyframes dropped: the outbox was full", o.dropped)
+        self.rejections.set("keyframes in the outbox are corrupt", o.corrupt)
         text = "".join(f", {count} {what}" for what, count in counts.items() if count)
         text += f", NOT DURABLE: {o.disk_fault}" if o.disk_fault else ""
         self.detail = f"{self._sent} keyframes, {len(o)} not acknowledged{text}"

@@ -74,6 +74,9 @@ class Ros2Node(Node):
             yield from self._process(sample) or (None,)
             lost = f"; {self._dropped} dropped" if self._dropped else ""
             self.detail = f"{self.robot.status}{lost}"
+            self.rejections.set("messages dropped, the queue was full", self._dropped)
+            for topic, count in self.robot.rejected.items():
+                self.rejections.set(f"{topic}: messages not usable", count)
 
     def close(self) -> None:
         if hasattr(self, "_session"):

@@ -101,6 +101,9 @@ def test_reasons_are_bounded_and_have_no_numbers():
     assert len(report) <= MOST_REASONS + 1
     assert sum(entry.count for entry in report) == 1003
     assert any(entry.reason == OTHER for entry in report)
+    for total in (0, 4, 7):
+        rejections.set("images overtaken", total)
+    assert [entry.count for entry in rejections.report() if entry.reason == "images overtaken"] == [7]
 
 
 def test_counts_of_a_process_that_was_restarted_or_failed_stay():
