@@ -117,6 +117,8 @@ class ExternalPose(Message):
 class Odometry(Message):
     """Smooth pose `T_odom_body` at the stamp, with the covariance of (x, y, yaw) in m and rad.
 
+    The lidar SLAM states the covariance of the motion over the last second, as the pose drifts without bound.
+
     If `metric` is False the scale of the translation is unknown: monocular odometry without a metric
     reference.
     """
