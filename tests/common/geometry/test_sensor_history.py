@@ -131,3 +131,19 @@ def test_memory_is_bounded():
         history.add_scan(_scan(i * S // 10, beams=8))
     assert len(history._poses) <= 12
     assert len(history._scans) <= 12
+
+
+@pytest.mark.parametrize("complete_only", [True, False])
+@pytest.mark.parametrize(
+    "stamp_of",
+    [lambda i: i * S // 10, lambda i: 5 * S, lambda i: 4000 * S - i * S // 10, lambda i: i % 2 * 10**18],
+    ids=["without poses", "the clock stands still", "the clock runs backwards", "the clock jumps"],
+)
+def test_an_hour_of_scans_without_poses_takes_bounded_memory(stamp_of, complete_only):
+    history = SensorHistory(np.eye(4), complete_only=complete_only)
+    ranges = np.ones(4, np.float32)
+    for i in range(36_000):
+        history.add_scan(TimedScan(stamp_of(i), 0.0, 0.1, 0.001, 0.1, 30.0, ranges))
+    assert len(history._incomplete) + len(history._scans) <= 256
+    if complete_only:
+        assert history.expired == 36_000 - len(history._incomplete)

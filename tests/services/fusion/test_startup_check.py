@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from beamsplat.common.geometry.transforms import inverse, se2_to_se3, so3_exp, transform_points
-from beamsplat.services.fusion.calibration.motion import apply_correction
+from beamsplat.services.fusion.calibration.motion import TrackedPair, apply_correction
 from beamsplat.services.fusion.calibration.startup_check import StartupCheck, check_calibration
 from tests.services.fusion.room import CAMERA, LIDAR_Z, T_BODY_CAMERA, render, scan
 from tests.services.fusion.test_calibration import MOUNT, _drive, _pose
@@ -102,3 +102,13 @@ def test_a_clock_that_is_set_back_starts_the_check_anew():
     started.add_pose(5, np.eye(4))
     assert started.job() is None
     assert "0 of 4" in started.progress
+
+
+def test_poses_are_bounded_while_too_few_images_can_be_used():
+    check = StartupCheck(CAMERA, MOUNT, T_BODY_LIDAR)
+    rays = np.ones((20, 3))
+    check._pairs.append(TrackedPair(0, 10**9, rays, rays))  # then the robot stands still
+    for i in range(36_000):  # an hour
+        check.add_pose(i * 10**8, np.eye(4))
+    assert len(check._poses) == len(check._stamps) <= 12_000
+    assert not check._pairs  # there are no poses of its time any more
