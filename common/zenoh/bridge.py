@@ -1,4 +1,4 @@
-"""Bridge between a robot and its edge server: forwards samples between Zenoh sessions without decoding them.
+"""Bridge between a robot and its edge server: forwards samples between Zenoh sessions, payloads unchanged.
 
 The column `uplink` of the topic table selects the topics that are forwarded, and the direction. All other
 topics stay on their host: no subscription on the other side can request them over a slow radio link. Small
@@ -16,11 +16,19 @@ from dataclasses import dataclass, replace
 import zenoh
 
 from beamsplat.common.messages import Health
+from beamsplat.common.messages.header import DecodeError
 from beamsplat.common.runtime.pacing import TokenBucket
+from beamsplat.common.runtime.rate_limited_log import RateLimitedLog
 from beamsplat.common.topics import HEALTH, TOPICS, Topic
 from beamsplat.common.zenoh.bus import key
 from beamsplat.common.zenoh.receiving import receive_in_thread
-from beamsplat.common.zenoh.streams import FIFO_MESSAGES, declare_publication, declare_subscription
+from beamsplat.common.zenoh.streams import (
+    FIFO_MESSAGES,
+    declare_publication,
+    declare_subscription,
+    decode_end_marker,
+    decode_header,
+)
 
 log = logging.getLogger(__name__)
 
@@ -54,7 +62,9 @@ class Bridge:
         self._robot = robot
         self._bulk_replaced = threading.Event()  # set: a later session forwards the large messages
         self.forwarded: dict[str, ForwardedTraffic] = {}  # by topic; "health" is all nodes of both sides
-        self.ended: set[str] = set()  # topics whose end-of-stream marker was forwarded
+        self._ends: dict[str, tuple[str, int]] = {}  # topic -> instance that ended it, number of its messages
+        self.undecodable = 0  # samples without a valid header or too large, which are not forwarded
+        self._undecodable_limit = RateLimitedLog()
         self.interrupted = 0  # messages lost because the connection broke while they were written
         self.health_dropped = 0  # health reports beyond _HEALTH_MAX_HZ
         for row in TOPICS.values():
@@ -73,6 +83,11 @@ class Bridge:
         for row in TOPICS.values():
             if row.uplink == "bulk":
                 self._forward_topic(row, sessions)
+
+    @property
+    def ended(self) -> set[str]:
+        """Topics whose end-of-stream marker was forwarded, and on which no message has followed it."""
+        return set(self._ends)
 
     def forwarded_up(self) -> dict[str, ForwardedTraffic]:
         """Return the numbers of messages and bytes forwarded from robot to edge server, by topic name."""
@@ -96,13 +111,22 @@ class Bridge:
             congestion=zenoh.CongestionControl.BLOCK_FIRST if large else zenoh.CongestionControl.DROP,
             priority=zenoh.Priority.DATA_LOW if large else zenoh.Priority.INTERACTIVE_HIGH,
         )  # fmt: skip
-        self._forward(source, row.name, row, lambda sample: _put(publisher, sample), row.name)
+
+        def send(sample: zenoh.Sample) -> None:
+            header = decode_header(sample, row)
+            _put(publisher, sample)
+            ended_by, sent = self._ends.get(row.name, ("", 0))
+            if ended_by and (header.instance != ended_by or header.sequence >= sent):
+                self._ends.pop(row.name, None)  # not a recovered message: a new process publishes
+
+        self._forward(source, row.name, row, send, row.name)
         end = replace(row, delivery="latched", cache=1)
         end_publisher = declare_publication(target, key(self._robot, "end", row.name), end)
 
         def send_end(sample: zenoh.Sample) -> None:
+            header, sent = decode_end_marker(sample)
             _put(end_publisher, sample)
-            self.ended.add(row.name)
+            self._ends[row.name] = (header.instance, sent)
 
         self._forward(source, f"end/{row.name}", end, send_end, None)
 
@@ -110,6 +134,7 @@ class Bridge:
         bucket = TokenBucket(_HEALTH_MAX_HZ)
 
         def send(sample: zenoh.Sample) -> None:
+            decode_header(sample, _HEALTH_ROW)
             if not bucket.take():
                 self.health_dropped += 1
                 return
@@ -144,6 +169,11 @@ class Bridge:
         def forward(sample: zenoh.Sample) -> None:
             try:
                 send(sample)
+            except DecodeError as error:
+                self.undecodable += 1
+                if (more := self._undecodable_limit.due(topic_key)) is not None:
+                    log.warning("%s: not forwarded (%d more): %s", topic_key, more, error)
+                return
             except zenoh.ZError as error:  # the connection broke, or the session was closed
                 self.interrupted += 1
                 log.info("a message on %s was not forwarded: %s", topic_key, error)

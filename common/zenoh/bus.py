@@ -39,7 +39,13 @@ from beamsplat.common.security.keys import NO_SECURITY, HostKeys, SecurityConfig
 from beamsplat.common.security.logins import Login, require_logins
 from beamsplat.common.topics import HEALTH, LIMIT_KB, Topic, topic
 from beamsplat.common.zenoh.receiving import receive_in_thread
-from beamsplat.common.zenoh.streams import Producer, Publication, Subscription, decode_sample
+from beamsplat.common.zenoh.streams import (
+    Producer,
+    Publication,
+    Subscription,
+    decode_end_marker,
+    decode_sample,
+)
 
 ROOT = "beamsplat"
 # Kernel send buffers of a link. Small messages: 13 ms of delay at 20 Mbit/s. Large messages: at least rate x
@@ -191,22 +197,6 @@ def _short(error: zenoh.ZError) -> str:
     return str(error).split(" at ")[0][:120]
 
 
-def _end_marker(sample: zenoh.Sample) -> tuple[Header, int]:
-    """Return header and content (number of sent messages) of an end-of-stream marker.
-
-    Raises:
-        DecodeError: no valid header, or the content is not a number of messages.
-    """
-    header = Header.unpack(sample.attachment.to_bytes() if sample.attachment else b"")
-    try:
-        sent = msgpack.unpackb(sample.payload.to_bytes(), max_array_len=0, max_map_len=0)
-    except (ValueError, msgpack.UnpackException) as error:
-        raise DecodeError(str(error)) from error
-    if type(sent) is not int or sent < 0:
-        raise DecodeError(f"{str(sent)[:40]!r} is not a number of messages")
-    return header, sent
-
-
 def _verb_of(query: zenoh.Query) -> str:
     return str(query.key_expr).rpartition("/")[2]
 
@@ -268,7 +258,7 @@ class Bus:
 
         def handle(sample: zenoh.Sample) -> None:
             try:
-                header, sent = _end_marker(sample)
+                header, sent = decode_end_marker(sample)
             except DecodeError as error:
                 on_undecodable(entry.topic, f"end marker: {error}")
             else:

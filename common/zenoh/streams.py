@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import msgpack
 import zenoh
 import zenoh.ext
 
@@ -176,19 +177,45 @@ class Subscription:
             self._on_envelope(envelope)
 
 
+def decode_header(sample: zenoh.Sample, row: Topic) -> Header:
+    """Return the header of a Zenoh sample received on the topic `row`; the payload is not decoded.
+
+    Raises:
+        DecodeError: no valid header, or a payload above the limit of the topic.
+    """
+    if sample.attachment is None:
+        raise DecodeError("sample without a header")
+    header = Header.unpack(sample.attachment.to_bytes())
+    if len(sample.payload) > row.limit_kb * 1000:
+        size, most = len(sample.payload) / 1e6, row.limit_kb / 1e3
+        raise DecodeError(f"{size:.1f} MB on {row.name}, the limit is {most:g} MB (common/topics.py)")
+    return header
+
+
+def decode_end_marker(sample: zenoh.Sample) -> tuple[Header, int]:
+    """Return header and content (number of sent messages) of an end-of-stream marker.
+
+    Raises:
+        DecodeError: no valid header, or the content is not a number of messages.
+    """
+    header = Header.unpack(sample.attachment.to_bytes() if sample.attachment else b"")
+    try:
+        sent = msgpack.unpackb(sample.payload.to_bytes(), max_array_len=0, max_map_len=0)
+    except (ValueError, msgpack.UnpackException) as error:
+        raise DecodeError(str(error)) from error
+    if type(sent) is not int or sent < 0:
+        raise DecodeError(f"{str(sent)[:40]!r} is not a number of messages")
+    return header, sent
+
+
 def decode_sample(sample: zenoh.Sample, row: Topic) -> Envelope:
     """Decode a Zenoh sample received on the topic `row`, and return it as an envelope.
 
     Raises:
         DecodeError: no header, too large, the schema of another message, or an undecodable payload.
     """
-    if sample.attachment is None:
-        raise DecodeError("sample without a header")
-    header = Header.unpack(sample.attachment.to_bytes())
+    header = decode_header(sample, row)
     schema = str(sample.encoding).partition(";")[2]
-    if len(sample.payload) > row.limit_kb * 1000:
-        size, most = len(sample.payload) / 1e6, row.limit_kb / 1e3
-        raise DecodeError(f"{size:.1f} MB on {row.name}, the limit is {most:g} MB (common/topics.py)")
     payload = sample.payload.to_bytes()
     message = decode(schema, payload)
     if type(message) is not row.message:

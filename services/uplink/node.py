@@ -164,6 +164,8 @@ class UplinkNode(Node):
             if self._connected.health_dropped
             else ""
         )
+        if self._connected.undecodable:
+            cuts += f", {self._connected.undecodable} messages without a valid header not forwarded"
         self.detail = (
             f"{state} ({self.config.edge}){cuts}: {sum(c.messages for c in up)} messages, "
             f"{sum(c.bytes for c in up) / 1e6:.1f} MB"

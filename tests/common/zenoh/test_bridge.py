@@ -122,3 +122,29 @@ def test_another_robots_topics_do_not_cross(sides):
     wait_until(own_crossed)
     assert received == []
     kept.undeclare()
+
+
+def test_garbage_neither_crosses_nor_ends_a_topic(sides):
+    robot, edge, bridge, _ = sides
+    kept = robot.open()
+    garbage = {"end/tick": 0, "tick": 0, "health/producer": 0}
+
+    def all_refused():
+        for name in garbage:
+            kept.put(f"beamsplat/r1/{name}", b"rubbish")
+            kept.put(f"beamsplat/r1/{name}", b"rubbish", attachment=b"BS")
+        return bridge.undecodable >= 3 * len(garbage)
+
+    wait_until(all_refused)
+    assert bridge.ended == set()
+    assert bridge.forwarded["tick"].messages == 0
+    wait_until(lambda: robot.publish(["tick"]) or edge.crossed == {"tick"})
+
+
+def test_a_topic_is_not_ended_any_more_when_a_new_process_publishes_on_it(sides):
+    robot, _, bridge, _ = sides
+    robot.publish(["tick"])
+    robot.bus.end(robot.publications["tick"])
+    wait_until(lambda: bridge.ended == {"tick"})
+    successor = Bus(robot.open(), "r1", "producer", "cc" * 8, 2).publish("tick")
+    wait_until(lambda: successor.put(SAMPLES[TOPICS["tick"].message]) and not bridge.ended)
