@@ -281,7 +281,12 @@ class KeyframesNode(Node):
         if image is None:
             log.warning("a keyframe is lost: its image arrived more than %d images ago", _IMAGES)
             return
-        frame = self._keyframe(image, depth, self._reasons.pop(depth.stamp_ns, ""))
+        try:
+            frame = self._keyframe(image, depth, self._reasons.pop(depth.stamp_ns, ""))
+        except ValueError as error:  # the image is damaged, or the depth has another size
+            log.warning("a keyframe is lost: %s", error)
+            self.rejections.add("keyframes cannot be made of their image or depth")
+            return
         T_map_camera = frame.T_map_anchor @ frame.T_anchor_body @ frame.camera.T_body_camera
         units = (self.config.distance_m, self.config.angle_rad)
         view = np.concatenate([T_map_camera[:3, 3] / units[0], T_map_camera[:3, 2] / units[1]])
@@ -322,8 +327,6 @@ class KeyframesNode(Node):
             "sent again": self._sent_again, "refused": self._rejected, "dropped": o.dropped,
             "not on disk": o.not_on_disk, "corrupt": o.corrupt, "of earlier drives": o.of_earlier_drives,
         }  # fmt: skip
-        self.rejections.set("keyframes dropped: the outbox was full", o.dropped)
-        self.rejections.set("keyframes in the outbox are corrupt", o.corrupt)
         self.rejections.set("keyframes dropped: the outbox was full", o.dropped)
         self.rejections.set("keyframes in the outbox are corrupt", o.corrupt)
         text = "".join(f", {count} {what}" for what, count in counts.items() if count)
