@@ -190,7 +190,8 @@ def _node(name: str, record: NodeRecord, now: float) -> dict[str, Any]:
         "silent_s": round(silent_s or 0.0), "detail": health.detail,
         "in_hz": round(totals.in_hz, 1), "out_hz": round(totals.out_hz, 1), "age_ms": round(totals.age_ms, 1),
         "step_ms": round(health.step_p50_ms, 1), "p95_ms": round(health.step_p95_ms, 1),
-        "dropped": totals.dropped, "lost": totals.lost, "late": totals.late, "bad": totals.bad + record.refused,
+        "dropped": totals.dropped, "lost": totals.lost, "late": totals.late,
+        "bad": totals.bad + record.refused,
         "rss_mb": round(health.rss_mb), "cpu_percent": round(health.cpu_percent),
     }  # fmt: skip
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 import tempfile
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Generator
 from pathlib import Path
 from typing import ClassVar
 
@@ -43,7 +43,8 @@ class _DirectoryReader(DirectoryReader):
 
     def messages(
         self, connections: Collection[Connection], start: int | None = None, stop: int | None = None
-    ) -> Iterator[tuple[Connection, int, bytes]]:  # type: ignore[override]  # an iterator is all that is used
+    ) -> Generator[tuple[Connection, int, bytes], None, None]:
+        """Yield (connection, time in ns, message) as the base class does, decompressed with a limit."""
         for connection, at_ns, data in super().messages(connections, start, stop):
             yield connection, at_ns, decompress(data, "zstd") if self._by_message else data
 
@@ -51,7 +52,7 @@ class _DirectoryReader(DirectoryReader):
 class BoundedReader2(Reader2):
     """Reader of ROS 2 bags; a message that expands too far raises ValueError when it is read."""
 
-    STORAGE_PLUGINS: ClassVar = {**Reader2.STORAGE_PLUGINS, "dir": _DirectoryReader}
+    STORAGE_PLUGINS: ClassVar = {**Reader2.STORAGE_PLUGINS, "dir": _DirectoryReader}  # type: ignore[misc]
 
 
 def decompress_bag(files: list[Path], target: Path) -> list[Path]:

@@ -6,7 +6,6 @@ from beamsplat.common.messages import Health, InputHealth, OutputHealth
 from beamsplat.common.messages.instances import ProcessId, process_of
 from beamsplat.common.runtime.health import STALE_S, HealthRecords
 
-
 FIRST, SECOND = (process_of(b"seed", "localization", epoch) for epoch in (1, 2))
 
 

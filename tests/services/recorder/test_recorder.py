@@ -11,9 +11,9 @@ from beamsplat.common.messages import Health, Tick
 from beamsplat.common.messages.header import Header
 from beamsplat.common.recording import RecordingReader
 from beamsplat.common.topics import TOPICS
+from beamsplat.services.recorder import node as recorder_node
 from beamsplat.services.recorder.arrival import ArrivalClock
 from beamsplat.services.recorder.config import RecorderConfig
-from beamsplat.services.recorder import node as recorder_node
 from beamsplat.services.recorder.node import RecorderNode
 from tests.common.files.small_disk import SmallDisk
 from tests.common.messages.random_messages import assert_same, random_message
