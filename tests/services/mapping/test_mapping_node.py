@@ -170,10 +170,10 @@ NAN = np.full((r.HEIGHT, r.WIDTH), np.nan, np.float32)
         ({"depth_png": depth_to_png(NAN)}, "no pixel has a depth"),
         ({"mask_png": mask_to_png(np.zeros((r.HEIGHT, r.WIDTH), bool))}, "the mask leaves no pixel"),
         ({"T_anchor_body": make_transform(np.eye(3), np.array([5e3, 0.0, 0.0]))}, "5000 m from its anchor"),
-        ({"depth_png": np.arange(9, dtype=np.uint8)}, "depth: expected a PNG"),
-        ({"depth_png": depth_to_png(NAN[:9, :9])}, "depth and sigma must be [120, 160]"),
+        ({"depth_png": np.arange(9, dtype=np.uint8)}, "depth: the image's 9 bytes do not decode as png"),
+        ({"depth_png": depth_to_png(NAN[:9, :9])}, "depth: the image is 9x9, not 160x120"),
         ({"picture": np.zeros(0, np.uint8)}, "do not decode as png"),
-        ({"mask_png": mask_to_png(np.ones((7, 7), bool))}, "the mask leaves no pixel"),
+        ({"mask_png": mask_to_png(np.ones((7, 7), bool))}, "mask: the image is 7x7, not 160x120"),
     ],
 )
 def test_invalid_keyframes_are_refused_with_a_reason_and_without_effect(node, change, words):
