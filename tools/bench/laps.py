@@ -59,7 +59,7 @@ def lap_deployment(data: Path, out: Path, endpoint: str) -> Deployment:
 def bench_laps(data: Path | None, minutes: float, out: Path, endpoint: str, log: Log) -> dict[str, Any]:
     """Run the whole system on laps for `minutes` and sample its processes every `EVERY_S`.
 
-    Writes samples.csv, report.html and report.json into `out`.
+    Writes samples.csv, report.html and report.json into `out`, also of a run that Ctrl-C ends early.
 
     Args:
         data: recording to play in a loop; None: one simulated lap, made in `out` at the first run.
@@ -80,23 +80,24 @@ def bench_laps(data: Path | None, minutes: float, out: Path, endpoint: str, log:
         Supervisor(deployment, on_event=log) as supervisor,
         open_session(deployment.router.listen) as session,
     ):
-        table, began = HealthTable(session, deployment.robot), time.monotonic()
-        next_log = began
-        while (now := time.monotonic()) < began + minutes * 60.0:
-            pids = {name: c.process.pid for name, c in supervisor.children.items()}
-            samples.take(now - began, {name: pid for name, pid in pids.items() if pid is not None})
-            detail = table.records["mapping"].health.detail if "mapping" in table.records else ""
-            sizes.append(MapSize(now - began, _size_mb(checkpoint), _gaussians(detail)))
-            if now >= next_log:
-                next_log = now + 60.0
-                log(f"{(now - began) / 60.0:.0f} min: {table.status_line()}")
-            while time.monotonic() < now + EVERY_S:
-                supervisor.poll()
-                time.sleep(0.2)
+        table, began, detail = HealthTable(session, deployment.robot), time.monotonic(), ""
+        next_log = now = began
+        with contextlib.suppress(KeyboardInterrupt):
+            while (now := time.monotonic()) < began + minutes * 60.0:
+                pids = {name: c.process.pid for name, c in supervisor.children.items()}
+                samples.take(now - began, {name: pid for name, pid in pids.items() if pid is not None})
+                detail = table.records["mapping"].health.detail if "mapping" in table.records else ""
+                sizes.append(MapSize(now - began, _size_mb(checkpoint), _gaussians(detail)))
+                if now >= next_log:
+                    next_log = now + 60.0
+                    log(f"{(now - began) / 60.0:.0f} min: {table.status_line()}")
+                while time.monotonic() < now + EVERY_S:
+                    supervisor.poll()
+                    time.sleep(0.2)
         restarts = {name: child.restarts for name, child in supervisor.children.items() if child.restarts}
         states = table.states()
     report: dict[str, Any] = {
-        "minutes": minutes, "mapping": detail, "processes": _figures(samples, sizes),
+        "minutes": (now - began) / 60.0, "mapping": detail, "processes": _figures(samples, sizes),
         "map": {key: _quarters(sizes, key) for key in ("lidar_mb", "gaussians")},
         "findings": [f"{name} was restarted {n} times" for name, n in restarts.items()]
         + [f"{name} is {state} at the end" for name, state in states.items() if state != "active"],

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -23,6 +24,12 @@ def _say(text: str) -> None:
     console.print(text, markup=False, highlight=False, soft_wrap=True)
 
 
+def _stop_in_order() -> None:
+    """Let SIGTERM and SIGHUP end a run as Ctrl-C does, so that no process of it is left behind."""
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.default_int_handler)
+
+
 def bench_laps(
     minutes: Annotated[float, typer.Option(min=0.5, max=10_000.0, help="Length of the run")] = 60.0,
     data: DataOption = None,
@@ -40,6 +47,7 @@ def bench_laps(
     """
     from beamsplat.tools.bench.laps import bench_laps as run
 
+    _stop_in_order()
     report = run(data, minutes, out, f"tcp/127.0.0.1:{port}", _say)
     if as_json:
         print(json.dumps(report))
@@ -92,6 +100,7 @@ def bench_faults(
     """
     from beamsplat.tools.bench.faults.campaign import bench_faults as run
 
+    _stop_in_order()
     report = run(data, minutes, seed, out, rate, _say)
     if as_json:
         print(json.dumps(report))

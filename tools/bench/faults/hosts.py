@@ -102,13 +102,13 @@ class CampaignHost:
             )  # fmt: skip
 
     def stop(self) -> float | None:
-        """Stop the system as with Ctrl-C; return the time in s that it took, or None if it was killed."""
+        """Stop the system as a service manager does; return the time in s, or None if it was killed."""
         process = self._process
         if process is None or process.poll() is not None:
             return 0.0
         pids = list(self.pids().values())
         began = time.monotonic()
-        process.send_signal(signal.SIGINT)
+        process.send_signal(signal.SIGTERM)
         try:
             process.wait(STOP_S)
             return time.monotonic() - began
