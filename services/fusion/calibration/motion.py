@@ -83,12 +83,14 @@ def solve_motion(
     T_body_camera: np.ndarray,
     focal_px: float,
     free: tuple[str, ...] = PARAMETERS,
+    drift_rad_s: float = 0.0,
 ) -> MotionCalibration:
     """Estimate the corrections of time offset and mount: grid search over the time offset, then Gauss-Newton.
 
     The result is the maximum a posteriori estimate. Its standard errors combine the spread between blocks of
     the drive (a jackknife, because the errors of the corners of one image are correlated), the width of the
-    prior where it determines the value, and the errors that all parts of a drive share.
+    prior where it determines the value, and the errors that all parts of a drive share. A parameter that is
+    not free counts as exact, but the shared errors that act like it change the others.
 
     Args:
         pairs: image pairs with tracked corners, in order of time.
@@ -96,6 +98,7 @@ def solve_motion(
         T_body_camera: the mount to correct.
         focal_px: focal length of the images in which the corners were tracked.
         free: names of the parameters to estimate; the others stay 0.
+        drift_rad_s: standard deviation of a constant drift of the yaw of the poses; 0 for poses in a map.
 
     Raises:
         ValueError: too few pairs with at least 8 corners.
@@ -113,7 +116,8 @@ def solve_motion(
     sigma = problem.jackknife(best, mask)
     # A value determined by the prior does not vary in the jackknife: add the width of the prior.
     held = problem.prior_share(best, mask)
-    sigma = np.hypot(np.hypot(sigma, held * _PRIOR), _SYSTEMATIC)
+    shared = np.hypot(_SYSTEMATIC, problem.shared_errors(best, mask, drift_rad_s))
+    sigma = np.hypot(np.hypot(sigma, held * _PRIOR), shared)
     after = problem.residuals(best)
     return MotionCalibration(
         best, np.where(mask, sigma, np.inf), float(np.median(np.abs(after))),
@@ -145,6 +149,7 @@ class _Problem:
         self._of = np.repeat(np.arange(len(pairs)), [len(p.rays_a) for p in pairs])
         self._rays_a = np.concatenate([p.rays_a for p in pairs])
         self._rays_b = np.concatenate([p.rays_b for p in pairs])
+        self._span_s = np.array([1e-9 * (p.stamp_b_ns - p.stamp_a_ns) for p in pairs])
         self._shift_ns: int | None = None
 
     def residuals(self, x: np.ndarray) -> np.ndarray:
@@ -184,6 +189,47 @@ class _Problem:
             H, _, prior = self._normal(x, columns)
             share[columns] = np.clip(np.diag(np.linalg.solve(H, np.diag(prior))), 0.0, 1.0)
         return share
+
+    def shared_errors(self, x: np.ndarray, mask: np.ndarray, drift_rad_s: float) -> np.ndarray:
+        """Return the standard errors float64 [6] by drift of the poses and by errors of the fixed parameters.
+
+        Both are consider parameters (Schmidt 1966). A drift of the yaw of the poses moves all corners sideways,
+        which the estimation takes for a sideways motion, thus for a yaw of the mount; so does a fixed x in
+        turns. Turns to both sides cancel, but the first pairs of a drive often turn to one side.
+
+        Args:
+            x: float64 [6], the estimate.
+            mask: bool [6], True = free.
+            drift_rad_s: standard deviation of the drift.
+        """
+        errors = np.zeros(len(x))
+        columns, fixed = np.flatnonzero(mask), np.flatnonzero(~mask)
+        if len(columns) == 0:
+            return errors
+        _, J, weight, prior = self._linear(x, np.arange(len(x)))
+        causes = np.column_stack([J[:, fixed] * _SYSTEMATIC[fixed], self._drift_derivative(x) * drift_rad_s])
+        J, prior = J[:, columns], prior[columns]
+        H = J.T @ (J * weight[:, None]) + np.diag(prior)
+        change = np.linalg.solve(H, J.T @ (causes * weight[:, None]))
+        errors[columns] = np.sqrt(np.sum(change**2, axis=1))
+        return errors
+
+    def _drift_derivative(self, x: np.ndarray) -> np.ndarray:
+        """Return the derivative [2M] (px s / rad) of the residuals with respect to a drift of the poses' yaw."""
+        step_rad_s = 1e-4
+        self._interpolate_motions(round(x[0] * 1e9))
+        T_bodies = self._T_bodies
+        residuals = []
+        for sign in (1.0, -1.0):
+            # T_b_a is turned half before and half after its translation, as by a constant drift.
+            half_rad = -0.5 * sign * step_rad_s * self._span_s
+            turn = np.array([so3_exp(np.array([0.0, 0.0, angle])) for angle in half_rad])
+            self._T_bodies = T_bodies.copy()
+            self._T_bodies[:, :3, :3] = turn @ T_bodies[:, :3, :3] @ turn
+            self._T_bodies[:, :3, 3] = np.einsum("nij,nj->ni", turn, T_bodies[:, :3, 3])
+            residuals.append(self.residuals(x))
+        self._T_bodies = T_bodies
+        return (residuals[0] - residuals[1]) / (2.0 * step_rad_s)
 
     def jackknife(self, x: np.ndarray, mask: np.ndarray) -> np.ndarray:
         """Return the standard error float64 [6] of each parameter, in the order and units of `PARAMETERS`.

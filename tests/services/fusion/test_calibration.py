@@ -23,12 +23,12 @@ def _pose(stamp_ns):
     )
 
 
-def _drive(mount, clock_s=0.0, count=80):
+def _drive(mount, clock_s=0.0, count=80, pose=_pose):
     rng = np.random.default_rng(4)
     pairs = []
     for k in range(count):
         a, b = round(k * 0.4e9), round((k * 0.4 + 0.3) * 1e9)
-        T_a, T_b = _pose(a) @ mount, _pose(b) @ mount
+        T_a, T_b = pose(a) @ mount, pose(b) @ mount
         points = np.column_stack(
             [rng.uniform(-1.5, 1.5, 40), rng.uniform(-1, 1, 40), rng.uniform(1.5, 6, 40)]
         )
@@ -59,6 +59,22 @@ def test_a_planted_yaw_error_is_found_within_a_fifth_of_a_degree(yaw_deg):
     assert found.residual_px < 0.9 * found.residual_before_px
     right = found.mount(wrong)
     assert np.degrees(np.arccos((np.trace(right[:3, :3].T @ MOUNT[:3, :3]) - 1) / 2)) < 0.2
+
+
+def _arc(stamp_ns):
+    """A drive that turns to one side."""
+    s = stamp_ns * 1e-9
+    return se2_to_se3(np.array([0.5 * np.sin(0.4 * s), 0.5 - 0.5 * np.cos(0.4 * s), 0.4 * s]))
+
+
+@pytest.mark.parametrize(("pose", "wide"), [(_arc, True), (_pose, False)])
+def test_the_error_of_yaw_includes_what_a_fixed_x_does_in_turns_to_one_side(pose, wide):
+    mounted = MOUNT.copy()
+    mounted[0, 3] += 0.007
+    pairs = _drive(mounted, pose=pose)
+    found = solve_motion(pairs, pose, MOUNT, 265.0, ("clock_s", "roll_rad", "pitch_rad", "yaw_rad"))
+    assert abs(found.values[3]) < 2.0 * found.sigma[3]
+    assert (np.degrees(found.sigma[3]) > 0.4) == wide
 
 
 def test_a_robot_that_drives_straight_tells_no_clock():
