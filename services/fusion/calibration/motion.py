@@ -193,9 +193,9 @@ class _Problem:
     def shared_errors(self, x: np.ndarray, mask: np.ndarray, drift_rad_s: float) -> np.ndarray:
         """Return the standard errors float64 [6] by drift of the poses and by errors of the fixed parameters.
 
-        Both are consider parameters (Schmidt 1966). A drift of the yaw of the poses moves all corners sideways,
-        which the estimation takes for a sideways motion, thus for a yaw of the mount; so does a fixed x in
-        turns. Turns to both sides cancel, but the first pairs of a drive often turn to one side.
+        Both are consider parameters (Schmidt 1966). A drift of the yaw of the poses moves all corners to one
+        side, which the estimation takes for a sideways motion, thus for a yaw of the mount; so does a fixed x
+        in turns. Turns to both sides cancel, but the first pairs of a drive often turn to one side.
 
         Args:
             x: float64 [6], the estimate.
@@ -215,7 +215,7 @@ class _Problem:
         return errors
 
     def _drift_derivative(self, x: np.ndarray) -> np.ndarray:
-        """Return the derivative [2M] (px s / rad) of the residuals with respect to a drift of the poses' yaw."""
+        """Return the derivative [2M] (px s / rad) of the residuals by a drift of the yaw of the poses."""
         step_rad_s = 1e-4
         self._interpolate_motions(round(x[0] * 1e9))
         T_bodies = self._T_bodies
