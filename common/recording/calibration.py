@@ -16,7 +16,7 @@ from beamsplat.common.errors import UserError
 from beamsplat.common.geometry.frames import R_body_camera_level, camera_mount
 from beamsplat.common.geometry.rig import CameraSection, LidarSection, Mount, RigFile
 from beamsplat.common.geometry.transforms import make_transform
-from beamsplat.common.recording.static_frames import StaticFrames, normalize_frame
+from beamsplat.common.recording.static_frames import MAX_FRAMES, StaticFrames, normalize_frame
 
 # Distortion model names of ROS -> ours. Other models are rejected.
 _MODELS = {
@@ -139,7 +139,14 @@ def find_mounts(
     for sensor, frame in sensor_frames.items():
         T = frames.find(body, frame) if body and frame else None
         if T is None or body is None:
-            _handle_missing_mount(calibration, sensor, frame, body, list(sensor_frames), assume)
+            joined = (
+                f"no static transform connects frame {frame!r} to {body!r}"
+                if body
+                else "there are no static transforms"
+            )
+            if frames.ignored:
+                joined += f"; {frames.ignored} transforms to more than {MAX_FRAMES} frames were ignored"
+            _handle_missing_mount(calibration, sensor, joined, list(sensor_frames), assume)
             continue
         if sensor == "camera":
             T = _to_optical_frame(calibration, frames, body, frame, T)
@@ -178,13 +185,9 @@ def _to_optical_frame(
 
 
 def _handle_missing_mount(
-    calibration: Calibration, sensor: str, frame: str, body: str | None, sensors: list[str], assume: bool
+    calibration: Calibration, sensor: str, joined: str, sensors: list[str], assume: bool
 ) -> None:
-    joined = (
-        f"no static transform connects frame {frame!r} to {body!r}"
-        if body
-        else "there are no static transforms"
-    )
+    """Use a default mount, or state that the mount is missing; `joined`: why no transform was found."""
     if sensor == "lidar" and "camera" not in sensors:
         calibration.mounts["lidar"] = np.eye(4)
         calibration.assumed.append(f"the lidar is at the body's origin, facing forward ({joined})")

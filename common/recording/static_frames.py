@@ -17,6 +17,7 @@ BODY_NAMES = (
     "robot_base",
     "chassis_link",
 )
+MAX_FRAMES = 2000  # in one tree; a humanoid robot has several hundred
 _TOLERANCE = 1e-6  # metres and rotation matrix entries: a repeated transform within this has not changed
 
 
@@ -26,18 +27,22 @@ class StaticFrames:
     def __init__(self) -> None:
         self._parent: dict[str, tuple[str, np.ndarray]] = {}  # child -> (parent, T_parent_child)
         self.moving: set[tuple[str, str]] = set()  # (parent, child) whose transform changed
+        self.ignored = 0  # transforms to further frames, when there are `MAX_FRAMES`
 
     def add(self, parent: str, child: str, T_parent_child: np.ndarray, *, replace: bool = False) -> None:
         """Add one received transform [4, 4].
 
         If the pair of frames already has a transform with another value: with `replace`, store the new value
         (a latched publisher has corrected it); otherwise mark the pair as moving and remove its transform.
+        A new frame beyond `MAX_FRAMES` is ignored and counted.
         """
         parent, child = normalize_frame(parent), normalize_frame(child)
         if not child or parent == child or (parent, child) in self.moving:
             return
         known = self._parent.get(child)
-        if known is None or replace:
+        if known is None and len(self._parent) + len(self.moving) >= MAX_FRAMES:
+            self.ignored += 1
+        elif known is None or replace:
             self._parent[child] = (parent, T_parent_child)
         elif known[0] == parent and not np.allclose(known[1], T_parent_child, atol=_TOLERANCE, rtol=0.0):
             self.moving.add((parent, child))
@@ -78,8 +83,9 @@ class StaticFrames:
         known = self.names | {normalize_frame(odometry_child)} - {""}
         for name in BODY_NAMES:
             for frame in sorted(known):
-                joined = any(self.find(frame, sensor) is not None for sensor in sensors)
-                if frame.split("/")[-1] == name and (joined or not sensors):
+                if frame.split("/")[-1] != name:
+                    continue
+                if not sensors or any(self.find(frame, sensor) is not None for sensor in sensors):
                     return frame
         return normalize_frame(odometry_child) or None
 

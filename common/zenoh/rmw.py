@@ -101,6 +101,16 @@ class RmwAttachment(NamedTuple):
         return None
 
 
+def _is_number(text: str) -> bool:
+    """Return whether `int` accepts a text of at most 18 digits; `isdigit` alone also accepts superscripts."""
+    return text.isascii() and text.isdigit() and len(text) <= 18
+
+
+def _is_topic(name: str) -> bool:
+    """Return whether a topic's messages have a key: no empty part, and no wildcard of Zenoh."""
+    return all(name.strip("/").split("/")) and not set(name) & set("*$?#")
+
+
 @dataclass(frozen=True)
 class RmwQos:
     """The quality of service settings in a liveliness token, which omits settings with default values.
@@ -132,7 +142,7 @@ class RmwQos:
         if len(parts) < 6 or "," not in parts[2]:
             return None
         history, depth = parts[2].split(",")[:2]
-        if depth and not depth.isdigit():
+        if depth and not _is_number(depth):
             return None
         return RmwQos(parts[0] == "2", parts[1] == "1", history == "2", int(depth) if depth else 42)
 
@@ -173,7 +183,8 @@ class RmwEntity:
     def parse(token: str) -> RmwEntity | None:
         """Return the entity described by `token`; None for unsupported tokens (services, other versions)."""
         parts = token.split("/")
-        if len(parts) < 9 or parts[0] != LIVELINESS_PREFIX or not (parts[1] + parts[3] + parts[4]).isdigit():
+        numbers = (parts[i] for i in (1, 3, 4))
+        if len(parts) < 9 or parts[0] != LIVELINESS_PREFIX or not all(_is_number(n) for n in numbers):
             return None
         kind = parts[5]
         type_name: str | None
@@ -183,7 +194,7 @@ class RmwEntity:
         elif kind in ("MP", "MS") and len(parts) == 13:
             topic, type_name, type_hash = demangle(parts[9]), ros_type(parts[10]), parts[11]
             qos = RmwQos.parse(parts[12])
-            if type_name is None or qos is None:
+            if type_name is None or qos is None or not _is_topic(topic):
                 return None
         else:
             return None

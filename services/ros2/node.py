@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import queue
 import time
+from collections import deque
 from collections.abc import Iterator
 
 import zenoh
@@ -24,6 +25,8 @@ from beamsplat.services.ros2.topics import IMAGE, SUPPORTED_TYPES, TF
 _POLL_S = 0.1
 _QUEUED = 1000  # messages; the oldest is dropped when the queue is full
 _FIFO = 256  # messages in the channel of each subscriber
+_MAX_IMAGE_TOPICS = 16  # raw images that are subscribed to until topics are selected
+_MAX_OWN_PUBLISHERS = 64  # of /tf; the newest are known
 
 
 class Ros2Node(Node):
@@ -55,7 +58,7 @@ class Ros2Node(Node):
         self._type_by_key: dict[str, str] = {}  # ROS type by subscribed key
         self._unused_keys: set[str] = set()  # keys to unsubscribe
         self._topics_selected = False
-        self._own_tf_gids: set[bytes] = set()  # gids of our own publishers of /tf
+        self._own_tf_gids: deque[bytes] = deque(maxlen=_MAX_OWN_PUBLISHERS)  # of our own publishers of /tf
         self._session = open_session((c.router,))
         self._subscribe_all()
 
@@ -126,14 +129,17 @@ class Ros2Node(Node):
             return
         if entity.node_name == "beamsplat":  # published by our node ros2_out
             if entity.type_name == TF:  # the robot uses the same topic
-                self._own_tf_gids.add(entity.gid())
+                self._own_tf_gids.append(entity.gid())
             else:
                 self.robot.ignore_topic(entity.topic)
             return
         self.robot.add_publisher(entity.topic, entity.type_name)
         asked = self.config.image_topic.strip("/") in ("", entity.topic.strip("/"))
         if entity.type_name == IMAGE and asked and "image" not in self.config.without:
-            self._subscribe(f"{entity.domain}/{entity.topic.strip('/')}/{dds_type(IMAGE)}/*", IMAGE)
+            if sum(type_name == IMAGE for type_name in self._type_by_key.values()) < _MAX_IMAGE_TOPICS:
+                self._subscribe(f"{entity.domain}/{entity.topic.strip('/')}/{dds_type(IMAGE)}/*", IMAGE)
+            else:
+                self.rejections.add(f"more than {_MAX_IMAGE_TOPICS} topics of raw images: set image_topic")
 
     def _subscribe_all(self) -> None:
         domain = self.config.domain

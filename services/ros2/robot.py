@@ -5,7 +5,7 @@ Nothing is published before the calibration is known, and no image whose size di
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,7 +19,7 @@ from beamsplat.common.messages.image_header import is_complete_image
 from beamsplat.common.recording import calibration as cal
 from beamsplat.common.recording.ros_types import deserialize, transform_of
 from beamsplat.common.recording.sensors import SENSORS, build_message, ros_fields
-from beamsplat.common.recording.static_frames import StaticFrames, normalize_frame
+from beamsplat.common.recording.static_frames import MAX_FRAMES, StaticFrames, normalize_frame
 from beamsplat.services.ros2.tf_odometry import TfOdometry
 from beamsplat.services.ros2.topics import (
     CAMERA_INFO,
@@ -31,6 +31,9 @@ from beamsplat.services.ros2.topics import (
 )
 
 _MAX_WAIT_S = 10.0  # for the first message of a topic that has a publisher
+_MAX_TOPICS = 256  # of the robot that are considered, and of BeamSplat that are ignored
+_MAX_REJECTING = 16  # topics whose unusable messages are counted apart
+_OTHER = "other topics"
 
 
 @dataclass(frozen=True)
@@ -52,7 +55,7 @@ class RosRobot:
     def __init__(self, options: RosRobotOptions) -> None:
         self._options = options
         self._publisher_types: dict[str, str] = {}  # ROS type by topic, of topics with a publisher
-        self._ignored: set[str] = set()
+        self._ignored: deque[str] = deque(maxlen=_MAX_TOPICS)
         self._first_messages: dict[str, tuple[str, Any]] = {}  # (ROS type, first message) by sensor topic
         self._camera_infos: dict[str, Any] = {}
         self._static_tree = StaticFrames()  # from /tf_static
@@ -64,7 +67,7 @@ class RosRobot:
         self._T_child_body = np.eye(4)
         self.rig: RigFile | None = None
         self.published: Counter[str] = Counter()
-        self.rejected: Counter[str] = Counter()
+        self.rejected: Counter[str] = Counter()  # unusable messages, by topic
         self.fault = ""
         self.status = "no message received yet"
 
@@ -79,13 +82,18 @@ class RosRobot:
         return self.rig is None or self._odometry_edge is not None
 
     def add_publisher(self, topic: str, type_name: str) -> None:
-        """Register a topic that has a publisher on the robot."""
-        if type_name in SUPPORTED_TYPES:
+        """Register a topic that has a publisher on the robot; beyond `_MAX_TOPICS` it is only counted."""
+        if type_name not in SUPPORTED_TYPES:
+            return
+        if topic in self._publisher_types or len(self._publisher_types) < _MAX_TOPICS:
             self._publisher_types[topic] = type_name
+        else:
+            self._reject(topic, f"the robot has more than {_MAX_TOPICS} topics")
 
     def ignore_topic(self, topic: str) -> None:
         """Ignore a topic that is not published by the robot itself."""
-        self._ignored.add(topic)
+        if topic not in self._ignored:
+            self._ignored.append(topic)
         self._first_messages.pop(topic, None)
 
     def convert(
@@ -109,27 +117,42 @@ class RosRobot:
         except ValueError as error:
             self._reject(topic, str(error))
             return []
-        if type_name == TF and self.rig is not None:
-            return self._odometry_from_tf(topic, message)
-        if type_name == TF:
-            self._add_transforms(topic, message)
-        elif type_name == CAMERA_INFO:
-            self._camera_infos[topic] = message
-        elif self.rig is None:
-            self._first_messages.setdefault(topic, (type_name, message))
-            self._first_message_s = now_s if self._first_message_s is None else self._first_message_s
         if self.rig is None:
-            if (
-                self._first_message_s is None
-                or not self._all_topics_seen(now_s - self._first_message_s)
-                or not self._calibrate()
-            ):
-                return []
-            stamp_ns = min(self._stamp_ns(m, received_ns) for _, m in self._first_messages.values())
-            assert self.rig is not None  # set by `_calibrate`
-            return [("rig", self.rig.message(max(stamp_ns, 0), self.rig.source))]
+            self._keep_for_calibration(topic, type_name, message, now_s)
+            return self._rig_message(received_ns, now_s)
+        if type_name == TF:
+            return self._odometry_from_tf(topic, message)
         kind = self._kind_by_topic.get(topic)
         return self._convert(topic, kind, message, received_ns) if kind else []
+
+    def _keep_for_calibration(self, topic: str, type_name: str, message: Any, now_s: float) -> None:
+        """Store transforms, the newest CameraInfo and the first sensor message of each topic."""
+        if type_name == TF:
+            self._add_transforms(topic, message)
+            return
+        known = topic in self._camera_infos or topic in self._first_messages
+        if not known and len(self._camera_infos) + len(self._first_messages) >= _MAX_TOPICS:
+            self._reject(topic, f"the robot has more than {_MAX_TOPICS} topics")
+        elif type_name == CAMERA_INFO:
+            self._camera_infos[topic] = message
+        else:
+            self._first_messages.setdefault(topic, (type_name, message))
+            self._first_message_s = now_s if self._first_message_s is None else self._first_message_s
+
+    def _rig_message(self, received_ns: int, now_s: float) -> list[tuple[str, Any]]:
+        """Return the calibration as [("rig", message)] once it is complete; until then []."""
+        if (
+            self._first_message_s is None
+            or not self._all_topics_seen(now_s - self._first_message_s)
+            or not self._calibrate()
+        ):
+            return []
+        stamps_ns = (self._stamp_ns(message, received_ns) for _, message in self._first_messages.values())
+        stamp_ns = max(min(stamps_ns), 0)
+        for stored in (self._first_messages, self._camera_infos, self._publisher_types):
+            stored.clear()  # not used any more
+        assert self.rig is not None  # set by `_calibrate`
+        return [("rig", self.rig.message(stamp_ns, self.rig.source))]
 
     def _all_topics_seen(self, waited_s: float) -> bool:
         silent = [
@@ -246,11 +269,15 @@ class RosRobot:
 
     def _add_transforms(self, topic: str, message: Any) -> None:
         fixed = topic.endswith("tf_static")
+        trees = (self._static_tree, self._constant_tree) if fixed else (self._constant_tree,)
+        ignored = sum(tree.ignored for tree in trees)
         for stamped, T in _transforms(message):
             if not fixed:
                 self._tf_odometry.add_edge(stamped.header.frame_id, stamped.child_frame_id)
-            for tree in (self._static_tree, self._constant_tree) if fixed else (self._constant_tree,):
+            for tree in trees:
                 tree.add(stamped.header.frame_id, stamped.child_frame_id, T, replace=fixed)
+        if sum(tree.ignored for tree in trees) > ignored:
+            self._reject(topic, f"transforms to more than {MAX_FRAMES} frames are ignored")
 
     def _odometry_from_tf(self, topic: str, message: Any) -> list[tuple[str, Any]]:
         """Return wheel odometry computed from a message of /tf; [] if there is an Odometry topic."""
@@ -260,6 +287,10 @@ class RosRobot:
             if edge != self._odometry_edge or topic.endswith("tf_static"):
                 continue
             stamp = stamped.header.stamp
+            source = next((name for name, kind in self._kind_by_topic.items() if kind == "odometry"), topic)
+            if topic != source:  # of another robot with the same names of frames
+                self._reject(topic, f"odometry is taken from {source}")
+                continue
             fields = self._tf_odometry.odometry_fields(int(stamp.sec) * 10**9 + int(stamp.nanosec), T)
             if fields is None:
                 continue
@@ -275,7 +306,8 @@ class RosRobot:
         return found
 
     def _reject(self, topic: str, reason: str) -> None:
-        self.rejected[topic] += 1
+        listed = topic in self.rejected or len(self.rejected) < _MAX_REJECTING
+        self.rejected[topic if listed else _OTHER] += 1
         self.fault = f"{topic}: {reason}"
         if self.rig is not None:
             self._update_status()

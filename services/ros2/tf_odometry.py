@@ -17,21 +17,19 @@ class TfOdometry:
     """Finds the transform odom -> base in /tf and computes velocities from its changes."""
 
     def __init__(self) -> None:
-        self._edges: set[tuple[str, str]] = set()  # (parent, child) of the transforms on /tf
+        self._edges: set[tuple[str, str]] = set()  # the first two (odom, child) on /tf
         self._previous: tuple[int, np.ndarray] | None = None
 
     def add_edge(self, parent: str, child: str) -> None:
-        """Register the frames (parent, child) of a transform on /tf."""
-        self._edges.add((normalize_frame(parent), normalize_frame(child)))
+        """Register the frames (parent, child) of a transform on /tf, if they have the usual names."""
+        edge = normalize_frame(parent), normalize_frame(child)
+        usual = edge[0].split("/")[-1] == _ODOM and edge[1].split("/")[-1] in BODY_NAMES
+        if usual and len(self._edges) < 2:  # of two or more, none can be chosen
+            self._edges.add(edge)
 
     def odometry_edge(self) -> tuple[str, str] | None:
         """Return the frames (odom, child), found by their usual names; None unless exactly one matches."""
-        found = [
-            (parent, child)
-            for parent, child in sorted(self._edges)
-            if parent.split("/")[-1] == _ODOM and child.split("/")[-1] in BODY_NAMES
-        ]
-        return found[0] if len(found) == 1 else None
+        return next(iter(self._edges)) if len(self._edges) == 1 else None
 
     def odometry_fields(self, stamp_ns: int, T_odom_child: np.ndarray) -> dict[str, Any] | None:
         """Return the fields of a `WheelOdometry` message for the transform `T_odom_child` [4, 4].
