@@ -30,6 +30,20 @@ def make_folder(path: Path) -> Path:
     return path
 
 
+def read_limited(path: Path, limit_bytes: int) -> bytes:
+    """Return the content of a file of at most `limit_bytes`, which bounds the memory.
+
+    Raises:
+        OSError: it cannot be read.
+        ValueError: it is longer.
+    """
+    with path.open("rb") as file:
+        data = file.read(limit_bytes + 1)
+    if len(data) > limit_bytes:
+        raise ValueError(f"longer than {limit_bytes} bytes")
+    return data
+
+
 def is_disk_fault(error: OSError) -> bool:
     """Return whether a disk is full, read-only or broken, in contrast to a path that a user has mistyped."""
     return error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO)

@@ -35,6 +35,7 @@ from pydantic import Field, model_validator
 
 from beamsplat.common.config.base import Config, parse
 from beamsplat.common.errors import UserError, reason
+from beamsplat.common.files.persist import read_limited
 from beamsplat.common.geometry.frames import R_body_camera_level
 from beamsplat.common.geometry.transforms import (
     make_transform,
@@ -45,6 +46,7 @@ from beamsplat.common.geometry.transforms import (
 )
 from beamsplat.common.messages import CameraModel, LidarModel, Rig
 
+_MAX_BYTES = 1_000_000  # of a rig file; usual ones have about 1 kB
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Metres = Annotated[float, Field(allow_inf_nan=False, ge=-100.0, le=100.0)]
 Degrees = Annotated[float, Field(allow_inf_nan=False, ge=-360.0, le=360.0)]
@@ -182,12 +184,12 @@ def load_rig(path: Path) -> RigFile:
     """Read and validate the rig file at `path`.
 
     Raises:
-        UserError: the file is missing, not TOML, or has an unknown key or an invalid value; the text names
-            file, field and value.
+        UserError: the file is missing, too long, not TOML, or has an unknown key or an invalid value; the
+            text names file, field and value.
     """
     try:
-        text = Path(path).read_text()
-    except (OSError, UnicodeDecodeError) as error:
+        text = read_limited(Path(path), _MAX_BYTES).decode()
+    except (OSError, ValueError) as error:
         raise UserError(
             f"{path}: cannot be read as a rig file ({reason(error)}); create one with `beamsplat rig`"
         ) from error

@@ -8,13 +8,15 @@ from pathlib import Path
 
 import numpy as np
 
-from beamsplat.common.errors import UserError
+from beamsplat.common.errors import UserError, reason
 from beamsplat.common.files.persist import make_folder
 from beamsplat.common.geometry.trajectory import Trajectory, write_tum
 from beamsplat.common.raster.layout import COLOUR, MEAN, OPACITY, QUAT, SCALE
 
 SH_C0 = 0.28209479177387814  # value of the spherical harmonic of degree 0
-_ROWS = 65_536  # Gaussians per write: bounds the memory
+_ROWS = 65_536  # Gaussians per write or read: bounds the memory
+_MAX_HEADER_BYTES = 65_536  # ours has less than 1 kB
+_END_OF_HEADER = b"end_header\n"
 _PLY_TYPES = {"float": "<f4", "float32": "<f4", "double": "<f8", "uchar": "u1", "uint8": "u1", "char": "i1",
               "short": "<i2", "ushort": "<u2", "int": "<i4", "uint": "<u4"}  # fmt: skip
 FIELDS = ("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity",
@@ -77,22 +79,51 @@ def write_map(
 
 
 def read_ply_points(path: Path) -> np.ndarray:
-    """Return the vertices float64 [N, 3] of a binary little-endian PLY file.
+    """Return the vertices float64 [N, 3] of a binary little-endian PLY file with the vertices first.
 
     Raises:
-        UserError: the file has another format.
+        UserError: the file cannot be read, has another format, or is shorter than its header says.
     """
-    blob = Path(path).read_bytes()
-    end = blob.find(b"end_header\n")
-    lines = blob[:end].decode("ascii", "replace").split("\n")
-    if end < 0 or "format binary_little_endian 1.0" not in lines:
-        raise UserError(f"{path}: expected a binary little-endian PLY")
-    fields, count = [], 0
-    for line in lines:
-        words = line.split()
-        if words[:2] == ["element", "vertex"]:
-            count = int(words[2])
-        elif words[:1] == ["property"] and len(words) == 3:
+    path = Path(path)
+    try:
+        with path.open("rb") as file:
+            head, found, _ = file.read(_MAX_HEADER_BYTES).partition(_END_OF_HEADER)
+            fields, count = _vertex_fields(head.decode("ascii", "replace").split("\n"))
+            if not found or not {"x", "y", "z"} <= {name for name, _ in fields}:
+                raise ValueError("expected a binary little-endian PLY with x, y and z of its vertices")
+            dtype, start = np.dtype(fields), len(head) + len(found)
+            if count > (path.stat().st_size - start) // dtype.itemsize:
+                raise ValueError(f"truncated: its header says {count} vertices")
+            points = np.empty((count, 3))
+            file.seek(start)
+            for first in range(0, count, _ROWS):
+                rows = np.frombuffer(file.read(min(_ROWS, count - first) * dtype.itemsize), dtype)
+                points[first : first + len(rows)] = np.stack([rows[name] for name in "xyz"], axis=1)
+            return points
+    except (OSError, ValueError) as error:
+        raise UserError(f"{path}: {reason(error)}") from error
+
+
+def _vertex_fields(lines: list[str]) -> tuple[list[tuple[str, str]], int]:
+    """Return the (name, dtype) of the properties of the vertices in a header, and their number.
+
+    Raises:
+        ValueError: another format, a property that is a list or of unknown type, or a wrong number.
+    """
+    if "format binary_little_endian 1.0" not in lines:
+        raise ValueError("expected a binary little-endian PLY")
+    element, fields, count = "", [], 0
+    for words in map(str.split, lines):
+        if words[:1] == ["element"]:
+            if len(words) != 3 or not (words[2].isascii() and words[2].isdigit()) or len(words[2]) > 18:
+                raise ValueError(f"wrong line in its header: {' '.join(words)!r}")
+            element = words[1]
+            if element == "vertex":
+                count = int(words[2])
+            elif not fields and int(words[2]):
+                raise ValueError(f"its first elements are {element}, expected vertex")
+        elif words[:1] == ["property"] and element == "vertex":
+            if len(words) != 3 or words[1] not in _PLY_TYPES:
+                raise ValueError(f"property {' '.join(words[1:])!r} of vertices is not supported")
             fields.append((words[2], _PLY_TYPES[words[1]]))
-    rows = np.frombuffer(blob, np.dtype(fields), count, end + len(b"end_header\n"))
-    return np.stack([rows[name] for name in "xyz"], axis=1).astype(np.float64)
+    return fields, count

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import zipfile
+import zlib
 from collections.abc import Callable, Iterator
 
 import cv2
 import numpy as np
 
-from beamsplat.common.errors import UserError
+from beamsplat.common.errors import UserError, reason
 from beamsplat.common.geometry.camera import Pinhole, Undistorter
+from beamsplat.common.geometry.depth_sigma import typical_sigma_m
 from beamsplat.common.mapfiles.session import Arrays, packed_arrays, unpacked_arrays
 from beamsplat.common.messages import Keyframe, KeyframeAck, MapChunk, MapPreview, MapState
 from beamsplat.common.messages.codec import encode, schema_of
@@ -49,12 +52,12 @@ def decode_keyframe(message: Keyframe, lens: Callable[[Pinhole], Undistorter]) -
     p = undistort.pinhole
     rgb = decode_rgb(message.picture, message.encoding, p.width_px, p.height_px)
     mask = mask_from_png(message.mask_png, p.shape) if len(message.mask_png) else None
+    depth_m = depth_from_png(message.depth_png, p.shape)
     return RgbdKeyframe(
         id=message.id, rgb=undistort(rgb),
         camera=RasterCamera(p.fx_px, p.fy_px, p.cx_px, p.cy_px, p.width_px, p.height_px),
         T_anchor_camera=message.T_anchor_body @ camera.T_body_camera,
-        depth_m=depth_from_png(message.depth_png, p.shape),
-        sigma_m=sigma_from_png(message.sigma_png, p.shape),
+        depth_m=depth_m, sigma_m=typical_sigma_m(depth_m, sigma_from_png(message.sigma_png, p.shape)),
         anchor=message.anchor_id, beams_uvz=message.beams[:, :3].astype(np.float64), mask=mask,
     )  # fmt: skip
 
@@ -88,7 +91,7 @@ def joined_state(pieces: list[MapState]) -> Arrays:
     """Join the messages of `state_messages`, in any order, to the arrays of a saved map.
 
     Raises:
-        UserError: some bytes are missing.
+        UserError: some bytes are missing, or they are no arrays.
     """
     pieces = sorted(pieces, key=lambda piece: piece.first)
     blob = b"".join(piece.data.tobytes() for piece in pieces)
@@ -96,4 +99,7 @@ def joined_state(pieces: list[MapState]) -> Arrays:
         raise UserError(
             f"received {len(blob)} of {pieces[0].total if pieces else 0} bytes of the map: try again"
         )
-    return unpacked_arrays(blob)
+    try:
+        return unpacked_arrays(blob)
+    except (OSError, ValueError, zipfile.BadZipFile, zlib.error) as error:
+        raise UserError(f"the mapper sent a map that cannot be read ({reason(error)}): try again") from error

@@ -21,7 +21,8 @@ import apsw
 from rosbags.rosbag1 import ReaderError as ReaderError1
 from rosbags.rosbag2 import ReaderError as ReaderError2
 
-from beamsplat.common.errors import UserError
+from beamsplat.common.errors import UserError, reason
+from beamsplat.common.files.persist import read_limited
 from beamsplat.common.recording.decompression import decompress
 from beamsplat.common.recording.mcap_file import McapFile
 from beamsplat.services.replay.bounded_readers import BoundedReader1, BoundedReader2, decompress_bag
@@ -32,6 +33,7 @@ _READ_ERRORS = (
     ReaderError1, ReaderError2, apsw.Error, sqlite3.Error, OSError, AssertionError, KeyError, IndexError,
     ValueError, struct.error, EOFError, RuntimeError, TypeError, MemoryError, OverflowError,
 )  # fmt: skip
+_MAX_METADATA_BYTES = 4_000_000  # of metadata.yaml; with hundreds of topics it has less than 1 MB
 _COPY_AGAIN = "copy it again from where it was recorded"
 
 
@@ -234,10 +236,18 @@ def _files(path: Path) -> list[Path]:
 
 
 def _compression_mode(metadata: Path) -> str:
-    """Return the compression mode in a metadata.yaml, in lower case: "file", "message", or "" for none."""
+    """Return the compression mode in a metadata.yaml, in lower case: "file", "message", or "" for none.
+
+    Raises:
+        UserError: the file cannot be read, or is too long: the reader of bags would need minutes for it.
+    """
     if not metadata.is_file():
         return ""
-    found = re.search(r"compression_mode:\s*['\"]?(file|message)", metadata.read_text(errors="replace"), re.I)
+    try:
+        text = read_limited(metadata, _MAX_METADATA_BYTES).decode(errors="replace")
+    except (OSError, ValueError) as error:
+        raise UserError(f"{metadata}: cannot be read ({reason(error)}); {_COPY_AGAIN}") from error
+    found = re.search(r"compression_mode:\s*['\"]?(file|message)", text, re.I)
     return found[1].lower() if found else ""
 
 

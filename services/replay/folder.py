@@ -24,7 +24,8 @@ from typing import Any
 
 import numpy as np
 
-from beamsplat.common.errors import UserError
+from beamsplat.common.errors import UserError, reason
+from beamsplat.common.files.persist import read_limited
 from beamsplat.common.geometry.rig import load_rig
 from beamsplat.common.geometry.trajectory import Trajectory, read_tum
 from beamsplat.common.geometry.transforms import so3_log
@@ -33,6 +34,8 @@ from beamsplat.common.recording.sensors import SENSORS, build_message
 from beamsplat.services.replay.folder_scans import CsvScans, scan_from_points, xy_from_pcd
 from beamsplat.services.replay.options import SourceOptions
 
+_MAX_SETTINGS_BYTES = 1_000_000  # of folder.toml
+_MAX_FILE_BYTES = 64_000_000  # of an image or a scan
 _IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
 Stamped = tuple[int, str, Any]
 
@@ -118,7 +121,7 @@ class FolderSource:
         if images:
             if rig.camera is None:
                 raise UserError(f'{file}: has no [camera] for the images; add it, or set without = ["image"]')
-            head = read_image_header(images[0][1].read_bytes())
+            head = read_image_header(read_limited(images[0][1], _MAX_FILE_BYTES))
             size = (rig.camera.width_px, rig.camera.height_px)
             if head is not None and head[1:] != size:
                 raise UserError(
@@ -194,9 +197,9 @@ class FolderSource:
         if not file.exists():
             return FolderLidar()
         try:
-            table = tomllib.loads(file.read_text())
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-            raise UserError(f"{file}: not a TOML file: {error}") from error
+            table = tomllib.loads(read_limited(file, _MAX_SETTINGS_BYTES).decode())
+        except (OSError, ValueError) as error:
+            raise UserError(f"{file}: not a TOML file: {reason(error)}") from error
         known = [field.name for field in fields(FolderLidar)]
         for name, value in table.items():
             if name not in known:
@@ -206,7 +209,7 @@ class FolderSource:
         return FolderLidar(**table)
 
     def _image(self, file: Path) -> dict[str, Any]:
-        data = np.fromfile(file, np.uint8)
+        data = np.frombuffer(read_limited(file, _MAX_FILE_BYTES), np.uint8)
         head = read_image_header(data.data)
         if head is None:
             raise ValueError(f"{file.name} is neither JPEG nor PNG")
@@ -216,7 +219,7 @@ class FolderSource:
         if self._csv is not None:
             return self._csv.fields(entry)
         settings = self._settings
-        points = xy_from_pcd(entry.read_bytes(), entry.name)
+        points = xy_from_pcd(read_limited(entry, _MAX_FILE_BYTES), entry.name)
         return scan_from_points(points, settings.range_min_m, settings.range_max_m, settings.scan_time_s)
 
     @staticmethod

@@ -143,6 +143,7 @@ def _latched_grid(session: Any, robot: str) -> Any:
     import zenoh
 
     from beamsplat.common.messages import Grid
+    from beamsplat.common.messages.header import DecodeError
     from beamsplat.common.topics import topic
     from beamsplat.common.zenoh.bus import key
     from beamsplat.common.zenoh.streams import declare_subscription, decode_sample
@@ -155,6 +156,8 @@ def _latched_grid(session: Any, robot: str) -> Any:
         grid = decode_sample(received.get(timeout=_GRID_TIMEOUT_S), row).message
     except queue.Empty:
         return None
+    except DecodeError as error:
+        raise UserError(f"localization/grid of the running system cannot be decoded: {error}") from error
     assert isinstance(grid, Grid)  # the row's message type
     x_m, y_m = (float(v) for v in grid.origin_m)
     return OccupancyGrid(grid.occupancy, x_m, y_m, grid.resolution_m)

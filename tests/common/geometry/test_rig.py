@@ -134,6 +134,13 @@ def test_an_empty_rig_and_a_missing_file(tmp_path):
         load_rig(tmp_path / "other.toml")
 
 
+def test_the_size_of_the_file_is_limited(tmp_path):
+    file = tmp_path / "rig.toml"
+    file.write_text(RIG + "# calibrated in the yard\n" * 50_000)
+    with pytest.raises(UserError, match=r"rig.toml: .*longer than 1000000 bytes"):
+        load_rig(file)
+
+
 @settings(max_examples=200, deadline=None)
 @given(st.text(max_size=60))
 def test_arbitrary_text_raises_user_errors_only(text):

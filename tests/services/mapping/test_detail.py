@@ -10,6 +10,7 @@ from beamsplat.common.geometry.transforms import inverse, make_transform
 from beamsplat.common.mapfiles.detail import FINEST_CELL_M, detail_cell_m, merge_by_cell
 from beamsplat.common.mapfiles.scores import psnr_db
 from beamsplat.common.mapfiles.store import GaussianStore
+from beamsplat.common.messages import MapState
 from beamsplat.common.raster.camera import RasterCamera
 from beamsplat.common.raster.layout import COLOUR, MEAN, OPACITY, QUAT, SCALE
 from beamsplat.common.raster.rasterizer import Rasterizer
@@ -133,3 +134,7 @@ def test_a_state_in_pieces_is_complete_or_refused():
         np.testing.assert_array_equal(again[name], arrays[name])
     with pytest.raises(UserError, match="try again"):
         joined_state(pieces[1:])
+    for data in (b"", b"PK\x03\x04" + b"x" * 90, pieces[0].data.tobytes()):
+        wrong = MapState(stamp_ns=0, first=0, total=len(data), data=np.frombuffer(data, np.uint8))
+        with pytest.raises(UserError, match="cannot be read"):
+            joined_state([wrong])

@@ -293,6 +293,15 @@ def test_compressed_bags(tmp_path, kind, mode):
     assert sourced[0].message.camera.fx_px == 50.0
 
 
+@pytest.mark.parametrize("kind", ["sqlite", "mcap"])
+def test_the_size_of_the_metadata_is_limited(tmp_path, kind):
+    path = write_bag(tmp_path, kind, Drive(seconds=0.2))
+    with (path / "metadata.yaml").open("a") as file:
+        file.write("# recorded in the yard\n" * 200_000)
+    with pytest.raises(UserError, match=r"metadata.yaml: .*longer than 4000000 bytes"):
+        Bag(path)
+
+
 def test_what_is_no_bag_is_refused(tmp_path):
     for name, content, words in [
         ("a.bag", b"hello", "not a bag"),
