@@ -45,6 +45,7 @@ class CameraTrackerSettings:
     opacity: float = 0.95
     prune_opacity: float = 0.05
     max_gaussians: int = 200_000
+    max_keyframes: int = 200  # 1.5 MB each at 320 x 240
     window: int = 6  # number of newest keyframes; every second optimisation step uses one of them
     steps_per_image: int = 2
     first_steps: int = 8  # on the first keyframe; few, because the robot keeps moving meanwhile

@@ -29,7 +29,7 @@ class MapKeyframe:
     rgb: np.ndarray  # float32 [3, H, W] in [0, 1]
     z_m: np.ndarray  # float32 [H, W], 0 unknown
     weight: np.ndarray  # float32 [H, W] of the depth
-    in_view: np.ndarray  # int32: Gaussians in the frustum when the keyframe was added
+    in_view: np.ndarray  # int32: Gaussians in the frustum when the keyframe was added; of the newest only
     thumbnail: np.ndarray  # float32 [h, w], descriptor for relocalization
 
 
@@ -83,8 +83,22 @@ class SplatMap:
         render = self.render(self.camera, inverse(frame.T_map_camera))
         frame.in_view = render.index.copy()
         self.release(render)
+        for before in self.keyframes[-1:]:
+            before.in_view = np.zeros(0, np.int32)  # not used any more
         self.keyframes.append(frame)
+        if len(self.keyframes) > s.max_keyframes:
+            self._drop_keyframe()
         return len(u)
+
+    def _drop_keyframe(self) -> None:
+        """Drop the keyframe that is most similar to a newer one: relocalization needs it least.
+
+        The first keyframe and the newest `window` stay.
+        """
+        thumbnails = np.array([frame.thumbnail.ravel() for frame in self.keyframes])
+        correlation = np.triu(thumbnails @ thumbnails.T, 1)  # of each keyframe with all newer ones
+        most_similar = correlation[1 : -self.settings.window].max(axis=1)
+        del self.keyframes[1 + int(np.argmax(most_similar))]
 
     def _contradicted_by(self, index: np.ndarray, missing: np.ndarray, frame: MapKeyframe) -> np.ndarray:
         """Return the indices int32 [C] of the Gaussians that contradict the keyframe; `add` removes them.
@@ -122,7 +136,7 @@ class SplatMap:
         keep[index] = False
         self.store.keep(keep)
         new_index = np.cumsum(keep, dtype=np.int32) - 1
-        for frame in self.keyframes[-1:]:  # the lists of older keyframes are not used any more
+        for frame in self.keyframes[-1:]:
             frame.in_view = new_index[frame.in_view[keep[frame.in_view]]]
 
     # --- optimising --------------------------------------------------------------------------------

@@ -10,6 +10,7 @@ from beamsplat.services.localization.camera.plane_sweep import fill_unknown, swe
 from beamsplat.services.localization.camera.relocalize import thumbnail
 from beamsplat.services.localization.camera.result import covisibility
 from beamsplat.services.localization.camera.settings import CameraTrackerSettings
+from beamsplat.services.localization.camera.splat_map import MapKeyframe, SplatMap
 from beamsplat.services.localization.camera.tracker import CameraTracker
 from tests.services.localization.camera.box import CAMERA, T_BODY_CAMERA, body, drive, pose_error, render_view
 
@@ -235,3 +236,34 @@ def test_loss_of_tracking_during_initialisation_restarts_it():
     assert statuses[0] == "lost"
     assert statuses[-1] == "ok"
     assert len(tracker.splats.keyframes) == 1
+
+
+def test_the_keyframes_of_the_map_are_bounded_and_the_most_similar_ones_are_dropped():
+    settings = CameraTrackerSettings(
+        width_px=160, first_steps=1, steps_per_image=0, window=2, max_keyframes=4
+    )
+    camera = tracking_camera(CAMERA, 160)
+    splats = SplatMap(camera, settings)
+    stamps = []
+    for number, turn in enumerate((0.0, 1.0, 2.0, 2.02, 3.0, 4.0, 4.01, 5.0)):
+        T = body(0.0, 0.0, turn)
+        rgb, z = render_view(T)
+        planes = np.ascontiguousarray(rgb.transpose(2, 0, 1)).astype(np.float32) / 255
+        splats.add(
+            MapKeyframe(
+                number,
+                T @ T_BODY_CAMERA,
+                planes,
+                z,
+                np.ones_like(z),
+                np.zeros(0, np.int32),
+                thumbnail(rgb.mean(axis=2).astype(np.float32)),
+            )  # fmt: skip
+        )
+        stamps.append([frame.stamp_ns for frame in splats.keyframes])
+    splats.close()
+    assert stamps[4] == [0, 1, 3, 4]  # 2 and 3 show the same
+    assert [len(each) for each in stamps] == [1, 2, 3, 4, 4, 4, 4, 4]
+    assert all(each[0] == 0 for each in stamps)
+    assert stamps[-1][-2:] == [6, 7]
+    assert [len(frame.in_view) > 0 for frame in splats.keyframes] == [False, False, False, True]
