@@ -9,6 +9,7 @@ import numpy as np
 from beamsplat.common.geometry.transforms import interpolate, transform_points
 
 RECENT_POSES = 200  # 20 s at 10 Hz
+_MAX_ENTITIES = 10_000  # whose time of drawing is kept
 REACH_NS = 500_000_000  # the first and last poses are held constant for this long outside the covered time
 
 
@@ -34,7 +35,10 @@ class RateLimit:
         last_ns = self._last_ns.get(kind + key)
         if last_ns is not None and 0 <= stamp_ns - last_ns < period_ns - period_ns // 10:
             return False
+        self._last_ns.pop(kind + key, None)  # the entity drawn longest ago is the first one
         self._last_ns[kind + key] = stamp_ns
+        if len(self._last_ns) > _MAX_ENTITIES:
+            del self._last_ns[next(iter(self._last_ns))]
         return True
 
 

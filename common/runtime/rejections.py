@@ -9,6 +9,7 @@ from beamsplat.common.messages import Message, Rejected
 from beamsplat.common.status import general_reason
 
 MOST_REASONS = 48  # per node; further ones are counted together
+MOST_REPORTED = 64  # limit of the field `rejected` of Health
 OTHER = "other reasons"
 _CHARS = 160
 # Topics whose messages have a status: anything but "ok" says that this result is missing.
@@ -36,10 +37,14 @@ class Rejections:
             self._counts[entry] += 1
 
     def set(self, reason: str, count: int) -> None:
-        """Set the number of inputs that were refused for a reason without numbers, counted elsewhere."""
-        if count:
-            with self._lock:
-                self._counts["", reason] = count
+        """Set the number of inputs that were refused for a reason, counted elsewhere.
+
+        The caller bounds the number of reasons; beyond `MOST_REPORTED` in all, further ones are ignored.
+        """
+        entry = ("", reason[:_CHARS])
+        with self._lock:
+            if count and (entry in self._counts or len(self._counts) < MOST_REPORTED):
+                self._counts[entry] = count
 
     def add_status(self, topic: str, message: Message) -> None:
         """Count a published message whose status is not "ok"."""

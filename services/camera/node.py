@@ -62,6 +62,9 @@ class CameraNode(Node):
         for checked in self._reader.images():
             uncalibrated = "" if self._rig is not None else "; NO CALIBRATION: set a rig file with rig = ..."
             self.detail = self._reader.status + uncalibrated
+            self.rejections.set("images overtaken by newer ones", self._reader.dropped)
+            for reason, count in self._reader.rejected.items():
+                self.rejections.set(f"images rejected: {reason}", count)
             if checked is None:
                 yield None
                 continue

@@ -210,6 +210,8 @@ class KeyframesNode(Node):
 
     def on_keyframes_candidate(self, candidate: KeyframeCandidate) -> Outputs:
         """Decide whether an image becomes a keyframe; without calibration, candidates are queued."""
+        if len(self._undecided) == _IMAGES:
+            self.rejections.add("candidates dropped: no calibration yet")
         self._undecided.append(candidate)
         yield from self._decide()
 
@@ -230,6 +232,8 @@ class KeyframesNode(Node):
     def on_fusion_depth(self, depth: FusedDepth) -> Outputs:
         """Store the depth of a selected image; if its depth was rejected, cancel the selection."""
         if depth.keyframe and depth.status == "ok":
+            if len(self._depths) == _IMAGES:
+                self.rejections.add("keyframes lost: no pose came for them")
             self._depths.append(depth)
         elif depth.keyframe and self._selector is not None:
             self._selector.withdraw()
@@ -280,6 +284,9 @@ class KeyframesNode(Node):
         image = next((p for p in self._images if p.stamp_ns == depth.stamp_ns), None)
         if image is None:
             log.warning("a keyframe is lost: its image arrived more than %d images ago", _IMAGES)
+            self.rejections.add(
+                "keyframes lost: their image was too old when their depth and pose were known"
+            )
             return
         try:
             frame = self._keyframe(image, depth, self._reasons.pop(depth.stamp_ns, ""))

@@ -45,6 +45,10 @@ class _LidarNode(Node, ABC):
         """Yield scans without end; None while no scan is complete."""
         for scan in self._reader.scans():
             self.detail = self._reader.status
+            counters = self._reader.driver.counters
+            self.rejections.set("revolutions dropped: too few measurements", counters.dropped_scans)
+            self.rejections.set("packets damaged", counters.bad_packets)
+            self.rejections.set("measurements missing or not plausible", counters.lost_samples)
             yield None if scan is None else SourceItem(None, "lidar/scan", self.message(scan))
 
     def message(self, scan: StampedScan) -> Scan:

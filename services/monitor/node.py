@@ -131,6 +131,7 @@ def _draw_safely(monitor: MonitorNode, view: str, draw: Draw, message: Any) -> t
         draw(getattr(monitor, view), monitor.panel, message)
     except ValueError as error:  # a valid message that cannot be drawn
         monitor.panel.log(str(error), message.stamp_ns, "WARN")
+        monitor.rejections.add(f"{type(message).__name__} not drawn: {error}")
     monitor.detail = monitor.writer.status
     return ()
 

@@ -24,6 +24,7 @@ PLOTS = {
     "rss_mb": "Memory [MB]",
     "cpu_percent": "CPU [%]",
 }
+_MAX_NODES = 1000  # of all robots, whose newest report is kept
 _STATES = {
     "configure": 0x9E9E9EFF, "standby": 0xFFC107FF, "active": 0x4CAF50FF,
     "drain": 0x00BCD4FF, "drained": 0x2196F3FF, "closed": 0x607D8BFF,
@@ -62,9 +63,11 @@ class HealthPanel:
 
     def report(self, new: NodeReport, stamp_ns: int | None) -> None:
         """Draw a report; `stamp_ns`: newest measurement time, None before the first measurement."""
-        old = self._reports.get(new.node)
+        old = self._reports.pop(new.node, None)  # the node that reported longest ago is the first one
         if old is None:
             self._declare_plots(new.node)
+        if len(self._reports) >= _MAX_NODES:
+            del self._reports[next(iter(self._reports))]
         if old is not None and old.instance != new.instance:
             self.log(f"{new.node} was restarted", stamp_ns, "WARN")
             old = None

@@ -90,8 +90,11 @@ def encode_depth(
     depth_m: np.ndarray,  # float32 [H, W], NaN = unknown
     widest_px: int,
 ) -> EncodedImage:
-    """Return a depth map [H, W] (m) as colour image, <= `widest_px` wide: near is red, unknown is black."""
-    stride = -(-depth_m.shape[1] // widest_px)
+    """Return a depth map [H, W] (m) as colour image: near is red, unknown is black.
+
+    Neither side is longer than `widest_px`.
+    """
+    stride = -(-max(depth_m.shape) // widest_px)
     small = depth_m[::stride, ::stride]
     near, far = _DEPTH_RANGE_M
     known = np.isfinite(small)

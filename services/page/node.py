@@ -162,6 +162,8 @@ class PageNode(Node):
             self._server.check()
             viewers = len(self._server.events)
             refused = "".join(f"; {n} {what}" for what, n in self._server.refused().items() if n)
+            for what, count in self._server.refused().items():
+                self.rejections.set(what, count)
             self.detail = (
                 f"open {self._address}; {viewers} {'viewer' if viewers == 1 else 'viewers'}{refused}"
             )

@@ -133,6 +133,7 @@ class PageState:
         """Return nodes, links, the status of the services, images and log, as data for JSON."""
         now = time.monotonic()
         with self._lock:
+            self._silent_nodes &= self._health.records.keys()
             for name, record in self._health.records.items():
                 if record.silent_s(now) and name not in self._silent_nodes:
                     self._silent_nodes.add(name)

@@ -156,6 +156,7 @@ class RecorderNode(_Handlers, Node):
         self._continue_if_possible()
         if self.writer is None:
             self.lost[topic] += 1
+            self.rejections.set("messages not recorded: the disk is full or broken", self.lost.total())
             return
         try:
             self.writer.write(topic, message, arrival_ns, header)

@@ -164,6 +164,8 @@ class UplinkNode(Node):
             if self._connected.health_dropped
             else ""
         )
+        self.rejections.set("health reports that were not forwarded", self._connected.health_dropped)
+        self.rejections.set("messages without a valid header, not forwarded", self._connected.undecodable)
         if self._connected.undecodable:
             cuts += f", {self._connected.undecodable} messages without a valid header not forwarded"
         self.detail = (

@@ -132,6 +132,9 @@ class LidarLocalization(Node):
     def on_wheel_odometry(self, odometry: WheelOdometry) -> Outputs:
         if self._slam is not None:
             self._slam.add_odometry(odometry.stamp_ns, *se3_to_se2(odometry.T_odom_body).tolist())
+            self.rejections.set(
+                "wheel odometry not newer than the last", self._slam.local_builder.odometry.rejected
+            )
         return iter(())
 
     def on_lidar_scan(self, scan: Scan) -> Outputs:
