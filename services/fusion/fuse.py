@@ -9,6 +9,7 @@ import numpy as np
 
 from beamsplat.common.geometry.beams import NO_BEAMS, project_beams
 from beamsplat.common.geometry.camera import Pinhole
+from beamsplat.common.geometry.depth_sigma import BETWEEN_KEYFRAMES, OF_KEYFRAMES, stated_sigma_log
 from beamsplat.services.fusion import upsample
 from beamsplat.services.fusion.input_checks import ImageCheck, check_beams
 from beamsplat.services.fusion.inputs import FusionInput, PlaneSweepConfig, SweepResult
@@ -16,15 +17,16 @@ from beamsplat.services.fusion.keyframe_depth import WarpedDepth
 from beamsplat.services.fusion.pairs import largest_cluster
 from beamsplat.services.fusion.plane_sweep import PlaneSweep
 from beamsplat.services.fusion.result import FusionResult, rejected
-from beamsplat.services.fusion.scaling import ScaleFit, as_depth, fit_scale
+from beamsplat.services.fusion.scaling import ScaleFit, as_depth, fit_scale, off_line_sigma
 from beamsplat.services.fusion.surfaces import CandidateSurfaces
 
-# Standard deviations of log depth by the evidence of a pixel, measured with `beamsplat eval depth` on the
-# recordings house_a and redkitchen.
+# Typical standard deviations of log depth by the evidence of a pixel, measured with `beamsplat eval depth` on
+# the recordings house_a and redkitchen. They leave out gross errors, see `stated_sigma_log`.
 _BEAM, _FLOOR, _SURFACE = 0.002, 0.004, 0.010
 _BETWEEN_BEAMS_M = 0.007  # standard deviation of the mean of two beams with 1 cm each
 _WARPED_SIGMA_LOG = (0.10, 0.06, 0.045)  # depth warped from one, two, three and more keyframes
 _UPRIGHT, _TILTING = 0.125, 0.13  # extruded walls without other evidence: level body, hand-held body
+_ESTIMATE_AWAY = 0.10  # estimate away from the scan line, where its error is not measured
 _BEAM_HEIGHT_M = 0.06  # pixels this near to the lidar plane have the depth of the beams
 _SAME_SURFACE = 0.08  # log depth: neighbours that differ by less belong to one surface
 _EDGE = 0.4  # share of a depth jump nearby that is added to sigma: the side of the edge is uncertain
@@ -80,7 +82,7 @@ class Fusion:
             )
             sigma_log = swept.spread
         self._sweep.keep(working)
-        return self._to_full_size(frame, swept, sigma_log, uv, z)
+        return self._to_full_size(frame, swept, sigma_log, uv, z, keyframe)
 
     def look(self, image_rgb: np.ndarray, T_map_body: np.ndarray) -> None:
         """Store an image for later plane sweeps, without estimating its depth."""
@@ -105,7 +107,7 @@ class Fusion:
             estimated = estimate.at_size(w, h)
             error = 2.0 * estimate.spread + 0.02
             take = np.isfinite(estimated) & (~np.isfinite(depth) | (spread > error))
-            depth[take], spread[take] = estimated[take], error
+            depth[take], spread[take] = estimated[take], np.hypot(error, _ESTIMATE_AWAY)
         known = warped.votes > 0
         depth[known] = warped.depth_m[known]
         spread[known] = np.array(_WARPED_SIGMA_LOG, np.float32)[np.minimum(warped.votes[known], 3) - 1]
@@ -170,14 +172,16 @@ class Fusion:
         return sure
 
     def _to_full_size(
-        self, frame: FusionInput, swept: SweepResult, sigma_log: np.ndarray, uv: np.ndarray, z: np.ndarray
-    ) -> FusionResult:
+        self, frame: FusionInput, swept: SweepResult, sigma_log: np.ndarray, uv: np.ndarray, z: np.ndarray,
+        keyframe: bool,
+    ) -> FusionResult:  # fmt: skip
         """Return the result at the image size, with scale, inlier share and residual (m) at the beams."""
         h, w = self._sweep.working_camera.shape
         depth = np.empty(self._sweep.camera.shape, np.float32)
         sigma = np.empty_like(depth)
         sigma_log = self._inflate_at_edges(swept.depth_m, sigma_log)
         known = np.where(self._known_mask(swept.depth_m, sigma_log), swept.depth_m, np.nan).astype(np.float32)
+        sigma_log = stated_sigma_log(sigma_log, OF_KEYFRAMES if keyframe else BETWEEN_KEYFRAMES)
         colour = cv2.resize(frame.image_rgb, (w, h), interpolation=cv2.INTER_AREA)
         upsample.upsample_depth(known, sigma_log, colour, frame.image_rgb, _SAME_SURFACE, depth, sigma)
         H, W = depth.shape
@@ -199,5 +203,6 @@ class Fusion:
         if frame.estimate is not None and frame.estimate_kind != "none":
             scale = fit_scale(as_depth(frame.estimate, frame.estimate_kind), uv, z)
         if not isinstance(scale, ScaleFit):
-            return replace(result, scale=1.0, scale_sigma=float(np.std(log_ratio) / np.sqrt(max(len(z), 1))))
-        return replace(result, scale=scale.alpha, scale_sigma=scale.sigma)
+            spread = float(np.std(log_ratio)) if len(log_ratio) else 0.0
+            return replace(result, scale=1.0, scale_sigma=off_line_sigma(spread))
+        return replace(result, scale=scale.alpha, scale_sigma=scale.image_sigma)

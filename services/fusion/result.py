@@ -12,10 +12,10 @@ class FusionResult:
     """Metric depth of one image with its standard deviation. All depth is NaN unless `status` is "ok"."""
 
     depth_m: np.ndarray  # float32 [H, W] optical z, NaN = unknown
-    sigma_m: np.ndarray  # float32 [H, W] standard deviation, NaN where depth is NaN
+    sigma_m: np.ndarray  # float32 [H, W] standard deviation with gross errors, NaN where depth is NaN
     status: str = "ok"  # else the reason why there is no depth
     scale: float = float("nan")  # metres per unit of the depth estimate (alpha of the paper)
-    scale_sigma: float = float("nan")  # its standard error
+    scale_sigma: float = float("nan")  # its standard deviation, as the scale of the whole image
     inlier_share: float = 0.0  # share of the pairs that agree with the result
     residual_m: float = float("nan")  # median |error| at the pairs after correction
     pairs: int = 0

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
 
 from beamsplat.common.geometry.beams import project_beams
 from beamsplat.common.geometry.camera import Pinhole
+from beamsplat.common.geometry.depth_sigma import OF_KEYFRAMES, stated_sigma_log
 from beamsplat.services.fusion.input_checks import ImageCheck
 from beamsplat.services.fusion.inputs import FusionInput
 from beamsplat.services.fusion.result import FusionResult, rejected
 from beamsplat.services.fusion.scaling import affine, as_depth, ratio
 
 SingleMethod = Literal["ratio", "affine", "given"]
-_GIVEN_SIGMA = 0.3  # relative sigma of an estimate that nothing has checked
+_GIVEN_SIGMA = 0.3  # typical relative sigma of an estimate that nothing has checked
 
 
 class SingleImageFusion:
@@ -39,7 +41,12 @@ class SingleImageFusion:
             return rejected(self._camera.shape, "there is no depth estimate")
         if self._method == "given":
             depth = as_depth(frame.estimate, frame.estimate_kind).astype(np.float32)
-            return FusionResult(depth, np.float32(_GIVEN_SIGMA) * depth, scale=1.0)
+            return _with_gross_errors(FusionResult(depth, np.float32(_GIVEN_SIGMA) * depth, scale=1.0))
         uv, z, _ = project_beams(frame.beams, self._camera, self._T_body_camera)
         correct = ratio if self._method == "ratio" else affine
-        return correct(frame.estimate, frame.estimate_kind, uv, z)
+        return _with_gross_errors(correct(frame.estimate, frame.estimate_kind, uv, z))
+
+
+def _with_gross_errors(result: FusionResult) -> FusionResult:
+    typical = result.sigma_m / result.depth_m
+    return replace(result, sigma_m=result.depth_m * stated_sigma_log(typical, OF_KEYFRAMES))

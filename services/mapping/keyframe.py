@@ -32,7 +32,7 @@ class RgbdKeyframe:
     camera: RasterCamera
     T_anchor_camera: np.ndarray
     depth_m: np.ndarray  # float32 [H, W] optical z, NaN unknown
-    sigma_m: np.ndarray  # float32 [H, W] standard deviation
+    sigma_m: np.ndarray  # float32 [H, W] standard deviation without gross errors, see `typical_sigma_m`
     anchor: int = 0
     # Lidar returns [N, 3]: px, px, optical z in m.
     beams_uvz: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))

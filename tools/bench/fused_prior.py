@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from beamsplat.common.geometry.beams import Beams
+from beamsplat.common.geometry.depth_sigma import typical_sigma_m
 from beamsplat.common.geometry.transforms import inverse, transform_points
 from beamsplat.services.depth.source import DepthInput, DepthSource, make_source
 from beamsplat.services.fusion.free_space import FreeSpaceGrid
@@ -34,7 +35,7 @@ class FusedDepthPrior:
     def __call__(self, recording: TruthDataset, index: int) -> tuple[np.ndarray, np.ndarray] | None:
         """Return (depth_m, sigma_m) float32 [H, W] of image `index`: optical z and its standard deviation.
 
-        None if fusion rejects the image.
+        As the mapper decodes keyframes, it is without gross errors. None if fusion rejects the image.
         """
         T_camera_body = inverse(recording.T_body_camera)
         if self._fusion is None or index < self._next:
@@ -55,7 +56,7 @@ class FusedDepthPrior:
                 self._fusion.look(recording.image(number), T_map_body)
         self._next = index + 1
         fused = self._fusion.fuse(self._frame(recording, index, T_map_body), keyframe=True)
-        return (fused.depth_m, fused.sigma_m) if fused.ok else None
+        return (fused.depth_m, typical_sigma_m(fused.depth_m, fused.sigma_m)) if fused.ok else None
 
     def _frame(self, recording: TruthDataset, index: int, T_map_body: np.ndarray) -> FusionInput:
         posed_image, rgb = recording.posed_images[index], recording.image(index)
