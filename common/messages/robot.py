@@ -197,11 +197,11 @@ class FusedDepth(Message):
     """
 
     depth_m: Annotated[np.ndarray, Array("float32", "H", "W")]  # optical z, NaN = unknown
-    sigma_m: Annotated[np.ndarray, Array("float32", "H", "W")]  # standard deviation of depth_m
+    sigma_m: Annotated[np.ndarray, Array("float32", "H", "W")]  # standard deviation, with gross errors
     status: Text = "ok"  # or why there is no depth
     keyframe: bool = False  # whether the image is a keyframe
     scale: float = float("nan")  # metres per unit of the estimate (the paper's alpha)
-    scale_sigma: float = float("nan")  # standard error of the scale
+    scale_sigma: float = float("nan")  # standard deviation of the scale, as that of the whole image
     inlier_share: NonNegative = 0.0  # fraction of the pairs that support the fit
     residual_m: float = float("nan")  # of the inliers
     pairs: Count = 0  # pairs of a beam and a depth pixel
