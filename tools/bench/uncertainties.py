@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import tempfile
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,8 @@ import numpy as np
 
 from beamsplat.common.geometry.trajectory import Trajectory, read_tum, write_tum
 from beamsplat.common.geometry.transforms import se2_to_se3, se3_to_se2, so3_log
-from beamsplat.services.fusion.calibration.motion import PARAMETERS
+from beamsplat.services.fusion.calibration.motion import PARAMETERS, apply_correction
+from beamsplat.services.fusion.calibration.startup_check import CalibrationHealth, StartupCheck
 from beamsplat.services.localization.lidar2d import se2
 from beamsplat.services.localization.lidar2d.job_runner import JobRunner
 from beamsplat.services.localization.lidar2d.motion_covariance import SPAN_NS
@@ -21,9 +22,10 @@ from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
 from beamsplat.services.localization.lidar2d.slam import LidarSlam, ScanResult
 from beamsplat.services.replay.options import SourceOptions
 from beamsplat.services.replay.source import open_source
+from beamsplat.tools.bench.depth_uncertainties import BANDS_M, DEPTHS, depth_samples
 from beamsplat.tools.bench.slam import recordings_in
-from beamsplat.tools.evaluation.calibrate import calibrate_motion
-from beamsplat.tools.evaluation.drive import open_drive
+from beamsplat.tools.evaluation.calibrate import calibrate_motion, with_clock_offset
+from beamsplat.tools.evaluation.drive import RecordedDrive, open_drive
 
 MOTION = ("motion in 1 s, forward", "motion in 1 s, left", "motion in 1 s, yaw")
 _UNITS = {"clock_s": ("ms", 1e3), "x_m": ("mm", 1e3), "y_m": ("mm", 1e3)}
@@ -55,8 +57,10 @@ def bench_uncertainties(folder: Path, log: Callable[[str], None]) -> list[dict[s
     """Return a row for each stated uncertainty: samples, RMS error, mean sigma, normalised error.
 
     The motion over one second has a sample per scan; a calibration has one sample per recording and
-    parameter, if the parameter is observable. Recordings with relations instead of a trajectory are left out:
-    their truth is less accurate than the motion of one second.
+    parameter, if the parameter is observable; depth has a sample per pixel of a grid, if the recording has
+    true depth. Depth is fused with the true calibration, because its sigma does not include a wrong one.
+    Recordings with relations instead of a trajectory are left out: their truth is less accurate than the
+    motion of one second.
 
     Args:
         folder: see `recordings_in`. The file camera.json beside a bag names the true mount of the camera and
@@ -64,7 +68,8 @@ def bench_uncertainties(folder: Path, log: Callable[[str], None]) -> list[dict[s
         log: receives progress messages.
     """
     motion: list[tuple[np.ndarray, np.ndarray]] = []
-    mounts: dict[str, list[tuple[float, float]]] = {name: [] for name in PARAMETERS}
+    calibrations: dict[str, list[tuple[float, float]]] = {}
+    depths: dict[str, list[np.ndarray]] = {}
     for name, bag, truth in recordings_in(folder):
         if truth[0] != "--groundtruth":
             log(f"{name}: left out, it has relations and no trajectory")
@@ -72,19 +77,42 @@ def bench_uncertainties(folder: Path, log: Callable[[str], None]) -> list[dict[s
         log(f"{name} ...")
         results, trajectory, has_camera = map_recording(bag)
         motion.append(motion_samples(results, read_tum(Path(truth[1]))))
-        if has_camera:
-            for parameter, sample in _mount_samples(bag, trajectory).items():
-                mounts[parameter].append(sample)
-    rows = []
+        if not has_camera:
+            continue
+        drive = _open_drive(bag, trajectory)
+        true_values = _true_corrections(bag, drive)
+        for check, samples in (
+            ("camera", _mount_samples(drive, true_values)),
+            ("start-up check,", _startup_samples(drive, results, true_values)),
+        ):
+            for parameter, sample in samples.items():
+                calibrations.setdefault(f"{check} {parameter}", []).append(sample)
+        if (bag.parent / "depth_gt").is_dir():
+            offset_ns = round(true_values[0] * 1e9)
+            right = replace(
+                with_clock_offset(drive, offset_ns),
+                poses=_odom(results), T_body_camera=apply_correction(drive.T_body_camera, true_values),
+            )  # fmt: skip
+            for method, rows in depth_samples(right, bag.parent, offset_ns).items():
+                depths.setdefault(method, []).append(rows)
+    table = []
     if motion:
         errors, sigmas = (np.concatenate(parts) for parts in zip(*motion))
         for k, (quantity, unit) in enumerate(zip(MOTION, (("mm", 1e3), ("mm", 1e3), _ANGLE))):
-            rows.append(StatedErrors(errors[:, k], sigmas[:, k]).row(quantity, *unit))
-    for parameter, samples in mounts.items():
-        if samples:
-            quantity = f"camera {parameter.rsplit('_', 1)[0]}"
-            rows.append(StatedErrors(*np.array(samples).T).row(quantity, *_UNITS.get(parameter, _ANGLE)))
-    return rows
+            table.append(StatedErrors(errors[:, k], sigmas[:, k]).row(quantity, *unit))
+    for quantity, pairs in calibrations.items():
+        name, parameter = quantity.rsplit(" ", 1)
+        unit = _UNITS.get(parameter, _ANGLE)
+        stated = StatedErrors(*np.array(pairs).T)
+        table.append(stated.row(f"{name} {parameter.rsplit('_', 1)[0]}", *unit))
+    for method, groups in depths.items():
+        rows = np.concatenate(groups)
+        for nearest, farthest in BANDS_M:
+            chosen = rows[(rows[:, 0] >= nearest) & (rows[:, 0] < farthest)]
+            if len(chosen):
+                quantity = f"{DEPTHS[method]}, {nearest:g} to {farthest:g} m"
+                table.append(StatedErrors(chosen[:, 1], chosen[:, 2]).row(quantity, "mm", 1e3))
+    return table
 
 
 def map_recording(bag: Path) -> tuple[list[ScanResult], Trajectory, bool]:
@@ -141,13 +169,21 @@ def motion_samples(results: list[ScanResult], truth: Trajectory) -> tuple[np.nda
     return np.array(errors).reshape(-1, 3), np.array(sigmas).reshape(-1, 3)
 
 
-def _mount_samples(bag: Path, trajectory: Trajectory) -> dict[str, tuple[float, float]]:
-    """Return (error, sigma) of each observable parameter of `PARAMETERS`, in its unit there."""
+def _odom(results: list[ScanResult]) -> Trajectory:
+    good = [r for r in results if r.status == "ok"]
+    stamps_ns = np.array([r.stamp_ns for r in good], dtype=np.int64)
+    return Trajectory(stamps_ns, se2_to_se3(np.array([r.pose_odom_body for r in good])))
+
+
+def _open_drive(bag: Path, trajectory: Trajectory) -> RecordedDrive:
     with tempfile.TemporaryDirectory() as folder:
         poses = Path(folder) / "trajectory.tum"
         write_tum(poses, trajectory, "T_map_body")
-        drive = open_drive(bag, poses)
-    found = calibrate_motion(drive)
+        return open_drive(bag, poses)
+
+
+def _true_corrections(bag: Path, drive: RecordedDrive) -> np.ndarray:
+    """Return the true corrections float64 [6] of the calibration in the bag, as `PARAMETERS`."""
     true_values = np.zeros(len(PARAMETERS))
     description = bag.parent / "camera.json"
     if description.is_file():
@@ -156,6 +192,12 @@ def _mount_samples(bag: Path, trajectory: Trajectory) -> dict[str, tuple[float, 
         true_values[0] = -1e-3 * text.get("camera_clock_offset_ms", 0.0)
         true_values[1:4] = so3_log(T_true[:3, :3] @ drive.T_body_camera[:3, :3].T)
         true_values[4:6] = (T_true - drive.T_body_camera)[:2, 3]
+    return true_values
+
+
+def _mount_samples(drive: RecordedDrive, true_values: np.ndarray) -> dict[str, tuple[float, float]]:
+    """Return (error, sigma) of each observable parameter of `PARAMETERS`, in its unit there."""
+    found = calibrate_motion(drive)
     return {
         name: (float(value - true), float(sigma))
         for name, value, true, sigma, sure in zip(
@@ -163,3 +205,37 @@ def _mount_samples(bag: Path, trajectory: Trajectory) -> dict[str, tuple[float, 
         )
         if sure
     }
+
+
+def _startup_samples(
+    drive: RecordedDrive, results: list[ScanResult], true_values: np.ndarray
+) -> dict[str, tuple[float, float]]:
+    """Return (error, sigma) of each parameter that the check at the start observes, as `_mount_samples`."""
+    health = _startup_health(drive, results)
+    if health is None:
+        return {}
+    values = np.array([1e-3 * health.clock_ms, *np.radians(health.turn_deg)])
+    sigmas = np.array([1e-3 * health.clock_sigma_ms, *np.radians(health.turn_sigma_deg)])
+    return {
+        name: (float(value - true), float(sigma))
+        for name, value, true, sigma in zip(PARAMETERS[:4], values, true_values[:4], sigmas)
+        if np.isfinite(value)
+    }
+
+
+def _startup_health(drive: RecordedDrive, results: list[ScanResult]) -> CalibrationHealth | None:
+    """Run the check at the start on the poses in odom; None if the drive is too short for it."""
+    check = StartupCheck(drive.undistort.pinhole, drive.T_body_camera, drive.T_body_lidar)
+    odom = _odom(results)
+    number = 0
+    for stamp_ns, T_odom_body in zip(odom.stamps_ns.tolist(), odom.T_a_b):
+        check.add_pose(stamp_ns, T_odom_body)
+        job = check.job()
+        if job is not None:
+            return job()
+        while number < len(drive.images) and drive.images[number].stamp_ns <= stamp_ns:
+            T_image = odom.at(drive.images[number].stamp_ns)
+            if T_image is not None:
+                check.add_image(drive.images[number].stamp_ns, drive.rgb(number), T_image)
+            number += 1
+    return None

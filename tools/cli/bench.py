@@ -86,7 +86,7 @@ def uncertainties(
     ],
     as_json: JsonOption = False,
 ) -> None:
-    """Compare stated standard deviations (localization, calibration of the camera) with true errors.
+    """Compare stated standard deviations (localization, calibration of the camera, depth) with true errors.
 
     The normalised error is the RMS of error / stated standard deviation: 1 is honest, more is too optimistic.
 
