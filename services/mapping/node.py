@@ -111,9 +111,7 @@ class MappingNode(Node):
     def take_over(self) -> None:
         """Open the session, if one is configured, and load the map from the session."""
         if self.config.session is not None:
-            self._session = LiveSession(
-                self.config, self._intake, resume_known=self.in_standby, report=self._report_progress
-            )
+            self._session = LiveSession(self.config, self._intake, self._report_progress)
             keyframes = len(self._intake.stored())
             self.detail = f"resumed with {keyframes} keyframes" if keyframes else ""
 
@@ -135,8 +133,6 @@ class MappingNode(Node):
 
     def on_keyframes_frame(self, message: Keyframe) -> Outputs:
         """Insert a keyframe, optimise a fixed number of steps, publish preview, status and chunk."""
-        if self._session.handled_before(message.id):
-            return
         acknowledged = self._session.start(message.id)
         known = self._mapper.was_inserted(message.id)
         load_visible = self._session.load_visible
@@ -189,13 +185,13 @@ class MappingNode(Node):
 
     def on_tick(self, tick: Tick) -> Outputs:
         """Refine the map (or insert a skipped keyframe), and publish the due chunk that is oldest."""
-        if not self._mapper.keyframes:
-            return
         if self._session.has_skipped:
             yield from self._skipped()
-        else:
+        elif self._mapper.keyframes:
             self._mapper.refine(self.config.tick_steps, FULL)
             self._session.keep_budget()
+        if not self._mapper.keyframes:
+            return
         oldest = self._feed.oldest_due(self._mapper, self._viewpoint)
         if oldest is not None:
             yield from self._chunk(oldest, tick.stamp_ns)

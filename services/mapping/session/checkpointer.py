@@ -83,7 +83,7 @@ class Checkpointer:
 
         Returns:
             The `extra` arrays that were passed to `checkpoint`, and the ids of keyframes on disk that are
-            newer than the checkpoint: the caller inserts them.
+            newer than the checkpoint, which the caller has to insert.
 
         Raises:
             UserError: there is a checkpoint, but it cannot be read.

@@ -7,7 +7,6 @@ the session.
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable
 
 from beamsplat.services.mapping.session.checkpointer import Checkpointer
@@ -18,13 +17,13 @@ class Inbox:
 
     `accept` runs on the receiving thread, all other methods on the mapping thread. The mailbox of the node is
     smaller than the inbox and drops its oldest messages. Keyframes dropped there are *skipped*: they are read
-    back from the disk later.
+    back from the disk later. So are keyframes that an earlier process has left there.
     """
 
     def __init__(self, checkpointer: Checkpointer) -> None:
         self._checkpointer = checkpointer
         self._waiting: dict[int, None] = {}  # in order of arrival
-        self._skipped: deque[int] = deque()
+        self._skipped: dict[int, None] = {}  # oldest first
         self._read: int | None = None  # read from the disk, and being processed now
 
     def accept(self, id: int, known: bool, body: Callable[[], tuple[str, bytes]]) -> bool:
@@ -47,13 +46,16 @@ class Inbox:
 
         Keyframes that arrived before it and still wait were dropped by the mailbox: they become skipped.
         """
+        if id in self._skipped:  # left by an earlier process, and also in this one's mailbox
+            del self._skipped[id]
+            return True
         if id not in self._waiting:
             return id == self._read
         for other in list(self._waiting):
             del self._waiting[other]
             if other == id:
                 return True
-            self._skipped.append(other)
+            self._skipped[other] = None
         return True
 
     def __len__(self) -> int:
@@ -69,10 +71,15 @@ class Inbox:
         """Remove and return the id of the oldest skipped keyframe; None without any."""
         if not self._skipped:
             return None
-        self._read = self._skipped.popleft()
+        self._read = next(iter(self._skipped))
+        del self._skipped[self._read]
         return self._read
+
+    def skip(self, ids: list[int]) -> None:
+        """Add keyframes on disk that an earlier process has not processed, oldest first."""
+        self._skipped.update(dict.fromkeys(ids))
 
     def skip_waiting(self) -> None:
         """Mark all waiting keyframes as skipped: after the end of the stream, the mailbox is empty."""
-        self._skipped.extend(self._waiting)
+        self._skipped.update(self._waiting)
         self._waiting.clear()

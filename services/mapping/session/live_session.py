@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import math
 from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Protocol
@@ -40,9 +39,6 @@ class MapSession(Protocol):
 
     def start(self, id: int) -> bool:
         """Start processing a keyframe; return whether it was already acknowledged on reception."""
-
-    def handled_before(self, id: int) -> bool:
-        """Return whether a keyframe was inserted from disk when the session was opened; True once per id."""
 
     def store(self, message: Keyframe, known: bool) -> bool:
         """Write an inserted keyframe to disk, unless `known` and on disk; return False if writing failed.
@@ -112,9 +108,6 @@ class NoSession:
     def start(self, id: int) -> bool:
         return False
 
-    def handled_before(self, id: int) -> bool:
-        return False
-
     def store(self, message: Keyframe, known: bool) -> bool:
         return True
 
@@ -147,19 +140,11 @@ class NoSession:
 class LiveSession:
     """A `MapSession` in a folder on disk."""
 
-    def __init__(
-        self,
-        config: MappingConfig,
-        intake: KeyframeIntake,
-        *,
-        resume_known: bool,
-        report: Callable[[str], None],
-    ) -> None:
+    def __init__(self, config: MappingConfig, intake: KeyframeIntake, report: Callable[[str], None]) -> None:
         """Open the session and resume from its last checkpoint.
 
-        With `resume_known`, a predecessor process has acknowledged the keyframes that are newer than the
-        checkpoint; they also wait in this process's mailbox and are skipped there. `report` is called with
-        the progress as text; what it raises ends the opening.
+        Keyframes on disk that are newer than the checkpoint wait in the inbox. `report` is called with the
+        progress as text; what it raises ends the opening.
 
         Raises:
             UserError: the folder cannot be written, is locked by another process, or cannot be read.
@@ -172,20 +157,14 @@ class LiveSession:
         self.load_visible: LoadVisible | None = lambda keyframe: self._checkpointer.load_visible(
             self._mapper, keyframe
         )
-        self._resumed: set[int] = set()
+        self._inbox = Inbox(self._checkpointer)
         try:
-            self._resume(resume_known, config, report)
+            self._resume(report)
         except BaseException:
             self._checkpointer.close()
             raise
-        self._inbox = Inbox(self._checkpointer)
 
-    def _resume(self, resume_known: bool, config: MappingConfig, report: Callable[[str], None]) -> None:
-        """Restore the checkpoint, then insert the keyframes that arrived after it.
-
-        All of them together get at most the steps of `calm_backlog` keyframes: until this is done, newer
-        keyframes wait. Later steps make up for it.
-        """
+    def _resume(self, report: Callable[[str], None]) -> None:
         c, m = self._checkpointer, self._mapper
         undistorter = self._intake.undistorter
         extra, newer = c.resume(
@@ -194,39 +173,17 @@ class LiveSession:
             report,
         )
         self._intake.restore(extra)
-        if resume_known:
-            self._resumed = set(newer)
-        share = min(config.calm_backlog / max(len(newer), 1), 1.0)
-        for number, id in enumerate(newer, 1):
-            report(f"resuming: keyframe {number} of {len(newer)} newer than the checkpoint")
-            message = self._read_message(id)
-            if message is None:
-                continue
-            c.start_period(message.stamp_ns)  # a process that is killed repeatedly still reaches a checkpoint
-            outcome = self._intake.insert(message, self.load_visible)
-            if outcome.ok:
-                m.optimise(math.ceil(config.half_steps * share), math.ceil(config.full_steps * share))
-            else:
-                self._intake.reject(id, outcome.status)
-                self.remove(id)
-        if m.keyframes:
-            log.info("resumed with %d keyframes (%d newer than the checkpoint), %d Gaussians, step %d",
-                     len(m.keyframes), len(newer), m.store.count, m.steps)  # fmt: skip
+        self._inbox.skip(newer)
+        if m.keyframes or newer:
+            log.info("resumed with %d keyframes, %d Gaussians, step %d; %d newer keyframes wait",
+                     len(m.keyframes), m.store.count, m.steps, len(newer))  # fmt: skip
 
     def accept(self, message: Keyframe) -> bool:
-        if message.id in self._resumed:
-            return False
         known = self._intake.knows(message.id)
         return self._inbox.accept(message.id, known, lambda: encode_keyframe(message))
 
     def start(self, id: int) -> bool:
         return self._inbox.start(id)
-
-    def handled_before(self, id: int) -> bool:
-        if id not in self._resumed:
-            return False
-        self._resumed.discard(id)
-        return True
 
     def store(self, message: Keyframe, known: bool) -> bool:
         if known and not self._checkpointer.is_unwritten(message.id):

@@ -3,7 +3,7 @@
 import numpy as np
 
 from beamsplat.common.geometry.transforms import inverse
-from beamsplat.common.messages import Keyframe
+from beamsplat.common.messages import Keyframe, Tick
 from beamsplat.common.messages.depth_png import depth_to_png, sigma_to_png
 from beamsplat.services.mapping.config import MappingConfig
 from beamsplat.services.mapping.node import MappingNode
@@ -42,6 +42,13 @@ def feed(node, numbers):
     for number in numbers:
         handle(node, "keyframes/frame", message(number), sent)
     return sent
+
+
+def insert_waiting(node):
+    """Let a resumed node insert the keyframes on disk that are newer than its checkpoint; return the node."""
+    while node._session.has_skipped:
+        handle(node, "tick", Tick(stamp_ns=1, count=1))
+    return node
 
 
 def handle(node, topic, content, sent=None):
