@@ -285,7 +285,7 @@ class KeyframesNode(Node):
         if image is None:
             log.warning("a keyframe is lost: its image arrived more than %d images ago", _IMAGES)
             self.rejections.add(
-                "keyframes lost: their image was too old when their depth and pose were known"
+                "keyframes lost: their image was too old"
             )
             return
         try:

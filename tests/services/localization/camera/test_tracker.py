@@ -249,17 +249,9 @@ def test_the_keyframes_of_the_map_are_bounded_and_the_most_similar_ones_are_drop
         T = body(0.0, 0.0, turn)
         rgb, z = render_view(T)
         planes = np.ascontiguousarray(rgb.transpose(2, 0, 1)).astype(np.float32) / 255
-        splats.add(
-            MapKeyframe(
-                number,
-                T @ T_BODY_CAMERA,
-                planes,
-                z,
-                np.ones_like(z),
-                np.zeros(0, np.int32),
-                thumbnail(rgb.mean(axis=2).astype(np.float32)),
-            )  # fmt: skip
-        )
+        small = thumbnail(rgb.mean(axis=2).astype(np.float32))
+        weight, in_view = np.ones_like(z), np.zeros(0, np.int32)
+        splats.add(MapKeyframe(number, T @ T_BODY_CAMERA, planes, z, weight, in_view, small))
         stamps.append([frame.stamp_ns for frame in splats.keyframes])
     splats.close()
     assert stamps[4] == [0, 1, 3, 4]  # 2 and 3 show the same
