@@ -112,7 +112,8 @@ def _vertex_fields(lines: list[str]) -> tuple[list[tuple[str, str]], int]:
     """
     if "format binary_little_endian 1.0" not in lines:
         raise ValueError("expected a binary little-endian PLY")
-    element, fields, count = "", [], 0
+    element, count = "", 0
+    fields: list[tuple[str, str]] = []
     for words in map(str.split, lines):
         if words[:1] == ["element"]:
             if len(words) != 3 or not (words[2].isascii() and words[2].isdigit()) or len(words[2]) > 18:

@@ -284,9 +284,7 @@ class KeyframesNode(Node):
         image = next((p for p in self._images if p.stamp_ns == depth.stamp_ns), None)
         if image is None:
             log.warning("a keyframe is lost: its image arrived more than %d images ago", _IMAGES)
-            self.rejections.add(
-                "keyframes lost: their image was too old"
-            )
+            self.rejections.add("keyframes lost: their image was too old")
             return
         try:
             frame = self._keyframe(image, depth, self._reasons.pop(depth.stamp_ns, ""))
