@@ -121,8 +121,17 @@ class MapLayer:
                     self._writer.log(f"plots/{name}", label, static=True)
                 self._writer.log(f"plots/{name}", rr.Scalars(value), stamp_ns=stamp_ns)
 
-    def finish(self) -> None:
-        """Draw the chunk revisions that were delayed by the rate limit."""
+    def finish(self) -> list[str]:
+        """Draw the chunk revisions that were delayed by the rate limit.
+
+        Returns:
+            The faults of the chunks that are no packed Gaussians.
+        """
+        faults = []
         for anchor, chunk in self._deferred.items():
-            self._draw(anchor, chunk)
+            try:
+                self._draw(anchor, chunk)
+            except ValueError as error:
+                faults.append(str(error))
         self._deferred.clear()
+        return faults

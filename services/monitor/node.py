@@ -130,8 +130,7 @@ def _draw_safely(monitor: MonitorNode, view: str, draw: Draw, message: Any) -> t
     try:
         draw(getattr(monitor, view), monitor.panel, message)
     except ValueError as error:  # a valid message that cannot be drawn
-        monitor.panel.log(str(error), message.stamp_ns, "WARN")
-        monitor.rejections.add(f"{type(message).__name__} not drawn: {error}")
+        monitor._not_drawn(type(message).__name__, str(error), message.stamp_ns)
     monitor.detail = monitor.writer.status
     return ()
 
@@ -209,6 +208,11 @@ class MonitorNode(_Handlers, Node):
     def on_header(self, header: Header) -> None:
         self._header = header
 
+    def _not_drawn(self, kind: str, fault: str, stamp_ns: int | None) -> None:
+        """Log and count a message that decodes, but cannot be drawn."""
+        self.panel.log(fault, stamp_ns, "WARN")
+        self.rejections.add(f"{kind} not drawn: {fault}")
+
     def on_mapping_chunk(self, message: MapChunk) -> tuple[Output, ...]:
         """Draw a chunk; the header tells which process of the mapper has sent it."""
         assert self._header is not None  # runners pass it before each message
@@ -236,7 +240,8 @@ class MonitorNode(_Handlers, Node):
 
     def drain(self) -> tuple[Output, ...]:
         self.scene.finish()
-        self.map_layer.finish()
+        for fault in self.map_layer.finish():
+            self._not_drawn("MapChunk", fault, self.scene.newest_ns)
         self.writer.flush()
         return ()
 

@@ -7,24 +7,33 @@ import warnings
 import numpy as np
 import pytest
 
-from beamsplat.common.messages import CameraModel, Image, Message, Odometry, Rig, Scan, WheelOdometry
+from beamsplat.common.messages import (
+    CameraModel,
+    FusedDepth,
+    Image,
+    Message,
+    Odometry,
+    Rig,
+    Scan,
+    WheelOdometry,
+)
 from beamsplat.common.messages.header import Header
-from beamsplat.common.runtime.node import Job, subscriptions
-from beamsplat.common.runtime.registry import make_node
+from beamsplat.common.runtime.node import subscriptions
 from beamsplat.common.topics import topic
-from beamsplat.services.nodes import NODES
+from beamsplat.services.page.events import as_json
+from beamsplat.services.page.node import PageNode
 from tests.common.messages.random_messages import random_message
-from tests.services.test_bounded_memory import KINDS, OPTIONS, RIG, step
+from tests.services.test_bounded_memory import KINDS, RIG, Player, make, step
 
 _STAMPS = (0, 1, 10**18, 10**18 + 10**8, 2**62 - 1)
 
 
 @pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize(("service", "kind"), KINDS)
-def test_random_messages_do_not_end_a_node(service, kind, seed):
+def test_random_messages_do_not_end_a_node(service, kind, seed, tmp_path, router_endpoint):
     rng = np.random.default_rng(seed)
-    node = make_node(NODES[service], {"kind": kind, **OPTIONS.get((service, kind), {})}, "test")
-    node.configure()
+    node = make(service, kind, tmp_path, router_endpoint)
+    player = Player(node)
     topics = [entry.topic for entry in subscriptions(type(node))]
     usual = [
         (name, make())
@@ -41,11 +50,15 @@ def test_random_messages_do_not_end_a_node(service, kind, seed):
                     message = RIG if rng.random() < 0.5 else _random_rig(rng)
                 else:
                     message = _message(name, usual, rng)
-                node.on_header(Header(message.stamp_ns, 0, 0, 0, 0, name.partition("/")[0], "0" * 16))
-                for output in node.handle(name, message):
-                    if isinstance(output, Job):
-                        list(node.handle_job(output.name, output.run()))
-            list(node.handle_drain())
+                player.send(
+                    name, message, Header(message.stamp_ns, 0, 0, 0, 0, name.partition("/")[0], "0" * 16)
+                )
+                if isinstance(node, PageNode):  # what its server does for an open page
+                    for image in node._state.images.values():
+                        image.encode_newest()
+                    for data in (node._state.status(), node._state.robot(), node._state.path()):
+                        as_json(data)
+            player.end()
         finally:
             node.close()
 
@@ -84,6 +97,19 @@ def _message(name: str, usual: list[tuple[str, Message]], rng: np.random.Generat
         return cls(**fields)
     except ValueError:  # refused by the message itself
         return message
+
+
+@pytest.mark.parametrize("shape", [(70_000, 1), (1, 70_000), (0, 5)])
+def test_the_page_shows_a_depth_map_of_any_shape(shape, tmp_path, router_endpoint):
+    node = make("page", "default", tmp_path, router_endpoint)
+    try:
+        depth = np.ones(shape, np.float32)
+        list(
+            node.on_fusion_depth(FusedDepth(stamp_ns=1, depth_m=depth, sigma_m=depth, T_odom_body=np.eye(4)))
+        )
+        node._state.images["depth"].encode_newest()
+    finally:
+        node.close()
 
 
 POSE = {"T_odom_body": np.eye(4), "covariance": np.eye(3)}

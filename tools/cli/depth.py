@@ -122,7 +122,7 @@ def depth(
         task = bar.add_task("images", total=None)
         count, refused, useful = 0, Rejections(), 0
         for count, (status, total) in enumerate(
-            draw_depth_panels(drive, chosen, truth, every, out, floor), start=1
+            draw_depth_panels(drive, chosen, truth, every, out, floor, refused.add), start=1
         ):
             bar.update(task, completed=count, total=total)
             useful += status == "ok"

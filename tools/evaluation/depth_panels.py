@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import cv2
@@ -21,7 +21,13 @@ _SIGMA_RANGE_M = (0.005, 2.0)  # colour range of sigma
 
 
 def draw_depth_panels(
-    drive: RecordedDrive, source: DepthSource, truth: Path | None, every: int, out: Path, floor: bool | None
+    drive: RecordedDrive,
+    source: DepthSource,
+    truth: Path | None,
+    every: int,
+    out: Path,
+    floor: bool | None,
+    refuse: Callable[[str], None],
 ) -> Iterator[tuple[str, int]]:
     """Write a panel of every n-th image as PNG; yield (status of its depth, number of panels) for each.
 
@@ -30,11 +36,12 @@ def draw_depth_panels(
         every: n.
         out: folder of the panels.
         floor: whether the camera's height above the floor is known; None: if the poses are planar.
+        refuse: receives the reason for each image that cannot be decoded.
     """
     files = truth_depth_files(truth) if truth is not None else {}
     chosen = [image.stamp_ns for image in drive.images if not files or image.stamp_ns in files][::every]
     wanted: dict[int, Path | None] = {stamp: files.get(stamp) for stamp in chosen}
-    for outcome in replay_depth(drive, source, wanted, floor=floor):
+    for outcome in replay_depth(drive, source, wanted, floor=floor, refuse=refuse):
         path = out / f"{outcome.stamp_ns}.png"
         cv2.imwrite(str(path), depth_panel(outcome, drive))
         yield outcome.methods["field"].status, len(wanted)

@@ -64,6 +64,7 @@ def replay_depth(
     heldout_mask: Callable[[int], np.ndarray] | None = None,
     config: PlaneSweepConfig | None = None,
     floor: bool | None = None,
+    refuse: Callable[[str], None] | None = None,
 ) -> Iterator[DepthComparison]:
     """Run depth estimation and fusion over a drive in order of time; yield the results of the wanted images.
 
@@ -76,6 +77,10 @@ def replay_depth(
         heldout_mask: returns bool [beams] for a number of beams; True beams are held out. None: no beams are.
         config: settings of fusion; None uses the defaults.
         floor: whether the camera's height above the floor is known; None: if the poses are planar.
+        refuse: receives the reason for each image that cannot be decoded; None: it is an error.
+
+    Raises:
+        UserError: an image cannot be decoded, and `refuse` is None.
     """
     planar = drive.planar
     known = planar if floor is None else floor
@@ -95,7 +100,13 @@ def replay_depth(
                 drive.scan_in_map(due, None if heldout_mask is None else heldout_mask(len(due.ranges_m)))
             )
             next_scan += 1
-        rgb = drive.rgb(number)
+        try:
+            rgb = drive.rgb(number)
+        except UserError as error:
+            if refuse is None:
+                raise
+            refuse(str(error))
+            continue
         scan = drive.scan_near(stamp)
         excluded_beams = None if heldout_mask is None or scan is None else heldout_mask(len(scan.ranges_m))
         beams = drive.beams_at(stamp, excluded_beams)
