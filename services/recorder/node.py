@@ -108,9 +108,13 @@ class RecorderNode(_Handlers, Node):
         except RecordingError as error:
             log.error("%s", error)
         self.lost.update(writer.lost)
+        self._report_lost()
         self._written += writer.counts.total()
         if self._fault and not writer.counts:
             writer.remove_files()
+
+    def _report_lost(self) -> None:
+        self.rejections.set("messages not recorded: the disk is full or broken", self.lost.total())
 
     def _continue_if_possible(self) -> None:
         """Start a new recording after a fault, if the disk has room now."""
@@ -156,7 +160,7 @@ class RecorderNode(_Handlers, Node):
         self._continue_if_possible()
         if self.writer is None:
             self.lost[topic] += 1
-            self.rejections.set("messages not recorded: the disk is full or broken", self.lost.total())
+            self._report_lost()
             return
         try:
             self.writer.write(topic, message, arrival_ns, header)

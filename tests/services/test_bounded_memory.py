@@ -203,13 +203,13 @@ def test_every_row_of_the_process_list_is_here_or_has_a_reason():
     assert not any(subscriptions(NODES[name].load(kind)) for name, kind in SOURCES)
 
 
-def make(service: str, kind: str, folder, endpoint: str) -> Node:
-    """Return a configured node with the options of these tests."""
+def make(service: str, kind: str, folder, endpoint: str, **more: object) -> Node:
+    """Return a configured node with the options of these tests, and `more`."""
     options = {
         name: value.format(folder=folder, endpoint=endpoint) if isinstance(value, str) else value
         for name, value in OPTIONS.get((service, kind), {}).items()
     }
-    node = make_node(NODES[service], {"kind": kind, **options}, "test")
+    node = make_node(NODES[service], {"kind": kind, **options, **more}, "test")
     node.configure()
     return node
 

@@ -163,6 +163,8 @@ def test_damaged_images_are_rejected(rig):
         node = CameraNode(CameraConfig(source=camera.url, rig=rig))
         with RunningSource(node) as running:
             running.wait(lambda: len(_images(running)) >= 10 and "rejected (damaged)" in node.detail)
+    counts = {entry.reason: entry.count for entry in node.rejections.report()}
+    assert counts["images rejected: damaged"] > 0
     for _, image in _images(running):
         assert cv2.imdecode(np.asarray(image.data), cv2.IMREAD_COLOR).shape == (48, 64, 3)
         assert is_complete_image(bytes(image.data))

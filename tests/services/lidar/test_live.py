@@ -74,6 +74,10 @@ def test_scans_over_a_link_with_wrong_bytes(tmp_path, kind):
     assert sorted(set(stamps)) == stamps
     assert abs(time.time_ns() - stamps[-1]) < 60e9
     assert "bad" in node.detail
+    counts = {entry.reason: entry.count for entry in node.rejections.report()}
+    counters = node._reader.driver.counters
+    assert counts.get("packets damaged", 0) == counters.bad_packets
+    assert counts["measurements missing or not plausible"] == counters.lost_samples > 0
 
 
 @pytest.mark.parametrize("kind", ["ldrobot", "rplidar"])

@@ -123,6 +123,8 @@ def test_recording_begins_again_when_the_disk_has_room(tmp_path, full_at, monkey
             list(node.handle("tick", Tick(stamp_ns=i * SECOND, count=i)))
         node.close()
         assert node.lost.total() == lost
+        (refused,) = node.rejections.report()
+        assert (refused.reason, refused.count) == ("messages not recorded: the disk is full or broken", lost)
         counts = []
         for path in sorted(disk.path.iterdir()):
             with RecordingReader(path) as reader:
