@@ -11,6 +11,7 @@ from beamsplat.services.localization.lidar2d import se2
 
 NS = 1e-9
 BASELINE_NS = 80_000_000
+_MAX_PENDING = 256  # matched turns that wait for odometry after them
 DELAY_CANDIDATES_S = np.arange(-30, 31) * 0.01  # candidates for the delay of the odometry stamps
 
 
@@ -155,8 +156,8 @@ class OdometryBuffer:
             ):
                 continue
             self._update_delay(costs / (costs + 0.02**2))
-        if len(self._pending_rotations) > 256:
-            del self._pending_rotations[:128]
+        if len(self._pending_rotations) > _MAX_PENDING:
+            del self._pending_rotations[: _MAX_PENDING // 2]
 
     def _update_delay(self, costs: np.ndarray) -> None:
         self._cost = 0.998 * self._cost + costs
