@@ -133,6 +133,9 @@ class MappingNode(Node):
 
     def on_keyframes_frame(self, message: Keyframe) -> Outputs:
         """Insert a keyframe, optimise a fixed number of steps, publish preview, status and chunk."""
+        yield from self._take(message, from_disk=False)
+
+    def _take(self, message: Keyframe, *, from_disk: bool) -> Outputs:
         acknowledged = self._session.start(message.id)
         known = self._mapper.was_inserted(message.id)
         load_visible = self._session.load_visible
@@ -153,12 +156,13 @@ class MappingNode(Node):
         yield from self._show(message, outcome, loss)
         if len(self._mapper.keyframes) % c.chunk_every == 0:
             yield from self._chunk(message.anchor_id, message.stamp_ns)
-        yield from self._checkpoint(message.stamp_ns)
+        if not from_disk:  # its stamp would be an old one, between new ones: a checkpoint each time
+            yield from self._checkpoint(message.stamp_ns)
 
     def _skipped(self) -> Outputs:
-        """Insert one keyframe from disk that was dropped from the full mailbox."""
+        """Insert one keyframe that waits on the disk."""
         for message in self._session.skipped():
-            yield from self.on_keyframes_frame(message)
+            yield from self._take(message, from_disk=True)
 
     def _checkpoint(self, stamp_ns: int) -> Outputs:
         if (work := self._session.checkpoint(stamp_ns)) is not None:

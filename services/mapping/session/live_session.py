@@ -174,6 +174,10 @@ class LiveSession:
         )
         self._intake.restore(extra)
         self._inbox.skip(newer)
+        # A process that is killed repeatedly reaches a checkpoint too: the first period begins at the oldest.
+        oldest = next(filter(None, map(self._read_message, newer)), None)
+        if oldest is not None:
+            c.start_period(oldest.stamp_ns)
         if m.keyframes or newer:
             log.info("resumed with %d keyframes, %d Gaussians, step %d; %d newer keyframes wait",
                      len(m.keyframes), m.store.count, m.steps, len(newer))  # fmt: skip

@@ -23,7 +23,7 @@ from beamsplat.services.mapping.session.disk_tier import CELL_M, groups_of, sphe
 from beamsplat.services.mapping.session.frustum import frustum_intersects
 from beamsplat.services.mapping.session.paging import PROCESS_MB
 from tests.services.mapping.session import gallery
-from tests.services.mapping.session.maps import SECOND, handle, make_node
+from tests.services.mapping.session.maps import SECOND, handle, insert_waiting, make_node
 
 BUDGET_MB = PROCESS_MB + 6.0
 PLACES = 40
@@ -249,7 +249,7 @@ def test_a_killed_mapper_finds_all_blocks_of_its_checkpoint(tmp_path):
     assert named
     assert named <= set(session.block_numbers())
     assert store_of(session.read_state()).count == session.manifest()["gaussians"]
-    again = make(tmp_path / "s", session_every_s=2.0)
+    again = insert_waiting(make(tmp_path / "s", session_every_s=2.0))
     assert len(again._mapper.keyframes) + len(again._mapper.paged_out) == PLACES
     walk(again, range(PLACES, PLACES + 6))
     list(again.drain())

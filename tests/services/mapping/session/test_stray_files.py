@@ -5,7 +5,7 @@ import pytest
 from beamsplat.common.mapfiles.session import SessionFolder
 from beamsplat.common.messages import Answer
 from beamsplat.common.messages.codec import encode, schema_of
-from tests.services.mapping.session.maps import feed, make_node, message
+from tests.services.mapping.session.maps import feed, insert_waiting, make_node, message
 
 STRAY = [
     "edge/state-old.npz", "edge/state-.npz", "edge/state-007.npz", "edge/state-\u0663.npz", "edge/state-1 (copy).npz",
@@ -47,7 +47,7 @@ def test_a_keyframe_file_that_holds_something_else_is_skipped_with_a_warning(sav
     folder.write_keyframe(12, schema_of(keyframe), b"no message")
     folder.write_keyframe(13, schema_of(keyframe), encode(keyframe))
     folder.write_keyframe(14, "Unknown/9.9", b"")
-    node = make_node(saved, half_steps=1, full_steps=1)
+    node = insert_waiting(make_node(saved, half_steps=1, full_steps=1))
     assert sorted(node._mapper.keyframes) == [message(n).id for n in range(4)]
     node.close()
     for id in (11, 12, 13, 14):
