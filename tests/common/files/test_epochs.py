@@ -78,7 +78,11 @@ def test_a_disk_that_fills_up_or_becomes_read_only_stops_no_restart(tmp_path):
         "print(*faults, sep='\\n')\n"
     )
     for folder in (tmp_path, *tmp_path.parents):  # pytest's folders are for their owner only
-        if folder.owner() == tmp_path.owner() and os.getuid() == 0 and folder.name.startswith(("pytest", "popen")):
+        if (
+            folder.owner() == tmp_path.owner()
+            and os.getuid() == 0
+            and folder.name.startswith(("pytest", "popen"))
+        ):
             folder.chmod(0o755)
     done = subprocess.run(
         [sys.executable, "-c", script, str(tmp_path)], capture_output=True, text=True, check=False
