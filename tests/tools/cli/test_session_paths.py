@@ -102,7 +102,7 @@ def test_a_merge_that_cannot_be_trusted_ends_with_code_3_and_says_what_to_do(
         pose_graph=SimpleNamespace(submaps=[0]), anchors=dict, save=lambda folder: folder.mkdir()
     )
     alignment = MapAlignment(np.zeros(3), 10, 24)
-    monkeypatch.setattr(session_cli, "_open", lambda path: (SessionFolder(path), arrays))
+    monkeypatch.setattr(session_cli, "_read", lambda folder: arrays)
     monkeypatch.setattr(session_cli, "load_slam", lambda path: slam)
     monkeypatch.setattr(session_cli, "_aligned", lambda *_: alignment)
     monkeypatch.setattr(session_cli, "_write", lambda *_: None)
