@@ -17,7 +17,7 @@ Verdict = Literal["same", "successor", "other", "stale", "refused"]
 class AcceptedProducer:
     """The process whose messages are accepted on one stream.
 
-    Whoever may write on a stream may send any epoch. So a higher epoch alone proves nothing: only the
+    Any process that may write on a stream can send any epoch, so a higher epoch alone is no proof. Only the
     supervisor of the accepted process knows the instances of later epochs
     (`beamsplat.common.messages.instances`).
 

@@ -2,7 +2,7 @@
 
 asyncio's own server accepts without a limit, so that connections that send nothing use up the descriptors of
 the process. Here, a new connection beyond the limit replaces the oldest one without a request: browsers keep
-such connections to use them again, and open a new one when needed; whoever opens many loses them.
+idle connections for later requests, and open a new one if it was closed.
 """
 
 from __future__ import annotations

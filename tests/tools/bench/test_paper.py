@@ -11,6 +11,7 @@ from beamsplat.common.geometry.camera import Pinhole
 from beamsplat.common.geometry.frames import camera_mount
 from beamsplat.common.geometry.trajectory import Trajectory
 from beamsplat.common.geometry.transforms import make_transform, so3_exp
+from beamsplat.common.messages import MapChunk, MapPoses
 from beamsplat.tools.bench import paper
 from beamsplat.tools.evaluation.drive import RecordedDrive
 from beamsplat.tools.report.html import write_report
@@ -235,9 +236,21 @@ def test_a_few_seconds_live(shared_dir, tmp_path):
     assert (Path(tmp_path) / "report.html").stat().st_size > 20_000
 
 
+def map_chunk(anchor, revision):
+    return MapChunk(
+        stamp_ns=S, anchor_id=anchor, revision=revision, T_map_anchor=np.eye(4), count=0,
+        packed=np.zeros(0, np.uint8),
+    )  # fmt: skip
+
+
+def map_poses():
+    return MapPoses(
+        stamp_ns=S, keyframe_ids=np.zeros(1, np.int64), stamps_ns=np.full(1, S), T_map_body=np.eye(4)[None]
+    )
+
+
 def test_the_map_at_the_end_of_the_drive_is_kept_apart_from_the_refined_one():
     """Topics have no common order: a chunk published before the end of the drive may be received after it."""
-    from beamsplat.common.messages import MapChunk, MapPoses
     from beamsplat.common.messages.header import Header
     from beamsplat.common.runtime.mailbox import Envelope
     from beamsplat.tools.report.observer import BusObserver
@@ -251,26 +264,17 @@ def test_the_map_at_the_end_of_the_drive_is_kept_apart_from_the_refined_one():
         )  # fmt: skip
         observer._receive(Envelope(topic, header, message, 100))
 
-    def chunk(anchor, revision):
-        return MapChunk(
-            stamp_ns=S, anchor_id=anchor, revision=revision, T_map_anchor=np.eye(4), count=0,
-            packed=np.zeros(0, np.uint8),
-        )  # fmt: skip
-
-    poses = MapPoses(
-        stamp_ns=S, keyframe_ids=np.zeros(1, np.int64), stamps_ns=np.full(1, S), T_map_body=np.eye(4)[None]
-    )
-    receive("mapping/chunk", chunk(0, 1), 10)
+    poses = map_poses()
+    receive("mapping/chunk", map_chunk(0, 1), 10)
     receive("mapping/poses", poses, 30)
-    receive("mapping/chunk", chunk(0, 2), 20)  # published before the end, received after it
-    receive("mapping/chunk", chunk(0, 3), 40)  # refined
+    receive("mapping/chunk", map_chunk(0, 2), 20)  # published before the end, received after it
+    receive("mapping/chunk", map_chunk(0, 3), 40)  # refined
     receive("mapping/poses", poses, 50)
     assert observer.record.online_chunks[0].revision == 2
     assert observer.record.chunks[0].revision == 3
 
 
 def test_the_map_of_a_restarted_mapper_is_scored_without_chunks_of_its_predecessor():
-    from beamsplat.common.messages import MapChunk, MapPoses
     from beamsplat.common.messages.header import Header
     from beamsplat.common.runtime.mailbox import Envelope
     from beamsplat.tools.report.observer import BusObserver
@@ -281,19 +285,11 @@ def test_the_map_of_a_restarted_mapper_is_scored_without_chunks_of_its_predecess
         header = Header(S, 10, 1, 0, 1, "mapping", instance)
         observer._receive(Envelope(topic, header, message, 100))
 
-    def chunk(anchor, revision):
-        return MapChunk(
-            stamp_ns=S, anchor_id=anchor, revision=revision, T_map_anchor=np.eye(4), count=0,
-            packed=np.zeros(0, np.uint8),
-        )  # fmt: skip
-
-    poses = MapPoses(
-        stamp_ns=S, keyframe_ids=np.zeros(1, np.int64), stamps_ns=np.full(1, S), T_map_body=np.eye(4)[None]
-    )
+    poses = map_poses()
     for anchor in (0, 1):
-        receive("mapping/chunk", chunk(anchor, 7), "ab" * 8)
+        receive("mapping/chunk", map_chunk(anchor, 7), "ab" * 8)
     receive("mapping/poses", poses, "ab" * 8)
-    receive("mapping/chunk", chunk(1, 2), "cd" * 8)
+    receive("mapping/chunk", map_chunk(1, 2), "cd" * 8)
     assert {anchor: c.revision for anchor, c in observer.record.chunks.items()} == {1: 2}
     assert observer.record.keyframe_poses is None
     receive("mapping/poses", poses, "cd" * 8)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import zenoh
 
-from beamsplat.common.messages import KeyframeAck, Odometry
+from beamsplat.common.messages import KeyframeAck, Message, Odometry
 from beamsplat.common.messages.header import DecodeError, Header
 from beamsplat.common.topics import topic
 from beamsplat.common.zenoh.bus import key
@@ -21,6 +21,15 @@ FORGED_INSTANCE = "badbadbadbadbad0"  # of headers that the campaign itself writ
 GAP_S = 1.0  # between two poses: ten scans; a shorter gap is not counted
 _QUEUE_SUFFIX = ".keyframe"
 _START_S = 120.0  # limit for the start of a router
+
+
+def _genuine(sample: zenoh.Sample, name: str) -> Message | None:
+    """Return the message in a sample of the topic `name`; None if it is garbage that a fault has sent."""
+    try:
+        envelope = decode_sample(sample, topic(name))
+    except DecodeError:
+        return None
+    return None if envelope.header.instance == FORGED_INSTANCE else envelope.message
 
 
 @dataclass(frozen=True)
@@ -53,13 +62,8 @@ class PoseWatch:
 
     def take(self, sample: zenoh.Sample) -> None:
         """Take a sample of `localization/odometry`."""
-        try:
-            envelope = decode_sample(sample, topic("localization/odometry"))
-        except DecodeError:
-            return
-        message = envelope.message
-        assert isinstance(message, Odometry)
-        if envelope.header.instance == FORGED_INSTANCE:
+        message = _genuine(sample, "localization/odometry")
+        if not isinstance(message, Odometry):
             return
         if message.status != "ok":
             self.rejected[message.status] = self.rejected.get(message.status, 0) + 1
@@ -94,13 +98,8 @@ class KeyframeWatch:
 
     def take_ack(self, sample: zenoh.Sample) -> None:
         """Take a sample of `keyframes/ack`."""
-        try:
-            envelope = decode_sample(sample, topic("keyframes/ack"))
-        except DecodeError:
-            return
-        ack = envelope.message
-        assert isinstance(ack, KeyframeAck)
-        if envelope.header.instance == FORGED_INSTANCE:
+        ack = _genuine(sample, "keyframes/ack")
+        if not isinstance(ack, KeyframeAck):
             return
         if ack.status == "ok":
             self.acknowledged.add(ack.id)
