@@ -58,6 +58,8 @@ def decode_compressed(
 ) -> np.ndarray:
     """Decode a JPEG or PNG with `cv2.imdecode`; dtype and channels [H, W] or [H, W, C] depend on `flags`.
 
+    An orientation in EXIF data is ignored: the pixels are returned as they are stored.
+
     Raises:
         UserError: as `decode_rgb`; only the header of the image is read then.
     """
@@ -70,12 +72,10 @@ def decode_compressed(
         raise UserError(f"the image is {width_px}x{height_px}: more than {MAX_PIXELS} pixels")
     if encoding == "jpeg" and data.tobytes().count(_START_OF_SCAN) > _MAX_SCANS:
         raise UserError(f"the image is a JPEG of more than {_MAX_SCANS} scans")
-    try:
-        image = cv2.imdecode(data, flags)
+    try:  # K belongs to the pixels as they are stored, whatever the orientation in the EXIF data
+        image = cv2.imdecode(data, flags | cv2.IMREAD_IGNORE_ORIENTATION)
     except cv2.error as error:
         raise UserError(f"the image's {len(data)} bytes do not decode as {encoding}: {error.err}") from error
     if image is None:
         raise UserError(f"the image's {len(data)} bytes do not decode as {encoding}")
-    if image.shape[:2] != (height_px, width_px):  # rotated by its EXIF data
-        raise UserError(f"the image is {image.shape[1]}x{image.shape[0]}, not {width_px}x{height_px}")
     return image

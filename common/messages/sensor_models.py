@@ -19,7 +19,7 @@ class CameraModel(MessagePart):
     """Pinhole camera with lens distortion, and its mount. K is valid for this image size only.
 
     `distortion_model` and the order of `distortion` follow ROS and OpenCV: plumb_bob (k1 k2 p1 p2 k3),
-    rational_polynomial (8 coefficients), equidistant (fisheye, 4 coefficients), none.
+    rational_polynomial (8, with thin prism 12, with tilt 14), equidistant (fisheye, 4 coefficients), none.
     """
 
     width_px: Annotated[int, Field(gt=0, le=16384)]
@@ -48,7 +48,9 @@ class CameraModel(MessagePart):
                     f"{axis} = {centre:g} px is outside the {self.width_px}x{self.height_px} image: "
                     "K belongs to another image size"
                 )
-        counts = {"none": (0,), "plumb_bob": (0, 4, 5), "rational_polynomial": (8,), "equidistant": (4,)}
+        counts = {
+            "none": (0,), "plumb_bob": (0, 4, 5), "rational_polynomial": (8, 12, 14), "equidistant": (4,),
+        }  # fmt: skip
         if len(self.distortion) not in counts[self.distortion_model]:
             raise ValueError(
                 f"distortion model {self.distortion_model} takes {counts[self.distortion_model]} "

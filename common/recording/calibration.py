@@ -16,18 +16,8 @@ from beamsplat.common.errors import UserError
 from beamsplat.common.geometry.frames import R_body_camera_level, camera_mount
 from beamsplat.common.geometry.rig import CameraSection, LidarSection, Mount, RigFile
 from beamsplat.common.geometry.transforms import make_transform
+from beamsplat.common.recording.camera_info import CameraIntrinsics
 from beamsplat.common.recording.static_frames import MAX_FRAMES, StaticFrames, normalize_frame
-
-# Distortion model names of ROS -> ours. Other models are rejected.
-_MODELS = {
-    "": "plumb_bob",
-    "plumb_bob": "plumb_bob",
-    "rational_polynomial": "rational_polynomial",
-    "equidistant": "equidistant",
-    "fisheye": "equidistant",
-    "kannala_brandt": "equidistant",
-    "none": "none",
-}
 
 
 @dataclass
@@ -39,7 +29,22 @@ class Calibration:
     found: list[str] = field(default_factory=list)  # sentences on where values come from
     assumed: list[str] = field(default_factory=list)
     missing: list[str] = field(default_factory=list)
+    doubts: list[str] = field(default_factory=list)  # sentences on values that contradict each other
     body_frame: str = ""  # name of the ROS frame used as body
+
+    def add_intrinsics(self, read: CameraIntrinsics | None, topic: str) -> None:
+        """Add the intrinsics read from a CameraInfo topic; None: all its messages have a K of zeros."""
+        if read is None:
+            self.missing.append(f"K on {topic} is all zero: this camera was never calibrated")
+            return
+        K = self.camera = read.fields
+        self.found.append(
+            f"K from {topic}: fx {K['fx_px']:.1f}, fy {K['fy_px']:.1f}, cx {K['cx_px']:.1f}, "
+            f"cy {K['cy_px']:.1f} px for {K['width_px']}x{K['height_px']}, "
+            f"distortion {K['distortion_model']}"
+        )
+        self.found += [f"{topic}: {note}" for note in read.notes]
+        self.doubts += [f"{topic}: {doubt}" for doubt in read.doubts]
 
     def rig(self, source: str) -> RigFile:
         """Return a rig file with the sensors whose calibration was found; `source` names the bag.
@@ -57,63 +62,6 @@ class Calibration:
             reason = error.errors(include_url=False, include_input=False)[0]["msg"]
             raise UserError(f"{source}: its CameraInfo is invalid: {reason}; use a rig file") from error
         return RigFile(camera=camera, lidar=lidar, assumed=tuple(self.assumed), source=source)
-
-
-def intrinsics(
-    info: Any, image_size_px: tuple[int, int], image_topic: str, where: str
-) -> dict[str, Any] | None:
-    """Return the fields of CameraSection from a CameraInfo; None if the camera is uncalibrated (K is zero).
-
-    For a rectified image topic the intrinsics are taken from the projection matrix P, without distortion.
-
-    Args:
-        info: ROS CameraInfo message.
-        image_size_px: width and height of the images on the topic.
-        image_topic: ROS topic of the images; if it contains "rect", the images are taken as rectified.
-        where: name of the CameraInfo's source, for error texts.
-
-    Raises:
-        UserError: the CameraInfo has another image size or an unsupported distortion model.
-    """
-    K, D, P = (np.asarray(_field(info, name), dtype=np.float64).ravel() for name in "kdp")
-    if K.size != 9 or K[0] <= 0.0 or K[4] <= 0.0:
-        return None
-    size = (int(info.width), int(info.height))
-    if size != image_size_px:
-        raise UserError(
-            f"{where}: K is for {size[0]}x{size[1]} px but the images on {image_topic} are "
-            f"{image_size_px[0]}x{image_size_px[1]} px; put the calibration for this size in a rig file "
-            "(create one with `beamsplat rig`)"
-        )
-    rectified = "rect" in image_topic and P.size == 12 and P[0] > 0.0
-    model, coefficients = ("none", ()) if rectified else _distortion(info.distortion_model, D, where)
-    fx, fy, cx, cy = (P[0], P[5], P[2], P[6]) if rectified else (K[0], K[4], K[2], K[5])
-    return {
-        "width_px": size[0], "height_px": size[1],
-        "fx_px": float(fx), "fy_px": float(fy), "cx_px": float(cx), "cy_px": float(cy),
-        "distortion_model": model, "distortion": coefficients,
-    }  # fmt: skip
-
-
-def _field(info: Any, name: str) -> Any:
-    """Return a field of a CameraInfo; its names are upper case in ROS 1, lower case in ROS 2."""
-    return getattr(info, name) if hasattr(info, name) else getattr(info, name.upper())
-
-
-def _distortion(name: str, D: np.ndarray, where: str) -> tuple[str, tuple[float, ...]]:
-    model = _MODELS.get(name)
-    if model is None:
-        known = ", ".join(sorted(set(_MODELS.values())))
-        raise UserError(f"{where}: distortion model {name!r} is not supported ({known}); use a rig file")
-    if not np.any(D):
-        return "none", ()
-    size = {"plumb_bob": 5, "rational_polynomial": 8, "equidistant": 4, "none": 0}[model]
-    if np.any(D[size:]):
-        raise UserError(
-            f"{where}: distortion model {name!r} has {len(D)} coefficients, at most {size} are supported; "
-            "use a rig file"
-        )
-    return model, tuple(float(value) for value in np.pad(D[:size], (0, max(0, size - len(D)))))
 
 
 def find_mounts(

@@ -56,6 +56,7 @@ class InputReport:
 
     def __init__(self) -> None:
         self._found: dict[tuple[str, ...], InputFinding] = {}
+        self.last_refusal = ""  # the newest one, without its topic
 
     def repaired(self, topic: str, field: str, value: object, what: str, remedy: str = "") -> None:
         """Count one message that is used although `field` was wrong; `what`: the fault and the repair."""
@@ -63,6 +64,7 @@ class InputReport:
 
     def refused(self, topic: str, fault: ValueError) -> None:
         """Count one message that is not used, because of an `InputFault` or an error of validation."""
+        self.last_refusal = reason_of(fault)
         if isinstance(fault, InputFault):
             self._add(InputFinding("refused", topic, fault.field, fault.value, fault.what, fault.remedy))
         else:

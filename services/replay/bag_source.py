@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterator
 from contextlib import suppress
 from typing import Any
@@ -12,8 +11,12 @@ import numpy as np
 from beamsplat.common.errors import UserError
 from beamsplat.common.geometry.rig import RigFile, load_rig
 from beamsplat.common.recording import calibration as cal
+from beamsplat.common.recording.camera_info import CameraIntrinsics, is_calibrated, read_camera_info
+from beamsplat.common.recording.image_reading import describe_format, image_size_px, is_camera_image
+from beamsplat.common.recording.input_report import InputReport
 from beamsplat.common.recording.ros_types import transform_of
-from beamsplat.common.recording.sensors import SENSORS, build_message, ros_fields
+from beamsplat.common.recording.sensor_reading import SensorReading
+from beamsplat.common.recording.sensors import SENSORS, ros_fields
 from beamsplat.common.recording.static_frames import StaticFrames, normalize_frame
 from beamsplat.services.replay.bags import Bag, BagTopic
 from beamsplat.services.replay.decode import RawMessage, deserialize
@@ -21,7 +24,6 @@ from beamsplat.services.replay.options import SourceOptions
 from beamsplat.services.replay.topic_selection import choose_camera_info, choose_topics
 
 TF_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
-_IMAGE_ENCODINGS = ("rgb8", "bgr8", "rgba8", "bgra8", "mono8", "yuv422_yuy2", "jpeg", "png")
 _PEEK = 5  # messages that may fail to decode before the topic counts as broken
 
 
@@ -36,9 +38,8 @@ class BagSource:
         self.bag = bag
         self.options = options
         self.where = str(bag.path)
-        self.skipped: Counter[str] = Counter()  # messages that cannot be decoded or are invalid, by topic
-        self.unstamped: Counter[str] = Counter()  # messages with stamp 0, by topic
-        self.first_fault: dict[str, str] = {}
+        self.report = InputReport()  # of what was repaired and refused since `messages` was called
+        self._info_topic = ""  # of the CameraInfo of the images
         self.chosen = choose_topics(bag.topics, options, self.where, self._is_image)
         self._first = {sensor_name: self._peek(topic) for sensor_name, topic in self.chosen.items()}
         self.frames = StaticFrames()
@@ -56,15 +57,8 @@ class BagSource:
 
     @property
     def problems(self) -> list[str]:
-        """Return sentences about messages that were skipped and stamps that were replaced."""
-        found = list(self.bag.problems)
-        for name, count in sorted(self.skipped.items()):
-            found.append(f"{name}: {count} messages skipped, the first because: {self.first_fault[name]}")
-        found += [
-            f"{name}: {count} messages have no stamp; the receive time is used"
-            for name, count in sorted(self.unstamped.items())
-        ]
-        return found
+        """Return sentences about the files, the calibration, and messages that were repaired or refused."""
+        return [*self.bag.problems, *self.calibration.doubts, *self.report.sentences]
 
     def message_count(self) -> int:
         """Return the number of messages on the selected topics."""
@@ -130,22 +124,31 @@ class BagSource:
 
     def messages(self, start_ns: int = 0, stop_ns: int | None = None) -> Iterator[tuple[int, str, Any]]:
         """Yield (receive time, topic, message) with start_ns <= receive time < stop_ns, by receive time."""
+        self.calibrate()
+        self.report.clear()
         sensor_names = {topic.name: sensor_name for sensor_name, topic in self.chosen.items()}
-        for raw in self.bag.messages(list(sensor_names), start_ns, stop_ns):
-            sensor = SENSORS[sensor_names[raw.topic]]
+        reading = SensorReading(
+            self.report, {name: topic.name for name, topic in self.chosen.items()}, self._info_topic,
+            self._T_child_body,
+        )  # fmt: skip
+        rig = load_rig(self.options.rig) if self.options.rig is not None else None
+        if rig is not None and rig.camera is not None:
+            reading.images.calibrate(rig.camera.model_dump(exclude={"mount"}), follow=False)
+        elif self.calibration.camera is not None:
+            reading.images.calibrate(self.calibration.camera, follow=True)
+        names = [*sensor_names, *([self._info_topic] if self._info_topic else [])]
+        for raw in self.bag.messages(names, start_ns, stop_ns):
             try:
-                fields = ros_fields(sensor.topic, deserialize(raw))
-                if fields["stamp_ns"] == 0:
-                    fields["stamp_ns"] = raw.at_ns
-                    self.unstamped[raw.topic] += 1
-                if sensor.name == "odometry":
-                    cal.move_odometry_to_body(fields, self._T_child_body)
-                message = build_message(sensor.topic, fields)
+                message = deserialize(raw)
             except ValueError as error:
-                self.skipped[raw.topic] += 1
-                self.first_fault.setdefault(raw.topic, _reason_of(error))
+                self.report.refused(raw.topic, error)
                 continue
-            yield raw.at_ns, sensor.topic, message
+            if raw.topic == self._info_topic:
+                reading.images.add_camera_info(message)
+                continue
+            sensor_name = sensor_names[raw.topic]
+            for built in reading.read(sensor_name, message, raw.at_ns):
+                yield raw.at_ns, SENSORS[sensor_name].topic, built
 
     def sample(self, sensor_name: str, count: int) -> list[dict[str, Any]]:
         """Return the fields of up to `count` messages of a sensor, evenly spread and not validated."""
@@ -176,22 +179,23 @@ class BagSource:
     def _is_image(self, topic: BagTopic) -> bool:
         """Return whether a topic has camera images; raw image topics may also have depth maps and masks."""
         try:
-            fields = ros_fields("camera/image", self._peek(topic))
+            return is_camera_image(self._peek(topic))
         except UserError:
             return True  # the error is reported when the topic is read
-        if topic.type_name == "sensor_msgs/msg/CompressedImage":
-            return "width_px" in fields
-        return fields["encoding"] in _IMAGE_ENCODINGS
 
     def image_size_px(self) -> tuple[int, int] | None:
         """Return (width, height) of the images; None if the bag has no images."""
         if "image" not in self._first:
             return None
-        fields = ros_fields("camera/image", self._first["image"])
-        if "width_px" not in fields:
-            name = self.chosen["image"].name
-            raise UserError(f"{self.where}: {name} starts with an image that is neither JPEG nor PNG")
-        return fields["width_px"], fields["height_px"]
+        first = self._first["image"]
+        size = image_size_px(first)
+        if size is None:
+            found = describe_format(bytes(first.data[:32]), str(first.format))
+            raise UserError(
+                f"{self.where}: {self.chosen['image'].name}: format = {first.format!r}: the image is "
+                f"{found}; only JPEG and PNG are decoded: publish JPEG"
+            )
+        return size
 
     def _find_intrinsics(self) -> None:
         image = self.chosen["image"]
@@ -203,16 +207,32 @@ class BagSource:
             return
         size_px = self.image_size_px()
         assert size_px is not None  # there are images
-        self.calibration.camera = cal.intrinsics(self._peek(info), size_px, image.name, self.where)
-        if self.calibration.camera is None:
-            self.calibration.missing.append(f"K on {info.name} is all zero: this camera was never calibrated")
-        else:
-            K = self.calibration.camera
-            self.calibration.found.append(
-                f"K from {info.name}: fx {K['fx_px']:.1f}, fy {K['fy_px']:.1f}, cx {K['cx_px']:.1f}, "
-                f"cy {K['cy_px']:.1f} px for {K['width_px']}x{K['height_px']}, "
-                f"distortion {K['distortion_model']}"
-            )
+        self._info_topic = info.name
+        self.calibration.add_intrinsics(self._read_intrinsics(info, size_px, image.name), info.name)
+
+    def _read_intrinsics(
+        self, info: BagTopic, size_px: tuple[int, int], image_topic: str
+    ) -> CameraIntrinsics | None:
+        """Return the intrinsics by the first CameraInfo that is calibrated and fits the size of the images.
+
+        Raises:
+            UserError: none fits; the text is that of the first one.
+        """
+        refusal: UserError | None = None
+        for raw in self.bag.messages([info.name]):
+            try:
+                message = deserialize(raw)
+            except ValueError:  # counted in `messages`
+                continue
+            if not is_calibrated(message):
+                continue
+            try:
+                return read_camera_info(message, size_px, image_topic, self.where)
+            except UserError as error:
+                refusal = refusal or error
+        if refusal is not None:
+            raise refusal
+        return None
 
     def _read_frames(self, *, static: bool) -> None:
         """Add the transforms of /tf_static, or those of /tf, to `frames`."""
@@ -252,11 +272,3 @@ def _transforms(raw: RawMessage) -> Iterator[tuple[str, str, np.ndarray]]:
                 yield stamped.header.frame_id, stamped.child_frame_id, T
     except ValueError:
         return
-
-
-def _reason_of(error: Exception) -> str:
-    """Return field and reason of a validation error, in one line."""
-    if hasattr(error, "errors"):
-        fault = error.errors(include_url=False, include_input=False)[0]
-        return f"{'.'.join(str(part) for part in fault['loc'])}: {fault['msg']}"
-    return str(error).split("\n")[0][:200]

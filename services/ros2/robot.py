@@ -15,15 +15,17 @@ import numpy as np
 
 from beamsplat.common.errors import UserError
 from beamsplat.common.geometry.rig import RigFile, load_rig
-from beamsplat.common.messages.image_header import is_complete_image
 from beamsplat.common.recording import calibration as cal
+from beamsplat.common.recording.camera_info import is_calibrated, read_camera_info
+from beamsplat.common.recording.image_reading import image_size_px, is_camera_image
+from beamsplat.common.recording.input_report import InputReport, reason_of
 from beamsplat.common.recording.ros_types import deserialize, transform_of
-from beamsplat.common.recording.sensors import SENSORS, build_message, ros_fields
+from beamsplat.common.recording.sensor_reading import SensorReading
+from beamsplat.common.recording.sensors import SENSORS, build_message
 from beamsplat.common.recording.static_frames import MAX_FRAMES, StaticFrames, normalize_frame
 from beamsplat.services.ros2.tf_odometry import TfOdometry
 from beamsplat.services.ros2.topics import (
     CAMERA_INFO,
-    IMAGE_ENCODINGS,
     SUPPORTED_TYPES,
     TF,
     select_camera_info,
@@ -68,6 +70,9 @@ class RosRobot:
         self.rig: RigFile | None = None
         self.published: Counter[str] = Counter()
         self.rejected: Counter[str] = Counter()  # unusable messages, by topic
+        self.report = InputReport()  # of messages of the selected topics that were repaired or refused
+        self._reading: SensorReading | None = None  # once the calibration is known
+        self._info_topic = ""
         self.fault = ""
         self.status = "no message received yet"
 
@@ -122,6 +127,9 @@ class RosRobot:
             return self._rig_message(received_ns, now_s)
         if type_name == TF:
             return self._odometry_from_tf(topic, message)
+        if topic == self._info_topic and self._reading is not None:
+            self._reading.images.add_camera_info(message)
+            return []
         kind = self._kind_by_topic.get(topic)
         return self._convert(topic, kind, message, received_ns) if kind else []
 
@@ -167,7 +175,7 @@ class RosRobot:
         seen = {
             t: k
             for t, (k, m) in self._first_messages.items()
-            if "image" not in _kind_of(k) or _is_camera_image(m)
+            if "image" not in _kind_of(k) or is_camera_image(m)
         }
         chosen = select_topics(seen, self._options.topics, self._options.without)
         if "scan" not in chosen and "image" not in chosen:
@@ -181,6 +189,10 @@ class RosRobot:
         if "odometry" not in chosen and "odometry" not in self._options.without:
             self._odometry_edge = self._tf_odometry.odometry_edge()
         self.rig = rig
+        self._reading = SensorReading(self.report, chosen, self._info_topic, self._T_child_body)
+        if rig.camera is not None:
+            follow = path is None and self._info_topic != ""
+            self._reading.images.calibrate(rig.camera.model_dump(exclude={"mount"}), follow=follow)
         self._update_status()
         return True
 
@@ -227,45 +239,25 @@ class RosRobot:
         if info is None:
             found.missing.append(f"no sensor_msgs/CameraInfo was received for {image}")
             return
-        fields = ros_fields("camera/image", self._first_messages[image][1])
-        if "width_px" not in fields:
+        size = image_size_px(self._first_messages[image][1])
+        if size is None:
             found.missing.append(f"the first image of {image} is neither JPEG nor PNG")
             del self._first_messages[image]
             return
-        size = fields["width_px"], fields["height_px"]
-        found.camera = cal.intrinsics(self._camera_infos[info], size, image, "the robot")
-        if found.camera is None:
-            found.missing.append(f"K on {info} is all zero: this camera was never calibrated")
+        message = self._camera_infos[info]
+        read = read_camera_info(message, size, image, "the robot") if is_calibrated(message) else None
+        found.add_intrinsics(read, info)
+        self._info_topic = info
 
     def _convert(self, topic: str, kind: str, message: Any, received_ns: int) -> list[tuple[str, Any]]:
-        sensor = SENSORS[kind]
-        try:
-            fields = ros_fields(sensor.topic, message)
-            if fields["stamp_ns"] == 0:
-                fields["stamp_ns"] = received_ns
-            if kind == "odometry":
-                cal.move_odometry_to_body(fields, self._T_child_body)
-            if kind == "image":
-                self._check_image(fields)
-            built = build_message(sensor.topic, fields)
-        except ValueError as error:
-            self._reject(topic, _first_line(error))
-            return []
-        self.published[topic] += 1
+        assert self._reading is not None  # topics are selected
+        refused = self.report.count("refused", topic)
+        built = self._reading.read(kind, message, received_ns)
+        if self.report.count("refused", topic) > refused:
+            self._reject(topic, self.report.last_refusal)
+        self.published[topic] += len(built)
         self._update_status()
-        return [(sensor.topic, built)]
-
-    def _check_image(self, fields: dict[str, Any]) -> None:
-        camera = None if self.rig is None else self.rig.camera
-        size = fields.get("width_px"), fields.get("height_px")
-        if None in size or (
-            fields["encoding"] in ("jpeg", "png") and not is_complete_image(fields["data"].data)
-        ):
-            raise ValueError("the image is damaged")
-        if camera is not None and size != (camera.width_px, camera.height_px):
-            raise ValueError(
-                f"the image is {size[0]}x{size[1]} px, K is for {camera.width_px}x{camera.height_px} px"
-            )
+        return [(SENSORS[kind].topic, message) for message in built]
 
     def _add_transforms(self, topic: str, message: Any) -> None:
         fixed = topic.endswith("tf_static")
@@ -298,7 +290,7 @@ class RosRobot:
             try:
                 found.append((SENSORS["odometry"].topic, build_message(SENSORS["odometry"].topic, fields)))
             except ValueError as error:
-                self._reject(topic, _first_line(error))
+                self._reject(topic, reason_of(error))
                 continue
             self._kind_by_topic[topic] = "odometry"
             self.published[topic] += 1
@@ -335,16 +327,3 @@ def _transforms(message: Any) -> Iterator[tuple[Any, np.ndarray]]:
 
 def _kind_of(type_name: str) -> str:
     return next((kind for kind, sensor in SENSORS.items() if type_name in sensor.ros_types), "")
-
-
-def _is_camera_image(message: Any) -> bool:
-    """Return whether an image message is a camera image and not a depth map or mask."""
-    fields = ros_fields("camera/image", message)
-    return "width_px" in fields and fields["encoding"] in IMAGE_ENCODINGS
-
-
-def _first_line(error: Exception) -> str:
-    if hasattr(error, "errors"):
-        fault = error.errors(include_url=False, include_input=False)[0]
-        return f"{'.'.join(str(part) for part in fault['loc'])}: {fault['msg']}"
-    return str(error).split("\n")[0][:200]

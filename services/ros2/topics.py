@@ -9,7 +9,6 @@ CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 IMAGE = "sensor_msgs/msg/Image"
 TF = "tf2_msgs/msg/TFMessage"
 SUPPORTED_TYPES = frozenset({t for sensor in SENSORS.values() for t in sensor.ros_types} | {CAMERA_INFO, TF})
-IMAGE_ENCODINGS = ("rgb8", "bgr8", "rgba8", "bgra8", "mono8", "yuv422_yuy2", "jpeg", "png")
 # Topic names of goals (not the robot's pose), and of depth and masks (no camera image).
 _EXCLUDED_NAMES = {
     "pose": ("goal", "target", "waypoint", "initial", "plan", "setpoint", "click"),

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from beamsplat.common.errors import UserError
@@ -16,6 +15,7 @@ from beamsplat.common.geometry.camera import Pinhole, Undistorter
 from beamsplat.common.geometry.sensor_history import TimedScan
 from beamsplat.common.geometry.trajectory import Trajectory, read_tum
 from beamsplat.common.geometry.transforms import se3_to_se2, transform_points
+from beamsplat.common.messages.image_codec import decode_rgb
 from beamsplat.services.replay.options import SourceOptions
 from beamsplat.services.replay.source import open_source
 
@@ -58,9 +58,15 @@ class RecordedDrive:
         """Return image `index`, undistorted, RGB uint8 [H, W, 3].
 
         Raises:
-            UserError: the image cannot be decoded.
+            UserError: the image cannot be decoded, or has another size than the calibration.
         """
-        return self.undistort(decode_rgb(self.images[index], str(self.path)))
+        image = self.images[index]
+        try:
+            return self.undistort(
+                decode_rgb(image.data, image.encoding, image.width_px, image.height_px, image.step_bytes)
+            )
+        except ValueError as error:
+            raise UserError(f"{self.path}: the image at {image.stamp_ns} ns: {error}") from error
 
     def scan_near(self, stamp_ns: int) -> TimedScan | None:
         """Return the scan whose middle is nearest to a time; None if the difference is 0.15 s or more."""
@@ -104,32 +110,6 @@ class RecordedDrive:
         if T_map_body is None:
             return np.zeros((0, 3))
         return transform_points(T_map_body, self.beams_of(scan, scan.middle_ns, excluded).points_body_m)
-
-
-def decode_rgb(image: Any, where: str) -> np.ndarray:
-    """Decode an Image message to RGB uint8 [H, W, 3]; `where` names the recording in error texts.
-
-    Raises:
-        UserError: the bytes do not match the encoding.
-    """
-    data, h, w = image.data, image.height_px, image.width_px
-    if image.encoding in ("jpeg", "png"):
-        bgr = cv2.imdecode(data, cv2.IMREAD_COLOR)
-        if bgr is None:
-            raise UserError(
-                f"{where}: the image at {image.stamp_ns} ns cannot be decoded as {image.encoding}"
-            )
-        return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
-    channels = {"rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4, "mono8": 1, "yuv422_yuy2": 2}[image.encoding]
-    step = image.step_bytes or w * channels
-    if len(data) < step * h:
-        raise UserError(f"{where}: the image at {image.stamp_ns} ns is truncated")
-    raw = data[: step * h].reshape(h, step)[:, : w * channels].reshape(h, w, channels)
-    codes = {
-        "bgr8": cv2.COLOR_BGR2RGB, "rgba8": cv2.COLOR_RGBA2RGB, "bgra8": cv2.COLOR_BGRA2RGB,
-        "mono8": cv2.COLOR_GRAY2RGB, "yuv422_yuy2": cv2.COLOR_YUV2RGB_YUY2,
-    }  # fmt: skip
-    return raw if image.encoding == "rgb8" else cv2.cvtColor(raw, codes[image.encoding])
 
 
 def open_drive(path: Path, poses: Path | None = None, rig: Path | None = None) -> RecordedDrive:
