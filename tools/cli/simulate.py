@@ -6,9 +6,10 @@ import json
 import os
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
@@ -23,6 +24,9 @@ from rich.progress import (
 )
 
 from beamsplat.tools.cli.options import writable
+
+if TYPE_CHECKING:
+    from beamsplat.tools.simulator.lidar_records import RecordingSummary
 
 console = Console(stderr=True)
 
@@ -39,14 +43,14 @@ def _numbers(text: str, count: int, option: str) -> tuple[float, ...]:
     return values
 
 
-def _size(text: str) -> tuple[int, int]:
+def _size(text: str, low: int, high: int, unit: str) -> tuple[int, int]:
     parts = text.lower().split("x")
     if len(parts) != 2 or not all(p.isdigit() for p in parts):
         raise typer.BadParameter(f"expected WIDTHxHEIGHT, got {text!r}", param_hint="--size")
-    width, height = int(parts[0]), int(parts[1])
-    if not (32 <= width <= 4096 and 32 <= height <= 4096):
-        raise typer.BadParameter("width and height must be 32 to 4096 pixels", param_hint="--size")
-    return width, height
+    first, second = int(parts[0]), int(parts[1])
+    if not (low <= first <= high and low <= second <= high):
+        raise typer.BadParameter(f"both numbers must be {low} to {high} {unit}", param_hint="--size")
+    return first, second
 
 
 def simulate(
@@ -58,10 +62,15 @@ def simulate(
         int | None,
         typer.Option(min=1, help="Number of laps; the images of one lap are rendered once and reused."),
     ] = None,
-    movers: Annotated[int, typer.Option(min=0, max=6, help="Number of walking people.")] = 0,
+    movers: Annotated[
+        int, typer.Option(min=0, max=200, help="Number of walking people; at most 6 in a home.")
+    ] = 0,
     carts: Annotated[int, typer.Option(min=0, max=3, help="Number of rolling carts.")] = 0,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the home, the route and the noise.")] = 0,
-    size: Annotated[str, typer.Option(help="Image size, WIDTHxHEIGHT.")] = "640x480",
+    size: Annotated[
+        str,
+        typer.Option(help="Image size in pixels (default 640x480); office: size in metres (default 120x80)."),
+    ] = "",
     rate_hz: Annotated[float, typer.Option(min=0.5, max=60.0, help="Image rate of the camera.")] = 10.0,
     scene: Annotated[
         Path | None,
@@ -73,6 +82,21 @@ def simulate(
     lidar_only: Annotated[
         bool, typer.Option("--lidar-only", help="No camera: fast, for long drives.")
     ] = False,
+    site: Annotated[
+        str, typer.Option(help="'home', or 'office': a large office floor, only with --lidar-only.")
+    ] = "home",
+    distance_m: Annotated[
+        float, typer.Option(min=20.0, help="Office: driven distance, before the way back to the start.")
+    ] = 3000.0,
+    aliased: Annotated[
+        bool, typer.Option("--aliased", help="Office: identical rooms along identical corridors.")
+    ] = False,
+    lost: Annotated[
+        int,
+        typer.Option(
+            min=0, max=50, help="Office: number of drives of 30 s without measurements into unknown space."
+        ),
+    ] = 0,
     clock_offset_ms: Annotated[
         float, typer.Option(min=-10_000.0, max=10_000.0, help="Fault: added to the stamps of the images.")
     ] = 0.0,
@@ -118,12 +142,35 @@ def simulate(
 
     beamsplat simulate --out soak --lidar-only --laps 40
 
+    beamsplat simulate --out site --site office --size 120x80 --lidar-only --distance-m 3000 --movers 30
+
     beamsplat simulate --out faulty --clock-offset-ms 40 --extrinsic-yaw-deg 2 --distortion=-0.12,0.03,0,0,0
     """
+    if site == "office":
+        if not lidar_only:
+            raise typer.BadParameter("an office has no camera: add --lidar-only", param_hint="--site")
+        length_m, width_m = _size(size or "120x80", 30, 1000, "metres")
+
+        def office(progress: Callable[[str, int, int], None]) -> RecordingSummary:
+            from beamsplat.tools.simulator.office.recording import simulate_office
+            from beamsplat.tools.simulator.office.settings import OfficeSettings
+
+            chosen = OfficeSettings(
+                seed=seed, length_m=length_m, width_m=width_m, distance_m=distance_m, aliased=aliased,
+                lost=lost, people=movers,
+            )  # fmt: skip
+            return simulate_office(chosen, out, replace=force, progress=progress)
+
+        _record(office, out, as_json)
+        return
+    if site != "home":
+        raise typer.BadParameter(f"'home' or 'office', got {site!r}", param_hint="--site")
+    if movers > 6:
+        raise typer.BadParameter("a home has room for at most 6 people", param_hint="--movers")
     from beamsplat.tools.simulator import recording
     from beamsplat.tools.simulator.settings import CameraSettings, Faults, LidarSettings, SimulationSettings
 
-    width, height = _size(size)
+    width, height = _size(size or "640x480", 32, 4096, "pixels")
     k1, k2, p1, p2, k3 = _numbers(distortion, 5, "--distortion")
     x_m, y_m, z_m = _numbers(extrinsic_xyz_m, 3, "--extrinsic-xyz-m")
     settings = SimulationSettings(
@@ -147,10 +194,21 @@ def simulate(
             exposure_changes=exposure_changes,
         ),
     )
+    _record(
+        lambda progress: recording.simulate(settings, out, jobs=jobs, replace=force, progress=progress),
+        out,
+        as_json,
+    )
+
+
+def _record(
+    simulate_with: Callable[[Callable[[str, int, int], None]], RecordingSummary], out: Path, as_json: bool
+) -> None:
+    """Simulate with a progress display, and print a summary of the recording in `out`."""
     began = time.monotonic()
     try:
         with _Bar() as bar:
-            summary = recording.simulate(settings, out, jobs=jobs, replace=force, progress=bar.show)
+            summary = simulate_with(bar.show)
     except (ValueError, FileExistsError) as error:
         console.print(f"[red]{error}[/]", highlight=False)
         raise typer.Exit(2) from error

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import heapq
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
-from beamsplat.common.geometry.transforms import se2_to_se3
 from beamsplat.tools.simulator import store
 from beamsplat.tools.simulator import writer as w
 from beamsplat.tools.simulator.actors import ActorPath, choose_actor_paths
 from beamsplat.tools.simulator.clearance_grid import ClearanceGrid
-from beamsplat.tools.simulator.drive_log import SimulationStep, simulate_lidar
+from beamsplat.tools.simulator.drive_log import simulate_lidar
 from beamsplat.tools.simulator.frames import (
     FrameRenderer,
     FrameSpec,
@@ -23,38 +20,21 @@ from beamsplat.tools.simulator.frames import (
     load_frame,
     render_frames,
 )
+from beamsplat.tools.simulator.lidar_records import (
+    Progress,
+    RecordingSummary,
+    TruthLog,
+    lidar_records,
+    static_tf,
+    write_lidar_truth,
+)
 from beamsplat.tools.simulator.path import DrivePath, MotionLimits
 from beamsplat.tools.simulator.ray_caster import RayCaster
 from beamsplat.tools.simulator.settings import START_NS, SimulationSettings
 from beamsplat.tools.simulator.truth import DepthViews, decode_depth, surface_points, write_extra_views
 from beamsplat.tools.simulator.world import get_world, world_key
 
-Progress = Callable[[str, int, int], None]  # stage, done, total
 SURFACE_VIEWS = 160  # maximum number of depth maps, evenly over the lap, that define the seen surface
-
-
-@dataclass(frozen=True)
-class RecordingSummary:
-    """Duration, driven distance in metres and number of images, scans, messages and views of a recording."""
-
-    seconds: float
-    laps: float
-    metres: float
-    images: int
-    scans: int
-    messages: int
-    extra_views: int
-
-
-@dataclass
-class _TruthLog:
-    """Ground truth collected while the lidar stream is written; beam masks are packed, 8 beams per byte."""
-
-    scan_stamps_ns: list[int] = field(default_factory=list)
-    moving: list[np.ndarray] = field(default_factory=list)
-    through_glass: list[np.ndarray] = field(default_factory=list)
-    stamps_ns: list[np.ndarray] = field(default_factory=list)
-    truth: list[np.ndarray] = field(default_factory=list)
 
 
 def simulate(
@@ -84,7 +64,7 @@ def simulate(
     rng = np.random.default_rng([settings.seed, 0x4D])
     actor_paths = choose_actor_paths(space, drive, caster, settings.people + settings.carts, duration, rng)
     with store.atomic_folder(out, replace=replace) as folder:
-        streams: list[Iterator[w.BagRecord]] = [_static_tf(settings)]
+        streams: list[Iterator[w.BagRecord]] = [static_tf(settings)]
         topics = ["/tf_static", "/tf", "/odom", "/scan"]
         images, views = 0, 0
         if not settings.lidar_only:
@@ -99,7 +79,7 @@ def simulate(
             views = _write_views(folder, settings, spec, space, unique, paths, progress)
             streams.append(_images(settings, times, [path_of[t] for t in in_lap]))
             topics += ["/camera/image_raw/compressed", "/camera/camera_info"]
-        log = _TruthLog()
+        log = TruthLog()
         actors = build_actors(world, tuple(actor_paths), settings.people, settings.seed)
         steps = simulate_lidar(
             world.mesh,
@@ -112,9 +92,9 @@ def simulate(
             actors=actors,
         )
         scans = round(duration * settings.lidar.rate_hz)
-        streams.append(_lidar_records(settings, steps, log, lambda i: progress("scanning", i, scans)))
+        streams.append(lidar_records(settings, steps, log, lambda i: progress("scanning", i, scans)))
         messages = w.write_bag(folder / "bag", streams, topics)
-        _write_lidar_truth(folder, settings, log, drive)
+        write_lidar_truth(folder, settings, log)
     metres = drive.length_m * duration / drive.lap_s
     return RecordingSummary(
         duration, duration / drive.lap_s, metres, images, len(log.scan_stamps_ns), messages, views
@@ -157,14 +137,6 @@ def _stamp(settings: SimulationSettings, time_s: float) -> int:
     return START_NS + round(time_s * 1e6) * 1000 + round(settings.faults.clock_offset_ms * 1e6)
 
 
-def _static_tf(settings: SimulationSettings) -> Iterator[w.BagRecord]:
-    links = [(w.BASE, w.LASER, settings.lidar.T_body_lidar)]
-    if not settings.lidar_only:
-        published = settings.faults.published_mount(settings.camera.T_body_camera)
-        links.insert(0, (w.BASE, w.CAMERA, published))
-    yield w.BagRecord(START_NS, "/tf_static", w.tf_bytes(START_NS, links))
-
-
 def _images(settings: SimulationSettings, times_s: list[float], paths: list[Path]) -> Iterator[w.BagRecord]:
     rng = np.random.default_rng([settings.seed, 0x4A, 1])
     received = 0
@@ -176,50 +148,6 @@ def _images(settings: SimulationSettings, times_s: list[float], paths: list[Path
             received, "/camera/image_raw/compressed", w.image_bytes(stamp, load_frame(path).jpeg)
         )
         yield w.BagRecord(received + 100, "/camera/camera_info", w.camera_info_bytes(stamp, settings.camera))
-
-
-def _lidar_records(
-    settings: SimulationSettings,
-    steps: Iterator[SimulationStep],
-    log: _TruthLog,
-    progress: Callable[[int], None],
-) -> Iterator[w.BagRecord]:
-    """Yield scans, odometry and tf in order of receipt; append their ground truth to `log`."""
-    rng = np.random.default_rng([settings.seed, 0x4A, 2])
-    period_ns = round(1e9 / settings.lidar.rate_hz)
-    waiting: list[tuple[int, int, w.BagRecord]] = []
-    last, number = {"/scan": 0, "/odom": 0}, 0
-
-    def push(topic: str, received: int, data: bytes) -> int:
-        nonlocal number
-        received = max(received, last.get(topic, 0) + 1000)
-        last[topic] = received
-        heapq.heappush(waiting, (received, number, w.BagRecord(received, topic, data)))
-        number += 1
-        return received
-
-    for index, step in enumerate(steps):
-        log.scan_stamps_ns.append(step.stamp_ns)
-        log.moving.append(np.packbits(step.moving))
-        log.through_glass.append(np.packbits(step.through_glass))
-        log.stamps_ns.append(step.odometry_stamps_ns)
-        log.truth.append(step.true_pose_world_body)
-        odometry = step.odometry
-        lags = 2e6 + rng.exponential(3e5, len(odometry.pose_odom_body) + 1)
-        for k, (stamp, T) in enumerate(
-            zip(step.odometry_stamps_ns.tolist(), se2_to_se3(odometry.pose_odom_body))
-        ):
-            data = w.odometry_bytes(stamp, T, float(odometry.speed_m_s[k]), float(odometry.turn_rad_s[k]))
-            received = push("/odom", stamp + int(lags[k]), data)
-            push("/tf", received + 100, w.tf_bytes(stamp, [(w.ODOM, w.BASE, T)]))
-        scan_lag = period_ns + int(5e6 + 4 * (lags[-1] - 2e6))
-        push("/scan", step.stamp_ns + scan_lag, w.scan_bytes(step.stamp_ns, step.ranges_m, settings.lidar))
-        # Odometry of later steps is measured after the end of this one: earlier records are complete.
-        while waiting and waiting[0][0] <= step.stamp_ns + period_ns:
-            yield heapq.heappop(waiting)[2]
-        progress(index + 1)
-    while waiting:
-        yield heapq.heappop(waiting)[2]
 
 
 def _write_image_truth(
@@ -276,23 +204,3 @@ def _write_views(
     points, colours = surface_points(scene, depth_views, settings.surface_points, frame_renderer.gain, rng)
     w.write_ply(folder / "gt_surface.ply", points, colours)
     return count
-
-
-def _write_lidar_truth(folder: Path, settings: SimulationSettings, log: _TruthLog, drive: DrivePath) -> None:
-    w.write_camera_json(folder / "camera.json", settings.camera, settings.lidar, settings.faults)
-    poses = np.concatenate(log.truth) if log.truth else np.zeros((0, 3))
-    stamps = np.concatenate(log.stamps_ns) if log.stamps_ns else np.zeros(0, np.int64)
-    w.write_tum(folder / "groundtruth.txt", stamps, se2_to_se3(poses))
-    np.savez_compressed(
-        folder / "beams.npz",
-        stamp_ns=np.array(log.scan_stamps_ns, dtype=np.int64),
-        moving=_unpack(log.moving, settings.lidar.beams),
-        through_glass=_unpack(log.through_glass, settings.lidar.beams),
-    )
-
-
-def _unpack(rows: list[np.ndarray], beams: int) -> np.ndarray:
-    """Return the beam masks bool [S, B] of S rows of packed bits."""
-    if not rows:
-        return np.zeros((0, beams), np.bool_)
-    return np.unpackbits(np.stack(rows), axis=1)[:, :beams].astype(np.bool_)
