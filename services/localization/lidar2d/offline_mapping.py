@@ -56,6 +56,8 @@ def map_measurements(
     slam = LidarSlam(settings or LidarSlamSettings(), log.T_body_lidar)
     wall, cpu = time.perf_counter(), time.process_time()
     steps_ms: list[float] = []
+    steps_cpu_ms: list[float] = []
+    cpu_s_at: list[float] = []  # CPU time of all threads before each scan
     statuses: dict[str, int] = {}
     refused: Counter[str] = Counter()
     with JobRunner(slam, threaded=True) as jobs:
@@ -63,10 +65,12 @@ def map_measurements(
             if kind == "odometry":
                 slam.add_odometry(*values)
                 continue
+            cpu_s_at.append(time.process_time() - cpu)
             jobs.before_scan()
-            started = time.perf_counter()
+            started, started_cpu = time.perf_counter(), time.thread_time()
             result = slam.add_scan(*values)
             steps_ms.append((time.perf_counter() - started) * 1e3)
+            steps_cpu_ms.append((time.thread_time() - started_cpu) * 1e3)
             jobs.after_scan(result)
             status = result.status.partition(":")[0]
             statuses[status] = statuses.get(status, 0) + 1
@@ -82,8 +86,12 @@ def map_measurements(
         "wall_s": wall_s,
         "cpu_s": cpu_s,
         "cpu_ms_per_scan": cpu_s / len(steps_ms) * 1e3,
+        "cpu_ms_per_scan_first_tenth": _cpu_ms_per_scan(cpu_s_at[: len(cpu_s_at) // 10 + 1]),
+        "cpu_ms_per_scan_last_tenth": _cpu_ms_per_scan(cpu_s_at[-(len(cpu_s_at) // 10) - 1 :]),
         "step_p50_ms": float(np.percentile(steps_ms, 50)),
         "step_p95_ms": float(np.percentile(steps_ms, 95)),
+        "step_max_ms": max(steps_ms),
+        "step_max_cpu_ms": max(steps_cpu_ms),  # without the waits of a busy machine
         "peak_rss_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0,
         "loop_closures": slam.pose_graph.loop_closures,
         "odometry_refused": slam.local_builder.odometry.rejected,
@@ -93,6 +101,11 @@ def map_measurements(
     }
     (out / "figures.json").write_text(json.dumps(figures, indent=1))
     return figures
+
+
+def _cpu_ms_per_scan(cpu_s_at: list[float]) -> float:
+    """Return the mean CPU time between scans in ms; `cpu_s_at` is the total in s before each of them."""
+    return (cpu_s_at[-1] - cpu_s_at[0]) / max(len(cpu_s_at) - 1, 1) * 1e3
 
 
 def _merged(log: MeasurementLog) -> Iterable[tuple]:
