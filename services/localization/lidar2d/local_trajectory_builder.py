@@ -184,7 +184,10 @@ class LocalTrajectoryBuilder:
         s = self.settings
         pose_submap_last = se2.between(local.pose_odom_submap, self.poses[-1])
         guess_pose = se2.compose(pose_submap_last, prediction.motion)
+        # A bias of the wheels persists over many scans: n priors of one sigma each, taken as independent,
+        # would outweigh the scans and bend long corridors.
         information = np.diag([prediction.sigma_m**-2, prediction.sigma_m**-2, prediction.sigma_rad**-2])
+        information /= s.prior_correlation_scans
         tables = local.surfels.tables()
         points = scan.features()
         match = refine(points, scan.origin_body, guess_pose, tables, s, guess_pose, information)

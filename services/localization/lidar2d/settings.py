@@ -45,6 +45,7 @@ class LidarSlamSettings:
     # Motion
     max_speed_m_s: float = 3.0  # a match that implies faster motion is rejected
     max_yaw_rate_rad_s: float = 6.0  # a match that implies faster rotation is rejected
+    prior_correlation_scans: float = 30.0  # errors of so many consecutive predictions have the same cause
     extrapolate_s: float = 0.5  # the last velocity is extrapolated for at most this time
 
     # Pose graph
