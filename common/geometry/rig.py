@@ -18,6 +18,11 @@
     xyz_m = [0.0, 0.0, 0.18]
     quat_xyzw = [0.0, 0.0, 0.0, 1.0]
 
+    [lidar.scan]                             # optional: how the driver reports its beams (common/scans)
+    order = "reversed"                       # forward, reversed, none (all at once)
+    sweep_s = 0.1                            # time from the first beam to the last
+    stamp = "first"                          # first, last: the beam whose time the stamp is
+
 The rotation of a mount is `rpy_deg` (R = Rz(yaw) Ry(pitch) Rx(roll)), or a quaternion in the order that its
 name states. For a camera, the quaternion is the orientation of the **optical** frame (x right, y down, z
 forward), as in ROS, but rpy_deg is the orientation of the housing (x forward), which is easy to measure.
@@ -140,10 +145,24 @@ class CameraSection(Config):
         return CameraModel(**fields, T_body_camera=self.mount.transform(R_body_camera_level))
 
 
+class ScanSection(Config):
+    """The [lidar.scan] section: how the driver of the lidar reports its beams; what is not set is found out.
+
+    BeamSplat finds these values from the data (common/scans) and `beamsplat rig` writes them.
+    """
+
+    order: Literal["forward", "reversed", "none"] | None = None  # of the beams in time; none: all at once
+    sweep_s: Annotated[Finite, Field(ge=0.0, le=10.0)] | None = None  # time from the first beam to the last
+    stamp: Literal["first", "last"] | None = None  # the stamp is the time of this beam, in the order of time
+    angles: Literal["increment", "limits", "from_max"] | None = None  # which of contradicting fields holds
+    mirrored: bool | None = None  # whether the directions of the beams change sign
+
+
 class LidarSection(Config):
     """The [lidar] section of a rig file."""
 
     mount: Mount
+    scan: ScanSection | None = None
 
     def model(self) -> LidarModel:
         """Return the lidar model of the `Rig` message."""
@@ -233,7 +252,7 @@ def format_rig(rig: RigFile, header: str, notes: dict[str, str]) -> str:
     Args:
         rig: the calibration; mounts are written as rpy_deg.
         header: comment at the top.
-        notes: comments above the sections "camera", "camera.mount" and "lidar.mount".
+        notes: comments above the sections "camera", "camera.mount", "lidar.mount" and "lidar.scan".
     """
     lines = [f"# {line}".rstrip() for line in header.splitlines()]
     lines += [f"source = {_toml(rig.source)}"]
@@ -246,6 +265,12 @@ def format_rig(rig: RigFile, header: str, notes: dict[str, str]) -> str:
         lines += _mount_lines("camera", rig.camera.mount, R_body_camera_level, notes)
     if rig.lidar is not None:
         lines += _mount_lines("lidar", rig.lidar.mount, np.eye(3), notes)
+        if rig.lidar.scan is not None:
+            lines += ["", *_comment(notes.get("lidar.scan", "")), "[lidar.scan]"]
+            lines += [
+                f"{name} = {_toml(value)}"
+                for name, value in rig.lidar.scan.model_dump(exclude_none=True).items()
+            ]
     return "\n".join(lines) + "\n"
 
 
@@ -268,4 +293,4 @@ def _toml(value: object) -> str:
         return f'"{escaped}"'
     if isinstance(value, (list, tuple)):
         return "[" + ", ".join(_toml(entry) for entry in value) + "]"
-    return repr(value)
+    return str(value).lower() if isinstance(value, bool) else repr(value)
