@@ -44,10 +44,14 @@ class InputFinding:
     count: int = 0  # messages
 
     @property
+    def reason(self) -> str:
+        """Return topic, field, value, what was done and the remedy, without the count."""
+        return f"{self.topic}: {self.action}: {_text(self.field, self.value, self.what, self.remedy)}"
+
+    @property
     def sentence(self) -> str:
-        """Return one sentence: topic, field, value, what was done, how often, and the remedy."""
-        verb = "repaired" if self.action == "repaired" else "refused"
-        number = f"{self.count} message{'s' * (self.count != 1)} {verb}"
+        """Return one sentence: topic, how often, field, value, what was done, and the remedy."""
+        number = f"{self.count} message{'s' * (self.count != 1)} {self.action}"
         return f"{self.topic}: {number}: {_text(self.field, self.value, self.what, self.remedy)}"
 
 

@@ -18,10 +18,11 @@ from beamsplat.common.recording.ros_types import transform_of
 from beamsplat.common.recording.sensor_reading import SensorReading
 from beamsplat.common.recording.sensors import SENSORS, ros_fields
 from beamsplat.common.recording.static_frames import StaticFrames, normalize_frame
+from beamsplat.common.recording.topic_choice import Candidate, choose_camera_info
 from beamsplat.services.replay.bags import Bag, BagTopic
 from beamsplat.services.replay.decode import RawMessage, deserialize
 from beamsplat.services.replay.options import SourceOptions
-from beamsplat.services.replay.topic_selection import choose_camera_info, choose_topics
+from beamsplat.services.replay.topic_selection import select_topics
 
 TF_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 _PEEK = 5  # messages that may fail to decode before the topic counts as broken
@@ -40,7 +41,9 @@ class BagSource:
         self.where = str(bag.path)
         self.report = InputReport()  # of what was repaired and refused since `messages` was called
         self._info_topic = ""  # of the CameraInfo of the images
-        self.chosen = choose_topics(bag.topics, options, self.where, self._is_image)
+        self.chosen, self.choices, self._unused = select_topics(
+            bag.topics, options, self.where, self._why_no_image
+        )
         self._first = {sensor_name: self._peek(topic) for sensor_name, topic in self.chosen.items()}
         self.frames = StaticFrames()
         self.calibration = cal.Calibration()
@@ -58,7 +61,7 @@ class BagSource:
     @property
     def problems(self) -> list[str]:
         """Return sentences about the files, the calibration, and messages that were repaired or refused."""
-        return [*self.bag.problems, *self.calibration.doubts, *self.report.sentences]
+        return [*self.bag.problems, *self._unused, *self.calibration.doubts, *self.report.sentences]
 
     def message_count(self) -> int:
         """Return the number of messages on the selected topics."""
@@ -176,12 +179,17 @@ class BagSource:
                     ) from error
         raise UserError(f"{self.where}: {topic.name} has no message that can be decoded")
 
-    def _is_image(self, topic: BagTopic) -> bool:
-        """Return whether a topic has camera images; raw image topics may also have depth maps and masks."""
+    def _why_no_image(self, topic: BagTopic) -> str:
+        """Return why a topic has no camera images, judged by its first message; "" if it has."""
         try:
-            return is_camera_image(self._peek(topic))
+            first = self._peek(topic)
         except UserError:
-            return True  # the error is reported when the topic is read
+            return ""  # the error is reported when the topic is read
+        if is_camera_image(first):
+            return ""
+        if hasattr(first, "format"):
+            return f"format = {first.format!r}: {describe_format(bytes(first.data[:32]), str(first.format))}"
+        return f"encoding = {first.encoding!r} is not that of a camera image"
 
     def image_size_px(self) -> tuple[int, int] | None:
         """Return (width, height) of the images; None if the bag has no images."""
@@ -199,7 +207,10 @@ class BagSource:
 
     def _find_intrinsics(self) -> None:
         image = self.chosen["image"]
-        info = choose_camera_info(self.bag.topics, image, self.options.camera_info_topic, self.where)
+        by_name = {topic.name: topic for topic in self.bag.topics if topic.count}
+        listed = [Candidate(topic.name, topic.type_name, topic.count) for topic in by_name.values()]
+        name = choose_camera_info(listed, image.name, self.where, self.options.camera_info_topic)
+        info = by_name[name] if name is not None else None
         if info is None:
             self.calibration.missing.append(
                 f"there are images on {image.name} but no sensor_msgs/CameraInfo with the camera's K"

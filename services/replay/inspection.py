@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -44,10 +45,14 @@ class InspectionReport:
     sensors: dict[str, str] = field(default_factory=dict)  # sensor name -> topic or file
     lidar: LidarStatistics | None = None
     camera: dict[str, Any] | None = None
+    choices: list[str] = field(default_factory=list)  # why topics were chosen, where there were several
     calibration_found: list[str] = field(default_factory=list)
     calibration_assumed: list[str] = field(default_factory=list)
     calibration_missing: list[str] = field(default_factory=list)
     problems: list[str] = field(default_factory=list)
+    input: list[dict[str, Any]] = field(
+        default_factory=list
+    )  # repaired and refused messages, see InputReport
     error: str = ""
 
     @property
@@ -125,6 +130,7 @@ def _describe_bag(
         except UserError:  # already in report.error
             return
     report.sensors = {sensor_name: topic.name for sensor_name, topic in source.chosen.items()}
+    report.choices = source.choices
     try:
         found = source.calibrate()
         if options.rig is None:
@@ -142,6 +148,10 @@ def _describe_bag(
             **{k: first[0].get(k) for k in ("width_px", "height_px", "encoding")},
             **(report.camera or {}),
         }
+    with suppress(UserError):  # of the calibration, in `calibration_missing`; damage, found before
+        for _ in source.messages():  # every message, as replay reads it: what it refuses is named here
+            pass
+    report.input = source.report.as_dicts()
     report.problems += source.problems
 
 

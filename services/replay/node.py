@@ -40,6 +40,8 @@ class ReplayNode(Node):
             source.close()
             raise
         self._source = source
+        for choice in getattr(source, "choices", ()):
+            log.info("%s", choice)
         return source
 
     def check_resources(self) -> None:

@@ -1,132 +1,82 @@
-"""Selection of the camera, lidar and odometry topics: by type, or by option if several have the type."""
+"""Selection of a bag's topics of sensors, by the rules of common/recording/topic_choice.py."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 from beamsplat.common.errors import UserError
-from beamsplat.common.recording.sensors import SENSORS, SensorType
+from beamsplat.common.recording.sensors import SENSORS
+from beamsplat.common.recording.topic_choice import Candidate, choose_topic
 from beamsplat.services.replay.bags import BagTopic
 from beamsplat.services.replay.options import SourceOptions
 
-CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
-# Names of topics that are not measured poses, and of images that are not camera images.
-_NOT_POSES = ("goal", "target", "waypoint", "initial", "plan", "setpoint", "click")
-_NOT_IMAGES = ("depth", "disparity", "mask", "semantic")
+
+class SelectedTopics(NamedTuple):
+    """The topic of each sensor that has one; sentences on choices, and on topics that cannot be used."""
+
+    topics: dict[str, BagTopic]
+    choices: list[str]
+    unusable: list[str]
 
 
-def choose_topics(
-    topics: list[BagTopic], options: SourceOptions, where: str, is_image: Callable[[BagTopic], bool]
-) -> dict[str, BagTopic]:
+def select_topics(
+    topics: list[BagTopic], options: SourceOptions, where: str, unusable: Callable[[BagTopic], str]
+) -> SelectedTopics:
     """Return the topic of each sensor ("image", "scan", ...); sensors without a topic are not in the result.
 
     Args:
         topics: all topics of the bag.
         options: contain the topics that the user has set.
         where: path of the data, for messages.
-        is_image: returns whether a raw image topic has camera images (the first message is read).
+        unusable: returns why an image topic has no camera images (the first message is read), or "".
 
     Raises:
         UserError: several topics are possible; a topic set by option is missing or has another type; or the
             topic of a required sensor is missing.
     """
-    chosen: dict[str, BagTopic] = {}
-    for sensor_name, sensor in SENSORS.items():
+    by_name = {topic.name: topic for topic in topics if topic.count}
+    left_out: dict[str, str] = {}
+    listed = []
+    for topic in by_name.values():
+        is_image = topic.type_name in SENSORS["image"].ros_types and "image" not in options.without
+        why = unusable(topic) if is_image and not options.image_topic else ""
+        if why:
+            left_out[topic.name] = why
+        else:
+            listed.append(Candidate(topic.name, topic.type_name, topic.count))
+    selected: dict[str, BagTopic] = {}
+    choices: list[str] = []
+    unused: list[str] = []
+    for sensor_name in ("scan", "image", "odometry", "pose"):
         if sensor_name in options.without:
             continue
-        name = options.topic_for(sensor_name)
-        topic = _named(topics, sensor, name, where) if name else _by_type(topics, sensor, where, is_image)
-        if topic is not None:
-            chosen[sensor_name] = topic
+        near = selected["scan"].name if "scan" in selected else ""
+        choice = choose_topic(sensor_name, listed, where, options.topic_for(sensor_name), near)
+        if choice is None:
+            continue
+        selected[sensor_name] = by_name[choice.topic.name]
+        if choice.reason and not options.topic_for(sensor_name):
+            choices.append(f"{choice.topic.name} is {choice.reason}")
+    if "image" not in selected and "image" not in options.without:
+        unused = [f"{name} is not used: {why}" for name, why in left_out.items()]
     for sensor_name in sorted(options.require - options.without):
-        if sensor_name not in chosen:
-            types = " or ".join(SENSORS[sensor_name].ros_types)
-            there = ", ".join(f"{t.name} ({t.type_name})" for t in topics if t.count) or "nothing"
-            raise UserError(
-                f"{where}: has no {sensor_name}: no topic of type {types}; it has {there}. "
-                f'Use another recording, or set without = ["{sensor_name}"] if it is not needed'
-            )
-    return chosen
+        if sensor_name not in selected:
+            raise UserError(_missing(sensor_name, topics, left_out, where))
+    return SelectedTopics(selected, choices, unused)
 
 
-def _named(topics: list[BagTopic], sensor: SensorType, name: str, where: str) -> BagTopic:
-    found = [topic for topic in topics if topic.name == name or topic.name == "/" + name]
-    fitting = [topic for topic in found if topic.type_name in sensor.ros_types and topic.count]
-    if fitting:
-        return fitting[0]
-    others = ", ".join(t.name for t in topics if t.type_name in sensor.ros_types and t.count) or "none"
-    if found:
-        problem = f"is a {found[0].type_name}" if found[0].count else "has no messages"
-        raise UserError(f"{where}: {sensor.name}_topic = {name!r} {problem}; possible topics: {others}")
-    raise UserError(f"{where}: {sensor.name}_topic = {name!r} is not there; possible topics: {others}")
-
-
-def _by_type(
-    topics: list[BagTopic], sensor: SensorType, where: str, is_image: Callable[[BagTopic], bool]
-) -> BagTopic | None:
-    fitting = candidates(topics, sensor)
-    if sensor.name == "image":
-        fitting = _without_raw_duplicates([topic for topic in fitting if is_image(topic)])
-    elif fitting:  # the preferred type; for images both types are equally good
-        best = min(sensor.ros_types.index(topic.type_name) for topic in fitting)
-        fitting = [topic for topic in fitting if topic.type_name == sensor.ros_types[best]]
-    if len(fitting) > 1:
-        names = ", ".join(f"{topic.name} ({topic.count} messages)" for topic in fitting)
-        raise UserError(
-            f"{where}: has several topics for {sensor.name}: {names}; choose one with "
-            f'{sensor.name}_topic = "{fitting[0].name}", or none with without = ["{sensor.name}"]'
+def _missing(sensor_name: str, topics: list[BagTopic], left_out: dict[str, str], where: str) -> str:
+    """Return the sentence on a required sensor without a topic: what there is instead."""
+    types = " or ".join(SENSORS[sensor_name].ros_types)
+    there = ", ".join(f"{t.name} ({t.type_name})" for t in topics if t.count) or "nothing"
+    encodings = sorted({t.encoding for t in topics if t.count} - {"cdr", "ros1"})
+    text = f"{where}: has no {sensor_name}: no topic of type {types}; it has {there}. "
+    if encodings:
+        text += (
+            f"Its messages are encoded as {', '.join(encodings)}, and only those of ROS (cdr, ros1) are "
+            "read: record or convert them as ROS messages. "
         )
-    return fitting[0] if fitting else None
-
-
-def candidates(topics: list[BagTopic], sensor: SensorType) -> list[BagTopic]:
-    """Return the topics whose type and name match a sensor."""
-    unfit = {"pose": _NOT_POSES, "image": _NOT_IMAGES}.get(sensor.name, ())
-    return [
-        topic
-        for topic in topics
-        if topic.type_name in sensor.ros_types
-        and topic.count
-        and not any(word in topic.name.lower() for word in unfit)
-    ]
-
-
-def _without_raw_duplicates(images: list[BagTopic]) -> list[BagTopic]:
-    """Return the image topics, without raw image topics that also exist in compressed form."""
-    names = {topic.name for topic in images}
-    return [topic for topic in images if f"{topic.name}/compressed" not in names]
-
-
-def choose_camera_info(topics: list[BagTopic], image: BagTopic, chosen: str, where: str) -> BagTopic | None:
-    """Return the CameraInfo topic that belongs to an image topic; None if there is none.
-
-    `chosen`: the topic set by option, or "".
-
-    Raises:
-        UserError: the topic set by option is missing, or several topics are possible.
-    """
-    infos = [topic for topic in topics if topic.type_name == CAMERA_INFO and topic.count]
-    names = ", ".join(topic.name for topic in infos) or "none"
-    if chosen:
-        found = [topic for topic in infos if topic.name in (chosen, "/" + chosen)]
-        if not found:
-            raise UserError(f"{where}: camera_info_topic = {chosen!r} is not there; there are: {names}")
-        return found[0]
-    beside = [topic for topic in infos if _folder(topic.name) in _ancestors(image.name)]
-    if beside:  # the one with the longest common namespace
-        return max(beside, key=lambda topic: len(_folder(topic.name)))
-    if len(infos) > 1:
-        raise UserError(
-            f"{where}: none of the CameraInfo topics is in the namespace of {image.name}: {names}; "
-            "choose one with camera_info_topic"
-        )
-    return infos[0] if infos else None
-
-
-def _folder(name: str) -> str:
-    return name.rsplit("/", 1)[0]
-
-
-def _ancestors(name: str) -> set[str]:
-    parts = name.split("/")
-    return {"/".join(parts[:i]) for i in range(2, len(parts))}
+    if sensor_name == "image" and left_out:
+        text += " ".join(f"{name} is not used: {why}." for name, why in left_out.items()) + " "
+    return text + f'Use another recording, or set without = ["{sensor_name}"] if it is not needed'

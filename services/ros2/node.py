@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import queue
 import time
 from collections import deque
@@ -21,6 +22,8 @@ from beamsplat.common.zenoh.rmw import LIVELINESS_PREFIX, RmwAttachment, RmwEnti
 from beamsplat.services.ros2.config import Ros2Config
 from beamsplat.services.ros2.robot import RosRobot, RosRobotOptions
 from beamsplat.services.ros2.topics import IMAGE, SUPPORTED_TYPES, TF
+
+log = logging.getLogger("beamsplat.ros2")
 
 _POLL_S = 0.1
 _QUEUED = 1000  # messages; the oldest is dropped when the queue is full
@@ -80,6 +83,8 @@ class Ros2Node(Node):
             self.rejections.set("messages dropped, the queue was full", self._dropped)
             for topic, count in self.robot.rejected.items():
                 self.rejections.set(f"{topic}: messages not usable", count)
+            for found in self.robot.report.findings:
+                self.rejections.set(found.reason, found.count)
 
     def close(self) -> None:
         if hasattr(self, "_session"):
@@ -113,6 +118,8 @@ class Ros2Node(Node):
     def _unsubscribe_unused(self) -> None:
         """Unsubscribe, after topic selection, from unneeded transforms and from other raw images."""
         self._topics_selected = True
+        for note in [*self.robot.notes, *self.robot.doubts]:
+            log.info("%s", note)
         chosen = {topic.strip("/") for topic in self.robot.selected_topics}
         for key, type_name in self._type_by_key.items():
             topic = key.split("/", 1)[1].rsplit("/", 2)[0]

@@ -74,6 +74,8 @@ class RosRobot:
         self._reading: SensorReading | None = None  # once the calibration is known
         self._info_topic = ""
         self.fault = ""
+        self.notes: list[str] = []  # why topics were chosen
+        self.doubts: list[str] = []  # about the calibration
         self.status = "no message received yet"
 
     @property
@@ -177,7 +179,8 @@ class RosRobot:
             for t, (k, m) in self._first_messages.items()
             if "image" not in _kind_of(k) or is_camera_image(m)
         }
-        chosen = select_topics(seen, self._options.topics, self._options.without)
+        seen |= dict.fromkeys(self._camera_infos, CAMERA_INFO)
+        chosen, self.notes = select_topics(seen, self._options.topics, self._options.without)
         if "scan" not in chosen and "image" not in chosen:
             self.status = f"no scan or image among the topics: {', '.join(sorted(seen)) or 'none received'}"
             return False
@@ -232,6 +235,7 @@ class RosRobot:
         if child and found.body_frame:
             T_child_body = tree.find(child, found.body_frame)
             self._T_child_body = np.eye(4) if T_child_body is None else T_child_body
+        self.doubts = found.doubts
         return found.rig("the robot's CameraInfo and transforms")
 
     def _intrinsics(self, found: cal.Calibration, image: str) -> None:
@@ -307,7 +311,11 @@ class RosRobot:
     def _update_status(self) -> None:
         counts = ", ".join(f"{topic} {self.published[topic]}" for topic in sorted(self._kind_by_topic))
         rejected = f"; {self.rejected.total()} rejected, last: {self.fault}" if self.rejected else ""
-        self.status = f"from ROS 2: {counts}{rejected}"
+        repaired = [found for found in self.report.findings if found.action == "repaired"]
+        if repaired:
+            rejected += f"; {self.report.count('repaired')} repaired, for example {repaired[0].reason}"
+        doubts = "".join(f"; {doubt}" for doubt in self.doubts)
+        self.status = f"from ROS 2: {counts}{rejected}{doubts}"
 
     def _stamp_ns(self, message: Any, received_ns: int) -> int:
         stamp = message.header.stamp

@@ -13,7 +13,7 @@ from rich.table import Table
 
 from beamsplat.common.errors import NothingUseful, UserError
 from beamsplat.common.files.persist import make_folder
-from beamsplat.tools.cli.options import writable
+from beamsplat.tools.cli.options import CameraInfoTopic, ImageTopic, OdometryTopic, ScanTopic, writable
 
 if TYPE_CHECKING:
     from beamsplat.tools.evaluation.drive import RecordedDrive
@@ -55,6 +55,10 @@ def eval_depth(
     rig: RigOption = None,
     floor: FloorOption = None,
     heldout: Annotated[bool, typer.Option(help="Also evaluate twice with beams held out.")] = True,
+    scan_topic: ScanTopic = "",
+    image_topic: ImageTopic = "",
+    odometry_topic: OdometryTopic = "",
+    camera_info_topic: CameraInfoTopic = "",
     as_json: JsonOption = False,
 ) -> None:
     """Evaluate depth against dense true depth and against held-out beams, for every method.
@@ -71,7 +75,11 @@ def eval_depth(
     from beamsplat.tools.evaluation.evaluate import evaluate, truth_depth_files
 
     cv2.setNumThreads(1)  # CPU times are measured on one core
-    drive = _open(bag, poses, rig)
+    topics = {
+        "scan_topic": scan_topic, "image_topic": image_topic, "odometry_topic": odometry_topic,
+        "camera_info_topic": camera_info_topic,
+    }  # fmt: skip
+    drive = _open(bag, poses, rig, topics)
     with _progress() as bar:
         task = bar.add_task("", total=None)
         report = evaluate(
@@ -98,6 +106,10 @@ def depth(
     floor: FloorOption = None,
     truth: Annotated[Path | None, typer.Option(help="Folder of true depth, shown as well.")] = None,
     every: Annotated[int, typer.Option(min=1, help="Use every n-th image.")] = 8,
+    scan_topic: ScanTopic = "",
+    image_topic: ImageTopic = "",
+    odometry_topic: OdometryTopic = "",
+    camera_info_topic: CameraInfoTopic = "",
     as_json: JsonOption = False,
 ) -> None:
     """Draw panels: image with beams, raw depth, corrected depth, sigma, and true depth if given.
@@ -117,7 +129,11 @@ def depth(
     if data.is_file() and data.suffix.lower() in (".jpg", ".jpeg", ".png"):
         print(draw_depth_of_image(data, chosen, rig, out))
         return
-    drive = _open(data, poses, rig)
+    topics = {
+        "scan_topic": scan_topic, "image_topic": image_topic, "odometry_topic": odometry_topic,
+        "camera_info_topic": camera_info_topic,
+    }  # fmt: skip
+    drive = _open(data, poses, rig, topics)
     with _progress() as bar:
         task = bar.add_task("images", total=None)
         count, refused, useful = 0, Rejections(), 0
@@ -180,10 +196,10 @@ def options_of(pairs: list[str] | None) -> dict[str, Any]:
     return options
 
 
-def _open(bag: Path, poses: Path | None, rig: Path | None) -> RecordedDrive:
+def _open(bag: Path, poses: Path | None, rig: Path | None, topics: dict[str, str]) -> RecordedDrive:
     from beamsplat.tools.evaluation.drive import open_drive
 
-    return open_drive(bag, poses, rig)
+    return open_drive(bag, poses, rig, topics)
 
 
 def _progress() -> Progress:

@@ -12,7 +12,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from beamsplat.common.errors import UserError
-from beamsplat.tools.cli.options import writable
+from beamsplat.tools.cli.options import CameraInfoTopic, ImageTopic, OdometryTopic, ScanTopic, writable
 
 if TYPE_CHECKING:
     from beamsplat.services.replay.inspection import InspectionReport
@@ -31,6 +31,11 @@ def info(
     allow_truncated: Annotated[
         bool, typer.Option(help="Inspect the readable part of a truncated bag.")
     ] = False,
+    scan_topic: ScanTopic = "",
+    image_topic: ImageTopic = "",
+    odometry_topic: OdometryTopic = "",
+    pose_topic: Annotated[str, typer.Option(help="Topic of poses from outside, likewise.")] = "",
+    camera_info_topic: CameraInfoTopic = "",
 ) -> None:
     """Show the content of a bag or recording: topics, rates, gaps, sensors, calibration, problems.
 
@@ -41,7 +46,11 @@ def info(
     from beamsplat.services.replay.inspection import inspect
     from beamsplat.services.replay.options import SourceOptions
 
-    report = inspect(path, SourceOptions(rig=rig, allow_truncated=allow_truncated))
+    options = SourceOptions(
+        rig=rig, allow_truncated=allow_truncated, scan_topic=scan_topic, image_topic=image_topic,
+        odometry_topic=odometry_topic, pose_topic=pose_topic, camera_info_topic=camera_info_topic,
+    )  # fmt: skip
+    report = inspect(path, options)
     if as_json:
         print(json.dumps(report.as_dict()))
     else:
@@ -119,6 +128,7 @@ def _print(report: InspectionReport, console: Console) -> None:
             text += f", distortion {camera['distortion_model']}"
         console.print(f"[bold]camera[/]: {text}")
     for title, colour, lines in (
+        ("chosen", "green", report.choices),
         ("calibration found", "green", report.calibration_found),
         ("assumed", "yellow", report.calibration_assumed),
         ("missing", "red", report.calibration_missing),

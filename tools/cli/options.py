@@ -3,9 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Annotated
+
+import typer
 
 from beamsplat.common.errors import UserError
 from beamsplat.common.files.persist import check_can_write
+
+ScanTopic = Annotated[str, typer.Option(help="Topic of the lidar; needed if the choice is not clear.")]
+ImageTopic = Annotated[str, typer.Option(help="Topic of the camera; needed if the choice is not clear.")]
+OdometryTopic = Annotated[str, typer.Option(help="Topic of the wheel odometry, likewise.")]
+CameraInfoTopic = Annotated[str, typer.Option(help="Topic of the camera's CameraInfo, likewise.")]
 
 
 def writable(path: Path | None) -> Path | None:

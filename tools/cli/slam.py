@@ -19,7 +19,7 @@ from rich.progress import (
 from rich.table import Table
 
 from beamsplat.common.errors import UserError
-from beamsplat.tools.cli.options import writable
+from beamsplat.tools.cli.options import OdometryTopic, ScanTopic, writable
 
 console = Console(stderr=True)
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the figures as one JSON object")]
@@ -30,8 +30,8 @@ def slam(
     out: Annotated[Path, typer.Option(callback=writable, help="Folder for trajectory, map and state")],
     no_odometry: Annotated[bool, typer.Option("--no-odometry", help="Use the scans only")] = False,
     rig: Annotated[Path | None, typer.Option(help="Calibration file, if the bag has none")] = None,
-    scan_topic: Annotated[str, typer.Option(help="Needed if the bag has several")] = "",
-    odometry_topic: Annotated[str, typer.Option(help="Needed if the bag has several")] = "",
+    scan_topic: ScanTopic = "",
+    odometry_topic: OdometryTopic = "",
     as_json: JsonOption = False,
 ) -> None:
     """Map a recording with the lidar SLAM, as fast as the machine allows.
@@ -57,6 +57,8 @@ def slam(
     )  # fmt: skip
     source = open_source(bag, options)
     try:
+        for choice in getattr(source, "choices", ()):
+            console.print(f"[green]{choice}[/]", highlight=False)
         lidar = source.rig().lidar
         if lidar is None:
             raise UserError(
@@ -94,6 +96,9 @@ def eval_slam(
 ) -> None:
     """Compute the errors of a trajectory against relations or a true trajectory; the scale is never fitted.
 
+    With a true trajectory also: wrong loop closures in the saved map (off by more than 0.5 m or 5 degrees),
+    and the share of true revisits that the map joins (relative pose within 0.15 m). With a folder: its costs.
+
     Examples:
 
         beamsplat eval slam map --relations intel.relations
@@ -104,11 +109,11 @@ def eval_slam(
     """
     if (relations is None) == (groundtruth is None):
         raise UserError("eval slam needs either --relations FILE or --groundtruth FILE")
-    from beamsplat.tools.evaluation.slam import errors_against_truth
+    from beamsplat.tools.evaluation.slam import costs, errors_against_truth
 
     figures = (
         _against_relations(folder, relations) if relations else errors_against_truth(folder, groundtruth)
-    )
+    ) | costs(folder)
     if as_json:
         print(json.dumps(figures))
     else:

@@ -112,16 +112,18 @@ class RecordedDrive:
         return transform_points(T_map_body, self.beams_of(scan, scan.middle_ns, excluded).points_body_m)
 
 
-def open_drive(path: Path, poses: Path | None = None, rig: Path | None = None) -> RecordedDrive:
+def open_drive(
+    path: Path, poses: Path | None = None, rig: Path | None = None, topics: dict[str, str] | None = None
+) -> RecordedDrive:
     """Open a recording: a bag, or a folder that contains bag/.
 
     Poses are taken from the TUM file `poses` (T_map_body), else from the pose topic of the recording, else
-    from the lidar SLAM, which is run on it.
+    from the lidar SLAM, which is run on it. `topics`: options of `SourceOptions`, for example `scan_topic`.
 
     Raises:
         UserError: images, scans, calibration or poses are missing.
     """
-    source = open_source(path, SourceOptions(rig=rig, require=frozenset({"scan", "image"})))
+    source = open_source(path, SourceOptions(rig=rig, require=frozenset({"scan", "image"}), **(topics or {})))
     try:
         images, scans, stamps, T, wheels = [], [], [], [], []
         for _, topic, message in source.messages():

@@ -193,8 +193,9 @@ def test_choices_by_option(tmp_path):
     sourced, _ = play(path, scan_topic="/rear/scan", without=("odometry", "pose", "image"))
     assert {item.topic for item in sourced} == {"rig", "tick", "lidar/scan"}
     assert sourced[0].message.camera is None
-    assert "scan_topic = '/front' is not there; possible topics: /rear/scan, /scan" in refusal(
-        path, scan_topic="/front"
+    assert (
+        "scan_topic = '/front' is not there or has no messages; possible topics: /rear/scan, /scan"
+        in refusal(path, scan_topic="/front")
     )
     assert "is a nav_msgs/msg/Odometry" in refusal(path, scan_topic="/odom")
 
