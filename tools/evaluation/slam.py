@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,12 @@ from beamsplat.common.errors import UserError
 from beamsplat.common.geometry.trajectory import read_tum
 from beamsplat.common.geometry.transforms import se3_to_se2
 from beamsplat.services.localization.lidar2d.metrics import interpolate_poses, trajectory_errors
+from beamsplat.tools.evaluation.loops import loop_figures
+
+COSTS = (
+    "cpu_ms_per_scan", "cpu_ms_per_scan_first_tenth", "cpu_ms_per_scan_last_tenth", "step_p95_ms",
+    "step_max_ms", "step_max_cpu_ms", "peak_rss_mb",
+)  # fmt: skip
 
 
 def measurements(source: Any) -> Iterator[tuple]:
@@ -36,11 +43,23 @@ def planar_poses(path: Path) -> tuple[np.ndarray, np.ndarray]:
     return trajectory.stamps_ns, se3_to_se2(trajectory.T_a_b)
 
 
+def costs(folder: Path) -> dict[str, float]:
+    """Return what `map_measurements` measured of its CPU time, steps and memory, by name; {} without a file.
+
+    `folder` is its output folder.
+    """
+    path = folder / "figures.json"
+    if not path.is_file():
+        return {}
+    figures = json.loads(path.read_text())
+    return {name: figures[name] for name in COSTS if name in figures}
+
+
 def errors_against_truth(folder: Path, truth: Path) -> dict[str, Any]:
     """Return position errors (m) and yaw errors (rad) of estimated trajectories against the truth, by name.
 
     Names with the prefix `online_` are of the trajectory as published during the drive, the others of the
-    trajectory after the last optimisation.
+    trajectory after the last optimisation. For the latter, see also `loops.loop_figures`.
 
     Args:
         folder: output folder of `map_measurements`, or one trajectory (TUM file).
@@ -69,4 +88,9 @@ def errors_against_truth(folder: Path, truth: Path) -> dict[str, Any]:
             f"{prefix}ate_se3_rmse_m": errors.ate_se3_rmse_m,
             f"{prefix}yaw_rmse_rad": errors.yaw_rmse_rad,
         }
+        if not prefix:
+            state = folder / "state" if name == "trajectory.tum" and (folder / "state").is_dir() else None
+            figures |= loop_figures(
+                state, true_stamps_ns, pose_world_body, stamps_ns[inside], pose_map_body[inside]
+            )
     return figures
