@@ -7,6 +7,10 @@ every    in order; the publisher caches `cache` messages, so that a subscriber r
          lost; messages that cannot be recovered are counted as lost
 latched  late-joining subscribers receive the last message
 
+`history` marks `every` topics of parts that together form a state (tiles of a grid): late-joining subscribers
+receive the cached messages too, messages are handled in order of arrival (not merged with other topics by
+stamp), and a gap is not a loss, because the producer sends all parts again in turn.
+
 `uplink` marks the topics that the bridge forwards between a robot and its edge server
 (common/zenoh/bridge.py): "up" from the robot; "bulk" also from the robot, but large, on a separate link with
 lower priority; "down" to the robot. A running system has exactly one producer per topic; where several
@@ -29,7 +33,7 @@ LIMIT_KB = 32_000
 # Smaller limits for the topics that other hosts publish: a few times the largest message of each.
 _LIMITS_KB = {
     "rig": 100, "localization/odometry": 64, "localization/correction": 64, "localization/anchors": 4000,
-    "localization/grid": 16_000, "keyframes/frame": 8000, "keyframes/ack": 16, "tick": 16, "health": 64,
+    "localization/grid": 1100, "keyframes/frame": 8000, "keyframes/ack": 16, "tick": 16, "health": 64,
 }  # fmt: skip
 
 
@@ -46,6 +50,12 @@ class Topic:
     uplink: Uplink = ""
     # The producer sends each message again until it is acknowledged: a gap in the sequence is not a loss.
     resent_until_ack: bool = False
+    history: bool = False
+
+    @property
+    def gaps_are_filled(self) -> bool:
+        """Return whether the producer sends what was missed again: a gap counts as dropped, not as lost."""
+        return self.resent_until_ack or self.history
 
     @property
     def handler(self) -> str:
@@ -69,7 +79,7 @@ _ROWS = (
     Topic("localization/correction", m.Correction,    ("localization",),         0, "latched", 1, "up"),
     Topic("localization/anchors",    m.Anchors,       ("localization",),         0, "latched", 1, "up"),
     Topic("localization/movers",     m.MovingBeams,   ("localization",),        10, "every", 400),
-    Topic("localization/grid",       m.Grid,          ("localization",),         0, "latched", 1, "bulk"),
+    Topic("localization/grid", m.GridTile, ("localization",), 0, "every", 1024, "bulk", history=True),
     Topic("depth/estimate",          m.DepthEstimate, ("depth",),                5, "latest"),
     Topic("keyframes/candidate",     m.KeyframeCandidate, ("fusion",),          10, "every"),
     Topic("keyframes/decision",      m.KeyframeDecision, ("keyframes",),        10, "every"),

@@ -12,6 +12,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
+from beamsplat.common.mapfiles.grid_tiles import MAX_TILE_CELLS
 from beamsplat.common.messages.map import (
     Keyframe,
     KeyframeAck,
@@ -31,6 +32,7 @@ from beamsplat.common.messages.schema import (
     Name,
     NonNegative,
     Positive,
+    StampNs,
     Text,
     Transform,
     Transforms,
@@ -161,7 +163,9 @@ class MovingBeams(Message):
 
 
 class Grid(Message):
-    """Occupancy grid in the map frame. The corner of cell [row, column] with the smallest x and y is at
+    """Occupancy grid in the map frame in one piece, as in old recordings; now `GridTile`s are sent.
+
+    The corner of cell [row, column] with the smallest x and y is at
     origin_m + (column, row) * resolution_m.
 
     Values are those of ROS: -1 unknown, 0 free .. 100 occupied. `changed` is the region that differs from the
@@ -172,6 +176,25 @@ class Grid(Message):
     origin_m: Annotated[np.ndarray, Array("float64", 2, finite=True)]
     occupancy: Annotated[np.ndarray, Array("int8", "H", "W")]
     changed: tuple[Count, Count, Count, Count] = (0, 0, 0, 0)
+
+
+class GridTile(Message):
+    """One square tile of the occupancy grid in the map frame (common/mapfiles/grid_tiles.py).
+
+    A producer sends the tiles that have changed, and the others again in turn, so that a subscriber that
+    joined late has all of them after some time. Tiles of another `map_uuid` or `since_ns` replace all.
+    """
+
+    resolution_m: Positive
+    size: Annotated[int, Field(ge=1, le=MAX_TILE_CELLS)]  # edge in cells
+    row: Annotated[int, Field(ge=-(2**20), lt=2**20)]  # the tile begins at y = row * size * resolution_m
+    column: Annotated[int, Field(ge=-(2**20), lt=2**20)]  # and at x = column * size * resolution_m
+    # int8 [size, size], row 0 at the smallest y; -1 unknown, 0 free .. 100 occupied, compressed by zlib.
+    # Empty: all cells are unknown.
+    packed: Annotated[np.ndarray, Array("uint8", "B")]
+    remaining: Count = 0  # tiles that follow in the same update; 0 = the grid is consistent now
+    map_uuid: Text = ""
+    since_ns: StampNs = 0  # stamp of the first tile that this process has sent
 
 
 # --- depth and fusion --------------------------------------------------------------------------
@@ -290,7 +313,7 @@ MESSAGES: dict[str, type[Message]] = {
     cls.schema_name(): cls
     for cls in (
         Rig, Image, Scan, WheelOdometry, ExternalPose, Odometry, Correction, Anchors, MovingBeams, Grid,
-        DepthEstimate, FusedDepth, Cloud, KeyframeCandidate, KeyframeDecision, Keyframe, KeyframeAck,
-        MapChunk, MapPoses, MapPreview, MapState, MapStatus, Tick, Health, Answer,
+        GridTile, DepthEstimate, FusedDepth, Cloud, KeyframeCandidate, KeyframeDecision, Keyframe,
+        KeyframeAck, MapChunk, MapPoses, MapPreview, MapState, MapStatus, Tick, Health, Answer,
     )
 }  # fmt: skip

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 from rosbags.serde import SerdeError
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from beamsplat.common.geometry.transforms import make_transform, matrix_from_quat_wxyz, quat_xyzw_from_matrix
@@ -20,13 +20,19 @@ FRAME_BODY = "base_link"
 FRAME_LIDAR = "laser"
 FRAME_CAMERA = "camera_optical_frame"
 
+# Not part of the distribution that `typestore` describes: nav2 and RViz read changed parts of a map with it.
+GRID_UPDATE = "map_msgs/msg/OccupancyGridUpdate"
+_GRID_UPDATE_FIELDS = "std_msgs/Header header\nint32 x\nint32 y\nuint32 width\nuint32 height\nint8[] data\n"
+
 _SEC_LIMIT = 2**31  # builtin_interfaces/Time counts seconds in an int32
 
 
 @cache
 def typestore() -> Typestore:
     """Return the message definitions of ROS 2 Jazzy; the types used here are the same in Humble."""
-    return get_typestore(Stores.ROS2_JAZZY)
+    store = get_typestore(Stores.ROS2_JAZZY)
+    store.register(get_types_from_msg(_GRID_UPDATE_FIELDS, GRID_UPDATE))
+    return store
 
 
 @cache

@@ -18,6 +18,7 @@ from beamsplat.common.messages.codec import encode, schema_of
 from beamsplat.common.messages.header import Header
 from beamsplat.common.recording import layout, ros_types
 from beamsplat.common.recording.from_ros import fields_of
+from beamsplat.common.recording.grid_records import GridRecords
 from beamsplat.common.recording.metadata import metadata_yaml, qos_profiles
 from beamsplat.common.recording.to_ros import RosRecord, records_of
 
@@ -100,6 +101,7 @@ class RecordingWriter:
         self._channels: dict[tuple[Any, ...], int] = {}
         self._schemas: dict[str, int] = {}
         self._sequences: Counter[str] = Counter()
+        self._grid = GridRecords()
         self._ros_topics: dict[str, tuple[str, int]] = {}  # ROS topic -> (type, count), for metadata.yaml
         self._times_ns: list[int] = []  # first and last log time
         self._failure = ""
@@ -223,7 +225,7 @@ class RecordingWriter:
                 channel = self._own_channel(topic, message, "fields", layout.FIELDS_ENCODING, header)
                 self._add(channel, layout.pack_fields(missing), *when)
             self._add_ros(topic, message, carried, cdr, header, when)
-        for record in records:
+        for record in [*records, *self._grid.records_of(message)]:
             if record is not carried:
                 cdr = ros_types.serialize(record.message)
                 self._add_ros(topic, message, record, cdr, header, when)

@@ -1,8 +1,8 @@
 """Input queues of a node: a slot per `latest` or `latched` input, queues merged by stamp for `every` inputs.
 
-An `every` input that is feedback has a queue of its own. A mailbox belongs to one node and is not
-thread-safe; the live runner locks it. It counts dropped, lost, late, stale, refused and undecodable messages
-per input.
+`every` inputs that are feedback, or whose topic has `history`, share a queue in order of arrival. A mailbox
+belongs to one node and is not thread-safe; the live runner locks it. It counts dropped, lost, late, stale,
+refused and undecodable messages per input.
 """
 
 from __future__ import annotations
@@ -75,7 +75,8 @@ class Mailbox:
         self._merger = StampMerger(merged_topics(node), clock_ns=clock_ns)
         self._slots: dict[str, Envelope] = {}
         self._feedback_topics = frozenset(i.topic for i in subscriptions(node) if i.feedback)
-        self._feedback_queue: deque[Envelope] = deque()  # of `every` inputs that are feedback
+        self._merged_topics = frozenset(merged_topics(node))
+        self._unmerged_queue: deque[Envelope] = deque()  # of all other `every` inputs
         self._most_bytes = {i.topic: i.queued_bytes for i in subscriptions(node)}
         self._clock_ns = clock_ns
         self._heard_ns: dict[str, int] = {}  # instance of an accepted producer -> last arrival on any input
@@ -83,7 +84,7 @@ class Mailbox:
         self.counts = {name: InputCount() for name in self._deliveries}
 
     def __len__(self) -> int:
-        return len(self._merger) + len(self._slots) + len(self._feedback_queue)
+        return len(self._merger) + len(self._slots) + len(self._unmerged_queue)
 
     def admit(self, envelope: Envelope) -> bool:
         """Count a received message, and return whether it is to be queued (`queue`).
@@ -132,10 +133,10 @@ class Mailbox:
             count.dropped += 1
         if self._deliveries[envelope.topic] != "every":
             self._slots[envelope.topic] = envelope
-        elif envelope.topic in self._feedback_topics:
-            if len(self._feedback_queue) >= MAX_QUEUED:
-                self.counts[self._feedback_queue.popleft().topic].dropped += 1
-            self._feedback_queue.append(envelope)
+        elif envelope.topic not in self._merged_topics:
+            if len(self._unmerged_queue) >= MAX_QUEUED:
+                self.counts[self._unmerged_queue.popleft().topic].dropped += 1
+            self._unmerged_queue.append(envelope)
         else:
             self._make_room(envelope, count)
             self._merger.put(envelope.topic, envelope.message.stamp_ns, envelope, _precedes)
@@ -191,7 +192,7 @@ class Mailbox:
         if self._deliveries[topic] == "every":
             count.lost += max(sent - self.next_sequence(topic, count.ended_by), 0)
             count.sequence.give_up(None)
-            if topic not in self._feedback_topics:
+            if topic in self._merged_topics:
                 self._merger.end(topic)
         return True
 
@@ -208,7 +209,7 @@ class Mailbox:
 
     def queued(self) -> list[Envelope]:
         """Return the queued messages of the `every` inputs, input by input in order of arrival."""
-        return [*self._feedback_queue, *self._merger.items()]
+        return [*self._unmerged_queue, *self._merger.items()]
 
     def handled(self) -> HandledSequences:
         """Return the sequence numbers that this node has handled on its `every` inputs.
@@ -234,12 +235,12 @@ class Mailbox:
     def pop(self) -> Envelope | None:
         """Remove and return the message to handle next, or None if none is ready.
 
-        Order: feedback, then the next message of the `every` inputs (merged by stamp), then the oldest
-        message of the `latest` and `latched` inputs.
+        Order: `every` inputs that are not merged (feedback, history), then those that are merged by stamp,
+        then the oldest message of the `latest` and `latched` inputs.
         """
         self._reconsider_refused()
-        if self._feedback_queue:
-            envelope = self._feedback_queue.popleft()
+        if self._unmerged_queue:
+            envelope = self._unmerged_queue.popleft()
             self.counts[envelope.topic].received += 1
             return envelope
         merged = self._merger.pop()
@@ -284,7 +285,7 @@ class Mailbox:
     def _health_of(self, name: str, count: InputCount) -> InputHealth:
         count.sequence.give_up(self._now_ns())
         gone, dropped = count.lost + count.sequence.lost, count.dropped
-        if TOPICS[name].resent_until_ack:  # its producer sends these messages again
+        if TOPICS[name].gaps_are_filled:  # its producer sends these messages again
             gone, dropped = 0, dropped + gone
         return InputHealth(
             topic=name, received=count.received, dropped=min(dropped, _MAX_COUNT), lost=min(gone, _MAX_COUNT),

@@ -287,7 +287,11 @@ def subscriptions(node: type[Node]) -> tuple[Input, ...]:
 def merged_topics(node: type[Node]) -> tuple[str, ...]:
     """Return the topics of the inputs that are merged by stamp, in the order of the topic table.
 
-    These are the `every` inputs except feedback.
+    These are the `every` inputs except feedback and topics with `history`.
     """
-    names = [i.topic for i in subscriptions(node) if i.effective_delivery == "every" and not i.feedback]
+    names = [
+        i.topic
+        for i in subscriptions(node)
+        if i.effective_delivery == "every" and not (i.feedback or i.row.history)
+    ]
     return tuple(sorted(names, key=ROW_NUMBER.__getitem__))

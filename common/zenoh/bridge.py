@@ -157,6 +157,8 @@ class Bridge:
             channel = zenoh.handlers.RingChannel(_RESENT_QUEUE_MESSAGES)
         elif row.delivery == "latched":
             channel = zenoh.handlers.RingChannel(1)
+        elif row.history:  # a full FIFO would block all topics of the session while the link is slow
+            channel = zenoh.handlers.RingChannel(row.cache)
         else:
             channel = zenoh.handlers.FifoChannel(max(row.cache, FIFO_MESSAGES))
         # REMOTE: messages that this bridge published to `source` must not come back.

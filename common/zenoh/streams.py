@@ -62,18 +62,20 @@ def declare_subscription(
     """Declare a subscriber for a row of the topic table.
 
     Unless the delivery is "latest", it recovers lost messages from the publisher's cache. On a latched topic
-    it also receives the last message published before it was declared.
+    it also receives the last message published before it was declared, on a topic with `history` all that
+    the publisher's cache has.
     """
     if not row.cache or delivery == "latest":
         return session.declare_subscriber(key_expr, channel, allowed_origin=origin)
-    latched = zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=1)
+    with_history = row.history or row.delivery == "latched"
+    history = zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=row.cache)
     return zenoh.ext.declare_advanced_subscriber(
         session,
         key_expr,
         channel,
         allowed_origin=origin,
         recovery=zenoh.ext.RecoveryConfig(periodic_queries=None, heartbeat=True),
-        history=latched if row.delivery == "latched" else None,
+        history=history if with_history else None,
     )
 
 

@@ -14,6 +14,7 @@ from beamsplat.common.config.deployment import NodeConfig
 from beamsplat.common.errors import UserError
 from beamsplat.common.files.persist import check_can_write
 from beamsplat.common.geometry.tracks import RateLimit
+from beamsplat.common.mapfiles.grid_tiles import GridSource
 from beamsplat.common.messages import FusedDepth, Health, MapChunk, MapStatus, Odometry, Rig
 from beamsplat.common.messages.header import Header
 from beamsplat.common.runtime.node import Input, Node, Output
@@ -107,8 +108,9 @@ SCENE: dict[Input, Draw] = {
     Input("localization/anchors", "latched"): lambda scene, _, m: scene.anchors(
         m.stamp_ns, m.anchor_ids, m.T_map_anchor
     ),
-    Input("localization/grid", "latched"): lambda scene, _, m: scene.grid(
-        m.stamp_ns, m.occupancy, m.resolution_m, m.origin_m
+    Input("localization/grid", "every"): lambda scene, _, m: scene.grid_tile(
+        m.stamp_ns, GridSource(m.map_uuid, m.since_ns, m.resolution_m, m.size), (m.row, m.column),
+        m.packed.tobytes(), m.remaining == 0,
     ),
 }  # fmt: skip
 DEPTH: dict[Input, Draw] = {

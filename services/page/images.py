@@ -9,11 +9,13 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
+from beamsplat.common.mapfiles.grid_tiles import TiledGrid
 from beamsplat.common.messages.image_codec import decode_rgb
 
 _DEPTH_RANGE_M = (0.3, 8.0)  # of the colour scale: indoor distances
 _QUALITY = (cv2.IMWRITE_JPEG_QUALITY, 75)
 _FREE, _OCCUPIED = 235, 20  # grey values of map cells
+_WIDEST_MAP_PX = 4096  # larger maps are shown with larger cells
 
 
 class EncodedImage(NamedTuple):
@@ -102,6 +104,18 @@ def encode_depth(
     colours = cv2.applyColorMap((nearness * 255.0).astype(np.uint8), cv2.COLORMAP_TURBO)
     colours[~known] = 0
     return _jpeg(colours)
+
+
+def encode_tiles(grid: TiledGrid) -> EncodedImage:
+    """Return a grid that consists of tiles as `encode_grid` does, with larger cells if it is very large.
+
+    Raises:
+        ValueError: no cell is known yet, or the tiles are too far apart.
+    """
+    stride = grid.stride_for(_WIDEST_MAP_PX)
+    cell_m = 1.0 if grid.source is None else grid.source.resolution_m * stride
+    occupancy = grid.assembled(stride, max_cells=_WIDEST_MAP_PX**2)
+    return encode_grid(occupancy, cell_m, grid.origin_m())
 
 
 def encode_grid(

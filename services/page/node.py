@@ -19,12 +19,13 @@ from pydantic import Field, SecretStr, field_validator
 from beamsplat.common.config.base import Remote
 from beamsplat.common.config.deployment import NodeConfig
 from beamsplat.common.errors import UserError
+from beamsplat.common.mapfiles.grid_tiles import GridSource, TiledGrid
 from beamsplat.common.messages import (
     Answer,
     Correction,
     ExternalPose,
     FusedDepth,
-    Grid,
+    GridTile,
     Health,
     Image,
     MapPreview,
@@ -36,7 +37,7 @@ from beamsplat.common.messages import (
 )
 from beamsplat.common.runtime.node import Input, Node, Outputs, QueryFunction
 from beamsplat.services.page.access import PageAccess, own_host_names
-from beamsplat.services.page.images import EncodedImage, encode_camera_image, encode_depth, encode_grid
+from beamsplat.services.page.images import EncodedImage, encode_camera_image, encode_depth, encode_tiles
 from beamsplat.services.page.server import PageServer
 from beamsplat.services.page.view import PageState
 
@@ -93,7 +94,7 @@ class PageNode(Node):
         Input("external/pose", "latest"),
         Input("localization/odometry", "latest"),
         Input("localization/correction", "latched"),
-        Input("localization/grid", "latched"),
+        Input("localization/grid", "every"),
         Input("fusion/depth", "latest"),
         Input("mapping/preview", "latest"),
         Input("mapping/status", "latest"),
@@ -109,6 +110,7 @@ class PageNode(Node):
     def configure(self) -> None:
         c = self.config
         self._state = PageState(c.picture_hz, c.map_hz)
+        self._grid = TiledGrid()
         names = own_host_names() | {name.lower() for name in c.names}
         access = PageAccess(c.token.get_secret_value(), names)
         tls = _tls(c.certificate, c.certificate_key)
@@ -203,8 +205,15 @@ class PageNode(Node):
         self._state.correction(m.T_map_odom)
         return iter(())
 
-    def on_localization_grid(self, m: Grid) -> Outputs:
-        self._state.images["map"].update(partial(encode_grid, m.occupancy, m.resolution_m, m.origin_m))
+    def on_localization_grid(self, m: GridTile) -> Outputs:
+        """Store a tile of the grid; with the last tile of an update, offer the whole grid to the pages."""
+        source = GridSource(m.map_uuid, m.since_ns, m.resolution_m, m.size)
+        try:
+            self._grid.add(source, m.row, m.column, m.packed.tobytes())
+        except ValueError as error:
+            self.rejections.add(str(error))
+        if m.remaining == 0:
+            self._state.images["map"].update(partial(encode_tiles, self._grid.copy()))
         return iter(())
 
     def on_fusion_depth(self, m: FusedDepth) -> Outputs:

@@ -84,6 +84,15 @@ def occupancy_grid(
     return ros.new(MAP, header=ros.header(stamp_ns, frame), info=info, data=occupancy.ravel())
 
 
+def grid_update(stamp_ns: int, frame: str, row: int, column: int, cells: np.ndarray) -> Any:
+    """Return a map_msgs/OccupancyGridUpdate: cells int8 [H, W] from (row, column) of the published map on."""
+    rows, columns = cells.shape
+    return ros.new(
+        ros.GRID_UPDATE,
+        header=ros.header(stamp_ns, frame), x=column, y=row, width=columns, height=rows, data=cells.ravel(),
+    )  # fmt: skip
+
+
 def point_cloud(
     stamp_ns: int,
     frame: str,

@@ -11,13 +11,15 @@ from typing import Any
 import zenoh
 import zenoh.ext
 
-from beamsplat.common.messages import Cloud, Correction, Grid, Odometry, WheelOdometry
+from beamsplat.common.mapfiles.grid_tiles import GridSource
+from beamsplat.common.messages import Cloud, Correction, GridTile, Odometry, WheelOdometry
 from beamsplat.common.recording import ros_types as ros
 from beamsplat.common.runtime.node import Node, Outputs
 from beamsplat.common.zenoh.bus import open_session
 from beamsplat.common.zenoh.rmw import RmwAttachment, RmwEntity, RmwQos, data_key
 from beamsplat.services.ros2_out import conversions
 from beamsplat.services.ros2_out.config import Ros2OutConfig
+from beamsplat.services.ros2_out.grid_publisher import GridPublisher
 
 _VOLATILE = RmwQos(depth=10)
 _LATCHED = RmwQos(transient_local=True, depth=1)
@@ -74,6 +76,7 @@ class Ros2OutNode(Node):
     def configure(self) -> None:
         c = self.config
         self._transforms = conversions.TfTree(c.map_frame, c.odom_frame, c.body_frame)
+        self._grid = GridPublisher(c.map_frame, c.map_every_s)
         self._session = open_session((c.router,))
         node = RmwEntity(c.domain, str(self._session.zid()), 0, 0, "NN", "beamsplat")
         self._token = self._session.liveliness().declare_token(node.token())
@@ -81,6 +84,7 @@ class Ros2OutNode(Node):
             ("pose", c.pose_topic, conversions.POSE, _VOLATILE),
             ("tf", "/tf" if c.tf else "", conversions.TF, RmwQos(depth=100)),
             ("map", c.map_topic, conversions.MAP, _LATCHED),
+            ("map_updates", c.map_topic and f"{c.map_topic}_updates", ros.GRID_UPDATE, RmwQos(depth=100)),
             ("cloud", c.cloud_topic, conversions.CLOUD, _VOLATILE),
         )
         self._publishers = {
@@ -104,13 +108,15 @@ class Ros2OutNode(Node):
             self._publish("tf", self._transforms.tf(odometry.stamp_ns, odometry.T_odom_body))
         return iter(())
 
-    def on_localization_grid(self, grid: Grid) -> Outputs:
-        self._publish(
-            "map",
-            conversions.occupancy_grid(
-                grid.stamp_ns, self.config.map_frame, grid.resolution_m, grid.origin_m, grid.occupancy
-            ),
-        )
+    def on_localization_grid(self, tile: GridTile) -> Outputs:
+        """Store a tile; after the last one of an update, publish the whole map or what has changed in it."""
+        source = GridSource(tile.map_uuid, tile.since_ns, tile.resolution_m, tile.size)
+        try:
+            self._grid.add(source, tile.row, tile.column, tile.packed.tobytes())
+            for name, message in self._grid.messages(tile.stamp_ns) if tile.remaining == 0 else ():
+                self._publish(name, message)
+        except ValueError as error:
+            self.rejections.add(f"map not published: {error}")
         return iter(())
 
     def on_fusion_cloud(self, cloud: Cloud) -> Outputs:

@@ -8,9 +8,10 @@ import numpy as np
 
 from beamsplat.common.config.deployment import NodeConfig
 from beamsplat.common.geometry.transforms import se2_to_se3
-from beamsplat.common.messages import Correction, ExternalPose, Grid, Image, Odometry, Scan, WheelOdometry
+from beamsplat.common.messages import Correction, ExternalPose, GridTile, Image, Odometry, Scan, WheelOdometry
 from beamsplat.common.runtime.node import Input, Job, Node, Outputs, SourceItem
 from beamsplat.common.runtime.registry import Service
+from tests.common.tiles import tile
 
 
 class SensorSourceConfig(NodeConfig):
@@ -120,8 +121,7 @@ class Slow(Node):
         time.sleep(self.config.sleep_s)
         yield (
             "localization/grid",
-            Grid(stamp_ns=message.stamp_ns, resolution_m=0.1, origin_m=np.zeros(2),
-                 occupancy=message.data[:4].astype(np.int8).reshape(2, 2)),
+            tile(message.stamp_ns, message.data[:4].astype(np.int8).reshape(2, 2)),
         )  # fmt: skip
 
     def on_lidar_scan(self, message: Scan) -> Outputs:
@@ -150,7 +150,7 @@ class Sink(Node):
         self.seen.append(("localization/correction", message))
         return iter(())
 
-    def on_localization_grid(self, message: Grid) -> Outputs:
+    def on_localization_grid(self, message: GridTile) -> Outputs:
         self.seen.append(("localization/grid", message))
         return iter(())
 

@@ -4,6 +4,7 @@ import numpy as np
 
 from beamsplat.common.geometry.frames import camera_mount, lidar_mount
 from beamsplat.common.geometry.transforms import se2_to_se3
+from beamsplat.common.mapfiles.grid_tiles import pack_tile
 from beamsplat.common.messages import (
     Anchors,
     Answer,
@@ -14,6 +15,7 @@ from beamsplat.common.messages import (
     ExternalPose,
     FusedDepth,
     Grid,
+    GridTile,
     Health,
     Image,
     InputHealth,
@@ -77,6 +79,10 @@ def sample_messages() -> list[Message]:
         Grid(
             stamp_ns=19, resolution_m=0.05, origin_m=np.array([-1.0, 2.0]),
             occupancy=np.array([[-1, 0, 100]], np.int8), changed=(0, 1, 1, 3),
+        ),
+        GridTile(
+            stamp_ns=19, resolution_m=0.05, size=2, row=-3, column=4, remaining=1, map_uuid="m", since_ns=7,
+            packed=np.frombuffer(pack_tile(np.array([[-1, 0], [100, 7]], np.int8)), np.uint8),
         ),
         DepthEstimate(
             stamp_ns=23, source="fastdepth", kind="relative", status="the network returned nothing above zero",

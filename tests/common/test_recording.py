@@ -15,7 +15,7 @@ from mcap.writer import CompressionType, Writer
 from rosbags.highlevel import AnyReader
 
 from beamsplat.common.errors import UserError
-from beamsplat.common.messages import MESSAGES, Anchors, Health, Image, Odometry, Scan, Tick
+from beamsplat.common.messages import MESSAGES, Anchors, Grid, Health, Image, Odometry, Scan, Tick
 from beamsplat.common.messages.codec import decode, schema_of
 from beamsplat.common.messages.header import Header
 from beamsplat.common.messages.image_header import read_image_header
@@ -26,6 +26,7 @@ from tests.common.messages.random_messages import assert_same, random_message
 from tests.common.samples import sample_messages
 
 TOPIC_OF = {row.message: name for name, row in TOPICS.items()}
+TOPIC_OF[Grid] = "localization/grid"  # until version 0.2
 
 
 def topic_of(message):

@@ -30,7 +30,7 @@ ThreadsOption = Annotated[int, typer.Option(min=1, help="Threads of the rasteriz
 _RESOLUTION_M = 0.05  # of nav2 grids
 _MIN_FACES = 60  # of a connected component of the mesh; smaller ones are removed
 _STATE_TIMEOUT_S = 120.0  # a mapper answers after its current keyframe, perhaps over a slow link
-_GRID_TIMEOUT_S = 2.0  # for the latched lidar grid
+_GRID_TIMEOUT_S = 2.0  # for the tiles of the lidar grid that were published before
 _VIEWS = 12  # viewpoints to measure the loss of merged detail
 
 
@@ -132,17 +132,19 @@ def _from_mapper(file: Path) -> tuple[dict[str, Any], Callable[[], Any]]:
     with open_session(deployment.router.listen, 2.0, login=login) as session:
         answers = ask(session, deployment.robot, "mapping", "state", {}, _STATE_TIMEOUT_S)
         arrays = joined_state([answer for answer in answers if isinstance(answer, MapState)])
-        grid = _latched_grid(session, deployment.robot)
+        grid = _published_grid(session, deployment.robot)
     return arrays, lambda: grid
 
 
-def _latched_grid(session: Any, robot: str) -> Any:
-    """Return the last lidar OccupancyGrid that localization published; None if there is none."""
+def _published_grid(session: Any, robot: str) -> Any:
+    """Return the lidar OccupancyGrid that localization has published; None if there is none."""
     import queue
+    import time
 
     import zenoh
 
-    from beamsplat.common.messages import Grid
+    from beamsplat.common.mapfiles.grid_tiles import GridSource, TiledGrid
+    from beamsplat.common.messages import GridTile
     from beamsplat.common.messages.header import DecodeError
     from beamsplat.common.topics import topic
     from beamsplat.common.zenoh.bus import key
@@ -151,16 +153,22 @@ def _latched_grid(session: Any, robot: str) -> Any:
 
     row = topic("localization/grid")
     received: queue.SimpleQueue[zenoh.Sample] = queue.SimpleQueue()
-    _kept = declare_subscription(session, key(robot, row.name), row, "latched", received.put)
+    _kept = declare_subscription(session, key(robot, row.name), row, "every", received.put)
+    grid, until = TiledGrid(), time.monotonic() + _GRID_TIMEOUT_S
     try:
-        grid = decode_sample(received.get(timeout=_GRID_TIMEOUT_S), row).message
+        while (left_s := until - time.monotonic()) > 0.0:
+            tile = decode_sample(received.get(timeout=left_s), row).message
+            assert isinstance(tile, GridTile)  # the row's message type
+            source = GridSource(tile.map_uuid, tile.since_ns, tile.resolution_m, tile.size)
+            grid.add(source, tile.row, tile.column, tile.packed.tobytes())
     except queue.Empty:
-        return None
-    except DecodeError as error:
+        pass
+    except (DecodeError, ValueError) as error:
         raise UserError(f"localization/grid of the running system cannot be decoded: {error}") from error
-    assert isinstance(grid, Grid)  # the row's message type
-    x_m, y_m = (float(v) for v in grid.origin_m)
-    return OccupancyGrid(grid.occupancy, x_m, y_m, grid.resolution_m)
+    if grid.source is None:
+        return None
+    x_m, y_m = (float(v) for v in grid.origin_m())
+    return OccupancyGrid(grid.assembled(), x_m, y_m, grid.source.resolution_m)
 
 
 def _gaussians(path: Path, to: str, store: Any, arrays: dict[str, Any], detail_m: float, threads: int) -> str:

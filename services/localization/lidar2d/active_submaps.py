@@ -182,15 +182,17 @@ class ActiveSubmaps:
             for active in growing:
                 active.submap.frozen = None
 
-    def count_grids(self) -> list[CountGrid]:
-        """Return the hit and miss grids of the active submaps that are not frozen."""
+    def count_grids(self) -> list[tuple[CountGrid, np.ndarray]]:
+        """Return copies of the hits and misses of the active submaps that are not frozen, and their poses."""
         return [
-            CountGrid(
-                a.local.surfels.hits,
-                a.local.surfels.misses,
-                a.local.surfels.row0,
-                a.local.surfels.col0,
-                a.local.surfels.cell_m,
+            (
+                CountGrid(
+                    a.local.surfels.hits.copy(),
+                    a.local.surfels.misses.copy(),
+                    a.local.surfels.row0,
+                    a.local.surfels.col0,
+                    a.local.surfels.cell_m,
+                ),
                 a.submap.pose_map_submap,
             )
             for a in self._active

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import shutil
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, cast
 
@@ -15,10 +16,11 @@ from beamsplat.common.config.deployment import NodeConfig
 from beamsplat.common.errors import UserError, reason
 from beamsplat.common.files.persist import check_can_write
 from beamsplat.common.geometry.transforms import se2_to_se3, se3_to_se2
+from beamsplat.common.mapfiles.grid_tiles import TILE_CELLS
 from beamsplat.common.messages import (
     Anchors,
     Correction,
-    Grid,
+    GridTile,
     MovingBeams,
     Odometry,
     Rig,
@@ -27,8 +29,8 @@ from beamsplat.common.messages import (
 )
 from beamsplat.common.runtime.node import Input, Job, Node, Outputs
 from beamsplat.common.status import TrackingStatus
+from beamsplat.services.localization.lidar2d.grid_tiles import GridTiles, Place
 from beamsplat.services.localization.lidar2d.jobs import JobResult
-from beamsplat.services.localization.lidar2d.occupancy import OccupancyGrid
 from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
 from beamsplat.services.localization.lidar2d.slam import LidarSlam, ScanResult
 from beamsplat.services.localization.lidar2d.state import MANIFEST, read_manifest, write_state
@@ -36,6 +38,8 @@ from beamsplat.services.localization.lidar2d.state import MANIFEST, read_manifes
 log = logging.getLogger("beamsplat.localization")
 
 _RESERVED_SUBMAP_IDS = 1000  # upper bound of the submaps started between the last checkpoint and a crash
+_GRID_AFTER_SCANS = 25  # a drawing of the grid is published exactly this many scans after its start, or fewer
+_REPEATED_TILES = 4  # unchanged tiles that are sent again with each update, for subscribers that joined late
 
 
 class LidarLocalizationConfig(NodeConfig):
@@ -80,7 +84,10 @@ class LidarLocalization(Node):
         self._published_correction: np.ndarray | None = None  # pose_map_odom
         self._optimisations = 0
         self._stamp_ns = 0
-        self._published_grid: OccupancyGrid | None = None
+        self._grid: GridTiles | None = None
+        self._grid_running = False
+        self._grid_since_ns: int | None = None  # stamp of the first tile
+        self._repeated: Place = (0, 0)  # the last tile that was sent again
         self._published_uuid = ""
         self._checkpoint_ns: int | None = None
         self._checkpoint_running = False
@@ -156,8 +163,7 @@ class LidarLocalization(Node):
             after = result.job.apply_at_scan - self._slam.scans + 1
             yield Job("optimise", result.job.run, after=after, of="lidar/scan")
         yield from self._start_checkpoint(self._slam, scan.stamp_ns, result.status == "ok")
-        if self._slam.scans % self.config.grid_every_scans == 0:
-            yield from self._publish_grid(self._slam)
+        yield from self._start_grid(self._slam)
 
     def on_job_optimise(self, result: JobResult) -> Outputs:
         """Apply the result of a background job and publish the new map poses; T_odom_body does not change."""
@@ -199,7 +205,8 @@ class LidarLocalization(Node):
         self._slam.finish()
         self._optimisations += 1
         yield from self._publish_map_poses(self._slam)
-        yield from self._publish_grid(self._slam)
+        grid = self._grid or GridTiles(self.config.grid_resolution_m)
+        yield from self._publish_grid(grid, grid.update(self._slam.map_content(), exact=True))
         if self.config.save is not None:
             self._save(self._slam, self.config.save)
 
@@ -259,38 +266,46 @@ class LidarLocalization(Node):
                 ),
             )
 
-    def _publish_grid(self, slam: LidarSlam) -> Outputs:
-        """Publish the occupancy grid with the bounding box of the cells that changed since the last grid."""
-        grid = slam.grid(self.config.grid_resolution_m)
-        changed = _changed(self._published_grid, grid)
-        self._published_grid = grid
-        yield (
-            "localization/grid",
-            Grid(
-                stamp_ns=self._stamp_ns, resolution_m=grid.resolution_m,
-                origin_m=np.array([grid.origin_x_m, grid.origin_y_m]), occupancy=grid.values, changed=changed,
-            ),
-        )  # fmt: skip
+    def _start_grid(self, slam: LidarSlam) -> Outputs:
+        """Start a job that draws the changed tiles of the grid, every `grid_every_scans`."""
+        if self._grid_running or slam.scans % self.config.grid_every_scans or not slam.record.count:
+            return
+        if self._grid is None:
+            self._grid = GridTiles(self.config.grid_resolution_m)
+        self._grid_running = True
+        grid, content = self._grid, slam.map_content()
+        after = min(_GRID_AFTER_SCANS, self.config.grid_every_scans)
+        yield Job("grid", lambda: grid.update(content), after=after, of="lidar/scan")
 
+    def on_job_grid(self, changed: dict[Place, bytes]) -> Outputs:
+        """Publish the changed tiles of the grid, and some of the others again."""
+        self._grid_running = False
+        assert self._grid is not None  # it has drawn them
+        yield from self._publish_grid(self._grid, changed)
 
-def _changed(before: OccupancyGrid | None, grid: OccupancyGrid) -> tuple[int, int, int, int]:
-    """Return the bounding box (row0, column0, row1, column1) of the cells that differ.
+    def _publish_grid(self, grid: GridTiles, changed: dict[Place, bytes]) -> Outputs:
+        assert self._slam is not None
+        if self._grid_since_ns is None:
+            self._grid_since_ns = self._stamp_ns
+        tiles = [*changed.items(), *self._tiles_to_repeat(grid, changed)]
+        for sent, ((row, column), packed) in enumerate(tiles, start=1):
+            yield (
+                "localization/grid",
+                GridTile(
+                    stamp_ns=self._stamp_ns, resolution_m=grid.resolution_m, size=TILE_CELLS, row=row,
+                    column=column, packed=np.frombuffer(packed, dtype=np.uint8), remaining=len(tiles) - sent,
+                    map_uuid=self._slam.pose_graph.uuid, since_ns=self._grid_since_ns,
+                ),
+            )  # fmt: skip
 
-    It covers the whole grid if the grid's origin or size has changed.
-    """
-    rows, columns = grid.values.shape
-    if (
-        before is None
-        or before.values.shape != grid.values.shape
-        or before.origin_x_m != grid.origin_x_m
-        or before.origin_y_m != grid.origin_y_m
-    ):
-        return 0, 0, rows, columns
-    differs = np.argwhere(before.values != grid.values)
-    if not len(differs):
-        return 0, 0, 0, 0
-    (row0, column0), (row1, column1) = differs.min(axis=0).tolist(), differs.max(axis=0).tolist()
-    return row0, column0, row1 + 1, column1 + 1
+    def _tiles_to_repeat(self, grid: GridTiles, changed: dict[Place, bytes]) -> Iterable[tuple[Place, bytes]]:
+        """Return the tiles that follow, in order of their place, on those that were repeated last."""
+        others = sorted(grid.published.keys() - changed.keys())
+        later = [place for place in others if place > self._repeated]
+        chosen = [*later, *others][: min(_REPEATED_TILES, len(others))]
+        if chosen:
+            self._repeated = chosen[-1]
+        return [(place, grid.published[place]) for place in chosen]
 
 
 def _odometry(result: ScanResult) -> Odometry:

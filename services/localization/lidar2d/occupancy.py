@@ -1,10 +1,12 @@
-"""Occupancy grids from the hits and misses of all submaps, and their files for nav2."""
+"""Occupancy grids from the hits and misses of submaps, drawn tile by tile, and their files for nav2."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol
 
 import cv2
 import numpy as np
@@ -12,9 +14,13 @@ import numpy as np
 from beamsplat.common.compiled import kernel
 from beamsplat.services.localization.lidar2d import se2
 
-HIT_LOG_ODDS = 1.5  # one hit outweighs three misses, because beams pass walls at grazing angles
-MISS_LOG_ODDS = -0.5
 OCCUPIED, FREE, UNKNOWN = 65, 25, -1  # percent; limits of nav2 for occupied and free
+_MARGIN_CELLS = 64  # the edges of a whole grid are at multiples of this many cells
+_BAND_CELLS = 12_000_000  # a whole grid is drawn in bands of rows: 60 MB of sums at a time
+# Log odds in half units: a hit is +1.5, a miss -0.5. One hit outweighs three misses, because beams pass walls
+# at grazing angles.
+_HIT, _MISS = 3, -1
+_LIMIT = 12  # of the sum: log odds of 6
 
 
 @dataclass(frozen=True)
@@ -25,6 +31,52 @@ class OccupancyGrid:
     origin_x_m: float  # lower left corner of cell (0, 0) in the map frame
     origin_y_m: float
     resolution_m: float
+
+
+class Counts(Protocol):
+    """Hits and misses of the cells of one submap, in the frame of the submap: a `FrozenMap` for example."""
+
+    @property
+    def shape(self) -> tuple[int, int]: ...
+
+    @property
+    def row0(self) -> int: ...
+
+    @property
+    def col0(self) -> int: ...
+
+    @property
+    def cell_m(self) -> float: ...
+
+    def counts(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return hits and misses, uint8 [h, w] each."""
+        ...
+
+
+@dataclass(frozen=True)
+class CountGrid:
+    """Hits and misses of a submap as arrays."""
+
+    hits: np.ndarray  # uint8 [h, w]
+    misses: np.ndarray  # uint8 [h, w]
+    row0: int
+    col0: int
+    cell_m: float
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        return self.hits.shape[0], self.hits.shape[1]
+
+    def counts(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return hits and misses, uint8 [h, w] each."""
+        return self.hits, self.misses
+
+
+def outline(grid: Counts, pose_map_submap: np.ndarray) -> np.ndarray:
+    """Return the corners of a submap in the map frame, float64 [4, 2]."""
+    rows, cols = grid.shape
+    corners = [[grid.col0 + u * cols, grid.row0 + v * rows] for u in (0, 1) for v in (0, 1)]
+    return se2.transform(pose_map_submap, np.array(corners, dtype=np.float64) * grid.cell_m)
 
 
 @kernel
@@ -42,10 +94,14 @@ def add_counts(
     high_row: int,
     low_col: int,
     high_col: int,
-    sum_hits: np.ndarray,
-    sum_misses: np.ndarray,  # in out float32 [H, W]
+    score: np.ndarray,  # in out int32 [H, W], log odds in half units
+    known: np.ndarray,  # in out bool [H, W]
 ) -> None:
-    """Add hits and misses of a submap to the map grid, from the submap cell at each map cell's centre."""
+    """Add hits and misses of a submap to a part of the map, from the submap cell at each map cell's centre.
+
+    `origin_x`, `origin_y`: corner of cell (0, 0) of the part. Rows from `low_row` to before `high_row` are
+    visited, and columns likewise.
+    """
     c, s = math.cos(pose_submap_map[2]), math.sin(pose_submap_map[2])
     for r in range(low_row, high_row):
         y = origin_y + (r + 0.5) * resolution
@@ -54,69 +110,81 @@ def add_counts(
             i = math.floor((pose_submap_map[1] + s * x + c * y) / cell_m) - row0
             j = math.floor((pose_submap_map[0] + c * x - s * y) / cell_m) - col0
             if 0 <= i < hits.shape[0] and 0 <= j < hits.shape[1]:
-                sum_hits[r, q] += hits[i, j]
-                sum_misses[r, q] += misses[i, j]
+                h, m = hits[i, j], misses[i, j]
+                if h > 0 or m > 0:
+                    score[r, q] += _HIT * np.int32(h) + _MISS * np.int32(m)
+                    known[r, q] = True
+
+
+_PERCENT = np.round(100.0 / (1.0 + np.exp(-0.5 * np.arange(-_LIMIT, _LIMIT + 1)))).astype(np.int8)
 
 
 @dataclass(frozen=True)
-class CountGrid:
-    """Hits and misses of one submap, with its pose."""
+class TileSum:
+    """Sums over the submaps in a rectangular part of the map, to which submaps are added one at a time."""
 
-    hits: np.ndarray  # uint8 [h, w]
-    misses: np.ndarray  # uint8 [h, w]
-    row0: int
-    col0: int
-    cell_m: float
-    pose_map_submap: np.ndarray  # float64 [3]
+    row: int  # the cell (0, 0) of the part has this row number in the map
+    column: int
+    resolution_m: float
+    score: np.ndarray  # int32 [H, W], log odds in half units
+    known: np.ndarray  # bool [H, W]
 
-    def corners(self) -> np.ndarray:
-        """Return the corners of the observed rectangle in the map frame, float64 [4, 2]."""
-        seen = (self.hits > 0) | (self.misses > 0)
-        rows, cols = np.flatnonzero(seen.any(axis=1)), np.flatnonzero(seen.any(axis=0))
-        if len(rows) == 0:
-            return se2.transform(self.pose_map_submap, np.zeros((4, 2)))
-        x = np.array([cols[0], cols[-1] + 1, cols[-1] + 1, cols[0]]) + self.col0
-        y = np.array([rows[0], rows[0], rows[-1] + 1, rows[-1] + 1]) + self.row0
-        return se2.transform(self.pose_map_submap, np.column_stack([x, y]) * self.cell_m)
-
-
-def render_occupancy(grids: list[CountGrid], resolution_m: float) -> OccupancyGrid:
-    """Return one occupancy grid of all submaps.
-
-    The origin is a multiple of 64 cells, so that cell boundaries do not change when the grid grows.
-    """
-    if not grids:
-        return OccupancyGrid(np.full((64, 64), UNKNOWN, dtype=np.int8), 0.0, 0.0, resolution_m)
-    boxes = [grid.corners() for grid in grids]
-    tile = 64 * resolution_m
-    low = np.floor(np.min([b.min(axis=0) for b in boxes], axis=0) / tile) * tile
-    high = np.ceil(np.max([b.max(axis=0) for b in boxes], axis=0) / tile) * tile
-    cols, rows = (int(v) for v in np.round((high - low) / resolution_m))
-    hits, misses = np.zeros((rows, cols), dtype=np.float32), np.zeros((rows, cols), dtype=np.float32)
-    for grid, box in zip(grids, boxes):
-        first = np.floor((box.min(axis=0) - low) / resolution_m).astype(int)
-        last = np.ceil((box.max(axis=0) - low) / resolution_m).astype(int)
-        add_counts(
-            grid.hits,
-            grid.misses,
-            grid.row0,
-            grid.col0,
-            grid.cell_m,
-            se2.inverse(grid.pose_map_submap),
-            low[0],
-            low[1],
-            resolution_m,
-            max(first[1], 0),
-            min(last[1], rows),
-            max(first[0], 0),
-            min(last[0], cols),
-            hits,
-            misses,
+    @staticmethod
+    def empty(row: int, column: int, shape: tuple[int, int], resolution_m: float) -> TileSum:
+        """Create the sums of no submap for `shape` cells, from (row, column) on."""
+        return TileSum(
+            row, column, resolution_m, np.zeros(shape, dtype=np.int32), np.zeros(shape, dtype=bool)
         )
-    log_odds = np.clip(HIT_LOG_ODDS * hits + MISS_LOG_ODDS * misses, -6.0, 6.0)
-    percent = np.round(100.0 / (1.0 + np.exp(-log_odds))).astype(np.int8)
-    values = np.where((hits > 0) | (misses > 0), percent, np.int8(UNKNOWN)).astype(np.int8)
-    return OccupancyGrid(values, float(low[0]), float(low[1]), resolution_m)
+
+    def copy(self) -> TileSum:
+        """Return a copy."""
+        return TileSum(self.row, self.column, self.resolution_m, self.score.copy(), self.known.copy())
+
+    def add(self, grid: Counts, counts: tuple[np.ndarray, np.ndarray], pose_map_submap: np.ndarray) -> int:
+        """Add a submap with `counts` (result of `grid.counts()`); return the number of visited cells."""
+        box = outline(grid, pose_map_submap) / self.resolution_m
+        corner, size = np.array([self.column, self.row]), np.array(self.score.shape[::-1])
+        low_col, low_row = np.clip(np.floor(box.min(axis=0)).astype(int) - corner, 0, size).tolist()
+        high_col, high_row = np.clip(np.ceil(box.max(axis=0)).astype(int) - corner, 0, size).tolist()
+        if low_col >= high_col or low_row >= high_row:
+            return 0
+        add_counts(
+            *counts, grid.row0, grid.col0, grid.cell_m, se2.inverse(pose_map_submap),
+            self.column * self.resolution_m, self.row * self.resolution_m, self.resolution_m,
+            low_row, high_row, low_col, high_col, self.score, self.known,
+        )  # fmt: skip
+        return (high_row - low_row) * (high_col - low_col)
+
+    def occupancy(self) -> np.ndarray:
+        """Return the occupancy in percent, int8 [H, W], -1 = unknown."""
+        percent = _PERCENT[np.clip(self.score, -_LIMIT, _LIMIT) + _LIMIT]
+        return np.where(self.known, percent, np.int8(UNKNOWN)).astype(np.int8)
+
+
+def render_occupancy(
+    submaps: Iterable[tuple[Counts, np.ndarray]], resolution_m: float = 0.05
+) -> OccupancyGrid:
+    """Return the occupancy grid of a whole map: submaps with their poses `pose_map_submap` (float64 [3]).
+
+    Besides the result it needs the sums of one band of rows, and the counts of one submap.
+    """
+    drawn = list(submaps)
+    if not drawn:
+        return OccupancyGrid(np.full((1, 1), UNKNOWN, dtype=np.int8), 0.0, 0.0, resolution_m)
+    boxes = [outline(grid, pose) / resolution_m for grid, pose in drawn]
+    lows, highs = np.array([b.min(axis=0) for b in boxes]), np.array([b.max(axis=0) for b in boxes])
+    low = (np.floor(lows.min(axis=0) / _MARGIN_CELLS) * _MARGIN_CELLS).astype(int)
+    high = (np.ceil(highs.max(axis=0) / _MARGIN_CELLS) * _MARGIN_CELLS).astype(int)
+    cols, rows = (high - low).tolist()
+    values = np.full((rows, cols), UNKNOWN, dtype=np.int8)
+    height = max(_BAND_CELLS // cols, 1)
+    for row in range(0, rows, height):
+        first, last = low[1] + row, low[1] + min(row + height, rows)
+        band = TileSum.empty(int(first), int(low[0]), (int(last - first), cols), resolution_m)
+        for k in np.flatnonzero((lows[:, 1] < last) & (highs[:, 1] > first)).tolist():
+            band.add(drawn[k][0], drawn[k][0].counts(), drawn[k][1])
+        values[row : row + height] = band.occupancy()
+    return OccupancyGrid(values, float(low[0] * resolution_m), float(low[1] * resolution_m), resolution_m)
 
 
 def save_nav2(grid: OccupancyGrid, folder: Path, name: str = "map") -> None:
@@ -128,18 +196,23 @@ def save_nav2(grid: OccupancyGrid, folder: Path, name: str = "map") -> None:
     image = np.full((height, width), 205, dtype=np.uint8)
     image[(flipped >= 0) & (flipped <= FREE)] = 254
     image[flipped >= OCCUPIED] = 0
-    header = f"P5\n{width} {height}\n255\n".encode()
-    (folder / f"{name}.pgm").write_bytes(header + image.tobytes())
+    with (folder / f"{name}.pgm").open("wb") as file:
+        file.write(f"P5\n{width} {height}\n255\n".encode())
+        file.write(image)
+    del image
     (folder / f"{name}.yaml").write_text(
         f"image: {name}.pgm\nmode: trinary\nresolution: {grid.resolution_m}\n"
         f"origin: [{grid.origin_x_m:.6f}, {grid.origin_y_m:.6f}, 0.0]\nnegate: 0\n"
         # Pixel 205 (unknown) is (255 - 205) / 255 = 0.1961 and must not be read as free.
         "occupied_thresh: 0.65\nfree_thresh: 0.196\n"
     )
-    known = np.argwhere(flipped >= 0)
-    shown = np.where(flipped < 0, 205, 255 - (flipped.astype(np.int16) * 255) // 100).astype(np.uint8)
-    if len(known):
-        (r0, c0), (r1, c1) = known.min(axis=0), known.max(axis=0) + 1
-        shown = shown[r0:r1, c0:c1]
-    if not cv2.imwrite(str(folder / f"{name}.png"), shown):
+    known = flipped >= 0
+    rows, columns = np.flatnonzero(known.any(axis=1)), np.flatnonzero(known.any(axis=0))
+    if len(rows):
+        flipped = flipped[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+    if not cv2.imwrite(str(folder / f"{name}.png"), _GREY[flipped.astype(np.int16) + 1]):
         raise ValueError(f"{folder / name}.png cannot be written")
+
+
+# Grey value of the preview for the occupancy -1 .. 100.
+_GREY = np.array([205, *(255 - (percent * 255) // 100 for percent in range(101))], dtype=np.uint8)

@@ -9,13 +9,14 @@ import numpy as np
 
 from beamsplat.services.localization.lidar2d import se2
 from beamsplat.services.localization.lidar2d.active_submaps import ActiveSubmaps
+from beamsplat.services.localization.lidar2d.grid_tiles import MapContent
 from beamsplat.services.localization.lidar2d.jobs import BackgroundJob, JobResult, run_job
 from beamsplat.services.localization.lidar2d.local_trajectory_builder import (
     LocalTrajectoryBuilder,
     RawScan,
 )
 from beamsplat.services.localization.lidar2d.motion_covariance import UNKNOWN, motion_covariance
-from beamsplat.services.localization.lidar2d.occupancy import CountGrid, OccupancyGrid, render_occupancy
+from beamsplat.services.localization.lidar2d.occupancy import OccupancyGrid, render_occupancy
 from beamsplat.services.localization.lidar2d.pose_graph import PoseGraph
 from beamsplat.services.localization.lidar2d.relocalization import (
     GlobalMap,
@@ -284,11 +285,15 @@ class LidarSlam:
 
     def grid(self, resolution_m: float = 0.05) -> OccupancyGrid:
         """Return the occupancy grid of the whole map."""
-        frozen = [
-            (s.frozen, s.pose_map_submap) for s in self.pose_graph.submaps.values() if s.frozen is not None
-        ]
-        grids = [CountGrid(*f.counts(), f.row0, f.col0, f.cell_m, pose) for f, pose in frozen]
-        return render_occupancy(grids + self.active_submaps.count_grids(), resolution_m)
+        content = self.map_content()
+        finished = [(frozen, pose) for _, frozen, pose in content.finished]
+        return render_occupancy([*finished, *content.growing], resolution_m)
+
+    def map_content(self) -> MapContent:
+        """Return what the grid is drawn from; only the counts of the active submaps are copied."""
+        submaps = self.pose_graph.submaps.values()
+        finished = [(s.id, s.frozen, s.pose_map_submap) for s in submaps if s.frozen is not None]
+        return MapContent(finished, self.active_submaps.count_grids())
 
     def relocalize(
         self,

@@ -3,17 +3,16 @@
 import numpy as np
 import pytest
 
-from beamsplat.common.messages import Grid, Odometry
+from beamsplat.common.messages import Odometry
 from beamsplat.common.messages.header import Header
 from beamsplat.common.runtime.handover import Handover, parse_progress
 from beamsplat.common.runtime.mailbox import Envelope, Mailbox
 from tests.common.nodes import Sink
+from tests.common.tiles import tile
 
 
 def grid(stamp_ns):
-    return Grid(
-        stamp_ns=stamp_ns, resolution_m=1.0, origin_m=np.zeros(2), occupancy=np.zeros((1, 1), np.int8)
-    )
+    return tile(stamp_ns, np.zeros((1, 1), np.int8))
 
 
 def published(handover, topic, stamps):

@@ -9,6 +9,7 @@ from beamsplat.common.messages.header import Header
 from beamsplat.common.topics import TOPICS
 from beamsplat.common.zenoh.bridge import Bridge, BridgeSessions
 from beamsplat.common.zenoh.bus import Bus, open_router, open_session
+from beamsplat.common.zenoh.streams import declare_subscription, decode_sample
 from tests.common.polling import wait_until
 from tests.common.samples import sample_messages
 from tests.conftest import free_port
@@ -95,6 +96,23 @@ def test_a_latched_message_of_before_the_bridge_crosses():
         bridge = Bridge("r1", sessions)
         wait_until(lambda: "rig" in edge.crossed)
         assert bridge.forwarded["rig"].messages == 1
+
+
+def test_tiles_of_before_the_bridge_reach_a_viewer_at_the_edge_that_joins_late():
+    row = TOPICS["localization/grid"]
+    sent = [SAMPLES[row.message].model_copy(update={"row": number}) for number in range(40)]
+    with contextlib.ExitStack() as stack:
+        robot, edge = Side(stack, AT_ROBOT), Side(stack, AT_EDGE)
+        for tile in sent:
+            robot.publications[row.name].put(tile)
+        bridge = Bridge("r1", BridgeSessions(robot=robot.open(), edge=edge.open(), edge_bulk=edge.open()))
+        wait_until(lambda: bridge.forwarded[row.name].messages == 40, 10.0)
+        rows = []
+        _kept = declare_subscription(
+            edge.open(), f"beamsplat/r1/{row.name}", row, "every",
+            lambda sample: rows.append(decode_sample(sample, row).message.row),
+        )  # fmt: skip
+        wait_until(lambda: rows == list(range(40)))
 
 
 def test_a_new_session_forwards_the_large_messages_alone(sides):

@@ -2,7 +2,7 @@
 
 import threading
 
-from beamsplat.common.messages import Image, Rig, WheelOdometry
+from beamsplat.common.messages import GridTile, Image, Rig, WheelOdometry
 from beamsplat.common.topics import topic
 from beamsplat.common.zenoh.bus import key
 from beamsplat.common.zenoh.streams import Subscription
@@ -93,3 +93,13 @@ def test_a_late_joiner_of_every_message_receives_only_what_follows(make_bus, rob
     late = Listener(make_bus("recorder"), robot, "wheel/odometry")
     publish_until_received(publication, message(WheelOdometry, 100), late.stamps)
     assert set(late.stamps) == {100}
+
+
+def test_a_late_joiner_of_tiles_receives_all_that_the_publisher_keeps(make_bus, robot):
+    publication = make_bus("localization").publish("localization/grid")
+    for stamp_ns in range(1, 301):
+        publication.put(message(GridTile, stamp_ns))
+    late = Listener(make_bus("monitor"), robot, "localization/grid")
+    wait_until(lambda: len(late.stamps) == 300)
+    publication.put(message(GridTile, 301))
+    wait_until(lambda: late.stamps == list(range(1, 302)))

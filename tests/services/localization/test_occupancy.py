@@ -22,7 +22,7 @@ def counts(shape=(20, 30)):
 def test_walls_and_floor_are_at_the_right_place():
     hits, misses = counts()
     pose = np.array([2.0, 1.0, np.pi / 2])
-    grid = render_occupancy([CountGrid(hits, misses, 0, 0, 0.05, pose)], 0.05)
+    grid = render_occupancy([(CountGrid(hits, misses, 0, 0, 0.05), pose)], 0.05)
     wall = se2.transform(pose, np.array([[0.5, 5.5 * 0.05]]))[0]
     floor = se2.transform(pose, np.array([[0.5, 10.5 * 0.05]]))[0]
 
@@ -39,7 +39,7 @@ def test_rendering_against_reference_code(rng):
     hits = rng.integers(0, 3, (12, 9)).astype(np.uint8)
     misses = rng.integers(0, 3, (12, 9)).astype(np.uint8)
     pose = np.array([0.3, -0.2, 0.7])
-    grid = render_occupancy([CountGrid(hits, misses, -4, -3, 0.1, pose)], 0.05)
+    grid = render_occupancy([(CountGrid(hits, misses, -4, -3, 0.1), pose)], 0.05)
     for r in range(0, grid.values.shape[0], 3):
         for c in range(0, grid.values.shape[1], 3):
             p = np.array([[grid.origin_x_m + (c + 0.5) * 0.05, grid.origin_y_m + (r + 0.5) * 0.05]])

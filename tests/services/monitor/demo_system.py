@@ -9,10 +9,11 @@ import numpy as np
 
 from beamsplat.common.config.deployment import NodeConfig
 from beamsplat.common.geometry.transforms import se2_to_se3
-from beamsplat.common.messages import Correction, FusedDepth, Grid, Image, Odometry, Rig, Scan
+from beamsplat.common.messages import Correction, FusedDepth, Image, Odometry, Rig, Scan
 from beamsplat.common.messages.sensor_models import LidarModel
 from beamsplat.common.runtime.node import Node, SourceItem
 from beamsplat.common.runtime.registry import Service
+from tests.common.tiles import tiles
 
 NASTY = "<img src=x onerror=\"document.title='taken over'\"> & <b>bold</b>"
 SCALE, SCALE_SIGMA = 1.25, 0.05
@@ -67,9 +68,8 @@ class CirclingLocalization(Node):
             yield "localization/correction", Correction(stamp_ns=scan.stamp_ns, T_map_odom=T_map_odom)
             occupancy = np.zeros((60, 60), np.int8)
             occupancy[[0, -1], :] = occupancy[:, [0, -1]] = 100
-            grid = Grid(stamp_ns=scan.stamp_ns, resolution_m=0.1, origin_m=np.array([-3.0, -3.0]),
-                        occupancy=occupancy)  # fmt: skip
-            yield "localization/grid", grid
+            for part in tiles(scan.stamp_ns, occupancy, (-30, -30), 32):
+                yield "localization/grid", part
         turn = 0.05 * self._count
         self._count += 1
         at = np.array([RADIUS_M * np.cos(turn), RADIUS_M * np.sin(turn), turn + np.pi / 2])

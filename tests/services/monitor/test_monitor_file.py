@@ -12,7 +12,6 @@ from beamsplat.common.messages import (
     CameraModel,
     Correction,
     ExternalPose,
-    Grid,
     Health,
     Image,
     InputHealth,
@@ -26,6 +25,7 @@ from beamsplat.common.runtime.lockstep import Lockstep
 from beamsplat.common.runtime.node import Node, SourceItem
 from beamsplat.common.topics import TOPICS
 from beamsplat.services.monitor.node import DEPTH, SCENE, MonitorConfig, MonitorNode
+from tests.common.tiles import tiles
 
 NS = 1_000_000_000
 T0 = 1_700_000_000 * NS
@@ -95,6 +95,9 @@ class RoomRecording(Node):
             yield SourceItem(_ns(t_s), "camera/image", picture)
 
 
+TILES = "-1_-1", "-1_0"  # entities of the tiles of the grid: row and column
+
+
 class TrueLocalization(Node):
     """Publishes the true pose."""
 
@@ -116,9 +119,9 @@ class TrueLocalization(Node):
             occupancy = np.full((40, 60), -1, np.int8)
             occupancy[10:20, 15:45] = 0
             occupancy[10, 15:45] = 100
-            grid = Grid(stamp_ns=scan.stamp_ns, resolution_m=0.1, origin_m=np.array([-3.0, -2.0]),
-                        occupancy=occupancy)  # fmt: skip
-            yield "localization/grid", grid
+            occupancy[15, 16 + round(t_s)] = 50  # a change in one tile
+            for part in tiles(scan.stamp_ns, occupancy, (-20, -30), 64):
+                yield "localization/grid", part
             anchors = Anchors(stamp_ns=scan.stamp_ns, anchor_ids=np.array([0, 3]),
                               T_map_anchor=np.stack([_T_map_body(0.0), _T_map_body(1.0)]))  # fmt: skip
             yield "localization/anchors", anchors
@@ -140,7 +143,7 @@ def saved(tmp_path_factory):
 def test_the_file_has_all_entities_and_a_layout(saved):
     body = "map/odom/body"
     expected = {
-        "map", "map/grid", "map/anchors", "map/scan", "map/odom", body, f"{body}/shape", f"{body}/heading",
+        "map", "map/grid", *(f"map/grid/{tile}" for tile in TILES), "map/anchors", "map/scan", "map/odom", body, f"{body}/shape", f"{body}/heading",
         f"{body}/camera", f"{body}/camera/image", "map/path/localization", "map/path/external",
         "map/path/wheel", "map/odom/path", "log", "health/state/localization",
     }  # fmt: skip
@@ -154,7 +157,8 @@ def test_rates_are_limited_and_time_is_that_of_measurement(saved):
     assert saved.stamps("map/scan") == [_ns(0.1 * i) for i in range(30)]
     assert saved.stamps("map/odom/body")[-30:] == [_ns(0.1 * i) for i in range(30)]
     assert 3 <= len(saved.stamps("map/path/localization")) <= 4
-    assert len(saved.stamps("map/grid")) == 2  # of 3, at 0.5 Hz
+    assert len(saved.stamps(f"map/grid/{TILES[0]}")) == 2  # of 3, at 0.5 Hz
+    assert len(saved.stamps(f"map/grid/{TILES[1]}")) == 1  # unchanged
     assert len(saved.stamps("map/anchors")) == 3
 
 
@@ -212,10 +216,10 @@ def test_the_camera_is_a_pinhole_on_the_body(saved):
 
 
 def test_the_grid_is_cropped_to_known_cells_with_row_0_at_the_bottom(saved):
-    data = saved.column("map/grid", "GridMap:data")[0].astype(np.uint8).reshape(10, 30)
+    data = saved.column(f"map/grid/{TILES[0]}", "GridMap:data")[0].astype(np.uint8).reshape(10, 15)
     assert np.all(data[-1] == 100)
-    assert np.all(data[:-1] == 0)
-    corner = saved.column("map/grid", "GridMap:translation")[0].ravel()
+    assert np.count_nonzero(data[:-1]) == 1  # the cell that changes
+    corner = saved.column(f"map/grid/{TILES[0]}", "GridMap:translation")[0].ravel()
     np.testing.assert_allclose(corner[:2], [-3.0 + 1.5, -2.0 + 1.0], atol=1e-6)
 
 
@@ -314,4 +318,4 @@ def test_a_monitor_without_output_is_rejected():
 def test_every_row_is_a_topic_and_none_blocks_a_publisher():
     for entry in (*SCENE, *DEPTH):
         assert entry.topic in TOPICS
-        assert entry.effective_delivery in ("latest", "latched"), entry.topic
+        assert entry.effective_delivery in ("latest", "latched") or entry.row.history, entry.topic

@@ -15,6 +15,7 @@ import pytest
 
 from beamsplat.common.errors import UserError
 from beamsplat.common.geometry.transforms import se2_to_se3
+from beamsplat.common.mapfiles.grid_tiles import GridSource, TiledGrid, pack_tile
 from beamsplat.common.messages import FusedDepth, Health
 from beamsplat.common.runtime.registry import make_node
 from beamsplat.common.security.access_control import HostRole
@@ -27,6 +28,7 @@ from beamsplat.services.page.images import (
     encode_camera_image,
     encode_depth,
     encode_grid,
+    encode_tiles,
 )
 from beamsplat.services.page.node import PageConfig, PageNode
 from beamsplat.services.page.server import PageServer
@@ -245,6 +247,21 @@ def test_the_map_is_cropped_to_known_cells():
     assert (pixels[..., 3] == 255).all()
     with pytest.raises(ValueError, match="no cell of the map"):
         encode_grid(np.full((3, 3), -1, np.int8), 0.1, np.zeros(2))
+
+
+def test_the_map_of_tiles_is_one_picture_with_larger_cells_if_it_is_very_large(monkeypatch):
+    grid, source = TiledGrid(), GridSource("a", 0, 0.1, 16)
+    walls = np.zeros((16, 16), np.int8)
+    walls[3] = 100
+    for column in range(8):
+        grid.add(source, 0, column - 4, pack_tile(walls))
+    picture = encode_tiles(grid)
+    assert picture.metadata == {"x_m": -6.4, "y_m": 0.0, "cell_m": 0.1, "width": 128, "height": 16}
+    monkeypatch.setattr("beamsplat.services.page.images._WIDEST_MAP_PX", 64)
+    picture = encode_tiles(grid)
+    assert picture.metadata == {"x_m": -6.4, "y_m": 0.0, "cell_m": 0.2, "width": 64, "height": 8}
+    pixels = cv2.imdecode(np.frombuffer(picture.data, np.uint8), cv2.IMREAD_UNCHANGED)
+    assert (pixels[-2, :, 0] == 20).all()  # thin walls remain
 
 
 def test_nan_and_infinity_become_null():

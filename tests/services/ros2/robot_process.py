@@ -2,7 +2,7 @@
 
 Written from rmw_zenoh's documents with Zenoh's serializer and rosbags, independently of our code.
 Usage: python -m tests.services.ros2.robot_process ENDPOINT DOMAIN BAG RATE SECONDS NOW TF
-Prints a line of JSON for each message received on /map, /tf, /beamsplat/pose and /beamsplat/cloud.
+Prints a line of JSON for each message received on /map, /map_updates, /tf, /beamsplat/pose and /beamsplat/cloud.
 NOW = 1 shifts the bag's stamps to the present, TF = 1 also replays its /tf.
 """
 
@@ -16,9 +16,15 @@ import xxhash
 import zenoh
 import zenoh.ext as ze
 from rosbags.highlevel import AnyReader
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
+UPDATE = "map_msgs/msg/OccupancyGridUpdate"
+STORE.register(
+    get_types_from_msg(
+        "std_msgs/Header header\nint32 x\nint32 y\nuint32 width\nuint32 height\nint8[] data", UPDATE
+    )
+)
 
 
 def token(domain, zid, number, kind, topic, ros, qos):
@@ -97,6 +103,8 @@ def summary(topic, message):
         found["x"] = message.pose.position.x
     if topic == "/map":
         found["cells"] = [message.info.height, message.info.width, len(message.data)]
+    if topic == "/map_updates":
+        found["cells"] = [message.y, message.x, message.height, message.width, len(message.data)]
     if topic.endswith("cloud"):
         found["points"] = message.width
     return found
@@ -113,6 +121,7 @@ def main():
             listen(session, domain, topic, ros)
             for topic, ros in (
                 ("/map", "nav_msgs/msg/OccupancyGrid"), ("/tf", "tf2_msgs/msg/TFMessage"),
+                ("/map_updates", UPDATE),
                 ("/beamsplat/pose", "geometry_msgs/msg/PoseStamped"),
                 ("/beamsplat/cloud", "sensor_msgs/msg/PointCloud2"),
             )

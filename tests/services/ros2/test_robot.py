@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from beamsplat.common.config.deployment import Deployment, RouterConfig
-from beamsplat.common.messages import Cloud, Correction, Grid, Odometry
+from beamsplat.common.messages import Cloud, Correction, Odometry
 from beamsplat.common.runtime.live import Live, LiveSettings
 from beamsplat.common.runtime.node import Input
 from beamsplat.common.zenoh.bus import Bus, open_router, open_session
@@ -20,6 +20,7 @@ from beamsplat.services.ros2.node import Ros2Node
 from beamsplat.services.ros2_out.config import Ros2OutConfig
 from beamsplat.services.ros2_out.node import Ros2OutNode
 from beamsplat.tools.system.supervisor import Supervisor
+from tests.common.tiles import tile
 from tests.services.replay.make_bags import START_NS, T_BASE_CAMERA, T_BASE_LIDAR, Drive, write_bag
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -193,9 +194,7 @@ def test_results_are_published_with_attachments_and_tokens(tmp_path, free_endpoi
                                            "localization/grid", "fusion/cloud", "wheel/odometry")}  # fmt: skip
         T = np.eye(4)
         T[0, 3] = 2.0
-        said["localization/grid"].put(
-            Grid(stamp_ns=4, resolution_m=0.1, origin_m=np.zeros(2), occupancy=np.zeros((3, 5), np.int8))
-        )
+        said["localization/grid"].put(tile(4, np.zeros((8, 8), np.int8)))
         time.sleep(0.5)
         with RobotProcess(free_endpoint, 5, bag, seconds=0.05) as robot:
             _wait(lambda: robot.on("end"))
@@ -211,16 +210,11 @@ def test_results_are_published_with_attachments_and_tokens(tmp_path, free_endpoi
             said["fusion/cloud"].put(
                 Cloud(stamp_ns=5, points_odom_m=points, colours=np.zeros((9, 3), np.uint8))
             )
-            said["localization/grid"].put(
-                Grid(
-                    stamp_ns=6,
-                    resolution_m=0.1,
-                    origin_m=np.zeros(2),
-                    occupancy=np.zeros((3, 5), np.int8),
-                )
-            )
+            said["localization/grid"].put(tile(6, np.zeros((8, 8), np.int8), row=1, remaining=1))
+            said["localization/grid"].put(tile(6, np.full((8, 8), 100, np.int8), row=2))
+            said["localization/grid"].put(tile(7, np.full((8, 8), 50, np.int8), row=1))
             _wait(lambda: len(robot.on("/beamsplat/pose")) == len(robot.on("/tf")) == 2 and robot.on("/beamsplat/cloud")
-                  and robot.on("/map"), say=lambda: str(robot.lines))  # fmt: skip
+                  and robot.on("/map_updates"), say=lambda: str(robot.lines))  # fmt: skip
         tokens = [str(r.ok.key_expr) for r in bus.session.liveliness().get("@ros2_lv/5/**")]
     poses = robot.on("/beamsplat/pose")
     assert [p["x"] for p in poses] == [4.0, 4.0]
@@ -228,7 +222,8 @@ def test_results_are_published_with_attachments_and_tokens(tmp_path, free_endpoi
     assert [p["sequence"] for p in poses] == [1, 2]
     assert all(line["same_bytes"] and line["hash_right"] for line in robot.lines if line["topic"] != "end")
     assert all(abs(line["source_age_s"]) < 60 for line in poses)
-    assert robot.on("/map")[-1]["cells"] == [3, 5, 15]
+    assert robot.on("/map")[-1]["cells"] == [24, 8, 192]
+    assert robot.on("/map_updates")[-1]["cells"] == [8, 0, 8, 8, 64]  # row, column, height, width
     assert robot.on("/beamsplat/cloud")[0]["points"] == 9
     assert robot.on("/tf")[0]["edges"] == [["map", "odom", 2.0], ["odom", "base_link", 2.0]]
     import xxhash

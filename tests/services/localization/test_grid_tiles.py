@@ -1,0 +1,124 @@
+"""The grid in tiles equals the grid in one piece, and its cost does not grow with the map."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from beamsplat.common.mapfiles.grid_tiles import TILE_CELLS, GridSource, TiledGrid
+from beamsplat.services.localization.lidar2d import grid_tiles
+from beamsplat.services.localization.lidar2d.grid_tiles import GridTiles, MapContent
+from beamsplat.services.localization.lidar2d.occupancy import CountGrid, render_occupancy
+
+RESOLUTION_M = 0.05
+SIDE = 300  # cells of a submap: 15 m
+
+
+def submap(seed):
+    """Return the counts of a square room with a wall of hits."""
+    rng = np.random.default_rng(seed)
+    hits, misses = np.zeros((SIDE, SIDE), np.uint8), rng.integers(0, 9, (SIDE, SIDE)).astype(np.uint8)
+    hits[[5, -6], 5:-5] = hits[5:-5, [5, -6]] = 40
+    return CountGrid(hits, misses, -SIDE // 2, -SIDE // 2, RESOLUTION_M)
+
+
+ROOMS = [submap(seed) for seed in range(4)]
+
+
+def corridor(count, spacing_m=10.0, shift_m=0.0):
+    """Return submaps in a row along x, with their poses; the last is still growing."""
+    poses = [np.array([i * spacing_m, shift_m * i, 0.1 * i]) for i in range(count)]
+    finished = [(i, ROOMS[i % 4], pose) for i, pose in enumerate(poses[:-1])]
+    return MapContent(finished, [(ROOMS[(count - 1) % 4], poses[-1])])
+
+
+def assembled(tiles, like):
+    """Return the tiles as one grid on the cells of the grid `like`."""
+    grid = TiledGrid()
+    for place, packed in tiles.items():
+        grid.add(GridSource("", 0, RESOLUTION_M, TILE_CELLS), *place, packed)
+    whole, origin = grid.assembled(), np.round(grid.origin_m() / RESOLUTION_M).astype(int)
+    top = round(like.origin_y_m / RESOLUTION_M) - origin[1]
+    left = round(like.origin_x_m / RESOLUTION_M) - origin[0]
+    rows, columns = like.values.shape
+    padded = np.pad(whole, 2 * TILE_CELLS, constant_values=-1)
+    top, left = top + 2 * TILE_CELLS, left + 2 * TILE_CELLS
+    return padded[top : top + rows, left : left + columns]
+
+
+def whole_grid(content):
+    return render_occupancy([*((f, p) for _, f, p in content.finished), *content.growing], RESOLUTION_M)
+
+
+def test_tiles_follow_a_map_that_grows_moves_and_loses_submaps():
+    tiles = GridTiles(RESOLUTION_M)
+    received = {}
+    moved = corridor(6, shift_m=0.7)
+    steps = [corridor(n) for n in range(1, 7)] + [
+        moved,
+        dataclasses.replace(moved, finished=moved.finished[2:]),
+    ]
+    for content in steps:
+        received |= tiles.update(content)
+        assert tiles.pending == 0
+        expected = whole_grid(content)
+        np.testing.assert_array_equal(assembled(received, expected), expected.values)
+        assert {place for place, packed in received.items() if packed} == set(tiles.published)
+    assert any(packed == b"" for packed in received.values())  # tiles that the removed submaps have left
+
+
+def test_what_does_not_change_is_neither_drawn_nor_published():
+    tiles = GridTiles(RESOLUTION_M)
+    content = corridor(6)
+    tiles.update(content)
+    before = dataclasses.replace(tiles.work)
+    assert tiles.update(content) == {}
+    assert tiles.work.submaps == before.submaps
+    assert tiles.work.tiles - before.tiles <= 4  # those of the growing submap
+    jitter = [(i, f, pose + 0.001) for i, f, pose in content.finished]  # as of every optimisation
+    assert tiles.update(dataclasses.replace(content, finished=jitter)) == {}
+    assert tiles.work.submaps == before.submaps
+    exact = tiles.update(dataclasses.replace(content, finished=jitter), exact=True)
+    expected = whole_grid(dataclasses.replace(content, finished=jitter))
+    assert exact
+    np.testing.assert_array_equal(assembled(tiles.published, expected), expected.values)
+
+
+def test_the_work_of_an_update_is_the_same_for_a_small_and_a_large_map():
+    tiles = GridTiles(RESOLUTION_M)
+    work = []
+    for count in range(1, 61):
+        before = dataclasses.replace(tiles.work)
+        tiles.update(corridor(count))
+        after = tiles.work
+        work.append((after.tiles - before.tiles, after.submaps - before.submaps, after.cells - before.cells))
+    first, last = np.array(work[5:20]).max(axis=0), np.array(work[-20:]).max(axis=0)
+    assert (last <= 1.05 * first).all(), (first, last)
+    assert last[1] <= 8
+    assert len(tiles.published) > 30
+
+
+def test_a_loop_closure_is_drawn_in_bounded_portions_the_oldest_change_first(monkeypatch):
+    monkeypatch.setattr(grid_tiles, "TILES_PER_UPDATE", 7)
+    tiles = GridTiles(RESOLUTION_M)
+    while tiles.update(corridor(60)) or tiles.pending:
+        pass
+    moved = corridor(60, shift_m=0.3)
+    expected, updates = whole_grid(moved), 0
+    while not updates or tiles.pending > 9:  # the tiles of the growing submap are always due
+        before = tiles.work.tiles
+        tiles.update(moved)
+        assert tiles.work.tiles - before <= 7
+        updates += 1
+    assert updates >= 5
+    while tiles.update(moved):
+        pass
+    np.testing.assert_array_equal(assembled(tiles.published, expected), expected.values)
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_bands_of_a_large_grid_fit_together(monkeypatch, count):
+    content = corridor(count)
+    expected = whole_grid(content)
+    monkeypatch.setattr("beamsplat.services.localization.lidar2d.occupancy._BAND_CELLS", 40_000)
+    np.testing.assert_array_equal(whole_grid(content).values, expected.values)
