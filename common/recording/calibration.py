@@ -19,6 +19,9 @@ from beamsplat.common.geometry.transforms import make_transform
 from beamsplat.common.recording.camera_info import CameraIntrinsics
 from beamsplat.common.recording.static_frames import MAX_FRAMES, StaticFrames, normalize_frame
 
+MAX_TILT_DEG = 10.0  # of the lidar's plane; ranges then differ by 1.5 % from those of a level lidar
+_LEVEL_DEG = 2.0  # below it, a tilt is not mentioned
+
 
 @dataclass
 class Calibration:
@@ -71,6 +74,7 @@ def find_mounts(
     odometry_child: str,
     body_frame: str,
     assume: bool,
+    beside: str = "",
 ) -> None:
     """Find the mounts of sensors in the static transforms, and add them to `calibration`.
 
@@ -81,6 +85,7 @@ def find_mounts(
         odometry_child: child frame of the wheel odometry, "" = unknown.
         body_frame: frame to use as body, "" = choose one.
         assume: use `ASSUMED_MOUNTS` where a transform is missing.
+        beside: why transforms that exist do not belong to the sensors, "" = they do.
     """
     body = body_frame or frames.body_frame(list(sensor_frames.values()), odometry_child)
     calibration.body_frame = body or ""
@@ -92,6 +97,18 @@ def find_mounts(
                 if body
                 else "there are no static transforms"
             )
+            if beside:
+                calibration.missing.append(f"the position of the {sensor} on the robot is unknown: {beside}")
+                continue
+            moving = frames.moving_between(body, frame) if body else []
+            if moving:
+                pairs = ", ".join(f"{parent} -> {child}" for parent, child in moving)
+                calibration.missing.append(
+                    f"the {sensor} is on a moving mount: the transform {pairs} changes during the "
+                    "drive; hold it "
+                    "still, or record without this sensor"
+                )
+                continue
             if frames.ignored:
                 joined += f"; {frames.ignored} transforms to more than {MAX_FRAMES} frames were ignored"
             _handle_missing_mount(calibration, sensor, joined, list(sensor_frames), assume)
@@ -99,11 +116,36 @@ def find_mounts(
         if sensor == "camera":
             T = _to_optical_frame(calibration, frames, body, frame, T)
         calibration.mounts[sensor] = T
+        calibration.doubts += frames.changes_between(body, frame)
         way = " -> ".join(frames.path(body, frame))
         xyz = ", ".join(f"{value:.3f}" for value in T[:3, 3])
         calibration.found.append(f"{sensor} at ({xyz}) m in the body frame, from transforms {way}")
     if body and normalize_frame(body).split("/")[-1] != "base_footprint" and calibration.mounts:
         calibration.found.append(f"the body is the frame {body!r}")
+
+
+def check_lidar_plane(T_body_lidar: np.ndarray, where: str) -> str:
+    """Return a sentence if the lidar's plane is slightly tilted, else "".
+
+    `where`: file or topic and frame that the mount comes from, for texts.
+
+    Raises:
+        UserError: the plane is tilted by more than 10 degrees: the scans are not level.
+    """
+    tilt_deg = float(np.degrees(np.arccos(np.clip(abs(T_body_lidar[2, 2]), 0.0, 1.0))))
+    if tilt_deg > MAX_TILT_DEG:
+        raise UserError(
+            f"{where}: the plane of the lidar is tilted by {tilt_deg:.0f} degrees from the floor; a map "
+            "needs a level "
+            "lidar: publish the scans in a frame whose z axis points up (not in an optical frame; for "
+            "depthimage_to_laserscan set output_frame), correct the transform, or give the mount in a "
+            "rig file"
+        )
+    if tilt_deg > _LEVEL_DEG:
+        return (
+            f"{where}: the plane of the lidar is tilted by {tilt_deg:.1f} degrees, ranges are taken as level"
+        )
+    return ""
 
 
 def _to_optical_frame(

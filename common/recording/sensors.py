@@ -23,7 +23,10 @@ SENSORS: dict[str, SensorType] = {
         SensorType(
             "image", "camera/image", m.Image, ("sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/Image")
         ),
-        SensorType("scan", "lidar/scan", m.Scan, ("sensor_msgs/msg/LaserScan",)),
+        SensorType(
+            "scan", "lidar/scan", m.Scan,
+            ("sensor_msgs/msg/LaserScan", "sensor_msgs/msg/MultiEchoLaserScan"),
+        ),
         SensorType("odometry", "wheel/odometry", m.WheelOdometry, ("nav_msgs/msg/Odometry",)),
         SensorType(
             "pose", "external/pose", m.ExternalPose,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 
 from beamsplat.common.geometry.transforms import inverse
@@ -27,6 +29,12 @@ class StaticFrames:
     def __init__(self) -> None:
         self._parent: dict[str, tuple[str, np.ndarray]] = {}  # child -> (parent, T_parent_child)
         self.moving: set[tuple[str, str]] = set()  # (parent, child) whose transform changed
+        self.replaced: dict[
+            tuple[str, str], tuple[np.ndarray, np.ndarray]
+        ] = {}  # first and last T_parent_child
+        self.reparented: dict[
+            str, tuple[str, str]
+        ] = {}  # child -> first and last parent of latched transforms
         self.ignored = 0  # transforms to further frames, when there are `MAX_FRAMES`
 
     def add(self, parent: str, child: str, T_parent_child: np.ndarray, *, replace: bool = False) -> None:
@@ -43,10 +51,95 @@ class StaticFrames:
         if known is None and len(self._parent) + len(self.moving) >= MAX_FRAMES:
             self.ignored += 1
         elif known is None or replace:
+            if known is not None:
+                self._note_change(child, known, parent, T_parent_child)
             self._parent[child] = (parent, T_parent_child)
         elif known[0] == parent and not np.allclose(known[1], T_parent_child, atol=_TOLERANCE, rtol=0.0):
             self.moving.add((parent, child))
             del self._parent[child]
+
+    def _note_change(
+        self, child: str, known: tuple[str, np.ndarray], parent: str, T_parent_child: np.ndarray
+    ) -> None:
+        """Remember that a latched transform was published again with another value or parent."""
+        if known[0] != parent:
+            self.reparented.setdefault(child, (known[0], parent))
+        elif not np.allclose(known[1], T_parent_child, atol=_TOLERANCE, rtol=0.0):
+            first = self.replaced.get((parent, child), (known[1], known[1]))[0]
+            self.replaced[parent, child] = (first, T_parent_child)
+
+    @classmethod
+    def merged(cls, trees: list[StaticFrames]) -> StaticFrames:
+        """Return the transforms of several trees in one; of the same child, that of the last tree holds."""
+        if len(trees) == 1:
+            return trees[0]
+        found = cls()
+        for tree in trees:
+            found._parent |= tree._parent
+            found.moving |= tree.moving
+            found.replaced |= tree.replaced
+            found.reparented |= tree.reparented
+            found.ignored += tree.ignored
+        for parent, child in found.moving:
+            if found._parent.get(child, ("",))[0] == parent:
+                del found._parent[child]
+        return found
+
+    def moving_between(self, a: str, b: str) -> list[tuple[str, str]]:
+        """Return the moving pairs (parent, child) on the path between the frames a and b."""
+        parents = {child: parent for child, (parent, _) in self._parent.items()}
+        parents |= {child: parent for parent, child in self.moving}
+
+        def up(frame: str) -> list[str]:
+            chain = [frame]
+            while frame in parents and parents[frame] not in chain:
+                frame = parents[frame]
+                chain.append(frame)
+            return chain
+
+        up_a, up_b = up(normalize_frame(a)), up(normalize_frame(b))
+        common = next((frame for frame in up_a if frame in up_b), None)
+        if common is None:
+            return []
+        path = up_a[: up_a.index(common)] + up_b[: up_b.index(common)]
+        return [(parents[child], child) for child in path if (parents[child], child) in self.moving]
+
+    def changes_between(self, a: str, b: str) -> list[str]:
+        """Return sentences on latched transforms between a and b that were published with two values."""
+        found = []
+        path = self.path(a, b)
+        for parent, child in pairwise(path):
+            for pair in ((parent, child), (child, parent)):
+                if pair in self.replaced:
+                    first, last = self.replaced[pair]
+                    found.append(
+                        f"the static transform {pair[0]} -> {pair[1]} was published with different values, "
+                        f"{_position(first)} and then {_position(last)}: the last is used; two robots "
+                        "may have the "
+                        "same names of frames"
+                    )
+        for frame in path:
+            if frame in self.reparented:
+                first_parent, last_parent = self.reparented[frame]
+                found.append(
+                    f"the frame {frame} has two static parents, {first_parent} and {last_parent}: the "
+                    "last is used; "
+                    "two robots may have the same names of frames"
+                )
+        return found
+
+    def pairs_between(self, a: str, b: str) -> list[tuple[str, str]]:
+        """Return the pairs (parent, child) on the path between the frames a and b."""
+        path = self.path(a, b)
+        pairs = []
+        for one, other in pairwise(path):
+            pairs.append((one, other) if self._parent.get(other, ("",))[0] == one else (other, one))
+        return pairs
+
+    def value(self, parent: str, child: str) -> np.ndarray | None:
+        """Return the static `T_parent_child` [4, 4] of neighbouring frames, or None."""
+        known = self._parent.get(child)
+        return known[1] if known is not None and known[0] == parent else None
 
     @property
     def names(self) -> set[str]:
@@ -100,6 +193,12 @@ class StaticFrames:
             T = T_parent_child @ T
             chain[frame] = T
         return chain
+
+
+def _position(T: np.ndarray) -> str:
+    """Return the translation and the yaw of a transform [4, 4] as text."""
+    x, y, z = T[:3, 3]
+    return f"({x:.3f}, {y:.3f}, {z:.3f}) m, yaw {np.degrees(np.arctan2(T[1, 0], T[0, 0])):.1f} deg"
 
 
 def normalize_frame(frame: str) -> str:

@@ -87,7 +87,7 @@ class TurnAssembler:
 
     def __init__(self, *, sectors: bool = False) -> None:
         """`sectors`: the scans have a fixed grid, of which each has measured a sector (see `are_sectors`)."""
-        self._sectors = sectors
+        self.sectors = sectors
         self._scans: list[dict[str, Any]] = []
         self._times_ns: list[np.ndarray] = []
         self._ranges: list[np.ndarray] = []
@@ -95,7 +95,7 @@ class TurnAssembler:
 
     def add(self, scan: dict[str, Any]) -> dict[str, Any] | None:
         """Add a part (fields of `Scan`); return the fields of a whole revolution if it completes one."""
-        part = sector_of(scan) if self._sectors else scan
+        part = sector_of(scan) if self.sectors else scan
         if part is None:
             return None
         step = part["angle_increment_rad"]
@@ -103,7 +103,7 @@ class TurnAssembler:
             last = self._scans[-1]
             gap = _gap_beams(last, part) if step * last["angle_increment_rad"] > 0.0 else math.inf
             late = part["stamp_ns"] - last["stamp_ns"] > 1_000_000_000 or part["stamp_ns"] <= last["stamp_ns"]
-            if abs(gap) > _GAP_BEAMS * (4.0 if self._sectors else 1.0) or late:
+            if abs(gap) > _GAP_BEAMS * (4.0 if self.sectors else 1.0) or late:
                 self.interrupted += len(self._scans)
                 self._reset()
             else:

@@ -155,7 +155,8 @@ def _angle_candidates(messages: list[LaserMessage], rules: ScanRules) -> tuple[t
 
 def _range_rules(messages: list[LaserMessage], rules: ScanRules) -> ScanRules:
     """Return the rules with the unit of the ranges, range_max, and the code for "no return"."""
-    ranges = np.concatenate([message.ranges_m for message in messages[:100]]).astype(np.float64)
+    with np.errstate(invalid="ignore"):
+        ranges = np.concatenate([message.ranges_m for message in messages[:100]]).astype(np.float64)
     known = ranges[np.isfinite(ranges) & (ranges > 0.0)]
     tops = [message.range_max_m for message in messages]
     top = float(np.median(tops)) if all(map(math.isfinite, tops)) else math.nan
@@ -180,7 +181,10 @@ def _range_rules(messages: list[LaserMessage], rules: ScanRules) -> ScanRules:
             scale, limit_scale = unit, 1.0 if not top > _LARGEST_RANGE_M else unit
             break
     rules = replace(
-        rules, range_scale=scale, limit_scale=limit_scale, no_return_m=None if code is None else code * scale
+        rules,
+        range_scale=scale,
+        limit_scale=limit_scale,
+        no_return_m=None if code is None or code * scale >= top * limit_scale else code * scale,
     )
     largest = float(measured.max()) * scale
     top *= limit_scale
@@ -202,7 +206,9 @@ def _no_return_code(known: np.ndarray, beams: int, top: float) -> float | None:
     count = int(np.sum(known == largest))
     if math.isfinite(top) and 0.0 < largest < 0.98 * top:
         return None
-    return largest if count > _CODE_COUNT and count > _CODE_SHARE * beams else None
+    # Without a limit, a far wall that is seen from one place may be the largest reading too.
+    share = _CODE_SHARE if math.isfinite(top) and top > 0.0 else 4.0 * _CODE_SHARE
+    return largest if count > _CODE_COUNT and count > share * beams else None
 
 
 def _sweeps(messages: list[LaserMessage], rules: ScanRules, period_s: float) -> tuple[tuple[float, ...], str]:

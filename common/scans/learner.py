@@ -43,7 +43,8 @@ class _Track:
             first, step = read_angles(message, replace(rules, angles=self.angles))
         except InputFault:
             return
-        ranges = message.ranges_m * np.float32(rules.range_scale)
+        with np.errstate(invalid="ignore"):
+            ranges = message.ranges_m * np.float32(rules.range_scale)
         top = rules.range_max_m or message.range_max_m * rules.limit_scale
         low = message.range_min_m * rules.limit_scale
         if rules.no_return_m is not None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
 
@@ -58,18 +58,27 @@ class ScanReader:
     def set_offset(self, offset_ns: int, why: str) -> None:
         """Add `offset_ns` to all stamps, because of `why` (the clock of the lidar is another one)."""
         self.offset_ns, self.offset_why = offset_ns, why
-        if self._rules is not None:
-            self._rules = replace(self._rules, offset_ns=offset_ns, offset_why=why)
 
-    def learn(
-        self,
-        messages: Iterable[LaserMessage | tuple[int, np.ndarray]],
-        *,
-        limit: Callable[[], bool] | None = None,
-    ) -> None:
+    def again(self, report: InputReport) -> ScanReader:
+        """Return a reader with the rules of this one, for another pass over the same data."""
+        other = ScanReader(self.topic, report, self.learner.section, as_stated=True)
+        other.learner, other._rules, other._first = self.learner, self._rules, self._first
+        other.set_offset(self.offset_ns, self.offset_why)
+        if self._assembler is not None:
+            other._assembler = TurnAssembler(sectors=self._assembler.sectors)
+        return other
+
+    def _on_clock(self, message: LaserMessage) -> LaserMessage:
+        """Return a message with its stamp on the common clock."""
+        if not self.offset_ns or not message.stamp_ns:
+            return message
+        return replace(message, stamp_ns=message.stamp_ns + self.offset_ns)
+
+    def learn(self, messages: Iterable[LaserMessage | tuple[int, np.ndarray]]) -> None:
         """Learn the rules from recorded scans and odometry (stamp ns, pose [3]), until they are known."""
         for message in messages:
             if isinstance(message, LaserMessage):
+                message = self._on_clock(message)
                 if len(self._first) < HEADER_MESSAGES:
                     self._first.append(message)
                 self.learner.add(message)
@@ -82,6 +91,7 @@ class ScanReader:
 
     def observe(self, message: LaserMessage) -> None:
         """Learn from a message of a live robot that is not used itself."""
+        message = self._on_clock(message)
         if len(self._first) < HEADER_MESSAGES:
             self._first.append(message)
         self.learner.add(message)
@@ -100,6 +110,12 @@ class ScanReader:
         if self._live:
             self._learn_live(message)
         repairs: list[tuple[str, object, str, str]] = []
+        if self.offset_ns and message.stamp_ns:
+            what = f"{self.offset_why}: {self.offset_ns / 1e9:.3f} s is added"
+            repairs.append(
+                ("header.stamp", f"{message.stamp_ns / 1e9:.3f} s", what, "synchronise the clocks")
+            )
+            message = self._on_clock(message)
         fields = apply_rules(message, self.rules, lambda *repair: repairs.append(repair))
         for repair in repairs:
             self.report.repaired(self.topic, *repair)
@@ -127,8 +143,7 @@ class ScanReader:
             )  # fmt: skip
 
     def _adopt(self) -> None:
-        rules = self.learner.rules()
-        self._rules = replace(rules, offset_ns=self.offset_ns, offset_why=self.offset_why)
+        self._rules = self.learner.rules()
         if self._assembler is None and len(self._first) >= 6:
             fields = []
             for message in self._first:

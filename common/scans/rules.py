@@ -47,8 +47,6 @@ class ScanRules:
     stamp_why: str = ""
     use_received: bool = False  # stamps do not tell the time
     received_why: str = ""
-    offset_ns: int = 0  # is added to the stamps
-    offset_why: str = ""
     period_s: float = 0.1
 
 
@@ -202,7 +200,14 @@ def _ranges(message: LaserMessage, rules: ScanRules, repaired: Repaired) -> tupl
     if rules.no_return_m is not None:
         with np.errstate(invalid="ignore"):
             code = np.abs(ranges - np.float32(rules.no_return_m)) < 1e-4 * rules.no_return_m
-        ranges = np.where(code, np.float32(np.inf), ranges)
+        if code.any():
+            repaired(
+                "ranges",
+                f"{rules.no_return_m:.2f} m",
+                "the driver's code for no return: no surface is there",
+                "",
+            )
+            ranges = np.where(code, np.float32(np.inf), ranges)
     return float(low), float(high), ranges
 
 
@@ -232,11 +237,6 @@ def _times(message: LaserMessage, rules: ScanRules, repaired: Repaired) -> tuple
     elif stamp_ns == 0:
         stamp_ns, at_last = message.at_ns, True
         repaired("header.stamp", 0, "the scan has no stamp: the receive time is used", "")
-    elif rules.offset_ns:
-        stamp_ns += rules.offset_ns
-        offset_s = rules.offset_ns / 1e9
-        repaired("header.stamp", message.stamp_ns, f"{rules.offset_why}: {offset_s:.3f} s is added",
-                 "synchronise the clocks")  # fmt: skip
     if at_last and not rules.use_received and message.stamp_ns and rules.stamp_at == "last" and sweep_s:
         repaired("header.stamp", message.stamp_ns,
                  f"{rules.stamp_why}: it is taken as the time of the last beam, {abs(sweep_s):.3g} s "

@@ -1,4 +1,4 @@
-"""Alignment of two lidar sweeps: points with normals, deskewing by a constant twist, point-to-line ICP.
+"""SweepAlignment of two lidar sweeps: points with normals, deskewing by a constant twist, point-to-line ICP.
 
 ICP with the point-to-line metric: A. Censi, "An ICP variant using a point-to-line metric", ICRA 2008.
 """
@@ -95,7 +95,7 @@ def deskewed(sweep: Sweep, twist: np.ndarray, sweep_s: float) -> tuple[np.ndarra
 
 
 @dataclass(frozen=True)
-class Alignment:
+class SweepAlignment:
     """Pose of a sweep relative to another, and how well they agree."""
 
     pose: np.ndarray  # float64 [3]: x, y (m), yaw (rad): pose_target_source
@@ -113,7 +113,7 @@ class Target:
 
     def align(
         self, points: np.ndarray, guess: np.ndarray, gates_m: tuple[float, ...] = _GATES_M
-    ) -> Alignment | None:
+    ) -> SweepAlignment | None:
         """Return the alignment of `points` [M, 2] from the pose `guess` [3]; None if too little overlaps.
 
         `gates_m`: largest distance of matched points, by iteration.
@@ -138,7 +138,7 @@ class Target:
         size = np.where(
             distance < 2.0 * RESIDUAL_CAP_M, np.minimum(np.abs(error), RESIDUAL_CAP_M), RESIDUAL_CAP_M
         )
-        return Alignment(pose, float(size.mean()), float((size < 0.1).mean()))
+        return SweepAlignment(pose, float(size.mean()), float((size < 0.1).mean()))
 
     def _match(self, points: np.ndarray, pose: np.ndarray) -> tuple[np.ndarray, ...]:
         c, s = math.cos(pose[2]), math.sin(pose[2])
@@ -146,7 +146,8 @@ class Target:
         assert self.tree is not None
         distance, index = self.tree.query(moved)
         normals = self.normals[index]
-        return moved, distance, np.einsum("ij,ij->i", moved - self.points[index], normals), normals
+        error = np.einsum("ij,ij->i", moved - self.points[index], normals)
+        return moved, np.asarray(distance), error, normals
 
 
 def compose(pose_a_b: np.ndarray, pose_b_c: np.ndarray) -> np.ndarray:

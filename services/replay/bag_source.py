@@ -14,17 +14,18 @@ from beamsplat.common.recording import calibration as cal
 from beamsplat.common.recording.camera_info import CameraIntrinsics, is_calibrated, read_camera_info
 from beamsplat.common.recording.image_reading import describe_format, image_size_px, is_camera_image
 from beamsplat.common.recording.input_report import InputReport
-from beamsplat.common.recording.ros_types import transform_of
 from beamsplat.common.recording.sensor_reading import SensorReading
 from beamsplat.common.recording.sensors import SENSORS, ros_fields
 from beamsplat.common.recording.static_frames import StaticFrames, normalize_frame
 from beamsplat.common.recording.topic_choice import Candidate, choose_camera_info
+from beamsplat.common.recording.transform_reading import TF_TYPES, TransformReading
+from beamsplat.common.scans.reader import ScanReader
 from beamsplat.services.replay.bags import Bag, BagTopic
-from beamsplat.services.replay.decode import RawMessage, deserialize
+from beamsplat.services.replay.decode import deserialize
 from beamsplat.services.replay.options import SourceOptions
+from beamsplat.services.replay.scan_learning import learn_offsets, learn_scans
 from beamsplat.services.replay.topic_selection import select_topics
 
-TF_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 _PEEK = 5  # messages that may fail to decode before the topic counts as broken
 
 
@@ -49,6 +50,11 @@ class BagSource:
         self.calibration = cal.Calibration()
         self._calibrated = False
         self._T_child_body = np.eye(4)
+        self._transforms = TransformReading(InputReport())
+        self._scans: ScanReader | None = None  # with the rules learnt from the bag
+        self._played: ScanReader | None = None  # of the last `messages`
+        self._offsets_s: dict[str, float] = {}
+        self._tilt = ""
 
     @property
     def start_ns(self) -> int:
@@ -61,7 +67,16 @@ class BagSource:
     @property
     def problems(self) -> list[str]:
         """Return sentences about the files, the calibration, and messages that were repaired or refused."""
-        return [*self.bag.problems, *self._unused, *self.calibration.doubts, *self.report.sentences]
+        found = [
+            *self.bag.problems,
+            *self._unused,
+            *self.calibration.doubts,
+            *([self._tilt] if self._tilt else []),
+        ]
+        found += self._transforms.report.sentences
+        if self._played is not None:
+            found += self._played.warnings
+        return [*found, *self.report.sentences]
 
     def message_count(self) -> int:
         """Return the number of messages on the selected topics."""
@@ -83,7 +98,13 @@ class BagSource:
         if self.options.rig is not None:
             rig = load_rig(self.options.rig)
             self._check_rig(rig, image)
+            if rig.lidar is not None:
+                self._tilt = cal.check_lidar_plane(rig.lidar.model().T_body_lidar, str(self.options.rig))
             return rig.model_copy(update={"source": rig.source or str(self.options.rig)})
+        if "lidar" in self.calibration.mounts:
+            frame = self._first["scan"].header.frame_id
+            where = f"{self.where}: {self.chosen['scan'].name}: frame_id = {frame!r}"
+            self._tilt = cal.check_lidar_plane(self.calibration.mounts["lidar"], where)
         if self.calibration.missing:
             missing = "; ".join(self.calibration.missing)
             raise UserError(
@@ -104,12 +125,12 @@ class BagSource:
         }
         odometry = self._first.get("odometry")
         child = normalize_frame(odometry.child_frame_id) if odometry is not None else ""
-        self._read_frames(static=True)
+        beside = self._read_frames(static=True)
         if (
             any(self.frames.find(child or f, f) is None for f in sensor_frames.values())
             or not self.frames.names
         ):
-            self._read_frames(static=False)
+            beside = self._read_frames(static=False)
         cal.find_mounts(
             self.calibration,
             self.frames,
@@ -117,6 +138,7 @@ class BagSource:
             child,
             self.options.body_frame,
             self.options.assume_mounts,
+            beside,
         )
         if child and self.calibration.body_frame:
             T = self.frames.find(child, self.calibration.body_frame)
@@ -129,10 +151,12 @@ class BagSource:
         """Yield (receive time, topic, message) with start_ns <= receive time < stop_ns, by receive time."""
         self.calibrate()
         self.report.clear()
+        scans = self.scan_reader()
+        self._played = None if scans is None else scans.again(self.report)
         sensor_names = {topic.name: sensor_name for sensor_name, topic in self.chosen.items()}
         reading = SensorReading(
             self.report, {name: topic.name for name, topic in self.chosen.items()}, self._info_topic,
-            self._T_child_body,
+            self._T_child_body, self._played, self._offsets_s,
         )  # fmt: skip
         rig = load_rig(self.options.rig) if self.options.rig is not None else None
         if rig is not None and rig.camera is not None:
@@ -152,6 +176,20 @@ class BagSource:
             sensor_name = sensor_names[raw.topic]
             for built in reading.read(sensor_name, message, raw.at_ns):
                 yield raw.at_ns, SENSORS[sensor_name].topic, built
+
+    def scan_reader(self) -> ScanReader | None:
+        """Return a reader that has learnt how the scans of the bag are to be read; None if there are none."""
+        self.calibrate()
+        if "scan" in self.chosen and self._scans is None:
+            self._offsets_s = learn_offsets(self.bag, self.chosen)
+            rig = None if self.options.rig is None else load_rig(self.options.rig)
+            lidar = None if rig is None else rig.lidar
+            mount = self.calibration.mounts.get("lidar") if lidar is None else lidar.model().T_body_lidar
+            section = None if lidar is None else lidar.scan
+            self._scans = learn_scans(
+                self.bag, self.chosen, section, mount, self._T_child_body, self._offsets_s
+            )
+        return self._scans
 
     def sample(self, sensor_name: str, count: int) -> list[dict[str, Any]]:
         """Return the fields of up to `count` messages of a sensor, evenly spread and not validated."""
@@ -245,18 +283,28 @@ class BagSource:
             raise refusal
         return None
 
-    def _read_frames(self, *, static: bool) -> None:
-        """Add the transforms of /tf_static, or those of /tf, to `frames`."""
+    def _read_frames(self, *, static: bool) -> str:
+        """Fill `frames` with the transforms of tf_static, or also those of tf, beside the sensors.
+
+        Returns why there are none, or "".
+        """
         names = [
             topic.name
             for topic in self.bag.topics
             if topic.type_name in TF_TYPES and topic.name.endswith("tf_static") == static
         ]
-        if not names:
-            return
-        for raw in self.bag.messages(names):
-            for parent, child, T in _transforms(raw):
-                self.frames.add(parent, child, T, replace=static)
+        for raw in self.bag.messages(names) if names else ():
+            try:
+                message = deserialize(raw)
+            except ValueError as error:
+                self._transforms.report.refused(raw.topic, error)
+                continue
+            self._transforms.add(raw.topic, message)
+        sensor = self.chosen.get("scan") or self.chosen.get("image")
+        if sensor is None:
+            return ""
+        self.frames, beside = self._transforms.tree(sensor.name, constant=not static)
+        return beside
 
     def _check_rig(self, rig: RigFile, image: tuple[int, int] | None) -> None:
         for sensor_name, sensor in (("image", "camera"), ("scan", "lidar")):
@@ -271,15 +319,3 @@ class BagSource:
                 f"{self.options.rig}: K is for {rig.camera.width_px}x{rig.camera.height_px} px but the "
                 f"images of {self.where} are {image[0]}x{image[1]} px; calibrate at this size"
             )
-
-
-def _transforms(raw: RawMessage) -> Iterator[tuple[str, str, np.ndarray]]:
-    """Yield (parent, child, T_parent_child) of a TFMessage; invalid ones are skipped."""
-    try:
-        message = deserialize(raw)
-        for stamped in message.transforms:
-            T = transform_of(stamped.transform.translation, stamped.transform.rotation)
-            if np.all(np.isfinite(T)):
-                yield stamped.header.frame_id, stamped.child_frame_id, T
-    except ValueError:
-        return

@@ -13,8 +13,9 @@ import numpy as np
 from beamsplat.common.errors import UserError
 from beamsplat.common.recording import is_recording
 from beamsplat.common.recording.sensors import SENSORS
+from beamsplat.services.replay.bag_files import looks_like_bag
 from beamsplat.services.replay.bag_source import BagSource
-from beamsplat.services.replay.bags import Bag, BagTopic, looks_like_bag
+from beamsplat.services.replay.bags import Bag, BagTopic
 from beamsplat.services.replay.decode import begins_with_header, header_stamp_ns
 from beamsplat.services.replay.folder import FolderSource, looks_like_folder
 from beamsplat.services.replay.options import SourceOptions
@@ -139,9 +140,6 @@ def _describe_bag(
         report.calibration_missing = found.missing
     except UserError as error:
         report.calibration_missing = [str(error)]
-    if "scan" in source.chosen:
-        scans = source.sample("scan", _SCANS_SAMPLED)
-        report.lidar = lidar_statistics(scans) if scans else None
     if "image" in source.chosen:
         first = source.sample("image", 1)
         report.camera = {
@@ -149,8 +147,18 @@ def _describe_bag(
             **(report.camera or {}),
         }
     with suppress(UserError):  # of the calibration, in `calibration_missing`; damage, found before
-        for _ in source.messages():  # every message, as replay reads it: what it refuses is named here
-            pass
+        every = max(1, source.chosen["scan"].count // _SCANS_SAMPLED) if "scan" in source.chosen else 1
+        scans: list[dict[str, Any]] = []
+        number = 0
+        for _, topic, message in source.messages():  # as replay reads it: what it refuses is named here
+            if topic == SENSORS["scan"].topic:
+                number += 1
+                if number % every == 0 and len(scans) < _SCANS_SAMPLED:
+                    scans.append(vars(message))
+        report.lidar = lidar_statistics(scans) if scans else None
+    reader = source.scan_reader()
+    if reader is not None:
+        report.calibration_found.append(f"{reader.topic}: {reader.learner.evidence()}")
     report.input = source.report.as_dicts()
     report.problems += source.problems
 

@@ -13,8 +13,11 @@ from rosbags.rosbag2 import CompressionMode
 from beamsplat.common.errors import UserError
 from beamsplat.common.geometry.frames import R_body_camera_level, camera_mount
 from beamsplat.common.geometry.transforms import make_transform
+from beamsplat.common.recording.input_report import InputReport
 from beamsplat.common.recording.sensors import SENSORS, build_message, ros_fields
-from beamsplat.services.replay.bag_source import TF_TYPES, _transforms
+from beamsplat.common.recording.transform_reading import TF_TYPES, TransformReading
+from beamsplat.common.scans.laser import laser_of_ros
+from beamsplat.common.scans.reader import ScanReader
 from beamsplat.services.replay.bags import Bag
 from beamsplat.services.replay.config import ReplayConfig
 from beamsplat.services.replay.decode import deserialize, header_stamp_ns
@@ -219,7 +222,9 @@ def test_broken_messages_are_counted_not_fatal(tmp_path, kind):
 
 def test_without_stamps_the_receive_time_stands_in(tmp_path):
     sourced, problems = play(write_bag(tmp_path, "mcap", Drive(stamped=False)))
-    assert all(item.message.stamp_ns == item.at_ns for item in of(sourced, "lidar/scan"))
+    # A scan is received after its last beam, 35 ms after the first.
+    ages = [(item.at_ns - item.message.stamp_ns) / 1e9 for item in of(sourced, "lidar/scan")]
+    assert ages == pytest.approx([0.035] * 20)
     assert any("no stamp" in problem for problem in problems)
 
 
@@ -382,8 +387,10 @@ def test_mutated_messages_raise_value_errors_only(tmp_path, kind):
                 message = deserialize(raw._replace(data=data))
                 if raw.type_name in topics:
                     build_message(topics[raw.type_name], ros_fields(topics[raw.type_name], message))
+                if raw.type_name in TF_TYPES:
+                    TransformReading(InputReport()).add(raw.topic, message)
+                if raw.type_name == "sensor_msgs/msg/LaserScan":
+                    ScanReader("/scan", InputReport()).read(laser_of_ros(message, raw.at_ns))
             except ValueError:
                 pass
             header_stamp_ns(raw._replace(data=data))
-            if raw.type_name in TF_TYPES:
-                list(_transforms(raw._replace(data=data)))
