@@ -63,7 +63,7 @@ class McapFile:
     profile: str = ""
     library: str = ""
     truncated: str = ""  # what is missing of a truncated file, as a sentence; "" = the file is complete
-    damaged_chunks: int = 0
+    damaged: dict[int, tuple[int, int]] = field(default_factory=dict)  # log times of chunks, by offset
     schemas: dict[int, Schema] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
     counts: Counter[int] = field(default_factory=Counter)  # messages by channel id
@@ -101,7 +101,7 @@ class McapFile:
         """Yield messages with start_ns <= log_time < stop_ns in order of log time, equal times in file order.
 
         Chunks without any of the channels are not read. A chunk that cannot be decoded is skipped and counted
-        in `damaged_chunks`.
+        in `damaged`.
 
         Raises:
             UserError: chunks overlap in time so much that more than 1 GiB of messages must be held back.
@@ -284,7 +284,7 @@ class McapFile:
                     raise McapError("checksum")
             return self._parse(data)
         except _DAMAGE:
-            self.damaged_chunks += 1
+            self.damaged[block.offset] = (block.start_ns, block.end_ns)
             return []
 
     def _parse(self, data: bytes) -> list[Message]:

@@ -14,6 +14,7 @@ from beamsplat.common.messages import Message
 from beamsplat.common.messages.codec import decode
 from beamsplat.common.messages.header import DecodeError, Header
 from beamsplat.common.recording import layout, ros_types
+from beamsplat.common.recording.damage import describe_damage
 from beamsplat.common.recording.from_ros import fields_of
 from beamsplat.common.recording.mcap_file import MAGIC, Channel, McapFile
 from beamsplat.common.recording.mcap_file import Message as McapMessage
@@ -73,9 +74,9 @@ class RecordingReader:
     def problems(self) -> list[str]:
         """Sentences about missing and damaged data that the reader has found so far."""
         found = [f"{file.path}: {file.truncated}" for file in self.files if file.truncated]
-        damaged = sum(file.damaged_chunks for file in self.files)
+        damaged = [span for file in self.files for span in file.damaged.values()]
         if damaged:
-            found.append(f"{self.path}: {damaged} damaged chunks were skipped")
+            found.append(describe_damage(self.path, damaged, self.start_ns, self.end_ns))
         found += [f"{topic}: {count} messages do not decode" for topic, count in self.undecodable.items()]
         return found
 

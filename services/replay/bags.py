@@ -1,13 +1,13 @@
 """Reader of ROS bags of any kind: topics with types and counts, raw messages by receive time.
 
-ROS 1 (.bag, or a folder of splits), ROS 2 sqlite (.db3), MCAP (.mcap), and ROS 2 folders with or
-without metadata.yaml. Errors are one sentence that names the file.
+ROS 1 (.bag, or a folder of splits), ROS 2 sqlite (.db3), MCAP (.mcap), each also compressed (.zstd) and in
+folders with or without metadata.yaml. Errors are one sentence that names the file.
 """
 
 from __future__ import annotations
 
 import heapq
-import re
+import shutil
 import sqlite3
 import struct
 import tempfile
@@ -18,23 +18,26 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import apsw
-from rosbags.rosbag1 import ReaderError as ReaderError1
+from rosbags.rosbag2 import Reader as Reader2
 from rosbags.rosbag2 import ReaderError as ReaderError2
 
 from beamsplat.common.errors import UserError, reason
-from beamsplat.common.files.persist import read_limited
-from beamsplat.common.recording.decompression import decompress
+from beamsplat.common.recording.damage import describe_damage
+from beamsplat.common.recording.decompression import decompress, decompress_file
 from beamsplat.common.recording.mcap_file import McapFile
-from beamsplat.services.replay.bounded_readers import BoundedReader1, BoundedReader2, decompress_bag
-from beamsplat.services.replay.decode import RawMessage
+from beamsplat.common.recording.ros1_file import Ros1File
+from beamsplat.services.replay.bag_files import find_bag_files, is_compressed
+from beamsplat.services.replay.decode import RawMessage, ros1_encoding
 
 # Exceptions of the readers on damaged files, besides their own errors.
 _READ_ERRORS = (
-    ReaderError1, ReaderError2, apsw.Error, sqlite3.Error, OSError, AssertionError, KeyError, IndexError,
+    ReaderError2, apsw.Error, sqlite3.Error, OSError, AssertionError, KeyError, IndexError,
     ValueError, struct.error, EOFError, RuntimeError, TypeError, MemoryError, OverflowError,
 )  # fmt: skip
-_MAX_METADATA_BYTES = 4_000_000  # of metadata.yaml; with hundreds of topics it has less than 1 MB
 _COPY_AGAIN = "copy it again from where it was recorded"
+_KEEP_FREE_BYTES = 1_000_000_000  # on the disk of temporary files
+_ZSTD = b"\x28\xb5\x2f\xfd"  # begins a zstd frame; CDR begins with a zero
+_SAME_TIME = 0.5  # of the shorter file: files that overlap more are not splits of one drive
 
 
 class BagTopic(NamedTuple):
@@ -47,7 +50,7 @@ class BagTopic(NamedTuple):
 
 
 class Bag:
-    """An open ROS bag. `problems` are sentences about missing parts of the bag.
+    """An open ROS bag.
 
     Raises:
         UserError: no such file, not a bag, truncated (unless `allow_truncated`), or without messages.
@@ -55,21 +58,31 @@ class Bag:
 
     def __init__(self, path: Path, *, allow_truncated: bool = False) -> None:
         self.path = Path(path)
-        self.problems: list[str] = []
+        self._notes: list[str] = []
         self._stack = ExitStack()
         self._bag_files: list[_BagFile] = []
         try:
-            files = _files(self.path)
-            if files[0].suffix == ".zstd":
-                folder = self._stack.enter_context(tempfile.TemporaryDirectory(prefix="beamsplat-bag-"))
-                files = decompress_bag(files, Path(folder))
-            for file in files:
-                self._bag_files.append(self._open(file, allow_truncated))
+            found = find_bag_files(self.path)
+            self._notes += found.notes
+            for file in found.files:
+                part = self._open(self._decompressed(file), file, allow_truncated)
+                if not self._is_duplicate(part):
+                    self._bag_files.append(part)
             if not any(topic.count for part in self._bag_files for topic in part.topics):
                 raise UserError(f"{self.path}: the bag has no messages; record again")
         except UserError:
             self.close()
             raise
+
+    @property
+    def problems(self) -> list[str]:
+        """Return sentences about missing and damaged parts of the bag that were found so far."""
+        damaged = [
+            describe_damage(part.file, part.damaged_ns, part.span_ns[0], part.span_ns[1])
+            for part in self._bag_files
+            if part.span_ns
+        ]
+        return [*self._notes, *(text for text in damaged if text)]
 
     @property
     def topics(self) -> list[BagTopic]:
@@ -124,32 +137,96 @@ class Bag:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _open(self, file: Path, allow_truncated: bool) -> _BagFile:
-        if file.suffix == ".mcap":
-            by_message = _compression_mode(self.path / "metadata.yaml") == "message"
-            part = _McapFile(self._stack.enter_context(McapFile(file)), by_message)
-            if part.file.truncated:
-                sentence = f"{file}: truncated: {part.file.truncated}"
+    def _open(self, file: Path, shown: Path, allow_truncated: bool) -> _BagFile:
+        """Open one file; `shown`: its path before decompression, for texts."""
+        if file.stat().st_size == 0:
+            raise UserError(f"{shown}: the file is empty; {_COPY_AGAIN}")
+        if ".mcap" in file.suffixes or ".bag" in file.suffixes:
+            part: _BagFile
+            if ".mcap" in file.suffixes:
+                part = _McapFile(self._stack.enter_context(McapFile(file)), shown)
+            else:
+                opened = Ros1File(file)
+                self._stack.callback(opened.close)
+                part = _Ros1File(opened, shown)
+            if part.truncated:
+                sentence = f"{shown}: truncated: {part.truncated}"
                 if not allow_truncated:
                     raise UserError(
-                        f"{sentence}; {_COPY_AGAIN}, or set allow_truncated to use the readable part"
+                        f"{sentence}; {_COPY_AGAIN}{_repair(file)}, or set allow_truncated to use the "
+                        "readable part"
                     )
-                self.problems.append(sentence)
+                self._notes.append(sentence)
+            if shown.suffix == ".active":
+                self._notes.append(f"{shown}: the recorder has not closed this file: its end may be missing")
             return part
         try:
-            reader = BoundedReader1(file) if file.suffix == ".bag" else BoundedReader2(file)
+            reader = Reader2(file)
             reader.open()
         except _READ_ERRORS as error:
-            raise UserError(_explain(file, error)) from error
+            raise UserError(_explain(shown, error)) from error
         self._stack.callback(_close, reader)
-        return _RosbagsFile(reader)
+        return _SqliteFile(reader, shown)
+
+    def _decompressed(self, file: Path) -> Path:
+        """Return a file, decompressed to a temporary folder if its name ends in .zstd.
+
+        Raises:
+            UserError: the file is damaged, or the disk has too little free space.
+        """
+        if not is_compressed(file):
+            return file
+        folder = Path(self._stack.enter_context(tempfile.TemporaryDirectory(prefix="beamsplat-bag-")))
+        target = folder / file.stem
+        limit = shutil.disk_usage(folder).free - _KEEP_FREE_BYTES
+        try:
+            with file.open("rb") as source, target.open("wb") as written:
+                decompress_file(source, written, limit)
+        except (OSError, ValueError) as error:
+            raise UserError(
+                f"{file}: cannot be decompressed to {tempfile.gettempdir()}: {reason(error)}; free disk "
+                "space, set TMPDIR to a larger disk, or copy the file again from where it was recorded"
+            ) from error
+        return target
+
+    def _is_duplicate(self, part: _BagFile) -> bool:
+        """Return whether a file has the same messages as an earlier one, with a sentence about it.
+
+        Raises:
+            UserError: it has the same topics at the same time, but not the same messages: another drive.
+        """
+        for other in self._bag_files:
+            if not part.span_ns or not other.span_ns:
+                continue
+            shorter_ns = min(end - start for start, end in (part.span_ns, other.span_ns))
+            both_ns = min(part.span_ns[1], other.span_ns[1]) - max(part.span_ns[0], other.span_ns[0])
+            shared = _repeated_topics(part) & _repeated_topics(other)
+            if not shared or both_ns <= _SAME_TIME * shorter_ns:
+                continue
+            if sorted(part.topics) == sorted(other.topics) and part.span_ns == other.span_ns:
+                self._notes.append(
+                    f"{self.path}: {part.file.name} has the same messages as {other.file.name}: not read"
+                )
+                return True
+            raise UserError(
+                f"{self.path}: {other.file.name} and {part.file.name} have the same topics "
+                f"({', '.join(sorted(shared))}) at the same time: give one file, not the folder"
+            )
+        return False
 
 
 class _BagFile(ABC):
     """One file of a bag (a bag may be split into several)."""
 
+    file: Path
     topics: list[BagTopic]
     span_ns: tuple[int, int] | None
+    truncated: str = ""
+
+    @property
+    def damaged_ns(self) -> list[tuple[int, int]]:
+        """Return the first and last receive time of each damaged chunk found so far."""
+        return []
 
     @abstractmethod
     def messages(self, topics: Collection[str] | None, start_ns: int, stop_ns: int) -> Iterator[RawMessage]:
@@ -157,40 +234,65 @@ class _BagFile(ABC):
 
 
 class _McapFile(_BagFile):
-    def __init__(self, file: McapFile, by_message: bool) -> None:
-        """`by_message`: each message is compressed separately."""
-        self.file, self._by_message = file, by_message
-        self.span_ns = (file.start_ns, file.end_ns) if file.counts.total() else None
+    def __init__(self, opened: McapFile, file: Path) -> None:
+        self.file, self._opened, self.truncated = file, opened, opened.truncated
+        self.span_ns = (opened.start_ns, opened.end_ns) if opened.counts.total() else None
         self.topics = [
-            BagTopic(channel.topic, self._type_of(channel), file.counts[i], channel.message_encoding)
-            for i, channel in file.channels.items()
+            BagTopic(channel.topic, self._type_of(channel), opened.counts[i], channel.message_encoding)
+            for i, channel in opened.channels.items()
         ]
 
+    @property
+    def damaged_ns(self) -> list[tuple[int, int]]:
+        return list(self._opened.damaged.values())
+
     def _type_of(self, channel: Any) -> str:
-        schema = self.file.schemas.get(channel.schema_id)
+        schema = self._opened.schemas.get(channel.schema_id)
         if schema is None:
             return channel.metadata.get("beamsplat.schema", "unknown")
-        package, _, name = schema.name.partition("/")
-        return schema.name if "/msg/" in schema.name or not name else f"{package}/msg/{name}"
+        return _ros2_type(schema.name)
 
     def messages(self, topics: Collection[str] | None, start_ns: int, stop_ns: int) -> Iterator[RawMessage]:
-        ids = [i for i, channel in self.file.channels.items() if topics is None or channel.topic in topics]
-        types = {i: self._type_of(self.file.channels[i]) for i in ids}
-        for channel, message in self.file.messages(ids, start_ns, stop_ns):
-            data = decompress(message.data, "zstd") if self._by_message else message.data
+        channels = self._opened.channels
+        ids = [i for i, channel in channels.items() if topics is None or channel.topic in topics]
+        types = {i: self._type_of(channels[i]) for i in ids}
+        for channel, message in self._opened.messages(ids, start_ns, stop_ns):
             yield RawMessage(
-                message.log_time, channel.topic, types[channel.id], data, channel.message_encoding
+                message.log_time, channel.topic, types[channel.id], _message_data(message.data),
+                channel.message_encoding,
+            )  # fmt: skip
+
+
+class _Ros1File(_BagFile):
+    def __init__(self, opened: Ros1File, file: Path) -> None:
+        self.file, self._opened, self.truncated = file, opened, opened.truncated
+        self.span_ns = (opened.start_ns, opened.end_ns) if opened.counts.total() else None
+        self._topics = {
+            number: BagTopic(
+                connection.topic, _ros2_type(connection.type_name), opened.counts[number],
+                ros1_encoding(_ros2_type(connection.type_name), connection.md5),
             )
+            for number, connection in opened.connections.items()
+        }  # fmt: skip
+        self.topics = list(self._topics.values())
+
+    @property
+    def damaged_ns(self) -> list[tuple[int, int]]:
+        return list(self._opened.damaged.values())
+
+    def messages(self, topics: Collection[str] | None, start_ns: int, stop_ns: int) -> Iterator[RawMessage]:
+        wanted = [n for n, topic in self._topics.items() if topics is None or topic.name in topics]
+        for message in self._opened.messages(wanted, start_ns, stop_ns):
+            topic = self._topics[message.connection]
+            yield RawMessage(message.at_ns, topic.name, topic.type_name, message.data, topic.encoding)
 
 
-class _RosbagsFile(_BagFile):
-    def __init__(self, reader: BoundedReader1 | BoundedReader2) -> None:
-        self._reader = reader
-        ros1 = isinstance(reader, BoundedReader1)
+class _SqliteFile(_BagFile):
+    def __init__(self, reader: Reader2, file: Path) -> None:
+        self.file, self._reader = file, reader
         self._encodings = {
-            id(c): "ros1" if ros1 else getattr(c.ext, "serialization_format", "cdr")
-            for c in reader.connections
-        }
+            id(c): getattr(c.ext, "serialization_format", "cdr") for c in reader.connections
+        }  # fmt: skip
         self.topics = [
             BagTopic(c.topic, c.msgtype, c.msgcount, self._encodings[id(c)]) for c in reader.connections
         ]
@@ -203,66 +305,39 @@ class _RosbagsFile(_BagFile):
             return
         for connection, at_ns, data in self._reader.messages(chosen, start_ns, stop_ns):
             encoding = self._encodings.get(id(connection), "cdr")
-            yield RawMessage(at_ns, connection.topic, connection.msgtype, bytes(data), encoding)
+            yield RawMessage(
+                at_ns, connection.topic, connection.msgtype, _message_data(bytes(data)), encoding
+            )
 
 
-def looks_like_bag(path: Path) -> bool:
-    """Return whether `path` is a bag, judged by its name or by the names of the files in it."""
-    if path.is_dir():
-        names = {file.suffix for file in path.iterdir()}
-        return bool(names & {".mcap", ".db3", ".bag", ".zstd"}) or (path / "metadata.yaml").exists()
-    return path.suffix in (".bag", ".mcap", ".db3")
+def _message_data(data: bytes) -> bytes:
+    """Return a serialised message, decompressed if the bag has its messages compressed one by one."""
+    return decompress(data, "zstd") if data[:4] == _ZSTD else data
 
 
-def _files(path: Path) -> list[Path]:
-    """Return the files to open for `path`; for a folder that rosbags opens as a whole, the folder."""
-    if not path.exists():
-        raise UserError(f"{path}: no such file or folder; check the path")
-    if path.is_file():
-        if path.suffix not in (".bag", ".mcap", ".db3"):
-            raise UserError(f"{path}: not a bag; expected .bag, .mcap, .db3, or a folder with one of them")
-        return [path]
-    metadata = path / "metadata.yaml"
-    if mcaps := sorted(path.glob("*.mcap")):
-        return mcaps
-    if _compression_mode(metadata) == "file" and (compressed := sorted(path.glob("*.zstd"))):
-        return compressed
-    if metadata.exists():
-        return [path]
-    files = sorted(path.glob("*.db3")) or sorted(path.glob("*.bag"))
-    if not files:
-        raise UserError(f"{path}: not a bag: no metadata.yaml and no .mcap, .db3 or .bag file in this folder")
-    return files
+def _ros2_type(name: str) -> str:
+    """Return the name of a type in the form pkg/msg/Type; other names are returned unchanged."""
+    package, _, last = name.partition("/")
+    return name if "/msg/" in name or not last else f"{package}/msg/{last}"
 
 
-def _compression_mode(metadata: Path) -> str:
-    """Return the compression mode in a metadata.yaml, in lower case: "file", "message", or "" for none.
+def _repeated_topics(part: _BagFile) -> set[str]:
+    """Return the topics with several messages: splits repeat latched ones."""
+    return {topic.name for topic in part.topics if topic.count > 2 and not topic.name.endswith("tf_static")}
 
-    Raises:
-        UserError: the file cannot be read, or is too long: the reader of bags would need minutes for it.
-    """
-    if not metadata.is_file():
-        return ""
-    try:
-        text = read_limited(metadata, _MAX_METADATA_BYTES).decode(errors="replace")
-    except (OSError, ValueError) as error:
-        raise UserError(f"{metadata}: cannot be read ({reason(error)}); {_COPY_AGAIN}") from error
-    found = re.search(r"compression_mode:\s*['\"]?(file|message)", text, re.I)
-    return found[1].lower() if found else ""
+
+def _repair(file: Path) -> str:
+    return f", repair it with `rosbag reindex {file.name}`" if ".bag" in file.suffixes else ""
 
 
 def _explain(file: Path, error: Exception) -> str:
-    """Return one sentence about a bag that could not be opened."""
-    if file.is_file() and file.stat().st_size == 0:
-        return f"{file}: the file is empty; {_COPY_AGAIN}"
-    reason = _reason(error)
-    if "magic" in reason or "file is not a database" in reason or "missing tables" in reason:
-        return f"{file}: not a bag, in spite of its name ({reason})"
-    if "not indexed" in reason:
-        return f"{file}: the recording was not closed; repair it with `rosbag reindex {file.name}`"
-    if isinstance(error, (ReaderError1, apsw.Error, AssertionError, struct.error, IndexError, ValueError)):
-        return f"{file}: truncated or damaged ({reason}); {_COPY_AGAIN}"
-    return f"{file}: cannot be read ({reason}); {_COPY_AGAIN}"
+    """Return one sentence about a file of a ROS 2 bag that could not be opened."""
+    text = _reason(error)
+    if "file is not a database" in text or "missing tables" in text:
+        return f"{file}: not a bag, in spite of its name ({text})"
+    if isinstance(error, (apsw.Error, AssertionError, struct.error, IndexError, ValueError)):
+        return f"{file}: truncated or damaged ({text}); {_COPY_AGAIN}"
+    return f"{file}: cannot be read ({text}); {_COPY_AGAIN}"
 
 
 def _reason(error: Exception) -> str:
@@ -270,6 +345,6 @@ def _reason(error: Exception) -> str:
     return text.rstrip(".")[:200] or type(error).__name__
 
 
-def _close(reader: BoundedReader1 | BoundedReader2) -> None:
+def _close(reader: Reader2) -> None:
     with suppress(*_READ_ERRORS):  # closing a damaged file may raise again
         reader.close()

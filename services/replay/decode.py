@@ -37,6 +37,19 @@ def _store(encoding: str) -> Typestore:
     return store
 
 
+@cache
+def ros1_encoding(type_name: str, md5: str) -> str:
+    """Return "ros1", or another text if the definition of the type, by its MD5 sum, is not that of Noetic.
+
+    Old bags have messages of the same name with other fields; read as Noetic's they would be wrong.
+    """
+    store = _store("ros1")
+    if md5 == "*" or type_name not in store.types:
+        return "ros1"
+    known = store.generate_msgdef(type_name, ros_version=1)[1]
+    return "ros1" if md5 == known else f"ros1 with an old definition of {type_name} (convert: rosbag fix)"
+
+
 def can_decode(type_name: str, encoding: str) -> bool:
     """Return whether messages of this type and encoding can be decoded."""
     return encoding in ("cdr", "ros1") and type_name in _store(encoding).types

@@ -9,8 +9,9 @@ from typing import Any, Protocol
 from beamsplat.common.errors import UserError
 from beamsplat.common.recording import is_recording
 from beamsplat.common.recording.sensors import build_message
+from beamsplat.services.replay.bag_files import looks_like_bag
 from beamsplat.services.replay.bag_source import BagSource
-from beamsplat.services.replay.bags import Bag, looks_like_bag
+from beamsplat.services.replay.bags import Bag
 from beamsplat.services.replay.folder import FolderSource, looks_like_folder
 from beamsplat.services.replay.options import SourceOptions
 from beamsplat.services.replay.recording_source import RecordingSource

@@ -126,7 +126,7 @@ def read_mcap(path: Path) -> str:
     with McapFile(path) as file:
         for _ in file.messages():
             pass
-        if not file.damaged_chunks:
+        if not file.damaged:
             return ""
     raise ValueError("damaged chunk")
 
@@ -161,6 +161,8 @@ def read_bag(path: Path) -> str:
     with Bag(path, allow_truncated=True) as bag:
         for _ in bag.messages():
             pass
+        if bag.problems:
+            raise ValueError(bag.problems[0])
     return ""
 
 

@@ -47,8 +47,7 @@ def test_messages_far_out_of_order_are_not_all_held_back(tmp_path, monkeypatch):
 
 
 def test_a_compressed_bag_is_not_decompressed_beyond_the_free_disk(tmp_path, monkeypatch):
-    from beamsplat.services.replay import bounded_readers
-    from beamsplat.services.replay.bags import Bag
+    from beamsplat.services.replay import bags
 
     path = rosbag2(tmp_path / "bag", b"")
     database = next(path.glob("*.db3"))
@@ -56,7 +55,7 @@ def test_a_compressed_bag_is_not_decompressed_beyond_the_free_disk(tmp_path, mon
     database.with_suffix(".db3.zstd").write_bytes(zstd_zeros())
     metadata = path / "metadata.yaml"
     metadata.write_text(metadata.read_text().replace("compression_mode: message", "compression_mode: file"))
-    free = bounded_readers.shutil.disk_usage(tmp_path).free
-    monkeypatch.setattr(bounded_readers, "_KEEP_FREE_BYTES", free - 50_000_000)
+    free = bags.shutil.disk_usage(tmp_path).free
+    monkeypatch.setattr(bags, "_KEEP_FREE_BYTES", free - 50_000_000)
     with pytest.raises(UserError, match=r"db3\.zstd: cannot be decompressed .* expands to more than"):
-        Bag(path)
+        bags.Bag(path)
