@@ -34,7 +34,8 @@ demo: setup
 
 test: setup
 	$(BIN)/python -m pytest -m "not live and not soak and not slow" -n auto --maxprocesses 4 --dist loadfile
-	$(BIN)/python -m pytest -m "live and not soak and not slow" --durations=12
+	# Tests of live systems wait more than they compute.
+	$(BIN)/python -m pytest -m "live and not soak and not slow" -n 3 --dist loadfile --durations=12
 
 # Whole drives and whole systems, minutes in all; most of them need recordings with truth.
 slow: setup
