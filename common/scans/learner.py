@@ -265,17 +265,23 @@ class ScanLearner:
             return replace(rules, stamp_at="first", stamp_why="the scans are received after a whole sweep")
         return rules
 
-    def found_section(self) -> ScanSection:
-        """Return the rules as the section [lidar.scan] of a rig file."""
-        rules, facts = self.rules(), self.facts
-        sweep_s = rules.sweep_s
-        if sweep_s is None:
-            sweep_s = facts.sweep_candidates_s[0] if facts is not None else 0.0
-        order = "none" if sweep_s == 0.0 else "forward" if sweep_s > 0.0 else "reversed"
-        return ScanSection(
-            order=order, sweep_s=round(abs(sweep_s), 6), stamp=rules.stamp_at or "first",
-            angles=rules.angles, mirrored=rules.mirrored,
-        )  # fmt: skip
+    def found_section(self) -> ScanSection | None:
+        """Return what the data have decided as the section [lidar.scan] of a rig file; None if it is nothing."""
+        if self.facts is None:
+            return None
+        rules, track = self.rules(), self._choose_track()[0]
+        values: dict[str, object] = {}
+        if track.order.decide() is not None or rules.sweep_s is not None:
+            sweep_s = self.facts.sweep_candidates_s[0] if rules.sweep_s is None else rules.sweep_s
+            values["order"] = "none" if sweep_s == 0.0 else "forward" if sweep_s > 0.0 else "reversed"
+            values["sweep_s"] = round(abs(sweep_s), 6)
+        if rules.stamp_at is not None:
+            values["stamp"] = rules.stamp_at
+        if len(self._tracks) > 1 and not self.undecided:
+            values["angles"] = rules.angles
+        if rules.mirrored:
+            values["mirrored"] = True
+        return ScanSection.model_validate(values) if values else None
 
     def evidence(self) -> str:
         """Return one sentence on how the order and the time of the beams were found."""

@@ -137,11 +137,11 @@ class MotionComparison:
         along = np.cos(middle) * steps[:, 0] - np.sin(middle) * steps[:, 1]
         across = np.sin(middle) * steps[:, 0] + np.cos(middle) * steps[:, 1]
         moving = np.hypot(steps[:, 0], steps[:, 1]) > 0.05
-        turning = moving & (np.abs(steps[:, 2]) > 0.03)
-        return bool(
-            turning.sum() >= 5
-            and np.median(np.abs(across[turning])) < 0.1 * np.median(np.abs(along[turning]))
-        )
+        heading = np.cumsum(steps[:, 2])[moving]
+        # With a wrong sign of the yaw, the path leaves the heading as soon as the robot has turned.
+        if moving.sum() < 3 or float(np.ptp(heading)) < _MIN_TURN_RAD:
+            return False
+        return bool(np.median(np.abs(across[moving])) < 0.1 * np.median(np.abs(along[moving])))
 
     def mount(self, *, mirrored: bool = False) -> MountEstimate | None:
         """Return the planar mount of the lidar; None if the robot has not moved enough.

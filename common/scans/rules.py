@@ -237,7 +237,10 @@ def _times(message: LaserMessage, rules: ScanRules, repaired: Repaired) -> tuple
     elif stamp_ns == 0:
         stamp_ns, at_last = message.at_ns, True
         repaired("header.stamp", 0, "the scan has no stamp: the receive time is used", "")
-    if at_last and not rules.use_received and message.stamp_ns and rules.stamp_at == "last" and sweep_s:
+    as_ros = (
+        sweep_s < 0.0 and claimed < 0.0
+    )  # the stamp is that of the first beam in the array, the last in time
+    if rules.stamp_at == "last" and message.stamp_ns and sweep_s and not (rules.use_received or as_ros):
         repaired("header.stamp", message.stamp_ns,
                  f"{rules.stamp_why}: it is taken as the time of the last beam, {abs(sweep_s):.3g} s "
                  "after the first",

@@ -15,7 +15,6 @@ from __future__ import annotations
 import heapq
 import math
 import tomllib
-from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
 from operator import itemgetter
@@ -28,9 +27,14 @@ from beamsplat.common.errors import UserError, reason
 from beamsplat.common.files.persist import read_limited
 from beamsplat.common.geometry.rig import load_rig
 from beamsplat.common.geometry.trajectory import Trajectory, read_tum
-from beamsplat.common.geometry.transforms import so3_log
+from beamsplat.common.geometry.transforms import se3_to_se2, so3_log
 from beamsplat.common.messages.image_header import read_image_header
+from beamsplat.common.recording.calibration import check_lidar_plane
+from beamsplat.common.recording.input_report import InputReport
 from beamsplat.common.recording.sensors import SENSORS, build_message
+from beamsplat.common.scans.clocks import UNIT_NAMES, UNITS_NS, stamp_unit
+from beamsplat.common.scans.laser import LaserMessage, laser_of_fields
+from beamsplat.common.scans.reader import ScanReader
 from beamsplat.services.replay.folder_scans import CsvScans, scan_from_points, xy_from_pcd
 from beamsplat.services.replay.options import SourceOptions
 
@@ -66,8 +70,10 @@ class FolderSource:
         self.path = Path(path)
         self.where = str(path)
         self.options = options
-        self.skipped: Counter[str] = Counter()
-        self.first_fault: dict[str, str] = {}
+        self.report = InputReport()  # of what was repaired and refused since `messages` was called
+        self._units: list[str] = []  # sentences on stamps that are not in nanoseconds
+        self._learnt: ScanReader | None = None
+        self._tilt = ""
         self._settings = self._read_settings()
         self._streams = {
             sensor_name: stream
@@ -91,11 +97,10 @@ class FolderSource:
 
     @property
     def problems(self) -> list[str]:
-        return [
-            f"{self.where}: {sensor_name}: {count} skipped, "
-            f"the first because: {self.first_fault[sensor_name]}"
-            for sensor_name, count in sorted(self.skipped.items())
-        ]
+        found = [*self._units, *([self._tilt] if self._tilt else [])]
+        if self._learnt is not None:
+            found += self._learnt.warnings
+        return [*found, *(f"{self.where}: {sentence}" for sentence in self.report.sentences)]
 
     def counts(self) -> dict[str, int]:
         """Return the number of files or rows of each sensor ("image", "scan", ...)."""
@@ -117,6 +122,8 @@ class FolderSource:
                 'one with rig = "rig.toml" (`beamsplat rig` writes a first one)'
             )
         rig = load_rig(file)
+        if rig.lidar is not None:
+            self._tilt = check_lidar_plane(rig.lidar.model().T_body_lidar, str(file))
         images = self._streams.get("image")
         if images:
             if rig.camera is None:
@@ -133,6 +140,9 @@ class FolderSource:
     def messages(self, start_ns: int = 0, stop_ns: int | None = None) -> Iterator[Stamped]:
         """Yield (stamp ns, topic, message) with start_ns <= stamp < stop_ns, in order of stamps."""
         stop_ns = 2**63 if stop_ns is None else stop_ns
+        self.report.clear()
+        scans = self.scan_reader()
+        self._reader = None if scans is None else scans.again(self.report)
         makers = {
             "image": self._image, "scan": self._scan, "odometry": self._odometry, "pose": self._pose,
         }  # fmt: skip
@@ -168,12 +178,46 @@ class FolderSource:
         topic = SENSORS[sensor_name].topic
         for stamp_ns, entry in entries:
             try:
-                message = build_message(topic, {"stamp_ns": stamp_ns, **make(entry)})
+                fields = {"stamp_ns": stamp_ns, **make(entry)}
+                read = [fields]
+                if sensor_name == "scan" and self._reader is not None:
+                    read = self._reader.read(laser_of_fields(fields, stamp_ns))
+                messages = [build_message(topic, found) for found in read]
             except (ValueError, OSError) as error:
-                self.skipped[sensor_name] += 1
-                self.first_fault.setdefault(sensor_name, str(error).split("\n")[0][:200])
+                self.report.refused(
+                    sensor_name, error if isinstance(error, ValueError) else ValueError(error)
+                )
                 continue
-            yield stamp_ns, topic, message
+            for message in messages:
+                yield stamp_ns, topic, message
+
+    def scan_reader(self) -> ScanReader | None:
+        """Return a reader that has learnt how the folder's scans are to be read; None if there are none."""
+        if not self._streams.get("scan") or self._learnt is not None:
+            return self._learnt
+        file = self.options.rig or self.path / "rig.toml"
+        lidar = load_rig(file).lidar if file.exists() else None
+        self._learnt = ScanReader("scan", InputReport(), None if lidar is None else lidar.scan)
+        if lidar is not None:
+            self._learnt.set_mount(lidar.model().T_body_lidar)
+        self._learnt.learn(self._measurements())
+        return self._learnt
+
+    def _measurements(self) -> Iterator[LaserMessage | tuple[int, np.ndarray]]:
+        """Yield scans, and odometry as (stamp ns, pose_odom_body [3]), in order of stamps."""
+        named = [
+            (stamp_ns, sensor_name, entry)
+            for sensor_name in ("odometry", "scan")
+            for stamp_ns, entry in self._streams.get(sensor_name, ())
+        ]
+        for stamp_ns, sensor_name, entry in sorted(named, key=itemgetter(0)):
+            if sensor_name == "odometry":
+                yield stamp_ns, se3_to_se2(entry[0])
+                continue
+            try:
+                yield laser_of_fields({"stamp_ns": stamp_ns, **self._scan(entry)}, stamp_ns)
+            except (ValueError, OSError):  # counted in `messages`
+                continue
 
     def _find_streams(self) -> dict[str, list[tuple[int, Any]]]:
         pcds = _stamped_files(self.path / "lasers", (".pcd",))
@@ -190,7 +234,32 @@ class FolderSource:
                 poses = read_tum(self.path / name)
                 made = _with_velocity(poses) if sensor_name == "odometry" else poses.T_a_b
                 streams[sensor_name] = list(zip(poses.stamps_ns.tolist(), made))
-        return streams
+        return {
+            name: self._in_nanoseconds(name, stream) if name in ("image", "scan") else stream
+            for name, stream in streams.items()
+        }
+
+    def _in_nanoseconds(self, sensor_name: str, stream: list[tuple[int, Any]]) -> list[tuple[int, Any]]:
+        """Return a stream with its stamps in nanoseconds, whatever unit its files use.
+
+        Raises:
+            UserError: the stamps do not advance.
+        """
+        stamps = np.array([stamp for stamp, _ in stream], np.int64)
+        if len(stamps) > 3 and len(np.unique(stamps)) < 0.5 * len(stamps):
+            raise UserError(
+                f"{self.where}: {sensor_name}: stamp = {stamps[0]}: {len(stamps)} entries have only "
+                f"{len(np.unique(stamps))} different stamps; write the time of each in nanoseconds"
+            )
+        unit = stamp_unit(stamps) if len(stamps) > 1 else "ns"
+        if unit == "ns":
+            return stream
+        self._units.append(
+            f"{self.where}: {sensor_name}: stamp = {stamps[0]}: the {len(stamps)} stamps are in "
+            f"{UNIT_NAMES[unit]} "
+            "and were converted; write nanoseconds"
+        )
+        return [(stamp * UNITS_NS[unit], entry) for stamp, entry in stream]
 
     def _read_settings(self) -> FolderLidar:
         file = self.path / "folder.toml"

@@ -9,6 +9,7 @@ from typing import Any
 from beamsplat.common.errors import UserError
 from beamsplat.common.geometry.rig import LidarSection, Mount, RigFile, load_rig
 from beamsplat.common.recording import RecordingReader
+from beamsplat.common.recording.calibration import check_lidar_plane
 from beamsplat.common.recording.sensors import SENSORS
 from beamsplat.services.replay.options import SourceOptions
 
@@ -65,6 +66,8 @@ class RecordingSource:
         """
         if self.options.rig is not None:
             rig = load_rig(self.options.rig)
+            if rig.lidar is not None:
+                check_lidar_plane(rig.lidar.model().T_body_lidar, str(self.options.rig))
             return rig.message(self.start_ns, rig.source or str(self.options.rig))
         recorded = next(self._reader.messages(["rig"]), None)
         if recorded is None and ({"image", "scan"} & set(self.sensor_names)) == {"scan"}:

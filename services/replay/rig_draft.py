@@ -80,7 +80,14 @@ def _from_bag(source: BagSource, where: str) -> tuple[str, list[str]]:
             assumed.append(f"mount of the {sensor}: not in the data, a usual one was assumed")
     notes += [f"assumed, to be measured: {text}" for text in assumed[len(found.assumed) :]]
     found.assumed = assumed
-    return format_rig(found.rig(where), _HEADER, comments), notes
+    rig = found.rig(where)
+    reader = source.scan_reader()
+    if reader is not None and rig.lidar is not None:
+        scan = reader.learner.found_section()
+        rig = rig.model_copy(update={"lidar": rig.lidar.model_copy(update={"scan": scan})})
+        comments["lidar.scan"] = f"Found in {where}: {reader.learner.evidence()}."
+        notes.append(f"found: {reader.learner.evidence()}")
+    return format_rig(rig, _HEADER, comments), notes
 
 
 def _is_assumed(sensor: str, assumed: list[str]) -> bool:
