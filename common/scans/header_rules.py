@@ -26,6 +26,7 @@ _CODE_SHARE = 0.005  # of the readings that are exactly the largest, for a code 
 _CODE_COUNT = 20
 _FULL_TURN = 0.0025  # relative difference from a whole revolution
 _UNKNOWN_RANGE_MAX_M = 30.0
+_FEW = 4  # messages that show their period
 
 
 @dataclass(frozen=True)
@@ -222,7 +223,7 @@ def _sweeps(messages: list[LaserMessage], rules: ScanRules, period_s: float) -> 
     step = abs(float(np.median([message.angle_increment_rad for message in messages])))
     step = math.radians(step) if "angle_increment" in rules.degrees else step
     span = step * max(beams - 1, 1) if math.isfinite(step) else TWO_PI
-    limit_s = min(MAX_PERIOD_S, 1.3 * period_s)
+    limit_s = min(MAX_PERIOD_S, 1.3 * period_s) if len(messages) >= _FEW else MAX_PERIOD_S
     # A turning lidar measures without pause, so the sweep takes its share of the period.
     turning_s = period_s * min(span / TWO_PI, 1.0)
     expected_s = turning_s if span > math.radians(200.0) else min(turning_s, period_s)

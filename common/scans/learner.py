@@ -118,7 +118,7 @@ class ScanLearner:
         stamp_ns = message.at_ns if self._base.use_received or not message.stamp_ns else message.stamp_ns
         if message.frame_id != self._base.frame_id or not len(message.ranges_m):
             return
-        if 0 < stamp_ns - self._last_ns < _STEP_NS:
+        if 0 <= stamp_ns - self._last_ns < _STEP_NS:
             return
         self._last_ns = stamp_ns
         self.scans += 1
@@ -207,11 +207,10 @@ class ScanLearner:
 
     def rules(self) -> ScanRules:
         """Return the rules by all evidence so far."""
-        if self.facts is None:
-            self.learn_header()
-        rules, facts, section = self._base, self.facts, self.section
-        if facts is None:
-            return rules
+        facts, section = self.facts, self.section
+        if facts is None:  # provisional, until there are enough messages
+            return learn_header(self._header)[0] if self._header else ScanRules()
+        rules = self._base
         track, why = self._choose_track()
         rules = replace(rules, angles=track.angles, angles_why=why or rules.angles_why)
         if section.angles is not None:
@@ -266,7 +265,7 @@ class ScanLearner:
         return rules
 
     def found_section(self) -> ScanSection | None:
-        """Return what the data have decided as the section [lidar.scan] of a rig file; None if it is nothing."""
+        """Return what the data have decided as the section [lidar.scan] of a rig file; None if nothing."""
         if self.facts is None:
             return None
         rules, track = self.rules(), self._choose_track()[0]

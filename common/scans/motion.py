@@ -52,9 +52,9 @@ class SweepMotion:
         pose = None
         if last is not None:
             dt_s = (sweep.stamp_ns - last.sweep.stamp_ns) * 1e-9
-            if dt_s <= 0.0:
+            if -_MAX_STEP_S < dt_s <= 0.0:
                 return None
-            pose = self._pose(sweep, last, dt_s)
+            pose = self._pose(sweep, last, dt_s) if dt_s > 0.0 else None  # None: the clock was set back
         if pose is None:
             self._chain += 1
             pose = np.zeros(3)

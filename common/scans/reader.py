@@ -45,6 +45,7 @@ class ScanReader:
         self._first: list[LaserMessage] = []
         self._read = 0
         self.offset_ns, self.offset_why = 0, ""
+        self._warnings: list[str] | None = None  # of a live robot, at the last look at the evidence
         self.sparse = 0  # scans with fewer than `MIN_RETURNS` returns
 
     @property
@@ -87,6 +88,7 @@ class ScanReader:
             else:
                 self.learner.add_odometry(*message)
         self._live = False
+        self.learner.learn_header()
         self._adopt()
 
     def observe(self, message: LaserMessage) -> None:
@@ -131,7 +133,7 @@ class ScanReader:
         self._read += 1
         if not self.learner.done:
             self.observe(message)
-        if self._rules is None or (self._read % _UPDATE_SCANS == 0 and self._read < 2000):
+        if self._rules is None or self._read < _UPDATE_SCANS or self._read % _UPDATE_SCANS == 0:
             self._adopt()
         if self.learner.undecided and self._read < _HOLD_SCANS:
             raise InputFault(
@@ -144,6 +146,7 @@ class ScanReader:
 
     def _adopt(self) -> None:
         self._rules = self.learner.rules()
+        self._warnings = self.learner.warnings() if self._live else None
         if self._assembler is None and len(self._first) >= 6:
             fields = []
             for message in self._first:
@@ -176,7 +179,8 @@ class ScanReader:
     @property
     def warnings(self) -> list[str]:
         """Return sentences on scans that disagree with odometry and transforms, or have few returns."""
-        found = [f"{self.topic}: {text}" for text in self.learner.warnings()]
+        texts = self.learner.warnings() if self._warnings is None else self._warnings
+        found = [f"{self.topic}: {text}" for text in texts]
         if self.sparse:
             found.append(
                 f"{self.topic}: ranges: {self.sparse} scans have fewer than {MIN_RETURNS} returns "

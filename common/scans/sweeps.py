@@ -9,7 +9,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 MIN_POINTS = 15  # with a normal; fewer do not define a motion
 _MAX_POINTS = 180  # of a sweep; more do not change the decisions
@@ -107,6 +106,8 @@ class Target:
     """A point cloud with normals that others are aligned to."""
 
     def __init__(self, points: np.ndarray, normals: np.ndarray) -> None:
+        from scipy.spatial import cKDTree  # only where sweeps are compared: drivers start without SciPy
+
         self.known = np.hypot(normals[:, 0], normals[:, 1]) > 0.5
         self.points, self.normals = points[self.known], normals[self.known]
         self.tree = cKDTree(self.points) if len(self.points) else None

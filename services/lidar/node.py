@@ -8,8 +8,11 @@ from collections.abc import Iterator
 import numpy as np
 
 from beamsplat.common.messages import Scan
+from beamsplat.common.recording.input_report import InputReport
 from beamsplat.common.runtime.clock import StampClock
 from beamsplat.common.runtime.node import Node, SourceItem
+from beamsplat.common.scans.laser import laser_of_fields
+from beamsplat.common.scans.reader import ScanReader
 from beamsplat.services.lidar.config import HokuyoConfig, LidarConfig, RplidarConfig
 from beamsplat.services.lidar.driver import LidarDriver
 from beamsplat.services.lidar.hokuyo import HokuyoDriver
@@ -37,6 +40,8 @@ class _LidarNode(Node, ABC):
         """
         bauds = (self.config.baud,) if self.config.baud else ()
         self._reader = LidarReader(self.driver, self._open, bauds, StampClock().now_ns)
+        self._report = InputReport()
+        self._scans = ScanReader("lidar/scan", self._report, as_stated=True)
 
     def _open(self, baud: int) -> DeviceLink:
         return open_link(self.config.device, baud)
@@ -49,10 +54,22 @@ class _LidarNode(Node, ABC):
             self.rejections.set("revolutions dropped: too few measurements", counters.dropped_scans)
             self.rejections.set("packets damaged", counters.bad_packets)
             self.rejections.set("measurements missing or not plausible", counters.lost_samples)
-            yield None if scan is None else SourceItem(None, "lidar/scan", self.message(scan))
+            message = None if scan is None else self._read(scan)
+            for finding in self._report.findings:
+                self.rejections.set(finding.reason, finding.count)
+            yield None if message is None else SourceItem(None, "lidar/scan", message)
+
+    def _read(self, scan: StampedScan) -> Scan | None:
+        """Return the message of a revolution as read by the one reader of scans; None if it is refused."""
+        try:
+            fields = self._scans.read(laser_of_fields(vars(self.message(scan)), scan.stamp_ns))
+            return Scan.model_validate(fields[0]) if fields else None
+        except ValueError as error:
+            self._report.refused("lidar/scan", error)
+            return None
 
     def message(self, scan: StampedScan) -> Scan:
-        """Return the scan message of a revolution.
+        """Return the scan message of a revolution, before `_read` has checked it.
 
         Ranges beyond the limit become NaN (not measured): subscribers interpret +inf as free space, and these
         devices do not distinguish "nothing within range" from "not measured".

@@ -6,7 +6,6 @@ Nothing is published before the calibration is known, and no image whose size di
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,14 +14,19 @@ import numpy as np
 
 from beamsplat.common.errors import UserError
 from beamsplat.common.geometry.rig import RigFile, load_rig
+from beamsplat.common.geometry.transforms import se3_to_se2
 from beamsplat.common.recording import calibration as cal
 from beamsplat.common.recording.camera_info import is_calibrated, read_camera_info
 from beamsplat.common.recording.image_reading import image_size_px, is_camera_image
-from beamsplat.common.recording.input_report import InputReport, reason_of
-from beamsplat.common.recording.ros_types import deserialize, transform_of
+from beamsplat.common.recording.input_report import InputFault, InputReport, reason_of
+from beamsplat.common.recording.ros_types import deserialize, stamp_ns_of
 from beamsplat.common.recording.sensor_reading import SensorReading
 from beamsplat.common.recording.sensors import SENSORS, build_message
-from beamsplat.common.recording.static_frames import MAX_FRAMES, StaticFrames, normalize_frame
+from beamsplat.common.recording.static_frames import MAX_FRAMES, normalize_frame
+from beamsplat.common.recording.transform_reading import TransformReading, namespace_of, valid_transforms
+from beamsplat.common.scans.clocks import clock_offsets_s, clock_sentence, prompt_lag_s
+from beamsplat.common.scans.laser import laser_of_ros
+from beamsplat.common.scans.reader import ScanReader
 from beamsplat.services.ros2.tf_odometry import TfOdometry
 from beamsplat.services.ros2.topics import (
     CAMERA_INFO,
@@ -36,6 +40,9 @@ _MAX_WAIT_S = 10.0  # for the first message of a topic that has a publisher
 _MAX_TOPICS = 256  # of the robot that are considered, and of BeamSplat that are ignored
 _MAX_REJECTING = 16  # topics whose unusable messages are counted apart
 _OTHER = "other topics"
+_MAX_SCAN_TOPICS = 8  # whose scans are learnt from before topics are selected
+_DELAYS = 40  # messages of each topic whose delay is measured
+_FIXED = 2e-3  # metres and rotation matrix entries: within it, a mount on /tf is fixed
 
 
 @dataclass(frozen=True)
@@ -60,8 +67,12 @@ class RosRobot:
         self._ignored: deque[str] = deque(maxlen=_MAX_TOPICS)
         self._first_messages: dict[str, tuple[str, Any]] = {}  # (ROS type, first message) by sensor topic
         self._camera_infos: dict[str, Any] = {}
-        self._static_tree = StaticFrames()  # from /tf_static
-        self._constant_tree = StaticFrames()  # also from /tf, transforms that do not change
+        self._transforms = TransformReading(InputReport())
+        self._watched: dict[tuple[str, str], np.ndarray] = {}  # of the mounts: (parent, child) -> T on /tf
+        self._watched_space = ""  # namespace of the topics with these transforms
+        self._moved = ""  # why the mounts are not fixed
+        self._scan_readers: dict[str, ScanReader] = {}  # by topic, which learn before topics are selected
+        self._delays: dict[str, tuple[list[int], list[int]]] = {}  # receive times and stamps, by topic
         self._tf_odometry = TfOdometry()  # of /tf
         self._odometry_edge: tuple[str, str] | None = None  # (odom, child) if odometry is taken from /tf
         self._first_message_s: float | None = None
@@ -85,8 +96,8 @@ class RosRobot:
 
     @property
     def needs_tf(self) -> bool:
-        """Return whether /tf is needed: until the calibration is known, and for odometry from /tf."""
-        return self.rig is None or self._odometry_edge is not None
+        """Return whether /tf is needed: for calibration, odometry, and to see that mounts are fixed."""
+        return self.rig is None or self._odometry_edge is not None or bool(self._watched)
 
     def add_publisher(self, topic: str, type_name: str) -> None:
         """Register a topic that has a publisher on the robot; beyond `_MAX_TOPICS` it is only counted."""
@@ -125,9 +136,10 @@ class RosRobot:
             self._reject(topic, str(error))
             return []
         if self.rig is None:
-            self._keep_for_calibration(topic, type_name, message, now_s)
+            self._keep_for_calibration(topic, type_name, message, received_ns, now_s)
             return self._rig_message(received_ns, now_s)
         if type_name == TF:
+            self._watch_mounts(topic, message)
             return self._odometry_from_tf(topic, message)
         if topic == self._info_topic and self._reading is not None:
             self._reading.images.add_camera_info(message)
@@ -135,7 +147,9 @@ class RosRobot:
         kind = self._kind_by_topic.get(topic)
         return self._convert(topic, kind, message, received_ns) if kind else []
 
-    def _keep_for_calibration(self, topic: str, type_name: str, message: Any, now_s: float) -> None:
+    def _keep_for_calibration(
+        self, topic: str, type_name: str, message: Any, received_ns: int, now_s: float
+    ) -> None:
         """Store transforms, the newest CameraInfo and the first sensor message of each topic."""
         if type_name == TF:
             self._add_transforms(topic, message)
@@ -148,6 +162,20 @@ class RosRobot:
         else:
             self._first_messages.setdefault(topic, (type_name, message))
             self._first_message_s = now_s if self._first_message_s is None else self._first_message_s
+            self._observe(topic, type_name, message, received_ns)
+
+    def _observe(self, topic: str, type_name: str, message: Any, received_ns: int) -> None:
+        """Learn from a sensor's message before topics are selected: how scans are to be read, its clock."""
+        received, stamps = self._delays.setdefault(topic, ([], []))
+        if len(received) < _DELAYS:
+            received.append(received_ns)
+            stamps.append(stamp_ns_of(message.header.stamp))
+        if type_name in SENSORS["scan"].ros_types:
+            reader = self._scan_readers.get(topic)
+            if reader is None and len(self._scan_readers) < _MAX_SCAN_TOPICS:
+                reader = self._scan_readers[topic] = ScanReader(topic, self.report)
+            if reader is not None:
+                reader.observe(laser_of_ros(message, received_ns))
 
     def _rig_message(self, received_ns: int, now_s: float) -> list[tuple[str, Any]]:
         """Return the calibration as [("rig", message)] once it is complete; until then []."""
@@ -159,7 +187,9 @@ class RosRobot:
             return []
         stamps_ns = (self._stamp_ns(message, received_ns) for _, message in self._first_messages.values())
         stamp_ns = max(min(stamps_ns), 0)
-        for stored in (self._first_messages, self._camera_infos, self._publisher_types):
+        for stored in (
+            self._first_messages, self._camera_infos, self._publisher_types, self._scan_readers, self._delays,
+        ):  # fmt: skip
             stored.clear()  # not used any more
         assert self.rig is not None  # set by `_calibrate`
         return [("rig", self.rig.message(stamp_ns, self.rig.source))]
@@ -192,12 +222,49 @@ class RosRobot:
         if "odometry" not in chosen and "odometry" not in self._options.without:
             self._odometry_edge = self._tf_odometry.odometry_edge()
         self.rig = rig
-        self._reading = SensorReading(self.report, chosen, self._info_topic, self._T_child_body)
+        if rig.lidar is not None:
+            where = str(path) if path is not None else f"the robot: {chosen.get('scan', '')}"
+            self.doubts += filter(None, [cal.check_lidar_plane(rig.lidar.model().T_body_lidar, where)])
+        offsets_s = self._offsets_s(chosen)
+        self._reading = SensorReading(
+            self.report, chosen, self._info_topic, self._T_child_body,
+            self._scan_reader(chosen, rig, offsets_s), offsets_s,
+        )  # fmt: skip
         if rig.camera is not None:
             follow = path is None and self._info_topic != ""
             self._reading.images.calibrate(rig.camera.model_dump(exclude={"mount"}), follow=follow)
         self._update_status()
         return True
+
+    def _offsets_s(self, chosen: dict[str, str]) -> dict[str, float]:
+        """Return seconds to add to the stamps of sensors that are on another clock than the others."""
+        lags = {kind: prompt_lag_s(*self._delays.get(topic, ([], []))) for kind, topic in chosen.items()}
+        reader = self._scan_readers.get(chosen.get("scan", ""))
+        expected = {}
+        if reader is not None and reader.learner.facts is not None:
+            expected["scan"] = abs(reader.learner.facts.sweep_candidates_s[0])
+            if reader.learner.rules().use_received:
+                lags.pop("scan")
+        return clock_offsets_s({kind: lag for kind, lag in lags.items() if lag is not None}, expected)
+
+    def _scan_reader(
+        self, chosen: dict[str, str], rig: RigFile, offsets_s: dict[str, float]
+    ) -> ScanReader | None:
+        """Return the reader of the selected scans, with what it has learnt so far."""
+        topic = chosen.get("scan")
+        if topic is None:
+            return None
+        reader = self._scan_readers.get(topic, ScanReader(topic, self.report))
+        section = None if rig.lidar is None else rig.lidar.scan
+        offset_s = offsets_s.get("scan", 0.0)
+        if section is not None or offset_s:
+            reader = ScanReader(topic, self.report, section)
+        if offset_s:
+            stamp_ns = stamp_ns_of(self._first_messages[topic][1].header.stamp)
+            reader.set_offset(round(offset_s * 1e9), clock_sentence(topic, stamp_ns, offset_s))
+        if rig.lidar is not None:
+            reader.set_mount(rig.lidar.model().T_body_lidar)
+        return reader
 
     def _rig_from_file(self, path: Path, chosen: dict[str, str]) -> RigFile:
         rig = load_rig(path)
@@ -221,10 +288,15 @@ class RosRobot:
             child = normalize_frame(self._first_messages[chosen["odometry"]][1].child_frame_id)
         elif (edge := self._tf_odometry.odometry_edge()) is not None:
             child = edge[1]
-        tree = self._static_tree
+        sensor_topic = chosen.get("scan") or chosen["image"]
+        tree, beside = self._transforms.tree(sensor_topic, constant=False)
         if not tree.names or any(tree.find(child or f, f) is None for f in frames.values()):
-            tree = self._constant_tree
-        cal.find_mounts(found, tree, frames, child, self._options.body_frame, self._options.assume_mounts)
+            fixed, (tree, beside) = tree, self._transforms.tree(sensor_topic, constant=True)
+        else:
+            fixed = tree
+        cal.find_mounts(
+            found, tree, frames, child, self._options.body_frame, self._options.assume_mounts, beside
+        )
         if "image" in chosen:
             self._intrinsics(found, chosen["image"])
         if found.missing:
@@ -235,7 +307,13 @@ class RosRobot:
         if child and found.body_frame:
             T_child_body = tree.find(child, found.body_frame)
             self._T_child_body = np.eye(4) if T_child_body is None else T_child_body
-        self.doubts = found.doubts
+        for frame in frames.values():
+            for pair in tree.pairs_between(found.body_frame, frame):
+                T = tree.value(*pair)
+                if T is not None and fixed.value(*pair) is None:
+                    self._watched[pair] = T
+        self._watched_space = sensor_topic
+        self.doubts = [*found.doubts, *self._transforms.report.sentences]
         return found.rig("the robot's CameraInfo and transforms")
 
     def _intrinsics(self, found: cal.Calibration, image: str) -> None:
@@ -256,6 +334,10 @@ class RosRobot:
     def _convert(self, topic: str, kind: str, message: Any, received_ns: int) -> list[tuple[str, Any]]:
         assert self._reading is not None  # topics are selected
         refused = self.report.count("refused", topic)
+        if self._moved and kind in ("scan", "image"):
+            self.report.refused(topic, InputFault("transform", "", self._moved, "hold the mount still"))
+            self._reject(topic, self._moved)
+            return []
         built = self._reading.read(kind, message, received_ns)
         if self.report.count("refused", topic) > refused:
             self._reject(topic, self.report.last_refusal)
@@ -264,21 +346,29 @@ class RosRobot:
         return [(SENSORS[kind].topic, message) for message in built]
 
     def _add_transforms(self, topic: str, message: Any) -> None:
-        fixed = topic.endswith("tf_static")
-        trees = (self._static_tree, self._constant_tree) if fixed else (self._constant_tree,)
-        ignored = sum(tree.ignored for tree in trees)
-        for stamped, T in _transforms(message):
-            if not fixed:
+        ignored = self._transforms.ignored
+        for stamped, _ in self._transforms.add(topic, message):
+            if not topic.endswith("tf_static"):
                 self._tf_odometry.add_edge(stamped.header.frame_id, stamped.child_frame_id)
-            for tree in trees:
-                tree.add(stamped.header.frame_id, stamped.child_frame_id, T, replace=fixed)
-        if sum(tree.ignored for tree in trees) > ignored:
+        if self._transforms.ignored > ignored:
             self._reject(topic, f"transforms to more than {MAX_FRAMES} frames are ignored")
+
+    def _watch_mounts(self, topic: str, message: Any) -> None:
+        """Note when a transform of a mount changes that was taken from /tf because it had not changed."""
+        if not self._watched or self._moved or topic.endswith("tf_static"):
+            return
+        if not ("/" + self._watched_space.strip("/")).startswith(namespace_of(topic) + "/"):
+            return
+        for stamped, T in valid_transforms(topic, message, self._transforms.report):
+            pair = normalize_frame(stamped.header.frame_id), normalize_frame(stamped.child_frame_id)
+            known = self._watched.get(pair)
+            if known is not None and not np.allclose(known, T, atol=_FIXED, rtol=0.0):
+                self._moved = f"the mount moves: the transform {pair[0]} -> {pair[1]} on {topic} has changed"
 
     def _odometry_from_tf(self, topic: str, message: Any) -> list[tuple[str, Any]]:
         """Return wheel odometry computed from a message of /tf; [] if there is an Odometry topic."""
         found = []
-        for stamped, T in _transforms(message):
+        for stamped, T in valid_transforms(topic, message, self._transforms.report):
             edge = normalize_frame(stamped.header.frame_id), normalize_frame(stamped.child_frame_id)
             if edge != self._odometry_edge or topic.endswith("tf_static"):
                 continue
@@ -291,6 +381,8 @@ class RosRobot:
             if fields is None:
                 continue
             cal.move_odometry_to_body(fields, self._T_child_body)
+            if self._reading is not None:
+                self._reading.scans.add_odometry(fields["stamp_ns"], se3_to_se2(fields["T_odom_body"]))
             try:
                 found.append((SENSORS["odometry"].topic, build_message(SENSORS["odometry"].topic, fields)))
             except ValueError as error:
@@ -314,23 +406,13 @@ class RosRobot:
         repaired = [found for found in self.report.findings if found.action == "repaired"]
         if repaired:
             rejected += f"; {self.report.count('repaired')} repaired, for example {repaired[0].reason}"
-        doubts = "".join(f"; {doubt}" for doubt in self.doubts)
+        scans = [] if self._reading is None else self._reading.scans.warnings
+        doubts = "".join(f"; {doubt}" for doubt in [*self.doubts, *scans])
         self.status = f"from ROS 2: {counts}{rejected}{doubts}"
 
     def _stamp_ns(self, message: Any, received_ns: int) -> int:
         stamp = message.header.stamp
         return int(stamp.sec) * 10**9 + int(stamp.nanosec) or received_ns
-
-
-def _transforms(message: Any) -> Iterator[tuple[Any, np.ndarray]]:
-    """Yield each transform of a TFMessage with its matrix [4, 4]; invalid transforms are skipped."""
-    for stamped in message.transforms:
-        try:
-            T = transform_of(stamped.transform.translation, stamped.transform.rotation)
-        except ValueError:
-            continue
-        if np.all(np.isfinite(T)):
-            yield stamped, T
 
 
 def _kind_of(type_name: str) -> str:
