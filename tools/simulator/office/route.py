@@ -9,12 +9,13 @@ import numpy as np
 from beamsplat.tools.simulator.office.floor import FloorPlan
 from beamsplat.tools.simulator.office.rooms import OfficeRoom
 from beamsplat.tools.simulator.office.settings import OfficeSettings
-from beamsplat.tools.simulator.path import DrivePath
+from beamsplat.tools.simulator.path import DrivePath, resample_closed
 
 Crossing = tuple[int, int]  # of corridor i along y and corridor j along x
 VISIT_NEW, VISIT_AGAIN = 0.15, 0.05  # share of open rooms that are visited in the first and in later passes
 SMOOTH_M = 1.4  # length of the window that rounds corners
 STEP_M = 0.05
+START_M = 4.0
 
 
 def plan_route(floor: FloorPlan, settings: OfficeSettings) -> DrivePath:
@@ -25,9 +26,12 @@ def plan_route(floor: FloorPlan, settings: OfficeSettings) -> DrivePath:
     """
     rng = np.random.default_rng([settings.seed, 0x0F2])
     walk = _Walk(floor, rng)
-    while walk.length_m < settings.distance_m:
+    first = walk.choose()
+    walk.go(first)
+    while walk.length_m < settings.distance_m or walk.at == walk.start:
         walk.go(walk.choose())
-    for crossing in walk.way_to(walk.start):
+    # The last lap joins the first without a U-turn.
+    for crossing in walk.way_to(walk.start, not_from=first):
         walk.go(crossing)
     return DrivePath(_smooth(np.array(walk.points)), settings.limits)
 
@@ -39,7 +43,7 @@ class _Walk:
         self._floor, self._rng = floor, rng
         self._shape = (len(floor.corridor_x_m), len(floor.corridor_y_m))
         self.start: Crossing = (0, 0)
-        self._at, self._before = self.start, self.start
+        self.at, self._before = self.start, self.start
         self._seen: set[frozenset[Crossing]] = set()
         self._visits = _rooms_by_edge(floor)
         self._plan: deque[Crossing] = deque()
@@ -58,7 +62,7 @@ class _Walk:
         """Return the next crossing: unseen and straight, unseen, else along the way to the nearest unseen."""
         if self._plan:
             return self._plan.popleft()
-        at, before = self._at, self._before
+        at, before = self.at, self._before
         ahead = (2 * at[0] - before[0], 2 * at[1] - before[1])
         unseen = [n for n in self._neighbours(at) if frozenset((at, n)) not in self._seen]
         if unseen:
@@ -80,32 +84,36 @@ class _Walk:
     def _has_unseen(self, c: Crossing) -> bool:
         return any(frozenset((c, n)) not in self._seen for n in self._neighbours(c))
 
-    def way_to(self, target: Crossing) -> list[Crossing]:
-        """Return the crossings of a shortest way from here, without a U-turn at its start where possible."""
+    def way_to(self, target: Crossing, not_from: Crossing | None = None) -> list[Crossing]:
+        """Return the crossings of a shortest way from here, without a U-turn at its start where possible.
+
+        The way does not reach its target from `not_from`.
+        """
         for avoid in (self._before, None):
-            came: dict[Crossing, Crossing] = {self._at: self._at}
-            queue = deque([self._at])
+            came: dict[Crossing, Crossing] = {self.at: self.at}
+            queue = deque([self.at])
             while queue and target not in came:
                 c = queue.popleft()
                 for n in self._neighbours(c):
-                    if n not in came and not (c == self._at and n == avoid):
+                    barred = (c == self.at and n == avoid) or (n == target and c == not_from)
+                    if n not in came and not barred:
                         came[n] = c
                         queue.append(n)
             if target in came:
                 break
-        way = []
-        while target != self._at:
+        way: list[Crossing] = []
+        while target != self.at:
             way.append(target)
             target = came[target]
         return way[::-1]
 
     def go(self, to: Crossing) -> None:
         """Drive to a neighbouring crossing, with visits of rooms on the way."""
-        edge = frozenset((self._at, to))
+        edge = frozenset((self.at, to))
         chance = VISIT_AGAIN if edge in self._seen else VISIT_NEW
-        a, b = self._position(self._at), self._position(to)
+        a, b = self._position(self.at), self._position(to)
         direction = (b - a) / np.linalg.norm(b - a)
-        along_x = self._at[1] == to[1]
+        along_x = self.at[1] == to[1]
         width = self._floor.width_y_m[to[1]] if along_x else self._floor.width_x_m[to[0]]
         lane = np.array([-direction[1], direction[0]]) * self._rng.uniform(-1.0, 1.0) * (width / 2.0 - 0.8)
         way = [a + 2.0 * direction + lane]
@@ -120,7 +128,7 @@ class _Walk:
             self.length_m += float(np.linalg.norm(point - self.points[-1]))
             self.points.append(point)
         self._seen.add(edge)
-        self._before, self._at = self._at, to
+        self._before, self.at = self.at, to
 
 
 def _door(room: OfficeRoom) -> np.ndarray:
@@ -144,16 +152,15 @@ def _rooms_by_edge(floor: FloorPlan) -> dict[frozenset[Crossing], list[OfficeRoo
 
 
 def _smooth(points_m: np.ndarray) -> np.ndarray:
-    """Return a closed curve [N, 2], a point each 0.2 m, that rounds the corners of a closed polyline."""
+    """Return a closed curve [N, 2], a point each 0.2 m, that rounds the corners of a closed polyline.
+
+    It begins START_M after the first point, so that the robot starts on a straight.
+    """
     keep = np.concatenate([[True], np.linalg.norm(np.diff(points_m, axis=0), axis=1) > 1e-6])
-    points_m = points_m[keep]
-    s = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points_m, axis=0), axis=1))])
-    at = np.arange(int(s[-1] / STEP_M)) * STEP_M
-    dense = np.stack([np.interp(at, s, points_m[:, k]) for k in range(2)], axis=1)
-    count = int(SMOOTH_M / STEP_M) | 1
-    window = np.hanning(count + 2)[1:-1]
-    window /= window.sum()
-    half = count // 2
+    dense = resample_closed(points_m[keep][:-1], STEP_M)
+    window = np.hanning((int(SMOOTH_M / STEP_M) | 1) + 2)[1:-1]
+    half = len(window) // 2
     padded = np.concatenate([dense[-half:], dense, dense[:half]])
-    smooth = np.stack([np.convolve(padded[:, k], window, "valid") for k in range(2)], axis=1)
-    return smooth[:: round(0.2 / STEP_M)]
+    smooth = np.stack([np.convolve(padded[:, k], window / window.sum(), "valid") for k in range(2)], axis=1)
+    smooth = np.roll(smooth, -round(START_M / STEP_M), axis=0)
+    return smooth[: len(smooth) // 4 * 4 : 4]
