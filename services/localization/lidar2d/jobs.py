@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from beamsplat.services.localization.lidar2d import se2
+from beamsplat.services.localization.lidar2d.drift_model import DriftModel
 from beamsplat.services.localization.lidar2d.graph_optimisation import ConstraintArrays, optimise
-from beamsplat.services.localization.lidar2d.loops import (
-    DriftModel,
-    LoopCandidate,
-    match_globally,
-    match_locally,
-    verify_constraint,
-)
+from beamsplat.services.localization.lidar2d.loop_hypotheses import LoopHypothesis
+from beamsplat.services.localization.lidar2d.loops import LoopCandidate, match_locally
 from beamsplat.services.localization.lidar2d.pose_graph_data import Constraint, constraint_arrays
 from beamsplat.services.localization.lidar2d.refinement import refine_submaps
-from beamsplat.services.localization.lidar2d.segments import link_segment
+from beamsplat.services.localization.lidar2d.revisits import find_revisits, nearest_member, submaps_of
+from beamsplat.services.localization.lidar2d.segments import first_of_components, join_components
 from beamsplat.services.localization.lidar2d.snapshot import Snapshot
 from beamsplat.services.localization.lidar2d.surfel_map import FrozenMap
 
@@ -32,6 +28,7 @@ class JobResult:
     """Result of a background job, to be passed to `LidarSlam.apply`."""
 
     number: int
+    newest_node: int  # of the snapshot
     # All constraints up to the snapshot, or None if they have not changed.
     constraints: list[Constraint] | None
     snapshot_constraints: int  # number of constraints in the snapshot
@@ -39,10 +36,9 @@ class JobResult:
     pose_map_node: dict[int, np.ndarray]
     frozen: dict[int, FrozenMap]  # rebuilt submaps
     still_pending: list[int]  # nodes whose loop closure search must be repeated
-    searched: list[int]  # submaps that were searched globally
     loops_found: int
     linked: bool  # the newest segment is connected to the map
-    candidate: tuple[int, np.ndarray] | None  # node id and pose_map_node of an unconfirmed relocalization
+    hypotheses: list[LoopHypothesis]  # loop closures that nothing has confirmed yet
 
 
 @dataclass(frozen=True)
@@ -55,7 +51,7 @@ class BackgroundJob:
 
 
 def run_job(snapshot: Snapshot, refine_rounds: int = 0) -> JobResult:
-    """Search loop closures (or the pose of a new segment in the map), then optimise the pose graph.
+    """Search loop closures and links between segments, then optimise the pose graph if there are new ones.
 
     `refine_rounds` times, the submaps are rebuilt from the optimised poses, all constraints are measured
     again, and the pose graph is optimised again.
@@ -63,21 +59,27 @@ def run_job(snapshot: Snapshot, refine_rounds: int = 0) -> JobResult:
     submap_row = {s: i for i, s in enumerate(snapshot.submap_ids)}
     node_row = {n: i for i, n in enumerate(snapshot.node_ids)}
     constraints, frozen = list(snapshot.constraints), dict(snapshot.frozen)
-    searched: list[int] = []
     edges = constraint_arrays(constraints, submap_row, node_row)
-    submap_poses, node_poses, link, candidate = snapshot.pose_map_submap, snapshot.pose_map_node, None, None
-    if snapshot.unlinked_from is None:
-        found, searched, still_pending = _find_constraints(snapshot, edges, submap_row, node_row)
-    else:
-        link, submap_poses, node_poses, candidate = link_segment(snapshot)
-        found, searched, still_pending = [] if link is None else [link], [], list(snapshot.pending)
-    constraints += found
+    drift = DriftModel(edges, snapshot.pose_map_submap, len(snapshot.node_ids), snapshot.settings)
     fixed = [submap_row[i] for i in sorted(snapshot.fixed) if i in submap_row] or [0]
-    if found:
-        edges = constraint_arrays(constraints, submap_row, node_row)
+    closed, still_pending = _close_loops(snapshot, edges, drift, node_row)
+    revisits, hypotheses = find_revisits(snapshot, edges, drift, submap_row, node_row)
+    found = closed + revisits
+    if not found and not refine_rounds:  # a chain without loops is its own solution
+        return _unchanged(snapshot, still_pending, hypotheses, _is_linked(drift, edges, fixed))
+    submap_poses, node_poses = snapshot.pose_map_submap.copy(), snapshot.pose_map_node.copy()
+    node_component = drift.components[edges.submap[np.searchsorted(edges.node, np.arange(len(node_row)))]]
+    join_components(
+        found, drift.components, int(drift.components[fixed[0]]), submap_row, node_row, node_component,
+        submap_poses, node_poses,
+    )  # fmt: skip
+    constraints += found
+    edges = constraint_arrays(constraints, submap_row, node_row)
+    joined = DriftModel(edges, submap_poses, len(snapshot.node_ids), snapshot.settings)
+    held = first_of_components(joined.components, fixed)
     # During mapping the next job continues from this solution; the final one must converge by itself.
     iterations = LAST_ITERATIONS if refine_rounds else ITERATIONS
-    solution = optimise(submap_poses, node_poses, edges, fixed, iterations=iterations)
+    solution = optimise(submap_poses, node_poses, edges, held, iterations=iterations)
     rebuilt: dict[int, FrozenMap] = {}
     for _ in range(refine_rounds):
         rebuilt, constraints = refine_submaps(
@@ -92,22 +94,37 @@ def run_job(snapshot: Snapshot, refine_rounds: int = 0) -> JobResult:
         frozen.update(rebuilt)
         edges = constraint_arrays(constraints, submap_row, node_row)
         solution = optimise(
-            solution.pose_map_submap, solution.pose_map_node, edges, fixed, iterations=LAST_ITERATIONS
+            solution.pose_map_submap, solution.pose_map_node, edges, held, iterations=LAST_ITERATIONS
         )
     constraints = _without_outliers(constraints, solution.chi2, node_row)
     return JobResult(
         snapshot.number,
+        snapshot.node_ids[-1],
         constraints,
         len(snapshot.constraints),
         dict(zip(snapshot.submap_ids, solution.pose_map_submap)),
         dict(zip(snapshot.node_ids, solution.pose_map_node)),
         rebuilt,
         still_pending,
-        searched,
         len(found),
-        snapshot.unlinked_from is None or link is not None,
-        candidate,
+        _is_linked(joined, edges, fixed),
+        hypotheses,
     )
+
+
+def _unchanged(
+    snapshot: Snapshot, still_pending: list[int], hypotheses: list[LoopHypothesis], linked: bool
+) -> JobResult:
+    """Return the result of a job that has found nothing: no pose and no constraint has changed."""
+    return JobResult(
+        snapshot.number, snapshot.node_ids[-1], None, len(snapshot.constraints), {}, {}, {}, still_pending,
+        0, linked, hypotheses,
+    )  # fmt: skip
+
+
+def _is_linked(drift: DriftModel, edges: ConstraintArrays, fixed: list[int]) -> bool:
+    """Return whether constraints connect the newest node with the main part of the map."""
+    return bool(drift.components[edges.submap[-1]] == drift.components[fixed[0]])
 
 
 def _without_outliers(
@@ -120,23 +137,24 @@ def _without_outliers(
     return [c for c, k in zip(constraints, keep) if k or not c.loop]
 
 
-def _find_constraints(
-    snapshot: Snapshot, edges: ConstraintArrays, submap_row: dict[int, int], node_row: dict[int, int]
-) -> tuple[list[Constraint], list[int], list[int]]:
-    """Return new loop closures, the submaps that were searched globally, and the node ids still pending."""
+def _close_loops(
+    snapshot: Snapshot, edges: ConstraintArrays, drift: DriftModel, node_row: dict[int, int]
+) -> tuple[list[Constraint], list[int]]:
+    """Match pending nodes to near submaps of other passes; return loop closures and nodes still pending."""
     s = snapshot.settings
     if not snapshot.frozen or not snapshot.pending:
-        return [], [], list(snapshot.pending)
-    drift = DriftModel(edges, len(snapshot.submap_ids), len(snapshot.node_ids), s)
-    windows: dict[int, tuple[np.ndarray, np.ndarray]] = {}
-    selected = snapshot.pending[-3 * s.job_nodes :]
-    still_pending = snapshot.pending[: -3 * s.job_nodes]
+        return [], list(snapshot.pending)
+    # The newest nodes, and in turn some of those that were too uncertain before.
+    older, newest = snapshot.pending[: -3 * s.job_nodes], snapshot.pending[-3 * s.job_nodes :]
+    turn = snapshot.number * len(newest) % max(len(older), 1)
+    selected = older[turn : turn + len(newest)] + newest
+    still_pending = older[:turn] + older[turn + len(newest) :]
     tasks = []
     for node_id in selected:
-        own = sorted(set(_submaps_of(edges, node_row[node_id]).tolist()))
-        if own[0] not in windows:
-            windows[own[0]] = drift.windows(own[0])
-        candidates, uncertain = _loop_candidates(snapshot, edges, node_row[node_id], own, windows[own[0]])
+        own = sorted(set(submaps_of(edges, node_row[node_id]).tolist()))
+        candidates, uncertain = _loop_candidates(
+            snapshot, edges, node_row[node_id], own, drift.windows(own[0])
+        )
         tasks += [(candidate.submap, node_id, candidate) for candidate in candidates]
         if uncertain and not candidates:
             still_pending.append(node_id)
@@ -145,27 +163,7 @@ def _find_constraints(
         match_locally(snapshot.nodes[node_id], candidate, snapshot.cache, s)
         for _, node_id, candidate in sorted(tasks, key=lambda task: task[:2])
     ]
-    found = [c for c in closed if c is not None]
-    newest = selected[-s.job_nodes :]
-    global_found, searched = _find_global_constraints(
-        snapshot, edges, node_row, newest[len(newest) // 2], windows, drift
-    )
-    return found + global_found, searched, sorted(still_pending)[-2000:]
-
-
-def _submaps_of(edges: ConstraintArrays, row: int) -> np.ndarray:
-    """Return the row numbers of the submaps that contain the node with row number `row`."""
-    lo, hi = np.searchsorted(edges.node, [row, row + 1])
-    return edges.submap[lo:hi][~edges.robust[lo:hi]]
-
-
-def _nearest_member(snapshot: Snapshot, edges: ConstraintArrays, row: int) -> np.ndarray:
-    """Return the distance (m) from the node in `row` to the nearest node of each submap, float64 [S]."""
-    away = np.hypot(*(snapshot.pose_map_node[:, :2] - snapshot.pose_map_node[row, :2]).T)
-    distance = np.full(len(snapshot.submap_ids), np.inf)
-    inner = ~edges.robust
-    np.minimum.at(distance, edges.submap[inner], away[edges.node[inner]])
-    return distance
+    return [c for c in closed if c is not None], sorted(still_pending)[-2000:]
 
 
 def _loop_candidates(
@@ -180,7 +178,7 @@ def _loop_candidates(
     The second value is True if a near submap was omitted because its relative pose is too uncertain.
     """
     s = snapshot.settings
-    distance = _nearest_member(snapshot, edges, row)
+    distance = nearest_member(snapshot, edges, row)
     distance[[k for o in own for k in range(o - 2, o + 3) if 0 <= k < len(distance)]] = np.inf
     candidates: list[LoopCandidate] = []
     taken: list[int] = []
@@ -202,51 +200,3 @@ def _loop_candidates(
             )
         )
     return candidates, uncertain
-
-
-def _find_global_constraints(
-    snapshot: Snapshot,
-    edges: ConstraintArrays,
-    node_row: dict[int, int],
-    centre: int,
-    windows: dict[int, tuple[np.ndarray, np.ndarray]],
-    drift: DriftModel,
-) -> tuple[list[Constraint], list[int]]:
-    """Match the node `centre` globally to submaps of uncertain pose; return constraints and submap ids."""
-    s = snapshot.settings
-    row = node_row[centre]
-    own = sorted(set(_submaps_of(edges, row).tolist()))
-    window_m, window_rad = windows.setdefault(own[0], drift.windows(own[0]))
-    distance = _nearest_member(snapshot, edges, row)
-    distance[own] = np.inf
-    half = s.merged_scans // 2
-    neighbours = [snapshot.nodes[n] for n in snapshot.node_ids[max(0, row - half) : row + half + 1]]
-    candidates = []
-    for k in np.flatnonzero(np.isfinite(distance)).tolist():
-        submap_id = snapshot.submap_ids[k]
-        local = window_m[k] <= s.local_window_m and window_rad[k] <= s.local_window_rad
-        if submap_id in snapshot.frozen and not local and distance[k] < s.loop_distance_m + window_m[k]:
-            candidates.append((snapshot.search_counts.get(submap_id, 0), float(distance[k]), k))
-    found, searched = [], []
-    for _, _, k in sorted(candidates)[: s.global_searches_per_job]:
-        submap_id = snapshot.submap_ids[k]
-        pose = se2.between(snapshot.pose_map_submap[k], snapshot.pose_map_node[row])
-        limit_m = s.max_global_window_m
-        window = min(float(window_m[k]), limit_m) if math.isfinite(window_m[k]) else limit_m
-        turn = min(float(window_rad[k]), math.pi) if math.isfinite(window_rad[k]) else math.pi
-        candidate = LoopCandidate(submap_id, snapshot.frozen[submap_id], pose, window, turn)
-        constraint = match_globally(snapshot.nodes[centre], neighbours, candidate, snapshot.cache, s)
-        searched.append(submap_id)
-        if constraint is not None and verify_constraint(
-            constraint,
-            snapshot.node_ids,
-            snapshot.nodes,
-            snapshot.members,
-            snapshot.frozen,
-            dict(zip(snapshot.submap_ids, snapshot.pose_map_submap)),
-            dict(zip(snapshot.node_ids, snapshot.pose_map_node)),
-            snapshot.cache,
-            s,
-        ):
-            found.append(constraint)
-    return found, searched

@@ -8,13 +8,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from beamsplat.services.localization.lidar2d import se2
-from beamsplat.services.localization.lidar2d.pose_graph_data import Submap
-from beamsplat.services.localization.lidar2d.relocalization import relocalize_in
+from beamsplat.services.localization.lidar2d.pose_graph import PoseGraph
+from beamsplat.services.localization.lidar2d.pose_graph_data import Constraint, Submap
 from beamsplat.services.localization.lidar2d.slam import LidarSlam
 from beamsplat.services.localization.lidar2d.trajectory_record import TrajectoryRecord
 
 QUERY_SCANS = 24  # number of scans of map b that are relocalized in map a
 MIN_AGREEING_SCANS = 3
+ALIGNED_SIGMA_M, ALIGNED_SIGMA_RAD = 0.15, math.radians(1.5)  # of the alignment, before loop closure
 SAME_POSE_M, SAME_POSE_RAD = 0.4, math.radians(4.0)  # tolerance for equal poses
 
 
@@ -29,11 +30,11 @@ class MapAlignment:
 
 def find_alignment(a: LidarSlam, b: LidarSlam) -> MapAlignment | None:
     """Find the pose of map b in map a by relocalization of scans; None if ambiguous or not confirmed."""
-    global_map, nodes = a.global_map(), list(b.pose_graph.nodes.values())
+    nodes = list(b.pose_graph.nodes.values())
     chosen = [nodes[i] for i in np.unique(np.linspace(0, len(nodes) - 1, QUERY_SCANS).round().astype(int))]
     poses_a_b = []
     for node in chosen:
-        found = relocalize_in(global_map, node.scan.features.astype(np.float64), node.scan.origin, a.settings)
+        found = a.relocalize_features(node.scan.features.astype(np.float64), node.scan.origin)
         if found.confidence >= 0.5:
             poses_a_b.append(
                 se2.compose(found.pose_map_body, se2.inverse(b.pose_graph.pose_map_node[node.id]))
@@ -70,6 +71,7 @@ def merge_into(a: LidarSlam, b: LidarSlam, pose_a_b: np.ndarray, offset: int) ->
     graph.constraints += [
         replace(c, submap=offset + c.submap, node=first + c.node) for c in other.constraints
     ]
+    graph.constraints.append(_link(graph, first + min(other.nodes), set(range(offset))))
     a.record = _merged_records(a.record, b.record, pose_a_b, first)
     graph.pending = [first + id for id in other.nodes]
     graph.unlinked_from = None  # both maps are one connected map now
@@ -77,6 +79,20 @@ def merge_into(a: LidarSlam, b: LidarSlam, pose_a_b: np.ndarray, offset: int) ->
     before = graph.loop_closures
     a.finish()
     return graph.loop_closures - before
+
+
+def _link(graph: PoseGraph, node: int, submaps_a: set[int]) -> Constraint:
+    """Return a loose constraint between a node of map b and the nearest submap of map a.
+
+    It tells the loop closure search how well the alignment is known.
+    """
+    pose = graph.pose_map_node[node]
+    near = min(
+        (s for s in graph.submaps.values() if s.id in submaps_a),
+        key=lambda s: float(np.hypot(*(s.pose_map_submap - pose)[:2])),
+    )
+    information = np.diag([ALIGNED_SIGMA_M**-2, ALIGNED_SIGMA_M**-2, ALIGNED_SIGMA_RAD**-2])
+    return Constraint(near.id, node, se2.between(near.pose_map_submap, pose), information, True)
 
 
 def _merged_records(

@@ -6,6 +6,7 @@ import numpy as np
 
 from beamsplat.services.localization.lidar2d import se2
 from beamsplat.services.localization.lidar2d.jobs import JobResult
+from beamsplat.services.localization.lidar2d.loop_hypotheses import LoopHypothesis
 from beamsplat.services.localization.lidar2d.pose_graph_data import (
     Constraint,
     Submap,
@@ -29,12 +30,12 @@ class PoseGraph:
         self.pose_map_node: dict[int, np.ndarray] = {}
         self.pose_map_odom = np.zeros(3)
         self.pending: list[int] = []
-        self.search_counts: dict[int, int] = {}
         self.cache = TableCache(settings.reach_cells)
         self.loop_closures = 0
         self.optimisations = 0
         self.unlinked_from: int | None = None
-        self._candidate: tuple[int, np.ndarray] | None = None
+        self.hypotheses: list[LoopHypothesis] = []
+        self._restarted = False
         self.fixed: frozenset[int] = frozenset()
         # Trimmed nodes: the remaining node they are attached to, and the pose (x, y, yaw) relative to it.
         self.trimmed_nodes: dict[int, tuple[int, float, float, float]] = {}
@@ -59,11 +60,14 @@ class PoseGraph:
         """Skip `count` submap ids: a crashed process may have published ids that the loaded map lacks."""
         self._next_submap += count
 
-    def start_segment(self) -> None:
-        """Start a trajectory segment; it is connected to the map when relocalization finds its pose."""
-        if self.nodes and self.unlinked_from is None:
+    def start_segment(self, restarted: bool = False) -> None:
+        """Start a trajectory segment; it is connected to the map when its place in the map is recognised.
+
+        `restarted`: the map was loaded; otherwise tracking was lost.
+        """
+        if self.nodes:
             self.unlinked_from = self._next_node
-            self._candidate = None
+            self._restarted = restarted
 
     def add_node(self, node: TrajectoryNode, edges: list[Constraint]) -> None:
         """Add a node with its constraints (`edges`) to the submaps into which its scan was inserted."""
@@ -74,6 +78,23 @@ class PoseGraph:
         for edge in edges:
             self.submaps[edge.submap].members.append(node.id)
         self.pending.append(node.id)
+
+    def main_submaps(self) -> set[int]:
+        """Return the ids of the submaps that constraints connect with the first submap."""
+        row = {s: i for i, s in enumerate(self.submaps)}
+        label = list(range(len(row)))
+
+        def root(i: int) -> int:
+            while label[i] != i:
+                label[i] = label[label[i]]
+                i = label[i]
+            return i
+
+        first: dict[int, int] = {}  # node -> row of a submap
+        for c in self.constraints:
+            a, b = root(row[c.submap]), root(first.setdefault(c.node, row[c.submap]))
+            label[max(a, b)] = min(a, b)
+        return {s for s, i in row.items() if root(i) == 0}
 
     @property
     def next_node_id(self) -> int:
@@ -94,12 +115,12 @@ class PoseGraph:
             np.array(list(self.pose_map_node.values())).reshape(-1, 3),
             list(self.constraints),
             list(self.pending),
-            dict(self.search_counts),
             self.cache,
             self.optimisations,
             self.unlinked_from,
             self.fixed,
-            self._candidate,
+            self._restarted,
+            list(self.hypotheses),
         )
 
     def apply(self, result: JobResult) -> None:
@@ -107,13 +128,22 @@ class PoseGraph:
 
         Nodes and submaps that were added since the snapshot move with the last optimised node.
         """
-        if not result.pose_map_node:
-            return
+        newest = max(result.pose_map_node, default=result.newest_node)
+        newer = [n for n in self.pending if n > newest]
+        self.pending = result.still_pending + newer
+        self.hypotheses = result.hypotheses
+        if result.linked and self.unlinked_from is not None and newest >= self.unlinked_from:
+            self.unlinked_from = None
+        self.loop_closures += result.loops_found
+        if result.pose_map_node:
+            self._move(result, newest)
+            self.optimisations += 1
+
+    def _move(self, result: JobResult, newest: int) -> None:
         if result.constraints is not None:
             self.constraints = result.constraints + self.constraints[result.snapshot_constraints :]
-        last = max(result.pose_map_node)
         self.pose_map_odom = se2.compose(
-            result.pose_map_node[last], se2.inverse(self.nodes[last].pose_odom_body)
+            result.pose_map_node[newest], se2.inverse(self.nodes[newest].pose_odom_body)
         )
         for i, submap in self.submaps.items():
             moved = result.pose_map_submap.get(i)
@@ -127,15 +157,6 @@ class PoseGraph:
             )
         for i, frozen in result.frozen.items():
             self.submaps[i].frozen = frozen
-        newer = [n for n in self.pending if n > last]
-        self.pending = result.still_pending + newer
-        for i in result.searched:
-            self.search_counts[i] = self.search_counts.get(i, 0) + 1
-        if result.linked and self.unlinked_from is not None and last >= self.unlinked_from:
-            self.unlinked_from = None
-        self._candidate = result.candidate
-        self.loop_closures += result.loops_found
-        self.optimisations += 1
 
     def trim(self, active: set[int]) -> list[int]:
         """Remove redundant submaps (never the submaps `active`); return the ids of the removed submaps."""
@@ -153,7 +174,6 @@ class PoseGraph:
 
     def _remove(self, submap_id: int) -> None:
         members = set(self.submaps.pop(submap_id).members)
-        self.search_counts.pop(submap_id, None)
         self.constraints = [c for c in self.constraints if c.submap != submap_id]
         inner = {m for s in self.submaps.values() for m in s.members if m in members}
         orphans = sorted(members - inner)

@@ -6,19 +6,20 @@ import threading
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, TypeVar, cast
+from typing import TypeVar
 
 import numpy as np
 
 from beamsplat.common.compiled import kernel
 from beamsplat.services.localization.lidar2d import se2
-from beamsplat.services.localization.lidar2d.branch_bound import SearchPyramid, build_pyramid
+from beamsplat.services.localization.lidar2d.branch_bound import SearchPyramid, search_pyramid
 from beamsplat.services.localization.lidar2d.graph_kernels import invert3
 from beamsplat.services.localization.lidar2d.graph_optimisation import ConstraintArrays
 from beamsplat.services.localization.lidar2d.scan import PreparedScan
 from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
 from beamsplat.services.localization.lidar2d.surfel_map import FrozenMap, MatchTables
 
+_K = TypeVar("_K")
 _T = TypeVar("_T")
 
 
@@ -77,59 +78,63 @@ class Constraint:
     pose_submap_node: np.ndarray  # float64 [3]
     information: np.ndarray  # float64 [3, 3]
     loop: bool
+    packed: np.ndarray = field(init=False, repr=False, compare=False)  # float64 [12], pose and information
+
+    def __post_init__(self) -> None:
+        # In one array, because joining many small arrays costs more than optimising the graph.
+        packed = np.concatenate([self.pose_submap_node, self.information.ravel()])
+        object.__setattr__(self, "packed", packed)
+        object.__setattr__(self, "pose_submap_node", packed[:3])
+        object.__setattr__(self, "information", packed[3:].reshape(3, 3))
 
 
 class TableCache:
     """Cache of the match tables and search pyramids of the most recently used finished submaps."""
 
-    def __init__(self, reach_cells: int, capacity: int = 12) -> None:
-        self._reach, self._capacity = reach_cells, capacity
+    def __init__(self, reach_cells: int, tables: int = 12, pyramids: int = 256) -> None:
+        self._reach, self._n_tables, self._n_pyramids = reach_cells, tables, pyramids
         # Each entry keeps the map that it was made from, to detect rebuilt submaps.
-        self._tables: OrderedDict[int, tuple[FrozenMap, MatchTables]] = OrderedDict()
+        self._tables: OrderedDict[tuple[int, bool], tuple[FrozenMap, MatchTables]] = OrderedDict()
         self._pyramids: OrderedDict[int, tuple[FrozenMap, SearchPyramid]] = OrderedDict()
-        self._global_map: tuple[object, Any] | None = None
         self._lock = threading.Lock()
 
-    def tables(self, submap: int, frozen: FrozenMap) -> MatchTables:
-        """Return the match tables of a submap, recomputed if `frozen` is another object than last time."""
-        return self._get(self._tables, submap, frozen, lambda: frozen.tables(self._reach))
+    def tables(self, submap: int, frozen: FrozenMap, for_search: bool = True) -> MatchTables:
+        """Return the match tables of a submap, recomputed if `frozen` is another object than last time.
+
+        Without `for_search`, the likelihood field may be empty.
+        """
+        key = (submap, for_search)
+        if not for_search and (submap, True) in self._tables:
+            key = (submap, True)
+        return self._get(
+            self._tables, self._n_tables, key, frozen, lambda: frozen.tables(self._reach, key[1])
+        )
 
     def pyramid(self, submap: int, frozen: FrozenMap) -> SearchPyramid:
         """Return the search pyramid of a submap, recomputed if `frozen` is another object than last time."""
-        return self._get(self._pyramids, submap, frozen, lambda: _pyramid_of(self.tables(submap, frozen)))
-
-    def global_map(self, key: object, make: Callable[[], _T]) -> _T:
-        """Return the global map with this key, made by `make()` if needed; only the latest map is cached."""
-        with self._lock:
-            if self._global_map is not None and self._global_map[0] == key:
-                return cast(_T, self._global_map[1])
-        value = make()
-        with self._lock:
-            self._global_map = (key, value)
-        return value
+        return self._get(
+            self._pyramids, self._n_pyramids, submap, frozen, lambda: search_pyramid(frozen.means)
+        )
 
     def _get(
         self,
-        store: OrderedDict[int, tuple[FrozenMap, _T]],
-        submap: int,
+        store: OrderedDict[_K, tuple[FrozenMap, _T]],
+        capacity: int,
+        key: _K,
         frozen: FrozenMap,
         make: Callable[[], _T],
     ) -> _T:
         with self._lock:
-            if submap in store and store[submap][0] is frozen:
-                store.move_to_end(submap)
-                return store[submap][1]
+            if key in store and store[key][0] is frozen:
+                store.move_to_end(key)
+                return store[key][1]
         value = make()
         with self._lock:
-            store[submap] = (frozen, value)
-            store.move_to_end(submap)
-            while len(store) > self._capacity:
+            store[key] = (frozen, value)
+            store.move_to_end(key)
+            while len(store) > capacity:
                 store.popitem(last=False)
         return value
-
-
-def _pyramid_of(tables: MatchTables) -> SearchPyramid:
-    return build_pyramid(tables.field, tables.row0, tables.col0, tables.cell_m)
 
 
 def constraint_arrays(
@@ -138,13 +143,15 @@ def constraint_arrays(
     """Convert constraints to arrays, ordered by node; the dicts map submap and node ids to row numbers."""
     node = np.array([node_row[c.node] for c in constraints], dtype=np.int32)
     order = np.argsort(node, kind="stable")
-    chosen = [constraints[i] for i in order]
+    submap = np.array([submap_row[c.submap] for c in constraints], dtype=np.int32)
+    packed = np.concatenate([c.packed for c in constraints]) if constraints else np.empty(0)
+    packed = packed.reshape(-1, 12)[order]
     return ConstraintArrays(
-        np.array([submap_row[c.submap] for c in chosen], dtype=np.int32),
+        submap[order],
         node[order],
-        np.array([c.pose_submap_node for c in chosen]).reshape(-1, 3),
-        np.array([c.information for c in chosen]).reshape(-1, 3, 3),
-        np.array([c.loop for c in chosen], dtype=bool),
+        np.ascontiguousarray(packed[:, :3]),
+        np.ascontiguousarray(packed[:, 3:]).reshape(-1, 3, 3),
+        np.array([c.loop for c in constraints], dtype=bool)[order],
     )
 
 

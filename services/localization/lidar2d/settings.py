@@ -61,10 +61,11 @@ class LidarSlamSettings:
     loop_distance_m: float = 3.0  # a submap is near if one of its nodes is within this distance
     local_window_m: float = 0.8  # largest window of the local loop search, done for every node
     local_window_rad: float = math.radians(12.0)  # largest rotation in the local loop search
-    global_searches_per_job: int = 4  # number of submaps per job that are searched in larger windows
-    max_global_window_m: float = 40.0  # largest window of a global search
-    merged_scans: int = 17  # number of scans merged for a global search
-    min_global_score: float = 0.30  # minimum mean likelihood of a global match
+    place_nodes: int = 40  # scans of a chunk that is searched in the whole map
+    place_points: int = 400  # returns of a chunk
+    max_place_targets: int = 100  # submaps that are searched for one chunk
+    min_place_score: float = 0.5  # minimum mean likelihood of a chunk in the coarse search
+    place_min_inlier_ratio: float = 0.75  # minimum of a chunk in a submap
     loop_min_inlier_ratio: float = 0.60  # a loop closure with less is rejected
     loop_min_overlap: float = 0.40  # a loop closure with less of its scan in mapped area is rejected
 
@@ -73,6 +74,4 @@ class LidarSlamSettings:
     trim_every_jobs: int = 5  # jobs between two searches for submaps to trim
     lost_scans: int = 5  # scans in a row without a match, after which a new segment starts
     link_every_scans: int = 10  # interval between relocalization attempts of a segment
-    link_min_confidence: float = 0.5  # minimum of a relocalization that links two segments
-    link_max_runner_up_ratio: float = 0.7  # above it, two relocalizations must agree
-    link_min_distance_m: float = 1.0  # minimum distance between two relocalizations that must agree
+    link_max_runner_up_ratio: float = 0.7  # a match without a rival above it links segments alone

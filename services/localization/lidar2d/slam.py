@@ -18,12 +18,7 @@ from beamsplat.services.localization.lidar2d.local_trajectory_builder import (
 from beamsplat.services.localization.lidar2d.motion_covariance import UNKNOWN, motion_covariance
 from beamsplat.services.localization.lidar2d.occupancy import OccupancyGrid, render_occupancy
 from beamsplat.services.localization.lidar2d.pose_graph import PoseGraph
-from beamsplat.services.localization.lidar2d.relocalization import (
-    GlobalMap,
-    Relocalization,
-    build_global_map,
-    relocalize_in,
-)
+from beamsplat.services.localization.lidar2d.relocalization import Relocalization, relocalize_in
 from beamsplat.services.localization.lidar2d.scan import PreparedScan
 from beamsplat.services.localization.lidar2d.scan_matching import Match
 from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
@@ -229,7 +224,7 @@ class LidarSlam:
         searching = self.pose_graph.unlinked_from is not None and self.scans >= self._next_link_scan
         if self._pending_job is not None or not self.pose_graph.nodes:
             return None
-        if not searching and self.active_submaps.nodes_since_job < s.job_nodes:
+        if self.active_submaps.nodes_since_job < (1 if searching else s.job_nodes):
             return None
         self.active_submaps.nodes_since_job = 0
         self._next_link_scan = self.scans + s.link_every_scans
@@ -255,11 +250,7 @@ class LidarSlam:
             return
         self.active_submaps.freeze_active()
         before = -1
-        while (
-            self.pose_graph.pending
-            and len(self.pose_graph.pending) != before
-            and self.pose_graph.unlinked_from is None
-        ):
+        while self.pose_graph.pending and len(self.pose_graph.pending) != before:
             before = len(self.pose_graph.pending)
             self.pose_graph.apply(run_job(self.pose_graph.snapshot()))
         self.pose_graph.apply(
@@ -312,18 +303,11 @@ class LidarSlam:
         if reason:
             raise ValueError(reason)
         scan = self.local_builder.prepare(raw, np.zeros(3))
-        return relocalize_in(self.global_map(), scan.features(), scan.origin_body, self.settings)
+        return self.relocalize_features(scan.features(), scan.origin_body)
 
-    def global_map(self) -> GlobalMap:
-        """Return the map for relocalization; it is built once per map version, in about a second."""
-        graph = self.pose_graph
-        known = [n for n in graph.nodes if graph.unlinked_from is None or n < graph.unlinked_from]
-
-        def build() -> GlobalMap:
-            nodes, pose_map_node = [graph.nodes[n] for n in known], [graph.pose_map_node[n] for n in known]
-            return build_global_map(self.settings, nodes, pose_map_node)
-
-        return graph.cache.global_map((graph.optimisations, len(known)), build)
+    def relocalize_features(self, features: np.ndarray, origin: np.ndarray) -> Relocalization:
+        """Return the pose of a scan (features float64 [K, 5], lidar at `origin` [2]) in the map."""
+        return relocalize_in(self.pose_graph, features, origin)
 
     def save(self, folder: Path) -> None:
         """Write the map and the trajectory to `folder`; mapping may continue afterwards."""
@@ -345,7 +329,7 @@ class LidarSlam:
         slam.pose_graph, extra = load_state(folder, settings)
         slam.active_submaps = ActiveSubmaps(settings, slam.pose_graph)
         slam.record = TrajectoryRecord() if localize_only else TrajectoryRecord.of(extra)
-        slam.pose_graph.start_segment()
+        slam.pose_graph.start_segment(restarted=True)
         if localize_only:
             slam.pose_graph.fixed = frozenset(slam.pose_graph.submaps)
         return slam

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from beamsplat.services.localization.lidar2d.loop_hypotheses import LoopHypothesis
 from beamsplat.services.localization.lidar2d.pose_graph_data import Constraint, TableCache, TrajectoryNode
 from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
 from beamsplat.services.localization.lidar2d.surfel_map import FrozenMap
@@ -26,9 +27,9 @@ class Snapshot:
     pose_map_node: np.ndarray  # float64 [N, 3]
     constraints: list[Constraint]
     pending: list[int]
-    search_counts: dict[int, int]
     cache: TableCache
     version: int  # counter of the map's optimisations
     unlinked_from: int | None  # first node of a segment that is not connected to the map
     fixed: frozenset[int]  # submaps that are held constant
-    candidate: tuple[int, np.ndarray] | None  # node id and pose_map_node of an unconfirmed relocalization
+    restarted: bool  # this segment began with the loading of the map, not with a loss of tracking
+    hypotheses: list[LoopHypothesis]  # loop closures that nothing has confirmed yet
