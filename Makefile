@@ -47,9 +47,11 @@ soak: setup
 bench: setup
 	$(BIN)/beamsplat bench bus
 
-# The deck of figures in the README: DATA holds X.bag beside X.relations, or bag/ beside groundtruth.txt.
+# The table in the README: DATA holds X.bag beside X.relations, or bag/ beside groundtruth.txt. Then large
+# simulated floors: out/sites/table.md.
 bench-slam: setup
 	$(BIN)/beamsplat bench slam --data $(DATA) --out out/slam --readme README.md --pictures docs/slam_maps.jpg
+	$(BIN)/beamsplat bench sites --out out/sites
 
 # The package as one folder of links: tools that read sources cannot follow an editable install.
 TYPED := build/typed

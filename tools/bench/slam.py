@@ -68,17 +68,32 @@ def bench_slam(folder: Path, out: Path, odometry: bool, log: Callable[[str], Non
         if truth[0] == "--groundtruth" and (why := _not_planar(Path(truth[1]))):
             log(f"{name}: left out, {why}")
             continue
-        log(f"{name} ...")
-        command = ["slam", str(bag), "--out", str(out / name), "--json"]
-        mapped = _beamsplat([*command, *([] if odometry else ["--no-odometry"])])
-        if mapped.returncode:
-            log(f"{name}: left out, {mapped.stderr.strip().splitlines()[-1]}")
-            continue
-        scored = _beamsplat(["eval", "slam", str(out / name), *truth, "--json"])
-        if scored.returncode:
-            raise UserError(f"{name}: {scored.stderr.strip()}")
-        rows.append({"name": name, **json.loads(mapped.stdout), **json.loads(scored.stdout)})
+        row = measure_recording(name, bag, truth, out / name, odometry, log)
+        if row is not None:
+            rows.append(row)
     return rows
+
+
+def measure_recording(
+    name: str, bag: Path, truth: list[str], out: Path, odometry: bool, log: Callable[[str], None]
+) -> dict[str, Any] | None:
+    """Map one recording into the folder `out`; return its accuracy and cost, None if it cannot be mapped.
+
+    `truth` are the arguments that pass its ground truth to `eval slam`.
+
+    Raises:
+        UserError: the ground truth cannot be used.
+    """
+    log(f"{name} ...")
+    command = ["slam", str(bag), "--out", str(out), "--json", *([] if odometry else ["--no-odometry"])]
+    mapped = run_beamsplat(command)
+    if mapped.returncode:
+        log(f"{name}: left out, {mapped.stderr.strip().splitlines()[-1]}")
+        return None
+    scored = run_beamsplat(["eval", "slam", str(out), *truth, "--json"])
+    if scored.returncode:
+        raise UserError(f"{name}: {scored.stderr.strip()}")
+    return {"name": name, **json.loads(mapped.stdout), **json.loads(scored.stdout)}
 
 
 def _not_planar(groundtruth: Path) -> str:
@@ -91,7 +106,8 @@ def _not_planar(groundtruth: Path) -> str:
     return f"its body rises by {rise_m:.2f} m and tilts by {tilt_deg:.0f} degrees"
 
 
-def _beamsplat(arguments: list[str]) -> subprocess.CompletedProcess[str]:
+def run_beamsplat(arguments: list[str]) -> subprocess.CompletedProcess[str]:
+    """Run a `beamsplat` command in a new process and return its output as text."""
     command = [sys.executable, "-m", "beamsplat", *arguments]
     return subprocess.run(command, capture_output=True, text=True, check=False)
 

@@ -1,4 +1,4 @@
-"""Commands `beamsplat bench`: bus, slam, uncertainties, paper, sensitivity; each with its reference."""
+"""Commands `beamsplat bench`: bus, slam, sites, uncertainties, paper, sensitivity."""
 
 from __future__ import annotations
 
@@ -76,6 +76,35 @@ def slam(
     if readme is not None:
         replace_readme_table(readme, "slam", table)
     write_map_overview(out, [row["name"] for row in rows], pictures or out / "maps.jpg")
+
+
+@app.command()
+def sites(
+    out: Annotated[
+        Path, typer.Option(callback=writable, help="Folder for recordings and maps; recordings are reused")
+    ],
+    only: Annotated[list[str] | None, typer.Option(help="Only this floor; repeatable")] = None,
+    size: Annotated[str, typer.Option(help="Size of each floor in metres")] = "120x80",
+    distance_m: Annotated[float, typer.Option(min=20.0, help="Driven distance on each floor")] = 3000.0,
+    as_json: JsonOption = False,
+) -> None:
+    """Measure the lidar SLAM on large simulated office floors: errors, wrong loop closures, revisits, cost.
+
+    The floors: office, office_lost (three stretches of 30 s without measurements, into unknown space),
+    aliased (identical rooms along identical corridors), aliased_lost. The table is also written to table.md.
+
+    Examples:
+
+        beamsplat bench sites --out out/sites
+
+        beamsplat bench sites --out out/sites --only aliased --distance-m 1000 --json
+    """
+    from beamsplat.tools.bench.sites import bench_sites, markdown
+
+    rows = bench_sites(out, only, size, distance_m, lambda text: console.print(text, highlight=False))
+    table = markdown(rows)
+    (out / "table.md").write_text(table + "\n")
+    print(json.dumps(rows) if as_json else table)
 
 
 @app.command()
