@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TypeVar
 
 import numpy as np
 
 from beamsplat.services.localization.lidar2d import se2
 from beamsplat.services.localization.lidar2d.dynamic_objects import contradicts_free_space, grow_along_beams
 from beamsplat.services.localization.lidar2d.local_trajectory_builder import LocalMap
+from beamsplat.services.localization.lidar2d.node_scan import NodeScan
 from beamsplat.services.localization.lidar2d.occupancy import CountGrid
 from beamsplat.services.localization.lidar2d.pose_graph import PoseGraph
 from beamsplat.services.localization.lidar2d.pose_graph_data import (
     Constraint,
-    NodeScan,
     Submap,
     TrajectoryNode,
     edge_information,
@@ -28,7 +26,6 @@ from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
 from beamsplat.services.localization.lidar2d.surfel_map import SurfelMap, freeze
 
 NS = 1e-9
-Result = TypeVar("Result")
 
 
 @dataclass
@@ -170,17 +167,6 @@ class ActiveSubmaps:
         """Freeze the current state of the active submaps for loop closure; they continue to grow."""
         for active in self._active:
             active.submap.frozen = freeze(active.local.surfels)
-
-    def with_frozen(self, work: Callable[[], Result]) -> Result:
-        """Freeze the active submaps, call `work()` (for example saving), unfreeze them; return its result."""
-        growing = [active for active in self._active if active.submap.frozen is None]
-        for active in growing:
-            active.submap.frozen = freeze(active.local.surfels)
-        try:
-            return work()
-        finally:
-            for active in growing:
-                active.submap.frozen = None
 
     def count_grids(self) -> list[tuple[CountGrid, np.ndarray]]:
         """Return copies of the hits and misses of the active submaps that are not frozen, and their poses."""

@@ -31,9 +31,10 @@ from beamsplat.common.runtime.node import Input, Job, Node, Outputs
 from beamsplat.common.status import TrackingStatus
 from beamsplat.services.localization.lidar2d.grid_tiles import GridTiles, Place
 from beamsplat.services.localization.lidar2d.jobs import JobResult
+from beamsplat.services.localization.lidar2d.map_saver import MapSaver
 from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
 from beamsplat.services.localization.lidar2d.slam import LidarSlam, ScanResult
-from beamsplat.services.localization.lidar2d.state import MANIFEST, read_manifest, write_state
+from beamsplat.services.localization.lidar2d.state import MANIFEST, read_manifest
 
 log = logging.getLogger("beamsplat.localization")
 
@@ -93,6 +94,7 @@ class LidarLocalization(Node):
         self._checkpoint_running = False
         live = self.live_settings
         self._checkpoint_dir = None if live is None else live.run_dir / "localization"
+        self._saver: MapSaver | None = None
         if self._checkpoint_dir is not None and live is not None and not live.resume:  # of an earlier run
             shutil.rmtree(self._checkpoint_dir, ignore_errors=True)
         if self.config.resume is not None:
@@ -181,13 +183,15 @@ class LidarLocalization(Node):
             or abs(stamp_ns - self._checkpoint_ns) >= self.config.keep_every_s * 1e9
         ):
             self._checkpoint_ns, self._checkpoint_running = stamp_ns, True
-            folder, state = self._checkpoint_dir, slam.pack()
+            if self._saver is None:
+                self._saver = MapSaver(self._checkpoint_dir, slam.settings)
+            saver, saved = self._saver, slam.saved()
 
             def write() -> str:
                 try:
-                    write_state(folder, state)
+                    saver.save(saved)
                 except OSError as error:
-                    return f"{folder}: {reason(error)}"
+                    return f"{saver.folder}: {reason(error)}"
                 return ""
 
             yield Job("checkpoint", write)

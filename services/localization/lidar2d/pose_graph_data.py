@@ -6,7 +6,7 @@ import threading
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from beamsplat.services.localization.lidar2d import se2
 from beamsplat.services.localization.lidar2d.branch_bound import SearchPyramid, search_pyramid
 from beamsplat.services.localization.lidar2d.graph_kernels import invert3
 from beamsplat.services.localization.lidar2d.graph_optimisation import ConstraintArrays
-from beamsplat.services.localization.lidar2d.scan import PreparedScan
+from beamsplat.services.localization.lidar2d.node_scan import NodeScan
 from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
 from beamsplat.services.localization.lidar2d.surfel_map import FrozenMap, MatchTables
 
@@ -23,32 +23,7 @@ _K = TypeVar("_K")
 _T = TypeVar("_T")
 
 
-@dataclass(frozen=True)
-class NodeScan:
-    """Range data of one node in the body frame, in compact types."""
-
-    points: np.ndarray  # float32 [M, 2]
-    tangents: np.ndarray  # float32 [M, 2]
-    spacing_m: np.ndarray  # float32 [M]
-    dynamic: np.ndarray  # bool [M], returns on dynamic objects
-    features: np.ndarray  # float32 [K, 5] of static returns, see PreparedScan.features
-    origin: np.ndarray  # float64 [2], the lidar in the body frame
-
-    @staticmethod
-    def of(scan: PreparedScan, dynamic: np.ndarray) -> NodeScan:
-        """Create the scan of a node from a prepared scan and the mask bool [M] of dynamic returns."""
-        static = ~dynamic[scan.match_index]
-        return NodeScan(
-            scan.points_body.astype(np.float32),
-            scan.tangents.astype(np.float32),
-            scan.spacing_m.astype(np.float32),
-            dynamic,
-            scan.features()[static].astype(np.float32),
-            scan.origin_body,
-        )
-
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class TrajectoryNode:
     """A scan that was inserted into the submaps, with its pose in the odom frame."""
 
@@ -69,7 +44,7 @@ class Submap:
     frozen: FrozenMap | None = None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Constraint:
     """A measured pose of a node in a submap."""
 
@@ -89,14 +64,23 @@ class Constraint:
 
 
 class TableCache:
-    """Cache of the match tables and search pyramids of the most recently used finished submaps."""
+    """Cache of the match tables and search pyramids of the most recently used finished submaps.
 
-    def __init__(self, reach_cells: int, tables: int = 12, pyramids: int = 256) -> None:
-        self._reach, self._n_tables, self._n_pyramids = reach_cells, tables, pyramids
+    Bounded by bytes, because a submap can cover a small room or a hall of 60 m x 60 m.
+    """
+
+    def __init__(self, reach_cells: int, limit_bytes: int = 64_000_000) -> None:
+        self._reach, self._limit_bytes = reach_cells, limit_bytes
         # Each entry keeps the map that it was made from, to detect rebuilt submaps.
         self._tables: OrderedDict[tuple[int, bool], tuple[FrozenMap, MatchTables]] = OrderedDict()
         self._pyramids: OrderedDict[int, tuple[FrozenMap, SearchPyramid]] = OrderedDict()
         self._lock = threading.Lock()
+
+    @property
+    def bytes(self) -> int:
+        """Return the size of the cached tables and pyramids."""
+        with self._lock:
+            return _bytes_in(self._tables) + _bytes_in(self._pyramids)
 
     def tables(self, submap: int, frozen: FrozenMap, for_search: bool = True) -> MatchTables:
         """Return the match tables of a submap, recomputed if `frozen` is another object than last time.
@@ -106,20 +90,15 @@ class TableCache:
         key = (submap, for_search)
         if not for_search and (submap, True) in self._tables:
             key = (submap, True)
-        return self._get(
-            self._tables, self._n_tables, key, frozen, lambda: frozen.tables(self._reach, key[1])
-        )
+        return self._get(self._tables, key, frozen, lambda: frozen.tables(self._reach, key[1]))
 
     def pyramid(self, submap: int, frozen: FrozenMap) -> SearchPyramid:
         """Return the search pyramid of a submap, recomputed if `frozen` is another object than last time."""
-        return self._get(
-            self._pyramids, self._n_pyramids, submap, frozen, lambda: search_pyramid(frozen.means)
-        )
+        return self._get(self._pyramids, submap, frozen, lambda: search_pyramid(frozen.means))
 
     def _get(
         self,
         store: OrderedDict[_K, tuple[FrozenMap, _T]],
-        capacity: int,
         key: _K,
         frozen: FrozenMap,
         make: Callable[[], _T],
@@ -132,9 +111,18 @@ class TableCache:
         with self._lock:
             store[key] = (frozen, value)
             store.move_to_end(key)
-            while len(store) > capacity:
+            while len(store) > 1 and _bytes_in(store) > self._limit_bytes // 2:
                 store.popitem(last=False)
         return value
+
+
+def _bytes_in(store: OrderedDict[Any, tuple[FrozenMap, Any]]) -> int:
+    return sum(
+        array.nbytes
+        for _, value in store.values()
+        for array in vars(value).values()
+        if isinstance(array, np.ndarray)
+    )
 
 
 def constraint_arrays(

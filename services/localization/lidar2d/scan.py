@@ -24,11 +24,15 @@ class PreparedScan:
     def features(self) -> np.ndarray:
         """Return the input of scan matching, float64 [K, 5]: x, y, tangent x, tangent y, half spacing (m)."""
         i = self.match_index
-        half = np.minimum(0.5 * self.spacing_m[i], 0.10)
-        return np.column_stack([self.points_body[i], self.tangents[i], half])
+        return np.column_stack([self.points_body[i], self.tangents[i], half_spacing_m(self.spacing_m[i])])
 
     def __len__(self) -> int:
         return len(self.points_body)
+
+
+def half_spacing_m(spacing_m: np.ndarray) -> np.ndarray:
+    """Return half the distance to the neighbouring returns as it is used for matching: at most 10 cm."""
+    return np.minimum(0.5 * spacing_m, 0.10)
 
 
 @kernel

@@ -15,6 +15,8 @@ from beamsplat.services.localization.lidar2d.local_trajectory_builder import (
     LocalTrajectoryBuilder,
     RawScan,
 )
+from beamsplat.services.localization.lidar2d.map_records import SavedMap
+from beamsplat.services.localization.lidar2d.map_saver import MapSaver
 from beamsplat.services.localization.lidar2d.motion_covariance import UNKNOWN, motion_covariance
 from beamsplat.services.localization.lidar2d.occupancy import OccupancyGrid, render_occupancy
 from beamsplat.services.localization.lidar2d.pose_graph import PoseGraph
@@ -22,13 +24,7 @@ from beamsplat.services.localization.lidar2d.relocalization import Relocalizatio
 from beamsplat.services.localization.lidar2d.scan import PreparedScan
 from beamsplat.services.localization.lidar2d.scan_matching import Match
 from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
-from beamsplat.services.localization.lidar2d.state import (
-    PackedMap,
-    load_state,
-    map_uuid,
-    pack_state,
-    write_state,
-)
+from beamsplat.services.localization.lidar2d.state import load_state, map_uuid
 from beamsplat.services.localization.lidar2d.trajectory_record import TrajectoryRecord
 from beamsplat.services.localization.lidar2d.validate import StampGuard, reason_to_reject
 
@@ -311,11 +307,11 @@ class LidarSlam:
 
     def save(self, folder: Path) -> None:
         """Write the map and the trajectory to `folder`; mapping may continue afterwards."""
-        write_state(folder, self.pack())
+        MapSaver(folder, self.settings).save(self.saved())
 
-    def pack(self) -> PackedMap:
-        """Return copies of the map and the trajectory, to be written with `state.write_state`."""
-        return self.active_submaps.with_frozen(lambda: pack_state(self.pose_graph, self.record.arrays()))
+    def saved(self) -> SavedMap:
+        """Return the map and the trajectory for a `MapSaver`; scans and grids are not copied."""
+        return SavedMap.of(self.pose_graph, self.record)
 
     @staticmethod
     def load(

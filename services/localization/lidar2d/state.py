@@ -1,32 +1,35 @@
-"""Saved maps: one manifest (JSON) and one array file (npz), see `beamsplat.common.files.numbered_state`."""
+"""Saved maps: a journal of what never changes, and a small state with all poses (`map_saver` writes them).
+
+`lidar_map.json` names two files (`beamsplat.common.files.numbered_state`): `lidar_map-<n>.npz` with the poses
+and with which records are part of the map, and `lidar_map-<n>.journal` with scans, finished submaps,
+constraints and the trajectory. Maps of version 1 consist of one npz file.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import uuid
+import zipfile
+import zlib
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from beamsplat.common.errors import UserError
-from beamsplat.common.files.numbered_state import Arrays, NumberedState
+from beamsplat.common.files.journal import read_records
+from beamsplat.common.files.numbered_state import Arrays, NumberedState, unpacked_arrays
+from beamsplat.services.localization.lidar2d import map_records, state_v1
 from beamsplat.services.localization.lidar2d.pose_graph import PoseGraph
-from beamsplat.services.localization.lidar2d.pose_graph_data import (
-    Constraint,
-    NodeScan,
-    Submap,
-    TrajectoryNode,
-)
 from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
-from beamsplat.services.localization.lidar2d.surfel_map import FrozenMap
 
 FORMAT = "beamsplat-lidar-map"
-VERSION = 1
+VERSION = 2
 MANIFEST = "lidar_map.json"
+PREFIX = "lidar_map-"
 
 
-# Version 1 of the format stores these settings under other names.
+# The manifest has these settings under other names, since version 1.
 _SETTING_KEYS = {
     "min_spacing_m": "spread_m", "max_match_points": "match_points", "submap_nodes": "submap_keynodes",
     "min_submap_nodes": "least_keynodes", "motion_filter_distance_m": "keynode_distance_m",
@@ -50,50 +53,25 @@ def map_uuid(stamp_ns: int, ranges_m: np.ndarray) -> str:
     return str(uuid.uuid5(uuid.NAMESPACE_OID, first))
 
 
-@dataclasses.dataclass(frozen=True)
-class PackedMap:
-    """Copies of a map's state; they can be written in another thread while mapping continues."""
-
-    arrays: dict[str, np.ndarray]
-    head: dict[str, object]
+def manifest_settings(settings: LidarSlamSettings) -> dict[str, Any]:
+    """Return the settings as they are named in a manifest."""
+    return {_SETTING_KEYS.get(k, k): v for k, v in dataclasses.asdict(settings).items()}
 
 
-def pack_state(graph: PoseGraph, extra: dict[str, np.ndarray]) -> PackedMap:
-    """Return copies of the pose graph as arrays, and the arrays `extra` of the caller."""
-    arrays = {**_pack_nodes(graph), **_pack_submaps(graph), **_pack_edges(graph.constraints), **extra}
-    head = {
-        "uuid": graph.uuid,
-        "keynodes": len(graph.nodes),
-        "submaps": len(graph.submaps),
-        "constraints": len(graph.constraints),
-        "settings": {_SETTING_KEYS.get(k, k): v for k, v in dataclasses.asdict(graph.settings).items()},
-    }
-    return PackedMap(arrays, head)
-
-
-def _files(folder: Path) -> NumberedState:
-    return NumberedState(Path(folder), "lidar_map-", MANIFEST, "arrays")
+def map_files(folder: Path) -> NumberedState:
+    """Return the files of a map in a folder."""
+    return NumberedState(Path(folder), PREFIX, MANIFEST, "arrays")
 
 
 def _existing_files(folder: Path) -> NumberedState:
-    files = _files(folder)
+    files = map_files(folder)
     if not files.manifest_path.is_file():
         raise UserError(f"{files.manifest_path}: no saved map here; give the folder of a saved map")
     return files
 
 
-def write_state(folder: Path, state: PackedMap) -> None:
-    """Write a map in place of the previous one; a crash or an error leaves one of the two valid.
-
-    Raises:
-        OSError: the disk is full or broken.
-    """
-    Path(folder).mkdir(parents=True, exist_ok=True)
-    _files(folder).write(state.arrays, {"format": FORMAT, "version": VERSION, **state.head})
-
-
 def load_state(folder: Path, settings: LidarSlamSettings) -> tuple[PoseGraph, dict[str, np.ndarray]]:
-    """Load a saved pose graph, and the `extra` arrays of `pack_state`.
+    """Load a saved pose graph, and the arrays of its trajectory record.
 
     Raises:
         UserError: there is no saved map, or it cannot be read; the text names the file and a remedy.
@@ -107,15 +85,25 @@ def load_state(folder: Path, settings: LidarSlamSettings) -> tuple[PoseGraph, di
                 f"{files.manifest_path}: settings.cell_m is {cell_m}, the running SLAM has "
                 f"{settings.cell_m}; use the same value"
             )
-        try:
-            graph = _unpack(arrays, settings)
-        except (KeyError, ValueError, IndexError, TypeError) as error:
-            raise UserError(
-                f"{files.folder / manifest['arrays']}: not a complete map of version {VERSION} ({error}); "
-                "restore it from a copy"
-            ) from error
+        graph = PoseGraph(settings)
         graph.uuid = str(manifest.get("uuid", ""))  # missing in old states
-        return graph, {key: value for key, value in arrays.items() if key.startswith("extra_")}
+        try:
+            if manifest["version"] == 1:
+                record = state_v1.unpack(arrays, graph)
+            else:
+                path = files.folder / Path(manifest["journal"]).name
+                records = read_records(path, manifest["journal_bytes"])
+                parts = ((kind, unpacked_arrays(payload)) for kind, payload in records)
+                record = map_records.restore(graph, arrays, parts)
+        except (
+            KeyError, ValueError, IndexError, TypeError, EOFError, zipfile.BadZipFile, zlib.error,
+        ) as error:  # fmt: skip
+            raise UserError(
+                f"{files.folder / manifest['arrays']}: not a complete map of version {manifest['version']} "
+                f"({error}); restore the folder from a copy"
+            ) from error
+        graph.resume_numbering()
+        return graph, record
 
     return files.read(_check_manifest, unpack)
 
@@ -132,104 +120,15 @@ def read_manifest(folder: Path) -> dict[str, Any]:
 def _check_manifest(manifest: dict[str, Any], path: Path) -> None:
     if manifest.get("format") != FORMAT:
         raise UserError(f"{path}: field 'format' is not {FORMAT!r}; this is not a lidar map")
-    if manifest.get("version") != VERSION:
+    version = manifest.get("version")
+    if type(version) is not int or not 1 <= version <= VERSION:
         raise UserError(
-            f"{path}: version {manifest.get('version')!r}, this program reads {VERSION}; "
+            f"{path}: version {version!r}, this program reads 1 to {VERSION}; "
             "map again or use the program that wrote it"
         )
     if not isinstance(manifest.get("settings"), dict):
         raise UserError(f"{path}: field 'settings' is missing; restore the folder from a copy")
-
-
-def _pack_nodes(graph: PoseGraph) -> dict[str, np.ndarray]:
-    nodes = list(graph.nodes.values())
-    scans = [n.scan for n in nodes]
-    return {
-        "node_id": np.array([n.id for n in nodes], dtype=np.int64),
-        "node_stamp_ns": np.array([n.stamp_ns for n in nodes], dtype=np.int64),
-        "node_odom": np.array([n.pose_odom_body for n in nodes]).reshape(-1, 3),
-        "node_map": np.array([graph.pose_map_node[n.id] for n in nodes]).reshape(-1, 3),
-        "node_origin": np.array([s.origin for s in scans]).reshape(-1, 2),
-        "node_points": np.array([len(s.points) for s in scans], dtype=np.int64),
-        "node_features": np.array([len(s.features) for s in scans], dtype=np.int64),
-        "points": _concat([s.points for s in scans], 2),
-        "tangents": _concat([s.tangents for s in scans], 2),
-        "spacing": np.concatenate([s.spacing_m for s in scans]) if scans else np.zeros(0, np.float32),
-        "moving": np.concatenate([s.dynamic for s in scans]) if scans else np.zeros(0, bool),
-        "features": _concat([s.features for s in scans], 5),
-    }
-
-
-def _concat(parts: list[np.ndarray], width: int) -> np.ndarray:
-    return np.concatenate(parts) if parts else np.zeros((0, width), np.float32)
-
-
-def _pack_submaps(graph: PoseGraph) -> dict[str, np.ndarray]:
-    finished = [(s, s.frozen) for s in graph.submaps.values() if s.frozen is not None]
-    submaps, frozen = [s for s, _ in finished], [f for _, f in finished]
-    return {
-        "submap_id": np.array([s.id for s in submaps], dtype=np.int64),
-        "submap_odom": np.array([s.pose_odom_submap for s in submaps]).reshape(-1, 3),
-        "submap_map": np.array([s.pose_map_submap for s in submaps]).reshape(-1, 3),
-        "submap_members": np.array([len(s.members) for s in submaps], dtype=np.int64),
-        "members": np.array([m for s in submaps for m in s.members], dtype=np.int64),
-        "submap_grid": np.array([[f.row0, f.col0, *f.shape] for f in frozen], dtype=np.int64).reshape(-1, 4),
-        "submap_surfels": np.array([len(f.means) for f in frozen], dtype=np.int64),
-        "means": _concat([f.means for f in frozen], 2),
-        "omegas": _concat([f.omegas for f in frozen], 3),
-        "views": _concat([f.views for f in frozen], 2),
-        "submap_packed": np.array([len(f.packed) for f in frozen], dtype=np.int64),
-        "packed": np.frombuffer(b"".join(f.packed for f in frozen), dtype=np.uint8),
-    }
-
-
-def _pack_edges(constraints: list[Constraint]) -> dict[str, np.ndarray]:
-    return {
-        "edge_submap": np.array([c.submap for c in constraints], dtype=np.int64),
-        "edge_node": np.array([c.node for c in constraints], dtype=np.int64),
-        "edge_pose": np.array([c.pose_submap_node for c in constraints]).reshape(-1, 3),
-        "edge_information": np.array([c.information for c in constraints]).reshape(-1, 3, 3),
-        "edge_loop": np.array([c.loop for c in constraints], dtype=bool),
-    }
-
-
-def _unpack(a: dict[str, np.ndarray], settings: LidarSlamSettings) -> PoseGraph:
-    graph = PoseGraph(settings)
-    p, f = np.r_[0, np.cumsum(a["node_points"])], np.r_[0, np.cumsum(a["node_features"])]
-    for k, node_id in enumerate(a["node_id"].tolist()):
-        here = slice(p[k], p[k + 1])
-        scan = NodeScan(
-            a["points"][here],
-            a["tangents"][here],
-            a["spacing"][here],
-            a["moving"][here],
-            a["features"][f[k] : f[k + 1]],
-            a["node_origin"][k],
-        )
-        graph.nodes[node_id] = TrajectoryNode(node_id, int(a["node_stamp_ns"][k]), a["node_odom"][k], scan)
-        graph.pose_map_node[node_id] = a["node_map"][k]
-    m, s, b = (np.r_[0, np.cumsum(a[key])] for key in ("submap_members", "submap_surfels", "submap_packed"))
-    for k, submap_id in enumerate(a["submap_id"].tolist()):
-        row0, col0, rows, cols = a["submap_grid"][k].tolist()
-        frozen = FrozenMap(
-            a["means"][s[k] : s[k + 1]],
-            a["omegas"][s[k] : s[k + 1]],
-            a["views"][s[k] : s[k + 1]],
-            a["packed"][b[k] : b[k + 1]].tobytes(),
-            (rows, cols),
-            row0,
-            col0,
-            settings.cell_m,
-        )
-        graph.submaps[submap_id] = Submap(
-            submap_id, a["submap_odom"][k], a["submap_map"][k], a["members"][m[k] : m[k + 1]].tolist(), frozen
-        )
-    graph.constraints = [
-        Constraint(int(i), int(j), z, w, bool(loop))
-        for i, j, z, w, loop in zip(
-            a["edge_submap"], a["edge_node"], a["edge_pose"], a["edge_information"], a["edge_loop"]
-        )
-        if int(i) in graph.submaps and int(j) in graph.nodes
-    ]
-    graph.resume_numbering()
-    return graph
+    if version > 1:
+        for field, kind in (("journal", str), ("journal_bytes", int)):
+            if not isinstance(manifest.get(field), kind):
+                raise UserError(f"{path}: field {field!r} is missing; restore the folder from a copy")

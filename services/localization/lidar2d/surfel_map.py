@@ -258,7 +258,7 @@ class FrozenMap:
             means,
             omegas,
             self.views.astype(np.float64),
-            self.counts()[1],
+            self.counts()[1].copy(),  # without the hits, which share its memory
             self.row0,
             self.col0,
             self.cell_m,

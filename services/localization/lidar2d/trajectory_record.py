@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from beamsplat.services.localization.lidar2d import se2
 
 
 class TrajectoryRecord:
-    """Stamp, node and poses of every scan in growing arrays: 64 bytes per scan, 18 MB in 8 h at 10 Hz."""
+    """Stamp, node and poses of every scan in growing arrays: 64 bytes per scan, 18 MB in 8 h at 10 Hz.
+
+    Rows are never changed, so that another thread may read those that existed when it started.
+    """
+
+    ROW_BYTES = 64
 
     def __init__(self) -> None:
         self.count = 0
@@ -49,11 +56,21 @@ class TrajectoryRecord:
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Return copies of the arrays for saving."""
+        return self.rows(0, self.count)
+
+    def rows(self, first: int, end: int) -> dict[str, np.ndarray]:
+        """Return copies of the rows `first` to before `end`."""
         return {
-            "extra_stamps": self.stamps_ns,
-            "extra_nodes": self.nodes,
-            "extra_poses": self._poses[: self.count].copy(),
+            "extra_stamps": self._stamps[first:end].copy(),
+            "extra_nodes": self._nodes[first:end].copy(),
+            "extra_poses": self._poses[first:end].copy(),
         }
+
+    @staticmethod
+    def joined(parts: Sequence[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+        """Return the rows of several results of `rows`, one after the other."""
+        empty = TrajectoryRecord().arrays()
+        return {key: np.concatenate([array, *(part[key] for part in parts)]) for key, array in empty.items()}
 
     @staticmethod
     def of(arrays: dict[str, np.ndarray]) -> TrajectoryRecord:
