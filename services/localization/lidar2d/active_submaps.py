@@ -56,6 +56,11 @@ class ActiveSubmaps:
         return self._active[0].local
 
     @property
+    def matching_target_id(self) -> int:
+        """Return the id of the older active submap."""
+        return self._active[0].submap.id
+
+    @property
     def active_ids(self) -> set[int]:
         """Return the ids of the active submaps."""
         return {a.submap.id for a in self._active}

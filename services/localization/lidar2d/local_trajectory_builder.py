@@ -19,6 +19,11 @@ from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
 from beamsplat.services.localization.lidar2d.surfel_map import SurfelMap
 
 NS = 1e-9
+# Over a gap, wheels are taken to err by these ratios of a path at this speed.
+GAP_SPEED_M_S, GAP_ERROR_RATIO, GAP_RAD_PER_M = 0.5, 0.1, 0.02
+MATCHED_GAP_M = 3.0  # a longer motion over a gap leaves the local map: the scan is not matched to it
+MATCHED_GAP_S = 3.0  # likewise a longer time without wheels
+GAP_MIN_OVERLAP = 0.6  # of a match after a gap
 
 
 @dataclass(frozen=True)
@@ -50,7 +55,7 @@ class Prediction:
     sigma_m: float
     sigma_rad: float
     source: str
-    long_gap: bool  # gap of over 1 s without wheel odometry: the motion is unknown
+    long_gap: bool  # no scan was matched for over 1 s, and no continuous wheel odometry covers the gap
 
 
 class LocalTrajectoryBuilder:
@@ -70,13 +75,15 @@ class LocalTrajectoryBuilder:
         self._wheel_error = MotionErrorModel(0.01, 0.05, 0.02, 0.004, 0.05, 0.03)
         self._velocity_error = MotionErrorModel(0.02, 0.10, 0.3, 0.02, 0.20, 0.4)
         self._standstill_error = MotionErrorModel(0.05, 0.0, 0.3, 0.05, 0.0, 0.4)
-        self.stamps: list[int] = []  # recent matched stamps and poses, newest last
+        self.stamps: list[int] = []  # recent stamps and poses, newest last
         self.poses: list[np.ndarray] = []
+        self.last_matched: tuple[int, np.ndarray] = (0, np.zeros(3))  # stamp and pose of the last good match
 
     def restart_clock(self, stamp_ns: int) -> None:
         """Continue from the last pose at the stamp `stamp_ns`, after the clock was set to another time."""
         if self.poses:
             self.stamps, self.poses = [stamp_ns - round(0.1 / NS)], [self.poses[-1]]
+            self.last_matched = self.stamps[-1], self.poses[-1]
             self.reckoning.restart(stamp_ns, self.poses[-1])
 
     # ---- motion -----------------------------------------------------------------------------------
@@ -99,6 +106,8 @@ class LocalTrajectoryBuilder:
         Predictions are by constant velocity, standstill and wheel odometry; while dead reckoning is active,
         its prediction is returned. Pass the second value to `accept`.
         """
+        if self.is_in_gap(stamp_ns) and (gap := self._predict_over_gap(stamp_ns)):
+            return gap, []
         dt = (stamp_ns - self.stamps[-1]) * NS
         steady = exp_twist(self.velocity(), min(dt, self.settings.extrapolate_s))
         # Stamps of real logs are irregular; then standstill predicts better than constant velocity.
@@ -122,11 +131,48 @@ class LocalTrajectoryBuilder:
             rated.append(
                 (
                     sigma_m / 0.05 + sigma_rad / 0.03,
-                    Prediction(motion, sigma_m, sigma_rad, name, dt > 1.0 and wheels is None),
+                    Prediction(motion, sigma_m, sigma_rad, name, False),
                 )
             )
         best = min(rated, key=lambda item: item[0])[1]
         return best, [(model, motion) for model, motion, _ in predictions]
+
+    def _predict_over_gap(self, stamp_ns: int) -> Prediction | None:
+        """Return the motion since the last scan, where the last good match is long ago.
+
+        None if wheel odometry without a gap covers the time.
+        """
+        if self.odometry.increment(self.last_matched[0], stamp_ns) is not None:
+            return None
+        moved = self.gap_motion(stamp_ns)
+        if moved is None:
+            dt = (stamp_ns - self.last_matched[0]) * NS
+            sigma_m, sigma_rad = self._standstill_error.sigmas(np.zeros(3), dt)
+            pose, source = self.last_matched[1], "standstill"
+        else:
+            sigma_m, sigma_rad = moved.sigma_m, moved.sigma_rad
+            pose, source = se2.compose(self.last_matched[1], moved.motion), "wheels"
+        return Prediction(se2.between(self.poses[-1], pose), sigma_m, sigma_rad, source, True)
+
+    def is_in_gap(self, stamp_ns: int) -> bool:
+        """Return whether the last good match is so long ago that the pose may be elsewhere in the map."""
+        return (stamp_ns - self.last_matched[0]) * NS > 1.0
+
+    def gap_motion(self, stamp_ns: int) -> Prediction | None:
+        """Return the motion by the wheels since the last good match, None if the wheels do not tell it.
+
+        The path between both is unknown, as are slip and bias on it: the uncertainty grows with the distance
+        that could have been driven.
+        """
+        motion = self.odometry.displacement(self.last_matched[0], stamp_ns)
+        dt = (stamp_ns - self.last_matched[0]) * NS
+        if motion is None or not self._is_plausible(motion, dt):
+            return None
+        distance = math.hypot(motion[0], motion[1])
+        unseen_m = min(GAP_SPEED_M_S * dt, 2.0 * distance + 2.0)
+        return Prediction(
+            motion, 0.05 + GAP_ERROR_RATIO * unseen_m, 0.02 + GAP_RAD_PER_M * unseen_m, "wheels", dt > 1.0
+        )
 
     def _is_plausible(self, motion: np.ndarray, dt_s: float) -> bool:
         """Return whether a motion is within the speed limits of the settings."""
@@ -182,6 +228,8 @@ class LocalTrajectoryBuilder:
         the match is poor. The scan is then deskewed again with the matched motion and matched once more.
         """
         s = self.settings
+        if prediction.long_gap and self._has_left(raw.stamp_ns, prediction):
+            return scan, Match(np.zeros(3), np.zeros((3, 3)), 0.0, 0.0, math.inf), False
         pose_submap_last = se2.between(local.pose_odom_submap, self.poses[-1])
         guess_pose = se2.compose(pose_submap_last, prediction.motion)
         # A bias of the wheels persists over many scans: n priors of one sigma each, taken as independent,
@@ -191,7 +239,7 @@ class LocalTrajectoryBuilder:
         tables = local.surfels.tables()
         points = scan.features()
         match = refine(points, scan.origin_body, guess_pose, tables, s, guess_pose, information)
-        long_gap = (raw.stamp_ns - self.stamps[-1]) * NS > 1.0
+        long_gap = prediction.long_gap
         window_m = min(max(3.0 * prediction.sigma_m, s.search_min_m), 2.0 if long_gap else s.search_max_m)
         window_rad = min(
             max(3.0 * prediction.sigma_rad, s.search_min_rad), math.pi if long_gap else s.search_max_rad
@@ -244,6 +292,13 @@ class LocalTrajectoryBuilder:
             True,
         )
 
+    def _has_left(self, stamp_ns: int, prediction: Prediction) -> bool:
+        """Return whether the robot may be outside the local map after a gap."""
+        if prediction.source != "wheels":
+            return (stamp_ns - self.last_matched[0]) * NS > MATCHED_GAP_S
+        moved = se2.compose(self.poses[-1], prediction.motion) - self.last_matched[1]
+        return math.hypot(moved[0], moved[1]) > MATCHED_GAP_M
+
     def _apply_dead_reckoning(self, stamp_ns: int, local: LocalMap, seen: ObservedMatch) -> Match:
         """Return the match, corrected along its weak direction by dead reckoning if it is degenerate."""
         pose_odom_submap = local.pose_odom_submap
@@ -269,7 +324,9 @@ class LocalTrajectoryBuilder:
             0.15 + 3.0 * prediction.sigma_rad
         )
         if prediction.long_gap:
-            return match.inlier_ratio >= s.good_inlier_ratio
+            known = prediction.source == "wheels" and not far
+            limit = s.good_inlier_ratio if known else s.sure_inlier_ratio
+            return match.inlier_ratio >= limit and match.overlap >= GAP_MIN_OVERLAP
         return match.inlier_ratio >= (s.sure_inlier_ratio if far else s.lost_inlier_ratio)
 
     def _search(
@@ -297,8 +354,11 @@ class LocalTrajectoryBuilder:
         stamp_ns: int,
         pose_odom_body: np.ndarray,
         predictions: list[tuple[MotionErrorModel, np.ndarray]],
+        matched: bool = True,
     ) -> None:
         """Append the pose of the newest scan; update the error models and the odometry delay."""
+        if matched:
+            self.last_matched = stamp_ns, pose_odom_body
         if self.poses:
             moved = se2.between(self.poses[-1], pose_odom_body)
             for model, motion in predictions:

@@ -127,6 +127,33 @@ class OdometryBuffer:
                 return None
         return se2.between(a, b)
 
+    def displacement(self, t0_ns: int, t1_ns: int) -> np.ndarray | None:
+        """Return the motion [3] of the body over a gap of any length, None without odometry on both sides.
+
+        Wheels count on while nothing is heard of them: the last pose before the gap and the first after it
+        are enough.
+        """
+        first = int(np.searchsorted(self.stamps_ns, t0_ns + self.delay_ns, side="right")) - 1
+        last = int(np.searchsorted(self.stamps_ns, t1_ns + self.delay_ns, side="right")) - 1
+        if first < 0 or last <= first:
+            return None
+        late_ns = max(
+            t0_ns + self.delay_ns - self.stamps_ns[first], t1_ns + self.delay_ns - self.stamps_ns[last]
+        )
+        return se2.between(self.poses[first], self.poses[last]) if late_ns <= self._gap_ns else None
+
+    def motion_after_gap(self, t0_ns: int, t1_ns: int) -> np.ndarray:
+        """Return the motion [3] between two stamps after a gap, by the mean velocity since the gap.
+
+        The odometry may begin after `t0_ns`. Zero where it tells nothing.
+        """
+        first = int(np.searchsorted(self.stamps_ns, t0_ns + self.delay_ns))
+        last = int(np.searchsorted(self.stamps_ns, t1_ns + self.delay_ns, side="right")) - 1
+        if last <= first or self.stamps_ns[last] - self.stamps_ns[first] < BASELINE_NS:
+            return np.zeros(3)
+        ratio = (t1_ns - t0_ns) / (self.stamps_ns[last] - self.stamps_ns[first])
+        return ratio * se2.between(self.poses[first], self.poses[last])
+
     def observe_rotation(self, t0_ns: int, t1_ns: int, yaw_rad: float) -> None:
         """Update the delay estimate with the rotation `yaw_rad` between two scans, as found by matching.
 

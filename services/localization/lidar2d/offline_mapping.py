@@ -94,6 +94,8 @@ def map_measurements(
         "step_max_cpu_ms": max(steps_cpu_ms),  # without the waits of a busy machine
         "peak_rss_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0,
         "loop_closures": slam.pose_graph.loop_closures,
+        "gaps_tied_by_odometry": slam.gaps_tied,
+        "gaps_open": slam.gaps_open,
         "odometry_refused": slam.local_builder.odometry.rejected,
         **{f"scans_{status}": count for status, count in statuses.items()},
         "refused": dict(refused),

@@ -13,6 +13,7 @@ from beamsplat.services.localization.lidar2d.grid_tiles import MapContent
 from beamsplat.services.localization.lidar2d.jobs import BackgroundJob, JobResult, run_job
 from beamsplat.services.localization.lidar2d.local_trajectory_builder import (
     LocalTrajectoryBuilder,
+    Prediction,
     RawScan,
 )
 from beamsplat.services.localization.lidar2d.map_records import SavedMap
@@ -20,6 +21,7 @@ from beamsplat.services.localization.lidar2d.map_saver import MapSaver
 from beamsplat.services.localization.lidar2d.motion_covariance import UNKNOWN, motion_covariance
 from beamsplat.services.localization.lidar2d.occupancy import OccupancyGrid, render_occupancy
 from beamsplat.services.localization.lidar2d.pose_graph import PoseGraph
+from beamsplat.services.localization.lidar2d.pose_graph_data import Constraint
 from beamsplat.services.localization.lidar2d.relocalization import Relocalization, relocalize_in
 from beamsplat.services.localization.lidar2d.scan import PreparedScan
 from beamsplat.services.localization.lidar2d.scan_matching import Match
@@ -27,6 +29,9 @@ from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
 from beamsplat.services.localization.lidar2d.state import load_state, map_uuid
 from beamsplat.services.localization.lidar2d.trajectory_record import TrajectoryRecord
 from beamsplat.services.localization.lidar2d.validate import StampGuard, reason_to_reject
+
+# Of the first scan of a segment, which defines the frame of its submap.
+FIRST_MATCH = Match(np.zeros(3), np.diag([1e6, 1e6, 1e8]), 1.0, 1.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -66,6 +71,9 @@ class LidarSlam:
         self._stamps = StampGuard()
         self._consecutive_lost = 0
         self._next_link_scan = 0
+        # Scans after a gap that wait for the segment to which they belong: stamp and published pose_map_body.
+        self._unplaced: list[tuple[int, np.ndarray]] = []
+        self.gaps_tied = self.gaps_open = 0  # gaps in tracking, with and without a constraint over them
         self._pending_job: BackgroundJob | None = None
 
     def add_odometry(self, stamp_ns: int, x_m: float, y_m: float, yaw_rad: float) -> None:
@@ -121,19 +129,23 @@ class LidarSlam:
                 self.active_submaps.matching_target.pose_odom_submap, match.pose_target_body
             )
         else:
-            last = self.local_builder.poses[-1]
-            pose_odom_body = se2.compose(last, prediction.motion) if prediction.source == "wheels" else last
+            moved = self.local_builder.gap_motion(stamp_ns)
+            pose_odom_body = self.local_builder.poses[-1]
+            if moved is not None:
+                pose_odom_body = se2.compose(self.local_builder.last_matched[1], moved.motion)
         target_yaw_rad = float(self.active_submaps.matching_target.pose_odom_submap[2])
-        self.local_builder.accept(stamp_ns, pose_odom_body, candidates if good else [])
+        self.local_builder.accept(stamp_ns, pose_odom_body, candidates if good else [], good)
         covariance = self._covariance(match, target_yaw_rad) if good else UNKNOWN
         self._consecutive_lost = 0 if good else self._consecutive_lost + 1
-        if self._consecutive_lost >= self.settings.lost_scans or (
-            self._consecutive_lost and prediction.long_gap
+        tie = None
+        if not good and (
+            self._consecutive_lost >= self.settings.lost_scans or (prediction.long_gap and moved is not None)
         ):
-            self._start_segment(raw.stamp_ns, scan, pose_odom_body)
-            good = True
+            tie = self._start_segment(moved, pose_odom_body)
+            self.local_builder.last_matched = stamp_ns, pose_odom_body
+            match, good = FIRST_MATCH, True
         # 5. dynamic objects, 6. insertion, 7. background job
-        return self._insert_scan(raw, scan, pose_odom_body, match, covariance, good)
+        return self._insert_scan(raw, scan, pose_odom_body, match, covariance, good, tie)
 
     def _add_first_scan(self, raw: RawScan) -> ScanResult:
         scan = self.local_builder.prepare(raw, self.local_builder.scan_velocity(raw, None))
@@ -141,23 +153,36 @@ class LidarSlam:
             return self._rejected(raw, f"{len(scan)} returns; at least {self.settings.min_points} are needed")
         self.local_builder.accept(raw.stamp_ns, np.zeros(3), [])
         self.pose_graph.uuid = self.pose_graph.uuid or map_uuid(raw.stamp_ns, raw.ranges_m)
-        match = Match(np.zeros(3), np.diag([1e6, 1e6, 1e8]), 1.0, 1.0, 0.0)
-        return self._insert_scan(raw, scan, np.zeros(3), match, self._covariance(match, 0.0), True)
+        covariance = self._covariance(FIRST_MATCH, 0.0)
+        return self._insert_scan(raw, scan, np.zeros(3), FIRST_MATCH, covariance, True)
 
     def _covariance(self, match: Match, target_yaw_rad: float) -> np.ndarray:
         builder = self.local_builder
         return motion_covariance(match, target_yaw_rad, builder.stamps, builder.poses, self.settings)
 
-    def _start_segment(self, stamp_ns: int, scan: PreparedScan, pose_odom_body: np.ndarray) -> None:
-        """Finish the active submaps; start a segment that is not connected to the map, with this scan."""
+    def _start_segment(self, moved: Prediction | None, pose_odom_body: np.ndarray) -> Constraint | None:
+        """Finish the active submaps and start a segment of the trajectory with the next inserted scan.
+
+        Returns the constraint over the gap: the motion by the wheels since the last good scan. Without it
+        (None) the segment is a separate map until its place in the map is recognised.
+        """
         self._consecutive_lost = 0
+        before = self.active_submaps.matching_target_id
         self.active_submaps.close()
-        self.pose_graph.start_segment()
-        self._next_link_scan = self.scans
+        if moved is None:
+            self.gaps_open += 1
+            self.pose_graph.start_segment()
+            self._next_link_scan = self.scans
+            return None
+        self.gaps_tied += 1
+        submap = self.pose_graph.submaps[before]
+        information = np.diag([moved.sigma_m**-2, moved.sigma_m**-2, moved.sigma_rad**-2])
+        pose = se2.between(submap.pose_odom_submap, pose_odom_body)
+        return Constraint(before, self.pose_graph.next_node_id, pose, information, False)
 
     def _insert_scan(
         self, raw: RawScan, scan: PreparedScan, pose_odom_body: np.ndarray, match: Match,
-        covariance: np.ndarray, good: bool,
+        covariance: np.ndarray, good: bool, tie: Constraint | None = None,
     ) -> ScanResult:  # fmt: skip
         """Detect dynamic objects, insert the scan, create a background job if due; return the result."""
         dynamic = (
@@ -168,18 +193,16 @@ class LidarSlam:
         inserted = good and self.active_submaps.insert(
             raw.stamp_ns, scan, pose_odom_body, dynamic, match, self.local_builder.reckoning.take_recovery()
         )
+        if tie is not None and inserted:
+            self.pose_graph.constraints.append(tie)
         job = self._next_job()
         per_beam = np.zeros(len(raw.ranges_m), dtype=bool)
         per_beam[scan.beams[dynamic]] = True
         pose_map_odom = self.pose_graph.pose_map_odom.copy()
-        last = self.active_submaps.last_node
-        assert last is not None  # the first accepted scan is a node
-        self.record.add(
-            raw.stamp_ns,
-            last.id,
-            se2.between(last.pose_odom_body, pose_odom_body),
-            se2.compose(pose_map_odom, pose_odom_body),
-        )
+        published = se2.compose(pose_map_odom, pose_odom_body)
+        self._unplaced.append((raw.stamp_ns, published))
+        if good or not self.local_builder.is_in_gap(raw.stamp_ns):
+            self._place_scans(raw.stamp_ns, pose_odom_body)
         status = "lost" if not good else "ok" if self.pose_graph.unlinked_from is None else "relocalizing"
         return ScanResult(
             raw.stamp_ns,
@@ -194,6 +217,18 @@ class LidarSlam:
             match.inlier_ratio,
             job,
         )
+
+    def _place_scans(self, stamp_ns: int, pose_odom_body: np.ndarray) -> None:
+        """Record this scan, and those before it that had no pose yet, relative to the last node."""
+        last = self.active_submaps.last_node
+        assert last is not None  # the first accepted scan is a node
+        for earlier_ns, published in self._unplaced:
+            pose = pose_odom_body
+            if earlier_ns != stamp_ns:
+                moved = self.local_builder.odometry.motion_after_gap(earlier_ns, stamp_ns)
+                pose = se2.compose(pose, se2.inverse(moved))
+            self.record.add(earlier_ns, last.id, se2.between(last.pose_odom_body, pose), published)
+        self._unplaced.clear()
 
     def _rejected(self, raw: RawScan, reason: str) -> ScanResult:
         pose_odom_body = self.local_builder.poses[-1].copy() if self.local_builder.poses else np.zeros(3)
@@ -244,6 +279,8 @@ class LidarSlam:
             self.apply(self._pending_job.run())
         if not self.pose_graph.nodes:
             return
+        if self._unplaced:  # the recording ends within a gap
+            self._place_scans(self._unplaced[-1][0], self.local_builder.poses[-1])
         self.active_submaps.freeze_active()
         before = -1
         while self.pose_graph.pending and len(self.pose_graph.pending) != before:
