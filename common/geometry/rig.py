@@ -154,7 +154,9 @@ class ScanSection(Config):
     order: Literal["forward", "reversed", "none"] | None = None  # of the beams in time; none: all at once
     sweep_s: Annotated[Finite, Field(ge=0.0, le=10.0)] | None = None  # time from the first beam to the last
     stamp: Literal["first", "last"] | None = None  # the stamp is the time of this beam, in the order of time
-    angles: Literal["increment", "limits", "from_max"] | None = None  # which of contradicting fields holds
+    angles: Literal["increment", "limits", "from_max", "to_max"] | None = (
+        None  # which of contradicting fields holds
+    )
     mirrored: bool | None = None  # whether the directions of the beams change sign
 
 

@@ -20,6 +20,7 @@ from beamsplat.common.recording.camera_info import CameraIntrinsics
 from beamsplat.common.recording.static_frames import MAX_FRAMES, StaticFrames, normalize_frame
 
 MAX_TILT_DEG = 10.0  # of the lidar's plane; ranges then differ by 1.5 % from those of a level lidar
+_LIMIT_M = 20.0  # of a position on the robot
 _LEVEL_DEG = 2.0  # below it, a tilt is not mentioned
 
 
@@ -112,6 +113,14 @@ def find_mounts(
             if frames.ignored:
                 joined += f"; {frames.ignored} transforms to more than {MAX_FRAMES} frames were ignored"
             _handle_missing_mount(calibration, sensor, joined, list(sensor_frames), assume)
+            continue
+        if float(np.abs(T[:3, 3]).max()) > _LIMIT_M:
+            xyz = ", ".join(f"{value:g}" for value in T[:3, 3])
+            calibration.missing.append(
+                f"the transforms put the {sensor} at ({xyz}) m in the body frame, which is no place on "
+                "a robot; "
+                "they may be in millimetres"
+            )
             continue
         if sensor == "camera":
             T = _to_optical_frame(calibration, frames, body, frame, T)

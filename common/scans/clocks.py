@@ -11,6 +11,10 @@ UNIT_NAMES = {"ns": "nanoseconds", "us": "microseconds", "ms": "milliseconds", "
 # Receive delays of sensors on one clock: a message cannot arrive before its stamp, or much later.
 _LATEST_S = 1.5
 _EARLIEST_S = -0.03
+_DOUBTFUL_S = 0.3  # difference of the receive delays of two sensors
+# Receive delay, relative to the sweep, that shows that the stamp is that of the last beam.
+_LAST_BEAM = (-0.1, 0.4)
+_MIN_SWEEP_S = 0.02
 _YEAR_2000_NS, _YEAR_2100_NS = 946_684_800 * 10**9, 4_102_444_800 * 10**9
 _PERIODS_NS = 2_000_000, 10_000_000_000  # of scans and images
 
@@ -37,6 +41,38 @@ def clock_offsets_s(lags_s: dict[str, float], expected_s: dict[str, float]) -> d
         for name, value in error.items()
         if not _EARLIEST_S - 0.3 <= value - reference <= _LATEST_S
     }
+
+
+def stamped_at_end(lag_s: float, sweep_s: float) -> bool:
+    """Return whether a message received `lag_s` after its stamp has the stamp of its last beam.
+
+    A sweep of `sweep_s` that begins at the stamp cannot be received before it has ended.
+    """
+    return sweep_s >= _MIN_SWEEP_S and _LAST_BEAM[0] * sweep_s - 0.003 <= lag_s <= _LAST_BEAM[1] * sweep_s
+
+
+def delay_doubts(
+    lags_s: dict[str, float], expected_s: dict[str, float], offsets_s: dict[str, float], names: dict[str, str]
+) -> list[str]:
+    """Return sentences on streams that are received much later after their stamps than others.
+
+    Args:
+        lags_s, expected_s: as for `clock_offsets_s`.
+        offsets_s: its result; these streams are corrected already.
+        names: topic or file of each stream.
+    """
+    error = {name: lag - expected_s.get(name, 0.0) for name, lag in lags_s.items() if name not in offsets_s}
+    if len(error) < 2:
+        return []
+    promptest = min(error, key=lambda name: error[name])
+    return [
+        f"{names.get(name, name)}: header.stamp: the messages are received {lags_s[name]:.2f} s after their "
+        f"stamps, those of {names.get(promptest, promptest)} {lags_s[promptest]:.2f} s: their clocks "
+        "may differ, "
+        "which shifts the sensors against each other; synchronise the clocks"
+        for name, value in error.items()
+        if value - error[promptest] > _DOUBTFUL_S
+    ]
 
 
 def clock_sentence(name: str, stamp_ns: int, offset_s: float) -> str:

@@ -26,6 +26,8 @@ _CODE_SHARE = 0.005  # of the readings that are exactly the largest, for a code 
 _CODE_COUNT = 20
 _FULL_TURN = 0.0025  # relative difference from a whole revolution
 _UNKNOWN_RANGE_MAX_M = 30.0
+_SOON = (0.85, 1.4)  # receive delay in sweeps of a lidar that is read at once and stamps the first beam
+_FULL_FIELD = math.radians(300.0)
 _FEW = 4  # messages that show their period
 
 
@@ -58,10 +60,10 @@ def learn_header(messages: list[LaserMessage]) -> tuple[ScanRules, HeaderFacts]:
     rules = replace(rules, degrees=_in_degrees(messages))
     candidates, angles_why = _angle_candidates(messages, rules)
     rules = replace(_range_rules(messages, rules), angles=candidates[0], angles_why=angles_why)
-    sweeps, fault = _sweeps(messages, rules, period_s)
+    lag_s = float(np.quantile((received - stamps) / 1e9, 0.1))
+    sweeps, fault = _sweeps(messages, rules, period_s, lag_s if tell and not why else None)
     if fault:
         rules = replace(rules, sweep_s=sweeps[0], sweep_why=fault)
-    lag_s = float(np.quantile((received - stamps) / 1e9, 0.1))
     return rules, HeaderFacts(period_s, candidates, sweeps, fault, lag_s, tell)
 
 
@@ -130,10 +132,10 @@ def _angle_candidates(messages: list[LaserMessage], rules: ScanRules) -> tuple[t
         )
     )
     even = (last - first) / max(n - 1, 1)
-    steps: dict[AngleRule, float] = {"increment": step, "limits": even, "from_max": step}
+    steps: dict[AngleRule, float] = {"increment": step, "limits": even, "from_max": step, "to_max": step}
     possible: list[AngleRule] = []
     for rule in get_args(AngleRule):
-        start = last if rule == "from_max" else first
+        start = last if rule in ("from_max", "to_max") else first
         span = abs(steps[rule]) * (n - 1)
         if math.isfinite(start) and math.isfinite(steps[rule]) and 0.0 < span <= TWO_PI * FULL_TURN_TOLERANCE:
             possible.append(rule)
@@ -192,6 +194,9 @@ def _range_rules(messages: list[LaserMessage], rules: ScanRules) -> ScanRules:
     replaced = max(_UNKNOWN_RANGE_MAX_M, 1.5 * largest)
     if not (math.isfinite(top) and top > 0.0):
         return replace(rules, range_max_m=replaced, range_max_why=_not_stated(top))
+    low = float(np.median([message.range_min_m for message in messages])) * limit_scale
+    if 0.0 < low < top and float(np.mean(measured * scale < low)) > 0.5:
+        rules = replace(rules, range_min_m=0.0, range_min_why="most of the readings are below it")
     if float(np.mean(measured * scale > top)) > 0.5:
         return replace(rules, range_max_m=replaced, range_max_why="most of the readings are beyond it")
     return rules
@@ -212,10 +217,13 @@ def _no_return_code(known: np.ndarray, beams: int, top: float) -> float | None:
     return largest if count > _CODE_COUNT and count > share * beams else None
 
 
-def _sweeps(messages: list[LaserMessage], rules: ScanRules, period_s: float) -> tuple[tuple[float, ...], str]:
+def _sweeps(
+    messages: list[LaserMessage], rules: ScanRules, period_s: float, lag_s: float | None
+) -> tuple[tuple[float, ...], str]:
     """Return the possible signed durations of a sweep, the default first, and why the stated one cannot be.
 
-    A duration is possible if it is at most the period of the scans and 2 s.
+    A duration is possible if it is at most the period of the scans and 2 s. `lag_s`: receive time minus
+    stamp, None = unknown: a message cannot be received before its last beam, and usually is soon after it.
     """
     claims = [claimed_sweep_s(message) for message in messages]
     claimed = float(np.median(claims)) if all(map(math.isfinite, claims)) else math.nan
@@ -236,6 +244,19 @@ def _sweeps(messages: list[LaserMessage], rules: ScanRules, period_s: float) -> 
         )
         fault = f"impossible, it makes {stated}"
         claimed = _plausible_duration_s(messages, claimed, period_s, expected_s)
+    soon = lag_s is not None and _SOON[0] * expected_s <= lag_s <= _SOON[1] * expected_s + 0.02
+    if not fault and claimed < 0.0 and lag_s is not None and lag_s > 0.6 * abs(claimed):
+        fault = f"negative, but the scans are received {lag_s * 1e3:.0f} ms after their stamps"
+        claimed = abs(claimed)
+    elif not fault and 0.005 < claimed < 0.6 * expected_s and soon and span > _FULL_FIELD:
+        fault = (
+            f"it makes {claimed:.3g} s, but there is a revolution every {period_s:.3g} s, received "
+            f"{(lag_s or 0.0) * 1e3:.0f} ms after its stamp"
+        )
+        claimed = expected_s
+    elif not fault and 0.0 < claimed <= 0.005 and soon and span > _FULL_FIELD:
+        fault = f"it makes {claimed * 1e3:.2g} ms, but the scans are received a revolution after their stamps"
+        claimed = expected_s
     candidates = [claimed]
     durations = [abs(claimed)] if abs(claimed) > 0.005 else []
     if (

@@ -9,6 +9,7 @@ import numpy as np
 
 from beamsplat.common.geometry.rig import ScanSection
 from beamsplat.common.recording.input_report import InputFault
+from beamsplat.common.scans.clocks import stamped_at_end
 from beamsplat.common.scans.header_rules import HeaderFacts, learn_header
 from beamsplat.common.scans.laser import LaserMessage
 from beamsplat.common.scans.motion import MANY_PAIRS, OrderEvidence, SweepMotion, describe_sweep
@@ -20,11 +21,8 @@ HEADER_MESSAGES = 24  # from which the rules of the header are learnt
 MAX_SCANS = 1500  # of which the motion is computed
 _MAX_PAIRS = 40  # compared sweeps
 _STEP_NS = 70_000_000  # sweeps that are nearer in time are left out of the motion
-_MIN_TURN_RATE = 0.15  # rad/s, for a comparison of sweeps
 _MOTIONS = 30  # of the body and the lidar, for the mount
 _HANDED = 0.8  # correlation of the turns
-_LAST_BEAM = (-0.1, 0.4)  # receive delay, relative to the sweep, that shows that the stamp is that of its end
-_MIN_SWEEP_S = 0.02
 _MAX_YAW_RAD = math.radians(20.0)  # between the mount by the motion and that of the transforms, for a choice
 
 
@@ -46,7 +44,7 @@ class _Track:
         with np.errstate(invalid="ignore"):
             ranges = message.ranges_m * np.float32(rules.range_scale)
         top = rules.range_max_m or message.range_max_m * rules.limit_scale
-        low = message.range_min_m * rules.limit_scale
+        low = message.range_min_m * rules.limit_scale if rules.range_min_m is None else rules.range_min_m
         if rules.no_return_m is not None:
             top = min(top, 0.999 * rules.no_return_m)
         low = low if math.isfinite(low) and 0.0 <= low < top else 0.0
@@ -56,11 +54,7 @@ class _Track:
             return
         self.comparison.add_lidar(turned.chain, turned.sweep.stamp_ns, turned.pose, float(turned.twist[2]))
         self._compared += 1
-        if (
-            self.order.pairs < _MAX_PAIRS
-            and abs(turned.twist[2]) > _MIN_TURN_RATE
-            and self._compared % 2 == 0
-        ):
+        if self.order.pairs < _MAX_PAIRS and self._compared % 2 == 0:
             self.order.compare(turned, self.motion.tracked)
 
 
@@ -252,9 +246,9 @@ class ScanLearner:
         if self.section.stamp is not None:
             return replace(rules, stamp_at=self.section.stamp, stamp_why="as set in the rig file")
         sweep_s = abs(facts.sweep_candidates_s[0] if rules.sweep_s is None else rules.sweep_s)
-        if rules.use_received or not facts.receive_times_tell or sweep_s < _MIN_SWEEP_S:
+        if rules.use_received or not facts.receive_times_tell:
             return rules
-        if _LAST_BEAM[0] * sweep_s - 0.003 <= facts.lag_s <= _LAST_BEAM[1] * sweep_s:
+        if stamped_at_end(facts.lag_s, sweep_s):
             why = (
                 f"the scans are received {facts.lag_s * 1e3:.0f} ms after their stamps, but their beams take "
                 f"{sweep_s * 1e3:.0f} ms"
@@ -349,7 +343,7 @@ def _mount_warnings(estimate: MountEstimate | None, T_body_lidar: np.ndarray | N
             f"{max(math.degrees(estimate.yaw_sigma_rad), 1.0):.0f} deg; correct the transform"
         )
     off = estimate.xy_m - T_body_lidar[:2, 3]
-    if float(np.hypot(*off)) > max(0.10, 5.0 * estimate.xy_sigma_m):
+    if float(np.hypot(*off)) > max(0.10, 4.0 * estimate.xy_sigma_m):
         found.append(
             f"transform of the lidar: it is at x {T_body_lidar[0, 3]:.2f}, y {T_body_lidar[1, 3]:.2f} "
             "m, but by the "

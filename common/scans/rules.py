@@ -12,11 +12,12 @@ import numpy as np
 from beamsplat.common.recording.input_report import InputFault
 from beamsplat.common.scans.laser import LaserMessage
 
-AngleRule = Literal["increment", "limits", "from_max"]
+AngleRule = Literal["increment", "limits", "from_max", "to_max"]
 ANGLE_RULES: dict[str, str] = {
     "increment": "angle_min + i * angle_increment",
     "limits": "evenly from angle_min to angle_max",
     "from_max": "angle_max + i * angle_increment",
+    "to_max": "by angle_increment, the last at angle_max,",
 }
 TWO_PI = 2.0 * math.pi
 FULL_TURN_TOLERANCE = 1.003  # of more than a revolution: rounding of the increment
@@ -39,6 +40,8 @@ class ScanRules:
     limit_scale: float = 1.0  # the same of range_min and range_max
     range_max_m: float | None = None  # in place of range_max
     range_max_why: str = ""
+    range_min_m: float | None = None  # in place of range_min
+    range_min_why: str = ""
     no_return_m: float | None = None  # this reading means "no return"
     sweep_s: float | None = None  # first to last beam in the array, see `OrderEvidence`; None: as each states
     order: Literal[-1, 0, 1] | None = None  # sign of the sweep; None: as each message states
@@ -66,9 +69,14 @@ def read_angles(message: LaserMessage, rules: ScanRules) -> tuple[float, float]:
         )
     )
     start = last if rules.angles == "from_max" else first
+    if rules.angles == "to_max":
+        start = last - (n - 1) * step
     if rules.angles == "limits":
         step = (last - first) / max(n - 1, 1)
-    for name, value in (("angle_max" if start is last else "angle_min", start), ("angle_increment", step)):
+    for name, value in (
+        ("angle_min" if rules.angles in ("increment", "limits") else "angle_max", start),
+        ("angle_increment", step),
+    ):
         if not math.isfinite(value):
             raise InputFault(name, value, "the directions of the beams are unknown", "correct the driver")
     if step == 0.0 and n > 1:
@@ -194,7 +202,11 @@ def _ranges(message: LaserMessage, rules: ScanRules, repaired: Repaired) -> tupl
         high = rules.range_max_m
     elif not (math.isfinite(high) and 0.0 < high <= 1e5):
         raise InputFault("range_max", f"{message.range_max_m:g}", "it is not a range", "correct the driver")
-    if not (math.isfinite(low) and 0.0 <= low < high):
+    if rules.range_min_m is not None:
+        why = f"{rules.range_min_why}: {rules.range_min_m:g} m is used"
+        repaired("range_min", f"{message.range_min_m:g}", why, "correct the driver")
+        low = rules.range_min_m
+    elif not (math.isfinite(low) and 0.0 <= low < high):
         repaired("range_min", f"{message.range_min_m:g}", "it is not below range_max: 0 m is used", "")
         low = 0.0
     if rules.no_return_m is not None:

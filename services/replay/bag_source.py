@@ -54,6 +54,7 @@ class BagSource:
         self._scans: ScanReader | None = None  # with the rules learnt from the bag
         self._played: ScanReader | None = None  # of the last `messages`
         self._offsets_s: dict[str, float] = {}
+        self._delayed: list[str] = []  # sentences on receive delays
         self._tilt = ""
 
     @property
@@ -74,6 +75,7 @@ class BagSource:
             *([self._tilt] if self._tilt else []),
         ]
         found += self._transforms.report.sentences
+        found += self._delayed
         if self._played is not None:
             found += self._played.warnings
         return [*found, *self.report.sentences]
@@ -181,7 +183,7 @@ class BagSource:
         """Return a reader that has learnt how the scans of the bag are to be read; None if there are none."""
         self.calibrate()
         if "scan" in self.chosen and self._scans is None:
-            self._offsets_s = learn_offsets(self.bag, self.chosen)
+            self._offsets_s, self._delayed = learn_offsets(self.bag, self.chosen)
             rig = None if self.options.rig is None else load_rig(self.options.rig)
             lidar = None if rig is None else rig.lidar
             mount = self.calibration.mounts.get("lidar") if lidar is None else lidar.model().T_body_lidar

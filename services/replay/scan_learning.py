@@ -11,7 +11,13 @@ from beamsplat.common.geometry.transforms import se3_to_se2
 from beamsplat.common.recording import calibration as cal
 from beamsplat.common.recording.input_report import InputReport
 from beamsplat.common.recording.sensors import ros_fields
-from beamsplat.common.scans.clocks import clock_offsets_s, clock_sentence, prompt_lag_s
+from beamsplat.common.scans.clocks import (
+    clock_offsets_s,
+    clock_sentence,
+    delay_doubts,
+    prompt_lag_s,
+    stamped_at_end,
+)
 from beamsplat.common.scans.header_rules import learn_header
 from beamsplat.common.scans.laser import LaserMessage, laser_of_ros
 from beamsplat.common.scans.reader import ScanReader
@@ -21,8 +27,8 @@ from beamsplat.services.replay.decode import deserialize, header_stamp_ns
 _LAGS = 40  # messages of each topic whose delay is measured
 
 
-def learn_offsets(bag: Bag, chosen: dict[str, BagTopic]) -> dict[str, float]:
-    """Return seconds to add to the stamps of sensors that are on another clock than the others."""
+def learn_offsets(bag: Bag, chosen: dict[str, BagTopic]) -> tuple[dict[str, float], list[str]]:
+    """Return seconds to add to the stamps of sensors on another clock, and sentences on their delays."""
     lags: dict[str, float] = {}
     expected: dict[str, float] = {}
     for sensor_name, topic in chosen.items():
@@ -44,11 +50,15 @@ def learn_offsets(bag: Bag, chosen: dict[str, BagTopic]) -> dict[str, float]:
             if rules.use_received:  # by the receive times, which have no offset
                 continue
             expected["scan"] = abs(facts.sweep_candidates_s[0])
+            if stamped_at_end(facts.lag_s, expected["scan"]):
+                expected["scan"] = facts.lag_s
         lag = prompt_lag_s(at, stamps)
         # Delays that vary by more than a second are no offset.
         if lag is not None and abs(float(np.median(np.array(at) - np.array(stamps))) / 1e9 - lag) < 1.0:
             lags[sensor_name] = lag
-    return clock_offsets_s(lags, expected)
+    offsets_s = clock_offsets_s(lags, expected)
+    names = {sensor_name: topic.name for sensor_name, topic in chosen.items()}
+    return offsets_s, delay_doubts(lags, expected, offsets_s, names)
 
 
 def learn_scans(

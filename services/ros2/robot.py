@@ -24,7 +24,13 @@ from beamsplat.common.recording.sensor_reading import SensorReading
 from beamsplat.common.recording.sensors import SENSORS, build_message
 from beamsplat.common.recording.static_frames import MAX_FRAMES, normalize_frame
 from beamsplat.common.recording.transform_reading import TransformReading, namespace_of, valid_transforms
-from beamsplat.common.scans.clocks import clock_offsets_s, clock_sentence, prompt_lag_s
+from beamsplat.common.scans.clocks import (
+    clock_offsets_s,
+    clock_sentence,
+    delay_doubts,
+    prompt_lag_s,
+    stamped_at_end,
+)
 from beamsplat.common.scans.laser import laser_of_ros
 from beamsplat.common.scans.reader import ScanReader
 from beamsplat.services.ros2.tf_odometry import TfOdometry
@@ -242,10 +248,16 @@ class RosRobot:
         reader = self._scan_readers.get(chosen.get("scan", ""))
         expected = {}
         if reader is not None and reader.learner.facts is not None:
-            expected["scan"] = abs(reader.learner.facts.sweep_candidates_s[0])
+            facts = reader.learner.facts
+            expected["scan"] = abs(facts.sweep_candidates_s[0])
+            if stamped_at_end(facts.lag_s, expected["scan"]):
+                expected["scan"] = facts.lag_s
             if reader.learner.rules().use_received:
                 lags.pop("scan")
-        return clock_offsets_s({kind: lag for kind, lag in lags.items() if lag is not None}, expected)
+        known = {kind: lag for kind, lag in lags.items() if lag is not None}
+        offsets_s = clock_offsets_s(known, expected)
+        self.doubts += delay_doubts(known, expected, offsets_s, chosen)
+        return offsets_s
 
     def _scan_reader(
         self, chosen: dict[str, str], rig: RigFile, offsets_s: dict[str, float]
