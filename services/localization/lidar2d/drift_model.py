@@ -9,11 +9,21 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components, dijkstra
 
 from beamsplat.common.compiled import kernel
+from beamsplat.services.localization.lidar2d.graph_kernels import invert3
 from beamsplat.services.localization.lidar2d.graph_optimisation import ConstraintArrays
 from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
 
 LEVER_M = 10.0  # weighs rotation against translation where a path is chosen
 WINDOW_M, WINDOW_RAD = 0.15, math.radians(1.5)  # added to three sigma
+
+
+@kernel
+def _variances(information: np.ndarray, var_m: np.ndarray, var_rad: np.ndarray) -> None:
+    """Write the variances (m^2, mean of x and y; rad^2) of constraints with information float64 [E, 3, 3]."""
+    covariance = np.empty((3, 3))
+    for i in range(information.shape[0]):
+        invert3(information[i], covariance)
+        var_m[i], var_rad[i] = 0.5 * (covariance[0, 0] + covariance[1, 1]), covariance[2, 2]
 
 
 @kernel
@@ -74,13 +84,13 @@ class DriftModel:
         settings: LidarSlamSettings,
     ) -> None:
         s, n = settings, len(pose_map_submap)
-        covariance = np.linalg.inv(edges.information)
+        var_m, var_rad = np.empty(len(edges.node)), np.empty(len(edges.node))
         # Constraints into the second submap include the drift between submaps, see
         # second_submap_information(): subtract it, then add it once.
-        var_m = 0.5 * (covariance[:, 0, 0] + covariance[:, 1, 1]) - s.submap_nodes * s.submap_drift_sigma_m**2
-        var_rad = covariance[:, 2, 2] - s.submap_nodes * s.submap_drift_sigma_rad**2
-        var_m = np.maximum(var_m, 0.0) + s.submap_drift_sigma_m**2
-        var_rad = np.maximum(var_rad, 0.0) + s.submap_drift_sigma_rad**2
+        drift_m2, drift_rad2 = s.submap_drift_sigma_m**2, s.submap_drift_sigma_rad**2
+        _variances(edges.information, var_m, var_rad)
+        var_m = np.maximum(var_m - s.submap_nodes * drift_m2, 0.0) + drift_m2
+        var_rad = np.maximum(var_rad - s.submap_nodes * drift_rad2, 0.0) + drift_rad2
         first = np.searchsorted(edges.node, np.arange(n_nodes + 1)).astype(np.int64)
         degree = np.diff(first)
         pairs = np.empty((int((degree * (degree - 1) // 2).sum()), 2), dtype=np.int64)

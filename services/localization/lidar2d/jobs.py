@@ -12,7 +12,7 @@ from beamsplat.services.localization.lidar2d.drift_model import DriftModel
 from beamsplat.services.localization.lidar2d.graph_optimisation import ConstraintArrays, optimise
 from beamsplat.services.localization.lidar2d.loop_hypotheses import LoopHypothesis
 from beamsplat.services.localization.lidar2d.loops import LoopCandidate, match_locally
-from beamsplat.services.localization.lidar2d.pose_graph_data import Constraint, constraint_arrays
+from beamsplat.services.localization.lidar2d.pose_graph_data import Constraint
 from beamsplat.services.localization.lidar2d.refinement import refine_submaps
 from beamsplat.services.localization.lidar2d.revisits import find_revisits, nearest_member, submaps_of
 from beamsplat.services.localization.lidar2d.segments import first_of_components, join_components
@@ -20,6 +20,8 @@ from beamsplat.services.localization.lidar2d.snapshot import Snapshot
 from beamsplat.services.localization.lidar2d.surfel_map import FrozenMap
 
 ITERATIONS, LAST_ITERATIONS = 10, 16
+MAX_JOBS_WITHOUT_OPTIMISATION = 5
+FIT_CHI2 = 7.8  # 95 % of correct loop closures are below it (three degrees of freedom)
 REJECT_CHI2 = 1e5  # loop closures above it after optimisation are deleted; others are only down-weighted
 
 
@@ -59,22 +61,26 @@ def run_job(snapshot: Snapshot, refine_rounds: int = 0) -> JobResult:
     submap_row = {s: i for i, s in enumerate(snapshot.submap_ids)}
     node_row = {n: i for i, n in enumerate(snapshot.node_ids)}
     constraints, frozen = list(snapshot.constraints), dict(snapshot.frozen)
-    edges = constraint_arrays(constraints, submap_row, node_row)
+    edges = snapshot.table.arrays(constraints, submap_row, node_row)
     drift = DriftModel(edges, snapshot.pose_map_submap, len(snapshot.node_ids), snapshot.settings)
     fixed = [submap_row[i] for i in sorted(snapshot.fixed) if i in submap_row] or [0]
     closed, still_pending = _close_loops(snapshot, edges, drift, node_row)
     revisits, hypotheses = find_revisits(snapshot, edges, drift, submap_row, node_row)
     found = closed + revisits
     if not found and not refine_rounds:  # a chain without loops is its own solution
-        return _unchanged(snapshot, still_pending, hypotheses, _is_linked(drift, edges, fixed))
+        return _unmoved(snapshot, None, 0, still_pending, hypotheses, _is_linked(drift, edges, fixed))
     submap_poses, node_poses = snapshot.pose_map_submap.copy(), snapshot.pose_map_node.copy()
     node_component = drift.components[edges.submap[np.searchsorted(edges.node, np.arange(len(node_row)))]]
-    join_components(
+    joined_any = join_components(
         found, drift.components, int(drift.components[fixed[0]]), submap_row, node_row, node_component,
         submap_poses, node_poses,
     )  # fmt: skip
     constraints += found
-    edges = constraint_arrays(constraints, submap_row, node_row)
+    fit = not revisits and not joined_any and _fit(found, submap_poses, node_poses, submap_row, node_row)
+    if fit and not refine_rounds and snapshot.jobs_since_optimisation < MAX_JOBS_WITHOUT_OPTIMISATION:
+        linked = _is_linked(drift, edges, fixed)
+        return _unmoved(snapshot, constraints, len(found), still_pending, hypotheses, linked)
+    edges = snapshot.table.arrays(constraints, submap_row, node_row)
     joined = DriftModel(edges, submap_poses, len(snapshot.node_ids), snapshot.settings)
     held = first_of_components(joined.components, fixed)
     # During mapping the next job continues from this solution; the final one must converge by itself.
@@ -92,7 +98,7 @@ def run_job(snapshot: Snapshot, refine_rounds: int = 0) -> JobResult:
             dict(zip(snapshot.node_ids, solution.pose_map_node)),
         )
         frozen.update(rebuilt)
-        edges = constraint_arrays(constraints, submap_row, node_row)
+        edges = snapshot.table.arrays(constraints, submap_row, node_row)
         solution = optimise(
             solution.pose_map_submap, solution.pose_map_node, edges, held, iterations=LAST_ITERATIONS
         )
@@ -112,14 +118,28 @@ def run_job(snapshot: Snapshot, refine_rounds: int = 0) -> JobResult:
     )
 
 
-def _unchanged(
-    snapshot: Snapshot, still_pending: list[int], hypotheses: list[LoopHypothesis], linked: bool
-) -> JobResult:
-    """Return the result of a job that has found nothing: no pose and no constraint has changed."""
+def _unmoved(
+    snapshot: Snapshot, constraints: list[Constraint] | None, found: int, still_pending: list[int],
+    hypotheses: list[LoopHypothesis], linked: bool,
+) -> JobResult:  # fmt: skip
+    """Return the result of a job that leaves all poses as they are."""
     return JobResult(
-        snapshot.number, snapshot.node_ids[-1], None, len(snapshot.constraints), {}, {}, {}, still_pending,
-        0, linked, hypotheses,
+        snapshot.number, snapshot.node_ids[-1], constraints, len(snapshot.constraints), {}, {}, {},
+        still_pending, found, linked, hypotheses,
     )  # fmt: skip
+
+
+def _fit(
+    found: list[Constraint], submap_poses: np.ndarray, node_poses: np.ndarray,
+    submap_row: dict[int, int], node_row: dict[int, int],
+) -> bool:  # fmt: skip
+    """Return whether loop closures agree with the poses as they are, within their uncertainty."""
+    for c in found:
+        seen = se2.between(submap_poses[submap_row[c.submap]], node_poses[node_row[c.node]])
+        off = se2.between(c.pose_submap_node, seen)
+        if off @ c.information @ off > FIT_CHI2:
+            return False
+    return True
 
 
 def _is_linked(drift: DriftModel, edges: ConstraintArrays, fixed: list[int]) -> bool:

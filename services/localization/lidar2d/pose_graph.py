@@ -9,6 +9,7 @@ from beamsplat.services.localization.lidar2d.jobs import JobResult
 from beamsplat.services.localization.lidar2d.loop_hypotheses import LoopHypothesis
 from beamsplat.services.localization.lidar2d.pose_graph_data import (
     Constraint,
+    ConstraintTable,
     Submap,
     TableCache,
     TrajectoryNode,
@@ -31,6 +32,8 @@ class PoseGraph:
         self.pose_map_odom = np.zeros(3)
         self.pending: list[int] = []
         self.cache = TableCache(settings.reach_cells)
+        self._table = ConstraintTable()
+        self._jobs_since_optimisation = 0  # jobs that added loop closures without moving anything
         self.loop_closures = 0
         self.optimisations = 0
         self.unlinked_from: int | None = None
@@ -77,7 +80,9 @@ class PoseGraph:
         self.constraints += edges
         for edge in edges:
             self.submaps[edge.submap].members.append(node.id)
-        self.pending.append(node.id)
+        # Matches of neighbouring scans have the same errors.
+        if node.id % self.settings.loop_every_nodes == 0:
+            self.pending.append(node.id)
 
     def main_submaps(self) -> set[int]:
         """Return the ids of the submaps that constraints connect with the first submap."""
@@ -114,6 +119,8 @@ class PoseGraph:
             np.array([s.pose_map_submap for s in self.submaps.values()]).reshape(-1, 3),
             np.array(list(self.pose_map_node.values())).reshape(-1, 3),
             list(self.constraints),
+            self._table,
+            self._jobs_since_optimisation,
             list(self.pending),
             self.cache,
             self.optimisations,
@@ -135,13 +142,15 @@ class PoseGraph:
         if result.linked and self.unlinked_from is not None and newest >= self.unlinked_from:
             self.unlinked_from = None
         self.loop_closures += result.loops_found
+        if result.constraints is not None:
+            self.constraints = result.constraints + self.constraints[result.snapshot_constraints :]
+            self._jobs_since_optimisation += 1
         if result.pose_map_node:
             self._move(result, newest)
+            self._jobs_since_optimisation = 0
             self.optimisations += 1
 
     def _move(self, result: JobResult, newest: int) -> None:
-        if result.constraints is not None:
-            self.constraints = result.constraints + self.constraints[result.snapshot_constraints :]
         self.pose_map_odom = se2.compose(
             result.pose_map_node[newest], se2.inverse(self.nodes[newest].pose_odom_body)
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 import threading
 from collections import OrderedDict
 from collections.abc import Callable
@@ -53,14 +54,6 @@ class Constraint:
     pose_submap_node: np.ndarray  # float64 [3]
     information: np.ndarray  # float64 [3, 3]
     loop: bool
-    packed: np.ndarray = field(init=False, repr=False, compare=False)  # float64 [12], pose and information
-
-    def __post_init__(self) -> None:
-        # In one array, because joining many small arrays costs more than optimising the graph.
-        packed = np.concatenate([self.pose_submap_node, self.information.ravel()])
-        object.__setattr__(self, "packed", packed)
-        object.__setattr__(self, "pose_submap_node", packed[:3])
-        object.__setattr__(self, "information", packed[3:].reshape(3, 3))
 
 
 class TableCache:
@@ -125,22 +118,63 @@ def _bytes_in(store: OrderedDict[Any, tuple[FrozenMap, Any]]) -> int:
     )
 
 
+class ConstraintTable:
+    """The columns of a list of constraints, kept from job to job: only what is new in the list is read.
+
+    Not thread-safe; one background job at a time uses it.
+    """
+
+    def __init__(self) -> None:
+        self._constraints: list[Constraint] = []
+        self._ids = np.empty((1024, 2), dtype=np.int64)  # submap, node
+        self._packed = np.empty((1024, 12))
+        self._loop = np.empty(1024, dtype=bool)
+
+    def arrays(
+        self, constraints: list[Constraint], submap_row: dict[int, int], node_row: dict[int, int]
+    ) -> ConstraintArrays:
+        """Return the constraints as arrays, ordered by node; the dicts map submap and node ids to rows."""
+        self._update(constraints)
+        n = len(constraints)
+        submap, node = _rows_of(self._ids[:n, 0], submap_row), _rows_of(self._ids[:n, 1], node_row)
+        order = np.argsort(node, kind="stable")
+        packed = self._packed[order]
+        return ConstraintArrays(
+            submap[order],
+            node[order],
+            np.ascontiguousarray(packed[:, :3]),
+            np.ascontiguousarray(packed[:, 3:]).reshape(-1, 3, 3),
+            self._loop[order],
+        )
+
+    def _update(self, constraints: list[Constraint]) -> None:
+        known = len(self._constraints)
+        if known > len(constraints) or not all(map(operator.is_, self._constraints, constraints)):
+            known = 0
+        while len(constraints) > len(self._ids):
+            self._ids = np.concatenate([self._ids, np.empty_like(self._ids)])
+            self._packed = np.concatenate([self._packed, np.empty_like(self._packed)])
+            self._loop = np.concatenate([self._loop, np.empty_like(self._loop)])
+        for row, c in enumerate(constraints[known:], known):
+            self._ids[row] = c.submap, c.node
+            self._packed[row, :3], self._packed[row, 3:] = c.pose_submap_node, c.information.ravel()
+            self._loop[row] = c.loop
+        self._constraints = list(constraints)
+
+
+def _rows_of(ids: np.ndarray, row_of: dict[int, int]) -> np.ndarray:
+    """Return the row int32 [N] of each id."""
+    known = np.fromiter(row_of.keys(), dtype=np.int64, count=len(row_of))
+    rows = np.fromiter(row_of.values(), dtype=np.int32, count=len(row_of))
+    order = np.argsort(known)
+    return rows[order][np.searchsorted(known, ids, sorter=order)]
+
+
 def constraint_arrays(
     constraints: list[Constraint], submap_row: dict[int, int], node_row: dict[int, int]
 ) -> ConstraintArrays:
     """Convert constraints to arrays, ordered by node; the dicts map submap and node ids to row numbers."""
-    node = np.array([node_row[c.node] for c in constraints], dtype=np.int32)
-    order = np.argsort(node, kind="stable")
-    submap = np.array([submap_row[c.submap] for c in constraints], dtype=np.int32)
-    packed = np.concatenate([c.packed for c in constraints]) if constraints else np.empty(0)
-    packed = packed.reshape(-1, 12)[order]
-    return ConstraintArrays(
-        submap[order],
-        node[order],
-        np.ascontiguousarray(packed[:, :3]),
-        np.ascontiguousarray(packed[:, 3:]).reshape(-1, 3, 3),
-        np.array([c.loop for c in constraints], dtype=bool)[order],
-    )
+    return ConstraintTable().arrays(constraints, submap_row, node_row)
 
 
 @kernel

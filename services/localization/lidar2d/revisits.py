@@ -34,7 +34,7 @@ FAR_WINDOW_M = 12.0
 NEAR_EVIDENCE, FAR_EVIDENCE, FREE_EVIDENCE = 2, 4, 6
 SURE_EVIDENCE = 4  # of a match that has no rival in the whole map
 SURE_INLIER_RATIO, SURE_OVERLAP = 0.85, 0.7
-DISTINCT_RATIO = 0.85  # score of the best rival of a match that is evidence for two
+DISTINCT_RATIO = 0.85  # a match with a lower score than this ratio of the best one is no rival
 SAME_PLACE_M, SAME_PLACE_RAD = 0.5, math.radians(10.0)
 
 
@@ -100,8 +100,8 @@ def _hypotheses_of_newest(
     for m in matches[:PER_CHUNK]:
         tables = snapshot.cache.tables(m.submap, snapshot.frozen[m.submap], for_search=False)
         seen = reduce_unobservable(features, centre.scan.origin, m.match, tables, s)
-        if seen.trust < MIN_TRUST:
-            continue  # it could be anywhere along a corridor
+        if seen.trust < MIN_TRUST or m.score < DISTINCT_RATIO * matches[0].score:
+            continue  # it could be anywhere along a corridor, or the chunk fits clearly better elsewhere
         information = edge_information(seen.match.information, CHUNK_SIGMA_M, CHUNK_SIGMA_RAD)
         link = Constraint(m.submap, centre.id, m.match.pose_target_body, information, True)
         confirmed = verify_constraint(

@@ -58,6 +58,7 @@ class LidarSlamSettings:
     job_nodes: int = 20  # a background job starts after this many new nodes
     apply_after_scans: int = 20  # the result of a job is applied exactly this many scans later
     max_loops_per_node: int = 3  # maximum number of loop closures per node
+    loop_every_nodes: int = 3  # loop closures are searched for every n-th node
     loop_distance_m: float = 3.0  # a submap is near if one of its nodes is within this distance
     local_window_m: float = 0.8  # largest window of the local loop search, done for every node
     local_window_rad: float = math.radians(12.0)  # largest rotation in the local loop search

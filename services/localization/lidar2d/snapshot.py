@@ -7,7 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from beamsplat.services.localization.lidar2d.loop_hypotheses import LoopHypothesis
-from beamsplat.services.localization.lidar2d.pose_graph_data import Constraint, TableCache, TrajectoryNode
+from beamsplat.services.localization.lidar2d.pose_graph_data import (
+    Constraint,
+    ConstraintTable,
+    TableCache,
+    TrajectoryNode,
+)
 from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
 from beamsplat.services.localization.lidar2d.surfel_map import FrozenMap
 
@@ -26,6 +31,8 @@ class Snapshot:
     pose_map_submap: np.ndarray  # float64 [S, 3]
     pose_map_node: np.ndarray  # float64 [N, 3]
     constraints: list[Constraint]
+    table: ConstraintTable
+    jobs_since_optimisation: int
     pending: list[int]
     cache: TableCache
     version: int  # counter of the map's optimisations

@@ -308,3 +308,36 @@ def test_errors_of_invalid_states(mapped, tmp_path):
     (tmp_path / MANIFEST).write_text("{")
     with pytest.raises(UserError, match="cannot be read"):
         LidarSlam.load(tmp_path, SETTINGS, np.eye(4))
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_a_drive_goes_on_after_a_gap_without_scans_and_odometry(known):
+    """For 16 s nothing is heard, in which the robot drives 8 m; the wheels have counted on, or are unknown."""
+    drive, lidar = SimulatedDrive(laps=2), RayCastLidar(beams=360, seed=14)
+    slam, ticks = LidarSlam(SETTINGS, np.eye(4)), np.arange(0, drive.duration_s, 0.02)
+    odometry = wheels(drive, ticks)
+    results, truth = [], []
+    k, silent = 0, (50.0, 66.0)
+    with JobRunner(slam) as jobs:
+        for t in np.arange(0.0, drive.duration_s - 0.2, 0.1):
+            while known and k < len(ticks) and ticks[k] <= t + 0.1:
+                if not silent[0] < ticks[k] < silent[1]:
+                    slam.add_odometry(START + round(ticks[k] * NS), *odometry[k])
+                k += 1
+            if silent[0] < t < silent[1]:
+                continue
+            jobs.before_scan()
+            results.append(slam.add_scan(START + round(t * NS), lidar.scan(drive, t), *lidar.arguments()))
+            jobs.after_scan(results[-1])
+            truth.append(drive(np.array([t]))[0])
+        jobs.finish()
+    assert (slam.gaps_tied, slam.gaps_open) == ((1, 0) if known else (0, 1))
+    after = [r.status for r in results[500:]]
+    assert set(after) <= ({"lost", "ok"} if known else {"lost", "relocalizing", "ok"})
+    assert ("relocalizing" in after) != known
+    assert after[-1] == "ok"
+    assert after.count("lost") <= 5
+    stamps, final, _ = slam.trajectory()
+    assert len(stamps) == len(results)  # no scan is without a pose, those right after the gap included
+    assert trajectory_errors(final, np.array(truth)).ate_first_pose_rmse_m < 0.03
+    assert np.hypot(*(se2.between(final[0], final[505]) - se2.between(truth[0], truth[505]))[:2]) < 0.15
