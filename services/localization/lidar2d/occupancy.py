@@ -198,7 +198,7 @@ def save_nav2(grid: OccupancyGrid, folder: Path, name: str = "map") -> None:
     image[flipped >= OCCUPIED] = 0
     with (folder / f"{name}.pgm").open("wb") as file:
         file.write(f"P5\n{width} {height}\n255\n".encode())
-        file.write(image)
+        file.write(image.data)
     del image
     (folder / f"{name}.yaml").write_text(
         f"image: {name}.pgm\nmode: trinary\nresolution: {grid.resolution_m}\n"

@@ -9,6 +9,7 @@ from beamsplat.common.mapfiles.grid_tiles import TILE_CELLS, GridSource, TiledGr
 from beamsplat.services.localization.lidar2d import grid_tiles
 from beamsplat.services.localization.lidar2d.grid_tiles import GridTiles, MapContent
 from beamsplat.services.localization.lidar2d.occupancy import CountGrid, render_occupancy
+from tests.services.localization.test_resume import drive, make
 
 RESOLUTION_M = 0.05
 SIDE = 300  # cells of a submap: 15 m
@@ -122,3 +123,29 @@ def test_bands_of_a_large_grid_fit_together(monkeypatch, count):
     expected = whole_grid(content)
     monkeypatch.setattr("beamsplat.services.localization.lidar2d.occupancy._BAND_CELLS", 40_000)
     np.testing.assert_array_equal(whole_grid(content).values, expected.values)
+
+
+def received(messages):
+    grid = TiledGrid()
+    for m in messages:
+        grid.add(
+            GridSource(m.map_uuid, m.since_ns, m.resolution_m, m.size), m.row, m.column, m.packed.tobytes()
+        )
+    return grid
+
+
+def test_a_subscriber_of_the_node_has_the_map_at_the_end_also_if_it_joined_late():
+    node = make(grid_every_scans=10)
+    sent, _ = drive(node, 0.0, 9.0, 1, 0)
+    messages = sent["localization/grid"]
+    updates = np.flatnonzero([m.remaining == 0 for m in messages])
+    assert len(updates) >= 8
+    sizes = np.diff([-1, *updates])
+    assert [m.remaining for m in messages] == [left for n in sizes for left in range(n - 1, -1, -1)]
+    whole = node._slam.grid(RESOLUTION_M)
+    for heard in (messages, messages[len(messages) // 2 :]):
+        np.testing.assert_array_equal(assembled(received(heard).tiles, whole), whole.values)
+    assert (whole.values >= 65).sum() > 300  # walls
+    again, _ = drive(make(grid_every_scans=10), 0.0, 2.0, 2, 1)  # a restarted process with another map
+    grid = received([*messages, *again["localization/grid"]])
+    assert grid.tiles == received(again["localization/grid"]).tiles
