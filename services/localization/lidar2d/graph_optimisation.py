@@ -53,6 +53,7 @@ def optimise(
     fixed: Sequence[int] = (0,),  # rows of the submaps that are held constant
     final_scale2: float = 9.0,
     iterations: int = 16,
+    anneal: bool = True,
 ) -> GraphSolution:
     """Optimise all poses: minimise the sum of rho(e^T Omega e) over the constraints.
 
@@ -62,6 +63,7 @@ def optimise(
     Args:
         final_scale2: squared scale of the robust loss in the last iterations, in units of chi^2.
         iterations: maximum number of iterations.
+        anneal: start with a large scale of the loss; not needed where all constraints agree with the start.
     """
     submap_poses, node_poses = (
         pose_map_submap.astype(np.float64).copy(),
@@ -76,7 +78,7 @@ def optimise(
     blocks, rhs = np.empty((len(unique), 3, 3)), np.empty((n_submaps, 3))
     W, Hnn_inv = np.empty((len(edges.node), 3, 3)), np.empty((n_nodes, 3, 3))
     bn, chi2 = np.empty((n_nodes, 3)), np.empty(len(edges.node))
-    done, scale2 = 0, math.inf
+    done, scale2 = 0, math.inf if anneal else final_scale2
     while done < iterations:
         done += 1
         # The first iteration has a very large scale and so accepts every loop closure; outliers are visible

@@ -85,7 +85,8 @@ def run_job(snapshot: Snapshot, refine_rounds: int = 0) -> JobResult:
     held = first_of_components(joined.components, fixed)
     # During mapping the next job continues from this solution; the final one must converge by itself.
     iterations = LAST_ITERATIONS if refine_rounds else ITERATIONS
-    solution = optimise(submap_poses, node_poses, edges, held, iterations=iterations)
+    anneal = not fit or refine_rounds > 0
+    solution = optimise(submap_poses, node_poses, edges, held, iterations=iterations, anneal=anneal)
     rebuilt: dict[int, FrozenMap] = {}
     for _ in range(refine_rounds):
         rebuilt, constraints = refine_submaps(

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from beamsplat.common.compiled import kernel
 from beamsplat.services.localization.lidar2d import se2
 from beamsplat.services.localization.lidar2d.drift_model import DriftModel
 from beamsplat.services.localization.lidar2d.graph_optimisation import ConstraintArrays
@@ -199,8 +200,24 @@ def submaps_of(edges: ConstraintArrays, row: int) -> np.ndarray:
 
 def nearest_member(snapshot: Snapshot, edges: ConstraintArrays, row: int) -> np.ndarray:
     """Return the distance (m) from the node in `row` to the nearest node of each submap, float64 [S]."""
-    away = np.hypot(*(snapshot.pose_map_node[:, :2] - snapshot.pose_map_node[row, :2]).T)
     distance = np.full(len(snapshot.submap_ids), np.inf)
-    inner = ~edges.robust
-    np.minimum.at(distance, edges.submap[inner], away[edges.node[inner]])
+    _nearest_member(edges.submap, edges.node, edges.robust, snapshot.pose_map_node, row, distance)
     return distance
+
+
+@kernel
+def _nearest_member(
+    submap: np.ndarray,
+    node: np.ndarray,
+    robust: np.ndarray,
+    pose_map_node: np.ndarray,
+    row: int,
+    out: np.ndarray,
+) -> None:
+    x, y = pose_map_node[row, 0], pose_map_node[row, 1]
+    for i in range(node.shape[0]):
+        if not robust[i]:
+            dx, dy = pose_map_node[node[i], 0] - x, pose_map_node[node[i], 1] - y
+            out[submap[i]] = min(out[submap[i]], dx * dx + dy * dy)
+    for k in range(out.shape[0]):
+        out[k] = math.sqrt(out[k])
