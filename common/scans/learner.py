@@ -21,6 +21,7 @@ HEADER_MESSAGES = 24  # from which the rules of the header are learnt
 MAX_SCANS = 1500  # of which the motion is computed
 _MAX_PAIRS = 40  # compared sweeps
 _STEP_NS = 70_000_000  # sweeps that are nearer in time are left out of the motion
+_MIN_TURN_RATE = 0.15  # rad/s, for a comparison of sweeps
 _MOTIONS = 30  # of the body and the lidar, for the mount
 _HANDED = 0.8  # correlation of the turns
 _MAX_YAW_RAD = math.radians(20.0)  # between the mount by the motion and that of the transforms, for a choice
@@ -54,7 +55,8 @@ class _Track:
             return
         self.comparison.add_lidar(turned.chain, turned.sweep.stamp_ns, turned.pose, float(turned.twist[2]))
         self._compared += 1
-        if self.order.pairs < _MAX_PAIRS and self._compared % 2 == 0:
+        turning = abs(turned.twist[2]) > _MIN_TURN_RATE
+        if turning and self.order.pairs < _MAX_PAIRS and self._compared % 2 == 0:
             self.order.compare(turned, self.motion.tracked)
 
 
@@ -309,6 +311,7 @@ class ScanLearner:
                 "wrong sign, or the lidar is mounted upside down and its transform does not say so; "
                 "correct it"
             )
+        found += self._timeless(rules)
         found += _mount_warnings(self.mount(), self.T_body_lidar)
         delay = track.comparison.delay_s()
         if delay is not None and abs(delay[0]) > max(0.15, 2.0 * delay[1]):
@@ -319,6 +322,21 @@ class ScanLearner:
                 f"{word} than those of the scans; synchronise the clocks (localization corrects up to 0.3 s)"
             )
         return found
+
+    def _timeless(self, rules: ScanRules) -> list[str]:
+        """Return a sentence if the scans have no time per beam, but arrive like those of a turning lidar."""
+        facts = self.facts
+        if facts is None or rules.sweep_s is not None or facts.sweep_candidates_s[0] != 0.0:
+            return []
+        turning_s = max(facts.sweep_candidates_s)
+        if not facts.receive_times_tell or facts.lag_s < 0.5 * turning_s or turning_s == 0.0:
+            return []
+        return [
+            "time_increment = 0: the scans do not say when each beam was measured, and are received "
+            f"{facts.lag_s * 1e3:.0f} ms after their stamps like those of a turning lidar: they are not "
+            "deskewed; "
+            "set order and sweep_s in [lidar.scan] of a rig file, or drive turns, in which the order shows"
+        ]
 
 
 def _mount_warnings(estimate: MountEstimate | None, T_body_lidar: np.ndarray | None) -> list[str]:

@@ -72,6 +72,9 @@ def slam(
             task = bar.add_task("mapping", total=source.message_count())
             log = MeasurementLog(lidar.T_body_lidar, measurements(source), lambda: bar.advance(task))
             figures = map_measurements(log, out)
+        reader = source.scan_reader() if hasattr(source, "scan_reader") else None
+        if reader is not None:
+            console.print(f"{reader.topic}: {reader.learner.evidence()}", markup=False, highlight=False)
         for problem in source.problems:
             console.print(f"[yellow]{problem}[/]", highlight=False)
     finally:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -46,16 +47,24 @@ def odometry(drive: Drive, seed: int = 0) -> list[tuple[int, np.ndarray]]:
     truth = drive(t)
     rng = np.random.default_rng(seed)
     poses = [np.zeros(3)]
-    for before, after in zip(truth, truth[1:]):
+    for before, after in pairwise(truth):
         length = np.hypot(*(after - before)[:2]) * 1.02 * (1.0 + 0.02 * rng.standard_normal())
         yaw = poses[-1][2] + 1.005 * (after - before)[2]
         middle = 0.5 * (yaw + poses[-1][2])
-        poses.append(np.array([poses[-1][0] + length * np.cos(middle), poses[-1][1] + length * np.sin(middle), yaw]))
+        poses.append(
+            np.array([poses[-1][0] + length * np.cos(middle), poses[-1][1] + length * np.sin(middle), yaw])
+        )
     return [(START_NS + round(s * 1e9), pose) for s, pose in zip(t, poses)]
 
 
 def sweeps(
-    drive: Drive, *, beams: int = 240, rate_hz: float = 10.0, clockwise: bool = False, at_once: bool = False, seed: int = 1
+    drive: Drive,
+    *,
+    beams: int = 240,
+    rate_hz: float = 10.0,
+    clockwise: bool = False,
+    at_once: bool = False,
+    seed: int = 1,
 ) -> list[LaserMessage]:
     """Return what an ideal driver publishes: counter-clockwise or clockwise revolutions, beams in order of time.
 
@@ -141,7 +150,10 @@ def ydlidar_ros2_driver(m: LaserMessage, k: int) -> LaserMessage:
 def rplidar_mirrored(m: LaserMessage, k: int) -> LaserMessage:
     """frozenreboot/rplidar_driver #7: a clockwise lidar whose angles are published as counter-clockwise."""
     return replace(
-        m, angle_min_rad=-m.angle_min_rad, angle_max_rad=-m.angle_max_rad, angle_increment_rad=-m.angle_increment_rad
+        m,
+        angle_min_rad=-m.angle_min_rad,
+        angle_max_rad=-m.angle_max_rad,
+        angle_increment_rad=-m.angle_increment_rad,
     )
 
 
