@@ -9,6 +9,10 @@ import numpy as np
 from beamsplat.common.geometry.transforms import wrap_angle
 from beamsplat.tools.simulator.settings import WheelSettings
 
+TRACK_M = 0.4  # distance between the wheels
+# A slip lasts for this travel, and the wheel turns too far by this share of it: 0.7 to 9 degrees.
+SLIP_M, SLIP_SHARE = (0.05, 0.2), (0.1, 0.3)
+
 
 @dataclass(frozen=True)
 class WheelReadings:
@@ -22,8 +26,10 @@ class WheelReadings:
 class WheelOdometrySimulator:
     """Wheel odometry of one robot; systematic errors are drawn once, and the pose is stored between calls."""
 
-    def __init__(self, settings: WheelSettings, rng: np.random.Generator) -> None:
+    def __init__(self, settings: WheelSettings, rng: np.random.Generator, slips_per_km: float = 0.0) -> None:
         self._noise, self._rng = settings.noise, rng
+        self._slips_per_m = slips_per_km * 1e-3
+        self._slip_left_m, self._slip = 0.0, 0.0
         self.scale = 1.0 + _signed(rng, settings.scale_error)
         self.turn = 1.0 + _signed(rng, settings.turn_error)
         self._pose_odom_body = np.zeros(3)
@@ -52,6 +58,9 @@ class WheelOdometrySimulator:
             turn * self.turn
             + self._noise * np.sqrt(np.abs(turn) * 0.02 + np.abs(forward) * 0.0005) * noise[1]
         )
+        if self._slips_per_m > 0.0:
+            excess = self._slip_excess(np.abs(forward))
+            forward, turn = forward + np.abs(excess) / 2.0, turn + excess / TRACK_M
         yaw = self._pose_odom_body[2] + np.cumsum(turn)
         along = yaw - turn / 2
         x = self._pose_odom_body[0] + np.cumsum(forward * np.cos(along))
@@ -60,6 +69,24 @@ class WheelOdometrySimulator:
         self._pose_odom_body = out[-1].copy()
         out[:, 2] = wrap_angle(out[:, 2])
         return WheelReadings(out, forward / period_s, turn / period_s)
+
+    def _slip_excess(self, metres: np.ndarray) -> np.ndarray:
+        """Return what one wheel turns too far during each step, in metres: positive = the right wheel.
+
+        `metres` float64 [M] are the lengths of the steps. The number of random draws is that of the steps.
+        """
+        starts = self._rng.random(len(metres)) < metres * self._slips_per_m
+        length, share, side = self._rng.random((3, len(metres)))
+        excess = np.zeros(len(metres))
+        for k, step_m in enumerate(metres):
+            if starts[k]:
+                self._slip_left_m = SLIP_M[0] + length[k] * (SLIP_M[1] - SLIP_M[0])
+                self._slip = SLIP_SHARE[0] + share[k] * (SLIP_SHARE[1] - SLIP_SHARE[0])
+                self._slip *= 1.0 if side[k] < 0.5 else -1.0
+            if self._slip_left_m > 0.0:
+                excess[k] = self._slip * step_m
+                self._slip_left_m -= step_m
+        return excess
 
 
 def _signed(rng: np.random.Generator, span: tuple[float, float]) -> float:

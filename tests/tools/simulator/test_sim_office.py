@@ -18,6 +18,7 @@ from beamsplat.tools.simulator.office.recording import measure, simulate_office
 from beamsplat.tools.simulator.office.route import plan_route
 from beamsplat.tools.simulator.office.settings import OfficeSettings
 from beamsplat.tools.simulator.settings import LidarSettings, WheelSettings
+from beamsplat.tools.simulator.wheels import TRACK_M, WheelOdometrySimulator
 from tests.services.localization.world import cast
 
 # Low rates keep the recordings of these tests small.
@@ -135,6 +136,25 @@ def test_legs_are_seen_as_circles_and_people_make_way():
         assert speed[far].max() <= 1.5 + 1e-6
         assert (circles[..., 2] == LEG_RADIUS_M).all()
     assert np.ptp(np.array(seen), axis=0).max(axis=1).min() > 5.0  # all of them walk
+
+
+def test_a_wheel_slips_now_and_then():
+    perfect = WheelSettings(scale_error=(0.0, 0.0), turn_error=(0.0, 0.0), noise=0.0)
+    truth = np.column_stack([np.arange(0.0, 3000.0, 0.05), np.zeros((60_000, 2))])  # straight, 3 km
+    wheels = WheelOdometrySimulator(perfect, np.random.default_rng(0), slips_per_km=10.0)
+    readings = [wheels.measure(part, 0.05) for part in np.array_split(truth, 30_000)]
+    turn = np.concatenate([r.turn_rad_s for r in readings]) * 0.05
+    speed = np.concatenate([r.speed_m_s for r in readings])
+    slipping = turn != 0.0
+    slips = np.split(turn, np.flatnonzero(np.diff(slipping.astype(int))) + 1)
+    degrees = np.abs(np.degrees([part.sum() for part in slips if part[0] != 0.0]))
+    assert len(degrees) == pytest.approx(30, abs=15)
+    assert degrees.min() > 0.7
+    assert degrees.max() < 13.0  # with one step more than SLIP_M
+    assert (turn[slipping] > 0.0).any()
+    assert (turn[slipping] < 0.0).any()
+    assert speed[slipping] == pytest.approx(1.0 + np.abs(turn[slipping]) / 0.05 * TRACK_M / 2.0, abs=1e-9)
+    assert (np.abs(speed[1:][~slipping[1:]] - 1.0) < 1e-9).all()
 
 
 @pytest.mark.parametrize("aliased", [False, True])

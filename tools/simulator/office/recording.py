@@ -82,7 +82,9 @@ def simulate_steps(
 ) -> Iterator[SimulationStep]:
     """Yield one step for each revolution of the lidar during the drive."""
     lidar = settings.lidar
-    wheels = WheelOdometrySimulator(settings.wheels, np.random.default_rng([settings.seed, 0x57]))
+    wheels = WheelOdometrySimulator(
+        settings.wheels, np.random.default_rng([settings.seed, 0x57]), settings.slips_per_km
+    )
     noise = np.random.default_rng([settings.seed, 0x4C49])
     period_ns, tick_ns = round(1e9 / lidar.rate_hz), round(1e9 / settings.wheels.rate_hz)
     blind = [s for s in stretches if s.kind == "blind"]

@@ -28,3 +28,4 @@ class OfficeSettings:
     lidar: LidarSettings = field(default_factory=lambda: LidarSettings(range_max_m=25.0, glass=True))
     # Each encoder reading costs time in the SLAM's input; 20 Hz is common for bases of service robots.
     wheels: WheelSettings = field(default_factory=lambda: WheelSettings(rate_hz=20.0))
+    slips_per_km: float = 10.0  # of one wheel, for example at the edge of a carpet
