@@ -8,6 +8,8 @@ import pytest
 from beamsplat.common.errors import UserError
 from beamsplat.services.localization.lidar2d import se2
 from beamsplat.services.localization.lidar2d.job_runner import JobRunner
+from beamsplat.services.localization.lidar2d.jobs import run_job
+from beamsplat.services.localization.lidar2d.map_saver import MapSaver
 from beamsplat.services.localization.lidar2d.metrics import trajectory_errors
 from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
 from beamsplat.services.localization.lidar2d.slam import LidarSlam
@@ -245,6 +247,17 @@ def test_save_load_and_continue(mapped, tmp_path):
     pose_world_map = se2.compose(truth[0], se2.inverse(slam.trajectory()[1][0]))
     placed = se2.compose_many(pose_world_map, again.trajectory()[1][-len(more) :])
     assert np.hypot(*(placed - more)[:, :2].T).max() < 0.08
+
+
+def test_a_job_adds_only_its_loop_closures_to_a_saved_map(mapped, tmp_path):
+    slam = mapped[0]
+    saver = MapSaver(tmp_path, SETTINGS)
+    saver.save(slam.saved())
+    whole, nodes = saver.bytes_written, len(slam.pose_graph.nodes)
+    assert whole / nodes < 8.2 * 360 + 2 * 360 + 64 + 2000  # a scan of 360 beams, and its share of submaps
+    slam.pose_graph.apply(run_job(slam.pose_graph.snapshot()))
+    saver.save(slam.saved())
+    assert saver.bytes_written - whole < 0.02 * whole
 
 
 def test_pure_localization_does_not_change_the_map(mapped, tmp_path):
