@@ -46,7 +46,7 @@ class Drive:
     compression: CompressionMode | None = None  # ROS 2 only
 
 
-class _Bag:
+class RobotBag:
     """rosbags' two writers behind one face."""
 
     def __init__(self, path: Path, kind: str) -> None:
@@ -130,7 +130,7 @@ def edges_of(drive: Drive) -> list[tuple[str, str, np.ndarray]]:
 def write_bag(folder: Path, kind: str, drive: Drive) -> Path:
     """Writes one bag; its path (a file for ROS 1, a folder for ROS 2)."""
     path = folder / ("drive.bag" if kind == "ros1" else "drive")
-    bag = _Bag(path, kind)
+    bag = RobotBag(path, kind)
     if drive.compression is not None:
         bag.writer.set_compression(drive.compression, CompressionFormat.ZSTD)
     with bag.writer:
@@ -141,7 +141,7 @@ def write_bag(folder: Path, kind: str, drive: Drive) -> Path:
     return path
 
 
-def _moment(bag: _Bag, drive: Drive, i: int, now_ns: int) -> None:
+def _moment(bag: RobotBag, drive: Drive, i: int, now_ns: int) -> None:
     stamp_ns = now_ns if drive.stamped else 0
     if drive.odometry:
         bag.write("/odom", _odometry(bag, drive, i, stamp_ns), now_ns)
@@ -160,7 +160,7 @@ def _moment(bag: _Bag, drive: Drive, i: int, now_ns: int) -> None:
         )
         bag.write("/pose", stamped, now_ns)
     for topic in ["/scan"] * drive.scan + [drive.extra_scan] * bool(drive.extra_scan):
-        bag.write(topic, _scan(bag, i, stamp_ns), now_ns + LAG_NS, corrupt=0 < i <= drive.corrupt_scans)
+        bag.write(topic, laser_scan(bag, i, stamp_ns), now_ns + LAG_NS, corrupt=0 < i <= drive.corrupt_scans)
 
 
 def _odometry(bag, drive, i, stamp_ns):
@@ -175,7 +175,7 @@ def _odometry(bag, drive, i, stamp_ns):
     )  # fmt: skip
 
 
-def _scan(bag, i, stamp_ns):
+def laser_scan(bag, i, stamp_ns):
     ranges = np.full(36, 2.0 + 0.01 * i, np.float32)
     ranges[:2] = np.inf, np.nan
     return bag.new(
@@ -199,16 +199,26 @@ def _image(bag, drive, i, stamp_ns):
 
 
 def _info(bag, drive, stamp_ns):
-    width, height = drive.info_px
-    K = np.array([drive.fx_px, 0, (width - 1) / 2, 0, drive.fx_px, (height - 1) / 2, 0, 0, 1])
-    P = np.hstack([K.reshape(3, 3), np.zeros((3, 1))]).ravel()
+    return camera_info(bag, stamp_ns, drive.fx_px, drive.info_px, drive.distortion, frame=drive.camera_frame)
+
+
+def camera_info(
+    bag, stamp_ns, fx, size, distortion=("plumb_bob", []), roi=(0, 0, 0, 0), binning=(0, 0), centre=None,
+    p_fx=None, frame="camera_optical_frame",
+):  # fmt: skip
+    """A CameraInfo; `centre`: principal point, by default the middle; `p_fx`: focal length in P."""
+    width, height = size
+    cx, cy = centre or ((width - 1) / 2, (height - 1) / 2)
+    K = np.array([fx, 0, cx, 0, fx, cy, 0, 0, 1.0])
+    P = np.array([p_fx or fx, 0, cx, 0, 0, p_fx or fx, cy, 0, 0, 0, 1.0, 0])
     matrices = dict(
-        zip("DKRP" if bag.ros1 else "dkrp", (np.array(drive.distortion[1]), K, np.eye(3).ravel(), P))
+        zip("DKRP" if bag.ros1 else "dkrp", (np.array(distortion[1], np.float64), K, np.eye(3).ravel(), P))
     )
-    roi = bag.new(
-        "sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
+    x, y, w, h = roi
+    region = bag.new(
+        "sensor_msgs/msg/RegionOfInterest", x_offset=x, y_offset=y, height=h, width=w, do_rectify=False
     )
     return bag.new(
-        "sensor_msgs/msg/CameraInfo", header=bag.header(stamp_ns, drive.camera_frame), height=height, width=width,
-        distortion_model=drive.distortion[0], binning_x=0, binning_y=0, roi=roi, **matrices,
+        "sensor_msgs/msg/CameraInfo", header=bag.header(stamp_ns, frame), height=height, width=width,
+        distortion_model=distortion[0], binning_x=binning[0], binning_y=binning[1], roi=region, **matrices,
     )  # fmt: skip
