@@ -30,6 +30,7 @@ from beamsplat.common.messages import (
     Odometry,
     Rig,
     Scan,
+    WheelOdometry,
 )  # fmt: skip
 from beamsplat.common.messages.header import Header
 from beamsplat.common.messages.image_codec import decode_rgb
@@ -85,6 +86,7 @@ class FusionNode(Node):
         "lidar/scan",
         "localization/odometry",
         "localization/movers",
+        Input("wheel/odometry", "latest"),  # for the check of the calibration only
         Input("keyframes/decision", feedback=True),
     )
     outputs = ("keyframes/candidate", "fusion/depth", "fusion/cloud")
@@ -143,6 +145,12 @@ class FusionNode(Node):
             self._history.add_scan(TimedScan.of(scan))
             if self._history.expired != expired:
                 self._update_detail()
+        return iter(())
+
+    def on_wheel_odometry(self, odometry: WheelOdometry) -> Outputs:
+        """Store a pose of the wheels, which tell whether the lidar is mirrored or turned on its mount."""
+        if self._check is not None:
+            self._check.add_wheels(odometry.stamp_ns, odometry.T_odom_body)
         return iter(())
 
     def on_localization_movers(self, movers: MovingBeams) -> Outputs:

@@ -135,6 +135,32 @@ def uncertainties(
 
 
 @app.command()
+def diagnosis(
+    data: Annotated[Path, typer.Option(help="Folder or bag with camera, lidar and wheel odometry")],
+    start_s: Annotated[float, typer.Option(min=0.0, help="Seconds after the start of the recording")] = 0.0,
+    duration_s: Annotated[float, typer.Option(min=20.0, help="Seconds used for each fault")] = 40.0,
+    as_json: JsonOption = False,
+) -> None:
+    """Plant twelve faults in a drive and show what the check of the calibration says about each.
+
+    Example: beamsplat bench diagnosis --data recordings/house_a
+    """
+    from beamsplat.tools.bench.diagnosis import bench_diagnosis
+
+    rows = [
+        {
+            "fault": row.fault.name, "right": row.right, "cause": row.health.cause if row.health else "",
+            "status": row.health.status if row.health else "not enough data",
+        }
+        for row in bench_diagnosis(data, start_s, duration_s, lambda text: console.print(text, markup=False))
+    ]  # fmt: skip
+    if as_json:
+        print(json.dumps(rows))
+    else:
+        print(f"{sum(row['right'] for row in rows)} of {len(rows)} named right")
+
+
+@app.command()
 def paper(
     data: Annotated[
         Path, typer.Option(help="Folder with bag/ and its ground truth, or a bag that contains poses")

@@ -208,7 +208,7 @@ def motion_report(drive: RecordedDrive, found: MotionCalibration) -> dict[str, A
         if np.isfinite(sigma) and not sure:
             unknown.append(name.rsplit("_", 1)[0])
     report["not_observable"] = [*unknown, "z: a body on a floor never moves along z"]
-    report["status"] = describe_calibration(found)
+    report["status"] = describe_calibration(found)[1]
     report["T_body_camera"] = found.mount(drive.T_body_camera).tolist()
     return report
 

@@ -172,10 +172,6 @@ class _Problem:
             if T_a is not None and T_b is not None:
                 self._T_bodies[k], self._known[k] = inverse(T_b) @ T_a, True
 
-    def conjugate_motions(self, X: np.ndarray) -> None:
-        """Replace the body motions T by X T X^-1, as another mounting of the lidar would measure them."""
-        self._T_bodies = X @ self._T_bodies @ np.linalg.inv(X)
-
     def cost(self, x: np.ndarray) -> float:
         """Return the mean robust cost (Cauchy, scale 1 px) of the corners whose poses are known."""
         r = self.residuals(x)
@@ -286,27 +282,6 @@ class _Problem:
             if np.all(np.abs(delta) < 0.1 * _STEP[columns]):
                 break
         return x
-
-
-def motion_misfit(
-    pairs: list[TrackedPair],
-    pose_at: Callable[[int], np.ndarray | None],
-    T_body_camera: np.ndarray,
-    focal_px: float,
-    X: np.ndarray | None = None,
-) -> float:
-    """Return the median distance (px) between tracked corners and their positions predicted from the poses.
-
-    If `X` [4, 4] is passed, each body motion T is replaced by X T X^-1, the motion that another mounting of
-    the lidar would measure.
-    """
-    problem = _Problem(pairs, pose_at, T_body_camera, focal_px)
-    start = np.zeros(len(PARAMETERS))
-    problem.residuals(start)
-    if X is not None:
-        problem.conjugate_motions(X)
-    r = np.abs(problem.residuals(start))
-    return float(np.median(r[r > 0.0])) if np.any(r > 0.0) else float("nan")
 
 
 def reprojection(

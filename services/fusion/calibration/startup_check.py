@@ -1,26 +1,35 @@
 """Calibration check at every start: camera clock, camera mount and lidar mounting against the images.
 
 During the first metres of a drive, corners are tracked between images and a few scans are stored. One
-background job then checks whether the lidar is mirrored or rotated, and estimates the clock offset and the
-orientation of the camera.
+background job then compares what could be wrong by its evidence (diagnosis.py), and, if the model explains
+the data, estimates the clock offset and the orientation of the camera.
 """
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
 from beamsplat.common.geometry.camera import Pinhole
 from beamsplat.common.geometry.trajectory import Trajectory
-from beamsplat.common.geometry.transforms import inverse, so3_exp
+from beamsplat.common.geometry.transforms import inverse
+from beamsplat.services.fusion.calibration.diagnosis import (
+    SMALL,
+    Evidence,
+    WheelEvidence,
+    compare_with_wheels,
+    sentence,
+    weigh,
+)
+from beamsplat.services.fusion.calibration.hypotheses import CornerProblem
 from beamsplat.services.fusion.calibration.motion import (
     MotionCalibration,
     TrackedPair,
-    motion_misfit,
+    apply_correction,
     solve_motion,
 )
 from beamsplat.services.fusion.calibration.mounting import check_mounting
@@ -40,8 +49,9 @@ _DRIFT_RAD_S = np.radians(0.012)
 _FREE = ("clock_s", "roll_rad", "pitch_rad", "yaw_rad")
 _CLOCK_MS, _ANGLE_DEG, _SIGMAS = 20.0, 0.7, 5.0  # least errors that are reported, and sigmas
 _MISFIT_PX = 1.5  # a larger residual is a fault
-_DOUBT_PX = 0.3  # with a larger residual other mountings of the lidar are tried
-_CLEARLY = 0.5  # another mounting is accepted if its residual is below this share of the present one
+_LARGE_TURN_RAD = 0.1  # beyond the prior of `solve_motion`: its start is corrected first
+_LEAST_EXPLAINED = 0.4  # of the corners: fewer, and no hypothesis is trusted
+_UNEXPLAINED = 0.3  # cost (mean of log(1 + r^2)) of the best hypothesis: none explains the data
 
 
 @dataclass(frozen=True)
@@ -55,6 +65,7 @@ class CalibrationHealth:
     turn_deg: np.ndarray  # float64 [3]: roll, pitch, yaw to add to the mount; NaN = not observable
     turn_sigma_deg: np.ndarray  # float64 [3], standard errors
     pairs: int
+    cause: str = "ok"  # of the fault, see `diagnosis.HYPOTHESES`; "clock", "mount", "unknown", "unchecked"
 
     @property
     def line(self) -> str:
@@ -73,7 +84,7 @@ class StartupCheck:
         self, camera: Pinhole, T_body_camera: np.ndarray, T_body_lidar: np.ndarray, pairs: int = 60
     ) -> None:
         height = round(camera.height_px * _WIDTH_PX / camera.width_px)
-        self._camera = camera.resized(_WIDTH_PX, height)
+        self._camera, self._full = camera.resized(_WIDTH_PX, height), camera
         self._T_body_camera, self._T_body_lidar = T_body_camera, T_body_lidar
         self._wanted = pairs
         self._pairs: list[TrackedPair] = []
@@ -81,6 +92,7 @@ class StartupCheck:
         self._stamps: list[int] = []
         self._poses: list[np.ndarray] = []
         self._scans: list[tuple[np.ndarray, np.ndarray]] = []
+        self._wheels: deque[tuple[int, np.ndarray]] = deque(maxlen=_MAX_POSES)
         self.done = False
 
     @property
@@ -90,7 +102,7 @@ class StartupCheck:
     def add_pose(self, stamp_ns: int, T_map_body: np.ndarray) -> None:
         """Add a pose of localization. A stamp earlier than the previous one restarts the check."""
         if self._stamps and stamp_ns <= self._stamps[-1]:
-            for kept in (self._pairs, self._images, self._stamps, self._poses, self._scans):
+            for kept in (self._pairs, self._images, self._stamps, self._poses, self._scans, self._wheels):
                 kept.clear()
         self._stamps.append(stamp_ns)
         self._poses.append(T_map_body)
@@ -99,6 +111,11 @@ class StartupCheck:
         elif len(self._stamps) > _MAX_POSES:  # too few pairs for long: the check uses the newest ones
             del self._stamps[: _MAX_POSES // 2], self._poses[: _MAX_POSES // 2]
             self._pairs = [pair for pair in self._pairs if pair.stamp_a_ns >= self._stamps[0]]
+
+    def add_wheels(self, stamp_ns: int, T_odom_body: np.ndarray) -> None:
+        """Add a pose of the wheel odometry; those not later than the newest one are ignored."""
+        if not self.done and (not self._wheels or stamp_ns > self._wheels[-1][0]):
+            self._wheels.append((stamp_ns, T_odom_body))
 
     def add_scan(self, points_lidar_m: np.ndarray, T_map_body: np.ndarray) -> None:
         """Add the returns float64 [N, 3] of a scan, lidar frame; scans nearer than 0.25 m are ignored."""
@@ -143,12 +160,23 @@ class StartupCheck:
         self._pairs, self._scans = [], []
         self._stamps, self._poses = [], []
         self._images.clear()
-        T_body_camera, T_body_lidar, focal_px = self._T_body_camera, self._T_body_lidar, self._camera.fx_px
+        wheels = _trajectory_of(self._wheels)
+        self._wheels.clear()
+        T_body_camera, T_body_lidar, camera = self._T_body_camera, self._T_body_lidar, self._full
 
         def pose_at(stamp_ns: int) -> np.ndarray | None:
             return trajectory.at(stamp_ns, max_gap_ns=_POSE_GAP_NS, max_extrapolation_ns=0)
 
-        return lambda: check_calibration(pairs, scans, pose_at, T_body_camera, T_body_lidar, focal_px)
+        def check() -> CalibrationHealth:
+            compared = None
+            if wheels is not None:
+                compared = compare_with_wheels(
+                    trajectory.stamps_ns, trajectory.T_a_b,
+                    lambda at: wheels.at(at, max_gap_ns=_POSE_GAP_NS, max_extrapolation_ns=0), T_body_lidar,
+                )  # fmt: skip
+            return check_calibration(pairs, scans, pose_at, T_body_camera, T_body_lidar, camera, compared)
+
+        return check
 
 
 def check_calibration(
@@ -157,84 +185,104 @@ def check_calibration(
     pose_at: Callable[[int], np.ndarray | None],
     T_body_camera: np.ndarray,
     T_body_lidar: np.ndarray,
-    focal_px: float,
+    camera: Pinhole,  # undistorted, of the images before they were scaled down
+    wheels: WheelEvidence | None = None,
 ) -> CalibrationHealth:
-    """Return the health of the calibration: check the lidar mounting, then clock and mount of the camera.
+    """Return the health of the calibration: the cause with the best evidence, or an error of clock or mount.
 
-    The lidar is checked first, because with a wrong lidar mounting the camera cannot be checked.
+    An offset is named only if the model with it explains the corners: with another fault, the offset that
+    fits best would be wrong advice. `wheels`: None = no wheel odometry.
     """
     nothing = np.full(3, np.nan)
-    misfit = motion_misfit(pairs, pose_at, T_body_camera, focal_px)
+
+    def fault(cause: str, status: str, misfit_px: float) -> CalibrationHealth:
+        return CalibrationHealth(status, misfit_px, np.nan, np.nan, nothing, nothing, len(pairs), cause)
+
+    small = camera.resized(_WIDTH_PX, round(camera.height_px * _WIDTH_PX / camera.width_px))
+    corner = ((-0.5 - small.cx_px) / small.fx_px, (-0.5 - small.cy_px) / small.fy_px)
+    problem = CornerProblem(pairs, pose_at, T_body_camera, T_body_lidar, small.fx_px, corner)
+    evidence = weigh(problem, wheels)
     against_poses = check_mounting([p for p, _ in scans], [T for _, T in scans], T_body_lidar)
-    fault = against_poses.status if against_poses.pairs and against_poses.status != "ok" else None
-    fault = fault or _mounting_fault(pairs, pose_at, T_body_camera, T_body_lidar, focal_px, misfit)
-    if fault is not None:
-        return CalibrationHealth(fault, misfit, np.nan, np.nan, nothing, nothing, len(pairs))
-    try:
-        found = solve_motion(pairs, pose_at, T_body_camera, focal_px, _FREE, _DRIFT_RAD_S)
-    except ValueError as error:
-        return CalibrationHealth(
-            f"cannot be checked: {error}", misfit, np.nan, np.nan, nothing, nothing, len(pairs)
+    if (
+        against_poses.pairs
+        and against_poses.status != "ok"
+        and (wheels is None or evidence.cause not in SMALL)
+    ):
+        return fault("lidar", against_poses.status, evidence.best.residual_px)
+    if evidence.cause not in SMALL:
+        text = sentence(evidence, (camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px))
+        return fault(evidence.cause, text, evidence.best.residual_px)
+    if evidence.best.cost > _UNEXPLAINED or evidence.explained_share < _LEAST_EXPLAINED:
+        return fault(
+            "unknown",
+            f"images and poses do not fit ({evidence.best.residual_px:.1f} px), and no error of clock, "
+            "mount, K, lens or lidar explains it: check the poses, and whether camera and lidar are of the "
+            "same drive",
+            evidence.best.residual_px,
         )
+    turn_rad, mount = _large_turn(evidence), T_body_camera
+    if np.any(turn_rad):
+        mount = apply_correction(T_body_camera, turn_rad)
+    try:
+        found = solve_motion(pairs, pose_at, mount, small.fx_px, _FREE, _DRIFT_RAD_S)
+    except ValueError as error:
+        return fault("unchecked", f"cannot be checked: {error}", evidence.best.residual_px)
+    found = replace(found, values=found.values + turn_rad)
     observable = found.observable
+    cause, status = describe_calibration(found, _CLOCK_MS, _ANGLE_DEG, _SIGMAS, evidence.clock_first)
     return CalibrationHealth(
-        describe_calibration(found, _CLOCK_MS, _ANGLE_DEG, _SIGMAS), found.residual_px,
+        status, found.residual_px,
         1e3 * found.values[0] if observable[0] else np.nan, 1e3 * found.sigma[0] if observable[0] else np.nan,
         np.where(observable[1:4], np.degrees(found.values[1:4]), np.nan),
-        np.where(observable[1:4], np.degrees(found.sigma[1:4]), np.nan), len(pairs),
+        np.where(observable[1:4], np.degrees(found.sigma[1:4]), np.nan), len(pairs), cause,
     )  # fmt: skip
 
 
-def _mounting_fault(
-    pairs: list[TrackedPair], pose_at: Callable[[int], np.ndarray | None], T_body_camera: np.ndarray,
-    T_body_lidar: np.ndarray, focal_px: float, misfit_px: float,
-) -> str | None:  # fmt: skip
-    """Return one sentence if another mounting of the lidar fits the images clearly better, else None.
+def _large_turn(evidence: Evidence) -> np.ndarray:
+    """Return the turn of the mount by the best fit, float64 [6] as `PARAMETERS`; zeros if it is small."""
+    turn = np.zeros(6)
+    turn[1:4] = [evidence.best.values.get(name, 0.0) for name in ("roll", "pitch", "yaw")]
+    return turn if np.abs(turn).max() > _LARGE_TURN_RAD else np.zeros(6)
 
-    Poses estimated from scans of a wrongly mounted lidar agree with those scans; only another sensor shows
-    the fault. `misfit_px`: result of `motion_misfit` with the calibrated mounting.
-    """
-    if not misfit_px > _DOUBT_PX:
+
+def _trajectory_of(poses: deque[tuple[int, np.ndarray]]) -> Trajectory | None:
+    if len(poses) < 2:
         return None
-    flip, half_turn = np.diag([1.0, -1.0, 1.0, 1.0]), np.eye(4)
-    half_turn[:3, :3] = so3_exp(np.array([0.0, 0.0, np.pi]))
-    mountings = {
-        "mirrored (upside down, or angles counted the other way)": flip,
-        "turned round by 180 degrees": half_turn,
-        "mirrored and turned round by 180 degrees": half_turn @ flip,
-    }
-    fits = {}
-    for name, change in mountings.items():
-        X = T_body_lidar @ change @ inverse(T_body_lidar)
-        fits[name] = motion_misfit(pairs, pose_at, T_body_camera, focal_px, X)
-    best = min(fits, key=lambda name: fits[name])
-    if fits[best] > _CLEARLY * misfit_px:
-        return None
-    return (
-        f"the lidar is {best}: images then fit its poses within {fits[best]:.1f} px "
-        f"instead of {misfit_px:.1f} px; correct its mounting in the rig file"
-    )
+    return Trajectory(np.array([at for at, _ in poses], dtype=np.int64), np.array([T for _, T in poses]))
 
 
 def describe_calibration(
-    found: MotionCalibration, clock_ms: float = 10.0, angle_deg: float = 0.5, sigmas: float = 4.0
-) -> str:
-    """Return "ok", or one sentence about the error of clock or mount.
+    found: MotionCalibration,
+    clock_ms: float = 10.0,
+    angle_deg: float = 0.5,
+    sigmas: float = 4.0,
+    clock_first: bool = True,
+) -> tuple[str, str]:
+    """Return (cause, status): ("ok", "ok"), or the larger error of clock or mount with one sentence about it.
 
-    Errors below `clock_ms` or `angle_deg`, or below `sigmas` standard errors, are ignored.
+    Errors below `clock_ms` or `angle_deg`, or below `sigmas` standard errors, are ignored. `clock_first`:
+    whether the clock is named if both are wrong.
     """
+    errors = []
     off_ms, sigma_ms = 1e3 * found.values[0], 1e3 * found.sigma[0]
     if found.observable[0] and abs(off_ms) > max(clock_ms, sigmas * sigma_ms):
-        return f"the camera's clock is wrong: add {off_ms:.0f} +- {sigma_ms:.0f} ms to its stamps"
+        text = f"the camera's clock is wrong: add {off_ms:.0f} +- {sigma_ms:.0f} ms to its stamps"
+        errors.append(("clock", text))
     turn_deg, turn_sigma = np.degrees(found.values[1:4]), np.degrees(found.sigma[1:4])
-    for name, value, sigma, sure in zip(
-        ("roll", "pitch", "yaw"), turn_deg, turn_sigma, found.observable[1:4]
-    ):
-        if sure and abs(value) > max(angle_deg, sigmas * sigma):
-            return f"the camera's {name} is wrong: turn its mount by {value:.2f} +- {sigma:.2f} degrees"
+    turns = [
+        (abs(value), f"the camera's {name} is wrong: turn its mount by {value:.2f} +- {sigma:.2f} degrees")
+        for name, value, sigma, sure in zip(
+            ("roll", "pitch", "yaw"), turn_deg, turn_sigma, found.observable[1:4]
+        )
+        if sure and abs(value) > max(angle_deg, sigmas * sigma)
+    ]
+    if turns:
+        errors.append(("mount", max(turns)[1]))
+    if errors:
+        return errors[0] if clock_first else errors[-1]
     if found.residual_px > _MISFIT_PX:
-        return f"images and poses do not fit ({found.residual_px:.1f} px): wrong K, or wrong poses"
-    return "ok"
+        return "unknown", f"images and poses do not fit ({found.residual_px:.1f} px): wrong K, or wrong poses"
+    return "ok", "ok"
 
 
 def _apart(T_a: np.ndarray, T_b: np.ndarray, way_m: float, turn_rad: float) -> bool:

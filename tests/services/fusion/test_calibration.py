@@ -23,14 +23,14 @@ def _pose(stamp_ns):
     )
 
 
-def _drive(mount, clock_s=0.0, count=80, pose=_pose):
+def _drive(mount, clock_s=0.0, count=80, pose=_pose, lowest_m=1.0):
     rng = np.random.default_rng(4)
     pairs = []
     for k in range(count):
         a, b = round(k * 0.4e9), round((k * 0.4 + 0.3) * 1e9)
         T_a, T_b = pose(a) @ mount, pose(b) @ mount
         points = np.column_stack(
-            [rng.uniform(-1.5, 1.5, 40), rng.uniform(-1, 1, 40), rng.uniform(1.5, 6, 40)]
+            [rng.uniform(-1.5, 1.5, 40), rng.uniform(-1, lowest_m, 40), rng.uniform(1.5, 6, 40)]
         )
         moved = transform_points(inverse(T_b) @ T_a, points)
         noise = np.column_stack([rng.normal(0, 0.15 / 265, (40, 2)), np.zeros(40)])

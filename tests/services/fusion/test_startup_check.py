@@ -3,20 +3,30 @@
 import numpy as np
 import pytest
 
+from beamsplat.common.geometry.camera import Pinhole
 from beamsplat.common.geometry.transforms import inverse, se2_to_se3, so3_exp, transform_points
+from beamsplat.services.fusion.calibration.diagnosis import WheelEvidence, compare_with_wheels
 from beamsplat.services.fusion.calibration.motion import TrackedPair, apply_correction
 from beamsplat.services.fusion.calibration.startup_check import StartupCheck, check_calibration
+from beamsplat.tools.bench.diagnosis import bench_diagnosis
 from tests.services.fusion.room import CAMERA, LIDAR_Z, T_BODY_CAMERA, render, scan
-from tests.services.fusion.test_calibration import MOUNT, _drive, _pose
+from tests.services.fusion.test_calibration import MOUNT, _pose
+from tests.services.fusion.test_calibration import _drive as _corners
 
 T_BODY_LIDAR = np.eye(4)
+SMALL = Pinhole(265.0, 265.0, 159.5, 119.5, 320, 240)
 FLIP = np.diag([1.0, -1.0, 1.0, 1.0])
 HALF_TURN = np.eye(4)
 HALF_TURN[:3, :3] = so3_exp(np.array([0.0, 0.0, np.pi]))
 
 
-def _check(pairs, pose=_pose, mount=MOUNT, scans=()):
-    return check_calibration(pairs, list(scans), pose, mount, T_BODY_LIDAR, 265.0)
+def _drive(mount, clock_s=0.0):
+    """The drive of the tests of the calibration, without corners under the floor."""
+    return _corners(mount, clock_s, lowest_m=0.25)
+
+
+def _check(pairs, pose=_pose, mount=MOUNT, scans=(), wheels=None):
+    return check_calibration(pairs, list(scans), pose, mount, T_BODY_LIDAR, SMALL, wheels)
 
 
 def test_a_right_robot_is_ok_with_figures():
@@ -112,3 +122,60 @@ def test_poses_are_bounded_while_too_few_images_can_be_used():
         check.add_pose(i * 10**8, np.eye(4))
     assert len(check._poses) == len(check._stamps) <= 12_000
     assert not check._pairs  # there are no poses of its time any more
+
+
+def _changed(pairs, change):
+    """The rays [N, 3] of all corners, changed."""
+    return [TrackedPair(p.stamp_a_ns, p.stamp_b_ns, change(p.rays_a), change(p.rays_b)) for p in pairs]
+
+
+@pytest.mark.parametrize(
+    ("cause", "change"),
+    [
+        ("images upside down", lambda rays: rays * [-1, -1, 1]),
+        ("principal point", lambda rays: np.add(rays, [0.2, 0.1, 0.0])),
+        ("K", lambda rays: rays * [1.3, 1.3, 1.0]),
+        ("distortion", lambda rays: rays * (1 - 0.25 * np.sum(rays[:, :2] ** 2, axis=1, keepdims=True) * [1, 1, 0])),
+        ("images turned left", lambda rays: rays[:, [1, 0, 2]] * [-1, 1, 1]),
+    ],
+)  # fmt: skip
+def test_a_fault_of_the_images_is_not_called_an_offset(cause, change):
+    """Before: EXIF rotation was "lidar mirrored", a region of interest "clock", missing distortion "yaw"."""
+    wheels = WheelEvidence("ok", 0.0)
+    health = _check(_changed(_drive(MOUNT), change), wheels=wheels)
+    assert health.cause == cause
+    assert np.isnan(health.clock_ms)
+
+
+def test_the_wheels_tell_a_mirrored_image_from_a_mirrored_lidar():
+    stamps = np.arange(0, 30 * 10**9, 10**8)
+    wheels = np.array([_pose(int(s)) for s in stamps])
+    flipped = FLIP @ wheels @ FLIP
+    assert compare_with_wheels(stamps, wheels, _pose, T_BODY_LIDAR).mounting == "ok"
+    mirrored = compare_with_wheels(stamps, flipped, _pose, T_BODY_LIDAR)
+    assert mirrored.mounting == "lidar mirrored"
+    turned = HALF_TURN @ wheels @ inverse(HALF_TURN)
+    assert compare_with_wheels(stamps, turned, _pose, T_BODY_LIDAR).mounting == "lidar turned"
+    images = _changed(_drive(MOUNT), lambda rays: rays * [-1, 1, 1])
+    assert _check(images, wheels=WheelEvidence("ok", 0.0)).cause == "images mirrored"
+    assert _check(_drive(MOUNT), lambda s: FLIP @ _pose(s) @ FLIP, wheels=mirrored).cause == "lidar mirrored"
+
+
+def test_poses_of_another_drive_give_no_advice():
+    rng = np.random.default_rng(2)
+    noise = _changed(
+        _drive(MOUNT),
+        lambda rays: rays + np.column_stack([rng.normal(0, 0.1, (len(rays), 2)), np.zeros(len(rays))]),
+    )
+    health = _check(noise)
+    assert health.cause in ("unknown", "unchecked")
+    assert np.isnan(health.clock_ms)
+
+
+@pytest.mark.slow
+def test_the_right_cause_is_named_for_eleven_of_twelve_planted_faults(shared_dir):
+    found = list(bench_diagnosis(shared_dir / "data" / "house_a"))
+    assert found[0].health.status == "ok"
+    wrong = [row.fault.name for row in found if not row.right]
+    assert len(found) == 13
+    assert len(wrong) <= 1, wrong
