@@ -79,8 +79,8 @@ class OfficeRoom:
 
     def line(self, out: SegmentList, u1: float, v1: float, u2: float, v2: float, glass: bool = False) -> None:
         """Add one segment in the axes of the room."""
-        a, b = self.to_floor(np.array([[u1, v1], [u2, v2]]))
-        out.line(*a.tolist(), *b.tolist(), glass)
+        x1, y1, x2, y2 = self.to_floor(np.array([[u1, v1], [u2, v2]])).ravel().tolist()
+        out.line(x1, y1, x2, y2, glass)
 
 
 def room_walls(out: SegmentList, room: OfficeRoom, rng: np.random.Generator, *, plain: bool) -> None:
