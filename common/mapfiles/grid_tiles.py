@@ -61,7 +61,7 @@ class TiledGrid:
         self._max_tiles = max_tiles
 
     def add(self, source: GridSource, row: int, column: int, packed: bytes) -> bool:
-        """Store a tile, or remove it if it is empty; tiles of another source remove all earlier ones.
+        """Store a tile, or remove it if no cell is known; tiles of another source remove all earlier ones.
 
         Returns:
             Whether the source is another one than before.
@@ -69,11 +69,11 @@ class TiledGrid:
         Raises:
             ValueError: the tile is damaged, or there are too many; the grid is unchanged.
         """
-        unpack_tile(packed, source.size)
+        known = (unpack_tile(packed, source.size) >= 0).any()
         changed = source != self.source
         if changed:
             self.source, self.tiles = source, {}
-        if not packed:
+        if not known:
             self.tiles.pop((row, column), None)
         elif len(self.tiles) >= self._max_tiles and (row, column) not in self.tiles:
             raise ValueError(f"grid tile ({row}, {column}): more than {self._max_tiles} tiles in one grid")

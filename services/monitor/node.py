@@ -19,6 +19,7 @@ from beamsplat.common.messages import FusedDepth, Health, MapChunk, MapStatus, O
 from beamsplat.common.messages.header import Header
 from beamsplat.common.runtime.node import Input, Node, Output
 from beamsplat.services.monitor.depth_layer import DepthLayer
+from beamsplat.services.monitor.grid_layer import GridLayer
 from beamsplat.services.monitor.layout import layout
 from beamsplat.services.monitor.map_layer import MapLayer
 from beamsplat.services.monitor.panel import HealthPanel, NodeReport
@@ -108,7 +109,9 @@ SCENE: dict[Input, Draw] = {
     Input("localization/anchors", "latched"): lambda scene, _, m: scene.anchors(
         m.stamp_ns, m.anchor_ids, m.T_map_anchor
     ),
-    Input("localization/grid", "every"): lambda scene, _, m: scene.grid_tile(
+}  # fmt: skip
+GRID: dict[Input, Draw] = {
+    Input("localization/grid", "every"): lambda view, _, m: view.tile(
         m.stamp_ns, GridSource(m.map_uuid, m.since_ns, m.resolution_m, m.size), (m.row, m.column),
         m.packed.tobytes(), m.remaining == 0,
     ),
@@ -142,19 +145,19 @@ _Handlers: Any = type(
     (),
     {
         entry.row.handler: _handler(view, draw)
-        for view, rows in (("scene", SCENE), ("depth_layer", DEPTH), ("map_layer", MAP))
+        for view, rows in (("scene", SCENE), ("grid_layer", GRID), ("depth_layer", DEPTH), ("map_layer", MAP))
         for entry, draw in rows.items()
     },
 )
 
 
 class MonitorNode(_Handlers, Node):
-    """Draws the topics of `SCENE`, `DEPTH` and `MAP`, and the health of all nodes."""
+    """Draws the topics of `SCENE`, `GRID`, `DEPTH` and `MAP`, and the health of all nodes."""
 
     name = "monitor"
     Config = MonitorConfig
     config: MonitorConfig
-    inputs = (*SCENE, *DEPTH, CHUNK, *MAP)
+    inputs = (*SCENE, *GRID, *DEPTH, CHUNK, *MAP)
     _header: Header | None = None
 
     def check_resources(self) -> None:
@@ -177,6 +180,7 @@ class MonitorNode(_Handlers, Node):
         limits = RateLimit({"health": 1.0, **{kind: getattr(c, f"{kind}_hz") for kind in kinds}})
         self.panel = HealthPanel(self.writer, limits)
         self.scene = Scene(self.writer, limits, SceneStyle(c.path_points, c.path_step_m, c.body_size_m))
+        self.grid_layer = GridLayer(self.writer, limits)
         self.depth_layer = DepthLayer(self.writer, limits, c.clouds)
         self.map_layer = MapLayer(self.writer, limits)
         self.detail = self.writer.status
@@ -242,6 +246,7 @@ class MonitorNode(_Handlers, Node):
 
     def drain(self) -> tuple[Output, ...]:
         self.scene.finish()
+        self.grid_layer.finish()
         for fault in self.map_layer.finish():
             self._not_drawn("MapChunk", fault, self.scene.newest_ns)
         self.writer.flush()

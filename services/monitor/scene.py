@@ -2,7 +2,6 @@
 
 Entities:
     map                        the map frame, z up
-    map/grid/<row>_<column>    tiles of the occupancy grid
     map/anchors                lidar submaps
     map/scan                   the newest scan, deskewed
     map/path/<source>          the robot's path by each source of poses
@@ -21,7 +20,6 @@ import rerun as rr
 
 from beamsplat.common.geometry.tracks import BoundedPath, PoseBuffer, RateLimit, scan_points, sweep_to_world
 from beamsplat.common.geometry.transforms import inverse, quat_xyzw_from_matrix, transform_points
-from beamsplat.common.mapfiles.grid_tiles import GridSource, TiledGrid
 from beamsplat.services.monitor.rerun_writer import RerunWriter
 
 WORLD = "map"
@@ -82,8 +80,6 @@ class Scene:
         self._T_map_wheel: np.ndarray | None = None
         self._T_body_lidar = np.eye(4)
         self._sweeps: deque[_Sweep] = deque()
-        self._grid = TiledGrid()
-        self._undrawn_tiles: dict[tuple[int, int], int] = {}  # (row, column) -> stamp
         self.newest_ns: int | None = None  # newest measurement time
         writer.log(WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         half = np.array(style.body_size_m) / 2.0
@@ -225,66 +221,10 @@ class Scene:
         )  # fmt: skip
         self._writer.log(f"{WORLD}/anchors", arrows, stamp_ns=stamp_ns)
 
-    def grid_tile(
-        self, stamp_ns: int, source: GridSource, place: tuple[int, int], packed: bytes, last: bool
-    ) -> None:
-        """Store a tile of the occupancy grid, and draw the changed ones after the last tile of an update.
-
-        Args:
-            place: row and column of the tile.
-            packed: its cells, see `common.mapfiles.grid_tiles`; the known part is drawn on the floor.
-            last: no tile of the same update follows.
-
-        Raises:
-            ValueError: the tile is damaged.
-        """
-        before = self._grid.tiles.get(place)
-        if self._grid.add(source, *place, packed):
-            self._writer.log(f"{WORLD}/grid", rr.Clear(recursive=True), stamp_ns=stamp_ns)
-            self._undrawn_tiles, before = {}, None
-        if self._grid.tiles.get(place) != before:
-            self._undrawn_tiles[place] = stamp_ns
-        if last and self._undrawn_tiles and self._limits.due("grid", stamp_ns):
-            self._draw_tiles()
-
-    def _draw_tiles(self) -> None:
-        for (row, column), stamp_ns in self._undrawn_tiles.items():
-            entity = f"{WORLD}/grid/{row}_{column}"
-            if (row, column) in self._grid.tiles:
-                self._draw_tile(entity, stamp_ns, row, column)
-            else:
-                self._writer.log(entity, rr.Clear(recursive=False), stamp_ns=stamp_ns)
-        self._undrawn_tiles = {}
-
-    def _draw_tile(self, entity: str, stamp_ns: int, row: int, column: int) -> None:
-        source, occupancy = self._grid.source, self._grid.cells(row, column)
-        assert source is not None  # there is a tile
-        known = occupancy >= 0
-        rows, columns = np.flatnonzero(known.any(axis=1)), np.flatnonzero(known.any(axis=0))
-        part = occupancy[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
-        height, width = part.shape
-        first = np.array([column, row]) * source.size + (columns[0], rows[0])
-        corner_m = source.resolution_m * first
-        drawing = rr.GridMap(
-            data=np.ascontiguousarray(part[::-1]).tobytes(),  # the first row of an image is its top
-            format=rr.components.ImageFormat(
-                width=width, height=height, color_model="L", channel_datatype="U8"
-            ),
-            cell_size=source.resolution_m,
-            translation=[
-                corner_m[0],
-                corner_m[1],
-                -0.01,
-            ],  # below the floor, so that objects on it are not hidden
-            colormap=rr.components.Colormap.RvizMap,
-        )
-        self._writer.log(entity, drawing, stamp_ns=stamp_ns)
-
     def finish(self) -> None:
-        """Draw the scans that still wait for a pose, and the newest tiles of the grid."""
+        """Draw the scans that still wait for a pose."""
         while self._sweeps:
             self._draw_sweep(self._sweeps.popleft())
-        self._draw_tiles()
 
     # --- frames and times ---
 

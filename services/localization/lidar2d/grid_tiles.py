@@ -12,6 +12,7 @@ from beamsplat.services.localization.lidar2d.occupancy import CountGrid, TileSum
 from beamsplat.services.localization.lidar2d.surfel_map import FrozenMap
 
 TILES_PER_UPDATE = 24  # drawn at most; the others follow in the next updates, the oldest change first
+_REPEATED_TILES = 4  # unchanged ones that are sent again with each update, for subscribers that joined late
 _CACHED_SUMS = 32  # tiles whose sums of the finished submaps are kept: 1.3 MB each
 _MOVED_CELLS = 0.4  # a submap is drawn again if a corner has moved by more, in cells of the grid
 
@@ -63,6 +64,7 @@ class GridTiles:
         self.resolution_m = resolution_m
         self.work = Work()
         self.published: dict[Place, bytes] = {}  # packed tiles that contain known cells
+        self._repeated: Place = (0, 0)  # the last tile that was sent again
         self._drawn: dict[int, _Drawn] = {}
         self._covering: dict[Place, set[int]] = {}
         self._growing: frozenset[Place] = frozenset()
@@ -87,6 +89,15 @@ class GridTiles:
             if not exact:
                 break
         return changed
+
+    def repeated(self, changed: dict[Place, bytes]) -> list[tuple[Place, bytes]]:
+        """Return some tiles beside the changed ones to send again: those that follow on the last repeated."""
+        others = sorted(self.published.keys() - changed.keys())
+        later = [place for place in others if place > self._repeated]
+        chosen = [*later, *others][: min(_REPEATED_TILES, len(others))]
+        if chosen:
+            self._repeated = chosen[-1]
+        return [(place, self.published[place]) for place in chosen]
 
     def _mark(self, content: MapContent, tolerance_m: float) -> None:
         """Find the tiles that must be drawn: where submaps are new, have changed, moved, or were removed."""

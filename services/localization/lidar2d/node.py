@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import shutil
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, cast
 
@@ -40,7 +39,6 @@ log = logging.getLogger("beamsplat.localization")
 
 _RESERVED_SUBMAP_IDS = 1000  # upper bound of the submaps started between the last checkpoint and a crash
 _GRID_AFTER_SCANS = 25  # a drawing of the grid is published exactly this many scans after its start, or fewer
-_REPEATED_TILES = 4  # unchanged tiles that are sent again with each update, for subscribers that joined late
 
 
 class LidarLocalizationConfig(NodeConfig):
@@ -88,7 +86,6 @@ class LidarLocalization(Node):
         self._grid: GridTiles | None = None
         self._grid_running = False
         self._grid_since_ns: int | None = None  # stamp of the first tile
-        self._repeated: Place = (0, 0)  # the last tile that was sent again
         self._published_uuid = ""
         self._checkpoint_ns: int | None = None
         self._checkpoint_running = False
@@ -291,7 +288,7 @@ class LidarLocalization(Node):
         assert self._slam is not None
         if self._grid_since_ns is None:
             self._grid_since_ns = self._stamp_ns
-        tiles = [*changed.items(), *self._tiles_to_repeat(grid, changed)]
+        tiles = [*changed.items(), *grid.repeated(changed)]
         for sent, ((row, column), packed) in enumerate(tiles, start=1):
             yield (
                 "localization/grid",
@@ -301,15 +298,6 @@ class LidarLocalization(Node):
                     map_uuid=self._slam.pose_graph.uuid, since_ns=self._grid_since_ns,
                 ),
             )  # fmt: skip
-
-    def _tiles_to_repeat(self, grid: GridTiles, changed: dict[Place, bytes]) -> Iterable[tuple[Place, bytes]]:
-        """Return the tiles that follow, in order of their place, on those that were repeated last."""
-        others = sorted(grid.published.keys() - changed.keys())
-        later = [place for place in others if place > self._repeated]
-        chosen = [*later, *others][: min(_REPEATED_TILES, len(others))]
-        if chosen:
-            self._repeated = chosen[-1]
-        return [(place, grid.published[place]) for place in chosen]
 
 
 def _odometry(result: ScanResult) -> Odometry:

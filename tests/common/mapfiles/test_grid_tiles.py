@@ -58,3 +58,5 @@ def test_damaged_tiles_are_refused_and_change_nothing():
     with pytest.raises(ValueError, match="160 x 160 cells, more than 1000"):
         grid.assembled(max_cells=1000)
     assert (unpack_tile(b"", 16) == -1).all()
+    grid.add(SOURCE, 9, 9, zlib.compress(bytes([200] * 256)))  # no cell is known: all are negative
+    assert list(grid.tiles) == [(0, 0)]

@@ -24,7 +24,7 @@ from beamsplat.common.messages import (
 from beamsplat.common.runtime.lockstep import Lockstep
 from beamsplat.common.runtime.node import Node, SourceItem
 from beamsplat.common.topics import TOPICS
-from beamsplat.services.monitor.node import DEPTH, SCENE, MonitorConfig, MonitorNode
+from beamsplat.services.monitor.node import DEPTH, GRID, SCENE, MonitorConfig, MonitorNode
 from tests.common.tiles import tiles
 
 NS = 1_000_000_000
@@ -316,6 +316,6 @@ def test_a_monitor_without_output_is_rejected():
 
 
 def test_every_row_is_a_topic_and_none_blocks_a_publisher():
-    for entry in (*SCENE, *DEPTH):
+    for entry in (*SCENE, *GRID, *DEPTH):
         assert entry.topic in TOPICS
         assert entry.effective_delivery in ("latest", "latched") or entry.row.history, entry.topic
