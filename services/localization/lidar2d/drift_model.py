@@ -73,6 +73,32 @@ def _propagate(
         out[0, k], out[1, k] = var_m[k] + max(lever, 0.0), var_rad[k]
 
 
+class DriftScale:
+    """Drift of this drive relative to the settings, learnt from the loops that it has closed.
+
+    In a building of identical rooms only the drift tells them apart, and it differs by a factor of ten
+    between lidars. The settings are for the worst; each job with loop closures is one measurement against
+    them.
+    """
+
+    PRIOR_JOBS = 4.0  # the settings count as much as the loop closures of so many jobs
+    LIMITS2 = (0.04, 1.0)
+    MAX_SAMPLE = 4.0  # a wrong loop closure must not open the windows
+
+    def __init__(self) -> None:
+        self._sum, self._jobs = self.PRIOR_JOBS, self.PRIOR_JOBS
+
+    @property
+    def scale2(self) -> float:
+        """Return the squared scale."""
+        return min(max(self._sum / self._jobs, self.LIMITS2[0]), self.LIMITS2[1])
+
+    def add(self, ratio2: float) -> None:
+        """Add the mean squared error of a job's loop closures, relative to the variance by the settings."""
+        self._sum += min(ratio2, self.MAX_SAMPLE)
+        self._jobs += 1.0
+
+
 class DriftModel:
     """Uncertainty of the relative pose of each two submaps, along the most certain path between them."""
 
@@ -82,6 +108,7 @@ class DriftModel:
         pose_map_submap: np.ndarray,  # float64 [S, 3]
         n_nodes: int,
         settings: LidarSlamSettings,
+        scale2: float = 1.0,  # measured drift between submaps relative to the settings, squared
     ) -> None:
         s, n = settings, len(pose_map_submap)
         var_m, var_rad = np.empty(len(edges.node)), np.empty(len(edges.node))
@@ -89,8 +116,8 @@ class DriftModel:
         # second_submap_information(): subtract it, then add it once.
         drift_m2, drift_rad2 = s.submap_drift_sigma_m**2, s.submap_drift_sigma_rad**2
         _variances(edges.information, var_m, var_rad)
-        var_m = np.maximum(var_m - s.submap_nodes * drift_m2, 0.0) + drift_m2
-        var_rad = np.maximum(var_rad - s.submap_nodes * drift_rad2, 0.0) + drift_rad2
+        var_m = np.maximum(var_m - s.submap_nodes * drift_m2, 0.0) + scale2 * drift_m2
+        var_rad = np.maximum(var_rad - s.submap_nodes * drift_rad2, 0.0) + scale2 * drift_rad2
         first = np.searchsorted(edges.node, np.arange(n_nodes + 1)).astype(np.int64)
         degree = np.diff(first)
         pairs = np.empty((int((degree * (degree - 1) // 2).sum()), 2), dtype=np.int64)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -41,6 +42,7 @@ class JobResult:
     loops_found: int
     linked: bool  # the newest segment is connected to the map
     hypotheses: list[LoopHypothesis]  # loop closures that nothing has confirmed yet
+    drift_ratio2: float | None  # see DriftScale.add; None without a loop closure
 
 
 @dataclass(frozen=True)
@@ -62,13 +64,17 @@ def run_job(snapshot: Snapshot, refine_rounds: int = 0) -> JobResult:
     node_row = {n: i for i, n in enumerate(snapshot.node_ids)}
     constraints, frozen = list(snapshot.constraints), dict(snapshot.frozen)
     edges = snapshot.table.arrays(constraints, submap_row, node_row)
-    drift = DriftModel(edges, snapshot.pose_map_submap, len(snapshot.node_ids), snapshot.settings)
+    drift = DriftModel(
+        edges, snapshot.pose_map_submap, len(snapshot.node_ids), snapshot.settings, snapshot.drift_scale2
+    )
     fixed = [submap_row[i] for i in sorted(snapshot.fixed) if i in submap_row] or [0]
     closed, still_pending = _close_loops(snapshot, edges, drift, node_row)
     revisits, hypotheses = find_revisits(snapshot, edges, drift, submap_row, node_row)
     found = closed + revisits
+    ratio2 = _drift_ratio2(found, snapshot, edges, drift, submap_row, node_row)
     if not found and not refine_rounds:  # a chain without loops is its own solution
-        return _unmoved(snapshot, None, 0, still_pending, hypotheses, _is_linked(drift, edges, fixed))
+        linked = _is_linked(drift, edges, fixed)
+        return _unmoved(snapshot, None, 0, still_pending, hypotheses, linked, ratio2)
     submap_poses, node_poses = snapshot.pose_map_submap.copy(), snapshot.pose_map_node.copy()
     node_component = drift.components[edges.submap[np.searchsorted(edges.node, np.arange(len(node_row)))]]
     joined_any = join_components(
@@ -79,9 +85,9 @@ def run_job(snapshot: Snapshot, refine_rounds: int = 0) -> JobResult:
     fit = not revisits and not joined_any and _fit(found, submap_poses, node_poses, submap_row, node_row)
     if fit and not refine_rounds and snapshot.jobs_since_optimisation < MAX_JOBS_WITHOUT_OPTIMISATION:
         linked = _is_linked(drift, edges, fixed)
-        return _unmoved(snapshot, constraints, len(found), still_pending, hypotheses, linked)
+        return _unmoved(snapshot, constraints, len(found), still_pending, hypotheses, linked, ratio2)
     edges = snapshot.table.arrays(constraints, submap_row, node_row)
-    joined = DriftModel(edges, submap_poses, len(snapshot.node_ids), snapshot.settings)
+    joined = DriftModel(edges, submap_poses, len(snapshot.node_ids), snapshot.settings, snapshot.drift_scale2)
     held = first_of_components(joined.components, fixed)
     # During mapping the next job continues from this solution; the final one must converge by itself.
     iterations = LAST_ITERATIONS if refine_rounds else ITERATIONS
@@ -116,17 +122,18 @@ def run_job(snapshot: Snapshot, refine_rounds: int = 0) -> JobResult:
         len(found),
         _is_linked(joined, edges, fixed),
         hypotheses,
+        ratio2,
     )
 
 
 def _unmoved(
     snapshot: Snapshot, constraints: list[Constraint] | None, found: int, still_pending: list[int],
-    hypotheses: list[LoopHypothesis], linked: bool,
+    hypotheses: list[LoopHypothesis], linked: bool, drift_ratio2: float | None,
 ) -> JobResult:  # fmt: skip
     """Return the result of a job that leaves all poses as they are."""
     return JobResult(
         snapshot.number, snapshot.node_ids[-1], constraints, len(snapshot.constraints), {}, {}, {},
-        still_pending, found, linked, hypotheses,
+        still_pending, found, linked, hypotheses, drift_ratio2,
     )  # fmt: skip
 
 
@@ -141,6 +148,24 @@ def _fit(
         if off @ c.information @ off > FIT_CHI2:
             return False
     return True
+
+
+def _drift_ratio2(
+    found: list[Constraint], snapshot: Snapshot, edges: ConstraintArrays, drift: DriftModel,
+    submap_row: dict[int, int], node_row: dict[int, int],
+) -> float | None:  # fmt: skip
+    """Return the mean squared error of loop closures relative to the variance by the settings."""
+    ratios = []
+    for c in found:
+        var_m, var_rad = drift.variances(int(submaps_of(edges, node_row[c.node]).min()))[
+            :, submap_row[c.submap]
+        ]
+        if math.isfinite(var_m):
+            pose_map_submap = snapshot.pose_map_submap[submap_row[c.submap]]
+            seen = se2.between(pose_map_submap, snapshot.pose_map_node[node_row[c.node]])
+            off = se2.between(c.pose_submap_node, seen)
+            ratios.append(max((off[0] ** 2 + off[1] ** 2) / var_m, off[2] ** 2 / var_rad))
+    return snapshot.drift_scale2 * float(np.mean(ratios)) if ratios else None
 
 
 def _is_linked(drift: DriftModel, edges: ConstraintArrays, fixed: list[int]) -> bool:

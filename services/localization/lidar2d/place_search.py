@@ -97,7 +97,8 @@ def search_places(
         target = targets[index]
         tables = cache.tables(target.submap, target.frozen, for_search=False)
         match = refine(features, origin, pose, tables, settings)
-        if match.overlap >= min_overlap and match.inlier_ratio >= min_inlier_ratio:
+        fits = match.overlap >= min_overlap and match.inlier_ratio >= min_inlier_ratio
+        if fits and _is_in_window(target, match):
             matches.append(PlaceMatch(target.submap, match))
     matches.sort(key=lambda m: -m.score)
     distinct: list[PlaceMatch] = []
@@ -105,6 +106,12 @@ def search_places(
         if not any(m.submap == o.submap and _same_pose(m.match, o.match) for o in distinct):
             distinct.append(m)
     return distinct
+
+
+def _is_in_window(target: SearchTarget, match: Match) -> bool:
+    """Return whether a match is as near to the prediction as it must be; the search covers whole submaps."""
+    off = se2.between(target.pose_submap_chunk, match.pose_target_body)
+    return math.hypot(off[0], off[1]) <= target.window_m and abs(off[2]) <= target.window_rad
 
 
 def _same_pose(a: Match, b: Match) -> bool:

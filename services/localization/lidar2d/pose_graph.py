@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from beamsplat.services.localization.lidar2d import se2
+from beamsplat.services.localization.lidar2d.drift_model import DriftScale
 from beamsplat.services.localization.lidar2d.jobs import JobResult
 from beamsplat.services.localization.lidar2d.loop_hypotheses import LoopHypothesis
 from beamsplat.services.localization.lidar2d.pose_graph_data import (
@@ -33,6 +34,7 @@ class PoseGraph:
         self.pending: list[int] = []
         self.cache = TableCache(settings.reach_cells)
         self._table = ConstraintTable()
+        self.drift_scale = DriftScale()
         self._jobs_since_optimisation = 0  # jobs that added loop closures without moving anything
         self.loop_closures = 0
         self.optimisations = 0
@@ -121,6 +123,7 @@ class PoseGraph:
             list(self.constraints),
             self._table,
             self._jobs_since_optimisation,
+            self.drift_scale.scale2,
             list(self.pending),
             self.cache,
             self.optimisations,
@@ -139,6 +142,8 @@ class PoseGraph:
         newer = [n for n in self.pending if n > newest]
         self.pending = result.still_pending + newer
         self.hypotheses = result.hypotheses
+        if result.drift_ratio2 is not None:
+            self.drift_scale.add(result.drift_ratio2)
         if result.linked and self.unlinked_from is not None and newest >= self.unlinked_from:
             self.unlinked_from = None
         self.loop_closures += result.loops_found

@@ -33,6 +33,7 @@ class Snapshot:
     constraints: list[Constraint]
     table: ConstraintTable
     jobs_since_optimisation: int
+    drift_scale2: float  # see DriftScale
     pending: list[int]
     cache: TableCache
     version: int  # counter of the map's optimisations

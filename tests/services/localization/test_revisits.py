@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from beamsplat.services.localization.lidar2d import se2
-from beamsplat.services.localization.lidar2d.drift_model import DriftModel
+from beamsplat.services.localization.lidar2d.drift_model import DriftModel, DriftScale
 from beamsplat.services.localization.lidar2d.graph_optimisation import ConstraintArrays
 from beamsplat.services.localization.lidar2d.loop_hypotheses import LoopHypothesis, select
 from beamsplat.services.localization.lidar2d.place_search import SearchTarget, search_places
@@ -158,3 +158,30 @@ def test_components_are_joined_where_they_met_and_the_main_one_stays(main):
     assert np.array_equal(nodes[stayed], before[1][stayed])
     for a, b in ((2, 3), (0, 1)):  # rigidly
         assert se2.between(submaps[a], submaps[b]) == pytest.approx(se2.between(before[0][a], before[0][b]))
+
+
+def test_the_drift_of_this_drive_is_learnt_from_its_loops():
+    accurate, poor = DriftScale(), DriftScale()
+    for _ in range(12):
+        accurate.add(0.01)
+        poor.add(1.0)
+    assert np.sqrt(accurate.scale2) == pytest.approx(0.5, abs=0.02)  # four jobs of prior against twelve
+    assert poor.scale2 == 1.0
+    edges = chain([(k, k + 1) for k in range(10)])
+    poses = np.column_stack([STEP_M * np.arange(11), np.zeros((11, 2))])
+    wide, narrow = (DriftModel(edges, poses, 10, SETTINGS, scale2).variances(0) for scale2 in (1.0, 0.25))
+    assert narrow[:, -1] == pytest.approx(0.25 * wide[:, -1], rel=0.01)
+
+
+def test_a_match_outside_of_its_window_is_no_match(mapped):
+    graph, cache = mapped.pose_graph, TableCache(SETTINGS.reach_cells)
+    node, members = graph.nodes[60], graph.submaps[1].members
+    poses = [graph.nodes[m].pose_odom_body for m in members]
+    submap = rebuild_submap(SETTINGS, [graph.nodes[m] for m in members], poses)
+    features = node.scan.features.astype(np.float64)
+    path = np.array(poses)[:, :2]
+    for off_m, found in ((2.0, True), (6.0, False)):
+        predicted = node.pose_odom_body + np.array([off_m, 0.0, 0.0])
+        target = SearchTarget(1, submap, path, predicted, 4.0, 0.5)
+        matches = search_places(features, node.scan.origin, [target], cache, SETTINGS, 0.5, 0.4, 0.8)
+        assert bool(matches) == found
