@@ -178,7 +178,8 @@ def _image_rules(sensor: SensorType, topics: list[Candidate]) -> tuple[tuple[str
         return [topic for topic in kept if f"{topic.name}/compressed" not in names]
 
     def colour(kept: list[Candidate]) -> list[Candidate]:
-        return [topic for topic in kept if _words(topic.name) & {"color", "colour", "rgb"}]
+        folders = {topic: _base(topic.name).rpartition("/")[0] for topic in kept}
+        return [topic for topic in kept if _words(folders[topic]) & {"color", "colour", "rgb"}]
 
     def raw(kept: list[Candidate]) -> list[Candidate]:
         """Keep the images as the camera takes them, if all are of one camera and its K is known."""
@@ -200,7 +201,6 @@ def _image_rules(sensor: SensorType, topics: list[Candidate]) -> tuple[tuple[str
         ("the images are in colour", colour),
         ("it is not rectified, and K belongs to it", raw),
         ("it is the image of the camera", named_raw),
-        ("the images are in colour", colour),
     )
 
 
