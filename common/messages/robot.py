@@ -123,15 +123,20 @@ class Odometry(Message):
 
     If `metric` is False the scale of the translation is unknown: monocular odometry without a metric
     reference.
+
+    `quality` is the probability that the errors of the motion over the last second are below 2 cm and 0.5
+    degrees (None: not stated), and `quality_reason` says what limits it.
     """
 
-    version = "1.1"
+    version = "1.2"
 
     T_odom_body: Transform
     covariance: Annotated[np.ndarray, Array("float64", 3, 3)]
     status: TrackingStatus = "ok"
     detail: Text = ""
     metric: bool = True  # since 1.1
+    quality: Annotated[float, Field(ge=0.0, le=1.0)] | None = None  # since 1.2
+    quality_reason: Text = ""  # since 1.2
 
 
 class Correction(Message):

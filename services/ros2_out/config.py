@@ -16,6 +16,8 @@ class Ros2OutConfig(NodeConfig):
     domain: Domain = domain_field()
     router: str = ROUTER
     pose_topic: str = "/beamsplat/pose"
+    # PoseWithCovarianceStamped; the covariance is that of the motion over the last second
+    pose_covariance_topic: str = "/beamsplat/pose_with_covariance"
     cloud_topic: str = "/beamsplat/cloud"
     # nav_msgs/OccupancyGrid, when its size has changed, and at intervals. Between them, the changed parts are
     # published as map_msgs/OccupancyGridUpdate on this topic with "_updates" appended.

@@ -13,8 +13,9 @@ from beamsplat.common.recording import ros_types as ros
 _MAX_POSES = 500  # of the wheel odometry: several seconds
 _MAX_AGE_NS = 100_000_000  # largest time between a scan and the wheel pose used with it
 
-POSE, TF, MAP, CLOUD = (
+POSE, POSE_COVARIANCE, TF, MAP, CLOUD = (
     "geometry_msgs/msg/PoseStamped",
+    "geometry_msgs/msg/PoseWithCovarianceStamped",
     "tf2_msgs/msg/TFMessage",
     "nav_msgs/msg/OccupancyGrid",
     "sensor_msgs/msg/PointCloud2",
@@ -40,6 +41,23 @@ class TfTree:
         """Return the PoseStamped of the body in the map frame for our localization's `T_odom_body` [4, 4]."""
         header = ros.header(stamp_ns, self._frames[0])
         return ros.new(POSE, header=header, pose=ros.pose(self.T_map_odom @ T_odom_body))
+
+    def pose_with_covariance(self, stamp_ns: int, T_odom_body: np.ndarray, covariance: np.ndarray) -> Any:
+        """Return the PoseWithCovarianceStamped of the body in the map frame.
+
+        Args:
+            covariance: float64 [3, 3] of (x, y, yaw) in odom axes. ROS wants (x, y, z, roll, pitch, yaw); the
+                others are zero, as with AMCL, because the robot moves in a plane.
+        """
+        rotation = np.eye(3)
+        rotation[:2, :2] = self.T_map_odom[:2, :2]
+        full = np.zeros((6, 6))
+        full[np.ix_((0, 1, 5), (0, 1, 5))] = rotation @ covariance @ rotation.T
+        pose = ros.new(
+            "geometry_msgs/msg/PoseWithCovariance", pose=ros.pose(self.T_map_odom @ T_odom_body),
+            covariance=full.ravel(),
+        )  # fmt: skip
+        return ros.new(POSE_COVARIANCE, header=ros.header(stamp_ns, self._frames[0]), pose=pose)
 
     def tf(self, stamp_ns: int, T_odom_body: np.ndarray) -> Any | None:
         """Return the TFMessage for our localization's `T_odom_body` [4, 4]; None if wheel poses are too old.

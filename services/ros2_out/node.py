@@ -82,6 +82,7 @@ class Ros2OutNode(Node):
         self._token = self._session.liveliness().declare_token(node.token())
         wanted = (
             ("pose", c.pose_topic, conversions.POSE, _VOLATILE),
+            ("pose_covariance", c.pose_covariance_topic, conversions.POSE_COVARIANCE, _VOLATILE),
             ("tf", "/tf" if c.tf else "", conversions.TF, RmwQos(depth=100)),
             ("map", c.map_topic, conversions.MAP, _LATCHED),
             ("map_updates", c.map_topic and f"{c.map_topic}_updates", ros.GRID_UPDATE, RmwQos(depth=100)),
@@ -105,6 +106,12 @@ class Ros2OutNode(Node):
         """Publish pose and transforms, if the status of localization is ok."""
         if odometry.status == "ok":
             self._publish("pose", self._transforms.pose(odometry.stamp_ns, odometry.T_odom_body))
+            self._publish(
+                "pose_covariance",
+                self._transforms.pose_with_covariance(
+                    odometry.stamp_ns, odometry.T_odom_body, odometry.covariance
+                ),
+            )
             self._publish("tf", self._transforms.tf(odometry.stamp_ns, odometry.T_odom_body))
         return iter(())
 

@@ -71,7 +71,7 @@ def sample_messages() -> list[Message]:
         ExternalPose(stamp_ns=15, T_map_body=T[1]),
         Odometry(
             stamp_ns=16, T_odom_body=T[0], covariance=np.diag([1e-4, 1e-4, 1e-6]), status="lost",
-            detail="no returns",
+            detail="no returns", quality=0.25, quality_reason="few surfaces",
         ),
         Correction(stamp_ns=17, T_map_odom=T[1], optimisation=3),
         Anchors(stamp_ns=18, anchor_ids=np.array([0, 7]), T_map_anchor=T, optimisation=3),

@@ -85,7 +85,22 @@ def slam(
         print_figures(figures)
         for reason, count in figures["refused"].items():
             console.print(f"{count} scans: {reason}", markup=False, highlight=False)
+        for text in _remarks(figures):
+            console.print(text, markup=False, highlight=False)
         console.print(f"wrote trajectory.tum, online.tum, map.pgm, map.yaml, map.png and state/ to {out}")
+
+
+def _remarks(figures: dict[str, Any]) -> list[str]:
+    """Return what was found out about the sensors during the drive, in sentences."""
+    remarks = []
+    odometry = figures["odometry"]
+    if odometry is not None and odometry["text"]:
+        remarks.append(f"wheel odometry: {odometry['text']}")
+    if figures["self_returns"]:
+        from beamsplat.services.localization.lidar2d.self_returns import Sector, sectors_text
+
+        remarks.append(sectors_text([Sector(**sector) for sector in figures["self_returns"]]))
+    return remarks
 
 
 def eval_slam(

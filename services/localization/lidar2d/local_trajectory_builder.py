@@ -14,9 +14,10 @@ from beamsplat.services.localization.lidar2d.dead_reckoning import WHEEL_SIGMA_M
 from beamsplat.services.localization.lidar2d.observability import ObservedMatch, reduce_unobservable
 from beamsplat.services.localization.lidar2d.odometry import MotionErrorModel, OdometryBuffer
 from beamsplat.services.localization.lidar2d.scan import PreparedScan, prepare_scan
-from beamsplat.services.localization.lidar2d.scan_matching import Match, refine
+from beamsplat.services.localization.lidar2d.scan_matching import Match, TwistPrior, refine
 from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
 from beamsplat.services.localization.lidar2d.surfel_map import SurfelMap
+from beamsplat.services.localization.lidar2d.twist import TwistErrorModel, exp_twist, twist
 
 NS = 1e-9
 # Over a gap, wheels are taken to err by these ratios of a path at this speed.
@@ -75,6 +76,9 @@ class LocalTrajectoryBuilder:
         self._wheel_error = MotionErrorModel(0.01, 0.05, 0.02, 0.004, 0.05, 0.03)
         self._velocity_error = MotionErrorModel(0.02, 0.10, 0.3, 0.02, 0.20, 0.4)
         self._standstill_error = MotionErrorModel(0.05, 0.0, 0.3, 0.05, 0.0, 0.4)
+        self._twist_error = TwistErrorModel()
+        self._predicted_twist: np.ndarray | None = None  # float64 [3], for the interval after the last pose
+        self._covariance_odom = np.zeros((3, 3))  # of the last matched pose in its submap; odom axes
         self.stamps: list[int] = []  # recent stamps and poses, newest last
         self.poses: list[np.ndarray] = []
         self.last_matched: tuple[int, np.ndarray] = (0, np.zeros(3))  # stamp and pose of the last good match
@@ -116,7 +120,7 @@ class LocalTrajectoryBuilder:
             (self._standstill_error, np.zeros(3), "standstill"),
         ]
         wheels = self.odometry.increment(self.stamps[-1], stamp_ns)
-        if wheels is not None and self._is_plausible(wheels, dt):
+        if wheels is not None and self._is_plausible(wheels, dt) and self.odometry.calibration.usable:
             predictions.append((self._wheel_error, wheels, "wheels"))
         reckoned = self.reckoning.predict(stamp_ns)
         if reckoned is not None:
@@ -183,23 +187,21 @@ class LocalTrajectoryBuilder:
         )
 
     def scan_velocity(self, raw: RawScan, motion: np.ndarray | None) -> np.ndarray:
-        """Return the body twist during the scan: from wheel odometry if it is accurate, else from `motion`.
+        """Return the predicted body twist during a scan.
 
-        `motion` is the motion [3] since the last scan, predicted or matched.
+        `motion` [3] is the predicted motion since the last scan; None for the first scan, which only has
+        wheel odometry. Later the odometry up to the end of the scan is not known yet, and the twist is
+        estimated with the pose.
         """
-        duration = raw.time_increment_s * len(raw.ranges_m)
+        duration = duration_s(raw)
         if duration <= 0.0:
             return np.zeros(3)
-        end = raw.stamp_ns + round(duration / NS)
-        wheels = self.odometry.increment(raw.stamp_ns, end)
-        trusted = self._wheel_error.scale2_m < 10.0 and self._wheel_error.scale2_rad < 10.0
-        if wheels is not None and trusted and self._is_plausible(wheels, duration):
-            return twist(wheels, duration)
-        if motion is not None and self.stamps:
-            dt = (raw.stamp_ns - self.stamps[-1]) * NS
-            if 0.02 < dt < 0.5:
-                return twist(motion, dt)
-        return self.velocity()
+        if motion is None:
+            wheels = self.odometry.increment(raw.stamp_ns, raw.stamp_ns + round(duration / NS))
+            plausible = wheels is not None and self._is_plausible(wheels, duration)
+            return twist(wheels, duration) if wheels is not None and plausible else np.zeros(3)
+        dt = (raw.stamp_ns - self.stamps[-1]) * NS
+        return twist(motion, dt) if 0.02 < dt < 0.5 else self.velocity()
 
     def prepare(self, raw: RawScan, velocity: np.ndarray) -> PreparedScan:
         """Filter and deskew a scan; `velocity` is the body twist [3] (m/s, m/s, rad/s) during the scan."""
@@ -220,25 +222,41 @@ class LocalTrajectoryBuilder:
     # ---- matching ---------------------------------------------------------------------------------
 
     def match(
-        self, raw: RawScan, scan: PreparedScan, prediction: Prediction, local: LocalMap
+        self,
+        raw: RawScan,
+        scan: PreparedScan,
+        velocity: np.ndarray,
+        prediction: Prediction,
+        local: LocalMap,
     ) -> tuple[PreparedScan, Match, bool]:
         """Match the scan to the local map; return the scan, the match, and whether the match is accepted.
 
-        Gauss-Newton starts at the prediction. Correlative search is added if the prediction is uncertain or
-        the match is poor. The scan is then deskewed again with the matched motion and matched once more.
+        Gauss-Newton starts at the prediction, and estimates the twist during the scan too if its beams have
+        times. Correlative search is added if the prediction is uncertain or the match is poor. The scan is
+        then deskewed again with the matched twist and matched once more.
+
+        Args:
+            velocity: float64 [3], the predicted twist, with which `scan` was deskewed.
         """
         s = self.settings
         if prediction.long_gap and self._has_left(raw.stamp_ns, prediction):
             return scan, Match(np.zeros(3), np.zeros((3, 3)), 0.0, 0.0, math.inf), False
         pose_submap_last = se2.between(local.pose_odom_submap, self.poses[-1])
         guess_pose = se2.compose(pose_submap_last, prediction.motion)
-        # A bias of the wheels persists over many scans: n priors of one sigma each, taken as independent,
-        # would outweigh the scans and bend long corridors.
-        information = np.diag([prediction.sigma_m**-2, prediction.sigma_m**-2, prediction.sigma_rad**-2])
-        information /= s.prior_correlation_scans
+        information = self._prior_information(prediction, local)
         tables = local.surfels.tables()
-        points = scan.features()
-        match = refine(points, scan.origin_body, guess_pose, tables, s, guess_pose, information)
+        predicted = velocity
+        prior = self._twist_prior(raw, scan, predicted, velocity)
+        match = refine(
+            scan.features(),
+            scan.origin_body,
+            guess_pose,
+            tables,
+            s,
+            guess_pose,
+            information,
+            twist_prior=prior,
+        )
         long_gap = prediction.long_gap
         window_m = min(max(3.0 * prediction.sigma_m, s.search_min_m), 2.0 if long_gap else s.search_max_m)
         window_rad = min(
@@ -266,13 +284,12 @@ class LocalTrajectoryBuilder:
                 s.search_max_m,
                 s.search_max_rad,
             )
-        points = scan.features()
-        if raw.time_increment_s > 0.0:
-            motion = se2.between(pose_submap_last, match.pose_target_body)
-            scan = self.prepare(raw, self.scan_velocity(raw, motion))
-            points = scan.features()
+        if prior is not None:
+            velocity = velocity + match.twist_correction
+            scan = self.prepare(raw, velocity)
+            prior = self._twist_prior(raw, scan, predicted, velocity)
             match = refine(
-                points,
+                scan.features(),
                 scan.origin_body,
                 match.pose_target_body,
                 tables,
@@ -280,17 +297,40 @@ class LocalTrajectoryBuilder:
                 guess_pose,
                 information,
                 anneal=(1.0,),
+                twist_prior=prior,
             )
-        trusted = self._is_trusted(prediction, guess_pose, match)
-        if not trusted:
+        if not self._is_trusted(prediction, guess_pose, match):
+            self._covariance_odom += np.diag([prediction.sigma_m**2] * 2 + [prediction.sigma_rad**2])
             return scan, match, False
-        return (
-            scan,
-            self._apply_dead_reckoning(
-                raw.stamp_ns, local, reduce_unobservable(points, scan.origin_body, match, tables, s)
-            ),
-            True,
+        self._covariance_odom = se2.rotate_covariance(
+            np.linalg.inv(match.information + information), local.pose_odom_submap[2]
         )
+        observed = reduce_unobservable(scan.features(), scan.origin_body, match, tables, s)
+        return scan, self._apply_dead_reckoning(raw.stamp_ns, local, observed), True
+
+    def _prior_information(self, prediction: Prediction, local: LocalMap) -> np.ndarray:
+        """Return the information [3, 3] of the predicted pose in the local map.
+
+        Its covariance is that of the last pose plus that of the motion (Kalman filter). A bias of the wheels
+        persists over many scans: n priors of one sigma each, taken as independent, would outweigh the scans
+        and bend long corridors. Therefore the variance of the motion is multiplied by n.
+        """
+        last = se2.rotate_covariance(self._covariance_odom, -local.pose_odom_submap[2])
+        motion = np.diag([prediction.sigma_m**2, prediction.sigma_m**2, prediction.sigma_rad**2])
+        return np.linalg.inv(last + self.settings.prior_correlation_scans * motion)
+
+    def _twist_prior(
+        self, raw: RawScan, scan: PreparedScan, predicted: np.ndarray, velocity: np.ndarray
+    ) -> TwistPrior | None:
+        """Return the prior of the twist during a scan, around `predicted` [3]; None without beam times.
+
+        The scan was deskewed with the twist `velocity` [3].
+        """
+        duration = duration_s(raw)
+        if duration <= 0.0:
+            return None
+        times_s = raw.time_increment_s * scan.beams[scan.match_index].astype(np.float64)
+        return TwistPrior(times_s, predicted - velocity, *self._twist_error.sigmas(duration))
 
     def _has_left(self, stamp_ns: int, prediction: Prediction) -> bool:
         """Return whether the robot may be outside the local map after a gap."""
@@ -354,41 +394,34 @@ class LocalTrajectoryBuilder:
         stamp_ns: int,
         pose_odom_body: np.ndarray,
         predictions: list[tuple[MotionErrorModel, np.ndarray]],
+        predicted_twist: np.ndarray | None = None,
         matched: bool = True,
     ) -> None:
-        """Append the pose of the newest scan; update the error models and the odometry delay."""
+        """Append the pose of the newest scan; update the error models and the estimated odometry errors.
+
+        Args:
+            predictions: of `predict`; empty if the match was not accepted.
+            predicted_twist: float64 [3], `scan_velocity` before the match.
+            matched: whether the pose is that of an accepted match.
+        """
         if matched:
             self.last_matched = stamp_ns, pose_odom_body
         if self.poses:
             moved = se2.between(self.poses[-1], pose_odom_body)
             for model, motion in predictions:
                 model.update(motion, moved)
-            self.odometry.observe_rotation(self.stamps[-1], stamp_ns, float(moved[2]))
+            dt = (stamp_ns - self.stamps[-1]) * NS
+            if self._predicted_twist is not None and predictions and 0.02 < dt < 0.5:
+                self._twist_error.update(self._predicted_twist, twist(moved, dt))
+            self._predicted_twist = predicted_twist if predictions else None
+            observed = bool(predictions) and not self.reckoning.degenerate
+            self.odometry.observe(self.stamps[-1], stamp_ns, moved if observed else None)
         self.stamps.append(stamp_ns)
         self.poses.append(pose_odom_body)
         if len(self.stamps) > 512:
             del self.stamps[:256], self.poses[:256]
 
 
-def twist(motion: np.ndarray, dt_s: float) -> np.ndarray:
-    """Return the constant body twist that moves by `motion` in `dt_s` (logarithm of SE(2))."""
-    half = 0.5 * motion[2]
-    ratio = 1.0 - half * half / 3.0 if abs(half) < 1e-3 else half / math.tan(half)
-    vx = ratio * motion[0] + half * motion[1]
-    vy = -half * motion[0] + ratio * motion[1]
-    return np.array([vx, vy, motion[2]]) / dt_s
-
-
-def exp_twist(velocity: np.ndarray, dt_s: float) -> np.ndarray:
-    """Return the motion after `dt_s` at a constant body twist (exponential of SE(2))."""
-    yaw = velocity[2] * dt_s
-    half = 0.5 * yaw
-    sinc = 1.0 - half * half / 6.0 if abs(half) < 1e-3 else math.sin(half) / half
-    c, s = math.cos(half) * sinc, math.sin(half) * sinc
-    return np.array(
-        [
-            (c * velocity[0] - s * velocity[1]) * dt_s,
-            (s * velocity[0] + c * velocity[1]) * dt_s,
-            se2.wrap(yaw),
-        ]
-    )
+def duration_s(raw: RawScan) -> float:
+    """Return the time from the first to after the last beam of a scan."""
+    return raw.time_increment_s * len(raw.ranges_m)

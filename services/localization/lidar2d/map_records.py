@@ -37,6 +37,7 @@ class SavedMap:
     trimmed_nodes: dict[int, tuple[int, float, float, float]]
     record: TrajectoryRecord  # which only grows
     scans: int  # number of its rows at the time of the copy
+    self_returns_m: np.ndarray | None  # float32 [self_returns.BINS]
 
     @staticmethod
     def of(graph: PoseGraph, record: TrajectoryRecord) -> SavedMap:
@@ -47,7 +48,7 @@ class SavedMap:
         ]
         return SavedMap(
             graph.uuid, list(graph.nodes.values()), list(graph.pose_map_node.values()), submaps,
-            list(graph.constraints), dict(graph.trimmed_nodes), record, record.count,
+            list(graph.constraints), dict(graph.trimmed_nodes), record, record.count, graph.self_returns_m,
         )  # fmt: skip
 
 
@@ -117,7 +118,8 @@ def state_arrays(
     limit = 2.0**31 - 1.0
     unfinished = [s for s in saved.submaps if s.frozen is None]
     trimmed = saved.trimmed_nodes
-    return {
+    own = {} if saved.self_returns_m is None else {"self_returns": saved.self_returns_m}
+    return own | {
         "counts": np.array([len(nodes_in_use), len(constraints_in_use), saved.scans], dtype=np.int64),
         "node_in_use": np.packbits(nodes_in_use), "constraint_in_use": np.packbits(constraints_in_use),
         "node_xy": np.clip(np.rint(poses[:, :2] / _M_PER_UNIT), -limit, limit).astype(np.int32),
@@ -147,6 +149,7 @@ def restore(graph: PoseGraph, state: Arrays, parts: Iterable[tuple[int, Arrays]]
     Raises:
         KeyError, ValueError, IndexError, TypeError: state and records do not fit together.
     """
+    graph.self_returns_m = state.get("self_returns")
     node_count, constraint_count, scans = state["counts"].tolist()
     node_used = np.unpackbits(state["node_in_use"], count=node_count).astype(bool)
     constraint_used = np.unpackbits(state["constraint_in_use"], count=constraint_count).astype(bool)

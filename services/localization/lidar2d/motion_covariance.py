@@ -10,6 +10,7 @@ import math
 
 import numpy as np
 
+from beamsplat.services.localization.lidar2d import se2
 from beamsplat.services.localization.lidar2d.scan_matching import Match
 from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
 
@@ -50,9 +51,7 @@ def motion_covariance(
     information = match.information * (settings.returns_per_measurement * (stated_m / residual_m) ** 2)
     # (3 m)^-2 and (0.5 rad)^-2 keep the inverse finite in unobservable directions.
     noise = np.linalg.inv(information + np.diag([0.1, 0.1, 4.0]))
-    c, s = math.cos(target_yaw_rad), math.sin(target_yaw_rad)
-    R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    covariance = R @ noise @ R.T
+    covariance = se2.rotate_covariance(noise, target_yaw_rad)
     first = len(stamps_ns) - 1
     rate_rad_s = 0.0
     while first > 0 and stamps_ns[-1] - stamps_ns[first - 1] <= SPAN_NS:

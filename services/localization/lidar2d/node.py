@@ -37,6 +37,7 @@ from beamsplat.services.localization.lidar2d.state import MANIFEST, read_manifes
 
 log = logging.getLogger("beamsplat.localization")
 
+_REPORT_EVERY_SCANS = 50  # of what was found out about the sensors
 _RESERVED_SUBMAP_IDS = 1000  # upper bound of the submaps started between the last checkpoint and a crash
 _GRID_AFTER_SCANS = 25  # a drawing of the grid is published exactly this many scans after its start, or fewer
 
@@ -89,6 +90,7 @@ class LidarLocalization(Node):
         self._published_uuid = ""
         self._checkpoint_ns: int | None = None
         self._checkpoint_running = False
+        self._fault = self._sensors = ""  # parts of the text of the health message
         live = self.live_settings
         self._checkpoint_dir = None if live is None else live.run_dir / "localization"
         self._saver: MapSaver | None = None
@@ -154,6 +156,7 @@ class LidarLocalization(Node):
         )  # fmt: skip
         self._stamp_ns = scan.stamp_ns
         yield from self._publish_new_map(self._slam)
+        self._report_sensors(self._slam)
         yield "localization/odometry", _odometry(result)
         yield "localization/movers", MovingBeams(stamp_ns=scan.stamp_ns, moving=result.dynamic)
         yield from self._correction(scan.stamp_ns, result.pose_map_odom)
@@ -194,10 +197,18 @@ class LidarLocalization(Node):
             yield Job("checkpoint", write)
 
     def on_job_checkpoint(self, fault: str) -> Outputs:
-        """Set the text of the health message: empty, or why the checkpoint was not written (`fault`)."""
+        """Show in the health message why the checkpoint was not written (`fault`), if it was not."""
         self._checkpoint_running = False
-        self.detail = f"the checkpoint of the map was not written: {fault}" if fault else ""
+        self._fault = f"the checkpoint of the map was not written: {fault}" if fault else ""
         return iter(())
+
+    def _report_sensors(self, slam: LidarSlam) -> None:
+        """Set the text of the health message: what is wrong with files, wheel odometry and lidar."""
+        if slam.scans % _REPORT_EVERY_SCANS == 1:
+            odometry = slam.local_builder.odometry.report().text
+            texts = [f"wheel odometry: {odometry}" if odometry else "", slam.self_returns.text()]
+            self._sensors = "; ".join(text for text in texts if text)
+        self.detail = "; ".join(text for text in (self._fault, self._sensors) if text)
 
     def drain(self) -> Outputs:
         """Do the final loop closure and optimisation, publish the result and write the requested files."""
@@ -224,7 +235,7 @@ class LidarLocalization(Node):
             fault = f"localization.save = {folder}: not written ({reason(error)})"
             if self.live_settings is None:
                 raise UserError(fault) from error
-            self.detail = fault
+            self._fault = self.detail = fault
             log.error("%s", fault)
             return
         log.info("map and state saved to %s", folder)
@@ -305,6 +316,7 @@ def _odometry(result: ScanResult) -> Odometry:
     return Odometry(
         stamp_ns=result.stamp_ns, T_odom_body=se2_to_se3(result.pose_odom_body), covariance=result.covariance,
         status=cast(TrackingStatus, status), detail=detail,
+        quality=result.quality.value, quality_reason=result.quality.reason,
     )  # fmt: skip
 
 

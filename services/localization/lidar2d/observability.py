@@ -39,16 +39,30 @@ def weights_when_shifted(
     `out` is float64 [K]; the shifts are `shifts_m` float64 [K] along `direction`. A sum that is almost as
     large at a shifted pose shows that the match is not observable in this direction.
     """
-    H, g, moved = np.empty((3, 3)), np.empty(3), np.empty(3)
+    H, g, moved, still, no_times = np.empty((3, 3)), np.empty(3), np.empty(3), np.zeros(3), np.empty(0)
     here, _, _ = accumulate(
-        points, origin, pose, nearest, means, omegas, views, row0, col0, cell_m, scale2, H, g
+        points, no_times, origin, pose, still, nearest, means, omegas, views, row0, col0, cell_m, scale2, H, g
     )
     for k in range(shifts_m.shape[0]):
         moved[0] = pose[0] + shifts_m[k] * direction[0]
         moved[1] = pose[1] + shifts_m[k] * direction[1]
         moved[2] = pose[2]
         out[k], _, _ = accumulate(
-            points, origin, moved, nearest, means, omegas, views, row0, col0, cell_m, scale2, H, g
+            points,
+            no_times,
+            origin,
+            moved,
+            still,
+            nearest,
+            means,
+            omegas,
+            views,
+            row0,
+            col0,
+            cell_m,
+            scale2,
+            H,
+            g,
         )
     return here
 

@@ -8,11 +8,16 @@ import numpy as np
 
 from beamsplat.common.compiled import kernel
 from beamsplat.services.localization.lidar2d import se2
+from beamsplat.services.localization.lidar2d.odometry_calibration import OdometryCalibration, OdometryReport
 
 NS = 1e-9
 BASELINE_NS = 80_000_000
-_MAX_PENDING = 256  # matched turns that wait for odometry after them
-DELAY_CANDIDATES_S = np.arange(-30, 31) * 0.01  # candidates for the delay of the odometry stamps
+_MAX_PENDING = 256  # matched motions that wait for odometry after them
+DELAY_STEP_S = 0.02
+DELAY_CANDIDATES_S = np.arange(-40, 41) * DELAY_STEP_S  # candidates for the delay of the odometry stamps
+_MIN_DELAY_WEIGHT = 20.0  # turning scans before the first estimate of the delay
+_DELAY_EVIDENCE = 25.0  # a change of the delay must improve the squared errors by so many of their mean
+_TURN_OUTLIER_RAD = 0.02  # a turn that disagrees by this much counts half
 
 
 @kernel
@@ -44,19 +49,17 @@ def interpolate(
 
 
 @kernel
-def delay_costs(
+def turns_at_delays(
     stamps_ns: np.ndarray,
     poses: np.ndarray,
     t0_ns: int,
     t1_ns: int,
-    yaw_rad: float,
     delays_ns: np.ndarray,
     gap_ns: int,
-    costs: np.ndarray,
+    turns: np.ndarray,
 ) -> bool:
-    """Write to `costs` the squared error (rad^2) of the rotation by odometry for each candidate delay.
+    """Write to `turns` the rotation (rad) by odometry between two stamps for each candidate delay.
 
-    The rotation between the stamps `t0_ns` and `t1_ns` is compared with the matched rotation `yaw_rad`.
     Returns False if there is no odometry at one of the stamps.
     """
     a, b = np.empty(3), np.empty(3)
@@ -66,8 +69,7 @@ def delay_costs(
             return False
         if not interpolate(stamps_ns, poses, t1_ns + d, 0, gap_ns, b):
             return False
-        e = se2.wrap(b[2] - a[2] - yaw_rad)
-        costs[k] = e * e
+        turns[k] = se2.wrap(b[2] - a[2])
     return True
 
 
@@ -83,11 +85,10 @@ class OdometryBuffer:
         self.delay_ns = 0
         self.rejected = 0
         self._delays_ns = np.round(DELAY_CANDIDATES_S / NS).astype(np.int64)
-        self._cost = np.zeros(len(DELAY_CANDIDATES_S))
+        self._sums = np.zeros((3, len(DELAY_CANDIDATES_S)))  # of matched^2, matched * wheels, wheels^2
         self._weight = 0.0
-        self._pending_rotations: list[
-            tuple[int, int, float]
-        ] = []  # matched turns waiting for odometry after them
+        self.calibration = OdometryCalibration()
+        self._pending: list[tuple[int, int, np.ndarray | None]] = []  # see observe()
 
     @property
     def stamps_ns(self) -> np.ndarray:
@@ -117,7 +118,14 @@ class OdometryBuffer:
         return True
 
     def increment(self, t0_ns: int, t1_ns: int, ahead_s: float = 0.25) -> np.ndarray | None:
-        """Return the motion [3] of the body between two scan stamps, None without odometry at them."""
+        """Return the motion [3] of the body between two scan stamps, None without odometry at them.
+
+        The estimated delay and scales are applied.
+        """
+        motion = self._measured(t0_ns, t1_ns, ahead_s)
+        return None if motion is None else self.calibration.apply(motion)
+
+    def _measured(self, t0_ns: int, t1_ns: int, ahead_s: float) -> np.ndarray | None:
         a, b = np.empty(3), np.empty(3)
         ahead = round(ahead_s / NS)
         for stamp, out in ((t0_ns, a), (t1_ns, b)):
@@ -140,7 +148,9 @@ class OdometryBuffer:
         late_ns = max(
             t0_ns + self.delay_ns - self.stamps_ns[first], t1_ns + self.delay_ns - self.stamps_ns[last]
         )
-        return se2.between(self.poses[first], self.poses[last]) if late_ns <= self._gap_ns else None
+        if late_ns > self._gap_ns:
+            return None
+        return self.calibration.apply(se2.between(self.poses[first], self.poses[last]))
 
     def motion_after_gap(self, t0_ns: int, t1_ns: int) -> np.ndarray:
         """Return the motion [3] between two stamps after a gap, by the mean velocity since the gap.
@@ -152,50 +162,62 @@ class OdometryBuffer:
         if last <= first or self.stamps_ns[last] - self.stamps_ns[first] < BASELINE_NS:
             return np.zeros(3)
         ratio = (t1_ns - t0_ns) / (self.stamps_ns[last] - self.stamps_ns[first])
-        return ratio * se2.between(self.poses[first], self.poses[last])
+        return ratio * self.calibration.apply(se2.between(self.poses[first], self.poses[last]))
 
-    def observe_rotation(self, t0_ns: int, t1_ns: int, yaw_rad: float) -> None:
-        """Update the delay estimate with the rotation `yaw_rad` between two scans, as found by matching.
+    def observe(self, t0_ns: int, t1_ns: int, motion: np.ndarray | None) -> None:
+        """Update the estimates with the motion [3] between two scans, as found by matching.
 
-        The delay is the candidate with the lowest sum of robust, exponentially forgotten squared rotation
-        errors.
+        `motion` is None if the match did not determine it. Motions wait for the odometry after them, until
+        all candidates of the delay can be compared.
         """
-        if abs(yaw_rad) > 0.01 and t1_ns - t0_ns < self._gap_ns:
-            self._pending_rotations.append((t0_ns, t1_ns, yaw_rad))
+        self._pending.append((t0_ns, t1_ns, motion))
         horizon = int(self._delays_ns[-1])
-        while (
-            self._pending_rotations
-            and self._count
-            and self.stamps_ns[-1] >= self._pending_rotations[0][1] + horizon
-        ):
-            t0, t1, yaw = self._pending_rotations.pop(0)
-            costs = np.empty(len(self._delays_ns))
-            recent = max(0, self._count - 1024)
-            if not delay_costs(
-                self.stamps_ns[recent:],
-                self.poses[recent:],
-                t0,
-                t1,
-                yaw,
-                self._delays_ns,
-                self._gap_ns,
-                costs,
-            ):
+        while self._pending and self._count and self.stamps_ns[-1] >= self._pending[0][1] + horizon:
+            t0, t1, matched = self._pending.pop(0)
+            if matched is None:
+                self.calibration.restart()
                 continue
-            self._update_delay(costs / (costs + 0.02**2))
-        if len(self._pending_rotations) > _MAX_PENDING:
-            del self._pending_rotations[: _MAX_PENDING // 2]
+            if abs(matched[2]) > 0.01 and t1 - t0 < self._gap_ns:
+                self._observe_rotation(t0, t1, float(matched[2]))
+            self.calibration.observe(self._measured(t0, t1, 0.0), matched, (t1 - t0) * NS)
+        if len(self._pending) > _MAX_PENDING:
+            del self._pending[: _MAX_PENDING // 2]
+            self.calibration.restart()
 
-    def _update_delay(self, costs: np.ndarray) -> None:
-        self._cost = 0.998 * self._cost + costs
-        self._weight = 0.998 * self._weight + 1.0
-        if self._weight < 20.0:
-            return
-        best = int(np.argmin(self._cost))
+    def report(self) -> OdometryReport:
+        """Return the estimated errors of the odometry."""
+        return self.calibration.report(self.delay_ns * NS)
+
+    def _observe_rotation(self, t0_ns: int, t1_ns: int, yaw_rad: float) -> None:
+        """Update the delay with the rotation `yaw_rad` between two scans.
+
+        The delay is the candidate whose rotations, times the best scale, have the lowest sum of squared
+        errors, exponentially forgotten.
+        """
+        turns = np.empty(len(self._delays_ns))
+        recent = max(0, self._count - 1024)
+        if turns_at_delays(
+            self.stamps_ns[recent:], self.poses[recent:], t0_ns, t1_ns, self._delays_ns, self._gap_ns, turns
+        ):
+            self._update_delay(yaw_rad, turns)
+
+    def _update_delay(self, yaw_rad: float, turns: np.ndarray) -> None:
         now = int(np.argmin(np.abs(self._delays_ns - self.delay_ns)))
+        # Slip is what fits no delay; the present delay may be wrong.
+        error = np.abs(yaw_rad - self.calibration.turn.value * turns).min() / _TURN_OUTLIER_RAD
+        weight = 1.0 / (1.0 + error**2)
+        self._sums = 0.998 * self._sums + weight * np.array(
+            [np.full(len(turns), yaw_rad**2), yaw_rad * turns, turns**2]
+        )
+        self._weight = 0.998 * self._weight + weight
+        if self._weight < _MIN_DELAY_WEIGHT:
+            return
+        costs = self._sums[0] - self._sums[1] ** 2 / np.maximum(self._sums[2], 1e-12)
+        best = int(np.argmin(costs))
         # Change only if the improvement exceeds the noise of the sum.
-        if self._cost[best] < self._cost[now] - 0.02 * self._weight**0.5 - 0.02 * self._cost[now]:
+        if costs[now] - costs[best] > _DELAY_EVIDENCE * costs[best] / self._weight:
             self.delay_ns = int(self._delays_ns[best])
+            self.calibration.restart()
 
 
 class MotionErrorModel:

@@ -7,7 +7,7 @@ import resource
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -60,9 +60,11 @@ def map_measurements(
     cpu_s_at: list[float] = []  # CPU time of all threads before each scan
     statuses: dict[str, int] = {}
     refused: Counter[str] = Counter()
+    heard = False
     with JobRunner(slam, threaded=True) as jobs:
         for kind, *values in _merged(log):
             if kind == "odometry":
+                heard = True
                 slam.add_odometry(*values)
                 continue
             cpu_s_at.append(time.process_time() - cpu)
@@ -97,6 +99,9 @@ def map_measurements(
         "gaps_tied_by_odometry": slam.gaps_tied,
         "gaps_open": slam.gaps_open,
         "odometry_refused": slam.local_builder.odometry.rejected,
+        "odometry": asdict(slam.local_builder.odometry.report()) if heard else None,
+        "self_returns": [asdict(sector) for sector in slam.self_returns.sectors()],
+        "self_returns_removed": slam.self_returns.removed,
         **{f"scans_{status}": count for status, count in statuses.items()},
         "refused": dict(refused),
         "T_body_lidar": se2.from_matrix(log.T_body_lidar).tolist(),

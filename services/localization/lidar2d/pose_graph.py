@@ -25,6 +25,8 @@ class PoseGraph:
 
     def __init__(self, settings: LidarSlamSettings) -> None:
         self.settings = settings
+        # Ranges of the robot's own surfaces by angle, float32 [self_returns.BINS]; None: none were found.
+        self.self_returns_m: np.ndarray | None = None
         self.uuid = ""  # of the map; derived from its first scan and kept over restarts
         self.nodes: dict[int, TrajectoryNode] = {}
         self.submaps: dict[int, Submap] = {}

@@ -132,25 +132,34 @@ def _tangents(
 
 
 @kernel
-def _spread(points: np.ndarray, step_m: float, limit: int, keep: np.ndarray) -> int:
-    """Select returns at least `step_m` from the one selected before; return the number of indices in `keep`.
+def _spread(
+    points: np.ndarray,  # float64 [M, 2] in beam order
+    spacing: np.ndarray,  # float64 [M]
+    step_m: float,
+    limit: int,
+    keep: np.ndarray,  # out int32 [limit + 1]
+) -> int:
+    """Select returns at least `step_m` apart along the surface; return the number of indices in `keep`.
 
     This is an adaptive voxel filter along the beam order: the step grows until at most `limit` returns are
-    selected.
+    selected. Distances along the surface are sums of `spacing`. The distance between two returns must not
+    decide: it selects the noise that leads away from the last return, which turns walls by milliradians.
     """
     step = step_m
     while True:
         count = 0
-        lx, ly = 1e18, 1e18
+        since = 1e18
         for i in range(points.shape[0]):
-            dx, dy = points[i, 0] - lx, points[i, 1] - ly
-            if dx * dx + dy * dy >= step * step:
+            if i > 0:
+                jump = math.hypot(points[i, 0] - points[i - 1, 0], points[i, 1] - points[i - 1, 1])
+                since += spacing[i] if jump < 3.0 * spacing[i] else jump
+            if since >= step:
                 if count == limit:
                     count = limit + 1
                     break
                 keep[count] = i
                 count += 1
-                lx, ly = points[i, 0], points[i, 1]
+                since = 0.0
         if count <= limit:
             return count
         step *= 1.25
@@ -201,5 +210,5 @@ def prepare_scan(
         spacing,
     )
     keep = np.empty(match_limit + 1, dtype=np.int32)
-    kept = _spread(points, min_spacing_m, match_limit, keep)
+    kept = _spread(points, spacing, min_spacing_m, match_limit, keep)
     return PreparedScan(points, tangents, spacing, beams, keep[:kept].copy(), pose_body_lidar[:2].copy())

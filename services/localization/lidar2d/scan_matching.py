@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -32,13 +32,65 @@ class Match:
     overlap: float  # returns in observed space / all returns
     residual_m: float  # robust RMS distance to the surfaces
     full_information: np.ndarray | None = None  # before a reduction by observability.reduce_unobservable()
+    # float64 [3], m/s, m/s, rad/s in body axes: the twist during the scan minus that of its deskewing
+    twist_correction: np.ndarray = field(default_factory=lambda: np.zeros(3))
+
+
+@kernel
+def associate(
+    x: float,
+    y: float,
+    tx: float,  # tangent in the target frame, (0, 0) if unknown
+    ty: float,
+    half_spacing_m: float,
+    ox: float,  # position of the lidar
+    oy: float,
+    nearest: np.ndarray,
+    means: np.ndarray,
+    omegas: np.ndarray,
+    views: np.ndarray,
+    row0: int,
+    col0: int,
+    inv_cell: float,
+) -> tuple[bool, float, float, float, float, float]:
+    """Find the surface of a return at (x, y) in the target frame.
+
+    A return constrains the pose only across its own surface. Along its tangent (or, if that is unknown,
+    within its spacing) its position is uncertain: S = s^2 t t^T or s^2 I, and Omega' = (Omega^-1 + S)^-1.
+    Without S, a corridor would seem to constrain the motion along it. A surface that was observed from its
+    other side is ignored, because walls are thin.
+
+    Returns (found, difference x, y to the mean of the surface, Omega' xx, xy, yy).
+    """
+    r, q = math.floor(y * inv_cell) - row0, math.floor(x * inv_cell) - col0
+    if r < 0 or q < 0 or r >= nearest.shape[0] or q >= nearest.shape[1]:
+        return False, 0.0, 0.0, 0.0, 0.0, 0.0
+    k = nearest[r, q]
+    if k < 0:
+        return False, 0.0, 0.0, 0.0, 0.0, 0.0
+    vx, vy = ox - x, oy - y
+    if vx * views[k, 0] + vy * views[k, 1] < MIN_VIEW_COSINE * math.sqrt(vx * vx + vy * vy):
+        return False, 0.0, 0.0, 0.0, 0.0, 0.0
+    a, b, d = omegas[k, 0], omegas[k, 1], omegas[k, 2]
+    if tx != 0.0 or ty != 0.0:
+        ux, uy = a * tx + b * ty, b * tx + d * ty
+        f = TANGENT_VARIANCE_M2 / (1.0 + TANGENT_VARIANCE_M2 * (tx * ux + ty * uy))
+        a, b, d = a - f * ux * ux, b - f * ux * uy, d - f * uy * uy
+    else:
+        s2 = half_spacing_m * half_spacing_m
+        det = a * d - b * b
+        f = 1.0 / (1.0 + s2 * (a + d) + s2 * s2 * det)
+        a, b, d = f * (a + s2 * det), f * b, f * (d + s2 * det)
+    return True, x - means[k, 0], y - means[k, 1], a, b, d
 
 
 @kernel
 def accumulate(
     points: np.ndarray,  # float64 [K, 5] body frame: x, y, tangent x, tangent y, half spacing
+    times_s: np.ndarray,  # float64 [K] after the stamp; not read if H is [3, 3]
     origin: np.ndarray,  # float64 [2] lidar in the body frame
     pose: np.ndarray,  # float64 [3] pose_target_body
+    twist: np.ndarray,  # float64 [3] in the axes of the target, added to that of the deskewing
     nearest: np.ndarray,
     means: np.ndarray,
     omegas: np.ndarray,
@@ -47,15 +99,12 @@ def accumulate(
     col0: int,
     cell_m: float,
     scale2: float,  # squared outlier scale, in units of the surface's standard deviation
-    H: np.ndarray,  # out float64 [3, 3]
-    g: np.ndarray,  # out float64 [3]
+    H: np.ndarray,  # out float64 [N, N], N = 3: pose, N = 6: pose and twist
+    g: np.ndarray,  # out float64 [N]
 ) -> tuple[float, float, float]:
     """Compute the normal equations of sum rho(d^T Omega d), d = pose * p - mean, with Geman-McClure weights.
 
-    A return constrains the pose only across its own surface. Along its tangent (or, if that is unknown,
-    within its spacing) its position is uncertain: S = s^2 t t^T or s^2 I, and Omega' = (Omega^-1 + S)^-1.
-    Without S, a corridor would seem to constrain the motion along it. A surface that was observed from its
-    other side is ignored, because walls are thin.
+    With a twist, the return measured t seconds after the stamp is moved by t * twist, to first order.
 
     Returns (sum of weights, number of associated returns, weighted sum of d^T Omega d).
     """
@@ -65,83 +114,101 @@ def accumulate(
     g[:] = 0.0
     weights = found = cost = 0.0
     inv = 1.0 / cell_m
-    rows, cols = nearest.shape
+    swept = H.shape[0] == 6
     for i in range(points.shape[0]):
         px, py = points[i, 0], points[i, 1]
         rx, ry = c * px - s * py, s * px + c * py
         x, y = pose[0] + rx, pose[1] + ry
-        r, q = math.floor(y * inv) - row0, math.floor(x * inv) - col0
-        if r < 0 or q < 0 or r >= rows or q >= cols:
-            continue
-        k = nearest[r, q]
-        if k < 0:
-            continue
-        vx, vy = ox - x, oy - y
-        if vx * views[k, 0] + vy * views[k, 1] < MIN_VIEW_COSINE * math.sqrt(vx * vx + vy * vy):
+        if swept:
+            t = times_s[i]
+            x += t * (twist[0] - twist[2] * ry)
+            y += t * (twist[1] + twist[2] * rx)
+        tx, ty = c * points[i, 2] - s * points[i, 3], s * points[i, 2] + c * points[i, 3]
+        hit, dx, dy, a, b, d = associate(
+            x, y, tx, ty, points[i, 4], ox, oy, nearest, means, omegas, views, row0, col0, inv
+        )
+        if not hit:
             continue
         found += 1.0
-        dx, dy = x - means[k, 0], y - means[k, 1]
-        a, b, d = omegas[k, 0], omegas[k, 1], omegas[k, 2]
-        if points[i, 2] != 0.0 or points[i, 3] != 0.0:
-            tx, ty = c * points[i, 2] - s * points[i, 3], s * points[i, 2] + c * points[i, 3]
-            vx, vy = a * tx + b * ty, b * tx + d * ty
-            f = TANGENT_VARIANCE_M2 / (1.0 + TANGENT_VARIANCE_M2 * (tx * vx + ty * vy))
-            a, b, d = a - f * vx * vx, b - f * vx * vy, d - f * vy * vy
-        else:
-            s2 = points[i, 4] * points[i, 4]
-            det = a * d - b * b
-            f = 1.0 / (1.0 + s2 * (a + d) + s2 * s2 * det)
-            a, b, d = f * (a + s2 * det), f * b, f * (d + s2 * det)
         ux, uy = a * dx + b * dy, b * dx + d * dy
         e2 = dx * ux + dy * uy
         root = scale2 / (scale2 + e2)
         w = root * root
         weights += w
         cost += w * e2
-        # Jacobian of pose * p: [I, (-ry, rx)]
+        # Jacobian of pose * p: [I, (-ry, rx)]; that of the twist is t times as large.
         jx, jy = a * -ry + b * rx, b * -ry + d * rx
-        H[0, 0] += w * a
-        H[0, 1] += w * b
-        H[1, 1] += w * d
-        H[0, 2] += w * jx
-        H[1, 2] += w * jy
-        H[2, 2] += w * (-ry * jx + rx * jy)
-        g[0] += w * ux
-        g[1] += w * uy
-        g[2] += w * (-ry * ux + rx * uy)
-    H[1, 0], H[2, 0], H[2, 1] = H[0, 1], H[0, 2], H[1, 2]
+        h00, h01, h11 = w * a, w * b, w * d
+        h02, h12, h22 = w * jx, w * jy, w * (-ry * jx + rx * jy)
+        g0, g1, g2 = w * ux, w * uy, w * (-ry * ux + rx * uy)
+        H[0, 0] += h00
+        H[0, 1] += h01
+        H[1, 1] += h11
+        H[0, 2] += h02
+        H[1, 2] += h12
+        H[2, 2] += h22
+        g[0] += g0
+        g[1] += g1
+        g[2] += g2
+        if swept:
+            H[0, 3] += t * h00
+            H[0, 4] += t * h01
+            H[1, 4] += t * h11
+            H[0, 5] += t * h02
+            H[1, 5] += t * h12
+            H[2, 5] += t * h22
+            t2 = t * t
+            H[3, 3] += t2 * h00
+            H[3, 4] += t2 * h01
+            H[4, 4] += t2 * h11
+            H[3, 5] += t2 * h02
+            H[4, 5] += t2 * h12
+            H[5, 5] += t2 * h22
+            g[3] += t * g0
+            g[4] += t * g1
+            g[5] += t * g2
+    if swept:
+        H[1, 3], H[2, 3], H[2, 4] = H[0, 4], H[0, 5], H[1, 5]
+    for i in range(H.shape[0]):
+        for j in range(i):
+            H[i, j] = H[j, i]
     return weights, found, cost
 
 
 @kernel
-def solve3(A: np.ndarray, b: np.ndarray, x: np.ndarray) -> bool:
-    """Solve A x = b for symmetric A [3, 3] by Cholesky; return False if A is not positive definite."""
-    l00 = A[0, 0]
-    if not l00 > 0.0:
-        return False
-    l00 = math.sqrt(l00)
-    l10, l20 = A[1, 0] / l00, A[2, 0] / l00
-    l11 = A[1, 1] - l10 * l10
-    if not l11 > 1e-12 * A[1, 1]:
-        return False
-    l11 = math.sqrt(l11)
-    l21 = (A[2, 1] - l20 * l10) / l11
-    l22 = A[2, 2] - l20 * l20 - l21 * l21
-    if not l22 > 1e-12 * A[2, 2]:
-        return False
-    l22 = math.sqrt(l22)
-    y0 = b[0] / l00
-    y1 = (b[1] - l10 * y0) / l11
-    y2 = (b[2] - l20 * y0 - l21 * y1) / l22
-    x[2] = y2 / l22
-    x[1] = (y1 - l21 * x[2]) / l11
-    x[0] = (y0 - l10 * x[1] - l20 * x[2]) / l00
+def solve(A: np.ndarray, b: np.ndarray, x: np.ndarray) -> bool:
+    """Solve A x = b for symmetric A [N, N] by Cholesky; return False if A is not positive definite.
+
+    The lower triangle of A is overwritten by its Cholesky factor.
+    """
+    n = A.shape[0]
+    for i in range(n):
+        for j in range(i + 1):
+            total = A[i, j]
+            for k in range(j):
+                total -= A[i, k] * A[j, k]
+            if i == j:
+                if not total > 1e-12 * A[i, i]:
+                    return False
+                A[i, i] = math.sqrt(total)
+            else:
+                A[i, j] = total / A[j, j]
+    for i in range(n):
+        x[i] = b[i]
+        for k in range(i):
+            x[i] -= A[i, k] * x[k]
+        x[i] /= A[i, i]
+    for i in range(n - 1, -1, -1):
+        for k in range(i + 1, n):
+            x[i] -= A[k, i] * x[k]
+        x[i] /= A[i, i]
     return True
 
 
 @kernel
 def gauss_newton(
     points: np.ndarray,
+    times_s: np.ndarray,
     origin: np.ndarray,
     start_pose: np.ndarray,
     nearest: np.ndarray,
@@ -153,54 +220,95 @@ def gauss_newton(
     cell_m: float,
     prior_pose: np.ndarray,  # float64 [3]
     prior_information: np.ndarray,  # float64 [3, 3], zeros = no prior
+    prior_twist: np.ndarray,  # float64 [3] in the axes of the target
+    twist_information: np.ndarray,  # float64 [3], diagonal; empty: the twist is not estimated
     outlier: float,  # units of the surface's standard deviation
     returns_per_measurement: float,  # number of returns per independent measurement
     anneal: np.ndarray,  # float64 [A]
     iterations: int,
     pose: np.ndarray,  # out float64 [3]
-    H: np.ndarray,  # out float64 [3, 3] information of the scan alone
+    twist: np.ndarray,  # out float64 [3] in the axes of the target
+    information: np.ndarray,  # out float64 [3, 3] of the pose, by the scan alone, twist marginalised
 ) -> tuple[float, float, float]:
     """Optimise the pose of a scan by iteratively reweighted Gauss-Newton with a robust prior on the pose.
 
-    Damping limits the steps in unobservable directions.
+    The twist during the scan is estimated together with the pose (continuous-time matching, Dellenbach et
+    al. 2022), because otherwise an acceleration distorts the scan: 1 rad/s^2 acts like a yaw error of 4 mrad
+    at 10 Hz. Damping limits the steps in unobservable directions.
 
     Returns (sum of weights, number of associated returns, weighted cost) at the final pose.
     """
-    g, A, b, step, e = np.empty(3), np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(3)
+    n = 3 + twist_information.shape[0]
+    H, A = np.empty((n, n)), np.empty((n, n))
+    g, b, step, e = np.empty(n), np.empty(n), np.empty(n), np.empty(3)
     pose[:] = start_pose
+    twist[:] = prior_twist
     weights = found = cost = 0.0
     for it in range(iterations):
         scale = outlier * (anneal[it] if it < anneal.shape[0] else 1.0)
         weights, found, cost = accumulate(
-            points, origin, pose, nearest, means, omegas, views, row0, col0, cell_m, scale * scale, H, g
-        )
+            points, times_s, origin, pose, twist, nearest, means, omegas, views, row0, col0, cell_m,
+            scale * scale, H, g,
+        )  # fmt: skip
         e[0], e[1], e[2] = pose[0] - prior_pose[0], pose[1] - prior_pose[1], se2.wrap(pose[2] - prior_pose[2])
         m2 = 0.0
         for i in range(3):
             for j in range(3):
                 m2 += e[i] * prior_information[i, j] * e[j]
         w = 1.0 / (1.0 + m2 / 9.0)  # Cauchy weight: 0.5 at three sigma
-        for i in range(3):
+        for i in range(n):
             b[i] = -g[i] / returns_per_measurement
+            for j in range(n):
+                A[i, j] = H[i, j] / returns_per_measurement
+        for i in range(3):
             for j in range(3):
-                A[i, j] = H[i, j] / returns_per_measurement + w * prior_information[i, j]
+                A[i, j] += w * prior_information[i, j]
                 b[i] -= w * prior_information[i, j] * e[j]
+        for i in range(n - 3):
+            A[3 + i, 3 + i] += twist_information[i]
+            b[3 + i] -= twist_information[i] * (twist[i] - prior_twist[i])
         # Damping of (1 m)^-2 and (0.3 rad)^-2; it matters only in unobservable directions.
         A[0, 0] += 1.0
         A[1, 1] += 1.0
         A[2, 2] += 10.0
-        if not solve3(A, b, step):
+        if not solve(A, b, step):
             break
         pose[0] += step[0]
         pose[1] += step[1]
         pose[2] = se2.wrap(pose[2] + step[2])
+        for i in range(n - 3):
+            twist[i] += step[3 + i]
         if it >= anneal.shape[0] and step[0] ** 2 + step[1] ** 2 < 1e-8 and abs(step[2]) < 2e-5:
             break
     weights, found, cost = accumulate(
-        points, origin, pose, nearest, means, omegas, views, row0, col0, cell_m, outlier * outlier, H, g
-    )
+        points, times_s, origin, pose, twist, nearest, means, omegas, views, row0, col0, cell_m,
+        outlier * outlier, H, g,
+    )  # fmt: skip
     H /= returns_per_measurement
+    _marginalise_twist(H, twist_information, information)
     return weights, found, cost
+
+
+@kernel
+def _marginalise_twist(H: np.ndarray, twist_information: np.ndarray, out: np.ndarray) -> None:
+    """Write the information [3, 3] of the pose to `out`: the Schur complement of the twist in H."""
+    for i in range(3):
+        for j in range(3):
+            out[i, j] = H[i, j]
+    if H.shape[0] == 3:
+        return
+    A, x, column = np.empty((3, 3)), np.empty(3), np.empty(3)
+    for j in range(3):
+        for i in range(3):
+            column[i] = H[3 + i, j]
+            for k in range(3):
+                A[i, k] = H[3 + i, 3 + k]
+            A[i, i] += twist_information[i]
+        if not solve(A, column, x):
+            return
+        for i in range(3):
+            for k in range(3):
+                out[i, j] -= H[i, 3 + k] * x[k]
 
 
 @kernel
@@ -225,6 +333,19 @@ def count_overlapping_returns(
     return n
 
 
+NO_TIMES = np.empty(0)
+
+
+@dataclass(frozen=True)
+class TwistPrior:
+    """Prior of the twist during a scan, for its estimation together with the pose."""
+
+    times_s: np.ndarray  # float64 [K], time of each return after the stamp
+    correction: np.ndarray  # float64 [3], body axes: expected twist minus the twist of the deskewing
+    sigma_m_s: float
+    sigma_rad_s: float
+
+
 def refine(
     points: np.ndarray,  # float64 [K, 5], PreparedScan.features()
     origin: np.ndarray,  # float64 [2]
@@ -235,14 +356,26 @@ def refine(
     prior_information: np.ndarray | None = None,
     iterations: int = 15,
     anneal: tuple[float, ...] = ANNEAL_SCALES,
+    twist_prior: TwistPrior | None = None,
 ) -> Match:
-    """Return the match of a scan, refined by Gauss-Newton from `start_pose` [3]."""
-    pose, H = np.empty(3), np.empty((3, 3))
+    """Return the match of a scan, refined by Gauss-Newton from `start_pose` [3].
+
+    With `twist_prior`, the twist during the scan is estimated too.
+    """
+    pose, twist, H = np.empty(3), np.empty(3), np.empty((3, 3))
     sigma_m = math.hypot(settings.range_sigma_m, settings.map_sigma_m)
     if prior_pose is None or prior_information is None:
         prior_pose, prior_information = start_pose, np.zeros((3, 3))
+    turn = np.array([0.0, 0.0, start_pose[2]])
+    times_s, prior_twist, twist_information = NO_TIMES, np.zeros(3), NO_TIMES
+    if twist_prior is not None:
+        times_s = twist_prior.times_s
+        prior_twist[:2] = se2.transform(turn, twist_prior.correction[None, :2])[0]
+        prior_twist[2] = twist_prior.correction[2]
+        twist_information = np.array([twist_prior.sigma_m_s] * 2 + [twist_prior.sigma_rad_s]) ** -2.0
     weights, _, cost = gauss_newton(
         points,
+        times_s,
         origin,
         start_pose,
         tables.nearest,
@@ -254,11 +387,14 @@ def refine(
         tables.cell_m,
         prior_pose,
         prior_information,
+        prior_twist,
+        twist_information,
         settings.outlier_m / sigma_m,
         settings.returns_per_measurement,
         np.array(anneal),
         iterations,
         pose,
+        twist,
         H,
     )
     n = max(len(points), 1)
@@ -266,4 +402,7 @@ def refine(
         points, pose, tables.nearest, tables.misses, tables.row0, tables.col0, tables.cell_m
     )
     residual = sigma_m * math.sqrt(max(cost, 0.0) / weights) if weights > 0 else math.inf
-    return Match(pose, H, weights / max(overlapping, 1), overlapping / n, residual)
+    correction = np.array([*se2.transform(-turn, twist[None, :2])[0], twist[2]])
+    return Match(
+        pose, H, weights / max(overlapping, 1), overlapping / n, residual, twist_correction=correction
+    )

@@ -91,3 +91,10 @@ def from_matrix(T_a_b: np.ndarray) -> np.ndarray:
         raise ValueError(f"a pose has shape {T_a_b.shape}; expected (4, 4), (3, 3) or (3,)")
     last = T_a_b.shape[0] - 1
     return np.array([T_a_b[0, last], T_a_b[1, last], math.atan2(T_a_b[1, 0], T_a_b[0, 0])])
+
+
+def rotate_covariance(covariance: np.ndarray, yaw_rad: float) -> np.ndarray:
+    """Return a covariance [3, 3] of (x, y, yaw) in axes that are rotated by `-yaw_rad`."""
+    c, s = math.cos(yaw_rad), math.sin(yaw_rad)
+    R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    return R @ covariance @ R.T

@@ -22,9 +22,11 @@ from beamsplat.services.localization.lidar2d.motion_covariance import UNKNOWN, m
 from beamsplat.services.localization.lidar2d.occupancy import OccupancyGrid, render_occupancy
 from beamsplat.services.localization.lidar2d.pose_graph import PoseGraph
 from beamsplat.services.localization.lidar2d.pose_graph_data import Constraint
+from beamsplat.services.localization.lidar2d.pose_quality import LOST, PoseQuality, rate_pose
 from beamsplat.services.localization.lidar2d.relocalization import Relocalization, relocalize_in
 from beamsplat.services.localization.lidar2d.scan import PreparedScan
 from beamsplat.services.localization.lidar2d.scan_matching import Match
+from beamsplat.services.localization.lidar2d.self_returns import SelfReturns
 from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
 from beamsplat.services.localization.lidar2d.state import load_state, map_uuid
 from beamsplat.services.localization.lidar2d.trajectory_record import TrajectoryRecord
@@ -48,6 +50,7 @@ class ScanResult:
     beams: np.ndarray  # int32 [M] beam of each return
     inserted: bool  # the scan became a node
     inlier_ratio: float  # returns on surfaces / returns in observed space
+    quality: PoseQuality
     job: BackgroundJob | None  # work to be run; its result is due before scan `job.apply_at_scan`
 
 
@@ -68,6 +71,7 @@ class LidarSlam:
         self.active_submaps = ActiveSubmaps(settings, self.pose_graph)
         self.record = TrajectoryRecord()
         self.scans = 0
+        self.self_returns = SelfReturns()
         self._stamps = StampGuard()
         self._consecutive_lost = 0
         self._next_link_scan = 0
@@ -113,15 +117,17 @@ class LidarSlam:
             return self._rejected(raw, reason)
         if restarted:
             self.local_builder.restart_clock(stamp_ns)
+        measured, raw = raw, self.self_returns.without(raw)
         if not self.local_builder.poses:
             return self._add_first_scan(raw)
         # 1. predict, 2. deskew, 3. match
         prediction, candidates = self.local_builder.predict(stamp_ns)
-        scan = self.local_builder.prepare(raw, self.local_builder.scan_velocity(raw, prediction.motion))
+        velocity = self.local_builder.scan_velocity(raw, prediction.motion)
+        scan = self.local_builder.prepare(raw, velocity)
         if len(scan) < self.settings.min_points:
             return self._rejected(raw, f"{len(scan)} returns; at least {self.settings.min_points} are needed")
         scan, match, good = self.local_builder.match(
-            raw, scan, prediction, self.active_submaps.matching_target
+            raw, scan, velocity, prediction, self.active_submaps.matching_target
         )
         # 4. take the matched pose, or else the wheel odometry
         if good:
@@ -133,8 +139,12 @@ class LidarSlam:
             pose_odom_body = self.local_builder.poses[-1]
             if moved is not None:
                 pose_odom_body = se2.compose(self.local_builder.last_matched[1], moved.motion)
+        if good:
+            self._find_self_returns(measured, se2.between(self.local_builder.poses[-1], pose_odom_body))
         target_yaw_rad = float(self.active_submaps.matching_target.pose_odom_submap[2])
-        self.local_builder.accept(stamp_ns, pose_odom_body, candidates if good else [], good)
+        self.local_builder.accept(
+            stamp_ns, pose_odom_body, candidates if good else [], velocity, matched=good
+        )
         covariance = self._covariance(match, target_yaw_rad) if good else UNKNOWN
         self._consecutive_lost = 0 if good else self._consecutive_lost + 1
         tie = None
@@ -215,8 +225,16 @@ class LidarSlam:
             scan.beams,
             inserted,
             match.inlier_ratio,
+            rate_pose(covariance, match, self.local_builder.reckoning.degenerate, self.settings)
+            if good
+            else LOST,
             job,
         )
+
+    def _find_self_returns(self, raw: RawScan, motion: np.ndarray) -> None:
+        """Look for returns on the robot itself; what is found is saved with the map."""
+        if self.self_returns.observe(raw, motion):
+            self.pose_graph.self_returns_m = self.self_returns.range_m.astype(np.float32)
 
     def _place_scans(self, stamp_ns: int, pose_odom_body: np.ndarray) -> None:
         """Record this scan, and those before it that had no pose yet, relative to the last node."""
@@ -244,6 +262,7 @@ class LidarSlam:
             np.zeros(0, dtype=np.int32),
             False,
             0.0,
+            LOST,
             self._next_job(),
         )
 
@@ -360,6 +379,8 @@ class LidarSlam:
         """
         slam = LidarSlam(settings, T_body_lidar)
         slam.pose_graph, extra = load_state(folder, settings)
+        if slam.pose_graph.self_returns_m is not None:
+            slam.self_returns.restore(slam.pose_graph.self_returns_m)
         slam.active_submaps = ActiveSubmaps(settings, slam.pose_graph)
         slam.record = TrajectoryRecord() if localize_only else TrajectoryRecord.of(extra)
         slam.pose_graph.start_segment(restarted=True)

@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 
 from beamsplat.services.localization.lidar2d import se2
-from beamsplat.services.localization.lidar2d.local_trajectory_builder import exp_twist, twist
 from beamsplat.services.localization.lidar2d.metrics import interpolate_poses
 from beamsplat.services.localization.lidar2d.odometry import MotionErrorModel, OdometryBuffer, interpolate
+from beamsplat.services.localization.lidar2d.twist import exp_twist, twist
 
 NS = 1_000_000_000
 
@@ -29,18 +29,60 @@ def test_interpolation_against_reference_code(rng):
     assert not interpolate(stamps, poses, int(stamps[-1]) + 2, 1, NS, out)
 
 
-@pytest.mark.parametrize("delay_s", [-0.12, 0.0, 0.15])
-def test_the_delay_is_estimated(delay_s, rng):
-    buffer, last = OdometryBuffer(), None
-    for k in range(3000):  # odometry at 50 Hz with a delayed clock
-        t = k * 0.02
-        buffer.add(round(t * NS), *turning(np.array([t - delay_s]))[0])
+def observed(distort, rng, seconds=60.0, delay_s=0.0):
+    """Return a buffer that has compared distorted odometry (50 Hz) with the motion by scans (5 Hz)."""
+    buffer = OdometryBuffer()
+    ticks = np.arange(0.0, seconds, 0.02)
+    truth = turning(ticks)
+    poses = [np.zeros(3)]
+    for t, step in zip(ticks, se2.between_many(truth[:-1], truth[1:])):
+        poses.append(se2.compose(poses[-1], distort(t, step)))
+    last = None
+    for k, (t, pose) in enumerate(zip(ticks, poses)):
+        buffer.add(round((t + delay_s) * NS), *pose)
         if k % 10 == 0 and t > 1.0:
-            stamp, yaw = round((t - 0.5) * NS), turning(np.array([t - 0.5]))[0, 2]
+            stamp, now = round((t - 0.5) * NS), turning(np.array([t - 0.5]))[0]
             if last is not None:
-                buffer.observe_rotation(last[0], stamp, yaw - last[1] + 0.003 * rng.standard_normal())
-            last = (stamp, yaw)
+                noise = rng.normal(0.0, (0.002, 0.002, 0.002))
+                buffer.observe(last[0], stamp, se2.between(last[1], now) + noise)
+            last = (stamp, now)
+    return buffer
+
+
+@pytest.mark.parametrize("delay_s", [-0.12, 0.0, 0.16, 0.64])
+def test_the_delay_is_estimated(delay_s, rng):
+    # The wheels also turn too much, which must not look like a delay.
+    buffer = observed(lambda t, step: step * (1.0, 1.0, 1.1), rng, delay_s=delay_s)
     assert buffer.delay_ns / NS == pytest.approx(delay_s, abs=0.021)
+
+
+@pytest.mark.parametrize(("scale", "turn"), [(1.1, 1.0), (0.97, 0.96), (-1.0, 1.0)])
+def test_the_scales_are_estimated_and_corrected(scale, turn, rng):
+    buffer = observed(lambda t, step: step * (scale, scale, turn), rng)
+    report = buffer.report()
+    assert report.used
+    assert abs(report.distance_scale - 1.0 / scale) < min(0.01, 4.0 * report.distance_scale_sigma)
+    assert abs(report.turn_scale - 1.0 / turn) < min(0.02, 4.0 * report.turn_scale_sigma)
+    assert bool(report.text) == (abs(scale - 1.0) > 0.05)
+    truth = turning(np.array([30.0, 31.0]))
+    error = se2.between(se2.between(*truth), buffer.increment(30 * NS, 31 * NS))
+    assert np.hypot(error[0], error[1]) < 0.01
+
+
+def test_slip_is_counted_and_does_not_change_the_scale(rng):
+    buffer = observed(lambda t, step: step * (1.6 if 20.0 < t % 25.0 < 22.0 else 1.0, 1.0, 1.0), rng)
+    report = buffer.report()
+    assert abs(report.distance_scale - 1.0) < 0.01
+    assert report.used
+    assert 1 <= report.disagreeing <= 6
+
+
+def test_odometry_without_a_constant_scale_is_not_used(rng):
+    # Wheels without a sign on a robot that moves back and forth.
+    buffer = observed(lambda t, step: step * (1.0 if t % 4.0 < 2.0 else -1.0, 1.0, 1.0), rng)
+    report = buffer.report()
+    assert not report.used
+    assert "not used" in report.text
 
 
 def test_increments_across_gaps_and_beyond_the_end():

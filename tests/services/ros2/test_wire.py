@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_typestore
 
 from beamsplat.common import messages as m
+from beamsplat.common.geometry.transforms import se2_to_se3
 from beamsplat.common.recording import ros_types as ros
 from beamsplat.common.recording.sensors import SENSORS, build_message, ros_fields
 from beamsplat.common.recording.to_ros import records_of
@@ -158,3 +159,23 @@ def test_the_robots_odometry_publishes_odom_to_body():
     T_map_odom = ros.transform_of(only.transform.translation, only.transform.rotation)
     assert T_map_odom @ wheels == pytest.approx(tree.T_map_odom @ ours, abs=1e-12)
     assert tree.tf(2 * 10**9, ours) is None  # where the wheels were then is not known
+
+
+def test_the_pose_with_covariance_has_the_axes_of_the_map():
+    transforms = TfTree("map", "odom", "base_link")
+    transforms.T_map_odom = se2_to_se3(np.array([1.0, 2.0, np.pi / 2]))
+    covariance = np.array(
+        [[4e-4, 1e-4, 2e-5], [1e-4, 1e-4, 0.0], [2e-5, 0.0, 1e-6]]
+    )  # larger along x of odom
+    message = transforms.pose_with_covariance(5, se2_to_se3(np.array([3.0, 0.0, 0.0])), covariance)
+    assert ros.serialize(message)
+    assert message.header.frame_id == "map"
+    position = message.pose.pose.position
+    assert (position.x, position.y) == pytest.approx((1.0, 5.0))
+    full = message.pose.covariance.reshape(6, 6)
+    assert full[1, 1] == pytest.approx(4e-4)  # x of odom is y of the map
+    assert full[0, 0] == pytest.approx(1e-4)
+    assert full[0, 1] == full[1, 0] == pytest.approx(-1e-4)
+    assert full[1, 5] == pytest.approx(2e-5)
+    assert full[5, 5] == pytest.approx(1e-6)
+    assert not full[2:5].any()
