@@ -16,6 +16,7 @@ from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
 from beamsplat.services.localization.lidar2d.slam import LidarSlam
 from tests.common.scans.robots import DRIVERS, START_NS, Drive, odometry, sweeps
 
+QUICK = ("sllidar_ros2", "ldlidar_stl_ros2", "ld08_driver", "rplidar_mirrored", "negative_time")
 COUNTER_CLOCKWISE = ("turtlebot3_slow", "eaibot", "negative_time", "no_time")
 
 
@@ -64,7 +65,9 @@ def compare(read, ideal):
     return max(directions), max(times)
 
 
-@pytest.mark.parametrize("name", sorted(DRIVERS))
+@pytest.mark.parametrize(
+    "name", [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in DRIVERS]
+)
 def test_beams_get_the_direction_and_the_time_of_their_measurement(recorded, name):
     clockwise, counter_clockwise, wheels = recorded
     ideal = counter_clockwise if name in COUNTER_CLOCKWISE else clockwise
