@@ -14,13 +14,13 @@ import numpy as np
 from beamsplat.services.localization.lidar2d.scan import PreparedScan, half_spacing_m
 
 # Number of returns and of features, metres per unit of the coordinates, position of the lidar.
-_HEAD = struct.Struct("<HHfdd")
+_HEAD = struct.Struct("<IHfdd")
 # Coordinates in units of the scan, surface direction in units of pi / 65534, spacing in m.
 _RETURN = np.dtype([("x", "<i2"), ("y", "<i2"), ("direction", "<i2"), ("spacing", "<f2")])
 _UNITS = 32767  # of the largest coordinate of a scan: steps of 1 mm for a return at 30 m
 _UNKNOWN_DIRECTION = -32768
 _RAD_PER_UNIT = 0.5 * math.pi / _UNITS
-_MAX_RETURNS = 65535
+_MAX_RETURNS = 65536  # the largest number of beams of a scan; feature indices have 16 bits
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +52,7 @@ class NodeScan:
         """Quantise a scan.
 
         Raises:
-            ValueError: more than 65535 returns, or values that are not finite.
+            ValueError: more than 65536 returns, or values that are not finite.
         """
         count = len(points)
         if count > _MAX_RETURNS:
