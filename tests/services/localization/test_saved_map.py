@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from beamsplat.common.messages.robot import MAX_BEAMS
 from beamsplat.services.localization.lidar2d import se2
 from beamsplat.services.localization.lidar2d.map_records import SavedMap
 from beamsplat.services.localization.lidar2d.map_saver import MapSaver
@@ -62,6 +63,14 @@ def test_scans_of_any_kind_are_stored_and_damaged_ones_are_refused():
     empty.check()
     assert empty.points.shape == (0, 2)
     assert empty.features.shape == (0, 5)
+    most = np.linspace(-30.0, 30.0, MAX_BEAMS)[:, None] * [1.0, 0.5]
+    dense = NodeScan.packed(
+        most, np.tile([0.6, 0.8], (MAX_BEAMS, 1)), np.ones(MAX_BEAMS), np.zeros(MAX_BEAMS, bool),
+        np.array([0, MAX_BEAMS - 1]), np.ones(2),
+    )  # fmt: skip
+    dense.check()
+    assert np.abs(dense.points - most).max() < 0.0005
+    assert np.abs(dense.features[:, :2] - most[[0, -1]]).max() < 0.0005
     data = room_scan(1).data
     for damaged in (b"", data[:-1], data + b"x", b"\xff\xff" + data[2:], data[:2] + b"\xff\xff" + data[4:]):
         with pytest.raises(ValueError, match="a node"):
