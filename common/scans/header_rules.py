@@ -20,6 +20,7 @@ from beamsplat.common.scans.rules import (
 )
 
 MAX_PERIOD_S = 2.0  # of a revolution: the slowest planar lidars make one per second
+_LARGEST_LIMIT_M = 1e5  # of range_max in a `Scan` message
 _LARGEST_RANGE_M = 300.0  # of any planar lidar
 _LARGEST_MEDIAN_M = 80.0  # of the readings of a stream, indoors or out
 _CODE_SHARE = 0.005  # of the readings that are exactly the largest, for a code of "no return"
@@ -192,7 +193,7 @@ def _range_rules(messages: list[LaserMessage], rules: ScanRules) -> ScanRules:
     largest = float(measured.max()) * scale
     top *= limit_scale
     replaced = max(_UNKNOWN_RANGE_MAX_M, 1.5 * largest)
-    if not (math.isfinite(top) and top > 0.0):
+    if not (math.isfinite(top) and 0.0 < top <= _LARGEST_LIMIT_M):
         return replace(rules, range_max_m=replaced, range_max_why=_not_stated(top))
     low = float(np.median([message.range_min_m for message in messages])) * limit_scale
     if 0.0 < low < top and float(np.mean(measured * scale < low)) > 0.5:

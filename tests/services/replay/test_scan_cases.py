@@ -439,7 +439,7 @@ MUTATIONS = {
         f"{field} * {factor}": scan(**{field: lambda m, field=field, factor=factor: factor * getattr(m, field)})
         for field in ("angle_min", "angle_max", "angle_increment", "time_increment", "range_max", "ranges")
         for factor in (-1.0, 0.5, 2.0, math.degrees(1.0), 100.0, 1000.0, 1e9)
-        if (field, factor) != ("ranges", -1.0)
+        if (field, factor) not in (("ranges", -1.0), ("range_max", 0.5))
     },
     "ranges reversed": scan(ranges=lambda m: m.ranges[::-1].copy()),
     "ranges cut": scan(ranges=lambda m: m.ranges[: BEAMS // 2].copy()),
