@@ -35,6 +35,8 @@ _USE_RIG = "give the calibration of these images in a rig file (create one with 
 _OFF_CENTRE = 0.15  # of the image size: a principal point farther from the centre is doubted
 _SAME_CENTRE = 0.03  # of the image size: two principal points count as equally plausible
 _PIXEL_ASPECT = 0.05  # |fx / fy - 1| of a camera with square pixels
+_LEAST_CORNER = 0.7  # of its radius: how far a pincushion distortion moves the corner inwards
+_MOST_TANGENTIAL = 0.05  # p1 and p2; decentred lenses have 0.001
 _P_RATIO = (0.4, 1.4)  # of fx in P to fx in K, for a lens with distortion
 
 
@@ -272,7 +274,14 @@ def _folds(
         folded = np.flatnonzero(~(np.diff(bent) > 0.0))
     reach = bent[folded[0]] if len(folded) else bent[-1]
     if reach >= 0.95 * radius_image:
-        return []
+        corner = float(r[int(np.argmax(bent >= 0.95 * radius_image))])
+        tangential = float(np.abs(D[2:4]).max(initial=0.0))
+        if corner >= _LEAST_CORNER * radius_image and tangential <= _MOST_TANGENTIAL:
+            return []
+        return [
+            f"d = {_short(np.array(D))}: no lens bends an image that much: the coefficients are in another "
+            "order or of another camera; calibrate the camera"
+        ]
     return [
         f"d = {_short(np.array(D))}: this distortion cannot be inverted towards the corners of the "
         f"{width}x{height} images: it belongs to another camera or size; calibrate the camera"

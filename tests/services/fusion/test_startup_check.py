@@ -136,7 +136,6 @@ def _changed(pairs, change):
         ("principal point", lambda rays: np.add(rays, [0.2, 0.1, 0.0])),
         ("K", lambda rays: rays * [1.3, 1.3, 1.0]),
         ("distortion", lambda rays: rays * (1 - 0.25 * np.sum(rays[:, :2] ** 2, axis=1, keepdims=True) * [1, 1, 0])),
-        ("images turned left", lambda rays: rays[:, [1, 0, 2]] * [-1, 1, 1]),
     ],
 )  # fmt: skip
 def test_a_fault_of_the_images_is_not_called_an_offset(cause, change):
