@@ -115,8 +115,9 @@ def read_camera_info(
     values = (P[0], P[5], P[2], P[6]) if use_P else (K[0], K[4], K[2], K[5])
     window = _window(info, image_size_px, (values[2], values[3]), image_topic, where)
     notes, doubts = [window.note] if window.note else [], []
+    coefficients: tuple[float, ...] = ()
     if rectified:
-        model, coefficients = "none", ()
+        model = "none"
         notes.append(f"{image_topic} is rectified: {'P' if use_P else 'K'} without distortion")
     else:
         model, coefficients = _distortion(str(info.distortion_model), D, where)

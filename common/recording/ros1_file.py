@@ -204,7 +204,8 @@ class Ros1File:
 
     def _take_chunk_info(self, fields: dict[bytes, bytes], data: bytes) -> None:
         (offset,) = struct.unpack("<Q", fields[b"chunk_pos"])
-        ids, counts = [], Counter()
+        ids: list[int] = []
+        counts: Counter[int] = Counter()
         for i in range(len(data) // 8):
             number, count = struct.unpack_from("<II", data, 8 * i)
             ids.append(number)

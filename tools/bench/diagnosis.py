@@ -164,9 +164,9 @@ def _distorted(drive: CheckedDrive) -> CheckedDrive:
     v, u = np.mgrid[:h, :w].astype(np.float64)
     rays = lens.rays(np.stack([u.ravel(), v.ravel()], axis=1))
     map_uv = (rays[:, :2] * [lens.fx_px, lens.fy_px] + [lens.cx_px, lens.cy_px]).astype(np.float32)
-    maps = map_uv.reshape(h, w, 2)
+    map_u, map_v = np.moveaxis(map_uv.reshape(h, w, 2), 2, 0)
     return _each_image(
-        lambda rgb: cv2.remap(rgb, maps, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        lambda rgb: cv2.remap(rgb, map_u, map_v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     )(drive)
 
 

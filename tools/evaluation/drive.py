@@ -113,7 +113,7 @@ class RecordedDrive:
 
 
 def open_drive(
-    path: Path, poses: Path | None = None, rig: Path | None = None, topics: dict[str, str] | None = None
+    path: Path, poses: Path | None = None, rig: Path | None = None, topics: dict[str, Any] | None = None
 ) -> RecordedDrive:
     """Open a recording: a bag, or a folder that contains bag/.
 

@@ -89,7 +89,7 @@ def weigh(problem: CornerProblem, wheels: WheelEvidence | None) -> Evidence:
 
     `wheels`: None = no wheel odometry, or too little motion.
     """
-    hypotheses = HYPOTHESES
+    hypotheses: tuple[Hypothesis, ...] = HYPOTHESES
     if wheels is not None:  # the wheels decide about the lidar
         hypotheses = tuple(
             h for h in hypotheses if not h.cause.startswith("lidar") or h.cause == wheels.mounting
@@ -120,9 +120,14 @@ def weigh(problem: CornerProblem, wheels: WheelEvidence | None) -> Evidence:
     close = {c for c in fits if c not in (*SMALL, gross) and scores[c] < scores[gross] + _CLOSE_COST}
     told = MIRRORED if gross in MIRRORED and wheels is None else ()
     alternatives = tuple(c for c in told if c in close)
-    turn = wheels.turn_rad if wheels is not None and gross == "lidar yaw" else 0.0
+    turn_rad = wheels.turn_rad if wheels is not None and gross == "lidar yaw" else 0.0
     return Evidence(
-        gross, fits[gross], fits[small].cost, explained_share, alternatives=alternatives, lidar_turn_rad=turn
+        gross,
+        fits[gross],
+        fits[small].cost,
+        explained_share,
+        alternatives=alternatives,
+        lidar_turn_rad=turn_rad,
     )
 
 
