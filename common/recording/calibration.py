@@ -16,7 +16,7 @@ from beamsplat.common.errors import UserError
 from beamsplat.common.geometry.frames import R_body_camera_level, camera_mount
 from beamsplat.common.geometry.rig import CameraSection, LidarSection, Mount, RigFile
 from beamsplat.common.geometry.transforms import make_transform
-from beamsplat.common.recording.camera_info import CameraIntrinsics
+from beamsplat.common.recording.camera_info import CameraInfoIntrinsics
 from beamsplat.common.recording.static_frames import MAX_FRAMES, StaticFrames, normalize_frame
 
 MAX_TILT_DEG = 10.0  # of the lidar's plane; ranges then differ by 1.5 % from those of a level lidar
@@ -36,7 +36,7 @@ class Calibration:
     doubts: list[str] = field(default_factory=list)  # sentences on values that contradict each other
     body_frame: str = ""  # name of the ROS frame used as body
 
-    def add_intrinsics(self, read: CameraIntrinsics | None, topic: str) -> None:
+    def add_intrinsics(self, read: CameraInfoIntrinsics | None, topic: str) -> None:
         """Add the intrinsics read from a CameraInfo topic; None: all its messages have a K of zeros."""
         if read is None:
             self.missing.append(f"K on {topic} is all zero: this camera was never calibrated")

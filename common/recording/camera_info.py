@@ -41,7 +41,7 @@ _P_RATIO = (0.4, 1.4)  # of fx in P to fx in K, for a lens with distortion
 
 
 @dataclass(frozen=True)
-class CameraIntrinsics:
+class CameraInfoIntrinsics:
     """Intrinsics for the images of one topic.
 
     `fields`: of `CameraSection`, without the mount. `notes`: how they were derived from the message, where
@@ -89,7 +89,7 @@ def is_calibrated(info: Any) -> bool:
 
 def read_camera_info(
     info: Any, image_size_px: tuple[int, int], image_topic: str, where: str
-) -> CameraIntrinsics | None:
+) -> CameraInfoIntrinsics | None:
     """Return the intrinsics from a CameraInfo; None if the camera is uncalibrated (K is zero).
 
     For a rectified image topic the intrinsics are taken from the projection matrix P, without distortion.
@@ -133,7 +133,7 @@ def read_camera_info(
         "fx_px": float(fx), "fy_px": float(fy), "cx_px": float(cx), "cy_px": float(cy),
         "distortion_model": model, "distortion": coefficients,
     }  # fmt: skip
-    return CameraIntrinsics(fields, notes, doubts)
+    return CameraInfoIntrinsics(fields, notes, doubts)
 
 
 def _window(

@@ -11,7 +11,7 @@ import numpy as np
 from beamsplat.common.errors import UserError
 from beamsplat.common.geometry.rig import RigFile, load_rig
 from beamsplat.common.recording import calibration as cal
-from beamsplat.common.recording.camera_info import CameraIntrinsics, is_calibrated, read_camera_info
+from beamsplat.common.recording.camera_info import CameraInfoIntrinsics, is_calibrated, read_camera_info
 from beamsplat.common.recording.image_reading import describe_format, image_size_px, is_camera_image
 from beamsplat.common.recording.input_report import InputReport
 from beamsplat.common.recording.sensor_reading import SensorReading
@@ -263,7 +263,7 @@ class BagSource:
 
     def _read_intrinsics(
         self, info: BagTopic, size_px: tuple[int, int], image_topic: str
-    ) -> CameraIntrinsics | None:
+    ) -> CameraInfoIntrinsics | None:
         """Return the intrinsics by the first CameraInfo that is calibrated and fits the size of the images.
 
         Raises:
