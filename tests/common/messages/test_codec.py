@@ -56,7 +56,7 @@ def _without_new_fields(value, old):
         mine, theirs = getattr(value, name), getattr(old, name)
         is_new = (
             not field.is_required()
-            and isinstance(theirs, (int, float, str, tuple))
+            and isinstance(theirs, (int, float, str, tuple, type(None)))
             and theirs == field.default
         )
         update[name] = theirs if is_new else _without_new_fields(mine, theirs)
