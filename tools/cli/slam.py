@@ -76,7 +76,7 @@ def slam(
         if reader is not None:
             console.print(f"{reader.topic}: {reader.learner.evidence()}", markup=False, highlight=False)
         for problem in source.problems:
-            console.print(f"[yellow]{problem}[/]", highlight=False)
+            console.print(problem, style="yellow", markup=False, highlight=False)
     finally:
         source.close()
     if as_json:
