@@ -19,8 +19,10 @@ from beamsplat.services.localization.lidar2d.pose_graph_data import Constraint
 MAX_HYPOTHESES = 64
 CHI2_LIMIT = 11.3  # 99 % of consistent pairs are below it (three degrees of freedom)
 SIGMA_M, SIGMA_RAD = 0.08, math.radians(1.0)  # of the pose of a chunk in a submap
+SURE_LOG_RATIO = 4.6  # a set that is a hundred times as likely has no rival
 RIVAL_RATIO = 0.6  # a set is ambiguous if a rival has this ratio of its evidence
-MAX_SET = 12  # larger sets are evidence enough
+MIN_SPACING = 6  # nodes between two chunks that both count
+MAX_SET = 24  # larger sets are evidence enough
 
 
 @dataclass(frozen=True)
@@ -31,6 +33,8 @@ class LoopHypothesis:
     own_submap: int  # a submap that contains the node of the constraint
     evidence: int  # 1: the chunk fits; 2: scans before and after it fit as well
     needed: int  # evidence that accepts a set with this hypothesis
+    inlier_ratio: float = 1.0
+    measurements: float = 0.0  # independent ones among the returns of the chunk
 
 
 Variances = Callable[[int, int], tuple[float, float]]  # ids of two submaps -> m^2, rad^2
@@ -92,18 +96,47 @@ def select(
     for i in range(n):
         if i in best or pool[i].constraint.node not in nodes or all(agrees[i, j] for j in best):
             continue
-        if _evidence(_grow(i, agrees, pool), pool) >= RIVAL_RATIO * _evidence(best, pool):
+        rival = _grow(i, agrees, pool)
+        if _evidence(rival, pool) >= RIVAL_RATIO * _evidence(best, pool) and (
+            _log_likelihood_ratio(best, rival, pool) < SURE_LOG_RATIO
+        ):
             return []
     return [pool[i] for i in best]
 
 
 def _evidence(members: list[int], pool: list[LoopHypothesis]) -> int:
-    """Return the evidence of a set: of each chunk, the best of its hypotheses counts."""
+    """Return the evidence of a set: of each chunk, the best of its hypotheses counts.
+
+    Chunks that share most of their scans count as one.
+    """
     by_node: dict[int, int] = {}
     for i in members:
         node = pool[i].constraint.node
         by_node[node] = max(by_node.get(node, 0), pool[i].evidence)
-    return sum(by_node.values())
+    total, last = 0, -MIN_SPACING
+    for node in sorted(by_node):
+        if node - last >= MIN_SPACING:
+            total, last = total + by_node[node], node
+    return total
+
+
+def _log_likelihood_ratio(best: list[int], rival: list[int], pool: list[LoopHypothesis]) -> float:
+    """Return how much better the first set explains the chunks of both sets (nats).
+
+    The inliers of a chunk are taken as binomial, with the inlier ratio of each set as the true one.
+    """
+    total = 0.0
+    for node in {pool[i].constraint.node for i in best} & {pool[i].constraint.node for i in rival}:
+        chosen, other = (
+            max((pool[i] for i in members if pool[i].constraint.node == node), key=lambda h: h.inlier_ratio)
+            for members in (best, rival)
+        )
+        p, q = (min(max(h.inlier_ratio, 0.01), 0.99) for h in (chosen, other))
+        n = chosen.measurements
+        total += (
+            n * (p * math.log(p / q) + (1.0 - p) * math.log((1.0 - p) / (1.0 - q))) * (1 if p > q else -1)
+        )
+    return total
 
 
 def _grow(start: int, agrees: np.ndarray, pool: list[LoopHypothesis]) -> list[int]:

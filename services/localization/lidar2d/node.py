@@ -200,14 +200,19 @@ class LidarLocalization(Node):
         """Show in the health message why the checkpoint was not written (`fault`), if it was not."""
         self._checkpoint_running = False
         self._fault = f"the checkpoint of the map was not written: {fault}" if fault else ""
+        self._show()
         return iter(())
 
     def _report_sensors(self, slam: LidarSlam) -> None:
-        """Set the text of the health message: what is wrong with files, wheel odometry and lidar."""
+        """Report what is wrong with wheel odometry and lidar, at intervals."""
         if slam.scans % _REPORT_EVERY_SCANS == 1:
             odometry = slam.local_builder.odometry.report().text
             texts = [f"wheel odometry: {odometry}" if odometry else "", slam.self_returns.text()]
             self._sensors = "; ".join(text for text in texts if text)
+            self._show()
+
+    def _show(self) -> None:
+        """Set the text of the health message."""
         self.detail = "; ".join(text for text in (self._fault, self._sensors) if text)
 
     def drain(self) -> Outputs:

@@ -22,6 +22,7 @@ from beamsplat.services.localization.lidar2d.surfel_map import FrozenMap
 SEARCH_RETURNS = 120  # returns of the chunk that branch and bound uses
 SEARCH_STEP_RAD = math.radians(1.0)
 KEEP = 0.9  # poses of one submap within this ratio of its best score are candidates
+RIVAL = 0.85  # poses below this ratio of the best score of all submaps are left out
 NEAR_PATH_M = 2.5  # a chunk is searched within this distance of the poses of the submap's scans
 CANDIDATES_PER_SUBMAP = 3
 CANDIDATES = 16  # poses over all submaps that are refined
@@ -83,12 +84,15 @@ def search_places(
         return []
     subset = features[:: max(1, len(features) // SEARCH_RETURNS)]
     candidates: list[tuple[float, int, np.ndarray]] = []
+    best = 0.0
     for index, target in enumerate(targets):
         centre, half = _window(target)
         found = branch_and_bound(
             subset, centre, cache.pyramid(target.submap, target.frozen), half,
-            min(target.window_rad, math.pi), min_score, keep=KEEP, min_step_rad=SEARCH_STEP_RAD,
+            min(target.window_rad, math.pi), max(min_score, RIVAL * best), keep=KEEP,
+            min_step_rad=SEARCH_STEP_RAD,
         )  # fmt: skip
+        best = max([best, *(score for score, _ in found)])
         candidates += [(score, index, pose) for score, pose in found[:CANDIDATES_PER_SUBMAP]]
     candidates.sort(key=lambda c: -c[0])
     matches: list[PlaceMatch] = []

@@ -32,8 +32,10 @@ CHUNK_SIGMA_M, CHUNK_SIGMA_RAD = 0.05, math.radians(0.7)  # drift within a chunk
 NEAR_WINDOW_M, NEAR_WINDOW_RAD = 2.0, math.radians(15.0)  # a prediction that is itself evidence
 FAR_WINDOW_M = 12.0
 # Evidence that accepts a set of hypotheses, by the window in which they were found.
-NEAR_EVIDENCE, FAR_EVIDENCE, FREE_EVIDENCE = 2, 4, 6
-SURE_EVIDENCE = 4  # of a match that has no rival in the whole map
+# In buildings of identical rooms a chunk may fit at a wrong place over 30 m.
+NEAR_EVIDENCE, FAR_EVIDENCE, WIDE_EVIDENCE = 2, 4, 12
+RESTART_EVIDENCE, LOST_EVIDENCE = 4, 6  # where nothing is known of the place
+SURE_EVIDENCE = 4  # after a restart, of a match that has no rival in the whole map
 SURE_INLIER_RATIO, SURE_OVERLAP = 0.85, 0.7
 DISTINCT_RATIO = 0.85  # a match with a lower score than this ratio of the best one is no rival
 SAME_PLACE_M, SAME_PLACE_RAD = 0.5, math.radians(10.0)
@@ -119,11 +121,13 @@ def _hypotheses_of_newest(
         rival = _rival_ratio(matches, snapshot) if m is matches[0] else 1.0
         evidence = 2 if confirmed or rival < DISTINCT_RATIO else 1
         fits = m.match.inlier_ratio >= SURE_INLIER_RATIO and m.match.overlap >= SURE_OVERLAP
-        if fits and rival < s.link_max_runner_up_ratio:
+        if fits and rival < s.link_max_runner_up_ratio and snapshot.restarted:
             evidence = SURE_EVIDENCE
+        measurements = m.match.overlap * len(features) / s.returns_per_measurement
+        needed = _needed(*windows[m.submap], snapshot.restarted)
         hypotheses.append(
             LoopHypothesis(
-                link, snapshot.submap_ids[own[0]], evidence, _needed(*windows[m.submap], snapshot.restarted)
+                link, snapshot.submap_ids[own[0]], evidence, needed, m.match.inlier_ratio, measurements
             )
         )
     return hypotheses
@@ -131,11 +135,11 @@ def _hypotheses_of_newest(
 
 def _needed(window_m: float, window_rad: float, restarted: bool) -> int:
     """Return the evidence that is needed for a loop closure which was found in a window of this size."""
+    if not math.isfinite(window_m):
+        return RESTART_EVIDENCE if restarted else LOST_EVIDENCE
     if window_m <= NEAR_WINDOW_M and window_rad <= NEAR_WINDOW_RAD:
         return NEAR_EVIDENCE
-    if window_m <= FAR_WINDOW_M or (restarted and not math.isfinite(window_m)):
-        return FAR_EVIDENCE
-    return FREE_EVIDENCE
+    return FAR_EVIDENCE if window_m <= FAR_WINDOW_M else WIDE_EVIDENCE
 
 
 def _rival_ratio(matches: list[PlaceMatch], snapshot: Snapshot) -> float:

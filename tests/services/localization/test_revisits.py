@@ -1,5 +1,7 @@
 """Loop closure over large drift: windows, place search, sets of hypotheses, segments."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -100,21 +102,23 @@ def test_a_chunk_is_found_in_the_submap_it_belongs_to(mapped, rng, known_m):
     assert abs(off[2]) < np.radians(0.5)
 
 
-def hypothesis(node, submap, pose, *, evidence=1, needed=4):
-    constraint = Constraint(submap, node, np.asarray(pose, dtype=float), np.eye(3), True)
-    return LoopHypothesis(constraint, node, evidence, needed)
+def hypothesis(own_submap, submap, pose, *, evidence=1, needed=4):
+    """Return a match of a chunk at the start of `own_submap`, whose node has ten times its number."""
+    constraint = Constraint(submap, 10 * own_submap, np.asarray(pose, dtype=float), np.eye(3), True)
+    return LoopHypothesis(constraint, own_submap, evidence, needed)
 
 
 class Corridor:
     """A straight drive along submaps 6 m apart, of which 20 and more run along 0 and more again."""
 
     poses = {k: np.array([STEP_M * k, 0.0, 0.0]) for k in range(40)}  # as odometry says
+    nodes = {10 * k: pose for k, pose in poses.items()}
 
     def variances(self, a, b):
         return 0.02**2 * abs(a - b) + 1e-6, np.radians(0.3) ** 2 * abs(a - b) + 1e-8
 
     def select(self, pool):
-        return select(pool, self.poses, self.poses, self.variances)
+        return select(pool, self.poses, self.nodes, self.variances)
 
 
 def test_a_consistent_set_is_accepted_and_a_single_match_is_not():
@@ -123,6 +127,16 @@ def test_a_consistent_set_is_accepted_and_a_single_match_is_not():
     assert corridor.select(true[:1]) == []
     assert corridor.select(true[:3]) == []
     assert set(map(id, corridor.select(true))) == set(map(id, true))
+
+
+def test_chunks_that_share_most_of_their_scans_count_once():
+    corridor = Corridor()
+    true = [hypothesis(20, 0, [0.02 * k, 0.0, 0.0]) for k in range(5)]
+    near = [replace(h, constraint=replace(h.constraint, node=200 + k)) for k, h in enumerate(true)]
+    nodes = corridor.nodes | {
+        200 + k: se2.compose(corridor.nodes[200], np.array([0.02 * k, 0.0, 0.0])) for k in range(5)
+    }
+    assert select(near, corridor.poses, nodes, corridor.variances) == []
 
 
 def test_matches_that_contradict_each_other_are_not_accepted():
@@ -139,8 +153,20 @@ def test_two_places_that_look_the_same_are_not_decided():
     assert corridor.select([h for pair in zip(here, there) for h in pair]) == []
     longer = [hypothesis(25 + k, 5 + k, [0.0, 0.01, 0.0]) for k in range(5)]  # only one of them goes on
     accepted = corridor.select(here + there + longer)
-    assert {h.constraint.node - h.constraint.submap for h in accepted} == {20}
+    assert {h.own_submap - h.constraint.submap for h in accepted} == {20}
     assert len(accepted) >= 8
+
+
+def test_of_two_similar_places_the_one_that_fits_better_is_accepted():
+    here = [
+        replace(hypothesis(20 + k, k, [0.02, 0.0, 0.0]), inlier_ratio=0.97, measurements=50.0)
+        for k in range(6)
+    ]
+    there = [
+        replace(hypothesis(20 + k, 10 + k, [0.0, 0.01, 0.0]), inlier_ratio=0.90, measurements=50.0)
+        for k in range(6)
+    ]
+    assert {h.own_submap - h.constraint.submap for h in Corridor().select(here + there)} == {20}
 
 
 @pytest.mark.parametrize("main", [0, 1])
