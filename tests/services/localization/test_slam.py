@@ -283,7 +283,7 @@ def test_a_kidnapped_robot_is_relocalized():
     slam = LidarSlam(SETTINGS, np.eye(4))
     _, truth = run(slam, drive, lidar, end_s=drive.duration_s - 1.0)
     results, more = run(
-        slam, drive, lidar, start_s=8.0, end_s=28.0, offset_s=drive.duration_s
+        slam, drive, lidar, start_s=8.0, end_s=38.0, offset_s=drive.duration_s
     )  # the robot was moved
     statuses = [r.status for r in results]
     assert "relocalizing" in statuses
