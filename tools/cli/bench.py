@@ -157,7 +157,7 @@ def diagnosis(
     if as_json:
         print(json.dumps(rows))
     else:
-        print(f"{sum(row['right'] for row in rows)} of {len(rows)} named right")
+        print(f"{sum(bool(row['right']) for row in rows)} of {len(rows)} named right")
 
 
 @app.command()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from scipy.sparse import coo_matrix
@@ -130,7 +131,9 @@ class DriftModel:
         key = low[order] * n + high[order]
         best = order[np.r_[True, np.diff(key) > 0]] if len(order) else order
         self._key, self._variances = low[best] * n + high[best], variances[best]
-        self._graph = coo_matrix((weight[best], (low[best], high[best])), shape=(n, n)).tocsr()
+        self._graph: Any = coo_matrix(  # the stubs of dijkstra do not know sparse matrices
+            (weight[best], (low[best], high[best])), shape=(n, n)
+        ).tocsr()
         self._positions_m = np.ascontiguousarray(pose_map_submap[:, :2])
         self._cache: dict[int, np.ndarray] = {}
         self.components = connected_components(self._graph, directed=False)[1]  # int32 [S]
