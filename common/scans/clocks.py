@@ -86,7 +86,8 @@ def clock_sentence(name: str, stamp_ns: int, offset_s: float) -> str:
 def stamp_unit(stamps: np.ndarray) -> str:
     """Return the unit of bare numbers int64 [N] that should be stamps in ns: "ns", "us", "ms" or "s".
 
-    The unit is another one if the numbers are dates of this century in it, with the period of a sensor.
+    It is the one in which the numbers are dates of this century, else that in which their period is that of a
+    sensor.
     """
     stamps = np.sort(np.asarray(stamps, np.int64))
     steps = np.diff(stamps)
@@ -95,10 +96,9 @@ def stamp_unit(stamps: np.ndarray) -> str:
         return "ns"
     period = float(np.median(steps))
     for unit, factor in UNITS_NS.items():
-        is_date = _YEAR_2000_NS <= int(stamps[0]) * factor <= _YEAR_2100_NS
-        if is_date and _PERIODS_NS[0] <= period * factor <= _PERIODS_NS[1]:
+        if _YEAR_2000_NS <= int(stamps[0]) * factor <= _YEAR_2100_NS:
             return unit
-    if _PERIODS_NS[0] <= period <= _PERIODS_NS[1] or period * 1000 > _PERIODS_NS[1] * 1000:
+    if period >= _PERIODS_NS[0]:
         return "ns"
     # Not dates: since the start of the device. The period alone tells.
     fitting = [u for u, factor in UNITS_NS.items() if _PERIODS_NS[0] <= period * factor <= _PERIODS_NS[1]]

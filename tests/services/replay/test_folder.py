@@ -109,7 +109,7 @@ def test_broken_files_are_counted(folder):
     # The first picture tells the size, so take care not to break that one.
     sourced, problems = play(folder)
     assert len(of(sourced, "lidar/scan")) == 4
-    assert any("scan: 1 skipped" in problem for problem in problems)
+    assert any("scan: 1 message refused" in problem for problem in problems)
 
 
 def test_csv_scans(folder):
