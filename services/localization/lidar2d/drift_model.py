@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 from scipy.sparse import coo_matrix
@@ -131,9 +130,7 @@ class DriftModel:
         key = low[order] * n + high[order]
         best = order[np.r_[True, np.diff(key) > 0]] if len(order) else order
         self._key, self._variances = low[best] * n + high[best], variances[best]
-        self._graph: Any = coo_matrix(  # the stubs of dijkstra do not know sparse matrices
-            (weight[best], (low[best], high[best])), shape=(n, n)
-        ).tocsr()
+        self._graph = coo_matrix((weight[best], (low[best], high[best])), shape=(n, n)).tocsr()
         self._positions_m = np.ascontiguousarray(pose_map_submap[:, :2])
         self._cache: dict[int, np.ndarray] = {}
         self.components = connected_components(self._graph, directed=False)[1]  # int32 [S]
@@ -144,7 +141,10 @@ class DriftModel:
         `source` is its row number. They are infinite for submaps that no constraint connects with it.
         """
         if source not in self._cache:
-            distance, parent = dijkstra(self._graph, directed=False, indices=source, return_predecessors=True)
+            # The stubs do not know one index with predecessors.
+            distance, parent = dijkstra(  # type: ignore[call-overload]
+                self._graph, directed=False, indices=source, return_predecessors=True
+            )
             n = len(parent)
             child = np.arange(n)
             key = np.minimum(child, parent) * n + np.maximum(child, parent)
