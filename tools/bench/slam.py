@@ -18,7 +18,12 @@ from beamsplat.common.errors import UserError
 from beamsplat.common.geometry.trajectory import read_tum
 
 # Mean absolute errors of Cartographer over the same relations as published (Hess et al. 2016, table II).
-CARTOGRAPHER = {"aces": (0.0375, 0.373), "intel": (0.0229, 0.453), "fr079": (0.0452, 0.538)}
+CARTOGRAPHER = {
+    "aces": (0.0375, 0.373),
+    "intel": (0.0229, 0.453),
+    "fr079": (0.0452, 0.538),
+    "mit-killian": (0.0395, 0.352),
+}
 COLUMNS = (
     "recording", "error, m", "error, deg", "Cartographer as published", "CPU ms per scan",
     "p95 of a step, ms", "memory, MB",
