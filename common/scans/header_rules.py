@@ -17,6 +17,7 @@ from beamsplat.common.scans.rules import (
     ScanRules,
     claimed_sweep_s,
     is_contradictory,
+    stated_angles,
 )
 
 MAX_PERIOD_S = 2.0  # of a revolution: the slowest planar lidars make one per second
@@ -124,14 +125,7 @@ def _angle_candidates(messages: list[LaserMessage], rules: ScanRules) -> tuple[t
         return ("increment",), ""
     message = contradictory[len(contradictory) // 2]
     n = len(message.ranges_m)
-    first, last, step = (
-        math.radians(value) if name in rules.degrees else value
-        for name, value in (
-            ("angle_min", message.angle_min_rad),
-            ("angle_max", message.angle_max_rad),
-            ("angle_increment", message.angle_increment_rad),
-        )
-    )
+    first, last, step = stated_angles(message, rules)
     even = (last - first) / max(n - 1, 1)
     steps: dict[AngleRule, float] = {"increment": step, "limits": even, "from_max": step, "to_max": step}
     possible: list[AngleRule] = []

@@ -53,13 +53,8 @@ class ScanRules:
     period_s: float = 0.1
 
 
-def read_angles(message: LaserMessage, rules: ScanRules) -> tuple[float, float]:
-    """Return the direction of the first beam and the increment (rad) by the rule `rules.angles`.
-
-    Raises:
-        InputFault: the fields define no directions.
-    """
-    n = len(message.ranges_m)
+def stated_angles(message: LaserMessage, rules: ScanRules) -> tuple[float, float, float]:
+    """Return angle_min, angle_max and angle_increment in rad, from degrees where `rules` says so."""
     first, last, step = (
         math.radians(value) if name in rules.degrees else value
         for name, value in (
@@ -68,6 +63,17 @@ def read_angles(message: LaserMessage, rules: ScanRules) -> tuple[float, float]:
             ("angle_increment", message.angle_increment_rad),
         )
     )
+    return first, last, step
+
+
+def read_angles(message: LaserMessage, rules: ScanRules) -> tuple[float, float]:
+    """Return the direction of the first beam and the increment (rad) by the rule `rules.angles`.
+
+    Raises:
+        InputFault: the fields define no directions.
+    """
+    n = len(message.ranges_m)
+    first, last, step = stated_angles(message, rules)
     start = last if rules.angles == "from_max" else first
     if rules.angles == "to_max":
         start = last - (n - 1) * step
@@ -92,14 +98,7 @@ def read_angles(message: LaserMessage, rules: ScanRules) -> tuple[float, float]:
 def is_contradictory(message: LaserMessage, rules: ScanRules) -> bool:
     """Return whether angle_min, angle_max, angle_increment and the number of ranges do not fit together."""
     n = len(message.ranges_m)
-    first, last, step = (
-        math.radians(value) if name in rules.degrees else value
-        for name, value in (
-            ("angle_min", message.angle_min_rad),
-            ("angle_max", message.angle_max_rad),
-            ("angle_increment", message.angle_increment_rad),
-        )
-    )
+    first, last, step = stated_angles(message, rules)
     if not (math.isfinite(first) and math.isfinite(last) and math.isfinite(step)) or step == 0.0:
         return True
     error = last - first - (n - 1) * step

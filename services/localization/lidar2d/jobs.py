@@ -87,8 +87,11 @@ def run_job(snapshot: Snapshot, refine_rounds: int = 0) -> JobResult:
         linked = _is_linked(drift, edges, fixed)
         return _unmoved(snapshot, constraints, len(found), still_pending, hypotheses, linked, ratio2)
     edges = snapshot.table.arrays(constraints, submap_row, node_row)
-    joined = DriftModel(edges, submap_poses, len(snapshot.node_ids), snapshot.settings, snapshot.drift_scale2)
-    held = first_of_components(joined.components, fixed)
+    if joined_any:  # else the new constraints connect nothing that was apart
+        drift = DriftModel(
+            edges, submap_poses, len(snapshot.node_ids), snapshot.settings, snapshot.drift_scale2
+        )
+    held = first_of_components(drift.components, fixed)
     # During mapping the next job continues from this solution; the final one must converge by itself.
     iterations = LAST_ITERATIONS if refine_rounds else ITERATIONS
     anneal = not fit or refine_rounds > 0
@@ -120,7 +123,7 @@ def run_job(snapshot: Snapshot, refine_rounds: int = 0) -> JobResult:
         rebuilt,
         still_pending,
         len(found),
-        _is_linked(joined, edges, fixed),
+        _is_linked(drift, edges, fixed),
         hypotheses,
         ratio2,
     )

@@ -170,13 +170,6 @@ def _rows_of(ids: np.ndarray, row_of: dict[int, int]) -> np.ndarray:
     return rows[order][np.searchsorted(known, ids, sorter=order)]
 
 
-def constraint_arrays(
-    constraints: list[Constraint], submap_row: dict[int, int], node_row: dict[int, int]
-) -> ConstraintArrays:
-    """Convert constraints to arrays, ordered by node; the dicts map submap and node ids to row numbers."""
-    return ConstraintTable().arrays(constraints, submap_row, node_row)
-
-
 @kernel
 def edge_information(match_information: np.ndarray, sigma_m: float, sigma_rad: float) -> np.ndarray:
     """Return the information [3, 3] of a constraint: of the match, reduced by unmodelled errors.
