@@ -4,6 +4,10 @@ rerun can write one stream to several sinks (`set_sinks`), but the slowest sink 
 browser that stops reading blocks `log()`, and thus also the file, for more than 20 s. Therefore each sink has
 its own stream of the same recording, and a queue that never blocks the caller: if the queue is full (number
 of entries or bytes), a new entry replaces the queued entry of the same path.
+
+rerun keeps an index of each open file in memory, about 0.5 kB per chunk of entries. A long recording is
+therefore written as several files, its parts; each begins with the entries that hold at all times, so that it
+can be opened alone.
 """
 
 from __future__ import annotations
@@ -35,6 +39,9 @@ _QUEUE = 256  # about five seconds of entries at the default rates
 _QUEUE_BYTES = 64_000_000  # a large map has about 13 MB and is drawn every two seconds
 _CHECK_S = 1.0  # between checks that the sink still works
 _FLUSH_S = 3.0
+_FILE_FLUSH_S = 5.0  # between two writes to a file: a killed process loses so much
+_PART_ENTRIES = 100_000  # of one file, which take at most 50 MB of memory until it is closed
+_PART_MB = 1000.0  # of one file
 
 
 @dataclass
@@ -46,25 +53,35 @@ class _LogEntry:
     bytes: int = 0
 
 
+@dataclass(frozen=True)
+class Sink:
+    """Where a thread writes its entries: a rerun stream that nothing else uses, and its rerun sink."""
+
+    stream: rr.RecordingStream
+    sink: Any
+    flush_s: float = _CHECK_S  # between two checks that the sink has taken all entries
+
+
 class RerunSinkThread:
-    """One sink of a recording (viewer server or file) and the thread that writes to it."""
+    """A viewer server, or the file or files of a recording, and the thread that writes to it."""
 
     def __init__(
         self,
         name: str,
-        stream: rr.RecordingStream,
-        sink: Any,
+        sink: Sink,
         blueprint: rrb.Blueprint,
         watch: Callable[[], str] = lambda: "",
+        next_part: Callable[[int], Sink | None] = lambda entries: None,
     ) -> None:
         """Open the sink and start the thread.
 
         Args:
             name: name of the sink, for status texts.
-            stream: rerun stream that only this sink uses.
-            sink: the rerun sink to open.
+            sink: the sink to open.
             blueprint: layout of the viewer.
             watch: called about once per second; returns the reason why the sink must be closed, or "".
+            next_part: called about once per second with the number of entries in the sink; returns the sink
+                that continues the recording, or None while the present one does.
 
         Raises:
             RuntimeError: the sink cannot be opened.
@@ -72,16 +89,24 @@ class RerunSinkThread:
         self.name = name
         self.fault = ""  # why the sink was closed
         self.dropped = 0  # entries replaced by newer ones
-        self._stream = stream
+        self._blueprint = blueprint
         self._watch = watch
+        self._next_part = next_part
+        self._static: dict[tuple[str, tuple[type, ...]], _LogEntry] = {}  # begin each part
         self._queue: deque[_LogEntry | threading.Event] = deque()
         self._newest: dict[str, _LogEntry] = {}
         self._bytes = 0  # of the queued entries
         self._changed = threading.Condition()
         self._closing = False
-        stream.set_sinks(sink, default_blueprint=blueprint)
+        self._open(sink)
         self._thread = threading.Thread(target=self._run, name=f"monitor-{name}", daemon=True)
         self._thread.start()
+
+    def _open(self, sink: Sink) -> None:
+        sink.stream.set_sinks(sink.sink, default_blueprint=self._blueprint)
+        self._stream, self._flush_s = sink.stream, sink.flush_s
+        self._next_flush = time.monotonic() + sink.flush_s
+        self._entries = 0  # in this part
 
     def put(self, entry: _LogEntry) -> None:
         """Queue one entry; never blocks."""
@@ -165,16 +190,27 @@ class RerunSinkThread:
         if entry.stamp_ns is not None:
             self._stream.set_time(TIMELINE, timestamp=np.datetime64(entry.stamp_ns, "ns"))
         self._stream.log(entry.path, *entry.parts, static=entry.static)
+        self._entries += 1
+        if entry.static:
+            self._static[entry.path, tuple(map(type, entry.parts))] = entry
 
     def _check_sink(self) -> None:
-        try:
-            self._stream.flush(timeout_sec=0.2)
-        except RuntimeError as error:
-            if "timed out" not in str(error):  # slow, but not failed
-                raise
+        if time.monotonic() >= self._next_flush:
+            self._next_flush = time.monotonic() + self._flush_s
+            try:
+                self._stream.flush(timeout_sec=0.2)
+            except RuntimeError as error:
+                if "timed out" not in str(error):  # slow, but not failed
+                    raise
         reason = self._watch()
         if reason:
             self._give_up(reason)
+        elif part := self._next_part(self._entries):
+            self._stream.flush(timeout_sec=_FLUSH_S)
+            self._stream.disconnect()
+            self._open(part)
+            for entry in self._static.values():
+                self._write(entry)
 
     def _give_up(self, reason: str) -> None:
         if not self.fault:
@@ -204,7 +240,8 @@ class RerunWriter:
     def save(self, path: Path, blueprint: rrb.Blueprint, *, limit_mb: int, keep_free_mb: int) -> Path:
         """Start a file under a name that does not exist yet (drive.rrd, drive-2.rrd, ...); return its path.
 
-        The file is closed, complete, at `limit_mb`, or when less than `keep_free_mb` are free on the disk.
+        A long recording continues in drive.part2.rrd and so on; `rerun drive*.rrd` shows them as one. It is
+        closed, complete, at `limit_mb`, or when less than `keep_free_mb` are free on the disk.
 
         On a disk that is full, read-only or broken, a note says so, and nothing is saved.
 
@@ -221,12 +258,19 @@ class RerunWriter:
                 log.error("%s", self.notes[-1])
                 return path
             raise RuntimeError(f"cannot create the folder of {path}: {error}") from error
-        # Few, large chunks: rerun keeps their index in memory until the file is closed.
-        stream = self._stream(flush_tick_s=2.0)
-        watch = _disk_watch(path, limit_mb, keep_free_mb)
-        self.sinks.append(RerunSinkThread(str(path), stream, rr.FileSink(path), blueprint, watch))
+        parts = _FileParts(path, limit_mb, keep_free_mb)
+
+        def next_part(entries: int) -> Sink | None:
+            following = parts.next(entries)
+            return None if following is None else self._file(following)
+
+        self.sinks.append(RerunSinkThread(str(path), self._file(path), blueprint, parts.watch, next_part))
         self.notes.append(f"writing {path}")
         return path
+
+    def _file(self, path: Path) -> Sink:
+        # Few, large chunks: rerun keeps their index in memory until the file is closed.
+        return Sink(self._stream(flush_tick_s=_FILE_FLUSH_S), rr.FileSink(path), _FILE_FLUSH_S)
 
     def serve(
         self, blueprint: rrb.Blueprint, *, bind: str, port: int, origins: list[str], memory_mb: int
@@ -242,7 +286,7 @@ class RerunWriter:
             bind, port, server_memory_limit=f"{memory_mb}MB", cors_allow_origin=origins or None
         )
         thread = RerunSinkThread(
-            f"viewer at port {port}", self._stream(0.1), sink, blueprint, self._watch_viewer
+            f"viewer at port {port}", Sink(self._stream(0.1), sink), blueprint, self._watch_viewer
         )
         self.sinks.append(thread)
         return f"rerun+http://127.0.0.1:{port}/proxy"
@@ -324,17 +368,35 @@ def _unused_path(path: Path) -> Path:
     return candidate
 
 
-def _disk_watch(path: Path, limit_mb: int, keep_free_mb: int) -> Callable[[], str]:
-    def watch() -> str:
+class _FileParts:
+    """The files of one recording (drive.rrd, drive.part2.rrd, ...) and their limits."""
+
+    def __init__(self, first: Path, limit_mb: int, keep_free_mb: int) -> None:
+        self._first, self._current = first, first
+        self._limit_mb, self._keep_free_mb = limit_mb, keep_free_mb
+        self._number, self._closed_mb, self._size_mb = 1, 0.0, 0.0
+
+    def watch(self) -> str:
+        """Return the reason to end the recording, or ""."""
+        path = self._current
         try:
-            size_mb = path.stat().st_size / 1e6
+            self._size_mb = path.stat().st_size / 1e6
             free_mb = shutil.disk_usage(path.parent).free / 1e6
         except OSError as error:
             return f"the file was removed ({error})"
-        if size_mb > limit_mb:
-            return f"closed at {size_mb:.0f} MB (save_limit_mb = {limit_mb})"
-        if free_mb < keep_free_mb:
-            return f"closed: {free_mb:.0f} MB left on the disk (keep_free_mb = {keep_free_mb})"
+        size_mb = self._closed_mb + self._size_mb
+        if size_mb > self._limit_mb:
+            return f"closed at {size_mb:.0f} MB (save_limit_mb = {self._limit_mb})"
+        if free_mb < self._keep_free_mb:
+            return f"closed: {free_mb:.0f} MB left on the disk (keep_free_mb = {self._keep_free_mb})"
         return ""
 
-    return watch
+    def next(self, entries: int) -> Path | None:
+        """Return the file of the next part if the present one is full: by its entries, or its last size."""
+        if entries < _PART_ENTRIES and self._size_mb < _PART_MB:
+            return None
+        self._closed_mb += self._size_mb
+        self._size_mb = 0.0
+        self._number += 1
+        self._current = _unused_path(self._first.with_stem(f"{self._first.stem}.part{self._number}"))
+        return self._current

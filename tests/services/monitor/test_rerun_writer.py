@@ -9,12 +9,14 @@ import time
 import pytest
 import rerun as rr
 
+from beamsplat.services.monitor import rerun_writer
 from beamsplat.services.monitor.layout import layout
 from beamsplat.services.monitor.rerun_writer import (
     _QUEUE,
     _QUEUE_BYTES,
     RerunSinkThread,
     RerunWriter,
+    Sink,
     _LogEntry,
 )
 
@@ -49,7 +51,7 @@ class StuckStream:
 
 def test_a_stalled_viewer_blocks_nothing_and_gets_the_newest_entries():
     stream = StuckStream()
-    thread = RerunSinkThread("viewer", stream, None, None)
+    thread = RerunSinkThread("viewer", Sink(stream, None), None)
     thread.put(_LogEntry("rig", ("rig",), None, True))
     for i in range(10 * _QUEUE):
         thread.put(_LogEntry(f"entity{i % 3}", (i,), i, False))
@@ -67,7 +69,7 @@ def test_a_stalled_viewer_blocks_nothing_and_gets_the_newest_entries():
 
 def test_queued_entries_are_bounded_by_bytes():
     stream = StuckStream()
-    thread = RerunSinkThread("viewer", stream, None, None)
+    thread = RerunSinkThread("viewer", Sink(stream, None), None)
     for i in range(200):
         thread.put(_LogEntry(f"splats{i % 4}", (i,), i, False, bytes=10_000_000))
     assert len(thread._queue) <= _QUEUE_BYTES // 10_000_000 + 4
@@ -81,7 +83,7 @@ def test_queued_entries_are_bounded_by_bytes():
 
 def test_closing_has_a_timeout(caplog):
     stream = StuckStream()
-    thread = RerunSinkThread("viewer", stream, None, None)
+    thread = RerunSinkThread("viewer", Sink(stream, None), None)
     thread.put(_LogEntry("a", (1,), None, False))
     thread.close(0.1)
     assert "viewer was not closed within 0.1 s" in caplog.text
@@ -149,6 +151,30 @@ def test_a_write_error_is_reported(tmp_path):
     )  # fmt: skip
     assert "stopped:" in done.stdout, done
     assert "drive.rrd: " in done.stdout
+
+
+def test_a_long_recording_has_parts_that_can_be_opened_alone(tmp_path, read_rrd, monkeypatch):
+    monkeypatch.setattr(rerun_writer, "_PART_ENTRIES", 20)
+    monkeypatch.setattr(rerun_writer, "_CHECK_S", 0.02)
+    writer = RerunWriter()
+    path = writer.save(tmp_path / "drive.rrd", layout(), limit_mb=100, keep_free_mb=0)
+    writer.log("map", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+    values = list(range(300))
+    for value in values:
+        writer.log("curve", rr.Scalars(float(value)), stamp_ns=value)
+        time.sleep(0.002)
+    writer.close()
+    assert not writer.sinks[0].fault
+    parts = sorted(tmp_path.glob("drive*.rrd"), key=lambda p: p.stat().st_mtime_ns)
+    assert parts[0] == path
+    assert [p.name for p in parts[1:]] == [f"drive.part{n}.rrd" for n in range(2, len(parts) + 1)]
+    assert len(parts) >= 4
+    seen = []
+    for part in parts:
+        saved = read_rrd(part)
+        assert saved.entities >= {"map", "curve"}
+        seen += [float(v[0]) for v in saved.column("curve", "Scalars:scalars")]
+    assert seen == values
 
 
 def test_a_file_is_never_overwritten(tmp_path):
