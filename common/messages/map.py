@@ -111,9 +111,12 @@ class MapPoses(Message):
 class MapPreview(Message):
     """The map rendered from its newest keyframe, as a JPEG with the aspect ratio of the image."""
 
+    version = "1.1"
+
     keyframe_id: Count
     render: Annotated[np.ndarray, Array("uint8", "B")]
     T_map_camera: Transform
+    camera: CameraModel | None = None  # of the render: a pinhole of its size; since 1.1
 
 
 class MapStatus(Message):

@@ -7,6 +7,10 @@ From rmw_zenoh's design document and its liveliness_utils.cpp and attachment_hel
     token       @ros2_lv/<domain>/<zid>/<node>/<entity>/<NN|MP|MS|SS|SC>/<enclave>/<namespace>/<node name>
                 [/<topic>/<type>/<hash>/<qos>], with "/" within a part replaced by "%"
 
+The type hash is that of REP 2011 ("RIHS01_" and 64 digits) from Iron on; Humble, which has none, writes
+"TypeHashNotSupported" in keys and tokens. From Lyrical on, tokens of types with arrays are longer: they also
+list the buffer backends of the endpoint (ros2/rmw_zenoh #930).
+
 The module opens no session.
 """
 
@@ -19,7 +23,11 @@ from typing import NamedTuple
 import xxhash
 
 LIVELINESS_PREFIX = "@ros2_lv"
+NO_TYPE_HASH = "TypeHashNotSupported"  # of all types, in Humble
+TYPE_HASH = "RIHS01_"  # first characters of a type hash, from Iron on
+OWN_NODE = "beamsplat"  # name of the nodes of this system in the ROS graph
 GID_BYTES = 16
+_MOST_PARTS = 16  # of a token: three more than those that are known
 _ATTACHMENT = struct.Struct("<qqB16s")
 # The format of late 2024 contains the names of its fields, each after its length.
 _NAMED_ATTACHMENT = struct.Struct("<B15sqB16sqB10sB16s")
@@ -111,6 +119,11 @@ def _is_topic(name: str) -> bool:
     return all(name.strip("/").split("/")) and not set(name) & set("*$?#")
 
 
+def _is_hash(text: str) -> bool:
+    """Return whether a text can be a type hash, and so a part of a key: letters, digits, underscores."""
+    return text.isascii() and text.replace("_", "a").isalnum()
+
+
 @dataclass(frozen=True)
 class RmwQos:
     """The quality of service settings in a liveliness token, which omits settings with default values.
@@ -163,6 +176,7 @@ class RmwEntity:
     type_name: str = ""
     type_hash: str = ""
     qos: RmwQos = RmwQos()
+    extension: str = ""  # what follows the QoS, with its leading slash (Lyrical: buffer backends)
 
     def token(self) -> str:
         """Return the key of this entity's liveliness token."""
@@ -172,7 +186,7 @@ class RmwEntity:
         ]  # fmt: skip
         if self.kind != "NN":
             parts += [mangle(self.topic), dds_type(self.type_name), self.type_hash, self.qos.text()]
-        return "/".join(parts)
+        return "/".join(parts) + self.extension
 
     def gid(self) -> bytes:
         """Return the entity's global id, 16 bytes: the XXH3 hash (128 bits) of the token, low half first."""
@@ -191,14 +205,15 @@ class RmwEntity:
         qos: RmwQos | None
         if kind == "NN" and len(parts) == 9:
             topic, type_name, type_hash, qos = "", "", "", RmwQos()
-        elif kind in ("MP", "MS") and len(parts) == 13:
+        elif kind in ("MP", "MS") and 13 <= len(parts) <= _MOST_PARTS:
             topic, type_name, type_hash = demangle(parts[9]), ros_type(parts[10]), parts[11]
             qos = RmwQos.parse(parts[12])
-            if type_name is None or qos is None or not _is_topic(topic):
+            if type_name is None or qos is None or not (_is_topic(topic) and _is_hash(type_hash)):
                 return None
         else:
             return None
         return RmwEntity(
             int(parts[1]), parts[2], int(parts[3]), int(parts[4]), kind, demangle(parts[8]),
             demangle(parts[7]), demangle(parts[6]), topic, type_name, type_hash, qos,
+            "".join(f"/{part}" for part in parts[13:]),
         )  # fmt: skip

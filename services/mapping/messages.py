@@ -13,7 +13,7 @@ from beamsplat.common.errors import UserError, reason
 from beamsplat.common.geometry.camera import Pinhole, Undistorter
 from beamsplat.common.geometry.depth_sigma import typical_sigma_m
 from beamsplat.common.mapfiles.session import Arrays, packed_arrays, unpacked_arrays
-from beamsplat.common.messages import Keyframe, KeyframeAck, MapChunk, MapPreview, MapState
+from beamsplat.common.messages import CameraModel, Keyframe, KeyframeAck, MapChunk, MapPreview, MapState
 from beamsplat.common.messages.codec import encode, schema_of
 from beamsplat.common.messages.depth_png import depth_from_png, mask_from_png, sigma_from_png
 from beamsplat.common.messages.image_codec import decode_rgb
@@ -67,8 +67,20 @@ def preview_message(keyframe: Keyframe, view: KeyframeRender) -> MapPreview:
     bgr = cv2.cvtColor(view.rgb, cv2.COLOR_RGB2BGR)
     render = cv2.imencode(".jpg", bgr, (cv2.IMWRITE_JPEG_QUALITY, 85))[1].ravel()
     return MapPreview(
-        stamp_ns=keyframe.stamp_ns, keyframe_id=keyframe.id, render=render, T_map_camera=view.T_map_camera
+        stamp_ns=keyframe.stamp_ns, keyframe_id=keyframe.id, render=render, T_map_camera=view.T_map_camera,
+        camera=_camera_model(view.camera, keyframe.camera.T_body_camera),
     )  # fmt: skip
+
+
+def _camera_model(camera: RasterCamera, T_body_camera: np.ndarray) -> CameraModel | None:
+    """Return a camera of the rasterizer as part of a message; None if a message does not allow its K."""
+    try:
+        return CameraModel(
+            width_px=camera.width_px, height_px=camera.height_px, fx_px=camera.fx_px, fy_px=camera.fy_px,
+            cx_px=camera.cx_px, cy_px=camera.cy_px, T_body_camera=T_body_camera,
+        )  # fmt: skip
+    except ValueError:  # a principal point within half a pixel of the edge of the image
+        return None
 
 
 def chunk_message(T_map_anchor: np.ndarray, anchor: int, update: ChunkUpdate, stamp_ns: int) -> MapChunk:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from beamsplat.common.mapfiles.scores import render_rgb_depth
+from beamsplat.common.raster.camera import RasterCamera
 from beamsplat.services.mapping.mapper import HALF, Mapper
 
 
@@ -15,6 +16,7 @@ class KeyframeRender:
     """The map rendered at half size at the pose of a keyframe, with the errors against the keyframe."""
 
     rgb: np.ndarray  # uint8 [h, w, 3]
+    camera: RasterCamera  # of the render
     T_map_camera: np.ndarray
     psnr_db: float  # against the keyframe's image, without dynamic objects
     depth_error_m: float  # median |rendered - measured| where depth was measured; NaN without any
@@ -37,6 +39,7 @@ def render_keyframe(mapper: Mapper, id: int) -> KeyframeRender:
     known = (level.depth_mm > 0) & (alpha > 0.5) & np.isfinite(depth)
     depth_error = np.abs(depth[known] - level.depth_mm[known] * np.float32(1e-3))
     return KeyframeRender(
-        (shown * 255.0 + 0.5).astype(np.uint8), T_map_camera, float(-10.0 * np.log10(max(error, 1e-12))),
+        (shown * 255.0 + 0.5).astype(np.uint8), level.camera, T_map_camera,
+        float(-10.0 * np.log10(max(error, 1e-12))),
         float(np.median(depth_error)) if len(depth_error) else float("nan"),
     )  # fmt: skip

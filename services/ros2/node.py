@@ -13,15 +13,22 @@ import zenoh
 import zenoh.ext
 
 from beamsplat.common.geometry.rig import check_rig_option
-from beamsplat.common.recording.ros_types import typestore
 from beamsplat.common.runtime.clock import StampClock
 from beamsplat.common.runtime.node import Node, SourceItem
 from beamsplat.common.zenoh.bus import open_session
 from beamsplat.common.zenoh.receiving import receive_in_thread
-from beamsplat.common.zenoh.rmw import LIVELINESS_PREFIX, RmwAttachment, RmwEntity, RmwKey, RmwQos, dds_type
+from beamsplat.common.zenoh.rmw import (
+    LIVELINESS_PREFIX,
+    OWN_NODE,
+    RmwAttachment,
+    RmwEntity,
+    RmwKey,
+    RmwQos,
+    dds_type,
+)
 from beamsplat.services.ros2.config import Ros2Config
 from beamsplat.services.ros2.robot import RosRobot, RosRobotOptions
-from beamsplat.services.ros2.topics import IMAGE, SUPPORTED_TYPES, TF
+from beamsplat.services.ros2.topics import IMAGE, SUPPORTED_TYPES, TF, kind_of
 
 log = logging.getLogger("beamsplat.ros2")
 
@@ -29,7 +36,8 @@ _POLL_S = 0.1
 _QUEUED = 1000  # messages; the oldest is dropped when the queue is full
 _FIFO = 256  # messages in the channel of each subscriber
 _MAX_IMAGE_TOPICS = 16  # raw images that are subscribed to until topics are selected
-_MAX_OWN_PUBLISHERS = 64  # of /tf; the newest are known
+_MAX_OWN_PUBLISHERS = 64  # of /tf and /tf_static; the newest are known
+_MAX_ANNOUNCED = 256  # topics whose publishers are told of our subscription
 
 
 class Ros2Node(Node):
@@ -48,8 +56,9 @@ class Ros2Node(Node):
             "odometry": c.odometry_topic,
             "pose": c.pose_topic,
         }
+        self._named_topics = {kind: name for kind, name in named_topics.items() if name}
         options = RosRobotOptions(
-            topics={kind: name for kind, name in named_topics.items() if name},
+            topics=self._named_topics,
             camera_info_topic=c.camera_info_topic, body_frame=c.body_frame, rig=c.rig,
             without=frozenset(c.without), assume_mounts=c.assume_mounts, settle_s=c.settle_s,
         )  # fmt: skip
@@ -58,6 +67,7 @@ class Ros2Node(Node):
         self._samples: queue.Queue[zenoh.Sample] = queue.Queue(_QUEUED)
         self._dropped = 0
         self._declarations: list[object] = []  # references keep subscribers and tokens declared
+        self._announced: dict[str, tuple[str, zenoh.LivelinessToken]] = {}  # by topic: type and our token
         self._type_by_key: dict[str, str] = {}  # ROS type by subscribed key
         self._unused_keys: set[str] = set()  # keys to unsubscribe
         self._topics_selected = False
@@ -125,6 +135,10 @@ class Ros2Node(Node):
             topic = key.split("/", 1)[1].rsplit("/", 2)[0]
             if (type_name == TF and not self.robot.needs_tf) or (type_name == IMAGE and topic not in chosen):
                 self._unused_keys.add(key)
+        for topic, (type_name, token) in list(self._announced.items()):
+            if kind_of(type_name) and topic.strip("/") not in chosen:
+                token.undeclare()
+                del self._announced[topic]
 
     def _on_liveliness_token(self, token: str, kind: zenoh.SampleKind) -> None:
         """Register a publisher of the robot, announced by its liveliness token.
@@ -134,19 +148,41 @@ class Ros2Node(Node):
         entity = RmwEntity.parse(token)
         if entity is None or entity.kind != "MP" or kind != zenoh.SampleKind.PUT:
             return
-        if entity.node_name == "beamsplat":  # published by our node ros2_out
+        if entity.node_name == OWN_NODE:  # published by our node ros2_out
             if entity.type_name == TF:  # the robot uses the same topic
                 self._own_tf_gids.append(entity.gid())
             else:
                 self.robot.ignore_topic(entity.topic)
             return
         self.robot.add_publisher(entity.topic, entity.type_name)
+        self._announce(entity)
         asked = self.config.image_topic.strip("/") in ("", entity.topic.strip("/"))
         if entity.type_name == IMAGE and asked and "image" not in self.config.without:
             if sum(type_name == IMAGE for type_name in self._type_by_key.values()) < _MAX_IMAGE_TOPICS:
                 self._subscribe(f"{entity.domain}/{entity.topic.strip('/')}/{dds_type(IMAGE)}/*", IMAGE)
             else:
                 self.rejections.add(f"more than {_MAX_IMAGE_TOPICS} topics of raw images: set image_topic")
+
+    def _announce(self, publisher: RmwEntity) -> None:
+        """Declare a token of our subscription to the topic of a publisher, as rmw_zenoh does.
+
+        Without it some publish nothing: cameras and image_transport work only for subscribers, and Lyrical
+        publishes arrays on the plain key only if a subscriber does not list buffer backends in its token.
+        """
+        topic, kind = publisher.topic, kind_of(publisher.type_name)
+        named = self._named_topics.get(kind, topic).strip("/")
+        if publisher.type_name not in SUPPORTED_TYPES or kind in self.config.without:
+            return
+        if named != topic.strip("/") or self._topics_selected or topic in self._announced:
+            return
+        if len(self._announced) < _MAX_ANNOUNCED:
+            ours = RmwEntity(
+                self.config.domain, str(self._session.zid()), 0, 1 + len(self._announced), "MS", OWN_NODE,
+                topic=topic, type_name=publisher.type_name, type_hash=publisher.type_hash,
+                qos=RmwQos(best_effort=True, depth=10),
+            )  # fmt: skip
+            token = self._session.liveliness().declare_token(ours.token())
+            self._announced[topic] = (publisher.type_name, token)
 
     def _subscribe_all(self) -> None:
         domain = self.config.domain
@@ -164,7 +200,7 @@ class Ros2Node(Node):
                 self._enqueue(reply.ok)
         self._declarations.append(
             self._session.liveliness().declare_token(
-                RmwEntity(domain, str(self._session.zid()), 0, 0, "NN", "beamsplat").token()
+                RmwEntity(domain, str(self._session.zid()), 0, 0, "NN", OWN_NODE).token()
             )
         )
 
@@ -183,14 +219,6 @@ class Ros2Node(Node):
             subscriber = self._session.declare_subscriber(key, channel)
         self._type_by_key[key] = type_name
         self._start_receiver(subscriber, key)
-        topic = key.split("/", 1)[1].rsplit("/", 2)[0]
-        if topic != "**":
-            entity = RmwEntity(
-                self.config.domain, str(self._session.zid()), 0, len(self._type_by_key), "MS", "beamsplat",
-                topic="/" + topic, type_name=type_name, type_hash=typestore().hash_rihs01(type_name),
-                qos=RmwQos(best_effort=True, depth=10),
-            )  # fmt: skip
-            self._declarations.append(self._session.liveliness().declare_token(entity.token()))
 
     def _start_receiver(self, subscriber: zenoh.Subscriber | zenoh.ext.AdvancedSubscriber, key: str) -> None:
         """Start a thread that receives a subscriber's messages, so that it never blocks the transport.

@@ -38,6 +38,7 @@ from beamsplat.services.ros2.topics import (
     CAMERA_INFO,
     SUPPORTED_TYPES,
     TF,
+    kind_of,
     select_camera_info,
     select_topics,
 )
@@ -119,6 +120,7 @@ class RosRobot:
         if topic not in self._ignored:
             self._ignored.append(topic)
         self._first_messages.pop(topic, None)
+        self._camera_infos.pop(topic, None)
 
     def convert(
         self, topic: str, type_name: str, data: bytes, received_ns: int, now_s: float
@@ -213,7 +215,7 @@ class RosRobot:
         seen = {
             t: k
             for t, (k, m) in self._first_messages.items()
-            if "image" not in _kind_of(k) or is_camera_image(m)
+            if "image" not in kind_of(k) or is_camera_image(m)
         }
         seen |= dict.fromkeys(self._camera_infos, CAMERA_INFO)
         chosen, self.notes = select_topics(seen, self._options.topics, self._options.without)
@@ -425,7 +427,3 @@ class RosRobot:
     def _stamp_ns(self, message: Any, received_ns: int) -> int:
         stamp = message.header.stamp
         return int(stamp.sec) * 10**9 + int(stamp.nanosec) or received_ns
-
-
-def _kind_of(type_name: str) -> str:
-    return next((kind for kind, sensor in SENSORS.items() if type_name in sensor.ros_types), "")

@@ -11,6 +11,11 @@ TF = "tf2_msgs/msg/TFMessage"
 SUPPORTED_TYPES = frozenset({t for sensor in SENSORS.values() for t in sensor.ros_types} | {CAMERA_INFO, TF})
 
 
+def kind_of(type_name: str) -> str:
+    """Return the sensor kind ("image", "scan", ...) of a ROS type; "" for CameraInfo and transforms."""
+    return next((kind for kind, sensor in SENSORS.items() if type_name in sensor.ros_types), "")
+
+
 def select_topics(
     seen: dict[str, str],  # type by topic, also of CameraInfo
     wanted: dict[str, str],  # topic by kind, set by options

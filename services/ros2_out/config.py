@@ -9,9 +9,14 @@ from pydantic import Field
 from beamsplat.common.config.deployment import NodeConfig
 from beamsplat.common.config.ros import ROUTER, Domain, domain_field
 
+Seconds = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+
 
 class Ros2OutConfig(NodeConfig):
-    """Options of the node that publishes to ROS 2. An empty topic name disables the topic."""
+    """Options of the node that publishes to ROS 2. An empty topic name disables the topic.
+
+    The CameraInfo of an image is on the topic `camera_info` beside it.
+    """
 
     domain: Domain = domain_field()
     router: str = ROUTER
@@ -22,8 +27,19 @@ class Ros2OutConfig(NodeConfig):
     # nav_msgs/OccupancyGrid, when its size has changed, and at intervals. Between them, the changed parts are
     # published as map_msgs/OccupancyGridUpdate on this topic with "_updates" appended.
     map_topic: str = "/map"
-    map_every_s: Annotated[float, Field(gt=0.0)] = 5.0  # large maps: longer, see `grid_publisher`
+    map_every_s: Seconds = 5.0  # large maps: longer, see `grid_publisher`
+    depth_topic: str = "/beamsplat/depth/image_rect"  # 32FC1, registered to the undistorted camera image
+    # The Gaussian map as points, when it has changed, at most every so often; one Gaussian per cell.
+    map_cloud_topic: str = "/beamsplat/map_cloud"
+    map_cloud_every_s: Seconds = 5.0
+    # 16 bytes each. rmw_zenoh loses latched messages of more than 1 MB on some links (ros2/rmw_zenoh #710).
+    map_cloud_points: Annotated[int, Field(ge=1, le=2_000_000)] = 50_000
+    map_cloud_cell_m: Annotated[float, Field(ge=0.005, le=100.0)] = 0.05  # doubled until the points suffice
+    # The map rendered from the pose of each new keyframe, rgb8.
+    render_topic: str = "/beamsplat/map_camera/image"
     tf: bool = True  # map -> odom, and odom -> body if the robot has no odometry
     map_frame: str = "map"
     odom_frame: str = "odom"
     body_frame: str = "base_link"
+    camera_frame: str = "beamsplat_camera"  # of the depth; body -> camera is published on /tf_static
+    render_frame: str = "beamsplat_map_camera"  # of the rendered images; map -> camera is published on /tf

@@ -1,62 +1,48 @@
-"""The ros2_out node: publishes pose, transforms, map and point cloud to ROS 2, without a ROS installation.
+"""The ros2_out node: publishes poses, transforms, maps, depth and renders to ROS 2, without ROS installed.
 
 It uses the Zenoh keys of rmw_zenoh.
 """
 
 from __future__ import annotations
 
-import time
-from typing import Any
+import logging
 
-import zenoh
-import zenoh.ext
+import numpy as np
 
+from beamsplat.common.errors import UserError
+from beamsplat.common.geometry.camera import Pinhole
 from beamsplat.common.mapfiles.grid_tiles import GridSource
-from beamsplat.common.messages import Cloud, Correction, GridTile, Odometry, WheelOdometry
+from beamsplat.common.messages import (
+    CameraModel,
+    Cloud,
+    Correction,
+    FusedDepth,
+    GridTile,
+    MapChunk,
+    MapPreview,
+    Odometry,
+    Rig,
+    Tick,
+    WheelOdometry,
+)
+from beamsplat.common.messages.header import Header
+from beamsplat.common.messages.image_codec import decode_rgb
 from beamsplat.common.recording import ros_types as ros
-from beamsplat.common.runtime.node import Node, Outputs
+from beamsplat.common.runtime.node import Input, Job, Node, Outputs, QueryFunction
 from beamsplat.common.zenoh.bus import open_session
-from beamsplat.common.zenoh.rmw import RmwAttachment, RmwEntity, RmwQos, data_key
-from beamsplat.services.ros2_out import conversions
+from beamsplat.common.zenoh.rmw import RmwQos
+from beamsplat.common.zenoh.ros_publishers import RosPublishers, ros_topic
+from beamsplat.services.ros2_out import conversions, images
 from beamsplat.services.ros2_out.config import Ros2OutConfig
 from beamsplat.services.ros2_out.grid_publisher import GridPublisher
+from beamsplat.services.ros2_out.splat_cloud import SplatCloud
+
+log = logging.getLogger("beamsplat.ros2_out")
 
 _VOLATILE = RmwQos(depth=10)
 _LATCHED = RmwQos(transient_local=True, depth=1)
-
-
-class RosPublisher:
-    """A publisher of one ROS topic, declared in the same way as by rmw_zenoh_cpp."""
-
-    def __init__(
-        self, session: zenoh.Session, domain: int, number: int, topic: str, type_name: str, qos: RmwQos
-    ) -> None:
-        type_hash = ros.typestore().hash_rihs01(type_name)
-        entity = RmwEntity(
-            domain, str(session.zid()), 0, number, "MP", "beamsplat", topic="/" + topic.strip("/"),
-            type_name=type_name, type_hash=type_hash, qos=qos,
-        )  # fmt: skip
-        key = data_key(domain, topic, type_name, type_hash)
-        self._publisher: zenoh.Publisher | zenoh.ext.AdvancedPublisher
-        if qos.transient_local:
-            self._publisher = zenoh.ext.declare_advanced_publisher(
-                session, key,
-                congestion_control=zenoh.CongestionControl.DROP,
-                cache=zenoh.ext.CacheConfig(qos.depth),
-                sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=0.5),
-                publisher_detection=True,
-            )  # fmt: skip
-        else:
-            self._publisher = session.declare_publisher(key, congestion_control=zenoh.CongestionControl.DROP)
-        self._token = session.liveliness().declare_token(entity.token())
-        self._gid = entity.gid()
-        self.sent = 0
-
-    def put(self, message: Any) -> None:
-        """Publish one ROS message."""
-        self.sent += 1
-        attachment = RmwAttachment(self.sent, time.time_ns(), self._gid)
-        self._publisher.put(ros.serialize(message), attachment=attachment.pack())
+_TF = RmwQos(depth=100)  # as tf2_ros publishes it
+_SNAPSHOT_S = 30.0  # longest wait for an answer of the mapper, which may be busy with a keyframe
 
 
 class Ros2OutNode(Node):
@@ -66,33 +52,64 @@ class Ros2OutNode(Node):
     Config = Ros2OutConfig
     config: Ros2OutConfig
     inputs = (
+        "rig",
         "wheel/odometry",
         "localization/odometry",
         "localization/correction",
         "localization/grid",
+        "fusion/depth",
         "fusion/cloud",
+        # In order of arrival: chunks have the stamps of keyframes, for which poses must not wait.
+        Input("mapping/chunk", feedback=True, queued_bytes=64_000_000),
+        "mapping/preview",
+        Input("tick", "latest"),
     )
+    _ask: QueryFunction | None = None
+
+    def set_query_function(self, ask: QueryFunction) -> None:
+        self._ask = ask
 
     def configure(self) -> None:
         c = self.config
         self._transforms = conversions.TfTree(c.map_frame, c.odom_frame, c.body_frame)
         self._grid = GridPublisher(c.map_frame, c.map_every_s)
+        self._splats = SplatCloud(c.map_cloud_points, c.map_cloud_cell_m)
+        self._chunk_ns = 0  # stamp of the newest chunk of the map
+        self._splats_ns: int | None = None  # time at which the map was last published as points
+        self._mapper = ""  # instance of the process that sent the newest chunk
+        self._camera: CameraModel | None = None
         self._session = open_session((c.router,))
-        node = RmwEntity(c.domain, str(self._session.zid()), 0, 0, "NN", "beamsplat")
-        self._token = self._session.liveliness().declare_token(node.token())
-        wanted = (
+        moves = c.tf or c.render_topic
+        topics = (
             ("pose", c.pose_topic, conversions.POSE, _VOLATILE),
             ("pose_covariance", c.pose_covariance_topic, conversions.POSE_COVARIANCE, _VOLATILE),
-            ("tf", "/tf" if c.tf else "", conversions.TF, RmwQos(depth=100)),
+            ("tf", "/tf" if moves else "", conversions.TF, _TF),
+            ("tf_static", "/tf_static" if c.depth_topic else "", conversions.TF, _LATCHED),
             ("map", c.map_topic, conversions.MAP, _LATCHED),
-            ("map_updates", c.map_topic and f"{c.map_topic}_updates", ros.GRID_UPDATE, RmwQos(depth=100)),
+            ("map_updates", c.map_topic and f"{c.map_topic}_updates", ros.GRID_UPDATE, _TF),
             ("cloud", c.cloud_topic, conversions.CLOUD, _VOLATILE),
+            ("depth", c.depth_topic, images.IMAGE, _VOLATILE),
+            ("depth_info", images.info_topic(c.depth_topic), images.CAMERA_INFO, _VOLATILE),
+            ("map_cloud", c.map_cloud_topic, conversions.CLOUD, _LATCHED),
+            ("render", c.render_topic, images.IMAGE, _VOLATILE),
+            ("render_info", images.info_topic(c.render_topic), images.CAMERA_INFO, _VOLATILE),
         )
-        self._publishers = {
-            name: RosPublisher(self._session, c.domain, number, topic, type_name, qos)
-            for number, (name, topic, type_name, qos) in enumerate(wanted, start=1)
-            if topic
-        }
+        self._ros = RosPublishers(
+            self._session, c.domain,
+            {name: ros_topic(topic, type_name, qos) for name, topic, type_name, qos in topics if topic},
+        )  # fmt: skip
+
+    def on_header(self, header: Header) -> None:
+        if header.producer == "mapping":
+            self._mapper = header.instance
+
+    def on_rig(self, rig: Rig) -> Outputs:
+        """Publish the mount of the camera, in whose frame the depth is."""
+        self._camera, c = rig.camera, self.config
+        if rig.camera is not None:
+            mount = ros.tf(rig.stamp_ns, c.body_frame, c.camera_frame, rig.camera.T_body_camera)
+            self._ros.put("tf_static", lambda: ros.tf_message([mount]))
+        return self._done()
 
     def on_wheel_odometry(self, odometry: WheelOdometry) -> Outputs:
         self._transforms.add_wheel_odometry(odometry.stamp_ns, odometry.T_odom_body)
@@ -105,15 +122,15 @@ class Ros2OutNode(Node):
     def on_localization_odometry(self, odometry: Odometry) -> Outputs:
         """Publish pose and transforms, if the status of localization is ok."""
         if odometry.status == "ok":
-            self._publish("pose", self._transforms.pose(odometry.stamp_ns, odometry.T_odom_body))
-            self._publish(
-                "pose_covariance",
-                self._transforms.pose_with_covariance(
-                    odometry.stamp_ns, odometry.T_odom_body, odometry.covariance
-                ),
+            stamp_ns, T, tree = odometry.stamp_ns, odometry.T_odom_body, self._transforms
+            self._ros.put("pose", lambda: tree.pose(stamp_ns, T))
+            self._ros.put(
+                "pose_covariance", lambda: tree.pose_with_covariance(stamp_ns, T, odometry.covariance)
             )
-            self._publish("tf", self._transforms.tf(odometry.stamp_ns, odometry.T_odom_body))
-        return iter(())
+            transforms = tree.tf(stamp_ns, T) if self.config.tf else None
+            if transforms is not None:
+                self._ros.put("tf", lambda: transforms)
+        return self._done()
 
     def on_localization_grid(self, tile: GridTile) -> Outputs:
         """Store a tile; after the last one of an update, publish the whole map or what has changed in it."""
@@ -121,27 +138,124 @@ class Ros2OutNode(Node):
         try:
             self._grid.add(source, tile.row, tile.column, tile.packed.tobytes())
             for name, message in self._grid.messages(tile.stamp_ns) if tile.remaining == 0 else ():
-                self._publish(name, message)
+                self._ros.put(name, lambda message=message: message)  # type: ignore[misc]
         except ValueError as error:
             self.rejections.add(f"map not published: {error}")
-        return iter(())
+        return self._done()
 
     def on_fusion_cloud(self, cloud: Cloud) -> Outputs:
-        self._publish(
+        self._ros.put(
             "cloud",
-            conversions.point_cloud(
+            lambda: conversions.point_cloud(
                 cloud.stamp_ns, self.config.map_frame, cloud.points_odom_m, cloud.colours,
                 self._transforms.T_map_odom,
             ),
         )  # fmt: skip
+        return self._done()
+
+    def on_fusion_depth(self, depth: FusedDepth) -> Outputs:
+        """Publish the depth of an undistorted image and its CameraInfo."""
+        if depth.status != "ok":
+            return iter(())
+        size_px = depth.depth_m.shape[::-1]
+        if self._camera is None or size_px != (self._camera.width_px, self._camera.height_px):
+            self.rejections.add(f"depth not published: {size_px} px do not belong to the calibration")
+            return iter(())
+        stamp_ns, frame = depth.stamp_ns, self.config.camera_frame
+        pinhole = Pinhole.of(self._camera).undistorted()
+        self._ros.put("depth", lambda: images.depth_image(stamp_ns, frame, depth.depth_m))
+        self._ros.put("depth_info", lambda: images.camera_info(stamp_ns, frame, pinhole))
+        return self._done()
+
+    def on_mapping_chunk(self, chunk: MapChunk) -> Outputs:
+        """Store the Gaussians of a submap, and publish the map as points if that is due."""
+        if "map_cloud" in self._ros:
+            self._chunk_ns = chunk.stamp_ns or self._chunk_ns
+            try:
+                self._splats.add(
+                    self._mapper, chunk.anchor_id, chunk.revision, chunk.T_map_anchor, chunk.packed
+                )
+            except ValueError as error:
+                self.rejections.add(f"chunk of the map not published: {error}")
+            self._publish_splats(chunk.stamp_ns)
+        self._done()
+        yield from self._ask_snapshot()
+
+    def on_tick(self, tick: Tick) -> Outputs:
+        self._publish_splats(tick.stamp_ns)
+        self._done()
+        yield from self._ask_snapshot()
+
+    def on_job_snapshot(self, snapshot: SplatCloud) -> Outputs:
+        self._splats.complete(snapshot)
         return iter(())
+
+    def on_mapping_preview(self, preview: MapPreview) -> Outputs:
+        """Publish the map as seen from its newest keyframe: image, CameraInfo and the pose of the camera."""
+        camera, c, stamp_ns = preview.camera, self.config, preview.stamp_ns
+        if "render" not in self._ros:
+            return iter(())
+        if camera is None:  # a mapper of an older version
+            self.rejections.add("render of the map not published: the mapper does not say with which camera")
+            return iter(())
+        size_px, frame = (camera.width_px, camera.height_px), c.render_frame
+        pose = ros.tf(stamp_ns, c.map_frame, frame, preview.T_map_camera)
+        try:
+            self._ros.put(
+                "render",
+                lambda: images.rgb_image(stamp_ns, frame, decode_rgb(preview.render, "jpeg", *size_px)),
+            )
+        except UserError as error:
+            self.rejections.add(f"render of the map not published: {error}")
+            return iter(())
+        pinhole = Pinhole.of(camera)
+        self._ros.put("render_info", lambda: images.camera_info(stamp_ns, frame, pinhole))
+        self._ros.put("tf", lambda: ros.tf_message([pose]))
+        return self._done()
+
+    def drain(self) -> Outputs:
+        """Publish the last state of the map."""
+        self._publish_splats(None)
+        return self._done()
 
     def close(self) -> None:
         if hasattr(self, "_session"):
             self._session.close()
 
-    def _publish(self, name: str, message: Any | None) -> None:
-        if message is not None and name in self._publishers:
-            self._publishers[name].put(message)
-            sent = ", ".join(f"{name} {p.sent}" for name, p in self._publishers.items())
-            self.detail = f"to ROS 2: {sent}"
+    def _ask_snapshot(self) -> Outputs:
+        """Ask the mapper, once, for what it has published before this process was started."""
+        ask, self._ask = self._ask, None
+        if ask is None or "map_cloud" not in self._ros or "mapping/chunk" in self.without_producer:
+            return
+        snapshot = SplatCloud(self.config.map_cloud_points, self.config.map_cloud_cell_m)
+
+        def collect() -> SplatCloud:
+            try:
+                for chunk in ask("mapping", "snapshot", {}, _SNAPSHOT_S):
+                    assert isinstance(chunk, MapChunk)  # the message type of this query
+                    snapshot.add("", chunk.anchor_id, chunk.revision, chunk.T_map_anchor, chunk.packed)
+            except ValueError as error:  # no mapper, an empty map, or an answer that does not decode
+                log.info("no snapshot of the map: %s", error)
+            return snapshot
+
+        yield Job("snapshot", collect)
+
+    def _publish_splats(self, stamp_ns: int | None) -> None:
+        """Publish the map as points if it has changed and the interval is over; None: in any case."""
+        c, last_ns = self.config, self._splats_ns
+        due = stamp_ns is None or last_ns is None or abs(stamp_ns - last_ns) >= c.map_cloud_every_s * 1e9
+        if not (due and self._splats.changed):
+            return
+        self._splats_ns = stamp_ns
+        points_m, colours = self._splats.points()
+        self._ros.put(
+            "map_cloud",
+            lambda: conversions.point_cloud(self._chunk_ns, c.map_frame, points_m, colours, np.eye(4)),
+        )
+
+    def _done(self) -> Outputs:
+        """Show what the robot's subscribers take and miss; return no messages."""
+        self.detail = self._ros.status()
+        for reason, count in self._ros.missed().items():
+            self.rejections.set(reason, count)
+        return iter(())

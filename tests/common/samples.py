@@ -112,7 +112,12 @@ def sample_messages() -> list[Message]:
         MapPoses(
             stamp_ns=28, keyframe_ids=np.array([26, 30]), stamps_ns=np.array([26, 30]), T_map_body=T,
         ),
-        MapPreview(stamp_ns=26, keyframe_id=26, render=np.arange(6, dtype=np.uint8), T_map_camera=T[0]),
+        MapPreview(
+            stamp_ns=26, keyframe_id=26, render=np.arange(6, dtype=np.uint8), T_map_camera=T[0],
+            camera=CameraModel(
+                width_px=320, height_px=240, fx_px=250.5, fy_px=251.0, cx_px=159.25, cy_px=119.5, T_body_camera=T[1],
+            ),
+        ),
         MapStatus(
             stamp_ns=26, status="the mask leaves no pixel to use", keyframes=3, refused=1, gaussians=9000, steps=40,
             loss=0.1, foretold_share=0.5, foretold_psnr_db=19.0, psnr_db=27.0, depth_error_m=0.02,

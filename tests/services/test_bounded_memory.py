@@ -125,7 +125,8 @@ def step(number: int, stamp_ns: int, lost: bool) -> dict[str, Callable[[], Messa
             packed=pack(np.full((14, 3), 0.5, np.float32))),
         "mapping/poses": lambda: MapPoses(
             **at, keyframe_ids=np.arange(2), stamps_ns=np.arange(2), T_map_body=np.array([T, T])),
-        "mapping/preview": lambda: MapPreview(**at, keyframe_id=number, render=jpeg, T_map_camera=T),
+        "mapping/preview": lambda: MapPreview(
+            **at, keyframe_id=number, render=jpeg, T_map_camera=T, camera=RIG.camera),
         "keyframes/ack": lambda: KeyframeAck(**at, id=stamp_ns, status=status),
         "mapping/status": lambda: MapStatus(**at, status=status),
     }  # fmt: skip

@@ -117,3 +117,42 @@ def test_tokens_of_others_end_no_node_and_are_bounded(free_endpoint):
         finally:
             node.close()
             del declared
+
+
+def test_publishers_are_told_of_our_subscriptions_with_their_own_type_hash(free_endpoint):
+    """Cameras that work only for subscribers, and those of Lyrical, publish nothing otherwise."""
+
+    def announced():
+        tokens = [RmwEntity.parse(str(r.ok.key_expr)) for r in other.liveliness().get("@ros2_lv/3/**/MS/**")]
+        return {(t.topic, t.type_name.rpartition("/")[2], t.type_hash) for t in tokens}
+
+    scan, image, laser = "/scan", "/camera/image_raw/compressed", "sensor_msgs/msg/LaserScan"
+    robot = [
+        RmwEntity(3, "ab12", 0, 1, "MP", "driver", topic=scan, type_name=laser, type_hash="TypeHashNotSupported"),
+        RmwEntity(3, "ab12", 0, 2, "MP", "driver", topic=image, type_name="sensor_msgs/msg/CompressedImage",
+                  type_hash="RIHS01_" + "7" * 64, extension="/cpu:"),
+        RmwEntity(3, "ab12", 0, 3, "MP", "driver", topic="/chatter", type_name="std_msgs/msg/String",
+                  type_hash="RIHS01_" + "8" * 64),
+        RmwEntity(3, "ab12", 0, 4, "MP", "driver", topic="/odom", type_name="nav_msgs/msg/Odometry", type_hash="RIHS01_9"),
+    ]  # fmt: skip
+    node = Ros2Node(Ros2Config(domain=3, router=free_endpoint, without=("odometry",)))
+    with open_router((free_endpoint,)), open_session((free_endpoint,)) as other:
+        declared = [other.liveliness().declare_token(entity.token()) for entity in robot]
+        node.configure()
+        try:
+            source = node.source()
+            while len(announced()) < 2:
+                next(source)
+            for _ in range(3):
+                next(source)
+            expected = {
+                (scan, "LaserScan", robot[0].type_hash),
+                (image, "CompressedImage", robot[1].type_hash),
+            }
+            assert announced() == expected
+            node.robot._kind_by_topic = {scan: "scan"}  # topics are selected: the camera may stop
+            node._unsubscribe_unused()
+            assert announced() == {(scan, "LaserScan", robot[0].type_hash)}
+        finally:
+            node.close()
+            del declared

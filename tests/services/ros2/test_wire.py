@@ -13,7 +13,7 @@ from beamsplat.common.geometry.transforms import se2_to_se3
 from beamsplat.common.recording import ros_types as ros
 from beamsplat.common.recording.sensors import SENSORS, build_message, ros_fields
 from beamsplat.common.recording.to_ros import records_of
-from beamsplat.common.zenoh.rmw import RmwAttachment, RmwEntity, RmwKey, RmwQos, data_key
+from beamsplat.common.zenoh.rmw import NO_TYPE_HASH, RmwAttachment, RmwEntity, RmwKey, RmwQos, data_key
 from beamsplat.services.ros2_out.conversions import TfTree, occupancy_grid, point_cloud
 
 # ros2/rmw_zenoh, docs/design.md, "Graph Cache": the tokens of a listener and of a talker on /chatter.
@@ -48,6 +48,41 @@ def test_parts_of_a_publishers_token():
         data_key(2, "/chatter", "std_msgs/msg/String", HASH)
         == f"2/chatter/std_msgs::msg::dds_::String_/{HASH}"
     )
+
+
+# Published by other projects: rosbag2's metadata.yaml, `ros2 topic info -v` of RViz and nav2, generated headers.
+KNOWN_HASHES = {
+    "geometry_msgs/msg/PoseStamped": "10f3786d7d40fd2b54367835614bff85d4ad3b5dab62bf8bca0cc232d73b4cd8",
+    "geometry_msgs/msg/PoseWithCovarianceStamped":
+        "26432f9803e43727d3c8f668d1fdb3c630f548af631e2f4e31382371bfea3b6e",
+    "map_msgs/msg/OccupancyGridUpdate": "c4095b0be2e4363f8978a1570e0293ee093436f1e1c61d99b48502ac317025e8",
+    "nav_msgs/msg/OccupancyGrid": "8d348150c12913a31ee0ec170fbf25089e4745d17035792a1ba94d6f0bc0cfc7",
+    "sensor_msgs/msg/CameraInfo": "b3dfd68ff46c9d56c80fd3bd4ed22c7a4ddce8c8348f2f59c299e73118e7e275",
+    "sensor_msgs/msg/Image": "d31d41a9a4c4bc8eae9be757b0beed306564f7526c88ea6a4588fb9582527d47",
+    "sensor_msgs/msg/PointCloud2": "9198cabf7da3796ae6fe19c4cb3bdd3525492988c70522628af5daa124bae2b5",
+    "tf2_msgs/msg/TFMessage": "e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("type_name", "digits"), KNOWN_HASHES.items())
+def test_type_hashes_of_what_is_published_are_those_of_ros(type_name, digits):
+    assert ros.typestore().hash_rihs01(type_name) == f"RIHS01_{digits}"
+    for distribution in (Stores.ROS2_JAZZY, Stores.ROS2_KILTED, Stores.ROS2_LYRICAL):
+        store = get_typestore(distribution)
+        if type_name in store.types:  # map_msgs is not
+            assert store.hash_rihs01(type_name) == f"RIHS01_{digits}"
+
+
+def test_longer_tokens_and_tokens_without_hashes_are_parsed():
+    humble = SUBSCRIPTION.replace(HASH, NO_TYPE_HASH)
+    longer = SUBSCRIPTION + "/cpu:,cuda:8"  # Lyrical lists buffer backends
+    for token, type_hash in ((humble, NO_TYPE_HASH), (longer, HASH)):
+        entity = RmwEntity.parse(token)
+        assert (entity.topic, entity.type_hash, entity.qos.depth) == ("/chatter", type_hash, 10)
+        assert entity.token() == token
+        assert entity.gid() == xxhash.xxh3_128(token.encode()).intdigest().to_bytes(16, "little")
+    assert RmwEntity.parse(PUBLISHER.replace(HASH, "RIHS01_*")) is None  # cannot be a part of a key
+    assert RmwEntity.parse(PUBLISHER + "/a" * 9) is None
 
 
 def test_unsupported_tokens_are_ignored():
