@@ -53,35 +53,30 @@ class _LogEntry:
     bytes: int = 0
 
 
-@dataclass(frozen=True)
-class Sink:
-    """Where a thread writes its entries: a rerun stream that nothing else uses, and its rerun sink."""
-
-    stream: rr.RecordingStream
-    sink: Any
-    flush_s: float = _CHECK_S  # between two checks that the sink has taken all entries
-
-
 class RerunSinkThread:
     """A viewer server, or the file or files of a recording, and the thread that writes to it."""
 
     def __init__(
         self,
         name: str,
-        sink: Sink,
+        stream: rr.RecordingStream,
+        sink: Any,
         blueprint: rrb.Blueprint,
         watch: Callable[[], str] = lambda: "",
-        next_part: Callable[[int], Sink | None] = lambda entries: None,
+        next_part: Callable[[int], Any | None] = lambda entries: None,
+        flush_s: float = _CHECK_S,
     ) -> None:
         """Open the sink and start the thread.
 
         Args:
             name: name of the sink, for status texts.
-            sink: the sink to open.
+            stream: rerun stream that only this sink uses.
+            sink: the rerun sink to open.
             blueprint: layout of the viewer.
             watch: called about once per second; returns the reason why the sink must be closed, or "".
             next_part: called about once per second with the number of entries in the sink; returns the sink
                 that continues the recording, or None while the present one does.
+            flush_s: time between two checks that the sink has taken all entries.
 
         Raises:
             RuntimeError: the sink cannot be opened.
@@ -89,7 +84,7 @@ class RerunSinkThread:
         self.name = name
         self.fault = ""  # why the sink was closed
         self.dropped = 0  # entries replaced by newer ones
-        self._blueprint = blueprint
+        self._stream = stream
         self._watch = watch
         self._next_part = next_part
         self._static: dict[tuple[str, tuple[type, ...]], _LogEntry] = {}  # begin each part
@@ -98,14 +93,13 @@ class RerunSinkThread:
         self._bytes = 0  # of the queued entries
         self._changed = threading.Condition()
         self._closing = False
-        self._open(sink)
+        self._flush_s, self._next_flush = flush_s, time.monotonic() + flush_s
+        self._open(sink, blueprint)
         self._thread = threading.Thread(target=self._run, name=f"monitor-{name}", daemon=True)
         self._thread.start()
 
-    def _open(self, sink: Sink) -> None:
-        sink.stream.set_sinks(sink.sink, default_blueprint=self._blueprint)
-        self._stream, self._flush_s = sink.stream, sink.flush_s
-        self._next_flush = time.monotonic() + sink.flush_s
+    def _open(self, sink: Any, blueprint: rrb.Blueprint | None) -> None:
+        self._stream.set_sinks(sink, default_blueprint=blueprint)
         self._entries = 0  # in this part
 
     def put(self, entry: _LogEntry) -> None:
@@ -207,8 +201,8 @@ class RerunSinkThread:
             self._give_up(reason)
         elif part := self._next_part(self._entries):
             self._stream.flush(timeout_sec=_FLUSH_S)
-            self._stream.disconnect()
-            self._open(part)
+            # rerun never ends the threads of a stream, and each blueprint is one: only the first part has it.
+            self._open(part, None)
             for entry in self._static.values():
                 self._write(entry)
 
@@ -260,17 +254,19 @@ class RerunWriter:
             raise RuntimeError(f"cannot create the folder of {path}: {error}") from error
         parts = _FileParts(path, limit_mb, keep_free_mb)
 
-        def next_part(entries: int) -> Sink | None:
+        def next_part(entries: int) -> rr.FileSink | None:
             following = parts.next(entries)
-            return None if following is None else self._file(following)
+            return None if following is None else rr.FileSink(following)
 
-        self.sinks.append(RerunSinkThread(str(path), self._file(path), blueprint, parts.watch, next_part))
+        # Few, large chunks: rerun keeps their index in memory until the file is closed.
+        stream = self._stream(flush_tick_s=_FILE_FLUSH_S)
+        self.sinks.append(
+            RerunSinkThread(
+                str(path), stream, rr.FileSink(path), blueprint, parts.watch, next_part, _FILE_FLUSH_S
+            )
+        )
         self.notes.append(f"writing {path}")
         return path
-
-    def _file(self, path: Path) -> Sink:
-        # Few, large chunks: rerun keeps their index in memory until the file is closed.
-        return Sink(self._stream(flush_tick_s=_FILE_FLUSH_S), rr.FileSink(path), _FILE_FLUSH_S)
 
     def serve(
         self, blueprint: rrb.Blueprint, *, bind: str, port: int, origins: list[str], memory_mb: int
@@ -286,7 +282,7 @@ class RerunWriter:
             bind, port, server_memory_limit=f"{memory_mb}MB", cors_allow_origin=origins or None
         )
         thread = RerunSinkThread(
-            f"viewer at port {port}", Sink(self._stream(0.1), sink), blueprint, self._watch_viewer
+            f"viewer at port {port}", self._stream(0.1), sink, blueprint, self._watch_viewer
         )
         self.sinks.append(thread)
         return f"rerun+http://127.0.0.1:{port}/proxy"

@@ -1,5 +1,6 @@
 """Sinks that stall, fill up, disappear or cannot be opened: the node continues and reports it."""
 
+import os
 import subprocess
 import sys
 import textwrap
@@ -16,7 +17,6 @@ from beamsplat.services.monitor.rerun_writer import (
     _QUEUE_BYTES,
     RerunSinkThread,
     RerunWriter,
-    Sink,
     _LogEntry,
 )
 
@@ -51,7 +51,7 @@ class StuckStream:
 
 def test_a_stalled_viewer_blocks_nothing_and_gets_the_newest_entries():
     stream = StuckStream()
-    thread = RerunSinkThread("viewer", Sink(stream, None), None)
+    thread = RerunSinkThread("viewer", stream, None, None)
     thread.put(_LogEntry("rig", ("rig",), None, True))
     for i in range(10 * _QUEUE):
         thread.put(_LogEntry(f"entity{i % 3}", (i,), i, False))
@@ -69,7 +69,7 @@ def test_a_stalled_viewer_blocks_nothing_and_gets_the_newest_entries():
 
 def test_queued_entries_are_bounded_by_bytes():
     stream = StuckStream()
-    thread = RerunSinkThread("viewer", Sink(stream, None), None)
+    thread = RerunSinkThread("viewer", stream, None, None)
     for i in range(200):
         thread.put(_LogEntry(f"splats{i % 4}", (i,), i, False, bytes=10_000_000))
     assert len(thread._queue) <= _QUEUE_BYTES // 10_000_000 + 4
@@ -83,7 +83,7 @@ def test_queued_entries_are_bounded_by_bytes():
 
 def test_closing_has_a_timeout(caplog):
     stream = StuckStream()
-    thread = RerunSinkThread("viewer", Sink(stream, None), None)
+    thread = RerunSinkThread("viewer", stream, None, None)
     thread.put(_LogEntry("a", (1,), None, False))
     thread.close(0.1)
     assert "viewer was not closed within 0.1 s" in caplog.text
@@ -160,9 +160,13 @@ def test_a_long_recording_has_parts_that_can_be_opened_alone(tmp_path, read_rrd,
     path = writer.save(tmp_path / "drive.rrd", layout(), limit_mb=100, keep_free_mb=0)
     writer.log("map", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     values = list(range(300))
+    threads = 0
     for value in values:
+        if value == 100:
+            threads = len(os.listdir("/proc/self/task"))
         writer.log("curve", rr.Scalars(float(value)), stamp_ns=value)
         time.sleep(0.002)
+    assert len(os.listdir("/proc/self/task")) <= threads
     writer.close()
     assert not writer.sinks[0].fault
     parts = sorted(tmp_path.glob("drive*.rrd"), key=lambda p: p.stat().st_mtime_ns)
