@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 _GAP_PERIODS = 3.0  # a longer pause is a gap
+_VARYING = 0.9  # of the beams: lidars whose speed is not constant have some more or fewer in each revolution
 
 
 @dataclass(frozen=True)
@@ -128,14 +129,19 @@ def topic_problems(facts: TopicStatistics) -> list[str]:
 def lidar_problems(facts: LidarStatistics, *, sparse: bool = False) -> list[str]:
     """Return sentences about problems of the scans; `sparse`: beams that were not measured are normal."""
     found = []
-    if facts.beams_min != facts.beams_max:
+    if facts.beams_min < _VARYING * facts.beams_max:
         found.append(f"the scans have between {facts.beams_min} and {facts.beams_max} beams")
     if facts.invalid_share > 0.2 and not sparse:
-        found.append(f"{facts.invalid_share:.0%} of the beams are NaN, negative or below range_min")
+        found.append(
+            f"{facts.invalid_share:.0%} of the beams are NaN, negative or below range_min: not measured, or "
+            "removed by the driver; they are not used"
+        )
     if facts.most_common_far_m is not None:
+        used = facts.most_common_far_m < facts.range_max_m
         found.append(
             f"{facts.most_common_far_share:.1%} of the beams read exactly {facts.most_common_far_m:.2f} m: "
-            "the driver's code for no return; drop these beams"
+            "the driver's code for no return; "
+            + ("drop these beams" if used else "it is not below range_max: they are not used")
         )
     if facts.time_increment_s == 0.0:
         found.append("the scans have no time per beam (time_increment is 0): they are not deskewed")

@@ -27,6 +27,7 @@ from beamsplat.tools.cli.options import writable
 
 if TYPE_CHECKING:
     from beamsplat.tools.simulator.lidar_records import RecordingSummary
+    from beamsplat.tools.simulator.robots import RobotPreset
 
 console = Console(stderr=True)
 
@@ -71,7 +72,16 @@ def simulate(
         str,
         typer.Option(help="Image size in pixels (default 640x480); office: size in metres (default 120x80)."),
     ] = "",
-    rate_hz: Annotated[float, typer.Option(min=0.5, max=60.0, help="Image rate of the camera.")] = 10.0,
+    rate_hz: Annotated[
+        float | None,
+        typer.Option(min=0.5, max=60.0, help="Image rate of the camera (default 10, or the robot's)."),
+    ] = None,
+    robot: Annotated[
+        str,
+        typer.Option(
+            help="Sensors, topics, frames, drivers of turtlebot4, rosmaster_x3, ugv_ld19 or jetrover_g4."
+        ),
+    ] = "",
     scene: Annotated[
         Path | None,
         typer.Option(exists=True, dir_okay=False, help="glTF/GLB scene instead of a generated home."),
@@ -144,8 +154,11 @@ def simulate(
 
     beamsplat simulate --out site --site office --size 120x80 --lidar-only --distance-m 3000 --movers 30
 
+    beamsplat simulate --out tb4 --robot turtlebot4 --lidar-only
+
     beamsplat simulate --out faulty --clock-offset-ms 40 --extrinsic-yaw-deg 2 --distortion=-0.12,0.03,0,0,0
     """
+    preset = _preset(robot, size if site == "home" else "", distortion)
     if site == "office":
         if not lidar_only:
             raise typer.BadParameter("an office has no camera: add --lidar-only", param_hint="--site")
@@ -159,6 +172,8 @@ def simulate(
                 seed=seed, length_m=length_m, width_m=width_m, distance_m=distance_m, aliased=aliased,
                 lost=lost, people=movers,
             )  # fmt: skip
+            if preset is not None:
+                chosen = preset.applied_to_office(chosen)
             return simulate_office(chosen, out, replace=force, progress=progress)
 
         _record(office, out, as_json)
@@ -173,6 +188,9 @@ def simulate(
     width, height = _size(size or "640x480", 32, 4096, "pixels")
     k1, k2, p1, p2, k3 = _numbers(distortion, 5, "--distortion")
     x_m, y_m, z_m = _numbers(extrinsic_xyz_m, 3, "--extrinsic-xyz-m")
+    camera = CameraSettings(
+        width_px=width, height_px=height, rate_hz=rate_hz or 10.0, distortion=(k1, k2, p1, p2, k3)
+    )
     settings = SimulationSettings(
         seed=seed,
         seconds=seconds,
@@ -181,9 +199,7 @@ def simulate(
         carts=carts,
         scene=None if scene is None else str(scene),
         lidar_only=lidar_only,
-        camera=CameraSettings(
-            width_px=width, height_px=height, rate_hz=rate_hz, distortion=(k1, k2, p1, p2, k3)
-        ),
+        camera=camera,
         lidar=LidarSettings(glass=glass),
         faults=Faults(
             clock_offset_ms=clock_offset_ms,
@@ -194,11 +210,26 @@ def simulate(
             exposure_changes=exposure_changes,
         ),
     )
+    if preset is not None:
+        settings = preset.applied(settings, rate_hz)
     _record(
         lambda progress: recording.simulate(settings, out, jobs=jobs, replace=force, progress=progress),
         out,
         as_json,
     )
+
+
+def _preset(name: str, size: str, distortion: str) -> RobotPreset | None:
+    """Return the preset of the option --robot; None without it."""
+    if not name:
+        return None
+    from beamsplat.tools.simulator.robots import ROBOTS
+
+    if name not in ROBOTS:
+        raise typer.BadParameter(f"{', '.join(ROBOTS)}: got {name!r}", param_hint="--robot")
+    if size or any(_numbers(distortion, 5, "--distortion")):
+        raise typer.BadParameter("sets the camera: leave out --size and --distortion", param_hint="--robot")
+    return ROBOTS[name]
 
 
 def _record(

@@ -43,8 +43,8 @@ def simulate_lidar(
 ) -> Iterator[SimulationStep]:
     """Yield one step for each lidar revolution that ends within `duration_s` seconds.
 
-    Noise-free ranges are computed in the first lap and reused in all other laps; noise, dropouts and odometry
-    are computed anew in each lap.
+    If a lap takes a whole number of revolutions, noise-free ranges are computed in the first lap and reused
+    in all other laps; noise, dropouts and odometry are computed anew in each lap.
 
     Args:
         mesh: the static scene.
@@ -59,18 +59,20 @@ def simulate_lidar(
     noise = np.random.default_rng([seed, 0x4C49])
     dynamic_scene = actors if actors is not None and actors.paths else None
     laps: dict[int, SimulatedRevolution] = {}
-    per_lap = round(drive.lap_s * lidar.rate_hz)
+    per_lap = drive.lap_s * lidar.rate_hz
+    repeats = abs(per_lap - round(per_lap)) < 1e-9
     period_ns = round(1e9 / lidar.rate_hz)
     tick_ns = round(1e9 / wheels.rate_hz)
     first_ns, next_tick, end_ns = round(lidar.phase_s * 1e9), 0, round(duration_s * 1e9)
     k = 0
     while first_ns + (k + 1) * period_ns <= end_ns:
         stamp = first_ns + k * period_ns
-        if k % per_lap not in laps:
-            laps[k % per_lap] = simulated_lidar.revolution(
-                (stamp / 1e9) % drive.lap_s, drive.pose_at, dynamic_scene
-            )
-        revolution = laps[k % per_lap]
+        at = k % round(per_lap) if repeats else k
+        revolution = laps.get(at)
+        if revolution is None:
+            revolution = simulated_lidar.revolution((stamp / 1e9) % drive.lap_s, drive.pose_at, dynamic_scene)
+            if repeats:
+                laps[at] = revolution
         ranges, through = simulated_lidar.measure(revolution, noise)
         last_tick = (stamp + period_ns) // tick_ns
         stamps = np.arange(next_tick, last_tick + 1) * tick_ns

@@ -55,7 +55,7 @@ class SimulatedLidar:
         n = caster._normal
         self._unit = n / np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-30)
         s = settings
-        self._angle = s.angle_min_rad + s.angle_increment_rad * np.arange(s.beams)
+        self._angle = s.yaw_rad + s.angle_min_rad + s.angle_increment_rad * np.arange(s.beams)
 
     def revolution(
         self, time_s: float, pose_at: PoseAt, dynamic_scene: DynamicScene | None = None
@@ -145,4 +145,17 @@ class SimulatedLidar:
         if s.dropout > 0:
             lost_return |= (revolution.cosine < GRAZING_COSINE) & (grazed < 0.5)
         lost_return |= ~((range_m >= s.range_min_m) & (range_m <= s.range_max_m))
-        return np.where(lost_return, np.inf, range_m).astype(np.float32), through
+        measured = np.where(lost_return, np.inf, range_m).astype(np.float32)
+        see_robot(measured, s, noise)
+        return measured, through
+
+
+def see_robot(ranges_m: np.ndarray, settings: LidarSettings, noise: np.ndarray) -> None:
+    """Set, in place, the ranges float32 [B] of the beams that hit the robot itself.
+
+    `noise` float64 [B]: standard normal.
+    """
+    if settings.self_returns is not None:
+        first, count, range_m = settings.self_returns
+        seen = slice(first, first + count)
+        ranges_m[seen] = range_m + settings.noise_m * noise[seen]

@@ -25,7 +25,7 @@ from beamsplat.tools.simulator.lidar_records import (
     RecordingSummary,
     TruthLog,
     lidar_records,
-    static_tf,
+    transforms,
     write_lidar_truth,
 )
 from beamsplat.tools.simulator.path import DrivePath, MotionLimits
@@ -64,8 +64,7 @@ def simulate(
     rng = np.random.default_rng([settings.seed, 0x4D])
     actor_paths = choose_actor_paths(space, drive, caster, settings.people + settings.carts, duration, rng)
     with store.atomic_folder(out, replace=replace) as folder:
-        streams: list[Iterator[w.BagRecord]] = [static_tf(settings)]
-        topics = ["/tf_static", "/tf", "/odom", "/scan"]
+        streams: list[Iterator[w.BagRecord]] = [transforms(settings, duration)]
         images, views = 0, 0
         if not settings.lidar_only:
             spec = frame_spec(settings, actor_paths)
@@ -78,7 +77,6 @@ def simulate(
             _write_image_truth(folder, settings, times, [path_of[t] for t in in_lap])
             views = _write_views(folder, settings, spec, space, unique, paths, progress)
             streams.append(_images(settings, times, [path_of[t] for t in in_lap]))
-            topics += ["/camera/image_raw/compressed", "/camera/camera_info"]
         log = TruthLog()
         actors = build_actors(world, tuple(actor_paths), settings.people, settings.seed)
         steps = simulate_lidar(
@@ -93,7 +91,8 @@ def simulate(
         )
         scans = round(duration * settings.lidar.rate_hz)
         streams.append(lidar_records(settings, steps, log, lambda i: progress("scanning", i, scans)))
-        messages = w.write_bag(folder / "bag", streams, topics)
+        camera = not settings.lidar_only
+        messages = w.write_bag(folder / "bag", streams, settings.layout, camera=camera)
         write_lidar_truth(folder, settings, log)
     metres = drive.length_m * duration / drive.lap_s
     return RecordingSummary(
@@ -139,15 +138,15 @@ def _stamp(settings: SimulationSettings, time_s: float) -> int:
 
 def _images(settings: SimulationSettings, times_s: list[float], paths: list[Path]) -> Iterator[w.BagRecord]:
     rng = np.random.default_rng([settings.seed, 0x4A, 1])
-    received = 0
+    layout, received = settings.layout, 0
     for time_s, path in zip(times_s, paths):
         stamp = _stamp(settings, time_s)
-        lag = int(28e6 + rng.exponential(2.5e6))
+        lag = int(1e9 * layout.image_delay_s + rng.exponential(2.5e6))
         received = max(received + 1000, START_NS + round(time_s * 1e9) + lag)
-        yield w.BagRecord(
-            received, "/camera/image_raw/compressed", w.image_bytes(stamp, load_frame(path).jpeg)
-        )
-        yield w.BagRecord(received + 100, "/camera/camera_info", w.camera_info_bytes(stamp, settings.camera))
+        image = w.image_bytes(stamp, load_frame(path).jpeg, layout)
+        yield w.BagRecord(received, layout.image_topic, image)
+        info = w.camera_info_bytes(stamp, settings.camera, layout)
+        yield w.BagRecord(received + 100, layout.camera_info_topic, info)
 
 
 def _write_image_truth(

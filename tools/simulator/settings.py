@@ -8,18 +8,22 @@ import numpy as np
 
 from beamsplat.common.geometry.frames import camera_mount, lidar_mount
 from beamsplat.common.geometry.transforms import make_transform, so3_exp
+from beamsplat.tools.simulator.bag_layout import BagLayout
+from beamsplat.tools.simulator.lidar_drivers import IDEAL, RosLidarDriver
 
 START_NS = 1_767_225_600_000_000_000  # stamp at time 0: 2026-01-01 00:00 UTC, an arbitrary fixed date
 
 
 @dataclass(frozen=True)
 class CameraSettings:
-    """Settings of the camera, fixed at (x, y, z) in the body frame; fx = fy = focal_widths * width_px."""
+    """Settings of the camera, fixed at (x, y, z) in the body frame; fx = focal_widths * width_px."""
 
     width_px: int = 640
     height_px: int = 480
     rate_hz: float = 10.0
     focal_widths: float = 530.0 / 640.0
+    aspect: float = 1.0  # fy / fx
+    centre_px: tuple[float, float] | None = None  # principal point; None = the image centre
     x_m: float = 0.10
     y_m: float = 0.0
     z_m: float = 0.45
@@ -32,10 +36,10 @@ class CameraSettings:
 
     @property
     def K(self) -> np.ndarray:
-        """Intrinsic matrix in pixels, float64 [3, 3]; the principal point is the image centre."""
+        """Intrinsic matrix in pixels, float64 [3, 3]."""
         f = self.focal_widths * self.width_px
-        cx, cy = (self.width_px - 1) / 2.0, (self.height_px - 1) / 2.0
-        return np.array([[f, 0.0, cx], [0.0, f, cy], [0.0, 0.0, 1.0]])
+        cx, cy = self.centre_px or ((self.width_px - 1) / 2.0, (self.height_px - 1) / 2.0)
+        return np.array([[f, 0.0, cx], [0.0, self.aspect * f, cy], [0.0, 0.0, 1.0]])
 
     @property
     def T_body_camera(self) -> np.ndarray:
@@ -52,6 +56,9 @@ class LidarSettings:
 
     beams: int = 720
     rate_hz: float = 10.0
+    sweep_s: float | None = None  # duration of a revolution; None = the whole period
+    clockwise: bool = False
+    angle_min_rad: float = -np.pi  # direction of the first beam in the lidar frame
     range_min_m: float = 0.12
     range_max_m: float = 12.0
     noise_m: float = 0.01  # standard deviation of a range
@@ -59,24 +66,22 @@ class LidarSettings:
     x_m: float = 0.0
     y_m: float = 0.0
     z_m: float = 0.18
+    yaw_rad: float = 0.0
+    # Part of the robot that the lidar sees: first beam, number of beams, range in metres.
+    self_returns: tuple[int, int, float] | None = None
     glass: bool = False  # whether beams can pass through glazed doors
     glass_pass: float = 0.7  # probability that a beam passes through glass
     phase_s: float = 0.020  # time of the first scan after the start
 
     @property
-    def angle_min_rad(self) -> float:
-        """Angle of the first beam in the lidar frame."""
-        return -np.pi
-
-    @property
     def angle_increment_rad(self) -> float:
-        """Angle between two successive beams."""
-        return 2.0 * np.pi / self.beams
+        """Angle between two successive beams, negative for a clockwise lidar."""
+        return (-2.0 if self.clockwise else 2.0) * np.pi / self.beams
 
     @property
     def scan_time_s(self) -> float:
         """Duration of a revolution in seconds."""
-        return 1.0 / self.rate_hz
+        return 1.0 / self.rate_hz if self.sweep_s is None else self.sweep_s
 
     @property
     def time_increment_s(self) -> float:
@@ -86,7 +91,7 @@ class LidarSettings:
     @property
     def T_body_lidar(self) -> np.ndarray:
         """True pose of the lidar in the body frame, float64 [4, 4]."""
-        return lidar_mount(self.x_m, self.y_m, self.z_m)
+        return lidar_mount(self.x_m, self.y_m, self.z_m, yaw_left_rad=self.yaw_rad)
 
 
 @dataclass(frozen=True)
@@ -153,4 +158,6 @@ class SimulationSettings:
     lidar: LidarSettings = field(default_factory=LidarSettings)
     wheels: WheelSettings = field(default_factory=WheelSettings)
     faults: Faults = field(default_factory=Faults)
+    driver: RosLidarDriver = IDEAL
+    layout: BagLayout = field(default_factory=BagLayout)
     truth_every: int = 8  # every n-th image has a ground-truth depth map

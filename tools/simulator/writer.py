@@ -16,20 +16,12 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from beamsplat.common.geometry.transforms import quat_xyzw_from_matrix
-from beamsplat.tools.simulator.settings import CameraSettings, Faults, LidarSettings
+from beamsplat.common.scans.laser import LaserMessage
+from beamsplat.tools.simulator.bag_layout import BagLayout
+from beamsplat.tools.simulator.settings import CameraSettings, SimulationSettings
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 TYPES = STORE.types
-TOPICS = {
-    "/tf_static": "tf2_msgs/msg/TFMessage",
-    "/tf": "tf2_msgs/msg/TFMessage",
-    "/odom": "nav_msgs/msg/Odometry",
-    "/camera/image_raw/compressed": "sensor_msgs/msg/CompressedImage",
-    "/camera/camera_info": "sensor_msgs/msg/CameraInfo",
-    "/scan": "sensor_msgs/msg/LaserScan",
-}
-SENSOR_TOPICS = ("/scan", "/camera/image_raw/compressed", "/camera/camera_info")
-BASE, CAMERA, LASER, ODOM = "base_link", "camera_optical_frame", "laser", "odom"
 
 
 @dataclass(frozen=True)
@@ -41,33 +33,37 @@ class BagRecord:
     data: bytes
 
 
-def write_bag(path: Path, streams: Iterable[Iterator[BagRecord]], topics: Iterable[str]) -> int:
+def write_bag(path: Path, streams: Iterable[Iterator[BagRecord]], layout: BagLayout, *, camera: bool) -> int:
     """Write a new bag folder with the messages of all streams, merged by time of receipt.
 
-    Each stream must be in order of receipt. `topics` are all topics of the messages.
+    Each stream must be in order of receipt; its topics are those of `layout`.
 
     Returns:
         The number of written messages.
     """
     count = 0
     with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as bag:
+        unreliable = set() if layout.reliable else layout.sensor_topics()
         connections = {
-            name: bag.add_connection(name, TOPICS[name], typestore=STORE, offered_qos_profiles=[_qos(name)])
-            for name in topics
-        }
+            name: bag.add_connection(
+                name, kind, typestore=STORE,
+                offered_qos_profiles=[_qos(name, reliable=name not in unreliable)],
+            )
+            for name, kind in layout.topics(camera=camera).items()
+        }  # fmt: skip
         for record in heapq.merge(*streams, key=lambda r: r.received_ns):
             bag.write(connections[record.topic], record.received_ns, record.data)
             count += 1
     return count
 
 
-def _qos(topic: str) -> Qos:
+def _qos(topic: str, *, reliable: bool) -> Qos:
     latched = topic == "/tf_static"
     zero = QosTime(0, 0)
     return Qos(
         QosHistory.KEEP_LAST,
         1 if latched else 10,
-        QosReliability.BEST_EFFORT if topic in SENSOR_TOPICS else QosReliability.RELIABLE,
+        QosReliability.RELIABLE if reliable else QosReliability.BEST_EFFORT,
         QosDurability.TRANSIENT_LOCAL if latched else QosDurability.VOLATILE,
         zero,
         zero,
@@ -108,7 +104,9 @@ def tf_bytes(stamp_ns: int, links: list[tuple[str, str, np.ndarray]]) -> bytes:
     return _cdr(_make("tf2_msgs/msg/TFMessage", [_stamped(stamp_ns, *link) for link in links]))
 
 
-def odometry_bytes(stamp_ns: int, T_odom_body: np.ndarray, speed_m_s: float, turn_rad_s: float) -> bytes:
+def odometry_bytes(
+    stamp_ns: int, T_odom_body: np.ndarray, speed_m_s: float, turn_rad_s: float, layout: BagLayout
+) -> bytes:
     """Return the CDR bytes of a nav_msgs/Odometry with the pose `T_odom_body` [4, 4], speed and yaw rate.
 
     The covariances are constant, with values that are typical of drivers of planar robots.
@@ -122,52 +120,59 @@ def odometry_bytes(stamp_ns: int, T_odom_body: np.ndarray, speed_m_s: float, tur
     return _cdr(
         _make(
             "nav_msgs/msg/Odometry",
-            _header(stamp_ns, ODOM),
-            BASE,
+            _header(stamp_ns, layout.odometry_frame),
+            layout.base_frame,
             _make("geometry_msgs/msg/PoseWithCovariance", pose, covariances[0]),
             _make("geometry_msgs/msg/TwistWithCovariance", twist, covariances[1]),
         )
     )
 
 
-def scan_bytes(stamp_ns: int, ranges_m: np.ndarray, lidar: LidarSettings) -> bytes:
-    """Return the CDR bytes of a sensor_msgs/LaserScan with ranges float32 [B] in metres, +inf = no return."""
-    step = lidar.angle_increment_rad
+def scan_bytes(m: LaserMessage) -> bytes:
+    """Return the CDR bytes of a sensor_msgs/LaserScan."""
     return _cdr(
         _make(
             "sensor_msgs/msg/LaserScan",
-            _header(stamp_ns, LASER),
-            lidar.angle_min_rad,
-            lidar.angle_min_rad + (lidar.beams - 1) * step,
-            step,
-            lidar.time_increment_s,
-            lidar.scan_time_s,
-            lidar.range_min_m,
-            lidar.range_max_m,
-            ranges_m,
-            np.zeros(0, np.float32),
+            _header(m.stamp_ns, m.frame_id),
+            m.angle_min_rad,
+            m.angle_max_rad,
+            m.angle_increment_rad,
+            m.time_increment_s,
+            m.scan_time_s,
+            m.range_min_m,
+            m.range_max_m,
+            m.ranges_m,
+            m.intensities,
         )
     )
 
 
-def image_bytes(stamp_ns: int, jpeg: np.ndarray) -> bytes:
-    """Return the CDR bytes of a sensor_msgs/CompressedImage with JPEG bytes uint8 [B]."""
-    return _cdr(_make("sensor_msgs/msg/CompressedImage", _header(stamp_ns, CAMERA), "jpeg", jpeg))
+def image_bytes(stamp_ns: int, jpeg: np.ndarray, layout: BagLayout) -> bytes:
+    """Return the CDR bytes of a sensor_msgs/CompressedImage or Image of JPEG bytes uint8 [B]."""
+    header = _header(stamp_ns, layout.camera_frame)
+    if layout.image_encoding == "jpeg":
+        return _cdr(_make("sensor_msgs/msg/CompressedImage", header, layout.jpeg_format, jpeg))
+    rgb = cv2.cvtColor(cv2.imdecode(jpeg, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
+    height, width = rgb.shape[:2]
+    image = (header, height, width, "rgb8", 0, 3 * width, rgb.ravel())
+    return _cdr(_make("sensor_msgs/msg/Image", *image))
 
 
-def camera_info_bytes(stamp_ns: int, camera: CameraSettings) -> bytes:
+def camera_info_bytes(stamp_ns: int, camera: CameraSettings, layout: BagLayout) -> bytes:
     """Return the CDR bytes of a sensor_msgs/CameraInfo with the camera's intrinsics and distortion."""
     K = camera.K
     P = np.hstack([K, np.zeros((3, 1))])
     region = _make("sensor_msgs/msg/RegionOfInterest", 0, 0, 0, 0, False)
+    distortion = np.zeros(8 if layout.distortion_model == "rational_polynomial" else 5)
+    distortion[:5] = camera.distortion
     return _cdr(
         _make(
             "sensor_msgs/msg/CameraInfo",
-            _header(stamp_ns, CAMERA),
+            _header(stamp_ns, layout.camera_frame),
             camera.height_px,
             camera.width_px,
-            "plumb_bob",
-            np.array(camera.distortion, dtype=np.float64),
+            layout.distortion_model,
+            distortion,
             K.ravel(),
             np.eye(3).ravel(),
             P.ravel(),
@@ -196,12 +201,13 @@ def transform_json(T: np.ndarray) -> dict[str, Any]:
     }
 
 
-def write_camera_json(path: Path, camera: CameraSettings, lidar: LidarSettings, faults: Faults) -> None:
+def write_camera_json(path: Path, settings: SimulationSettings) -> None:
     """Write the true calibration of camera and lidar, and the faults, as a JSON file.
 
     Its key `published_T_base_camera` is the pose of the camera in the bag's tf; with an extrinsic fault, this
     pose differs from the true `T_base_camera`.
     """
+    camera, lidar, faults, layout = settings.camera, settings.lidar, settings.faults, settings.layout
     K = camera.K
     text: dict[str, Any] = {
         "width": camera.width_px,
@@ -218,9 +224,9 @@ def write_camera_json(path: Path, camera: CameraSettings, lidar: LidarSettings, 
         "depth_unit": "uint16 millimetres along optical z, 0 = no surface",
         "depth_grid": "depth_gt and moving_masks have the images' distorted pixels; extra_views are pinhole",
         "frames": {
-            "base": f"{BASE} (on the floor between the wheels, x forward, z up)",
-            "camera": f"{CAMERA} (x right, y down, z forward)",
-            "lidar": LASER,
+            "base": f"{layout.base_frame} (on the floor between the wheels, x forward, z up)",
+            "camera": f"{layout.camera_frame} (x right, y down, z forward)",
+            "lidar": layout.lidar_frame,
         },
         "T_base_camera": transform_json(camera.T_body_camera),
         "T_base_lidar": transform_json(lidar.T_body_lidar),
@@ -240,6 +246,7 @@ def write_camera_json(path: Path, camera: CameraSettings, lidar: LidarSettings, 
             "dropout": lidar.dropout,
             "glass": lidar.glass,
             "stamp": "time of the first beam",
+            "order": "that of measurement, as in beams.npz; the driver may publish another one",
         },
     }
     path.write_text(json.dumps(text, indent=1) + "\n")

@@ -31,6 +31,18 @@ def test_bad_values_name_the_option_and_exit_with_2(tmp_path):
     assert not (tmp_path / "r").exists()
 
 
+def test_a_robot_that_is_unknown_or_has_another_camera_is_refused(tmp_path):
+    for options, why in (
+        (["--robot", "roomba"], "turtlebot4, rosmaster_x3, ugv_ld19, jetrover_g4"),
+        (["--robot", "turtlebot4", "--size", "640x480"], "leave out --size"),
+        (["--robot", "turtlebot4", "--distortion", "0.1,0,0,0,0"], "leave out --size"),
+    ):
+        result = runner.invoke(app, ["--out", str(tmp_path / "r"), *options], env={"COLUMNS": "200"})
+        assert result.exit_code == 2
+        assert why in result.output
+    assert not (tmp_path / "r").exists()
+
+
 def test_an_existing_folder_is_refused_with_2(tmp_path):
     result = runner.invoke(app, ["--out", str(tmp_path)], env={"COLUMNS": "200"})
     assert result.exit_code == 2

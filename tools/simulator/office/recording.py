@@ -13,13 +13,13 @@ from beamsplat.common.geometry.transforms import se2_to_se3
 from beamsplat.tools.simulator import store
 from beamsplat.tools.simulator import writer as w
 from beamsplat.tools.simulator.drive_log import SimulationStep
-from beamsplat.tools.simulator.lidar import GRAZING_COSINE
+from beamsplat.tools.simulator.lidar import GRAZING_COSINE, see_robot
 from beamsplat.tools.simulator.lidar_records import (
     Progress,
     RecordingSummary,
     TruthLog,
     lidar_records,
-    static_tf,
+    transforms,
     write_lidar_truth,
 )
 from beamsplat.tools.simulator.office.caster import SegmentGrid, build_grid, cast_revolution
@@ -59,15 +59,16 @@ def simulate_office(
     stretches = choose_stretches(drive, settings.lost, settings.lost_s)
     people = People(floor, settings.people, np.random.default_rng([settings.seed, 0x0F3]))
     common = SimulationSettings(
-        seed=settings.seed, lidar_only=True, lidar=settings.lidar, wheels=settings.wheels
-    )
+        seed=settings.seed, lidar_only=True, lidar=settings.lidar, wheels=settings.wheels,
+        driver=settings.driver, layout=settings.layout,
+    )  # fmt: skip
     log = TruthLog()
     scans = int(drive.lap_s * settings.lidar.rate_hz)
     with store.atomic_folder(out, replace=replace) as folder:
         steps = simulate_steps(settings, build_grid(floor), drive, people, stretches)
         records = lidar_records(common, steps, log, lambda i: progress("scanning", i, scans))
-        streams = [static_tf(common), _without_silent(records, stretches)]
-        messages = w.write_bag(folder / "bag", streams, ["/tf_static", "/tf", "/odom", "/scan"])
+        streams = [transforms(common, drive.lap_s), _without_silent(records, stretches)]
+        messages = w.write_bag(folder / "bag", streams, common.layout, camera=False)
         write_lidar_truth(folder, common, log)
         _write_site(folder / "site.json", settings, floor, stretches)
     return RecordingSummary(drive.lap_s, 1.0, drive.length_m, 0, len(log.scan_stamps_ns), messages, 0)
@@ -91,6 +92,7 @@ def simulate_steps(
     hits, moving = np.zeros((lidar.beams, 4)), np.zeros(lidar.beams, dtype=bool)
     next_tick, stamp = 0, round(lidar.phase_s * 1e9)
     part_s = np.arange(KNOTS + 1) / KNOTS * lidar.scan_time_s
+    first_rad = lidar.yaw_rad + lidar.angle_min_rad
     while stamp + period_ns <= drive.lap_s * 1e9:
         time_s = stamp / 1e9
         knots = drive.pose_at(time_s + part_s)
@@ -100,7 +102,7 @@ def simulate_steps(
             time_s + 0.5 * (part_s[1:] + part_s[:-1]), middle[:, :2], lidar.range_max_m + 2.0
         )
         cast_revolution(
-            knots, lidar.x_m, lidar.y_m, lidar.angle_min_rad, lidar.angle_increment_rad, lidar.range_max_m,
+            knots, lidar.x_m, lidar.y_m, first_rad, lidar.angle_increment_rad, lidar.range_max_m,
             grid.segments, grid.glass, grid.low_m, *grid.shape, grid.start, grid.index, circles, hits, moving,
         )  # fmt: skip
         ranges, through = measure(hits, lidar, noise)
@@ -143,7 +145,9 @@ def measure(
     if lidar.dropout > 0:
         no_return |= (np.where(seen, 1.0, cosine) < GRAZING_COSINE) & (grazed < 0.5)
     no_return |= ~((measured >= lidar.range_min_m) & (measured <= lidar.range_max_m))
-    return np.where(no_return, np.inf, measured).astype(np.float32), through
+    ranges = np.where(no_return, np.inf, measured).astype(np.float32)
+    see_robot(ranges, lidar, noise)
+    return ranges, through
 
 
 def _without_silent(records: Iterator[w.BagRecord], stretches: list[LostStretch]) -> Iterator[w.BagRecord]:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from beamsplat.tools.simulator.bag_layout import BagLayout
+from beamsplat.tools.simulator.lidar_drivers import IDEAL, RosLidarDriver
 from beamsplat.tools.simulator.path import MotionLimits
 from beamsplat.tools.simulator.settings import LidarSettings, WheelSettings
 
@@ -29,3 +31,5 @@ class OfficeSettings:
     # Each encoder reading costs time in the SLAM's input; 20 Hz is common for bases of service robots.
     wheels: WheelSettings = field(default_factory=lambda: WheelSettings(rate_hz=20.0))
     slips_per_km: float = 10.0  # of one wheel, for example at the edge of a carpet
+    driver: RosLidarDriver = IDEAL
+    layout: BagLayout = field(default_factory=BagLayout)
