@@ -164,8 +164,9 @@ def _without_silent(records: Iterator[w.BagRecord], stretches: list[LostStretch]
 
 def _write_site(path: Path, settings: OfficeSettings, floor: FloorPlan, stretches: list[LostStretch]) -> None:
     """Write the settings, the lost stretches with their stamps, and all surfaces rounded to 1 mm."""
+    described = {k: v for k, v in asdict(settings).items() if k not in ("driver", "layout")}  # not JSON: inf
     text = {
-        "settings": asdict(settings),
+        "settings": described,
         "lost": [
             {
                 "start_ns": START_NS + round(s.start_s * 1e9),
