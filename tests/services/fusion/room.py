@@ -21,12 +21,16 @@ _SURFACES = (
     (0, 4.2, {2: (0.0, 0.75)}),
     (2, 0.75, {0: (4.2, 5.0)}),
 )
+CLOSED = (*_SURFACES, (0, -1.5, {}))  # with a wall behind: for robots that turn around
+CLOSED_WALLS = np.array(  # what the lidar sees of it: segments (x, y, x, y) in m
+    [[-1.5, -1.8, 4.2, -1.8], [4.2, -1.8, 4.2, 1.8], [4.2, 1.8, -1.5, 1.8], [-1.5, 1.8, -1.5, -1.8]]
+)
 
 
 def _textures():
     rng = np.random.default_rng(11)
     out = []
-    for _ in _SURFACES:
+    for _ in CLOSED:
         coarse = cv2.resize(
             rng.uniform(0, 255, (32, 32)).astype(np.float32), (512, 512), interpolation=cv2.INTER_CUBIC
         )
@@ -40,11 +44,11 @@ def _textures():
 _TEXTURES = _textures()
 
 
-def cast(origin, directions):
+def cast(origin, directions, surfaces=_SURFACES):
     """(distance along each direction [N], surface number [N]) of the first hit."""
     best = np.full(len(directions), np.inf)
     which = np.zeros(len(directions), int)
-    for number, (axis, position, limits) in enumerate(_SURFACES):
+    for number, (axis, position, limits) in enumerate(surfaces):
         with np.errstate(divide="ignore", invalid="ignore"):
             s = (position - origin[axis]) / directions[:, axis]
             hit = origin + s[:, None] * directions
@@ -55,22 +59,25 @@ def cast(origin, directions):
     return best, which
 
 
-def render(T_map_body, camera=CAMERA):
+def render(T_map_body, camera=CAMERA, surfaces=_SURFACES):
     """(uint8 [H, W, 3], float32 [H, W] optical z) of the room."""
     T = T_map_body @ T_BODY_CAMERA
     rays = camera.ray_grid().reshape(-1, 3) @ T[:3, :3].T
-    z, which = cast(T[:3, 3], rays)
+    z, which = cast(T[:3, 3], rays, surfaces)
     hit = T[:3, 3] + z[:, None] * rays
     grey = np.zeros(len(z))
-    for number, (axis, _, _) in enumerate(_SURFACES):
-        mine = which == number
-        if not mine.any():
-            continue
-        a, b = (hit[mine][:, k] for k in range(3) if k != axis)
-        x, y = (np.mod(a * 64.0, 511.0), np.mod(b * 64.0, 511.0))
-        grey[mine] = cv2.remap(
-            _TEXTURES[number], x.astype(np.float32)[:, None], y.astype(np.float32)[:, None], cv2.INTER_LINEAR
-        )[:, 0]
+    for number, (axis, _, _) in enumerate(surfaces):
+        mine = np.flatnonzero(which == number)
+        for part in np.array_split(mine, 1 + len(mine) // 30_000):  # remap takes fewer than 32768 rows
+            a, b = (hit[part][:, k] for k in range(3) if k != axis)
+            x, y = (np.mod(a * 64.0, 511.0), np.mod(b * 64.0, 511.0))
+            if len(part):
+                grey[part] = cv2.remap(
+                    _TEXTURES[number],
+                    x.astype(np.float32)[:, None],
+                    y.astype(np.float32)[:, None],
+                    cv2.INTER_LINEAR,
+                )[:, 0]
     image = np.repeat(grey.reshape(camera.shape)[..., None], 3, axis=2).astype(np.uint8)
     return image, z.reshape(camera.shape).astype(np.float32)
 
@@ -91,4 +98,15 @@ def in_map(T_map_body, beams):
     return transform_points(T_map_body, beams.points_body_m)
 
 
-__all__ = ["CAMERA", "LIDAR_Z", "T_BODY_CAMERA", "cast", "in_map", "inverse", "render", "scan"]
+__all__ = [
+    "CAMERA",
+    "CLOSED",
+    "CLOSED_WALLS",
+    "LIDAR_Z",
+    "T_BODY_CAMERA",
+    "cast",
+    "in_map",
+    "inverse",
+    "render",
+    "scan",
+]

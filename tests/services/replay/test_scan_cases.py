@@ -18,7 +18,7 @@ from beamsplat.services.replay.inspection import inspect
 from beamsplat.services.replay.open import open_recording
 from beamsplat.services.replay.options import SourceOptions
 from beamsplat.services.replay.rig_draft import draft_from_data
-from tests.common.scans.robots import START_NS, Drive, odometry, sllidar_ros2, sweeps
+from tests.common.scans.robots import START_NS, Drive, odometry, oradar_ms200, sllidar_ros2, sweeps
 from tests.services.replay.make_bags import RobotBag
 
 BEAMS = 90
@@ -77,12 +77,20 @@ class Bench:
         return self.bag.new("tf2_msgs/msg/TFMessage", transforms=made)
 
     def write(
-        self, lasers, wheels, change=lambda row: [row], edges=(), names=("/scan", "/odom", "/tf_static")
+        self,
+        lasers,
+        wheels,
+        change=lambda row: [row],
+        edges=(),
+        names=("/scan", "/odom", "/tf_static"),
+        others=(),
     ):
+        """`others`: rows (topic, message, receive time in ns) besides transforms, scans and odometry."""
         edges = edges or [("base_link", "laser", (0.0, 0.0, 0.18), self.mount)]
         rows = [(names[2], self.transforms(edges), START_NS)]
         rows += [(names[0], self.scan(laser), laser.at_ns) for laser in lasers]
         rows += [(names[1], self.odometry(stamp, pose), stamp + 2_000_000) for stamp, pose in wheels]
+        rows += others
         changed = sorted((r for row in rows for r in change(row)), key=lambda row: row[2])
         with self.bag.writer:
             for topic, message, at_ns in changed:
@@ -378,17 +386,8 @@ def test_parts_of_revolutions_are_assembled(tmp_path, clean, as_sectors):
 def test_messages_of_316_degrees_give_whole_revolutions(tmp_path, drive, clean):
     """As of an ORADAR MS200: 79 of 90 beams in each message, the next one starts where it ended."""
     all_ranges = np.concatenate([m.ranges_m for m in clean[0]])
-    first, lasers = clean[0][0], []
-    for k in range(len(all_ranges) // 79):
-        start = k * 79
-        stamp = START_NS + round(start * first.time_increment_s * 1e9)
-        angle = math.remainder(first.angle_min_rad + start * first.angle_increment_rad, 2.0 * math.pi)
-        lasers.append(
-            dataclasses.replace(
-                first, stamp_ns=stamp, at_ns=stamp + 93_000_000, angle_min_rad=angle,
-                angle_max_rad=angle + 78 * first.angle_increment_rad, ranges_m=all_ranges[start : start + 79],
-            )
-        )  # fmt: skip
+    first, lasers = clean[0][0], oradar_ms200(clean[0])
+    assert {len(m.ranges_m) for m in lasers} == {79}
     scans, _, problems = play(Bench(tmp_path / "b").write(lasers, clean[1]))
     assert len(scans) >= len(clean[0]) - 2
     assert {len(m.ranges_m) for m in scans} == {BEAMS}
