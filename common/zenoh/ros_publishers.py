@@ -54,34 +54,33 @@ class _Endpoint:
         )  # fmt: skip
         key = data_key(domain, topic.name, topic.type_name, type_hash)
         drop = zenoh.CongestionControl.DROP  # a slow robot must not block this node
-        self.plain: zenoh.Publisher | None = None
-        self.latched: zenoh.ext.AdvancedPublisher | None = None
+        self._publisher: zenoh.Publisher | zenoh.ext.AdvancedPublisher
         if topic.qos.transient_local:
-            self.latched = zenoh.ext.declare_advanced_publisher(
+            self._publisher = zenoh.ext.declare_advanced_publisher(
                 session, key, congestion_control=drop,
                 cache=zenoh.ext.CacheConfig(topic.qos.depth),
                 sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=0.5),
                 publisher_detection=True,
             )  # fmt: skip
         else:
-            self.plain = session.declare_publisher(key, congestion_control=drop)
+            self._publisher = session.declare_publisher(key, congestion_control=drop)
         self._token = session.liveliness().declare_token(entity.token())
         self._gid = entity.gid()
 
     @property
     def matched(self) -> bool:
         """Whether somebody subscribes to the key; also True if the topic is latched."""
-        if self.plain is None:
+        if not isinstance(self._publisher, zenoh.Publisher):
             return True
-        return self.plain.matching_status.matching  # type: ignore[attr-defined, no-any-return]
+        return bool(self._publisher.matching_status.matching)  # type: ignore[attr-defined]
 
     def put(self, payload: bytes, sequence: int) -> None:
         attachment = RmwAttachment(sequence, time.time_ns(), self._gid).pack()
-        (self.plain or self.latched).put(payload, attachment=attachment)  # type: ignore[union-attr]
+        self._publisher.put(payload, attachment=attachment)
 
     def undeclare(self) -> None:
         self._token.undeclare()
-        (self.plain or self.latched).undeclare()  # type: ignore[union-attr]
+        self._publisher.undeclare()
 
 
 class _TopicPublisher:

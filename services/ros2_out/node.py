@@ -6,6 +6,7 @@ It uses the Zenoh keys of rmw_zenoh.
 from __future__ import annotations
 
 import logging
+from typing import Any
 
 import numpy as np
 
@@ -108,7 +109,7 @@ class Ros2OutNode(Node):
         self._camera, c = rig.camera, self.config
         if rig.camera is not None:
             mount = ros.tf(rig.stamp_ns, c.body_frame, c.camera_frame, rig.camera.T_body_camera)
-            self._ros.put("tf_static", lambda: ros.tf_message([mount]))
+            self._put_built("tf_static", ros.tf_message([mount]))
         return self._done()
 
     def on_wheel_odometry(self, odometry: WheelOdometry) -> Outputs:
@@ -129,7 +130,7 @@ class Ros2OutNode(Node):
             )
             transforms = tree.tf(stamp_ns, T) if self.config.tf else None
             if transforms is not None:
-                self._ros.put("tf", lambda: transforms)
+                self._put_built("tf", transforms)
         return self._done()
 
     def on_localization_grid(self, tile: GridTile) -> Outputs:
@@ -138,7 +139,7 @@ class Ros2OutNode(Node):
         try:
             self._grid.add(source, tile.row, tile.column, tile.packed.tobytes())
             for name, message in self._grid.messages(tile.stamp_ns) if tile.remaining == 0 else ():
-                self._ros.put(name, lambda message=message: message)  # type: ignore[misc]
+                self._put_built(name, message)
         except ValueError as error:
             self.rejections.add(f"map not published: {error}")
         return self._done()
@@ -210,7 +211,7 @@ class Ros2OutNode(Node):
             return iter(())
         pinhole = Pinhole.of(camera)
         self._ros.put("render_info", lambda: images.camera_info(stamp_ns, frame, pinhole))
-        self._ros.put("tf", lambda: ros.tf_message([pose]))
+        self._put_built("tf", ros.tf_message([pose]))
         return self._done()
 
     def drain(self) -> Outputs:
@@ -221,6 +222,9 @@ class Ros2OutNode(Node):
     def close(self) -> None:
         if hasattr(self, "_session"):
             self._session.close()
+
+    def _put_built(self, name: str, message: Any) -> None:
+        self._ros.put(name, lambda: message)
 
     def _ask_snapshot(self) -> Outputs:
         """Ask the mapper, once, for what it has published before this process was started."""
