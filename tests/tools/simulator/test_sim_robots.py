@@ -161,13 +161,17 @@ def mapped(folder, **options):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ROBOTS)
-def test_the_map_is_as_good_as_with_an_ideal_driver_and_closes(scene_file, own_cache, tmp_path, name):
-    """A lap and a bit: at its end the robot is where it was before."""
-    simulate(tmp_path / "robot", scene_file, name, LAP_S)
+def test_a_lap_is_mapped_as_with_an_ideal_driver_but_for_half_a_beam(scene_file, own_cache, tmp_path, name):
+    """The drivers state directions that are up to a beam off, which turns the path about its start."""
+    settings = simulate(tmp_path / "robot", scene_file, name, LAP_S)
     simulate(tmp_path / "ideal", scene_file, name, LAP_S, ideal=True)
     errors, figures = mapped(tmp_path / "robot")
     clean, _ = mapped(tmp_path / "ideal")
-    assert errors["ate_first_pose_rmse_m"] <= 1.2 * clean["ate_first_pose_rmse_m"]
+    path_m = read_tum(tmp_path / "robot/groundtruth.txt").T_a_b[:, :2, 3]
+    reach_m = np.linalg.norm(path_m - path_m[0], axis=1).max()
+    turned_m = 0.5 * abs(settings.lidar.angle_increment_rad) * reach_m
+    assert errors["ate_first_pose_rmse_m"] <= 1.2 * clean["ate_first_pose_rmse_m"] + turned_m
+    assert errors["ate_se3_rmse_m"] < 0.006
     assert errors["loops_wrong"] == 0
     assert figures["refused"] == {}
     found, truth = (
@@ -178,7 +182,7 @@ def test_the_map_is_as_good_as_with_an_ideal_driver_and_closes(scene_file, own_c
     moved = np.linalg.inv(found.T_a_b[0]) @ found.T_a_b[-1]
     true_move = np.linalg.inv(truth.T_a_b[at[0]]) @ truth.T_a_b[at[1]]
     assert np.linalg.norm(true_move[:2, 3]) < 2.5
-    assert np.linalg.norm(moved[:2, 3] - true_move[:2, 3]) < 0.05
+    assert np.linalg.norm(moved[:2, 3] - true_move[:2, 3]) < 0.05  # it closes
 
 
 @pytest.mark.slow
