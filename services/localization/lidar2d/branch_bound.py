@@ -3,105 +3,34 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
 from beamsplat.common.compiled import kernel
-from beamsplat.services.localization.lidar2d.table_kernels import FIELD_SIGMA_M
+from beamsplat.services.localization.lidar2d.search_pyramid import LEVELS, SearchPyramid
 
 SAME_POSE_CELLS = 3  # leaves within this distance count as the same pose
-FIELD_CELL_M = 0.1  # cell of the field of `search_pyramid`, half a search cell
-LEVELS = 6  # a cell of the coarsest level covers 2^5 x 2^5 search cells
+# The search begins with cells of 2^3 x 2^3 search cells, for 8 yaws at once.
+GROUP_LEVEL, GROUP_YAWS = 3, 8
 
 
-@dataclass(frozen=True)
-class SearchPyramid:
-    """Precomputed grids for branch and bound.
+@kernel
+def _score(
+    level: np.ndarray, rows: np.ndarray, cols: np.ndarray, dr: int, dc: int, min_score: float
+) -> float:
+    """Return the mean likelihood (0 .. 1) of the returns in cells (rows + dr, cols + dc) of a level.
 
-    A cell of level h contains the maximum likelihood of the 2^h x 2^h search cells that start at this cell.
+    Zero if it is below `min_score`, which shows before all returns are read.
     """
-
-    levels: np.ndarray  # uint8 [LEVELS, H, W], padded by 2^(LEVELS - 1) on all sides
-    row0: int  # search cell of the first row of the padded arrays
-    col0: int
-    cell_m: float
-
-
-@kernel
-def _fill(field: np.ndarray, shift_r: int, shift_c: int, levels: np.ndarray) -> None:
-    """Compute all levels of the pyramid from the likelihood field, shifted by whole field cells."""
-    for r in range(field.shape[0]):
-        for c in range(field.shape[1]):
-            rr, cc = (r + shift_r) >> 1, (c + shift_c) >> 1
-            if field[r, c] > levels[0, rr, cc]:
-                levels[0, rr, cc] = field[r, c]
-    rows, cols = levels.shape[1], levels.shape[2]
-    for h in range(1, levels.shape[0]):
-        d = 1 << (h - 1)
-        for r in range(rows):
-            r2 = min(r + d, rows - 1)
-            for c in range(cols):
-                c2 = min(c + d, cols - 1)
-                levels[h, r, c] = max(
-                    max(levels[h - 1, r, c], levels[h - 1, r2, c]),
-                    max(levels[h - 1, r, c2], levels[h - 1, r2, c2]),
-                )
-
-
-def build_pyramid(field: np.ndarray, row0: int, col0: int, cell_m: float) -> SearchPyramid:
-    """Return the search pyramid of a likelihood field uint8 [H, W] whose first cell is (row0, col0).
-
-    Search cells are twice as large as the cells of the field.
-    """
-    pad = 1 << (LEVELS - 1)
-    r0, c0 = row0 >> 1, col0 >> 1
-    rows = ((row0 + field.shape[0]) >> 1) - r0 + 1
-    cols = ((col0 + field.shape[1]) >> 1) - c0 + 1
-    levels = np.zeros((LEVELS, rows + 2 * pad, cols + 2 * pad), dtype=np.uint8)
-    _fill(field, row0 - 2 * r0 + 2 * pad, col0 - 2 * c0 + 2 * pad, levels)
-    return SearchPyramid(levels, r0 - pad, c0 - pad, 2.0 * cell_m)
-
-
-@kernel
-def _fill_field(
-    means: np.ndarray, row0: int, col0: int, cell_m: float, sigma_m: float, field: np.ndarray
-) -> None:
-    """Write to `field` the largest likelihood that a surface element causes anywhere in each cell."""
-    for i in range(means.shape[0]):
-        row, col = math.floor(means[i, 1] / cell_m), math.floor(means[i, 0] / cell_m)
-        for r in range(row - 1, row + 2):
-            for c in range(col - 1, col + 2):
-                if r < row0 or c < col0 or r >= row0 + field.shape[0] or c >= col0 + field.shape[1]:
-                    continue
-                dx = max(c * cell_m - means[i, 0], means[i, 0] - (c + 1) * cell_m, 0.0)
-                dy = max(r * cell_m - means[i, 1], means[i, 1] - (r + 1) * cell_m, 0.0)
-                value = np.uint8(255.0 * math.exp(-0.5 * (dx * dx + dy * dy) / (sigma_m * sigma_m)))
-                if value > field[r - row0, c - col0]:
-                    field[r - row0, c - col0] = value
-
-
-def search_pyramid(means: np.ndarray) -> SearchPyramid:
-    """Return the search pyramid, of 0.2 m per cell, of surface elements with these means float [S, 2]."""
-    means = means.astype(np.float64)
-    if len(means) == 0:
-        return build_pyramid(np.zeros((2, 2), dtype=np.uint8), 0, 0, FIELD_CELL_M)
-    low = np.floor(means.min(axis=0) / FIELD_CELL_M).astype(np.int64) - 1
-    high = np.floor(means.max(axis=0) / FIELD_CELL_M).astype(np.int64) + 2
-    field = np.zeros((int(high[1] - low[1]), int(high[0] - low[0])), dtype=np.uint8)
-    _fill_field(means, int(low[1]), int(low[0]), FIELD_CELL_M, FIELD_SIGMA_M, field)
-    return build_pyramid(field, int(low[1]), int(low[0]), FIELD_CELL_M)
-
-
-@kernel
-def _score(level: np.ndarray, rows: np.ndarray, cols: np.ndarray, dr: int, dc: int) -> float:
-    """Return the mean likelihood (0 .. 1) of the returns in cells (rows + dr, cols + dc) of a level."""
-    total = 0
+    missing, allowed = 0, int(255.0 * rows.shape[0] * (1.0 - min_score)) + 1
     for i in range(rows.shape[0]):
         r, c = rows[i] + dr, cols[i] + dc
+        missing += 255
         if r >= 0 and c >= 0 and r < level.shape[0] and c < level.shape[1]:
-            total += level[r, c]
-    return total / (255.0 * rows.shape[0])
+            missing -= level[r, c]
+        if missing > allowed:
+            return 0.0
+    return 1.0 - missing / (255.0 * rows.shape[0])
 
 
 @kernel
@@ -142,6 +71,85 @@ def _make_room(found: np.ndarray, best: float, keep: float) -> tuple[float, int]
 
 
 @kernel
+def _cells(
+    points: np.ndarray,  # float64 [K, >= 2]
+    centre_pose: np.ndarray,  # float64 [3]
+    yaws: np.ndarray,  # float64 [A]
+    cell_m: float,
+    row0: int,
+    col0: int,
+    rows: np.ndarray,  # out int32 [A, K]
+    cols: np.ndarray,  # out
+) -> None:
+    """Compute the search cells of the returns at each yaw, at the centre of the window."""
+    for a in range(yaws.shape[0]):
+        c, s = math.cos(yaws[a]), math.sin(yaws[a])
+        for i in range(points.shape[0]):
+            x = centre_pose[0] + c * points[i, 0] - s * points[i, 1]
+            y = centre_pose[1] + s * points[i, 0] + c * points[i, 1]
+            rows[a, i], cols[a, i] = math.floor(y / cell_m) - row0, math.floor(x / cell_m) - col0
+
+
+@kernel
+def _group_yaws(
+    rows: np.ndarray,  # int32 [A, K] cells of the returns at each yaw
+    cols: np.ndarray,
+    first_row: np.ndarray,  # out int32 [G, K], lowest row of each return over the yaws of a group
+    first_col: np.ndarray,
+    level: np.ndarray,  # out int8 [G, K], level whose cell covers the search cells of all yaws; -1: none
+) -> None:
+    """Compute the cells of groups of yaws, at which each return reads an upper bound of its likelihood.
+
+    Over the yaws of a group, a return moves by e rows. A cell of level h that starts at the first row covers
+    the 2^GROUP_LEVEL rows of a translation and those e rows if 2^h is at least their sum.
+    """
+    for g in range(first_row.shape[0]):
+        a0, a1 = g * GROUP_YAWS, min((g + 1) * GROUP_YAWS, rows.shape[0])
+        for i in range(rows.shape[1]):
+            r0, r1, c0, c1 = rows[a0, i], rows[a0, i], cols[a0, i], cols[a0, i]
+            for a in range(a0 + 1, a1):
+                r0, r1 = min(r0, rows[a, i]), max(r1, rows[a, i])
+                c0, c1 = min(c0, cols[a, i]), max(c1, cols[a, i])
+            needed = (1 << GROUP_LEVEL) + max(r1 - r0, c1 - c0)
+            h = GROUP_LEVEL
+            while h < LEVELS and (1 << h) < needed:
+                h += 1
+            first_row[g, i], first_col[g, i], level[g, i] = r0, c0, h if h < LEVELS else -1
+
+
+@kernel
+def _group_score(
+    levels: np.ndarray, level: np.ndarray, rows: np.ndarray, cols: np.ndarray, dr: int, dc: int,
+    min_score: float,
+) -> float:  # fmt: skip
+    """Return an upper bound of the score for a group of yaws and the translations from (dr, dc) on.
+
+    Zero if it is below `min_score`, which shows before all returns are read.
+    """
+    missing, allowed = 0, int(255.0 * rows.shape[0] * (1.0 - min_score)) + 1
+    for i in range(rows.shape[0]):
+        if level[i] < 0:
+            continue
+        r, c = rows[i] + dr, cols[i] + dc
+        missing += 255
+        if r >= 0 and c >= 0 and r < levels.shape[1] and c < levels.shape[2]:
+            missing -= levels[level[i], r, c]
+        if missing > allowed:
+            return 0.0
+    return 1.0 - missing / (255.0 * rows.shape[0])
+
+
+@kernel
+def _push(stack: np.ndarray, depth: int, base: int, score: float, h: int, yaw: int, dr: int, dc: int) -> None:
+    """Insert a node above row `base` of the stack so that the best one is on top."""
+    j = depth
+    while j > base and stack[j - 1, 0] > score:
+        stack[j] = stack[j - 1]
+        j -= 1
+    stack[j, 0], stack[j, 1], stack[j, 2], stack[j, 3], stack[j, 4] = score, h, yaw, dr, dc
+
+
+@kernel
 def _search(
     levels: np.ndarray,  # uint8 [L, H, W]
     rows: np.ndarray,  # int32 [A, K] cells of the returns at each yaw, window centre
@@ -153,29 +161,38 @@ def _search(
     found: np.ndarray,  # out float64 [M, 4] score, yaw index, dr, dc
 ) -> tuple[int, int]:
     """Search depth first, best child first; return the number of rows of `found` and of scores computed."""
-    top = levels.shape[0] - 1
-    width = 1 << top
-    n_angles = rows.shape[0]
+    width = 1 << GROUP_LEVEL
+    groups = (rows.shape[0] + GROUP_YAWS - 1) // GROUP_YAWS
+    first_row = np.empty((groups, rows.shape[1]), dtype=np.int32)
+    first_col = np.empty((groups, rows.shape[1]), dtype=np.int32)
+    level = np.empty((groups, rows.shape[1]), dtype=np.int8)
+    _group_yaws(rows, cols, first_row, first_col, level)
     side = (2 * steps) // width + 1
-    n = n_angles * side * side
+    n = groups * side * side
     order_score = np.empty(n)
-    for a in range(n_angles):
+    for g in range(groups):
         for iy in range(side):
             for ix in range(side):
-                order_score[(a * side + iy) * side + ix] = _score(
-                    levels[top], rows[a], cols[a], -steps + iy * width, -steps + ix * width
-                )
+                order_score[(g * side + iy) * side + ix] = _group_score(
+                    levels, level[g], first_row[g], first_col[g], -steps + iy * width, -steps + ix * width,
+                    min_score,
+                )  # fmt: skip
     order = np.argsort(-order_score)
     best, count, visited = min_score, 0, n
-    stack = np.empty((8 * (top + 1) + 8, 5))
+    stack = np.empty((GROUP_YAWS + 4 * GROUP_LEVEL + 4, 5))
     for k in range(n):
         root = order[k]
         if order_score[root] < max(min_score, keep * best):
             break
-        a = root // (side * side)
-        stack[0, 0], stack[0, 1], stack[0, 2] = order_score[root], top, a
-        stack[0, 3], stack[0, 4] = -steps + (root // side) % side * width, -steps + root % side * width
-        depth = 1
+        dr, dc = -steps + (root // side) % side * width, -steps + root % side * width
+        g, depth = root // (side * side), 0
+        for a in range(g * GROUP_YAWS, min((g + 1) * GROUP_YAWS, rows.shape[0])):
+            limit = max(min_score, keep * best)
+            score = _score(levels[GROUP_LEVEL], rows[a], cols[a], dr, dc, limit)
+            visited += 1
+            if score >= limit:
+                _push(stack, depth, 0, score, GROUP_LEVEL, a, dr, dc)
+                depth += 1
         while depth > 0:
             depth -= 1
             score, hh, ai = stack[depth, 0], int(stack[depth, 1]), int(stack[depth, 2])
@@ -199,16 +216,12 @@ def _search(
                 r1, c1 = r0 + (q >> 1) * half, c0 + (q & 1) * half
                 if r1 > steps or c1 > steps:
                     continue
-                child = _score(levels[hh - 1], rows[ai], cols[ai], r1, c1)
+                limit = max(min_score, keep * best)
+                child = _score(levels[hh - 1], rows[ai], cols[ai], r1, c1, limit)
                 visited += 1
-                if child < max(min_score, keep * best):
-                    continue
-                j = depth  # insertion keeps the best child on top of the stack
-                while j > base and stack[j - 1, 0] > child:
-                    stack[j] = stack[j - 1]
-                    j -= 1
-                stack[j, 0], stack[j, 1], stack[j, 2], stack[j, 3], stack[j, 4] = child, hh - 1, ai, r1, c1
-                depth += 1
+                if child >= limit:
+                    _push(stack, depth, base, child, hh - 1, ai, r1, c1)
+                    depth += 1
     return count, visited
 
 
@@ -239,11 +252,9 @@ def branch_and_bound(
     yaws = centre_pose[2] + step_rad * np.arange(-half, half + 1)
     if window_rad >= math.pi - 1e-6:
         yaws = yaws[:-1]
-    c, s = np.cos(yaws)[:, None], np.sin(yaws)[:, None]
-    x = centre_pose[0] + c * points[:, 0] - s * points[:, 1]
-    y = centre_pose[1] + s * points[:, 0] + c * points[:, 1]
-    rows = np.floor(y / pyramid.cell_m).astype(np.int32) - pyramid.row0
-    cols = np.floor(x / pyramid.cell_m).astype(np.int32) - pyramid.col0
+    rows = np.empty((len(yaws), len(points)), dtype=np.int32)
+    cols = np.empty((len(yaws), len(points)), dtype=np.int32)
+    _cells(points, centre_pose, yaws, pyramid.cell_m, pyramid.row0, pyramid.col0, rows, cols)
     found = np.empty((max_found, 4))
     steps = max(1, math.ceil(window_m / pyramid.cell_m))
     count, _ = _search(

@@ -96,9 +96,8 @@ def run_job(snapshot: Snapshot, refine_rounds: int = 0) -> JobResult:
     iterations = LAST_ITERATIONS if refine_rounds else ITERATIONS
     anneal = not fit or refine_rounds > 0
     solution = optimise(submap_poses, node_poses, edges, held, iterations=iterations, anneal=anneal)
-    rebuilt: dict[int, FrozenMap] = {}
     for _ in range(refine_rounds):
-        rebuilt, constraints = refine_submaps(
+        constraints = refine_submaps(
             snapshot.settings,
             snapshot.nodes,
             snapshot.members,
@@ -107,7 +106,6 @@ def run_job(snapshot: Snapshot, refine_rounds: int = 0) -> JobResult:
             dict(zip(snapshot.submap_ids, solution.pose_map_submap)),
             dict(zip(snapshot.node_ids, solution.pose_map_node)),
         )
-        frozen.update(rebuilt)
         edges = snapshot.table.arrays(constraints, submap_row, node_row)
         solution = optimise(
             solution.pose_map_submap, solution.pose_map_node, edges, held, iterations=LAST_ITERATIONS
@@ -120,7 +118,7 @@ def run_job(snapshot: Snapshot, refine_rounds: int = 0) -> JobResult:
         len(snapshot.constraints),
         dict(zip(snapshot.submap_ids, solution.pose_map_submap)),
         dict(zip(snapshot.node_ids, solution.pose_map_node)),
-        rebuilt,
+        frozen if refine_rounds else {},
         still_pending,
         len(found),
         _is_linked(drift, edges, fixed),

@@ -140,9 +140,7 @@ class LidarLocalization(Node):
     def on_wheel_odometry(self, odometry: WheelOdometry) -> Outputs:
         if self._slam is not None:
             self._slam.add_odometry(odometry.stamp_ns, *se3_to_se2(odometry.T_odom_body).tolist())
-            self.rejections.set(
-                "wheel odometry not newer than the last", self._slam.local_builder.odometry.rejected
-            )
+            self.rejections.set("wheel odometry not newer than the last", self._slam.motion.odometry.rejected)
         return iter(())
 
     def on_lidar_scan(self, scan: Scan) -> Outputs:
@@ -206,7 +204,7 @@ class LidarLocalization(Node):
     def _report_sensors(self, slam: LidarSlam) -> None:
         """Report what is wrong with wheel odometry and lidar, at intervals."""
         if slam.scans % _REPORT_EVERY_SCANS == 1:
-            odometry = slam.local_builder.odometry.report().text
+            odometry = slam.motion.odometry.report().text
             texts = [f"wheel odometry: {odometry}" if odometry else "", slam.self_returns.text()]
             self._sensors = "; ".join(text for text in texts if text)
             self._show()

@@ -9,6 +9,7 @@ import numpy as np
 from beamsplat.common.compiled import kernel
 from beamsplat.services.localization.lidar2d import se2
 from beamsplat.services.localization.lidar2d.odometry_calibration import OdometryCalibration, OdometryReport
+from beamsplat.services.localization.lidar2d.wheel_gap import GapMotion, motion_over_gap
 
 NS = 1e-9
 BASELINE_NS = 80_000_000
@@ -135,11 +136,11 @@ class OdometryBuffer:
                 return None
         return se2.between(a, b)
 
-    def displacement(self, t0_ns: int, t1_ns: int) -> np.ndarray | None:
-        """Return the motion [3] of the body over a gap of any length, None without odometry on both sides.
+    def motion_over_gap(self, t0_ns: int, t1_ns: int) -> GapMotion | None:
+        """Return the motion of the body over a gap of any length.
 
         Wheels count on while nothing is heard of them: the last pose before the gap and the first after it
-        are enough.
+        are enough. None without odometry on both sides.
         """
         first = int(np.searchsorted(self.stamps_ns, t0_ns + self.delay_ns, side="right")) - 1
         last = int(np.searchsorted(self.stamps_ns, t1_ns + self.delay_ns, side="right")) - 1
@@ -150,7 +151,8 @@ class OdometryBuffer:
         )
         if late_ns > self._gap_ns:
             return None
-        return self.calibration.apply(se2.between(self.poses[first], self.poses[last]))
+        intervals_s = np.diff(self.stamps_ns[first : last + 1]) * NS
+        return motion_over_gap(self.poses[first : last + 1], intervals_s, self._gap_ns * NS, self.calibration)
 
     def motion_after_gap(self, t0_ns: int, t1_ns: int) -> np.ndarray:
         """Return the motion [3] between two stamps after a gap, by the mean velocity since the gap.

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from beamsplat.services.localization.lidar2d.wheel_heading import WheelHeadingError
+
 WINDOW_M, WINDOW_RAD, WINDOW_S = 0.5, 0.5, 10.0  # a comparison covers this motion, in at most this time
 MATCH_SIGMA_M, MATCH_SIGMA_RAD = 0.005, 0.003  # error of the matched motion over a comparison
 INITIAL_SIGMA = 0.03  # of the scales, before the first comparison: typical errors of wheel radius and track
@@ -35,6 +37,11 @@ class ScaleEstimate:
     @property
     def sigma(self) -> float:
         return math.sqrt(self.variance)
+
+    @property
+    def random_variance(self) -> float:
+        """Relative variance of the motion over a window, beyond that of the scale."""
+        return self._random_variance
 
     def update(self, factor: float, sigma: float) -> None:
         """Take in one comparison: the factor that it gives, and its standard deviation."""
@@ -85,6 +92,7 @@ class OdometryCalibration:
 
     def __init__(self) -> None:
         self.distance, self.turn = ScaleEstimate(), ScaleEstimate()
+        self.heading = WheelHeadingError()
         self.restart()
 
     def apply(self, motion: np.ndarray) -> np.ndarray:
@@ -98,12 +106,23 @@ class OdometryCalibration:
             s.disagreeing <= MAX_DISAGREEING and s.sigma <= MAX_SIGMA for s in (self.distance, self.turn)
         )
 
+    @property
+    def distance_random(self) -> float:
+        """Relative variance of a distance of one metre, beyond that of the scale."""
+        return self.distance.random_variance * WINDOW_M
+
     def observe(self, wheels: np.ndarray | None, scans: np.ndarray, dt_s: float) -> None:
         """Add the motion [3] between two scans by wheels, without scales, and by matching.
 
         `wheels` is None if there is no odometry; the window then starts again.
         """
-        if wheels is None or self._duration_s > WINDOW_S:
+        if wheels is None:
+            self.heading.restart()
+            self.restart()
+            return
+        scaled = self.apply(wheels)
+        self.heading.observe(float(scans[2] - scaled[2]), scaled, dt_s, self.turn.sigma)
+        if self._duration_s > WINDOW_S:
             self.restart()
             return
         self._duration_s += dt_s

@@ -23,6 +23,7 @@ SEARCH_RETURNS = 120  # returns of the chunk that branch and bound uses
 SEARCH_STEP_RAD = math.radians(1.0)
 KEEP = 0.9  # poses of one submap within this ratio of its best score are candidates
 RIVAL = 0.85  # poses below this ratio of the best score of all submaps are left out
+SEARCH_LIMITS = (0.8, 0.6)  # of the score, tried one after the other
 NEAR_PATH_M = 2.5  # a chunk is searched within this distance of the poses of the submap's scans
 CANDIDATES_PER_SUBMAP = 3
 CANDIDATES = 16  # poses over all submaps that are refined
@@ -82,18 +83,9 @@ def search_places(
     """
     if len(features) < settings.min_points:
         return []
-    subset = features[:: max(1, len(features) // SEARCH_RETURNS)]
-    candidates: list[tuple[float, int, np.ndarray]] = []
-    best = 0.0
-    for index, target in enumerate(targets):
-        centre, half = _window(target)
-        found = branch_and_bound(
-            subset, centre, cache.pyramid(target.submap, target.frozen), half,
-            min(target.window_rad, math.pi), max(min_score, RIVAL * best), keep=KEEP,
-            min_step_rad=SEARCH_STEP_RAD,
-        )  # fmt: skip
-        best = max([best, *(score for score, _ in found)])
-        candidates += [(score, index, pose) for score, pose in found[:CANDIDATES_PER_SUBMAP]]
+    count = min(len(features), SEARCH_RETURNS)
+    subset = features[np.linspace(0, len(features) - 1, count).astype(np.int64)]
+    candidates = _coarse_search(subset, targets, cache, min_score)
     candidates.sort(key=lambda c: -c[0])
     matches: list[PlaceMatch] = []
     # Sorted by submap, because the cache holds few of the large match tables.
@@ -110,6 +102,31 @@ def search_places(
         if not any(m.submap == o.submap and _same_pose(m.match, o.match) for o in distinct):
             distinct.append(m)
     return distinct
+
+
+def _coarse_search(
+    points: np.ndarray, targets: list[SearchTarget], cache: TableCache, min_score: float
+) -> list[tuple[float, int, np.ndarray]]:
+    """Return (score, index of the target, pose [3]) of the candidates, also of some that are no rivals.
+
+    Branch and bound is much faster with a high limit. If the best pose is above it by 1 / RIVAL, a search
+    with a lower limit would find no other candidates.
+    """
+    candidates: list[tuple[float, int, np.ndarray]] = []
+    for limit in (*(t for t in SEARCH_LIMITS if t > min_score), min_score):
+        candidates, best = [], 0.0
+        for index, target in enumerate(targets):
+            centre, half = _window(target)
+            found = branch_and_bound(
+                points, centre, cache.pyramid(target.submap, target.frozen), half,
+                min(target.window_rad, math.pi), max(limit, RIVAL * best), keep=KEEP,
+                min_step_rad=SEARCH_STEP_RAD,
+            )  # fmt: skip
+            best = max([best, *(score for score, _ in found)])
+            candidates += [(score, index, pose) for score, pose in found[:CANDIDATES_PER_SUBMAP]]
+        if RIVAL * best >= limit:
+            break
+    return candidates
 
 
 def _is_in_window(target: SearchTarget, match: Match) -> bool:

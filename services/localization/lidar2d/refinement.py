@@ -72,9 +72,11 @@ def refine_submaps(
     constraints: list[Constraint],
     pose_map_submap: dict[int, np.ndarray],
     pose_map_node: dict[int, np.ndarray],
-) -> tuple[dict[int, FrozenMap], list[Constraint]]:
-    """Rebuild the finished submaps from optimised poses; return them by id, and remeasured constraints."""
-    rebuilt: dict[int, FrozenMap] = {}
+) -> list[Constraint]:
+    """Rebuild the finished submaps from optimised poses; return the remeasured constraints.
+
+    `frozen` is changed, so that not all submaps are in memory in both forms.
+    """
     by_submap: dict[int, list[int]] = {}
     for k, c in enumerate(constraints):
         by_submap.setdefault(c.submap, []).append(k)
@@ -84,19 +86,19 @@ def refine_submaps(
         own = [constraints[k] for k in by_submap.get(submap, []) if not constraints[k].loop]
         moved = _has_moved({c.node: c.pose_submap_node for c in own}, members[submap], poses)
         before = None if moved else frozen[submap]
-        rebuilt[submap] = rebuild_submap(settings, [nodes[n] for n in members[submap]], poses, before)
-        tables = rebuilt[submap].tables(settings.reach_cells, for_search=False)
+        frozen[submap] = rebuild_submap(settings, [nodes[n] for n in members[submap]], poses, before)
+        tables = frozen[submap].tables(settings.reach_cells, for_search=False)
         for k in by_submap.get(submap, []):
             remeasured[k] = _remeasure(
                 settings,
                 nodes[constraints[k].node],
                 constraints[k],
-                rebuilt[submap],
+                frozen[submap],
                 tables,
                 pose_map_submap[submap],
                 pose_map_node[constraints[k].node],
             )
-    return rebuilt, remeasured
+    return remeasured
 
 
 def _remeasure(

@@ -38,6 +38,7 @@ RESTART_EVIDENCE, LOST_EVIDENCE = 4, 6  # where nothing is known of the place
 SURE_EVIDENCE = 4  # after a restart, of a match that has no rival in the whole map
 SURE_INLIER_RATIO, SURE_OVERLAP = 0.85, 0.7
 DISTINCT_RATIO = 0.85  # a match with a lower score than this ratio of the best one is no rival
+REPEATED_M = 3.0  # matches farther apart than this are at different places
 SAME_PLACE_M, SAME_PLACE_RAD = 0.5, math.radians(10.0)
 
 
@@ -99,6 +100,8 @@ def _hypotheses_of_newest(
         s.place_min_inlier_ratio,
     )  # fmt: skip
     windows = {t.submap: (t.window_m, t.window_rad) for t in targets}
+    wide = [m for m in matches[:PER_CHUNK] if windows[m.submap][0] > NEAR_WINDOW_M]
+    repeats = bool(wide) and _is_repeated(wide[0], features, centre.scan.origin, targets, own, snapshot)
     hypotheses = []
     for m in matches[:PER_CHUNK]:
         tables = snapshot.cache.tables(m.submap, snapshot.frozen[m.submap], for_search=False)
@@ -125,12 +128,62 @@ def _hypotheses_of_newest(
             evidence = SURE_EVIDENCE
         measurements = m.match.overlap * len(features) / s.returns_per_measurement
         needed = _needed(*windows[m.submap], snapshot.restarted)
+        if repeats and windows[m.submap][0] > NEAR_WINDOW_M and not snapshot.restarted:
+            needed = WIDE_EVIDENCE
         hypotheses.append(
             LoopHypothesis(
                 link, snapshot.submap_ids[own[0]], evidence, needed, m.match.inlier_ratio, measurements
             )
         )
     return hypotheses
+
+
+def _is_repeated(
+    best: PlaceMatch,
+    features: np.ndarray,
+    origin: np.ndarray,
+    targets: list[SearchTarget],
+    own: list[int],
+    snapshot: Snapshot,
+) -> bool:
+    """Return whether the chunk fits nearly as well at a place of the map that the drift rules out.
+
+    Then the building repeats itself, and a fit says little: the true place may not have been mapped yet.
+    """
+    row = {s: i for i, s in enumerate(snapshot.submap_ids)}
+    pose = se2.compose(snapshot.pose_map_submap[row[best.submap]], best.match.pose_target_body)
+    others = _other_targets(snapshot, {t.submap for t in targets} | {snapshot.submap_ids[o] for o in own})
+    s = snapshot.settings
+    found = search_places(
+        features, origin, others, snapshot.cache, s, MIN_CHUNK_OVERLAP,
+        max(s.min_place_score, DISTINCT_RATIO * best.score), s.place_min_inlier_ratio,
+    )  # fmt: skip
+    for m in found:
+        other = se2.compose(snapshot.pose_map_submap[row[m.submap]], m.match.pose_target_body)
+        off = se2.between(pose, other)
+        if m.score >= DISTINCT_RATIO * best.score and math.hypot(off[0], off[1]) > REPEATED_M:
+            return True
+    return False
+
+
+def _other_targets(snapshot: Snapshot, without: set[int]) -> list[SearchTarget]:
+    """Return every second finished submap that is not in `without`, to be searched everywhere."""
+    targets: list[SearchTarget] = []
+    chosen: set[int] = set()
+    node_row = {n: i for i, n in enumerate(snapshot.node_ids)}
+    for k, submap_id in enumerate(snapshot.submap_ids):
+        if submap_id in without or submap_id not in snapshot.frozen or submap_id - 1 in chosen:
+            continue
+        chosen.add(submap_id)
+        path = [node_row[m] for m in snapshot.members[submap_id][::4] if m in node_row]
+        positions = se2.transform(
+            se2.inverse(snapshot.pose_map_submap[k]), snapshot.pose_map_node[path][:, :2]
+        )
+        targets.append(
+            SearchTarget(submap_id, snapshot.frozen[submap_id], positions, np.zeros(3), math.inf, math.inf)
+        )
+    step = max(1, math.ceil(len(targets) / snapshot.settings.max_place_targets))
+    return targets[::step]
 
 
 def _needed(window_m: float, window_rad: float, restarted: bool) -> int:

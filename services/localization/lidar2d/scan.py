@@ -11,6 +11,19 @@ from beamsplat.common.compiled import kernel
 
 
 @dataclass(frozen=True)
+class RawScan:
+    """One scan (revolution or sweep) of the sensor, unprocessed; `stamp_ns` is the time of the first beam."""
+
+    stamp_ns: int
+    ranges_m: np.ndarray  # float32 [N], +inf or >= range_max_m: no return
+    angle_min_rad: float
+    angle_increment_rad: float
+    time_increment_s: float
+    range_min_m: float
+    range_max_m: float
+
+
+@dataclass(frozen=True)
 class PreparedScan:
     """Valid returns of one scan, deskewed to the stamp of its first beam, in the body frame."""
 
@@ -212,3 +225,8 @@ def prepare_scan(
     keep = np.empty(match_limit + 1, dtype=np.int32)
     kept = _spread(points, spacing, min_spacing_m, match_limit, keep)
     return PreparedScan(points, tangents, spacing, beams, keep[:kept].copy(), pose_body_lidar[:2].copy())
+
+
+def duration_s(raw: RawScan) -> float:
+    """Return the time from the first to after the last beam of a scan."""
+    return raw.time_increment_s * len(raw.ranges_m)

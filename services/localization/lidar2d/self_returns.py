@@ -12,7 +12,7 @@ import math
 
 import numpy as np
 
-from beamsplat.services.localization.lidar2d.local_trajectory_builder import RawScan
+from beamsplat.services.localization.lidar2d.scan import RawScan
 
 BINS = 1440  # of a quarter of a degree: the angles of beams differ from scan to scan with some lidars
 MAX_RANGE_M = 1.0  # the body of a robot with a planar lidar ends nearer

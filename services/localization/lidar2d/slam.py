@@ -11,20 +11,17 @@ from beamsplat.services.localization.lidar2d import se2
 from beamsplat.services.localization.lidar2d.active_submaps import ActiveSubmaps
 from beamsplat.services.localization.lidar2d.grid_tiles import MapContent
 from beamsplat.services.localization.lidar2d.jobs import BackgroundJob, JobResult, run_job
-from beamsplat.services.localization.lidar2d.local_trajectory_builder import (
-    LocalTrajectoryBuilder,
-    Prediction,
-    RawScan,
-)
+from beamsplat.services.localization.lidar2d.local_trajectory_builder import LocalTrajectoryBuilder
 from beamsplat.services.localization.lidar2d.map_records import SavedMap
 from beamsplat.services.localization.lidar2d.map_saver import MapSaver
 from beamsplat.services.localization.lidar2d.motion_covariance import UNKNOWN, motion_covariance
+from beamsplat.services.localization.lidar2d.motion_prediction import MotionPredictor, Prediction
 from beamsplat.services.localization.lidar2d.occupancy import OccupancyGrid, render_occupancy
 from beamsplat.services.localization.lidar2d.pose_graph import PoseGraph
 from beamsplat.services.localization.lidar2d.pose_graph_data import Constraint
 from beamsplat.services.localization.lidar2d.pose_quality import LOST, PoseQuality, rate_pose
 from beamsplat.services.localization.lidar2d.relocalization import Relocalization, relocalize_in
-from beamsplat.services.localization.lidar2d.scan import PreparedScan
+from beamsplat.services.localization.lidar2d.scan import PreparedScan, RawScan
 from beamsplat.services.localization.lidar2d.scan_matching import Match
 from beamsplat.services.localization.lidar2d.self_returns import SelfReturns
 from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
@@ -64,8 +61,10 @@ class LidarSlam:
         """Create an empty map; `T_body_lidar` is float64 [4, 4], or a planar pose [3]."""
         matrix = np.asarray(T_body_lidar, dtype=np.float64)
         self.settings = settings
+        self.motion = MotionPredictor(settings)
+        upside_down = matrix.shape == (4, 4) and matrix[2, 2] < 0
         self.local_builder = LocalTrajectoryBuilder(
-            settings, se2.from_matrix(matrix), matrix.shape == (4, 4) and matrix[2, 2] < 0
+            settings, se2.from_matrix(matrix), self.motion, bool(upside_down)
         )
         self.pose_graph = PoseGraph(settings)
         self.active_submaps = ActiveSubmaps(settings, self.pose_graph)
@@ -83,9 +82,9 @@ class LidarSlam:
     def add_odometry(self, stamp_ns: int, x_m: float, y_m: float, yaw_rad: float) -> None:
         """Add a pose of the body from wheel odometry, in the frame of the odometry.
 
-        Rejected poses are counted in `local_builder.odometry.rejected`.
+        Rejected poses are counted in `motion.odometry.rejected`.
         """
-        self.local_builder.odometry.add(stamp_ns, x_m, y_m, yaw_rad)
+        self.motion.odometry.add(stamp_ns, x_m, y_m, yaw_rad)
 
     def add_scan(
         self,
@@ -116,13 +115,13 @@ class LidarSlam:
         if reason:
             return self._rejected(raw, reason)
         if restarted:
-            self.local_builder.restart_clock(stamp_ns)
+            self.motion.restart_clock(stamp_ns)
         measured, raw = raw, self.self_returns.without(raw)
-        if not self.local_builder.poses:
+        if not self.motion.poses:
             return self._add_first_scan(raw)
         # 1. predict, 2. deskew, 3. match
-        prediction, candidates = self.local_builder.predict(stamp_ns)
-        velocity = self.local_builder.scan_velocity(raw, prediction.motion)
+        prediction, candidates = self.motion.predict(stamp_ns)
+        velocity = self.motion.scan_velocity(raw, prediction.motion)
         scan = self.local_builder.prepare(raw, velocity)
         if len(scan) < self.settings.min_points:
             return self._rejected(raw, f"{len(scan)} returns; at least {self.settings.min_points} are needed")
@@ -135,40 +134,36 @@ class LidarSlam:
                 self.active_submaps.matching_target.pose_odom_submap, match.pose_target_body
             )
         else:
-            moved = self.local_builder.gap_motion(stamp_ns)
-            pose_odom_body = self.local_builder.poses[-1]
+            moved = self.motion.gap_motion(stamp_ns)
+            pose_odom_body = self.motion.poses[-1]
             if moved is not None:
-                pose_odom_body = se2.compose(self.local_builder.last_matched[1], moved.motion)
+                pose_odom_body = se2.compose(self.motion.last_matched[1], moved.motion)
         if good:
-            self._find_self_returns(measured, se2.between(self.local_builder.poses[-1], pose_odom_body))
+            self._find_self_returns(measured, se2.between(self.motion.poses[-1], pose_odom_body))
         target_yaw_rad = float(self.active_submaps.matching_target.pose_odom_submap[2])
-        self.local_builder.accept(
-            stamp_ns, pose_odom_body, candidates if good else [], velocity, matched=good
-        )
+        self.motion.accept(stamp_ns, pose_odom_body, candidates if good else [], velocity, matched=good)
         covariance = self._covariance(match, target_yaw_rad) if good else UNKNOWN
         self._consecutive_lost = 0 if good else self._consecutive_lost + 1
         tie = None
-        if not good and (
-            self._consecutive_lost >= self.settings.lost_scans or (prediction.long_gap and moved is not None)
-        ):
+        known = prediction.long_gap and moved is not None and self.motion.can_deskew(raw)
+        if not good and (known or self._consecutive_lost >= self.settings.lost_scans):
             tie = self._start_segment(moved, pose_odom_body)
-            self.local_builder.last_matched = stamp_ns, pose_odom_body
+            self.motion.last_matched = stamp_ns, pose_odom_body
             match, good = FIRST_MATCH, True
         # 5. dynamic objects, 6. insertion, 7. background job
         return self._insert_scan(raw, scan, pose_odom_body, match, covariance, good, tie)
 
     def _add_first_scan(self, raw: RawScan) -> ScanResult:
-        scan = self.local_builder.prepare(raw, self.local_builder.scan_velocity(raw, None))
+        scan = self.local_builder.prepare(raw, self.motion.scan_velocity(raw, None))
         if len(scan) < self.settings.min_points:
             return self._rejected(raw, f"{len(scan)} returns; at least {self.settings.min_points} are needed")
-        self.local_builder.accept(raw.stamp_ns, np.zeros(3), [])
+        self.motion.accept(raw.stamp_ns, np.zeros(3), [])
         self.pose_graph.uuid = self.pose_graph.uuid or map_uuid(raw.stamp_ns, raw.ranges_m)
         covariance = self._covariance(FIRST_MATCH, 0.0)
         return self._insert_scan(raw, scan, np.zeros(3), FIRST_MATCH, covariance, True)
 
     def _covariance(self, match: Match, target_yaw_rad: float) -> np.ndarray:
-        builder = self.local_builder
-        return motion_covariance(match, target_yaw_rad, builder.stamps, builder.poses, self.settings)
+        return motion_covariance(match, target_yaw_rad, self.motion.stamps, self.motion.poses, self.settings)
 
     def _start_segment(self, moved: Prediction | None, pose_odom_body: np.ndarray) -> Constraint | None:
         """Finish the active submaps and start a segment of the trajectory with the next inserted scan.
@@ -201,7 +196,7 @@ class LidarSlam:
             else np.zeros(len(scan), dtype=bool)
         )
         inserted = good and self.active_submaps.insert(
-            raw.stamp_ns, scan, pose_odom_body, dynamic, match, self.local_builder.reckoning.take_recovery()
+            raw.stamp_ns, scan, pose_odom_body, dynamic, match, self.motion.reckoning.take_recovery()
         )
         if tie is not None and inserted:
             self.pose_graph.constraints.append(tie)
@@ -211,7 +206,7 @@ class LidarSlam:
         pose_map_odom = self.pose_graph.pose_map_odom.copy()
         published = se2.compose(pose_map_odom, pose_odom_body)
         self._unplaced.append((raw.stamp_ns, published))
-        if good or not self.local_builder.is_in_gap(raw.stamp_ns):
+        if good or not self.motion.is_in_gap(raw.stamp_ns):
             self._place_scans(raw.stamp_ns, pose_odom_body)
         status = "lost" if not good else "ok" if self.pose_graph.unlinked_from is None else "relocalizing"
         return ScanResult(
@@ -225,9 +220,7 @@ class LidarSlam:
             scan.beams,
             inserted,
             match.inlier_ratio,
-            rate_pose(covariance, match, self.local_builder.reckoning.degenerate, self.settings)
-            if good
-            else LOST,
+            rate_pose(covariance, match, self.motion.reckoning.degenerate, self.settings) if good else LOST,
             job,
         )
 
@@ -243,13 +236,13 @@ class LidarSlam:
         for earlier_ns, published in self._unplaced:
             pose = pose_odom_body
             if earlier_ns != stamp_ns:
-                moved = self.local_builder.odometry.motion_after_gap(earlier_ns, stamp_ns)
+                moved = self.motion.odometry.motion_after_gap(earlier_ns, stamp_ns)
                 pose = se2.compose(pose, se2.inverse(moved))
             self.record.add(earlier_ns, last.id, se2.between(last.pose_odom_body, pose), published)
         self._unplaced.clear()
 
     def _rejected(self, raw: RawScan, reason: str) -> ScanResult:
-        pose_odom_body = self.local_builder.poses[-1].copy() if self.local_builder.poses else np.zeros(3)
+        pose_odom_body = self.motion.poses[-1].copy() if self.motion.poses else np.zeros(3)
         count = len(raw.ranges_m) if isinstance(raw.ranges_m, np.ndarray) and raw.ranges_m.ndim == 1 else 0
         return ScanResult(
             raw.stamp_ns,
@@ -299,7 +292,7 @@ class LidarSlam:
         if not self.pose_graph.nodes:
             return
         if self._unplaced:  # the recording ends within a gap
-            self._place_scans(self._unplaced[-1][0], self.local_builder.poses[-1])
+            self._place_scans(self._unplaced[-1][0], self.motion.poses[-1])
         self.active_submaps.freeze_active()
         before = -1
         while self.pose_graph.pending and len(self.pose_graph.pending) != before:

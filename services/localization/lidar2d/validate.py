@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from beamsplat.services.localization.lidar2d.local_trajectory_builder import RawScan
+from beamsplat.services.localization.lidar2d.scan import RawScan
 
 RESTART_SCANS = 5  # rejected scans in a row with increasing stamps, after which the clock is followed
 

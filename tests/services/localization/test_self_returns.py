@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from beamsplat.services.localization.lidar2d.local_trajectory_builder import RawScan
+from beamsplat.services.localization.lidar2d.scan import RawScan
 from beamsplat.services.localization.lidar2d.self_returns import BINS, SelfReturns
 from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
 from beamsplat.services.localization.lidar2d.slam import LidarSlam
