@@ -105,7 +105,7 @@ class MotionPredictor:
 
         None if wheel odometry without a gap covers the time.
         """
-        if self.odometry.increment(self.last_matched[0], stamp_ns) is not None:
+        if self.odometry.is_continuous(self.last_matched[0], stamp_ns):
             return None
         moved = self.gap_motion(stamp_ns)
         if moved is None:

@@ -8,8 +8,9 @@ import numpy as np
 
 from beamsplat.common.compiled import kernel
 from beamsplat.services.localization.lidar2d import se2
-from beamsplat.services.localization.lidar2d.drift_model import DriftModel
+from beamsplat.services.localization.lidar2d.drift_model import WINDOW_M, WINDOW_RAD, DriftModel
 from beamsplat.services.localization.lidar2d.graph_optimisation import ConstraintArrays
+from beamsplat.services.localization.lidar2d.look_alikes import is_ambiguous, look_alikes
 from beamsplat.services.localization.lidar2d.loop_hypotheses import (
     MAX_HYPOTHESES,
     LoopHypothesis,
@@ -38,7 +39,7 @@ RESTART_EVIDENCE, LOST_EVIDENCE = 4, 6  # where nothing is known of the place
 SURE_EVIDENCE = 4  # after a restart, of a match that has no rival in the whole map
 SURE_INLIER_RATIO, SURE_OVERLAP = 0.85, 0.7
 DISTINCT_RATIO = 0.85  # a match with a lower score than this ratio of the best one is no rival
-REPEATED_M = 3.0  # matches farther apart than this are at different places
+MAP_MARGIN_M = 5.0  # of the map around the driven path
 SAME_PLACE_M, SAME_PLACE_RAD = 0.5, math.radians(10.0)
 
 
@@ -57,7 +58,7 @@ def find_revisits(
         h for h in snapshot.hypotheses
         if h.constraint.submap in submap_row and h.constraint.node in node_row and h.own_submap in submap_row
     ]  # fmt: skip
-    added = _hypotheses_of_newest(snapshot, edges, drift, node_row)
+    added = _hypotheses_of_newest(snapshot, edges, drift, submap_row, node_row)
     if not added:
         return [], pool
     pool = (pool + added)[-MAX_HYPOTHESES:]
@@ -79,7 +80,11 @@ def find_revisits(
 
 
 def _hypotheses_of_newest(
-    snapshot: Snapshot, edges: ConstraintArrays, drift: DriftModel, node_row: dict[int, int]
+    snapshot: Snapshot,
+    edges: ConstraintArrays,
+    drift: DriftModel,
+    submap_row: dict[int, int],
+    node_row: dict[int, int],
 ) -> list[LoopHypothesis]:
     s = snapshot.settings
     members = snapshot.node_ids[-s.place_nodes :]
@@ -100,14 +105,30 @@ def _hypotheses_of_newest(
         s.place_min_inlier_ratio,
     )  # fmt: skip
     windows = {t.submap: (t.window_m, t.window_rad) for t in targets}
-    wide = [m for m in matches[:PER_CHUNK] if windows[m.submap][0] > NEAR_WINDOW_M]
-    repeats = bool(wide) and _is_repeated(wide[0], features, centre.scan.origin, targets, own, snapshot)
+    first_wide = next((m for m in matches[:PER_CHUNK] if windows[m.submap][0] > NEAR_WINDOW_M), None)
+    likenesses = (
+        look_alikes(
+            first_wide.score, features, centre.scan.origin, snapshot, {snapshot.submap_ids[o] for o in own}
+        )
+        if first_wide is not None
+        else []
+    )
+    predicted = {t.submap: t.pose_submap_chunk for t in targets}
+    extent_m = np.ptp(snapshot.pose_map_node[:, :2], axis=0) + 2.0 * MAP_MARGIN_M
+    area_m2 = float(extent_m[0] * extent_m[1])
     hypotheses = []
     for m in matches[:PER_CHUNK]:
         tables = snapshot.cache.tables(m.submap, snapshot.frozen[m.submap], for_search=False)
         seen = reduce_unobservable(features, centre.scan.origin, m.match, tables, s)
         if seen.trust < MIN_TRUST or m.score < DISTINCT_RATIO * matches[0].score:
             continue  # it could be anywhere along a corridor, or the chunk fits clearly better elsewhere
+        window_m, window_rad = windows[m.submap]
+        if NEAR_WINDOW_M < window_m < math.inf and not snapshot.restarted:
+            pose_map_submap = snapshot.pose_map_submap[submap_row[m.submap]]
+            others = [se2.between(pose_map_submap, pose) for pose in likenesses]
+            sigmas = (window_m - WINDOW_M) / 3.0, (window_rad - WINDOW_RAD) / 3.0
+            if is_ambiguous(m.match.pose_target_body, predicted[m.submap], *sigmas, others, area_m2):
+                continue
         information = edge_information(seen.match.information, CHUNK_SIGMA_M, CHUNK_SIGMA_RAD)
         link = Constraint(m.submap, centre.id, m.match.pose_target_body, information, True)
         confirmed = verify_constraint(
@@ -127,63 +148,13 @@ def _hypotheses_of_newest(
         if fits and rival < s.link_max_runner_up_ratio and snapshot.restarted:
             evidence = SURE_EVIDENCE
         measurements = m.match.overlap * len(features) / s.returns_per_measurement
-        needed = _needed(*windows[m.submap], snapshot.restarted)
-        if repeats and windows[m.submap][0] > NEAR_WINDOW_M and not snapshot.restarted:
-            needed = WIDE_EVIDENCE
+        needed = _needed(window_m, window_rad, snapshot.restarted)
         hypotheses.append(
             LoopHypothesis(
                 link, snapshot.submap_ids[own[0]], evidence, needed, m.match.inlier_ratio, measurements
             )
         )
     return hypotheses
-
-
-def _is_repeated(
-    best: PlaceMatch,
-    features: np.ndarray,
-    origin: np.ndarray,
-    targets: list[SearchTarget],
-    own: list[int],
-    snapshot: Snapshot,
-) -> bool:
-    """Return whether the chunk fits nearly as well at a place of the map that the drift rules out.
-
-    Then the building repeats itself, and a fit says little: the true place may not have been mapped yet.
-    """
-    row = {s: i for i, s in enumerate(snapshot.submap_ids)}
-    pose = se2.compose(snapshot.pose_map_submap[row[best.submap]], best.match.pose_target_body)
-    others = _other_targets(snapshot, {t.submap for t in targets} | {snapshot.submap_ids[o] for o in own})
-    s = snapshot.settings
-    found = search_places(
-        features, origin, others, snapshot.cache, s, MIN_CHUNK_OVERLAP,
-        max(s.min_place_score, DISTINCT_RATIO * best.score), s.place_min_inlier_ratio,
-    )  # fmt: skip
-    for m in found:
-        other = se2.compose(snapshot.pose_map_submap[row[m.submap]], m.match.pose_target_body)
-        off = se2.between(pose, other)
-        if m.score >= DISTINCT_RATIO * best.score and math.hypot(off[0], off[1]) > REPEATED_M:
-            return True
-    return False
-
-
-def _other_targets(snapshot: Snapshot, without: set[int]) -> list[SearchTarget]:
-    """Return every second finished submap that is not in `without`, to be searched everywhere."""
-    targets: list[SearchTarget] = []
-    chosen: set[int] = set()
-    node_row = {n: i for i, n in enumerate(snapshot.node_ids)}
-    for k, submap_id in enumerate(snapshot.submap_ids):
-        if submap_id in without or submap_id not in snapshot.frozen or submap_id - 1 in chosen:
-            continue
-        chosen.add(submap_id)
-        path = [node_row[m] for m in snapshot.members[submap_id][::4] if m in node_row]
-        positions = se2.transform(
-            se2.inverse(snapshot.pose_map_submap[k]), snapshot.pose_map_node[path][:, :2]
-        )
-        targets.append(
-            SearchTarget(submap_id, snapshot.frozen[submap_id], positions, np.zeros(3), math.inf, math.inf)
-        )
-    step = max(1, math.ceil(len(targets) / snapshot.settings.max_place_targets))
-    return targets[::step]
 
 
 def _needed(window_m: float, window_rad: float, restarted: bool) -> int:

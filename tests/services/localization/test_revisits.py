@@ -8,6 +8,7 @@ import pytest
 from beamsplat.services.localization.lidar2d import se2
 from beamsplat.services.localization.lidar2d.drift_model import DriftModel, DriftScale
 from beamsplat.services.localization.lidar2d.graph_optimisation import ConstraintArrays
+from beamsplat.services.localization.lidar2d.look_alikes import is_ambiguous
 from beamsplat.services.localization.lidar2d.loop_hypotheses import LoopHypothesis, select
 from beamsplat.services.localization.lidar2d.place_search import SearchTarget, search_places
 from beamsplat.services.localization.lidar2d.pose_graph_data import Constraint, TableCache
@@ -211,3 +212,31 @@ def test_a_match_outside_of_its_window_is_no_match(mapped):
         target = SearchTarget(1, submap, path, predicted, 4.0, 0.5)
         matches = search_places(features, node.scan.origin, [target], cache, SETTINGS, 0.5, 0.4, 0.8)
         assert bool(matches) == found
+
+
+AREA_M2 = 3000.0
+ROOM_M = 13.0  # rooms of a corridor of identical rooms are so far apart
+
+
+@pytest.mark.parametrize(
+    ("off_m", "sigma_m", "copies", "ambiguous"),
+    [
+        (9.0, 4.0, (1,), True),  # the copy on the other side, mapped or not, is only 4 m from the prediction
+        (9.0, 4.0, (-1,), True),
+        (1.0, 1.5, (1, 2), False),  # the drift rules all copies out
+        (1.0, 1.5, tuple(range(1, 12)), True),  # one of many: another is to be expected nearby
+        (9.0, 4.0, (), False),  # nothing else in the building looks like this
+    ],
+)
+def test_a_room_with_copies_is_recognised_only_where_the_drift_decides(off_m, sigma_m, copies, ambiguous):
+    predicted = np.array([20.0, 3.0, 0.1])
+    matched = np.array([20.0 + off_m, 3.0, 0.1])
+    others = [matched + np.array([n * ROOM_M, 0.0, 0.0]) for n in copies]
+    assert is_ambiguous(matched, predicted, sigma_m, np.radians(3.0), others, AREA_M2) is ambiguous
+
+
+def test_a_copy_that_is_turned_around_is_told_apart_by_the_heading():
+    matched = np.array([1.0, 0.0, 0.0])
+    turned = [np.array([4.5, 0.0, np.pi])]
+    assert not is_ambiguous(matched, np.zeros(3), 4.0, np.radians(5.0), turned, AREA_M2)
+    assert is_ambiguous(matched, np.zeros(3), 4.0, np.radians(90.0), turned, AREA_M2)
