@@ -152,7 +152,9 @@ def image_bytes(stamp_ns: int, jpeg: np.ndarray, layout: BagLayout) -> bytes:
     header = _header(stamp_ns, layout.camera_frame)
     if layout.image_encoding == "jpeg":
         return _cdr(_make("sensor_msgs/msg/CompressedImage", header, layout.jpeg_format, jpeg))
-    rgb = cv2.cvtColor(cv2.imdecode(jpeg, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
+    bgr = cv2.imdecode(jpeg, cv2.IMREAD_COLOR)
+    assert bgr is not None  # the simulator's own bytes
+    rgb = cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
     height, width = rgb.shape[:2]
     image = (header, height, width, "rgb8", 0, 3 * width, rgb.ravel())
     return _cdr(_make("sensor_msgs/msg/Image", *image))
