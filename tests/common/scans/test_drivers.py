@@ -14,7 +14,7 @@ from beamsplat.services.localization.lidar2d.job_runner import JobRunner
 from beamsplat.services.localization.lidar2d.metrics import trajectory_errors
 from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
 from beamsplat.services.localization.lidar2d.slam import LidarSlam
-from tests.common.scans.robots import DRIVERS, START_NS, Drive, odometry, sweeps
+from tests.common.scans.robots import DRIVERS, START_NS, Drive, odometry, oradar_ms200, sweeps
 
 QUICK = ("sllidar_ros2", "ldlidar_stl_ros2", "ld08_driver", "rplidar_mirrored", "negative_time")
 COUNTER_CLOCKWISE = ("turtlebot3_slow", "eaibot", "negative_time", "no_time")
@@ -133,8 +133,16 @@ def test_the_pose_error_on_a_spinning_robot_is_that_of_the_ideal_driver(recorded
         id(ideal): slam_error_m(learn(ideal, wheels)[0], wheels, drive)
         for ideal in (clockwise, counter_clockwise)
     }
-    for name, driver in DRIVERS.items():
+    published = {
+        name: [
+            driver(message, k)
+            for k, message in enumerate(counter_clockwise if name in COUNTER_CLOCKWISE else clockwise)
+        ]
+        for name, driver in DRIVERS.items()
+    }
+    published["oradar_ms200"] = oradar_ms200(clockwise)
+    for name, messages in published.items():
         ideal = counter_clockwise if name in COUNTER_CLOCKWISE else clockwise
-        read, _, _ = learn([driver(message, k) for k, message in enumerate(ideal)], wheels)
+        read, _, _ = learn(messages, wheels)
         # The receive time stands in for stamps of the end of a scan, which is up to 7 ms later.
         assert slam_error_m(read, wheels, drive) <= max(1.2 * clean_m[id(ideal)], 0.004), name
