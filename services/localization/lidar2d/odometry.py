@@ -137,12 +137,12 @@ class OdometryBuffer:
         return se2.between(a, b)
 
     def is_continuous(self, t0_ns: int, t1_ns: int) -> bool:
-        """Return whether the odometry was heard without a gap between two stamps."""
+        """Return whether `increment` needs no bridge over a longer silence between two stamps."""
         first = int(np.searchsorted(self.stamps_ns, t0_ns + self.delay_ns, side="right")) - 1
         last = int(np.searchsorted(self.stamps_ns, t1_ns + self.delay_ns))
         if first < 0 or last <= first or t1_ns + self.delay_ns - self.stamps_ns[-1] > self._gap_ns:
             return False
-        return bool((np.diff(self.stamps_ns[first : last + 1]) <= self._gap_ns).all())
+        return bool((np.diff(self.stamps_ns[first : last + 1]) <= self._bridge_ns).all())
 
     def motion_over_gap(self, t0_ns: int, t1_ns: int) -> GapMotion | None:
         """Return the motion of the body over a gap of any length.

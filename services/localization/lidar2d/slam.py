@@ -129,6 +129,7 @@ class LidarSlam:
             raw, scan, velocity, prediction, self.active_submaps.matching_target
         )
         # 4. take the matched pose, or else the wheel odometry
+        moved: Prediction | None = None
         if good:
             pose_odom_body = se2.compose(
                 self.active_submaps.matching_target.pose_odom_submap, match.pose_target_body

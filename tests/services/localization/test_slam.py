@@ -354,3 +354,17 @@ def test_a_drive_goes_on_after_a_gap_without_scans_and_odometry(known):
     assert len(stamps) == len(results)  # no scan is without a pose, those right after the gap included
     assert trajectory_errors(final, np.array(truth)).ate_first_pose_rmse_m < 0.03
     assert np.hypot(*(se2.between(final[0], final[505]) - se2.between(truth[0], truth[505]))[:2]) < 0.15
+
+
+@pytest.mark.parametrize("pause_s", [2.5, 20.0])
+def test_a_robot_that_stands_through_a_pause_of_its_lidar_goes_on_in_the_same_map(pause_s):
+    drive, lidar = SimulatedDrive(), RayCastLidar(beams=360, seed=15)
+    slam, results = LidarSlam(SETTINGS, np.eye(4)), []
+    for t in [*np.arange(0.0, 1.0, 0.1), *(pause_s + np.arange(1.0, 2.0, 0.1))]:
+        stamp = START + round(t * NS)
+        slam.add_odometry(stamp, 0.0, 0.0, 0.0)
+        slam.add_odometry(stamp + round(0.1 * NS), 0.0, 0.0, 0.0)
+        results.append(slam.add_scan(stamp, lidar.scan(drive, 0.0), *lidar.arguments()))
+    assert {r.status for r in results} == {"ok"}
+    assert (slam.gaps_tied, slam.gaps_open) == (0, 0)
+    assert np.abs(results[-1].pose_odom_body).max() < 0.01
