@@ -37,6 +37,8 @@ _EXCLUDED = {
     "pose": {"goal", "target", "waypoint", "initial", "initialpose", "plan", "setpoint", "click", "clicked"},
     "image": {"depth", "disparity", "mask", "semantic", "segmentation", "confidence", "compresseddepth"},
 }
+# The name of a device, which takes colour images too: /depth_cam/rgb, but not /depth_cam/depth.
+_DEPTH_CAMERA = re.compile(r"(?<![^/_])depth_?cam(?:era)?(?=[/_0-9]|$)")
 # Derived from the measurement of another sensor, or for display: used only if there is nothing else.
 _DERIVED = {
     "scan": {"depth", "camera", "kinect", "virtual", "cloud", "pointcloud", "points", "fake", "simulated"},
@@ -105,7 +107,10 @@ def candidates(topics: list[Candidate], sensor_name: str) -> list[Candidate]:
     """Return the topics whose type and name match a sensor, by name."""
     sensor, excluded = SENSORS[sensor_name], _EXCLUDED.get(sensor_name, set())
     return sorted(
-        topic for topic in topics if topic.type_name in sensor.ros_types and not _words(topic.name) & excluded
+        topic
+        for topic in topics
+        if topic.type_name in sensor.ros_types
+        and not _words(_DEPTH_CAMERA.sub("camera", topic.name.lower())) & excluded
     )
 
 

@@ -62,6 +62,9 @@ def test_a_filtered_topic_with_few_messages_is_not_used():
         (topics("raw", "/oakd/rgb/preview/image_raw", "/oakd/rgb/image_raw"), "/oakd/rgb/image_raw"),
         (topics("raw", "/oakd/rgb/preview/image_raw"), "/oakd/rgb/preview/image_raw"),
         (topics("raw", "/cam/image_raw", "/cam/debug/image_raw"), "/cam/image_raw"),
+        (topics("raw", "/depth_cam/depth/image_raw", "/depth_cam/rgb/image_raw"), "/depth_cam/rgb/image_raw"),
+        (topics("raw", "/depth_camera/image_raw", "/depth_camera/depth/image_raw"), "/depth_camera/image_raw"),
+        (topics("raw", "/c/aligned_depth_to_color/image_raw", "/c/color/image_raw"), "/c/color/image_raw"),
     ],
 )  # fmt: skip
 def test_images(found, best):
