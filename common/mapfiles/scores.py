@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from beamsplat.common.geometry.transforms import inverse
 from beamsplat.common.mapfiles.store import GaussianStore
 from beamsplat.common.raster.camera import RasterCamera
-from beamsplat.common.raster.rasterizer import Rasterizer
+from beamsplat.common.raster.rasterizer import Rasterizer, expected_depth
 from beamsplat.common.raster.ssim import ssim
 
 GRID_M = 0.02  # cell of the fused surface; fixed by the evaluation protocol
@@ -32,10 +32,19 @@ def render_rgb_depth(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return (rgb float32 [H, W, 3] in [0, 1], expected optical z float32 [H, W] m, alpha float32 [H, W])."""
     render = rasterizer.render(store.params, store.count, camera, inverse(T_map_camera))
-    rgb = np.clip(render.image[:3].transpose(1, 2, 0), 0.0, 1.0).copy()
-    depth, alpha = render.expected_depth(), render.image[4].copy()
+    out = rgb_depth_alpha(render.image)
     rasterizer.release(render)
-    return rgb, depth, alpha
+    return out
+
+
+def rgb_depth_alpha(image: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return copies of colour, expected depth and alpha of a render float32 [5, H, W].
+
+    Returns:
+        As `render_rgb_depth`.
+    """
+    rgb = np.clip(image[:3].transpose(1, 2, 0), 0.0, 1.0).copy()
+    return rgb, expected_depth(image), image[4].copy()
 
 
 def psnr_db(a: np.ndarray, b: np.ndarray) -> float:
@@ -64,15 +73,17 @@ def score_view(
 
 
 def fused_surface(
-    rasterizer: Rasterizer, store: GaussianStore, views: Iterable[tuple[RasterCamera, np.ndarray]]
+    render: Callable[[RasterCamera, np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray]],
+    views: Iterable[tuple[RasterCamera, np.ndarray]],
 ) -> np.ndarray:
     """Return the surface of the map as points float64 [N, 3] (m) in the map frame, one per 2 cm cell.
 
     The points are computed from the depth rendered at `views` (camera, T_map_camera) where alpha > 0.5.
+    `render` returns colour, depth and alpha of the map at a view, as `render_rgb_depth`.
     """
     parts = []
     for camera, T_map_camera in views:
-        _, depth, alpha = render_rgb_depth(rasterizer, store, camera, T_map_camera)
+        _, depth, alpha = render(camera, T_map_camera)
         v, u = np.nonzero((alpha > 0.5) & np.isfinite(depth))
         z = depth[v, u].astype(np.float64)
         rays = np.stack(

@@ -22,8 +22,17 @@ def store_of(arrays: Arrays) -> GaussianStore:
         KeyError: an array is missing.
     """
     store = GaussianStore()
-    store.restore({k.removeprefix("store_"): a for k, a in arrays.items() if k.startswith("store_")})
+    restore_store(store, arrays)
     return store
+
+
+def restore_store(store: GaussianStore, arrays: Arrays) -> None:
+    """Replace the contents of `store` by the Gaussians of a saved state.
+
+    Raises:
+        KeyError: an array is missing.
+    """
+    store.restore({k.removeprefix("store_"): a for k, a in arrays.items() if k.startswith("store_")})
 
 
 def progress_of(arrays: Arrays) -> dict[str, Any]:

@@ -9,6 +9,7 @@ from typing import Protocol
 import numpy as np
 
 from beamsplat.common.geometry.transforms import quat_wxyz_from_matrix
+from beamsplat.common.raster.camera import RasterCamera
 from beamsplat.common.raster.layout import MEAN, OPACITY, QUAT, SCALE
 from beamsplat.common.raster.optimiser import GaussianArrays
 
@@ -28,6 +29,19 @@ class DiskGaussians(Protocol):
         """Return a lower bound on the distance (m) from a point to the Gaussians of an anchor.
 
         `at_map_m` is the point [3] in the map frame. The result is inf if no Gaussians are on disk.
+        """
+
+    def read_visible(
+        self,
+        camera: RasterCamera,
+        T_map_camera: np.ndarray,
+        T_map_anchor: dict[int, np.ndarray],
+        max_count: int,
+    ) -> tuple[list[np.ndarray], int]:
+        """Read at most `max_count` Gaussians that a camera may see, the nearest first.
+
+        Returns:
+            Parts float32 [14, N] in the map frame, and the number of Gaussians left out.
         """
 
 
@@ -66,7 +80,7 @@ class GaussianStore(GaussianArrays):
 
         The keys are the names in saved files.
         """
-        out = {_saved(name): getattr(self, name)[..., : self.count].copy() for name in self._arrays()}
+        out = {saved_name(name): getattr(self, name)[..., : self.count].copy() for name in self._arrays()}
         out["events"] = np.array(list(self._events.items()), np.int64).reshape(-1, 2)
         return out
 
@@ -81,7 +95,7 @@ class GaussianStore(GaussianArrays):
         self.count = state["params"].shape[1]
         self._allocate(-(-max(self.count, 1) // 16) * 16)
         for name in self._arrays():
-            getattr(self, name)[..., : self.count] = state[_saved(name)]
+            self._write(name, slice(0, self.count), state[saved_name(name)])
         self._events = {anchor: events + _VERSION_LEAP for anchor, events in state["events"].tolist()}
 
     def add(self, params: np.ndarray, anchor: int) -> None:
@@ -122,7 +136,7 @@ class GaussianStore(GaussianArrays):
         count = arrays["params"].shape[1]
         at = self.append(arrays["params"])
         for name in self._arrays()[1:]:
-            getattr(self, name)[..., at] = anchor if name == "anchor" else arrays[_saved(name)]
+            self._write(name, at, anchor if name == "anchor" else arrays[saved_name(name)])
         self.count_paged_out(anchor, -count, -_sum(arrays["steps"]))
 
     def columns(self, group: np.ndarray) -> dict[str, np.ndarray]:
@@ -130,7 +144,8 @@ class GaussianStore(GaussianArrays):
 
         The keys are the names in saved files.
         """
-        return {_saved(name): getattr(self, name)[..., group] for name in self._arrays() if name != "anchor"}
+        names = (name for name in self._arrays() if name != "anchor")
+        return {saved_name(name): getattr(self, name)[..., group] for name in names}
 
     def count_paged_out(self, anchor: int, count: int, steps: int) -> None:
         """Record that `count` more Gaussians of an anchor are on disk only.
@@ -155,6 +170,10 @@ class GaussianStore(GaussianArrays):
         if len(chosen) == 0 and anchor not in self.paged_out:
             return
         self._events[anchor] = self._events.get(anchor, 0) + 1
+        self._transform(chosen, T_new_old)
+
+    def _transform(self, chosen: np.ndarray, T_new_old: np.ndarray) -> None:
+        """Transform the columns `chosen` and their first moments."""
         self.params[:, chosen], self.first[:, chosen] = transform_with_momentum(
             self.params[:, chosen], self.first[:, chosen], T_new_old
         )
@@ -186,7 +205,8 @@ class GaussianStore(GaussianArrays):
         ]
 
 
-def _saved(name: str) -> str:
+def saved_name(name: str) -> str:
+    """Return the name of an array in saved files."""
     return _SAVED_NAMES.get(name, name)
 
 

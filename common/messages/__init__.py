@@ -8,6 +8,7 @@ from beamsplat.common.messages.map import (
     MapChunk,
     MapPoses,
     MapPreview,
+    MapRender,
     MapState,
     MapStatus,
 )
@@ -61,6 +62,7 @@ __all__ = [
     "MapChunk",
     "MapPoses",
     "MapPreview",
+    "MapRender",
     "MapState",
     "MapStatus",
     "Message",

@@ -119,6 +119,15 @@ class MapPreview(Message):
     camera: CameraModel | None = None  # of the render: a pinhole of its size; since 1.1
 
 
+class MapRender(Message):
+    """The map rendered from the pose in a query, as a JPEG of the size of `camera`."""
+
+    render: Annotated[np.ndarray, Array("uint8", "B")]
+    T_map_camera: Transform
+    camera: CameraModel  # a pinhole
+    left_out: Count = 0  # Gaussians that may be in view but are not drawn
+
+
 class MapStatus(Message):
     """State of the map after a keyframe, with rendering errors at the newest keyframe's view.
 

@@ -21,6 +21,7 @@ from beamsplat.common.messages.map import (
     MapChunk,
     MapPoses,
     MapPreview,
+    MapRender,
     MapState,
     MapStatus,
 )
@@ -319,6 +320,7 @@ MESSAGES: dict[str, type[Message]] = {
     for cls in (
         Rig, Image, Scan, WheelOdometry, ExternalPose, Odometry, Correction, Anchors, MovingBeams, Grid,
         GridTile, DepthEstimate, FusedDepth, Cloud, KeyframeCandidate, KeyframeDecision, Keyframe,
-        KeyframeAck, MapChunk, MapPoses, MapPreview, MapState, MapStatus, Tick, Health, Answer,
+        KeyframeAck, MapChunk, MapPoses, MapPreview, MapRender, MapState, MapStatus, Tick, Health,
+        Answer,
     )
 }  # fmt: skip

@@ -12,7 +12,7 @@ from beamsplat.common.messages.schema import Finite, MessagePart, Positive, Tran
 MAX_PIXELS = 2**24  # of an image (4096 x 4096): bounds the memory of everything that has one value per pixel
 # Limits of a possible focal length, as a multiple of the longer side: less than a tenth of that of a fisheye
 # lens, and 90 times that of a usual camera.
-_FOCAL_RATIO = (0.02, 100.0)
+FOCAL_RATIO = (0.02, 100.0)
 
 
 class CameraModel(MessagePart):
@@ -38,7 +38,7 @@ class CameraModel(MessagePart):
             raise ValueError(f"{self.width_px}x{self.height_px}: more than {MAX_PIXELS} pixels")
         for axis, focal in (("fx", self.fx_px), ("fy", self.fy_px)):
             ratio = focal / max(self.width_px, self.height_px)
-            if not _FOCAL_RATIO[0] <= ratio <= _FOCAL_RATIO[1]:
+            if not FOCAL_RATIO[0] <= ratio <= FOCAL_RATIO[1]:
                 raise ValueError(
                     f"{axis} = {focal:g} px is impossible for a {self.width_px}x{self.height_px} image"
                 )

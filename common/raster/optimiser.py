@@ -49,10 +49,14 @@ class GaussianArrays:
             self.resize(max(self.count + new, 2 * self.capacity))
         at = slice(self.count, self.count + new)
         for name in self._arrays()[1:]:
-            getattr(self, name)[..., at] = 0
-        self.params[:, at] = params
+            self._write(name, at, 0)
+        self._write("params", at, params)
         self.count += new
         return at
+
+    def _write(self, name: str, at: slice, values: np.ndarray | int) -> None:
+        """Set the columns `at` of an array."""
+        getattr(self, name)[..., at] = values
 
     def resize(self, capacity: int) -> None:
         """Resize all arrays to `capacity` Gaussians, at least `count`, rounded up to a multiple of 16.
@@ -74,11 +78,15 @@ class GaussianArrays:
         chosen = np.flatnonzero(mask)
         dropped = self.count - len(chosen)
         if dropped:
-            for name in self._arrays():
-                array = getattr(self, name)
-                array[..., : len(chosen)] = array[..., chosen]
+            self._compact(chosen)
             self.count = len(chosen)
         return dropped
+
+    def _compact(self, chosen: np.ndarray) -> None:
+        """Move the columns `chosen`, ascending, to the front of all arrays."""
+        for name in self._arrays():
+            array = getattr(self, name)
+            array[..., : len(chosen)] = array[..., chosen]
 
     def step(
         self,

@@ -94,10 +94,14 @@ class Render:
         return len(self.tables.lists) - 1
 
     def expected_depth(self) -> np.ndarray:
-        """Return the expected depth float32 [H, W] (m): accumulated depth / alpha, NaN for alpha <= 1e-3."""
-        alpha = self.image[4]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            return np.where(alpha > 1e-3, self.image[3] / alpha, np.float32(np.nan))
+        """Return `expected_depth` of the image."""
+        return expected_depth(self.image)
+
+
+def expected_depth(image: np.ndarray) -> np.ndarray:
+    """Return the expected depth float32 [H, W] (m) of a render [5, H, W]; NaN where alpha is <= 1e-3."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(image[4] > 1e-3, image[3] / image[4], np.float32(np.nan))
 
 
 @dataclass

@@ -105,13 +105,24 @@ def choose_topic(
 
 def candidates(topics: list[Candidate], sensor_name: str) -> list[Candidate]:
     """Return the topics whose type and name match a sensor, by name."""
-    sensor, excluded = SENSORS[sensor_name], _EXCLUDED.get(sensor_name, set())
-    return sorted(
-        topic
-        for topic in topics
-        if topic.type_name in sensor.ros_types
-        and not _words(_DEPTH_CAMERA.sub("camera", topic.name.lower())) & excluded
-    )
+    types = SENSORS[sensor_name].ros_types
+    return sorted(t for t in topics if t.type_name in types and not _excluding_words(t.name, sensor_name))
+
+
+def left_out_by_name(topics: list[Candidate], sensor_name: str) -> dict[str, str]:
+    """Return why topics of a sensor's type are not used for it, by topic: words in their names."""
+    types = SENSORS[sensor_name].ros_types
+    found = {t.name: _excluding_words(t.name, sensor_name) for t in sorted(topics) if t.type_name in types}
+    return {
+        name: f"its name contains {', '.join(map(repr, words))}; {sensor_name}_topic selects it nevertheless"
+        for name, words in found.items()
+        if words
+    }
+
+
+def _excluding_words(name: str, sensor_name: str) -> list[str]:
+    words = _words(_DEPTH_CAMERA.sub("camera", name.lower()))
+    return sorted(words & _EXCLUDED.get(sensor_name, set()))
 
 
 def choose_camera_info(topics: list[Candidate], image: str, where: str, named: str = "") -> str | None:

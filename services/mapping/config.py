@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import Field
 
@@ -11,14 +11,18 @@ from beamsplat.common.config.base import Remote
 from beamsplat.common.config.deployment import NodeConfig
 
 PositiveFinite = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+EngineName = Literal["auto", "cpu", "cuda"]
 Steps = Annotated[int, Field(ge=0, le=100_000)]
 
 
 class MappingConfig(NodeConfig):
     """Options of the mapping service. The work per keyframe and per tick is fixed.
 
-    `threads` is the number of threads of the rasterizer.
+    `threads` is the number of threads of the CPU engine.
     """
+
+    # What computes the map. "auto": the GPU if there is one with a driver and torch, else the CPU.
+    engine: EngineName = "auto"
 
     nice: Annotated[int, Field(ge=0, le=19)] = 5  # lower CPU priority than the services that feed the map
     half_steps: Remote[Steps] = 18  # per keyframe, at half size

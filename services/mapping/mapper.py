@@ -16,26 +16,12 @@ import numpy as np
 
 from beamsplat.common.geometry.transforms import inverse, is_rigid
 from beamsplat.common.mapfiles.store import DiskGaussians, GaussianStore
+from beamsplat.common.raster.camera import RasterCamera
 from beamsplat.common.raster.layout import OPACITY
-from beamsplat.common.raster.optimiser import learning_rates
-from beamsplat.common.raster.rasterizer import Rasterizer, Render
-from beamsplat.common.raster.ssim import SsimLoss
+from beamsplat.services.mapping.engines.cpu import CpuEngine, count_votes
+from beamsplat.services.mapping.engines.protocol import Engine, OptimiserStep
 from beamsplat.services.mapping.insertion import new_gaussians, prediction_quality, unexplained_pixels
-from beamsplat.services.mapping.kernels import (
-    add_lidar,
-    count_carving_votes,
-    exposure_gradient,
-    photometric_and_depth,
-)
-from beamsplat.services.mapping.keyframe import (
-    PyramidLevel,
-    RgbdKeyframe,
-    StoredKeyframe,
-    compress,
-    refine_exposure,
-    refine_pose,
-    with_hidden,
-)
+from beamsplat.services.mapping.keyframe import PyramidLevel, RgbdKeyframe, StoredKeyframe, compress
 from beamsplat.services.mapping.pose_bins import PoseBins
 from beamsplat.services.mapping.settings import MapperSettings
 
@@ -62,13 +48,26 @@ class InsertionResult:
 
 
 class Mapper:
-    """The map and its optimiser. The same keyframes and seed produce a bit-identical map."""
+    """The map and its optimiser. The same keyframes, seed and engine produce a bit-identical map.
 
-    def __init__(self, settings: MapperSettings | None = None, *, seed: int = 0, threads: int = 1) -> None:
+    It decides what is computed; an engine (services/mapping/engines) computes it.
+    """
+
+    def __init__(
+        self,
+        settings: MapperSettings | None = None,
+        *,
+        seed: int = 0,
+        threads: int = 1,
+        engine: Engine | None = None,
+    ) -> None:
+        """Args:
+        threads: of the CPU engine.
+        engine: None = the CPU engine.
+        """
         self.settings = settings or MapperSettings()
-        self.store = GaussianStore()
+        self.engine: Engine = CpuEngine(threads) if engine is None else engine
         self.disk_gaussians: DiskGaussians | None = None  # Gaussians that are not in `store`
-        self.rasterizer = Rasterizer(threads)
         self.keyframes: dict[int, StoredKeyframe] = {}
         self.paged_out: dict[int, StoredKeyframe] = {}  # without images; the first is paged in next
         self.T_map_anchor: dict[int, np.ndarray] = {}
@@ -80,12 +79,15 @@ class Mapper:
         self.max_in_memory: int | None = None  # limit on Gaussians in memory, set by the pager
         self._dropped: dict[int, None] = {}  # ids of the latest ones, oldest first
         self._bins = PoseBins()
-        self._ssim = SsimLoss()
-        self._buffers: dict[tuple[int, int], tuple[np.ndarray, np.ndarray]] = {}
-        r = self.settings.rates
-        rest = (r.log_scale, r.quat, r.opacity_logit, r.colour)
-        self._rates = learning_rates(r.mean_m, *rest)
-        self._refining_rates = learning_rates(r.refined_mean_m, *rest)
+
+    @property
+    def store(self) -> GaussianStore:
+        """Return the Gaussians in memory."""
+        return self.engine.store
+
+    def render(self, camera: RasterCamera, T_map_camera: np.ndarray) -> np.ndarray:
+        """Return the map in memory as float32 [5, H, W]: red, green, blue, accumulated depth (m), alpha."""
+        return self.engine.render(camera, inverse(T_map_camera))
 
     # --- keyframes and anchors ---------------------------------------------------------------------
 
@@ -142,9 +144,8 @@ class Mapper:
 
     @property
     def workspace_bytes(self) -> int:
-        """Return the size of the buffers for rendering and losses, in bytes."""
-        losses = sum(array.nbytes for pair in self._buffers.values() for array in pair)
-        return self.rasterizer.allocated_bytes + self._ssim.allocated_bytes + losses
+        """Return the size of the buffers for rendering and losses in host memory, in bytes."""
+        return self.engine.workspace_bytes
 
     def _drop_redundant(self) -> None:
         """Drop random keyframes of the fullest pose bin until one more fits; their Gaussians stay."""
@@ -153,6 +154,7 @@ class Mapper:
             gone = old[int(self._random.integers(len(old)))]
             self.keyframes.pop(gone, None)
             self.paged_out.pop(gone, None)
+            self.engine.forget(gone)
             self._bins.remove(gone)
             self._newest = [id for id in self._newest if id != gone]
             self.dropped_count += 1
@@ -227,10 +229,9 @@ class Mapper:
         in_all, here = self.settings.max_gaussians - self.store.paged_out_count, self.max_in_memory
         room = max(min(in_all, in_all if here is None else here) - self.store.count, 0)
         T_map_camera = self.T_map_camera(keyframe)
-        render = self._render(level, T_map_camera)
-        missing = unexplained_pixels(render.image, level, self.settings)
-        known = prediction_quality(render.image, level)
-        self.rasterizer.release(render)
+        image = self.render(level.camera, T_map_camera)
+        missing = unexplained_pixels(image, level, self.settings)
+        known = prediction_quality(image, level)
         u, v, new = new_gaussians(missing, level, T_map_camera, self.settings)
         sure = level.depth_weight[v, u] >= 255.0 * self.settings.sure_weight
         new = new[:, sure | ~self._in_free_space(new)]
@@ -246,24 +247,15 @@ class Mapper:
         """
         votes = np.zeros(params.shape[1], np.int32)
         for id in self._newest:
-            self._vote_carving(self.keyframes[id], params, params.shape[1], votes)
+            keyframe = self.keyframes[id]
+            T_map_camera = self.T_map_camera(keyframe)
+            count_votes(params, len(votes), keyframe.levels[HALF], T_map_camera, self.settings, votes)
         return votes > 0
-
-    def _vote_carving(
-        self, keyframe: StoredKeyframe, params: np.ndarray, count: int, votes: np.ndarray
-    ) -> None:
-        """Add the carving votes of a keyframe to `votes` int32 [N], for the first `count` Gaussians."""
-        level, s = keyframe.levels[HALF], self.settings
-        packed = level.camera.packed(inverse(self.T_map_camera(keyframe)))
-        least = np.uint8(255.0 * s.carve_weight)
-        count_carving_votes(
-            params, count, packed, level.depth_mm, level.depth_weight, least, s.carve_margin, votes
-        )
 
     def _prune(self, keyframe: StoredKeyframe) -> int:
         """Remove faint Gaussians and Gaussians with enough carving votes; return the number removed."""
         s, store = self.settings, self.store
-        self._vote_carving(keyframe, store.params, store.count, store.carving_votes)
+        self.engine.vote_carving(keyframe.levels[HALF], self.T_map_camera(keyframe), s)
         faint = np.log(s.prune_opacity / (1.0 - s.prune_opacity))
         keep = (store.carving_votes[: store.count] < s.carve_votes) & (
             store.params[OPACITY, : store.count] > faint
@@ -282,24 +274,18 @@ class Mapper:
         full = self.settings.full_iterations if full is None else full
         if not self.keyframes or self.store.count == 0:
             return 0.0
-        losses: list[float] = []
-        for size in (*repeat(HALF, half), *repeat(FULL, full)):
-            if self.must_stop():
-                break
-            losses.append(self.step(self._draw(), size))
-        return float(np.mean(losses)) if losses else 0.0
+        sizes = (*repeat(HALF, half), *repeat(FULL, full))
+        return self._run([(self._draw(), size) for size in sizes], refining=False)
 
     def refine(self, iterations: int, size: int = FULL) -> float:
         """Do `iterations` steps on keyframes in random order, each equally often; return the mean loss."""
         ids: list[int] = []
-        losses: list[float] = []
+        drawn: list[tuple[StoredKeyframe, int]] = []
         for _ in range(iterations):
-            if self.must_stop():
-                break
             if not ids:
                 ids = list(self._random.permutation(sorted(self.keyframes)))
-            losses.append(self.step(self.keyframes[int(ids.pop())], size, refining=True))
-        return float(np.mean(losses)) if losses else 0.0
+            drawn.append((self.keyframes[int(ids.pop())], size))
+        return self._run(drawn, refining=True)
 
     def _draw(self) -> StoredKeyframe:
         """Return a random keyframe: with probability 1/2 one of the newest, else any."""
@@ -311,58 +297,17 @@ class Mapper:
 
         `size` is FULL or HALF; `refining` selects the lower step size of the centres.
         """
-        level = keyframe.levels[size]
-        T_map_camera = self.T_map_camera(keyframe)
-        render = self._render(level, T_map_camera)
-        if level.hidden is not None:
-            level = with_hidden(level, render.image, keyframe.exposure)
-        loss, gradient = self._loss(render, level, keyframe)
-        gradients = self.rasterizer.backward(render, gradient)
+        return self._run([(keyframe, size)], refining=refining)
+
+    def _run(self, drawn: list[tuple[StoredKeyframe, int]], *, refining: bool) -> float:
+        """Let the engine do one step per (keyframe, size); return the mean loss, 0 without any step."""
         s = self.settings
-        pixels = level.camera.width_px * level.camera.height_px
-        self.store.step(
-            self.rasterizer.team, gradients, self._refining_rates if refining else self._rates,
-            s.isotropy_weight / pixels, np.log(s.isotropy_ratio),
-        )  # fmt: skip
-        if s.refine_pose:
-            refine_pose(
-                keyframe, gradients.pose, (s.rates.pose_m, s.rates.pose_rad), (s.max_pose_m, s.max_pose_rad)
+        steps = [
+            OptimiserStep(
+                keyframe, size, s.ssim_weight > 0.0 and (self.steps + i) % s.ssim_every == 0, refining
             )
-        if s.refine_exposure:
-            rows = np.empty((level.camera.height_px, 6))
-            self.rasterizer.team.run(exposure_gradient, render.image, gradient, keyframe.exposure, rows)
-            refine_exposure(keyframe, rows.sum(axis=0), s.rates.exposure)
-        self.rasterizer.release(render)
-        self.steps += 1
-        return loss
-
-    def _render(self, level: PyramidLevel, T_map_camera: np.ndarray) -> Render:
-        return self.rasterizer.render(
-            self.store.params, self.store.count, level.camera, inverse(T_map_camera)
-        )
-
-    def _loss(
-        self, render: Render, level: PyramidLevel, keyframe: StoredKeyframe
-    ) -> tuple[float, np.ndarray]:
-        """Return the loss of a render against a level of a keyframe, and its gradient, float32 [5, H, W]."""
-        s, (h, w) = self.settings, level.depth_mm.shape
-        if (h, w) not in self._buffers:
-            self._buffers[h, w] = np.empty((5, h, w), np.float32), np.empty((h, 2))
-        gradient, sums = self._buffers[h, w]
-        with_ssim = s.ssim_weight > 0.0 and self.steps % s.ssim_every == 0
-        colour_scale = np.float32((1.0 - s.ssim_weight * with_ssim) / (3 * h * w))
-        self.rasterizer.team.run(
-            photometric_and_depth, render.image, level.rgb, level.depth_mm, level.depth_weight,
-            keyframe.exposure, colour_scale, np.float32(s.depth_weight / (h * w)), gradient, sums,
-        )  # fmt: skip
-        loss = float(sums[:, 0].sum() * colour_scale + sums[:, 1].sum())
-        if len(level.beam_pixels):
-            scale = np.float32(s.lidar_weight / len(level.beam_pixels))
-            loss += add_lidar(render.image, level.beam_pixels, level.beam_z_m, scale, gradient)
-        if with_ssim:
-            loss += self._ssim.add(
-                render.image, level.rgb, keyframe.exposure, s.ssim_weight, gradient, self.rasterizer.team
-            )
-        if level.hidden is not None:
-            gradient[:, level.hidden] = 0.0
-        return loss, gradient
+            for i, (keyframe, size) in enumerate(drawn)
+        ]
+        losses = self.engine.optimise(steps, self.T_map_anchor, s, self.must_stop)
+        self.steps += len(losses)
+        return float(np.mean(losses)) if losses else 0.0

@@ -13,7 +13,15 @@ from beamsplat.common.errors import UserError, reason
 from beamsplat.common.geometry.camera import Pinhole, Undistorter
 from beamsplat.common.geometry.depth_sigma import typical_sigma_m
 from beamsplat.common.mapfiles.session import Arrays, packed_arrays, unpacked_arrays
-from beamsplat.common.messages import CameraModel, Keyframe, KeyframeAck, MapChunk, MapPreview, MapState
+from beamsplat.common.messages import (
+    CameraModel,
+    Keyframe,
+    KeyframeAck,
+    MapChunk,
+    MapPreview,
+    MapRender,
+    MapState,
+)
 from beamsplat.common.messages.codec import encode, schema_of
 from beamsplat.common.messages.depth_png import depth_from_png, mask_from_png, sigma_from_png
 from beamsplat.common.messages.image_codec import decode_rgb
@@ -21,7 +29,7 @@ from beamsplat.common.messages.splat_codec import pack
 from beamsplat.common.raster.camera import RasterCamera
 from beamsplat.services.mapping.chunks import ChunkUpdate
 from beamsplat.services.mapping.keyframe import RgbdKeyframe
-from beamsplat.services.mapping.preview import KeyframeRender
+from beamsplat.services.mapping.preview import KeyframeRender, MapView
 
 _PIECE_BYTES = 4 << 20  # of a state in one message
 
@@ -64,12 +72,30 @@ def decode_keyframe(message: Keyframe, lens: Callable[[Pinhole], Undistorter]) -
 
 def preview_message(keyframe: Keyframe, view: KeyframeRender) -> MapPreview:
     """Return the preview message of a keyframe: the render of the map at its pose, as JPEG."""
-    bgr = cv2.cvtColor(view.rgb, cv2.COLOR_RGB2BGR)
-    render = cv2.imencode(".jpg", bgr, (cv2.IMWRITE_JPEG_QUALITY, 85))[1].ravel()
     return MapPreview(
-        stamp_ns=keyframe.stamp_ns, keyframe_id=keyframe.id, render=render, T_map_camera=view.T_map_camera,
-        camera=_camera_model(view.camera, keyframe.camera.T_body_camera),
+        stamp_ns=keyframe.stamp_ns, keyframe_id=keyframe.id, render=_jpeg(view.rgb, 85),
+        T_map_camera=view.T_map_camera, camera=_camera_model(view.camera, keyframe.camera.T_body_camera),
     )  # fmt: skip
+
+
+def render_message(view: MapView, T_map_camera: np.ndarray) -> MapRender:
+    """Return the map, rendered from the pose of a query, as a message.
+
+    Raises:
+        UserError: a message does not allow the camera.
+    """
+    camera = _camera_model(view.camera, np.eye(4))
+    if camera is None:
+        raise UserError("render: the camera's principal point is at the edge of the image")
+    return MapRender(
+        stamp_ns=0, render=_jpeg(view.rgb, 90), T_map_camera=T_map_camera, camera=camera,
+        left_out=view.left_out,
+    )  # fmt: skip
+
+
+def _jpeg(rgb: np.ndarray, quality: int) -> np.ndarray:
+    bgr = cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)
+    return cv2.imencode(".jpg", bgr, (cv2.IMWRITE_JPEG_QUALITY, quality))[1].ravel()
 
 
 def _camera_model(camera: RasterCamera, T_body_camera: np.ndarray) -> CameraModel | None:

@@ -15,6 +15,7 @@ from beamsplat.common.messages import (
     Keyframe,
     MapChunk,
     MapPoses,
+    MapRender,
     MapState,
     MapStatus,
     Message,
@@ -23,16 +24,18 @@ from beamsplat.common.messages import (
 from beamsplat.common.runtime.node import Input, Job, Node, Outputs, StopRequested
 from beamsplat.services.mapping.chunks import ChunkFeed, Viewpoint, chunk_snapshot, disk_params
 from beamsplat.services.mapping.config import MappingConfig
+from beamsplat.services.mapping.engines.choice import check_cuda, make_engine
 from beamsplat.services.mapping.intake import KeyframeIntake
 from beamsplat.services.mapping.mapper import FULL, HALF, InsertionResult, Mapper
 from beamsplat.services.mapping.messages import (
     ack,
     chunk_message,
     preview_message,
+    render_message,
     state_messages,
 )
-from beamsplat.services.mapping.preview import render_keyframe
-from beamsplat.services.mapping.queries import check_names, viewpoint_of
+from beamsplat.services.mapping.preview import render_keyframe, render_view
+from beamsplat.services.mapping.queries import check_names, view_of, viewpoint_of
 from beamsplat.services.mapping.session.checkpointer import CheckpointResult
 from beamsplat.services.mapping.session.live_session import LiveSession, MapSession, NoSession
 from beamsplat.services.mapping.session.paging import check_budget
@@ -63,8 +66,10 @@ class MappingNode(Node):
     _session: MapSession = NoSession()
 
     def check_resources(self) -> None:
-        """Check the memory budget, and that the folders can be written."""
+        """Check the engine, the memory budget, and that the folders can be written."""
         c = self.config
+        if c.engine == "cuda":
+            check_cuda()
         if c.memory_mb is not None:
             check_budget(c.memory_mb, c.session)
         for option, folder in (("save", c.save), ("session", c.session)):
@@ -78,7 +83,7 @@ class MappingNode(Node):
             half_iterations=c.half_steps, full_iterations=c.full_steps, max_gaussians=c.gaussians(),
             max_keyframes=c.max_keyframes, refine_pose=c.refine_pose, refine_exposure=c.refine_exposure,
         )  # fmt: skip
-        self._mapper = Mapper(settings, seed=c.seed, threads=c.threads)
+        self._mapper = Mapper(settings, seed=c.seed, engine=make_engine(c.engine, c.threads))
         self._mapper.must_stop = self.must_stop
         self._intake = KeyframeIntake(self._mapper)
         self._feed = ChunkFeed()
@@ -221,6 +226,7 @@ class MappingNode(Node):
             f", {rejected} refused (last: {outcome.status})" if not outcome.ok else ""
         )
         self.detail += f"; {session}" if session else ""
+        self.detail += f"; {m.engine.description}"
         return MapStatus(
             stamp_ns=stamp_ns, status=outcome.status, keyframes=keyframes, refused=rejected,
             gaussians=gaussians, steps=m.steps, loss=loss, foretold_share=outcome.predicted_coverage,
@@ -244,6 +250,16 @@ class MappingNode(Node):
         self._check_map("snapshot")
         for anchor, part in chunk_snapshot(self._mapper, viewpoint).items():
             yield chunk_message(self._mapper.T_map_anchor[anchor], anchor, part, 0)
+
+    def on_query_render(self, parameters: dict[str, str]) -> Iterator[MapRender]:
+        """Yield the map as a camera would see it.
+
+        Parameters: `position=X,Y,Z` (m) and `quaternion=X,Y,Z,W` of the optical frame in the map frame;
+        `width_px`, `height_px` and `focal_px` for another camera than that of the keyframes at half size.
+        """
+        T_map_camera, camera = view_of(parameters)
+        self._check_map("render")
+        yield render_message(render_view(self._mapper, T_map_camera, camera), T_map_camera)
 
     def on_query_state(self, parameters: dict[str, str]) -> Iterator[MapState]:
         """Yield the current state of the map, with the content of a checkpoint, in several messages."""

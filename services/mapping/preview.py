@@ -1,14 +1,19 @@
-"""Preview of the map from a keyframe's viewpoint, with its error against the keyframe."""
+"""Renders of the map from the viewpoint of a keyframe, with the error against it, and from any other."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
-from beamsplat.common.mapfiles.scores import render_rgb_depth
+from beamsplat.common.geometry.transforms import inverse
+from beamsplat.common.mapfiles.scores import rgb_depth_alpha
 from beamsplat.common.raster.camera import RasterCamera
+from beamsplat.common.raster.rasterizer import Rasterizer
 from beamsplat.services.mapping.mapper import HALF, Mapper
+
+_MOST_FROM_DISK = 500_000  # Gaussians read for one render: 28 MB
 
 
 @dataclass(frozen=True)
@@ -31,7 +36,7 @@ def render_keyframe(mapper: Mapper, id: int) -> KeyframeRender:
     keyframe = mapper.keyframes[id]
     level = keyframe.levels[HALF]
     T_map_camera = mapper.T_map_camera(keyframe)
-    rgb, depth, alpha = render_rgb_depth(mapper.rasterizer, mapper.store, level.camera, T_map_camera)
+    rgb, depth, alpha = rgb_depth_alpha(mapper.render(level.camera, T_map_camera))
     shown = np.clip(rgb * np.exp(keyframe.exposure[:3]) + keyframe.exposure[3:], 0.0, 1.0)
     truth = level.rgb.transpose(1, 2, 0).astype(np.float32) / 255.0
     static = np.ones(truth.shape[:2], bool) if level.hidden is None else ~level.hidden
@@ -43,3 +48,34 @@ def render_keyframe(mapper: Mapper, id: int) -> KeyframeRender:
         float(-10.0 * np.log10(max(error, 1e-12))),
         float(np.median(depth_error)) if len(depth_error) else float("nan"),
     )  # fmt: skip
+
+
+class MapView(NamedTuple):
+    """The map rendered from any pose."""
+
+    rgb: np.ndarray  # uint8 [H, W, 3]
+    camera: RasterCamera
+    left_out: int  # Gaussians that may be in view, but are on disk and were not read
+
+
+def render_view(mapper: Mapper, T_map_camera: np.ndarray, camera: RasterCamera | None) -> MapView:
+    """Render the map from a pose, with what is on disk; the map itself stays as it is.
+
+    Args:
+        camera: None = the camera of the newest keyframe in memory, at half size.
+    """
+    if camera is None:
+        camera = next(k.levels[HALF].camera for k in reversed(mapper.keyframes.values()))
+    params, count, parts, left_out = mapper.store.params, mapper.store.count, [], 0
+    if mapper.disk_gaussians is not None:
+        parts, left_out = mapper.disk_gaussians.read_visible(
+            camera, T_map_camera, mapper.T_map_anchor, _MOST_FROM_DISK
+        )
+    if parts:
+        whole = np.concatenate([params[:, :count], *parts], axis=1)
+        count = whole.shape[1]
+        params = np.pad(whole, ((0, 0), (0, -count % 16)))
+    # A rasterizer of its own: that of the mapper would keep buffers for the largest image ever asked for.
+    render = Rasterizer(1).render(params, count, camera, inverse(T_map_camera))
+    rgb = (np.clip(render.image[:3].transpose(1, 2, 0), 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
+    return MapView(rgb, camera, left_out)

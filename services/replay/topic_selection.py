@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from beamsplat.common.errors import UserError
 from beamsplat.common.recording.sensors import SENSORS
-from beamsplat.common.recording.topic_choice import Candidate, choose_topic
+from beamsplat.common.recording.topic_choice import Candidate, choose_topic, left_out_by_name
 from beamsplat.services.replay.bags import BagTopic
 from beamsplat.services.replay.options import SourceOptions
 
@@ -59,6 +59,7 @@ def select_topics(
         if choice.reason and not options.topic_for(sensor_name):
             choices.append(f"{choice.topic.name} is {choice.reason}")
     if "image" not in selected and "image" not in options.without:
+        left_out |= left_out_by_name(listed, "image")
         unused = [f"{name} is not used: {why}" for name, why in left_out.items()]
     for sensor_name in sorted(options.require - options.without):
         if sensor_name not in selected:

@@ -4,7 +4,12 @@ from __future__ import annotations
 
 from beamsplat.common.recording.camera_info import CAMERA_INFO
 from beamsplat.common.recording.sensors import SENSORS
-from beamsplat.common.recording.topic_choice import Candidate, choose_camera_info, choose_topic
+from beamsplat.common.recording.topic_choice import (
+    Candidate,
+    choose_camera_info,
+    choose_topic,
+    left_out_by_name,
+)
 
 IMAGE = "sensor_msgs/msg/Image"
 TF = "tf2_msgs/msg/TFMessage"
@@ -40,6 +45,8 @@ def select_topics(
             chosen[kind] = choice.topic.name
             if choice.reason and not named:
                 notes.append(f"{choice.topic.name} is {choice.reason}")
+        elif kind == "image":
+            notes += [f"{name} is not used: {why}" for name, why in left_out_by_name(topics, kind).items()]
     return chosen, notes
 
 

@@ -33,7 +33,8 @@ from beamsplat.common.runtime.node import Input, Job, Node, Outputs, QueryFuncti
 from beamsplat.common.zenoh.bus import open_session
 from beamsplat.common.zenoh.rmw import RmwQos
 from beamsplat.common.zenoh.ros_publishers import RosPublishers, ros_topic
-from beamsplat.services.ros2_out import conversions, images
+from beamsplat.common.zenoh.ros_subscription import RosSubscription
+from beamsplat.services.ros2_out import conversions, images, map_views
 from beamsplat.services.ros2_out.config import Ros2OutConfig
 from beamsplat.services.ros2_out.grid_publisher import GridPublisher
 from beamsplat.services.ros2_out.splat_cloud import SplatCloud
@@ -80,7 +81,8 @@ class Ros2OutNode(Node):
         self._mapper = ""  # instance of the process that sent the newest chunk
         self._camera: CameraModel | None = None
         self._session = open_session((c.router,))
-        moves = c.tf or c.render_topic
+        views = c.view_topic if c.view_pose_topic and self._ask is not None else ""
+        moves = c.tf or c.render_topic or views
         topics = (
             ("pose", c.pose_topic, conversions.POSE, _VOLATILE),
             ("pose_covariance", c.pose_covariance_topic, conversions.POSE_COVARIANCE, _VOLATILE),
@@ -94,11 +96,21 @@ class Ros2OutNode(Node):
             ("map_cloud", c.map_cloud_topic, conversions.CLOUD, _LATCHED),
             ("render", c.render_topic, images.IMAGE, _VOLATILE),
             ("render_info", images.info_topic(c.render_topic), images.CAMERA_INFO, _VOLATILE),
+            ("view", views, images.IMAGE, _VOLATILE),
+            ("view_info", images.info_topic(views), images.CAMERA_INFO, _VOLATILE),
         )
         self._ros = RosPublishers(
             self._session, c.domain,
             {name: ros_topic(topic, type_name, qos) for name, topic, type_name, qos in topics if topic},
         )  # fmt: skip
+        if views and (ask := self._ask) is not None:
+
+            def on_pose(cdr: bytes) -> None:
+                self._publish_view(cdr, ask)
+
+            self._view_requests = RosSubscription(
+                self._session, c.domain, c.view_pose_topic, map_views.POSE, on_pose
+            )
 
     def on_header(self, header: Header) -> None:
         if header.producer == "mapping":
@@ -213,6 +225,21 @@ class Ros2OutNode(Node):
         self._ros.put("render_info", lambda: images.camera_info(stamp_ns, frame, pinhole))
         self._put_built("tf", ros.tf_message([pose]))
         return self._done()
+
+    def _publish_view(self, cdr: bytes, ask: QueryFunction) -> None:
+        """Publish the map as seen from the pose in a message of the robot; called in the receiving thread."""
+        try:
+            view = map_views.render_request(cdr, self.config, ask)
+        except ValueError as error:
+            self.rejections.add(f"view of the map not published: {error}")
+            return
+        stamp_ns, frame = view.stamp_ns, self.config.view_frame
+        if view.left_out:
+            self.rejections.add(f"view of the map incomplete: {view.left_out} Gaussians are left out")
+        pose = ros.tf(stamp_ns, self.config.map_frame, frame, view.T_map_camera)
+        self._ros.put("view", lambda: images.rgb_image(stamp_ns, frame, view.rgb))
+        self._ros.put("view_info", lambda: images.camera_info(stamp_ns, frame, view.camera))
+        self._put_built("tf", ros.tf_message([pose]))
 
     def drain(self) -> Outputs:
         """Publish the last state of the map."""

@@ -27,6 +27,7 @@ from beamsplat.common.messages import (
     MapChunk,
     MapPoses,
     MapPreview,
+    MapRender,
     MapState,
     MapStatus,
     Message,
@@ -111,6 +112,13 @@ def sample_messages() -> list[Message]:
         MapState(stamp_ns=27, first=4, total=9, data=np.arange(5, dtype=np.uint8)),
         MapPoses(
             stamp_ns=28, keyframe_ids=np.array([26, 30]), stamps_ns=np.array([26, 30]), T_map_body=T,
+        ),
+        MapRender(
+            stamp_ns=0, render=np.arange(6, dtype=np.uint8), T_map_camera=T[0], left_out=12,
+            camera=CameraModel(
+                width_px=320, height_px=240, fx_px=250.5, fy_px=251.0, cx_px=159.25, cy_px=119.5,
+                T_body_camera=np.eye(4),
+            ),
         ),
         MapPreview(
             stamp_ns=26, keyframe_id=26, render=np.arange(6, dtype=np.uint8), T_map_camera=T[0],

@@ -20,10 +20,20 @@ NUMBERS = st.one_of(
 )  # fmt: skip
 POINTS = st.lists(NUMBERS, max_size=4).map(",".join)
 SOUND = {"from": "1,2,0.5", "focal_px": "300", "error_px": "2"}
+SOUND_VIEW = {
+    "position": "0,0,0.4",
+    "quaternion": "-0.5,0.5,-0.5,0.5",
+    "width_px": "32",
+    "height_px": "24",
+    "focal_px": "30",
+}
+NAMES = [*SOUND, *SOUND_VIEW]
 PARAMETERS = st.one_of(
-    st.dictionaries(st.one_of(st.sampled_from([*SOUND, "set"]), st.text(max_size=8)), st.one_of(NUMBERS, POINTS)),
+    st.dictionaries(st.one_of(st.sampled_from([*NAMES, "set"]), st.text(max_size=8)), st.one_of(NUMBERS, POINTS)),
     st.tuples(st.sampled_from(list(SOUND)), NUMBERS).map(lambda change: {**SOUND, change[0]: change[1]}),
     POINTS.map(lambda point: {**SOUND, "from": point}),
+    st.tuples(st.sampled_from(list(SOUND_VIEW)), st.one_of(NUMBERS, POINTS)).map(
+        lambda change: {**SOUND_VIEW, change[0]: change[1]}),
 )  # fmt: skip
 
 
@@ -36,7 +46,7 @@ def mapper():
 PREPARED = {"mapping": mapper}  # node -> one that can answer
 
 
-QUERIES = [("mapping", "snapshot"), ("mapping", "state")]
+QUERIES = [("mapping", "render"), ("mapping", "snapshot"), ("mapping", "state")]
 
 
 def test_no_query_of_a_node_is_left_out():
@@ -66,7 +76,7 @@ def test_any_parameters_give_messages_or_an_error_that_names_one_of_them(nodes, 
             fault = str(error)
         if fault:
             assert fault.startswith(f"{query}: ")
-            assert any(ascii(parameter)[1:-1][:60] in fault for parameter in parameters)
+            assert not parameters or any(ascii(parameter)[1:-1][:60] in fault for parameter in parameters)
             assert len(fault) < 400
 
     check()
@@ -87,7 +97,7 @@ def test_a_bad_number_is_refused_with_its_name_and_value(nodes, parameter, value
     [
         ({"from": "0,0,0"}, "snapshot: the parameter focal_px is missing"),
         ({"focal_px": "300"}, "snapshot: the parameter from is missing"),
-        ({"from": "0,0", "focal_px": "300"}, "from=0,0: expected three numbers"),
+        ({"from": "0,0", "focal_px": "300"}, "from=0,0: expected 3 numbers X,Y,Z"),
         ({**SOUND, "focal": "3"}, "unknown parameter focal=3: its parameters are from, focal_px, error_px"),
     ],
 )
@@ -100,7 +110,31 @@ def test_an_empty_map_is_an_error_and_no_silence():
     node = maps.make_node()
     for query in node.queries():
         with pytest.raises(UserError, match="the map is still empty"):
-            answers(node, query, {})
+            answers(node, query, SOUND_VIEW if query == "render" else {})
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"quaternion": "0,0,0,0"}, "quaternion=0,0,0,0: expected a quaternion that is not zero"),
+        ({"quaternion": "0,0,1"}, "quaternion=0,0,1: expected 4 numbers X,Y,Z,W"),
+        ({"position": "0,nan,0"}, "position=0,nan,0: expected a number from -1e\\+06 to 1e\\+06"),
+        ({"width_px": "15"}, "width_px=15: expected a number from 16 to 2048"),
+        ({"height_px": "1e6"}, "height_px=1e6: expected a number from 16 to 2048"),
+        ({"focal_px": "0"}, "focal_px=0: expected a number from 0.64 to 3200"),
+        ({"focal_px": "1e4"}, "focal_px=1e4: expected a number from 0.64 to 3200"),
+    ],
+)
+def test_a_bad_view_is_refused_with_its_name_and_value(nodes, change, words):
+    with pytest.raises(UserError, match=f"render: {words}"):
+        answers(nodes["mapping"], "render", {**SOUND_VIEW, **change})
+
+
+def test_a_camera_needs_all_its_parameters(nodes):
+    for left in ("position", "quaternion", "width_px", "height_px", "focal_px"):
+        given = {name: value for name, value in SOUND_VIEW.items() if name != left}
+        with pytest.raises(UserError, match=f"render: the parameter {left} is missing"):
+            answers(nodes["mapping"], "render", given)
 
 
 def test_sound_parameters_give_finite_gaussians(nodes):

@@ -16,7 +16,7 @@ from beamsplat.common.geometry.beams import project_beams
 from beamsplat.common.geometry.camera import Pinhole
 from beamsplat.common.geometry.transforms import make_transform, so3_exp
 from beamsplat.common.mapfiles.ply import read_ply_points, write_gaussian_ply
-from beamsplat.common.mapfiles.scores import ViewScore, f_score, fused_surface, render_rgb_depth, score_view
+from beamsplat.common.mapfiles.scores import ViewScore, f_score, fused_surface, rgb_depth_alpha, score_view
 from beamsplat.common.raster.camera import RasterCamera
 from beamsplat.services.mapping.keyframe import RgbdKeyframe
 from beamsplat.services.mapping.mapper import HALF, Mapper
@@ -191,7 +191,7 @@ def write_comparison_images(recording: TruthDataset, mapper: Mapper, out: Path) 
     camera = raster_camera(recording.camera)
 
     def write(name: str, T_map_camera: np.ndarray, truth: np.ndarray) -> None:
-        rgb, _, _ = render_rgb_depth(mapper.rasterizer, mapper.store, camera, T_map_camera)
+        rgb, _, _ = rgb_depth_alpha(mapper.render(camera, T_map_camera))
         both = np.hstack([truth, (rgb * 255.0 + 0.5).astype(np.uint8)])
         cv2.imwrite(str(out / name), cv2.cvtColor(both, cv2.COLOR_RGB2BGR))
 
@@ -242,12 +242,11 @@ def score_map(
     off, held = [], []
     for view in recording.offpath_views:
         true_rgb = cv2.cvtColor(cv2.imread(str(view.image_file)), cv2.COLOR_BGR2RGB)
-        rgb, depth, _ = render_rgb_depth(mapper.rasterizer, mapper.store, camera, view.T_map_camera)
+        rgb, depth, _ = rgb_depth_alpha(mapper.render(camera, view.T_map_camera))
         off.append(score_view(rgb, depth, true_rgb, read_depth_png(view.depth_file)))
     for index in range(HELD_OUT_AT, len(recording.posed_images), HELD_OUT_EVERY):
-        rgb, depth, _ = render_rgb_depth(
-            mapper.rasterizer, mapper.store, camera, recording.posed_images[index].T_map_camera
-        )
+        T_map_camera = recording.posed_images[index].T_map_camera
+        rgb, depth, _ = rgb_depth_alpha(mapper.render(camera, T_map_camera))
         held.append(score_view(rgb, depth, recording.image(index), None))
     figures = {
         "psnr_offpath_db": _mean(off, "psnr_db"), "ssim_offpath": _mean(off, "ssim"),
@@ -260,7 +259,8 @@ def score_map(
     if true_surface_m is not None:
         half = camera.resized(camera.width_px // 2, camera.height_px // 2)
         views = [(half, mapper.T_map_camera(held)) for held in mapper.keyframes.values()]
-        figures |= f_score(fused_surface(mapper.rasterizer, mapper.store, views), true_surface_m)
+        points_m = fused_surface(lambda c, T: rgb_depth_alpha(mapper.render(c, T)), views)
+        figures |= f_score(points_m, true_surface_m)
     return figures
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -91,7 +92,9 @@ def _score(
     if surface.is_file() and record.keyframe_poses is not None:
         half = camera.resized(camera.width_px // 2, camera.height_px // 2)
         poses = [(half, T @ truth.drive.T_body_camera) for T in record.keyframe_poses]
-        points = transform_points(T_world_map, fused_surface(rasterizer, store, poses))
+        points = transform_points(
+            T_world_map, fused_surface(partial(render_rgb_depth, rasterizer, store), poses)
+        )
         figures |= f_score(points, read_ply_points(surface))
     rasterizer.close()
     return figures, images

@@ -25,7 +25,9 @@ from beamsplat.common.mapfiles.blocks import (
 )
 from beamsplat.common.mapfiles.session import SessionFolder
 from beamsplat.common.mapfiles.store import GaussianStore
+from beamsplat.common.raster.camera import RasterCamera
 from beamsplat.common.raster.layout import MEAN, QUAT, SCALE
+from beamsplat.services.mapping.session.frustum import frustum_intersects
 
 log = logging.getLogger("beamsplat.mapping")
 
@@ -123,6 +125,36 @@ class DiskTier:
                 yield read_block(self._folder.blocks, block, T_map_anchor)["params"]
             except UserError as error:
                 log.warning("%d Gaussians are not shown: %s", block.count, error)
+
+    def read_visible(
+        self,
+        camera: RasterCamera,
+        T_map_camera: np.ndarray,  # float64 [4, 4]
+        T_map_anchor: dict[int, np.ndarray],
+        max_count: int,
+    ) -> tuple[list[np.ndarray], int]:
+        """Read at most `max_count` Gaussians on disk that a camera may see, the nearest blocks first.
+
+        They stay on disk. Returns:
+            The blocks, float32 [14, N] each, in the map frame, and the number of Gaussians left out: of files
+            that cannot be read, and those beyond `max_count`.
+        """
+        numbers, centres, radii = self.spheres(T_map_anchor)
+        seen = np.flatnonzero(frustum_intersects(camera, T_map_camera, np.inf, centres, radii))
+        distance_m = np.linalg.norm(centres[seen] - T_map_camera[:3, 3], axis=1)
+        parts, total, left_out = [], 0, 0
+        for number in numbers[seen[np.argsort(distance_m, kind="stable")]].tolist():
+            block = self.blocks[number]
+            if total + block.count > max_count:
+                left_out += block.count
+                continue
+            try:
+                parts.append(read_block(self._folder.blocks, block, T_map_anchor[block.anchor])["params"])
+                total += block.count
+            except UserError as error:
+                log.warning("%d Gaussians are not shown: %s", block.count, error)
+                left_out += block.count
+        return parts, left_out
 
     # --- geometry ---
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from beamsplat.common.errors import UserError
 from beamsplat.common.mapfiles.blocks import Arrays
-from beamsplat.common.mapfiles.state import CAMERA_FIELDS, camera_of, progress_of, store_of
+from beamsplat.common.mapfiles.state import CAMERA_FIELDS, camera_of, progress_of, restore_store
 from beamsplat.services.mapping.keyframe import (
     DeferredLevels,
     PyramidLevel,
@@ -82,7 +82,7 @@ def restore(
     """
     lost = []
     try:
-        mapper.store = store_of(arrays)
+        restore_store(mapper.store, arrays)
         anchors = zip(arrays["anchor_id"].tolist(), arrays["anchor_T_map"])
         mapper.T_map_anchor = {anchor: T.copy() for anchor, T in anchors}
         ids = arrays["keyframe_id"].tolist()

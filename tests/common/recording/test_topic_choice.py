@@ -3,7 +3,12 @@
 import pytest
 
 from beamsplat.common.errors import UserError
-from beamsplat.common.recording.topic_choice import Candidate, choose_camera_info, choose_topic
+from beamsplat.common.recording.topic_choice import (
+    Candidate,
+    choose_camera_info,
+    choose_topic,
+    left_out_by_name,
+)
 
 TYPES = {
     "scan": "sensor_msgs/msg/LaserScan", "odometry": "nav_msgs/msg/Odometry", "raw": "sensor_msgs/msg/Image",
@@ -96,3 +101,14 @@ def test_the_camera_info_of_an_image_is_the_one_beside_it():
     assert choose_camera_info(infos, "/image_raw", "drive") == "/camera_info"
     with pytest.raises(UserError, match="--camera-info-topic"):
         choose_camera_info(topics("info", "/a/camera_info", "/b/camera_info"), "/c/image", "drive")
+
+
+def test_images_that_are_left_out_by_their_names_are_listed_with_the_word():
+    found = topics("raw", "/depth_cam/depth/image_raw", "/depth_cam/rgb/image_raw", "/seg/semantic_mask")
+    left_out = left_out_by_name(found, "image")
+    assert set(left_out) == {"/depth_cam/depth/image_raw", "/seg/semantic_mask"}
+    assert "'depth'" in left_out["/depth_cam/depth/image_raw"]
+    assert "'mask', 'semantic'" in left_out["/seg/semantic_mask"]
+    assert chosen("image", found)[0] == "/depth_cam/rgb/image_raw"
+    named = chosen("image", found, named="/seg/semantic_mask")
+    assert named[0] == "/seg/semantic_mask"

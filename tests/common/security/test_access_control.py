@@ -16,8 +16,8 @@ HOSTS = {
     "monitor_of_r1": HostRole(role="monitor", robot="r1"),
     "edge": HostRole(role="edge"),
 }
-QUERIES = ("snapshot", "state", "params", "swap", "set_params", "restart")
-READ_ONLY = {"snapshot", "state", "params"}
+QUERIES = ("snapshot", "render", "state", "params", "swap", "set_params", "restart")
+READ_ONLY = {"snapshot", "render", "state", "params"}
 
 
 @functools.cache

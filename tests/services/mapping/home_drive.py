@@ -82,10 +82,7 @@ def home(width_px=160, keyframes_a_lap=60):
 
 def rendered(mapper, camera, T_map_camera):
     """float32 [3, H, W] of what is in the mapper's memory."""
-    render = mapper.rasterizer.render(mapper.store.params, mapper.store.count, camera, inverse(T_map_camera))
-    image = np.clip(render.image[:3], 0.0, 1.0).copy()
-    mapper.rasterizer.release(render)
-    return image
+    return np.clip(mapper.render(camera, T_map_camera)[:3], 0.0, 1.0)
 
 
 def psnr_db(a, b):

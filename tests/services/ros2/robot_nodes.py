@@ -80,6 +80,15 @@ class RobotNode:
         self.endpoint("MS", topic, ros, latched)
         return got
 
+    def publish(self, topic, message):
+        """Publish one message once the robot's node has seen a subscription to the topic."""
+        ros = message.__msgtype__
+        tokens = f"@ros2_lv/{self.domain}/*/*/*/MS/*/*/*/{topic.replace('/', '%')}/{dds_name(ros)}/{self.type_hash(ros)}/*"
+        wait(lambda: [r for r in self.session.liveliness().get(tokens, timeout=1.0) if r.ok is not None])
+        key = f"{self.domain}{topic}/{dds_name(ros)}/{self.type_hash(ros)}"
+        attachment = ze.z_serialize((ze.Int64(1), ze.Int64(time.time_ns()), bytes(16)))
+        self.session.put(key, bytes(self.store.serialize_cdr(message, ros)), attachment=attachment)
+
     def end(self):
         for entity in self._kept:
             entity.undeclare()

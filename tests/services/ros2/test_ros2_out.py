@@ -23,12 +23,16 @@ from beamsplat.common.messages import (
 )
 from beamsplat.common.messages.header import Header
 from beamsplat.common.messages.splat_codec import pack
+from beamsplat.common.recording import ros_types as ros
 from beamsplat.common.zenoh.bus import open_session
 from beamsplat.services.ros2_out.config import Ros2OutConfig
 from beamsplat.services.ros2_out.node import Ros2OutNode
+from tests.services.mapping import room_drive
+from tests.services.mapping.session import maps
 from tests.services.ros2.robot_nodes import RobotNode, image_of, matrix, points_of, wait
 
 DOMAIN = 11
+POSE_TOPIC = "/beamsplat/map_view/pose"
 S = 10**9
 IMAGE, INFO = "sensor_msgs/msg/Image", "sensor_msgs/msg/CameraInfo"
 CLOUD, TF, POSE = "sensor_msgs/msg/PointCloud2", "tf2_msgs/msg/TFMessage", "geometry_msgs/msg/PoseStamped"
@@ -268,3 +272,48 @@ def test_the_map_as_a_camera_has_pose_and_intrinsics_of_the_render(router_endpoi
     off = np.abs(image_of(image).astype(int) - rgb)
     assert off[:, :12].max() <= 8
     assert off[:, 20:].max() <= 8
+
+
+@pytest.mark.parametrize("distribution", ["humble", "jazzy"])
+def test_the_map_is_rendered_from_the_pose_that_a_node_asks_for(router_endpoint, distribution):
+    mapper = maps.make_node(half_steps=40, full_steps=20)
+    maps.feed(mapper, range(4))
+    node = Ros2OutNode(Ros2OutConfig(domain=DOMAIN, router=router_endpoint))
+    node.set_query_function(lambda name, query, given, _: getattr(mapper, f"on_query_{query}")(given))
+    camera = room_drive.CAMERA_MODEL
+    T_body_view = np.eye(4)  # x forward, z up, at the camera
+    T_body_view[:3, 3] = camera.T_body_camera[:3, 3]
+    with open_session((router_endpoint,)) as session:
+        robot = RobotNode(session, DOMAIN, distribution)
+        images = robot.subscribe("/beamsplat/map_view/image", IMAGE)
+        infos = robot.subscribe("/beamsplat/map_view/camera_info", INFO)
+        moves = robot.subscribe("/tf", TF)
+        try:
+            node.configure()
+            wait_for_match(node, "view", "view_info", "tf")
+            robot.publish(POSE_TOPIC, ros_pose("odom", room_drive.T_map_body(2) @ T_body_view, 5))
+            wait(lambda: node.rejections.report())
+            robot.publish(POSE_TOPIC, ros_pose("map", room_drive.T_map_body(2) @ T_body_view, 6))
+            wait(lambda: images and infos and moves, say=lambda: str(node.rejections.report()))
+        finally:
+            node.close()
+    ((image, _),), ((info, _),), ((move, _),) = images, infos, moves
+    (entry,) = node.rejections.report()
+    assert (
+        entry.reason
+        == f"view of the map not published: {POSE_TOPIC}: header.frame_id = 'odom': expected 'map'"
+    )
+    assert image.header == info.header
+    assert (image.header.stamp.sec, image.header.frame_id) == (6, "beamsplat_map_view")
+    assert move.transforms[0].header.frame_id == "map"
+    seen_from = room_drive.T_map_body(2) @ camera.T_body_camera
+    assert matrix(move.transforms[0].transform) == pytest.approx(seen_from, abs=1e-9)
+    assert (image.width, image.height) == (80, 60)
+    assert np.reshape(info.k, (3, 3))[0, 0] == pytest.approx(camera.fx_px / 2)
+    truth = cv2.resize(room_drive.shot(2)[0], (80, 60), interpolation=cv2.INTER_AREA)
+    error = np.mean((image_of(image) / 255.0 - truth / 255.0) ** 2)
+    assert -10.0 * np.log10(error) > 20.0  # the map was optimised for a moment only
+
+
+def ros_pose(frame, T, sec):
+    return ros.new(POSE, header=ros.header(sec * S, frame), pose=ros.pose(T))

@@ -43,7 +43,7 @@ KIND_HEADINGS = {
     "down": "topics to the robot", "down end": "their end markers", "down history": "their caches",
     "host": "topics that stay on a host", "host end": "their end markers", "host history": "their caches",
     "health": "health of any node", "alive": "tokens of active nodes", "failed": "tokens of failed nodes",
-    "reading query": "queries `params`, `snapshot`, `state`",
+    "reading query": "queries `params`, `render`, `snapshot`, `state`",
     "changing query": "all other queries (`restart`, `swap`, ...)",
     "request": "hand-over requests to a process", "operator": "commands of the operator", "unknown": "any other key of this robot",
     "foreign": "keys outside `beamsplat/`", PATTERN: "one wildcard for all keys of this robot",
@@ -198,7 +198,7 @@ def render(edge: tuple[Router, Effects], local: tuple[Router, Effects], requests
         "",
         "## Processes of a robot with `security.local`",
         "",
-        "Queries: reading = `params`, `snapshot`, `state`; changing = all others; operator = commands that may set any",
+        "Queries: reading = `params`, `render`, `snapshot`, `state`; changing = all others; operator = commands that may set any",
         "option; requests = hand-over of a process; router = state of the router. Who publishes a topic also publishes its end marker and answers queries to its cache.",
         "",
         *_table(

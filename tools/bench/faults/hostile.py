@@ -32,7 +32,10 @@ VALUES = (
     "a,b,c", "9" * 400, "x" * 50_000, "{", "[1]", "[[]]", '["kind=../../etc/passwd"]', '["nice=99"]',
     '["=", "a.b.c=1", "\\u0000=1"]', '{"said": {"": "x"}}', '{"handled": 1}', "%00%ff", "../../..", "\u202e",
 )  # fmt: skip
-PARAMETERS = ("from", "focal_px", "error_px", "set", "cold", "after", "add", "unknown")
+PARAMETERS = (
+    "from", "focal_px", "error_px", "position", "quaternion", "width_px", "height_px", "set",
+    "cold", "after", "add", "unknown",
+)  # fmt: skip
 VERBS = ("swap", "params")  # of the supervisor; `restart` is a fault of its own, because it always works
 
 

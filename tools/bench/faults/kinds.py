@@ -33,7 +33,7 @@ from beamsplat.tools.system.assembly import node_classes
 Target = tuple[Role, str]  # host and process
 HOUR_S = 3600.0
 FROZEN_S = 10.0
-_READ_ONLY = ("snapshot", "state")
+_READ_ONLY = ("snapshot", "render", "state")
 
 
 @dataclass

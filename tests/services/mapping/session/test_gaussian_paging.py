@@ -19,6 +19,7 @@ from beamsplat.common.messages.splat_codec import unpack
 from beamsplat.common.raster.layout import MEAN, SCALE
 from beamsplat.services.mapping.chunks import disk_params
 from beamsplat.services.mapping.keyframe import MAX_DEPTH_M
+from beamsplat.services.mapping.preview import render_view
 from beamsplat.services.mapping.session.disk_tier import CELL_M, groups_of, spheres_of
 from beamsplat.services.mapping.session.frustum import frustum_intersects
 from beamsplat.services.mapping.session.paging import PROCESS_MB
@@ -48,12 +49,7 @@ def rows(store):
 
 
 def picture(mapper, place):
-    render = mapper.rasterizer.render(
-        mapper.store.params, mapper.store.count, gallery.CAMERA, inverse(gallery.T_map_camera(place))
-    )
-    image = np.clip(render.image[:3], 0.0, 1.0).copy()
-    mapper.rasterizer.release(render)
-    return image
+    return np.clip(mapper.render(gallery.CAMERA, gallery.T_map_camera(place))[:3], 0.0, 1.0)
 
 
 def psnr_db(a, b):
@@ -154,6 +150,41 @@ def test_paged_out_gaussians_render_the_same_after_page_in(walked):
     checkpointer.disk_tier.page_in(mapper.store, list(checkpointer.disk_tier.blocks), mapper.T_map_anchor)
     stored = {tuple(row) for row in rows(mapper.store)}
     assert {tuple(row) for row in whole} <= stored
+
+
+def test_a_render_of_any_pose_includes_what_is_on_disk(walked):
+    """All Gaussians leave: each painting is rendered as before, and nothing comes back into memory."""
+    _, node = walked
+    mapper, disk_tier = node._mapper, node._session._checkpointer.disk_tier
+    disk_tier.page_in(mapper.store, list(disk_tier.blocks), mapper.T_map_anchor)
+    cameras = {place: gallery.T_map_camera(place) for place in (0, 17, 39)}
+    before = {place: render_view(mapper, T, gallery.CAMERA) for place, T in cameras.items()}
+    for place, view in before.items():
+        assert psnr_db(view.rgb / 255.0, gallery.painting(place) / 255.0) > 18.0
+    disk_tier.page_out(mapper.store, groups_of(mapper.store, mapper.T_map_anchor), mapper.T_map_anchor)
+    kept = mapper.store.count
+    for place, T in cameras.items():
+        view = render_view(mapper, T, gallery.CAMERA)
+        assert view.left_out == 0
+        # Not more: many Gaussians have one depth, and which of them is drawn first depends on their order.
+        assert psnr_db(view.rgb / 255.0, before[place].rgb / 255.0) > 30.0
+    assert mapper.store.count == kept
+
+
+def test_what_cannot_be_read_for_a_render_is_counted(walked):
+    folder, node = walked
+    mapper, disk_tier = node._mapper, node._session._checkpointer.disk_tier
+    disk_tier.page_out(mapper.store, groups_of(mapper.store, mapper.T_map_anchor), mapper.T_map_anchor)
+    T, camera = gallery.T_map_camera(3), gallery.CAMERA
+    parts, left_out = disk_tier.read_visible(camera, T, mapper.T_map_anchor, 10**9)
+    in_view = sum(part.shape[1] for part in parts)
+    assert in_view > 100
+    assert left_out == 0
+    few, left_out = disk_tier.read_visible(camera, T, mapper.T_map_anchor, in_view // 2)
+    assert sum(part.shape[1] for part in few) + left_out == in_view
+    for block in disk_tier.blocks.values():
+        block_file(SessionFolder(folder).blocks, block.number).write_bytes(b"damaged")
+    assert render_view(mapper, T, camera).left_out == in_view
 
 
 def test_anchors_move_gaussians_on_disk(walked):

@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 
 from beamsplat.common.errors import UserError
-from beamsplat.common.geometry.transforms import inverse
 from beamsplat.common.mapfiles.session import EDGE_MANIFEST, MANIFEST, SessionFolder
 from beamsplat.common.mapfiles.state import keyframe_views, progress_of
 from beamsplat.common.messages import Tick
@@ -36,10 +35,7 @@ GOLDEN = Path(__file__).parent / "golden"
 
 def picture(mapper, number=2):
     T_map_camera = r.T_map_body(number) @ r.T_BODY_CAMERA
-    render = mapper.rasterizer.render(
-        mapper.store.params, mapper.store.count, r.CAMERA, inverse(T_map_camera)
-    )
-    return np.clip(render.image[:3], 0.0, 1.0).copy()
+    return np.clip(mapper.render(r.CAMERA, T_map_camera)[:3], 0.0, 1.0)
 
 
 @pytest.fixture(scope="module")

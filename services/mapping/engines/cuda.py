@@ -1,0 +1,188 @@
+"""The engine of NVIDIA GPUs: the Gaussians, the optimiser and the losses are in device memory.
+
+A step is one CUDA graph; the host waits once per plan. Insertion is computed on the host, from one render
+per keyframe. The same calls give the same bits on the same model of GPU, with the same torch and NVRTC; they
+differ from those of the CPU engine in the last digits.
+"""
+
+from __future__ import annotations
+
+import weakref
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from beamsplat.common.geometry.transforms import inverse
+from beamsplat.common.raster.camera import RasterCamera
+from beamsplat.common.raster.cuda.device_map import DeviceMap
+from beamsplat.common.raster.cuda.keyframe_states import FIELDS
+from beamsplat.common.raster.cuda.source import Kernels
+from beamsplat.common.raster.cuda.targets import pack_targets
+from beamsplat.common.raster.cuda.training import StepSettings
+from beamsplat.services.mapping.engines.cpu import rate_rows
+from beamsplat.services.mapping.engines.device_store import DeviceStore
+from beamsplat.services.mapping.engines.protocol import OptimiserStep
+from beamsplat.services.mapping.keyframe import PyramidLevel, StoredKeyframe
+from beamsplat.services.mapping.settings import LearningRates, MapperSettings
+
+_BATCH = 4096  # steps between two waits for the device, at most
+_TARGETS_BYTES = (
+    512 << 20
+)  # of keyframes in device memory; those that were not used for the longest time leave
+
+
+class _Targets(NamedTuple):
+    """The targets of one level of a keyframe in device memory."""
+
+    level: weakref.ref[PyramidLevel]  # whose they are; a keyframe that is read from disk again has new ones
+    bytes: torch.Tensor
+
+
+class CudaEngine:
+    """Implements `Engine`.
+
+    Args:
+        kernels: compiled for the device.
+    """
+
+    def __init__(self, kernels: Kernels) -> None:
+        self._kernels = kernels
+        self._map = DeviceMap(kernels, keyframes=_BATCH)
+        self.store = DeviceStore(self._map.gaussians)
+        self._targets: dict[tuple[int, int], _Targets] = {}  # by keyframe and size; the last was used last
+        self._rates: dict[tuple[int, int], tuple[LearningRates, bool]] = {}  # set in the views, by image size
+
+    @property
+    def description(self) -> str:
+        """Return the device and the memory that the map takes there."""
+        gaussians = self._map.gaussians
+        used = gaussians.bytes_each * gaussians.capacity + self._map.workspace_bytes + self._targets_bytes()
+        return f"{self._kernels.description}, {used / 1e6:.0f} MB"
+
+    @property
+    def workspace_bytes(self) -> int:
+        """Nothing is kept in host memory."""
+        return 0
+
+    def render(self, camera: RasterCamera, T_camera_map: np.ndarray) -> np.ndarray:
+        """See `Engine.render`."""
+        return self._map.picture(camera, T_camera_map)
+
+    def optimise(
+        self,
+        steps: Sequence[OptimiserStep],
+        T_map_anchor: Mapping[int, np.ndarray],
+        settings: MapperSettings,
+        must_stop: Callable[[], bool],
+    ) -> list[float]:
+        """See `Engine.optimise`."""
+        self._use(settings)
+        losses: list[float] = []
+        for first in range(0, len(steps), _BATCH):
+            batch = steps[first : first + _BATCH]
+            done = self._batch(batch, T_map_anchor, settings, must_stop)
+            losses += done
+            if len(done) < len(batch):
+                break
+        return losses
+
+    def vote_carving(self, level: PyramidLevel, T_map_camera: np.ndarray, settings: MapperSettings) -> None:
+        """See `Engine.vote_carving`."""
+        camera = level.camera
+        self._map.gaussians.vote_carving(
+            self._uploaded(level), camera.packed(inverse(T_map_camera)), (camera.width_px, camera.height_px),
+            int(255.0 * settings.carve_weight), settings.carve_margin,
+        )  # fmt: skip
+        self.store.changed()
+
+    def forget(self, id: int) -> None:
+        """See `Engine.forget`."""
+        for key in [key for key in self._targets if key[0] == id]:
+            del self._targets[key]
+
+    def close(self) -> None:
+        """See `Engine.close`."""
+        self._targets.clear()
+
+    def _use(self, settings: MapperSettings) -> None:
+        r = settings.rates
+        step = StepSettings(
+            ssim_weight=settings.ssim_weight, depth_weight=settings.depth_weight,
+            lidar_weight=settings.lidar_weight, isotropy_weight=settings.isotropy_weight,
+            isotropy_ratio=settings.isotropy_ratio, refine_pose=settings.refine_pose,
+            refine_exposure=settings.refine_exposure, pose_m=r.pose_m, pose_rad=r.pose_rad,
+            max_pose_m=settings.max_pose_m, max_pose_rad=settings.max_pose_rad, exposure=r.exposure,
+        )  # fmt: skip
+        if step != self._map.settings:
+            self._map.use(step)
+            self._rates.clear()
+
+    def _batch(
+        self,
+        steps: Sequence[OptimiserStep],
+        T_map_anchor: Mapping[int, np.ndarray],
+        settings: MapperSettings,
+        must_stop: Callable[[], bool],
+    ) -> list[float]:
+        keyframes = {step.keyframe.id: step.keyframe for step in steps}
+        rows = {id: row for row, id in enumerate(keyframes)}
+        self._map.states.write(list(rows.values()), [_state(keyframe) for keyframe in keyframes.values()])
+        for step in steps:
+            if must_stop():
+                break
+            self._launch(step, T_map_anchor, settings, rows[step.keyframe.id])
+        losses = self._map.losses.read()  # waits
+        for keyframe, state in zip(keyframes.values(), self._map.states.read(list(rows.values()))):
+            _set_state(keyframe, state)
+        self._map.grow()
+        self.store.changed()
+        return losses.astype(float).tolist()
+
+    def _launch(
+        self,
+        step: OptimiserStep,
+        T_map_anchor: Mapping[int, np.ndarray],
+        settings: MapperSettings,
+        row: int,
+    ) -> None:
+        keyframe, level = step.keyframe, step.keyframe.levels[step.size]
+        size = level.camera.width_px, level.camera.height_px
+        view = self._map.training_view(*size)
+        if self._rates.get(size) != (settings.rates, step.refining):
+            view.set_learning_rates(rate_rows(settings.rates, step.refining))
+            self._rates[size] = settings.rates, step.refining
+        view.load(self._targets_of(step, level))
+        view.begin(level.camera, T_map_anchor[keyframe.anchor] @ keyframe.T_anchor_camera, row)
+        view.run(step.with_ssim)
+
+    def _targets_of(self, step: OptimiserStep, level: PyramidLevel) -> torch.Tensor:
+        key = step.keyframe.id, step.size
+        held = self._targets.pop(key, None)
+        if held is None or held.level() is not level:
+            held = _Targets(weakref.ref(level), self._uploaded(level))
+        self._targets[key] = held
+        used = self._targets_bytes()
+        while used > _TARGETS_BYTES and len(self._targets) > 1:
+            used -= self._targets.pop(next(iter(self._targets))).bytes.nbytes
+        return held.bytes
+
+    def _targets_bytes(self) -> int:
+        return sum(held.bytes.nbytes for held in self._targets.values())
+
+    def _uploaded(self, level: PyramidLevel) -> torch.Tensor:
+        block = pack_targets(
+            level.rgb, level.depth_mm, level.depth_weight, level.hidden, level.beam_pixels, level.beam_z_m
+        )
+        return torch.from_numpy(block).to(self._kernels.device)
+
+
+def _state(keyframe: StoredKeyframe) -> dict[str, np.ndarray]:
+    return {name: np.asarray(getattr(keyframe, name), np.float64) for name in FIELDS}
+
+
+def _set_state(keyframe: StoredKeyframe, state: dict[str, np.ndarray]) -> None:
+    for name, value in state.items():
+        old = getattr(keyframe, name)
+        setattr(keyframe, name, int(value) if isinstance(old, int) else value.astype(old.dtype))
