@@ -42,6 +42,7 @@ def test_it_holds_one_package_and_its_data(wheel):
     data = {
         "beamsplat/py.typed", "beamsplat/deploy/demo.toml", "beamsplat/deploy/models.toml",
         "beamsplat/deploy/paper/monogs-lidar.toml", "beamsplat/services/page/static/page.js",
+        "beamsplat/common/raster/cuda/raster.cu",
     }  # fmt: skip
     assert data <= set(names)
     assert not [name for name in names if name.startswith("beamsplat/tools/api/")]

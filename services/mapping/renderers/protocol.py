@@ -67,6 +67,7 @@ class DifferentiableRenderer(Protocol):
 RENDERERS: dict[str, str] = {
     "reference": "beamsplat.services.mapping.renderers.reference:ReferenceRenderer",
     "cpu": "beamsplat.services.mapping.renderers.cpu:CpuRenderer",
+    "cuda": "beamsplat.services.mapping.renderers.cuda:CudaRenderer",
     "gsplat": "beamsplat.services.mapping.renderers.gsplat:GsplatRenderer",
 }
 

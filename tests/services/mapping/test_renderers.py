@@ -7,10 +7,17 @@ import torch
 from beamsplat.common.errors import UserError
 from beamsplat.common.geometry.transforms import se3_exp
 from beamsplat.common.raster.camera import RasterCamera
-from beamsplat.services.mapping.renderers.protocol import Gaussians, make_renderer
+from beamsplat.services.mapping.renderers.protocol import RENDERERS, Gaussians, make_renderer
+from tests.common.raster.cuda.shim import needs_compiler
 from tests.common.raster.scenes import random_camera, random_gaussians, random_pose
 
 NAMES = ("mean_map_m", "log_scale", "quat_wxyz", "opacity_logit", "colour", "pose", "background")
+
+
+@pytest.fixture(autouse=True)
+def cuda_on_the_cpu(monkeypatch):
+    """The kernels of "cuda" as the CPU runs them, beside those of a GPU."""
+    monkeypatch.setitem(RENDERERS, "cuda on the CPU", "tests.common.raster.cuda.shim:ShimRenderer")
 
 
 def gaussians_of(arrays, dtype):
@@ -48,10 +55,17 @@ def scene(seed, **size):
 
 
 def backends():
+    from beamsplat.common.raster.cuda.driver import cuda_fault
     from beamsplat.services.mapping.renderers.gsplat import fault
 
-    why = fault()
-    return ["cpu", pytest.param("gsplat", marks=pytest.mark.skipif(why is not None, reason=str(why)))]
+    return [
+        "cpu",
+        pytest.param("cuda on the CPU", marks=needs_compiler),
+        *(
+            pytest.param(name, marks=pytest.mark.skipif(why is not None, reason=str(why)))
+            for name, why in (("cuda", cuda_fault()), ("gsplat", fault()))
+        ),
+    ]
 
 
 @pytest.mark.parametrize("backend", backends())
@@ -98,8 +112,9 @@ def test_nothing_in_view_is_background(backend):
         assert bool(torch.isnan(picture.expected_depth_m()).all())
 
 
-def test_two_live_graphs_do_not_disturb_each_other():
-    renderer = make_renderer("cpu")
+@pytest.mark.parametrize("backend", backends())
+def test_two_live_graphs_do_not_disturb_each_other(backend):
+    renderer = make_renderer(backend)
     arrays, camera, T, _, weights = scene(2)
     other, _, other_T, _, _ = scene(3)
     alone = gaussians_of(arrays, torch.float32)
@@ -162,8 +177,10 @@ def test_a_single_gaussian_is_rendered_at_its_pinhole_projection():
 
 
 def test_unknown_and_missing_renderers_say_what_to_do():
-    with pytest.raises(UserError, match="reference, cpu, gsplat"):
+    with pytest.raises(UserError, match="reference, cpu, cuda, gsplat"):
         make_renderer("vulkan")
     if not torch.cuda.is_available():
         with pytest.raises(UserError, match="renderer = 'cpu'"):
             make_renderer("gsplat")
+        with pytest.raises(UserError, match=r"use the CPU|without CUDA"):
+            make_renderer("cuda")
