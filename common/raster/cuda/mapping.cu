@@ -61,10 +61,12 @@ __device__ double column_sum(const float *parts, int rows, int columns, int colu
 
 // Adam's step of six values (Kingma & Ba 2015); updates the moments.
 __device__ void adam_of_six(const double *gradient, double *first, double *second, double t, double *move) {
+    const double fix_1 = 1.0 - pow(0.9, t), fix_2 = 1.0 - pow(0.99, t);
+    #pragma unroll 1
     for (int k = 0; k < 6; ++k) {
         first[k] += 0.1 * (gradient[k] - first[k]);
         second[k] += 0.01 * (gradient[k] * gradient[k] - second[k]);
-        move[k] = first[k] / (1.0 - pow(0.9, t)) / (sqrt(second[k] / (1.0 - pow(0.99, t))) + 1e-12);
+        move[k] = first[k] / fix_1 / (sqrt(second[k] / fix_2) + 1e-12);
     }
 }
 
@@ -129,7 +131,7 @@ __device__ void refine_pose(const FinishArguments &s, double *state) {
 // One step of Adam on log gains and offsets, with a weak prior for no change, see `refine_exposure`.
 __device__ void refine_exposure(const FinishArguments &s, double *state) {
     double gradient[6], move[6], *exposure = state + EXPOSURE;
-    for (int k = 0; k < 6; ++k) gradient[k] = s.exposure_gradient[k] + 1e-3 * exposure[k];
+    for (int k = 0; k < 6; ++k) gradient[k] = s.exposure_gradient[k] + (double)(1e-3f * (float)exposure[k]);
     adam_of_six(gradient, state + EXPOSURE_FIRST, state + EXPOSURE_SECOND, ++state[EXPOSURE_STEPS], move);
     for (int k = 0; k < 6; ++k) exposure[k] = (double)(float)(exposure[k] - s.exposure_rate * move[k]);
 }

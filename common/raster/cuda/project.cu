@@ -60,24 +60,30 @@ struct Ellipse {  // where alpha is 1/255: A x^2 + B x y + C y^2 + level = 0 abo
     float x, y, A, B, C, level, half_width, half_height;
 };
 
-// Finds the rows of pixels y0 ... y1 of the ellipse in a column of tiles; returns false if there are none.
-// y = (-B x -+ sqrt(B^2 x^2 - 4 C (A x^2 + level))) / 2 C, at the highest and the lowest point of the column.
+// Half of the width in y of the ellipse at x, times 2 |C|: sqrt(B^2 x^2 - 4 C (A x^2 + level)), without its cancellation.
+__device__ float root_at(const Ellipse &e, float x) {
+    const float ratio = x / e.half_width;
+    return sqrtf(fmaxf(-4.0f * e.C * e.level * (1.0f - ratio) * (1.0f + ratio), 0.0f));
+}
+
+// Finds the rows of pixels y0 ... y1 of the ellipse in a column of tiles; returns false if there are none: its highest
+// and lowest point in the column, y = (-B x -+ root) / 2 C. Where the compiler could choose whether to fuse a product
+// and a sum, the choice is written: `project` counts the pairs that `emit` writes, so both must round alike.
 __device__ bool rows_in_column(const Ellipse &e, int column, bool whole, int bottom, int &y0, int &y1) {
     const float slack = 1e-3f;
     float low = -e.half_height, high = e.half_height;
     if (!whole) {
         const float x_top = -0.5f * e.B * e.half_height / e.A, half_over_c = 0.5f / e.C;
-        const float curved = e.B * e.B - 4.0f * e.A * e.C, lifted = -4.0f * e.C * e.level;
         const float left = fmaxf((float)(column * TILE) - e.x, -e.half_width);
         const float right = fminf((float)(column * TILE + TILE - 1) - e.x, e.half_width);
         if (left > right + slack) return false;
         if (x_top < left || x_top > right) {
             const float x = fminf(fmaxf(x_top, left), right);
-            high = (-e.B * x - sqrtf(fmaxf(curved * x * x + lifted, 0.0f))) * half_over_c;
+            high = __fmul_rn(__fmaf_rn(-e.B, x, -root_at(e, x)), half_over_c);
         }
         if (-x_top < left || -x_top > right) {
             const float x = fminf(fmaxf(-x_top, left), right);
-            low = (-e.B * x + sqrtf(fmaxf(curved * x * x + lifted, 0.0f))) * half_over_c;
+            low = __fmul_rn(__fmaf_rn(-e.B, x, root_at(e, x)), half_over_c);
         }
     }
     y0 = (int)ceilf(fmaxf(e.y + low - slack, 0.0f));

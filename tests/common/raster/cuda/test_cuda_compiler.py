@@ -14,8 +14,9 @@ from beamsplat.common.raster.cuda.rtc import Nvrtc, best_architecture, compiled,
 from beamsplat.common.raster.cuda.source import filled, kernel_source
 
 _USAGE = re.compile(
-    r"Function properties for (?P<name>\w+)\s+\d+ bytes stack frame, (?P<stores>\d+) bytes spill stores, "
-    r"(?P<loads>\d+) bytes spill loads\s+ptxas info\s*: Used (?P<registers>\d+) registers"
+    r"Compiling entry function '(?P<name>\w+)'.*?(?P<stores>\d+) bytes spill stores, "
+    r"(?P<loads>\d+) bytes spill loads.*?Used (?P<registers>\d+) registers",
+    re.DOTALL,
 )
 
 

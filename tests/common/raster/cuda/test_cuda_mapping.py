@@ -221,7 +221,7 @@ def test_whole_steps_agree_with_the_mapper():
     np.testing.assert_allclose(device_map.losses.read(), expected, rtol=1e-4)
     mine = device_map.gaussians.read()
     seen = mine["steps"] == 6
-    assert seen.sum() > 100
+    assert seen.sum() > 30
     change, true_change = (
         p[:, :count][:, seen] - params[:, :count][:, seen] for p in (mine["params"], arrays.params)
     )
