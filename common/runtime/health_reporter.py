@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import threading
 import time
 
@@ -11,10 +12,12 @@ import zenoh
 
 from beamsplat.common.messages import Health, OutputHealth
 from beamsplat.common.redaction import without_secrets
+from beamsplat.common.runtime.heap import trim_heap
 from beamsplat.common.runtime.running_node import RunningNode
 from beamsplat.common.zenoh.bus import Bus
 
 _DETAIL_CHARS = 2000
+_TRIM_EVERY = 30  # reports between two returns of freed memory
 
 
 class HealthReporter:
@@ -27,11 +30,15 @@ class HealthReporter:
         threading.Thread(target=self._report, name="health", daemon=True).start()
 
     def _report(self) -> None:
-        while self._running.state != "closed":
+        for count in itertools.count(1):
+            if self._running.state == "closed":
+                return
             try:
                 self.send()
             except zenoh.ZError:  # the session is closing
                 return
+            if count % _TRIM_EVERY == 0:
+                trim_heap()
             time.sleep(1.0)
 
     def send(self) -> None:

@@ -18,6 +18,7 @@ from beamsplat.common.geometry.transforms import make_transform, so3_exp
 from beamsplat.common.mapfiles.ply import read_ply_points, write_gaussian_ply
 from beamsplat.common.mapfiles.scores import ViewScore, f_score, fused_surface, rgb_depth_alpha, score_view
 from beamsplat.common.raster.camera import RasterCamera
+from beamsplat.services.mapping.engines.protocol import Engine
 from beamsplat.services.mapping.keyframe import RgbdKeyframe
 from beamsplat.services.mapping.mapper import HALF, Mapper
 from beamsplat.services.mapping.settings import MapperSettings
@@ -59,12 +60,15 @@ class MapperTimer:
 
     wall_s: float = 0.0
     cpu_s: float = 0.0
+    mapper_wall_s: float = 0.0  # of the mapper alone
 
-    def run(self, work: Callable[[], Any]) -> Any:
+    def run(self, work: Callable[[], Any], *, of_mapper: bool = True) -> Any:
         """Call `work`, add its wall and CPU time to the sums, and return its result."""
         wall, cpu = time.perf_counter(), time.process_time()
         result = work()
-        self.wall_s += time.perf_counter() - wall
+        spent_s = time.perf_counter() - wall
+        self.wall_s += spent_s
+        self.mapper_wall_s += spent_s * of_mapper
         self.cpu_s += time.process_time() - cpu
         return result
 
@@ -83,6 +87,7 @@ def run_bench(
     out: Path | None = None,
     prior: Prior | None = None,
     mask: Mask | None = None,
+    engine: Engine | None = None,
 ) -> dict[str, Any]:
     """Map a recording and score the map before and after refinement; return the results by name.
 
@@ -99,10 +104,11 @@ def run_bench(
         out: folder for the map and for renders of held-out views beside true images; None writes nothing.
         prior: depth prior of the keyframes; None uses the one called `bench.prior`.
         mask: computes the masks of dynamic objects; None maps all pixels.
+        engine: of the mapper; None = the CPU, with `bench.threads`.
     """
     warm()
     recording = load_dataset(path)
-    mapper = Mapper(bench.settings, seed=bench.seed, threads=bench.threads)
+    mapper = Mapper(bench.settings, seed=bench.seed, threads=bench.threads, engine=engine)
     timer = MapperTimer()
     keyframes, refused = _map_drive(
         recording, mapper, bench, prior or find_prior(bench.prior), mask, timer, log
@@ -121,6 +127,7 @@ def run_bench(
         "data": str(path), "prior": bench.prior, "threads": bench.threads, "seed": bench.seed,
         "keyframes": keyframes, "refused": refused, "data_s": recording.seconds,
         "wall_s": online_timer.wall_s, "cpu_s": online_timer.cpu_s, "steps": online_steps,
+        "mapper_wall_s": online_timer.mapper_wall_s, "images": len(recording.posed_images),
         "refine_wall_s": timer.wall_s - online_timer.wall_s, "refine_cpu_s": timer.cpu_s - online_timer.cpu_s,
         "refine_steps": mapper.steps - online_steps, "online": online, "refined": refined,
         "peak_rss_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0,
@@ -154,14 +161,16 @@ def _map_drive(
     for index, posed_image in enumerate(recording.posed_images):
         if index % HELD_OUT_EVERY == HELD_OUT_AT or not _moved(last, posed_image.T_map_camera, bench):
             continue
-        prior_depth = timer.run(lambda i=index: prior(recording, i))
+        prior_depth = timer.run(lambda i=index: prior(recording, i), of_mapper=False)
         if prior_depth is None:
             continue
         last = posed_image.T_map_camera
         late = 2 * index >= len(recording.posed_images)
         frame = replace(
             make_keyframe(recording, index, prior_depth), anchor=int(late),
-            mask=None if mask is None else timer.run(lambda i=index, d=prior_depth[0]: mask(recording, i, d)),
+            mask=None if mask is None else timer.run(
+                lambda i=index, d=prior_depth[0]: mask(recording, i, d), of_mapper=False
+            ),
         )  # fmt: skip
         T_map_anchor = T_MAP_ANCHOR_JUMP if late and bench.jump else np.eye(4)
         outcome = timer.run(lambda f=frame, T=T_map_anchor: mapper.add(f, T))

@@ -10,6 +10,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from beamsplat.services.mapping.config import EngineName
 from beamsplat.tools.cli.options import writable
 
 console = Console(stderr=True)
@@ -67,6 +68,9 @@ def bench_map(
     settle_steps: Annotated[
         int, typer.Option(min=0, help="Steps at the end of the drive, before the first evaluation")
     ] = 0,
+    engine: Annotated[
+        EngineName, typer.Option(help="What computes the map: cpu, cuda, or auto (the GPU if there is one)")
+    ] = "cpu",
     movers: Annotated[
         bool, typer.Option("--movers", help="Mask dynamic objects that the beams detect")
     ] = False,
@@ -86,6 +90,7 @@ def bench_map(
     """
     import cv2
 
+    from beamsplat.services.mapping.engines.choice import make_engine
     from beamsplat.services.mapping.settings import MapperSettings
     from beamsplat.tools.bench.fused_prior import DynamicObjectMasks, FusedDepthPrior
     from beamsplat.tools.bench.mapping import MapBenchSettings, run_bench
@@ -97,11 +102,61 @@ def bench_map(
         settings=MapperSettings(refine_pose=refine_pose, refine_exposure=refine_exposure),
     )  # fmt: skip
     field = FusedDepthPrior(source) if prior == "field" else None
-    result = run_bench(data, bench, console.print, out, field, DynamicObjectMasks() if movers else None)
+    masks = DynamicObjectMasks() if movers else None
+    result = run_bench(data, bench, console.print, out, field, masks, make_engine(engine, threads))
     if as_json:
         print(json.dumps(result))
         return
     _print_scores(result)
+
+
+def bench_gpu(
+    out: Annotated[Path, typer.Option(callback=writable, help="Folder for gpu.json")],
+    data: Annotated[
+        Path | None, typer.Option(help="Recording with truth: also run `bench map` on it, with the GPU")
+    ] = None,
+    tile: Annotated[int, typer.Option(help="Side of the rasterizer's tiles, px: 8 or 16")] = 8,
+    repeats: Annotated[int, typer.Option(min=10, help="Timed steps of each case")] = 100,
+    as_json: JsonOption = False,
+) -> None:
+    """Measure the CUDA engine on this machine's GPU: correctness, determinism, ms a step, memory, a map.
+
+    It needs no network, and a few minutes. gsplat is measured beside it where it is installed.
+
+    Examples:
+
+        beamsplat bench gpu --out out/gpu
+
+        beamsplat bench gpu --out out/gpu --data recordings/house_a
+    """
+    from beamsplat.services.mapping.engines.choice import check_cuda
+
+    check_cuda()
+    from beamsplat.common.raster.cuda.driver import CudaKernels
+    from beamsplat.tools.bench.gpu import bench_gpu as run
+
+    result = run(out, CudaKernels(tile), data, console.print, repeats=repeats)
+    if as_json:
+        print(json.dumps(result))
+        return
+    table = Table(
+        "Gaussians", "size", "ms a step", "with SSIM", "forward ms", "kernels ms", "MB", "same bits"
+    )
+    for row in result["steps"]:
+        times = (row[key] for key in ("step_ms", "step_with_ssim_ms", "forward_ms", "kernel_sum_ms"))
+        size = f"{row['width']}x{row['height']}"
+        same = "yes" if row["same_bits_twice"] else "NO"
+        numbers = [f"{ms:.3f}" for ms in times]
+        table.add_row(str(row["gaussians"]), size, *numbers, f"{row['peak_mb']:.0f}", same)
+    screen = Console()
+    screen.print(table)
+    worst = ", ".join(f"{name} {value:.1e}" for name, value in result["correctness"].items())
+    screen.print(f"against float64: {worst}")
+    for prior in ("truth", "field"):
+        if found := result.get(f"map_{prior}"):
+            screen.print(f"bench map, depth {prior}:")
+            _print_scores(found)
+    screen.print(str(out / "gpu.json"))
 
 
 def _print_scores(result: dict[str, Any]) -> None:

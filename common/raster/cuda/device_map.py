@@ -39,6 +39,11 @@ class DeviceMap:
         self._training: dict[tuple[int, int], TrainingView] = {}
         self._views: dict[tuple[int, int], RasterView] = {}
 
+    def use(self, settings: StepSettings) -> None:
+        """Use other weights and rates from the next step on; graphs are recorded anew."""
+        self.settings = settings
+        self._training.clear()
+
     def training_view(self, width_px: int, height_px: int) -> TrainingView:
         """Return the view for steps at an image size, created at the first call."""
         size = (width_px, height_px)

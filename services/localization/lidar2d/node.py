@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import shutil
+import threading
 from pathlib import Path
 from typing import Annotated, cast
 
@@ -39,6 +40,7 @@ log = logging.getLogger("beamsplat.localization")
 
 _REPORT_EVERY_SCANS = 50  # of what was found out about the sensors
 _RESERVED_SUBMAP_IDS = 1000  # upper bound of the submaps started between the last checkpoint and a crash
+_FINISH_S = 1.5  # for the final optimisation of a process that must stop: it is killed after 5 s
 _GRID_AFTER_SCANS = 25  # a drawing of the grid is published exactly this many scans after its start, or fewer
 
 
@@ -93,7 +95,8 @@ class LidarLocalization(Node):
         self._fault = self._sensors = ""  # parts of the text of the health message
         live = self.live_settings
         self._checkpoint_dir = None if live is None else live.run_dir / "localization"
-        self._saver: MapSaver | None = None
+        self._saver: MapSaver | None = None  # of checkpoints
+        self._final_saver: MapSaver | None = None  # of the option `save`
         if self._checkpoint_dir is not None and live is not None and not live.resume:  # of an earlier run
             shutil.rmtree(self._checkpoint_dir, ignore_errors=True)
         if self.config.resume is not None:
@@ -214,10 +217,23 @@ class LidarLocalization(Node):
         self.detail = "; ".join(text for text in (self._fault, self._sensors) if text)
 
     def drain(self) -> Outputs:
-        """Do the final loop closure and optimisation, publish the result and write the requested files."""
+        """Do the final loop closure and optimisation, publish the result and write the requested files.
+
+        If the process must stop, the map is written first, and a final optimisation that takes long is left out.
+        """
         if self._slam is None or not self._slam.anchors():
             return  # there was no usable scan
-        self._slam.finish()
+        if self.must_stop():
+            if self.config.save is not None:
+                self._save(self._slam, self.config.save)
+            finishing = threading.Thread(target=self._slam.finish, name="finish", daemon=True)
+            finishing.start()
+            finishing.join(_FINISH_S)
+            if finishing.is_alive():
+                log.warning("the map is saved without its final optimisation, for which there is no time")
+                return
+        else:
+            self._slam.finish()
         self._optimisations += 1
         yield from self._publish_map_poses(self._slam)
         grid = self._grid or GridTiles(self.config.grid_resolution_m)
@@ -233,7 +249,9 @@ class LidarLocalization(Node):
                 shown in the health of the node.
         """
         try:
-            slam.save(folder)
+            if self._final_saver is None:
+                self._final_saver = MapSaver(folder, slam.settings)
+            self._final_saver.save(slam.saved())
         except OSError as error:
             fault = f"localization.save = {folder}: not written ({reason(error)})"
             if self.live_settings is None:

@@ -1,6 +1,8 @@
 """A second drive continues the map of the first: relocalization, same submaps, one saved state."""
 
 import json
+import threading
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +13,8 @@ from beamsplat.common.geometry.transforms import inverse, se2_to_se3
 from beamsplat.common.messages import LidarModel, Rig, Scan
 from beamsplat.common.runtime.live_settings import LiveSettings
 from beamsplat.services.localization.lidar2d.node import LidarLocalization
+from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
+from beamsplat.services.localization.lidar2d.slam import LidarSlam
 from tests.services.localization.world import RayCastLidar, SimulatedDrive
 
 T0 = 1_000_000_000_000
@@ -70,6 +74,23 @@ def make(home=None, **options):
     node.live_settings = home
     node.configure()
     return node
+
+
+def test_a_stop_without_time_for_the_final_optimisation_keeps_the_map(tmp_path, monkeypatch):
+    node, ended = make(save=tmp_path / "map"), threading.Event()
+    monkeypatch.setattr(LidarSlam, "finish", lambda slam: ended.wait(60.0))
+    node.must_stop = lambda: True
+    started = time.monotonic()
+    sent, poses = drive(node, 0.0, 4.0, 1, 0)
+    ended.set()
+    assert time.monotonic() - started < 40.0
+    opened = LidarSlam.load(tmp_path / "map", LidarSlamSettings(), np.eye(4))
+    _, saved, _ = opened.trajectory()
+    assert len(saved) == len(poses) > 30
+    true = np.array([T[:2, 3] for T, _ in poses])
+    assert np.linalg.norm(np.diff(saved[[0, -1], :2], axis=0)) == pytest.approx(
+        np.linalg.norm(true[-1] - true[0]), abs=0.05
+    )
 
 
 @pytest.mark.slow
