@@ -219,7 +219,8 @@ class LidarLocalization(Node):
     def drain(self) -> Outputs:
         """Do the final loop closure and optimisation, publish the result and write the requested files.
 
-        If the process must stop, the map is written first, and a final optimisation that takes long is left out.
+        If the process must stop, the map is written first, and a final optimisation that takes long is left
+        out.
         """
         if self._slam is None or not self._slam.anchors():
             return  # there was no usable scan

@@ -2,7 +2,6 @@
 
 import json
 import threading
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -77,13 +76,12 @@ def make(home=None, **options):
 
 
 def test_a_stop_without_time_for_the_final_optimisation_keeps_the_map(tmp_path, monkeypatch):
-    node, ended = make(save=tmp_path / "map"), threading.Event()
-    monkeypatch.setattr(LidarSlam, "finish", lambda slam: ended.wait(60.0))
+    node, may_end, finished = make(save=tmp_path / "map"), threading.Event(), []
+    monkeypatch.setattr(LidarSlam, "finish", lambda slam: may_end.wait(60.0) and finished.append(slam))
     node.must_stop = lambda: True
-    started = time.monotonic()
-    sent, poses = drive(node, 0.0, 4.0, 1, 0)
-    ended.set()
-    assert time.monotonic() - started < 40.0
+    _, poses = drive(node, 0.0, 4.0, 1, 0)
+    assert not finished  # it was not waited for
+    may_end.set()
     opened = LidarSlam.load(tmp_path / "map", LidarSlamSettings(), np.eye(4))
     _, saved, _ = opened.trajectory()
     assert len(saved) == len(poses) > 30
