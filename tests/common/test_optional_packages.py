@@ -13,9 +13,8 @@ from beamsplat.services.nodes import NODES
 @pytest.mark.parametrize(
     ("module", "remedy"),
     [
-        ("torch", "pip install 'beamsplat[edge]'"),
-        ("torch.cuda", "pip install 'beamsplat[edge]'"),
-        ("gsplat", "pip install 'beamsplat[gpu]'"),
+        ("torch", "pip install 'beamsplat[gpu]'"),
+        ("torch.cuda", "pip install 'beamsplat[gpu]'"),
         ("trimesh", "pip install 'beamsplat[sim]'"),
         ("embreex.rtcore_scene", "pip install 'beamsplat[sim]'"),
         ("beamsplat.common.absent", None),
@@ -32,7 +31,7 @@ def test_the_remedy_follows_the_metadata_for_the_monitor():
 
 def test_only_packages_of_ours_are_explained():
     explained = missing_packages_explained("bench")
-    with pytest.raises(UserError, match=r"bench needs the package torch, .*beamsplat.edge."), explained:
+    with pytest.raises(UserError, match=r"bench needs the package torch, .*beamsplat.gpu."), explained:
         raise ModuleNotFoundError("No module named 'torch'", name="torch")
     with pytest.raises(ModuleNotFoundError), missing_packages_explained():
         raise ModuleNotFoundError("No module named 'absent'", name="absent")

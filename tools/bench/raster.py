@@ -99,7 +99,6 @@ def bench_raster(gaussians: int = 50_000, repeats: int = 15, log: Log = lambda t
         cases.append(_reference_case(params, gaussians, camera, T_camera_map))
         fastest = min(case["cpu_ms"] for case in cases if case["width"] == width and case["backend"] == "cpu")
         cases[-1]["times_slower"] = cases[-1]["cpu_ms"] / fastest
-    cases += _gsplat_cases(repeats)
     return {
         "cases": cases, "load_average": os.getloadavg()[0], "cores": os.cpu_count(),
         "peak_rss_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0,
@@ -201,20 +200,3 @@ def _torch_step(
     (image - target).abs().mean().backward()
     wait()
     return middle - start, time.perf_counter() - start, time.process_time() - cpu
-
-
-def _gsplat_cases(repeats: int) -> list[dict[str, Any]]:
-    """Time gsplat at 640x480 with a million Gaussians; return its case, or an empty list without a GPU."""
-    from beamsplat.services.mapping.renderers.gsplat import fault
-    from beamsplat.services.mapping.renderers.protocol import make_renderer
-
-    if fault() is not None:
-        return []
-    count = 1_000_000
-    params, T_camera_map = synthetic_room(count)
-    camera = RasterCamera(576.0, 576.0, 319.5, 239.5, 640, 480)
-    renderer = make_renderer("gsplat")
-    times = [_torch_step(renderer, params, count, camera, T_camera_map, "cuda") for _ in range(repeats + 2)][
-        2:
-    ]
-    return [_case("gsplat", count, camera, 1, times)]

@@ -21,6 +21,7 @@ from rich.table import Table
 
 from beamsplat.common.config.deployment import Deployment, load_deployment
 from beamsplat.common.optional_packages import remedy_for, requirements
+from beamsplat.services.mapping.engines.choice import cuda_obstacle
 
 MIN_PYTHON = (3, 11)
 MIN_SHM_MB = 256
@@ -74,34 +75,20 @@ def _has_nvidia() -> bool:
 
 
 def _gpu() -> Iterator[Finding]:
-    """Report the mapper's processor: its rasterizer is compiled for the CPU and does not need torch.
+    """Report what computes the map with `mapping.engine = "auto"`: the GPU, or the CPU and why."""
+    why = cuda_obstacle()
+    if why is None:
+        import torch
 
-    Torch serves only the renderers of `beamsplat bench raster` ("reference" and "gsplat").
-    """
+        name, memory = torch.cuda.get_device_name(0), torch.cuda.get_device_properties(0).total_memory
+        architecture = "sm_{}{}".format(*torch.cuda.get_device_capability(0))
+        text = f"on the GPU: {name}, {memory / 1e9:.0f} GB, {architecture}; torch {torch.__version__}"
+        yield Finding("mapper", "ok", text)
+        return
     text = f"on the CPU ({os.cpu_count()} cores): it needs neither a GPU nor torch"
     yield Finding("mapper", "ok", text)
-    if not _has_nvidia():
-        return
-    if importlib.util.find_spec("torch") is None:
-        yield Finding(
-            "GPU", "note", "there is one, but torch is not installed: `beamsplat bench raster` cannot use it",
-            str(remedy_for("gsplat")),
-        )  # fmt: skip
-        return
-    import torch
-
-    if torch.cuda.is_available():
-        memory_gb = torch.cuda.get_device_properties(0).total_memory / 1e9
-        name = f"{torch.cuda.get_device_name(0)}, {memory_gb:.0f} GB"
-        yield Finding("GPU", "ok", f"{name}: used by `beamsplat bench raster`, not by the mapper")
-        if importlib.util.find_spec("gsplat") is None:
-            text = "not installed: `beamsplat bench raster` leaves the GPU out"
-            yield Finding("gsplat", "note", text, str(remedy_for("gsplat")))
-    else:
-        yield Finding(
-            "GPU", "note", f"there is a GPU, but torch {torch.__version__} is built without CUDA",
-            "pip install --force-reinstall torch, then 'beamsplat[gpu]'",
-        )  # fmt: skip
+    if _has_nvidia():
+        yield Finding("GPU", "note", f"there is one, but the mapper cannot use it: {why}")
 
 
 def _deployment(deployment: Deployment) -> Iterator[Finding]:

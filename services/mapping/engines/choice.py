@@ -5,11 +5,13 @@ from __future__ import annotations
 import ctypes
 import importlib.util
 import logging
+from typing import TYPE_CHECKING
 
 from beamsplat.common.errors import UserError
 from beamsplat.services.mapping.config import EngineName
-from beamsplat.services.mapping.engines.cpu import CpuEngine
-from beamsplat.services.mapping.engines.protocol import Engine
+
+if TYPE_CHECKING:
+    from beamsplat.services.mapping.engines.protocol import Engine
 
 log = logging.getLogger("beamsplat.mapping")
 
@@ -41,7 +43,11 @@ def check_cuda() -> None:
     """
     why = cuda_obstacle()
     if why is not None:
-        raise UserError(f'mapping.engine = "cuda": {why}; or set mapping.engine = "auto"')
+        raise UserError(_refusal(why))
+
+
+def _refusal(why: str) -> str:
+    return f'mapping.engine = "cuda": {why}; or set mapping.engine = "auto"'
 
 
 def make_engine(name: EngineName, threads: int) -> Engine:
@@ -53,11 +59,12 @@ def make_engine(name: EngineName, threads: int) -> Engine:
     Raises:
         UserError: "cuda" is asked for and cannot run here.
     """
-    if name == "cpu":
-        return CpuEngine(threads)
-    if name == "cuda":
-        check_cuda()
-    elif (why := cuda_obstacle()) is not None:
+    why = "it is configured" if name == "cpu" else cuda_obstacle()
+    if why is not None:
+        if name == "cuda":
+            raise UserError(_refusal(why))
+        from beamsplat.services.mapping.engines.cpu import CpuEngine
+
         log.info("the map is computed on the CPU: %s", why)
         return CpuEngine(threads)
     from beamsplat.common.raster.cuda.driver import CudaKernels

@@ -68,7 +68,6 @@ RENDERERS: dict[str, str] = {
     "reference": "beamsplat.services.mapping.renderers.reference:ReferenceRenderer",
     "cpu": "beamsplat.services.mapping.renderers.cpu:CpuRenderer",
     "cuda": "beamsplat.services.mapping.renderers.cuda:CudaRenderer",
-    "gsplat": "beamsplat.services.mapping.renderers.gsplat:GsplatRenderer",
 }
 
 

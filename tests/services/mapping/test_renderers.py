@@ -56,15 +56,11 @@ def scene(seed, **size):
 
 def backends():
     from beamsplat.common.raster.cuda.driver import cuda_fault
-    from beamsplat.services.mapping.renderers.gsplat import fault
 
     return [
         "cpu",
         pytest.param("cuda on the CPU", marks=needs_compiler),
-        *(
-            pytest.param(name, marks=pytest.mark.skipif(why is not None, reason=str(why)))
-            for name, why in (("cuda", cuda_fault()), ("gsplat", fault()))
-        ),
+        pytest.param("cuda", marks=pytest.mark.skipif(cuda_fault() is not None, reason=str(cuda_fault()))),
     ]
 
 
@@ -177,10 +173,8 @@ def test_a_single_gaussian_is_rendered_at_its_pinhole_projection():
 
 
 def test_unknown_and_missing_renderers_say_what_to_do():
-    with pytest.raises(UserError, match="reference, cpu, cuda, gsplat"):
+    with pytest.raises(UserError, match="reference, cpu, cuda"):
         make_renderer("vulkan")
     if not torch.cuda.is_available():
-        with pytest.raises(UserError, match="renderer = 'cpu'"):
-            make_renderer("gsplat")
         with pytest.raises(UserError, match=r"use the CPU|without CUDA"):
             make_renderer("cuda")

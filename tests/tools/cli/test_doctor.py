@@ -40,10 +40,16 @@ def test_an_option_that_is_given_on_the_command_line_is_no_fault(tmp_path, no_ne
 
 def test_mapping_needs_neither_torch_nor_a_gpu_and_the_doctor_says_so(monkeypatch):
     monkeypatch.setattr(doctor, "_has_nvidia", lambda: False)
+    monkeypatch.setattr(doctor, "cuda_obstacle", lambda: "there is no NVIDIA driver (libcuda.so.1)")
     (finding,) = doctor._gpu()
     assert (finding.subject, finding.verdict) == ("mapper", "ok")
+    assert finding.text.startswith("on the CPU")
+    monkeypatch.setattr(doctor, "_has_nvidia", lambda: True)
+    on_cpu, why = doctor._gpu()
+    assert (on_cpu.verdict, why.subject, why.verdict) == ("ok", "GPU", "note")
+    assert "libcuda" in why.text
     code = (
-        "import sys; sys.modules.update(torch=None, gsplat=None, trimesh=None, embreex=None)\n"
+        "import sys; sys.modules.update(torch=None, trimesh=None, embreex=None)\n"
         "from beamsplat.services.nodes import NODES; NODES['mapping'].load('default')"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)

@@ -21,7 +21,9 @@ def test_all_that_is_copied_into_the_image_exists():
         for line in re.findall(r"^COPY --chown=beamsplat (.+) \S+$", DOCKERFILE, re.M)
         for name in line.split()
     ]
-    assert {"common", "services", "constraints.txt"} <= set(copied)
+    packages = re.search(r"^FOLDERS = \((.+)\)$", (ROOT / "setup.py").read_text(), re.M)
+    needed = {*re.findall(r'"(\w+)"', packages[1]), "setup.py", "pyproject.toml", "constraints.txt"}
+    assert needed <= set(copied)
     assert all((ROOT / name).exists() for name in copied)
 
 
