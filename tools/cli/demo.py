@@ -166,7 +166,7 @@ def write_results(
     if not record.images:
         return {}
     from beamsplat.tools.evaluation.drive import has_poses
-    from beamsplat.tools.report.html import write_report
+    from beamsplat.tools.report.drive_report import write_drive_report
     from beamsplat.tools.report.run_report import open_truth, score_run, single_run_report
 
     known = has_poses(source)
@@ -177,7 +177,7 @@ def write_results(
     if row["plots"]["above"] is not None:
         cv2.imwrite(str(out / "map.png"), row["plots"]["above"])
     report = single_run_report("demo", "lidar + fused depth", source, truth, row)
-    write_report(out / "report.html", report, truth, paper=False)
+    write_drive_report(out / "report.html", report, truth)
     figures = {**{name: value for name, value in row.items() if name != "plots"}, "refused": losses}
     write_atomically(out / "report.json", json.dumps(figures, indent=1).encode())
     return figures

@@ -76,7 +76,7 @@ def single_run_report(
     `row` is the result of `score_run`.
     """
     whole = {
-        "name": name, "title": title, "seed": 0, "paper": {}, "partner": None, "lidar": True,
+        "name": name, "title": title, "seed": None, "paper": {}, "partner": None, "lidar": True,
         "depth_source": title, "advice": "", "status": "ok", **row,
     }  # fmt: skip
     return report_of_runs([whole], data.parent if data.name == "bag" else data, truth)

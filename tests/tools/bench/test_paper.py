@@ -14,9 +14,10 @@ from beamsplat.common.geometry.transforms import make_transform, so3_exp
 from beamsplat.common.messages import MapChunk, MapPoses
 from beamsplat.tools.bench import paper
 from beamsplat.tools.evaluation.drive import RecordedDrive
+from beamsplat.tools.report.drive_report import write_drive_report
 from beamsplat.tools.report.html import write_report
 from beamsplat.tools.report.observer import RunCosts, RunRecord
-from beamsplat.tools.report.run_report import compare_pairs
+from beamsplat.tools.report.run_report import compare_pairs, single_run_report
 from beamsplat.tools.report.scores import (
     GroundTruth,
     aligned_poses,
@@ -201,6 +202,35 @@ def test_the_report_is_one_file_and_names_what_did_not_run(tmp_path):
     assert "data:image/jpeg;base64," in text
     assert 'src="http' not in text
     assert "src='http" not in text
+
+
+@pytest.mark.parametrize("has_truth", [True, False])
+def test_the_report_on_a_drive_begins_with_its_pictures(tmp_path, has_truth):
+    known = truth(tmp_path, [S, 2 * S])
+    above = np.full((8, 8, 3), 90, np.uint8)
+    row = {
+        "position_rmse_m": 0.0123, "psnr_keyframes_db": 24.56, "fps": None, "gaussians": 1234,
+        "depth_series": {"stamps_ns": [S], "scaled_m": [0.1], "unscaled_m": [None]},
+        "plots": {
+            "stamps_ns": np.array([S, 2 * S]), "found": known.drive.poses.T_a_b, "true": known.drive.poses.T_a_b,
+            "offpath": [np.zeros((8, 8, 3), np.uint8)], "previews": [], "estimates": {},
+            "fused": {S: np.full((8, 8), 2.0, np.float32)}, "above": above,
+        },
+    }  # fmt: skip
+    if not has_truth:
+        del row["position_rmse_m"]
+    report = single_run_report("demo", "lidar + fused depth", tmp_path / "kitchen", known, row)
+    write_drive_report(tmp_path / "report.html", report, known)
+    text = (tmp_path / "report.html").read_text()
+    assert ("1.2 cm" in text) == ("Errors over time" in text) == ("truth</text>" in text) == has_truth
+    assert "24.6 dB" in text
+    assert "kitchen, mapped" in text
+    assert "#0" not in text.partition("<style>")[0] + text.partition("</style>")[2]
+    order = [
+        text.index(word)
+        for word in ("24.6 dB", "The map from above", "Depth: 0.5 m", "All figures", "<table>")
+    ]
+    assert order == sorted(order)
 
 
 def test_single_corrections_of_fusion_are_the_papers_ratio_or_the_guess_itself():
