@@ -94,8 +94,7 @@ __device__ void adam_step(const RasterArguments &s, int i, float *g, float weigh
     const int n = s.stride;
     const float t = s.steps[i] + 1.0f;
     s.steps[i] = t;
-    const float fix_1 = 1.0f / (1.0f - exp2f(fmaxf(t * LOG2_BETA_1, -100.0f)));
-    const float fix_2 = 1.0f / (1.0f - exp2f(fmaxf(t * LOG2_BETA_2, -100.0f)));
+    const float fix_1 = -1.0f / expm1f(t * LN_BETA_1), fix_2 = -1.0f / expm1f(t * LN_BETA_2);  // 1 / (1 - beta^t)
     const float a = s.params[SCALE * n + i], b = s.params[(SCALE + 1) * n + i], c = s.params[(SCALE + 2) * n + i];
     const float longest = fmaxf(a, fmaxf(b, c)), middle = fmaxf(fminf(a, b), fminf(fmaxf(a, b), c));
     const float pull = fmaxf(longest - middle - s.rates[PARAMS + 1], 0.0f) * s.rates[PARAMS] * weight;

@@ -60,15 +60,14 @@ struct Ellipse {  // where alpha is 1/255: A x^2 + B x y + C y^2 + level = 0 abo
     float x, y, A, B, C, level, half_width, half_height;
 };
 
-// Half of the width in y of the ellipse at x, times 2 |C|: sqrt(B^2 x^2 - 4 C (A x^2 + level)), without its cancellation.
+// sqrt(B^2 x^2 - 4 C (A x^2 + level)) without its cancellation: the extent of the ellipse at x, times 2 |C|.
 __device__ float root_at(const Ellipse &e, float x) {
     const float ratio = x / e.half_width;
     return sqrtf(fmaxf(-4.0f * e.C * e.level * (1.0f - ratio) * (1.0f + ratio), 0.0f));
 }
 
-// Finds the rows of pixels y0 ... y1 of the ellipse in a column of tiles; returns false if there are none: its highest
-// and lowest point in the column, y = (-B x -+ root) / 2 C. Where the compiler could choose whether to fuse a product
-// and a sum, the choice is written: `project` counts the pairs that `emit` writes, so both must round alike.
+// Finds the rows of pixels y0 ... y1 of the ellipse in a column of tiles; returns false if there are none. They are
+// bounded by the highest and the lowest point of the ellipse in the column, y = (-B x -+ root) / 2 C.
 __device__ bool rows_in_column(const Ellipse &e, int column, bool whole, int bottom, int &y0, int &y1) {
     const float slack = 1e-3f;
     float low = -e.half_height, high = e.half_height;
@@ -79,11 +78,11 @@ __device__ bool rows_in_column(const Ellipse &e, int column, bool whole, int bot
         if (left > right + slack) return false;
         if (x_top < left || x_top > right) {
             const float x = fminf(fmaxf(x_top, left), right);
-            high = __fmul_rn(__fmaf_rn(-e.B, x, -root_at(e, x)), half_over_c);
+            high = (-e.B * x - root_at(e, x)) * half_over_c;
         }
         if (-x_top < left || -x_top > right) {
             const float x = fminf(fmaxf(-x_top, left), right);
-            low = __fmul_rn(__fmaf_rn(-e.B, x, root_at(e, x)), half_over_c);
+            low = (-e.B * x + root_at(e, x)) * half_over_c;
         }
     }
     y0 = (int)ceilf(fmaxf(e.y + low - slack, 0.0f));
@@ -91,10 +90,10 @@ __device__ bool rows_in_column(const Ellipse &e, int column, bool whole, int bot
     return y0 <= y1;
 }
 
-// Returns the number of tiles that the splat overlaps, exact per column of tiles. With at >= 0, writes its pairs to
+// Returns the number of tiles that the splat overlaps, exact per column of tiles. Writes its first `limit` pairs to
 // places at, at + 1, ...; those beyond the capacity are dropped.
 __device__ int list_tiles(const RasterArguments &s, float4 r0, float4 r1, float half_width, float half_height,
-                          int at, int gaussian) {
+                          int at, int limit, int gaussian) {
     const Ellipse e = {r0.x, r0.y, r0.z, r0.w, r1.x, r1.y - LOG2_ALPHA_MIN, half_width, half_height};
     const float right = s.width - 1, bottom = s.height - 1;
     if (!(e.level > 0.0f)) return 0;  // alpha is below 1/255 at the centre, or NaN
@@ -106,7 +105,7 @@ __device__ int list_tiles(const RasterArguments &s, float4 r0, float4 r1, float 
         int y0, y1;
         if (!rows_in_column(e, column, first == last, s.height - 1, y0, y1)) continue;
         for (int row = y0 / TILE; row <= y1 / TILE; ++row, ++n)
-            if (at >= 0 && at + n < s.pairs) {
+            if (n < limit && at + n < s.pairs) {
                 s.pair_tile[at + n] = (short)(row * s.tiles_x + column);
                 s.pair_gaussian[at + n] = gaussian;
             }
@@ -130,7 +129,7 @@ KERNEL(256) project(RasterArguments s) {
         const float4 r0 = make_float4(u, v, h.d * k * (-0.5f * LOG2_E), h.b * k * LOG2_E);
         const float4 r1 = make_float4(h.a * k * (-0.5f * LOG2_E), log_opacity, p[COLOUR * s.stride],
                                       p[(COLOUR + 1) * s.stride]);
-        n = list_tiles(s, r0, r1, half_width, half_height, -1, i);
+        n = list_tiles(s, r0, r1, half_width, half_height, 0, 0, i);
         if (n) {
             s.records[3 * i] = r0;
             s.records[3 * i + 1] = r1;
@@ -148,8 +147,10 @@ KERNEL(256) emit(RasterArguments s) {
     const int gaussian = (int)s.order[i], n = s.pair_count[gaussian], at = s.pair_end[i] - n;
     s.first_pair[gaussian] = at;
     if (i == s.stride - 1) *s.most_pairs = max(*s.most_pairs, s.pair_end[i]);
-    if (n && at < s.pairs) {
-        const float4 r2 = s.records[3 * gaussian + 2];
-        list_tiles(s, s.records[3 * gaussian], s.records[3 * gaussian + 1], r2.z, r2.w, at, gaussian);
-    }
+    if (n == 0 || at >= s.pairs) return;
+    const float4 r2 = s.records[3 * gaussian + 2];
+    const int listed = list_tiles(s, s.records[3 * gaussian], s.records[3 * gaussian + 1], r2.z, r2.w, at, n, gaussian);
+    // The compiler may round here otherwise than in `project`: pairs that were counted and not listed have no sums.
+    for (int k = at + listed; k < min(at + n, s.pairs); ++k)
+        for (int j = 0; j < 3; ++j) s.slots[3 * k + j] = make_float4(0, 0, 0, 0);
 }

@@ -28,7 +28,7 @@ EMPTY_TILE = 32767  # the largest int16: behind all tiles
 KEYFRAME_STATE = 48  # float64 values of a keyframe, see `keyframe_states`
 TILES = (8, 16)  # possible sides of a tile, px
 
-_TYPES: dict[str, type] = {"int": ctypes.c_int, "float": ctypes.c_float, "double": ctypes.c_double}
+_TYPES: dict[str, Any] = {"int": ctypes.c_int, "float": ctypes.c_float, "double": ctypes.c_double}
 _STRUCTURE = re.compile(r"^struct (?P<name>\w+Arguments) \{(?P<body>.*?)^\};", re.MULTILINE | re.DOTALL)
 _DECLARATION = re.compile(
     r"^\s*(?:const )?(?P<type>(?:unsigned |long )?\w+) (?P<names>[^;/]+);", re.MULTILINE
@@ -98,7 +98,7 @@ def _constants(tile: int) -> dict[str, float]:
         "BUCKET": BUCKET, "GROUP": GROUP, "EMPTY_TILE": EMPTY_TILE, "KEYFRAME_STATE": KEYFRAME_STATE,
         "FAR": 3.0e38, "LOG2_E": math.log2(math.e),
         "ADAM_1": 1.0 - optimiser.BETA_1, "ADAM_2": 1.0 - optimiser.BETA_2, "EPSILON": optimiser.EPSILON,
-        "LOG2_BETA_1": math.log2(optimiser.BETA_1), "LOG2_BETA_2": math.log2(optimiser.BETA_2),
+        "LN_BETA_1": math.log(optimiser.BETA_1), "LN_BETA_2": math.log(optimiser.BETA_2),
         "SSIM_C1": ssim.C1, "SSIM_C2": ssim.C2,
         **{f"LUMA_{channel}": float(weight) for channel, weight in zip("RGB", ssim.LUMA)},
     }  # fmt: skip
@@ -110,20 +110,21 @@ def _literal(value: float) -> str:
 
 def _structure(name: str, body: str) -> type[ctypes.Structure]:
     """Build the ctypes structure of a C structure; pointers become `c_void_p`."""
-    fields: list[tuple[str, type]] = []
+    fields: list[tuple[str, Any]] = []
     for line in _DECLARATION.finditer(body):
         for part in line["names"].split(","):
             found = _NAME.fullmatch(part.strip())
             if found is None:
                 raise ValueError(f"{name}: cannot read the declaration {line[0].strip()!r}")
-            kind: type = ctypes.c_void_p if found["pointer"] else _TYPES[line["type"]]
+            kind: Any = ctypes.c_void_p if found["pointer"] else _TYPES[line["type"]]
             fields.append((found["name"], kind * int(found["length"]) if found["length"] else kind))
-    return type(name, (ctypes.Structure,), {"_fields_": fields})
+    structure: Any = type(name, (ctypes.Structure,), {"_fields_": fields})
+    return structure
 
 
 def filled(structure: type[ctypes.Structure], **values: Any) -> ctypes.Structure:
     """Return a structure with fields from tensors (their addresses), arrays of numbers, numbers and None."""
-    out, kinds = structure(), dict(structure._fields_)  # type: ignore[arg-type]
+    out, kinds = structure(), {field[0]: field[1] for field in structure._fields_}
     for name, value in values.items():
         kind: Any = kinds[name]
         if kind is ctypes.c_void_p:

@@ -8,6 +8,7 @@ import torch
 
 from beamsplat.common.raster.camera import RasterCamera
 from beamsplat.common.raster.cuda.device_map import DeviceMap
+from beamsplat.common.raster.cuda.target_cache import TargetCache
 from beamsplat.common.raster.cuda.targets import pack_targets, pixel_bytes
 from beamsplat.common.raster.cuda.training import StepSettings
 from beamsplat.common.raster.ssim import SsimLoss
@@ -156,6 +157,29 @@ def test_targets_of_many_beams_enlarge_the_buffer():
     view.compute_losses()
     expected = cpu_loss(level, image, np.zeros(6, np.float32), SETTINGS, False)
     assert np.array_equal(view.gradient.numpy()[3:], expected.gradient[3:])
+
+
+def test_the_target_cache_frees_what_was_used_least_recently():
+    cache, packed = TargetCache(shim_kernels(), budget_bytes=250), []
+
+    def get(key, size=100):
+        def pack():
+            packed.append(key)
+            return np.full(size, key, np.uint8)
+
+        assert np.array_equal(cache.get(key, pack).numpy(), np.full(size, key, np.uint8))
+
+    for key in (1, 2, 1, 3, 1, 2):  # 2 leaves for 3, then 3 for 2
+        get(key)
+    assert packed == [1, 2, 3, 2]
+    assert cache.held_bytes == 200
+    cache.forget(1)
+    cache.forget(7)
+    assert cache.held_bytes == 100
+    get(5, 1000)  # more than the budget: alone
+    assert cache.held_bytes == 1000
+    get(2)
+    assert packed == [1, 2, 3, 2, 5, 2]
 
 
 def test_packed_targets_hold_beams_by_pixel():
