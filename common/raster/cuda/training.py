@@ -152,14 +152,17 @@ class TrainingView(RasterView):
         recorded[1].replay()
 
     def _record(self, with_ssim: bool) -> Any:
-        stream = torch.cuda.Stream(self._kernels.device)
-        stream.wait_stream(torch.cuda.current_stream(self._kernels.device))
-        with torch.cuda.stream(stream):
-            self.forward()  # torch loads its kernels at their first call, which a capture does not allow
-        torch.cuda.current_stream(self._kernels.device).wait_stream(stream)
-        graph = torch.cuda.CUDAGraph()
-        with torch.cuda.graph(graph, pool=self._buffers.graph_pool, capture_error_mode="thread_local"):
-            self.step(with_ssim)
+        device = self._kernels.device
+        with torch.cuda.device(device):
+            stream = torch.cuda.Stream(device)
+            stream.wait_stream(torch.cuda.current_stream(device))
+            with torch.cuda.stream(stream):
+                self.forward()  # torch loads its kernels at their first call, which a capture does not allow
+            torch.cuda.current_stream(device).wait_stream(stream)
+            graph = torch.cuda.CUDAGraph()
+            pool = self._buffers.graph_pool
+            with torch.cuda.graph(graph, pool=pool, capture_error_mode="thread_local"):
+                self.step(with_ssim)
         return graph
 
     def step(self, with_ssim: bool = False, learn: bool = True) -> None:

@@ -5,7 +5,7 @@ import numpy as np
 from beamsplat.common.raster.cuda.buffers import RasterBuffers
 from beamsplat.common.raster.cuda.gaussians import DeviceGaussians
 from beamsplat.common.raster.cuda.view import RasterView
-from tests.common.raster.cuda.shim import shim_kernels
+from tests.common.raster.cuda.shim import kernels_under_test
 from tests.common.raster.scenes import random_camera, random_gaussians, random_pose
 
 
@@ -29,7 +29,7 @@ def random_scene(seed, width_px=61, height_px=47, count=400, more_opacity=0.0):
 
 def view_of(params, count, camera, T_camera_map, *, tile=8, pairs=1 << 14, with_rows=True):
     """A view of the Gaussians with its camera set."""
-    kernels = shim_kernels(tile)
+    kernels = kernels_under_test(tile)
     gaussians = DeviceGaussians(kernels, count)
     gaussians.append(params[:, :count])
     view = RasterView(

@@ -16,9 +16,9 @@ from beamsplat.common.raster.threads import ThreadTeam
 from beamsplat.services.mapping.kernels import add_lidar, exposure_gradient, photometric_and_depth
 from beamsplat.services.mapping.keyframe import PyramidLevel, with_hidden
 from tests.common.raster.cuda.scenes import relative
-from tests.common.raster.cuda.shim import needs_compiler, shim_kernels
+from tests.common.raster.cuda.shim import LOOSE, ON_GPU, kernels_under_test, needs_kernels
 
-pytestmark = needs_compiler
+pytestmark = needs_kernels
 
 SETTINGS = StepSettings(lidar_weight=0.05, refine_exposure=True)
 EXPOSURE = np.array([0.3, -0.2, 0.1, 0.05, -0.1, 0.02], np.float32)
@@ -97,7 +97,7 @@ def packed_level(level):
 def test_losses_and_gradients_agree_with_numba(size, with_mask, beams, with_ssim):
     level, image = level_of(*size, with_mask=with_mask, beams=beams)
     expected = cpu_loss(level, image, EXPOSURE, SETTINGS, with_ssim)
-    device_map = DeviceMap(shim_kernels(), SETTINGS)
+    device_map = DeviceMap(kernels_under_test(), SETTINGS)
     view = device_map.training_view(*size)
     view.load(packed_level(level))
     view.begin(level.camera, np.eye(4), exposure=EXPOSURE)
@@ -105,23 +105,25 @@ def test_losses_and_gradients_agree_with_numba(size, with_mask, beams, with_ssim
     view.image.copy_(torch.from_numpy(image))
     view.compute_losses(with_ssim)
     view._finish(with_ssim)
-    gradient = view.gradient.numpy()
+    gradient = view.gradient.cpu().numpy()
     for channel in range(5):
-        assert relative(gradient[channel], expected.gradient[channel]) <= 2e-6, channel
-    if not with_ssim:  # the same instructions
+        assert relative(gradient[channel], expected.gradient[channel]) <= 2e-6 * LOOSE, channel
+    if not with_ssim and not ON_GPU:  # the same instructions
         assert np.array_equal(gradient[3:], expected.gradient[3:])
     if with_mask:
         assert not gradient[:, level.hidden].any()
     (loss,) = device_map.losses.read()
-    assert loss == pytest.approx(expected.loss, rel=2e-6)
-    np.testing.assert_allclose(view.exposure.numpy(), expected.exposure, rtol=1e-4, atol=1e-6)
+    assert loss == pytest.approx(expected.loss, rel=2e-6 * LOOSE)
+    np.testing.assert_allclose(
+        view.exposure.cpu().numpy(), expected.exposure, rtol=1e-4 * LOOSE, atol=1e-6 * LOOSE
+    )
 
 
 def test_ssim_of_hidden_pixels_is_that_of_the_render():
     """All pixels hidden: the target is the render, rounded to 8 bits; nothing is to be learned."""
     level, image = level_of(40, 30, with_mask=True)
     level.hidden[:] = True
-    device_map = DeviceMap(shim_kernels(), SETTINGS)
+    device_map = DeviceMap(kernels_under_test(), SETTINGS)
     view = device_map.training_view(40, 30)
     view.load(packed_level(level))
     view.begin(level.camera, np.eye(4), exposure=np.zeros(6))
@@ -129,13 +131,13 @@ def test_ssim_of_hidden_pixels_is_that_of_the_render():
     view.image.copy_(torch.from_numpy(image))
     view.compute_losses(True)
     view._finish(True)
-    assert not view.gradient.numpy().any()
+    assert not view.gradient.cpu().numpy().any()
     expected = cpu_loss(level, image, np.zeros(6, np.float32), SETTINGS, True)
-    assert device_map.losses.read()[0] == pytest.approx(expected.loss, rel=1e-5)
+    assert device_map.losses.read()[0] == pytest.approx(expected.loss, rel=1e-5 * LOOSE)
 
 
 def test_losses_are_read_once_and_in_order():
-    device_map = DeviceMap(shim_kernels(), StepSettings(lidar_weight=0.0, depth_weight=0.0))
+    device_map = DeviceMap(kernels_under_test(), StepSettings(lidar_weight=0.0, depth_weight=0.0))
     view = device_map.training_view(8, 8)
     for grey in (0, 51, 102):
         rgb = np.full((3, 8, 8), grey, np.uint8)
@@ -149,25 +151,25 @@ def test_losses_are_read_once_and_in_order():
 
 def test_targets_of_many_beams_enlarge_the_buffer():
     level, image = level_of(20, 10, beams=20_000)
-    view = DeviceMap(shim_kernels(), SETTINGS).training_view(20, 10)
+    view = DeviceMap(kernels_under_test(), SETTINGS).training_view(20, 10)
     view.load(packed_level(level))
     view.begin(level.camera, np.eye(4))
     view.prepare()
     view.image.copy_(torch.from_numpy(image))
     view.compute_losses()
     expected = cpu_loss(level, image, np.zeros(6, np.float32), SETTINGS, False)
-    assert np.array_equal(view.gradient.numpy()[3:], expected.gradient[3:])
+    np.testing.assert_allclose(view.gradient.cpu().numpy()[3:], expected.gradient[3:], rtol=1e-6 * LOOSE)
 
 
 def test_the_target_cache_frees_what_was_used_least_recently():
-    cache, packed = TargetCache(shim_kernels(), budget_bytes=250), []
+    cache, packed = TargetCache(kernels_under_test(), budget_bytes=250), []
 
     def get(key, size=100):
         def pack():
             packed.append(key)
             return np.full(size, key, np.uint8)
 
-        assert np.array_equal(cache.get(key, pack).numpy(), np.full(size, key, np.uint8))
+        assert np.array_equal(cache.get(key, pack).cpu().numpy(), np.full(size, key, np.uint8))
 
     for key in (1, 2, 1, 3, 1, 2):  # 2 leaves for 3, then 3 for 2
         get(key)

@@ -17,10 +17,10 @@ from beamsplat.common.raster.rasterizer import Rasterizer
 from beamsplat.services.mapping.kernels import count_carving_votes
 from beamsplat.services.mapping.keyframe import StoredKeyframe, refine_exposure, refine_pose
 from tests.common.raster.cuda.scenes import random_scene, relative
-from tests.common.raster.cuda.shim import needs_compiler, shim_kernels
+from tests.common.raster.cuda.shim import LOOSE, ON_GPU, kernels_under_test, needs_kernels
 from tests.common.raster.cuda.test_cuda_losses import cpu_loss, level_of, packed_level
 
-pytestmark = needs_compiler
+pytestmark = needs_kernels
 
 RATES = learning_rates(2e-3, 6e-3, 2e-3, 3e-2, 5e-3)
 
@@ -46,21 +46,23 @@ def test_begin_step_is_the_packed_camera_and_the_exposure():
         make_transform(so3_exp([0.3, -1.0, 2.0]), rng.normal(size=3)),
         random_keyframe(rng, camera),
     )
-    device_map = DeviceMap(shim_kernels(), keyframes=3)
+    device_map = DeviceMap(kernels_under_test(), keyframes=3)
     device_map.states.write([2], [state_of(keyframe)])
     view = device_map.training_view(61, 47)
     view.begin(camera, T_map_camera, 2)
     np.testing.assert_allclose(
-        view.camera.numpy(), camera.packed(inverse(T_map_camera @ keyframe.delta)), rtol=1e-6, atol=1e-7
+        view.camera.cpu().numpy(), camera.packed(inverse(T_map_camera @ keyframe.delta)), rtol=1e-6, atol=1e-7
     )
     gain, offset = np.exp(keyframe.exposure[:3]), keyframe.exposure[3:]
     luma = np.array([0.299, 0.587, 0.114], np.float32)
-    np.testing.assert_allclose(view.tone.numpy(), [*gain, *offset, *(luma * gain), luma @ offset], rtol=1e-6)
+    np.testing.assert_allclose(
+        view.tone.cpu().numpy(), [*gain, *offset, *(luma * gain), luma @ offset], rtol=1e-6
+    )
     view.begin(camera, T_map_camera)
     np.testing.assert_allclose(
-        view.camera.numpy(), camera.packed(inverse(T_map_camera)), rtol=1e-6, atol=1e-7
+        view.camera.cpu().numpy(), camera.packed(inverse(T_map_camera)), rtol=1e-6, atol=1e-7
     )
-    np.testing.assert_allclose(view.tone.numpy(), [1, 1, 1, 0, 0, 0, *luma, 0])
+    np.testing.assert_allclose(view.tone.cpu().numpy(), [1, 1, 1, 0, 0, 0, *luma, 0])
     with pytest.raises(ValueError, match="61x47"):
         view.begin(camera.resized(30, 23), T_map_camera)
 
@@ -68,7 +70,7 @@ def test_begin_step_is_the_packed_camera_and_the_exposure():
 def test_states_of_keyframes_are_read_as_written():
     rng = np.random.default_rng(2)
     keyframes = [random_keyframe(rng, RasterCamera(50.0, 52.0, 30.0, 22.0, 61, 47)) for _ in range(3)]
-    states = DeviceMap(shim_kernels(), keyframes=5).states
+    states = DeviceMap(kernels_under_test(), keyframes=5).states
     states.write([4, 0, 2], [state_of(k) for k in keyframes])
     for keyframe, state in zip(keyframes[1:], states.read([0, 2])):
         for name in FIELDS:
@@ -84,7 +86,7 @@ def test_steps_of_pose_and_exposure_agree_with_the_mapper(scale):
         refine_pose=True, refine_exposure=True, pose_m=5e-2 * scale, pose_rad=3e-2 * scale, exposure=1e-2
     )
     keyframe = random_keyframe(rng, camera)
-    device_map = DeviceMap(shim_kernels(), s, keyframes=2)
+    device_map = DeviceMap(kernels_under_test(), s, keyframes=2)
     device_map.states.write([1], [state_of(keyframe)])
     view = device_map.training_view(16, 16)
     view.begin(camera, np.eye(4), 1)
@@ -110,17 +112,17 @@ def test_carving_votes_agree_with_numba():
     level, _ = level_of(61, 47)
     packed = camera.packed(T)
     expected = np.arange(count, dtype=np.int32) % 3
-    kernels = shim_kernels()
+    kernels = kernels_under_test()
     gaussians = DeviceGaussians(kernels, count)
     gaussians.append(params[:, :count])
     gaussians.write(slice(0, count), {"carving_votes": expected})
-    gaussians.vote_carving(packed_level(level), packed, (61, 47), 127, 0.08)
+    gaussians.vote_carving(packed_level(level).to(kernels.device), packed, (61, 47), 127, 0.08)
     voted = count_carving_votes(
         params, count, packed, level.depth_mm, level.depth_weight, np.uint8(127), 0.08, expected
     )
     votes = gaussians.read(names=("carving_votes",))["carving_votes"]
     assert voted > 100
-    assert np.count_nonzero(votes != expected) <= 1  # a pixel or a depth at the limit, rounded otherwise
+    assert np.count_nonzero(votes != expected) <= LOOSE  # a pixel or a depth at the limit, rounded otherwise
     keep = gaussians.survivors(3, 0.0)
     assert np.array_equal(keep, (votes < 3) & (params[OPACITY, :count] > 0.0))
 
@@ -131,7 +133,7 @@ def test_a_rigid_motion_agrees_with_the_store():
     T_new_old = make_transform(so3_exp([0.3, -1.0, 2.0]), rng.normal(size=3))
     group = np.sort(rng.choice(count, count // 3, replace=False))
     first = rng.normal(size=(14, count)).astype(np.float32)
-    gaussians = DeviceGaussians(shim_kernels(), count)
+    gaussians = DeviceGaussians(kernels_under_test(), count)
     gaussians.append(params[:, :count])
     gaussians.write(slice(0, count), {"first": first})
     gaussians.move(group, T_new_old)
@@ -146,7 +148,7 @@ def test_a_rigid_motion_agrees_with_the_store():
 
 
 def test_device_gaussians_grow_and_shrink_with_their_optimiser_state():
-    gaussians, rng = DeviceGaussians(shim_kernels(), 16), np.random.default_rng(0)
+    gaussians, rng = DeviceGaussians(kernels_under_test(), 16), np.random.default_rng(0)
     old, new = (rng.normal(size=(14, n)).astype(np.float32) for n in (200, 300))
     assert gaussians.append(old) == slice(0, 200)
     gaussians.write(
@@ -206,7 +208,7 @@ def test_whole_steps_agree_with_the_mapper():
         StoredKeyframe(0, 0, np.eye(4), camera, []),
     )
     arrays.append(params[:, :count])
-    device_map = DeviceMap(shim_kernels(), settings, keyframes=2, pairs=1 << 14)
+    device_map = DeviceMap(kernels_under_test(), settings, keyframes=2, pairs=1 << 14)
     device_map.gaussians.append(params[:, :count])
     device_map.states.write([1], [state_of(keyframe)])
     T_map_camera, expected = inverse(T_camera_map), []
@@ -218,14 +220,16 @@ def test_whole_steps_agree_with_the_mapper():
         view.begin(level.camera, T_map_camera, 1)
         view.run(with_ssim)
         expected.append(cpu_step(arrays, numba, keyframe, level, T_map_camera, settings, with_ssim))
-    np.testing.assert_allclose(device_map.losses.read(), expected, rtol=1e-4)
+    np.testing.assert_allclose(device_map.losses.read(), expected, rtol=1e-4 * LOOSE)
     mine = device_map.gaussians.read()
     seen = mine["steps"] == 6
     assert seen.sum() > 30
     change, true_change = (
         p[:, :count][:, seen] - params[:, :count][:, seen] for p in (mine["params"], arrays.params)
     )
-    assert relative(change, true_change) < 0.05  # Adam's first steps follow the signs of gradients near zero
+    assert relative(change, true_change) < (
+        0.3 if ON_GPU else 0.05
+    )  # Adam's first steps follow the signs of gradients near zero
     (state,) = device_map.states.read([1])
     np.testing.assert_allclose(state["delta"], keyframe.delta, atol=2e-5)
     np.testing.assert_allclose(state["exposure"], keyframe.exposure, atol=1e-4)
@@ -235,11 +239,11 @@ def test_whole_steps_agree_with_the_mapper():
 
 def test_pictures_agree_with_the_numba_rasterizer():
     params, count, camera, T, _ = random_scene(11)
-    device_map = DeviceMap(shim_kernels(), pairs=128)  # grows
+    device_map = DeviceMap(kernels_under_test(), pairs=128)  # grows
     device_map.gaussians.append(params[:, :count])
     expected = Rasterizer(1).render(params, count, camera, T, np.array([0.1, 0.2, 0.3], np.float32)).image
     got = device_map.picture(camera, T, np.array([0.1, 0.2, 0.3]))
-    np.testing.assert_allclose(got, expected, atol=2e-5 * np.abs(expected).max())
+    np.testing.assert_allclose(got, expected, atol=2e-5 * LOOSE * np.abs(expected).max())
     for width in range(20, 30):  # many sizes: the buffers of some are freed
         device_map.picture(camera.resized(width, 15), T)
     assert len(device_map._views) <= 5

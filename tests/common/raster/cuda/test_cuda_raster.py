@@ -6,21 +6,22 @@ import numpy as np
 import pytest
 import torch
 
+from beamsplat.common.raster.cuda.view import RasterView, tile_for
 from beamsplat.common.raster.layout import WEIGHT
 from beamsplat.common.raster.optimiser import GaussianArrays, learning_rates
 from beamsplat.common.raster.rasterizer import Rasterizer
 from beamsplat.services.mapping.renderers.protocol import Gaussians, make_renderer
 from tests.common.raster.cuda.scenes import packed, random_scene, relative, view_of
-from tests.common.raster.cuda.shim import needs_compiler
+from tests.common.raster.cuda.shim import LOOSE, ON_GPU, kernels_under_test, needs_kernels
 from tests.common.raster.scenes import random_camera, random_gaussians, random_pose
 
-pytestmark = needs_compiler
+pytestmark = needs_kernels
 
 
 def backward(view, gradient, learn=False):
     view.gradient.copy_(torch.from_numpy(gradient))
     view.backward(learn)
-    return view.rows.numpy(), view.pose_gradient().numpy()
+    return view.rows.cpu().numpy(), view.pose_gradient().cpu().numpy()
 
 
 @functools.cache
@@ -35,15 +36,15 @@ def float64_result(seed, size, count):
     render = make_renderer("reference").render(gaussians, camera, T, None, tangent)
     image = torch.cat([render.colour.permute(2, 0, 1), render.depth_m[None], render.alpha[None]])
     (torch.as_tensor(weights) * image + 0.1 * (image - 0.5) ** 2).mean().backward()
-    gradients = [tensor.grad.numpy().reshape(count, -1) for tensor in gaussians.tensors()]
+    gradients = [tensor.grad.cpu().numpy().reshape(count, -1) for tensor in gaussians.tensors()]
     return (
         arrays,
         camera,
         T,
         weights,
-        image.detach().numpy(),
+        image.detach().cpu().numpy(),
         np.concatenate(gradients, 1),
-        tangent.grad.numpy(),
+        tangent.grad.cpu().numpy(),
     )
 
 
@@ -54,12 +55,12 @@ def float64_result(seed, size, count):
 def test_image_and_gradients_agree_with_float64(seed, size, count, tile):
     arrays, camera, T, weights, true_image, true_rows, true_pose = float64_result(seed, size, count)
     view = view_of(*packed(arrays), camera, T, tile=tile)
-    image = view.forward().numpy().astype(np.float64)
-    assert -10 * np.log10(np.mean((image - true_image) ** 2)) >= 100.0
+    image = view.forward().cpu().numpy().astype(np.float64)
+    assert -10 * np.log10(np.mean((image - true_image) ** 2)) >= (80.0 if ON_GPU else 100.0)
     rows, pose = backward(view, ((weights + 0.2 * (image - 0.5)) / image.size).astype(np.float32))
     for row, expected in enumerate(true_rows.T):
-        assert relative(rows[row, :count], expected) <= 1e-4, row
-    assert relative(pose, true_pose) <= 1e-4
+        assert relative(rows[row, :count], expected) <= 1e-4 * LOOSE, row
+    assert relative(pose, true_pose) <= 1e-4 * LOOSE
 
 
 @pytest.mark.parametrize("tile", [8, 16])
@@ -75,12 +76,14 @@ def compare_with_numba(params, count, camera, T, weights, tile=8, **view_options
     gradients = numba.backward(render, weights)
     dense = gradients.dense(count)
     view = view_of(params, count, camera, T, tile=tile, **view_options)
-    assert np.abs(view.forward().numpy() - render.image).max() <= 2e-5 * max(1.0, np.abs(render.image).max())
+    assert np.abs(view.forward().cpu().numpy() - render.image).max() <= 2e-5 * LOOSE * max(
+        1.0, np.abs(render.image).max()
+    )
     rows, pose = backward(view, weights)
     for row in range(len(dense)):
-        assert relative(rows[row, :count], dense[row]) <= 1e-4, row
+        assert relative(rows[row, :count], dense[row]) <= 1e-4 * LOOSE, row
     assert not rows[:, count:].any()
-    assert relative(pose, gradients.pose) <= 2e-4
+    assert relative(pose, gradients.pose) <= 2e-4 * LOOSE
     return view
 
 
@@ -102,7 +105,7 @@ def test_the_same_input_gives_the_same_bits():
         for _ in range(3):
             view.forward()
             rows, pose = backward(view, weights, learn=True)
-        results.append((view.image.numpy().copy(), rows.copy(), pose, view._gaussians.read()))
+        results.append((view.image.cpu().numpy().copy(), rows.copy(), pose, view._gaussians.read()))
     for a, b in zip(results[0][:3], results[1][:3]):
         assert np.array_equal(a, b)
     for name, array in results[0][3].items():
@@ -128,28 +131,28 @@ def test_images_do_not_depend_on_earlier_images():
 def test_pairs_beyond_the_capacity_are_the_farthest_and_growth_repairs_it():
     params, count, camera, T, weights = random_scene(6, count=1500)
     full = view_of(params, count, camera, T)
-    image = full.forward().numpy().copy()
+    image = full.forward().cpu().numpy().copy()
     needed = int(full._buffers.most_pairs)
     view = view_of(params, count, camera, T, pairs=needed // 2)
     assert view._buffers.pairs == 0  # allocated with the first image
-    short = view.forward().numpy().copy()
+    short = view.forward().cpu().numpy().copy()
     kept = view._buffers.pairs
     assert needed // 2 <= kept < needed
     rows, _ = backward(view, weights)
     assert np.isfinite(short).all()
     assert np.isfinite(rows).all()
     # What is drawn lies in front of what is not.
-    depth = view._buffers.depth.numpy()[:count]
+    depth = view._buffers.depth.cpu().numpy()[:count]
     drawn = rows[WEIGHT, :count] > 0
-    dropped = (view._buffers.first_pair.numpy()[:count] >= kept) & (
-        view._buffers.pair_count.numpy()[:count] > 0
+    dropped = (view._buffers.first_pair.cpu().numpy()[:count] >= kept) & (
+        view._buffers.pair_count.cpu().numpy()[:count] > 0
     )
     assert drawn.sum() > 20
     assert dropped.sum() > 50
     assert depth[drawn].max() <= depth[dropped].min()
     assert view._buffers.grow()
     assert not view._buffers.grow()
-    assert np.array_equal(view.forward().numpy(), image)
+    assert np.array_equal(view.forward().cpu().numpy(), image)
     rows, _ = backward(view, weights)
     full_rows, _ = backward(full, weights)
     assert np.array_equal(rows, full_rows)
@@ -171,18 +174,18 @@ def test_adam_agrees_with_numba():
     for name in ("params", "first", "second"):
         start = params[:, :count] if name == "params" else 0.0
         change, expected = mine[name] - start, getattr(arrays, name)[:, :count] - start
-        assert relative(change[:, seen], expected[:, seen]) <= 1e-3, name
+        assert relative(change[:, seen], expected[:, seen]) <= 1e-3 * LOOSE, name
     assert np.array_equal(mine["steps"], seen.astype(np.float32))
     assert np.array_equal(mine["params"][:, ~seen], params[:, :count][:, ~seen])
 
 
 def test_gaussians_with_nan_are_not_drawn():
     params, count, camera, T, weights = random_scene(7)
-    without = view_of(np.ascontiguousarray(params[:, 16:]), count - 16, camera, T).forward().numpy()
+    without = view_of(np.ascontiguousarray(params[:, 16:]), count - 16, camera, T).forward().cpu().numpy()
     broken = params.copy()
     broken[:, :16] = np.nan
     view = view_of(broken, count, camera, T)
-    assert np.array_equal(view.forward().numpy(), without)
+    assert np.array_equal(view.forward().cpu().numpy(), without)
     rows, pose = backward(view, weights)
     assert np.isfinite(rows).all()
     assert np.isfinite(pose).all()
@@ -191,20 +194,17 @@ def test_gaussians_with_nan_are_not_drawn():
 def test_no_gaussians_are_a_black_image():
     params, _, camera, T, weights = random_scene(7)
     view = view_of(params, 0, camera, T)
-    assert not view.forward().numpy().any()
+    assert not view.forward().cpu().numpy().any()
     rows, pose = backward(view, weights)
     assert not rows.any()
     assert not pose.any()
 
 
 def test_large_images_need_large_tiles():
-    from beamsplat.common.raster.cuda.view import RasterView, tile_for
-    from tests.common.raster.cuda.shim import shim_kernels
-
     assert tile_for(640, 480) == 8
     assert tile_for(1920, 1080) == 8
     assert tile_for(2560, 1440) == 16
     with pytest.raises(ValueError, match="too many"):
         tile_for(8000, 8000)
     with pytest.raises(ValueError, match="too many"):
-        RasterView(shim_kernels(8), None, None, 2560, 1440)
+        RasterView(kernels_under_test(8), None, None, 2560, 1440)
