@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import weakref
 from collections.abc import Callable, Mapping, Sequence
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -19,6 +18,7 @@ from beamsplat.common.raster.camera import RasterCamera
 from beamsplat.common.raster.cuda.device_map import DeviceMap
 from beamsplat.common.raster.cuda.keyframe_states import FIELDS
 from beamsplat.common.raster.cuda.source import Kernels
+from beamsplat.common.raster.cuda.target_cache import TargetCache
 from beamsplat.common.raster.cuda.targets import pack_targets
 from beamsplat.common.raster.cuda.training import StepSettings
 from beamsplat.services.mapping.engines.cpu import rate_rows
@@ -28,16 +28,7 @@ from beamsplat.services.mapping.keyframe import PyramidLevel, StoredKeyframe
 from beamsplat.services.mapping.settings import LearningRates, MapperSettings
 
 _BATCH = 4096  # steps between two waits for the device, at most
-_TARGETS_BYTES = (
-    512 << 20
-)  # of keyframes in device memory; those that were not used for the longest time leave
-
-
-class _Targets(NamedTuple):
-    """The targets of one level of a keyframe in device memory."""
-
-    level: weakref.ref[PyramidLevel]  # whose they are; a keyframe that is read from disk again has new ones
-    bytes: torch.Tensor
+_TARGETS_BYTES = 512 << 20  # of keyframes in device memory: about 200 of 640x480 px
 
 
 class CudaEngine:
@@ -51,14 +42,17 @@ class CudaEngine:
         self._kernels = kernels
         self._map = DeviceMap(kernels, keyframes=_BATCH)
         self.store = DeviceStore(self._map.gaussians)
-        self._targets: dict[tuple[int, int], _Targets] = {}  # by keyframe and size; the last was used last
+        self._targets = TargetCache(kernels, _TARGETS_BYTES)  # by keyframe and size
+        # Whose targets they are: a keyframe that is read from disk again has new levels.
+        self._levels: dict[tuple[int, int], weakref.ref[PyramidLevel]] = {}
         self._rates: dict[tuple[int, int], tuple[LearningRates, bool]] = {}  # set in the views, by image size
 
     @property
     def description(self) -> str:
         """Return the device and the memory that the map takes there."""
         gaussians = self._map.gaussians
-        used = gaussians.bytes_each * gaussians.capacity + self._map.workspace_bytes + self._targets_bytes()
+        used = gaussians.bytes_each * gaussians.capacity + self._map.workspace_bytes
+        used += self._targets.held_bytes
         return f"{self._kernels.description}, {used / 1e6:.0f} MB"
 
     @property
@@ -90,21 +84,23 @@ class CudaEngine:
 
     def vote_carving(self, level: PyramidLevel, T_map_camera: np.ndarray, settings: MapperSettings) -> None:
         """See `Engine.vote_carving`."""
-        camera = level.camera
+        camera, targets = level.camera, torch.from_numpy(_packed(level)).to(self._kernels.device)
         self._map.gaussians.vote_carving(
-            self._uploaded(level), camera.packed(inverse(T_map_camera)), (camera.width_px, camera.height_px),
+            targets, camera.packed(inverse(T_map_camera)), (camera.width_px, camera.height_px),
             int(255.0 * settings.carve_weight), settings.carve_margin,
         )  # fmt: skip
         self.store.changed()
 
     def forget(self, id: int) -> None:
         """See `Engine.forget`."""
-        for key in [key for key in self._targets if key[0] == id]:
-            del self._targets[key]
+        for key in [key for key in self._levels if key[0] == id]:
+            del self._levels[key]
+            self._targets.forget(key)
 
     def close(self) -> None:
         """See `Engine.close`."""
-        self._targets.clear()
+        for id in {key[0] for key in self._levels}:
+            self.forget(id)
 
     def _use(self, settings: MapperSettings) -> None:
         r = settings.rates
@@ -129,10 +125,14 @@ class CudaEngine:
         keyframes = {step.keyframe.id: step.keyframe for step in steps}
         rows = {id: row for row, id in enumerate(keyframes)}
         self._map.states.write(list(rows.values()), [_state(keyframe) for keyframe in keyframes.values()])
-        for step in steps:
+        targets = self._targets_of(steps[0])
+        for number, step in enumerate(steps):
             if must_stop():
                 break
-            self._launch(step, T_map_anchor, settings, rows[step.keyframe.id])
+            # The next ones are copied to the device while this step runs.
+            following = self._targets_of(steps[number + 1]) if number + 1 < len(steps) else targets
+            self._launch(step, targets, T_map_anchor, settings, rows[step.keyframe.id])
+            targets = following
         losses = self._map.losses.read()  # waits
         for keyframe, state in zip(keyframes.values(), self._map.states.read(list(rows.values()))):
             _set_state(keyframe, state)
@@ -143,6 +143,7 @@ class CudaEngine:
     def _launch(
         self,
         step: OptimiserStep,
+        targets: torch.Tensor,
         T_map_anchor: Mapping[int, np.ndarray],
         settings: MapperSettings,
         row: int,
@@ -153,29 +154,23 @@ class CudaEngine:
         if self._rates.get(size) != (settings.rates, step.refining):
             view.set_learning_rates(rate_rows(settings.rates, step.refining))
             self._rates[size] = settings.rates, step.refining
-        view.load(self._targets_of(step, level))
+        view.load(targets)
         view.begin(level.camera, T_map_anchor[keyframe.anchor] @ keyframe.T_anchor_camera, row)
         view.run(step.with_ssim)
 
-    def _targets_of(self, step: OptimiserStep, level: PyramidLevel) -> torch.Tensor:
-        key = step.keyframe.id, step.size
-        held = self._targets.pop(key, None)
-        if held is None or held.level() is not level:
-            held = _Targets(weakref.ref(level), self._uploaded(level))
-        self._targets[key] = held
-        used = self._targets_bytes()
-        while used > _TARGETS_BYTES and len(self._targets) > 1:
-            used -= self._targets.pop(next(iter(self._targets))).bytes.nbytes
-        return held.bytes
+    def _targets_of(self, step: OptimiserStep) -> torch.Tensor:
+        level, key = step.keyframe.levels[step.size], (step.keyframe.id, step.size)
+        known = self._levels.get(key)
+        if known is None or known() is not level:
+            self._targets.forget(key)
+            self._levels[key] = weakref.ref(level)
+        return self._targets.get(key, lambda: _packed(level))
 
-    def _targets_bytes(self) -> int:
-        return sum(held.bytes.nbytes for held in self._targets.values())
 
-    def _uploaded(self, level: PyramidLevel) -> torch.Tensor:
-        block = pack_targets(
-            level.rgb, level.depth_mm, level.depth_weight, level.hidden, level.beam_pixels, level.beam_z_m
-        )
-        return torch.from_numpy(block).to(self._kernels.device)
+def _packed(level: PyramidLevel) -> np.ndarray:
+    return pack_targets(
+        level.rgb, level.depth_mm, level.depth_weight, level.hidden, level.beam_pixels, level.beam_z_m
+    )
 
 
 def _state(keyframe: StoredKeyframe) -> dict[str, np.ndarray]:
