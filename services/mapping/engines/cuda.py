@@ -129,10 +129,9 @@ class CudaEngine:
         for number, step in enumerate(steps):
             if must_stop():
                 break
-            # The next ones are copied to the device while this step runs.
-            following = self._targets_of(steps[number + 1]) if number + 1 < len(steps) else targets
             self._launch(step, targets, T_map_anchor, settings, rows[step.keyframe.id])
-            targets = following
+            if number + 1 < len(steps):  # copied to the device while this step runs
+                targets = self._targets_of(steps[number + 1])
         losses = self._map.losses.read()  # waits
         for keyframe, state in zip(keyframes.values(), self._map.states.read(list(rows.values()))):
             _set_state(keyframe, state)
