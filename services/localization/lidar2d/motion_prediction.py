@@ -45,9 +45,13 @@ class MotionPredictor:
         self.last_matched: tuple[int, np.ndarray] = (0, np.zeros(3))  # stamp and pose of the last good match
 
     def restart_clock(self, stamp_ns: int) -> None:
-        """Continue from the last pose at the stamp `stamp_ns`, after the clock was set to another time."""
+        """Continue at the stamp `stamp_ns`, after the clock was set back: from where the wheels say, else
+        from the last pose."""
         if self.poses:
-            self.stamps, self.poses = [stamp_ns - round(0.1 / NS)], [self.poses[-1]]
+            pose, moved = self.poses[-1], self.odometry.motion_over_set_back(self.last_matched[0], stamp_ns)
+            if moved is not None:
+                pose = se2.compose(self.last_matched[1], moved)
+            self.stamps, self.poses = [stamp_ns - round(0.1 / NS)], [pose]
             self.last_matched = self.stamps[-1], self.poses[-1]
             self.reckoning.restart(stamp_ns, self.poses[-1])
 

@@ -9,6 +9,7 @@ import numpy as np
 from beamsplat.common.compiled import kernel
 from beamsplat.services.localization.lidar2d import se2
 from beamsplat.services.localization.lidar2d.odometry_calibration import OdometryCalibration, OdometryReport
+from beamsplat.services.localization.lidar2d.validate import StampGuard
 from beamsplat.services.localization.lidar2d.wheel_gap import GapMotion, motion_over_gap
 
 NS = 1e-9
@@ -89,6 +90,8 @@ class OdometryBuffer:
         self._sums = np.zeros((3, len(DELAY_CANDIDATES_S)))  # of matched^2, matched * wheels, wheels^2
         self._weight = 0.0
         self.calibration = OdometryCalibration()
+        self._guard = StampGuard()
+        self._before = np.zeros(0, np.int64), np.zeros((0, 3))  # the buffer when the clock was set back
         self._pending: list[tuple[int, int, np.ndarray | None]] = []  # see observe()
 
     @property
@@ -100,15 +103,24 @@ class OdometryBuffer:
         return self._poses[: self._count]
 
     def add(self, stamp_ns: int, x_m: float, y_m: float, yaw_rad: float) -> bool:
-        """Append a pose; reject it (return False) if it is not finite or not newer than the last pose."""
+        """Append a pose; reject it (return False) if it is not finite or not newer than the last pose.
+
+        If the clock was set back, the new time is followed after a few poses: one stamp from the future must
+        not silence the wheels until then. See `motion_over_set_back` for the poses before.
+        """
         values = (x_m, y_m, yaw_rad)
-        if not all(math.isfinite(v) for v in values) or (self._count and stamp_ns <= self.stamps_ns[-1]):
-            # Restart if the clock was set back by more than the length of the buffer.
-            if self._count and stamp_ns < self.stamps_ns[0] and all(math.isfinite(v) for v in values):
-                self._count = 0
-            else:
-                self.rejected += 1
-                return False
+        if not all(math.isfinite(v) for v in values):
+            self.rejected += 1
+            return False
+        fault, set_back = self._guard.check(stamp_ns)
+        if fault:
+            self.rejected += 1
+            return False
+        if set_back:
+            self._before = self.stamps_ns.copy(), self.poses.copy()
+            self._count = 0
+            self._pending.clear()
+            self.calibration.restart()
         if self._count == 2 * self._capacity:
             self._stamps[: self._capacity] = self._stamps[self._capacity :]
             self._poses[: self._capacity] = self._poses[self._capacity :]
@@ -161,6 +173,21 @@ class OdometryBuffer:
             return None
         intervals_s = np.diff(self.stamps_ns[first : last + 1]) * NS
         return motion_over_gap(self.poses[first : last + 1], intervals_s, self._gap_ns * NS, self.calibration)
+
+    def motion_over_set_back(self, before_ns: int, now_ns: int) -> np.ndarray | None:
+        """Return the motion [3] from a stamp before the clock was set back to a stamp of the new time.
+
+        Wheels do not care about clocks: their poses tell the motion, also where a recording was played again
+        from an earlier place. None if the odometry's clock was not set back, or there is none at the stamps.
+        """
+        a, b = np.empty(3), np.empty(3)
+        stamps_ns, poses = self._before
+        if not interpolate(stamps_ns, poses, before_ns + self.delay_ns, self._gap_ns, self._gap_ns, a):
+            return None
+        at_ns = max(now_ns + self.delay_ns, int(self.stamps_ns[0])) if self._count else now_ns
+        if not interpolate(self.stamps_ns, self.poses, at_ns, self._gap_ns, self._gap_ns, b):
+            return None
+        return self.calibration.apply(se2.between(a, b))
 
     def motion_after_gap(self, t0_ns: int, t1_ns: int) -> np.ndarray:
         """Return the motion [3] between two stamps after a gap, by the mean velocity since the gap.

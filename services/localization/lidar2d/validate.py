@@ -8,7 +8,7 @@ import numpy as np
 
 from beamsplat.services.localization.lidar2d.scan import RawScan
 
-RESTART_SCANS = 5  # rejected scans in a row with increasing stamps, after which the clock is followed
+RESTART_AFTER = 5  # rejected stamps in a row that increase, after which the clock is followed
 
 
 class StampGuard:
@@ -27,7 +27,7 @@ class StampGuard:
         if self._refused_ns and stamp_ns <= self._refused_ns[-1]:
             self._refused_ns.clear()
         self._refused_ns.append(stamp_ns)
-        if len(self._refused_ns) >= RESTART_SCANS:
+        if len(self._refused_ns) >= RESTART_AFTER:
             self._refused_ns.clear()
             self.last_ns = stamp_ns
             return "", True

@@ -121,3 +121,29 @@ def test_the_error_model_follows_the_recent_errors():
 def test_twist_and_its_exponential():
     for motion in ([0.3, -0.1, 0.8], [0.2, 0.05, 1e-5], [0.0, 0.0, -2.5]):
         assert np.allclose(exp_twist(twist(np.array(motion), 0.4), 0.4), motion, atol=1e-9)
+
+
+def test_a_stamp_from_the_future_does_not_silence_the_wheels():
+    buffer, ticks = OdometryBuffer(), np.arange(0.0, 4.0, 0.02)
+    for k, (t, pose) in enumerate(zip(ticks, turning(ticks))):
+        stamp_ns = int(t * NS) + (3600 * NS if k == 100 else 0)
+        buffer.add(stamp_ns, *pose)
+    assert buffer.rejected == 4
+    moved = buffer.increment(int(3.0 * NS), int(3.5 * NS))
+    assert moved == pytest.approx(se2.between(*turning(np.array([3.0, 3.5]))), abs=2e-3)
+
+
+@pytest.mark.parametrize("repeated_s", [0.0, 5.0], ids=["clock set back", "played again"])
+def test_the_wheels_tell_the_motion_over_stamps_that_go_back(repeated_s):
+    """The clock goes back by an hour, or a recording is played again from 5 s earlier: there the robot was."""
+    buffer, end_s = OdometryBuffer(), 10.0
+    back_ns = 3600 * NS if repeated_s == 0.0 else 0
+    before, after = np.arange(0.0, end_s, 0.02), np.arange(end_s - repeated_s, end_s - repeated_s + 1.0, 0.02)
+    for t, pose in zip(before, turning(before)):
+        buffer.add(int(t * NS) + back_ns, *pose)
+    for t, pose in zip(after, turning(after)):
+        buffer.add(int(t * NS), *pose)
+    at_s = end_s - repeated_s + 0.5
+    moved = buffer.motion_over_set_back(int(9.9 * NS) + back_ns, int(at_s * NS))
+    assert moved == pytest.approx(se2.between(*turning(np.array([9.9, at_s]))), abs=5e-3)
+    assert OdometryBuffer().motion_over_set_back(0, NS) is None

@@ -188,6 +188,30 @@ def test_a_gap_in_the_scans_and_a_clock_set_back():
     assert back[-1].status == "ok"
 
 
+@pytest.mark.parametrize("with_wheels", [True, False])
+def test_a_recording_that_is_played_again_from_an_earlier_place_does_not_shift_the_map(with_wheels):
+    """Stamps and robot go back by 4 s, 2 m: the new scans do not continue from the last pose."""
+    drive, lidar = SimulatedDrive(), RayCastLidar(beams=240, seed=7)
+    ticks = np.arange(0, drive.duration_s, 0.02)
+    poses, slam, results, truth = wheels(drive, ticks), LidarSlam(SETTINGS, np.eye(4)), [], []
+    with JobRunner(slam) as jobs:
+        for first_s, last_s in ((0.0, 10.0), (6.0, 26.0)):
+            k = round(first_s / 0.02)
+            for t in np.arange(first_s, last_s, 0.1):
+                while with_wheels and ticks[k] <= t + 0.1:
+                    slam.add_odometry(START + round(ticks[k] * NS), *poses[k])
+                    k += 1
+                jobs.before_scan()
+                result = slam.add_scan(START + round(t * NS), lidar.scan(drive, t), *lidar.arguments())
+                jobs.after_scan(result)
+                results.append(result)
+                truth.append(drive(np.array([t]))[0])
+    ok = [i for i, r in enumerate(results) if r.status == "ok"]
+    assert len(ok) > (290 if with_wheels else 120)
+    found = np.array([se2.compose(results[i].pose_map_odom, results[i].pose_odom_body) for i in ok])
+    assert trajectory_errors(found, np.array(truth)[ok]).ate_first_pose_rmse_m < 0.06
+
+
 def test_dynamic_objects_are_marked_and_not_mapped():
     drive, lidar = SimulatedDrive(speed_m_s=0.3), RayCastLidar(beams=360, seed=8)
 
