@@ -63,12 +63,8 @@ def _model_of(dataset: WrittenDataset) -> _ColmapModel:
         index[mine] = np.arange(len(mine))
         T = inverse(entry.T_map_camera)
         pose = [*quat_wxyz_from_matrix(T[:3, :3]).tolist(), *T[:3, 3].tolist()]
-        images.append(
-            _ColmapImage(
-                cameras.index(entry.camera) + 1, pose, PurePosixPath(entry.image).name,
-                points.uv_px[mine] + PIXEL_CENTRE, mine + 1,
-            )  # fmt: skip
-        )
+        name, camera = PurePosixPath(entry.image).name, cameras.index(entry.camera) + 1
+        images.append(_ColmapImage(camera, pose, name, points.uv_px[mine] + PIXEL_CENTRE, mine + 1))
     track = np.stack([points.entry + 1, index], axis=1)
     return _ColmapModel(cameras, images, points.points_map_m, points.colours, track)
 

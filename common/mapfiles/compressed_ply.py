@@ -1,7 +1,7 @@
 """Gaussians as compressed `.ply` files (PlayCanvas, SuperSplat): 16 bytes each, y down.
 
 Chunks of 256 neighbours share their bounds. Resolution: x and z 1/2047, y 1/1023 of the chunk's extent; log
-scales likewise; colours 1/255 of the chunk's range; opacity 1/255; rotations 0.1 degrees.
+scales likewise; colours 1/255 of the chunk's range; opacity 1/255; rotations 0.3 degrees.
 https://blog.playcanvas.com/compressing-gaussian-splats
 """
 
@@ -75,7 +75,7 @@ def _fixed(unit: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:
 
 
 def _rotations(quat_wxyz: np.ndarray) -> np.ndarray:
-    """Pack quaternions [..., 4] of any norm: index of the largest of w, x, y, z; 10 bits of each other one."""
+    """Pack quaternions [..., 4] of any norm: index of the largest of w, x, y, z; the others in 10 bits."""
     quat = quat_wxyz / np.maximum(np.linalg.norm(quat_wxyz, axis=-1, keepdims=True), 1e-12)
     largest = np.argmax(np.abs(quat), axis=-1)[..., None]
     quat = quat * np.where(np.take_along_axis(quat, largest, axis=-1) < 0.0, -1.0, 1.0)

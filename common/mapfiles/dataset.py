@@ -31,8 +31,8 @@ class DatasetFrame:
     rgb: np.ndarray  # uint8 [H, W, 3]
     encoded: tuple[str, bytes] | None  # ("jpeg" or "png", file) if the undistorted image exists as a file
     depth_m: np.ndarray  # float32 [H, W] optical z, NaN = unknown
-    mask: np.ndarray  # bool [H, W], False = not to be used: a dynamic object, or outside the original image
-    beams_uvz_sigma: np.ndarray  # float64 [N, 4], lidar returns: px, px, optical z in m, standard deviation in m
+    mask: np.ndarray  # bool [H, W], False = not to be used: a dynamic object, or outside the original
+    beams_uvz_sigma: np.ndarray  # float64 [N, 4], lidar returns: px, px, optical z in m, sigma in m
 
 
 @dataclass(frozen=True)

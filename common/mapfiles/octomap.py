@@ -6,13 +6,16 @@ that are free or occupied as a whole.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
+from scipy import ndimage
 
 from beamsplat.common.files.persist import write_atomically
 from beamsplat.common.mapfiles.mesh import TRUNCATION, TsdfVolume
 from beamsplat.common.mapfiles.morton import morton_codes
+from beamsplat.common.mapfiles.surface import RenderedDepth, points_of
 
 FREE, OCCUPIED = 1, 2  # the format's codes of a child; 0 is unknown, 3 has children
 _INNER = 3
@@ -40,17 +43,22 @@ def volume_for_octomap(low_m: np.ndarray, high_m: np.ndarray, voxel_m: float) ->
     return volume
 
 
-def occupancy_of(volume: TsdfVolume) -> tuple[np.ndarray, np.ndarray]:
+def occupancy_of(volume: TsdfVolume, views: Iterable[RenderedDepth]) -> tuple[np.ndarray, np.ndarray]:
     """Return the observed voxels of a volume.
 
-    A voxel is occupied if the surface crosses the line from its centre to a neighbour's within the voxel;
-    free if it is in front of the surface. What is behind the surface is unknown.
+    A voxel is occupied if the fused surface crosses the line from its centre to a neighbour's within the
+    voxel, and a view shows a point there; free if it is in front of the surface. What is behind the surface
+    is unknown.
+
+    Args:
+        views: those that were added to `volume`.
 
     Returns:
         Keys int64 [N, 3] of the octree, and states uint8 [N], `FREE` or `OCCUPIED`.
     """
     seen, distance = volume.weight > 0.0, volume.distance
     states = np.where(seen & (distance > 0.0), np.uint8(FREE), np.uint8(0))
+    shown = _near_points(volume, views)
     for axis in range(3):
         a, b = [slice(None)] * 3, [slice(None)] * 3
         a[axis], b[axis] = slice(None, -1), slice(1, None)
@@ -59,10 +67,23 @@ def occupancy_of(volume: TsdfVolume) -> tuple[np.ndarray, np.ndarray]:
         crossed = seen[before] & seen[after] & ((da > 0.0) != (db > 0.0))
         crossed &= np.abs(da - db) <= _MAX_STEP / TRUNCATION
         nearer = np.abs(da) <= np.abs(db)
-        states[before][crossed & nearer] = OCCUPIED
-        states[after][crossed & ~nearer] = OCCUPIED
+        states[before][crossed & nearer & shown[before]] = OCCUPIED
+        states[after][crossed & ~nearer & shown[after]] = OCCUPIED
     first = np.round(volume.origin_m / volume.voxel_m - 0.5).astype(np.int64) + _MIDDLE
     return np.argwhere(states > 0) + first, states[states > 0]
+
+
+def _near_points(volume: TsdfVolume, views: Iterable[RenderedDepth]) -> np.ndarray:
+    """Return a mask bool [X, Y, Z] of the voxels that contain a point of a view, or touch one that does.
+
+    The mean of what one view sees as free and another as hidden changes its sign anywhere behind an object.
+    """
+    out = np.zeros(volume.distance.shape, bool)
+    for view in views:
+        cells = np.round((points_of(view)[0] - volume.origin_m) / volume.voxel_m).astype(np.int64)
+        cells = cells[np.all((cells >= 0) & (cells < out.shape), axis=1)]
+        out[tuple(cells.T)] = True
+    return ndimage.binary_dilation(out, np.ones((3, 3, 3), bool))
 
 
 def write_octomap(path: Path, keys: np.ndarray, states: np.ndarray, resolution_m: float) -> None:

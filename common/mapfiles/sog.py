@@ -2,7 +2,7 @@
 
 Resolution: positions 16 bits of the logarithm, (1 + |x|) * range / 131070 with range = the difference of the
 logarithms sign(x) ln(1 + |x|) at both ends: 0.6 mm at 10 m, 1.6 mm at 30 m from the origin of a map of
-60 m; log scales 1/255 of their range; colours 1/255; opacity 1/255; rotations 0.5 degrees.
+60 m; log scales 1/255 of their range; colours 1/255; opacity 1/255; rotations 1.1 degrees.
 https://developer.playcanvas.com/user-manual/gaussian-splatting/formats/sog
 """
 
@@ -67,7 +67,7 @@ def write_sog(path: Path, params: np.ndarray) -> None:
 
 
 def _positions(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the bounds [3], [3] of the logarithms of points [N, 3], and their 16 bit numbers int64 [N, 3]."""
+    """Return the bounds [3], [3] of the logarithms of points [N, 3], and their 16 bits, int64 [N, 3]."""
     logs = np.sign(points) * np.log1p(np.abs(points))
     low, high = logs.min(axis=0), logs.max(axis=0)
     return low, high, np.round((logs - low) / np.maximum(high - low, 1e-9) * 65535.0).astype(np.int64)

@@ -65,10 +65,10 @@ def export(
 
     Splats: ply (3DGS layout), gltf (.glb with KHR_gaussian_splatting), spz (Niantic, small), sog and
     compressed-ply (PlayCanvas, SuperSplat; small). points, las: coloured points. mesh: coloured triangles.
-    octomap: occupied and free voxels. nav2: map.yaml (both layers), lidar.yaml, camera.yaml (obstacles outside
-    the lidar plane). nerfstudio, colmap: images, depth maps, poses and lidar points of the keyframes; they
-    need a saved session. All are in metres. z is up; gltf and spz: y up; sog and compressed-ply: y down, which
-    their viewers turn upright.
+    octomap: occupied and free voxels. nav2: map.yaml (both layers), lidar.yaml, camera.yaml (obstacles
+    outside the lidar plane). nerfstudio, colmap: images, depth maps, poses and lidar points of the keyframes;
+    they need a saved session. All are in metres. z is up; gltf and spz: y up; sog and compressed-ply: y down,
+    which their viewers turn upright.
 
     Examples:
 
@@ -81,7 +81,7 @@ def export(
         beamsplat export deploy/demo.toml --to spz --detail-m 0.04 --out far.spz
     """
     path = _target(session, to, out)
-    map_ = formats.SavedMap(session, *_open(session), threads)
+    map_ = formats.ExportedMap(session, *_open(session), threads)
     try:
         make_folder(path.parent)
         if to in formats.SPLATS:

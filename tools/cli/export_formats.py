@@ -1,4 +1,4 @@
-"""The formats of `beamsplat export`: from a saved state to files. Each function returns what it has written."""
+"""The formats of `beamsplat export`: from a saved state to files. The functions return what they wrote."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _NO_SURFACE = "the map shows no surface from its keyframes"
 
 
 @dataclass(frozen=True)
-class SavedMap:
+class ExportedMap:
     """The map to be exported."""
 
     session: Path  # folder of the session, or the deployment file of a running system
@@ -40,7 +40,7 @@ class SavedMap:
         return store_of(self.arrays)
 
 
-def write_splats(path: Path, to: str, map_: SavedMap, detail_m: float) -> str:
+def write_splats(path: Path, to: str, map_: ExportedMap, detail_m: float) -> str:
     """Write the Gaussians in one of the formats `SPLATS`; those in a cell of `detail_m` are merged."""
     from beamsplat.common.mapfiles.detail import merge_by_cell
 
@@ -55,7 +55,7 @@ def write_splats(path: Path, to: str, map_: SavedMap, detail_m: float) -> str:
     return f"{text} for {store.count}; {psnr_db:.1f} dB PSNR against the whole map from the keyframes"
 
 
-def _cost_db(map_: SavedMap, params: Any) -> float:
+def _cost_db(map_: ExportedMap, params: Any) -> float:
     """Return the mean PSNR (dB) of merged Gaussians against all Gaussians, from the keyframes' viewpoints."""
     import numpy as np
 
@@ -88,7 +88,7 @@ def _splat_writer(to: str) -> Any:
     return write
 
 
-def _views(map_: SavedMap) -> Any:
+def _views(map_: ExportedMap) -> Any:
     """Yield the rendered depth of the map from all keyframes, with a progress bar."""
     from rich.progress import track
 
@@ -102,7 +102,7 @@ def _views(map_: SavedMap) -> Any:
     return track(rendered, "rendering", len(views), console=console, transient=True)
 
 
-def write_points(path: Path, to: str, map_: SavedMap, cell_m: float) -> str:
+def write_points(path: Path, to: str, map_: ExportedMap, cell_m: float) -> str:
     """Write the surface as coloured points, one per cell of `cell_m`: ("points") PLY or ("las") LAS."""
     from beamsplat.common.mapfiles.las import write_las
     from beamsplat.common.mapfiles.surface import surface_points, write_ply
@@ -131,7 +131,7 @@ def _surface_box(views: list[Any]) -> tuple[Any, Any]:
     return np.percentile(corners, 5.0, axis=0), np.percentile(corners, 95.0, axis=0)
 
 
-def write_mesh(path: Path, map_: SavedMap, voxel_m: float) -> str:
+def write_mesh(path: Path, map_: ExportedMap, voxel_m: float) -> str:
     """Write the surface as a coloured mesh (PLY)."""
     from beamsplat.common.mapfiles.mesh import TsdfVolume, remove_small_components, surface_nets
     from beamsplat.common.mapfiles.surface import write_ply
@@ -144,20 +144,20 @@ def write_mesh(path: Path, map_: SavedMap, voxel_m: float) -> str:
     return f"{len(mesh.faces)} triangles"
 
 
-def write_octomap(path: Path, map_: SavedMap, voxel_m: float) -> str:
+def write_octomap(path: Path, map_: ExportedMap, voxel_m: float) -> str:
     """Write occupied and free voxels as an OctoMap tree (.bt)."""
     from beamsplat.common.mapfiles import octomap
 
     views = list(_views(map_))
     volume = octomap.volume_for_octomap(*_surface_box(views), voxel_m)
     volume.add(views)
-    keys, states = octomap.occupancy_of(volume)
+    keys, states = octomap.occupancy_of(volume, views)
     octomap.write_octomap(path, keys, states, voxel_m)
     occupied = int((states == octomap.OCCUPIED).sum())
     return f"{occupied} occupied and {len(states) - occupied} free voxels of {voxel_m:g} m"
 
 
-def write_nav2(path: Path, map_: SavedMap, band_m: tuple[float, float]) -> str:
+def write_nav2(path: Path, map_: ExportedMap, band_m: tuple[float, float]) -> str:
     """Write the lidar grid, the camera layer of obstacles within `band_m`, and both combined, for nav2."""
     from beamsplat.common.mapfiles.nav2 import camera_layer, combined, grid_around
     from beamsplat.common.mapfiles.surface import surface_points
@@ -181,7 +181,7 @@ def write_nav2(path: Path, map_: SavedMap, band_m: tuple[float, float]) -> str:
     return "map.yaml, lidar.yaml, camera.yaml"
 
 
-def write_dataset(path: Path, to: str, map_: SavedMap, cell_m: float, text: bool) -> str:
+def write_dataset(path: Path, to: str, map_: ExportedMap, cell_m: float, text: bool) -> str:
     """Write the keyframes as a data set for nerfstudio or COLMAP: the whole folder, or nothing.
 
     Raises:

@@ -267,13 +267,15 @@ def test_a_damaged_keyframe_is_left_out_and_named(session, tmp_path):
     folder = SessionFolder(tmp_path / "s")
     ids = folder.keyframe_ids()
     (folder.keyframes / f"{ids[1]}.kf").write_bytes(b"BSKF")
-    result = CliRunner().invoke(app, ["export", str(tmp_path / "s"), "--to", "colmap", "--out", str(tmp_path / "o")])
+    result = CliRunner().invoke(
+        app, ["export", str(tmp_path / "s"), "--to", "colmap", "--out", str(tmp_path / "o")]
+    )
     assert result.exit_code == 0
     assert f"{KEYFRAMES - 1} images" in result.output
     assert f"left out: keyframe {ids[1]}" in result.output
     for id in ids:
         (folder.keyframes / f"{id}.kf").unlink()
-    with pytest.raises(UserError, match="has no keyframe with an image; keyframe .* cannot be read"):
+    with pytest.raises(UserError, match=r"has no keyframe with an image; keyframe .* cannot be read"):
         run("export", tmp_path / "s", "--to", "nerfstudio", "--out", tmp_path / "p")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["o", "s"]  # nothing half done
 

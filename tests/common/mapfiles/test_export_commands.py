@@ -1,6 +1,9 @@
 """`beamsplat export` and `beamsplat render` on a session of the synthetic room."""
 
+import json
 import shutil
+import struct
+import zipfile
 
 import cv2
 import numpy as np
@@ -52,7 +55,9 @@ def run(*words):
 
 def test_every_format_is_written_where_it_is_asked_for(session, tmp_path):
     params = SessionFolder(session).read_state()["store_params"]
-    for to, name in (("ply", "a.ply"), ("gltf", "b.glb"), ("spz", "c.spz"), ("points", "d.ply")):
+    formats = {"ply": "a.ply", "gltf": "b.glb", "spz": "c.spz", "points": "d.ply", "sog": "e.sog",
+               "compressed-ply": "f.ply", "las": "g.las", "octomap": "h.bt"}  # fmt: skip
+    for to, name in formats.items():
         assert str(tmp_path / name) in run("export", session, "--to", to, "--out", tmp_path / name)
     assert PlyData.read(tmp_path / "a.ply")["vertex"].count == params.shape[1]
     (cloud,) = trimesh.load_scene(tmp_path / "b.glb").dump()
@@ -60,6 +65,14 @@ def test_every_format_is_written_where_it_is_asked_for(session, tmp_path):
     assert (tmp_path / "c.spz").stat().st_size < 0.3 * (tmp_path / "a.ply").stat().st_size
     points = PlyData.read(tmp_path / "d.ply")["vertex"]
     assert points.count > 1000
+    with zipfile.ZipFile(tmp_path / "e.sog") as sog:
+        assert json.loads(sog.read("meta.json"))["count"] == params.shape[1]
+    assert PlyData.read(tmp_path / "f.ply")["vertex"].count == params.shape[1]
+    las = (tmp_path / "g.las").read_bytes()
+    assert struct.unpack_from("<I", las, 107) == (points.count,)
+    xyz = np.frombuffer(las, np.uint8, offset=227).reshape(-1, 26)[:, :12].copy().view("<i4") * 1e-4
+    np.testing.assert_allclose(xyz, np.stack([points[axis] for axis in "xyz"], axis=1), atol=1e-4)
+    assert (tmp_path / "h.bt").read_bytes().startswith(b"# Octomap OcTree binary file\n")
 
 
 def test_points_and_mesh_match_the_surface_of_the_room(session, tmp_path):
@@ -135,7 +148,7 @@ def test_nav2_layers_are_aligned(session, tmp_path):
 
 
 def test_wrong_arguments_are_answered_with_valid_ones(session, tmp_path):
-    with pytest.raises(UserError, match="choose one of ply, gltf, spz"):
+    with pytest.raises(UserError, match="choose one of ply, compressed-ply, gltf, spz"):
         run("export", session, "--to", "obj")
     with pytest.raises(UserError, match=r"ending in \.glb"):
         run("export", session, "--to", "gltf", "--out", tmp_path / "map.gltf")
