@@ -15,7 +15,7 @@ from beamsplat.tools.cli.options import session_folder, writable
 
 FORMATS = {
     "ply": "map.ply", "compressed-ply": "map.compressed.ply", "gltf": "map.glb", "spz": "map.spz",
-    "sog": "map.sog", "points": "points.ply", "las": "points.las", "mesh": "mesh.ply",
+    "sog": "map.sog", "points": "points.ply", "las": "points.las", "e57": "points.e57", "mesh": "mesh.ply",
     "octomap": "map.bt", "nav2": "nav2", "nerfstudio": "nerfstudio", "colmap": "colmap",
 }  # fmt: skip
 SessionArgument = Annotated[
@@ -48,7 +48,8 @@ def export(
     cell_m: Annotated[
         float,
         typer.Option(
-            min=0.002, help="points, las: distance between points; nerfstudio, colmap: between lidar points"
+            min=0.002,
+            help="points, las, e57: distance between points; nerfstudio, colmap: between lidar points",
         ),
     ] = 0.02,
     voxel_m: Annotated[float, typer.Option(min=0.005, help="mesh, octomap: edge of a voxel")] = 0.04,
@@ -64,11 +65,11 @@ def export(
     """Write a map for other programs, also while the map is being built.
 
     Splats: ply (3DGS layout), gltf (.glb with KHR_gaussian_splatting), spz (Niantic, small), sog and
-    compressed-ply (PlayCanvas, SuperSplat; small). points, las: coloured points. mesh: coloured triangles.
-    octomap: occupied and free voxels. nav2: map.yaml (both layers), lidar.yaml, camera.yaml (obstacles
-    outside the lidar plane). nerfstudio, colmap: images, depth maps, poses and lidar points of the keyframes;
-    they need a saved session. All are in metres. z is up; gltf and spz: y up; sog and compressed-ply: y down,
-    which their viewers turn upright.
+    compressed-ply (PlayCanvas, SuperSplat; small). points, las, e57: coloured points. mesh: coloured
+    triangles. octomap: occupied and free voxels. nav2: map.yaml (both layers), lidar.yaml, camera.yaml
+    (obstacles outside the lidar plane). nerfstudio, colmap: images, depth maps, poses and lidar points of the
+    keyframes; they need a saved session. All are in metres. z is up; gltf and spz: y up; sog and
+    compressed-ply: y down, which their viewers turn upright.
 
     Examples:
 
@@ -86,7 +87,7 @@ def export(
         make_folder(path.parent)
         if to in formats.SPLATS:
             written = formats.write_splats(path, to, map_, detail_m)
-        elif to in ("points", "las"):
+        elif to in formats.POINTS:
             written = formats.write_points(path, to, map_, cell_m)
         elif to == "mesh":
             written = formats.write_mesh(path, map_, voxel_m)

@@ -16,6 +16,7 @@ from beamsplat.common.errors import UserError
 
 console = Console(stderr=True)
 SPLATS = ("ply", "compressed-ply", "gltf", "spz", "sog")
+POINTS = ("points", "las", "e57")
 DATASETS = ("nerfstudio", "colmap")
 RESOLUTION_M = 0.05  # of nav2 grids
 _MIN_FACES = 60  # of a connected component of the mesh; smaller ones are removed
@@ -103,14 +104,18 @@ def _views(map_: ExportedMap) -> Any:
 
 
 def write_points(path: Path, to: str, map_: ExportedMap, cell_m: float) -> str:
-    """Write the surface as coloured points, one per cell of `cell_m`: ("points") PLY or ("las") LAS."""
+    """Write the surface as coloured points, one per cell of `cell_m`, in one of the formats `POINTS`."""
+    from beamsplat.common.mapfiles.e57 import write_e57
     from beamsplat.common.mapfiles.las import write_las
     from beamsplat.common.mapfiles.surface import surface_points, write_ply
 
     points, colours = surface_points(_views(map_), cell_m)
     if len(points) == 0:
         raise UserError(_NO_SURFACE)
-    (write_las if to == "las" else write_ply)(path, points, colours)
+    write: dict[str, Callable[[Path, Any, Any], None]] = {
+        "points": write_ply, "las": write_las, "e57": write_e57
+    }  # fmt: skip
+    write[to](path, points, colours)
     return f"{len(points)} points"
 
 

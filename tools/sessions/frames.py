@@ -17,6 +17,8 @@ from beamsplat.common.messages import Keyframe
 from beamsplat.common.messages.codec import decode
 from beamsplat.services.mapping.messages import decode_keyframe
 
+_EXIF, _HEAD_BYTES = b"Exif\0\0", 65_536  # where the first segments of a JPEG are
+
 
 class SessionFrames:
     """Iterates over the keyframes of a checkpoint, in the order of time.
@@ -48,11 +50,13 @@ class SessionFrames:
         frame = decode_keyframe(message, self._lens)
         lens = Pinhole.of(message.camera)
         mask = self._valid(lens)
-        # The image as the camera compressed it, if no undistortion has changed it.
-        encoded = None if lens.is_distorted else (message.encoding, message.picture.tobytes())
+        picture = message.picture.tobytes()
+        # The image as the camera compressed it, if no undistortion has changed it. With an orientation in EXIF
+        # data some readers would turn it, but K belongs to the pixels as they are stored.
+        verbatim = not lens.is_distorted and _EXIF not in picture[:_HEAD_BYTES]
         return DatasetFrame(
             id=view.id, stamp_ns=message.stamp_ns, camera=frame.camera, T_map_camera=view.T_map_camera,
-            rgb=frame.rgb, encoded=encoded, depth_m=frame.depth_m,
+            rgb=frame.rgb, encoded=(message.encoding, picture) if verbatim else None, depth_m=frame.depth_m,
             mask=mask if frame.mask is None else mask & frame.mask,
             beams_uvz_sigma=message.beams.astype(np.float64),
         )  # fmt: skip

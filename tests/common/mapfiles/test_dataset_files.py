@@ -1,5 +1,6 @@
 """Data sets for nerfstudio and COLMAP, of a session, as other programs read them."""
 
+import io
 import json
 import shutil
 
@@ -21,6 +22,7 @@ from tests.services.mapping.session.maps import handle, make_node, message
 
 KEYFRAMES = 6
 HIDDEN = np.s_[20:50, 10:40]  # rows, columns of a dynamic object in keyframe 2
+JPEG, TURNED = 3, 5  # these are JPEG; the second one has an orientation in its EXIF data
 DISTORTED = 4  # this keyframe comes from a lens with pincushion distortion
 LENS = CameraModel(
     width_px=r.WIDTH, height_px=r.HEIGHT, fx_px=r.FOCAL, fy_px=r.FOCAL, cx_px=79.5, cy_px=59.5,
@@ -43,6 +45,14 @@ def distorted(rgb):
     return cv2.remap(rgb, u.astype(np.float32), v.astype(np.float32), cv2.INTER_LINEAR)
 
 
+def jpeg(rgb, orientation):
+    image, file, exif = Image.fromarray(rgb), io.BytesIO(), Image.Exif()
+    if orientation is not None:
+        exif[0x0112] = orientation
+    image.save(file, "JPEG", quality=97, subsampling=0, exif=exif.tobytes() if orientation else b"")
+    return np.frombuffer(file.getvalue(), np.uint8)
+
+
 @pytest.fixture(scope="module")
 def session(tmp_path_factory):
     folder = tmp_path_factory.mktemp("dataset") / "room"
@@ -54,6 +64,8 @@ def session(tmp_path_factory):
             mask = np.ones(depth.shape, bool)
             mask[HIDDEN] = False
             change["mask_png"] = mask_to_png(mask)
+        if number in (JPEG, TURNED):
+            change |= {"encoding": "jpeg", "picture": jpeg(rgb, 6 if number == TURNED else None)}
         if number == DISTORTED:
             change |= {"camera": LENS, "picture": r.jpeg(distorted(rgb))}
         handle(node, "keyframes/frame", message(number, **change))
@@ -162,8 +174,18 @@ def test_nerfstudio_depth_maps_and_images_are_those_of_the_keyframes(ns):
         known = np.isfinite(depth)
         np.testing.assert_array_equal(ns.depth_m(frame) > 0.0, known)
         np.testing.assert_allclose(ns.depth_m(frame)[known], depth[known], atol=0.0006)
-        if number != DISTORTED:
+        if number not in (DISTORTED, JPEG, TURNED):
             np.testing.assert_array_equal(ns.image(frame), rgb)
+
+
+def test_a_jpeg_is_copied_unless_readers_would_turn_it(ns):
+    plain, turned = (ns.table["frames"][number] for number in (JPEG, TURNED))
+    data = (ns.folder / plain["file_path"]).read_bytes()
+    assert plain["file_path"].endswith(".jpg")
+    assert data == jpeg(r.shot(JPEG)[0], None).tobytes()
+    assert turned["file_path"].endswith(".png")
+    original = np.asarray(Image.open(io.BytesIO(jpeg(r.shot(TURNED)[0], 6).tobytes())))
+    assert np.abs(ns.image(turned).astype(int) - original).max() <= 1
 
 
 def test_a_distorted_image_becomes_a_pinhole_image_and_its_margin_is_masked(ns):
@@ -286,3 +308,36 @@ def test_an_existing_folder_and_a_running_system_are_refused(session, folders, t
     (tmp_path / "robot.toml").write_text("")
     with pytest.raises(UserError, match="needs the images of a saved session"):
         run("export", tmp_path / "robot.toml", "--to", "colmap", "--out", tmp_path / "o")
+
+
+def test_nerfstudios_own_loader_sees_the_room_where_it_is(session, folders):
+    """Its rays through the pixels of an image end on the surface, at the depth of its depth map."""
+    parser = pytest.importorskip(
+        "nerfstudio.data.dataparsers.nerfstudio_dataparser", reason="needs nerfstudio: pip install nerfstudio"
+    )
+    torch = pytest.importorskip("torch")
+    from nerfstudio.data.utils.data_utils import get_depth_image_from_path
+
+    config = parser.NerfstudioDataParserConfig(
+        data=folders / "ns", center_method="none", auto_scale_poses=False, load_3D_points=False, eval_mode="all"
+    )
+    read = config.setup().get_dataparser_outputs(split="train")
+    assert len(read.image_filenames) == len(read.mask_filenames) == KEYFRAMES
+    assert read.dataparser_scale == 1.0
+    np.testing.assert_allclose(np.asarray(read.dataparser_transform), np.eye(4)[:3], atol=1e-6)
+    coordinates = read.cameras.get_image_coords()[[30, 60, 90]][:, [20, 80, 140]].reshape(-1, 2)
+    for number, T_map_camera in enumerate(refined(session)):
+        depth = get_depth_image_from_path(
+            filepath=read.metadata["depth_filenames"][number], height=r.HEIGHT, width=r.WIDTH,
+            scale_factor=read.metadata["depth_unit_scale_factor"],
+        )[[30, 60, 90]][:, [20, 80, 140]].reshape(-1, 1)  # fmt: skip
+        indices = torch.full((len(coordinates), 1), number)
+        rays = read.cameras.generate_rays(camera_indices=indices, coords=coordinates)
+        seen = (rays.origins + rays.directions * rays.metadata["directions_norm"] * depth).numpy()
+        true_z = r.shot(number)[1][[30, 60, 90]][:, [20, 80, 140]].ravel()
+        u, v = np.tile([20.0, 80.0, 140.0], 3), np.repeat([30.0, 60.0, 90.0], 3)
+        camera = np.stack([(u - 79.5) / r.FOCAL, (v - 59.5) / r.FOCAL, np.ones(9)], axis=1) * true_z[:, None]
+        true = camera @ T_map_camera[:3, :3].T + T_map_camera[:3, 3]
+        known = np.isfinite(true_z)
+        assert known.sum() > 5
+        np.testing.assert_allclose(seen[known], true[known], atol=0.001)

@@ -1,10 +1,12 @@
-"""LAS files as laspy reads them: positions to 0.1 mm, colours exact."""
+"""LAS and E57 files as their libraries read them: positions to 0.1 mm or exact, colours exact."""
 
 import struct
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 
+from beamsplat.common.mapfiles.e57 import write_e57
 from beamsplat.common.mapfiles.las import write_las
 
 
@@ -58,3 +60,68 @@ def test_las_says_what_it_cannot_hold(cloud, tmp_path):
     with pytest.raises(ValueError, match="no points"):
         write_las(tmp_path / "map.las", points[:0], colours[:0])
     assert not list(tmp_path.iterdir())
+
+
+# --- E57 ---
+
+
+def test_e57_as_libe57_reads_it(cloud, tmp_path):
+    pye57 = pytest.importorskip("pye57", reason="needs libE57, a reader of E57: pip install pye57")
+    points, colours = cloud
+    write_e57(tmp_path / "map.e57", *cloud)
+    with pye57.E57(str(tmp_path / "map.e57")) as file:
+        assert file.scan_count == 1
+        header = file.get_header(0)
+        assert header.point_count == len(points)
+        scan = file.read_scan(0, colors=True, ignore_missing_fields=True)
+    np.testing.assert_array_equal(np.stack([scan[f"cartesian{axis}"] for axis in "XYZ"], axis=1), points)
+    read = np.stack([scan[f"color{name}"] for name in ("Red", "Green", "Blue")], axis=1)
+    np.testing.assert_array_equal(read, colours)
+
+
+def crc32c(data):
+    """Bit by bit, as RFC 3720 defines it."""
+    crc = 0xFFFFFFFF
+    for byte in data:
+        crc ^= byte
+        for _ in range(8):
+            crc = (crc >> 1) ^ (0x82F63B78 if crc & 1 else 0)
+    return crc ^ 0xFFFFFFFF
+
+
+def test_e57_by_the_published_layout(cloud, tmp_path):
+    """Header, checksums of the pages, XML, section and packets, read by hand."""
+    points, colours = cloud
+    write_e57(tmp_path / "map.e57", *cloud)
+    blob = (tmp_path / "map.e57").read_bytes()
+    signature, major, _, length, xml_at, xml_length, page = struct.unpack_from("<8sIIQQQQ", blob)
+    assert (signature, major, length, page) == (b"ASTM-E57", 1, len(blob), 1024)
+    assert crc32c(b"123456789") == 0xE3069283  # the check value of the algorithm
+    pages = [blob[first : first + 1024] for first in range(0, len(blob), 1024)]
+    for one in (pages[0], pages[-1], pages[len(pages) // 2]):
+        assert struct.unpack(">I", one[1020:]) == (crc32c(one[:1020]),)
+    content = b"".join(one[:1020] for one in pages)
+
+    def logical(physical):
+        return physical - physical // 1024 * 4
+
+    root = ElementTree.fromstring(content[logical(xml_at) : logical(xml_at) + xml_length])
+    space = "{http://www.astm.org/COMMIT/E57/2010-e57-v1.0}"
+    node = root.find(f"{space}data3D/{space}vectorChild/{space}points")
+    assert int(node.get("recordCount")) == len(points)
+    start = logical(int(node.get("fileOffset")))
+    kind, size, data_at, index_at = struct.unpack_from("<B7xQQQ", content, start)
+    assert kind == 1
+    at, streams = logical(data_at), [b""] * 6
+    while at < logical(index_at):
+        kind, _, last, count = struct.unpack_from("<BBHH", content, at)
+        assert (kind, count, (last + 1) % 4) == (1, 6, 0)
+        lengths = struct.unpack_from("<6H", content, at + 6)
+        begin = at + 18
+        for i, n in enumerate(lengths):
+            streams[i] += content[begin : begin + n]
+            begin += n
+        at += last + 1
+    assert (content[at], at + struct.unpack_from("<H", content, at + 2)[0] + 1) == (0, start + size)
+    np.testing.assert_array_equal(np.stack([np.frombuffer(s, "<f8") for s in streams[:3]], axis=1), points)
+    np.testing.assert_array_equal(np.stack([np.frombuffer(s, "u1") for s in streams[3:]], axis=1), colours)
