@@ -51,7 +51,7 @@ class SessionFrames:
         lens = Pinhole.of(message.camera)
         mask = self._valid(lens)
         picture = message.picture.tobytes()
-        # The image as the camera compressed it, if no undistortion has changed it. With an orientation in EXIF
+        # The image as the camera compressed it, if no undistortion has changed it. By an orientation in EXIF
         # data some readers would turn it, but K belongs to the pixels as they are stored.
         verbatim = not lens.is_distorted and _EXIF not in picture[:_HEAD_BYTES]
         return DatasetFrame(

@@ -319,7 +319,11 @@ def test_nerfstudios_own_loader_sees_the_room_where_it_is(session, folders):
     from nerfstudio.data.utils.data_utils import get_depth_image_from_path
 
     config = parser.NerfstudioDataParserConfig(
-        data=folders / "ns", center_method="none", auto_scale_poses=False, load_3D_points=False, eval_mode="all"
+        data=folders / "ns",
+        center_method="none",
+        auto_scale_poses=False,
+        load_3D_points=False,
+        eval_mode="all",
     )
     read = config.setup().get_dataparser_outputs(split="train")
     assert len(read.image_filenames) == len(read.mask_filenames) == KEYFRAMES
