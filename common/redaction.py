@@ -8,7 +8,7 @@ from typing import Any
 
 REMOVED = "REMOVED"
 _MIN_SECRET_CHARS = 5  # of what is removed from texts: shorter ones are parts of other words
-_SECRET_NAMES = re.compile(r"passw|token|secret|credential|login|api_?key|(^|_)keys?$", re.IGNORECASE)
+_SECRET_NAMES = re.compile(r"passw|token|secret|credential|login|webhook|api_?key|(^|_)keys?$", re.IGNORECASE)
 _URL_USER = re.compile(r"(://)[^/@\s\"']+@")
 _URL_PARAMETER = re.compile(
     r"([?&;][^=&\s]*(?:passw|token|secret|key|auth|pwd)[^=&\s]*=)[^&\s\"']+", re.IGNORECASE

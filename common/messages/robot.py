@@ -28,6 +28,7 @@ from beamsplat.common.messages.map import (
 from beamsplat.common.messages.schema import (
     Array,
     Count,
+    Finite,
     Message,
     MessagePart,
     Name,
@@ -285,6 +286,13 @@ class Rejected(MessagePart):
     count: Count
 
 
+class NodeFigure(MessagePart):
+    """One number that a node reports; `beamsplat.common.runtime.figures` lists the names and units."""
+
+    name: Name
+    value: Finite
+
+
 # "failed": the node's process cannot run, and its supervisor reports it.
 NodeState = Literal["configure", "standby", "active", "drain", "drained", "closed", "failed"]
 
@@ -292,7 +300,9 @@ NodeState = Literal["configure", "standby", "active", "drain", "drained", "close
 class Health(Message):
     """State, message counts and resource use of one node, published by each node at 1 Hz."""
 
-    version = "1.3"  # 1.1: pid; 1.2: state "failed", counters `late` and `refused`; 1.3: rejected
+    # 1.1: pid; 1.2: state "failed", counters `late` and `refused`; 1.3: rejected; 1.4: status, figures,
+    # clock_id
+    version = "1.4"
 
     node: Name
     instance: Name
@@ -307,6 +317,11 @@ class Health(Message):
     detail: Text = ""
     pid: Count = 0  # process id on its host; 0 = not reported
     rejected: Annotated[tuple[Rejected, ...], Field(max_length=64)] = ()
+    # Of the newest result with a status: "ok", or why it is missing; "" = none yet.
+    status: Text = ""
+    figures: Annotated[tuple[NodeFigure, ...], Field(max_length=64)] = ()
+    # Of the host's monotonic clock (`header.local_clock_id`): equal for all nodes of one host; 0 = unknown.
+    clock_id: Annotated[int, Field(ge=0, lt=2**64)] = 0
 
 
 class Answer(Message):

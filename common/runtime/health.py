@@ -52,6 +52,10 @@ class NodeRecord:
             return 0.0
         return (count(after) - count(before)) / (last - first)
 
+    def figure(self, name: str) -> float | None:
+        """Return a figure of the newest report (`runtime.figures`), None if the node does not report it."""
+        return next((figure.value for figure in self.health.figures if figure.name == name), None)
+
     def losses(self) -> Counter[str]:
         """Return what all processes of this node have refused, dropped and lost: counts by reason."""
         return self.earlier_losses + losses_of(self.health)

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
+import shutil
 import threading
 import time
+from pathlib import Path
 
 import numpy as np
 import psutil
 import zenoh
 
 from beamsplat.common.messages import Health, OutputHealth
+from beamsplat.common.messages.header import local_clock_id
 from beamsplat.common.redaction import without_secrets
 from beamsplat.common.runtime.heap import trim_heap
 from beamsplat.common.runtime.running_node import RunningNode
@@ -25,6 +29,7 @@ class HealthReporter:
 
     def __init__(self, running: RunningNode, bus: Bus) -> None:
         self._running, self._bus = running, bus
+        self._clock_id = local_clock_id()
         self._process = psutil.Process()
         self._process.cpu_percent()  # the first call only starts the measurement
         threading.Thread(target=self._report, name="health", daemon=True).start()
@@ -48,6 +53,7 @@ class HealthReporter:
             return
         with r.changed:
             inputs = r.mailbox.health()
+        self._measure_disk()
         steps = np.array(r.steps_ms or [0.0])
         outputs = tuple(
             OutputHealth(topic=name, sent=p.sent, bytes=p.bytes, refused=p.refused)
@@ -60,6 +66,22 @@ class HealthReporter:
                 step_p50_ms=float(np.percentile(steps, 50)), step_p95_ms=float(np.percentile(steps, 95)),
                 rss_mb=self._process.memory_info().rss / 1e6, cpu_percent=self._process.cpu_percent(),
                 detail=without_secrets(r.detail_text())[:_DETAIL_CHARS], pid=self._process.pid,
-                rejected=r.node.rejections.report(),
+                rejected=r.node.rejections.report(), status=without_secrets(r.node.figures.status),
+                figures=r.node.figures.report(), clock_id=self._clock_id,
             )
         )  # fmt: skip
+
+    def _measure_disk(self) -> None:
+        """Update the figures of the disk that the node writes to."""
+        node = self._running.node
+        folder = _existing(node.writes_to or self._running.settings.run_dir)
+        with contextlib.suppress(OSError):  # a broken disk: the last figures remain
+            usage = shutil.disk_usage(folder)
+            node.figures.set("disk_free_bytes", usage.free)
+            node.figures.set("disk_size_bytes", usage.total)
+
+
+def _existing(path: Path) -> Path:
+    """Return `path`, or its nearest parent that exists."""
+    absolute = path.expanduser().absolute()
+    return next((p for p in (absolute, *absolute.parents) if p.exists()), Path("/"))

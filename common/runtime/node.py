@@ -18,11 +18,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
 from beamsplat.common.config.deployment import NodeConfig
 from beamsplat.common.messages import Health, Message
 from beamsplat.common.messages.header import Header
+from beamsplat.common.runtime.figures import Figures
 from beamsplat.common.runtime.live_settings import LiveSettings
 from beamsplat.common.runtime.rejections import Rejections
 from beamsplat.common.topics import ROW_NUMBER, Delivery, Topic, topic
@@ -119,6 +121,8 @@ class Node:
         self.without_producer: frozenset[str] = frozenset()  # inputs that nothing publishes; set by runners
         self.detail = ""  # one line that is shown with the node's health
         self.rejections = Rejections()  # of inputs and results; those with a status are counted by this class
+        self.figures = Figures()  # for alerts and metrics; those in results are read by this class
+        self.writes_to: Path | None = None  # the health reports this disk; None: that of the state folder
         # Whether the process was asked to end, within seconds; set by the live runner. Long work asks between
         # its steps and ends early, `configure` by raising StopRequested. `drain` then only saves the state.
         self.must_stop: Callable[[], bool] = lambda: False
@@ -269,6 +273,7 @@ class Node:
             else:
                 self.check_output(*output)
                 self.rejections.add_status(*output)
+                self.figures.note(*output)
             yield output
 
     def check_output(self, topic_name: str, message: Message) -> None:

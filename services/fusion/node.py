@@ -189,6 +189,8 @@ class FusionNode(Node):
     def on_job_check_calibration(self, health: CalibrationHealth) -> Outputs:
         """Log the result of the calibration check, and show the result in the health detail of this node."""
         self.calibration = health
+        if health.cause != "unchecked":
+            self.figures.set("calibration_doubts", health.status != "ok")
         (log.info if health.status == "ok" else log.error)("%s", health.line)
         self._update_detail()
         return iter(())

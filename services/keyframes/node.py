@@ -334,6 +334,9 @@ class KeyframesNode(Node):
         }  # fmt: skip
         self.rejections.set("keyframes dropped: the outbox was full", o.dropped)
         self.rejections.set("keyframes in the outbox are corrupt", o.corrupt)
+        self.figures.set("outbox_keyframes", len(o))
+        self.figures.set("outbox_bytes", o.bytes)
+        self.figures.set("outbox_dropped_total", o.dropped)
         text = "".join(f", {count} {what}" for what, count in counts.items() if count)
         text += f", NOT DURABLE: {o.disk_fault}" if o.disk_fault else ""
         self.detail = f"{self._sent} keyframes, {len(o)} not acknowledged{text}"

@@ -78,6 +78,7 @@ class MappingNode(Node):
 
     def configure(self) -> None:
         c = self.config
+        self.writes_to = c.session
         warm()
         settings = MapperSettings(
             half_iterations=c.half_steps, full_iterations=c.full_steps, max_gaussians=c.gaussians(),

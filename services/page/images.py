@@ -43,6 +43,11 @@ class LatestImage:
         number = self._pending[0] + 1 if self._pending else 1
         self._pending = number, time.monotonic(), encode
 
+    @property
+    def newest(self) -> int:
+        """Number of the newest image, encoded or not; 0 = there is none yet."""
+        return self._pending[0] if self._pending else 0
+
     def due(self) -> bool:
         """Return whether there is a newer image than the encoded one and the rate limit permits it."""
         pending = self._pending

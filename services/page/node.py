@@ -9,35 +9,29 @@ from __future__ import annotations
 import json
 import logging
 import ssl
-from functools import partial
+import threading
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 from urllib.parse import quote
 
 from pydantic import Field, SecretStr, field_validator
 
+from beamsplat.common.config.alerts import AlertConfig
 from beamsplat.common.config.base import Remote
 from beamsplat.common.config.deployment import NodeConfig
 from beamsplat.common.errors import UserError
-from beamsplat.common.mapfiles.grid_tiles import GridSource, TiledGrid
-from beamsplat.common.messages import (
-    Answer,
-    Correction,
-    ExternalPose,
-    FusedDepth,
-    GridTile,
-    Health,
-    Image,
-    MapPreview,
-    MapStatus,
-    Odometry,
-    Rig,
-    Scan,
-    WheelOdometry,
-)
+from beamsplat.common.messages import Answer, Health, Message
+from beamsplat.common.messages.header import local_clock_id
+from beamsplat.common.runtime.live_settings import LiveSettings
 from beamsplat.common.runtime.node import Input, Node, Outputs, QueryFunction
+from beamsplat.common.security.logins import login_of
+from beamsplat.common.zenoh.bus import open_session
 from beamsplat.services.page.access import PageAccess, own_host_names
-from beamsplat.services.page.images import EncodedImage, encode_camera_image, encode_depth, encode_tiles
+from beamsplat.services.page.alerting import Alerting
+from beamsplat.services.page.fleet import Fleet
+from beamsplat.services.page.intake import RobotIntake
+from beamsplat.services.page.live_session import FleetSubscriptions
 from beamsplat.services.page.server import PageServer
 from beamsplat.services.page.view import PageState
 
@@ -69,6 +63,8 @@ class PageConfig(NodeConfig):
     map_hz: Remote[Hz] = 0.5
     robot_hz: Remote[Hz] = 5.0
     widest_px: Remote[Annotated[int, Field(ge=64, le=4096)]] = 640  # wider images are scaled down
+    fleet: bool = False  # show all robots that this router hears: for the page of an edge server
+    alerts: AlertConfig = AlertConfig()
 
     @field_validator("token")
     @classmethod
@@ -80,25 +76,40 @@ class PageConfig(NodeConfig):
         return token
 
 
-class PageNode(Node):
+_INPUTS = (
+    Input("rig", "latched"),
+    Input("wheel/odometry", "latest"),
+    Input("lidar/scan", "latest"),
+    Input("camera/image", "latest"),
+    Input("external/pose", "latest"),
+    Input("localization/odometry", "latest"),
+    Input("localization/correction", "latched"),
+    Input("localization/grid", "every"),
+    Input("fusion/depth", "latest"),
+    Input("mapping/preview", "latest"),
+    Input("mapping/status", "latest"),
+)
+
+
+def _handler(topic: str) -> Callable[[Any, Message], Outputs]:
+    def take(self: PageNode, message: Message) -> Outputs:
+        self._intake.take(topic, message)
+        return iter(())
+
+    return take
+
+
+# A handler for each input: `RobotIntake` tells what is stored.
+_Handlers: Any = type("_Handlers", (), {i.row.handler: _handler(i.topic) for i in _INPUTS})
+
+
+class PageNode(_Handlers, Node):
     """Stores the newest message of each input for the page, and executes commands of users."""
 
     name = "page"
     Config = PageConfig
     config: PageConfig
-    inputs = (
-        Input("rig", "latched"),
-        Input("wheel/odometry", "latest"),
-        Input("lidar/scan", "latest"),
-        Input("camera/image", "latest"),
-        Input("external/pose", "latest"),
-        Input("localization/odometry", "latest"),
-        Input("localization/correction", "latched"),
-        Input("localization/grid", "every"),
-        Input("fusion/depth", "latest"),
-        Input("mapping/preview", "latest"),
-        Input("mapping/status", "latest"),
-    )
+    inputs = _INPUTS
     _ask: QueryFunction | None = None
 
     def set_query_function(self, ask: QueryFunction) -> None:
@@ -108,13 +119,25 @@ class PageNode(Node):
         _tls(self.config.certificate, self.config.certificate_key)
 
     def configure(self) -> None:
-        c = self.config
-        self._state = PageState(c.picture_hz, c.map_hz)
-        self._grid = TiledGrid()
+        c, live = self.config, self.live_settings
+        robot = "robot" if live is None else live.robot
+        self._fleet = Fleet(robot, lambda: PageState(c.picture_hz, c.map_hz))
+        self._intake = self._new_intake(self._fleet.own_state)
+        self._intakes: dict[str, RobotIntake] = {}  # of other robots
+        self._fleet_lock = threading.Lock()
         names = own_host_names() | {name.lower() for name in c.names}
         access = PageAccess(c.token.get_secret_value(), names)
         tls = _tls(c.certificate, c.certificate_key)
-        self._server = PageServer(self._state, self._command, access, c.robot_hz)
+        file = None if live is None else live.run_dir / "alerts.json"
+        self._alerting = Alerting(self._fleet, c.alerts, local_clock_id(), file)
+        self._server = PageServer(self._fleet, self._alerting, self._command, access, c.robot_hz)
+        self._listen(tls)
+        self._alerting.start()
+        if c.fleet and live is not None:
+            self._subscribe_to_fleet(live)
+
+    def _listen(self, tls: ssl.SSLContext | None) -> None:
+        c = self.config
         try:
             port = self._server.start(c.bind, c.port, tls)
         except OSError as error:
@@ -127,7 +150,20 @@ class PageNode(Node):
         self.detail = f"open {self._address}"
         log.info("%s", self.detail)
 
+    def _subscribe_to_fleet(self, live: LiveSettings) -> None:
+        """Open a session for the messages of all other robots: those of a node are of its own robot."""
+        login = login_of(live.security, self.name)
+        self._session = open_session(live.endpoints, should_stop=self.must_stop, login=login)
+        topics = tuple(entry.topic for entry in _INPUTS)
+        self._subscriptions = FleetSubscriptions(
+            self._session, live.robot, topics, self._take_of_other, self.rejections.add
+        )
+
     def close(self) -> None:
+        if hasattr(self, "_session"):
+            self._session.close()
+        if hasattr(self, "_alerting"):
+            self._alerting.close()
         if hasattr(self, "_server"):
             self._server.close()
 
@@ -159,83 +195,37 @@ class PageNode(Node):
     # --- inputs ---
 
     def on_health(self, health: Health) -> None:
-        self._state.health(health)
-        if health.node == self.name:
-            self._server.check()
-            viewers = len(self._server.events)
-            refused = "".join(f"; {n} {what}" for what, n in self._server.refused().items() if n)
-            for what, count in self._server.refused().items():
-                self.rejections.set(what, count)
-            self.detail = (
-                f"open {self._address}; {viewers} {'viewer' if viewers == 1 else 'viewers'}{refused}"
-            )
+        self._intake.take_health(health)
+        if health.node != self.name:
+            return
+        self._server.check()
+        viewers, robots = self._server.viewers, len(self._fleet.states())
+        for what, count in self._server.refused().items():
+            self.rejections.set(what, count)
+        self.rejections.set("messages of other robots: too many robots", self._fleet.ignored)
+        texts = [f"open {self._address}", f"{viewers} {'viewer' if viewers == 1 else 'viewers'}"]
+        texts += [f"{robots} robots"] if robots > 1 else []
+        texts += [f"{n} {what}" for what, n in self._server.refused().items() if n]
+        self.detail = "; ".join(texts)
 
-    def on_rig(self, rig: Rig) -> Outputs:
-        if rig.lidar is not None:
-            self._state.lidar(rig.lidar.T_body_lidar)
-        return iter(())
+    def _take_of_other(self, robot: str, topic: str, message: Message) -> None:
+        """Store a message of another robot; called from the threads of the session of the fleet."""
+        with self._fleet_lock:
+            state = self._fleet.state_of(robot)
+            if state is None:
+                return
+            intake = self._intakes.get(robot)
+            if intake is None or intake.state is not state:
+                known = self._fleet.states()
+                self._intakes = {name: i for name, i in self._intakes.items() if name in known}
+                intake = self._intakes[robot] = self._new_intake(state)
+            if isinstance(message, Health):
+                intake.take_health(message)
+            else:
+                intake.take(topic, message)
 
-    def on_wheel_odometry(self, m: WheelOdometry) -> Outputs:
-        self._state.pose("wheel", m.stamp_ns, m.T_odom_body)
-        return iter(())
-
-    def on_lidar_scan(self, m: Scan) -> Outputs:
-        self._state.scan(
-            m.stamp_ns, m.ranges_m, m.angle_min_rad, m.angle_increment_rad, (m.range_min_m, m.range_max_m)
-        )
-        return iter(())
-
-    def on_camera_image(self, m: Image) -> Outputs:
-        size_px = (m.width_px, m.height_px)
-        self._state.images["camera"].update(
-            partial(encode_camera_image, m.data, m.encoding, size_px, m.step_bytes, self.config.widest_px)
-        )
-        return iter(())
-
-    def on_external_pose(self, m: ExternalPose) -> Outputs:
-        self._state.pose("external", m.stamp_ns, m.T_map_body)
-        return iter(())
-
-    def on_localization_odometry(self, m: Odometry) -> Outputs:
-        self._state.pose("localization", m.stamp_ns, m.T_odom_body)
-        self._state.service_status("localization", m.status, detail=m.detail, metric=m.metric)
-        return iter(())
-
-    def on_localization_correction(self, m: Correction) -> Outputs:
-        self._state.correction(m.T_map_odom)
-        return iter(())
-
-    def on_localization_grid(self, m: GridTile) -> Outputs:
-        """Store a tile of the grid; with the last tile of an update, offer the whole grid to the pages."""
-        source = GridSource(m.map_uuid, m.since_ns, m.resolution_m, m.size)
-        try:
-            self._grid.add(source, m.row, m.column, m.packed.tobytes())
-        except ValueError as error:
-            self.rejections.add(str(error))
-        if m.remaining == 0:
-            self._state.images["map"].update(partial(encode_tiles, self._grid.copy()))
-        return iter(())
-
-    def on_fusion_depth(self, m: FusedDepth) -> Outputs:
-        self._state.service_status(
-            "fusion", "ok" if m.status == "ok" else "refused", detail=m.status.removeprefix("ok"),
-            scale=m.scale, scale_sigma=m.scale_sigma, inlier_share=m.inlier_share, residual_m=m.residual_m,
-        )  # fmt: skip
-        self._state.scale(m.scale, m.scale_sigma)
-        if m.depth_m.size:
-            self._state.images["depth"].update(partial(encode_depth, m.depth_m, self.config.widest_px))
-        return iter(())
-
-    def on_mapping_preview(self, m: MapPreview) -> Outputs:
-        self._state.images["render"].update(lambda: EncodedImage(m.render.tobytes(), "image/jpeg", {}))
-        return iter(())
-
-    def on_mapping_status(self, m: MapStatus) -> Outputs:
-        self._state.service_status(
-            "mapping", "ok" if m.status == "ok" else "refused", detail=m.status.removeprefix("ok"),
-            keyframes=m.keyframes, gaussians=m.gaussians, psnr_db=m.psnr_db, depth_error_m=m.depth_error_m,
-        )  # fmt: skip
-        return iter(())
+    def _new_intake(self, state: PageState) -> RobotIntake:
+        return RobotIntake(state, self.config.widest_px, self.rejections.add)
 
 
 def _tls(certificate: Path | None, key: Path | None) -> ssl.SSLContext | None:

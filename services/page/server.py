@@ -4,6 +4,9 @@ GET /                     the page; its parts are /page.js, /page.css ...
 GET /events               server-sent events: status, scale, path, robot, picture (a newer image is available)
 GET /picture/NAME         the newest image: camera, depth, render or map
 GET /status               the data of the status event, for scripts
+GET /metrics              Prometheus metrics of all robots that the page knows
+GET /fleet                the list of these robots, from GET /robots; GET /robots/NAME/ is the page of one of
+                          them, with /robots/NAME/events, /picture/NAME and /status as above
 POST /command             {"action": "restart", "node": "depth"}, with "Authorization: Bearer TOKEN";
                           also params (returns the node's options); swap and "cold swap" take
                           {"parameters": {OPTION: VALUE}}
@@ -22,6 +25,7 @@ import ssl
 import threading
 from collections.abc import Awaitable, Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from http import HTTPStatus
 from pathlib import Path
 from typing import Any
@@ -30,9 +34,12 @@ from aiohttp import web
 from aiohttp.http_exceptions import HttpProcessingError
 
 from beamsplat.services.page.access import PageAccess
+from beamsplat.services.page.alerting import Alerting
 from beamsplat.services.page.events import EventHub, as_json
+from beamsplat.services.page.fleet import Fleet
 from beamsplat.services.page.listener import MAX_CONNECTIONS, Listener
-from beamsplat.services.page.view import PageState
+from beamsplat.services.page.metrics import CONTENT_TYPE, page_metrics
+from beamsplat.services.page.robot_view import RobotView
 
 _http_log = logging.getLogger(f"{__name__}.http")
 _STATIC = Path(__file__).parent / "static"
@@ -42,7 +49,11 @@ _FILES = {
     "/map.js": ("map.js", "text/javascript; charset=utf-8"),
     "/page.css": ("page.css", "text/css; charset=utf-8"),
     "/icon.svg": ("icon.svg", "image/svg+xml"),
+    "/fleet": ("fleet.html", "text/html; charset=utf-8"),
+    "/fleet.js": ("fleet.js", "text/javascript; charset=utf-8"),
 }
+_OF_FLEET = ("/fleet", "/fleet.js")  # the other files are also served for each robot
+_ROBOT = "/robots/{robot}"
 # No content from other origins, no inline scripts, no embedding in frames, no content sniffing, no caching.
 _HEADERS = {
     "Content-Security-Policy": "default-src 'self'; frame-ancestors 'none'; base-uri 'none'",
@@ -94,17 +105,19 @@ class _ProtocolErrors(logging.Filter):
 
 
 class PageServer:
-    """HTTP server of one `PageState`; call `start()`, then `close()`."""
+    """HTTP server of the robots of a `Fleet`; call `start()`, then `close()`."""
 
-    def __init__(self, state: PageState, command: Command, access: PageAccess, robot_hz: float) -> None:
-        self._state = state
+    def __init__(
+        self, fleet: Fleet, alerting: Alerting, command: Command, access: PageAccess, robot_hz: float
+    ) -> None:
+        self._fleet, self._alerting = fleet, alerting
         self._command = command
         self._access = access
         self._robot_hz = robot_hz
         self._files = {path: ((_STATIC / name).read_bytes(), kind) for path, (name, kind) in _FILES.items()}
-        self.events = EventHub()
-        self._commands = 0
         self._encoder = ThreadPoolExecutor(1, "page-encoder")
+        self._views: dict[str, RobotView] = {}  # by robot; used in the server's thread
+        self._commands = 0
         self._command_executor = ThreadPoolExecutor(_MAX_COMMANDS, "page-command")
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._loop.run_forever, name="page", daemon=True)
@@ -113,6 +126,17 @@ class PageServer:
         self._publishing: asyncio.Task[None] | None = None
         self._protocol_errors = _ProtocolErrors()
         self.rejected_commands = 0  # commands with a wrong token
+        self._view(fleet.own)
+
+    @property
+    def events(self) -> EventHub:
+        """Event streams of the page's own robot."""
+        return self._view(self._fleet.own).events
+
+    @property
+    def viewers(self) -> int:
+        """Number of open event streams of all robots."""
+        return sum(len(view.events) for view in list(self._views.values()))
 
     def start(self, bind: str, port: int, tls: ssl.SSLContext | None) -> int:
         """Start listening; return the port (a free one if `port` is 0).
@@ -124,14 +148,17 @@ class PageServer:
         return asyncio.run_coroutine_threadsafe(self._open(bind, port, tls), self._loop).result()
 
     async def _open(self, bind: str, port: int, tls: ssl.SSLContext | None) -> int:
-        self._encode_locks = {name: asyncio.Lock() for name in self._state.images}
         app = web.Application(middlewares=[self._guard], client_max_size=_MAX_BODY_BYTES)
-        app.router.add_get("/events", self._stream, allow_head=False)
-        app.router.add_get("/status", self._get_status)
-        app.router.add_get("/picture/{name}", self._get_image)
+        for prefix in ("", _ROBOT):
+            app.router.add_get(f"{prefix}/events", self._stream, allow_head=False)
+            app.router.add_get(f"{prefix}/status", self._get_status)
+            app.router.add_get(f"{prefix}/picture/{{name}}", self._get_image)
+            for path in self._files:
+                if not prefix or path not in _OF_FLEET:
+                    app.router.add_get(f"{prefix}{path}", self._get_file)
+        app.router.add_get("/robots", self._get_robots)
+        app.router.add_get("/metrics", self._get_metrics)
         app.router.add_post("/command", self._post_command)
-        for path in self._files:
-            app.router.add_get(path, self._get_file)
         _http_log.setLevel(logging.DEBUG)  # the filter counts what aiohttp logs at this level
         _http_log.addFilter(self._protocol_errors)
         runner = web.AppRunner(
@@ -178,47 +205,39 @@ class PageServer:
         if self._publishing is not None:
             self._publishing.cancel()
 
-    # --- events to all pages ---
+    # --- robots ---
+
+    def _view(self, robot: str) -> RobotView:
+        """Return the view of a robot. Raises RefusedRequest if the page does not know it."""
+        state = self._fleet.states().get(robot)
+        if state is None:
+            raise RefusedRequest(HTTPStatus.NOT_FOUND, "no robot with this name is known: see /robots")
+        view = self._views.get(robot)
+        if view is None or view.state is not state:  # new, or forgotten and heard again
+            view = self._views[robot] = RobotView(state, partial(self._facts, robot), self._encoder)
+        return view
+
+    def _view_of(self, request: web.Request) -> RobotView:
+        return self._view(request.match_info.get("robot", self._fleet.own))
+
+    def _facts(self, robot: str, view: RobotView) -> dict[str, Any]:
+        own = robot == self._fleet.own
+        page = {
+            "robot": robot, "viewers": len(view.events), "overtaken": view.events.dropped,
+            "commands": own and bool(self._access.token), "robots": len(self._fleet.states()),
+        }  # fmt: skip
+        return {"page": page, "alerts": [alert.as_json() for alert in self._alerting.alerts(robot)]}
 
     async def _publish_periodically(self) -> None:
-        """Publish the robot's pose at `robot_hz` and other events once per second, while a page is open."""
-        beat = 0
+        """Publish the robots' poses at `robot_hz` and other events once per second, to open pages."""
         while True:
             await asyncio.sleep(1.0 / self._robot_hz)
-            if self.events:
-                self._publish_all(slow=beat <= 0)
-                beat = round(self._robot_hz) - 1 if beat <= 0 else beat - 1
-                for name, image in self._state.images.items():
-                    if image.due() and not self._encode_locks[name].locked():
-                        await self._encode_if_due(name)
-
-    def _publish_all(self, slow: bool) -> None:
-        self.events.publish("robot", self._state.robot())
-        if slow:
-            self.events.publish("status", self._status())
-            self.events.publish("scale", self._state.scales())
-            self.events.publish("path", self._state.path())
-
-    def _status(self) -> dict[str, Any]:
-        facts = {
-            "viewers": len(self.events),
-            "overtaken": self.events.dropped,
-            "commands": bool(self._access.token),
-        }
-        return {**self._state.status(), "page": facts}
-
-    async def _encode_if_due(self, name: str) -> None:
-        """Encode the image `name` if it is due; concurrent callers wait for the same encoding."""
-        image = self._state.images[name]
-        async with self._encode_locks[name]:
-            if not image.due():
-                return
-            await self._loop.run_in_executor(self._encoder, image.encode_newest)
-        self._publish_image(name)
-
-    def _publish_image(self, name: str) -> None:
-        if (facts := self._state.images[name].metadata()) is not None:
-            self.events.publish(f"picture/{name}", {"name": name, **facts})
+            known = self._fleet.states()
+            self._views = {name: v for name, v in self._views.items() if name in known or v.events}
+            for view in list(self._views.values()):
+                if view.events:
+                    view.publish(self._loop.time())
+                    await view.encode_due_images()
 
     # --- requests ---
 
@@ -266,38 +285,57 @@ class PageServer:
             raise RefusedRequest(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"more than {_MAX_BODY_BYTES} bytes")
 
     async def _stream(self, request: web.Request) -> web.StreamResponse:
-        if len(self.events) >= _MAX_VIEWERS:
+        view = self._view_of(request)
+        if self.viewers >= _MAX_VIEWERS:
             raise RefusedRequest(*_BUSY)
         response = web.StreamResponse(headers={**_HEADERS, "Content-Type": "text/event-stream"})
-        viewer = self.events.subscribe()
+        viewer = view.events.subscribe()
         try:
             with _aborting(request):
                 await response.prepare(request)
-                self._publish_all(slow=True)
-                for name in self._state.images:
-                    self._publish_image(name)
+                view.publish(None)
+                for name in view.state.images:
+                    view.publish_image(name)
                 while True:
                     data = await viewer.next_events(_HEARTBEAT_S) or _HEARTBEAT
                     async with asyncio.timeout(_TRANSFER_S):
                         await response.write(data)
                         await request.writer.drain()
         finally:
-            self.events.unsubscribe(viewer)
+            view.events.unsubscribe(viewer)
         return response
 
     async def _get_status(self, request: web.Request) -> web.Response:
-        return _json_response(self._status())
+        return _json_response(self._view_of(request).status())
+
+    async def _get_robots(self, request: web.Request) -> web.Response:
+        robots = [
+            {
+                "name": name, "own": name == self._fleet.own, **state.summary(),
+                "alerts": [alert.as_json() for alert in self._alerting.alerts(name)],
+            }
+            for name, state in self._fleet.states().items()
+        ]  # fmt: skip
+        return _json_response({"robots": robots})
+
+    async def _get_metrics(self, request: web.Request) -> web.Response:
+        body = page_metrics(self._fleet, self._alerting, self.viewers, self.refused())
+        return web.Response(body=body, headers={"Content-Type": CONTENT_TYPE})
 
     async def _get_file(self, request: web.Request) -> web.Response:
-        body, kind = self._files[request.path]
+        path = request.path
+        if (robot := request.match_info.get("robot")) is not None:
+            self._view(robot)
+            path = path.removeprefix(f"/robots/{robot}")
+        body, kind = self._files[path]
         return web.Response(body=body, headers={"Content-Type": kind})
 
     async def _get_image(self, request: web.Request) -> web.Response:
-        name = request.match_info["name"]
-        if name not in self._state.images:
+        view, name = self._view_of(request), request.match_info["name"]
+        if name not in view.state.images:
             raise RefusedRequest(HTTPStatus.NOT_FOUND, "not found")
-        await self._encode_if_due(name)
-        encoded = self._state.images[name].encoded
+        await view.encode_if_due(name)
+        encoded = view.state.images[name].encoded
         if encoded is None:
             raise RefusedRequest(HTTPStatus.NOT_FOUND, f"no {name} yet")
         return web.Response(body=encoded.data, content_type=encoded.content_type)

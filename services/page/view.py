@@ -9,7 +9,8 @@ import math
 import threading
 import time
 from collections import deque
-from typing import Any
+from collections.abc import Callable
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -26,6 +27,7 @@ _SCAN_POINTS = 360  # of a scan that are sent at most
 _MAX_WAITING_SCANS = 30  # scans kept until their pose is known
 _MAX_SCALES = 120  # seconds of the scale chart: one value per second
 _LOG_LINES = 60
+_T = TypeVar("_T")
 
 
 class PageState:
@@ -33,6 +35,7 @@ class PageState:
 
     def __init__(self, picture_hz: float, map_hz: float) -> None:
         self._lock = threading.Lock()
+        self.heard_s = time.monotonic()  # when the newest message of the robot arrived
         self._health = HealthRecords()
         self._silent_nodes: set[str] = set()
         self._log: deque[dict[str, Any]] = deque(maxlen=_LOG_LINES)
@@ -124,6 +127,11 @@ class PageState:
                 return transform_points(T_map_body, points_body)
         return np.zeros((0, 3))
 
+    def log_event(self, text: str) -> None:
+        """Add a line to the events that the page lists."""
+        with self._lock:
+            self._log_event(text)
+
     def _log_event(self, text: str) -> None:
         self._log.append({"at": time.time(), "text": text})
 
@@ -152,6 +160,30 @@ class PageState:
                 },
                 "log": list(self._log),
             }
+
+    def with_records(self, use: Callable[[dict[str, NodeRecord]], _T]) -> _T:
+        """Return `use(records)`: the newest health by node name, which does not change meanwhile."""
+        with self._lock:
+            return use(self._health.records)
+
+    def summary(self) -> dict[str, Any]:
+        """Return one robot's line of the fleet page, as data for JSON."""
+        now = time.monotonic()
+        with self._lock:
+            records = self._health.records
+            states = self._health.states(now)
+            running = sum(state not in ("silent", "failed") for state in states.values())
+            pose = records.get("localization")
+            heard = pose is not None and pose.silent_s(now) is None
+            return {
+                "age_s": round(now - self.heard_s, 1), "nodes": len(states), "running": running,
+                "localization": pose.health.status if pose is not None and heard else "silent",
+                "link": _link_state(records, now),
+                "keyframes": _figure(records, "map_keyframes", now),
+                "gaussians": _figure(records, "map_gaussians", now),
+                "outbox": _figure(records, "outbox_keyframes", now),
+                "map": self.images["map"].newest,
+            }  # fmt: skip
 
     def scales(self) -> list[list[float | None]]:
         """Return [[age s, depth scale, standard error], ...], oldest first."""
@@ -195,6 +227,20 @@ def _node(name: str, record: NodeRecord, now: float) -> dict[str, Any]:
         "bad": totals.bad + record.refused,
         "rss_mb": round(health.rss_mb), "cpu_percent": round(health.cpu_percent),
     }  # fmt: skip
+
+
+def _figure(records: dict[str, NodeRecord], name: str, now: float) -> float | None:
+    """Return a figure of the node that reports it, None if no node does."""
+    heard = (record for record in records.values() if record.silent_s(now) is None)
+    return next((value for record in heard if (value := record.figure(name)) is not None), None)
+
+
+def _link_state(records: dict[str, NodeRecord], now: float) -> str:
+    """Return the state of the uplink of a robot: "up", "down", or "none" if it has none."""
+    known = [record for record in records.values() if record.figure("link_up") is not None]
+    if not known:
+        return "none"
+    return "up" if any(r.silent_s(now) is None and r.figure("link_up") for r in known) else "down"
 
 
 def _link(flow: Any) -> dict[str, Any]:

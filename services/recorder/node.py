@@ -55,6 +55,7 @@ class RecorderNode(_Handlers, Node):
         for name in (*config.topics, *config.without):
             if name not in TOPICS:
                 raise UserError(f"recorder: no topic called {name!r}; there are {', '.join(TOPICS)}")
+        self.writes_to = config.out.parent
         self._chosen = set(config.topics or TOPICS) - set(config.without)
         self._clock = ArrivalClock(config.clock, time.time_ns, time.monotonic_ns)
         self._clock_id = local_clock_id()
@@ -125,6 +126,7 @@ class RecorderNode(_Handlers, Node):
                     self._open()
 
     def _update_detail(self) -> None:
+        self.figures.set("recording", self.writer is not None)
         lost = self.lost.total() + (self.writer.lost.total() if self.writer is not None else 0)
         text = f"NOT RECORDING: {self._fault}" if self.writer is None else f"writing {self.writer.path}"
         self.detail = text + (f", {lost} messages LOST" if lost else "")

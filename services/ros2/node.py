@@ -90,6 +90,7 @@ class Ros2Node(Node):
             yield from self._process(sample) or (None,)
             lost = f"; {self._dropped} dropped" if self._dropped else ""
             self.detail = f"{self.robot.status}{lost}"
+            self.figures.set("calibration_doubts", len(self.robot.doubts))
             self.rejections.set("messages dropped, the queue was full", self._dropped)
             for topic, count in self.robot.rejected.items():
                 self.rejections.set(f"{topic}: messages not usable", count)

@@ -67,6 +67,7 @@ class UplinkNode(Node):
                     break
                 except UserError as error:
                     self._fault = error
+            self.figures.set("link_up", 0)
             self.detail = f"no link for {time.monotonic() - started:.0f} s: {self._fault}"
             yield None
             time.sleep(_POLL_S)
@@ -158,6 +159,10 @@ class UplinkNode(Node):
             self._bulk_session_cut = True
             state = f"no link for {now - self._cut_since_s:.0f} s"
         up = self._connected.forwarded_up().values()
+        self.figures.set("link_up", self._cut_since_s is None)
+        self.figures.set("link_cuts_total", self._cuts)
+        self.figures.set("link_sent_messages_total", sum(c.messages for c in up))
+        self.figures.set("link_sent_bytes_total", sum(c.bytes for c in up))
         cuts = f", {self._cuts} cuts, {self._connected.interrupted} messages cut off" if self._cuts else ""
         cuts += (
             f", {self._connected.health_dropped} health reports rejected"

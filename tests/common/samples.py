@@ -32,6 +32,7 @@ from beamsplat.common.messages import (
     MapStatus,
     Message,
     MovingBeams,
+    NodeFigure,
     Odometry,
     OutputHealth,
     Rejected,
@@ -136,7 +137,8 @@ def sample_messages() -> list[Message]:
             inputs=(InputHealth(topic="rig", received=1, dropped=2, lost=3, undecodable=4, stale=5, age_ms=6.0, late=7, refused=8),),
             outputs=(OutputHealth(topic="rig", sent=1, bytes=2, refused=3),),
             step_p50_ms=1.0, step_p95_ms=2.0, rss_mb=3.0, cpu_percent=4.0, detail="warm",
-            rejected=(Rejected(topic="fusion/depth", reason="N beams", count=9),),
+            rejected=(Rejected(topic="fusion/depth", reason="N beams", count=9),), pid=10, status="lost: no match",
+            figures=(NodeFigure(name="link_up", value=1.0),), clock_id=2**64 - 1,
         ),
         Answer(stamp_ns=31, text="depth was told to end, and starts again"),
     ]  # fmt: skip

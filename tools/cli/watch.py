@@ -32,14 +32,16 @@ def _board(file: Path, overrides: list[str] | None, every_robot: bool) -> Iterat
     Raises:
         UserError: no router answers.
     """
+    from beamsplat.common.config.alerts import alert_rules
     from beamsplat.common.security.logins import OPERATOR, login_of
     from beamsplat.common.zenoh.bus import open_session
     from beamsplat.tools.system.health_table import ALL, HealthTable
 
     deployment = load_deployment(file, tuple(overrides or ()))
     login = login_of(deployment.security, OPERATOR)
+    rules = alert_rules(deployment, str(file))
     with open_session(deployment.router.listen, 2.0, login=login) as session:
-        yield HealthTable(session, ALL if every_robot else deployment.robot)
+        yield HealthTable(session, ALL if every_robot else deployment.robot, rules=rules)
 
 
 def _watch(board: HealthTable, table: str, seconds: float | None) -> None:
@@ -63,7 +65,10 @@ def top(
         typer.Option("--json", help="Print one JSON object after --seconds (default 3) instead of a table"),
     ] = False,
 ) -> None:
-    """Show a live table of the nodes: process, state, rates, step time, age, drops, memory, CPU.
+    """Show a live table of the nodes: process, state, rates, step time, age, drops, memory, CPU; and alerts.
+
+    Alerts follow the rules of the table [nodes.page.alerts] of the deployment. A pending one has not held for
+    `hold_s` yet.
 
     Examples:
 

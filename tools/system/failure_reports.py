@@ -56,6 +56,6 @@ class FailureReports:
         self._publications[name].put(
             Health(
                 stamp_ns=time.time_ns(), node=name, instance=instance, epoch=epoch, state="failed",
-                detail=why[:_DETAIL_CHARS],
+                detail=why[:_DETAIL_CHARS], clock_id=local_clock_id(),
             )
         )  # fmt: skip

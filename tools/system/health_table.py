@@ -13,8 +13,10 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from beamsplat.common.config.alerts import AlertConfig
 from beamsplat.common.messages import Health
-from beamsplat.common.messages.header import DecodeError
+from beamsplat.common.messages.header import DecodeError, local_clock_id
+from beamsplat.common.runtime.alerts import Alert, AlertBook, AlertKey, conditions
 from beamsplat.common.runtime.health import HealthRecords, NodeRecord, TopicConsumer, TopicTraffic
 from beamsplat.common.topics import HEALTH, Topic
 from beamsplat.common.zenoh.bus import key
@@ -22,6 +24,7 @@ from beamsplat.common.zenoh.receiving import receive_in_thread
 from beamsplat.common.zenoh.streams import decode_sample
 
 ALL = "*"
+DEFAULT_RULES = AlertConfig()
 
 
 class HealthTable:
@@ -31,10 +34,19 @@ class HealthTable:
     """
 
     def __init__(
-        self, session: zenoh.Session, robot: str, clock_s: Callable[[], float] = time.monotonic
-    ) -> None:
+        self, session: zenoh.Session, robot: str, clock_s: Callable[[], float] = time.monotonic,
+        rules: AlertConfig = DEFAULT_RULES,
+    ) -> None:  # fmt: skip
+        """Subscribe.
+
+        Args:
+            clock_s: replaces `time.monotonic`.
+            rules: of the alerts that `alerts` returns and `nodes_table` shows.
+        """
         self._clock_s = clock_s
-        self._all = robot == ALL
+        self._all, self._robot = robot == ALL, robot
+        self._rules, self._alerts = rules, AlertBook(rules)
+        self._clock_id = local_clock_id()
         self._book = HealthRecords()
         self.records: dict[str, NodeRecord] = self._book.records
         self._lock = threading.Lock()
@@ -77,7 +89,24 @@ class HealthTable:
         with self._lock:
             nodes = {name: _node_figures(record, now) for name, record in sorted(self.records.items())}
             topics = {flow.topic: _topic_figures(flow) for flow in self._book.traffic()}
-        return {"nodes": nodes, "topics": topics}
+        return {"nodes": nodes, "topics": topics, "alerts": [alert.as_json() for alert in self.alerts()]}
+
+    def alerts(self) -> list[Alert]:
+        """Evaluate the alerts now, and return the active and the pending ones, oldest first.
+
+        A pending alert is a condition that does not hold for long enough yet. Time counts from the first call.
+        """
+        now = self._clock_s()
+        with self._lock:
+            robots: dict[str, dict[str, NodeRecord]] = {}
+            for name, record in self.records.items():
+                robot, _, node = name.rpartition("/")
+                robots.setdefault(robot or self._robot, {})[node] = record
+            found: dict[AlertKey, str] = {}
+            for robot, records in robots.items():
+                found.update(conditions(robot, records, self._clock_id, self._rules, now))
+            self._alerts.update(found, robots, now, time.time())
+            return self._alerts.alerts(pending=True)
 
     def status_line(self) -> str:
         """Return state, message rate and number of lost messages of every node in one line of text."""
@@ -118,7 +147,7 @@ class HealthTable:
         ):
             table.add_column(heading, justify="right", no_wrap=True)
         now = self._clock_s()
-        said = []
+        said = [_alert_text(alert, now, self._all) for alert in self.alerts()]
         with self._lock:
             for name, record in sorted(self.records.items()):
                 name_cell, *cells = _node_row(name, record, now)
@@ -197,6 +226,15 @@ def _node_row(name: str, record: NodeRecord, now: float) -> tuple[str, ...]:
         _count(totals.bad + record.refused, "red"),
         f"{health.rss_mb:.0f}",
         f"{health.cpu_percent:.0f}",
+    )
+
+
+def _alert_text(alert: Alert, now: float, with_robot: bool) -> Text:
+    key, seconds = alert.key, now - alert.since_s
+    subject = f"{key.robot}: " if with_robot else ""
+    kind = f"{'ALERT' if alert.active else 'pending alert'} {key.kind.replace('_', ' ')}"
+    return Text(
+        f"{subject}{kind} ({seconds:.0f} s): {alert.text}", style="bold red" if alert.active else "yellow"
     )
 
 

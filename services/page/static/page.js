@@ -108,7 +108,28 @@ function offerNodes(names) {
   select.replaceChildren(...names.map((name) => new Option(name, name, false, name === chosen)));
 }
 
+function showAlerts(alerts) {
+  const lines = alerts.map((a) => `${a.alert.replaceAll("_", " ")}, since ${new Date(a.since).toLocaleTimeString()}: ${a.text}`);
+  $("alerts-section").hidden = !lines.length;
+  if ([...$("alerts").children].map((li) => li.textContent).join("\n") === lines.join("\n")) return; // a screen reader would repeat it
+  $("alerts").replaceChildren(...lines.map((line) => {
+    const li = document.createElement("li");
+    li.textContent = line; li.className = "bad";
+    return li;
+  }));
+}
+
+function showRobotName(page) {
+  const inFleet = location.pathname.includes("/robots/");
+  $("fleet").hidden = page.robots < 2;
+  $("fleet").setAttribute("href", inFleet ? "../../fleet" : "fleet");
+  document.title = page.robots < 2 ? "BeamSplat" : `BeamSplat: ${page.robot}`;
+  document.querySelector("h1").textContent = document.title;
+}
+
 function showStatus(status) {
+  showAlerts(status.alerts);
+  showRobotName(status.page);
   showNodes(status.nodes);
   showLinks(status.links);
   showWords(status.words);

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import pytest
 
+from beamsplat.common.config.alerts import AlertConfig
 from beamsplat.common.errors import UserError
 from beamsplat.common.geometry.transforms import se2_to_se3
 from beamsplat.common.mapfiles.grid_tiles import GridSource, TiledGrid, pack_tile
@@ -22,6 +23,8 @@ from beamsplat.common.security.access_control import HostRole
 from beamsplat.common.security.keys import CA, CERTIFICATE, KEY
 from beamsplat.services.nodes import NODES
 from beamsplat.services.page.access import PageAccess
+from beamsplat.services.page.alerting import Alerting
+from beamsplat.services.page.fleet import Fleet
 from beamsplat.services.page.images import (
     EncodedImage,
     LatestImage,
@@ -42,9 +45,12 @@ class Serving:
     """A running server whose state a test sets."""
 
     def __init__(self, picture_hz=20.0, robot_hz=20.0, tls=None):
-        self.state = PageState(picture_hz, picture_hz)
+        self.fleet = Fleet("r0", lambda: PageState(picture_hz, picture_hz))
+        self.fleet.state_of("r1")
+        self.state = self.fleet.own_state
         self.orders = []
-        self.server = PageServer(self.state, self._command, PageAccess(TOKEN), robot_hz)
+        self.alerting = Alerting(self.fleet, AlertConfig())
+        self.server = PageServer(self.fleet, self.alerting, self._command, PageAccess(TOKEN), robot_hz)
         self.port = self.server.start("127.0.0.1", 0, tls)
 
     def _command(self, *order):
@@ -56,6 +62,7 @@ class Serving:
 
     def __exit__(self, *exception):
         self.server.close()
+        self.alerting.close()
 
     def ask(self, raw):
         """Send raw bytes; return (status, body) of the response."""
@@ -334,10 +341,10 @@ def test_a_refused_depth_is_reported_and_shows_no_image():
         refused = FusedDepth(stamp_ns=1, depth_m=none, sigma_m=none, status="too few beams in the picture")
         list(node.handle("fusion/depth", refused))
         node.on_health(Health(stamp_ns=1, node="page", instance="ab", epoch=1, state="active"))
-        status = node._state.status()
+        status = node._fleet.own_state.status()
         assert status["words"]["fusion"]["status"] == "refused"
         assert status["words"]["fusion"]["detail"] == "too few beams in the picture"
         assert "fusion: refused" in [line["text"] for line in status["log"]]
-        assert node._state.images["depth"].metadata() is None
+        assert node._fleet.own_state.images["depth"].metadata() is None
     finally:
         node.close()

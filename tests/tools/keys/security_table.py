@@ -108,7 +108,13 @@ def try_requests() -> dict[tuple[str, str], dict[str, int]]:
         for method, path in sorted(routes, key=lambda route: (route[1], route[0])):
             if method != "HEAD":
                 found[method, path] = {
-                    case: _status(serving, method, path.replace("{name}", "camera"), headers, host)
+                    case: _status(
+                        serving,
+                        method,
+                        path.replace("{name}", "camera").replace("{robot}", "r1"),
+                        headers,
+                        host,
+                    )
                     for case, (headers, host) in REQUESTS.items()
                 }
         for method in ("OPTIONS", "PUT"):
