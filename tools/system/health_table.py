@@ -94,7 +94,8 @@ class HealthTable:
     def alerts(self) -> list[Alert]:
         """Evaluate the alerts now, and return the active and the pending ones, oldest first.
 
-        A pending alert is a condition that does not hold for long enough yet. Time counts from the first call.
+        A pending alert is a condition that does not hold for long enough yet; time counts from the first
+        call.
         """
         now = self._clock_s()
         with self._lock:
