@@ -158,6 +158,7 @@ def options() -> str:
                 rows += ["No options of its own.", ""]
             else:
                 rows += [*_docstring(config), *_options_table(config)]
+                rows += _tables_within(f"nodes.{service.name}", config)
     rows += ["## Depth sources", "", "`[nodes.depth]` with `source = NAME` and `options = { ... }`.", ""]
     for name in SOURCES:
         rows += [
@@ -167,6 +168,15 @@ def options() -> str:
             *_parameters(source_class(name)),
         ]
     return "\n".join(rows)
+
+
+def _tables_within(table: str, config: type[BaseModel]) -> list[str]:
+    """Return a section for each option of a node that is a table itself."""
+    rows: list[str] = []
+    for name, field in config.model_fields.items():
+        if isinstance(inner := field.annotation, type) and issubclass(inner, BaseModel):
+            rows += [f"### Table [{table}.{name}]", "", *_docstring(inner), *_options_table(inner, own=inner)]
+    return rows
 
 
 def _section(title: str, config: type[BaseModel], own: type) -> list[str]:

@@ -17,6 +17,8 @@ from beamsplat.common.runtime.health import NodeRecord
 
 _ENDED = ("drained", "closed")  # a process that was stopped in order reports one of them last
 _TEXT_CHARS = 300
+_LATEST_UNIX_S = 4e9  # the year 2096
+_FORGET_S = 86400.0  # an alert about a robot of which nothing is known for so long is over
 
 
 class AlertKey(NamedTuple):
@@ -115,7 +117,10 @@ class Alert:
     since_s: float  # when the condition began, `time.monotonic`
     since_unix_s: float
     active: bool = False
-    absent_since_s: float | None = None
+    absent_since_s: float | None = (
+        None  # since then the condition is absent, or nothing is known of the robot
+    )
+    robot_known: bool = True  # False: after a restart, until the robot is heard
 
     def as_json(self) -> dict[str, Any]:
         """Return the alert as data for JSON; `since` is UTC, ISO 8601."""
@@ -154,23 +159,26 @@ class AlertBook:
 
         Args:
             found: conditions by key, with their texts (`conditions` of each robot).
-            robots: robots of which health is known. An alert about any other one stays as it is.
+            robots: robots of which health is known. A restored alert about any other one stays for a day.
             now: reading of `time.monotonic`, s.
             now_unix_s: the time of day at `now`, s since 1970.
         """
         events = []
         for key, text in found.items():
             alert = self._alerts.setdefault(key, Alert(key, text, now, now_unix_s))
-            alert.text, alert.absent_since_s = text, None
+            alert.text, alert.absent_since_s, alert.robot_known = text, None, True
             if not alert.active and now - alert.since_s >= self._rules.hold_s:
                 alert.active = True
                 events.append(AlertEvent(alert, "begin", now_unix_s))
         for key, alert in list(self._alerts.items()):
-            if key in found or key.robot not in robots:
+            if key in found:
                 continue
+            if key.robot in robots and not alert.robot_known:
+                alert.robot_known, alert.absent_since_s = True, None
             if alert.absent_since_s is None:
                 alert.absent_since_s = now
-            if alert.active and now - alert.absent_since_s < self._rules.clear_s:
+            wait_s = self._rules.clear_s if alert.robot_known else _FORGET_S
+            if alert.active and now - alert.absent_since_s < wait_s:
                 continue
             del self._alerts[key]
             if alert.active:
@@ -195,8 +203,12 @@ class AlertBook:
         for entry in saved:
             key = AlertKey(str(entry["robot"]), entry["kind"], str(entry["node"]))
             since_unix_s = float(entry["since_unix_s"])
+            if not 0.0 <= since_unix_s < _LATEST_UNIX_S:
+                raise ValueError(f"since_unix_s = {since_unix_s} is no time of day")
             since_s = now - max(now_unix_s - since_unix_s, 0.0)
-            self._alerts[key] = Alert(key, str(entry["text"]), since_s, since_unix_s, active=True)
+            self._alerts[key] = Alert(
+                key, str(entry["text"]), since_s, since_unix_s, active=True, robot_known=False
+            )
 
 
 def iso_time(unix_s: float) -> str:

@@ -43,7 +43,7 @@ FIGURES: dict[str, FigureKind] = {
     "map_gaussians": FigureKind("Gaussians in the map."),
     "map_steps_total": FigureKind("Optimisation steps of the mapper.", counter=True),
     "map_psnr_decibels": FigureKind("PSNR of the newest keyframe after it was added."),
-    "map_depth_error_meters": FigureKind("Median |rendered - fused depth| of the newest keyframe."),
+    "map_depth_error_meters": FigureKind("Median difference of rendered and fused depth, newest keyframe."),
     "depth_scale_ratio": FigureKind("Metres per unit of the depth estimate, of the newest image."),
     "depth_inliers_ratio": FigureKind("Share of the lidar-depth pairs that support the newest fit."),
 }

@@ -64,7 +64,7 @@ class PageConfig(NodeConfig):
     robot_hz: Remote[Hz] = 5.0
     widest_px: Remote[Annotated[int, Field(ge=64, le=4096)]] = 640  # wider images are scaled down
     fleet: bool = False  # show all robots that this router hears: for the page of an edge server
-    alerts: AlertConfig = AlertConfig()
+    alerts: AlertConfig = AlertConfig()  # table [nodes.page.alerts]
 
     @field_validator("token")
     @classmethod

@@ -167,17 +167,24 @@ class PageState:
             return use(self._health.records)
 
     def summary(self) -> dict[str, Any]:
-        """Return one robot's line of the fleet page, as data for JSON."""
+        """Return one robot's line of the fleet page, as data for JSON.
+
+        `localization`: status of the newest pose ("" = none yet), "silent", or "none" without such a node;
+        `map`: number of the newest image of the map, 0 = there is none.
+        """
         now = time.monotonic()
         with self._lock:
             records = self._health.records
             states = self._health.states(now)
             running = sum(state not in ("silent", "failed") for state in states.values())
             pose = records.get("localization")
-            heard = pose is not None and pose.silent_s(now) is None
+            if pose is None:
+                localization = "none"
+            else:
+                localization = pose.health.status if pose.silent_s(now) is None else "silent"
             return {
                 "age_s": round(now - self.heard_s, 1), "nodes": len(states), "running": running,
-                "localization": pose.health.status if pose is not None and heard else "silent",
+                "localization": localization,
                 "link": _link_state(records, now),
                 "keyframes": _figure(records, "map_keyframes", now),
                 "gaussians": _figure(records, "map_gaussians", now),

@@ -19,7 +19,7 @@ function age(seconds) {
 
 function number(value) { return value === null ? "–" : value.toLocaleString("en"); }
 
-function newCard(name) {
+function newCard({ name, own }) {
   const item = element("li"), link = element("a", name), list = element("dl");
   const image = element("img");
   item.dataset.robot = name;
@@ -27,17 +27,18 @@ function newCard(name) {
   image.alt = `Map of ${name}`;
   image.hidden = true;
   item.append(element("h3"), image, list);
-  item.firstChild.append(link);
+  item.firstChild.append(link, own ? " (this page)" : "");
   return { item, image, list, shown: 0 };
 }
 
 function facts(robot) {
-  const pose = robot.localization || "no pose yet";
+  const pose = robot.localization === "none" ? "–" : robot.localization || "no pose yet";
+  const poseClass = { "ok": "good", "–": "" }[pose] ?? "warn";
   const link = { up: ["up", "good"], down: ["down", "bad"], none: ["no uplink", ""] }[robot.link];
   return [
     ["last message", `${age(robot.age_s)} ago`, robot.age_s > LATE_S ? "bad" : "good"],
     ["nodes", `${robot.running} of ${robot.nodes} running`, robot.running < robot.nodes ? "bad" : "good"],
-    ["pose", pose, pose === "ok" ? "good" : "warn"],
+    ["pose", pose, poseClass],
     ["link", ...link],
     ["map", `${number(robot.keyframes)} keyframes, ${number(robot.gaussians)} Gaussians`, ""],
     ["outbox", robot.outbox === null ? "–" : `${number(robot.outbox)} keyframes wait`, ""],
@@ -59,7 +60,7 @@ function show(robots) {
   const names = new Set(robots.map((r) => r.name));
   for (const [name, card] of cards) if (!names.has(name)) { card.item.remove(); cards.delete(name); }
   robots.forEach((robot, i) => {
-    if (!cards.has(robot.name)) cards.set(robot.name, newCard(robot.name));
+    if (!cards.has(robot.name)) cards.set(robot.name, newCard(robot));
     const card = cards.get(robot.name);
     if ($("robots").children[i] !== card.item) $("robots").insertBefore(card.item, $("robots").children[i] ?? null);
     fill(card, robot);

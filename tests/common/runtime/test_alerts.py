@@ -146,6 +146,18 @@ def test_after_a_restart_an_active_alert_is_not_sent_again_and_ends_once_the_rob
     assert [e.state for e in after.update({}, {"r1"}, 306.0, 1e9 + 226)] == ["end"]
 
 
+def test_an_alert_about_a_robot_that_is_never_heard_again_ends_after_a_day():
+    before = Timeline()
+    before.run(0, 20, lambda now: True)
+    after = AlertBook(RULES)
+    after.restore(before.book.state(), 0.0, 1e9)
+    day_s = 86400.0
+    assert after.update({}, set(), 1.0, 1e9) == []
+    assert after.update({}, {"r2"}, day_s, 1e9 + day_s) == []
+    assert [e.state for e in after.update({}, {"r2"}, day_s + 1.0, 1e9 + day_s)] == ["end"]
+    assert after.state() == []
+
+
 @pytest.mark.parametrize(
     "address",
     ["hooks.example/x", "ftp://hooks.example/SECRET", "https://", "http://a:b/SECRET", "http://a b"],

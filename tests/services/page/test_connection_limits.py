@@ -9,7 +9,7 @@ import pytest
 
 from beamsplat.common.security.access_control import HostRole
 from beamsplat.common.security.keys import CA, CERTIFICATE, KEY
-from beamsplat.services.page import listener, server
+from beamsplat.services.page import command_requests, listener, server
 from beamsplat.services.page.images import EncodedImage
 from beamsplat.tools.keys.pki import CertificateAuthority
 from tests.common.polling import wait_until
@@ -51,7 +51,7 @@ def test_a_connection_without_a_complete_request_is_closed(monkeypatch, start):
 
 
 def test_a_request_with_an_incomplete_body_is_answered_and_closed(monkeypatch):
-    monkeypatch.setattr(server, "_TRANSFER_S", 0.5)
+    monkeypatch.setattr(command_requests, "TRANSFER_S", 0.5)
     head = f"POST /command HTTP/1.1\r\nHost: localhost\r\nAuthorization: Bearer {TOKEN}\r\nContent-Length: 99\r\n\r\n{{"
     with Serving() as serving:
         assert serving.ask(head.encode())[0] == 408
@@ -59,7 +59,7 @@ def test_a_request_with_an_incomplete_body_is_answered_and_closed(monkeypatch):
 
 
 def test_a_client_that_does_not_read_a_response_is_closed(monkeypatch):
-    monkeypatch.setattr(server, "_TRANSFER_S", 0.5)
+    monkeypatch.setattr(server, "TRANSFER_S", 0.5)
     with Serving() as serving, connect(serving) as deaf:
         serving.state.images["camera"].update(lambda: EncodedImage(bytes(8_000_000), "image/jpeg", {}))
         deaf.sendall(b"GET /picture/camera HTTP/1.1\r\nHost: localhost\r\n\r\n")

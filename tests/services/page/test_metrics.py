@@ -1,6 +1,7 @@
 """Metrics: values in base units, read by the parser of the Prometheus client from a real page."""
 
 import math
+import re
 import time
 import urllib.request
 from pathlib import Path
@@ -162,9 +163,12 @@ def test_numbers_keep_their_precision():
         assert out.text().decode().splitlines()[-1] == f"beamsplat_page_viewers {text}"
 
 
-def test_every_metric_is_documented():
-    text = DOCS.read_text()
-    assert [name for name in FAMILIES if f"`beamsplat_{name}`" not in text] == []
+def test_every_metric_is_documented_with_its_type_and_text():
+    rows = [line.split(" | ") for line in DOCS.read_text().splitlines() if line.startswith("| `beamsplat_")]
+    documented = {
+        row[0].strip("|` "): (re.split(r"[,;]", row[1])[0], row[2].removesuffix(" |")) for row in rows
+    }
+    assert documented == {f"beamsplat_{name}": family for name, family in FAMILIES.items()}
 
 
 def _now():
