@@ -8,6 +8,7 @@ from beamsplat.common.config.deployment import Deployment
 from beamsplat.common.messages import DepthEstimate, Image, Odometry, Rig, Scan
 from beamsplat.common.runtime.lockstep import Lockstep
 from beamsplat.services.depth.node import DepthNode
+from beamsplat.services.fusion.calibration.startup_check import CalibrationHealth
 from beamsplat.services.fusion.node import FusionNode
 from beamsplat.tools.system.assembly import build_node
 from tests.common.samples import sample_messages
@@ -251,6 +252,25 @@ def test_the_calibration_check_is_told_beside_the_health():
     node = _node()
     _drive(node, [_moment(k, _live_image(k)) for k in range(3)])
     assert "calibration not checked yet" in node.detail
+    assert _doubts(node) is None
     off = _node(check_pairs=0)
     _drive(off, [_moment(k, _live_image(k)) for k in range(3)])
     assert "calibration" not in off.detail
+
+
+def _doubts(node):
+    return {f.name: f.value for f in node.figures.report()}.get("calibration_doubts")
+
+
+@pytest.mark.parametrize(
+    ("cause", "status", "doubts"),
+    [
+        ("ok", "ok", 0.0),
+        ("clock", "the camera's clock is wrong", 1.0),
+        ("unchecked", "cannot be checked", None),
+    ],
+)
+def test_the_result_of_the_calibration_check_is_a_figure(cause, status, doubts):
+    node, none = _node(), np.full(3, np.nan)
+    list(node.on_job_check_calibration(CalibrationHealth(status, 0.3, 0.0, 1.0, none, none, 60, cause)))
+    assert _doubts(node) == doubts

@@ -102,6 +102,9 @@ def test_without_an_answer_the_oldest_is_sent_again():
     assert ids.count(ids[0]) == 3  # again after one second and after two
     assert len(set(ids)) == 4
     assert "4 not acknowledged" in node.detail
+    figures = {figure.name: figure.value for figure in node.figures.report()}
+    assert (figures["outbox_keyframes"], figures["outbox_dropped_total"]) == (4, 0)
+    assert figures["outbox_bytes"] > 4000
 
 
 def test_an_answer_ends_it():

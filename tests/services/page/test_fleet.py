@@ -14,6 +14,7 @@ import pytest
 from beamsplat.common.config.deployment import Deployment, RouterConfig
 from beamsplat.common.geometry.transforms import se2_to_se3
 from beamsplat.common.messages import Correction, Health, NodeFigure, Odometry
+from beamsplat.common.messages.header import local_clock_id
 from beamsplat.common.zenoh.bus import Bus, open_session
 from beamsplat.services.page import fleet as fleet_module
 from beamsplat.services.page.fleet import Fleet
@@ -116,6 +117,9 @@ def test_the_edge_lists_each_robot_with_status_map_and_its_own_view(start):
         wait_until(heard)
         robots = page.robots()
         assert robots["edge"]["own"]
+        own = page.board.records["page"]
+        assert own.health.clock_id == local_clock_id()
+        assert 0.0 < own.figure("disk_free_bytes") < own.figure("disk_size_bytes")
         facts = ("own", "nodes", "running", "localization", "link")
         assert [robots["robot1"][f] for f in facts] == [False, 2, 2, "ok", "up"]
         assert [robots["robot2"][f] for f in facts] == [False, 2, 2, "lost: no beam matches", "down"]

@@ -118,6 +118,7 @@ def test_recording_begins_again_when_the_disk_has_room(tmp_path, full_at, monkey
         lost = node.lost.total()
         assert lost > 0
         assert node.detail.startswith("NOT RECORDING")
+        assert [(f.name, f.value) for f in node.figures.report()] == [("recording", 0.0)]
         disk.free()
         for i in range(60, 63):
             list(node.handle("tick", Tick(stamp_ns=i * SECOND, count=i)))

@@ -97,7 +97,9 @@ def test_a_cut_link_loses_no_keyframe_and_does_not_affect_the_robot(tmp_path):
         poll(both, lambda: len(mapped.messages) >= 2, 90)
         pair.link.cut = True
         poses_before, sent_before = len(poses.messages), len(set(sent.ids()))
+        assert near_board.records["uplink"].figure("link_up") == 1.0
         poll(both, lambda: "no link" in detail(near_board, "uplink"), 10)
+        assert near_board.records["uplink"].figure("link_up") == 0.0
         poll(both, lambda: len(set(sent.ids())) >= sent_before + 8, 30)
         assert len(poses.messages) >= poses_before + 12  # the robot drives on
         assert near_board.states()["uplink"] == "active"

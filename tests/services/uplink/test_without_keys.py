@@ -25,3 +25,4 @@ def test_an_uplink_without_keys_says_so_and_does_not_occupy_a_core(tmp_path):
     assert yielded(node) < MOST
     assert "no link for" in node.detail
     assert "keys" in node.detail
+    assert {figure.name: figure.value for figure in node.figures.report()} == {"link_up": 0.0}

@@ -1,7 +1,11 @@
 """What `top` and `topics` show is what the nodes report."""
 
+import pytest
 from rich.console import Console
 
+from beamsplat.common.config.alerts import AlertConfig, alert_rules
+from beamsplat.common.config.deployment import Deployment
+from beamsplat.common.errors import UserError
 from beamsplat.common.messages import Health, InputHealth, OutputHealth
 from beamsplat.common.zenoh.bus import Bus, open_router, open_session
 from beamsplat.tools.system.health_table import ALL, HealthTable
@@ -84,3 +88,42 @@ def test_a_fleet_is_shown_by_robot_and_kept_apart(free_endpoint):
         assert "r3/replay" in _text(fleet.nodes_table())
         for bus in buses.values():
             bus.session.close()
+
+
+def test_alerts_are_shown_first_as_pending_and_then_as_active(free_endpoint):
+    with open_router((free_endpoint,)), open_session((free_endpoint,)) as watcher:
+        clock_s = [0.0]
+        one, fleet = (HealthTable(watcher, robot, lambda: clock_s[0]) for robot in ("r1", ALL))
+        lost = _health("localization", 1).model_copy(update={"status": "lost: 3 beams match"})
+        with Bus(open_session((free_endpoint,)), "r1", "localization", "cd" * 8, 1) as bus:
+
+            def reported(at):
+                """Whether both tables have a report of the time `at`; one is sent."""
+                bus.publish_health(lost)
+                known = [
+                    name.records.get(node)
+                    for name, node in ((one, "localization"), (fleet, "r1/localization"))
+                ]
+                return all(record and record.received_s == at for record in known)
+
+            wait_until(lambda: reported(0.0))
+            assert "pending alert lost (0 s): localization: lost: 3 beams match" in _text(one.nodes_table())
+            assert "r1: pending alert lost" in _text(fleet.nodes_table())
+            clock_s[0] = 11.0
+            wait_until(lambda: reported(11.0))
+            assert "\nALERT lost (11 s): localization: lost: 3 beams match" in _text(one.nodes_table())
+            (alert,) = one.snapshot()["alerts"]
+            facts = ("robot", "alert", "node", "state", "text")
+            assert [alert[f] for f in facts] == [
+                "r1", "lost", "localization", "active", "localization: lost: 3 beams match",
+            ]  # fmt: skip
+
+
+def test_the_rules_of_the_alerts_come_from_the_deployment():
+    deployment = Deployment(nodes={"page": {"alerts": {"hold_s": 3.5, "off": ["lost"]}}})
+    rules = alert_rules(deployment, "robot.toml")
+    assert (rules.hold_s, rules.clear_s, rules.off) == (3.5, 10.0, ("lost",))
+    assert alert_rules(Deployment(), "robot.toml") == AlertConfig()
+    wrong = Deployment(nodes={"page": {"alerts": {"hold": 1}}})
+    with pytest.raises(UserError, match=r"robot.toml: unknown option 'hold' \(options are: clear_s, "):
+        alert_rules(wrong, "robot.toml")
