@@ -12,11 +12,13 @@ import logging
 import threading
 import time
 from pathlib import Path
+from typing import Any
 
 from beamsplat.common.config.alerts import AlertConfig
 from beamsplat.common.errors import reason
 from beamsplat.common.files.persist import read_limited, write_atomically
-from beamsplat.common.runtime.alerts import Alert, AlertBook, AlertEvent, conditions
+from beamsplat.common.runtime.alerts import Alert, AlertBook, AlertEvent, AlertKey, conditions
+from beamsplat.common.runtime.health import NodeRecord
 from beamsplat.common.runtime.rate_limited_log import RateLimitedLog
 from beamsplat.services.page.fleet import Fleet
 from beamsplat.services.page.webhook import Webhook
@@ -69,10 +71,11 @@ class Alerting:
 
     def update(self, now: float, now_unix_s: float) -> None:
         """Evaluate the alerts at `now` (s, `time.monotonic`), which is `now_unix_s` (s since 1970)."""
-        found, known = {}, set()
+        found: dict[AlertKey, str] = {}
+        known: set[str] = set()
         for robot, state in self._fleet.states().items():
 
-            def read(records: dict, robot: str = robot) -> None:
+            def read(records: dict[str, NodeRecord], robot: str = robot) -> None:
                 if records:
                     known.add(robot)
                 found.update(conditions(robot, records, self._own_clock_id, self.rules, now))
@@ -101,7 +104,7 @@ class Alerting:
         if self.webhook is not None:
             self.webhook.post(event.as_json())
 
-    def _write(self, state: list) -> None:
+    def _write(self, state: list[dict[str, Any]]) -> None:
         if self._file is None:
             return
         try:

@@ -23,6 +23,7 @@ from beamsplat.tools.system.health_table import HealthTable
 from beamsplat.tools.system.supervisor import Supervisor
 from tests.common.polling import poll, wait_until
 from tests.common.tiles import tiles
+from tests.conftest import free_port
 from tests.services.page.webhook_receiver import Receiver
 
 OTHER_HOST = 12345
@@ -92,7 +93,7 @@ def start(tmp_path, free_endpoint, monkeypatch):
         def starter(**alerts):
             deployment = Deployment(
                 robot="edge", role="edge", router=RouterConfig(listen=(free_endpoint,)), state_dir=tmp_path,
-                nodes={"page": {"port": 0, "fleet": True, "alerts": alerts}},
+                nodes={"page": {"port": free_port(), "fleet": True, "alerts": alerts}},
             )  # fmt: skip
             supervisor = stack.enter_context(Supervisor(deployment))
             session = stack.enter_context(open_session((free_endpoint,)))
@@ -171,7 +172,12 @@ def test_alerts_of_a_robot_reach_the_webhook_once_each_and_survive_a_restart_of_
         wait_until(
             lambda: page.supervisor.poll() or page.board.reported().get("page") == (before, "active"), 60
         )
+        # What was published before it started is recovered: the map, and the pose of the odom frame.
+        wait_until(lambda: robot.report() or page.robots().get("robot1", {}).get("map"), 30)
         until(2)
+        with urllib.request.urlopen(f"{page.address}robots/robot1/events", timeout=10) as events:
+            pose = next(json.loads(line[5:]) for line in events if b'"x_m"' in line and b"source" in line)
+        assert pose["x_m"] == X_M["robot1"]
         assert told == [("robot1", "lost", "begin"), ("robot1", "lost", "end")]
         assert receiver.events[0]["id"] == receiver.events[1]["id"]
         # The robot falls silent: one alert about its link, none about its nodes.
