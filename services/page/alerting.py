@@ -83,11 +83,11 @@ class Alerting:
             state.with_records(read)
         with self._lock:
             events = self._book.update(found, known, now, now_unix_s)
-            state = self._book.state()
+            active = self._book.state()
         for event in events:
             self._tell(event)
         if events:
-            self._write(state)
+            self._write(active)
 
     def _run(self) -> None:
         while not self._ended.wait(_EVERY_S):
@@ -104,11 +104,11 @@ class Alerting:
         if self.webhook is not None:
             self.webhook.post(event.as_json())
 
-    def _write(self, state: list[dict[str, Any]]) -> None:
+    def _write(self, active: list[dict[str, Any]]) -> None:
         if self._file is None:
             return
         try:
-            write_atomically(self._file, json.dumps(state).encode())
+            write_atomically(self._file, json.dumps(active).encode())
         except OSError as error:  # a full disk is the subject of an alert, and must not end them
             if (more := self._write_limit.due("write")) is not None:
                 log.error("%s: not written (%s, %d more)", self._file, reason(error), more)
