@@ -17,6 +17,7 @@ from beamsplat.common.runtime.health import NodeRecord
 
 _ENDED = ("drained", "closed")  # a process that was stopped in order reports one of them last
 _TEXT_CHARS = 300
+_CRASHES, _CRASHES_S = 3, 60.0  # restarts within this time: the process crashes again and again
 _LATEST_UNIX_S = 4e9  # the year 2096
 _FORGET_S = 86400.0  # an alert about a robot of which nothing is known for so long is over
 
@@ -46,7 +47,7 @@ def conditions(
             found[AlertKey(robot, kind, node)] = text[:_TEXT_CHARS]
 
     heard = {name: record for name, record in records.items() if record.silent_s(now) is None}
-    for name, text in _failures(records, heard).items():
+    for name, text in _failures(records, heard, now).items():
         if not _is_on_unreachable_host(records[name], records, heard, own_clock_id):
             add("node_failed", name, text)
     if text := _link_fault(records, heard, own_clock_id):
@@ -62,14 +63,16 @@ def conditions(
     return found
 
 
-def _failures(records: Mapping[str, NodeRecord], heard: Collection[str]) -> dict[str, str]:
-    """Return the nodes that cannot run, or report nothing although nobody has stopped them."""
+def _failures(records: Mapping[str, NodeRecord], heard: Collection[str], now: float) -> dict[str, str]:
+    """Return the nodes that cannot run, end again and again, or are silent although nobody stopped them."""
     found = {}
     for name, record in records.items():
         if record.health.state == "failed":
             found[name] = f"{name} cannot run: {record.health.detail}"
         elif name not in heard and record.health.state not in _ENDED:
             found[name] = f"{name} reports nothing; its last state was {record.health.state}"
+        elif (restarts := sum(now - at < _CRASHES_S for at in record.restarts_s)) >= _CRASHES:
+            found[name] = f"{name} was restarted {restarts} times in the last {_CRASHES_S:.0f} s"
     return found
 
 

@@ -16,6 +16,7 @@ from beamsplat.common.topics import TOPICS
 STALE_S = 3.0  # nodes report at 1 Hz: after three missing reports a node is shown as silent
 _WINDOW_S = 5.0  # rates are averages over this time
 _MAX_HISTORY = 50  # reports kept per node, in case it sends more than it should
+_MAX_RESTARTS = 16  # whose times are kept per node
 _MAX_NODES = 1000  # of all robots; names beyond that are ignored, since anybody can send them
 _FORGET_S = 60.0  # a silent node makes room for another one after this time
 
@@ -34,6 +35,7 @@ class NodeRecord:
     earlier_results: Counter[str] = field(default_factory=Counter)
     refused: int = 0  # reports of other processes, which are not accepted as this node
     history: deque[tuple[float, Health]] = field(default_factory=lambda: deque(maxlen=_MAX_HISTORY))
+    restarts_s: deque[float] = field(default_factory=lambda: deque(maxlen=_MAX_RESTARTS))  # their times
 
     def silent_s(self, now: float) -> float | None:
         """Return the time in s from the last report to `now`, or None if this time is at most `STALE_S`.
@@ -203,6 +205,7 @@ class HealthRecords:
         if record.health.instance != health.instance:
             record.history.clear()
             record.starts += 1
+            record.restarts_s.append(now)
         record.health, record.received_s = health, now
         record.history.append((now, health))
         while now - record.history[0][0] > _WINDOW_S:

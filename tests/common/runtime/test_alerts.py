@@ -6,6 +6,7 @@ from beamsplat.common.config.alerts import AlertConfig
 from beamsplat.common.config.base import parse
 from beamsplat.common.errors import UserError
 from beamsplat.common.messages import Health, NodeFigure
+from beamsplat.common.messages.instances import process_of
 from beamsplat.common.runtime.alerts import AlertBook, AlertKey, conditions
 from beamsplat.common.runtime.health import STALE_S, HealthRecords
 
@@ -48,6 +49,19 @@ def test_a_node_that_crashed_or_cannot_run_has_failed_and_a_stopped_one_has_not(
     assert found(report("depth", state="drained"), now=later) == {}
     failed = found(report("depth", state="failed", detail="no such model"))
     assert failed == {("node_failed", "depth"): "depth cannot run: no such model"}
+
+
+def test_a_node_that_crashes_again_and_again_has_failed_although_it_reports_between():
+    book = HealthRecords()
+    for second in range(100):
+        process = process_of(b"seed", "depth", min(second // 5, 4) + 1)  # restarted at 5, 10, 15 and 20 s
+        health = report("depth").model_copy(update={"instance": process.instance, "epoch": process.epoch})
+        book.add(health, float(second))
+        seen = conditions("r1", book.records, HERE, RULES, float(second))
+        # Three of the restarts are within the last minute until 70 s.
+        expected = [("node_failed", "depth")] if 15 <= second < 70 else []
+        assert [key[1:] for key in seen] == expected, second
+    assert book.records["depth"].starts == 5
 
 
 def test_the_uplink_says_that_its_link_is_down():
