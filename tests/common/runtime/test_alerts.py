@@ -154,8 +154,8 @@ def test_after_a_restart_an_active_alert_is_not_sent_again_and_ends_once_the_rob
     after = AlertBook(RULES)
     after.restore(before.book.state(), 100.0, 1e9 + 20)
     assert after.alerts()[0].since_s == pytest.approx(80.0)
-    assert after.update({KEY: "still lost"}, {"r1"}, 101.0, 1e9 + 21) == []
-    assert after.update({}, set(), 200.0, 1e9 + 120) == [], "nothing is known of the robot yet"
+    assert after.update({}, set(), 101.0, 1e9 + 21) == [], "nothing is known of the robot yet"
+    assert after.update({KEY: "still lost"}, {"r1"}, 200.0, 1e9 + 120) == []
     assert after.update({}, {"r1"}, 300.0, 1e9 + 220) == []
     assert [e.state for e in after.update({}, {"r1"}, 306.0, 1e9 + 226)] == ["end"]
 
