@@ -19,6 +19,7 @@ from beamsplat.tools.cli import bench_endurance as endurance_cli
 from beamsplat.tools.cli import bench_mapping as mapping_cli
 from beamsplat.tools.cli import bug_report, demo, doctor, warm
 from beamsplat.tools.cli import calibrate as calibrate_cli
+from beamsplat.tools.cli import compare as compare_cli
 from beamsplat.tools.cli import depth as depth_cli
 from beamsplat.tools.cli import export as formats_cli
 from beamsplat.tools.cli import info as replay_cli
@@ -54,7 +55,9 @@ app.add_typer(swap_cli.app, name="params", rich_help_panel=_SYSTEM)
 for command in (simulator_cli.simulate, replay_cli.info, replay_cli.rig):
     app.command(rich_help_panel=_DATA)(command)
 app.add_typer(calibrate_cli.app, name="calibrate", rich_help_panel=_DATA)
-for command in (localization_cli.slam, depth_cli.depth, formats_cli.export, formats_cli.render):
+for command in (
+    localization_cli.slam, depth_cli.depth, formats_cli.export, formats_cli.render, compare_cli.compare,
+):  # fmt: skip
     app.command(rich_help_panel=_RESULTS)(command)
 
 app.add_typer(session_cli.app, name="session", rich_help_panel=_RESULTS)
@@ -63,6 +66,7 @@ evaluate = typer.Typer(no_args_is_help=True, help="Errors against truth.")
 evaluate.command("slam")(localization_cli.eval_slam)
 evaluate.command("relocalize")(eval_relocalize)
 evaluate.command("depth")(depth_cli.eval_depth)
+evaluate.command("compare")(compare_cli.eval_compare)
 app.add_typer(evaluate, name="eval", rich_help_panel=_RESULTS)
 
 for command in (setup_cli.setup, doctor.doctor, bug_report.bug_report, warm.warm):

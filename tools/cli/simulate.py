@@ -68,6 +68,20 @@ def simulate(
     ] = 0,
     carts: Annotated[int, typer.Option(min=0, max=3, help="Number of rolling carts.")] = 0,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the home, the route and the noise.")] = 0,
+    drive: Annotated[
+        int,
+        typer.Option(
+            min=0, max=1000, help="Number of the drive in the same home: another start, other noise."
+        ),
+    ] = 0,
+    moved: Annotated[
+        int, typer.Option(min=0, max=20, help="Pieces of furniture moved since drives without this option.")
+    ] = 0,
+    removed: Annotated[int, typer.Option(min=0, max=20, help="Pieces removed, likewise.")] = 0,
+    added: Annotated[int, typer.Option(min=0, max=20, help="Pieces added, likewise.")] = 0,
+    changes_seed: Annotated[
+        int, typer.Option(min=0, help="Seed that selects the pieces moved, removed and added.")
+    ] = 0,
     size: Annotated[
         str,
         typer.Option(help="Image size in pixels (default 640x480); office: size in metres (default 120x80)."),
@@ -139,8 +153,9 @@ def simulate(
     """Simulate a robot that drives through a generated home, and record it with exact ground truth.
 
     The folder contains bag/ (ROS 2, MCAP) without ground truth, and beside it groundtruth.txt, camera.json,
-    depth_gt/, moving_masks/, beams.npz, extra_views/ and gt_surface.ply. Worlds and images are cached in
-    $BEAMSPLAT_CACHE (default ~/.cache/beamsplat) and reused.
+    depth_gt/, moving_masks/, beams.npz, extra_views/ and gt_surface.ply; with --moved, --removed or --added
+    also changes.json, the boxes of the changed furniture in the frame of groundtruth.txt. Worlds and images
+    are cached in $BEAMSPLAT_CACHE (default ~/.cache/beamsplat) and reused.
 
     Examples:
 
@@ -156,9 +171,15 @@ def simulate(
 
     beamsplat simulate --out tb4 --robot turtlebot4 --lidar-only
 
+    beamsplat simulate --out tuesday --seed 7 --drive 1 --moved 5
+
     beamsplat simulate --out faulty --clock-offset-ms 40 --extrinsic-yaw-deg 2 --distortion=-0.12,0.03,0,0,0
     """
     preset = _preset(robot, size if site == "home" else "", distortion)
+    if moved + removed + added and (site != "home" or scene is not None):
+        raise typer.BadParameter(
+            "changes a generated home: leave out --site and --scene", param_hint="--moved, --removed, --added"
+        )
     if site == "office":
         if not lidar_only:
             raise typer.BadParameter("an office has no camera: add --lidar-only", param_hint="--site")
@@ -183,6 +204,7 @@ def simulate(
     if movers > 6:
         raise typer.BadParameter("a home has room for at most 6 people", param_hint="--movers")
     from beamsplat.tools.simulator import recording
+    from beamsplat.tools.simulator.changes import Rearrangement
     from beamsplat.tools.simulator.settings import CameraSettings, Faults, LidarSettings, SimulationSettings
 
     width, height = _size(size or "640x480", 32, 4096, "pixels")
@@ -193,6 +215,10 @@ def simulate(
     )
     settings = SimulationSettings(
         seed=seed,
+        drive=drive,
+        rearrangement=(
+            Rearrangement(moved, removed, added, changes_seed) if moved + removed + added else None
+        ),
         seconds=seconds,
         laps=laps,
         people=movers,

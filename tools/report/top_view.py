@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 
@@ -17,12 +20,24 @@ _MIN_OPACITY_LOGIT = -2.0  # fainter Gaussians do not extend the image
 _WHITE = np.ones(3, np.float32)
 
 
+@dataclass(frozen=True)
+class LabelledBox:
+    """A rectangle with a label on the view from above; corners (x, y) in metres, colour BGR."""
+
+    low_m: tuple[float, float]
+    high_m: tuple[float, float]
+    label: str
+    bgr: tuple[int, int, int]
+
+
 def top_view(
     params: np.ndarray,  # float32 [14, N] in a frame whose z points up
     path_m: np.ndarray | None = None,  # [K, >= 2] drawn on it
     *,
     ceiling_m: float = 1.8,  # Gaussians above this height are left out
     metres_per_px: float = 0.015,
+    corners_m: np.ndarray | None = None,  # [2, 2], lower and upper corner (x, y); default: around the map
+    boxes: Sequence[LabelledBox] = (),  # drawn on it
 ) -> np.ndarray | None:
     """Return the map from above, BGR uint8 [H, W, 3], x to the right, y up; None if nothing is visible."""
     solid = (
@@ -32,7 +47,7 @@ def top_view(
         return None
     store = GaussianArrays(int(solid.sum()))
     store.append(params[:, solid])
-    low, high = _extent(params[MEAN : MEAN + 2, solid])
+    low, high = extent(params[MEAN : MEAN + 2, solid]) if corners_m is None else corners_m
     scale = max(metres_per_px, float((high - low).max()) / _MAX_SIDE_PX)
     width, height = (int(np.ceil(v / scale)) for v in high - low)
     centre = (low + high) / 2
@@ -47,16 +62,24 @@ def top_view(
     bgr = cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)
     rasterizer.release(render)
     rasterizer.close()
+
+    def pixels(xy_m: np.ndarray) -> np.ndarray:
+        x = (xy_m[:, 0] - centre[0]) / scale + (width - 1) / 2
+        y = (centre[1] - xy_m[:, 1]) / scale + (height - 1) / 2
+        return np.round(np.stack([x, y], axis=1)).astype(np.int32)
+
     if path_m is not None and len(path_m):
-        x = (path_m[:, 0] - centre[0]) / scale + (width - 1) / 2
-        y = (centre[1] - path_m[:, 1]) / scale + (height - 1) / 2
-        line = np.round(np.stack([x, y], axis=1)).astype(np.int32)
-        cv2.polylines(bgr, [line], False, (40, 40, 220), 2, cv2.LINE_AA)
+        cv2.polylines(bgr, [pixels(path_m)], False, (40, 40, 220), 2, cv2.LINE_AA)
+    for box in boxes:
+        first, last = pixels(np.array([box.low_m, box.high_m], dtype=np.float64)).tolist()
+        cv2.rectangle(bgr, first, last, box.bgr, 2)
+        at = (min(first[0], last[0]) + 3, max(first[1], last[1]) - 4)
+        cv2.putText(bgr, box.label, at, cv2.FONT_HERSHEY_SIMPLEX, 0.5, box.bgr, 2, cv2.LINE_AA)
     _scale_bar(bgr, scale)
     return bgr
 
 
-def _extent(xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def extent(xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the lower and the upper corner float64 [2] in m of a rectangle around points xy [2, N].
 
     It contains 99 % of the points per axis, plus a margin: a few outliers must not shrink the rest.

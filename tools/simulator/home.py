@@ -6,9 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from beamsplat.tools.simulator.changes import ObjectChange, Rearrangement
 from beamsplat.tools.simulator.mesh import Light, Material, MeshBuilder, SceneMesh
 from beamsplat.tools.simulator.palette import Textures, home_textures
 from beamsplat.tools.simulator.place import Room, WallOpening
+from beamsplat.tools.simulator.rearrange import rearrange
 from beamsplat.tools.simulator.rooms import furnish
 from beamsplat.tools.simulator.shapes import box
 from beamsplat.tools.simulator.walls import HALF_WALL_M, RoomFinish, draw_shell
@@ -24,10 +26,17 @@ class Home:
     textures: Textures
     lights: tuple[Light, ...]
     route_m: np.ndarray
+    changes: tuple[ObjectChange, ...] = ()  # what differs from the home of the same seed
 
 
-def build_home(seed: int) -> Home:
-    """Return the home generated from `seed`; the same seed yields bit-identical arrays."""
+def build_home(seed: int, rearrangement: Rearrangement | None = None) -> Home:
+    """Return the home generated from `seed`; the same seed yields bit-identical arrays.
+
+    With a rearrangement, some furniture is moved, removed or added; the rest is bit-identical.
+
+    Raises:
+        ValueError: the rearrangement asks for more than the home offers.
+    """
     rng = np.random.default_rng([seed, 0x48])
     textures = home_textures(np.random.default_rng([seed, 0x54]))
     builder = MeshBuilder({name: size for name, (_, size) in textures.items()})
@@ -35,10 +44,12 @@ def build_home(seed: int) -> Home:
     finishes = _finishes(rng, rooms)
     for room in rooms:
         draw_shell(builder, room, finishes[room.name], rng)
-    for room in rooms:
-        furnish(builder, room, route, ROUTE_CLEARANCE_M, rng)
+    pieces = [piece for room in rooms for piece in furnish(builder, room, route, ROUTE_CLEARANCE_M, rng)]
     _terrace(builder, rooms)
-    return Home(builder.build(), textures, builder.lights, route)
+    changes: tuple[ObjectChange, ...] = ()
+    if rearrangement is not None:
+        changes = rearrange(builder, pieces, route, ROUTE_CLEARANCE_M, rearrangement)
+    return Home(builder.build(), textures, builder.lights, route, changes)
 
 
 def floor_plan(rng: np.random.Generator) -> tuple[list[Room], np.ndarray]:

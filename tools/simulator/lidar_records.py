@@ -78,7 +78,7 @@ def lidar_records(
     progress: Callable[[int], None],
 ) -> Iterator[w.BagRecord]:
     """Yield scans, odometry and tf in order of receipt; append their ground truth to `log`."""
-    rng = np.random.default_rng([settings.seed, 0x4A, 2])
+    rng = np.random.default_rng([settings.drive_seed, 0x4A, 2])
     layout = settings.layout
     period_ns, sweep_ns = round(1e9 / settings.lidar.rate_hz), round(1e9 * settings.lidar.scan_time_s)
     waiting: list[tuple[int, int, w.BagRecord]] = []

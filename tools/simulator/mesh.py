@@ -82,11 +82,18 @@ class Light:
 class _MeshBuffers:
     """Surfaces and lights of one mesh, shared by all builders that `placed` and `tilted` derive."""
 
-    lights: list[Light] = field(default_factory=list)
-    pieces: list[tuple[np.ndarray, ...]] = field(default_factory=list)
+    lights: list[Light | None] = field(default_factory=list)  # None = removed
+    # Vertices, normals, bake points, uvs, triangles, material of each triangle; None = removed.
+    pieces: list[tuple[np.ndarray, ...] | None] = field(default_factory=list)
     materials: dict[Material, int] = field(default_factory=dict)
-    vertices: int = 0
-    surfaces: int = 0
+
+
+@dataclass(frozen=True)
+class MeshPart:
+    """Surfaces and lights of a mesh builder, drawn one after the other: a piece of furniture, for example."""
+
+    surfaces: range
+    lights: range
 
 
 class MeshBuilder:
@@ -153,13 +160,10 @@ class MeshBuilder:
                 normals @ self._R.T,
                 bake @ self._R.T + self._t,
                 uvs,
-                triangles + store.vertices,
+                triangles,
                 np.full(len(triangles), number),
-                np.full(len(triangles), store.surfaces),
             )
         )
-        store.vertices += len(vertices)
-        store.surfaces += 1
 
     def quad(
         self,
@@ -198,7 +202,7 @@ class MeshBuilder:
         if not fit:
             size = self.texture_size_m[material.texture]
             metres = np.hstack([t * height, s * width]) if turn else np.hstack([s * width, t * height])
-            k = self._buffers.surfaces
+            k = len(self._buffers.pieces)
             shift = (k * 0.6180339 % 1.0, k * 0.7548776 % 1.0) if offset is None else offset
             uv = metres / np.array(size) + np.array(shift)
         self.add(
@@ -235,13 +239,49 @@ class MeshBuilder:
 
     @property
     def lights(self) -> tuple[Light, ...]:
-        """All lights added until now, in the frame of the mesh."""
-        return tuple(self._buffers.lights)
+        """All lights added until now and not removed, in the frame of the mesh."""
+        return tuple(light for light in self._buffers.lights if light is not None)
+
+    def part_from(self, before: MeshPart | None = None) -> MeshPart:
+        """Return the part that was added since `before` was returned; None = since the start."""
+        first = (0, 0) if before is None else (before.surfaces.stop, before.lights.stop)
+        store = self._buffers
+        return MeshPart(range(first[0], len(store.pieces)), range(first[1], len(store.lights)))
+
+    def vertices_of(self, part: MeshPart) -> np.ndarray:
+        """Return the vertices of a part that was not removed, float64 [V, 3] in metres in the mesh frame."""
+        pieces = (self._buffers.pieces[k] for k in part.surfaces)
+        return np.concatenate([piece[0] for piece in pieces if piece is not None])
+
+    def move(self, part: MeshPart, T_new_old: np.ndarray) -> None:
+        """Apply a rigid transform [4, 4] in the mesh frame to a part; its look stays the same."""
+        R, t, store = T_new_old[:3, :3], T_new_old[:3, 3], self._buffers
+        for k in part.surfaces:
+            piece = store.pieces[k]
+            if piece is not None:
+                vertices, normals, bake, *rest = piece
+                store.pieces[k] = (vertices @ R.T + t, normals @ R.T, bake @ R.T + t, *rest)
+        for k in part.lights:
+            light = store.lights[k]
+            if light is not None:
+                centre, right, up = (R @ np.array(v) for v in (light.centre_m, light.right_m, light.up_m))
+                at = [tuple(v.tolist()) for v in (centre + t, right, up)]
+                store.lights[k] = replace(light, centre_m=at[0], right_m=at[1], up_m=at[2])
+
+    def remove(self, part: MeshPart) -> None:
+        """Remove the surfaces and lights of a part."""
+        for k in part.surfaces:
+            self._buffers.pieces[k] = None
+        for k in part.lights:
+            self._buffers.lights[k] = None
 
     def build(self) -> SceneMesh:
-        """Return the mesh of all surfaces added until now."""
-        columns = [np.concatenate(column) for column in zip(*self._buffers.pieces)]
-        vertices, normals, bake, uvs, triangles, material, surface = columns
+        """Return the mesh of all surfaces added until now and not removed."""
+        pieces = [piece for piece in self._buffers.pieces if piece is not None]
+        vertices, normals, bake, uvs, _, material = (np.concatenate(column) for column in zip(*pieces))
+        first = np.cumsum([0, *(len(piece[0]) for piece in pieces)])
+        triangles = np.concatenate([piece[4] + offset for piece, offset in zip(pieces, first)])
+        surface = np.repeat(np.arange(len(pieces)), [len(piece[4]) for piece in pieces])
         return SceneMesh(
             vertices.astype(np.float32),
             normals.astype(np.float32),

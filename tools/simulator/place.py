@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from beamsplat.tools.simulator.furniture import FurniturePiece
+from beamsplat.tools.simulator.mesh import MeshPart
 
 SIDES = ("south", "east", "north", "west")
 YAW = {"south": np.pi, "east": -np.pi / 2, "north": 0.0, "west": np.pi / 2}
@@ -83,6 +84,8 @@ class FurniturePlacer:
         self.room = room
         self.rng = rng
         self.clearance_m = clearance_m
+        # Pieces that were drawn, with their placement and their surfaces in the mesh builder.
+        self.drawn: list[tuple[FurniturePiece, Placement, MeshPart]] = []
         near = (
             (route_m[:, 0] > room.x0 - 1.0)
             & (route_m[:, 0] < room.x1 + 1.0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import numpy as np
 from beamsplat.tools.simulator import store
 from beamsplat.tools.simulator import writer as w
 from beamsplat.tools.simulator.actors import ActorPath, choose_actor_paths
+from beamsplat.tools.simulator.changes import changes_json
 from beamsplat.tools.simulator.clearance_grid import ClearanceGrid
 from beamsplat.tools.simulator.drive_log import simulate_lidar
 from beamsplat.tools.simulator.frames import (
@@ -56,12 +58,14 @@ def simulate(
     if out.exists() and not replace:
         raise FileExistsError(f"{out} exists: choose another folder, or replace this one with --force")
     progress("preparing the scene (first time: about half a minute)", 0, 0)
-    world = get_world(settings.seed, settings.scene, lambda stage: progress(stage, 0, 0))
-    drive = DrivePath(world.route_m, MotionLimits(), start=lap_start(settings.seed))
+    world = get_world(
+        settings.seed, settings.scene, lambda stage: progress(stage, 0, 0), settings.rearrangement
+    )
+    drive = DrivePath(world.route_m, MotionLimits(), start=lap_start(settings.drive_seed))
     duration = _duration(settings, drive)
     caster = RayCaster.of(world.mesh)
     space = ClearanceGrid(world.mesh, caster)
-    rng = np.random.default_rng([settings.seed, 0x4D])
+    rng = np.random.default_rng([settings.drive_seed, 0x4D])
     actor_paths = choose_actor_paths(space, drive, caster, settings.people + settings.carts, duration, rng)
     with store.atomic_folder(out, replace=replace) as folder:
         streams: list[Iterator[w.BagRecord]] = [transforms(settings, duration)]
@@ -78,14 +82,14 @@ def simulate(
             views = _write_views(folder, settings, spec, space, unique, paths, progress)
             streams.append(_images(settings, times, [path_of[t] for t in in_lap]))
         log = TruthLog()
-        actors = build_actors(world, tuple(actor_paths), settings.people, settings.seed)
+        actors = build_actors(world, tuple(actor_paths), settings.people, settings.drive_seed)
         steps = simulate_lidar(
             world.mesh,
             caster,
             drive,
             settings.lidar,
             settings.wheels,
-            seed=settings.seed,
+            seed=settings.drive_seed,
             duration_s=duration,
             actors=actors,
         )
@@ -94,6 +98,8 @@ def simulate(
         camera = not settings.lidar_only
         messages = w.write_bag(folder / "bag", streams, settings.layout, camera=camera)
         write_lidar_truth(folder, settings, log)
+        if settings.rearrangement is not None:
+            (folder / "changes.json").write_text(json.dumps(changes_json(world.changes), indent=1) + "\n")
     metres = drive.length_m * duration / drive.lap_s
     return RecordingSummary(
         duration, duration / drive.lap_s, metres, images, len(log.scan_stamps_ns), messages, views
@@ -109,10 +115,10 @@ def _duration(settings: SimulationSettings, drive: DrivePath) -> float:
 
 def frame_spec(settings: SimulationSettings, actor_paths: list[ActorPath]) -> FrameSpec:
     """Return the inputs that determine the frames of a recording; its world must already be in the cache."""
-    name = f"{world_key(settings.seed, settings.scene)}.npz"
+    name = f"{world_key(settings.seed, settings.scene, settings.rearrangement)}.npz"
     return FrameSpec(
         str(store.cache_root() / "worlds" / name),
-        settings.seed,
+        settings.drive_seed,
         settings.camera,
         tuple(actor_paths),
         settings.people,
@@ -137,7 +143,7 @@ def _stamp(settings: SimulationSettings, time_s: float) -> int:
 
 
 def _images(settings: SimulationSettings, times_s: list[float], paths: list[Path]) -> Iterator[w.BagRecord]:
-    rng = np.random.default_rng([settings.seed, 0x4A, 1])
+    rng = np.random.default_rng([settings.drive_seed, 0x4A, 1])
     layout, received = settings.layout, 0
     for time_s, path in zip(times_s, paths):
         stamp = _stamp(settings, time_s)
@@ -187,7 +193,7 @@ def _write_views(
         settings.camera.K,
         settings.camera.distortion,
     )
-    rng = np.random.default_rng([settings.seed, 0x56])
+    rng = np.random.default_rng([settings.drive_seed, 0x56])
     count = write_extra_views(
         folder / "extra_views",
         frame_renderer,

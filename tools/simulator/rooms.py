@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from beamsplat.tools.simulator import furniture as f
@@ -9,16 +11,26 @@ from beamsplat.tools.simulator import furniture_kitchen as fk
 from beamsplat.tools.simulator import furniture_rooms as fr
 from beamsplat.tools.simulator import furniture_small as fs
 from beamsplat.tools.simulator.furniture import FurniturePiece
-from beamsplat.tools.simulator.mesh import Material, MeshBuilder
+from beamsplat.tools.simulator.mesh import Material, MeshBuilder, MeshPart
 from beamsplat.tools.simulator.place import SIDES, YAW, FurniturePlacer, Placement, Room
 from beamsplat.tools.simulator.shapes import box
 from beamsplat.tools.simulator.walls import CEILING_M
 
 
+@dataclass(frozen=True)
+class PlacedPiece:
+    """A piece of furniture in a home: its room, its placement, and its surfaces in the mesh builder."""
+
+    room: Room
+    piece: FurniturePiece
+    spot: Placement
+    part: MeshPart
+
+
 def furnish(
     b: MeshBuilder, room: Room, route_m: np.ndarray, clearance_m: float, rng: np.random.Generator
-) -> None:
-    """Draw the furniture, lamps, radiators and wall decoration of one room into `b`.
+) -> list[PlacedPiece]:
+    """Draw the furniture, lamps, radiators and wall decoration of one room into `b`; return the furniture.
 
     A piece for which no free placement is found is not drawn. Furniture is at least `clearance_m` from the
     route [N, 2].
@@ -35,6 +47,20 @@ def furnish(
     fr.ceiling_lamp(b.placed(*centre, CEILING_M), 0.35)
     _radiators(b, room)
     _hang(b, room, rng)
+    return [PlacedPiece(room, *drawn) for drawn in placer.drawn]
+
+
+def draw_piece(
+    b: MeshBuilder,
+    placer: FurniturePlacer,
+    piece: FurniturePiece,
+    spot: Placement,
+    rng: np.random.Generator,
+) -> None:
+    """Draw a piece at a placement that `placer` has found, and record it in `placer.drawn`."""
+    before = b.part_from()
+    piece.draw(b.placed(spot.x_m, spot.y_m, 0.0, spot.yaw_rad), rng)
+    placer.drawn.append((piece, spot, b.part_from(before)))
 
 
 def _wall_piece(
@@ -42,7 +68,7 @@ def _wall_piece(
 ) -> Placement | None:
     spot = placer.at_wall(piece)
     if spot is not None:
-        piece.draw(b.placed(spot.x_m, spot.y_m, 0.0, spot.yaw_rad), rng)
+        draw_piece(b, placer, piece, spot, rng)
     return spot
 
 
@@ -51,7 +77,7 @@ def _inside_piece(
 ) -> Placement | None:
     spot = placer.inside(piece)
     if spot is not None:
-        piece.draw(b.placed(spot.x_m, spot.y_m, 0.0, spot.yaw_rad), rng)
+        draw_piece(b, placer, piece, spot, rng)
     return spot
 
 
@@ -128,7 +154,7 @@ def _beside(
         cos, sin = np.cos(spot.yaw_rad), np.sin(spot.yaw_rad)
         place = Placement(spot.x_m + cos * dx - sin * dy, spot.y_m + sin * dx + cos * dy, spot.yaw_rad)
         if placer.at(place, small):
-            small.draw(b.placed(place.x_m, place.y_m, 0.0, place.yaw_rad), rng)
+            draw_piece(b, placer, small, place, rng)
 
 
 def _study(b: MeshBuilder, placer: FurniturePlacer, rng: np.random.Generator) -> None:
@@ -159,7 +185,10 @@ def _radiators(b: MeshBuilder, room: Room) -> None:
             for k in range(count):
                 x = hole.s0 + 0.1 + (k + 0.5) * width / count
                 box(at, (x, -0.09, 0.14), (0.05, 0.08, 0.52), f.LACQUER)
-            box(at, ((hole.s0 + hole.s1) / 2, -0.09, 0.2), (width, 0.03, 0.04), f.LACQUER)
+            middle = (hole.s0 + hole.s1) / 2
+            box(at, (middle, -0.09, 0.2), (width, 0.03, 0.04), f.LACQUER)
+            x, y = zip(room.to_house(side, hole.s0, 0.0), room.to_house(side, hole.s1, 0.13))
+            room.taken.append((min(x), min(y), max(x), max(y), 0.66))
 
 
 def _hang(b: MeshBuilder, room: Room, rng: np.random.Generator) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 from beamsplat.common.geometry.frames import camera_mount, lidar_mount
 from beamsplat.common.geometry.transforms import make_transform, so3_exp
 from beamsplat.tools.simulator.bag_layout import BagLayout
+from beamsplat.tools.simulator.changes import Rearrangement
 from beamsplat.tools.simulator.lidar_drivers import IDEAL, RosLidarDriver
 
 START_NS = 1_767_225_600_000_000_000  # stamp at time 0: 2026-01-01 00:00 UTC, an arbitrary fixed date
@@ -146,6 +147,8 @@ class SimulationSettings:
     """Settings of one recording."""
 
     seed: int = 0
+    drive: int = 0  # number of the drive: another start of the lap, other noise and actors in the same home
+    rearrangement: Rearrangement | None = None  # furniture that differs from the home of `seed`
     seconds: float | None = None  # duration; None: all `laps`; with `laps`: the shorter of both
     laps: int | None = None  # number of laps; None: until `seconds`, or one lap if both are None
     people: int = 0
@@ -161,3 +164,8 @@ class SimulationSettings:
     driver: RosLidarDriver = IDEAL
     layout: BagLayout = field(default_factory=BagLayout)
     truth_every: int = 8  # every n-th image has a ground-truth depth map
+
+    @property
+    def drive_seed(self) -> int:
+        """Seed of all that differs between drives through one home; that of the home for drive 0."""
+        return self.seed + 1_000_003 * self.drive

@@ -12,6 +12,7 @@ import numpy as np
 
 from beamsplat.tools.simulator import store
 from beamsplat.tools.simulator.atlas import Atlas, build_atlas
+from beamsplat.tools.simulator.changes import ObjectChange, Rearrangement
 from beamsplat.tools.simulator.clearance_grid import ClearanceGrid
 from beamsplat.tools.simulator.glb import load_glb
 from beamsplat.tools.simulator.home import build_home
@@ -36,6 +37,7 @@ class World:
     light: np.ndarray  # float32 [V, 3], irradiance / pi as `light.bake` returns
     lights: tuple[Light, ...]
     route_m: np.ndarray
+    changes: tuple[ObjectChange, ...] = ()  # what a rearrangement has changed in the home
 
     @property
     def texture_size_m(self) -> dict[str, tuple[float, float]]:
@@ -43,42 +45,60 @@ class World:
         return {name: (float(w), float(h)) for name, (w, h) in zip(self.atlas.names, self.atlas.size_m)}
 
 
-def world_key(seed: int, scene: str | None) -> str:
-    """Return the cache key of the world of a seed, and of a scene file if there is one."""
-    return store.key("world", seed, store.file_hash(Path(scene)) if scene else None)
+def world_key(seed: int, scene: str | None, rearrangement: Rearrangement | None = None) -> str:
+    """Return the cache key of the world of a seed, and of a scene file or a rearrangement if there is one."""
+    parts = [] if rearrangement is None else [rearrangement]
+    return store.key("world", seed, store.file_hash(Path(scene)) if scene else None, *parts)
 
 
-def get_world(seed: int, scene: str | None, report: Report = lambda _: None) -> World:
+def get_world(
+    seed: int,
+    scene: str | None,
+    report: Report = lambda _: None,
+    rearrangement: Rearrangement | None = None,
+) -> World:
     """Return a world from the cache; if it is not there, build and store it first (tens of seconds).
 
     Args:
         seed: seed of the generated home, or of the route through the scene file.
         scene: path of a 3D scene file; None = a generated home.
         report: called with the name of each stage of the build.
+        rearrangement: furniture that is moved, removed and added in the generated home.
 
     Raises:
-        ValueError: the scene file cannot be used, or no route is clear of obstacles.
+        ValueError: the scene file cannot be used, no route is clear of obstacles, or a scene file or a home
+            cannot be rearranged so.
     """
-    path = store.cache_root() / "worlds" / f"{world_key(seed, scene)}.npz"
+    path = store.cache_root() / "worlds" / f"{world_key(seed, scene, rearrangement)}.npz"
     if not path.exists():
-        world = build_world(seed, scene, report)
+        world = build_world(seed, scene, report, rearrangement)
         with store.atomic_file(path) as part, open(part, "wb") as out:
             _save(world, out)
     return load_world(path)
 
 
-def build_world(seed: int, scene: str | None, report: Report = lambda _: None) -> World:
+def build_world(
+    seed: int,
+    scene: str | None,
+    report: Report = lambda _: None,
+    rearrangement: Rearrangement | None = None,
+) -> World:
     """Return a new world: generate or load the geometry, find a route, compute the light.
 
     The arguments are the same as of `get_world`; the cache is not used.
 
     Raises:
-        ValueError: the scene file cannot be used, or there is no route clear of obstacles.
+        ValueError: the scene file cannot be used, there is no route clear of obstacles, or the home cannot be
+            rearranged so.
     """
+    if scene is not None and rearrangement is not None:
+        raise ValueError("--moved, --removed and --added change a generated home: leave out --scene")
+    changes: tuple[ObjectChange, ...] = ()
     rng = np.random.default_rng([seed, 0x57])
     if scene is None:
         report("furnishing the home")
-        home = build_home(seed)
+        home = build_home(seed, rearrangement)
+        changes = home.changes
         mesh, textures, lights, hint = home.mesh, home.textures, home.lights, home.route_m
     else:
         report(f"loading {scene}")
@@ -99,7 +119,7 @@ def build_world(seed: int, scene: str | None, report: Report = lambda _: None) -
         )
     atlas = build_atlas({**textures, **clothes(np.random.default_rng([seed, 0x43]))})
     report("baking light")
-    return World(mesh, atlas, bake(mesh, atlas, lights, caster), lights, route)
+    return World(mesh, atlas, bake(mesh, atlas, lights, caster), lights, route, changes)
 
 
 def _lamps(route_m: np.ndarray) -> tuple[Light, ...]:
@@ -117,6 +137,7 @@ def _save(world: World, out: BinaryIO) -> None:
         "materials": [asdict(m) for m in mesh.materials],
         "lights": [asdict(light) for light in world.lights],
         "names": list(atlas.names),
+        "changes": [asdict(change) for change in world.changes],
     }
     arrays = {f"mesh_{k}": getattr(mesh, k) for k in _MESH}
     arrays |= {f"atlas_{k}": getattr(atlas, k) for k in _ATLAS}
@@ -145,4 +166,5 @@ def load_world(path: Path) -> World:
         lights = tuple(Light(**_with_tuples(light)) for light in head["lights"])
         mesh = SceneMesh(**{k: data[f"mesh_{k}"] for k in _MESH}, materials=materials)
         atlas = Atlas(tuple(head["names"]), **{k: data[f"atlas_{k}"] for k in _ATLAS})
-        return World(mesh, atlas, data["light"], lights, data["route_m"])
+        changes = tuple(ObjectChange(**_with_tuples(change)) for change in head["changes"])
+        return World(mesh, atlas, data["light"], lights, data["route_m"], changes)

@@ -19,7 +19,7 @@ _MARGIN_CELLS = 64  # the edges of a whole grid are at multiples of this many ce
 _BAND_CELLS = 12_000_000  # a whole grid is drawn in bands of rows: 60 MB of sums at a time
 # Log odds in half units: a hit is +1.5, a miss -0.5. One hit outweighs three misses, because beams pass walls
 # at grazing angles.
-_HIT, _MISS = 3, -1
+HIT, MISS = 3, -1
 _LIMIT = 12  # of the sum: log odds of 6
 
 
@@ -112,7 +112,7 @@ def add_counts(
             if 0 <= i < hits.shape[0] and 0 <= j < hits.shape[1]:
                 h, m = hits[i, j], misses[i, j]
                 if h > 0 or m > 0:
-                    score[r, q] += _HIT * np.int32(h) + _MISS * np.int32(m)
+                    score[r, q] += HIT * np.int32(h) + MISS * np.int32(m)
                     known[r, q] = True
 
 

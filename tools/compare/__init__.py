@@ -1,0 +1,1 @@
+"""Compare two sessions of one place: what appeared and what vanished, with evidence."""
