@@ -28,6 +28,7 @@ _SUBMAP_POINTS = 3_000
 _BEND_SIGMA_M, _BEND_SIGMA_RAD = 0.03, math.radians(0.4)
 _INLIER_M = 0.05  # a return of b on a surface of a; three times `range_sigma_m`
 MIN_INLIER_RATIO = 0.5  # of the returns of b, in a place where furniture has moved
+_MIN_AGREEING = 1 / 3  # of the scans that are relocalized: others are in rooms that only one drive has seen
 _MIN_OVERLAP = 0.3  # of the returns of b within reach of a surface of a: the drives share that much
 
 
@@ -67,46 +68,52 @@ def align_drives(a: LidarSlam, b: LidarSlam, given_pose_a_b: np.ndarray | None =
     Raises:
         UserError: the scans do not agree on one pose, or do not fit the map at it; the text says what to do.
     """
-    agreeing = queried = 0
-    if given_pose_a_b is not None:
-        pose_a_b = given_pose_a_b
-    elif a.pose_graph.uuid and a.pose_graph.uuid == b.pose_graph.uuid:
-        pose_a_b = np.zeros(3)
-    else:
-        found = find_alignment(a, b)
-        if found is None or 3 * found.agreeing < found.queried:
-            said = "no" if found is None else f"only {found.agreeing} of {found.queried}"
-            raise UserError(
-                f"{said} scans of the second session agree on one place in the first: nothing is compared, "
-                "because every difference could be a wrong place; give the pose of the second map with "
-                "--place X,Y,DEG"
-            )
-        pose_a_b, agreeing, queried = found.pose_a_b, found.agreeing, found.queried
+    pose_a_b, agreeing, queried = _rough_pose(a, b, given_pose_a_b)
     lines_a, lines_b = _lines_of(a.pose_graph), _lines_of(b.pose_graph)
-    tree = cKDTree(lines_a.points)
-    pose_a_b = _fit(tree, lines_a, lines_b.some(_POINTS), pose_a_b, None)
-    away = np.abs(_distances(tree, lines_a, lines_b.some(_POINTS), pose_a_b))
-    near = away[np.isfinite(away)]
-    inliers = float((near < _INLIER_M).mean()) if len(near) else 0.0
-    if len(near) < _MIN_OVERLAP * len(away) or inliers < MIN_INLIER_RATIO:
+    tree, some = cKDTree(lines_a.points), lines_b.some(_POINTS)
+    pose_a_b = _fit(tree, lines_a, some, pose_a_b, None)
+    off = np.abs(_residuals(tree, lines_a, se2.transform(pose_a_b, some.points), _REACH_M[0])[0])
+    near = off[np.isfinite(off)]
+    inlier_ratio = float((near < _INLIER_M).mean()) if len(near) else 0.0
+    if len(near) < _MIN_OVERLAP * len(off) or inlier_ratio < MIN_INLIER_RATIO:
+        share = len(near) / max(len(off), 1)
         raise UserError(
-            f"only {len(near) / max(len(away), 1):.0%} of the returns of the second session are near surfaces "
-            f"of the first, and {inliers:.0%} of these on them: the pose is wrong, or the sessions are of "
-            "different places; nothing is compared. Give the pose of the second map with --place X,Y,DEG"
+            f"{share:.0%} of the returns of the second session are near surfaces of the first, and "
+            f"{inlier_ratio:.0%} of these on them: the pose is wrong, or the sessions are of different places; "
+            "nothing is compared. Give the pose of the second map with --place X,Y,DEG"
         )
-    poses = {}
+    poses, left = {}, [np.zeros(0)]
     for id, submap in b.pose_graph.submaps.items():
-        mine = _members(lines_b, id).some(_SUBMAP_POINTS)
-        fitted = _fit(tree, lines_a, mine, pose_a_b, pose_a_b) if len(mine.points) else pose_a_b
+        mine, fitted = _members(lines_b, id).some(_SUBMAP_POINTS), pose_a_b
+        if len(mine.points):
+            fitted = _fit(tree, lines_a, mine, pose_a_b, pose_a_b)
+            left.append(_residuals(tree, lines_a, se2.transform(fitted, mine.points), _REACH_M[-1])[0])
         poses[id] = se2.compose(fitted, submap.pose_map_submap)
-    left = np.concatenate([
-        _distances(tree, lines_a, mine, se2.compose(poses[id], se2.inverse(s.pose_map_submap)))
-        for id, s in b.pose_graph.submaps.items()
-        if len((mine := _members(lines_b, id).some(_SUBMAP_POINTS)).points)
-    ])  # fmt: skip
-    left = left[np.isfinite(left) & (np.abs(left) < 2 * _INLIER_M)]
-    sigma_m = max(1.4826 * float(np.median(np.abs(left))), _SETTINGS.range_sigma_m)
-    return DriveAlignment(pose_a_b, poses, sigma_m, inliers, agreeing, queried)
+    residual = np.abs(np.concatenate(left))
+    residual = residual[residual < 2 * _INLIER_M]  # what has moved is farther; NaN is dropped too
+    spread_m = 1.4826 * float(np.median(residual)) if len(residual) else 0.0
+    sigma_m = max(spread_m, _SETTINGS.range_sigma_m)
+    return DriveAlignment(pose_a_b, poses, sigma_m, inlier_ratio, agreeing, queried)
+
+
+def _rough_pose(a: LidarSlam, b: LidarSlam, given: np.ndarray | None) -> tuple[np.ndarray, int, int]:
+    """Return the rough pose of map b in map a, and how many scans of b agree on it, of how many.
+
+    Raises:
+        UserError: the scans do not agree on one pose.
+    """
+    if given is not None:
+        return given, 0, 0
+    if a.pose_graph.uuid and a.pose_graph.uuid == b.pose_graph.uuid:
+        return np.zeros(3), 0, 0
+    found = find_alignment(a, b)
+    if found is None or _MIN_AGREEING * found.queried > found.agreeing:
+        said = "no" if found is None else f"only {found.agreeing} of {found.queried}"
+        raise UserError(
+            f"{said} scans of the second session agree on one place in the first: nothing is compared, because "
+            "every difference could be a wrong place; give the pose of the second map with --place X,Y,DEG"
+        )
+    return found.pose_a_b, found.agreeing, found.queried
 
 
 def _lines_of(graph: PoseGraph) -> _Lines:
@@ -170,7 +177,3 @@ def _residuals(tree: cKDTree, a: _Lines, points: np.ndarray, reach_m: float) -> 
     normal = a.normals[index]
     distance = np.einsum("ij,ij->i", points - a.points[index], normal)
     return np.where(found & (np.abs(normal).max(axis=1) > 0.0), distance, np.nan), normal
-
-
-def _distances(tree: cKDTree, a: _Lines, b: _Lines, pose_a_b: np.ndarray) -> np.ndarray:
-    return _residuals(tree, a, se2.transform(pose_a_b, b.points), _REACH_M[0])[0]

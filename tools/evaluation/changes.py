@@ -106,19 +106,19 @@ def _error_m(detections: list[Detection], at: list[list[bool]], k: int, place: C
     return float(np.linalg.norm(middle - (place.box_m[:2] + place.box_m[3:5]) / 2))
 
 
-def pose_world_map(slam: LidarSlam, truth: Path) -> np.ndarray:
-    """Return the pose float64 [3] of a lidar map in the world, by its trajectory and the true one.
+def pose_world_map(slam: LidarSlam, true_ns: np.ndarray, pose_world_body: np.ndarray) -> np.ndarray | None:
+    """Return the pose float64 [3] of a lidar map in the world that fits its trajectory to the true one.
 
-    Raises:
-        UserError: they have no time in common.
+    Args:
+        true_ns, pose_world_body: true trajectory, int64 [N] and float64 [N, 3].
+
+    Returns:
+        None if the trajectories have no time in common.
     """
     stamps_ns, pose_map_body, _ = slam.trajectory()
-    true_ns, pose_world_body = planar_poses(truth)
     inside = (stamps_ns >= true_ns[0]) & (stamps_ns <= true_ns[-1])
     if inside.sum() < 2:
-        raise UserError(
-            f"{truth}: has no poses of the time of the first session; give the truth of its drive"
-        )
+        return None
     there = interpolate_poses(true_ns, pose_world_body, stamps_ns[inside])[:, :2]
     here = pose_map_body[inside, :2]
     p, q = here - here.mean(axis=0), there - there.mean(axis=0)
@@ -139,7 +139,9 @@ def score_files(changes: Path, slam: LidarSlam, truth: Path, true_changes: Path)
     Raises:
         UserError: a file cannot be read, or is not what it should be; the text names file and field.
     """
-    pose = pose_world_map(slam, truth)
+    pose = pose_world_map(slam, *planar_poses(truth))
+    if pose is None:
+        raise UserError(f"{truth}: has no poses of the time of the first session; give those of its drive")
     found = [Detection.of(row, pose) for row in _table(changes, "objects")]
     return score(places_of(_table(true_changes, "changes")), found)
 
