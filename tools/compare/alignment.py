@@ -79,8 +79,8 @@ def align_drives(a: LidarSlam, b: LidarSlam, given_pose_a_b: np.ndarray | None =
         share = len(near) / max(len(off), 1)
         raise UserError(
             f"{share:.0%} of the returns of the second session are near surfaces of the first, and "
-            f"{inlier_ratio:.0%} of these on them: the pose is wrong, or the sessions are of different places; "
-            "nothing is compared. Give the pose of the second map with --place X,Y,DEG"
+            f"{inlier_ratio:.0%} of these on them: the pose is wrong, or the sessions are of different "
+            "places; nothing is compared. Give the pose of the second map with --place X,Y,DEG"
         )
     poses, left = {}, [np.zeros(0)]
     for id, submap in b.pose_graph.submaps.items():
@@ -110,8 +110,9 @@ def _rough_pose(a: LidarSlam, b: LidarSlam, given: np.ndarray | None) -> tuple[n
     if found is None or _MIN_AGREEING * found.queried > found.agreeing:
         said = "no" if found is None else f"only {found.agreeing} of {found.queried}"
         raise UserError(
-            f"{said} scans of the second session agree on one place in the first: nothing is compared, because "
-            "every difference could be a wrong place; give the pose of the second map with --place X,Y,DEG"
+            f"{said} scans of the second session agree on one place in the first: nothing is compared, "
+            "because every difference could be a wrong place; give the pose of the second map with "
+            "--place X,Y,DEG"
         )
     return found.pose_a_b, found.agreeing, found.queried
 

@@ -70,9 +70,9 @@ def open_drive(
         assert isinstance(message, Keyframe)  # sessions store keyframes only
         return decode_keyframe(message, lens)
 
-    return MappedDrive(
-        folder.path.name, store_of(arrays), slam, pose_map_submap, keyframe_views(arrays), read
-    )
+    path = folder.path.resolve()
+    name = path.parent.name if path.name == "session" else path.name  # `demo` writes NAME/session
+    return MappedDrive(name, store_of(arrays), slam, pose_map_submap, keyframe_views(arrays), read)
 
 
 def depth_views(

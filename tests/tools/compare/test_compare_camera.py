@@ -21,7 +21,7 @@ def test_a_box_that_is_gone_is_found_at_its_place_and_size():
     points = vanished([BOX], [])
     assert len(points) > 60
     low, high = points.min(axis=0), points.max(axis=0)
-    assert low == pytest.approx([2.0, -0.25, 0.0], abs=1.5 * VOXEL_M)
+    assert low == pytest.approx([2.0, -0.25, 0.0], abs=2.0 * VOXEL_M)  # near the floor, the floor is behind
     assert high[1:] == pytest.approx([0.25, 0.5], abs=1.5 * VOXEL_M)
     assert high[0] < 2.5 + 1.5 * VOXEL_M
 
