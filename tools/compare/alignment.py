@@ -68,6 +68,9 @@ def align_drives(a: LidarSlam, b: LidarSlam, given_pose_a_b: np.ndarray | None =
     Raises:
         UserError: the scans do not agree on one pose, or do not fit the map at it; the text says what to do.
     """
+    for which, slam in (("first", a), ("second", b)):
+        if not any(s.frozen is not None for s in slam.pose_graph.submaps.values()):
+            raise UserError(f"the lidar map of the {which} session has no finished submap: drive farther")
     pose_a_b, agreeing, queried = _rough_pose(a, b, given_pose_a_b)
     lines_a, lines_b = _lines_of(a.pose_graph), _lines_of(b.pose_graph)
     tree, some = cKDTree(lines_a.points), lines_b.some(_POINTS)
