@@ -59,6 +59,7 @@ class SessionComparison:
             if pair is not None:
                 row["keyframe"] = pair.keyframe
                 row["appearance_difference"] = round(pair.difference, 3)
+                row["appearance_typical"] = round(pair.typical, 3)
             objects.append(row)
         pose = self.alignment.pose_a_b
         return {
@@ -102,12 +103,15 @@ def compare_sessions(
         surface_a, surface_b = surface_voxels(views_a), surface_voxels(views_b)
         vanished = changed_voxels(surface_a, views_a, views_b, alignment.sigma_m)
         appeared = changed_voxels(surface_b, views_b, views_a, alignment.sigma_m)
-        objects = find_objects(beams, vanished, appeared, _beam_height_m(drive_a))
-        pairs = []
-        for number, found in enumerate(objects):
-            progress("rendering objects", number, len(objects))
-            there = views_b if found.kind == APPEARED else views_a
-            pairs.append(object_pair(drive_a, drive_b, there, found, rasterizer))
+        found = find_objects(beams, vanished, appeared, _beam_height_m(drive_a))
+        objects, pairs = [], []
+        for number, candidate in enumerate(found):
+            progress("rendering objects", number, len(found))
+            there = views_b if candidate.kind == APPEARED else views_a
+            pair = object_pair(drive_a, drive_b, there, candidate, rasterizer)
+            if candidate.by_lidar or (pair is not None and pair.looks_changed):
+                objects.append(candidate)
+                pairs.append(pair)
     finally:
         rasterizer.close()
     counts = len(views_a), len(views_b)

@@ -13,11 +13,11 @@ from beamsplat.tools.compare.beams import CELL_M, BeamEvidence
 from beamsplat.tools.compare.voxels import VOXEL_M, ChangedVoxels
 
 APPEARED, VANISHED = "appeared", "vanished"
-# Cells and voxels nearer than this to each other are one object. What is too little for an object, such as
-# one leg of a table, is then linked over the larger distance.
-LINK_M, LEG_LINK_M = 0.25, 0.70
-# The least evidence of an object: lidar cells alone, legs alone, voxels alone (0.1 m^2 of surface), or both.
-MIN_CELLS, MIN_LEG_CELLS, MIN_VOXELS = 3, 4, 40
+# Cells and voxels nearer than this to each other are one object. What is no wider than a leg is then linked over
+# the larger distance: the legs of a table.
+LINK_M, LEG_LINK_M, LEG_M = 0.25, 1.0, 0.20
+# The least evidence of an object: lidar cells alone, voxels alone (0.1 m^2 of surface), or both.
+MIN_CELLS, MIN_VOXELS = 3, 40
 MIN_CELLS_BOTH, MIN_VOXELS_BOTH = 2, 10
 _CORE = (2.0, 98.0)  # percentiles of the points that the box of an object contains
 
@@ -37,6 +37,11 @@ class ChangedObject:
     seen: int  # keyframes of one session that saw a surface there, the most of any voxel
     through: int  # keyframes of the other session that looked through, the most of any voxel
     points_m: np.ndarray  # float64 [N, 3], the changed voxels and lidar cells
+
+    @property
+    def by_lidar(self) -> bool:
+        """Return whether the lidar has seen the change; otherwise only the camera has."""
+        return self.cells >= MIN_CELLS_BOTH
 
     @property
     def centre_m(self) -> np.ndarray:
@@ -91,8 +96,8 @@ def find_objects(
         (APPEARED, e.appeared, e.b.hits, e.a.misses, appeared),
     ):
         changes = _Changes(kind, cells.copy(), ended, passed, voxels, e.origin_m, beam_height_m)
-        out += changes.take_objects(LINK_M, MIN_CELLS)
-        out += changes.take_objects(LEG_LINK_M, MIN_LEG_CELLS)
+        out += changes.take_objects(LINK_M, least_width_m=LEG_M)
+        out += changes.take_objects(LEG_LINK_M, least_width_m=0.0)
     return sorted(out, key=lambda o: -o.confidence)
 
 
@@ -116,8 +121,11 @@ class _Changes:
         self.left = np.flatnonzero(inside)  # voxels without an object; beyond the lidar map they are not used
         self.row, self.column = row, column
 
-    def take_objects(self, link_m: float, min_cells: int) -> list[ChangedObject]:
-        """Return the groups of cells and voxels with enough evidence, and remove them from what is left."""
+    def take_objects(self, link_m: float, least_width_m: float) -> list[ChangedObject]:
+        """Return the groups of cells and voxels with enough evidence, and remove them from what is left.
+
+        Groups that are narrower than `least_width_m` in both directions stay.
+        """
         where = self.cells.copy()
         strong = self.left[self.voxels.strong[self.left]]
         where[self.row[strong], self.column[strong]] = True
@@ -134,10 +142,12 @@ class _Changes:
             voxels = self.left[chosen]
             alone = int(self.voxels.strong[voxels].sum())
             both = len(row) >= MIN_CELLS_BOTH and len(voxels) >= MIN_VOXELS_BOTH
-            if len(row) >= min_cells or alone >= MIN_VOXELS or both:
-                out.append(self._object(row, column, voxels))
-                self.cells[row, column] = False
-                taken |= chosen
+            if len(row) >= MIN_CELLS or alone >= MIN_VOXELS or both:
+                found = self._object(row, column, voxels)
+                if (found.high_m - found.low_m)[:2].max() >= least_width_m:
+                    out.append(found)
+                    self.cells[row, column] = False
+                    taken |= chosen
         self.left = self.left[~taken]
         return out
 

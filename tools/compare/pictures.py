@@ -16,6 +16,9 @@ from beamsplat.tools.compare.objects import ChangedObject
 from beamsplat.tools.report.top_view import LabelledBox, extent, top_view
 
 COLOUR_BGR = {"vanished": (40, 40, 220), "appeared": (60, 160, 30)}
+# Of an object that only the camera has seen. A depth source that puts a surface at a wrong depth does so in one
+# session only; then both maps look the same there.
+MIN_CONTRAST = 2.0
 _SIZE_PX = 480  # width of one render of a pair
 _MARGIN_M = 0.15  # of a surface before a pixel counts as hidden
 
@@ -28,6 +31,12 @@ class ObjectPair:
     before: np.ndarray  # uint8 [H, W, 3] BGR, from map a
     after: np.ndarray  # uint8 [H, W, 3] BGR, from map b
     difference: float  # 0..1, mean absolute colour difference of the renders on the object
+    typical: float  # the same of all other pixels: what two maps of equal surfaces differ by
+
+    @property
+    def looks_changed(self) -> bool:
+        """Return whether the object's pixels differ clearly more than all others."""
+        return self.difference > MIN_CONTRAST * self.typical
 
 
 def maps_from_above(a: MappedDrive, b: MappedDrive, objects: list[ChangedObject]) -> np.ndarray | None:
@@ -75,14 +84,16 @@ def object_pair(
     for drive in (a, b):
         rgb, _, _ = render_rgb_depth(rasterizer, drive.store, big, best.T_map_camera)
         pair.append(rgb)
-    part = np.s_[top : bottom + 1, left : right + 1]
-    difference = float(np.abs(pair[0][part] - pair[1][part]).mean())
+    off = np.abs(pair[0] - pair[1]).mean(axis=2)
+    on = np.zeros(off.shape, bool)
+    on[top : bottom + 1, left : right + 1] = True
+    difference, typical = float(off[on].mean()), float(off[~on].mean()) if not on.all() else 0.0
     drawn = []
     for rgb in pair:
         image = cv2.cvtColor((rgb * 255.0 + 0.5).astype(np.uint8), cv2.COLOR_RGB2BGR)
         cv2.rectangle(image, (int(left), int(top)), (int(right), int(bottom)), COLOUR_BGR[found.kind], 2)
         drawn.append(image)
-    return ObjectPair(best.id, drawn[0], drawn[1], difference)
+    return ObjectPair(best.id, drawn[0], drawn[1], difference, typical)
 
 
 def _in_view(view: DepthView, points_m: np.ndarray) -> tuple[int, np.ndarray]:

@@ -149,7 +149,12 @@ def _in_sight(points_m: np.ndarray, view: DepthView) -> tuple[np.ndarray, np.nda
 
 
 def _nearest(view: DepthView) -> np.ndarray:
-    """Return float32 [H, W]: the least depth (m), measured or rendered, in 3 x 3 pixels; 0 = unknown."""
+    """Return float32 [H, W]: the least depth (m), measured or rendered, in 3 x 3 pixels.
+
+    It is 0 where one of them is unknown; unknown neighbours are ignored.
+    """
     measured, rendered = view.depth_m.astype(np.float32), view.rendered_m.astype(np.float32)
     nearest = np.minimum(measured, rendered)  # NaN if one of them is
-    return cv2.erode(np.nan_to_num(nearest, nan=0.0), np.ones((3, 3), np.uint8))
+    known = np.isfinite(nearest)
+    least = cv2.erode(np.where(known, nearest, np.float32(np.inf)), np.ones((3, 3), np.uint8))
+    return np.where(known, least, np.float32(0.0))
