@@ -13,8 +13,8 @@ from beamsplat.tools.compare.beams import CELL_M, BeamEvidence
 from beamsplat.tools.compare.voxels import VOXEL_M, ChangedVoxels
 
 APPEARED, VANISHED = "appeared", "vanished"
-# Cells and voxels nearer than this to each other are one object. What is no wider than a leg is then linked over
-# the larger distance: the legs of a table.
+# Cells and voxels nearer than this to each other are one object. What is no wider than a leg is then linked
+# over the larger distance: the legs of a table.
 LINK_M, LEG_LINK_M, LEG_M = 0.25, 1.0, 0.20
 # The least evidence of an object: lidar cells alone, voxels alone (0.1 m^2 of surface), or both.
 MIN_CELLS, MIN_VOXELS = 3, 40

@@ -16,8 +16,8 @@ from beamsplat.tools.compare.objects import ChangedObject
 from beamsplat.tools.report.top_view import LabelledBox, extent, top_view
 
 COLOUR_BGR = {"vanished": (40, 40, 220), "appeared": (60, 160, 30)}
-# Of an object that only the camera has seen. A depth source that puts a surface at a wrong depth does so in one
-# session only; then both maps look the same there.
+# Of an object that only the camera has seen, where a wrong depth of one session would be a surface that
+# appeared or vanished; then both maps look the same there. Chosen on the simulated home of seed 7.
 MIN_CONTRAST = 2.0
 _SIZE_PX = 480  # width of one render of a pair
 _MARGIN_M = 0.15  # of a surface before a pixel counts as hidden

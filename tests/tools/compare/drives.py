@@ -16,7 +16,11 @@ STEP_NS = 100_000_000
 def mapped_flat(place, start_s=0.0, seconds=52.0, seed=0) -> tuple[LidarSlam, np.ndarray]:
     """Return the lidar map of a drive with the box at `place` (None: without it), and its pose in the world."""
     walls = WALLS if place is None else np.concatenate([WALLS, box(*place, SIZE_M)])
-    slam, lidar, path = LidarSlam(LidarSlamSettings(), np.eye(4)), RayCastLidar(seed=seed), SimulatedDrive()
+    slam, lidar, path = (
+        LidarSlam(LidarSlamSettings(), np.eye(4)),
+        RayCastLidar(beams=240, seed=seed),
+        SimulatedDrive(),
+    )
     for number in range(int(seconds * 10)):
         result = slam.add_scan(
             10**18 + seed * 10**15 + number * STEP_NS,
