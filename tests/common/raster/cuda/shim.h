@@ -33,7 +33,7 @@ constexpr int MAX_THREADS = 256;
 constexpr size_t STACK = 64 << 10;
 
 struct Barrier { int arrived, alive, generation; bool all, result; };
-struct Fiber { jmp_buf at; bool started, done; int side; };
+struct Fiber { jmp_buf at; bool done; int side; };
 
 static Fiber fibers[MAX_THREADS];
 static Barrier block_barrier, warp_barrier[MAX_THREADS / 32];
@@ -43,8 +43,23 @@ static jmp_buf scheduler;
 static std::function<void()> body;
 static std::mutex one_launch;
 static int running;
+static bool backwards;  // threads and blocks run in reverse order: a race changes the results
 
-static void pause() { if (!_setjmp(fibers[running].at)) _longjmp(scheduler, 1); }
+static void go_on(int t) {
+    running = t;
+    threadIdx = {t, 0, 0};
+    _longjmp(fibers[t].at, 1);
+}
+
+static void pause() {  // goes on with the next fiber of the block; the scheduler goes on when none is left
+    const int threads = blockDim.x;
+    if (_setjmp(fibers[running].at)) return;
+    for (int k = 1, t = running; k <= threads; ++k) {
+        t = backwards ? (t ? t - 1 : threads - 1) : (t + 1 < threads ? t + 1 : 0);
+        if (!fibers[t].done) go_on(t);
+    }
+    _longjmp(scheduler, 1);
+}
 
 static void open(Barrier &b) {
     if (!b.alive || b.arrived != b.alive) return;
@@ -62,6 +77,7 @@ static bool wait(Barrier &b, bool yes = true) {  // whether all said yes
 static void leave(Barrier &b) { --b.alive; open(b); }
 
 static void live() {  // a fiber is used by all launches
+    if (!_setjmp(fibers[running].at)) _longjmp(scheduler, 1);
     for (;;) {
         body();
         fibers[running].done = true;
@@ -71,12 +87,9 @@ static void live() {  // a fiber is used by all launches
     }
 }
 
-static void resume(int t) {
+static void start(int t) {
     running = t;
-    threadIdx = {t, 0, 0};
     if (_setjmp(scheduler)) return;
-    if (fibers[t].started) _longjmp(fibers[t].at, 1);
-    fibers[t].started = true;
     static ucontext_t context;
     getcontext(&context);
     context.uc_stack.ss_sp = stacks + STACK * t;
@@ -91,20 +104,22 @@ static void run_block(int threads) {
     for (int w = 0; w < MAX_THREADS / 32; ++w)
         warp_barrier[w] = {0, max(0, min(32, threads - 32 * w)), 0, true, true};
     for (int t = 0; t < threads; ++t) { fibers[t].done = false; fibers[t].side = 0; }
-    for (bool any = true; any;) {
-        any = false;
-        for (int t = 0; t < threads; ++t)
-            if (!fibers[t].done) { any = true; resume(t); }
-    }
+    if (!_setjmp(scheduler)) go_on(backwards ? threads - 1 : 0);
 }
 
 template <class S> static void launch(void (*kernel)(S), int blocks, int threads, const S &arguments) {
     std::lock_guard<std::mutex> guard(one_launch);
-    if (!stacks) stacks = (char *)malloc(STACK * MAX_THREADS);
+    if (!stacks) {
+        stacks = (char *)malloc(STACK * MAX_THREADS);
+        for (int t = 0; t < MAX_THREADS; ++t) start(t);
+    }
     body = [&] { kernel(arguments); };
     blockDim = {threads, 1, 1};
     gridDim = {blocks, 1, 1};
-    for (int b = 0; b < blocks; ++b) { blockIdx = {b, 0, 0}; run_block(threads); }
+    for (int b = 0; b < blocks; ++b) {
+        blockIdx = {backwards ? blocks - 1 - b : b, 0, 0};
+        run_block(threads);
+    }
 }
 
 template <class T> static T shuffle(T value, int source) {
@@ -115,6 +130,8 @@ template <class T> static T shuffle(T value, int source) {
     return value;
 }
 }  // namespace shim
+
+extern "C" void run_backwards(int yes) { shim::backwards = yes; }
 
 static void __syncthreads() { shim::wait(shim::block_barrier); }
 static void __syncwarp() { shim::wait(shim::warp_barrier[shim::running / 32]); }

@@ -4,6 +4,7 @@ With BEAMSPLAT_CUDA_TESTS=gpu, the tests run on the GPU instead, with wider tole
 accurate.
 """
 
+import contextlib
 import ctypes
 import fcntl
 import functools
@@ -50,6 +51,15 @@ class ShimKernels:
     def launch(self, name, blocks, arguments):
         assert type(arguments).__name__ == self.source.kernels[name][0]
         getattr(self._library, f"launch_{name}")(blocks, ctypes.byref(arguments))
+
+    @contextlib.contextmanager
+    def backwards(self):
+        """Run threads and blocks in reverse order: a race between threads changes the results."""
+        self._library.run_backwards(1)
+        try:
+            yield
+        finally:
+            self._library.run_backwards(0)
 
 
 @functools.cache

@@ -17,7 +17,7 @@ from beamsplat.common.raster.rasterizer import Rasterizer
 from beamsplat.services.mapping.kernels import count_carving_votes
 from beamsplat.services.mapping.keyframe import StoredKeyframe, refine_exposure, refine_pose
 from tests.common.raster.cuda.scenes import random_scene, relative
-from tests.common.raster.cuda.shim import LOOSE, ON_GPU, kernels_under_test, needs_kernels
+from tests.common.raster.cuda.shim import LOOSE, ON_GPU, kernels_under_test, needs_kernels, shim_kernels
 from tests.common.raster.cuda.test_cuda_losses import cpu_loss, level_of, packed_level
 
 pytestmark = needs_kernels
@@ -235,29 +235,48 @@ def test_whole_steps_agree_with_the_mapper():
     assert device_map.workspace_bytes > 0
 
 
-def test_the_same_steps_give_the_same_bits():
-    """Also after the capacities have grown: sums do not depend on them."""
-    params, count, camera, T_camera_map, _ = random_scene(12, 60, 44, count=600)
+def results_of_steps(kernels, capacity=600, pairs=1 << 14):
+    """Everything that four steps change."""
+    params, count, camera, T_camera_map, _ = random_scene(12, 60, 44, count=600, more_opacity=1.0)
     level, _ = level_of(60, 44, with_mask=True)
-    results = []
-    for capacity, pairs in ((600, 1 << 14), (600, 1 << 14), (3000, 1 << 15)):
-        device_map = DeviceMap(
-            kernels_under_test(), StepSettings(refine_pose=True, refine_exposure=True), keyframes=1,
-            capacity=capacity, pairs=pairs,
-        )  # fmt: skip
-        device_map.gaussians.append(params[:, :count])
-        device_map.states.write([0], [state_of(StoredKeyframe(0, 0, np.eye(4), camera, []))])
-        view = device_map.training_view(60, 44)
-        view.set_learning_rates(RATES)
-        view.load(packed_level(level))
-        for step in range(4):
-            view.begin(camera, inverse(T_camera_map), 0)
-            view.run(with_ssim=step % 2 == 0)
-        (state,) = device_map.states.read([0])
-        results.append({**device_map.gaussians.read(), **state, "losses": device_map.losses.read()})
-    for other in results[1:]:
-        for name, array in results[0].items():
-            assert np.array_equal(array, other[name]), name
+    settings = StepSettings(refine_pose=True, refine_exposure=True)
+    device_map = DeviceMap(kernels, settings, keyframes=1, capacity=capacity, pairs=pairs)
+    device_map.gaussians.append(params[:, :count])
+    device_map.states.write([0], [state_of(StoredKeyframe(0, 0, np.eye(4), camera, []))])
+    view = device_map.training_view(60, 44)
+    view.set_learning_rates(RATES)
+    view.load(packed_level(level))
+    for step in range(4):
+        view.begin(camera, inverse(T_camera_map), 0)
+        view.run(with_ssim=step % 2 == 0)
+    device_map.gaussians.vote_carving(view._targets, camera.packed(T_camera_map), (60, 44), 100, 0.08)
+    (state,) = device_map.states.read([0])
+    image, gradient = view.image.cpu().numpy(), view.gradient.cpu().numpy()
+    return {
+        **device_map.gaussians.read(), **state, "losses": device_map.losses.read(), "image": image,
+        "gradient": gradient,
+    }  # fmt: skip
+
+
+def assert_same_bits(some, others):
+    for name, array in some.items():
+        assert np.array_equal(array, others[name]), name
+
+
+def test_the_same_steps_give_the_same_bits():
+    """Also with other capacities: sums do not depend on them."""
+    once = results_of_steps(kernels_under_test())
+    assert_same_bits(once, results_of_steps(kernels_under_test()))
+    assert_same_bits(once, results_of_steps(kernels_under_test(), 3000, 1 << 15))
+
+
+@pytest.mark.parametrize("tile", [8, 16])
+@pytest.mark.skipif(ON_GPU, reason="a GPU chooses the order of its threads")
+def test_results_do_not_depend_on_the_order_of_threads(tile):
+    kernels = shim_kernels(tile)
+    forwards = results_of_steps(kernels)
+    with kernels.backwards():
+        assert_same_bits(forwards, results_of_steps(kernels))
 
 
 def test_pictures_agree_with_the_numba_rasterizer():
