@@ -19,7 +19,7 @@ from beamsplat.common.mapfiles.y_up import R_ydown_map, R_yup_map
 
 SH_C0 = 0.28209479177387814
 COUNT = 5000
-# The chunks of this house have 256 Gaussians on 17 m2; of a mapped room on less than 1 m2.
+# The fewer Gaussians, the larger the chunks: in this house 256 are spread over 17 m2.
 LIMIT_M = {"sog": 0.001, "compressed": 0.004}
 ANGLE_DEG = {"sog": 1.12, "compressed": 0.28}  # half a step in all components: 4 sqrt(3) of it in radians
 
