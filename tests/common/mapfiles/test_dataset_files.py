@@ -311,7 +311,11 @@ def test_an_existing_folder_and_a_running_system_are_refused(session, folders, t
 
 
 def test_nerfstudios_own_loader_sees_the_room_where_it_is(session, folders):
-    """Its rays through the pixels of an image end on the surface, at the depth of its depth map."""
+    """Its rays through the pixels of an image end on the surface, at the depth of its depth map.
+
+    The loader needs none of the large packages of nerfstudio: `pip install --no-deps nerfstudio jaxtyping
+    wadler_lindig tyro docstring_parser typeguard viser msgspec websockets tensorboard absl-py torchvision`.
+    """
     parser = pytest.importorskip(
         "nerfstudio.data.dataparsers.nerfstudio_dataparser", reason="needs nerfstudio: pip install nerfstudio"
     )
