@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterable, Mapping
+from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any, get_args
 
@@ -95,7 +96,7 @@ def page_metrics(fleet: Fleet, alerting: Alerting, viewers: int, refused: Mappin
     out.add("build_info", 1, version=_program_version())
     states = fleet.states()
     for robot, state in states.items():
-        state.with_records(lambda records, robot=robot: add_robot(out, robot, records, now))
+        state.with_records(partial(add_robot, out, robot, now))
     add_alerts(out, states, alerting.alerts(), alerting.rules.off)
     out.add("page_viewers", viewers)
     for reason, count in refused.items():
@@ -108,7 +109,7 @@ def page_metrics(fleet: Fleet, alerting: Alerting, viewers: int, refused: Mappin
     return out.text()
 
 
-def add_robot(out: MetricsText, robot: str, records: Mapping[str, NodeRecord], now: float) -> None:
+def add_robot(out: MetricsText, robot: str, now: float, records: Mapping[str, NodeRecord]) -> None:
     """Add what is known of a robot: `records` by node name, `now` in s of `time.monotonic`."""
     for node, record in sorted(records.items()):
         _add_state(out, robot, node, record, now)
@@ -152,7 +153,7 @@ def _add_messages(out: MetricsText, robot: str, node: str, record: NodeRecord) -
     for entry in record.health.inputs:
         labels = {"robot": robot, "node": node, "topic": entry.topic}
         out.add("node_input_messages_total", entry.received, **labels)
-        out.add("node_input_rate_hertz", record.rate(lambda h, t=entry.topic: _received(h, t)), **labels)
+        out.add("node_input_rate_hertz", record.rate(partial(_received, entry.topic)), **labels)
         if entry.age_ms > 0.0:  # 0 = unknown
             out.add("node_input_age_seconds", entry.age_ms / 1e3, **labels)
         for reason, counter in _DROP_REASONS.items():
@@ -162,7 +163,7 @@ def _add_messages(out: MetricsText, robot: str, node: str, record: NodeRecord) -
         labels = {"robot": robot, "node": node, "topic": sent.topic}
         out.add("node_output_messages_total", sent.sent, **labels)
         out.add("node_output_bytes_total", sent.bytes, **labels)
-        out.add("node_output_rate_hertz", record.rate(lambda h, t=sent.topic: _sent(h, t)), **labels)
+        out.add("node_output_rate_hertz", record.rate(partial(_sent, sent.topic)), **labels)
         out.add("node_dropped_total", sent.refused, **labels, reason="too_large")
     for refused in record.health.rejected:
         labels = {"robot": robot, "node": node, "topic": refused.topic, "reason": refused.reason}
@@ -186,11 +187,11 @@ def _program_version() -> str:
         return "unknown"
 
 
-def _received(health: Any, topic: str) -> int:
+def _received(topic: str, health: Any) -> int:
     return next((i.received for i in health.inputs if i.topic == topic), 0)
 
 
-def _sent(health: Any, topic: str) -> int:
+def _sent(topic: str, health: Any) -> int:
     return next((o.sent for o in health.outputs if o.topic == topic), 0)
 
 
