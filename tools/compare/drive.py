@@ -98,5 +98,12 @@ def depth_views(
         rgb, rendered, alpha = render_rgb_depth(rasterizer, drive.store, camera, view.T_map_camera)
         sure = (alpha > MIN_ALPHA) & np.isfinite(rendered) & ~flying_pixels(rendered)
         rendered = np.where(sure, rendered, np.float32(np.nan))
-        images = (array.astype(np.float16) for array in (depth, sigma, rendered))
-        yield DepthView(view.id, camera, view.T_map_camera, *images, (rgb * 255.0 + 0.5).astype(np.uint8))
+        yield DepthView(
+            id=view.id,
+            camera=camera,
+            T_map_camera=view.T_map_camera,
+            depth_m=depth.astype(np.float16),
+            sigma_m=sigma.astype(np.float16),
+            rendered_m=rendered.astype(np.float16),
+            rgb=(rgb * 255.0 + 0.5).astype(np.uint8),
+        )

@@ -187,8 +187,8 @@ def _radiators(b: MeshBuilder, room: Room) -> None:
                 box(at, (x, -0.09, 0.14), (0.05, 0.08, 0.52), f.LACQUER)
             middle = (hole.s0 + hole.s1) / 2
             box(at, (middle, -0.09, 0.2), (width, 0.03, 0.04), f.LACQUER)
-            x, y = zip(room.to_house(side, hole.s0, 0.0), room.to_house(side, hole.s1, 0.13))
-            room.taken.append((min(x), min(y), max(x), max(y), 0.66))
+            (xa, ya), (xb, yb) = room.to_house(side, hole.s0, 0.0), room.to_house(side, hole.s1, 0.13)
+            room.taken.append((min(xa, xb), min(ya, yb), max(xa, xb), max(ya, yb), 0.66))
 
 
 def _hang(b: MeshBuilder, room: Room, rng: np.random.Generator) -> None:
