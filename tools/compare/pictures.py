@@ -53,8 +53,9 @@ def maps_from_above(a: MappedDrive, b: MappedDrive, objects: list[ChangedObject]
         )
         for number, o in enumerate(objects, 1)
     ]  # fmt: skip
-    sides = [top_view(p, corners_m=shared, boxes=marks) for p in params]
-    if sides[0] is None or sides[1] is None:
+    views = (top_view(p, corners_m=shared, boxes=marks) for p in params)
+    sides = [view for view in views if view is not None]
+    if len(sides) < len(params):
         return None
     for side, text in zip(sides, (f"before: {a.name}", f"after: {b.name}")):
         cv2.putText(side, text, (12, 24), cv2.FONT_HERSHEY_SIMPLEX, 0.7, (0, 0, 0), 2, cv2.LINE_AA)
