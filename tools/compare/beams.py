@@ -18,6 +18,9 @@ CELL_M = LidarSlamSettings().cell_m
 # Of all observations of a cell, from where it is a surface: edges and grazed walls are hit by some beams only
 # (the ratio at which the lidar map itself refutes a surface), and below which it is free.
 SURFACE_RATIO, FREE_RATIO = 0.2, 0.02
+# Depth sources extrude the surface that a beam hits upwards, also above its true end: so near to a surface
+# that is still there, depth alone is no evidence.
+EXTRUDED_M = 0.15
 MIN_HITS, MIN_MISSES = 2, 4  # scans; each is counted in up to two submaps
 
 
@@ -38,6 +41,7 @@ class BeamEvidence:
     b: BeamCounts
     vanished: np.ndarray  # bool [H, W], surface in a, free in b
     appeared: np.ndarray  # bool [H, W], surface in b, free in a
+    extruded: np.ndarray  # bool [H, W], within EXTRUDED_M of a surface in a that is still there in b
 
 
 def compare_beams(a: MappedDrive, b: MappedDrive, sigma_m: float) -> BeamEvidence:
@@ -53,8 +57,14 @@ def compare_beams(a: MappedDrive, b: MappedDrive, sigma_m: float) -> BeamEvidenc
     columns, rows = (np.ceil(boxes.max(axis=0) / CELL_M).astype(int) - low).tolist()
     count_a, count_b = (_counts(part, low, (rows, columns)) for part in parts)
     radius = 1 + int(np.ceil(2.0 * sigma_m / CELL_M))
+    stayed = _surface(count_a) & ndimage.binary_dilation(_surface(count_b), _disc(radius))
     return BeamEvidence(
-        low * CELL_M, count_a, count_b, _gone(count_a, count_b, radius), _gone(count_b, count_a, radius)
+        origin_m=low * CELL_M,
+        a=count_a,
+        b=count_b,
+        vanished=_gone(count_a, count_b, radius),
+        appeared=_gone(count_b, count_a, radius),
+        extruded=ndimage.binary_dilation(stayed, _disc(round(EXTRUDED_M / CELL_M))),
     )
 
 
@@ -75,11 +85,17 @@ def _counts(parts: list[tuple[FrozenMap, np.ndarray]], low: np.ndarray, shape: t
 
 def _gone(before: BeamCounts, after: BeamCounts, radius: int) -> np.ndarray:
     """Return bool [H, W]: cells with a surface before, and free after with no surface within `radius`."""
-    total = np.maximum(before.hits + before.misses, 1)
-    surface = (before.hits >= MIN_HITS) & (before.hits > SURFACE_RATIO * total)
     seen = after.hits + after.misses
     free = (after.misses >= MIN_MISSES) & (after.hits <= FREE_RATIO * seen)
     known = (after.hits > 0) & (after.hits > FREE_RATIO * seen)
+    return _surface(before) & free & ~ndimage.binary_dilation(known, _disc(radius))
+
+
+def _surface(counts: BeamCounts) -> np.ndarray:
+    """Return bool [H, W]: cells with a surface."""
+    return (counts.hits >= MIN_HITS) & (counts.hits > SURFACE_RATIO * (counts.hits + counts.misses))
+
+
+def _disc(radius: int) -> np.ndarray:
     y, x = np.mgrid[-radius : radius + 1, -radius : radius + 1]
-    disc = x * x + y * y <= radius * radius
-    return surface & free & ~ndimage.binary_dilation(known, disc)
+    return x * x + y * y <= radius * radius

@@ -95,7 +95,7 @@ def find_objects(
         (VANISHED, e.vanished, e.a.hits, e.b.misses, vanished),
         (APPEARED, e.appeared, e.b.hits, e.a.misses, appeared),
     ):
-        changes = _Changes(kind, cells.copy(), ended, passed, voxels, e.origin_m, beam_height_m)
+        changes = _Changes(kind, cells.copy(), ended, passed, voxels, e, beam_height_m)
         out += changes.take_objects(LINK_M, least_width_m=LEG_M)
         out += changes.take_objects(LEG_LINK_M, least_width_m=0.0)
     return sorted(out, key=lambda o: -o.confidence)
@@ -111,15 +111,17 @@ class _Changes:
         ended: np.ndarray,  # int32 [H, W], scans with a return in the cell, of the session with the surface
         passed: np.ndarray,  # int32 [H, W], scans of the other session whose beams crossed it
         voxels: ChangedVoxels,
-        origin_m: np.ndarray,
+        evidence: BeamEvidence,
         beam_height_m: float,
     ) -> None:
         self.kind, self.cells, self.ended, self.passed = kind, cells, ended, passed
-        self.voxels, self.origin_m, self.beam_height_m = voxels, origin_m, beam_height_m
-        column, row = np.floor((voxels.points_m[:, :2] - origin_m) / CELL_M).astype(int).T
+        self.voxels, self.origin_m, self.beam_height_m = voxels, evidence.origin_m, beam_height_m
+        column, row = np.floor((voxels.points_m[:, :2] - self.origin_m) / CELL_M).astype(int).T
         inside = (row >= 0) & (row < cells.shape[0]) & (column >= 0) & (column < cells.shape[1])
         self.left = np.flatnonzero(inside)  # voxels without an object; beyond the lidar map they are not used
         self.row, self.column = row, column
+        self.alone = voxels.strong.copy()  # is evidence without the lidar
+        self.alone[self.left] &= ~evidence.extruded[row[self.left], column[self.left]]
 
     def take_objects(self, link_m: float, least_width_m: float) -> list[ChangedObject]:
         """Return the groups of cells and voxels with enough evidence, and remove them from what is left.
@@ -127,7 +129,7 @@ class _Changes:
         Groups that are narrower than `least_width_m` in both directions stay.
         """
         where = self.cells.copy()
-        strong = self.left[self.voxels.strong[self.left]]
+        strong = self.left[self.alone[self.left]]
         where[self.row[strong], self.column[strong]] = True
         reach = int(np.ceil(link_m / (2 * CELL_M)))
         y, x = np.mgrid[-reach : reach + 1, -reach : reach + 1]
@@ -140,7 +142,7 @@ class _Changes:
             row, column = (at + s.start for at, s in zip(np.nonzero(mine & self.cells[part]), part))
             chosen = label_of_voxel == label
             voxels = self.left[chosen]
-            alone = int(self.voxels.strong[voxels].sum())
+            alone = int(self.alone[voxels].sum())
             both = len(row) >= MIN_CELLS_BOTH and len(voxels) >= MIN_VOXELS_BOTH
             if len(row) >= MIN_CELLS or alone >= MIN_VOXELS or both:
                 found = self._object(row, column, voxels)

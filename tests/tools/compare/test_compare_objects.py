@@ -19,7 +19,7 @@ def vanished_at(squares, size_m=0.1) -> BeamEvidence:
         cells[row : row + n, column : column + n] = True
     ended = BeamCounts(np.where(cells, 5, 0), np.zeros(cells.shape, int))
     passed = BeamCounts(np.zeros(cells.shape, int), np.full(cells.shape, 8))
-    return BeamEvidence(np.zeros(2), ended, passed, cells, np.zeros_like(cells))
+    return BeamEvidence(np.zeros(2), ended, passed, cells, np.zeros_like(cells), np.zeros_like(cells))
 
 
 def voxels_at(points, strong) -> ChangedVoxels:
@@ -60,3 +60,13 @@ def test_two_maps_that_look_the_same_do_not_support_a_change():
     image = np.zeros((2, 2, 3), np.uint8)
     assert ObjectPair(1, image, image, difference=0.11, typical=0.05).looks_changed
     assert not ObjectPair(1, image, image, difference=0.09, typical=0.05).looks_changed
+
+
+def test_depth_above_a_surface_that_stayed_is_no_evidence_alone():
+    """A depth source that extrudes the front of a cupboard upwards makes a wall of the space above it."""
+    x, z = np.meshgrid(np.arange(1.0, 1.4, 0.05), np.arange(0.9, 1.5, 0.05))
+    above = voxels_at(np.column_stack([x.ravel(), np.full(x.size, 1.1), z.ravel()]), strong=True)
+    nothing = vanished_at([])
+    assert len(find_objects(nothing, above, above, 0.2)) == 2
+    nothing.extruded[:] = True
+    assert find_objects(nothing, above, above, 0.2) == []
