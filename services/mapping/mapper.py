@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from itertools import repeat
+from itertools import count, repeat
 from typing import Any
 
 import numpy as np
@@ -308,6 +308,12 @@ class Mapper:
             )
             for i, (keyframe, size) in enumerate(drawn)
         ]
-        losses = self.engine.optimise(steps, self.T_map_anchor, s, self.must_stop)
-        self.steps += len(losses)
+        before, asked = self.steps, count()
+
+        def must_stop() -> bool:  # asked before each step
+            self.steps = before + next(asked)
+            return self.must_stop()
+
+        losses = self.engine.optimise(steps, self.T_map_anchor, s, must_stop)
+        self.steps = before + len(losses)
         return float(np.mean(losses)) if losses else 0.0

@@ -51,7 +51,7 @@ class Engine(Protocol):
         date in the keyframes when this returns.
 
         Args:
-            must_stop: asked between steps; True ends them early, and the list of losses is shorter.
+            must_stop: asked once before each step; True ends them early, and the list of losses is shorter.
         """
         ...
 
