@@ -7,12 +7,10 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
+from beamsplat.common.geometry.limits import FOCAL_RATIO
 from beamsplat.common.messages.schema import Finite, MessagePart, Positive, Transform
 
 MAX_PIXELS = 2**24  # of an image (4096 x 4096): bounds the memory of everything that has one value per pixel
-# Limits of a possible focal length, as a multiple of the longer side: less than a tenth of that of a fisheye
-# lens, and 90 times that of a usual camera.
-FOCAL_RATIO = (0.02, 100.0)
 
 
 class CameraModel(MessagePart):

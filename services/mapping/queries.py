@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from beamsplat.common.errors import UserError
+from beamsplat.common.geometry.limits import FOCAL_RATIO
 from beamsplat.common.geometry.transforms import make_transform, matrix_from_quat_wxyz
-from beamsplat.common.messages.sensor_models import FOCAL_RATIO
 from beamsplat.common.raster.camera import RasterCamera
 from beamsplat.services.mapping.chunks import Viewpoint
 

@@ -21,6 +21,7 @@ from beamsplat.common.messages import (
     GridTile,
     MapChunk,
     MapPreview,
+    MapRender,
     Odometry,
     Rig,
     Tick,
@@ -44,7 +45,7 @@ log = logging.getLogger("beamsplat.ros2_out")
 _VOLATILE = RmwQos(depth=10)
 _LATCHED = RmwQos(transient_local=True, depth=1)
 _TF = RmwQos(depth=100)  # as tf2_ros publishes it
-_SNAPSHOT_S = 30.0  # longest wait for an answer of the mapper, which may be busy with a keyframe
+_RENDER_S = _SNAPSHOT_S = 30.0  # longest wait for an answer of the mapper, which may be busy with a keyframe
 
 
 class Ros2OutNode(Node):
@@ -228,17 +229,22 @@ class Ros2OutNode(Node):
 
     def _publish_view(self, cdr: bytes, ask: QueryFunction) -> None:
         """Publish the map as seen from the pose in a message of the robot; called in the receiving thread."""
+        c, frame = self.config, self.config.view_frame
         try:
-            view = map_views.render_request(cdr, self.config, ask)
+            stamp_ns, T_map_camera = map_views.requested_view(cdr, c.view_pose_topic, c.map_frame)
+            parameters = map_views.render_parameters(T_map_camera, c.view_size_px, c.view_fov_deg)
+            (view,) = ask("mapping", "render", parameters, _RENDER_S)
+            assert isinstance(view, MapRender)  # the message type of this query
+            rgb = decode_rgb(view.render, "jpeg", view.camera.width_px, view.camera.height_px)
         except ValueError as error:
             self.rejections.add(f"view of the map not published: {error}")
             return
-        stamp_ns, frame = view.stamp_ns, self.config.view_frame
         if view.left_out:
             self.rejections.add(f"view of the map incomplete: {view.left_out} Gaussians are left out")
-        pose = ros.tf(stamp_ns, self.config.map_frame, frame, view.T_map_camera)
-        self._ros.put("view", lambda: images.rgb_image(stamp_ns, frame, view.rgb))
-        self._ros.put("view_info", lambda: images.camera_info(stamp_ns, frame, view.camera))
+        pinhole = Pinhole.of(view.camera)
+        pose = ros.tf(stamp_ns, c.map_frame, frame, view.T_map_camera)
+        self._ros.put("view", lambda: images.rgb_image(stamp_ns, frame, rgb))
+        self._ros.put("view_info", lambda: images.camera_info(stamp_ns, frame, pinhole))
         self._put_built("tf", ros.tf_message([pose]))
 
     def drain(self) -> Outputs:

@@ -54,9 +54,13 @@ def test_random_messages_do_not_end_a_node(service, kind, seed, tmp_path, router
                     name, message, Header(message.stamp_ns, 0, 0, 0, 0, name.partition("/")[0], "0" * 16)
                 )
                 if isinstance(node, PageNode):  # what its server does for an open page
-                    for image in node._state.images.values():
+                    for image in node._fleet.own_state.images.values():
                         image.encode_newest()
-                    for data in (node._state.status(), node._state.robot(), node._state.path()):
+                    for data in (
+                        node._fleet.own_state.status(),
+                        node._fleet.own_state.robot(),
+                        node._fleet.own_state.path(),
+                    ):
                         as_json(data)
             player.end()
         finally:
@@ -107,7 +111,7 @@ def test_the_page_shows_a_depth_map_of_any_shape(shape, tmp_path, router_endpoin
         list(
             node.on_fusion_depth(FusedDepth(stamp_ns=1, depth_m=depth, sigma_m=depth, T_odom_body=np.eye(4)))
         )
-        node._state.images["depth"].encode_newest()
+        node._fleet.own_state.images["depth"].encode_newest()
     finally:
         node.close()
 
