@@ -66,7 +66,8 @@ def render_view(mapper: Mapper, T_map_camera: np.ndarray, camera: RasterCamera |
     """
     if camera is None:
         camera = next(k.levels[HALF].camera for k in reversed(mapper.keyframes.values()))
-    params, count, parts, left_out = mapper.store.params, mapper.store.count, [], 0
+    params, count, left_out = mapper.store.params, mapper.store.count, 0
+    parts: list[np.ndarray] = []
     if mapper.disk_gaussians is not None:
         parts, left_out = mapper.disk_gaussians.read_visible(
             camera, T_map_camera, mapper.T_map_anchor, _MOST_FROM_DISK

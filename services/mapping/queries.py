@@ -70,8 +70,8 @@ def view_of(parameters: dict[str, str]) -> View:
         raise _wrong("render", parameters, "quaternion", "a quaternion that is not zero") from None
     if "width_px" not in parameters:
         return View(T_map_camera, None)
-    limits = (_LEAST_SIZE_PX, _LARGEST_SIZE_PX)
-    width_px, height_px = (int(_number("render", parameters, name, limits)) for name in size[:2])
+    sizes_px = (_LEAST_SIZE_PX, _LARGEST_SIZE_PX)
+    width_px, height_px = (int(_number("render", parameters, name, sizes_px)) for name in size[:2])
     largest_px = max(width_px, height_px)
     limits = (FOCAL_RATIO[0] * largest_px, FOCAL_RATIO[1] * largest_px)
     focal_px = _number("render", parameters, "focal_px", limits)

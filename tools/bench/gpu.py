@@ -104,7 +104,8 @@ def compare_with_reference(kernels: Kernels) -> dict[str, float]:
         error = float(np.mean((image - true_image) ** 2))
         errors.setdefault("psnr_db", []).append(-10.0 * np.log10(max(error, 1e-20)))
         for name, a, b in zip((*GROUPS, "pose"), measured, true):
-            errors.setdefault(name, []).append(float(np.linalg.norm(a - b) / max(np.linalg.norm(b), 1e-12)))
+            length = max(float(np.linalg.norm(b)), 1e-12)
+            errors.setdefault(name, []).append(float(np.linalg.norm(a - b)) / length)
     psnr_db = min(errors.pop("psnr_db"))
     return {"psnr_db": psnr_db, **{name: max(values) for name, values in errors.items()}}
 

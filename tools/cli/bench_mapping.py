@@ -10,6 +10,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from beamsplat.common.errors import UserError
 from beamsplat.services.mapping.config import EngineName
 from beamsplat.tools.cli.options import writable
 
@@ -115,7 +116,7 @@ def bench_gpu(
     data: Annotated[
         Path | None, typer.Option(help="Recording with truth: also run `bench map` on it, with the GPU")
     ] = None,
-    tile: Annotated[int, typer.Option(help="Side of the rasterizer's tiles, px: 8 or 16")] = 8,
+    tile: Annotated[int, typer.Option(min=8, max=16, help="Side of the rasterizer's tiles, px: 8 or 16")] = 8,
     repeats: Annotated[int, typer.Option(min=10, help="Timed steps of each case")] = 100,
     as_json: JsonOption = False,
 ) -> None:
@@ -131,6 +132,8 @@ def bench_gpu(
     """
     from beamsplat.services.mapping.engines.choice import check_cuda
 
+    if tile not in (8, 16):
+        raise UserError(f"--tile {tile}: expected 8 or 16")
     check_cuda()
     from beamsplat.common.raster.cuda.driver import CudaKernels
     from beamsplat.tools.bench.gpu import bench_gpu as run

@@ -31,8 +31,15 @@ class OptimiserStep(NamedTuple):
 class Engine(Protocol):
     """Renders and optimises the Gaussians of `store`."""
 
-    description: str  # the device, for the status; the bits of the map depend on it
-    store: GaussianStore
+    @property
+    def description(self) -> str:
+        """Return the device, for the status; the bits of the map depend on it."""
+        ...
+
+    @property
+    def store(self) -> GaussianStore:
+        """Return the Gaussians."""
+        ...
 
     def render(self, camera: RasterCamera, T_camera_map: np.ndarray) -> np.ndarray:
         """Return the map as float32 [5, H, W]: red, green, blue, accumulated depth (m), alpha."""
