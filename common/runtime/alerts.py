@@ -37,7 +37,7 @@ def conditions(
 
     Args:
         records: the newest health of each node of this robot by node name.
-        own_clock_id: of this host: a silent host is told from a silent node of this host by it.
+        own_clock_id: clock of this host; a robot with the same one runs on this host.
         now: reading of `time.monotonic`, s.
     """
     found: dict[AlertKey, str] = {}
