@@ -15,6 +15,7 @@ from beamsplat.common.raster.camera import RasterCamera
 MAX_DEPTH_M = 60.0  # larger depths are unknown; fits uint16 millimetres
 _MIN_DEPTH_M = 0.05
 _UNKNOWN_REACH_M = 20.0  # assumed visible range where the depth is unknown
+REACH_TILES = (6, 8)  # rows and columns of the image tiles that have a visible range each
 # Largest distance of a keyframe from its anchor. Submaps are a few dozen metres at most.
 MAX_ANCHOR_DISTANCE_M = 200.0
 
@@ -117,7 +118,8 @@ class StoredKeyframe:
     exposure_first: np.ndarray = field(default_factory=lambda: np.zeros(6))
     exposure_second: np.ndarray = field(default_factory=lambda: np.zeros(6))
     exposure_steps: int = 0
-    reach_m: float = MAX_DEPTH_M  # visible range (optical z): far plane of the view frustum
+    # float32 [6, 8]: visible range (optical z) of each image tile, the far plane of its part of the frustum
+    reach_m: np.ndarray = field(default_factory=lambda: np.full(REACH_TILES, MAX_DEPTH_M, np.float32))
 
     def T_anchor_refined(self) -> np.ndarray:
         """Return T_anchor_camera (SLAM) @ delta (mapper)."""
@@ -173,19 +175,23 @@ def unobserved_levels(camera: RasterCamera) -> list[PyramidLevel]:
     return out
 
 
-def visible_range_m(frame: RgbdKeyframe) -> float:
-    """Return the optical z (m) beyond which the keyframe observes nothing, from its largest depth.
+def visible_range_m(frame: RgbdKeyframe) -> np.ndarray:
+    """Return the optical z (m) beyond which the keyframe observes nothing, float32 [6, 8] by image tile.
 
-    It is at least `_UNKNOWN_REACH_M` if more than 5 % of the image has no depth: these pixels may show the
-    space behind a door or a window.
+    It is the largest depth of the tile with a margin, and at least `_UNKNOWN_REACH_M` if more than 5 % of the
+    tile has no depth: these pixels may show the space behind a door or a window.
     """
     with np.errstate(invalid="ignore"):
         known = (frame.depth_m > _MIN_DEPTH_M) & (frame.depth_m < MAX_DEPTH_M)
-    if not known.any():
-        return MAX_DEPTH_M
-    farthest_m = 1.1 * float(frame.depth_m[known].max()) + 0.5
-    unknown = ~known if frame.mask is None else ~known & frame.mask
-    return farthest_m if unknown.mean() < 0.05 else max(farthest_m, _UNKNOWN_REACH_M)
+    out = np.empty(REACH_TILES, np.float32)
+    rows, columns = (np.linspace(0, size, n + 1).astype(int) for size, n in zip(known.shape, REACH_TILES))
+    for i, j in np.ndindex(REACH_TILES):
+        tile = np.s_[rows[i] : rows[i + 1], columns[j] : columns[j + 1]]
+        seen = known[tile]
+        unknown = ~seen if frame.mask is None else ~seen & frame.mask[tile]
+        farthest_m = 1.1 * float(frame.depth_m[tile][seen].max()) + 0.5 if seen.any() else MAX_DEPTH_M
+        out[i, j] = farthest_m if unknown.mean() < 0.05 else max(farthest_m, _UNKNOWN_REACH_M)
+    return out
 
 
 def with_hidden(level: PyramidLevel, image: np.ndarray, exposure: np.ndarray) -> PyramidLevel:

@@ -39,7 +39,7 @@ _SPARE = 1.25
 _COPIES = 2  # of each Gaussian in memory: a checkpoint is written from a copy
 _MAX_TRIED = 32  # paged-out keyframes tested per call until one can be paged in
 _GUEST_EVERY = 16  # calls between two keyframes that are paged in with the blocks they observe
-_KEYFRAME_BYTES, _ANCHOR_BYTES, _BLOCK_BYTES, _ID_BYTES = 4500, 1000, 2000, 120  # bookkeeping, measured
+_KEYFRAME_BYTES, _ANCHOR_BYTES, _BLOCK_BYTES, _ID_BYTES = 4700, 1000, 2000, 120  # bookkeeping, measured
 _INSERTION_FACTOR = 8  # memory to insert a keyframe, as a multiple of its images
 
 

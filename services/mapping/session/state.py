@@ -16,6 +16,7 @@ from beamsplat.common.errors import UserError
 from beamsplat.common.mapfiles.blocks import Arrays
 from beamsplat.common.mapfiles.state import CAMERA_FIELDS, camera_of, progress_of, restore_store
 from beamsplat.services.mapping.keyframe import (
+    REACH_TILES,
     DeferredLevels,
     PyramidLevel,
     RgbdKeyframe,
@@ -126,6 +127,8 @@ def _keyframe(arrays: Arrays, row: int) -> StoredKeyframe:
     """Return the keyframe in a row of the arrays, without levels; fields not saved have their default."""
     stored = [n for n in _FIELDS if f"keyframe_{n}" in arrays]
     values = {n: _value(arrays[f"keyframe_{n}"][row]) for n in stored}
+    if "reach_m" in values:  # one for the whole image in sessions of earlier versions
+        values["reach_m"] = np.broadcast_to(np.float32(values["reach_m"]), REACH_TILES).copy()
     return StoredKeyframe(camera=camera_of(arrays, row), levels=[], **values)
 
 
