@@ -15,8 +15,8 @@ from beamsplat.tools.cli.options import session_folder, writable
 
 FORMATS = {
     "ply": "map.ply", "compressed-ply": "map.compressed.ply", "gltf": "map.glb", "spz": "map.spz",
-    "sog": "map.sog", "points": "points.ply", "las": "points.las", "e57": "points.e57", "mesh": "mesh.ply",
-    "octomap": "map.bt", "nav2": "nav2", "nerfstudio": "nerfstudio", "colmap": "colmap",
+    "sog": "map.sog", "usd": "map.usda", "points": "points.ply", "las": "points.las", "e57": "points.e57",
+    "mesh": "mesh.ply", "octomap": "map.bt", "nav2": "nav2", "nerfstudio": "nerfstudio", "colmap": "colmap",
 }  # fmt: skip
 SessionArgument = Annotated[
     Path,
@@ -65,11 +65,11 @@ def export(
     """Write a map for other programs, also while the map is being built.
 
     Splats: ply (3DGS layout), gltf (.glb with KHR_gaussian_splatting), spz (Niantic, small), sog and
-    compressed-ply (PlayCanvas, SuperSplat; small). points, las, e57: coloured points. mesh: coloured
-    triangles. octomap: occupied and free voxels. nav2: map.yaml (both layers), lidar.yaml, camera.yaml
-    (obstacles outside the lidar plane). nerfstudio, colmap: images, depth maps, poses and lidar points of the
-    keyframes; they need a saved session. All are in metres. z is up; gltf and spz: y up; sog and
-    compressed-ply: y down, which their viewers turn upright.
+    compressed-ply (PlayCanvas, SuperSplat; small), usd (OpenUSD 26.03 and newer; text). points, las, e57:
+    coloured points. mesh: coloured triangles. octomap: occupied and free voxels. nav2: map.yaml (both
+    layers), lidar.yaml, camera.yaml (obstacles outside the lidar plane). nerfstudio, colmap: images, depth
+    maps, poses and lidar points of the keyframes; they need a saved session. All are in metres. z is up;
+    gltf and spz: y up; sog and compressed-ply: y down, which their viewers turn upright.
 
     Examples:
 

@@ -15,7 +15,7 @@ from rich.console import Console
 from beamsplat.common.errors import UserError
 
 console = Console(stderr=True)
-SPLATS = ("ply", "compressed-ply", "gltf", "spz", "sog")
+SPLATS = ("ply", "compressed-ply", "gltf", "spz", "sog", "usd")
 POINTS = ("points", "las", "e57")
 DATASETS = ("nerfstudio", "colmap")
 RESOLUTION_M = 0.05  # of nav2 grids
@@ -84,6 +84,8 @@ def _splat_writer(to: str) -> Any:
         from beamsplat.common.mapfiles.gltf import write_gltf as write
     elif to == "sog":
         from beamsplat.common.mapfiles.sog import write_sog as write
+    elif to == "usd":
+        from beamsplat.common.mapfiles.usd import write_usd as write
     else:
         from beamsplat.common.mapfiles.spz import write_spz as write
     return write

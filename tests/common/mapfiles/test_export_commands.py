@@ -56,7 +56,8 @@ def run(*words):
 def test_every_format_is_written_where_it_is_asked_for(session, tmp_path):
     params = SessionFolder(session).read_state()["store_params"]
     formats = {"ply": "a.ply", "gltf": "b.glb", "spz": "c.spz", "points": "d.ply", "sog": "e.sog",
-               "compressed-ply": "f.ply", "las": "g.las", "octomap": "h.bt"}  # fmt: skip
+               "compressed-ply": "f.ply", "las": "g.las", "octomap": "h.bt",
+               "usd": "i.usda"}  # fmt: skip
     for to, name in formats.items():
         assert str(tmp_path / name) in run("export", session, "--to", to, "--out", tmp_path / name)
     assert PlyData.read(tmp_path / "a.ply")["vertex"].count == params.shape[1]
@@ -72,6 +73,7 @@ def test_every_format_is_written_where_it_is_asked_for(session, tmp_path):
     assert struct.unpack_from("<I", las, 107) == (points.count,)
     xyz = np.frombuffer(las, np.uint8, offset=227).reshape(-1, 26)[:, :12].copy().view("<i4") * 1e-4
     np.testing.assert_allclose(xyz, np.stack([points[axis] for axis in "xyz"], axis=1), atol=1e-4)
+    assert "def ParticleField3DGaussianSplat" in (tmp_path / "i.usda").read_text()
     assert (tmp_path / "h.bt").read_bytes().startswith(b"# Octomap OcTree binary file\n")
 
 
