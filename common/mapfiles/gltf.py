@@ -20,7 +20,8 @@ from beamsplat.common.mapfiles.y_up import QUAT_XYZW
 from beamsplat.common.raster.layout import COLOUR, MEAN, OPACITY, QUAT, SCALE
 
 _EXTENSION = "KHR_gaussian_splatting"
-_FLOAT, _SHORT = 5126, 5123
+FLOAT, _SHORT = 5126, 5123  # component types
+_VERTICES = 34962  # target of a buffer view
 _WIDTH = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 
 
@@ -45,7 +46,7 @@ def write_gltf(path: Path, params: np.ndarray) -> None:
         f"{_EXTENSION}:OPACITY": opacity[:, None].astype("<f4"),
         f"{_EXTENSION}:SH_DEGREE_0_COEF_0": ((colour - 0.5) / SH_C0).astype("<f4"),
     }
-    write_atomically(Path(path), _glb(attributes))
+    write_atomically(Path(path), _splats(attributes))
 
 
 def _linear(srgb: np.ndarray) -> np.ndarray:
@@ -53,20 +54,16 @@ def _linear(srgb: np.ndarray) -> np.ndarray:
     return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
 
 
-def _glb(attributes: dict[str, np.ndarray]) -> bytes:
-    views, accessors, pieces, offset = [], [], [], 0
-    for array in attributes.values():
-        blob = np.ascontiguousarray(array).tobytes()
-        views.append({"buffer": 0, "byteOffset": offset, "byteLength": len(blob), "target": 34962})
+def _splats(attributes: dict[str, np.ndarray]) -> bytes:
+    accessors = []
+    for number, array in enumerate(attributes.values()):
         accessor: dict[str, Any] = {
-            "bufferView": len(views) - 1, "count": len(array), "type": _WIDTH[array.shape[1]],
-            "componentType": _SHORT if array.dtype == np.uint16 else _FLOAT,
+            "bufferView": number, "count": len(array), "type": _WIDTH[array.shape[1]],
+            "componentType": _SHORT if array.dtype == np.uint16 else FLOAT,
         }  # fmt: skip
         if array.dtype == np.uint16:
             accessor["normalized"] = True
         accessors.append(accessor)
-        pieces.append(blob)
-        offset += len(blob)
     positions = attributes["POSITION"]
     accessors[0] |= {"min": positions.min(axis=0).tolist(), "max": positions.max(axis=0).tolist()}
     primitive = {
@@ -74,16 +71,33 @@ def _glb(attributes: dict[str, np.ndarray]) -> bytes:
         "extensions": {_EXTENSION: {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}},
     }  # fmt: skip
     document = {
-        "asset": {"version": "2.0", "generator": "BeamSplat"}, "extensionsUsed": [_EXTENSION],
-        "scene": 0, "scenes": [{"nodes": [0]}],
+        "extensionsUsed": [_EXTENSION],
         "nodes": [{"name": "map, metres", "mesh": 0, "rotation": list(QUAT_XYZW)}],
-        "meshes": [{"primitives": [primitive]}], "accessors": accessors, "bufferViews": views,
-        "buffers": [{"byteLength": offset}],
+        "meshes": [{"primitives": [primitive]}], "accessors": accessors,
     }  # fmt: skip
-    head = json.dumps(document, separators=(",", ":")).encode()
+    return glb(document, [(array, _VERTICES) for array in attributes.values()])
+
+
+def glb(document: dict[str, Any], parts: list[tuple[np.ndarray | bytes, int | None]]) -> bytes:
+    """Return a `.glb` file of one scene with node 0.
+
+    Args:
+        document: the rest of the JSON document; it refers to the parts as buffer views 0, 1, ...
+        parts: content and target (34962 = vertices, 34963 = indices, None = neither) of each buffer view.
+    """
+    views, pieces, offset = [], [], 0
+    for content, target in parts:
+        blob = content if isinstance(content, bytes) else np.ascontiguousarray(content).tobytes()
+        view = {"buffer": 0, "byteOffset": offset, "byteLength": len(blob)}
+        views.append(view if target is None else view | {"target": target})
+        pieces.append(blob + bytes(-len(blob) % 4))
+        offset += len(pieces[-1])
+    whole = {
+        "asset": {"version": "2.0", "generator": "BeamSplat"}, "scene": 0, "scenes": [{"nodes": [0]}],
+        **document, "bufferViews": views, "buffers": [{"byteLength": offset}],
+    }  # fmt: skip
+    head = json.dumps(whole, separators=(",", ":")).encode()
     head += b" " * (-len(head) % 4)
-    body = b"".join(pieces)
-    body += bytes(-len(body) % 4)
-    total = 12 + 8 + len(head) + 8 + len(body)
+    total = 12 + 8 + len(head) + 8 + offset
     return b"".join((struct.pack("<4sII", b"glTF", 2, total), struct.pack("<I4s", len(head), b"JSON"), head,
-                     struct.pack("<I4s", len(body), b"BIN\0"), body))  # fmt: skip
+                     struct.pack("<I4s", offset, b"BIN\0"), *pieces))  # fmt: skip

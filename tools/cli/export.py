@@ -16,7 +16,8 @@ from beamsplat.tools.cli.options import session_folder, writable
 FORMATS = {
     "ply": "map.ply", "compressed-ply": "map.compressed.ply", "gltf": "map.glb", "spz": "map.spz",
     "sog": "map.sog", "usd": "map.usda", "points": "points.ply", "las": "points.las", "e57": "points.e57",
-    "mesh": "mesh.ply", "octomap": "map.bt", "nav2": "nav2", "nerfstudio": "nerfstudio", "colmap": "colmap",
+    "mesh": "mesh.ply", "textured-mesh": "mesh.glb", "octomap": "map.bt", "nav2": "nav2",
+    "nerfstudio": "nerfstudio", "colmap": "colmap",
 }  # fmt: skip
 SessionArgument = Annotated[
     Path,
@@ -52,7 +53,9 @@ def export(
             help="points, las, e57: distance between points; nerfstudio, colmap: between lidar points",
         ),
     ] = 0.02,
-    voxel_m: Annotated[float, typer.Option(min=0.005, help="mesh, octomap: edge of a voxel")] = 0.04,
+    voxel_m: Annotated[
+        float, typer.Option(min=0.005, help="mesh, textured-mesh, octomap: edge of a voxel")
+    ] = 0.04,
     low_m: Annotated[
         float, typer.Option(min=-10.0, max=10.0, help="nav2: lower end of the obstacle band above the floor")
     ] = 0.10,
@@ -66,10 +69,12 @@ def export(
 
     Splats: ply (3DGS layout), gltf (.glb with KHR_gaussian_splatting), spz (Niantic, small), sog and
     compressed-ply (PlayCanvas, SuperSplat; small), usd (OpenUSD 26.03 and newer; text). points, las, e57:
-    coloured points. mesh: coloured triangles. octomap: occupied and free voxels. nav2: map.yaml (both
-    layers), lidar.yaml, camera.yaml (obstacles outside the lidar plane). nerfstudio, colmap: images, depth
-    maps, poses and lidar points of the keyframes; they need a saved session. All are in metres. z is up;
-    gltf and spz: y up; sog and compressed-ply: y down, which their viewers turn upright.
+    coloured points. mesh: triangles with coloured vertices. textured-mesh: triangles with a texture cut out
+    of the keyframes' images (.glb). octomap: occupied and free voxels. nav2: map.yaml (both layers),
+    lidar.yaml, camera.yaml (obstacles outside the lidar plane). nerfstudio, colmap: images, depth maps, poses
+    and lidar points of the keyframes; these two and textured-mesh need a saved session. All are in metres. z
+    is up; gltf, spz and textured-mesh: y up; sog and compressed-ply: y down, which their viewers turn
+    upright.
 
     Examples:
 
@@ -91,6 +96,8 @@ def export(
             written = formats.write_points(path, to, map_, cell_m)
         elif to == "mesh":
             written = formats.write_mesh(path, map_, voxel_m)
+        elif to == "textured-mesh":
+            written = formats.write_textured_mesh(path, map_, voxel_m)
         elif to == "octomap":
             written = formats.write_octomap(path, map_, voxel_m)
         elif to == "nav2":
@@ -112,7 +119,7 @@ def _target(session: Path, to: str, out: Path | None) -> Path:
     """
     if to not in FORMATS:
         raise UserError(f"--to {to!r}: choose one of {', '.join(FORMATS)}")
-    if to in formats.DATASETS and _running(session):
+    if to in formats.WITH_IMAGES and _running(session):
         raise UserError(
             f"--to {to}: needs the images of a saved session, and {session} is a running system: give the "
             "folder of its option `mapping.session`"

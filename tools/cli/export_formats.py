@@ -18,6 +18,7 @@ console = Console(stderr=True)
 SPLATS = ("ply", "compressed-ply", "gltf", "spz", "sog", "usd")
 POINTS = ("points", "las", "e57")
 DATASETS = ("nerfstudio", "colmap")
+WITH_IMAGES = (*DATASETS, "textured-mesh")  # formats that need the images of a saved session
 RESOLUTION_M = 0.05  # of nav2 grids
 _MIN_FACES = 60  # of a connected component of the mesh; smaller ones are removed
 _VIEWS = 12  # viewpoints to measure the loss of merged detail
@@ -138,17 +139,61 @@ def _surface_box(views: list[Any]) -> tuple[Any, Any]:
     return np.percentile(corners, 5.0, axis=0), np.percentile(corners, 95.0, axis=0)
 
 
-def write_mesh(path: Path, map_: ExportedMap, voxel_m: float) -> str:
-    """Write the surface as a coloured mesh (PLY)."""
+def _mesh_of(views: list[Any], voxel_m: float) -> Any:
+    """Return the surface in rendered views as a TriangleMesh."""
     from beamsplat.common.mapfiles.mesh import TsdfVolume, remove_small_components, surface_nets
-    from beamsplat.common.mapfiles.surface import write_ply
 
-    views = list(_views(map_))
     field = TsdfVolume.around(*_surface_box(views), voxel_m)
     field.add(views)
-    mesh = remove_small_components(surface_nets(field), _MIN_FACES)
+    return remove_small_components(surface_nets(field), _MIN_FACES)
+
+
+def write_mesh(path: Path, map_: ExportedMap, voxel_m: float) -> str:
+    """Write the surface as a coloured mesh (PLY)."""
+    from beamsplat.common.mapfiles.surface import write_ply
+
+    mesh = _mesh_of(list(_views(map_)), voxel_m)
     write_ply(path, mesh.vertices_m, mesh.colours, mesh.faces)
     return f"{len(mesh.faces)} triangles"
+
+
+def write_textured_mesh(path: Path, map_: ExportedMap, voxel_m: float) -> str:
+    """Write the surface as a mesh with a texture from the images of the keyframes (glTF)."""
+    from beamsplat.common.mapfiles import textured_mesh
+    from beamsplat.common.mapfiles.session import SessionFolder
+    from beamsplat.common.mapfiles.texture import choose_views
+    from beamsplat.tools.sessions.frames import SessionFrames
+
+    frames = SessionFrames(SessionFolder(map_.session), map_.arrays)
+    rendered = list(_views(map_))
+    mesh = _mesh_of(rendered, voxel_m)
+    keyframes, views = [], []
+    for keyframe, view in zip(frames.views, rendered):
+        frame = frames.frame(keyframe)
+        if frame is not None:
+            keyframes.append(keyframe)
+            views.append(textured_mesh.without_masked(view, frame.mask))
+    choice = choose_views(mesh, views, [keyframe.camera for keyframe in keyframes])
+
+    def image(number: int) -> Any:
+        frame = frames.frame(keyframes[number])
+        if frame is None:
+            raise UserError(f"{map_.session}: {frames.lost[-1]}")
+        return frames.as_mapped(frame)
+
+    images = textured_mesh.ImageOf(keyframes, image)
+    width, height = textured_mesh.write_textured_mesh(path, mesh, choice, images)
+    _report_left_out(frames.lost)
+    used = len(set(choice.view[choice.view >= 0].tolist()))
+    return (
+        f"{len(mesh.faces)} triangles, {(choice.view >= 0).mean():.0%} of them with the texture "
+        f"({width} x {height} px) of {used} images"
+    )
+
+
+def _report_left_out(lost: list[str]) -> None:
+    for fault in lost:
+        console.print(f"left out: {fault}", style="yellow", markup=False, soft_wrap=True)
 
 
 def write_octomap(path: Path, map_: ExportedMap, voxel_m: float) -> str:
@@ -220,6 +265,5 @@ def write_dataset(path: Path, to: str, map_: ExportedMap, cell_m: float, text: b
         os.replace(partial, path)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
-    for fault in frames.lost:
-        console.print(f"left out: {fault}", style="yellow", markup=False, soft_wrap=True)
+    _report_left_out(frames.lost)
     return f"{len(dataset.entries)} images with depth, {len(dataset.points.sigma_m)} lidar points"

@@ -30,6 +30,8 @@ class SessionFrames:
         self.views = keyframe_views(arrays)
         self.lost: list[str] = []
         self._folder = folder
+        exposures = arrays.get("keyframe_exposure", np.zeros((0, 6)))
+        self._exposures = dict(zip(arrays["keyframe_id"].tolist(), exposures))
         self._lens = lru_cache(maxsize=4)(Undistorter)
         self._valid: Callable[[Pinhole], np.ndarray] = lru_cache(maxsize=4)(self._inside_original)
 
@@ -38,10 +40,23 @@ class SessionFrames:
 
     def __iter__(self) -> Iterator[DatasetFrame]:
         for view in self.views:
-            try:
-                yield self._frame(view)
-            except (UserError, ValueError) as error:
-                self.lost.append(f"keyframe {view.id}: {reason(error)}")
+            frame = self.frame(view)
+            if frame is not None:
+                yield frame
+
+    def frame(self, view: KeyframeView) -> DatasetFrame | None:
+        """Return one of the keyframes; None if its file is missing or damaged, which is added to `lost`."""
+        try:
+            return self._frame(view)
+        except (UserError, ValueError) as error:
+            self.lost.append(f"keyframe {view.id}: {reason(error)}")
+            return None
+
+    def as_mapped(self, frame: DatasetFrame) -> np.ndarray:
+        """Return the image of a keyframe with the exposure of the map, uint8 [H, W, 3]."""
+        exposure = self._exposures.get(frame.id, np.zeros(6)).astype(np.float64)
+        image = (frame.rgb / 255.0 - exposure[3:]) / np.exp(exposure[:3])
+        return (np.clip(image, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
 
     def _frame(self, view: KeyframeView) -> DatasetFrame:
         message = decode(*self._folder.read_keyframe(view.id))
