@@ -10,8 +10,9 @@ import typer
 from rich.console import Console
 
 from beamsplat.common.errors import UserError
-from beamsplat.tools.cli.options import session_folder, writable
-from beamsplat.tools.cli.session import ROBOT_MANIFEST, JsonOption, _locked, _parsed_pose, _read, load_slam
+from beamsplat.tools.cli.options import parsed_pose, session_folder, writable
+from beamsplat.tools.cli.session import JsonOption
+from beamsplat.tools.sessions.opened import ROBOT_MANIFEST, load_slam, locked, read_saved
 
 console = Console(stderr=True)
 
@@ -55,7 +56,7 @@ def compare(
 
     from beamsplat.tools.compare.comparison import OpenedSession, compare_sessions, write_comparison
 
-    with _locked(first, shared=True) as folder_a, _locked(second, shared=True) as folder_b:
+    with locked(first, shared=True) as folder_a, locked(second, shared=True) as folder_b:
         opened = []
         for folder in (folder_a, folder_b):
             if not (folder.robot / ROBOT_MANIFEST).is_file():
@@ -63,11 +64,11 @@ def compare(
                     f"{folder.path}: has no robot half (lidar map), by which two drives are aligned; add it "
                     "with `beamsplat session join`"
                 )
-            opened.append(OpenedSession(folder, _read(folder), load_slam(folder.robot)))
+            opened.append(OpenedSession(folder, read_saved(folder), load_slam(folder.robot)))
         with Progress(console=console, transient=True) as bar:
             task = bar.add_task("reading", total=None)
             result = compare_sessions(
-                opened[0], opened[1], _parsed_pose(place) if place else None, threads,
+                opened[0], opened[1], parsed_pose(place) if place else None, threads,
                 lambda stage, done, total: bar.update(
                     task, description=stage, completed=done, total=total or None
                 ),

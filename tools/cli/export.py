@@ -141,7 +141,7 @@ def _open(session: Path) -> tuple[dict[str, Any], Callable[[], Any]]:
     if _running(session):
         return _from_mapper(session)
     from beamsplat.common.mapfiles.session import SessionFolder
-    from beamsplat.tools.cli.session import ROBOT_MANIFEST, load_slam
+    from beamsplat.tools.sessions.opened import ROBOT_MANIFEST, load_slam
 
     folder = SessionFolder(session)
     arrays = folder.read_state()

@@ -26,6 +26,7 @@ from beamsplat.tools.cli import info as replay_cli
 from beamsplat.tools.cli import keys as keys_cli
 from beamsplat.tools.cli import models as models_cli
 from beamsplat.tools.cli import session as session_cli
+from beamsplat.tools.cli import session_edit as edit_cli
 from beamsplat.tools.cli import setup as setup_cli
 from beamsplat.tools.cli import simulate as simulator_cli
 from beamsplat.tools.cli import slam as localization_cli
@@ -60,6 +61,8 @@ for command in (
 ):  # fmt: skip
     app.command(rich_help_panel=_RESULTS)(command)
 
+for command in (edit_cli.edit, edit_cli.undo):
+    session_cli.app.command()(command)
 app.add_typer(session_cli.app, name="session", rich_help_panel=_RESULTS)
 
 evaluate = typer.Typer(no_args_is_help=True, help="Errors against truth.")

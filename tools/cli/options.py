@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from beamsplat.common.errors import UserError
 from beamsplat.common.files.persist import check_can_write
+
+if TYPE_CHECKING:
+    import numpy as np
 
 ScanTopic = Annotated[str, typer.Option(help="Topic of the lidar; needed if the choice is not clear.")]
 ImageTopic = Annotated[str, typer.Option(help="Topic of the camera; needed if the choice is not clear.")]
@@ -45,3 +48,18 @@ def session_folder(path: Path) -> Path:
         )
     inner = path / "session"
     return inner if not SessionFolder(path).exists() and SessionFolder(inner).exists() else path
+
+
+def parsed_pose(text: str) -> np.ndarray:
+    """Return the planar pose float64 [3] (x m, y m, yaw rad) of a text "X,Y,DEG" (m, m, degrees).
+
+    Raises:
+        UserError: the text has another form.
+    """
+    import numpy as np
+
+    try:
+        x_m, y_m, yaw_deg = (float(word) for word in text.split(","))
+    except ValueError as error:
+        raise UserError(f"--place {text!r}: expected X,Y,DEG, for example 12.4,-3.1,90") from error
+    return np.array([x_m, y_m, np.radians(yaw_deg)])

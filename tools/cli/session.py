@@ -5,9 +5,7 @@ A session has two halves: the edge half (Gaussians and keyframes) and the robot 
 
 from __future__ import annotations
 
-import contextlib
 import json
-from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -15,19 +13,28 @@ import typer
 from rich.console import Console
 
 from beamsplat.common.errors import UserError
-from beamsplat.tools.cli.options import session_folder, writable
+from beamsplat.tools.cli.options import parsed_pose, session_folder, writable
+from beamsplat.tools.sessions.opened import (
+    ROBOT_MANIFEST,
+    created,
+    faults_explained,
+    load_slam,
+    locked,
+    newer_keyframes,
+    read_saved,
+    write_saved,
+)
 
 if TYPE_CHECKING:
     from beamsplat.common.files.numbered_state import Arrays
     from beamsplat.common.mapfiles.session import SessionFolder
 
 console = Console(stderr=True)
-app = typer.Typer(no_args_is_help=True, help="Saved maps: inspect, join, merge, prune.")
+app = typer.Typer(no_args_is_help=True, help="Saved maps: inspect, join, merge, prune, edit.")
 SessionArgument = Annotated[
     Path, typer.Argument(callback=session_folder, help="Folder written by `mapping.session = DIR`")
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object")]
-ROBOT_MANIFEST = "lidar_map.json"
 _AROUND_NS = 60_000_000_000  # largest time between a keyframe and the scans of the same drive
 
 
@@ -47,7 +54,7 @@ def info(session: SessionArgument, as_json: JsonOption = False) -> None:
         edge["keyframes_on_disk"] = len(folder.keyframe_ids())
         state = folder.read_state()
         assert state is not None  # there is a manifest
-        edge["keyframes_newer"] = _newer(folder, state)
+        edge["keyframes_newer"] = newer_keyframes(folder, state)
         edge["map_uuid"] = _map_uuid(state)
     robot = _robot_summary(folder.robot) if (folder.robot / ROBOT_MANIFEST).is_file() else None
     table = {"uuid": head["uuid"], "version": head["version"], "edge": edge, "robot": robot}
@@ -96,12 +103,12 @@ def join(
     from beamsplat.common.geometry.transforms import se2_to_se3
     from beamsplat.tools.sessions.edit import with_anchors
 
-    with _locked(session) as folder:
-        arrays = _read(folder)
+    with locked(session) as folder:
+        arrays = read_saved(folder)
         slam = load_slam(robot)
         _same_drive(session, robot, arrays, slam)
         T_map_anchor = {id: se2_to_se3(pose) for id, pose in slam.anchors().items()}
-        _write(folder, with_anchors(arrays, T_map_anchor), slam)
+        write_saved(folder, with_anchors(arrays, T_map_anchor), slam)
     missing = [a for a in arrays["anchor_id"].tolist() if a >= 0 and a not in T_map_anchor]
     more = f"; {len(missing)} anchors that the robot has removed keep their pose" if missing else ""
     print(f"{session}: {len(T_map_anchor)} submaps joined{more}")
@@ -139,7 +146,7 @@ def merge(
     target = SessionFolder(out)
     if target.exists():
         raise UserError(f"{out}: contains a session already; choose another folder")
-    with _locked(first, shared=True) as folder_a, _locked(second, shared=True) as folder_b, _created(target):
+    with locked(first, shared=True) as folder_a, locked(second, shared=True) as folder_b, created(target):
         arrays, before, doubt = _merged(folder_a, folder_b, target, place)
     left, count = arrays["store_params"].shape[1], len(arrays["keyframe_id"])
     print(f"{out}: {count} keyframes, {left} Gaussians; {before - left} duplicates removed")
@@ -165,11 +172,11 @@ def _merged(
     from beamsplat.tools.sessions.edit import merged, with_anchors
     from beamsplat.tools.sessions.merge import deduplicated, merge_doubt
 
-    a, b = _read(folder_a), _read(folder_b)
+    a, b = read_saved(folder_a), read_saved(folder_b)
     both = all((folder.robot / ROBOT_MANIFEST).is_file() for folder in (folder_a, folder_b))
     slams = [load_slam(folder.robot) for folder in (folder_a, folder_b)] if both else []
     alignment = None if place else _aligned(folder_a.path, folder_b.path, slams)
-    pose_a_b = _parsed_pose(place) if alignment is None else alignment.pose_a_b
+    pose_a_b = parsed_pose(place) if alignment is None else alignment.pose_a_b
     known = [*a["anchor_id"].tolist(), *(slams[0].pose_graph.submaps if slams else [])]
     offset = max([*known, -1]) + 2  # -1 is the odom origin of the second map
     arrays, doubt = merged(a, b, se2_to_se3(pose_a_b), offset), ""
@@ -182,7 +189,7 @@ def _merged(
         if alignment is not None:
             doubt = merge_doubt(alignment.agreeing, alignment.queried, loops)
     ids = set(arrays["keyframe_id"].tolist())
-    with _faults_explained(target):
+    with faults_explained(target):
         for folder in (folder_a, folder_b):
             for id in ids.intersection(folder.keyframe_ids()):
                 target.write_keyframe(id, *folder.read_keyframe(id))
@@ -190,7 +197,7 @@ def _merged(
     arrays = deduplicated(
         target, arrays, offset, lambda views: track(views, "comparing", console=console, transient=True)
     )
-    _write(target, arrays, slams[0] if slams else None)
+    write_saved(target, arrays, slams[0] if slams else None)
     return arrays, before, doubt
 
 
@@ -212,11 +219,11 @@ def prune(
     from beamsplat.common.mapfiles.state import progress_of
     from beamsplat.tools.sessions.edit import pruned
 
-    with _locked(session) as folder:
-        arrays = _read(folder)
+    with locked(session) as folder:
+        arrays = read_saved(folder)
         before = _bytes(session)
         out = pruned(arrays, opacity, keyframes)
-        _write(folder, out)
+        write_saved(folder, out)
         folder.remove_keyframes(progress_of(out)["forgotten"])
     gaussians = [a["store_params"].shape[1] for a in (arrays, out)]
     print(
@@ -227,114 +234,6 @@ def prune(
 
 def _bytes(path: Path) -> int:
     return sum(file.stat().st_size for file in path.rglob("*") if file.is_file())
-
-
-@contextlib.contextmanager
-def _locked(session: Path, shared: bool = False) -> Iterator[SessionFolder]:
-    """Hold the lock of a session, from before it is read until its changes are written.
-
-    Args:
-        shared: for a session that is only read.
-
-    Raises:
-        UserError: there is no session, another process uses it, or it cannot be locked.
-    """
-    from beamsplat.common.mapfiles.session import SessionFolder
-
-    folder = SessionFolder(session)
-    folder.header()  # before a lock file is created
-    try:
-        folder.lock(shared)
-    except OSError as error:
-        raise UserError(f"{session}: cannot be locked ({error.strerror})") from error
-    try:
-        yield folder
-    finally:
-        folder.unlock()
-
-
-@contextlib.contextmanager
-def _created(target: SessionFolder) -> Iterator[None]:
-    """Create a session and hold its lock; it is removed again if nothing is written to it.
-
-    Raises:
-        UserError: it cannot be created, or another process has created it meanwhile.
-    """
-    with _faults_explained(target):
-        target.create()
-        target.lock()
-    try:
-        if target.manifest() is not None:
-            raise UserError(f"{target.path}: contains a session already; choose another folder")
-        yield
-    finally:
-        target.unlock()
-
-
-@contextlib.contextmanager
-def _faults_explained(folder: SessionFolder) -> Iterator[None]:
-    """Convert the OSError of writing to a session to a UserError."""
-    try:
-        yield
-    except OSError as error:
-        raise UserError(
-            f"{folder.path}: not written ({error.strerror}); what was saved before is still valid"
-        ) from error
-
-
-def _read(folder: SessionFolder) -> Arrays:
-    """Return the arrays of the last checkpoint of a session.
-
-    Raises:
-        UserError: there is no checkpoint, or it cannot be read.
-    """
-    arrays = folder.read_state()
-    if arrays is None:
-        raise UserError(f"{folder.path}: nothing has been saved in this session yet")
-    newer = _newer(folder, arrays)
-    if newer:
-        console.print(f"[yellow]{folder.path}: {newer} keyframes are newer than the checkpoint and not "
-                      "included; a mapper that resumes inserts them[/]")  # fmt: skip
-    return arrays
-
-
-def _newer(folder: SessionFolder, arrays: Arrays) -> int:
-    from beamsplat.common.mapfiles.state import progress_of
-
-    known = {*arrays["extra_taken_id"].tolist(), *progress_of(arrays)["forgotten"]}
-    return len(set(folder.keyframe_ids()) - known)
-
-
-def _write(folder: SessionFolder, arrays: Arrays, slam: Any = None) -> None:
-    """Write the state of a locked session, and the robot half `slam`, if one is given.
-
-    Raises:
-        UserError: the disk is full or broken.
-    """
-    from beamsplat.tools.sessions.edit import summary_of
-
-    with _faults_explained(folder):
-        if slam is not None:
-            slam.save(folder.robot)
-        folder.write_state(arrays, summary_of(arrays))
-        folder.remove_blocks(folder.block_numbers())  # all Gaussians are in the state now
-
-
-def load_slam(path: Path) -> Any:
-    """Return the lidar SLAM that is saved in the robot half of a session.
-
-    `path` is the folder of the saved state, or contains it as `state`.
-
-    Raises:
-        UserError: there is no saved state, or it cannot be read.
-    """
-    import numpy as np
-
-    from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
-    from beamsplat.services.localization.lidar2d.slam import LidarSlam
-
-    folder = path if (path / ROBOT_MANIFEST).is_file() else path / "state"
-    return LidarSlam.load(folder, LidarSlamSettings(), np.eye(4))  # T_body_lidar is needed for scans only
 
 
 def _same_drive(session: Path, robot: Path, arrays: Arrays, slam: Any) -> None:
@@ -364,17 +263,6 @@ def _same_drive(session: Path, robot: Path, arrays: Arrays, slam: Any) -> None:
             f"{robot}: only {inside.mean():.0%} of the keyframes of {session} were taken during its scans: "
             "it is the robot half of another drive"
         )
-
-
-def _parsed_pose(text: str) -> Any:
-    """Return the planar pose float64 [3] (x m, y m, yaw rad) of a text "X,Y,DEG" (m, m, degrees)."""
-    import numpy as np
-
-    try:
-        x_m, y_m, yaw_deg = (float(word) for word in text.split(","))
-    except ValueError as error:
-        raise UserError(f"--place {text!r}: expected X,Y,DEG, for example 12.4,-3.1,90") from error
-    return np.array([x_m, y_m, np.radians(yaw_deg)])
 
 
 def _aligned(first: Path, second: Path, slams: list[Any]) -> Any:

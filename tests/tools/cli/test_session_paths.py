@@ -102,10 +102,10 @@ def test_a_merge_that_cannot_be_trusted_ends_with_code_3_and_says_what_to_do(
         pose_graph=SimpleNamespace(submaps=[0]), anchors=dict, save=lambda folder: folder.mkdir()
     )
     alignment = MapAlignment(np.zeros(3), 10, 24)
-    monkeypatch.setattr(session_cli, "_read", lambda folder: arrays)
+    monkeypatch.setattr(session_cli, "read_saved", lambda folder: arrays)
     monkeypatch.setattr(session_cli, "load_slam", lambda path: slam)
     monkeypatch.setattr(session_cli, "_aligned", lambda *_: alignment)
-    monkeypatch.setattr(session_cli, "_write", lambda *_: None)
+    monkeypatch.setattr(session_cli, "write_saved", lambda *_: None)
     edit, merge = "beamsplat.tools.sessions.edit", "beamsplat.tools.sessions.merge"
     monkeypatch.setattr(f"{edit}.merged", lambda *_: arrays)
     monkeypatch.setattr(f"{edit}.with_anchors", lambda *_: arrays)
