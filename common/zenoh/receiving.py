@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import atexit
+import contextlib
 import threading
+import time
 from collections.abc import Callable
 from typing import Protocol, TypeVar
 
@@ -10,6 +13,8 @@ import zenoh
 
 T_co = TypeVar("T_co", covariant=True)
 T = TypeVar("T")
+_EXIT_S = 1.0  # for the threads to end, at the end of the interpreter
+_receiving: dict[threading.Thread, zenoh.Session] = {}
 
 
 class Receiver(Protocol[T_co]):
@@ -51,4 +56,26 @@ def receive_in_thread(
                     return
                 raise
 
-    threading.Thread(target=receive, name=name, daemon=True).start()
+    def receive_until_closed() -> None:
+        try:
+            receive()
+        finally:
+            with contextlib.suppress(KeyError):
+                del _receiving[thread]
+
+    thread = threading.Thread(target=receive_until_closed, name=name, daemon=True)
+    _receiving[thread] = session
+    thread.start()
+
+
+@atexit.register
+def _join_threads() -> None:
+    """Wait for the threads whose session is closed.
+
+    A thread that returns from `recv` while the interpreter ends is unwound through Zenoh's Rust code, which
+    aborts the process: "FATAL: exception not rethrown".
+    """
+    deadline = time.monotonic() + _EXIT_S
+    for thread, session in list(_receiving.items()):
+        if session.is_closed():
+            thread.join(max(0.0, deadline - time.monotonic()))

@@ -13,6 +13,7 @@ from beamsplat.services.localization.lidar2d.odometry import MotionErrorModel, O
 from beamsplat.services.localization.lidar2d.scan import RawScan, duration_s
 from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
 from beamsplat.services.localization.lidar2d.twist import TwistErrorModel, exp_twist, twist
+from beamsplat.services.localization.lidar2d.wheel_gap import POSITION_SIGMA_M
 
 NS = 1e-9
 
@@ -43,17 +44,31 @@ class MotionPredictor:
         self.stamps: list[int] = []  # recent stamps and poses, newest last
         self.poses: list[np.ndarray] = []
         self.last_matched: tuple[int, np.ndarray] = (0, np.zeros(3))  # stamp and pose of the last good match
+        # The last good match before the clock was set back, while the motion over that is not known.
+        self._set_back: tuple[int, np.ndarray] | None = None
 
     def restart_clock(self, stamp_ns: int) -> None:
         """Continue at the stamp `stamp_ns`, after the clock was set back: from where the wheels say, else
-        from the last pose."""
-        if self.poses:
-            pose, moved = self.poses[-1], self.odometry.motion_over_set_back(self.last_matched[0], stamp_ns)
-            if moved is not None:
-                pose = se2.compose(self.last_matched[1], moved)
-            self.stamps, self.poses = [stamp_ns - round(0.1 / NS)], [pose]
-            self.last_matched = self.stamps[-1], self.poses[-1]
-            self.reckoning.restart(stamp_ns, self.poses[-1])
+        from the last pose, until the wheels or a match say more."""
+        if not self.poses:
+            return
+        before = self._set_back or self.last_matched
+        self.odometry.clock_set_back(self.stamps[-1], stamp_ns)
+        moved = self.odometry.motion_over_set_back(before[0], stamp_ns)
+        pose = self.poses[-1] if moved is None else se2.compose(before[1], moved)
+        self._set_back = before if moved is None else None
+        self.stamps, self.poses = [stamp_ns - round(0.1 / NS)], [pose]
+        self.last_matched = self.stamps[-1], before[1] if moved is None else pose
+        self.reckoning.restart(stamp_ns, pose)
+
+    def start_segment(self, stamp_ns: int, pose_odom_body: np.ndarray) -> bool:
+        """Continue from a pose that begins a new segment of the trajectory.
+
+        Returns whether the clock was set back since the last match, and the motion over it is not known.
+        """
+        unknown, self._set_back = self._set_back is not None, None
+        self.last_matched = stamp_ns, pose_odom_body
+        return unknown
 
     def velocity(self) -> np.ndarray:
         """Return the body twist (m/s, m/s, rad/s) over the last 0.15 s or the last scan interval."""
@@ -73,7 +88,7 @@ class MotionPredictor:
         Predictions are by constant velocity, standstill and wheel odometry; while dead reckoning is active,
         its prediction is returned. Pass the second value to `accept`.
         """
-        if self.is_in_gap(stamp_ns) and (gap := self._predict_over_gap(stamp_ns)):
+        if (self._set_back or self.is_in_gap(stamp_ns)) and (gap := self._predict_over_gap(stamp_ns)):
             return gap, []
         dt = (stamp_ns - self.stamps[-1]) * NS
         steady = exp_twist(self.velocity(), min(dt, self.settings.extrapolate_s))
@@ -109,9 +124,11 @@ class MotionPredictor:
 
         None if wheel odometry without a gap covers the time.
         """
-        if self.odometry.is_continuous(self.last_matched[0], stamp_ns):
+        if not self._set_back and self.odometry.is_continuous(self.last_matched[0], stamp_ns):
             return None
         moved = self.gap_motion(stamp_ns)
+        if moved is None and not self.is_in_gap(stamp_ns):
+            return None
         if moved is None:
             dt = (stamp_ns - self.last_matched[0]) * NS
             sigma_m, sigma_rad = self._standstill_error.sigmas(np.zeros(3), dt)
@@ -127,6 +144,12 @@ class MotionPredictor:
 
     def gap_motion(self, stamp_ns: int) -> Prediction | None:
         """Return the motion by the wheels since the last good match, None if the wheels do not tell it."""
+        if self._set_back is not None:
+            moved = self.odometry.motion_over_set_back(self._set_back[0], stamp_ns)
+            if moved is None:
+                return None
+            sigma_m, sigma_rad = self._wheel_error.sigmas(moved, 0.0)
+            return Prediction(moved, POSITION_SIGMA_M + sigma_m, sigma_rad, "wheels", True)
         over_gap = self.odometry.motion_over_gap(self.last_matched[0], stamp_ns)
         dt = (stamp_ns - self.last_matched[0]) * NS
         if over_gap is None or not self._is_plausible(over_gap.motion, dt):
@@ -184,7 +207,7 @@ class MotionPredictor:
             matched: whether the pose is that of an accepted match.
         """
         if matched:
-            self.last_matched = stamp_ns, pose_odom_body
+            self.last_matched, self._set_back = (stamp_ns, pose_odom_body), None
         if self.poses:
             moved = se2.between(self.poses[-1], pose_odom_body)
             for model, motion in predictions:

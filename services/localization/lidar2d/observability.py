@@ -8,7 +8,8 @@ import math
 import numpy as np
 
 from beamsplat.common.compiled import kernel
-from beamsplat.services.localization.lidar2d.scan_matching import Match, accumulate
+from beamsplat.services.localization.lidar2d.matching_kernels import accumulate
+from beamsplat.services.localization.lidar2d.scan_matching import Match
 from beamsplat.services.localization.lidar2d.settings import LidarSlamSettings
 from beamsplat.services.localization.lidar2d.surfel_map import MatchTables
 

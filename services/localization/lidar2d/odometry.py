@@ -19,6 +19,7 @@ DELAY_STEP_S = 0.02
 DELAY_CANDIDATES_S = np.arange(-40, 41) * DELAY_STEP_S  # candidates for the delay of the odometry stamps
 _MIN_DELAY_WEIGHT = 20.0  # turning scans before the first estimate of the delay
 _DELAY_EVIDENCE = 25.0  # a change of the delay must improve the squared errors by so many of their mean
+_AT_ZERO, _ELSEWHERE = 0.1, 0.5  # m, rad: an odometer that was elsewhere goes on at zero: it was restarted
 _TURN_OUTLIER_RAD = 0.02  # a turn that disagrees by this much counts half
 
 
@@ -91,7 +92,11 @@ class OdometryBuffer:
         self._weight = 0.0
         self.calibration = OdometryCalibration()
         self._guard = StampGuard()
-        self._before = np.zeros(0, np.int64), np.zeros((0, 3))  # the buffer when the clock was set back
+        self._before = (
+            np.zeros(0, np.int64),
+            np.zeros((0, 3)),
+        )  # poses of the time before the clock was set back
+        self._new_time = True  # the poses in the buffer are of the present time
         self._pending: list[tuple[int, int, np.ndarray | None]] = []  # see observe()
 
     @property
@@ -117,10 +122,8 @@ class OdometryBuffer:
             self.rejected += 1
             return False
         if set_back:
-            self._before = self.stamps_ns.copy(), self.poses.copy()
-            self._count = 0
-            self._pending.clear()
-            self.calibration.restart()
+            self._end_time()
+            self._new_time = True
         if self._count == 2 * self._capacity:
             self._stamps[: self._capacity] = self._stamps[self._capacity :]
             self._poses[: self._capacity] = self._poses[self._capacity :]
@@ -129,6 +132,25 @@ class OdometryBuffer:
         self._poses[self._count] = values
         self._count += 1
         return True
+
+    def clock_set_back(self, before_ns: int, now_ns: int) -> None:
+        """Put the poses of the old time away: the stamps of the scans went back from `before_ns` to `now_ns`.
+
+        They would pass for motion of the new time, whose poses may arrive later.
+        """
+        if self._count and self.stamps_ns[-1] - now_ns > (before_ns - now_ns) // 2:
+            self._end_time()
+            self._new_time = False
+
+    def _end_time(self) -> None:
+        """Put the poses in the buffer away, as the end of the time before."""
+        stamps_ns, poses = self._before
+        if self._new_time:
+            stamps_ns, poses = stamps_ns[:0], poses[:0]
+        self._before = np.append(stamps_ns, self.stamps_ns), np.append(poses, self.poses, axis=0)
+        self._count = 0
+        self._pending.clear()
+        self.calibration.restart()
 
     def increment(self, t0_ns: int, t1_ns: int, ahead_s: float = 0.25) -> np.ndarray | None:
         """Return the motion [3] of the body between two scan stamps, None without odometry at them.
@@ -178,14 +200,19 @@ class OdometryBuffer:
         """Return the motion [3] from a stamp before the clock was set back to a stamp of the new time.
 
         Wheels do not care about clocks: their poses tell the motion, also where a recording was played again
-        from an earlier place. None if the odometry's clock was not set back, or there is none at the stamps.
+        from an earlier place. None if the odometry's clock was not set back, it began again at zero, or there
+        is none at the stamps.
         """
         a, b = np.empty(3), np.empty(3)
         stamps_ns, poses = self._before
         if not interpolate(stamps_ns, poses, before_ns + self.delay_ns, self._gap_ns, self._gap_ns, a):
             return None
         at_ns = max(now_ns + self.delay_ns, int(self.stamps_ns[0])) if self._count else now_ns
+        if at_ns > now_ns + self.delay_ns + self._gap_ns:
+            return None
         if not interpolate(self.stamps_ns, self.poses, at_ns, self._gap_ns, self._gap_ns, b):
+            return None
+        if np.abs(self.poses[0]).max() < _AT_ZERO and np.abs(a).max() > _ELSEWHERE:
             return None
         return self.calibration.apply(se2.between(a, b))
 

@@ -148,8 +148,7 @@ class LidarSlam:
         tie = None
         known = prediction.long_gap and moved is not None and self.motion.can_deskew(raw)
         if not good and (known or self._consecutive_lost >= self.settings.lost_scans):
-            tie = self._start_segment(moved, pose_odom_body)
-            self.motion.last_matched = stamp_ns, pose_odom_body
+            tie = self._start_segment(moved, stamp_ns, pose_odom_body)
             match, good = FIRST_MATCH, True
         # 5. dynamic objects, 6. insertion, 7. background job
         return self._insert_scan(raw, scan, pose_odom_body, match, covariance, good, tie)
@@ -166,7 +165,9 @@ class LidarSlam:
     def _covariance(self, match: Match, target_yaw_rad: float) -> np.ndarray:
         return motion_covariance(match, target_yaw_rad, self.motion.stamps, self.motion.poses, self.settings)
 
-    def _start_segment(self, moved: Prediction | None, pose_odom_body: np.ndarray) -> Constraint | None:
+    def _start_segment(
+        self, moved: Prediction | None, stamp_ns: int, pose_odom_body: np.ndarray
+    ) -> Constraint | None:
         """Finish the active submaps and start a segment of the trajectory with the next inserted scan.
 
         Returns the constraint over the gap: the motion by the wheels since the last good scan. Without it
@@ -175,9 +176,11 @@ class LidarSlam:
         self._consecutive_lost = 0
         before = self.active_submaps.matching_target_id
         self.active_submaps.close()
+        set_back = self.motion.start_segment(stamp_ns, pose_odom_body)
         if moved is None:
             self.gaps_open += 1
-            self.pose_graph.start_segment()
+            # A robot does not leave its map because its clock is set: as after a restart.
+            self.pose_graph.start_segment(restarted=set_back)
             self._next_link_scan = self.scans
             return None
         self.gaps_tied += 1

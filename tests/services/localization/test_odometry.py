@@ -147,3 +147,33 @@ def test_the_wheels_tell_the_motion_over_stamps_that_go_back(repeated_s):
     moved = buffer.motion_over_set_back(int(9.9 * NS) + back_ns, int(at_s * NS))
     assert moved == pytest.approx(se2.between(*turning(np.array([9.9, at_s]))), abs=5e-3)
     assert OdometryBuffer().motion_over_set_back(0, NS) is None
+
+
+def test_wheels_of_the_old_time_are_not_motion_of_the_new_time():
+    """The scans' clock has gone back by 5 s; the wheels of the new time come later, one of the old time too."""
+    buffer, before, after = OdometryBuffer(), np.arange(0.0, 10.0, 0.02), np.arange(5.0, 7.0, 0.02)
+    poses = turning(before)
+    for t, pose in zip(before[:-1], poses):
+        buffer.add(int(t * NS), *pose)
+    buffer.clock_set_back(int(9.9 * NS), int(5.0 * NS))
+    assert buffer.increment(int(5.0 * NS), int(5.5 * NS)) is None
+    assert buffer.motion_over_set_back(int(9.9 * NS), int(5.5 * NS)) is None
+    buffer.add(int(before[-1] * NS), *poses[-1])
+    assert buffer.increment(int(5.0 * NS), int(5.5 * NS)) is None
+    for t, pose in zip(after, turning(after)):
+        buffer.add(int(t * NS), *pose)
+    moved = buffer.motion_over_set_back(int(9.9 * NS), int(6.0 * NS))
+    assert moved == pytest.approx(se2.between(*turning(np.array([9.9, 6.0]))), abs=5e-3)
+    assert buffer.increment(int(6.0 * NS), int(6.5 * NS)) == pytest.approx(
+        se2.between(*turning(np.array([6.0, 6.5]))), abs=5e-3
+    )
+
+
+def test_wheels_that_began_again_at_zero_tell_no_motion_over_a_clock_set_back():
+    buffer, ticks = OdometryBuffer(), np.arange(0.0, 10.0, 0.02)
+    for t, pose in zip(ticks, turning(ticks)):
+        buffer.add(int(t * NS) + 3600 * NS, *pose)
+    driven_s = np.maximum(ticks[:100] - 0.3, 0.0)  # it stands at first
+    for t, pose in zip(ticks, turning(driven_s) - turning(driven_s[:1])):
+        buffer.add(int(t * NS), *pose)
+    assert buffer.motion_over_set_back(int(9.9 * NS) + 3600 * NS, int(1.0 * NS)) is None

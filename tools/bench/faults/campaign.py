@@ -81,6 +81,7 @@ class Campaign:
         self._recoveries: list[float] = []
         self._survived = 0  # faults of rounds without a finding
         self._found_before = 0  # findings at the end of the previous round
+        self._watches: dict[Role, HostWatch] = {}
         self._reasons: dict[Target, str] = {}  # why a process ended, from the output of `beamsplat run`
 
     def run(self) -> dict[str, Any]:
@@ -103,6 +104,8 @@ class Campaign:
             self._finish()
         finally:
             stopped = {host.role: host.stop() for host in reversed(self._hosts.all)}
+            for watch in self._watches.values():
+                watch.close()
         for role, seconds in stopped.items():
             if seconds is None:
                 self._find(f"{role}: did not stop within 30 s after Ctrl-C")
@@ -117,7 +120,8 @@ class Campaign:
         return time.monotonic() - self._began
 
     def _connect(self) -> None:
-        self._watches: dict[Role, HostWatch] = {host.role: HostWatch(host) for host in self._hosts.all}
+        for host in self._hosts.all:
+            self._watches[host.role] = HostWatch(host)
         outbox = self._hosts.robot.deployment.run_dir / "keyframes"
         self._poses, self._keyframes = PoseWatch(), KeyframeWatch(outbox)
         robot = self._watches["robot"]

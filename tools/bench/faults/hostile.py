@@ -20,6 +20,7 @@ from beamsplat.common.messages.instances import control_id
 from beamsplat.common.runtime.handover import CONTROL
 from beamsplat.common.topics import HEALTH, TOPICS
 from beamsplat.common.zenoh.bus import key
+from beamsplat.common.zenoh.receiving import receive_in_thread
 from beamsplat.tools.bench.faults.hosts import ROBOT_NAME
 from beamsplat.tools.bench.faults.watch import FORGED_INSTANCE
 
@@ -69,9 +70,12 @@ class HeardMessages:
 
     def __init__(self, session: zenoh.Session) -> None:
         self.newest: dict[str, tuple[bytes, bytes]] = {}  # topic -> (payload, header)
-        self._kept = [
-            session.declare_subscriber(key(ROBOT_NAME, name), partial(self._take, name)) for name in TOPICS
-        ]
+        self._kept = []
+        for name in TOPICS:
+            # The newest only: channels that hold more of each would hold gigabytes of images.
+            newest = session.declare_subscriber(key(ROBOT_NAME, name), zenoh.handlers.RingChannel(1))
+            self._kept.append(newest)
+            receive_in_thread(session, f"heard-{name}", newest, partial(self._take, name))
 
     def _take(self, name: str, sample: zenoh.Sample) -> None:
         if sample.attachment is not None:

@@ -13,6 +13,7 @@ from beamsplat.common.messages import KeyframeAck, Message, Odometry
 from beamsplat.common.messages.header import DecodeError, Header
 from beamsplat.common.topics import topic
 from beamsplat.common.zenoh.bus import key
+from beamsplat.common.zenoh.receiving import receive_in_thread
 from beamsplat.common.zenoh.streams import decode_sample
 from beamsplat.tools.bench.faults.hosts import ROBOT_NAME, ROUTER, CampaignHost
 from beamsplat.tools.system.health_table import HealthTable
@@ -21,6 +22,7 @@ FORGED_INSTANCE = "badbadbadbadbad0"  # of headers that the campaign itself writ
 GAP_S = 1.0  # between two poses: ten scans; a shorter gap is not counted
 _QUEUE_SUFFIX = ".keyframe"
 _START_S = 120.0  # limit for the start of a router
+_WAITING = 256  # samples in a subscription's channel
 
 
 def _genuine(sample: zenoh.Sample, name: str) -> Message | None:
@@ -132,8 +134,15 @@ class HostWatch:
         self._kept: list[zenoh.Subscriber] = []
 
     def subscribe(self, name: str, take: Callable[[zenoh.Sample], None]) -> None:
-        """Call `take` with every sample on the topic `name`."""
-        self._kept.append(self.session.declare_subscriber(key(ROBOT_NAME, name), take))
+        """Call `take` with every sample on the topic `name`, from a thread."""
+        channel = zenoh.handlers.FifoChannel(_WAITING)
+        subscriber = self.session.declare_subscriber(key(ROBOT_NAME, name), channel)
+        self._kept.append(subscriber)
+        receive_in_thread(self.session, f"watch-{name}", subscriber, take)
+
+    def close(self) -> None:
+        """Close the session, and with it all subscriptions."""
+        self.session.close()
 
     def unhealthy(self) -> dict[str, str]:
         """Return what is wrong with each process of the host that does not work: nothing if all do."""
