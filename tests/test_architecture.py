@@ -24,7 +24,8 @@ LIBRARY_ALLOWED = (
     "beamsplat.common.runtime.stamp_merger", "beamsplat.common.runtime.rate_limited_log",
     "beamsplat.common.runtime.health", "beamsplat.common.runtime.alerts", "beamsplat.common.runtime.figures",
     "beamsplat.common.messages.image_codec", "beamsplat.common.messages.splat_codec",
-    "beamsplat.common.messages.depth_png", "beamsplat.common.messages.image_header", "beamsplat.common.zenoh.rmw",
+    "beamsplat.common.messages.depth_codec", "beamsplat.common.messages.depth_png",
+    "beamsplat.common.messages.image_header", "beamsplat.common.zenoh.rmw",
 )  # fmt: skip
 
 

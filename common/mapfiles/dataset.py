@@ -14,6 +14,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from beamsplat.common.messages.depth_codec import depth_to_mm
 from beamsplat.common.messages.depth_png import depth_to_png, mask_to_png
 from beamsplat.common.raster.camera import RasterCamera
 
@@ -92,7 +93,7 @@ def write_frames(folder: Path, frames: Iterable[DatasetFrame], cell_m: float) ->
             f"images/{name}", f"depths/{Path(name).stem}.png", f"masks/{name}.png",
         )  # fmt: skip
         (folder / entry.image).write_bytes(data)
-        (folder / entry.depth).write_bytes(depth_to_png(frame.depth_m).tobytes())
+        (folder / entry.depth).write_bytes(depth_to_png(depth_to_mm(frame.depth_m)).tobytes())
         if not frame.mask.all():
             masked.add(len(entries))
             _write_mask(folder / entry.mask, frame.mask)

@@ -47,18 +47,32 @@ class DiskGaussians(Protocol):
 
 @dataclass(frozen=True)
 class Chunk:
-    """The Gaussians of one anchor. `version` changes whenever one of them changes."""
+    """The Gaussians of one anchor. `version` changes whenever one of them changes in the anchor's frame."""
 
     anchor: int
     version: int
     params: np.ndarray  # float32 [14, N], in the map frame
 
 
+@dataclass(frozen=True)
+class Census:
+    """Which Gaussians in memory belong to which anchor, and the version of each chunk, at one time."""
+
+    versions: dict[int, int]  # anchor -> version, of all chunks, also of those on disk only
+    order: np.ndarray  # int64 [count], columns of the store, ordered by anchor
+    anchors: list[int]  # with Gaussians in memory, ascending
+    starts: np.ndarray  # int64 [len(anchors)], of each anchor in `order`
+
+    def columns(self) -> dict[int, np.ndarray]:
+        """Return the columns int64 [N] of each anchor in memory, ascending."""
+        return dict(zip(self.anchors, np.split(self.order, self.starts[1:])))
+
+
 class GaussianStore(GaussianArrays):
     """Gaussians with their anchors, carving votes and chunk versions."""
 
     def __init__(self, capacity: int = 4096) -> None:
-        self._events: dict[int, int] = {}  # per anchor: insertions, removals and moves so far
+        self._events: dict[int, int] = {}  # per anchor: insertions and removals so far
         self.paged_out: dict[int, tuple[int, int]] = {}  # per anchor: (Gaussians, their steps) on disk only
         super().__init__(capacity)
 
@@ -165,12 +179,13 @@ class GaussianStore(GaussianArrays):
         self._events[anchor] = self._events.get(anchor, 0) + 1
 
     def move(self, anchor: int, T_new_old: np.ndarray) -> None:
-        """Transform the Gaussians of an anchor rigidly: means, rotations, and Adam's first moments."""
+        """Transform the Gaussians of an anchor rigidly: means, rotations, and Adam's first moments.
+
+        The version of the chunk stays: in the frame of the anchor, which moves too, nothing has changed.
+        """
         chosen = np.flatnonzero(self.anchor[: self.count] == anchor)
-        if len(chosen) == 0 and anchor not in self.paged_out:
-            return
-        self._events[anchor] = self._events.get(anchor, 0) + 1
-        self._transform(chosen, T_new_old)
+        if len(chosen):
+            self._transform(chosen, T_new_old)
 
     def _transform(self, chosen: np.ndarray, T_new_old: np.ndarray) -> None:
         """Transform the columns `chosen` and their first moments."""
@@ -178,18 +193,28 @@ class GaussianStore(GaussianArrays):
             self.params[:, chosen], self.first[:, chosen], T_new_old
         )
 
-    def versions(self) -> dict[int, int]:
-        """Return the version of each chunk, by anchor id.
-
-        A version grows with each optimiser step, insertion, removal and move of Gaussians in the chunk.
-        """
-        anchors, which = np.unique(self.anchor[: self.count], return_inverse=True)
-        steps = np.bincount(which, weights=self.steps[: self.count], minlength=len(anchors))
-        taken = {int(anchor): int(n) for anchor, n in zip(anchors, steps)}
+    def census(self) -> Census:
+        """Return which Gaussians in memory belong to which anchor, and the versions of all chunks."""
+        anchors = self.anchor[: self.count]
+        order = np.argsort(anchors, kind="stable")  # nearly sorted: Gaussians are inserted in runs
+        in_order = anchors[order]
+        starts = np.flatnonzero(np.diff(in_order, prepend=in_order[:1] - 1))
+        ids = in_order[starts].tolist()
+        in_steps = self.steps[: self.count][order].astype(np.float64)
+        steps = np.add.reduceat(in_steps, starts).tolist() if ids else []
+        taken = {anchor: int(n) for anchor, n in zip(ids, steps)}
         for anchor, (_, n) in self.paged_out.items():
             taken[anchor] = taken.get(anchor, 0) + n
         # One event counts more than all steps: a removal lowers their sum, but the version must grow.
-        return {a: (events << 40) + taken.get(a, 0) for a, events in sorted(self._events.items())}
+        versions = {a: (events << 40) + taken.get(a, 0) for a, events in sorted(self._events.items())}
+        return Census(versions, order, ids, starts)
+
+    def versions(self) -> dict[int, int]:
+        """Return the version of each chunk, by anchor id.
+
+        A version grows with each optimiser step, insertion and removal of Gaussians in the chunk.
+        """
+        return self.census().versions
 
     def chunk(self, anchor: int) -> np.ndarray:
         """Return a copy of an anchor's Gaussians in memory, float32 [14, N], in the map frame."""

@@ -40,12 +40,36 @@ def schema_of(message: Message | type[Message]) -> str:
     return f"{message.schema_name()}/{message.version}"
 
 
-def encode(message: Message) -> bytes:
+def encode(message: Message, keep: bool = False) -> bytes:
     """Return the payload of a message; its schema (`schema_of`) must be transmitted beside it.
+
+    A message that was decoded, or encoded before with `keep`, is not encoded again.
+
+    Args:
+        keep: keep the payload with the message, for the next call: it is sent and stored, for example.
 
     Raises:
         ValueError: texts and numbers of the message exceed `MAX_HEAD_BYTES`; arrays do not count.
     """
+    payload = kept_payload(message)
+    if payload is None:
+        payload = b"".join(_pieces(message))
+        if keep:
+            _keep(message, payload)
+    return payload
+
+
+def kept_payload(message: Message) -> bytes | None:
+    """Return the payload that is kept with a message, of the schema `schema_of`; None without one."""
+    return getattr(message, "kept_payload", None)
+
+
+def _keep(message: Message, payload: bytes) -> None:
+    object.__setattr__(message, "kept_payload", payload)  # messages are frozen
+
+
+def _pieces(message: Message) -> list[bytes | memoryview]:
+    """Return the parts of a payload, in order: head, padding, arrays."""
     arrays: list[np.ndarray] = []
     position = 0
 
@@ -66,27 +90,39 @@ def encode(message: Message) -> bytes:
             f"{schema_of(message)}: texts and numbers of {len(head)} bytes, at most {MAX_HEAD_BYTES}"
         )
     start = _padded(_LENGTH.size + len(head))
-    pieces = [_LENGTH.pack(len(head)), head, bytes(start - _LENGTH.size - len(head))]
+    pieces: list[bytes | memoryview] = [
+        _LENGTH.pack(len(head)),
+        head,
+        bytes(start - _LENGTH.size - len(head)),
+    ]
     for array in arrays:
         pieces.append(array.data)
         pieces.append(bytes(_padded(array.nbytes) - array.nbytes))
-    return b"".join(pieces)
+    return pieces
 
 
 def decode(schema: str, payload: bytes) -> Message:
     """Decode and validate the message in `payload`; its arrays are read-only views into the payload.
 
-    Of a newer minor version, fields unknown to this program are ignored.
+    Of a newer minor version, fields unknown to this program are ignored. Messages of the older major versions
+    that their class can read (`Message.oldest_major`) are converted. The payload is kept with a message of
+    the current version, see `encode`.
 
     Raises:
         DecodeError: the schema is unknown or has another major version, the bytes are truncated or
             inconsistent, or a value is invalid. No other exception is raised, whatever the bytes.
     """
-    cls, minor = _class_of(schema)
+    cls, version = _class_of(schema)
+    current = _version(cls)
     try:
         fields = _unpack(payload)
-        newer = minor > _version(cls)[1]
-        return cls.model_validate(fields, extra="ignore" if newer else None)
+        if version[0] < current[0]:
+            fields = cls.upgraded(version[0], fields)
+        exact = version <= current and version[0] == current[0]  # no unknown fields are expected
+        message = cls.model_validate(fields, extra=None if exact else "ignore")
+        if version == current:
+            _keep(message, payload)
+        return message
     except DecodeError:
         raise
     # msgpack and pydantic raise ValueError; on malicious bytes they also raise the others.
@@ -95,19 +131,21 @@ def decode(schema: str, payload: bytes) -> Message:
 
 
 @lru_cache(maxsize=256)
-def _class_of(schema: str) -> tuple[type[Message], int]:
+def _class_of(schema: str) -> tuple[type[Message], tuple[int, int]]:
     name, _, version = schema.partition("/")
     if name not in MESSAGES:
         raise DecodeError(f"unknown message {schema[:80]!r}")
     major, _, minor = version.partition(".")
     if not (major.isascii() and major.isdecimal() and minor.isascii() and minor.isdecimal()):
         raise DecodeError(f"{schema[:80]!r} has no version")
-    if len(version) > 12 or int(major) != _version(MESSAGES[name])[0]:
+    newest = _version(MESSAGES[name])[0]
+    oldest = MESSAGES[name].oldest_major or newest
+    if len(version) > 12 or not oldest <= int(major) <= newest:
         raise DecodeError(
             f"{name} has version {version[:12]}, this program supports {MESSAGES[name].version}: "
             "update the older of the two programs"
         )
-    return MESSAGES[name], int(minor)
+    return MESSAGES[name], (int(major), int(minor))
 
 
 def _version(cls: type[Message]) -> tuple[int, int]:

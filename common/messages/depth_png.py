@@ -1,4 +1,7 @@
-"""PNG encoding of depth maps, their standard deviations, and masks, as used in keyframes."""
+"""PNG encoding of depth maps and masks, for exports; reading of the PNGs in keyframes of earlier versions.
+
+Messages contain the encoding of `depth_codec`, with the same quantisation.
+"""
 
 from __future__ import annotations
 
@@ -7,53 +10,30 @@ import numpy as np
 
 from beamsplat.common.messages.image_codec import decode_compressed
 
-_SIGMA_M = 1e-3  # sigma of code 1
-_PER_OCTAVE = 16  # codes per doubling of sigma: the quantisation error is at most 2.2 %
 _FAST = (cv2.IMWRITE_PNG_COMPRESSION, 1)  # zlib level
 
 
-def depth_to_png(depth_m: np.ndarray) -> np.ndarray:
-    """Encode depth float32 [H, W] (m) as a PNG of uint16 millimetres, returned as uint8 [B].
-
-    NaN and values outside (0, 65) m are encoded as 0 = unknown.
-    """
-    with np.errstate(invalid="ignore"):
-        fits = (depth_m > 0.0) & (depth_m < 65.0)
-    mm = np.where(fits, np.nan_to_num(depth_m) * 1e3 + 0.5, 0.0).astype(np.uint16)
-    return cv2.imencode(".png", mm, _FAST)[1].ravel()
+def depth_to_png(depth_mm: np.ndarray) -> np.ndarray:
+    """Encode depth uint16 [H, W] (mm, 0 = unknown) as a PNG, returned as uint8 [B]."""
+    return cv2.imencode(".png", depth_mm, _FAST)[1].ravel()
 
 
-def depth_from_png(png: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """Decode depth float32 [H, W] (m), of this shape, from a PNG uint8 [B]; NaN = unknown.
+def depth_mm_from_png(png: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """Decode depth uint16 [H, W] (mm, 0 = unknown), of this shape, from a PNG uint8 [B].
 
     Raises:
         ValueError: the bytes are not a PNG of 16 bits and one channel, or has another shape.
     """
-    mm = _decode(png, shape, np.uint16, "depth")
-    return np.where(mm > 0, mm * np.float32(1e-3), np.float32(np.nan)).astype(np.float32)
+    return _decode(png, shape, np.uint16, "depth")
 
 
-def sigma_to_png(sigma_m: np.ndarray) -> np.ndarray:
-    """Encode standard deviations float32 [H, W] (m) as a PNG of logarithmic codes, returned as uint8 [B].
-
-    Codes 1 to 255 range from 1 mm to about 60 m; 0 = unknown (NaN).
-    """
-    with np.errstate(invalid="ignore"):
-        known = sigma_m > 0.0
-    octaves = np.log2(np.where(known, sigma_m, _SIGMA_M) / _SIGMA_M)
-    code = np.where(known, np.clip(np.round(octaves * _PER_OCTAVE) + 1.0, 1.0, 255.0), 0.0)
-    return cv2.imencode(".png", code.astype(np.uint8), _FAST)[1].ravel()
-
-
-def sigma_from_png(png: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """Decode standard deviations float32 [H, W] (m), of this shape, from a PNG uint8 [B]; NaN = unknown.
+def sigma_codes_from_png(png: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """Decode codes of standard deviations uint8 [H, W] (`depth_codec.sigma_to_codes`) from a PNG uint8 [B].
 
     Raises:
         ValueError: the bytes are not a PNG of 8 bits and one channel, or has another shape.
     """
-    code = _decode(png, shape, np.uint8, "sigma")
-    sigma = _SIGMA_M * np.exp2((code.astype(np.float32) - 1.0) / _PER_OCTAVE)
-    return np.where(code > 0, sigma, np.float32(np.nan)).astype(np.float32)
+    return _decode(png, shape, np.uint8, "sigma")
 
 
 def mask_to_png(mask: np.ndarray) -> np.ndarray:

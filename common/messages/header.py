@@ -13,8 +13,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 _LAYOUT = struct.Struct("<2sBBqqQQI")  # magic, layout version, producer length, then the numbers
+_BACKLOG = struct.Struct("<I")  # follows the numbers in version 2
 _MAGIC = b"BS"
-_VERSION = 1
+# A header without a backlog is of version 1, so that programs from before 2 read all other messages.
+_VERSIONS = (1, 2)
+MAX_BACKLOG = 2**32 - 1
 _INSTANCE_BYTES = 8
 
 
@@ -40,15 +43,17 @@ class Header:
     epoch: int  # uint32: counts the hand-overs of the node; subscribers ignore lower epochs
     producer: str  # node name
     instance: str  # 16 hex digits, random per process start
+    backlog: int = 0  # uint32: messages of this topic that the publisher has sent, not acknowledged so far
 
     def pack(self) -> bytes:
         """Return the header as bytes, for Zenoh's attachment."""
         producer = self.producer.encode()
         return (
             _LAYOUT.pack(
-                _MAGIC, _VERSION, len(producer),
+                _MAGIC, 2 if self.backlog else 1, len(producer),
                 self.stamp_ns, self.publish_ns, self.clock_id, self.sequence, self.epoch,
             )
+            + (_BACKLOG.pack(self.backlog) if self.backlog else b"")
             + bytes.fromhex(self.instance)
             + producer
         )  # fmt: skip
@@ -63,17 +68,21 @@ class Header:
         if len(data) < _LAYOUT.size + _INSTANCE_BYTES:
             raise DecodeError(f"header of {len(data)} bytes is too short")
         magic, version, length, stamp_ns, publish_ns, clock_id, sequence, epoch = _LAYOUT.unpack_from(data)
-        if magic != _MAGIC or version != _VERSION:
-            raise DecodeError(f"header starts with {data[:3]!r}, expected {_MAGIC!r} version {_VERSION}")
-        instance_end = _LAYOUT.size + _INSTANCE_BYTES
+        if magic != _MAGIC or version not in _VERSIONS:
+            raise DecodeError(f"header starts with {data[:3]!r}, expected {_MAGIC!r} version 1 or 2")
+        start, backlog = _LAYOUT.size, 0
+        if version == 2:
+            (backlog,) = _BACKLOG.unpack_from(data, start)  # present: an instance id is longer
+            start += _BACKLOG.size
+        instance_end = start + _INSTANCE_BYTES
         if len(data) != instance_end + length:
             raise DecodeError(f"header of {len(data)} bytes, expected {instance_end + length}")
         try:
             producer = data[instance_end:].decode()
         except UnicodeDecodeError as error:
             raise DecodeError(f"header's producer is not text: {error}") from error
-        instance = data[_LAYOUT.size : instance_end].hex()
-        return Header(stamp_ns, publish_ns, clock_id, sequence, epoch, producer, instance)
+        instance = data[start:instance_end].hex()
+        return Header(stamp_ns, publish_ns, clock_id, sequence, epoch, producer, instance, backlog)
 
     def age_ns(self, now_ns: int, clock_id: int) -> int | None:
         """Return the time in ns from publication to `now_ns`, a reading of `time.monotonic_ns`.

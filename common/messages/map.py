@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field
@@ -35,11 +35,16 @@ class Keyframe(Message):
     other message of this time must be stored during a network outage. An `id` always has the same content.
 
     T_map_body = T_map_anchor @ T_anchor_body; both are results of pose-graph optimisation number
-    `optimisation`. A later optimisation changes T_map_anchor only. Depth and mask refer to the undistorted
-    image (a pinhole with the camera's K) and are encoded by `depth_png`; mask 0 = on a dynamic object.
+    `optimisation`. A later optimisation changes T_map_anchor only. Depth, standard deviation and mask refer
+    to the undistorted image (a pinhole with the camera's K) and are encoded by `depth_codec`, or are PNGs of
+    an earlier version; mask 0 = on a dynamic object.
+
+    How many keyframes the robot has sent without an acknowledgement is in the message's header: the same
+    payload is stored and sent again.
     """
 
-    version = "1.2"
+    version = "2.0"  # 1.x: depth_png, sigma_png and mask_png, PNGs; backlog
+    oldest_major = 1
 
     id: Count
     encoding: Literal["jpeg", "png"]
@@ -49,18 +54,24 @@ class Keyframe(Message):
     T_anchor_body: Transform
     T_map_anchor: Transform
     optimisation: Count = 0
-    depth_png: Annotated[np.ndarray, Array("uint8", "D")]  # optical z
-    sigma_png: Annotated[np.ndarray, Array("uint8", "S")]  # standard deviation of the depth
-    mask_png: Annotated[np.ndarray, Array("uint8", "M")] = Field(
+    depth: Annotated[np.ndarray, Array("uint8", "D")]  # optical z
+    sigma: Annotated[np.ndarray, Array("uint8", "S")]  # standard deviation of the depth
+    mask: Annotated[np.ndarray, Array("uint8", "M")] = Field(
         default_factory=lambda: np.zeros(0, np.uint8)
-    )
+    )  # empty = no dynamic object
     # Lidar returns deskewed to the image's time and projected: u, v (px, undistorted), optical z, sigma (m).
     beams: Annotated[np.ndarray, Array("float32", "N", 4, finite=True)] = Field(
         default_factory=lambda: np.zeros((0, 4), np.float32)
     )
     why: Text = ""  # why this image was selected as a keyframe
-    backlog: Count = 0  # number of unacknowledged keyframes when this one was sent; since 1.1
     map_uuid: Text = ""  # UUID of the map that the anchor belongs to (see `Anchors`); since 1.2
+
+    @classmethod
+    def upgraded(cls, major: int, fields: dict[str, Any]) -> dict[str, Any]:
+        """Rename the fields of version 1; the bytes of the PNGs stay as they are."""
+        renamed = {name.removesuffix("_png"): value for name, value in fields.items()}
+        renamed.pop("backlog", None)
+        return renamed
 
 
 class KeyframeAck(Message):
@@ -78,10 +89,11 @@ class MapChunk(Message):
     """The Gaussians of one anchor, in the anchor's frame, encoded by `splat_codec`.
 
     A chunk with a higher `revision`, or with the same `revision` and smaller `cell_m`, replaces the previous
-    chunk of this anchor; `count` 0 removes it.
+    chunk of this anchor; `count` 0 removes it. A chunk is not sent again when only its anchor has moved
+    (`MapAnchors`): `T_map_anchor` is the pose when it was sent.
     """
 
-    version = "1.1"
+    version = "1.2"
 
     anchor_id: Annotated[int, Field(ge=-1, lt=2**63)]
     revision: Count
@@ -89,6 +101,20 @@ class MapChunk(Message):
     count: Count
     packed: Annotated[np.ndarray, Array("uint8", "B")]
     cell_m: NonNegative = 0.0  # level of detail: Gaussians within a cell are merged; 0 = all; since 1.1
+    pose_revision: Count = 0  # of T_map_anchor, see `MapAnchors`; since 1.2
+
+
+class MapAnchors(Message):
+    """Poses of all anchors of the map, sent when one of them has moved: a loop closure sends only this.
+
+    `pose_revision` counts the moves of one process of the mapper, also in its chunks. Of the poses of an
+    anchor in messages of both kinds, the one with the highest `pose_revision` is valid, whatever arrives
+    first (`common/mapfiles/anchor_poses.py`).
+    """
+
+    pose_revision: Count
+    anchor_ids: Annotated[np.ndarray, Array("int64", "N")]
+    T_map_anchor: Transforms
 
 
 class MapState(Message):

@@ -7,7 +7,7 @@ released version).
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -18,6 +18,7 @@ from beamsplat.common.messages.map import (
     KeyframeAck,
     KeyframeCandidate,
     KeyframeDecision,
+    MapAnchors,
     MapChunk,
     MapPoses,
     MapPreview,
@@ -223,11 +224,15 @@ class DepthEstimate(Message):
 class FusedDepth(Message):
     """Metric depth of the undistorted image with this stamp, its standard deviation, and metrics of the fit.
 
-    If the status is not "ok" there is no depth (0 x 0): a depth map with a bad fit is rejected.
+    Depth and standard deviation are encoded by `depth_codec`, as in keyframes. If the status is not "ok"
+    there is no depth (both are empty): a depth map with a bad fit is rejected.
     """
 
-    depth_m: Annotated[np.ndarray, Array("float32", "H", "W")]  # optical z, NaN = unknown
-    sigma_m: Annotated[np.ndarray, Array("float32", "H", "W")]  # standard deviation, with gross errors
+    version = "2.0"  # 1.0: float32 arrays depth_m and sigma_m
+    oldest_major = 1
+
+    depth: Annotated[np.ndarray, Array("uint8", "D")]  # optical z
+    sigma: Annotated[np.ndarray, Array("uint8", "S")]  # standard deviation, with gross errors
     status: Text = "ok"  # or why there is no depth
     keyframe: bool = False  # whether the image is a keyframe
     scale: float = float("nan")  # metres per unit of the estimate (the paper's alpha)
@@ -237,6 +242,49 @@ class FusedDepth(Message):
     pairs: Count = 0  # pairs of a beam and a depth pixel
     beams_age_ns: Annotated[int, Field(ge=-(2**63), lt=2**63)] = 0  # image stamp minus stamp of the beams
     T_odom_body: Transform = Field(default_factory=lambda: np.eye(4))
+
+    @classmethod
+    def of(cls, depth_m: np.ndarray, sigma_m: np.ndarray, **fields: Any) -> FusedDepth:
+        """Return a message with depth and standard deviation float32 [H, W] (m, NaN = unknown).
+
+        Both are quantised, see `depth_codec`: depth to 1 mm, the standard deviation to 4.4 %.
+
+        Raises:
+            ValueError: the shapes differ, or a field is invalid.
+        """
+        from beamsplat.common.messages.depth_codec import pack_depth, pack_sigma  # imports OpenCV
+
+        if depth_m.shape != sigma_m.shape:
+            raise ValueError(f"depth is {list(depth_m.shape)}, sigma {list(sigma_m.shape)}")
+        none = np.zeros(0, np.uint8)
+        packed = (pack_depth(depth_m), pack_sigma(sigma_m)) if depth_m.size else (none, none)
+        return cls(depth=packed[0], sigma=packed[1], **fields)
+
+    @property
+    def depth_m(self) -> np.ndarray:
+        """Depth float32 [H, W] (optical z, m; NaN = unknown), decoded at each access; [0, 0] without depth.
+
+        Raises:
+            ValueError: the bytes are damaged.
+        """
+        from beamsplat.common.messages.depth_codec import unpack_depth
+
+        return unpack_depth(self.depth) if self.depth.size else np.zeros((0, 0), np.float32)
+
+    @property
+    def sigma_m(self) -> np.ndarray:
+        """Standard deviation float32 [H, W] (m; NaN = unknown), decoded at each access; as `depth_m`."""
+        from beamsplat.common.messages.depth_codec import unpack_sigma
+
+        return unpack_sigma(self.sigma) if self.sigma.size else np.zeros((0, 0), np.float32)
+
+    @classmethod
+    def upgraded(cls, major: int, fields: dict[str, Any]) -> dict[str, Any]:
+        """Quantise the arrays of version 1."""
+        floats = Array("float32", "H", "W")
+        depth_m, sigma_m = (floats.check(fields.pop(name, None)) for name in ("depth_m", "sigma_m"))
+        quantised = cls.of(depth_m, sigma_m, stamp_ns=0)
+        return {**fields, "depth": quantised.depth, "sigma": quantised.sigma}
 
 
 class Cloud(Message):
@@ -335,7 +383,7 @@ MESSAGES: dict[str, type[Message]] = {
     for cls in (
         Rig, Image, Scan, WheelOdometry, ExternalPose, Odometry, Correction, Anchors, MovingBeams, Grid,
         GridTile, DepthEstimate, FusedDepth, Cloud, KeyframeCandidate, KeyframeDecision, Keyframe,
-        KeyframeAck, MapChunk, MapPoses, MapPreview, MapRender, MapState, MapStatus, Tick, Health,
-        Answer,
+        KeyframeAck, MapChunk, MapAnchors, MapPoses, MapPreview, MapRender, MapState, MapStatus, Tick,
+        Health, Answer,
     )
 }  # fmt: skip

@@ -120,11 +120,29 @@ class MessagePart(BaseModel):
 
 
 class Message(MessagePart):
-    """Base class of all messages. `stamp_ns` is the measurement time, int64 nanoseconds."""
+    """Base class of all messages. `stamp_ns` is the measurement time, int64 nanoseconds.
+
+    A message can keep its encoded payload (`codec.encode`), so that it is not encoded again to be queued,
+    stored or forwarded. The payload is no field: it is neither compared nor copied by `model_copy`.
+    """
+
+    __slots__ = ("kept_payload",)
 
     version: ClassVar[str] = "1.0"
+    oldest_major: ClassVar[int] = 0  # of the versions that `upgraded` can read; 0 = only that of `version`
     stamp_ns: StampNs
 
     @classmethod
     def schema_name(cls) -> str:
         return cls.__name__
+
+    @classmethod
+    def upgraded(cls, major: int, fields: dict[str, Any]) -> dict[str, Any]:
+        """Return the fields of this version, made of the decoded `fields` of an older major version.
+
+        A class with `oldest_major` overrides this.
+
+        Raises:
+            ValueError, TypeError: a field has a wrong type, or does not decode.
+        """
+        raise ValueError(f"{cls.schema_name()}: version {major} cannot be read")

@@ -94,16 +94,16 @@ class Lockstep:
         at_ns = max(item.message.stamp_ns if item.at_ns is None else item.at_ns, now_ns)
 
         def act(time_ns: int) -> None:
-            self._send(state, item.topic, item.message, time_ns)
+            self._send(state, item.topic, item.message, 0, time_ns)
             self._pull(state, time_ns)
 
         self._at(at_ns, ROW_NUMBER[item.topic], act)
 
-    def _send(self, state: _NodeState, name: str, message: Message, time_ns: int) -> None:
+    def _send(self, state: _NodeState, name: str, message: Message, backlog: int, time_ns: int) -> None:
         """Create the header of a message, pass both to `on_message`, and deliver them to all subscribers."""
         sequence = state.sequences.get(name, 0)
         state.sequences[name] = sequence + 1
-        header = Header(message.stamp_ns, time_ns, 0, sequence, 0, state.node.name, state.instance)
+        header = Header(message.stamp_ns, time_ns, 0, sequence, 0, state.node.name, state.instance, backlog)
         envelope = Envelope(name, header, message)
         self._on_message(envelope)
         for consumer in self._consumers[name]:
@@ -147,7 +147,8 @@ class Lockstep:
                 self._start(state, output, time_ns)
             else:
                 name, message = output
-                self._at(time_ns, ROW_NUMBER[name], partial(self._send, state, name, message))
+                backlog = state.node.backlog(name)
+                self._at(time_ns, ROW_NUMBER[name], partial(self._send, state, name, message, backlog))
 
     def _start(self, state: _NodeState, job: Job, time_ns: int) -> None:
         future = state.jobs.start(job)

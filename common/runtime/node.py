@@ -190,6 +190,13 @@ class Node:
     def on_header(self, header: Header) -> None:
         """Receive the header of the message that is handled next; the recorder writes it to its file."""
 
+    def backlog(self, topic: str) -> int:
+        """Return how many messages on `topic` were sent and are not acknowledged, for the header of the next.
+
+        It is part of the header because it changes while a message waits to be sent again.
+        """
+        return 0
+
     def handover_obstacle(self, before: Node) -> str:
         """Return why this node cannot take over from the running node `before`, or "" if it can."""
         return "" if self.replaceable else "its state exists only in its process"

@@ -155,7 +155,7 @@ class RunningNode:
             if isinstance(output, Job):
                 self.jobs.start(output).add_done_callback(lambda _: self.wake())
             elif not self.handover.holds_back(*output):
-                self.publications[output[0]].put(output[1])
+                self.publications[output[0]].put(output[1], self.node.backlog(output[0]))
 
     def emit_results(self, results: Iterator[tuple[str, Any]]) -> None:
         """Pass the results of background jobs, as (name, result), to the node and emit its outputs."""

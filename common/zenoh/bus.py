@@ -22,6 +22,7 @@ import json
 import time
 from collections.abc import Callable
 from functools import partial
+from typing import TypeVar
 
 import msgpack
 import zenoh
@@ -44,8 +45,11 @@ from beamsplat.common.zenoh.streams import (
     Publication,
     Subscription,
     decode_end_marker,
+    decode_header,
     decode_sample,
 )
+
+T = TypeVar("T")
 
 ROOT = "beamsplat"
 # Kernel send buffers of a link. Small messages: 13 ms of delay at 20 Mbit/s. Large messages: at least rate x
@@ -241,12 +245,7 @@ class Bus:
             on_end: called with (topic, header, sent) when a producer has published its end-of-stream
                 marker; `sent` is the number of messages that it has published.
         """
-        delivery = entry.effective_delivery
-        self._declared.append(
-            Subscription(
-                self.session, entry.row, delivery, key(self.robot, entry.topic), on_envelope, on_undecodable
-            )
-        )
+        self._subscribe(entry, lambda sample: decode_sample(sample, entry.row), on_envelope, on_undecodable)
         subscriber = zenoh.ext.declare_advanced_subscriber(
             self.session,
             key(self.robot, "end", entry.topic),
@@ -265,6 +264,28 @@ class Bus:
                 on_end(entry.topic, header, sent)
 
         receive_in_thread(self.session, f"end-{entry.topic}", subscriber, handle)
+
+    def subscribe_headers(
+        self,
+        entry: Input,
+        on_header: Callable[[Header], None],
+        on_undecodable: Callable[[str, str], None],
+    ) -> None:
+        """Declare a subscription that reads the headers of the messages only; arguments as of `subscribe`."""
+        self._subscribe(entry, lambda sample: decode_header(sample, entry.row), on_header, on_undecodable)
+
+    def _subscribe(
+        self,
+        entry: Input,
+        decode: Callable[[zenoh.Sample], T],
+        on_decoded: Callable[[T], None],
+        on_undecodable: Callable[[str, str], None],
+    ) -> None:
+        key_expr, delivery = key(self.robot, entry.topic), entry.effective_delivery
+        subscription = Subscription(
+            self.session, entry.row, delivery, key_expr, decode, on_decoded, on_undecodable
+        )
+        self._declared.append(subscription)
 
     def end(self, publication: Publication) -> None:
         """Publish the end-of-stream marker of `publication`, with the number of messages published on it."""

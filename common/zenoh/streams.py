@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Generic, TypeVar
 
 import msgpack
 import zenoh
@@ -14,13 +15,15 @@ import zenoh.ext
 
 from beamsplat.common.messages import Message
 from beamsplat.common.messages.codec import MEDIA_TYPE, decode, encode, schema_of
-from beamsplat.common.messages.header import DecodeError, Header
+from beamsplat.common.messages.header import MAX_BACKLOG, DecodeError, Header
 from beamsplat.common.runtime.mailbox import Envelope
 from beamsplat.common.runtime.rate_limited_log import RateLimitedLog
 from beamsplat.common.topics import Topic
 from beamsplat.common.zenoh.receiving import receive_in_thread
 
 log = logging.getLogger(__name__)
+
+T = TypeVar("T")
 
 FIFO_MESSAGES = 256  # queue between Zenoh and the receiving thread, for an `every` input without a cache
 ENCODING = zenoh.Encoding(MEDIA_TYPE)
@@ -102,8 +105,10 @@ class Publication:
         self._refusal_log = RateLimitedLog()
         self._publisher = declare_publication(session, key_expr, row)
 
-    def put(self, message: Message) -> Header | None:
+    def put(self, message: Message, backlog: int = 0) -> Header | None:
         """Publish one message and return its header; never waits for a subscriber.
+
+        `backlog` is for the header: the number of messages sent that are not acknowledged.
 
         Return None, and count and log the message, if it is larger than the limit of its topic: routers and
         subscribers would drop it.
@@ -125,6 +130,7 @@ class Publication:
                 epoch=self._producer.epoch,
                 producer=self._producer.node,
                 instance=self._producer.instance,
+                backlog=min(backlog, MAX_BACKLOG),
             )
             self._publisher.put(payload, attachment=header.pack())
             self.sent += 1
@@ -147,8 +153,8 @@ def encode_within(message: Message, limit_kb: int, subject: str) -> bytes:
     return payload
 
 
-class Subscription:
-    """One input of a node: a thread that receives samples from a Zenoh channel and decodes them."""
+class Subscription(Generic[T]):
+    """One input of a node: a thread that receives samples from a Zenoh channel."""
 
     def __init__(
         self,
@@ -156,11 +162,14 @@ class Subscription:
         row: Topic,
         delivery: str,
         key_expr: str,
-        on_envelope: Callable[[Envelope], None],
+        decode: Callable[[zenoh.Sample], T],
+        on_decoded: Callable[[T], None],
         on_undecodable: Callable[[str, str], None],
     ) -> None:
+        """Subscribe; `on_undecodable` is called with (topic, reason) if `decode` raises a DecodeError."""
         self.row = row
-        self._on_envelope = on_envelope
+        self._decode = decode
+        self._on_decoded = on_decoded
         self._on_undecodable = on_undecodable
         channel: zenoh.handlers.FifoChannel[zenoh.Sample] | zenoh.handlers.RingChannel[zenoh.Sample]
         if delivery == "every":
@@ -172,11 +181,11 @@ class Subscription:
 
     def _handle(self, sample: zenoh.Sample) -> None:
         try:
-            envelope = decode_sample(sample, self.row)
+            decoded = self._decode(sample)
         except DecodeError as error:
             self._on_undecodable(self.row.name, str(error))
         else:
-            self._on_envelope(envelope)
+            self._on_decoded(decoded)
 
 
 def decode_header(sample: zenoh.Sample, row: Topic) -> Header:

@@ -323,10 +323,10 @@ class FusionNode(Node):
 def _message(
     stamp_ns: int, fused: FusionResult, keyframe: bool, age_ns: int, T_odom_body: np.ndarray
 ) -> FusedDepth:
-    return FusedDepth(
+    return FusedDepth.of(
+        fused.depth_m,
+        fused.sigma_m,
         stamp_ns=stamp_ns,
-        depth_m=fused.depth_m,
-        sigma_m=fused.sigma_m,
         keyframe=keyframe,
         scale=float(fused.scale),
         scale_sigma=float(fused.scale_sigma),
@@ -339,5 +339,5 @@ def _message(
 
 
 def _rejected(stamp_ns: int, status: str, keyframe: bool = False) -> FusedDepth:
-    empty = np.zeros((0, 0), np.float32)
-    return FusedDepth(stamp_ns=stamp_ns, depth_m=empty, sigma_m=empty, status=status, keyframe=keyframe)
+    empty = np.zeros(0, np.uint8)
+    return FusedDepth(stamp_ns=stamp_ns, depth=empty, sigma=empty, status=status, keyframe=keyframe)

@@ -13,7 +13,7 @@ from pydantic import Field
 from beamsplat.common.config.base import Remote
 from beamsplat.common.config.deployment import NodeConfig
 from beamsplat.common.geometry.beams import project_beams
-from beamsplat.common.geometry.camera import Pinhole, Undistorter
+from beamsplat.common.geometry.camera import Pinhole
 from beamsplat.common.geometry.keyframe_selection import KeyframeSelector, SelectionSettings, field_of_view
 from beamsplat.common.geometry.sensor_history import SensorHistory, TimedScan
 from beamsplat.common.geometry.transforms import inverse
@@ -32,7 +32,7 @@ from beamsplat.common.messages import (
     Scan,
 )  # fmt: skip
 from beamsplat.common.messages.codec import decode, encode, schema_of
-from beamsplat.common.messages.depth_png import depth_to_png, mask_to_png, sigma_to_png
+from beamsplat.common.messages.depth_codec import pack_mask, packed_shape, unpack_depth
 from beamsplat.common.messages.header import DecodeError, Header
 from beamsplat.common.messages.image_codec import decode_rgb
 from beamsplat.common.messages.map import ODOM_ORIGIN
@@ -42,7 +42,6 @@ from beamsplat.services.keyframes.outbox import Outbox
 
 log = logging.getLogger("beamsplat.keyframes")
 
-_SCHEMA = schema_of(Keyframe)
 _IMAGES = 64  # kept until their depth arrives: 6 s at 10 Hz
 _CLOCK_STEP_NS = 600_000_000_000  # a larger step between the stamps of two images is not a duration
 _BEAMS_NS = 120_000_000  # poses up to this long after an image place the scan around it (10 Hz lidars)
@@ -152,7 +151,7 @@ class KeyframesNode(Node):
         c = rig.camera
         self._camera, self._rig = c, rig
         lens = Pinhole.of(c)
-        self._undistort = Undistorter(lens)
+        self._pinhole = lens.undistorted()
         self._history = SensorHistory(np.eye(4) if rig.lidar is None else rig.lidar.T_body_lidar)
         s = self.config
         self._selector = KeyframeSelector(
@@ -198,15 +197,17 @@ class KeyframesNode(Node):
         yield from self._resend_due()
 
     def _resend_due(self) -> Outputs:
-        for key, payload in list(self._outbox.due(self._now_ns)):
+        for key, schema, payload in list(self._outbox.due(self._now_ns)):
             try:
-                frame = decode(_SCHEMA, payload)
-            except DecodeError as error:  # written by another version
+                frame = decode(schema, payload)
+                if not isinstance(frame, Keyframe):
+                    raise DecodeError(f"{schema} is no keyframe")
+            except DecodeError as error:  # written by a newer version
                 log.warning("keyframe %d in the outbox cannot be decoded and is dropped: %s", key, error)
                 self._outbox.discard(key)
                 continue
             self._sent_again += 1
-            yield "keyframes/frame", frame.model_copy(update={"backlog": len(self._outbox)})
+            yield "keyframes/frame", frame
 
     def on_keyframes_candidate(self, candidate: KeyframeCandidate) -> Outputs:
         """Decide whether an image becomes a keyframe; without calibration, candidates are queued."""
@@ -264,6 +265,10 @@ class KeyframesNode(Node):
         yield from self._resend_due()
         self._update_detail()
 
+    def backlog(self, topic: str) -> int:
+        """Return the number of keyframes without acknowledgement, by which the mapper plans its steps."""
+        return len(self._outbox) if topic == "keyframes/frame" else 0
+
     def awaits_feedback(self) -> bool:
         """Return whether acknowledgements are missing; recorded data may end before they are received."""
         return len(self._outbox) > 0
@@ -295,10 +300,11 @@ class KeyframesNode(Node):
         T_map_camera = frame.T_map_anchor @ frame.T_anchor_body @ frame.camera.T_body_camera
         units = (self.config.distance_m, self.config.angle_rad)
         view = np.concatenate([T_map_camera[:3, 3] / units[0], T_map_camera[:3, 2] / units[1]])
-        self._outbox.put(frame.id, view, encode(frame), self._now_ns)
+        # The payload is kept with the message: it is queued and sent, and encoded once.
+        self._outbox.put(frame.id, view, schema_of(frame), encode(frame, keep=True), self._now_ns)
         self._sent += 1
         self._update_detail()
-        yield "keyframes/frame", frame.model_copy(update={"backlog": len(self._outbox)})
+        yield "keyframes/frame", frame
 
     def _keyframe(self, image: Image, depth: FusedDepth, why: str) -> Keyframe:
         """Return the keyframe message with the poses of the newest optimisation; `why`: selection reason."""
@@ -306,15 +312,21 @@ class KeyframesNode(Node):
         assert self._history is not None  # depths are queued after the calibration only
         encoding, picture = self._compress(image)
         beams, _ = self._history.beams(stamp_ns)
-        uv, z, index = project_beams(beams, self._undistort.pinhole, T_body_camera)
+        uv, z, index = project_beams(beams, self._pinhole, T_body_camera)
+        shape = self._pinhole.shape
+        if not packed_shape(depth.depth) == packed_shape(depth.sigma) == shape:
+            raise ValueError(f"depth of {packed_shape(depth.depth)} pixels, the image has {shape}")
         moving = self._history.moving_returns(stamp_ns)
-        mask = dynamic_object_mask(moving, depth.depth_m, self._undistort.pinhole, T_body_camera)
+        packed_mask = np.zeros(0, np.uint8)
+        if len(moving):  # depth is decoded only for a mask
+            depth_m = unpack_depth(depth.depth, shape)
+            mask = dynamic_object_mask(moving, depth_m, self._pinhole, T_body_camera)
+            packed_mask = pack_mask(~mask) if mask.any() else packed_mask
         return Keyframe(
             stamp_ns=stamp_ns, id=stamp_ns, encoding=encoding, picture=picture, camera=self._camera,
             anchor_id=self._anchor_id, T_map_anchor=self._T_map_anchor, optimisation=self._optimisation,
             T_anchor_body=inverse(self._T_map_anchor) @ self._T_map_odom @ depth.T_odom_body,
-            depth_png=depth_to_png(depth.depth_m), sigma_png=sigma_to_png(depth.sigma_m),
-            mask_png=mask_to_png(~mask) if mask.any() else np.zeros(0, np.uint8),
+            depth=depth.depth, sigma=depth.sigma, mask=packed_mask,
             beams=np.column_stack([uv, z, beams.sigma_m[index]]).astype(np.float32).reshape(-1, 4), why=why,
             map_uuid=self._map_uuid,
         )  # fmt: skip

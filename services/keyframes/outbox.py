@@ -104,17 +104,18 @@ class Outbox:
         folder = self._folder
         return self._discarded + (folder.corrupt + folder.unreadable if folder is not None else 0)
 
-    def put(self, key: int, view: np.ndarray, payload: bytes, now_ns: int) -> None:
+    def put(self, key: int, view: np.ndarray, schema: str, payload: bytes, now_ns: int) -> None:
         """Store a keyframe that is being sent for the first time.
 
         Args:
             key: id of the keyframe.
             view: float64 [6], position and viewing direction in the map, in units of the distance and angle
                 between keyframes.
+            schema: name and version of the message.
             payload: the encoded message.
             now_ns: measurement time.
         """
-        label = QueueEntry(key, self.drive, tuple(float(value) for value in view), len(payload))
+        label = QueueEntry(key, self.drive, tuple(float(value) for value in view), len(payload), schema)
         self._forget(key)
         if not len(self):
             self._last_ack_ns = now_ns  # the retry time starts here
@@ -154,8 +155,8 @@ class Outbox:
                 other.send_index = None
         return True
 
-    def due(self, now_ns: int) -> Iterator[tuple[int, bytes]]:
-        """Yield key and payload of the keyframes that must be sent again now."""
+    def due(self, now_ns: int) -> Iterator[tuple[int, str, bytes]]:
+        """Yield key, schema and payload of the keyframes that must be sent again now."""
         current = [entry for entry in self._entries.values() if entry.meta.drive == self.drive]
         if not current:
             return
@@ -176,7 +177,7 @@ class Outbox:
         self._forget(key)
         self._discarded += 1
 
-    def _send(self, entry: _Pending) -> Iterator[tuple[int, bytes]]:
+    def _send(self, entry: _Pending) -> Iterator[tuple[int, str, bytes]]:
         payload = entry.payload
         if payload is None and self._folder is not None:
             payload = self._folder.read(entry.meta.key)
@@ -185,7 +186,7 @@ class Outbox:
             self.bytes -= entry.meta.size
             return
         entry.send_index, entry.resent = self._next_send_index(), True
-        yield entry.meta.key, payload
+        yield entry.meta.key, entry.meta.schema, payload
 
     def _next_send_index(self) -> int:
         self._sent_count += 1

@@ -1,6 +1,6 @@
 """Files of the keyframe outbox, one per keyframe, which remain complete after a crash or a power failure.
 
-    "BSK1" | uint32 head length | head (msgpack map: key, drive, view, size, hash) | payload
+    "BSK1" | uint32 head length | head (msgpack map: key, drive, view, size, schema, hash) | payload
 
 The hash (xxh64) is computed over the payload; a truncated or damaged head cannot be unpacked. Files are
 written atomically, so that only a faulty disk causes corrupt files. Corrupt files are logged, counted and
@@ -29,6 +29,7 @@ _MAGIC = b"BSK1"
 _LENGTH = struct.Struct("<I")
 _MAX_HEAD = 65536  # bytes
 _SUFFIX = ".keyframe"
+_FIRST_SCHEMA = "Keyframe/1.2"  # of the files of programs that did not write a schema
 
 
 class CorruptFile(ValueError):
@@ -43,6 +44,7 @@ class QueueEntry:
     drive: str  # to whose anchors it belongs
     view: tuple[float, ...]  # position and viewing direction, see `beamsplat.services.keyframes.outbox`
     size: int  # bytes of the payload
+    schema: str = _FIRST_SCHEMA  # name and version of the message
 
 
 class QueueFolder:
@@ -92,7 +94,7 @@ class QueueFolder:
         """Write a keyframe atomically. Raises OSError if the disk is full or not writable."""
         head = msgpack.packb({
             "key": entry.key, "drive": entry.drive, "view": list(entry.view), "size": len(payload),
-            "hash": xxhash.xxh64_digest(payload),
+            "schema": entry.schema, "hash": xxhash.xxh64_digest(payload),
         })  # fmt: skip
         try:
             write_atomically(self._file(entry.key), _MAGIC + _LENGTH.pack(len(head)) + head + payload)
@@ -164,7 +166,8 @@ def _read_head(data: bytes) -> tuple[QueueEntry, int]:
     head, start = _head_of(data)
     try:
         view = tuple(float(value) for value in head["view"])
-        entry = QueueEntry(int(head["key"]), str(head["drive"]), view, int(head["size"]))
+        schema = str(head.get("schema", _FIRST_SCHEMA))
+        entry = QueueEntry(int(head["key"]), str(head["drive"]), view, int(head["size"]), schema)
         usable = entry.key >= 0 and np.isfinite(view).all() and isinstance(head["hash"], bytes)
     except (KeyError, TypeError, ValueError) as error:
         raise CorruptFile(f"its head lacks {error}") from error

@@ -138,7 +138,8 @@ def compress(frame: RgbdKeyframe, sigma_unit: float) -> StoredKeyframe:
             known &= frame.mask
         relative = frame.sigma_m / np.maximum(frame.depth_m, _MIN_DEPTH_M)
         weight = np.where(known, 1.0 / (1.0 + (relative / sigma_unit) ** 2), 0.0)
-    depth_mm = np.where(known, frame.depth_m * 1e3, 0.0).astype(np.uint16)
+    # Rounded: messages have whole millimetres, of which none must be lost.
+    depth_mm = np.where(known, frame.depth_m * 1e3 + 0.5, 0.0).astype(np.uint16)
     weight_8 = np.clip(np.nan_to_num(weight) * 255.0 + 0.5, 0.0, 255.0).astype(np.uint8)
     levels: list[PyramidLevel] = []
     camera, rgb = frame.camera, frame.rgb

@@ -71,6 +71,7 @@ class Mapper:
         self.keyframes: dict[int, StoredKeyframe] = {}
         self.paged_out: dict[int, StoredKeyframe] = {}  # without images; the first is paged in next
         self.T_map_anchor: dict[int, np.ndarray] = {}
+        self.pose_revision = 0  # number of moves of anchors in this process
         self.steps = 0  # of the optimiser, in all
         self.must_stop: Callable[[], bool] = lambda: False  # asked between two steps: ends them early
         self._random = np.random.default_rng(seed)
@@ -203,6 +204,7 @@ class Mapper:
                 moved += 1
             self.T_map_anchor[anchor] = np.array(T, dtype=np.float64)
         if moved:
+            self.pose_revision += 1
             self._update_bins()
         return moved
 

@@ -17,18 +17,20 @@ from beamsplat.common.messages import (
     CameraModel,
     Keyframe,
     KeyframeAck,
+    MapAnchors,
     MapChunk,
     MapPreview,
     MapRender,
     MapState,
 )
 from beamsplat.common.messages.codec import encode, schema_of
-from beamsplat.common.messages.depth_png import depth_from_png, mask_from_png, sigma_from_png
+from beamsplat.common.messages.depth_codec import unpack_depth, unpack_mask, unpack_sigma
 from beamsplat.common.messages.image_codec import decode_rgb
 from beamsplat.common.messages.splat_codec import pack
 from beamsplat.common.raster.camera import RasterCamera
 from beamsplat.services.mapping.chunks import ChunkUpdate
 from beamsplat.services.mapping.keyframe import RgbdKeyframe
+from beamsplat.services.mapping.mapper import Mapper
 from beamsplat.services.mapping.preview import KeyframeRender, MapView
 
 _PIECE_BYTES = 4 << 20  # of a state in one message
@@ -40,7 +42,10 @@ def ack(message: Keyframe, status: str) -> tuple[str, KeyframeAck]:
 
 
 def encode_keyframe(message: Keyframe) -> tuple[str, bytes]:
-    """Encode a keyframe message to (schema, payload), the format of keyframe files in a session."""
+    """Return (schema, payload) of a keyframe message, the format of keyframe files in a session.
+
+    A received keyframe is stored as it was received.
+    """
     return schema_of(message), encode(message)
 
 
@@ -59,13 +64,13 @@ def decode_keyframe(message: Keyframe, lens: Callable[[Pinhole], Undistorter]) -
     )  # fmt: skip
     p = undistort.pinhole
     rgb = decode_rgb(message.picture, message.encoding, p.width_px, p.height_px)
-    mask = mask_from_png(message.mask_png, p.shape) if len(message.mask_png) else None
-    depth_m = depth_from_png(message.depth_png, p.shape)
+    mask = unpack_mask(message.mask, p.shape) if len(message.mask) else None
+    depth_m = unpack_depth(message.depth, p.shape)
     return RgbdKeyframe(
         id=message.id, rgb=undistort(rgb),
         camera=RasterCamera(p.fx_px, p.fy_px, p.cx_px, p.cy_px, p.width_px, p.height_px),
         T_anchor_camera=message.T_anchor_body @ camera.T_body_camera,
-        depth_m=depth_m, sigma_m=typical_sigma_m(depth_m, sigma_from_png(message.sigma_png, p.shape)),
+        depth_m=depth_m, sigma_m=typical_sigma_m(depth_m, unpack_sigma(message.sigma, p.shape)),
         anchor=message.anchor_id, beams_uvz=message.beams[:, :3].astype(np.float64), mask=mask,
     )  # fmt: skip
 
@@ -109,11 +114,22 @@ def _camera_model(camera: RasterCamera, T_body_camera: np.ndarray) -> CameraMode
         return None
 
 
-def chunk_message(T_map_anchor: np.ndarray, anchor: int, update: ChunkUpdate, stamp_ns: int) -> MapChunk:
+def chunk_message(mapper: Mapper, anchor: int, update: ChunkUpdate, stamp_ns: int) -> MapChunk:
     """Return the message of the chunk of an anchor, with packed Gaussians."""
     return MapChunk(
         stamp_ns=stamp_ns, anchor_id=anchor, revision=update.version, cell_m=update.cell_m,
-        T_map_anchor=T_map_anchor, count=update.params.shape[1], packed=pack(update.params),
+        T_map_anchor=mapper.T_map_anchor[anchor], pose_revision=mapper.pose_revision,
+        count=update.params.shape[1], packed=pack(update.params),
+    )  # fmt: skip
+
+
+def anchors_message(mapper: Mapper, stamp_ns: int) -> MapAnchors:
+    """Return the message of the poses of all anchors."""
+    ids = sorted(mapper.T_map_anchor)
+    poses = np.array([mapper.T_map_anchor[anchor] for anchor in ids]).reshape(-1, 4, 4)
+    return MapAnchors(
+        stamp_ns=stamp_ns, pose_revision=mapper.pose_revision, anchor_ids=np.array(ids, np.int64),
+        T_map_anchor=poses,
     )  # fmt: skip
 
 

@@ -21,14 +21,16 @@ from beamsplat.common.messages import (
     Message,
     Tick,
 )
+from beamsplat.common.messages.header import Header
 from beamsplat.common.runtime.node import Input, Job, Node, Outputs, StopRequested
-from beamsplat.services.mapping.chunks import ChunkFeed, Viewpoint, chunk_snapshot, disk_params
+from beamsplat.services.mapping.chunks import ChunkCensus, ChunkFeed, Viewpoint, chunk_snapshot, disk_params
 from beamsplat.services.mapping.config import MappingConfig
 from beamsplat.services.mapping.engines.choice import check_cuda, make_engine
 from beamsplat.services.mapping.intake import KeyframeIntake
 from beamsplat.services.mapping.mapper import FULL, HALF, InsertionResult, Mapper
 from beamsplat.services.mapping.messages import (
     ack,
+    anchors_message,
     chunk_message,
     preview_message,
     render_message,
@@ -62,7 +64,10 @@ class MappingNode(Node):
         Input("keyframes/frame", queued_bytes=32_000_000), Input("localization/anchors", "every"),
         Input("tick", "latest"),
     )  # fmt: skip
-    outputs = ("keyframes/ack", "mapping/chunk", "mapping/poses", "mapping/preview", "mapping/status")
+    outputs = (
+        "keyframes/ack", "mapping/chunk", "mapping/anchors", "mapping/poses", "mapping/preview",
+        "mapping/status",
+    )  # fmt: skip
     _session: MapSession = NoSession()
 
     def check_resources(self) -> None:
@@ -89,6 +94,7 @@ class MappingNode(Node):
         self._intake = KeyframeIntake(self._mapper)
         self._feed = ChunkFeed()
         self._viewpoint: Viewpoint | None = None  # of the newest keyframe
+        self._backlog = 0  # keyframes that wait on the robot
         if c.memory_mb is not None:
             check_budget(c.memory_mb, c.session)
         if not self.in_standby:
@@ -129,6 +135,11 @@ class MappingNode(Node):
 
     # --- keyframes ---
 
+    def on_header(self, header: Header) -> None:
+        """Note how many keyframes wait on the robot."""
+        if header.producer == "keyframes":
+            self._backlog = header.backlog
+
     def on_arrival(self, topic: str, message: Message) -> Outputs:
         """Write a received keyframe to the session and acknowledge it, before it is processed."""
         if isinstance(self._session, NoSession) or not isinstance(message, Keyframe):
@@ -155,13 +166,14 @@ class MappingNode(Node):
             self._session.remove(message.id)
             yield "mapping/status", self._status(message.stamp_ns, outcome, 0.0)
             return
-        c, waiting = self.config, message.backlog + self._session.waiting
+        c, waiting = self.config, self._backlog + self._session.waiting
         share = min(c.calm_backlog / max(waiting, 1), 1.0)
         loss = self._mapper.optimise(math.ceil(c.half_steps * share), math.ceil(c.full_steps * share))
         self._session.keep_budget()
         yield from self._show(message, outcome, loss)
         if len(self._mapper.keyframes) % c.chunk_every == 0:
-            yield from self._chunk(message.anchor_id, message.stamp_ns)
+            census = ChunkCensus(self._mapper, self._viewpoint)
+            yield from self._chunk(census, message.anchor_id, message.stamp_ns)
         if not from_disk:  # its stamp would be an old one, between new ones: a checkpoint each time
             yield from self._checkpoint(message.stamp_ns)
 
@@ -188,10 +200,10 @@ class MappingNode(Node):
         given = {int(a): T for a, T in zip(anchors.anchor_ids, anchors.T_map_anchor)}
         moved = self._intake.move_anchors(given)
         if moved and self._mapper.keyframes:
+            # Viewers move the chunks that they have. What the steps change follows with the next chunks.
+            yield "mapping/anchors", anchors_message(self._mapper, anchors.stamp_ns)
             self._session.anchors_moved()
             self._mapper.refine(self.config.mend_steps, HALF)
-            for anchor in moved:
-                yield from self._chunk(anchor, anchors.stamp_ns)
 
     def on_tick(self, tick: Tick) -> Outputs:
         """Refine the map (or insert a skipped keyframe), and publish the due chunk that is oldest."""
@@ -202,9 +214,10 @@ class MappingNode(Node):
             self._session.keep_budget()
         if not self._mapper.keyframes:
             return
-        oldest = self._feed.oldest_due(self._mapper, self._viewpoint)
+        census = ChunkCensus(self._mapper, self._viewpoint)
+        oldest = self._feed.oldest_due(census)
         if oldest is not None:
-            yield from self._chunk(oldest, tick.stamp_ns)
+            yield from self._chunk(census, oldest, tick.stamp_ns)
         yield from self._checkpoint(tick.stamp_ns)
 
     # --- outputs ---
@@ -235,11 +248,11 @@ class MappingNode(Node):
             session=session,
         )  # fmt: skip
 
-    def _chunk(self, anchor: int, stamp_ns: int, whole: bool = False) -> Outputs:
-        """Publish the chunk of an anchor, if there is new visible detail; with `whole`, in full detail."""
-        part = self._feed.take_update(self._mapper, anchor, None if whole else self._viewpoint)
+    def _chunk(self, census: ChunkCensus, anchor: int, stamp_ns: int) -> Outputs:
+        """Publish the chunk of an anchor, if there is new visible detail."""
+        part = self._feed.take_update(census, anchor)
         if part is not None:
-            yield "mapping/chunk", chunk_message(self._mapper.T_map_anchor[anchor], anchor, part, stamp_ns)
+            yield "mapping/chunk", chunk_message(self._mapper, anchor, part, stamp_ns)
 
     def on_query_snapshot(self, parameters: dict[str, str]) -> Iterator[MapChunk]:
         """Yield the whole map, chunk by chunk, for a viewer that has just joined.
@@ -249,8 +262,8 @@ class MappingNode(Node):
         """
         viewpoint = viewpoint_of(parameters)
         self._check_map("snapshot")
-        for anchor, part in chunk_snapshot(self._mapper, viewpoint).items():
-            yield chunk_message(self._mapper.T_map_anchor[anchor], anchor, part, 0)
+        for anchor, part in chunk_snapshot(self._mapper, viewpoint):
+            yield chunk_message(self._mapper, anchor, part, 0)
 
     def on_query_render(self, parameters: dict[str, str]) -> Iterator[MapRender]:
         """Yield the map as a camera would see it.
@@ -299,8 +312,9 @@ class MappingNode(Node):
         """Publish all chunks that viewers do not have in full detail, and the poses of all keyframes."""
         stamps_ns, T_map_body, ids = self._intake.poses()
         last_ns = int(stamps_ns[-1])
-        for anchor in self._mapper.store.versions():
-            yield from self._chunk(anchor, last_ns, whole=True)
+        census = ChunkCensus(self._mapper, None)  # in full detail
+        for anchor in census.versions:
+            yield from self._chunk(census, anchor, last_ns)
         poses = MapPoses(stamp_ns=last_ns, keyframe_ids=ids, stamps_ns=stamps_ns, T_map_body=T_map_body)
         yield "mapping/poses", poses
 

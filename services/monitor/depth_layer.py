@@ -28,14 +28,17 @@ class DepthLayer:
         self._clouds = clouds
         self._drawn = 0
 
+    def depth_is_due(self, stamp_ns: int) -> bool:
+        """Return whether the rate limit permits to draw a depth map of this time: only then decode it."""
+        return self._limits.due("depth", stamp_ns)
+
     def depth(self, stamp_ns: int, depth_m: np.ndarray) -> None:
         """Draw a depth map float32 [H, W] (optical z, m); NaN (unknown) is not drawn."""
-        if depth_m.size and self._limits.due("depth", stamp_ns):
-            small = np.nan_to_num(depth_m[::_SHRINK, ::_SHRINK], nan=0.0)
-            drawing = rr.DepthImage(
-                np.ascontiguousarray(small), meter=1.0, depth_range=_RANGE_M, colormap="turbo"
-            )
-            self._writer.log(DEPTH, drawing, stamp_ns=stamp_ns)
+        small = np.nan_to_num(depth_m[::_SHRINK, ::_SHRINK], nan=0.0)
+        drawing = rr.DepthImage(
+            np.ascontiguousarray(small), meter=1.0, depth_range=_RANGE_M, colormap="turbo"
+        )
+        self._writer.log(DEPTH, drawing, stamp_ns=stamp_ns)
 
     def cloud(self, stamp_ns: int, points_odom_m: np.ndarray, colours: np.ndarray) -> None:
         """Draw the points float32 [N, 3] (odom frame, m) of a keyframe, with colours uint8 [N, 3] (RGB).

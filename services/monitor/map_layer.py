@@ -16,6 +16,7 @@ import rerun as rr
 
 from beamsplat.common.geometry.tracks import RateLimit
 from beamsplat.common.geometry.transforms import quat_xyzw_from_matrix
+from beamsplat.common.mapfiles.anchor_poses import AnchorPoses
 from beamsplat.common.messages.splat_codec import unpack
 from beamsplat.common.raster.layout import COLOUR, MEAN, OPACITY, QUAT, SCALE
 from beamsplat.services.monitor.rerun_writer import RerunWriter
@@ -28,7 +29,6 @@ PLOTS = {"psnr_db": "Render against image, PSNR [dB]", "depth_error_m": "Rendere
 @dataclass
 class _Chunk:
     stamp_ns: int
-    T_map_anchor: np.ndarray
     packed: np.ndarray
 
 
@@ -44,6 +44,8 @@ class MapLayer:
         self._limits = limits
         self._producer = ""  # instance of the mapper process whose chunks are drawn
         self._revisions: dict[int, int] = {}
+        self._poses = AnchorPoses()
+        self._drawn: set[int] = set()  # anchors of which a chunk is drawn
         self._deferred: dict[int, _Chunk] = {}
         self._declared: set[str] = set()
 
@@ -53,28 +55,55 @@ class MapLayer:
         producer: str,
         anchor: int,
         revision: int,
-        T_map_anchor: np.ndarray,
+        pose: tuple[int, np.ndarray],
         packed: np.ndarray,
     ) -> None:
         """Draw the packed Gaussians of one submap, in its anchor's frame; outdated revisions are ignored.
 
-        `producer`: instance of the mapper process that sent the chunk; `packed`: uint8 [B], encoded by
-        `splat_codec`; `T_map_anchor` [4, 4].
+        Args:
+            producer: instance of the mapper process that sent the chunk.
+            pose: revision of the pose, and T_map_anchor float64 [4, 4].
+            packed: uint8 [B], encoded by `splat_codec`.
 
         Raises:
-            ValueError: the bytes are no packed Gaussians.
+            ValueError: the bytes are no packed Gaussians, or there are too many submaps.
         """
         if producer != self._producer:
             self._start_map(producer, stamp_ns)
-        if revision < self._revisions.get(anchor, -1):
-            return
-        self._revisions[anchor] = revision
-        chunk = _Chunk(stamp_ns, T_map_anchor, packed)
-        if self._limits.due("splats", stamp_ns, f"{producer} {anchor}"):
+        moved = self._poses.update(pose[0], [(anchor, pose[1])])
+        chunk, newer = _Chunk(stamp_ns, packed), revision >= self._revisions.get(anchor, -1)
+        if newer:
+            self._revisions[anchor] = revision
+        if newer and self._limits.due("splats", stamp_ns, f"{producer} {anchor}"):
             self._deferred.pop(anchor, None)
             self._draw(anchor, chunk)
-        else:
+            return
+        if newer:
             self._deferred[anchor] = chunk
+        self._draw_poses(stamp_ns, moved)
+
+    def anchors(
+        self, stamp_ns: int, producer: str, revision: int, T_map_anchor: dict[int, np.ndarray]
+    ) -> None:
+        """Move the submaps to the poses (float64 [4, 4]) of all anchors.
+
+        Raises:
+            ValueError: there are too many submaps.
+        """
+        if producer != self._producer:
+            self._start_map(producer, stamp_ns)
+        self._draw_poses(stamp_ns, self._poses.update(revision, T_map_anchor.items()))
+
+    def _draw_poses(self, stamp_ns: int, anchors: list[int]) -> None:
+        for anchor in anchors:
+            if anchor in self._drawn:
+                self._writer.log(_entity(anchor), self._transform(anchor), stamp_ns=stamp_ns)
+
+    def _transform(self, anchor: int) -> rr.Transform3D:
+        T = self._poses.pose(anchor)
+        return rr.Transform3D(
+            translation=T[:3, 3], quaternion=rr.Quaternion(xyzw=quat_xyzw_from_matrix(T[:3, :3]))
+        )
 
     def _start_map(self, producer: str, stamp_ns: int) -> None:
         """Remove the chunks of the process that sent chunks before."""
@@ -82,19 +111,18 @@ class MapLayer:
             self._writer.log(SPLATS, rr.Clear(recursive=True), stamp_ns=stamp_ns)
         self._producer = producer
         self._revisions.clear()
+        self._poses.clear()
+        self._drawn.clear()
         self._deferred.clear()
 
     def _draw(self, anchor: int, chunk: _Chunk) -> None:
         params = unpack(chunk.packed)
-        entity = f"{SPLATS}/{'odom' if anchor < 0 else anchor}"
         opacity = 1.0 / (1.0 + np.exp(-params[OPACITY]))
         rgba = np.concatenate([params[COLOUR:], opacity[None]]).T
-        T = chunk.T_map_anchor
+        self._drawn.add(anchor)
         self._writer.log(
-            entity,
-            rr.Transform3D(
-                translation=T[:3, 3], quaternion=rr.Quaternion(xyzw=quat_xyzw_from_matrix(T[:3, :3]))
-            ),
+            _entity(anchor),
+            self._transform(anchor),
             rr.GaussianSplats3D(
                 np.ascontiguousarray(params[MEAN:SCALE].T),
                 scales=np.ascontiguousarray(np.exp(params[SCALE:QUAT]).T),
@@ -135,3 +163,7 @@ class MapLayer:
                 faults.append(str(error))
         self._deferred.clear()
         return faults
+
+
+def _entity(anchor: int) -> str:
+    return f"{SPLATS}/{'odom' if anchor < 0 else anchor}"

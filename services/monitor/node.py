@@ -15,7 +15,7 @@ from beamsplat.common.errors import UserError
 from beamsplat.common.files.persist import check_can_write
 from beamsplat.common.geometry.tracks import RateLimit
 from beamsplat.common.mapfiles.grid_tiles import GridSource
-from beamsplat.common.messages import FusedDepth, Health, MapChunk, MapStatus, Odometry, Rig
+from beamsplat.common.messages import FusedDepth, Health, MapAnchors, MapChunk, MapStatus, Odometry, Rig
 from beamsplat.common.messages.header import Header
 from beamsplat.common.runtime.node import Input, Node, Output
 from beamsplat.services.monitor.depth_layer import DepthLayer
@@ -79,7 +79,8 @@ def _draw_odometry(scene: Scene, panel: HealthPanel, m: Odometry) -> None:
 
 
 def _draw_depth(view: DepthLayer, panel: HealthPanel, m: FusedDepth) -> None:
-    view.depth(m.stamp_ns, m.depth_m)
+    if m.depth.size and view.depth_is_due(m.stamp_ns):
+        view.depth(m.stamp_ns, m.depth_m)
     panel.status("fusion", "ok" if m.status == "ok" else "refused", m.status.removeprefix("ok"), m.stamp_ns)
 
 
@@ -120,7 +121,7 @@ DEPTH: dict[Input, Draw] = {
     Input("fusion/depth", "latest"): _draw_depth,
     Input("fusion/cloud", "latest"): lambda view, _, m: view.cloud(m.stamp_ns, m.points_odom_m, m.colours),
 }
-CHUNK = Input("mapping/chunk", "every")
+CHUNK, ANCHORS = Input("mapping/chunk", "every"), Input("mapping/anchors", "latched")
 MAP: dict[Input, Draw] = {
     Input("mapping/preview", "latest"): lambda view, _, m: view.render(m.stamp_ns, m.render),
     Input("mapping/status", "latest"): _draw_status,
@@ -157,7 +158,7 @@ class MonitorNode(_Handlers, Node):
     name = "monitor"
     Config = MonitorConfig
     config: MonitorConfig
-    inputs = (*SCENE, *GRID, *DEPTH, CHUNK, *MAP)
+    inputs = (*SCENE, *GRID, *DEPTH, CHUNK, ANCHORS, *MAP)
     _header: Header | None = None
 
     def check_resources(self) -> None:
@@ -225,7 +226,20 @@ class MonitorNode(_Handlers, Node):
         sent_by = self._header.instance
 
         def draw(view: MapLayer, _: HealthPanel, m: MapChunk) -> None:
-            view.chunk(m.stamp_ns, sent_by, m.anchor_id, m.revision, m.T_map_anchor, m.packed)
+            pose = (m.pose_revision, m.T_map_anchor)
+            view.chunk(m.stamp_ns, sent_by, m.anchor_id, m.revision, pose, m.packed)
+
+        return _draw_safely(self, "map_layer", draw, message)
+
+    def on_mapping_anchors(self, message: MapAnchors) -> tuple[Output, ...]:
+        """Move the chunks with their anchors."""
+        assert self._header is not None  # runners pass it before each message
+        sent_by = self._header.instance
+
+        def draw(view: MapLayer, _: HealthPanel, m: MapAnchors) -> None:
+            view.anchors(
+                m.stamp_ns, sent_by, m.pose_revision, dict(zip(m.anchor_ids.tolist(), m.T_map_anchor))
+            )
 
         return _draw_safely(self, "map_layer", draw, message)
 

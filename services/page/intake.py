@@ -103,8 +103,8 @@ class RobotIntake:
             scale=m.scale, scale_sigma=m.scale_sigma, inlier_share=m.inlier_share, residual_m=m.residual_m,
         )  # fmt: skip
         self.state.scale(m.scale, m.scale_sigma)
-        if m.depth_m.size:
-            self.state.images["depth"].update(partial(encode_depth, m.depth_m, self._widest_px))
+        if m.depth.size:  # decoded only while a page is open
+            self.state.images["depth"].update(lambda: encode_depth(m.depth_m, self._widest_px))
 
     def _preview(self, m: MapPreview) -> None:
         self.state.images["render"].update(lambda: EncodedImage(m.render.tobytes(), "image/jpeg", {}))

@@ -19,6 +19,7 @@ from beamsplat.common.messages import (
     Correction,
     FusedDepth,
     GridTile,
+    MapAnchors,
     MapChunk,
     MapPreview,
     MapRender,
@@ -27,6 +28,7 @@ from beamsplat.common.messages import (
     Tick,
     WheelOdometry,
 )
+from beamsplat.common.messages.depth_codec import packed_shape
 from beamsplat.common.messages.header import Header
 from beamsplat.common.messages.image_codec import decode_rgb
 from beamsplat.common.recording import ros_types as ros
@@ -64,6 +66,7 @@ class Ros2OutNode(Node):
         "fusion/cloud",
         # In order of arrival: chunks have the stamps of keyframes, for which poses must not wait.
         Input("mapping/chunk", feedback=True, queued_bytes=64_000_000),
+        "mapping/anchors",
         "mapping/preview",
         Input("tick", "latest"),
     )
@@ -171,13 +174,17 @@ class Ros2OutNode(Node):
         """Publish the depth of an undistorted image and its CameraInfo."""
         if depth.status != "ok":
             return iter(())
-        size_px = depth.depth_m.shape[::-1]
-        if self._camera is None or size_px != (self._camera.width_px, self._camera.height_px):
-            self.rejections.add(f"depth not published: {size_px} px do not belong to the calibration")
-            return iter(())
         stamp_ns, frame = depth.stamp_ns, self.config.camera_frame
+        try:
+            size_px = packed_shape(depth.depth)[::-1]
+            if self._camera is None or size_px != (self._camera.width_px, self._camera.height_px):
+                raise ValueError(f"{size_px} px do not belong to the calibration")
+            # Decoded only if somebody subscribes.
+            self._ros.put("depth", lambda: images.depth_image(stamp_ns, frame, depth.depth_m))
+        except ValueError as error:
+            self.rejections.add(f"depth not published: {error}")
+            return iter(())
         pinhole = Pinhole.of(self._camera).undistorted()
-        self._ros.put("depth", lambda: images.depth_image(stamp_ns, frame, depth.depth_m))
         self._ros.put("depth_info", lambda: images.camera_info(stamp_ns, frame, pinhole))
         return self._done()
 
@@ -186,14 +193,23 @@ class Ros2OutNode(Node):
         if "map_cloud" in self._ros:
             self._chunk_ns = chunk.stamp_ns or self._chunk_ns
             try:
-                self._splats.add(
-                    self._mapper, chunk.anchor_id, chunk.revision, chunk.T_map_anchor, chunk.packed
-                )
+                self._splats.add(self._mapper, *_chunk_arguments(chunk))
             except ValueError as error:
                 self.rejections.add(f"chunk of the map not published: {error}")
             self._publish_splats(chunk.stamp_ns)
         self._done()
         yield from self._ask_snapshot()
+
+    def on_mapping_anchors(self, anchors: MapAnchors) -> Outputs:
+        """Move the submaps of the map that is published as points."""
+        if "map_cloud" in self._ros:
+            poses = dict(zip(anchors.anchor_ids.tolist(), anchors.T_map_anchor))
+            try:
+                self._splats.move(self._mapper, anchors.pose_revision, poses)
+            except ValueError as error:
+                self.rejections.add(f"poses of the map not used: {error}")
+            self._publish_splats(anchors.stamp_ns)
+        return self._done()
 
     def on_tick(self, tick: Tick) -> Outputs:
         self._publish_splats(tick.stamp_ns)
@@ -270,7 +286,7 @@ class Ros2OutNode(Node):
             try:
                 for chunk in ask("mapping", "snapshot", {}, _SNAPSHOT_S):
                     assert isinstance(chunk, MapChunk)  # the message type of this query
-                    snapshot.add("", chunk.anchor_id, chunk.revision, chunk.T_map_anchor, chunk.packed)
+                    snapshot.add("", *_chunk_arguments(chunk))
             except ValueError as error:  # no mapper, an empty map, or an answer that does not decode
                 log.info("no snapshot of the map: %s", error)
             return snapshot
@@ -296,3 +312,8 @@ class Ros2OutNode(Node):
         for reason, count in self._ros.missed().items():
             self.rejections.set(reason, count)
         return iter(())
+
+
+def _chunk_arguments(chunk: MapChunk) -> tuple[int, int, tuple[int, np.ndarray], np.ndarray]:
+    """Return the arguments of `SplatCloud.add` after the producer."""
+    return chunk.anchor_id, chunk.revision, (chunk.pose_revision, chunk.T_map_anchor), chunk.packed

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from beamsplat.common.geometry.transforms import transform_points
+from beamsplat.common.mapfiles.anchor_poses import AnchorPoses
 from beamsplat.common.messages.splat_codec import unpack
 from beamsplat.common.raster.layout import COLOUR, MEAN, OPACITY, SCALE
 
@@ -19,7 +20,6 @@ _CELL_BITS = 21  # of a cell index per axis: 52 km in each direction at 5 cm
 @dataclass(frozen=True)
 class _Submap:
     revision: int
-    T_map_anchor: np.ndarray  # float64 [4, 4]
     points_m: np.ndarray  # float32 [N, 3], anchor frame
     colours: np.ndarray  # uint8 [N, 3], RGB
 
@@ -36,6 +36,7 @@ class SplatCloud:
         self._initial_cell_m = self.cell_m = cell_m
         self._producer = ""  # instance of the mapper process that sent the chunks
         self._submaps: dict[int, _Submap] = {}
+        self._poses = AnchorPoses()
         self.changed = False  # since the last call of `points`
 
     def add(
@@ -43,7 +44,7 @@ class SplatCloud:
         producer: str,
         anchor: int,
         revision: int,
-        T_map_anchor: np.ndarray,  # float64 [4, 4]
+        pose: tuple[int, np.ndarray],  # its revision, and T_map_anchor float64 [4, 4]
         packed: np.ndarray,  # uint8 [B], encoded by `splat_codec`
     ) -> None:
         """Store the Gaussians of one submap instead of its earlier ones; older revisions are ignored.
@@ -53,11 +54,8 @@ class SplatCloud:
         Raises:
             ValueError: the bytes are no packed Gaussians, or there are too many submaps.
         """
-        if self._producer and producer != self._producer:
-            self.changed = self.changed or bool(self._submaps)
-            self._submaps.clear()
-            self.cell_m = self._initial_cell_m
-        self._producer = producer
+        self._start_map(producer)
+        self.move(producer, pose[0], {anchor: pose[1]})
         known = self._submaps.get(anchor)
         if known is not None and revision < known.revision:
             return
@@ -68,24 +66,48 @@ class SplatCloud:
         params = params[:, np.argsort(-params[OPACITY], kind="stable")]
         colours = (np.clip(params[COLOUR:], 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8).T
         points_m = np.ascontiguousarray(params[MEAN:SCALE].T)
-        submap = _Submap(revision, T_map_anchor, points_m, np.ascontiguousarray(colours))
+        submap = _Submap(revision, points_m, np.ascontiguousarray(colours))
         self._submaps[anchor] = _thinned(submap, self.cell_m)
         self.changed = True
         self._keep_limit()
+
+    def move(self, producer: str, revision: int, T_map_anchor: dict[int, np.ndarray]) -> None:
+        """Store the poses (float64 [4, 4]) of submaps, unless newer ones are known.
+
+        Raises:
+            ValueError: there are too many submaps.
+        """
+        self._start_map(producer)
+        moved = self._poses.update(revision, T_map_anchor.items())
+        self.changed = self.changed or any(anchor in self._submaps for anchor in moved)
+
+    def _start_map(self, producer: str) -> None:
+        """Forget the map of another process of the mapper."""
+        if self._producer and producer != self._producer:
+            self.changed = self.changed or bool(self._submaps)
+            self._submaps.clear()
+            self._poses.clear()
+            self.cell_m = self._initial_cell_m
+        self._producer = producer
 
     def complete(self, other: SplatCloud) -> None:
         """Add the submaps of `other`, a snapshot of the same map, that are not known yet."""
         for anchor, submap in other._submaps.items():
             if anchor not in self._submaps and len(self._submaps) < _MAX_SUBMAPS:
                 self._submaps[anchor] = _thinned(submap, self.cell_m)
+                self._poses.update(*other._poses.entry(anchor))
                 self.changed = True
                 self._keep_limit()
 
     def points(self) -> tuple[np.ndarray, np.ndarray]:
         """Return points float32 [N, 3] (m, map frame) and colours uint8 [N, 3] (RGB), ordered by submap."""
         self.changed = False
-        submaps = [self._submaps[anchor] for anchor in sorted(self._submaps)]
-        points = [transform_points(s.T_map_anchor, s.points_m.astype(np.float64)) for s in submaps]
+        anchors = sorted(self._submaps)
+        submaps = [self._submaps[anchor] for anchor in anchors]
+        points = [
+            transform_points(self._poses.pose(a), s.points_m.astype(np.float64))
+            for a, s in zip(anchors, submaps)
+        ]
         if not points:
             return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
         colours = np.concatenate([s.colours for s in submaps])
@@ -109,4 +131,4 @@ def _thinned(submap: _Submap, cell_m: float) -> _Submap:
     key = (cells[:, 0] << 2 * _CELL_BITS) | (cells[:, 1] << _CELL_BITS) | cells[:, 2]
     _, first = np.unique(key, return_index=True)
     first.sort()
-    return _Submap(submap.revision, submap.T_map_anchor, submap.points_m[first], submap.colours[first])
+    return _Submap(submap.revision, submap.points_m[first], submap.colours[first])

@@ -28,8 +28,9 @@ import zstandard
 from mcap.writer import CompressionType, Writer
 
 from beamsplat.common.mapfiles.session import unpacked_arrays
-from beamsplat.common.messages import Image, Keyframe, Tick
+from beamsplat.common.messages import FusedDepth, Image, Keyframe, Tick
 from beamsplat.common.messages.codec import decode
+from beamsplat.common.messages.depth_codec import pack_depth, pack_sigma
 from beamsplat.common.messages.image_codec import decode_rgb
 from beamsplat.common.messages.splat_codec import unpack
 from beamsplat.common.recording import layout
@@ -87,8 +88,8 @@ def keyframe_with(**fields: object) -> Keyframe:
     grey = np.zeros((480, 640), np.uint8)
     valid = {
         "picture": cv2.imencode(".jpg", grey)[1].ravel(),
-        "depth_png": cv2.imencode(".png", grey.astype(np.uint16))[1].ravel(),
-        "sigma_png": cv2.imencode(".png", grey)[1].ravel(), "mask_png": np.zeros(0, np.uint8),
+        "depth": pack_depth(grey.astype(np.float32)), "sigma": pack_sigma(grey.astype(np.float32)),
+        "mask": np.zeros(0, np.uint8),
     }  # fmt: skip
     return keyframe.model_copy(update=valid | fields)
 
@@ -209,6 +210,11 @@ def zstd_zeros(size: int = _ZEROS) -> bytes:
     return _zeros(compressor, compressor.flush, size)
 
 
+def packed_zeros(width_px: int, height_px: int) -> np.ndarray:
+    """Return packed depth of a stated size, whose data expand to 400 MB."""
+    return np.frombuffer(struct.pack("<4sBxHH", b"BSZ1", 2, height_px, width_px) + zstd_zeros(), np.uint8)
+
+
 def lz4_zeros() -> bytes:
     compressor = lz4.frame.LZ4FrameCompressor()
     return compressor.begin() + _zeros(compressor, compressor.flush)
@@ -250,9 +256,12 @@ BOMBS: dict[str, tuple[Callable[[Path], object], Callable[[object], object]]] = 
         stamp_ns=1, width_px=SIDE_PX, height_px=SIDE_PX, encoding="png", data=b)),
     "keyframe picture": (
         lambda f: keyframe_with(picture=png(SIDE_PX), encoding="png"), lambda b: keyframe_pixels(b)),
-    "keyframe depth": (lambda f: keyframe_with(depth_png=png(SIDE_PX, 16)), lambda b: keyframe_pixels(b)),
-    "keyframe sigma": (lambda f: keyframe_with(sigma_png=png(SIDE_PX)), lambda b: keyframe_pixels(b)),
-    "keyframe mask": (lambda f: keyframe_with(mask_png=png(SIDE_PX)), lambda b: keyframe_pixels(b)),
+    "keyframe depth png": (lambda f: keyframe_with(depth=png(SIDE_PX, 16)), lambda b: keyframe_pixels(b)),
+    "keyframe sigma png": (lambda f: keyframe_with(sigma=png(SIDE_PX)), lambda b: keyframe_pixels(b)),
+    "keyframe mask png": (lambda f: keyframe_with(mask=png(SIDE_PX)), lambda b: keyframe_pixels(b)),
+    "keyframe depth": (lambda f: keyframe_with(depth=packed_zeros(640, 480)), lambda b: keyframe_pixels(b)),
+    "fused depth": (lambda f: FusedDepth(
+        stamp_ns=1, depth=packed_zeros(16384, 16384), sigma=packed_zeros(1, 1)), lambda b: b.depth_m),
     "message head": (lambda f: head(nested_lists(100, 400_000)), lambda b: decode("Tick/1.0", b)),
     "array description": (
         lambda f: head(msgpack.packb(msgpack.ExtType(1, nested_lists(100, 400_000)))),

@@ -24,6 +24,7 @@ from beamsplat.common.messages import (
     KeyframeCandidate,
     KeyframeDecision,
     LidarModel,
+    MapAnchors,
     MapChunk,
     MapPoses,
     MapPreview,
@@ -90,7 +91,7 @@ def sample_messages() -> list[Message]:
             stamp_ns=23, source="fastdepth", kind="relative", status="the network returned nothing above zero",
             values=np.array([[1.0, np.nan]], np.float32),
         ),
-        FusedDepth(
+        FusedDepth.of(
             stamp_ns=24, depth_m=np.array([[1.0, np.nan]], np.float32), sigma_m=np.array([[0.1, np.nan]], np.float32),
             status="no beams in view", keyframe=True, scale=1.2, scale_sigma=0.01, inlier_share=0.9, residual_m=0.02,
             pairs=120, beams_age_ns=-5, T_odom_body=T[1],
@@ -100,8 +101,8 @@ def sample_messages() -> list[Message]:
         ),
         Keyframe(
             stamp_ns=26, id=26, encoding="jpeg", picture=np.arange(5, dtype=np.uint8), camera=camera, anchor_id=7,
-            T_anchor_body=T[0], T_map_anchor=T[1], optimisation=3, depth_png=np.arange(3, dtype=np.uint8),
-            sigma_png=np.arange(4, dtype=np.uint8), mask_png=np.arange(2, dtype=np.uint8),
+            T_anchor_body=T[0], T_map_anchor=T[1], optimisation=3, depth=np.arange(3, dtype=np.uint8),
+            sigma=np.arange(4, dtype=np.uint8), mask=np.arange(2, dtype=np.uint8),
             beams=np.array([[320.0, 240.0, 2.0, 0.01]], np.float32), why="moved",
         ),
         KeyframeCandidate(stamp_ns=26, T_odom_body=T[1], sharpness=0.7),
@@ -109,7 +110,9 @@ def sample_messages() -> list[Message]:
         KeyframeAck(stamp_ns=26, id=26, status="no pixel has a depth"),
         MapChunk(
             stamp_ns=27, anchor_id=7, revision=4, T_map_anchor=T[1], count=2, packed=np.arange(9, dtype=np.uint8),
+            pose_revision=3,
         ),
+        MapAnchors(stamp_ns=27, pose_revision=3, anchor_ids=np.array([0, 7]), T_map_anchor=T),
         MapState(stamp_ns=27, first=4, total=9, data=np.arange(5, dtype=np.uint8)),
         MapPoses(
             stamp_ns=28, keyframe_ids=np.array([26, 30]), stamps_ns=np.array([26, 30]), T_map_body=T,

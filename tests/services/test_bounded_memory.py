@@ -33,6 +33,7 @@ from beamsplat.common.messages import (
     KeyframeCandidate,
     KeyframeDecision,
     LidarModel,
+    MapAnchors,
     MapChunk,
     MapPoses,
     MapPreview,
@@ -45,7 +46,7 @@ from beamsplat.common.messages import (
     Tick,
     WheelOdometry,
 )
-from beamsplat.common.messages.depth_png import depth_to_png, sigma_to_png
+from beamsplat.common.messages.depth_codec import pack_depth, pack_sigma
 from beamsplat.common.messages.header import Header
 from beamsplat.common.messages.splat_codec import pack
 from beamsplat.common.runtime.node import Job, Node, subscriptions
@@ -110,7 +111,7 @@ def step(number: int, stamp_ns: int, lost: bool) -> dict[str, Callable[[], Messa
         "depth/estimate": lambda: DepthEstimate(**at, source="a", kind="metric", values=depth),
         "keyframes/candidate": lambda: KeyframeCandidate(**at, T_odom_body=T, sharpness=5.0),
         "keyframes/decision": lambda: KeyframeDecision(**at, keyframe=False),
-        "fusion/depth": lambda: FusedDepth(
+        "fusion/depth": lambda: FusedDepth.of(
             **at, depth_m=depth, sigma_m=0.1 * depth, keyframe=number % 3 == 0, T_odom_body=T),
         "fusion/cloud": lambda: Cloud(
             **at, points_odom_m=np.ones((9, 3), np.float32), colours=np.ones((9, 3), np.uint8)),
@@ -118,11 +119,13 @@ def step(number: int, stamp_ns: int, lost: bool) -> dict[str, Callable[[], Messa
             **at, cells=np.zeros((8, 8), np.int8), row=number, map_uuid="b" if lost else "a"),
         "keyframes/frame": lambda: Keyframe(
             **at, id=number, encoding="jpeg", picture=jpeg, camera=RIG.camera, anchor_id=number % 2,
-            T_anchor_body=T, T_map_anchor=np.eye(4), depth_png=depth_to_png(depth),
-            sigma_png=sigma_to_png(0.1 * depth), map_uuid="b" if lost and number % 2 else "a"),
+            T_anchor_body=T, T_map_anchor=np.eye(4), depth=pack_depth(depth),
+            sigma=pack_sigma(0.1 * depth), map_uuid="b" if lost and number % 2 else "a"),
         "mapping/chunk": lambda: MapChunk(
             **at, anchor_id=number % 2, revision=number, T_map_anchor=np.eye(4), count=3,
             packed=pack(np.full((14, 3), 0.5, np.float32))),
+        "mapping/anchors": lambda: MapAnchors(
+            **at, pose_revision=number, anchor_ids=np.arange(2), T_map_anchor=np.array([T, T])),
         "mapping/poses": lambda: MapPoses(
             **at, keyframe_ids=np.arange(2), stamps_ns=np.arange(2), T_map_body=np.array([T, T])),
         "mapping/preview": lambda: MapPreview(

@@ -109,7 +109,9 @@ def test_the_page_shows_a_depth_map_of_any_shape(shape, tmp_path, router_endpoin
     try:
         depth = np.ones(shape, np.float32)
         list(
-            node.on_fusion_depth(FusedDepth(stamp_ns=1, depth_m=depth, sigma_m=depth, T_odom_body=np.eye(4)))
+            node.on_fusion_depth(
+                FusedDepth.of(stamp_ns=1, depth_m=depth, sigma_m=depth, T_odom_body=np.eye(4))
+            )
         )
         node._fleet.own_state.images["depth"].encode_newest()
     finally:

@@ -15,6 +15,8 @@ import psutil
 
 from beamsplat.common.config.deployment import Deployment
 from beamsplat.common.errors import UserError
+from beamsplat.common.mapfiles.anchor_poses import AnchorPoses
+from beamsplat.common.messages.header import Header
 from beamsplat.common.runtime.mailbox import Envelope
 from beamsplat.common.runtime.node import Input
 from beamsplat.common.topics import Delivery, topic
@@ -22,9 +24,11 @@ from beamsplat.common.zenoh.bus import Bus, open_session
 from beamsplat.tools.system.health_table import HealthTable
 from beamsplat.tools.system.supervisor import Supervisor
 
+IMAGES = "camera/image"
 TOPICS = (
-    "camera/image", "localization/odometry", "localization/correction", "depth/estimate", "fusion/depth",
-    "keyframes/frame", "keyframes/ack", "mapping/chunk", "mapping/poses", "mapping/preview", "mapping/status",
+    "localization/odometry", "localization/correction", "depth/estimate", "fusion/depth",
+    "keyframes/frame", "keyframes/ack", "mapping/chunk", "mapping/anchors", "mapping/poses",
+    "mapping/preview", "mapping/status",
 )  # fmt: skip
 DEPTH_STRIDE = 2  # recorded depth maps keep every second row and column
 
@@ -61,7 +65,7 @@ class RunRecord:
 
 
 class BusObserver:
-    """Subscriber to all `TOPICS` of one run, which stores the messages in `record`.
+    """Subscriber to `IMAGES` and all `TOPICS` of one run, which stores the messages in `record`.
 
     Depth maps are stored only for the stamps `keep_depth_at`.
     """
@@ -72,10 +76,13 @@ class BusObserver:
         self._T_map_odom = np.eye(4)
         self._ended_ns = 0
         self._mapper = ""  # instance of the mapper process that has sent `chunks`
+        self._poses = AnchorPoses()
         self._lock = threading.Lock()
 
     def subscribe(self, bus: Bus) -> None:
-        """Subscribe to all TOPICS; callbacks run in threads of the bus."""
+        """Subscribe to IMAGES and all TOPICS; callbacks run in threads of the bus."""
+        # Of images only the time of publication is recorded: their payloads are not read.
+        bus.subscribe_headers(Input(IMAGES, "every"), self._receive_image, self._count_undecodable)
         for name in TOPICS:
             delivery: Delivery | None = None if topic(name).delivery == "latched" else "every"
             bus.subscribe(Input(name, delivery), self._receive, self._count_undecodable, lambda *_: None)
@@ -89,8 +96,9 @@ class BusObserver:
             if topic(envelope.topic).uplink in ("up", "bulk"):
                 self.record.link_bytes += envelope.size_bytes
 
-    def _camera_image(self, envelope: Envelope, m: Any) -> None:
-        self.record.images[m.stamp_ns] = envelope.header.publish_ns
+    def _receive_image(self, header: Header) -> None:
+        with self._lock:
+            self.record.images[header.stamp_ns] = header.publish_ns
 
     def _localization_correction(self, envelope: Envelope, m: Any) -> None:
         self._T_map_odom = m.T_map_odom.copy()
@@ -132,14 +140,32 @@ class BusObserver:
         """Discard the map of a mapper process that was replaced: the new one sends its own map."""
         if self._mapper not in ("", instance):
             self.record.chunks.clear()
+            self._poses.clear()
             self.record.keyframe_poses = None
         self._mapper = instance
 
     def _mapping_chunk(self, envelope: Envelope, m: Any) -> None:
         self._follow_mapper(envelope.header.instance)
-        self.record.chunks[m.anchor_id] = m
-        if self.record.online_chunks is not None and envelope.header.publish_ns <= self._ended_ns:
-            self.record.online_chunks[m.anchor_id] = m  # sent before the final poses, received after them
+        self._poses.update(m.pose_revision, [(m.anchor_id, m.T_map_anchor)])
+        for chunks in self._maps(envelope):
+            chunks[m.anchor_id] = self._posed(m)
+
+    def _mapping_anchors(self, envelope: Envelope, m: Any) -> None:
+        self._follow_mapper(envelope.header.instance)
+        self._poses.update(m.pose_revision, zip(m.anchor_ids.tolist(), m.T_map_anchor))
+        for chunks in self._maps(envelope):
+            chunks.update({anchor: self._posed(chunk) for anchor, chunk in chunks.items()})
+
+    def _posed(self, chunk: Any) -> Any:
+        """Return a chunk with the newest pose of its anchor."""
+        return chunk.model_copy(update={"T_map_anchor": self._poses.pose(chunk.anchor_id)})
+
+    def _maps(self, envelope: Envelope) -> list[dict[int, Any]]:
+        """Return the chunks of the maps to which a message belongs: one sent before the final poses, and
+        received after them, belongs to the map at the end of the drive too."""
+        online = self.record.online_chunks
+        late = online is not None and envelope.header.publish_ns <= self._ended_ns
+        return [self.record.chunks, online] if late and online is not None else [self.record.chunks]
 
     def _mapping_poses(self, envelope: Envelope, m: Any) -> None:
         self._follow_mapper(envelope.header.instance)

@@ -15,7 +15,7 @@ from beamsplat.common.errors import UserError
 from beamsplat.common.geometry.camera import Pinhole
 from beamsplat.common.mapfiles.session import SessionFolder
 from beamsplat.common.messages import CameraModel
-from beamsplat.common.messages.depth_png import mask_to_png
+from beamsplat.common.messages.depth_codec import pack_mask
 from beamsplat.tools.cli.main import app
 from tests.services.mapping import room_drive as r
 from tests.services.mapping.session.maps import handle, make_node, message
@@ -63,7 +63,7 @@ def session(tmp_path_factory):
         if number == 2:
             mask = np.ones(depth.shape, bool)
             mask[HIDDEN] = False
-            change["mask_png"] = mask_to_png(mask)
+            change["mask"] = pack_mask(mask)
         if number in (JPEG, TURNED):
             change |= {"encoding": "jpeg", "picture": jpeg(rgb, 6 if number == TURNED else None)}
         if number == DISTORTED:

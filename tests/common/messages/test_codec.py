@@ -12,7 +12,7 @@ from hypothesis.extra import numpy as hnp
 from pydantic import BaseModel
 
 from beamsplat.common.messages import MESSAGES, Correction, Image, Rig, Scan
-from beamsplat.common.messages.codec import decode, encode, schema_of
+from beamsplat.common.messages.codec import decode, encode, kept_payload, schema_of
 from beamsplat.common.messages.header import DecodeError, Header
 from tests.common.samples import assert_equal, sample_messages
 
@@ -29,7 +29,31 @@ def test_round_trip(message):
     payload = encode(message)
     decoded = decode(schema_of(message), payload)
     assert_equal(message, decoded)
-    assert encode(decoded) == payload
+    assert encode(decoded) is payload  # kept with the message
+    copied = decoded.model_copy()
+    assert kept_payload(copied) is None
+    assert encode(copied) == payload
+
+
+def test_a_payload_is_kept_until_the_message_is_changed():
+    message = SAMPLES[6].model_copy()
+    assert encode(message) == encode(message)
+    assert kept_payload(message) is None
+    payload = encode(message, keep=True)
+    assert encode(message) is payload
+    assert "kept_payload" not in message.__dict__
+    other = message.model_copy(update={"optimisation": 9})
+    assert decode(schema_of(other), encode(other)).optimisation == 9
+
+
+def test_a_payload_of_another_version_is_not_kept():
+    """What is encoded again has the version that this program states beside it."""
+    for file in sorted(GOLDEN.glob("*.bin")):
+        name, _, version = file.stem.partition("-")
+        message = decode(f"{name}/{version}", file.read_bytes())
+        assert (kept_payload(message) is not None) == (version == message.version)
+        again = decode(schema_of(message), encode(message))
+        assert_equal(message, again)
 
 
 @pytest.mark.parametrize("message", SAMPLES, ids=lambda m: m.schema_name())
@@ -172,11 +196,20 @@ def test_random_headers_raise_decode_errors_only(data):
         stamp_ns=st.integers(0, 2**63 - 1), publish_ns=st.integers(0, 2**63 - 1),
         clock_id=st.integers(0, 2**64 - 1), sequence=st.integers(0, 2**64 - 1), epoch=st.integers(0, 2**32 - 1),
         producer=st.text(max_size=40), instance=st.binary(min_size=8, max_size=8).map(bytes.hex),
+        backlog=st.integers(0, 2**32 - 1),
     )
 )  # fmt: skip
 @settings(deadline=None)
 def test_header_round_trip(header):
     assert Header.unpack(header.pack()) == header
+
+
+def test_a_header_without_a_backlog_is_readable_by_earlier_programs():
+    calm, busy = (Header(5, 6, 7, 8, 9, "keyframes", "ab" * 8, backlog) for backlog in (0, 3))
+    assert calm.pack()[2] == 1
+    assert (busy.pack()[2], len(busy.pack())) == (2, len(calm.pack()) + 4)
+    with pytest.raises(DecodeError, match="version 1 or 2"):
+        Header.unpack(calm.pack()[:2] + b"\3" + calm.pack()[3:])
 
 
 def test_age_is_known_only_on_the_same_clock():

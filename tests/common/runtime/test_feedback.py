@@ -38,8 +38,8 @@ class Requester(Node):
         yield (
             "keyframes/frame",
             Keyframe(stamp_ns=scan.stamp_ns, id=scan.stamp_ns, encoding="png", picture=BYTES, camera=CAMERA,
-                     anchor_id=0, T_anchor_body=np.eye(4), T_map_anchor=np.eye(4), depth_png=BYTES,
-                     sigma_png=BYTES),
+                     anchor_id=0, T_anchor_body=np.eye(4), T_map_anchor=np.eye(4), depth=BYTES,
+                     sigma=BYTES),
         )  # fmt: skip
 
     def on_keyframes_ack(self, ack):

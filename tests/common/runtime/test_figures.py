@@ -35,7 +35,9 @@ def test_results_set_their_figures_and_the_status():
 def test_a_refused_depth_has_a_status_and_no_scale():
     none = np.zeros((0, 0), np.float32)
     figures = Figures()
-    figures.note("fusion/depth", FusedDepth(stamp_ns=1, depth_m=none, sigma_m=none, status="too few beams"))
+    figures.note(
+        "fusion/depth", FusedDepth.of(stamp_ns=1, depth_m=none, sigma_m=none, status="too few beams")
+    )
     assert figures.status == "too few beams"
     assert values(figures) == {"depth_inliers_ratio": 0.0}
 

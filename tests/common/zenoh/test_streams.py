@@ -5,7 +5,7 @@ import threading
 from beamsplat.common.messages import GridTile, Image, Rig, WheelOdometry
 from beamsplat.common.topics import topic
 from beamsplat.common.zenoh.bus import key
-from beamsplat.common.zenoh.streams import Subscription
+from beamsplat.common.zenoh.streams import Subscription, decode_sample
 from tests.common.polling import publish_until_received, wait_until
 from tests.common.samples import sample_messages
 
@@ -30,6 +30,7 @@ class Listener:
             row,
             delivery or row.delivery,
             key(robot, name),
+            lambda sample: decode_sample(sample, row),
             self._take,
             lambda *f: self.faults.append(f),
         )

@@ -17,7 +17,7 @@ from beamsplat.common.messages import (
     Rig,
     Scan,
 )
-from beamsplat.common.messages.depth_png import depth_from_png, mask_from_png, sigma_from_png
+from beamsplat.common.messages.depth_codec import unpack_depth, unpack_mask, unpack_sigma
 from beamsplat.common.messages.image_codec import decode_rgb
 from beamsplat.common.runtime.lockstep import Lockstep
 from beamsplat.common.runtime.node import Node
@@ -82,11 +82,11 @@ def test_picture_and_depth_arrive_as_they_were(frames):
         rgb, depth = r.shot(number_of(frame))
         got = decode_rgb(frame.picture, frame.encoding, r.WIDTH, r.HEIGHT)
         assert np.array_equal(got, rgb)
-        back = depth_from_png(frame.depth_png, depth.shape)
+        back = unpack_depth(frame.depth, depth.shape)
         assert np.array_equal(np.isfinite(back), np.isfinite(depth))
         assert np.nanmax(np.abs(back - depth)) < 0.001
-        assert np.nanmax(np.abs(sigma_from_png(frame.sigma_png, depth.shape) - 0.01)) < 3e-4
-        assert len(frame.mask_png) == 0
+        assert np.nanmax(np.abs(unpack_sigma(frame.sigma, depth.shape) - 0.01)) < 3e-4
+        assert len(frame.mask) == 0
 
 
 def test_raw_pictures_are_compressed():
@@ -146,7 +146,7 @@ def drive_by_hand(moving):
                                data=r.jpeg(r.shot(0)[0]))),
         ("localization/movers", MovingBeams(stamp_ns=stamp_ns, moving=moving)),
         ("localization/odometry", Odometry(stamp_ns=stamp_ns, T_odom_body=np.eye(4), covariance=np.eye(3))),
-        ("fusion/depth", FusedDepth(stamp_ns=stamp_ns, depth_m=depth, sigma_m=depth * 0.01, keyframe=True)),
+        ("fusion/depth", FusedDepth.of(stamp_ns=stamp_ns, depth_m=depth, sigma_m=depth * 0.01, keyframe=True)),
         ("localization/odometry", Odometry(stamp_ns=stamp_ns + 10**9, T_odom_body=np.eye(4), covariance=np.eye(3))),
     ):  # fmt: skip
         out += list(node.handle(topic, message))
@@ -168,7 +168,7 @@ def test_beams_lie_where_the_camera_sees_them():
     assert len(body) > 60
     np.testing.assert_allclose(body[:, 2], LIDAR_Z, atol=1e-4)
     assert np.all(np.minimum(np.abs(body[:, 0] - 3.0), np.abs(body[:, 0] - 1.5)) < 1e-4)
-    assert len(frame.mask_png) == 0
+    assert len(frame.mask) == 0
 
 
 def test_movers_are_masked_and_their_beams_left_out():
@@ -176,7 +176,7 @@ def test_movers_are_masked_and_their_beams_left_out():
     moving[350:370] = True
     frame = drive_by_hand(moving)
     assert np.all(frame.beams[:, 2] > 2.0)
-    mask = mask_from_png(frame.mask_png, (r.HEIGHT, r.WIDTH))
+    mask = unpack_mask(frame.mask, (r.HEIGHT, r.WIDTH))
     assert not mask[60, 79]  # the walker
     assert mask[:, :20].all()
     assert 0.02 < (~mask).mean() < 0.5

@@ -1,7 +1,9 @@
 """What was not acknowledged: sent again in time, kept within bounds, on a disk that may fail."""
 
 import os
+import struct
 
+import msgpack
 import numpy as np
 import pytest
 from hypothesis import given
@@ -13,6 +15,7 @@ from beamsplat.services.keyframes.queue_folder import CorruptFile, QueueEntry, Q
 from tests.common.files.faulty_disk import FaultyDisk
 
 S = 1_000_000_000
+SCHEMA = "Keyframe/2.0"
 
 
 def view(x, heading=0.0):
@@ -20,11 +23,11 @@ def view(x, heading=0.0):
 
 
 def put(box, key, now_ns=0, x=None, payload=None):
-    box.put(key, view(float(key) if x is None else x), payload or f"frame {key}".encode(), now_ns)
+    box.put(key, view(float(key) if x is None else x), SCHEMA, payload or f"frame {key}".encode(), now_ns)
 
 
 def sent(box, now_ns):
-    return [key for key, _ in box.due(now_ns)]
+    return [key for key, _, _ in box.due(now_ns)]
 
 
 @pytest.fixture(params=["memory", "disk"])
@@ -37,7 +40,7 @@ def test_while_nobody_answers_only_the_oldest_is_tried(folder):
     for i in range(3):
         put(box, i, i * S)
     assert sent(box, 4 * S) == []
-    assert list(box.due(5 * S)) == [(0, b"frame 0")]
+    assert list(box.due(5 * S)) == [(0, SCHEMA, b"frame 0")]
     assert sent(box, 6 * S) == []  # frame 1 is old too, but nobody has answered
     assert sent(box, 10 * S) == [0]
 
@@ -114,7 +117,7 @@ def test_the_queue_survives_a_restart(tmp_path):
     assert (len(again), again.of_earlier_drives) == (2, 0)
     assert sent(again, 7 * S) == [0]  # is there anybody?
     again.acknowledge(0, 8 * S)
-    assert list(again.due(8 * S)) == [(2, b"frame 2")]
+    assert list(again.due(8 * S)) == [(2, SCHEMA, b"frame 2")]
 
 
 def test_keyframes_of_an_earlier_drive_stay_but_make_room_first(tmp_path):
@@ -157,7 +160,7 @@ def test_broken_files_are_counted_and_the_rest_goes_on(tmp_path, caplog):
     assert (len(again), again.corrupt) == (3, 2)
     assert sent(again, 9 * S) == []  # frame 2 is tried, and is corrupt
     assert (len(again), again.corrupt) == (2, 3)
-    assert list(again.due(99 * S)) == [(3, b"\x03" * 100)]
+    assert list(again.due(99 * S)) == [(3, SCHEMA, b"\x03" * 100)]
     assert sorted(tmp_path.iterdir()) == files[3:]
     assert "checksum" in caplog.text
 
@@ -190,7 +193,9 @@ def test_a_full_disk_is_said_and_counted_and_keyframes_go_on_in_memory(tmp_path,
     assert caplog.text.count("keyframes cannot be written") == 1  # said at a bounded rate
     put(box, 4)  # there is room again
     box.acknowledge(4, 0)
-    assert list(box.due(0)) == [(1, b"frame 1"), (2, b"x" * 5000), (3, b"y" * 5000)]
+    assert list(box.due(0)) == [
+        (1, SCHEMA, b"frame 1"), (2, SCHEMA, b"x" * 5000), (3, SCHEMA, b"y" * 5000)
+    ]  # fmt: skip
     assert (box.not_on_disk, box.disk_fault) == (0, "")
     assert len(Outbox(10_000_000, S, 4, tmp_path)._entries) == 3  # those from memory are on the disk now
 
@@ -228,6 +233,20 @@ def test_any_bytes_are_a_label_or_broken(data):
             continue
         assert isinstance(label, QueueEntry)
         assert 8 <= start <= len(candidate)
+
+
+def test_a_file_of_an_earlier_program_is_of_the_version_of_that_time(tmp_path):
+    folder = QueueFolder(tmp_path)
+    folder.write(QueueEntry(7, "d", (0.0,) * 6, 4, SCHEMA), b"data")
+    (file,) = tmp_path.iterdir()
+    (length,) = struct.unpack_from("<I", file.read_bytes(), 4)
+    head = msgpack.unpackb(file.read_bytes()[8 : 8 + length])
+    assert head.pop("schema") == SCHEMA
+    old_head = msgpack.packb(head)
+    file.write_bytes(b"BSK1" + struct.pack("<I", len(old_head)) + old_head + b"data")
+    box = Outbox(10_000, S, 4, tmp_path)
+    box.drive = "d"
+    assert list(box.due(9 * S)) == [(7, "Keyframe/1.2", b"data")]
 
 
 def test_folder_names_sort_as_time_does(tmp_path):

@@ -13,7 +13,7 @@ pytest.importorskip("embreex", reason="the simulator needs the [sim] extra")
 
 from beamsplat.common.geometry.transforms import inverse
 from beamsplat.common.messages import CameraModel, Keyframe
-from beamsplat.common.messages.depth_png import depth_to_png, sigma_to_png
+from beamsplat.common.messages.depth_codec import pack_depth, pack_sigma
 from beamsplat.common.raster.camera import RasterCamera
 from beamsplat.tools.simulator.frames import FrameRenderer
 from beamsplat.tools.simulator.recording import frame_spec
@@ -58,7 +58,7 @@ class Home:
             jpeg, mm, _ = self.renderer.render_frame(self.time_s(number))
             depth = np.where(mm > 0, mm * np.float32(1e-3), np.nan).astype(np.float32)
             sigma = np.full_like(depth, 0.01)
-            self._shots[number] = np.frombuffer(jpeg, np.uint8), depth_to_png(depth), sigma_to_png(sigma)
+            self._shots[number] = np.frombuffer(jpeg, np.uint8), pack_depth(depth), pack_sigma(sigma)
         return self._shots[number]
 
     def rgb(self, number):
@@ -72,7 +72,7 @@ class Home:
         stamp_ns = T0 + number * SECOND if stamp_ns is None else stamp_ns
         return Keyframe(stamp_ns=stamp_ns, id=stamp_ns, encoding="jpeg", picture=jpeg, camera=self.model,
                         anchor_id=anchor, T_anchor_body=inverse(T_map_anchor) @ self.T_map_body(number),
-                        T_map_anchor=T_map_anchor, depth_png=depth, sigma_png=sigma)  # fmt: skip
+                        T_map_anchor=T_map_anchor, depth=depth, sigma=sigma)  # fmt: skip
 
 
 @lru_cache(maxsize=2)

@@ -33,7 +33,7 @@ class Lap:
         stamp_ns = 1_000_000_000_000 + round(number * period_s * SECOND)
         return Keyframe(stamp_ns=stamp_ns, id=stamp_ns, encoding="jpeg", picture=jpeg, camera=self.model,
                         anchor_id=anchor, T_anchor_body=inverse(T_map_anchor) @ T_map_body, T_map_anchor=T_map_anchor,
-                        depth_png=depth, sigma_png=sigma)  # fmt: skip
+                        depth=depth, sigma=sigma)  # fmt: skip
 
 
 def lap_of(home, anchor_every):

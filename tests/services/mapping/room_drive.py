@@ -157,7 +157,7 @@ class Fusion(Node):
         depth = shot(number)[1]
         yield (
             "fusion/depth",
-            FusedDepth(stamp_ns=decision.stamp_ns, depth_m=depth, sigma_m=np.full_like(depth, 0.01),
+            FusedDepth.of(stamp_ns=decision.stamp_ns, depth_m=depth, sigma_m=np.full_like(depth, 0.01),
                        keyframe=decision.keyframe, T_odom_body=inverse(T_MAP_ODOM) @ T_map_body(number)),
         )  # fmt: skip
 

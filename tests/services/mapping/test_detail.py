@@ -14,7 +14,7 @@ from beamsplat.common.messages import MapState
 from beamsplat.common.raster.camera import RasterCamera
 from beamsplat.common.raster.layout import COLOUR, MEAN, OPACITY, QUAT, SCALE
 from beamsplat.common.raster.rasterizer import Rasterizer
-from beamsplat.services.mapping.chunks import ChunkFeed, Viewpoint, chunk_snapshot
+from beamsplat.services.mapping.chunks import ChunkCensus, ChunkFeed, Viewpoint, chunk_snapshot
 from beamsplat.services.mapping.mapper import Mapper
 from beamsplat.services.mapping.messages import joined_state, state_messages
 from beamsplat.services.mapping.queries import viewpoint_of
@@ -97,22 +97,55 @@ def test_a_distant_chunk_is_coarse_and_complete_for_a_near_viewpoint():
     mapper.T_map_anchor[3] = make_transform(np.eye(3), np.array([2.0, 0.0, 0.0]))
     mapper.store.add(wall(20_000), 3)
     far, near = (Viewpoint(np.array([0.0, 0.0, z]), 280.0, 1.0) for z in (-30.0, 0.0))
-    first = feed.take_update(mapper, 3, far)
+
+    def take(viewpoint, anchor=3):
+        return feed.take_update(ChunkCensus(mapper, viewpoint), anchor)
+
+    def oldest_due(viewpoint):
+        return feed.oldest_due(ChunkCensus(mapper, viewpoint))
+
+    first = take(far)
     assert first.cell_m == 0.08
     assert first.params.shape[1] < 0.2 * 20_000
     assert first.params[MEAN].mean() == pytest.approx(-2.0, abs=0.1)  # in the anchor's frame
-    assert feed.take_update(mapper, 3, far) is None  # nothing new
-    assert feed.oldest_due(mapper, far) is None
-    assert feed.oldest_due(mapper, near) == 3
-    assert feed.take_update(mapper, 3, near).params.shape[1] == 20_000
-    assert feed.take_update(mapper, 3, far) is None  # detail is kept when the viewpoint moves away
-    assert feed.oldest_due(mapper, far) is None
-    mapper.store.move(3, mapper.T_map_anchor[3])
-    assert feed.oldest_due(mapper, far) == 3  # but a new version comes as it is seen from there
-    assert feed.take_update(mapper, 3, far).cell_m == 0.08
-    assert feed.take_update(mapper, 3, None).cell_m == 0.0
-    assert chunk_snapshot(mapper, far)[3].cell_m == 0.08
-    assert feed.take_update(mapper, 99, None) is None
+    assert take(far) is None  # nothing new
+    assert oldest_due(far) is None
+    assert oldest_due(near) == 3
+    assert take(near).params.shape[1] == 20_000
+    assert take(far) is None  # detail is kept when the viewpoint moves away
+    assert oldest_due(far) is None
+    mapper.move_anchors({3: make_transform(np.eye(3), np.array([2.0, 0.1, 0.0]))})
+    assert oldest_due(far) is None  # viewers move the chunk with its anchor
+    mapper.store.add(wall(10), 3)
+    assert oldest_due(far) == 3  # but a new version comes as it is seen from there
+    assert take(far).cell_m == 0.08
+    assert take(None).cell_m == 0.0
+    assert dict(chunk_snapshot(mapper, far))[3].cell_m == 0.08
+    assert take(None, anchor=99) is None
+
+
+def test_one_census_finds_what_a_search_per_anchor_finds():
+    rng = np.random.default_rng(3)
+    mapper = Mapper(MapperSettings(), seed=0, threads=1)
+    for anchor in (5, -1, 2, 5, 9, 2):
+        params = wall(400)
+        params[MEAN:SCALE] += rng.normal(0.0, 4.0, (3, 1)).astype(np.float32)
+        mapper.T_map_anchor[anchor] = np.eye(4)
+        mapper.store.add(params, anchor)
+    store, at_m = mapper.store, np.array([1.0, 2.0, 3.0])
+    store.steps[: store.count] = rng.integers(0, 50, store.count)
+    store.keep(rng.random(store.count) < 0.8)
+    census = ChunkCensus(mapper, Viewpoint(at_m, 280.0, 1.0))
+    events = {5: 3, -1: 2, 2: 3, 9: 2}  # insertions and one removal
+    for anchor, number in events.items():
+        mine = store.anchor[: store.count] == anchor
+        assert census.versions[anchor] == (number << 40) + int(store.steps[: store.count][mine].sum())
+        np.testing.assert_array_equal(
+            census.update(anchor, 0.0).params, store.params[:, : store.count][:, mine]
+        )
+        means = store.params[MEAN : MEAN + 3, : store.count][:, mine].T
+        nearest_m = np.linalg.norm(means - at_m, axis=1).min()
+        assert census.cell_m(anchor) == detail_cell_m(nearest_m, 280.0, 1.0)
 
 
 def test_a_query_may_contain_a_viewpoint():

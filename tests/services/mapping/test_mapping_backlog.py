@@ -2,6 +2,7 @@
 
 import itertools
 
+from beamsplat.common.messages.header import Header
 from beamsplat.services.mapping.node import MappingConfig, MappingNode
 from tests.services.keyframes.test_keyframes_node import keyframes_of
 
@@ -12,7 +13,8 @@ def test_steps_per_keyframe_follow_the_backlog():
     node.configure()
     steps = [0]
     for frame, backlog in zip(frames, (1, 16, 1000)):
-        messages = list(node.handle("keyframes/frame", frame.model_copy(update={"backlog": backlog})))
+        node.on_header(Header(frame.stamp_ns, 0, 0, 0, 1, "keyframes", "ab" * 8, backlog))
+        messages = list(node.handle("keyframes/frame", frame))
         steps += [m.steps for name, m in messages if name == "mapping/status"]
         assert [m.status for name, m in messages if name == "keyframes/ack"] == ["ok"]
     assert [b - a for a, b in itertools.pairwise(steps)] == [12, 3, 2]

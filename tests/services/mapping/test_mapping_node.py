@@ -12,7 +12,7 @@ from beamsplat.common.geometry.transforms import inverse, make_transform
 from beamsplat.common.mapfiles.store import transform_gaussians
 from beamsplat.common.messages import Anchors, Keyframe, Tick
 from beamsplat.common.messages.codec import encode
-from beamsplat.common.messages.depth_png import depth_to_png, mask_to_png, sigma_to_png
+from beamsplat.common.messages.depth_codec import pack_depth, pack_mask, pack_sigma
 from beamsplat.common.messages.image_codec import decode_rgb
 from beamsplat.common.messages.splat_codec import unpack
 from beamsplat.common.runtime.lockstep import Lockstep
@@ -117,9 +117,13 @@ def test_an_independent_reader_opens_the_ply_file(drive):
 def test_submaps_move_their_gaussians():
     """The pose graph moves submap 1 by a metre and ten degrees; -1 and 0 stay."""
     still, jumped = run(None)[1], run(None, jump_at=11)[1]
-    where = {c.anchor_id: c.T_map_anchor for c in jumped["mapping/chunk"]}
+    moved = jumped["mapping/anchors"][-1]
+    where = dict(zip(moved.anchor_ids.tolist(), moved.T_map_anchor))
     np.testing.assert_allclose(where[1], r.JUMP @ r.T_map_body(4), atol=1e-9)
     np.testing.assert_allclose(where[0], r.T_map_body(0), atol=1e-9)
+    last = {c.anchor_id: c for c in jumped["mapping/chunk"]}[1]
+    np.testing.assert_allclose(last.T_map_anchor, where[1], atol=1e-12)
+    assert last.pose_revision == moved.pose_revision > 0
     final = jumped["mapping/status"][-1]
     assert final.keyframes == still["mapping/status"][-1].keyframes
 
@@ -147,7 +151,7 @@ def keyframe(number, **change):
     fields = {
         "stamp_ns": r.T0 + number, "id": number, "encoding": "png", "picture": r.jpeg(rgb), "camera": r.CAMERA_MODEL,
         "anchor_id": 0, "T_anchor_body": r.T_map_body(number), "T_map_anchor": np.eye(4),
-        "depth_png": depth_to_png(depth), "sigma_png": sigma_to_png(np.full_like(depth, 0.01)),
+        "depth": pack_depth(depth), "sigma": pack_sigma(np.full_like(depth, 0.01)),
     }  # fmt: skip
     return Keyframe(**{**fields, **change})
 
@@ -167,13 +171,19 @@ NAN = np.full((r.HEIGHT, r.WIDTH), np.nan, np.float32)
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"depth_png": depth_to_png(NAN)}, "no pixel has a depth"),
-        ({"mask_png": mask_to_png(np.zeros((r.HEIGHT, r.WIDTH), bool))}, "the mask leaves no pixel"),
+        ({"depth": pack_depth(NAN)}, "no pixel has a depth"),
+        ({"mask": pack_mask(np.zeros((r.HEIGHT, r.WIDTH), bool))}, "the mask leaves no pixel"),
         ({"T_anchor_body": make_transform(np.eye(3), np.array([5e3, 0.0, 0.0]))}, "5000 m from its anchor"),
-        ({"depth_png": np.arange(9, dtype=np.uint8)}, "depth: the image's 9 bytes do not decode as png"),
-        ({"depth_png": depth_to_png(NAN[:9, :9])}, "depth: the image is 9x9, not 160x120"),
+        ({"depth": np.arange(9, dtype=np.uint8)}, "depth: 9 bytes are too few"),
+        (
+            {"depth": pack_depth(NAN[:9, :9])},
+            "depth: 2 bytes per pixel and 9x9 pixels, expected 2 and 160x120",
+        ),
         ({"picture": np.zeros(0, np.uint8)}, "do not decode as png"),
-        ({"mask_png": mask_to_png(np.ones((7, 7), bool))}, "mask: the image is 7x7, not 160x120"),
+        (
+            {"mask": pack_mask(np.ones((7, 7), bool))},
+            "mask: 1 bytes per pixel and 7x7 pixels, expected 1 and 160x120",
+        ),
     ],
 )
 def test_invalid_keyframes_are_refused_with_a_reason_and_without_effect(node, change, words):

@@ -95,7 +95,7 @@ class FloorDepth(Node):
     def on_camera_image(self, picture):
         depth = np.linspace(0.5, 6.0, 60 * 80, dtype=np.float32).reshape(60, 80)
         depth[:5] = np.nan
-        fused = FusedDepth(stamp_ns=picture.stamp_ns, depth_m=depth, sigma_m=0.1 * depth, scale=self.config.scale,
+        fused = FusedDepth.of(stamp_ns=picture.stamp_ns, depth_m=depth, sigma_m=0.1 * depth, scale=self.config.scale,
                            scale_sigma=SCALE_SIGMA, inlier_share=0.9, residual_m=0.02)  # fmt: skip
         yield "fusion/depth", fused
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from beamsplat.common.geometry.transforms import se2_to_se3
-from beamsplat.common.messages import MapChunk, MapPreview, MapStatus
+from beamsplat.common.messages import MapAnchors, MapChunk, MapPreview, MapStatus
 from beamsplat.common.messages.header import Header
 from beamsplat.common.messages.splat_codec import pack
 from beamsplat.common.topics import TOPICS
@@ -100,6 +100,23 @@ def test_a_loop_closure_moves_the_chunk(monitor, tmp_path, read_rrd):
     monitor.close()
     places = read_rrd(tmp_path / "m.rrd").column("map/splats/7", "Transform3D:translation")
     np.testing.assert_allclose([p.ravel()[0] for p in places], [2.0, 3.0], atol=1e-6)
+
+
+def test_chunks_move_with_their_anchors_without_being_sent_again(monitor, tmp_path, read_rrd):
+    tell(monitor, "mapping/chunk", chunk(0.0, 1))
+    T = np.array([PLACE, PLACE])
+    T[:, 0, 3] = 4.0
+    anchors = MapAnchors(stamp_ns=T0 + S, pose_revision=2, anchor_ids=np.array([7, 8]), T_map_anchor=T)
+    tell(monitor, "mapping/anchors", anchors)
+    tell(monitor, "mapping/chunk", chunk(5.0, 2))  # with the pose before the move
+    tell(monitor, "mapping/chunk", chunk(6.0, 1, anchor=8))
+    monitor.close()
+    saved = read_rrd(tmp_path / "m.rrd")
+    places = saved.column("map/splats/7", "Transform3D:translation")
+    np.testing.assert_allclose([p.ravel()[0] for p in places], [2.0, 4.0, 4.0], atol=1e-6)
+    assert len(saved.column("map/splats/7", "GaussianSplats3D:centers")) == 2
+    (place,) = saved.column("map/splats/8", "Transform3D:translation")
+    assert place.ravel()[0] == pytest.approx(4.0)
 
 
 def test_invalid_chunks_are_logged_and_ignored(monitor, tmp_path, read_rrd):

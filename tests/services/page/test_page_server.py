@@ -338,7 +338,7 @@ def test_a_refused_depth_is_reported_and_shows_no_image():
     node.configure()
     try:
         none = np.zeros((0, 0), np.float32)
-        refused = FusedDepth(stamp_ns=1, depth_m=none, sigma_m=none, status="too few beams in the picture")
+        refused = FusedDepth.of(stamp_ns=1, depth_m=none, sigma_m=none, status="too few beams in the picture")
         list(node.handle("fusion/depth", refused))
         node.on_health(Health(stamp_ns=1, node="page", instance="ab", epoch=1, state="active"))
         status = node._fleet.own_state.status()

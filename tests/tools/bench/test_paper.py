@@ -11,7 +11,7 @@ from beamsplat.common.geometry.camera import Pinhole
 from beamsplat.common.geometry.frames import camera_mount
 from beamsplat.common.geometry.trajectory import Trajectory
 from beamsplat.common.geometry.transforms import make_transform, so3_exp
-from beamsplat.common.messages import MapChunk, MapPoses
+from beamsplat.common.messages import MapAnchors, MapChunk, MapPoses
 from beamsplat.tools.bench import paper
 from beamsplat.tools.evaluation.drive import RecordedDrive
 from beamsplat.tools.report.drive_report import write_drive_report
@@ -302,6 +302,15 @@ def test_the_map_at_the_end_of_the_drive_is_kept_apart_from_the_refined_one():
     receive("mapping/poses", poses, 50)
     assert observer.record.online_chunks[0].revision == 2
     assert observer.record.chunks[0].revision == 3
+    T = np.eye(4)
+    T[0, 3] = 2.0
+    receive("mapping/anchors", MapAnchors(stamp_ns=S, pose_revision=1, anchor_ids=np.zeros(1, np.int64),
+                                          T_map_anchor=T[None]), 45)  # fmt: skip
+    assert observer.record.online_chunks[0].T_map_anchor[0, 3] == 0.0
+    assert observer.record.chunks[0].T_map_anchor[0, 3] == 2.0
+    receive("mapping/chunk", map_chunk(0, 4), 42)  # sent before the anchors have moved
+    assert observer.record.chunks[0].revision == 4
+    assert observer.record.chunks[0].T_map_anchor[0, 3] == 2.0
 
 
 def test_the_map_of_a_restarted_mapper_is_scored_without_chunks_of_its_predecessor():

@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 
 from beamsplat.common.geometry.transforms import inverse, se2_to_se3
 from beamsplat.common.mapfiles.ply import read_ply_points
-from beamsplat.common.messages.depth_png import depth_to_png, sigma_to_png
+from beamsplat.common.messages.depth_codec import pack_depth, pack_sigma
 from beamsplat.services.localization.lidar2d import se2
 from beamsplat.tools.cli.main import app
 from tests.services.mapping import room_drive as r
@@ -53,8 +53,8 @@ def sessions(tmp_path_factory):
                 rgb, depth = with_box(number)
                 change |= {
                     "picture": cv2.imencode(".png", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))[1].ravel(),
-                    "depth_png": depth_to_png(depth),
-                    "sigma_png": sigma_to_png(np.full_like(depth, 0.01)),
+                    "depth": pack_depth(depth),
+                    "sigma": pack_sigma(np.full_like(depth, 0.01)),
                 }
             list(node.handle("keyframes/frame", whole.model_copy(update=change)))
         list(node.drain())

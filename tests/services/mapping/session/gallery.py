@@ -8,7 +8,7 @@ import numpy as np
 from beamsplat.common.geometry.frames import camera_mount
 from beamsplat.common.geometry.transforms import inverse, make_transform
 from beamsplat.common.messages import CameraModel, Keyframe
-from beamsplat.common.messages.depth_png import depth_to_png, sigma_to_png
+from beamsplat.common.messages.depth_codec import pack_depth, pack_sigma
 from beamsplat.common.raster.camera import RasterCamera
 from tests.services.mapping.session.maps import SECOND
 
@@ -46,4 +46,4 @@ def message(number, places=40):
     stamp_ns = T0 + number * SECOND
     return Keyframe(stamp_ns=stamp_ns, id=stamp_ns, encoding="png", picture=png, camera=MODEL, anchor_id=anchor,
                     T_anchor_body=inverse(T_map_anchor) @ T_map_body(place), T_map_anchor=T_map_anchor,
-                    depth_png=depth_to_png(depth), sigma_png=sigma_to_png(np.full_like(depth, 0.01)))  # fmt: skip
+                    depth=pack_depth(depth), sigma=pack_sigma(np.full_like(depth, 0.01)))  # fmt: skip

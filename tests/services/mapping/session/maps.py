@@ -4,7 +4,7 @@ import numpy as np
 
 from beamsplat.common.geometry.transforms import inverse
 from beamsplat.common.messages import Keyframe, Tick
-from beamsplat.common.messages.depth_png import depth_to_png, sigma_to_png
+from beamsplat.common.messages.depth_codec import pack_depth, pack_sigma
 from beamsplat.services.mapping.config import MappingConfig
 from beamsplat.services.mapping.node import MappingNode
 from tests.services.mapping import room_drive as r
@@ -21,8 +21,8 @@ def message(number, stamp_ns=None, **change):
     fields = {
         "stamp_ns": stamp_ns, "id": stamp_ns, "encoding": "png", "picture": r.jpeg(rgb), "camera": r.CAMERA_MODEL,
         "anchor_id": anchor, "T_anchor_body": inverse(T_map_anchor) @ r.T_map_body(number),
-        "T_map_anchor": T_map_anchor, "depth_png": depth_to_png(depth),
-        "sigma_png": sigma_to_png(np.full_like(depth, 0.01)),
+        "T_map_anchor": T_map_anchor, "depth": pack_depth(depth),
+        "sigma": pack_sigma(np.full_like(depth, 0.01)),
         "beams": np.array([[80.0, 60.0, depth[60, 80], 0.01]], np.float32),
     }  # fmt: skip
     return Keyframe(**{**fields, **change})

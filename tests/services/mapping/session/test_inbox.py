@@ -6,7 +6,7 @@ import pytest
 from beamsplat.common.errors import UserError
 from beamsplat.common.mapfiles.session import SessionFolder
 from beamsplat.common.messages import Tick
-from beamsplat.common.messages.depth_png import mask_to_png
+from beamsplat.common.messages.depth_codec import pack_mask
 from beamsplat.common.runtime.lockstep import Lockstep
 from beamsplat.services.keyframes.node import KeyframesConfig, KeyframesNode
 from beamsplat.services.mapping.config import MappingConfig
@@ -42,8 +42,8 @@ def test_a_received_keyframe_is_acknowledged_once_and_survives_a_killed_mapper(t
 
 def test_a_keyframe_refused_later_is_answered_again_and_removed_from_disk(tmp_path):
     node = make_node(tmp_path / "s")
-    everything_moves = mask_to_png(np.zeros((r.HEIGHT, r.WIDTH), bool))
-    empty = message(0).model_copy(update={"mask_png": everything_moves})
+    everything_moves = pack_mask(np.zeros((r.HEIGHT, r.WIDTH), bool))
+    empty = message(0).model_copy(update={"mask": everything_moves})
     assert arrive(node, empty) == ["ok"]
     (answer,) = handle(node, "keyframes/frame", empty)["keyframes/ack"]
     assert "mask leaves no pixel" in answer.status

@@ -5,6 +5,7 @@ import json
 import cv2
 
 from beamsplat.common.mapfiles.session import EDGE_VERSION, VERSION
+from beamsplat.common.messages.depth_codec import pack_depth, pack_sigma, unpack_depth, unpack_sigma
 from beamsplat.services.mapping.session.disk_tier import groups_of
 from tests.services.mapping.session.maps import make_node, message
 from tests.services.mapping.session.test_session import GOLDEN
@@ -15,14 +16,18 @@ def small(number):
     whole = message(number)
     size = (40, 30)
 
-    def shrunk(png):
-        image = cv2.imdecode(png, cv2.IMREAD_UNCHANGED)
-        return cv2.imencode(".png", cv2.resize(image, size, interpolation=cv2.INTER_NEAREST))[1].ravel()
+    def shrunk(image):
+        return cv2.resize(image, size, interpolation=cv2.INTER_NEAREST)
 
     camera = whole.camera.model_copy(
         update={"width_px": 40, "height_px": 30, "fx_px": 27.5, "fy_px": 27.5, "cx_px": 19.5, "cy_px": 14.5}
     )
-    fields = {name: shrunk(getattr(whole, name)) for name in ("picture", "depth_png", "sigma_png")}
+    picture = shrunk(cv2.imdecode(whole.picture, cv2.IMREAD_UNCHANGED))
+    fields = {
+        "picture": cv2.imencode(".png", picture)[1].ravel(),
+        "depth": pack_depth(shrunk(unpack_depth(whole.depth))),
+        "sigma": pack_sigma(shrunk(unpack_sigma(whole.sigma))),
+    }
     return whole.model_copy(update={**fields, "camera": camera, "beams": whole.beams[:0]})
 
 
