@@ -41,6 +41,7 @@ class NodeConfig(Config):
     kind: str = "default"  # name of the implementation (services/nodes.py lists them)
     step_cost_s: Seconds = 0.0  # lockstep only: modelled duration of one step
     job_cost_s: Seconds = 0.0  # lockstep only: modelled duration of a background job
+    idle_cost_s: Seconds = 0.0  # lockstep only: modelled duration of a piece of work without a message
     threads: Annotated[int, Field(ge=1)] = 1  # for cv2, torch and ONNX in this process
     nice: Annotated[int, Field(ge=0, le=19)] = 0  # nice value of the process: higher = lower CPU priority
     essential: bool | None = None  # whether an error at the start ends the run; None: as in services/nodes.py

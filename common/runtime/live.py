@@ -103,9 +103,12 @@ class Live:
         r = self.running
         # Assigned as a whole: the health thread iterates over it meanwhile.
         r.publications = {name: bus.publish(name) for name in r.node.outputs}
+        ignored = r.node.ignored_inputs()
         for entry in subscriptions(type(r.node)):
-            if entry.topic in r.settings.without_producer:
+            if entry.topic in r.settings.without_producer or entry.topic in ignored:
                 r.mailbox.end(entry.topic, None)
+            if entry.topic in ignored:
+                continue
             bus.subscribe(entry, r.receive, self._on_undecodable, r.receive_end)
         if r.node.watches_health():
             bus.watch_health(self._on_health, self._on_undecodable)
@@ -162,10 +165,13 @@ class Live:
                 with r.changed:  # messages wait until this process has the predecessor's state
                     r.changed.wait(POLL_S)
                 continue
-            envelope = r.next_envelope()
+            envelope = r.next_envelope(wait=not r.node.has_idle_work())
             r.emit_results(r.jobs.finished())
             if envelope is None:
-                if r.mailbox.ended:
+                if not r.mailbox.ended:
+                    if r.node.has_idle_work():
+                        r.emit(r.node.handle_idle())
+                else:
                     if not (r.mailbox.feedback_may_arrive and r.node.awaits_feedback()):
                         return
                     last_received = self._check_feedback_timeout(last_received)

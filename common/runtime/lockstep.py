@@ -1,8 +1,9 @@
 """Lockstep runner: all nodes in one thread, as a discrete-event simulation. Same input, same bytes.
 
 Events are ordered by (time, topic row, order of creation). Time is the arrival time that sources
-return. A node is busy for its modelled `step_cost_s` per message, so that `latest` inputs drop messages as
-they would on a slow machine, but reproducibly. The node handlers are the same as in the live runner.
+return. A node is busy for its modelled `step_cost_s` per message (`idle_cost_s` per piece of idle work), so
+that `latest` inputs drop messages as they would on a slow machine, but reproducibly. The node handlers are
+the same as in the live runner.
 """
 
 from __future__ import annotations
@@ -47,8 +48,10 @@ class Lockstep:
         self._states = [_state_of(node) for node in nodes]
         self._events: list[tuple[int, int, int, Callable[[int], None]]] = []
         self._created = 0
+        ignored = {id(s): s.node.ignored_inputs() for s in self._states}
         self._consumers: dict[str, list[_NodeState]] = {
-            name: [s for s in self._states if name in s.mailbox.counts] for name in TOPICS
+            name: [s for s in self._states if name in s.mailbox.counts and name not in ignored[id(s)]]
+            for name in TOPICS
         }
 
     def run(self) -> dict[str, Mailbox]:
@@ -62,6 +65,8 @@ class Lockstep:
             for state in self._states:
                 state.node.without_producer = frozenset(state.mailbox.counts) - produced
                 state.node.configure()
+                for name in state.node.ignored_inputs() & state.mailbox.counts.keys():
+                    state.mailbox.end(name, None)
             for name in TOPICS:
                 if name not in produced:
                     self._end_topic(name, None, 0)
@@ -121,6 +126,13 @@ class Lockstep:
             state.busy_until_ns = now_ns + _ns(state.node.config.step_cost_s)
             state.node.on_header(envelope.header)
             self._emit(state, state.node.handle(envelope.topic, envelope.message), state.busy_until_ns)
+            if state.busy_until_ns > now_ns:
+                self._at(state.busy_until_ns, _LAST_ROW, lambda t: self._step(state, t))
+        while now_ns >= state.busy_until_ns and not (state.ended or state.mailbox.ended):
+            if not state.node.has_idle_work():
+                break
+            state.busy_until_ns = now_ns + _ns(state.node.config.idle_cost_s)
+            self._emit(state, state.node.handle_idle(), state.busy_until_ns)
             if state.busy_until_ns > now_ns:
                 self._at(state.busy_until_ns, _LAST_ROW, lambda t: self._step(state, t))
         waits = state.mailbox.feedback_may_arrive and state.node.awaits_feedback()

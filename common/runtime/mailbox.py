@@ -1,4 +1,4 @@
-"""Input queues of a node: a slot per `latest` or `latched` input, queues merged by stamp for `every` inputs.
+"""Input queues of a node: a ring per `latest` or `latched` input, queues merged by stamp for `every` inputs.
 
 `every` inputs that are feedback, or whose topic has `history`, share a queue in order of arrival. A mailbox
 belongs to one node and is not thread-safe; the live runner locks it. It counts dropped, lost, late, stale,
@@ -73,7 +73,8 @@ class Mailbox:
         """`clock_ns`: clock for time-outs in the live runner, None in lockstep; see `StampMerger`."""
         self._deliveries = {i.topic: i.effective_delivery for i in subscriptions(node)}
         self._merger = StampMerger(merged_topics(node), clock_ns=clock_ns)
-        self._slots: dict[str, Envelope] = {}
+        self._keep = {i.topic: i.keep for i in subscriptions(node)}
+        self._rings: dict[str, deque[Envelope]] = {}  # of `latest` and `latched` inputs; none is empty
         self._feedback_topics = frozenset(i.topic for i in subscriptions(node) if i.feedback)
         self._merged_topics = frozenset(merged_topics(node))
         self._unmerged_queue: deque[Envelope] = deque()  # of all other `every` inputs
@@ -84,7 +85,7 @@ class Mailbox:
         self.counts = {name: InputCount() for name in self._deliveries}
 
     def __len__(self) -> int:
-        return len(self._merger) + len(self._slots) + len(self._unmerged_queue)
+        return len(self._merger) + sum(map(len, self._rings.values())) + len(self._unmerged_queue)
 
     def admit(self, envelope: Envelope) -> bool:
         """Count a received message, and return whether it is to be queued (`queue`).
@@ -129,10 +130,12 @@ class Mailbox:
     def queue(self, envelope: Envelope) -> None:
         """Queue an admitted message."""
         count = self.counts[envelope.topic]
-        if envelope.topic in self._slots:
-            count.dropped += 1
         if self._deliveries[envelope.topic] != "every":
-            self._slots[envelope.topic] = envelope
+            ring = self._rings.setdefault(envelope.topic, deque())
+            if len(ring) >= self._keep[envelope.topic]:
+                ring.popleft()
+                count.dropped += 1
+            ring.append(envelope)
         elif envelope.topic not in self._merged_topics:
             if len(self._unmerged_queue) >= MAX_QUEUED:
                 self.counts[self._unmerged_queue.popleft().topic].dropped += 1
@@ -247,10 +250,12 @@ class Mailbox:
         if merged is not None:
             envelope = merged[1]
             self.counts[envelope.topic].queued_bytes -= envelope.size_bytes
-        elif self._slots:
-            slots = self._slots.values()
-            oldest = min(slots, key=lambda s: (s.message.stamp_ns, ROW_NUMBER[s.topic]))
-            envelope = self._slots.pop(oldest.topic)
+        elif self._rings:
+            heads = (ring[0] for ring in self._rings.values())
+            envelope = min(heads, key=lambda e: (e.message.stamp_ns, ROW_NUMBER[e.topic]))
+            self._rings[envelope.topic].popleft()
+            if not self._rings[envelope.topic]:
+                del self._rings[envelope.topic]
         else:
             return None
         self.counts[envelope.topic].received += 1

@@ -40,6 +40,9 @@ class Input:
             arrival, not merged by stamp, and the node ends without waiting for its end: otherwise the node
             would wait for itself. Feedback after the node's end is still handled, but the outputs of its
             handler are discarded.
+        keep: messages of a `latest` input that wait while the node is busy; a further one replaces the
+            oldest, which is counted as dropped. More than 1 for a node that needs every message, and falls
+            behind for moments only.
         queued_bytes: limit on the payload bytes queued for an `every` input; beyond this limit the oldest
             messages are dropped and counted.
     """
@@ -47,6 +50,7 @@ class Input:
     topic: str
     delivery: Delivery | None = None
     feedback: bool = False
+    keep: int = 1
     queued_bytes: int = 256 * 1024 * 1024  # enough for a recorder to bridge a stalled disk
 
     @property
@@ -65,8 +69,8 @@ class Job:
     Args:
         run: the computation; it must not access state that the node changes meanwhile.
         after: deliver the result just before the n-th next message, and wait for it if necessary:
-            reproducible in both runners. None: deliver it when it is finished; for work on a disk, which
-            then delays no result that the node waits for.
+            reproducible in both runners. None: deliver it when it is finished (in lockstep after the modelled
+            `job_cost_s`): for work on a disk, and for work that must delay no message.
         of: topic whose messages `after` counts; the default counts the messages of all inputs.
     """
 
@@ -218,6 +222,22 @@ class Node:
         """Whether this process is a successor: `configure` must not change the predecessor's files."""
         return self.live_settings is not None and self.live_settings.standby
 
+    def ignored_inputs(self) -> frozenset[str]:
+        """Return the topics that this node does not use with its options: they are not subscribed to."""
+        return frozenset()
+
+    def has_idle_work(self) -> bool:
+        """Return whether there is work left for times in which no message waits; see `on_idle`."""
+        return False
+
+    def on_idle(self) -> Iterable[Output]:
+        """Do one short piece of the work that can wait, and return output messages.
+
+        Called while no message is ready and `has_idle_work` is True. The amount of this work follows from the
+        messages: it is finite, because the lockstep runner with `idle_cost_s` = 0 does all of it at once.
+        """
+        return ()
+
     def awaits_feedback(self) -> bool:
         """Return whether the node must wait for more feedback although its other inputs have ended."""
         return False
@@ -265,6 +285,10 @@ class Node:
     def handle_feedback_timeout(self, seconds: float) -> Iterator[Output]:
         """Yield the outputs of `on_feedback_timeout`; raise UndeclaredOutput for an undeclared output."""
         yield from self._declared(self.on_feedback_timeout(seconds))
+
+    def handle_idle(self) -> Iterator[Output]:
+        """Yield the outputs of `on_idle`; raise UndeclaredOutput for an undeclared output."""
+        yield from self._declared(self.on_idle())
 
     def handle_drain(self) -> Iterator[Output]:
         """Yield the outputs of `drain`; raise UndeclaredOutput for an undeclared output."""

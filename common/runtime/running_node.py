@@ -119,12 +119,12 @@ class RunningNode:
         texts += [f"{number} {what}" for number, what in others if number]
         return "; ".join(text for text in texts if text)
 
-    def next_envelope(self) -> Envelope | None:
-        """Return the next message for the node, or None after waiting `POLL_S` seconds without one."""
+    def next_envelope(self, wait: bool = True) -> Envelope | None:
+        """Return the next message for the node, or None if there is none, after waiting `POLL_S` for one."""
         with self.changed:
             self._apply_ends()
             envelope = self.mailbox.pop()
-            if envelope is None and not self.mailbox.ended:
+            if envelope is None and wait and not self.mailbox.ended:
                 self.changed.wait(POLL_S)
                 self._apply_ends()
                 envelope = self.mailbox.pop()

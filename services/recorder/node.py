@@ -134,6 +134,10 @@ class RecorderNode(_Handlers, Node):
     def check_resources(self) -> None:
         check_can_write(self.config.out, "out", read_only_disk=True)
 
+    def ignored_inputs(self) -> frozenset[str]:
+        """Return the topics that are not recorded: they need not be received, copied and decoded."""
+        return frozenset(TOPICS) - self._chosen
+
     def on_header(self, header: Header) -> None:
         self._header = header
 

@@ -4,6 +4,7 @@ import hashlib
 
 import pytest
 
+from beamsplat.common.config.deployment import NodeConfig
 from beamsplat.common.messages.codec import encode
 from beamsplat.common.runtime.lockstep import Lockstep
 from tests.common.nodes import Chain, SensorSource, SensorSourceConfig, Sink, Slow, SlowConfig
@@ -49,6 +50,53 @@ def test_no_cost_drops_nothing():
     _, envelopes, mailboxes = _run(SensorSource(SensorSourceConfig()), slow, Sink(Sink.Config()))
     assert mailboxes["localization"].counts["camera/image"].dropped == 0
     assert sum(envelope.topic == "localization/grid" for envelope in envelopes) == 90
+
+
+class Postponing(Chain):
+    """Owes three pieces of work per scan, and notes when it does them."""
+
+    def configure(self):
+        super().configure()
+        self.owed, self.done, self.scans = 0, [], 0
+
+    def on_lidar_scan(self, message):
+        self.owed += 3
+        self.scans += 1
+        yield from super().on_lidar_scan(message)
+
+    def has_idle_work(self):
+        return self.owed > 0
+
+    def on_idle(self):
+        self.owed -= 1
+        self.done.append(self.scans)
+        return ()
+
+
+def test_work_that_can_wait_is_done_between_messages_as_its_modelled_duration_allows():
+    quick, slow, slower = (Postponing(NodeConfig(idle_cost_s=s)) for s in (0.0, 0.02, 0.2))
+    for node in (quick, slow, slower):
+        _run(SensorSource(SensorSourceConfig(images=False)), node, Sink(Sink.Config()))
+    expected = [k for k in range(1, 31) for _ in range(3)]
+    assert quick.done == expected
+    assert slow.done == expected[: len(slow.done)]
+    assert len(slow.done) >= 3 * 29  # what is left when the inputs end is for `drain`
+    assert 10 < len(slower.done) < 18  # one piece each 0.2 s
+    assert slower.owed == 90 - len(slower.done)
+    assert slower.done == sorted(slower.done)
+
+
+def test_inputs_that_a_node_ignores_are_not_delivered_and_not_waited_for():
+    class WithoutWheels(Chain):
+        def ignored_inputs(self):
+            return frozenset({"wheel/odometry"})
+
+        def on_wheel_odometry(self, message):
+            raise AssertionError("not subscribed")
+
+    _, envelopes, mailboxes = _run(SensorSource(SensorSourceConfig()), WithoutWheels(WithoutWheels.Config()))
+    assert mailboxes["localization"].counts["wheel/odometry"].received == 0
+    assert sum(envelope.topic == "localization/odometry" for envelope in envelopes) == 30
 
 
 def test_messages_reach_a_node_in_order_of_their_stamps():

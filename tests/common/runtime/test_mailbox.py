@@ -93,6 +93,26 @@ def test_a_queue_is_limited_in_bytes():
     assert mailbox.counts["lidar/scan"].dropped == 90
 
 
+class Keeping(Slow):
+    """A node that handles every scan, unless it falls behind by more than three."""
+
+    name = "localization"
+    inputs = (Input("lidar/scan", "latest", keep=3),)
+
+
+def test_a_ring_keeps_the_newest_messages_in_order_and_counts_the_others():
+    mailbox = Mailbox(Keeping)
+    for sequence in range(5):
+        mailbox.put(_scan(sequence))
+    assert len(mailbox) == 3
+    assert mailbox.counts["lidar/scan"].dropped == 2
+    assert [mailbox.pop().header.sequence for _ in range(3)] == [2, 3, 4]
+    assert mailbox.pop() is None
+    mailbox.put(_scan(5))
+    assert mailbox.pop().header.sequence == 5
+    assert mailbox.counts["lidar/scan"].dropped == 2
+
+
 def test_messages_missing_at_the_end_of_a_stream_are_lost():
     mailbox = Mailbox(Chain)
     mailbox.end("lidar/scan", FIRST, 3)

@@ -53,6 +53,11 @@ def test_every_means_every(tmp_path):
     assert deliveries["rig"] == "latched"
 
 
+def test_topics_that_are_not_chosen_are_not_subscribed_to(tmp_path):
+    node = RecorderNode(RecorderConfig(out=tmp_path / "rec", without=("fusion/depth", "camera/image")))
+    assert node.ignored_inputs() == {"fusion/depth", "camera/image"}
+
+
 def test_topics_are_chosen(tmp_path):
     node = started(tmp_path, topics=("tick", "rig"), without=("rig",), clock="data")
     rng = np.random.default_rng(0)
