@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 OUT ?= out/demo
 STAMP := $(VENV)/.installed
 
-.PHONY: setup demo test slow soak bench bench-slam lint docs clean
+.PHONY: setup web demo test slow soak bench bench-slam lint docs clean
 
 setup: $(STAMP)
 
@@ -27,7 +27,12 @@ $(STAMP): pyproject.toml constraints.txt
 	fi
 	$(BIN)/pip install -q -c constraints.txt -e '.[all]'
 	$(BIN)/beamsplat warm
+	@sh web/build.sh $(BIN) || true
 	touch $@
+
+# The 3D viewer of the page, from web/ to services/page/static/viewer/; set-up does it once, where npm packages can be had.
+web: setup
+	@sh web/build.sh $(BIN)
 
 demo: setup
 	$(BIN)/beamsplat demo --out $(OUT)
@@ -60,6 +65,7 @@ lint: setup $(TYPED)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	@if [ -x web/node_modules/.bin/tsc ]; then cd web && node_modules/.bin/tsc --project tsconfig.json; fi
 
 $(TYPED):
 	mkdir -p $@/beamsplat
@@ -71,4 +77,4 @@ docs: setup $(TYPED)
 	NO_MKDOCS_2_WARNING=true $(BIN)/mkdocs build --strict
 
 clean:
-	rm -rf $(VENV) out build .numba_cache
+	rm -rf $(VENV) out build .numba_cache web/node_modules services/page/static/viewer

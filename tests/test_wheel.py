@@ -1,6 +1,7 @@
 """The wheel: one package, typed, with its data; a base install that works from an empty directory."""
 
 import os
+import shutil
 import subprocess
 import sys
 import zipfile
@@ -46,6 +47,22 @@ def test_it_holds_one_package_and_its_data(wheel):
     }  # fmt: skip
     assert data <= set(names)
     assert not [name for name in names if name.startswith("beamsplat/tools/api/")]
+
+
+@pytest.mark.slow
+def test_it_holds_the_3d_viewer_with_its_licences(tmp_path):
+    built = ROOT / "services" / "page" / "static" / "viewer"
+    if not (built / "viewer.js").exists():
+        pytest.skip("needs the built 3D viewer: make web")
+    archive = subprocess.run(["git", "archive", "HEAD"], cwd=ROOT, capture_output=True, check=True)
+    subprocess.run(["tar", "-x", "-C", tmp_path], input=archive.stdout, check=True)
+    shutil.copytree(built, tmp_path / "services" / "page" / "static" / "viewer")
+    _run(sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", tmp_path / "dist", tmp_path)
+    (found,) = (tmp_path / "dist").glob("*.whl")
+    with zipfile.ZipFile(found) as files:
+        folder = "beamsplat/services/page/static/viewer/"
+        assert files.read(folder + "viewer.js") == (built / "viewer.js").read_bytes()
+        assert "Permission is hereby granted" in files.read(folder + "licences.txt").decode()  # three.js: MIT
 
 
 @pytest.fixture(scope="module")

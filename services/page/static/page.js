@@ -170,6 +170,36 @@ function showRobot(robot) {
   map.draw();
 }
 
+// The tabs of the map: the flat one, and the 3D viewer, whose code and data are loaded when it is chosen.
+let viewer = null;
+async function openTab(three) {
+  for (const [tab, on] of [["tab-flat", !three], ["tab-3d", three]]) {
+    $(tab).setAttribute("aria-selected", String(on));
+    $(tab).tabIndex = on ? 0 : -1;
+  }
+  $("flat").hidden = three;
+  $("map3d").hidden = !three;
+  $("map3d-fault").textContent = "";
+  history.replaceState(null, "", three ? "#3d" : location.pathname);
+  if (!three) { viewer?.close(); viewer = null; map.draw(); return; }
+  try { // no bundle, or no WebGL 2
+    const { openViewer } = await import("./viewer/viewer.js").catch(() => { throw new Error("it was not built: run make web on the robot"); });
+    if (!$("map3d").hidden) viewer ??= openViewer($("map3d"), { base: "", saved: false, embedded: null });
+  } catch (error) {
+    await openTab(false);
+    $("map3d-fault").textContent = `The 3D view cannot be shown: ${error.message}.`;
+  }
+}
+for (const [tab, three] of [["tab-flat", false], ["tab-3d", true]]) {
+  $(tab).addEventListener("click", () => openTab(three));
+  $(tab).addEventListener("keydown", (e) => { // tabs are changed with the arrows
+    if (e.key !== "ArrowLeft" && e.key !== "ArrowRight") return;
+    $(three ? "tab-flat" : "tab-3d").focus();
+    openTab(!three);
+  });
+}
+if (location.hash === "#3d") openTab(true);
+
 function drawScales() {
   const c = $("scale"), ratio = window.devicePixelRatio || 1, w = c.clientWidth, h = c.clientHeight;
   c.width = w * ratio; c.height = h * ratio;
@@ -256,10 +286,7 @@ $("follow").addEventListener("change", (e) => { map.follow = e.target.checked; m
 window.addEventListener("resize", drawScales);
 if (token) mayCommand(true);
 
-function connection(text, className) {
-  $("connection").textContent = text;
-  $("connection").className = className;
-}
+const connection = (text, className) => Object.assign($("connection"), { textContent: text, className });
 const events = new EventSource("events");
 const on = (kind, take) => events.addEventListener(kind, (e) => take(JSON.parse(e.data)));
 events.onopen = () => connection("connected", "good");

@@ -12,6 +12,7 @@ import pytest
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 PHONE = {"width": 390, "height": 844}
+SOFTWARE_GL = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader"]  # WebGL without a GPU, for the 3D map
 DESK = {"width": 1280, "height": 1150}
 
 
@@ -23,7 +24,7 @@ def browser():
         pytest.skip("needs a browser: apt-get install chromium")
     sandbox = ["--no-sandbox"] if os.getuid() == 0 else []  # Chromium has no sandbox for root
     with api.sync_playwright() as playwright:
-        chromium = playwright.chromium.launch(executable_path=CHROMIUM, args=sandbox)
+        chromium = playwright.chromium.launch(executable_path=CHROMIUM, args=sandbox + SOFTWARE_GL)
         try:
             yield chromium
         finally:
