@@ -56,13 +56,24 @@ def merge_by_cell(params: np.ndarray, cell_m: float) -> np.ndarray:
         return params
     some = params[:, small]
     cells = np.floor(some[MEAN:SCALE].astype(np.float64) / cell_m).astype(np.int64)
-    _, which, counts = np.unique(cells, axis=1, return_inverse=True, return_counts=True)
-    which = which.ravel()
+    _, which, counts = np.unique(_cell_keys(cells), return_inverse=True, return_counts=True)
     single = counts[which] == 1
     order = np.argsort(which[~single], kind="stable")
     groups = some[:, ~single][:, order]
     merged = _merged(groups, np.unique(which[~single][order], return_index=True)[1])
     return np.concatenate([params[:, ~small], some[:, single], merged], axis=1)
+
+
+def _cell_keys(cells: np.ndarray) -> np.ndarray:
+    """Return one number [N] for each cell int64 [3, N], in the order of (x, y, z).
+
+    Sorting numbers takes a tenth of the time of sorting columns. Cells that span more than 2^21 per axis,
+    such as those of a map of kilometres in millimetres, are numbered by sorting the columns.
+    """
+    offset = cells - cells.min(axis=1, keepdims=True)
+    if offset.max() < 1 << 21:
+        return (offset[0] << 42) | (offset[1] << 21) | offset[2]
+    return np.unique(cells, axis=1, return_inverse=True)[1].ravel()
 
 
 def _merged(params: np.ndarray, starts: np.ndarray) -> np.ndarray:

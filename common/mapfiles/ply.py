@@ -11,7 +11,7 @@ import numpy as np
 from beamsplat.common.errors import UserError, reason
 from beamsplat.common.files.persist import make_folder
 from beamsplat.common.geometry.trajectory import Trajectory, write_tum
-from beamsplat.common.raster.layout import COLOUR, MEAN, OPACITY, QUAT, SCALE
+from beamsplat.common.raster.layout import COLOUR, MEAN, OPACITY, PARAMS, QUAT, SCALE
 
 SH_C0 = 0.28209479177387814  # value of the spherical harmonic of degree 0
 _ROWS = 65_536  # Gaussians per write or read: bounds the memory
@@ -21,6 +21,7 @@ _PLY_TYPES = {"float": "<f4", "float32": "<f4", "double": "<f8", "uchar": "u1", 
               "short": "<i2", "ushort": "<u2", "int": "<i4", "uint": "<u4"}  # fmt: skip
 FIELDS = ("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity",
           "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3")  # fmt: skip
+_NORMALS = ("nx", "ny", "nz")  # always zero; some files lack them
 
 
 def write_gaussian_ply(path: Path, params: np.ndarray) -> None:
@@ -102,6 +103,52 @@ def read_ply_points(path: Path) -> np.ndarray:
             return points
     except (OSError, ValueError) as error:
         raise UserError(f"{path}: {reason(error)}") from error
+
+
+def read_gaussian_ply(path: Path) -> np.ndarray:
+    """Return the Gaussians float32 [14, N] of a 3DGS `.ply` file (INRIA layout), in the file's frame.
+
+    Colours are those of spherical harmonics of degree 0; coefficients of higher degrees are left out, and
+    so are Gaussians with values that are not finite.
+
+    Raises:
+        UserError: the file cannot be read, has another format, lacks a property, or is shorter than its
+            header says.
+    """
+    path = Path(path)
+    try:
+        with path.open("rb") as file:
+            head, found, _ = file.read(_MAX_HEADER_BYTES).partition(_END_OF_HEADER)
+            fields, count = _vertex_fields(head.decode("ascii", "replace").split("\n"))
+            missing = [name for name in FIELDS if name not in _NORMALS and name not in dict(fields)]
+            if not found or missing:
+                raise ValueError(
+                    f"no Gaussian splats: its vertices have no property {', '.join(missing[:3])}; expected "
+                    "the layout of 3DGS, which `beamsplat export --to ply` and most trainers write"
+                )
+            dtype, start = np.dtype(fields), len(head) + len(found)
+            if count > (path.stat().st_size - start) // dtype.itemsize:
+                raise ValueError(f"truncated: its header says {count} Gaussians")
+            out = np.empty((PARAMS, count), np.float32)
+            file.seek(start)
+            for first in range(0, count, _ROWS):
+                rows = np.frombuffer(file.read(min(_ROWS, count - first) * dtype.itemsize), dtype)
+                out[:, first : first + len(rows)] = _params(rows)
+            return out[:, np.isfinite(out).all(axis=0)]
+    except (OSError, ValueError) as error:
+        raise UserError(f"{path}: {reason(error)}") from error
+
+
+def _params(rows: np.ndarray) -> np.ndarray:
+    """Return the Gaussians float32 [14, M] in rows of a file; the inverse of `_rows`."""
+    out = np.empty((PARAMS, len(rows)), np.float32)
+    out[MEAN:SCALE] = [rows[name] for name in "xyz"]
+    out[SCALE:QUAT] = [rows[f"scale_{i}"] for i in range(3)]
+    quat = np.array([rows[f"rot_{i}"] for i in range(4)], np.float64)
+    out[QUAT:OPACITY] = quat / np.maximum(np.linalg.norm(quat, axis=0), 1e-12)
+    out[OPACITY] = rows["opacity"]
+    out[COLOUR:] = [0.5 + SH_C0 * rows[f"f_dc_{i}"] for i in range(3)]
+    return out
 
 
 def _vertex_fields(lines: list[str]) -> tuple[list[tuple[str, str]], int]:

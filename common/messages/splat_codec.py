@@ -46,6 +46,20 @@ def pack(params: np.ndarray) -> np.ndarray:
     return np.frombuffer(_HEAD.pack(_MAGIC, count, *low, *high) + body, np.uint8)
 
 
+def extent_of(packed: bytes) -> tuple[int, np.ndarray, np.ndarray]:
+    """Return count, lowest and highest corner float64 [3] of the means, from the header of packed Gaussians.
+
+    Raises:
+        ValueError: the bytes do not begin with a valid header.
+    """
+    if len(packed) < _HEAD.size:
+        raise ValueError(f"{len(packed)} bytes are too few for packed Gaussians")
+    magic, count, *corners = _HEAD.unpack_from(packed)
+    if magic != _MAGIC or count > MAX_GAUSSIANS or not np.all(np.isfinite(corners)):
+        raise ValueError(f"not packed Gaussians: the data starts with {magic!r} and a count of {count}")
+    return count, np.array(corners[:3]), np.array(corners[3:])
+
+
 def unpack(packed: np.ndarray) -> np.ndarray:
     """Decode the bytes of `pack` to Gaussians float32 [14, N].
 
@@ -53,11 +67,7 @@ def unpack(packed: np.ndarray) -> np.ndarray:
         ValueError: the bytes are invalid, truncated, or have more than `MAX_GAUSSIANS` Gaussians.
     """
     blob = packed.tobytes()
-    if len(blob) < _HEAD.size:
-        raise ValueError(f"{len(blob)} bytes are too few for packed Gaussians")
-    magic, count, *corners = _HEAD.unpack_from(blob)
-    if magic != _MAGIC or count > MAX_GAUSSIANS or not np.all(np.isfinite(corners)):
-        raise ValueError(f"not packed Gaussians: the data starts with {magic!r} and a count of {count}")
+    count, lowest, highest = extent_of(blob)
     try:
         body = zlib.decompressobj().decompress(blob[_HEAD.size :], _BYTES * count + 1)
     except zlib.error as error:
@@ -65,7 +75,7 @@ def unpack(packed: np.ndarray) -> np.ndarray:
     if len(body) != _BYTES * count:
         raise ValueError(f"packed Gaussians: {len(body)} bytes for {count} of {_BYTES} bytes each")
     planes = np.frombuffer(body, np.uint8).reshape(_BYTES, count)
-    low, high = np.array(corners[:3])[:, None], np.array(corners[3:])[:, None]
+    low, high = lowest[:, None], highest[:, None]
     grid = planes[0:3].astype(np.float64) * 256.0 + planes[3:6]
     out = np.empty((PARAMS, count), np.float32)
     out[MEAN:SCALE] = low + grid / 65535.0 * np.maximum(high - low, 1e-9)
