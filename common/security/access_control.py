@@ -26,7 +26,7 @@ from beamsplat.common.topics import HEALTH, TOPICS
 ROOT = "beamsplat"
 ADMIN_USERS = ("supervisor", "operator")  # users of a host's router that are not nodes; they may do anything
 UNRESTRICTED_CLIENTS = ("page",)  # nodes that may send any query: they forward commands of authorised users
-READ_ONLY_QUERIES = ("snapshot", "render", "state", "params")
+READ_ONLY_QUERIES = ("snapshot", "render", "state", "poses", "keyframe", "params")
 _DECLARE = ["declare_subscriber", "declare_queryable", "liveliness_token", "liveliness_query",
             "declare_liveliness_subscriber"]  # fmt: skip
 _ANY = ["put", "delete", "query", "reply", *_DECLARE]

@@ -15,6 +15,7 @@ from beamsplat.common.geometry.depth_sigma import typical_sigma_m
 from beamsplat.common.mapfiles.session import Arrays, packed_arrays, unpacked_arrays
 from beamsplat.common.messages import (
     CameraModel,
+    Image,
     Keyframe,
     KeyframeAck,
     MapAnchors,
@@ -73,6 +74,24 @@ def decode_keyframe(message: Keyframe, lens: Callable[[Pinhole], Undistorter]) -
         depth_m=depth_m, sigma_m=typical_sigma_m(depth_m, unpack_sigma(message.sigma, p.shape)),
         anchor=message.anchor_id, beams_uvz=message.beams[:, :3].astype(np.float64), mask=mask,
     )  # fmt: skip
+
+
+def keyframe_rgb(message: Keyframe, lens: Callable[[Pinhole], Undistorter]) -> np.ndarray:
+    """Return the undistorted image of a keyframe message, uint8 [H, W, 3]; `lens` as in `decode_keyframe`.
+
+    Raises:
+        UserError, ValueError: the image cannot be decoded or has the wrong size.
+    """
+    undistort = lens(Pinhole.of(message.camera))
+    p = undistort.pinhole
+    return undistort(decode_rgb(message.picture, message.encoding, p.width_px, p.height_px))
+
+
+def image_message(rgb: np.ndarray) -> Image:
+    """Return an image uint8 [H, W, 3] as a message, encoded as JPEG."""
+    height, width = rgb.shape[:2]
+    data = _jpeg(np.ascontiguousarray(rgb), 90)
+    return Image(stamp_ns=0, width_px=width, height_px=height, encoding="jpeg", data=data)
 
 
 def preview_message(keyframe: Keyframe, view: KeyframeRender) -> MapPreview:

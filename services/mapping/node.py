@@ -12,6 +12,7 @@ from beamsplat.common.files.persist import check_can_write
 from beamsplat.common.mapfiles.ply import write_map
 from beamsplat.common.messages import (
     Anchors,
+    Image,
     Keyframe,
     MapChunk,
     MapPoses,
@@ -32,12 +33,14 @@ from beamsplat.services.mapping.messages import (
     ack,
     anchors_message,
     chunk_message,
+    image_message,
+    keyframe_rgb,
     preview_message,
     render_message,
     state_messages,
 )
 from beamsplat.services.mapping.preview import render_keyframe, render_view
-from beamsplat.services.mapping.queries import check_names, view_of, viewpoint_of
+from beamsplat.services.mapping.queries import check_names, keyframe_id_of, view_of, viewpoint_of
 from beamsplat.services.mapping.session.checkpointer import CheckpointResult
 from beamsplat.services.mapping.session.live_session import LiveSession, MapSession, NoSession
 from beamsplat.services.mapping.session.paging import check_budget
@@ -274,6 +277,27 @@ class MappingNode(Node):
         T_map_camera, camera = view_of(parameters)
         self._check_map("render")
         yield render_message(render_view(self._mapper, T_map_camera, camera), T_map_camera)
+
+    def on_query_poses(self, parameters: dict[str, str]) -> Iterator[MapPoses]:
+        """Yield the refined poses of all keyframes, as `mapping/poses` has them at the end of a drive."""
+        check_names("poses", parameters, ())
+        self._check_map("poses")
+        stamps_ns, T_map_body, ids = self._intake.poses()
+        yield MapPoses(
+            stamp_ns=int(stamps_ns[-1]), keyframe_ids=ids, stamps_ns=stamps_ns, T_map_body=T_map_body
+        )
+
+    def on_query_keyframe(self, parameters: dict[str, str]) -> Iterator[Image]:
+        """Yield the undistorted image of the keyframe `id` as a JPEG, from memory or from the session."""
+        self._check_map("keyframe")
+        id = keyframe_id_of(parameters)
+        keyframe = self._mapper.keyframes.get(id)
+        if keyframe is not None:
+            yield image_message(keyframe.levels[FULL].rgb.transpose(1, 2, 0))
+        elif id in self._mapper.paged_out and (message := self._session.read(id)) is not None:
+            yield image_message(keyframe_rgb(message, self._intake.undistorter))
+        else:
+            raise UserError(f"keyframe: id={id}: the image of this keyframe is not kept")
 
     def on_query_state(self, parameters: dict[str, str]) -> Iterator[MapState]:
         """Yield the current state of the map, with the content of a checkpoint, in several messages."""

@@ -79,6 +79,21 @@ def view_of(parameters: dict[str, str]) -> View:
     return View(T_map_camera, RasterCamera(focal_px, focal_px, cx_px, cy_px, width_px, height_px))
 
 
+def keyframe_id_of(parameters: dict[str, str]) -> int:
+    """Return the id in the parameters of the query `keyframe`.
+
+    Raises:
+        UserError: a parameter is unknown, missing, or not an id; the text has its name and value.
+    """
+    check_names("keyframe", parameters, ("id",))
+    if "id" not in parameters:
+        raise UserError(f"keyframe: the parameter id is missing, with {_shown(parameters)}")
+    word = parameters["id"]
+    if not (word.isascii() and word.isdigit() and len(word) <= 19):
+        raise _wrong("keyframe", parameters, "id", "the id of a keyframe")
+    return int(word)
+
+
 def check_names(query: str, parameters: dict[str, str], known: tuple[str, ...]) -> bool:
     """Check the names of the parameters of a query; return whether there are any.
 

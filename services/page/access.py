@@ -49,6 +49,12 @@ class PageAccess:
         return authority == host.strip().lower() or _name_of(authority) in self.names
 
 
+def page_address(bind: str, port: int, scheme: str = "http") -> str:
+    """Return the address of a page that listens at `bind`, for a browser on this machine."""
+    host = "127.0.0.1" if bind in ("0.0.0.0", "::") else bind
+    return f"{scheme}://{f'[{host}]' if ':' in host else host}:{port}/"
+
+
 def _name_of(host: str) -> str:
     """Return the name or address in a Host header, without port and brackets."""
     name = host.strip().lower()

@@ -8,11 +8,14 @@ import json
 from dataclasses import dataclass, field
 from typing import Any
 
+SCAN = "scan3d"  # the kind of event that only those streams receive that have asked for it
+
 
 @dataclass(eq=False)
 class EventSubscriber:
     """One open event stream: the connection of one page."""
 
+    wants_scan: bool = False  # receives the events `scan3d`
     waiting: dict[str, bytes] = field(default_factory=dict)
     dropped: int = 0  # events replaced by newer ones before they were sent
     _wake: asyncio.Event = field(default_factory=asyncio.Event)
@@ -53,13 +56,19 @@ class EventHub:
         """Return the number of events, since the start, that were replaced before they were sent."""
         return self._dropped + sum(viewer.dropped for viewer in self.subscribers)
 
-    def subscribe(self) -> EventSubscriber:
+    @property
+    def scan_wanted(self) -> bool:
+        """Return whether a stream receives the events `scan3d`."""
+        return any(viewer.wants_scan for viewer in self.subscribers)
+
+    def subscribe(self, wants_scan: bool = False) -> EventSubscriber:
         """Register a new stream; it receives the newest event of each kind first."""
         if not self.subscribers:
             self._newest.clear()  # outdated: nothing is published without subscribers
-        viewer = EventSubscriber()
+        viewer = EventSubscriber(wants_scan)
         for kind, event in self._newest.items():
-            viewer.push(kind, event)
+            if wants_scan or kind != SCAN:
+                viewer.push(kind, event)
         self.subscribers.add(viewer)
         return viewer
 
@@ -77,7 +86,8 @@ class EventHub:
         if self._newest.get(kind) != event:
             self._newest[kind] = event
             for viewer in self.subscribers:
-                viewer.push(kind, event)
+                if viewer.wants_scan or kind != SCAN:
+                    viewer.push(kind, event)
 
 
 def as_json(data: Any) -> bytes:

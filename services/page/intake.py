@@ -7,6 +7,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
+from beamsplat.common.geometry.camera import Pinhole
 from beamsplat.common.mapfiles.grid_tiles import GridSource, TiledGrid
 from beamsplat.common.messages import (
     Correction,
@@ -24,6 +25,7 @@ from beamsplat.common.messages import (
     WheelOdometry,
 )
 from beamsplat.services.page.images import EncodedImage, encode_camera_image, encode_depth, encode_tiles
+from beamsplat.services.page.map3d.source import MountedCamera, ShownCamera
 from beamsplat.services.page.view import PageState
 
 
@@ -60,6 +62,9 @@ class RobotIntake:
         self.state.health(health)
 
     def _rig(self, m: Rig) -> None:
+        if m.camera is not None:
+            shown = ShownCamera(m.camera.width_px, m.camera.height_px, Pinhole.of(m.camera).K)
+            self.state.camera = MountedCamera(shown, m.camera.T_body_camera)
         if m.lidar is not None:
             self.state.lidar(m.lidar.T_body_lidar)
 

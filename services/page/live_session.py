@@ -30,15 +30,18 @@ class FleetSubscriptions:
     def __init__(
         self, session: zenoh.Session, own: str, topics: tuple[str, ...],
         on_message: Callable[[str, str, Message], None], on_refused: Callable[[str], None],
+        robots: str = "*",
     ) -> None:  # fmt: skip
         """Subscribe.
 
         Args:
-            own: name of the robot whose messages are ignored here.
+            own: name of the robot whose messages are ignored here, "" = of none.
             topics: names of topics; the health of all nodes besides.
             on_message: called with (robot, topic, message); topic is "health" for a `Health`.
             on_refused: called with the reason for each sample that cannot be used.
+            robots: name of the only robot to be heard, "*" = all.
         """
+        self._robots = robots
         self._own, self._on_message, self._on_refused = own, on_message, on_refused
         self._declared: list[object] = []  # Zenoh undeclares a handle that is garbage-collected
         for name in topics:
@@ -49,7 +52,7 @@ class FleetSubscriptions:
     def _subscribe(self, session: zenoh.Session, row: Topic, suffix: str, delivery: str) -> None:
         size = _QUEUED_HISTORY if row.history else _QUEUED
         channel: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(size)
-        subscriber = declare_subscription(session, key("*", suffix), row, delivery, channel)
+        subscriber = declare_subscription(session, key(self._robots, suffix), row, delivery, channel)
         self._declared.append(subscriber)
         receive_in_thread(session, f"fleet-{row.name}", subscriber, partial(self._handle, row))
 

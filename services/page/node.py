@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Annotated, Any
 from urllib.parse import quote
 
+import zenoh
 from pydantic import Field, SecretStr, field_validator
 
 from beamsplat.common.config.alerts import AlertConfig
@@ -27,11 +28,13 @@ from beamsplat.common.runtime.live_settings import LiveSettings
 from beamsplat.common.runtime.node import Input, Node, Outputs, QueryFunction
 from beamsplat.common.security.logins import login_of
 from beamsplat.common.zenoh.bus import open_session
-from beamsplat.services.page.access import PageAccess, own_host_names
+from beamsplat.services.page.access import PageAccess, own_host_names, page_address
 from beamsplat.services.page.alerting import Alerting
 from beamsplat.services.page.fleet import Fleet
 from beamsplat.services.page.intake import RobotIntake
 from beamsplat.services.page.live_session import FleetSubscriptions
+from beamsplat.services.page.map3d.live_session import LiveMap
+from beamsplat.services.page.map3d.source import MapSource
 from beamsplat.services.page.server import PageServer
 from beamsplat.services.page.view import PageState
 
@@ -62,6 +65,7 @@ class PageConfig(NodeConfig):
     picture_hz: Remote[Hz] = 2.0
     map_hz: Remote[Hz] = 0.5
     robot_hz: Remote[Hz] = 5.0
+    map3d_mb: Annotated[float, Field(ge=1.0, le=100_000.0)] = 200.0  # memory for the 3D map of each robot
     widest_px: Remote[Annotated[int, Field(ge=64, le=4096)]] = 640  # wider images are scaled down
     fleet: bool = False  # show all robots that this router hears: for the page of an edge server
     alerts: AlertConfig = AlertConfig()  # table [nodes.page.alerts]
@@ -89,6 +93,7 @@ _INPUTS = (
     Input("mapping/preview", "latest"),
     Input("mapping/status", "latest"),
 )
+TOPICS = tuple(entry.topic for entry in _INPUTS)  # what the page shows of a robot, besides health
 
 
 def _handler(topic: str) -> Callable[[Any, Message], Outputs]:
@@ -130,7 +135,9 @@ class PageNode(_Handlers, Node):
         tls = _tls(c.certificate, c.certificate_key)
         file = None if live is None else live.run_dir / "alerts.json"
         self._alerting = Alerting(self._fleet, c.alerts, local_clock_id(), file)
-        self._server = PageServer(self._fleet, self._alerting, self._command, access, c.robot_hz)
+        self._server = PageServer(
+            self._fleet, self._alerting, self._command, access, c.robot_hz, self._make_map
+        )
         self._listen(tls)
         self._alerting.start()
         if c.fleet and live is not None:
@@ -145,18 +152,28 @@ class PageNode(_Handlers, Node):
                 f"page: cannot listen at {c.bind}:{c.port} ({error.strerror}): choose another port with "
                 "--set page.port=PORT (0: any free port)"
             ) from error
-        host = "127.0.0.1" if c.bind in ("0.0.0.0", "::") else c.bind
-        self._address = f"{'https' if tls else 'http'}://{f'[{host}]' if ':' in host else host}:{port}/"
+        self._address = page_address(c.bind, port, "https" if tls else "http")
         self.detail = f"open {self._address}"
         log.info("%s", self.detail)
 
+    def _make_map(self, robot: str, state: PageState) -> MapSource:
+        live = self.live_settings
+        if live is None:
+            return MapSource()
+        return LiveMap(
+            robot, lambda: self._open_session(live), state.mapper_instance, lambda: state.camera,
+            self.config.map3d_mb, self.rejections.add,
+        )  # fmt: skip
+
+    def _open_session(self, live: LiveSettings) -> zenoh.Session:
+        login = login_of(live.security, self.name)
+        return open_session(live.endpoints, should_stop=self.must_stop, login=login)
+
     def _subscribe_to_fleet(self, live: LiveSettings) -> None:
         """Open a session for the messages of all other robots: those of a node are of its own robot."""
-        login = login_of(live.security, self.name)
-        self._session = open_session(live.endpoints, should_stop=self.must_stop, login=login)
-        topics = tuple(entry.topic for entry in _INPUTS)
+        self._session = self._open_session(live)
         self._subscriptions = FleetSubscriptions(
-            self._session, live.robot, topics, self._take_of_other, self.rejections.add
+            self._session, live.robot, TOPICS, self._take_of_other, self.rejections.add
         )
 
     def close(self) -> None:
@@ -205,7 +222,8 @@ class PageNode(_Handlers, Node):
         self.rejections.set("messages of other robots: too many robots", self._fleet.ignored)
         texts = [f"open {self._address}", f"{viewers} {'viewer' if viewers == 1 else 'viewers'}"]
         texts += [f"{robots} robots"] if robots > 1 else []
-        texts += [f"{n} {what}" for what, n in self._server.refused().items() if n]
+        counts = {**self._server.refused(), **self._server.reduced_chunks()}
+        texts += [f"{n} {what}" for what, n in counts.items() if n]
         self.detail = "; ".join(texts)
 
     def _take_of_other(self, robot: str, topic: str, message: Message) -> None:

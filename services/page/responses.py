@@ -13,7 +13,8 @@ from aiohttp.http_exceptions import HttpProcessingError
 
 from beamsplat.services.page.events import as_json
 
-# No content from other origins, no inline scripts, no embedding in frames, no content sniffing, no caching.
+# Of responses that set no other values: no content from other origins, no inline scripts, no embedding in
+# frames, no content sniffing, no caching.
 HEADERS = {
     "Content-Security-Policy": "default-src 'self'; frame-ancestors 'none'; base-uri 'none'",
     "X-Content-Type-Options": "nosniff",

@@ -7,27 +7,32 @@ from collections.abc import Callable
 from concurrent.futures import Executor
 from typing import Any
 
-from beamsplat.services.page.events import EventHub
+from beamsplat.services.page.events import SCAN, EventHub
+from beamsplat.services.page.map3d.source import MapSource
 from beamsplat.services.page.view import PageState
+
+_SCAN_S, _MAP_S = 0.2, 0.5  # shortest time between two events
 
 
 class RobotView:
     """Events and images of one robot; used in the server's thread only."""
 
     def __init__(
-        self, state: PageState, facts: Callable[[RobotView], dict[str, Any]], encoder: Executor
-    ) -> None:
+        self, state: PageState, facts: Callable[[RobotView], dict[str, Any]], encoder: Executor,
+        map3d: MapSource,
+    ) -> None:  # fmt: skip
         """Create the view.
 
         Args:
             state: of the robot.
             facts: returns what the status has besides the state: alerts, and facts about the page.
             encoder: encodes the images.
+            map3d: the robot's map.
         """
-        self.state, self.events = state, EventHub()
+        self.state, self.events, self.map3d = state, EventHub(), map3d
         self._facts, self._encoder = facts, encoder
         self._locks = {name: asyncio.Lock() for name in state.images}
-        self._next_slow_s = 0.0
+        self._next_slow_s = self._next_scan_s = self._next_map_s = 0.0
 
     def status(self) -> dict[str, Any]:
         """Return the data of the status event."""
@@ -36,6 +41,17 @@ class RobotView:
     def publish(self, now_s: float | None) -> None:
         """Publish the robot's pose, and once per second all else; None: everything, for a new viewer."""
         self.events.publish("robot", self.state.robot())
+        if self.events.scan_wanted and (now_s is None or now_s >= self._next_scan_s):
+            if now_s is not None:
+                self._next_scan_s = now_s + _SCAN_S
+            self.events.publish(SCAN, self.state.scan3d())
+        if self.map3d.active and (now_s is None or now_s >= self._next_map_s):
+            if now_s is not None:
+                self._next_map_s = now_s + _MAP_S
+            self.map3d.want()  # as long as a page is open
+            self.events.publish(
+                "map3d", {"producer": self.map3d.map.producer, "revision": self.map3d.map.revision}
+            )
         if now_s is None or now_s >= self._next_slow_s:
             if now_s is not None:
                 self._next_slow_s = now_s + 1.0

@@ -1,9 +1,11 @@
 """The page's HTTP server, in its own thread: the node never waits for a browser.
 
 GET /                     the page; its parts are /page.js, /page.css ...
-GET /events               server-sent events: status, scale, path, robot, picture (a newer image is available)
+GET /events               server-sent events: status, scale, path, robot, picture (there is a newer image),
+                          map3d (the map has changed); with ?scan=1 also scan3d
 GET /picture/NAME         the newest image: camera, depth, render or map
 GET /status               the data of the status event, for scripts
+GET /map3d, /map3d/...    the 3D map: see `map3d.routes`; /view is a page for it alone, /viewer/... its parts
 GET /metrics              Prometheus metrics of all robots that the page knows
 GET /fleet                the list of these robots, from GET /robots; GET /robots/NAME/ is the page of one of
                           them, with /robots/NAME/events, /picture/NAME and /status as above
@@ -22,10 +24,7 @@ import logging
 import ssl
 import threading
 from collections.abc import Awaitable, Callable
-from concurrent.futures import ThreadPoolExecutor
-from functools import partial
 from http import HTTPStatus
-from typing import Any
 
 from aiohttp import web
 
@@ -35,6 +34,8 @@ from beamsplat.services.page.command_requests import Command, CommandRequests
 from beamsplat.services.page.events import EventHub
 from beamsplat.services.page.fleet import Fleet
 from beamsplat.services.page.listener import MAX_CONNECTIONS, Listener
+from beamsplat.services.page.map3d.routes import Map3dRoutes
+from beamsplat.services.page.map3d.source import MapSource
 from beamsplat.services.page.metrics import CONTENT_TYPE, page_metrics
 from beamsplat.services.page.responses import (
     BUSY,
@@ -46,7 +47,8 @@ from beamsplat.services.page.responses import (
     json_response,
 )
 from beamsplat.services.page.robot_view import RobotView
-from beamsplat.services.page.static_files import OF_FLEET, read_files
+from beamsplat.services.page.robot_views import MapMaker, RobotViews
+from beamsplat.services.page.static_files import OF_FLEET, read_files, read_viewer
 
 _http_log = logging.getLogger(f"{__name__}.http")
 _ROBOT = "/robots/{robot}"
@@ -66,22 +68,29 @@ class PageServer:
     """HTTP server of the robots of a `Fleet`; call `start()`, then `close()`."""
 
     def __init__(
-        self, fleet: Fleet, alerting: Alerting, command: Command, access: PageAccess, robot_hz: float
-    ) -> None:
-        self._fleet, self._alerting = fleet, alerting
-        self._access = access
+        self, fleet: Fleet, alerting: Alerting, command: Command, access: PageAccess, robot_hz: float,
+        make_map: MapMaker = lambda robot, state: MapSource(), saved: bool = False,
+    ) -> None:  # fmt: skip
+        """Create the server.
+
+        Args:
+            robot_hz: rate of the robots' poses.
+            make_map: called once for each robot; the default has no map.
+            saved: the page /view shows a map that does not change.
+        """
+        self._fleet, self._alerting, self._access = fleet, alerting, access
+        self._views = RobotViews(fleet, alerting, bool(access.token), make_map)
         self._commands = CommandRequests(command, access)
         self._robot_hz = robot_hz
-        self._files = read_files()
-        self._encoder = ThreadPoolExecutor(1, "page-encoder")
-        self._views: dict[str, RobotView] = {}  # by robot; used in the server's thread
+        self._files, self._viewer = read_files(saved), read_viewer()
+        self._map3d = Map3dRoutes(lambda request: self._view_of(request).map3d)
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._loop.run_forever, name="page", daemon=True)
         self._runner: web.AppRunner | None = None
         self._listener: Listener | None = None
         self._publishing: asyncio.Task[None] | None = None
         self._protocol_errors = ProtocolErrors()
-        self._view(fleet.own)
+        self._views.of(fleet.own)
 
     @property
     def rejected_commands(self) -> int:
@@ -91,12 +100,12 @@ class PageServer:
     @property
     def events(self) -> EventHub:
         """Event streams of the page's own robot."""
-        return self._view(self._fleet.own).events
+        return self._views.of(self._fleet.own).events
 
     @property
     def viewers(self) -> int:
         """Number of open event streams of all robots."""
-        return sum(len(view.events) for view in list(self._views.values()))
+        return self._views.viewers
 
     def start(self, bind: str, port: int, tls: ssl.SSLContext | None) -> int:
         """Start listening; return the port (a free one if `port` is 0).
@@ -113,6 +122,8 @@ class PageServer:
             app.router.add_get(f"{prefix}/events", self._stream, allow_head=False)
             app.router.add_get(f"{prefix}/status", self._get_status)
             app.router.add_get(f"{prefix}/picture/{{name}}", self._get_image)
+            app.router.add_get(f"{prefix}/viewer/{{file}}", self._get_viewer)
+            self._map3d.add(app.router, prefix)
             for path in self._files:
                 if not prefix or path not in OF_FLEET:
                     app.router.add_get(f"{prefix}{path}", self._get_file)
@@ -147,14 +158,19 @@ class PageServer:
             "connections closed because too many were open": replaced,
         }
 
+    def reduced_chunks(self) -> dict[str, int]:
+        """Return how many chunks of the 3D maps are not shown in full detail, by reason."""
+        return self._views.reduced_chunks()
+
     def close(self) -> None:
         """Close all connections and end the thread."""
         if self._thread.is_alive():
             asyncio.run_coroutine_threadsafe(self._close_all(), self._loop).result()
             self._loop.call_soon_threadsafe(self._loop.stop)
             self._thread.join()
-        self._encoder.shutdown(wait=False, cancel_futures=True)
         self._commands.close()
+        self._map3d.close()
+        self._views.close()
 
     async def _close_all(self) -> None:
         if self._listener is not None:
@@ -165,39 +181,16 @@ class PageServer:
         if self._publishing is not None:
             self._publishing.cancel()
 
-    # --- robots ---
-
-    def _view(self, robot: str) -> RobotView:
-        """Return the view of a robot. Raises RefusedRequest if the page does not know it."""
-        state = self._fleet.states().get(robot)
-        if state is None:
-            raise RefusedRequest(HTTPStatus.NOT_FOUND, "no robot with this name is known: see /robots")
-        view = self._views.get(robot)
-        if view is None or view.state is not state:  # new, or forgotten and heard again
-            view = self._views[robot] = RobotView(state, partial(self._facts, robot), self._encoder)
-        return view
-
     def _view_of(self, request: web.Request) -> RobotView:
-        return self._view(request.match_info.get("robot", self._fleet.own))
-
-    def _facts(self, robot: str, view: RobotView) -> dict[str, Any]:
-        own = robot == self._fleet.own
-        page = {
-            "robot": robot, "viewers": len(view.events), "overtaken": view.events.dropped,
-            "commands": own and bool(self._access.token), "robots": len(self._fleet.states()),
-        }  # fmt: skip
-        return {"page": page, "alerts": [alert.as_json() for alert in self._alerting.alerts(robot)]}
+        return self._views.of(request.match_info.get("robot", self._fleet.own))
 
     async def _publish_periodically(self) -> None:
         """Publish the robots' poses at `robot_hz` and other events once per second, to open pages."""
         while True:
             await asyncio.sleep(1.0 / self._robot_hz)
-            known = self._fleet.states()
-            self._views = {name: v for name, v in self._views.items() if name in known or v.events}
-            for view in list(self._views.values()):
-                if view.events:
-                    view.publish(self._loop.time())
-                    await view.encode_due_images()
+            for view in self._views.with_viewers():
+                view.publish(self._loop.time())
+                await view.encode_due_images()
 
     # --- requests ---
 
@@ -226,7 +219,8 @@ class PageServer:
         except RefusedRequest as error:
             response = json_response({"error": str(error)}, error.status)
         if not response.prepared:
-            response.headers.update(HEADERS)
+            for name, value in HEADERS.items():
+                response.headers.setdefault(name, value)
         return response
 
     def _check_source(self, request: web.Request) -> None:
@@ -249,7 +243,7 @@ class PageServer:
         if self.viewers >= _MAX_VIEWERS:
             raise RefusedRequest(*BUSY)
         response = web.StreamResponse(headers={**HEADERS, "Content-Type": "text/event-stream"})
-        viewer = view.events.subscribe()
+        viewer = view.events.subscribe(wants_scan=request.query.get("scan") == "1")
         try:
             with aborting(request):
                 await response.prepare(request)
@@ -285,10 +279,20 @@ class PageServer:
     async def _get_file(self, request: web.Request) -> web.Response:
         path = request.path
         if (robot := request.match_info.get("robot")) is not None:
-            self._view(robot)
+            self._views.of(robot)
             path = path.removeprefix(f"/robots/{robot}")
         body, kind = self._files[path]
         return web.Response(body=body, headers={"Content-Type": kind})
+
+    async def _get_viewer(self, request: web.Request) -> web.StreamResponse:
+        self._view_of(request)
+        file = self._viewer.get(request.match_info["file"])
+        if file is None:
+            raise RefusedRequest(HTTPStatus.NOT_FOUND, "not found: `make web` builds the 3D viewer")
+        headers = {"Content-Type": file.kind, "ETag": file.tag, "Cache-Control": "no-cache"}
+        if request.headers.get("If-None-Match") == file.tag:
+            return web.Response(status=HTTPStatus.NOT_MODIFIED, headers=headers)
+        return web.Response(body=file.body, headers=headers)
 
     async def _get_image(self, request: web.Request) -> web.Response:
         view, name = self._view_of(request), request.match_info["name"]

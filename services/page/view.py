@@ -18,6 +18,7 @@ from beamsplat.common.geometry.tracks import BoundedPath, PoseBuffer, scan_point
 from beamsplat.common.geometry.transforms import transform_points, yaw_of
 from beamsplat.common.runtime.health import HealthRecords, NodeRecord
 from beamsplat.services.page.images import LatestImage
+from beamsplat.services.page.map3d.source import MountedCamera
 
 # Sources of the robot's pose, best first; the best available one is shown.
 SOURCES = ("localization", "external", "wheel")
@@ -42,12 +43,13 @@ class PageState:
         self._services: dict[str, dict[str, Any]] = {}
         self._scales: deque[tuple[float, float, float]] = deque(maxlen=_MAX_SCALES)
         self._T_body_lidar = np.eye(4)
+        self.camera: MountedCamera | None = None
         self._T_map_odom = np.eye(4)
         self._source_rank = len(SOURCES)
         self._poses = PoseBuffer()  # T_map_body of the best source
         self._received_s = 0.0
         self._path = BoundedPath(_PATH_POINTS, _PATH_STEP_M)
-        self._scans: deque[tuple[int, np.ndarray]] = deque(maxlen=_MAX_WAITING_SCANS)
+        self._scans: deque[tuple[int, np.ndarray]] = deque(maxlen=_MAX_WAITING_SCANS)  # stamp, lidar frame
         self.images = {name: LatestImage(map_hz if name == "map" else picture_hz) for name in IMAGE_NAMES}
 
     # --- written by the node ---
@@ -117,15 +119,16 @@ class PageState:
         points, _ = scan_points(ranges_m, angle_min_rad, angle_increment_rad, range_limits_m)
         points = points[:: max(-(-len(points) // _SCAN_POINTS), 1)]
         with self._lock:
-            self._scans.append((stamp_ns, transform_points(self._T_body_lidar, points)))
+            self._scans.append((stamp_ns, points))
 
-    def _newest_scan_map_m(self) -> np.ndarray:
-        """Return the points [N, 3] (m, map frame) of the newest scan whose pose is known."""
+    def _newest_scan(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return T_map_lidar [4, 4] and points [N, 3] (m, lidar frame) of the newest scan whose pose is
+        known; without one, no points."""
         newest_ns, _ = self._poses.newest
-        for stamp_ns, points_body in reversed(self._scans):
+        for stamp_ns, points_lidar in reversed(self._scans):
             if stamp_ns <= newest_ns and (T_map_body := self._poses.at(stamp_ns)) is not None:
-                return transform_points(T_map_body, points_body)
-        return np.zeros((0, 3))
+                return T_map_body @ self._T_body_lidar, points_lidar
+        return np.eye(4), np.zeros((0, 3))
 
     def log_event(self, text: str) -> None:
         """Add a line to the events that the page lists."""
@@ -206,12 +209,29 @@ class PageState:
         with self._lock:
             if not self._poses:
                 return None
-            T = self._poses.newest[1]
+            T, scan_m = self._poses.newest[1], transform_points(*self._newest_scan())
             return {
                 "source": SOURCES[self._source_rank], "age_s": round(time.monotonic() - self._received_s, 1),
                 "x_m": round(float(T[0, 3]), 3), "y_m": round(float(T[1, 3]), 3),
-                "yaw_rad": round(float(yaw_of(T)), 4), "scan_cm": _centimetres(self._newest_scan_map_m()),
+                "yaw_rad": round(float(yaw_of(T)), 4), "scan_cm": _centimetres(scan_m),
             }  # fmt: skip
+
+    def scan3d(self) -> dict[str, Any] | None:
+        """Return T_map_lidar and the points [x, y] (m, lidar frame) of the newest scan; None before it."""
+        with self._lock:
+            if not self._poses:
+                return None
+            T_map_lidar, points = self._newest_scan()
+            return {
+                "T_map_lidar": np.round(T_map_lidar, 5).ravel().tolist(),
+                "points": np.round(points[:, :2], 3).tolist(),
+            }
+
+    def mapper_instance(self) -> str:
+        """Return the id of the mapper's process by its newest health, "" before the first."""
+        with self._lock:
+            record = self._health.records.get("mapping")
+            return "" if record is None else record.health.instance
 
     def path(self) -> list[int]:
         """Return the robot's path in the map frame as x, y, x, y ... in cm."""

@@ -27,7 +27,7 @@ SOUND_VIEW = {
     "height_px": "24",
     "focal_px": "30",
 }
-NAMES = [*SOUND, *SOUND_VIEW]
+NAMES = [*SOUND, *SOUND_VIEW, "id"]
 PARAMETERS = st.one_of(
     st.dictionaries(st.one_of(st.sampled_from([*NAMES, "set"]), st.text(max_size=8)), st.one_of(NUMBERS, POINTS)),
     st.tuples(st.sampled_from(list(SOUND)), NUMBERS).map(lambda change: {**SOUND, change[0]: change[1]}),
@@ -46,7 +46,7 @@ def mapper():
 PREPARED = {"mapping": mapper}  # node -> one that can answer
 
 
-QUERIES = [("mapping", "render"), ("mapping", "snapshot"), ("mapping", "state")]
+QUERIES = [("mapping", name) for name in ("keyframe", "poses", "render", "snapshot", "state")]
 
 
 def test_no_query_of_a_node_is_left_out():

@@ -46,6 +46,9 @@ class MapSession(Protocol):
         Without a session folder, return True.
         """
 
+    def read(self, id: int) -> Keyframe | None:
+        """Return a keyframe on disk; None if there is none, or it cannot be read."""
+
     def remove(self, id: int) -> None:
         """Remove a rejected keyframe from disk."""
 
@@ -110,6 +113,8 @@ class NoSession:
 
     def store(self, message: Keyframe, known: bool) -> bool:
         return True
+
+    def read(self, id: int) -> None: ...
 
     def remove(self, id: int) -> None: ...
 
@@ -193,6 +198,9 @@ class LiveSession:
         if known and not self._checkpointer.is_unwritten(message.id):
             return True
         return self._checkpointer.write_keyframe(message.id, *encode_keyframe(message))
+
+    def read(self, id: int) -> Keyframe | None:
+        return self._read_message(id)
 
     def remove(self, id: int) -> None:
         self._checkpointer.remove_keyframe(id)

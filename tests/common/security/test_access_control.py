@@ -16,8 +16,8 @@ HOSTS = {
     "monitor_of_r1": HostRole(role="monitor", robot="r1"),
     "edge": HostRole(role="edge"),
 }
-QUERIES = ("snapshot", "render", "state", "params", "swap", "set_params", "restart")
-READ_ONLY = {"snapshot", "render", "state", "params"}
+QUERIES = ("snapshot", "render", "state", "poses", "keyframe", "params", "swap", "set_params", "restart")
+READ_ONLY = {"snapshot", "render", "state", "poses", "keyframe", "params"}
 
 
 @functools.cache

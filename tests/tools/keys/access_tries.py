@@ -28,7 +28,7 @@ from tests.conftest import free_port
 ROOT = Path(__file__).resolve().parents[3]
 ROBOT = "r1"
 INSTANCE = "0123456789abcdef"
-READ_ONLY_QUERIES = ("params", "render", "snapshot", "state")
+READ_ONLY_QUERIES = ("keyframe", "params", "poses", "render", "snapshot", "state")
 REQUESTS = ("reached", "retire", "activate")
 OPERATIONS = ("put", "delete", "read", "ask", "answer", "announce", "watch")
 _LAST_S = 30.0  # an operation that the policy allows must have an effect within this time

@@ -43,7 +43,7 @@ KIND_HEADINGS = {
     "down": "topics to the robot", "down end": "their end markers", "down history": "their caches",
     "host": "topics that stay on a host", "host end": "their end markers", "host history": "their caches",
     "health": "health of any node", "alive": "tokens of active nodes", "failed": "tokens of failed nodes",
-    "reading query": "queries `params`, `render`, `snapshot`, `state`",
+    "reading query": "queries `keyframe`, `params`, `poses`, `render`, `snapshot`, `state`",
     "changing query": "all other queries (`restart`, `swap`, ...)",
     "request": "hand-over requests to a process", "operator": "commands of the operator", "unknown": "any other key of this robot",
     "foreign": "keys outside `beamsplat/`", PATTERN: "one wildcard for all keys of this robot",
@@ -111,7 +111,7 @@ def try_requests() -> dict[tuple[str, str], dict[str, int]]:
                     case: _status(
                         serving,
                         method,
-                        path.replace("{name}", "camera").replace("{robot}", "r1"),
+                        path.format(name="camera", robot="r1", anchor="0", id="0", file="none.js"),
                         headers,
                         host,
                     )
@@ -204,7 +204,7 @@ def render(edge: tuple[Router, Effects], local: tuple[Router, Effects], requests
         "",
         "## Processes of a robot with `security.local`",
         "",
-        "Queries: reading = `params`, `render`, `snapshot`, `state`; changing = all others; operator = commands that may set any",
+        "Queries: reading = `keyframe`, `params`, `poses`, `render`, `snapshot`, `state`; changing = all others; operator = commands that may set any",
         "option; requests = hand-over of a process; router = state of the router. Who publishes a topic also publishes its end marker and answers queries to its cache.",
         "",
         *_table(
@@ -217,7 +217,8 @@ def render(edge: tuple[Router, Effects], local: tuple[Router, Effects], requests
         "",
         "## The web page",
         "",
-        "Status codes; 404 of an image: there is none yet. Without the option `token` every command is refused with 403.",
+        "Status codes; 404 of an image, a chunk or a file of the viewer: there is none; 400 of a render: without a pose.",
+        "Without the option `token` every command is refused with 403.",
         "",
         *_table(
             ["", *REQUESTS],
