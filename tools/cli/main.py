@@ -32,6 +32,7 @@ from beamsplat.tools.cli import simulate as simulator_cli
 from beamsplat.tools.cli import slam as localization_cli
 from beamsplat.tools.cli import swap as swap_cli
 from beamsplat.tools.cli import system as system_cli
+from beamsplat.tools.cli import view as view_cli
 from beamsplat.tools.cli import watch as watch_cli
 from beamsplat.tools.cli.relocalize import eval_relocalize
 
@@ -57,7 +58,8 @@ for command in (simulator_cli.simulate, replay_cli.info, replay_cli.rig):
     app.command(rich_help_panel=_DATA)(command)
 app.add_typer(calibrate_cli.app, name="calibrate", rich_help_panel=_DATA)
 for command in (
-    localization_cli.slam, depth_cli.depth, formats_cli.export, formats_cli.render, compare_cli.compare,
+    view_cli.view, localization_cli.slam, depth_cli.depth, formats_cli.export, formats_cli.render,
+    compare_cli.compare,
 ):  # fmt: skip
     app.command(rich_help_panel=_RESULTS)(command)
 
