@@ -17,6 +17,7 @@ from beamsplat.common.config.deployment import load_deployment
 from beamsplat.common.errors import UserError
 from beamsplat.common.files.persist import make_folder, write_atomically
 from beamsplat.common.files.resources import shipped_file
+from beamsplat.tools.cli.browser import BrowserOption, open_in_browser
 from beamsplat.tools.cli.memory_option import MemoryOption, memory_overrides
 from beamsplat.tools.cli.options import writable
 
@@ -54,8 +55,11 @@ def demo(
         list[str] | None, typer.Option("--set", metavar="NODE.OPTION=VALUE", help="Override an option")
     ] = None,
     memory: MemoryOption = None,
+    browser: BrowserOption = True,
 ) -> None:
     """Simulate a drive through a furnished home, run the system on it live, and record it.
+
+    At the end the report is opened in a browser, where there is a display.
 
     Examples:
 
@@ -107,6 +111,8 @@ def demo(
             f"Other programs took {cores:.1f} of {os.cpu_count()} CPU cores meanwhile: on an idle machine "
             "more images are processed, with less delay, and the map is better."
         )
+    if browser and (out / "report.html").exists():
+        open_in_browser((out / "report.html").resolve().as_uri())
     end.check_useful()
 
 
@@ -186,13 +192,13 @@ def write_results(
 def _say_where(out: Path, source: Path, figures: dict[str, Any]) -> None:
     rows = [
         (source, "the drive: camera, lidar, wheels"),
-        (out / "report.html", "the results: open it in a browser"),
+        (out / "report.html", "the results, with the map in 3D: open it in a browser"),
         (out / "map" / "splats.ply", "the map: opens in viewers of 3D Gaussian splats"),
         (out / "map.png", "the map from above"),
         (out / "trajectory.tum", "the trajectory of the robot"),
         (
             out / "session",
-            "the saved map, to continue, export or render: beamsplat session info, export, render",
+            "the saved map, to view, continue or export: beamsplat view, session info, export, render",
         ),
         (out / "demo.rrd", "the view of the monitor: rerun FILE"),
         (out / "recording", "all messages: Foxglove, `ros2 bag`, beamsplat info"),

@@ -19,6 +19,7 @@ from beamsplat.tools.report.html import (
     table,
     write_page,
 )
+from beamsplat.tools.report.map_view import map_section
 from beamsplat.tools.report.scores import GroundTruth
 from beamsplat.tools.report.svg import COLOURS, Curve, chart
 
@@ -36,7 +37,7 @@ _KEY_FIGURES: tuple[tuple[str, float, str, str], ...] = (
 
 
 def write_drive_report(path: Path, report: dict[str, Any], truth: GroundTruth) -> None:
-    """Write the report on a single drive as one HTML file that includes its images.
+    """Write the report on a single drive as one HTML file that includes its images and the map in 3D.
 
     Args:
         path: file to write.
@@ -45,7 +46,8 @@ def write_drive_report(path: Path, report: dict[str, Any], truth: GroundTruth) -
     """
     (row,) = report["configurations"]
     plots = row["plots"]
-    body = [f"<h1>{escape(report['data'])}, mapped</h1>", _summary(row, report["cores"])]
+    head = [f"<h1>{escape(report['data'])}, mapped</h1>", _summary(row, report["cores"])]
+    body = []
     if plots["above"] is not None:
         body.append(
             figure(plots["above"], "The map from above, without its ceiling, and the way of the robot")
@@ -57,7 +59,10 @@ def write_drive_report(path: Path, report: dict[str, Any], truth: GroundTruth) -
     body += ["<h2>Errors over time</h2>", *errors_over_time([row])] if has_truth else []
     tables = "".join(table(title, columns, [row]) for title, columns in TABLES)
     body.append(f"<details><summary>All figures</summary>{tables}</details>")
-    write_page(path, f"{report['data']}, mapped", body)
+    if plots.get("map") is not None:
+        used_bytes = sum(len(part.encode()) for part in (*head, *body))
+        head.append(map_section(plots["map"], plots["found"][:, :2, 3], used_bytes))
+    write_page(path, f"{report['data']}, mapped", [*head, *body])
 
 
 def _summary(row: Row, cores: int) -> str:

@@ -23,7 +23,8 @@ td,th{border:1px solid #ccc;padding:3px 8px;text-align:right}
 td:first-child,th:first-child{text-align:left}.p{color:#777}svg text{font-size:10px;fill:#333}
 svg .t{font-size:13px;font-weight:bold}img{max-width:100%;margin:2px}.w{color:#a40}figure{margin:0 0 1.5em}
 .k{display:inline-block;margin:0 1.6em .6em 0}.k b{display:block;font-size:22px}summary{cursor:pointer}
-details{margin:1.5em 0}"""
+details{margin:1.5em 0}svg circle:hover{fill:#222}
+pre{white-space:pre-wrap;font-size:11px}#map3d{background:#111;color:#ddd}"""
 
 Row = dict[str, Any]
 DEPTH_RANGE_M = (0.5, 8.0)  # of the colours of depth
@@ -119,7 +120,7 @@ def table(title: str, columns: tuple[tuple[str, str, str], ...], rows: list[Row]
 def _name(row: Row) -> str:
     """Return title and seed of a row; after the title, the substitute for a missing depth network if any."""
     stand_in = " [" + row["depth_source"] + "]" if row["advice"] else ""
-    seed = "" if row["seed"] is None else f" #{row['seed']}"
+    seed = "" if row["seed"] is None else f", seed {row['seed']}"
     return f"{row['title']}{stand_in}{seed}"
 
 

@@ -107,12 +107,20 @@ def top_view_of_map(record: RunRecord, T_world_map: np.ndarray, path_m: np.ndarr
         T_world_map: alignment of the map with the ground truth, float64 [4, 4].
         path_m: x, y of the path that is drawn on the image, float64 [K, >= 2], world frame.
     """
+    params = map_in_world(record, T_world_map)
+    return None if params is None else top_view(params, path_m)
+
+
+def map_in_world(record: RunRecord, T_world_map: np.ndarray) -> np.ndarray | None:
+    """Return the last map of a run as Gaussians float32 [14, N] in the world frame; None if it is empty.
+
+    Args:
+        T_world_map: alignment of the map with the ground truth, float64 [4, 4].
+    """
     store = assemble_map(record.chunks)
     if not store.count:
         return None
-    return top_view(
-        transform_gaussians(store.params[:, : store.count], T_world_map).astype(np.float32), path_m
-    )
+    return transform_gaussians(store.params[:, : store.count], T_world_map).astype(np.float32)
 
 
 def previews(record: RunRecord, most: int) -> list[tuple[int, bytes]]:

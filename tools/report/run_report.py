@@ -12,7 +12,13 @@ from beamsplat.common.errors import UserError
 from beamsplat.common.geometry.transforms import inverse
 from beamsplat.tools.evaluation.drive import open_drive
 from beamsplat.tools.evaluation.evaluate import truth_depth_files
-from beamsplat.tools.report.map_scores import map_figures, previews, top_view_of_map, truth_folder
+from beamsplat.tools.report.map_scores import (
+    map_figures,
+    map_in_world,
+    previews,
+    top_view_of_map,
+    truth_folder,
+)
 from beamsplat.tools.report.observer import RunCosts, RunRecord
 from beamsplat.tools.report.scores import (
     GroundTruth,
@@ -64,6 +70,7 @@ def score_run(record: RunRecord, costs: RunCosts, truth: GroundTruth) -> dict[st
         "previews": previews(record, 4),
         "estimates": record.kept_estimates, "fused": record.kept_fused,
         "above": None if T_world_map is None else top_view_of_map(record, T_world_map, T_found[:, :2, 3]),
+        "map": None if T_world_map is None else map_in_world(record, T_world_map),
     }  # fmt: skip
     return row
 

@@ -1,4 +1,4 @@
-"""Draw line charts as SVG text, without a plotting library."""
+"""Draw line charts as SVG text, without a plotting library. Values are shown under the pointer."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 
 COLOURS = ("#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#ff7f0e", "#17becf", "#8c564b")
 _WIDTH, _HEIGHT, _EDGE = 560, 340, 46
+_MARKS = 80  # points of a curve that show their values under the pointer
 
 
 @dataclass(frozen=True)
@@ -48,7 +49,8 @@ def chart(title: str, x_label: str, y_label: str, curves: list[Curve], *, equal:
     ]
     out += _axes(low, low + room / scale, x_label, y_label)
     for number, curve in enumerate(curves):
-        out += _line(curve, at(curve.points))
+        xy = at(curve.points)
+        out += [*_line(curve, xy), *_marks(curve, xy, x_label, y_label)]
         y = 30 + 14 * number
         out.append(
             f'<line x1="{_WIDTH - 150}" y1="{y}" x2="{_WIDTH - 132}" y2="{y}" stroke="{curve.colour}"/>'
@@ -70,6 +72,17 @@ def _line(curve: Curve, xy: np.ndarray) -> list[str]:
         text = " ".join(f"{x:.1f},{y:.1f}" for x, y in thin)
         out.append(f'<polyline points="{text}" fill="none" stroke="{curve.colour}"{dash}/>')
     return out
+
+
+def _marks(curve: Curve, xy: np.ndarray, x_label: str, y_label: str) -> list[str]:
+    """Return invisible circles at some points of a curve, at xy [N, 2] px, whose titles are their values."""
+    good = np.flatnonzero(np.all(np.isfinite(xy), axis=1))
+    out = ['<g fill="none" pointer-events="all">']
+    for i in good[:: max(-(-len(good) // _MARKS), 1)]:
+        (x, y), (value_x, value_y) = xy[i], curve.points[i]
+        text = escape(f"{curve.name}: {x_label} {value_x:.4g}, {y_label} {value_y:.4g}")
+        out.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="4"><title>{text}</title></circle>')
+    return [*out, "</g>"]
 
 
 def _axes(low: np.ndarray, high: np.ndarray, x_label: str, y_label: str) -> list[str]:

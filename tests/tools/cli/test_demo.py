@@ -25,7 +25,7 @@ def drive(tmp_path_factory):
 
 def run(source, out, free_endpoint):
     demo(
-        out=out, data=source, seconds=8.0, rate=1.0, view="none",
+        out=out, data=source, seconds=8.0, rate=1.0, view="none", browser=False,
         set_=[f'router.listen=["{free_endpoint}"]', f'state_dir="{out / "state"}"', "monitor.grpc_port=0"],
     )  # fmt: skip
     return json.loads((out / "report.json").read_text())
