@@ -100,7 +100,17 @@ class MapServer:
 
     def robot(self, x_m, y_m, yaw_rad):
         """Publish the robot's pose."""
-        self.publish("robot", {"x_m": x_m, "y_m": y_m, "yaw_rad": yaw_rad, "source": "localization", "age_s": 0.0, "scan_cm": []})
+        self.publish(
+            "robot",
+            {
+                "x_m": x_m,
+                "y_m": y_m,
+                "yaw_rad": yaw_rad,
+                "source": "localization",
+                "age_s": 0.0,
+                "scan_cm": [],
+            },
+        )
 
     def index(self):
         """Return the index of the map."""

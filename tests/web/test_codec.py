@@ -25,7 +25,10 @@ def test_the_viewer_decodes_what_the_mapper_packs(tmp_path):
     records = np.fromfile(tmp_path / "records", np.uint32).reshape(500, 12)
     floats = records.view(np.float32)
     want = unpack(packed).astype(np.float64)
-    assert np.abs(floats[:, :3] - (T_map_anchor[:3, :3] @ want[MEAN:SCALE] + T_map_anchor[:3, 3:]).T).max() < 1e-5
+    assert (
+        np.abs(floats[:, :3] - (T_map_anchor[:3, :3] @ want[MEAN:SCALE] + T_map_anchor[:3, 3:]).T).max()
+        < 1e-5
+    )
     R = T_map_anchor[:3, :3] @ Rotation.from_quat(np.roll(want[QUAT:OPACITY], -1, axis=0).T).as_matrix()
     scale = np.exp(want[SCALE:QUAT]).T
     covariance = np.einsum("nij,nj,nkj->nik", R, scale**2, R)

@@ -19,7 +19,7 @@ import css from "./style.css";
 /** @typedef {import("./pinhole.js").Point} Point */
 
 const BUDGET = { desk: 300_000, phone: 100_000 }; // Gaussians
-const DISTANCE = 0.75, PITCH_RAD = -0.75; // of the view of the whole map: share of its diagonal
+const PITCH_RAD = -0.75; // of the view of the whole map
 const MOVED_M = 0.3; // of the viewpoint, after which the levels of detail are chosen again
 const ASSEMBLE_MS = 200; // between two uploads of changed Gaussians
 
@@ -147,7 +147,6 @@ export class Viewer {
 
   /** The camera of the keyframe that is compared. @returns {Pinhole | null} */
   _comparedPinhole() { return this.keyframes.compared && this.keyframes.pinhole(this.keyframes.compared); }
-
   /** Where the map is seen from. @returns {Point} */
   get _eye() { return this.keyframes.compared ? origin(this.keyframes.compared.T_map_camera) : this.navigation.eye; }
 
@@ -168,6 +167,9 @@ export class Viewer {
     if (this.store.index.size) this.store.choose(this._eye, this._camera().fx, this.budget);
   }
 
+  /** From where a map with this diagonal (m) fills the picture. @param {number} size */
+  _distanceOf(size) { return Math.max(size / Math.min(1, this.canvas.clientWidth / Math.max(this.canvas.clientHeight, 1)), 1); }
+
   /** Show the whole map. @param {boolean} [atOnce] */
   whole(atOnce = false) {
     const bounds = this.scene.bounds();
@@ -176,7 +178,7 @@ export class Viewer {
     const { low, high } = bounds, size = Math.hypot(high[0] - low[0], high[1] - low[1], high[2] - low[2]);
     this.framed = true;
     if (this.navigation.mode !== "fly") this.setMode("orbit");
-    this.navigation.goTo({ pivot: [(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, (low[2] + high[2]) / 2], distance: Math.max(DISTANCE * size, 1), pitch: PITCH_RAD }, atOnce);
+    this.navigation.goTo({ pivot: [(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, (low[2] + high[2]) / 2], distance: this._distanceOf(size), pitch: PITCH_RAD }, atOnce);
     this.scene.invalidate();
   }
 
@@ -232,7 +234,7 @@ export class Viewer {
       this.navigation.eyePitch = Math.asin(Math.max(-1, Math.min(1, last.T_map_camera[10])));
     }
     const extent = this.framed ? null : extentOf(index.chunks); // roughly as `whole` will, for the right levels of detail
-    if (extent) this.navigation.goTo({ pivot: extent.middle, distance: Math.max(DISTANCE * extent.size, 1), pitch: PITCH_RAD }, true);
+    if (extent) this.navigation.goTo({ pivot: extent.middle, distance: this._distanceOf(extent.size), pitch: PITCH_RAD }, true);
     this.panel.setKeyframes(index.camera ? index.keyframes.length : 0);
     this._drawKeyframes();
     this.choose();
@@ -291,7 +293,6 @@ export class Viewer {
   }
 
   compareNearest() { this.compare(this.keyframes.nearest(this._eye, this.navigation.forward)); }
-
   async save() { saveAs(await this.picture(), `beamsplat-${new Date().toISOString().slice(0, 19).replaceAll(":", "-")}.png`); }
 }
 
