@@ -85,7 +85,7 @@ class RecordingPublication:
     def __init__(self, topic, log):
         self.topic, self.log = topic, log
 
-    def put(self, message):
+    def put(self, message, backlog=0):
         self.log.append((self.topic, message.stamp_ns))
 
 
