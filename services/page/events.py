@@ -15,7 +15,7 @@ SCAN = "scan3d"  # the kind of event that only those streams receive that have a
 class EventSubscriber:
     """One open event stream: the connection of one page."""
 
-    wants_scan: bool = False  # receives the events `scan3d`
+    wants_scan: bool = False  # a viewer of the 3D map: receives the events `scan3d`
     waiting: dict[str, bytes] = field(default_factory=dict)
     dropped: int = 0  # events replaced by newer ones before they were sent
     _wake: asyncio.Event = field(default_factory=asyncio.Event)

@@ -48,7 +48,8 @@ class RobotView:
         if self.map3d.active and (now_s is None or now_s >= self._next_map_s):
             if now_s is not None:
                 self._next_map_s = now_s + _MAP_S
-            self.map3d.want()  # as long as a page is open
+            if self.events.scan_wanted:  # by a viewer of the map, which need not ask for anything meanwhile
+                self.map3d.want()
             self.events.publish(
                 "map3d", {"producer": self.map3d.map.producer, "revision": self.map3d.map.revision}
             )

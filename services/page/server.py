@@ -2,7 +2,7 @@
 
 GET /                     the page; its parts are /page.js, /page.css ...
 GET /events               server-sent events: status, scale, path, robot, picture (there is a newer image),
-                          map3d (the map has changed); with ?scan=1 also scan3d
+                          map3d (the map has changed); with ?scan=1, for viewers of the map, also scan3d
 GET /picture/NAME         the newest image: camera, depth, render or map
 GET /status               the data of the status event, for scripts
 GET /map3d, /map3d/...    the 3D map: see `map3d.routes`; /view is a page for it alone, /viewer/... its parts

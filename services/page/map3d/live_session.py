@@ -1,7 +1,7 @@
 """The map of a running mapper, followed over a session of its own while somebody looks at it.
 
-Nothing is subscribed to, kept or merged before the first request, and `IDLE_S` after the last viewer has left
-the session is closed and the memory freed.
+Nothing is subscribed to, kept or merged before the first request. `IDLE_S` after the last request, if no
+viewer has an event stream open, the session is closed and the memory freed.
 """
 
 from __future__ import annotations

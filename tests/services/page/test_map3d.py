@@ -203,7 +203,7 @@ def test_changes_are_announced_and_arrive(endpoint, mapper, tmp_path):
     with LivePage(endpoint, tmp_path) as page:
         page.node.on_health(mapper.health())
         before = complete(page.address, mapper)
-        with urllib.request.urlopen(page.address + "events", timeout=120) as events:
+        with urllib.request.urlopen(page.address + "events?scan=1", timeout=120) as events:
             lines = iter(events.readline, b"")
             revision = next(data["revision"] for data in _data_of(lines, "map3d"))
             assert revision >= before["revision"]
@@ -252,7 +252,9 @@ def test_the_map_is_freed_when_nobody_looks_any_more(endpoint, mapper, tmp_path,
         page.node.on_health(mapper.health())
         index_of(page.address)
         wait_until(lambda: page.map3d.map.index())
-        wait_until(lambda: not page.map3d.active)
+        # The flat page alone does not keep the map.
+        with urllib.request.urlopen(page.address + "events", timeout=120):
+            wait_until(lambda: not page.map3d.active)
         assert page.map3d.map.index() == []
         complete(page.address, mapper)
 
