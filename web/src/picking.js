@@ -7,10 +7,10 @@ import { NEAR_M } from "./pinhole.js";
 const REACH = 3.4; // standard deviations at which alpha is below 1/255
 const ALPHA_MIN = 1 / 255;
 const MIN_VARIANCE = 1e-8; // (0.1 mm)^2: keeps covariances of flat Gaussians invertible
-const OPAQUE = 0.5; // the surface is where so much of the ray is left: its median depth
+const LEAST_ABSORBED = 0.2; // of a ray that meets a surface: between the Gaussians of a thin wall it is not all
 
 /**
- * Return the point where the ray is half absorbed, or null if it leaves the map before.
+ * Return the point where half of what the ray loses is lost (its median depth), or null if it meets next to nothing.
  * @param {Float32Array} records [>= count * WORDS] @param {number} count
  * @param {ArrayLike<number>} eye m @param {ArrayLike<number>} direction unit vector
  * @param {[number, number]} heights as in `DepthSorter.sort`
@@ -31,10 +31,12 @@ export function pick(records, count, eye, direction, [low, high]) {
     if (hit.alpha > ALPHA_MIN && hit.t > NEAR_M) hits.push(hit);
   }
   hits.sort((a, b) => a.t - b.t);
+  const absorbed = 1 - hits.reduce((rest, { alpha }) => rest * (1 - alpha), 1);
+  if (absorbed < LEAST_ABSORBED) return null;
   let left = 1;
   for (const { t, alpha } of hits) {
     left *= 1 - alpha;
-    if (left < OPAQUE) return [eye[0] + t * dx, eye[1] + t * dy, eye[2] + t * dz];
+    if (1 - left >= absorbed / 2) return [eye[0] + t * dx, eye[1] + t * dy, eye[2] + t * dz];
   }
   return null;
 }
