@@ -9,7 +9,11 @@ latched  late-joining subscribers receive the last message
 
 `history` marks `every` topics of parts that together form a state (tiles of a grid): late-joining subscribers
 receive the cached messages too, messages are handled in order of arrival (not merged with other topics by
-stamp), and a gap is not a loss, because the producer sends all parts again in turn.
+stamp), and a gap is not a loss, because the producer sends the parts again, at the latest before they leave
+the cache.
+
+`thinned` marks topics of which the bridge forwards fewer messages while the robot stands still
+(common/zenoh/thinning.py): for subscribers on the other host, a gap is not a loss.
 
 `uplink` marks the topics that the bridge forwards between a robot and its edge server
 (common/zenoh/bridge.py): "up" from the robot; "bulk" also from the robot, but large, on a separate link with
@@ -51,6 +55,7 @@ class Topic:
     # The producer sends each message again until it is acknowledged: a gap in the sequence is not a loss.
     resent_until_ack: bool = False
     history: bool = False
+    thinned: bool = False
 
     @property
     def gaps_are_filled(self) -> bool:
@@ -75,7 +80,7 @@ _ROWS = (
     Topic("lidar/scan",              m.Scan,          ("lidar", "ros2", "replay"), 10, "every", 400),
     Topic("camera/image",            m.Image,         ("camera", "ros2", "replay"), 10, "latest"),
     Topic("external/pose",           m.ExternalPose,  ("ros2", "replay"),       10, "every", 400),
-    Topic("localization/odometry",   m.Odometry,      ("localization",),        10, "every", 400, "up"),
+    Topic("localization/odometry", m.Odometry, ("localization",), 10, "every", 400, "up", thinned=True),
     Topic("localization/correction", m.Correction,    ("localization",),         0, "latched", 1, "up"),
     Topic("localization/anchors",    m.Anchors,       ("localization",),         0, "latched", 1, "up"),
     Topic("localization/movers",     m.MovingBeams,   ("localization",),        10, "every", 400),

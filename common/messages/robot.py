@@ -189,8 +189,9 @@ class Grid(Message):
 class GridTile(Message):
     """One square tile of the occupancy grid in the map frame (common/mapfiles/grid_tiles.py).
 
-    A producer sends the tiles that have changed, and the others again in turn, so that a subscriber that
-    joined late has all of them after some time. Tiles of another `map_uuid` or `since_ns` replace all.
+    A producer sends the tiles that have changed. A subscriber that joins late receives the others from the
+    publisher's cache: a tile is sent again before it leaves the cache. Tiles of another `map_uuid` or
+    `since_ns` replace all.
     """
 
     resolution_m: Positive

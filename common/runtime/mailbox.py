@@ -13,7 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from beamsplat.common.messages import InputHealth, Message
-from beamsplat.common.messages.header import Header
+from beamsplat.common.messages.header import Header, local_clock_id
 from beamsplat.common.messages.instances import ProcessId
 from beamsplat.common.runtime.accepted_producer import SILENCE_S, AcceptedProducer
 from beamsplat.common.runtime.node import Node, merged_topics, subscriptions
@@ -62,6 +62,7 @@ class InputCount:
     sequence: SequenceTracker = field(default_factory=lambda: SequenceTracker(None))
     arrival_ns: int = 0  # of the newest admitted message
     ended_by: str | None = None  # instance that ended the stream, or NO_PRODUCER
+    elsewhere: bool = False  # the newest message was published on another host
     ended_after: int = 0  # number of messages that this instance has sent in all
     queued_bytes: int = 0
 
@@ -80,6 +81,7 @@ class Mailbox:
         self._unmerged_queue: deque[Envelope] = deque()  # of all other `every` inputs
         self._most_bytes = {i.topic: i.queued_bytes for i in subscriptions(node)}
         self._clock_ns = clock_ns
+        self._clock_id = 0 if clock_ns is None else local_clock_id()  # 0 in the headers of lockstep
         self._heard_ns: dict[str, int] = {}  # instance of an accepted producer -> last arrival on any input
         self._refused_latched: dict[str, Envelope] = {}  # topic -> newest message of a process without proof
         self.counts = {name: InputCount() for name in self._deliveries}
@@ -116,6 +118,7 @@ class Mailbox:
             return False
         count.late += order == "late"
         count.arrival_ns = self._heard_ns[header.instance] = now_ns
+        count.elsewhere = header.clock_id != self._clock_id
         if header.instance != count.ended_by or header.sequence >= count.ended_after:
             count.ended_by = None
         return True
@@ -290,7 +293,9 @@ class Mailbox:
     def _health_of(self, name: str, count: InputCount) -> InputHealth:
         count.sequence.give_up(self._now_ns())
         gone, dropped = count.lost + count.sequence.lost, count.dropped
-        if TOPICS[name].gaps_are_filled:  # its producer sends these messages again
+        row = TOPICS[name]
+        # The producer sends these messages again, or the bridge has not forwarded them.
+        if row.gaps_are_filled or (row.thinned and count.elsewhere):
             gone, dropped = 0, dropped + gone
         return InputHealth(
             topic=name, received=count.received, dropped=min(dropped, _MAX_COUNT), lost=min(gone, _MAX_COUNT),

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 
 import zenoh
 
-from beamsplat.common.messages import Health
+from beamsplat.common.messages import Health, Odometry
 from beamsplat.common.messages.header import DecodeError
 from beamsplat.common.runtime.pacing import TokenBucket
 from beamsplat.common.runtime.rate_limited_log import RateLimitedLog
@@ -28,7 +28,9 @@ from beamsplat.common.zenoh.streams import (
     declare_subscription,
     decode_end_marker,
     decode_header,
+    decode_sample,
 )
+from beamsplat.common.zenoh.thinning import PoseThinning
 
 log = logging.getLogger(__name__)
 
@@ -112,35 +114,49 @@ class Bridge:
             priority=zenoh.Priority.DATA_LOW if large else zenoh.Priority.INTERACTIVE_HIGH,
         )  # fmt: skip
 
-        def send(sample: zenoh.Sample) -> None:
+        thinning = PoseThinning() if row.thinned else None
+        skipped: list[zenoh.Sample] = []  # the newest message, if it was not forwarded
+
+        def send(sample: zenoh.Sample) -> bool:
             header = decode_header(sample, row)
+            skipped.clear()
+            ended = row.name in self._ends  # what is still in transit then is needed
+            if thinning is not None and not (thinning.is_due(_pose_in(sample, row)) or ended):
+                skipped.append(sample)
+                return False
             _put(publisher, sample)
             ended_by, sent = self._ends.get(row.name, ("", 0))
             if ended_by and (header.instance != ended_by or header.sequence >= sent):
                 self._ends.pop(row.name, None)  # not a recovered message: a new process publishes
+            return True
 
         self._forward(source, row.name, row, send, row.name)
         end = replace(row, delivery="latched", cache=1)
         end_publisher = declare_publication(target, key(self._robot, "end", row.name), end)
 
-        def send_end(sample: zenoh.Sample) -> None:
+        def send_end(sample: zenoh.Sample) -> bool:
             header, sent = decode_end_marker(sample)
+            for last in skipped:  # subscribers wait for the last message before the end
+                _put(publisher, last)
+            skipped.clear()
             _put(end_publisher, sample)
             self._ends[row.name] = (header.instance, sent)
+            return True
 
         self._forward(source, f"end/{row.name}", end, send_end, None)
 
     def _forward_health(self, source: zenoh.Session, target: zenoh.Session) -> None:
         bucket = TokenBucket(_HEALTH_MAX_HZ)
 
-        def send(sample: zenoh.Sample) -> None:
+        def send(sample: zenoh.Sample) -> bool:
             decode_header(sample, _HEALTH_ROW)
             if not bucket.take():
                 self.health_dropped += 1
-                return
+                return False
             target.put(
                 sample.key_expr, sample.payload, encoding=sample.encoding, attachment=sample.attachment
             )
+            return True
 
         self._forward(source, f"{HEALTH}/*", _HEALTH_ROW, send, HEALTH)
 
@@ -149,7 +165,7 @@ class Bridge:
         source: zenoh.Session,
         topic_key: str,
         row: Topic,
-        send: Callable[[zenoh.Sample], None],
+        send: Callable[[zenoh.Sample], bool],  # returns whether it has forwarded the sample
         count_as: str | None,
     ) -> None:
         channel: zenoh.handlers.FifoChannel[zenoh.Sample] | zenoh.handlers.RingChannel[zenoh.Sample]
@@ -170,7 +186,7 @@ class Bridge:
 
         def forward(sample: zenoh.Sample) -> None:
             try:
-                send(sample)
+                forwarded = send(sample)
             except DecodeError as error:
                 self.undecodable += 1
                 if (more := self._undecodable_limit.due(topic_key)) is not None:
@@ -180,11 +196,18 @@ class Bridge:
                 self.interrupted += 1
                 log.info("a message on %s was not forwarded: %s", topic_key, error)
                 return
-            count.messages += 1
-            count.bytes += len(sample.payload)
+            count.messages += forwarded
+            count.bytes += len(sample.payload) if forwarded else 0
 
         # The subscriber is undeclared when its thread has ended.
         receive_in_thread(source, f"forward-{topic_key}", subscriber, forward, replaced.is_set)
+
+
+def _pose_in(sample: zenoh.Sample, row: Topic) -> Odometry:
+    """Return the message of a sample. Raises DecodeError if it does not decode."""
+    message = decode_sample(sample, row).message
+    assert isinstance(message, Odometry)  # the message type of thinned topics
+    return message
 
 
 def _put(publisher: zenoh.Publisher | zenoh.ext.AdvancedPublisher, sample: zenoh.Sample) -> None:

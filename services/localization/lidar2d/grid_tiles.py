@@ -7,12 +7,17 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from beamsplat.common.mapfiles.grid_tiles import TILE_CELLS, pack_tile
+from beamsplat.common.mapfiles.grid_tiles import TILE_CELLS, pack_tile, unpack_tile
 from beamsplat.services.localization.lidar2d.occupancy import CountGrid, TileSum, outline
 from beamsplat.services.localization.lidar2d.surfel_map import FrozenMap
 
 TILES_PER_UPDATE = 24  # drawn at most; the others follow in the next updates, the oldest change first
-_REPEATED_TILES = 4  # unchanged ones that are sent again with each update, for subscribers that joined late
+# A subscriber that joins late receives the newest 1024 tiles from the publisher's cache (common/topics.py).
+# An unchanged tile is sent again when so many others were sent after it: before it leaves the cache.
+_RESEND_AFTER = 512
+_REPEATED_TILES = 4  # of these, with each update
+_QUIET_UPDATES = 6  # without any change, one tile is sent in so many updates: what was lost is healed slowly
+_VISIBLE_PERCENT = 20  # of occupancy: less is not published before the end of the drive
 _CACHED_SUMS = 32  # tiles whose sums of the finished submaps are kept: 1.3 MB each
 _MOVED_CELLS = 0.4  # a submap is drawn again if a corner has moved by more, in cells of the grid
 
@@ -64,7 +69,11 @@ class GridTiles:
         self.resolution_m = resolution_m
         self.work = Work()
         self.published: dict[Place, bytes] = {}  # packed tiles that contain known cells
-        self._repeated: Place = (0, 0)  # the last tile that was sent again
+        self._sent: dict[
+            Place, int
+        ] = {}  # published tiles, and the number of tiles sent before; oldest first
+        self._sent_count = 0
+        self._quiet = 0  # updates in a row without a tile to send
         self._drawn: dict[int, _Drawn] = {}
         self._covering: dict[Place, set[int]] = {}
         self._growing: frozenset[Place] = frozenset()
@@ -85,19 +94,29 @@ class GridTiles:
         self._mark(content, 0.0 if exact else _MOVED_CELLS * self.resolution_m)
         changed: dict[Place, bytes] = {}
         while self._dirty:
-            changed |= self._draw(list(self._dirty)[:TILES_PER_UPDATE], content)
+            changed |= self._draw(list(self._dirty)[:TILES_PER_UPDATE], content, exact)
             if not exact:
                 break
         return changed
 
-    def repeated(self, changed: dict[Place, bytes]) -> list[tuple[Place, bytes]]:
-        """Return some tiles beside the changed ones to send again: those that follow on the last repeated."""
-        others = sorted(self.published.keys() - changed.keys())
-        later = [place for place in others if place > self._repeated]
-        chosen = [*later, *others][: min(_REPEATED_TILES, len(others))]
-        if chosen:
-            self._repeated = chosen[-1]
-        return [(place, self.published[place]) for place in chosen]
+    def to_send(self, changed: dict[Place, bytes]) -> dict[Place, bytes]:
+        """Return the packed tiles to send in an update: the changed ones, and few others again.
+
+        While nothing changes, that is one tile in `_QUIET_UPDATES` updates, if the map has up to
+        `_RESEND_AFTER` tiles.
+        """
+        others = [place for place in self._sent if place not in changed]  # the oldest first
+        aged = [p for p in others[:_REPEATED_TILES] if self._sent_count - self._sent[p] >= _RESEND_AFTER]
+        self._quiet = 0 if changed or aged else self._quiet + 1
+        if self._quiet == _QUIET_UPDATES:
+            self._quiet, aged = 0, others[:1]
+        out = changed | {place: self.published[place] for place in aged}
+        for place, packed in out.items():
+            self._sent.pop(place, None)
+            if packed:
+                self._sent[place] = self._sent_count
+            self._sent_count += 1
+        return out
 
     def _mark(self, content: MapContent, tolerance_m: float) -> None:
         """Find the tiles that must be drawn: where submaps are new, have changed, moved, or were removed."""
@@ -136,8 +155,8 @@ class GridTiles:
         (x0, y0), (x1, y1) = np.floor(scaled.min(axis=0)).astype(int), np.ceil(scaled.max(axis=0)).astype(int)
         return frozenset((row, column) for row in range(y0, y1) for column in range(x0, x1))
 
-    def _draw(self, places: list[Place], content: MapContent) -> dict[Place, bytes]:
-        """Draw tiles; return the packed ones that differ from what was published."""
+    def _draw(self, places: list[Place], content: MapContent, exact: bool) -> dict[Place, bytes]:
+        """Draw tiles; return the packed ones that differ from the published: visibly, or (`exact`) at all."""
         self._add_finished(places)
         changed = {}
         for place in places:
@@ -147,9 +166,10 @@ class GridTiles:
                 total = total.copy()
             for grid, pose in content.growing:
                 self.work.cells += total.add(grid, grid.counts(), pose)
-            packed = pack_tile(total.occupancy())
+            cells, before = total.occupancy(), self.published.get(place, b"")
+            packed = pack_tile(cells)
             self.work.tiles += 1
-            if packed != self.published.get(place, b""):
+            if packed != before and (exact or _differs_visibly(cells, before)):
                 changed[place] = packed
                 self.published[place] = packed
                 if not packed:
@@ -179,6 +199,16 @@ class GridTiles:
                 total = self._sums[place]
                 self.work.cells += total.total.add(drawn.frozen, counts, drawn.pose_map_submap)
                 total.parts[id] = drawn
+
+
+def _differs_visibly(cells: np.ndarray, before: bytes) -> bool:
+    """Return whether a cell became known or unknown, or changed by `_VISIBLE_PERCENT`, since a packed tile.
+
+    At rest, scans that hit a wall or miss it by a hair change the counts for ever, but not the picture.
+    """
+    published = unpack_tile(before, TILE_CELLS).astype(np.int16)
+    change = np.abs(cells - published) >= _VISIBLE_PERCENT
+    return bool((change | ((cells < 0) != (published < 0))).any())
 
 
 def _moved_m(frozen: FrozenMap, before: np.ndarray, now: np.ndarray) -> float:

@@ -312,7 +312,7 @@ class LidarLocalization(Node):
         yield Job("grid", lambda: grid.update(content), after=after, of="lidar/scan")
 
     def on_job_grid(self, changed: dict[Place, bytes]) -> Outputs:
-        """Publish the changed tiles of the grid, and some of the others again."""
+        """Publish the changed tiles of the grid."""
         self._grid_running = False
         assert self._grid is not None  # it has drawn them
         yield from self._publish_grid(self._grid, changed)
@@ -321,8 +321,8 @@ class LidarLocalization(Node):
         assert self._slam is not None
         if self._grid_since_ns is None:
             self._grid_since_ns = self._stamp_ns
-        tiles = [*changed.items(), *grid.repeated(changed)]
-        for sent, ((row, column), packed) in enumerate(tiles, start=1):
+        tiles = grid.to_send(changed)
+        for sent, ((row, column), packed) in enumerate(tiles.items(), start=1):
             yield (
                 "localization/grid",
                 GridTile(

@@ -1,11 +1,16 @@
 """The bridge between a robot's router and an edge server's: what the topic table marks crosses, the rest does not."""
 
 import contextlib
+import dataclasses
 
+import numpy as np
 import pytest
 
-from beamsplat.common.messages import Health
+from beamsplat.common.geometry.transforms import make_transform, so3_exp
+from beamsplat.common.messages import Health, Odometry
 from beamsplat.common.messages.header import Header
+from beamsplat.common.runtime.mailbox import Mailbox
+from beamsplat.common.runtime.node import Node
 from beamsplat.common.topics import TOPICS
 from beamsplat.common.zenoh.bridge import Bridge, BridgeSessions
 from beamsplat.common.zenoh.bus import Bus, open_router, open_session
@@ -18,6 +23,14 @@ SAMPLES = {type(m): m for m in sample_messages()}
 UP = {name for name, row in TOPICS.items() if row.uplink in ("up", "bulk")}
 DOWN = {name for name, row in TOPICS.items() if row.uplink == "down"}
 AT_ROBOT, AT_EDGE = "aa" * 8, "bb" * 8  # instances of the producers of the two sides
+
+
+class _EdgePage(Node):
+    name = "page"
+    inputs = ("localization/odometry",)
+
+    def on_localization_odometry(self, message):
+        return iter(())
 
 
 class Side:
@@ -140,6 +153,50 @@ def test_another_robots_topics_do_not_cross(sides):
     wait_until(own_crossed)
     assert received == []
     kept.undeclare()
+
+
+def pose(number, x_m=0.0, yaw_rad=0.0, status="ok"):
+    """Return the pose number `number` of a stream at 10 Hz."""
+    T = make_transform(so3_exp([0.0, 0.0, yaw_rad]), np.array([x_m, 0.0, 0.0]))
+    return Odometry(stamp_ns=10**18 + number * 10**8, T_odom_body=T, covariance=np.eye(3), status=status)
+
+
+def test_of_a_robot_that_stands_still_one_pose_per_second_crosses(sides):
+    robot, edge, bridge, _ = sides
+    row = TOPICS["localization/odometry"]
+    now_ns, stamps = [1], []
+    mailbox = Mailbox(_EdgePage, lambda: now_ns[0])
+
+    def take(sample):
+        envelope = decode_sample(sample, row)
+        # Here the clocks of both sides are the same: the header of a robot has another one.
+        header = dataclasses.replace(envelope.header, clock_id=1)
+        mailbox.put(dataclasses.replace(envelope, header=header))
+        stamps.append((envelope.message.stamp_ns - 10**18) // 10**8)
+
+    _kept = declare_subscription(edge.open(), f"beamsplat/r1/{row.name}", row, "every", take)
+    publication = robot.publications[row.name]
+    wait_until(lambda: publication.put(pose(0, status="lost")) and stamps)
+    stamps.clear()
+    noise = np.random.default_rng(1).normal(0.0, 0.001, (60, 2))
+    for number in range(1, 61):  # six seconds at rest
+        publication.put(pose(number, *noise[number - 1]))
+    for number in range(61, 81):  # then two seconds at 0.3 m/s
+        publication.put(pose(number, 0.03 * (number - 60)))
+    wait_until(lambda: 80 in stamps)
+    for number in range(81, 84):
+        publication.put(pose(number, 0.6))
+    robot.bus.end(publication)
+    wait_until(lambda: row.name in bridge.ended)
+    wait_until(lambda: 83 in stamps)  # the last one before the end crosses in any case
+    expected = [1, 11, 21, 31, 41, 51, *range(61, 81)]
+    assert stamps[: len(expected)] == expected
+    at_rest_bytes_per_s = bridge.forwarded[row.name].bytes / bridge.forwarded[row.name].messages
+    assert at_rest_bytes_per_s < 1000
+    now_ns[0] += 60 * 10**9  # what is missing does not count as lost later either
+    (health,) = mailbox.health()
+    assert health.lost == 0
+    assert health.dropped > 50
 
 
 def test_garbage_neither_crosses_nor_ends_a_topic(sides):

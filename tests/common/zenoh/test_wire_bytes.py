@@ -7,7 +7,9 @@ from beamsplat.common.messages import codec as message_codec
 from beamsplat.common.messages.codec import encode, kept_payload
 from beamsplat.common.messages.depth_codec import pack_depth, pack_sigma, unpack_depth
 from beamsplat.common.runtime.node import Input
+from beamsplat.common.topics import topic
 from beamsplat.common.zenoh.bus import key
+from beamsplat.common.zenoh.streams import declare_subscription, decode_sample
 from tests.common.polling import wait_until
 from tests.common.samples import sample_messages
 
@@ -24,18 +26,17 @@ def room():
 
 
 class Received:
-    """Envelopes and raw samples of one topic."""
+    """Raw samples of one topic."""
 
     def __init__(self, bus, robot, name):
-        self.envelopes, self.faults, self.samples = [], [], []
-        bus.subscribe(
-            Input(name, "every"), self.envelopes.append, lambda *f: self.faults.append(f), lambda *_: None
+        self.samples, self._row = [], topic(name)
+        self._kept = declare_subscription(
+            bus.session, key(robot, name), self._row, "every", self.samples.append
         )
-        self._kept = bus.session.declare_subscriber(key(robot, name), self.samples.append)
 
-    def wait(self, count=1):
-        wait_until(lambda: self.faults or (len(self.envelopes) >= count and len(self.samples) >= count))
-        assert self.faults == []
+    @property
+    def envelopes(self):
+        return [decode_sample(sample, self._row) for sample in self.samples]
 
 
 def received(make_bus, robot, name, messages, backlog=0):
@@ -46,7 +47,7 @@ def received(make_bus, robot, name, messages, backlog=0):
     producer.wait_for_subscribers((name,), 5.0)
     for message in messages:
         publication.put(message, backlog)
-    heard.wait(len(messages))
+    wait_until(lambda: len(heard.samples) == len(messages))
     return heard
 
 
@@ -70,12 +71,13 @@ def test_a_keyframe_passes_on_the_bytes_of_fusion_and_is_encoded_once(make_bus, 
     queued = encode(keyframe, keep=True)  # as the outbox does, before it is published
     heard = received(make_bus, robot, "keyframes/frame", [keyframe, keyframe], backlog=7)
     assert encoded == [Keyframe]
-    for envelope in heard.envelopes:
+    envelopes = heard.envelopes
+    for envelope in envelopes:
         assert envelope.header.backlog == 7
         assert kept_payload(envelope.message) == queued  # what a session stores, and a recorder writes
         assert encode(envelope.message) == queued
     assert encoded == [Keyframe]
-    again = heard.envelopes[0].message
+    again = envelopes[0].message
     np.testing.assert_array_equal(again.depth, pack_depth(depth))
     np.testing.assert_array_equal(again.sigma, pack_sigma(0.02 * depth))
     assert np.abs(unpack_depth(again.depth, depth.shape) - depth).max() <= 0.000501

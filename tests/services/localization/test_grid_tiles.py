@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from beamsplat.common.mapfiles.grid_tiles import TILE_CELLS, GridSource, TiledGrid
+from beamsplat.common.topics import topic
 from beamsplat.services.localization.lidar2d import grid_tiles
 from beamsplat.services.localization.lidar2d.grid_tiles import GridTiles, MapContent
 from beamsplat.services.localization.lidar2d.occupancy import CountGrid, render_occupancy
@@ -117,6 +118,57 @@ def test_a_loop_closure_is_drawn_in_bounded_portions_the_oldest_change_first(mon
     np.testing.assert_array_equal(assembled(tiles.published, expected), expected.values)
 
 
+def sent_tiles(tiles, content, updates):
+    """Return the numbers of tiles sent in the updates, and all packed tiles in order."""
+    counts, sent = [], []
+    for _ in range(updates):
+        update = tiles.to_send(tiles.update(content))
+        counts.append(len(update))
+        sent += update.items()
+    return counts, sent
+
+
+def test_at_rest_one_tile_in_half_a_minute_is_sent():
+    tiles = GridTiles(RESOLUTION_M)
+    counts, sent = sent_tiles(tiles, corridor(6), 4)
+    assert set(dict(sent)) == set(tiles.published)
+    assert counts[1:] == [0, 0, 0]
+    counts, sent = sent_tiles(tiles, corridor(6), 60)  # five minutes
+    assert sum(counts) == 10
+    assert dict(sent).items() <= tiles.published.items()
+    assert len(dict(sent)) == len(tiles.published)  # each in its turn: what was lost is healed
+
+
+def test_a_tile_is_sent_again_before_it_leaves_the_cache(monkeypatch):
+    monkeypatch.setattr(grid_tiles, "_RESEND_AFTER", 20)
+    tiles, sent, first = GridTiles(RESOLUTION_M), [], corridor(2)
+    sent_tiles(tiles, first, 1)
+    old = set(tiles.published)
+    for count in range(3, 60):
+        _, more = sent_tiles(tiles, corridor(count), 1)
+        sent += more
+        assert old <= {place for place, _ in sent[-200:]} or len(sent) < 40
+    assert len(sent) > 300
+    assert dict(sent[-200:]) == tiles.published
+
+
+def test_noise_on_counts_is_not_published_before_the_end():
+    tiles, growing = GridTiles(RESOLUTION_M), ROOMS[0]
+    content = MapContent([], [(growing, np.zeros(3))])
+    tiles.update(content)
+    hits = growing.hits.copy()
+    hits[hits > 0] += 1  # a further scan of the same walls, at rest
+    misses = np.where(growing.misses >= 8, growing.misses + 1, growing.misses).astype(np.uint8)
+    again = MapContent([], [(dataclasses.replace(growing, hits=hits, misses=misses), np.zeros(3))])
+    assert tiles.update(again) == {}
+    exact = tiles.update(again, exact=True)
+    np.testing.assert_array_equal(assembled(tiles.published, whole_grid(again)), whole_grid(again).values)
+    assert exact.keys() <= tiles.published.keys()
+    hits[100:110, 100] = 40  # an obstacle
+    seen = MapContent([], [(dataclasses.replace(growing, hits=hits, misses=misses), np.zeros(3))])
+    assert len(tiles.update(seen)) == 1
+
+
 @pytest.mark.parametrize("count", [1, 3])
 def test_bands_of_a_large_grid_fit_together(monkeypatch, count):
     content = corridor(count)
@@ -143,7 +195,8 @@ def test_a_subscriber_of_the_node_has_the_map_at_the_end_also_if_it_joined_late(
     sizes = np.diff([-1, *updates])
     assert [m.remaining for m in messages] == [left for n in sizes for left in range(n - 1, -1, -1)]
     whole = node._slam.grid(RESOLUTION_M)
-    for heard in (messages, messages[len(messages) // 2 :]):
+    cached = messages[-topic("localization/grid").cache :]  # what a subscriber that joins at the end receives
+    for heard in (messages, cached):
         np.testing.assert_array_equal(assembled(received(heard).tiles, whole), whole.values)
     assert (whole.values >= 65).sum() > 300  # walls
     again, _ = drive(make(grid_every_scans=10), 0.0, 2.0, 2, 1)  # a restarted process with another map
