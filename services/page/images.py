@@ -90,7 +90,8 @@ def encode_camera_image(
     """
     if encoding == "jpeg" and size_px[0] <= widest_px:
         return EncodedImage(data.tobytes(), "image/jpeg", {})
-    return _jpeg(_shrink(decode_rgb(data, encoding, *size_px, step_bytes)[..., ::-1], widest_px))
+    rgb = decode_rgb(data, encoding, *size_px, step_bytes, least_width_px=widest_px)
+    return _jpeg(_shrink(rgb[..., ::-1], widest_px))
 
 
 def encode_depth(

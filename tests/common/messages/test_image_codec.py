@@ -31,6 +31,21 @@ def test_grey_and_png():
 
 
 @pytest.mark.parametrize(
+    ("least_width_px", "size"),
+    [(None, (250, 161)), (126, (250, 161)), (125, (125, 81)), (40, (63, 41)), (9, (32, 21))],
+)
+def test_a_jpeg_is_decoded_at_the_smallest_sufficient_size(least_width_px, size):
+    ramp = np.linspace(0, 255, 250)[None, :, None] * np.ones((161, 1, 3)) * np.array([1.0, 0.5, 0.0])
+    jpeg = cv2.imencode(".jpg", ramp[..., ::-1].astype(np.uint8))[1].reshape(-1)
+    decoded = decode_rgb(jpeg, "jpeg", 250, 161, least_width_px=least_width_px)
+    assert decoded.shape == (*size[::-1], 3)
+    expected = cv2.resize(ramp, size, interpolation=cv2.INTER_AREA)
+    assert np.abs(decoded - expected).mean() < 3.0
+    png = cv2.imencode(".png", RGB[..., ::-1])[1].reshape(-1)
+    assert decode_rgb(png, "png", 8, 6, least_width_px=1).shape == (6, 8, 3)  # PNG has no smaller sizes
+
+
+@pytest.mark.parametrize(
     ("data", "encoding", "message"),
     [
         (np.zeros(0, np.uint8), "jpeg", "0 bytes do not decode"),
