@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 
 from beamsplat.common.errors import UserError
+from beamsplat.common.onnx_model import OnnxModel, to_hw
 from beamsplat.services.depth.model_files import find_model
-from beamsplat.services.depth.onnx_model import OnnxModel, to_hw
 from beamsplat.services.depth.source import DepthInput, Estimate, Kind, check_depth_map
 
 PATCH = 14  # px, side of a vision transformer patch

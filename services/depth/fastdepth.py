@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 
 from beamsplat.common.geometry.camera import Pinhole
+from beamsplat.common.onnx_model import OnnxModel, to_hw
 from beamsplat.services.depth.model_files import find_model
-from beamsplat.services.depth.onnx_model import OnnxModel, to_hw
 from beamsplat.services.depth.source import DepthInput, Estimate, check_depth_map
 
 _FX_PER_WIDTH = 0.889  # of the NYU-v2 training crops

@@ -154,7 +154,7 @@ def describe_model_file(file: Path, table: dict[str, ModelEntry]) -> dict[str, o
     Raises:
         UserError: the file is missing, or ONNX Runtime cannot run its graph here.
     """
-    from beamsplat.services.depth.onnx_model import OnnxModel
+    from beamsplat.common.onnx_model import OnnxModel
 
     path = find_model(file)
     model = OnnxModel(path)

@@ -16,9 +16,9 @@ import numpy as np
 
 from beamsplat.common.errors import UserError
 from beamsplat.common.geometry.camera import Pinhole
+from beamsplat.common.onnx_model import OnnxModel
 from beamsplat.services.depth.depth_anything import PATCH, normalize_image
 from beamsplat.services.depth.model_files import find_model
-from beamsplat.services.depth.onnx_model import OnnxModel
 from beamsplat.services.depth.source import DepthInput, Estimate, check_depth_map
 
 

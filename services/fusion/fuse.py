@@ -11,6 +11,7 @@ from beamsplat.common.geometry.beams import NO_BEAMS, project_beams
 from beamsplat.common.geometry.camera import Pinhole
 from beamsplat.common.geometry.depth_sigma import BETWEEN_KEYFRAMES, OF_KEYFRAMES, stated_sigma_log
 from beamsplat.services.fusion import upsample
+from beamsplat.services.fusion.aggregation import Aggregation
 from beamsplat.services.fusion.input_checks import ImageCheck, check_beams
 from beamsplat.services.fusion.inputs import FusionInput, PlaneSweepConfig, SweepResult
 from beamsplat.services.fusion.keyframe_depth import WarpedDepth
@@ -32,6 +33,7 @@ _SAME_SURFACE = 0.08  # log depth: neighbours that differ by less belong to one 
 _EDGE = 0.4  # share of a depth jump nearby that is added to sigma: the side of the edge is uncertain
 _EDGE_REACH = (3, 5)  # rows, columns of the working size
 _SIGMA_BLUR_PX = 3.0  # of the working size: Gaussian over which sigma is averaged
+_LEARNED_FLOOR, _LEARNED_BEAM = 0.05, 0.10  # spread below which the learned aggregation is on that surface
 _CONTRADICTION = 0.25  # log depth: a beam that differs by more contradicts the warped depth
 _LEAST_KNOWN = 20  # beams with warped depth, below which they are not compared
 _LEAST_INLIERS = 0.3  # share of the beams that fit the result, below which it is rejected
@@ -42,10 +44,13 @@ class Fusion:
 
     def __init__(
         self, camera: Pinhole, T_body_camera: np.ndarray, *, floor_known: bool, planar: bool,
-        config: PlaneSweepConfig | None = None,
+        config: PlaneSweepConfig | None = None, aggregation: Aggregation | None = None,
     ) -> None:  # fmt: skip
         """Prepare fusion for one camera; arguments as in `PlaneSweep`."""
-        self._sweep = PlaneSweep(camera, T_body_camera, floor_known=floor_known, planar=planar, config=config)
+        self._sweep = PlaneSweep(
+            camera, T_body_camera, floor_known=floor_known, planar=planar, config=config,
+            aggregation=aggregation,
+        )  # fmt: skip
         self._planar = planar
         self._image_check = ImageCheck()
 
@@ -141,9 +146,13 @@ class Fusion:
             floor = swept.snapped & (np.abs(np.log(surfaces.floor / swept.depth_m)) < 0.01)
             beam = swept.snapped & (surfaces.wall_offset_m < _BEAM_HEIGHT_M)
         config = self._sweep.config
-        base = np.where(swept.snapped, _SURFACE, config.matched)
+        learned = self._sweep.aggregation.states_whole_error
+        if learned:  # near another surface by chance, its spread stays large
+            floor &= swept.spread < _LEARNED_FLOOR
+            beam &= swept.spread < _LEARNED_BEAM
+        base = np.where(swept.snapped | learned, _SURFACE, config.matched)
         base = np.where(floor, _FLOOR, np.where(beam, _BEAM + _BETWEEN_BEAMS_M / swept.depth_m, base))
-        doubt = np.where(floor | beam, 0.0, config.per_spread * swept.spread)
+        doubt = np.where(floor | beam, 0.0, (1.0 if learned else config.per_spread) * swept.spread)
         return np.hypot(base, doubt).astype(np.float32)
 
     def _pin_to_beams(self, swept: SweepResult, sigma_log: np.ndarray, surfaces: CandidateSurfaces) -> None:
@@ -179,7 +188,8 @@ class Fusion:
         h, w = self._sweep.working_camera.shape
         depth = np.empty(self._sweep.camera.shape, np.float32)
         sigma = np.empty_like(depth)
-        sigma_log = self._inflate_at_edges(swept.depth_m, sigma_log)
+        if not (keyframe and self._sweep.aggregation.states_whole_error):
+            sigma_log = self._inflate_at_edges(swept.depth_m, sigma_log)
         known = np.where(self._known_mask(swept.depth_m, sigma_log), swept.depth_m, np.nan).astype(np.float32)
         sigma_log = stated_sigma_log(sigma_log, OF_KEYFRAMES if keyframe else BETWEEN_KEYFRAMES)
         colour = cv2.resize(frame.image_rgb, (w, h), interpolation=cv2.INTER_AREA)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections import deque
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 import cv2
@@ -35,6 +36,11 @@ from beamsplat.common.messages import (
 from beamsplat.common.messages.header import Header
 from beamsplat.common.messages.image_codec import decode_rgb
 from beamsplat.common.runtime.node import Input, Job, Node, Outputs
+from beamsplat.services.fusion.aggregation_choice import (
+    AggregationName,
+    check_aggregation,
+    make_aggregation,
+)
 from beamsplat.services.fusion.calibration.startup_check import CalibrationHealth, StartupCheck
 from beamsplat.services.fusion.fuse import Fusion
 from beamsplat.services.fusion.inputs import FusionInput
@@ -57,6 +63,9 @@ class FusionConfig(NodeConfig):
     floor_known: Remote[bool] = True  # the camera height in the calibration is reliable
     planar: Remote[bool] = True  # the body stays level on a floor
     cloud_every_px: Remote[int] = 4  # pixels per point of the cloud, in each direction
+    # Of the plane sweep (method `field`). sgm: semi-global matching; learned: a network.
+    aggregation: Remote[AggregationName] = "sgm"
+    aggregation_weights: Path | None = None  # for "learned": a file of `beamsplat train aggregator`
     check_pairs: Remote[int] = Field(60, ge=0)  # image pairs for the check of the calibration; 0 = none
 
 
@@ -101,6 +110,13 @@ class FusionNode(Node):
         self._localizer = ""  # instance of the localization process
         self.calibration: CalibrationHealth | None = None
         self.overtaken = 0
+        c = self.config
+        self._aggregation = make_aggregation(c.aggregation, c.aggregation_weights, c.method)
+
+    def check_resources(self) -> None:
+        """Check the options of the aggregation, and that its weights file exists."""
+        c = self.config
+        check_aggregation(c.aggregation, c.aggregation_weights, c.method)
 
     def on_header(self, header: Header) -> None:
         """Reset if the header is from another localization process, which has another odom frame."""
@@ -130,7 +146,7 @@ class FusionNode(Node):
             return iter(())
         self._fusion = Fusion(
             self._undistort.pinhole, camera.T_body_camera, floor_known=self.config.floor_known,
-            planar=self.config.planar,
+            planar=self.config.planar, aggregation=self._aggregation,
         )  # fmt: skip
         assert rig.lidar is not None  # checked above
         self._check = StartupCheck(

@@ -9,6 +9,7 @@ from lidar localization (plane sweep: Collins 1996; aggregation: semi-global mat
 from __future__ import annotations
 
 from collections import deque
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -17,6 +18,7 @@ from beamsplat.common.geometry.beams import project_beams
 from beamsplat.common.geometry.camera import Pinhole
 from beamsplat.common.geometry.transforms import inverse
 from beamsplat.services.fusion import volume_kernels as kernels
+from beamsplat.services.fusion.aggregation import Aggregation, SemiGlobalMatching, SweepEvidence
 from beamsplat.services.fusion.inputs import (
     FusionInput,
     PlaneSweepConfig,
@@ -25,10 +27,11 @@ from beamsplat.services.fusion.inputs import (
     features,
 )
 from beamsplat.services.fusion.keyframe_depth import KeyframeDepths, WarpedDepth
+from beamsplat.services.fusion.learned_kernels import quantised_cost
 from beamsplat.services.fusion.lidar_map import LidarMap
 from beamsplat.services.fusion.metric_estimate import MetricEstimate, metric_estimate
 from beamsplat.services.fusion.relative_pose import detect_corners, refine_from_images
-from beamsplat.services.fusion.surfaces import CandidateSurfaces, CeilingDetector, SurfacePredictor
+from beamsplat.services.fusion.surfaces import CandidateSurfaces, CeilingDetector, SurfacePredictor, snap
 
 _TILTED_WALL_M = 0.05  # snapping distance to extruded beams of a hand-held lidar: its walls are tilted
 
@@ -38,7 +41,7 @@ class PlaneSweep:
 
     def __init__(
         self, camera: Pinhole, T_body_camera: np.ndarray, *, floor_known: bool, planar: bool,
-        config: PlaneSweepConfig | None = None,
+        config: PlaneSweepConfig | None = None, aggregation: Aggregation | None = None,
     ) -> None:  # fmt: skip
         """Prepare the sweep for one camera.
 
@@ -47,14 +50,23 @@ class PlaneSweep:
             T_body_camera: float64 [4, 4].
             floor_known: the camera height in `T_body_camera` is reliable.
             planar: the body stays level on a floor.
-            config: None = the defaults if `planar`, else `PlaneSweepConfig.in_hand()`.
+            config: None = the defaults if `planar`, else `PlaneSweepConfig.in_hand()`, with the number of
+                labels that `aggregation` requires.
+            aggregation: None = semi-global matching.
 
         Raises:
-            ValueError: `camera` has distortion.
+            ValueError: `camera` has distortion, or `aggregation` requires another number of labels.
         """
         if camera.is_distorted:
             raise ValueError("fusion needs undistorted images: pass Pinhole.undistorted()")
-        self.config = config or (PlaneSweepConfig() if planar else PlaneSweepConfig.in_hand())
+        self.aggregation: Aggregation = aggregation or SemiGlobalMatching()
+        labels = self.aggregation.labels
+        if config is None:
+            config = PlaneSweepConfig() if planar else PlaneSweepConfig.in_hand()
+            config = config if labels is None else replace(config, labels=labels)
+        if labels not in (None, config.labels):
+            raise ValueError(f"the aggregation requires {labels} labels, not {config.labels}")
+        self.config = config
         self.camera = camera
         self.T_body_camera = T_body_camera
         width = self.config.width_px
@@ -75,6 +87,7 @@ class PlaneSweep:
         )
         limit = np.where(np.isfinite(self._predictor.floor), self._predictor.floor * 1.08, np.inf)
         self._z_last = np.maximum(limit, 1.1 * self.config.z_near_m).astype(np.float32)
+        self._rise = self._predictor.ray_z if planar else np.zeros_like(self._predictor.ray_z)
 
     def add_scan(self, points_map_m: np.ndarray) -> None:
         """Add the returns float64 [N, 3] of a scan, in the map frame, to the lidar map (only if `planar`)."""
@@ -129,11 +142,19 @@ class PlaneSweep:
             self._find_ceilings(cost, surfaces.background_wall)
         # Candidate surfaces as priors.
         surfaces = self.surfaces(frame)
+        matching_cost = quantised_cost(cost) if self.aggregation.uses_matching_cost else None
         np.minimum(cost, self.config.cost_cap, out=cost)
         warped = warped or self.warp_into(working)
-        self._add_priors(cost, frame, surfaces, warped if len(self._keyframe_depths) else None)
-        # Semi-global matching.
-        swept = self._solve(cost, working, surfaces, views)
+        known = warped if len(self._keyframe_depths) else None
+        estimate = self.metric_estimate_of(frame)
+        self._add_priors(cost, estimate, surfaces, known)
+        # Aggregation: depth per pixel.
+        h, w = self.working_camera.shape
+        evidence = SweepEvidence(
+            cost, matching_cost, self._log_z, working, frame.image_rgb, surfaces, known,
+            None if estimate is None else estimate.at_size(w, h), self._trust(estimate), self._rise, views,
+        )  # fmt: skip
+        swept = self._solve(evidence)
         certain = swept.spread < self.config.keyframe_max_spread
         self._keyframe_depths.add(working.T_map_camera, np.where(certain, swept.depth_m, np.nan))
         return (
@@ -213,7 +234,7 @@ class PlaneSweep:
     def _add_priors(
         self,
         cost: np.ndarray,
-        frame: FusionInput,
+        estimate: MetricEstimate | None,
         surfaces: CandidateSurfaces,
         warped: WarpedDepth | None,
     ) -> None:
@@ -234,13 +255,17 @@ class PlaneSweep:
             self._add_prior(cost, ceiling, c.ceiling)
         if warped is not None:
             self._add_prior(cost, warped.depth_m, c.keyframe_depth * np.minimum(warped.votes, 3) / 3.0)
-        estimate = self.metric_estimate_of(frame)
         if estimate is not None:
-            trust = float(np.exp(-((estimate.spread / c.estimate_spread) ** 2)))
             h, w = self.working_camera.shape
-            self._add_prior(cost, estimate.at_size(w, h), c.estimate * trust, width=4.0)
+            self._add_prior(cost, estimate.at_size(w, h), c.estimate * self._trust(estimate), width=4.0)
         unlikely = c.near * np.maximum(np.log(c.near_m) - self._log_z, 0.0)
         cost += unlikely.astype(np.float32)
+
+    def _trust(self, estimate: MetricEstimate | None) -> float:
+        """Return the weight of the depth source's estimate in [0, 1], by its agreement with the beams."""
+        if estimate is None:
+            return 0.0
+        return float(np.exp(-((estimate.spread / self.config.estimate_spread) ** 2)))
 
     def metric_estimate_of(self, frame: FusionInput) -> MetricEstimate | None:
         """Return the depth estimate scaled to metres by the beams; None without estimate or beams."""
@@ -257,38 +282,9 @@ class PlaneSweep:
         z32 = np.asarray(z, dtype=np.float32)
         kernels.add_prior(cost, z32, np.ascontiguousarray(weights), self._log_z[0], step, width)
 
-    def _solve(
-        self, cost: np.ndarray, working: WorkingImage, surfaces: CandidateSurfaces, views: int
-    ) -> SweepResult:
-        c = self.config
-        total = np.zeros_like(cost)
-        for dv, du in ((0, 1), (0, -1), (1, 0), (-1, 0)):
-            kernels.aggregate(cost, working.grey, dv, du, c.p1, c.p2, c.edge_grey, total)
-        depth = np.empty(cost.shape[:2], np.float32)
-        spread = np.empty_like(depth)
-        kernels.winner_takes_all(total, self._log_z, c.temperature, depth, spread)
+    def _solve(self, evidence: SweepEvidence) -> SweepResult:
+        depth, spread = self.aggregation.solve(evidence, self.config)
         wall_reach_m = np.inf if self._planar else _TILTED_WALL_M
-        snapped = snap(depth, surfaces, 1.2 * (self._log_z[1] - self._log_z[0]), wall_reach_m)
-        return SweepResult(depth, spread, snapped, views)
-
-
-def snap(depth: np.ndarray, surfaces: CandidateSurfaces, tolerance: float, wall_reach_m: float) -> np.ndarray:
-    """Set depth [h, w] (m), in place, to the nearest candidate surface; return bool [h, w]: where set.
-
-    A surface is accepted if it differs by less than `tolerance` in log depth; extruded walls only up to
-    `wall_reach_m` above and below the lidar plane.
-    """
-    wall = np.where(surfaces.on_floor | ~(surfaces.wall_offset_m < wall_reach_m), np.nan, surfaces.wall)
-    best = np.full(depth.shape, tolerance)
-    result = depth.copy()
-    background_wall = (
-        np.where(surfaces.on_floor, np.nan, surfaces.background_wall) if np.isinf(wall_reach_m) else wall
-    )
-    for surface in (wall, background_wall, surfaces.floor, *surfaces.occluded_walls, *surfaces.ceilings):
-        with np.errstate(invalid="ignore"):
-            error = np.abs(np.log(surface / depth))
-            nearer = error < best
-        result[nearer] = surface[nearer]
-        best = np.where(nearer, error, best)
-    depth[:] = result
-    return best < tolerance
+        tolerance = 1.2 * (self._log_z[1] - self._log_z[0])
+        snapped = snap(depth, evidence.surfaces, tolerance, wall_reach_m)
+        return SweepResult(depth, spread, snapped, evidence.views)

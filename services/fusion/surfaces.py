@@ -45,6 +45,28 @@ class CandidateSurfaces:
             return np.isfinite(self.floor) & ~(self.wall < self.floor)
 
 
+def snap(depth: np.ndarray, surfaces: CandidateSurfaces, tolerance: float, wall_reach_m: float) -> np.ndarray:
+    """Set depth [h, w] (m), in place, to the nearest candidate surface; return bool [h, w]: where set.
+
+    A surface is accepted if it differs by less than `tolerance` in log depth; extruded walls only up to
+    `wall_reach_m` above and below the lidar plane.
+    """
+    wall = np.where(surfaces.on_floor | ~(surfaces.wall_offset_m < wall_reach_m), np.nan, surfaces.wall)
+    best = np.full(depth.shape, tolerance)
+    result = depth.copy()
+    background_wall = (
+        np.where(surfaces.on_floor, np.nan, surfaces.background_wall) if np.isinf(wall_reach_m) else wall
+    )
+    for surface in (wall, background_wall, surfaces.floor, *surfaces.occluded_walls, *surfaces.ceilings):
+        with np.errstate(invalid="ignore"):
+            error = np.abs(np.log(surface / depth))
+            nearer = error < best
+        result[nearer] = surface[nearer]
+        best = np.where(nearer, error, best)
+    depth[:] = result
+    return best < tolerance
+
+
 class SurfacePredictor:
     """Predicts candidate surfaces: intersects the rays of one camera with beams, map, floor, ceilings."""
 

@@ -11,6 +11,14 @@ from beamsplat.common.geometry.transforms import se2_to_se3
 from beamsplat.services.fusion.free_space import FreeSpaceGrid
 from beamsplat.services.fusion.fuse import Fusion
 from beamsplat.services.fusion.inputs import FusionInput
+from beamsplat.services.fusion.learned_inputs import (
+    CANDIDATES,
+    LABELS,
+    MULTIPLE,
+    OUTPUTS,
+    AggregatorInputs,
+)
+from beamsplat.services.fusion.learned_kernels import decode_depth, quantised_cost, quantised_energy
 
 
 def warm() -> None:
@@ -29,3 +37,23 @@ def warm() -> None:
         frame = FusionInput(i, np.roll(image, i, axis=1), T_map_body, beams, estimate, "relative")
         fusion.fuse(frame, keyframe=i % 2 == 0)
     FreeSpaceGrid().add(np.zeros(2), points)
+    _warm_learned()
+
+
+def _warm_learned() -> None:
+    """Run the kernels of the learned aggregation on a few pixels."""
+    h, w = 3, 4
+    volume = np.ones((h, w, LABELS), np.float32)
+    map16 = np.zeros((h, w), np.float16)
+    inputs = AggregatorInputs(
+        quantised_cost(volume), quantised_energy(volume, 4.0), np.zeros((len(CANDIDATES), h, w), np.float16),
+        np.zeros((h, w, 3), np.uint8), map16, np.zeros((h, w), np.uint8), map16, map16, 1, 0.0,
+    )  # fmt: skip
+    log_z = np.linspace(-1.0, 2.0, LABELS)
+    inputs.features(log_z)
+    depth = np.empty((h, w), np.float32)
+    output = np.zeros((OUTPUTS, MULTIPLE, MULTIPLE), np.float32)
+    decode_depth(
+        output, inputs.cost, inputs.energy, inputs.place(log_z), float(log_z[0]),
+        float(log_z[1] - log_z[0]), depth, np.empty_like(depth),
+    )  # fmt: skip

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from beamsplat.services.depth.source import make_source
+from beamsplat.tools.evaluation.depth_replay import replay_depth, truth_depth_files
 from beamsplat.tools.evaluation.drive import RecordedDrive
-from beamsplat.tools.evaluation.evaluate import replay_depth, truth_depth_files
 
 DEPTHS = {"field": "depth of a keyframe", "field_carried": "depth of another image"}
 BANDS_M = ((0.0, 1.5), (1.5, 3.0), (3.0, 6.0), (6.0, np.inf))  # of the stated depth

@@ -106,8 +106,9 @@ def open_fusion(data: Path, seconds: float) -> Run:
 
     from beamsplat.services.depth.source import make_source
     from beamsplat.services.fusion.warm import warm
+    from beamsplat.tools.evaluation.depth_replay import truth_depth_files
     from beamsplat.tools.evaluation.drive import open_drive
-    from beamsplat.tools.evaluation.evaluate import DEFAULT, evaluate, truth_depth_files
+    from beamsplat.tools.evaluation.evaluate import DEFAULT, evaluate
 
     cv2.setNumThreads(1)
     drive, truth = open_drive(data / "bag", data / "groundtruth.txt"), truth_depth_files(data)

@@ -133,7 +133,7 @@ def _simulated(out: Path, seconds: float) -> Path:
 
 
 def _truth_stamps(source: Path) -> frozenset[int]:
-    from beamsplat.tools.evaluation.evaluate import truth_depth_files
+    from beamsplat.tools.evaluation.depth_replay import truth_depth_files
     from beamsplat.tools.report.map_scores import truth_folder
 
     try:

@@ -13,8 +13,8 @@ from beamsplat.common.geometry.beams import project_beams
 from beamsplat.common.geometry.camera import Pinhole, Undistorter
 from beamsplat.common.geometry.rig import load_rig
 from beamsplat.services.depth.source import DepthInput, DepthSource
+from beamsplat.tools.evaluation.depth_replay import DepthComparison, replay_depth, truth_depth_files
 from beamsplat.tools.evaluation.drive import RecordedDrive
-from beamsplat.tools.evaluation.evaluate import DepthComparison, replay_depth, truth_depth_files
 
 _Z_RANGE_M = (0.4, 10.0)  # colour range of depth
 _SIGMA_RANGE_M = (0.005, 2.0)  # colour range of sigma

@@ -10,8 +10,8 @@ import numpy as np
 
 from beamsplat.common.errors import UserError
 from beamsplat.common.geometry.transforms import inverse
+from beamsplat.tools.evaluation.depth_replay import truth_depth_files
 from beamsplat.tools.evaluation.drive import open_drive
-from beamsplat.tools.evaluation.evaluate import truth_depth_files
 from beamsplat.tools.report.map_scores import (
     map_figures,
     map_in_world,

@@ -5,9 +5,9 @@ import pytest
 
 from beamsplat.common.errors import UserError
 from beamsplat.common.geometry.camera import Pinhole
+from beamsplat.common.onnx_model import OnnxModel, available_providers, to_hw
 from beamsplat.services.depth.depth_anything import network_input_size
 from beamsplat.services.depth.fastdepth import network_crop
-from beamsplat.services.depth.onnx_model import OnnxModel, available_providers, to_hw
 from beamsplat.services.depth.source import DepthInput, make_source
 from beamsplat.services.depth.unidepth import letterbox_layout, network_rays
 
@@ -167,7 +167,7 @@ def test_the_network_at_hand_answers_at_its_known_error(shared_dir, monkeypatch)
     from beamsplat.services.depth.recorded import read_depth
     from beamsplat.services.replay.options import SourceOptions
     from beamsplat.services.replay.source import open_source
-    from beamsplat.tools.evaluation.evaluate import truth_depth_files
+    from beamsplat.tools.evaluation.depth_replay import truth_depth_files
 
     monkeypatch.setenv("BEAMSPLAT_MODELS", str(shared_dir / "models"))
     source = make_source("fastdepth")

@@ -49,6 +49,26 @@ def test_eval_depth_estimates_poses_and_has_all_figures(drive):
     assert field["absrel"] < 0.05
     assert field["heldout_median_m"] < 0.03
     assert report["ratio"]["frames"] == 5
+    rows = {row["part"]: row for row in report["breakdown"]["methods"]["field"]["height"]}
+    assert "there is no groundtruth.txt" in report["breakdown"]["heights"]["poses"]
+    assert sum(row["share"] for row in rows.values()) == pytest.approx(1.0)
+    assert rows["floor"]["within_5cm"] > 0.9
+    assert rows["1.2 m to the ceiling"]["share"] > 0.05
+
+
+def test_eval_depth_prints_the_parts_of_the_image(drive, poses):
+    result = run(
+        "eval", "depth", drive / "rec", "--truth", drive, "--poses", poses, "--source", "none", "--no-heldout"
+    )
+    assert result.exit_code == 0, result.output
+    for text in (
+        "1.2 m to the ceiling",
+        "depth edges",
+        "2 to 4 m",
+        "share_of_l1",
+        "body on the floor, at 0.00 m",
+    ):
+        assert text in result.output
 
 
 def test_depth_writes_panels(drive, poses, tmp_path):
@@ -89,6 +109,10 @@ def test_bench_depth_reports_the_source_alone_and_the_whole():
         (("calibrate", "extrinsics", "{drive}", "--target", "board"), "--rig"),
         (("calibrate", "extrinsics", "{drive}/rec", "--target", "wall"), "motion or board"),
         (("eval", "depth", "{drive}/rec", "--truth", "{drive}", "--source", "nonsense"), "stixel"),
+        (
+            ("eval", "depth", "{drive}/rec", "--truth", "{drive}", "--weights", "{drive}/no.onnx"),
+            "train aggregator",
+        ),
     ],
 )
 def test_errors_name_the_cause(drive, arguments, words):

@@ -69,6 +69,7 @@ class OnnxModel:
             reason = str(error).strip().split("\n")[0][:200]
             raise UserError(f"{self.path}: not an ONNX graph that can run here: {reason}") from error
         self.providers = self._session.get_providers()
+        self.metadata: dict[str, str] = dict(self._session.get_modelmeta().custom_metadata_map)
         self.inputs = [self._tensor_spec(node) for node in self._session.get_inputs()]
         self.outputs = [self._tensor_spec(node) for node in self._session.get_outputs()]
 
