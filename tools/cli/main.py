@@ -32,6 +32,7 @@ from beamsplat.tools.cli import simulate as simulator_cli
 from beamsplat.tools.cli import slam as localization_cli
 from beamsplat.tools.cli import swap as swap_cli
 from beamsplat.tools.cli import system as system_cli
+from beamsplat.tools.cli import train as train_cli
 from beamsplat.tools.cli import view as view_cli
 from beamsplat.tools.cli import watch as watch_cli
 from beamsplat.tools.cli.relocalize import eval_relocalize
@@ -77,6 +78,7 @@ app.add_typer(evaluate, name="eval", rich_help_panel=_RESULTS)
 for command in (setup_cli.setup, doctor.doctor, bug_report.bug_report, warm.warm):
     app.command(rich_help_panel=_MACHINE)(command)
 app.add_typer(models_cli.app, name="models", rich_help_panel=_MACHINE)
+app.add_typer(train_cli.app, name="train", rich_help_panel=_MACHINE)
 app.add_typer(keys_cli.app, name="keys", rich_help_panel=_MACHINE)
 bench_cli.app.command("depth")(depth_cli.bench_depth)
 bench_cli.app.command("raster")(mapping_cli.bench_raster)
