@@ -54,7 +54,7 @@ export class Overlays {
   setScan({ T_map_lidar, points }) {
     const at = new Float32Array(points.length * 3);
     points.forEach(([x, y], i) => at.set(transform(T_map_lidar, [x, y, 0]), 3 * i));
-    const material = new PointsMaterial({ color: COLOURS.scan, size: 4, sizeAttenuation: false, depthTest: false });
+    const material = new PointsMaterial({ color: COLOURS.scan, size: 4, sizeAttenuation: false, depthTest: false, transparent: true });
     this._replace("scan", [over(new Points(vertices(at), material))]);
   }
 
@@ -87,7 +87,7 @@ export class Overlays {
   /** @param {Point[]} points one or two */
   setMeasure(points) {
     const at = new Float32Array(points.flat());
-    const material = new PointsMaterial({ color: COLOURS.measure, size: 9, sizeAttenuation: false, depthTest: false });
+    const material = new PointsMaterial({ color: COLOURS.measure, size: 9, sizeAttenuation: false, depthTest: false, transparent: true });
     this._replace("measure", points.length ? [over(new Points(vertices(at), material)), new Line(vertices(at), line(COLOURS.measure))] : []);
   }
 
@@ -108,7 +108,7 @@ export class Overlays {
   }
 }
 
-/** Draw an object after the Gaussians. @template {Mesh | Line | Points} T @param {T} object @returns {T} */
+/** Draw an object after the Gaussians; its material must be transparent, because three.js draws opaque ones first. @template {Mesh | Line | Points} T @param {T} object @returns {T} */
 function over(object) {
   object.renderOrder = 2;
   object.frustumCulled = false;
