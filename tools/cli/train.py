@@ -110,7 +110,8 @@ def _print_summary(report: dict[str, Any]) -> None:
     heldout = report["heldout"]
     if not heldout:
         return
-    print(f"CPU ms per keyframe, one thread: network {heldout['network_cpu_ms']:.1f}")
+    median, least = heldout["network_cpu_ms"], heldout["network_least_cpu_ms"]
+    print(f"network: {median:.1f} CPU ms per keyframe (least {least:.1f}), one thread")
     table = Table(
         title="held-out homes: change from sgm to learned, with 95 % intervals", title_justify="left"
     )

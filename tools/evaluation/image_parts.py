@@ -81,9 +81,9 @@ def _horizontal_planes(heights_m: np.ndarray) -> list[float]:
     padded = np.concatenate([[0.0], near, [0.0]])
     peaks = np.flatnonzero((near >= least) & (near > padded[:-2]) & (near >= padded[2:]))
     found = []
-    for k in peaks:
+    for k in peaks.tolist():
         first, stop = max(k - 1, 0), min(k + 2, len(counts))
-        centre = np.average(np.arange(int(first), int(stop)) + 0.5, weights=counts[first:stop])
+        centre = np.average(np.arange(first, stop) + 0.5, weights=counts[first:stop])
         found.append(float(low + centre * _BIN_M))
     return found
 
