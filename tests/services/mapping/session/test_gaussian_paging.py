@@ -18,7 +18,7 @@ from beamsplat.common.messages import Anchors
 from beamsplat.common.messages.splat_codec import unpack
 from beamsplat.common.raster.layout import MEAN, SCALE
 from beamsplat.services.mapping.chunks import disk_params
-from beamsplat.services.mapping.keyframe import MAX_DEPTH_M
+from beamsplat.services.mapping.keyframe import MAX_DEPTH_M, RgbdKeyframe, visible_range_m
 from beamsplat.services.mapping.preview import render_view
 from beamsplat.services.mapping.session.disk_tier import CELL_M, groups_of, spheres_of
 from beamsplat.services.mapping.session.frustum import frustum_intersects
@@ -203,7 +203,7 @@ def test_anchors_move_gaussians_on_disk(walked):
         Anchors(stamp_ns=gallery.T0, anchor_ids=np.array([0]), T_map_anchor=places),
         {},
     )
-    assert mapper.store.versions()[0] == version  # viewers move the chunk with its anchor
+    assert mapper.store.versions()[0] == version  # in their own frame they are the same
     disk_tier.page_in(
         mapper.store, [n for n, b in disk_tier.blocks.items() if b.anchor == 0], mapper.T_map_anchor
     )
@@ -389,6 +389,53 @@ def test_spheres_in_the_image_intersect_the_frustum_and_distant_ones_do_not():
     behind = (centres - T_map_camera[:3, 3]) @ T_map_camera[:3, 2] < -radii
     assert not seen[behind].any()
     assert frustum_intersects(c, T_map_camera, MAX_DEPTH_M, centres, radii).sum() > seen.sum()
+
+
+def test_a_sphere_is_seen_unless_it_is_behind_the_depths_of_all_tiles_that_it_covers():
+    """Points of a sphere that are nearer than the depth of their tile make it seen; behind a wall that fills
+    the image nothing is.
+    """
+    chance = np.random.default_rng(5)
+    c, T_map_camera = gallery.CAMERA, gallery.T_map_camera(3)
+    reach_m = chance.uniform(1.0, 12.0, (6, 8))
+    centres, radii = chance.uniform(-12, 12, (4000, 3)), chance.uniform(0.05, 1.5, 4000)
+    on = chance.normal(size=(4000, 200, 3))
+    points = centres[:, None] + on / np.linalg.norm(on, axis=2, keepdims=True) * radii[:, None, None]
+    inward = inverse(T_map_camera)
+    x, y, z = np.moveaxis(points @ inward[:3, :3].T + inward[:3, 3], 2, 0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        u, v = x / z * c.fx_px + c.cx_px, y / z * c.fy_px + c.cy_px
+    inside = (z > 0.1) & (u > -0.5) & (v > -0.5) & (u < c.width_px - 0.5) & (v < c.height_px - 0.5)
+    row = np.clip((np.where(inside, v, 0.0) + 0.5) / c.height_px * 6, 0, 5).astype(int)
+    column = np.clip((np.where(inside, u, 0.0) + 0.5) / c.width_px * 8, 0, 7).astype(int)
+    inside &= z < reach_m[row, column]
+    seen = frustum_intersects(c, T_map_camera, reach_m, centres, radii)
+    assert seen[inside.any(axis=1)].all()
+    whole = frustum_intersects(c, T_map_camera, 12.0, centres, radii)
+    assert 30 < seen.sum() < 0.8 * whole.sum()
+    assert not (seen & ~whole).any()
+    depth_m = (centres - T_map_camera[:3, 3]) @ T_map_camera[:3, 2]
+    wall = frustum_intersects(c, T_map_camera, np.full((6, 8), 3.0), centres, radii)
+    assert not wall[depth_m - radii > 3.0].any()
+
+
+def test_the_visible_range_is_that_of_each_tile_and_far_where_a_doorway_has_no_depth():
+    shape = (gallery.CAMERA.height_px, gallery.CAMERA.width_px)
+    depth_m = np.full(shape, 2.0, np.float32)
+    depth_m[:, : shape[1] // 2] = 5.0
+    depth_m[-shape[0] // 6 :, -shape[1] // 8 :] = np.nan
+    frame = RgbdKeyframe(
+        0,
+        np.zeros((*shape, 3), np.uint8),
+        gallery.CAMERA,
+        np.eye(4),
+        depth_m,
+        np.full(shape, 0.1, np.float32),
+    )
+    reach_m = visible_range_m(frame)
+    np.testing.assert_allclose(reach_m[:, :4], 6.0, atol=1e-6)
+    np.testing.assert_allclose(reach_m[:5, 4:], 2.7, atol=1e-6)
+    assert reach_m[5, 7] >= 20.0
 
 
 def test_groups_contain_all_gaussians_of_a_cell_and_their_spheres_the_rendered_extents(walked):
